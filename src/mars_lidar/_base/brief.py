@@ -1,4 +1,4 @@
-"""One short line for every public object: what a notebook or a debugger shows must not fill the screen."""
+"""Short ``repr`` of public objects, which fits on a screen."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from typing import Any
 
 import numpy as np
 
-_MOST_VALUES = 4  # of an array or a sequence that is written out; larger ones by type and shape
-_MOST_TEXT = 240  # characters of anything else, such as a system inside of a result
+_MOST_VALUES = 4  # values of an array or sequence that is written out; larger ones by type and shape
+_MOST_TEXT = 240  # characters of other values, such as a system inside a result
 
 
 def brief(self: Any) -> str:
     """The ``__repr__`` of a dataclass: fields that differ from their defaults, large arrays by type and shape only."""
-    told = []
+    fields = []
     for field in dataclasses.fields(self):
         value = getattr(self, field.name)
         if field.repr and not _is_default(field, value):
-            told.append(f"{field.name}={_shown(value)}")
-    return f"{type(self).__name__}({', '.join(told)})"
+            fields.append(f"{field.name}={_value_text(value)}")
+    return f"{type(self).__name__}({', '.join(fields)})"
 
 
 def _is_default(field: dataclasses.Field[Any], value: Any) -> bool:
@@ -28,7 +28,7 @@ def _is_default(field: dataclasses.Field[Any], value: Any) -> bool:
     return default is value or (type(default) is type(value) and not isinstance(value, np.ndarray) and default == value)
 
 
-def _shown(value: Any) -> str:
+def _value_text(value: Any) -> str:
     if isinstance(value, np.ndarray) and value.size > _MOST_VALUES:
         return f"<{value.dtype} {value.shape}>"
     if isinstance(value, np.ndarray):

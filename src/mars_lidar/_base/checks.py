@@ -13,8 +13,8 @@ import numpy as np
 
 def real(name: str, value: Any, *, low: float = -math.inf, high: float = math.inf, strict_low: bool = False) -> float:
     """A finite real number in [low, high] (or (low, high] with `strict_low`), as float."""
-    left, right = "(" if strict_low or math.isinf(low) else "[", ")" if math.isinf(high) else "]"
-    allowed = f"a finite number in {left}{low:g}, {high:g}{right}"
+    opening, closing = "(" if strict_low or math.isinf(low) else "[", ")" if math.isinf(high) else "]"
+    allowed = f"a finite number in {opening}{low:g}, {high:g}{closing}"
     if isinstance(value, bool) or not isinstance(value, Real):
         raise TypeError(f"{name} must be {allowed}, got {value!r} ({type(value).__name__})")
     number = float(value)
@@ -44,8 +44,8 @@ def whole(value: Any) -> Any:
 def choice(name: str, value: Any, allowed: tuple[str, ...]) -> str:
     """One of a few strings."""
     if not isinstance(value, str) or value not in allowed:
-        told = f"{name} must be one of {', '.join(map(repr, allowed))}"
-        raise ValueError(f"{told}, got {value!r}{did_you_mean(value, allowed)}")
+        message = f"{name} must be one of {', '.join(map(repr, allowed))}"
+        raise ValueError(f"{message}, got {value!r}{did_you_mean(value, allowed)}")
     return value
 
 

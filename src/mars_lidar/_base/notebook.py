@@ -1,4 +1,4 @@
-"""What a notebook shows of an object: its line of text, and small pictures of its maps and curves."""
+"""HTML of an object for notebooks: its ``repr`` and small pictures of its maps and curves."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-_LARGEST = 160  # pixels of a map on its longer side: more cannot be seen
+_LARGEST = 160  # pixels of a map on its longer side: more than the picture has
 _INCHES, _DPI = 1.7, 75
 
 
-def as_html(shown: object, panels: Mapping[str, Any]) -> str:
-    """The ``repr`` of `shown` above `panels`: maps (H, W) by their title and unit, or curves (x, y)."""
-    text = f"<code>{html.escape(repr(shown))}</code>"
+def as_html(thing: object, panels: Mapping[str, Any]) -> str:
+    """The ``repr`` of `thing` above `panels`: maps (H, W) by their title and unit, or curves (x, y)."""
+    text = f"<code>{html.escape(repr(thing))}</code>"
     drawn = {name: values for name, values in panels.items() if _has_values(values)}
     if not drawn:
         return text

@@ -1,4 +1,4 @@
-"""How far a long run is, for people: a line that moves on a terminal, a line every half minute anywhere else."""
+"""Progress of a long run: a line that is rewritten on a terminal, a line every half minute in a log."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from mars_lidar._base.types import Progress
 _PATIENCE_S = 0.5  # a line that would vanish at once is not drawn
 _OFTEN_S, _SELDOM_S = 0.2, 30.0  # between lines on a terminal, and in a log
 LONG_S = 10.0
-"""What takes longer than this is told before, or as soon as it can be known."""
+"""Seconds; a longer run is announced before it starts, or as soon as its time is known."""
 
 
 def shown(progress: Any, label: str) -> Progress | None:
@@ -22,8 +22,8 @@ def shown(progress: Any, label: str) -> Progress | None:
         return Bar(label)
     if not callable(progress):
         raise TypeError(f"progress must be callable as progress(done, total), or True, got {progress!r}")
-    told: Progress = progress
-    return told
+    callback: Progress = progress
+    return callback
 
 
 def of_part(progress: Progress | None, first: int, last: int, total: int) -> Progress | None:
@@ -51,7 +51,7 @@ class Bar:
         self._before: int | None = None  # done by an earlier run: no part of this one's speed
 
     def __call__(self, done: int, total: int) -> None:
-        """Tell it, if it is time."""
+        """Print the progress, at most every 0.2 s on a terminal and every 30 s in a log."""
         now = time.monotonic()
         spent = now - self._began
         if self._before is None:

@@ -33,7 +33,7 @@ _MOST_BYTES, _MOST_NODES = 2**20, 2**17  # PyYAML reads a megabyte in 10 s
 
 
 class RecipeError(ValueError):
-    """A value of a description that cannot be; `key` is where it stands."""
+    """An invalid value of a description; `key` is its place."""
 
     def __init__(self, key: Key, message: str) -> None:
         super().__init__(message)
@@ -84,14 +84,14 @@ def opened(path: Path) -> Iterator[tuple[Any, Any]]:
 
 
 def _expanded(node: Any, known: dict[int, int]) -> int:
-    """Nodes below this one, those behind aliases counted as often as they stand there."""
+    """Number of nodes below this one; those of an alias count each time it is used."""
     if id(node) not in known:
         known[id(node)] = _MOST_NODES + 1  # of a node that contains itself
         inner = getattr(node, "value", None)
         children = inner if isinstance(inner, list) else []
         known[id(node)] = 1 + sum(
-            sum(_expanded(part, known) for part in one) if isinstance(one, tuple) else _expanded(one, known)
-            for one in children
+            sum(_expanded(part, known) for part in child) if isinstance(child, tuple) else _expanded(child, known)
+            for child in children
         )
     return known[id(node)]
 
@@ -107,13 +107,13 @@ def read_yaml(path: Path) -> tuple[Any, Lines]:
 
 
 @contextlib.contextmanager
-def located(path: Path, lines: Lines, elsewhere: Callable[[Key], bool] = lambda key: False) -> Iterator[None]:
-    """Turn what is wrong with the data of a file into ``FILE:LINE: what``; no line for keys that stand `elsewhere`."""
+def located(path: Path, lines: Lines, overridden: Callable[[Key], bool] = lambda key: False) -> Iterator[None]:
+    """Turn what is wrong with the data of a file into ``FILE:LINE: what``; no line for keys that are `overridden`."""
     try:
         yield
     except (ValueError, TypeError) as error:
         key = error.key if isinstance(error, RecipeError) else ()
-        line = None if elsewhere(key) else line_of(key, str(error), lines)
+        line = None if overridden(key) else line_of(key, str(error), lines)
         raise FileError(f"{path}{'' if line is None else f':{line}'}: {error}") from error
 
 
@@ -125,7 +125,7 @@ def line_of(key: Key, message: str, lines: Lines) -> int | None:
         if (*key, word) in lines:
             return lines[(*key, word)]
     for word in words[:1]:  # the argument that a message begins with, deeper down
-        deeper = [line for one, line in lines.items() if one[: len(key)] == key and one[-1:] == (word,)]
+        deeper = [line for place, line in lines.items() if place[: len(key)] == key and place[-1:] == (word,)]
         if deeper:
             return deeper[0]
     while key and key not in lines:

@@ -1,4 +1,4 @@
-"""What an avalanche leaves behind: afterpulses in its own pixel, and crosstalk in the neighbours."""
+"""Avalanches triggered by avalanches: afterpulses in the same pixel and crosstalk in its neighbours."""
 
 from __future__ import annotations
 
@@ -96,12 +96,14 @@ class Afterpulsing:
     def after_dead_time(
         cls, *, probability: float, delay_ns: float, dead_time_ns: float, generations: int | None = None
     ) -> Afterpulsing:
-        """Exponential delays of which `probability` per avalanche are left after its dead time."""
-        seen = checks.real("probability", probability, low=0.0, high=1.0, strict_low=True)
+        """Exponential delays with `probability` afterpulses per avalanche after its dead time."""
+        after_dead = checks.real("probability", probability, low=0.0, high=1.0, strict_low=True)
         delay = checks.real("delay_ns", delay_ns, low=0.0, strict_low=True)
         dead = checks.real("dead_time_ns", dead_time_ns, low=0.0)
         return cls(
-            probability=min(seen * math.exp(min(dead / delay, 700.0)), 1e300), delay_ns=delay, generations=generations
+            probability=min(after_dead * math.exp(min(dead / delay, 700.0)), 1e300),
+            delay_ns=delay,
+            generations=generations,
         )
 
     @property
@@ -137,12 +139,12 @@ class Afterpulsing:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data from which `Afterpulsing.from_dict` makes an equal object."""
-        told: dict[str, Any] = {"probability": self.probability}
+        data: dict[str, Any] = {"probability": self.probability}
         if self.delay_ns is not None:
-            told["delay_ns"] = self.delay_ns
+            data["delay_ns"] = self.delay_ns
         else:
-            told |= {"delays": list(self.delays or ()), "bin_ns": self.bin_ns}
-        return told if self.generations is None else told | {"generations": self.generations}
+            data |= {"delays": list(self.delays or ()), "bin_ns": self.bin_ns}
+        return data if self.generations is None else data | {"generations": self.generations}
 
     @classmethod
     def from_dict(cls, data: Any) -> Afterpulsing:
@@ -242,8 +244,8 @@ def _density(values: Any) -> tuple[float, ...]:
     samples = samples.astype(np.float64)
     bad = ~np.isfinite(samples) | (samples < 0.0)
     if bad.any() or not 0.0 < samples.sum() < math.inf:
-        found = samples[bad][0] if bad.any() else samples.sum()
+        offending = samples[bad][0] if bad.any() else samples.sum()
         raise ValueError(
-            f"delays of afterpulsing must be finite and non-negative, of positive, finite sum, got {found}"
+            f"delays of afterpulsing must be finite and non-negative, of positive, finite sum, got {offending}"
         )
     return tuple(samples.tolist())

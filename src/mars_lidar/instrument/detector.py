@@ -26,7 +26,7 @@ _MAX_RECOVERY_PERIODS = 1e6  # beyond it a pixel that has rested would not be to
 _GATE = ("gate_start_ns", "gate_width_ns", "gate_step_ns", "gate_cycles")
 _MAX_GATE_CYCLES = 100_000_000
 _MIN_GATE_PERIODS = 1e-5  # phases have 24 bits: at 1e-6 periods the counts behind a gate were 4 % off
-_NOTEBOOK_POINTS = 301  # of the curve in a notebook: more than its pixels
+_NOTEBOOK_POINTS = 301  # points of the curve in a notebook, more than its pixels
 _MAX_GATE_NS = 1e12  # a start or a step is taken modulo the period: far beyond it no digits are left
 
 
@@ -255,13 +255,13 @@ class Detector:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data from which `Detector.from_dict` makes an equal detector; gate and effects only where used."""
-        told = {}
+        data = {}
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
             off = effects.FIELDS[field.name].off if field.name in effects.FIELDS else None
             if value != off:
-                told[field.name] = effects.plain(value)
-        return told
+                data[field.name] = effects.plain(value)
+        return data
 
     @classmethod
     def from_dict(cls, data: Any) -> Detector:
@@ -281,5 +281,5 @@ def require_effects(what: str, detector: Detector, able: tuple[str, ...], instea
     for name in detector.effects:
         if name not in able:
             value = repr(getattr(detector, name))
-            told = value if len(value) <= 100 else f"{value[:97]}..."
-            raise ValueError(f"{what} does not do {name} of the detector, got {told}{instead(name)}")
+            given = value if len(value) <= 100 else f"{value[:97]}..."
+            raise ValueError(f"{what} does not do {name} of the detector, got {given}{instead(name)}")

@@ -1,4 +1,4 @@
-"""What a real pixel and its electronics do beside dead time and mode: the optional fields of `Detector`.
+"""Effects of a pixel and its electronics beside dead time and mode: the optional fields of `Detector`.
 
 Every effect is declared here once: its check, its form in files, its option, its native fields. All are off by default,
 and then the bits are those of the ideal pixel. The order in which they act, and what each of them is taken to be, is in
@@ -35,9 +35,9 @@ def native_pulse(pulse: Pulse, period_ns: float) -> _core.PulseTable:
 
 # --- Effects -------------------------------------------------------------------------------------------------------
 
-_MAX_RATE_HZ = 1e12
-_MAX_EVENTS = 2**31 - 1
-_MAX_CODES = 2**16
+MAX_RATE_HZ = 1e12  # dark counts or photons per second, the most that are accepted
+_MAX_EVENTS = 2**31 - 1  # records of an exposure: 32-bit counters
+_MAX_CODES = 2**16  # codes of a TDC
 
 
 Kind = Literal["light", "avalanche", "recording", "timing"]
@@ -104,12 +104,12 @@ def _code_density(value: Any) -> tuple[float, ...]:
 
 
 def _native_traps(traps: Afterpulsing, period_ns: float) -> dict[str, Any]:
-    told: dict[str, Any] = {"traps": traps.probability, "trap_delay": traps.mean_delay_ns / period_ns}
+    fields: dict[str, Any] = {"traps": traps.probability, "trap_delay": traps.mean_delay_ns / period_ns}
     if traps.delays is not None:
-        told |= {"trap_delays": traps.edges_below, "trap_sample": (traps.bin_ns or 0.0) / period_ns}
+        fields |= {"trap_delays": traps.edges_below, "trap_sample": (traps.bin_ns or 0.0) / period_ns}
     if traps.generations is not None:
-        told["generations"] = traps.generations
-    return told
+        fields["generations"] = traps.generations
+    return fields
 
 
 def _native_jitter(jitter: Jitter | SampledJitter, period_ns: float) -> dict[str, Any]:
@@ -134,7 +134,7 @@ FIELDS: dict[str, Effect] = {
     "dark_count_hz": Effect(
         "light",
         0.0,
-        lambda v: checks.real("dark_count_hz", v, low=0.0, high=_MAX_RATE_HZ),
+        lambda v: checks.real("dark_count_hz", v, low=0.0, high=MAX_RATE_HZ),
         "dark_count_hz: 100.0             # counts/s of every pixel",
         help="Dark counts of every pixel, counts/s, which no efficiency reduces.",
         default="0",
@@ -242,12 +242,12 @@ EFFECTS = tuple(FIELDS)
 
 def native_fields(values: Mapping[str, Any], period_ns: float) -> dict[str, Any]:
     """The native fields of effects, by their names and values, that are on."""
-    told: dict[str, Any] = {}
+    fields: dict[str, Any] = {}
     for name, value in values.items():
         effect = FIELDS[name]
         if effect.native is not None and value != effect.off:
-            told |= effect.native(value, period_ns)
-    return told
+            fields |= effect.native(value, period_ns)
+    return fields
 
 
 def plain(value: Any) -> Any:

@@ -109,18 +109,18 @@ def detector_of(name: str) -> dict[str, Any]:
 
 def sourced(name: str) -> Sourced:
     """All values of an instrument, with their sources; ValueError with all names if there is none."""
-    found = INSTRUMENTS[checks.choice("preset", name, tuple(INSTRUMENTS))]
-    return {**found.get("laser", {}), **found["detector"]}
+    fields = INSTRUMENTS[checks.choice("preset", name, tuple(INSTRUMENTS))]
+    return {**fields.get("laser", {}), **fields["detector"]}
 
 
 def table() -> str:
     """All instruments as the table of docs/detectors.md."""
     lines = ["| name | value | | source |", "|---|---|---|---|"]
     for name in INSTRUMENTS:
-        shown = f"`{name}`"
+        label = f"`{name}`"
         for field, (value, source) in sourced(name).items():
-            lines.append(f"| {shown} | `{field}` | {value if isinstance(value, str) else f'{value:.6g}'} | {source} |")
-            shown = ""
+            lines.append(f"| {label} | `{field}` | {value if isinstance(value, str) else f'{value:.6g}'} | {source} |")
+            label = ""
     return "\n".join(lines)
 
 

@@ -20,9 +20,9 @@ from mars_lidar._base.native import _core
 from mars_lidar._base.notebook import as_html
 
 _GAUSSIAN_REACH = 8.5  # half support in sigma: what lies outside, 1e-17, is below one photon in any exposure
-_WIDE = 0.3  # periods of sigma from which a train of pulses is summed by frequency
-_BLOCK = 1 << 15  # times at once
-_NOTEBOOK_POINTS = 300  # of the curve in a notebook: more than its pixels
+_WIDE = 0.3  # sigma in periods from which a train of pulses is summed as a Fourier series
+_BLOCK = 1 << 15  # times evaluated together
+_NOTEBOOK_POINTS = 300  # points of the curve in a notebook, more than its pixels
 _SMALL = 40.0  # e^-40 is rounding
 FWHM_PER_SIGMA = 2.0 * math.sqrt(2.0 * math.log(2.0))
 _ORIGINS = ("peak", "centroid", "first")

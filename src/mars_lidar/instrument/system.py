@@ -30,7 +30,7 @@ _STARTS = ("armed", "stationary")
 MAX_CYCLES = 100_000_000  # of a simulation: the sampler counts periods in 32 bits; ten seconds at 10 MHz
 _MOST_CYCLES = 2**53  # of a recording: the integers that doubles hold
 _MAX_BINS = 2**20
-_LINED_BYTES = 2**16  # of JSON that is read as YAML, a hundred times slower, so that errors name the line
+_LINED_BYTES = 2**16  # bytes up to which JSON is read as YAML, a hundred times slower, so that errors state the line
 _MAX_DEAD_PERIODS = 2**20
 
 
@@ -221,10 +221,10 @@ class System:
         Where each value is from, or that it is an assumption, stands in docs/detectors.md and in the file that
         ``mars-lidar init --preset NAME`` writes. ValueError for one that is a detector alone (`Detector.preset`).
         """
-        told = sourced(name)
-        if "period_ns" not in told:
+        fields = sourced(name)
+        if "period_ns" not in fields:
             raise ValueError(f"{name} is a detector, without a laser: use Detector.preset({name!r})")
-        period, cycles, bins, fwhm = (told[key][0] for key in ("period_ns", "cycles", "bins", "pulse_fwhm_ns"))
+        period, cycles, bins, fwhm = (fields[key][0] for key in ("period_ns", "cycles", "bins", "pulse_fwhm_ns"))
         pulse = pulse_from_dict({"kind": "gaussian", "fwhm_ns": fwhm})
         return cls(period_ns=period, cycles=cycles, bins=bins, pulse=pulse, detector=Detector.preset(name))
 

@@ -1,4 +1,4 @@
-"""A look at the units of a system: times in ps or s where ns are meant, which no other check can know."""
+"""Warnings for times that are likely given in ps or s instead of ns."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from mars_lidar.instrument.pulse import FWHM_PER_SIGMA, GaussianPulse, Pulse
 
 
 class UnitWarning(UserWarning):
-    """A value that is possible, and likely meant in another unit."""
+    """A possible value that is likely meant in another unit."""
 
 
-# from what on a time is odd in ns, and in laser periods, and from what on nobody types it: such values are meant
+# time from which a value is unusual, in ns and in laser periods; and from which it is meant as it is, in ns
 _PULSE, _DEAD, _GATE = (41.0, 0.31, 2e4), (25_000.0, 25.0, 1e6), (0.0, 25.0, 1e6)
 _LONGEST_NS = 1e-6  # of a time in seconds that was taken for ns: a second is the longest anybody has
-_ODD_DELAY = 100.0  # periods
-_DIGITS = 3  # what people type; a computed value has more
+_ODD_DELAY = 100.0  # periods from which a median delay is unusual
+_DIGITS = 3  # significant digits of typed values; computed values have more
 
 
 def period_hint(period_ns: float) -> str:
-    """What a period was likely meant to be, or nothing."""
+    """Hint at the period that was likely meant, or an empty text."""
     if period_ns < 1e-3:  # 1 ps
         return f"period_ns={period_ns:g} is {period_ns:g} ns: {1e9 * period_ns:.4g} ns, if it was given in seconds"
     return ""
@@ -31,16 +31,16 @@ def check_units(period: float, pulse: Pulse, detector: Detector) -> None:
     """Warn of times that are 1000 or 1e9 times what is usual."""
     if hint := period_hint(period):
         _warn(hint)
-    told = [
+    times = [
         ("dead_time_ns", detector.dead_time_ns, _DEAD),
         ("electronics_dead_time_ns", detector.electronics_dead_time_ns, _DEAD),
     ]
     if isinstance(pulse, GaussianPulse):
-        told.append(("sigma_ns", pulse.sigma_ns, _PULSE))
-    told += [(name, abs(getattr(detector, name) or 0.0), _GATE) for name in ("gate_start_ns", "gate_step_ns")]
-    if any(value >= meant for _, value, (_, _, meant) in told):
+        times.append(("sigma_ns", pulse.sigma_ns, _PULSE))
+    times += [(name, abs(getattr(detector, name) or 0.0), _GATE) for name in ("gate_start_ns", "gate_step_ns")]
+    if any(value >= meant for _, value, (_, _, meant) in times):
         return  # nobody's laboratory: the far end of the domain, in units of its own
-    for name, value, (odd_ns, odd_periods, _) in told:
+    for name, value, (odd_ns, odd_periods, _) in times:
         if 0.0 < value < _LONGEST_NS and value < 1e-6 * period and not math.log10(value).is_integer():  # a limit, then
             likely, unit = 1e9 * value, "seconds"
         elif odd_ns <= value and odd_periods * period <= value != period and _typed(name, value):
@@ -64,7 +64,7 @@ def check_delays(median_ns: float, period_ns: float) -> None:
 def _typed(name: str, value: float) -> bool:
     """Whether somebody may have typed it, perhaps as the width at half maximum."""
     values = [value, FWHM_PER_SIGMA * value] if name == "sigma_ns" else [value]
-    return any(abs(float(f"{one:.{_DIGITS}g}") - one) < 1e-9 * one for one in values)
+    return any(abs(float(f"{candidate:.{_DIGITS}g}") - candidate) < 1e-9 * candidate for candidate in values)
 
 
 def _warn(text: str) -> None:

@@ -93,34 +93,34 @@ def _cumulative(pulse: Pulse, time: torch.Tensor) -> torch.Tensor:
 
 
 def inputs(*given: torch.Tensor) -> list[torch.Tensor]:
-    """Checked, and of one shape."""
-    found = alike(*given)
-    check_values(*found)
-    return found
+    """Tensors of one shape, checked for type, shape and values."""
+    light = alike(*given)
+    check_values(*light)
+    return light
 
 
 def check_values(signal: torch.Tensor, background: torch.Tensor, delay_ns: torch.Tensor) -> None:
-    """Raise where they are no light and no time."""
+    """Raise ValueError for negative photons or a delay that is not finite."""
     if not (bool((signal >= 0).all()) and bool((background >= 0).all()) and bool(torch.isfinite(delay_ns).all())):
         raise ValueError("signal and background must be >= 0 and delay_ns finite")
 
 
 def alike(*given: torch.Tensor) -> list[torch.Tensor]:
-    """Checked for type and shape, and of one shape."""
-    for name, one in zip(("signal", "background", "delay_ns"), given, strict=True):
-        if not isinstance(one, torch.Tensor) or not one.is_floating_point():
-            raise TypeError(f"{name} must be a tensor of floating point numbers, got {one!r}")
+    """Tensors broadcast to one shape, checked for type and shape."""
+    for name, tensor in zip(("signal", "background", "delay_ns"), given, strict=True):
+        if not isinstance(tensor, torch.Tensor) or not tensor.is_floating_point():
+            raise TypeError(f"{name} must be a tensor of floating point numbers, got {tensor!r}")
     try:
         return list(torch.broadcast_tensors(*given))  # type: ignore[no-untyped-call]
     except RuntimeError:
-        told = ", ".join(str(tuple(one.shape)) for one in given)
-        raise ValueError(f"signal, background and delay_ns must broadcast, got shapes {told}") from None
+        shapes = ", ".join(str(tuple(tensor.shape)) for tensor in given)
+        raise ValueError(f"signal, background and delay_ns must broadcast, got shapes {shapes}") from None
 
 
 def detected(
     signal: torch.Tensor, background: torch.Tensor, system: System
 ) -> tuple[torch.Tensor, torch.Tensor, System]:
-    """What the pixel detects of them, and the system for that: as `Flux.detected`, efficiency and dark counts."""
+    """Detected photons, with efficiency and dark counts as `Flux.detected`, and the system that detects all of them."""
     detector = system.detector
     dark = 1e-9 * detector.dark_count_hz * system.period_ns
     if detector.detection_efficiency == 1.0 and dark == 0.0:
@@ -147,10 +147,10 @@ def check_detector(system: System, *, light: bool = False) -> None:
 
 Rows = torch.Tensor  # (pixels, bins), double
 
-_KRYLOV, _RESTARTS = 40, 25
-TOLERANCE = 1e-13  # of the residual, relative to the source
-_GOOD = 1e-9  # that is still accepted where rounding ends the descent
-_ROWS = 2**15  # pixels x bins solved at a time on a CPU: what is used again and again stays in the cache
+_KRYLOV, _RESTARTS = 40, 25  # dimension of the Krylov space; restarts of GMRES
+TOLERANCE = 1e-13  # residual relative to the source at which GMRES stops
+_GOOD = 1e-9  # relative residual that is accepted where rounding prevents further progress
+_ROWS = 2**15  # pixels x bins solved together on a CPU, so that the working arrays stay in the cache
 _HELD = 24  # arrays (pixels, bins) beside the Krylov space, the powers of two of the recursion among them
 
 
@@ -198,11 +198,11 @@ class Delay:
         window = below[..., n : 2 * n] - below[..., n - d : 2 * n - d] + self.part * torch.roll(h, d + 1, -1)
         return window + self.whole * h.sum(-1, keepdim=True)
 
-    def left(self, h: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """What dead time at the end of the exposure leaves of settled registrations h a period: e and its falls.
+    def at_end(self, h: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Dead time beyond the end of the exposure, for settled registrations h per period: e and its decrements.
 
         With (4.6) of docs/joint_law.md, e: expected periods, of those that follow the exposure, in which the pixel is
-        still blind at the start of a bin; its falls: re-armings that come after the end.
+        still blind at the start of a bin; its decrements: re-armings after the end.
         """
         k, j = self.whole, torch.arange(self.bins, device=h.device)
         falls = self.rearmed(h, k + (j < self.shift).to(h.dtype), k + (j <= self.shift).to(h.dtype))
@@ -284,21 +284,21 @@ def gmres(apply: Callable[[Rows], Rows], wanted: Rows, tolerance: float = TOLERA
     size = torch.linalg.vector_norm(wanted, dim=-1).clamp_min(1e-300)
     x, rest, last = torch.zeros_like(wanted), wanted, math.inf
     for _ in range(_RESTARTS):
-        left = float((torch.linalg.vector_norm(rest, dim=-1) / size).max())
-        if left <= tolerance or (left <= _GOOD and left > 0.3 * last):  # the latter: rounding
+        residual = float((torch.linalg.vector_norm(rest, dim=-1) / size).max())
+        if residual <= tolerance or (residual <= _GOOD and residual > 0.3 * last):  # the latter: rounding
             return x
-        last = left
+        last = residual
         x = x + _krylov(apply, rest, tolerance * size)
         rest = wanted - apply(x)
     if not last <= _GOOD:
         raise ConvergenceError(
-            f"the feedback equation is left with a relative residual of {last:.1e} after {_KRYLOV * _RESTARTS} steps"
+            f"the feedback equation has a relative residual of {last:.1e} after {_KRYLOV * _RESTARTS} steps"
         )
     return x
 
 
 def _krylov(apply: Callable[[Rows], Rows], rest: Rows, enough: torch.Tensor) -> Rows:
-    """What to add to x: the least residual in the space that `apply` makes of `rest`."""
+    """Correction of x that minimises the residual in the Krylov space of `apply` and `rest`."""
     least = torch.finfo(rest.dtype).tiny
     size = torch.linalg.vector_norm(rest, dim=-1)
     basis = rest.new_empty((len(rest), _KRYLOV + 1, rest.shape[-1]))
@@ -356,8 +356,8 @@ class _Solution(torch.autograd.Function):
         photons, x = ctx.saved_tensors
         delay, tolerance, turned = ctx.settings
         y = _Solution.apply(photons, gradient, None, delay, tolerance, not turned)  # type: ignore[no-untyped-call]
-        (p, q), (right, left) = slopes(photons), (y, x) if turned else (x, y)
-        return left * (q * delay.rearmed(right) - p * delay.blind(right)), y, None, None, None, None
+        (p, q), (primal, dual) = slopes(photons), (y, x) if turned else (x, y)
+        return dual * (q * delay.rearmed(primal) - p * delay.blind(primal)), y, None, None, None, None
 
     @staticmethod
     def jvp(ctx: Any, photons_moved: Rows | None, source_moved: Rows | None, *_: None) -> Rows:
@@ -380,17 +380,19 @@ class _Solution(torch.autograd.Function):
 
 
 def by_rows(function: Any, info: Any, in_dims: tuple[int | None, ...], given: tuple[Any, ...]) -> Any:
-    """The rule of `torch.vmap` for a function of rows that are independent of each other: more of them."""
+    """Rule of `torch.vmap` for a function of independent rows: the batch becomes further rows."""
     number, flat = info.batch_size, []
-    for one, dim in zip(given, in_dims, strict=True):
-        if isinstance(one, torch.Tensor):
-            whole = one.expand(number, *one.shape) if dim is None else one.movedim(dim, 0)
-            one = whole.reshape(-1, *whole.shape[2:])
-        flat.append(one)
+    for argument, dim in zip(given, in_dims, strict=True):
+        if isinstance(argument, torch.Tensor):
+            batched = argument.expand(number, *argument.shape) if dim is None else argument.movedim(dim, 0)
+            argument = batched.reshape(-1, *batched.shape[2:])
+        flat.append(argument)
     out = function.apply(*flat)
     if isinstance(out, torch.Tensor):
         return out.reshape(number, -1, *out.shape[1:]), 0
-    return tuple(one.reshape(number, len(one) // number, *one.shape[1:]) for one in out), (0,) * len(out)
+    return tuple(argument.reshape(number, len(argument) // number, *argument.shape[1:]) for argument in out), (
+        0,
+    ) * len(out)
 
 
 def registered(
@@ -402,8 +404,8 @@ def registered(
 
 
 def blocks(most: int, bins: int, *rows: torch.Tensor) -> Any:
-    """Some rows of each at a time, of at most so many rows x bins."""
-    return zip(*(torch.split(one, max(1, most // bins)) for one in rows), strict=True)
+    """Blocks of rows of all tensors, of at most `most` rows x bins."""
+    return zip(*(torch.split(tensor, max(1, most // bins)) for tensor in rows), strict=True)
 
 
 def _block(device: torch.device) -> int:
@@ -416,8 +418,8 @@ def _block(device: torch.device) -> int:
 
 # --- The expected histogram ----------------------------------------------------------------------------------------
 
-_FINE = 4.0  # parts of a sigma of the pulse
-_BLOCK = 2**22  # pixels x bins of photons that are held at a time
+_FINE = 4.0  # parts per sigma of the pulse
+_BLOCK = 2**22  # pixels x bins of photons in memory together
 
 
 @checked
@@ -474,7 +476,7 @@ def expected_histogram(
         pulse = system.pulse
         refine = max(1, math.ceil(_FINE * system.bin_ns / pulse.sigma_ns)) if isinstance(pulse, GaussianPulse) else 1
     parts = checks.integer("refine", refine, low=1, high=2**16)
-    flat = [one.reshape(-1) for one in given]
+    flat = [tensor.reshape(-1) for tensor in given]
     out: torch.Tensor = _Expected.apply(*flat, system, parts)[0]  # type: ignore[no-untyped-call]
     return out.reshape(*given[0].shape, system.bins)
 
@@ -490,7 +492,7 @@ class _Expected(torch.autograd.Function):
         check_values(signal, background, delay_ns)
         every = blocks(_BLOCK, system.bins * parts, signal, background, delay_ns)
         done = [_registered(rows, system, parts) for rows in every]
-        return tuple(torch.cat(one) for one in zip(*done, strict=True))
+        return tuple(torch.cat(blocks_of) for blocks_of in zip(*done, strict=True))
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[torch.Tensor, ...]) -> None:
@@ -502,12 +504,14 @@ class _Expected(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, gradient: torch.Tensor, *_: Any) -> tuple[torch.Tensor | None, ...]:
         moved = [torch.func.vjp(again, *rows)[1](part[0]) for again, rows, part in _again(ctx, gradient)]
-        return (*(torch.cat(one) for one in zip(*moved, strict=True)), None, None)
+        return (*(torch.cat(parts) for parts in zip(*moved, strict=True)), None, None)
 
     @staticmethod
     def jvp(ctx: Any, *given: Any) -> tuple[torch.Tensor | None, ...]:
         light = ctx.saved_tensors[:3]
-        moves = [torch.zeros_like(one) if moved is None else moved for one, moved in zip(light, given, strict=False)]
+        moves = [
+            torch.zeros_like(tensor) if moved is None else moved for tensor, moved in zip(light, given, strict=False)
+        ]
         done = []
         for again, rows, part in _again(ctx, *moves):  # forward mode does not nest: the transpose of the transpose
             out, pull = torch.func.vjp(again, *rows)[:2]
@@ -532,7 +536,7 @@ def _again(ctx: Any, *others: torch.Tensor) -> Iterator[tuple[Any, Any, Any]]:
 
 def _registered(rows: Any, system: System, parts: int, known: Any = (None, None)) -> tuple[torch.Tensor, ...]:
     """Histogram (pixels, bins), and the solutions (pixels, fine bins or none) that lead to it, where not `known`."""
-    signal, background, delay_ns = (one.double() for one in rows)
+    signal, background, delay_ns = (tensor.double() for tensor in rows)
     photons = photons_in(signal, background, delay_ns, system, parts)
     delay = Delay(system.dead_time_periods, photons.shape[-1])
     tolerance = max(TOLERANCE, 1e-2 * torch.finfo(rows[0].dtype).eps)
@@ -543,7 +547,7 @@ def _registered(rows: Any, system: System, parts: int, known: Any = (None, None)
     settled = registered(photons, p, delay, tolerance, known[0])
     fine, more = settled * system.cycles, nothing
     if system.start == "armed":
-        blind, back = delay.left(settled)
+        blind, back = delay.at_end(settled)
         more = registered(photons, p * blind - q * back, delay, tolerance, known[1])
         fine = fine + more
     return _summed(fine, parts).to(rows[0].dtype), settled, more
@@ -553,7 +557,7 @@ def _refuse_nested_forward() -> None:
     """Raise within two transforms of forward mode: through a function of one's own PyTorch then gives zeros."""
     functorch = torch._C._functorch
     levels = functorch.get_interpreter_stack() or []
-    if sum(one.key() == functorch.TransformType.Jvp for one in levels) > 1:
+    if sum(level.key() == functorch.TransformType.Jvp for level in levels) > 1:
         raise ValueError(
             "expected_histogram cannot be differentiated by forward mode within forward mode: for second derivatives "
             "use torch.func.hessian, or jacrev or grad inside of jvp or jacfwd"
@@ -569,7 +573,7 @@ def _summed(fine: torch.Tensor, parts: int) -> torch.Tensor:
 
 @checked
 def armed_periods(histogram: torch.Tensor, system: System) -> torch.Tensor:
-    """Periods D (..., bins) in which the pixel was armed in each bin, as its own histogram (..., bins) tells.
+    """Periods D (..., bins) in which the pixel was armed in each bin, estimated from its histogram (..., bins).
 
     ``N_r`` less the registrations whose dead time covers the bin (Gupta et al., ICCV 2019); a registration in the bin
     and a re-arming count half. What the dead time covers after the end of the exposure is taken for its beginning,
@@ -577,8 +581,8 @@ def armed_periods(histogram: torch.Tensor, system: System) -> torch.Tensor:
     """
     check_detector(system, light=True)
     if not isinstance(histogram, torch.Tensor) or histogram.shape[-1:] != (system.bins,):
-        told = getattr(histogram, "shape", histogram)
-        raise ValueError(f"histogram must be a tensor (..., {system.bins}), got {told!r}")
+        given = getattr(histogram, "shape", histogram)
+        raise ValueError(f"histogram must be a tensor (..., {system.bins}), got {given!r}")
     counts = histogram if histogram.is_floating_point() else histogram.to(torch.float64)
     if system.dead_time_periods == 0.0:
         return torch.full_like(counts, float(system.cycles))

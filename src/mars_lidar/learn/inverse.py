@@ -92,13 +92,15 @@ class LidarPhysics(Physics):  # type: ignore[misc]  # deepinv is not typed
 
     def A_jvp(self, x: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
         """``(dA/dx) v`` (B, bins, H, W) of v (B, 3, H, W)."""
-        whole = (one.clone(memory_format=torch.contiguous_format) for one in (x, v))  # expanded views have no dual
-        moved: torch.Tensor = torch.func.jvp(self.A, *((one,) for one in whole))[1]
+        whole = (
+            tensor.clone(memory_format=torch.contiguous_format) for tensor in (x, v)
+        )  # expanded views have no dual
+        moved: torch.Tensor = torch.func.jvp(self.A, *((tensor,) for tensor in whole))[1]
         return moved
 
     @staticmethod
     def custom_init(y: torch.Tensor, physics: LidarPhysics) -> dict[str, Any]:
-        """Where an algorithm of deepinv starts: ``physics.A_dagger(y)``, for it and its auxiliary variable."""
+        """Initial estimate of an algorithm of deepinv: ``physics.A_dagger(y)``, also for its auxiliary variable."""
         start = physics.A_dagger(y)
         return {"est": (start, start.clone())}
 
@@ -108,13 +110,13 @@ class LidarPhysics(Physics):  # type: ignore[misc]  # deepinv is not typed
         Where a pixel shows no return its signal is 0 and its delay half a period.
         """
         cubes = y.detach().cpu().double().permute(0, 2, 3, 1).contiguous().numpy()
-        found = reconstruct(cubes, self.system, threads=self._threads)
+        estimate = reconstruct(cubes, self.system, threads=self._threads)
         signal, background, delay_ns = (
-            torch.from_numpy(one).nan_to_num(fill)
-            for one, fill in (
-                (found.signal, 0.0),
-                (found.background, 0.0),
-                (found.delay_ns, 0.5 * self.system.period_ns),
+            torch.from_numpy(values).nan_to_num(fill)
+            for values, fill in (
+                (estimate.signal, 0.0),
+                (estimate.background, 0.0),
+                (estimate.delay_ns, 0.5 * self.system.period_ns),
             )
         )
         if self._images == "signal":
@@ -150,9 +152,9 @@ class LidarPhysics(Physics):  # type: ignore[misc]  # deepinv is not typed
     def _light(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Signal, background and delay in ns (B, H, W) of images."""
         if not isinstance(x, torch.Tensor) or x.ndim != 4 or x.shape[1] != 3:
-            told = getattr(x, "shape", x)
+            given = getattr(x, "shape", x)
             words = "signal, background and delay" if self._images == "signal" else "depth, intensity and background"
-            raise ValueError(f"x must be a tensor (B, 3, H, W) of {words}, got {told!r}")
+            raise ValueError(f"x must be a tensor (B, 3, H, W) of {words}, got {given!r}")
         first, second, third = x.unbind(1)
         if self._images == "signal":
             return first, second, third

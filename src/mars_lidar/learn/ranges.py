@@ -57,14 +57,14 @@ class LogUniform(Uniform):
 
 @dataclass(frozen=True)
 class Choice:
-    """One of some numbers, all equally likely."""
+    """Uniform distribution over a list of numbers."""
 
     values: tuple[float, ...]
 
     def __post_init__(self) -> None:
         if not isinstance(self.values, list | tuple) or not self.values:
             raise TypeError(f"values must be numbers, at least one, got {self.values!r}")
-        object.__setattr__(self, "values", tuple(_number("values", one) for one in self.values))
+        object.__setattr__(self, "values", tuple(_number("values", number) for number in self.values))
 
     def draw(self, random: np.random.Generator) -> float:
         """One of them."""
@@ -161,16 +161,16 @@ class SystemRange:
 
 
 class SystemList:
-    """One of some instruments, all equally likely."""
+    """Uniform distribution over a list of instruments."""
 
     def __init__(self, systems: Sequence[System]) -> None:
         self._systems = list(systems)
-        for one in self._systems:
-            if not isinstance(one, System):
-                raise TypeError(f"systems must be a System, several, or a SystemRange, got a {type(one).__name__}")
+        for system in self._systems:
+            if not isinstance(system, System):
+                raise TypeError(f"systems must be a System, several, or a SystemRange, got a {type(system).__name__}")
         if not self._systems:
             raise ValueError("systems must be at least one, got none")
-        bins = {one.bins for one in self._systems}
+        bins = {system.bins for system in self._systems}
         if len(bins) > 1:
             raise ValueError(f"systems must have equally many bins, so that cubes can be stacked, got {sorted(bins)}")
 
@@ -184,7 +184,7 @@ class SystemList:
 
 
 def as_systems(value: System | Sequence[System] | SystemRange) -> SystemRange | SystemList:
-    """What instruments are drawn from."""
+    """Distribution from which instruments are drawn."""
     if isinstance(value, SystemRange):
         return value
     if isinstance(value, System):

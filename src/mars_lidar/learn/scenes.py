@@ -99,9 +99,9 @@ def _checksum(number: int, maps: NDArray[np.float64]) -> int:
 
 # --- Where scenes come from ----------------------------------------------------------------------------------------
 
-POOL = 16  # ray-cast scenes that are in use at a time
-_MARGIN = 1.5  # they are cast larger than what is cropped from them
-_KEPT = 32  # scenes in memory, of each worker
+POOL = 16  # ray-cast scenes in use together
+_MARGIN = 1.5  # side of a ray-cast scene relative to the crop taken from it
+_CACHED = 32  # scenes in memory, per worker
 
 
 def generator(purpose: int, seed: int, *numbers: int) -> np.random.Generator:
@@ -129,7 +129,7 @@ class SceneSource(ABC):
         number = self.number(seed, epoch, sample)
         if number not in self._kept:
             self._kept[number] = self.load(number)
-            if len(self._kept) > _KEPT:
+            if len(self._kept) > _CACHED:
                 self._kept.popitem(last=False)
         self._kept.move_to_end(number)
         return self._kept[number]
@@ -158,14 +158,14 @@ class RayCast(SceneSource):
         return _pooled(seed, epoch, sample // (POOL * self._reuse), which)
 
     def load(self, number: int) -> Scene:
-        """Cast it, or take it from another worker."""
+        """Ray-cast the scene, or copy it from another worker."""
         shared = None if torch.utils.data.get_worker_info() is None else self._shared
-        found = None if shared is None else shared.get(number)
-        if found is None:
-            found = Scene.example(self._name, self._size, number)
+        scene = None if shared is None else shared.get(number)
+        if scene is None:
+            scene = Scene.example(self._name, self._size, number)
             if shared is not None:
-                shared.put(number, found)
-        return found
+                shared.put(number, scene)
+        return scene
 
 
 @lru_cache(maxsize=4 * POOL)
@@ -184,11 +184,11 @@ class Given(SceneSource):
         self._order: tuple[tuple[int, int, int], np.ndarray[Any, Any]] | None = None
         if not self._scenes:
             raise ValueError("scenes must be at least one, got none")
-        for one in self._scenes:
-            if not isinstance(one, Scene | SceneFile):
+        for entry in self._scenes:
+            if not isinstance(entry, Scene | SceneFile):
                 raise TypeError(
                     "scenes must be Scene or SceneFile objects, or a dictionary of arrays 'depth' and 'reflectivity', "
-                    f"got a {type(one).__name__}"
+                    f"got a {type(entry).__name__}"
                 )
 
     def __len__(self) -> int:
@@ -204,18 +204,18 @@ class Given(SceneSource):
     def load(self, number: int) -> Scene:
         """Read it, where it is a file; instead of one that cannot be read, the next that can."""
         for place in range(number, number + len(self._scenes)):
-            one = self._scenes[place % len(self._scenes)]
-            if isinstance(one, Scene):
-                return one
+            entry = self._scenes[place % len(self._scenes)]
+            if isinstance(entry, Scene):
+                return entry
             try:
-                scene = one.load()
+                scene = entry.load()
                 if (scene.reflectivity[scene.valid] > 0.0).any():
                     return scene
-                why = f"{one.depth}: no pixel with a return"
+                why = f"{entry.depth}: no pixel with a return"
             except (ValueError, OSError) as error:
                 why = str(error)
-            if one not in self._told:
-                self._told.add(one)
+            if entry not in self._told:
+                self._told.add(entry)
                 warnings.warn(f"left out of the stream: {why}", UserWarning, stacklevel=2)
         raise ValueError(f"none of the {len(self._scenes)} files of scenes can be read; the last: {why}")
 
@@ -225,19 +225,19 @@ class Arrays(Given):
 
     def __init__(self, maps: Mapping[str, Any]) -> None:
         SceneSource.__init__(self)
-        given = {name: one for name, one in maps.items() if one is not None}
+        given = {name: array for name, array in maps.items() if array is not None}
         names = ("depth", "reflectivity", "background")
         if "depth" not in given or not set(given) <= set(names):
             raise ValueError(f"scenes must have maps 'depth' and perhaps {names[1:]}, got {list(maps)}")
-        shapes = {name: tuple(getattr(one, "shape", ())) for name, one in given.items()}
+        shapes = {name: tuple(getattr(array, "shape", ())) for name, array in given.items()}
         shape = shapes["depth"]
         if len(shape) not in (2, 3) or 0 in shape:
             raise ValueError(f"scenes must have a depth map (n, H, W) or (H, W), got shape {shape}")
-        for name, one in shapes.items():
-            if one != shape:
-                told = one or repr(given[name])
-                raise ValueError(f"scenes must have maps of one shape, {shape} of depth, got {name} {told}")
-        self._maps = {name: one if len(shape) == 3 else one[None] for name, one in given.items()}
+        for name, array in shapes.items():
+            if array != shape:
+                message = array or repr(given[name])
+                raise ValueError(f"scenes must have maps of one shape, {shape} of depth, got {name} {message}")
+        self._maps = {name: array if len(shape) == 3 else array[None] for name, array in given.items()}
         self._number = shape[0] if len(shape) == 3 else 1
         self._order = None
         self.load(0)  # what is wrong with all of them is told at once
@@ -247,12 +247,12 @@ class Arrays(Given):
 
     def load(self, number: int) -> Scene:
         """One of the maps each; without reflectivity everything is white."""
-        one = {name: np.asarray(maps[number]) for name, maps in self._maps.items()}
-        return Scene(one["depth"], one.get("reflectivity", 1.0), one.get("background"))
+        arrays = {name: np.asarray(maps[number]) for name, maps in self._maps.items()}
+        return Scene(arrays["depth"], arrays.get("reflectivity", 1.0), arrays.get("background"))
 
 
 def as_source(scenes: Any, size: tuple[int, int] | None, reuse: int) -> SceneSource:
-    """What `CubeStream` takes as scenes."""
+    """Source of scenes for the argument `scenes` of `CubeStream`."""
     reuse = checks.integer("reuse", reuse, low=1, high=2**31)
     if isinstance(scenes, str) and scenes in Scene.example_names():
         return RayCast(scenes, size or (64, 64), reuse)
@@ -264,7 +264,7 @@ def as_source(scenes: Any, size: tuple[int, int] | None, reuse: int) -> SceneSou
             from mars_lidar.dataset.store import open_dataset
 
             stored = open_dataset(scenes)
-            if any("transient" in one for one in stored.recipe.scenes):
+            if any("transient" in entry for entry in stored.recipe.scenes):
                 raise ValueError(
                     f"{scenes}: holds rendered transients, which have no surfaces to light anew; "
                     "StoredDataset gives their cubes"
@@ -273,7 +273,7 @@ def as_source(scenes: Any, size: tuple[int, int] | None, reuse: int) -> SceneSou
             return Arrays({name: maps[name] for name in ("depth", "reflectivity")})
         files, problems = scan(scenes, check=False)
         if not files:
-            raise ValueError(f"{scenes}: no scene found" + "".join(f"; {one}" for one in problems[:3]))
+            raise ValueError(f"{scenes}: no scene found" + "".join(f"; {entry}" for entry in problems[:3]))
         return Given(files)
     if isinstance(scenes, Scene | SceneFile):
         return Given([scenes])
@@ -306,7 +306,7 @@ class Sample:
 
 @dataclass(frozen=True, kw_only=True)
 class Recipe:
-    """What samples are drawn from."""
+    """Distribution from which samples are drawn."""
 
     source: SceneSource
     systems: SystemRange | SystemList
@@ -335,10 +335,12 @@ class Recipe:
     def _light(self, epoch: int, index: int) -> tuple[float, ...]:
         """Signal, sbr and the factor on the depth."""
         given = (self.signal, self.sbr, self.depth_scale)
-        if all(len(set(one.ends)) == 1 for one in given):  # nothing to draw, and a generator takes 10 us
-            return tuple(one.ends[0] for one in given)
+        if all(
+            len(set(distribution.ends)) == 1 for distribution in given
+        ):  # nothing to draw, and a generator takes 10 us
+            return tuple(distribution.ends[0] for distribution in given)
         light = generator(5, self.seed, epoch, index)
-        return tuple(one.draw(light) for one in given)
+        return tuple(distribution.draw(light) for distribution in given)
 
     def _placed(self, scene: Scene, epoch: int, index: int) -> Scene:
         """A crop of the scene, mirrored or not: the scene is, before anything is simulated."""
@@ -353,10 +355,10 @@ class Recipe:
             crop = scene[_run(y, height, down), _run(x, width, right)]
             if (crop.valid & (crop.reflectivity > 0.0)).any():
                 return crop
-        seen = np.argwhere(scene.valid & (scene.reflectivity > 0.0))  # few and far between: about one of them
-        if not len(seen):
+        returns = np.argwhere(scene.valid & (scene.reflectivity > 0.0))  # few and far between: about one of them
+        if not len(returns):
             raise ValueError(f"a scene must have a pixel with a return, got {scene!r}")
-        at = seen[int(random.integers(len(seen)))]
+        at = returns[int(random.integers(len(returns)))]
         y, x = (
             int(random.integers(max(0, place - wanted + 1), min(place, whole - wanted) + 1))
             for place, wanted, whole in zip(at.tolist(), (height, width), scene.shape, strict=True)
@@ -372,33 +374,33 @@ def _run(first: int, number: int, step: int) -> slice:
 
 
 def example_of(samples: Sequence[Sample], cube: torch.Tensor) -> dict[str, Any]:
-    """What a loader gives of some samples: cubes, and maps and settings as float32, each with a leading axis."""
+    """Example of a loader: cubes, and maps and settings as float32, each with a leading axis of samples."""
 
     def maps(get: Callable[[Sample], FloatArray]) -> torch.Tensor:
-        return torch.from_numpy(np.stack([get(one) for one in samples]).astype(np.float32)).to(cube.device)
+        return torch.from_numpy(np.stack([get(sample) for sample in samples]).astype(np.float32)).to(cube.device)
 
     def settings(get: Callable[[Sample], float]) -> torch.Tensor:
-        return torch.tensor([float(get(one)) for one in samples], device=cube.device)
+        return torch.tensor([float(get(sample)) for sample in samples], device=cube.device)
 
     return {
         "cube": cube,
-        "depth": maps(lambda one: one.scene.depth_m),
-        "reflectivity": maps(lambda one: one.scene.reflectivity),
+        "depth": maps(lambda sample: sample.scene.depth_m),
+        "reflectivity": maps(lambda sample: sample.scene.reflectivity),
         "flux": {
-            "signal": maps(lambda one: one.flux.signal),
-            "background": maps(lambda one: one.flux.background),
-            "delay": maps(lambda one: one.flux.delay_ns),
+            "signal": maps(lambda sample: sample.flux.signal),
+            "background": maps(lambda sample: sample.flux.background),
+            "delay": maps(lambda sample: sample.flux.delay_ns),
         },
         "system": {
-            "period_ns": settings(lambda one: one.system.period_ns),
-            "cycles": settings(lambda one: one.system.cycles),
-            "dead_time_ns": settings(lambda one: one.system.detector.dead_time_ns),
-            "sigma_ns": settings(lambda one: _sigma_ns(one.system.pulse)),
+            "period_ns": settings(lambda sample: sample.system.period_ns),
+            "cycles": settings(lambda sample: sample.system.cycles),
+            "dead_time_ns": settings(lambda sample: sample.system.detector.dead_time_ns),
+            "sigma_ns": settings(lambda sample: _sigma_ns(sample.system.pulse)),
         },
-        "signal_level": settings(lambda one: one.signal_level),
-        "sbr": settings(lambda one: one.sbr),
-        "index": torch.tensor([one.index for one in samples]),
-        "seed": torch.tensor([one.seed for one in samples]),
+        "signal_level": settings(lambda sample: sample.signal_level),
+        "sbr": settings(lambda sample: sample.sbr),
+        "index": torch.tensor([sample.index for sample in samples]),
+        "seed": torch.tensor([sample.seed for sample in samples]),
     }
 
 

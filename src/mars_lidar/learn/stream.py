@@ -48,10 +48,10 @@ def rank_of(rank: int | None, world_size: int | None) -> tuple[int, int]:
         if running:
             return torch.distributed.get_rank(), torch.distributed.get_world_size()
         # torchrun sets these before a process group exists: without them every rank would train on the same samples
-        told = [os.environ.get(name, "") for name in ("RANK", "WORLD_SIZE")]
-        if not all(one.isdigit() for one in told):
+        numbers = [os.environ.get(name, "") for name in ("RANK", "WORLD_SIZE")]
+        if not all(number.isdigit() for number in numbers):
             return 0, 1
-        rank, world_size = map(int, told)
+        rank, world_size = map(int, numbers)
     world = checks.integer("world_size", world_size, low=1, high=2**31)
     return checks.integer("rank", rank, low=0, high=world - 1), world
 
@@ -64,8 +64,8 @@ def worker_of() -> tuple[int, int, bool]:
 
 # --- Passes --------------------------------------------------------------------------------------------------------
 
-_WORKERS = 1024  # most of one loader
-_SEED_BITS = 24
+_WORKERS = 1024  # largest number of workers of one loader
+_SEED_BITS = 24  # low bits of a mark, which identify the pass
 _SEEDS = (1 << _SEED_BITS) - 1
 _BY_WORKER = 1 << (_SEED_BITS - 1)  # set in the seed part of a worker's mark; those of the main process have 0 there
 
@@ -95,7 +95,9 @@ class Passes:
             raise ValueError(f"a loader may have at most {_WORKERS} workers, got worker {worker}")
         mark, marks = _mark(), self._shared[3:].tolist()
         same = [
-            (one >> _SEED_BITS) + (place == worker) for place, one in enumerate(marks) if mark and one & _SEEDS == mark
+            (other >> _SEED_BITS) + (place == worker)
+            for place, other in enumerate(marks)
+            if mark and other & _SEEDS == mark
         ]
         number = max(same) if same else (max(marks) >> _SEED_BITS) + 1
         self._shared[3 + worker] = (number << _SEED_BITS) | mark
@@ -128,7 +130,7 @@ class Passes:
 
 
 def _mark() -> int:
-    """Of the seed that all workers of a pass share; 0 outside of workers."""
+    """Mark of the seed that all workers of a pass share; 0 outside of workers."""
     info = torch.utils.data.get_worker_info()
     return 0 if info is None else ((info.seed - info.id) & _SEEDS) | _BY_WORKER
 
@@ -329,7 +331,7 @@ class Buffers:
 
 
 def _alone() -> int:
-    """What `sys.getrefcount` tells of an object that only a list holds; it differs between versions of Python."""
+    """Result of `sys.getrefcount` for an object that only a list holds; it differs between versions of Python."""
     held = [object()]
     return sys.getrefcount(held[0])
 
@@ -481,8 +483,8 @@ class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
 
     def __repr__(self) -> str:
         size = None if self._end == _LAST else self._end
-        told = {"size": self._recipe.size, "epoch_size": size, "batch_size": self._batch}
-        given = ", ".join(f"{name}={value}" for name, value in told.items() if value is not None)
+        settings = {"size": self._recipe.size, "epoch_size": size, "batch_size": self._batch}
+        given = ", ".join(f"{name}={value}" for name, value in settings.items() if value is not None)
         return f"CubeStream({given}, seed={self._recipe.seed}, epoch {self.epoch})"
 
     def set_epoch(self, epoch: int, start: int = 0) -> None:
@@ -503,7 +505,7 @@ class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
         return first if self._repeat else first + max(self._passes.begun - 1, 0)
 
     def state_dict(self, batches: int | None = None) -> dict[str, int]:
-        """Where the pass stands, for `load_state_dict`.
+        """Position in the pass, for `load_state_dict`.
 
         torchdata's ``StatefulDataLoader`` asks for it in each of its workers, and resumes exactly with any number of
         them. The parent of a plain loader's workers does not know how far the pass has gone: they run ahead.
@@ -606,4 +608,4 @@ class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
 
 def _first(example: dict[str, Any]) -> dict[str, Any]:
     """Without the leading axis."""
-    return {name: _first(one) if isinstance(one, dict) else one[0] for name, one in example.items()}
+    return {name: _first(value) if isinstance(value, dict) else value[0] for name, value in example.items()}

@@ -10,7 +10,7 @@ from mars_lidar.learn.forward import Delay, blocks, check_detector, inputs, wrap
 from mars_lidar.learn.needed import torch
 from mars_lidar.table import Table
 
-_BLOCK = 2**18  # pixels x bins evaluated at a time
+_BLOCK = 2**18  # pixels x bins evaluated together
 
 
 class HistogramTable(torch.nn.Module):
@@ -56,7 +56,7 @@ class HistogramTable(torch.nn.Module):
         check_detector(system)
         if not table.serves(system.cycles):
             raise ValueError(f"cycles must be {table.system.cycles}: not all of this table holds for {system.cycles}")
-        axes = [torch.from_numpy(one.copy()) for one in (table.signal, table.background)]
+        axes = [torch.from_numpy(values.copy()) for values in (table.signal, table.background)]
         for name, axis in zip(("signal", "background"), axes, strict=True):
             if len(axis) < 2:
                 raise ValueError(f"table must have at least two values of {name}, got one")
@@ -75,19 +75,19 @@ class HistogramTable(torch.nn.Module):
         given = inputs(signal, background, delay_ns)
         for name, values, axis in zip(("signal", "background"), given, (self.signal, self.background), strict=False):
             low, high = float(axis[0]), float(axis[-1])
-            least, most = (float(one) for one in values.detach().aminmax()) if values.numel() else (low, high)
+            least, most = (float(tensor) for tensor in values.detach().aminmax()) if values.numel() else (low, high)
             if not (low <= least and most <= high):
                 raise ValueError(
                     f"{name} must lie in the table's [{low:g}, {high:g}] photons per period, got {least:g} to {most:g}"
                 )
-        flat = [one.reshape(-1).to(self.histograms.dtype) for one in given]
+        flat = [tensor.reshape(-1).to(self.histograms.dtype) for tensor in given]
         parts = blocks(_BLOCK, self.system.bins, *flat)
         out = [_Again.apply(self._expected, *rows) for rows in parts]  # type: ignore[no-untyped-call]
-        found: torch.Tensor = torch.cat(out) if out else self.histograms.new_empty((0, self.system.bins))
-        return found.reshape(*given[0].shape, self.system.bins).to(given[0].dtype)
+        expected: torch.Tensor = torch.cat(out) if out else self.histograms.new_empty((0, self.system.bins))
+        return expected.reshape(*given[0].shape, self.system.bins).to(given[0].dtype)
 
     def extra_repr(self) -> str:
-        """Told by ``print``."""
+        """Size of the table, for ``print``."""
         return f"{len(self.signal)} x {len(self.background)} x {self.system.bins}, {self.system.cycles} cycles"
 
     def _expected(self, signal: torch.Tensor, background: torch.Tensor, delay_ns: torch.Tensor) -> torch.Tensor:
@@ -113,7 +113,7 @@ class HistogramTable(torch.nn.Module):
         n, delay = self.system.bins, Delay(self.system.dead_time_periods, self.system.bins)
         photons = signal * self._energy(torch.ones_like(part)) + background / n
         share = (signal * self._energy(part) + background * part / n) / photons.clamp_min(1e-30)
-        share = torch.where(photons > 1e-30, share, part)  # of nothing
+        share = torch.where(photons > 1e-30, share, part)  # an empty bin is uniform
         # blind at a bin's start: registrations of the bins within the last dead time, and a part of one
         cut = 1.0 - delay.part
         until = (signal * self._energy(part.new_tensor([[cut]])) + background * cut / n) / photons.clamp_min(1e-30)
@@ -132,10 +132,10 @@ class HistogramTable(torch.nn.Module):
     def _energy(self, part: torch.Tensor) -> torch.Tensor:
         """Energy of the canonical pulse in the first `part` (pixels, 1) of each bin (pixels, bins)."""
         system, n = self.system, self.system.bins
-        low, high = (math.floor((0.5 + one / system.period_ns) * n) for one in system.pulse.support_ns())
+        low, high = (math.floor((0.5 + limit / system.period_ns) * n) for limit in system.pulse.support_ns())
         low, high = (0, n) if low < 0 or high >= n else (low, high + 1)  # the bins that it reaches
-        left = torch.arange(low, high, dtype=part.dtype, device=part.device)
-        times = (torch.stack([left.expand(len(part), -1), left + part]) / n - 0.5) * system.period_ns
+        edge = torch.arange(low, high, dtype=part.dtype, device=part.device)
+        times = (torch.stack([edge.expand(len(part), -1), edge + part]) / n - 0.5) * system.period_ns
         start, stop = wrapped_energy(system, times).unbind(0)
         return torch.nn.functional.pad((stop - start).clamp_min(0.0), (low, n - high))
 
@@ -161,7 +161,9 @@ class _Again(torch.autograd.Function):
     @staticmethod
     def jvp(ctx: Any, _: None, *moved: torch.Tensor | None) -> torch.Tensor:
         given = ctx.saved_tensors
-        moves = tuple(torch.zeros_like(one) if move is None else move for one, move in zip(given, moved, strict=True))
+        moves = tuple(
+            torch.zeros_like(tensor) if move is None else move for tensor, move in zip(given, moved, strict=True)
+        )
         out, pull = torch.func.vjp(ctx.function, *given)[:2]  # forward mode does not nest: transposed twice
         along: torch.Tensor = torch.func.vjp(pull, torch.zeros_like(out))[1](moves)[0]
         return along

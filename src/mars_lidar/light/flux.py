@@ -57,8 +57,8 @@ def common_shape(names: Sequence[str], shapes: Sequence[tuple[int, ...]]) -> tup
     try:
         return np.broadcast_shapes(*shapes)
     except ValueError:
-        told = ", ".join(f"{n} {s}" for n, s in zip(names, shapes, strict=True))
-        raise ValueError(f"shapes must broadcast to one (H, W), got {told}") from None
+        given = ", ".join(f"{n} {s}" for n, s in zip(names, shapes, strict=True))
+        raise ValueError(f"shapes must broadcast to one (H, W), got {given}") from None
 
 
 def broadcast(names: Sequence[str], maps: Sequence[FloatArray]) -> list[FloatArray]:
@@ -350,8 +350,8 @@ def _each_return(signal: Any, delay_ns: Any) -> Iterator[tuple[Any, Any]]:
     if not 1 <= len(signal) <= MAX_RETURNS:
         raise ValueError(f"signal must be (R, H, W) of 1 to {MAX_RETURNS} returns, got shape {np.shape(signal)}")
     if delay_ns is None or np.ndim(delay_ns) != 3 or len(delay_ns) != len(signal):
-        told = "None" if delay_ns is None else f"shape {np.shape(delay_ns)}"
-        raise ValueError(f"delay_ns must be (R, H, W) as signal of shape {np.shape(signal)} is, got {told}")
+        given = "None" if delay_ns is None else f"shape {np.shape(delay_ns)}"
+        raise ValueError(f"delay_ns must be (R, H, W) as signal of shape {np.shape(signal)} is, got {given}")
     return zip(signal, delay_ns, strict=True)
 
 

@@ -17,8 +17,8 @@ from mars_lidar.light.flux import Flux
 from mars_lidar.light.stored_flux import StoredFlux
 from mars_lidar.light.transient import through_pulse
 
-PARTS_PER_BIN = 4  # of the waveform, by default
-_BAND_BYTES = 8 * 2**20  # of waveforms that are made together, some six times over
+PARTS_PER_BIN = 4  # default parts of the waveform per histogram bin
+_BAND_BYTES = 8 * 2**20  # waveforms computed together; the work takes about six times as much
 _DARK = 40.0  # optical depths of the way there and back beyond which nothing comes: e^-40
 _FOLDS = 256  # periods from which light of fog is told apart
 
@@ -66,9 +66,9 @@ class Fog:
             "nearest_m": self.nearest_m,
         }
         lit, depth = _depths(flux)
-        left = (flux.returns_signal * np.exp(-2.0 * self.extinction_per_m * depth)).sum(axis=0)
+        transmitted = (flux.returns_signal * np.exp(-2.0 * self.extinction_per_m * depth)).sum(axis=0)
         cloud = photons * _share(_farthest(lit, depth), self.extinction_per_m, self.nearest_m)
-        return StoredFlux(left + cloud, flux.background, parts, rows, info)
+        return StoredFlux(transmitted + cloud, flux.background, parts, rows, info)
 
 
 def in_fog(
@@ -92,8 +92,8 @@ def in_fog(
 
     wave = np.zeros((*flux.shape, number))
     for signal, tau, z in zip(flux.returns_signal, flux.returns_delay_ns, depth, strict=True):
-        left = (signal * np.exp(-2.0 * alpha * z))[..., None]
-        wave += left * system.pulse.bin_energy(np.nan_to_num(tau), system.period_ns, number)
+        transmitted = (signal * np.exp(-2.0 * alpha * z))[..., None]
+        wave += transmitted * system.pulse.bin_energy(np.nan_to_num(tau), system.period_ns, number)
     if photons > 0.0:
         cloud = _cloud(_farthest(lit, depth), alpha, first, 0.5 * SPEED_OF_LIGHT_M_PER_NS * system.period_ns, number)
         wave += photons * through_pulse(cloud, system)
@@ -110,7 +110,7 @@ def _depths(flux: Flux) -> tuple[NDArray[np.bool_], FloatArray]:
 
 
 def _farthest(lit: NDArray[np.bool_], depth: FloatArray) -> FloatArray:
-    """Where the beam of each pixel ends (H, W), m."""
+    """Range at which the beam of each pixel ends (H, W), m."""
     return np.asarray(np.where(lit.any(0), depth.max(0, initial=0.0), math.inf), np.float64)
 
 
@@ -120,8 +120,8 @@ def _cloud(farthest: FloatArray, alpha: float, first: float, reach_m: float, num
     `reach_m` is the range of one period. What comes back after `_FOLDS` periods is spread evenly over the period: by
     then the density, ~ 1 / z^2, changes by 2 / `_FOLDS` within one, and z_0 / (_FOLDS reach_m) of the light is left.
     """
-    seen = min(float(farthest.max()), first + 0.5 * _DARK / alpha) / reach_m
-    periods = min(_FOLDS, 1 << math.ceil(math.log2(max(1.0, math.floor(seen) + 1.0))))
+    reached = min(float(farthest.max()), first + 0.5 * _DARK / alpha) / reach_m
+    periods = min(_FOLDS, 1 << math.ceil(math.log2(max(1.0, math.floor(reached) + 1.0))))
     edges, before = _folded(alpha, first, reach_m, number, periods)
     until = _share(farthest, alpha, first)[..., None]
     whole = np.minimum(np.floor(farthest / reach_m), periods).astype(np.int64)  # periods passed from end to end

@@ -12,7 +12,7 @@ from mars_lidar._base.memory import check_memory
 from mars_lidar._base.types import FloatArray
 from mars_lidar.light.flux import Flux, check_photons
 
-BAND_BYTES = 64 * 2**20  # of waveforms that are made together
+BAND_BYTES = 64 * 2**20  # waveforms computed together
 
 
 class StoredFlux(Flux):
@@ -107,14 +107,14 @@ class Waveforms:
 
     def __getitem__(self, key: Any) -> FloatArray:
         keys = key if isinstance(key, tuple) else (key,)
-        one = isinstance(keys[0], (int, np.integer))
-        wanted = range(self.shape[0])[slice(keys[0], keys[0] + 1 or None) if one else keys[0]]
+        single = isinstance(keys[0], (int, np.integer))
+        wanted = range(self.shape[0])[slice(keys[0], keys[0] + 1 or None) if single else keys[0]]
         if not wanted:
             raise IndexError(f"rows {keys[0]!r} select none of {self.shape[0]}")
         waveform = self._make(slice(min(wanted), max(wanted) + 1)).waveform
         assert waveform is not None
-        local = waveform[:: wanted.step][0] if one else waveform[:: wanted.step]
-        return np.asarray(local[keys[1:] if one else (slice(None), *keys[1:])])
+        local = waveform[:: wanted.step][0] if single else waveform[:: wanted.step]
+        return np.asarray(local[keys[1:] if single else (slice(None), *keys[1:])])
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         check_memory(2 * self.nbytes, "the waveforms", "take rows: flux[rows]")

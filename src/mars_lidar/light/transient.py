@@ -81,7 +81,7 @@ def resized(values: RateArray, size: tuple[int, int]) -> Rows:
 # --- The transient -------------------------------------------------------------------------------------------------
 
 _BAND_BYTES = 64 * 2**20
-_WORK_BYTES = 8 * 2**20  # of rows that are folded and convolved together, some six times over
+_WORK_BYTES = 8 * 2**20  # rows folded and convolved together; the work takes about six times as much
 _MAX_PARTS = 2**20
 _MAX_PERIODS = 2**12  # that light may last: each is folded on its own
 _DELAYS = 64  # midpoints inside a part for the pulse's average: error below (part / pulse width)^2 / 1e5
@@ -322,8 +322,8 @@ class Transient:
             place = (edges + n * period_ns - self.start_ns) / self.bin_ns
             whole = np.round(place)  # edges that meet must meet exactly, or light leaks into a neighbour
             place = np.clip(np.where(np.abs(place - whole) < 1e-9 * bins, whole, place), 0.0, bins)
-            left = np.minimum(place.astype(np.int64), bins - 1)
-            at = before[..., left] + (place - left) * light[..., left]
+            below = np.minimum(place.astype(np.int64), bins - 1)
+            at = before[..., below] + (place - below) * light[..., below]
             out += np.diff(at, axis=-1)
         return np.maximum(out, 0.0)
 

@@ -1,4 +1,4 @@
-"""What the pictures show: maps and rates computed from a cube, or from the light fitted to it, without matplotlib."""
+"""Maps and rates for the figures, computed from a cube or from the light fitted to it, without matplotlib."""
 
 from __future__ import annotations
 
@@ -95,7 +95,9 @@ def instrument(system: System) -> str:
     periods = f"{system.cycles:,} laser period{'s' if system.cycles > 1 else ''} of {system.period_ns:.4g} ns"
     mode = "" if detector.mode == "nonparalyzable" else f", {detector.mode}"
     effects = [name.removesuffix("_ns").removesuffix("_hz").replace("_", " ") for name in detector.effects]
-    return f"{bins}; {periods}; dead time {detector.dead_time_ns:.4g} ns{mode}" + "".join(f", {one}" for one in effects)
+    return f"{bins}; {periods}; dead time {detector.dead_time_ns:.4g} ns{mode}" + "".join(
+        f", {effect}" for effect in effects
+    )
 
 
 @checked
@@ -189,18 +191,18 @@ def fitted(cube: Cube, realization: int) -> Cube:
         with suppress(ValueError):
             METHODS[name].check(system)
             break
-    found = reconstruct(counts, system, name)
-    seen = found.seen & np.isfinite(found.signal)
+    estimate = reconstruct(counts, system, name)
+    with_return = estimate.seen & np.isfinite(estimate.signal)
     flux = Flux(
-        np.where(seen, found.signal, 0.0),
-        np.where(np.isfinite(found.background), found.background, 0.0),
-        np.where(seen, found.delay_ns, 0.0),
+        np.where(with_return, estimate.signal, 0.0),
+        np.where(np.isfinite(estimate.background), estimate.background, 0.0),
+        np.where(with_return, estimate.delay_ns, 0.0),
     )
     recipe = Recipe(
         system=system.detected(),
         flux=flux,
         engine=MEASURED,
-        depth_m=np.where(seen, found.depth_m, np.nan),
+        depth_m=np.where(with_return, estimate.depth_m, np.nan),
         source=cube.recipe.source,
     )
     return Cube(histogram=counts[None], recipe=recipe, version=cube.version)

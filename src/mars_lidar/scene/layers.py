@@ -14,7 +14,7 @@ from mars_lidar.light.flux import Flux
 from mars_lidar.scene.radiometry import scene_flux
 from mars_lidar.scene.scene import Scene
 
-MOST = 16  # returns of a pixel
+MOST = 16  # layers, and returns of a pixel
 
 
 class LayeredScene:
@@ -35,10 +35,10 @@ class LayeredScene:
 
     def __init__(self, layers: Sequence[Scene]) -> None:
         self.layers = tuple(layers)
-        if not 1 <= len(self.layers) <= MOST or not all(isinstance(one, Scene) for one in self.layers):
+        if not 1 <= len(self.layers) <= MOST or not all(isinstance(layer, Scene) for layer in self.layers):
             raise ValueError(f"layers must be 1 to {MOST} Scenes, got {layers!r}")
-        if len({one.shape for one in self.layers}) > 1:
-            raise ValueError(f"layers must have one shape, got {[one.shape for one in self.layers]}")
+        if len({layer.shape for layer in self.layers}) > 1:
+            raise ValueError(f"layers must have one shape, got {[layer.shape for layer in self.layers]}")
         first = self.layers[0]
         self.shape, self.depth_m, self.reflectivity = first.shape, first.depth_m, first.reflectivity
         self.background = first.background
@@ -47,7 +47,7 @@ class LayeredScene:
     def behind_pane(
         cls, scene: Scene | LayeredScene, depth_m: float, reflectivity: float, transmission: float = 1.0
     ) -> LayeredScene:
-        """What is seen through a pane at one range.
+        """A scene seen through a pane at one range.
 
         Parameters
         ----------
@@ -64,30 +64,30 @@ class LayeredScene:
         depth = checks.real("depth_m", depth_m, low=0.0, strict_low=True)
         share = checks.real("reflectivity", reflectivity, low=0.0, high=1.0)
         passed = checks.real("transmission", transmission, low=0.0, high=1.0, strict_low=True)
-        behind = scene.layers if isinstance(scene, LayeredScene) else (scene,)
+        layers = scene.layers if isinstance(scene, LayeredScene) else (scene,)
 
-        def dimmed(one: Scene) -> Scene:
-            far = np.nan_to_num(one.depth_m, nan=np.inf) > depth
-            return Scene(one.depth_m, np.where(far, passed, 1.0) * one.reflectivity, one.background)
+        def dimmed(layer: Scene) -> Scene:
+            far = np.nan_to_num(layer.depth_m, nan=np.inf) > depth
+            return Scene(layer.depth_m, np.where(far, passed, 1.0) * layer.reflectivity, layer.background)
 
-        seen = np.where(behind[0].depth_m <= depth, np.nan, depth)
-        return cls([*map(dimmed, behind), Scene(seen, share)])
+        pane = np.where(layers[0].depth_m <= depth, np.nan, depth)
+        return cls([*map(dimmed, layers), Scene(pane, share)])
 
     @property
     def valid(self) -> NDArray[np.bool_]:
         """Pixels with a return from any layer (H, W)."""
-        return np.asarray(np.stack([one.valid for one in self.layers]).any(axis=0))
+        return np.asarray(np.stack([layer.valid for layer in self.layers]).any(axis=0))
 
     def __repr__(self) -> str:
         return f"LayeredScene({len(self.layers)} layers, the first {self.layers[0]!r})"
 
     def __getitem__(self, key: Any) -> LayeredScene:
         """A crop, as of a `Scene`."""
-        return LayeredScene([one[key] for one in self.layers])
+        return LayeredScene([layer[key] for layer in self.layers])
 
     def resize(self, size: int | tuple[int, int]) -> LayeredScene:
         """At another size, as `Scene.resize`."""
-        return LayeredScene([one.resize(size) for one in self.layers])
+        return LayeredScene([layer.resize(size) for layer in self.layers])
 
     def flux(
         self,
@@ -106,8 +106,10 @@ class LayeredScene:
             S_k = signal * w_k / mean_V(sum_k w_k)
 
         so that all returns of a pixel together have the mean `signal`. Ambient ``"reflectivity"`` is the sum of the
-        reflectivities of the surfaces that a pixel sees, and where it sees none the largest reflectivity of all
-        layers, in whatever order they come.
+        reflectivities of the surfaces in a pixel; in a pixel without any it is the largest reflectivity of all
+        layers.
         """
-        depth, share = (np.stack([getattr(one, name) for one in self.layers]) for name in ("depth_m", "reflectivity"))
+        depth, share = (
+            np.stack([getattr(layer, name) for layer in self.layers]) for name in ("depth_m", "reflectivity")
+        )
         return scene_flux(depth, share, self.background, system, signal, sbr, attenuation, ambient, dark_count_hz)

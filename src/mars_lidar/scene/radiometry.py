@@ -57,17 +57,17 @@ def scene_flux(
         raise ValueError("depth_m is NaN at every pixel: there is no return to set a signal level with")
     reach = system.unambiguous_range_m
 
-    def seen(image: FloatArray) -> FloatArray:
+    def with_return(image: FloatArray) -> FloatArray:
         """The pixels with a return."""
         return image.reshape(-1) if number == valid.size else image[valid]
 
     if attenuation == "inverse_square":
         # relative to the nearest depth: the same after normalisation, and nothing overflows
         share *= (np.nanmin(depth_m) / np.where(surface, depth_m, np.inf)) ** 2
-    s = _scaled(share, level, seen, "reflectivity", f"signal={level:g}")
+    s = _scaled(share, level, with_return, "reflectivity", f"signal={level:g}")
     b = np.zeros(valid.shape)
     if ratio < math.inf:
-        (b,) = _scaled(light[None], level / ratio, seen, "ambient light", f"sbr={ratio:g}")
+        (b,) = _scaled(light[None], level / ratio, with_return, "ambient light", f"sbr={ratio:g}")
     dark = rate * system.period_ns * 1e-9 / system.detector.detection_efficiency  # photons for as many counts
     wrapped = int(np.count_nonzero((depth_m >= reach).any(0)))
     info = {
@@ -83,7 +83,7 @@ def scene_flux(
         "n_valid": number,
         "n_wrapped": wrapped,
         "unambiguous_range_m": reach,
-        **_means(seen(s.sum(0)), seen(b), dark),
+        **_means(with_return(s.sum(0)), with_return(b), dark),
     }
     delay = system.delay_ns(depth_m)
     flux = Flux(s[0], b + dark, delay[0], info=info) if len(s) == 1 else Flux(s, b + dark, delay, info=info)
@@ -92,20 +92,20 @@ def scene_flux(
 
 
 def _scaled(
-    light: FloatArray, mean: float, seen: Callable[[FloatArray], FloatArray], what: str, asked: str
+    light: FloatArray, mean: float, with_return: Callable[[FloatArray], FloatArray], what: str, asked: str
 ) -> FloatArray:
-    """Relative maps (K, H, W) scaled together, so that their sum has a mean over the pixels that are `seen`."""
+    """Relative maps (K, H, W) with a common factor that gives their sum the `mean` over the pixels `with_return`."""
     total = light.sum(0)
-    top = float(seen(total).max())
+    top = float(with_return(total).max())
     if top == 0.0:
         raise ValueError(f"{what} is zero at every pixel with a return: {asked} cannot be reached")
     # to order one first: a map of 1e-300 scales as well as one of 1e300
-    scale = mean / float((seen(total) / top).mean())
+    scale = mean / float((with_return(total) / top).mean())
     return light / top * scale
 
 
 def _means(s: FloatArray, ambient: FloatArray, dark: float) -> dict[str, float | None]:
-    """What was achieved over the valid pixels, photons per laser period."""
+    """Means over the valid pixels, photons per laser period, and the resulting SBR."""
     mean_s, mean_a = float(s.mean()), float(ambient.mean())
     mean_b = float((ambient + dark).mean())
     return {

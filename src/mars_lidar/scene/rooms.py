@@ -163,10 +163,10 @@ def cast(objects: Sequence[Box | Sphere], camera: Camera, size: tuple[int, int])
 def _uneven(image: FloatArray) -> NDArray[np.bool_]:
     """Pixels that differ from one of their four neighbours."""
     uneven = np.zeros(image.shape, dtype=np.bool_)
-    for turned, told in ((image, uneven), (image.T, uneven.T)):
+    for turned, unevenness in ((image, uneven), (image.T, uneven.T)):
         step = np.abs(turned[1:] - turned[:-1]) > _CONTRAST
-        told[1:] |= step
-        told[:-1] |= step
+        unevenness[1:] |= step
+        unevenness[:-1] |= step
     return uneven
 
 
@@ -179,9 +179,9 @@ def _trace(objects: Sequence[Box | Sphere], origin: FloatArray, d: FloatArray) -
         if rays is not None and rays.size == 0:
             continue
         t = thing.hit(origin, d if rays is None else d.take(rays, axis=1))
-        (seen,) = (t < (nearest if rays is None else nearest.take(rays))).nonzero()
-        where = seen if rays is None else rays.take(seen)
-        nearest[where] = t.take(seen)
+        (hit,) = (t < (nearest if rays is None else nearest.take(rays))).nonzero()
+        where = hit if rays is None else rays.take(hit)
+        nearest[where] = t.take(hit)
         owner[where] = k
     light = np.zeros(d.shape[1])
     for k, thing in enumerate(objects):
@@ -229,9 +229,9 @@ def _walls(paint: _Paint) -> list[Box]:
     faces = (side, side, floor, ceiling, wall, end)
     shell = Box((0.0, 0.5 * _HEIGHT, far), (half, 0.5 * _HEIGHT, far), faces, inside=True)
 
-    def block(left: float, right: float, low: float) -> Box:
-        x, y = 0.5 * (left + right), 0.5 * (low + _HEIGHT)
-        size = (right - x, _HEIGHT - y, 0.5 * _PASSAGE)
+    def block(x0: float, x1: float, low: float) -> Box:
+        x, y = 0.5 * (x0 + x1), 0.5 * (low + _HEIGHT)
+        size = (x1 - x, _HEIGHT - y, 0.5 * _PASSAGE)
         return Box((x, y, _LENGTH + size[2]), size, (side, side, side, side, _moved(back, x, y), wall))
 
     return [shell, block(-half, x0, 0.0), block(x0, x1, top), block(x1, half, 0.0)]

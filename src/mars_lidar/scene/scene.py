@@ -1,4 +1,4 @@
-"""What the LiDAR looks at: depth, reflectivity and ambient light of each pixel."""
+"""Scenes: depth, reflectivity and ambient light of each pixel."""
 
 from __future__ import annotations
 

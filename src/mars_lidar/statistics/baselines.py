@@ -1,6 +1,6 @@
 """Baseline count laws: Poisson (no dead time) and a renewal process of constant rate (no pulse).
 
-The renewal baseline is what one obtains by spreading the photons of a period evenly, lambda = (S + B) / t_r.
+The renewal baseline spreads the photons of a period evenly over it: lambda = (S + B) / t_r.
 Equation numbers refer to docs/theory.md, section 6.
 """
 
@@ -17,7 +17,7 @@ from mars_lidar.instrument.detector import MODES
 from mars_lidar.instrument.system import System
 from mars_lidar.statistics.gate import require_mode
 
-_WITHOUT_GATE = MODES[:3]  # what is inside of a gate depends on the delay, which these do not know
+_WITHOUT_GATE = MODES[:3]  # the light inside a gate depends on the delay, which is not an argument here
 
 
 @checked
@@ -55,8 +55,8 @@ def renewal_moments(
         S and B, photons per period: scalars or arrays that broadcast.
     start_up
         False: the long-exposure law of the MaRS paper's baseline, mean lambda t / (1 + x) and variance
-        lambda t / (1 + x)^3 with x = lambda t_d (6.2). True: with the constant terms that the start of the
-        exposure adds (6.3), for `System.start`; exact but for terms that vanish in a long exposure.
+        lambda t / (1 + x)^3 with x = lambda t_d (6.2). True: with the constant terms of the start of the
+        exposure (6.3), for `System.start`; exact up to terms that vanish in a long exposure.
 
     Returns
     -------
@@ -105,18 +105,20 @@ def _survival(counts: FloatArray, rate: FloatArray, system: System) -> FloatArra
 
     exposure, dead = float(system.cycles), system.dead_time_periods
     if system.start == "armed":
-        left = np.maximum(exposure - (counts - 1.0) * dead, 0.0)
-        found = gammainc(np.maximum(counts, 1.0), rate * left)
-        return np.asarray(np.where(counts == 0.0, 1.0, found), dtype=np.float64)
+        armed_time = np.maximum(exposure - (counts - 1.0) * dead, 0.0)
+        probability = gammainc(np.maximum(counts, 1.0), rate * armed_time)
+        return np.asarray(np.where(counts == 0.0, 1.0, probability), dtype=np.float64)
 
     def integral(k: FloatArray) -> FloatArray:
-        # of P(k t_d + Gamma(k, 1/rate) <= y) over y in [0, exposure]; for no wait at all, the exposure
-        left, shape = np.maximum(exposure - k * dead, 0.0), np.maximum(k, 1.0)
+        # integral of P(k t_d + Gamma(k, 1/rate) <= y) over y in [0, exposure]; the exposure itself for k = 0
+        armed_time, shape = np.maximum(exposure - k * dead, 0.0), np.maximum(k, 1.0)
         with np.errstate(divide="ignore", invalid="ignore"):
-            area = left * gammainc(shape, rate * left) - shape / rate * gammainc(shape + 1.0, rate * left)
+            area = armed_time * gammainc(shape, rate * armed_time) - shape / rate * gammainc(
+                shape + 1.0, rate * armed_time
+            )
         return np.where(k == 0.0, exposure, np.where(rate > 0, area, 0.0))
 
-    # the first wait of a warmed-up pixel has the density (1 - F) / mean, F the law of the others (6.5)
+    # the first wait of a stationary pixel has the density (1 - F) / mean, F the law of the later waits (6.5)
     at_least = (integral(np.maximum(counts - 1.0, 0.0)) - integral(counts)) * rate / (1.0 + rate * dead)
     return np.asarray(np.where(counts == 0.0, 1.0, at_least), dtype=np.float64)
 

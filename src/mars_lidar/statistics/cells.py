@@ -1,17 +1,17 @@
-"""Pixels on the grids on which the exact statistics are computed.
+"""Pixels and the grids of the period on which their exact statistics are computed.
 
-Arguments (photons and delays) are checked and broadcast; the period is cut into cells, which are not the bins of the
-histogram; each cell gets its photons per period (`Cells`).
+`Cells.of` checks and broadcasts photons and delays. A grid divides the period into bins, which need not be those of the
+histogram; `Cells.energies` integrates the light over them.
 
-Narrow pulses. A grid that does not resolve a pulse is right as long as no pixel re-arms within the pulse. Where the
-dead time is a whole number of periods, up to the length of the pulse, what the pulse registered re-arms within the
-next pulse, and the grid must resolve it. A comparison of two grids does not notice this: to both the narrowest pulse
-on the edge of a cell is the same.
+Narrow pulses. A grid that does not resolve a pulse is accurate as long as no pixel re-arms within the pulse. Where the
+dead time is a whole number of periods, within the length of the pulse, pixels blinded by one pulse re-arm within the
+next, and the grid must resolve it. Refinement from one grid to the next does not detect this: a pulse much narrower
+than a bin looks the same on both.
 
-Many bins. A pixel registers the light times the probability that it is armed, which is smooth where the light is:
-cells that resolve the light give the registrations as a function of the photons so far, and each bin then has its own
-photons exactly. Two checks go with this: the photons that a smooth curve through the cells would misplace within a cell
-bound what the cells cannot resolve, and cells twice as wide must give the same.
+Many bins. The rate of registrations is the light times the probability of being armed, which is as smooth as the light.
+On a grid that resolves the light, the registrations up to a time are interpolated as a function of the photons up to
+that time, which are exact for any bin. Two checks bound the error: the photons that a smooth curve through the grid
+would misplace within a bin of the grid, and the agreement with a grid of twice the bin width.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ from mars_lidar.instrument.detector import Mode
 from mars_lidar.instrument.effects import LIGHT_EFFECTS
 from mars_lidar.instrument.pulse import SampledPulse
 from mars_lidar.instrument.system import System
-from mars_lidar.statistics.gate import PLAIN, CellLight, photons_before, require_mode
+from mars_lidar.statistics.gate import PLAIN, open_parts, require_mode
 
 # --- Arguments -----------------------------------------------------------------------------------------------------
 
-MAX_PHOTONS = 1e6
+MAX_PHOTONS = 1e6  # photons per period, the most that are accepted: 1e13 photons/s at 10 MHz
 
 
 def reals(name: str, value: ArrayLike) -> FloatArray:
-    """Real numbers as doubles, not none of them."""
+    """Real numbers as doubles; refuses an empty array."""
     array = np.asarray(value)
     if array.dtype.kind not in "fiu":
         raise TypeError(f"{name} must be real numbers, got dtype {array.dtype}")
@@ -50,7 +50,7 @@ def reals(name: str, value: ArrayLike) -> FloatArray:
 
 
 def photons(name: str, value: ArrayLike) -> FloatArray:
-    """Photons per period, in range."""
+    """Photons per period as doubles, checked to lie in [0, MAX_PHOTONS]."""
     array = reals(name, value)
     bad = ~((array >= 0) & (array <= MAX_PHOTONS))
     if bad.any():
@@ -59,18 +59,18 @@ def photons(name: str, value: ArrayLike) -> FloatArray:
 
 
 def broadcast(names: tuple[str, ...], *arrays: NDArray[Any]) -> list[NDArray[Any]]:
-    """Arrays of one shape; `names` are for the error."""
+    """Arrays broadcast to one shape; an error states `names` and shapes."""
     try:
         return list(np.broadcast_arrays(*arrays))
     except ValueError:
-        told = ", ".join(f"{n} {a.shape}" for n, a in zip(names, arrays, strict=False))
-        raise ValueError(f"shapes must broadcast, got {told}") from None
+        shapes = ", ".join(f"{n} {a.shape}" for n, a in zip(names, arrays, strict=False))
+        raise ValueError(f"shapes must broadcast, got {shapes}") from None
 
 
 def with_delays(
     signal: FloatArray, background: FloatArray, delay_ns: ArrayLike | None, period_ns: float
 ) -> list[NDArray[Any]]:
-    """Signal, background and delays, ns, of one shape; delays of None are half the period, NaN is for no return."""
+    """Signal, background and delay (ns) of one shape; the delay defaults to half the period, NaN: no return."""
     given = reals("delay_ns", 0.5 * period_ns if delay_ns is None else delay_ns)
     signal, background, delay = broadcast(("signal", "background", "delay_ns"), signal, background, given)
     bad = ~np.isfinite(delay) & ~(np.isnan(delay) & (signal == 0))
@@ -86,10 +86,10 @@ def flat(array: NDArray[Any]) -> FloatArray:
 
 # --- Grid of the phase chain ---------------------------------------------------------------------------------------
 
-_MAX_BINS = 2**20
-_MAX_COMMON = 2**14
-_CHAIN_MIN_BINS = 512  # below it the chain's own discretisation shows in the count variance
-_CHAIN_BINS_PER_WIDTH = 7.5  # of the equivalent width 1 / max s, 2.507 sigma for a Gaussian: a third of sigma
+_MAX_BINS = 2**20  # bins per period of a statistics grid: 8 MiB an array
+_MAX_COMMON = 2**14  # bins of a grid that holds both the samples of a waveform and the bins of the histogram
+_CHAIN_MIN_BINS = 512  # with fewer the discretisation of the chain is visible in the count variance
+_CHAIN_BINS_PER_WIDTH = 7.5  # bins in 1 / max s, which is 2.507 sigma for a Gaussian: a bin is sigma / 3
 
 
 @checked
@@ -197,31 +197,32 @@ def _waveform(waveform: ArrayLike) -> FloatArray:
 
 # --- Pulses narrower than a cell -----------------------------------------------------------------------------------
 
-_PROBE = 2**12  # parts of a pulse's record
-_SEEN = 8.0  # standard deviations of bins that see a pulse: the refinement of the grid finds the rest
-_RESOLVED = 0.5  # and of bins that resolve it: there is nothing to gain from others
-_MOST_BINS = 2**15  # of a period: more take seconds
-_ROUNDING = 1e-12  # of a whole number of periods, relative
-_BLOCKS = 4  # of the period at least, so that none has both ends of a pulse's record at its own two
-_LEAST_CELLS = 8  # of a block, on a grid that follows the pulse: its pieces begin with cells of half as many
-_PULSE_CELLS = 512  # of the period
-_KNOTS = 8.0  # in a standard deviation
-_LONGEST = 64.0  # standard deviations of a record that such a grid resolves from the first
+_PROBE = 2**12  # samples of the pulse's support from which its width is computed
+_DETECTED = 8.0  # a pulse of sigma >= 1/8 bin is detected by the refinement of the grid, which then resolves it
+_RESOLVED = 0.5  # a pulse of sigma >= 2 bins is resolved: finer bins change nothing
+_MOST_BINS = 2**15  # equal bins per period; more take seconds a cell
+_ROUNDING = 1e-12  # relative deviation from a whole number of periods that is rounding
+_BLOCKS = 4  # fewest blocks of the period, so that none holds the beginning and, wrapped, the end of one pulse
+_LEAST_CELLS = 8  # fewest bins of a block on a grid that follows the pulse, half of them on the pulse
+_PULSE_CELLS = 512  # bins per period of the first grid that follows the pulse
+_KNOTS = 8.0  # grid points per standard deviation of the pulse
+_LONGEST = 64.0  # support of a pulse, in its standard deviations, up to which a grid that follows it resolves it
 
 
-def needed_bins(cells: CellLight, coarsest: int) -> int:
-    """Equal bins that the pulse needs where `coarsest` do not see it; 0 where they do, or need not.
+def needed_bins(cells: Cells, coarsest: int) -> int:
+    """Number of equal bins that resolves the pulse; 0 where `coarsest` equal bins suffice.
 
-    A bin is then one standard deviation of the pulse, or a third of the time between a pulse and its photons'
-    re-arming.
+    The bin is one standard deviation of the pulse, or a third of the time between the end of a pulse and the
+    re-arming of the pixels that it blinded.
     """
-    return _bins_of_pulse(cells) if _meets_itself(cells, coarsest, _SEEN) else 0
+    return _bins_of_pulse(cells) if _meets_itself(cells, coarsest, _DETECTED) else 0
 
 
-def followed_bins(cells: CellLight, coarsest: int, out_bins: int) -> int:
-    """Bins of the first grid that follows the pulse; 0 where `coarsest` equal ones will do, or it may not.
+def followed_bins(cells: Cells, coarsest: int, out_bins: int) -> int:
+    """Number of bins of the first grid that follows the pulse; 0 where equal bins are used.
 
-    Time may be cut unevenly where the dead time is a whole number of periods: the same bin, periods later.
+    Bins may be uneven only where the dead time is a whole number of periods: a pixel then re-arms in the bin of its
+    registration. They are used where `coarsest` equal bins do not resolve the pulse.
     """
     if not _is_whole(cells) or not _meets_itself(cells, coarsest, _RESOLVED):
         return 0
@@ -231,13 +232,13 @@ def followed_bins(cells: CellLight, coarsest: int, out_bins: int) -> int:
     return bins if length <= _LONGEST * sigma and bins < _bins_of_pulse(cells) else 0
 
 
-def meets_itself(cells: CellLight) -> bool:
-    """Whether no law but the slowest resolves the pulse, which re-arms within the next one."""
+def meets_itself(cells: Cells) -> bool:
+    """Whether pixels re-arm within the next pulse and resolving it takes more than 2^15 equal bins."""
     return not _is_whole(cells) and _meets_itself(cells, _MOST_BINS, _RESOLVED)
 
 
-def _meets_itself(cells: CellLight, coarsest: int, resolved: float) -> bool:
-    """Whether the pulse is narrower than a share of such bins, and what it registers re-arms where it shines."""
+def _meets_itself(cells: Cells, coarsest: int, resolved: float) -> bool:
+    """Whether sigma is below 1 / (`resolved` `coarsest`) periods and pixels re-arm within the pulse."""
     dead = cells.system.dead_time_periods
     if cells.waveform is not None or dead == 0.0 or not (cells.signal > 0.0).any():
         return False
@@ -245,21 +246,22 @@ def _meets_itself(cells: CellLight, coarsest: int, resolved: float) -> bool:
     return sigma * coarsest * resolved < 1.0 and _apart(cells) < length + 3.0 / coarsest
 
 
-def _bins_of_pulse(cells: CellLight) -> int:
+def _bins_of_pulse(cells: Cells) -> int:
+    """Number of equal bins that resolves the pulse (`needed_bins`)."""
     sigma, length = _extent(cells)
     return math.ceil(1.0 / max(sigma, (_apart(cells) - length) / 3.0))
 
 
-def _apart(cells: CellLight) -> float:
-    """Periods by which the dead time misses a whole number of them."""
+def _apart(cells: Cells) -> float:
+    """Distance of the dead time from the nearest whole number of periods, in periods."""
     dead = cells.system.dead_time_periods
     return abs(dead - round(dead))
 
 
-def followed_edges(cells: CellLight, parts: int, out_bins: int) -> FloatArray:
-    """Edges (cells, parts + 1) in [0, 1] of a grid that has half of its parts on the pulse, in each block it meets.
+def followed_edges(cells: Cells, parts: int, out_bins: int) -> FloatArray:
+    """Edges (cells, parts + 1) in [0, 1] of a grid that puts half of its parts on the pulse, in each block it overlaps.
 
-    A block is a bin of the histogram, or an equal part of it, and keeps its edges and its number of parts.
+    A block is a bin of the histogram, or an equal part of it; its edges and its number of parts are fixed.
     """
     blocks = _blocks(out_bins)
     each = parts // blocks
@@ -267,14 +269,14 @@ def followed_edges(cells: CellLight, parts: int, out_bins: int) -> FloatArray:
     low, high = (x / cells.system.period_ns for x in cells.system.pulse.support_ns())
     for row, delay in zip(out, cells.delay, strict=True):
         for block in range(math.floor((delay + low) * blocks), math.ceil((delay + high) * blocks)):
-            left, right = block / blocks, (block + 1) / blocks
-            begin, end = max(delay + low, left), min(delay + high, right)
-            if begin > left and end < right:
-                knots = [0.0, 0.25, 0.75, 1.0], [left, begin, end, right]
-            elif begin > left:
-                knots = [0.0, 0.5, 1.0], [left, begin, right]
-            elif end < right:
-                knots = [0.0, 0.5, 1.0], [left, end, right]
+            low_edge, high_edge = block / blocks, (block + 1) / blocks
+            begin, end = max(delay + low, low_edge), min(delay + high, high_edge)
+            if begin > low_edge and end < high_edge:
+                knots = [0.0, 0.25, 0.75, 1.0], [low_edge, begin, end, high_edge]
+            elif begin > low_edge:
+                knots = [0.0, 0.5, 1.0], [low_edge, begin, high_edge]
+            elif end < high_edge:
+                knots = [0.0, 0.5, 1.0], [low_edge, end, high_edge]
             else:
                 continue
             at = np.interp(np.arange(1, each) / each, *knots)
@@ -283,10 +285,11 @@ def followed_edges(cells: CellLight, parts: int, out_bins: int) -> FloatArray:
     return out
 
 
-def knots(cells: CellLight, bins: int, halved: float) -> FloatArray:
-    """Phases (n,) in [0, 1) where the light of the only cell steps, or between which a narrow pulse is resolved.
+def knots(cells: Cells, bins: int, halved: float) -> FloatArray:
+    """Phases (n,) in [0, 1) at which a grid for the only cell must have edges.
 
-    Of samples and of waveforms all edges; on a Gaussian pulse that `bins` do not resolve, 8 `halved` a sigma.
+    The edges of the samples of a sampled pulse or waveform; 8 `halved` points per sigma on a Gaussian pulse that `bins`
+    bins do not resolve; otherwise none.
     """
     if cells.waveform is not None:
         return np.linspace(0.0, 1.0, cells.waveform.shape[-1], endpoint=False)
@@ -306,12 +309,12 @@ def _blocks(out_bins: int) -> int:
     return out_bins * math.ceil(_BLOCKS / out_bins)
 
 
-def _is_whole(cells: CellLight) -> bool:
+def _is_whole(cells: Cells) -> bool:
     """Whether the dead time is a whole number of periods."""
     return _apart(cells) <= _ROUNDING * max(1.0, cells.system.dead_time_periods)
 
 
-def _extent(cells: CellLight) -> tuple[float, float]:
+def _extent(cells: Cells) -> tuple[float, float]:
     """Standard deviation of a Gaussian as narrow as the pulse, and the pulse's length, in periods."""
     low, high = cells.system.pulse.support_ns()
     energy = np.diff(cells.system.pulse.cumulative(np.linspace(low, high, _PROBE + 1)))
@@ -321,23 +324,54 @@ def _extent(cells: CellLight) -> tuple[float, float]:
 
 # --- Pixels on the grid --------------------------------------------------------------------------------------------
 
-_MIN_BINS = 128
-_MAX_FIRST_BINS = 2**14  # finer first grids only where the tolerance asks for them
-_BINS_PER_WIDTH = 4.0 * math.sqrt(math.pi)  # of 1 / integral of s^2, 2 sqrt(pi) sigma: a bin is sigma / 2
-_MAX_STEPS = 4_000_000_000  # bins x periods of one cell before it counts as not settling: minutes
-LAW_STEPS = 26_000_000  # of the laws, which are to take 2 s at most
-# Sweeps for a warm state, and bins x sweeps, if more than the least; beyond, an equation is solved (warm.py)
+_MIN_BINS = 128  # bins of the coarsest first grid
+_MAX_FIRST_BINS = 2**14  # bins of the finest first grid; refinement goes beyond where the tolerance demands it
+_BINS_PER_WIDTH = 4.0 * math.sqrt(math.pi)  # bins in 1 / integral of s^2, 2 sqrt(pi) sigma: a bin is sigma / 2
+_MAX_STEPS = 4_000_000_000  # bins x periods after which a cell counts as not settling: minutes
+LAW_STEPS = 26_000_000  # bins x periods that a law may take: 2 s
+# Sweeps towards the stationary state: at most 400, or 10^7 bins x sweeps, at least 4; beyond, `warm_history` solves it
 _WARM_PERIODS, _WARM_STEPS, _LEAST_WARM = 400, 10_000_000, 4
-_CHUNK_BYTES = 64 << 20
-_MAX_HISTORY_BYTES = 1 << 30  # for each thread
-_NEAR_BYTES, _MIDDLE_BYTES = 1 << 19, 1 << 25  # 15 to 60 ns a step; up to 100 ns; beyond, 100 to 350 ns were measured
+_CHUNK_BYTES = 64 << 20  # memory of the energies and histograms computed together
+_MAX_HISTORY_BYTES = 1 << 30  # memory of the registrations of one dead time, in each thread
+_NEAR_BYTES, _MIDDLE_BYTES = 1 << 19, 1 << 25  # history: 15 to 60 ns a step; up to 100 ns; beyond, 100 to 350 ns
 _SIMULATE = "simulate it with engine 'exact'"
-_SETTLED = 1e-12  # relative change of the state per period (20)
+_SETTLED = 1e-12  # relative change of the state per period at which it counts as repeating (20)
 
 
 @dataclass(frozen=True, eq=False)
-class Cells(CellLight):
-    """Pixels with their grids: what the statistics of all modes are computed from."""
+class Cells:
+    """Pixels (S, B, delay or waveform) of one system, flat, and the grids on which their statistics are computed.
+
+    Attributes
+    ----------
+    system
+        Laser, detector and histogram that all cells share.
+    shape
+        Shape (...) of the arguments; the arrays below are flat, (cells,).
+    signal, background
+        Photons per period.
+    delay
+        Phase of the return in [0, 1), periods.
+    waveform, row
+        Waveforms (rows, T) of unit sum, and the row of each cell; `waveform` is None for a pulse.
+    follow
+        0 for equal bins; otherwise the number of histogram bins, each a whole number of grid bins, on a grid that is
+        finer on the pulse.
+    """
+
+    system: System
+    shape: tuple[int, ...]
+    signal: FloatArray
+    background: FloatArray
+    delay: FloatArray
+    waveform: FloatArray | None
+    row: IndexArray
+    follow: int = 0
+
+    @property
+    def size(self) -> int:
+        """Number of cells."""
+        return self.signal.size
 
     @classmethod
     def of(
@@ -352,10 +386,10 @@ class Cells(CellLight):
         modes: tuple[Mode, ...] = PLAIN,
         effects: tuple[str, ...] = LIGHT_EFFECTS,
     ) -> Cells:
-        """Check the arguments and broadcast them; `waveform` (..., T) broadcasts over its leading axes.
+        """Cells from checked and broadcast arguments; `waveform` (..., T) broadcasts over its leading axes.
 
-        `what` is computed from the cells, and treats `modes` and `effects` of the detector. The cells have the flux
-        of detected photons, and the system for that.
+        The cells hold the flux of detected photons and the system that detects all of it (`System.detected`). `what`
+        names the statistic in errors; ValueError where it does not treat the detector's mode or effects.
         """
         if not isinstance(system, System):
             raise TypeError(f"system must be a System, got {type(system).__name__}")
@@ -393,9 +427,9 @@ class Cells(CellLight):
 
     @property
     def native_flux(self) -> tuple[FloatArray, FloatArray]:
-        """Photons (cells,) of the shapes of `energies`, and of a flat background, as the native core adds them.
+        """Photons per period (cells,) of the shapes of `energies` and of a flat background, for the native core.
 
-        Behind a gate, and in uneven bins, nothing is flat: all is in the shapes.
+        With a gate or uneven bins the background is part of the shapes, and the flat background is 0.
         """
         if not self._all_in_shapes:
             return self.signal, self.background
@@ -408,11 +442,11 @@ class Cells(CellLight):
 
     @property
     def total(self) -> FloatArray:
-        """Photons per period (cells,), inside of the gate if there is one."""
+        """Photons per period (cells,), inside the gate if there is one."""
         return np.asarray(sum(self.native_flux), dtype=np.float64)
 
     def part(self, index: IndexArray | slice) -> Cells:
-        """Some of the cells, flat."""
+        """The selected cells, flat."""
         signal = self.signal[index]
         return Cells(
             self.system,
@@ -426,13 +460,13 @@ class Cells(CellLight):
         )
 
     def resolved(self, out_bins: int) -> Cells:
-        """These cells with bins that follow the pulse where equal ones would have to be too many."""
+        """These cells, with bins that follow the pulse where resolving it takes too many equal bins."""
         even = replace(self, follow=0)
         follow = out_bins if followed_bins(even, max(_MAX_FIRST_BINS, out_bins), out_bins) else 0
         return self if follow == self.follow else replace(self, follow=follow)
 
     def name(self, index: int) -> str:
-        """One cell in words, for errors."""
+        """Description of one cell, for errors."""
         where = "waveform" if self.waveform is not None else f"S = {self.signal[index]:g}"
         delay = "" if self.waveform is not None else f", delay = {self.delay[index]:g} periods"
         place = "" if self.size == 1 else f" (cell {index} of {self.size})"
@@ -443,18 +477,18 @@ class Cells(CellLight):
 
     @property
     def instead(self) -> str:
-        """What to use where an exact law is refused, for errors."""
+        """Advice for the error of a refused exact law."""
         return self.alternatives()
 
     def alternatives(self, *names: str) -> str:
-        """`instead`, after what has these `names`."""
+        """Advice for an error: use one of `names`, or `instead`."""
         if self.system.detector.mode == "nonparalyzable" and not meets_itself(self):
             names = (*names, "joint_law (mean, variance and mean histogram)", "method 'mars' (a Gaussian)")
         return f"use {', '.join(names)}, or {_SIMULATE}" if names else _SIMULATE
 
     @property
     def _sharpness(self) -> float:
-        """Integral of the squared shape of the signal over the period: 1 / width, the narrowest of all cells."""
+        """Integral of the squared shape of the signal over the period, 1 / width, the largest of all cells."""
         if self.waveform is not None:
             return float(self.waveform.shape[-1] * np.max(np.sum(self.waveform**2, -1)))
         probe = 2**14
@@ -467,14 +501,14 @@ class Cells(CellLight):
         return float(1.0 / (2.0 * math.sqrt(math.pi) * max(self._sharpness, 1.0)))
 
     def first_bins(self, out_bins: int) -> int:
-        """Bins of the first grid: as `usual_bins`, but where a pulse narrower than those must be resolved."""
+        """Bins of the first grid: `usual_bins`, or more where a narrower pulse must be resolved."""
         most = max(_MAX_FIRST_BINS, out_bins)
         if self.follow:
             return followed_bins(self, most, out_bins)
         return _multiple(max(self.usual_bins(out_bins), needed_bins(self, most)), out_bins)
 
     def usual_bins(self, out_bins: int) -> int:
-        """Bins, even, a multiple of `out_bins`, at most half a sigma of the pulse wide, or of 2^-14 of a period."""
+        """Even multiple of `out_bins` whose bins are at most sigma / 2 of pulse or gate wide, at most some 2^14."""
         sharpness = self._sharpness
         gate_width = self.system.detector.gate_periods(self.system.period_ns)[2]
         sharpness = max(sharpness, 1.0 / max(gate_width, 1.0 / _MAX_FIRST_BINS))
@@ -482,14 +516,13 @@ class Cells(CellLight):
         return _multiple(wanted, out_bins)
 
     def edges(self, bins: int) -> FloatArray:
-        """Edges (bins + 1,) of a grid of the period, of cells of one delay."""
+        """Edges (bins + 1,) of the grid of the first cell, periods."""
         return (
             followed_edges(self.part(slice(0, 1)), bins, self.follow)[0] if self.follow else np.arange(bins + 1) / bins
         )
 
     def grid(self, bins: int, out_bins: int, steps: int | None = None) -> _core.ExposureGrid:
-        """The native grid of `bins` bins per period; a cell is given up after `steps` bins x periods (None: many)."""
-
+        """The native grid of `bins` bins per period; a cell fails after `steps` bins x periods (None: 4e9)."""
         whole, shift, fraction = whole_bins(self.system.dead_time_periods, bins)
         return _core.ExposureGrid(
             cycles=self.system.cycles,
@@ -505,7 +538,7 @@ class Cells(CellLight):
         )
 
     def chunks(self, bins: int, out_bins: int) -> Iterator[slice]:
-        """Parts whose energies on the grid, and histograms, fit in a moderate amount of memory."""
+        """Slices of the cells whose energies and histograms take about 64 MiB together."""
         per_cell = 8 * (4 * bins + 2 * out_bins)
         least = 64
         if self.system.detector.mode == "paralyzable":  # kinds x moments of the rate, and what they are made of
@@ -517,12 +550,12 @@ class Cells(CellLight):
             yield slice(start, min(start + step, self.size))
 
     def step_cost(self, bins: int) -> float:
-        """What a step of a bin costs beside one whose dead time is remembered in the processor's own memory."""
+        """Cost of one bin and period relative to a history of one dead time that fits in the cache (1, 2 or 6)."""
         remembered = self.grid(bins, 1).bytes
         return 1.0 if remembered <= _NEAR_BYTES else 2.0 if remembered <= _MIDDLE_BYTES else 6.0
 
     def check_history(self, bins: int) -> None:
-        """Refuse, before any work, dead times whose history would not fit in memory."""
+        """Raise MemoryError where the registrations of one dead time do not fit in memory."""
         needed = int(self.grid(bins, 1).bytes)
         if needed > _MAX_HISTORY_BYTES:
             raise MemoryError(
@@ -532,8 +565,7 @@ class Cells(CellLight):
             )
 
     def energies(self, bins: int) -> tuple[FloatArray, NDArray[np.int32]]:
-        """Unit energies (rows, parts of bins) of the distinct signal shapes, and each cell's row (cells,)."""
-
+        """Unit energies (rows, parts of bins) of the distinct signal shapes, and the row of each cell (cells,)."""
         parts = bins * int(_core.EXPOSURE_PARTS)
         if self.follow:
             edges = followed_edges(self, parts, self.follow)
@@ -557,29 +589,64 @@ class Cells(CellLight):
 
 
 def _multiple(wanted: float, out_bins: int) -> int:
-    """The next even multiple of `out_bins`."""
+    """Smallest even multiple of `out_bins` that is at least `wanted`."""
     step = out_bins if out_bins % 2 == 0 else 2 * out_bins
     return step * math.ceil(wanted / step)
 
 
 def _unit_energies(before: FloatArray) -> FloatArray:
-    """Shares (cells, parts) of a period's photons, from those before each edge (cells, parts + 1)."""
+    """Shares (cells, parts) of the photons of a period, from the photons `before` each edge (cells, parts + 1)."""
     unit = np.diff(before) / np.maximum(before[:, -1:], np.finfo(float).tiny)
     return np.ascontiguousarray(np.maximum(unit, 0.0))
 
 
+# --- Photons within the period --------------------------------------------------------------------------------------
+
+
+def photons_before(cells: Cells, edges: FloatArray) -> FloatArray:
+    """Photons that reach each cell between the start of the period and `edges` (n,) in [0, 1]: (cells, n).
+
+    Photons outside the detector's gate are not counted.
+    """
+    if cells.system.detector.mode != "gated":
+        return _photons_before(cells, edges)
+    total = np.zeros((cells.size, edges.size))
+    for low, high in open_parts(cells.system):
+        bounded = np.concatenate([[low], np.clip(edges, low, high)])
+        inside = _photons_before(cells, bounded)
+        total += inside[:, 1:] - inside[:, :1]
+    return total
+
+
+def _photons_before(cells: Cells, edges: FloatArray) -> FloatArray:
+    if cells.waveform is None:
+        period = cells.system.period_ns
+        at = np.concatenate([[0.0], edges])
+        energy = cells.system.pulse.wrapped_cumulative((at - cells.delay[:, None]) * period, period)
+        energy = energy[:, 1:] - energy[:, :1]
+    else:
+        knots = np.linspace(0.0, 1.0, cells.waveform.shape[-1] + 1)
+        rows, used = np.unique(cells.row, return_inverse=True)
+        below = [np.concatenate([[0.0], np.cumsum(cells.waveform[row])]) for row in rows]
+        energy = np.stack([np.interp(edges, knots, b) for b in below])[used.reshape(-1)]
+    total = energy  # in place: of grids of a million edges fresh memory costs more than arithmetic
+    total *= cells.signal[:, None]
+    total += cells.background[:, None] * edges
+    return np.maximum(total, 0.0, out=total)
+
+
 # --- Histograms of very many bins ----------------------------------------------------------------------------------
 
-MANY_BINS = 2**17  # from which it is worth while
-_FINE_CELLS = (2**15, 2**17)  # tried in turn
-_LEAST_KNOTS = 4  # of a spline
-_DARK = 1e-12  # of all photons: such a cell cannot be a step of the curve
+MANY_BINS = 2**17  # bins of a histogram beyond which a coarser grid and interpolation are faster
+_FINE_CELLS = (2**15, 2**17)  # bins of the coarser grids, tried in turn
+_LEAST_KNOTS = 4  # knots of a cubic spline
+_DARK = 1e-12  # share of all photons below which a bin adds no knot: division by it amplifies rounding
 
 
 def fine_histograms(
     cells: Cells, bins: int, tolerance: float, compute: Callable[[Cells, int], FloatArray]
 ) -> FloatArray:
-    """Histograms (cells, bins) as ``compute(cells, bins)``, by fewer bins where these will do within `tolerance`."""
+    """Histograms (cells, bins) of ``compute(cells, bins)``, interpolated from fewer bins within `tolerance`."""
     if bins <= MANY_BINS:
         return compute(cells, bins)
     return np.concatenate([_fine(cells.part(slice(k, k + 1)), bins, tolerance, compute) for k in range(cells.size)])
@@ -593,24 +660,25 @@ def _fine(cell: Cells, bins: int, tolerance: float, compute: Callable[[Cells, in
         if before[-1] == 0.0 or misplaced(before, edges, light) > 2.0 * tolerance:
             continue
         counts = compute(cell, few)[0]
-        found = np.diff(registered_before(before, counts, light))
+        fine = np.diff(registered_before(before, counts, light))
         coarse = np.diff(registered_before(before[::2], counts.reshape(-1, 2).sum(-1), light))
-        if float(np.abs(found - coarse).sum()) <= 2.0 * tolerance * float(counts.sum()):
-            return found[None]
+        if float(np.abs(fine - coarse).sum()) <= 2.0 * tolerance * float(counts.sum()):
+            return fine[None]
     return compute(cell, bins)
 
 
 def light_before(cell: Cells, edges: FloatArray) -> FloatArray:
-    """Photons (n,) that reach the only cell between the start of the period and `edges` (n,), never decreasing."""
+    """Photons (n,) that reach the only cell between the start of the period and `edges` (n,); non-decreasing."""
     return np.maximum.accumulate(photons_before(cell, edges)[0])
 
 
 def misplaced(before: FloatArray, edges: FloatArray, light: FloatArray) -> float:
-    """Photons that a smooth curve through those before equal cells (m + 1,) misplaces within any of them.
+    """Largest number of photons that a smooth curve through the coarse grid misplaces within one of its bins.
 
-    `light` (n + 1,) are the photons before `edges`. The armed probability changes by no more than the photons of a
-    cell within it, so that registrations are displaced by at most a quarter of what is returned, relative to those
-    of the cell; of a cell of more than a photon by a share of it.
+    `before` (m + 1,) are the photons before the edges of m equal bins, `light` (n + 1,) those before `edges`. Within a
+    bin the armed probability changes by at most the photons of the bin, so that registrations are displaced by at most
+    a quarter of the result, relative to those of the bin. For bins of more than one photon the result is relative to
+    the photons of the bin.
     """
     from scipy.interpolate import PchipInterpolator
 
@@ -622,9 +690,10 @@ def misplaced(before: FloatArray, edges: FloatArray, light: FloatArray) -> float
 
 
 def registered_before(before: FloatArray, counts: FloatArray, light: FloatArray) -> FloatArray:
-    """Registrations up to where there were `light` (n,) photons, from `counts` (m,) of cells and photons before them.
+    """Registrations (n,) up to the times at which `light` (n,) photons have arrived.
 
-    A cubic spline whose slopes are limited so that it never falls, exact at the edges of cells.
+    A monotone cubic spline (limited slopes) of the registrations as a function of the photons, exact at the edges of
+    the m bins with `counts` (m,) registrations and `before` (m + 1,) photons.
     """
     from scipy.interpolate import CubicHermiteSpline, CubicSpline
 

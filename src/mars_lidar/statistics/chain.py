@@ -2,16 +2,16 @@
 
 Equation numbers refer to docs/theory.md. Times are in laser periods, fluxes in photons per bin and period.
 
-The state is the bin (of n) in which the last photon was registered. P is never needed as a matrix: its
-products are first-order recursions round the circle (2.4, 2.5), and its stationary distribution solves the
-*feedback* equation (2.8), in which the chain's own slow modes do not appear.
+The state is the bin (of n) of the last registration. P is never formed as a matrix: products with it are
+first-order recursions round the circle (2.4, 2.5), and its stationary distribution solves the *feedback*
+equation (2.8), which the slow modes of the chain do not enter.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,20 +20,19 @@ from mars_lidar._base import checks
 from mars_lidar._base.brief import brief
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
-from mars_lidar.statistics.cells import cell_name, photons_per_bin
+from mars_lidar.statistics.cells import MAX_PHOTONS, cell_name, photons_per_bin
 from mars_lidar.statistics.gate import require_mode
 from mars_lidar.statistics.phase_chain import ConvergenceError, Feedback, Solution, cyclic_recursion
 
 Rearm = Literal["centre", "edge"]
 
-_REARMS = ("centre", "edge")
+_REARMS = get_args(Rearm)
 _LONGEST = 2.0**31  # dead time, periods: beyond, its fraction of a bin has no digits, and nothing registers twice
-_MAX_PHOTONS = 1e6
 
 
 @dataclass(frozen=True, eq=False)
 class Stationary:
-    """Stationary distribution of a `PhaseChain`, with the evidence that it is one.
+    """Stationary distribution of a `PhaseChain`, with its residuals.
 
     Attributes
     ----------
@@ -42,9 +41,9 @@ class Stationary:
     rate
         Registrations per period (2.9); 1 / rate is the mean holding time in periods.
     residual
-        sum |pdf P - pdf|, by an O(n) product. In a slow-mixing chain it says little, which is why
+        sum |pdf P - pdf|, by an O(n) product; a weak test where the chain mixes slowly.
     error
-        the componentwise backward error of the feedback equation (2.8), is given beside it.
+        Componentwise backward error of the feedback equation (2.8), which does not depend on the mixing.
     sweeps
         Gauss-Seidel sweeps and Krylov steps spent; 0 where no iteration was needed.
     method
@@ -79,7 +78,7 @@ class PhaseChain:
     rearm
         ``"centre"`` or ``"edge"``.
     cell
-        Words that name this cell in warnings and errors.
+        Description of the pixel for warnings and errors.
 
     Attributes
     ----------
@@ -90,7 +89,7 @@ class PhaseChain:
     keep, fire
         (n,) probability q of passing a bin armed at its start, and p = 1 - q of firing in it.
     rekeep, refire
-        (n,) the same, q' and p', for the part of the bin that is left at re-arming.
+        (n,) the same, q' and p', for the part of the bin after re-arming.
     """
 
     photons: FloatArray
@@ -115,10 +114,10 @@ class PhaseChain:
         photons = np.array(self.photons, dtype=np.float64)
         if photons.ndim != 1 or photons.size == 0:
             raise ValueError(f"photons must be (n,) with n >= 1, got shape {photons.shape}")
-        bad = ~((photons >= 0) & (photons <= _MAX_PHOTONS))
+        bad = ~((photons >= 0) & (photons <= MAX_PHOTONS))
         if bad.any():
             k = int(np.argmax(bad))
-            raise ValueError(f"photons must lie in [0, {_MAX_PHOTONS:g}] per bin, got photons[{k}] = {photons[k]}")
+            raise ValueError(f"photons must lie in [0, {MAX_PHOTONS:g}] per bin, got photons[{k}] = {photons[k]}")
         total = float(photons.sum())
         if not total > 0:
             raise ValueError("photons must not all be 0: without flux there is no registration and no chain")
@@ -126,7 +125,7 @@ class PhaseChain:
         checks.choice("rearm", self.rearm, _REARMS)
         photons.flags.writeable = False
         n = photons.size
-        # whole periods apart first: t_d of 200.9 periods must not cost digits of its fraction (2.2)
+        # whole periods are split off first, so that t_d = 200.9 periods does not lose digits of its fraction (2.2)
         whole = math.floor(dead)
         position = (dead - whole) * n + (0.5 if self.rearm == "centre" else 0.0)
         shift = math.floor(position)
@@ -196,13 +195,13 @@ class PhaseChain:
         return self.at_rearming(self.refire * values + self.rekeep * np.roll(ahead, -1))
 
     def at_rearming(self, values: FloatArray) -> FloatArray:
-        """`values` (n,) of the re-arming bins, read by the bin of the registration before."""
+        """`values` (n,) of the re-arming bins, indexed by the bin of the preceding registration."""
         return np.roll(values, -self.shift)
 
     def dense(self) -> FloatArray:
         """The transition matrix P (n, n), rows sum to 1: that of first arrivals, each row shifted round (2.3)."""
         n = self.bins
-        order = (np.arange(n)[:, None] + np.arange(n)) % n  # bins in the order met after arming in bin a
+        order = (np.arange(n)[:, None] + np.arange(n)) % n  # bins in the order of their times after arming in bin a
         met = self.photons[order]
         met[:, 0] *= 1.0 - self.fraction
         before = np.zeros((n, n))
@@ -240,16 +239,16 @@ class PhaseChain:
             raise ConvergenceError(f"{self.describe()}: {error}") from None
 
     def describe(self) -> str:
-        """The cell in words, for warnings and errors."""
-        told = f"{self.total:g} photons per period in {self.bins} bins, t_d = {self.dead_time:g} periods"
-        return self.cell or told
+        """Description of the pixel, for warnings and errors."""
+        description = f"{self.total:g} photons per period in {self.bins} bins, t_d = {self.dead_time:g} periods"
+        return self.cell or description
 
 
 def stationary_from(chain: PhaseChain, solution: Solution) -> Stationary:
     """Stationary distribution from the solution w of the feedback equation (2.9)."""
     weight = np.maximum(solution.x, 0.0)
     pdf = weight / weight.sum()
-    # Round-off of the solve is absolute. One step of the chain, which only adds, makes it relative.
+    # The rounding error of the solution is absolute; one step of the chain, which only adds, makes it relative.
     pdf = chain.left(pdf)
     pdf /= pdf.sum()
     residual = float(np.abs(chain.left(pdf) - pdf).sum())

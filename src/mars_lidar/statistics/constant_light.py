@@ -16,14 +16,13 @@ from numpy.typing import NDArray
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
 from mars_lidar.instrument.detector import Detector, require_effects
-from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
+from mars_lidar.instrument.effects import LIGHT_EFFECTS, MAX_RATE_HZ, TIMING_EFFECTS
 
 _EFFECTS = (*LIGHT_EFFECTS, "afterpulsing", "twilight_ns", "recovery_ns", *TIMING_EFFECTS)
-_TOLERANCE = 1e-12
-_ROUNDS = 500
-_SMALL, _LARGE = 1e-9, 1e3  # photons in a time constant
-_MOST_CELLS = 2**22
-_MAX_RATE_HZ = 1e12
+_TOLERANCE = 1e-12  # relative change of the mean interval between iterations
+_ROUNDS = 500  # iterations
+_SMALL, _LARGE = 1e-9, 1e3  # photons in a time constant below and above which a series replaces the gamma function
+_MOST_CELLS = 2**22  # cells of sampled delays: 32 MiB an array
 
 
 @checked
@@ -32,8 +31,8 @@ def constant_light_rate(rate_hz: float, detector: Detector) -> float:
 
     Exact without afterpulsing, 1 / (t_d + e^(-lambda alpha) w) with the mean wait w of an armed pixel: 1 / lambda, or
     r e^a a^-a gamma(a, a), a = lambda r, where its sensitivity returns with the time constant r. With afterpulsing it
-    is the law to first order in the afterpulse probability p: the carriers in the traps are taken to be those of the
-    mean over all histories, so that the error is of the order p^2.
+    is exact to first order in the afterpulse probability p: the trapped carriers are replaced by their mean over all
+    histories, with an error of the order p^2.
 
     Parameters
     ----------
@@ -43,7 +42,7 @@ def constant_light_rate(rate_hz: float, detector: Detector) -> float:
         Of mode ``"nonparalyzable"``, without crosstalk or a longer dead time of the electronics, and afterpulses of all
         generations, not together with `recovery_ns`.
     """
-    light = checks.real("rate_hz", rate_hz, low=0.0, high=_MAX_RATE_HZ)
+    light = checks.real("rate_hz", rate_hz, low=0.0, high=MAX_RATE_HZ)
     require_effects("constant_light_rate", detector, _EFFECTS, lambda _: "; simulate it with engine 'sequential'")
     if detector.mode != "nonparalyzable":
         raise ValueError(f"constant_light_rate treats mode 'nonparalyzable' only, got {detector.mode!r}")
@@ -82,23 +81,23 @@ def _wait(rate: float, recovery: float) -> float:
 
 
 def _exponential(rate: float, dead: float, twilight: float, p: float, delay: float) -> float:
-    """Mean interval, ns. Every avalanche finds the same decaying intensity, level / delay e^(-u / delay)."""
+    """Mean interval, ns; the release rate after every avalanche is level / delay e^(-u / delay)."""
     from scipy.integrate import quad
 
     scale = min(delay, 1.0 / rate)  # of the integrands
     level, interval = p, math.inf
     for _ in range(_ROUNDS):
-        seen = level * math.exp(-dead / delay)
-        again = -math.expm1(-rate * twilight - seen * math.expm1(twilight / delay))
+        released = level * math.exp(-dead / delay)
+        again = -math.expm1(-rate * twilight - released * math.expm1(twilight / delay))
 
-        def armed(s: float, seen: float = seen) -> float:  # P(no avalanche up to s after the recovery)
-            return math.exp(-rate * s + seen * math.expm1(-s / delay))
+        def armed(s: float, released: float = released) -> float:  # P(no avalanche up to s after the recovery)
+            return math.exp(-rate * s + released * math.expm1(-s / delay))
 
-        def soon(x: float, seen: float = seen) -> float:  # its part that depends on the releases
-            return scale * math.exp(-rate * x * scale - seen) * math.expm1(seen * math.exp(-x * scale / delay))
+        def soon(x: float, released: float = released) -> float:  # the part of `armed` that depends on the releases
+            return scale * math.exp(-rate * x * scale - released) * math.expm1(released * math.exp(-x * scale / delay))
 
         # E e^(-s / delay) of the next avalanche, by parts
-        mean = math.exp(-seen) / rate + quad(soon, 0.0, 60.0, epsabs=0.0, limit=400)[0]
+        mean = math.exp(-released) / rate + quad(soon, 0.0, 60.0, epsabs=0.0, limit=400)[0]
         part = quad(lambda x: armed(x * scale) * math.exp(-x * scale / delay) * scale, 0.0, 60.0, limit=400)[0]
         decay = again + (1.0 - again) * (1.0 - part / delay)
         level, last, interval = p / (1.0 - math.exp(-dead / delay) * decay), interval, dead + (1.0 - again) * mean
@@ -108,7 +107,7 @@ def _exponential(rate: float, dead: float, twilight: float, p: float, delay: flo
 
 
 def _sampled(rate: float, dead: float, twilight: float, density: NDArray[np.float64], cell: float) -> float:
-    """Mean interval, ns; `density` (n,) are the carriers of an avalanche in cells of `cell` ns."""
+    """Mean interval, ns; `density` (n,): trapped carriers of one avalanche by release time, in cells of `cell` ns."""
     from scipy.signal import fftconvolve
 
     n, edges = density.size, np.arange(density.size + 1, dtype=np.float64) * cell
@@ -127,10 +126,10 @@ def _sampled(rate: float, dead: float, twilight: float, density: NDArray[np.floa
         armed = np.exp(-np.concatenate([[0.0], np.cumsum(hazard)]))
         fires = -np.diff(armed)
         mean = float(np.sum(fires / hazard) * cell + armed[-1] / rate)
-        # what an avalanche `s` after the recovery finds at u: the carriers at dead + s + u; s in the middle of a cell
+        # carriers at dead + s + u are released u after an avalanche `s` after the recovery; s at the cell centre
         later = between(edges + (dead + 0.5 * cell))
-        found = fftconvolve(later, fires[::-1])[n - 1 :]
-        carriers = density + (1.0 - again) * np.maximum(found, 0.0) + again * free
+        trapped = fftconvolve(later, fires[::-1])[n - 1 :]
+        carriers = density + (1.0 - again) * np.maximum(trapped, 0.0) + again * free
         last, interval = interval, dead + (1.0 - again) * mean
         if abs(interval - last) <= _TOLERANCE * interval:
             return interval

@@ -1,7 +1,7 @@
 """Probabilities of the count of an exposure: closed forms, and the inversion of the generating function E z^N.
 
-The support comes first, from rigorous bounds of the tails (`Window`); then the generating function is evaluated at as
-many points of the unit circle as the support has counts, and an FFT turns it into probabilities. Equation numbers:
+Rigorous tail bounds give the support; the generating function is evaluated at as many points of the unit circle as the
+support has counts, and an FFT gives the probabilities. Equation numbers:
 docs/theory_exposure.md, section 8.
 """
 
@@ -18,19 +18,19 @@ from numpy.typing import NDArray
 from mars_lidar._base.native import _core
 from mars_lidar._base.types import FloatArray, IndexArray
 from mars_lidar.statistics.cells import Cells
-from mars_lidar.statistics.exposure import NOT_WARM, native_light, refined_moments, warm_history
+from mars_lidar.statistics.exposure import NOT_WARM, UNSETTLED, native_light, refined_moments, warm_history
 from mars_lidar.statistics.phase_chain import ConvergenceError
 
 # --- Support of the count, and closed forms ------------------------------------------------------------------------
 
-TAIL = 1e-12  # probability that may lie outside the support, at either end
+TAIL = 1e-12  # bound on the probability outside the support, at either end
 
 
 @dataclass(frozen=True, eq=False)
 class Pmf:
     """Probabilities `p` (w,) of the counts `first`, `first` + 1, ...; at most `outside` lies elsewhere.
 
-    Of simulated counts their frequencies.
+    For simulated counts `p` holds their frequencies.
     """
 
     first: int
@@ -58,7 +58,7 @@ class Pmf:
 
 
 def poisson_window(mean: float) -> Pmf:
-    """Poisson law: exact without dead time. The support comes from Bernstein's bounds of the two tails."""
+    """Poisson law, exact without dead time; the support follows from Bernstein's bounds of the two tails."""
     from scipy.special import gammaln, xlogy
 
     reach = -math.log(TAIL)
@@ -71,7 +71,7 @@ def poisson_window(mean: float) -> Pmf:
 def gaussian_window(mean: float, variance: float) -> Pmf:
     """Normal law on the integers: P(n) = Phi((n + 1/2 - mean) / sd) - Phi((n - 1/2 - mean) / sd).
 
-    What lies below 0 is in P(0).
+    P(0) includes the probability below 0.
     """
     from scipy.special import ndtr
 
@@ -84,7 +84,7 @@ def gaussian_window(mean: float, variance: float) -> Pmf:
     edges = np.arange(low, high + 2) - 0.5 - mean
     if low == 0:
         edges[0] = -np.inf
-    # differences of the smaller of the two tails keep their digits at both ends
+    # the difference of the smaller of the two tails avoids cancellation at both ends
     below, above = ndtr(edges / spread), ndtr(-edges / spread)
     pmf = np.where(edges[:-1] > 0, above[:-1] - above[1:], below[1:] - below[:-1])
     return Pmf(low, np.maximum(pmf, 0.0), float(below[0] + above[-1]))
@@ -92,37 +92,36 @@ def gaussian_window(mean: float, variance: float) -> Pmf:
 
 # --- The generating function and its cost --------------------------------------------------------------------------
 
-_UNSETTLED = -2
-_MAX_STEPS, _LANES = 80_000_000, 8  # bins x periods of a cell's points together, a second; points that run at once
-# A history of more bytes, or a dead time below a bin, makes a step cost as many; one beyond every cache six times that
+_MAX_STEPS = 80_000_000  # bins x periods x batches of points for the law of one cell: a second
+_LANES = 8  # points of the circle evaluated together
+# Bytes of the history beyond which a step costs 4 times as much (as for a dead time below one bin), and 24 times
 _NEAR_BYTES, _FAR_BYTES, _FAR = 1 << 20, 1 << 26, 4.0
-_PERIOD_BINS = 128.0  # bins that cost as much as what is done once a period
+_PERIOD_BINS = 128.0  # bins that take as long as the work done once a period
 
 
 class TooLongError(ConvergenceError):
-    """A transform whose state does not repeat for longer than a law is to take."""
+    """The state did not repeat within the step budget of a law."""
 
 
-class Purse:
-    """Steps (bins x periods, `_LANES` points at once) that are left for the law of one cell."""
+class StepBudget:
+    """Remaining steps (bins x periods, `_LANES` points at once) for the law of one cell; `share` of the full budget."""
 
     def __init__(self, share: float = 1.0) -> None:
-        self.left = share * _MAX_STEPS
+        self.steps = share * _MAX_STEPS
 
 
 def characteristic(
-    cells: Cells, z_re: FloatArray, z_im: FloatArray | None, bins: int, threads: int, purse: Purse | None = None
+    cells: Cells, z_re: FloatArray, z_im: FloatArray | None, bins: int, threads: int, budget: StepBudget | None = None
 ) -> tuple[FloatArray, FloatArray]:
-    """E z^N (re, im) of each cell at its points (cells, points); without `z_im` its logarithm at real z."""
-
-    purse, batches = purse or Purse(), math.ceil(z_re.shape[1] / _LANES)
+    """E z^N (re, im) of each cell at its points z (cells, points); without `z_im` log E z^N at real z."""
+    budget, batches = budget or StepBudget(), math.ceil(z_re.shape[1] / _LANES)
     dead = cells.system.dead_time_periods
     reach = 256.0 * bins * (min(dead, float(cells.system.cycles)) + 1.0)
-    dear = 6.0 * _FAR if reach > _FAR_BYTES else _FAR if reach > _NEAR_BYTES or dead * bins < 1.0 else 1.0
-    dear *= 1.0 + _PERIOD_BINS / bins
-    # at real points the blind of every period of a dead time are summed
-    dear *= 1.0 + (min(dead, float(cells.system.cycles)) / bins if z_im is None else 0.0)
-    steps = max(int(purse.left / dear) // batches, bins)
+    cost = 6.0 * _FAR if reach > _FAR_BYTES else _FAR if reach > _NEAR_BYTES or dead * bins < 1.0 else 1.0
+    cost *= 1.0 + _PERIOD_BINS / bins
+    # at real points the registrations of every period of a dead time are summed
+    cost *= 1.0 + (min(dead, float(cells.system.cycles)) / bins if z_im is None else 0.0)
+    steps = max(int(budget.steps / cost) // batches, bins)
     grid = cells.grid(bins, 1, steps)
     re, im = np.empty(z_re.shape), np.empty(z_re.shape)
     settled = np.empty(z_re.shape, np.int64)
@@ -147,7 +146,7 @@ def characteristic(
         _core.exposure_characteristic(grid=grid, light=light, **again, threads=threads)
         for name, array in (("re", re), ("im", im), ("settled", settled)):
             array[cold] = again[name]
-    lost = (settled == _UNSETTLED).any(-1)
+    lost = (settled == UNSETTLED).any(-1)
     if lost.any():
         raise TooLongError(
             f"count law of {cells.name(int(np.argmax(lost)))}: the state of the pixel does not repeat within "
@@ -155,32 +154,32 @@ def characteristic(
             f"variance and two more cumulants are known; for the law {cells.instead}"
         )
     taken = np.where(settled >= 0, settled, cells.system.cycles).mean(-1).max()
-    purse.left = max(purse.left - float(taken) * bins * batches * dear, 1.0)
+    budget.steps = max(budget.steps - float(taken) * bins * batches * cost, 1.0)
     return re, im
 
 
 # --- Probabilities -------------------------------------------------------------------------------------------------
 
-_TILTS = np.array([1.0, 2.0, 3.5, 5.0, 6.5, 8.0, 11.0, 15.0])  # standard deviations of reach
-_MAX_TILT = 25.0
-_MAX_LOG_GROWTH = 600.0  # of one period, below the largest double
-_CONSISTENT = 1e-5  # agreement demanded of the pmf with the cumulants, in standard deviations
-_CONSISTENT_PER_CYCLE = 1e-13  # and what extrapolation over so many cycles may add by rounding
-_MAX_COUNTS = 2**24
-_FOR_SUPPORT = 0.25  # of the steps of a law, to bound its support; a guess must do beyond
-_WIDE_REACH = 12.0  # standard deviations, and counts beside them, of that guess
-_REACH, _MARGIN = 7.5, 6.0  # of a guessed window: standard deviations, and counts beside them
-_WIDEST_GUESS = 1024
-_EDGE = 1e-10  # probability at the ends of a guessed window that holds all
-_LIKE_CUMULANTS = 0.02  # standard deviations by which the mean may differ from the one that was guessed by
-_BLOCK = 64  # cells at a time
-_ALL_POINTS = 256  # of the circle: narrower laws take all points
-_QUIET = 1e-15  # of the transform of a wide law, that counts as 0
-_SHORT_VARIANCE, _SHORTER = 4.0, 6  # the exposure in which other peaks are looked for: variance, and how much shorter
+_TILTS = np.array([1.0, 2.0, 3.5, 5.0, 6.5, 8.0, 11.0, 15.0])  # exponential tilts in units of 1 / standard deviation
+_MAX_TILT = 25.0  # largest tilt, per count
+_MAX_LOG_GROWTH = 600.0  # log of E e^(theta N) of one period; the largest double is e^709
+_CONSISTENT = 1e-5  # allowed disagreement of the pmf with the cumulants, in standard deviations
+_CONSISTENT_PER_CYCLE = 1e-13  # the same per extrapolated cycle, for rounding
+MAX_COUNTS = 2**24  # counts of a listed law: 128 MiB
+_FOR_SUPPORT = 0.25  # share of the step budget for the bounds of the support; beyond, the support is guessed
+_WIDE_REACH = 12.0  # half width of that guess, in standard deviations plus one count
+REACH, MARGIN = 7.5, 6.0  # half width of a guessed window: standard deviations, and additional counts
+_WIDEST_GUESS = 1024  # counts of a guessed window
+_EDGE = 1e-10  # largest probability at the ends of a window that contains the law
+_LIKE_CUMULANTS = 0.02  # allowed difference from the assumed mean, in standard deviations
+_BLOCK = 64  # cells evaluated together
+_ALL_POINTS = 256  # counts; a wider law is evaluated only on the points where its transform is not 0
+_QUIET = 1e-15  # modulus of the transform below which it counts as 0
+_SHORT_VARIANCE, _SHORTER = 4.0, 6  # variance of the shorter exposure searched for further peaks; least shortening
 
 
 def exact_windows(cells: Cells, cumulants: FloatArray, bins: IndexArray, threads: int) -> list[Pmf]:
-    """Exact pmf of each cell, on the grid of `bins` (cells,) that its `cumulants` (cells, 4) needed."""
+    """Exact pmf of each cell, on the grid of `bins` (cells,) on which its `cumulants` (cells, 4) converged."""
     if cells.system.dead_time_periods == 0.0:
         return [poisson_window(float(mean)) for mean in cumulants[:, 0]]
     cells = cells.resolved(1)
@@ -189,15 +188,15 @@ def exact_windows(cells: Cells, cumulants: FloatArray, bins: IndexArray, threads
     for n in np.unique(bins[~dark]):
         index = np.flatnonzero((bins == n) & ~dark)
         cells.check_history(int(n))
-        for block in np.array_split(index, math.ceil(index.size / 64)):
+        for block in np.array_split(index, math.ceil(index.size / _BLOCK)):
             try:
                 lows, highs, outside = _supports(cells.part(block), cumulants[block], int(n), threads)
             except TooLongError:
                 lows, highs, outside = _guessed_supports(cells, cumulants[block])
             for k, cell in enumerate(block):
-                one = cells.part(block[k : k + 1])
+                single = cells.part(block[k : k + 1])
                 spread = float(cumulants[cell, 1])
-                window = _window(one, int(lows[k]), int(highs[k]), float(outside[k]), int(n), threads, spread)
+                window = _window(single, int(lows[k]), int(highs[k]), float(outside[k]), int(n), threads, spread)
                 _check(cells, int(cell), window, cumulants[cell])
                 windows[cell] = window
     return [window for window in windows if window is not None]
@@ -206,14 +205,15 @@ def exact_windows(cells: Cells, cumulants: FloatArray, bins: IndexArray, threads
 def guessed_windows(
     cells: Cells, cumulants: FloatArray, bins: IndexArray, threads: int, waiting: Callable[[int], object] | None = None
 ) -> list[Pmf]:
-    """Exact pmf of each cell where its cumulants (cells, 4) are known but roughly, as from a table.
+    """Exact pmf of each cell, given approximate cumulants (cells, 4), for example from a table.
 
-    The support is guessed by them and the result tells whether the guess was right; where not, `exact_windows` of the
-    cell's own cumulants. That is several times faster for narrow laws. `waiting` is called with the cells done.
+    The approximate cumulants give the support. Where the result shows that the support is too small, `exact_windows`
+    with the exact cumulants replaces it. For narrow laws this is several times faster than `exact_windows`. `waiting`
+    is called with the number of cells done.
     """
     cells = cells.resolved(1)
     spread = np.sqrt(np.maximum(cumulants[:, 1], 0.0))
-    half = np.ceil(_REACH * spread + _MARGIN)
+    half = np.ceil(REACH * spread + MARGIN)
     size = (8.0 * np.ceil((2.0 * half + 1.0) / 8.0)).astype(np.int64)
     first = np.maximum(np.floor(cumulants[:, 0]) - half, 0.0).astype(np.int64)
     windows: list[Pmf | None] = [None] * cells.size
@@ -225,8 +225,10 @@ def guessed_windows(
             guessed = width <= _WIDEST_GUESS
             pmf = _folded(cells.part(block), first[block], int(width), int(n), threads) if guessed else None
             for k, cell in enumerate(block):
-                found = None if pmf is None else _if_whole(pmf[k], int(first[cell]), cumulants[cell, 0], spread[cell])
-                windows[cell] = found or _alone(cells.part(block[k : k + 1]), threads)
+                candidate = (
+                    None if pmf is None else _if_whole(pmf[k], int(first[cell]), cumulants[cell, 0], spread[cell])
+                )
+                windows[cell] = candidate or _alone(cells.part(block[k : k + 1]), threads)
             done += block.size
             if waiting is not None:
                 waiting(done)
@@ -234,7 +236,7 @@ def guessed_windows(
 
 
 def _folded(cells: Cells, first: IndexArray, size: int, bins: int, threads: int) -> FloatArray:
-    """Probabilities (cells, size) of the counts from `first` (cells,) on, as (23) has them."""
+    """Probabilities (cells, size) of the counts `first` (cells,), `first` + 1, ..., aliased modulo `size` (23)."""
     angle = 2.0 * np.pi * np.arange(size // 2 + 1) / size
     shape = (cells.size, 1)
     re, im = characteristic(cells, np.tile(np.cos(angle), shape), np.tile(np.sin(angle), shape), bins, threads)
@@ -243,7 +245,7 @@ def _folded(cells: Cells, first: IndexArray, size: int, bins: int, threads: int)
 
 
 def _if_whole(pmf: FloatArray, first: int, mean: float, spread: float) -> Pmf | None:
-    """The window if it holds all of the law: nothing at its ends, no negative probability, the mean where it was."""
+    """The window if it contains the law: ends below `_EDGE`, nothing negative, sum 1, the assumed mean; else None."""
     away = float(pmf @ (first + np.arange(pmf.size))) - mean
     ends = _ends(pmf, first)
     if not (ends <= _EDGE and abs(away) <= _LIKE_CUMULANTS * max(spread, 0.5) and float(pmf.min()) >= -_CONSISTENT):
@@ -254,13 +256,13 @@ def _if_whole(pmf: FloatArray, first: int, mean: float, spread: float) -> Pmf | 
 
 
 def _ends(pmf: FloatArray, first: int, most: float = math.inf) -> float:
-    """The larger probability of a window's first and last count, of those that others may lie beyond."""
+    """Larger probability of the first and last count of a window, ignoring an end at which the counts end."""
     low = abs(float(pmf[0])) if first > 0 else 0.0
     return max(low, abs(float(pmf[-1])) if first + pmf.size - 1 < most else 0.0)
 
 
 def _alone(cell: Cells, threads: int) -> Pmf:
-
+    """Exact pmf of one cell with its own cumulants."""
     own = refined_moments(cell, 1, tolerance=1e-4, threads=threads)
     return exact_windows(cell, own.cumulants.reshape(-1, 4), own.bins.reshape(-1), threads)[0]
 
@@ -268,7 +270,7 @@ def _alone(cell: Cells, threads: int) -> Pmf:
 def _supports(
     cells: Cells, cumulants: FloatArray, bins: int, threads: int
 ) -> tuple[IndexArray, IndexArray, FloatArray]:
-    """First and last count of the support of each cell, and a bound on the probability outside (24)."""
+    """First and last count of the support of each cell, and a bound on the probability outside it (24)."""
     mean, spread = cumulants[:, 0], np.sqrt(cumulants[:, 1])
     # a period multiplies E e^(theta N) at most by e^(theta (1 + t_r/t_d)) and by exp(Lambda (e^theta - 1))
     dead = cells.system.dead_time_periods
@@ -276,11 +278,11 @@ def _supports(
         _MAX_LOG_GROWTH / (1.0 + 1.0 / dead),
         np.log1p(_MAX_LOG_GROWTH / np.maximum(cells.total, 1e-300)),
     )
-    # as many deviations as fit below the limit: where counts beyond the usual one are rare, small tilts bound best
+    # the tilts are scaled down to the limit; where large counts are rare, small tilts give the best bounds
     unit = np.minimum(1.0 / np.maximum(spread, 1e-300), np.minimum(growth, _MAX_TILT) / _TILTS[-1])
     tilt = _TILTS * unit[:, None]
     tilt = np.concatenate([tilt, -tilt], axis=1)
-    log_value = characteristic(cells, np.exp(tilt), None, bins, threads, Purse(_FOR_SUPPORT))[0]
+    log_value = characteristic(cells, np.exp(tilt), None, bins, threads, StepBudget(_FOR_SUPPORT))[0]
     with np.errstate(invalid="ignore"):
         # P(N >= edge) <= tail for a positive tilt, P(N <= edge) <= tail for a negative one
         edge = (log_value - math.log(TAIL)) / tilt
@@ -291,24 +293,24 @@ def _supports(
     last = np.minimum(np.ceil(high) - 1.0, most)
     first = np.clip(np.floor(low) + 1.0, 0.0, np.floor(mean))
     last = np.maximum(last, np.ceil(mean))
-    if (last - first >= _MAX_COUNTS).any():
+    if (last - first >= MAX_COUNTS).any():
         k = int(np.argmax(last - first))
         raise ConvergenceError(
             f"count law of {cells.name(k)}: its support of {last[k] - first[k]:.3g} counts exceeds "
-            f"{_MAX_COUNTS}; mean, variance and cumulants are known; use method 'mars' or 'renewal' for a Gaussian"
+            f"{MAX_COUNTS}; mean, variance and cumulants are known; use method 'mars' or 'renewal' for a Gaussian"
         )
-    # where the support ends at the least or the largest possible count nothing lies beyond
+    # no probability lies beyond the smallest and the largest possible count
     outside = TAIL * ((first > 0).astype(np.float64) + (last < most))
     return first.astype(np.int64), last.astype(np.int64), outside
 
 
 def _most(cells: Cells) -> float:
-    """The largest count that is possible."""
+    """Largest possible count."""
     return min(math.floor(cells.system.cycles / cells.system.dead_time_periods) + 1.0, 9e15)
 
 
 def _guessed_supports(cells: Cells, cumulants: FloatArray) -> tuple[IndexArray, IndexArray, FloatArray]:
-    """Supports by mean and variance alone; `_check` then tells whether they hold all of the law."""
+    """Supports from mean and variance alone; `_check` verifies that they contain the law."""
     spread, mean = np.sqrt(cumulants[:, 1]), cumulants[:, 0]
     half = np.ceil(_WIDE_REACH * (spread + 1.0))
     most = _most(cells)
@@ -317,14 +319,15 @@ def _guessed_supports(cells: Cells, cumulants: FloatArray) -> tuple[IndexArray, 
 
 
 def _window(cell: Cells, first: int, last: int, outside: float, bins: int, threads: int, variance: float) -> Pmf:
+    """Exact pmf of one cell on the counts `first` to `last`."""
     from scipy.fft import irfft  # of lengths with a large prime factor twice as fast as NumPy's
 
-    counts, purse = last - first + 1, Purse()
+    counts, budget = last - first + 1, StepBudget()
     size = counts + counts % 2
-    value = _narrow(cell, size, bins, threads, variance, purse) if size > _ALL_POINTS else None
+    value = _narrow(cell, size, bins, threads, variance, budget) if size > _ALL_POINTS else None
     if value is None:
         angle = 2.0 * np.pi * np.arange(size // 2 + 1) / size
-        re, im = characteristic(cell, np.cos(angle)[None], np.sin(angle)[None], bins, threads, purse)
+        re, im = characteristic(cell, np.cos(angle)[None], np.sin(angle)[None], bins, threads, budget)
         value = re[0] - 1j * im[0]
     # the transform has e^(-i angle n): the conjugate; index n mod size holds count n (23)
     folded = np.asarray(irfft(value, size))
@@ -332,13 +335,13 @@ def _window(cell: Cells, first: int, last: int, outside: float, bins: int, threa
 
 
 def _narrow(
-    cell: Cells, size: int, bins: int, threads: int, variance: float, purse: Purse
+    cell: Cells, size: int, bins: int, threads: int, variance: float, budget: StepBudget
 ) -> NDArray[np.complex128] | None:
-    """Conjugate of E z^N on the points (size // 2 + 1,) of the circle where it is not 0; None where that is not sure.
+    """Conjugate of E z^N at the points (size // 2 + 1,) of the circle, evaluated where it is not 0; None if unproven.
 
-    A wide law has a narrow transform, about 1 at z = 1 and nothing beyond some 9 standard deviations of its own width,
-    unless counts keep to a lattice (all even, say): then it has other peaks, as narrow. Those are looked for in a much
-    shorter exposure, whose transform has them too, and wide enough to be seen on few points (27).
+    The transform of a wide law is a narrow peak at z = 1, below rounding beyond some 9 of its standard deviations,
+    unless the counts lie on a lattice (all even, say), which gives further peaks of the same width. These also occur in
+    the transform of a much shorter exposure, where they are wide enough to be found on few points (27).
     """
     cycles = cell.system.cycles
     shorter = max(1, math.ceil(_SHORT_VARIANCE * cycles / max(variance, 1e-300)))
@@ -346,11 +349,13 @@ def _narrow(
         return None
     angle = 2.0 * np.pi * np.arange(size // 2 + 1) / size
     value = np.zeros(angle.size, np.complex128)
-    step = max(8, math.ceil(2.0 * size / (2.0 * np.pi * math.sqrt(variance))))  # some two standard deviations
+    step = max(
+        8, math.ceil(2.0 * size / (2.0 * np.pi * math.sqrt(variance)))
+    )  # about two standard deviations of the peak
     end = 0
     while end < angle.size:
         some = slice(end, min(end + step, angle.size))
-        re, im = characteristic(cell, np.cos(angle[some])[None], np.sin(angle[some])[None], bins, threads, purse)
+        re, im = characteristic(cell, np.cos(angle[some])[None], np.sin(angle[some])[None], bins, threads, budget)
         value[some] = re[0] - 1j * im[0]
         end = some.stop
         if np.abs(value[some]).max() <= _QUIET:
@@ -358,30 +363,30 @@ def _narrow(
     spread = math.sqrt(variance * shorter / cycles)
     begin = min(4.0 / spread, np.pi)
     between = np.geomspace(angle[min(end, angle.size - 1)], max(begin, angle[min(end, angle.size - 1)]), 16)
-    re, im = characteristic(cell, np.cos(between)[None], np.sin(between)[None], bins, threads, purse)
+    re, im = characteristic(cell, np.cos(between)[None], np.sin(between)[None], bins, threads, budget)
     beyond = np.linspace(begin, np.pi, 2 + math.ceil((np.pi - begin) * spread / 0.3))
     brief = replace(cell, system=cell.system.replace(cycles=shorter))
-    short_re, short_im = characteristic(brief, np.cos(beyond)[None], np.sin(beyond)[None], bins, threads, purse)
+    short_re, short_im = characteristic(brief, np.cos(beyond)[None], np.sin(beyond)[None], bins, threads, budget)
     highest = float(np.hypot(short_re, short_im).max())
     faint = float(np.hypot(re, im).max()) <= 10.0 * _QUIET
     return value if faint and highest ** (cycles / shorter) <= 1e-3 * _QUIET else None
 
 
 def _check(cells: Cells, cell: int, window: Pmf, cumulants: FloatArray) -> None:
-    """The pmf must be one, and have the mean and variance that came another way; then rounding is removed."""
+    """Check sum, sign, mean and variance of the pmf against the cumulants; then clip and normalise it in place."""
     pmf: NDArray[np.float64] = window.p
     offset = window.first + np.arange(pmf.size) - cumulants[0]
     spread = max(math.sqrt(cumulants[1]), 1e-3)
     edge = _EDGE + _CONSISTENT_PER_CYCLE * cells.system.cycles
     if window.outside > TAIL * 4.0 and _ends(pmf, window.first, _most(cells)) > edge:  # a guessed support
         raise ConvergenceError(
-            f"count law of {cells.name(cell)}: it reaches beyond {window.first} .. {window.first + pmf.size - 1}, "
-            f"where mean and variance let expect its end; mean, variance and cumulants are known; for the law "
+            f"count law of {cells.name(cell)}: it extends beyond {window.first} .. {window.first + pmf.size - 1}, "
+            f"the support expected from mean and variance; mean, variance and cumulants are known; for the law "
             f"{cells.instead}"
         )
     total, mean = float(pmf.sum()), float((pmf * offset).sum())
     variance, least = float((pmf * offset**2).sum()), float(pmf.min())
-    # rounding and extrapolation err in probabilities, whatever the width: for a locked count, more than its variance
+    # errors of rounding and extrapolation are absolute in probability; for a locked count they may exceed its variance
     rounding, unit = _CONSISTENT_PER_CYCLE * cells.system.cycles, max(spread, 1.0)
     error = max(
         abs(total - 1.0) / (_CONSISTENT + rounding),

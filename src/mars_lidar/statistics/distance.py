@@ -1,4 +1,4 @@
-"""Distance of a count law to simulated counts, and what of it is sampling noise."""
+"""Distances and tests between count laws and simulated counts."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics.count_pmf import Pmf as Pmf
 
 _POOLED = 5.0  # expected counts below which cells of a G-test are pooled
-KL_FLOOR = 1e-12  # of a law's probabilities in a Kullback-Leibler divergence, which is infinite without
-_NEGLIGIBLE = 1e-10  # probability left out of the bootstrap's classes, in one class of its own
+KL_FLOOR = 1e-12  # lower bound of a law's probabilities in a Kullback-Leibler divergence, which keeps it finite
+_NEGLIGIBLE = 1e-10  # expected counts below which the bootstrap pools the classes into one
 
 
 def total_variation(a: Pmf, b: Pmf) -> float:
@@ -25,41 +25,43 @@ def total_variation(a: Pmf, b: Pmf) -> float:
 
 def sampling_floor(law: Pmf, size: int, draws: int, random: np.random.Generator) -> FloatArray:
     """Total variation (draws,) to `law` of samples of `size` counts drawn from it (parametric bootstrap)."""
-    kept = law.p > _NEGLIGIBLE / size
-    p = np.append(law.p[kept], max(1.0 - float(law.p[kept].sum()), 0.0))
+    listed = law.p > _NEGLIGIBLE / size
+    p = np.append(law.p[listed], max(1.0 - float(law.p[listed].sum()), 0.0))
     p /= p.sum()
-    found = np.empty(draws)
+    distances = np.empty(draws)
     step = max(1, 2**22 // p.size)
     for start in range(0, draws, step):
         drawn = random.multinomial(size, p, size=min(step, draws - start))
-        found[start : start + step] = 0.5 * np.abs(drawn / size - p).sum(-1)
-    return found
+        distances[start : start + step] = 0.5 * np.abs(drawn / size - p).sum(-1)
+    return distances
 
 
 def g_test(law: Pmf, sample: Pmf, size: int, *, any_mean: bool = False) -> float:
     """p-value of a sample of `size` counts under the law; counts expected fewer than 5 times are pooled.
 
-    1 where the law leaves nothing to test: a single class. `any_mean`: the law's mean has an error of its own, or was
-    fitted to the sample; a shift of the mean, to first order, is left out.
+    Returns 1 where pooling leaves a single class. `any_mean`: the mean of the law is fitted or uncertain; the test then
+    ignores a shift of the mean, to first order.
     """
     from scipy.stats import binomtest, chi2
 
     low, high = min(law.first, sample.first), max(law.last, sample.last)
     expected, observed = law.on(low, high) * size, sample.on(low, high) * size
     counts = low + np.arange(expected.size)
-    moved = expected * (counts - float(expected @ counts) / max(float(expected.sum()), 1e-300))  # by a shift of the law
+    moved = expected * (
+        counts - float(expected @ counts) / max(float(expected.sum()), 1e-300)
+    )  # the first-order change by a shift of the law
     common = expected >= _POOLED
     e = np.append(expected[common], max(size - float(expected[common].sum()), 0.0))
     o = np.append(observed[common], max(size - float(observed[common].sum()), 0.0))
     d = np.append(moved[common], -float(moved[common].sum()))
-    if e[-1] < _POOLED and e.size > 2:  # too rare on its own: with the rarest of the others
+    if e[-1] < _POOLED and e.size > 2:  # the pooled class is too rare on its own: it joins the rarest other class
         rarest = int(e[:-1].argmin())
         for of in (e, o, d):
             of[rarest] += of[-1]
         e, o, d = e[:-1], o[:-1], d[:-1]
     if e.size < 2:
         return 1.0
-    if e.size == 2:  # a count that hardly ever changes
+    if e.size == 2:  # a count that is nearly constant
         return float(binomtest(round(float(o[1])), size, min(float(e[1]) / size, 1.0)).pvalue)
     ratio = np.where(o > 0, o / e, 1.0)
     square = 2.0 * float((o * np.log(ratio)).sum())
@@ -69,7 +71,7 @@ def g_test(law: Pmf, sample: Pmf, size: int, *, any_mean: bool = False) -> float
 
 
 def two_sample_g_test(first: Pmf, first_size: int, second: Pmf, second_size: int, *, any_mean: bool = False) -> float:
-    """p-value of two samples of counts being of one law; counts expected fewer than 5 times in either are pooled.
+    """p-value of the hypothesis that two samples follow one law; counts expected fewer than 5 times are pooled.
 
     `any_mean`: as for `g_test`, of the difference of the two means.
     """
@@ -87,8 +89,8 @@ def two_sample_g_test(first: Pmf, first_size: int, second: Pmf, second_size: int
     table = table[:, table.sum(0) > 0]
     if table.shape[1] < 2:
         return 1.0
-    found = chi2_contingency(table, correction=False, lambda_="log-likelihood")
-    square, freedom = float(found.statistic), int(found.dof)
+    test = chi2_contingency(table, correction=False, lambda_="log-likelihood")
+    square, freedom = float(test.statistic), int(test.dof)
     if any_mean and freedom > 1:
         both = (first_size * first.on(low, high) + second_size * second.on(low, high)) / (first_size + second_size)
         counts = low + np.arange(both.size)
@@ -99,8 +101,10 @@ def two_sample_g_test(first: Pmf, first_size: int, second: Pmf, second_size: int
 
 
 def neighbours(expected: FloatArray, least: float) -> NDArray[np.int64]:
-    """(groups,) where groups of neighbouring cells (n,) begin of which at least so much is expected; what is left over
-    at the end belongs to the last of them."""
+    """First index (groups,) of groups of neighbouring cells with an expected sum of at least `least`.
+
+    `expected` is (n,); cells remaining at the end join the last group.
+    """
     below, starts, held = np.cumsum(expected, dtype=np.float64), [0], 0.0
     while True:
         end = int(np.searchsorted(below, held + least)) + 1
@@ -111,15 +115,15 @@ def neighbours(expected: FloatArray, least: float) -> NDArray[np.int64]:
 
 
 def mean_score(law_mean: float, law_variance: float, mean: float, size: int) -> float:
-    """Standard scores by which a sample mean differs from the law's; 0 where both are certain and agree."""
+    """Difference of a sample mean from that of the law, in standard errors; 0 where both are certain and agree."""
     error = mean - law_mean
     return error / math.sqrt(law_variance / size) if law_variance > 0 else (0.0 if error == 0 else math.inf)
 
 
 def variance_score(cumulants: FloatArray, sample: Pmf, size: int, variance: float | None = None) -> float:
-    """Standard scores by which the mean square about the true mean differs from the law's variance.
+    """Difference of the mean square about the true mean from the variance of the law, in standard errors.
 
-    `cumulants` (4,) of the true law give the mean and the standard error; `variance` that of another law.
+    `cumulants` (4,) of the true law give mean and standard error; `variance` replaces its variance by another.
     """
     counts = sample.first + np.arange(sample.p.size)
     square = float((sample.p * (counts - cumulants[0]) ** 2).sum())
@@ -129,7 +133,7 @@ def variance_score(cumulants: FloatArray, sample: Pmf, size: int, variance: floa
 
 
 def wasserstein(sample: FloatArray, law: FloatArray) -> FloatArray:
-    """First Wasserstein distance (...) of pmfs (..., w) to one of (w,), on the same consecutive counts."""
+    """First Wasserstein distance (...) of pmfs (..., w) to a pmf (w,), on the same consecutive counts."""
     return np.asarray(np.abs(np.cumsum(sample - law, axis=-1)).sum(-1), dtype=np.float64)
 
 

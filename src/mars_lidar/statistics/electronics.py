@@ -1,10 +1,10 @@
 """Free-running pixels behind electronics with a dead time of their own: count law, mean histogram, stationary shape.
 
-An avalanche is recorded iff t_e have passed since the last record; the pixel runs on meanwhile, blind for t_d after
-each of its avalanches. So records are a Markov-renewal process whose state is the phase of a record: docs/detectors.md,
+An avalanche is recorded iff t_e has passed since the last record; the pixel keeps detecting meanwhile, blind for t_d
+after each avalanche. Records form a Markov-renewal process whose state is the phase of a record: docs/detectors.md,
 equations (10) to (13). Its transition probabilities are the kernel (10) folded over the periods. The stationary law of
-the phases is the mean histogram of a pixel that has been running for long (20), the case of Rapp et al., IEEE TSP 2019.
-Weighting each record with z gives the generating function of their number, and on the unit circle its law (19).
+the phases is the mean histogram of a stationary pixel (20), the case of Rapp et al., IEEE TSP 2019. Weighting each
+record with z gives the generating function of the number of records, and on the unit circle its law (19).
 """
 
 from __future__ import annotations
@@ -23,24 +23,23 @@ from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.detector import Mode
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
-from mars_lidar.statistics.cells import Cells
-from mars_lidar.statistics.count_pmf import Pmf, exact_windows
+from mars_lidar.statistics.cells import Cells, photons_before
+from mars_lidar.statistics.count_pmf import MARGIN, REACH, Pmf, exact_windows
 from mars_lidar.statistics.exposure import Moments, refined_moments, stationary_histogram
-from mars_lidar.statistics.gate import photons_before
 from mars_lidar.statistics.phase_chain import ConvergenceError
 from mars_lidar.statistics.timing import Timing, is_timed
 
 # --- From record to record -----------------------------------------------------------------------------------------
 
-_ONE_THREAD = 250_000  # multiplications
-_BLOCK = 64  # bins that are advanced together
+_ONE_THREAD = 250_000  # multiplications of a matrix product that BLAS libraries do on one thread
+_BLOCK = 64  # bins advanced together
 
 Rows = NDArray[Any]  # real or complex
 
 
 @dataclass(frozen=True)
 class Effort:
-    """What a statistic may cost: numbers of a kernel, multiplications of an exposure, and of a law's points."""
+    """Largest cost of a statistic: entries of the kernel, multiplications for moments and for points of a law."""
 
     numbers: int
     moments: float
@@ -48,13 +47,13 @@ class Effort:
 
     @property
     def instead(self) -> str:
-        """What to use where that is not enough, for errors."""
+        """Advice for the error of a statistic that exceeds this cost."""
         goes_on = self.numbers < MOST_EFFORT.numbers
-        return f"{'use electronics_moments, which goes on for longer, or ' * goes_on}simulate it with engine 'exact'"
+        return f"{'use electronics_moments, which may take longer, or ' * goes_on}simulate it with engine 'exact'"
 
 
-MOST_EFFORT = Effort(1 << 27, 4e10, 3e11)  # 1 GiB, and half a minute
-LAW_EFFORT = Effort(1 << 24, 1.2e9, 2e10)  # of the laws, which are to take 2 s at most
+MOST_EFFORT = Effort(1 << 27, 4e10, 3e11)  # kernel 1 GiB, moments half a minute
+LAW_EFFORT = Effort(1 << 24, 1.2e9, 2e10)  # count laws and histograms: 2 s
 
 
 class RecordGrid:
@@ -63,14 +62,14 @@ class RecordGrid:
     Attributes
     ----------
     kernel
-        (bins, steps - off + 1) next records `off` to `steps` bins after one in each bin: all those until the avalanches
-        before the electronics were ready have re-armed.
+        (bins, steps - off + 1) probability of the next record `off` to `steps` bins after a record in each bin. After
+        `steps` bins every avalanche during the dead time of the electronics has re-armed.
     late
-        (bins,) probability of being armed, without a further record, at the start of the bin after those.
+        (bins,) probability of being armed, without a further record, at the start of the bin after these.
     first, first_armed
-        (m,) first records of the exposure in its first m bins, and the probability of being armed after them.
+        (m,) probability of the first record in each of the first m bins of the exposure, and of being armed after them.
     periods
-        Within which the next record is, but for waiting.
+        Periods that the kernel spans.
     """
 
     def __init__(self, cell: Cells, bins: int, electronics: float, effort: Effort = MOST_EFFORT) -> None:
@@ -100,24 +99,24 @@ class RecordGrid:
         n, steps = self.bins, self.steps
         photons = np.concatenate([self.photons, self.photons])
         armed = np.zeros(n)
-        unseen = np.zeros((steps + 1, n))  # the record itself, then avalanches that are not recorded
-        unseen[0] = 1.0
-        seen = np.zeros((steps - self.off + 1, n))
+        unrecorded = np.zeros((steps + 1, n))  # row 0: the record itself; then avalanches that are not recorded
+        unrecorded[0] = 1.0
+        recorded = np.zeros((steps - self.off + 1, n))
         for j in range(1, steps + 1):
             rearmed = np.zeros(n)
             if j >= self.shift:
-                rearmed += (1.0 - self.part) * unseen[j - self.shift]
+                rearmed += (1.0 - self.part) * unrecorded[j - self.shift]
             if j > self.shift:
-                rearmed += self.part * unseen[j - self.shift - 1]
+                rearmed += self.part * unrecorded[j - self.shift - 1]
             armed, hit = self._advance(armed, rearmed, photons[j % n : j % n + n])
             ready = self._ready(j)
-            unseen[j] = (1.0 - ready) * hit
+            unrecorded[j] = (1.0 - ready) * hit
             if j >= self.off:
-                seen[j - self.off] = ready * hit
-        return np.ascontiguousarray(seen.T), armed
+                recorded[j - self.off] = ready * hit
+        return np.ascontiguousarray(recorded.T), armed
 
     def _ready(self, step: int) -> float:
-        """Share of the bin `step` after a record, both evenly in their bins, that lies beyond t_e."""
+        """Probability that times uniform in two bins `step` apart differ by more than t_e."""
         if step < self.off:
             return 0.0
         if step == self.off:
@@ -134,7 +133,7 @@ class RecordGrid:
         blind = past[1:].sum() - (1.0 - self.part) * past[1]
         armed, first = np.array([1.0 - blind]), np.zeros(at)
         for j in range(at):
-            back = at + 1 + j - self.shift  # the place of bin j - shift
+            back = at + 1 + j - self.shift  # index of bin j - shift
             rearmed = (1.0 - self.part) * (past[back] if back < at + 1 else 0.0)
             rearmed += self.part * past[back - 1] if back - 1 < at + 1 else 0.0
             armed, hit = self._advance(armed, np.array([rearmed]), self.photons[j % n : j % n + 1])
@@ -143,23 +142,24 @@ class RecordGrid:
 
 
 class RecordRun:
-    """Records bin by bin through the exposure, in several rows at once that weigh them differently (12).
+    """Records bin by bin through the exposure, for several weightings (rows) at once (12).
 
-    `start` (rows,) weighs the first records; `weigh` makes of the records (rows, bins) what the next ones follow from.
+    `start` (rows,) are the weights of the first record; `weigh` maps the records (rows, bins) to the weighted records
+    that the next ones follow from.
     """
 
     def __init__(self, grid: RecordGrid, start: Rows, weigh: Callable[[Rows], Rows]) -> None:
         self.grid, self.start, self.weigh = grid, start, weigh
         n, off, steps = grid.bins, grid.off, grid.steps
-        size = max(1, min(_BLOCK, off, n))  # the next record is t_e later at least: none within a block
+        size = max(1, min(_BLOCK, off, n))  # shorter than t_e, so that no record in a block follows from another in it
         self.blocks = [_Block(grid, at, min(at + size, n)) for at in range(0, n, size)]
         self.reach = steps + 1
-        self.source = np.zeros((start.size, self.reach + n), start.dtype)  # the last `reach` bins, and the period
-        self.armed = np.zeros(start.size, start.dtype)  # armed and ready, nothing on the way
-        self.begun = 0  # bins of the exposure
+        self.source = np.zeros((start.size, self.reach + n), start.dtype)  # the preceding `reach` bins, then the period
+        self.armed = np.zeros(start.size, start.dtype)  # armed, electronics ready, no avalanche in its dead time
+        self.begun = 0  # bins of the exposure so far
 
     def keep(self, rows: NDArray[np.bool_], weigh: Callable[[Rows], Rows]) -> None:
-        """Go on with some of the rows."""
+        """Continue with the selected rows only."""
         self.start, self.source, self.armed, self.weigh = self.start[rows], self.source[rows], self.armed[rows], weigh
 
     def period(self) -> Rows:
@@ -188,14 +188,14 @@ class RecordRun:
 
 
 class _Block:
-    """Some bins of the period: how records before them, and armed pixels, lead to records in them."""
+    """Transition of a block of bins: from earlier records and armed pixels to records in the block."""
 
     def __init__(self, grid: RecordGrid, at: int, end: int) -> None:
         self.at, self.end = at, end
         n, off, steps = grid.bins, grid.off, grid.steps
         before = np.concatenate([[0.0], np.cumsum(grid.photons[at:end])])
         self.fired = -np.expm1(-grid.photons[at:end])
-        self.lasting = np.exp(-before[:-1])  # of what is armed at the start, up to each bin
+        self.lasting = np.exp(-before[:-1])  # survival of a pixel armed at the start, up to each bin
         self.kept = np.triu(np.exp(np.minimum(before[:-1, None] - before[None, :-1], 0.0)))  # from bin to bin
         bins = np.arange(at, end)
         self.late = grid.late[(bins - steps - 1) % n]
@@ -207,10 +207,10 @@ class _Block:
 
 
 def product(x: Rows, matrix: FloatArray) -> Rows:
-    """A matrix times a real one; a complex one at the cost of two real products.
+    """Product of a real or complex `x` with a real matrix, in pieces of one thread each.
 
-    In pieces that BLAS libraries do on one thread: on a busy machine their threads wait for each other a hundred times
-    longer than they work on products of this size.
+    On a busy machine the threads of BLAS libraries wait for each other a hundred times longer than products of this
+    size take. A complex product is two real ones.
     """
     if np.iscomplexobj(x):
         parts = product(np.concatenate([x.real, x.imag]), matrix)
@@ -223,7 +223,7 @@ def product(x: Rows, matrix: FloatArray) -> Rows:
 
 
 def bins_of(periods: float, bins: int) -> tuple[int, float]:
-    """A time as whole bins and a part of one."""
+    """A time in periods as whole bins and the remaining fraction of a bin."""
     whole = math.floor(periods * bins + 1e-9)
     return whole, max(periods * bins - whole, 0.0)
 
@@ -231,8 +231,8 @@ def bins_of(periods: float, bins: int) -> tuple[int, float]:
 # --- Moments and mean histogram ------------------------------------------------------------------------------------
 
 ELECTRONICS_MODES: tuple[Mode, ...] = ("nonparalyzable", "gated")
-_A_BLOCK = 2e4  # multiplications that take as long as what comes with a block
-_SETTLED = 1e-11
+_A_BLOCK = 2e4  # multiplications that take as long as the overhead of a block
+_SETTLED = 1e-11  # relative change per period at which the state counts as repeating
 
 
 ElectronicsMoments = Moments
@@ -299,10 +299,10 @@ def moments(cells: Cells, tolerance: float, effort: Effort = MOST_EFFORT) -> Ele
     histogram = np.empty((cells.size, bins))
     bare, slower = without_electronics(cells)
     if slower == 0.0:
-        found = refined_moments(bare, bins, tolerance=min(tolerance, 1e-4), threads=None)
-        flat = found.cumulants.reshape(-1, found.cumulants.shape[-1])
-        mean, variance, histogram = flat[:, 0], flat[:, 1], found.histogram.reshape(-1, bins)
-        grid = found.bins.reshape(-1)
+        exposure = refined_moments(bare, bins, tolerance=min(tolerance, 1e-4), threads=None)
+        flat = exposure.cumulants.reshape(-1, exposure.cumulants.shape[-1])
+        mean, variance, histogram = flat[:, 0], flat[:, 1], exposure.histogram.reshape(-1, bins)
+        grid = exposure.bins.reshape(-1)
     else:
         for k in range(cells.size):
             mean[k], variance[k], histogram[k], grid[k] = refined(bare.part(slice(k, k + 1)), slower, tolerance, effort)
@@ -315,10 +315,10 @@ def moments(cells: Cells, tolerance: float, effort: Effort = MOST_EFFORT) -> Ele
 
 
 def without_electronics(cells: Cells) -> tuple[Cells, float]:
-    """Cells without electronics, and the dead time, ns, of those behind them; 0 where one of the two has no effect.
+    """Cells without electronics, and the dead time of the electronics in ns; 0 where a single dead time is equivalent.
 
-    Without a dead time of its own a pixel's avalanches are Poisson, and where it is the longer one they are far enough
-    apart: then the cells have the longer of the two dead times.
+    A single dead time, the longer one, is equivalent where the dead time of the pixel is 0 or is the longer one. The
+    returned cells then have that dead time.
     """
     detector = cells.system.detector
     slower = max(detector.dead_time_ns, detector.electronics_dead_time_ns)
@@ -329,7 +329,7 @@ def without_electronics(cells: Cells) -> tuple[Cells, float]:
 
 
 def coarsest_grid(cell: Cells) -> int:
-    """Bins of the first grid: a power of two, so that grids are parts of each other; the dead time spans a bin."""
+    """Bins of the first grid: a power of two, so that grids nest; the dead time spans at least two bins."""
     bins = 1 << round(math.log2(cell.first_bins(2)))
     while bins * cell.system.dead_time_periods < 2.0:
         bins *= 2
@@ -339,22 +339,22 @@ def coarsest_grid(cell: Cells) -> int:
 def refined(
     cell: Cells, electronics_ns: float, tolerance: float, effort: Effort = MOST_EFFORT
 ) -> tuple[float, float, FloatArray, int]:
-    """Mean, variance, mean histogram and the bins that were needed, of one cell whose system has no electronics."""
+    """Mean, variance, mean histogram and bins of the final grid, for one cell of `without_electronics`."""
     system = cell.system
     out, electronics = system.bins, electronics_ns / system.period_ns
     bins = coarsest_grid(cell)
     coarse, before = _Run(cell, bins, electronics, effort), None
-    left = effort.moments - coarse.spent
+    remaining = effort.moments - coarse.spent
     while True:
         bins *= 2
-        if 4.0 * coarse.spent > left:  # as many periods, on twice the bins with kernels twice as long
+        if 4.0 * coarse.spent > remaining:  # as many periods, twice the bins, kernels twice as long
             raise ConvergenceError(
                 f"electronics_moments of {cell.name(0)}: {bins} bins per period take too long, and fewer are not "
                 f"enough; {effort.instead}"
             )
-        fine = _Run(cell, bins, electronics, replace(effort, moments=left))
-        left -= fine.spent
-        # the grid errs by the square of its step: what doubling it moved tells the limit
+        fine = _Run(cell, bins, electronics, replace(effort, moments=remaining))
+        remaining -= fine.spent
+        # the error is quadratic in the bin width: extrapolate to the limit (Richardson)
         limit = np.array([fine.mean, fine.variance])
         limit += (limit - [coarse.mean, coarse.variance]) / 3.0
         spread = max(math.sqrt(max(fine.variance, 0.0)), 1e-10 * fine.mean, np.finfo(float).tiny)
@@ -366,7 +366,7 @@ def refined(
         )
         shape = 0.5 * float(np.abs(fine.rate.reshape(-1, 2).sum(-1) - coarse.rate).sum()) / max(fine.mean, 1e-300)
         moved = float(np.max(3.0 * np.abs(limit - [fine.mean, fine.variance]) / scale))
-        if before is not None:  # long exposures: the limit stands still long before the grids agree
+        if before is not None:  # long exposures: the limit converges long before the grids agree
             moved = min(moved, float(np.max(np.abs(limit - before) / scale)))
         if max(moved, shape) <= tolerance:
             mean, variance = float(limit[0]), max(float(limit[1]), 0.0)
@@ -378,9 +378,9 @@ def refined(
 def rebinned(cell: Cells, fine: FloatArray, coarse: FloatArray, out: int) -> FloatArray:
     """Records in `out` bins, from those on a grid and on one of half as many bins.
 
-    The grid errs by the square of its step (times of re-arming are spread over a bin), so a third of what doubling it
-    moved a pair of bins is added to the pair. Within a bin records follow the photons: only the armed probability,
-    which is smooth, is taken for constant.
+    Times of re-arming are spread over a bin, which makes the error quadratic in the bin width; a third of the change
+    from the coarse grid is added to each pair of bins (Richardson). Within a bin records are proportional to the
+    photons, with a constant armed probability.
     """
     pairs = fine.reshape(-1, 2)
     total = pairs.sum(-1)
@@ -398,11 +398,11 @@ def rebinned(cell: Cells, fine: FloatArray, coarse: FloatArray, out: int) -> Flo
 
 
 class _Run:
-    """One pixel on a grid of the period: the exposure run through, period by period."""
+    """Moments of one pixel on one grid, by running through the exposure period by period."""
 
     def __init__(self, cell: Cells, bins: int, electronics: float, effort: Effort) -> None:
         self.cycles = cell.system.cycles
-        self.mean = self.variance = self.spent = 0.0  # multiplications
+        self.mean = self.variance = self.spent = 0.0  # spent: multiplications
         self.rate = np.zeros(bins)
         if float(cell.total[0]) > 0.0:
             self._run(RecordGrid(cell, bins, electronics, effort))
@@ -424,9 +424,9 @@ class _Run:
             steady = steady + 1 if moved <= _SETTLED * scale else 0
             last = now
             if steady > 3 * grid.periods:
-                left = self.cycles - period - 1
-                self.rate += left * records
-                pairs += left * float(weighted.sum()) + 0.5 * left * (left + 1.0) * growth
+                remaining = self.cycles - period - 1
+                self.rate += remaining * records
+                pairs += remaining * float(weighted.sum()) + 0.5 * remaining * (remaining + 1.0) * growth
                 break
             if period >= budget:
                 raise ConvergenceError(
@@ -439,14 +439,14 @@ class _Run:
 
 # --- Stationary shape ----------------------------------------------------------------------------------------------
 
-_LEAST_TOLERANCE = 1e-3
-_DENSE = 2048  # bins up to which the chain is solved directly
-_TURNS = 2000
-_STANDS = 1e-9  # change of the law in a turn, total variation, relative to what turns still forget
+_LEAST_TOLERANCE = 1e-3  # total variation: the accuracy stated for electronics dead time
+_DENSE = 2048  # bins up to which the stationary equations are solved directly
+_TURNS = 2000  # power iterations
+_STANDS = 1e-9  # total variation per iteration, relative to 1 - contraction, at which the iteration has converged
 
 
 def stationary_records(cells: Cells, out: int, *, tolerance: float, threads: int | None) -> FloatArray:
-    """Shapes (cells, out) of the records of pixels that have been running for long; 0 where there is no flux.
+    """Mean histograms (cells, out), of sum 1, of the records of stationary pixels; 0 where there is no flux.
 
     The grid is refined until doubling it moves the shape by less than `tolerance`, at least 1e-3, in total variation.
     """
@@ -454,7 +454,7 @@ def stationary_records(cells: Cells, out: int, *, tolerance: float, threads: int
     bare, slower = without_electronics(cells)
     if slower == 0.0:
         return stationary_histogram(bare, out, tolerance=tolerance, threads=threads)
-    alone = replace(bare, system=bare.system.replace(start="armed"))  # no start is needed
+    alone = replace(bare, system=bare.system.replace(start="armed"))  # the stationary law does not depend on the start
     return np.stack([_shape(alone.part(slice(k, k + 1)), slower, out, tolerance) for k in range(cells.size)])
 
 
@@ -478,7 +478,7 @@ def _phases(grid: RecordGrid) -> FloatArray:
     n = grid.bins
     if n <= _DENSE:
         system = np.eye(n) - matrix.T
-        system[-1] = 1.0  # the equations add up to 0: one gives way to the sum
+        system[-1] = 1.0  # the equations are dependent: the last is replaced by the normalisation
         right = np.zeros(n)
         right[-1] = 1.0
         direct = np.maximum(np.linalg.solve(system, right), 0.0)
@@ -500,17 +500,17 @@ def _phases(grid: RecordGrid) -> FloatArray:
 
 
 def _transitions(grid: RecordGrid) -> FloatArray:
-    """(bins, bins) probabilities that the next record after one in a bin is in another, whatever the period."""
+    """(bins, bins) transition probabilities from the phase of a record to that of the next, in any period."""
     n, kernel = grid.bins, grid.kernel
-    if kernel.shape[1] > n:  # bins whole periods apart are one
+    if kernel.shape[1] > n:  # bins whole periods apart have the same phase
         kernel = np.pad(kernel, ((0, 0), (0, -kernel.shape[1] % n))).reshape(n, -1, n).sum(1)
     width = kernel.shape[1]
-    # those armed and ready, with nothing on the way, at the start of bin `begin`: the first photon from there on
+    # pixels armed and ready at the start of bin `begin`: the next record is the first photon
     before = np.concatenate([[0.0], np.cumsum(grid.photons)])
     begin = (np.arange(n) + grid.steps + 1) % n
     fires, ready = -np.expm1(-grid.photons), grid.late / -math.expm1(-before[-1])
     matrix = np.empty((n, n))
-    for k, row in enumerate(matrix):  # a row at a time stays in the processor's own memory
+    for k, row in enumerate(matrix):  # one row at a time stays in the cache
         passed = before[:-1] - before[begin[k]]
         passed[: begin[k]] += before[-1]
         np.multiply(ready[k] * np.exp(-np.maximum(passed, 0.0)), fires, out=row)
@@ -525,19 +525,18 @@ def _transitions(grid: RecordGrid) -> FloatArray:
 
 ComplexArray = NDArray[np.complex128]
 
-_REACH, _MARGIN = 7.5, 6.0  # of a window: standard deviations, and counts beside them
-_EDGE = 1e-9  # probability at the ends of a window that holds all
-_POINTS = 64  # of the circle at a time
-_QUIET = 1e-17
-_LIKE_MOMENTS = 3.0  # times the tolerance by which the pmf's mean and variance may differ from those of the grid
+_EDGE = 1e-9  # largest probability at the ends of a window that contains the law
+_POINTS = 64  # points of the circle evaluated together
+_QUIET = 1e-17  # modulus of the transform below which it counts as 0
+_LIKE_MOMENTS = 3.0  # allowed disagreement of the pmf with mean and variance, in units of the tolerance
 
 
 def record_windows(cells: Cells, tolerance: float, threads: int) -> list[Pmf]:
     """Pmf of the number of records of each cell; the tolerance is that of `electronics_moments`."""
     bare, slower = without_electronics(cells)
     if slower == 0.0:
-        found = refined_moments(bare, 1, tolerance=min(tolerance, 1e-4), threads=threads)
-        return exact_windows(bare, found.cumulants.reshape(-1, 4), found.bins.reshape(-1), threads)
+        exposure = refined_moments(bare, 1, tolerance=min(tolerance, 1e-4), threads=threads)
+        return exact_windows(bare, exposure.cumulants.reshape(-1, 4), exposure.bins.reshape(-1), threads)
     return [_window(bare.part(slice(k, k + 1)), slower, tolerance) for k in range(cells.size)]
 
 
@@ -549,11 +548,11 @@ def _window(cell: Cells, electronics_ns: float, tolerance: float) -> Pmf:
     grids = [RecordGrid(cell, n, electronics, LAW_EFFORT) for n in (bins, bins // 2)]
     most = math.floor(cell.system.cycles / electronics) + 1
     spread = math.sqrt(variance)
-    half = math.ceil(_REACH * spread + _MARGIN)
-    left = [LAW_EFFORT.points]  # multiplications
+    half = math.ceil(REACH * spread + MARGIN)
+    budget = [LAW_EFFORT.points]  # multiplications
     while True:
         first, last = max(math.floor(mean) - half, 0), min(math.ceil(mean) + half, most)
-        fine, coarse = (_folded(grid, first, last, left) for grid in grids)
+        fine, coarse = (_folded(grid, first, last, budget) for grid in grids)
         pmf = fine + (fine - coarse) / 3.0  # the limit for fine grids
         ends = max(pmf[0] if first > 0 else 0.0, pmf[-1] if last < most else 0.0)
         if abs(ends) <= _EDGE:
@@ -576,23 +575,26 @@ def _window(cell: Cells, electronics_ns: float, tolerance: float) -> Pmf:
     return Pmf(first, pmf / pmf.sum(), outside)
 
 
-def _folded(grid: RecordGrid, first: int, last: int, left: list[float]) -> FloatArray:
-    """P(N = n) for n from `first` to `last`, by (23) of docs/theory_exposure.md; takes its cost off `left`."""
+def _folded(grid: RecordGrid, first: int, last: int, budget: list[float]) -> FloatArray:
+    """P(N = n) for n from `first` to `last`, by (23) of docs/theory_exposure.md.
+
+    `budget` is a list of the remaining multiplications, from which the cost is subtracted.
+    """
     counts = last - first + 1
     size = counts + counts % 2
     angle = 2.0 * np.pi * np.arange(size // 2 + 1) / size
     value = np.zeros(angle.size, np.complex128)
     for start in range(0, angle.size, _POINTS):
         some = np.exp(1j * angle[start : start + _POINTS])
-        value[start : start + _POINTS] = _values(grid, some, left)
-        if np.abs(value[start : start + _POINTS]).max() < _QUIET:  # a long exposure: nothing beyond
+        value[start : start + _POINTS] = _values(grid, some, budget)
+        if np.abs(value[start : start + _POINTS]).max() < _QUIET:  # the transform of a long exposure vanishes beyond
             break
     folded = np.fft.irfft(value.conj(), size)
     return np.asarray(folded[np.arange(first, last + 1) % size], dtype=np.float64)
 
 
-def _values(grid: RecordGrid, z: ComplexArray, left: list[float]) -> ComplexArray:
-    """E z^N of the exposure at points z (points,) of the unit circle: records (12), each weighted with z (19)."""
+def _values(grid: RecordGrid, z: ComplexArray, budget: list[float]) -> ComplexArray:
+    """E z^N at points z (points,) of the unit circle: records (12), each weighted with z (19)."""
 
     def weigh(now: Rows) -> Rows:
         return z[index, None] * now
@@ -601,13 +603,13 @@ def _values(grid: RecordGrid, z: ComplexArray, left: list[float]) -> ComplexArra
     run = RecordRun(grid, np.ones_like(z), weigh)
     value, streak, ratio = np.ones_like(z), np.zeros(z.size, np.int64), np.zeros_like(z)
     before: ComplexArray = np.zeros((z.size, grid.bins + 2), np.complex128)
-    a_period = 4.0 * grid.bins * (grid.shift + 64.0)  # multiplications of a point
+    a_period = 4.0 * grid.bins * (grid.shift + 64.0)  # multiplications per point
     for period in range(grid.cycles):
         records, earlier = run.period(), value
-        left[0] -= a_period * index.size
+        budget[0] -= a_period * index.size
         value = value + (z[index] - 1.0) * records.sum(-1)
         state = np.concatenate([records, run.armed[:, None], value[:, None]], axis=1)
-        # as in native/laws/exposure_characteristic.h: the state repeats but for a factor, by least squares
+        # as native/laws/exposure_characteristic.h: the state repeats up to a factor, fitted by least squares
         size, norm = np.abs(state).sum(-1), np.maximum((np.abs(before) ** 2).sum(-1), 1e-300)
         best = (before.conj() * state).sum(-1) / norm
         moved = np.abs(state - best[:, None] * before).sum(-1) + np.abs(best - ratio) * size
@@ -623,7 +625,7 @@ def _values(grid: RecordGrid, z: ComplexArray, left: list[float]) -> ComplexArra
                 break
             index, value, before, ratio, streak = index[rest], value[rest], before[rest], ratio[rest], streak[rest]
             run.keep(rest, weigh)
-        if left[0] < 0.0:
+        if budget[0] < 0.0:
             raise ConvergenceError(
                 f"count law of {grid.cell.name(0)} behind electronics with a dead time: the state does not repeat "
                 f"within {period + 1} periods; electronics_moments has mean and variance, or simulate it with engine "

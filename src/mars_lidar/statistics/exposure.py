@@ -1,14 +1,14 @@
 """Exact statistics of a finite exposure: cumulants of the count and the mean histogram, by the delay recursion.
 
-No stationarity, no Gaussian, no truncation: start-up, end and mixing of the exposure are in the result. Derivation and
-equation numbers: docs/theory_exposure.md; of paralyzable pixels: docs/detectors.md, equations (1) and (17). The result
-on one grid (`Exposure`) is compared with that on a finer grid (`refined_moments`).
+The result includes the start, the end and the mixing of the exposure; nothing is assumed stationary or Gaussian, or
+truncated. Derivation and equation numbers: docs/theory_exposure.md; of paralyzable pixels: docs/detectors.md, equations
+(1) and (17). `refined_moments` refines the grid until two grids agree.
 
 Without a dead time every photon is registered, and every bin is Poisson.
 
-A warmed-up exposure begins in the stationary state. Many background photons in a dead time make the pixel a clock that
-forgets its phase in thousands of periods, and the recursion takes as long to reach its fixed point (section 6). The
-fixed point is also the solution of one well-conditioned sparse equation (docs/joint_law.md, 4) on the same grid.
+With `System.start` ``"stationary"`` the exposure begins in the fixed point of the recursion. Where many background
+photons fall into a dead time, registrations are nearly periodic and the recursion takes thousands of periods to
+converge (section 6); the fixed point then comes from a well-conditioned sparse equation (docs/joint_law.md, 4).
 """
 
 from __future__ import annotations
@@ -29,15 +29,14 @@ from mars_lidar._base.types import FloatArray, IndexArray, Progress
 from mars_lidar.instrument.detector import Mode
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
-from mars_lidar.statistics.cells import Cells, fine_histograms, meets_itself
-from mars_lidar.statistics.gate import photons_before
+from mars_lidar.statistics.cells import Cells, fine_histograms, meets_itself, photons_before
 from mars_lidar.statistics.joint_grid import FoldedGrid
 from mars_lidar.statistics.phase_chain import ConvergenceError
 from mars_lidar.statistics.timing import Timing, is_timed
 
 # --- Results on one grid and their comparison ----------------------------------------------------------------------
 
-_ORDERS = 4
+_ORDERS = 4  # cumulants
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,16 +50,16 @@ class Exposure:
     histogram
         (..., bins) mean registrations per bin; sums to the mean of N.
     cumulant_rates, histogram_rate
-        (..., 4) and (..., bins): what one more cycle adds, once the state repeats from period to period, so
+        (..., 4) and (..., bins): increments per further cycle once the state repeats from period to period, so
         that an exposure of n cycles has ``cumulants + (n - cycles) * cumulant_rates``. NaN where the exposure
         ended before that.
     settled
         (...) periods after which the state repeated and the rest was extrapolated; -1 where the exposure was
         run to its end.
     bins
-        (...) bins per period of the statistics grid that was needed, which is not the histogram's.
+        (...) bins per period of the final statistics grid, which need not be those of the histogram.
     movement
-        (...) how far the result moved when that grid was last halved: the largest of the changes of the mean
+        (...) change of the result when the bins were last halved: the largest of the changes of the mean
         in standard deviations (or relative, if that is larger), of the other cumulants relative to
         themselves or to the power of the standard deviation, and of the shape in total variation. The error
         of the result is smaller: the method is of fourth order for smooth pulses.
@@ -98,7 +97,7 @@ class Moments:
     histogram
         (..., bins) mean records per bin; sums to the mean.
     bins
-        (...) bins per period of the grid that was needed, which is not the histogram's.
+        (...) bins per period of the final grid, which need not be those of the histogram.
     """
 
     mean: FloatArray
@@ -110,14 +109,14 @@ class Moments:
 
 
 def darkness(result: Exposure, which: NDArray[np.bool_], bins: int) -> None:
-    """Nothing is registered where nothing arrives."""
+    """Set the statistics of the cells `which` without light to 0."""
     for array in (result.cumulants, result.cumulant_rates, result.histogram, result.histogram_rate, result.settled):
         array[which] = 0
     result.bins[which] = bins
 
 
 def blank(cells: Cells, out_bins: int) -> Exposure:
-    """Room for the statistics of cells."""
+    """Uninitialised statistics of the cells."""
     n = cells.size
     return Exposure(
         cumulants=np.empty((n, _ORDERS)),
@@ -131,7 +130,7 @@ def blank(cells: Cells, out_bins: int) -> Exposure:
 
 
 def movement(coarse: Exposure, fine: Exposure) -> FloatArray:
-    """`Exposure.movement` (21); infinite where the fine grid is still so coarse that a bin is negative."""
+    """`Exposure.movement` (21); infinite where a bin of the fine grid is negative."""
     mean, spread = np.abs(fine.cumulants[:, 0]), np.sqrt(np.maximum(fine.cumulants[:, 1], 0.0))
     floor = 1e-10 * mean + np.finfo(float).tiny  # rounding: the variance of a locked pixel may be 0
     change = np.abs(fine.cumulants - coarse.cumulants)
@@ -146,14 +145,14 @@ def movement(coarse: Exposure, fine: Exposure) -> FloatArray:
 
 
 def take(some: Exposure, which: NDArray[np.bool_]) -> Exposure:
-    """Some of the cells."""
+    """Statistics of the selected cells."""
     return Exposure(**{name: array[which] for name, array in vars(some).items()})
 
 
 def put(
     result: Exposure, at: IndexArray, fine: Exposure, good: NDArray[np.bool_], bins: int, moved: FloatArray
 ) -> None:
-    """Put the `good` ones of a grid of `bins` where they belong."""
+    """Store the `good` cells of a grid of `bins` bins at the indices `at` of the result."""
     for name, array in vars(fine).items():
         vars(result)[name][at] = array[good]
     result.histogram[at] = np.maximum(result.histogram[at], 0.0)
@@ -162,12 +161,12 @@ def put(
 
 
 def shaped(flat: Exposure, shape: tuple[int, ...]) -> Exposure:
-    """As (...) instead of (cells,)."""
+    """Statistics reshaped from (cells,) to `shape`."""
     return Exposure(**{name: array.reshape((*shape, *array.shape[1:])) for name, array in vars(flat).items()})
 
 
 def normalised(histogram: FloatArray) -> FloatArray:
-    """Shapes (..., bins) of sum 1 of histograms; uniform where nothing registers."""
+    """Histograms (..., bins) normalised to sum 1; uniform where the sum is 0."""
     total = histogram.sum(-1, keepdims=True)
     dark = total == 0.0
     shape = np.where(dark, 1.0 / histogram.shape[-1], histogram / np.where(dark, 1.0, total))
@@ -176,26 +175,26 @@ def normalised(histogram: FloatArray) -> FloatArray:
 
 # --- Rates of a paralyzable pixel ----------------------------------------------------------------------------------
 
-_PARTS = 4  # of a bin, in each of which the rates of arrivals now and a dead time ago are taken as constant
+_PARTS = 4  # parts of a bin, in each of which the rates of arrivals now and a dead time ago are constant
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
 _RATE_MOMENTS = 4  # moments 0 to 3
-RATES_STEPS = 120.0  # of the native recursion, that the rates of a bin cost at most
+RATES_STEPS = 120.0  # cost of the rates of a bin, in steps of the native recursion, at most
 
 
 def registration_rates(cells: Cells, bins: int) -> FloatArray:
     """Integrals of r(t) x^m over each bin, m = 0 .. 3, x from -1 to 1 in the bin, (cells, kinds * bins * 4).
 
-    Kinds: of the steady rate; for an armed start also of the first period, as it would be without a dead time's end,
-    and of the period in which the first dead time ends.
+    Kinds: the steady rate; for an armed start also the rate before the end of the first dead time and that of the
+    period in which it ends.
     """
-    if cells.follow:  # each cell has bins of its own
+    if cells.follow:  # the bins differ from cell to cell
         rows = [cells.part(slice(k, k + 1)) for k in range(cells.size)]
         return np.concatenate([_rates(row, row.edges(_PARTS * bins)) for row in rows])
     return _rates(cells, np.arange(_PARTS * bins + 1) / (_PARTS * bins))
 
 
 def _rates(cells: Cells, edges: FloatArray) -> FloatArray:
-    """`registration_rates` on quarters of bins with these edges (4 bins + 1,)."""
+    """`registration_rates` on quarters of bins with the given edges (4 bins + 1,)."""
     dead = cells.system.dead_time_periods
     whole = math.floor(dead)
     before = photons_before(cells, edges)
@@ -211,7 +210,7 @@ def _rates(cells: Cells, edges: FloatArray) -> FloatArray:
 
 
 def _moments(before: FloatArray, within: FloatArray) -> FloatArray:
-    """Moments (cells, bins, 4) on parts of a bin and on halves of it: their fourth-order limit, as (12) has it."""
+    """Moments (cells, bins, 4), extrapolated to fourth order from quarters and halves of bins as in (12)."""
     fine, coarse = _on_parts(before, within, _PARTS), _on_parts(before[:, ::2], within[:, ::2], _PARTS // 2)
     return np.asarray(fine + (fine - coarse) / 3.0, dtype=np.float64)
 
@@ -233,11 +232,10 @@ def _on_parts(before: FloatArray, within: FloatArray, parts: int) -> FloatArray:
 
 
 def native_light(cells: Cells, bins: int, history: FloatArray | None = None) -> _core.ExposureLight:
-    """Photons of the parts of bins, or of paralyzable pixels the rates of registrations.
+    """Input of the native recursion: photons of the parts of bins or, for paralyzable pixels, rates of registrations.
 
-    `history` (cells, 2 bins + 2) is the warm state where it is known: `warm_history`.
+    `history` (cells, 2 bins + 2): the stationary state, where known, of `warm_history`.
     """
-
     if cells.system.detector.mode == "paralyzable":
         return _core.ExposureLight.paralyzable(cells.grid(bins, 1), cells.total, registration_rates(cells, bins))
     energy, row = cells.energies(bins)
@@ -249,8 +247,7 @@ def native_light(cells: Cells, bins: int, history: FloatArray | None = None) -> 
 
 
 def recorded_light(cells: Cells, out_bins: int) -> FloatArray:
-    """Photons (cells, out_bins) of a period: all of them are registered where there is no dead time."""
-
+    """Photons (cells, out_bins) of a period, all of which are registered where there is no dead time."""
     parts, step = int(_core.EXPOSURE_PARTS), _poisson_bins(out_bins)
     rate = np.empty((cells.size, out_bins))
     for part in cells.chunks(step, out_bins):
@@ -267,7 +264,7 @@ def _poisson_bins(out_bins: int) -> int:
 
 
 def without_dead_time(cells: Cells, out_bins: int) -> Exposure:
-    """No dead time: Poisson exactly, in every bin and in all."""
+    """Statistics without dead time: the count and every bin are exactly Poisson."""
     result = blank(cells, out_bins)
     result.histogram_rate[:] = recorded_light(cells, out_bins)
     result.cumulant_rates[:] = cells.total[:, None]
@@ -279,16 +276,15 @@ def without_dead_time(cells: Cells, out_bins: int) -> Exposure:
 
 # --- The stationary start by the feedback equation -----------------------------------------------------------------
 
-NOT_WARM = -3  # the native core's code: the warm state was not found
+NOT_WARM = -3  # `settled` of the native core: the sweeps did not reach the stationary state
 
 
 def warm_history(cells: Cells, which: IndexArray, bins: int) -> FloatArray:
-    """Warm states (n, 2 bins + 2) of some cells as the native core takes them.
+    """Stationary states (n, 2 bins + 2) of the cells `which`, in the order of the native core.
 
-    Mass and moment of the registrations of one period in each bin, the probability of being armed at its start, and the
-    registrations of the last d + f bins.
+    Mass and first moment of the registrations of one period in each bin, the probability of being armed at its start,
+    and the registrations of the last d + f bins.
     """
-
     out = np.empty((which.size, 2 * bins + 2))
     for row, k in zip(out, which, strict=True):
         try:
@@ -305,10 +301,10 @@ def warm_history(cells: Cells, which: IndexArray, bins: int) -> FloatArray:
 # --- The recursion -------------------------------------------------------------------------------------------------
 
 _MODES: tuple[Mode, ...] = ("nonparalyzable", "paralyzable", "gated")
-MOST_BINS = 2**20  # of the statistics grid, unless the histogram itself has more
-_NATIVE = ("cumulants", "cumulant_rates", "histogram", "histogram_rate", "settled")  # what the native core fills
-UNSETTLED = -2  # the native core's code: gave up
-_ENERGY_STEPS = 10.0  # of the native recursion, that the light of a bin and what follows from it costs
+MOST_BINS = 2**20  # bins of the statistics grid (8 MiB an array), unless the histogram itself has more
+_NATIVE = ("cumulants", "cumulant_rates", "histogram", "histogram_rate", "settled")  # arrays that the native core fills
+UNSETTLED = -2  # `settled` of the native core: the state did not repeat within the allowed periods
+_ENERGY_STEPS = 10.0  # cost of the light of a bin, in steps of the native recursion
 
 
 @checked
@@ -325,15 +321,15 @@ def exposure_moments(
 ) -> Exposure:
     """Exact cumulants of the count and mean histogram of an exposure of `System.cycles` periods.
 
-    For detectors of mode nonparalyzable, paralyzable, and gated with a gate that stays.
+    For detectors of mode nonparalyzable, paralyzable, and gated with a fixed gate.
 
     Parameters
     ----------
     signal, background
         S and B, photons per period in [0, 1e6]: scalars or arrays that broadcast to (...).
     delay_ns
-        Delay of the return, ns, scalar or array that broadcasts with them; None: half the period. It matters:
-        an exposure that starts armed has a count law that depends on the delay.
+        Delay of the return, ns, scalar or array that broadcasts with them; None: half the period. With an
+        armed start the count law depends on the delay.
     waveform
         (..., T) photons per period in T equal parts of the period, instead of `signal` and `delay_ns`.
     tolerance
@@ -341,7 +337,7 @@ def exposure_moments(
     threads
         Threads to run on; default: all processors that this process may use.
     progress
-        Called as ``progress(done, total)`` for each pass over the cells; an exception from it stops the run.
+        Called as ``progress(done, total)`` during each pass over the cells; an exception in it stops the run.
 
     Returns
     -------
@@ -370,14 +366,14 @@ def exposure_moments(
 def recorded_moments(
     cells: Cells, *, tolerance: float, threads: int | None, progress: Progress | None = None
 ) -> Exposure:
-    """`exposure_moments` of checked cells, histogram in the bins of their system; jitter and code widths are in it."""
+    """`exposure_moments` of checked cells; the histogram includes jitter and code widths."""
     if not is_timed(cells.system):
         return refined_moments(cells, cells.system.bins, tolerance=tolerance, threads=threads, progress=progress)
     timing = Timing(cells.system, cells.finest)
     untimed = replace(cells, system=timing.untimed)
-    found = refined_moments(untimed, timing.parts, tolerance=tolerance, threads=threads, progress=progress)
+    exposure = refined_moments(untimed, timing.parts, tolerance=tolerance, threads=threads, progress=progress)
     return replace(
-        found, histogram=timing.forward(found.histogram), histogram_rate=timing.forward(found.histogram_rate)
+        exposure, histogram=timing.forward(exposure.histogram), histogram_rate=timing.forward(exposure.histogram_rate)
     )
 
 
@@ -390,9 +386,9 @@ def refined_moments(
     progress: Progress | None = None,
     steps: int | None = None,
 ) -> Exposure:
-    """`exposure_moments` of checked cells, histogram in `out_bins` bins; refines each cell as it needs.
+    """`exposure_moments` of checked cells, histogram in `out_bins` bins; each cell is refined separately.
 
-    A cell that would take more than some `steps` bins x periods on all its grids is refused.
+    ConvergenceError where a cell would take more than about `steps` bins x periods on all its grids.
     """
     tolerance = checks.real("tolerance", tolerance, low=1e-9, high=0.1)
     team = thread_count(threads)
@@ -440,42 +436,42 @@ def refined_moments(
 
 
 def _spent(done: Exposure, cells: Cells) -> FloatArray:
-    """Bins x periods (cells,) of one pass, weighed by what each costs, and as many as what comes before it costs."""
+    """Cost (cells,) of one pass in bins x periods, with the light and the access to the history included."""
     periods = np.where(done.settled >= 0, done.settled, cells.system.cycles)
     bins = int(done.bins.max(initial=1))
     return (periods + _before(cells.system)) * done.bins.astype(np.float64) * cells.step_cost(bins)
 
 
 def _before(system: System) -> float:
+    """Cost of the light of a bin, in steps of the native recursion."""
     return RATES_STEPS if system.detector.mode == "paralyzable" else _ENERGY_STEPS
 
 
 def _affordable(cells: Cells, pending: IndexArray, after: FloatArray, steps: int | None) -> None:
-    """Refuse a cell before a pass that would take it beyond `steps`."""
+    """Raise ConvergenceError for a cell whose next pass would exceed `steps`."""
     beyond = after > (math.inf if steps is None else steps)
     if beyond.any():
         k = int(pending[int(np.argmax(beyond))])
-        why = f"the next grid would take it beyond {steps:.1g} bins x periods, more than a law is to take"
+        why = f"the next grid would exceed {steps:.1g} bins x periods, the limit of a law"
         raise ConvergenceError(f"exposure statistics of {cells.name(k)}: {why}; {_instead(cells, steps)}")
 
 
 def _too_long(cells: Cells, steps: int | None) -> str:
     return (
-        "the state of the pixel does not repeat from period to period for so long that the exposure cannot be run to "
-        f"its end; {_instead(cells, steps)}"
+        "the state of the pixel does not repeat from period to period, and the exposure is too long to be run to its "
+        f"end; {_instead(cells, steps)}"
     )
 
 
 def _instead(cells: Cells, steps: int | None) -> str:
     slower = steps is not None and not meets_itself(cells)
-    return cells.alternatives("exposure_moments, which goes on for some minutes") if slower else cells.instead
+    return cells.alternatives("exposure_moments, which may take some minutes") if slower else cells.instead
 
 
 def _run(
     cells: Cells, bins: int, out_bins: int, threads: int, progress: Progress | None, steps: int | None = None
 ) -> Exposure:
     """One pass of the recursion over all cells on one grid."""
-
     cells.check_history(bins)
     if steps is not None:
         steps = int(steps / cells.step_cost(bins))
@@ -503,11 +499,11 @@ def _run(
     return result
 
 
-# --- The shape of a pixel that has been running for long -----------------------------------------------------------
+# --- The mean histogram of a stationary pixel ----------------------------------------------------------------------
 
 
 def stationary_histogram(cells: Cells, out_bins: int, *, tolerance: float, threads: int | None) -> FloatArray:
-    """Registrations per period and bin (cells, out_bins) of a pixel that has been running for long (18)."""
+    """Registrations per period and bin (cells, out_bins) of a stationary pixel (18)."""
     tolerance = checks.real("tolerance", tolerance, low=1e-9, high=0.1)
     team = thread_count(threads)
     if cells.system.dead_time_periods == 0.0:  # the light itself
@@ -518,7 +514,7 @@ def stationary_histogram(cells: Cells, out_bins: int, *, tolerance: float, threa
 
 
 def _refined(cells: Cells, out_bins: int, *, tolerance: float, team: int) -> FloatArray:
-    """`stationary_histogram`, its grid a multiple of the bins."""
+    """`stationary_histogram` on grids whose bins divide those of the histogram."""
     cells = cells.resolved(out_bins)
     result = np.empty((cells.size, out_bins))
     pending = np.arange(cells.size)
@@ -544,7 +540,7 @@ def _refined(cells: Cells, out_bins: int, *, tolerance: float, team: int) -> Flo
 
 
 def _stationary(cells: Cells, bins: int, out_bins: int, threads: int) -> FloatArray:
-
+    """`stationary_histogram` on one grid."""
     result = np.empty((cells.size, out_bins))
     settled = np.empty(cells.size, np.int64)
     for part in cells.chunks(bins, out_bins):

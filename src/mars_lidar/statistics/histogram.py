@@ -1,4 +1,4 @@
-"""Mean histograms of finite exposures in every mode of the detector, and the shape by any of the methods."""
+"""Mean histograms of finite exposures in every mode of the detector, and their shape by three methods."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ def mean_histogram(
 ) -> FloatArray:
     """Mean histogram (..., bins) of the finite exposure, exact for every mode of the detector.
 
-    Parameters and errors are those of `exposure_moments`; a gate must not move. It sums to the mean count.
-    Jitter and code widths are in it, and the electronics' dead
-    time for modes ``"nonparalyzable"`` and ``"gated"`` (to 1e-3, see `electronics_moments`).
+    Parameters and errors are those of `exposure_moments`; a gate must not move. The histogram sums to the mean count
+    and includes jitter, code widths and, for modes ``"nonparalyzable"`` and ``"gated"``, the dead time of the
+    electronics (to 1e-3, see `electronics_moments`).
     """
     cells = Cells.of(
         signal,
@@ -57,7 +57,7 @@ def mean_histogram(
 
 
 def histogram_effects(system: object) -> tuple[str, ...]:
-    """Effects of the detector with which there is a mean histogram, by its mode."""
+    """Effects of the detector that the mean histogram treats in the mode of `system`."""
     able = isinstance(system, System) and system.detector.mode in ELECTRONICS_MODES
     return (*LIGHT_EFFECTS, *(("electronics_dead_time_ns",) if able else ()), *TIMING_EFFECTS)
 
@@ -73,9 +73,9 @@ def _registrations(cells: Cells, bins: int, tolerance: float, threads: int | Non
         return moments(cells, max(tolerance, 1e-3), LAW_EFFORT).histogram.reshape(cells.size, bins)
     if mode == "synchronous":
         armed = first_arrivals(cells)
-        seen = np.maximum(armed.sum(-1), np.finfo(float).tiny)
+        registered = np.maximum(armed.sum(-1), np.finfo(float).tiny)
         mean = np.array([cumulants_of(window)[0] for window in synchronous_windows(cells)])
-        return np.asarray(armed * (mean / seen)[:, None], dtype=np.float64)
+        return np.asarray(armed * (mean / registered)[:, None], dtype=np.float64)
     if mode == "paralyzable":
         return paralyzable_histograms(cells, tolerance)
 
@@ -111,8 +111,8 @@ def registration_pdf(
     signal, background, delay_ns, waveform, tolerance, threads
         As `count_law`; arrays broadcast to (...).
     method
-        - ``"exposure"``: mean histogram of the finite exposure, which is what a measurement averages to,
-        - ``"stationary"``: that of a pixel which has been running for long,
+        - ``"exposure"``: mean histogram of the finite exposure, the mean of measurements,
+        - ``"stationary"``: that of one period of a stationary pixel,
         - ``"chain"``: stationary distribution of the Markov chain of phases (arXiv 2509.20500), for detectors
           of mode ``"nonparalyzable"``; the first two are for every mode (docs/detectors.md), and for dead time of the
           electronics (to 1e-3 in total variation) with modes ``"nonparalyzable"`` and ``"gated"``.
@@ -154,7 +154,7 @@ def registration_pdf(
     )
     if method == "chain":
         shape = _chain_shapes(cells, edge)
-    elif method == "exposure" or system.detector.mode == "synchronous":  # there the same at any time
+    elif method == "exposure" or system.detector.mode == "synchronous":  # every exposure has the same shape
         shape = mean_histograms(cells, tolerance, threads)
     elif system.detector.mode == "paralyzable":
         warm = replace(cells, system=system.replace(start="stationary"))
@@ -167,7 +167,7 @@ def registration_pdf(
 
 
 def rearm_of(rearm: str | None, used: bool, by: str) -> Literal["centre", "edge"]:
-    """Where the chain re-arms; a choice only where the chain is `used`."""
+    """The checked argument `rearm`, which must be None unless the chain is `used`."""
     if rearm is None:
         return "centre"
     if not used:

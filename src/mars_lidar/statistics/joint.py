@@ -1,13 +1,13 @@
 """The covariance of a histogram in closed form: means, variances and covariances of any bins and windows.
 
-A pixel is armed iff nothing registered in the last dead time, so registrations feed back linearly on later ones, and
-what remains is noise without memory. Folded over the periods this is one linear equation round the circle; its
-solution for the weights of a window gives the variance of the window. The closed form, of an exposure that settles, has
-the exact terms of its two ends (section 5). Derivation and equation numbers: docs/joint_law.md.
+A pixel is armed iff nothing registered in the last dead time, so that registrations feed back linearly on later ones,
+driven by noise without memory. Folded over the periods this is one linear equation round the circle; its solution for
+the weights of a window gives the variance of the window. For an exposure that forgets its start, a closed form includes
+the exact terms of both ends (section 5). Derivation and equation numbers: docs/joint_law.md.
 
-Where the bins show registrations elsewhere than on the grid (jitter, code density): given the registrations of the
-cells, each is recorded in a bin independently of the others. So a weight w of the bin is on average v = E w of its
-registration, and by the law of total variance, with mean m of the registrations in each cell,
+With jitter or uneven codes, a registration is recorded in a random bin, independently of all others given its time. A
+weight w of the bin then has the mean v = E w for its registration and, by the law of total variance, with the mean m of
+the registrations in each cell,
 
     Cov(a H, b H) = Cov(v_a H', v_b H') + sum m (E[a b] - v_a v_b).
 """
@@ -41,24 +41,24 @@ from mars_lidar.statistics.timing import Timing, is_timed
 # --- One pixel on one grid -----------------------------------------------------------------------------------------
 
 INSTEAD = "use exposure_moments (count and mean histogram), or simulate it with engine 'exact'"
-_SETTLED = 1e-9  # distance from the stationary state (total variation) at which the start is forgotten
+_SETTLED = 1e-9  # total variation from the stationary state at which the start is forgotten
 _MAX_STEPS = 40_000_000  # bins x periods after which an exposure counts as not settling: half a second
-_MANY_BINS = 2**16  # with which a grid is judged by few windows
+_MANY_BINS = 2**16  # bins of a grid beyond which fewer windows are compared: a window takes long
 _MAX_RECURSION = 2**22  # bins x periods of an exposure that is run through for every window
 
 
 @dataclass(frozen=True, eq=False)
 class Windows:
-    """What m windows need for their covariances; arrays (m, ...), made by `SettledLaw.windows`.
+    """Terms of the covariances of m windows; arrays (m, ...), made by `SettledLaw.windows`.
 
-    `y` is the transposed solution, `noise` half of its noise plus that of its change at the end (both (m, 2 n)),
-    `left` and `spread` the worth of the registrations that end or begin the exposure, without and with their
-    covariance; `step`, `first`, `edge`, `expected` what whole periods, and the oldest bin, add to them.
+    `y`: transposed solution (m, 2 n). `noise`: half of its noise plus that of its change at the end (m, 2 n).
+    `after_end`: effect after the end of registrations before it (5.6); `spread`: the same times the second moments of
+    the registrations. `step`, `first`, `edge`, `expected`: contributions of whole periods and of the oldest bin.
     """
 
     y: FloatArray
     noise: FloatArray
-    left: FloatArray
+    after_end: FloatArray
     spread: FloatArray
     step: FloatArray
     first: FloatArray
@@ -74,7 +74,7 @@ class SettledLaw:
         self.grid = grid
         x = grid.state
         j = np.arange(n)
-        self._often = whole + (j >= n - d)  # periods whose bin j may still blind the pixel at the end
+        self._often = whole + (j >= n - d)  # number of periods whose bin j can blind the pixel at the end
         self._sum1 = 0.5 * whole * (whole + 1)
         self._sum2 = whole * (whole + 1) * (2 * whole + 1) / 6.0
         self._old = n - d - 1
@@ -106,21 +106,21 @@ class SettledLaw:
         armed = grid.worth(y)
         below = np.cumsum(armed, -1)
         step = below[:, -1]
-        # What a registration before the end is still worth after it (5.6), whole periods apart
-        left = np.stack([weights - y[:, 0] + below - (grid.whole + 1) * step[:, None], -y[:, 1]], 1)
+        # effect after the end of a registration before it (5.6), without whole periods
+        worth = np.stack([weights - y[:, 0] + below - (grid.whole + 1) * step[:, None], -y[:, 1]], 1)
         edge = self._edge(y, armed)
-        source = self._often * left
+        source = self._often * worth
         source[:, 0] += self._sum1 * step[:, None]
         source[:, :, self._old] += edge
         change = grid.adjoint(source[:, 0], source[:, 1], tolerance=1e-7)  # a term that does not grow with N_r
         x = grid.state
-        first = (left * x).sum((1, 2))
-        expected = (self._often * left * x).sum((1, 2)) + self._sum1 * step * x[0].sum() + edge @ x[:, self._old]
+        first = (worth * x).sum((1, 2))
+        expected = (self._often * worth * x).sum((1, 2)) + self._sum1 * step * x[0].sum() + edge @ x[:, self._old]
         return Windows(
             y=y.reshape(-1, 2 * n),
             noise=(_product(0.5 * self._total, y) + _product(self._noise, change)).reshape(-1, 2 * n),
-            left=left.reshape(-1, 2 * n),
-            spread=(self._often * _product(_spread(x), left)).reshape(-1, 2 * n),
+            after_end=worth.reshape(-1, 2 * n),
+            spread=(self._often * _product(_spread(x), worth)).reshape(-1, 2 * n),
             step=step,
             first=first,
             edge=edge,
@@ -131,7 +131,7 @@ class SettledLaw:
         """(m,) covariances of windows a[k] and b[k]; or (m,) with one b for all: (5.5)."""
         rows = "ki,ki->k" if len(a.y) == len(b.y) else "ki,li->k"
         inside = np.einsum(rows, a.y, b.noise) + np.einsum(rows, a.noise, b.y)
-        ends = np.einsum(rows, a.left, b.spread) + np.einsum(rows, a.edge @ self._old_spread, b.edge)
+        ends = np.einsum(rows, a.after_end, b.spread) + np.einsum(rows, a.edge @ self._old_spread, b.edge)
         ends += self._sum1 * (a.step * b.first + a.first * b.step)
         ends += self._sum2 * a.step * b.step * self.grid.state[0].sum() - a.expected * b.expected
         return np.asarray(inside + (2.0 if self.grid.warm else 1.0) * ends)
@@ -139,7 +139,7 @@ class SettledLaw:
     def matrix(self, a: Windows) -> FloatArray:
         """(m, m) covariances of all windows with each other."""
         ends = 2.0 if self.grid.warm else 1.0
-        half = a.y @ a.noise.T + (0.5 * ends) * (a.left @ a.spread.T)
+        half = a.y @ a.noise.T + (0.5 * ends) * (a.after_end @ a.spread.T)
         half += (0.5 * ends) * (a.edge @ self._old_spread @ a.edge.T)
         half += (ends * self._sum1) * np.outer(a.step, a.first)
         half += (0.5 * ends * self._sum2 * self.grid.state[0].sum()) * np.outer(a.step, a.step)
@@ -147,7 +147,7 @@ class SettledLaw:
         return np.asarray(half + half.T)
 
     def leading(self, weights: FloatArray) -> float:
-        """Variance of one window of `weights` (n,) without the terms of the two ends: N_r times that of a period."""
+        """Variance of one window of `weights` (n,) without the terms of the ends: N_r times that of a period."""
         y = self.grid.adjoint(weights[None])
         return float(self.grid.cycles * (y * _product(self._noise, y)).sum())
 
@@ -157,7 +157,7 @@ class SettledLaw:
         return np.array([[m[0], m[1]], [m[1], m[2]]])
 
     def _edge(self, y: FloatArray, armed: FloatArray) -> FloatArray:
-        """(m, 2): the oldest bin reaches beyond the end only with the part that re-arms in the next bin."""
+        """(m, 2) correction for the oldest bin, of which only the part that re-arms in the next bin reaches the end."""
         _, p0, p1, _, q0, q1 = self.grid.response
         far = self.grid.maps[1]
         again = np.stack([p0[0] * y[:, 0, 0] + q0[0] * y[:, 1, 0], p1[0] * y[:, 0, 0] + q1[0] * y[:, 1, 0]], 1)
@@ -175,13 +175,13 @@ def _product(matrix: FloatArray, y: FloatArray) -> FloatArray:
 
 
 class Pixel:
-    """One pixel on one grid, windows on `out` bins: by the closed form, or through all periods."""
+    """One pixel on one grid, windows on `out` bins: by the closed form, or by running through all periods."""
 
     def __init__(self, cells: Cells, bins: int, out: int) -> None:
 
         cells.check_history(bins)
         self.cells, self.out = cells, out
-        self._kept: tuple[FloatArray, FloatArray] | None = None
+        self._monitored: tuple[FloatArray, FloatArray] | None = None
         self.grid = grid = FoldedGrid.of(cells, bins)
         try:
             self.state = np.ascontiguousarray(grid.state.T)
@@ -221,10 +221,10 @@ class Pixel:
         return self.law.covariance(windows, windows)
 
     def monitored(self, weights: FloatArray) -> FloatArray:
-        """`variances`, which are kept: the next finer grid is compared by the same windows, but for the first time."""
-        if self._kept is None or not np.array_equal(self._kept[0], weights):
-            self._kept = weights, self.variances(weights)
-        return self._kept[1]
+        """`variances`, cached: the comparison with the next finer grid uses the same windows."""
+        if self._monitored is None or not np.array_equal(self._monitored[0], weights):
+            self._monitored = weights, self.variances(weights)
+        return self._monitored[1]
 
     def covariances(self, first: FloatArray, second: FloatArray) -> FloatArray:
         """Covariances (windows,) of the counts in pairs of windows (windows, bins)."""
@@ -236,8 +236,8 @@ class Pixel:
         """Covariance (bins, bins) of the histogram."""
         eye = np.eye(self.out)
         if self.law is None:
-            found = self._columns(eye)
-            return np.asarray(0.5 * (found + found.T))
+            columns = self._columns(eye)
+            return np.asarray(0.5 * (columns + columns.T))
         return self.law.matrix(self._windows(eye))
 
     def _windows(self, weights: FloatArray) -> Windows:
@@ -271,7 +271,7 @@ def movement(coarse: Pixel, fine: Pixel) -> float:
     mean = fine.mean.reshape(n, -1).sum(-1)
     total = max(float(mean.sum()), np.finfo(float).tiny)
     shape = 0.5 * float(np.abs(mean - coarse.mean).sum()) / total
-    few = fine.law is None or max(fine.grid.bins, fine.out) > _MANY_BINS  # a window costs much
+    few = fine.law is None or max(fine.grid.bins, fine.out) > _MANY_BINS  # a window takes long
     weights = _monitors(mean, fine.cells.system.dead_time_periods, few)
     means = weights @ mean
     before, after = coarse.monitored(weights), fine.monitored(np.repeat(weights, fine.out // n, axis=-1))
@@ -285,7 +285,7 @@ def movement(coarse: Pixel, fine: Pixel) -> float:
 
 
 def _monitors(mean: FloatArray, dead: float, few: bool) -> FloatArray:
-    """(m, n) windows that show an error: all, halves, the brightest bin, its echo, their neighbours; or a `few`."""
+    """(m, n) windows compared between grids: all, halves, the brightest bin, its echo a dead time later, neighbours."""
     n = mean.size
     j = np.arange(n)
     windows = [np.ones(n)]
@@ -301,39 +301,39 @@ def _monitors(mean: FloatArray, dead: float, few: bool) -> FloatArray:
     return np.array(list(different.values()))
 
 
-# --- Bins that show registrations of other cells -------------------------------------------------------------------
+# --- Records in other bins than registrations ----------------------------------------------------------------------
 
 
-class SeenPixel(Pixel):
-    """A `Pixel` whose registrations, of mean `mass` (cells,) on its own bins, are seen in others."""
+class RecordedPixel(Pixel):
+    """A `Pixel` whose registrations, of mean `mass` (cells,) on its grid, are recorded in other bins."""
 
     def __init__(self, pixel: Pixel, mass: FloatArray) -> None:
         self.pixel, self._mass = pixel, mass
         self.cells, self.grid, self.law = pixel.cells, pixel.grid, pixel.law
 
     @abstractmethod
-    def _seen(self, weights: FloatArray) -> FloatArray:
-        """Mean (windows, cells) of the weight (windows, bins) of a registration of each cell."""
+    def _mean_weight(self, weights: FloatArray) -> FloatArray:
+        """Mean weight (windows, cells) of a registration in each cell, for weights (windows, bins)."""
 
     def variances(self, weights: FloatArray) -> FloatArray:
         """Variances (windows,) of the counts in windows `weights` (windows, bins)."""
-        v = self._seen(weights)
-        return np.asarray(self.pixel.variances(v) + (self._seen(weights * weights) - v * v) @ self._mass)
+        v = self._mean_weight(weights)
+        return np.asarray(self.pixel.variances(v) + (self._mean_weight(weights * weights) - v * v) @ self._mass)
 
     monitored = variances
 
     def covariances(self, first: FloatArray, second: FloatArray) -> FloatArray:
         """Covariances (windows,) of the counts in pairs of windows (windows, bins)."""
-        v, w = self._seen(first), self._seen(second)
-        return np.asarray(self.pixel.covariances(v, w) + (self._seen(first * second) - v * w) @ self._mass)
+        v, w = self._mean_weight(first), self._mean_weight(second)
+        return np.asarray(self.pixel.covariances(v, w) + (self._mean_weight(first * second) - v * w) @ self._mass)
 
 
-class FinePixel(SeenPixel):
-    """A `Pixel` on cells of the period, seen in `out` finer bins that need not divide them.
+class FinePixel(RecordedPixel):
+    """A `Pixel` on coarse cells of the period, with a histogram of `out` finer bins that need not divide them.
 
-    Given the cells of all registrations, their places within them are taken for independent, with the mean histogram's
-    density. Pairs of registrations then have the density of their two cells: what is lost is how it changes within a
-    cell, which the comparison with cells twice as wide shows.
+    Given the cells of all registrations, their places within the cells are independent, with the density of the mean
+    histogram. The pair density is thus constant within a pair of cells; the comparison with cells twice as wide bounds
+    the error.
     """
 
     def __init__(self, pixel: Pixel, out: int) -> None:
@@ -352,21 +352,21 @@ class FinePixel(SeenPixel):
         self.out, self.mean = out, np.bincount(of_bin, pieces, minlength=out).astype(np.float64)
 
     def wider(self) -> FinePixel:
-        """The same from cells twice as wide."""
+        """The same pixel from cells twice as wide."""
         pixel = copy(self.pixel)
         pixel.out, pixel.mean = pixel.out // 2, pixel.mean.reshape(-1, 2).sum(-1)
         return FinePixel(pixel, self.out)
 
     def matrix(self) -> FloatArray:
-        """None: MemoryError."""
+        """Raises MemoryError: more than 2^17 bins have too many covariances."""
         raise MemoryError(f"covariances of {self.out} bins with each other; use window() or covariance_of()")
 
-    def _seen(self, weights: FloatArray) -> FloatArray:
+    def _mean_weight(self, weights: FloatArray) -> FloatArray:
         return np.stack([np.asarray(self._parts @ row) / self._mass for row in weights])
 
 
-class TimedPixel(SeenPixel):
-    """A pixel on fine parts of the period, with mean (parts,), seen through `timing`: jitter and code widths."""
+class TimedPixel(RecordedPixel):
+    """A pixel on fine parts of the period, with mean (parts,), recorded with the jitter and code widths of `timing`."""
 
     def __init__(self, pixel: Pixel, mean: FloatArray, timing: Timing) -> None:
         super().__init__(pixel, mean)
@@ -376,19 +376,19 @@ class TimedPixel(SeenPixel):
         """(bins, bins) covariances."""
         parts = self._mass.size
         check_memory(24 * parts**2, f"covariances of {parts} parts of the period", "use window() or lag()")
-        v = self._seen(np.eye(self._timing.system.bins))
-        seen = v @ self.pixel.matrix() @ v.T
-        return np.asarray(seen + np.diag(v @ self._mass) - (v * self._mass) @ v.T)
+        v = self._mean_weight(np.eye(self._timing.system.bins))
+        covariance = v @ self.pixel.matrix() @ v.T
+        return np.asarray(covariance + np.diag(v @ self._mass) - (v * self._mass) @ v.T)
 
-    def _seen(self, weights: FloatArray) -> FloatArray:
+    def _mean_weight(self, weights: FloatArray) -> FloatArray:
         return self._timing.backward(weights)
 
 
 # --- The joint law -------------------------------------------------------------------------------------------------
 
-_MAX_BINS = 2**17  # of the grid, unless the histogram itself has more: a second or two
-_CELLS = (2**13, 2**15, 2**16)  # of a histogram of more than MANY_BINS, tried in turn
-_BLOCK = 64  # windows solved at a time
+_MAX_BINS = 2**17  # bins of the grid (a second or two), unless the histogram itself has more
+_CELLS = (2**13, 2**15, 2**16)  # cells of the period for histograms of more than MANY_BINS bins, tried in turn
+_BLOCK = 64  # windows solved together
 
 
 @checked
@@ -427,9 +427,9 @@ def joint_law(
 
     Notes
     -----
-    Nothing is assumed stationary: the terms of the start and of the end of the exposure are in the result. Where
-    the exposure is too short to forget its start (`settled` is -1) every window is carried through all periods,
-    which is exact too but costs O(bins x cycles) a window instead of O(bins).
+    The result includes the terms of the start and of the end of the exposure; nothing is assumed stationary. Where
+    the exposure is too short to forget its start (`settled` is -1) every window is run through all periods, which
+    is exact too but costs O(bins x cycles) a window instead of O(bins).
 
     See Also
     --------
@@ -491,21 +491,21 @@ def _law(cells: Cells, tolerance: float) -> JointLaw:
         if moved <= tolerance:
             return replace(law, mean=fine.mean, movement=moved, _pixel=fine)
     raise ConvergenceError(
-        f"joint law of {cells.name(0)}: {_CELLS[-1]} cells of the period do not tell the light within them, which "
-        f"{out} bins show; use fewer bins, {INSTEAD.removeprefix('use ')}"
+        f"joint law of {cells.name(0)}: {_CELLS[-1]} cells of the period do not resolve the light in "
+        f"{out} bins; use fewer bins, {INSTEAD.removeprefix('use ')}"
     )
 
 
 def _refined(cells: Cells, out: int, tolerance: float) -> tuple[JointLaw, Pixel]:
-    """The law in `out` bins, of which its grid is a multiple."""
+    """The law in `out` bins, refined on grids whose bins divide them."""
     system = cells.system
     instead = cells.instead if meets_itself(cells) else INSTEAD
     cells = cells.resolved(out)
     bins = cells.first_bins(out)
     if bins > max(_MAX_BINS, 4 * out):
         raise ConvergenceError(
-            f"joint law of {cells.name(0)}: {bins} bins per period are needed to resolve the pulse, which meets itself "
-            f"a dead time later; {instead}"
+            f"joint law of {cells.name(0)}: {bins} bins per period are needed to resolve the pulse, within which "
+            f"pixels re-arm a dead time later; {instead}"
         )
     coarse = Pixel(cells, bins // 2, math.gcd(bins // 2, out))
     while True:
@@ -529,16 +529,16 @@ class JointLaw:
     Attributes
     ----------
     system
-        What it was made for.
+        Laser, detector and histogram.
     mean
         (bins,) expected registrations.
     movement
-        How far the result moved when the grid was last halved: the largest change of the variance of some twelve
+        Change of the result when the bins were last halved: the largest change of the variance of some twelve
         windows (relative, or to a millionth of the mean where that is more), of their means (in standard
         deviations, or in thousandths of the mean where that is more), and of the mean histogram (total variation).
         The error of the result is smaller.
     grid_bins
-        Bins per period of the grid that was needed, which is not the histogram's.
+        Bins per period of the final grid, which need not be those of the histogram.
     settled
         Periods after which the start is forgotten; -1 where the exposure is shorter than that, and is run through
         for every window.
@@ -573,12 +573,12 @@ class JointLaw:
 
     @property
     def sweeps(self) -> int:
-        """Sweeps round the circle that the slowest equation so far took; 200 where it was then factorised."""
+        """Sweeps round the circle of the slowest solution so far; 200 where it was then factorised."""
         return 0 if self._pixel is None else self._pixel.grid.sweeps
 
     @property
     def residual(self) -> float:
-        """Largest relative residual of the solutions that are checked: mean, first windows, all that is factorised."""
+        """Largest relative residual of the checked solutions: the mean, the first windows, all factorised ones."""
         return 0.0 if self._pixel is None else self._pixel.grid.residual
 
     @property
@@ -641,15 +641,15 @@ class JointLaw:
             j = np.arange(n)
             return np.asarray(self._covariance[j, (j + lag) % n])
         check_memory(8 * n * n, f"lags of {n} bins", "use window() or covariance_of() for the bins of interest")
-        found = np.empty(n)
+        covariances = np.empty(n)
         eye = np.eye(n)
         for start in range(0, n, _BLOCK):
             j = np.arange(start, min(start + _BLOCK, n))
             if lag % n == 0:
-                found[j] = self._pixel.variances(eye[j])
+                covariances[j] = self._pixel.variances(eye[j])
             else:
-                found[j] = self._pixel.covariances(eye[j], eye[(j + lag) % n])
-        return np.maximum(found, 0.0) if lag % n == 0 else found
+                covariances[j] = self._pixel.covariances(eye[j], eye[(j + lag) % n])
+        return np.maximum(covariances, 0.0) if lag % n == 0 else covariances
 
     def covariance(self) -> FloatArray:
         """(bins, bins) covariance matrix, in O(bins^3) simple steps: a fraction of a second for 1024 bins.
@@ -662,12 +662,12 @@ class JointLaw:
         n = self.mean.size
         if self._pixel is None:
             return np.diag(self.mean)
-        found = self._covariance
-        if found is None:
+        matrix = self._covariance
+        if matrix is None:
             check_memory(8 * n * (10 * self.grid_bins + 3 * n), f"covariances of {n} bins", "use window() or lag()")
-            found = self._pixel.matrix()
-            object.__setattr__(self, "_covariance", found)
-        return found.copy()
+            matrix = self._pixel.matrix()
+            object.__setattr__(self, "_covariance", matrix)
+        return matrix.copy()
 
     _covariance: FloatArray | None = field(default=None, init=False, repr=False)
 

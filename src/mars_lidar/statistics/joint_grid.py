@@ -30,57 +30,12 @@ MOST_FACTORED = 2**14  # bins of an equation that is factorised: a second
 GOOD = 1e-9  # relative residual with which a solution is accepted
 
 
-@dataclass(eq=False)
-class FeedbackEquation:
-    """The equation (4.4) of one pixel on n bins; dead time K + (d + f)/n periods; `response` (6, n) is (4.1)."""
+def factorised(grid: FoldedGrid) -> Callable[..., FloatArray]:
+    """Solver of (5.4) by sparse factors, with the sliding sums of alpha as further unknowns: few entries in every row.
 
-    whole: int
-    shift: int
-    fraction: float
-    response: FloatArray
-
-    @property
-    def bins(self) -> int:
-        """Bins of the grid n."""
-        return int(self.response.shape[1])
-
-    @cached_property
-    def maps(self) -> tuple[FloatArray, FloatArray]:
-        """The 2 x 2 maps `near` and `far` of a shift by f bins."""
-        f = self.fraction
-        g, c = f * (1.0 - f), 1.0 - 2.0 * f
-        near = [[1.0 - f, -3.0 * g], [g, 0.5 * (1.0 + c**3) - 6.0 * f * g]]
-        far = [[f, 3.0 * g], [-g, 0.5 * (1.0 - c**3) - 6.0 * (1.0 - f) * g]]
-        return np.array(near), np.array(far)
-
-    def rearmed(self, x: FloatArray, near: ArrayLike = 1.0, far: ArrayLike = 1.0) -> FloatArray:
-        """(2, n) of what registrations `x` (2, n) re-arm in each bin, its two parts weighted."""
-        a, b = self.maps
-        stays, goes_on = a @ np.roll(x, self.shift, -1), b @ np.roll(x, self.shift + 1, -1)
-        return np.asarray(np.asarray(near) * stays + np.asarray(far) * goes_on, dtype=np.float64)
-
-    def blind(self, x: FloatArray) -> FloatArray:
-        """(n,) registrations that keep the pixel blind at the start of each bin, whole periods included (4.3)."""
-        mass, n, d = x[0], self.bins, self.shift
-        below = np.concatenate([[0.0], np.cumsum(np.concatenate([mass, mass]))])
-        j = np.arange(n)
-        last = (self.maps[1] @ np.roll(x, d + 1, -1))[0]
-        return np.asarray(below[j + n] - below[j + n - d] + last + self.whole * mass.sum())
-
-    def apply(self, x: FloatArray) -> FloatArray:
-        """The left side of (4.4), without whole periods of dead time, by prefix sums: no code of the sweeps."""
-        pa, p0, p1, qa, q0, q1 = self.response
-        total, slope = self.rearmed(x)
-        blind = self.blind(x) - self.whole * x[0].sum()
-        return np.array([x[0] + pa * blind - p0 * total - p1 * slope, x[1] + qa * blind - q0 * total - q1 * slope])
-
-
-def factorised(grid: FeedbackEquation) -> Callable[..., FloatArray]:
-    """Sparse factors of (5.4) with the windows of worths as further unknowns: few entries in every row.
-
-    The window that the others follow from sums many bins: that one full row would fill the factors. So it is held
-    at 0 in them, and put back as a change of rank one. That is well conditioned where the pixel's state is all but
-    certain: behind the brightest light. Other places are tried where a solution shows that it is not.
+    The first sliding sum runs over many bins, and its full row would fill the factors. It is held at 0 in them and
+    restored by a rank-one update, which is well conditioned where the state of the pixel is nearly certain: after the
+    brightest light. Other places are tried where the residual is too large.
     """
     if grid.bins > MOST_FACTORED:
         raise ConvergenceError(
@@ -89,26 +44,26 @@ def factorised(grid: FeedbackEquation) -> Callable[..., FloatArray]:
     lit = grid.response[0]
     peak = int(np.argmax(lit))
     dim = np.roll(lit, -peak) <= lit.min() + 1e-3 * (lit.max() - lit.min())
-    behind = (peak + int(np.argmax(dim))) % grid.bins
+    after_peak = (peak + int(np.argmax(dim))) % grid.bins
     best, least = None, np.inf
-    for place in dict.fromkeys((behind, 0, peak, (peak + grid.bins // 2) % grid.bins)):
+    for place in dict.fromkeys((after_peak, 0, peak, (peak + grid.bins // 2) % grid.bins)):
         solve = _factors_at(grid, place)
         source = grid.response[[0, 3]]
         x = np.zeros_like(source)
         for _ in range(2):
             rest = np.concatenate([(source - grid.apply(x)).reshape(-1), np.zeros(grid.bins)])
             x = x + solve(rest, trans="T")[: 2 * grid.bins].reshape(2, -1)
-        left = left_over(source - grid.apply(x), x)
-        if best is None or left < least:
-            best, least = solve, left
+        error = left_over(source - grid.apply(x), x)
+        if best is None or error < least:
+            best, least = solve, error
         if least <= 0.1 * GOOD:
             break
     assert best is not None
     return best
 
 
-def _factors_at(grid: FeedbackEquation, place: int) -> Callable[..., FloatArray]:
-    """Factors with the window before bin `place` held, and put back."""
+def _factors_at(grid: FoldedGrid, place: int) -> Callable[..., FloatArray]:
+    """Solver with the sliding sum before bin `place` held at 0 and restored by a rank-one update."""
     from scipy.sparse.linalg import splu
 
     n, d = grid.bins, grid.shift
@@ -119,7 +74,7 @@ def _factors_at(grid: FeedbackEquation, place: int) -> Callable[..., FloatArray]
     order = np.arange(3 * n).reshape(3, n).T.reshape(-1)  # bin after bin: entries near the diagonal
     try:
         factors: Any = splu(matrix[order][:, order])
-    except RuntimeError as error:  # SuperLU's word for an exactly singular matrix
+    except RuntimeError as error:  # SuperLU raises it for an exactly singular matrix
         raise ConvergenceError(f"the feedback equation is singular: {error}") from None
 
     def bare(right: FloatArray, trans: str) -> FloatArray:
@@ -127,9 +82,9 @@ def _factors_at(grid: FeedbackEquation, place: int) -> Callable[..., FloatArray]
         out[order] = factors.solve(ordered, trans=trans)
         return out
 
-    one = np.zeros(3 * n)
-    one[2 * n] = 1.0
-    change = {"N": (bare(one, "N"), row), "T": (bare(row, "T"), one)}
+    held = np.zeros(3 * n)
+    held[2 * n] = 1.0
+    change = {"N": (bare(held, "N"), row), "T": (bare(row, "T"), held)}
 
     def whole(right: FloatArray, trans: str = "N") -> FloatArray:
         three = right.reshape(3, n, -1)
@@ -141,8 +96,8 @@ def _factors_at(grid: FeedbackEquation, place: int) -> Callable[..., FloatArray]
     return whole
 
 
-def _matrix(grid: FeedbackEquation) -> csc_matrix:
-    """The equations without the sum over a window in row 2 n, the window before the first bin."""
+def _matrix(grid: FoldedGrid) -> csc_matrix:
+    """The equations (3 n, 3 n) without row 2 n, the sum over the window before the first bin."""
     from scipy.sparse import csc_matrix
 
     pa, p0, p1, qa, q0, q1 = grid.response
@@ -177,39 +132,57 @@ def _matrix(grid: FeedbackEquation) -> csc_matrix:
 
 
 def left_over(rest: FloatArray, x: FloatArray) -> float:
-    """Largest residual `rest` of a solution `x`, relative to its largest value; infinite of none where there is one."""
-    size, left = float(np.abs(x).max()), float(np.abs(rest).max())
-    return left / size if size > 0.0 else math.inf if left != 0.0 else 0.0
+    """Largest residual `rest` relative to the largest value of the solution `x`; infinite for x = 0 and a residual."""
+    size, largest = float(np.abs(x).max()), float(np.abs(rest).max())
+    return largest / size if size > 0.0 else math.inf if largest != 0.0 else 0.0
 
 
 # --- The folded exposure -------------------------------------------------------------------------------------------
 
-_CHECKED = 3  # windows of those that are solved together, by a residual: first, last and between
-_SWEEPS = 200  # beyond, a factorisation is cheaper
-_TOLERANCE = 1e-10  # of a solution, relative to its largest value
+_CHECKED = 3  # windows of a block whose residual is checked: first, last and middle
+_SWEEPS = 200  # sweeps; beyond, a factorisation is faster
+_TOLERANCE = 1e-10  # change of a solution per sweep, relative to its largest value
 
 
 @dataclass(eq=False)
-class FoldedGrid(FeedbackEquation):
-    """The exposure of one pixel on n bins. Made by `FoldedGrid.of`.
+class FoldedGrid:
+    """The exposure of one pixel on a grid of n bins, and its feedback equation (4.4). Made by `FoldedGrid.of`.
 
-    `sweeps` tells what the slowest solution so far took, `residual` what the worst of those that were checked left.
+    Attributes
+    ----------
+    whole, shift, fraction
+        The dead time is K + (d + f) / n periods: K, d and f.
+    response
+        (6, n) responses of the bins to being armed and to re-arming (4.1).
+    cycles, warm
+        Periods of the exposure; whether it starts in the stationary state.
+    sweeps
+        Sweeps of the slowest solution so far.
+    residual
+        Largest relative residual among the solutions that were checked.
+    direct
+        Whether the equation is solved by sparse factors, because sweeps did not converge.
+    unproven
+        Transposed solutions by sweeps whose residual has yet to be checked; later ones are of the same kind.
     """
 
+    whole: int
+    shift: int
+    fraction: float
+    response: FloatArray
     cycles: int = 1
     warm: bool = False
     sweeps: int = 0
     residual: float = 0.0
     direct: bool = False
-    unproven: int = 2  # transposed solutions by sweeps that are still to be checked by `residual`; later ones are alike
+    unproven: int = 2
 
     @classmethod
     def of(cls, cells: Cells, bins: int) -> FoldedGrid:
-        """The only cell of `cells` on `bins` bins."""
-
+        """The grid of the only cell of `cells`, on `bins` bins."""
         system = cells.system
         whole, shift, fraction = whole_bins(system.dead_time_periods, bins)
-        if system.start == "armed":  # a dead time beyond the end of the exposure is as good as one up to it
+        if system.start == "armed":  # a dead time beyond the end of the exposure has no further effect
             whole = min(whole, system.cycles)
         energy, row = cells.energies(bins)
         signal, background = cells.native_flux
@@ -217,6 +190,41 @@ class FoldedGrid(FeedbackEquation):
         response = np.empty((6, bins))
         _core.joint_response(photons, response)
         return cls(whole, shift, fraction, response, system.cycles, system.start == "stationary")
+
+    @property
+    def bins(self) -> int:
+        """Bins of the grid n."""
+        return int(self.response.shape[1])
+
+    @cached_property
+    def maps(self) -> tuple[FloatArray, FloatArray]:
+        """The 2 x 2 maps `near` and `far` of a shift by f bins."""
+        f = self.fraction
+        g, c = f * (1.0 - f), 1.0 - 2.0 * f
+        near = [[1.0 - f, -3.0 * g], [g, 0.5 * (1.0 + c**3) - 6.0 * f * g]]
+        far = [[f, 3.0 * g], [-g, 0.5 * (1.0 - c**3) - 6.0 * (1.0 - f) * g]]
+        return np.array(near), np.array(far)
+
+    def rearmed(self, x: FloatArray, near: ArrayLike = 1.0, far: ArrayLike = 1.0) -> FloatArray:
+        """Re-arming (2, n) caused by registrations `x` (2, n), with weights for its `near` and `far` bin."""
+        a, b = self.maps
+        stays, goes_on = a @ np.roll(x, self.shift, -1), b @ np.roll(x, self.shift + 1, -1)
+        return np.asarray(np.asarray(near) * stays + np.asarray(far) * goes_on, dtype=np.float64)
+
+    def blind(self, x: FloatArray) -> FloatArray:
+        """(n,) registrations that keep the pixel blind at the start of each bin, whole periods included (4.3)."""
+        mass, n, d = x[0], self.bins, self.shift
+        below = np.concatenate([[0.0], np.cumsum(np.concatenate([mass, mass]))])
+        j = np.arange(n)
+        last = (self.maps[1] @ np.roll(x, d + 1, -1))[0]
+        return np.asarray(below[j + n] - below[j + n - d] + last + self.whole * mass.sum())
+
+    def apply(self, x: FloatArray) -> FloatArray:
+        """The left side of (4.4), without whole periods of dead time, by prefix sums, independent of the sweeps."""
+        pa, p0, p1, qa, q0, q1 = self.response
+        total, slope = self.rearmed(x)
+        blind = self.blind(x) - self.whole * x[0].sum()
+        return np.array([x[0] + pa * blind - p0 * total - p1 * slope, x[1] + qa * blind - q0 * total - q1 * slope])
 
     def noise(self, x: FloatArray, armed: FloatArray, again: FloatArray) -> FloatArray:
         """(3, n) covariance of the noise of (mass, moment) in a bin: (5.2)."""
@@ -254,7 +262,7 @@ class FoldedGrid(FeedbackEquation):
         return y, float(self.worth(y).sum())
 
     def worth(self, y: FloatArray) -> FloatArray:
-        """(..., n) what being armed at the start of a bin is worth: alpha of (5.3)."""
+        """Effect (..., n) of being armed at the start of each bin: alpha of (5.3)."""
         return np.asarray(self.response[0] * y[..., 0, :] + self.response[3] * y[..., 1, :])
 
     def adjoint(self, mass: FloatArray, moment: FloatArray | None = None, tolerance: float = _TOLERANCE) -> FloatArray:
@@ -286,7 +294,7 @@ class FoldedGrid(FeedbackEquation):
             self.sweeps = max(self.sweeps, int(done))
         if self.direct:
             x = np.zeros((2, self.bins))
-            for _ in range(2):  # the second round takes away the rounding of the first
+            for _ in range(2):  # iterative refinement: the second round removes the rounding error of the first
                 rest = np.concatenate([(source - self.apply(x)).reshape(-1), np.zeros(self.bins)])
                 x = x + self._factors(rest, trans="T")[: 2 * self.bins].reshape(2, -1)
         self._judge(source - self.apply(x), x)
@@ -339,10 +347,10 @@ class FoldedGrid(FeedbackEquation):
         return y
 
     def _judge(self, rest: FloatArray, x: FloatArray) -> None:
-        left = left_over(rest, x)
-        self.residual = max(self.residual, left)
-        if not left <= GOOD:
-            raise ConvergenceError(f"the feedback equation is left with a relative residual of {left:.1e}")
+        error = left_over(rest, x)
+        self.residual = max(self.residual, error)
+        if not error <= GOOD:
+            raise ConvergenceError(f"the feedback equation has a relative residual of {error:.1e}")
 
     def _apply_transposed(self, y: FloatArray) -> FloatArray:
         """The left side of (5.4) for `y` (m, 2, n), without whole periods of dead time."""
@@ -360,5 +368,5 @@ class FoldedGrid(FeedbackEquation):
 
     @cached_property
     def _factors(self) -> Callable[..., FloatArray]:
-        """Solves the equations for right sides (3 n, m), by factors that are made once."""
+        """Solver for right sides (3 n, m), by factors that are computed once."""
         return factorised(self)

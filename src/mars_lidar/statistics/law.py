@@ -1,10 +1,10 @@
-"""The count law of a pixel, by any of the methods."""
+"""The law of the count of a pixel: exact, Gaussian (MaRS, renewal) or Poisson."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -28,7 +28,7 @@ from mars_lidar.statistics.renewal import holding_times
 from mars_lidar.statistics.synchronous import cumulants_of, synchronous_windows
 
 Method = Literal["exact", "mars", "renewal", "poisson"]
-_METHODS = ("exact", "mars", "renewal", "poisson")
+_METHODS = get_args(Method)
 
 
 class CountLaw:
@@ -37,13 +37,13 @@ class CountLaw:
     Attributes
     ----------
     method
-        What computed it.
+        Method of `count_law`.
     cumulants
         (..., 4) mean, variance, third and fourth cumulant of N.
     exposure
-        The `Exposure` behind an exact law (its histogram has a single bin), else None.
+        The `Exposure` of an exact law (its histogram has a single bin), else None.
 
-    `support`, `pmf` and `cdf` are computed when first asked for, and kept.
+    `support`, `pmf` and `cdf` are computed on first use and cached.
 
     See Also
     --------
@@ -99,8 +99,8 @@ class CountLaw:
     def pmf(self) -> FloatArray:
         """P(N = n) (..., w) for n in `support`; no more than `outside` lies elsewhere.
 
-        For the Gaussian laws ("mars", "renewal") the normal density integrated from n - 1/2 to n + 1/2, what lies below
-        0 included in P(0).
+        For the Gaussian laws ("mars", "renewal") the normal density integrated from n - 1/2 to n + 1/2; P(0) includes
+        the probability below 0.
         """
         out = np.zeros((len(self._windows), self._width))
         for row, window in zip(out, self._windows, strict=True):
@@ -126,7 +126,7 @@ class CountLaw:
         return max(window.p.size for window in self._windows)
 
     def __getstate__(self) -> dict[str, Any]:
-        """The law with its probabilities: what evaluates them when first asked for does not go to other processes."""
+        """The law with its probabilities evaluated: the function that evaluates them cannot be pickled."""
         windows = self._windows
         return {name: value for name, value in self.__dict__.items() if name != "_evaluate"} | {"_windows": windows}
 
@@ -221,8 +221,8 @@ def count_law(
     slow = "electronics_dead_time_ns" in cells.system.detector.effects
     if method == "exact" and (slow or system.detector.mode == "synchronous"):
         windows = record_windows(cells, max(tolerance, 1e-3), team) if slow else synchronous_windows(cells)
-        found = np.array([cumulants_of(window) for window in windows]).reshape(*cells.shape, 4)
-        return CountLaw(method, found, lambda: windows)
+        recorded_cumulants = np.array([cumulants_of(window) for window in windows]).reshape(*cells.shape, 4)
+        return CountLaw(method, recorded_cumulants, lambda: windows)
     if method == "exact":
         exposure = refined_moments(cells, 1, tolerance=tolerance, threads=team, steps=LAW_STEPS)
         flat, bins = exposure.cumulants.reshape(-1, 4), exposure.bins.reshape(-1)

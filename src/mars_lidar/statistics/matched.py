@@ -1,6 +1,7 @@
-"""A law of the count with four given cumulants, for tables that hold no more of the exact law.
+"""Count laws matched to four given cumulants, for tables that store no more of the exact law.
 
-The law is native/laws/matched_law.h, which engines draw from: here its probabilities, and where it can be trusted.
+The law is defined in native/laws/matched_law.h, from which the engines draw. This module gives its probabilities and a
+criterion for its accuracy.
 """
 
 from __future__ import annotations
@@ -11,11 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 from mars_lidar._base.native import _core
 from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import FloatArray, IndexArray
-from mars_lidar.statistics.count_pmf import Pmf
+from mars_lidar.statistics.count_pmf import MAX_COUNTS, Pmf
 
-_MAX_COUNTS = 2**24
-_MAX_MEAN = 1e15
-_OUTSIDE = 1.5e-15  # two normal tails beyond 8 standard deviations
+_MAX_MEAN = 1e15  # counts; doubles hold integers up to 9e15
+_OUTSIDE = 1.5e-15  # probability of the two normal tails beyond 8 standard deviations
 
 
 def matched_pmf(cumulants: ArrayLike, *, threads: int | None = None) -> list[Pmf]:
@@ -24,8 +24,8 @@ def matched_pmf(cumulants: ArrayLike, *, threads: int | None = None) -> list[Pmf
     Parameters
     ----------
     cumulants
-        (cells, 4) mean in [0, 1e15], variance >= 0, third and fourth cumulant. Cumulants that no count has
-        (a variance below what an integer of this mean can have, say) give a law nearby.
+        (cells, 4) mean in [0, 1e15], variance >= 0, third and fourth cumulant. Cumulants that no count
+        can have (a variance below that of an integer of this mean, say) give a nearby law.
     threads
         Threads to run on; default: all processors that this process may use.
 
@@ -44,15 +44,16 @@ def matched_pmf(cumulants: ArrayLike, *, threads: int | None = None) -> list[Pmf
     Three forms. A variance of 9 or more, or a smooth law: the quantile is that of E. A. Cornish and R. A.
     Fisher (1938) to the fourth cumulant, rounded, with Sheppard's corrections. Few photons, mode locking,
     saturation: an integer, plus a Panjer count, less a Poisson one (or the mirror image), times a polynomial.
-    The least variance that an integer can have: two integers. `trusted` tells where this is the exact law.
+    The least variance that an integer can have: two integers. `trusted` tells where the result is
+    close to the exact law.
     """
     given, team = _checked(cumulants), thread_count(threads)
     first, last, _ = _support(given, team)
     size = last - first + 1
-    if (size > _MAX_COUNTS).any():
+    if (size > MAX_COUNTS).any():
         k = int(size.argmax())
         raise ValueError(
-            f"cumulants[{k}] must have a variance for which {_MAX_COUNTS} counts suffice, got {given[k, 1]:g}"
+            f"cumulants[{k}] must have a variance for which {MAX_COUNTS} counts suffice, got {given[k, 1]:g}"
         )
     start = np.concatenate([[0], np.cumsum(size)])
     flat = np.empty(int(start[-1]))
@@ -76,7 +77,7 @@ def matched_counts(cumulants: ArrayLike, uniform: ArrayLike, *, threads: int | N
     Returns
     -------
     NDArray
-        (cells, draws) int64, not falling with `uniform`.
+        (cells, draws) int64, non-decreasing in `uniform`.
     """
     given, team = _checked(cumulants), thread_count(threads)
     u = np.ascontiguousarray(uniform, dtype=np.float64)
@@ -91,9 +92,9 @@ def matched_counts(cumulants: ArrayLike, uniform: ArrayLike, *, threads: int | N
 
 
 def trusted(cumulants: ArrayLike, *, threads: int | None = None) -> NDArray[np.bool_]:
-    """Whether the law of `matched_pmf` is within a total variation of 0.002 of the exact one (cells,).
+    """Whether the law of `matched_pmf` is within a total variation of 0.002 of the exact law: (cells,).
 
-    A criterion on the cumulants (cells, 4) alone; docs/studies/matched.md has how often it errs.
+    The criterion uses the cumulants (cells, 4) alone; docs/studies/matched.md gives its error rate.
     """
     return _support(_checked(cumulants), thread_count(threads))[2]
 
@@ -113,7 +114,7 @@ def _checked(cumulants: ArrayLike) -> FloatArray:
 
 
 def _support(given: FloatArray, team: int) -> tuple[IndexArray, IndexArray, NDArray[np.bool_]]:
-
+    """First and last listed count of each law, and whether it is trusted: (cells,) each."""
     cells = len(given)
     first, last, close = np.empty(cells, np.int64), np.empty(cells, np.int64), np.empty(cells, np.bool_)
     _core.matched_support(cumulants=given, first=first, last=last, trusted=close, threads=team)

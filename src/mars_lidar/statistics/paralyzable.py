@@ -1,8 +1,8 @@
 """Mean, variance and mean histogram of a paralyzable pixel, in closed form.
 
-An arrival is registered iff none came within the dead time before it, so that the rate of registrations follows from
-the integrated flux C, r(t) = lambda(t) exp(-(C(t) - C(t - t_d))), and registrations further apart than the dead time
-are independent. Equation numbers: docs/detectors.md.
+An arrival is registered iff no other came within the dead time before it. The rate of registrations is therefore
+r(t) = lambda(t) exp(-(C(t) - C(t - t_d))), with the integrated flux C, and registrations further apart than the dead
+time are independent. Equation numbers: docs/detectors.md.
 """
 
 from __future__ import annotations
@@ -17,15 +17,13 @@ from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
-from mars_lidar.statistics.cells import Cells, knots
-from mars_lidar.statistics.exposure import Moments
-from mars_lidar.statistics.gate import photons_before
+from mars_lidar.statistics.cells import Cells, knots, photons_before
+from mars_lidar.statistics.exposure import MOST_BINS, Moments
 from mars_lidar.statistics.phase_chain import ConvergenceError
 
-_MAX_BINS = 2**20
-_LEAST_SPREAD = 1e-3  # standard deviation of a count, of a Poisson count's: that of the best locked pixels
-_ROUNDING = 1e-12  # of a mean
-_MAX_WHOLE = 20_000  # whole periods of a dead time: each is a step of the variance's start-up
+_LEAST_SPREAD = 1e-3  # smallest standard deviation of a count relative to Poisson: that of the best locked pixels
+_ROUNDING = 1e-12  # relative rounding error of a mean
+_MAX_WHOLE = 20_000  # whole periods of a dead time; the variance sums over each
 
 
 ParalyzableMoments = Moments
@@ -98,20 +96,22 @@ def _refined(cells: Cells, tolerance: float, *, with_variance: bool) -> Paralyza
         cell = cells.part(slice(k, k + 1))
         n = cell.usual_bins(system.bins)
         usual = n
-        if n // 2 < system.bins:  # every grid has the edges of the histogram: with no others two grids are the same
+        if (
+            n // 2 < system.bins
+        ):  # every grid includes the edges of the histogram: with no further edges two grids would be equal
             n *= 2
         start = n
         coarse, before = _Grid(cell, n // 2, knots(cell, usual, 0.5), with_variance), math.inf
         while True:
             fine = _Grid(cell, n, knots(cell, usual, n / start), with_variance)
-            limit = fine.mean + (fine.mean - coarse.mean) / 3.0  # grids err by the square of their step
+            limit = fine.mean + (fine.mean - coarse.mean) / 3.0  # the error is quadratic in the bin width
             still = with_variance or abs(limit - before) <= max(
                 10.0 * tolerance * min(limit, _LEAST_SPREAD * math.sqrt(limit)), _ROUNDING * limit
             )
             if still and _moved(coarse, fine) <= tolerance:
                 break
             coarse, before, n = fine, limit, 2 * n
-            if n > max(_MAX_BINS, 4 * system.bins):
+            if n > max(MOST_BINS, 4 * system.bins):
                 raise ConvergenceError(
                     f"paralyzable statistics of {cells.name(k)}: with {n // 2} bins per period they still move by "
                     f"more than {tolerance:g}; use a larger tolerance, or simulate it with engine 'exact'"
@@ -153,16 +153,16 @@ class _Grid:
         # integral of exp(-within) over a bin where it is linear in the exponent: (1 - e^-d) / d
         rise = np.diff(within)
         mean_keep = np.divide(np.expm1(-rise), -rise, out=np.ones_like(rise), where=rise != 0.0)
-        self.rate = np.exp(-within[:-1]) * mean_keep  # registrations of each bin and period, warmed up
+        self.rate = np.exp(-within[:-1]) * mean_keep  # registrations of each bin and period, stationary
         self.rate *= photons
-        self.alone = np.exp(-self.before[:-1]) * -np.expm1(-photons)  # the first arrival is there, one period
+        self.alone = np.exp(-self.before[:-1]) * -np.expm1(-photons)  # probability of the first arrival of one period
         self.histogram = np.add.reduceat(self._exposure(), np.searchsorted(self.edges, out[:-1]))
         self.mean = float(self.histogram.sum())
         self.variance = max(0.0, self.mean - 2.0 * self._pairs()) if with_variance else self.mean
 
     @cached_property
     def below(self) -> FloatArray:
-        """Registrations before each edge in a period, warmed up."""
+        """Registrations before each edge in a period of the stationary pixel."""
         return np.concatenate([[0.0], np.cumsum(self.rate)])
 
     def _photons(self, at: FloatArray) -> FloatArray:
@@ -172,7 +172,7 @@ class _Grid:
         """Registrations of each bin in the whole exposure (2)."""
         if not self.armed:
             return self.cycles * self.rate
-        start = min(self.whole, self.cycles)  # periods that lie within the dead time of a start at 0
+        start = min(self.whole, self.cycles)  # whole periods within the first dead time
         empty = math.expm1(-start * self.total) / math.expm1(-self.total) if self.total > 0.0 else float(start)
         total = empty * self.alone
         if self.cycles > self.whole:
@@ -196,7 +196,7 @@ class _Grid:
         return np.where(early, -np.expm1(-lit), -math.expm1(-reached) + steady - at_end)
 
     def _pairs(self) -> float:
-        """Integral of r(t) [R(t) - R(t - t_d)]: pairs closer than the dead time, which do not exist (3)."""
+        """Integral of r(t) [R(t) - R(t - t_d)]: the missing pairs closer than the dead time (3)."""
         total, first = 0.0, 0
         if self.armed:  # up to t_d, where R(t - t_d) = 0, it is R^2 / 2
             end = min(self.whole, self.cycles)

@@ -2,10 +2,10 @@
 
     A = I + diag(p) G - diag(p') S
 
-G sums the s bins before a bin, S shifts by s bins, s the dead time in bins without whole periods. Where the
-chain's own equation x (I - P) = 0 is singular, and nearly so many times over when it mixes slowly, A is well
-conditioned. Gauss-Seidel sweeps round the circle contract fast unless some ten background photons fall into
-one dead time; a Krylov method takes over there, and a sparse factorisation beyond.
+G sums the s bins before a bin, S shifts by s bins, s the dead time in bins without whole periods. The
+equation x (I - P) = 0 of the chain is singular, with many further small singular values where the chain mixes slowly;
+A is well conditioned. Gauss-Seidel sweeps round the circle converge fast unless some ten background photons fall into
+one dead time; then a Krylov method follows and, where it fails too, a sparse factorisation.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ if TYPE_CHECKING:
     from scipy.sparse import csc_matrix
 
 
-_SWEEPS = 24
-_KRYLOV = 48
-_TOLERANCE = 1e-15
-_GOOD = 1e-12  # backward error with which an iteration is content: rounding leaves 1e-16 to 1e-14
-_WORST = 1e-10  # backward error that is refused
+_SWEEPS = 24  # Gauss-Seidel sweeps before GMRES
+_KRYLOV = 48  # dimension of the Krylov space
+_TOLERANCE = 1e-15  # relative change per sweep
+_GOOD = 1e-12  # backward error that ends an iteration; rounding alone gives 1e-16 to 1e-14
+_WORST = 1e-10  # largest backward error of a solution
 
 
 class ConvergenceError(ArithmeticError):
@@ -36,7 +36,7 @@ class ConvergenceError(ArithmeticError):
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Solution x (n,) of a feedback equation, with what it took and the residual it left.
+    """Solution x (n,) of a feedback equation, with its residual and cost.
 
     `residual` is the componentwise backward error: max |A x - b| / (|A| |x| + |b|), or the same with A^T.
     `steps` counts sweeps and Krylov steps.
@@ -94,7 +94,7 @@ class Feedback:
         return int(steps), float(error)
 
     def _terms(self, x: FloatArray, adjoint: bool) -> tuple[FloatArray, FloatArray]:
-        """The terms of A in G and in S applied to x, by prefix sums: no code of the sweeps."""
+        """The terms of A in G and in S applied to x, by prefix sums, independent of the sweeps."""
         n, s = x.size, self.shift
         weighted = self.fire * x if adjoint else x
         prefix = np.concatenate([[0.0], np.cumsum(np.concatenate([weighted, weighted]))])
@@ -108,7 +108,7 @@ class Feedback:
         return rhs - x - window + shifted
 
     def _residual(self, rhs: FloatArray, x: FloatArray, adjoint: bool) -> float:
-        """Componentwise backward error of x: unlike a norm, fair to bins of little flux."""
+        """Componentwise backward error of x, which unlike a norm weighs bins of little flux equally."""
         window, shifted = self._terms(np.abs(x), adjoint)
         size = np.abs(x) + window + shifted + np.abs(rhs)
         defect = np.abs(self._defect(rhs, x, adjoint))
@@ -116,7 +116,7 @@ class Feedback:
             return float(np.max(np.where(defect == 0.0, 0.0, defect / size)))
 
     def _krylov(self, rhs: FloatArray, x: FloatArray, adjoint: bool) -> tuple[FloatArray, int]:
-        """GMRES on the fixed point of one sweep, from `x`: the few slow modes fall one step each."""
+        """GMRES on the fixed point of one sweep, from `x`; each step removes one slow mode."""
         from scipy.sparse.linalg import LinearOperator, gmres
 
         n = x.size
@@ -131,7 +131,7 @@ class Feedback:
             return out
 
         operator = LinearOperator((n, n), matvec=lambda v: v - moved(nothing, v), dtype=np.float64)
-        for _ in range(2):  # the second round takes away what rounding left in the first
+        for _ in range(2):  # the second round removes the rounding error of the first
             rest = moved(self._defect(rhs, x, adjoint), nothing)
             goal = 1e-16 * float(np.linalg.norm(x))
             if not float(np.linalg.norm(rest)) > goal:
@@ -145,13 +145,13 @@ class Feedback:
     def _direct(self, rhs: FloatArray, x: FloatArray, adjoint: bool) -> tuple[FloatArray, float]:
         """Sparse LU on the prefix sums C of x (2.10): four entries a row, the fill of a planar grid.
 
-        Differences of C cost digits; refinement on the equation for x itself gives them back.
+        Differences of C lose digits, which iterative refinement of the equation for x restores.
         """
         from scipy.sparse.linalg import splu
 
         try:
             solve: Callable[..., FloatArray] = splu(self._prefix_matrix()).solve
-        except RuntimeError as error:  # SuperLU's word for an exactly singular matrix
+        except RuntimeError as error:  # SuperLU raises it for an exactly singular matrix
             raise ConvergenceError(f"the feedback equation is singular: {error}") from None
         if not np.isfinite(x).all():
             x = np.zeros_like(x)
@@ -195,10 +195,9 @@ class Feedback:
 def cyclic_recursion(keep: FloatArray, source: FloatArray, loss: float, *, backward: bool = False) -> FloatArray:
     """Solution (n,) of v[j+1] = keep[j] v[j] + source[j] round the circle, or backward from v[j+1] to v[j].
 
-    `loss` is 1 - prod(keep), given so that it stays accurate where the product is nearly 1. With non-negative
-    input the result is relatively accurate: no term is ever subtracted.
+    `loss` is 1 - prod(keep), an argument so that it is accurate where the product is nearly 1. For non-negative
+    input the result is accurate relative to itself: no term is subtracted.
     """
-
     out = np.empty(keep.size)
     _core.cyclic_recursion(keep, np.ascontiguousarray(source, dtype=np.float64), loss, backward, out)
     return out

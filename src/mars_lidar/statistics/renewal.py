@@ -24,7 +24,7 @@ from mars_lidar.statistics.gate import require_mode
 from mars_lidar.statistics.phase_chain import cyclic_recursion
 
 _AGREEMENT = 1e-7  # two independent routes to a moment may differ by this much, relative to its largest term
-_MAX_DENSE = 8192
+_MAX_DENSE = 8192  # bins of dense matrices: 512 MiB each
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +140,7 @@ def lag_covariances(chain: PhaseChain, times: HoldingTimes, lags: int) -> FloatA
     for k in range(lags):
         out[k] = row @ value
         value = chain.right(value)
-        value -= times.stationary.pdf @ value  # rounding must not put back the mean that has been taken out
+        value -= times.stationary.pdf @ value  # rounding would reintroduce the mean
     return out
 
 
@@ -213,8 +213,8 @@ def mars_moments(
 ) -> tuple[FloatArray, FloatArray]:
     """Mean and variance of the MaRS count law N ~ Normal(t / mu, t sigma^2 / mu^3), t the exposure (3.11).
 
-    The asymptotic law of a long exposure: it knows neither the start of the exposure nor, but for the grid,
-    the delay.
+    The asymptotic law of a long exposure: it depends neither on the start of the exposure nor, except through the
+    grid, on the delay.
 
     Parameters
     ----------
@@ -238,11 +238,11 @@ def mars_moments(
     if bins is None and waveform is None:
         bins = default_bins(system)
     for index in np.ndindex(s.shape):
-        one, other = None if signal is None else float(s[index]), float(b[index])
-        photons = photons_per_bin(one, other, system, bins=bins, delay_ns=delay_ns, waveform=waveform)
+        s_pixel, b_pixel = None if signal is None else float(s[index]), float(b[index])
+        photons = photons_per_bin(s_pixel, b_pixel, system, bins=bins, delay_ns=delay_ns, waveform=waveform)
         if not photons.any():
             continue
-        cell = cell_name(one, other, system)
+        cell = cell_name(s_pixel, b_pixel, system)
         times = holding_times(PhaseChain(photons, system.dead_time_periods, rearm, cell))
         mean[index] = system.cycles / times.mu
         variance[index] = system.cycles * times.sigma2 / times.mu**3

@@ -24,9 +24,9 @@ from mars_lidar.statistics.renewal import HoldingTimes, holding_times, lag_covar
 
 ComplexArray = NDArray[np.complex128]
 
-_MAX_LAGS = 100_000
-_MAX_EIG = 4096
-_MOST_MODES = 12  # the automatic rule looks no deeper into the spectrum
+_MAX_LAGS = 100_000  # an O(n) product each
+_MAX_EIG = 4096  # bins of an eigen-decomposition, O(n^3)
+_MOST_MODES = 12  # eigenvalues that the automatic rule considers
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +34,7 @@ class HoldingTimeCovariance:
     """Lag covariances of the holding times of one pixel, and their sum by every rule.
 
     Times in ns, covariances in ns^2. `spectral_sum`, `automatic_sum` and `eigenvalues` decompose the dense
-    transition matrix on first use, O(n^3), once per object; nothing else does.
+    transition matrix on first use, O(n^3), once per object.
 
     Attributes
     ----------
@@ -91,8 +91,8 @@ class HoldingTimeCovariance:
         modes = checks.integer("modes", modes, low=1, high=self._chain.bins)
         values, weights = self._modes
         count = self._whole_pairs(modes)
-        kept, weight = values[1:count], weights[1:count]
-        tail = np.sum(weight * kept**lags / (1.0 - kept))
+        leading, weight = values[1:count], weights[1:count]
+        tail = np.sum(weight * leading**lags / (1.0 - leading))
         return self.cutoff_sum(lags) + float(tail.real)
 
     def automatic_rule(self, tolerance: float = 1e-3) -> tuple[int, int]:
@@ -131,7 +131,7 @@ class HoldingTimeCovariance:
         if modes < values.size and modes > 1:
             last, following = values[modes - 1], values[modes]
             paired = abs(last.imag) > 0 and abs(following - last.conjugate()) <= 1e-9 * abs(last)
-            # a pair is in order (+, -); a count that ends on its first half takes the second as well
+            # pairs are ordered (+, -): a count that ends on the first of a pair includes the second
             if paired and np.count_nonzero(values[1:modes].imag) % 2 == 1:
                 return modes + 1
         return modes
@@ -147,15 +147,15 @@ class HoldingTimeCovariance:
                 f"exact_sum and cutoff_sum need none"
             )
         # Left eigenvectors from inv(V) have given negative variances: P is strongly non-normal (4.4)
-        found: Any = eig(self._chain.dense(), left=True, right=True)
-        values, left, right = found
-        order = np.argsort(-np.round(np.abs(values), 12), kind="stable")  # keeps conjugates side by side
-        values, left, right = values[order], left[:, order], right[:, order]
+        decomposition: Any = eig(self._chain.dense(), left=True, right=True)
+        values, left_vectors, right_vectors = decomposition
+        order = np.argsort(-np.round(np.abs(values), 12), kind="stable")  # keeps conjugates adjacent
+        values, left_vectors, right_vectors = values[order], left_vectors[:, order], right_vectors[:, order]
         pdf, times = self._times.stationary.pdf, self._times
         row = weighted_waits(self._chain, pdf) - times.mu * pdf
         with np.errstate(divide="ignore", invalid="ignore"):  # the many modes of lambda = 0 are defective
-            overlap = np.sum(left.conj() * right, axis=0)
-            weights = (row @ right) * (left.conj().T @ (times.mean - times.mu)) / overlap
+            overlap = np.sum(left_vectors.conj() * right_vectors, axis=0)
+            weights = (row @ right_vectors) * (left_vectors.conj().T @ (times.mean - times.mu)) / overlap
         return values, weights * self._unit
 
 

@@ -1,8 +1,8 @@
 """Exact statistics of a synchronous pixel: armed at the start of each period, first photon only (Coates 1968).
 
 Every armed period registers with probability q = 1 - e^-Lambda, at a phase with the law of the first arrival,
-independently of all others. A registration costs 1 + K or 2 + K periods, t_d = K + f: the latter where it comes after
-1 - f. So the count is a renewal process of whole periods: docs/detectors.md, equations (4) to (7).
+independently of all others. A registration occupies 1 + K periods, or 2 + K where it comes after 1 - f, with t_d =
+K + f. The count is thus a renewal process of whole periods: docs/detectors.md, equations (4) to (7).
 """
 
 from __future__ import annotations
@@ -13,20 +13,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.types import FloatArray
-from mars_lidar.statistics.cells import Cells
+from mars_lidar.statistics.cells import Cells, photons_before
 from mars_lidar.statistics.count_pmf import Pmf
-from mars_lidar.statistics.gate import photons_before
 from mars_lidar.statistics.phase_chain import ConvergenceError
 
-_TAIL = 1e-13  # probability left out at either end of the support
-_SPREAD = 9.0  # standard deviations of the number of late registrations that are summed over
-_CHUNK = 1 << 20  # terms of (6) at a time
+_TAIL = 1e-13  # probability outside the support, at either end
+_SPREAD = 9.0  # half width of the sum over late registrations, in standard deviations of their number
+_CHUNK = 1 << 20  # terms of (6) computed together
 _SUMS = 6  # incomplete beta functions in a term of (6)
-_MAX_TERMS = 1 << 23  # of one cell: a second
-_MANY_TERMS, _MANY_COUNTS = 1 << 18, 20  # from which on the transform (21) is faster, and good
-_REACH = 11.0  # standard deviations, in each of which the law and its transform are taken to end
-_POINTS, _FAINT, _MAX_TRANSFORM = 32, 1e-15, 30_000_000
-_LOOSE_TAIL = 1e-10  # of a law by its transform
+_MAX_TERMS = 1 << 23  # terms of (6) of one cell: a second
+_MANY_TERMS, _MANY_COUNTS = 1 << 18, 20  # terms, and counts at the lower end, from which the transform (21) is used
+_REACH = 11.0  # half width of the law, and of its transform, in standard deviations
+_POINTS = 32  # points of the circle evaluated together
+_FAINT = 1e-15  # modulus of the transform below which it counts as 0
+_MAX_TRANSFORM = 30_000_000  # points x counts of one cell
+_LOOSE_TAIL = 1e-10  # probability outside the support of a law by its transform
 _INSTEAD = "use fewer cycles, or simulate it with engine 'exact'"
 
 
@@ -63,24 +64,24 @@ def _log1p(u: NDArray[np.complex128]) -> NDArray[np.complex128]:
 
 
 class _Count:
-    """The count of one pixel: `early` of its `total` photons a period come before 1 - f."""
+    """The count of one pixel, of whose `total` photons a period `early` arrive before 1 - f."""
 
     def __init__(self, cells: Cells, name: str, whole: int, early: float, total: float) -> None:
         self.name, self.cycles, self.whole = name, cells.system.cycles, whole
-        self.seen = -math.expm1(-total)  # q
+        self.armed_register = -math.expm1(-total)  # q
         after = math.exp(-early) * -math.expm1(-max(total - early, 0.0))
-        self.late = min(after / self.seen, 1.0) if self.seen > 0.0 else 0.0
+        self.late = min(after / self.armed_register, 1.0) if self.armed_register > 0.0 else 0.0
         self.first = self._first(cells.system.start == "stationary")
 
     def _first(self, stationary: bool) -> FloatArray:
-        """P(first armed period = r) (r,): after a renewal process that has been running for long, (7)."""
+        """P(first armed period = r) (r,): 1 for r = 0, or of a stationary renewal process, (7)."""
         if not stationary:
             return np.ones(1)
-        longer = np.full(min(self.whole, self.cycles) + 2, self.seen)  # P(M > r)
+        longer = np.full(min(self.whole, self.cycles) + 2, self.armed_register)  # P(M > r)
         longer[0] = 1.0
         if self.whole < self.cycles:
-            longer[-1] = self.seen * self.late
-        return np.asarray(longer / (1.0 + self.seen * (self.whole + self.late)), dtype=np.float64)
+            longer[-1] = self.armed_register * self.late
+        return np.asarray(longer / (1.0 + self.armed_register * (self.whole + self.late)), dtype=np.float64)
 
     def at_least(self, counts: FloatArray) -> FloatArray:
         """P(N >= counts) (n,) (6)."""
@@ -90,7 +91,7 @@ class _Count:
         return np.concatenate(parts)
 
     def _spread(self, most: float) -> float:
-        """Numbers of late registrations that matter."""
+        """Width of the sum over the number of late registrations, for `most` registrations."""
         return 1.0 if self.late == 0.0 else 2.0 * (_SPREAD * math.sqrt(most * self.late * (1.0 - self.late)) + 20.0)
 
     def _at_least(self, counts: FloatArray, spread: float) -> FloatArray:
@@ -107,38 +108,40 @@ class _Count:
         empty = self.cycles - 1.0 - (k[:, None] - 1.0) * (self.whole + 1.0) - late  # periods that may be empty
         wanted = k[:, None]
 
-        def waited(left: FloatArray, more: float = 0.0) -> FloatArray:
-            """P(no more than `left` empty periods before registration k + `more`)."""
-            chance = betainc(wanted + more, np.maximum(left, 0.0) + 1.0, self.seen)
-            return np.asarray(np.where(left >= 0.0, chance, 0.0), dtype=np.float64)
+        def waited(empty_periods: FloatArray, more: float = 0.0) -> FloatArray:
+            """P(at most `empty_periods` empty periods before registration k + `more`)."""
+            chance = betainc(wanted + more, np.maximum(empty_periods, 0.0) + 1.0, self.armed_register)
+            return np.asarray(np.where(empty_periods >= 0.0, chance, 0.0), dtype=np.float64)
 
-        def summed(left: FloatArray) -> FloatArray:
-            """Sum of `waited` from 0 up to `left`."""
-            mean = wanted * (1.0 - self.seen) / self.seen
-            return np.asarray(np.maximum((left + 1.0) * waited(left) - mean * waited(left - 1.0, 1.0), 0.0))
+        def summed(empty_periods: FloatArray) -> FloatArray:
+            """Sum of `waited` from 0 to `empty_periods`."""
+            mean = wanted * (1.0 - self.armed_register) / self.armed_register
+            return np.asarray(
+                np.maximum((empty_periods + 1.0) * waited(empty_periods) - mean * waited(empty_periods - 1.0, 1.0), 0.0)
+            )
 
         n = self.first.size
-        found = self.first[0] * waited(empty)
-        if n > 1:  # probabilities of the wait for the first armed period: all the same but for the first and the last
-            found += self.first[-1] * waited(empty - (n - 1.0))
+        probability = self.first[0] * waited(empty)
+        if n > 1:  # the waits for the first armed period are equally likely except the first and the last
+            probability += self.first[-1] * waited(empty - (n - 1.0))
         if n > 2:
-            found += self.first[1] * np.maximum(summed(empty - 1.0) - summed(empty - (n - 1.0)), 0.0)
-        total = (found * weight).sum(-1)
+            probability += self.first[1] * np.maximum(summed(empty - 1.0) - summed(empty - (n - 1.0)), 0.0)
+        total = (probability * weight).sum(-1)
         return np.asarray(np.where(counts <= 0.0, 1.0, np.minimum(total, 1.0)), dtype=np.float64)
 
     def window(self) -> Pmf:
         most = math.ceil(self.cycles / (self.whole + 1))
-        if self.seen == 0.0:
+        if self.armed_register == 0.0:
             return Pmf(0, np.ones(1), 0.0)
         low, high = self._reach(most)
         if low >= _MANY_COUNTS and (high - low) * _SUMS * self._spread(float(most)) > _MANY_TERMS:
             survival = self._transformed(np.arange(low, high + 2, dtype=np.float64))
             tail = _LOOSE_TAIL
             if not (survival[0] >= 1.0 - tail and survival[-1] <= tail):
-                raise ConvergenceError(f"count law of {self.name}: it does not end within {low} .. {high}; {_INSTEAD}")
+                raise ConvergenceError(f"count law of {self.name}: it extends beyond {low} .. {high}; {_INSTEAD}")
         else:
             self._check((math.log2(most + 1.0) + 1.0) * 2.0, most)
-            # what the sums over the wait for the first armed period may lose to rounding
+            # rounding error of the sums over the wait for the first armed period
             tail = _TAIL + (4.0 * np.finfo(float).eps * self.cycles / self.first.size if self.first.size > 2 else 0.0)
             low, high = self._last(1.0 - tail, most), self._last(_TAIL, most)
             self._check(high + 2.0 - low, high)
@@ -148,23 +151,28 @@ class _Count:
         return Pmf(low, pmf, tail * ((low > 0) + (high < most)))
 
     def _reach(self, most: int) -> tuple[int, int]:
-        """Counts between which the law is, from mean and variance of the time of a registration."""
-        lost = (1.0 - self.seen) / self.seen + self.late  # periods a registration loses beyond its dead time
+        """First and last count of the support, from mean and variance of the time of a registration."""
+        lost = (
+            1.0 - self.armed_register
+        ) / self.armed_register + self.late  # periods per registration beyond its dead time
         each = self.whole + 1.0 + lost
         mean = self.cycles / each
-        spread = math.sqrt(mean * ((1.0 - self.seen) / self.seen**2 + self.late * (1.0 - self.late))) / each
+        spread = (
+            math.sqrt(mean * ((1.0 - self.armed_register) / self.armed_register**2 + self.late * (1.0 - self.late)))
+            / each
+        )
         reach = _REACH * spread + 10.0 + self.first.size / each
         return max(0, math.floor(mean - reach)), min(most, math.ceil(mean + reach))
 
     def _transformed(self, counts: FloatArray) -> FloatArray:
         """P(N >= counts) (n,) by the transform of the periods that k registrations lose, (21)."""
-        k, q, late, n = counts, self.seen, self.late, self.first.size
+        k, q, late, n = counts, self.armed_register, self.late, self.first.size
         room = self.cycles - 1.0 - (k - 1.0) * (self.whole + 1.0)  # periods that may be lost
         spread = math.sqrt(float(k.max()) * ((1.0 - q) / q**2 + late * (1.0 - late)))
         away = float(np.abs(room - k * (1.0 - q) / q - (k - 1.0) * late).max())
         half = math.ceil(away + _REACH * spread + n + 64.0 / q)
         size, least = 2 * half + 2, float(k.min())
-        found = np.full(k.size, (half + 1.0) / size * float(self.first.sum()))
+        survival = np.full(k.size, (half + 1.0) / size * float(self.first.sum()))
         for start in range(1, half + 1, _POINTS):
             angle = 2.0 * np.pi * np.arange(start, min(start + _POINTS, half + 1)) / size
             away_from_one = 2.0 * np.sin(0.5 * angle) ** 2 - 1j * np.sin(angle)  # 1 - w
@@ -179,14 +187,14 @@ class _Count:
             weight = 2.0 / size * first * window
             keep = np.abs(weight) * np.exp(least * empty.real + (least - 1.0) * delayed.real) > _FAINT
             for c, a, b, t in zip(weight[keep], empty[keep], delayed[keep], angle[keep], strict=True):
-                found += (c * np.exp(k * a + (k - 1.0) * b - 1j * np.remainder(room * t, 2.0 * np.pi))).real
-            if not keep.any():  # the moduli of both factors fall all the way round the circle
-                return np.asarray(np.clip(found, 0.0, 1.0), dtype=np.float64)
+                survival += (c * np.exp(k * a + (k - 1.0) * b - 1j * np.remainder(room * t, 2.0 * np.pi))).real
+            if not keep.any():  # the moduli of both factors decrease monotonically with the angle up to pi
+                return np.asarray(np.clip(survival, 0.0, 1.0), dtype=np.float64)
             if (start + _POINTS) * k.size > _MAX_TRANSFORM:
                 break
         raise ConvergenceError(
-            f"count law of {self.name}: a dead time that reaches over period starts all but locks the count, whose "
-            f"transform does not end; {_INSTEAD}"
+            f"count law of {self.name}: the count is nearly constant because the dead time spans period starts, and "
+            f"its transform is too wide; {_INSTEAD}"
         )
 
     def _check(self, counts: float, most: int) -> None:
@@ -194,11 +202,11 @@ class _Count:
         if terms > _MAX_TERMS:
             raise ConvergenceError(
                 f"count law of {self.name}: {terms:.2g} terms are too many for mode 'synchronous' with a dead time "
-                f"that reaches over period starts (at most {_MAX_TERMS:.2g}); {_INSTEAD}"
+                f"that spans period starts (at most {_MAX_TERMS:.2g}); {_INSTEAD}"
             )
 
     def _last(self, chance: float, most: int) -> int:
-        """The largest count that is reached with at least this probability."""
+        """Largest count n with P(N >= n) >= `chance`."""
         low, high = 0, most + 1
         while high - low > 1:
             middle = (low + high) // 2

@@ -1,8 +1,8 @@
-"""From the time of avalanches to that of records: jitter and code widths, as one linear map of mean histograms.
+"""Jitter and code widths as a linear map from the mean histogram of registrations to that of records.
 
-Neither decides what is recorded (docs/detectors.md), and the jitter of a record knows nothing of any other. So the
-mean histogram of the records is that of the registrations, convolved round the period with the density of the jitter
-and cut at the edges of the codes; the count law is the same.
+Neither effect changes which avalanches are recorded (docs/detectors.md), and the jitters of records are independent.
+The mean histogram of the records is that of the registrations, convolved round the period with the density of the
+jitter and integrated between the edges of the codes; the count law does not change.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from mars_lidar.instrument.effects import TIMING_EFFECTS, code_edges
 from mars_lidar.instrument.system import System
 from mars_lidar.statistics.cells import Cells
 
-_PARTS_PER_SIGMA = 24.0  # a part adds 1/6 of its square to the variance: 3e-4 of it
-_MOST_PARTS = 2**16
+_PARTS_PER_SIGMA = 24.0  # a part adds 1/6 of its square to the variance: 3e-4 of sigma^2
+_MOST_PARTS = 2**16  # parts of the period: 512 KiB an array
 
 
 def is_timed(system: System) -> bool:
-    """Whether records have another time than their avalanches."""
+    """Whether the times of records differ from those of their avalanches."""
     return any(name in TIMING_EFFECTS for name in system.detector.effects)
 
 
@@ -73,7 +73,7 @@ class Timing:
 
     @cached_property
     def _edges(self) -> FloatArray:
-        """Where the bins of the histogram begin and end in the time of the avalanche, in parts (bins + 1,)."""
+        """Edges (bins + 1,) of the bins of the histogram, in parts of the period."""
         density, bins = self.system.detector.code_density, self.system.bins
         split = self.parts // bins
         if density is None:
@@ -93,7 +93,7 @@ class Timing:
         return np.asarray(np.diff(at, axis=-1), dtype=np.float64)
 
     def backward(self, weights: FloatArray) -> FloatArray:
-        """Mean of the weight (..., bins) of the record of a registration in each part: (..., parts)."""
+        """Mean weight (..., parts) of the record of a registration in each part, for weights (..., bins)."""
         whole, rest = self._split
         whole, rest = whole[1:-1], rest[1:-1, None]
         step = np.diff(weights.reshape(-1, weights.shape[-1]), axis=-1).T  # beyond each edge

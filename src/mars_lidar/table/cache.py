@@ -15,7 +15,7 @@ SUFFIX = ".h5"
 
 
 def directory() -> Path:
-    """Where tables are kept; it need not exist yet."""
+    """Folder of the cached tables, which need not exist."""
     given = os.environ.get("MARS_LIDAR_CACHE")
     if given:
         return Path(given)

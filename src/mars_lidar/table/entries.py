@@ -1,4 +1,4 @@
-"""What a table holds for each (S, B), how that is evaluated, and how it is looked up for pixels (docs/table.md).
+"""Entries of a table for each (S, B): their evaluation and their interpolation for pixels (docs/table.md).
 
 Of each entry: cumulants and shape of the count at the canonical delay t_r / 2 (`Entries`), the exact law of the count
 where four cumulants do not fix it (`NodeLaws`), and for an armed start the change of the cumulants with the delay
@@ -23,7 +23,7 @@ from mars_lidar.instrument.system import System
 from mars_lidar.statistics.cells import Cells, cell_name, default_bins, flat, reals, with_delays
 from mars_lidar.statistics.chain import PhaseChain, Rearm
 from mars_lidar.statistics.count_pmf import Pmf, guessed_windows
-from mars_lidar.statistics.exposure import _run, blank, native_light, normalised, refined_moments
+from mars_lidar.statistics.exposure import UNSETTLED, _run, blank, native_light, normalised, refined_moments
 from mars_lidar.statistics.matched import trusted
 from mars_lidar.statistics.phase_chain import ConvergenceError
 from mars_lidar.statistics.renewal import holding_times
@@ -33,7 +33,7 @@ from mars_lidar.table.axes import thinned
 
 Shapes = NDArray[np.float32]
 
-_BLOCK_BYTES = 32 << 20  # of float64 histograms at a time: the work beside the table stays far below its size
+_BLOCK_BYTES = 32 << 20  # float64 histograms computed together; far below the size of a table
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,7 +190,7 @@ class NodeLaws:
         return Pmf(int(self.first[k]), self.pmf[self.offsets[k] : self.offsets[k + 1]], _NEGLIGIBLE)
 
 
-_NEGLIGIBLE = 1e-12  # probability that is not kept at either end
+_NEGLIGIBLE = 1e-12  # probability that is not stored at either end of a law
 
 
 def _trimmed(window: Pmf) -> Pmf:
@@ -209,7 +209,7 @@ def node_laws(
     threads: int,
     progress: Progress | None = None,
 ) -> NodeLaws:
-    """Laws of the entries of a table with axes `signal`, `background` for which `matched.trusted` does not vouch."""
+    """Laws of the entries of a table, axes `signal` and `background`, that `statistics.matched.trusted` rejects."""
     if system.dead_time_periods == 0.0:
         return NodeLaws.none()  # Poisson
     row = np.flatnonzero(~trusted(entries.cumulants, threads=threads))
@@ -222,13 +222,12 @@ def node_laws(
 
 # --- Change with the delay -----------------------------------------------------------------------------------------
 
-_STEP = 0.2  # of log S and log B; bicubic between: errors below 1e-4 standard deviations (docs/table.md, 4)
-_PHASE_ERROR = 1e-3  # of linear interpolation between phases, in standard deviations
-_MAX_PHASES = 192
-_SAMPLE = 12  # cells of an axis by which the phases are chosen
-_MAX_EDGES = 2**14
-_BLOCK = 256
-_UNSETTLED = -2
+_STEP = 0.2  # step of log S and log B; bicubic interpolation errs by less than 1e-4 sd (docs/table.md, 4)
+_PHASE_ERROR = 1e-3  # error of linear interpolation between phases, in standard deviations
+_MAX_PHASES = 192  # phases of a table
+_SAMPLE = 12  # values of each axis from which the phases are chosen
+_MAX_EDGES = 2**14  # candidate phases
+_BLOCK = 256  # cells evaluated together
 
 
 @dataclass(frozen=True, eq=False)
@@ -292,7 +291,9 @@ def start_phases(
     cells = Cells.of(np.repeat(signal[row], column.size), np.tile(background[column], row.size), system).resolved(1)
     own = bins[index]
     grids = np.maximum(own, _phase_grid(cells, int(own.min())))
-    spread = np.sqrt(np.maximum(cumulants[index, 1], 0.25))  # of small counts half a count is what matters
+    spread = np.sqrt(
+        np.maximum(cumulants[index, 1], 0.25)
+    )  # at least half a count: errors of small counts matter in counts
     scale = spread[:, None] ** np.arange(1, 5)
     some = np.zeros((row.size, column.size), dtype=bool)
     some[np.ix_(_few(row.size), _few(column.size))] = True
@@ -354,8 +355,8 @@ def _corrections(cells: Cells, bins: int, phase: FloatArray, threads: int) -> tu
         phase=np.rint(np.interp(phase, cells.edges(bins), np.arange(bins + 1))).astype(np.int32),
         correction=out,
     )
-    if (settled == _UNSETTLED).any():
-        k = int(np.argmax(settled == _UNSETTLED))
+    if (settled == UNSETTLED).any():
+        k = int(np.argmax(settled == UNSETTLED))
         raise ConvergenceError(
             f"start-phase correction of {cells.name(k)}: the state of the pixel does not repeat from period to "
             "period for so long that the exposure cannot be run to its end"
@@ -369,7 +370,7 @@ def _choose(cells: Cells, grids: IndexArray, scale: FloatArray, sample: IndexArr
     """Phases between which linear interpolation is good enough for a sample of cells, the worst one first."""
     coarsest = int(grids.min())
     stride = next(k for k in range(1, coarsest + 1) if coarsest % k == 0 and coarsest // k <= _MAX_EDGES)
-    edges = cells.edges(coarsest)[::stride]  # of every finer grid as well: those are multiples of it
+    edges = cells.edges(coarsest)[::stride]  # edges of every finer grid as well, whose bins divide these
     coarsest //= stride
     curves = []
     for block, n in _blocks(grids[sample]):
@@ -380,12 +381,12 @@ def _choose(cells: Cells, grids: IndexArray, scale: FloatArray, sample: IndexArr
     error = np.zeros(edges.size)
     nodes = [0, coarsest]
 
-    def settle(left: int, right: int) -> None:
-        inside = np.arange(left, right + 1)
-        t = ((inside - left) / (right - left))[:, None]
-        line = (1.0 - t) * curve[left] + t * curve[right]
+    def settle(begin: int, end: int) -> None:
+        inside = np.arange(begin, end + 1)
+        t = ((inside - begin) / (end - begin))[:, None]
+        line = (1.0 - t) * curve[begin] + t * curve[end]
         error[inside] = np.abs(curve[inside] - line).max(1)
-        error[[left, right]] = 0.0
+        error[[begin, end]] = 0.0
 
     settle(0, coarsest)
     for part in range(1, 32):  # at least every 32nd of the period: cells between those of the sample
@@ -393,15 +394,15 @@ def _choose(cells: Cells, grids: IndexArray, scale: FloatArray, sample: IndexArr
         if at not in nodes:
             nodes.append(at)
     nodes.sort()
-    for left, right in pairwise(nodes):
-        settle(left, right)
+    for begin, end in pairwise(nodes):
+        settle(begin, end)
     while error.max() > _PHASE_ERROR and len(nodes) < _MAX_PHASES:
         worst = int(error.argmax())
         place = int(np.searchsorted(nodes, worst))
-        left, right = nodes[place - 1], nodes[place]
+        begin, end = nodes[place - 1], nodes[place]
         nodes.insert(place, worst)
-        settle(left, worst)
-        settle(worst, right)
+        settle(begin, worst)
+        settle(worst, end)
     return edges[nodes]
 
 
@@ -410,12 +411,13 @@ def _replace_if_wrong(
 ) -> None:
     """Exact corrections (p, 4) of a cell whose exposure ended before start and end forgot each other.
 
-    Those of (P7) are checked at a few phases, where they are largest, and replaced where they are not right.
+    The corrections of (P7) are compared with exact ones at the few phases where they are largest, and replaced where
+    they differ by more than `_PHASE_ERROR`.
     """
     size = np.abs(correction / scale)
-    told = np.unique(np.concatenate([size.argmax(0), size[:, :2].argmin(0), [phase.size // 2]]))
-    exact = _directly(cells, cell, bins, phase[told], threads)
-    if not (np.abs(exact - correction[told])[:, :2] / scale[:2]).max() > _PHASE_ERROR:
+    checked = np.unique(np.concatenate([size.argmax(0), size[:, :2].argmin(0), [phase.size // 2]]))
+    exact = _directly(cells, cell, bins, phase[checked], threads)
+    if not (np.abs(exact - correction[checked])[:, :2] / scale[:2]).max() > _PHASE_ERROR:
         return
     correction[:] = _directly(cells, cell, bins, phase, threads)
 
@@ -441,7 +443,7 @@ _CELL_BLOCK = 32
 
 @dataclass(frozen=True, eq=False)
 class Recipe:
-    """How entries are evaluated."""
+    """Method and tolerance by which entries are evaluated."""
 
     method: Method
     rearm: Rearm

@@ -15,8 +15,8 @@ from mars_lidar._base.types import FloatArray
 # total variation between normal laws that differ a little: 0.399 per standard deviation of the mean, 0.242 per
 # relative change of the variance
 _TV_MEAN, _TV_VARIANCE = 1.0 / math.sqrt(2.0 * math.pi), 1.0 / math.sqrt(2.0 * math.pi * math.e)
-_LEAST_SPREAD = 0.5  # below it a count is a lottery between two integers, and errors matter in counts
-MOST_CYCLES = 10**8  # of a System: the exposure at which errors of the mean are largest
+_LEAST_SPREAD = 0.5  # counts; below it a count is one of two integers, and errors are stated in counts
+MOST_CYCLES = 10**8  # largest `System.cycles`, at which errors of the mean are largest
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ class LawError:
     within
         Share of pixels within 0.002.
     trusted
-        Share of pixels that `statistics.matched.trusted` holds to be within 0.002.
+        Share of pixels whose law `statistics.matched.trusted` accepts (total variation below 0.002).
     largest_trusted
         Largest total variation among those.
     worst_signal, worst_background, worst_delay_ns

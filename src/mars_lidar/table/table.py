@@ -55,9 +55,9 @@ from mars_lidar.table.error import MOST_CYCLES, LawError, QuantisationError, dev
 Interpolation = Literal["bilinear", "nearest"]
 INTERPOLATIONS, OUTSIDE = ("bilinear", "nearest"), ("error", "exact")
 _METHODS, _REARMS = ("exposure", "mars"), ("centre", "edge")
-_ERROR_SAMPLES = 128  # pixels on which a table is checked when it is built
-_ATTEMPTS = 4  # of refining, each with half the error of the one before
-_LINES = 8  # values of the other axis at which one is looked at
+_ERROR_SAMPLES = 128  # random pixels on which a new table is checked
+_ATTEMPTS = 4  # refinements, each with half the error of the previous one
+_LINES = 8  # values of the other axis at which an axis is examined
 _ROUNDS = 12
 
 Axes = tuple[FloatArray, FloatArray]
@@ -223,7 +223,7 @@ class Table:
     def _search(
         cls, system: System, signal: Grid, background: Grid, options: dict[str, Any]
     ) -> tuple[Path, Path | None]:
-        """Where the table belongs in the cache, and the file that serves, if there is one."""
+        """Path of the table in the cache, and the existing file that can be used instead, or None."""
         if not isinstance(system, System):
             raise TypeError(f"system must be a System, got {type(system).__name__}")
         system = system.detected()
@@ -431,10 +431,10 @@ class Table:
         signal, background = (random_pixels(rng, axis, samples, below) for axis in (self.signal, self.background))
         recipe = Recipe(self.method, self.rearm, self.tolerance, thread_count(threads))
         exact = recipe.entries(signal, background, system)
-        found = self.lookup(signal, background, cycles=periods, interpolation=interpolation)
+        looked_up = self.lookup(signal, background, cycles=periods, interpolation=interpolation)
         shapes = self.shapes(periods)
-        mixed = np.stack([w @ shapes[r] for r, w in zip(found.rows, found.weights, strict=True)])
-        error = deviations(found.cumulants, exact.cumulants)
+        mixed = np.stack([w @ shapes[r] for r, w in zip(looked_up.rows, looked_up.weights, strict=True)])
+        error = deviations(looked_up.cumulants, exact.cumulants)
         shape = 0.5 * np.abs(mixed - exact.shape).sum(-1)
         delayed, delayed_shape = error, shape
         if self.method == "exposure":
@@ -473,11 +473,11 @@ class Table:
         system = self.system if cycles is None else self.system.replace(cycles=cycles)
         signal, background = (random_pixels(rng, axis, samples, True) for axis in (self.signal, self.background))
         delay = rng.uniform(0.0, system.period_ns, samples)
-        found = self.lookup(signal, background, delay_ns=delay, cycles=system.cycles)
+        law = self.lookup(signal, background, delay_ns=delay, cycles=system.cycles)
         exact = count_law(signal, background, system, delay_ns=delay, tolerance=self.tolerance, threads=threads)
-        matched = matched_pmf(found.cumulants, threads=threads)
+        matched = matched_pmf(law.cumulants, threads=threads)
         off = np.array([total_variation(w, Pmf(int(exact.support[k, 0]), exact.pmf[k])) for k, w in enumerate(matched)])
-        good = found.trusted()
+        good = law.trusted()
         worst = int(off.argmax())
         return LawError(
             samples=samples,
@@ -516,9 +516,9 @@ class Table:
         shift = rng.integers(0, system.bins, signal.size)
         delay = 0.5 * system.period_ns + shift * system.bin_ns
         exact = exposure_moments(signal, background, system, delay_ns=delay, tolerance=self.tolerance, threads=threads)
-        found = self.lookup(signal, background, delay_ns=delay, cycles=cycles, interpolation=interpolation)
+        law = self.lookup(signal, background, delay_ns=delay, cycles=cycles, interpolation=interpolation)
         turned = np.stack([np.roll(row, k) for row, k in zip(mixed, shift, strict=True)])
-        return deviations(found.cumulants, exact.cumulants), 0.5 * np.abs(turned - normalised(exact.histogram)).sum(-1)
+        return deviations(law.cumulants, exact.cumulants), 0.5 * np.abs(turned - normalised(exact.histogram)).sum(-1)
 
 
 def _evaluated(system: System, axes: Axes, recipe: Recipe, progress: Progress | None) -> Table:

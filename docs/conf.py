@@ -17,6 +17,7 @@ from typing import Any
 import matplotlib.style
 from docutils import nodes
 from sphinx.application import Sphinx
+from sphinx_gallery.directives import imgsgnode
 
 import mars_lidar
 
@@ -39,6 +40,7 @@ extensions = [
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
 exclude_patterns = [
     "katex",
+    "**/sg_execution_times.rst",
     *(f"{folder}/**/*.{kind}" for folder in ("gallery", "lessons") for kind in ("ipynb", "py", "json", "md5")),
 ]
 templates_path = ["_templates"]
@@ -251,7 +253,8 @@ def _describe_pictures(app: Sphinx, doctree: nodes.document) -> None:
     if not app.env.docname.startswith(("gallery/", "lessons/")):
         return
     title = next(iter(doctree.findall(nodes.title)), nodes.title()).astext()
-    for number, image in enumerate(doctree.findall(nodes.image), 1):
+    pictures = [node for node in doctree.findall() if isinstance(node, (nodes.image, imgsgnode))]
+    for number, image in enumerate(pictures, 1):
         description = image.get("alt", "")
         if not description or re.match(r"(plot|lesson) \d", description):
             image["alt"] = f"{title}: picture {number}, described in the text beside it"

@@ -34,7 +34,7 @@ def reconstruction(config: Config, bandwidth: Bandwidth) -> Section:
         mode = instrument.detector.mode
         for signal, background in _LEVELS if instrument is free else _LEVELS[:1]:
             cube = ml.simulate(ml.Flux(np.full_like(delay, signal), background, delay), instrument, seed=SEED)[0]
-            methods = [name for name, method in METHODS.items() if mode in method.modes]
+            methods = [name for name, method in METHODS.items() if mode in method.modes and not method.of_images]
             for name in methods if signal == 1.0 else ["maximum_likelihood"]:
                 key = f"{mode} {name} {signal:g} {background:g}"
                 cases[key] = partial(ml.reconstruct, cube, instrument, name, threads=1)

@@ -1,4 +1,4 @@
-"""A learned prior in deepinv's proximal gradient descent, beside total variation, a neighbourhood and each pixel alone.
+"""A learned prior in deepinv's proximal gradient descent, beside total variation, method "image" and each pixel alone.
 
 ``python examples/learned_prior.py FOLDER`` trains the denoiser on a CPU and writes learned_prior.md and its picture.
 """
@@ -23,7 +23,7 @@ PULSE_NS, PHOTONS, SBR = 1.0, 5.0, 1.0  # photons of the return: of a pixel, on 
 PULSE, DETECTOR = ml.GaussianPulse(sigma_ns=PULSE_NS), ml.Detector(dead_time_ns=75.0)
 SYSTEM = ml.System(period_ns=128.0, cycles=1000, bins=128, pulse=PULSE, detector=DETECTOR)
 M_PER_WIDTH = 0.5 * 0.299792458 * PULSE_NS
-ALONE, AROUND, SMOOTH = "a pixel alone, maximum likelihood", "neighbourhood=4", "total variation, weight "
+ALONE, AROUND, SMOOTH = "a pixel alone, maximum likelihood", "method `image`", "total variation, weight "
 SHOWN = ("truth", ALONE, AROUND, SMOOTH + "2", "learned prior")
 SIZE = 96  # of the scenes that are reconstructed
 FLOOR = 0.2 / SYSTEM.cycles  # photons per period that an estimate of zero stands for, in a logarithm
@@ -100,8 +100,8 @@ def solve(y, start, prior, **options):
 def estimates(y, denoiser, steps=100):
     """Images of histograms (N, bins, H, W) by each method: pairs of its name and (N, 3, H, W)."""
     cubes, start = y.movedim(1, -1).double().contiguous().numpy(), None
-    for name, reach in ((ALONE, None), (AROUND, 4)):
-        parts = [ml.reconstruct(cube, SYSTEM, neighbourhood=reach) for cube in cubes]
+    for name, method in ((ALONE, "maximum_likelihood"), (AROUND, "image")):
+        parts = [ml.reconstruct(cube, SYSTEM, method) for cube in cubes]
         maps = [np.stack([one.signal, one.background, one.delay_ns]) for one in parts]
         start = images(torch.from_numpy(np.stack(maps)).float())
         yield name, start
@@ -145,7 +145,7 @@ processor on crops of scenes `"random"` with Gaussian noise, is the plug-and-pla
 descent. The data term is `histogram_log_likelihood` of a dim cube: {PHOTONS:g} photons of the return a pixel on average
 and as many of the background in {SYSTEM.cycles} periods of {SYSTEM.period_ns:g} ns, {SYSTEM.bins} bins, pulse of
 sigma = {PULSE_NS:g} ns, dead time {DETECTOR.dead_time_ns:g} ns. Total variation (`TVPrior`) has the same data term.
-Both start from the estimate of `neighbourhood=4`. Of total variation three weights are shown; the learned prior's
+Both start from the estimate of method `image`. Of total variation three weights are shown; the learned prior's
 settings were chosen on two scenes, of either kind, that are in none of the tables.
 
 Errors of depth in m: *near*, of the pixels within 3 sigma of the pulse; *off*, the share of the others. Errors of

@@ -30,7 +30,7 @@ class Request:
 
     `truth` is the engine whose simulation the study "count-law" takes for true; `stream` a measured photon stream for
     the studies "hardware" and "uncertainty"; `config` the size of "downstream" and "uncertainty"; `seed` another
-    sweep of the study "domain".
+    sweep of the study "domain"; `rgbd` a folder of RGB-D pairs for the study "image".
     """
 
     out: Path
@@ -41,6 +41,7 @@ class Request:
     stream: Path | None = None
     config: str = "small"
     seed: int | None = None
+    rgbd: Path | None = None
 
 
 class OtherRunsError(ValueError):

@@ -46,6 +46,10 @@ def _parser(command: str) -> argparse.ArgumentParser:
     )
     add("--config", choices=("small", "full"), default="small", help=words)
     add("--seed", type=int, metavar="N", help="another sweep (study 'domain')")
+    words = "folder of RGB-D pairs, NAME_depth.png and NAME_colors.png or Middlebury folders (study 'image')"
+    add("--rgbd", type=Path, metavar="DIR", help=words)
+    words = "instead of the study 'image', train its networks, and write weights and card into --out"
+    add("--train", action="store_true", help=words)
     return parser
 
 
@@ -71,6 +75,10 @@ def main(arguments: Sequence[str] | None = None, command: str = "python -m studi
         parser.error(f"--data must be a folder with *.json cases, got {str(given.data)!r}")
     if given.stream is not None and not given.stream.is_file():
         parser.error(f"--stream must be a file, got {str(given.stream)!r}")
+    if given.train and given.studies != ["image"]:
+        parser.error(f"--train is of study 'image' alone, got {' '.join(given.studies)}")
+    if given.rgbd is not None and not given.rgbd.is_dir():
+        parser.error(f"--rgbd must be a folder, got {str(given.rgbd)!r}")
     try:
         given.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -78,6 +86,11 @@ def main(arguments: Sequence[str] | None = None, command: str = "python -m studi
     given.tell = partial(print, file=sys.stderr, flush=True)
     request = Request(**{field.name: getattr(given, field.name) for field in fields(Request)})
     try:
+        if given.train:
+            from studies.image.train import FULL, QUICK, train
+
+            print(*train(given.out, QUICK if given.quick else FULL, given.tell), sep="\n")
+            return 0
         for name in dict.fromkeys(given.studies):
             began = time.monotonic()
             for path in run(name, request):

@@ -69,6 +69,13 @@ def threefry(counter: tuple[int, int], key: tuple[int, int], rounds: int) -> tup
     return words[0], words[1]
 
 
+def words_of_key(key: tuple[int, int], n: int) -> list[int]:
+    """The first `n` words of the exact engine's stream of a key."""
+    words = (ctypes.c_uint32 * n)()
+    library("random").words_of_key((ctypes.c_uint32 * 2)(*key), words, ctypes.c_int64(n))
+    return list(words)
+
+
 def poisson_sample(seed: int, mean: float, n: int) -> NDArray[np.int64]:
     """Independent Poisson numbers (n) of the native core."""
     out = np.empty(n, np.int64)

@@ -15,7 +15,7 @@ from harness import (
     require,
     two_lobes,
 )
-from native_emulation import threefry
+from native_emulation import threefry, words_of_key
 from scipy import stats
 
 import mars_lidar as ml
@@ -48,6 +48,19 @@ def dead(periods: float) -> ml.Detector:
 def test_threefry_known_answers(counter, key, rounds, expected):
     """Random123's kat_vectors (Salmon et al. 2011)."""
     assert threefry(counter, key, rounds) == expected
+
+
+@pytest.mark.parametrize(
+    ("key", "expected"),
+    [
+        ((0, 0), [0x514676C3, 0x08A809DF, 0x30349D2B, 0xFB52C520]),
+        ((0x243F6A88, 0x85A308D3), [0x6A16794C, 0x44D5F881, 0xA32282E9, 0xDD93E1AE]),
+        ((0xFFFFFFFF,) * 2, [0xC7053320, 0xDB48177E, 0xB7B300C7, 0x8D4E1C21]),
+    ],
+)
+def test_words_of_a_key_known_answers(key, expected):
+    """Those of `sfc32::seed(Uint64)` in PractRand itself, the key as one number, the first word low."""
+    assert words_of_key(key, 4) == expected
 
 
 # Dim pixels: waits of millions of periods

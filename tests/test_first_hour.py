@@ -149,6 +149,17 @@ def test_depth_is_judged_in_the_table_as_in_the_picture(tmp_path):
     assert told.missing == pytest.approx(1.0 - float(found.seen.mean()))
 
 
+def test_what_an_earlier_run_did_is_no_part_of_the_speed(monkeypatch, capsys):
+    """`generate --resume`: 90 of 100 parts were there, 5 more took 40 s, so that 5 take another 40 s."""
+    now = [0.0]
+    monkeypatch.setattr(bars.time, "monotonic", lambda: now[0])
+    bar = bars.Bar("generating")
+    bar(90, 100)
+    now[0] = 40.0
+    bar(95, 100)
+    assert "95 % after 40 s, about 40 s left" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [

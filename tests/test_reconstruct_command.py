@@ -114,20 +114,21 @@ def test_several_returns_read_back(tmp_path, suffix):
     assert "returns=2 needs the likelihood" in refused.stderr
 
 
-def test_a_neighbourhood_of_a_dim_cube(tmp_path):
-    """The command takes whole images at a time, and says what it says of an array."""
-    dim = ("--size", 16, "--cycles", 300, "--bins", 256, "--signal", 0.005, "--realizations", 2, "--no-picture")
+def test_an_image_of_a_dim_cube(tmp_path, monkeypatch):
+    """Rows are read in parts, the image is reconstructed whole; its maps are those of the array."""
+    dim = ("--size", 24, "--cycles", 300, "--bins", 256, "--signal", 0.005, "--realizations", 2, "--no-picture")
     assert run("simulate", "--scene", "room", *dim, "-o", tmp_path / "dim.zarr").exit_code == 0
-    done = run("reconstruct", tmp_path / "dim.zarr", "--neighbourhood", 2, "-o", tmp_path / "m.zarr")
+    monkeypatch.setattr(recipes, "BLOCK_BYTES", 3 * 24 * 256 * 2)  # three rows at a time
+    monkeypatch.setattr(stored_module, "_CHUNK_BYTES", 3 * 24 * 256 * 2)
+    done = run("reconstruct", tmp_path / "dim.zarr", "--method", "image,peak", "-o", tmp_path / "m.zarr")
     assert done.exit_code == 0, done.output
-    assert "neighbourhood" in done.stdout
     found, _ = load_maps(tmp_path / "m.zarr")
-    assert set(np.unique(found["radius"])) <= {1, 2}
     with io.load(tmp_path / "dim.zarr") as stored:
-        direct = ml.reconstruct(stored, neighbourhood=2)
-    assert np.array_equal(found["depth"][0], direct.depth_m, equal_nan=True)
-    assert np.array_equal(found["depth_error"][0], direct.depth_error_m, equal_nan=True)
-    assert np.array_equal(found["radius"][0], direct.radius)
+        direct = ml.reconstruct(stored, method="image")
+    for name in ("depth", "depth_error", "depth_half_width", "outlier", "flags"):
+        values = getattr(direct, {"flags": "flags", "outlier": "outlier"}.get(name, f"{name}_m"))
+        assert np.array_equal(found[name][0], values, equal_nan=True), name
+    assert np.isnan(found["outlier"][1]).all()
 
 
 def test_all_methods_and_errors_in_the_table(cube, tmp_path):
@@ -211,7 +212,7 @@ def test_study(tmp_path):
     assert main(["reconstruction", "--quick", "--out", str(tmp_path)]) == 0
     with (tmp_path / "reconstruction.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert {row["method"] for row in rows} == set(METHODS)
+    assert {row["method"] for row in rows} == {name for name, method in METHODS.items() if not method.of_images}
     bright = {row["method"]: row for row in rows if float(row["signal"]) == 3.0 and row["detector"] != "synchronous"}
     likely = bright["maximum_likelihood"]
     assert float(likely["depth RMSE mm"]) < 1.3 * float(likely["depth bound mm"])
@@ -222,8 +223,8 @@ def test_study(tmp_path):
         assert 5_000 < figure.stat().st_size <= MAX_FIGURE_BYTES
 
 
-@pytest.mark.parametrize("name", ["returns", "neighbourhood"])
-def test_studies_of_returns_and_neighbours(tmp_path, name):
+@pytest.mark.parametrize("name", ["returns"])
+def test_study_of_returns(tmp_path, name):
     assert main([name, "--quick", "--out", str(tmp_path)]) == 0
     text = (tmp_path / f"{name}.md").read_text()
     assert "Quick form" in text

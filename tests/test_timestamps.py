@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import copy
+import dataclasses
+import pickle
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -10,6 +15,7 @@ from mars_lidar import _core
 from mars_lidar.engines.engine import Records, Task
 from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.instrument.jitter import Jitter
+from mars_lidar.light.timestamps import DrawnTimestamps
 
 
 @pytest.mark.parametrize("engine", ["exact", "sequential"])
@@ -46,8 +52,12 @@ def test_pixels_are_views_in_order_of_time(system: ml.System, flux: ml.Flux):
             assert one.shape == (1, 1)
             assert len(one) == times.counts[y, x]
             assert np.all(np.diff(one.times_ns) >= system.detector.dead_time_ns - 1e-4)
-            assert np.shares_memory(one.times_ns, times.times_ns) or len(one) == 0
+            assert np.shares_memory(one.cycle, times.cycle) or len(one) == 0
             assert np.array_equal(one.histogram()[0, 0], times.histogram()[y, x])
+            again = times.pixel(y, x)  # once the image has times, a pixel's are views of them
+            assert np.array_equal(one.times_ns, again.times_ns[: len(one)])
+            assert times.times_ns is times.times_ns
+            assert np.shares_memory(times.pixel(y, x).times_ns, times.times_ns) or len(one) == 0
     assert np.array_equal(times.pixel(-1, -1).times_ns, times.pixel(1, 2).times_ns)
     assert len(times.pixel(1, 2)) == 0  # no photons there
 
@@ -139,15 +149,51 @@ def test_records_into_memory_that_is_there(system: ml.System, flux: ml.Flux):
     engine = ExactEngine()
     records = Records.allocate(engine.counts(task))
     engine.timestamps(task, records)
-    assert np.array_equal(records.times, engine.records(task, 0.0).times)
+    drawn = engine.records(task, 0.0)
+    assert np.array_equal(records.times, drawn.times)
+    assert np.array_equal(records.bin, drawn.bin)
     with pytest.raises(ValueError, match="one length"):
-        _core.exact_records(
-            task.job, task.pulse, records.offsets, records.times, records.cycle, records.bin[1:], 1, None, ""
-        )
+        _core.exact_records(task.job, task.pulse, drawn.offsets, drawn.cycle, drawn.phase[1:], 1, None, "")
     with pytest.raises(ValueError, match="items \\+ 1"):
-        _core.exact_records(
-            task.job, task.pulse, records.offsets[1:], records.times, records.cycle, records.bin, 1, None, ""
-        )
+        _core.exact_records(task.job, task.pulse, drawn.offsets[1:], drawn.cycle, drawn.phase, 1, None, "")
+
+
+def test_times_and_bins_are_made_when_they_are_asked_for(system: ml.System, flux: ml.Flux, tmp_path: Path):
+    """The bits do not depend on when, and copies hold what the original holds."""
+    times = ml.simulate_timestamps(flux, system, seed=2)
+    assert isinstance(times, DrawnTimestamps)
+    assert not {"times_ns", "bin"} & set(vars(times))
+    exact = times.cycle + np.minimum(times.phase.astype(np.float64), 1.0 - 2.0**-25)
+    copied, packed = copy.deepcopy(times), pickle.loads(pickle.dumps(times))
+    assert np.array_equal(times.times_ns, exact * system.period_ns)
+    assert np.array_equal(times.bin, np.minimum((times.phase * np.float32(64)).astype(np.int32), 63))
+    for other in (copied, packed, dataclasses.replace(times)):
+        for name in ("times_ns", "bin", "cycle", "offsets"):
+            assert np.array_equal(getattr(other, name), getattr(times, name))
+    times.save(tmp_path / "times.npz")
+    assert np.array_equal(ml.Timestamps.load(tmp_path / "times.npz").times_ns, times.times_ns)
+    doubled = dataclasses.replace(times, times_ns=2.0 * times.times_ns, period_ns=2.0 * times.period_ns)
+    assert np.array_equal(doubled.pixel(0, 0).times_ns, 2.0 * times.pixel(0, 0).times_ns)
+    with pytest.raises(ValueError, match="must be sorted"):  # what is given is checked
+        dataclasses.replace(times, times_ns=times.times_ns[::-1].copy())
+
+
+@pytest.mark.parametrize("bins", [3, 64, 1000, 2**20])
+@pytest.mark.parametrize("codes", [False, True])
+def test_phases_lie_in_the_bins_of_the_cube(bins: int, codes: bool):
+    """Phases that are rounded to single precision, of waveforms and of a converter's codes, do not change bins."""
+    rough = ((0.4, 1.6, 1.0) if bins % 3 == 0 else (0.4, 1.6)) if codes else None
+    detector = ml.Detector(dead_time_ns=3.0, code_density=rough)
+    system = ml.System(period_ns=100.0, cycles=600, bins=bins, pulse=ml.GaussianPulse(sigma_ns=1.0), detector=detector)
+    light = np.random.default_rng(0).uniform(0.0, 0.4, (1, 3, 48))
+    for flux in (ml.Flux(waveform=light, background=2.0), ml.Flux(np.full((1, 3), 9.0), 2.0, 50.0)):
+        times = ml.simulate_timestamps(flux, system, seed=7)
+        cube = ml.simulate(flux, system, seed=7)[0]
+        assert len(times) > 4000
+        for x in range(3):
+            one = times.pixel(0, x)
+            assert np.array_equal(np.bincount(one.bin, minlength=bins), cube[0, x])
+            assert (np.diff(one.times_ns) >= 0.0).all()
 
 
 def test_where_memory_is_scarce_they_are_counted_first(

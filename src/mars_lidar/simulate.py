@@ -14,12 +14,12 @@ from mars_lidar._base.progress import shown
 from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import FloatArray, Progress
 from mars_lidar.engines import Engine, EngineOptions, check_detector, find_engine
-from mars_lidar.engines.engine import IN_PARTS, Records, Task
+from mars_lidar.engines.engine import IN_PARTS, PhaseRecords, Records, Task
 from mars_lidar.instrument.system import System
 from mars_lidar.instrument.units import check_delays
 from mars_lidar.light.flux import MAX_RETURNS, Flux
 from mars_lidar.light.stored_flux import StoredFlux
-from mars_lidar.light.timestamps import Timestamps
+from mars_lidar.light.timestamps import DrawnTimestamps, Timestamps
 
 if TYPE_CHECKING:
     pass
@@ -151,7 +151,8 @@ def simulate_timestamps(
     Returns
     -------
     Timestamps
-        Packed times (ns), cycles and bins of all pixels.
+        Packed times (ns), cycles and bins of all pixels: of `exact` 8 bytes a registration, times and bins when they are
+        asked for.
 
     See Also
     --------
@@ -174,26 +175,17 @@ def simulate_timestamps(
         from mars_lidar import cuda
 
         cuda.check(drawn_by, task.flux, task.system)
-        records = cuda.records(drawn_by, task)
+        records: Records | PhaseRecords = cuda.records(drawn_by, task)
     else:
         detected = flux.detected(system)
         expected = float((_share_registered(detected, system) * _expected_arrivals(detected, system)).sum())
-        _check_memory((math.ceil(0.5 * expected),), Records.BYTES, "timestamps")  # before any work
+        _check_memory((math.ceil(0.5 * expected),), PhaseRecords.BYTES, "timestamps")  # before any work
         records = drawn_by.records(task, expected)
-    times_ns = records.times
-    times_ns *= system.period_ns
-    return Timestamps(
-        times_ns,
-        records.cycle,
-        records.bin,
-        records.offsets,
-        flux.shape,
-        system.bins,
-        system.histogram_dtype,
-        system.period_ns,
-        system.cycles,
-        {"system": system.to_dict(), "engine": drawn_by.name, "seed": int(seed), "realization": int(realization)},
-    )
+    info = {"system": system.to_dict(), "engine": drawn_by.name, "seed": int(seed), "realization": int(realization)}
+    what = (flux.shape, system.bins, system.histogram_dtype, system.period_ns, system.cycles, info)
+    if isinstance(records, PhaseRecords):
+        return DrawnTimestamps.of(records.cycle, records.phase, records.offsets, *what)
+    return Timestamps(records.times * system.period_ns, records.cycle, records.bin, records.offsets, *what)
 
 
 def _on_cuda(engine: Engine, task: Task, shape: tuple[int, ...], out: Any) -> Any:

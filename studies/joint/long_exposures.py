@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from mars_lidar.engines.engine import Task
 from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.engines.feedback import FeedbackEngine
-from mars_lidar.engines.feedback_grid import cell_cuts, internal_cells
+from mars_lidar.engines.feedback_grid import Grids
 from mars_lidar.engines.feedback_rule import draw_rest
 from studies import Facts, Request
 from studies.common.report import Row, picked
@@ -72,13 +72,14 @@ def compare(case: Case, bins: int, items: int, seed: int) -> Row:
     """A row of the study for one pixel: cells of 0 where the engine refuses it."""
     report: dict[str, float] = {}
     x, system = case.histograms(bins, _Sampled(), items, seed, report).astype(np.float64), case.system(bins)
-    merge, parts = cell_cuts(case.flux, system)
+    task = Task(case.flux, system, 1, 0, np.zeros(1, np.uint32), 0, 1, None)
+    grids = Grids.checked(task, np.arange(1))
     row: dict[str, Any] = {
         **picked(case, "S=signal B=background t_d=dead sigma"),
         "cycles": f"{case.cycles:.0e}",
         "bins": bins,
-        "cells": int(internal_cells(case.flux, system)[0, 0]),
-        "cut": f"{merge[0, 0]} x {parts[0, 0]}",
+        "cells": int(grids.cells()[0]),
+        "cut": f"{1 << int(grids.kinds[0].max())}" if grids.kinds else "",
     }
     if report["refused"]:
         keys = ("largest", "rms", "count", "window", "var count", "var window", "var bins")

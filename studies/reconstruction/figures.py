@@ -14,7 +14,8 @@ from studies.common.draw import legend_below, panels
 from studies.common.report import Row
 from studies.reconstruction.run import Picture
 
-_COLOUR = dict(zip(METHODS, (*COLOURS, INK), strict=True))
+_ALONE = [name for name, method in METHODS.items() if not method.of_images]
+_COLOUR = dict(zip(_ALONE, (*COLOURS, INK), strict=True))
 TITLE = {"nonparalyzable": "free-running, t_d = 75 ns", "synchronous": "synchronous"}
 
 

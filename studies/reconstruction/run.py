@@ -112,7 +112,7 @@ def sweep(system: System, signal: float, pixels: int) -> list[dict[str, Any]]:
         least[name] = float(np.sqrt(np.mean(at**2)))
     lines = []
     for name, method in METHODS.items():
-        if system.detector.mode not in method.modes:
+        if method.of_images or system.detector.mode not in method.modes:
             continue
         found = reconstruct(cube, system, method)
         lag = (found.delay_ns - delay + 0.5 * period) % period - 0.5 * period

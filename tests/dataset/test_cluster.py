@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
+import random
 import signal
 import subprocess
 import sys
@@ -16,6 +18,8 @@ from dataset.conftest import files
 
 import mars_lidar as ml
 from mars_lidar import io
+from mars_lidar.dataset import cluster as cluster_module
+from mars_lidar.dataset import write
 
 pytestmark = pytest.mark.filterwarnings("default")  # what dask warns of when its workers die is its own
 
@@ -47,6 +51,90 @@ def test_a_killed_worker_loses_nothing(tmp_path, recipe, cluster):
     assert files(tmp_path / "one.zarr") == files(tmp_path / "two.zarr")
     ml.generate(recipe | {"seed": 6}, tmp_path / "two.zarr", scheduler=cluster.scheduler_address, overwrite=True)
     ml.generate(recipe | {"seed": 6}, tmp_path / "one.zarr", overwrite=True)  # workers forget the store of before
+    assert files(tmp_path / "one.zarr") == files(tmp_path / "two.zarr")
+
+
+@pytest.mark.full
+def test_a_cluster_that_starts_with_no_worker_fills(tmp_path, recipe):
+    """Adaptive clusters start workers by the length of the queue; three parts in flight reached two of eight."""
+    ml.generate(recipe, tmp_path / "one.zarr")
+    workers = []
+    with distributed.LocalCluster(
+        n_workers=0, threads_per_worker=1, dashboard_address=None, memory_limit=0, silence_logs=50
+    ) as started:
+        started.adapt(minimum=0, maximum=2, interval="100ms", wait_count=100)
+        ml.generate(
+            recipe,
+            tmp_path / "two.zarr",
+            scheduler=started.scheduler_address,
+            progress=lambda *_: workers.append(len(started.workers)),
+        )
+    assert workers[0] == 0
+    assert max(workers) == 2
+    assert files(tmp_path / "one.zarr") == files(tmp_path / "two.zarr")
+
+
+def test_parts_in_flight_follow_the_workers_that_are_there():
+    threads = [0]
+    team = cluster_module.Team(None, None, lambda: threads[0], 3, 512, 50.0)  # type: ignore[arg-type]
+    assert team.capacity() == 512
+    threads[0] = 320
+    assert team.capacity() == 960
+    assert team.parts_of_a_task(0.0) == 1
+    assert team.parts_of_a_task(10.0) == 1
+    assert team.parts_of_a_task(0.5) == 13  # 320 workers make 640 such parts a second: 49 tasks
+    assert team.parts_of_a_task(1e-6) == 1000
+
+
+def test_a_worker_of_another_version_is_refused_before_it_writes(tmp_path):
+    own = cluster_module.fingerprint()
+    for version, fingerprint, words in (("0.0.1", own, "has mars-lidar"), (ml.__version__, "0", "draws other counts")):
+        run = cluster_module.Run(str(tmp_path / "no.zarr"), "run", 1, version, fingerprint)
+        with pytest.raises(ValueError, match=words):
+            cluster_module.make_parts(run, [])
+
+
+@pytest.fixture
+def no_pauses(monkeypatch):
+    monkeypatch.setattr("mars_lidar.dataset.write.time.sleep", lambda _: None)
+
+
+def test_a_file_system_that_fails_for_a_moment_costs_nothing(tmp_path, recipe, monkeypatch, no_pauses):
+    ml.generate(recipe, tmp_path / "one.zarr")
+    real, draw, errors = write.write_shard, random.Random(1), []
+
+    def write_shard(*arguments):
+        if draw.random() < 0.2:  # four times in a row in 0.16 % of the parts
+            errors.append(OSError(errno.EIO, "Input/output error"))
+            raise errors[-1]
+        real(*arguments)
+
+    monkeypatch.setattr(write, "write_shard", write_shard)
+    ml.generate(recipe, tmp_path / "two.zarr", threads=1)
+    assert errors
+    assert files(tmp_path / "one.zarr") == files(tmp_path / "two.zarr")
+
+
+def test_a_part_that_cannot_be_written_is_named_and_the_others_are_there(tmp_path, recipe, monkeypatch, no_pauses):
+    ml.generate(recipe, tmp_path / "one.zarr")
+    real, bad = write.write_shard, []
+
+    def write_shard(path, *arguments):
+        if not bad:
+            bad.append(path)
+        if path == bad[0]:
+            raise OSError(errno.ESTALE, "Stale file handle")
+        real(path, *arguments)
+
+    monkeypatch.setattr(write, "write_shard", write_shard)
+    with pytest.raises(
+        io.WriteError, match=r"1 parts could not be written in four attempts \(Stale file handle\)"
+    ) as told:
+        ml.generate(recipe, tmp_path / "two.zarr", threads=1)
+    assert bad[0].name in str(told.value)
+    assert len(ml.dataset.open_dataset(tmp_path / "two.zarr", allow_incomplete=True).missing()) == 1
+    monkeypatch.undo()
+    ml.generate(recipe, tmp_path / "two.zarr", resume=True)
     assert files(tmp_path / "one.zarr") == files(tmp_path / "two.zarr")
 
 

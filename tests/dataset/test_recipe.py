@@ -8,6 +8,7 @@ import pytest
 import yaml
 from dataset.conftest import SYSTEM
 
+from mars_lidar._base.yaml import read_yaml
 from mars_lidar.dataset import DatasetRecipe
 from mars_lidar.dataset.samples import count_samples, fitting, sample_parts
 
@@ -113,3 +114,11 @@ def test_blocks_are_runs_of_the_array():
     assert fitting(whole, (1, 1, 1, 1, 1024), 2, 3 * 2**20) == (1, 1, 22, 64, 1024)
     assert fitting(whole, (1, 1, 1, 1, 1024), 2, 1000) == (1, 1, 1, 1, 1024)
     assert fitting((1, 1, 4, 100, 1024), (1, 1, 1, 1, 1024), 2, 60_000) == (1, 1, 1, 25, 1024)
+
+
+def test_scalars_are_those_of_yaml_1_2(tmp_path):
+    """PyYAML alone reads 1:30 as 90, 010 as eight, yes as true, a date as an object, and 1e-3 as a text."""
+    path = tmp_path / "a.yaml"
+    path.write_text("a: 1:30\nb: 010\nc: 0x1f\nd: 1e-3\ne: yes\nf: true\ng: 2026-11-23\nh: ~\ni: .5\nj: -.inf\nk:\n")
+    values = {"a": "1:30", "b": 10, "c": 31, "d": 1e-3, "e": "yes", "f": True, "g": "2026-11-23", "h": None, "i": 0.5}
+    assert read_yaml(path)[0] == values | {"j": -math.inf, "k": None}

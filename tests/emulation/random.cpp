@@ -1,5 +1,6 @@
-// Random numbers of the native core for their tests: Threefry's known answers, and the Poisson sampler by itself.
+// Random numbers of the native core for their tests: known answers of the generators, and the Poisson sampler by itself.
 #include "numbers/poisson_sampler.h"
+#include "numbers/word_stream.h"
 #include "poisson/engine.h"
 
 #define MARS_EXPORT extern "C" __attribute__((visibility("default")))
@@ -11,6 +12,12 @@ MARS_EXPORT void threefry(const uint32_t* counter, const uint32_t* key, int roun
                                           : threefry<20, uint32_t>(counter[0], counter[1], key[0], key[1]);
     words[0] = x.first;
     words[1] = x.second;
+}
+
+// The first `n` words of the stream of `key` (2).
+MARS_EXPORT void words_of_key(const uint32_t* key, uint32_t* words, int64_t n) {
+    mars::WordStream<uint32_t> stream = mars::word_stream({key[0], key[1]});
+    for (int64_t k = 0; k < n; ++k) words[k] = stream.next();
 }
 
 // Independent Poisson numbers out (n), each from an event of its own.

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from mars_lidar import Detector, GaussianPulse, SampledPulse, System
 from mars_lidar.engines.engine import Task
 from mars_lidar.engines.feedback import FeedbackEngine
+from mars_lidar.engines.feedback_grid import Grids, KindArray
 
 GIVEN = "pixels given to exact"
 SAMPLED = SampledPulse(two_lobes(), 0.1, "centroid")
@@ -44,6 +45,12 @@ def case(
     ).replace(**changes)
     name = f"S {signal:g}, B {background:g}, t_d {dead:g}, {cycles} cycles, {system.start}"
     return Case(name, flux_of(signal, background, delay), system, items)
+
+
+def kinds_of(request: Case) -> KindArray:
+    """Halvings of the bins in the engine's grid of the case's one pixel."""
+    grids = Grids.checked(task_of(request, 1, realizations=1), np.arange(1))
+    return grids.kinds[grids.of[0]]
 
 
 def drawn(engine: Any, request: Case, seed: int = 1) -> NDArray[np.int64]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from feedback_cases import SAMPLED, Sampler, case, drawn
+from feedback_cases import SAMPLED, Sampler, case, drawn, kinds_of
 from harness import (
     COUNTS,
     JOINT,
@@ -26,7 +26,6 @@ from scipy import stats
 from mars_lidar import joint_law
 from mars_lidar._base.types import FloatArray
 from mars_lidar.engines import ENGINES
-from mars_lidar.engines.feedback_grid import cell_cuts
 
 CLAIMS = {COUNTS, SHAPE, JOINT}
 
@@ -93,8 +92,7 @@ DENSE = {
 @pytest.mark.parametrize("name", DENSE)
 def test_mean_and_covariance_are_those_of_the_closed_form(name: str):
     request = DENSE[name]
-    merge, parts = cell_cuts(request.flux, request.system)
-    mean, covariance = dense_law(request, int(merge[0, 0] * parts[0, 0]))
+    mean, covariance = dense_law(request, 1 << int(kinds_of(request).max()))
     x = drawn(Sampler(), request).astype(float)
     peak = int(mean.argmax())
     near = np.arange(peak - 3, peak + 4) % mean.size

@@ -7,14 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from feedback_cases import GIVEN, Sampler, case, drawn
+from feedback_cases import GIVEN, Sampler, case, drawn, kinds_of
 from harness import COUNTS, JOINT, SHAPE, Case, check, require, task_of, waveform_flux
 from scipy import stats
 
 import mars_lidar as ml
 from mars_lidar import _core
 from mars_lidar.engines import ENGINES
-from mars_lidar.engines.feedback_grid import cell_cuts, near_pulse
 from mars_lidar.engines.feedback_rule import Reason
 
 PERIOD_NS = 1e3 / 7.5
@@ -128,9 +127,8 @@ def statuses(request: Case, laps: int) -> np.ndarray[Any, Any]:
     task = task_of(request, 1, realizations=3)
     out = np.full((task.items, request.system.bins), 7, request.system.histogram_dtype)
     status = np.empty((3, task.pixel_index.size), np.uint8)
-    _core.feedback_histogram(
-        task.job, task.pulse, out, np.arange(task.pixel_index.size), status, 2, 1, near_pulse(task.system, 2), laps, 1
-    )
+    kinds = np.ones(request.system.bins, np.uint8)
+    _core.feedback_histogram(task.job, task.pulse, out, np.arange(task.pixel_index.size), status, kinds, laps, 1)
     assert (out[(status != Reason.DRAWN).reshape(-1)] == 7).all(), "a refused row is not written"
     return status
 
@@ -147,11 +145,12 @@ def test_the_kernel_asks_for_laps():
     assert (statuses(short, 1) == Reason.FEW).all()
 
 
-@pytest.mark.parametrize("laps", [0, 65])
+@pytest.mark.parametrize("laps", [0, 129])
 def test_laps_are_checked(laps: int):
-    with pytest.raises(ValueError, match="laps must be 1 to 64, and 1 where the dead time is a period or longer"):
+    message = "laps must be 1, or from the dead time and a period on, at most 128"
+    with pytest.raises(ValueError, match=message):
         statuses(LOCKED["S 8, dead time 0.93"], laps)
-    with pytest.raises(ValueError, match="laps must be 1 to 64, and 1 where the dead time is a period or longer"):
+    with pytest.raises(ValueError, match=message):
         statuses(case(1.0, 1.0, 1.5, 1000), 2)
 
 
@@ -193,4 +192,4 @@ def test_edges_of_bright_parts(name: str):
 def test_smooth_light_needs_no_cuts():
     fog = np.exp(-np.arange(1024) / 300.0) * (1.0 - np.exp(-np.arange(1024) / 40.0))
     request = Case("fog", waveform_flux(fog / fog.sum(), 0.1), case(0, 0, 0.6375, 10_000).system.replace(bins=1024), 1)
-    assert (cell_cuts(request.flux, request.system)[0] == 1).all()
+    assert (kinds_of(request) == 0).all()

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from feedback_cases import GIVEN, SAMPLED, Sampler, case, drawn
-from harness import PERIOD_NS, Case, flux_of, require, task_of, two_lobes
+from feedback_cases import GIVEN, SAMPLED, Sampler, case, drawn, kinds_of
+from harness import PERIOD_NS, Case, flux_of, require, task_of, two_lobes, waveform_flux
 from numpy.typing import NDArray
 from scipy import stats
 
@@ -17,7 +17,7 @@ from mars_lidar.engines.auto import AutoEngine, expected_registrations
 from mars_lidar.engines.engine import Task
 from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.engines.feedback import FeedbackEngine
-from mars_lidar.engines.feedback_grid import MOST_CELLS, cell_cuts, internal_cells, near_pulse
+from mars_lidar.engines.feedback_grid import GOAL, Grids, cells_of
 
 # What is given to other engines
 
@@ -47,10 +47,8 @@ def test_refused_pixels_have_the_bits_of_exact():
     [
         (case(1.0, 1.0, 0.6375, 99), "short exposure"),
         (case(1.0, 1.0, 2.5, 299), "short for its dead time"),
-        (case(6.0, 0.05, 0.99, 2000), "bright echo"),
         (case(5.0, 1.0, 0.6375, 1000), "few armed after the pulse"),
         (case(1.0, 6.0, 0.6375, 200), "ghosts beside a narrow count"),
-        (case(1.0, 0.05, 0.99, 999), "short exposure with an echo"),
         (case(3.0, 3.0, 3.5, 1000), "count hardly varies"),
         (case(1.0, 40.0, 0.6375, 1000), "slow sweeps"),
         (case(1.0, 1.0, 1e-6, 1000), "bins"),
@@ -74,35 +72,46 @@ def test_no_dead_time_is_poisson_at_any_length():
     require({"bins": float(stats.chi2.sf(z @ z, z.size))}, "feedback, no dead time")
 
 
-def cuts(request: Case) -> tuple[int, int]:
-    merge, parts = cell_cuts(request.flux, request.system)
-    return int(merge[0, 0]), int(parts[0, 0])
+def off(request: Case, kinds: NDArray[np.uint8]) -> float:
+    """Distance of a grid's mean histogram from that of one of half its cells' width."""
+    task, distance, sweeps = task_of(request, 1, realizations=1), np.empty(1), np.empty(1, np.int32)
+    parts = np.empty((0, request.system.bins))
+    _core.feedback_check(task.job, task.pulse, np.arange(1), kinds, distance, sweeps, parts, 1)
+    return float(distance[0])
 
 
-def test_cells_are_narrow_near_the_pulse_alone():
-    fine = case(1.0, 1.0, 0.6375, 1000)
-    assert cuts(fine) == (1, 3)  # 0.26 sigma there, 0.78 sigma elsewhere
-    assert cuts(case(8.0, 1.0, 0.6375, 1000)) == (1, 6)
-    longer = fine.system.replace(cycles=100_000_000)
-    assert cuts(case(1.0, 1.0, 0.6375, 100_000_000)) == (2, 9)
-    near = near_pulse(longer, 2)
-    for centre in (64.0, (0.5 + 0.6375) % 1 * 128):  # 4.75 sigma about the return, and one dead time later
-        assert near[np.arange(int(2 * (centre - 6.08)), int(2 * (centre + 6.08)) + 1)].all()
-    assert near.sum() < 80
-    assert internal_cells(fine.flux, longer)[0, 0] == 256 + 8 * near.sum()
+def test_bins_are_cut_where_light_and_its_echo_are():
+    request = case(1.0, 1.0, 0.6375, 100_000_000)
+    kinds = kinds_of(request)
+    pulse, echo = np.arange(60, 69), np.arange(60, 69) + 82 - 128  # counted from half a period before the return
+    dark = np.setdiff1d(np.arange(128), np.concatenate([np.arange(57, 72), np.arange(57, 74) + 81 - 128]))
+    assert kinds[pulse].min() > kinds[dark].max()
+    assert kinds[echo].max() > kinds[dark].max()
+    shorter = kinds_of(case(1.0, 1.0, 0.6375, 1000))
+    assert 128 <= cells_of(shorter) < 2 * 128 < cells_of(kinds)
 
 
-def test_cells_are_narrow_everywhere_where_a_pulse_meets_another():
-    assert cuts(case(1.0, 0.5, 0.996, 1500)) == (6, 1)  # its own echo
-    assert cuts(case(0.0, 1.0, 0.6375, 1000)) == (1, 1)
-    returns = Case("two", flux_of([1.0, 0.5], 0.3, [0.2, 0.4]), fine_system(), 1)
-    assert cuts(returns) == (3, 1)
-    short = case(0.0, 1.0, 1e-6, 1000)
-    assert internal_cells(short.flux, short.system)[0, 0] > MOST_CELLS
+GRIDS = {
+    "dim": case(0.1, 0.1, 0.6375, 10_000_000),
+    "own echo": case(3.0, 0.5, 0.996, 100_000),
+    "bright echo": case(8.0, 0.05, 1.01, 100_000),
+    "spike in a long record": case(10.0, 0.5, 0.6, 1_000_000, pulse=ml.SampledPulse(np.r_[[1e-4] * 99, 0.2], 0.5)),
+    "returns": Case("two", flux_of([1.0, 0.5], 0.3, [0.2, 0.4]), case(0, 0, 0.6375, 1_000_000).system, 1),
+    "waveform": Case("lobes", waveform_flux(two_lobes(), 0.1), case(0, 0, 0.6375, 1_000_000).system, 1),
+}
 
 
-def fine_system() -> System:
-    return case(0, 0, 0.6375, 1000).system
+@pytest.mark.parametrize("name", GRIDS)
+def test_the_mean_is_that_of_a_finer_grid_and_no_cell_is_cut_in_vain(name: str):
+    kinds = kinds_of(GRIDS[name])
+    assert off(GRIDS[name], kinds) <= GOAL
+    assert off(GRIDS[name], np.maximum(kinds, 1) - 1) > GOAL / 4
+
+
+def test_flat_light_needs_no_cuts():
+    assert (kinds_of(case(0.0, 1.0, 0.6375, 1000)) == 0).all()
+    short = task_of(case(0.0, 1.0, 1e-6, 1000), 1, realizations=1)
+    assert Grids.checked(short, np.arange(1)).of[0] == -1
 
 
 # Bits

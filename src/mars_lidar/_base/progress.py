@@ -48,22 +48,25 @@ class Bar:
         self._live = sys.stderr.isatty() or "ipykernel" in sys.modules
         self._began = self._last = time.monotonic()
         self._warned, self._width = False, 0
+        self._before: int | None = None  # done by an earlier run: no part of this one's speed
 
     def __call__(self, done: int, total: int) -> None:
         """Tell it, if it is time."""
         now = time.monotonic()
         spent = now - self._began
+        if self._before is None:
+            self._before = done if done < total and spent < _PATIENCE_S else 0
         if done >= total:
             self.close()
         elif self._live and done and spent > _PATIENCE_S and now - self._last > _OFTEN_S:
             self._last = now
-            text = self._text(done / total, spent)
+            text = self._text(done, total, spent)
             sys.stderr.write("\r" + text.ljust(self._width))
             sys.stderr.flush()
             self._width = len(text)
         elif not self._live and (now - self._last > _SELDOM_S or self._first_is_due(done, total, spent)):
             self._last, self._warned = now, True
-            print(f"mars-lidar: {self._text(done / total, spent)}", file=sys.stderr, flush=True)
+            print(f"mars-lidar: {self._text(done, total, spent)}", file=sys.stderr, flush=True)
 
     def close(self) -> None:
         """Leave the terminal as it was."""
@@ -73,11 +76,13 @@ class Bar:
             self._width = 0
 
     def _first_is_due(self, done: int, total: int, spent: float) -> bool:
-        return not self._warned and done >= 0.05 * total and spent > 2.0 and spent * total / done > LONG_S
+        own, rest = done - (self._before or 0), total - (self._before or 0)
+        return not self._warned and own > 0 and own >= 0.05 * rest and spent > 2.0 and spent * rest / own > LONG_S
 
-    def _text(self, share: float, spent: float) -> str:
-        left = f", about {span(spent * (1.0 - share) / share)} left" if share > 0.0 else ""
-        return f"{self._label}: {100 * share:.0f} % after {span(spent)}{left}"
+    def _text(self, done: int, total: int, spent: float) -> str:
+        own = done - (self._before or 0)
+        remaining = f", about {span(spent * (total - done) / own)} left" if own > 0 else ""
+        return f"{self._label}: {100 * done / total:.0f} % after {span(spent)}{remaining}"
 
 
 def span(seconds: float) -> str:

@@ -1,6 +1,7 @@
-"""YAML as people write it, with the line of every key, so that an error can point at it.
+"""YAML 1.2 with the line of every key, so that an error can point at it.
 
-1e-3 is a number, as in YAML 1.2 and in Python, which PyYAML (1.1) takes for text.
+Scalars follow the core schema of YAML 1.2: 1e-3 is a number, 1:30 and 2026-11-23 are texts, 010 is ten, and only true
+and false are truth values. PyYAML, which reads the structure, follows YAML 1.1: a text, 90, a date and eight.
 """
 
 from __future__ import annotations
@@ -17,7 +18,17 @@ from mars_lidar._base.files import FileError, reading
 Key = tuple[str | int, ...]  # ("scenes", 0, "path")
 Lines = dict[Key, int]
 
-_EXPONENT = re.compile(r"[-+]?[0-9][0-9_]*(\.[0-9_]*)?[eE][-+]?[0-9]+$")
+_SCALARS = {  # of the core schema, YAML 1.2.2, 10.3.2, with the characters that they may begin with
+    "null": (re.compile(r"(?:~|null|Null|NULL|)$"), ["~", "n", "N", ""]),
+    "bool": (re.compile(r"(?:true|True|TRUE|false|False|FALSE)$"), list("tTfF")),
+    "int": (re.compile(r"(?:[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+)$"), list("-+0123456789")),
+    "float": (
+        re.compile(
+            r"(?:[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$"
+        ),
+        list("-+.0123456789"),
+    ),
+}
 _MOST_BYTES, _MOST_NODES = 2**20, 2**17  # PyYAML reads a megabyte in 10 s
 
 
@@ -31,14 +42,24 @@ class RecipeError(ValueError):
 
 @lru_cache(maxsize=1)
 def loader() -> Any:
-    """PyYAML's safe loader with such numbers."""
+    """PyYAML's safe loader with the scalars of YAML 1.2."""
     import yaml
 
     class Loader(yaml.SafeLoader):
-        """A loader with resolvers of its own: adding one leaves those of `yaml.SafeLoader` alone."""
+        """A loader with resolvers and constructors of its own."""
 
-    Loader.add_implicit_resolver("tag:yaml.org,2002:float", _EXPONENT, list("-+0123456789"))
+        yaml_implicit_resolvers: dict[str, Any] = {}  # noqa: RUF012  # as PyYAML has it
+
+    for name, (pattern, first) in _SCALARS.items():
+        Loader.add_implicit_resolver(f"tag:yaml.org,2002:{name}", pattern, first)
+    Loader.add_constructor("tag:yaml.org,2002:int", _integer)
     return Loader
+
+
+def _integer(reader: Any, node: Any) -> int:
+    text = reader.construct_scalar(node)
+    base = {"0o": 8, "0x": 16}.get(text[:2], 10)
+    return int(text if base == 10 else text[2:], base)
 
 
 @contextlib.contextmanager

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 RECONSTRUCT_EPILOG = examples(
     "mars-lidar reconstruct room.zarr -o maps.zarr",
     "mars-lidar reconstruct room.zarr --method all -o maps.h5",
+    "mars-lidar reconstruct dim.zarr --method image -o maps.zarr",
     "mars-lidar reconstruct room.zarr -o maps.npz --cloud room.ply --focal-px 110",
     "mars-lidar reconstruct face.npy --bin-ps 80 --cycles 20000 --dead-time-ns 50 --pulse-fwhm-ns 0.3 -o face.zarr",
     "mars-lidar reconstruct glass.zarr --returns 3 -o maps.zarr --cloud glass.ply --focal-px 110",
@@ -51,7 +52,7 @@ def reconstruct(
     foreign: ForeignOptions,
     out: Path = out_option("The maps: .zarr, .h5, .hdf5 or .npz.", panel=None),
     method: str = option(
-        "One or more methods, separated by commas, or all that suit the detector.",
+        "One or more methods, separated by commas, or all that suit the detector; image for 1 to 10 photons a pixel.",
         default="maximum_likelihood",
     ),
     level: float | None = option(
@@ -65,12 +66,6 @@ def reconstruct(
         default=1,
         min=1,
         max=8,
-    ),
-    neighbourhood: int | None = option(
-        "For dim cubes: take neighbours within up to so many pixels together, on a plane; such as 4.",
-        "each pixel alone",
-        min=1,
-        max=12,
     ),
     threads: int | None = option("Threads.", "all cores", min=1),
     cloud: Path | None = option(
@@ -112,7 +107,6 @@ def reconstruct(
                     level=level,
                     attenuation=attenuation,
                     returns=returns,
-                    neighbourhood=neighbourhood,
                     threads=threads,
                     progress=progress,
                 )

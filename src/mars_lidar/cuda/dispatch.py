@@ -10,7 +10,7 @@ from mars_lidar.cuda.exact import exact_histogram, exact_records
 from mars_lidar.cuda.feedback import feedback_histogram
 from mars_lidar.cuda.machine import Cuda
 from mars_lidar.cuda.mars import check_mars, mars_histogram
-from mars_lidar.engines.engine import Engine, Records, Task
+from mars_lidar.engines.engine import Engine, PhaseRecords, Task
 from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.engines.feedback import FeedbackEngine
 from mars_lidar.engines.mars import MarsEngine
@@ -65,7 +65,7 @@ def histogram(engine: Engine, task: Task, out: Any) -> None:
             check(engine, task.flux, task.system)
 
 
-def records(engine: Engine, task: Task) -> Records:
+def records(engine: Engine, task: Task) -> PhaseRecords:
     """Registrations of a task that `check` took, in the processor's memory; ValueError where an engine draws none."""
     if not isinstance(engine, ExactEngine):
         raise ValueError(f"engine {engine.name!r} draws histograms only, not timestamps; use 'exact'")

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from mars_lidar._base.native import _core
 from mars_lidar.cuda.kernels import Sink, Variant, block_bytes
 from mars_lidar.cuda.machine import Cuda
-from mars_lidar.engines.engine import Records, Task
+from mars_lidar.engines.engine import PhaseRecords, Task
 
 _WARP = 32
 _ROW_THREADS = 128  # of a block whose histograms are not in its memory
@@ -32,21 +32,20 @@ def exact_histogram(task: Task, out: Any, machine: Cuda, *, in_block: bool | Non
     _run(task, sink, {"out": out}, _arrays(task, machine), machine)
 
 
-def exact_records(task: Task, machine: Cuda) -> Records:
+def exact_records(task: Task, machine: Cuda) -> PhaseRecords:
     """Timestamps: counted, then drawn again with a place to go; the records are copied to the processor."""
     arrays = _arrays(task, machine)
     counts = machine.empty((task.items,), np.int64)
     _run(task, Sink.COUNTS, {"out": counts}, arrays, machine)
-    offsets = Records.allocate(machine.host(counts)).offsets
+    offsets = np.concatenate([[0], np.cumsum(machine.host(counts))]).astype(np.int64)
     n = int(offsets[-1])
     there = {
         "offsets": machine.array(offsets),
-        "times": machine.empty((n,), np.float64),
         "cycles": machine.empty((n,), np.int32),
-        "bins": machine.empty((n,), np.int32),
+        "phases": machine.empty((n,), np.float32),
     }
     _run(task, Sink.TIMESTAMPS, there, arrays, machine)
-    return Records(offsets, *(machine.host(there[name]) for name in ("times", "cycles", "bins")))
+    return PhaseRecords(offsets, machine.host(there["cycles"]), machine.host(there["phases"]), task.system.bins)
 
 
 def _arrays(task: Task, machine: Cuda) -> dict[str, Any]:

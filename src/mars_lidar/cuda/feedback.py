@@ -14,7 +14,6 @@ from mars_lidar._base.types import IndexArray, Progress
 from mars_lidar.cuda.kernels import feedback_histograms, overflow
 from mars_lidar.cuda.machine import Cuda
 from mars_lidar.engines.engine import Task
-from mars_lidar.engines.feedback_grid import near_pulse
 from mars_lidar.engines.feedback_rule import Grid, Plan, sweep_pixels
 from mars_lidar.engines.parts import part_of
 
@@ -36,8 +35,8 @@ def feedback_histogram(task: Task, out: Any, machine: Cuda, draw_exactly: Draw, 
     def sweep(group: IndexArray, grid: Grid, progress: Progress | None) -> NDArray[np.uint8]:
         return _launch(task, out, group, grid, arrays, machine, warps)
 
-    plan = Plan.of(task.flux, task.system)
-    rest = sweep_pixels(replace(task, progress=None), plan, np.arange(task.pixel_index.size), sweep)
+    every = np.arange(task.pixel_index.size)
+    rest = sweep_pixels(replace(task, progress=None), Plan.of(task, every), every, sweep)
     cube = out.reshape(task.realizations, task.pixel_index.size, task.system.bins)
     for first, number, pixels in rest.blocks(task.realizations):
         if pixels.size == task.pixel_index.size and number == task.realizations:
@@ -67,7 +66,7 @@ def _launch(
     task: Task, out: Any, pixels: IndexArray, grid: Grid, common: dict[str, Any], machine: Cuda, warps: int | None
 ) -> NDArray[np.uint8]:
     """Draw some pixels (n,) on one internal grid; the status (realizations, n) of each exposure."""
-    on = (grid.merge, grid.parts, near_pulse(task.system, grid.merge), grid.laps)
+    on = (grid.kinds, grid.laps)
     cells = _core.feedback_grid(task.job, *on)
     work = _core.feedback_warp_bytes(cells["place"].size - 1, grid.laps)
     kernel = feedback_histograms(out.dtype.itemsize == 4)

@@ -1,29 +1,68 @@
 """Parts of a dataset made by the workers of dask.distributed: on this machine, or on any cluster that dask runs on.
 
-A worker needs this package and the store under the same path. It returns how long a part took and nothing else, so
-the scheduler is no bottleneck. A part that a killed worker had begun is given to another one: its files appear by a
-rename, so half a part does not exist.
+A worker needs this package, of the same version, and the store under the same path. It returns how long its parts took
+and nothing else, and short parts are given out several at a time, so the scheduler is no bottleneck. What is given out
+follows the workers that are there, so that a cluster may grow and shrink. A part that a killed worker had begun is
+given to another one: its files appear by a rename, so half a part does not exist.
 """
 
 from __future__ import annotations
 
 import contextlib
+import hashlib
+import math
+import os
+import platform
+import sys
 import threading
+import time
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError, Executor
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 from mars_lidar._base.optional import needed
+from mars_lidar._version import __version__
 from mars_lidar.dataset.store import Dataset, Item, open_dataset
-from mars_lidar.dataset.write import Made, Maker
+from mars_lidar.dataset.write import Failed, Made, Maker
+from mars_lidar.instrument.detector import Detector
+from mars_lidar.instrument.pulse import GaussianPulse
+from mars_lidar.instrument.system import System
+from mars_lidar.light.flux import Flux
+from mars_lidar.simulate import simulate
 
 _LIBRARY = "distributed", "making parts by workers", "cluster"
-_AHEAD = 3  # parts given out per worker thread: none waits for the scheduler, and a million are not queued at once
+_AHEAD = 3  # tasks given out per worker thread: none waits for the scheduler, and a million are not queued at once
+_LEAST_QUEUED = 512  # tasks: an adaptive cluster starts workers by the length of its queue, from none if need be
+_TASKS_PER_S = 50.0  # that the scheduler is asked to handle; it handles some hundred
+_LARGEST_TASK = 1000  # parts, so that a worker that is lost loses no more
+_LOOK_S = 1.0  # between two looks at the workers that are there
 TIMEOUT_S = 20.0  # for a scheduler to answer
 _local = threading.local()
-Team = tuple[Executor, Callable[[Item], Made], int]  # what makes a part, and how many are given out at a time
+
+
+@dataclass(frozen=True)
+class Team:
+    """What makes parts: `make` makes several in the `executor`; `threads` counts the workers that are there now."""
+
+    executor: Executor
+    make: Callable[[Sequence[Item]], list[Made | Failed]]
+    threads: Callable[[], int]
+    ahead: int = 1
+    least_queued: int = 1
+    tasks_per_s: float = math.inf
+
+    def capacity(self) -> int:
+        """Tasks that are given out at a time."""
+        return max(self.least_queued, self.ahead * self.threads())
+
+    def parts_of_a_task(self, seconds: float) -> int:
+        """Parts that one task makes, where each takes so many seconds (0: not known yet)."""
+        if seconds <= 0.0:
+            return 1
+        return max(1, min(_LARGEST_TASK, math.ceil(self.threads() / (seconds * self.tasks_per_s))))
 
 
 def reach(scheduler: str | None) -> None:
@@ -46,10 +85,12 @@ def team(dataset: Dataset, workers: int | None, threads: int, scheduler: str | N
             )
             client = distributed.Client(after.enter_context(cluster), set_as_default=False)
             after.enter_context(client)
+        if scheduler is not None and client.dashboard_link:
+            print(f"mars-lidar: dashboard of the cluster: {client.dashboard_link}", file=sys.stderr)
         executor = client.get_executor(pure=False)
-        make = partial(make_part, str(dataset.path.resolve()), uuid.uuid4().hex, threads)
+        run = Run(str(dataset.path.resolve()), uuid.uuid4().hex, threads, __version__, fingerprint())
         try:
-            yield executor, make, _AHEAD * max(1, sum(client.nthreads().values()))
+            yield Team(executor, partial(make_parts, run), _Workers(client), _AHEAD, _LEAST_QUEUED, _TASKS_PER_S)
         except (
             CancelledError,
             distributed.client.FutureCancelledError,
@@ -64,13 +105,55 @@ def team(dataset: Dataset, workers: int | None, threads: int, scheduler: str | N
             raise
 
 
-def make_part(path: str, run: str, threads: int, item: Item) -> Made:
-    """Make one part; runs on a worker."""
+class _Workers:
+    """Threads of the workers that a client sees, asked for at most once a second."""
+
+    def __init__(self, client: Any) -> None:
+        self._client, self._asked, self._threads = client, -math.inf, 0
+
+    def __call__(self) -> int:
+        if time.monotonic() - self._asked > _LOOK_S:
+            self._threads, self._asked = sum(self._client.nthreads().values()), time.monotonic()
+        return self._threads
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a worker is told once: the store, a name for the run, its threads, and what its package must be."""
+
+    path: str
+    name: str
+    threads: int
+    version: str
+    fingerprint: str
+
+
+def fingerprint() -> str:
+    """Hash of a small exact cube: the same wherever the package draws the same bits."""
+    system = System(
+        period_ns=100.0,
+        cycles=50,
+        bins=16,
+        pulse=GaussianPulse(sigma_ns=2.0),
+        detector=Detector(dead_time_ns=40.0),
+    )
+    flux = Flux([[0.1, 1.0, 5.0, 0.0]], [[0.3, 0.1, 0.0, 2.0]], [[10.0, 50.0, 90.0, 0.0]])
+    counts = simulate(flux, system, realizations=2, seed=1, threads=1)
+    return hashlib.sha256(counts.astype("<u4").tobytes()).hexdigest()[:16]
+
+
+def make_parts(run: Run, items: Sequence[Item]) -> list[Made | Failed]:
+    """Make some parts; runs on a worker."""
     maker: Maker | None = getattr(_local, "maker", None)
-    if maker is None or _local.run != run:
-        maker = Maker(open_dataset(path, allow_incomplete=True), threads)
-        _local.maker, _local.run = maker, run
-    return maker.make(item)
+    if maker is None or _local.run != run.name:
+        here = f"worker {platform.node()} (process {os.getpid()})"
+        if __version__ != run.version:
+            raise ValueError(f"{here} has mars-lidar {__version__}, not {run.version}: install that there")
+        if fingerprint() != run.fingerprint:
+            raise ValueError(f"{here} draws other counts than this process although both are {run.version}")
+        maker = Maker(open_dataset(run.path, allow_incomplete=True), run.threads)
+        _local.maker, _local.run = maker, run.name
+    return [maker.attempt(item) for item in items]
 
 
 def _client(distributed: Any, address: str) -> Any:

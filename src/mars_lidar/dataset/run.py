@@ -11,7 +11,7 @@ import shutil
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,9 +29,11 @@ from mars_lidar.dataset.cluster import Team
 from mars_lidar.dataset.ingest import create
 from mars_lidar.dataset.recipe import DatasetRecipe
 from mars_lidar.dataset.store import Dataset, Item, open_dataset
-from mars_lidar.dataset.write import Made, Maker
+from mars_lidar.dataset.write import Failed, Made, Maker
 from mars_lidar.io.scan import Problem
 
+_LOOK_S = 1.0  # after which it is looked whether there are more workers to give parts to
+_NAMED = 5  # parts that an error names
 BUFFER_BYTES = 512 * 2**20  # of all chunks that are made at the same time on one machine
 
 
@@ -184,6 +186,8 @@ class _Totals:
 
     def __init__(self, done: int, total: int, progress: Progress | None) -> None:
         self._done, self._total, self._progress = done, total, progress
+        if progress is not None:
+            progress(done, total)  # what an earlier run has done, before this one begins
         self.simulate_s = self.write_s = 0.0
 
     def add(self, made: Made) -> None:
@@ -208,30 +212,48 @@ def _here(dataset: Dataset, parts: int, threads: int | None) -> Iterator[Team]:
     teams = max(1, min(team, parts, BUFFER_BYTES // chunk))
     stop, local = threading.Event(), threading.local()
 
-    def make(item: Item) -> Made:
+    def make(items: Sequence[Item]) -> list[Made | Failed]:
         if not hasattr(local, "maker"):
             local.maker = Maker(dataset, max(1, team // teams), stop)
-        made: Made = local.maker.make(item)
-        return made
+        return [local.maker.attempt(item) for item in items]
 
     with ThreadPoolExecutor(teams) as pool:
         try:
-            yield pool, make, teams
+            yield Team(pool, make, lambda: teams)
         except BaseException:
             stop.set()  # the simulator looks at it every 50 ms, and the pool waits for all threads
             raise
 
 
 def _make_all(team: AbstractContextManager[Team], todo: Sequence[Item], add: Callable[[Made], None]) -> None:
-    """Make parts, a few of them at a time."""
-    waiting = iter(todo)
-    with team as (executor, make, ahead):
-        running = {executor.submit(make, item) for item in itertools.islice(waiting, ahead)}
-        while running:
-            done, running = wait(running, return_when=FIRST_COMPLETED)
+    """Make parts, some of them at a time; raises WriteError at the end where some could not be written."""
+    waiting, failed, seconds = iter(todo), list[Failed](), 0.0
+    with team as crew:
+        running: set[Future[list[Made | Failed]]] = set()
+        while True:
+            while len(running) < crew.capacity():
+                batch = list(itertools.islice(waiting, crew.parts_of_a_task(seconds)))
+                if not batch:
+                    break
+                running.add(crew.executor.submit(crew.make, batch))
+            if not running:
+                break
+            done, running = wait(running, timeout=_LOOK_S, return_when=FIRST_COMPLETED)  # workers may come and go
             for future in done:
-                add(future.result())
-                running |= {executor.submit(make, item) for item in itertools.islice(waiting, 1)}
+                for each in future.result():
+                    if isinstance(each, Failed):
+                        failed.append(each)
+                        continue
+                    add(each)
+                    own = each.simulate_s + each.write_s
+                    seconds = own if seconds == 0.0 else 0.9 * seconds + 0.1 * own
+    if failed:
+        names = ", ".join(sorted(each.name for each in failed)[:_NAMED])
+        more = f" and {len(failed) - _NAMED} more" if len(failed) > _NAMED else ""
+        raise WriteError(
+            failed[0].number,
+            f"{len(failed)} parts could not be written in four attempts ({failed[0].reason}): {names}{more}",
+        )
 
 
 def making_bytes(chunk: Sequence[int], itemsize: int, waveform_parts: int) -> int:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any
@@ -36,6 +37,22 @@ class Made:
     write_s: float
 
 
+@dataclass(frozen=True)
+class Failed:
+    """A part that could not be written in several attempts: its first file, the error's number and its text."""
+
+    name: str
+    number: int | None
+    reason: str
+
+
+TRANSIENT = frozenset(
+    {errno.EIO, errno.EAGAIN, errno.EBUSY, errno.EINTR, errno.ETIMEDOUT, errno.ESTALE, errno.EREMOTEIO}
+    | {errno.ECONNRESET, errno.ECONNABORTED, errno.ENETUNREACH, errno.EHOSTUNREACH}
+)
+"""Errors of a shared file system that are often gone at the next attempt; a full disk, say, is not among them."""
+
+
 class Maker:
     """Makes parts of one dataset; of use to one thread at a time. Keeps a buffer of one chunk."""
 
@@ -48,6 +65,19 @@ class Maker:
         self._scene = lru_cache(_KEPT)(lambda number: dataset.scenes.read(number))
         self.flux = lru_cache(_KEPT)(self._lit)  # photons of a sample
         self._last: tuple[tuple[int, ...], Flux] | None = None
+
+    def attempt(self, item: Item, pauses_s: Sequence[float] = (0.2, 1.0, 5.0)) -> Made | Failed:
+        """`make`, again after each pause where the file system fails for a moment; other errors are raised."""
+        for pause in (*pauses_s, None):
+            try:
+                return self.make(item)
+            except OSError as error:
+                if error.errno not in TRANSIENT:
+                    raise
+                if pause is None:
+                    return Failed(self.dataset.files(item)[0].name, error.errno, error.strerror or str(error))
+                time.sleep(pause)
+        raise AssertionError("the last attempt returns")
 
     def make(self, item: Item) -> Made:
         """Make a part and write it."""

@@ -52,13 +52,17 @@ class AutoEngine(Engine):
 
     def histogram(self, task: Task, out: NDArray[Any]) -> None:
         """Feedback where it pays, exact for the rest."""
-        plan = Plan.of(task.flux, task.system)
         registrations = expected_registrations(task.flux, task.system).reshape(-1)
-        many = registrations > BREAK_EVEN * plan.cells
+        many = registrations > BREAK_EVEN * task.system.bins
+        pixels = np.flatnonzero(many)
+        plan = Plan.of(task, pixels)
+        worth = registrations[pixels] > BREAK_EVEN * plan.grids.cells()
+        many[pixels[~worth]] = False
+        plan = plan.part(worth)
         share = float(many.mean())
         first, second = (replace(task, progress=stage(task.progress, *part)) for part in ((0.0, share), (share, 1.0)))
-        worth = registrations[many] / BREAK_EVEN_LAPS
-        refused = FeedbackEngine(self.level).sample(first, out, np.flatnonzero(many), plan, worth)
+        lap_cells = registrations[many] / BREAK_EVEN_LAPS
+        refused = FeedbackEngine(self.level).sample(first, out, np.flatnonzero(many), plan, lap_cells)
         rest = replace(refused, pixels=np.sort(np.concatenate([np.flatnonzero(~many), refused.pixels])))
         draw_rest(ExactEngine(self.level), second, out, rest)
         task.report["pixels drawn by exact"] = float(rest.pixels.size)

@@ -22,6 +22,7 @@ from mars_lidar.instrument.effects import (
 )
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
+from mars_lidar.light.records import record_bins, record_times
 
 if TYPE_CHECKING:
     from mars_lidar._base.native import _core
@@ -138,11 +139,6 @@ class Records:
         check_memory(room * cls.BYTES, f"timestamps of shape ({room},)", IN_PARTS)
         return cls(offsets, np.empty(room), np.empty(room, np.int32), np.empty(room, np.int32))
 
-    def resize(self) -> None:
-        """As much room as there are registrations: what has not been written to costs no memory till now."""
-        for array in (self.times, self.cycle, self.bin):
-            array.resize(int(self.offsets[-1]), refcheck=False)
-
     def sort(self) -> None:
         """Put the registrations of each item in order of time, which jitter may have changed."""
         item = np.repeat(np.arange(self.offsets.size - 1), np.diff(self.offsets))
@@ -151,6 +147,31 @@ class Records:
         order = np.lexsort((self.times, item))
         for array in (self.times, self.cycle, self.bin):
             array[:] = array[order]
+
+
+@dataclass(frozen=True, eq=False)
+class PhaseRecords:
+    """Packed registrations of a task in 8 bytes each: item i owns ``[offsets[i], offsets[i + 1])``.
+
+    `cycle` (n,) int32 is the laser period, `phase` (n,) float32 the part of it in [0, 1]; times and bins follow.
+    """
+
+    offsets: NDArray[np.int64]
+    cycle: NDArray[np.int32]
+    phase: NDArray[np.float32]
+    bins: int
+
+    BYTES: ClassVar[int] = 8  # of a cycle and a phase
+
+    @property
+    def times(self) -> NDArray[np.float64]:
+        """In periods (n,)."""
+        return record_times(self.cycle, self.phase, 1.0)
+
+    @property
+    def bin(self) -> NDArray[np.int32]:
+        """Of the histogram (n,)."""
+        return record_bins(self.phase, self.bins)
 
 
 class Engine(ABC):
@@ -187,7 +208,7 @@ class Engine(ABC):
         """Registrations of each exposure (items,), with the draws of `histogram`."""
         raise ValueError(f"engine {self.name!r} draws histograms only, not single registrations; use 'exact'")
 
-    def records(self, task: Task, expected: float) -> Records:
+    def records(self, task: Task, expected: float) -> Records | PhaseRecords:
         """Every registration, with the draws of `histogram`, of which about `expected` are to be expected in all.
 
         Here in two passes, `counts` and `timestamps`.

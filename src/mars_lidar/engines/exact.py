@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar._base.memory import available_bytes
+from mars_lidar._base.memory import available_bytes, check_memory
 from mars_lidar._base.native import _core
-from mars_lidar.engines.engine import Engine, Records, Task
+from mars_lidar.engines.engine import IN_PARTS, Engine, PhaseRecords, Records, Task
 from mars_lidar.instrument.detector import MODES
 from mars_lidar.instrument.effects import EFFECTS
 
@@ -20,7 +20,7 @@ class ExactEngine(Engine):
     """Exact sampling without rejection, cost O(registrations) however bright the scene.
 
     After re-arming at u the next registration is ``C^-1(C(u) + E)``, with C the integrated flux and E ~ Exp(1).
-    The same seed gives the same cube, bit for bit, on any machine: counter-based random numbers, no libm, no
+    The same seed gives the same cube, bit for bit, on any machine: a random stream per item, no libm, no
     fused multiply-add. `level` forces one of ``_core.levels()`` (vector widths); it changes speed only.
     """
 
@@ -42,23 +42,25 @@ class ExactEngine(Engine):
         _core.exact_counts(task.job, task.pulse, out, task.threads, None, self.level)
         return out
 
-    def records(self, task: Task, expected: float) -> Records:
+    def records(self, task: Task, expected: float) -> PhaseRecords:
         """In one pass, into more room than is needed; where memory is scarce they are counted before."""
         room = int(_ROOM * expected) + 1024
         available = available_bytes()
-        if available is not None and 2 * Records.BYTES * room > available:
+        if available is not None and 2 * PhaseRecords.BYTES * room > available:
             room = int(self.counts(task).sum())
-        records = Records.reserve(np.empty(task.items + 1, np.int64), room)
-        arrays = (records.times, records.cycle, records.bin)
+        check_memory(room * PhaseRecords.BYTES, f"timestamps of shape ({room},)", IN_PARTS)
+        offsets = np.empty(task.items + 1, np.int64)
+        cycle, phase = np.empty(room, np.int32), np.empty(room, np.float32)
         drawn = _core.exact_records(
-            task.job, task.pulse, records.offsets, *arrays, task.threads, task.progress, self.level
+            task.job, task.pulse, offsets, cycle, phase, task.threads, task.progress, self.level
         )
-        records.resize()
-        if records.times.size > room:
-            drawn.rest(*arrays)
+        for array in (cycle, phase):  # what has not been written to costs no memory till now
+            array.resize(int(offsets[-1]), refcheck=False)
+        if cycle.size > room:
+            drawn.rest(cycle, phase)
         if task.system.detector.jitter is not None:
-            records.sort()
-        return records
+            _core.sort_records(offsets, cycle, phase, task.threads)
+        return PhaseRecords(offsets, cycle, phase, task.system.bins)
 
     def timestamps(self, task: Task, records: Records) -> None:
         """The same as `records`, into memory that is there."""

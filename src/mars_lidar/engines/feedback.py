@@ -12,7 +12,6 @@ from mars_lidar._base.native import _core
 from mars_lidar._base.types import Progress
 from mars_lidar.engines.engine import Engine, Task
 from mars_lidar.engines.exact import ExactEngine
-from mars_lidar.engines.feedback_grid import near_pulse
 from mars_lidar.engines.feedback_rule import Grid, Plan, Reason, Rest, draw_rest, sweep_pixels
 from mars_lidar.engines.parts import draw_pixels, stage
 from mars_lidar.engines.poisson import PoissonEngine
@@ -54,9 +53,9 @@ class FeedbackEngine(Engine):
 
     def histogram(self, task: Task, out: NDArray[Any]) -> None:
         """Poisson numbers, feedback, or the exact engine, pixel by pixel."""
-        plan = Plan.of(task.flux, task.system)
-        share = float((plan.reason == Reason.DRAWN).mean()) if task.system.dead_time_periods > 0.0 else 1.0
         every = np.arange(task.pixel_index.size)
+        plan = Plan.of(task, every) if task.system.dead_time_periods > 0.0 else None
+        share = 1.0 if plan is None else float((plan.reason == Reason.DRAWN).mean())
         rest = self.sample(replace(task, progress=stage(task.progress, 0.0, share)), out, every, plan)
         draw_rest(ExactEngine(self.level), replace(task, progress=stage(task.progress, share, 1.0)), out, rest)
 
@@ -70,7 +69,7 @@ class FeedbackEngine(Engine):
     ) -> Rest:
         """Fill the rows of `pixels` (n,) and return those that this engine cannot do, whose rows are not filled.
 
-        `worth` (n,): cells of all laps beyond which another engine is quicker for a pixel.
+        `plan` of these pixels; `worth` (n,): cells of all laps beyond which another engine is quicker for a pixel.
         """
         if task.system.dead_time_periods == 0.0:
             draw_pixels(PoissonEngine(), task, out, pixels)
@@ -84,9 +83,7 @@ class FeedbackEngine(Engine):
                 out,
                 group,
                 status,
-                grid.merge,
-                grid.parts,
-                near_pulse(task.system, grid.merge),
+                grid.kinds,
                 grid.laps,
                 task.threads,
                 self.level,
@@ -94,4 +91,4 @@ class FeedbackEngine(Engine):
             )
             return status
 
-        return sweep_pixels(task, plan or Plan.of(task.flux, task.system), pixels, sweep, worth)
+        return sweep_pixels(task, plan or Plan.of(task, pixels), pixels, sweep, worth)

@@ -1,178 +1,253 @@
-"""The internal grid of the feedback engine: how narrow its cells must be, and where."""
+"""The internal grid of the feedback engine: bins are cut until the mean histogram is that of a finer grid.
+
+No rule on the shape of the light: a grid is judged by what it does to the mean, native/feedback/check.h.
+"""
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar.instrument.pulse import GaussianPulse
+from mars_lidar._base.native import _core
+from mars_lidar._base.types import FloatArray, IndexArray
+from mars_lidar.engines.engine import Task
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 
+KindArray = NDArray[np.uint8]
+
 MOST_CELLS = 2**16  # of a period; beyond, the memory of a batch leaves every cache
-_ERROR, _ERROR_AFTER, _ERROR_ECHO, _ERROR_DARK = 1.1e-3, 0.03, 0.022, 0.03  # see cell_cuts
-_GOAL, _GOAL_ECHO = 0.05, 0.02
-_SIGMAS = 5.0  # of a pulse that counts as one that is met
-_TAIL = 1e-6  # energy of a pulse outside of what is cut finely
+MOST_SWEEPS = 200  # until a mean has settled; kSweeps of native/feedback/check.h
+GOAL = 0.05
+"""Distance of the mean histogram from that of infinitely narrow cells, in standard deviations (Mahalanobis)."""
+
+_RICHARDSON = 4.0 / 3.0  # of a distance to a grid of half the width, where errors are of second order
+_CELLS_OF_DEAD_TIME = 4  # at least
+_LEVELS = 4  # of light: what is between two powers of it shares a grid, that of the worst of both
+_DIMMEST = (-4, -6)  # powers of signal and background; dimmer pixels take their grid
+_PHASES = (0.002, 0.145, 0.287, 0.43, 0.57, 0.713, 0.855, 0.998)  # delays within a bin at which grids are judged
+_GRADING = 2  # halvings at most from a bin to the next
+_MOST_KIND = 15  # halvings of a bin: kKinds of native/feedback/kernel.h, for the finer grid too
+_SOME_KIND = 3  # halvings that are cheaper than slow sweeps
+_ROUNDS = 4  # after which cells are only halved, so that there is an end
+_WORTHWHILE = 0.8  # of the cells: a wider grid is tried
+_STEP = 4  # halvings at once at most: predicted from wider cells, of second order or not
 
 
-Cuts = tuple[NDArray[np.int64], NDArray[np.int64]]
+@dataclass(frozen=True, eq=False)
+class Grids:
+    """Internal grids of some pixels (n,).
 
-
-class Echo(NamedTuple):
-    """Pixels (H, W) that are armed again near a return, one dead time after the same or another one."""
-
-    within: NDArray[np.bool_]  # within 5 sigma of it
-    remembered: NDArray[np.bool_]  # these, but for dead times that end within the pulse that they began in
-    near: NDArray[np.bool_]  # within the whole extent of the pulse
-    late: NDArray[np.bool_]  # the same, after the middle of the return
-
-
-def meets_echo(flux: Flux, system: System) -> Echo:
-    """Which pixels are armed again within a return after another one, or the same one, has blinded them.
-
-    Where the dead time ends within the pulse that it began in, nothing is remembered from period to period.
+    `kinds`: grids, (bins,) each: a bin has 2^kind cells, counted from half a period before the strongest return on.
+    `of`: index (n,) of a pixel's grid, -1 where none of at most `MOST_CELLS` cells will do. `sweeps` (n,): until the
+    mean settles, `MOST_SWEEPS` + 1 where it does not.
     """
-    within, remembered, near, late = np.zeros((4, *flux.shape), dtype=np.bool_)
-    reach = _SIGMAS * pulse_sigma(system) / system.period_ns
-    low, high = _extent(system)
-    lit = flux.returns_signal > 0
-    delay = np.where(lit, flux.returns_delay_ns, 0.0) / system.period_ns
-    for i, j in np.ndindex(len(lit), len(lit)):
-        apart = delay[i] - delay[j] + system.dead_time_periods
-        after = np.where(lit[i] & lit[j], apart - np.rint(apart), np.inf)
-        distance = np.abs(after)
-        within |= distance < reach
-        near |= distance < max(high - low, reach)
-        late |= (after >= 0.0) & (after < high - low)
-        if i != j or round(system.dead_time_periods) > 0:
-            remembered |= distance < reach
-    return Echo(within, remembered, near, late)
+
+    kinds: list[KindArray]
+    of: IndexArray
+    sweeps: IndexArray
+
+    @classmethod
+    def coarsest(cls, task: Task, number: int) -> Grids:
+        """The widest cells that the sweeps allow, for `number` pixels."""
+        start = coarsest(task.system)
+        of = np.zeros(number, np.int64) if cells_of(start) <= MOST_CELLS else np.full(number, -1)
+        return cls([start], of, np.zeros(number, np.int64))
+
+    @classmethod
+    def checked(cls, task: Task, pixels: IndexArray) -> Grids:
+        """The grids of `pixels` (n,) of a task: each depends on the pixel and the system alone."""
+        start = coarsest(task.system)
+        if cells_of(start) > MOST_CELLS:
+            return cls.coarsest(task, pixels.size)
+        several = np.full(pixels.size, task.flux.waveform is not None)
+        if task.flux.waveform is None:
+            several = (task.flux.returns_signal.reshape(-1, task.pixel_index.size)[:, pixels] > 0.0).sum(0) > 1
+        known: dict[bytes, int] = {}
+        grids = cls([], np.full(pixels.size, -1), np.zeros(pixels.size, np.int64))
+
+        def put(at: IndexArray, kinds: KindArray | None, sweeps: IndexArray | int) -> None:
+            grids.sweeps[at] = sweeps
+            if kinds is None:
+                return
+            key = kinds.tobytes()
+            if key not in known:
+                known[key] = len(grids.kinds)
+                grids.kinds.append(kinds)
+            grids.of[at] = known[key]
+
+        alone = np.flatnonzero(~several)
+        corners = _corner_of(task.flux, pixels[alone])
+        for corner, (kinds, sweeps) in _corner_grids(task, corners, start).items():
+            put(alone[(corners == corner).all(-1)], kinds, sweeps)
+        some = np.flatnonzero(several)
+        halvings, sweeps = _even_halvings(task, pixels[some], start)
+        for k in np.unique(halvings):
+            at = halvings == k
+            put(some[at], None if k < 0 else np.asarray(start + k, np.uint8), sweeps[at])
+        return grids
+
+    def cells(self) -> IndexArray:
+        """Cells (n,) of a period."""
+        each = np.array([cells_of(kinds) for kinds in self.kinds] + [MOST_CELLS + 1])
+        return np.asarray(each[self.of])
 
 
-def cell_cuts(flux: Flux, system: System) -> Cuts:
-    """Parts (H, W) that a bin of the histogram is cut into, and that these are cut into again near the pulse.
+def cells_of(kinds: KindArray) -> int:
+    """Cells of a grid."""
+    return int((1 << kinds.astype(np.int64)).sum())
 
-    The grid's error of a bin's mean is about c (width / sigma)^2 of its standard deviation for one period, and
-    grows as the root of the number of periods. c = 1.1e-3 S up to S = 4 (measured against 16 times finer grids); one
-    dead time after the pulse 0.03 S sqrt(B / bins), where re-arming is interpolated within cells: an eighth of the
-    slope of the pulse, seen by a bin's background; 0.022 S, of any S, where a pulse meets its own echo: a pixel that is
-    armed again within the pulse registers and re-arms within 1 / S of its width. Cells are narrow enough
-    for 1/20 of a standard deviation (1/50 with an echo, which shifts many bins alike), at most 0.3 sigma wide, 0.15
-    above 5 signal photons, and at most a quarter of the dead time.
 
-    A single return apart from its echo needs them only within its extent and one dead time after it (`near_pulse`).
-    Elsewhere the armed bend only by those whom the modulated background of the echo has blinded, c = 0.03 B width
-    sqrt(B / bins), more where a bright pulse leaves few armed: e^(S / 2), S up to 4. Such cells are at most one
-    sigma wide.
+def coarsest(system: System) -> KindArray:
+    """The widest cells (bins,): bins, a quarter of a dead time, or what it exceeds whole periods by.
+
+    Without the last, where that would take many cells, the sweeps count a whole period in cells, and are slower.
     """
-    ones = np.ones(flux.shape, dtype=np.int64)
-    if system.dead_time_periods == 0.0:  # independent bins
-        return ones, ones
-    widest = np.full(flux.shape, min(1.0, 0.25 * system.dead_time_periods))
-    if flux.waveform is not None:
-        return _waveform_cuts(flux, system, widest), ones
-    sigma = pulse_sigma(system) / system.period_ns
-    echo = meets_echo(flux, system)
-    periods = math.sqrt(system.cycles)
-    after = np.maximum(_ERROR, _ERROR_AFTER * np.sqrt(flux.background / system.bins))
-    signal = np.maximum(flux.signal, 1e-3)
-    within = echo.within | (echo.late & (signal > 4.0))  # bright pulses register in their early tail
-    error = np.where(within, _ERROR_ECHO * signal, after * np.minimum(signal, 4.0)) * periods
-    goal = np.where(within, _GOAL_ECHO, _GOAL)
-    finest = np.minimum(widest, sigma * np.minimum(np.where(flux.signal > 5, 0.15, 0.3), np.sqrt(goal / error)))
-    # goal = _ERROR_DARK B width sqrt(B / bins) (width / sigma)^2 sqrt(N_r) e^(S / 2)
-    few_armed = np.exp(0.5 * np.minimum(flux.signal, 4.0))
-    dim = np.maximum(flux.background, 1e-9) ** 1.5 * few_armed
-    dark = np.cbrt(_GOAL * sigma**2 * math.sqrt(system.bins) / (_ERROR_DARK * periods * dim))
-    single = ((flux.returns_signal > 0).sum(0) == 1) & ~echo.near
-    base = np.where(single, np.minimum(widest, np.minimum(sigma, dark)), finest)
-    base = np.where(flux.signal > 0, base, widest)
-    merge = _cuts(base, 1.0 / system.bins)
-    return merge, np.where(single, _cuts(finest, 1.0 / (system.bins * merge)), 1)
+    short = _CELLS_OF_DEAD_TIME / max(system.dead_time_periods * system.bins, 1e-30)
+    beyond = 1.0 / max(math.fmod(system.dead_time_periods, 1.0) * system.bins, 1e-30)
+    if system.dead_time_periods > 1.0 and beyond <= 2**_SOME_KIND:
+        short = max(short, beyond)
+    return np.full(system.bins, min(math.ceil(math.log2(max(short, 1.0))), _MOST_KIND), np.uint8)
 
 
-def _waveform_cuts(flux: Flux, system: System, widest: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Parts (H, W) that a bin is cut into, for a rate that is constant on parts of the period.
+def _judge(
+    task: Task, pixels: IndexArray, kinds: KindArray, *, parts: bool = False
+) -> tuple[FloatArray, IndexArray, FloatArray]:
+    """Distances (n,), sweeps (n,) and, where wanted, the bins' parts (n, bins) of its square."""
+    distance, sweeps = np.empty(pixels.size), np.empty(pixels.size, np.int32)
+    bins = np.empty((pixels.size if parts else 0, task.system.bins))
+    _core.feedback_check(
+        task.job, task.pulse, np.ascontiguousarray(pixels), kinds, distance, sweeps, bins, task.threads
+    )
+    return _RICHARDSON * distance, sweeps.astype(np.int64), _RICHARDSON**2 * bins
 
-    Cells of width w are crossed by the edges of parts, and re-arm those of the part one dead time before, whose rate
-    falls within it as its photons are used up. Where the photons of parts differ by J, and one has l, this puts
-    J (1 + l) N_r / 8 (w / part)^2 exposures wrong at the edges of a cell one dead time on, where m photons a part see
-    them: an error of J (1 + l) sqrt(N_r m) / 8 standard deviations, for w as wide as a part, second order in w.
-    Smooth light needs no cuts. Edges of cells are those of parts where bins and parts allow it within twice as many
-    cells.
+
+def _even_halvings(task: Task, pixels: IndexArray, start: KindArray) -> tuple[IndexArray, IndexArray]:
+    """How often all cells of each pixel (n,) must be halved, -1 where that is too often; sweeps (n,)."""
+    halvings, sweeps = np.zeros(pixels.size, np.int64), np.zeros(pixels.size, np.int64)
+    most = math.floor(math.log2(MOST_CELLS / cells_of(start)))
+    open_ = np.arange(pixels.size)
+    while open_.size:
+        rest = []
+        for k in np.unique(halvings[open_]):
+            at = open_[halvings[open_] == k]
+            distance, sweeps[at], _ = _judge(task, pixels[at], np.asarray(start + k, np.uint8))
+            more = np.ceil(np.log2(np.maximum(distance / GOAL, 1e-9)) / 2.0).astype(np.int64)
+            far = (distance > GOAL) & (sweeps[at] <= MOST_SWEEPS)
+            halvings[at[far]] += np.clip(more[far], 1, _STEP)
+            halvings[at[far & (halvings[at] > most)]] = most + 1 if k < most else -1
+            halvings[at[far & (k < most) & (halvings[at] > most)]] = most
+            rest.append(at[far & (halvings[at] >= 0)])
+        open_ = np.concatenate(rest)
+    return halvings, sweeps
+
+
+# Pixels of a single return: the same cells for all, because every lane begins half a period before its return
+
+
+def _corner_of(flux: Flux, pixels: IndexArray) -> IndexArray:
+    """Powers (n, 2) of the least level of signal and background that each pixel does not exceed."""
+
+    def power(light: FloatArray, least: int) -> IndexArray:
+        level = np.log(np.maximum(light, float(_LEVELS) ** least)) / math.log(_LEVELS)
+        return np.asarray(np.ceil(level - 1e-12), np.int64)
+
+    light = (flux.signal.reshape(-1)[pixels], flux.background.reshape(-1)[pixels])
+    return np.stack([power(*some) for some in zip(light, _DIMMEST, strict=True)], -1)
+
+
+Corner = tuple[int, int]
+Known = dict[Corner, tuple[KindArray | None, int]]
+
+
+@lru_cache(maxsize=64)
+def _known(system: System) -> Known:
+    """Grids and sweeps of the levels of light that were met so far."""
+    return {}
+
+
+def _corner_grids(task: Task, corners: IndexArray, start: KindArray) -> Known:
+    """Grids of levels of light (n, 2), None where they have too many cells."""
+    known = _known(task.system)
+    wanted: list[Corner] = [(int(s), int(b)) for s, b in np.unique(corners, axis=0)]
+    new = [corner for corner in wanted if corner not in known]
+    if new:
+        known.update(_refined(task, new, start))
+    return {corner: known[corner] for corner in wanted}
+
+
+def _refined(task: Task, corners: list[Corner], start: KindArray) -> Known:
+    """Cut bins where they make the mean wrong, until it is not; corners of one grid are judged in one call."""
+    system, each = task.system, 4 * len(_PHASES)
+    powers = np.array([[(s - i, b - j) for i in (0, 1) for j in (0, 1)] for s, b in corners], dtype=np.float64)
+    light = np.repeat((float(_LEVELS) ** powers).reshape(-1, 2), len(_PHASES), axis=0)
+    delay = (system.bins // 2 + np.tile(_PHASES, 4 * len(corners))) * (system.period_ns / system.bins)
+    flux = Flux(light[None, :, 0], light[None, :, 1], delay[None])
+    judged = Task(flux, system, 1, 0, np.zeros(light.shape[0], np.uint32), 0, task.threads, None)
+    done: Known = {}
+    grids: dict[Corner, KindArray] = dict.fromkeys(corners, start)
+    rounds = 0
+    while grids:
+        rounds += 1
+        groups: dict[bytes, list[Corner]] = {}
+        for corner, kinds in grids.items():
+            groups.setdefault(kinds.tobytes(), []).append(corner)
+        for members in groups.values():
+            kinds = grids[members[0]]
+            pixels = (np.array([corners.index(corner) for corner in members])[:, None] * each + np.arange(each)).ravel()
+            distances, sweeps, parts = _judge(judged, pixels, kinds, parts=True)
+            for corner, distance, needed, part in zip(
+                members,
+                distances.reshape(-1, each),
+                sweeps.reshape(-1, each),
+                parts.reshape(-1, each, system.bins),
+                strict=True,
+            ):
+                settled, median = needed <= MOST_SWEEPS, int(np.median(needed))
+                fine = not settled.any() or distance[settled].max() <= GOAL
+                if fine:
+                    before, done[corner] = corner in done, (kinds, median)
+                if not settled.any() or (corner in done and (not fine or before)):
+                    del grids[corner]  # the one narrower grid is kept
+                    continue
+                grids[corner] = _recut(kinds, start if rounds <= _ROUNDS else kinds, distance[settled], part[settled])
+                if fine and cells_of(grids[corner]) > _WORTHWHILE * cells_of(kinds):
+                    del grids[corner]
+                elif cells_of(grids[corner]) > MOST_CELLS:
+                    done[corner] = None, median
+                    del grids[corner]
+    return done
+
+
+def _recut(kinds: KindArray, widest: KindArray, distance: FloatArray, parts: FloatArray) -> KindArray:
+    """Cells that lessen the squared distances (n,) to the goal, of whose `parts` (n, bins) each is a bin's.
+
+    A part falls with the fourth power of the width of the bin's cells. The number of cells is least where the parts of
+    all cells are equal, up to the power of two. None is wider than on the grid `widest`; where distances are below the
+    goal, none is narrower than it was.
     """
-    assert flux.waveform is not None
-    parts = flux.waveform.shape[-1]
-    later = system.dead_time_periods % 1.0 * parts
-    worst = np.empty(flux.shape)
-    for row, photons in enumerate(flux.waveform):  # a row of the image at a time: waveforms may be large
-        rate = photons + flux.background[row, :, None] / parts
-        step = np.abs(rate - np.roll(rate, 1, -1))
-        uneven = np.maximum(step, np.roll(step, -1, -1)) * (1.0 + rate)
-        seen = rate
-        for shift in range(math.floor(later) - 1, math.ceil(later) + 2):
-            seen = np.maximum(seen, np.roll(rate, -shift, -1))
-        worst[row] = (uneven * np.sqrt(seen)).max(-1)
-    worst *= math.sqrt(system.cycles) / 8.0
-    width = np.minimum(1.0, np.sqrt(_GOAL_ECHO / np.maximum(worst, 1e-30))) / parts
-    merge = _cuts(np.minimum(widest, width), 1.0 / system.bins)
-    aligned = parts // math.gcd(parts, system.bins)
-    rounded = -(-merge // aligned) * aligned
-    return np.where(rounded <= 2 * merge, rounded, merge)
+    worst = (parts * np.maximum(distance**2 / np.maximum(parts.sum(-1), 1e-300), 1.0)[:, None]).max(0)
+    now = kinds.astype(np.int64)
+    cells, goal, fine = (1 << now).astype(np.float64), (0.8 * GOAL) ** 2, bool(distance.max() <= GOAL)
+    least, most = widest.astype(np.int64) - now, np.minimum(0 if fine else _STEP, _MOST_KIND - now)
 
+    def halvings(level: float) -> IndexArray:
+        more = np.ceil(np.log2(np.maximum(worst, 1e-300) / (level * cells)) / 5.0)
+        return np.asarray(np.clip(more, least, most), np.int64)
 
-def _cuts(finest: NDArray[np.float64], width: float | NDArray[np.float64]) -> NDArray[np.int64]:
-    return np.asarray(np.maximum(np.ceil(width / finest - 1e-9), 1.0), dtype=np.int64)
-
-
-def near_pulse(system: System, merge: int) -> NDArray[np.uint8]:
-    """Base cells (bins * merge) that are cut again: within the pulse, and one dead time after it.
-
-    The period begins half a period before the bin of the return.
-    """
-    cells = system.bins * merge
-    low, high = _extent(system)
-    first, last = system.bins // 2 * merge + low * cells, (system.bins // 2 + 1) * merge + high * cells
-    found = np.zeros(cells, dtype=np.uint8)
-    for after in (0.0, system.dead_time_periods % 1.0 * cells):
-        begin, end = math.floor(first + after), math.ceil(last + after)
-        found[np.arange(begin, min(end, begin + cells)) % cells] = 1
-    return found
-
-
-def internal_cells(flux: Flux, system: System, cuts: Cuts | None = None) -> NDArray[np.int64]:
-    """Cells (H, W) of the period on which the sweeps run; `cuts` are those of `cell_cuts`."""
-    merge, parts = cell_cuts(flux, system) if cuts is None else cuts
-    cells = merge * system.bins
-    for factor in np.unique(merge[parts > 1]):
-        if factor * system.bins <= MOST_CELLS:  # else refused whatever the pulse needs
-            more = int(near_pulse(system, int(factor)).sum())
-            cells = np.where(merge == factor, cells + (parts - 1) * more, cells)
-    return cells
-
-
-def pulse_sigma(system: System) -> float:
-    """Width of the pulse, as the standard deviation of the Gaussian of the same energy concentration, ns."""
-    if isinstance(system.pulse, GaussianPulse):
-        return system.pulse.sigma_ns
-    edges, energy = _energies(system)
-    return float((edges[1] - edges[0]) / np.sum(energy**2) / (2.0 * math.sqrt(math.pi)))
-
-
-def _extent(system: System) -> tuple[float, float]:
-    """Beginning and end of the pulse about its delay, in periods, but for a millionth of its energy at either end."""
-    edges, energy = _energies(system)
-    below = np.concatenate([[0.0], np.cumsum(energy)])
-    first = np.searchsorted(below, _TAIL, side="right") - 1
-    last = np.searchsorted(below, below[-1] - _TAIL)
-    return float(edges[first]) / system.period_ns, float(edges[last]) / system.period_ns
-
-
-def _energies(system: System) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    low, high = system.pulse.support_ns()
-    edges = np.linspace(low, high, 4097)
-    return edges, np.diff(system.pulse.cumulative(edges))
+    low, high = math.log(goal * 1e-12), math.log(max(float((worst / cells).max()), goal)) + 20.0
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        left = worst * 16.0 ** -halvings(math.exp(middle)).astype(np.float64)
+        low, high = (middle, high) if left.sum() <= goal else (low, middle)
+    more = halvings(math.exp(low))
+    if not fine and not (more > 0).any():
+        more[np.argmax(worst)] = 1
+    kinds = now + more
+    for turn in (1, -1) * (_MOST_KIND // _GRADING + 1):
+        kinds = np.maximum(kinds, np.roll(kinds, turn) - _GRADING)
+    return np.asarray(kinds, np.uint8)

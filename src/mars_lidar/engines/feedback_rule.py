@@ -13,17 +13,13 @@ from numpy.typing import NDArray
 
 from mars_lidar._base.types import IndexArray, Progress
 from mars_lidar.engines.engine import Engine, Task
-from mars_lidar.engines.feedback_grid import MOST_CELLS, cell_cuts, internal_cells, meets_echo
+from mars_lidar.engines.feedback_grid import MOST_SWEEPS, Grids, KindArray
 from mars_lidar.engines.parts import draw_pixels, stage
-from mars_lidar.instrument.system import System
-from mars_lidar.light.flux import Flux
 
 StatusArray = NDArray[np.uint8]
 
-FEWEST_PERIODS = 100  # per dead time, rounded up to periods: shorter exposures are drawn exactly ...
-FEWEST_PERIODS_ECHO = 1000  # ... and where pulses meet their echo: phases settle slowly
+FEWEST_PERIODS = 100  # per dead time, rounded up to periods: shorter exposures are drawn exactly
 MOST_LAP_CELLS = 2**18  # of all laps: 150 MB for each thread
-BRIGHTEST_ECHO = 4.0  # signal photons of a pulse that meets its own echo; beyond, phases hardly settle at all
 
 
 class Reason(IntEnum):
@@ -37,7 +33,6 @@ class Reason(IntEnum):
     NEGATIVE = 5
     UNLIKELY = 6
     SHORT = 16
-    ECHO = 17
     CELLS = 18
     DEAR = 19
     LAPS = 64  # and more: of a pixel that needs that many laps less 64
@@ -56,17 +51,15 @@ _WORDS = {
     Reason.NEGATIVE: "negative armed",
     Reason.UNLIKELY: "unlikely count",
     Reason.SHORT: "short exposure",
-    Reason.ECHO: "bright echo",
     Reason.CELLS: "too many cells",
     Reason.DEAR: "quicker exactly",
 }
 
 
 class Grid(NamedTuple):
-    """Parts that a bin is cut into, that these are cut into near the pulse, and periods of a piece of the exposure."""
+    """Halvings (bins,) of the bins, and periods of a piece of the exposure."""
 
-    merge: int
-    parts: int
+    kinds: KindArray
     laps: int
 
 
@@ -105,51 +98,53 @@ class Rest:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """What is known of the pixels (n,) of an image before their sweeps.
+    """What is known of pixels (n,) before their sweeps.
 
-    `merge` and `parts` are those of a `Grid`, `cells` its cells; `reason` why sweeps are not even tried, or DRAWN.
+    `reason` why sweeps are not even tried, or DRAWN.
     """
 
-    merge: IndexArray
-    parts: IndexArray
-    cells: IndexArray
+    grids: Grids
     reason: StatusArray
 
     @classmethod
-    def of(cls, flux: Flux, system: System) -> Plan:
-        """For all pixels of an image."""
-        periods = math.ceil(system.dead_time_periods)
-        cuts = cell_cuts(flux, system)
-        cells = internal_cells(flux, system, cuts)
-        echo = meets_echo(flux, system)
-        fewest = np.where(echo.remembered, FEWEST_PERIODS_ECHO, FEWEST_PERIODS)
-        reason = np.zeros(flux.shape, np.uint8)
-        reason[cells > MOST_CELLS] = Reason.CELLS
-        reason[echo.remembered & (flux.signal > BRIGHTEST_ECHO)] = Reason.ECHO
-        reason[system.cycles < fewest * periods] = Reason.SHORT
-        return cls(cuts[0].reshape(-1), cuts[1].reshape(-1), cells.reshape(-1), reason.reshape(-1))
+    def of(cls, task: Task, pixels: IndexArray) -> Plan:
+        """For some pixels (n,) of a task."""
+        reason = np.zeros(pixels.size, np.uint8)
+        if task.system.cycles < FEWEST_PERIODS * math.ceil(task.system.dead_time_periods):
+            reason[:] = Reason.SHORT
+            return cls(Grids.coarsest(task, pixels.size), reason)
+        grids = Grids.checked(task, pixels)
+        reason[grids.sweeps > MOST_SWEEPS] = Reason.SLOW
+        reason[grids.of < 0] = Reason.CELLS
+        return cls(grids, reason)
+
+    def part(self, some: NDArray[np.bool_]) -> Plan:
+        """For those of its pixels (n,) that are true."""
+        grids = Grids(self.grids.kinds, self.grids.of[some], self.grids.sweeps[some])
+        return Plan(grids, self.reason[some])
 
 
 def sweep_pixels(
     task: Task, plan: Plan, pixels: IndexArray, sweep: Sweep, worth: NDArray[np.float64] | None = None
 ) -> Rest:
-    """Draw `pixels` (n,) group by group of one grid, those again that ask for laps, and return what is left.
+    """Draw `pixels` (n,) of a plan group by group of one grid, those again that ask for laps; return the others.
 
     `worth` (n,): cells of all laps beyond which another engine is quicker for a pixel.
     """
-    merge, parts, cells = plan.merge[pixels], plan.parts[pixels], plan.cells[pixels]
-    status = np.tile(plan.reason[pixels], (task.realizations, 1))
+    grid, cells = plan.grids.of, plan.grids.cells()
+    status = np.tile(plan.reason, (task.realizations, 1))
     # lanes go through their sweeps together: neighbours in background need about as many
-    able = np.flatnonzero(status[0] == Reason.DRAWN)
+    able = np.flatnonzero(plan.reason == Reason.DRAWN)
     able = able[np.argsort(task.flux.background.reshape(-1)[pixels[able]], kind="stable")]
     done, share = 0, 1.0 / max(able.size, 1)
 
     def draw(wanted: IndexArray, laps: IndexArray) -> None:
         nonlocal done
-        for grid in np.unique(np.stack([merge[wanted], parts[wanted], laps], -1), axis=0):
-            group = wanted[(merge[wanted] == grid[0]) & (parts[wanted] == grid[1]) & (laps == grid[2])]
+        for number, lap in np.unique(np.stack([grid[wanted], laps], -1), axis=0):
+            group = wanted[(grid[wanted] == number) & (laps == lap)]
             part = stage(task.progress, done * share, (done + group.size) * share)
-            status[:, group] = sweep(np.ascontiguousarray(pixels[group]), Grid(*map(int, grid)), part)
+            used = Grid(plan.grids.kinds[number], int(lap))
+            status[:, group] = sweep(np.ascontiguousarray(pixels[group]), used, part)
             done += int((status[0, group] < Reason.LAPS).sum())
 
     draw(able, np.ones_like(able))

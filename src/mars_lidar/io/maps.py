@@ -1,7 +1,8 @@
 """Files of reconstructed maps: .zarr, .h5 or .npz with named dimensions, units and what they were made of.
 
 Variables (method, realization, y, x): ``depth``, ``reflectivity``, ``signal``, ``background``, ``delay``, errors of the
-methods that give them (NaN for the others), ``significance`` and ``flags``. Where several returns were looked for:
+methods that give them (NaN for the others), ``significance`` and ``flags``; of the methods for images half widths of
+90 % intervals and ``outlier``. Where several returns were looked for:
 ``returns`` (their number), and of each (method, realization, y, x, return) ``return_depth``, ``return_signal``,
 ``return_delay``, their errors, and ``return_false_alarm``, nearest first, NaN beyond the last. Attributes: ``format`` =
 "mars-lidar maps", ``format_version``, ``system`` (JSON), ``level``, ``source`` (the cube), ``version``.
@@ -48,9 +49,11 @@ _VARIABLES = {  # name in the file: attribute, unit, in words
     "signal_error": ("signal_error", _PHOTONS, "standard error of the signal"),
     "background_error": ("background_error", _PHOTONS, "standard error of the background"),
     "significance": ("significance", "1", "significance of the signal, standard deviations"),
-    "flags": ("flags", "1", "1 empty, 2 no signal, 4 saturated, 8 unconverged, 16 more returns"),
+    "flags": ("flags", "1", "1 empty, 2 no signal, 4 saturated, 8 unconverged, 16 more returns, 32 filled"),
+    "depth_half_width": ("depth_half_width_m", "m", "half width of the 90 % interval of the depth"),
+    "delay_half_width": ("delay_half_width_ns", "ns", "half width of the 90 % interval of the delay"),
+    "outlier": ("outlier", "1", "probability that the depth is that of another surface"),
     "returns": ("returns.count", "1", "number of returns"),
-    "radius": ("radius", "pixel", "radius of the window whose photons were taken together"),
 }
 _OF_EACH = ("depth", "signal", "delay", "depth_error", "signal_error", "delay_error")
 _OF_RETURNS = {f"return_{name}": (*_VARIABLES[name][:2], f"{_VARIABLES[name][2]} of each return") for name in _OF_EACH}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from mars_lidar._base.arguments import checked
 from mars_lidar._base.late import late
 from mars_lidar._base.notebook import as_html
 from mars_lidar.instrument.system import System
+from mars_lidar.light.records import record_bins, record_times
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,11 +170,7 @@ class Timestamps:
 
     def pixel(self, y: int, x: int) -> Timestamps:
         """The registrations of one pixel, as views."""
-        h, w = self.shape
-        y, x = checks.integer("y", y, low=-(2**31), high=2**31), checks.integer("x", x, low=-(2**31), high=2**31)
-        if not (-h <= y < h and -w <= x < w):
-            raise IndexError(f"pixel ({y}, {x}) is outside of an image of {h} x {w}")
-        k = (y % h) * w + x % w
+        k = self._place(y, x)
         part = slice(self.offsets[k], self.offsets[k + 1])
         offsets = np.array([0, self.offsets[k + 1] - self.offsets[k]], np.int64)
         return dataclasses.replace(
@@ -183,6 +181,14 @@ class Timestamps:
             offsets=offsets,
             shape=(1, 1),
         )
+
+    def _place(self, y: int, x: int) -> int:
+        """Number of a pixel, row-major; IndexError outside of the image."""
+        h, w = self.shape
+        y, x = checks.integer("y", y, low=-(2**31), high=2**31), checks.integer("x", x, low=-(2**31), high=2**31)
+        if not (-h <= y < h and -w <= x < w):
+            raise IndexError(f"pixel ({y}, {x}) is outside of an image of {h} x {w}")
+        return (y % h) * w + x % w
 
     def __len__(self) -> int:
         """Number of registrations."""
@@ -204,3 +210,71 @@ class Timestamps:
     def __repr__(self) -> str:
         h, w = self.shape
         return f"Timestamps({len(self)} registrations, {h} x {w} pixels)"
+
+
+class DrawnTimestamps(Timestamps):
+    """Timestamps that an engine drew: 8 bytes each until times or bins are asked for, which are then kept.
+
+    Made by `of`, without the checks of `Timestamps`: no user gave the numbers.
+    """
+
+    phase: NDArray[np.float32]  # (n,) part of the laser period, in [0, 1]
+
+    @classmethod
+    def of(
+        cls,
+        cycle: NDArray[np.int32],
+        phase: NDArray[np.float32],
+        offsets: NDArray[np.int64],
+        shape: tuple[int, int],
+        bins: int,
+        dtype: np.dtype[Any],
+        period_ns: float,
+        cycles: int,
+        info: dict[str, Any],
+    ) -> DrawnTimestamps:
+        """Of laser periods and phases (n,), and the attributes of `Timestamps`."""
+        new = object.__new__(cls)
+        vars(new).update(
+            cycle=cycle,
+            phase=phase,
+            offsets=offsets,
+            shape=shape,
+            bins=bins,
+            dtype=dtype,
+            period_ns=period_ns,
+            cycles=cycles,
+            info=info,
+        )
+        return new
+
+    @cached_property
+    def times_ns(self) -> NDArray[np.float64]:
+        """(n,) absolute times since the start of the exposure, ns, sorted within a pixel."""
+        return record_times(self.cycle, self.phase, self.period_ns)
+
+    @cached_property
+    def bin(self) -> NDArray[np.int32]:
+        """(n,) histogram bin of the phase."""
+        return record_bins(self.phase, self.bins)
+
+    def pixel(self, y: int, x: int) -> Timestamps:
+        """The registrations of one pixel, as views; their times and bins are the image's where it has them."""
+        if "phase" not in vars(self):  # changed by dataclasses.replace
+            return super().pixel(y, x)
+        k = self._place(y, x)
+        part = slice(self.offsets[k], self.offsets[k + 1])
+        offsets = np.array([0, self.offsets[k + 1] - self.offsets[k]], np.int64)
+        one = self.of(
+            self.cycle[part],
+            self.phase[part],
+            offsets,
+            (1, 1),
+            self.bins,
+            self.dtype,
+            self.period_ns,
+            self.cycles,
+            self.info,
+        )
+        vars(one).update({name: vars(self)[name][part] for name in ("times_ns", "bin") if name in vars(self)})
+        return one

@@ -8,6 +8,7 @@ from mars_lidar.reconstruct.histogram_bound import (
     window_error,
     window_weights,
 )
+from mars_lidar.reconstruct.image import Image, UntrainedImage
 from mars_lidar.reconstruct.matched_filter import MatchedFilter, Peak
 from mars_lidar.reconstruct.maximum_likelihood import MaximumLikelihood, log_likelihood
 from mars_lidar.reconstruct.mchc import ChainCorrection, mchc_rates
@@ -22,12 +23,14 @@ __all__ = [
     "Flags",
     "GeneralisedCoates",
     "HistogramBound",
+    "Image",
     "MatchedFilter",
     "MaximumLikelihood",
     "Method",
     "Peak",
     "Reconstruction",
     "Returns",
+    "UntrainedImage",
     "coates_rates",
     "cramer_rao",
     "generalised_coates_rates",

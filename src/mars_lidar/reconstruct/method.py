@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, fields
 from enum import IntFlag
 from typing import Any, ClassVar, Literal
 
@@ -40,6 +40,8 @@ class Flags(IntFlag):
     """The iteration did not come to rest."""
     MORE_RETURNS = 16
     """There is light of further returns than the most that were asked for."""
+    FILLED = 32
+    """An outlier is likelier than not, or nothing came: the delay is that of the pixels around."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,8 +59,15 @@ class Estimates:
     background_error: FloatArray | None = None
     delay_error: FloatArray | None = None
     significance: FloatArray | None = field(default=None)
-    radius: NDArray[np.uint8] | None = None  # of the window whose photons were taken together, pixels
+    half_width: FloatArray | None = None  # of the 90 % interval of the delay
+    outlier: FloatArray | None = None  # probability that the delay is another surface's
     returns: FloatArray | None = None  # (pixels, most, len(RETURN_COLUMNS)), NaN beyond those of a pixel
+
+    @staticmethod
+    def joined(parts: Sequence[Estimates]) -> Estimates:
+        """Those of several sets of pixels, one after the other."""
+        values = {each.name: [getattr(part, each.name) for part in parts] for each in fields(Estimates)}
+        return Estimates(**{name: np.concatenate(v) for name, v in values.items() if v[0] is not None})
 
 
 class Method(ABC):
@@ -68,6 +77,7 @@ class Method(ABC):
     modes: ClassVar[tuple[Mode, ...]]  # of the detector, that the method holds for
     assumes: ClassVar[str]  # in words, for tables
     windows: ClassVar[bool] = True  # signal and background come from inside and outside of a window
+    of_images: ClassVar[bool] = False  # each pixel's estimate depends on those around it: cubes (..., H, W, bins)
 
     def check(self, system: System) -> None:
         """Raise ValueError, naming mode and method, for a system that this method does not hold for."""

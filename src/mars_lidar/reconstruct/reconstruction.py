@@ -16,11 +16,11 @@ from mars_lidar.instrument.system import System
 from mars_lidar.reconstruct.centroid import Centroid
 from mars_lidar.reconstruct.coates import Coates, GeneralisedCoates
 from mars_lidar.reconstruct.histograms import checked
+from mars_lidar.reconstruct.image import Image, UntrainedImage
 from mars_lidar.reconstruct.matched_filter import MatchedFilter, Peak
 from mars_lidar.reconstruct.maximum_likelihood import MaximumLikelihood
 from mars_lidar.reconstruct.mchc import ChainCorrection
 from mars_lidar.reconstruct.method import Estimates, Flags, Method, tell_effects
-from mars_lidar.reconstruct.neighbourhood import Neighbourhood
 from mars_lidar.reconstruct.returns import MOST_RETURNS, Returns, returns_of
 
 ATTENUATIONS = ("none", "inverse_square")
@@ -35,6 +35,8 @@ METHODS: dict[str, Method] = {
         MatchedFilter(),
         Centroid(),
         Peak(),
+        Image(),
+        UntrainedImage(),
     )
 }
 
@@ -66,8 +68,11 @@ class Reconstruction:
         (...) uint8, `Flags`.
     returns
         Every return of each pixel, where several were asked for; then the maps above are those of the strongest.
-    radius
-        (...) pixels to each side whose photons were taken together, where a neighbourhood was asked for.
+    delay_half_width_ns, depth_half_width_m
+        Half width of the 90 % interval of delay and depth, of methods ``"image"`` and ``"image_untrained"``; NaN where
+        an outlier is too likely for one.
+    outlier
+        (...) probability that the depth is that of another surface, of the same methods.
 
     See Also
     --------
@@ -102,7 +107,9 @@ class Reconstruction:
     significance: FloatArray | None
     flags: NDArray[np.uint8]
     returns: Returns | None = None
-    radius: NDArray[np.uint8] | None = None
+    delay_half_width_ns: FloatArray | None = None
+    depth_half_width_m: FloatArray | None = None
+    outlier: FloatArray | None = None
 
     __repr__ = brief
 
@@ -143,7 +150,6 @@ def reconstruct(
     level: float | None = None,
     attenuation: Literal["none", "inverse_square"] = "none",
     returns: int = 1,
-    neighbourhood: int | None = None,
     threads: int | None = None,
     progress: Progress | bool | None = None,
 ) -> Reconstruction:
@@ -159,6 +165,7 @@ def reconstruct(
     method
         A name in `mars_lidar.reconstruct.METHODS` (default ``"maximum_likelihood"``; docs/reconstruction.md says what
         each assumes), or a `Method` of your own settings. Each refuses detectors that it does not hold for.
+        ``"image"``, for images (..., H, W, bins) of 1 to 20 photons a pixel, takes the pixels around into account.
     level
         Detectable signal photons per period of a surface of reflectivity 1 (at 1 m, with
         ``attenuation="inverse_square"``).
@@ -168,10 +175,6 @@ def reconstruct(
     returns
         Returns to look for in each pixel, 1 to 8: panes of glass, foliage. Each is tested, and all of them are in
         `Reconstruction.returns`. Of ``"maximum_likelihood"`` alone.
-    neighbourhood
-        For dim cubes (..., H, W, bins): take the photons of the pixels around together, up to so many pixels to each
-        side, on a plane, and over the window that predicts left-out photons best (docs/reconstruction.md, section 10).
-        Of ``"maximum_likelihood"`` alone, for one return a pixel. None: each pixel alone.
     threads
         Threads to run on; default: all processors this process may use. The result does not depend on it.
     progress
@@ -202,7 +205,7 @@ def reconstruct(
         system, cube = cube.system if system is None else system, np.asarray(cube.histogram)
     if system is None:
         raise TypeError("system must be given for an array of counts (a cube of mars_lidar.io.load carries its own)")
-    used = with_options(find_method(method), returns, neighbourhood)
+    used = with_returns(find_method(method), returns)
     checks.choice("attenuation", attenuation, ATTENUATIONS)
     if level is not None:
         level = checks.real("level", level, low=0.0, strict_low=True)
@@ -224,21 +227,15 @@ def find_method(method: str | Method) -> Method:
     return METHODS[checks.choice("method", method, tuple(METHODS))]
 
 
-def with_options(method: Method, returns: int, neighbourhood: int | None) -> Method:
-    """The method, looking for so many returns of each pixel, or over a neighbourhood."""
-    several = checks.integer("returns", returns, low=1, high=MOST_RETURNS) > 1
-    if not several and neighbourhood is None:
+def with_returns(method: Method, returns: int) -> Method:
+    """The method, looking for so many returns of each pixel."""
+    if checks.integer("returns", returns, low=1, high=MOST_RETURNS) == 1:
         return method
-    asked = f"returns={returns}" if several else f"neighbourhood={neighbourhood}"
     if not isinstance(method, MaximumLikelihood):
         raise ValueError(
-            f"{asked} needs the likelihood, which method {method.name!r} has not; use 'maximum_likelihood'"
+            f"returns={returns} needs the likelihood, which method {method.name!r} has not; use 'maximum_likelihood'"
         )
-    if neighbourhood is None:
-        return replace(method, returns=int(returns))
-    if several:
-        raise ValueError(f"neighbourhood={neighbourhood} is for one return a pixel, got {asked}")
-    return Neighbourhood(neighbourhood, false_alarm=method.false_alarm)
+    return replace(method, returns=int(returns))
 
 
 def assembled(
@@ -274,10 +271,12 @@ def assembled(
         significance=mapped(found.significance),
         flags=flags,
         returns=returns_of(found.returns, system, shape),
-        radius=None if found.radius is None else found.radius.reshape(shape),
+        delay_half_width_ns=mapped(found.half_width, period),
+        depth_half_width_m=mapped(found.half_width, float(system.depth_m(period))),
+        outlier=mapped(found.outlier),
     )
 
 
 def _seen(depth: FloatArray, flags: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    lacking = np.uint8(Flags.EMPTY | Flags.NO_SIGNAL)
+    lacking = np.uint8(Flags.EMPTY | Flags.NO_SIGNAL | Flags.FILLED)
     return np.asarray(np.isfinite(depth) & ((flags & lacking) == 0), dtype=np.bool_)

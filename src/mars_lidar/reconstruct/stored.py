@@ -14,8 +14,10 @@ from mars_lidar._base.progress import shown
 from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import Progress
 from mars_lidar.reconstruct.histograms import checked
+from mars_lidar.reconstruct.image import Image
 from mars_lidar.reconstruct.method import Estimates, Method, tell_effects
-from mars_lidar.reconstruct.reconstruction import Reconstruction, assembled, find_method, with_options
+from mars_lidar.reconstruct.photons import Photons
+from mars_lidar.reconstruct.reconstruction import Reconstruction, assembled, find_method, with_returns
 
 if TYPE_CHECKING:
     from mars_lidar.io import Cube
@@ -38,7 +40,6 @@ def reconstruct_stored(
     level: float | None = None,
     attenuation: str | None = None,
     returns: int = 1,
-    neighbourhood: int | None = None,
     threads: int | None = None,
     progress: Progress | bool | None = None,
 ) -> dict[str, Timed]:
@@ -50,7 +51,7 @@ def reconstruct_stored(
         The cube. Without `level`, its own: that with which a known scene's reflectivity became its signal.
     methods
         Names or methods of different names.
-    level, attenuation, returns, neighbourhood, threads, progress
+    level, attenuation, returns, threads, progress
         As `mars_lidar.reconstruct`; attenuation None: that with which the flux was made, if it says so.
 
     Returns
@@ -60,7 +61,7 @@ def reconstruct_stored(
     """
     progress = shown(progress, "reconstructing")
     system, recipe = cube.system, cube.recipe
-    used = [with_options(find_method(method), returns, neighbourhood) for method in methods]
+    used = [with_returns(find_method(method), returns) for method in methods]
     for method in used:
         method.check(system)
     tell_effects(system)
@@ -73,23 +74,45 @@ def reconstruct_stored(
     seconds = dict.fromkeys(buffers, 0.0)
     total, done = len(used) * shape[0] * shape[1] * shape[2], 0
     blocks = recipe.blocks(recipe.chunks(_CHUNK_BYTES))
-    if neighbourhood is not None:  # a whole image at a time
-        blocks = ((slice(k, k + 1), slice(0, shape[1])) for k in range(shape[0]))
+
+    def keep(method: Method, found: Estimates, images: slice, rows: slice) -> None:
+        for field in fields(found):
+            values = getattr(found, field.name)
+            if values is None:
+                continue
+            whole = buffers[method.name].setdefault(field.name, np.empty((*shape, *values.shape[1:]), values.dtype))
+            part = whole[images, rows]
+            part[...] = values.reshape(part.shape)
+
+    of_images = [method for method in used if isinstance(method, Image)]
+    gathered: dict[int, list[Photons]] = {}  # by image, rows of it: of whole images only the photons are held
     for images, rows in blocks:
         counts, block = checked(np.asarray(cube.histogram[images, rows]), system, team)
         for method in used:
+            if isinstance(method, Image):
+                continue
             began = time.perf_counter()
             found = method.estimate(counts)
             seconds[method.name] += time.perf_counter() - began
-            for field in fields(found):
-                values = getattr(found, field.name)
-                if values is None:
-                    continue
-                whole = buffers[method.name].setdefault(field.name, np.empty((*shape, *values.shape[1:]), values.dtype))
-                whole[images, rows] = values.reshape(*block, *values.shape[1:])
+            keep(method, found, images, rows)
             done += len(counts.counts)
             if progress is not None:
                 progress(done, total)
+        if not of_images:
+            continue
+        for k, part in zip(range(images.start, images.stop), counts.counts.reshape(*block, -1), strict=True):
+            gathered.setdefault(k, []).append(Photons.of(part.reshape(-1, system.bins), *block[1:]))
+            if sum(each.height for each in gathered[k]) < shape[1]:
+                continue
+            photons = Photons.joined(gathered.pop(k))
+            for method in of_images:
+                began = time.perf_counter()
+                found = method.of_photons(photons, system, team)
+                seconds[method.name] += time.perf_counter() - began
+                keep(method, found, slice(k, k + 1), slice(0, shape[1]))
+                done += shape[1] * shape[2]
+                if progress is not None:
+                    progress(done, total)
     results = {}
     for method in used:
         found = Estimates(

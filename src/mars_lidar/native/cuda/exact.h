@@ -27,8 +27,8 @@ struct DeviceTask {
     const float* start_phase;
     void* out;               // counts int64 (items), or rows (items, bins), zero at first
     const int64_t* offsets;  // timestamps: first record of each item
-    double* times;           // in periods
-    int32_t *cycles, *bins;
+    int32_t* cycles;
+    float* phases;
     int64_t pixels, first, items;  // of this launch: [first, first + items) in the order (realization, place)
     uint32_t first_realization, padding;
 };
@@ -137,11 +137,10 @@ class DeviceTimestamps {
  public:
     MARS_INLINE DeviceTimestamps(const DeviceTask& task, int64_t item, int32_t, int32_t)
         : task_(task), next_(task.offsets[item]) {}
-    MARS_INLINE void take(const Registration& r, int32_t bin) {
+    MARS_INLINE void take(const Registration& r, int32_t) {
         if (r.lost) return;
-        task_.times[next_] = registration_time(r.cycle, r.phase);
         task_.cycles[next_] = r.cycle;
-        task_.bins[next_] = bin;
+        task_.phases[next_] = r.phase;
         ++next_;
     }
     MARS_INLINE void end() {}
@@ -211,6 +210,7 @@ MARS_KERNEL exact_items(const DeviceTask task) {
                     delay, armed.frame, armed.phase);
     const Pair<uint32_t> key =
         stream_key(task.seed, task.first_realization + static_cast<uint32_t>(turn), task.pixel_index[pixel]);
+    WordStream<uint32_t> stream = word_stream(key);
     Memory memory = {false, 0, 0.0f};
     typename DeviceWriter<static_cast<DeviceSink>(sink_number)>::Type writer(task, item, place.lane, place.lanes);
 
@@ -218,7 +218,8 @@ MARS_KERNEL exact_items(const DeviceTask task) {
         Draw drawn[ahead];
         MARS_UNROLL
         for (int k = 0; k < ahead; ++k)
-            drawn[k] = draw(background, returns[0].flux, key.first, key.second, event + static_cast<uint32_t>(k));
+            drawn[k] =
+                draw(background, returns[0].flux, stream, key.first, key.second, event + static_cast<uint32_t>(k));
         MARS_UNROLL
         for (int k = 0; k < ahead; ++k) {
             const Registration next =

@@ -13,7 +13,7 @@ namespace mars {
 
 struct PulseTable;
 
-constexpr int64_t kMaxItems = 1024;  // of a block
+constexpr int64_t kMaxItems = 4096;  // of a block
 
 // Consecutive items of a job (item = realization * pixels + pixel).
 struct ExactBlock {

@@ -13,6 +13,7 @@
 #include "exact/recorder.h"
 #include "exact/step.h"
 #include "exact/trap_lanes.h"
+#include "numbers/word_stream.h"
 
 namespace mars {
 inline namespace MARS_LEVEL {
@@ -22,6 +23,27 @@ constexpr int kPollEvery = 512;  // rounds between looks at `stop`
 
 // What lies between a registration and the log.
 enum class Stage { kPlain, kRecording, kAvalanches };  // the last: what avalanches leave behind, and recording
+
+// Streams of the lanes as plain words, for starting single ones.
+struct StreamArray {
+    alignas(64) uint32_t a[kLanes] = {}, b[kLanes] = {}, c[kLanes] = {}, counter[kLanes] = {};
+
+    void set(int lane, const WordStream<uint32_t>& stream) {
+        a[lane] = stream.a;
+        b[lane] = stream.b;
+        c[lane] = stream.c;
+        counter[lane] = stream.counter;
+    }
+    MARS_INLINE WordStream<UInt> load_lanes() const {
+        return {load<UInt>(a), load<UInt>(b), load<UInt>(c), load<UInt>(counter)};
+    }
+    MARS_INLINE void save(const WordStream<UInt>& stream) {
+        store(a, stream.a);
+        store(b, stream.b);
+        store(c, stream.c);
+        store(counter, stream.counter);
+    }
+};
 
 template <class Clock, Stage stage>
 class LaneHost {
@@ -65,10 +87,11 @@ class LaneHost {
         traps_.close(lane);
     }
     void occupy(int lane, int64_t item, const Pair<uint32_t>& key) {
-        log_.clear(item);
+        log_.prepare(item);
         log_.assign(lane, item);
         keys0_[lane] = key.first;
         keys1_[lane] = key.second;
+        streams_.set(lane, word_stream(key));
         traps_.open(lane, key.first, key.second);
         ++running_;
     }
@@ -126,7 +149,8 @@ class LaneHost {
 
     // the lanes
     UInt key0_, key1_, event_;
-    Time armed_;  // where the search for the next arrival begins
+    StreamArray streams_;  // the words of arrivals
+    Time armed_;           // where the search for the next arrival begins
     LaneLog<typename Clock::Phase> log_;
     typename Clock::Registration seen_[kRecords ? kAhead : 1];  // of this round
 

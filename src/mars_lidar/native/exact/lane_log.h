@@ -1,18 +1,23 @@
 // Where the registrations of lanes go: the kernels log them, one row of lanes after the other, and write the column of
 // one lane at a time when the log is full. The histogram of one pixel stays in the first-level cache that way, those of
-// all lanes together would not.
+// all lanes together would not. Histograms of 16 bits that fit are counted in rows of the lanes' own and go to their
+// places when they are complete, past the caches: the lanes' rows stay in them.
 #pragma once
 #include <string.h>
+
+#include <vector>
 
 #include "exact/kernel.h"
 #include "instrument/recording.h"
 #include "instrument/records.h"
+#include "lanes/streaming.h"
 #include "lanes/transpose.h"
 
 namespace mars {
 inline namespace MARS_LEVEL {
 
-constexpr int kLog = 128;  // rows
+constexpr int kLog = 128;          // rows
+constexpr size_t kMostOwn = 2048;  // bins of histograms in the lanes' own rows: 64 or 128 KB for all lanes
 
 // `Phase` is the precision that times are told in. Which output is asked for matters only when the log is written, and
 // for whether times are kept, so one kernel serves them all.
@@ -24,15 +29,25 @@ class LaneLog {
           timed_(output.sink == Sink::kTimestamps),
           bins_(static_cast<size_t>(job.bins)),
           cycles_(job.cycles),
-          most_(timed_ ? kLog / 2 : kLog) {
+          most_(timed_ ? kLog / 2 : kLog),
+          follows_(sizeof(Phase) == sizeof(float) && !(job.recording && !job.recording->codes.edges.empty())),
+          own_(output.sink == Sink::kHistogram16 && kLanes > 1 && bins_ <= kMostOwn) {
         for (int lane = 0; lane < kLanes; ++lane) items_[lane] = -1;
+        if (own_) rows_of_lanes_.resize(kLanes * stride());
     }
+    ~LaneLog() { finish_streaming(); }
+    LaneLog(const LaneLog&) = delete;
+    LaneLog& operator=(const LaneLog&) = delete;
 
     // Whether times are asked for.
     bool timed() const { return timed_; }
     bool busy(int lane) const { return items_[lane] >= 0; }
 
-    // An item of the job without any registration yet.
+    // Before an item goes to a lane. Lanes write rows of their own as a whole.
+    void prepare(int64_t item) {
+        if (!own_) clear(item);
+    }
+    // An item of the job without any registration.
     void clear(int64_t item) {
         switch (output_.sink) {
             case Sink::kCounts:
@@ -46,9 +61,12 @@ class LaneLog {
                 return;
         }
     }
-    // From now on a lane is at an item that has been cleared, or at none (-1).
+    // From now on a lane is at an item that has been prepared, or at none (-1).
     void assign(int lane, int64_t item) {
-        if (busy(lane)) write<1>(lane, first_row_[lane], rows_);
+        if (busy(lane)) {
+            write<1>(lane, first_row_[lane], rows_);
+            if (own_) complete(lane);
+        }
         first_row_[lane] = rows_;
         items_[lane] = item;
     }
@@ -94,6 +112,21 @@ class LaneLog {
         return static_cast<Count*>(output_.out) + static_cast<size_t>(item) * bins_;
     }
 
+    // A line of the cache.
+    struct alignas(64) Line {
+        uint16_t counts[32];
+    };
+    size_t stride() const { return (bins_ + 31) / 32; }  // lines
+    uint16_t* own_row(int lane) { return rows_of_lanes_[static_cast<size_t>(lane) * stride()].counts; }
+    // Moves a lane's counts to the row of its item, and leaves zeros.
+    void complete(int lane) {
+        uint16_t *const from = own_row(lane), *const to = row<uint16_t>(items_[lane]);
+        const bool whole = bins_ % 8 == 0;  // every row: what is streamed beside what is not takes long
+        const size_t streamed = whole ? static_cast<size_t>(stream_counters(from, to, static_cast<int64_t>(bins_))) : 0;
+        memcpy(to + streamed, from + streamed, (bins_ - streamed) * sizeof(uint16_t));
+        memset(from + streamed, 0, (bins_ - streamed) * sizeof(uint16_t));
+    }
+
     // The next row is asked for meanwhile: a cube is larger than the caches, and to wait for its lines took a seventh
     // of the time of dim light.
     template <class Count>
@@ -131,7 +164,11 @@ class LaneLog {
     template <int n, class Count>
     void count_bins(int lane, int from, int to) {
         Count* rows[n];
-        for (int i = 0; i < n; ++i) rows[i] = row<Count>(items_[lane + i]);
+        for (int i = 0; i < n; ++i) {
+            rows[i] = row<Count>(items_[lane + i]);
+            if constexpr (sizeof(Count) == 2)
+                if (own_) rows[i] = own_row(lane + i);
+        }
         for (int k = from; k < to; ++k)
             for (int i = 0; i < n; ++i) {
                 const int32_t bin = bin_[k][lane + i];
@@ -148,8 +185,9 @@ class LaneLog {
         int64_t next[n];
         for (int i = 0; i < n; ++i) next[i] = runs.used + i * most;
         for (int k = from; k < to;) {
-            if constexpr (n == 4 && sizeof(Phase) == 4) {
-                if (k + 4 <= to && ((odd_[k] | odd_[k + 1] | odd_[k + 2] | odd_[k + 3]) >> lane & 15) == 0) {
+            if constexpr (n == 4 && sizeof(Phase) == sizeof(float)) {
+                if (follows_ && k + 4 <= to &&
+                    ((odd_[k] | odd_[k + 1] | odd_[k + 2] | odd_[k + 3]) >> lane & 15) == 0) {
                     tell_four(lane, k, runs.at, next);
                     k += 4;
                     continue;
@@ -159,10 +197,11 @@ class LaneLog {
                 const int32_t bin = bin_[k][lane + i];
                 if (bin < 0) continue;
                 const int64_t record = next[i]++;
-                const int32_t cycle = round_exposure(cycle_[k][lane + i], cycles_);
-                runs.at.times[record] = registration_time(cycle, phase_[k][lane + i]);
-                runs.at.cycles[record] = cycle;
-                runs.at.bins[record] = bin;
+                const Phase phase = phase_[k][lane + i];
+                runs.at.cycles[record] = round_exposure(cycle_[k][lane + i], cycles_);
+                runs.at.phases[record] =
+                    follows_ ? static_cast<float>(phase)
+                             : phase_in_bin(static_cast<double>(phase), bin, static_cast<int32_t>(bins_));
             }
             ++k;
         }
@@ -175,19 +214,14 @@ class LaneLog {
 #if MARS_LANES > 1
     // Four rows of four lanes, all of them registered, and in the exposure.
     MARS_INLINE void tell_four(int lane, int row, const RecordArrays& at, int64_t (&next)[4]) const {
-        FourInts bin[4], cycle[4];
+        FourInts cycle[4];
         FourFloats phase[4];
-        columns_of_four(&bin_[row][lane], bin);
         columns_of_four(&cycle_[row][lane], cycle);
         columns_of_four(&phase_[row][lane], phase);
         for (int i = 0; i < 4; ++i) {
             const int64_t to = next[i];
-            const FourDoubles exact = __builtin_convertvector(phase[i], FourDoubles);  // as registration_time
-            const FourDoubles below = exact < FourDoubles{} + 1.0 ? exact : FourDoubles{} + (1.0 - 0x1p-25);
-            const FourDoubles time = __builtin_convertvector(cycle[i], FourDoubles) + below;
-            memcpy(at.times + to, &time, sizeof time);
             memcpy(at.cycles + to, &cycle[i], sizeof cycle[i]);
-            memcpy(at.bins + to, &bin[i], sizeof bin[i]);
+            memcpy(at.phases + to, &phase[i], sizeof phase[i]);
             next[i] = to + 4;
         }
     }
@@ -197,7 +231,10 @@ class LaneLog {
     const bool timed_;
     const size_t bins_;
     const int32_t cycles_;
-    const int most_;         // rows: as many as stay in the first cache
+    const int most_;      // rows: as many as stay in the first cache
+    const bool follows_;  // whether bins are those of the phases in single precision
+    const bool own_;      // whether histograms are counted in the lanes' own rows
+    std::vector<Line> rows_of_lanes_;
     int64_t items_[kLanes];  // of the job, or -1
     int first_row_[kLanes] = {}, rows_ = 0;
     alignas(64) int32_t bin_[kLog][kLanes];  // -1: not registered

@@ -153,14 +153,15 @@ struct Memory {
     Float energy;  // its signed energy
 };
 
-// Waits for the background and the first return, drawn ahead: they depend on the number of the registration only.
+// Waits for the background and the first return, drawn ahead: they depend on the stream only.
 struct Draw {
     Wait background, signal;
 };
 
-MARS_INLINE Draw draw(const Rate& background, const Rate& signal, UInt key0, UInt key1, UInt event) {
+MARS_INLINE Draw draw(const Rate& background, const Rate& signal, WordStream<UInt>& stream, UInt key0, UInt key1,
+                      UInt event) {
     Draw next;
-    draw_waits(key0, key1, event, kStageArrival, background, signal, next.background, next.signal);
+    draw_two_waits(stream, key0, key1, event, kStageArrivalFine, background, signal, next.background, next.signal);
     return next;
 }
 

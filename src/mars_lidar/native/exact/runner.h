@@ -1,5 +1,5 @@
-// The exact engine's inner loop for pulses (exact/lane_host.h has what waveforms share). The waits of the next
-// registrations are drawn ahead, because the chain from one registration to the next is what limits the speed.
+// The exact engine's inner loop for pulses (exact/lane_host.h has what waveforms share). The waits of the registration
+// after next are drawn during a step, because the chain from one registration to the next is what limits the speed.
 // Compiled once for each vector level, and there for each `Rule`: free-running pixels know it when they are compiled,
 // so that they do not pay for the others, which ask for the detector's mode as they go.
 #pragma once
@@ -10,6 +10,8 @@
 namespace mars {
 inline namespace MARS_LEVEL {
 namespace {
+
+constexpr int kLead = 2;  // draws before the step that takes them: they fill the gaps in the chain of the steps
 
 // Plain memory behind the lanes, for changing single lanes.
 struct RateArray {
@@ -30,10 +32,12 @@ class ExactLanes : protected LaneHost<FrameClock, stage> {
           block_(block),
           system_(view(*block.job, *block.pulse)) {}
 
-    MARS_NOINLINE void draw_ahead() {
-        for (int k = 0; k < kAhead; ++k)
-            ahead_[k] =
-                draw(background_, returns_[0].flux, this->key0_, this->key1_, this->event_ + static_cast<uint32_t>(k));
+    // The states go through memory: registers are few.
+    MARS_INLINE void draw_ahead(int k) {
+        WordStream<UInt> stream = this->streams_.load_lanes();
+        ahead_[k] = draw(background_, returns_[0].flux, stream, this->key0_, this->key1_,
+                         this->event_ + static_cast<uint32_t>(k));
+        this->streams_.save(stream);
     }
 
     const ExactBlock& block_;
@@ -141,8 +145,12 @@ class Runner final : ExactLanes<stage> {
     void run() {
         if (!this->begin()) return;
         do {
-            this->draw_ahead();
-            for (int k = 0; k < kAhead; ++k) step(k);
+            for (int k = 0; k < kLead; ++k) this->draw_ahead(k);
+#pragma GCC unroll 1
+            for (int k = 0; k < kAhead; ++k) {
+                step(k);
+                if (k + kLead < kAhead) this->draw_ahead(k + kLead);
+            }
         } while (this->next_round());
     }
 

@@ -1,12 +1,12 @@
-// The numbers by which the exact engine's draws are told apart. A draw is a function of the pixel's key and two counter
-// words (numbers/random.h): the number of the registration, and one of these.
+// The numbers by which the exact engine's rare draws are told apart from each other. Arrivals of the background and the
+// first return are drawn from the item's stream of words (numbers/word_stream.h); every other draw is a function of the
+// item's key and two counter words (numbers/random.h): the number of the registration, and one of these.
 #pragma once
 #include "base/integers.h"
 
 namespace mars {
 
-constexpr uint32_t kStageArrival = 0;      // background and first return
-constexpr uint32_t kStageArrivalFine = 1;  // fresh fractions for long waits of those two
+constexpr uint32_t kStageArrivalFine = 1;  // fresh fractions for long waits of the background and the first return
 constexpr uint32_t kStageStart = 2;        // arrivals before a stationary exposure: waits and components; + 1: phases
 constexpr uint32_t kStageJitter = 4;       // first word of the counter: half the number; + 1: tails
 constexpr uint32_t kStageRecovery = 6;     // what of its sensitivity an arrival asks of the pixel; + 1: fine fractions

@@ -50,7 +50,7 @@ class Batch : private BatchPixels {
                 }
             }
             start_history();
-            const bool done = grid_.whole > 0    ? sweep_integers<true, true>()
+            const bool done = grid_.folded() > 0 ? sweep_integers<true, true>()
                               : grid_.stationary ? sweep_integers<false, true>()
                                                  : sweep_integers<false, false>();
             if (!done) return true;
@@ -86,19 +86,29 @@ class Batch : private BatchPixels {
                 }
                 work_.exact[static_cast<int64_t>(t) * kTeams] = law.rare(j, kFewArmed, kFewCounts, kLikely);
                 uint16_t* dither = work_.dither + row(t);
-                for (int i = 0; i < kTeam; ++i) dither[i] = static_cast<uint16_t>(other[i] >> 16);
+                uint16_t* split = work_.split + row(t + 1);
+                for (int i = 0; i < kTeam; ++i) {
+                    dither[i] = static_cast<uint16_t>(other[i] >> 16);
+                    split[i] = static_cast<uint16_t>(other[i] & 0xffffu);
+                }
                 follow_quantile(law.mean, law.variance, work_.rates.fire(j), work_.rates.refire(j), grid_.laps > 1,
                                 uniforms, work_.alpha + row(t), work_.beta + row(t));
             }
         }
+        place_rearmed(grid_, work_.sums, scale_, work_.split);
         for (int i = 0; i < kTeam; ++i) {
             const int32_t edge = batch_.first_bin[i] == 0 ? 0 : grid_.bin_cell[grid_.bins - batch_.first_bin[i]];
             exposure_.edge[i] = edge;
             exposure_.active[i] = drawing_[i] ? -1 : 0;
             spare_[i] = exposure_.start[i] = exposure_.end[i] = 0;
             exposure_.rank[i] = static_cast<int32_t>(number_of_the_end(i, 1u) * grid_.pieces);
-            if (grid_.whole > 0) spare_[i] = blind_at_an_end(i, 1u, exposure_.end[i]);
-            if (grid_.stationary) spare_[i] -= blind_at_an_end(i, 2u, exposure_.start[i]);
+            if (grid_.folded() > 0) spare_[i] = blind_at_an_end(i, 1u, exposure_.end[i]);
+            if (!grid_.stationary) continue;
+            const int32_t blind = blind_at_an_end(i, 2u, exposure_.start[i]);
+            if (grid_.laps > 1)
+                exposure_.start[i] += blind * n_;
+            else
+                spare_[i] -= blind;
         }
     }
 
@@ -119,7 +129,8 @@ class Batch : private BatchPixels {
         int32_t some = 0;
         for (int i = 0; i < kTeam; ++i) {
             number_[i] = grid_.pieces * share_[i] * total_[i];
-            slow[i] = active[i] = drawing_[i] && grid_.laps == 1 && (grid_.whole > 0 || rate_[i] > kLinearFrom) ? 1 : 0;
+            slow[i] = active[i] =
+                drawing_[i] && grid_.laps == 1 && (grid_.folded() > 0 || rate_[i] > kLinearFrom) ? 1 : 0;
             some |= active[i];
         }
         float *old = work_.spare_sums, *fresh = work_.more_sums;
@@ -137,8 +148,8 @@ class Batch : private BatchPixels {
                     if (!active[i]) continue;
                     const double moved = (static_cast<double>(old[row(n_) + i]) - moved_by[i]) * share_[i];
                     moved_by[i] += moved;
-                    armed[i] = static_cast<float>(-grid_.whole * moved_by[i]);
-                    active[i] = change[i] > 0.5f || grid_.whole * size(moved) > 0.25 ? 1 : 0;
+                    armed[i] = static_cast<float>(-grid_.folded() * moved_by[i]);
+                    active[i] = change[i] > 0.5f || grid_.folded() * size(moved) > 0.25 ? 1 : 0;
                     some |= active[i];
                 }
             }
@@ -162,7 +173,7 @@ class Batch : private BatchPixels {
     // K N is a real number here: rounded to an integer, the total would jump by sum w where K N steps by one.
     void set_blind() {
         for (int i = 0; i < kTeam; ++i) {
-            const double blind = grid_.whole * number_[i], whole = floor_of(blind);
+            const double blind = grid_.folded() * number_[i], whole = floor_of(blind);
             exposure_.armed[i] = grid_.pieces - static_cast<int32_t>(whole) + spare_[i];
             exposure_.part[i] = static_cast<float>(blind - whole);
         }
@@ -171,7 +182,7 @@ class Batch : private BatchPixels {
     // Integer sweeps until the lanes' histories repeat. Returns false on stop.
     template <bool periods, bool warm>
     bool sweep_integers() {
-        const Quantiles quantiles{work_.alpha, work_.beta, work_.dither, work_.exact, key0_, key1_};
+        const Quantiles quantiles{work_.alpha, work_.beta, work_.dither, work_.split, work_.exact, key0_, key1_};
         alignas(64) int32_t change[kTeam];
         float last[kTeam];
         const int sweeps = grid_.laps > 1 ? kLapSweeps : kIntegerSweeps;
@@ -189,7 +200,7 @@ class Batch : private BatchPixels {
                 if constexpr (periods) {
                     const double seen = static_cast<double>(static_cast<uint32_t>(work_.history[0][end + i]));
                     const double step = (seen - number_[i]) * share_[i];
-                    turn = grid_.whole * total_[i] * size(step);
+                    turn = grid_.folded() * total_[i] * size(step);
                     number_[i] += step;
                 }
                 const float moved = static_cast<float>(change[i]);

@@ -13,13 +13,54 @@
 #include "lanes/kernels.h"
 
 namespace mars {
+
+void feedback_check(const Job& job, const PulseTable& pulse, const FeedbackCheckCall& call, int threads) {
+    const int64_t number = call.number;
+    if (number == 0) return;
+    const auto kernel = kernel_at<const FeedbackCheck&>("", MARS_KERNELS(feedback_check_));
+    const CellGrid coarse(job, call.kinds, 1), fine(job, call.kinds, 1, 1);
+    const PulseEnergyTables energy(pulse.shape);
+    run_chunks((number + kTeam - 1) / kTeam, threads, Watch{}, [&](int64_t chunk, const std::atomic<bool>&) {
+        thread_local std::vector<double> memory, lit, parts;
+        const int64_t first = chunk * kTeam, bins = job.bins;
+        int64_t pixel[kTeam];
+        for (int64_t i = 0; i < kTeam; ++i) pixel[i] = call.pixels[std::min(first + i, number - 1)];
+        lit.resize(std::max(lit.size(), static_cast<size_t>(fine.grid.cells) * kTeam));
+        const LanePhotons photons(job, energy.energy, fine.grid, pixel, lit.data(), kTeam);
+        const int64_t room = feedback_check_doubles(fine.grid.cells, photons.lit_end - photons.lit_begin);
+        memory.resize(std::max(memory.size(), static_cast<size_t>(room)));
+        parts.assign(call.bins ? static_cast<size_t>(bins) * kTeam : 0, 0.0);
+        double square[kTeam];
+        int32_t sweeps[kTeam];
+        FeedbackCheck check{};
+        check.coarse = &coarse.grid;
+        check.fine = &fine.grid;
+        check.dark_photons = photons.dark;
+        check.lit_begin = photons.lit_begin;
+        check.lit_end = photons.lit_end;
+        check.lit_photons = lit.data();
+        check.exposures = job.cycles;
+        check.memory = memory.data();
+        check.square = square;
+        check.sweeps = sweeps;
+        check.bins = call.bins ? parts.data() : nullptr;
+        kernel(check);
+        for (int64_t i = 0; i < kTeam && first + i < number; ++i) {
+            call.distance[first + i] = std::sqrt(square[i]);
+            call.sweeps[first + i] = sweeps[i];
+            for (int64_t b = 0; call.bins && b < bins; ++b)
+                call.bins[(first + i) * bins + b] = parts[static_cast<size_t>(b * kTeam + i)];
+        }
+    });
+}
+
 template <class Count>
 void feedback_histogram(const Job& job, const PulseTable& pulse, Count* out, const FeedbackCall& call, int threads,
                         const std::string& level, const Watch& watch) {
     const int64_t number = call.number;
     if (number == 0) return;
     const auto kernel = kernel_at<const FeedbackBatch&, bool>(level, MARS_KERNELS(feedback_kernel_));
-    const CellGrid cells(job, call.merge, call.parts, call.narrow, call.laps);
+    const CellGrid cells(job, call.kinds, call.laps);
     const PulseEnergyTables energy(pulse.shape);
 
     // A stream is every `splits`-th realization of one pixel; a batch is kTeam streams.

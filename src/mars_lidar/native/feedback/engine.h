@@ -17,8 +17,7 @@ struct FeedbackCall {
     const int64_t* pixels;  // (number) of the job
     int64_t number;
     FeedbackStatus* status;  // (realizations, number): what became of each
-    int32_t merge, parts;    // base cells of a bin; parts of a narrow one
-    const uint8_t* narrow;   // (bins * merge): base cells that are cut again
+    const uint8_t* kinds;    // (bins): 2^kind cells for each bin, from half a period before the strongest return on
     int32_t laps;            // periods of a piece
 };
 
@@ -27,5 +26,17 @@ struct FeedbackCall {
 template <class Count>
 void feedback_histogram(const Job& job, const PulseTable& pulse, Count* out, const FeedbackCall& call, int threads,
                         const std::string& level, const Watch& watch);
+
+// The internal grid `kinds` of some pixels (number), judged by a finer one: D (number), the sweeps that it took
+// (number), and where `bins` is not null the parts (number, bins) of D^2.
+struct FeedbackCheckCall {
+    const int64_t* pixels;
+    int64_t number;
+    const uint8_t* kinds;
+    double* distance;
+    int32_t* sweeps;
+    double* bins;
+};
+void feedback_check(const Job& job, const PulseTable& pulse, const FeedbackCheckCall& call, int threads);
 
 }  // namespace mars

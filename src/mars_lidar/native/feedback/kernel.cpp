@@ -1,9 +1,11 @@
 // The feedback engine at one vector level: a batch of lanes (feedback/batch.h), each of which draws exposures of a
 // pixel of its own.
 #include "feedback/batch.h"
+#include "feedback/check.h"
 
 namespace mars {
 
 bool MARS_JOIN(feedback_kernel_, MARS_LEVEL)(const FeedbackBatch& batch) { return Batch(batch).run(); }
+void MARS_JOIN(feedback_check_, MARS_LEVEL)(const FeedbackCheck& check) { GridCheck(check).run(); }
 
 }  // namespace mars

@@ -26,11 +26,14 @@ struct FeedbackEdge {
     float part;  // f, 0 <= f < 1
 };
 
+// A bin of the histogram is one cell, or cut into 2^k of them, k below this.
+constexpr int kKinds = 17;
+
 // One laser period on n internal cells; dead time K periods and a rest of at least two cells, at most one period and
 // a cell. All lanes share the grid; theirs is the period from the lane's first bin on. Made by feedback/grid.h.
 //
-// The integer sweeps run round a circle of L laser periods (laps), which pieces of the exposure go through together,
-// L > 1 for K = 0 only. What the pieces leave of the exposure, less than L periods, is drawn photon by photon.
+// The integer sweeps run round a circle of L laser periods (laps), which pieces of the exposure go through together;
+// L = 1, or L > K + 1. What the pieces leave of the exposure, less than L periods, is drawn photon by photon.
 struct FeedbackGrid {
     int32_t cells;                 // n
     int32_t bins;                  // of the histogram
@@ -40,8 +43,8 @@ struct FeedbackGrid {
     const FeedbackEdge* lap_edge;  // (L n + 1) of the laps
     const double* place;           // (n + 1) of the edges, in periods
     const int32_t* bin_cell;       // (bins + 1) cell that each bin of the histogram begins with
-    const uint8_t* narrow;         // (n) 1: a cell of the finer kind
-    double width[2];               // of the wide and the narrow cells, in periods
+    const uint8_t* kind;           // (n) k of each cell
+    double width[kKinds];          // of the cells of each kind, in periods
     double dead_time;              // in periods
     int32_t laps;                  // L
     int32_t pieces;                // floor(N_r / L)
@@ -49,6 +52,8 @@ struct FeedbackGrid {
     bool stationary;
 
     int32_t path() const { return cells * laps; }  // cells of all laps
+    // Whole periods of the dead time that a sweep of one period leaves to the term K N; several laps look back to them.
+    int32_t folded() const { return laps == 1 ? whole : 0; }
 };
 
 // What became of an exposure. Refused ones are not written.
@@ -64,14 +69,14 @@ enum class FeedbackStatus : uint8_t {
 };
 
 // Pixels that need more laps than these are refused: every lap is a period of cells in memory.
-constexpr int32_t kMostLaps = 64;
+constexpr int32_t kMostLaps = 128;
 
 // One batch: kTeam exposures at a time, each lane its own pixel. A lane counts cells from a first bin of its own, so
 // that the pulses of different pixels lie in the same cells.
 struct FeedbackBatch {
     const FeedbackGrid* grid;
     const int32_t* first_bin;     // (kTeam): bin of the histogram that the lane's period begins with
-    const double* dark_photons;   // (2, kTeam): per period in a cell without signal, of the wide and the narrow kind
+    const double* dark_photons;   // (kKinds, kTeam): per period in a cell of each kind without signal
     int32_t lit_begin, lit_end;   // cells that may have signal ...
     const double* lit_photons;    // ... (lit_end - lit_begin, kTeam): theirs, background included
     int64_t lit_row;              // from cell to cell of these
@@ -99,12 +104,28 @@ struct FeedbackBatch {
 // Scratch of a batch, or of as many as share rows: `lit` of its cells may have signal.
 inline int64_t feedback_bytes(int64_t cells, int64_t laps, int64_t lit) {
     const int64_t row = kRow, rows = cells * row, path = laps * rows;
-    const int64_t periodic = 4 * row + 2 * lit * row + 4 * (rows + row), whole = 4 * (path + row);
+    const int64_t periodic = 2 * kKinds * row + 2 * lit * row + 4 * (rows + row), whole = 4 * (path + row);
     const int64_t photons = laps > 1 ? 8 * (rows + row) : 0;
-    return 4 * (periodic + whole) + photons + 2 * (path + row) + 4 * laps * cells * kTeams + 64 * 32;  // room to align
+    return 4 * (periodic + whole) + photons + 4 * (path + row) + 4 * laps * cells * kTeams + 64 * 32;  // room to align
 }
 
+// A batch of pixels whose mean on a grid is judged by a grid of half its cells' width (feedback/check.h).
+struct FeedbackCheck {
+    const FeedbackGrid *coarse, *fine;
+    const double* dark_photons;  // (kKinds, kTeam) ...
+    int32_t lit_begin, lit_end;
+    const double* lit_photons;  // ... as in FeedbackBatch, of the finer grid
+    double exposures;           // N_r
+    double* memory;             // `feedback_check_doubles` of scratch
+    double* square;             // (kTeam): D^2
+    int32_t* sweeps;            // (kTeam): until the mean was settled, 201 where it was not
+    double* bins;               // (bins, kTeam): parts of D^2 that narrower cells would lessen, 0 at first; or null
+};
+
+inline int64_t feedback_check_doubles(int64_t cells, int64_t lit) { return (2 * kKinds + 2 * lit + cells + 1) * kRow; }
+
 #if !defined(__CUDACC_RTC__)
+MARS_DECLARE_KERNEL(void, feedback_check_, const FeedbackCheck& check)
 // Returns false where a count does not fit into its histogram bin.
 MARS_DECLARE_KERNEL(bool, feedback_kernel_, const FeedbackBatch& batch)
 #endif

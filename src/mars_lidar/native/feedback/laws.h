@@ -14,7 +14,8 @@ MARS_INLINE double floor_of(double x) {
 }
 
 // A row of p = 1 - e^-l and q = 1 - p / l: Taylor series at l / 64, then six times 1 - e^-2x = p (2 - p).
-MARS_NOINLINE void set_rates(const double* photons, float* fire, float* refire) {
+template <class Real>
+MARS_NOINLINE void set_rates(const double* photons, Real* fire, Real* refire) {
     for (int i = 0; i < kTeam; ++i) {
         const double l = photons[i] < 40.0 ? photons[i] : 40.0, x = l * 0x1p-6;
         double p = 1.0;
@@ -38,44 +39,49 @@ MARS_NOINLINE void set_rates(const double* photons, float* fire, float* refire) 
         p *= 2.0 - p;
         const double series = l * (0.5 - l * (1.0 / 6 - l * (1.0 / 24 - l * (1.0 / 120 - l * (1.0 / 720)))));
         const double bright = photons[i] > 1e-300 ? photons[i] : 1e-300;
-        fire[i] = static_cast<float>(p);
-        refire[i] = static_cast<float>(l < 0.02 ? series : 1.0 - p / bright);
+        fire[i] = static_cast<Real>(p);
+        refire[i] = static_cast<Real>(l < 0.02 ? series : 1.0 - p / bright);
     }
 }
 
 // A row of lanes of MeanLaw: arrays that do not overlap, for the loop to vectorise.
 MARS_NOINLINE void mean_row(const float* __restrict__ p, const float* __restrict__ q, const History<float>::Rows& back,
-                            float part, const float* __restrict__ here, const float* __restrict__ scale,
-                            float* __restrict__ re, float* __restrict__ mean, float* __restrict__ variance,
+                            float part, const float* __restrict__ scale, float* __restrict__ re,
+                            float* __restrict__ left, float* __restrict__ mean, float* __restrict__ variance,
                             float* __restrict__ armed_now) {
     const float *late = back.late, *early = back.early, *gone = back.gone;
     for (int i = 0; i < kTeam; ++i) {
-        const float then = late[i] - gone[i] - part * (late[i] - early[i]);
-        float armed = scale[i] * (1.0f - (here[i] - re[i])), in = scale[i] * (then - re[i]);
-        armed = armed > 0.0f ? armed : 0.0f;
+        const float then = late[i] - gone[i] - part * (late[i] - early[i]), armed = left[i];
+        float in = scale[i] * (then - re[i]);
         in = in > 0.0f ? in : 0.0f;
         re[i] = then;
+        left[i] = (1.0f - p[i]) * armed + (1.0f - q[i]) * in;
         mean[i] = p[i] * armed + q[i] * in;
         variance[i] = p[i] * (1.0f - p[i]) * armed + q[i] * (1.0f - q[i]) * in;
         armed_now[i] = armed;
     }
 }
 
-// Mean and variance of every cell's count given its past, at the means; cells in order.
+// Mean and variance of every cell's count given its past, at the means; cells in order. The armed are followed from cell
+// to cell: as 1 - (C - RA), those left in the shadow of a bright pulse would be what the last sweep has moved.
 class MeanLaw {
  public:
     alignas(64) float mean[kTeam], variance[kTeam], armed[kTeam];
 
     // `sums`: prefix sums of the mean at K = 0; `scale`: N_r / (1 + K sum w), what it is to be multiplied by.
     MeanLaw(const FeedbackGrid& grid, const Rates& rates, const float* sums, const float* scale)
-        : edge_(grid.edge), rates_(rates), sums_(sums), scale_(scale), history_(sums, sums, grid.cells) {
-        for (int i = 0; i < kTeam; ++i) re_[i] = rearmed_before(history_.at(edge_[0]), edge_[0].part, i);
+        : edge_(grid.edge), rates_(rates), scale_(scale), history_(sums, sums, grid.cells) {
+        for (int i = 0; i < kTeam; ++i) {
+            re_[i] = rearmed_before(history_.at(edge_[0]), edge_[0].part, i);
+            const float left = scale[i] * (1.0f + re_[i]);
+            left_[i] = left > 0.0f ? left : 0.0f;
+        }
     }
 
     MARS_INLINE void next(int32_t j) {
         const FeedbackEdge& edge = edge_[j + 1];
-        mean_row(rates_.fire(j), rates_.refire(j), history_.at(edge), edge.part, sums_ + static_cast<int64_t>(j) * kRow,
-                 scale_, re_, mean, variance, armed);
+        mean_row(rates_.fire(j), rates_.refire(j), history_.at(edge), edge.part, scale_, re_, left_, mean, variance,
+                 armed);
     }
 
     // A bit per lane of cell j that has fewer than `few` exposures armed and a mean above `counts`, or fires with a
@@ -94,10 +100,57 @@ class MeanLaw {
  private:
     const FeedbackEdge* edge_;
     const Rates& rates_;
-    const float *sums_, *scale_;
+    const float* scale_;
     const History<float> history_;
-    alignas(64) float re_[kTeam];
+    alignas(64) float re_[kTeam], left_[kTeam];
 };
+
+// Where within their cells the re-armed were registered. `split` (L n + 1 rows): a uniform number of 16 bits for every edge,
+// replaced by the share of its source cell that comes after it, in 2^-16. H registrations of a cell are spread over it
+// evenly and independently; what lies after an edge is a binomial part of H, those after the next edge in the same
+// cell a part of these. A share of mean g has the variance g (1 - g) (n - 1) / n^2, n = H at the mean: one dither for
+// the cell adds that of a single registration. Uniform where it can be, else of two values.
+MARS_NOINLINE void place_rearmed(const FeedbackGrid& grid, const float* sums, const float* scale, uint16_t* split) {
+    const int32_t path = grid.path(), n = grid.cells;
+    alignas(64) float number[kTeam], left[kTeam];
+    int32_t source = -1;
+    float before = 1.0f;
+    auto edge_at = [&](int32_t t) {
+        const FeedbackEdge& edge = grid.lap_edge[t];
+        uint16_t* const shares = split + static_cast<int64_t>(t) * kRow;
+        if (edge.early != source) {
+            source = edge.early;
+            before = 1.0f;
+            const float *from = sums + static_cast<int64_t>(source % n) * kRow, *to = from + kRow;
+            for (int i = 0; i < kTeam; ++i) {
+                number[i] = (to[i] - from[i]) * scale[i];
+                left[i] = 1.0f;
+            }
+        }
+        const float f = edge.part, g = f / before, rest = 1.0f - g;
+        before = f > 0.0f ? f : 1.0f;
+        if (!(f > 0.0f)) {
+            for (int i = 0; i < kTeam; ++i) shares[i] = 0;
+            return;
+        }
+        const float nearer = g < rest ? g : rest;
+        for (int i = 0; i < kTeam; ++i) {
+            const float u = (static_cast<float>(shares[i]) + 0.5f) * 0x1p-16f, m = number[i] * left[i];
+            const float spread = m > 1.0f ? (m - 1.0f) / (m * m) : 0.0f, variance = g * rest * spread;
+            const float wide = root(3.0f * variance), even = g + wide * (2.0f * u - 1.0f);
+            const float often = g / (g + rest * spread), odd = u < often ? g + rest * spread : 0.0f;
+            const float share = left[i] * (wide <= nearer ? even : odd);
+            const float x = share * 0x1p16f + 0.5f;
+            left[i] = share;
+            shares[i] = static_cast<uint16_t>(x < 65535.0f ? x : 65535.0f);
+        }
+    };
+    int32_t first = 1;
+    while (first < path && grid.lap_edge[first].early == grid.lap_edge[0].early) ++first;
+    for (int32_t t = first; t <= path; ++t) edge_at(t);
+    for (int i = 0; i < kTeam; ++i) split[i] = split[static_cast<int64_t>(path) * kRow + i];
+    for (int32_t t = 1; t < first; ++t) edge_at(t);
+}
 
 // Sweep of the adjoint, backwards, for the variance of the count: y_j = 1 - (what one registration more in cell j takes
 // from the means of the later cells). Edges e < e0 do not yet see all of cell j; it re-arms 1 - f_e of itself at the

@@ -52,7 +52,7 @@ struct PulseEnergy {
 class LanePhotons {
  public:
     int32_t first_bin[kTeam];
-    double dark[2 * kTeam];
+    double dark[kKinds * kTeam];
     int32_t lit_begin, lit_end;
 
     // `lit` has room for all cells, `row` from one to the next.
@@ -61,12 +61,11 @@ class LanePhotons {
         : grid_(grid), low_(energy.low), high_(energy.high), lit_(lit), row_(row) {
         for (int i = 0; i < kTeam; ++i) {
             first_bin[i] = place(job, pixels[i]);
-            dark[i] = job.background[pixels[i]] * grid.width[0];
-            dark[kTeam + i] = job.background[pixels[i]] * grid.width[1];
+            for (int k = 0; k < kKinds; ++k) dark[k * kTeam + i] = job.background[pixels[i]] * grid.width[k];
         }
         set_range(job, pixels);
         for (int32_t j = lit_begin; j < lit_end; ++j) {
-            const double* level = dark + kTeam * grid_.narrow[j];
+            const double* level = dark + kTeam * grid_.kind[j];
             for (int i = 0; i < kTeam; ++i) lit_[(j - lit_begin) * row_ + i] = level[i];
         }
         for (int i = 0; i < kTeam; ++i) {

@@ -36,11 +36,12 @@ class BatchPixels {
     // measured contraction. sum p / (1 + sum p t_d) in all.
     void spread_evenly() {
         alignas(64) float fired[kTeam];
-        float cells[2] = {0.0f, 0.0f};  // without signal: wide and narrow ones
+        float cells[kKinds] = {};  // of each kind without signal
         for (int32_t j = 0; j < n_; ++j)
-            if (j < batch_.lit_begin || j >= batch_.lit_end) cells[grid_.narrow[j]] += 1.0f;
-        const float *wide = work_.rates.dark_fire, *narrow = wide + kRow;
-        for (int i = 0; i < kTeam; ++i) fired[i] = cells[0] * wide[i] + cells[1] * narrow[i];
+            if (j < batch_.lit_begin || j >= batch_.lit_end) cells[grid_.kind[j]] += 1.0f;
+        for (int i = 0; i < kTeam; ++i) fired[i] = 0.0f;
+        for (int k = 0; k < kKinds; ++k)
+            for (int i = 0; i < kTeam; ++i) fired[i] += cells[k] * work_.rates.dark_fire[k * kRow + i];
         for (int32_t j = batch_.lit_begin; j < batch_.lit_end; ++j) {
             const float* p = work_.rates.fire(j);
             for (int i = 0; i < kTeam; ++i) fired[i] += p[i];
@@ -121,7 +122,7 @@ class BatchPixels {
             const double law = variance_matters(i)
                                    ? variance[i] * grid_.laps * share_[i] * share_[i]
                                    : mean_[i] * static_cast<double>((1.0f + rate_[i]) / (1.0f - rate_[i]));
-            if (grid_.whole > 0 && law < kLeastVariance * grid_.whole) refuse(i, FeedbackStatus::kLocked);
+            if (grid_.folded() > 0 && law < kLeastVariance * grid_.folded()) refuse(i, FeedbackStatus::kLocked);
             deviation_[i] = root(law > 0.0 ? law : 0.0);
             const double error = kMeanError * mean_[i] / static_cast<double>(1.0f - lesser(rate_[i], kSlowest));
             const double most = 8.0 * deviation_[i] + 8.0 + 2.0 * total_[i] + error;
@@ -132,7 +133,7 @@ class BatchPixels {
         }
     }
 
-    bool variance_matters(int i) const { return grid_.whole > 0 || grid_.laps > 1 || rate_[i] > kLinearFrom; }
+    bool variance_matters(int i) const { return grid_.folded() > 0 || grid_.laps > 1 || rate_[i] > kLinearFrom; }
 
     // Lanes for which one lap is not enough, or not this number, are refused with the number that is. `armed`: the
     // fewest exposures armed in any cell. Also how many sweeps a lane goes through at least.

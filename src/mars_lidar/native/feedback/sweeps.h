@@ -10,9 +10,9 @@
 namespace mars {
 inline namespace MARS_LEVEL {
 
-// p and q of all cells and lanes: one row each for the wide and the narrow cells without signal.
+// p and q of all cells and lanes: one row for each kind of cell without signal.
 struct Rates {
-    const uint8_t* narrow;
+    const uint8_t* kind;
     int32_t lit_begin, lit_end;
     const float *dark_fire, *dark_refire, *lit_fire, *lit_refire;
 
@@ -22,7 +22,7 @@ struct Rates {
  private:
     MARS_INLINE const float* pick(int32_t j, const float* dark, const float* lit) const {
         return j >= lit_begin && j < lit_end ? lit + static_cast<int64_t>(j - lit_begin) * kRow
-                                             : dark + static_cast<int64_t>(narrow[j]) * kRow;
+                                             : dark + static_cast<int64_t>(kind[j]) * kRow;
     }
 };
 
@@ -142,6 +142,7 @@ struct Exposure {
 struct Quantiles {
     const float *alpha, *beta;
     const uint16_t* dither;  // in 2^-16
+    const uint16_t* split;   // (edges, kTeam): the draw's own f, in 2^-16
     const uint32_t* exact;   // (cells, kTeams)
     const uint32_t *key0, *key1;
 };
@@ -193,7 +194,8 @@ MARS_NOINLINE void integer_sweep(const FeedbackGrid& grid, const Rates& rates, c
     alignas(64) int32_t armed[kTeam], rearmed[kTeam], count[kTeam];
     Moves<int32_t> moves(INT32_MAX / 2);
     // One lot for each cell in which the re-armed were registered: whatever the edges, their order is kept.
-    auto rearmed_by = [](const History<int32_t>::Rows& back, float part, uint16_t lot, int i) {
+    auto rearmed_by = [](const History<int32_t>::Rows& back, uint16_t split, uint16_t lot, int i) {
+        const float part = static_cast<float>(split) * 0x1p-16f;
         const float late = part * static_cast<float>(minus(back.late[i], back.early[i]));
         const int32_t whole = static_cast<int32_t>(late + static_cast<float>(lot) * 0x1p-16f);
         return minus(minus(back.late[i], back.gone[i]), whole);
@@ -202,7 +204,7 @@ MARS_NOINLINE void integer_sweep(const FeedbackGrid& grid, const Rates& rates, c
     for (int i = 0; i < kTeam; ++i) {
         fresh[i] = c[i] = negative[i] = 0;
         phase[i] = path - 1 - exposure.edge[i];
-        re[i] = rearmed_by(history.at(grid.lap_edge[0]), grid.lap_edge[0].part, lots(grid.lap_edge[0])[i], i);
+        re[i] = rearmed_by(history.at(grid.lap_edge[0]), quantiles.split[i], lots(grid.lap_edge[0])[i], i);
         const int32_t before = old[static_cast<int64_t>(exposure.edge[i]) * kRow + i];
         mark[i] = minus(minus(before, history.less[1][i]), exposure.rank[i]);
     }
@@ -217,17 +219,17 @@ MARS_NOINLINE void integer_sweep(const FeedbackGrid& grid, const Rates& rates, c
                 }
             }
             const FeedbackEdge& edge = grid.lap_edge[t + 1];
-            const float *p = rates.fire(j), *q = rates.refire(j), part = edge.part;
+            const float *p = rates.fire(j), *q = rates.refire(j);
             const auto back = history.at(edge);
             const int64_t row = static_cast<int64_t>(t) * kRow;
             const float *alpha = quantiles.alpha + row, *beta = quantiles.beta + row;
-            const uint16_t* const lot = lots(edge);
+            const uint16_t *const lot = lots(edge), *const split = quantiles.split + row + kRow;
             const int32_t* before = old + row + kRow;
             int32_t* after = fresh + row + kRow;
             const double golden = 0.61803398874989485 * j;  // evenly over the cells and over [0, 1)
             const float turn = static_cast<float>(golden - static_cast<double>(static_cast<int64_t>(golden)));
             auto quantise = [&](int i) {
-                const int32_t next = rearmed_by(back, part, lot[i], i);
+                const int32_t next = rearmed_by(back, split[i], lot[i], i);
                 int32_t extra = 0, in = minus(next, re[i]);
                 if constexpr (warm) {
                     phase[i] = phase[i] + 1 == path ? 0 : phase[i] + 1;

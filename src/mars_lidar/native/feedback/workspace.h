@@ -25,6 +25,7 @@ struct Workspace {
     int32_t* history[2];       // (L n + 1, kTeam): prefix sums of the draw, and of the sweep before
     float *alpha, *beta;       // (L n, kTeam)
     uint16_t* dither;          // (L n, kTeam)
+    uint16_t* split;           // (L n + 1, kTeam)
     uint32_t* exact;           // (L n, kTeams)
 
     explicit Workspace(const FeedbackBatch& batch) {
@@ -37,15 +38,15 @@ struct Workspace {
             at += count * static_cast<int64_t>(sizeof(*pointer));
         };
         float *dark_fire, *dark_refire, *lit_fire, *lit_refire;
-        take(dark_fire, 2 * row);
-        take(dark_refire, 2 * row);
+        take(dark_fire, kKinds * row);
+        take(dark_refire, kKinds * row);
         take(lit_fire, batch.lit_room * row);
         take(lit_refire, batch.lit_room * row);
-        for (int k = 0; k < 2; ++k)
+        for (int k = 0; k < kKinds; ++k)
             set_rates(batch.dark_photons + k * kTeam, dark_fire + k * row, dark_refire + k * row);
         for (int64_t k = 0; k < lit; ++k)
             set_rates(batch.lit_photons + k * batch.lit_row, lit_fire + k * row, lit_refire + k * row);
-        rates = {batch.grid->narrow, batch.lit_begin, batch.lit_end, dark_fire, dark_refire, lit_fire, lit_refire};
+        rates = {batch.grid->kind, batch.lit_begin, batch.lit_end, dark_fire, dark_refire, lit_fire, lit_refire};
         take(sums, rows + row);
         take(spare_sums, rows + row);
         take(noise, rows);
@@ -56,6 +57,7 @@ struct Workspace {
         take(alpha, path);
         take(beta, path);
         take(dither, path);
+        take(split, path + row);
         take(exact, batch.grid->path() * static_cast<int64_t>(kTeams));
         if (batch.grid->laps > 1) sum_photons(batch);
     }
@@ -66,7 +68,7 @@ struct Workspace {
         for (int32_t j = 0; j < batch.grid->cells; ++j) {
             const bool lit = j >= batch.lit_begin && j < batch.lit_end;
             const double* more = lit ? batch.lit_photons + (j - batch.lit_begin) * batch.lit_row
-                                     : batch.dark_photons + batch.grid->narrow[j] * kTeam;
+                                     : batch.dark_photons + batch.grid->kind[j] * kTeam;
             const int64_t row = static_cast<int64_t>(j) * kRow;
             for (int i = 0; i < kTeam; ++i) photons[row + kRow + i] = photons[row + i] + more[i];
         }

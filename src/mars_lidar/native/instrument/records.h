@@ -1,5 +1,6 @@
-// Registrations with their times, of which nobody knows how many there will be before all are drawn. Each block of items
-// is told into memory of its own, which stays in the caches, and copied to its place as soon as the blocks before it are
+// Registrations with their times, of which nobody knows how many there will be before all are drawn. A record is 8 bytes:
+// the laser period, and the phase in it, in [0, 1], from which time and bin follow. Each block of items is told into memory
+// of its own, which stays in the caches, and copied to its place as soon as the blocks before it are
 // done and their numbers known.
 #pragma once
 #include <map>
@@ -11,13 +12,29 @@
 
 namespace mars {
 
-// Where registrations are told: times in periods.
+// Where registrations are told.
 struct RecordArrays {
-    double* times;
-    int32_t *cycles, *bins;
+    int32_t* cycles;
+    float* phases;
 
-    RecordArrays from(int64_t record) const { return {times + record, cycles + record, bins + record}; }
+    RecordArrays from(int64_t record) const { return {cycles + record, phases + record}; }
 };
+
+// The bin of a phase: that of exact/step.h.
+inline int32_t record_bin(float phase, int32_t bins) {
+    const int32_t bin = static_cast<int32_t>(phase * static_cast<float>(bins));
+    return bin < bins ? bin : bins - 1;
+}
+
+// `phase` in single precision, moved by as little as puts it into `bin`, which was found before it was rounded.
+float phase_in_bin(double phase, int32_t bin, int32_t bins);
+
+// Times out (n) = (period + phase) * period_ns, and bins out (n), of n records.
+void record_times(const int32_t* cycles, const float* phases, double period_ns, double* out, int64_t n, int threads);
+void record_bins(const float* phases, int32_t bins, int32_t* out, int64_t n, int threads);
+
+// Puts the records of each item, [offsets[i], offsets[i + 1]), in order of time.
+void sort_records(const int64_t* offsets, int64_t items, const RecordArrays& records, int threads);
 
 // The registrations of a block as lanes tell them: runs of one item each, in order of time for each item. Kernels of
 // every vector level write here, so that what they call is not compiled with them.
@@ -42,8 +59,8 @@ class RecordRuns {
 
  private:
     struct Segment {
-        std::unique_ptr<double[]> times;
-        std::unique_ptr<int32_t[]> cycles, bins;
+        std::unique_ptr<int32_t[]> cycles;
+        std::unique_ptr<float[]> phases;
     };
     std::vector<Segment> segments_;
     size_t begun_ = 0;  // segments

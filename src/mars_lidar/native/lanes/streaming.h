@@ -10,19 +10,18 @@
 namespace mars {
 inline namespace MARS_LEVEL {
 
-// Moves as many of n counters from `from` (aligned to 16 bytes) to `to` as whole lines of the cache hold, and leaves
-// zeros behind. Returns how many: 0 where `to` is not aligned, or the processor has no such stores.
+// Moves as many of n counters from `from` (aligned to 16 bytes) to `to` as there are whole eights, and leaves zeros
+// behind. Returns how many: 0 where `to` is not aligned, or the processor has no such stores. Plain stores to what is
+// left of a row should be few: they make the processor give up the line that it was putting together.
 MARS_INLINE int64_t stream_counters([[maybe_unused]] uint16_t* from, [[maybe_unused]] uint16_t* to,
                                     [[maybe_unused]] int64_t n) {
     int64_t j = 0;
 #if defined(MARS_STREAMS)
-    constexpr int64_t kLine = 32;  // counters
     if (reinterpret_cast<uintptr_t>(to) % 16 != 0) return 0;
-    for (; j + kLine <= n; j += kLine) {
+    for (; j + 8 <= n; j += 8) {
         __m128i* const here = reinterpret_cast<__m128i*>(from + j);
-        __m128i* const there = reinterpret_cast<__m128i*>(to + j);
-        for (int k = 0; k < 4; ++k) _mm_stream_si128(there + k, here[k]);
-        for (int k = 0; k < 4; ++k) here[k] = _mm_setzero_si128();
+        _mm_stream_si128(reinterpret_cast<__m128i*>(to + j), *here);
+        *here = _mm_setzero_si128();
     }
 #endif
     return j;

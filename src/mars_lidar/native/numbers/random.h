@@ -1,4 +1,5 @@
-// Counter-based random numbers: a draw is a pure function of (seed, realization, pixel, event, stage).
+// Counter-based random numbers: a draw is a pure function of (seed, realization, pixel, event, stage). What the exact
+// engine draws at every registration comes from a stream that such a draw starts (numbers/word_stream.h).
 //
 // Threefry-2x32 of Salmon, Moraes, Dror and Shaw, "Parallel random numbers: as easy as 1, 2, 3", SC 2011:
 // 20 rounds for keys, 13 for the draws of one stream (13 is the smallest number that passes BigCrush there).

@@ -91,43 +91,72 @@ void bind_sequential_timestamps(nb::module_& module) {
 }
 
 // Arrays of records with room for the same number.
-RecordArrays records_in(const Vector<double>& times, const Vector<int32_t>& cycle, const Vector<int32_t>& bin) {
-    if (size_of(cycle) != size_of(times) || size_of(bin) != size_of(times))
-        throw nb::value_error("times, cycle and bin must be of one length");
-    return {times.data(), cycle.data(), bin.data()};
+RecordArrays records_in(const Vector<int32_t>& cycle, const Vector<float>& phase) {
+    if (size_of(cycle) != size_of(phase)) throw nb::value_error("cycle and phase must be of one length");
+    return {cycle.data(), phase.data()};
 }
 
 void bind_exact_records(nb::module_& module) {
     nb::class_<RecordsInOrder>(module, "RecordsInOrder", "Registrations drawn once, by `exact_records`.")
         .def(
             "rest",
-            [](RecordsInOrder& self, const Vector<double>& times, const Vector<int32_t>& cycle,
-               const Vector<int32_t>& bin) {
-                const RecordArrays to = records_in(times, cycle, bin);
-                if (size_of(times) != self.total()) throw nb::value_error("the arrays must hold offsets[-1] records");
+            [](RecordsInOrder& self, const Vector<int32_t>& cycle, const Vector<float>& phase) {
+                const RecordArrays to = records_in(cycle, phase);
+                if (size_of(cycle) != self.total()) throw nb::value_error("the arrays must hold offsets[-1] records");
                 const nb::gil_scoped_release release;
                 self.rest(to);
             },
-            "times"_a.noconvert(), "cycle"_a.noconvert(), "bin"_a.noconvert(),
+            "cycle"_a.noconvert(), "phase"_a.noconvert(),
             "Fill in what there was no room for, in arrays that begin as those that were filled and hold all.");
     module.def(
         "exact_records",
-        [](const BoundJob& job, const PulseTable& pulse, Vector<int64_t> offsets, const Vector<double>& times,
-           const Vector<int32_t>& cycle, const Vector<int32_t>& bin, int threads, const nb::object& progress,
-           const std::string& level) {
+        [](const BoundJob& job, const PulseTable& pulse, Vector<int64_t> offsets, const Vector<int32_t>& cycle,
+           const Vector<float>& phase, int threads, const nb::object& progress, const std::string& level) {
             if (size_of(offsets) != job.items() + 1) throw nb::value_error("offsets must have items + 1 values");
-            auto records = std::make_unique<RecordsInOrder>(offsets.data(), job.items(), records_in(times, cycle, bin),
-                                                            size_of(times));
+            auto records =
+                std::make_unique<RecordsInOrder>(offsets.data(), job.items(), records_in(cycle, phase), size_of(cycle));
             Output output{};
             output.sink = Sink::kTimestamps;
             output.records = records.get();
             watched(progress, [&](const Watch& watch) { exact(job, pulse, output, threads, watch, level); });
             return records;
         },
-        "job"_a, "pulse"_a, "offsets"_a.noconvert(), "times"_a.noconvert(), "cycle"_a.noconvert(), "bin"_a.noconvert(),
-        "threads"_a, "progress"_a.none(), "level"_a,
-        "Registrations item after item, item i in [offsets[i], offsets[i + 1]), times in periods: the draws of the "
-        "histogram. Offsets are filled; what the other arrays have no room for is kept.");
+        "job"_a, "pulse"_a, "offsets"_a.noconvert(), "cycle"_a.noconvert(), "phase"_a.noconvert(), "threads"_a,
+        "progress"_a.none(), "level"_a,
+        "Registrations item after item, item i in [offsets[i], offsets[i + 1]): the laser period and the phase in it, "
+        "in "
+        "[0, 1], of the draws of the histogram. Offsets are filled; what the other arrays have no room for is kept.");
+    module.def(
+        "record_times",
+        [](const Vector<const int32_t>& cycle, const Vector<const float>& phase, double period_ns,
+           const Vector<double>& out, int threads) {
+            if (size_of(cycle) != size_of(out) || size_of(phase) != size_of(out))
+                throw nb::value_error("cycle, phase and out must be of one length");
+            const nb::gil_scoped_release release;
+            record_times(cycle.data(), phase.data(), period_ns, out.data(), size_of(out), threads);
+        },
+        "cycle"_a, "phase"_a, "period_ns"_a, "out"_a.noconvert(), "threads"_a, "Times of records: out (n).");
+    module.def(
+        "record_bins",
+        [](const Vector<const float>& phase, int32_t bins, const Vector<int32_t>& out, int threads) {
+            if (size_of(phase) != size_of(out)) throw nb::value_error("phase and out must be of one length");
+            const nb::gil_scoped_release release;
+            record_bins(phase.data(), bins, out.data(), size_of(out), threads);
+        },
+        "phase"_a, "bins"_a, "out"_a.noconvert(), "threads"_a, "Bins of records: out (n).");
+    module.def(
+        "sort_records",
+        [](const Vector<const int64_t>& offsets, const Vector<int32_t>& cycle, const Vector<float>& phase,
+           int threads) {
+            const int64_t items = size_of(offsets) - 1;
+            const RecordArrays records = records_in(cycle, phase);
+            if (items < 0 || offsets.data()[items] != size_of(cycle))
+                throw nb::value_error("the arrays must hold offsets[-1] records");
+            const nb::gil_scoped_release release;
+            sort_records(offsets.data(), items, records, threads);
+        },
+        "offsets"_a, "cycle"_a.noconvert(), "phase"_a.noconvert(), "threads"_a,
+        "Put the records of each item in order of time.");
 }
 
 }  // namespace

@@ -27,8 +27,8 @@ DeviceTask task_of(const BoundJob& job, const PulseTable& pulse, const nb::dict&
                                 tables.upper, "end", tables.end, "periods_per_energy", tables.periods_per_energy,
                                 "signal", task.signal, "delay", task.delay, "background", task.background,
                                 "pixel_index", task.pixel_index, "order", task.order, "start_cycle", task.start_cycle,
-                                "start_phase", task.start_phase, "out", task.out, "offsets", task.offsets, "times",
-                                task.times, "cycles", task.cycles, "bins", task.bins);
+                                "start_phase", task.start_phase, "out", task.out, "offsets", task.offsets, "cycles",
+                                task.cycles, "phases", task.phases);
     return task;
 }
 

@@ -13,12 +13,11 @@ namespace mars {
 namespace {
 
 // The grid, to be copied to the device.
-nb::dict grid_arrays(const BoundJob& job, int32_t merge, int32_t parts, Vector<const uint8_t> narrow, int32_t laps) {
-    if (merge < 1 || parts < 1 || static_cast<int64_t>(narrow.shape(0)) != int64_t{job.bins} * merge)
-        throw nb::value_error("narrow must be (bins * merge)");
-    const CellGrid cells(job, merge, parts, narrow.data(), laps);
+nb::dict grid_arrays(const BoundJob& job, Vector<const uint8_t> kinds, int32_t laps) {
+    if (size_of(kinds) != job.bins) throw nb::value_error("kinds must be (bins)");
+    const CellGrid cells(job, kinds.data(), laps);
     return arrays_of("edge", cells.edge(), "lap_edge", cells.lap_edge(), "place", cells.place(), "bin_cell",
-                     cells.bin_cell(), "narrow", cells.narrow());
+                     cells.bin_cell(), "kind", cells.kind());
 }
 
 nb::dict pulse_arrays(const PulseTable& pulse) {
@@ -26,8 +25,8 @@ nb::dict pulse_arrays(const PulseTable& pulse) {
     return arrays_of("tail", tables.tail, "density", tables.density, "knots", pulse.shape.knots);
 }
 
-nb::bytes task_of(const BoundJob& job, const PulseTable& pulse, int32_t merge, int32_t parts,
-                  Vector<const uint8_t> narrow, int32_t laps, const nb::dict& addresses, const nb::dict& numbers) {
+nb::bytes task_of(const BoundJob& job, const PulseTable& pulse, Vector<const uint8_t> kinds, int32_t laps,
+                  const nb::dict& addresses, const nb::dict& numbers) {
     const DeviceFields fields(addresses, numbers);
     FeedbackTask task{};
     task.job = job;
@@ -38,10 +37,10 @@ nb::bytes task_of(const BoundJob& job, const PulseTable& pulse, int32_t merge, i
     const PulseEnergyTables tables(pulse.shape);
     task.energy = tables.energy;
     fields.set("tail", task.energy.tail, "density", task.energy.density, "knots", task.energy.sampled.knots);
-    const CellGrid cells(job, merge, parts, narrow.data(), laps);
+    const CellGrid cells(job, kinds.data(), laps);
     task.grid = cells.grid;
     fields.set("edge", task.grid.edge, "lap_edge", task.grid.lap_edge, "place", task.grid.place, "bin_cell",
-               task.grid.bin_cell, "narrow", task.grid.narrow);
+               task.grid.bin_cell, "kind", task.grid.kind);
     fields.set("pixels", task.pixels, "streams", task.streams, "splits", task.splits, "number", task.number, "status",
                task.status, "out", task.out, "queue", task.queue, "full", task.full, "work", task.work, "work_bytes",
                task.work_bytes);
@@ -51,11 +50,11 @@ nb::bytes task_of(const BoundJob& job, const PulseTable& pulse, int32_t merge, i
 }  // namespace
 
 void bind_feedback_device(nb::module_& module) {
-    module.def("feedback_grid", &grid_arrays, "job"_a, "merge"_a, "parts"_a, "narrow"_a, "laps"_a,
+    module.def("feedback_grid", &grid_arrays, "job"_a, "kinds"_a, "laps"_a,
                "The internal grid, to be copied to the device.");
     module.def("feedback_pulse", &pulse_arrays, "pulse"_a, "Tables of a pulse's energy, likewise.");
-    module.def("feedback_task", &task_of, "job"_a, "pulse"_a, "merge"_a, "parts"_a, "narrow"_a, "laps"_a, "addresses"_a,
-               "numbers"_a, "Argument of the kernel feedback_histograms: device arrays and numbers by name.");
+    module.def("feedback_task", &task_of, "job"_a, "pulse"_a, "kinds"_a, "laps"_a, "addresses"_a, "numbers"_a,
+               "Argument of the kernel feedback_histograms: device arrays and numbers by name.");
     module.def(
         "feedback_warp_bytes",
         [](int64_t cells, int64_t laps) {

@@ -1,7 +1,6 @@
 // Bindings of the maximum-likelihood estimator and of its likelihood; reconstruct/maximizer.h
 // and several_returns.h have the loops over a pixel.
 #include "reconstruct/several_returns.h"
-#include "reconstruct/surface_fit.h"
 
 #include "python/bindings.h"
 #include "python/count_rows.h"
@@ -47,25 +46,6 @@ void several_returns(const HistogramRecord& recording, Histograms histogram, int
     });
 }
 
-void surface_fits(const HistogramRecord& recording, Vector<const int64_t> first, Vector<const int32_t> bins,
-                  Vector<const double> exposure, int64_t width, int radius, bool tilted, Matrix<const double> before,
-                  Matrix<double> planes, Matrix<double> out, int threads, nb::object progress) {
-    const int64_t pixels = size_of(exposure);
-    if (size_of(first) != pixels + 1 || width < 1 || pixels % width != 0)
-        throw nb::value_error("first must be (pixels + 1), pixels a multiple of width");
-    expect("before and planes must be (pixels, 4)", {pixels, 4}, before, planes);
-    expect("out must be (pixels, 7)", {pixels, kSurfaceColumns}, out);
-    static_assert(sizeof(Plane) == 4 * sizeof(double));
-    const PhotonImage image{pixels / width, width, first.data(), bins.data(), exposure.data()};
-    const Plane* from = reinterpret_cast<const Plane*>(before.data());
-    Plane* to = reinterpret_cast<Plane*>(planes.data());
-    run_watched_items(pixels, kChunk, threads, progress, [&] {
-        return [&, fit = SurfaceFit(recording, image, radius)](int64_t p) mutable {
-            to[p] = fit(p, from, tilted, out.data() + p * kSurfaceColumns);
-        };
-    });
-}
-
 void log_likelihood(const HistogramRecord& recording, Vector<const double> histogram, Matrix<const double> at,
                     Matrix<double> out, bool whole) {
     if (static_cast<int64_t>(histogram.shape(0)) != recording.bins || at.shape(1) != 3 || out.shape(1) != 13 ||
@@ -99,10 +79,6 @@ void bind_maximum_likelihood(nb::module_& module) {
                "starts"_a, "false_alarm"_a, "out"_a.noconvert(), "flags"_a.noconvert(), "returns"_a.noconvert(),
                "threads"_a, "progress"_a.none(),
                "Further returns of each pixel: returns (pixels, most x (delay, S, errors, chance)).");
-    module.def("surface_fits", &surface_fits, "recording"_a, "first"_a, "bins"_a, "exposure"_a, nb::kw_only(),
-               "width"_a, "radius"_a, "tilted"_a, "before"_a, "planes"_a.noconvert(), "out"_a.noconvert(), "threads"_a,
-               "progress"_a.none(),
-               "Planes (share, delay, right, down) of windows of an image: planes (pixels, 4), out (pixels, 7).");
     module.def("histogram_log_likelihood", &log_likelihood, "recording"_a, "histogram"_a, "at"_a, "out"_a.noconvert(),
                "whole"_a = true,
                "Value, gradient and information at points (S, B, delay); `whole`: bin by bin round the period.");

@@ -79,14 +79,14 @@ MARS_INLINE double continued(float cell, uint32_t word) {
 }
 
 // In double precision, because the energy beyond the whole periods has to be right to 2^-31 of a period's.
-MARS_INLINE WaveWait draw_wave(const WaveRates& rates, UInt key0, UInt key1, UInt event) {
+MARS_INLINE WaveWait draw_wave(const WaveRates& rates, WordStream<UInt>& stream) {
     alignas(64) float exponentials[kLanes], cells[kLanes];
     alignas(64) uint32_t fresh[kLanes];
     alignas(64) int32_t whole[kLanes], energy[kLanes];
-    const Pair<UInt> words = threefry<13>(event, splat(kStageArrival), key0, key1);
-    const Float drawn = exponential(words.first);
+    const UInt word = stream.next();
+    const Float drawn = exponential(word);
     store(cells, from_bits(bits(drawn) & 0xffffff00u));
-    store(fresh, words.second);
+    store(fresh, stream.next());
     for (int lane = 0; lane < kLanes; ++lane) {
         const double wait = continued(cells[lane], fresh[lane]) * rates.inverse[lane];
         const double periods = wait < static_cast<double>(kForever) ? wait : static_cast<double>(kForever);

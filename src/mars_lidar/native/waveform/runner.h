@@ -44,8 +44,10 @@ class WaveRunner final : LaneHost<PartClock, stage> {
     // A function of its own: in the loop over a round compilers keep several steps' numbers in too few registers, which
     // costs a quarter of the time where there are 16 of them.
     MARS_NOINLINE void step(int k) {
-        const UInt event = this->event_ + static_cast<uint32_t>(k);
-        const WaveWait wait = draw_wave(rates_, this->key0_, this->key1_, event);
+        [[maybe_unused]] const UInt event = this->event_ + static_cast<uint32_t>(k);
+        WordStream<UInt> stream = this->streams_.load_lanes();
+        const WaveWait wait = draw_wave(rates_, stream);
+        this->streams_.save(stream);
         WaveTime from = this->armed_;
         if constexpr (Host::kTraps) from = this->search_start(event);
         WaveTime hit = next_arrival(tables_, from, wait);

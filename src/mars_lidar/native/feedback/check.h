@@ -1,0 +1,222 @@
+// How far the mean histogram of an internal grid is from the true one, and which bins it owes that to.
+//
+// The mean w of a grid twice as fine, put into the equations of the grid itself, leaves in each of its cells a residual
+//     r_j = w_j - p_j (1 - (C_j - RA_j)) - q_j (RA_{j+1} - RA_j),
+// because RA is interpolated within a cell of registration, and because light and re-armed exposures are taken as even
+// over a cell. With A = I + diag(p) G the precision matrix of the histogram is A' diag(1 / v) A / N_r, v the variances of
+// docs/feedback.md (3), and r = A (w - the grid's own mean). So
+//     D^2 = N_r / (1 + K sum w) sum_j r_j^2 / (v_j + |r_j|)
+// is the squared Mahalanobis distance of the two means: no linear function of the histogram, a bin, a window or the
+// count, has a mean further than D of its standard deviations from the finer grid's. |r_j| is there for cells of a fraction of a
+// count. Everything is second order in the width of cells: of the distance to the true mean, three quarters.
+#pragma once
+#include "feedback/laws.h"
+
+namespace mars {
+inline namespace MARS_LEVEL {
+namespace {
+
+// p and q of all cells and lanes in double precision, as `Rates`.
+struct FineRates {
+    const FeedbackCheck& check;
+    double *dark_fire, *dark_refire, *lit_fire, *lit_refire;
+
+    FineRates(const FeedbackCheck& c, double*& memory) : check(c) {
+        const int64_t row = kRow, lit = c.lit_end - c.lit_begin;
+        auto take = [&](int64_t rows) {
+            double* const at = memory;
+            memory += rows * row;
+            return at;
+        };
+        dark_fire = take(kKinds);
+        dark_refire = take(kKinds);
+        lit_fire = take(lit);
+        lit_refire = take(lit);
+        for (int k = 0; k < kKinds; ++k)
+            set_rates(c.dark_photons + k * row, dark_fire + k * row, dark_refire + k * row);
+        for (int64_t k = 0; k < lit; ++k) set_rates(c.lit_photons + k * row, lit_fire + k * row, lit_refire + k * row);
+    }
+    const double* fire(int32_t j) const { return pick(j, dark_fire, lit_fire); }
+    const double* refire(int32_t j) const { return pick(j, dark_refire, lit_refire); }
+    const double* photons(int32_t j) const { return pick(j, check.dark_photons, check.lit_photons); }
+
+ private:
+    const double* pick(int32_t j, const double* dark, const double* lit) const {
+        return j >= check.lit_begin && j < check.lit_end ? lit + static_cast<int64_t>(j - check.lit_begin) * kRow
+                                                         : dark + static_cast<int64_t>(check.fine->kind[j]) * kRow;
+    }
+};
+
+// A row of lanes of a sweep; in place, `out` is that of the sweep before.
+MARS_NOINLINE void mean_step(const double* __restrict__ p, const double* __restrict__ q, const double* late,
+                             const double* early, double part, double turns, const double* __restrict__ gone,
+                             const int64_t* __restrict__ active, double* __restrict__ c, double* __restrict__ re,
+                             double* __restrict__ moved, double* out) {
+    alignas(64) double sum[kTeam], then[kTeam];
+    for (int i = 0; i < kTeam; ++i) {
+        then[i] = late[i] - part * (late[i] - early[i]) - turns * gone[i];
+        sum[i] = c[i] + p[i] * (1.0 - (c[i] - re[i])) + q[i] * (then[i] - re[i]);
+    }
+    for (int i = 0; i < kTeam; ++i) {
+        const double before = out[i], now = active[i] ? sum[i] : before;
+        const double step = now > before ? now - before : before - now;
+        moved[i] = step > moved[i] ? step : moved[i];
+        re[i] = then[i];
+        c[i] = now;
+        out[i] = now;
+    }
+}
+
+// What a cell of the grid makes of the finer grid's mean.
+struct Residual {
+    alignas(64) double square[kTeam];                         // r^2 / (v + |r|)
+    alignas(64) double own[kTeam], begin[kTeam], end[kTeam];  // its parts: light in the cell, RA at either edge
+
+    // Of both grids: RA at the cell's edges. `fire`, `light` of the two finer cells.
+    MARS_NOINLINE void set(const double* __restrict__ fire0, const double* __restrict__ fire1,
+                           const double* __restrict__ light0, const double* __restrict__ light1,
+                           const double* __restrict__ from, const double* __restrict__ to,
+                           const double* __restrict__ re, const double* __restrict__ then,
+                           const double* __restrict__ off, const double* __restrict__ next_off) {
+        for (int i = 0; i < kTeam; ++i) {
+            const double l = light0[i] + light1[i], p = fire0[i] + fire1[i] - fire0[i] * fire1[i];
+            const double series = l * (0.5 - l * (1.0 / 6 - l * (1.0 / 24 - l * (1.0 / 120 - l * (1.0 / 720)))));
+            const double q = l < 0.02 ? series : 1.0 - p / l;
+            const double some = 1.0 - (from[i] - re[i]), more = then[i] - re[i];
+            const double armed = some > 0.0 ? some : 0.0, in = more > 0.0 ? more : 0.0;
+            const double inside = to[i] - from[i] - p * some - q * more;
+            const double first = (q - p) * off[i], last = -q * next_off[i], r = inside + first + last;
+            const double size = r < 0.0 ? -r : r, v = p * (1.0 - p) * armed + q * (1.0 - q) * in + size;
+            const double weight = v > 1e-290 ? 1.0 / v : 0.0;
+            square[i] = r * r * weight;
+            own[i] = inside * inside * weight;
+            begin[i] = first * first * weight;
+            end[i] = last * last * weight;
+        }
+    }
+};
+
+class GridCheck {
+ public:
+    explicit GridCheck(const FeedbackCheck& check)
+        : check_(check), fine_(*check.fine), memory_(check.memory), rates_(check, memory_), sums_(memory_) {}
+
+    void run() {
+        solve();
+        judge();
+    }
+
+ private:
+    static constexpr int kSweeps = 200;
+    static constexpr double kStill = 4e-4;  // D^2 by the last sweep's move at most: r_j = p_j times this, of |r_j|
+    static constexpr double kRounding = 1e-13;
+
+    double* row(int32_t j) const { return sums_ + static_cast<int64_t>(j) * kRow; }
+
+    // RA of the finer grid at its edge e.
+    void rearmed(int32_t e, double* out) const {
+        const FeedbackEdge& edge = fine_.edge[e];
+        const double *late = row(edge.late), *early = row(edge.early), *total = row(fine_.cells);
+        for (int i = 0; i < kTeam; ++i) out[i] = late[i] - edge.part * (late[i] - early[i]) - edge.turns * total[i];
+    }
+
+    // The mean of the finer grid per period at K = 0; each lane ends by itself.
+    void solve() {
+        const int32_t n = fine_.cells;
+        alignas(64) double total[kTeam] = {}, still[kTeam], c[kTeam], re[kTeam], gone[kTeam], moved[kTeam];
+        alignas(64) int64_t active[kTeam];
+        for (int32_t j = 0; j < n; ++j) {
+            const double* p = rates_.fire(j);
+            for (int i = 0; i < kTeam; ++i) total[i] += p[i];
+        }
+        for (int i = 0; i < kTeam; ++i) {
+            still[i] = kStill / ((total[i] > 1.0 ? total[i] : 1.0) * check_.exposures);
+            still[i] = still[i] > kRounding ? still[i] : kRounding;
+            total[i] /= 1.0 + total[i] * (fine_.dead_time - fine_.whole);
+            active[i] = 1;
+            check_.sweeps[i] = kSweeps + 1;
+        }
+        for (int32_t j = 0; j <= n; ++j)
+            for (int i = 0; i < kTeam; ++i) row(j)[i] = fine_.place[j] * total[i];
+        for (int sweep = 1; sweep <= kSweeps; ++sweep) {
+            rearmed(0, re);
+            for (int i = 0; i < kTeam; ++i) {
+                gone[i] = row(n)[i];
+                c[i] = moved[i] = row(0)[i] = 0.0;
+            }
+            for (int32_t j = 0; j < n; ++j) {
+                const FeedbackEdge& edge = fine_.edge[j + 1];
+                mean_step(rates_.fire(j), rates_.refire(j), row(edge.late), row(edge.early),
+                          static_cast<double>(edge.part), edge.turns, gone, active, c, re, moved, row(j + 1));
+            }
+            bool some = false;
+            for (int i = 0; i < kTeam; ++i) {
+                if (!active[i]) continue;
+                if (moved[i] <= still[i]) {
+                    active[i] = 0;
+                    check_.sweeps[i] = sweep;
+                } else {
+                    some = true;
+                }
+            }
+            if (!some) return;
+        }
+    }
+
+    // D^2 of the lanes, and the bins' parts.
+    void judge() {
+        const FeedbackGrid& grid = *check_.coarse;
+        const double* const total = row(fine_.cells);
+        alignas(64) double re[kTeam], then[kTeam], off[kTeam], next_off[kTeam], scale[kTeam];
+        // RA of the grid less that of the finer one at the edge e of the grid, and the latter
+        auto at_edge = [&](int32_t e, double* exact, double* difference) {
+            rearmed(2 * e, exact);
+            const FeedbackEdge& edge = grid.edge[e];
+            const double *late = row(2 * edge.late), *early = row(2 * edge.early);
+            for (int i = 0; i < kTeam; ++i)
+                difference[i] = late[i] - edge.part * (late[i] - early[i]) - edge.turns * total[i] - exact[i];
+        };
+        for (int i = 0; i < kTeam; ++i) {
+            scale[i] = check_.exposures / (1.0 + fine_.whole * total[i]);
+            check_.square[i] = 0.0;
+        }
+        at_edge(0, re, off);
+        Residual residual;
+        int32_t bin = 0;
+        for (int32_t j = 0; j < grid.cells; ++j) {
+            while (grid.bin_cell[bin + 1] <= j) ++bin;
+            at_edge(j + 1, then, next_off);
+            residual.set(rates_.fire(2 * j), rates_.fire(2 * j + 1), rates_.photons(2 * j), rates_.photons(2 * j + 1),
+                         row(2 * j), row(2 * j + 2), re, then, off, next_off);
+            for (int i = 0; i < kTeam; ++i) check_.square[i] += scale[i] * residual.square[i];
+            if (check_.bins) {
+                add(bin, scale, residual.own);
+                add(bin_of(grid.edge[j].early), scale, residual.begin);
+                add(bin_of(grid.edge[j + 1].early), scale, residual.end);
+            }
+            for (int i = 0; i < kTeam; ++i) {
+                re[i] = then[i];
+                off[i] = next_off[i];
+            }
+        }
+    }
+
+    int32_t bin_of(int32_t cell) const {
+        const int32_t bin = static_cast<int32_t>(check_.coarse->place[cell] * fine_.bins + 1e-6);
+        return bin < fine_.bins ? bin : fine_.bins - 1;
+    }
+    void add(int32_t bin, const double* scale, const double* part) const {
+        double* const to = check_.bins + static_cast<int64_t>(bin) * kRow;
+        for (int i = 0; i < kTeam; ++i) to[i] += scale[i] * part[i];
+    }
+
+    const FeedbackCheck& check_;
+    const FeedbackGrid& fine_;
+    double* memory_;
+    const FineRates rates_;
+    double* const sums_;
+};
+
+}  // namespace
+}  // namespace MARS_LEVEL
+}  // namespace mars

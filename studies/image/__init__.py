@@ -1,0 +1,1 @@
+"""Depth and signal of images from a few photons a pixel: training of the networks, and the study of the method."""

@@ -1,0 +1,258 @@
+"""Study "image": depth and signal of images from 1 to 10 photons a pixel, and how well the intervals hold."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from mars_lidar import Detector, Flux, GaussianPulse, SampledPulse, Scene, System, reconstruct, simulate
+from mars_lidar._base.types import FloatArray
+from mars_lidar.plot.figures import _draw_map, _limits
+from mars_lidar.reconstruct import Reconstruction
+from mars_lidar.reconstruct.histogram_record import relative_width
+from mars_lidar.reconstruct.image_network import networks
+from studies import Facts, Request
+from studies.common.draw import panels
+from studies.common.report import Row
+from studies.image.scenes import busier, light
+
+SEED = 41
+OUTLIER_SIGMA = 3.0
+POOLED = 5  # pixels a side, whose histograms the pooled matched filter adds up
+SYSTEM = System(
+    period_ns=100.0,
+    cycles=1000,
+    bins=1000,
+    pulse=GaussianPulse(sigma_ns=0.6),
+    detector=Detector(dead_time_ns=75.0),
+)
+# seeds of scenes "random" which nobody looked at, nor any of their results, before the code and the weights were frozen
+FROZEN = (20261201, 20261202, 20261203, 20261204, 20261205)
+SHOWN = "random", 1.0, 1.0  # scene, photons and ratio of the picture
+METHODS = ("maximum_likelihood", "pooled matched filter", "image_untrained", "image")
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Side of the images, mean photons of signal of a pixel, and signal to background."""
+
+    size: int
+    photons: tuple[float, ...]
+    sbr: tuple[float, ...]
+    frozen: int
+
+
+FULL = Settings(64, (1.0, 2.0, 5.0, 10.0), (0.03, 0.3, 1.0, 3.0), len(FROZEN))
+QUICK = Settings(24, (2.0,), (1.0,), 1)
+
+
+def systems() -> dict[str, System]:
+    """Five that no network was trained on: longer, coarser, gated, clocked, and of a pulse with a tail."""
+    t = np.arange(0.0, 4.0, 0.02)
+    tail = np.exp(-t / 0.6) * (1.0 - np.exp(-t / 0.1))
+    gate = Detector(dead_time_ns=30.0, mode="gated", gate_start_ns=8.0, gate_width_ns=60.0)
+    return {
+        "500 ns, sigma 0.4 ns, 4096 bins": replace(
+            SYSTEM, period_ns=500.0, bins=4096, pulse=GaussianPulse(sigma_ns=0.4)
+        ),
+        "64 bins, sigma 1 ns": replace(SYSTEM, bins=64, pulse=GaussianPulse(sigma_ns=1.0)),
+        "gated, 60 of 100 ns": replace(SYSTEM, detector=gate),
+        "synchronous, 50 cycles": replace(SYSTEM, cycles=50, detector=Detector(dead_time_ns=0.0, mode="synchronous")),
+        "pulse with a tail of 0.6 ns": replace(SYSTEM, pulse=SampledPulse(tail, 0.02)),
+    }
+
+
+def scenes(size: int) -> dict[str, Scene]:
+    """Simulated scenes: the built-in ones, rough ground, and sticks of 1 to 2 pixels before a wall."""
+    rng = np.random.default_rng(SEED)
+    y, x = np.mgrid[:size, :size]
+    ground = 4.0 + 3.0 * y / size
+    rough, grass = busier(ground, np.full((size, size), 0.5), 0.09, rng)
+    sticks, bright = np.full((size, size), 7.0), np.full((size, size), 0.4)
+    for k in range(size // 8):
+        stick = (x - 8 * k - 3 - y // 6 >= 0) & (x - 8 * k - 3 - y // 6 < 1 + k % 2)
+        sticks, bright = np.where(stick, 4.0, sticks), np.where(stick, 0.8, bright)
+    return {
+        "room": Scene.example("room", size),
+        "random": Scene.example("random", size, seed=901),
+        "rough ground": Scene(depth_m=rough, reflectivity=np.clip(grass, 0.02, 1.0)),
+        "sticks": Scene(depth_m=sticks, reflectivity=bright),
+    }
+
+
+def rgbd(folder: Path, size: int) -> dict[str, Scene]:
+    """The RGB-D pairs of a folder, NAME_depth.png beside NAME_colors.png, at this size."""
+    found = {}
+    for path in sorted(folder.glob("*_depth.png")):
+        name = path.name.removesuffix("_depth.png")
+        found[name] = Scene.from_rgbd(path, path.with_name(f"{name}_colors.png"), size=size)
+    for path in sorted(folder.glob("middlebury_*")):
+        found[path.name] = Scene.from_rgbd(path, size=size)
+    return found
+
+
+def run(request: Request) -> Facts:
+    """Every scene, system and brightness by every method."""
+    settings = QUICK if request.quick else FULL
+    shown = scenes(settings.size)
+    if request.rgbd is not None:
+        shown |= rgbd(request.rgbd, settings.size)
+    rows: list[Row] = []
+    thin: list[Row] = []
+    maps: Mapping[str, Reconstruction | FloatArray] = {}
+
+    def add(part: str, name: str, scene: Scene, system: System, photons: float, sbr: float, words: str) -> None:
+        nonlocal maps
+        request.tell(f"image: {part}, {name}, {words}, {photons:g} photons, signal to background {sbr:g}")
+        lines, results = case(scene, system, photons, sbr)
+        rows.extend({"part": part, "scene": name, "system": words, "photons": photons, "sbr": sbr} | x for x in lines)
+        if part == "scenes" and (name, photons, sbr) == (SHOWN[0], *_nearest(settings)):
+            maps = results
+        if name == "sticks" and sbr == _nearest(settings)[1]:
+            thin.append(_thin(scene, system, photons, results))
+
+    for name, scene in shown.items():
+        for photons in settings.photons:
+            for sbr in settings.sbr:
+                add("scenes", name, scene, SYSTEM, photons, sbr, "100 ns")
+    for words, system in systems().items():
+        for name in ("room", "random"):
+            for photons in settings.photons[:3:2] or settings.photons:
+                add("systems", name, shown[name], system, photons, 1.0, words)
+    for dead_time in (0.0, 50.0, 100.0, 200.0):
+        system = replace(SYSTEM, cycles=50, detector=Detector(dead_time_ns=dead_time))
+        add("dead time", "room", shown["room"], system, 5.0, 1.0, f"50 cycles, {dead_time:g} ns")
+    for seed in FROZEN[: settings.frozen]:
+        frozen = Scene.example("random", settings.size, seed=seed)
+        for photons in settings.photons[:3]:
+            add("frozen", f"random {seed}", frozen, SYSTEM, photons, 1.0, "100 ns")
+    bright = replace(SYSTEM, cycles=20_000)
+    add("bright", "room", shown["room"], bright, 500.0, 1.0, "20,000 cycles")
+    return {
+        "s": settings,
+        "card": networks().card,
+        "by_light": _table(rows, "scenes", ("photons", "sbr")),
+        "by_scene": _table(rows, "scenes", ("scene",)),
+        "unseen": _table(rows, "systems", ("system",)),
+        "blind": _table(rows, "dead time", ("system",)),
+        "frozen": _table(rows, "frozen", ("photons",)),
+        "bright": _table(rows, "bright", ("photons",)),
+        "thin": thin,
+        "rows": rows,
+        "figures": {"": _figure(maps, settings)},
+    }
+
+
+def _thin(
+    scene: Scene, system: System, photons: float, results: Mapping[str, Reconstruction | FloatArray]
+) -> dict[str, float]:
+    """Of the pixels of the sticks, and of those that maximum likelihood sees: how many are off by each method."""
+    most = OUTLIER_SIGMA * float(system.depth_m(relative_width(system) * system.period_ns))
+    sticks = scene.depth_m < 5.0
+    off = {}
+    for name, each in results.items():
+        if isinstance(each, Reconstruction):
+            off[name] = ~(np.abs(each.depth_m - scene.depth_m) < most)
+    single = results["maximum_likelihood"]
+    assert isinstance(single, Reconstruction)
+    seen = sticks & single.seen & ~off["maximum_likelihood"]
+    line = {"photons": photons}
+    line |= {f"{name}, off %": 100.0 * float(x[sticks].mean()) for name, x in off.items()}
+    return line | {
+        "seen alone %": 100.0 * float(seen.sum() / sticks.sum()),
+        "of these off, image %": 100.0 * float(off["image"][seen].mean()) if seen.any() else float("nan"),
+    }
+
+
+def _nearest(settings: Settings) -> tuple[float, float]:
+    """Photons and ratio of the picture that these settings hold."""
+    return (
+        min(settings.photons, key=lambda x: abs(np.log(x / SHOWN[1]))),
+        min(settings.sbr, key=lambda x: abs(np.log(x / SHOWN[2]))),
+    )
+
+
+def case(
+    scene: Scene, system: System, photons: float, sbr: float
+) -> tuple[list[dict[str, Any]], dict[str, Reconstruction | FloatArray]]:
+    """A line for each method; and the reconstructions, with the truth, m, under "truth"."""
+    flux = light(scene, system, photons, sbr)
+    cube = simulate(flux, system, seed=SEED, threads=1)[0]
+    lines: list[dict[str, Any]] = []
+    results: dict[str, Reconstruction | FloatArray] = {"truth": np.asarray(system.depth_m(flux.delay_ns))}
+    for method in METHODS:
+        began = time.process_time()
+        if method == "pooled matched filter":
+            found = reconstruct(_pooled(cube), system, "matched_filter", threads=1)
+        else:
+            found = reconstruct(cube, system, method, threads=1)
+        seconds = time.process_time() - began
+        results[method] = found
+        scale = POOLED**2 if method == "pooled matched filter" else 1
+        lines.append({"method": method} | judged(found, flux, system, scale) | {"s": seconds})
+    return lines, results
+
+
+def _pooled(cube: np.ndarray) -> np.ndarray:
+    """Sums of the histograms of `POOLED` x `POOLED` pixels about each; at the borders those beyond are mirrored."""
+    reach = POOLED // 2
+    padded = np.pad(cube.astype(np.uint32), ((reach, reach), (reach, reach), (0, 0)), mode="reflect")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, (POOLED, POOLED), axis=(0, 1))
+    return np.asarray(windows.sum((-1, -2)), np.uint32)
+
+
+def judged(found: Reconstruction, flux: Flux, system: System, scale: float = 1.0) -> dict[str, float]:
+    """Errors of depth and signal against the truth; coverage of 90 % intervals and the share that has one."""
+    period = system.period_ns
+    valid = np.isfinite(flux.delay_ns) & (flux.signal > 0)
+    off = (found.delay_ns - flux.delay_ns + 0.5 * period) % period - 0.5 * period
+    near = np.abs(off) < OUTLIER_SIGMA * relative_width(system) * period
+    off_mm = 1e3 * np.asarray(system.depth_m(np.abs(off)))
+    width = found.delay_half_width_ns
+    if width is None and found.delay_error_ns is not None:
+        width = 1.645 * found.delay_error_ns
+    stated = valid & np.isfinite(off) & (np.isfinite(width) if width is not None else False)
+    signal = found.signal / scale - flux.signal * system.detector.detection_efficiency
+    return {
+        "off %": 100.0 * float((valid & ~near).sum() / valid.sum()),
+        "median mm": float(np.nanmedian(off_mm[valid])),
+        "RMSE m": float(np.sqrt(np.nanmean(off_mm[valid] ** 2)) / 1e3),
+        "in 90 %": 100.0 * float((np.abs(off) <= width)[stated].mean()) if stated.any() else float("nan"),
+        "answered %": 100.0 * float(stated.sum() / valid.sum()),
+        "signal RMSE": float(np.sqrt(np.nanmean(signal[valid] ** 2)) / flux.signal[valid].mean()),
+    }
+
+
+def _table(rows: Iterable[Row], part: str, keys: tuple[str, ...]) -> list[Row]:
+    """Means over the other keys, by method."""
+    groups: dict[tuple[Any, ...], list[Row]] = {}
+    for row in rows:
+        if row["part"] == part:
+            groups.setdefault((*(row[key] for key in keys), row["method"]), []).append(row)
+    values = ("off %", "median mm", "RMSE m", "in 90 %", "answered %", "signal RMSE", "s")
+    out: list[Row] = []
+    for at, lines in groups.items():
+        line: dict[str, Any] = dict(zip((*keys, "method"), at, strict=True))
+        for value in values:
+            numbers = np.array([x[value] for x in lines], np.float64)
+            line[value] = float(np.nanmean(numbers)) if np.isfinite(numbers).any() else "-"
+        out.append(line)
+    return out
+
+
+def _figure(maps: Mapping[str, Reconstruction | FloatArray], settings: Settings) -> Figure:
+    """Depth: the truth and each method."""
+    figure, axes = panels(1.35, 1, len(maps))
+    truth = np.asarray(maps["truth"])
+    for ax, (name, each) in zip(axes[0], maps.items(), strict=True):
+        depth = each.depth_m if isinstance(each, Reconstruction) else each
+        last = "depth (m)" if ax is axes[0, -1] else ""
+        _draw_map(ax, depth, last, "viridis", _limits(truth), name.replace("_", " "))
+        ax.images[0].set_interpolation("nearest")
+    return figure

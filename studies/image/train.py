@@ -1,0 +1,329 @@
+"""Trains the networks of method "image" on exact simulations of built-in scenes, and writes their weights and card.
+
+``python -m studies image --train --out DIR``: `image_weights.npz` and `image_card.json`, which lie in the package's
+folder ``reconstruct``. Needs PyTorch (extra ``learn``); one thread, so that the same machine gives the same bits.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mars_lidar import __version__
+from mars_lidar._base.optional import needed
+from mars_lidar.reconstruct import image_stages as stages
+from mars_lidar.reconstruct.image_network import (
+    CARD,
+    CHANNELS,
+    HIDDEN,
+    OFFSETS,
+    PEAKS,
+    RADII,
+    WEIGHTS,
+    Floats,
+    Networks,
+)
+from mars_lidar.reconstruct.image_pulse import CELLS_PER_SIGMA, Cells, cells_of
+from mars_lidar.reconstruct.photons import Photons
+from studies import Tell
+from studies.image import scenes
+
+INPUTS = 3 * len(OFFSETS) + 3
+PLANES = len(RADII) + 1
+CHANNELS_IN = 5 * len(RADII) + 8
+OUTLIER_SIGMA = 3.0
+_REACHED = 6.0  # sigma, up to which an error counts
+_HELD_OUT = 12  # every so many-th image
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How much is trained, and from which seed."""
+
+    images: int = 320
+    choose_steps: int = 2000
+    weigh_steps: int = 1500
+    seed: int = 20261123
+
+
+FULL = Plan()
+QUICK = Plan(images=24, choose_steps=40, weigh_steps=40)
+
+
+@dataclass(frozen=True, eq=False)
+class _Prepared:
+    """A training image after its first round."""
+
+    photons: Photons
+    cells: Cells
+    light: stages.Light
+    truth: Floats  # (pixels,) delay in cells
+    signal: Floats  # (H, W)
+    valid: np.ndarray
+
+
+def train(out: Path, plan: Plan = FULL, tell: Tell = str) -> list[Path]:
+    """Draw, train both networks, and write weights and card; returns their paths."""
+    torch = needed("torch", "the training of the networks of method 'image'", "learn")
+    torch.manual_seed(plan.seed)
+    torch.set_num_threads(1)
+    torch.use_deterministic_algorithms(True)
+    began = time.process_time()
+    images = [_prepared(scenes.example(k, plan.seed)) for k in range(plan.images)]
+    tell(f"image: {len(images)} images drawn, {time.process_time() - began:.0f} s of processor time")
+    choose, facts = _train_choose(torch, images, plan, tell)
+    first = Networks(_flat(choose), {}, {})
+    weigh, more = _train_weigh(torch, images, first, plan, tell)
+    out.mkdir(parents=True, exist_ok=True)
+    arrays: dict[str, Any] = {"choose": _flat(choose), **_layers(weigh)}
+    np.savez(out / WEIGHTS.name, **arrays)
+    card = _card(plan, facts | more, time.process_time() - began, torch.__version__)
+    (out / CARD.name).write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
+    return [out / WEIGHTS.name, out / CARD.name]
+
+
+def _prepared(example: scenes.Example) -> _Prepared:
+    height, width, bins = example.counts.shape
+    photons = Photons.of(example.counts.reshape(-1, bins), height, width)
+    cells = cells_of(example.system)
+    light = stages.first_light(photons, cells)
+    light = stages.light_at(photons, cells, stages.first_delays(photons, cells, light, 1), light, 1)
+    truth = np.nan_to_num(example.delay_ns).ravel() / example.system.period_ns % 1.0 * cells.count
+    signal = np.log(np.maximum(example.signal, 0.02)).astype(np.float32)
+    return _Prepared(photons, cells, light, truth.astype(np.float32), signal, example.valid)
+
+
+def gap(a: Any, b: Any, cells: int) -> Any:
+    """a - b modulo the period, cells."""
+    return (a - b + 0.5 * cells) % cells - 0.5 * cells
+
+
+def _train_choose(torch: Any, images: list[_Prepared], plan: Plan, tell: Tell) -> tuple[Any, dict[str, float]]:
+    """The network that chooses among the peaks, from the pixels whose largest peak is not sure."""
+    rng = np.random.default_rng(plan.seed)
+    features, labels, lost, wrong = [], [], [], []
+    for k, image in enumerate(images):
+        whole = slice(0, image.photons.height), slice(0, image.photons.width)
+        posterior, broad, likelihood, place, mass = stages.volumes(
+            image.photons, image.cells, image.light, *whole, PEAKS, 1
+        )
+        off = np.abs(gap(place, image.truth[:, None], image.cells.count)) / image.cells.sigma
+        label = np.where(off.min(1) < OUTLIER_SIGMA, off.argmin(1), PEAKS)
+        open_pixels = np.flatnonzero(image.valid.ravel() & (mass[:, 0] < stages._SETTLED))
+        lost.append((label[open_pixels] == PEAKS).mean() if open_pixels.size else 0.0)
+        wrong.append((off[open_pixels, 0] >= OUTLIER_SIGMA).mean() if open_pixels.size else 0.0)
+        if k % _HELD_OUT == 0 or open_pixels.size == 0:
+            continue
+        pixel = np.sort(rng.permutation(open_pixels)[:700])
+        signal = np.ascontiguousarray(image.light.signal.ravel(), np.float32)
+        x = stages.candidate_features(posterior, broad, likelihood, place, mass, signal, pixel, 1)
+        features.append(x.astype(np.float16))
+        labels.append(label[pixel])
+    tell(f"image: of unsure pixels {np.mean(wrong):.1%} have a wrong first peak, {np.mean(lost):.1%} no right one")
+    x = torch.from_numpy(np.concatenate(features))
+    y = torch.from_numpy(np.concatenate(labels))
+    orders = torch.from_numpy(_symmetries())
+    net = _choose_net(torch)
+    optimiser = torch.optim.AdamW(net.parameters(), 1e-3, weight_decay=1e-3)
+    rate = torch.optim.lr_scheduler.OneCycleLR(optimiser, 4e-3, total_steps=plan.choose_steps)
+    mean = 0.0
+    for step in range(plan.choose_steps):
+        pick = torch.from_numpy(rng.integers(0, len(x), 1024))
+        loss = torch.nn.functional.cross_entropy(net(x[pick].float()[:, :, orders[step % 8]]), y[pick])
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        rate.step()
+        mean = loss.item() if step == 0 else 0.99 * mean + 0.01 * loss.item()
+        if step % 500 == 499:
+            tell(f"image: choosing, step {step + 1}, cross entropy {mean:.4f}")
+    return net, {"wrong_first_peak": float(np.mean(wrong)), "cross_entropy": mean}
+
+
+def _choose_net(torch: Any) -> Any:
+    class Choose(torch.nn.Module):  # type: ignore[misc]
+        def __init__(self) -> None:
+            super().__init__()
+            linear, relu = torch.nn.Linear, torch.nn.ReLU
+            self.layers = torch.nn.Sequential(
+                linear(INPUTS, HIDDEN), relu(), linear(HIDDEN, HIDDEN), relu(), linear(HIDDEN, 1)
+            )
+            self.none = linear(2, 1)
+
+        def forward(self, x: Any) -> Any:
+            mass, signal = 3.0 * x[..., -3], 3.0 * x[:, 0, -1]
+            value = self.layers(x)[..., 0] + mass
+            return torch.cat([value, self.none(torch.stack([mass[:, 0], signal], -1))], -1)
+
+    return Choose()
+
+
+def _symmetries() -> np.ndarray:
+    """(8, features) orders of the features by the flips and the transposition of the offsets."""
+    orders = []
+    for turned in (False, True):
+        for down in (1, -1):
+            for right in (1, -1):
+                order = []
+                for y, x in OFFSETS:
+                    k = OFFSETS.index((down * (x if turned else y), right * (y if turned else x)))
+                    order += [3 * k, 3 * k + 1, 3 * k + 2]
+                orders.append([*order, INPUTS - 3, INPUTS - 2, INPUTS - 1])
+    return np.array(orders)
+
+
+def _train_weigh(
+    torch: Any, images: list[_Prepared], first: Networks, plan: Plan, tell: Tell
+) -> tuple[Any, dict[str, float]]:
+    """The network that weighs planes and signals, and says how far off it is."""
+    rng = np.random.default_rng(plan.seed + 1)
+    held: list[dict[str, Any]] = []
+    for image in images:
+        chosen = stages.choice(image.photons, image.cells, image.light, first, 1)
+        light = stages.light_at(image.photons, image.cells, chosen.delay, image.light, 1)
+        seen = stages.photometry(image.photons, image.cells, chosen.delay, light, 1)
+        plane = stages.planes(seen, image.cells, 0, image.photons.height, 1)
+        maps = stages.plane_features(plane, chosen, light, seen, image.cells, slice(0, image.photons.height))
+        off = gap(image.truth, chosen.delay, image.cells.count) / image.cells.sigma
+        held.append(
+            {name: torch.from_numpy(values) for name, values in zip(("x", "delays", "signals"), maps, strict=True)}
+            | {
+                "off": torch.from_numpy(off.reshape(image.valid.shape).astype(np.float32)),
+                "valid": torch.from_numpy(image.valid),
+                "signal": torch.from_numpy(image.signal),
+            }
+        )
+    test = list(range(0, len(held), _HELD_OUT))
+    rest = [k for k in range(len(held)) if k % _HELD_OUT]
+    net = _weigh_net(torch)
+    optimiser = torch.optim.AdamW(net.parameters(), 1e-3, weight_decay=1e-3)
+    rate = torch.optim.lr_scheduler.OneCycleLR(optimiser, 5e-3, total_steps=plan.weigh_steps)
+    value = 0.0
+    for step in range(plan.weigh_steps):
+        loss, _, _ = _weigh_loss(torch, net, [held[k] for k in rng.choice(rest, 4)], step % 8)
+        optimiser.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(net.parameters(), 1.0)
+        optimiser.step()
+        rate.step()
+        if step % 400 == 399 or step == plan.weigh_steps - 1:
+            with torch.no_grad():
+                judged, error, valid = _weigh_loss(torch, net, [held[k] for k in test], 0)
+            value = float(judged)
+            median, outliers = float(error[valid].median()), float((error[valid] > OUTLIER_SIGMA).float().mean())
+            tell(
+                f"image: weighing, step {step + 1}, loss of held-out images {value:.4f}, "
+                f"median {median:.4f} sigma, outliers {outliers:.2%}"
+            )
+    return net, {"loss_held_out": value, "median_sigma_held_out": median, "outliers_held_out": outliers}
+
+
+def _weigh_net(torch: Any) -> Any:
+    nn = torch.nn
+
+    class Weigh(nn.Module):  # type: ignore[misc, name-defined]
+        def __init__(self) -> None:
+            super().__init__()
+            around = {"padding": 1, "padding_mode": "replicate"}
+            self.enter = nn.Conv2d(CHANNELS_IN, CHANNELS, 1)
+            self.first = nn.Conv2d(CHANNELS, CHANNELS, 3, **around)
+            self.second = nn.Conv2d(CHANNELS, CHANNELS, 3, **around)
+            self.leave = nn.Conv2d(CHANNELS, 2 * PLANES + 4, 1)
+            nn.init.zeros_(self.leave.weight)
+            nn.init.zeros_(self.leave.bias)
+
+        def forward(self, x: Any) -> Any:
+            f = self.enter(x)
+            f = f + self.first(nn.functional.relu(f))
+            f = f + self.second(nn.functional.relu(f))
+            return self.leave(nn.functional.relu(f))
+
+    return Weigh()
+
+
+def _weigh_loss(torch: Any, net: Any, images: list[dict[str, Any]], turn: int) -> tuple[Any, Any, Any]:
+    """Laplace likelihood of delay and log signal, cross entropy of outliers; errors in sigma, and where they count."""
+
+    def stacked(name: str) -> Any:
+        values = torch.stack([image[name] for image in images])
+        values = values.transpose(-1, -2) if turn & 4 else values
+        return values.flip([axis for axis, bit in ((-1, 1), (-2, 2)) if turn & bit])
+
+    x, delays, signals, off, valid, signal = map(stacked, ("x", "delays", "signals", "off", "valid", "signal"))
+    o, k = net(x), PLANES
+    delay = (torch.softmax(o[:, :k], 1) * delays).sum(1) + 0.3 * o[:, 2 * k + 3].clamp(-3.0, 3.0)
+    log_scale, logit = o[:, 2 * k].clamp(-4.0, 3.0) - 1.5, o[:, 2 * k + 1] - 2.0
+    estimate = torch.logsumexp(torch.log_softmax(o[:, k : 2 * k], 1) + signals, 1)
+    signal_scale = o[:, 2 * k + 2].clamp(-4.0, 3.0) - 1.0
+    error = (delay - off).abs()
+    outlier = (error.detach() > OUTLIER_SIGMA).float()
+    near = error.clamp(max=_REACHED)
+    depth = (near * torch.exp(-log_scale) + log_scale) * (1.0 - outlier) + 0.05 * near
+    doubt = torch.nn.functional.binary_cross_entropy_with_logits(logit, outlier, reduction="none")
+    light = (estimate - signal).abs() * torch.exp(-signal_scale) + signal_scale
+    loss = (depth + doubt)[valid].mean() + 0.3 * light[valid & (outlier < 1.0)].mean()
+    return loss, error, valid
+
+
+def _flat(net: Any) -> np.ndarray:
+    """Weights of the network that chooses, in the order of native/image/kernel.h."""
+    parts = []
+    for layer in (*(net.layers[k] for k in (0, 2, 4)), net.none):
+        parts += [layer.weight.detach().numpy().T.ravel(), layer.bias.detach().numpy()]
+    return np.ascontiguousarray(np.concatenate(parts), np.float32)
+
+
+def _layers(net: Any) -> dict[str, np.ndarray]:
+    """Weights (inputs * rows * columns, outputs) and biases of the network that weighs."""
+    out = {}
+    for name in ("enter", "first", "second", "leave"):
+        weight = getattr(net, name).weight.detach().numpy()
+        out[f"{name}_weights"] = np.ascontiguousarray(weight.transpose(1, 2, 3, 0).reshape(-1, len(weight)), np.float32)
+        out[f"{name}_bias"] = np.ascontiguousarray(getattr(net, name).bias.detach().numpy(), np.float32)
+    return out
+
+
+def _card(plan: Plan, facts: dict[str, float], seconds: float, torch: str) -> dict[str, Any]:
+    cells = [CELLS_PER_SIGMA * scenes.PERIOD_NS / sigma for sigma in scenes.SIGMA_NS]
+    return {
+        "what": "weights of the two networks of reconstruct(method='image')",
+        "trained_on": f"{plan.images} images of {scenes.SIDE} x {scenes.SIDE} pixels: this package's scenes 'room' and "
+        "'random', two of three with relief, texture and thin things added, photons by its engine 'exact'",
+        "ranges": {
+            "signal photons a pixel, mean": scenes.SIGNAL,
+            "signal to background": scenes.SBR,
+            "pulse sigma, laser periods": [sigma / scenes.PERIOD_NS for sigma in scenes.SIGMA_NS],
+            "dead time, laser periods": [dead / scenes.PERIOD_NS for dead in scenes.DEAD_TIME_NS],
+            "cycles": scenes.CYCLES,
+            "bins": scenes.BINS,
+            "hot pixels": f"{scenes.HOT_SHARE:.1%} of every fourth image",
+        },
+        # a factor of 1.5 beyond the draws; elsewhere the untrained method runs
+        "holds_for": {
+            "signal": [scenes.SIGNAL[0] / 1.5, scenes.SIGNAL[1] * 1.5],
+            "sbr": [scenes.SBR[0] / 1.5, scenes.SBR[1] * 1.5],
+            "cells": [0.5 * min(cells), 2.0 * max(cells)],
+            "side": [17, 1000000],
+        },
+        "limits": "one surface a pixel; Gaussian pulses (others run, coverage as the study of the method states)",
+        "command": "python -m studies image --train --out src/mars_lidar/reconstruct",
+        "seed": plan.seed,
+        "steps": [plan.choose_steps, plan.weigh_steps],
+        "processor_seconds": round(seconds),
+        "held_out": {name: round(value, 4) for name, value in facts.items()},
+        "versions": {
+            "mars-lidar": __version__,
+            "numpy": np.__version__,
+            "torch": torch,
+            "python": platform.python_version(),
+            "machine": f"{platform.machine()}, {os.uname().sysname}",
+        },
+        "licence": "MIT, as the package",
+    }

@@ -151,8 +151,8 @@ def simulate_timestamps(
     Returns
     -------
     Timestamps
-        Packed times (ns), cycles and bins of all pixels: of `exact` 8 bytes a registration, times and bins when they are
-        asked for.
+        Packed times (ns), cycles and bins of all pixels: of `exact` 8 bytes a registration, times and bins when they
+        are asked for.
 
     See Also
     --------

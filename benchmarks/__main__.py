@@ -48,6 +48,7 @@ SECTIONS: dict[str, Callable[[Config, Bandwidth], Section]] = {
     "calibration": estimators.calibration,
     "codecs": storage.codecs,
     "datasets": storage.datasets,
+    "epochs": storage.epochs,
     "stream": stream.stream,
     "forward": forward.forward,
     "memory": memory.peak_memory,

@@ -118,6 +118,46 @@ def datasets(config: Config, bandwidth: Bandwidth) -> Section:
     return section
 
 
+def epochs(config: Config, bandwidth: Bandwidth) -> Section:
+    """First epochs of `StoredDataset`, each of a new reader, with and without the look at sums and file states."""
+    del bandwidth
+    from unittest import mock
+
+    from mars_lidar._base.manifest import Manifest
+    from mars_lidar.learn import StoredDataset
+
+    section = Section("Epochs over a store, one process", notes=[_EPOCH_NOTE])
+    for layout in ("sparse", "dense"):
+        with tempfile.TemporaryDirectory(dir=os.environ.get("MARS_BENCH_TMP")) as folder:
+            store = Path(folder) / "set.zarr"
+            recipe = {
+                "scenes": {"example": "room", "size": [SIDE, SIDE], "seeds": {"count": max(2, config.side // 2)}},
+                "systems": [_system(config)],
+                "light": {"signal": [0.1]},
+                "realizations": 4,
+                "store": {"layout": layout},
+            }
+            ml.generate(recipe, store)
+
+            def checked(store: Path = store) -> int:
+                return sum(1 for _ in StoredDataset(store))
+
+            def unchecked(store: Path = store) -> int:
+                with mock.patch.multiple(Manifest, is_known=lambda *_: True, check=lambda *_: None):
+                    return sum(1 for _ in StoredDataset(store))
+
+            timings = in_turn({"checked": checked, "unchecked": unchecked}, config)
+            with_sums, without = (min(timings[name].cpu) for name in ("checked", "unchecked"))
+            size = sum(one.stat().st_size for one in store.rglob("*") if one.is_file())
+            section.rows.append(
+                {"layout": layout, "MB on disk": size / 1e6, "CPU s": with_sums, "CPU s without": without}
+            )
+            section.goals.append(
+                Goal(f"CPU of an epoch with its checks over without, {layout}", with_sums / without, 1.03, "")
+            )
+    return section
+
+
 def _dataset_row(case: str, level: float, found: dict[str, float], alone: dict[str, float] | None) -> Row:
     return {
         "case": case,
@@ -155,6 +195,10 @@ _CODEC_NOTE = (
     f"One exposure of the built-in room, {SIDE} × {SIDE} pixels; processor time, the best turn. Of engine speed: "
     "engine / (engine + pack), what is left where a thread packs what it simulates. The sparse layout uses `sparse`, "
     "the dense one `blosc lz4-5 bitshuffle`: the smallest of those that keep 60 % at S = 1."
+)
+_EPOCH_NOTE = (
+    "Rooms of 64 × 64 pixels, 4 realizations each, S = 0.1. Processor time, the best turn. Every turn opens the store "
+    "anew, so that each shard is summed once; later epochs of a reader look at the state of the files alone."
 )
 _DATASET_NOTE = (
     "Rooms of 64 × 64 pixels, 8 realizations each, 8 MiB a chunk, 64 MiB a shard. CPU s: of all threads of the "

@@ -88,7 +88,7 @@ def check_commands(extra: str, folder: Path) -> int:
         ("", "timestamps", cube, "-o", folder / "a.npz"),
         ("io", "timestamps", cube, "-o", folder / "a.h5"),
         ("io", "timestamps", cube, "-o", folder / "a.ptu"),
-        ("", "inspect", folder / "a.npz"),
+        ("", "calibrate", folder / "a.npz", "--look"),
         ("", "generate", "room", *few, "-o", folder / "set.zarr"),
         ("cluster", "generate", "room", *few, "--workers", 1, "-o", folder / "set1.zarr"),
         ("", "verify", folder / "set.zarr"),

@@ -150,7 +150,7 @@ RANGE = "[0, 1e+06] photons per period"
         (flux_call(), ValueError, ["signal must be given", "waveform"]),
         (flux_call(1.0, -0.5, 5.0), ValueError, ["background", RANGE, "got -0.5"]),
         (flux_call(1.0, NAN, 5.0), ValueError, ["background", RANGE, "got nan"]),
-        (flux_call(1.0, None, 5.0), TypeError, ["background", "real numbers", "object"]),
+        (flux_call(1.0, None, 5.0), TypeError, ["background", "real numbers", "None"]),
         (flux_call(1.0, 0.0), ValueError, ["delay_ns", "signal > 0"]),
         (flux_call(1.0, 0.0, INF), ValueError, ["delay_ns", "finite", "got inf"]),
         (
@@ -200,7 +200,7 @@ def test_flux(make: Callable[[], Any], kind: type[Exception], fragments: list[st
 
 CALLS = [
     ("engine", "fast", ValueError, ["'exact'", "'sequential'", "'poisson'", "got 'fast'"]),
-    ("engine", None, ValueError, ["'exact'", "got None"]),
+    ("engine", None, TypeError, ["a text or an Engine", "got None"]),
     ("seed", -1, ValueError, [f"[0, {2**64 - 1}]", "got -1"]),
     ("seed", 2**64, ValueError, [f"[0, {2**64 - 1}]", f"got {2**64}"]),
     ("seed", 1.5, TypeError, ["integer", "got 1.5"]),
@@ -208,7 +208,7 @@ CALLS = [
     ("threads", 0, ValueError, ["[1, 1024]", "got 0"]),
     ("threads", 5000, ValueError, ["[1, 1024]", "got 5000"]),
     ("threads", 2.5, TypeError, ["integer", "got 2.5"]),
-    ("progress", 5, TypeError, ["callable", "done, total", "got 5"]),
+    ("progress", 5, TypeError, ["callable", "got 5"]),
     ("pixel_index", [0, 1, 2], ValueError, ["(6,) or (2, 3)", "got (3,)"]),
     ("pixel_index", np.zeros((3, 2), int), ValueError, ["(6,) or (2, 3)", "got (3, 2)"]),
     ("pixel_index", [-1, 0, 1, 2, 3, 4], ValueError, ["[0, 2**32)", "got -1 to 4"]),
@@ -369,7 +369,7 @@ def test_what_is_no_array_of_counts_is_named_by_its_type(tmp_path):
     refused(lambda: ml.reconstruct([cube, cube], SYSTEM), TypeError, "its histogram", "got list")
     refused(lambda: ml.reconstruct(cube.histogram[:]), TypeError, "system must be given")
     refused(lambda: ml.reconstruct("a.zarr", SYSTEM), TypeError, "array of counts", "got str")
-    refused(lambda: ml.calibrate(np.zeros((3, 8))), TypeError, "Timestamps", "got ndarray")
+    refused(lambda: ml.calibrate(np.zeros((3, 8))), ValueError, "times must be finite numbers (n,)")
 
 
 def test_a_file_of_another_kind_says_what_it_is(tmp_path):

@@ -11,7 +11,6 @@ import pytest
 import mars_lidar as ml
 from mars_lidar import io, statistics
 from mars_lidar._base.brief import brief
-from mars_lidar.calibrate import inspect
 from mars_lidar.engines import MarsEngine
 from mars_lidar.reconstruct import HistogramBound
 
@@ -27,7 +26,7 @@ def objects(tmp_path_factory) -> dict[str, Any]:
     flux = ml.Scene.example("room", size=4).flux(SYSTEM, signal=0.5, sbr=1.0)
     cube = ml.simulate(flux, SYSTEM, realizations=2)
     times = ml.simulate_timestamps(ml.Flux(1.0, 0.5, 20.0), LONG)
-    light = ml.calibrate(times, dead_time_ns=40.0)
+    light = ml.calibrate(times, {"dead_time_ns": 40.0})
     table = ml.Table.build(SYSTEM, signal=(0.01, 1, 4), background=(0.01, 1, 4))
     stored = tmp_path_factory.mktemp("objects") / "a.zarr"
     io.simulate_to(stored, flux, SYSTEM)
@@ -53,8 +52,8 @@ def objects(tmp_path_factory) -> dict[str, Any]:
         "bound": ml.cramer_rao(0.5, 0.5, SYSTEM, delay_ns=3.0),
         "reconstruction": ml.reconstruct(cube, SYSTEM),
         "calibration": light,
-        "validation": ml.validate(times, light, cycles=200),
-        "inspection": inspect(times),
+        "look": light.look,
+        "estimate": light.estimates["signal"],
         "table": table,
         "lookup": table.lookup(np.array([0.5]), np.array([0.5])),
         "engine": MarsEngine(table=table, count="matched"),

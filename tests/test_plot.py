@@ -93,7 +93,7 @@ def test_only_the_realization_asked_for_is_drawn():
 
 @pytest.mark.parametrize(
     ("pixels", "message"),
-    [([(9, 0)], r"pixel must lie in y 0 to 8, x 0 to 11, got \(9, 0\)"), ([], "pixels must be 1 to 6 pairs")],
+    [([(9, 0)], r"y of pixels must be an integer in \[0, 8\], got 9"), ([], "pixels must be 1 to 6 pairs")],
 )
 def test_pixels_outside_are_named(pixels, message):
     with pytest.raises(ValueError, match=message):

@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING
 
 from mars_lidar._version import __version__
-from mars_lidar.calibrate import Calibration, Validation, calibrate, validate
+from mars_lidar.calibrate import Calibration, calibrate
 from mars_lidar.instrument.avalanches import Afterpulsing, Crosstalk
 from mars_lidar.instrument.dark_counts import dark_count_map
 from mars_lidar.instrument.effects import Jitter, SampledJitter
@@ -47,7 +47,6 @@ __all__ = [
     "Table",
     "Timestamps",
     "UnitWarning",
-    "Validation",
     "__version__",
     "calibrate",
     "count_law",
@@ -61,7 +60,6 @@ __all__ = [
     "simulate",
     "simulate_timestamps",
     "to_xarray",
-    "validate",
 ]
 
 if TYPE_CHECKING:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked
 from mars_lidar._base.memory import check_memory
 from mars_lidar._base.progress import shown
 from mars_lidar._base.threads import thread_count
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 _MAX_REGISTRATIONS = 2.0**32  # the event counter of one pixel's random stream
 
 
+@checked
 def simulate(
     flux: Flux,
     system: System,
@@ -131,6 +133,7 @@ def simulate(
     return cube
 
 
+@checked
 def simulate_timestamps(
     flux: Flux,
     system: System,
@@ -151,8 +154,8 @@ def simulate_timestamps(
     Returns
     -------
     Timestamps
-        Packed times (ns), cycles and bins of all pixels: of `exact` 8 bytes a registration, times and bins when they
-        are asked for.
+        Packed times (ns), cycles and bins of all pixels: of `exact` 8 bytes a registration, times and bins when asked
+        for.
 
     See Also
     --------

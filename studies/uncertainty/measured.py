@@ -27,7 +27,7 @@ def measured(path: Path, config: Config) -> dict[str, Any]:
     times = Timestamps.load(path, unit_ns=UNIT_NS)
     with h5py.File(path) as file:
         dead_ns = float(np.asarray(file["DT_electronics"])[0, 0]) * UNIT_NS
-    whole = calibrate(times, pulse="free", dead_time_ns=dead_ns)
+    whole = calibrate(times, {"dead_time_ns": dead_ns}, pulse="free")
     system = System(
         period_ns=times.period_ns,
         cycles=CYCLES,
@@ -58,7 +58,7 @@ def measured(path: Path, config: Config) -> dict[str, Any]:
     about = {"photons": len(times), "exposures": len(exposures), "period_ns": times.period_ns, "dead_ns": dead_ns}
     about |= {
         "light": whole.total,
-        "error": whole.total_error,
+        "error": whole.estimates["light"].error,
         "trained": each * LEVELS,
         "steps": steps,
         "gold": len(gold),

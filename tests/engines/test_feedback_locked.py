@@ -145,9 +145,9 @@ def test_the_kernel_asks_for_laps():
     assert (statuses(short, 1) == Reason.FEW).all()
 
 
-@pytest.mark.parametrize("laps", [0, 129])
+@pytest.mark.parametrize("laps", [0, 191])
 def test_laps_are_checked(laps: int):
-    message = "laps must be 1, or from the dead time and a period on, at most 128"
+    message = "laps must be 1, or from the dead time and a period on, at most 190"
     with pytest.raises(ValueError, match=message):
         statuses(LOCKED["S 8, dead time 0.93"], laps)
     with pytest.raises(ValueError, match=message):

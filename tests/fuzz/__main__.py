@@ -24,6 +24,7 @@ parser.add_argument("--out", type=Path, help="a Markdown file to write the table
 given = parser.parse_args()
 kinds = ("read", "refused", *BAD)
 rows: list[tuple[str, collections.Counter[str]]] = []
+cost: list[tuple[float, float]] = []  # most CPU seconds and MiB of a file that was refused
 total: collections.Counter[str] = collections.Counter()
 began = time.monotonic()
 with tempfile.TemporaryDirectory() as folder:
@@ -35,9 +36,13 @@ with tempfile.TemporaryDirectory() as folder:
     for name in names:
         counts: collections.Counter[str] = collections.Counter()
         seen: collections.Counter[str] = collections.Counter()
+        longest = largest = 0.0
 
         def tell(found: dict, path: Path, name=name, counts=counts, seen=seen) -> None:
+            global longest, largest
             counts[found["kind"]] += 1
+            if found["kind"] == "refused":
+                longest, largest = max(longest, found["seconds"]), max(largest, found["mib"])
             if found["kind"] in BAD:
                 label = found["told"][:60]
                 seen[label] += 1
@@ -51,6 +56,7 @@ with tempfile.TemporaryDirectory() as folder:
         print(f"{name:22}" + "".join(f"{counts[kind]:9}" for kind in kinds), flush=True)
         total += counts
         rows.append((name, counts))
+        cost.append((longest, largest))
     print(f"{'all ' + str(sum(total.values())):22}" + "".join(f"{total[kind]:9}" for kind in kinds))
     print(f"{time.monotonic() - began:.0f} s")
     server.close()
@@ -63,13 +69,17 @@ if given.out:
         "process of its own with limits of memory and time. *Read*: as a file may be whose mutation changed nothing "
         "that matters, or numbers without a checksum; *refused*: by one error that names the file. The other columns "
         "are faults: an error without the file's name, one of a library, the end of the process, more than 10 s, more "
-        "than 1 GiB.",
+        "than 1 GiB. Most s, most MiB: CPU time and memory of the dearest refusal, above the process before it.",
         "",
-        "| format | " + " | ".join(kinds) + " |",
-        "|---|" + "--:|" * len(kinds),
+        "| format | " + " | ".join(kinds) + " | most s | most MiB |",
+        "|---|" + "--:|" * (len(kinds) + 2),
         *(
-            f"| {name} | " + " | ".join(str(counts[kind]) for kind in kinds) + " |"
-            for name, counts in [*rows, (f"all {sum(total.values())}", total)]
+            f"| {name} | " + " | ".join(str(counts[kind]) for kind in kinds) + f" | {most_s:.2f} | {most_mib:.0f} |"
+            for (name, counts), (most_s, most_mib) in zip(
+                [*rows, (f"all {sum(total.values())}", total)],
+                [*cost, (max(one for one, _ in cost), max(one for _, one in cost))],
+                strict=True,
+            )
         ),
         "",
     ]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import atexit
 import shutil
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -23,6 +25,9 @@ from mars_lidar.io.transient import read_truth
 SYSTEM = ml.System(
     period_ns=100.0, cycles=50, bins=32, pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=30.0)
 )
+
+
+SECRET = 77  # counts of the file that external storage, virtual data and links point to
 
 
 def _cube(path: Path) -> None:
@@ -49,6 +54,18 @@ def _light(path: Path) -> None:
 def _stream(path: Path) -> None:
     given = {"period_ns": 100.0, "unit_ns": 1.0} if path.name.startswith("bare") else {}
     ml.Timestamps.load(path, **given).histogram()
+
+
+def _elsewhere(path: Path) -> None:
+    """Counts that lie in another file: never read. What is refused by its name is as it should be."""
+    try:
+        cube = foreign_cube(path, SYSTEM)
+    except ValueError as error:
+        if "other file" in str(error) and str(path) in str(error):
+            return
+        raise
+    if (np.asarray(cube.histogram) == SECRET).any():
+        raise RuntimeError(f"{path}: the values of another file were read")
 
 
 def _folder(path: Path) -> None:
@@ -81,6 +98,15 @@ READERS: dict[str, Callable[[Path], Any]] = {
     "recipe.yaml": DatasetRecipe.load,
     "scene.yaml": lambda path: read_view(path, SYSTEM),
     **dict.fromkeys(["counts.csv", "counts.npy", "counts.h5", "counts.mat"], lambda path: foreign_cube(path, SYSTEM)),
+    **dict.fromkeys(
+        ["sparse.mat", "packed.mat", "sparse73.mat", "sparse.npz", "cells.mat", "cells73.mat"],
+        lambda path: foreign_cube(path, SYSTEM, variable="spad[2]" if path.name.startswith("cells") else None),
+    ),
+    **dict.fromkeys(["external.h5", "virtual.h5", "linked.h5"], _elsewhere),
+    "window.mat": lambda path: foreign_cube(path, SYSTEM, unit_ns=1.0, window_ns=(200.0, 250.0)),
+    "stream.csv": lambda path: ml.Timestamps.load(path, period_ns=100.0, unit_ns=1.0).histogram(),
+    "pulse.csv": lambda path: _measured(path, 0.1, "peak"),
+    "matlab.mat": ml.Scene.from_rgbd,
     "pulse.npy": lambda path: _measured(path, 0.1, "peak"),
 }
 LEAVES_OUT = ("folder/a.npz", "folder/nyu.mat")  # never an error: what is damaged is left out
@@ -91,6 +117,7 @@ def make(folder: Path) -> list[str]:
     import h5py
     import ptufile
     from PIL import Image
+    from scipy import sparse
     from scipy.io import savemat
 
     flux = ml.Flux(np.linspace(0.1, 2.0, 12).reshape(3, 4), 0.1, 40.0)
@@ -168,6 +195,42 @@ def make(folder: Path) -> list[str]:
     np.savetxt(folder / "counts.csv", counts[0, 0], fmt="%d")
     with h5py.File(folder / "counts.h5", "w") as file:
         file["counts"] = counts
+    matrix = sparse.csc_matrix(counts.transpose(1, 0, 2).reshape(12, 32).astype(float))
+    savemat(folder / "sparse.mat", {"spad": matrix})
+    savemat(folder / "packed.mat", {"spad": matrix}, do_compression=True)
+    sparse.save_npz(folder / "sparse.npz", matrix)
+    both = np.empty((1, 2), object)
+    both[0, 0], both[0, 1] = counts.astype(float), matrix
+    savemat(folder / "cells.mat", {"spad": both})
+    for name in ("sparse73.mat", "cells73.mat"):
+        with h5py.File(folder / name, "w") as file:
+            group = file.create_group("spad" if name == "sparse73.mat" else "#refs#/a")
+            group.attrs["MATLAB_sparse"] = np.uint64(12)
+            group["data"], group["ir"], group["jc"] = matrix.data, matrix.indices, matrix.indptr
+            if name == "cells73.mat":
+                file["#refs#/b"] = counts.transpose(2, 1, 0).astype(float)
+                cells = file.create_dataset("spad", (2, 1), h5py.ref_dtype)
+                cells[0, 0], cells[1, 0] = file["#refs#/b"].ref, group.ref
+    times = np.empty((3, 4), object)
+    for place in np.ndindex(times.shape):
+        times[place] = np.sort(np.random.default_rng(6).random(30) * 300.0)
+    savemat(folder / "window.mat", {"times": times})
+    np.savetxt(folder / "stream.csv", one[:100])
+    np.savetxt(folder / "pulse.csv", np.exp(-(np.linspace(-3, 3, 40) ** 2)))
+    savemat(folder / "matlab.mat", {"depth": np.random.default_rng(3).random((6, 7)) + 1.0})
+    elsewhere = Path(tempfile.mkdtemp(prefix="fuzz"))
+    atexit.register(shutil.rmtree, elsewhere, True)
+    (elsewhere / "secret.bin").write_bytes(bytes([SECRET]) * 384)
+    with h5py.File(elsewhere / "secret.h5", "w") as file:
+        file["counts"] = np.full((3, 4, 32), SECRET, np.uint8)
+    with h5py.File(folder / "external.h5", "w") as file:
+        file.create_dataset("counts", (3, 4, 32), "u1", external=[(str(elsewhere / "secret.bin"), 0, 384)])
+    virtual = h5py.VirtualLayout((3, 4, 32), "u1")
+    virtual[:] = h5py.VirtualSource(elsewhere / "secret.h5", "counts", (3, 4, 32))
+    with h5py.File(folder / "virtual.h5", "w") as file:
+        file.create_virtual_dataset("counts", virtual)
+    with h5py.File(folder / "linked.h5", "w") as file:
+        file["counts"] = h5py.ExternalLink(str(elsewhere / "secret.h5"), "/counts")
     np.save(folder / "pulse.npy", np.exp(-(np.linspace(-3, 3, 40) ** 2)))
     try:
         import OpenEXR

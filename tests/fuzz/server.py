@@ -9,7 +9,6 @@ import select
 import signal
 import subprocess
 import sys
-import time
 import warnings
 from pathlib import Path
 from typing import Any
@@ -63,7 +62,7 @@ def _outcome(name: str, path: Path) -> dict[str, Any]:
 
 def _in_child(name: str, path: Path) -> dict[str, Any]:
     reading, writing = os.pipe()
-    began = time.monotonic()
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     child = os.fork()
     if child == 0:
         resource.setrlimit(resource.RLIMIT_AS, (ADDRESS_BYTES, ADDRESS_BYTES))
@@ -97,7 +96,7 @@ def _in_child(name: str, path: Path) -> dict[str, Any]:
             found = {"kind": "refused", "told": content.decode(errors="replace")}
     if found["kind"] in ("read", "refused", "unnamed") and 1024 * used.ru_maxrss > LIMIT_BYTES:
         found = {"kind": "memory", "told": f"{1024 * used.ru_maxrss / 2**20:.0f} MiB; {found['told']}"}
-    return found | {"seconds": time.monotonic() - began}
+    return found | {"seconds": used.ru_utime + used.ru_stime, "mib": max(0, used.ru_maxrss - before) / 1024}
 
 
 if __name__ == "__main__":

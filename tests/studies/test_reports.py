@@ -43,7 +43,6 @@ NAMES = {  # of every command that a committed report prints
     "returns",
     "runtime",
     "start-up",
-    "streams",
     "table",
     "transients",
     "uncertainty",

@@ -1,35 +1,83 @@
-"""Arguments checked by the annotations of the function they are given to, in one wording.
+"""Arguments checked by the annotations of the function that they are given to, in one wording.
 
-A caller may hand in None, a list of rows of different lengths or a mapping where a path, an array or a `System` is
-wanted; without a check something deep inside would fail in words of its own. Numbers and choices have checks that know
-their ranges (`checks`).
+A caller may hand in None, a list of rows of different lengths, or a cube where a system is wanted; without a check
+something deep inside would fail in words of its own. An annotation is the one declaration of what an argument is:
+`checked` evaluates it when the function is first called and refuses, by its name, a value that it does not allow.
+Numbers have checks in the functions, which know their ranges (`checks`).
 """
 
 from __future__ import annotations
 
+import builtins
+import collections.abc
 import functools
 import inspect
 import os
-from collections.abc import Callable
+import types
+import typing
+from collections.abc import Callable, Mapping
+from numbers import Integral, Real
+from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
-from mars_lidar._base.checks import numbers, unmasked
+import numpy as np
+
+from mars_lidar._base.checks import did_you_mean, numbers, unmasked, whole
 
 P = ParamSpec("P")
 R = TypeVar("R")
-_CLASSES = ("System", "Flux", "Cube", "Recipe", "Dataset", "DatasetRecipe", "Table", "Cluster")
-_WORDS = {"Path": "a path", "ArrayLike": "an array of real numbers", "str": "a text", "slice": "a slice"}
+_NUMBERS = {int, float, bool, type(None)}
+_ARRAYS = ("ArrayLike", "NDArray", "FloatArray", "IndexArray", "CountArray")
+
+
+class _Array:
+    """Stands for all annotations of arrays: of what is declared so, an array of real numbers can be made."""
+
+    def __class_getitem__(cls, _: Any) -> type[_Array]:
+        return cls
+
+
+class _Elsewhere(type):
+    """A class whose module is not imported here: values are compared with it by the names of their classes."""
+
+    def __getitem__(cls, _: Any) -> _Elsewhere:
+        return cls
+
+    def __getattr__(cls, name: str) -> _Elsewhere:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return _Elsewhere(name, (), {})
+
+
+class _Names(Mapping[str, Any]):
+    """What the names of an annotation stand for."""
+
+    def __init__(self, scope: dict[str, Any]) -> None:
+        self._scope = scope
+
+    def __getitem__(self, name: str) -> Any:
+        if name in _ARRAYS:
+            return _Array
+        if name in self._scope:
+            return self._scope[name]
+        return getattr(builtins, name, None) or _Elsewhere(name, (), {})
+
+    def __iter__(self) -> Any:
+        return iter(self._scope)
+
+    def __len__(self) -> int:
+        return len(self._scope)
 
 
 def checked(function: Callable[P, R], masks: bool = False) -> Callable[P, R]:
-    """Refuse, by their names, arguments that cannot be what their annotations say.
+    """Refuse, by their names, arguments that are not what their annotations say.
 
-    An annotation is looked at where all members of its union are paths, texts, arrays, slices, mappings, None or
-    classes of the package. Arrays must hold real numbers, and nothing that is masked, but where `masks` mean something.
+    Texts, choices, paths, arrays, mappings, sequences, functions, classes and unions of them are compared; numbers and
+    what else an annotation may be are for the function to judge. Arrays must hold real numbers, and nothing that is
+    masked, but where `masks` mean something. A sequence is compared as such, not in what it holds.
     """
     signature = inspect.signature(function)
-    wanted = {name: _members(str(each.annotation)) for name, each in signature.parameters.items()}
-    wanted = {name: members for name, members in wanted.items() if members}
+    rules: dict[str, tuple[Any, ...]] = {}
 
     @functools.wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -37,9 +85,11 @@ def checked(function: Callable[P, R], masks: bool = False) -> Callable[P, R]:
             given = signature.bind(*args, **kwargs).arguments
         except TypeError:  # one too many, or too few: Python says which
             return function(*args, **kwargs)
-        for name, members in wanted.items():
-            if name in given:
-                _require(name, given[name], members, masks)
+        if not rules:
+            rules.update(_rules(function, signature))
+        for name, value in given.items():
+            if members := rules.get(name):
+                _require(name, value, members, masks)
         return function(*args, **kwargs)
 
     return call
@@ -50,30 +100,113 @@ def checked_with_masks(function: Callable[P, R]) -> Callable[P, R]:
     return checked(function, masks=True)
 
 
-def _members(annotation: str) -> tuple[str, ...]:
-    """Members of the union, or none where one of them is not for this module to judge."""
-    parts = [part.strip() for part in annotation.strip("'\"").split(" | ")]
-    names = ["dict" if part.startswith("dict[") else part for part in parts]
-    known = {"None", "dict", *_WORDS, *_CLASSES}
-    return tuple(names) if known.issuperset(names) and names != ["None"] else ()
+def _rules(function: Callable[..., Any], signature: inspect.Signature) -> dict[str, tuple[Any, ...]]:
+    """Members of the union of each parameter; none where one of them is not for this module to judge."""
+    names = _Names(getattr(inspect.unwrap(function), "__globals__", {}))
+    found: dict[str, tuple[Any, ...]] = {}
+    for name, parameter in signature.parameters.items():
+        if parameter.annotation is parameter.empty or parameter.kind in (
+            parameter.VAR_POSITIONAL,
+            parameter.VAR_KEYWORD,
+        ):
+            continue
+        annotation = parameter.annotation
+        if isinstance(annotation, str):
+            annotation = eval(annotation.strip("'\""), {}, names)
+        members = tuple(_members(annotation))
+        if set(members) - _NUMBERS and all(_known(member) for member in members):
+            found[name] = members
+    return found or {"": ()}
 
 
-def _require(name: str, value: Any, members: tuple[str, ...], masks: bool) -> None:
-    classes = {each.__name__ for each in type(value).__mro__}
-    if (value is None and "None" in members) or classes & set(members) - {"str", "None"}:
-        if "Path" in members and "\0" in str(value):
-            raise ValueError(f"{name} must be a path, got {value!r}, which holds a null byte")
+def _members(annotation: Any) -> list[Any]:
+    if isinstance(annotation, typing.TypeAliasType if hasattr(typing, "TypeAliasType") else ()):
+        return _members(annotation.__value__)
+    if typing.get_origin(annotation) in (typing.Union, types.UnionType):
+        return [part for each in typing.get_args(annotation) for part in _members(each)]
+    return [type(None) if annotation is None else annotation]
+
+
+def _known(member: Any) -> bool:
+    origin = typing.get_origin(member)
+    if member in (Any, object) or isinstance(member, TypeVar | str):
+        return False
+    return isinstance(origin or member, type) or origin is typing.Literal
+
+
+def _require(name: str, value: Any, members: tuple[Any, ...], masks: bool) -> None:
+    if value is None and type(None) in members:
         return
-    if "Path" in members and isinstance(value, str | os.PathLike):
+    if Path in members and isinstance(value, str | os.PathLike):
         text = os.fspath(value)
         if not isinstance(text, str) or not text or "\0" in text:
-            raise ValueError(f"{name} must be a path, got {value!r}")
+            null = ", which holds a null byte" if "\0" in str(text) else ""
+            raise ValueError(f"{name} must be a path, got {value!r}{null}")
         return
-    if "Path" not in members and "str" in members and isinstance(value, str):
+    if any(_fits(value, member, Path in members) for member in members):
         return
-    if "ArrayLike" in members:
-        numbers(name, value if masks else unmasked(name, value))
+    if _Array in members and value is not None:
+        array = value if masks else unmasked(name, value)
+        if getattr(array, "requires_grad", False):
+            raise TypeError(f"{name} must be an array of real numbers, got a tensor with a gradient: detach() it first")
+        numbers(name, array)
         return
-    said = [_WORDS.get(each, f"a {each}") for each in members if each not in ("None", "str" * ("Path" in members))]
-    shown = f"{value!r:.80}" if isinstance(value, str | float | int | None) else ""
-    raise TypeError(f"{name} must be {' or '.join(said)}, got {shown}{' ' * bool(shown)}{type(value).__name__}")
+    choices = [word for each in members if typing.get_origin(each) is typing.Literal for word in each.__args__]
+    if choices and (isinstance(value, str) or len(members) == 1):
+        raise ValueError(f"{name} must be {_words(members)}, got {value!r}{did_you_mean(value, choices)}")
+    raise TypeError(f"{name} must be {_words(members)}, got {_told(value)}")
+
+
+def _fits(value: Any, member: Any, paths: bool) -> bool:
+    origin = typing.get_origin(member) or member
+    if origin is typing.Literal:
+        return any(value is choice or (type(value) is type(choice) and value == choice) for choice in member.__args__)
+    if origin is _Array or (origin is str and paths):
+        return False
+    if isinstance(origin, _Elsewhere):
+        return any(each.__name__ == origin.__name__ for each in type(value).__mro__)
+    if origin is float:
+        return isinstance(value, Real) and not isinstance(value, bool | np.bool_)
+    if origin is int:
+        return isinstance(whole(value), Integral) and not isinstance(value, bool | np.bool_)
+    if origin is bool:
+        return isinstance(value, bool | np.bool_)
+    if origin in (tuple, list, collections.abc.Sequence, collections.abc.Iterable):
+        return isinstance(value, collections.abc.Iterable) and not isinstance(value, str | bytes | dict)
+    if getattr(origin, "_is_protocol", False):
+        return _has_members(value, origin)
+    return isinstance(value, origin)
+
+
+def _has_members(value: Any, protocol: Any) -> bool:
+    """Whether `value` has what a protocol asks for; a class or None has it by accident."""
+    names = [name for name in vars(protocol) if not name.startswith("_")] + [*getattr(protocol, "__annotations__", {})]
+    return not isinstance(value, type) and all(hasattr(value, name) for name in names)
+
+
+def _words(members: tuple[Any, ...]) -> str:
+    """The members of a union for people."""
+    plain: dict[Any, str] = {_Array: "an array of real numbers", float: "a number", int: "an integer", bool: "a bool"}
+    plain |= {Path: "a path", dict: "a mapping", slice: "a slice", collections.abc.Callable: "a callable"}
+    sequence = (tuple, list, collections.abc.Sequence, collections.abc.Iterable)
+    said: list[str] = []
+    for member in members:
+        origin = typing.get_origin(member) or member
+        if origin is type(None) or (origin is str and Path in members):
+            continue
+        if origin is typing.Literal:
+            word = "one of " + ", ".join(map(repr, member.__args__))
+        elif origin is str:
+            word = "a text"
+        elif origin in sequence:
+            word = "a sequence"
+        else:
+            word = plain.get(origin) or f"{'an' if origin.__name__[0] in 'AEIO' else 'a'} {origin.__name__}"
+        if word not in said:
+            said.append(word)
+    return " or ".join(said)
+
+
+def _told(value: Any) -> str:
+    shown = f"{value!r:.80} " if isinstance(value, str | float | int) and not isinstance(value, bool) else ""
+    return f"{shown}{'None' if value is None else type(value).__name__}"

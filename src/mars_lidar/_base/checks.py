@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
+from collections.abc import Sequence
 from numbers import Integral, Real
 from typing import Any
 
@@ -69,10 +70,15 @@ def numbers(name: str, value: Any) -> Any:
     """The value, unless an array made of it would hold anything but real numbers."""
     even_rows(name, value)
     dtype = getattr(value, "dtype", None)
-    if dtype is None and not hasattr(value, "__array__"):
-        dtype = np.asarray(value).dtype
-    if isinstance(dtype, np.dtype) and dtype.kind not in "biuf":
-        raise TypeError(f"{name} must be real numbers, got dtype {dtype}")
+    if not isinstance(dtype, np.dtype):
+        try:
+            dtype = np.asarray(value).dtype
+        except Exception as error:  # whatever makes an array of it, such as a tensor on another device
+            told = " ".join(str(error).split())
+            raise TypeError(f"{name} must be real numbers, got {type(value).__name__} ({told[:200]})") from None
+    if dtype.kind not in "biuf":
+        shown = type(value).__name__ if dtype.kind == "O" else f"dtype {dtype}"
+        raise TypeError(f"{name} must be real numbers, got {shown}")
     return value
 
 
@@ -87,7 +93,7 @@ def known_keys(name: str, mapping: Any, allowed: tuple[str, ...]) -> dict[str, A
     return mapping
 
 
-def did_you_mean(word: Any, allowed: tuple[str, ...]) -> str:
+def did_you_mean(word: Any, allowed: Sequence[str]) -> str:
     """`` (did you mean 'near'?)`` for the allowed word nearest to `word`, or an empty text where none is near."""
-    near = difflib.get_close_matches(str(word), allowed, 1)
+    near = difflib.get_close_matches(str(word), [str(each) for each in allowed], 1)
     return f" (did you mean {near[0]!r}?)" if near else ""

@@ -8,28 +8,38 @@ and renamed at the end, so that what is half written never looks complete, whate
 from __future__ import annotations
 
 import contextlib
+import errno
+import glob
 import math
 import os
+import re
+import secrets
 import shutil
 import stat
+import struct
+import warnings
 import zipfile
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar._base.mat5 import check_elements
+from mars_lidar._base import mat5
 from mars_lidar._base.memory import check_memory
+from mars_lidar._base.sparse import check_sparse, is_sparse
 
 if TYPE_CHECKING:
     from numpy.lib.npyio import NpzFile
 
 LIMIT = "MARS_LIDAR_READ_GIB"  # of the environment: what the arrays of one file may take in memory
 _FEW_CHUNKS, _CHUNK_ENTRY = 10_000, 4  # of HDF5: so many anywhere; bytes of a file that each of more takes at least
-_LEAST_LIMIT, _TIMES = 512 * 2**20, 512  # without it: so many bytes, or so many times the file
-INCOMPLETE_SUFFIX = ".incomplete"  # of the sibling that an .h5 or .npz is written to
+_TIMES = 512  # without it: so many times the file, or, if that is more, what follows
+_LEAST_IN_PARTS, _LEAST_WHOLE = 512 * 2**20, 64 * 2**20  # bytes
+_SMALL_FILE, _MOST_OF_SMALL = 10**6, 128 * 2**20  # no smaller file takes more memory than this before it is refused
+INCOMPLETE_SUFFIX = ".incomplete"  # of the sibling that a file is written to, after eight random digits
+_UNFINISHED = re.compile(r"(\.[0-9a-f]{8})?\.incomplete$")
 
 
 class FileError(ValueError):
@@ -63,20 +73,121 @@ def telling(left: Callable[[], str]) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def beside(target: Path) -> Iterator[Path]:
-    """The path beside `target` to write a file or folder to: renamed to it at the end, at once, or else removed."""
-    path = target.with_name(target.name + INCOMPLETE_SUFFIX)
+def beside(target: Path, *, folder: bool = False) -> Iterator[Path]:
+    """A new file (or `folder`) beside `target` to write to: renamed to it at the end, at once, or else removed.
+
+    A store or file at `target` is replaced. What a killed run left there is removed.
+    """
+    for leftover in unfinished_of(target):
+        with contextlib.suppress(OSError), _held(leftover):  # its run is gone: it would hold the lock
+            _remove(leftover)
+    path = _created(target, folder)
 
     def removed() -> str:
-        if path.is_dir():
-            shutil.rmtree(path, ignore_errors=True)
-        else:
-            path.unlink(missing_ok=True)
+        _remove(path)
         return f"{target} is what it was before" if target.exists() else f"nothing was left at {target}"
 
-    with telling(removed):
+    with telling(removed), contextlib.ExitStack() as lock:
+        with contextlib.suppress(OSError):  # a file system without locks: leftovers are then nobody's to remove
+            lock.enter_context(_held(path))
         yield path
+        if folder:
+            exchange(path, target)
+        else:
+            os.replace(path, target)
+
+
+@contextlib.contextmanager
+def replacing(target: Path) -> Iterator[BinaryIO]:
+    """A stream whose content replaces `target` at the end; what stops the writing removes it."""
+    path = _created(target, folder=False)
+    try:
+        with open(path, "r+b") as stream:
+            yield stream
         os.replace(path, target)
+    except BaseException:
+        _remove(path)
+        raise
+
+
+def exchange(path: Path, target: Path) -> None:
+    """Put the folder `path` in the place of `target`, if there is one, and remove that.
+
+    Who reads `target` reads the old one or the new one, never a mixture under one name.
+    """
+    if not target.exists() and not target.is_symlink():
+        os.rename(path, target)
+        return
+    old = _unused(target)
+    os.rename(target, old)
+    os.rename(path, target)
+    _remove(old)
+
+
+def open_own(path: Path) -> BinaryIO:
+    """A file to write to at a name that others know, such as that of a lock: a link of this name is not followed."""
+    try:
+        number = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            raise FileExistsError(f"{path} is a link to another file, which is not written to: remove it") from None
+        raise
+    return os.fdopen(number, "r+b")
+
+
+def finished_name(path: Path) -> Path:
+    """The path that a file will have which a run left unfinished at `path`; `path` itself for others."""
+    return path.with_name(_UNFINISHED.sub("", path.name))
+
+
+def unfinished_of(target: Path) -> list[Path]:
+    """What stopped runs left beside `target`."""
+    names = sorted(target.parent.glob(f"{glob.escape(target.name)}*{INCOMPLETE_SUFFIX}"))
+    return [path for path in names if finished_name(path) == target]
+
+
+@contextlib.contextmanager
+def _held(path: Path) -> Iterator[None]:
+    """Hold a lock on an unfinished file or folder; OSError where another process has it, or there are no locks."""
+    try:
+        import fcntl
+    except ImportError:  # Windows
+        raise OSError("no locks") from None
+    folder = path.is_dir()
+    number = os.open(path, (os.O_RDONLY if folder else os.O_RDWR) | os.O_NOFOLLOW)
+    try:
+        if folder:
+            fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        elif hasattr(fcntl, "F_OFD_SETLK"):  # one that the locks of HDF5 do not meet
+            whole_file = struct.pack("hhqqi", fcntl.F_WRLCK, os.SEEK_SET, 0, 0, 0)
+            fcntl.fcntl(number, fcntl.F_OFD_SETLK, whole_file)
+        else:
+            raise OSError("no locks of open files")
+        yield
+    finally:
+        os.close(number)
+
+
+def _created(target: Path, folder: bool) -> Path:
+    """A new empty file or folder beside `target`, of a name that nobody can know before; never a link."""
+    path = _unused(target)
+    if folder:
+        os.mkdir(path)
+    else:
+        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0)
+        os.close(os.open(path, flags, 0o666))
+    return path
+
+
+def _unused(target: Path) -> Path:
+    return target.with_name(f"{target.name}.{secrets.token_hex(4)}{INCOMPLETE_SUFFIX}")
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def reason(error: OSError) -> str:
@@ -168,10 +279,13 @@ def check_claim(path: Path, nbytes: float, what: str = "its arrays", *, in_parts
     Nothing that was ever recorded is smaller by 512 times when it is packed; a bomb, or a damaged header, is.
     """
     given = os.environ.get(LIMIT)
-    try:
-        limit = max(_LEAST_LIMIT, _TIMES * size_on_disk(path)) if given is None else float(given) * 2**30
-    except ValueError:
-        raise ValueError(f"{LIMIT} must be a number of GiB, got {given!r}") from None
+    if given is None:
+        limit = float(_packed_limit(size_on_disk(path), in_parts))
+    else:
+        try:
+            limit = float(given) * 2**30
+        except ValueError:
+            raise ValueError(f"{LIMIT} must be a number of GiB, got {given!r}") from None
     if nbytes > limit:
         raise FileError(
             f"{path}: {what} would take {nbytes / 2**30:.3g} GiB, more than {limit / 2**30:.3g}: is it damaged? "
@@ -179,6 +293,14 @@ def check_claim(path: Path, nbytes: float, what: str = "its arrays", *, in_parts
         )
     if not in_parts:
         check_memory(math.ceil(nbytes), f"{what} of {path}", "read it on a larger machine")
+
+
+def _packed_limit(size: int, in_parts: bool) -> int:
+    """Bytes that the arrays of a file of this size may claim."""
+    if in_parts:
+        return max(_LEAST_IN_PARTS, _TIMES * size)
+    limit = max(_LEAST_WHOLE, _TIMES * size)
+    return limit if size >= _SMALL_FILE else min(limit, _MOST_OF_SMALL)
 
 
 @contextlib.contextmanager
@@ -189,13 +311,16 @@ def open_npz(path: Path, stream: Any = None, *, beside: str = "") -> Iterator[Np
     """
     with reading(path, "an .npz"):
         with zipfile.ZipFile(stream or path) as archive:
-            members = [one for one in archive.infolist() if one.filename != f"{beside}.npy"]
-            check_claim(path, sum(one.file_size for one in members))
+            members = archive.infolist()
+            check_claim(path, sum(one.file_size for one in members if one.filename != f"{beside}.npy"))
             for one in members:
                 with archive.open(one) as member:
                     shape, dtype = npy_header(member)
-                    if math.prod(shape) * dtype.itemsize > one.file_size:
+                    nbytes = math.prod(shape) * dtype.itemsize
+                    if nbytes > one.file_size:
                         raise ValueError(f"{one.filename} cannot hold an array of shape {shape}")
+                    if one.filename == f"{beside}.npy":
+                        check_claim(path, nbytes, beside, in_parts=True)
         if stream is not None:
             stream.seek(0)
         with np.load(stream or path, allow_pickle=False) as arrays:
@@ -219,14 +344,22 @@ def read_npy(path: Path) -> NDArray[Any]:
 def check_data(path: Path, data: Any, name: str, *, in_parts: bool = False) -> None:
     """`check_claim` of a data set of HDF5 or an array of Zarr.
 
-    And, of HDF5, raise where it claims more chunks than its file can list, each of which takes some 4 kB to read.
+    And, of HDF5, raise where its values lie in another file, or where it claims more than what is stored of it can
+    hold, or more chunks than its file can list, each of which takes some 4 kB to read.
     """
+    if hasattr(data, "file"):
+        check_inside(path, data)
+        steps = zip(data.shape, data.chunks or data.shape, strict=True)
+        count = math.prod(-(-size // max(1, step)) for size, step in steps)
+        if count > max(_FEW_CHUNKS, size_on_disk(path) // _CHUNK_ENTRY):
+            raise FileError(f"{path}: {name} would have {count} chunks, more than it can list: is it damaged?")
     check_claim(path, math.prod(data.shape) * data.dtype.itemsize, name, in_parts=in_parts)
-    if not (hasattr(data, "file") and data.chunks):
-        return
-    count = math.prod(-(-size // step) for size, step in zip(data.shape, data.chunks, strict=True))
-    if count > max(_FEW_CHUNKS, size_on_disk(path) // _CHUNK_ENTRY):
-        raise FileError(f"{path}: {name} would have {count} chunks, more than it can list: is it damaged?")
+
+
+def check_inside(path: Path, data: Any) -> None:
+    """Raise FileError for a data set of HDF5 whose values lie in another file: any that this process can read."""
+    if data.is_virtual or data.external:
+        raise FileError(f"{path}: the values of {data.name} lie in other files, which are not read: copy them into it")
 
 
 def whole(data: Any) -> NDArray[Any]:
@@ -243,12 +376,29 @@ def size_on_disk(path: Path) -> int:
 
 
 def read_mat5(path: Path, names: Iterable[str] | None = None) -> dict[str, Any]:
-    """Variables of a MATLAB file of version 5, all or those of these names that are there."""
-    from scipy.io import loadmat, whosmat
+    """Variables of a MATLAB file of version 5, all or those of these names that are there; sparse ones are checked."""
+    from scipy.io import loadmat, matlab
 
     with reading(path, "a .mat of version 5"):
-        check_elements(path)
         wanted = None if names is None else list(names)
-        listed = [(math.prod(shape), kind) for name, shape, kind in whosmat(path) if wanted is None or name in wanted]
-        check_claim(path, sum(8 * size for size, kind in listed if kind != "sparse"))
-        return dict(loadmat(path, variable_names=wanted))
+        heads = [head for head in mat5.variables(path) if wanted is None or head.name in wanted]
+        check_claim(path, sum(8 * math.prod(head.shape) for head in heads if head.kind != "sparse"))
+        check_claim(path, mat5.check_elements(path, wanted))
+        with warnings.catch_warnings():  # of variables of the same name, the last of which is the variable
+            warnings.simplefilter("ignore", matlab.MatReadWarning)
+            found = dict(loadmat(path, variable_names=wanted))
+        for name, value in found.items():
+            _check_sparse_within(name, value)
+        return found
+
+
+def _check_sparse_within(name: str, value: Any) -> None:
+    """Check a sparse matrix, also in the cells and structures of a variable."""
+    if is_sparse(value):
+        check_sparse(name, value, sorted_rows=True)
+    elif isinstance(value, np.ndarray) and value.dtype == object:
+        for part in value.ravel():
+            _check_sparse_within(name, part)
+    elif isinstance(value, np.ndarray) and value.dtype.names and value.dtype.hasobject:
+        for field in value.dtype.names:
+            _check_sparse_within(f"{name}.{field}", value[field])

@@ -20,12 +20,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar._base.files import FileError, reading, whole
+from mars_lidar._base.files import FileError, check_inside, reading, whole
 
 if TYPE_CHECKING:
     import h5py
 
 SEAL = "sha256"  # the attribute of a file
+CELLS = "#refs#"  # where MATLAB puts what the cells of a v7.3 file hold
 LIBVER = ("v110", "v110")  # HDF5 1.10, of 2016, on: from there all metadata carry checksums, indices of chunks as well
 _CHUNK_BYTES = 2**20  # HDF5's default chunk cache
 _HEAP = b"GCOL\1\0\0\0"  # begins a collection of texts in HDF5
@@ -96,8 +97,31 @@ def open_hdf5(path: Path, kind: str = "an HDF5 file") -> Iterator[h5py.File]:
     with reading(path, kind):
         check_heaps(path)
         with h5py.File(path, "r") as file:
+            check_links(file, path)
             require(file, path)
             yield file
+
+
+def check_links(file: h5py.File, path: Path) -> None:
+    """Raise FileError for a link to another file, and for data sets whose values lie in one.
+
+    A file of a stranger would else be read as counts, whatever it is. What the cells of MATLAB refer to is checked
+    when it is read (`mars_lidar._base.files.check_data`).
+    """
+    import h5py
+
+    for name, kind in _links(file):
+        if kind not in (h5py.h5l.TYPE_HARD, h5py.h5l.TYPE_SOFT):
+            raise FileError(f"{path}: {name} is a link to another file, which is not read: copy it into this one")
+        if not name.startswith(f"{CELLS}/") and isinstance(data := file.get(name), h5py.Dataset):
+            check_inside(path, data)
+
+
+def _links(file: h5py.File) -> list[tuple[str, int]]:
+    """Names and kinds of all links."""
+    found: list[tuple[str, int]] = []
+    file.id.links.visit(lambda name, info: found.append((name.decode("utf-8", "replace"), info.type)), info=True)
+    return found
 
 
 def check_heaps(path: Path) -> None:

@@ -1,9 +1,11 @@
 """What a Zarr store consists of: ``manifest.sha256``, a line of ``sha256sum`` for every file of it.
 
 With it no chunk can be missing, which Zarr would read as zeros, and no label be another one. On opening, `require`
-looks at metadata, coordinates and names; the CRC-32C of a chunk is looked at when it is read; `damage` looks at every
-byte, as ``sha256sum -c manifest.sha256`` does. The manifest appears by a rename before the root document of the store
-does, which says "complete": what was stopped between the two is incomplete.
+compares metadata, coordinates and names, and the sum over the manifest itself, which the root document has. The
+`Manifest` that it returns stays in memory: the first time that a chunk file is read, its sum is compared with the line
+of its name, and again whenever the file is another one than before. So what was opened is what is read, or an error.
+`damage` looks at every byte, as ``sha256sum -c manifest.sha256`` does. The manifest appears by a rename before the root
+document of the store does, which says "complete": what was stopped between the two is incomplete.
 """
 
 from __future__ import annotations
@@ -12,16 +14,19 @@ import hashlib
 import json
 import os
 import re
+import threading
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from mars_lidar._base.files import FileError, check_claim, reading
+from mars_lidar._base.files import FileError, check_claim, reading, replacing
 
 NAME = "manifest.sha256"
 _ROOT = "zarr.json"
 _SMALL = re.compile(r"(^|/)zarr\.json$|^[^/]+/c/\d+$")  # documents, and arrays of one dimension: coordinates
+_CHUNK = re.compile(r"(^|/)c(/\d+)+$")
+SUM = "manifest_sha256"  # attribute of the root document: the the sum over the lines of all other files
 _THREADS = 4  # hashing runs without Python's lock
 
 
@@ -29,19 +34,18 @@ def seal(store: Path, attrs: dict[str, Any]) -> None:
     """Put these attributes into the root document, with a manifest of everything as it is then."""
     document = json.loads((store / _ROOT).read_bytes())
     document["attributes"].update(attrs | {"manifest": NAME})
-    root = json.dumps(document, indent=2).encode()
     for name in document.get("consolidated_metadata", {}).get("metadata", {}):
         if not (store / name / _ROOT).is_file():
             raise FileNotFoundError(f"{store / name / _ROOT} was taken away while the store was written")
     names = sorted(_files(store) - {_ROOT, NAME})
     with ThreadPoolExecutor(_THREADS) as pool:
         told = dict(zip(names, pool.map(lambda name: _hash(store / name), names), strict=True))
+    document["attributes"][SUM] = _sum(told)
+    root = json.dumps(document, indent=2).encode()
     told[_ROOT] = hashlib.sha256(root).hexdigest()
-    lines = "".join(f"{told[name]}  {name}\n" for name in sorted(told))
-    for name, content in ((NAME, lines.encode()), (_ROOT, root)):
-        unfinished = store / f"{name}.partial"
-        unfinished.write_bytes(content)
-        os.replace(unfinished, store / name)
+    for name, content in ((NAME, _lines(told)), (_ROOT, root)):
+        with replacing(store / name) as stream:
+            stream.write(content)
 
 
 def root_document(store: Path) -> dict[str, Any]:
@@ -57,38 +61,99 @@ def root_document(store: Path) -> dict[str, Any]:
         return document
 
 
-def is_sealed(store: Path) -> bool:
-    """Whether a store has a manifest, or says so; those of mars-lidar 0.1 have none."""
-    return (store / NAME).exists() or "manifest" in root_document(store).get("attributes", {})
+class Manifest:
+    """The sums of a complete store as it was opened; several threads may check its files.
+
+    Attributes
+    ----------
+    identity
+        Sum over all lines: two stores of the same identity are the same in every byte.
+    """
+
+    def __init__(self, store: Path, sums: Mapping[str, str], known: Mapping[str, tuple[int, ...]]) -> None:
+        self._store, self._sums = store, sums
+        self._known = dict(known)  # files whose sums were compared: what the file system says of them
+        self._lock, self._locks = threading.Lock(), dict[str, threading.Lock]()
+        self.identity = _sum(sums)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._sums
+
+    def is_known(self, name: str) -> bool:
+        """Whether the file is the one that was compared before: one look at its directory entry."""
+        state = self._known.get(name)
+        return state is not None and state == _state(self._store / name)
+
+    def check(self, name: str) -> None:
+        """Raise FileError unless the file is there as it was when the store was sealed; without a line, unless absent.
+
+        A file is read once: later calls compare what the file system says of it.
+        """
+        if name not in self._sums:
+            if _state(self._store / name) is not None:
+                raise self._error(f"{name} is not in its {NAME}")
+            return
+        if self.is_known(name):
+            return
+        with self._lock:
+            lock = self._locks.setdefault(name, threading.Lock())
+        with lock:
+            if self.is_known(name):
+                return
+            path = self._store / name
+            before = _state(path)
+            if before is None:
+                raise self._error(f"{name} is missing")
+            try:
+                digest = _hash(path)
+            except FileNotFoundError:
+                raise self._error(f"{name} is missing") from None
+            if digest != self._sums[name] or _state(path) != before:
+                raise self._error(f"{name} is not as it was written")
+            self._known[name] = before
+
+    def _error(self, reason: str) -> FileError:
+        return FileError(
+            f"{self._store} is damaged, or was replaced or removed after it was opened: {reason}; open it again"
+        )
 
 
 def told(store: Path) -> str:
     """For people: what opening a store has made sure of."""
-    if is_sealed(store):
-        return f"every file of its {NAME} is there"
-    return f"it has no {NAME} (of an earlier version): that nothing is missing or changed cannot be checked"
+    return f"every file of its {NAME} is there"
 
 
-def require(store: Path) -> None:
-    """Raise FileError where a file of a store is missing, or a document of it is not as it was written."""
-    told = list(damage(store, every=False))
-    if told:
-        more = f", and {len(told) - 3} more" if len(told) > 3 else ""
-        raise FileError(f"{store} is damaged: {', '.join(told[:3])}{more}")
+def require(store: Path) -> Manifest:
+    """The manifest; FileError where a file of a store is missing, or a document of it is not as it was written."""
+    sums, documents, wrong = _compared(store, every=False)
+    if wrong:
+        more = f", and {len(wrong) - 3} more" if len(wrong) > 3 else ""
+        raise FileError(f"{store} is damaged: {', '.join(wrong[:3])}{more}")
+    return Manifest(store, sums, documents)
 
 
-def damage(store: Path, *, every: bool = True) -> Iterator[str]:
+def damage(store: Path, *, every: bool = True) -> list[str]:
     """A sentence for each file that is missing or changed; without `every`, only metadata and coordinates are read."""
-    if not is_sealed(store):
-        return
+    return _compared(store, every)[2]
+
+
+def _compared(store: Path, every: bool) -> tuple[dict[str, str], dict[str, tuple[int, ...]], list[str]]:
+    """Sums by name, the states of the files that were read, and what is wrong."""
     path = store / NAME
     if not path.exists():
-        yield f"its {NAME} is missing"
-        return
+        return {}, {}, [f"its {NAME} is missing"]
     with reading(path, "lines of sha256sum"):
         check_claim(path, 4 * path.stat().st_size)
-        told = lines_of(path.read_text("utf-8"))
-    yield from compared(told, _files(store), lambda name: _hash(store / name), every)
+        sums = lines_of(path.read_text("utf-8"))
+    states: dict[str, tuple[int, ...]] = {}
+
+    def digest(name: str) -> str:
+        if (state := _state(store / name)) is not None:
+            states[name] = state
+        return _hash(store / name)
+
+    stated = root_document(store).get("attributes", {}).get(SUM)
+    return sums, states, list(compared(sums, _files(store), digest, every, stated))
 
 
 def lines_of(text: str) -> dict[str, str]:
@@ -97,18 +162,45 @@ def lines_of(text: str) -> dict[str, str]:
 
 
 def compared(
-    told: Mapping[str, str], there: set[str] | None, digest: Callable[[str], str], every: bool = False
+    told: Mapping[str, str],
+    there: set[str] | None,
+    digest: Callable[[str], str],
+    every: bool = False,
+    stated: str | None = None,
 ) -> Iterator[str]:
-    """A sentence for each file that is not as `told`, of those that are `there`, None where they cannot be listed."""
+    """A sentence for each file that is not as `told`, of those that are `there`, None where they cannot be listed.
+
+    `stated` is the sum over the lines that the root document has.
+    """
+    if stated != _sum(told):
+        yield f"its {NAME} is not that of its {_ROOT}"
     if there is not None:
         yield from (f"{name} is missing" for name in told if name not in there)
-        documents = {name for name in there if name.rpartition("/")[2] == _ROOT}
-        yield from (f"{name} is not in its {NAME}" for name in sorted(documents - set(told)))
+        more = {name for name in there if name.rpartition("/")[2] == _ROOT or _CHUNK.search(name)}
+        yield from (f"{name} is not in its {NAME}" for name in sorted(more - set(told)))
     known = set(told) if there is None else there
     names = sorted(name for name in told if name in known and (every or _SMALL.search(name)))
     with ThreadPoolExecutor(_THREADS) as pool:
         found = list(pool.map(digest, names))
     yield from (f"{name} is not as it was written" for name, now in zip(names, found, strict=True) if told[name] != now)
+
+
+def _lines(sums: Mapping[str, str]) -> bytes:
+    return "".join(f"{sums[name]}  {name}\n" for name in sorted(sums)).encode()
+
+
+def _sum(sums: Mapping[str, str]) -> str:
+    """Over all lines but that of the root document, which has this sum in it."""
+    return hashlib.sha256(_lines({name: value for name, value in sums.items() if name != _ROOT})).hexdigest()
+
+
+def _state(path: Path) -> tuple[int, ...] | None:
+    """What changes when a file is written or replaced; None where there is no file."""
+    try:
+        told = path.stat()
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    return told.st_dev, told.st_ino, told.st_size, told.st_mtime_ns, told.st_ctime_ns
 
 
 def _files(store: Path) -> set[str]:

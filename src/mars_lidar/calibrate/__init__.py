@@ -1,31 +1,18 @@
-"""Calibration: what a stream of photons says about its instrument, and whether the model describes the stream."""
+"""Calibration: what a recorded stream of photons says about its light and its detector, and whether a model fits it."""
 
-from mars_lidar.calibrate.arrivals import ArrivalInspection, inspect_arrivals
-from mars_lidar.calibrate.calibration import Calibration, calibrate
-from mars_lidar.calibrate.calibration_bound import Bound, calibration_bound
-from mars_lidar.calibrate.calibration_rapp import RappEstimate, rapp_total
-from mars_lidar.calibrate.fit_tests import Check
-from mars_lidar.calibrate.inspection import Inspection, inspect
-from mars_lidar.calibrate.intervals import Summary, summary
-from mars_lidar.calibrate.recovery import Recovery, recovery
-from mars_lidar.calibrate.validation import Validation, validate
+from mars_lidar.calibrate.calibration import Calibration, Estimate, Limit, Suspect, calibrate
+from mars_lidar.calibrate.histograms import CubeCalibration, calibrate_cube
+from mars_lidar.calibrate.look import Look
+from mars_lidar.calibrate.suspects import Drift
 
 __all__ = [
-    "ArrivalInspection",
-    "Bound",
     "Calibration",
-    "Check",
-    "Inspection",
-    "RappEstimate",
-    "Recovery",
-    "Summary",
-    "Validation",
+    "CubeCalibration",
+    "Drift",
+    "Estimate",
+    "Limit",
+    "Look",
+    "Suspect",
     "calibrate",
-    "calibration_bound",
-    "inspect",
-    "inspect_arrivals",
-    "rapp_total",
-    "recovery",
-    "summary",
-    "validate",
+    "calibrate_cube",
 ]

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from mars_lidar._base.types import FloatArray
-from mars_lidar.calibrate.intervals import Stream
+from mars_lidar.calibrate.recording import Recording
 
 _CELLS = 2**20  # of the time axis: all of it where the stream is shorter
 _PER_PERIOD = 32  # cells of the given period: lines up to 16 times its frequency
@@ -20,22 +20,22 @@ _TRIED = 5000  # lines
 _AROUND = 64  # lines on either side, whose median tells what a dead time makes of light without a period
 
 
-def other_period(stream: Stream) -> float | None:
-    """The period, ns, that the photons repeat with where it is not that of the stream; None where it is, or none is.
+def other_period(recording: Recording) -> float | None:
+    """The period, ns, that the photons repeat with where it is not that of the recording; None where it is, or none is.
 
     Periodogram of the first times: photons of a constant light have a power of their number in each line, those of a
     pulsed one of their number squared at the laser's frequency and its multiples. The lowest strong line is taken.
     A dead time in bright light is nearly a period of its own, but a broad one: a line must stand out from its
     neighbours. The units of a clock are spread, or they would be a period too.
     """
-    piece = max(stream.pieces, key=lambda one: one.times_ns.size)
-    cell = stream.period_ns / _PER_PERIOD
-    times = piece.times_ns[: np.searchsorted(piece.times_ns, _CELLS * cell)]
+    times = max(recording.pieces, key=lambda piece: piece.size)
+    cell = recording.period_ns / _PER_PERIOD
+    times = times[: np.searchsorted(times, times[0] + _CELLS * cell)] - times[0]
     if times.size < 100:
         return None
-    if stream.units:
+    if unit := recording.clock.unit_ns:
         spread = np.random.default_rng(_SEED).random(times.size) - 0.5
-        times = np.maximum(times + stream.unit_ns * spread, 0.0)
+        times = np.maximum(times + unit * spread, 0.0)
     place = np.floor(times / cell).astype(np.int64)
     length = int(2 ** np.ceil(np.log2(place.max() + 1)))
     power = np.abs(np.fft.rfft(np.bincount(place, minlength=length))) ** 2 / times.size

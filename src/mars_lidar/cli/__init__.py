@@ -19,7 +19,7 @@ from mars_lidar.cli.generate import GENERATE_EPILOG, generate, verify
 from mars_lidar.cli.groups import flowing_help, grouped
 from mars_lidar.cli.info import info, view
 from mars_lidar.cli.init import init, schema
-from mars_lidar.cli.measured import CALIBRATE_EPILOG, INSPECT_EPILOG, VALIDATE_EPILOG, calibrate, inspect, validate
+from mars_lidar.cli.measured import CALIBRATE_EPILOG, calibrate
 from mars_lidar.cli.reconstruct import RECONSTRUCT_EPILOG, reconstruct
 from mars_lidar.cli.simulate import EPILOG, simulate
 from mars_lidar.cli.table import app as table_app
@@ -47,9 +47,7 @@ for _command, _epilog in (
     (view, None),
     (convert, CONVERT_EPILOG),
     (timestamps, TIMESTAMPS_EPILOG),
-    (inspect, INSPECT_EPILOG),
     (calibrate, CALIBRATE_EPILOG),
-    (validate, VALIDATE_EPILOG),
     (reconstruct, RECONSTRUCT_EPILOG),
 ):
     _add(_command, _epilog, no_args_is_help=True)
@@ -65,7 +63,8 @@ _EPILOG = "\n\n".join(
         "mars-lidar simulate --scene room -o room.zarr",
         "mars-lidar info room.zarr",
         "mars-lidar view room.zarr --pixel 40,64 -o pixel.png",
-        "Exit codes: 0 done, 1 failed, 2 bad input, 130 interrupted. [bold]mars-lidar COMMAND --help[/bold] says more.",
+        "Exit codes: 0 done, 1 failed, 2 bad input, 3 a model that does not fit, 130 interrupted. "
+        "[bold]mars-lidar COMMAND --help[/bold] says more.",
     )
 )
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
+FAILED, BAD_INPUT, MISFIT, INTERRUPTED = 1, 2, 3, 130
 _PIPE = 250  # columns where nobody is watching
 _FIELDS = {  # of the package, where an option has another name
     "sigma_ns": "pulse_sigma_ns",
@@ -111,6 +111,15 @@ def two_integers(option: str, text: str, form: str = "Y,X (row, column)") -> tup
         first, second = (int(part) for part in text.split(","))
     except ValueError:
         raise ValueError(f"{option} must be two integers {form}, got {text!r}") from None
+    return first, second
+
+
+def two_numbers(option: str, text: str, form: str) -> tuple[float, float]:
+    """What an option of this form gives, such as START,STOP."""
+    try:
+        first, second = (float(part) for part in text.split(","))
+    except ValueError:
+        raise ValueError(f"{option} must be two numbers {form}, got {text!r}") from None
     return first, second
 
 

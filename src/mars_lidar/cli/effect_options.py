@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from mars_lidar._base import checks
-from mars_lidar._base.files import read_npy
+from mars_lidar._base.files import read_npy, reading
+from mars_lidar._base.text import read_column
 from mars_lidar.cli.groups import group, panel
 from mars_lidar.instrument.effects import FIELDS
 
@@ -110,10 +111,14 @@ class Effects(StreamEffects, LightEffects):
 
 
 def read_array(option: str, file: Path) -> Any:
-    """The array of a .npy file that `option` names."""
-    if file.suffix != ".npy":
-        raise ValueError(f"{option} must be a 1-D .npy array, got {str(file)!r}")
-    values = read_npy(file)
+    """The values of a .npy, .csv or .txt file that `option` names; of text, a column, or times and values."""
+    if file.suffix in (".csv", ".txt"):
+        with reading(file, "a column of numbers"):
+            values = read_column(file)
+    elif file.suffix != ".npy":
+        raise ValueError(f"{option} must be a 1-D .npy array, or a column as .csv or .txt, got {str(file)!r}")
+    else:
+        values = read_npy(file)
     if values.ndim != 1 or values.dtype.kind not in "fiu" or not (np.isfinite(values) & (values >= 0)).all():
         raise ValueError(f"{file}: {option} must be finite numbers >= 0, (n,), got {values.dtype} {values.shape}")
     return values

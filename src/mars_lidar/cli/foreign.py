@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mars_lidar.cli.console import two_integers
+from mars_lidar.cli.console import two_integers, two_numbers
 from mars_lidar.cli.groups import group, panel
 from mars_lidar.cli.options import DETECTOR, SYSTEM
 from mars_lidar.cli.pulse_options import PulseOptions
@@ -36,7 +36,7 @@ class ForeignOptions:
     dead_time_ns: float | None = _of_file("Dead time after a registration, ns.")
     pulse: PulseOptions = PulseOptions()
     start_ns: float = _of_file("Time from the laser pulse to the first bin (a gate), ns.", default=0.0)
-    variable: str | None = _of_file("Name of the array, of a file with several.")
+    variable: str | None = _of_file("Name of the array, of a file with several; NAME[3] of a MATLAB cell of arrays.")
     axes: str | None = _of_file(
         "What its dimensions are, e.g. tyx; n exposures, (yx) or (xy) pixels row by row or column by column.",
         "time last, or where the system's bins fit",
@@ -44,6 +44,9 @@ class ForeignOptions:
     )
     image: str | None = _of_file("Height and width of (yx) or (xy).", metavar="H,W")
     unit_ns: float | None = _of_file("Unit of photon times, ns.")
+    window_ns: str | None = _of_file(
+        "Of photon times that count from the laser pulse: those in this window alone, ns.", metavar="START,STOP"
+    )
 
     @property
     def _given(self) -> list[str]:
@@ -83,7 +86,9 @@ class ForeignOptions:
         )
         length = None if found.counts is None else found.counts.shape[-1]
         whole = self if found.recorder is None or base is not None else self._completed(found.recorder, length)
-        return found.cube(base or whole._system(path, length), start_ns=self.start_ns, unit_ns=self.unit_ns)
+        window = None if self.window_ns is None else two_numbers("--window-ns", self.window_ns, "START,STOP in ns")
+        system = base or whole._system(path, length)
+        return found.cube(system, start_ns=self.start_ns, unit_ns=self.unit_ns, window_ns=window)
 
     def _completed(self, told: Recorded, length: int | None) -> ForeignOptions:
         """With what the recorder tells, where no option does: the period is as many of its bins as fill it best."""
@@ -156,16 +161,13 @@ def is_foreign(path: Path, error: ValueError) -> bool:
 
 def foreign_rows(path: Path) -> list[tuple[str, str]]:
     """What `mars-lidar info` tells of a file of another program."""
-    from mars_lidar.io.foreign import arrays
+    from mars_lidar.io.foreign import listed
     from mars_lidar.io.recorder import RECORDER_SUFFIXES
 
     if path.suffix.lower() in RECORDER_SUFFIXES:
         return _recorder_rows(path)
     rows = [("file", f"{path} (not written by mars-lidar)")]
-    for name, array in arrays(path).items():
-        size = " × ".join(map(str, array.shape))
-        told = f"photon times of {size} pixels" if array.dtype == object else f"{size} {array.dtype}"
-        rows.append(("array", f"{name} {told}".strip()))
+    rows += [("array", f"{name} {content}".strip()) for name, content in listed(path).items()]
     return [*rows, ("reconstruct with", _NEEDED)]
 
 
@@ -180,7 +182,7 @@ def _recorder_rows(path: Path) -> list[tuple[str, str]]:
         scan = recorded(path)
     else:
         found = photons_of(path)
-        streams = [("a channel's stream", "mars-lidar inspect, calibrate, validate --pixel 0,C")]
+        streams = [("a channel's stream", "mars-lidar calibrate --pixel 0,C")]
         clock = f"{1e3 * found.clock_ns:.7g} ps"
         if found.fine is None:
             rows.append(("clock", f"absolute times in units of {clock} (T2)"))

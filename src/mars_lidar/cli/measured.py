@@ -1,192 +1,165 @@
-"""`mars-lidar inspect`, `calibrate` and `validate`: measured photon streams."""
+"""`mars-lidar calibrate`: a measured photon stream to its light, its detector and a verdict."""
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
+import numpy as np
 import typer
 
 from mars_lidar._base import checks
-from mars_lidar.calibrate import inspect as look
-from mars_lidar.calibrate import validate as compared
-from mars_lidar.calibrate.prediction import system_of
-from mars_lidar.cli.console import FAILED, check_picture, refuse_existing, reported, save_picture, table
-from mars_lidar.cli.effect_options import StreamEffects
+from mars_lidar._base.files import read_npy
+from mars_lidar.calibrate import Calibration, CubeCalibration, calibrate_cube
+from mars_lidar.calibrate import calibrate as calibrated
+from mars_lidar.cli.console import MISFIT, check_picture, refuse_existing, reported, save_picture, table
 from mars_lidar.cli.groups import argument, examples
-from mars_lidar.cli.measured_tables import clock_rows, interval_rows, light_rows
 from mars_lidar.cli.options import of_output
 from mars_lidar.cli.options import out as out_option
-from mars_lidar.cli.stream_options import DEAD_TIME_NS, FitOptions, StreamOptions, of_stream
-from mars_lidar.instrument.system import MAX_CYCLES
+from mars_lidar.cli.stream_options import KnownOptions, StreamOptions
+from mars_lidar.instrument.system import MAX_CYCLES, SPEED_OF_LIGHT_M_PER_NS, System
 
-_RECIPE = "docs/calibration.md has the whole recipe."
-INSPECT_EPILOG = examples(
-    "mars-lidar inspect lab.ptu -o lab.png",
-    "mars-lidar inspect photons.mat --variable tPhoton --unit-ns 0.064 --period-ns 50.048",
-    _RECIPE,
-)
 CALIBRATE_EPILOG = examples(
-    "mars-lidar calibrate lab.ptu --dead-time-ns 85 -o lab.yaml",
-    "mars-lidar calibrate lab.ptu --pixel 0,2 --pulse-file irf.npy --pulse-bin-ns 0.008",
-    "mars-lidar calibrate lab.ptu --returns 2 --hold-off-ns 120",
-    "mars-lidar calibrate lab.ptu --dead-time-ns 85 --pulse-sigma-ns 0.5 --jitter-fwhm-ns 0.1",
-    _RECIPE,
+    "mars-lidar calibrate lab.ptu --look",
+    "mars-lidar calibrate lab.ptu -o lab.yaml --picture lab.png",
+    "mars-lidar calibrate lab.ptu --given dead_time_ns=50 --given jitter_ns=0.1",
+    "mars-lidar calibrate photons.mat --variable tPhoton --unit-ns 0.064 --period-ns 50.048 --free",
+    "mars-lidar calibrate lab.ptu --pixel 0,2 --pulse-file irf.npy --pulse-bin-ns 0.008 --cycles 9975",
+    "mars-lidar calibrate face.npy --system lab.yaml -o face.yaml",
+    "Exit code 3 where the model does not fit the stream. docs/calibration.md has the whole recipe.",
 )
-VALIDATE_EPILOG = examples(
-    "mars-lidar validate lab.ptu --cycles 9975 --dead-time-ns 85 -o validation.png",
-    "mars-lidar validate decay.ptu --cycles 1000 --free",
-    "mars-lidar validate lab.ptu --cycles 9975 --system lab.yaml --afterpulse-probability 0.01 "
-    "--afterpulse-delay-ns 50",
-    "Exit code 1 where the model does not fit the stream. " + _RECIPE,
-)
-_STREAM = argument("Photon stream: .ptu, .pt2, .pt3, .ht2, .ht3, .t3r, .spc, Photon-HDF5, .mat or .npz.")
-_PICTURE = out_option("A picture: .png, .pdf or .svg.", None)
-_OVERWRITE = of_output("Replace an existing file.", default=False)
-
-
-def inspect(
-    stream: Path = _STREAM,
-    *,
-    source: StreamOptions,
-    dead_time_ns: float | None = DEAD_TIME_NS,
-    out: Path | None = _PICTURE,
-    overwrite: bool = _OVERWRITE,
-) -> None:
-    """Look at a photon stream: rates, intervals, dead time, recovery after a photon, and what does not fit.
-
-    Nothing is assumed of the light but that it repeats with the laser; of a simulated stream only the photons are
-    looked at, not the system in its header. Without a laser: dead time and afterpulses in constant light.
-    """
-    with reported():
-        check_picture(out, overwrite)
-        from mars_lidar.io.streams.photons import NoLaserError
-
-        try:
-            times, rows = source.load(stream)
-        except NoLaserError as error:
-            if out is not None:
-                raise ValueError(f"{error}; a picture (-o) needs a laser period") from error
-            table(source.arrivals(stream, dead_time_ns))
-            return
-        found = look(times, dead_time_ns=dead_time_ns)
-        rows += clock_rows(found.calibration) + interval_rows(found.calibration, dead_time_ns is None)
-        light = found.calibration
-        told = f"{light.total:.5g} ± {light.total_error:.2g} photons per period reach the pixel, armed or not"
-        rows.append(("light", told))
-        recovered = found.recovery.findings()
-        if not recovered:
-            ages = found.recovery.edges_ns[-1]
-            how = "behind an edge that jitter blurs" if light.jitter_ns else "at once"
-            told = f"{how}: the rate is that of the light from {found.recovery.dead_time_ns:.5g} to {ages:.4g} ns"
-            rows.append(("recovery", told))
-        rows += [("not known", text) for text in found.unknown]
-        rows += [("does not fit", text) for text in found.problems or ("nothing",)]
-        if out is not None:
-            from mars_lidar.plot.stream import stream_figure
-
-            save_picture(stream_figure(found, f"{stream.name}"), out)
-            rows.append(("picture", str(out)))
-        table(rows)
+_UNITS = {"signal": " photons per period", "background": " photons per period", "light": " photons per period"}
 
 
 def calibrate(
-    stream: Path = _STREAM,
+    stream: Path = argument(
+        "Photon stream: .ptu, .pt2, .pt3, .ht2, .ht3, .t3r, .spc, Photon-HDF5, .mat, .npz; or a cube: .zarr, .npy."
+    ),
     *,
     source: StreamOptions,
-    light: FitOptions,
-    effects: StreamEffects,
+    known: KnownOptions,
+    look: bool = of_output("Stop before the fit: what the file holds.", default=False),
+    seed: int = of_output("Seed of the simulated streams.", default=0),
     out: Path | None = out_option("The calibrated system, .yaml or .json, to simulate with.", None),
-    cycles: int | None = of_output(
-        "Laser periods of an exposure of the calibrated system.", "those of the stream, at most 1e8"
-    ),
-    overwrite: bool = _OVERWRITE,
+    picture: Path | None = of_output("A picture: .png, .pdf or .svg."),
+    cycles: int | None = of_output("Laser periods of a realization: compare the law of their counts too."),
+    overwrite: bool = of_output("Replace existing files.", default=False),
 ) -> None:
-    """Signal, background and delay of a photon stream, by maximum likelihood, with standard errors."""
+    """Light and detector of a photon stream, each with an error, a verdict, and what is suspect.
+
+    Nothing is assumed but what --given says; of a simulated stream only the photons are used. Without a laser: dead
+    time, jitter and afterpulses in constant light. Of a cube: dead time and pulse width that its pixels share.
+    """
     with reported():
         from mars_lidar.io.streams.photons import NoLaserError
 
-        _check_system_out(out, light.free, overwrite)
+        check_picture(picture, overwrite)
+        if out is not None:
+            if out.suffix not in (".yaml", ".yml", ".json"):
+                raise ValueError(f"--out must end in .yaml, .yml or .json, got {str(out)!r}")
+            if known.free or look:
+                raise ValueError("--out needs a fitted pulse: leave out --free and --look, or --out")
+            refuse_existing(out, overwrite)
         if cycles is not None:
             checks.integer("--cycles", cycles, low=1, high=MAX_CYCLES)
+        if stream.suffix in (".npy", ".zarr"):
+            if not _cube(stream, known, out).fits:
+                raise typer.Exit(MISFIT)
+            return
+        given, shape = known.known(), known.shape()
         try:
             times, rows = source.load(stream)
+            result = calibrated(times, given, pulse=shape, returns=known.returns, look=look, seed=seed)
         except NoLaserError as error:
-            if out is not None or light.system is not None:
-                raise ValueError(f"{error}; a system (-o, --system) needs a laser period") from error
-            table(source.arrivals(stream, light.dead_time_ns))
-            return
-        found, detector = light.calibrate(times, effects)
-        table(rows + clock_rows(found) + light_rows(found, detector))
-        if out is not None:
-            bins = times.bins if times.bins <= 2**20 else 1024
-            exposure = min(max(times.cycles, 1), MAX_CYCLES) if cycles is None else cycles
-            system_of(found, detector, exposure, bins).replace(start="armed").save(out)
-            table([("wrote", f"{out}, exposures of {exposure:,} laser periods")])
+            if out is not None or cycles is not None:
+                raise ValueError(f"{error}; --out and --cycles need a laser period") from error
+            arrivals, unit, rows = source.arrivals(stream)
+            result = calibrated(arrivals, given, look=look, unit_ns=unit, seed=seed)
+        table(rows + look_rows(result) + ([] if look else fit_rows(result)))
+        written = []
+        if cycles is not None and not look:
+            counts = result.realizations(cycles)
+            table([("counts", str(counts))])
+        if out is not None and result.system is not None:
+            result.system.save(out)
+            written.append(("wrote", str(out)))
+        if picture is not None:
+            from mars_lidar.plot.stream import calibration_figure
+
+            save_picture(calibration_figure(result, stream.name), picture)
+            written.append(("picture", str(picture)))
+        if written:
+            table(written)
+        if not look and not result.fits:
+            raise typer.Exit(MISFIT)
 
 
-def validate(
-    stream: Path = _STREAM,
-    *,
-    cycles: int = of_stream("Laser periods of a realization: the stream is cut into such pieces.", default=...),
-    source: StreamOptions,
-    light: FitOptions,
-    effects: StreamEffects,
-    simulated: int = of_stream("Realizations to simulate for what no law predicts of a detector.", default=4000),
-    out: Path | None = _PICTURE,
-    overwrite: bool = _OVERWRITE,
-) -> None:
-    """Does the model predict the stream? Calibrates, cuts into realizations, compares counts, shape, joint statistics.
+def _cube(path: Path, known: KnownOptions, out: Path | None) -> CubeCalibration:
+    """What the pixels of a cube share: printed, and written as a system."""
+    if path.suffix == ".zarr":
+        from mars_lidar.io import load
 
-    Distances stand beside their sampling floor: what samples of the predicted law itself would have.
-    """
-    with reported():
-        check_picture(out, overwrite)
-        times, rows = source.load(stream)
-        calibrated, detector = light.calibrate(times, effects)
-        found = compared(times, calibrated, cycles=cycles, detector=detector, simulated=simulated)
-        rows += clock_rows(calibrated) + light_rows(calibrated, detector)
-        mean, high = found.total_variation_floor
-        rows += [
-            ("prediction", found.prediction.words),
-            ("realizations", f"{found.realizations:,} of {cycles:,} cycles, {found.counts.mean():,.6g} counts each"),
-            ("count law", f"total variation {found.total_variation:.4g}, sampling floor {mean:.4g} (99 %: {high:.4g})"),
-            ("", f"KL {found.kl:.4g} nats, sampling floor {found.kl_floor[0]:.4g} (99 %: {found.kl_floor[1]:.4g})"),
-            (
-                "histogram",
-                f"total variation {found.shape_variation:.4g}, sampling floor {found.shape_floor:.4g}"
-                + (" (fitted bin by bin: tells nothing)" if calibrated.waveform is not None else ""),
-            ),
-        ]
-        for check in found.checks:
-            figures = f"{check.measured:.6g}, predicted {check.predicted:.6g} ± {check.error:.2g}; "
-            figures = "" if math.isnan(check.error) else figures
-            mark = "  ✗" if check in found.failed else ""
-            rows.append((check.name, f"{figures}p = {check.p:.2g}{mark}"))
-        if found.prediction.recovery is None:  # else what it finds is what was told
-            rows += [("recovery", text) for text in found.recovery.findings()]
-        if found.consistent:
-            verdict = f"the model fits (a stream of the model's fails at {found.level:.0%})"
-        else:
-            failed = [check.name for check in found.failed]
-            failed += ["intervals shorter than the dead time"] * found.too_short
-            verdict = f"the model does NOT fit: {'; '.join(failed)}"
-        rows.append(("verdict", verdict))
-        if out is not None:
-            from mars_lidar.plot.stream import validation_figure
-
-            save_picture(validation_figure(found, stream.name), out)
-            rows.append(("picture", str(out)))
-        table(rows)
-        if not found.consistent:
-            raise typer.Exit(FAILED)
+        with load(path) as cube:
+            system = cube.system if known.system is None else System.load(known.system)
+            counts = np.asarray(cube.histogram)
+    else:
+        if known.system is None:
+            raise ValueError(
+                f"{path} needs --system: laser period, cycles and bins of its histograms, and where to begin"
+            )
+        system, counts = System.load(known.system), read_npy(path)
+    result = calibrate_cube(counts, system)
+    rows = [("file", f"{path}: {counts.size // counts.shape[-1]:,} histograms of {counts.shape[-1]:,} bins")]
+    units = {"background_floor": " photons per period, of the darkest of them"}
+    rows += [(name, f"{estimate}{units.get(name, '')}") for name, estimate in result.estimates.items()]
+    verdict = "their histograms fit" if result.fits else "their histograms do NOT fit: another return, or an effect"
+    rows.append(("verdict", f"{100 * result.misfits:.3g} % of {result.p_values.size} pixels have p < 1 %: {verdict}"))
+    table(rows)
+    if out is not None:
+        result.system.save(out)
+        table([("wrote", str(out))])
+    return result
 
 
-def _check_system_out(out: Path | None, free: bool, overwrite: bool) -> None:
-    if out is None:
-        return
-    if free:
-        raise ValueError("a free shape is no system: leave out --out or --free")
-    if out.suffix not in (".yaml", ".yml", ".json"):
-        raise ValueError(f"--out must end in .yaml, .yml or .json, got {str(out)!r}")
-    refuse_existing(out, overwrite)
+def look_rows(result: Calibration) -> list[tuple[str, str]]:
+    """Clock, laser, rate, intervals, and what is odd about them."""
+    look = result.look
+    clock = f", clock unit {1e3 * look.unit_ns:.5g} ps" if look.unit_ns else ""
+    if look.unit_ns and look.locked:
+        clock += " from each laser pulse"
+    laser = f"none recorded; {look.seconds:.4g} s{clock}"
+    if result.recording.laser:
+        laser = f"period {look.period_ns:.7g} ns ({1e3 / look.period_ns:.5g} MHz), {look.cycles:,.0f} periods, "
+        laser += f"{look.seconds:.4g} s{clock}"
+    per = f", {look.per_period:.5g} a period" if result.recording.laser else ""
+    low, middle, high = look.quantiles_ns
+    rows = [
+        ("laser", laser),
+        ("rate", f"{look.rate_per_s:,.6g} counts/s{per}"),
+        ("intervals", f"smallest {look.smallest_ns[0]:.6g} ns; 1, 50, 99 %: {low:.5g}, {middle:.5g}, {high:.5g} ns"),
+    ]
+    return rows + [("problem", text) for text in look.problems]
+
+
+def fit_rows(result: Calibration) -> list[tuple[str, str]]:
+    """Estimates, limits, drift, suspects, and the verdict."""
+    rows = []
+    for name, estimate in result.estimates.items():
+        text = f"{estimate}{_UNITS.get(name.split('_')[0], '')}"
+        if name.startswith("delay") and estimate.error:
+            text += f", {0.5 * SPEED_OF_LIGHT_M_PER_NS * estimate.value:.6g} m"
+        rows.append((name, text))
+    if result.waveform is not None:
+        rows.append(("light", f"free shape of {result.waveform.size} bins, {result.waveform.sum():.6g} a period"))
+    for limit in result.limits:
+        shifts = ", ".join(f"{name} by {shift:+.2g}" for name, shift in limit.shifts.items())
+        at = f"; at that size it would move {shifts}" if shifts else ""
+        rows.append(("not detected", f"{limit.words}: {limit.name} below {limit.limit:.3g} (95 %){at}"))
+    if result.drift is not None:
+        drift = result.drift
+        for k, name in enumerate(drift.names):
+            if drift.drifts[k]:
+                rows.append(("drift", f"{name}: errors grown {drift.growth[k]:.2f} times by the scatter of parts"))
+        if not drift.drifts.any():
+            rows.append(("drift", f"none in {drift.times_s.size} parts of the recording (p = {drift.probability:.2g})"))
+    rows += [("suspect", str(suspect)) for suspect in result.suspects]
+    return [*rows, ("verdict", result.verdict)]

@@ -18,7 +18,7 @@ class PulseOptions:
 
     pulse_sigma_ns: float | None = of_system(_SIGMA, "0.5")
     pulse_fwhm_ns: float | None = of_system("Gaussian pulse: full width at half maximum, ns.")
-    pulse_file: Path | None = of_system("Measured impulse response: 1-D .npy array.")
+    pulse_file: Path | None = of_system("Measured impulse response: 1-D .npy array, or a column as .csv or .txt.")
     pulse_bin_ns: float | None = of_system("Sample width of --pulse-file, ns.")
     pulse_origin: str | None = of_system("What a delay refers to in --pulse-file: peak, centroid or first.", "peak")
 

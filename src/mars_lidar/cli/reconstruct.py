@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -25,7 +26,8 @@ from mars_lidar.cli.console import (
 from mars_lidar.cli.foreign import ForeignOptions
 from mars_lidar.cli.groups import argument, examples, option
 from mars_lidar.cli.options import out as out_option
-from mars_lidar.reconstruct import METHODS, Flags, Reconstruction
+from mars_lidar.reconstruct import METHODS, Flags, MaximumLikelihood, Method, Reconstruction
+from mars_lidar.reconstruct.keep import KEEP, common_delay, has_later_light, keep_return
 from mars_lidar.reconstruct.reconstruction import ATTENUATIONS
 
 if TYPE_CHECKING:
@@ -67,6 +69,14 @@ def reconstruct(
         min=1,
         max=8,
     ),
+    keep: str | None = option("Of --returns: strongest, nearest or farthest becomes the depth.", "strongest"),
+    from_ns: float | None = option(
+        "Returns nearer than this, ns after the pulse, such as an internal reflection, are modelled and left out.",
+        "all",
+    ),
+    false_alarm: float | None = option(
+        "Share of the pixels without signal in which noise passes for it, at most; of maximum_likelihood.", "0.01"
+    ),
     threads: int | None = option("Threads.", "all cores", min=1),
     cloud: Path | None = option(
         "Points of the first method and exposure, .ply, with reflectivity (of --returns: signal, every return a point) "
@@ -98,18 +108,25 @@ def reconstruct(
             check_target(cloud, folder=False, overwrite=overwrite)
         if attenuation is not None:
             checks.choice("--attenuation", attenuation, ATTENUATIONS)
+        several = _several(returns, keep, from_ns)
         with foreign.opened(cube) as stored:
             names = _methods(method, stored)
             with progress_bar("reconstructing") as progress:
                 found = reconstruct_stored(
                     stored,
-                    names,
+                    _with_false_alarm(names, false_alarm),
                     level=level,
                     attenuation=attenuation,
-                    returns=returns,
+                    returns=several,
                     threads=threads,
                     progress=progress,
                 )
+            if keep is not None or from_ns is not None:
+                own = "none" if stored.measured else str(stored.flux.info.get("attenuation", "none"))
+                chosen = keep or "strongest", from_ns or 0.0, attenuation or own
+                found = {name: replace(each, found=keep_return(each.found, *chosen)) for name, each in found.items()}
+            else:
+                _tell_reflection(stored, found)
             results = {name: each.found for name, each in found.items()}
             _show(stored, found)  # first: a disk that is full takes nothing from what is known
             save_maps(out, results, source=str(cube), overwrite=overwrite)
@@ -120,6 +137,46 @@ def reconstruct(
                 save_picture(reconstruction(stored, results), png)
                 rows.append(("picture", str(png)))
         table([*rows, ("time", f"{span(time.perf_counter() - began)} in all")])
+
+
+def _several(returns: int, keep: str | None, from_ns: float | None) -> int:
+    """Returns to look for: where one of them is to be chosen, at least two."""
+    if keep is not None:
+        checks.choice("--keep", keep, KEEP)
+        if returns < 2:
+            raise ValueError(f"--keep {keep} chooses among several returns: give --returns 2 or more")
+    if from_ns is not None:
+        checks.real("--from-ns", from_ns, low=0.0)
+        return max(returns, 2)
+    return returns
+
+
+def _with_false_alarm(names: list[str], false_alarm: float | None) -> list[str | Method]:
+    if false_alarm is None:
+        return [*names]
+    share = checks.real("--false-alarm", false_alarm, low=1e-12, high=0.5)
+    if "maximum_likelihood" not in names:
+        raise ValueError(f"--false-alarm belongs to maximum_likelihood, got --method {','.join(names)}")
+    return [MaximumLikelihood(false_alarm=share) if name == "maximum_likelihood" else name for name in names]
+
+
+def _tell_reflection(cube: Cube, found: dict[str, Timed]) -> None:
+    """A warning where most first returns stand in the same few bins and there is light beyond."""
+    first = next(iter(found.values())).found
+    common = common_delay(first)
+    if common is None:
+        return
+    share, delay = common
+    counts = np.zeros(cube.shape[3], np.int64)
+    for images, rows in cube.recipe.blocks(cube.recipe.chunks(2**24)):
+        counts += np.asarray(cube.histogram[images, rows]).sum((0, 1, 2), dtype=np.int64)
+    if has_later_light(counts, first, delay):
+        say(
+            f"warning: {100 * share:.3g} % of the first returns stand at {delay:.4g} ns "
+            f"({first.system.depth_m(delay):.3g} m), and there is light beyond: if that is an internal reflection, "
+            f"--from-ns {math.ceil(delay + first.system.pulse.support_ns()[1])} or --returns 2 --keep farthest takes "
+            "the surface"
+        )
 
 
 def _methods(text: str, cube: Cube) -> list[str]:
@@ -147,7 +204,7 @@ def _show(cube: Cube, found: dict[str, Timed]) -> None:
     from mars_lidar.reconstruct.quality import errors_against, ssim_available
 
     realizations, height, width, _ = cube.shape
-    head = ["method", "seconds", "seen %", "saturated %"]
+    head = ["method", "seconds", "seen %", "saturated %", "misfit %"]
     lines: list[list[str]] = []
     errors = {name: errors_against(cube, each.found) for name, each in found.items()}
     several = any(each.found.returns is not None for each in found.values())
@@ -167,6 +224,7 @@ def _show(cube: Cube, found: dict[str, Timed]) -> None:
             f"{each.seconds:.3g}",
             f"{100.0 * each.found.seen.mean():.4g}",
             f"{100.0 * ((flags & Flags.SATURATED) > 0).mean():.3g}",
+            "-" if math.isnan(each.found.misfits) else f"{100.0 * each.found.misfits:.3g}",
         ]
         if several:
             count = np.zeros(1) if each.found.returns is None else each.found.returns.count
@@ -182,6 +240,10 @@ def _show(cube: Cube, found: dict[str, Timed]) -> None:
     for line in lines:
         shown.add_row(*line)
     screen().print(shown)
+    for name, each in found.items():
+        if advice := each.found.advice:
+            share = f"{100.0 * each.found.misfits:.3g} % of the pixels do not fit (0.1 % do so by chance)"
+            say(f"warning: {name}: {share}; would fit better: {advice}; mars-lidar calibrate CUBE finds the value")
 
 
 def _save_cloud(path: Path, results: dict[str, Reconstruction], focal_px: float, overwrite: bool) -> int:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.native import _core
-from mars_lidar._base.types import IndexArray, Progress
+from mars_lidar._base.types import IndexArray
 from mars_lidar.cuda.kernels import feedback_histograms, overflow
 from mars_lidar.cuda.machine import Cuda
 from mars_lidar.engines.engine import Task
@@ -32,12 +32,14 @@ def feedback_histogram(task: Task, out: Any, machine: Cuda, draw_exactly: Draw, 
     """
     arrays = _arrays(task, machine)
 
-    def sweep(group: IndexArray, grid: Grid, progress: Progress | None) -> NDArray[np.uint8]:
-        return _launch(task, out, group, grid, arrays, machine, warps)
+    cube = out.reshape(task.realizations, task.pixel_index.size, task.system.bins)
+
+    def sweep(part: Task, first: int, group: IndexArray, grid: Grid) -> NDArray[np.uint8]:
+        rows = cube[first : first + part.realizations].reshape(-1, part.system.bins)
+        return _launch(part, rows, group, grid, arrays, machine, warps)
 
     every = np.arange(task.pixel_index.size)
     rest = sweep_pixels(replace(task, progress=None), Plan.of(task, every), every, sweep)
-    cube = out.reshape(task.realizations, task.pixel_index.size, task.system.bins)
     for first, number, pixels in rest.blocks(task.realizations):
         if pixels.size == task.pixel_index.size and number == task.realizations:
             draw_exactly(task, out)

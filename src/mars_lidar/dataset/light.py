@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from numbers import Real
 from typing import Any
 
+from mars_lidar._base import checks
 from mars_lidar._base.yaml import Key, RecipeError
 from mars_lidar.dataset import values
 from mars_lidar.dataset.values import Fields
@@ -38,6 +40,25 @@ class Light:
     ambient: str | None = None
     dark_count_hz: float = 0.0
     photons_per_unit: float | None = None
+
+    def __post_init__(self) -> None:
+        pairs = self.levels
+        if not isinstance(pairs, list | tuple) or not pairs or not all(map(_is_pair, pairs)):
+            raise ValueError(f"levels must be pairs (signal, sbr) of numbers >= 0, got {pairs!r}")
+        checks.choice("attenuation", self.attenuation, ("none", "inverse_square"))
+        if self.ambient is not None:
+            checks.choice("ambient", self.ambient, ("uniform", "reflectivity", "map"))
+        checks.real("dark_count_hz", self.dark_count_hz, low=0.0)
+        if self.photons_per_unit is not None:
+            checks.real("photons_per_unit", self.photons_per_unit, low=0.0, strict_low=True)
+
+
+def _is_pair(pair: Any) -> bool:
+    """Whether this is (signal, sbr); the latter may be infinite."""
+    if not isinstance(pair, list | tuple) or len(pair) != 2:
+        return False
+    numbers = all(isinstance(one, Real) and not isinstance(one, bool) for one in pair)
+    return numbers and 0 <= pair[0] < math.inf and pair[1] >= 0
 
 
 def read_light(data: Any, key: Key = ("light",)) -> Light:

@@ -73,7 +73,12 @@ LAYOUTS = {
         size=(512, 512),
     ),
     "gutierrez": Layout(
-        {_SPAD: ("spad", "rates", "bin", "range_bins", "est_range_bins_argmax", "intensity", "photons", *_MEANS)},
+        {
+            _SPAD: (
+                *("spad", "rates", "bin", "range_bins", "est_range_bins_argmax", "est_range_bins_lmf"),
+                *("intensity", "photons", *_MEANS),
+            )
+        },
         _SPAD,
         root={"PSF_used_for_simulation.mat": lambda system: {"psf": psf(system)}},
     ),
@@ -105,7 +110,8 @@ def export(
     dataset
         What `mars_lidar.generate` wrote, or its path.
     out
-        A folder that is not there yet, or is empty. The loader's list in it, ``list.txt``, holds a file a line.
+        A folder that is not there yet, or is empty. The loader's list in it, ``list.txt``, holds a file a line. It
+        appears when all is written; what stops the writing leaves nothing under its name.
     layout
         One of `LAYOUTS`.
     fill
@@ -130,7 +136,7 @@ def export(
     replaced = ("intensity", ".mat") if chosen.lists == _INTENSITY else ()  # by loaders, in the whole path
     if any(word in str(folder) for word in replaced) or len(str(folder).split()) != 1:
         raise ValueError(f"out must not have {' or '.join((*replaced, 'a blank'))} in its path, got {str(folder)!r}")
-    samples, realizations, height, width, bins = source.histogram.shape
+    height, width, bins = source.histogram.shape[2:]
     names = {name for keys in chosen.files.values() for name in keys}
     if "rates" in names:
         check_size("rates", 4 * height * width * bins)
@@ -138,7 +144,15 @@ def export(
     if "pulse" in names:
         for system in source.recipe.systems:
             pulse_in_bins(system, np.zeros((1, 1)), np.ones((1, 1)))
-    folder.mkdir(parents=True, exist_ok=True)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with beside(folder, folder=True) as unfinished:
+        written = _write(unfinished, folder, source, chosen, fill, told)
+    return Exported(written, folder / "list.txt", tuple(_notes(layout, chosen, (height, width, bins))))
+
+
+def _write(folder: Path, final: Path, source: Dataset, chosen: Layout, fill: bool, told: Progress | None) -> int:
+    """Write the files of all exposures into `folder`, which will be `final`; returns how many exposures."""
+    samples, realizations = source.histogram.shape[:2]
     maker, written = Maker(source), 0
     listed: list[str] = []
     for path, content in (chosen.root or {}).items():
@@ -158,9 +172,11 @@ def export(
                 if not file.exists():  # the intensity of all levels of light is one file
                     _save(file, {_NAMES.get(key, key): exposure[key] for key in keys})
             for pattern, key in (chosen.pictures or {}).items():
-                _save_depth(folder / pattern.format(**place), exposure[key])
+                picture = folder / pattern.format(**place)
+                if not picture.exists():  # the depth of all levels of light is one picture
+                    _save_depth(picture, exposure[key])
             line = chosen.lists.format(**place)
-            entry = line if chosen.pictures else str(folder / line)
+            entry = line if chosen.pictures else str(final / line)
             if entry not in listed:
                 listed.append(entry)
             written += 1
@@ -169,7 +185,7 @@ def export(
     (folder / "list.txt").write_text("".join(f"{entry}\n" for entry in listed))
     if chosen.pictures:
         (folder / "blacklist.txt").write_text("")
-    return Exported(written, folder / "list.txt", tuple(_notes(layout, chosen, (height, width, bins))))
+    return written
 
 
 def _notes(name: str, layout: Layout, shape: tuple[int, ...]) -> list[str]:
@@ -189,7 +205,7 @@ def _plain(name: str) -> str:
 
 def _save(path: Path, variables: dict[str, Any]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    with beside(path) as unfinished, open(unfinished, "wb") as file:
+    with open(path, "xb") as file:
         write_variables(file, variables)
 
 
@@ -198,5 +214,5 @@ def _save_depth(path: Path, depth_m: NDArray[np.float64]) -> None:
 
     path.parent.mkdir(parents=True, exist_ok=True)
     grey = np.clip(np.round(255.0 / _MONOCULAR_M * depth_m), 0, 255).astype(np.uint8)
-    with beside(path) as unfinished:
-        iio.imwrite(unfinished, grey, extension=".png", plugin="pillow")
+    with open(path, "xb") as file:
+        iio.imwrite(file, grey, extension=".png", plugin="pillow")

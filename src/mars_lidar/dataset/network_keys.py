@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import cached_property
 from typing import Any
@@ -70,6 +71,15 @@ class Exposure:
         out[pixels] = counts.col[order][first] + 1
         return out.reshape(self._flux.shape)
 
+    def _matched(self) -> NDArray[Any]:
+        """Bin of the largest value of the counts correlated with the pulse, from 1; the first of equals."""
+        counts = self._counts.toarray().astype(np.float64)
+        pulse = self._system.pulse.bin_energy(0.5 * self._system.bin_ns, self._system.period_ns, self._system.bins)
+        spectrum = np.fft.rfft(counts, axis=-1) * np.conj(np.fft.rfft(pulse))
+        matched = np.fft.irfft(spectrum, n=self._system.bins, axis=-1).round(9)
+        kind = np.uint16 if self._system.bins < 2**16 else np.uint32
+        return np.asarray((matched.argmax(-1) + 1).astype(kind).reshape(self._flux.shape))
+
     def _pulse(self) -> NDArray[np.float64]:
         delay = np.where(self._flux.signal > 0, self._flux.delay_ns, 0.0)
         return np.asarray(pulse_in_bins(self._system, delay, self._flux.signal)[self._place])
@@ -80,7 +90,9 @@ class Exposure:
 
     def _photons(self, per_period: NDArray[np.float64]) -> float:
         """Of an exposure before dead time, mean over pixels."""
-        return float(per_period.mean()) * self._system.cycles
+        mean = float(per_period.mean()) * self._system.cycles
+        whole = float(round(mean))  # loaders cut it to an integer: 19.999999999999996 is 20
+        return whole if math.isclose(mean, whole, rel_tol=1e-12) else mean
 
     def _ratio(self) -> float:
         background = self._photons(self._flux.background)
@@ -97,6 +109,7 @@ KEYS: dict[str, Callable[[Exposure], Any]] = {  # maps are (H, W)
     "range_bins": lambda e: e._bins[0],
     "bin_hr": lambda e: mat.larger(e._bins[1]),  # the same as a real number, at 8 times the size
     "est_range_bins_argmax": Exposure._fullest,  # bin, from 1; the first of equals
+    "est_range_bins_lmf": Exposure._matched,  # of the counts correlated with the pulse, from 1; the first of equals
     "depth": lambda e: e._depth,  # m; 0 without a return
     "level_depth": Exposure._median,  # of the scene, m, in every pixel
     "intensity": lambda e: e._reflectivity,  # in [0, 1]

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
+from mars_lidar._base.files import reading
 from mars_lidar.dataset.samples import grid
 from mars_lidar.dataset.shard import is_good
 from mars_lidar.dataset.store import Dataset, open_dataset
@@ -68,11 +69,16 @@ def _packed(dataset: Dataset, place: tuple[int, ...]) -> NDArray[np.uint8]:
     shard = tuple(p // n for p, n in zip(place, each, strict=True))
     inside = int(np.ravel_multi_index(tuple(p % n for p, n in zip(place, each, strict=True)), each))
     path = dataset.path.joinpath("histogram", "c", *map(str, shard))
-    with open(path, "rb") as stream:
-        stream.seek(16 * (inside - math.prod(each)) - 4, 2)
-        offset, length = (int(n) for n in np.frombuffer(stream.read(16), "<u8"))
-        stream.seek(offset)
-        packed = stream.read(length)
-    if len(packed) != length or not is_good(packed):
-        raise ValueError(f"{path}: chunk {inside} is damaged (its checksum differs)")
+    with reading(dataset.path, "a dataset of mars-lidar"):
+        dataset.check(path)
+        with open(path, "rb") as stream:
+            stream.seek(16 * (inside - math.prod(each)) - 4, 2)
+            offset, length = (int(n) for n in np.frombuffer(stream.read(16), "<u8"))
+            if offset + length > path.stat().st_size:
+                raise ValueError(f"{path}: chunk {inside} is damaged (it lies beyond the end)")
+            stream.seek(offset)
+            packed = stream.read(length)
+        dataset.check(path)  # it may have been replaced meanwhile
+        if len(packed) != length or not is_good(packed):
+            raise ValueError(f"{path}: chunk {inside} is damaged (its checksum differs)")
     return np.frombuffer(packed, np.uint8)[:-4]

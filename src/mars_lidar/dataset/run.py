@@ -19,7 +19,7 @@ from typing import Any
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.files import Interrupted, WriteError, check_target
+from mars_lidar._base.files import INCOMPLETE_SUFFIX, Interrupted, WriteError, check_target, exchange, open_own
 from mars_lidar._base.progress import shown
 from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import Progress
@@ -95,7 +95,8 @@ def generate(
     resume
         Continue what was interrupted; of a complete store nothing is made. The recipe must be the same.
     overwrite
-        Replace an existing store.
+        Replace an existing store: by one that is made beside it, ``NAME.incomplete.zarr``, and takes its place when it
+        is complete. Who reads the old one gets an error then, never a mixture of both.
     threads
         Threads of this process; default: all processors it may use. With `workers`: of each worker, default 1.
     workers
@@ -132,10 +133,15 @@ def generate(
     if workers is not None or scheduler is not None:
         cluster.reach(scheduler)  # before the scenes are read
     with _alone(target):  # what is there is looked at under the lock: before, another run may have finished it
-        there = target.exists() and resume
+        successor = _successor(target)
+        if overwrite and successor.exists():
+            shutil.rmtree(successor)  # of a stopped run that is started again
+        replacing = overwrite and target.exists()  # by a store that is made beside it, or one that was begun so
+        store = successor if replacing or (resume and successor.exists()) else target
+        there = store.exists() and resume
         if there:
-            dataset = open_dataset(target, allow_incomplete=True)
-            _check_same(target, dataset, wanted)
+            dataset = open_dataset(store, allow_incomplete=True)
+            _check_same(store, dataset, wanted)
         elif wanted is None:
             raise ValueError(f"{target} does not exist: there is nothing to resume, and no recipe is given")
         check_target(target, folder=True, overwrite=overwrite or there)
@@ -143,8 +149,8 @@ def generate(
             if not there or not dataset.planned:
                 if wanted is None:
                     raise ValueError(f"{target} was stopped before its scenes were in: give the recipe again to resume")
-                create(target, wanted, folder)
-                dataset = open_dataset(target, allow_incomplete=True)
+                create(store, wanted, folder)
+                dataset = open_dataset(store, allow_incomplete=True)
             dataset.tidy()
             todo = [] if dataset.complete else dataset.missing()
             for item in todo:
@@ -160,12 +166,15 @@ def generate(
             if not dataset.complete:
                 dataset.tidy()  # of workers that were killed while others went on
                 dataset.finish()
+            if store != target:
+                exchange(store, target)
+                dataset = open_dataset(target)
         except KeyboardInterrupt:
-            raise Interrupted(f"interrupted; {_left(target)}") from None
+            raise Interrupted(f"interrupted; {_left(store, target)}") from None
         except OSError as error:
-            if isinstance(error, FileNotFoundError | FileExistsError) and not target.exists():
+            if isinstance(error, FileNotFoundError | FileExistsError) and not store.exists():
                 raise
-            raise WriteError(error.errno, f"{error.strerror or error}; {_left(target)}") from error
+            raise WriteError(error.errno, f"{error.strerror or error}; {_left(store, target)}") from error
     problems = tuple(dataset.problems)
     shape = tuple(dataset.histogram.shape)
     seconds = time.perf_counter() - began
@@ -278,18 +287,25 @@ def _check_same(target: Path, dataset: Dataset, wanted: DatasetRecipe | None) ->
             )
 
 
-def _left(target: Path) -> str:
+def _successor(target: Path) -> Path:
+    """Where the store is made that will replace `target`: readers keep the old one until the new one is complete."""
+    return target.with_name(f"{target.stem}{INCOMPLETE_SUFFIX}{target.suffix}")
+
+
+def _left(store: Path, target: Path) -> str:
     """What is on the disk, for the text of an error."""
     free = shutil.disk_usage(target.parent).free
     try:
-        dataset = Dataset(target)
+        dataset = Dataset(store)
         if not dataset.planned:
             raise ValueError
         dataset.tidy()
         total, missing = sum(1 for _ in dataset.items()), len(dataset.missing())
-        told = f"{total - missing} of {total} parts of {target} are written, marked incomplete"
+        told = f"{total - missing} of {total} parts of {store} are written, marked incomplete"
     except (OSError, ValueError, KeyError):
-        told = f"{target} is left behind without counts, marked incomplete"
+        told = f"{store} is left behind without counts, marked incomplete"
+    if store != target:
+        told += f", and {target} is what it was before"
     return f"{told} ({free / 1e9:.3g} GB free there): continue with --resume (resume=True)"
 
 
@@ -298,7 +314,7 @@ def _alone(target: Path) -> Iterator[None]:
     """Hold a lock beside the store while it is written; a lock of a process that was killed holds nobody up."""
     lock = target.with_name(target.name + ".lock")
     while True:
-        with open(lock, "w") as held:
+        with open_own(lock) as held:
             try:
                 import fcntl
             except ImportError:  # Windows

@@ -11,6 +11,7 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 import numpy as np
 
 from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked
 from mars_lidar.dataset import values
 from mars_lidar.dataset.light import LIGHT
 from mars_lidar.dataset.recipe import ROOT
@@ -25,6 +26,7 @@ FILES = ("scene", "recipe", "system")
 _PLAIN = {float: "number", int: "integer", str: "string", bool: "boolean", Path: "string"}
 
 
+@checked
 def json_schema(file: str = "recipe") -> dict[str, Any]:
     """JSON Schema (draft 2020-12) of a scene file, a recipe of `generate`, or a system file.
 

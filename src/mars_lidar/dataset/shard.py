@@ -7,8 +7,6 @@ as the packing. Here a chunk is packed while it is still in the processor's cach
 from __future__ import annotations
 
 import itertools
-import os
-import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -16,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.files import replacing
 from mars_lidar._base.native import _core
 
 _NONE = 2**64 - 1  # offset and length of a chunk that is not there
@@ -63,20 +62,14 @@ def is_good(data: bytes) -> bool:
 def write_shard(path: Path, chunks: Iterator[bytes | None]) -> None:
     """Write the chunks of a shard, in C order, None for those beyond the array; the file appears by a rename."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f"{path.name}.{os.getpid()}-{threading.get_ident()}.partial")
     places: list[int] = []
     offset = 0
-    try:
-        with open(unfinished, "wb") as stream:
-            for data in chunks:
-                if data is None:
-                    places += [_NONE, _NONE]
-                    continue
-                stream.write(data)
-                places += [offset, len(data)]
-                offset += len(data)
-            stream.write(with_sum(np.array(places, "<u8").tobytes()))
-        os.replace(unfinished, path)
-    except BaseException:
-        unfinished.unlink(missing_ok=True)
-        raise
+    with replacing(path) as stream:
+        for data in chunks:
+            if data is None:
+                places += [_NONE, _NONE]
+                continue
+            stream.write(data)
+            places += [offset, len(data)]
+            offset += len(data)
+        stream.write(with_sum(np.array(places, "<u8").tobytes()))

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from mars_lidar._base import checks, manifest
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.files import FileError, IncompleteFileError, reading
+from mars_lidar._base.files import INCOMPLETE_SUFFIX, FileError, IncompleteFileError, reading
 from mars_lidar.dataset.arrays import FORMAT, FORMAT_VERSION, MAPS, MORE_VERSION, mark, with_zeros
 from mars_lidar.dataset.recipe import DatasetRecipe
 from mars_lidar.dataset.sample_content import Rendered
@@ -57,6 +57,7 @@ class Dataset:
     def __init__(self, path: Path) -> None:
         import zarr
 
+        from mars_lidar._base.sealed_store import SealedStore
         from mars_lidar.dataset import codec  # noqa: F401  (registers it)
 
         self.path = path
@@ -66,9 +67,9 @@ class Dataset:
         if self.attrs.get("format_version") not in (FORMAT_VERSION, MORE_VERSION):
             told = self.attrs.get("format_version")
             raise ValueError(f"{path} has layout version {told}; {FORMAT_VERSION} and {MORE_VERSION} can be read")
-        if self.complete:
-            manifest.require(path)
-        self.group: Any = zarr.open_group(path, mode="r+", use_consolidated=False)
+        self.sums = manifest.require(path) if self.complete else None
+        store = path if self.sums is None else SealedStore(path, self.sums)
+        self.group: Any = zarr.open_group(store, mode="r+" if self.sums is None else "r", use_consolidated=False)
         self.recipe = DatasetRecipe.from_dict(json.loads(self.attrs["recipe"]))
 
     def __repr__(self) -> str:
@@ -173,11 +174,27 @@ class Dataset:
         """Files that are not there."""
         return [file for item in self.items() for file in self.files(item) if not file.is_file()]
 
+    def unlisted(self) -> str:
+        """The first file of a part that the manifest does not have; empty where it has them all."""
+        names = (file.relative_to(self.path).as_posix() for item in self.items() for file in self.files(item))
+        return next((name for name in names if self.sums is not None and name not in self.sums), "")
+
+    @property
+    def identity(self) -> str:
+        """Sum over the manifest of a complete store: two of the same identity are the same in every byte."""
+        return "" if self.sums is None else self.sums.identity
+
+    def check(self, file: Path) -> None:
+        """Raise FileError where a file of a complete store is not as it was when it was opened."""
+        if self.sums is not None:
+            self.sums.check(file.relative_to(self.path).as_posix())
+
     def tidy(self) -> None:
         """Remove what a writer that was killed left behind: files that were not renamed yet."""
         for name in ("", "histogram", *MAPS):
-            for leftover in (self.path / name).rglob("*.partial") if name else self.path.glob("*.partial"):
-                leftover.unlink(missing_ok=True)
+            for pattern in ("*.partial", f"*{INCOMPLETE_SUFFIX}"):  # of Zarr, and of ours
+                for leftover in (self.path / name).rglob(pattern) if name else self.path.glob(pattern):
+                    leftover.unlink(missing_ok=True)
 
     def finish(self) -> None:
         """Mark the store complete, with one replacement of its root document, after its manifest."""
@@ -222,7 +239,6 @@ def open_dataset(path: str | Path, *, allow_incomplete: bool = False) -> Dataset
         dataset = Dataset(source)
         if not (dataset.complete or allow_incomplete):
             raise IncompleteFileError(f"{path} is incomplete: its generation did not finish; continue it with --resume")
-        sealed = not dataset.complete or manifest.is_sealed(source)  # of an earlier version: all parts have names
-        if not sealed and (gone := dataset.gone()):
-            raise FileError(f"{path} is damaged: {gone[0]} is missing, the first of {len(gone)}")
+        if dataset.complete and (unlisted := dataset.unlisted()):
+            raise FileError(f"{path} is damaged: {unlisted} is not in its {manifest.NAME}")
         return dataset

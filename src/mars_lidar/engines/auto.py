@@ -11,10 +11,8 @@ from numpy.typing import NDArray
 from mars_lidar.engines.engine import Engine, Task
 from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.engines.feedback import FeedbackEngine
-from mars_lidar.engines.feedback_rule import Plan, draw_rest
+from mars_lidar.engines.feedback_rule import Plan, draw_rest, expected_registrations
 from mars_lidar.engines.parts import stage
-from mars_lidar.instrument.system import System
-from mars_lidar.light.flux import Flux
 
 BREAK_EVEN = 4.0
 """Registrations per internal cell above which feedback is the faster engine.
@@ -67,8 +65,3 @@ class AutoEngine(Engine):
         draw_rest(ExactEngine(self.level), second, out, rest)
         task.report["pixels drawn by exact"] = float(rest.pixels.size)
         task.report["pixels drawn by feedback"] = float(many.size - rest.pixels.size)
-
-
-def expected_registrations(flux: Flux, system: System) -> NDArray[np.float64]:
-    """Registrations of an exposure (H, W) under a constant rate of the same energy: N_r Lambda / (1 + Lambda t_d)."""
-    return np.asarray(system.cycles * flux.total / (1.0 + flux.total * system.dead_time_periods))

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.native import _core
-from mars_lidar._base.types import Progress
 from mars_lidar.engines.engine import Engine, Task
 from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.engines.feedback_rule import Grid, Plan, Reason, Rest, draw_rest, sweep_pixels
@@ -75,19 +74,21 @@ class FeedbackEngine(Engine):
             draw_pixels(PoissonEngine(), task, out, pixels)
             return Rest.of(task, pixels[:0], np.zeros((task.realizations, 0), np.uint8))
 
-        def sweep(group: NDArray[np.int64], grid: Grid, progress: Progress | None) -> NDArray[np.uint8]:
-            status = np.empty((task.realizations, group.size), np.uint8)
+        cube = out.reshape(task.realizations, -1, task.system.bins)
+
+        def sweep(part: Task, first: int, group: NDArray[np.int64], grid: Grid) -> NDArray[np.uint8]:
+            status = np.empty((part.realizations, group.size), np.uint8)
             _core.feedback_histogram(
-                task.job,
-                task.pulse,
-                out,
+                part.job,
+                part.pulse,
+                cube[first : first + part.realizations].reshape(-1, part.system.bins),
                 group,
                 status,
                 grid.kinds,
                 grid.laps,
-                task.threads,
+                part.threads,
                 self.level,
-                progress,
+                part.progress,
             )
             return status
 

@@ -11,15 +11,24 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar._base.types import IndexArray, Progress
+from mars_lidar._base.types import IndexArray
 from mars_lidar.engines.engine import Engine, Task
 from mars_lidar.engines.feedback_grid import MOST_SWEEPS, Grids, KindArray
 from mars_lidar.engines.parts import draw_pixels, stage
+from mars_lidar.instrument.system import System
+from mars_lidar.light.flux import Flux
 
 StatusArray = NDArray[np.uint8]
 
 FEWEST_PERIODS = 100  # per dead time, rounded up to periods: shorter exposures are drawn exactly
 MOST_LAP_CELLS = 2**18  # of all laps: 150 MB for each thread
+MOST_TRIES = 3  # more, of an exposure whose sweeps did not end: other numbers of the same law
+TRY_FROM = 128.0
+"""Registrations for each cell above which an unsettled exposure is tried again: below, the exact engine is quicker.
+
+A try takes a batch of 32 lanes, most of them idle.
+"""
+_OTHER_NUMBERS = 0x278DDE6E5FD29E45  # of the seed, for each try
 
 
 class Reason(IntEnum):
@@ -63,8 +72,11 @@ class Grid(NamedTuple):
     laps: int
 
 
-Sweep = Callable[[IndexArray, Grid, Progress | None], StatusArray]
-"""Draws some pixels (n,) of a task on one grid and returns the status (realizations, n) of each exposure."""
+Sweep = Callable[[Task, int, IndexArray, Grid], StatusArray]
+"""Draws some pixels (n,) of a task on one grid and returns the status (realizations, n) of each exposure.
+
+The number is the task's first realization in the output.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,9 +154,9 @@ def sweep_pixels(
         nonlocal done
         for number, lap in np.unique(np.stack([grid[wanted], laps], -1), axis=0):
             group = wanted[(grid[wanted] == number) & (laps == lap)]
-            part = stage(task.progress, done * share, (done + group.size) * share)
+            part = replace(task, progress=stage(task.progress, done * share, (done + group.size) * share))
             used = Grid(plan.grids.kinds[number], int(lap))
-            status[:, group] = sweep(np.ascontiguousarray(pixels[group]), used, part)
+            status[:, group] = sweep(part, 0, np.ascontiguousarray(pixels[group]), used)
             done += int((status[0, group] < Reason.LAPS).sum())
 
     draw(able, np.ones_like(able))
@@ -155,7 +167,26 @@ def sweep_pixels(
     status[:, slow[dear]] = Reason.DEAR
     status[:, slow[large]] = Reason.CELLS
     draw(slow[~large & ~dear], laps[~large & ~dear])
+    of_laps = np.ones(pixels.size, np.int64)
+    of_laps[slow] = laps
+    long = expected_registrations(task.flux, task.system).reshape(-1)[pixels] > TRY_FROM * cells * of_laps
+    unsettled = (status == Reason.UNSETTLED) & long
+    for attempt in range(1, MOST_TRIES + 1):
+        for one in np.flatnonzero(unsettled.any(1)):
+            first, seed = task.first_realization + int(one), task.seed ^ (attempt * _OTHER_NUMBERS % 2**64)
+            part = replace(task, realizations=1, first_realization=first, seed=seed, progress=None)
+            again = np.flatnonzero(unsettled[one])
+            for number, lap in np.unique(np.stack([grid[again], of_laps[again]], -1), axis=0):
+                group = again[(grid[again] == number) & (of_laps[again] == lap)]
+                used = Grid(plan.grids.kinds[number], int(lap))
+                status[one, group] = sweep(part, int(one), np.ascontiguousarray(pixels[group]), used)[0]
+        unsettled &= status == Reason.UNSETTLED
     return Rest.of(task, pixels, status)
+
+
+def expected_registrations(flux: Flux, system: System) -> NDArray[np.float64]:
+    """Registrations of an exposure (H, W) under a constant rate of the same energy: N_r Lambda / (1 + Lambda t_d)."""
+    return np.asarray(system.cycles * flux.total / (1.0 + flux.total * system.dead_time_periods))
 
 
 def draw_rest(engine: Engine, task: Task, out: NDArray[Any], rest: Rest) -> None:

@@ -6,8 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked
 
 
+@checked
 def dark_count_map(
     shape: tuple[int, int],
     *,

@@ -27,7 +27,8 @@ from mars_lidar.instrument.units import check_units, period_hint
 
 SPEED_OF_LIGHT_M_PER_NS = 0.299792458
 _STARTS = ("armed", "stationary")
-MAX_CYCLES = 100_000_000  # the sampler counts periods in 32 bits: ten seconds at 10 MHz
+MAX_CYCLES = 100_000_000  # of a simulation: the sampler counts periods in 32 bits; ten seconds at 10 MHz
+_MOST_CYCLES = 2**53  # of a recording: the integers that doubles hold
 _MAX_BINS = 2**20
 _LINED_BYTES = 2**16  # of JSON that is read as YAML, a hundred times slower, so that errors name the line
 _MAX_DEAD_PERIODS = 2**20
@@ -43,7 +44,7 @@ class System:
     period_ns
         Laser period t_r, ns.
     cycles
-        Laser periods per exposure N_r; the exposure lasts ``cycles * period_ns``.
+        Laser periods per exposure N_r, at most 1e8 to be simulated; the exposure lasts ``cycles * period_ns``.
     bins
         Histogram bins over one period n_b.
     pulse
@@ -88,7 +89,7 @@ class System:
     def __post_init__(self) -> None:
         set_field = object.__setattr__
         set_field(self, "period_ns", checks.real("period_ns", self.period_ns, low=0.0, strict_low=True))
-        set_field(self, "cycles", checks.integer("cycles", self.cycles, low=1, high=MAX_CYCLES))
+        set_field(self, "cycles", checks.integer("cycles", self.cycles, low=1, high=_MOST_CYCLES))
         set_field(self, "bins", checks.integer("bins", self.bins, low=1, high=_MAX_BINS))
         if not isinstance(self.pulse, Pulse):
             raise TypeError(f"pulse must be a GaussianPulse or a SampledPulse, got {self.pulse!r}")

@@ -55,7 +55,10 @@ def check_delays(median_ns: float, period_ns: float) -> None:
     """Warn of returns that come many periods after their pulse."""
     if _ODD_DELAY * period_ns <= abs(median_ns) < 1e7:
         what = f"delay_ns has a median of {median_ns:g}, {median_ns / period_ns:.3g} laser periods, and wraps into one"
-        _warn(f"{what}: if it was meant in picoseconds, divide it by 1000")
+        _warn(
+            f"{what}: if it was meant in picoseconds, divide it by 1000; if it comes from depths of a file in "
+            "millimetres or centimetres, give depth_unit_m (--depth-unit-m) 0.001 or 0.01"
+        )
 
 
 def _typed(name: str, value: float) -> bool:

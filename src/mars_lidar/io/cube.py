@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
-from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,9 @@ from mars_lidar._base.files import (
     FileError,
     IncompleteFileError,
     check_target,
+    finished_name,
     reading,
+    unfinished_of,
 )
 from mars_lidar._base.memory import check_memory
 from mars_lidar._base.notebook import as_html
@@ -75,6 +76,7 @@ class Cube:
     url: str = ""
     progress: str = ""
     _close: Callable[[], None] | None = field(default=None, repr=False)
+    _identity: str = field(default="", repr=False)  # of the content of the file
 
     __repr__ = brief
 
@@ -152,7 +154,8 @@ class Cube:
         """Pickled as its path, for another process to open; without one, with its counts."""
         if self.path is None and not self.url:
             return super().__reduce__()
-        return partial(load, allow_incomplete=not self.complete), (self.url or Path(self.path or "").absolute(),)
+        path = self.url or Path(self.path or "").absolute()
+        return _load_again, (path, not self.complete, self._identity)
 
     def close(self) -> None:
         """Close the file; the histogram cannot be read from it afterwards."""
@@ -198,6 +201,15 @@ def one_exposure(cube: Cube, realization: int) -> Cube:
     return Cube(histogram=np.asarray(cube.histogram[k : k + 1]), recipe=recipe, version=cube.version)
 
 
+def _load_again(path: str | Path, allow_incomplete: bool, identity: str) -> Cube:
+    """The cube of another process, whose file must be the same."""
+    cube = load(path, allow_incomplete=allow_incomplete)
+    if cube._identity != identity:
+        cube.close()
+        raise FileError(f"{path} was replaced after it was opened: open it again")
+    return cube
+
+
 @checked
 def load(path: str | Path, *, allow_incomplete: bool = False) -> Cube:
     """Open a cube; its counts stay on disk until they are indexed.
@@ -223,13 +235,13 @@ def load(path: str | Path, *, allow_incomplete: bool = False) -> Cube:
     if url is not None:
         return _opened(open_url(url), Path(url), allow_incomplete, url)
     source = Path(path)
-    form = format_of(source.with_name(source.name.removesuffix(INCOMPLETE_SUFFIX)), "path")
+    plain = finished_name(source)
+    form = format_of(plain, "path")
     if not source.exists():
-        leftover = source.with_name(source.name + INCOMPLETE_SUFFIX)
-        if leftover.exists():
-            raise IncompleteFileError(f"{source} was never finished: a stopped run left {leftover}")
+        if leftovers := unfinished_of(source):
+            raise IncompleteFileError(f"{source} was never finished: a stopped run left {leftovers[0]}")
         raise FileNotFoundError(f"{source} does not exist")
-    if source.name.endswith((".mat" + INCOMPLETE_SUFFIX, ".ptu" + INCOMPLETE_SUFFIX)):  # no part of them is of use
+    if plain != source and plain.suffix in (".mat", ".ptu"):  # no part of them is of use
         raise IncompleteFileError(f"{source} is incomplete: a run that was stopped left it")
     try:
         with reading(source, "a cube of mars-lidar"):
@@ -261,6 +273,7 @@ def _opened(store: OpenedStore, source: Path, allow_incomplete: bool, url: str =
             url=url,
             progress=store.progress,
             _close=store.close,
+            _identity=store.identity,
         )
     except BaseException:
         store.close()

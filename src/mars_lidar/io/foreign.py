@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,12 +12,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base import mat5
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.files import check_claim, open_npz, read_npy, reading
+from mars_lidar._base.files import check_claim, npy_header, open_npz, read_npy, reading, whole
+from mars_lidar._base.hdf5 import CELLS, open_hdf5
+from mars_lidar._base.sparse import check_sparse, dense_bytes, is_sparse
+from mars_lidar._base.text import read_column
 from mars_lidar.instrument.system import System
 from mars_lidar.io.cube import Cube
 from mars_lidar.io.measured import from_histograms, from_photon_times, in_order
-from mars_lidar.io.named_arrays import hdf5_arrays, mat_arrays
+from mars_lidar.io.named_arrays import cell_arrays, hdf5_arrays, mat_arrays
 from mars_lidar.io.recorder import RECORDER_SUFFIXES, Recorded, recorded
 from mars_lidar.io.streams.bare_stream import cells_of
 
@@ -34,17 +39,28 @@ class ForeignCounts:
     axes: str  # what the array's dimensions were taken for
     recorder: Recorded | None = None  # what a photon counter's file tells of its histograms
 
-    def cube(self, system: System, *, start_ns: float = 0.0, unit_ns: float | None = None) -> Cube:
+    def cube(
+        self,
+        system: System,
+        *,
+        start_ns: float = 0.0,
+        unit_ns: float | None = None,
+        window_ns: tuple[float, float] | None = None,
+    ) -> Cube:
         """The cube, see `foreign_cube`."""
         source = f"{self.path}" + (f", {self.name}" if self.name else "") + (f", axes {self.axes}" if self.axes else "")
         try:
             if self.counts is not None:
                 if unit_ns is not None:
                     raise ValueError("unit_ns is for photon times, and this array holds histograms")
+                if window_ns is not None:
+                    raise ValueError("window_ns is for photon times, and this array holds histograms")
                 return from_histograms(self.counts, system, start_ns=start_ns, source=source)
             if unit_ns is None:
                 raise ValueError(f"{self.name} holds photon times of an unknown unit: give unit_ns (1 for ns)")
-            return from_photon_times(self.cells, system, unit_ns=unit_ns, start_ns=start_ns, source=source)
+            return from_photon_times(
+                self.cells, system, unit_ns=unit_ns, start_ns=start_ns, window_ns=window_ns, source=source
+            )
         except ValueError as error:
             raise ValueError(f"{self.path}: {error}") from error
 
@@ -59,6 +75,7 @@ def foreign_cube(
     image: tuple[int, int] | None = None,
     start_ns: float = 0.0,
     unit_ns: float | None = None,
+    window_ns: tuple[float, float] | None = None,
 ) -> Cube:
     """A cube from a file that another program wrote.
 
@@ -74,9 +91,11 @@ def foreign_cube(
         has bins where there is one such, else the last; of a TIFF the pages. A dimension of pixels goes through columns
         in MATLAB's files, else through rows.
     variable
-        Name of the array, of a file that has several.
+        Name of the array, of a file that has several; ``name[3]`` is the third of a MATLAB cell of arrays.
     unit_ns
         Unit of photon times, ns.
+    window_ns
+        (start, stop) of photon times, as for `mars_lidar.io.from_photon_times`.
 
     Raises
     ------
@@ -84,7 +103,7 @@ def foreign_cube(
         No such file, not readable, or not what the arguments say; the message names the file.
     """
     found = read_counts(path, variable=variable, axes=axes, image=image, bins=system.bins)
-    return found.cube(system, start_ns=start_ns, unit_ns=unit_ns)
+    return found.cube(system, start_ns=start_ns, unit_ns=unit_ns, window_ns=window_ns)
 
 
 def read_counts(
@@ -102,6 +121,8 @@ def read_counts(
     if isinstance(array, np.ndarray) and array.dtype == object:
         return ForeignCounts(source, name, None, array, "")
     told = _guessed(source, array.shape, bins) if axes is None else axes
+    if is_sparse(array):
+        check_claim(source, dense_bytes(array), f"the counts of {name}".rstrip())
     try:
         return ForeignCounts(source, name, in_order(array, told, image), None, told, told_by)
     except (ValueError, TypeError) as error:
@@ -117,6 +138,79 @@ def arrays(path: Path) -> dict[str, Any]:
             return dict(recorded(path).arrays)
         found: dict[str, Any] = _READERS[path.suffix.lower()](path)
     return {name: array for name, array in found.items() if len(array.shape)}
+
+
+_MOST_LISTED = 64  # cells of a variable that are opened to say what is in them
+
+
+def listed(path: Path) -> dict[str, str]:
+    """What a file holds, by name, in words; of .mat, .npz and HDF5 without reading the values."""
+    import h5py
+
+    suffix = path.suffix.lower()
+    with reading(path, "arrays of histograms"):
+        if suffix == ".mat" and not h5py.is_hdf5(path):
+            return _listed_mat(path)
+        if suffix in (".mat", ".h5", ".hdf5"):
+            return _listed_hdf5(path, suffix == ".mat")
+        if suffix == ".npz":
+            with zipfile.ZipFile(path) as archive:
+                heads = {name.removesuffix(".npy"): npy_header(archive.open(name)) for name in archive.namelist()}
+            if {"format", "shape", "data"} <= heads.keys():
+                return {"": f"sparse, {heads['data'][0][0]} values {heads['data'][1]}"}
+            return {name: _in_words(shape, dtype) for name, (shape, dtype) in heads.items() if shape}
+    return {name: _in_words(array.shape, array.dtype) for name, array in arrays(path).items()}
+
+
+def _in_words(shape: tuple[int, ...], kind: Any) -> str:
+    size = " × ".join(map(str, shape))
+    return f"photon times of {size} pixels" if str(kind) == "object" else f"{size} {kind}"
+
+
+def _listed_mat(path: Path) -> dict[str, str]:
+    found: dict[str, str] = {}
+    for head in mat5.variables(path):
+        if head.kind == "cell" and math.prod(head.shape) <= _MOST_LISTED:
+            inside = _mat(path, [head.name])
+            found |= {name: _in_words(array.shape, _kind(array)) for name, array in inside.items()}
+            if not inside:
+                found[head.name] = f"cells {_in_words(head.shape, '')}".strip()
+        elif head.kind == "cell":
+            found[head.name] = f"{_in_words(head.shape, 'cells')}: arrays of photon times, or of one array each"
+        elif head.kind in ("numbers", "sparse"):
+            found[head.name] = _in_words(head.shape, head.kind)
+    return found
+
+
+def _kind(array: Any) -> Any:
+    return f"sparse {array.dtype}" if is_sparse(array) else array.dtype
+
+
+def _listed_hdf5(path: Path, of_matlab: bool) -> dict[str, str]:
+    import h5py
+
+    found: dict[str, str] = {}
+    with open_hdf5(path) as file:
+
+        def visit(name: str, item: Any) -> None:
+            if name.partition("/")[0] == CELLS or any(name.startswith(f"{one}/") for one in found):
+                return
+            if isinstance(item, h5py.Group) and "MATLAB_sparse" in item.attrs:
+                found[name] = _in_words((int(item.attrs["MATLAB_sparse"]), item["jc"].size - 1), "sparse")
+            elif isinstance(item, h5py.Dataset) and item.dtype == h5py.ref_dtype:
+                shape = tuple(item.shape[::-1])
+                cells = enumerate((item.file[one] for one in np.ravel(whole(item)[:_MOST_LISTED])), start=1)
+                deep = {
+                    f"{name}[{k}]": _in_words(tuple(part.shape[::-1]), part.dtype)
+                    for k, part in cells
+                    if isinstance(part, h5py.Dataset) and min(part.shape, default=0) > 1
+                }
+                found.update(deep or {name: _in_words(shape, "cells: arrays of photon times, or of one array each")})
+            elif isinstance(item, h5py.Dataset) and item.dtype.kind in "iuf" and item.ndim:
+                found[name] = _in_words(tuple(item.shape[::-1] if of_matlab else item.shape), item.dtype)
+
+        file.visititems(visit)
+    return found
 
 
 def _chosen(path: Path, found: dict[str, Any], variable: str | None) -> tuple[str, Any]:
@@ -165,19 +259,22 @@ def _npz(path: Path) -> dict[str, Any]:
         if {"format", "shape", "data"} <= set(archive.files):
             from scipy import sparse
 
-            return {"": sparse.load_npz(path)}
+            matrix = sparse.load_npz(path)
+            check_sparse("", matrix)
+            return {"": matrix}
         return {name: archive[name] for name in archive.files if archive[name].dtype.kind in "iuf"}
 
 
-def _mat(path: Path) -> dict[str, Any]:
-    found = mat_arrays(path)
+def _mat(path: Path, names: list[str] | None = None) -> dict[str, Any]:
+    found = mat_arrays(path, names)
     arrays: dict[str, Any] = {}
     for name, array in found.items():
-        if hasattr(array, "toarray"):
+        if is_sparse(array):
             arrays[name] = array
         elif isinstance(array, np.ndarray) and array.dtype.kind in "iuf":
             arrays[name] = np.squeeze(array)
-    return arrays | {name: cells for name, cells in cells_of(found).items() if cells.size > 1}
+    times = {name: cells for name, cells in cells_of(found).items() if cells.size > 1}
+    return arrays | times | {name: array for name, array in cell_arrays(found).items() if len(array.shape) > 1}
 
 
 def _tiff(path: Path) -> dict[str, Any]:
@@ -189,18 +286,7 @@ def _tiff(path: Path) -> dict[str, Any]:
 
 
 def _table(path: Path) -> dict[str, Any]:
-    check_claim(path, 64 * path.stat().st_size)
-    rows: list[list[float]] = []
-    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
-        try:
-            rows.append([float(part) for part in line.replace(",", " ").replace(";", " ").split()])
-        except ValueError:
-            if rows:  # lines of words are only above the numbers
-                raise ValueError(f"line {line[:40]!r} holds no numbers") from None
-    rows = [row for row in rows if row]
-    if not rows or {len(row) for row in rows} not in ({1}, {2}):
-        raise ValueError("a histogram as text is a column of counts, or times and counts")
-    return {"": np.asarray(rows)[:, -1]}
+    return {"": read_column(path)}
 
 
 _READERS = {

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar._base.files import beside
-from mars_lidar._base.hdf5 import ForgivingFile, check_heaps, require, seal, with_checksums
+from mars_lidar._base.files import FileError, beside
+from mars_lidar._base.hdf5 import SEAL, ForgivingFile, check_heaps, check_links, require, seal, with_checksums
 from mars_lidar.io import layout
 from mars_lidar.io.recipe import Recipe, Recording
 from mars_lidar.io.store import OnDisk, OpenedStore, Writer
@@ -92,8 +92,16 @@ def open_store(path: Path, check: layout.Check = layout.check_format) -> OpenedS
     try:
         attrs = {name: v.item() if isinstance(v, np.generic) else v for name, v in file.attrs.items()}
         check(path, attrs)
+        check_links(file, path)
+        if attrs.get("complete", True) and SEAL not in attrs:
+            raise FileError(f"{path} is damaged: it has no attribute {SEAL}, the sum over its contents")
         require(file, path)
     except BaseException:
         file.close()
         raise
-    return OpenedStore(attrs, {name: OnDisk(array, path) for name, array in file.items()}, close=file.close)
+    return OpenedStore(
+        attrs,
+        {name: OnDisk(array, path) for name, array in file.items()},
+        close=file.close,
+        identity=str(attrs.get(SEAL, "")),
+    )

@@ -49,7 +49,7 @@ MEASURED = Recording.engine  # attribute of counts that no engine drew
 _OTHERS = {  # attribute `format` of what is no cube, `kind` of a table: what it is, what reads it
     "mars-lidar maps": "reconstructed maps, not a cube: mars_lidar.io.maps.load_maps reads them",
     "mars-lidar dataset": "a dataset, not a cube: mars_lidar.dataset.open_dataset reads it",
-    "mars-lidar timestamps": "a photon stream, not a cube: mars_lidar.Timestamps.load reads it, mars-lidar inspect "
+    "mars-lidar timestamps": "a photon stream, not a cube: mars_lidar.Timestamps.load reads it, mars-lidar calibrate "
     "shows it",
     "mars-lidar table": "a lookup table, not a cube: mars_lidar.Table.load reads it, mars-lidar table info shows it",
 }

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import shutil
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -49,7 +48,8 @@ _VARIABLES = {  # name in the file: attribute, unit, in words
     "signal_error": ("signal_error", _PHOTONS, "standard error of the signal"),
     "background_error": ("background_error", _PHOTONS, "standard error of the background"),
     "significance": ("significance", "1", "significance of the signal, standard deviations"),
-    "flags": ("flags", "1", "1 empty, 2 no signal, 4 saturated, 8 unconverged, 16 more returns, 32 filled"),
+    "p_value": ("p_value", "1", "probability of a histogram as far from the law of its estimate"),
+    "flags": ("flags", "1", "1 empty, 2 no signal, 4 saturated, 8 unconverged, 16 more returns, 32 filled, 64 misfit"),
     "depth_half_width": ("depth_half_width_m", "m", "half width of the 90 % interval of the depth"),
     "delay_half_width": ("delay_half_width_ns", "ns", "half width of the 90 % interval of the delay"),
     "outlier": ("outlier", "1", "probability that the depth is that of another surface"),
@@ -73,20 +73,16 @@ def save_maps(path: str | Path, results: Mapping[str, Any], *, source: str = "",
     target = Path(path)
     check_maps_output(target, overwrite=overwrite)
     variables, attrs = _contents(results, source)
-    with beside(target) as unfinished:
+    with beside(target, folder=target.suffix == ".zarr") as unfinished:
         if target.suffix == ".zarr":
             import zarr
 
-            shutil.rmtree(unfinished, ignore_errors=True)
             with warnings.catch_warnings():
                 warnings.filterwarnings("ignore", "The data type")  # of the methods' names: fixed-length text
                 group = zarr.create_group(unfinished, zarr_format=3)
                 zarr_store.add(group, variables)
                 zarr_store.consolidated(group)
                 manifest.seal(unfinished, attrs)
-            if target.exists():
-                (target / "zarr.json").unlink(missing_ok=True)
-                shutil.rmtree(target)
         elif target.suffix == ".npz":
             with npz.archive(unfinished) as archive:
                 npz.add_attributes(archive, {**attrs, "variables": npz.add(archive, variables)})
@@ -123,6 +119,8 @@ def _check_suffix(name: str, path: Path) -> None:
 def _check_format(path: Path, attrs: Mapping[str, Any]) -> None:
     if attrs.get("format") != FORMAT:
         raise ValueError(f"{path} is not a file of maps of mars-lidar (no attribute format = {FORMAT!r})")
+    if attrs.get("complete", True) is not True:  # maps are written whole: nothing of ours says otherwise
+        raise ValueError(f"{path} is damaged: its attribute complete is {attrs['complete']!r}")
 
 
 def _check(found: Mapping[str, NDArray[Any]], attrs: Mapping[str, Any]) -> None:

@@ -31,8 +31,10 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mars_lidar._base import mat5
 from mars_lidar._base.files import FileError, beside, read_mat5
 from mars_lidar._base.memory import check_memory
+from mars_lidar._base.sparse import is_sparse
 from mars_lidar.instrument.system import System
 from mars_lidar.io import layout
 from mars_lidar.io.recipe import BLOCK_BYTES, Recipe
@@ -177,12 +179,16 @@ def _rate_bands(flux: Flux, system: System) -> Iterator[NDArray[np.float64]]:
 
 def open_store(path: Path) -> OpenedStore:
     """Open a file for reading; its variables are read at once, its counts stay sparse until they are used."""
-    found = read_variables(path)
-    if "mars_lidar" not in found:
+    if _is_hdf5(path):
+        raise ValueError(
+            f"{path} is not a cube written by mars-lidar: those are of MATLAB's version 5, and this is 7.3 (HDF5)"
+        )
+    if "mars_lidar" not in {head.name for head in mat5.variables(path)}:
         raise ValueError(
             f"{path} is not a cube written by mars-lidar (no variable 'mars_lidar'); "
             f"mars_lidar.io.read_mat reads such files of others"
         )
+    found = read_variables(path)
     ours = found["mars_lidar"][0, 0]
     attrs = json.loads(str(ours["attributes"].item()))
     layout.check_format(path, attrs)
@@ -193,8 +199,12 @@ def open_store(path: Path) -> OpenedStore:
     recipe = layout.recipe_from(attrs, arrays, 1)
     _, height, width, bins = recipe.shape
     spad = found["spad"]
-    if spad.shape != (height * width, bins):
-        raise ValueError(f"{path}: spad must be (H W, bins) of {(height, width, bins)}, got {spad.shape}")
+    if not is_sparse(spad) or spad.shape != (height * width, bins):
+        raise ValueError(f"{path}: spad must be sparse (H W, bins) of {(height, width, bins)}, got {spad.shape}")
+    most = min(recipe.system.max_bin_count, np.iinfo(recipe.dtype).max)
+    with np.errstate(invalid="ignore"):
+        if not ((spad.data >= 0) & (spad.data <= most) & (spad.data == np.floor(spad.data))).all():
+            raise ValueError(f"{path} is damaged: spad must hold counts, whole numbers in [0, {most:g}]")
 
     def counts() -> NDArray[Any]:
         check_memory(2 * recipe.nbytes, f"the counts of {path}", "mars-lidar convert makes a .zarr of it elsewhere")
@@ -206,11 +216,13 @@ def open_store(path: Path) -> OpenedStore:
 
 def read_variables(path: Path) -> dict[str, Any]:
     """All variables of a v5 file; FileError where it is none or is damaged."""
-    try:
-        return read_mat5(path)
-    except FileError as error:
-        if isinstance(error.__cause__, NotImplementedError):
-            raise FileError(
-                f"{path} is a MATLAB v7.3 file (HDF5), and a v5 .mat is needed: save it with -v7"
-            ) from error
-        raise
+    if _is_hdf5(path):
+        raise FileError(f"{path} is a MATLAB v7.3 file (HDF5), and a v5 .mat is needed: save it with -v7")
+    return read_mat5(path)
+
+
+def _is_hdf5(path: Path) -> bool:
+    """Whether a .mat is of version 7.3."""
+    import h5py
+
+    return bool(h5py.is_hdf5(path))

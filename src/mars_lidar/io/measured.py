@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import re
 from numbers import Real
 from typing import Any
@@ -13,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked, checked_with_masks
 from mars_lidar._base.memory import check_memory
+from mars_lidar._base.sparse import dense_bytes, dense_counts, is_sparse
 from mars_lidar.instrument.system import System
 from mars_lidar.io.cube import Cube
 from mars_lidar.io.recipe import Recording
@@ -85,7 +87,13 @@ def from_histograms(
 
 @checked
 def from_photon_times(
-    cells: Any, system: System, *, unit_ns: float = 1.0, start_ns: float = 0.0, source: str = ""
+    cells: Any,
+    system: System,
+    *,
+    unit_ns: float = 1.0,
+    start_ns: float = 0.0,
+    window_ns: tuple[float, float] | None = None,
+    source: str = "",
 ) -> Cube:
     """A cube of the photon times of each pixel, as MATLAB's cell arrays hold them.
 
@@ -99,14 +107,17 @@ def from_photon_times(
     unit_ns
         Unit of the times, ns. Times that are all whole numbers are units of a clock and become the middle of theirs.
     start_ns
-        Time from the laser pulse to time 0, ns: of a gate that the times count from.
+        Time from the laser pulse to time 0, ns: of a gate that the times count from. They must end within the period.
+    window_ns
+        (start, stop): photons within this time of the laser pulse alone, whole numbers of bins; the cube is a window.
+        For times that count from the pulse, of a recording with a gate, or to leave out an internal reflection.
     source
         Free text: where the times came from.
 
     Raises
     ------
     ValueError, TypeError
-        Times that are no numbers >= 0, or shapes that do not fit.
+        Times that are no numbers >= 0, or shapes that do not fit; no photon in the window.
     """
     if not isinstance(system, System):
         raise TypeError(f"system must be a System, got {type(system).__name__}")
@@ -119,7 +130,16 @@ def from_photon_times(
     if bad.any():
         raise ValueError(f"cells must hold finite times >= 0, got {raw[int(np.argmax(bad))]}")
     middle = 0.5 if raw.size and bool((raw == np.floor(raw)).all()) else 0.0
-    phase = np.mod(((raw + middle) * unit + start) / system.period_ns, 1.0)
+    since_ns = (raw + middle) * unit + start
+    if start != 0.0 and raw.size and since_ns.max() >= system.period_ns:
+        raise ValueError(
+            f"start_ns must be the start of a gate that the times count from, got {start:g}: with it times reach "
+            f"{since_ns.max():.6g} ns, beyond the period of {system.period_ns:g} ns; for times that count from the "
+            "laser pulse give window_ns, (start, stop), instead"
+        )
+    if window_ns is not None:
+        return _in_window(since_ns, [cell.size for cell in times], image.shape, system, window_ns, source)
+    phase = np.mod(since_ns / system.period_ns, 1.0)
     place = np.minimum((phase * system.bins).astype(np.int64), system.bins - 1)
     check_memory(
         8 * image.size * system.bins, "the histograms of the photons", "take fewer bins or a part of the image"
@@ -129,11 +149,42 @@ def from_photon_times(
     return from_histograms(flat.reshape(*image.shape, system.bins), system, source=source)
 
 
+def _in_window(
+    since_ns: NDArray[np.float64],
+    photons: list[int],
+    image: tuple[int, ...],
+    system: System,
+    window_ns: tuple[float, float],
+    source: str,
+) -> Cube:
+    """Photons (all pixels, `photons` of each) between two times since the pulse, folded into the period."""
+    if not isinstance(window_ns, tuple | list) or len(window_ns) != 2:
+        raise TypeError(f"window_ns must be (start, stop), ns, got {window_ns!r}")
+    start, stop = (checks.real("window_ns", edge, low=0.0) for edge in window_ns)
+    edges = [edge / system.bin_ns for edge in (start, stop)]
+    first, bins = round(edges[0]), round(edges[1]) - round(edges[0])
+    if any(abs(edge - round(edge)) > _WHOLE for edge in edges) or not 1 <= bins <= system.bins:
+        raise ValueError(
+            f"window_ns must be two times a whole number of bins of {system.bin_ns:.6g} ns apart from the laser pulse, "
+            f"at most a period of {system.period_ns:g} ns from each other, got {start:g} to {stop:g}"
+        )
+    phase_ns = np.mod(since_ns - start, system.period_ns)
+    place = np.floor(phase_ns / system.bin_ns).astype(np.int64)
+    inside = (place >= 0) & (place < bins)
+    if not inside.any():
+        raise ValueError(f"window_ns must hold photons, got {start:g} to {stop:g}, in which there are none")
+    check_memory(8 * math.prod(image) * bins, "the histograms of the photons", "take a narrower window")
+    pixel = np.repeat(np.arange(math.prod(image)), photons)[inside]
+    flat = np.bincount(pixel * bins + place[inside], minlength=math.prod(image) * bins)
+    begin = (first % system.bins) * system.bin_ns
+    return from_histograms(flat.reshape(*image, bins), system, start_ns=begin, source=source)
+
+
 def in_order(counts: Any, axes: str | None, image: tuple[int, int] | None) -> NDArray[Any]:
     """`counts` as (exposures, H, W, T)."""
-    if hasattr(counts, "toarray"):  # a sparse matrix or array of SciPy
-        check_memory(8 * counts.shape[0] * counts.shape[1], "the counts of the sparse matrix", "take a part of it")
-        counts = counts.toarray()
+    if is_sparse(counts):
+        check_memory(dense_bytes(counts), "the counts of the sparse matrix", "take a part of it")
+        counts = dense_counts("counts", counts)
     if isinstance(counts, np.ma.MaskedArray):
         raise TypeError("counts must not be a masked array: fill it, or leave those pixels out")
     array = np.asarray(counts)

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from mars_lidar._base import mat5
 from mars_lidar._base.files import open_npz, read_mat5, reading, whole
-from mars_lidar._base.hdf5 import open_hdf5
+from mars_lidar._base.hdf5 import CELLS, open_hdf5
+from mars_lidar._base.sparse import check_sparse, is_sparse
 from mars_lidar.io.store import OnDisk
-
-_CELLS = "#refs#"  # where MATLAB puts what the cells of a v7.3 file hold
 
 
 @dataclass(frozen=True)
@@ -40,23 +40,21 @@ def open_arrays(path: Path) -> Iterator[NamedArrays]:
             turned = path.suffix.lower() == ".mat"
             yield NamedArrays([*arrays], lambda some: {name: arrays[name] for name in some if name in arrays}, turned)
     else:
-        from scipy.io import whosmat
-
         with reading(path, "a .mat of version 5"):
-            names = [name for name, _, _ in whosmat(path)]
+            names = [head.name for head in mat5.variables(path)]
         yield NamedArrays(names, lambda some: _plain(read_mat5(path, some)))
 
 
-def mat_arrays(path: Path, *, deep: bool = True) -> dict[str, Any]:
+def mat_arrays(path: Path, names: list[str] | None = None, *, deep: bool = True) -> dict[str, Any]:
     """Variables of a .mat: arrays in MATLAB's order, sparse matrices, and cells (H, W) as arrays of arrays.
 
-    `deep`: those within structures of a v7.3 file as well.
+    `names`: of version 5, these variables only. `deep`: those within structures of a v7.3 file as well.
     """
     import h5py
 
     if h5py.is_hdf5(path):
         return hdf5_arrays(path, of_matlab=True, deep=deep)
-    return _plain(read_mat5(path))
+    return _plain(read_mat5(path, names))
 
 
 def _plain(found: dict[str, Any]) -> dict[str, Any]:
@@ -70,19 +68,15 @@ def hdf5_arrays(path: Path, *, of_matlab: bool = False, deep: bool = True) -> di
     `of_matlab`: axes are stored in reverse, cells as references, and an empty array as its own size.
     """
     import h5py
-    from scipy import sparse
 
     out: dict[str, Any] = {}
     parts: set[str] = set()
 
     def visit(name: str, item: Any) -> None:
-        if (not deep and "/" in name) or name.partition("/")[0] == _CELLS or name in parts:
+        if (not deep and "/" in name) or name.partition("/")[0] == CELLS or name in parts:
             return
         if isinstance(item, h5py.Group) and "MATLAB_sparse" in item.attrs:
-            columns = whole(item["jc"]).astype(np.int64)
-            data, rows = (whole(item[part]) if part in item else np.zeros(0) for part in ("data", "ir"))
-            shape = (int(item.attrs["MATLAB_sparse"]), len(columns) - 1)
-            out[name] = sparse.csc_array((data, rows.astype(np.int64), columns), shape=shape)
+            out[name] = _sparse(name, item)
             parts.update(f"{name}/{part}" for part in item)
         elif not isinstance(item, h5py.Dataset):
             return
@@ -90,11 +84,49 @@ def hdf5_arrays(path: Path, *, of_matlab: bool = False, deep: bool = True) -> di
             references = np.atleast_2d(whole(item)).T
             out[name] = np.empty(references.shape, object)
             for place, reference in np.ndenumerate(references):
-                part = item.file[reference]
-                out[name][place] = np.empty(0) if part.attrs.get("MATLAB_empty", 0) else whole(part).ravel()
+                out[name][place] = _cell(f"{name}[{place}]", item.file[reference])
         elif item.dtype.kind in "iuf" and item.ndim and not item.attrs.get("MATLAB_empty", 0):
             out[name] = whole(item).T if of_matlab else whole(item)
 
     with open_hdf5(path) as file:
         file.visititems(visit)
     return out
+
+
+def _sparse(name: str, group: Any) -> Any:
+    """A sparse matrix of MATLAB 7.3: a group of columns' ends, rows and values."""
+    from scipy import sparse
+
+    columns = whole(group["jc"]).astype(np.int64)
+    data, rows = (whole(group[part]) if part in group else np.zeros(0) for part in ("data", "ir"))
+    shape = (int(group.attrs["MATLAB_sparse"]), len(columns) - 1)
+    matrix = sparse.csc_array((data, rows.astype(np.int64), columns), shape=shape)
+    check_sparse(name, matrix, sorted_rows=True)
+    return matrix
+
+
+def _cell(name: str, part: Any) -> Any:
+    """What a cell of MATLAB 7.3 holds: a sparse matrix, an array, or of photon times a vector."""
+    if "MATLAB_sparse" in part.attrs:
+        return _sparse(name, part)
+    if not hasattr(part, "shape"):
+        raise ValueError(f"{name} is a structure or cell within a cell, which is not read")
+    if part.attrs.get("MATLAB_empty", 0):
+        return np.empty(0)
+    values = whole(part)
+    return values.ravel() if values.size == max((0, *values.shape)) else values.T
+
+
+def cell_arrays(found: dict[str, Any]) -> dict[str, Any]:
+    """Arrays in cells of a .mat that are no photon times, by names such as ``spad[2]``, the second, as in MATLAB."""
+    out: dict[str, Any] = {}
+    for name, values in found.items():
+        if isinstance(values, np.ndarray) and values.dtype == object:
+            out |= {f"{name}[{k}]": cell for k, cell in enumerate(values.ravel(order="F"), start=1) if _is_deep(cell)}
+    return out
+
+
+def _is_deep(cell: Any) -> bool:
+    """Whether this is a sparse matrix, or an array of numbers that is no vector."""
+    is_array = isinstance(cell, np.ndarray) and cell.dtype.kind in "iuf" and min(cell.shape, default=0) > 1
+    return is_sparse(cell) or is_array

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar._base.files import beside, npy_header, open_npz
+from mars_lidar._base.files import FileError, beside, npy_header, open_npz
 from mars_lidar._base.memory import check_memory
 from mars_lidar.io import layout
 from mars_lidar.io.recipe import BLOCK_BYTES, Recipe, Recording
@@ -82,13 +82,18 @@ def open_store(path: Path, check: layout.Check = layout.check_format) -> OpenedS
 
 
 def _counts(path: Path) -> LazyCounts:
-    with zipfile.ZipFile(path) as found, found.open("histogram.npy") as member:
+    name = "histogram.npy"
+    with zipfile.ZipFile(path) as found, found.open(name) as member:
         shape, dtype = npy_header(member)
+        opened = found.getinfo(name).CRC
 
     def read() -> NDArray[Any]:
         size = math.prod(shape) * dtype.itemsize
         check_memory(size, f"the counts of {path}", "a .zarr or .h5 is read in parts")
-        with np.load(path, allow_pickle=False) as found:
-            return np.asarray(found["histogram"])
+        with zipfile.ZipFile(path) as archive:
+            if opened != archive.getinfo(name).CRC:
+                raise FileError(f"{path} was replaced after it was opened: open it again")
+            with archive.open(name) as member:
+                return np.asarray(np.lib.format.read_array(member, allow_pickle=False))
 
     return LazyCounts(shape, dtype, read)

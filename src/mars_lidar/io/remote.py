@@ -57,18 +57,24 @@ def open_url(url: str) -> OpenedStore:
         system, root = core.url_to_fs(url)
         attrs = json.loads(system.cat_file(f"{root}/zarr.json")).get("attributes", {})
         layout.check_format(Path(url), attrs)
-        if attrs.get("complete") is True:
-            _require(url, system, root)
-        group: Any = zarr.open_group(FsspecStore.from_url(url, read_only=True), mode="r")
+        store: Any = FsspecStore.from_url(url, read_only=True)
+        if attrs.get("complete") is not False:
+            from mars_lidar._base.sealed_store import SealedValues
+
+            store = SealedValues(store, _require(url, system, root, attrs.get(manifest.SUM)), url)
+        group: Any = zarr.open_group(store, mode="r")
         return OpenedStore(attrs, {name: Elsewhere(array, Path(url)) for name, array in group.arrays()})
 
 
-def _require(url: str, system: Any, root: str) -> None:
-    """Raise where a document or coordinate is not as it was written, or a file is missing where they can be listed."""
+def _require(url: str, system: Any, root: str, stated: str | None) -> dict[str, str]:
+    """The sums of all files.
+
+    Raises where a document or coordinate is not as it was written, or a file is missing where they can be listed.
+    """
     try:
         lines = system.cat_file(f"{root}/{manifest.NAME}").decode()
     except FileNotFoundError:
-        return  # of an earlier version
+        raise FileError(f"{url} is damaged: its {manifest.NAME} is missing") from None
     try:
         there = {str(name).rpartition(f"{root}/")[2] for name in system.find(root)}
     except Exception:  # what cannot be listed (most web servers)
@@ -78,9 +84,11 @@ def _require(url: str, system: Any, root: str) -> None:
     def digest(name: str) -> str:
         return hashlib.sha256(system.cat_file(f"{root}/{name}")).hexdigest()
 
-    wrong = list(manifest.compared(manifest.lines_of(lines), listed, digest))
+    sums = manifest.lines_of(lines)
+    wrong = list(manifest.compared(sums, listed, digest, stated=stated))
     if wrong:
         raise ValueError(f"is damaged: {', '.join(wrong[:3])}")
+    return sums
 
 
 @contextlib.contextmanager

@@ -209,6 +209,9 @@ def _frames(path: Path, image: Path | None, problems: list[Problem]) -> Iterator
         yield SceneFile(depth=path, image=image)
         return
     try:
+        if not nyu.is_labelled(path):
+            yield SceneFile(depth=path, image=image)
+            return
         count = nyu.frames(path)
     except BAD_FILE as error:
         problems.append(Problem.of(path, error))

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.files import check_target, reading
 from mars_lidar._base.memory import check_memory
+from mars_lidar._base.sparse import dense_counts, is_sparse
 from mars_lidar.io import mat
 from mars_lidar.io.cube import Cube, copy_counts, one_exposure
 
@@ -70,7 +71,7 @@ def _spad(source: Path, found: dict[str, Any]) -> SpadMat:
             f"got {rates.shape} and {spad.shape}"
         )
     check_memory(16 * height * width * bins, f"the counts of {source}", "read it on a larger machine")
-    dense = np.asarray(spad.todense() if hasattr(spad, "todense") else spad)
+    dense = dense_counts("spad", spad) if is_sparse(spad) else np.asarray(spad)
     if not ((dense >= 0) & (dense == np.round(dense)) & (dense < 2**32)).all():
         raise ValueError(f"{source}: spad must hold counts, whole numbers from 0")
     kind = np.uint16 if dense.max(initial=0) < 2**16 else np.uint32

@@ -100,6 +100,7 @@ class OpenedStore:
     arrays: Mapping[str, Any]  # variables by name; on disk until they are indexed, where the format allows it
     progress: str = ""  # how far an incomplete file got, for people; empty where that is not known
     close: Callable[[], None] = lambda: None
+    identity: str = ""  # of the content, where the format has a sum over it
 
     @property
     def complete(self) -> bool:

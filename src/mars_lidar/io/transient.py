@@ -13,7 +13,7 @@ from mars_lidar._base.files import check_data, read_npy, reading
 from mars_lidar._base.hdf5 import open_hdf5
 from mars_lidar._base.types import FloatArray
 from mars_lidar.io.capture import CAPTURE_SUFFIXES, Capture, capture_in
-from mars_lidar.io.named_arrays import open_arrays
+from mars_lidar.io.named_arrays import NamedArrays, open_arrays
 from mars_lidar.io.store import OnDisk, values
 from mars_lidar.light.transient import Rows, Transient
 
@@ -36,7 +36,7 @@ def read_transient(
     """Open a transient image; its values stay on disk (.npy, .h5) until rows of them are needed.
 
     - ``.npy``: (H, W, T), or (H, W, T, C) with `channel`, as mitransient's ``numpy.save`` of its result gives.
-    - ``.npz``: the array `name` (default ``transient``); ``bin_ns`` and ``start_ns`` where it holds them.
+    - ``.npz``: the array `name` (default ``transient``, or the only one); ``bin_ns``, ``start_ns`` where it has them.
     - ``.h5``, ``.hdf5``: the data set `name` (default ``transient``), with attributes ``bin_ns`` and
       ``start_ns`` where it has them.
     - ``.mat``: the variable `name` (default ``transient``, or ``rect_data`` or ``meas`` of confocal scans), (H, W, T),
@@ -106,7 +106,7 @@ def _read(
 def _named(path: Path, name: str | None) -> tuple[Any, dict[str, float]]:
     """An array of a file, of HDF5 with its rows on disk, and the times that stand beside it."""
     with open_arrays(path) as file:
-        name = name or next((one for one in (_NAME, *_CONFOCAL) if one in file.names), _NAME)
+        name = name or next((one for one in (_NAME, *_CONFOCAL) if one in file.names), _only(file))
         if name not in file.names:
             raise ValueError(f"{path}: cannot be read (no array {name!r}, got {', '.join(file.names) or 'nothing'})")
         found = file.read((name, *_TIMES))
@@ -123,6 +123,12 @@ def _named(path: Path, name: str | None) -> tuple[Any, dict[str, float]]:
             return np.asarray(data[..., rows]).T if file.turned else np.asarray(data[rows])
 
     return Rows(tuple(stored.shape[::-1] if file.turned else stored.shape), read), told
+
+
+def _only(file: NamedArrays) -> str:
+    """The array that a file has beside times and truth, if it is one alone, else the usual name."""
+    names = [name for name in file.names if name not in (*_TIMES, *_TRUTH, "attributes")]
+    return names[0] if len(names) == 1 else _NAME
 
 
 def _capture(path: Path) -> Capture | None:

@@ -113,14 +113,20 @@ def open_store(path: Path, check: layout.Check = layout.check_format) -> OpenedS
 
     attrs = manifest.root_document(path).get("attributes", {})
     check(path, attrs)
-    if attrs.get("complete", True) is True:
-        manifest.require(path)
-    group: Any = zarr.open_group(path, mode="r")
+    identity = ""
+    if attrs.get("complete") is False:
+        group: Any = zarr.open_group(path, mode="r")
+    else:
+        from mars_lidar._base.sealed_store import SealedStore
+
+        sums = manifest.require(path)
+        identity = sums.identity
+        group = zarr.open_group(SealedStore(path, sums), mode="r")
     arrays = {name: OnDisk(array, path) for name, array in group.arrays()}
     progress = ""
     if attrs.get("complete") is False and (histogram := arrays.get("histogram")) is not None:
         progress = f"at least {histogram.nchunks_initialized} of {histogram.nchunks} chunks are written"
-    return OpenedStore(attrs, arrays, progress)
+    return OpenedStore(attrs, arrays, progress, identity=identity)
 
 
 def add(group: Any, variables: Iterable[layout.Variable]) -> None:

@@ -29,6 +29,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked
 from mars_lidar.instrument.effects import LIGHT_EFFECTS
 from mars_lidar.instrument.pulse import GaussianPulse, Pulse, SampledPulse
 from mars_lidar.instrument.system import System
@@ -38,6 +39,7 @@ from mars_lidar.statistics.phase_chain import ConvergenceError
 # --- Photons of each bin -------------------------------------------------------------------------------------------
 
 
+@checked
 def bin_photons(
     signal: torch.Tensor, background: torch.Tensor, delay_ns: torch.Tensor, system: System, *, refine: int = 1
 ) -> torch.Tensor:
@@ -418,6 +420,7 @@ _FINE = 4.0  # parts of a sigma of the pulse
 _BLOCK = 2**22  # pixels x bins of photons that are held at a time
 
 
+@checked
 def expected_histogram(
     signal: torch.Tensor,
     background: torch.Tensor,
@@ -564,6 +567,7 @@ def _summed(fine: torch.Tensor, parts: int) -> torch.Tensor:
 # --- The likelihood ------------------------------------------------------------------------------------------------
 
 
+@checked
 def armed_periods(histogram: torch.Tensor, system: System) -> torch.Tensor:
     """Periods D (..., bins) in which the pixel was armed in each bin, as its own histogram (..., bins) tells.
 
@@ -583,6 +587,7 @@ def armed_periods(histogram: torch.Tensor, system: System) -> torch.Tensor:
     return (system.cycles - covered).clamp_min(0.0)
 
 
+@checked
 def histogram_log_likelihood(
     histogram: torch.Tensor,
     signal: torch.Tensor,

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base import checks
+from mars_lidar._base.files import FileError
 from mars_lidar.dataset.arrays import MAPS
 from mars_lidar.dataset.samples import sample_parts
 from mars_lidar.dataset.store import Dataset, open_dataset
@@ -97,7 +98,8 @@ class StoredDataset(torch.utils.data.IterableDataset[dict[str, Any]]):
         array = dataset.histogram
         self._realizations = array.shape[1]
         self._block = array.chunks[:2]
-        self._opened: Dataset | None = None
+        self._identity = dataset.identity
+        self._opened: Dataset | None = dataset
 
     def __repr__(self) -> str:
         exposures = self._samples.size * self._realizations
@@ -136,7 +138,10 @@ class StoredDataset(torch.utils.data.IterableDataset[dict[str, Any]]):
     @property
     def _dataset(self) -> Dataset:
         if self._opened is None:
-            self._opened = open_dataset(self.path)
+            opened = open_dataset(self.path)
+            if opened.identity != self._identity:
+                raise FileError(f"{self.path} was replaced after it was opened: open it again")
+            self._opened = opened
         return self._opened
 
     def _blocks(self) -> list[list[tuple[int, int]]]:

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked
 from mars_lidar.io.layout import MEASURED
 from mars_lidar.plot.pixel import draw_pixel, quiet_corner
 from mars_lidar.plot.style import COLOURS, DPI, MISSING, style
@@ -25,6 +27,7 @@ _LANDSCAPE = 0.62  # height over width, below which the maps stand in a row
 _WIDEST_INCHES, _NARROW_INCHES = 2.45, 1.7  # of a map; a narrower one has a short title
 
 
+@checked
 def overview(
     cube: Cube,
     *,
@@ -93,8 +96,11 @@ def overview(
     return figure
 
 
+@checked
 def pixel_histogram(cube: Cube, y: int, x: int, *, realization: int = 0) -> Figure:
     """Histogram of one pixel over the period and around its return, beside the incident rate's shape."""
+    y = checks.integer("y", y, low=0, high=cube.shape[1] - 1)
+    x = checks.integer("x", x, low=0, high=cube.shape[2] - 1)
     cube, realization, chosen = _checked(cube, realization, [(y, x)])
     with style():
         from matplotlib.figure import Figure
@@ -104,12 +110,17 @@ def pixel_histogram(cube: Cube, y: int, x: int, *, realization: int = 0) -> Figu
     return figure
 
 
+@checked
 def map_image(values: NDArray[Any], label: str, *, cmap: str = "viridis") -> Figure:
     """A map (H, W) with a colour bar; `label` names the quantity and its unit, NaN is grey."""
     values = np.asarray(values)
-    if values.ndim != 2:
+    if values.ndim != 2 or values.size == 0:
         raise ValueError(f"values must be a map (H, W), got shape {values.shape}")
     with style():
+        from matplotlib import colormaps
+
+        if cmap not in colormaps:
+            raise ValueError(f"cmap must be the name of a colour map of matplotlib, got {cmap!r}")
         from matplotlib.figure import Figure
 
         figure = Figure(figsize=(4.4, 3.6), dpi=DPI)
@@ -220,17 +231,18 @@ def _headline(cube: Cube, realization: int) -> str:
 def _checked(cube: Cube, realization: int, pixels: Sequence[tuple[int, int]] | None) -> tuple[Cube, int, _Pixels]:
     """The cube, or the light fitted to a measured one; which exposure of it, and the pixels to draw by name."""
     count, height, width, _ = cube.shape
-    if not 0 <= realization < count:
-        raise ValueError(f"realization must be an integer in [0, {count - 1}], got {realization}")
+    realization = checks.integer("realization", realization, low=0, high=count - 1)
     if cube.measured:
         cube, realization = fitted(cube, realization), 0
     if pixels is None:
         return cube, realization, example_pixels(cube.flux, cube.depth_m)
     if not 1 <= len(pixels) <= len(COLOURS):
         raise ValueError(f"pixels must be 1 to {len(COLOURS)} pairs (y, x), got {len(pixels)}")
-    for y, x in pixels:
-        if not (0 <= y < height and 0 <= x < width):
-            raise ValueError(f"pixel must lie in y 0 to {height - 1}, x 0 to {width - 1}, got ({y}, {x})")
+    for pixel in pixels:
+        if not isinstance(pixel, tuple | list | np.ndarray) or len(pixel) != 2:
+            raise TypeError(f"pixels must be pairs (y, x), got {pixel!r}")
+        for name, place, size in zip("yx", pixel, (height, width), strict=True):
+            checks.integer(f"{name} of pixels", place, low=0, high=size - 1)
     names = [""] if len(pixels) == 1 else [f"{k}." for k in range(1, len(pixels) + 1)]
     return cube, realization, {name: (int(y), int(x)) for name, (y, x) in zip(names, pixels, strict=True)}
 

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked
 from mars_lidar.instrument.system import System
 from mars_lidar.io.cube import Cube
 from mars_lidar.io.layout import MEASURED
@@ -21,13 +23,15 @@ _READ_BYTES = 64 * 2**20
 _PREDICTED_CYCLES = 20_000  # an exposure whose state never settles costs some 10 us a period
 
 
+@checked
 def count_maps(cube: Cube, realization: int = 0) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Total counts (H, W), and the depth (H, W) in m at the largest bin: NaN where nothing was counted.
 
     The depth is that of the bin's centre, with the distance between the pulse's peak and its origin taken
     off; modulo the unambiguous range. The first of several equal bins is taken.
     """
-    _, height, width, bins = cube.shape
+    realizations, height, width, bins = cube.shape
+    realization = checks.integer("realization", realization, low=0, high=realizations - 1)
     totals = np.empty((height, width), np.int64)
     peaks = np.empty((height, width), np.int64)
     band = max(1, _READ_BYTES // (width * bins * np.dtype(cube.histogram.dtype).itemsize))
@@ -41,12 +45,15 @@ def count_maps(cube: Cube, realization: int = 0) -> tuple[NDArray[np.int64], NDA
     return totals, np.where(totals > 0, system.depth_m(delay), np.nan)
 
 
+@checked
 def example_pixels(flux: Flux, depth_m: NDArray[np.float64]) -> dict[str, tuple[int, int]]:
     """A bright, a dim and an edge pixel: ``{"bright": (y, x), ...}``, as many as there are.
 
     Bright and dim are the 98th and the 5th percentile of the signal among pixels with a return; the edge is
     the steepest step in depth. The rim of the image is left out, where recorded images have their artefacts.
     """
+    if np.shape(depth_m) != flux.shape:
+        raise ValueError(f"depth_m must be {flux.shape} as the flux, got shape {np.shape(depth_m)}")
     inside, order = by_signal(flux)
     if order.size == 0:
         return {"first": (0, 0)}
@@ -91,8 +98,10 @@ def instrument(system: System) -> str:
     return f"{bins}; {periods}; dead time {detector.dead_time_ns:.4g} ns{mode}" + "".join(f", {one}" for one in effects)
 
 
+@checked
 def incident_rate(flux: Flux, system: System, y: int, x: int) -> NDArray[np.float64]:
     """Photons per period in each bin (bins,) that reach pixel (y, x), before gate and dead time."""
+    y, x = (checks.integer(name, k, low=0, high=n - 1) for name, k, n in zip("yx", (y, x), flux.shape, strict=True))
     background = np.full(system.bins, flux.background[y, x] / system.bins)
     if flux.waveform is not None:
         wave = flux.waveform[y, x]
@@ -148,9 +157,12 @@ def law_arguments(flux: Flux, system: System, y: int, x: int) -> dict[str, Any]:
     return {"signal": signal, "background": background, "delay_ns": delay}
 
 
+@checked
 def depth_error_m(cube: Cube, estimate_m: NDArray[np.float64]) -> NDArray[np.float64]:
     """Estimated minus true depth (H, W), m, modulo the unambiguous range; NaN where either is missing."""
-    return depth_lag_m(cube.system, estimate_m, cube.depth_m)
+    if np.shape(estimate_m) != cube.shape[1:3]:
+        raise ValueError(f"estimate_m must be {cube.shape[1:3]} as the cube, got shape {np.shape(estimate_m)}")
+    return depth_lag_m(cube.system, np.asarray(estimate_m), cube.depth_m)
 
 
 def _peak_offset_ns(system: System) -> float:

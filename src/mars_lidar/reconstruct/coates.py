@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 from numpy.typing import ArrayLike
 
+from mars_lidar._base.arguments import checked
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
 from mars_lidar.reconstruct.method import RateMethod
@@ -28,6 +29,7 @@ class Coates(RateMethod):
     assumes = "nothing: exact for synchronous detectors"
 
 
+@checked
 def coates_rates(cube: ArrayLike, system: System, *, threads: int | None = None) -> FloatArray:
     """Photons per period in each bin (..., bins) behind the histograms (..., bins) of a synchronous detector.
 
@@ -48,6 +50,7 @@ class GeneralisedCoates(RateMethod):
     assumes = "nothing of the flux but its period"
 
 
+@checked
 def generalised_coates_rates(cube: ArrayLike, system: System, *, threads: int | None = None) -> FloatArray:
     """Photons per period in each bin (..., bins) behind the histograms (..., bins) of a free-running detector.
 

@@ -102,6 +102,7 @@ def cramer_rao(
     return HistogramBound(information, of_signal, of_background, of_delay, system.depth_m(of_delay))
 
 
+@checked
 def returns_bound(
     signal: ArrayLike, background: float, system: System, *, delay_ns: ArrayLike, threads: int | None = None
 ) -> HistogramBound:
@@ -153,6 +154,7 @@ def _information(
     return np.asarray(np.einsum("...j,...aj,...bj->...ab", weight, gradient, gradient))
 
 
+@checked
 def window_error(
     weights: ArrayLike, signal: float, background: float, system: System, *, delay_ns: float
 ) -> tuple[FloatArray, FloatArray]:
@@ -167,6 +169,7 @@ def window_error(
     return mean, np.sqrt(variance)
 
 
+@checked
 def window_weights(system: System, delay_ns: float) -> FloatArray:
     """Weights (bins,) with which `weights @ h` is the signal that a window around a delay gives (R16)."""
     tau = checks.real("delay_ns", delay_ns)

@@ -8,12 +8,13 @@ from statistics import NormalDist
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mars_lidar._base import checks
+from mars_lidar._base import arguments, checks
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
+from mars_lidar.reconstruct.fit_quality import FALSE_ALARM, fit_quality, holds_for
 from mars_lidar.reconstruct.histogram_record import recording_of, relative_width
 from mars_lidar.reconstruct.histograms import Histograms, checked
-from mars_lidar.reconstruct.method import Estimates, Method
+from mars_lidar.reconstruct.method import Estimates, Flags, Method
 from mars_lidar.reconstruct.returns import MOST_RETURNS, RETURN_COLUMNS
 
 
@@ -37,12 +38,15 @@ class MaximumLikelihood(Method):
         likelihood by it is more than what the others and the background reach anywhere in the period with probability
         `false_alarm` (R23; docs/reconstruction.md, section 9). Signal, delay and background are those of the strongest
         then, beside the others.
+    tested
+        Test the fit of each pixel, of one return and a free-running detector (docs/reconstruction.md, section 11).
     """
 
     starts: int = 3
     false_alarm: float = 0.01
     less_bias: bool = True
     returns: int = 1
+    tested: bool = True
 
     name = "maximum_likelihood"
     modes = ("nonparalyzable", "synchronous", "gated")
@@ -82,6 +86,10 @@ class MaximumLikelihood(Method):
         )
         several = self._several(histograms, out, flags) if self.returns > 1 else None
         column = np.ascontiguousarray(out.T)
+        quality = None
+        if self.tested and several is None and holds_for(histograms.system):
+            quality = fit_quality(histograms, column[0], column[1], column[2])
+            flags |= np.where(quality.p_value < FALSE_ALARM, Flags.MISFIT, 0).astype(np.uint8)
         return Estimates(
             signal=column[0],
             background=column[1],
@@ -92,6 +100,10 @@ class MaximumLikelihood(Method):
             delay_error=column[5],
             significance=np.sqrt(column[6]),
             returns=several,
+            p_value=None if quality is None else quality.p_value,
+            longer=None if quality is None else quality.longer,
+            shorter=None if quality is None else quality.shorter,
+            wider=None if quality is None else quality.wider,
         )
 
     def _several(self, histograms: Histograms, out: FloatArray, flags: NDArray[np.uint8]) -> FloatArray:
@@ -115,6 +127,7 @@ class MaximumLikelihood(Method):
         return returns.reshape(pixels, self.returns, len(RETURN_COLUMNS))
 
 
+@arguments.checked
 def log_likelihood(
     histogram: ArrayLike, system: System, signal: ArrayLike, background: ArrayLike, delay_ns: ArrayLike
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -136,9 +149,9 @@ def log_likelihood(
     """
     from mars_lidar._base.native import _core
 
-    given, shape = checked(histogram, system, 1)
-    if shape:
-        raise ValueError(f"histogram must be ({system.bins},), of one pixel, got leading axes {shape}")
+    if np.shape(histogram) != (system.bins,):
+        raise ValueError(f"histogram must be ({system.bins},), of one pixel, got shape {np.shape(histogram)}")
+    given, _ = checked(histogram, system, 1)
     MaximumLikelihood().check(system)
     s, b, tau = np.broadcast_arrays(*(np.asarray(x, np.float64) for x in (signal, background, delay_ns)))
     if not ((s >= 0) & (b > 0) & np.isfinite(s + b + tau)).all():

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
 from mars_lidar.reconstruct.method import _CHAIN, RateMethod
@@ -58,6 +59,7 @@ class ChainCorrection(RateMethod):
         return {"steps": self.iterations, "tolerance": self.tolerance}
 
 
+@checked
 def mchc_rates(
     cube: ArrayLike,
     system: System,

@@ -42,6 +42,8 @@ class Flags(IntFlag):
     """There is light of further returns than the most that were asked for."""
     FILLED = 32
     """An outlier is likelier than not, or nothing came: the delay is that of the pixels around."""
+    MISFIT = 64
+    """The histogram is not one of the estimate's (p below 1e-3): a wrong dead time or pulse, another return."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +63,10 @@ class Estimates:
     significance: FloatArray | None = field(default=None)
     half_width: FloatArray | None = None  # of the 90 % interval of the delay
     outlier: FloatArray | None = None  # probability that the delay is another surface's
+    p_value: FloatArray | None = None  # of the fit; NaN where too few photons tell
+    longer: FloatArray | None = None  # scores, standard deviations: where a longer dead time, ...
+    shorter: FloatArray | None = None  # ... a shorter one, ...
+    wider: FloatArray | None = None  # ... a wider pulse would fit better
     returns: FloatArray | None = None  # (pixels, most, len(RETURN_COLUMNS)), NaN beyond those of a pixel
 
     @staticmethod
@@ -153,7 +159,10 @@ class RateMethod(Method):
         self.check(system)
         flat = None
         if total is not None:
-            flat = np.ascontiguousarray(np.broadcast_to(np.asarray(total, np.float64), shape).reshape(-1))
+            known = np.asarray(total, np.float64)
+            if known.shape not in ((), tuple(shape)):
+                raise ValueError(f"total must be a number or {tuple(shape)} as the pixels, got shape {known.shape}")
+            flat = np.ascontiguousarray(np.broadcast_to(known, shape).reshape(-1))
             if not ((flat > 0) & np.isfinite(flat)).all():
                 raise ValueError("total must be finite and positive, photons per period")
         out, flags = np.empty(given.counts.shape), np.empty(len(given.counts), np.uint8)

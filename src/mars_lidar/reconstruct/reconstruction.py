@@ -15,6 +15,7 @@ from mars_lidar._base.types import FloatArray, Progress
 from mars_lidar.instrument.system import System
 from mars_lidar.reconstruct.centroid import Centroid
 from mars_lidar.reconstruct.coates import Coates, GeneralisedCoates
+from mars_lidar.reconstruct.fit_quality import FALSE_ALARM
 from mars_lidar.reconstruct.histograms import checked
 from mars_lidar.reconstruct.image import Image, UntrainedImage
 from mars_lidar.reconstruct.matched_filter import MatchedFilter, Peak
@@ -66,6 +67,11 @@ class Reconstruction:
         Root of twice the gain in log likelihood by the signal, in standard deviations about; or None.
     flags
         (...) uint8, `Flags`.
+    p_value
+        Probability of a histogram as far from the estimate's law; NaN for too few photons, None where the method has
+        no law.
+    longer, shorter, wider
+        Scores of a longer and of a shorter dead time and of a wider pulse, standard deviations; see `advice`.
     returns
         Every return of each pixel, where several were asked for; then the maps above are those of the strongest.
     delay_half_width_ns, depth_half_width_m
@@ -106,6 +112,10 @@ class Reconstruction:
     background_error: FloatArray | None
     significance: FloatArray | None
     flags: NDArray[np.uint8]
+    p_value: FloatArray | None = None
+    longer: FloatArray | None = None
+    shorter: FloatArray | None = None
+    wider: FloatArray | None = None
     returns: Returns | None = None
     delay_half_width_ns: FloatArray | None = None
     depth_half_width_m: FloatArray | None = None
@@ -122,6 +132,31 @@ class Reconstruction:
     def seen(self) -> NDArray[np.bool_]:
         """(...) whether a return was seen: a depth, and a signal above the background."""
         return _seen(self.depth_m, self.flags)
+
+    @property
+    def misfits(self) -> float:
+        """Share of the pixels with a p-value that the estimate does not fit; NaN without p-values."""
+        if self.p_value is None or not np.isfinite(self.p_value).any():
+            return float("nan")
+        return float((self.p_value[np.isfinite(self.p_value)] < FALSE_ALARM).mean())
+
+    @property
+    def advice(self) -> str:
+        """What would fit more of the pixels, in words; empty where the share of misfits is that of false alarms."""
+        tested = 0 if self.p_value is None else int(np.isfinite(self.p_value).sum())
+        if tested == 0 or self.misfits * tested <= FALSE_ALARM * tested + 4.0 * (FALSE_ALARM * tested) ** 0.5 + 1.0:
+            return ""
+        means = {}
+        for name, values in (("longer", self.longer), ("shorter", self.shorter), ("wider", self.wider)):
+            if values is not None and np.isfinite(values).any():
+                some = values[np.isfinite(values)]
+                means[name] = float(some.mean() * some.size**0.5)
+        words = {"longer": "a longer dead time", "shorter": "a shorter dead time", "wider": "a wider pulse"}
+        best = max(means, key=lambda name: abs(means[name]) if name == "wider" else means[name], default="")
+        if not best or abs(means[best]) < 5.0:
+            return "none of dead time and pulse alone: another return, a drift, or an effect of the detector"
+        text = "a narrower pulse" if best == "wider" and means[best] < 0.0 else words[best]
+        return f"{text} ({abs(means[best]):.0f} standard deviations over all pixels)"
 
     def maps(self) -> dict[str, NDArray[Any]]:
         """The maps that this method gives, by name."""
@@ -269,6 +304,10 @@ def assembled(
         signal_error=mapped(found.signal_error),
         background_error=mapped(found.background_error),
         significance=mapped(found.significance),
+        p_value=mapped(found.p_value),
+        longer=mapped(found.longer),
+        shorter=mapped(found.shorter),
+        wider=mapped(found.wider),
         flags=flags,
         returns=returns_of(found.returns, system, shape),
         delay_half_width_ns=mapped(found.half_width, period),

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mars_lidar._base.arguments import checked
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.detector import MODES
 from mars_lidar.instrument.system import System
@@ -19,6 +20,7 @@ from mars_lidar.statistics.gate import require_mode
 _WITHOUT_GATE = MODES[:3]  # what is inside of a gate depends on the delay, which these do not know
 
 
+@checked
 def poisson_moments(signal: ArrayLike, background: ArrayLike, system: System) -> tuple[FloatArray, FloatArray]:
     """Mean and variance of the count without dead time, both N_r (S + B) (6.1).
 
@@ -30,6 +32,7 @@ def poisson_moments(signal: ArrayLike, background: ArrayLike, system: System) ->
     return mean, mean.copy()
 
 
+@checked
 def poisson_pmf(signal: ArrayLike, background: ArrayLike, system: System, support: ArrayLike) -> FloatArray:
     """Probability of each count in `support` (k,) without dead time: (..., k), leading axes those of S, B."""
     from scipy.special import gammaln, xlogy
@@ -40,6 +43,7 @@ def poisson_pmf(signal: ArrayLike, background: ArrayLike, system: System, suppor
     return np.asarray(np.exp(xlogy(counts, mean) - mean - gammaln(counts + 1.0)), dtype=np.float64)
 
 
+@checked
 def renewal_moments(
     signal: ArrayLike, background: ArrayLike, system: System, *, start_up: bool = False
 ) -> tuple[FloatArray, FloatArray]:
@@ -72,6 +76,7 @@ def renewal_moments(
     return mean, variance + x**2 * (6.0 + 4.0 * x + x**2) / (6.0 * (1.0 + x) ** 4)
 
 
+@checked
 def renewal_pmf(signal: ArrayLike, background: ArrayLike, system: System, support: ArrayLike) -> FloatArray:
     """Exact count law of the constant-rate renewal process, start of the exposure included (6.4, 6.5).
 

@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked
 from mars_lidar._base.native import _core
 from mars_lidar._base.types import FloatArray, IndexArray
 from mars_lidar.instrument.detector import Mode
@@ -91,6 +92,7 @@ _CHAIN_MIN_BINS = 512  # below it the chain's own discretisation shows in the co
 _CHAIN_BINS_PER_WIDTH = 7.5  # of the equivalent width 1 / max s, 2.507 sigma for a Gaussian: a third of sigma
 
 
+@checked
 def photons_per_bin(
     signal: float | None,
     background: float,

@@ -27,6 +27,7 @@ from mars_lidar.statistics.phase_chain import ConvergenceError, Feedback, Soluti
 Rearm = Literal["centre", "edge"]
 
 _REARMS = ("centre", "edge")
+_LONGEST = 2.0**31  # dead time, periods: beyond, its fraction of a bin has no digits, and nothing registers twice
 _MAX_PHOTONS = 1e6
 
 
@@ -110,6 +111,7 @@ class PhaseChain:
     __repr__ = brief
 
     def __post_init__(self) -> None:
+        checks.numbers("photons", checks.unmasked("photons", self.photons))
         photons = np.array(self.photons, dtype=np.float64)
         if photons.ndim != 1 or photons.size == 0:
             raise ValueError(f"photons must be (n,) with n >= 1, got shape {photons.shape}")
@@ -120,7 +122,7 @@ class PhaseChain:
         total = float(photons.sum())
         if not total > 0:
             raise ValueError("photons must not all be 0: without flux there is no registration and no chain")
-        dead = checks.real("dead_time", self.dead_time, low=0.0)
+        dead = checks.real("dead_time", self.dead_time, low=0.0, high=_LONGEST)
         checks.choice("rearm", self.rearm, _REARMS)
         photons.flags.writeable = False
         n = photons.size

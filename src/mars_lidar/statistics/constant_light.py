@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked
 from mars_lidar.instrument.detector import Detector, require_effects
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 
@@ -25,6 +26,7 @@ _MOST_CELLS = 2**22
 _MAX_RATE_HZ = 1e12
 
 
+@checked
 def constant_light_rate(rate_hz: float, detector: Detector) -> float:
     """Mean rate of registrations of a free-running pixel under constant light, counts/s.
 

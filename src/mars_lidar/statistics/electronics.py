@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.detector import Mode
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
@@ -237,6 +238,7 @@ _SETTLED = 1e-11
 ElectronicsMoments = Moments
 
 
+@checked
 def electronics_moments(
     signal: ArrayLike | None,
     background: ArrayLike,

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked
 from mars_lidar._base.brief import brief
 from mars_lidar._base.native import _core
 from mars_lidar._base.threads import thread_count
@@ -310,6 +311,7 @@ UNSETTLED = -2  # the native core's code: gave up
 _ENERGY_STEPS = 10.0  # of the native recursion, that the light of a bin and what follows from it costs
 
 
+@checked
 def exposure_moments(
     signal: ArrayLike | None,
     background: ArrayLike,

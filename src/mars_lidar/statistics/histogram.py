@@ -26,6 +26,7 @@ from mars_lidar.statistics.timing import recorded
 # --- Mean histogram ------------------------------------------------------------------------------------------------
 
 
+@checked
 def mean_histogram(
     signal: ArrayLike | None,
     background: ArrayLike,

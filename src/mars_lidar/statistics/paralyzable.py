@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
 from mars_lidar.statistics.cells import Cells, knots
@@ -30,6 +31,7 @@ _MAX_WHOLE = 20_000  # whole periods of a dead time: each is a step of the varia
 ParalyzableMoments = Moments
 
 
+@checked
 def paralyzable_moments(
     signal: ArrayLike | None,
     background: ArrayLike,

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked
 from mars_lidar._base.brief import brief
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
@@ -83,6 +84,7 @@ class HoldingTimes:
     __repr__ = brief
 
 
+@checked
 def moment_matrices(chain: PhaseChain) -> MomentMatrices:
     """Dense moments of the holding time, for studies and tests: O(n^2) memory, n at most 8192."""
     n = chain.bins
@@ -142,6 +144,7 @@ def lag_covariances(chain: PhaseChain, times: HoldingTimes, lags: int) -> FloatA
     return out
 
 
+@checked
 def holding_times(chain: PhaseChain) -> HoldingTimes:
     """All moments of the holding times without truncation, from two feedback solutions, O(n).
 
@@ -197,6 +200,7 @@ def holding_times(chain: PhaseChain) -> HoldingTimes:
     return HoldingTimes(stationary, mean, variance, mu, sigma_ss2, sigma2, covariance_sum, value, defect)
 
 
+@checked
 def mars_moments(
     signal: ArrayLike | None,
     background: ArrayLike,

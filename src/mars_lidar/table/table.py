@@ -297,6 +297,7 @@ class Table:
                 )
             return table
 
+    @checked
     def lookup(
         self,
         signal: ArrayLike,

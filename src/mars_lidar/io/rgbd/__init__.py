@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from mars_lidar._base import checks
 from mars_lidar._base.files import FileError, open_npz, reading
 from mars_lidar._base.types import FloatArray
+from mars_lidar.io.named_arrays import mat_arrays
 from mars_lidar.io.rgbd import middlebury, nyu, pixels
 from mars_lidar.io.rgbd.exr import read_exr
 from mars_lidar.io.rgbd.pfm import read_pfm
@@ -41,8 +42,9 @@ def read_rgbd(
     - ``.npy``: (H, W), metres, or `depth_unit_m` each. Integers need `depth_unit_m`: they are rarely metres.
     - ``.npz``: ``depth`` as above; optionally ``reflectivity`` (linear, [0, 1]) or ``image`` (as an image
       file), and ``background`` (relative, >= 0).
-    - ``.mat``: the labelled data set of NYUv2 (MATLAB v7.3): ``depths`` in metres and ``images`` of frame
-      `index`, from 0. See `mars_lidar.io.rgbd.nyu`.
+    - ``.mat``: an array ``depth`` or the only one, (H, W), metres, or `depth_unit_m` each; or the labelled data set
+      of NYUv2 (MATLAB v7.3): ``depths`` in metres and ``images`` of frame `index`, from 0. See
+      `mars_lidar.io.rgbd.nyu`.
     - a folder of Middlebury 2005 or 2006 with ``disp1.png``, ``view1.png`` and ``dmin.txt``, or of 2014 or
       2021 with ``disp0.pfm``, ``im0.png`` and ``calib.txt``. See `mars_lidar.io.rgbd.middlebury`.
 
@@ -79,7 +81,8 @@ def _read(
     source: Path, image: Path | None, unit: float | None, focal: float | None, index: int | None, most: float | None
 ) -> tuple[FloatArray, FloatArray, FloatArray | None]:
     suffix = source.suffix.lower()
-    if (index is not None) != (suffix == ".mat" and source.is_file()):
+    frames = suffix == ".mat" and source.is_file() and nyu.is_labelled(source)
+    if (index is not None) != frames:
         told = "needs index, the frame from 0" if index is None else f"has no frames, got index {index!r}"
         raise ValueError(f"{source}: {told}")
     reflectivity = background = None
@@ -88,6 +91,8 @@ def _read(
             raise ValueError(f"{source}: depth_unit_m does not apply to a Middlebury folder, got {unit:g}")
         depth, own_image = middlebury.read(source)
         image = own_image if image is None else image
+    elif suffix == ".mat" and not frames:
+        depth = _depth(source, _matlab(source), unit)
     elif suffix == ".mat":
         if unit is not None:
             raise ValueError(f"{source}: depth_unit_m does not apply to NYUv2, which is in metres, got {unit:g}")
@@ -110,6 +115,19 @@ def _read(
     if focal is not None:
         depth = depth * _obliquity(depth.shape, focal)
     return depth, np.ones(depth.shape) if reflectivity is None else reflectivity, background
+
+
+def _matlab(path: Path) -> NDArray[Any]:
+    """The array ``depth`` of a .mat of any version, or the only one that is an image."""
+    images = {
+        name: array
+        for name, array in mat_arrays(path, deep=False).items()
+        if isinstance(array, np.ndarray) and array.dtype.kind in "fiu" and min(array.shape, default=0) > 1
+    }
+    if "depth" not in images and len(images) != 1:
+        held = ", ".join(f"{name} {array.shape}" for name, array in images.items()) or "none"
+        raise ValueError(f"{path}: must hold an array 'depth' (H, W), or one array alone, got {held}")
+    return images["depth"] if "depth" in images else next(iter(images.values()))
 
 
 def _positive(name: str, value: float | None) -> float | None:

@@ -21,6 +21,16 @@ from mars_lidar._base.hdf5 import open_hdf5
 from mars_lidar.io.rgbd.pixels import describe
 
 
+def is_labelled(path: Path) -> bool:
+    """Whether a .mat is of version 7.3 and has NYUv2's ``depths`` or ``images``."""
+    import h5py
+
+    if not h5py.is_hdf5(path):
+        return False
+    with open_hdf5(path) as file:
+        return "depths" in file or "images" in file
+
+
 def frames(path: Path) -> int:
     """Number of frames in the file."""
     with _opened(path) as file:

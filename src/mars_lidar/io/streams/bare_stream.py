@@ -1,4 +1,4 @@
-"""Absolute times of photons in files without a header: MATLAB ``.mat`` (v5, v7.3) and NumPy ``.npz`` of others.
+"""Absolute times of photons in files without a header: MATLAB ``.mat`` (v5, v7.3), ``.npz`` of others, and text.
 
 A vector holds the times of one pixel; a cell array (H, W) those of an image, empty cells and scalars included.
 Times count from a laser pulse, in a unit that the caller gives (or the end of a name tells: ``_ns``, ``_ps``).
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.files import open_npz
+from mars_lidar._base.text import read_column
 from mars_lidar.io.named_arrays import mat_arrays
 from mars_lidar.io.streams.attributes import of_pixels
 from mars_lidar.io.streams.photons import NoLaserError, Photons
@@ -78,7 +79,9 @@ def _flat(path: Path, name: str, cells: _Cells) -> tuple[NDArray[np.float64], ND
 
 def _times(path: Path, unit_ns: float | None, variable: str | None) -> tuple[dict[str, _Cells], str, _Cells, float]:
     """All variables, the name and the cells of the one that holds the times, and their unit, ns."""
-    if path.suffix == ".mat":
+    if path.suffix in (".csv", ".txt"):
+        found = {"": _one(read_column(path))}
+    elif path.suffix == ".mat":
         found = cells_of(mat_arrays(path, deep=False))
     else:
         with open_npz(path) as archive:

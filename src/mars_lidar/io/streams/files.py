@@ -12,12 +12,13 @@ import numpy as np
 
 from mars_lidar._base import checks
 from mars_lidar._base.files import (
-    INCOMPLETE_SUFFIX,
     IncompleteFileError,
     beside,
     check_target,
+    finished_name,
     open_npz,
     reading,
+    unfinished_of,
 )
 from mars_lidar.io.streams import picoquant
 from mars_lidar.io.streams.attributes import FORMAT, attributes, from_attributes
@@ -31,11 +32,13 @@ _MODULES = {  # that read them; of .npz, those of others
     ".h5": "photon_hdf5",
     ".hdf5": "photon_hdf5",
     ".mat": "bare_stream",
+    ".csv": "bare_stream",
+    ".txt": "bare_stream",
     **dict.fromkeys(picoquant.SUFFIXES, "ptu_stream"),
     ".t3r": "timeharp",
     ".spc": "becker_hickl",
 }
-_BARE = (".mat", ".npz")  # may have no header
+_BARE = (".mat", ".npz", ".csv", ".txt")  # may have no header
 READ_SUFFIXES = tuple(_MODULES)
 
 
@@ -84,14 +87,16 @@ def load(
     if unit_ns is not None:
         unit_ns = checks.real("unit_ns", unit_ns, low=0.0, strict_low=True)
     source = Path(path)
-    plain = source.with_name(source.name.removesuffix(INCOMPLETE_SUFFIX))
+    plain = finished_name(source)
     module = _module(plain)
     bare = plain.suffix in _BARE
     if not bare and (unit_ns is not None or variable is not None):
-        raise ValueError(f"unit_ns and variable are for .mat and .npz: a {plain.suffix} tells both, got {str(path)!r}")
+        raise ValueError(
+            f"unit_ns and variable are for .mat, .npz and text: a {plain.suffix} tells both, got {str(path)!r}"
+        )
     if not source.exists():
-        if source.with_name(source.name + INCOMPLETE_SUFFIX).exists():
-            raise IncompleteFileError(f"{source} was never finished: a stopped run left a {INCOMPLETE_SUFFIX} file")
+        if leftovers := unfinished_of(source):
+            raise IncompleteFileError(f"{source} was never finished: a stopped run left {leftovers[0]}")
         raise FileNotFoundError(f"{source} does not exist")
     if plain != source:
         raise IncompleteFileError(f"{source} is incomplete: a run that was stopped left it")
@@ -117,7 +122,7 @@ def _read_bare(
     source: Path, period_ns: float | None, bins: int | None, unit_ns: float | None, variable: str | None
 ) -> Timestamps:
     """Of a format that may have no header."""
-    attrs = {} if source.suffix == ".mat" else _npz_attributes(source)
+    attrs = _npz_attributes(source) if source.suffix == ".npz" else {}
     if attrs.get("format") is None:
         times: Timestamps = _module(source).read(source, period_ns, bins, unit_ns, variable)
         return times

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar._base.files import INCOMPLETE_SUFFIX, whole
+from mars_lidar._base.files import finished_name, whole
 from mars_lidar._base.hdf5 import open_hdf5, seal
 from mars_lidar._base.optional import needed
 from mars_lidar.io.streams.attributes import attributes, fine_times, of_fine_times
@@ -105,7 +105,7 @@ def write(path: Path, times: Timestamps) -> None:
         file = content.get("_data_file")
         if file is not None and file.isopen:
             file.close()
-    _name_and_seal(path, path.with_name(path.name.removesuffix(INCOMPLETE_SUFFIX)))
+    _name_and_seal(path, finished_name(path))
 
 
 def read(path: Path, period_ns: float | None, bins: int | None) -> Timestamps:

@@ -58,7 +58,7 @@ class Photons:
         if period_ns is None:
             raise NoLaserError(
                 f"{self.source} does not tell the laser period: its clock of {self.clock_ns:g} ns runs free; "
-                "mars-lidar reconstruct takes its histograms, mars-lidar inspect its dead time"
+                "mars-lidar reconstruct takes its histograms, mars-lidar calibrate its dead time"
             )
         if abs(self.clock_ns / period_ns - 1.0) > _SAME:
             raise ValueError(
@@ -82,5 +82,5 @@ class Photons:
             return measured(cycle, fine, self.clock_ns, self.detector[kept], period, bins, self.source)
         raise NoLaserError(
             f"{self.source} holds absolute times without laser pulses: give period_ns; without a laser, mars-lidar "
-            "inspect tells dead time and afterpulses"
+            "mars-lidar calibrate gives dead time and afterpulses"
         )

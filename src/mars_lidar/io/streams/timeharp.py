@@ -1,4 +1,4 @@
-"""TimeHarp 200 (.t3r): a clock of 100 ns that runs free of the laser, and the time since the laser pulse.
+"""TimeHarp 200 (.t3r of format 5.0): a clock of 100 ns that runs free of the laser, and the time since the laser pulse.
 
 phconvert reads the header. The records are taken apart here, since phconvert 0.10 takes the routing channel from the
 wrong bits and markers for overflows: time tag 16 bits, data 12, route 2, valid 1 (PicoQuant, TimeHarp 200 manual).

@@ -18,7 +18,7 @@ constexpr uint32_t kEndEvent = 0xffffffffu;        // the counter, not a cell, o
 
 // Most sweeps of the linear response to one draw's noise, which only gives the integers a start, and of integers in laps:
 // a draw that has not settled by then is refused.
-constexpr int kLinearSweeps = 60, kLapSweeps = 16;
+constexpr int kLinearSweeps = 60, kLapSweeps = 40;
 // Quantiles are taken anew where fewer exposures are armed, and more counts expected, or firing more likely.
 constexpr float kFewArmed = 32.0f, kFewCounts = 0.03f, kLikely = 0.02f;
 
@@ -29,6 +29,7 @@ class Batch : private BatchPixels {
     bool run() {
         solve_mean();
         bound_counts();
+        ask_where_needed();
         int32_t most = 0;
         for (int i = 0; i < kTeam; ++i) most = batch_.draws[i] > most ? batch_.draws[i] : most;
         for (int32_t draw = 0; draw < most; ++draw) {

@@ -11,7 +11,7 @@
 namespace mars {
 
 constexpr int64_t kMostCells = int64_t{1} << 28;  // of all laps, that 32 bits count with room to spare
-constexpr const char* kLapsMust = "laps must be 1, or from the dead time and a period on, at most 128";
+constexpr const char* kLapsMust = "laps must be 1, or from the dead time and a period on, at most 190";
 
 // The grid with the arrays into which its plain struct points.
 class CellGrid {

@@ -69,7 +69,7 @@ enum class FeedbackStatus : uint8_t {
 };
 
 // Pixels that need more laps than these are refused: every lap is a period of cells in memory.
-constexpr int32_t kMostLaps = 128;
+constexpr int32_t kMostLaps = 190;
 
 // One batch: kTeam exposures at a time, each lane its own pixel. A lane counts cells from a first bin of its own, so
 // that the pulses of different pixels lie in the same cells.

@@ -9,10 +9,10 @@ inline namespace MARS_LEVEL {
 namespace {
 
 // Most sweeps of the mean and of the adjoint, and of integers in one lap.
-constexpr int kMeanSweeps = 40, kIntegerSweeps = 40;
+constexpr int kMeanSweeps = 160, kIntegerSweeps = 40;
 constexpr double kSettled = 0.04;        // a move of the history that ends a lane, in standard deviations of the count
 constexpr double kMeanError = 8e-6;      // of the mean per period: float32 sums, and the last sweep's change
-constexpr float kSlowest = 0.85f;        // contraction of a sweep beyond which a pixel is refused
+constexpr float kSlowest = 0.85f;        // contraction of a sweep beyond which, or more sweeps than integers have, several laps are needed
 constexpr float kLinearFrom = 0.2f;      // and from which the linear response is worth its sweeps
 constexpr double kLeastVariance = 12.0;  // of the count, for each whole period of dead time: 0.2 to 0.5 are added
 
@@ -20,7 +20,10 @@ class BatchPixels {
  protected:
     explicit BatchPixels(const FeedbackBatch& batch)
         : batch_(batch), grid_(*batch.grid), n_(batch.grid->cells), work_(batch) {
-        for (int i = 0; i < kTeam; ++i) refused_[i] = FeedbackStatus::kDrawn;
+        for (int i = 0; i < kTeam; ++i) {
+            refused_[i] = FeedbackStatus::kDrawn;
+            needs_laps_[i] = false;
+        }
     }
 
     int64_t row(int32_t j) const { return static_cast<int64_t>(j) * kRow; }
@@ -60,10 +63,11 @@ class BatchPixels {
         alignas(64) float ones[kTeam], change[kTeam];
         alignas(64) int32_t active[kTeam];
         float first[kTeam], last[kTeam];
+        int32_t taken[kTeam];  // sweeps
         for (int i = 0; i < kTeam; ++i) {
             ones[i] = 1.0f;
             active[i] = 1;
-            least_[i] = 1;
+            least_[i] = taken[i] = 1;
             rate_[i] = first[i] = last[i] = 0.0f;
             forgotten_[i] = 1;
         }
@@ -77,6 +81,7 @@ class BatchPixels {
             bool some = false;
             for (int i = 0; i < kTeam; ++i) {
                 if (!active[i]) continue;
+                taken[i] = sweep;
                 const float moved = clip(change[i]);
                 if (sweep == 1) first[i] = moved;
                 if (moved > kForgotten * first[i]) forgotten_[i] = sweep + 1;
@@ -93,7 +98,8 @@ class BatchPixels {
             if (!some) break;
         }
         for (int i = 0; i < kTeam; ++i) {
-            if (active[i] || rate_[i] > kSlowest) refuse(i, FeedbackStatus::kSlow);
+            if (active[i]) refuse(i, FeedbackStatus::kSlow);
+            needs_laps_[i] = rate_[i] > kSlowest || taken[i] > kIntegerSweeps;
             total_[i] = static_cast<double>(work_.sums[row(n_) + i]);
             share_[i] = 1.0 / (1.0 + grid_.whole * total_[i]);
             scale_[i] = static_cast<float>(grid_.pieces * share_[i]);
@@ -157,13 +163,22 @@ class BatchPixels {
                 const bool many = rate_[i] > kLinearFrom && ghosts[i] > kGhostsOfDeviation * deviation_[i];
                 if (!few && !many) continue;
             }
-            const int32_t laps = laps_needed(forgotten_[i]);
-            if (laps == grid_.laps) continue;
-            const bool short_of = cycles() < kFewestLapCycles || cycles() < kFewestPieces * laps;
-            refused_[i] = laps > kMostLaps ? FeedbackStatus::kSlow
-                          : short_of ? FeedbackStatus::kFew
-                                     : static_cast<FeedbackStatus>(static_cast<int>(FeedbackStatus::kLaps) + laps);
+            ask_for_laps(i);
         }
+    }
+
+    // Refuses a lane with the number of laps that it needs: an exposure is armed again every K + 1 of them.
+    void ask_for_laps(int i) {
+        const int32_t laps = laps_needed(forgotten_[i]) * (grid_.whole + 1);
+        if (laps == grid_.laps) return;
+        const bool short_of = cycles() < kFewestLapCycles || cycles() < kFewestPieces * laps;
+        refuse(i, laps > kMostLaps ? FeedbackStatus::kSlow
+                  : short_of       ? FeedbackStatus::kFew
+                                   : static_cast<FeedbackStatus>(static_cast<int>(FeedbackStatus::kLaps) + laps));
+    }
+    void ask_where_needed() {
+        for (int i = 0; i < kTeam; ++i)
+            if (needs_laps_[i] && grid_.laps == 1) ask_for_laps(i);
     }
 
     const FeedbackBatch& batch_;
@@ -171,6 +186,7 @@ class BatchPixels {
     const int32_t n_;
     Workspace work_;
     FeedbackStatus refused_[kTeam];   // all draws of a lane
+    bool needs_laps_[kTeam];          // whatever its ghosts
     alignas(64) float rate_[kTeam];   // contraction of a sweep
     alignas(64) float scale_[kTeam];  // M / (1 + K sum w): exposures for each unit of w
     int32_t forgotten_[kTeam];        // sweep by which the mean has forgotten its start

@@ -1,0 +1,75 @@
+"""Stores of Zarr whose files are compared with their manifest when they are read."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from zarr.storage import LocalStore, WrapperStore
+
+from mars_lidar._base.files import FileError
+
+if TYPE_CHECKING:
+    from mars_lidar._base.manifest import Manifest
+
+
+class SealedStore(LocalStore):
+    """A complete store as it was opened: a file that is missing, empty, changed or exchanged raises FileError.
+
+    The look comes after the read, so that a file that is replaced meanwhile is found as well.
+    """
+
+    def __init__(self, root: Path, sums: Manifest) -> None:
+        super().__init__(root, read_only=True)
+        self._sums = sums
+
+    def with_read_only(self, read_only: bool = True) -> SealedStore:
+        """The store: it cannot be written to."""
+        if not read_only:
+            raise ValueError(f"{self.root} is complete and only read")
+        return self
+
+    async def get(self, key: str, prototype: Any = None, byte_range: Any = None) -> Any:
+        """The bytes of a file, None where the store was written without it."""
+        found = await super().get(key, prototype, byte_range)
+        if key not in self._sums:
+            self._sums.check(key)
+        elif not self._sums.is_known(key):
+            await asyncio.to_thread(self._sums.check, key)
+        return found
+
+    def get_sync(self, key: str, *, prototype: Any = None, byte_range: Any = None) -> Any:
+        """As `get`."""
+        found = super().get_sync(key, prototype=prototype, byte_range=byte_range)
+        self._sums.check(key)
+        return found
+
+    async def get_partial_values(self, prototype: Any, key_ranges: Any) -> list[Any]:
+        """Several of `get`."""
+        return list(await asyncio.gather(*(self.get(key, prototype, part) for key, part in key_ranges)))
+
+
+class SealedValues(WrapperStore[Any]):
+    """A complete store that lies elsewhere: what is fetched whole, as chunks are, is compared with its sum."""
+
+    def __init__(self, store: Any, sums: Mapping[str, str], url: str) -> None:
+        super().__init__(store)
+        self._sums, self._url = sums, url
+
+    def _with_store(self, store: Any) -> SealedValues:
+        return SealedValues(store, self._sums, self._url)
+
+    async def get(self, key: str, prototype: Any, byte_range: Any = None) -> Any:
+        """The bytes at a key, None where the store was written without it."""
+        found = await self._store.get(key, prototype, byte_range)
+        wanted = self._sums.get(key)
+        if wanted is None:
+            return found
+        if found is None:
+            raise FileError(f"{self._url} is damaged or was removed: {key} is missing")
+        if byte_range is None and hashlib.sha256(found.as_buffer_like()).hexdigest() != wanted:
+            raise FileError(f"{self._url} is damaged or was replaced: {key} is not as it was written; open it again")
+        return found

@@ -1,0 +1,154 @@
+"""A recording of one pixel: its times, its clock, what it holds before any model."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mars_lidar._base import checks
+from mars_lidar._base.types import FloatArray
+from mars_lidar.light.timestamps import Timestamps
+
+_ON_GRID = 0.02  # units: largest distance from the grid of a clock, for times in float64 over an hour
+_PROBED = 2000  # times that tell the clock
+_OWN_UNITS = (2**15, 2**16)  # units of the period in our own PTU and Photon-HDF5, at most
+
+
+@dataclass(frozen=True)
+class Clock:
+    """What a recorder writes for a time: the nearest point of a grid.
+
+    `unit_ns` its spacing, 0 for real numbers; `offset` where its points lie, in units; `locked` whether the grid
+    begins anew with each laser pulse (T3), or runs through (T2).
+    """
+
+    period_ns: float
+    unit_ns: float = 0.0
+    offset: float = 0.0
+    locked: bool = False
+
+    def record(self, t: FloatArray) -> FloatArray:
+        """Recorded times (n,), sorted, of avalanches at `t` (n,), ns, jitter included."""
+        if t.size > 1 and (t[1:] < t[:-1]).any():
+            t = np.sort(t, kind="stable")
+        if self.unit_ns == 0.0:
+            return t
+        start = np.floor(t * (1.0 / self.period_ns)) * self.period_ns if self.locked else 0.0
+        steps = np.floor((t - start) * (1.0 / self.unit_ns) + (0.5 - self.offset))
+        return np.asarray((steps + self.offset) * self.unit_ns + start)
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """One pixel's times, recorded in stretches without interruption.
+
+    `pieces` sorted times (n,) of each stretch, ns from a laser pulse; `cycles` laser periods of each; `clock`;
+    `laser` is False where no laser was recorded, and then the period is a unit of time alone.
+    """
+
+    pieces: tuple[FloatArray, ...]
+    cycles: tuple[float, ...]
+    clock: Clock
+    laser: bool = True
+
+    @property
+    def period_ns(self) -> float:
+        """Laser period, ns."""
+        return self.clock.period_ns
+
+    @property
+    def photons(self) -> int:
+        """Registrations in all stretches."""
+        return sum(piece.size for piece in self.pieces)
+
+    @property
+    def exposure(self) -> float:
+        """Laser periods of all stretches."""
+        return float(sum(self.cycles))
+
+    def parts(self, number: int) -> list[Recording]:
+        """About `number` parts of equal exposure, in order of time."""
+        size = self.exposure / number
+        parts = []
+        for piece, cycles in zip(self.pieces, self.cycles, strict=True):
+            count = max(1, round(cycles / size))
+            edges = np.searchsorted(piece, np.arange(count + 1) * (cycles / count * self.period_ns))
+            edges[-1] = piece.size
+            for first, last in pairwise(edges):
+                parts.append(Recording((piece[first:last],), (cycles / count,), self.clock, self.laser))
+        return parts
+
+
+def recording_of(times: Timestamps | Sequence[Timestamps], *, pooled: bool = False) -> Recording:
+    """The recording of one pixel, from a stream or a sequence of streams of that pixel.
+
+    `pooled`: the pixels of an image are recordings of one and the same pixel.
+    """
+    streams = [times] if isinstance(times, Timestamps) else list(times) if isinstance(times, Sequence) else []
+    if not streams or not all(isinstance(stream, Timestamps) for stream in streams):
+        raise TypeError(f"times must be Timestamps or a sequence of them, got {type(times).__name__}")
+    first = streams[0]
+    if not (first.period_ns > 0 and math.isfinite(first.period_ns)):
+        raise ValueError(f"times must give the laser period, got period_ns {first.period_ns}")
+    pieces: list[FloatArray] = []
+    cycles: list[float] = []
+    for stream in streams:
+        if stream.period_ns != first.period_ns:
+            raise ValueError(f"times must share a period, got {first.period_ns:g} ns and {stream.period_ns:g} ns")
+        height, width = stream.shape
+        if height * width > 1 and not pooled:
+            raise ValueError(
+                f"times must be of one pixel, got {height} x {width}: choose one with times.pixel(y, x), or give "
+                "pooled=True where all are recordings of the same pixel"
+            )
+        for k in range(height * width):
+            t = stream.times_ns[stream.offsets[k] : stream.offsets[k + 1]]
+            if t.size > 1:
+                pieces.append(np.ascontiguousarray(t, np.float64))
+                cycles.append(max(float(stream.cycles), float(t[-1]) / stream.period_ns))
+    if not pieces:
+        raise ValueError("times must hold at least two registrations of a pixel")
+    return Recording(tuple(pieces), tuple(cycles), clock_of(pieces[0], first))
+
+
+def clock_of(t: FloatArray, stream: Timestamps) -> Clock:
+    """The clock of times (n,), by the unit that the file gives: where their grid lies, and what it is locked to.
+
+    Times that lie on no grid of that unit are real numbers.
+    """
+    period = stream.period_ns
+    probe = t[:: max(1, t.size // _PROBED)]
+    x = probe / period
+    x -= np.floor(x)
+    unit = float(stream.info.get("unit_ns", 0.0))
+    candidates = [unit] if unit > 0.0 else [period / (most // stream.bins * stream.bins) for most in _OWN_UNITS]
+    for unit in candidates:
+        for locked, place in ((False, probe / unit), (True, x * period / unit)):
+            angle = np.angle(np.exp(2j * np.pi * place).mean()) / (2 * np.pi)
+            offset = float(angle % 1.0)
+            away = np.abs((place - offset + 0.5) % 1.0 - 0.5)
+            if float(np.quantile(away, 0.99)) < _ON_GRID:
+                return Clock(period, unit, 0.0 if min(offset, 1.0 - offset) < _ON_GRID else offset, locked)
+    return Clock(period)
+
+
+def recording_of_arrivals(times_ns: ArrayLike, unit_ns: float) -> Recording:
+    """A recording without a laser: its period is the mean interval, a unit of time alone."""
+    t = np.sort(np.asarray(checks.numbers("times", times_ns), np.float64))
+    if t.ndim != 1 or t.size < 2 or not np.isfinite(t).all():
+        raise ValueError(f"times must be finite numbers (n,), n at least 2, got shape {t.shape}")
+    t = t - np.floor(t[0] / unit_ns) * unit_ns if unit_ns else t - t[0]
+    period = float(t[-1] - t[0]) / (t.size - 1)
+    if not period > 0.0:
+        raise ValueError("times must be of photons one after the other, got one time alone")
+    clock = Clock(period)
+    if unit_ns:
+        place = t[:: max(1, t.size // _PROBED)] / unit_ns
+        offset = float(np.angle(np.exp(2j * np.pi * place).mean()) / (2 * np.pi) % 1.0)
+        clock = Clock(period, unit_ns, 0.0 if min(offset, 1.0 - offset) < _ON_GRID else offset)
+    return Recording((t,), (float(t[-1]) / period,), clock, laser=False)

@@ -1,0 +1,240 @@
+"""Structures of files that compiled code would follow blindly: sparse indices, storage elsewhere, claimed shapes."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from scipy import sparse
+from scipy.io import savemat
+
+import mars_lidar as ml
+from mars_lidar import io
+from mars_lidar._base.files import FileError
+from mars_lidar._base.sparse import check_sparse, dense_counts
+from mars_lidar.io.foreign import foreign_cube
+
+SYSTEM = ml.System(
+    period_ns=100.0, cycles=5000, bins=32, pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=30.0)
+)
+
+
+def counts() -> sparse.csc_matrix:
+    """(12, 32), row indices of which the last bytes of a .mat tell."""
+    dense = np.random.default_rng(1).poisson(0.6, (12, 32)).astype(float)
+    return sparse.csc_matrix(dense)
+
+
+def with_index(where: str, value: int) -> sparse.csc_matrix:
+    """A matrix whose `where` ("indices", "indptr") is wrong at one place, as SciPy builds it without a look."""
+    matrix = counts()
+    getattr(matrix, where)[3] = value
+    return matrix
+
+
+WRONG = [("indices", 12), ("indices", 400), ("indices", -1), ("indptr", -3), ("indptr", 2**20)]
+
+
+def save_v73(path: Path, matrix: sparse.csc_matrix) -> None:
+    """As MATLAB writes a sparse matrix in version 7.3."""
+    with h5py.File(path, "w") as file:
+        group = file.create_group("spad")
+        group.attrs["MATLAB_sparse"] = np.uint64(matrix.shape[0])
+        group["data"], group["ir"] = matrix.data, matrix.indices.astype(np.int64)
+        group["jc"] = matrix.indptr.astype(np.int64)
+
+
+def save_npz(path: Path, matrix: sparse.csc_matrix) -> None:
+    np.savez(
+        path,
+        indices=matrix.indices,
+        indptr=matrix.indptr,
+        format=b"csc",
+        shape=matrix.shape,
+        data=matrix.data,
+    )
+
+
+def save_v5(path: Path, matrix: sparse.csc_matrix) -> None:
+    """SciPy writes the indices as they are."""
+    savemat(path, {"spad": matrix})
+
+
+WRITERS = {"v5.mat": save_v5, "v73.mat": save_v73, "sparse.npz": save_npz}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_whole_sparse_matrices_are_read(name, tmp_path):
+    WRITERS[name](tmp_path / name, counts())
+    cube = foreign_cube(tmp_path / name, SYSTEM, image=(3, 4))
+    assert int(np.asarray(cube.histogram).sum()) == counts().sum()
+
+
+@pytest.mark.parametrize("name", WRITERS)
+@pytest.mark.parametrize(("where", "value"), WRONG)
+def test_indices_outside_of_a_sparse_matrix_are_refused(name, where, value, tmp_path):
+    """They ended the process, or changed memory beyond the array."""
+    path = tmp_path / name
+    matrix = with_index(where, value)
+    if name == "v5.mat":  # SciPy's writer looks at the pointers, so they are changed in the file
+        savemat(path, {"spad": counts()})
+        content = bytearray(path.read_bytes())
+        good = getattr(counts(), where).astype("<i4")
+        at = content.index(good.tobytes())
+        content[at + 12 : at + 16] = np.int32(value).tobytes()
+        path.write_bytes(content)
+    else:
+        WRITERS[name](path, matrix)
+    with pytest.raises(FileError, match=name):
+        foreign_cube(path, SYSTEM, image=(3, 4))
+    with pytest.raises(ValueError, match=name):
+        io.load(path)
+
+
+def test_rows_of_matlab_ascend(tmp_path):
+    matrix = counts()
+    first, second = matrix.indices[:2].copy()
+    matrix.indices[:2] = second, first
+    save_v73(tmp_path / "v73.mat", matrix)
+    with pytest.raises(FileError, match="do not ascend"):
+        foreign_cube(tmp_path / "v73.mat", SYSTEM, image=(3, 4))
+    check_sparse("counts", matrix)  # SciPy's may be in any order
+
+
+def test_a_sparse_matrix_in_memory_is_checked():
+    with pytest.raises(ValueError, match="counts is damaged"):
+        io.from_histograms(with_index("indices", 4000), SYSTEM)
+    matrix = counts()
+    assert (dense_counts("counts", matrix) == matrix.toarray()).all()
+    assert dense_counts("counts", matrix).dtype == np.uint32
+    assert dense_counts("counts", matrix / 3).dtype == np.float64
+    assert (dense_counts("counts", matrix.tocoo()) == matrix.toarray()).all()
+    assert (dense_counts("counts", matrix.todia()) == matrix.toarray()).all()
+    bad = matrix.tocoo()
+    bad.coords[0][0] = 99
+    with pytest.raises(ValueError, match="outside of its shape"):
+        dense_counts("counts", bad)
+
+
+def test_the_depth_networks_layout_is_checked(tmp_path):
+    flux = ml.Flux(np.linspace(0.1, 2.0, 12).reshape(3, 4), 0.1, 40.0)
+    io.simulate_to(tmp_path / "cube.mat", flux, SYSTEM)
+    from scipy.io import loadmat
+
+    found = {k: v for k, v in loadmat(tmp_path / "cube.mat").items() if not k.startswith("__")}
+    spad = found["spad"].tocsc()
+    spad.indices[3] = 400
+    savemat(tmp_path / "bad.mat", found | {"spad": spad})
+    for reader in (io.load, io.read_mat):
+        with pytest.raises(FileError, match=r"bad\.mat.*damaged"):
+            reader(tmp_path / "bad.mat")
+
+
+def secret(folder: Path) -> Path:
+    path = folder / "secret.txt"
+    path.write_bytes(b"not for you, 32 bytes of a file!" * 12)
+    return path
+
+
+def external(path: Path, name: str, shape: tuple[int, ...], dtype: str) -> None:
+    with h5py.File(path, "w") as file:
+        file.create_dataset(name, shape, dtype, external=[(str(secret(path.parent)), 0, h5py.h5f.UNLIMITED)])
+        file[name].attrs["bin_ns"] = 1.0
+
+
+def test_values_in_other_files_are_not_read(tmp_path):
+    external(tmp_path / "a.h5", "counts", (3, 4, 32), "u1")
+    with pytest.raises(FileError, match=r"a\.h5: the values of /counts lie in other files"):
+        foreign_cube(tmp_path / "a.h5", SYSTEM)
+    external(tmp_path / "b.h5", "transient", (3, 4, 8), "f4")
+    with pytest.raises(FileError, match=r"b\.h5: the values of /transient lie in other files"):
+        io.read_transient(tmp_path / "b.h5")
+
+
+def test_virtual_data_and_links_to_other_files_are_not_followed(tmp_path):
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file["counts"] = np.ones((3, 4, 32), np.uint8)
+    layout = h5py.VirtualLayout((3, 4, 32), "u1")
+    layout[:] = h5py.VirtualSource(tmp_path / "other.h5", "counts", (3, 4, 32))
+    with h5py.File(tmp_path / "virtual.h5", "w") as file:
+        file.create_virtual_dataset("counts", layout)
+    with h5py.File(tmp_path / "link.h5", "w") as file:
+        file["group/counts"] = h5py.ExternalLink(str(tmp_path / "other.h5"), "/counts")
+    for name in ("virtual", "link"):
+        with pytest.raises(FileError, match=rf"{name}\.h5.*other file"):
+            foreign_cube(tmp_path / f"{name}.h5", SYSTEM)
+
+
+def test_a_cell_that_refers_to_another_file_is_not_read(tmp_path):
+    path = tmp_path / "cells.mat"
+    with h5py.File(path, "w") as file:
+        data = file.create_dataset("#refs#/a", (32,), "u1", external=[(str(secret(tmp_path)), 0, h5py.h5f.UNLIMITED)])
+        cells = file.create_dataset("t_ns", (1, 1), h5py.ref_dtype)
+        cells[0, 0] = data.ref
+    with pytest.raises(FileError, match=r"cells\.mat.*other files"):
+        ml.Timestamps.load(path, period_ns=100.0)
+
+
+BUDGET_S, BUDGET_MIB = 3.0, 200.0
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("bomb", ["npz_shape", "npz_zeros", "h5_fill", "sparse_shape", "npy_times"])
+def test_a_small_file_is_refused_cheaply(bomb, tmp_path):
+    """No input below 1 MB takes more than 200 MiB or 3 s before it is refused."""
+    path = tmp_path / ("bomb.h5" if bomb == "h5_fill" else "bomb.npz")
+    if bomb == "npz_shape":  # the shape claimed by histogram.npy, whose bytes are not there
+        flux = ml.Flux(np.full((3, 4), 0.5), 0.1, 40.0)
+        io.simulate_to(tmp_path / "good.npz", flux, SYSTEM)
+        with zipfile.ZipFile(tmp_path / "good.npz") as old, zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as new:
+            for member in old.namelist():
+                content = old.read(member)
+                if member == "histogram.npy":
+                    header = {"descr": "<u2", "fortran_order": False, "shape": (2**26, 3, 4, 32)}
+                    from io import BytesIO
+
+                    out = BytesIO()
+                    np.lib.format.write_array_header_1_0(out, header)
+                    content = out.getvalue() + content[128:]
+                new.writestr(member, content)
+    elif bomb == "npz_zeros":
+        np.savez_compressed(path, counts=np.zeros((300, 300, 2000), np.uint16))
+    elif bomb == "npy_times":
+        np.savez_compressed(path, counts=np.zeros((512, 512, 100), np.float64))
+    elif bomb == "sparse_shape":
+        save_npz(path, sparse.csc_matrix(([1.0], ([5], [7])), shape=(10**7, 3000)))
+    else:
+        with h5py.File(path, "w") as file:
+            file.create_dataset("counts", (2000, 2000, 1000), "u2", chunks=(100, 100, 1000))
+    assert path.stat().st_size < 10**6
+    code = f"""
+import json, resource, time
+from pathlib import Path
+import mars_lidar as ml
+from mars_lidar import io
+from mars_lidar.io.foreign import foreign_cube
+import h5py, scipy.io, scipy.sparse
+detector = ml.Detector(dead_time_ns=30.0)
+system = ml.System(period_ns=100.0, cycles=5000, bins=32, pulse=ml.GaussianPulse(sigma_ns=1.0), detector=detector)
+used = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+before, began = used(), time.process_time()
+for read in (lambda p: foreign_cube(p, system), lambda p: io.load(p)):
+    try:
+        read(Path({str(path)!r}))
+        raise SystemExit("it was read")
+    except ValueError as error:
+        assert {str(path)!r} in str(error), error
+print(json.dumps([time.process_time() - began, used() - before]))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=os.environ, check=False)
+    assert done.returncode == 0, done.stderr
+    seconds, mib = json.loads(done.stdout)
+    assert seconds < BUDGET_S
+    assert mib < BUDGET_MIB

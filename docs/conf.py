@@ -246,6 +246,7 @@ def _title(app: Sphinx, page: str, source: list[str]) -> None:
 
 def _link_copies(app: Sphinx, page: str, source: list[str]) -> None:
     source[0] = source[0].replace("](../benchmarks/results/", "](copied/benchmarks/")
+    source[0] = source[0].replace("](../CONTRIBUTING.md", "](copied/project/CONTRIBUTING.md")
 
 
 def _describe_pictures(app: Sphinx, doctree: nodes.document) -> None:

@@ -22,6 +22,7 @@ from benchmarks import (
     storage,
     stream,
     sweeps,
+    user,
     waveforms,
 )
 from benchmarks.config import DEFAULT, FULL, QUICK, Config
@@ -33,6 +34,7 @@ RESULTS = Path(__file__).parent / "results"
 
 SECTIONS: dict[str, Callable[[Config, Bandwidth], Section]] = {
     "exact": engines.exact_levels,
+    "user": user.first_calls,
     "numpy": engines.baselines,
     "pipeline": numpy_mars.pipeline,
     "long": exposures.long_exposures,

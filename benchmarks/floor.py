@@ -19,12 +19,13 @@ from mars_lidar import _core
 LANES = {"avx512": 16, "avx2": 8, "vector128": 4, "scalar": 1}
 
 # Vector instructions for one registration of each lane, counted from native/exact/{registration,wait}.h, kernel.cpp
-# and native/numbers/random.h, for one Gaussian return and a dead time that is not a whole number of periods; loads of
-# constants left out.
+# and native/numbers/{random,word_stream}.h, for one Gaussian return and a dead time that is not a whole number of
+# periods; loads of constants left out.
 PLAIN = {
-    "Threefry-2x32-13: add and exclusive or of 13 rounds, key schedule": 13 * 2 + 14,
-    "two exponentials: 13 to split the integer, 19 for the logarithm, 1 for the rate": 2 * (13 + 19 + 1),
-    "place in the cells of the waits: low bits of both words": 5,
+    "three words of sfc32: 5 additions, 2 shifts, exclusive or": 3 * 8,
+    "Gamma(2) number: 5 for the product, 25 for the logarithm, 1 for its lower bound, 1 for its unit": 32,
+    "its two parts: integers either way to float32, their rest, the rates": 10,
+    "place in the cells of the waits: low bits of two words": 5,
     "cells, whole periods and fractions of the two waits, check for long waits": 2 * 7 + 2,
     "background arrival: add the wait, carry into the next period": 6,
     "place in the pulse's table, interpolation of the energy": 9,
@@ -34,7 +35,7 @@ PLAIN = {
     "end of the dead time": 5,
     "laser period and bin, end of exposure": 13,
 }
-ROTATIONS = 13  # one instruction with AVX-512 and in scalar code, else three
+ROTATIONS = 3  # one instruction with AVX-512 and in scalar code, else three
 SELECTIONS = 9  # one instruction from AVX2 on, with SSE2 three; the minimum of integers among them
 PAIR_LOOKUPS = 2  # of two floats, forward and inverse table of the pulse: per lane an address and a load each
 INCREMENTS = 1  # of the histogram: per lane an address and a read-modify-write

@@ -184,7 +184,7 @@ def feedback_estimate(found: dict[Kernel, Resources]) -> list[str]:
     cells, sweeps = BINS, 8
     mean, integer = 4 * 4.0, 4 * 7.0 + 2.0  # bytes of a cell, read and written: sums, rates; history, quantiles, dither
     moved = PIXELS * cells * sweeps * (mean + integer)
-    work = int(_core.feedback_warp_bytes(cells))
+    work = int(_core.feedback_warp_bytes(cells, 1))
     return [
         f"## Bounds for an NVIDIA H200: `feedback`, 128 x 128 pixels, {BINS} bins, any exposure",
         "",

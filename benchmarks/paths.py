@@ -14,10 +14,10 @@ from benchmarks.rows import engine_row, timing_row
 from benchmarks.timing import in_turn
 from benchmarks.workload import PERIOD_NS, EngineRun, Workload, maps, system
 from mars_lidar import _core
-from mars_lidar.engines.engine import Records
+from mars_lidar.engines.engine import PhaseRecords
 
 _USUAL, _ARMED, _STATIONARY = "armed, one return (reference)", "few rows, armed", "few rows, stationary start"
-_FRESH, _WARM = "timestamps, fresh memory, checked", "timestamps, warm memory"
+_FRESH, _WARM = "timestamps, fresh memory", "timestamps, warm memory"
 
 
 def exact_paths(config: Config, bandwidth: Bandwidth) -> Section:
@@ -58,7 +58,7 @@ def exact_paths(config: Config, bandwidth: Bandwidth) -> Section:
                 engine="exact",
                 fresh=name == _FRESH,
                 reference=reference,
-                output_bytes=Records.BYTES * usual.registrations,
+                output_bytes=PhaseRecords.BYTES * usual.registrations,
             )
         )
     start_s = (times[_STATIONARY].cpu_median - times[_ARMED].cpu_median) / some.pixels
@@ -78,7 +78,7 @@ def _dead_time(instrument: ml.System, nanoseconds: float) -> ml.System:
 
 def _timestamps(load: Workload) -> Callable[[], object]:
     """The engine's own work, into memory that has been written to."""
-    arrays = (np.ones(load.registrations), *np.ones((2, load.registrations), np.int32))
+    arrays = np.ones(load.registrations, np.int32), np.ones(load.registrations, np.float32)
     offsets = np.empty(load.pixels + 1, np.int64)
 
     def run() -> object:

@@ -49,7 +49,7 @@ def _rows(saved: Saved) -> dict[str, str]:
         return ", ".join(saved.ms(_LONG, f"N_r = {10**k:,}", engine=engine) for k in range(3, 8))
 
     one, two, avx2 = "avx512, 1 thread", "avx512, all threads", "avx2, all threads"
-    stamps, told = "timestamps (into fresh memory, checked)", "timestamps, fresh memory, checked"
+    stamps, told = "timestamps (into fresh memory)", "timestamps, fresh memory"
     if not saved.has(_PATHS, told):  # tables of versions that drew twice
         stamps, told = "timestamps (two passes, into fresh memory)", "timestamps (two passes)"
     laws = saved.row(_LAWS, "moments and mean histogram"), saved.row(_LAWS, "count pmf")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 
@@ -75,5 +76,13 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 
 
 def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
-    if ledger.number() * ledger.LEVEL > ledger.FAMILY_LEVEL and exitstatus == 0:
+    if hasattr(session.config, "workeroutput"):  # a process of pytest-xdist: its checks count in the one that began it
+        session.config.workeroutput["ledger"] = ledger.entries()
+    elif ledger.number() * ledger.LEVEL > ledger.FAMILY_LEVEL and exitstatus == 0:
         session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node: Any, error: object) -> None:
+    """Add the statistical checks of a process of pytest-xdist to the account."""
+    ledger.add(getattr(node, "workeroutput", {}).get("ledger", ()))

@@ -383,3 +383,29 @@ def test_command_line(tmp_path: Path):
         failed = run(*options, "-o", str(tmp_path / "not.npz"))
         assert failed.exit_code != 0
         assert told in " ".join(failed.output.split())
+
+
+@pytest.mark.parametrize("engine", ["exact", "sequential"])
+@pytest.mark.parametrize(
+    ("signal", "background", "dead", "twilight"),
+    [(8.0, 0.023, 105.567, 31.16), (8.0, 0.023, 130.2, 31.16), (1.9, 0.63, 357.0, 344.0)],
+)
+def test_ticking_pixels_have_no_stationary_start(
+    engine: str, signal: float, background: float, dead: float, twilight: float
+):
+    """The mean count of the first periods was up to 4 % off in `exact`, and drifted in `sequential`."""
+    detector = ml.Detector(dead_time_ns=dead, twilight_ns=twilight)
+    system = ml.System(
+        period_ns=100.0,
+        cycles=100,
+        bins=50,
+        pulse=ml.GaussianPulse(sigma_ns=0.22),
+        detector=detector,
+        start="stationary",
+    )
+    flux = ml.Flux(signal, background, 99.99)
+    with pytest.raises(ValueError, match=r"start must be 'armed' where more than 5 photons .* got 'stationary' with"):
+        ml.simulate(flux, system, engine=engine)
+    ml.simulate(flux, system.replace(start="armed"), engine=engine)
+    dim = ml.Flux(0.1 * signal, background, 99.99)
+    ml.simulate(dim, system, engine=engine)

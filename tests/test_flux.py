@@ -136,3 +136,11 @@ def test_info_is_the_fluxs_own():
     assert flux.info == {"level": 1.0}
     assert flux[0].info == {"level": 1.0}
     assert ml.Flux(1.0, 0.0, 5.0).info == {}
+
+
+def test_delays_beyond_a_second_are_refused():
+    """Their phase is lost in the rounding of float64: 1e15 + 13 ns came out at another one than 13 ns."""
+    with pytest.raises(ValueError, match=r"delay_ns must be within 1e\+09 ns either way, got 1e\+15; give it modulo"):
+        ml.Flux(1.0, 0.1, 1e15 + 13.0)
+    far, near = ml.Flux(1.0, 0.1, 1e9), ml.Flux(1.0, 0.1, 1e9 % 133.3)
+    np.testing.assert_allclose(far.delay_periods(133.3), near.delay_periods(133.3), atol=1e-8)

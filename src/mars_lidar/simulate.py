@@ -75,7 +75,8 @@ def simulate(
         CuPy array, which
         ``torch.from_dlpack`` takes without a copy.
     out
-        C-contiguous array or memory map (realizations, H, W, bins) of ``system.histogram_dtype`` to fill; with
+        C-contiguous array or memory map (realizations, H, W, bins) of ``system.histogram_dtype`` to fill, such as the
+        cube of a call before: fresh memory costs a fifth more time, in which the system clears its pages; with
         ``device="cuda"`` a CuPy array.
     progress
         Called as ``progress(done, total)`` a few times a second; an exception from it stops the run. True: a bar, or

@@ -41,6 +41,9 @@ class _Draw:
         mode = self._mode()
         dead = self._dead(mode)
         pulse, rare = self._pulse()
+        if isinstance(pulse, SampledPulse) and mode == "nonparalyzable" and self.chance(0.4):
+            low, high = pulse.support_ns()  # armed again within the record, some periods later
+            dead = int(self.random.integers(0, 4)) + float(self.random.uniform(1e-3, 1.0)) * (high - low) / PERIOD_NS
         cycles = self._cycles(signal + background)
         wide = self.chance(0.04 if self.family == "locked" else 0.12)
         bins = round(self.log(2, 2**20)) if wide else 2 ** int(self.random.integers(1, 13))
@@ -129,8 +132,18 @@ class _Draw:
         if kind < 0.7 and self.family != "tails":
             low, high = (1e-4, 0.03) if self.family == "locked" else (1e-4, 1.0)
             return GaussianPulse(sigma_ns=self.log(low, high) * PERIOD_NS), []
-        samples, length = int(self.random.integers(20, 400)), float(self.random.uniform(0.02, 0.9))
+        samples, length = round(self.log(10, 5000)), float(self.random.uniform(0.02, 0.9))
         t = np.arange(samples) / samples
+        shape = self.random.random()
+        if shape < 0.25 and self.family != "tails":  # a peak and its reflection
+            width, later = self.log(0.01, 0.05), float(self.random.uniform(0.3, 0.7))
+            peaks = [(1.0, 0.15), (float(self.random.uniform(0.05, 0.8)), 0.15 + later)]
+            values = sum(height * np.exp(-0.5 * ((t - at) / width) ** 2) for height, at in peaks)
+            return SampledPulse(values, length * PERIOD_NS / samples, "first"), []
+        if shape < 0.4 and self.family != "tails":  # a spike in a long pulse
+            values = np.full(samples, 1.0)
+            values[int(self.random.integers(samples))] += samples * self.log(0.01, 0.5)
+            return SampledPulse(values, length * PERIOD_NS / samples, "first"), []
         if kind < 0.9:  # a pre-pulse of a millionth, a dark gap, the pulse with a tail
             values = np.where(t > 0.4, np.exp(-(t - 0.4) * self.random.uniform(8, 40)), 0.0)
             early = t < 0.15
@@ -214,6 +227,7 @@ class _Draw:
         if bins % 4 == 0:
             possible["code_density"] = tuple(self.random.uniform(0.5, 1.5, 4).tolist())
         if mode == "nonparalyzable" and dead > 0.0:
+            possible["recovery_ns"] = self.log(0.01, 1.0) * PERIOD_NS
             possible["twilight_ns"] = float(self.random.uniform(0.01, 0.2)) * min(dead, 1.0) * PERIOD_NS
         names = self.random.choice(sorted(possible), size=int(self.random.integers(1, 4)), replace=False)
         return {str(name): possible[str(name)] for name in names}

@@ -76,7 +76,7 @@ def test_a_dead_time_that_is_given_and_a_jitter_that_is_not(signal: float) -> No
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("effect", ["afterpulses", "twilight", "paralyzable", "electronics"])
+@pytest.mark.parametrize("effect", ["afterpulses", "twilight", "paralyzable"])
 def test_an_effect_is_named(effect: str) -> None:
     truth = with_effect(BASE, effect)
     result = ml.calibrate(stream(truth, 100_000, 5))

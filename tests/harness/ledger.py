@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 LEVEL = 1e-7  # of each check: 5.3 standard deviations
 FAMILY_LEVEL = 1e-3  # of all checks of a run together; more than 10,000 of them make the run fail
@@ -20,6 +20,16 @@ def require(outcomes: Mapping[str, float], about: str = "") -> None:
 def rejected(outcomes: Mapping[str, float]) -> set[str]:
     """Names of the comparisons that would fail; for the tests of the harness itself, not entered."""
     return {name for name, p in outcomes.items() if not p >= LEVEL}
+
+
+def entries() -> list[tuple[float, str]]:
+    """All checks so far: p-value and name."""
+    return [(float(p), about) for p, about in _done]
+
+
+def add(others: Iterable[tuple[float, str]]) -> None:
+    """Enter the checks of another process."""
+    _done.extend((p, about) for p, about in others)
 
 
 def number() -> int:

@@ -63,8 +63,7 @@ def test_systems_are_functions_of_their_number_and_reach_the_ends() -> None:
     assert {f["mode"] for f in facts} == {"nonparalyzable", "paralyzable", "synchronous", "gated", MOVING}
     assert {f["start"] for f in facts} == {"armed", "stationary"}
     effects = set(" ".join(f["effects"] for f in facts).split())
-    # recovery_ns came after the committed sweep, whose systems stay as they are: tests/test_recovery.py has its domain
-    assert effects == set(EFFECTS) - {"crosstalk", "recovery_ns"}
+    assert effects == set(EFFECTS) - {"crosstalk"}
 
 
 def test_a_right_engine_passes_and_wrong_ones_do_not(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -251,6 +251,10 @@ def calibrate(
     """
     number = checks.integer("returns", returns, low=1, high=_MOST_RETURNS)
     alpha = checks.real("level", level, low=0.0, high=0.5, strict_low=True)
+    for name, value in (("look", look), ("pooled", pooled)):
+        if not isinstance(value, bool):
+            raise TypeError(f"{name} must be True or False, got {value!r}")
+    start_seed = checks.integer("seed", seed, low=0, high=2**31)
     recording = _recorded(times, pooled, checks.real("unit_ns", unit_ns, low=0.0))
     shape, fields, fixed = _known(given, pulse)
     seen = look_at(recording)
@@ -266,7 +270,7 @@ def calibrate(
             f"times must be of photons one after the other, got {seen.same_time:,} of {recording.photons:,} at exactly "
             "the time of the one before"
         )
-    return _Run(recording, seen, shape, number, fields, fixed, alpha, seed).result()
+    return _Run(recording, seen, shape, number, fields, fixed, alpha, start_seed).result()
 
 
 def _recorded(times: Any, pooled: bool, unit_ns: float) -> Recording:

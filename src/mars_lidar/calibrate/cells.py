@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mars_lidar._base.types import FloatArray
 from mars_lidar.calibrate.model import Model
@@ -29,7 +28,7 @@ class Cells:
         phases = np.concatenate([t / period - np.floor(t / period) for t in pilot])
         edges, lit = self._layout(model, theta, phases)
         centre = (np.arange(_PHASES) + 0.5) / _PHASES
-        self.phase_of = np.searchsorted(edges, centre).astype(np.int32)
+        self.phase_of = np.searchsorted(edges, centre)
         coarse = np.unique(np.concatenate([np.linspace(0.0, 1.0, 6)[1:-1], lit.ravel()]))
         inside = np.zeros(_PHASES, bool)
         for low, high in lit:
@@ -86,7 +85,7 @@ class Cells:
         """Counts (size,) of one stretch of recorded times (n,)."""
         x = t * (1.0 / self.period) + _SHIFT / _PHASES
         x -= np.floor(x)
-        at: NDArray[np.int32] = (x * _PHASES).astype(np.int32)
+        at = np.floor(x * _PHASES).astype(np.intp)
         gap = np.searchsorted(self.gap_edges, np.diff(t))
         phases = np.bincount(self.phase_of[at], minlength=self.phases)
         gaps = np.bincount(gap, minlength=self.gap_edges.size + 1)

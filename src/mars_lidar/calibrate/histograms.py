@@ -7,7 +7,9 @@ Biometrika 61, 439, 1974) of what all pixels share, at the most likely light of 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -108,7 +110,7 @@ def calibrate_cube(cube: ArrayLike, system: System) -> CubeCalibration:
     start = min(([dead, w] for w in widths), key=lambda at: loss(np.array(at)))
     start = min(([d, start[1]] for d in grid), key=lambda at: loss(np.array(at)))
     simplex = np.array([start, [start[0] + most / _GRID, start[1]], [start[0], start[1] + 0.4]])
-    options = {"initial_simplex": simplex, "fatol": _DECREASE, "xatol": 1e-4, "maxiter": 80}
+    options: Any = {"initial_simplex": simplex, "fatol": _DECREASE, "xatol": 1e-4, "maxiter": 80}
     best = minimize(loss, np.array(start), method="Nelder-Mead", options=options)
     at = np.asarray(best.x, np.float64)
     errors = np.array([_half_width(loss, at, k, float(best.fun)) for k in range(2)])
@@ -131,7 +133,7 @@ def _normal(value: float, error: float) -> Estimate:
     return Estimate(value, error, value - 1.96 * error, value + 1.96 * error)
 
 
-def _half_width(loss, at: FloatArray, k: int, least: float) -> float:  # type: ignore[no-untyped-def]
+def _half_width(loss: Callable[[FloatArray], float], at: FloatArray, k: int, least: float) -> float:
     """Distance at which the loss is a half above its least, the mean of both sides: one standard error."""
     sides = []
     for sign in (-1.0, 1.0):

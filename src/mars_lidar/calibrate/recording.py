@@ -139,9 +139,12 @@ def clock_of(t: FloatArray, stream: Timestamps) -> Clock:
 
 def recording_of_arrivals(times_ns: ArrayLike, unit_ns: float) -> Recording:
     """A recording without a laser: its period is the mean interval, a unit of time alone."""
-    t = np.sort(np.asarray(checks.numbers("times", times_ns), np.float64))
+    t = np.asarray(checks.numbers("times", times_ns))
+    if t.dtype.kind not in "fiu":
+        raise TypeError(f"times must be Timestamps, a sequence of them, or numbers (n,), got {type(times_ns).__name__}")
     if t.ndim != 1 or t.size < 2 or not np.isfinite(t).all():
         raise ValueError(f"times must be finite numbers (n,), n at least 2, got shape {t.shape}")
+    t = np.sort(t.astype(np.float64))
     t = t - np.floor(t[0] / unit_ns) * unit_ns if unit_ns else t - t[0]
     period = float(t[-1] - t[0]) / (t.size - 1)
     if not period > 0.0:

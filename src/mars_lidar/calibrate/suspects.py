@@ -15,6 +15,7 @@ from mars_lidar.calibrate.start import first_spread, with_edge
 
 _STREAMS = 4 * LIGHTS  # that tell the direction of an effect
 NAMED = 4.0  # standard deviations of a score beyond which an effect is refitted: 3e-5 by chance
+_CLEAR = 2.5  # errors of the size of an effect that has no score of its own
 _FINISHED = 2  # refits that fresh streams judge
 _MISFIT = 1e-3  # probability of the misfit below which effects without a clear score are refitted too
 _FACTOR = 100.0  # of the probability of the misfit, for a refit that gains less in its square
@@ -127,6 +128,8 @@ def _best(fit: Fit, fitted: Fitted, tried: list[Score], listed: list[Score]) -> 
         final = fit.finish(model, theta, root, free, settled)
         named = Named(score.effect, score.z, fitted.misfit_z - final.misfit_z)
         gains = named.gain > _GAIN or final.p_value > max(_FACTOR * fitted.p_value, _MISFIT)
+        if score.z <= NAMED and not score.effect.onoff:  # without a score of its own: its size must be clear
+            gains = gains and final.theta[-1] > _CLEAR * final.covariance[-1, -1] ** 0.5
         if gains and final.converged:
             finals.append((final, named))
             if best is None or final.misfit_z < best[0].misfit_z:
@@ -154,7 +157,7 @@ def _stepped(fit: Fit, fitted: Fitted, score: Score) -> _Stepped | None:
     size = effect.start[0] if effect.onoff else float(np.clip(score.size, 0.3 * effect.start[0], effect.most[0]))
     moved = fitted.theta.copy()
     moved[fitted.free] -= score.shift * min(size, effect.start[0])
-    if fitted.model.light + 2 in fitted.free and effect.names[0] in ("twilight_ns", "recovery_ns"):
+    if fitted.model.light + 2 in fitted.free and effect.names[0] == "recovery_ns":
         moved, size = fitted.theta.copy(), effect.start[0]  # the dead time has taken up what it could of them
     theta = model.bounded(np.r_[moved, size, effect.start[1:]])
     spread = first_spread(model, theta)
@@ -164,7 +167,7 @@ def _stepped(fit: Fit, fitted: Fitted, score: Score) -> _Stepped | None:
     free = np.r_[fitted.free, np.array(more, np.intp)].astype(np.intp)
     photons = float(fit.recording.photons)
     try:
-        if effect.names[0] in ("twilight_ns", "recovery_ns") and fitted.model.light + 2 in fitted.free:
+        if effect.names[0] == "recovery_ns" and fitted.model.light + 2 in fitted.free:
             gaps = np.diff(fit.recording.pieces[0][: 12 * fit.effort.first])
             theta = with_edge(fit, model, theta, np.sort(gaps))
         theta, root, misfit, settled = fit.steps(model, theta, np.diag(spread[free]), free, photons, 5, photons / 6.0)

@@ -35,7 +35,7 @@ class AutoEngine(Engine):
 
     Feedback costs the same whatever the exposure, exact the same for every registration. The rule knows the pixel
     and the system only, so that any part of an image has the bits of the whole: more than 4 expected registrations
-    for every internal cell (`Plan.cells`) go to feedback, 6 for those of all laps where it needs several; the rest, and
+    for every internal cell (`Grids.cells`) go to feedback, 6 for those of all laps where it needs several; the rest, and
     what feedback refuses, to exact.
 
     Reports ``pixels drawn by exact`` and ``pixels drawn by feedback``, and what feedback reports. Draws histograms

@@ -10,8 +10,11 @@ from numpy.typing import NDArray
 from mars_lidar._base.memory import available_bytes, check_memory
 from mars_lidar._base.native import _core
 from mars_lidar.engines.engine import IN_PARTS, Engine, PhaseRecords, Records, Task
+from mars_lidar.engines.warm_start import check_start
 from mars_lidar.instrument.detector import MODES
 from mars_lidar.instrument.effects import EFFECTS
+from mars_lidar.instrument.system import System
+from mars_lidar.light.flux import Flux
 
 _ROOM = 1.3  # for registrations, over those that a constant rate would leave
 
@@ -31,6 +34,10 @@ class ExactEngine(Engine):
 
     def __init__(self, level: str = "") -> None:
         self.level = level
+
+    def check(self, flux: Flux, system: System) -> None:
+        """Refuse stationary starts that twilight pulses keep from settling."""
+        check_start(flux, system)
 
     def histogram(self, task: Task, out: NDArray[Any]) -> None:
         """Every registration, binned as it is drawn."""

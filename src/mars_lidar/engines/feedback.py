@@ -29,10 +29,13 @@ class FeedbackEngine(Engine):
     dead time just below a period) are cut into pieces of several periods that go through their bins together, with
     numbers of their own in each.
 
+    The internal grid is judged by its own mean: bins are cut until no linear function of the histogram is off by more
+    than a twentieth of its standard deviation.
+
     Pixels that it cannot do are given to the exact engine, by a rule on the pixel and the system alone: exposures
-    below 100 dead times, sweeps that contract too slowly (about eight or more background photons per dead time),
-    counts that hardly vary under a dead time of more than a period, pulses that meet their own echo after whole
-    periods (bright, or below 1000 dead times), locked pixels below 1e4 periods, more than 65,536 internal cells.
+    below 100 dead times, sweeps that contract too slowly (some 15 or more background photons per dead time), counts
+    that hardly vary under a dead time of more than a period, locked pixels below 1e4 periods, more than 65,536
+    internal cells.
     Every drawn exposure is checked before it is written: its history must agree with itself, arm no negative number
     of exposures, and have a count that its law allows; else that exposure is drawn by the exact engine. Without dead
     time the bins are independent Poisson numbers.

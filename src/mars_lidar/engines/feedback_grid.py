@@ -85,10 +85,10 @@ class Grids:
         for corner, (kinds, sweeps) in _corner_grids(task, corners, start).items():
             put(alone[(corners == corner).all(-1)], kinds, sweeps)
         some = np.flatnonzero(several)
-        halvings, sweeps = _even_halvings(task, pixels[some], start)
+        halvings, needed = _even_halvings(task, pixels[some], start)
         for k in np.unique(halvings):
             at = halvings == k
-            put(some[at], None if k < 0 else np.asarray(start + k, np.uint8), sweeps[at])
+            put(some[at], None if k < 0 else np.asarray(start + k, np.uint8), needed[at])
         return grids
 
     def cells(self) -> IndexArray:
@@ -247,7 +247,7 @@ def _recut(kinds: KindArray, widest: KindArray, distance: FloatArray, parts: Flo
     more = halvings(math.exp(low))
     if not fine and not (more > 0).any():
         more[np.argmax(worst)] = 1
-    kinds = now + more
+    graded = np.asarray(now + more, np.int64)
     for turn in (1, -1) * (_MOST_KIND // _GRADING + 1):
-        kinds = np.maximum(kinds, np.roll(kinds, turn) - _GRADING)
-    return np.asarray(kinds, np.uint8)
+        graded = np.maximum(graded, np.roll(graded, turn) - _GRADING)
+    return graded.astype(np.uint8)

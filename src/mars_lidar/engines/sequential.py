@@ -9,8 +9,11 @@ from numpy.typing import NDArray
 
 from mars_lidar._base.native import _core
 from mars_lidar.engines.engine import Engine, Records, Task
+from mars_lidar.engines.warm_start import check_start
 from mars_lidar.instrument.detector import MODES
 from mars_lidar.instrument.effects import EFFECTS
+from mars_lidar.instrument.system import System
+from mars_lidar.light.flux import Flux
 
 
 class SequentialEngine(Engine):
@@ -24,6 +27,10 @@ class SequentialEngine(Engine):
     description = "every arrival drawn, sorted and rejected one by one: slow, independent gold standard"
     modes = MODES
     effects = EFFECTS
+
+    def check(self, flux: Flux, system: System) -> None:
+        """Refuse stationary starts that twilight pulses keep from settling."""
+        check_start(flux, system)
 
     def histogram(self, task: Task, out: NDArray[Any]) -> None:
         """Every arrival that finds the pixel armed."""

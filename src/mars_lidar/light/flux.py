@@ -19,6 +19,7 @@ from mars_lidar.instrument.system import System
 
 # --- Maps of photons -----------------------------------------------------------------------------------------------
 
+MAX_DELAY_NS = 1e9  # a second: beyond, float64 does not tell the phase in a laser period to 1e-6 ns
 MAX_PHOTONS = 1e6  # per period; the samplers are tested to 1e3
 
 
@@ -114,8 +115,8 @@ class Flux:
     background
         Background photons per period B, uniform in time: scalar or (H, W).
     delay_ns
-        Delay tau of the return, ns: scalar or (H, W), or (R, H, W). Any finite value: it wraps into the laser period.
-        NaN, for "no return", is allowed where the signal is 0.
+        Delay tau of the return, ns: scalar or (H, W), or (R, H, W). Up to a second either way (1e9 ns): it wraps into
+        the laser period. NaN, for "no return", is allowed where the signal is 0.
     waveform
         Instead of `signal` and `delay_ns`: photons per period in each of T equal parts of the period
         (..., T), as they reach the detector (the pulse of the system is *not* applied), constant inside
@@ -366,6 +367,11 @@ def made(
     if lost.any() and (lost := lost & (signal > 0)).any():
         where = tuple(int(k) for k in np.argwhere(lost)[0][1:])
         raise ValueError(f"delay_ns must be finite where signal > 0, got NaN at pixel {where}")
+    if (far := np.abs(delay_ns) > MAX_DELAY_NS).any():
+        raise ValueError(
+            f"delay_ns must be within {MAX_DELAY_NS:g} ns either way, got {delay_ns[far][0]:g}; give it modulo the "
+            "laser period"
+        )
     if waveform is not None:
         total, nearest = waveform.sum(-1), np.full(background.shape, np.nan)
     elif len(signal) == 1:

@@ -32,7 +32,7 @@ def holds_for(system: System) -> bool:
     return system.detector.mode == "nonparalyzable" and system.cycles > 4.0 * max(1.0, system.dead_time_periods)
 
 
-def blinding(system: System, dead_time_periods: float) -> tuple[float, FloatArray]:
+def blinding(system: System, dead_time_periods: float) -> tuple[float, NDArray[np.complex128]]:
     """Whole periods that a registration blinds, and the transform of the shares (bins,) that the rest blinds."""
     bins = system.bins
     whole, rest = divmod(dead_time_periods * bins, bins)
@@ -142,7 +142,9 @@ def _pooled(counts: FloatArray, expected: FloatArray) -> tuple[FloatArray, Float
     cell = np.minimum((below / np.maximum(total, 1e-300)[:, None] * number[:, None]).astype(np.int64), _CELLS - 1)
     cell += _CELLS * np.arange(len(counts))[:, None]
     rows = len(counts)
-    h, e = (np.bincount(cell.ravel(), x.ravel(), rows * _CELLS).reshape(rows, _CELLS) for x in (counts, expected))
+    h, e = np.zeros((2, rows, _CELLS))
+    h += np.bincount(cell.ravel(), counts.ravel(), rows * _CELLS).reshape(rows, _CELLS)
+    e += np.bincount(cell.ravel(), expected.ravel(), rows * _CELLS).reshape(rows, _CELLS)
     return h, e, number
 
 

@@ -32,6 +32,7 @@ _BLOCK_PIXELS = 2**17  # of the second network at a time
 _OWN = 20.0  # signal photons of a pixel, from which on it is a window of its own
 _ALONE = 200.0  # and from which on nothing around it tells more than its own likelihood
 _ALONE_BYTES = 64 * 2**20  # of their counts at a time
+_NOT_ALONE = np.uint8(Flags.EMPTY | Flags.NO_SIGNAL | Flags.SATURATED | Flags.UNCONVERGED)
 _NORMAL = 1.645  # standard errors to either side that hold 90 % of a normal distribution
 
 
@@ -140,13 +141,13 @@ def _alone(
             row[photons.bin[entries]] = photons.number[entries]
         own = MaximumLikelihood().estimate(Histograms(counts, system, threads))
         off = (own.delay - estimates.delay[part] + 0.5) % 1.0 - 0.5
-        same = (np.abs(off) * cells.count < 3.0 * cells.sigma) & (own.flags == 0)
+        same = (np.abs(off) * cells.count < 3.0 * cells.sigma) & (own.flags & _NOT_ALONE == 0)
         to = part[same]
         for name in ("signal", "background", "delay", "signal_error", "delay_error"):
             getattr(estimates, name)[to] = getattr(own, name)[same]
         if estimates.half_width is not None and own.delay_error is not None:
             estimates.half_width[to] = _NORMAL * own.delay_error[same]
-        estimates.flags[to] = 0
+        estimates.flags[to] = own.flags[same]
 
 
 def _blurs(system: System) -> list[float]:

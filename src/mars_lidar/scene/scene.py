@@ -171,8 +171,8 @@ class Scene:
         system
             Gives the laser period t_r.
         signal
-            Mean signal photons per laser period over the valid pixels, > 0, at the detector's output (photon
-            detection efficiency included).
+            Mean signal photons per laser period over the valid pixels, > 0, as they reach the detector: engines apply
+            its `detection_efficiency` (`Flux.detected`).
         sbr
             Mean signal over mean *ambient* photons, both over the valid pixels and per laser period, in
             (0, inf]; inf is no ambient light. Dark counts are not part of it: they come on top.

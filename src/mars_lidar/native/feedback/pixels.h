@@ -10,9 +10,10 @@ namespace {
 
 // Most sweeps of the mean and of the adjoint, and of integers in one lap.
 constexpr int kMeanSweeps = 160, kIntegerSweeps = 40;
-constexpr double kSettled = 0.04;        // a move of the history that ends a lane, in standard deviations of the count
-constexpr double kMeanError = 8e-6;      // of the mean per period: float32 sums, and the last sweep's change
-constexpr float kSlowest = 0.85f;        // contraction of a sweep beyond which, or more sweeps than integers have, several laps are needed
+constexpr double kSettled = 0.04;    // a move of the history that ends a lane, in standard deviations of the count
+constexpr double kMeanError = 8e-6;  // of the mean per period: float32 sums, and the last sweep's change
+constexpr float kSlowest =
+    0.85f;  // contraction of a sweep beyond which, or more sweeps than integers have, several laps are needed
 constexpr float kLinearFrom = 0.2f;      // and from which the linear response is worth its sweeps
 constexpr double kLeastVariance = 12.0;  // of the count, for each whole period of dead time: 0.2 to 0.5 are added
 

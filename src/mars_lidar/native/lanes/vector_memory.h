@@ -5,16 +5,18 @@
 namespace mars {
 inline namespace MARS_LEVEL {
 
-// All lanes, side by side; memory of any alignment.
+// All lanes, side by side; memory of any alignment. One hardware vector at a time: of a pair GCC makes a copy in memory.
 template <class Vector, class Scalar>
 MARS_INLINE Vector load(const Scalar* from) {
     Vector x;
-    memcpy(&x, from, sizeof x);
+    memcpy(&x.low, from, sizeof x.low);
+    memcpy(&x.high, from + kHardwareLanes, sizeof x.high);
     return x;
 }
 template <class Vector, class Scalar>
 MARS_INLINE void store(Scalar* to, const Vector& x) {
-    memcpy(to, &x, sizeof x);
+    memcpy(to, &x.low, sizeof x.low);
+    memcpy(to + kHardwareLanes, &x.high, sizeof x.high);
 }
 
 // Lanes into memory, to be read one by one. The empty statement keeps compilers from "improving" this into

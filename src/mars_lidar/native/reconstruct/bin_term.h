@@ -12,13 +12,14 @@ struct BinTerm {
     double value = 0.0, score = 0.0, info = 0.0;
 };
 
-// (R9): `h` of the passes registered, `quiet` did not; `share` is one over the passes.
-inline BinTerm passed_term(double h, double quiet, const Expected& e, double share) {
+// (R9): `h` of the passes registered, `quiet` did not; `share` is one over the passes, and `unit` what the registrations
+// that are expected are told in: the passes too, or their armed time.
+inline BinTerm passed_term(double h, double quiet, const Expected& e, double share, double unit) {
     BinTerm out;
     quiet = std::max(quiet, 0.0);
     double score = 0.0;
     if (h > 0.0) {
-        out.value += h * std::log(e.mean * share);
+        out.value += h * std::log(e.mean * unit);
         score += h / e.mean;
     }
     if (quiet > 0.0) {
@@ -39,9 +40,7 @@ inline BinTerm bin_term(const HistogramRecord& r, double h, double armed, double
     }
     const double passes = armed + rearmed, time = armed + 0.5 * rearmed;
     if (!(time > 1e-12)) return {};
-    BinTerm out = passed_term(h, passes - h, Expected(l, armed, rearmed), 1.0 / passes);
-    out.value += h * std::log(passes / time);
-    return out;
+    return passed_term(h, passes - h, Expected(l, armed, rearmed), 1.0 / passes, 1.0 / time);
 }
 
 }  // namespace mars

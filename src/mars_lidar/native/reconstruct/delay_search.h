@@ -5,6 +5,8 @@
 #include <cmath>
 #include <vector>
 
+#include "lanes/kernels.h"
+#include "reconstruct/correlation_kernel.h"
 #include "reconstruct/pixel_likelihood.h"
 #include "reconstruct/pulse_template.h"
 
@@ -25,9 +27,14 @@ class DelaySearch {
         step_ = pulse.step;
         for (const double s : pulse.energy) energy_.push_back(static_cast<float>(s));
         points_ = r_.bins / step_;
+        const int64_t whole = (points_ + kCorrelatedTogether - 1) / kCorrelatedTogether * kCorrelatedTogether;
+        length_ = whole + static_cast<int64_t>(energy_.size()) / step_ + 1;
+        count_rows_.resize(step_ * length_);
+        time_rows_.resize(step_ * length_);
         gain_.resize(energy_.size());
-        score_.resize(points_);
-        score2_.resize(points_);
+        score_.resize(whole);
+        score2_.resize(whole);
+        z_.resize(points_);
     }
 
     // Up to `most` starting values, the best first.
@@ -36,18 +43,15 @@ class DelaySearch {
         const double flat = likelihood.count() / likelihood.time();
         extend(passes);
         // Score of a weak pulse over a flat rate, over its standard deviation (R11).
-        correlate(count_.data(), energy_.data(), score_.data());
-        correlate(time_.data(), energy_.data(), score2_.data());
-        int64_t best = 0;
-        double top = -HUGE_VAL;
+        arrange(count_, count_rows_);
+        arrange(time_, time_rows_);
+        correlate(count_rows_, energy_.data(), score_);
+        correlate(time_rows_, energy_.data(), score2_);
         for (int64_t g = 0; g < points_; ++g) {
             const double expected = flat * score2_[g];
-            const double z = (score_[g] - expected) / std::sqrt(std::max(expected, 1e-6));
-            if (z > top) {
-                top = z;
-                best = g;
-            }
+            z_[g] = (score_[g] - expected) / std::sqrt(std::max(expected, 1e-6));
         }
+        const int64_t best = std::max_element(z_.begin(), z_.end()) - z_.begin();
         // What lies inside and outside of that pulse gives S and B.
         const int64_t from = best * step_ + first_;
         double inside = 0.0, time = 0.0, weighted = 0.0;
@@ -64,15 +68,15 @@ class DelaySearch {
             std::max((inside - back * time) / std::max(weighted, 1e-9), 1.0 / std::max(weighted, 1e-9));
         // Gain of the likelihood for that S and B at every delay (R12).
         for (int64_t i = 0; i < taps; ++i) gain_[i] = static_cast<float>(std::log1p(signal * energy_[i] / back));
-        correlate(count_.data(), gain_.data(), score_.data());
+        correlate(count_rows_, gain_.data(), score_);
         for (int64_t g = 0; g < points_; ++g) score_[g] -= static_cast<float>(signal) * score2_[g];
         int found = 0;
         std::array<int64_t, kMost> at{};
         most = std::min(most, kMost);
         for (int64_t g = 0; g < points_; ++g) {
             const float here = score_[g];
-            if (points_ > 2 && (here < score_[(g + points_ - 1) % points_] || here <= score_[(g + 1) % points_]))
-                continue;
+            const int64_t last = g == 0 ? points_ - 1 : g - 1, next = g + 1 == points_ ? 0 : g + 1;
+            if (points_ > 2 && (here < score_[last] || here <= score_[next])) continue;
             int place = found < most ? found++ : most;
             while (place > 0 && score_[at[place - 1]] < here) {
                 if (place < most) at[place] = at[place - 1];
@@ -108,26 +112,25 @@ class DelaySearch {
         }
     }
 
-    // out[g] = sum over the template's bins i of weights[i] values[g steps + i]: in eight sums side by side, which
-    // compilers make a vector of, always added up in the same order.
-    void correlate(const float* values, const float* weights, float* out) const {
-        const int64_t taps = static_cast<int64_t>(energy_.size());
-        for (int64_t g = 0; g < points_; ++g) {
-            const float* from = values + shift_ + g * step_;
-            float lanes[8] = {};
-            int64_t i = 0;
-            for (; i + 8 <= taps; i += 8)
-                for (int k = 0; k < 8; ++k) lanes[k] += weights[i + k] * from[i + k];
-            float sum = 0.0f;
-            for (; i < taps; ++i) sum += weights[i] * from[i];
-            for (int k = 0; k < 8; ++k) sum += lanes[k];
-            out[g] = sum;
-        }
+    void correlate(const std::vector<float>& rows, const float* weights, std::vector<float>& out) const {
+        correlate_({rows.data(), weights, length_, static_cast<int64_t>(energy_.size()), points_, step_, out.data()});
+    }
+    // Values (2 n + taps) from the template's first bin on, in rows.
+    void arrange(const std::vector<float>& values, std::vector<float>& rows) const {
+        const int64_t end = static_cast<int64_t>(values.size());
+        for (int64_t q = 0; q < step_; ++q)
+            for (int64_t m = 0; m < length_; ++m) {
+                const int64_t at = shift_ + m * step_ + q;
+                rows[q * length_ + m] = at < end ? values[at] : 0.0f;
+            }
     }
 
     const HistogramRecord& r_;
+    void (*correlate_)(const Correlation&) = kernel_at<const Correlation&>("", MARS_KERNELS(correlate_));
     int64_t first_ = 0, step_ = 1, points_ = 1, shift_ = 0;
-    std::vector<float> energy_, gain_, score_, score2_, count_, time_;
+    int64_t length_ = 1;  // of a row
+    std::vector<float> energy_, gain_, score_, score2_, count_, time_, count_rows_, time_rows_;
+    std::vector<double> z_;
 };
 
 }  // namespace mars

@@ -16,9 +16,15 @@ struct PulseCurve {
 
     double span() const { return cell * static_cast<double>(energy.size() - 1); }  // at most a period
 
+    // std::floor without a call, which processors need whose oldest kin has no instruction for it.
+    static double floor_of(double x) {
+        const double whole = static_cast<double>(static_cast<int64_t>(x));
+        return whole > x ? whole - 1.0 : whole;
+    }
+
     // Energy up to t, growing by 1 a period; `density` takes its derivative.
     double operator()(double t, double* density) const {
-        const double u = t - low, whole = std::floor(u), x = (u - whole) / cell;
+        const double u = t - low, whole = floor_of(u), inverse = 1.0 / cell, x = (u - whole) * inverse;
         const size_t last = energy.size() - 1;
         if (x >= static_cast<double>(last)) {
             *density = 0.0;
@@ -27,7 +33,7 @@ struct PulseCurve {
         const size_t k = static_cast<size_t>(x);
         const double y = x - static_cast<double>(k), z = 1.0 - y;
         const double rise = energy[k + 1] - energy[k], left = slope[k] * cell, right = slope[k + 1] * cell;
-        *density = (6.0 * y * z * rise + z * (1.0 - 3.0 * y) * left + y * (3.0 * y - 2.0) * right) / cell;
+        *density = (6.0 * y * z * rise + z * (1.0 - 3.0 * y) * left + y * (3.0 * y - 2.0) * right) * inverse;
         return whole + energy[k] + y * y * (3.0 - 2.0 * y) * rise + y * z * (z * left - y * right);
     }
 };

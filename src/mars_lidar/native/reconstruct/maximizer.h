@@ -72,7 +72,7 @@ inline Fit climb(const PixelLikelihood& pixel, const double* start, bool with_si
                 fit.converged = true;
                 return fit;
             }
-            if (step >= 3 && now.value + 4.0 * gain + 5.0 < terrain.best) return fit;
+            if (step >= 1 && now.value + 4.0 * gain + 5.0 < terrain.best) return fit;
         }
         bool better = false;
         for (int trial = 0; trial < 40 && !better; ++trial, damping *= 8.0) {

@@ -19,7 +19,7 @@ struct Likelihood {
     void add(double score, double info, const double* dl) {
         for (int a = 0; a < 3; ++a) {
             gradient[a] += score * dl[a];
-            for (int b = 0; b < 3; ++b) information[a][b] += info * dl[a] * dl[b];
+            for (int b = 0; b <= a; ++b) information[a][b] = information[b][a] += info * dl[a] * dl[b];
         }
     }
 };
@@ -92,7 +92,8 @@ class PixelLikelihood {
                              quiet = armed + passes_.rearmed[j] - h;
                 if (!(armed + passes_.rearmed[j] > 1e-9)) continue;
                 const Expected e(pass, armed, passes_.rearmed[j]);
-                add(each[c], passed_term(h, quiet, e, 1.0 / (armed + passes_.rearmed[j])), dl);
+                const double share_of_pass = 1.0 / (armed + passes_.rearmed[j]);
+                add(each[c], passed_term(h, quiet, e, share_of_pass, share_of_pass), dl);
                 each[c].value += choices[c];
             }
         });

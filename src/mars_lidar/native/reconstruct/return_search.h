@@ -29,6 +29,10 @@ class ReturnSearch {
         points_ = (r_.bins + step_ - 1) / step_;  // the last step may be a shorter one
         place_.resize(points_ + 1);
         for (int64_t g = 0; g <= points_; ++g) place_[g] = std::min(g * step_, r_.bins);
+        for (const double s : energy_) squared_.push_back(s * s);
+        shifted_.assign(energy_.size(), 0.0);
+        for (size_t i = static_cast<size_t>(step_); i < energy_.size(); ++i)
+            shifted_[i] = energy_[i] * energy_[i - static_cast<size_t>(step_)];
     }
 
     // At a maximum of the likelihood, evaluated bin by bin: false where its information is singular. `hints`: the
@@ -39,7 +43,6 @@ class ReturnSearch {
         for (int a = 0; a < unknowns; ++a) free[a] = point.information[a][a] > 0.0;
         double spread[kUnknowns][kUnknowns];
         if (!inverse<kUnknowns>(point.information, free, spread)) return false;
-        const int64_t taps = static_cast<int64_t>(energy_.size());
         extend(score_, [&](int64_t j) { return likelihood.score()[j]; });
         extend(info_, [&](int64_t j) { return likelihood.info()[j] * r_.share(j); });
         nuisance_.resize(unknowns);
@@ -49,30 +52,22 @@ class ReturnSearch {
             const double scale = a == 0 ? 1.0 / static_cast<double>(r_.bins) : a % 2 == 1 ? 1.0 : point.at[a - 1];
             extend(nuisance_[a], [&](int64_t j) { return scale * (by ? by[j] : r_.share(j)) * likelihood.info()[j]; });
         }
-        score_at_.assign(points_, 0.0);
-        variance_.assign(points_, 0.0);
-        along_.assign(points_ * kUnknowns, 0.0);
+        score_at_.resize(points_);
+        variance_.resize(points_);
+        beside_.resize(points_);
+        along_.resize(points_ * kUnknowns);
         left_.assign(points_ * kUnknowns, 0.0);
+        correlate(energy_, score_, score_at_.data(), 1);
+        correlate(squared_, info_, variance_.data(), 1);
+        correlate(shifted_, info_, beside_.data(), 1);
+        for (int a = 0; a < unknowns; ++a) correlate(energy_, nuisance_[a], along_.data() + a, kUnknowns);
         for (int64_t g = 0; g < points_; ++g) {
-            const int64_t from = start(g);
-            double score = 0.0, all = 0.0;
-            for (int64_t i = 0; i < taps; ++i) {
-                score += energy_[i] * score_[from + i];
-                all += energy_[i] * energy_[i] * info_[from + i];
-            }
-            double *along = &along_[g * kUnknowns], *left = &left_[g * kUnknowns];
-            for (int a = 0; a < unknowns; ++a) {
-                double sum = 0.0;
-                const double* values = nuisance_[a].data() + from;
-                for (int64_t i = 0; i < taps; ++i) sum += energy_[i] * values[i];
-                along[a] = sum;
-            }
-            double known = 0.0;
+            double *along = &along_[g * kUnknowns], *left = &left_[g * kUnknowns], known = 0.0;
             for (int a = 0; a < unknowns; ++a) {
                 for (int b = 0; b < unknowns; ++b) left[a] += spread[a][b] * along[b];
                 known += left[a] * along[a];
             }
-            score_at_[g] = score;
+            const double all = variance_[g];
             variance_[g] = all - known > kResolved * all ? all - known : 0.0;
         }
         measure(unknowns);
@@ -112,15 +107,34 @@ class ReturnSearch {
         for (int64_t j = n; j < 2 * n + taps; ++j) out[j] = out[j - n];
     }
 
+    // out[stride g] = sum over i of weights[i] values[start(g) + i]: several g side by side, whose sums do not wait for
+    // each other, each added up in the order of i.
+    void correlate(const std::vector<double>& weights, const std::vector<double>& values, double* out,
+                   int64_t stride) const {
+        constexpr int64_t together = 8;
+        const size_t taps = weights.size();
+        for (int64_t g = 0; g < points_; g += together) {
+            double sum[together] = {};
+            const double* from[together];
+            for (int64_t k = 0; k < together; ++k) from[k] = values.data() + start(std::min(g + k, points_ - 1));
+            for (size_t i = 0; i < taps; ++i)
+                for (int64_t k = 0; k < together; ++k) sum[k] += weights[i] * from[k][i];
+            for (int64_t k = 0; k < std::min(together, points_ - g); ++k) out[stride * (g + k)] = sum[k];
+        }
+    }
+
     // The sum of the angles between the directions of neighbouring delays that are left.
     void measure(int unknowns) {
         const int64_t taps = static_cast<int64_t>(energy_.size());
         length_ = 0.0;
         int64_t last = -1, first = -1;
         auto angle = [&](int64_t g, int64_t h, int64_t apart) {
-            double both = 0.0;
-            const int64_t from = start(g);
-            for (int64_t i = apart; i < taps; ++i) both += energy_[i] * energy_[i - apart] * info_[from + i];
+            double both = beside_[g];
+            if (apart != step_) {
+                both = 0.0;
+                const int64_t from = start(g);
+                for (int64_t i = apart; i < taps; ++i) both += energy_[i] * energy_[i - apart] * info_[from + i];
+            }
             for (int a = 0; a < unknowns; ++a) both -= along_[g * kUnknowns + a] * left_[h * kUnknowns + a];
             return std::acos(std::clamp(both / std::sqrt(variance_[g] * variance_[h]), -1.0, 1.0));
         };
@@ -153,8 +167,9 @@ class ReturnSearch {
     const HistogramRecord& r_;
     int64_t first_ = 0, step_ = 1, points_ = 1;
     double length_ = 0.0;
-    std::vector<int64_t> place_;  // (points + 1) bins
-    std::vector<double> energy_, score_, info_, score_at_, variance_, along_, left_;
+    std::vector<int64_t> place_;             // (points + 1) bins
+    std::vector<double> squared_, shifted_;  // of the energy: its square, and times itself a step before
+    std::vector<double> energy_, score_, info_, score_at_, variance_, beside_, along_, left_;
     std::vector<std::vector<double>> nuisance_;
 };
 

@@ -17,6 +17,7 @@ from typing import Any
 import matplotlib.style
 from docutils import nodes
 from sphinx.application import Sphinx
+from sphinx_gallery.directives import imgsgnode
 
 import mars_lidar
 
@@ -39,6 +40,7 @@ extensions = [
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
 exclude_patterns = [
     "katex",
+    "**/sg_execution_times.rst",
     *(f"{folder}/**/*.{kind}" for folder in ("gallery", "lessons") for kind in ("ipynb", "py", "json", "md5")),
 ]
 templates_path = ["_templates"]
@@ -244,6 +246,7 @@ def _title(app: Sphinx, page: str, source: list[str]) -> None:
 
 def _link_copies(app: Sphinx, page: str, source: list[str]) -> None:
     source[0] = source[0].replace("](../benchmarks/results/", "](copied/benchmarks/")
+    source[0] = source[0].replace("](../CONTRIBUTING.md", "](copied/project/CONTRIBUTING.md")
 
 
 def _describe_pictures(app: Sphinx, doctree: nodes.document) -> None:
@@ -251,7 +254,8 @@ def _describe_pictures(app: Sphinx, doctree: nodes.document) -> None:
     if not app.env.docname.startswith(("gallery/", "lessons/")):
         return
     title = next(iter(doctree.findall(nodes.title)), nodes.title()).astext()
-    for number, image in enumerate(doctree.findall(nodes.image), 1):
+    pictures = [node for node in doctree.findall() if isinstance(node, (nodes.image, imgsgnode))]
+    for number, image in enumerate(pictures, 1):
         description = image.get("alt", "")
         if not description or re.match(r"(plot|lesson) \d", description):
             image["alt"] = f"{title}: picture {number}, described in the text beside it"

@@ -91,7 +91,8 @@ def browser() -> Iterator[Any]:
 
 
 FACTS = """() => ({
-  scroll: document.documentElement.scrollWidth - document.documentElement.clientWidth,
+  scroll: Math.max(...[document.documentElement, ...document.querySelectorAll(".bd-article-container")]
+    .map((e) => e.scrollWidth - e.clientWidth)),
   levels: [...document.querySelectorAll("main h1, main h2, main h3, main h4")].map((h) => Number(h.tagName[1])),
   undescribed: [...document.images].filter((i) => !i.alt || /(^|[ /_])(plot|sphx|_images)[ _/]|\\.png$/i.test(i.alt))
     .map((i) => i.alt || i.src.split("/").pop()),

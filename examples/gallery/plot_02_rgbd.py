@@ -4,7 +4,7 @@ An RGB-D image to a cube and a point cloud
 
 Depth and colour, as an RGB-D camera gives them (here written from a built-in scene: put your own files in their
 place), become photon rates, photon rates become a cube of histograms, and the cube a depth map and a cloud of points
-that any viewer opens. The program prints ``6,669,611 counts; median depth error 4.4 mm.``
+that any viewer opens. The program prints ``6,667,088 counts; median depth error 4.3 mm.``
 """
 
 import imageio.v3 as imageio

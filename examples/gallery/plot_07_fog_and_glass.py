@@ -4,7 +4,7 @@ Fog and glass
 
 The same wall in clear air, behind a pane of glass, and in fog. A pane is a second return in every pixel; fog is light
 from everywhere before the wall, and less of it from the wall. In a pixel with dead time the early light hides the
-late. The program prints ``Counts of the wall: 76,806 in clear air, 7,553 in fog.``
+late. The program prints ``Counts of the wall: 76,903 in clear air, 7,358 in fog.``
 """
 
 import matplotlib.pyplot as plt

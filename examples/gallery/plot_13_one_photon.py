@@ -3,9 +3,9 @@ One photon a pixel
 ==================
 
 A room of which each pixel registers one photon of the laser on average, and one of the background, in the whole
-exposure. Alone, half of the pixels have no depth, or that of a background photon. Method ``image`` takes the pixels
-around into account, and says how sure it is: pixels whose depth may be that of another surface have no interval.
-The program prints ``Off by more than 3 sigma: 55% of the pixels alone, 2% of the image.``
+exposure. Alone, half of the pixels have no depth, or that of a background photon. Method ``image`` takes the
+pixels around into account, and says how sure it is: pixels whose depth may be that of another surface have no
+interval. The program prints ``Wrong depths: 55% alone, 1.7% by the image.``
 """
 
 import matplotlib.pyplot as plt
@@ -18,16 +18,18 @@ system = ml.System(period_ns=100.0, cycles=1000, bins=1000, pulse=pulse, detecto
 room = ml.Scene.example("room", size=(96, 128))
 cube = ml.simulate(room.flux(system, signal=1 / system.cycles, sbr=1.0), system)[0]
 alone, image = ml.reconstruct(cube, system), ml.reconstruct(cube, system, method="image")
-off = [float(np.mean(~(np.abs(found.depth_m - room.depth_m) < 0.27))) for found in (alone, image)]  # 3 sigma, m
 
 fig, axes = plt.subplots(2, 2, figsize=(7.4, 4.6), layout="constrained")
 shown = {"truth": room.depth_m, "each pixel alone": alone.depth_m, "image": image.depth_m}
+shares = {}
 for ax, (title, depth) in zip(axes.flat, shown.items(), strict=False):
     picture = ax.imshow(depth, vmin=2.0, vmax=9.0)
-    ax.set(title=title, xticks=[], yticks=[])
+    off = ~(np.abs(depth - room.depth_m) < 0.27)  # three standard deviations of the pulse
+    shares[title] = off.mean()
+    ax.set(title=f"{title}: {off.mean():.1%} off", xticks=[], yticks=[])
 fig.colorbar(picture, ax=axes[:, 0], label="depth (m)", location="left")
 width = axes[1, 1].imshow(1000 * image.depth_half_width_m, cmap="magma", vmax=150)
 axes[1, 1].set(title="half of the 90 % interval (mm)", xticks=[], yticks=[])
 fig.colorbar(width, ax=axes[:, 1])
 plt.show()
-print(f"Off by more than 3 sigma: {off[0]:.0%} of the pixels alone, {off[1]:.0%} of the image.")
+print(f"Wrong depths: {shares['each pixel alone']:.0%} alone, {shares['image']:.1%} by the image.")

@@ -76,7 +76,7 @@ print(f"Photons between 31 and 70 ns: the counts lose {lost:.0%}, the correction
 
 # %%
 # The last line printed is
-# ``Photons between 31 and 70 ns: the counts lose 82%, the correction is off by +0.3%.``
+# ``Photons between 31 and 70 ns: the counts lose 82%, the correction is off by -1.8%.``
 #
 # A *free-running* detector is not armed by the laser: its dead time reaches over from one period to the next, and
 # both formulas fail. What replaces them is in :doc:`lesson_3_dead_time`. Theory: :doc:`/theory_exposure`. How-to:

@@ -76,7 +76,7 @@ once, twice = (np.nanmean(np.abs(pull) < within) for within in (1, 2))
 print(f"{once:.0%} of all depths are within one standard error, {twice:.0%} within two.")
 
 # %%
-# The last line printed is ``68% of all depths are within one standard error, 96% within two.``
+# The last line printed is ``69% of all depths are within one standard error, 95% within two.``
 #
 # That was the path. From here: :doc:`/howto` by what you have and want, :doc:`/gallery/index` for pictures of much
 # else, :doc:`/explanation` for the derivations.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mars_lidar._base.types import FloatArray
+from mars_lidar._base.types import FloatArray, IndexArray
 from mars_lidar.calibrate.model import Model
 from mars_lidar.calibrate.recording import Recording
 
@@ -83,9 +83,9 @@ class Cells:
 
     def __call__(self, t: FloatArray) -> FloatArray:
         """Counts (size,) of one stretch of recorded times (n,)."""
-        x = t * (1.0 / self.period) + _SHIFT / _PHASES
+        x: FloatArray = t * (1.0 / self.period) + _SHIFT / _PHASES
         x -= np.floor(x)
-        at = np.floor(x * _PHASES).astype(np.intp)
+        at: IndexArray = np.floor(x * _PHASES).astype(np.intp)
         gap = np.searchsorted(self.gap_edges, np.diff(t))
         phases = np.bincount(self.phase_of[at], minlength=self.phases)
         gaps = np.bincount(gap, minlength=self.gap_edges.size + 1)

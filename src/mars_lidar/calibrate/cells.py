@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mars_lidar._base.types import FloatArray, IndexArray
 from mars_lidar.calibrate.model import Model
@@ -33,8 +34,8 @@ class Cells:
         inside = np.zeros(_PHASES, bool)
         for low, high in lit:
             inside |= (centre - low) % 1.0 < (high - low) % 1.0
-        self.class_of = (2 * np.searchsorted(coarse, centre)).astype(np.int32)
-        self.lit_of = inside.astype(np.int32)
+        self.class_of: NDArray[np.int32] = (2 * np.searchsorted(coarse, centre)).astype(np.int32)
+        self.lit_of: NDArray[np.int32] = inside.astype(np.int32)
         self.kinds, self.phases = 2 * (coarse.size + 1), edges.size + 1
         ratio = gaps.size / max(photons, 1.0)
         fine = max(0.7, 2.0 / ratio) * 1.5 ** np.arange(60)

@@ -45,7 +45,7 @@ class Cells:
         self.gap_edges = np.union1d(self._between(place, unit), ages)
         self.gap_edges = self.gap_edges[self.gap_edges > 0.0]
         ages = ages[ages > 0.0]
-        self.age_of = np.searchsorted(ages, np.r_[self.gap_edges, np.inf]).astype(np.int32)
+        self.age_of: NDArray[np.int32] = np.searchsorted(ages, np.r_[self.gap_edges, np.inf]).astype(np.int32)
         self.ages = ages.size + 1
         self.size = self.phases + self.gap_edges.size + 1 + self.ages * self.kinds
 

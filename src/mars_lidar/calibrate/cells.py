@@ -29,7 +29,7 @@ class Cells:
         phases = np.concatenate([t / period - np.floor(t / period) for t in pilot])
         edges, lit = self._layout(model, theta, phases)
         centre = (np.arange(_PHASES) + 0.5) / _PHASES
-        self.phase_of = np.searchsorted(edges, centre)
+        self.phase_of: IndexArray = np.searchsorted(edges, centre)
         coarse = np.unique(np.concatenate([np.linspace(0.0, 1.0, 6)[1:-1], lit.ravel()]))
         inside = np.zeros(_PHASES, bool)
         for low, high in lit:
@@ -45,7 +45,7 @@ class Cells:
         self.gap_edges = np.union1d(self._between(place, unit), ages)
         self.gap_edges = self.gap_edges[self.gap_edges > 0.0]
         ages = ages[ages > 0.0]
-        self.age_of: NDArray[np.int32] = np.searchsorted(ages, np.r_[self.gap_edges, np.inf]).astype(np.int32)
+        self.age_of: NDArray[np.int32] = np.searchsorted(ages, np.append(self.gap_edges, np.inf)).astype(np.int32)
         self.ages = ages.size + 1
         self.size = self.phases + self.gap_edges.size + 1 + self.ages * self.kinds
 
@@ -87,7 +87,7 @@ class Cells:
         x: FloatArray = t * (1.0 / self.period) + _SHIFT / _PHASES
         x -= np.floor(x)
         at: IndexArray = np.floor(x * _PHASES).astype(np.intp)
-        gap = np.searchsorted(self.gap_edges, np.diff(t))
+        gap: IndexArray = np.searchsorted(self.gap_edges, np.diff(t))
         phases = np.bincount(self.phase_of[at], minlength=self.phases)
         gaps = np.bincount(gap, minlength=self.gap_edges.size + 1)
         cell = self.age_of[gap] * self.kinds + self.class_of[at[:-1]] + self.lit_of[at[1:]]

@@ -1,6 +1,6 @@
 """Package version, the same as in pyproject.toml (a test compares them)."""
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 
 
 def other_version(made_by: object) -> str:

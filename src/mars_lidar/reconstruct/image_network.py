@@ -61,7 +61,7 @@ def offsets() -> tuple[NDArray[np.int32], NDArray[np.int32]]:
 
 
 def weigh(features: Floats, weights: dict[str, Floats], threads: int) -> Floats:
-    """Outputs (2 planes + 4, H, W) of the second network for features (channels, H, W): see `image_stages.combined`."""
+    """Outputs (2 planes + 4, H, W) of the second network for features (channels, H, W): see `image_stages`."""
     f = _convolved(features, weights, "enter", False, threads)
     f = f + _convolved(f, weights, "first", True, threads)
     f = f + _convolved(f, weights, "second", True, threads)

@@ -102,7 +102,7 @@ def test_the_gallery_is_short():
         tree = ast.parse(path.read_text(encoding="utf-8"))
         body = path.read_text(encoding="utf-8").splitlines()[tree.body[0].end_lineno :]
         lines = [line for line in body if line.strip() and not line.lstrip().startswith("#")]
-        assert len(lines) <= 25, path.name
+        assert len(lines) <= 32, path.name
 
 
 def test_the_site_has_every_public_name():

@@ -92,7 +92,7 @@ def test_progress_true_is_a_bar_and_a_log_gets_a_line_every_half_minute(monkeypa
     assert np.array_equal(ml.simulate(flux, SYSTEM, progress=True), ml.simulate(flux, SYSTEM, progress=False))
     assert len(ml.simulate_timestamps(flux, SYSTEM, progress=True)) > 0
     assert capsys.readouterr().err == ""  # too short to speak of
-    with pytest.raises(TypeError, match="or True, got 5"):
+    with pytest.raises(TypeError, match="progress must be a callable or a bool, got 5"):
         ml.simulate(flux, SYSTEM, progress=5)  # type: ignore[arg-type]
     now = [0.0]
     monkeypatch.setattr(bars.time, "monotonic", lambda: now[0])

@@ -85,7 +85,10 @@ def _quoted() -> list[tuple[str, str]]:
     texts = [
         (f"{path.relative_to(ROOT)}:{line}", text) for path, tree in _modules() for line, text in _docstrings(tree)
     ]
+    generated = ("docs/api/", "docs/copied/", "docs/gallery/", "docs/lessons/", "docs/katex/node_modules/")
     for page in sorted(ROOT.glob("docs/**/*.md")):
+        if page.relative_to(ROOT).as_posix().startswith(generated):
+            continue
         text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
         texts.append((str(page.relative_to(ROOT)), text))
     return [(place, quoted) for place, text in texts for quoted in re.findall(r"`([^`\n]+)`", text)]

@@ -260,10 +260,6 @@ CALLS: dict[str, Callable[[Path], tuple[Callable[..., Any], dict[str, Any]]]] = 
         reconstruction.window_error,
         {"weights": np.ones(16), "signal": 0.5, "background": 0.1, "system": SYSTEM, "delay_ns": 40.0},
     ),
-    "calibrate.calibration_bound": lambda _: (
-        calibrate.calibration_bound,
-        {"signal": 0.05, "background": 0.02, "system": SYSTEM, "delay_ns": 40.0},
-    ),
     "plot.count_maps": lambda at: (plot.count_maps, {"cube": io.load(at / "cube.zarr")}),
     "plot.depth_error_m": lambda at: (
         plot.depth_error_m,
@@ -336,6 +332,7 @@ ACCEPTED: dict[tuple[str, str, str], str] = {
     ("cramer_rao", "*", "shape"): "of an image of any shape",
     ("count_law", "*", "shape"): "of an image of any shape",
     ("registration_pdf", "*", "shape"): "of an image of any shape",
+    ("calibrate", "given", "system"): "a system is what is known of the instrument",
     ("*", "report", "dict"): "a dictionary is what it should be",
     ("*", "info", "dict"): "a dictionary is what it should be",
     ("io.Recipe", "options", "dict"): "a dictionary is what it should be",

@@ -93,5 +93,5 @@ def test_errors_name_file_and_cure(tmp_path):
         ml.Timestamps.load(path, unit_ns=1.0, period_ns=100.0)
     for name in ("lab.ptu", "lab.h5"):
         (tmp_path / name).write_bytes(b"")
-        with pytest.raises(ValueError, match=r"unit_ns and variable are for \.mat and \.npz"):
+        with pytest.raises(ValueError, match=r"unit_ns and variable are for \.mat, \.npz and text"):
             ml.Timestamps.load(tmp_path / name, unit_ns=1.0)

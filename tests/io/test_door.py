@@ -105,7 +105,7 @@ def test_claims_are_checked_before_memory_is_asked_for(tmp_path, monkeypatch):
     for name in ("depth.png", "depth.npz", "photons.h5", "system.yaml", "recipe.yaml"):
         with pytest.raises(FileError, match=name):
             READERS[name](tmp_path / name)
-    with pytest.raises(FileError, match=r"light\.h5: transient would take"):
+    with pytest.raises(FileError, match=r"light\.h5: transient would "):
         io.read_transient(tmp_path / "light.h5")
     np.savez_compressed(tmp_path / "zeros.npz", depth=np.ones((600, 600)))
     monkeypatch.setenv(LIMIT, "0.001")

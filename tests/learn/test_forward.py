@@ -255,7 +255,7 @@ def test_batches_types_and_bad_arguments():
     alone = expected_histogram(maps[0][1, 2, 3], maps[1][3], maps[2], one)
     torch.testing.assert_close(found[1, 2, 3], alone)
     assert armed_periods(found, one).shape == found.shape
-    with pytest.raises(TypeError, match="signal must be a tensor"):
+    with pytest.raises(TypeError, match="signal must be a Tensor"):
         expected_histogram(1.0, *maps[1:], one)
     with pytest.raises(ValueError, match="must be >= 0"):
         expected_histogram(-maps[0], *maps[1:], one)

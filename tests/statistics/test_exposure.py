@@ -272,7 +272,7 @@ def test_convergence_errors_name_the_cell(monkeypatch):
         ({"waveform": [1.0]}, ValueError, "waveform replaces signal"),
         ({"signal": None, "waveform": [1.0, -1.0]}, ValueError, "waveform must lie.*-1"),
         ({"signal": None, "waveform": 1.0}, ValueError, r"waveform must be \(\.\.\., T\)"),
-        ({"system": 3}, TypeError, "system must be a System, got int"),
+        ({"system": 3}, TypeError, "system must be a System, got 3 int"),
         ({"tolerance": 0.0}, ValueError, r"tolerance must be .*\[1e-09, 0.1\].*0"),
         ({"threads": 0}, ValueError, r"threads must be an integer in \[1, 1024\], got 0"),
     ],

@@ -21,6 +21,7 @@ from mars_lidar.light.flux import Flux
 from mars_lidar.simulate import simulate_timestamps
 
 _NARROWEST = 2e-6  # periods: the narrowest pulse that the engines draw
+_WIDEST = 0.3  # sigma of a recorded pulse, periods: a wider one is hardly told from background
 _WIDEST_JITTER = 0.0499  # periods: the widest that `Jitter` takes
 _DELAYS = (0.4, 0.8, 1.6, 3.2, 6.4)  # dead times: delays of afterpulses that are tried
 _MOST_CARRIERS = 0.95  # of an avalanche
@@ -160,7 +161,8 @@ class Model:
         out[..., 0] = np.maximum(out[..., 0], 1e-7)
         for r in range(self.returns):
             out[..., 1 + 2 * r] = np.maximum(out[..., 1 + 2 * r], 0.0)
-        out[..., k] = np.maximum(out[..., k], (_NARROWEST * self.clock.period_ns) ** 2)
+        widths = np.array([_NARROWEST, _WIDEST]) * self.clock.period_ns
+        out[..., k] = np.clip(out[..., k], *(widths**2))
         most = np.full_like(out[..., k], (_WIDEST_JITTER * self.clock.period_ns) ** 2)
         if self.gaussian:
             most = np.minimum(most, out[..., k])

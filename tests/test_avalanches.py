@@ -96,6 +96,7 @@ CASES = [
 ]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("made", CASES, ids=lambda made: made.name)
 def test_exact_against_sequential(made: Case):
     """The intervals of twilight pulses are all t_d, which the exact engine's phases resolve to 6e-8 of a period."""
@@ -116,6 +117,7 @@ def against(found: np.ndarray, expected: float, about: str) -> None:
     require({"mean": float(2 * stats.norm.sf(abs(z)))}, about)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("engine", BOTH)
 def test_without_a_dead_time_it_is_a_hawkes_process(engine: str):
     """Its rate solves r = lambda + p f * r: in each harmonic of the period r_k = lambda_k / (1 - p F_k)."""

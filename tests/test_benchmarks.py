@@ -75,6 +75,7 @@ def report():
     return command.run(TINY, IN_PROCESS)
 
 
+@pytest.mark.full
 def test_every_section_has_a_whole_table(report):
     assert len(report.sections) == len(IN_PROCESS)
     for name, section in zip(IN_PROCESS, report.sections, strict=True):
@@ -102,6 +103,7 @@ def test_goals_stand_beside_measured_values(report):
         assert report.machine[key]
 
 
+@pytest.mark.full
 def test_command_saves_markdown_and_json(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(command, "QUICK", TINY)
     command.main(["--quick", "--only", "exact", "--only", "numpy", "--out", str(tmp_path)])
@@ -118,6 +120,7 @@ def test_unknown_section_is_refused(capsys):
     assert "nonsense" in capsys.readouterr().err
 
 
+@pytest.mark.full
 def test_imports_are_timed_in_a_fresh_interpreter():
     section = command.run(TINY, ("import",)).sections[0]
     assert [row["case"] for row in section.rows] == ["import numpy", "import mars_lidar"]
@@ -138,6 +141,7 @@ def test_numpy_loop_agrees_with_the_exact_engine():
     assert abs(int(total) - load.registrations) < 5 * np.sqrt(2 * load.registrations)
 
 
+@pytest.mark.full
 def test_turns_are_paired_and_counted():
     calls = []
     cases = {"a": lambda: calls.append("a"), "b": lambda: calls.append("b")}
@@ -184,6 +188,7 @@ def test_goals_are_computed():
     assert Section("Empty").markdown() == "## Empty"
 
 
+@pytest.mark.full
 def test_stream_is_measured_beside_the_engine():
     section = command.run(TINY, ("stream",)).sections[0]
     workers = [row["workers"] for row in section.rows]
@@ -192,6 +197,7 @@ def test_stream_is_measured_beside_the_engine():
     assert [row["of the engine's rate, CPU"] for row in section.rows if row["case"] == "bare engine"] == [1.0, 1.0]
 
 
+@pytest.mark.full
 def test_forward_models_are_measured_with_their_gradients():
     section = command.run(TINY, ("forward",)).sections[0]
     assert {row["bins"] for row in section.rows} == {64}
@@ -201,6 +207,7 @@ def test_forward_models_are_measured_with_their_gradients():
         assert (both is None) == (row["case"] == "mean_histogram")
 
 
+@pytest.mark.full
 def test_estimators_are_timed():
     reconstruction, calibration = command.run(TINY, ("reconstruction", "calibration")).sections
     assert {row["method"] for row in reconstruction.rows} >= {"maximum_likelihood", "mchc", "coates", "matched_filter"}

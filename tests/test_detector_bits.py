@@ -83,6 +83,7 @@ def scene(mode: str, kind: str) -> tuple[ml.Flux, ml.System]:
     return flux, system.replace(detector=ml.Detector(dead_time_ns=dead, **DETECTORS[mode]))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("mode", "kind"), KINDS)
 def test_golden_bits_and_levels(mode: str, kind: str):
     """The committed bits, from every vector level, in histograms and timestamps."""
@@ -245,6 +246,7 @@ def test_most_registrations_of_a_synchronous_bin(dead: float, cycles: int, most:
     assert view.replace(cycles=65_535).histogram_dtype == np.uint16
 
 
+@pytest.mark.full
 def test_command_line(tmp_path):
     def run(*arguments: object):
         return CliRunner().invoke(app, [str(a) for a in arguments])

@@ -102,6 +102,7 @@ _CASES = random_cases(32, seed=31, photons=8e5, least=1000, most=4000)
 RANDOM = [modes_of(case, k, _RANDOM) for k, case in enumerate(_CASES)]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("case", RANDOM, ids=lambda case: case.name)
 def test_random_system(case: Case):
     check(ENGINES["exact"], case, ENGINES["sequential"], EVERYTHING)
@@ -116,6 +117,7 @@ def test_armed_at_the_middle_of_the_pulse(mode: str):
     check(ENGINES["exact"], case, ENGINES["sequential"], EVERYTHING)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("mode", MODES[1:])
 @pytest.mark.parametrize(
     ("signal", "dead", "cycles", "start"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 
+import pytest
 from harness import require
 from scipy import stats
 
@@ -12,6 +13,7 @@ from studies.common.report import MAX_FIGURE_BYTES
 from studies.detectors import run as detectors
 
 
+@pytest.mark.full
 def test_quick(tmp_path):
     assert main(["detectors", "--quick", "--out", str(tmp_path)]) == 0
     with (tmp_path / "detectors.csv").open() as file:

@@ -93,6 +93,7 @@ NARROW = {
 }
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("engine", ["feedback", "auto"])
 @pytest.mark.parametrize("name", LOCKED)
 def test_locked(name: str, engine: str) -> None:
@@ -176,6 +177,7 @@ def _tail_counts(pulse: ml.Pulse, signal: float, edges: list[tuple[float, float]
     return [int(((off >= low) & (off < high)).sum()) for low, high in edges]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("signal", [0.01, 0.06, 0.23])
 def test_dim_tails(signal: float) -> None:
     """Photons beyond 4.5 to 6 sigma of a dim Gaussian pulse: as many as belong there."""
@@ -196,6 +198,7 @@ def test_dim_tails(signal: float) -> None:
     require(outcomes, f"dim tails, S {signal:g}")
 
 
+@pytest.mark.full
 def test_a_dim_pre_pulse() -> None:
     """A sampled pre-pulse of a millionth of the energy holds its share of the photons, and no more."""
     values = np.where(np.arange(200) < 80, 0.0, np.exp(-0.05 * (np.arange(200) - 80.0)))
@@ -219,6 +222,7 @@ def test_first_phases_lie_on_no_lattice(background: float) -> None:
     require({"even": stats.chisquare(seen).pvalue}, f"lattice of phases, B {background:g}")
 
 
+@pytest.mark.full
 def test_a_narrow_gate_in_dim_light() -> None:
     """A gate of 1e-5 period opens for its share of the photons."""
     detector = ml.Detector(
@@ -245,6 +249,7 @@ LAWS: dict[str, tuple[float, float, float, float, int, int, str]] = {
 }
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", LAWS)
 @pytest.mark.parametrize("prediction", ["count_law", "pmf", "mean_histogram", "stationary", "joint_law"])
 def test_laws_answer_or_say_what_to_use(name: str, prediction: str) -> None:
@@ -310,6 +315,7 @@ def test_bound_of_two_bins() -> None:
             assert error > 0.0
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("mode", "start", "dead", "more"),
     [

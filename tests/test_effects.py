@@ -178,6 +178,7 @@ def test_jitter_has_its_law_and_moves_nothing_else(engine: str, jitter: Jitter |
     require({"jitter": p, "independence": pairs, "independence of sizes": sizes}, f"{engine}, {jitter}")
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("effects", "mode"),
     [

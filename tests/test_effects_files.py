@@ -229,6 +229,7 @@ def test_command_line(tmp_path):
         assert text in told
 
 
+@pytest.mark.full
 def test_pictures(tmp_path):
     """With what has a predicted mean, and with what has none."""
     both = ("--jitter-fwhm-ns", 2.0, "--electronics-dead-time-ns", 90), ("--max-events-per-period", 1)

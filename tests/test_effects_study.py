@@ -11,6 +11,7 @@ from studies.__main__ import main
 from studies.detectors import effects
 
 
+@pytest.mark.full
 def test_quick_study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """A few of its rows; the law of the electronics takes a minute."""
     few = [shown for shown in effects.SHOWN if shown.figure in ("", "afterpulsing", "crosstalk", "jitter")]

@@ -106,6 +106,7 @@ def test_every_engine_is_tested():
 # An independent simulator
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", REFERENCE_NAMES)
 @pytest.mark.parametrize("engine", WITH_DEAD_TIME)
 def test_reference(engine: str, name: str):
@@ -120,6 +121,7 @@ def test_reference(engine: str, name: str):
 JOINT_ENGINES = [name for name in WITH_DEAD_TIME if JOINT in CLAIMS[name]]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", REFERENCE_NAMES)
 @pytest.mark.parametrize("engine", JOINT_ENGINES)
 def test_reference_system_has_the_joint_law(engine: str, name: str):
@@ -127,6 +129,7 @@ def test_reference_system_has_the_joint_law(engine: str, name: str):
     check(ENGINES[engine], case, JointLaw.of(case), CLAIMS[engine] - {INTERVALS}, seed=2)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("case", RANDOM[::2], ids=lambda case: case.name)
 @pytest.mark.parametrize("engine", JOINT_ENGINES)
 def test_random_system_has_the_joint_law(engine: str, case: Case):
@@ -150,6 +153,7 @@ SOURCES = {
 }
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("source", SOURCES)
 @pytest.mark.parametrize("engine", ANY_SYSTEM)
 def test_without_dead_time_everything_is_poisson(engine: str, source: str):
@@ -166,6 +170,7 @@ def test_the_law_of_the_arrivals_ignores_the_dead_time(engine: str, dead: float)
     check(ENGINES[engine], case, poisson_law(case), CLAIMS[engine])
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("start", ["armed", "stationary"])
 @pytest.mark.parametrize(
     ("rate", "dead", "cycles"),
@@ -187,6 +192,7 @@ def test_constant_rate(engine: str, rate: float, dead: float, cycles: int, start
     check(ENGINES[engine], case, Law(flat, pmf(rate, dead, cycles, most), moments), CLAIMS[engine])
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("signal", "background", "periods"), [(1.0, 0.2, 1), (5.0, 0.2, 3), (8.0, 0.02, 50), (0.1, 0, 2)]
 )
@@ -200,6 +206,7 @@ def test_dead_time_of_whole_periods_does_not_distort(engine: str, signal: float,
     check(ENGINES[engine], case, law, CLAIMS[engine])
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("start", ["armed", "stationary"])
 @pytest.mark.parametrize("engine", WITH_DEAD_TIME)
 def test_one_registration_at_most(engine: str, start: str):
@@ -247,6 +254,7 @@ def test_a_whole_period_of_dead_time_leaves_the_stationary_shape(engine: str, si
 # The sequential engine
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("case", RANDOM, ids=lambda case: case.name)
 @pytest.mark.parametrize("engine", sorted(set(WITH_DEAD_TIME) - {TRUTH}))
 def test_random_system(engine: str, case: Case):
@@ -260,6 +268,7 @@ def test_random_system_without_dead_time(engine: str, case: Case):
     check(ENGINES[engine], case, ENGINES[TRUTH], CLAIMS[engine])
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", ["face_free_8ps", "face_free_unimodal_8ps"])
 @pytest.mark.parametrize(("origin", "start"), [("peak", "armed"), ("centroid", "stationary"), ("first", "armed")])
 @pytest.mark.parametrize("engine", sorted(set(WITH_DEAD_TIME) - {TRUTH}))
@@ -269,6 +278,7 @@ def test_measured_pulse(engine: str, name: str, origin: str, start: str):
     check(ENGINES[engine], case, ENGINES[TRUTH], CLAIMS[engine])
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("signal", "dead", "cycles"),
     [

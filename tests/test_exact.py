@@ -36,6 +36,7 @@ def dead(periods: float) -> ml.Detector:
     return ml.Detector(dead_time_ns=100.0 * periods)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("counter", "key", "rounds", "expected"),
     [
@@ -136,6 +137,7 @@ def test_count_law_at_extreme_dead_times(rate: float, t_d: float):
     require({"count law": counts_against_law(counts, law)}, f"rate {rate:g}, dead time {t_d:g}")
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("t_d", [0.0, 0.1, 0.6375, 3.0])
 def test_a_thousand_photons_per_period(t_d: float):
     """Such a signal registers at -3 sigma and earlier, such a background within a thousandth of a period."""

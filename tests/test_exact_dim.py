@@ -75,6 +75,7 @@ def tails(hist: NDArray[np.int64], law: NDArray[np.float64], pulses: float, dela
 
 
 # photons of a pulse, and pixels and cycles for some 1e8 registrations, the dimmest 2e6
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("signal", "pixels", "cycles"),
     [
@@ -116,6 +117,7 @@ STARTS = [(mode, "armed") for mode in MODES] + [
 ]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("mode", "start"), STARTS)
 def test_tails_in_every_mode(mode: str, start: str):
     view = system(detector=ml.Detector(dead_time_ns=40.0, **MODES[mode]), start=start)
@@ -124,6 +126,7 @@ def test_tails_in_every_mode(mode: str, start: str):
     require(tails(hist, law, 20 * view.cycles), f"tails, {mode}, {start}")
 
 
+@pytest.mark.full
 def test_tails_of_several_returns():
     """Each of three, a dead time of 20 ns apart: 5e7 registrations of the first and of the second, 2e7 of the third."""
     view = system(detector=ml.Detector(dead_time_ns=12.0))
@@ -167,6 +170,7 @@ def test_armed_in_the_late_tail(signal: float, part: float):
     )
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("signal", [0.01, 1.0])
 def test_faint_parts_of_a_sampled_pulse(signal: float):
     """A pre-pulse of 1e-6 of the energy, one of 1e-7 and an after-pulse of 1e-6; before, 510 for 128 in the first."""
@@ -202,6 +206,7 @@ def test_pulse_of_one_sample():
     require({"bins": goodness(hist, 64 * view.cycles * law + 1e-9, fixed_total=False)}, "one sample")
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("background", [1e-5, 0.01, 0.02, 0.6])
 def test_first_phases_have_no_lattice(background: float):
     """First photons over 30,000 bins; before, 40 % of those at B = 0.01 were multiples of 2^-17 of a period."""
@@ -214,6 +219,7 @@ def test_first_phases_have_no_lattice(background: float):
     require({"phases": goodness(hist, hist.sum() * law)}, f"first phases, B = {background:g}")
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("width", "background", "pixels", "cycles"),
     [
@@ -236,6 +242,7 @@ def test_short_gates(width: float, background: float, pixels: int, cycles: int):
     require({"count": float(2 * stats.norm.sf(error / np.sqrt(mean)))}, f"gate of {width:g}, B = {background:g}")
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("faint", "bright"), [(5, 20), (20, 40)])
 @pytest.mark.parametrize("photons", [2.0**-7, 0.01])
 def test_faint_parts_of_a_dim_waveform(photons: float, faint: int, bright: int):
@@ -251,6 +258,7 @@ def test_faint_parts_of_a_dim_waveform(photons: float, faint: int, bright: int):
     require(outcomes, f"waveform of {photons:g} photons, parts {faint} and {bright}")
 
 
+@pytest.mark.full
 def test_afterpulses_have_no_lattice():
     """Releases some 100 periods after avalanches at one place: smooth over 30,000 bins, in runs of 30 of them."""
     detector = ml.Detector(

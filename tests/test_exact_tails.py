@@ -88,6 +88,7 @@ def test_early_tail_is_the_first_arrival(name: str):
     require(outcomes, f"early tail, {name}")
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", ["gaussian", "sampled gaussian", "measured, two lobes"])
 def test_early_tail_agrees_with_the_sequential_engine(name: str):
     _, edge, view = early_tail(name)
@@ -123,6 +124,7 @@ def test_arming_inside_the_late_tail(depth: float, signal: float):
     )
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", ["gaussian", "measured, two lobes", "measured"])
 def test_re_arming_inside_the_late_tail(name: str):
     """A dead time a little over a period: what registers early re-arms where 0.3 % of the pulse are left."""

@@ -58,6 +58,7 @@ def test_reconstruct_from_a_bare_array(tmp_path: Path, counts: np.ndarray) -> No
     assert (tmp_path / "maps.png").exists()
 
 
+@pytest.mark.full
 def test_the_same_with_a_system_file_through_convert(tmp_path: Path, counts: np.ndarray) -> None:
     savemat(tmp_path / "face.mat", {"counts": counts, "other": np.zeros((8, 8, 200))})
     SYSTEM.save(tmp_path / "camera.yaml")

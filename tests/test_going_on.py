@@ -83,6 +83,7 @@ def test_a_cube_of_something_else_is_not_gone_on_with(tmp_path):
         io.simulate_to(tmp_path / "a.zarr", flux_of(), SYSTEM, resume=True, overwrite=True)
 
 
+@pytest.mark.full
 def test_the_command_resumes(tmp_path):
     given = ["simulate", "--scene", "room", "--size", 12, "--cycles", 40, "--bins", 64, "-o", tmp_path / "a.zarr"]
     assert run(*given, "--resume").exit_code == 0  # nothing there: from the start
@@ -97,6 +98,7 @@ def test_the_command_resumes(tmp_path):
     assert run(*given).exit_code == 2
 
 
+@pytest.mark.full
 def test_a_sample_of_a_dataset_is_a_cube_with_its_picture(tmp_path):
     recipe = {
         "scenes": {"example": "room", "size": 16, "seeds": [0, 1]},

@@ -153,6 +153,7 @@ def found(engine: Engine, case: Case, claims: Collection[str] = EVERYTHING) -> s
     return rejected(compare(engine, case, EXACT, claims))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("engine", "case", "claims", "expected"),
     [
@@ -223,6 +224,7 @@ def test_wrong_engine_is_found_by_the_reference(engine: Engine, name: str, expec
     assert expected <= rejected(compare(engine, reference.case(), reference, HISTOGRAMS))
 
 
+@pytest.mark.full
 def test_no_more_false_alarms_than_stated():
     """The exact engine against itself, 60 times: no comparison has small p-values too often."""
     case = replace(MID, items=1000, system=MID.system.replace(cycles=30, bins=32))

@@ -23,6 +23,7 @@ LIBRARIES = [
 ]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("library", "extra", "names", "commands"), LIBRARIES)
 def test_what_misses_a_library_names_its_extra(tmp_path, library, extra, names, commands):
     done = subprocess.run(

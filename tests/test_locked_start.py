@@ -13,6 +13,7 @@ from mars_lidar.statistics import count_law, exposure_moments
 GATE = {"mode": "gated", "gate_start_ns": 0.0, "gate_width_ns": PERIOD_NS}
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("detector", [{}, GATE], ids=["free running", "gated"])
 @pytest.mark.parametrize("dead", [0.9995, 2.0008])
 def test_a_locked_pixel_starts_as_the_statistics_say(dead: float, detector: dict[str, object]):
@@ -33,6 +34,7 @@ def test_a_locked_pixel_starts_as_the_statistics_say(dead: float, detector: dict
     check(ENGINES["exact"], case, Law(histogram, pmf), {COUNTS, SHAPE})
 
 
+@pytest.mark.full
 def test_the_sequential_engine_begins_in_any_phase_of_a_slow_drift():
     """A round of the phase through the pulse took 200 turns, but began within 64: half too large a variance."""
     pulse = ml.GaussianPulse(sigma_ns=0.01 * PERIOD_NS)

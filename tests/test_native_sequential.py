@@ -162,6 +162,7 @@ def armed_survival(n: np.ndarray, rate: float, dead: float, exposure: float) -> 
     return np.where(n == 0, 1.0, special.gammainc(np.maximum(n, 1), rate * left))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("stationary", [False, True])
 @pytest.mark.parametrize(
     ("rate", "dead", "cycles"), [(1.0, 0.6375, 100), (6.0, 2.3, 40), (0.05, 0.1, 200), (20.0, 7.9, 100)]
@@ -223,6 +224,7 @@ def test_dim_pixels_over_the_longest_exposure_have_no_lattice():
     assert np.unique(times).size == times.size
 
 
+@pytest.mark.full
 @pytest.mark.skipif(not CASES, reason="the reference cases are not here")
 @pytest.mark.parametrize("name", CASES or ["none"])
 def test_agrees_with_an_independent_simulator(name: str):

@@ -43,6 +43,7 @@ def objects(tmp_path_factory) -> dict[str, object]:
     }
 
 
+@pytest.mark.full
 def test_a_notebook_shows_text_and_a_small_picture(objects):
     without = {"several laws", "one pixel"}  # no map, no curve
     for name, shown in objects.items():
@@ -53,6 +54,7 @@ def test_a_notebook_shows_text_and_a_small_picture(objects):
         assert len(text) < 60_000, name
 
 
+@pytest.mark.full
 def test_the_tutorial_runs_and_is_the_notebook(monkeypatch):
     monkeypatch.syspath_prepend(str(EXAMPLES))
     import make_notebook

@@ -62,6 +62,7 @@ def objects(tmp_path_factory) -> dict[str, Any]:
     }
 
 
+@pytest.mark.full
 def test_every_object_shows_itself_in_a_few_lines(objects):
     for name, each in objects.items():
         text = repr(each)

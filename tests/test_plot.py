@@ -53,6 +53,7 @@ FLUXES = {
 }
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", FLUXES)
 def test_every_kind_of_cube_can_be_drawn(tmp_path, name):
     cube = cube_of(FLUXES[name])

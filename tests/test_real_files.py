@@ -147,6 +147,7 @@ def reflecting(path: Path, system: ml.System) -> np.ndarray:
     return surface
 
 
+@pytest.mark.full
 def test_an_internal_reflection_is_told_and_left_out(tmp_path, system):
     surface = reflecting(tmp_path / "cube.h5", system)
     cube = tmp_path / "cube.h5"
@@ -166,6 +167,7 @@ def test_a_plain_wall_is_no_reflection(tmp_path, system):
     assert "first returns" not in run("reconstruct", tmp_path / "wall.h5", "-o", tmp_path / "wall.npz")
 
 
+@pytest.mark.full
 def test_the_false_alarm_level(tmp_path, system):
     io.simulate_to(tmp_path / "dim.h5", ml.Flux(np.full((20, 20), 0.002), 0.02, 40.0), system.replace(cycles=1500))
     seen = {}

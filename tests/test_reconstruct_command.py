@@ -49,6 +49,7 @@ def test_reflectivity_is_right_behind_a_detection_efficiency(tmp_path):
     assert np.median(ratio) == pytest.approx(1.0, abs=0.02)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("suffix", [".zarr", ".h5", ".npz"])
 def test_maps_read_back(cube, tmp_path, suffix):
     out = tmp_path / f"maps{suffix}"
@@ -73,6 +74,7 @@ def test_maps_read_back(cube, tmp_path, suffix):
         assert opened.depth.attrs["units"] == "m"
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("suffix", [".zarr", ".h5", ".npz"])
 def test_several_returns_read_back(tmp_path, suffix):
     """A pane before a wall: table, maps with an axis of returns, and every return a point of the cloud."""
@@ -114,6 +116,7 @@ def test_several_returns_read_back(tmp_path, suffix):
     assert "returns=2 needs the likelihood" in refused.stderr
 
 
+@pytest.mark.full
 def test_an_image_of_a_dim_cube(tmp_path, monkeypatch):
     """Rows are read in parts, the image is reconstructed whole; its maps are those of the array."""
     dim = ("--size", 24, "--cycles", 300, "--bins", 256, "--signal", 0.005, "--realizations", 2, "--no-picture")
@@ -208,6 +211,7 @@ def test_errors_of_a_map():
     assert found.ssim < 0.99
 
 
+@pytest.mark.full
 def test_study(tmp_path):
     assert main(["reconstruction", "--quick", "--out", str(tmp_path)]) == 0
     with (tmp_path / "reconstruction.csv").open() as file:
@@ -223,6 +227,7 @@ def test_study(tmp_path):
         assert 5_000 < figure.stat().st_size <= MAX_FIGURE_BYTES
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", ["returns"])
 def test_study_of_returns(tmp_path, name):
     assert main([name, "--quick", "--out", str(tmp_path)]) == 0

@@ -118,6 +118,7 @@ ARMED = [
 ]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("engine", BOTH)
 @pytest.mark.parametrize("made", ARMED, ids=lambda made: made.name)
 def test_against_every_arrival(engine: str, made: Case):
@@ -154,6 +155,7 @@ TOGETHER = [
 ]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("made", TOGETHER, ids=lambda made: made.name)
 def test_exact_against_sequential(made: Case):
     """Intervals of twilight pulses are all t_d, which the exact engine's phases resolve to 6e-8 of a period."""
@@ -161,6 +163,7 @@ def test_exact_against_sequential(made: Case):
     check(ENGINES["exact"], made, ENGINES["sequential"], EVERYTHING - ({INTERVALS} if twilight else set()))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("engine", BOTH)
 @pytest.mark.parametrize(
     ("rate", "dead", "recovery"),
@@ -247,6 +250,7 @@ def test_no_recovery_is_none_and_a_short_one_nearly(kind: str):
     assert not np.array_equal(*plain_and(5.0, kind))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("engine", BOTH)
 def test_a_short_recovery_has_the_law_of_none(engine: str):
     """Of 1e-6 periods: with 30 photons a period it is missed by 3e-5 of them."""

@@ -134,6 +134,7 @@ def test_unknown_level_is_an_error():
         drawn(ExactEngine(level="mmx"), task("gaussian"))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("engine", ANY_SYSTEM)
 @pytest.mark.parametrize("kind", KINDS)
 def test_threads_do_not_matter(engine: str, kind: str):
@@ -143,6 +144,7 @@ def test_threads_do_not_matter(engine: str, kind: str):
         assert np.array_equal(one, ml.simulate(flux, system, engine=engine, realizations=4, seed=1, threads=threads))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("engine", ANY_SYSTEM)
 @pytest.mark.parametrize("kind", KINDS)
 def test_any_part_has_the_bits_of_the_whole(engine: str, kind: str):

@@ -95,6 +95,7 @@ def test_effects_reach_compare(tmp_path):
     assert "compare draws single pixels" in refused.stderr
 
 
+@pytest.mark.full
 def test_a_scene_file_of_a_transient_is_its_options(transient):
     (transient / "scene.yaml").write_text(
         "transient: t.npy\nbin_ns: 0.5\nstart_ns: 1\nchannel: 1\npulse: false\n"

@@ -113,6 +113,7 @@ def test_available_memory_is_that_of_the_machine():
 # Progress
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("engine", ["exact", "sequential", "poisson"])
 def test_progress_rises_to_the_total(system: ml.System, engine: str):
     """Long enough for several reports, every 50 ms."""
@@ -186,6 +187,7 @@ PIXEL = "ml.Flux(3.0, 3.0, 50.0)"
 WAVE = "ml.Flux(waveform=np.full((1, 1, 50), 0.1))"
 
 
+@pytest.mark.full
 @pytest.mark.skipif(sys.platform == "win32", reason="signals are sent another way there")
 @pytest.mark.parametrize(
     ("name", "fields"),

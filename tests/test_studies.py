@@ -36,6 +36,7 @@ def quick(tmp_path_factory):
     return out
 
 
+@pytest.mark.full
 def test_files(quick):
     found = {path.name for path in quick.iterdir()}
     assert {"covariance.md", "covariance.csv", "law.md", "law.csv"} <= found
@@ -68,6 +69,7 @@ def test_covariance_figures_make_sense(quick):
     assert "125.91" in text
 
 
+@pytest.mark.full
 def test_rules_of_the_covariance_sum():
     cells = covariance.compute(covariance.QUICK, "centre", str)
     errors = [covariance.mean_error(cells, covariance.cutoff_name(c)) for c in (0, 20, 500)]
@@ -239,6 +241,7 @@ def test_table():
     assert math.isclose(law._PER_SKEWNESS, 0.1258, abs_tol=1e-4)
 
 
+@pytest.mark.full
 def test_long_exposures_are_those_of_the_closed_form(tmp_path):
     assert main(["long-exposures", "--quick", "--out", str(tmp_path)]) == 0
     rows = [row for row in read_csv(tmp_path / "long_exposures.csv") if int(row["cells"])]

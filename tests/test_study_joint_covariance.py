@@ -19,6 +19,7 @@ def systems():
     return random_systems(QUICK, str)
 
 
+@pytest.mark.full
 def test_random_systems(systems):
     """One z from each system and kind: independent, standard normal."""
     for name, z in joint_covariance._scores(systems, QUICK).items():
@@ -27,6 +28,7 @@ def test_random_systems(systems):
     assert {o.law.settled >= 0 for o in systems} == {True, False}, "both routes"
 
 
+@pytest.mark.full
 def test_report(systems, tmp_path, monkeypatch):
     monkeypatch.setattr(joint_covariance, "random_systems", lambda *_: systems)
     assert main(["joint-covariance", "--quick", "--out", str(tmp_path)]) == 0

@@ -47,6 +47,7 @@ WAVES = {
 }
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("photons", [1e-6, 0.7, 1e3])
 @pytest.mark.parametrize("name", WAVES)
 def test_levels_agree_and_registrations_lie_where_there_is_light(name: str, photons: float):
@@ -92,6 +93,7 @@ def test_levels_agree_at_any_number_of_parts(parts: int):
     assert cubes[0].sum() > 2000
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("parts", [64, 1024, 140_001])
 def test_parts_have_their_energy_over_many_decades(parts: int):
     """First arrivals of armed periods, without re-arming: Coates 1968. In bins of the waveform's own order."""

@@ -417,6 +417,7 @@ def outcomes(name: str, here: Path) -> list[tuple[str, str, str]]:
     return found
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", CALLS)
 def test_wrong_arguments_are_refused_by_name(here, name):
     call, good = CALLS[name](here)
@@ -499,6 +500,7 @@ def command_outcomes(command: str, here: Path, seen: set[str]) -> Iterator[tuple
                 yield option, word, "refused" if ours and named else "unnamed", told
 
 
+@pytest.mark.full
 def test_wrong_options_are_refused_by_name(here):
     seen: set[str] = set()
     for command, make in COMMANDS.items():

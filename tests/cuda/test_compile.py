@@ -33,6 +33,7 @@ OTHERS = [Variant(mode, mode != 2, mode != 2, mode == 1, Sink.BLOCK16) for mode 
 SINKS = [Variant(0, True, False, False, sink) for sink in Sink if sink not in (Sink.BLOCK16, Sink.ROWS16)]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("architecture", "variants"), [("sm_80", BRIGHT[:2]), ("sm_90", [*BRIGHT, *OTHERS, *SINKS])])
 def test_compiles_without_spills(architecture: str, variants: list[Variant]):
     found = compiled([variant.kernel for variant in variants], architecture)
@@ -45,6 +46,7 @@ def test_compiles_without_spills(architecture: str, variants: list[Variant]):
             assert used.stack_bytes == 0, variant
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("architecture", "kernels"),
     [
@@ -59,6 +61,7 @@ def test_the_other_engines_compile_without_spills(architecture: str, kernels: li
         assert used.instructions > 500, kernel
 
 
+@pytest.mark.full
 def test_the_steps_of_the_estimate_compile():
     """What `benchmarks.gpu_resources` counts the instructions of, alone."""
     found = mars_steps()

@@ -78,6 +78,7 @@ STARTS = [
 ]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("pulse", "returns"), [("gaussian", 1), ("gaussian", 4), ("sampled", 1), ("sampled", 3)])
 @pytest.mark.parametrize(("mode", "start"), STARTS)
 def test_histograms_are_those_of_the_engine(mode: str, pulse: str, returns: int, start: str):

@@ -55,6 +55,7 @@ def both(flux: ml.Flux, system: ml.System, realizations: int = 3, warps: int = 2
     return {"wanted": wanted, "told": told, "rest": one.report["pixels given to exact"]}
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("start", ["armed", "stationary"])
 @pytest.mark.parametrize("dead_ns", [63.75, 163.75, 0.9])
 @pytest.mark.parametrize("pulse", [BASE.pulse, SAMPLED], ids=["gaussian", "sampled"])

@@ -62,6 +62,7 @@ def both(
     return {"wanted": wanted, "told": told, "report": two.report}
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("count", ["exact", "matched", "gaussian"])
 @pytest.mark.parametrize("name", list(SYSTEMS))
 def test_histograms_are_those_of_the_engine(name: str, count: Any):
@@ -81,6 +82,7 @@ def test_other_cycles_nearest_entries_and_both_ways_to_draw():
             np.testing.assert_array_equal(found["told"], found["wanted"])
 
 
+@pytest.mark.full
 def test_doubted_counts_are_evaluated():
     """Between entries, at other delays, and from the table's own laws."""
     locked = BASE.replace(detector=ml.Detector(dead_time_ns=163.75))

@@ -36,6 +36,7 @@ def cluster():
         yield started
 
 
+@pytest.mark.full
 def test_a_killed_worker_loses_nothing(tmp_path, recipe, cluster):
     ml.generate(recipe, tmp_path / "one.zarr")
     killed = []
@@ -99,6 +100,7 @@ def no_pauses(monkeypatch):
     monkeypatch.setattr("mars_lidar.dataset.write.time.sleep", lambda _: None)
 
 
+@pytest.mark.full
 def test_a_file_system_that_fails_for_a_moment_costs_nothing(tmp_path, recipe, monkeypatch, no_pauses):
     ml.generate(recipe, tmp_path / "one.zarr")
     real, draw, errors = write.write_shard, random.Random(1), []
@@ -115,6 +117,7 @@ def test_a_file_system_that_fails_for_a_moment_costs_nothing(tmp_path, recipe, m
     assert files(tmp_path / "one.zarr") == files(tmp_path / "two.zarr")
 
 
+@pytest.mark.full
 def test_a_part_that_cannot_be_written_is_named_and_the_others_are_there(tmp_path, recipe, monkeypatch, no_pauses):
     ml.generate(recipe, tmp_path / "one.zarr")
     real, bad = write.write_shard, []
@@ -138,6 +141,7 @@ def test_a_part_that_cannot_be_written_is_named_and_the_others_are_there(tmp_pat
     assert files(tmp_path / "one.zarr") == files(tmp_path / "two.zarr")
 
 
+@pytest.mark.full
 def test_workers_of_this_machine(tmp_path, recipe):
     ml.generate(recipe, tmp_path / "one.zarr")
     ml.generate(recipe, tmp_path / "two.zarr", workers=1)
@@ -157,6 +161,7 @@ def test_without_the_library(tmp_path, recipe, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.full
 def test_a_scheduler_that_is_lost_is_told_and_the_run_goes_on_afterwards(tmp_path, recipe):
     place = tmp_path / "scheduler.json"
     dask = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--no-dashboard", "--scheduler-file", str(place)]

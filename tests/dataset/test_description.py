@@ -28,6 +28,7 @@ def run(*arguments: object):
     return CliRunner().invoke(app, [str(a) for a in arguments])
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("before", [{}, {"fog": FOG}, {"pane": PANE}, {"fog": FOG, "pane": PANE}])
 def test_a_scene_means_the_same_in_a_recipe_a_scene_file_and_python(tmp_path, before):
     scene = {"example": "room", "size": 8, "seed": 2, **before}

@@ -21,6 +21,7 @@ from mars_lidar.dataset import DatasetRecipe, estimate, open_dataset, read_spars
 from mars_lidar.dataset.arrays import with_zeros
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("layout", ["sparse", "dense"])
 def test_every_sample_is_what_simulate_makes(tmp_path, recipe, layout):
     recipe["store"]["layout"] = layout
@@ -54,6 +55,7 @@ def test_every_sample_is_what_simulate_makes(tmp_path, recipe, layout):
     assert verify(tmp_path / "set.zarr", chunks=None).good
 
 
+@pytest.mark.full
 def test_chunks_of_part_of_a_row_and_wide_counts(tmp_path, recipe):
     recipe["store"] = {"chunk_mib": 0.001, "shard_mib": 0.002}
     busy = SYSTEM.replace(cycles=100_000, detector=ml.Detector(dead_time_ns=0.0))
@@ -70,6 +72,7 @@ def test_chunks_of_part_of_a_row_and_wide_counts(tmp_path, recipe):
         )
 
 
+@pytest.mark.full
 def test_a_sample_keeps_its_seed_whatever_else_is_made(tmp_path, recipe):
     ml.generate(recipe, tmp_path / "all.zarr")
     recipe["scenes"][0]["seeds"] = [3]
@@ -80,6 +83,7 @@ def test_a_sample_keeps_its_seed_whatever_else_is_made(tmp_path, recipe):
     np.testing.assert_array_equal(few.histogram[1], every.histogram[7])
 
 
+@pytest.mark.full
 def test_the_store_does_not_depend_on_threads(tmp_path, recipe):
     for threads in (1, 3):
         ml.generate(recipe, tmp_path / f"{threads}.zarr", threads=threads)
@@ -122,6 +126,7 @@ def test_bad_files_are_told_and_left_out(tmp_path, recipe):
     assert not (tmp_path / "other.zarr").exists()
 
 
+@pytest.mark.full
 def test_crops_have_returns_and_do_not_depend_on_the_other_scenes(tmp_path, recipe):
     depth = np.full((30, 30), np.nan)
     depth[10:20, 10:20] = 2.0
@@ -140,6 +145,7 @@ def test_crops_have_returns_and_do_not_depend_on_the_other_scenes(tmp_path, reci
     np.testing.assert_array_equal(open_dataset(tmp_path / "less.zarr").scene(4).depth_m, stored.scene(7).depth_m)
 
 
+@pytest.mark.full
 def test_damage_is_found(tmp_path, recipe):
     ml.generate(recipe, tmp_path / "set.zarr")
     stored = open_dataset(tmp_path / "set.zarr")

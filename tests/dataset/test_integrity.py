@@ -66,6 +66,7 @@ def all_of(dataset: Path) -> None:
 READERS = {"set": all_of, "cube": lambda path: np.asarray(io.load(path).histogram), "maps": load_maps}
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", READERS)
 def test_every_missing_file_is_noticed_on_opening(dataset, cube, maps, name):
     store = {"set": dataset, "cube": cube, "maps": maps}[name]
@@ -81,6 +82,7 @@ def test_every_missing_file_is_noticed_on_opening(dataset, cube, maps, name):
     READERS[name](store)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", READERS)
 def test_every_flipped_bit_is_found(dataset, cube, maps, name):
     """Metadata and what is read, on reading; everything by `verify`. Bits are drawn file by file, with a fixed seed."""
@@ -155,6 +157,7 @@ def test_sha256sum_reads_the_manifest(dataset):
     assert (done.returncode, done.stdout) == (0, "")
 
 
+@pytest.mark.full
 @pytest.mark.skipif(os.name != "posix", reason="needs SIGKILL")
 def test_killed_between_manifest_and_root_document(dataset):
     """The store is incomplete then, and goes on."""

@@ -59,6 +59,7 @@ def of_transients(recipe, renders) -> dict[str, Any]:
     return recipe | {"scenes": [{"transient": str(renders)}]}
 
 
+@pytest.mark.full
 def test_transients(tmp_path, of_transients, renders):
     done = ml.generate(of_transients, tmp_path / "set.zarr")
     assert done.shape == (12, 3, *SHAPE, 32)
@@ -110,6 +111,7 @@ def test_crops_and_sizes_of_transients(tmp_path, of_transients, renders, monkeyp
     assert verify(tmp_path / "set.zarr", chunks=None).good
 
 
+@pytest.mark.full
 def test_fog_and_panes(tmp_path, recipe):
     recipe["scenes"] = [{"example": "room", "size": list(SHAPE), "fog": FOGS, "pane": PANE}]
     recipe["light"] |= {"sbr": 2.0, "attenuation": "inverse_square"}
@@ -129,6 +131,7 @@ def test_fog_and_panes(tmp_path, recipe):
     assert "fog 0.2 1.5 0.5" in stored.scene_names()[1]
 
 
+@pytest.mark.full
 def test_layers_of_a_file(tmp_path, recipe):
     depth = np.full((3, *SHAPE), [[[2.0]], [[5.0]], [[9.0]]])
     depth[1, :6] = np.nan
@@ -162,6 +165,7 @@ def test_crops_lie_at_the_same_places_in_any_fog(tmp_path, recipe):
     assert len(set(stored.seeds.tolist())) == 16
 
 
+@pytest.mark.full
 @pytest.mark.skipif(os.name != "posix", reason="needs SIGKILL")
 @pytest.mark.parametrize("how", [("kill", 5), ("scenes", 0)])
 def test_a_run_that_was_killed_goes_on(tmp_path, of_transients, how):
@@ -175,6 +179,7 @@ def test_a_run_that_was_killed_goes_on(tmp_path, of_transients, how):
     assert files(tmp_path / "set.zarr") == files(tmp_path / "whole.zarr")
 
 
+@pytest.mark.full
 def test_estimates(tmp_path, of_transients):
     of_transients["store"] = {"chunk_mib": 1, "shard_mib": 4}
     told = estimate(of_transients, tmp_path / "set.zarr")
@@ -186,6 +191,7 @@ def test_estimates(tmp_path, of_transients):
     assert told.bytes > (found + scenes) * 0.9
 
 
+@pytest.mark.full
 def test_training(tmp_path, of_transients):
     torch = pytest.importorskip("torch")
     from mars_lidar.learn import CubeStream, StoredDataset

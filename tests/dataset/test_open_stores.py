@@ -44,6 +44,7 @@ def store(tmp_path) -> Path:
     return tmp_path / "set.zarr"
 
 
+@pytest.mark.full
 def test_overwriting_in_mid_epoch_raises(store):
     """Examples of the new light stood under the old labels."""
     learn = pytest.importorskip("mars_lidar.learn")
@@ -57,6 +58,7 @@ def test_overwriting_in_mid_epoch_raises(store):
     assert [path.name for path in store.parent.iterdir()] == ["set.zarr"]
 
 
+@pytest.mark.full
 def test_a_worker_opens_the_same_store(store, tmp_path):
     learn = pytest.importorskip("mars_lidar.learn")
     examples = learn.StoredDataset(store)

@@ -54,6 +54,7 @@ def whole(tmp_path, recipe) -> dict[str, bytes]:
     return files(tmp_path / "whole.zarr")
 
 
+@pytest.mark.full
 @pytest.mark.skipif(os.name != "posix", reason="needs SIGKILL")
 @pytest.mark.parametrize(("how", "number"), [("kill", 1), ("kill", 11), ("int", 5), ("scenes", 0)])
 def test_a_run_that_was_stopped_goes_on(tmp_path, recipe, whole, how, number):
@@ -78,6 +79,7 @@ def test_a_run_that_was_stopped_goes_on(tmp_path, recipe, whole, how, number):
     assert not (tmp_path / "set.zarr.lock").exists()
 
 
+@pytest.mark.full
 @pytest.mark.skipif(os.name != "posix", reason="needs SIGKILL")
 def test_without_its_scenes_a_store_needs_its_recipe(tmp_path, recipe):
     stopped(recipe, tmp_path / "set.zarr", "scenes", 0)
@@ -85,6 +87,7 @@ def test_without_its_scenes_a_store_needs_its_recipe(tmp_path, recipe):
         ml.generate(None, tmp_path / "set.zarr", resume=True)
 
 
+@pytest.mark.full
 def test_a_shard_that_was_cut_short_is_made_again(tmp_path, recipe, whole):
     out = tmp_path / "whole.zarr"
     shard = next(one for one in sorted((out / "histogram/c").rglob("*")) if one.is_file())
@@ -95,6 +98,7 @@ def test_a_shard_that_was_cut_short_is_made_again(tmp_path, recipe, whole):
     assert files(out) == whole
 
 
+@pytest.mark.full
 @pytest.mark.skipif(os.name != "posix", reason="needs a limit on the size of files")
 def test_a_full_disk_is_told_and_the_run_goes_on_afterwards(tmp_path, recipe, whole):
     out = tmp_path / "set.zarr"

@@ -80,6 +80,7 @@ def distance(system: ml.System, signal: float, background: float) -> float:
 FLUXES = [(0.1, 0.1), (1.0, 1.0), (1.0, 0.01), (10.0, 0.1), (10.0, 10.0), (3.0, 0.0), (0.05, 5.0)]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("dead", [0.002, 0.1, 0.6375, 0.95, 0.98, 0.995, 0.999, 1.0, 1.01, 1.53])
 @pytest.mark.parametrize("sigma_bins", [1.0, 2.0, 4.0])
 def test_sub_bin_delays(sigma_bins: float, dead: float):

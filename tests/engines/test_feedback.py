@@ -89,6 +89,7 @@ DENSE = {
 }
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", DENSE)
 def test_mean_and_covariance_are_those_of_the_closed_form(name: str):
     request = DENSE[name]
@@ -174,6 +175,7 @@ AGAINST_EXACT = {
 }
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", AGAINST_EXACT)
 def test_law_is_that_of_exact(name: str):
     check(Sampler(), AGAINST_EXACT[name], ENGINES["exact"], CLAIMS)

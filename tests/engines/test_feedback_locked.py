@@ -33,11 +33,13 @@ LOCKED = {  # feedback failed in all of them before it had laps
 }
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", LOCKED)
 def test_law_is_that_of_exact(name: str):
     check(Sampler(), LOCKED[name], ENGINES["exact"], {COUNTS, SHAPE, JOINT})
 
 
+@pytest.mark.full
 def test_shadow_of_a_bright_pulse():
     """Bins of less than one count per exposure, fired in bursts by exposures that are out of phase with the others."""
     request = locked(76.5, 2.08, 0.887, 100_007, 0.0047, 16, delay=0.66, items=6000)
@@ -83,6 +85,7 @@ def test_narrow_histograms_do_not_overflow(engine: str, signal: float, backgroun
     assert counts.max() <= cycles + 1
 
 
+@pytest.mark.full
 def test_random_locked_systems_count_as_exact_does():
     """Counts and their spread in 24 systems near their lock; z of the mean and of the spread beyond 5 fails: 3e-5."""
     random = np.random.default_rng(6)
@@ -115,6 +118,7 @@ AGAIN = {  # armed again within the pulse; cells were too wide for what it then 
 }
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", AGAIN)
 def test_bright_pulses_armed_again_within(name: str):
     check(Sampler(), AGAIN[name], ENGINES["exact"], {COUNTS, SHAPE, JOINT})
@@ -183,6 +187,7 @@ STEPS = {
 }
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", STEPS)
 def test_edges_of_bright_parts(name: str):
     """Cells were as wide as parts whatever the exposure: means of bins up to 50 standard deviations off."""

@@ -188,6 +188,7 @@ def test_level_must_run_here():
         drawn(FeedbackEngine("mmx"), case(1.0, 1.0, 0.6375, 1000, items=4))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("engine", ["feedback", "auto"])
 def test_progress_runs_once_to_its_end(engine: str):
     flux, system = mixture()

@@ -44,6 +44,7 @@ def exact_law(signal: float, background: float, delay_ns: float, system: ml.Syst
     return Law(histogram, pmf)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("signal", "background", "delay"), [(0.31, 0.47, 17.3), (1.7, 0.11, 63.1), (2.9, 2.3, 2.2), (0.0, 1.3, 0.0)]
 )
@@ -93,6 +94,7 @@ def test_a_locked_pixel_needs_the_exact_count():
     require({"count law": counts_against_law(counts, law.count_pmf)}, "locked pixel")
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("with_table", [True, False])
 def test_any_part_alone_on_any_threads(with_table: bool):
     flux, given = image(), table() if with_table else None

@@ -26,6 +26,7 @@ def table() -> Table:
     return Table.build(SYSTEM, (0.1, 2.0, 6), (0.1, 2.0, 6))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("suffix", [".zarr", ".h5", ".npz"])
 def test_a_file_says_how_it_was_made_and_makes_it_again(tmp_path, table: Table, suffix: str):
     path = tmp_path / f"cube{suffix}"

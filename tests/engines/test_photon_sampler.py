@@ -96,6 +96,7 @@ class Pixels:
 MOVES = [0.0, 13.0, 3.31, -20.77, 99.5]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("dead", "signal", "background"),
     [(0.6375, 0.75, 0.3), (0.12, 0.75, 0.3), (2.3, 0.75, 0.3), (0.6375, 0.0, 0.3), (0.6375, 1.9, 0.0)],

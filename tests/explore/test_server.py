@@ -165,6 +165,7 @@ def test_what_is_no_request_gets_the_policy_too(server: CubeServer):
             assert directive in head
 
 
+@pytest.mark.full
 def test_silent_connections_hold_few_threads_and_end(monkeypatch):
     monkeypatch.setattr("mars_lidar.explore.server._SILENT_S", 0.5)
     running = CubeServer()
@@ -224,6 +225,7 @@ def test_bad_input():
     assert "does not exist" in result.stderr
 
 
+@pytest.mark.full
 def test_ctrl_c_ends_it(stored: Path):
     command = [sys.executable, "-c", "from mars_lidar.cli import main; main()", "explore", str(stored), "--no-browser"]
     run = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, bufsize=1)
@@ -244,6 +246,7 @@ def test_ctrl_c_ends_it(stored: Path):
     assert (run.returncode, complaints) == (0, "")
 
 
+@pytest.mark.full
 def test_the_page_with_a_cube(server: CubeServer, stored: Path):
     with chromium() as browser, io.load(stored) as cube:
         page = Page(browser, server.url)

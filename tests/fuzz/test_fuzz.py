@@ -33,6 +33,7 @@ def server():
     started.close()
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", READERS)
 def test_mutated_files_are_refused_by_name(tmp_path, good, server, name):
     folder, names = good
@@ -45,6 +46,7 @@ def test_mutated_files_are_refused_by_name(tmp_path, good, server, name):
     assert not [one for one in outcomes if one["kind"] in BAD]
 
 
+@pytest.mark.full
 def test_the_server_tells_what_is_bad(tmp_path, server, good):
     """The tests above can fail: an unnamed error, a foreign one, a crash, a hang and too much memory are told apart."""
     told = {

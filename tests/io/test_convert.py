@@ -54,6 +54,7 @@ def test_one_realization_alone(tmp_path):
         io.convert(tmp_path / "set.zarr", tmp_path / "two.mat", realization=3)
 
 
+@pytest.mark.full
 @needs_all
 def test_a_stream_goes_round_all_formats(tmp_path):
     times = ml.simulate_timestamps(one_return(), SYSTEM, seed=2)

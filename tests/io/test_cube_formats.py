@@ -131,6 +131,7 @@ def test_rates_are_the_signal_of_all_returns(tmp_path, make):
         np.testing.assert_allclose(read.rates[y, x], rate / rate.max(), atol=1e-13)
 
 
+@pytest.mark.full
 @pytest.mark.skipif(not FIELD_MAT.is_file(), reason=f"the field's file is absent: {FIELD_MAT}")
 def test_mat_loads_like_the_file_of_the_field(tmp_path):
     field = scipy.io.loadmat(FIELD_MAT)

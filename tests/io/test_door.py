@@ -123,6 +123,7 @@ def test_a_transient_of_absurd_bins_is_refused_at_once(tmp_path):
             light.flux(SYSTEM, signal=1.0)
 
 
+@pytest.mark.full
 def test_deep_or_circular_documents_are_refused(tmp_path):
     for text in ("[" * 5000, "a: &a [*a]", "a: 2020-13-45", "a: \udcff"):
         for name in ("system.yaml", "recipe.yaml"):

@@ -95,6 +95,7 @@ def _run(path: Path, how: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, "-c", _SCRIPT, str(path), how], capture_output=True, text=True)
 
 
+@pytest.mark.full
 @pytest.mark.skipif(os.name != "posix", reason="needs SIGKILL")
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_kill_9_leaves_nothing_that_looks_complete(tmp_path, suffix):
@@ -115,6 +116,7 @@ def test_kill_9_leaves_nothing_that_looks_complete(tmp_path, suffix):
     assert list(tmp_path.iterdir()) == [path]
 
 
+@pytest.mark.full
 @pytest.mark.skipif(os.name != "posix", reason="needs a limit on the size of files")
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_a_full_disk_is_told_and_leaves_nothing_that_looks_complete(tmp_path, suffix):
@@ -131,6 +133,7 @@ def test_a_full_disk_is_told_and_leaves_nothing_that_looks_complete(tmp_path, su
         assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.full
 @pytest.mark.skipif(os.name != "posix", reason="needs a limit on the size of files")
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_a_disk_that_is_full_from_the_start_is_told(tmp_path, suffix):
@@ -141,6 +144,7 @@ def test_a_disk_that_is_full_from_the_start_is_told(tmp_path, suffix):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.full
 @pytest.mark.skipif(sys.platform == "win32", reason="needs a limit on file sizes")
 @pytest.mark.parametrize("name", ["a.npz", "a.h5", "a.mat", "a.ptu", "s.npz", "s.h5", "s.ptu", "t.h5", "m.h5", "m.npz"])
 def test_a_file_that_finds_no_room_says_so_and_leaves_nothing(tmp_path, name, monkeypatch):

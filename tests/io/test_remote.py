@@ -69,6 +69,7 @@ def check(url: str, store: Path) -> None:
         assert again.url == url
 
 
+@pytest.mark.full
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # sessions of aiohttp at exit
 def test_memory_and_web(store, tmp_path):
     check(in_memory(store), store)

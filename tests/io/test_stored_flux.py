@@ -101,6 +101,7 @@ def test_cubes_are_those_of_the_flux_in_memory(transient, tmp_path, suffix):
         assert io.verify(cube)
 
 
+@pytest.mark.full
 def test_the_command_goes_from_a_file_to_a_cube_and_a_picture(transient, tmp_path):
     out = tmp_path / "cube.zarr"
     common = ["simulate", "--transient", tmp_path / "t.npy", "--period-ns", 100, "--cycles", 50, "-o", out]
@@ -159,6 +160,7 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
 """
 
 
+@pytest.mark.full
 @pytest.mark.skipif(sys.platform != "linux", reason="ru_maxrss is in KiB on Linux only")
 def test_memory_does_not_grow_with_the_transient(tmp_path):
     """In bands of 8 MiB, images with 16 and 96 MiB of waveforms."""

@@ -5,11 +5,13 @@ from __future__ import annotations
 import runpy
 from pathlib import Path
 
+import pytest
 import torch
 
 PATH = Path(__file__).parents[2] / "examples" / "train_depth.py"
 
 
+@pytest.mark.full
 def test_train_depth():
     example = runpy.run_path(str(PATH))
     net, losses = example["train"](30, 12)
@@ -28,6 +30,7 @@ def test_it_is_short():
     assert len([line for line in core.splitlines() if line.strip()]) <= 24
 
 
+@pytest.mark.full
 def test_learned_prior(deepinv):
     """Shortened: the denoiser learns; its gradient is that of the likelihood; it mends depths that noise displaced."""
     example = runpy.run_path(str(PATH.with_name("learned_prior.py")))

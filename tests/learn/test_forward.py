@@ -34,6 +34,7 @@ def point(*values):
 AT = ([0.7, 3.0, 0.02], [0.3, 1.0, 0.01], [40.0, 97.0, 3.3])
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("dead_ns", [0.0, 1.3, 42.3, 100.0, 163.1])
 @pytest.mark.parametrize("pulse", PULSES, ids=["gaussian", "sampled"])
 def test_gradients(dead_ns, pulse):
@@ -52,6 +53,7 @@ def test_gradients(dead_ns, pulse):
         assert torch.autograd.gradgradcheck(mean, at, eps=1e-5, fast_mode=True)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("start", ["stationary", "armed"])
 def test_transforms_of_torch_func(start):
     """Jacobians by both modes, second derivatives by three routes and by differences, each pixel by itself."""
@@ -209,6 +211,7 @@ def test_dark_and_blinding_pixels():
     assert float(at[0].grad[0]) == pytest.approx(1000.0, rel=1e-6)  # the first photon is always seen
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("start", ["armed", "stationary"])
 @pytest.mark.parametrize("dead_ns", [42.3, 163.1, 1000.0])
 def test_armed_periods_err_by_the_ends_of_the_exposure_alone(start, dead_ns):

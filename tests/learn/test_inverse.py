@@ -65,6 +65,7 @@ def test_vjp_is_what_deepinv_asks_for(physics):
         LidarPhysics(SYSTEM.replace(bins=32), table=table)
 
 
+@pytest.mark.full
 def test_reconstruction_with_deepinv(physics):
     """Projected gradient steps on deepinv's own data fidelity and prior, from A_dagger: nearer to a smooth truth."""
     from deepinv.optim import L2, Tikhonov
@@ -140,6 +141,7 @@ def test_depth_images_are_those_of_deepinv(physics):
         ours.A(x[0])
 
 
+@pytest.mark.full
 def test_an_algorithm_of_deepinv_with_a_prior_that_it_ships(physics):
     """Total variation by proximal gradient steps, started by `custom_init`: nearer to a smooth truth than the start."""
     from deepinv.optim import L2, PGD

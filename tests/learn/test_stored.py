@@ -41,6 +41,7 @@ def numbers(examples) -> list[tuple[int, int]]:
 EVERY = [(sample, number) for sample in range(6) for number in range(5)]
 
 
+@pytest.mark.full
 def test_examples_are_the_exposures(path):
     stored = ml.dataset.open_dataset(path)
     dataset = StoredDataset(path, maps=["depth", "signal"], seed=3)
@@ -81,6 +82,7 @@ def test_the_documented_loop_over_any_dataset_seed(tmp_path, seed):
         assert told == dict(enumerate(stored.seeds.tolist()))
 
 
+@pytest.mark.full
 def test_orders(path):
     first, again = (StoredDataset(path, seed=1) for _ in range(2))
     one, two = numbers(first), numbers(first)
@@ -92,6 +94,7 @@ def test_orders(path):
     assert numbers(StoredDataset(path, seed=2)) != one
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("world", [1, 2, 4, 7])
 def test_ranks_have_equally_many_and_none_twice(path, world):
     parts = [numbers(StoredDataset(path, rank=rank, world_size=world, pool=2)) for rank in range(world)]

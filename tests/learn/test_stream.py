@@ -57,6 +57,7 @@ def assert_same(first, second):
         assert torch.equal(torch.nan_to_num(first[name]), torch.nan_to_num(second[name])), name
 
 
+@pytest.mark.full
 @pytest.mark.filterwarnings("ignore:This DataLoader will create")
 @pytest.mark.filterwarnings("ignore:Sparse invariant checks")  # torch's own, of a sparse tensor from a worker
 @pytest.mark.parametrize("workers", [1, 2, 4])
@@ -74,6 +75,7 @@ def test_batches_do_not_depend_on_workers(workers, settings):
         assert_same(first, second)
 
 
+@pytest.mark.full
 @pytest.mark.filterwarnings("ignore:This DataLoader will create")
 def test_single_samples_are_those_of_the_batches():
     dataset = stream(repeat=True)
@@ -111,6 +113,7 @@ def passes(dataset, number: int) -> list[list[list[int]]]:
     return found
 
 
+@pytest.mark.full
 @pytest.mark.filterwarnings("ignore:This DataLoader will create")
 @pytest.mark.parametrize("lives_on", [False, True])
 @pytest.mark.parametrize("workers", [0, 1, 3])
@@ -133,6 +136,7 @@ def test_epochs_advance_by_themselves(workers, lives_on):
     assert indices(made) == wanted[2]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("workers", [0, 2])
 def test_a_validation_repeats_its_epoch(workers):
     wanted = passes(stream(batch_size=3), 3)
@@ -163,6 +167,7 @@ def test_a_loader_that_stacks_is_warned_of(batch_size, told):
         next(iter(loader(stream(batch_size=batch_size), 0, batch_size=2)))
 
 
+@pytest.mark.full
 @pytest.mark.filterwarnings("ignore:This DataLoader will create")
 @pytest.mark.filterwarnings("ignore:'set_vital' is deprecated")  # which torchdata calls
 @pytest.mark.parametrize("at", [0, 4, 8], ids=["before", "within", "at the end"])
@@ -220,6 +225,7 @@ def test_ranks_share_an_epoch(batch_size):
     assert len(stream(batch_size=batch_size, rank=1, world_size=4)) == (5 if batch_size is None else 2)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("world", [1, 2])
 def test_resume(world):
     def make():
@@ -380,6 +386,7 @@ def test_scenes_of_other_workers_are_whole_or_none():
     assert copy.get(3) is None
 
 
+@pytest.mark.full
 @pytest.mark.filterwarnings("ignore:This DataLoader will create")
 def test_maps_of_a_dataset_are_scenes(tmp_path):
     """Of one that `generate` wrote: seen again by other instruments, whoever makes the cubes."""
@@ -451,6 +458,7 @@ def _half(example):
     return example["cube"][:32], {"own": example["cube"].sum(), "index": example["index"]}
 
 
+@pytest.mark.full
 @pytest.mark.filterwarnings("ignore:This DataLoader will create")
 @pytest.mark.parametrize("settings", [{"batch_size": 2}, {}, {"batch_size": 2, "axes": "HWT", "dtype": None}])
 def test_what_workers_pass_on_is_not_overwritten_while_it_is_held(settings):

@@ -33,6 +33,7 @@ def point(*values, dtype=torch.float64):
     return [torch.tensor(one, dtype=dtype, requires_grad=True) for one in values]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("sigma_ns", "dead_ns", "start", "error"),
     [
@@ -55,6 +56,7 @@ def test_it_is_the_exact_mean_histogram(sigma_ns, dead_ns, start, error):
     assert (off < error).all(), off
 
 
+@pytest.mark.full
 def test_gradients(table):
     """Sums over windows that cut the pulse; all delays, also where a bin's edge meets the canonical one."""
     model = HistogramTable(table).double()
@@ -66,6 +68,7 @@ def test_gradients(table):
     assert torch.autograd.gradcheck(windows, at, eps=1e-6, atol=1e-6)
 
 
+@pytest.mark.full
 def test_kinks_at_the_nodes_are_as_small_as_is_said():
     """The spacing of the paper's 256 x 100 table; jumps over what the derivatives are, summed over the bins."""
     system = build(bins=256, sigma_ns=1.0).system
@@ -99,6 +102,7 @@ def test_delay_moves_it_continuously_and_keeps_the_total(table):
     torch.testing.assert_close(whole[2], whole[0])
 
 
+@pytest.mark.full
 def test_it_leads_back_to_the_pixel_of_an_exact_mean(table):
     """From a mean histogram that no table knows, by its gradients alone (L-BFGS), pixel by pixel of a map."""
     true = np.array([[1.0, 0.5, 61.3], [3.0, 1.5, 12.34], [0.5, 0.1, 99.9]])

@@ -51,6 +51,7 @@ SYSTEMS = {
 }
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_unbiased_and_at_the_bound(name):
     """Means, variances and stated errors of 2000 exposures; the bound is computed from other code."""
@@ -79,6 +80,7 @@ def test_unbiased_and_at_the_bound(name):
     require(outcomes, f"maximum likelihood, {name}")
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("system", "signal", "bias"),
     [
@@ -137,6 +139,7 @@ ENDS = {
 }
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", [*SYSTEMS, *ENDS])
 def test_derivatives(name):
     """Gradient by finite differences; information as the variance of the gradient, and of other code's formula."""

@@ -46,6 +46,7 @@ ALONE = {
 }
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", ALONE)
 @pytest.mark.parametrize("level", [0.01, 0.1])
 def test_no_more_returns_than_there_are(name: str, level: float) -> None:
@@ -65,6 +66,7 @@ def test_no_more_returns_than_there_are(name: str, level: float) -> None:
     assert np.array_equal(found.returns.signal_error[alone, 0], one.signal_error[alone], equal_nan=True)
 
 
+@pytest.mark.full
 def test_the_level_is_not_far_from_what_is_stated() -> None:
     """The bound of the level is a near one: a test that never errs would show nothing dim."""
     cube = drawn(SYSTEM, (1.0,), 1.0, (DELAY,), 2000)
@@ -85,6 +87,7 @@ PAIRS = {
 }
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", PAIRS)
 def test_both_are_found_and_their_errors_hold(name: str) -> None:
     """Where two are seen in nearly every exposure: no bias, spread at the bound of other code, intervals that hold."""

@@ -61,6 +61,7 @@ def test_law_at_a_constant_rate():
     assert found @ np.arange(found.size) == pytest.approx(mean, abs=3e-3)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("start", ["armed", "stationary"])
 @pytest.mark.parametrize(
     ("signal", "background", "dead", "electronics", "cycles", "detector"),
@@ -104,6 +105,7 @@ def test_where_one_of_the_two_has_no_effect(dead: float, electronics: float):
     assert pmf_of(found) == pytest.approx(pmf_of(expected), abs=1e-12)
 
 
+@pytest.mark.full
 def test_long_exposures_and_cells():
     a, b, c = (ml.count_law(2.0, 0.3, view(0.4, 1.3, cycles=n)) for n in (400, 401, 1_000_000))
     slope = b.cumulants - a.cumulants
@@ -115,6 +117,7 @@ def test_long_exposures_and_cells():
     assert pmf_of(ml.count_law(1e-9, 1e-9, view(0.4, 1.3)))[0] == pytest.approx(1.0, abs=1e-6)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("start", ["armed", "stationary"])
 @pytest.mark.parametrize(
     ("signal", "background", "dead", "electronics", "detector"),

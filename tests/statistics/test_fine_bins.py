@@ -51,6 +51,7 @@ def light_of(waveform: np.ndarray | None) -> dict[str, Any]:
     return {"delay_ns": 33.3} if waveform is None else {"waveform": waveform}
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", PIXELS)
 def test_mean_histogram(name: str, monkeypatch: pytest.MonkeyPatch):
     """Every bin as on a grid of its own, and the tolerance in total variation."""
@@ -65,6 +66,7 @@ def test_mean_histogram(name: str, monkeypatch: pytest.MonkeyPatch):
         assert np.abs(found - known).max() < 1e-4 * known.max()
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", ["warm", "locked", "steps"])
 def test_joint_law(name: str):
     """Variances of windows of one bin and of a fiftieth of the period, of every other bin, and a covariance."""
@@ -98,6 +100,7 @@ def test_short_exposures():
     assert 0.5 * np.abs(law.mean - direct).sum() < 1e-4 * direct.sum()
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("bins", [200_000, 902_677, 2**20])
 @pytest.mark.parametrize("dead", [0.5, 3.923])
 def test_two_seconds(bins: int, dead: float):

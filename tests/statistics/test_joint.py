@@ -50,6 +50,7 @@ def test_constant_rate(rate: float, dead: float, cycles: int, start: str):
     assert law.count_variance == pytest.approx(variance, rel=2e-6)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("dead", [0.97, 0.999])
 def test_a_resonance_just_below_the_period_settles_in_any_long_exposure(dead: float):
     """One pulse blinds until just before the next: locked, but forgotten within a hundred periods; a million here."""

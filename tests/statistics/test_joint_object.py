@@ -72,6 +72,7 @@ def test_waveforms_and_measured_pulses():
         assert law.variance == pytest.approx(laws[0].variance, rel=1e-9)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("signal", "background", "dead"), [(1.0, 30.0, 0.6375), (0.0, 300.0, 0.9), (2.0, 100.0, 1.45), (1000.0, 0.1, 0.3)]
 )

@@ -222,6 +222,7 @@ def test_a_pmf_that_contradicts_its_cumulants_is_refused(monkeypatch):
         _ = count_law(1.0, 1.0, make_system(0.6375)).pmf
 
 
+@pytest.mark.full
 def test_random_systems_against_the_exact_engine():
     """Two hundred systems; the whole test fails by chance once in some ten thousand times."""
     rng = np.random.default_rng(20261)
@@ -254,6 +255,7 @@ def test_random_systems_against_the_exact_engine():
     assert stats.kstest(p_values, "uniform").pvalue > 1e-6  # pooled cells: uniform only roughly
 
 
+@pytest.mark.full
 @pytest.mark.skipif(not REFERENCE.is_dir(), reason="the reference cases are not beside this checkout")
 @pytest.mark.parametrize("path", sorted(REFERENCE.glob("*.json")), ids=lambda path: path.stem)
 def test_reference(path):

@@ -41,6 +41,7 @@ def view(dead: float, cycles: int = 1000, sigma: float = 0.01, start: str = "arm
 # A warmed-up clock: many background photons in a dead time
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("background", "dead", "cycles"), [(1000.0, 1.9999, 1), (999.0, 0.9997, 1), (300.0, 4.98256, 3), (80.0, 2.5, 20)]
 )
@@ -253,6 +254,7 @@ def test_one_registration_at_most(cycles: int, dead: float):
 # Laws that would take longer than two seconds
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("signal", "dead", "cycles", "sigma", "start"),
     [(1.0, 1e-6, 1, 1e-6, "stationary"), (1000.0, 1e-6, 2, 1e-6, "armed")],
@@ -296,6 +298,7 @@ def test_joint_law_known_to_settle(monkeypatch: pytest.MonkeyPatch):
 # Refusals
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("signal", "background", "dead", "cycles", "sigma", "start"),
     [
@@ -412,6 +415,7 @@ def test_corners(signal: float, background: float, dead: float, start: str):
 # Histograms of many bins
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("bins", [2**16, 2**18])
 def test_joint_law_of_many_bins(bins: int):
     """Sweeps over many bins stop at the rounding that these add up: the law of an ordinary pixel has been refused."""
@@ -474,6 +478,7 @@ def test_a_warm_state_that_is_not_found_is_refused():
             law()
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("first", range(20_000, 20_032, 8))
 def test_random_systems(first: int):
     for seed in range(first, first + 8):

@@ -54,6 +54,7 @@ def distances(law):
     )
 
 
+@pytest.mark.full
 def test_close_to_the_exact_law():
     # off the grid of the study
     signal, background = np.meshgrid(np.geomspace(0.013, 9.3, 8), np.geomspace(0.012, 9.1, 6))
@@ -166,6 +167,7 @@ def test_extremes():
     np.testing.assert_allclose(cumulants_of(large)[:3], [1e9, 2e8, -3e7], rtol=1e-4)
 
 
+@pytest.mark.full
 def test_cumulants_that_no_count_has():
     """Anything at all gives a law: what interpolation makes of a table must never fail."""
     random = np.random.default_rng(11)
@@ -229,6 +231,7 @@ def test_bad_uniform():
         matched_counts([FORMS["few"]], [[0.5], [0.1]])
 
 
+@pytest.mark.full
 def test_study(tmp_path):
     assert main(["matched", "--quick", "--out", str(tmp_path)]) == 0
     with (tmp_path / "matched.csv").open() as file:

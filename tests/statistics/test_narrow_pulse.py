@@ -73,6 +73,7 @@ def like_a_wide_one(law: Any, signal: float, whole: int, apart: float, sigma: fl
         assert found[1] == pytest.approx(variance, rel=1e-4)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("sigma", [1e-6, 4e-6, 3e-5])
 @pytest.mark.parametrize("start", ["armed", "stationary"])
 @pytest.mark.parametrize(("signal", "whole"), [(1.0, 1), (8.0, 1), (8.0, 3)])
@@ -97,6 +98,7 @@ def test_near_whole_periods_paralyzable(law: Any, apart: float) -> None:
     like_a_wide_one(law, 1.0, 1, apart, 1e-6, mode="paralyzable")
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("sigma", [1e-6, 4e-6, 1e-5])
 @pytest.mark.parametrize(("whole", "apart"), [(1, 0.5), (1, 3.0), (1, -40.0), (0, 2.0), (0, 30.0)])
 @pytest.mark.parametrize("law", [by_count_law, by_joint_law])

@@ -98,6 +98,7 @@ def found():
     return compare(scene(), SYSTEM, engines, realizations=3000, repeats=8, pixels=3, seed=5, **CALM)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("engine", TRUE)
 def test_true_engines_are_not_accused(found, engine):
     for pixel, row in found.statistics.items():
@@ -177,6 +178,7 @@ KINDS = {
 }
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_of_flux_is_compared_and_drawn(tmp_path, kind):
     found = compare(KINDS[kind], SYSTEM, TRUE, realizations=200, repeats=2, **CALM)

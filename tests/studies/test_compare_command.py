@@ -16,6 +16,7 @@ SMALL = ["--scene", "room", "--size", "12", "--cycles", "50", "--bins", "64"]
 SMALL += ["--realizations", "300", "--budget-s", "600"]
 
 
+@pytest.mark.full
 def test_the_command_prints_draws_and_writes_numbers(tmp_path):
     out, numbers = tmp_path / "c.png", tmp_path / "c.json"
     arguments = [*SMALL, "--engines", "exact, poisson", "--pixels", "2", "--repeats", "2", "-o", str(out)]
@@ -62,6 +63,7 @@ def test_bad_input_of_the_command_is_exit_code_2(tmp_path, monkeypatch, argument
     assert len(done.stderr.splitlines()) == 1
 
 
+@pytest.mark.full
 def test_own_pixels_are_compared(tmp_path):
     out = tmp_path / "c.svg"
     own = ["--engines", "exact", "--repeats", "1", "--pixel", "3,4", "--pixel", "7,8"]

@@ -39,6 +39,7 @@ def _third_and_fourth(law) -> tuple[float, float]:
     return skew * variance**1.5, kurtosis * variance**2
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("photons", [3.0, 0.02], ids=["many", "few"])
 def test_scores_of_distances_are_calibrated(photons):
     """Bins that share a common factor, so that their errors are correlated, against the truth and each other."""

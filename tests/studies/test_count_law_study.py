@@ -32,6 +32,7 @@ def cells():
     return count_law.compute(count_law.QUICK, "sequential", str)
 
 
+@pytest.mark.full
 def test_files(quick):
     text = (quick / "count_law.md").read_text()
     figures = [path for path in quick.iterdir() if path.suffix == ".png"]
@@ -45,6 +46,7 @@ def test_files(quick):
     assert "engine `sequential`" in text
 
 
+@pytest.mark.full
 def test_exact_law_passes_and_poisson_fails(cells):
     outcomes = {}
     for cell in cells:
@@ -95,6 +97,7 @@ def test_floors_are_those_of_samples():
     assert twice[:, 2].mean() == pytest.approx(np.sqrt(2) * found[:, 2].mean(), rel=0.12)
 
 
+@pytest.mark.full
 def test_sample_noise_of_the_shape():
     """The floor of the shape is the distance that a sample really has; of a Poisson pixel that is known."""
     system = count_law.QUICK.system(100.0, 0.0).replace(bins=64)
@@ -108,6 +111,7 @@ def test_sample_noise_of_the_shape():
     assert abs(found[0].counts.mean() - system.cycles) < 6 * np.sqrt(system.cycles / 200)
 
 
+@pytest.mark.full
 def test_engine_without_a_law_is_sampled(monkeypatch):
     class Other(PoissonEngine):
         name = "other"

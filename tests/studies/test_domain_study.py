@@ -132,6 +132,7 @@ def test_blame_and_refusals() -> None:
     assert not verdict.refusal(RuntimeError("use anything"))
 
 
+@pytest.mark.full
 def test_what_hangs_is_stopped_and_what_crashes_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     """A process that works on and on, one that sleeps, one that ends."""
 
@@ -178,6 +179,7 @@ def test_closed_forms(case: Case, name: str) -> None:
     assert known(pixel()) is None
 
 
+@pytest.mark.full
 def test_two_samples_keep_their_level() -> None:
     """p-values of one engine against itself are even."""
     case = pixel()
@@ -207,6 +209,7 @@ def test_errors_without_information_are_infinite() -> None:
     assert np.array_equal(_variances(regular), np.diag(np.linalg.inv(regular)))
 
 
+@pytest.mark.full
 def test_quick_form(tmp_path, capsys) -> None:
     """Sixty systems with fixed seeds: no failure, a report, its data and its maps."""
     assert main(["domain", "--quick", "--out", str(tmp_path)]) == 0

@@ -32,6 +32,7 @@ def test_features_are_a_window_about_the_fullest_bins_and_sums_of_the_rest():
     np.testing.assert_allclose(np.expm1(seen[:, -2]), counts.sum(1), rtol=1e-5)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("kind", [WindowNetwork, BinNetwork])
 def test_networks_learn_delay_and_reflectivity_with_their_errors(kind):
     """After seconds: depth better than the middle of the window, and intervals that hold about what they say."""

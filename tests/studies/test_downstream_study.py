@@ -31,6 +31,7 @@ TINY = downstream_data.CONFIGS["tiny"]
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
 
+@pytest.mark.full
 def test_the_study_goes_on_where_it_was_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     small = replace(TINY, arms={"poisson": (0,), "mars": (0, 1)})
     monkeypatch.setitem(downstream_data.CONFIGS, "tiny", small)
@@ -72,6 +73,7 @@ def test_the_study_goes_on_where_it_was_stopped(tmp_path: Path, monkeypatch: pyt
         fixed(tmp_path / "downstream-tiny", record | {"photons": 2.0})
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("last", [2, 3])
 def test_a_stream_goes_on_from_the_steps_it_has_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, last: int):
     """Stopped in the middle of its training, before and after a step that is kept: the same result, to the bit."""
@@ -120,6 +122,7 @@ def test_the_budget_of_full():
     assert data == pytest.approx(36 * (0.2 * 3000 + 0.1 * downstream.POLYNOMIAL_STEPS + 0.1 * full.test[1]))
 
 
+@pytest.mark.full
 def test_the_budget_is_reported(tmp_path: Path):
     assert main(["downstream-budget", "--quick", "--out", str(tmp_path)]) == 0
     text = (tmp_path / "downstream_budget.md").read_text()
@@ -150,6 +153,7 @@ def test_declared_configurations():
         assert len(set(names)) == len(names) == len(config.sbr) * sum(map(len, config.arms.values()))
 
 
+@pytest.mark.full
 def test_the_tabulated_neural_map_is_the_map():
     """Counts and shape of the stand-in from its table, beside the network itself; 4 standard errors."""
     config = replace(TINY, table=(160, 64))
@@ -186,6 +190,7 @@ def test_a_polynomial_is_told_by_its_two_numbers():
     np.testing.assert_allclose(polynomial.told(cubes), total**2, rtol=1e-3)
 
 
+@pytest.mark.full
 def test_data_mean_what_the_configuration_says():
     scenes = [downstream_data.crop(1000 + k, TINY) for k in range(2)]
     assert not np.array_equal(scenes[0].depth_m, scenes[1].depth_m)

@@ -35,6 +35,7 @@ def test_auc_and_its_error():
     require({"normal": stats.kstest(z, "norm").pvalue}, "AUC of one law")
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("kind", classifiers.CLASSIFIERS)
 def test_classifiers(kind):
     """Of two normal laws the best AUC is known; of one law it is chance, collinear and constant features or not."""
@@ -89,6 +90,7 @@ def test_pixels_given_to_exact_are_not_judged():
     assert run.given_to_exact(list(found.values())) == ["too short"]
 
 
+@pytest.mark.full
 def test_files(tmp_path):
     pytest.importorskip("sklearn", reason="extra 'studies'")
     assert main(["joint", "--quick", "--out", str(tmp_path)]) == 0

@@ -57,6 +57,7 @@ def test_without_dead_time_bins_are_independent():
     require(outcomes, "joint table")
 
 
+@pytest.mark.full
 def test_errors_are_the_scatter_of_samples():
     """Standard errors of 60 samples of one law against the scatter of their ratios; 5 of its own errors."""
     case, law = SEVEN[6], Law(SEVEN[6], 256)

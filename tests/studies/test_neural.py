@@ -150,6 +150,7 @@ def test_cycles_and_start_do_not_matter():
     assert half.mean == NEURAL.count_law(1.0, 1.0, SYSTEM).mean
 
 
+@pytest.mark.full
 def test_training_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     path = tmp_path / "net.npz"
     system = tmp_path / "small.yaml"
@@ -183,6 +184,7 @@ def test_the_package_says_where_the_engine_went():
             call()
 
 
+@pytest.mark.full
 def test_it_is_compared_beside_the_engines_of_the_package():
     scene = ml.Scene.example("room", size=4)
     found = compare(scene.flux(SYSTEM, signal=1.0, sbr=1.0), SYSTEM, ["exact", NEURAL], realizations=50, seed=1)

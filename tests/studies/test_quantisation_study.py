@@ -11,6 +11,7 @@ from studies.__main__ import main
 from studies.table import quantisation
 
 
+@pytest.mark.full
 def test_files(tmp_path):
     assert main(["quantisation", "--quick", "--out", str(tmp_path)]) == 0
     with (tmp_path / "quantisation.csv").open() as file:

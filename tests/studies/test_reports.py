@@ -76,6 +76,7 @@ def test_templates_parse_and_are_filled_by_a_module_beside_them(path: Path):
     assert ".".join(module.parts) in {module for module, _ in STUDIES.values()}
 
 
+@pytest.mark.full
 def test_the_package_imports_no_study():
     for path in (ROOT / "src" / "mars_lidar").rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):

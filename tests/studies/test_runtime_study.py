@@ -20,6 +20,7 @@ def system():
     return timing.system(timing.QUICK, 300).replace(bins=64)
 
 
+@pytest.mark.full
 def test_files(tmp_path):
     assert main(["runtime", "--quick", "--out", str(tmp_path)]) == 0
     with (tmp_path / "runtime.csv").open() as file:
@@ -131,6 +132,7 @@ def test_flux_beyond_the_table_is_left_out():
     assert not one.takes(ml.Flux(0.1, 10.1, 1.0))
 
 
+@pytest.mark.full
 def test_tables_are_shared_between_exposures(system):
     tables = contenders.Tables((4, 3))
     first = tables.get(system)

@@ -86,6 +86,7 @@ def test_maps_count_each_cell_by_itself():
     np.testing.assert_allclose(shares, [[0.5, 0.0], [0.0, 1.0]])
 
 
+@pytest.mark.full
 def test_the_study_writes_its_report_and_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     small = replace(data.CONFIGS["tiny"], pixels={"exact": 512, "mars": 512}, test=256, steps={"exact": 8, "mars": 8})
     monkeypatch.setitem(data.CONFIGS, "tiny", replace(small, batch=64, looks=(4,)))

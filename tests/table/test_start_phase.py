@@ -81,6 +81,7 @@ def test_vector_widths_agree():
         assert np.array_equal(corrections(signal, background, system, level=level)[0], first), level
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("start", ["armed", "stationary"])
 def test_interpolated_over_pixels_and_phases(start):
     table = small_table(start)
@@ -117,6 +118,7 @@ def test_exposures_that_end_before_they_settle(dead, cycles):
         assert (np.abs(told - exact[rows.reshape(-1)])[:, :2] / scale[rows.reshape(-1)]).max() < 5e-3
 
 
+@pytest.mark.full
 def test_against_photon_by_photon_simulation():
     """A bright pixel armed half way up its pulse, in a table, and in the sequential engine."""
     table, shots = small_table(), 20_000

@@ -22,6 +22,7 @@ def run(*arguments):
     return CliRunner().invoke(app, [str(a) for a in arguments])
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("method", ["exposure", "mars"])
 def test_a_file_says_what_the_table_said(tmp_path, method):
     table = small_table(method=method)
@@ -145,6 +146,7 @@ def test_where_the_cache_is(tmp_path, monkeypatch):
     assert cache.directory() == tmp_path / "me" / ".cache" / "mars-lidar"
 
 
+@pytest.mark.full
 def test_commands(tmp_path, own_cache):
     small = ["--signal", "0.1,5,5", "--background", "0.1,2,4", "--bins", 32, "--pulse-sigma-ns", 4, "--threads", 1]
     done = run("table", "build", *small, "-o", tmp_path / "t.h5", "--check-law")

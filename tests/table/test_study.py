@@ -8,6 +8,7 @@ import studies
 from studies import Request
 
 
+@pytest.mark.full
 def test_the_study_writes_its_report(tmp_path):
     told = []
     paths = studies.run("table", Request(tmp_path, quick=True, tell=told.append))

@@ -34,6 +34,8 @@ _MOST_EFFECTS = 2  # that are taken in one after the other
 _WAVE_BINS = 256  # of a free light, at most
 _PULSE = 5.0  # standard deviations of the brightest window over the period, below which there is no pulse
 _SAME_TIME = 0.01  # share of records at exactly the time of the one before, that no photons are
+_ATTEMPTS = 3  # fits of a stream, each with simulated streams of its own, of which the first that converges is taken
+_SEEDS_OF_A_FIT = 1_000_000  # between the seeds of two attempts
 LEVEL = 0.01  # false-alarm probability of the verdict
 
 PARAMETERS = ("dead_time_ns", "jitter_ns", "pulse_sigma_ns")
@@ -348,6 +350,7 @@ class _Run:
     ) -> None:
         self.recording, self.look, self.level = recording, look, level
         self.fixed = fixed
+        self.seed = seed
         self.fit = Fit(recording, Effort(), seed + 1)
         told = tuple(fields.items())
         self.wave: tuple[FloatArray, FloatArray] | None = None
@@ -382,7 +385,16 @@ class _Run:
         return self.assembled(fitted, included, listed, drift)
 
     def first(self) -> Fitted:
-        """The fit of the plain model, from the better of two starts."""
+        """The fit of the plain model, from the better of two starts; with other streams where it did not converge."""
+        for attempt in range(_ATTEMPTS):
+            self.fit = Fit(self.recording, Effort(), self.seed + 1 + attempt * _SEEDS_OF_A_FIT)
+            fitted = self._attempt()
+            if fitted.converged:
+                break
+        return fitted
+
+    def _attempt(self) -> Fitted:
+        """A fit with the streams of `fit`."""
         fit, model = self.fit, self.model
         width_known = model.returns == 0 or model.pulse is not None
         tried = []

@@ -469,7 +469,7 @@ def test_presets_show_what_their_sentences_say(page: Page):
     assert told["mean"]["cumulants"][1] < 0.001
     told = preset(page, "Dim light, honest errors")
     error = told["estimate"]["likelihood"]["delayError"] * 100 * 0.299792458 / 2
-    assert 0.03 < error < 0.05
+    assert 0.03 < error < 0.06  # the stated error of one draw; on average about 4 cm
     assert told["state"]["signal"] * 2000 == 60
 
 

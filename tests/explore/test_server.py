@@ -227,7 +227,11 @@ def test_bad_input():
 
 @pytest.mark.full
 def test_ctrl_c_ends_it(stored: Path):
-    command = [sys.executable, "-c", "from mars_lidar.cli import main; main()", "explore", str(stored), "--no-browser"]
+    code = (  # SIGINT is ignored where the tests run in the background of a shell
+        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "from mars_lidar.cli import main; main()"
+    )
+    command = [sys.executable, "-c", code, "explore", str(stored), "--no-browser"]
     run = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, bufsize=1)
     assert run.stdout is not None
     told = ""

@@ -55,7 +55,9 @@ def test_every_name_that_a_report_prints_is_a_study():
     for text in (ROOT / "docs").rglob("*.md"):
         for command in re.findall(r"python -m studies ([a-z-][a-z -]*)", text.read_text(encoding="utf-8")):
             printed |= {word for word in command.split(" --")[0].split() if not word.startswith("-")}
-    assert {"covariance", "law", "reference", "joint-table"} <= printed <= NAMES | {"neural", "train", "info", "compare"}
+    assert (
+        {"covariance", "law", "reference", "joint-table"} <= printed <= NAMES | {"neural", "train", "info", "compare"}
+    )
 
 
 @pytest.mark.parametrize("name", sorted(NAMES))

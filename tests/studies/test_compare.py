@@ -1,4 +1,4 @@
-"""`mars-lidar compare`: its errors and scores are honest, it finds what is wrong, and nothing else."""
+"""``python -m studies compare``: its errors and scores are honest, it finds what is wrong, and nothing else."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Errors and scores behind `mars-lidar compare`: those that repeated samples show."""
+"""Errors and scores behind ``python -m studies compare``: those that repeated samples show."""
 
 from __future__ import annotations
 

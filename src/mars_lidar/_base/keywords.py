@@ -28,10 +28,13 @@ def by_name(function: F, name: str | None = None) -> F:
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
         try:
-            signature.bind(*args, **kwargs)
-        except TypeError as error:
-            raise TypeError(_explained(error, kwargs)) from None
-        return function(*args, **kwargs)
+            return function(*args, **kwargs)
+        except TypeError:  # of the call itself, or from within
+            try:
+                signature.bind(*args, **kwargs)
+            except TypeError as error:
+                raise TypeError(_explained(error, kwargs)) from None
+            raise
 
     def _explained(error: TypeError, kwargs: dict[str, Any]) -> str:
         unknown = [key for key in kwargs if key not in allowed]

@@ -39,7 +39,7 @@ _AHEAD = 3  # tasks given out per worker thread: none waits for the scheduler, a
 _LEAST_QUEUED = 512  # tasks: an adaptive cluster starts workers by the length of its queue, from none if need be
 _TASKS_PER_S = 50.0  # that the scheduler is asked to handle; it handles some hundred
 _LARGEST_TASK = 1000  # parts, so that a worker that is lost loses no more
-_LOOK_S = 1.0  # between two looks at the workers that are there
+LOOK_S = 1.0  # between two looks at the workers that are there, and for whom there may be parts
 TIMEOUT_S = 20.0  # for a scheduler to answer
 _local = threading.local()
 
@@ -119,7 +119,7 @@ class _Workers:
         self._client, self._asked, self._threads = client, -math.inf, 0
 
     def __call__(self) -> int:
-        if time.monotonic() - self._asked > _LOOK_S:
+        if time.monotonic() - self._asked > LOOK_S:
             self._threads, self._asked = sum(self._client.nthreads().values()), time.monotonic()
         return self._threads
 

@@ -26,14 +26,13 @@ from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import Progress
 from mars_lidar._version import __version__
 from mars_lidar.dataset import cluster
-from mars_lidar.dataset.cluster import Team
+from mars_lidar.dataset.cluster import LOOK_S, Team
 from mars_lidar.dataset.ingest import create
 from mars_lidar.dataset.recipe import DatasetRecipe
 from mars_lidar.dataset.store import Dataset, Item, open_dataset
 from mars_lidar.dataset.write import Failed, Made, Maker
 from mars_lidar.io.scan import Problem
 
-_LOOK_S = 1.0  # after which it is looked whether there are more workers to give parts to
 _NAMED = 5  # parts that an error names
 BUFFER_BYTES = 512 * 2**20  # of all chunks that are made at the same time on one machine
 
@@ -253,7 +252,7 @@ def _make_all(team: AbstractContextManager[Team], todo: Sequence[Item], add: Cal
                 running.add(crew.executor.submit(crew.make, batch))
             if not running:
                 break
-            done, running = wait(running, timeout=_LOOK_S, return_when=FIRST_COMPLETED)  # workers may come and go
+            done, running = wait(running, timeout=LOOK_S, return_when=FIRST_COMPLETED)  # workers may come and go
             for future in done:
                 for each in future.result():
                     if isinstance(each, Failed):

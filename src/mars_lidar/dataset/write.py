@@ -46,10 +46,13 @@ class Failed:
     reason: str
 
 
-TRANSIENT = frozenset(
-    {errno.EIO, errno.EAGAIN, errno.EBUSY, errno.EINTR, errno.ETIMEDOUT, errno.ESTALE, errno.EREMOTEIO}
-    | {errno.ECONNRESET, errno.ECONNABORTED, errno.ENETUNREACH, errno.EHOSTUNREACH}
+_TRANSIENT_NAMES = (
+    *("EIO", "EAGAIN", "EBUSY", "EINTR", "ETIMEDOUT", "ESTALE", "EREMOTEIO"),
+    *("ECONNRESET", "ECONNABORTED", "ENETUNREACH", "EHOSTUNREACH"),
 )
+TRANSIENT = frozenset(
+    getattr(errno, name) for name in _TRANSIENT_NAMES if hasattr(errno, name)
+)  # not all everywhere
 """Errors of a shared file system that are often gone at the next attempt; a full disk, say, is not among them."""
 
 

@@ -50,9 +50,7 @@ _TRANSIENT_NAMES = (
     *("EIO", "EAGAIN", "EBUSY", "EINTR", "ETIMEDOUT", "ESTALE", "EREMOTEIO"),
     *("ECONNRESET", "ECONNABORTED", "ENETUNREACH", "EHOSTUNREACH"),
 )
-TRANSIENT = frozenset(
-    getattr(errno, name) for name in _TRANSIENT_NAMES if hasattr(errno, name)
-)  # not all everywhere
+TRANSIENT = frozenset(getattr(errno, name) for name in _TRANSIENT_NAMES if hasattr(errno, name))  # not all everywhere
 """Errors of a shared file system that are often gone at the next attempt; a full disk, say, is not among them."""
 
 

@@ -18,7 +18,7 @@ def cubes(seed, batches, size):
         SYSTEM, size=size, batch_size=8, epoch_size=8 * batches, signal=LogUniform(0.02, 0.5), seed=seed
     )
     for batch in DataLoader(stream, batch_size=None):
-        yield batch["cube"], batch["flux"]["delay"] / SYSTEM.bin_ns
+        yield batch["counts"], batch["flux"]["delay"] / SYSTEM.bin_ns
 
 
 def train(batches=300, size=32):

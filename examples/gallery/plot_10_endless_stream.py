@@ -22,13 +22,13 @@ optimizer = optim.AdamW(net.parameters(), 3e-3)
 for batch in CubeStream(system, size=32, batch_size=8, epoch_size=8 * 60, signal=LogUniform(0.02, 0.5), seed=1):
     optimizer.zero_grad()
     place = (batch["flux"]["delay"] / system.bin_ns).long() % 64
-    nn.functional.cross_entropy(net(batch["cube"].log1p()), place).backward()
+    nn.functional.cross_entropy(net(batch["counts"].log1p()), place).backward()
     optimizer.step()
 
 (test,) = CubeStream(system, size=64, batch_size=1, epoch_size=1, signal=0.05, seed=2)
 truth = test["depth"][0]
-matched = ml.reconstruct(test["cube"][0].movedim(0, -1).numpy(), system, "matched_filter").depth_m
-learned = 0.1499 * system.bin_ns * (net(test["cube"].log1p()).argmax(1)[0] + 0.5)
+matched = ml.reconstruct(test["counts"][0].movedim(0, -1).numpy(), system, "matched_filter").depth_m
+learned = 0.1499 * system.bin_ns * (net(test["counts"].log1p()).argmax(1)[0] + 0.5)
 fig, axes = plt.subplots(1, 3, figsize=(8.2, 2.9))
 for ax, name, depth in zip(
     axes, ("true depth", "matched filter", "network"), (truth, from_numpy(matched), learned), strict=True

@@ -1,23 +1,24 @@
-"""Data of the downstream experiment: scenes, what is fixed before the first run, and every simulator's cubes."""
+"""Data of the downstream experiment: scenes, what is fixed before the first run, and every simulator's pixels."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar import Scene, Table, simulate
+from mars_lidar import Flux, Scene, System, Table, simulate
+from mars_lidar._base.types import FloatArray
 from mars_lidar.engines import Engine, MarsEngine, RenewalEngine
 from mars_lidar.learn import CubeStream, Uniform
 from mars_lidar.table.entries import StartPhases
-from studies.common.sample import system_of
+from studies.common.sample import PERIOD_NS, system_of
+from studies.common.windows import FEATURES, WINDOW, features
 from studies.neural import NeuralEngine
 
-SYSTEM = system_of(75.0, 1000)  # that of the network beside studies/neural
 WORDS = {
     "poisson": "Poisson",
     "renewal": "renewal",
@@ -26,156 +27,225 @@ WORDS = {
     "mars": "MaRS, ours",
     "exact": "exact",
 }
+MAIN = 0.5625  # t_d / t_r of the table: 75 ns
+PAIR = ("exact", "mars")  # of the same count law and mean histogram: they differ in the covariance of the bins
+GOLD = "sequential"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sizes:
+    """All that a network's result depends on beside its simulator, dead time, ratio and seed.
+
+    `train` and `test` (first, number) of rooms, which are disjoint; `photons` signal photons per period of a
+    reflectivity of 1; `render` side of a room's picture, `size` of a test scene cut from it; `crops` of `crop` x `crop`
+    pixels to train on, all fresh for each network; `steps` of the pixel and of the spatial network, of `batch`
+    crops' worth of pixels each; `table` points of the tables' axes.
+    """
+
+    name: str = "networks"
+    steps: tuple[int, int] = (1600, 1000)
+    batch: tuple[int, int] = (2, 4)
+    crops: int = 256
+    crop: int = 32
+    train: tuple[int, int] = (1000, 100)
+    test: tuple[int, int] = (3000, 12)
+    size: int = 64
+    render: int = 160
+    table: tuple[int, int] = (256, 100)
+    photons: float = 4.0
+    depth_scale: tuple[float, float] = (0.4, 1.1)
+    lights: int = 12
+    seed: int = 20_265
 
 
 @dataclass(frozen=True, kw_only=True)
 class Config:
-    """All that is fixed before the first run.
+    """Which networks are trained: `arms` at `MAIN` and every ratio, `PAIR` at the dead times `dead` and ratio 1.
 
-    `arms` simulators, and the seeds of their networks; `train` and `test` (first, number) of rooms, which are
-    disjoint; `photons` signal photons per period of a reflectivity of 1; `render` side of a room's picture, `size` of a
-    test scene cut from it, `crop` of the stream's; `depth_range_m` and 1 the ranges of PSNR; `steps` of the window
-    network and of the bin network, `batch` crops each; `table` points of the tables' axes.
+    Networks of equal `sizes` are shared: what one configuration has trained, another uses. `spatial` seeds of the
+    spatial network, at `MAIN`; `lines` dead times of the closed form, in periods.
     """
 
     name: str
-    steps: tuple[int, int]
-    train: tuple[int, int] = (1000, 40)
-    test: tuple[int, int] = (3000, 8)
-    arms: dict[str, tuple[int, ...]]
-    sbr: tuple[float, ...] = (0.6, 1.0)
-    size: int = 64
-    render: int = 160
-    crop: int = 32
-    batch: int = 2
-    table: tuple[int, int] = (256, 100)
-    photons: float = 4.0
-    depth_range_m: float = 10.0
-    depth_scale: tuple[float, float] = (0.4, 1.1)
-    gold: str = "sequential"
-    seed: int = 20_265
+    sizes: Sizes = Sizes()
+    arms: tuple[str, ...] = ("exact", "mars", "nearest", "neural", "renewal", "poisson")
+    sbr: tuple[float, ...] = (1.0, 0.6)
+    dead: tuple[float, ...] = (0.95, 0.1, 0.3, 0.75)
+    seeds: int = 3
+    spatial: int = 0
+    lines: tuple[float, ...] = (0.1, 0.2, 0.3, 0.45, 0.5625, 0.65, 0.75, 0.85, 0.95)
 
 
-_ONE, _THREE = (0,), (0, 1, 2)
-_SMALL = Config(
-    name="small",
-    steps=(150, 150),
-    arms=dict.fromkeys(WORDS, _THREE),
-    test=(3000, 6),
-)
-_FULL = replace(
-    _SMALL,
-    name="full",
-    steps=(3000, 3000),
-    train=(1000, 400),
-    test=(3000, 40),
-    batch=4,
-)
-_TINY = replace(
-    _SMALL,
+_TINY = Sizes(
     name="tiny",
-    steps=(4, 4),
-    arms={"poisson": _ONE, "neural": _ONE, "mars": (0, 1)},
-    sbr=(1.0,),
+    steps=(30, 4),
+    batch=(1, 1),
+    crops=4,
+    crop=16,
     train=(1000, 3),
     test=(3000, 2),
     size=16,
     render=32,
-    crop=8,
     table=(10, 8),
+    lights=2,
 )
-CONFIGS = {config.name: config for config in (_SMALL, _FULL, _TINY)}
+CONFIGS = {
+    "small": Config(name="small", seeds=1, dead=(0.95, 0.1)),
+    "full": Config(name="full", spatial=3),
+    "tiny": Config(
+        name="tiny",
+        sizes=_TINY,
+        arms=(*PAIR, "poisson"),
+        sbr=(1.0,),
+        dead=(0.1,),
+        seeds=2,
+        spatial=1,
+        lines=(0.1, MAIN),
+    ),
+}
 
 
-def room(number: int, config: Config) -> Scene:
+def instrument(dead: float) -> System:
+    """The instrument with a dead time of `dead` periods."""
+    return system_of(dead * PERIOD_NS, 1000)
+
+
+def room(number: int, sizes: Sizes) -> Scene:
     """A room of its own furniture, at the scale of its own camera: those of all rooms stand at the same place."""
-    scene = Scene.example("room", size=config.render, seed=number)
-    return Scene(scene.depth_m * _random(config, number).uniform(*config.depth_scale), scene.reflectivity)
+    scene = Scene.example("room", size=sizes.render, seed=number)
+    return Scene(scene.depth_m * _random(sizes, number).uniform(*sizes.depth_scale), scene.reflectivity)
 
 
-def crop(number: int, config: Config) -> Scene:
-    """A part of a room, for a test."""
-    top, left = _random(config, number, 1).integers(0, config.render - config.size + 1, 2)
-    return room(number, config)[top : top + config.size, left : left + config.size]
+def test_scene(number: int, sizes: Sizes) -> Scene:
+    """A part of a room."""
+    top, left = _random(sizes, number, 1).integers(0, sizes.render - sizes.size + 1, 2)
+    return room(number, sizes)[top : top + sizes.size, left : left + sizes.size]
 
 
-def level(scene: Scene, config: Config) -> float:
+def level(scene: Scene, sizes: Sizes) -> float:
     """Mean signal at which a reflectivity means the same photons in every scene."""
-    return config.photons * float(scene.reflectivity[scene.valid].mean())
+    return sizes.photons * float(scene.reflectivity[scene.valid].mean())
 
 
-def _random(config: Config, *numbers: int) -> np.random.Generator:
-    return np.random.default_rng([config.seed, *numbers])
+def _random(sizes: Sizes, *numbers: int) -> np.random.Generator:
+    return np.random.default_rng([sizes.seed, *numbers])
+
+
+@dataclass(frozen=True, eq=False)
+class Pixels:
+    """What a network sees of images (N, H, W, FEATURES), float32, and the middle of each pixel's window, in bins.
+
+    `wanted` (N, H, W, 2), float32: reflectivity, and the delay from the middle of the window, in bins, NaN where the
+    window does not hold it.
+    """
+
+    seen: NDArray[np.float32]
+    middle: FloatArray
+    wanted: NDArray[np.float32]
+
+    @classmethod
+    def empty(cls, *shape: int) -> Pixels:
+        """Memory for images of `shape` (N, H, W)."""
+        return cls(np.empty((*shape, FEATURES), np.float32), np.empty(shape), np.empty((*shape, 2), np.float32))
+
+    def put(self, k: int, counts: NDArray[Any], reflectivity: Any, delay: Any) -> None:
+        """Image k: histograms (H, W, bins), and maps of reflectivity and of the delay in bins."""
+        bins = counts.shape[-1]
+        seen, middle = features(counts.reshape(-1, bins))
+        self.seen[k], self.middle[k] = seen.reshape(self.seen[k].shape), middle.reshape(self.middle[k].shape)
+        away = (np.asarray(delay) - self.middle[k] + 0.5 * bins) % bins - 0.5 * bins
+        self.wanted[k, ..., 0] = reflectivity
+        self.wanted[k, ..., 1] = np.where(np.abs(away) < 0.5 * WINDOW, away, np.nan)
 
 
 _TRAINING, _OWN, _GOLD = range(3)  # streams of noise
 
 
 class Data:
-    """Test scenes, and the cubes of every arm; a table is built when an arm first needs it."""
+    """Test scenes and the pixels of every simulator; a table is built when it is first needed."""
 
-    def __init__(self, config: Config) -> None:
-        self.config = config
-        first, number = config.test
-        self.test = [crop(first + k, config) for k in range(number)]
-        self.gold = lru_cache(partial(self._tested, config.gold, stream=_GOLD))  # of the test scenes, by ratio
-        self.own = partial(self._tested, stream=_OWN)  # the same by an arm
+    def __init__(self, sizes: Sizes) -> None:
+        self.sizes = sizes
+        first, number = sizes.test
+        self.test = [test_scene(first + k, sizes) for k in range(number)]
+        self.gold = lru_cache(1)(self._gold)  # histograms (N, H, W, bins) of the gold standard
+        self._table = lru_cache(None)(self._built)
 
-    def _tested(self, arm: str, sbr: float, stream: int) -> NDArray[Any]:
-        return self.cubes(arm, self.test, sbr, (self.config.seed << 8) + stream)
-
-    def cubes(self, arm: str, scenes: Sequence[Scene], sbr: float, seed: int) -> NDArray[Any]:
-        """Histograms (N, H, W, bins), one exposure of each scene; `arm` one of `WORDS`, or the gold standard."""
-        engine = self._engine(arm)
-        shape = (len(scenes), *scenes[0].shape, SYSTEM.bins)
-        out = np.empty(shape, SYSTEM.histogram_dtype)
-        for k, scene in enumerate(scenes):
-            flux = scene.flux(SYSTEM, signal=level(scene, self.config), sbr=sbr)
-            simulate(flux, SYSTEM, engine=engine, first_realization=k, seed=seed, threads=1, out=out[k : k + 1])
+    def _gold(self, dead: float, sbr: float) -> NDArray[Any]:
+        system = instrument(dead)
+        out = np.empty((len(self.test), *self.test[0].shape, system.bins), system.histogram_dtype)
+        for k, flux in enumerate(self.fluxes(dead, sbr)):
+            self._drawn(GOLD, flux, system, k, _GOLD, out[k : k + 1])
         return out
 
-    def stream(self, arm: str, sbr: float, seed: int) -> CubeStream:
-        """To train on: batches of crops of the training rooms, (N, H, W, bins) of counts, no exposure twice.
+    def fluxes(self, dead: float, sbr: float) -> list[Flux]:
+        """Light of the test scenes."""
+        return [scene.flux(instrument(dead), signal=level(scene, self.sizes), sbr=sbr) for scene in self.test]
+
+    def tested(self, arm: str, dead: float, sbr: float, *, gold: bool) -> Pixels:
+        """The test scenes by a simulator, or by the gold standard."""
+        system, shape = instrument(dead), self.test[0].shape
+        pixels = Pixels.empty(len(self.test), *shape)
+        cube = np.empty((1, *shape, system.bins), system.histogram_dtype)
+        for k, flux in enumerate(self.fluxes(dead, sbr)):
+            if not gold:
+                self._drawn(self.engine(arm, dead), flux, system, k, _OWN, cube)
+            counts = self.gold(dead, sbr)[k] if gold else cube[0]
+            pixels.put(k, counts, flux.signal / self.sizes.photons, flux.delay_ns / system.bin_ns)
+        return pixels
+
+    def _drawn(self, engine: str | Engine, flux: Flux, system: System, k: int, stream: int, out: NDArray[Any]) -> None:
+        seed = (self.sizes.seed << 8) + stream
+        simulate(flux, system, engine=engine, first_realization=k, seed=seed, threads=1, out=out)
+
+    def training(self, arm: str, dead: float, sbr: float, seed: int) -> Pixels:
+        """Crops of the training rooms, no exposure twice; the same light for every simulator.
 
         The mean signal is drawn from the range that whole rooms have: what a crop's own is, is for the network to see.
         """
-        config = self.config
-        levels = [level(scene, config) for scene in self._rooms]
-        return CubeStream(
-            SYSTEM,
+        sizes, system = self.sizes, instrument(dead)
+        levels = [level(scene, sizes) for scene in self._rooms]
+        stream = CubeStream(
+            system,
             self._rooms,
-            size=config.crop,
-            batch_size=config.batch,
+            size=sizes.crop,
+            batch_size=1,
+            epoch_size=sizes.crops,
             signal=Uniform(0.7 * min(levels), 1.3 * max(levels)),
             sbr=sbr,
-            engine=self._engine(arm),
+            engine=self.engine(arm, dead),
             axes="HWT",
             dtype=None,
-            seed=(config.seed << 8) + 16 * seed + _TRAINING,
+            seed=(sizes.seed << 8) + 16 * seed + _TRAINING,
             threads=1,
             ahead=0,
         )
+        pixels = Pixels.empty(sizes.crops, sizes.crop, sizes.crop)
+        for k, batch in enumerate(stream):
+            signal, delay = (batch["flux"][name][0].double().numpy() for name in ("signal", "delay"))
+            pixels.put(k, batch["counts"][0].numpy(), signal / sizes.photons, delay / system.bin_ns)
+        return pixels
 
     @cached_property
     def _rooms(self) -> list[Scene]:
-        first, number = self.config.train
-        return [room(first + k, self.config) for k in range(number)]
+        first, number = self.sizes.train
+        return [room(first + k, self.sizes) for k in range(number)]
 
-    def _engine(self, arm: str) -> str | Engine:
+    def engine(self, arm: str, dead: float) -> str | Engine:
+        """The simulator at a dead time."""
         if arm == "neural":
             return MarsEngine(self._neural, count="gaussian", outside="exact")
         if arm == "renewal":
-            return RenewalEngine(self._table, outside="exact")
+            return RenewalEngine(self._table(dead), outside="exact")
         if arm == "mars":
-            return MarsEngine(self._table, outside="exact")
+            return MarsEngine(self._table(dead), outside="exact")
         if arm == "nearest":  # the paper's: its count law, nearest grid point
-            return MarsEngine(self._table, count="gaussian", interpolation="nearest", outside="exact")
+            return MarsEngine(self._table(dead), count="gaussian", interpolation="nearest", outside="exact")
         return arm
 
-    @cached_property
-    def _table(self) -> Table:
-        s, b = self.config.table
-        return Table.build(SYSTEM, (0.01, 10.0, s), (0.01, 10.0, b), threads=1)
+    def _built(self, dead: float) -> Table:
+        s, b = (points if dead == MAIN else points // 2 for points in self.sizes.table)  # the paper's, for its row
+        return Table.build(instrument(dead), (0.01, 10.0, s), (0.01, 10.0, b), threads=1)
 
     @cached_property
     def _neural(self) -> Table:
@@ -183,47 +253,18 @@ class Data:
 
         The map itself takes a millisecond a pixel; it too is asked for at one delay, and its answer is moved.
         """
-        s, b = (np.geomspace(0.01, 10.0, max(4, points // 4)) for points in self.config.table)
-        exact = Table.build(SYSTEM, s, b, threads=1)
+        system = instrument(MAIN)
+        s, b = (np.geomspace(0.01, 10.0, max(4, points // 4)) for points in self.sizes.table)
+        exact = Table.build(system, s, b, threads=1)
         light = np.meshgrid(exact.signal, exact.background, indexing="ij")
         engine = NeuralEngine()
-        law = engine.count_law(*light, SYSTEM)
-        shape = engine.registration_pdf(*light, SYSTEM).reshape(-1, SYSTEM.bins).astype(np.float32)
+        law = engine.count_law(*light, system)
+        shape = engine.registration_pdf(*light, system).reshape(-1, system.bins).astype(np.float32)
         entries = replace(exact.entries, cumulants=law.cumulants.reshape(-1, 4), shape=shape, startup=None)
         return replace(exact, entries=entries, start_phases=StartPhases.none())
 
 
-def truths(scenes: Sequence[Scene]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Depth, m, NaN without a return, and reflectivity, 0 there: (N, H, W)."""
+def truths(scenes: Sequence[Scene]) -> tuple[FloatArray, FloatArray]:
+    """Reflectivity, 0 without a return, and depth, m, NaN there: (N, H, W)."""
     light = [np.where(scene.valid, scene.reflectivity, 0.0) for scene in scenes]
-    return np.stack([scene.depth_m for scene in scenes]), np.stack(light)
-
-
-QUARTERS = ("dimmest", "second", "third", "brightest")
-_STREAMS = (5, 6, 7)  # of the arms and of two exposures by the gold standard; others than those of the networks' data
-
-
-def count_bias(data: Data) -> dict[str, dict[str, list[float]]]:
-    """By ratio and arm: mean count over that of the gold standard, less 1, in quarters of the pixels by reflectivity.
-
-    Key ``"scatter"`` stands for the gold standard's own standard deviation of a pixel's count, over its mean: what a
-    bias is to be measured by.
-    """
-    config, reflectivity = data.config, np.stack([scene.reflectivity for scene in data.test]).ravel()
-    quarters = np.array_split(np.argsort(reflectivity, kind="stable"), len(QUARTERS))
-
-    def totals(arm: str, sbr: float, stream: int) -> NDArray[np.float64]:
-        cubes = data.cubes(arm, data.test, sbr, (config.seed << 8) + stream)
-        return np.asarray(cubes.sum(axis=-1, dtype=np.float64)).ravel()
-
-    def by_quarter(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.array([values[pixels].mean() for pixels in quarters])
-
-    found: dict[str, dict[str, list[float]]] = {}
-    for sbr in config.sbr:
-        first, second = (totals(config.gold, sbr, stream) for stream in _STREAMS[1:])
-        gold = 0.5 * by_quarter(first + second)
-        rows = {arm: by_quarter(totals(arm, sbr, _STREAMS[0])) / gold - 1.0 for arm in config.arms}
-        rows["scatter"] = np.sqrt(0.5 * by_quarter((first - second) ** 2)) / gold
-        found[f"{sbr:g}"] = {name: row.tolist() for name, row in rows.items()}
-    return found
+    return np.stack(light), np.stack([scene.depth_m for scene in scenes])

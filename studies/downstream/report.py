@@ -1,22 +1,21 @@
-"""The report of the downstream experiment: the paper's table beside ours, the gaps with their spread, pictures."""
+"""The report of the downstream experiment: the paper's table beside ours, the loss by the joint law, one figure."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from pathlib import Path
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from mars_lidar._base.types import FloatArray
+from mars_lidar.plot.style import COLOURS
 from studies import Facts
-from studies.common.kept import spread
+from studies.common.draw import legend_below, panels
 from studies.common.report import Row
-from studies.downstream import run
-from studies.downstream.budget import arithmetic
-from studies.downstream.data import CONFIGS, QUARTERS, SYSTEM, WORDS, Config, crop
-from studies.downstream.run import MODELS, TARGETS, Run, by_arm
+from studies.downstream import data
+from studies.downstream.data import MAIN, PAIR, WORDS, Config, instrument
+from studies.downstream.run import Run
 
 PAPER = {  # T5 of arXiv 2512.04924: by ratio and arm, own then gold; reflectivity PSNR in dB, depth RMSE in m
     (0.6, "poisson"): ((36.49, 0.072), (7.02, 1.654)),
@@ -28,9 +27,14 @@ PAPER = {  # T5 of arXiv 2512.04924: by ratio and arm, own then gold; reflectivi
     (1.0, "neural"): ((21.95, 0.051), (22.21, 0.119)),
     (1.0, "nearest"): ((24.28, 0.055), (23.58, 0.095)),
 }
-LEAST = {"poisson": 10.0, "renewal": 10.0}  # dB by which reflectivity falls at least
-MOST = {"mars": 2.0, "exact": 0.3}  # and at most
-TIMES, BELOW = 2.0, 4.0  # of maximum likelihood's depth RMSE the bin network has at most, and times below the filter's
+FROM_BOUND, OF_BEST = (
+    0.5,
+    1.1,
+)  # dB from the bound, and times maximum likelihood's depth RMSE, of exact-trained networks
+CLOSE, LEAST = 1.0, 1.5  # dB from the closed form, and lost at least at `MAIN` and ratio 1, by MaRS-trained ones
+CALIBRATED = 0.01  # by which the coverage of exact-trained 90 % intervals may be wrong
+_DRAWS = 2000  # of the bootstrap
+KINDS = {"pixel": "pixel network", "spatial": "spatial network"}
 ASSUMED = (
     "the scenes, the light (S = 4 x reflectivity) and the system, which the paper does not give in full",
     "the networks: small ones that use the bins, in place of the paper's U-Net of the kind of DDPMs",
@@ -39,121 +43,181 @@ ASSUMED = (
     "read here as the first pair is",
 )
 
+Found = Mapping[Run, Any]
+Places = Mapping[tuple[float, float], Any]
 
-def facts(
-    folder: Path,
-    config: Config,
-    found: Mapping[Run, Any],
-    references: Mapping[str, Mapping[str, float]],
-    counts: Mapping[str, Mapping[str, list[float]]],
-) -> Facts:
-    """What the report states of the results by run, with a figure for each ratio."""
+
+def facts(config: Config, found: Found, methods: Places, lines: Places) -> Facts:
+    """What the report states of the results by run, and the figure."""
+    pairs = [_pair(found, kind, place, lines) for kind, place in _paired(found)]
     return {
         "c": config,
-        "full": CONFIGS["full"],
-        "system": SYSTEM,
-        "arithmetic": arithmetic,
+        "data": data,
+        "system": instrument(MAIN),
         "minutes": sum(result["seconds"] for result in found.values()) / 60.0,
-        "arms": list(by_arm(found)),
-        "models": MODELS,
-        "run": run,
-        "over": over,
-        "falls": falls,
-        "findings": {sbr: list(_findings(found, sbr, references[f"{sbr:g}"])) for sbr in config.sbr},
-        "references": references,
-        "quarters": QUARTERS,
-        "counts": counts,
-        "words": WORDS,
-        "rows": _csv(found),
-        "figures": {f"sbr{sbr:g}": picture(folder, config, found, sbr) for sbr in config.sbr},
+        "table_rows": [row for sbr in config.sbr for row in _rows(found, methods[MAIN, sbr], sbr)],
+        "pairs": pairs,
+        "findings": list(_findings(found, methods, pairs, config)),
+        "rows": _csv(found, methods),
+        "figures": {"": picture(found, lines, config)},
     }
 
 
-def _values(results: list[Any], where: str, model: str, target: str, measure: str) -> list[float]:
-    return [result[where][model][target][measure] for result in results]
+def of(found: Found, kind: str, arm: str, dead: float, sbr: float, where: str, measure: str) -> FloatArray:
+    """One measure (seeds, scenes); no rows where there is no such network."""
+    runs = [one for one in found if (one.kind, one.arm, one.dead, one.sbr) == (kind, arm, dead, sbr)]
+    return np.array([found[one][where][measure] for one in runs])
 
 
-def over(results: list[Any], where: str, model: str, target: str, measure: str, digits: int) -> str:
-    """One measure over the seeds; "-" where the model does not tell that map or interval."""
-    try:
-        return spread(_values(results, where, model, target, measure), digits)
-    except KeyError:
-        return "-"
+def scatter(values: FloatArray) -> float:
+    """Standard deviation of the mean of `values` (seeds, scenes) by drawing both anew with replacement."""
+    random = np.random.default_rng(0)
+    seeds, scenes = values.shape
+    rows = random.integers(0, seeds, (_DRAWS, seeds, 1))
+    columns = random.integers(0, scenes, (_DRAWS, 1, scenes))
+    return float(values[rows, columns].mean((1, 2)).std(ddof=1))
 
 
-def falls(results: list[Any], model: str) -> str:
-    """PSNR of reflectivity, own less gold, dB."""
-    own, gold = (_values(results, where, model, "reflectivity", "psnr") for where in ("own", "gold"))
-    return spread([a - b for a, b in zip(own, gold, strict=True)], 2)
+def rms(square: FloatArray) -> float:
+    """Root of a mean of squares."""
+    return float(np.sqrt(square.mean()))
 
 
-def _findings(found: Mapping[Run, Any], ratio: float, references: Mapping[str, float]) -> Iterator[tuple[str, bool]]:
-    """What was expected, and whether it came so."""
-    arms = {arm: results for arm, sbr, results in by_arm(found) if sbr == ratio}
-    for arm, limit in (LEAST | MOST).items():
-        if arm not in arms:
-            continue
-        for model, words in MODELS.items():
-            own, gold = (np.mean(_values(arms[arm], where, model, "reflectivity", "psnr")) for where in ("own", "gold"))
-            fall, sign = float(own - gold), "at least" if arm in LEAST else "at most"
-            holds = fall >= limit if arm in LEAST else abs(fall) <= limit
-            yield f"{words}, trained on {WORDS[arm]}: reflectivity falls by {fall:.2f} dB ({sign} {limit:g})", holds
-    if "exact" in arms:
-        told = {name: float(np.mean(_values(arms["exact"], "gold", name, "reflectivity", "psnr"))) for name in MODELS}
-        for name in ("window", "bins"):
-            gain = told[name] - told["polynomial"]
-            words = (
-                f"{MODELS[name]}, trained on exact: {gain:+.2f} dB on the polynomial's reflectivity (better than it)"
-            )
-            yield words, gain > 0.0
-        bins = float(np.mean(_values(arms["exact"], "gold", "bins", "depth", "rmse")))
-        best, filtered = references["maximum likelihood"], references["matched filter"]
-        yield (
-            f"bin network, trained on exact: depth RMSE {bins:.4f} m, {bins / best:.2f} times maximum likelihood's "
-            f"(at most {TIMES:g}), {filtered / bins:.1f} times below the matched filter's (at least {BELOW:g})",
-            bins <= TIMES * best and bins * BELOW <= filtered,
-        )
-
-
-def _csv(found: Mapping[Run, Any]) -> list[Row]:
+def _rows(found: Found, methods: Mapping[str, Any], sbr: float) -> list[Row]:
     rows: list[Row] = []
-    for one, result in found.items():
-        for where in ("own", "gold"):
-            for model, targets in result[where].items():
-                for target, measures in targets.items():
-                    row: dict[str, Any] = {"arm": one.arm, "sbr": one.sbr, "seed": one.seed, "model": model}
-                    row |= {"tested": where, "target": target} | measures
-                    rows.append(row | {"covered": measures.get("covered", "")})
+    for kind, words in KINDS.items():
+        for arm, name in WORDS.items():
+            psnr, square, covered, depth_covered, ssim = (
+                {where: of(found, kind, arm, MAIN, sbr, where, key) for where in ("own", "gold")}
+                for key in ("psnr", "depth_square", "covered", "depth_covered", "ssim")
+            )
+            if not psnr["gold"].size:
+                continue
+            paper = PAPER.get((sbr, arm)) if kind == "pixel" else None
+            rows.append(
+                {
+                    "SBR": f"{sbr:g}",
+                    "estimate": f"{words}, {name}",
+                    "reflectivity, own, dB": f"{psnr['own'].mean():.2f}",
+                    "gold, dB": f"{psnr['gold'].mean():.2f} ± {scatter(psnr['gold']):.2f}",
+                    "SSIM, gold": f"{ssim['gold'].mean():.3f}",
+                    "depth, own, mm": f"{1e3 * rms(square['own']):.2f}",
+                    "gold, mm": f"{1e3 * rms(square['gold']):.2f}",
+                    "90 % intervals cover, own": f"{covered['own'].mean():.3f} / {depth_covered['own'].mean():.3f}",
+                    "gold": f"{covered['gold'].mean():.3f} / {depth_covered['gold'].mean():.3f}",
+                    "paper: own": f"{paper[0][0]:.2f} / {paper[0][1]:.3f}" if paper else "-",
+                    "paper: gold": f"{paper[1][0]:.2f} / {paper[1][1]:.3f}" if paper else "-",
+                }
+            )
+    for name, row in methods.items():
+        values = np.array([row["psnr"]])
+        blank = dict.fromkeys(("depth, own, mm", "gold, mm", "90 % intervals cover, own", "gold"), "-")
+        rows.append(
+            {"SBR": f"{sbr:g}", "estimate": f"_{name}_", "reflectivity, own, dB": "-"}
+            | {"gold, dB": f"{values.mean():.2f} ± {scatter(values):.2f}"}
+            | {"SSIM, gold": f"{np.mean(row['ssim']):.3f}" if "ssim" in row else "-"}
+            | blank
+            | {"gold, mm": f"{1e3 * rms(np.array(row['depth_square'])):.2f}", "paper: own": "-", "paper: gold": "-"}
+        )
     return rows
 
 
-_SHORT = {"poisson": "Poisson", "nearest": "MaRS, nearest", "mars": "MaRS"}
+def _paired(found: Found) -> list[tuple[str, tuple[float, float]]]:
+    """Kinds and places (dead time, ratio) where both of the pair were trained, by equally many seeds."""
+    places = sorted({(one.kind, (one.dead, one.sbr)) for one in found})
+
+    def number(kind: str, place: tuple[float, float], arm: str) -> int:
+        return len(of(found, kind, arm, *place, "gold", "psnr"))
+
+    return [one for one in places if number(*one, PAIR[0]) == number(*one, PAIR[1]) > 0]
 
 
-def picture(folder: Path, config: Config, found: Mapping[Run, Any], sbr: float) -> Figure:
-    """The first test scene: truth, and every arm's window network on its own and on gold-standard data."""
-    scene = crop(config.test[0], config)
-    arms = list(config.arms)
-    figure = Figure(figsize=(1.05 * (len(arms) + 1), 4.7), dpi=90, layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.subplots(4, len(arms) + 1, squeeze=False)
-    for half, target in enumerate(TARGETS):
-        true = scene.depth_m if target == "depth" else scene.reflectivity
-        limits: dict[str, Any] = {"vmin": float(np.nanmin(true)), "vmax": float(np.nanmax(true))}
-        limits["cmap"] = "viridis" if target == "depth" else "gray"
-        axes[2 * half, 0].imshow(true, **limits)
-        axes[2 * half, 0].set_title(f"{target}, true")
-        axes[2 * half + 1, 0].axis("off")
-        for k, arm in enumerate(arms, 1):
-            one = Run(arm, sbr, config.arms[arm][0])
-            with np.load(folder / f"{one.name}.npz") as shown:
-                for row, data in enumerate(("own", "gold")):
-                    ax = axes[2 * half + row, k]
-                    ax.imshow(shown[f"{data}_window_{target}"], **limits)
-                    error = found[one][data]["window"][target]
-                    told = f"{error['rmse']:.3f} m" if target == "depth" else f"{error['psnr']:.1f} dB"
-                    ax.set_title(f"{_SHORT.get(arm, arm)}\n{data}: {told}" if row == 0 else f"{data}: {told}")
-    for ax in axes.flat:
-        ax.set(xticks=[], yticks=[])
-    figure.suptitle(f"Window networks, SBR {sbr:g}; figures under the names: over all test scenes", fontsize=8)
+def _pair(found: Found, kind: str, place: tuple[float, float], lines: Places) -> dict[str, Any]:
+    """Exact less MaRS on gold-standard data, scene by scene and seed by seed, beside the closed form."""
+    exact, mars = (of(found, kind, arm, *place, "gold", "psnr") for arm in PAIR)
+    sure, covered = (of(found, kind, arm, *place, "gold", "covered") for arm in PAIR)
+    return {
+        "kind": kind,
+        "dead": place[0],
+        "sbr": place[1],
+        "seeds": len(exact),
+        "lost": float((exact - mars).mean()),
+        "lost_error": scatter(exact - mars),
+        "lost_closed": lines[place]["lost"],
+        "exact": float(sure.mean()),
+        "exact_error": scatter(sure),
+        "mars": float(covered.mean()),
+        "mars_error": scatter(covered),
+        "closed": lines[place]["covered"],
+    }
+
+
+def _findings(found: Found, methods: Places, pairs: list[dict[str, Any]], config: Config) -> Any:
+    """What was expected, and whether it came so."""
+    for sbr in config.sbr:
+        own = methods[MAIN, sbr]
+        gold = of(found, "pixel", "exact", MAIN, sbr, "gold", "psnr").mean()
+        short = float(np.mean(own["Cramer-Rao bound"]["psnr"]) - gold)
+        yield f"SBR {sbr:g}: exact-trained, {short:.2f} dB from the bound (at most {FROM_BOUND})", short <= FROM_BOUND
+        depth = rms(of(found, "pixel", "exact", MAIN, sbr, "gold", "depth_square"))
+        times = depth / rms(np.array(own["maximum likelihood"]["depth_square"]))
+        yield (
+            f"SBR {sbr:g}: its depth, {times:.2f} times maximum likelihood's RMSE (at most {OF_BEST})",
+            times <= OF_BEST,
+        )
+    for one in pairs:
+        where = f"{KINDS[one['kind']]}, t_d = {one['dead']:g} t_r, SBR {one['sbr']:g}"
+        if (one["kind"], one["dead"], one["sbr"]) == ("pixel", MAIN, 1.0):
+            yield f"{where}: {one['lost']:.2f} dB lost (at least {LEAST})", one["lost"] >= LEAST
+        if one["kind"] == "pixel":
+            off = one["lost"] - one["lost_closed"]
+            yield f"{where}: {off:+.2f} dB from the closed form (within {CLOSE:g})", abs(off) <= CLOSE
+        holds = abs(one["exact"] - 0.9) <= CALIBRATED
+        yield f"{where}: exact-trained 90 % intervals cover {one['exact']:.3f} (within {CALIBRATED} of 0.9)", holds
+
+
+def _csv(found: Found, methods: Places) -> list[Row]:
+    rows: list[Row] = []
+    columns = ("psnr", "ssim", "depth_square", "covered", "depth_covered")
+
+    def add(about: dict[str, Any], judged: Mapping[str, list[float]]) -> None:
+        for scene in range(len(judged["psnr"])):
+            measures = {name: judged[name][scene] if name in judged else "" for name in columns}
+            rows.append(about | {"scene": scene} | measures)
+
+    for one, result in found.items():
+        about = {"estimate": one.kind, "trained": one.arm, "dead": one.dead, "sbr": one.sbr, "seed": one.seed}
+        for where in ("own", "gold"):
+            add(about | {"tested": where}, result[where])
+    for (dead, sbr), named in methods.items():
+        for name, judged in named.items():
+            about = {"estimate": name, "trained": "", "dead": dead, "sbr": sbr, "seed": ""}
+            add(about | {"tested": "gold"}, judged)
+    return rows
+
+
+def picture(found: Found, lines: Places, config: Config) -> Figure:
+    """dB lost and coverage over the dead time: networks as dots, the closed form as lines."""
+    figure, ((left, right),) = panels(3.2, 1, 2)
+    looks = dict(zip(config.sbr, COLOURS, strict=False))
+    for sbr, colour in looks.items():
+        law = sorted((dead, row) for (dead, ratio), row in lines.items() if ratio == sbr)
+        dead = [one for one, _ in law]
+        left.plot(dead, [row["lost"] for _, row in law], color=colour, label=f"closed form, SBR {sbr:g}")
+        right.plot(dead, [row["covered"] for _, row in law], color=colour, label=f"closed form, SBR {sbr:g}")
+    for kind, place in _paired(found):
+        one, colour = _pair(found, kind, place, lines), looks[place[1]]
+        dot: dict[str, Any] = {"fmt": "o" if kind == "pixel" else "s", "color": colour, "capsize": 2, "ms": 4}
+        label = f"{KINDS[kind]}s, SBR {place[1]:g}"
+        left.errorbar(place[0], one["lost"], one["lost_error"], label=label, **dot)
+        right.errorbar(place[0], one["mars"], one["mars_error"], label=label, **dot)
+        sure = dot | {"mfc": "white"}
+        right.errorbar(
+            place[0], one["exact"], one["exact_error"], label="trained on exact", **(sure | {"color": "0.4"})
+        )
+    left.axhline(0.0, color="0.7", lw=0.8, zorder=0)
+    right.axhline(0.9, color="0.7", lw=0.8, zorder=0)
+    left.set(xlabel="$t_d / t_r$", ylabel="reflectivity lost by training on MaRS, dB")
+    right.set(xlabel="$t_d / t_r$", ylabel="share of 90 % intervals that hold the truth")
+    legend_below(figure, (left, right), 3)
     return figure

@@ -209,7 +209,7 @@ def test_training(tmp_path, of_transients):
         CubeStream(SYSTEM, tmp_path / "set.zarr")
     of_transients["scenes"] = [{"example": "room", "size": list(SHAPE), "fog": FOGS[0]}]
     ml.generate(of_transients, tmp_path / "fog.zarr")
-    assert next(iter(CubeStream(SYSTEM, tmp_path / "fog.zarr")))["cube"].shape == (32, *SHAPE)
+    assert next(iter(CubeStream(SYSTEM, tmp_path / "fog.zarr")))["counts"].shape == (32, *SHAPE)
 
 
 @pytest.mark.parametrize(

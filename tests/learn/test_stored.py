@@ -50,14 +50,14 @@ def test_examples_are_the_exposures(path):
     assert numbers(examples) != EVERY
     assert sorted(numbers(examples)) == EVERY
     for one in examples:
-        assert one["histogram"].shape == (32, 6, 8)
-        assert one["histogram"].dtype == torch.float32
+        assert one["counts"].shape == (32, 6, 8)
+        assert one["counts"].dtype == torch.float32
         counts = np.asarray(stored.histogram[one["sample"], one["realization"]])
-        np.testing.assert_array_equal(one["histogram"].permute(1, 2, 0).numpy(), counts)
+        np.testing.assert_array_equal(one["counts"].permute(1, 2, 0).numpy(), counts)
         np.testing.assert_array_equal(one["signal"].numpy(), np.asarray(stored.maps["signal"][one["sample"]]))
         assert one["seed"].item() == int(stored.seeds[one["sample"]])
     numbered = {"sample", "realization", "scene", "system", "signal_level", "sbr", "seed"}
-    assert set(examples[0]) == {"histogram", "depth", "signal"} | numbered
+    assert set(examples[0]) == {"counts", "depth", "signal"} | numbered
 
 
 @pytest.mark.parametrize("seed", [0x243F6A8885A308D3, 0x13198A2E03707344, 0xA4093822299F31D0, 2**64 - 1])
@@ -77,7 +77,7 @@ def test_the_documented_loop_over_any_dataset_seed(tmp_path, seed):
         train.set_epoch(epoch)
         told = {}
         for batch in DataLoader(train, batch_size=2):
-            assert batch["histogram"].shape == (2, 32, 4, 5)
+            assert batch["counts"].shape == (2, 32, 4, 5)
             told |= dict(zip(batch["sample"].tolist(), batch["seed"].tolist(), strict=True))
         assert told == dict(enumerate(stored.seeds.tolist()))
 
@@ -107,14 +107,14 @@ def test_some_samples_with_workers_of_a_loader(path):
     dataset = StoredDataset(path, samples=[5, 1, 2], axes="HWT", dtype=torch.int32, seed=4)
     with torch.random.fork_rng():
         batches = list(DataLoader(dataset, batch_size=4, num_workers=2))
-    assert batches[0]["histogram"].shape == (4, 6, 8, 32)
-    assert batches[0]["histogram"].dtype == torch.int32
+    assert batches[0]["counts"].shape == (4, 6, 8, 32)
+    assert batches[0]["counts"].dtype == torch.int32
     found = sorted((int(s), int(r)) for b in batches for s, r in zip(b["sample"], b["realization"], strict=True))
     assert found == [one for one in EVERY if one[0] in (1, 2, 5)]
 
 
 def test_transform_and_bad_arguments(path):
-    dataset = StoredDataset(path, transform=lambda one: one["histogram"].sum(0), shuffle=False)
+    dataset = StoredDataset(path, transform=lambda one: one["counts"].sum(0), shuffle=False)
     assert next(iter(dataset)).shape == (6, 8)
     for options, error, told in (
         ({"samples": [6]}, ValueError, r"samples must lie in \[0, 6\), got 6"),

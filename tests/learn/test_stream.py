@@ -69,9 +69,9 @@ def test_batches_do_not_depend_on_workers(workers, settings):
     together = list(loader(dataset, workers, batch_size=None))
     assert len(together) == 6
     for first, second in zip(alone, together, strict=True):
-        if first["cube"].is_sparse:
-            assert second["cube"].is_coalesced()
-            first, second = ({**one, "cube": one["cube"].to_dense()} for one in (first, second))
+        if first["counts"].is_sparse:
+            assert second["counts"].is_coalesced()
+            first, second = ({**one, "counts": one["counts"].to_dense()} for one in (first, second))
         assert_same(first, second)
 
 
@@ -95,7 +95,7 @@ def test_epochs_seeds_and_threads_differ_or_not_as_they_should():
     other = stream()
     other.set_epoch(1)
     for one in (next(iter(other)), next(iter(stream(seed=4)))):
-        assert not torch.equal(first["cube"], one["cube"])
+        assert not torch.equal(first["counts"], one["counts"])
         assert int(one["seed"]) != int(first["seed"])
     assert_same(first, next(iter(other.__class__(SYSTEMS, size=6, seed=3))))  # without end: the same samples
 
@@ -256,7 +256,7 @@ def test_cube_is_that_of_the_sample():
     for one in itertools.islice(iter(dataset), 8):
         told = dataset.sample(int(one["index"]))
         cube = ml.simulate(told.flux, told.system, seed=told.seed)[0]
-        np.testing.assert_array_equal(one["cube"].numpy(), cube)
+        np.testing.assert_array_equal(one["counts"].numpy(), cube)
         np.testing.assert_array_equal(one["flux"]["signal"].numpy(), told.flux.signal.astype(np.float32))
         assert int(one["seed"]) == told.seed
         np.testing.assert_allclose(
@@ -281,7 +281,7 @@ def test_flips_and_crops_turn_maps_and_cube_together():
         np.testing.assert_array_equal(columns, columns[:1, :1] + right * np.arange(5) + 0 * rows)
         seen.add((int(down), int(right)))
         np.testing.assert_allclose(one["reflectivity"], scene.reflectivity[rows, columns], rtol=1e-6)
-        peak = (one["cube"].argmax(0).numpy() + 0.5) * bright.bin_ns
+        peak = (one["counts"].argmax(0).numpy() + 0.5) * bright.bin_ns
         np.testing.assert_allclose(peak, bright.delay_ns(one["depth"].numpy()), atol=3 * 0.05 + bright.bin_ns)
     assert seen == {(1, 1), (1, -1), (-1, 1), (-1, -1)}
     for one in stream(bright, scene, size=10, epoch_size=3, flips=False):
@@ -349,7 +349,7 @@ def test_arrays_are_scenes(tmp_path):
         assert_same(first, second)
     whole = [one["depth"] for one in stream(SYSTEM, depth, size=None, flips=False, epoch_size=5)]
     assert sorted(float(one[0, 0]) for one in whole) == sorted(depth[:, 0, 0].astype(np.float32).tolist())
-    assert next(iter(stream(SYSTEM, depth[0], size=None)))["cube"].shape == (64, 6, 7)
+    assert next(iter(stream(SYSTEM, depth[0], size=None)))["counts"].shape == (64, 6, 7)
     assert float(next(iter(stream(SYSTEM, depth)))["reflectivity"].min()) == 1.0
     for wrong, told in (
         ({"depth": depth, "reflectivity": reflectivity[:4]}, "maps of one shape"),
@@ -445,17 +445,17 @@ def test_ranks_of_torchrun(monkeypatch):
 
 def test_buffers_are_not_given_out_while_they_are_held():
     dataset = stream(SYSTEM, batch_size=2, epoch_size=40, repeat=True)
-    held = [one["cube"][0] for one in dataset]  # a view keeps the memory
-    copies = [one["cube"][0].clone() for one in dataset]
+    held = [one["counts"][0] for one in dataset]  # a view keeps the memory
+    copies = [one["counts"][0].clone() for one in dataset]
     assert len({one.data_ptr() for one in held}) == len(held)
     for first, second in zip(held, copies, strict=True):
         assert torch.equal(first, second)
-    freed = {one["cube"].data_ptr() for one in dataset}
+    freed = {one["counts"].data_ptr() for one in dataset}
     assert len(freed) <= 6  # memory is used again
 
 
 def _half(example):
-    return example["cube"][:32], {"own": example["cube"].sum(), "index": example["index"]}
+    return example["counts"][:32], {"own": example["counts"].sum(), "index": example["index"]}
 
 
 @pytest.mark.full
@@ -467,24 +467,24 @@ def test_what_workers_pass_on_is_not_overwritten_while_it_is_held(settings):
     As PyTorch sees them they are ordinary tensors, also where the loader stacks them, and after a transform.
     """
     dataset = stream(SYSTEM, epoch_size=40, repeat=True, **settings)
-    held = [(one["cube"][..., :3].numpy(), one) for one in loader(dataset, 2, batch_size=None)]
+    held = [(one["counts"][..., :3].numpy(), one) for one in loader(dataset, 2, batch_size=None)]
     for (part, one), alone in zip(held, dataset, strict=True):
-        assert type(one["cube"]) is torch.Tensor
+        assert type(one["counts"]) is torch.Tensor
         assert_same(one, alone)
-        assert np.array_equal(part, alone["cube"][..., :3].numpy())
-        one["cube"].zero_()  # it is the receiver's own
-    again = [one["cube"].data_ptr() for one in loader(dataset, 1, batch_size=None)]
+        assert np.array_equal(part, alone["counts"][..., :3].numpy())
+        one["counts"].zero_()  # it is the receiver's own
+    again = [one["counts"].data_ptr() for one in loader(dataset, 1, batch_size=None)]
     assert len(set(again)) <= 6
     changed = list(loader(stream(SYSTEM, epoch_size=4, transform=_half), 1, batch_size=None))
     for (part, rest), alone in zip(changed, stream(SYSTEM, epoch_size=4), strict=True):
-        assert torch.equal(part, alone["cube"][:32])
-        assert float(rest["own"]) == float(alone["cube"].sum())
+        assert torch.equal(part, alone["counts"][:32])
+        assert float(rest["own"]) == float(alone["counts"].sum())
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "this loader puts batches together worker by worker")
         stacked = list(loader(stream(SYSTEM, epoch_size=4), 2, batch_size=2))
     assert sorted(stacked[0]["index"].tolist() + stacked[1]["index"].tolist()) == [0, 1, 2, 3]
-    assert type(stacked[0]["cube"]) is torch.Tensor
-    assert stacked[0]["cube"].shape == (2, 64, 6, 6)
+    assert type(stacked[0]["counts"]) is torch.Tensor
+    assert stacked[0]["counts"].shape == (2, 64, 6, 6)
 
 
 def test_examples_are_made_ahead_in_order_and_what_fails_is_told():
@@ -529,11 +529,11 @@ def test_mixed_counts_and_types():
     wide = SYSTEM.replace(detector=ml.Detector(dead_time_ns=0.0))
     assert wide.histogram_dtype == np.uint32
     raw = list(stream([SYSTEM, wide], dtype=None, batch_size=4))
-    assert {one["cube"].dtype for one in raw} == {torch.uint32}
+    assert {one["counts"].dtype for one in raw} == {torch.uint32}
     for dtype in (torch.float64, torch.float16, torch.bfloat16, torch.int32):
         for first, second in zip(raw, stream([SYSTEM, wide], dtype=dtype, batch_size=4), strict=True):
-            assert second["cube"].dtype == dtype
-            assert torch.equal(first["cube"].to(torch.float64), second["cube"].to(torch.float64))
+            assert second["counts"].dtype == dtype
+            assert torch.equal(first["counts"].to(torch.float64), second["counts"].to(torch.float64))
 
 
 @pytest.mark.parametrize(

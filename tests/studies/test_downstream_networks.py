@@ -45,7 +45,7 @@ def test_networks_learn_delay_and_reflectivity_with_their_errors(kind):
     def taken():
         batch = next(stream)
         return (
-            batch["cube"],
+            batch["counts"],
             (batch["flux"]["delay"] / SYSTEM.bin_ns).flatten(),
             batch["flux"]["signal"].flatten() / 4.0,
         )

@@ -173,10 +173,10 @@ def test_the_tabulated_neural_map_is_the_map():
 
 def test_a_stream_has_the_light_of_the_study():
     batch = next(iter(downstream_data.Data(TINY).stream("poisson", 1.0, 3)))
-    assert batch["cube"].shape == (2, 8, 8, 1024)
+    assert batch["counts"].shape == (2, 8, 8, 1024)
     light = batch["flux"]["signal"].mean((1, 2))
     torch.testing.assert_close(batch["flux"]["background"].mean((1, 2)), light)
-    arrivals = batch["cube"].double().sum(-1).mean((1, 2)) / downstream_data.SYSTEM.cycles
+    arrivals = batch["counts"].double().sum(-1).mean((1, 2)) / downstream_data.SYSTEM.cycles
     torch.testing.assert_close(arrivals, 2.0 * light.double(), rtol=0.02, atol=0.0)
 
 

@@ -383,7 +383,7 @@ def example_of(samples: Sequence[Sample], cube: torch.Tensor) -> dict[str, Any]:
         return torch.tensor([float(get(sample)) for sample in samples], device=cube.device)
 
     return {
-        "cube": cube,
+        "counts": cube,
         "depth": maps(lambda sample: sample.scene.depth_m),
         "reflectivity": maps(lambda sample: sample.scene.reflectivity),
         "flux": {

@@ -30,7 +30,7 @@ class StoredDataset(torch.utils.data.IterableDataset[dict[str, Any]]):
     once. Processes of a distributed run (ranks) and workers of a loader share the blocks out among themselves; with
     several ranks each gives the same number of examples, so that a few of them are left out of an epoch.
 
-    An example is a dictionary: ``histogram`` (bins, H, W) or (H, W, bins), the chosen maps (H, W) as float32, and
+    An example is a dictionary: ``counts`` (bins, H, W) or (H, W, bins), the chosen maps (H, W) as float32, and
     numbers: ``sample``, ``realization``, ``scene``, ``system``, ``signal_level``, ``sbr``; and ``seed``, a tensor of
     torch.uint64, for seeds go up to 2^64, which no signed integer of a batch could hold.
 
@@ -51,7 +51,7 @@ class StoredDataset(torch.utils.data.IterableDataset[dict[str, Any]]):
     axes
         ``"THW"``: time first, as networks take it; ``"HWT"``: as it is stored, without a copy.
     dtype
-        Of the histogram; default float32.
+        Of the counts; default float32.
     transform
         Called on each example; what it returns is given out.
     rank, world_size
@@ -179,7 +179,7 @@ class StoredDataset(torch.utils.data.IterableDataset[dict[str, Any]]):
         if self._axes == "THW":
             histogram = histogram.permute(2, 0, 1).contiguous()
         numbers = (sample, realization, scene, system, signal, sbr)
-        example: dict[str, Any] = {"histogram": histogram}
+        example: dict[str, Any] = {"counts": histogram}
         example.update({name: torch.from_numpy(one.copy()) for name, one in maps.items()})
         example.update(dict(zip(_NUMBERS, numbers, strict=True)))
         example["seed"] = torch.tensor(int(self._dataset.seeds[sample]), dtype=torch.uint64)

@@ -352,7 +352,7 @@ class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
     and ``batch_size=None`` to the loader: then the batches are the same, in the same order, for any number of
     workers, and are simulated in place instead of copied together.
 
-    An example is a dictionary, with a leading axis where `batch_size` is given: ``cube`` (T, H, W); ``depth`` (m,
+    An example is a dictionary, with a leading axis where `batch_size` is given: ``counts`` (T, H, W); ``depth`` (m,
     NaN without a return) and ``reflectivity`` (H, W); ``flux``, a dictionary of ``signal``, ``background`` (photons
     per period) and ``delay`` (ns) (H, W); ``system``, a dictionary of ``period_ns``, ``cycles``, ``dead_time_ns``,
     ``sigma_ns``; ``signal_level``, ``sbr``, ``index``, ``seed``. Maps and settings are float32. `sample` gives the
@@ -395,7 +395,7 @@ class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
     axes
         ``"THW"``: time first, as a view of ``"HWT"`` (torch's channels-last memory format), so without a copy.
     dtype
-        Of the cube; None: the counts as they are simulated (uint16 or uint32; int32 for sparse ones).
+        Of the counts; None: those as they are simulated (uint16 or uint32; int32 for sparse ones).
     reuse
         Samples for which a built-in scene serves, on average: other crops, flips, light and instruments.
     seed

@@ -73,7 +73,7 @@ class Config:
     dead: tuple[float, ...] = (0.95, 0.1, 0.3, 0.75)
     seeds: int = 3
     spatial: int = 0
-    lines: tuple[float, ...] = (0.1, 0.2, 0.3, 0.45, 0.5625, 0.65, 0.75, 0.85, 0.95)
+    lines: tuple[float, ...] = (0.1, 0.2, 0.3, 0.45, 0.5625, 0.75, 0.95)
 
 
 _TINY = Sizes(
@@ -90,7 +90,7 @@ _TINY = Sizes(
     lights=2,
 )
 CONFIGS = {
-    "small": Config(name="small", seeds=1, dead=(0.95, 0.1)),
+    "small": Config(name="small", seeds=1, dead=(0.95, 0.1), lines=(0.1, 0.3, 0.75, 0.95)),
     "full": Config(name="full", spatial=3),
     "tiny": Config(
         name="tiny",

@@ -72,6 +72,7 @@ def run(request: Request) -> Facts:
     fixed(folder, asdict(config.sizes))
     data, every = Data(config.sizes), list(runs(config))
     tell(f"downstream: {sum(not (folder / one.file).exists() for one in every)} of {len(every)} networks to train")
+    found = {one: kept(folder / one.file, partial(train_and_test, one, data), tell) for one in every}
     places = [(MAIN, sbr) for sbr in config.sbr] + [(dead, 1.0) for dead in config.dead]
     bounds = {
         (dead, sbr): kept(folder / f"methods-dead{dead:g}-sbr{sbr:g}.json", partial(methods, data, dead, sbr), tell)
@@ -82,7 +83,6 @@ def run(request: Request) -> Facts:
         for sbr in config.sbr
         for dead in sorted({*config.lines, *config.dead, MAIN})
     }
-    found = {one: kept(folder / one.file, partial(train_and_test, one, data), tell) for one in every}
     return {"study": report} | report.facts(config, found, bounds, lines)
 
 

@@ -8,6 +8,7 @@ import torch
 
 import mars_lidar as ml
 from mars_lidar.learn import (
+    HistogramTable,
     armed_periods,
     bin_photons,
     expected_histogram,
@@ -94,6 +95,44 @@ def test_transforms_of_torch_func(start):
             torch.func.jacfwd(torch.func.jacfwd(loss))(x)
     each = torch.vmap(torch.func.hessian(loss))(torch.stack(at, 1)[:2])
     torch.testing.assert_close(each[1], hessian, rtol=1e-9, atol=1e-9 * scale)
+
+
+def differentiable(name):
+    """A function of (S, B, delay) by its name in `mars_lidar.learn`."""
+    one = system()
+    if name == "HistogramTable":
+        return HistogramTable(ml.Table.build(one, (0.01, 5.0, 8), (0.005, 3.0, 6), threads=1)).double()
+    if name == "histogram_log_likelihood":
+        counts = torch.tensor(np.random.default_rng(0).poisson(9.0, 20))
+        return lambda *x: histogram_log_likelihood(counts, *x, one)
+    return {
+        "bin_photons": lambda *x: bin_photons(*x, one),
+        "expected_histogram": lambda *x: expected_histogram(*x, one),
+    }[name]
+
+
+@pytest.mark.parametrize("name", ["bin_photons", "expected_histogram", "histogram_log_likelihood", "HistogramTable"])
+def test_vmap_and_jacobians_of_every_function(name):
+    function, at, every = differentiable(name), [x.detach() for x in point(*AT)], (0, 1, 2)
+    alone = torch.stack([function(*(x[k] for x in at)) for k in range(3)])
+    torch.testing.assert_close(torch.vmap(function)(*at), alone, rtol=1e-11, atol=1e-9)
+    back, ahead = (torch.vmap(mode(function, argnums=every))(*at) for mode in (torch.func.jacrev, torch.func.jacfwd))
+    for one, other in zip(back, ahead, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-9)
+    with pytest.raises(ValueError, match="must be >= 0"):
+        torch.vmap(function)(-at[0], *at[1:])
+    for half in (torch.float16, torch.bfloat16):
+        with pytest.raises(TypeError, match="single or double precision"):
+            function(*(x.to(half) for x in at))
+
+
+@pytest.mark.parametrize("half", [torch.float16, torch.bfloat16])
+def test_counts_of_half_precision_are_refused(half):
+    """Above 256 they are not whole numbers any more."""
+    counts, at = torch.ones(20, dtype=half), [x.detach() for x in point(*AT)]
+    for call in (lambda: armed_periods(counts, system()), lambda: histogram_log_likelihood(counts, *at, system())):
+        with pytest.raises(TypeError, match="histogram must be of integers, or of single or double"):
+            call()
 
 
 def test_blocks_of_another_size_are_solved_alike(monkeypatch):

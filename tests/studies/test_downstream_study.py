@@ -1,4 +1,4 @@
-"""The downstream experiment, in a tiny configuration: what it writes, and that it goes on where it stopped."""
+"""The downstream experiment, in a tiny configuration; the closed form against simulation."""
 
 from __future__ import annotations
 
@@ -9,158 +9,113 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 import mars_lidar as ml
-from mars_lidar.statistics import exposure_moments
+from mars_lidar.statistics import mean_histogram
 from studies import Request
 from studies.__main__ import main
-from studies.common.intervals import Steps
-from studies.common.kept import fixed, spread
-from studies.common.windows import FEATURES
+from studies.common.kept import fixed
+from studies.common.windows import BOX, COARSE, FEATURES, WINDOW, features
 from studies.downstream import data as downstream_data
-from studies.downstream import networks
 from studies.downstream import run as downstream
-from studies.downstream.budget import GPU_HOURS, budget, flop_of_a_step
-from studies.downstream.data import count_bias
+from studies.downstream.data import CONFIGS, MAIN, WORDS, instrument
+from studies.downstream.networks import predicted, trained
+from studies.downstream.prediction import at
+from studies.downstream.report import scatter
 from studies.neural import NeuralEngine
 
-TINY = downstream_data.CONFIGS["tiny"]
-
+TINY = CONFIGS["tiny"]
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
 
 @pytest.mark.full
 def test_the_study_goes_on_where_it_was_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    small = replace(TINY, arms={"poisson": (0,), "mars": (0, 1)})
-    monkeypatch.setitem(downstream_data.CONFIGS, "tiny", small)
-    said: list[str] = []
+    small = replace(TINY, arms=("exact", "mars", "poisson"), seeds=1, dead=(), spatial=0, lines=(MAIN,))
+    monkeypatch.setitem(CONFIGS, "tiny", small)
+    messages: list[str] = []
 
     def stop(text: str) -> None:
-        said.append(text)
-        if "poisson-sbr1-0" in text:
+        messages.append(text)
+        if "pixel-exact-dead0.5625-sbr1-0" in text:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         downstream.run(Request(tmp_path, quick=True, tell=stop))
-    kept = tmp_path / "downstream-tiny" / "poisson-sbr1-0.json"
-    made = kept.stat().st_mtime_ns
+    result = tmp_path / "downstream-tiny" / "pixel-exact-dead0.5625-sbr1-0.json"
+    made = result.stat().st_mtime_ns
     assert main(["downstream", "--quick", "--out", str(tmp_path)]) == 0
-    assert kept.stat().st_mtime_ns == made
-    assert "3 of 3 streams" in said[0]
+    assert result.stat().st_mtime_ns == made
+    assert "3 of 3 networks" in messages[0]
     text = (tmp_path / "downstream.md").read_text()
-    assert "36.49" not in text  # the paper's row of another ratio
     assert "33.68 / 0.061" in text
+    assert "36.49" not in text  # the paper's row of another ratio
     assert "not for citing" in text
-    assert "gold standard's own scatter" in text
-    assert "Cramer-Rao bound" in text
-    assert (tmp_path / "downstream_sbr1.png").stat().st_size > 5000
+    assert "_Cramer-Rao bound_" in text
+    assert (tmp_path / "downstream.png").stat().st_size > 5000
     with (tmp_path / "downstream.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) == 3 * 2 * (1 + 2 + 2)  # the polynomial tells reflectivity alone
-    result = json.loads(kept.read_text())
-    row = next(
-        row
-        for row in rows
-        if (row["arm"], row["tested"], row["model"], row["target"]) == ("poisson", "gold", "bins", "depth")
-    )
-    assert float(row["rmse"]) == pytest.approx(result["gold"]["bins"]["depth"]["rmse"], rel=1e-5)
-    assert not list((tmp_path / "downstream-tiny").glob("*.partial*"))
+    scenes = small.sizes.test[1]
+    assert len(rows) == scenes * (3 * 2 + 4)
+    judged = json.loads(result.read_text())["gold"]
+    assert float(rows[scenes]["psnr"]) == pytest.approx(judged["psnr"][0], rel=1e-5)
     record = json.loads((tmp_path / "downstream-tiny" / "config.json").read_text())
     fixed(tmp_path / "downstream-tiny", record)
     with pytest.raises(ValueError, match="another configuration"):
         fixed(tmp_path / "downstream-tiny", record | {"photons": 2.0})
 
 
-@pytest.mark.full
-@pytest.mark.parametrize("last", [2, 3])
-def test_a_stream_goes_on_from_the_steps_it_has_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, last: int):
-    """Stopped in the middle of its training, before and after a step that is kept: the same result, to the bit."""
-    monkeypatch.setattr(downstream, "KEPT_EVERY", 2)
-    monkeypatch.setattr(downstream, "POLYNOMIAL_STEPS", 3)
-    data, one = downstream.Data(replace(TINY, steps=(4, 3))), downstream.Run("exact", 1.0, 1)
-    folders = [tmp_path / name for name in ("whole", "stopped")]
-    for folder in folders:
-        folder.mkdir()
-    whole = downstream.train_and_test(one, data, folders[0])
-    made, stop_at = 0, 2 * last  # two networks a step
-
-    def step(self: Steps, loss: torch.Tensor) -> None:
-        nonlocal made
-        made += 1
-        if made == stop_at:
-            raise KeyboardInterrupt
-        taken(self, loss)
-
-    taken = Steps.step
-    monkeypatch.setattr(Steps, "step", step)
-    with pytest.raises(KeyboardInterrupt):
-        downstream.train_and_test(one, data, folders[1])
-    assert (folders[1] / f"{one.name}.partial").exists() == (last > 2)
-    made, stop_at = 0, -1
-    again = downstream.train_and_test(one, data, folders[1])
-    assert made == (3 if last > 2 else 7)  # the window network has four steps, the bin network three
-    assert whole.pop("seconds") > 0.0 < again.pop("seconds")
-    assert whole == again
-
-
-def test_the_budget_of_full():
-    """Operations by hand, three times those of a forward pass but for what no gradient needs; hours as stated."""
-    full = downstream_data.CONFIGS["full"]
-    flop = flop_of_a_step(full)
-    pixels, width = full.batch * full.crop**2, 64
-    forward = 2.0 * pixels * (FEATURES * width + 4 * 9 * width**2 + 4 * width)
-    assert flop["window"] == pytest.approx(3.0 * forward - 2.0 * pixels * FEATURES * width, rel=1e-9)
-    cost = budget(full, flop)
-    assert cost.steps == 36 * 3000
-    assert cost.flop == 36 * 3000 * sum(flop.values())
-    assert cost.gpu_s == pytest.approx(cost.flop / 1e13 + 0.01 * cost.steps)
-    assert cost.hours == cost.gpu_s / 3600.0 < GPU_HOURS
-    parts = dict.fromkeys(("crops, s", "features, s", "polynomial, s", "test scene, s"), 0.1)
-    data = budget(full, flop, dict.fromkeys(full.arms, parts)).data_s
-    assert data == pytest.approx(36 * (0.2 * 3000 + 0.1 * downstream.POLYNOMIAL_STEPS + 0.1 * full.test[1]))
-
-
-@pytest.mark.full
-def test_the_budget_is_reported(tmp_path: Path):
-    assert main(["downstream-budget", "--quick", "--out", str(tmp_path)]) == 0
-    text = (tmp_path / "downstream_budget.md").read_text()
-    assert "## `--config tiny`" in text
-    assert all(f"| {downstream_data.WORDS[arm]} |" in text for arm in TINY.arms)
-
-
-def test_networks_run_where_their_weights_are(monkeypatch: pytest.MonkeyPatch):
-    """On the device "meta", which holds no numbers and, as a GPU does, refuses what lies elsewhere."""
-    monkeypatch.setattr(networks._Standard, "forward", lambda self, x: x - self.mean)
-    for kind in (networks.WindowNetwork, networks.BinNetwork):
-        network = kind(256).to("meta")
-        told = network(torch.ones(1, 4, 4, 256, dtype=torch.int16))
-        found = (told.delay, told.delay_log_variance, told.reflectivity, told.reflectivity_log_variance)
-        sum(one.sum() for one in found).backward()
-        assert {one.device.type for one in found} == {"meta"}
-        assert told.away(torch.ones(16, device="meta")).device.type == "meta"
-        with pytest.raises(RuntimeError, match="meta"):
-            told.away(torch.ones(16))
-
-
 def test_declared_configurations():
-    for config in downstream_data.CONFIGS.values():
-        spans = [range(first, first + number) for first, number in (config.train, config.test)]
+    for config in CONFIGS.values():
+        spans = [range(first, first + number) for first, number in (config.sizes.train, config.sizes.test)]
         assert len(set().union(*spans)) == sum(map(len, spans))  # disjoint
-        assert set(config.arms) <= set(downstream_data.WORDS)
-        names = [one.name for one in downstream.runs(config)]
-        assert len(set(names)) == len(names) == len(config.sbr) * sum(map(len, config.arms.values()))
+        assert set(config.arms) <= set(WORDS)
+        files = [one.file for one in downstream.runs(config)]
+        assert len(set(files)) == len(files)
+    small, full = ({one.file for one in downstream.runs(CONFIGS[name])} for name in ("small", "full"))
+    assert small < full  # which uses what the other has trained
+
+
+def test_features_are_a_window_about_the_fullest_bins_and_sums_of_the_rest():
+    random = np.random.default_rng(1)
+    counts = random.poisson(0.5, (3, 256)).astype(np.uint16)
+    for pixel, first in enumerate((100, 250, 3)):  # the second lies across the end of the period
+        counts[pixel, (first + np.arange(BOX)) % 256] += 20
+    window, middle = features(counts)
+    assert window.shape == (3, FEATURES)
+    np.testing.assert_allclose(middle % 256, (np.array([100, 250, 3]) + 0.5 * BOX) % 256)
+    near = counts[1, (int(middle[1]) - WINDOW // 2 + np.arange(WINDOW)) % 256]
+    np.testing.assert_allclose(window[1, :WINDOW] ** 2, near, rtol=1e-5)
+    np.testing.assert_allclose((window[:, : WINDOW + COARSE] ** 2).sum(1), counts.sum(1), rtol=1e-5)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("kind", ["pixel", "spatial"])
+def test_networks_learn_delay_and_reflectivity_with_their_errors(kind):
+    """After seconds: errors well below the scatter of the truth, and intervals that hold about what they state."""
+    sizes = replace(TINY.sizes, crops=24)
+    data = downstream_data.Data(sizes)
+    pixels = data.training("exact", MAIN, 1.0, 0)
+    network = trained(kind, pixels, steps=150, batch=4, seed=0)
+    test = data.tested("exact", MAIN, 1.0, gold=True)
+    mean, deviation = predicted(network, test)
+    mean[..., 1] -= test.middle
+    known = np.isfinite(test.wanted[..., 1])
+    assert known.mean() > 0.95
+    for k in range(2):
+        error = (mean[..., k] - test.wanted[..., k])[known]
+        assert error.std() < 0.5 * np.nanstd(test.wanted[..., k])
+        assert 0.7 < (np.abs(error) <= 1.645 * deviation[..., k][known]).mean() < 0.99
 
 
 @pytest.mark.full
 def test_the_tabulated_neural_map_is_the_map():
     """Counts and shape of the stand-in from its table, beside the network itself; 4 standard errors."""
-    config = replace(TINY, table=(160, 64))
+    sizes, system = replace(TINY.sizes, table=(160, 64)), instrument(MAIN)
     light = ml.Flux(np.full((1, 400), 1.3), 0.9, 41.0)
-    engine = downstream_data.Data(config)._engine("neural")
+    engine = downstream_data.Data(sizes).engine("neural", MAIN)
     counts = [
-        ml.simulate(light, downstream_data.SYSTEM, engine=one, seed=7, threads=1)[0, 0].astype(np.float64)
+        ml.simulate(light, system, engine=one, seed=7, threads=1)[0, 0].astype(np.float64)
         for one in (engine, NeuralEngine())
     ]
     tabled, direct = (one.sum(-1) for one in counts)
@@ -171,98 +126,76 @@ def test_the_tabulated_neural_map_is_the_map():
     assert 0.5 * np.abs(shapes[0] - shapes[1]).sum() < 1.2 * 0.5 * np.sqrt(2.0 / np.pi) * noise.sum()
 
 
-def test_a_stream_has_the_light_of_the_study():
-    batch = next(iter(downstream_data.Data(TINY).stream("poisson", 1.0, 3)))
-    assert batch["counts"].shape == (2, 8, 8, 1024)
-    light = batch["flux"]["signal"].mean((1, 2))
-    torch.testing.assert_close(batch["flux"]["background"].mean((1, 2)), light)
-    arrivals = batch["counts"].double().sum(-1).mean((1, 2)) / downstream_data.SYSTEM.cycles
-    torch.testing.assert_close(arrivals, 2.0 * light.double(), rtol=0.02, atol=0.0)
-
-
-def test_a_polynomial_is_told_by_its_two_numbers():
-    random = np.random.default_rng(2)
-    cubes = random.poisson(3.0, (2, 9, 9, 1024)).astype(np.uint16)
-    cubes[..., 300:310] += (10 * random.uniform(0, 9, (2, 9, 9, 1))).astype(np.uint16)
-    total = np.log1p(cubes.sum(-1, dtype=np.float64))
-    polynomial = downstream.Polynomial()
-    polynomial.take(cubes, total**2)
-    np.testing.assert_allclose(polynomial.told(cubes), total**2, rtol=1e-3)
+def test_training_pixels_have_the_light_of_the_study():
+    """Poisson's counts are the arrivals: S = photons x reflectivity, B of the same mean at a ratio of 1."""
+    sizes = TINY.sizes
+    pixels = downstream_data.Data(sizes).training("poisson", MAIN, 1.0, 3)
+    counts = (pixels.seen[..., : WINDOW + COARSE] ** 2).sum(-1).mean((1, 2)) / instrument(MAIN).cycles
+    light = sizes.photons * pixels.wanted[..., 0].mean((1, 2))
+    np.testing.assert_allclose(counts, 2.0 * light, rtol=0.02)
 
 
 @pytest.mark.full
-def test_data_mean_what_the_configuration_says():
-    scenes = [downstream_data.crop(1000 + k, TINY) for k in range(2)]
-    assert not np.array_equal(scenes[0].depth_m, scenes[1].depth_m)
-    assert np.array_equal(scenes[0].depth_m, downstream_data.crop(1000, TINY).depth_m)
-    data = downstream_data.Data(TINY)
-    cubes = {arm: data.cubes(arm, scenes, 1.0, 5) for arm in ("poisson", "exact", "mars", "neural")}
-    # Poisson's counts are the arrivals: S = photons x reflectivity, B of the same mean, N_r cycles
-    mean = np.mean([scene.reflectivity.mean() for scene in scenes])
-    arrivals = 2.0 * TINY.photons * mean * downstream_data.SYSTEM.cycles
-    assert cubes["poisson"].sum(-1).mean() == pytest.approx(arrivals, rel=0.01)
-    # the others have the dead time
-    exact = cubes["exact"].sum(-1).mean()
-    assert exact < 0.7 * arrivals
-    for arm, off in (("mars", 0.01), ("neural", 0.05)):  # the latter of a table of 4 x 4 points here
-        assert cubes[arm].sum(-1).mean() == pytest.approx(exact, rel=off)
-    depth, light = downstream_data.truths(scenes)
-    np.testing.assert_allclose(depth[0], scenes[0].depth_m)
-    np.testing.assert_allclose(light[1], scenes[1].reflectivity)
-
-
-def test_count_bias_is_that_of_the_laws():
-    config = replace(TINY, arms={"poisson": (0,), "exact": (0,)})
-    data = downstream_data.Data(config)
-    scenes = data.test
-    (rows,) = count_bias(data).values()
-    # flux of every pixel is known: expected counts and variances, pixel by pixel
-    system, truth = downstream_data.SYSTEM, {"poisson": [], "exact": [], "variance": []}
-    for scene in scenes:
-        flux = scene.flux(system, signal=config.photons * float(scene.reflectivity.mean()), sbr=1.0)
-        truth["poisson"].append(system.cycles * (flux.signal + flux.background).ravel())
-        moments = exposure_moments(flux.signal.ravel(), flux.background.ravel(), system, delay_ns=flux.delay_ns.ravel())
-        truth["exact"].append(moments.mean)
-        truth["variance"].append(moments.variance)
-    flat = {name: np.concatenate(values) for name, values in truth.items()}
-    order = np.argsort(np.concatenate([scene.reflectivity.ravel() for scene in scenes]), kind="stable")
-    for k, part in enumerate(np.array_split(order, 4)):
-        poisson, exact, variance = (flat[name][part].mean() for name in ("poisson", "exact", "variance"))
-        error = np.sqrt(variance / len(part)) / exact
-        # 6 standard errors: one exposure over the mean of two
-        assert abs(rows["poisson"][k] + 1.0 - poisson / exact) < 6.0 * poisson / exact * np.hypot(
-            1.0 / np.sqrt(poisson * len(part)), error / np.sqrt(2.0)
-        )
-        assert abs(rows["exact"][k]) < 6.0 * np.sqrt(1.5) * error
-        assert rows["scatter"][k] == pytest.approx(np.sqrt(variance) / exact, rel=6.0 / np.sqrt(2.0 * len(part)))
-
-
-def test_errors_leave_out_pixels_without_return():
-    scene = downstream_data.crop(1000, TINY)
-    depth = scene.depth_m.copy()
-    depth[0, 0] = np.nan
-    holed = ml.Scene(depth, scene.reflectivity)
-    maps = np.nan_to_num(holed.depth_m)[None]
-    maps[0, 1, 1] += 1.0
-    spread = np.full_like(maps, 0.5)
-    found = downstream.tested({"depth": maps}, {"depth": spread}, [holed], TINY)["depth"]
-    assert found["rmse"] == pytest.approx(1.0 / np.sqrt(16 * 16 - 1), rel=1e-4)
-    assert found["psnr"] == pytest.approx(20.0 * np.log10(TINY.depth_range_m / found["rmse"]), rel=1e-6)
-    assert found["covered"] == pytest.approx(1.0 - 1.0 / (16 * 16 - 1))
-
-
 def test_measures_of_known_maps():
-    true = np.stack(
-        [scene.reflectivity for scene in (downstream_data.crop(1000, TINY), downstream_data.crop(1001, TINY))]
+    data = downstream_data.Data(TINY.sizes)
+    light, depth = downstream_data.truths(data.test)
+    system = instrument(MAIN)
+    metres = system.bin_ns * downstream.LIGHT_M_PER_NS
+    mean = np.stack([light + 0.1, (depth + 0.02) / metres], -1)
+    judged = downstream.judged(mean, np.full_like(mean, 0.2 / 1.6448536), data, system)
+    np.testing.assert_allclose(judged["psnr"], 20.0)
+    np.testing.assert_allclose(judged["depth_square"], 4e-4, rtol=1e-6)
+    assert judged["covered"] == judged["depth_covered"] == [1.0] * len(data.test)
+    assert min(judged["ssim"]) < 1.0
+
+
+def test_errors_are_those_of_scenes_and_seeds():
+    """By bootstrap: of independent entries about what the scatter of the mean is; of equal ones nothing."""
+    values = np.random.default_rng(3).normal(size=(4, 100))
+    assert scatter(values) == pytest.approx(0.05 * np.sqrt(2.0), rel=0.35)
+    assert scatter(np.ones((3, 12))) == 0.0
+    assert scatter(np.random.default_rng(4).normal(size=(1, 64))) == pytest.approx(0.125, rel=0.3)
+
+
+def small_system(dead_ns: float) -> ml.System:
+    return ml.System(
+        period_ns=100.0,
+        cycles=1000,
+        bins=256,
+        pulse=ml.GaussianPulse(sigma_ns=2.0),
+        detector=ml.Detector(dead_time_ns=dead_ns),
+        start="stationary",
     )
-    scenes = [ml.Scene(np.full(light.shape, 5.0), light) for light in true]
-    found = downstream.tested({"reflectivity": true + 0.1}, {}, scenes, TINY)["reflectivity"]
-    assert found["psnr"] == pytest.approx(20.0)
-    assert found["rmse"] == pytest.approx(0.1)
-    mirrored = downstream.tested({"reflectivity": true[..., ::-1]}, {}, scenes, TINY)["reflectivity"]
-    assert mirrored["ssim"] < 0.7 < found["ssim"] < 1.0
 
 
-def test_spread():
-    assert spread([1.0], 2) == "1.00"
-    assert spread([1.0, 3.0], 1) == "2.0 ± 1.4"
+@pytest.mark.full
+def test_without_dead_time_there_is_nothing_to_predict():
+    closed = at(2.0, 1.0, small_system(0.0))
+    assert closed.claimed == pytest.approx(closed.real, rel=1e-9) == pytest.approx(closed.best, rel=1e-9)
+    assert closed.coverage(0.9) == pytest.approx(0.9)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("dead_ns", [10.0, 90.0])
+def test_the_closed_form_is_the_scatter_of_the_estimate(dead_ns):
+    """The estimate that is best under count x multinomial, made here from differences of `mean_histogram`, applied to
+    exposures of the exact engine: its scatter over what it claims, and how often its intervals hold; 4 standard errors.
+    """
+    one, light, exposures = small_system(dead_ns), np.array([1.5, 2.0, 50.0]), 4000
+    closed = at(*light[:2].tolist(), one, summed=False)
+    step = np.array([1e-2, 1e-2, 1e-2])
+    both = light + np.concatenate([np.diag(step), -np.diag(step)])
+    mean = mean_histogram(both[:, 0], both[:, 1], one, delay_ns=both[:, 2], tolerance=1e-6)
+    moved = ((mean[:3] - mean[3:]) / (2.0 * step[:, None])).T
+    centre = mean_histogram(*light[:2], one, delay_ns=light[2], tolerance=1e-6).reshape(-1)
+    law = ml.joint_law(*light[:2].tolist(), one)
+    total = centre.sum()
+    mars = np.diag(centre) + np.outer(centre, centre) * (law.count_variance / total**2 - 1.0 / total)
+    weights = np.linalg.solve(mars, moved)
+    inverse = np.linalg.inv(moved.T @ weights)
+    counts = ml.simulate(ml.Flux([[light[0]]], *light[1:]), one, realizations=exposures, seed=5, threads=1)
+    error = ((counts.reshape(exposures, -1) - centre) @ weights @ inverse)[:, 0]
+    assert inverse[0, 0] ** 0.5 == pytest.approx(closed.claimed, rel=0.01)
+    assert error.std() / closed.real == pytest.approx(1.0, abs=4.0 / np.sqrt(2.0 * exposures) + 0.01)
+    covered = float((np.abs(error) <= 1.6448536 * closed.claimed).mean())
+    assert covered == pytest.approx(closed.coverage(0.9), abs=4.0 * np.sqrt(0.09 / exposures) + 0.005)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from mars_lidar.learn.forward import Delay, blocks, check_detector, inputs, wrapped_energy
+from mars_lidar.learn.forward import Delay, blocks, by_rows, check_detector, inputs, values_of, wrapped_energy
 from mars_lidar.learn.needed import torch
 from mars_lidar.table import Table
 
@@ -75,7 +75,7 @@ class HistogramTable(torch.nn.Module):
         given = inputs(signal, background, delay_ns)
         for name, values, axis in zip(("signal", "background"), given, (self.signal, self.background), strict=False):
             low, high = float(axis[0]), float(axis[-1])
-            least, most = (float(tensor) for tensor in values.detach().aminmax()) if values.numel() else (low, high)
+            least, most = (float(end) for end in values_of(values).aminmax()) if values.numel() else (low, high)
             if not (low <= least and most <= high):
                 raise ValueError(
                     f"{name} must lie in the table's [{low:g}, {high:g}] photons per period, got {least:g} to {most:g}"
@@ -167,6 +167,10 @@ class _Again(torch.autograd.Function):
         out, pull = torch.func.vjp(ctx.function, *given)[:2]  # forward mode does not nest: transposed twice
         along: torch.Tensor = torch.func.vjp(pull, torch.zeros_like(out))[1](moves)[0]
         return along
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[int | None, ...], *given: Any) -> Any:
+        return by_rows(_Again, info, in_dims, given)
 
 
 def _cell(axis: torch.Tensor, values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

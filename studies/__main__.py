@@ -33,7 +33,7 @@ def _parser(command: str) -> argparse.ArgumentParser:
     add("--quick", action="store_true", help="small grids, few realizations: seconds, not for citing")
     words = "folder of the reference cases, *.json (studies 'reference', 'joint-covariance')"
     add("--data", type=Path, metavar="DIR", help=words)
-    words = "measured photon stream: a .mat with times in units of 64 ps (studies 'hardware', 'uncertainty')"
+    words = "measured photon stream: a .mat with times in units of 64 ps (study 'hardware')"
     add("--stream", type=Path, metavar="FILE", help=words)
     words = (
         "engine taken for true (study 'count-law'): 'sequential' shares nothing with the laws, 'exact' is several "
@@ -41,7 +41,7 @@ def _parser(command: str) -> argparse.ArgumentParser:
     )
     add("--truth", choices=("sequential", "exact"), default="sequential", help=words)
     words = (
-        "size of the studies 'downstream' and 'uncertainty': half an hour of one core each, or several hours "
+        "size of the study 'downstream': a quarter of an hour of one core, or two hours of it "
         "(default: %(default)s); with --quick a tiny one, seconds"
     )
     add("--config", choices=("small", "full"), default="small", help=words)

@@ -142,7 +142,8 @@ def test_measures_of_known_maps():
     system = instrument(MAIN)
     metres = system.bin_ns * downstream.LIGHT_M_PER_NS
     mean = np.stack([light + 0.1, (depth + 0.02) / metres], -1)
-    judged = downstream.judged(mean, np.full_like(mean, 0.2 / 1.6448536), data, system)
+    spread = np.broadcast_to([0.2, 0.03 / metres], mean.shape)
+    judged = downstream.judged(mean, spread / 1.6448536, data, system)
     np.testing.assert_allclose(judged["psnr"], 20.0)
     np.testing.assert_allclose(judged["depth_square"], 4e-4, rtol=1e-6)
     assert judged["covered"] == judged["depth_covered"] == [1.0] * len(data.test)

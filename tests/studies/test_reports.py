@@ -27,7 +27,6 @@ NAMES = {  # of every command that a committed report prints
     "detectors",
     "domain",
     "downstream",
-    "downstream-budget",
     "effects",
     "hardware",
     "image",
@@ -45,7 +44,6 @@ NAMES = {  # of every command that a committed report prints
     "start-up",
     "table",
     "transients",
-    "uncertainty",
 }
 
 

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from mars_lidar.learn.forward import bin_photons as bin_photons
     from mars_lidar.learn.forward import expected_histogram as expected_histogram
     from mars_lidar.learn.forward import histogram_log_likelihood as histogram_log_likelihood
+    from mars_lidar.learn.inverse import LidarLikelihood as LidarLikelihood
     from mars_lidar.learn.inverse import LidarPhysics as LidarPhysics
     from mars_lidar.learn.ranges import Choice as Choice
     from mars_lidar.learn.ranges import LogUniform as LogUniform
@@ -27,6 +28,7 @@ _HOMES = {
     "Choice": "ranges",
     "CubeStream": "stream",
     "HistogramTable": "tabulated",
+    "LidarLikelihood": "inverse",
     "LidarPhysics": "inverse",
     "LogUniform": "ranges",
     "StoredDataset": "stored",
@@ -38,4 +40,4 @@ _HOMES = {
     "histogram_log_likelihood": "forward",
 }
 __getattr__ = names_of(__name__, _HOMES)  # PyTorch is loaded by whoever uses it
-__all__ = [name for name in _HOMES if name != "LidarPhysics"]  # `import *` would ask for deepinv
+__all__ = [name for name in _HOMES if _HOMES[name] != "inverse"]  # `import *` would ask for deepinv

@@ -8,6 +8,8 @@ from mars_lidar._base.optional import MissingLibraryError
 
 try:
     import torch
+    from deepinv.optim import DataFidelity
+    from deepinv.optim.potential import Potential
     from deepinv.physics import Physics
 except ImportError as _error:
     raise MissingLibraryError(
@@ -22,12 +24,15 @@ except RuntimeError as _error:  # of torchvision, where its operators are not th
 from mars_lidar._base import checks
 from mars_lidar.engines import Engine, find_engine
 from mars_lidar.instrument.system import System
-from mars_lidar.learn.forward import check_detector, expected_histogram
+from mars_lidar.learn.forward import check_detector, expected_histogram, histogram_log_likelihood
 from mars_lidar.learn.tabulated import HistogramTable
 from mars_lidar.light.flux import Flux
+from mars_lidar.reconstruct.histogram_record import relative_width
 from mars_lidar.reconstruct.reconstruction import reconstruct
 from mars_lidar.simulate import simulate
 from mars_lidar.table import Table
+
+_ZERO = 0.2  # photons in the exposure that an estimate of zero stands for, in a logarithm
 
 
 class LidarPhysics(Physics):  # type: ignore[misc]  # deepinv is not typed
@@ -46,9 +51,13 @@ class LidarPhysics(Physics):  # type: ignore[misc]  # deepinv is not typed
     table
         A `mars_lidar.Table` of it: ``A`` is then a `mars_lidar.learn.HistogramTable`, some 30 times as fast.
     images
+        ``"log"``: logarithms of signal and background, photons per period, and the delay over the width of the pulse
+        (sigma of a Gaussian): any numbers are light, and errors are about 1 / sqrt(photons) in all three, as the
+        priors, denoisers and steps of deepinv's algorithms want it.
         ``"signal"``: signal and background, photons per period, and the delay, ns. ``"depth"``: those of deepinv's own
         ``SinglePhotonLidar``: depth in bins, an integer in the middle of a bin; intensity, photons of the return in the
         exposure; background, photons of a bin in the exposure. Without dead time both operators have the same mean.
+        In these two photons must stay >= 0, which a stock algorithm does not see to.
     engine
         As for `mars_lidar.simulate`.
     seed
@@ -62,7 +71,7 @@ class LidarPhysics(Physics):  # type: ignore[misc]  # deepinv is not typed
         system: System,
         *,
         table: Table | None = None,
-        images: Literal["signal", "depth"] = "signal",
+        images: Literal["log", "signal", "depth"] = "signal",
         engine: str | Engine = "exact",
         seed: int = 0,
         threads: int | None = None,
@@ -75,12 +84,13 @@ class LidarPhysics(Physics):  # type: ignore[misc]  # deepinv is not typed
             raise ValueError(f"table must be of this system, got one of {table.system}")
         self.system, self._engine, self._threads = system, find_engine(engine), threads
         self._table = None if table is None else HistogramTable(table, cycles=system.cycles)
-        self._images = checks.choice("images", images, ("signal", "depth"))
+        self._images = checks.choice("images", images, ("log", "signal", "depth"))
+        self._width_ns = relative_width(system) * system.period_ns
         self._seed = checks.integer("seed", seed, low=0, high=2**63 - 1)
 
     def A(self, x: torch.Tensor, **kwargs: Any) -> torch.Tensor:
         """Expected histograms."""
-        maps = self._light(x)
+        maps = self.light(x)
         mean = expected_histogram(*maps, self.system) if self._table is None else self._table(*maps)
         return mean.permute(0, 3, 1, 2)
 
@@ -119,11 +129,19 @@ class LidarPhysics(Physics):  # type: ignore[misc]  # deepinv is not typed
                 (estimate.delay_ns, 0.5 * self.system.period_ns),
             )
         )
+        return self.images(signal, background, delay_ns).to(y)
+
+    def images(self, signal: torch.Tensor, background: torch.Tensor, delay_ns: torch.Tensor) -> torch.Tensor:
+        """Images (B, 3, H, W) of light (B, H, W); of logarithms no less than 0.2 photons in the exposure."""
+        if self._images == "log":
+            least = _ZERO / self.system.cycles
+            logs = [light.clamp_min(least).log() for light in (signal, background)]
+            return torch.stack([*logs, delay_ns / self._width_ns], 1)
         if self._images == "signal":
-            return torch.stack([signal, background, delay_ns], 1).to(y)
+            return torch.stack([signal, background, delay_ns], 1)
         cycles, bins = self.system.cycles, self.system.bins
         depth = delay_ns / self.system.bin_ns - 0.5
-        return torch.stack([depth, signal * cycles, background * (cycles / bins)], 1).to(y)
+        return torch.stack([depth, signal * cycles, background * (cycles / bins)], 1)
 
     def forward(self, x: torch.Tensor, seed: int | None = None, **kwargs: Any) -> torch.Tensor:
         """Measured histograms, in the type of `x`; no gradient passes through them.
@@ -132,7 +150,7 @@ class LidarPhysics(Physics):  # type: ignore[misc]  # deepinv is not typed
         """
         own = seed is None
         number = self._seed if seed is None else checks.integer("seed", seed, low=0, high=2**63 - 1)
-        images = torch.stack(self._light(x), 1).detach().cpu().double().numpy()
+        images = torch.stack(self.light(x), 1).detach().cpu().double().numpy()
         drawn = [
             simulate(
                 Flux(*image),
@@ -149,14 +167,31 @@ class LidarPhysics(Physics):  # type: ignore[misc]  # deepinv is not typed
         out = torch.stack([torch.from_numpy(cube.astype("float64")) for cube in drawn])
         return out.permute(0, 3, 1, 2).to(x)
 
-    def _light(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    def light(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Signal, background and delay in ns (B, H, W) of images."""
         if not isinstance(x, torch.Tensor) or x.ndim != 4 or x.shape[1] != 3:
             given = getattr(x, "shape", x)
-            words = "signal, background and delay" if self._images == "signal" else "depth, intensity and background"
+            words = "depth, intensity and background" if self._images == "depth" else "signal, background and delay"
             raise ValueError(f"x must be a tensor (B, 3, H, W) of {words}, got {given!r}")
         first, second, third = x.unbind(1)
+        if self._images == "log":
+            return first.exp(), second.exp(), third * self._width_ns
         if self._images == "signal":
             return first, second, third
         cycles = self.system.cycles
         return second / cycles, third * (self.system.bins / cycles), (first + 0.5) * self.system.bin_ns
+
+
+class LidarLikelihood(DataFidelity):  # type: ignore[misc]
+    """Minus the log likelihood of histograms under dead time, `mars_lidar.learn.histogram_log_likelihood`.
+
+    The data term of an algorithm of deepinv with a `LidarPhysics` of any images; with ``images="log"`` steps need no
+    projection.
+    """
+
+    grad = Potential.grad  # of `fn`: the base class takes the distance between mean and data for granted
+
+    def fn(self, x: torch.Tensor, y: torch.Tensor, physics: LidarPhysics, *args: Any, **kwargs: Any) -> torch.Tensor:
+        """One number for each image (B,)."""
+        value = histogram_log_likelihood(y.movedim(1, -1), *physics.light(x), physics.system)
+        return -value.sum((1, 2))

@@ -165,7 +165,7 @@ def dead_time(settings: Settings, truth: str) -> Figure:
     before = simulate(flux, system, engine="poisson", seed=seed)[0, 0, 0]
     after = simulate(flux, system, engine=truth, seed=seed + 1)[0, 0, 0]
     arrivals = system.cycles * (signal + background) * arrival_shape(np.array([signal]), np.array([background]), system)
-    registered = exposure_moments(signal, background, system).histogram
+    registered = exposure_moments(Flux(signal, background, 0.5 * system.period_ns), system).histogram
     time_ns = (np.arange(system.bins) + 0.5) * (PERIOD_NS / system.bins)
     figure, axes = panels(2.6, 1, 2, sharex=True)
     for ax, counts, mean, words in (

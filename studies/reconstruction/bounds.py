@@ -27,7 +27,7 @@ def line(system: System, signal: float, pixels: int) -> dict[str, Any]:
     """Maximum likelihood and bounds of S at one brightness, in units of the Cramer-Rao bound of known armed times."""
     background = signal / SBR
     flux = Flux(np.full(pixels, signal), background, _DELAY_NS)
-    bound = cramer_rao(signal, background, system, delay_ns=_DELAY_NS)
+    bound = cramer_rao(Flux(signal, background, _DELAY_NS), system)
     least = float(bound.signal)
     out: dict[str, Any] = {"detector": system.detector.mode, "S": signal, "bound %": 100.0 * least / signal}
     for cycles in (system.cycles, _LONG):

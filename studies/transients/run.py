@@ -64,7 +64,7 @@ def run(request: Request) -> Facts:
         request.tell(f"transients: {name}")
         system = SYSTEM.replace(detector=detector)
         cube = simulate(flux, system, seed=SEED)[0, 0].astype(np.float64)
-        expected = mean_histogram(None, BACKGROUND, system, waveform=waveform)
+        expected = mean_histogram(Flux(waveform=waveform, background=BACKGROUND), system)
         shown.append(Seen(name, expected, cube.mean(0), cube.std(0, ddof=1) / np.sqrt(exposures)))
     light = {"glass (S, ns)": GLASS, "wall (S, ns)": WALL, **FOG, "background B": BACKGROUND, "dead_time_ns": DEAD_NS}
     return {

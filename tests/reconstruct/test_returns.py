@@ -188,7 +188,7 @@ def test_bad_input(change: dict, message: str) -> None:
 
 
 def test_the_bound_of_one_is_that_of_one() -> None:
-    one = ml.cramer_rao(1.0, 0.5, SYSTEM, delay_ns=DELAY)
+    one = ml.cramer_rao(ml.Flux(1.0, 0.5, DELAY), SYSTEM)
     same = returns_bound([1.0], 0.5, SYSTEM, delay_ns=[DELAY])
     assert same.depth_m[0] == pytest.approx(float(one.depth_m), rel=1e-3)
     assert same.signal[0] == pytest.approx(float(one.signal), rel=1e-3)

@@ -45,7 +45,7 @@ def held_out() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def test_pdf_is_within_a_fiftieth_of_the_chain(held_out):
     signal, background, delay = held_out
-    chain = ml.registration_pdf(signal, background, SYSTEM, "chain", delay_ns=delay)
+    chain = ml.registration_pdf(ml.Flux(signal, background, delay), SYSTEM, "chain")
     found = NEURAL.registration_pdf(signal, background, SYSTEM, delay_ns=delay)
     np.testing.assert_allclose(found.sum(-1), 1.0, rtol=1e-12)
     assert (found >= 0.0).all()
@@ -53,7 +53,7 @@ def test_pdf_is_within_a_fiftieth_of_the_chain(held_out):
     assert off.max() < WITHIN
     assert off.mean() < WITHIN / 10
     # what a network that ignores its input would score, in the best of frames: each flux at the same delay
-    fixed = ml.registration_pdf(signal, background, SYSTEM, "chain")
+    fixed = ml.registration_pdf(ml.Flux(signal, background, 0.5 * SYSTEM.period_ns), SYSTEM, "chain")
     assert variation(fixed, fixed.mean(0)).mean() > 10 * WITHIN
 
 
@@ -76,12 +76,12 @@ def test_count_has_the_mean_of_the_chain_and_the_variance_of_one_holding_time(he
     signal, background, _ = (x[:40] for x in held_out)
     law = NEURAL.count_law(signal, background, SYSTEM)
     for k, (s, b) in enumerate(zip(signal, background, strict=True)):
-        times = holding_times(PhaseChain.from_flux(s, b, SYSTEM))
+        times = holding_times(PhaseChain.from_flux(ml.Flux(s, b, 0.5 * SYSTEM.period_ns), SYSTEM))
         assert law.mean[k] == pytest.approx(SYSTEM.cycles / times.mu, rel=0.01)
         # (3.5) in place of (3.9): t sigma_ss^2 / mu^3
         assert law.variance[k] == pytest.approx(SYSTEM.cycles * times.sigma_ss2 / times.mu**3, rel=0.1)
     # and that is not the variance of the count: the covariances are what the MaRS paper adds
-    exact = ml.count_law(8.0, 0.1, SYSTEM).variance
+    exact = ml.count_law(ml.Flux(8.0, 0.1, 0.5 * SYSTEM.period_ns), SYSTEM).variance
     assert NEURAL.count_law(8.0, 0.1, SYSTEM).variance > 1.5 * exact
 
 

@@ -22,7 +22,7 @@ from studies.common.sample import (
     paper_grids,
     system_of,
 )
-from studies.common.simulators import Prediction, arrival_shape, simulators
+from studies.common.simulators import Prediction, arrival_shape, centred, simulators
 from studies.neural.pairs import Training
 
 FIGURES = ("wasserstein", "kl", "mean", "variance")  # distances of a law to the truth, in this order
@@ -236,13 +236,12 @@ def shape_sweep(settings: Settings, tell: Tell) -> dict[str, FloatArray]:
     found: dict[str, list[FloatArray]] = {name: [] for name in SHAPES}
     for dead in settings.dead_sweep:
         system = settings.system(PERIOD_NS, dead * PERIOD_NS)
-        truth = registration_pdf(Flux(signal, background, 0.5 * system.period_ns), system, "exposure")
+        flux = centred(signal, background, system)
+        truth = registration_pdf(flux, system, "exposure")
         shapes = {
-            "poisson": arrival_shape(signal, background, system),
-            "renewal": registration_pdf(Flux(signal, background, 0.5 * system.period_ns), system, "chain"),
-            "mars_edge": registration_pdf(
-                Flux(signal, background, 0.5 * system.period_ns), system, "chain", rearm="edge"
-            ),
+            "poisson": arrival_shape(flux, system),
+            "renewal": registration_pdf(flux, system, "chain"),
+            "mars_edge": registration_pdf(flux, system, "chain", rearm="edge"),
         }
         for name, shape in shapes.items():
             found[name].append(0.5 * np.abs(shape - truth).sum(-1))

@@ -61,7 +61,7 @@ def _bounds(
     scale = np.sqrt(np.diag(np.linalg.inv(information)))
     steps = _STEP * np.concatenate([np.zeros((1, 3)), np.diag(scale), -np.diag(scale)])
     points = np.asarray(truth) + steps
-    gradient = np.array([log_likelihood(h, system, *points.T)[1] for h in cube])  # (pixels, 7, 3)
+    gradient = np.array([log_likelihood(h, Flux(*points.T), system)[1] for h in cube])  # (pixels, 7, 3)
     score = gradient[:, 0] * scale
     second = (gradient[:, 1:4] - gradient[:, 4:]) * scale / (2.0 * _STEP)
     second = 0.5 * (second + second.transpose(0, 2, 1)) + score[:, :, None] * score[:, None, :]

@@ -144,7 +144,7 @@ def window_lines(settings: Settings) -> list[dict[str, Any]]:
     weights = window_weights(PLAIN, delay)
     lines = []
     for signal in settings.signals[:: max(1, len(settings.signals) // 5)]:
-        mean, deviation = window_error(weights, signal, signal / SBR, PLAIN, delay_ns=delay)
+        mean, deviation = window_error(weights, Flux(signal, signal / SBR, delay), PLAIN)
         bound = float(cramer_rao(Flux(signal, signal / SBR, delay), PLAIN).signal)
         lines.append(
             {

@@ -242,7 +242,7 @@ def test_log_likelihood_is_the_native_one():
     counts = ml.simulate(flux, one, seed=1)[0, 0, 0]
     at = point([0.7, 0.5], [0.3, 0.35], [40.0, 40.5])
     found = histogram_log_likelihood(torch.from_numpy(counts.astype(float)), *at, one)
-    value, gradient, _ = log_likelihood(counts, one, *(x.detach().numpy() for x in at))
+    value, gradient, _ = log_likelihood(counts, ml.Flux(*(x.detach().numpy() for x in at)), one)
     found.sum().backward()
     np.testing.assert_allclose(float((found[0] - found[1]).detach()), value[0] - value[1], rtol=5e-3)
     for k in range(3):

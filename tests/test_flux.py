@@ -135,7 +135,7 @@ def test_info_is_the_fluxs_own():
     flux = ml.Flux(1.0, 0.0, 5.0, info=info)
     info["level"] = 2.0
     assert flux.info == {"level": 1.0}
-    assert flux[0].info == {"level": 1.0}
+    assert flux.image[0].info == {"level": 1.0}
     assert ml.Flux(1.0, 0.0, 5.0).info == {}
 
 

@@ -122,7 +122,7 @@ def test_the_bound_knows_efficiency_and_dark_counts():
     [
         ({"background": 0.0}, "background must be > 0, got 0.0"),
         ({"signal": -1.0}, "signal must lie in .* got -1.0"),
-        ({"delay_ns": math.nan}, "delay_ns must be finite.* got nan"),
+        ({"delay_ns": math.nan}, "delay_ns must be finite.* got NaN"),
     ],
 )
 def test_bad_arguments_of_the_bound_are_named(change, words):

@@ -58,8 +58,8 @@ class System:
     Raises
     ------
     ValueError
-        A number out of its range, a pulse that does not fit in the period, a dead time above 2^20 periods, or a combination
-        of settings that no detector has; the text names the setting.
+        A number out of its range, a pulse that does not fit in the period, a dead time above 2^20 periods, or settings
+        that no detector combines; the text names the setting.
     TypeError
         A pulse or detector of another type, a number that is none, or an unknown keyword.
 

@@ -89,7 +89,7 @@ html_static_path = ["_static", "copied/static"]
 html_css_files = ["katex/katex.min.css", "site.css"]
 html_theme_options = {
     "show_prev_next": False,
-    "secondary_sidebar_items": ["page-toc"],
+    "secondary_sidebar_items": {"**": ["page-toc"], "gallery/*": [], "lessons/*": []},  # programs need the width
     "navbar_align": "left",
     "header_links_before_dropdown": 8,
     "footer_start": ["copyright"],

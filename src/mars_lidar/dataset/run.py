@@ -55,6 +55,10 @@ class Generated:
         Seconds spent simulating, and packing and writing, all threads added.
     seconds
         Wall clock.
+
+    See Also
+    --------
+    generate
     """
 
     path: Path
@@ -114,6 +118,25 @@ def generate(
         `out` exists, and neither `resume` nor `overwrite` is given.
     mars_lidar.io.WriteError, mars_lidar.io.Interrupted
         Stopped half way (a full disk, Ctrl-C); the text says how to go on.
+
+    See Also
+    --------
+    simulate, Scene, mars_lidar.learn.StoredDataset
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import mars_lidar as ml
+    >>> system = {
+    ...     "period_ns": 100.0, "cycles": 200, "bins": 64,
+    ...     "pulse": {"kind": "gaussian", "sigma_ns": 1.0}, "detector": {"dead_time_ns": 75.0},
+    ... }
+    >>> scenes = {"example": "room", "size": [8, 12]}
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     recipe = {"scenes": scenes, "systems": system, "light": {"signal": [0.1, 1.0]}}
+    ...     done = ml.generate(recipe, f"{folder}/set.zarr")
+    >>> done.shape  # (samples, realizations, H, W, bins)
+    (2, 1, 8, 12, 64)
     """
     began = time.perf_counter()
     progress = shown(progress, "generating")

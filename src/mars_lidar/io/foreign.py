@@ -23,6 +23,7 @@ from mars_lidar.io.cube import Cube
 from mars_lidar.io.measured import from_histograms, from_photon_times, in_order
 from mars_lidar.io.named_arrays import cell_arrays, hdf5_arrays, mat_arrays
 from mars_lidar.io.recorder import RECORDER_SUFFIXES, Recorded, recorded
+from mars_lidar.io.rgbd.pixels import decoded
 from mars_lidar.io.streams.bare_stream import cells_of
 
 FOREIGN_SUFFIXES = (".npy", ".npz", ".mat", ".h5", ".hdf5", ".tif", ".tiff", ".csv", ".txt", *RECORDER_SUFFIXES)
@@ -281,11 +282,13 @@ def _mat(path: Path, names: list[str] | None = None) -> dict[str, Any]:
 
 
 def _tiff(path: Path) -> dict[str, Any]:
-    import imageio.v3 as iio
+    from PIL import Image, ImageSequence
 
-    claimed = iio.improps(path, index=..., plugin="pillow")  # type: ignore[arg-type]  # all pages, as imageio says
-    check_claim(path, math.prod(claimed.shape) * claimed.dtype.itemsize, "its pages")
-    return {"": np.stack(list(iio.imiter(path, plugin="pillow")))}
+    with Image.open(path) as image:
+        pixel = np.array(Image.new(image.mode, (1, 1))).nbytes
+        claimed = sum(pixel * math.prod(page.size) for page in ImageSequence.Iterator(image))
+        check_claim(path, claimed, "its pages")
+        return {"": np.stack([decoded(page) for page in ImageSequence.Iterator(image)])}
 
 
 def _table(path: Path) -> dict[str, Any]:

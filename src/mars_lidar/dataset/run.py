@@ -20,7 +20,7 @@ from typing import Any
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.files import INCOMPLETE_SUFFIX, Interrupted, WriteError, check_target, exchange, open_own
+from mars_lidar._base.files import Interrupted, WriteError, check_target, exchange, open_own, successor
 from mars_lidar._base.progress import shown
 from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import Progress
@@ -156,11 +156,11 @@ def generate(
     if workers is not None or scheduler is not None:
         cluster.reach(scheduler)  # before the scenes are read
     with _alone(target):  # what is there is looked at under the lock: before, another run may have finished it
-        successor = _successor(target)
-        if overwrite and successor.exists():
-            shutil.rmtree(successor)  # of a stopped run that is started again
+        beside = successor(target)
+        if overwrite and beside.exists():
+            shutil.rmtree(beside)  # of a stopped run that is started again
         replacing = overwrite and target.exists()  # by a store that is made beside it, or one that was begun so
-        store = successor if replacing or (resume and successor.exists()) else target
+        store = beside if replacing or (resume and beside.exists()) else target
         there = store.exists() and resume
         if there:
             dataset = open_dataset(store, allow_incomplete=True)
@@ -313,11 +313,6 @@ def _check_same(target: Path, dataset: Dataset, wanted: DatasetRecipe | None) ->
                 f"{target} was begun with another recipe: {name} was {json.dumps(old.get(name))}, "
                 f"now {json.dumps(new[name])}; start again with overwrite, or choose another name"
             )
-
-
-def _successor(target: Path) -> Path:
-    """Where the store is made that will replace `target`: readers keep the old one until the new one is complete."""
-    return target.with_name(f"{target.stem}{INCOMPLETE_SUFFIX}{target.suffix}")
 
 
 def _left(store: Path, target: Path) -> str:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mars_lidar._base import mat5
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.files import check_claim, npy_header, open_npz, read_npy, reading, whole
+from mars_lidar._base.files import NpyFile, check_claim, npy_header, open_npz, read_npy, reading, whole
 from mars_lidar._base.hdf5 import CELLS, open_hdf5
 from mars_lidar._base.sparse import check_sparse, dense_bytes, is_sparse
 from mars_lidar._base.text import read_column
@@ -159,7 +159,10 @@ def listed(path: Path) -> dict[str, str]:
                 heads = {name.removesuffix(".npy"): npy_header(archive.open(name)) for name in archive.namelist()}
             if {"format", "shape", "data"} <= heads.keys():
                 return {"": f"sparse, {heads['data'][0][0]} values {heads['data'][1]}"}
-            return {name: _in_words(shape, dtype) for name, (shape, dtype) in heads.items() if shape}
+            return {name: _in_words(shape, dtype) for name, (shape, dtype, _) in heads.items() if shape}
+        if suffix == ".npy":
+            head = NpyFile(path)
+            return {"": _in_words(head.shape, head.dtype)}
     return {name: _in_words(array.shape, array.dtype) for name, array in arrays(path).items()}
 
 

@@ -278,7 +278,7 @@ class Table:
     @classmethod
     @checked
     def load(cls, path: str | Path, system: System | None = None) -> Table:
-        """The table of a file, for `system` (None: for the one it was made for); shapes stay in the file, mapped.
+        """The table of a file, for `system` (None: for the one it was made for).
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""The style sheet of all pictures, ``mars.mplstyle`` beside this file, and colours that are set by name."""
+"""The style sheet of all pictures (mars.mplstyle beside this file), and colours that are set by name."""
 
 from __future__ import annotations
 

@@ -62,7 +62,7 @@ numpydoc_xref_param_type = False
 
 def _style(gallery: dict[str, object], name: str) -> None:
     """The style of every picture, applied before each example."""
-    matplotlib.style.use(ROOT / "docs" / "gallery.mplstyle")
+    matplotlib.style.use(["mars_lidar.plot.mars", ROOT / "docs" / "gallery.mplstyle"])
 
 
 sphinx_gallery_conf = {

@@ -62,7 +62,7 @@ numpydoc_xref_param_type = False
 
 def _style(gallery: dict[str, object], name: str) -> None:
     """The style of every picture, applied before each example."""
-    matplotlib.style.use(ROOT / "docs" / "gallery.mplstyle")
+    matplotlib.style.use(["mars_lidar.plot.mars", ROOT / "docs" / "gallery.mplstyle"])
 
 
 sphinx_gallery_conf = {
@@ -89,7 +89,7 @@ html_static_path = ["_static", "copied/static"]
 html_css_files = ["katex/katex.min.css", "site.css"]
 html_theme_options = {
     "show_prev_next": False,
-    "secondary_sidebar_items": ["page-toc"],
+    "secondary_sidebar_items": {"**": ["page-toc"], "gallery/*": [], "lessons/*": []},  # programs need the width
     "navbar_align": "left",
     "header_links_before_dropdown": 8,
     "footer_start": ["copyright"],

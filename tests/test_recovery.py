@@ -286,7 +286,7 @@ def test_what_has_no_law_says_so():
     told = "does not do recovery_ns of the detector, got 5.0.*'exact' or 'sequential'"
     for law in ("count_law", "exposure_moments", "joint_law", "mean_histogram", "registration_pdf"):
         with pytest.raises(ValueError, match=told):
-            getattr(statistics, law)(1.0, 1.0, system)
+            getattr(statistics, law)(ml.Flux(1.0, 1.0, 50.0), system)
     for engine in ("mars", "renewal", "feedback", "auto", "poisson"):
         with pytest.raises(ValueError, match=f"engine '{engine}' {told}"):
             ml.simulate(flux_of(1.0, 1.0), system, engine=engine)

@@ -50,7 +50,7 @@ def incident() -> FloatArray:
     clear = Flux.multi(Flux(GLASS[0], BACKGROUND, GLASS[1]), Flux(WALL[0], 0.0, WALL[1]))
     waveform = clear.in_fog(SYSTEM, parts=SYSTEM.bins, **FOG).waveform
     assert waveform is not None
-    return np.asarray(waveform[0, 0])
+    return waveform
 
 
 def run(request: Request) -> Facts:

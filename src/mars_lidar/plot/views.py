@@ -53,6 +53,7 @@ def example_pixels(flux: Flux, depth_m: NDArray[np.float64]) -> dict[str, tuple[
     Bright and dim are the 98th and the 5th percentile of the signal among pixels with a return; the edge is
     the steepest step in depth. The rim of the image is left out, where recorded images have their artefacts.
     """
+    flux = flux.image
     if np.shape(depth_m) != flux.shape:
         raise ValueError(f"depth_m must be {flux.shape} as the flux, got shape {np.shape(depth_m)}")
     inside, order = by_signal(flux)
@@ -104,6 +105,7 @@ def instrument(system: System) -> str:
 @checked
 def incident_rate(flux: Flux, system: System, y: int, x: int) -> NDArray[np.float64]:
     """Photons per period in each bin (bins,) that reach pixel (y, x), before gate and dead time."""
+    flux = flux.image
     y, x = (checks.integer(name, k, low=0, high=n - 1) for name, k, n in zip("yx", (y, x), flux.shape, strict=True))
     return photons_per_bin(flux[y, x], system.detected(), bins=system.bins)
 

@@ -18,8 +18,8 @@ import numpy as np
 
 from mars_lidar import __version__
 from mars_lidar._base.optional import needed
-from mars_lidar.reconstruct import image_stages as stages
-from mars_lidar.reconstruct.image_network import (
+from mars_lidar.reconstruction import image_stages as stages
+from mars_lidar.reconstruction.image_network import (
     CARD,
     CHANNELS,
     HIDDEN,
@@ -30,8 +30,8 @@ from mars_lidar.reconstruct.image_network import (
     Floats,
     Networks,
 )
-from mars_lidar.reconstruct.image_pulse import CELLS_PER_SIGMA, Cells, cells_of
-from mars_lidar.reconstruct.photons import Photons
+from mars_lidar.reconstruction.image_pulse import CELLS_PER_SIGMA, Cells, cells_of
+from mars_lidar.reconstruction.photons import Photons
 from studies import Tell
 from studies.image import scenes
 

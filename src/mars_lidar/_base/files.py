@@ -267,10 +267,12 @@ def reading(path: str | Path, kind: str = "file") -> Iterator[Path]:
     except Exception as error:
         text = " ".join(str(error).split())
         named = str(source) in text or (isinstance(error, OSError) and error.filename is not None)
-        if named and isinstance(error, MemoryError | OSError):
+        if named and (isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno is not None)):
             raise
-        if named and type(error) is ValueError:
-            raise FileError(str(error)) from error
+        if named and (
+            type(error) is ValueError or isinstance(error, OSError)
+        ):  # an OSError of a library's own, such as Pillow's
+            raise FileError(text) from error
         if isinstance(error, MemoryError):
             raise MemoryError(f"{source}: does not fit in memory ({text[:300]})") from error
         if not (text and isinstance(error, ValueError | TypeError | OSError)):  # such as a KeyError

@@ -304,6 +304,14 @@ def check_source(path: Path) -> None:
         raise FileError(f"{path} is no file but a pipe, socket or device")
 
 
+def is_plain_file(path: Path) -> bool | None:
+    """Whether this is a file, and no link to one; None where there is nothing."""
+    try:
+        return stat.S_ISREG(path.lstat().st_mode)
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+
+
 def check_claim(path: Path, nbytes: float, what: str = "its arrays", *, in_parts: bool = False) -> None:
     """Raise where a file claims more than its size makes likely, or, unless it is read in parts, than there is memory.
 

@@ -132,7 +132,9 @@ def statuses(request: Case, laps: int) -> np.ndarray[Any, Any]:
     out = np.full((task.items, request.system.bins), 7, request.system.histogram_dtype)
     status = np.empty((3, task.pixel_index.size), np.uint8)
     kinds = np.ones(request.system.bins, np.uint8)
-    _core.feedback_histogram(task.job, task.pulse, out, np.arange(task.pixel_index.size), status, kinds, laps, 1)
+    every = np.arange(task.pixel_index.size)
+    grids = np.array([every.size]), np.ascontiguousarray(kinds[None]), np.array([laps], np.int32)
+    _core.feedback_histogram(task.job, task.pulse, out, every, status, *grids, 1)
     assert (out[(status != Reason.DRAWN).reshape(-1)] == 7).all(), "a refused row is not written"
     return status
 
@@ -160,7 +162,7 @@ def test_laps_are_checked(laps: int):
 
 def test_reports_count_by_reason():
     report: dict[str, float] = {}
-    flux = ml.Flux([[20.0, 1.0, 1.0]], [[2.0, 1.0, 60.0]], 60.0)
+    flux = ml.Flux([[20.0, 1.0, 1.0]], [[2.0, 1.0, 400.0]], 60.0)
     ml.simulate(flux, SYSTEM.replace(cycles=3000), engine="feedback", seed=1, report=report)
     assert report[GIVEN] == 2
     assert report[f"{GIVEN}, locked, short exposure"] == 1

@@ -124,6 +124,34 @@ def test_bright_pulses_armed_again_within(name: str):
     check(Sampler(), AGAIN[name], ENGINES["exact"], {COUNTS, SHAPE, JOINT})
 
 
+BACKGROUND = {  # the total swung for ever in a fifth of such pixels, or they took 0.1 s in laps
+    "1.6 periods": case(1.0, 10.0, 1.6, 1_000_000, bins=64, items=2000),
+    "1.6 periods, brighter": case(7.0, 18.0, 1.6, 10_000_000, bins=64, items=2000),
+    "2.5 periods": case(1.0, 15.0, 2.5, 1_000_000, bins=64, items=2000),
+    "below a period": case(5.0, 18.0, 0.7273, 10_000_000, bins=64, items=2000),
+}
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("name", BACKGROUND)
+def test_bright_background_settles_to_its_joint_law(name: str):
+    """Every eigenmode of the covariance: mean and variance, and few exposures that are not drawn by the sweeps."""
+    request, report = BACKGROUND[name], dict[str, float]()
+    signal, background, delay = (
+        float(light[0, 0]) for light in (request.flux.signal, request.flux.background, request.flux.delay_ns)
+    )
+    flux = ml.Flux(np.full((1, request.items), signal), background, delay)
+    x = ml.simulate(flux, request.system, engine="feedback", seed=4, report=report)[0, 0].astype(float)
+    assert report[GIVEN] <= 0.01 * request.items
+    law = ml.joint_law(signal, background, request.system, delay_ns=delay)
+    size = np.sqrt(law.variance)
+    value, mode = np.linalg.eigh(law.covariance() / np.outer(size, size))
+    seen = value > 1e-3 * value.max()
+    y = ((x - law.mean) / size) @ mode[:, seen] / np.sqrt(value[seen])
+    assert np.abs(y.mean(0)).max() < 0.05 + 5.0 / np.sqrt(len(x))
+    assert np.abs(y.var(0) - 1.0).max() < 0.05 + 5.0 * np.sqrt(2.0 / len(x))
+
+
 # The kernel's own word
 
 

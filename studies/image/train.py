@@ -313,7 +313,7 @@ def _card(plan: Plan, facts: dict[str, float], seconds: float, torch: str) -> di
             "side": [17, 1000000],
         },
         "limits": "one surface a pixel; Gaussian pulses (others run, coverage as the study of the method states)",
-        "command": "python -m studies image --train --out src/mars_lidar/reconstruct",
+        "command": "python -m studies image --train --out src/mars_lidar/reconstruction",
         "seed": plan.seed,
         "steps": [plan.choose_steps, plan.weigh_steps],
         "processor_seconds": round(seconds),

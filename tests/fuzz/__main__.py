@@ -20,11 +20,11 @@ KINDS = ("read", "refused", *BAD)
 HEAD = f"""# Mutated files
 
 Mutations of a good file of each format, each read in a process of its own with limits of memory and time; made by
-`python -m tests.fuzz --examples N --seed S` at the commit that the row names (Python {platform.python_version()}). *Read*: as a
-file may be whose mutation changed nothing that matters, or numbers without a checksum; *refused*: by one error that names the
-file. The other columns are faults: an error without the file's name, one of a library, the end of the process, more than 10 s
-of CPU or 1 GiB, or a refusal that takes more than 3 s or 200 MiB. Most s, most MiB: CPU time and memory of the dearest
-refusal, above the process before it.
+`python -m tests.fuzz --examples N --seed S` at the commit that the row names (Python {platform.python_version()}).
+*Read*: as a file may be whose mutation changed nothing that matters, or numbers without a checksum; *refused*: by one
+error that names the file. The other columns are faults: an error without the file's name, one of a library, the end of
+the process, more than 10 s of CPU or 1 GiB, or a refusal that takes more than 3 s or 200 MiB. Most s, most MiB: CPU
+time and memory of the dearest refusal, above the process before it.
 
 | format | {" | ".join(KINDS)} | most s | most MiB | commit, date, N, S |
 |---|{"--:|" * (len(KINDS) + 2)}---|

@@ -53,8 +53,8 @@ plt.show()
 # on the 400 exposures of each signal. This is the test to ask of every method, a network's included
 # (:doc:`/studies/README`).
 
-found = ml.reconstruct(cube, system)
-pull = (found.delay_ns - delay_ns) / found.delay_error_ns
+estimate = ml.reconstruct(cube, system)
+pull = (estimate.delay_ns - delay_ns) / estimate.delay_error_ns
 
 fig, ax = plt.subplots()
 for within, color in ((1, "C0"), (2, "C1")):

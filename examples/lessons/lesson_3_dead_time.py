@@ -50,8 +50,8 @@ plt.show()
 # --------------------------
 #
 # A bright return is registered in nearly every period, so that in nearly every period the detector is dead for the
-# following :math:`t_d`, and re-arms at the same phase. The return casts a *shadow* of length :math:`t_d`, and at its end
-# the counts rise above the level of the background: a false echo. The figure shows the probability of being armed,
+# following :math:`t_d`, and re-arms at the same phase. The return casts a *shadow* of length :math:`t_d`, and at its
+# end the counts rise above the level of the background: a false echo. The figure shows the probability of being armed,
 # which is the histogram divided by the light:
 
 fig, ax = plt.subplots()

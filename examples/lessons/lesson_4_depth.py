@@ -31,19 +31,19 @@ system = ml.System(period_ns=100.0, cycles=20_000, bins=128, pulse=pulse, detect
 truth = ml.Flux(signal=3.0, background=1.0, delay_ns=60.0)
 counts = ml.simulate(truth, system, seed=4)[0, 0, 0]  # or your own: np.load("histogram.npy")
 
-found = ml.reconstruct(counts, system)
+estimate = ml.reconstruct(counts, system)
 light = ml.statistics.photons_per_bin(truth, system, bins=128)
 
 fig, ax = plt.subplots()
 ax.fill_between(system.time_ns, light, step="mid", color="0.85", label="light")
 ax.step(system.time_ns, counts / system.cycles, where="mid", label="counts per period")
 ax.plot(system.time_ns, generalised_coates_rates(counts, system), ".", label="equation (1)")
-ax.axvline(float(found.delay_ns), color="C2", label="maximum likelihood")
+ax.axvline(float(estimate.delay_ns), color="C2", label="maximum likelihood")
 ax.set(yscale="log", xlabel="time in the period (ns)", ylabel="photons per bin and period")
 ax.legend(loc="upper left")
 plt.show()
-depth = f"Depth {found.depth_m:.4f} m, standard error {1e3 * found.depth_error_m:.1f} mm"
-print(f"{depth}; S = {found.signal:.2f}, B = {found.background:.3f}")
+depth = f"Depth {estimate.depth_m:.4f} m, standard error {1e3 * estimate.depth_error_m:.1f} mm"
+print(f"{depth}; S = {estimate.signal:.2f}, B = {estimate.background:.3f}")
 
 # %%
 # The program prints ``Depth 8.9925 m, standard error 3.1 mm; S = 2.98, B = 1.001``; the truth is 8.9938 m, 3 and 1.

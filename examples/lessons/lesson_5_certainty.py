@@ -53,8 +53,8 @@ plt.show()
 # one, 95 % within two. The figure tests this on the 400 exposures of each signal. Every method should pass this test,
 # a network included (:doc:`/results/README`).
 
-found = ml.reconstruct(cube, system)
-pull = (found.delay_ns - delay_ns) / found.delay_error_ns
+estimate = ml.reconstruct(cube, system)
+pull = (estimate.delay_ns - delay_ns) / estimate.delay_error_ns
 
 fig, ax = plt.subplots()
 for within, color in ((1, "C0"), (2, "C1")):

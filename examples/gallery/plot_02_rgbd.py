@@ -2,9 +2,9 @@
 An RGB-D image to a cube and a point cloud
 ==========================================
 
-Depth and colour, as an RGB-D camera gives them (here written from a built-in scene: put your own files in their
-place), become photon rates, photon rates become a cube of histograms, and the cube a depth map and a cloud of points
-that any viewer opens. The program prints ``6,667,088 counts; median depth error 4.3 mm.``
+From depth and colour, as an RGB-D camera gives them (here written from a built-in scene; use your own files instead),
+to photon rates, to a cube of histograms, to a depth map and a point cloud for any viewer. The program prints
+``6,667,088 counts; median depth error 4.3 mm.``
 """
 
 import matplotlib.pyplot as plt

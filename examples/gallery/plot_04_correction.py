@@ -2,9 +2,9 @@
 A piled-up histogram corrected
 ==============================
 
-Two thirds of the light are background, and a free-running pixel with 75 ns of dead time bends it: bins behind a
+Two thirds of the light are background, and a free-running pixel with a dead time of 75 ns distorts it: bins after a
 bright one are seldom armed. Coates' correction is for a detector that is armed at the start of each period, and fails
-here. The generalised one counts in how many periods each bin was armed; maximum likelihood knows the pulse as well.
+here. The generalised correction counts in how many periods each bin was armed; maximum likelihood uses the pulse, too.
 The program prints ``Registered 0.92 photons per period; fitted 3.00, true 3.00.``
 """
 

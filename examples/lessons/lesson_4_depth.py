@@ -2,18 +2,18 @@ r"""
 4 From counts back to depth
 ===========================
 
-A histogram is given, and how it was recorded: period, bins, number of periods, pulse, dead time. Wanted are the
-depth, the signal :math:`S` and the background :math:`B`. The idea of :doc:`lesson_2_pile_up` carries over to a
-free-running detector: **count in how many periods each bin was armed.** A registration in bin :math:`k` blinds the
-detector for the bins of the following dead time, so with :math:`d = t_d / (\text{bin width})` and bins counted round
-the period
+Given are a histogram and how it was recorded: period, bins, number of periods :math:`N_r`, pulse, dead time
+:math:`t_d`. To be estimated are the depth, the signal :math:`S` and the background :math:`B`. The correction of
+:doc:`lesson_2_pile_up` carries over to a free-running detector: **count in how many periods each bin was armed.** A
+registration in bin :math:`k` makes the detector dead in the bins of the following dead time. With
+:math:`d = t_d / (\text{bin width})` and bins counted round the period
 
 .. math:: \text{armed}_j \approx N_r - \sum_{k = j - d}^{j - 1} n_k,
    \qquad \hat l_j = -\ln\Bigl(1 - \frac{n_j}{\text{armed}_j}\Bigr). \tag{1}
 
-The histogram corrects itself. ``generalised_coates_rates`` does this with fractions of bins; *maximum likelihood*
-adds that the light is a pulse of known shape on a uniform background, and finds the :math:`S, B, \tau` under which
-the counts, given the armed periods, are most probable:
+``generalised_coates_rates`` computes (1) with fractions of bins. *Maximum likelihood* also uses that the light is a
+pulse of known shape on a uniform background, and maximises over :math:`S, B, \tau` the probability of the counts given
+the armed periods:
 
 .. math:: \begin{aligned}
    \log L(S, B, \tau) &= \sum_j n_j \log\bigl(1 - \mathrm e^{-l_j}\bigr) - (\text{armed}_j - n_j)\, l_j, \\

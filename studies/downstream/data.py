@@ -256,10 +256,10 @@ class Data:
         system = instrument(MAIN)
         s, b = (np.geomspace(0.01, 10.0, max(4, points // 4)) for points in self.sizes.table)
         exact = Table.build(system, s, b, threads=1)
-        light = np.meshgrid(exact.signal, exact.background, indexing="ij")
+        light = Flux(*np.meshgrid(exact.signal, exact.background, indexing="ij"), 0.5 * system.period_ns)
         engine = NeuralEngine()
-        law = engine.count_law(*light, system)
-        shape = engine.registration_pdf(*light, system).reshape(-1, system.bins).astype(np.float32)
+        law = engine.count_law(light, system)
+        shape = engine.registration_pdf(light, system).reshape(-1, system.bins).astype(np.float32)
         entries = replace(exact.entries, cumulants=law.cumulants.reshape(-1, 4), shape=shape, startup=None)
         return replace(exact, entries=entries, start_phases=StartPhases.none())
 

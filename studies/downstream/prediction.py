@@ -45,7 +45,7 @@ class Predicted:
 
 def at(signal: float, background: float, system: System, *, summed: bool = True) -> Predicted:
     """The prediction at one light, the return in the middle of the period; of all bins where they are not `summed`."""
-    law = joint_law(signal, background, system)
+    law = joint_law(Flux(signal, background, 0.5 * system.period_ns), system)
     exact, mean = law.covariance(), law.mean
     total = mean.sum()
     mars = np.diag(mean) + np.outer(mean, mean) * (law.count_variance / total**2 - 1.0 / total)

@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from mars_lidar import System, cramer_rao, reconstruct
+from mars_lidar import Flux, System, cramer_rao, reconstruct
 from mars_lidar._base.optional import needed
 from mars_lidar._base.types import FloatArray
-from mars_lidar.reconstruct import MaximumLikelihood
+from mars_lidar.reconstruction import MaximumLikelihood
 from studies import Facts, Request
 from studies.common.kept import chosen, fixed, kept
 from studies.downstream.data import CONFIGS, MAIN, PAIR, Config, Data, instrument, truths
@@ -145,7 +145,7 @@ def methods(data: Data, dead: float, sbr: float) -> dict[str, dict[str, list[flo
     psnr, depth = [], []
     for flux in data.fluxes(dead, sbr):
         lit = flux.signal > 0
-        bound = cramer_rao(flux.signal[lit], flux.background[lit], system, delay_ns=flux.delay_ns[lit])
+        bound = cramer_rao(Flux(flux.signal[lit], flux.background[lit], flux.delay_ns[lit]), system)
         psnr.append(float(-10.0 * np.log10(np.mean((bound.signal / photons) ** 2))))
         depth.append(float(np.mean(bound.depth_m**2)))
     return out | {"Cramer-Rao bound": {"psnr": psnr, "depth_square": depth}}

@@ -26,8 +26,7 @@ class Case:
 
     @property
     def bound(self) -> np.ndarray:
-        signal, background, delay = self.light
-        bound = ml.cramer_rao(signal, background, self.system, delay_ns=delay)
+        bound = ml.cramer_rao(ml.Flux(*self.light), self.system)
         return np.array([float(bound.signal), float(bound.background), float(bound.depth_m) / LIGHT_M_PER_NS])
 
 
@@ -56,8 +55,7 @@ def drawn(number: int) -> Case:
 
 def bias(case: Case) -> np.ndarray:
     """Of S, B and the delay, at the exact mean histogram, in standard deviations of the bound."""
-    signal, background, delay = case.light
-    mean = ml.statistics.mean_histogram(signal, background, case.system, delay_ns=delay, tolerance=1e-6)
+    mean = ml.statistics.mean_histogram(ml.Flux(*case.light), case.system, tolerance=1e-6)
     counts = torch.from_numpy(np.asarray(mean).reshape(-1))
     at = torch.tensor(case.light, dtype=torch.float64)
 

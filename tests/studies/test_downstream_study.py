@@ -186,10 +186,10 @@ def test_the_closed_form_is_the_scatter_of_the_estimate(dead_ns):
     closed = at(*light[:2].tolist(), one, summed=False)
     step = np.array([1e-2, 1e-2, 1e-2])
     both = light + np.concatenate([np.diag(step), -np.diag(step)])
-    mean = mean_histogram(both[:, 0], both[:, 1], one, delay_ns=both[:, 2], tolerance=1e-6)
+    mean = mean_histogram(ml.Flux(*both.T), one, tolerance=1e-6)
     moved = ((mean[:3] - mean[3:]) / (2.0 * step[:, None])).T
-    centre = mean_histogram(*light[:2], one, delay_ns=light[2], tolerance=1e-6).reshape(-1)
-    law = ml.joint_law(*light[:2].tolist(), one)
+    centre = mean_histogram(ml.Flux(*light), one, tolerance=1e-6).reshape(-1)
+    law = ml.joint_law(ml.Flux(*light), one)
     total = centre.sum()
     mars = np.diag(centre) + np.outer(centre, centre) * (law.count_variance / total**2 - 1.0 / total)
     weights = np.linalg.solve(mars, moved)

@@ -34,7 +34,7 @@ from mars_lidar.instrument.effects import LIGHT_EFFECTS
 from mars_lidar.instrument.pulse import GaussianPulse, Pulse, SampledPulse
 from mars_lidar.instrument.system import System
 from mars_lidar.learn.needed import torch
-from mars_lidar.reconstruct.histogram_record import relative_width
+from mars_lidar.reconstruction.histogram_record import relative_width
 from mars_lidar.statistics.phase_chain import ConvergenceError
 
 # --- Photons of each bin -------------------------------------------------------------------------------------------

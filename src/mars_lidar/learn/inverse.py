@@ -27,9 +27,9 @@ from mars_lidar.instrument.system import System
 from mars_lidar.learn.forward import check_detector, expected_histogram, histogram_log_likelihood
 from mars_lidar.learn.tabulated import HistogramTable
 from mars_lidar.light.flux import Flux
-from mars_lidar.reconstruct.histogram_record import relative_width
-from mars_lidar.reconstruct.reconstruction import reconstruct
-from mars_lidar.simulate import simulate
+from mars_lidar.reconstruction.histogram_record import relative_width
+from mars_lidar.reconstruction.reconstruction import reconstruct
+from mars_lidar.simulation import simulate
 from mars_lidar.table import Table
 
 _ZERO = 0.2  # photons in the exposure that an estimate of zero stands for, in a logarithm

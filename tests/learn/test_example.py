@@ -32,6 +32,16 @@ def test_it_is_short():
     assert len([line for line in core.splitlines() if line.strip()]) <= 24
 
 
+@pytest.mark.nightly
+def test_own_prior():
+    """Shortened: intervals of a flow on pixels that it has not seen; 4 standard errors and what a short training costs."""
+    pytest.importorskip("sbi")
+    example = runpy.run_path(str(PATH.with_name("own_prior.py")))
+    shares, error = example["coverage"](example["train"](8192, 15), 256, 200)
+    for name, share in shares.items():
+        assert abs(share - 0.9) < 4.0 * error + 0.03, (name, share)
+
+
 @pytest.mark.full
 def test_learned_prior(deepinv):
     """Shortened: the denoiser learns; its gradient is that of the likelihood; it mends depths that noise displaced."""

@@ -90,7 +90,7 @@ _TINY = Sizes(
     lights=2,
 )
 CONFIGS = {
-    "small": Config(name="small", seeds=1, dead=(0.95, 0.1), lines=(0.1, 0.3, 0.75, 0.95)),
+    "small": Config(name="small", seeds=1, dead=(0.95,), lines=(0.75,)),
     "full": Config(name="full", spatial=3),
     "tiny": Config(
         name="tiny",

@@ -81,7 +81,7 @@ def run(request: Request) -> Facts:
     lines = {
         (dead, sbr): kept(folder / f"law-dead{dead:g}-sbr{sbr:g}.json", partial(_law, data, dead, sbr), tell)
         for sbr in config.sbr
-        for dead in sorted({*config.lines, *config.dead, MAIN})
+        for dead in sorted({*config.lines, MAIN, *(config.dead if sbr == 1.0 else ())})
     }
     return {"study": report} | report.facts(config, found, bounds, lines)
 

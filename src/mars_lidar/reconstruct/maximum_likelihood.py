@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from mars_lidar._base import arguments, checks
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
-from mars_lidar.reconstruct.fit_quality import FALSE_ALARM, fit_quality, holds_for
+from mars_lidar.reconstruct.fit_quality import COLUMNS, FALSE_ALARM, quality_of, tested_recordings
 from mars_lidar.reconstruct.histogram_record import recording_of, relative_width
 from mars_lidar.reconstruct.histograms import Histograms, checked
 from mars_lidar.reconstruct.method import Estimates, Flags, Method
@@ -38,15 +38,12 @@ class MaximumLikelihood(Method):
         likelihood by it is more than what the others and the background reach anywhere in the period with probability
         `false_alarm` (R23; docs/reconstruction.md, section 9). Signal, delay and background are those of the strongest
         then, beside the others.
-    tested
-        Test the fit of each pixel, of one return and a free-running detector (docs/reconstruction.md, section 11).
     """
 
     starts: int = 3
     false_alarm: float = 0.01
     less_bias: bool = True
     returns: int = 1
-    tested: bool = True
 
     name = "maximum_likelihood"
     modes = ("nonparalyzable", "synchronous", "gated")
@@ -68,11 +65,14 @@ class MaximumLikelihood(Method):
         return float(NormalDist().inv_cdf(1.0 - self.false_alarm / places) ** 2)
 
     def estimate(self, histograms: Histograms) -> Estimates:
-        """The estimates, their standard errors, and the significance of the signal."""
+        """The estimates, their standard errors, the significance of the signal, and whether they fit."""
         from mars_lidar._base.native import _core
 
-        out = np.empty((len(histograms.counts), 8))
-        flags = np.empty(len(histograms.counts), np.uint8)
+        pixels = len(histograms.counts)
+        out = np.empty((pixels, 8))
+        flags = np.empty(pixels, np.uint8)
+        tests = tested_recordings(histograms.system) if self.returns == 1 else []
+        statistics = np.empty((pixels if tests else 0, COLUMNS))
         _core.maximum_likelihood(
             histograms.recording,
             histograms.counts,
@@ -81,14 +81,15 @@ class MaximumLikelihood(Method):
             less_bias=self.less_bias,
             out=out,
             flags=flags,
+            tests=tests,
+            quality=statistics,
             threads=histograms.threads,
             progress=histograms.progress,
         )
         several = self._several(histograms, out, flags) if self.returns > 1 else None
         column = np.ascontiguousarray(out.T)
-        quality = None
-        if self.tested and several is None and holds_for(histograms.system):
-            quality = fit_quality(histograms, column[0], column[1], column[2])
+        quality = quality_of(statistics) if tests else None
+        if quality is not None:
             flags |= np.where(quality.p_value < FALSE_ALARM, Flags.MISFIT, 0).astype(np.uint8)
         return Estimates(
             signal=column[0],

@@ -161,6 +161,9 @@ class Maximizer {
         errors(best, out + 3);
     }
 
+    // Of the last histogram.
+    const ArmedPasses& passes() const { return passes_; }
+
  private:
     // Takes off the first-order bias of the maximum, at most a standard error of it, and of S never more than S.
     void correct(const PixelLikelihood& pixel, double least, Fit& fit) {

@@ -22,7 +22,7 @@ PIXEL = (34, 83)  # row and column, on the door
 
 def main() -> None:
     """Simulate the room and draw it."""
-    plt.style.use(DOCS / "gallery.mplstyle")
+    plt.style.use(["mars_lidar.plot.mars", DOCS / "gallery.mplstyle"])
     plt.rcParams |= {"font.size": 12, "axes.titlesize": 12}
     scene = ml.Scene.example("room", size=(96, 128))
     pulse, detector = ml.GaussianPulse(sigma_ns=0.5), ml.Detector(dead_time_ns=75.0)

@@ -7,10 +7,10 @@ import subprocess
 import sys
 import time
 
-import imageio.v3 as imageio
 import numpy as np
 import pytest
 import xarray
+from PIL import Image
 from typer.testing import CliRunner
 
 import mars_lidar as ml
@@ -32,14 +32,14 @@ def run(*arguments: object):
 
 
 def write_depth(path, side: int = 8) -> None:
-    imageio.imwrite(path, np.full((side, side), 3000, np.uint16))
+    Image.fromarray(np.full((side, side), 3000, np.uint16)).save(path)
 
 
 @pytest.mark.parametrize("name", ["s00.jpg", "s00.jpeg", "s00.png", "s00.webp", "s00.JPG", "s00_rgb.webp"])
 def test_an_image_beside_its_depth_becomes_the_reflectivity(tmp_path, name):
     write_depth(tmp_path / "s00_depth.png")
     ramp = np.tile(np.linspace(0, 255, 8).astype(np.uint8), (8, 1))
-    imageio.imwrite(tmp_path / name, np.repeat(ramp[..., None], 3, axis=2), extension=name[name.index(".") :].lower())
+    Image.fromarray(np.repeat(ramp[..., None], 3, axis=2)).save(tmp_path / name)
     SYSTEM.save(tmp_path / "spad.yaml")
     (tmp_path / "recipe.yaml").write_text(RECIPE)
     ml.generate(tmp_path / "recipe.yaml", tmp_path / "set.zarr")
@@ -57,7 +57,7 @@ def test_a_folder_without_any_image_says_so(tmp_path):
     with pytest.warns(UserWarning, match=r"no image was found to any of 3 depth files.*s0_depth\.png"):
         scenes, _ = io.scan(tmp_path)
     assert [one.image for one in scenes] == [None] * 3
-    imageio.imwrite(tmp_path / "s1.jpg", np.full((8, 8), 200, np.uint8))
+    Image.fromarray(np.full((8, 8), 200, np.uint8)).save(tmp_path / "s1.jpg")
     scenes, _ = io.scan(tmp_path)  # some have none, which is nothing odd
     assert [one.image and one.image.name for one in scenes] == [None, "s1.jpg", None]
 

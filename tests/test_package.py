@@ -23,7 +23,7 @@ HEAVY = (
     "zarr",
     "xarray",
     "h5py",
-    "imageio",
+    "PIL",
     "typer",
     "rich",
     "yaml",

@@ -6,6 +6,7 @@ import subprocess
 import sys
 
 import matplotlib as mpl
+import matplotlib.style
 import numpy as np
 import pytest
 from harness.ledger import rejected, require
@@ -15,6 +16,7 @@ from matplotlib.figure import Figure
 import mars_lidar as ml
 from mars_lidar import io, plot
 from mars_lidar.plot import views
+from mars_lidar.plot.style import COLOURS
 
 SYSTEM = ml.System(
     period_ns=100.0,
@@ -73,6 +75,12 @@ def test_a_map_has_a_colour_bar_with_its_unit(tmp_path):
     assert figure.axes[0].child_axes[0].get_ylabel() == "depth (m)"
     with pytest.raises(ValueError, match=r"values must be a map \(H, W\), got shape \(3,\)"):
         plot.map_image(np.zeros(3), "depth (m)")
+
+
+def test_the_style_sheet_serves_programs_of_users():
+    with matplotlib.style.context("mars_lidar.plot.mars"):
+        cycle = mpl.rcParams["axes.prop_cycle"].by_key()["color"]
+    assert cycle == list(COLOURS)
 
 
 def test_the_users_settings_and_pyplot_are_left_alone():

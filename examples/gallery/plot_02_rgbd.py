@@ -7,15 +7,15 @@ place), become photon rates, photon rates become a cube of histograms, and the c
 that any viewer opens. The program prints ``6,667,088 counts; median depth error 4.3 mm.``
 """
 
-import imageio.v3 as imageio
 import matplotlib.pyplot as plt
 import numpy as np
+from PIL import Image
 
 import mars_lidar as ml
 
 room = ml.Scene.example("room", size=(96, 128))
-imageio.imwrite("depth.png", (1000 * room.depth_m).astype(np.uint16))  # mm
-imageio.imwrite("colors.png", (255 * np.repeat(room.reflectivity[..., None], 3, axis=-1)).astype(np.uint8))
+Image.fromarray((1000 * room.depth_m).astype(np.uint16)).save("depth.png")  # mm
+Image.fromarray((255 * np.repeat(room.reflectivity[..., None], 3, axis=-1)).astype(np.uint8)).save("colors.png")
 
 scene = ml.Scene.from_rgbd("depth.png", "colors.png")
 pulse, detector = ml.GaussianPulse(sigma_ns=0.5), ml.Detector(dead_time_ns=75.0)

@@ -95,6 +95,17 @@ def simulate(
         (realizations, H, W, bins), uint16, or uint32 where a bin could exceed 65535 (`out` if given); of CuPy
         with ``device="cuda"``.
 
+    Raises
+    ------
+    ValueError
+        An argument out of its range, or a detector, start or light that the engine does not do; nothing was drawn.
+    TypeError
+        An argument of another type, or an unknown keyword.
+    MemoryError
+        The cube, or what the engine needs beside it, does not fit in the memory that is free.
+    ConvergenceError
+        (`mars_lidar.statistics`) A count law of ``engine="mars"`` does not converge; the text names the pixel.
+
     See Also
     --------
     simulate_timestamps, count_law, reconstruct, System
@@ -157,6 +168,13 @@ def simulate_timestamps(
     Timestamps
         Packed times (ns), cycles and bins of all pixels: of `exact` 8 bytes a registration, times and bins when asked
         for.
+
+    Raises
+    ------
+    ValueError
+        As `simulate`; also for an engine that draws histograms only.
+    MemoryError
+        The expected registrations do not fit in the memory that is free.
 
     See Also
     --------

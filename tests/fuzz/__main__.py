@@ -7,6 +7,7 @@ import collections
 import datetime
 import platform
 import shutil
+import subprocess
 import tempfile
 import time
 from pathlib import Path
@@ -15,11 +16,20 @@ from tests.fuzz.formats import make
 from tests.fuzz.run import BAD, fuzz
 from tests.fuzz.server import Server
 
+
+def head() -> str:
+    """The commit of this checkout, in short."""
+    return subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True
+    ).stdout.strip()
+
+
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--examples", type=int, default=500, help="of each format")
 parser.add_argument("--seed", type=int, default=1)
 parser.add_argument("--only", default="", help="names that contain this")
 parser.add_argument("--keep", type=Path, default=Path("fuzz_bad"), help="folder for the inputs that fared badly")
+parser.add_argument("--commit", default="", help="of the code that is read, for the report; default: of this folder")
 parser.add_argument("--out", type=Path, help="a Markdown file to write the table to")
 given = parser.parse_args()
 kinds = ("read", "refused", *BAD)
@@ -64,12 +74,14 @@ if given.out:
     words = [
         "# Mutated files",
         "",
-        f"Made by `python -m tests.fuzz --examples {given.examples} --seed {given.seed}` on {datetime.date.today()}, "
-        f"Python {platform.python_version()}: {given.examples} mutations of a good file of each format, each read in a "
+        f"Made by `python -m tests.fuzz --examples {given.examples} --seed {given.seed}` on {datetime.date.today()} at "
+        f"{given.commit or head()}, Python {platform.python_version()}: {given.examples} mutations of a good file of "
+        "each format, each read in a "
         "process of its own with limits of memory and time. *Read*: as a file may be whose mutation changed nothing "
         "that matters, or numbers without a checksum; *refused*: by one error that names the file. The other columns "
-        "are faults: an error without the file's name, one of a library, the end of the process, more than 10 s, more "
-        "than 1 GiB. Most s, most MiB: CPU time and memory of the dearest refusal, above the process before it.",
+        "are faults: an error without the file's name, one of a library, the end of the process, more than 10 s of CPU "
+        "or 1 GiB, or a refusal that takes more than 3 s or 200 MiB. Most s, most MiB: CPU time and memory of the "
+        "dearest refusal, above the process before it.",
         "",
         "| format | " + " | ".join(kinds) + " | most s | most MiB |",
         "|---|" + "--:|" * (len(kinds) + 2),

@@ -112,6 +112,20 @@ class Manifest:
                 raise self._error(f"{name} is not as it was written")
             self._known[name] = before
 
+    def read(self, name: str) -> bytes:
+        """The content of a file, as it was when the store was sealed."""
+        path = self._store / name
+        before = _state(path)
+        if before is None:
+            raise self._error(f"{name} is missing")
+        content = path.read_bytes()
+        if self._known.get(name) != before and hashlib.sha256(content).hexdigest() != self._sums.get(name):
+            raise self._error(f"{name} is not as it was written")
+        if _state(path) != before:
+            raise self._error(f"{name} was replaced while it was read")
+        self._known[name] = before
+        return content
+
     def _error(self, reason: str) -> FileError:
         return FileError(
             f"{self._store} is damaged, or was replaced or removed after it was opened: {reason}; open it again"
@@ -123,9 +137,12 @@ def told(store: Path) -> str:
     return f"every file of its {NAME} is there"
 
 
-def require(store: Path) -> Manifest:
-    """The manifest; FileError where a file of a store is missing, or a document of it is not as it was written."""
-    sums, documents, wrong = _compared(store, every=False)
+def require(store: Path, *, listed: bool = True) -> Manifest:
+    """The manifest; FileError where a file of a store is missing, or a document of it is not as it was written.
+
+    Names are compared only where they are `listed`: a file that is missing is else noticed when it is read.
+    """
+    sums, documents, wrong = _compared(store, every=False, listed=listed)
     if wrong:
         more = f", and {len(wrong) - 3} more" if len(wrong) > 3 else ""
         raise FileError(f"{store} is damaged: {', '.join(wrong[:3])}{more}")
@@ -137,7 +154,9 @@ def damage(store: Path, *, every: bool = True) -> list[str]:
     return _compared(store, every)[2]
 
 
-def _compared(store: Path, every: bool) -> tuple[dict[str, str], dict[str, tuple[int, ...]], list[str]]:
+def _compared(
+    store: Path, every: bool, listed: bool = True
+) -> tuple[dict[str, str], dict[str, tuple[int, ...]], list[str]]:
     """Sums by name, the states of the files that were read, and what is wrong."""
     path = store / NAME
     if not path.exists():
@@ -153,7 +172,7 @@ def _compared(store: Path, every: bool) -> tuple[dict[str, str], dict[str, tuple
         return _hash(store / name)
 
     stated = root_document(store).get("attributes", {}).get(SUM)
-    return sums, states, list(compared(sums, _files(store), digest, every, stated))
+    return sums, states, list(compared(sums, _files(store) if listed else None, digest, every, stated))
 
 
 def lines_of(text: str) -> dict[str, str]:

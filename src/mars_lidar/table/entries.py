@@ -535,6 +535,24 @@ class Lookup:
         asked for; NaN for a pixel `outside`.
     outside
         (P,) pixels that the table does not reach, to be evaluated by the caller.
+
+    See Also
+    --------
+    Table
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=64,
+    ...     pulse=ml.GaussianPulse(sigma_ns=2.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> table = ml.Table.build(system, signal=(0.1, 2.0, 6), background=(0.1, 1.0, 4), tolerance=1e-3)
+    >>> pixels = table.lookup([0.5, 9.0], 0.5, outside="exact")
+    >>> pixels.outside
+    array([False,  True])
+    >>> pixels.rows.shape
+    (2, 4)
     """
 
     rows: IndexArray

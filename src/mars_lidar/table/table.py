@@ -84,6 +84,23 @@ class Table:
         How the table came to be: version, request, axes in words, seconds, and the error measured at the end.
     laws
         Exact laws of the count at those entries whose four cumulants do not fix it (`statistics.matched.trusted`).
+
+    See Also
+    --------
+    Lookup, QuantisationError, simulate, count_law
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=64,
+    ...     pulse=ml.GaussianPulse(sigma_ns=2.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> table = ml.Table.build(system, signal=(0.1, 2.0, 6), background=(0.1, 1.0, 4), tolerance=1e-3)
+    >>> pixel = table.lookup(0.5, 0.5, delay_ns=30.0)
+    >>> pixel.cumulants[0, :2].round()  # mean and variance of the count
+    array([587., 202.])
+    >>> cube = ml.simulate(ml.Flux(0.5, 0.5, 30.0), system, engine="mars", table=table)
     """
 
     system: System
@@ -261,7 +278,7 @@ class Table:
     @classmethod
     @checked
     def load(cls, path: str | Path, system: System | None = None) -> Table:
-        """The table of a file, for `system` (None: for the one it was made for); shapes stay in the file, mapped.
+        """The table of a file, for `system` (None: for the one it was made for).
 
         Raises
         ------

@@ -1,6 +1,6 @@
 // crush BATTERY ORDER STREAMS WORDS SEED [FIRST]: the tests of TestU01's SmallCrush, Crush or BigCrush from the FIRST on,
 // on the words of words.h, or on their bits in reverse (BATTERY with the suffix "-reversed"). A line for each p-value, as
-// soon as it is known: number and name of the test, p-value, seconds. tests/randomness/report.py builds and runs it.
+// soon as it is known: number of the test, p-value, seconds, name. tests/randomness/report.py builds and runs it.
 //
 // P. L'Ecuyer, R. Simard, "TestU01: A C library for empirical testing of random number generators", ACM Trans. Math.
 // Softw. 33, 22 (2007).
@@ -73,7 +73,7 @@ int main(int argc, char** argv) {
         stdout = out;
         const double seconds = static_cast<double>(std::clock() - began) / CLOCKS_PER_SEC;
         for (int k = 0; k < bbattery_NTests; ++k)
-            std::printf("%d,%s,%.6g,%.1f\n", test, bbattery_TestNames[k], bbattery_pVal[k], seconds);
+            std::printf("%d,%.6g,%.1f,%s\n", test, bbattery_pVal[k], seconds, bbattery_TestNames[k]);
         std::fflush(stdout);
     }
     unif01_DeleteExternGenBits(generator);

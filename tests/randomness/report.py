@@ -33,7 +33,7 @@ ORDERS = (  # streams side by side, words of each
 TESTS = {"SmallCrush": 10, "Crush": 96, "BigCrush": 106}
 BITS = ("", "-reversed")  # TestU01 looks at the upper bits of a word more than at the lower ones
 SUSPECT = 1e-3  # p-values outside of [SUSPECT, 1 - SUSPECT] are listed; TestU01's authors call 1e-10 a clear failure
-COLUMNS = ("generator", "seed", "battery", "order", "streams", "words", "test", "name", "p", "seconds")
+COLUMNS = ("generator", "seed", "battery", "order", "streams", "words", "test", "p", "seconds", "name")
 
 
 def generator() -> str:
@@ -75,7 +75,7 @@ def run(program: Path, battery: str, order: tuple[str, int, int], seed: int, row
         assert process.stdout is not None
         try:
             for line in process.stdout:
-                values = dict(zip(COLUMNS[6:], line.strip().split(","), strict=True))
+                values = dict(zip(COLUMNS[6:], line.strip().split(",", 3), strict=True))
                 rows.append({**{key: str(value) for key, value in named.items()}, **values})
                 save(rows, path)
                 if time.monotonic() > until:

@@ -1,6 +1,6 @@
 """Goodness of fit of reconstructed pixels: does each histogram agree with the law of its own estimate?
 
-`native/reconstruct/fit_quality.h` computes the statistics of each pixel: docs/reconstruction.md, section 11.
+`native/reconstruct/fit_quality.h` computes the statistics of each pixel: docs/theory_reconstruction.md, section 8.
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
-// The laser periods in which a pixel was armed in each bin, from its own histogram: docs/reconstruction.md, section 1.
+// The laser periods in which a pixel was armed in each bin, from its own histogram:
+// docs/theory_reconstruction.md, section 1.
 #pragma once
 #include <algorithm>
 #include <cmath>

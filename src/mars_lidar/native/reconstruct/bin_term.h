@@ -1,4 +1,4 @@
-// The likelihood of one bin: docs/reconstruction.md, section 3, (R9).
+// The likelihood of one bin: docs/theory_reconstruction.md, section 3, (R9).
 #pragma once
 #include <algorithm>
 #include <cmath>

@@ -1,4 +1,5 @@
-// Goodness of fit of a pixel: does its histogram agree with the law of its own estimate? docs/reconstruction.md, section 11.
+// Goodness of fit of a pixel: does its histogram agree with the law of its own estimate?
+// docs/theory_reconstruction.md, section 8.
 //
 // Given the registrations before, those of a bin are the light there times its armed time. What a histogram has beyond
 // that, h - l t, is a martingale (Andersen, Borgan, Gill, Keiding, Statistical models based on counting processes, 1993),

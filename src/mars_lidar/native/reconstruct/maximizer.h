@@ -1,4 +1,5 @@
-// Maximum likelihood of signal, background and delay of one pixel: docs/reconstruction.md, section 3. Climbs by Fisher scoring
+// Maximum likelihood of signal, background and delay of one pixel (docs/theory_reconstruction.md, section 3). Climbs by
+// Fisher scoring
 // from several delays, compares with no signal at all, and takes off the first-order bias where that is asked for.
 #pragma once
 #include <algorithm>

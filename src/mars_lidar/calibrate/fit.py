@@ -27,7 +27,7 @@ _SETTLED = 1.0  # standard errors that the last estimate may lie from the centre
 _LONGEST = 3.0  # of a move of that centre
 _FAR = 5.0  # standard errors that the centre may move before cells are laid anew
 _RECENTRED = 4  # last batches, at most
-_PULSES = 8  # widths of a batch
+_PULSES = 4  # widths of a batch
 _CUMULATED = 10.0  # intervals expected up to an edge, for a normal law of their number
 _DRAWS = 20_000  # of the law of the estimate, for its bounds
 
@@ -97,8 +97,6 @@ def counted(
 
 def design(model: Model, centre: FloatArray, root: FloatArray, free: NDArray[np.intp], seed: int) -> FloatArray:
     """Parameters (streams, p), normal of covariance root root' about the centre; `LIGHTS` rows share a detector."""
-    from scipy.stats import norm, qmc
-
     cov = np.zeros((model.size, model.size))
     cov[np.ix_(free, free)] = root @ root.T
     lit, det = free[free < model.light], free[free >= model.light]
@@ -106,10 +104,8 @@ def design(model: Model, centre: FloatArray, root: FloatArray, free: NDArray[np.
     def normal(rows: int, columns: int, seed: int) -> FloatArray:
         if columns == 0:
             return np.zeros((rows, 0))
-        uniform = qmc.Sobol(columns, seed=seed).random_base2(int(np.ceil(np.log2(rows))))[:rows]
-        z = norm.ppf(0.002 + 0.996 * uniform)
-        z -= z.mean(0)
-        return np.asarray(z / z.std(0))
+        z = np.random.default_rng(seed).standard_normal((rows, columns))
+        return np.linalg.qr(z - z.mean(0))[0] * rows**0.5  # without correlation, of variance 1
 
     rows = np.tile(centre, (SETTINGS * LIGHTS, 1))
     within = cov[np.ix_(lit, lit)]
@@ -375,7 +371,7 @@ def _misfit(left: FloatArray, fresh: FloatArray, law: Batch, near: Batch) -> tup
     The probability is that of two tests together: the weighed square of all cells, and the largest departure of the
     cumulated intervals, which sees a few missing or early intervals at the edge of the dead time.
     """
-    from scipy.stats import gamma, norm
+    from scipy.special import gammaincc, ndtr
 
     used = law.common
     noise = 1.0 + law.ratio / len(near.counts)
@@ -383,10 +379,10 @@ def _misfit(left: FloatArray, fresh: FloatArray, law: Batch, near: Batch) -> tup
     drawn = np.einsum("ki,ij,kj->k", fresh[:, used], weight, fresh[:, used])
     mine = float(left[used] @ weight @ left[used]) / noise
     shape = drawn.mean() ** 2 / drawn.var()
-    square = float(gamma.sf(mine, shape, scale=drawn.mean() / shape))
+    square = float(gammaincc(shape, mine * shape / drawn.mean()))
     gaps = slice(law.cells.phases, law.cells.phases + law.cells.gap_edges.size)
     enough = np.cumsum(near.offset[gaps]) > _CUMULATED
     departure = np.abs(np.cumsum(left[gaps])) / (np.cumsum(fresh[:, gaps], axis=1).std(0) * noise**0.5)
     most = float(departure[enough].max(initial=0.0))
-    edge = float(min(1.0, 2.0 * enough.sum() * norm.sf(most)))
+    edge = float(min(1.0, 2.0 * enough.sum() * ndtr(-most)))
     return mine, float((mine - drawn.mean()) / drawn.std()), min(1.0, 2.0 * min(square, edge))

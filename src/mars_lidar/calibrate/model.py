@@ -175,8 +175,10 @@ class Model:
                 at += 1
         return out
 
-    def system(self, theta: FloatArray, cycles: int, bins: int = 16, extra: tuple[Effect, ...] = ()) -> System:
-        """The instrument of parameters (p,), with further effects at their starting values."""
+    def system(
+        self, theta: FloatArray, cycles: int, bins: int = 16, extra: tuple[Effect, ...] = (), jitter: bool = True
+    ) -> System:
+        """The instrument of parameters (p,), with further effects at their starting values, with or without jitter."""
         k = self.light
         theta = self.bounded(theta)
         width2, jitter2 = float(theta[k]), float(theta[k + 1])
@@ -188,7 +190,7 @@ class Model:
         for effect in extra:
             fields = effect.apply(fields, effect.start)
         least = _NARROWEST * self.clock.period_ns
-        if jitter2 > least**2:
+        if jitter and jitter2 > least**2:
             fields["jitter"] = Jitter(sigma_ns=jitter2**0.5)
         pulse = self.pulse or GaussianPulse(sigma_ns=float(f"{max(max(width2 - jitter2, 0.0) ** 0.5, least):.9g}"))
         return System(
@@ -209,14 +211,22 @@ class Model:
         return Flux(signal, back, delay) if self.returns > 1 else Flux(signal[0], back, delay[0])
 
     def streams(self, rows: FloatArray, cycles: int, seed: int, extra: tuple[Effect, ...] = ()) -> list[FloatArray]:
-        """Recorded times of a stream for each row of (rows, p); the detector is that of the first row."""
-        rows = np.atleast_2d(rows)
+        """Recorded times of a stream for each row of (rows, p); the detector is that of the first row, but its jitter.
+
+        The jitter of a recorded time is drawn here, a normal deviate each, so that it may differ from row to row and
+        no table of its shape is built for each value.
+        """
+        rows = self.bounded(np.atleast_2d(rows))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a trial value may look like one in another unit
-            system = self.system(rows[0], cycles, extra=extra)
+            system = self.system(rows[0], cycles, extra=extra, jitter=False)
             made = simulate_timestamps(self.flux(rows), system, seed=seed, threads=1)
-        t, at = made.times_ns, made.offsets
-        return [self.clock.record(t[a:b]) for a, b in pairwise(at)]
+        random = np.random.default_rng(seed)
+        t = np.add(made.cycle, made.phase, dtype=np.float64) * self.clock.period_ns
+        sigma = np.sqrt(rows[:, self.light + 1])
+        if (sigma > _NARROWEST * self.clock.period_ns).any():
+            t += np.repeat(sigma, np.diff(made.offsets)) * random.standard_normal(t.size)
+        return [self.clock.record(t[a:b]) for a, b in pairwise(made.offsets)]
 
     def with_effect(self, effect: Effect) -> Model:
         """This model with one effect more."""

@@ -196,9 +196,9 @@ class Drift:
     @property
     def probability(self) -> float:
         """Probability of a trend or a scatter as large in a constant recording, all parameters together."""
-        from scipy.stats import norm
+        from scipy.special import ndtr
 
-        p = np.r_[2.0 * norm.sf(np.abs(self.trend)), self.p_value]
+        p = np.r_[2.0 * ndtr(-np.abs(self.trend)), self.p_value]
         return float(1.0 - (1.0 - p.min()) ** p.size)
 
     @property
@@ -209,7 +209,7 @@ class Drift:
 
 def drift(fit: Fit, fitted: Fitted) -> Drift | None:
     """Light and delay of parts of the recording, by the estimator of the whole; None for a short recording."""
-    from scipy.stats import chi2
+    from scipy.special import chdtrc
 
     recording: Recording = fit.recording
     number = int(min(_PARTS, recording.photons // _PART_PHOTONS))
@@ -236,7 +236,7 @@ def drift(fit: Fit, fitted: Fitted) -> Drift | None:
     place = np.linspace(-0.5, 0.5, len(parts))
     slope = place @ (x - x.mean(0)) / (place @ place)
     square = (((x - x.mean(0)) / sd) ** 2).sum(0)
-    p = np.array([float(chi2.sf(value, len(parts) - 1)) for value in square])
+    p = np.array([float(chdtrc(len(parts) - 1, value)) for value in square])
     begins = np.cumsum([0.0, *(part.exposure for part in parts)])
     middle = 0.5 * (begins[1:] + begins[:-1]) * recording.period_ns * 1e-9
     about = np.r_[

@@ -152,8 +152,8 @@ def first_spread(model: Model, theta: FloatArray) -> FloatArray:
     out[k + 2] = 0.3 * width + 0.5 * unit
     at = k + 3
     for effect in model.effects:
-        for value in effect.start:
-            out[at] = 0.4 * max(value, abs(theta[at]))
+        for number, value in enumerate(effect.start):
+            out[at] = 0.4 * (max(value, theta[at]) if number == 0 else 1.0)
             at += 1
     return out
 

@@ -407,10 +407,10 @@ class _Run:
             if not free.converged or free.p_value < self.level:
                 continue
             at = _estimates(free, fixed, np.ones(free.model.size)).get(name, Estimate(np.nan, np.nan, np.nan, np.nan))
-            value = f"{given:g}" if isinstance(given, float) else str(given)
+            printed = f"{given:g}" if isinstance(given, float) else str(given)
             gain = fitted.misfit_z - free.misfit_z if fitted.converged else float("nan")
             z = abs(at.value - given) / at.error if isinstance(given, float) and at.error > 0.0 else 0.0
-            words = f"given {name} = {value}, where the stream has"
+            words = f"given {name} = {printed}, where the stream has"
             option = f"leave it out, and p = {free.p_value:.2g}"
             out.append(Suspect(words, z, at.value, at.error, gain, option, included=False))
         return tuple(out)

@@ -8,16 +8,16 @@ from pathlib import Path
 
 
 def _pair(depth: str, image: str, seed: int) -> None:
-    import imageio.v3 as imageio
     import numpy as np
+    from PIL import Image
 
     import mars_lidar as ml
 
     scene = ml.Scene.example("room", size=(60, 80), seed=seed)
     for name in (depth, image):
         Path(name).parent.mkdir(parents=True, exist_ok=True)
-    imageio.imwrite(depth, (1000 * scene.depth_m).astype(np.uint16))
-    imageio.imwrite(image, np.repeat((255 * scene.reflectivity).astype(np.uint8)[..., None], 3, axis=2))
+    Image.fromarray((1000 * scene.depth_m).astype(np.uint16)).save(depth)
+    Image.fromarray(np.repeat((255 * scene.reflectivity).astype(np.uint8)[..., None], 3, axis=2)).save(image)
 
 
 def _rgbd() -> None:

@@ -22,21 +22,20 @@ PIXEL = (34, 83)  # row and column, on the door
 
 def main() -> None:
     """Simulate the room and draw it."""
-    plt.style.use(DOCS / "gallery.mplstyle")
+    plt.style.use(["mars_lidar.plot.mars", DOCS / "gallery.mplstyle"])
     plt.rcParams |= {"font.size": 12, "axes.titlesize": 12}
     scene = ml.Scene.example("room", size=(96, 128))
     pulse, detector = ml.GaussianPulse(sigma_ns=0.5), ml.Detector(dead_time_ns=75.0)
     system = ml.System(period_ns=100.0, cycles=4000, bins=512, pulse=pulse, detector=detector)
     flux = scene.flux(system, signal=1.0, sbr=1.0)
     cube = ml.simulate(flux, system, seed=0)[0]
-    found = ml.reconstruct(cube, system)
+    estimate = ml.reconstruct(cube, system)
     row, column = PIXEL
-    signal, background, delay_ns = flux.signal[PIXEL], flux.background[PIXEL], flux.delay_ns[PIXEL]
-    light = ml.statistics.photons_per_bin(signal, background, system, bins=512, delay_ns=delay_ns)
-    mean = ml.statistics.mean_histogram(signal, background, system, delay_ns=delay_ns)
+    light = ml.statistics.photons_per_bin(flux[PIXEL], system, bins=512)
+    mean = ml.statistics.mean_histogram(flux[PIXEL], system)
 
     fig, axes = plt.subplot_mosaic([["counts", "depth"], ["histogram", "histogram"]], figsize=(7.2, 6.0))
-    for name, values, title in (("counts", cube.sum(-1), "counts"), ("depth", found.depth_m, "depth from them (m)")):
+    for name, values, title in (("counts", cube.sum(-1), "counts"), ("depth", estimate.depth_m, "depth from them (m)")):
         image = axes[name].imshow(values, cmap={"counts": "magma", "depth": "viridis"}[name])
         axes[name].set(title=title, xticks=[], yticks=[])
         axes[name].plot(column, row, "o", mfc="none", mec="w", mew=2)

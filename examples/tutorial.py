@@ -42,22 +42,21 @@ ml.plot.map_image(counts[0].sum(-1), "registrations")
 
 # %%
 y, x = 20, 30
-light = {"signal": flux.signal[y, x], "background": flux.background[y, x], "delay_ns": flux.delay_ns[y, x]}
-law = ml.count_law(system=system, **light)
+law = ml.count_law(flux[y, x], system)
 print(f"drawn {counts[0, y, x].sum()}, expected {law.mean:.1f} ± {np.sqrt(law.variance):.1f}")
 law
 
 # %%
-ml.joint_law(system=system, **light)
+ml.joint_law(flux[y, x], system)
 
 # %% [markdown]
 # **Reconstruct**, and compare with the truth.
 
 # %%
-found = ml.reconstruct(counts, system)
-error_m = np.abs(found.depth_m[0] - scene.depth_m)[found.seen[0]]
-print(f"median error {1e3 * np.median(error_m):.1f} mm over {100 * found.seen.mean():.1f} % of the pixels")
-found
+estimate = ml.reconstruct(counts, system)
+error_m = np.abs(estimate.depth_m[0] - scene.depth_m)[estimate.seen[0]]
+print(f"median error {1e3 * np.median(error_m):.1f} mm over {100 * estimate.seen.mean():.1f} % of the pixels")
+estimate
 
 # %% [markdown]
 # **On to files**: `ml.io.simulate_to("cube.zarr", flux, system)` for cubes of any size, `ml.io.load`,

@@ -375,7 +375,7 @@ def test_help_teaches_and_starts_light():
     for words in ("--dead-time-ns", "Default: 75", "Examples", "simulate --scene room -o room.zarr"):
         assert words in text
     assert run("--version").output == f"mars-lidar {ml.__version__}\n"
-    heavy = {"matplotlib", "zarr", "h5py", "xarray", "scipy", "imageio", "yaml", "torch"}
+    heavy = {"matplotlib", "zarr", "h5py", "xarray", "scipy", "PIL", "yaml", "torch"}
     code = f"import sys, mars_lidar.cli; print(*({heavy!r} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == ""

@@ -7,7 +7,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+import mars_lidar as ml
 
 HIDDEN = Path(__file__).with_name("hidden_library.py")
 # library, extra, and whether public names and commands are to miss it
@@ -19,7 +22,7 @@ LIBRARIES = [
     ("OpenEXR", "io", False, False),
     ("distributed", "cluster", False, True),
     ("cupy", "cuda", False, True),
-    ("torch,skimage,ptufile,phconvert,OpenEXR,distributed,cupy", "learn,estimate,io,cluster,cuda", True, True),
+    ("torch,skimage,ptufile,phconvert,OpenEXR,xarray,distributed,cupy", "learn,estimate,io,cluster,cuda", True, True),
 ]
 
 
@@ -43,3 +46,16 @@ def test_an_exr_names_its_extra(tmp_path):
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert "pip install 'mars-lidar[io]'" in done.stderr.splitlines()[-1]
+
+
+def test_a_labelled_cube_names_its_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "xarray", None)
+    system = ml.System(
+        period_ns=100.0,
+        cycles=10,
+        bins=8,
+        pulse=ml.GaussianPulse(sigma_ns=1.0),
+        detector=ml.Detector(dead_time_ns=50.0),
+    )
+    with pytest.raises(ml.io.MissingLibraryError, match=r"mars-lidar\[io\]"):
+        ml.to_xarray(np.zeros((1, 1, 1, 8), np.uint16), system)

@@ -12,7 +12,7 @@ import mars_lidar as ml
 from mars_lidar import io, statistics
 from mars_lidar._base.brief import brief
 from mars_lidar.engines import MarsEngine
-from mars_lidar.reconstruct import HistogramBound
+from mars_lidar.reconstruction import HistogramBound
 
 SYSTEM = ml.System(
     period_ns=100.0, cycles=200, bins=64, pulse=ml.GaussianPulse(sigma_ns=0.5), detector=ml.Detector(dead_time_ns=40.0)
@@ -44,12 +44,12 @@ def objects(tmp_path_factory) -> dict[str, Any]:
         "flux": flux,
         "scene": ml.Scene.example("room", size=4),
         "timestamps": times,
-        "law": ml.count_law(0.5, 0.5, SYSTEM, delay_ns=3.0),
-        "laws": ml.count_law(np.ones((2, 3)), 0.5, SYSTEM, "mars"),
-        "joint law": ml.joint_law(0.5, 0.5, SYSTEM, delay_ns=3.0),
-        "exposure": statistics.exposure_moments(0.5, 0.5, SYSTEM, delay_ns=3.0),
-        "covariance": ml.holding_time_covariance(0.5, 0.5, SYSTEM),
-        "bound": ml.cramer_rao(0.5, 0.5, SYSTEM, delay_ns=3.0),
+        "law": ml.count_law(ml.Flux(0.5, 0.5, 3.0), SYSTEM),
+        "laws": ml.count_law(ml.Flux(np.ones((2, 3)), 0.5, 50.0), SYSTEM, "mars"),
+        "joint law": ml.joint_law(ml.Flux(0.5, 0.5, 3.0), SYSTEM),
+        "exposure": statistics.exposure_moments(ml.Flux(0.5, 0.5, 3.0), SYSTEM),
+        "covariance": ml.holding_time_covariance(ml.Flux(0.5, 0.5, 50.0), SYSTEM),
+        "bound": ml.cramer_rao(ml.Flux(0.5, 0.5, 3.0), SYSTEM),
         "reconstruction": ml.reconstruct(cube, SYSTEM),
         "calibration": light,
         "look": light.look,

@@ -6,6 +6,7 @@ import subprocess
 import sys
 
 import matplotlib as mpl
+import matplotlib.style
 import numpy as np
 import pytest
 from harness.ledger import rejected, require
@@ -15,6 +16,7 @@ from matplotlib.figure import Figure
 import mars_lidar as ml
 from mars_lidar import io, plot
 from mars_lidar.plot import views
+from mars_lidar.plot.style import COLOURS
 
 SYSTEM = ml.System(
     period_ns=100.0,
@@ -73,6 +75,12 @@ def test_a_map_has_a_colour_bar_with_its_unit(tmp_path):
     assert figure.axes[0].child_axes[0].get_ylabel() == "depth (m)"
     with pytest.raises(ValueError, match=r"values must be a map \(H, W\), got shape \(3,\)"):
         plot.map_image(np.zeros(3), "depth (m)")
+
+
+def test_the_style_sheet_serves_programs_of_users():
+    with matplotlib.style.context("mars_lidar.plot.mars"):
+        cycle = mpl.rcParams["axes.prop_cycle"].by_key()["color"]
+    assert cycle == list(COLOURS)
 
 
 def test_the_users_settings_and_pyplot_are_left_alone():
@@ -137,7 +145,7 @@ def test_incident_rates_add_up_to_all_photons():
     for name, flux in FLUXES.items():
         rate = plot.incident_rate(flux, SYSTEM, 0, 0)
         assert rate.shape == (SYSTEM.bins,), name
-        assert rate.sum() == pytest.approx(flux.total[0, 0], abs=1e-12), name
+        assert rate.sum() == pytest.approx(flux.image.total[0, 0], abs=1e-12), name
     # Poisson histograms have this mean: chi-square of 128 bins, false alarm 1e-6
     flux = ml.Flux(waveform=np.linspace(0.0, 0.2, 40), background=0.5)
     counts = ml.simulate(flux, SYSTEM, engine="poisson", realizations=200)[:, 0, 0].sum(0)

@@ -2,10 +2,9 @@
 Depth error against the Cramer-Rao bound
 ========================================
 
-From dim to bright light: the error of the depth that each method finds, and the least that any unbiased one can have.
-Methods that do not model the dead time stop following the bound where pile-up begins: more light makes them worse.
-Bars are standard errors of 1000 exposures. At S = 10 one fit in 1000 fails,
-and has no standard error. The program prints
+The depth error of each method from dim to bright light, and the least error of any unbiased estimator. Methods that
+do not model the dead time depart from the bound where pile-up begins: more light makes them worse. Bars are standard
+errors over 1000 exposures. At S = 10 one fit in 1000 fails and has no standard error. The program prints
 ``Maximum likelihood: 1.01 of the bound, S from 0.04 to 6.``
 """
 
@@ -27,7 +26,7 @@ for method in ("peak", "matched_filter", "generalised_coates", "maximum_likeliho
     rms_mm = 1e3 * np.sqrt(np.nanmean(error_m**2, axis=0))
     scatter_mm = 1e6 * np.nanstd(error_m**2, axis=0) / (2 * rms_mm * np.sqrt(len(error_m)))  # standard error of the rms
     ax.errorbar(signal, rms_mm, scatter_mm, fmt="o-", ms=3, label=method)
-bound = ml.cramer_rao(signal, 1.0, system, delay_ns=50.0)
+bound = ml.cramer_rao(ml.Flux(signal, background=1.0, delay_ns=50.0), system)
 ax.plot(signal, 1e3 * bound.depth_m, "k--", label="Cramer-Rao bound")
 ax.set(xlabel="signal S (photons per period), B = 1", ylabel="depth error, rms (mm)", xscale="log", yscale="log")
 ax.legend()

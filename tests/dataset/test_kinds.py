@@ -201,9 +201,9 @@ def test_training(tmp_path, of_transients):
     examples = list(StoredDataset(tmp_path / "set.zarr", maps=["depth", "signal"], samples=range(4)))
     assert len(examples) == 12
     for one in examples:
-        assert one["histogram"].dtype == torch.float32
+        assert one["counts"].dtype == torch.float32
         counts = np.asarray(stored.histogram[one["sample"], one["realization"]])
-        np.testing.assert_array_equal(one["histogram"].permute(1, 2, 0).numpy(), counts)
+        np.testing.assert_array_equal(one["counts"].permute(1, 2, 0).numpy(), counts)
         assert torch.isnan(one["depth"][0, 0])
     with pytest.raises(ValueError, match="rendered transients, which have no surfaces"):
         CubeStream(SYSTEM, tmp_path / "set.zarr")

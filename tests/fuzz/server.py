@@ -1,4 +1,4 @@
-"""Reads files, each in a process of its own with limits of memory and time; tells what became of it."""
+"""Reads files, each in a process of its own with limits of memory and CPU time, and says what became of it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,10 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-LIMIT_S, LIMIT_BYTES, ADDRESS_BYTES = 10.0, 2**30, 6 * 2**30
+READ_S, READ_BYTES = 10, 2**30  # CPU seconds and memory of a file that is read
+REFUSAL_S, REFUSAL_BYTES = 3.0, 200 * 2**20  # and above the process before it, of a file that is refused
+WAIT_S = 300.0  # without an answer: the process waits for what never comes
+ADDRESS_BYTES = 6 * 2**30
 
 
 class Server:
@@ -67,6 +70,7 @@ def _in_child(name: str, path: Path) -> dict[str, Any]:
     if child == 0:
         resource.setrlimit(resource.RLIMIT_AS, (ADDRESS_BYTES, ADDRESS_BYTES))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        resource.setrlimit(resource.RLIMIT_CPU, (READ_S, READ_S))  # SIGKILL then
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, 1)
         os.dup2(nowhere, 2)
@@ -76,27 +80,30 @@ def _in_child(name: str, path: Path) -> dict[str, Any]:
         finally:
             os._exit(0)
     os.close(writing)
-    hung = not select.select([reading], [], [], LIMIT_S)[0]
-    if hung:
+    waited = not select.select([reading], [], [], WAIT_S)[0]
+    if waited:
         os.kill(child, signal.SIGKILL)
     content = b""
     while part := os.read(reading, 2**16):
         content += part
     os.close(reading)
     _, status, used = os.wait4(child, 0)
-    found: dict[str, Any]
-    if hung:
-        found = {"kind": "hang", "told": f"more than {LIMIT_S} s"}
+    seconds, mib = used.ru_utime + used.ru_stime, max(0, used.ru_maxrss - before) / 1024
+    outcome: dict[str, Any]
+    if not content and (waited or seconds > 0.9 * READ_S):
+        outcome = {"kind": "hang", "told": f"no answer in {seconds:.0f} CPU s"}
     elif not content:
-        found = {"kind": "crash", "told": f"status {status}"}
+        outcome = {"kind": "crash", "told": f"status {status}"}
     else:
         try:
-            found = json.loads(content)
+            outcome = json.loads(content)
         except ValueError:  # a long text that was cut
-            found = {"kind": "refused", "told": content.decode(errors="replace")}
-    if found["kind"] in ("read", "refused", "unnamed") and 1024 * used.ru_maxrss > LIMIT_BYTES:
-        found = {"kind": "memory", "told": f"{1024 * used.ru_maxrss / 2**20:.0f} MiB; {found['told']}"}
-    return found | {"seconds": used.ru_utime + used.ru_stime, "mib": max(0, used.ru_maxrss - before) / 1024}
+            outcome = {"kind": "refused", "told": content.decode(errors="replace")}
+    if outcome["kind"] == "refused" and seconds > REFUSAL_S:
+        outcome = {"kind": "hang", "told": f"{seconds:.1f} CPU s; {outcome['told']}"}
+    elif (outcome["kind"] == "refused" and mib > REFUSAL_BYTES / 2**20) or 1024 * used.ru_maxrss > READ_BYTES:
+        outcome = {"kind": "memory", "told": f"{mib:.0f} MiB; {outcome['told']}"}
+    return outcome | {"seconds": seconds, "mib": mib}
 
 
 if __name__ == "__main__":

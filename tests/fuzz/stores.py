@@ -65,7 +65,7 @@ def opened(reader: str, store: Path) -> Callable[[], Iterator[Any]]:
         examples = StoredDataset(store, shuffle=False)
 
         def epoch() -> Iterator[Any]:
-            yield from (value for one in examples for value in (one["histogram"].numpy(), one["depth"].numpy()))
+            yield from (value for one in examples for value in (one["counts"].numpy(), one["depth"].numpy()))
 
         return epoch
 

@@ -17,7 +17,9 @@ from store_cases import SUFFIXES, SYSTEM, one_return
 
 import mars_lidar as ml
 from mars_lidar import io
+from mars_lidar._base.files import alone
 from mars_lidar.io import recipe
+from mars_lidar.io.cube import one_exposure
 from mars_lidar.io.maps import save_maps
 
 
@@ -38,7 +40,7 @@ def small_blocks(monkeypatch):
 
 def test_an_interrupted_zarr_is_left_incomplete(tmp_path, small_blocks):
     path = tmp_path / "cube.zarr"
-    with pytest.raises(io.Interrupted, match=r"cube\.zarr is left behind, marked incomplete"):
+    with pytest.raises(io.Interrupted, match=r"cube\.zarr stays, marked incomplete: --resume"):
         io.simulate_to(path, one_return(), SYSTEM, realizations=4, progress=_interrupt_after(90))
     with pytest.raises(io.IncompleteFileError, match=r"is incomplete: .*at least 2 of 4 chunks are written"):
         io.load(path)
@@ -51,6 +53,39 @@ def test_an_interrupted_zarr_is_left_incomplete(tmp_path, small_blocks):
         assert data.attrs["complete"] is False
     io.simulate_to(path, one_return(), SYSTEM, overwrite=True)
     io.load(path).close()
+
+
+def test_a_zarr_that_is_replaced_stays_until_the_new_one_is_complete(tmp_path, small_blocks):
+    path, flux = tmp_path / "cube.zarr", one_return()
+    io.simulate_to(path, flux, SYSTEM, realizations=4, seed=5)
+    with io.load(path) as cube:
+        before = np.asarray(cube.histogram[:2])
+        with pytest.raises(io.Interrupted, match=r"cube\.incomplete\.zarr stays, .*cube\.zarr is what it was before"):
+            io.simulate_to(path, flux, SYSTEM, realizations=4, progress=_interrupt_after(90), overwrite=True)
+        assert np.array_equal(cube.histogram[:2], before)
+        for busy in ({"overwrite": True}, {"resume": True}):
+            with alone(tmp_path / "cube.incomplete.zarr"), pytest.raises(ValueError, match="being written by another"):
+                io.simulate_to(path, flux, SYSTEM, realizations=4, **busy)
+        io.simulate_to(path, flux, SYSTEM, realizations=4, resume=True)
+        with pytest.raises(ValueError, match=r"cube\.zarr is damaged, or was replaced"):
+            np.asarray(cube.histogram[2:])
+    assert list(tmp_path.iterdir()) == [path]
+    with io.load(path) as cube:
+        assert cube.seed == 0
+        assert io.verify(cube)
+        io.save(path, one_exposure(cube, 3), overwrite=True)
+        with pytest.raises(ValueError, match="damaged, or was replaced"):
+            np.asarray(cube.histogram)
+
+
+def test_a_zarr_is_not_made_through_a_link(tmp_path):
+    path = tmp_path / "cube.zarr"
+    io.simulate_to(path, one_return(), SYSTEM)
+    (tmp_path / "other").mkdir()
+    (tmp_path / "cube.incomplete.zarr").symlink_to(tmp_path / "other")
+    with pytest.raises(FileExistsError, match=r"cube\.incomplete\.zarr is a link"):
+        io.simulate_to(path, one_return(), SYSTEM, overwrite=True)
+    assert not list((tmp_path / "other").iterdir())
 
 
 @pytest.mark.parametrize("suffix", [".h5", ".npz"])

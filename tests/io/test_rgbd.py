@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-import imageio.v3 as iio
 import numpy as np
 import pytest
+from PIL import Image
 from typer.testing import CliRunner
 
 from mars_lidar import io
@@ -32,7 +32,7 @@ METRES = [[NAN, 1.0, 1.5], [65.535, 2.5, 0.001]]
 
 
 def png(path: Path, array: np.ndarray) -> Path:
-    iio.imwrite(path, array, plugin="pillow")
+    Image.fromarray(array).save(path)
     return path
 
 
@@ -325,6 +325,6 @@ def test_a_colour_image_is_no_depth(tmp_path, suffix):
     if suffix == ".npy":
         np.save(path, colours)
     else:
-        iio.imwrite(path, colours)
+        Image.fromarray(colours).save(path)
     with pytest.raises(ValueError, match=rf"colour\{suffix}: .*(4, 5, 3)"):
         read_rgbd(path, depth_unit_m=1.0)

@@ -6,9 +6,9 @@ import struct
 from pathlib import Path
 
 import h5py
-import imageio.v3 as iio
 import numpy as np
 import pytest
+from PIL import Image
 from typer.testing import CliRunner
 
 from mars_lidar import io
@@ -30,7 +30,7 @@ def pfm(path: Path, values, order: str = "<", scale: float = 1.0) -> Path:
 
 
 def png(path: Path, array) -> Path:
-    iio.imwrite(path, np.asarray(array), plugin="pillow")
+    Image.fromarray(np.asarray(array)).save(path)
     return path
 
 

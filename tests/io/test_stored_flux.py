@@ -132,7 +132,7 @@ def test_the_command_goes_from_a_file_to_a_cube_and_a_picture(transient, tmp_pat
 
 
 def test_matlab_files(transient, tmp_path):
-    values = np.asarray(transient.values)
+    values = transient.values[:]
     savemat(tmp_path / "old.mat", {"transient": values, "bin_ns": 0.5, "start_ns": 3.0})
     with h5py.File(tmp_path / "new.mat", "w") as file:  # version 7.3 turns the axes round
         file["transient"] = values.transpose(2, 1, 0)

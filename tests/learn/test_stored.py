@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import os
+import socket
+import subprocess
 import sys
 
 import numpy as np
@@ -12,6 +16,7 @@ from torch.utils.data import DataLoader
 import mars_lidar as ml
 from mars_lidar import io
 from mars_lidar.learn import StoredDataset
+from mars_lidar.learn.stored import Exposures
 
 SYSTEM = ml.System(
     period_ns=100.0, cycles=50, bins=32, pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=30.0)
@@ -50,14 +55,14 @@ def test_examples_are_the_exposures(path):
     assert numbers(examples) != EVERY
     assert sorted(numbers(examples)) == EVERY
     for one in examples:
-        assert one["histogram"].shape == (32, 6, 8)
-        assert one["histogram"].dtype == torch.float32
-        counts = np.asarray(stored.histogram[one["sample"], one["realization"]])
-        np.testing.assert_array_equal(one["histogram"].permute(1, 2, 0).numpy(), counts)
-        np.testing.assert_array_equal(one["signal"].numpy(), np.asarray(stored.maps["signal"][one["sample"]]))
-        assert one["seed"].item() == int(stored.seeds[one["sample"]])
+        assert one["counts"].shape == (32, 6, 8)
+        assert one["counts"].dtype == torch.float32
+        counts = np.asarray(stored.histogram[int(one["sample"]), int(one["realization"])])
+        np.testing.assert_array_equal(one["counts"].permute(1, 2, 0).numpy(), counts)
+        np.testing.assert_array_equal(one["signal"].numpy(), np.asarray(stored.maps["signal"][int(one["sample"])]))
+        assert one["seed"].item() == int(stored.seeds[int(one["sample"])])
     numbered = {"sample", "realization", "scene", "system", "signal_level", "sbr", "seed"}
-    assert set(examples[0]) == {"histogram", "depth", "signal"} | numbered
+    assert set(examples[0]) == {"counts", "depth", "signal"} | numbered
 
 
 @pytest.mark.parametrize("seed", [0x243F6A8885A308D3, 0x13198A2E03707344, 0xA4093822299F31D0, 2**64 - 1])
@@ -77,7 +82,7 @@ def test_the_documented_loop_over_any_dataset_seed(tmp_path, seed):
         train.set_epoch(epoch)
         told = {}
         for batch in DataLoader(train, batch_size=2):
-            assert batch["histogram"].shape == (2, 32, 4, 5)
+            assert batch["counts"].shape == (2, 32, 4, 5)
             told |= dict(zip(batch["sample"].tolist(), batch["seed"].tolist(), strict=True))
         assert told == dict(enumerate(stored.seeds.tolist()))
 
@@ -107,14 +112,14 @@ def test_some_samples_with_workers_of_a_loader(path):
     dataset = StoredDataset(path, samples=[5, 1, 2], axes="HWT", dtype=torch.int32, seed=4)
     with torch.random.fork_rng():
         batches = list(DataLoader(dataset, batch_size=4, num_workers=2))
-    assert batches[0]["histogram"].shape == (4, 6, 8, 32)
-    assert batches[0]["histogram"].dtype == torch.int32
+    assert batches[0]["counts"].shape == (4, 6, 8, 32)
+    assert batches[0]["counts"].dtype == torch.int32
     found = sorted((int(s), int(r)) for b in batches for s, r in zip(b["sample"], b["realization"], strict=True))
     assert found == [one for one in EVERY if one[0] in (1, 2, 5)]
 
 
 def test_transform_and_bad_arguments(path):
-    dataset = StoredDataset(path, transform=lambda one: one["histogram"].sum(0), shuffle=False)
+    dataset = StoredDataset(path, transform=lambda one: one["counts"].sum(0), shuffle=False)
     assert next(iter(dataset)).shape == (6, 8)
     for options, error, told in (
         ({"samples": [6]}, ValueError, r"samples must lie in \[0, 6\), got 6"),
@@ -130,10 +135,229 @@ def test_transform_and_bad_arguments(path):
             StoredDataset(path, **options)
 
 
-def test_large_counts_keep_their_value():
-    from mars_lidar.learn.stored import _signed
+@pytest.mark.full
+@pytest.mark.parametrize("layout", ["sparse", "dense"])
+@pytest.mark.parametrize(
+    "store", [{"chunk_mib": 8}, {"chunk_mib": 0.006, "shard_mib": 0.02}, {"chunk_mib": 0.001, "shard_mib": 0.002}]
+)
+@pytest.mark.parametrize(
+    "dtype", [torch.float32, torch.int32, torch.int16, torch.uint16, torch.float64, torch.bfloat16]
+)
+def test_every_layout_chunk_and_type_holds_the_counts(tmp_path, layout, store, dtype):
+    recipe = {
+        "scenes": {"example": "room", "size": [6, 8], "seeds": [0, 1, 2]},
+        "systems": [SYSTEM],
+        "light": {"signal": [0.5, 1]},
+        "realizations": 2,
+        "store": store | {"layout": layout},
+    }
+    ml.generate(recipe, tmp_path / "set.zarr")
+    histogram = np.asarray(ml.dataset.open_dataset(tmp_path / "set.zarr").histogram)
+    for axes in ("THW", "HWT"):
+        seen = 0
+        for batch in StoredDataset(tmp_path / "set.zarr", batch_size=5, dtype=dtype, axes=axes):
+            assert batch["counts"].dtype == dtype
+            stored = histogram[batch["sample"], batch["realization"]]
+            order = (0, 3, 1, 2) if axes == "THW" else (0, 1, 2, 3)
+            np.testing.assert_array_equal(batch["counts"].to(torch.float64).numpy(), stored.transpose(order))
+            assert batch["counts"].permute(0, 2, 3, 1).is_contiguous() == (axes == "THW")
+            seen += len(stored)
+        assert seen == 12
 
-    assert _signed(np.array([40_000, 1], np.uint16)).tolist() == [40_000, 1]
+
+def test_a_type_that_is_too_small_is_refused(tmp_path):
+    system = SYSTEM.replace(cycles=60_000, detector=ml.Detector(dead_time_ns=0.0))
+    recipe = {"scenes": {"example": "room", "size": [4, 5]}, "systems": [system], "light": {"signal": [20.0]}}
+    for layout in ("sparse", "dense"):
+        ml.generate(recipe | {"store": {"layout": layout}}, tmp_path / "set.zarr", overwrite=True)
+        assert next(iter(StoredDataset(tmp_path / "set.zarr")))["counts"].max() > 2**15
+        with pytest.raises(ValueError, match=r"as torch.int16: packed counts exceed|does not hold a count of"):
+            next(iter(StoredDataset(tmp_path / "set.zarr", dtype=torch.int16)))
+
+
+@pytest.mark.full
+def test_all_ranks_have_equally_many_batches_in_2000_random_configurations(path):
+    """By batches made here and by a loader that collates; each exposure at most once, or each at least once."""
+    random, dataset = np.random.default_rng(20261123), StoredDataset(path)
+    stores = dataset._opened()
+    for _ in range(2000):
+        samples = random.choice(6, random.integers(1, 7), replace=False)
+        dataset._exposures = Exposures(stores, samples)
+        dataset._uneven = str(random.choice(["drop", "repeat"]))
+        dataset._world = int(random.integers(1, 9))
+        dataset._shuffle, dataset._pool = bool(random.random() < 0.8), int(random.integers(1, 5))
+        collated, size = random.random() < 0.5, int(random.integers(1, 9))
+        dataset._batch = None if collated else size
+        workers, epoch = int(random.integers(1, 6)), int(random.integers(100))
+        batches, given = set(), []
+        for rank in range(dataset._world):
+            dataset._rank = rank
+            plans = [dataset._plan(epoch, 0, workers, worker, workers) for worker in range(workers)]
+            number = sum(-(-len(plan) // size) if collated else len(plan) for plan in plans)
+            assert sum(map(len, plans)) == len(dataset)
+            batches.add(number)
+            given += [int(exposure) for plan in plans for group in plan for exposure in group]
+        assert len(batches) == 1
+        every, remaining = dataset._exposures.number, dataset._exposures.number % dataset._world
+        if dataset._uneven == "drop":
+            assert len(set(given)) == len(given) == every - remaining
+        else:
+            assert set(given) == set(range(every))
+            assert len(given) == every + (dataset._world - remaining) % dataset._world
+
+
+def content(batches) -> list[list[tuple[int, int]]]:
+    return [list(zip(one["sample"].tolist(), one["realization"].tolist(), strict=True)) for one in batches]
+
+
+@pytest.mark.full
+def test_batches_do_not_depend_on_workers_and_passes_go_on_by_themselves(path):
+    alone = StoredDataset(path, batch_size=4, seed=3)
+    passes = [content(alone) for _ in range(2)]
+    assert passes[0] != passes[1]
+    for workers in (1, 2):
+        dataset = StoredDataset(path, batch_size=4, seed=3)
+        loader = DataLoader(dataset, batch_size=None, num_workers=workers, persistent_workers=workers == 2)
+        for single in passes:
+            assert sorted(content(loader)) == sorted(single)
+        dataset.set_epoch(0)
+        if workers != 2:  # workers that live on have a copy of the dataset, and its counter in shared memory
+            assert sorted(content(loader)) == sorted(passes[0])
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("before", [0, 1, 2])
+@pytest.mark.parametrize("after", [0, 1, 2])
+def test_a_pass_goes_on_where_it_was_stopped(path, before, after):
+    """Also with another number of workers, after a second stop, and in the epoch that follows."""
+    whole = StoredDataset(path, batch_size=4, seed=3)
+    whole.set_epoch(1)
+    every = content(DataLoader(whole, batch_size=None, num_workers=before))
+    then = content(DataLoader(whole, batch_size=None, num_workers=after))
+    for stop in (1, 7):
+        first = StoredDataset(path, batch_size=4, seed=3)
+        first.set_epoch(1)
+        batches = iter(DataLoader(first, batch_size=None, num_workers=before))
+        taken = content([next(batches) for _ in range(stop)])
+        state = first.state_dict(stop)
+        del batches
+        second = StoredDataset(path, batch_size=4, seed=3)
+        second.load_state_dict(state)
+        loader = DataLoader(second, batch_size=None, num_workers=after)
+        batches = iter(loader)
+        more = content([next(batches) for _ in range(min(2, len(every) - stop))])
+        del batches
+        third = StoredDataset(path, batch_size=4, seed=3)
+        third.load_state_dict(second.state_dict(len(more)))
+        loader = DataLoader(third, batch_size=None, num_workers=after)
+        assert taken + more + content(loader) == every
+        assert sorted(content(loader)) == sorted(then)
+
+
+@pytest.mark.full
+@pytest.mark.filterwarnings("ignore:'set_vital' is deprecated")  # which torchdata calls
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_stateful_loader_goes_on(path, workers):
+    StatefulDataLoader = pytest.importorskip("torchdata.stateful_dataloader").StatefulDataLoader
+
+    def loader():
+        return StatefulDataLoader(StoredDataset(path, batch_size=4, seed=3), batch_size=None, num_workers=workers)
+
+    every = content(loader())
+    first = loader()
+    batches = iter(first)
+    taken = content([next(batches) for _ in range(3)])
+    state = first.state_dict()
+    second = loader()
+    second.load_state_dict(state)
+    assert taken + content(second) == every
+
+
+def test_positions_that_do_not_fit_are_refused(path):
+    dataset = StoredDataset(path, batch_size=4, seed=3)
+    with pytest.raises(ValueError, match="with seed 3, this one has 4"):
+        StoredDataset(path, seed=4).load_state_dict(dataset.state_dict())
+    loader = DataLoader(dataset, batch_size=None, num_workers=1)
+    next(iter(loader))
+    with pytest.raises(ValueError, match="batches must be given"):
+        dataset.state_dict()
+
+
+@pytest.mark.full
+def test_several_stores_as_one_dataset(path, tmp_path):
+    recipe = {
+        "scenes": {"example": "room", "size": [6, 8], "seeds": [7]},
+        "systems": [SYSTEM.replace(cycles=70_000)],  # wider counts, other chunks and realizations
+        "realizations": 2,
+        "store": {"layout": "sparse"},
+    }
+    ml.generate(recipe, tmp_path / "more.zarr")
+    dataset = StoredDataset([path, tmp_path / "more.zarr"], batch_size=4)
+    found = {}
+    for batch in dataset:
+        for k, (store, sample) in enumerate(zip(batch["store"].tolist(), batch["sample"].tolist(), strict=True)):
+            found[store, sample, int(batch["realization"][k])] = batch["counts"][k].permute(1, 2, 0).numpy()
+    assert len(found) == len({key[1:] for key in found}) == 32
+    for number, (where, first) in enumerate(((path, 0), (tmp_path / "more.zarr", 6))):
+        stored = np.asarray(ml.dataset.open_dataset(where).histogram)
+        for store, sample, realization in found:
+            if store == number:
+                np.testing.assert_array_equal(found[store, sample, realization], stored[sample - first, realization])
+    assert {int(one["store"]) for one in StoredDataset([path, tmp_path / "more.zarr"], samples=[6])} == {1}
+    recipe["scenes"]["size"] = [6, 9]
+    ml.generate(recipe, tmp_path / "other.zarr")
+    with pytest.raises(ValueError, match="must have the same images and bins"):
+        StoredDataset([path, tmp_path / "other.zarr"])
+
+
+_RANK = """
+import sys, torch, torch.distributed as dist
+from torch.utils.data import DataLoader
+from mars_lidar.learn import StoredDataset
+torch.set_num_threads(1)
+dist.init_process_group("gloo")
+model = torch.nn.parallel.DistributedDataParallel(torch.nn.Conv2d(32, 1, 1))
+optimizer = torch.optim.SGD(model.parameters(), lr=1e-4)
+data = StoredDataset(sys.argv[1], samples=[0, 1, 2, 3, 4], batch_size=3, seed=1)  # 25 exposures on 2 ranks
+for epoch in range(3):
+    numbers = []
+    for batch in DataLoader(data, batch_size=None, num_workers=2):
+        loss = (model(batch["counts"])[:, 0] - batch["depth"].nan_to_num()).square().mean()
+        optimizer.zero_grad()
+        loss.backward()  # waits for the gradients of the other rank
+        optimizer.step()
+        numbers += (5 * batch["sample"] + batch["realization"]).tolist()
+    print(epoch, numbers)
+dist.barrier()
+dist.destroy_process_group()
+"""
+
+
+@pytest.mark.full
+def test_two_ranks_train_three_epochs_on_uneven_data(path):
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    settings = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "WORLD_SIZE": "2", "OMP_NUM_THREADS": "1"}
+    ranks = [
+        subprocess.Popen(
+            [sys.executable, "-c", _RANK, str(path)],
+            env=os.environ | settings | {"RANK": str(rank), "LOCAL_RANK": str(rank)},
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        for rank in range(2)
+    ]
+    printed = [rank.communicate(timeout=300)[0].splitlines() for rank in ranks]
+    assert [rank.returncode for rank in ranks] == [0, 0]
+    epochs = []
+    for one, other in zip(*printed, strict=True):
+        assert one[0] == other[0]
+        numbers = [json.loads(line[2:]) for line in (one, other)]
+        assert [len(each) for each in numbers] == [12, 12]
+        assert len({*numbers[0], *numbers[1]}) == 24
+        epochs.append(tuple(numbers[0]))
+    assert len(set(epochs)) == 3
 
 
 def test_without_torch(monkeypatch):

@@ -29,11 +29,10 @@ def test_a_file_says_what_the_table_said(tmp_path, method):
     table.save(tmp_path / "t.h5")
     assert [p.name for p in tmp_path.iterdir()] == ["t.h5"]
     read = ml.Table.load(tmp_path / "t.h5", table.system)
-    assert isinstance(read.entries.shape, np.memmap)
-    assert isinstance(read.shapes().base, np.memmap)
+    assert ml.Table.load(tmp_path / "t.h5").system == table.system
+    (tmp_path / "t.h5").write_bytes(b"")  # a table that was mapped would end the process here
     assert (read.system, read.method, read.provenance) == (table.system, method, table.provenance)
     assert read.nbytes == table.nbytes
-    assert ml.Table.load(tmp_path / "t.h5").system == table.system
     for name in ("row", "first", "offsets", "pmf"):
         assert np.array_equal(getattr(read.laws, name), getattr(table.laws, name))
     assert (table.laws.row.size > 0) == (method == "exposure")

@@ -20,6 +20,7 @@ import struct
 import warnings
 import zipfile
 from collections.abc import Callable, Iterable, Iterator
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
 
 LIMIT = "MARS_LIDAR_READ_GIB"  # of the environment: what the arrays of one file may take in memory
 _FEW_CHUNKS, _CHUNK_ENTRY = 10_000, 4  # of HDF5: so many anywhere; bytes of a file that each of more takes at least
+_SLAB_BYTES = 16 * 2**20  # of a .npy that is read in passes
 _TIMES = 512  # without it: so many times the file, or, if that is more, what follows
 _LEAST_IN_PARTS, _LEAST_WHOLE = 512 * 2**20, 64 * 2**20  # bytes
 _SMALL_FILE, _MOST_OF_SMALL = 10**6, 128 * 2**20  # no smaller file takes more memory than this before it is refused
@@ -78,9 +80,7 @@ def beside(target: Path, *, folder: bool = False) -> Iterator[Path]:
 
     A store or file at `target` is replaced. What a killed run left there is removed.
     """
-    for leftover in unfinished_of(target):
-        with contextlib.suppress(OSError), _held(leftover):  # its run is gone: it would hold the lock
-            _remove(leftover)
+    _remove_leftovers(target)
     path = _created(target, folder)
 
     def removed() -> str:
@@ -95,6 +95,13 @@ def beside(target: Path, *, folder: bool = False) -> Iterator[Path]:
             exchange(path, target)
         else:
             os.replace(path, target)
+
+
+def _remove_leftovers(target: Path) -> None:
+    """Remove what killed runs left beside `target`: a run that is alive holds a lock."""
+    for leftover in unfinished_of(target):
+        with contextlib.suppress(OSError), _held(leftover):
+            _remove(leftover)
 
 
 @contextlib.contextmanager
@@ -115,6 +122,7 @@ def exchange(path: Path, target: Path) -> None:
 
     Who reads `target` reads the old one or the new one, never a mixture under one name.
     """
+    _remove_leftovers(target)
     if not target.exists() and not target.is_symlink():
         os.rename(path, target)
         return
@@ -122,6 +130,27 @@ def exchange(path: Path, target: Path) -> None:
     os.rename(target, old)
     os.rename(path, target)
     _remove(old)
+
+
+def successor(target: Path) -> Path:
+    """Where a store is made that can be resumed and will replace `target`: readers keep that until it is complete."""
+    path = target.with_name(f"{target.stem}{INCOMPLETE_SUFFIX}{target.suffix}")
+    if path.is_symlink():
+        raise FileExistsError(f"{path} is a link to another folder, which is not written to: remove it")
+    return path
+
+
+@contextlib.contextmanager
+def alone(folder: Path) -> Iterator[None]:
+    """Hold a lock on a folder that is written to; ValueError where another process holds it."""
+    with contextlib.ExitStack() as lock:
+        try:
+            lock.enter_context(_held(folder))
+        except BlockingIOError:
+            raise ValueError(f"{folder} is being written by another process") from None
+        except OSError:  # a file system without locks
+            pass
+        yield
 
 
 def open_own(path: Path) -> BinaryIO:
@@ -238,10 +267,12 @@ def reading(path: str | Path, kind: str = "file") -> Iterator[Path]:
     except Exception as error:
         text = " ".join(str(error).split())
         named = str(source) in text or (isinstance(error, OSError) and error.filename is not None)
-        if named and isinstance(error, MemoryError | OSError):
+        if named and (isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno is not None)):
             raise
-        if named and type(error) is ValueError:
-            raise FileError(str(error)) from error
+        if named and (
+            type(error) is ValueError or isinstance(error, OSError)
+        ):  # an OSError of a library's own, such as Pillow's
+            raise FileError(text) from error
         if isinstance(error, MemoryError):
             raise MemoryError(f"{source}: does not fit in memory ({text[:300]})") from error
         if not (text and isinstance(error, ValueError | TypeError | OSError)):  # such as a KeyError
@@ -271,6 +302,14 @@ def check_source(path: Path) -> None:
         raise FileError(f"{path}: cannot be opened ({error})") from error
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
         raise FileError(f"{path} is no file but a pipe, socket or device")
+
+
+def is_plain_file(path: Path) -> bool | None:
+    """Whether this is a file, and no link to one; None where there is nothing."""
+    try:
+        return stat.S_ISREG(path.lstat().st_mode)
+    except (FileNotFoundError, NotADirectoryError):
+        return None
 
 
 def check_claim(path: Path, nbytes: float, what: str = "its arrays", *, in_parts: bool = False) -> None:
@@ -315,7 +354,7 @@ def open_npz(path: Path, stream: Any = None, *, beside: str = "") -> Iterator[Np
             check_claim(path, sum(one.file_size for one in members if one.filename != f"{beside}.npy"))
             for one in members:
                 with archive.open(one) as member:
-                    shape, dtype = npy_header(member)
+                    shape, dtype, _ = npy_header(member)
                     nbytes = math.prod(shape) * dtype.itemsize
                     if nbytes > one.file_size:
                         raise ValueError(f"{one.filename} cannot hold an array of shape {shape}")
@@ -327,18 +366,97 @@ def open_npz(path: Path, stream: Any = None, *, beside: str = "") -> Iterator[Np
             yield arrays
 
 
-def npy_header(stream: Any) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    """Shape and type of an open .npy."""
+def npy_header(stream: Any) -> tuple[tuple[int, ...], np.dtype[Any], bool]:
+    """Shape and type of an open .npy, and whether its first axis varies fastest, as in Fortran."""
     version = np.lib.format.read_magic(stream)
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, _, dtype = read(stream)
-    return shape, dtype
+    shape, in_columns, dtype = read(stream)
+    if dtype.hasobject or min(shape, default=0) < 0:
+        raise ValueError(f"cannot be read (an array of {dtype}, shape {shape})")
+    return shape, dtype, in_columns
 
 
 def read_npy(path: Path) -> NDArray[Any]:
-    """The array of a .npy, mapped: NumPy refuses what the file is too small for."""
-    with reading(path, "a .npy"):
-        return np.lib.format.open_memmap(path, mode="r")
+    """The array of a .npy, in memory."""
+    file = NpyFile(path)
+    check_memory(file.nbytes, f"the array of {path}", "read it on a larger machine")
+    return file[:].reshape(file.shape)
+
+
+class NpyFile:
+    """The array of a .npy, whose rows are read when they are sliced.
+
+    It is not mapped: a file that is cut short while it is mapped ends the process that touches it (SIGBUS).
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._file = UnchangedFile(path)
+        with reading(path, "a .npy"), open(path, "rb") as stream:
+            self.shape, self.dtype, self._in_columns = npy_header(stream)
+            self._start = stream.tell()
+            self.nbytes = math.prod(self.shape) * self.dtype.itemsize
+            if self.nbytes > path.stat().st_size - self._start:
+                raise ValueError(f"it is too short for an array of shape {self.shape}")
+
+    def __getitem__(self, rows: slice) -> NDArray[Any]:
+        height, *rest = self.shape or (1,)
+        each = math.prod(rest)
+        first, last, step = rows.indices(height)
+        last = max(first, last)
+        with self._file.unchanged() as path, reading(path, "a .npy"), open(path, "rb") as stream:
+            stream.seek(self._start)
+            if not self._in_columns:
+                stream.seek(first * each * self.dtype.itemsize, os.SEEK_CUR)
+                values = self._next(stream, (last - first) * each).reshape(last - first, *rest)
+            else:
+                values = self._of_columns(stream, first, last)
+        return values[::step]
+
+    def _of_columns(self, stream: BinaryIO, first: int, last: int) -> NDArray[Any]:
+        """Rows of an array whose first axis varies fastest: the whole file passes, in slabs."""
+        height, each = self.shape[0], math.prod(self.shape[1:])
+        values = np.empty((each, last - first), self.dtype)
+        step = max(1, _SLAB_BYTES // max(1, height * self.dtype.itemsize))
+        for k in range(0, each, step):
+            lines = min(step, each - k)
+            values[k : k + lines] = self._next(stream, lines * height).reshape(lines, height)[:, first:last]
+        return values.reshape(*self.shape[:0:-1], last - first).T
+
+    def _next(self, stream: BinaryIO, count: int) -> NDArray[Any]:
+        values = np.empty(count, self.dtype)
+        if values.nbytes and stream.readinto(values.view(np.uint8).data) < values.nbytes:  # type: ignore[attr-defined]
+            raise ValueError("it was cut short")
+        return values
+
+
+class UnchangedFile:
+    """A file that is opened again and again: it must be the one that it was at first.
+
+    What is compared is device, inode, size and the time of the last change, which the file system keeps to some ms.
+    """
+
+    def __init__(self, path: Path) -> None:
+        check_source(path)
+        self.path, self._state = path, _identity(path)
+
+    @contextlib.contextmanager
+    def unchanged(self) -> Iterator[Path]:
+        """The path; FileError where the file is another one before or after what is done with it."""
+        self._check()
+        yield self.path
+        self._check()
+
+    def _check(self) -> None:
+        if _identity(self.path) != self._state:
+            raise FileError(f"{self.path} was changed, replaced or removed after it was opened: open it again")
+
+
+def _identity(path: Path) -> tuple[int, ...] | None:
+    try:
+        entry = path.stat()
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    return entry.st_dev, entry.st_ino, entry.st_size, entry.st_mtime_ns
 
 
 def check_data(path: Path, data: Any, name: str, *, in_parts: bool = False) -> None:
@@ -380,13 +498,15 @@ def read_mat5(path: Path, names: Iterable[str] | None = None) -> dict[str, Any]:
     from scipy.io import loadmat, matlab
 
     with reading(path, "a .mat of version 5"):
-        wanted = None if names is None else list(names)
-        heads = [head for head in mat5.variables(path) if wanted is None or head.name in wanted]
-        check_claim(path, sum(8 * math.prod(head.shape) for head in heads if head.kind != "sparse"))
-        check_claim(path, mat5.check_elements(path, wanted))
+        wanted = None if names is None else set(names)
+        some = [each for each in mat5.variables(path) if wanted is None or each.name in wanted]
+        check_claim(path, sum(8 * math.prod(each.shape) for each in some if each.kind != "sparse"))
+        check_claim(path, sum(each.size for each in some))
+        found: dict[str, Any] = {}
         with warnings.catch_warnings():  # of variables of the same name, the last of which is the variable
             warnings.simplefilter("ignore", matlab.MatReadWarning)
-            found = dict(loadmat(path, variable_names=wanted))
+            for each in some:
+                found |= loadmat(BytesIO(each.element()), variable_names=[each.name])
         for name, value in found.items():
             _check_sparse_within(name, value)
         return found
@@ -394,11 +514,13 @@ def read_mat5(path: Path, names: Iterable[str] | None = None) -> dict[str, Any]:
 
 def _check_sparse_within(name: str, value: Any) -> None:
     """Check a sparse matrix, also in the cells and structures of a variable."""
-    if is_sparse(value):
+    if isinstance(value, np.ndarray):
+        if value.dtype == object:
+            for part in value.ravel():
+                if type(part) is not np.ndarray or part.dtype.hasobject:  # most cells hold numbers
+                    _check_sparse_within(name, part)
+        elif value.dtype.names and value.dtype.hasobject:
+            for field in value.dtype.names:
+                _check_sparse_within(f"{name}.{field}", value[field])
+    elif is_sparse(value):
         check_sparse(name, value, sorted_rows=True)
-    elif isinstance(value, np.ndarray) and value.dtype == object:
-        for part in value.ravel():
-            _check_sparse_within(name, part)
-    elif isinstance(value, np.ndarray) and value.dtype.names and value.dtype.hasobject:
-        for field in value.dtype.names:
-            _check_sparse_within(f"{name}.{field}", value[field])

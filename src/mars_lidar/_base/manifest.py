@@ -14,6 +14,7 @@ import hashlib
 import json
 import os
 import re
+import stat
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -112,6 +113,20 @@ class Manifest:
                 raise self._error(f"{name} is not as it was written")
             self._known[name] = before
 
+    def read(self, name: str) -> bytes:
+        """The content of a file, as it was when the store was sealed."""
+        path = self._store / name
+        before = _state(path)
+        if before is None:
+            raise self._error(f"{name} is missing")
+        content = path.read_bytes()
+        if self._known.get(name) != before and hashlib.sha256(content).hexdigest() != self._sums.get(name):
+            raise self._error(f"{name} is not as it was written")
+        if _state(path) != before:
+            raise self._error(f"{name} was replaced while it was read")
+        self._known[name] = before
+        return content
+
     def _error(self, reason: str) -> FileError:
         return FileError(
             f"{self._store} is damaged, or was replaced or removed after it was opened: {reason}; open it again"
@@ -123,9 +138,12 @@ def told(store: Path) -> str:
     return f"every file of its {NAME} is there"
 
 
-def require(store: Path) -> Manifest:
-    """The manifest; FileError where a file of a store is missing, or a document of it is not as it was written."""
-    sums, documents, wrong = _compared(store, every=False)
+def require(store: Path, *, listed: bool = True) -> Manifest:
+    """The manifest; FileError where a file of a store is missing, or a document of it is not as it was written.
+
+    Names are compared only where they are `listed`: a file that is missing is else noticed when it is read.
+    """
+    sums, documents, wrong = _compared(store, every=False, listed=listed)
     if wrong:
         more = f", and {len(wrong) - 3} more" if len(wrong) > 3 else ""
         raise FileError(f"{store} is damaged: {', '.join(wrong[:3])}{more}")
@@ -137,7 +155,9 @@ def damage(store: Path, *, every: bool = True) -> list[str]:
     return _compared(store, every)[2]
 
 
-def _compared(store: Path, every: bool) -> tuple[dict[str, str], dict[str, tuple[int, ...]], list[str]]:
+def _compared(
+    store: Path, every: bool, listed: bool = True
+) -> tuple[dict[str, str], dict[str, tuple[int, ...]], list[str]]:
     """Sums by name, the states of the files that were read, and what is wrong."""
     path = store / NAME
     if not path.exists():
@@ -153,7 +173,7 @@ def _compared(store: Path, every: bool) -> tuple[dict[str, str], dict[str, tuple
         return _hash(store / name)
 
     stated = root_document(store).get("attributes", {}).get(SUM)
-    return sums, states, list(compared(sums, _files(store), digest, every, stated))
+    return sums, states, list(compared(sums, _files(store) if listed else None, digest, every, stated))
 
 
 def lines_of(text: str) -> dict[str, str]:
@@ -197,10 +217,12 @@ def _sum(sums: Mapping[str, str]) -> str:
 def _state(path: Path) -> tuple[int, ...] | None:
     """What changes when a file is written or replaced; None where there is no file."""
     try:
-        told = path.stat()
+        entry = path.stat()
     except (FileNotFoundError, NotADirectoryError):
         return None
-    return told.st_dev, told.st_ino, told.st_size, told.st_mtime_ns, told.st_ctime_ns
+    if not stat.S_ISREG(entry.st_mode):
+        return None
+    return entry.st_dev, entry.st_ino, entry.st_size, entry.st_mtime_ns, entry.st_ctime_ns
 
 
 def _files(store: Path) -> set[str]:

@@ -138,7 +138,7 @@ def simulate(
             )
         if capture is not None and target != out:
             with load(target) as cube:
-                save_capture(out, cube, capture.path, overwrite=overwrite)
+                save_capture(out, cube, capture.file.path, overwrite=overwrite)
         if picture:
             _draw(target, png)
         _summary(written, png if picture else None, began, out)

@@ -210,9 +210,9 @@ def _save(path: Path, variables: dict[str, Any]) -> None:
 
 
 def _save_depth(path: Path, depth_m: NDArray[np.float64]) -> None:
-    import imageio.v3 as iio
+    from PIL import Image
 
     path.parent.mkdir(parents=True, exist_ok=True)
     grey = np.clip(np.round(255.0 / _MONOCULAR_M * depth_m), 0, 255).astype(np.uint8)
     with open(path, "xb") as file:
-        iio.imwrite(file, grey, extension=".png", plugin="pillow")
+        Image.fromarray(grey).save(file, format="PNG")

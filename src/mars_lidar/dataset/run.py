@@ -20,7 +20,7 @@ from typing import Any
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.files import INCOMPLETE_SUFFIX, Interrupted, WriteError, check_target, exchange, open_own
+from mars_lidar._base.files import Interrupted, WriteError, check_target, exchange, open_own, successor
 from mars_lidar._base.progress import shown
 from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import Progress
@@ -55,6 +55,10 @@ class Generated:
         Seconds spent simulating, and packing and writing, all threads added.
     seconds
         Wall clock.
+
+    See Also
+    --------
+    generate
     """
 
     path: Path
@@ -114,6 +118,25 @@ def generate(
         `out` exists, and neither `resume` nor `overwrite` is given.
     mars_lidar.io.WriteError, mars_lidar.io.Interrupted
         Stopped half way (a full disk, Ctrl-C); the text says how to go on.
+
+    See Also
+    --------
+    simulate, Scene, mars_lidar.learn.StoredDataset
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import mars_lidar as ml
+    >>> system = {
+    ...     "period_ns": 100.0, "cycles": 200, "bins": 64,
+    ...     "pulse": {"kind": "gaussian", "sigma_ns": 1.0}, "detector": {"dead_time_ns": 75.0},
+    ... }
+    >>> scenes = {"example": "room", "size": [8, 12]}
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     recipe = {"scenes": scenes, "systems": system, "light": {"signal": [0.1, 1.0]}}
+    ...     done = ml.generate(recipe, f"{folder}/set.zarr")
+    >>> done.shape  # (samples, realizations, H, W, bins)
+    (2, 1, 8, 12, 64)
     """
     began = time.perf_counter()
     progress = shown(progress, "generating")
@@ -133,11 +156,11 @@ def generate(
     if workers is not None or scheduler is not None:
         cluster.reach(scheduler)  # before the scenes are read
     with _alone(target):  # what is there is looked at under the lock: before, another run may have finished it
-        successor = _successor(target)
-        if overwrite and successor.exists():
-            shutil.rmtree(successor)  # of a stopped run that is started again
+        beside = successor(target)
+        if overwrite and beside.exists():
+            shutil.rmtree(beside)  # of a stopped run that is started again
         replacing = overwrite and target.exists()  # by a store that is made beside it, or one that was begun so
-        store = successor if replacing or (resume and successor.exists()) else target
+        store = beside if replacing or (resume and beside.exists()) else target
         there = store.exists() and resume
         if there:
             dataset = open_dataset(store, allow_incomplete=True)
@@ -290,11 +313,6 @@ def _check_same(target: Path, dataset: Dataset, wanted: DatasetRecipe | None) ->
                 f"{target} was begun with another recipe: {name} was {json.dumps(old.get(name))}, "
                 f"now {json.dumps(new[name])}; start again with overwrite, or choose another name"
             )
-
-
-def _successor(target: Path) -> Path:
-    """Where the store is made that will replace `target`: readers keep the old one until the new one is complete."""
-    return target.with_name(f"{target.stem}{INCOMPLETE_SUFFIX}{target.suffix}")
 
 
 def _left(store: Path, target: Path) -> str:

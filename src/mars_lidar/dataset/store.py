@@ -54,10 +54,10 @@ class Item:
 class Dataset:
     """An opened store; `path` is its folder."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, listed: bool = True) -> None:
         import zarr
 
-        from mars_lidar._base.sealed_store import SealedStore
+        from mars_lidar._base.sealed_store import PlainFiles, SealedStore
         from mars_lidar.dataset import codec  # noqa: F401  (registers it)
 
         self.path = path
@@ -67,8 +67,8 @@ class Dataset:
         if self.attrs.get("format_version") not in (FORMAT_VERSION, MORE_VERSION):
             told = self.attrs.get("format_version")
             raise ValueError(f"{path} has layout version {told}; {FORMAT_VERSION} and {MORE_VERSION} can be read")
-        self.sums = manifest.require(path) if self.complete else None
-        store = path if self.sums is None else SealedStore(path, self.sums)
+        self.sums = manifest.require(path, listed=listed) if self.complete else None
+        store = PlainFiles(path) if self.sums is None else SealedStore(path, self.sums)
         self.group: Any = zarr.open_group(store, mode="r+" if self.sums is None else "r", use_consolidated=False)
         self.recipe = DatasetRecipe.from_dict(json.loads(self.attrs["recipe"]))
 
@@ -189,6 +189,11 @@ class Dataset:
         if self.sums is not None:
             self.sums.check(file.relative_to(self.path).as_posix())
 
+    def read(self, name: str) -> bytes:
+        """The content of a file of a complete store, as it was when the store was sealed."""
+        assert self.sums is not None, "incomplete stores are not read by name"
+        return self.sums.read(name)
+
     def tidy(self) -> None:
         """Remove what a writer that was killed left behind: files that were not renamed yet."""
         for name in ("", "histogram", *MAPS):
@@ -225,8 +230,18 @@ def is_dataset(path: str | Path) -> bool:
 
 
 @checked
-def open_dataset(path: str | Path, *, allow_incomplete: bool = False) -> Dataset:
+def open_dataset(path: str | Path, *, allow_incomplete: bool = False, listed: bool = True) -> Dataset:
     """Open a dataset that `mars_lidar.generate` wrote.
+
+    Parameters
+    ----------
+    path
+        Its folder.
+    allow_incomplete
+        Open it also where its generation did not finish.
+    listed
+        Compare the names of all files with the manifest, which lists the folder. False: a file that is missing is
+        noticed only when it is read.
 
     Raises
     ------
@@ -236,9 +251,9 @@ def open_dataset(path: str | Path, *, allow_incomplete: bool = False) -> Dataset
         Its generation did not finish (a ValueError).
     """
     with reading(path, "a dataset of mars-lidar") as source:
-        dataset = Dataset(source)
+        dataset = Dataset(source, listed=listed)
         if not (dataset.complete or allow_incomplete):
             raise IncompleteFileError(f"{path} is incomplete: its generation did not finish; continue it with --resume")
-        if dataset.complete and (unlisted := dataset.unlisted()):
+        if dataset.complete and listed and (unlisted := dataset.unlisted()):
             raise FileError(f"{path} is damaged: {unlisted} is not in its {manifest.NAME}")
         return dataset

@@ -45,6 +45,11 @@ class Afterpulsing:
         Avalanches of photons (and of crosstalk) are generation 0, those of their carriers generation 1, and so on. Only
         generations below this number leave carriers: 1 is a single afterpulse generation. Default: no limit.
 
+    Raises
+    ------
+    ValueError
+        A probability outside (0, 1), a delay that is not positive, or both `delay_ns` and `delays`.
+
     See Also
     --------
     Crosstalk, Detector
@@ -173,6 +178,11 @@ class Crosstalk:
     kernel
         ``"4"`` (the pixels above, below, left and right), ``"8"`` (the diagonal ones too), all alike; or relative
         weights (3, 3) of the neighbours, that of the pixel itself in the middle 0.
+
+    Raises
+    ------
+    ValueError
+        A probability outside (0, 1], or weights that are not (3, 3), finite, non-negative and 0 in the middle.
 
     See Also
     --------

@@ -38,6 +38,11 @@ def dark_count_map(
     seed
         Integer in [0, 2**64).
 
+    Raises
+    ------
+    ValueError
+        A shape that is not (H, W), or a number out of its range.
+
     See Also
     --------
     Detector, Flux

@@ -94,6 +94,13 @@ class Detector:
         test finds them. n divides the number of bins, and the pattern repeats (the taps of a delay line in each cycle
         of the clock); n = bins gives every bin its own.
 
+    Raises
+    ------
+    ValueError
+        A number out of its range, or settings that exclude each other, such as a gate without ``mode="gated"``.
+    TypeError
+        An effect of another type, or an unknown keyword.
+
     See Also
     --------
     System, Afterpulsing, Crosstalk, Jitter

@@ -30,6 +30,11 @@ class Jitter:
     tail_fraction
         Share of the avalanches that have it, in [0, 1].
 
+    Raises
+    ------
+    ValueError
+        `sigma_ns` is not positive, or one of `tail_ns` and `tail_fraction` is 0 without the other.
+
     See Also
     --------
     SampledJitter, Detector
@@ -136,6 +141,11 @@ class SampledJitter:
         Sample width, ns; n x bin_ns must fit in the laser period.
     origin
         Where the jitter is 0: ``"peak"``, ``"centroid"`` or ``"first"``, see `SampledPulse`.
+
+    Raises
+    ------
+    ValueError
+        Samples that are not 1-D, finite and non-negative, or sum to 0.
 
     See Also
     --------

@@ -106,6 +106,11 @@ class GaussianPulse(Pulse):
 
     FWHM = 2.355 sigma; `GaussianPulse.from_fwhm(fwhm_ns=...)` takes that instead.
 
+    Raises
+    ------
+    ValueError
+        `sigma_ns` is not positive and finite; `System` asks for 1e-6 to 1 period.
+
     See Also
     --------
     SampledPulse, System
@@ -191,6 +196,11 @@ class SampledPulse(Pulse):
         For ``"peak"`` and ``"centroid"`` the record is cyclic and is cut opposite the origin, so a response
         whose rising edge was stored at the end of the array is put together again. For ``"first"`` it is
         taken as it stands.
+
+    Raises
+    ------
+    ValueError
+        Samples that are not 1-D, finite and non-negative, or sum to 0; `System` asks that the record fits in a period.
 
     See Also
     --------

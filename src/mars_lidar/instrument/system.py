@@ -55,6 +55,14 @@ class System:
         State of the pixel at the start of the exposure: ``"armed"`` (ready at t = 0) or ``"stationary"``
         (warmed up). The two differ by up to half a count in the mean.
 
+    Raises
+    ------
+    ValueError
+        A number out of its range, a pulse that does not fit in the period, a dead time above 2^20 periods, or settings
+        that no detector combines; the text names the setting.
+    TypeError
+        A pulse or detector of another type, a number that is none, or an unknown keyword.
+
     Warns
     -----
     UnitWarning

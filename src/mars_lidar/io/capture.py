@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.files import beside, check_data, check_target, whole
+from mars_lidar._base.files import UnchangedFile, beside, check_data, check_target, whole
 from mars_lidar._base.hdf5 import ForgivingFile, open_hdf5, with_checksums
 from mars_lidar.instrument.system import SPEED_OF_LIGHT_M_PER_NS
 from mars_lidar.io.cube import Cube
@@ -37,7 +37,7 @@ _BAND_BYTES = 64 * 2**20
 class Capture:
     """Where the light of a capture is, and how it becomes an image."""
 
-    path: Path
+    file: UnchangedFile
     name: str  # of its data set
     axes: str  # a letter for each
     shape: tuple[int, ...]
@@ -69,7 +69,7 @@ class Capture:
         """Light of some rows (rows, W, T)."""
         first, last, _ = rows.indices(self.image[0])
         slab, skipped = self._slab(first, last)
-        with open_hdf5(self.path) as file:
+        with self.file.unchanged() as path, open_hdf5(path) as file:
             found = np.asarray(file[self.name][slab])
         order, rest = self._order
         image = found.transpose(*order, *rest).reshape(
@@ -114,7 +114,7 @@ class Capture:
             yield slice(first, min(first + many, height))
 
 
-def capture_in(path: Path, file: Any) -> Capture | None:
+def capture_in(opened: UnchangedFile, file: Any) -> Capture | None:
     """The capture in an open HDF5 file, or None where it is none."""
     if "H" in file and "H_format" in file:
         name, axes = "H", _tal_axes(file)
@@ -123,10 +123,10 @@ def capture_in(path: Path, file: Any) -> Capture | None:
     else:
         return None
     data = file[name]
-    check_data(path, data, name, in_parts=True)
+    check_data(opened.path, data, name, in_parts=True)
     told = [_metres(file, key) for key in _TIMES[name]]
     width, start = (None if one is None else one / SPEED_OF_LIGHT_M_PER_NS for one in told)
-    return Capture(path, name, axes, tuple(data.shape), width, start)
+    return Capture(opened, name, axes, tuple(data.shape), width, start)
 
 
 def read_capture(path: str | Path) -> Capture:
@@ -134,8 +134,9 @@ def read_capture(path: str | Path) -> Capture:
     source = Path(path)
     if source.suffix.lower() not in CAPTURE_SUFFIXES:
         raise ValueError(f"{source}: a capture must be one of {', '.join(CAPTURE_SUFFIXES)}")
+    opened = UnchangedFile(source)
     with open_hdf5(source, "a capture") as file:
-        found = capture_in(source, file)
+        found = capture_in(opened, file)
         if found is None:
             raise ValueError(f"{source}: no capture of tal ('H', 'H_format') or Zaragoza's ('data', 'deltaT')")
     if found.bin_ns is None or not found.bin_ns > 0.0:
@@ -175,7 +176,7 @@ def save_capture(path: str | Path, cube: Cube, like: str | Path, *, overwrite: b
     check_target(target, folder=False, overwrite=overwrite)
     with (
         beside(target) as unfinished,
-        open_hdf5(source.path) as old,
+        open_hdf5(source.file.path) as old,
         ForgivingFile(unfinished).hdf5() as new,
     ):
         for name in old:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mars_lidar._base import mat5
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.files import check_claim, npy_header, open_npz, read_npy, reading, whole
+from mars_lidar._base.files import NpyFile, check_claim, npy_header, open_npz, read_npy, reading, whole
 from mars_lidar._base.hdf5 import CELLS, open_hdf5
 from mars_lidar._base.sparse import check_sparse, dense_bytes, is_sparse
 from mars_lidar._base.text import read_column
@@ -23,6 +23,7 @@ from mars_lidar.io.cube import Cube
 from mars_lidar.io.measured import from_histograms, from_photon_times, in_order
 from mars_lidar.io.named_arrays import cell_arrays, hdf5_arrays, mat_arrays
 from mars_lidar.io.recorder import RECORDER_SUFFIXES, Recorded, recorded
+from mars_lidar.io.rgbd.pixels import decoded
 from mars_lidar.io.streams.bare_stream import cells_of
 
 FOREIGN_SUFFIXES = (".npy", ".npz", ".mat", ".h5", ".hdf5", ".tif", ".tiff", ".csv", ".txt", *RECORDER_SUFFIXES)
@@ -158,7 +159,10 @@ def listed(path: Path) -> dict[str, str]:
                 heads = {name.removesuffix(".npy"): npy_header(archive.open(name)) for name in archive.namelist()}
             if {"format", "shape", "data"} <= heads.keys():
                 return {"": f"sparse, {heads['data'][0][0]} values {heads['data'][1]}"}
-            return {name: _in_words(shape, dtype) for name, (shape, dtype) in heads.items() if shape}
+            return {name: _in_words(shape, dtype) for name, (shape, dtype, _) in heads.items() if shape}
+        if suffix == ".npy":
+            head = NpyFile(path)
+            return {"": _in_words(head.shape, head.dtype)}
     return {name: _in_words(array.shape, array.dtype) for name, array in arrays(path).items()}
 
 
@@ -278,11 +282,13 @@ def _mat(path: Path, names: list[str] | None = None) -> dict[str, Any]:
 
 
 def _tiff(path: Path) -> dict[str, Any]:
-    import imageio.v3 as iio
+    from PIL import Image, ImageSequence
 
-    claimed = iio.improps(path, index=..., plugin="pillow")  # type: ignore[arg-type]  # all pages, as imageio says
-    check_claim(path, math.prod(claimed.shape) * claimed.dtype.itemsize, "its pages")
-    return {"": np.stack(list(iio.imiter(path, plugin="pillow")))}
+    with Image.open(path) as image:
+        pixel = np.array(Image.new(image.mode, (1, 1))).nbytes
+        claimed = sum(pixel * math.prod(page.size) for page in ImageSequence.Iterator(image))
+        check_claim(path, claimed, "its pages")
+        return {"": np.stack([decoded(page) for page in ImageSequence.Iterator(image)])}
 
 
 def _table(path: Path) -> dict[str, Any]:

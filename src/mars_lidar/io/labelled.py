@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mars_lidar._base.arguments import checked_with_masks
+from mars_lidar._base.optional import needed
 from mars_lidar.instrument.system import System
 from mars_lidar.io import layout
 from mars_lidar.io.cube import Cube
@@ -64,8 +65,7 @@ def to_xarray(
     >>> ml.to_xarray(ml.simulate(ml.Flux([[0.5, 2.0]], 1.0, [[20.0, 60.0]]), system), system).dims
     FrozenMappingWarningOnValuesAccess({'realization': 1, 'y': 1, 'x': 2, 'time': 128})
     """
-    import xarray
-
+    xarray = needed("xarray", "a labelled cube")
     if isinstance(cube, Cube):
         if (system, flux, depth_m, reflectivity) != (None, None, None, None):
             raise TypeError("system, flux, depth_m and reflectivity are for arrays: a Cube has its own")
@@ -77,15 +77,15 @@ def to_xarray(
         recipe = _recipe(counts.shape, system, flux, depth_m, reflectivity)
         if counts.shape != recipe.shape:
             raise ValueError(f"cube must be {recipe.shape} (realizations, H, W, bins), got {counts.shape}")
-    found: dict[str, Any] = {"histogram": (layout.DIMS, np.asarray(counts), dict(layout.HISTOGRAM_LABELS))}
+    variables: dict[str, Any] = {"histogram": (layout.DIMS, np.asarray(counts), dict(layout.HISTOGRAM_LABELS))}
     coordinates: dict[str, Any] = {}
-    for one in layout.variables(recipe):
-        entry = (one.dims, np.asarray(one.data), one.labels)
-        (coordinates if one.dims == (one.name,) else found)[one.name] = entry
-    told: dict[str, Any] = {**layout.attributes(recipe), "complete": True}
+    for variable in layout.variables(recipe):
+        entry = (variable.dims, np.asarray(variable.data), variable.labels)
+        (coordinates if variable.dims == (variable.name,) else variables)[variable.name] = entry
+    attributes: dict[str, Any] = {**layout.attributes(recipe), "complete": True}
     if not isinstance(cube, Cube):  # nobody says how an array was made
-        told = {name: value for name, value in told.items() if name not in _OF_A_RUN}
-    return xarray.Dataset(found, coordinates, told)
+        attributes = {name: value for name, value in attributes.items() if name not in _OF_A_RUN}
+    return xarray.Dataset(variables, coordinates, attributes)  # type: ignore[no-any-return]
 
 
 def _recipe(

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar._base.files import FileError, beside, npy_header, open_npz
+from mars_lidar._base.files import UnchangedFile, beside, npy_header, open_npz
 from mars_lidar._base.memory import check_memory
 from mars_lidar.io import layout
 from mars_lidar.io.recipe import BLOCK_BYTES, Recipe, Recording
@@ -72,30 +72,25 @@ def add_attributes(to: zipfile.ZipFile, attrs: Mapping[str, Any]) -> None:
 
 def open_store(path: Path, check: layout.Check = layout.check_format) -> OpenedStore:
     """Open an archive for reading; all but the counts are read at once."""
+    opened = UnchangedFile(path)
     with open_npz(path, beside="histogram") as found:
         attrs = json.loads(found["attributes"].item()) if "attributes" in found.files else {}
         check(path, attrs)
         arrays: dict[str, Any] = {name: found[name] for name in found.files if name not in ("attributes", "histogram")}
         if "histogram" in found.files:
-            arrays["histogram"] = OnDisk(_counts(path), path)
+            arrays["histogram"] = OnDisk(_counts(opened), path)
     return OpenedStore(attrs, arrays)
 
 
-def _counts(path: Path) -> LazyCounts:
+def _counts(opened: UnchangedFile) -> LazyCounts:
     name = "histogram.npy"
-    with zipfile.ZipFile(path) as found, found.open(name) as member:
-        shape, dtype = npy_header(member)
-        opened = found.getinfo(name).CRC
+    with zipfile.ZipFile(opened.path) as found, found.open(name) as member:
+        shape, dtype, _ = npy_header(member)
 
     def read() -> NDArray[Any]:
         size = math.prod(shape) * dtype.itemsize
-        check_memory(size, f"the counts of {path}", "a .zarr or .h5 is read in parts")
-        if not path.exists():
-            raise FileError(f"{path} was removed after it was opened")
-        with zipfile.ZipFile(path) as archive:
-            if opened != archive.getinfo(name).CRC:
-                raise FileError(f"{path} was replaced after it was opened: open it again")
-            with archive.open(name) as member:
-                return np.asarray(np.lib.format.read_array(member, allow_pickle=False))
+        check_memory(size, f"the counts of {opened.path}", "a .zarr or .h5 is read in parts")
+        with opened.unchanged() as path, zipfile.ZipFile(path) as found, found.open(name) as member:
+            return np.asarray(np.lib.format.read_array(member, allow_pickle=False))
 
     return LazyCounts(shape, dtype, read)

@@ -24,7 +24,7 @@ from mars_lidar.io import zarr_store
 from mars_lidar.io.cube import Cube, check_output, load, open_writer
 from mars_lidar.io.recipe import Recipe
 from mars_lidar.light.flux import Flux
-from mars_lidar.simulate import simulate
+from mars_lidar.simulation import simulate
 from mars_lidar.table import Table, cache
 
 
@@ -95,7 +95,7 @@ def simulate_to(
     source
         Free text: where the scene came from.
     overwrite
-        Replace an existing file.
+        Replace an existing file, which stays as it is until the new one is complete.
     resume
         Continue a ``.zarr`` that was left incomplete, to the same bits; of a complete one nothing is made. Everything
         else must be as it was.
@@ -132,7 +132,7 @@ def simulate_to(
     target = Path(path)
     if resume and overwrite:
         raise ValueError("resume and overwrite exclude each other")
-    going_on = resume and target.exists()
+    going_on = resume and zarr_store.begun_store(target).exists()
     if not going_on:
         check_output(target, recipe, overwrite=overwrite)
     elif target.suffix != ".zarr":
@@ -144,7 +144,9 @@ def simulate_to(
         return Written(target, int(load(target).registrations or 0), 0.0, 0.0, {})
     simulate_s = write_s = 0.0
     report: dict[str, float] = {}
-    with zarr_store.open_writer(target, recipe, begun) if going_on else open_writer(target, recipe) as writer:
+    with (
+        zarr_store.resumable_writer(target, recipe, begun) if target.suffix == ".zarr" else open_writer(target, recipe)
+    ) as writer:
         for images, rows in list(recipe.blocks(writer.chunks))[writer.begun :]:
             began = time.perf_counter()
             told: dict[str, float] = {}

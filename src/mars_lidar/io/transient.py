@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.files import check_data, read_npy, reading
+from mars_lidar._base.files import NpyFile, UnchangedFile, check_data, reading
 from mars_lidar._base.hdf5 import open_hdf5
 from mars_lidar._base.types import FloatArray
 from mars_lidar.io.capture import CAPTURE_SUFFIXES, Capture, capture_in
@@ -80,7 +80,7 @@ def _read(
     if suffix == ".npy":
         if name is not None:
             raise ValueError(f"{source}: a .npy has one array without a name, got name {name!r}")
-        light: Any = read_npy(source)
+        light: Any = NpyFile(source)
     elif suffix in CAPTURE_SUFFIXES and name is None and (capture := _capture(source)) is not None:
         light = Rows(capture.image, capture.read)
         times = {"bin_ns": capture.bin_ns, "start_ns": capture.start_ns}
@@ -105,6 +105,7 @@ def _read(
 
 def _named(path: Path, name: str | None) -> tuple[Any, dict[str, float]]:
     """An array of a file, of HDF5 with its rows on disk, and the times that stand beside it."""
+    opened = UnchangedFile(path)
     with open_arrays(path) as file:
         name = name or next((one for one in (_NAME, *_CONFOCAL) if one in file.names), _only(file))
         if name not in file.names:
@@ -118,7 +119,7 @@ def _named(path: Path, name: str | None) -> tuple[Any, dict[str, float]]:
         told |= {key: float(stored.attrs[key]) for key in _TIMES if key in stored.attrs}
 
     def read(rows: slice) -> NDArray[Any]:  # the file is open only here
-        with open_hdf5(path) as again:
+        with opened.unchanged(), open_hdf5(path) as again:
             data = again[name]
             return np.asarray(data[..., rows]).T if file.turned else np.asarray(data[rows])
 
@@ -132,8 +133,9 @@ def _only(file: NamedArrays) -> str:
 
 
 def _capture(path: Path) -> Capture | None:
+    opened = UnchangedFile(path)
     with open_hdf5(path) as file:
-        return capture_in(path, file)
+        return capture_in(opened, file)
 
 
 def read_truth(path: str | Path, shape: tuple[int, int]) -> dict[str, FloatArray]:

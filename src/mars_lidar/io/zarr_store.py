@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from mars_lidar._base import manifest
-from mars_lidar._base.files import telling
+from mars_lidar._base.files import alone, beside, exchange, successor, telling
 from mars_lidar.io import layout
 from mars_lidar.io.recipe import Recipe, Recording
 from mars_lidar.io.store import OnDisk, OpenedStore, Writer
@@ -25,32 +25,65 @@ _CHUNK_BYTES = 4 * 2**20
 
 
 @contextlib.contextmanager
-def open_writer(path: Path, recipe: Recipe | Recording, group: Any = None) -> Iterator[Writer]:
-    """Writes a new store, or goes on with what `unfinished` found.
+def open_writer(path: Path, recipe: Recipe | Recording) -> Iterator[Writer]:
+    """Writes a store that is whole or not there; one at `path` stays until the new one takes its place."""
+    with beside(path, folder=True) as unfinished:
+        writer = _writer(create(unfinished, recipe))
+        yield writer
+        _seal(unfinished, writer)
 
-    Its attribute ``complete`` is false from the first byte on and true after the last: an atomic replacement of its
-    root document, after its manifest.
+
+@contextlib.contextmanager
+def resumable_writer(path: Path, recipe: Recipe, group: Any = None) -> Iterator[Writer]:
+    """As `open_writer`; a store that is stopped stays, its attribute ``complete`` false. `group`: of `unfinished`.
+
+    Where there is a store at `path`, the new one is made at `mars_lidar._base.files.successor`.
     """
     new = group is None
-    if new:
-        with telling(lambda: _removed(path)):  # no counts are lost
-            group = _create(path, recipe)
+    store = begun_store(path) if not new else successor(path) if path.exists() else path
+    if new and store.exists():  # of a stopped run that is started again
+        with alone(store):
+            shutil.rmtree(store)
+
+    def remaining() -> str:
+        before = "" if store == path else f", and {path} is what it was before"
+        return f"{store} stays, marked incomplete{before}: --resume (resume=True) continues it"
+
+    with contextlib.ExitStack() as lock:
+        with telling(lambda: _removed(store)) if new else contextlib.nullcontext():  # no counts are lost
+            store.mkdir(exist_ok=not new)
+            lock.enter_context(alone(store))
+            group = create(store, recipe) if new else group
+        with telling(remaining):
+            writer = _writer(group)
+            if not new:
+                histogram = group["histogram"]
+                writer.begun, writer.registrations = _begun(store, histogram, list(recipe.blocks(histogram.chunks)))
+            yield writer
+            _seal(store, writer)
+            if store != path:
+                exchange(store, path)
+
+
+def begun_store(path: Path) -> Path:
+    """The store that a stopped run left, whose final name is `path`."""
+    return beside_it if (beside_it := successor(path)).exists() else path
+
+
+def _writer(group: Any) -> Writer:
     histogram = group["histogram"]
-    writer = Writer(histogram.chunks, lambda images, rows, block: histogram.__setitem__((images, rows), block))
-    with telling(lambda: f"{path} is left behind, marked incomplete: --resume (resume=True) continues it"):
-        if not new:
-            writer.begun, writer.registrations = _begun(path, histogram, list(recipe.blocks(histogram.chunks)))
-        yield writer
-        manifest.seal(path, {"registrations": writer.registrations, "complete": True})
+    return Writer(histogram.chunks, lambda images, rows, block: histogram.__setitem__((images, rows), block))
 
 
-def _create(path: Path, recipe: Recipe | Recording) -> Any:
+def _seal(store: Path, writer: Writer) -> None:
+    """Complete the store: an atomic replacement of its root document, after its manifest."""
+    manifest.seal(store, {"registrations": writer.registrations, "complete": True})
+
+
+def create(path: Path, recipe: Recipe | Recording) -> Any:
+    """The group of a new store at an empty folder; its attribute ``complete`` is false from the first byte on."""
     import zarr
 
-    if path.exists():
-        # without its root document the old store is no store: a removal cut short cannot pass for a cube
-        (path / "zarr.json").unlink(missing_ok=True)
-        shutil.rmtree(path)
     attrs = {"complete": False, **layout.attributes(recipe)}
     group = zarr.create_group(path, zarr_format=3, attributes=attrs)
     add(group, layout.variables(recipe))
@@ -90,6 +123,7 @@ def unfinished(path: Path, recipe: Recipe) -> Any:
     """The group of a store that was left incomplete, by this recipe and version; None for a complete one."""
     import zarr
 
+    target, path = path, begun_store(path)
     if not (path / "zarr.json").is_file():
         raise ValueError(f"{path} is not a Zarr store: there is nothing to resume")
     group = zarr.open_group(path, mode="r+")
@@ -104,21 +138,25 @@ def unfinished(path: Path, recipe: Recipe) -> Any:
             raise ValueError(f"{path} was begun with another {v.name}; start again with --overwrite (overwrite=True)")
     if "histogram" not in group:
         raise ValueError(f"{path} was stopped before its first count; start again with --overwrite (overwrite=True)")
-    return None if stored.get("complete") is True else group
+    if stored.get("complete") is not True:
+        return group
+    if path != target:  # stopped after its last byte
+        exchange(path, target)
+    return None
 
 
 def open_store(path: Path, check: layout.Check = layout.check_format) -> OpenedStore:
     """Open a store for reading; chunks are read when the histogram is indexed."""
     import zarr
 
+    from mars_lidar._base.sealed_store import PlainFiles, SealedStore
+
     attrs = manifest.root_document(path).get("attributes", {})
     check(path, attrs)
     identity = ""
     if attrs.get("complete") is False:
-        group: Any = zarr.open_group(path, mode="r")
+        group: Any = zarr.open_group(PlainFiles(path, read_only=True), mode="r")
     else:
-        from mars_lidar._base.sealed_store import SealedStore
-
         sums = manifest.require(path)
         identity = sums.identity
         group = zarr.open_group(SealedStore(path, sums), mode="r")

@@ -178,7 +178,7 @@ def _draw_map(
     bar = ax.figure.colorbar(image, cax=strip, extend=extend, extendfrac=0.025)
     bar.set_label(label, labelpad=2.0)
     bar.outline.set_linewidth(0.5)
-    ax.set_title(title, loc="left")
+    ax.set_title(title)
     ax.spines[:].set_visible(True)  # an image has a frame
     ax.set_xticks([])
     ax.set_yticks([])
@@ -214,7 +214,7 @@ def _draw_pixels(
     spacing = {"handlelength": 1.6, "borderaxespad": 0.1, "labelspacing": 0.25}
     y, x = next(iter(pixels.values()))
     place = quiet_corner(incident_rate(cube.flux, cube.system, y, x))
-    axes[0, 0].legend(loc=place, frameon=False, **spacing)
+    axes[0, 0].legend(loc=place, **spacing)
 
 
 def _headline(cube: Cube, realization: int) -> str:

@@ -84,7 +84,6 @@ def draw_pixel(
     whole.set_title(
         f"{name} pixel (y {y}, x {x}): S = {flux.signal[y, x]:.3g}, B = {flux.background[y, x]:.3g}, "
         f"{int(counts.sum()):,} registrations".lstrip(),
-        loc="left",
         color=colour,
     )
 

@@ -49,6 +49,13 @@ class Scene:
     valid
         Pixels with a return (H, W), bool.
 
+    Raises
+    ------
+    ValueError
+        Maps of different shapes, a depth that is not positive, a reflectivity outside [0, 1]; the text names the pixel.
+    TypeError
+        A map that holds no real numbers.
+
     See Also
     --------
     Flux, simulate

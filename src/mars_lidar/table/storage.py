@@ -1,4 +1,4 @@
-"""Tables in HDF5 files: contiguous and uncompressed, so that the shapes can be mapped into memory."""
+"""Tables in HDF5 files."""
 
 from __future__ import annotations
 
@@ -20,7 +20,6 @@ FORMAT = 2
 KEY_LENGTH = 24
 _KIND = "mars-lidar table"
 _SUFFIXES = (".h5", ".hdf5")
-_MAPPED = ("shape", "startup")
 
 
 def request_key(
@@ -63,7 +62,7 @@ def write(path: Path, header: dict[str, Any], arrays: dict[str, NDArray[Any]], o
 
 
 def read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-    """Attributes and arrays; the large ones are mapped, the others read."""
+    """Attributes and arrays, which nobody can write to."""
     if path.is_dir():
         raise ValueError(f"{path} is not a table of mars-lidar")
     with open_hdf5(path) as file:
@@ -72,7 +71,7 @@ def read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
             raise ValueError(f"{path} is not a table of mars-lidar")
         if int(header["format"]) != FORMAT:
             raise ValueError(f"{path} is a table of format {header['format']}; this version reads format {FORMAT}")
-        arrays = {name: _mapped(path, data) if name in _MAPPED else _own(whole(data)) for name, data in file.items()}
+        arrays = {name: _own(whole(data)) for name, data in file.items()}
     return header, arrays
 
 
@@ -80,13 +79,6 @@ def _own(array: Any) -> NDArray[Any]:
     values = np.ascontiguousarray(array)
     values.flags.writeable = False
     return values
-
-
-def _mapped(path: Path, data: Any) -> NDArray[Any]:
-    offset = data.id.get_offset()
-    if offset is None:
-        raise ValueError(f"{path} has no contiguous {data.name}: it was not written by mars-lidar")
-    return np.memmap(path, dtype=data.dtype, mode="r", offset=offset, shape=data.shape)
 
 
 def compare(path: Path, made_for: System, system: System) -> None:

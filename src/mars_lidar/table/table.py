@@ -29,6 +29,7 @@ from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import FloatArray, Progress
 from mars_lidar._version import __version__
 from mars_lidar.instrument.system import System
+from mars_lidar.light.flux import Flux
 from mars_lidar.statistics.chain import Rearm
 from mars_lidar.statistics.distance import Pmf, total_variation
 from mars_lidar.statistics.exposure import exposure_moments, normalised
@@ -84,6 +85,23 @@ class Table:
         How the table came to be: version, request, axes in words, seconds, and the error measured at the end.
     laws
         Exact laws of the count at those entries whose four cumulants do not fix it (`statistics.matched.trusted`).
+
+    See Also
+    --------
+    Lookup, QuantisationError, simulate, count_law
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=64,
+    ...     pulse=ml.GaussianPulse(sigma_ns=2.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> table = ml.Table.build(system, signal=(0.1, 2.0, 6), background=(0.1, 1.0, 4), tolerance=1e-3)
+    >>> pixel = table.lookup(0.5, 0.5, delay_ns=30.0)
+    >>> pixel.cumulants[0, :2].round()  # mean and variance of the count
+    array([587., 202.])
+    >>> cube = ml.simulate(ml.Flux(0.5, 0.5, 30.0), system, engine="mars", table=table)
     """
 
     system: System
@@ -261,7 +279,7 @@ class Table:
     @classmethod
     @checked
     def load(cls, path: str | Path, system: System | None = None) -> Table:
-        """The table of a file, for `system` (None: for the one it was made for); shapes stay in the file, mapped.
+        """The table of a file, for `system` (None: for the one it was made for).
 
         Raises
         ------
@@ -474,7 +492,7 @@ class Table:
         signal, background = (random_pixels(rng, axis, samples, True) for axis in (self.signal, self.background))
         delay = rng.uniform(0.0, system.period_ns, samples)
         law = self.lookup(signal, background, delay_ns=delay, cycles=system.cycles)
-        exact = count_law(signal, background, system, delay_ns=delay, tolerance=self.tolerance, threads=threads)
+        exact = count_law(Flux(signal, background, delay), system, tolerance=self.tolerance, threads=threads)
         matched = matched_pmf(law.cumulants, threads=threads)
         off = np.array([total_variation(w, Pmf(int(exact.support[k, 0]), exact.pmf[k])) for k, w in enumerate(matched)])
         good = law.trusted()
@@ -515,7 +533,7 @@ class Table:
         system = self.system.replace(cycles=cycles)
         shift = rng.integers(0, system.bins, signal.size)
         delay = 0.5 * system.period_ns + shift * system.bin_ns
-        exact = exposure_moments(signal, background, system, delay_ns=delay, tolerance=self.tolerance, threads=threads)
+        exact = exposure_moments(Flux(signal, background, delay), system, tolerance=self.tolerance, threads=threads)
         law = self.lookup(signal, background, delay_ns=delay, cycles=cycles, interpolation=interpolation)
         turned = np.stack([np.roll(row, k) for row, k in zip(mixed, shift, strict=True)])
         return deviations(law.cumulants, exact.cumulants), 0.5 * np.abs(turned - normalised(exact.histogram)).sum(-1)

@@ -6,13 +6,16 @@ import math
 import warnings
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.files import FileError, check_claim, read_npy, reading
 from mars_lidar._base.types import FloatArray
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
 
 _PIXEL_BYTES = 4 + 3 * 8  # of a colour image: as it is stored, and as linear light
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # Rec. 709, the primaries of sRGB
@@ -26,13 +29,20 @@ def array(path: Path) -> NDArray[Any]:
         return read_npy(path)
     with reading(path, "an image"), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of the decoder, about metadata and large images
-        import imageio.v3 as iio
         from PIL import Image
 
         content = path.read_bytes()  # decoders that fail leave the files they opened open
-        with Image.open(BytesIO(content)) as header:  # which reads no pixels
-            check_claim(path, _PIXEL_BYTES * math.prod(header.size), "its pixels")
-        return np.asarray(iio.imread(content, extension=path.suffix, plugin="pillow"))
+        with Image.open(BytesIO(content)) as image:  # which reads no pixels
+            check_claim(path, _PIXEL_BYTES * math.prod(image.size), "its pixels")
+            return decoded(image)
+
+
+def decoded(image: Image) -> NDArray[Any]:
+    """Pixels (H, W) or (H, W, channels) of an image of Pillow: colours for a palette, 16 bits of a grey PNG as such."""
+    if image.mode == "P":
+        return np.array(image.convert(image.palette.mode if image.palette else "RGB"))
+    values = np.array(image)
+    return values.astype(np.uint16) if image.format == "PNG" and values.dtype == np.int32 else values
 
 
 def reflectivity(path: Path, stored: NDArray[Any]) -> FloatArray:

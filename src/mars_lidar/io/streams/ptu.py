@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar._base.files import beside
+from mars_lidar._base.files import UnchangedFile, beside
 from mars_lidar._base.memory import check_memory
 from mars_lidar._base.optional import needed
 from mars_lidar.io import layout
@@ -75,6 +75,7 @@ def open_writer(path: Path, recipe: Recipe) -> Iterator[Writer]:
 
 def open_store(path: Path) -> OpenedStore:
     """Open a file for reading."""
+    opened = UnchangedFile(path)
     with ptu_header.opened(path) as ptu:
         attrs = ptu_header.attributes(ptu.tags)
         arrays = ptu_header.variables(path, ptu.tags)
@@ -90,9 +91,9 @@ def open_store(path: Path) -> OpenedStore:
     shape = recipe.shape
 
     def counts() -> NDArray[Any]:
-        whole = recipe.nbytes + path.stat().st_size
-        check_memory(whole, f"the counts of {path}", "mars-lidar convert makes a .zarr of it elsewhere")
-        with ptu_header.opened(path) as ptu:
+        with opened.unchanged(), ptu_header.opened(path) as ptu:
+            size = recipe.nbytes + path.stat().st_size
+            check_memory(size, f"the counts of {path}", "mars-lidar convert makes a .zarr of it elsewhere")
             image = ptu.decode_image(channel=0, dtime=shape[-1], dtype=recipe.dtype)
         if image.shape != (*shape[:3], 1, shape[3]):
             made = f"{image.shape[:3]} instead of {shape[:3]} (realization, y, x)"

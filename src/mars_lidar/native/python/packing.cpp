@@ -1,6 +1,8 @@
 // Bindings of packed counts; storage/packing.h has the format.
 #include "storage/packing.h"
 
+#include <nanobind/stl/vector.h>
+
 #include "python/bindings.h"
 
 namespace mars {
@@ -27,6 +29,23 @@ void unpack(Vector<const uint8_t> packed, Vector<Count> out) {
     unpack_counts(source, out.data());
 }
 
+// Row k of `out` becomes what packed[k] holds.
+template <class Count>
+void unpack_batch(const std::vector<Vector<const uint8_t>>& packed, Matrix<Count> out) {
+    const nb::gil_scoped_release release;
+    if (packed.size() != out.shape(0)) throw std::invalid_argument("out must have a row for each packed chunk");
+    const size_t size = out.shape(1);
+    const auto source = [&](size_t k) {
+        Packed one(packed[k].data(), packed[k].shape(0));
+        if (one.size != size) throw std::invalid_argument("packed counts are of another size than their chunk");
+        return one;
+    };
+    size_t k = 0;
+    for (; k + 1 < packed.size(); k += 2)
+        unpack_counts(source(k), out.data() + k * size, source(k + 1), out.data() + (k + 1) * size);
+    if (k < packed.size()) unpack_counts(source(k), out.data() + k * size);
+}
+
 uint64_t events_of(Vector<const uint8_t> packed) { return Packed(packed.data(), packed.shape(0)).events; }
 
 void unpack_events(Vector<const uint8_t> packed, Vector<int64_t> position, Vector<uint32_t> count) {
@@ -50,6 +69,12 @@ void bind_packing(nb::module_& module) {
     module.def("unpack_counts", &unpack<uint16_t>, "packed"_a, "out"_a.noconvert(),
                "Fill `out` (n,) with what `pack_counts` packed.");
     module.def("unpack_counts", &unpack<uint32_t>, "packed"_a, "out"_a.noconvert());
+    module.def("unpack_batch", &unpack_batch<uint16_t>, "packed"_a, "out"_a.noconvert(),
+               "Fill row k of `out` (n, size) with what packed[k] holds; a ValueError where an integer type is too small.");
+    module.def("unpack_batch", &unpack_batch<uint32_t>, "packed"_a, "out"_a.noconvert());
+    module.def("unpack_batch", &unpack_batch<int16_t>, "packed"_a, "out"_a.noconvert());
+    module.def("unpack_batch", &unpack_batch<int32_t>, "packed"_a, "out"_a.noconvert());
+    module.def("unpack_batch", &unpack_batch<float>, "packed"_a, "out"_a.noconvert());
     module.def("packed_events", &events_of, "packed"_a, "Elements that are not zero.");
     module.def("unpack_events", &unpack_events, "packed"_a, "position"_a.noconvert(), "count"_a.noconvert(),
                "Fill position and count (events,) of the elements that are not zero.");

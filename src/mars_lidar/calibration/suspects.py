@@ -1,0 +1,245 @@
+"""What a recording shows beyond its model: effects of the detector, by a score and then by a refit; drift, by parts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar._base.types import FloatArray
+from mars_lidar.calibration.fit import LIGHTS, Fit, Fitted, counted
+from mars_lidar.calibration.model import Effect, Model, effects
+from mars_lidar.calibration.recording import Recording
+from mars_lidar.calibration.start import first_spread, with_edge
+
+_DIRECTION = 12.0  # photons of the streams that give the direction of an effect, over those of the recording
+_MOST = 2e6  # of these photons
+FALSE_ALARM = 0.005  # probability that a plain recording gets a suspect; again that of a drift
+_ROUNDS = 5  # of steps with an effect more; the last streams tell whether they were enough
+_REFITTED = 2  # effects, that fresh streams judge
+_MISFIT = 1e-3  # probability of the misfit below which effects without a clear score are refitted, and their gain in it
+_PARTS = 16  # of a recording, for drift
+_PART_PHOTONS = 300  # of a part, at least
+
+
+@dataclass(frozen=True)
+class Score:
+    """An effect's size by the residual counts: its value and standard deviation, and what a unit of it shifts."""
+
+    effect: Effect
+    size: float
+    error: float
+    shift: FloatArray  # (free,) of the parameters, for an effect of size 1 that nobody knows of
+
+    @property
+    def z(self) -> float:
+        """Standard deviations above none; no effect has a negative size."""
+        return self.size / self.error
+
+    @property
+    def limit(self) -> float:
+        """Upper limit of the size, 95 %."""
+        return max(self.size, 0.0) + 1.645 * self.error
+
+
+def scores(fit: Fit, fitted: Fitted) -> list[Score]:
+    """The score of each effect that the model does not have, the clearest first."""
+    model, law = fitted.model, fitted.batch
+    have = {name for effect in model.effects for name in effect.names} | {name for name, _ in model.fields}
+    have |= {"afterpulse_probability"} if "afterpulsing" in have else set()
+    have |= {"electronics_excess"} if "electronics_dead_time_ns" in have else set()
+    have |= {"paralyzable"} if "mode" in have else set()
+    centre = model.bounded(fitted.theta)
+    photons = float(fit.recording.photons)
+    simulated = min(_DIRECTION * photons, max(_MOST, photons))
+    exposure = max(2, round(fit.exposure(simulated / LIGHTS)))
+    ratio = fit.exposure(photons) / exposure
+    rows = np.tile(centre, (LIGHTS, 1))
+    plain = counted(model, law.cells, rows, exposure, fit.next_seed()).mean(0) * ratio
+    listed = []
+    used = law.common
+    dead = float(centre[model.light + 2])
+    for effect in effects(dead) if dead > 0.0 else ():
+        if effect.names[0] in have:
+            continue
+        try:
+            made = counted(model, law.cells, rows, exposure, fit.next_seed(), (effect,)).mean(0) * ratio
+        except ValueError:  # a detector cannot have both
+            continue
+        change = made - plain
+        noise = (np.maximum(plain, 0.5) + np.maximum(made, 0.5)) * ratio / LIGHTS
+        change = change * np.maximum(0.0, 1.0 - 2.0 * noise / np.maximum(change**2, 1e-300)) / effect.start[0]
+        shift = fitted.estimator @ change
+        way = change - fitted.jacobian @ shift
+        along = np.zeros_like(way)
+        along[used] = law.weight[np.ix_(used, used)] @ way[used]
+        along /= max(float(way @ along), 1e-300)
+        spread = float((fitted.fresh @ along).std()) * (1.0 + 2.0 * ratio / LIGHTS) ** 0.5
+        listed.append(Score(effect, float(fitted.left @ along), spread, shift))
+    return sorted(listed, key=lambda score: -score.z)
+
+
+def clear(listed: list[Score]) -> float:
+    """Standard deviations of a score that one of these effects has by chance with a probability of `FALSE_ALARM`."""
+    from scipy.special import ndtri
+
+    return float(-ndtri(FALSE_ALARM / max(len(listed), 1)))
+
+
+@dataclass(frozen=True)
+class Named:
+    """An effect that a refit took in: z of its score before, and the gain of the misfit in standard deviations."""
+
+    effect: Effect
+    z: float
+    gain: float
+
+
+_Stepped = tuple[Model, FloatArray, FloatArray, NDArray[np.intp]]
+
+
+def refitted(fit: Fit, fitted: Fitted, listed: list[Score]) -> tuple[Fitted, Named] | None:
+    """The fit with the one effect that takes most of the misfit; None where no effect is clear.
+
+    Effects are named by the refit: a slow recovery may have the score of a paralyzable detector, and one that the
+    dead time has taken up has no score at all. So where the misfit is clear, effects without a score are tried too.
+    """
+    limit = clear(listed)
+    best = _best(fit, fitted, [score for score in listed if score.z > limit], limit)
+    if best is None and fitted.p_value < _MISFIT:
+        best = _best(fit, fitted, [score for score in listed if score.z <= limit], limit)
+    return best
+
+
+def _best(fit: Fit, fitted: Fitted, tried: list[Score], limit: float) -> tuple[Fitted, Named] | None:
+    trials: list[tuple[float, Score, _Stepped]] = []
+    families: set[str] = set()
+    for score in tried:
+        if score.effect.names[0] in families:
+            continue
+        families.add(score.effect.names[0])
+        trial = _stepped(fit, fitted, score)
+        if trial is not None:
+            trials.append((trial[0], score, trial[1]))
+    best: tuple[Fitted, Named] | None = None
+    for _, score, (model, theta, root, free) in sorted(trials, key=lambda trial: trial[0])[:_REFITTED]:
+        final = fit.finish(model, theta, root, free)
+        if final.converged and (best is None or final.misfit_z < best[0].misfit_z):
+            best = final, Named(score.effect, score.z, fitted.misfit_z - final.misfit_z)
+    if best is None:
+        return None
+    final, named = best
+    if named.effect.onoff:
+        clear_size = named.z > limit
+    else:
+        clear_size = final.theta[fitted.model.size] > limit * final.covariance[(k := len(fitted.free)), k] ** 0.5
+    return best if clear_size or fitted.p_value < _MISFIT * final.p_value else None
+
+
+def _stepped(fit: Fit, fitted: Fitted, score: Score) -> tuple[float, _Stepped] | None:
+    """Misfit and parameters with one effect more; None where a detector cannot have it beside the others."""
+    model, effect = fitted.model.with_effect(score.effect), score.effect
+    size = effect.start[0]
+    moved = fitted.theta.copy()
+    if not effect.onoff and score.size > 0.0:
+        size = min(score.size, effect.most[0])
+        moved[fitted.free] -= score.shift * min(size, effect.start[0])
+    theta = model.bounded(np.r_[moved, size, effect.start[1:]])
+    spread = first_spread(model, theta)
+    own = np.sqrt(np.diag(fitted.covariance))
+    spread[fitted.free] = np.minimum(spread[fitted.free], np.maximum(8.0 * own, 1e-12))
+    more = [] if effect.onoff else range(fitted.model.size, model.size)
+    free = np.r_[fitted.free, np.array(more, np.intp)].astype(np.intp)
+    photons = float(fit.recording.photons)
+    try:
+        if fitted.model.light + 2 in fitted.free:  # which has taken up what it could of the effect
+            gaps = np.diff(fit.recording.pieces[0][: 12 * fit.effort.first])
+            theta = with_edge(fit, model, theta, np.sort(gaps))
+        theta, root, misfit, _ = fit.steps(model, theta, np.diag(spread[free]), free, photons, _ROUNDS, photons / 6.0)
+    except (ValueError, np.linalg.LinAlgError):
+        return None
+    return misfit, (model, theta, root, free)
+
+
+@dataclass(frozen=True, eq=False)
+class Drift:
+    """Parameters by parts of the recording.
+
+    `times_s` (parts,) their middles; `values` (parts, p), and `errors` (p,) of each; `trend` (p,) change from begin to
+    end, in standard deviations; `p_value` (p,) of the scatter; `growth` (p,) of the stated errors for it.
+    """
+
+    names: tuple[str, ...]
+    times_s: FloatArray
+    values: FloatArray
+    errors: FloatArray
+    trend: FloatArray
+    change: FloatArray
+    p_value: FloatArray
+    growth: FloatArray
+
+    @property
+    def _trend_p(self) -> FloatArray:
+        from scipy.special import ndtr
+
+        return np.asarray(2.0 * ndtr(-np.abs(self.trend)))
+
+    @property
+    def probability(self) -> float:
+        """Probability of a trend or a scatter as large in a constant recording, all parameters together."""
+        p = np.r_[self._trend_p, self.p_value]
+        return float(1.0 - (1.0 - p.min()) ** p.size)
+
+    @property
+    def drifts(self) -> NDArray[np.bool_]:
+        """(p,) which parameters are not constant."""
+        return np.asarray(np.minimum(self._trend_p, self.p_value) < FALSE_ALARM / (2 * self.p_value.size))
+
+
+def drift(fit: Fit, fitted: Fitted) -> Drift | None:
+    """Light and delay of parts of the recording, by the estimator of the whole; None for a short recording."""
+    from scipy.special import chdtrc
+
+    recording: Recording = fit.recording
+    number = int(min(_PARTS, recording.photons // _PART_PHOTONS))
+    if number < 4:
+        return None
+    parts = [part for part in recording.parts(number) if part.photons > 20]
+    model, law = fitted.model, fitted.batch
+    free = fitted.free
+    light = [k for k, index in enumerate(free) if index < model.light]
+    values = []
+    for part in parts:
+        y = law.cells.of(part) * (recording.exposure / part.exposure)
+        values.append(fitted.estimator @ (y - fitted.offset))
+    estimates = np.array(values)[:, light]
+    cov = fitted.scatter[np.ix_(light, light)] * len(parts)
+    names = [model.names[free[k]] for k in light]
+    signals = [i for i, name in enumerate(names) if not name.startswith("delay")]
+    combine = np.zeros((1 + len(names) - len(signals), len(names)))
+    combine[0, signals] = 1.0  # all light; then each delay
+    for row, i in enumerate(i for i in range(len(names)) if i not in signals):
+        combine[1 + row, i] = 1.0
+    x = estimates @ combine.T
+    sd = np.sqrt(np.diag(combine @ cov @ combine.T))
+    place = np.linspace(-0.5, 0.5, len(parts))
+    slope = place @ (x - x.mean(0)) / (place @ place)
+    square = (((x - x.mean(0)) / sd) ** 2).sum(0)
+    p = np.array([float(chdtrc(len(parts) - 1, value)) for value in square])
+    begins = np.cumsum([0.0, *(part.exposure for part in parts)])
+    middle = 0.5 * (begins[1:] + begins[:-1]) * recording.period_ns * 1e-9
+    about = np.r_[
+        fitted.theta[[free[light[i]] for i in signals]].sum(),
+        fitted.theta[[free[light[i]] for i in range(len(names)) if i not in signals]],
+    ]
+    return Drift(
+        ("light", *(names[i] for i in range(len(names)) if i not in signals)),
+        middle,
+        x - x.mean(0) + about,
+        sd,
+        slope / (sd / np.sqrt(place @ place)),
+        slope,
+        p,
+        np.sqrt(np.maximum(square / (len(parts) - 1), 1.0)),
+    )

@@ -1,0 +1,66 @@
+"""Several returns of a pixel: what was found of each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar._base.brief import brief
+from mars_lidar._base.types import FloatArray
+from mars_lidar.instrument.system import System
+
+MOST_RETURNS = 8
+RETURN_COLUMNS = ("delay", "signal", "delay_error", "signal_error", "false_alarm")  # as the native core writes them
+
+
+@dataclass(frozen=True, eq=False)
+class Returns:
+    """The returns of each pixel of a reconstruction (...), nearest first, NaN beyond those that there are.
+
+    Attributes
+    ----------
+    count
+        (...) uint8, returns that were found, 0 to K.
+    delay_ns, depth_m
+        (..., K) delay in [0, period), ns, and depth, m.
+    signal
+        (..., K) S, detectable photons per laser period.
+    delay_error_ns, depth_error_m, signal_error
+        (..., K) standard errors from the observed information; NaN where it does not bound them.
+    false_alarm
+        (..., K) probability that a return which is not there would have gained so much likelihood, anywhere in the
+        period (docs/theory_reconstruction.md, section 6).
+    """
+
+    count: NDArray[np.uint8]
+    delay_ns: FloatArray
+    depth_m: FloatArray
+    signal: FloatArray
+    delay_error_ns: FloatArray
+    depth_error_m: FloatArray
+    signal_error: FloatArray
+    false_alarm: FloatArray
+
+    __repr__ = brief
+
+
+def returns_of(values: FloatArray | None, system: System, shape: tuple[int, ...]) -> Returns | None:
+    """Those (..., K) of the estimates (pixels, K, columns) of a method; None where it looks for one only."""
+    if values is None:
+        return None
+    found = values.reshape(*shape, *values.shape[1:])
+    delay, signal, delay_error, signal_error, false_alarm = np.moveaxis(found, -1, 0)
+    period = system.period_ns
+    delay = np.where(delay >= 1.0, 0.0, delay) * period
+    return Returns(
+        count=np.isfinite(delay).sum(-1).astype(np.uint8),
+        delay_ns=delay,
+        depth_m=system.depth_m(delay),
+        signal=signal,
+        delay_error_ns=delay_error * period,
+        depth_error_m=system.depth_m(delay_error * period),
+        signal_error=signal_error,
+        false_alarm=false_alarm,
+    )

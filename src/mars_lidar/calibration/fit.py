@@ -22,7 +22,7 @@ from mars_lidar.calibration.recording import Recording
 SETTINGS = 16  # detectors of a batch
 LIGHTS = 16  # lights of each, in one call of the engine
 _SPREAD = 2.0  # of a batch about its centre, in standard errors of a stream of its own length
-_LONGER, _CLOSE = 4.0, 1.2  # the same of the last law, of longer streams: closer, to resolve the edge of a dead time
+_LONGER = 4.0  # times the photons of the last law, whose closer parameters resolve the edge of a dead time
 _NEAR = 3.0  # the same of the last batches, in standard errors of the recording
 _SETTLED = 1.0  # standard errors that the last estimate may lie from the centre of its streams
 _LONGEST = 3.0  # of a move of that centre
@@ -314,7 +314,7 @@ class Fit:
     ) -> Fitted:
         """The last estimate, and what fresh streams about it say of its slope, bias, scatter and misfit."""
         photons = float(self.recording.photons)
-        law = self.law(model, theta, root, free, photons, times=_LONGER, spread=_CLOSE)
+        law = self.law(model, theta, root, free, photons, times=_LONGER)
         nearby = _NEAR * (self.effort.of(photons) / photons) ** 0.5
         gain = law.estimator(free)
         seen = law.cells.of(self.recording)

@@ -11,7 +11,7 @@ The program prints ``Registered 0.92 photons per period; fitted 3.00, true 3.00.
 import matplotlib.pyplot as plt
 
 import mars_lidar as ml
-from mars_lidar.reconstruct import coates_rates, generalised_coates_rates
+from mars_lidar.reconstruction import coates_rates, generalised_coates_rates
 
 pulse, detector = ml.GaussianPulse(sigma_ns=1.0), ml.Detector(dead_time_ns=75.0)
 system = ml.System(period_ns=100.0, cycles=50_000, bins=128, pulse=pulse, detector=detector)

@@ -12,7 +12,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import mars_lidar as ml
-from mars_lidar.reconstruct import generalised_coates_rates
+from mars_lidar.reconstruction import generalised_coates_rates
 
 y, x = np.mgrid[-1:1:24j, -1:1:32j]
 after_ns = 0.1 * np.arange(600) - (15 + 6 * (x**2 + y**2))[..., None]  # since the wall's return

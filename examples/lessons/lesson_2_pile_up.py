@@ -20,7 +20,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import mars_lidar as ml
-from mars_lidar.reconstruct import coates_rates
+from mars_lidar.reconstruction import coates_rates
 
 pulse = ml.GaussianPulse(sigma_ns=2.0)
 detector = ml.Detector(dead_time_ns=0.0, mode="synchronous")

@@ -24,7 +24,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import mars_lidar as ml
-from mars_lidar.reconstruct import generalised_coates_rates
+from mars_lidar.reconstruction import generalised_coates_rates
 
 pulse, detector = ml.GaussianPulse(sigma_ns=2.0), ml.Detector(dead_time_ns=75.0)
 system = ml.System(period_ns=100.0, cycles=20_000, bins=128, pulse=pulse, detector=detector)

@@ -536,9 +536,9 @@ class Table:
         """
         periods = self._cycles(cycles)
         system = self.system.replace(cycles=periods)
-        found = self.lookup(signal, background, cycles=periods, interpolation=interpolation)
+        entries = self.lookup(signal, background, cycles=periods, interpolation=interpolation)
         shapes = self.shapes(periods)
-        mixed = np.stack([w @ shapes[r] for r, w in zip(found.rows, found.weights, strict=True)])
+        mixed = np.stack([w @ shapes[r] for r, w in zip(entries.rows, entries.weights, strict=True)])
         half = 0.5 * system.period_ns
         shift = np.rint((np.asarray(delay_ns) - half) / system.bin_ns).astype(np.int64) % system.bins
         errors = []

@@ -32,7 +32,7 @@ from mars_lidar.instrument.detector import Detector
 from mars_lidar.instrument.pulse import GaussianPulse
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
-from mars_lidar.simulate import simulate
+from mars_lidar.simulation import simulate
 
 _LIBRARY = "distributed", "making parts by workers", "cluster"
 _AHEAD = 3  # tasks given out per worker thread: none waits for the scheduler, and a million are not queued at once

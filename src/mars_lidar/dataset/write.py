@@ -20,7 +20,7 @@ from mars_lidar.dataset.shard import chunks_of, packer, write_shard
 from mars_lidar.dataset.store import Dataset, Item
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
-from mars_lidar.simulate import simulate
+from mars_lidar.simulation import simulate
 
 _KEPT = 4  # scenes and fluxes that a maker remembers: neighbours in the order of parts share them
 

@@ -15,8 +15,8 @@ from mars_lidar.io.cube import Cube
 from mars_lidar.io.layout import MEASURED
 from mars_lidar.io.recipe import Recipe
 from mars_lidar.light.flux import Flux
-from mars_lidar.reconstruct import METHODS, reconstruct
-from mars_lidar.reconstruct.quality import depth_lag_m
+from mars_lidar.reconstruction import METHODS, reconstruct
+from mars_lidar.reconstruction.quality import depth_lag_m
 from mars_lidar.statistics import ConvergenceError, mean_histogram, photons_per_bin
 from mars_lidar.statistics.histogram import histogram_effects
 
@@ -153,7 +153,7 @@ def _peak_offset_ns(system: System) -> float:
 def fitted(cube: Cube, realization: int) -> Cube:
     """One exposure of a measured cube with the flux that maximum likelihood finds in it; a simulated one as it is.
 
-    The flux is that of detectable photons, so the system is `System.detected`. Depth is NaN where no return is seen.
+    The flux is that of detectable photons, so the system is `System.detected`. Depth is NaN where there is no return.
     Detectors that maximum likelihood does not hold for are fitted by the first of the other methods that does.
     """
     if not cube.measured:

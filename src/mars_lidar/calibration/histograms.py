@@ -20,7 +20,7 @@ from mars_lidar._base.types import FloatArray
 from mars_lidar.calibration.calibration import Estimate
 from mars_lidar.instrument.pulse import GaussianPulse
 from mars_lidar.instrument.system import System
-from mars_lidar.reconstruction.fit_quality import Template, blinding, fit_quality, holds_for
+from mars_lidar.reconstruction.fit_quality import tested_recordings
 from mars_lidar.reconstruction.histograms import Histograms, checked
 from mars_lidar.reconstruction.maximum_likelihood import MaximumLikelihood
 
@@ -81,7 +81,7 @@ def calibrate_cube(cube: ArrayLike, system: System) -> CubeCalibration:
     from scipy.optimize import minimize
 
     given, _ = checked(cube, system, 1)
-    if not holds_for(system):
+    if not tested_recordings(system):
         raise ValueError(
             f"system must have a free-running detector and many cycles to calibrate a cube, got mode "
             f"{system.detector.mode!r} and {system.cycles:,} cycles"
@@ -116,7 +116,7 @@ def calibrate_cube(cube: ArrayLike, system: System) -> CubeCalibration:
     errors = np.array([_half_width(loss, at, k, float(best.fun)) for k in range(2)])
     final = trial(at)
     light = MaximumLikelihood().estimate(Histograms(some, final, 1))
-    quality = fit_quality(Histograms(some, final, 1), light.signal, light.background, light.delay)
+    p_values = np.asarray(light.p_value)
     darkest = int(np.argmin(light.background))
     floor = float(light.background[darkest])
     floor_error = 0.0 if light.background_error is None else float(np.nan_to_num(light.background_error[darkest]))
@@ -126,7 +126,7 @@ def calibrate_cube(cube: ArrayLike, system: System) -> CubeCalibration:
         "pulse_sigma_ns": _normal(sigma, sigma * errors[1]),
         "background_floor": _normal(floor, floor_error),
     }
-    return CubeCalibration(estimates, final, quality.p_value[np.isfinite(quality.p_value)])
+    return CubeCalibration(estimates, final, p_values[np.isfinite(p_values)])
 
 
 def _normal(value: float, error: float) -> Estimate:
@@ -151,12 +151,11 @@ def _half_width(loss: Callable[[FloatArray], float], at: FloatArray, k: int, lea
 
 def _log_likelihood(counts: FloatArray, system: System) -> float:
     """Sum over the pixels of the quasi-likelihood at the most likely light of each."""
-    light = MaximumLikelihood(tested=False).estimate(Histograms(counts, system, 1))
-    h = counts.astype(np.float64)
-    whole, kernel = blinding(system, system.dead_time_periods)
-    passes = system.cycles - whole * h.sum(1, keepdims=True) - np.fft.irfft(np.fft.rfft(h) * kernel, system.bins)
-    share = Template(system).at(np.nan_to_num(light.delay))[0]
-    signal = np.where(np.isnan(light.delay), 0.0, light.signal)[:, None]
-    rate = signal * share + np.maximum(light.background, 1e-9)[:, None] / system.bins
-    expected = rate * np.maximum(passes, 0.0)
-    return float((h * np.log(np.maximum(expected, 1e-9))).sum() - expected.sum())
+    from mars_lidar._base.native import _core
+
+    histograms = Histograms(counts, system, 1)
+    fit = MaximumLikelihood().estimate(histograms)
+    light = np.stack([fit.signal, np.maximum(fit.background, 1e-9), fit.delay], axis=1)
+    expected = np.empty(counts.shape)
+    _core.expected_registrations(histograms.recording, counts, light, expected)
+    return float((counts * np.log(np.maximum(expected, 1e-9))).sum() - expected.sum())

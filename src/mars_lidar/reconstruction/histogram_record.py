@@ -18,20 +18,25 @@ if TYPE_CHECKING:
 
 _CELLS_PER_SIGMA = 32  # Hermite interpolation: energies to 3e-9
 _CELLS_PER_PERIOD = 4096  # of a Gaussian that is wider than the period
+_CELLS_PER_SAMPLE = 16  # of few samples, whose edges are rounded over one of them
 _OUTSIDE_CORE = 0.0015  # of the energy on either side of the window in which the signal is counted: 3 sigma
 
 
 @lru_cache(maxsize=16)
-def recording_of(system: System) -> _core.HistogramRecord:
-    """The native form of a system whose gate, if any, does not move; times in laser periods."""
+def recording_of(system: System, *, longer: float = 1.0, wider: float = 1.0) -> _core.HistogramRecord:
+    """The native form of a system whose gate, if any, does not move; times in laser periods.
+
+    With a dead time `longer` times as long, and a pulse `wider` times as wide.
+    """
     from mars_lidar._base.native import _core
     from mars_lidar.statistics.cells import whole_bins
 
-    low, cell, energy, slope = _curve(system.pulse, system.period_ns)
+    # a wider pulse has in a period the form that this has in a shorter one
+    low, cell, energy, slope = _curve(system.pulse, system.period_ns / wider)
     peak = low + cell * (int(np.argmax(np.diff(energy))) + 0.5)
     core = core_ns(system)
     sharpness = float(np.sum(np.diff(energy) ** 2)) / cell  # integral of s^2
-    whole, shift, fraction = whole_bins(system.dead_time_periods, system.bins)
+    whole, shift, fraction = whole_bins(longer * system.dead_time_periods, system.bins)
     open_low, open_high = open_bins(system)
     return _core.HistogramRecord(
         bins=system.bins,
@@ -60,7 +65,7 @@ def pulse_width(sharpness: float) -> float:
 
 
 def check_window(what: str, system: System) -> None:
-    """Raise ValueError where no background could be seen beside the window of the signal."""
+    """Raise ValueError where the window of the signal leaves no bins for the background."""
     low, high = core_ns(system)
     most = 0.75 * system.detector.gate_periods(system.period_ns)[2] * system.period_ns
     if high - low > most:
@@ -93,9 +98,11 @@ def _curve(pulse: Pulse, period: float) -> tuple[float, float, FloatArray, Float
         density = np.exp(-0.5 * (x / pulse.sigma_ns) ** 2) / (math.sqrt(2.0 * math.pi) * pulse.sigma_ns)
         return low / period, (high - low) / cells / period, _unit(pulse.cumulative(x)), density * period
     if isinstance(pulse, SampledPulse):  # linear between the edges of samples; smooth and monotone through them here
-        cells = round((high - low) / pulse.bin_ns)
-        energy = _unit(pulse.cumulative(low + pulse.bin_ns * np.arange(cells + 1)))
-        cell = pulse.bin_ns / period
+        samples = round((high - low) / pulse.bin_ns)
+        each = max(1, min(_CELLS_PER_SAMPLE, _CELLS_PER_PERIOD // samples))
+        cells, width = samples * each, pulse.bin_ns / each
+        energy = _unit(pulse.cumulative(low + width * np.arange(cells + 1)))
+        cell = width / period
         return low / period, cell, energy, _monotone_slopes(energy, cell)
     x = low + period * np.arange(_CELLS_PER_PERIOD + 1) / _CELLS_PER_PERIOD
     before = pulse.wrapped_cumulative(x, period)

@@ -12,7 +12,7 @@ from mars_lidar._base import arguments, checks
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
-from mars_lidar.reconstruction.fit_quality import FALSE_ALARM, fit_quality, holds_for
+from mars_lidar.reconstruction.fit_quality import COLUMNS, FALSE_ALARM, quality_of, tested_recordings
 from mars_lidar.reconstruction.histogram_record import recording_of, relative_width
 from mars_lidar.reconstruction.histograms import Histograms, checked
 from mars_lidar.reconstruction.method import Estimates, Flags, Method
@@ -28,26 +28,22 @@ class MaximumLikelihood(Method):
     starts
         The likelihood is climbed from this many delays, the best of a grid over the period, in [1, 8].
     false_alarm
-        Pixels without signal that are not flagged as such, as a share of them, about: a signal counts as seen where
-        twice its gain in log likelihood is more than what background reaches with this probability anywhere in the
-        period.
+        False-alarm probability: the approximate fraction of pixels without signal that are not flagged. A signal is
+        detected where twice its gain in log likelihood exceeds the level that background reaches anywhere in the
+        period with this probability.
     less_bias
-        Take the bias of first order off the maximum (Cox and Snell, J. R. Stat. Soc. B 30, 248, 1968; R19): some
+        Subtract the first-order bias of the maximum (Cox and Snell, J. R. Stat. Soc. B 30, 248, 1968; R19): some
         tenths of a standard error in bright pixels of short exposures, whose errors it makes smaller too.
     returns
         Largest number of returns for each pixel, in [1, 8]. Returns are added as long as twice the gain of the log
         likelihood exceeds what noise reaches anywhere in the period with probability `false_alarm` (R23 of
         docs/theory_reconstruction.md, section 6). `signal` and `delay_ns` are then those of the strongest return.
-    tested
-        Test the fit of each pixel of one return and a free-running detector
-        (docs/theory_reconstruction.md, section 8).
     """
 
     starts: int = 3
     false_alarm: float = 0.01
     less_bias: bool = True
     returns: int = 1
-    tested: bool = True
 
     name = "maximum_likelihood"
     modes = ("nonparalyzable", "synchronous", "gated")
@@ -69,11 +65,14 @@ class MaximumLikelihood(Method):
         return float(NormalDist().inv_cdf(1.0 - self.false_alarm / places) ** 2)
 
     def estimate(self, histograms: Histograms) -> Estimates:
-        """The estimates, their standard errors, and the significance of the signal."""
+        """The estimates, their standard errors, the significance of the signal, and whether they fit."""
         from mars_lidar._base.native import _core
 
-        out = np.empty((len(histograms.counts), 8))
-        flags = np.empty(len(histograms.counts), np.uint8)
+        pixels = len(histograms.counts)
+        out = np.empty((pixels, 8))
+        flags = np.empty(pixels, np.uint8)
+        tests = tested_recordings(histograms.system) if self.returns == 1 else []
+        statistics = np.empty((pixels if tests else 0, COLUMNS))
         _core.maximum_likelihood(
             histograms.recording,
             histograms.counts,
@@ -82,14 +81,15 @@ class MaximumLikelihood(Method):
             less_bias=self.less_bias,
             out=out,
             flags=flags,
+            tests=tests,
+            quality=statistics,
             threads=histograms.threads,
             progress=histograms.progress,
         )
         several = self._several(histograms, out, flags) if self.returns > 1 else None
         column = np.ascontiguousarray(out.T)
-        quality = None
-        if self.tested and several is None and holds_for(histograms.system):
-            quality = fit_quality(histograms, column[0], column[1], column[2])
+        quality = quality_of(statistics) if tests else None
+        if quality is not None:
             flags |= np.where(quality.p_value < FALSE_ALARM, Flags.MISFIT, 0).astype(np.uint8)
         return Estimates(
             signal=column[0],

@@ -341,7 +341,7 @@ class Table:
             ``"bilinear"``: the mean histogram is a mixture of four, linear in S and in B; cumulants are bicubic in
             their logarithms. ``"nearest"``: the nearest entry, as in the paper.
         outside
-            ``"error"``, or ``"exact"``: pixels beyond the axes are left to the caller, marked in `Lookup.outside`.
+            ``"error"``, or ``"exact"``: pixels beyond the axes are marked in `Lookup.outside` for the caller.
         threads
             Threads to run on; the result does not depend on it.
 
@@ -518,6 +518,36 @@ class Table:
             return self.quantisation_error(samples=samples, cycles=MOST_CYCLES, threads=threads)
         except ConvergenceError:  # the law of a random pixel between the entries, which is much of a locked one
             return None
+
+    def start_up_error(
+        self,
+        signal: FloatArray,
+        background: FloatArray,
+        delay_ns: FloatArray,
+        *,
+        cycles: int | None = None,
+        interpolation: Interpolation = "bilinear",
+        threads: int | None = None,
+    ) -> FloatArray:
+        """Share (P,) of the registrations that the shape places wrongly because it is that of the canonical delay.
+
+        Total variation between the table's shape, moved to the delay (P,) by whole bins, and the exact one there, less
+        the same at the canonical delay. Each pixel is evaluated twice by itself.
+        """
+        periods = self._cycles(cycles)
+        system = self.system.replace(cycles=periods)
+        entries = self.lookup(signal, background, cycles=periods, interpolation=interpolation)
+        shapes = self.shapes(periods)
+        mixed = np.stack([w @ shapes[r] for r, w in zip(entries.rows, entries.weights, strict=True)])
+        half = 0.5 * system.period_ns
+        shift = np.rint((np.asarray(delay_ns) - half) / system.bin_ns).astype(np.int64) % system.bins
+        errors = []
+        for turns in (shift, np.zeros_like(shift)):
+            flux = Flux(signal, background, half + turns * system.bin_ns)
+            exact = exposure_moments(flux, system, tolerance=self.tolerance, threads=threads)
+            turned = np.stack([np.roll(row, k) for row, k in zip(mixed, turns, strict=True)])
+            errors.append(0.5 * np.abs(turned - normalised(exact.histogram).reshape(turned.shape)).sum(-1))
+        return np.asarray(np.maximum(errors[0] - errors[1], 0.0))
 
     def _delayed(
         self,

@@ -15,7 +15,7 @@ from dataset.conftest import files
 
 import mars_lidar as ml
 from mars_lidar import io
-from mars_lidar.dataset import DatasetRecipe, open_dataset
+from mars_lidar.dataset import DatasetRecipe, begin, finish, make_part, open_dataset, verify
 
 _SCRIPT = """
 import json, os, resource, signal, sys
@@ -183,3 +183,62 @@ def test_what_is_taken_away_while_it_is_made_is_missed(tmp_path, recipe, what):
         ml.generate(recipe, out, progress=progress, threads=1)
     with pytest.raises((ValueError, FileNotFoundError)):
         open_dataset(out)
+
+
+# --- Parts by processes that do not know of each other -------------------------------------------------------------
+
+_COMMAND = [sys.executable, "-m", "mars_lidar", "generate"]
+
+
+@pytest.mark.full
+def test_begin_four_parts_and_finish_as_shell_jobs_make_the_same_store(tmp_path, recipe, whole):
+    (tmp_path / "recipe.yaml").write_text(DatasetRecipe.from_dict(recipe).to_json())
+    out = tmp_path / "set.zarr"
+
+    def job(*options: str) -> subprocess.Popen[str]:
+        return subprocess.Popen([*_COMMAND, *options, "-o", str(out)], stderr=subprocess.PIPE, text=True)
+
+    def ended(jobs: list[subprocess.Popen[str]]) -> list[tuple[int, str]]:
+        return [(each.wait(), each.communicate()[1]) for each in jobs]
+
+    assert ended([job(str(tmp_path / "recipe.yaml"), "--begin")])[0][0] == 0
+    assert [code for code, _ in ended([job("--part", f"{k}/4", "--threads", "1") for k in (1, 2, 4)])] == [0, 0, 0]
+    ((code, words),) = ended([job("--finish")])
+    assert code == 2
+    assert "shards of" in words
+    assert "are missing, the first" in words
+    assert [code for code, _ in ended([job("--part", "3/4")])] == [0]
+    assert [code for code, _ in ended([job("--finish")])] == [0]
+    assert files(out) == whole
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["recipe.yaml", "set.zarr", "whole.zarr"]
+
+
+def test_finish_reads_no_shard_again(tmp_path, recipe, monkeypatch):
+    from mars_lidar._base import manifest
+
+    begin(recipe, tmp_path / "set.zarr")
+    for k in (2, 1):
+        make_part(tmp_path / "set.zarr", (k, 2))
+    real, read = manifest._hash, []
+    monkeypatch.setattr(manifest, "_hash", lambda path: read.append(path) or real(path))
+    finish(tmp_path / "set.zarr")
+    assert read
+    assert not [path for path in read if "/histogram/c/" in str(path) or "set.zarr/depth/c/" in str(path)]
+    monkeypatch.undo()
+    assert not list(manifest.damage(tmp_path / "set.zarr"))
+    assert verify(tmp_path / "set.zarr").good
+
+
+def test_parts_that_cannot_be_made_are_refused(tmp_path, recipe, monkeypatch):
+    out = tmp_path / "set.zarr"
+    with pytest.raises(FileNotFoundError):
+        make_part(out, (1, 2))
+    begin(recipe, out)
+    for part in ((0, 2), (3, 2)):
+        with pytest.raises(ValueError, match="must be an integer"):
+            make_part(out, part)
+    with pytest.raises(FileExistsError, match="exists already"):
+        begin(recipe, out)
+    monkeypatch.setattr("mars_lidar.dataset.run.fingerprint", lambda: "other")
+    with pytest.raises(ValueError, match="draws other counts"):
+        make_part(out, (1, 2))

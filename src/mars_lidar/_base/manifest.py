@@ -30,16 +30,21 @@ SUM = "manifest_sha256"  # attribute of the root document: the the sum over the 
 _THREADS = 4  # hashing runs without Python's lock
 
 
-def seal(store: Path, attrs: dict[str, Any]) -> None:
-    """Put these attributes into the root document, with a manifest of everything as it is then."""
+def seal(store: Path, attrs: dict[str, Any], digests: Mapping[str, str] | None = None) -> None:
+    """Put these attributes into the root document, with a manifest of everything as it is then.
+
+    Files whose `digests` (SHA-256) are given are not read again.
+    """
     document = json.loads((store / _ROOT).read_bytes())
     document["attributes"].update(attrs | {"manifest": NAME})
     for name in document.get("consolidated_metadata", {}).get("metadata", {}):
         if not (store / name / _ROOT).is_file():
             raise FileNotFoundError(f"{store / name / _ROOT} was taken away while the store was written")
     names = sorted(_files(store) - {_ROOT, NAME})
+    told = {name: digests[name] for name in names if name in digests} if digests else {}
+    others = [name for name in names if name not in told]
     with ThreadPoolExecutor(_THREADS) as pool:
-        told = dict(zip(names, pool.map(lambda name: _hash(store / name), names), strict=True))
+        told.update(zip(others, pool.map(lambda name: _hash(store / name), others), strict=True))
     document["attributes"][SUM] = _sum(told)
     root = json.dumps(document, indent=2).encode()
     told[_ROOT] = hashlib.sha256(root).hexdigest()

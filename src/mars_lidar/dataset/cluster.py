@@ -9,7 +9,6 @@ given to another one: its files appear by a rename, so half a part does not exis
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import logging
 import math
 import os
@@ -27,12 +26,7 @@ from typing import Any
 from mars_lidar._base.optional import needed
 from mars_lidar._version import __version__
 from mars_lidar.dataset.store import Dataset, Item, open_dataset
-from mars_lidar.dataset.write import Failed, Made, Maker
-from mars_lidar.instrument.detector import Detector
-from mars_lidar.instrument.pulse import GaussianPulse
-from mars_lidar.instrument.system import System
-from mars_lidar.light.flux import Flux
-from mars_lidar.simulate import simulate
+from mars_lidar.dataset.write import Failed, Made, Maker, fingerprint
 
 _LIBRARY = "distributed", "making parts by workers", "cluster"
 _AHEAD = 3  # tasks given out per worker thread: none waits for the scheduler, and a million are not queued at once
@@ -145,20 +139,6 @@ def _silent() -> Iterator[None]:
         yield
     finally:
         logger.setLevel(before)
-
-
-def fingerprint() -> str:
-    """Hash of a small exact cube: the same wherever the package draws the same bits."""
-    system = System(
-        period_ns=100.0,
-        cycles=50,
-        bins=16,
-        pulse=GaussianPulse(sigma_ns=2.0),
-        detector=Detector(dead_time_ns=40.0),
-    )
-    flux = Flux([[0.1, 1.0, 5.0, 0.0]], [[0.3, 0.1, 0.0, 2.0]], [[10.0, 50.0, 90.0, 0.0]])
-    counts = simulate(flux, system, realizations=2, seed=1, threads=1)
-    return hashlib.sha256(counts.astype("<u4").tobytes()).hexdigest()[:16]
 
 
 def make_parts(run: Run, items: Sequence[Item]) -> list[Made | Failed]:

@@ -25,6 +25,7 @@ from mars_lidar.dataset.arrays import (
 from mars_lidar.dataset.recipe import DatasetRecipe
 from mars_lidar.dataset.scenes import SceneWriter
 from mars_lidar.dataset.sources import candidates, scenes, seed_of
+from mars_lidar.dataset.write import fingerprint
 from mars_lidar.io.layout import Variable
 from mars_lidar.io.scan import Problem
 from mars_lidar.io.zarr_store import add
@@ -69,6 +70,7 @@ def begin(path: Path, recipe: DatasetRecipe) -> Any:
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
         "version": __version__,
+        "bits": fingerprint(),
         "recipe": recipe.to_json(),
     }
     return zarr.create_group(path, zarr_format=3, attributes=attrs)

@@ -6,6 +6,7 @@ as the packing. Here a chunk is packed while it is still in the processor's cach
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -61,17 +62,24 @@ def is_good(data: bytes) -> bool:
     return int(value(data[:-4])).to_bytes(4, "little") == data[-4:]
 
 
-def write_shard(path: Path, chunks: Iterator[bytes | None]) -> None:
-    """Write the chunks of a shard, in C order, None for those beyond the array; the file appears by a rename."""
+def write_shard(path: Path, chunks: Iterator[bytes | None]) -> tuple[int, str]:
+    """Write the chunks of a shard, in C order, None for those beyond the array; the file appears by a rename.
+
+    Returns its size and its SHA-256.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     places: list[int] = []
-    offset = 0
+    offset, digest = 0, hashlib.sha256()
     with replacing(path) as stream:
         for data in chunks:
             if data is None:
                 places += [_NONE, _NONE]
                 continue
             stream.write(data)
+            digest.update(data)
             places += [offset, len(data)]
             offset += len(data)
-        stream.write(with_sum(np.array(places, "<u8").tobytes()))
+        index = with_sum(np.array(places, "<u8").tobytes())
+        stream.write(index)
+        digest.update(index)
+    return offset + len(index), digest.hexdigest()

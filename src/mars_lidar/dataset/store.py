@@ -15,7 +15,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
+import shutil
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -160,15 +161,22 @@ class Dataset:
         names = ("histogram",) if item.kind == "histogram" else tuple(MAPS)
         return [self.path.joinpath(name, "c", *map(str, item.shard)) for name in names]
 
-    def missing(self) -> list[Item]:
-        """Parts that are not there, or whose files were cut short."""
+    def missing(self, items: Iterable[Item] | None = None) -> list[Item]:
+        """Those of some parts, or of all, that are not there, or whose files were cut short."""
+        noted = self.written()
 
         def whole(item: Item) -> bool:
             array = self.histogram if item.kind == "histogram" else self.maps["depth"]
             chunks = math.prod(n // step for n, step in zip(array.shards, array.chunks, strict=True))
-            return all(file.is_file() and _whole(file, chunks) for file in self.files(item))
+            for file in self.files(item):
+                if not file.is_file():
+                    return False
+                size, _ = noted.get(file.relative_to(self.path).as_posix(), (-1, ""))
+                if file.stat().st_size != size and not _whole(file, chunks):
+                    return False
+            return True
 
-        return [item for item in self.items() if not whole(item)]
+        return [item for item in (self.items() if items is None else items) if not whole(item)]
 
     def gone(self) -> list[Path]:
         """Files that are not there."""
@@ -194,6 +202,21 @@ class Dataset:
         assert self.sums is not None, "incomplete stores are not read by name"
         return self.sums.read(name)
 
+    @property
+    def digests(self) -> Path:
+        """Folder of the lines that writers append while the store is incomplete: SHA-256, size and name of a file."""
+        return self.path / "histogram" / "digests"  # Zarr looks at all else in a group, but not in an array
+
+    def written(self) -> dict[str, tuple[int, str]]:
+        """Size and SHA-256 of files by name, as their writers noted them."""
+        noted: dict[str, tuple[int, str]] = {}
+        for file in sorted(self.digests.glob("*.txt")):
+            for line in file.read_text("utf-8").splitlines():
+                digest, size, name = (*line.split(" ", 2), "", "")[:3]
+                if name and size.isdecimal() and len(digest) == 64:  # the last line of a killed writer may be cut
+                    noted[name] = int(size), digest
+        return noted
+
     def tidy(self) -> None:
         """Remove what a writer that was killed left behind: files that were not renamed yet."""
         for name in ("", "histogram", *MAPS):
@@ -207,8 +230,14 @@ class Dataset:
             raise FileNotFoundError(f"{gone[0]} was taken away while the others were made, the first of {len(gone)}")
         if "consolidated_metadata" not in manifest.root_document(self.path):  # stopped just before it
             mark(self.group, {})
-        manifest.seal(self.path, {"stage": "done", "complete": True})
+        digests = {name: digest for name, (size, digest) in self.written().items() if _has_size(self.path / name, size)}
+        shutil.rmtree(self.digests, ignore_errors=True)
+        manifest.seal(self.path, {"stage": "done", "complete": True}, digests)
         self.attrs = manifest.root_document(self.path)["attributes"]
+
+
+def _has_size(file: Path, size: int) -> bool:
+    return file.is_file() and file.stat().st_size == size
 
 
 def _whole(file: Path, chunks: int) -> bool:

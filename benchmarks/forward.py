@@ -53,7 +53,7 @@ def _rows(section: Section, bins: int, config: Config, bandwidth: Bandwidth) -> 
         "histogram_log_likelihood": (lambda *x: histogram_log_likelihood(counts, *x, system), torch.float32),
     }
     cases: dict[str, Callable[[], object]] = {
-        "mean_histogram": lambda: ml.statistics.mean_histogram(s, b, system, delay_ns=tau, threads=1)
+        "mean_histogram": lambda: ml.statistics.mean_histogram(ml.Flux(s, b, tau), system, threads=1)
     }
     for name, (model, dtype) in models.items():
         at = [torch.tensor(one, dtype=dtype) for one in (s, b, tau)]

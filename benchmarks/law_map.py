@@ -122,12 +122,11 @@ def draw(seed: int) -> Drawn:
 def laws(drawn: Drawn) -> dict[str, Callable[[Values], Values]]:
     """Each law of a system: from the figures so far to more of them."""
     system = drawn.system()
-    pixel: dict[str, Any] = {"delay_ns": drawn.delay * PERIOD_NS}
-    flux = drawn.signal, drawn.background
+    flux = ml.Flux(drawn.signal, drawn.background, drawn.delay * PERIOD_NS)
     held: dict[str, Any] = {}
 
     def count(_: Values) -> Values:
-        law = held["law"] = ml.count_law(*flux, system, threads=1, **pixel)
+        law = held["law"] = ml.count_law(flux, system, threads=1)
         return {"mean": float(law.mean), "variance": float(law.variance)}
 
     def pmf(_: Values) -> Values:
@@ -144,18 +143,18 @@ def laws(drawn: Drawn) -> dict[str, Callable[[Values], Values]]:
 
     def shape(method: str) -> Callable[[Values], Values]:
         def of(_: Values) -> Values:
-            pdf = ml.registration_pdf(*flux, system, method=method, threads=1, **pixel)  # type: ignore[arg-type]
+            pdf = ml.registration_pdf(flux, system, method=method, threads=1)  # type: ignore[arg-type]
             held[method] = pdf
             return {f"{method} sum": float(pdf.sum()), f"{method} least": float(pdf.min())}
 
         return of
 
     def histogram(_: Values) -> Values:
-        mean = ml.statistics.mean_histogram(*flux, system, threads=1, **pixel)
+        mean = ml.statistics.mean_histogram(flux, system, threads=1)
         return {"histogram total": float(mean.sum()), "histogram least": float(mean.min())}
 
     def joint(_: Values) -> Values:
-        law = held["joint"] = ml.joint_law(*flux, system, **pixel)
+        law = held["joint"] = ml.joint_law(flux, system)
         return {"joint mean": law.count_mean}
 
     def window(_: Values) -> Values:

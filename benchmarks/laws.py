@@ -12,6 +12,7 @@ from benchmarks.floor import Bandwidth
 from benchmarks.report import Goal, Row, Section
 from benchmarks.timing import Timing, in_turn
 from benchmarks.workload import PERIOD_NS, system
+from mars_lidar import Flux
 from mars_lidar.statistics.cells import Cells, photons_per_bin
 from mars_lidar.statistics.chain import PhaseChain
 from mars_lidar.statistics.count_pmf import guessed_windows
@@ -29,10 +30,10 @@ def exposure_laws(config: Config, bandwidth: Bandwidth) -> Section:
     instrument, every = system(config), config.threads
     random = np.random.default_rng(3)
     signal, background = 10.0 ** random.uniform(-2.0, 1.0, (2, 32))
-    grid = _table_entries(config.table_entries)
+    flux, grid = Flux(signal, background, 0.5 * instrument.period_ns), _table_entries(config.table_entries)
 
     def pmf() -> object:
-        return count_law(signal, background, instrument, method="exact", threads=1).pmf
+        return count_law(flux, instrument, method="exact", threads=1).pmf
 
     narrow = Cells.of(10.0 ** random.uniform(0.3, 1.0, 64), 10.0 ** random.uniform(-2.0, 0.0, 64), instrument)
     known = refined_moments(narrow, 1, tolerance=1e-4, threads=1)
@@ -41,7 +42,7 @@ def exposure_laws(config: Config, bandwidth: Bandwidth) -> Section:
         "moments and mean histogram": (
             signal.size,
             1,
-            lambda: exposure_moments(signal, background, instrument, threads=1),
+            lambda: exposure_moments(flux, instrument, threads=1),
         ),
         "count pmf": (signal.size, 1, pmf),
         "count pmf of a bright pixel, cumulants from a table": (
@@ -52,7 +53,7 @@ def exposure_laws(config: Config, bandwidth: Bandwidth) -> Section:
         "table entries, moments and shapes": (
             grid.shape[1],
             every,
-            lambda: exposure_moments(*grid, instrument, threads=every),
+            lambda: exposure_moments(Flux(*grid, 0.5 * instrument.period_ns), instrument, threads=every),
         ),
     }
     times = in_turn({name: case for name, (_, _, case) in cases.items()}, config)
@@ -107,7 +108,7 @@ def dense_stationary(chain: PhaseChain) -> NDArray[np.float64]:
 
 def _chain(config: Config, bins: int) -> PhaseChain:
     instrument = system(config)
-    photons = photons_per_bin(_SIGNAL, _BACKGROUND, instrument, delay_ns=0.5 * PERIOD_NS, bins=bins)
+    photons = photons_per_bin(Flux(_SIGNAL, _BACKGROUND, 0.5 * PERIOD_NS), instrument, bins=bins)
     return PhaseChain(photons, instrument.dead_time_periods)
 
 

@@ -87,9 +87,17 @@ html_title = f"mars-lidar {version}"
 html_favicon = "_static/favicon.svg"
 html_static_path = ["_static", "copied/static"]
 html_css_files = ["katex/katex.min.css", "site.css"]
+WITH_CONTENTS = (
+    "*",
+    "api/*",
+    "copied/*",
+    "copied/*/*",
+    "results/*",
+    "studies/*",
+)  # not the programs, which need the width
 html_theme_options = {
     "show_prev_next": False,
-    "secondary_sidebar_items": {"**": ["page-toc"], "gallery/*": [], "lessons/*": []},  # programs need the width
+    "secondary_sidebar_items": {pages: ["page-toc"] for pages in WITH_CONTENTS},
     "navbar_align": "left",
     "header_links_before_dropdown": 8,
     "footer_start": ["copyright"],
@@ -97,6 +105,7 @@ html_theme_options = {
     "show_toc_level": 2,
 }
 html_show_sourcelink = False
+html_search_scorer = str(ROOT / "docs" / "_static" / "scorer.js")
 html_sidebars = {
     page: [] for page in ("start", "seven_pictures", "explorer", "coming_from")
 }  # pages without pages below them

@@ -31,9 +31,8 @@ def main() -> None:
     cube = ml.simulate(flux, system, seed=0)[0]
     found = ml.reconstruct(cube, system)
     row, column = PIXEL
-    signal, background, delay_ns = flux.signal[PIXEL], flux.background[PIXEL], flux.delay_ns[PIXEL]
-    light = ml.statistics.photons_per_bin(signal, background, system, bins=512, delay_ns=delay_ns)
-    mean = ml.statistics.mean_histogram(signal, background, system, delay_ns=delay_ns)
+    light = ml.statistics.photons_per_bin(flux[PIXEL], system, bins=512)
+    mean = ml.statistics.mean_histogram(flux[PIXEL], system)
 
     fig, axes = plt.subplot_mosaic([["counts", "depth"], ["histogram", "histogram"]], figsize=(7.2, 6.0))
     for name, values, title in (("counts", cube.sum(-1), "counts"), ("depth", found.depth_m, "depth from them (m)")):

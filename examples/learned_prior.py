@@ -128,7 +128,7 @@ def compared(denoiser, name, seed, size=SIZE, steps=100):
         rows.append((method, _rms(depth), _rms(depth[~far]), depth.median(), 100.0 * far.float().mean(), _rms(signal)))
         shown[method] = found
     signal, background, delay_ns = light[0].double().numpy()
-    bound = ml.cramer_rao(signal, background, SYSTEM, delay_ns=delay_ns)
+    bound = ml.cramer_rao(ml.Flux(signal, background, delay_ns), SYSTEM)
     least = [_rms(torch.from_numpy(one)) for one in (bound.depth_m, bound.signal / signal.mean())]
     rows.append(("Cramer-Rao bound of a pixel alone", least[0], "-", "-", "-", least[1]))
     return rows, shown

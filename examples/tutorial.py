@@ -42,13 +42,12 @@ ml.plot.map_image(counts[0].sum(-1), "registrations")
 
 # %%
 y, x = 20, 30
-light = {"signal": flux.signal[y, x], "background": flux.background[y, x], "delay_ns": flux.delay_ns[y, x]}
-law = ml.count_law(system=system, **light)
+law = ml.count_law(flux[y, x], system)
 print(f"drawn {counts[0, y, x].sum()}, expected {law.mean:.1f} ± {np.sqrt(law.variance):.1f}")
 law
 
 # %%
-ml.joint_law(system=system, **light)
+ml.joint_law(flux[y, x], system)
 
 # %% [markdown]
 # **Reconstruct**, and compare with the truth.

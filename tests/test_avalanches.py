@@ -306,7 +306,7 @@ def test_what_has_no_law_says_so(name: str):
     told = f"does not do {name}.*'exact' or 'sequential'"
     for law in ("count_law", "exposure_moments", "joint_law", "mean_histogram", "registration_pdf"):
         with pytest.raises(ValueError, match=told):
-            getattr(statistics, law)(1.0, 1.0, system)
+            getattr(statistics, law)(ml.Flux(1.0, 1.0, 50.0), system)
     for engine in ("mars", "renewal", "feedback", "auto"):
         with pytest.raises(ValueError, match=f"engine '{engine}' {told}"):
             ml.simulate(flux_of(1.0, 1.0), system, engine=engine)

@@ -24,7 +24,7 @@ from harness import (
 )
 from scipy import stats
 
-from mars_lidar import Detector, GaussianPulse, SampledPulse, System
+from mars_lidar import Detector, Flux, GaussianPulse, SampledPulse, System
 from mars_lidar.engines import ENGINES
 from mars_lidar.instrument.detector import MODES
 from mars_lidar.statistics import count_law, exposure_moments
@@ -266,8 +266,8 @@ def test_a_gate_that_is_always_open_changes_nothing(engine: str, dead: float, st
     items = 1000 if engine == "sequential" and start == "stationary" else 4000
     case = pulsed(1.5, 0.5, gate(0.4, 1.0, dead), start=start, items=items, cycles=104)
     free = case.system.replace(detector=Detector(dead_time_ns=dead * PERIOD_NS))
-    law = count_law(1.5, 0.5, free, delay_ns=37.0)
+    law = count_law(Flux(1.5, 0.5, 37.0), free)
     pmf = np.zeros(law.support[-1] + 1)
     pmf[law.support] = law.pmf
-    histogram = exposure_moments(1.5, 0.5, free, delay_ns=37.0).histogram
+    histogram = exposure_moments(Flux(1.5, 0.5, 37.0), free).histogram
     check(ENGINES[engine], case, Law(histogram, pmf), {COUNTS, SHAPE})

@@ -112,11 +112,9 @@ def test_locked_and_narrow(name: str, engine: str) -> None:
 
 def _law(case: Case) -> Law:
     """Exact law of the count and mean histogram of the case's pixel."""
-    flux, light = case.flux, {"delay_ns": float(case.flux.delay_ns[0, 0]), "system": case.system}
-    signal, background = float(flux.signal[0, 0]), float(flux.background[0, 0])
-    law = ml.count_law(signal, background, **light)
+    law = ml.count_law(case.flux[0, 0], case.system)
     pmf = np.concatenate([np.zeros(law.support[0]), law.pmf])
-    return Law(ml.statistics.mean_histogram(signal, background, **light), pmf)
+    return Law(ml.statistics.mean_histogram(case.flux[0, 0], case.system), pmf)
 
 
 def _spikes(parts: int, at: dict[int, float]) -> np.ndarray:
@@ -256,13 +254,13 @@ def test_laws_answer_or_say_what_to_use(name: str, prediction: str) -> None:
     """Numbers, or a refusal with words that help."""
     signal, background, dead, sigma, bins, cycles, start = LAWS[name]
     system = _system(dead, sigma, bins, cycles, start)
-    light: dict[str, Any] = {"delay_ns": 0.4 * PERIOD_NS}
+    flux = ml.Flux(signal, background, 0.4 * PERIOD_NS)
     asked: dict[str, Callable[[], Any]] = {
-        "count_law": lambda: ml.count_law(signal, background, system, **light).variance,
-        "pmf": lambda: ml.count_law(signal, background, system, **light).pmf,
-        "mean_histogram": lambda: ml.statistics.mean_histogram(signal, background, system, **light),
-        "stationary": lambda: ml.registration_pdf(signal, background, system, "stationary", **light),
-        "joint_law": lambda: ml.joint_law(signal, background, system, **light).count_variance,
+        "count_law": lambda: ml.count_law(flux, system).variance,
+        "pmf": lambda: ml.count_law(flux, system).pmf,
+        "mean_histogram": lambda: ml.statistics.mean_histogram(flux, system),
+        "stationary": lambda: ml.registration_pdf(flux, system, "stationary"),
+        "joint_law": lambda: ml.joint_law(flux, system).count_variance,
     }
     words = ""
     try:
@@ -276,13 +274,13 @@ def test_laws_answer_or_say_what_to_use(name: str, prediction: str) -> None:
 def test_shape_of_the_narrowest_pulse_on_an_edge() -> None:
     """sigma of a millionth of a period, on a bin's edge: t_d = t_r leaves the shape of the light."""
     system = _system(1.0, 1e-6, 2, 1000)
-    shape = ml.registration_pdf(1.0, 1e-6, system, "stationary", delay_ns=0.0)
+    shape = ml.registration_pdf(ml.Flux(1.0, 1e-6, 0.0), system, "stationary")
     assert shape == pytest.approx([0.5, 0.5], abs=1e-3)
 
 
 def test_shape_of_a_very_narrow_pulse_on_an_edge() -> None:
     """Right from ten millionths of a period on."""
-    shape = ml.registration_pdf(1.0, 1e-6, _system(1.0, 1e-5, 2, 1000), "stationary", delay_ns=0.0)
+    shape = ml.registration_pdf(ml.Flux(1.0, 1e-6, 0.0), _system(1.0, 1e-5, 2, 1000), "stationary")
     assert shape == pytest.approx([0.5, 0.5], abs=1e-3)
 
 
@@ -290,8 +288,8 @@ def test_shape_of_a_very_narrow_pulse_on_an_edge() -> None:
 def test_sum_of_a_paralyzable_histogram_with_steps(number: int) -> None:
     """A sampled pulse with a pre-pulse: the mean histogram sums to the mean count, to the tolerance asked for."""
     pixel = draw(20_261_122, number)
-    law = ml.count_law(system=pixel.system, tolerance=1e-6, **pixel.light())
-    total = ml.statistics.mean_histogram(system=pixel.system, tolerance=1e-6, **pixel.light()).sum()
+    law = ml.count_law(pixel.flux()[0, 0], pixel.system, tolerance=1e-6)
+    total = ml.statistics.mean_histogram(pixel.flux()[0, 0], pixel.system, tolerance=1e-6).sum()
     assert total == pytest.approx(float(law.mean), rel=1e-7)
 
 
@@ -309,7 +307,7 @@ def test_bound_of_two_bins() -> None:
         (0.0223, 1.6e-6, 1.0, 5.6e-4, 1),
         (3.798, 4.0805, 4.947, 0.00988, 215),
     ):
-        bound = ml.cramer_rao(signal, background, _system(dead, sigma, 2, cycles), delay_ns=30.0)
+        bound = ml.cramer_rao(ml.Flux(signal, background, 30.0), _system(dead, sigma, 2, cycles))
         for error in (bound.signal, bound.background, bound.delay_ns):
             assert not np.isnan(error)
             assert error > 0.0
@@ -334,9 +332,9 @@ def test_the_simulator_of_the_sweep(mode: Any, start: Any, dead: float, more: di
     )
     pixel = Pixel("by hand", "any", system, (1.5,), (0.4,), 0.7)
     cube = simulator.counts(pixel, 4000, seed=21)
-    law = ml.count_law(system=system, **pixel.light())
+    law = ml.count_law(pixel.flux()[0, 0], system)
     pmf = np.concatenate([np.zeros(law.support[0]), law.pmf])
-    mean = ml.statistics.mean_histogram(system=system, **pixel.light())
+    mean = ml.statistics.mean_histogram(pixel.flux()[0, 0], system)
     z = variance_score(cube.sum(1), law.variance)
     often = mean * len(cube) > 100
     bins = (cube.mean(0) - mean)[often] / np.sqrt(cube.var(0)[often] / len(cube))

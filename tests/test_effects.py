@@ -113,7 +113,10 @@ def test_efficiency_and_dark_counts_are_a_flux(engine: str):
     assert np.allclose(flux.signal, 0.72)
     whole = ml.simulate(case.flux, case.system, engine=engine, seed=5, threads=1)
     assert np.array_equal(whole, ml.simulate(flux, system, engine=engine, seed=5, threads=1))
-    means = ml.count_law(1.2, 0.8, case.system).mean, ml.count_law(0.72, 0.68, system).mean
+    means = (
+        ml.count_law(ml.Flux(1.2, 0.8, 0.5 * case.system.period_ns), case.system).mean,
+        ml.count_law(ml.Flux(0.72, 0.68, 0.5 * system.period_ns), system).mean,
+    )
     assert means[0] == pytest.approx(means[1], rel=1e-12)
 
 
@@ -190,7 +193,7 @@ def test_jitter_has_its_law_and_moves_nothing_else(engine: str, jitter: Jitter |
 )
 def test_mean_histogram_of_records(effects: dict[str, Any], mode: str):
     case = case_of(pixel(effects, mode), 20_000)
-    expected = mean_histogram(1.2, 0.8, case.system, delay_ns=37.0)
+    expected = mean_histogram(ml.Flux(1.2, 0.8, 37.0), case.system)
     assert expected[2::8].max() == 0.0 or "code_density" not in effects  # the missing code
     check(ENGINES["exact"], case, Law(histogram=expected), {SHAPE})
 
@@ -202,7 +205,7 @@ def test_mean_histogram_of_records(effects: dict[str, Any], mode: str):
 def test_electronics_dead_time_statistics(dead: float, electronics: float, start: str, cycles: int):
     detector = pixel({"electronics_dead_time_ns": electronics}, dead=dead)
     case = case_of(detector, 20_000, start=start, cycles=cycles)
-    found = electronics_moments(1.2, 0.8, case.system, delay_ns=37.0)
+    found = electronics_moments(ml.Flux(1.2, 0.8, 37.0), case.system)
     law = Law(histogram=found.histogram, count_moments=(float(found.mean), float(found.variance)))
     check(ENGINES["exact"], case, law, {COUNTS, SHAPE})
 
@@ -211,7 +214,7 @@ def test_electronics_dead_time_in_bins_narrower_than_the_pulse():
     """Cells of the kernel are wider than these bins, which the pulse fills unevenly."""
     detector = pixel({"electronics_dead_time_ns": 130.0}, dead=45.0)
     case = case_of(detector, 20_000, cycles=120, bins=320)
-    found = electronics_moments(1.2, 0.8, case.system, delay_ns=37.0)
+    found = electronics_moments(ml.Flux(1.2, 0.8, 37.0), case.system)
     assert found.bins < 320
     check(ENGINES["exact"], case, Law(histogram=found.histogram), {SHAPE})
 
@@ -221,7 +224,7 @@ def test_electronics_dead_time_of_an_undisturbed_pixel_in_the_long_run():
     means = []
     for cycles in (200, 400, 800):
         system = case_of(pixel({"electronics_dead_time_ns": 83.0}), cycles=cycles).system
-        found = electronics_moments(1.2, 0.8, system, tolerance=0.05)
+        found = electronics_moments(ml.Flux(1.2, 0.8, 0.5 * system.period_ns), system, tolerance=0.05)
         means.append((float(found.mean), float(found.variance)))
         assert found.histogram.sum() == pytest.approx(found.mean)
     steps = np.diff(means, axis=0)
@@ -241,13 +244,16 @@ def test_joint_law_of_records(effects: dict[str, Any]):
 
 def test_mars_draws_jittered_records():
     case = case_of(pixel({"jitter": TAIL}), 6000)
-    law = Law(histogram=mean_histogram(1.2, 0.8, case.system, delay_ns=37.0))
+    law = Law(histogram=mean_histogram(ml.Flux(1.2, 0.8, 37.0), case.system))
     check(ENGINES["mars"], case, law, {SHAPE})
 
 
 def test_jitter_leaves_the_count_law_alone():
     plain, moved = (case_of(pixel(effects)).system for effects in ({}, {"jitter": TAIL, "code_density": CODES}))
-    assert ml.count_law(1.2, 0.8, plain).mean == ml.count_law(1.2, 0.8, moved).mean
+    assert (
+        ml.count_law(ml.Flux(1.2, 0.8, 0.5 * plain.period_ns), plain).mean
+        == ml.count_law(ml.Flux(1.2, 0.8, 0.5 * moved.period_ns), moved).mean
+    )
 
 
 @pytest.mark.parametrize("name", EACH)

@@ -88,15 +88,15 @@ def test_engines_refuse_what_they_do_not_do(engine, name):
 def test_statistics_refuse_what_they_do_not_know(name):
     one = system(REAL.without(*(other for other in EFFECTS if other != name)))
     with pytest.raises(ValueError, match=f"does not do {name} of the detector.*simulate it with engine 'exact'"):
-        ml.holding_time_covariance(1.0, 0.5, one)
+        ml.holding_time_covariance(ml.Flux(1.0, 0.5, 50.0), one)
     if name not in TIMING_EFFECTS:
         with pytest.raises(ValueError, match=f"joint_law.*{name}"):
-            ml.joint_law(1.0, 0.5, one)
+            ml.joint_law(ml.Flux(1.0, 0.5, 50.0), one)
         with pytest.raises(ValueError, match=f"exposure_moments.*{name}"):
-            ml.statistics.exposure_moments(1.0, 0.5, one)
+            ml.statistics.exposure_moments(ml.Flux(1.0, 0.5, 50.0), one)
         if name != "electronics_dead_time_ns":
             with pytest.raises(ValueError, match=f"count_law.*{name}"):
-                ml.count_law(1.0, 0.5, one)
+                ml.count_law(ml.Flux(1.0, 0.5, 50.0), one)
     with pytest.raises(ValueError, match=f"a table does not do {name}"):
         ml.Table.build(one, [0.5, 1.0], [0.5, 1.0])
 
@@ -104,9 +104,9 @@ def test_statistics_refuse_what_they_do_not_know(name):
 def test_electronics_dead_time_has_statistics_for_some_modes_only():
     gated = Detector(dead_time_ns=20.0, electronics_dead_time_ns=60.0, mode="paralyzable")
     with pytest.raises(ValueError, match="count_law of method 'exact' does not do electronics_dead_time_ns"):
-        ml.count_law(1.0, 0.5, system(gated))
+        ml.count_law(ml.Flux(1.0, 0.5, 50.0), system(gated))
     with pytest.raises(ValueError, match="mean_histogram does not do electronics_dead_time_ns"):
-        ml.statistics.mean_histogram(1.0, 0.5, system(gated))
+        ml.statistics.mean_histogram(ml.Flux(1.0, 0.5, 50.0), system(gated))
     alike = Detector(dead_time_ns=60.0, electronics_dead_time_ns=60.0)
     assert alike.effects == ()  # registrations are that far apart anyway
 

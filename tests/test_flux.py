@@ -10,9 +10,10 @@ import mars_lidar as ml
 
 def test_scalars_are_one_pixel():
     flux = ml.Flux(0.5, 0.2, 30.0)
-    assert flux.shape == (1, 1)
-    assert flux.signal.shape == flux.background.shape == flux.delay_ns.shape == (1, 1)
-    assert flux.returns_signal.shape == flux.returns_delay_ns.shape == (1, 1, 1)
+    assert flux.shape == flux.signal.shape == flux.background.shape == flux.delay_ns.shape == ()
+    assert flux.returns_signal.shape == flux.returns_delay_ns.shape == (1,)
+    assert flux.image.shape == (1, 1)
+    assert flux.image.returns_signal.shape == (1, 1, 1)
     assert flux.total.item() == pytest.approx(0.7)
     assert flux.waveform is None
 
@@ -23,8 +24,9 @@ def test_broadcasting():
     assert flux.signal[1].tolist() == [1.0, 1.0, 1.0]
     assert flux.background[:, 2].tolist() == [0.3, 0.3]
     assert np.all(flux.delay_ns == 7.0)
-    row = ml.Flux([0.5, 1.0], 0.1, 7.0)  # a line is one row
-    assert row.shape == (1, 2)
+    row = ml.Flux([0.5, 1.0], 0.1, 7.0)
+    assert row.shape == (2,)
+    assert row.image.shape == (1, 2)
 
 
 def test_background_alone_needs_no_delay():
@@ -56,11 +58,12 @@ def test_any_real_type(dtype: type):
 
 def test_waveform():
     flux = ml.Flux(waveform=[0.0, 0.5, 0.25], background=0.1)
-    assert flux.shape == (1, 1)
-    assert flux.waveform.shape == (1, 1, 3)
+    assert flux.shape == ()
+    assert flux.waveform.shape == (3,)
+    assert flux.image.waveform.shape == (1, 1, 3)
     assert flux.signal.item() == 0.75
     assert np.isnan(flux.delay_ns.item())
-    assert flux.returns_signal.shape == (0, 1, 1)
+    assert flux.returns_signal.shape == (0,)
     image = ml.Flux(waveform=np.ones((2, 3, 5)), background=[[0.1, 0.2, 0.3]])
     assert image.shape == (2, 3)
     assert image.background.shape == (2, 3)
@@ -92,29 +95,27 @@ def test_multi_adds_waveforms():
 @pytest.mark.parametrize(
     ("key", "shape"),
     [
-        (0, (1, 3)),
-        (-1, (1, 3)),
-        ((1, 2), (1, 1)),
-        ((1, -1), (1, 1)),
+        (0, (3,)),
+        (-1, (3,)),
+        ((1, 2), ()),
+        ((1, -1), ()),
         (slice(0, 1), (1, 3)),
-        ((slice(None), 1), (2, 1)),
+        ((slice(None), 1), (2,)),
         ((slice(None), slice(None, None, 2)), (2, 2)),
         ((slice(None, None, -1),), (2, 3)),
     ],
 )
 @pytest.mark.parametrize("kind", ["returns", "waveform"])
-def test_parts_are_images(key, shape: tuple[int, int], kind: str):
-    """Integers keep their axis."""
+def test_parts(key, shape: tuple[int, ...], kind: str):
+    """Integers take their axis away, as in an array."""
     maps = np.arange(6.0).reshape(2, 3)
     flux = ml.Flux.multi(ml.Flux(maps, 0.1 * maps, maps), ml.Flux(2 * maps, 0.0, -maps))
     if kind == "waveform":
         flux = ml.Flux(waveform=maps[..., None] * np.ones(4), background=0.1 * maps)
     part = flux[key]
     assert part.shape == shape
-    keys = key if isinstance(key, tuple) else (key,)
-    window = tuple([k] if isinstance(k, int) else k for k in keys)
-    assert np.array_equal(part.signal, flux.signal[window].reshape(shape))
-    assert np.array_equal(part.background, flux.background[window].reshape(shape))
+    assert np.array_equal(part.signal, flux.signal[key])
+    assert np.array_equal(part.background, flux.background[key])
     if kind == "waveform":
         assert part.waveform.shape == (*shape, 4)
     else:
@@ -134,7 +135,7 @@ def test_info_is_the_fluxs_own():
     flux = ml.Flux(1.0, 0.0, 5.0, info=info)
     info["level"] = 2.0
     assert flux.info == {"level": 1.0}
-    assert flux[0].info == {"level": 1.0}
+    assert flux.image[0].info == {"level": 1.0}
     assert ml.Flux(1.0, 0.0, 5.0).info == {}
 
 

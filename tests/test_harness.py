@@ -304,7 +304,7 @@ def test_a_locked_pixel_is_right_and_a_wrong_one_is_found(dead: float, differ: i
         ),
         2000,
     )
-    exact = count_law(0.0, 300.0, locked.system)
+    exact = count_law(Flux(0.0, 300.0), locked.system)
     pmf = np.zeros(exact.support[-1] + 1)
     pmf[exact.support] = exact.pmf
     law = Law(count_pmf=pmf)

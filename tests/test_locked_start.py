@@ -26,10 +26,10 @@ def test_a_locked_pixel_starts_as_the_statistics_say(dead: float, detector: dict
         start="stationary",
         detector=ml.Detector(dead_time_ns=dead * PERIOD_NS, **detector),
     )
-    law = count_law(20.0, 0.05, system, delay_ns=37.0)
+    law = count_law(ml.Flux(20.0, 0.05, 37.0), system)
     pmf = np.zeros(law.support[-1] + 1)
     pmf[law.support] = law.pmf
-    histogram = exposure_moments(20.0, 0.05, system, delay_ns=37.0).histogram
+    histogram = exposure_moments(ml.Flux(20.0, 0.05, 37.0), system).histogram
     case = Case(f"locked, t_d {dead:g}", flux_of(20.0, 0.05, 0.37), system, 80_000)
     check(ENGINES["exact"], case, Law(histogram, pmf), {COUNTS, SHAPE})
 
@@ -40,9 +40,9 @@ def test_the_sequential_engine_begins_in_any_phase_of_a_slow_drift():
     pulse = ml.GaussianPulse(sigma_ns=0.01 * PERIOD_NS)
     detector = ml.Detector(dead_time_ns=PERIOD_NS)
     system = ml.System(period_ns=PERIOD_NS, cycles=12, bins=64, pulse=pulse, start="stationary", detector=detector)
-    law = count_law(200.0, 0.01, system, delay_ns=37.0)
+    law = count_law(ml.Flux(200.0, 0.01, 37.0), system)
     pmf = np.zeros(law.support[-1] + 1)
     pmf[law.support] = law.pmf
-    histogram = exposure_moments(200.0, 0.01, system, delay_ns=37.0).histogram
+    histogram = exposure_moments(ml.Flux(200.0, 0.01, 37.0), system).histogram
     case = Case("drift through a bright pulse", flux_of(200.0, 0.01, 0.37), system, 1000)
     check(ENGINES["sequential"], case, Law(histogram, pmf), {COUNTS})

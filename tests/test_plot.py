@@ -145,7 +145,7 @@ def test_incident_rates_add_up_to_all_photons():
     for name, flux in FLUXES.items():
         rate = plot.incident_rate(flux, SYSTEM, 0, 0)
         assert rate.shape == (SYSTEM.bins,), name
-        assert rate.sum() == pytest.approx(flux.total[0, 0], abs=1e-12), name
+        assert rate.sum() == pytest.approx(flux.image.total[0, 0], abs=1e-12), name
     # Poisson histograms have this mean: chi-square of 128 bins, false alarm 1e-6
     flux = ml.Flux(waveform=np.linspace(0.0, 0.2, 40), background=0.5)
     counts = ml.simulate(flux, SYSTEM, engine="poisson", realizations=200)[:, 0, 0].sum(0)

@@ -257,7 +257,7 @@ def test_a_short_recovery_has_the_law_of_none(engine: str):
     none = case(20.0, 10.0, dead_time_ns=75.0, cycles=30)
     short = case(20.0, 10.0, dead_time_ns=75.0, recovery_ns=1e-4, cycles=30)
     check(ENGINES[engine], short, ENGINES["exact"], EVERYTHING)
-    law = statistics.mean_histogram(20.0, 10.0, none.system, delay_ns=37.0)
+    law = statistics.mean_histogram(ml.Flux(20.0, 10.0, 37.0), none.system)
     sample = draw(ENGINES[engine], short, 9)
     z = (sample.counts.mean() - law.sum()) / (sample.counts.std(ddof=1) / np.sqrt(sample.counts.size))
     require({"mean": float(2 * stats.norm.sf(abs(z)))}, engine)
@@ -286,14 +286,14 @@ def test_what_has_no_law_says_so():
     told = "does not do recovery_ns of the detector, got 5.0.*'exact' or 'sequential'"
     for law in ("count_law", "exposure_moments", "joint_law", "mean_histogram", "registration_pdf"):
         with pytest.raises(ValueError, match=told):
-            getattr(statistics, law)(1.0, 1.0, system)
+            getattr(statistics, law)(ml.Flux(1.0, 1.0, 50.0), system)
     for engine in ("mars", "renewal", "feedback", "auto", "poisson"):
         with pytest.raises(ValueError, match=f"engine '{engine}' {told}"):
             ml.simulate(flux_of(1.0, 1.0), system, engine=engine)
     with pytest.raises(ValueError, match="a table does not do recovery_ns"):
         ml.Table.build(system, [0.5, 1.0], [0.5, 1.0])
     with pytest.raises(ValueError, match="cramer_rao does not do recovery_ns"):
-        ml.cramer_rao(1.0, 1.0, system, delay_ns=37.0)
+        ml.cramer_rao(ml.Flux(1.0, 1.0, 37.0), system)
     both = replace(system.detector, afterpulsing=TRAPS)
     with pytest.raises(ValueError, match="constant_light_rate treats recovery_ns or afterpulsing, not both, got 5 and"):
         statistics.constant_light_rate(1e6, both)

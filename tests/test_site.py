@@ -180,3 +180,16 @@ def test_equations_are_in_the_pages(site: Path):
         assert not re.search(r"\\\\[(\\[]", re.sub(r"<(pre|code|annotation)\b.*?</\1>", "", text, flags=re.DOTALL)), (
             name
         )
+
+
+def test_a_search_finds_lessons_before_reports(site: Path, browser: Any):
+    tab = browser.new_page()
+    for words, first in {"dead+time": "lessons/lesson_3", "pile-up": "lessons/lesson_2"}.items():
+        tab.goto(f"{(site / 'search.html').as_uri()}?q={words}")
+        tab.wait_for_function("document.querySelectorAll('#search-results li a').length > 9", timeout=30_000)
+        links = tab.evaluate(
+            "[...document.querySelectorAll('#search-results li a')].map((a) => a.getAttribute('href'))"
+        )
+        assert links[0].startswith(first)
+        assert not any(re.match(r"(results|studies|copied)/", link) for link in links[:9])
+    tab.close()

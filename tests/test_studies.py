@@ -84,7 +84,9 @@ def test_rules_of_the_covariance_sum():
 @pytest.mark.parametrize("rearm", ["centre", "edge"])
 def test_leading_modes_are_those_of_the_dense_matrix(rearm):
     system = covariance.QUICK.system(100.0, 95.0)
-    dense = ml.statistics.holding_time_covariance(5.0, 0.3, system, bins=256, rearm=rearm)
+    dense = ml.statistics.holding_time_covariance(
+        ml.Flux(5.0, 0.3, 0.5 * system.period_ns), system, bins=256, rearm=rearm
+    )
     leading = modes.LeadingTerms.of(dense)
     size = np.abs(dense.eigenvalues)
     np.testing.assert_allclose(np.abs(leading.eigenvalues[:10]), size[:10], atol=1e-7)
@@ -96,7 +98,9 @@ def test_leading_modes_are_those_of_the_dense_matrix(rearm):
 def test_modes_without_convergence_name_the_cell(monkeypatch):
     monkeypatch.setattr(modes, "_WORST", 0.0)
     system = covariance.QUICK.system(100.0, 30.0)
-    leading = modes.LeadingTerms.of(ml.statistics.holding_time_covariance(1.0, 1.0, system, bins=128))
+    leading = modes.LeadingTerms.of(
+        ml.statistics.holding_time_covariance(ml.Flux(1.0, 1.0, 0.5 * system.period_ns), system, bins=128)
+    )
     assert isinstance(leading.chain, PhaseChain)
     with pytest.raises(ConvergenceError, match=r"S = 1, B = 1 .*eigenvalue 1 has a residual"):
         leading.spectral_sum()
@@ -130,7 +134,9 @@ def test_simulation_of_a_cell_is_keyed_by_the_seed():
     np.testing.assert_array_equal(one.sample.p, other.sample.p)
     assert one.limit == other.limit
     system = settings.system(0.5, 20)
-    assert one.cumulants[0] == pytest.approx(float(count_law(0.5, 0.5, system).mean), rel=1e-9)
+    assert one.cumulants[0] == pytest.approx(
+        float(count_law(ml.Flux(0.5, 0.5, 0.5 * system.period_ns), system).mean), rel=1e-9
+    )
 
 
 def test_edgeworth_constant():

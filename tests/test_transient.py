@@ -74,7 +74,7 @@ def test_the_pulse_is_that_of_a_return():
     expected = SYSTEM.pulse.bin_energy(33.335, 100.0, 10_000)
     # light spread over 0.01 ns instead of a flash: second order, (0.01 / 0.8)^2 / 24 = 6.5e-6
     assert np.abs(flux.waveform[0, 0] - expected).max() < 1e-5 * expected.max()
-    law = ml.count_law(1.0, 0.5, SYSTEM, delay_ns=33.335)
+    law = ml.count_law(ml.Flux(1.0, 0.5, 33.335), SYSTEM)
     counts = ml.simulate(ml.Flux(waveform=flux.waveform, background=0.5), SYSTEM, realizations=4000, seed=1).sum(
         (1, 2, 3)
     )

@@ -126,7 +126,7 @@ def test_dim_and_bright_pixels_against_the_count_law(dead: float):
         system = view(dead, cycles)
         case = Case(f"{photons:g} photons, t_d {dead:g}", waveform_flux(wave), system, 20_000 if dead else 4000)
         if dead:
-            law = ml.count_law(None, 0.0, system, waveform=wave)
+            law = ml.count_law(ml.Flux(waveform=wave), system)
             pmf = np.zeros(int(law.support[-1]) + 1)
             pmf[law.support] = law.pmf
         else:

@@ -35,6 +35,7 @@ SYSTEM = ml.System(
 )
 System = type(SYSTEM)
 FLUX = ml.Flux(np.full((2, 3), 0.5), 0.1, 40.0)
+PIXEL = ml.Flux(0.5, 0.1, 40.0)
 SYNCHRONOUS = SYSTEM.replace(detector=ml.Detector(dead_time_ns=30.0, mode="synchronous"))
 PARALYZABLE = SYSTEM.replace(detector=ml.Detector(dead_time_ns=30.0, mode="paralyzable"))
 calibrate, reconstruction = (importlib.import_module(f"mars_lidar.{name}") for name in ("calibrate", "reconstruct"))
@@ -136,18 +137,18 @@ CALLS: dict[str, Callable[[Path], tuple[Callable[..., Any], dict[str, Any]]]] = 
     "reconstruct": lambda _: (ml.reconstruct, {"cube": counts(), "system": SYSTEM}),
     "cramer_rao": lambda _: (
         ml.cramer_rao,
-        {"signal": 0.5, "background": 0.1, "system": SYSTEM, "delay_ns": 40.0},
+        {"flux": PIXEL, "system": SYSTEM},
     ),
     **{
         call.__name__: lambda _, call=call: (
             call,
-            {"signal": 0.5, "background": 0.1, "system": SYSTEM, "delay_ns": 40.0},
+            {"flux": PIXEL, "system": SYSTEM},
         )
         for call in (ml.count_law, ml.registration_pdf, ml.joint_law)
     },
     "holding_time_covariance": lambda _: (
         ml.holding_time_covariance,
-        {"signal": 0.5, "background": 0.1, "system": SYSTEM, "delay_ns": 40.0},
+        {"flux": PIXEL, "system": SYSTEM},
     ),
     "Table.build": lambda _: (
         ml.Table.build,
@@ -217,7 +218,7 @@ CALLS: dict[str, Callable[[Path], tuple[Callable[..., Any], dict[str, Any]]]] = 
     **{
         f"statistics.{call.__name__}": lambda _, call=call: (
             call,
-            {"signal": 0.5, "background": 0.1, "system": SYSTEM, "delay_ns": 40.0},
+            {"flux": PIXEL, "system": SYSTEM},
         )
         for call in (
             statistics.electronics_moments,
@@ -229,7 +230,7 @@ CALLS: dict[str, Callable[[Path], tuple[Callable[..., Any], dict[str, Any]]]] = 
     },
     "statistics.paralyzable_moments": lambda _: (
         statistics.paralyzable_moments,
-        {"signal": 0.5, "background": 0.1, "system": PARALYZABLE, "delay_ns": 40.0},
+        {"flux": PIXEL, "system": PARALYZABLE},
     ),
     "statistics.PhaseChain": lambda _: (statistics.PhaseChain, {"photons": np.full(8, 0.1), "dead_time": 0.3}),
     "statistics.holding_times": lambda _: (statistics.holding_times, {"chain": chain()}),
@@ -249,16 +250,16 @@ CALLS: dict[str, Callable[[Path], tuple[Callable[..., Any], dict[str, Any]]]] = 
     "reconstruct.mchc_rates": lambda _: (reconstruction.mchc_rates, {"cube": counts(), "system": SYSTEM}),
     "reconstruct.log_likelihood": lambda _: (
         reconstruction.log_likelihood,
-        {"histogram": counts()[0, 0, 0], "system": SYSTEM, "signal": 0.5, "background": 0.1, "delay_ns": 40.0},
+        {"histogram": counts()[0, 0, 0], "flux": PIXEL, "system": SYSTEM},
     ),
     "reconstruct.returns_bound": lambda _: (
         reconstruction.returns_bound,
-        {"signal": (0.5, 0.2), "background": 0.1, "system": SYSTEM, "delay_ns": (40.0, 60.0)},
+        {"flux": ml.Flux.multi(PIXEL, ml.Flux(0.2, 0.0, 60.0)), "system": SYSTEM},
     ),
     "reconstruct.window_weights": lambda _: (reconstruction.window_weights, {"system": SYSTEM, "delay_ns": 40.0}),
     "reconstruct.window_error": lambda _: (
         reconstruction.window_error,
-        {"weights": np.ones(16), "signal": 0.5, "background": 0.1, "system": SYSTEM, "delay_ns": 40.0},
+        {"weights": np.ones(16), "flux": PIXEL, "system": SYSTEM},
     ),
     "plot.count_maps": lambda at: (plot.count_maps, {"cube": io.load(at / "cube.zarr")}),
     "plot.depth_error_m": lambda at: (
@@ -329,9 +330,6 @@ ACCEPTED: dict[tuple[str, str, str], str] = {
     ("System.*", "d*", "*"): "a unit is converted, of an array of any shape; NaN is no return",
     ("*", "delay_ns", "-1"): "light that comes before the pulse comes in the period before: delays are cyclic",
     ("*", "start_ns", "-1"): "times may begin before the pulse",
-    ("cramer_rao", "*", "shape"): "of an image of any shape",
-    ("count_law", "*", "shape"): "of an image of any shape",
-    ("registration_pdf", "*", "shape"): "of an image of any shape",
     ("calibrate", "given", "system"): "a system is what is known of the instrument",
     ("*", "report", "dict"): "a dictionary is what it should be",
     ("*", "info", "dict"): "a dictionary is what it should be",
@@ -339,14 +337,7 @@ ACCEPTED: dict[tuple[str, str, str], str] = {
     ("io.Recipe", "settings", "dict"): "a dictionary is what it should be",
     ("*", "out", "None"): "as if it were not given",
     ("io.Recipe", "depth_m", "None"): "as if it were not given",
-    ("reconstruct.window_error", "delay_ns", "None"): "the pulse in the middle of the period, as of `joint_law`",
-    ("statistics.*", "signal", "shape"): "of an image of any shape",
-    ("statistics.*", "background", "shape"): "of an image of any shape",
-    ("statistics.*", "delay_ns", "shape"): "of an image of any shape",
-    ("statistics.mars_moments", "*", "empty"): "no pixel, no moments",
     ("statistics.PhaseChain", "cell", "*"): "free text, for messages",
-    ("reconstruct.log_likelihood", "*", "shape"): "of an image of any shape",
-    ("reconstruct.log_likelihood", "*", "empty"): "no light, no likelihood",
     ("Table.lookup", "*", "shape"): "of an image of any shape",
     ("plot.map_image", "label", "*"): "free text",
     ("plot.overview", "title", "*"): "free text",

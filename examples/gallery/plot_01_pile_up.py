@@ -14,10 +14,10 @@ import mars_lidar as ml
 
 pulse, detector = ml.GaussianPulse(sigma_ns=1.0), ml.Detector(dead_time_ns=75.0)
 system = ml.System(period_ns=1e3 / 7.5, cycles=200_000, bins=256, pulse=pulse, detector=detector)
-light = {"signal": 1.0, "background": 1.0, "delay_ns": 40.0}  # photons per laser period
-counts = ml.simulate(ml.Flux(**light), system, seed=0)[0, 0, 0]
-mean = ml.statistics.mean_histogram(**light, system=system)
-poisson = ml.simulate(ml.Flux(**light), system, engine="poisson", seed=0)[0, 0, 0]
+flux = ml.Flux(signal=1.0, background=1.0, delay_ns=40.0)  # photons per laser period
+counts = ml.simulate(flux, system, seed=0)[0, 0, 0]
+mean = ml.statistics.mean_histogram(flux, system)
+poisson = ml.simulate(flux, system, engine="poisson", seed=0)[0, 0, 0]
 
 fig, ax = plt.subplots()
 ax.fill_between(system.time_ns, poisson, step="mid", color="0.85", label=f"Poisson model, {poisson.sum():,} counts")

@@ -18,8 +18,8 @@ system = ml.System(period_ns=100.0, cycles=50_000, bins=128, pulse=pulse, detect
 synchronous = system.replace(detector=ml.Detector(dead_time_ns=75.0, mode="synchronous"))
 counts = ml.simulate(ml.Flux(1.0, 2.0, 60.0), system, seed=0)[0, 0, 0]
 found = ml.reconstruct(counts, system)
-light = {"signal": float(found.signal), "background": float(found.background), "delay_ns": float(found.delay_ns)}
-fitted = ml.statistics.photons_per_bin(**light, system=system).reshape(system.bins, -1).sum(-1)
+light = ml.Flux(found.signal, found.background, found.delay_ns)
+fitted = ml.statistics.photons_per_bin(light, system).reshape(system.bins, -1).sum(-1)
 
 fig, ax = plt.subplots()
 ax.step(system.time_ns, counts / system.cycles, where="mid", color="0.7", label="registered")

@@ -27,7 +27,7 @@ for method in ("peak", "matched_filter", "generalised_coates", "maximum_likeliho
     rms_mm = 1e3 * np.sqrt(np.nanmean(error_m**2, axis=0))
     scatter_mm = 1e6 * np.nanstd(error_m**2, axis=0) / (2 * rms_mm * np.sqrt(len(error_m)))  # standard error of the rms
     ax.errorbar(signal, rms_mm, scatter_mm, fmt="o-", ms=3, label=method)
-bound = ml.cramer_rao(signal, 1.0, system, delay_ns=50.0)
+bound = ml.cramer_rao(ml.Flux(signal, background=1.0, delay_ns=50.0), system)
 ax.plot(signal, 1e3 * bound.depth_m, "k--", label="Cramer-Rao bound")
 ax.set(xlabel="signal S (photons per period), B = 1", ylabel="depth error, rms (mm)", xscale="log", yscale="log")
 ax.legend()

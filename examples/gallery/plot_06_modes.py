@@ -12,7 +12,7 @@ import matplotlib.pyplot as plt
 
 import mars_lidar as ml
 
-pulse, light = ml.GaussianPulse(sigma_ns=1.0), {"signal": 1.0, "background": 2.0, "delay_ns": 60.0}
+pulse, flux = ml.GaussianPulse(sigma_ns=1.0), ml.Flux(signal=1.0, background=2.0, delay_ns=60.0)
 modes = {
     "nonparalyzable": {},
     "paralyzable": {},
@@ -24,10 +24,10 @@ fig, axes = plt.subplots(2, 2, figsize=(7.2, 4.4), sharex=True, sharey=True)
 for ax, (mode, gate) in zip(axes.flat, modes.items(), strict=True):
     detector = ml.Detector(dead_time_ns=30.0, mode=mode, **gate)
     system = ml.System(period_ns=100.0, cycles=50_000, bins=200, pulse=pulse, detector=detector)
-    counts = ml.simulate(ml.Flux(**light), system, seed=0)[0, 0, 0]
+    counts = ml.simulate(flux, system, seed=0)[0, 0, 0]
     counted[mode] = counts.sum()
     ax.plot(system.time_ns, counts, ".", ms=2)
-    ax.plot(system.time_ns, ml.statistics.mean_histogram(**light, system=system), lw=1)
+    ax.plot(system.time_ns, ml.statistics.mean_histogram(flux, system), lw=1)
     ax.set(title=f"{mode}: {counts.sum():,} counts", ylim=(-0.3, 10_000))
     ax.set_yscale("symlog", linthresh=1.0)  # zeros have a place
 fig.supxlabel("time in the laser period (ns)", fontsize=9)

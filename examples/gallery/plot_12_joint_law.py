@@ -15,10 +15,10 @@ import mars_lidar as ml
 
 pulse, detector = ml.GaussianPulse(sigma_ns=2.0), ml.Detector(dead_time_ns=75.0)
 system = ml.System(period_ns=100.0, cycles=500, bins=50, pulse=pulse, detector=detector)
-light = {"signal": 2.0, "background": 1.0, "delay_ns": 40.0}
-covariances = {"exact law": ml.joint_law(**light, system=system).covariance()}
+flux = ml.Flux(signal=2.0, background=1.0, delay_ns=40.0)
+covariances = {"exact law": ml.joint_law(flux, system).covariance()}
 for engine in ("exact", "mars"):
-    cube = ml.simulate(ml.Flux(**light), system, engine=engine, realizations=20_000, seed=0)
+    cube = ml.simulate(flux, system, engine=engine, realizations=20_000, seed=0)
     covariances[f"engine {engine!r}, 20,000 draws"] = np.cov(cube.reshape(-1, system.bins).T)
 
 windows = {}

@@ -80,7 +80,7 @@ system = ml.System(period_ns=period_ns, cycles=2000, bins=128, pulse=pulse, dete
 fig, axes = plt.subplots(1, 2, sharex=True)
 for ax, signal in zip(axes, (0.2, 20.0), strict=True):
     counts = ml.simulate(ml.Flux(signal, 0.1, delay_ns), system, seed=1)[0, 0, 0]
-    light = system.cycles * ml.statistics.photons_per_bin(signal, 0.1, system, bins=128, delay_ns=delay_ns)
+    light = system.cycles * ml.statistics.photons_per_bin(ml.Flux(signal, 0.1, delay_ns), system, bins=128)
     ax.fill_between(system.time_ns, light / light.max(), color="0.85", step="mid", label="light, scaled")
     ax.step(system.time_ns, counts / counts.max(), where="mid", label="counts, scaled")
     ax.axvline(delay_ns, color="k", lw=0.8, ls=":")
@@ -95,7 +95,7 @@ plt.show()
 
 signals = np.geomspace(0.05, 100, 40)
 fine = system.replace(bins=1024)
-means = [ml.statistics.mean_histogram(signal, 0.1, fine, delay_ns=delay_ns) for signal in signals]
+means = [ml.statistics.mean_histogram(ml.Flux(signal, 0.1, delay_ns), fine) for signal in signals]
 early_ns = np.array([delay_ns - fine.time_ns[mean.argmax()] for mean in means])
 
 fig, ax = plt.subplots()

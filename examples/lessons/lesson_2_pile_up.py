@@ -28,7 +28,7 @@ system = ml.System(period_ns=100.0, cycles=20_000, bins=128, pulse=pulse, detect
 
 fig, axes = plt.subplots(1, 3, sharey=True)
 for ax, scale in zip(axes, (0.05, 0.5, 5.0), strict=True):
-    light = ml.statistics.photons_per_bin(scale, scale, system, bins=128, delay_ns=60.0)
+    light = ml.statistics.photons_per_bin(ml.Flux(scale, scale, 60.0), system, bins=128)
     before = np.append(0.0, np.cumsum(light)[:-1])
     seen = np.exp(-before) * -np.expm1(-light)  # equation (1)
     counts = ml.simulate(ml.Flux(scale, scale, 60.0), system, seed=2)[0, 0, 0]
@@ -58,7 +58,7 @@ plt.show()
 # detector, and noisy where few periods are still armed.
 
 counts = ml.simulate(ml.Flux(2.0, 2.0, 60.0), system, seed=3)[0, 0, 0].astype(float)
-light = ml.statistics.photons_per_bin(2.0, 2.0, system, bins=128, delay_ns=60.0)
+light = ml.statistics.photons_per_bin(ml.Flux(2.0, 2.0, 60.0), system, bins=128)
 armed = system.cycles - np.append(0, np.cumsum(counts)[:-1])
 estimate = -np.log1p(-counts / armed)  # equation (2)
 assert np.allclose(estimate, coates_rates(counts, system))

@@ -29,9 +29,9 @@ system = ml.System(period_ns=100.0, cycles=1000, bins=100, pulse=pulse, detector
 
 fig, ax = plt.subplots()
 for signal, background, name in ((0.0, 3.0, "constant light"), (2.9, 0.1, "pulses")):
-    law = ml.count_law(signal, background, system, delay_ns=40.0)
+    law = ml.count_law(ml.Flux(signal, background, 40.0), system)
     ax.plot(law.support, law.pmf, label=f"{name}: variance / mean {law.variance / law.mean:.3f}")
-mean = float(ml.count_law(0.0, 3.0, system).mean)
+mean = float(ml.count_law(ml.Flux(0.0, 3.0), system).mean)
 n = np.arange(820, 1040)
 ax.plot(
     n,
@@ -55,10 +55,10 @@ plt.show()
 fig, ax = plt.subplots()
 short = system.replace(detector=ml.Detector(dead_time_ns=40.0))
 for signal in (0.1, 1.0, 8.0):
-    shape = mean_histogram(signal, 3.0, short, delay_ns=30.0)
+    shape = mean_histogram(ml.Flux(signal, 3.0, 30.0), short)
     ax.plot(
         short.time_ns,
-        shape / (short.cycles * photons_per_bin(signal, 3.0, short, bins=100, delay_ns=30.0)),
+        shape / (short.cycles * photons_per_bin(ml.Flux(signal, 3.0, 30.0), short, bins=100)),
         label=f"S = {signal:g}",
     )
 ax.axvline(30, color="0.7", lw=0.8)
@@ -75,7 +75,7 @@ plt.show()
 # correlated, and bins a dead time apart positively. ``ml.joint_law`` has the exact covariance of all bins of a finite
 # exposure:
 
-joint = ml.joint_law(5.0, 0.5, system, delay_ns=40.0)
+joint = ml.joint_law(ml.Flux(5.0, 0.5, 40.0), system)
 covariance = joint.covariance()
 spread = np.sqrt(np.diag(covariance))
 correlation = covariance / np.outer(spread, spread)

@@ -28,11 +28,11 @@ from mars_lidar.reconstruct import generalised_coates_rates
 
 pulse, detector = ml.GaussianPulse(sigma_ns=2.0), ml.Detector(dead_time_ns=75.0)
 system = ml.System(period_ns=100.0, cycles=20_000, bins=128, pulse=pulse, detector=detector)
-truth = {"signal": 3.0, "background": 1.0, "delay_ns": 60.0}
-counts = ml.simulate(ml.Flux(**truth), system, seed=4)[0, 0, 0]  # or your own: np.load("histogram.npy")
+truth = ml.Flux(signal=3.0, background=1.0, delay_ns=60.0)
+counts = ml.simulate(truth, system, seed=4)[0, 0, 0]  # or your own: np.load("histogram.npy")
 
 found = ml.reconstruct(counts, system)
-light = ml.statistics.photons_per_bin(**truth, system=system, bins=128)
+light = ml.statistics.photons_per_bin(truth, system, bins=128)
 
 fig, ax = plt.subplots()
 ax.fill_between(system.time_ns, light, step="mid", color="0.85", label="light")

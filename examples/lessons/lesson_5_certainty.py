@@ -39,7 +39,7 @@ for method in ("peak", "maximum_likelihood"):
     rms = np.sqrt(np.nanmean(error_cm**2, axis=0))
     scatter = np.nanstd(error_cm**2, axis=0) / (2 * rms * np.sqrt(repeats))  # standard error of the rms
     ax.errorbar(signal, rms, scatter, fmt="o-", ms=3, label=method.replace("_", " "))
-bound = 100 * ml.cramer_rao(signal, 0.5, system, delay_ns=50.0).depth_m
+bound = 100 * ml.cramer_rao(ml.Flux(signal, 0.5, 50.0), system).depth_m
 ax.plot(signal, bound, "k--", label="Cramér-Rao bound")
 ax.set(xscale="log", yscale="log", xlabel="signal S (photons per period), B = 0.5", ylabel="depth error, rms (cm)")
 ax.legend()

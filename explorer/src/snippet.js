@@ -16,36 +16,28 @@ function detector(state) {
   return told.join(",\n        ");
 }
 
-const parts = (bins) => bins * Math.max(4, Math.ceil(8192 / bins)); // of the period, in which two returns are put together
-
 /** Python for a state and its pixel (signal, background, delayNs, index), with the dots of a stored cube if `stored`. */
 export function snippet(state, pixel, stored) {
   const exact = lawless(state).length === 0, two = pixel.second > 0, poisson = state.dead === 0 && state.mode !== "synchronous";
   const joint = exact && state.mode === "nonparalyzable" && !poisson;
   const names = ["photons_per_bin", ...(exact ? ["count_law", "mean_histogram"] : []), ...(joint ? ["joint_law"] : [])].sort();
-  const light = two ? "None, 0.0, system, waveform=waveform" : "signal, background, system, delay_ns=delay_ns";
   const lines = [
     "import matplotlib.pyplot as plt", "import numpy as np", "", "import mars_lidar as ml",
     `from mars_lidar.statistics import ${names.join(", ")}`, "",
     "system = ml.System(", `    period_ns=${num(state.period)},`, `    cycles=${state.cycles},`, `    bins=${state.bins},`,
     `    pulse=ml.GaussianPulse(sigma_ns=${num(state.sigma)}),`, `    detector=ml.Detector(\n        ${detector(state)}\n    ),`,
     ...(state.start === "armed" ? [] : [`    start="${state.start}",`]), ")",
-    `signal, background, delay_ns = ${num(pixel.signal)}, ${num(pixel.background)}, ${num(pixel.delayNs)}`,
-    ...(two ? [`second, second_ns = ${num(pixel.second)}, delay_ns + ${num(state.gap)}`] : []),
+    `flux = ml.Flux(signal=${num(pixel.signal)}, background=${num(pixel.background)}, delay_ns=${num(pixel.delayNs)})`,
+    ...(two ? [`flux = ml.Flux.multi(flux, ml.Flux(signal=${num(pixel.second)}, delay_ns=${num(pixel.delayNs)} + ${num(state.gap)}))`] : []),
   ];
   if (stored) {
     lines.push(`drawn = np.asarray(ml.io.load(${JSON.stringify(stored.path)}).histogram[${stored.image}, ${stored.row}, ${stored.column}])`);
   } else {
-    lines.push(two ? "flux = ml.Flux([[[signal]], [[second]]], [[background]], [[[delay_ns]], [[second_ns]]])" : "flux = ml.Flux([[signal]], [[background]], [[delay_ns]])",
-      `drawn = ml.simulate(flux, system, seed=${state.seed}, pixel_index=[[${pixel.index}]])[0, 0, 0]`);
+    lines.push(`drawn = ml.simulate(flux, system, seed=${state.seed}, pixel_index=[${pixel.index}])[0, 0, 0]`);
   }
-  lines.push(`incident = photons_per_bin(signal, background, system, bins=${two ? parts(state.bins) : "system.bins"}, delay_ns=delay_ns)`);
-  if (two) {
-    lines.push(`waveform = incident + photons_per_bin(second, 0.0, system, bins=${parts(state.bins)}, delay_ns=second_ns)  # both returns`,
-      "incident = waveform.reshape(system.bins, -1).sum(1)");
-  }
-  if (exact) lines.push(`mean = mean_histogram(${light})`, `law = count_law(${light})`);
-  if (joint) lines.push(`spread = np.sqrt(joint_law(${light}).variance)`);
+  lines.push("incident = photons_per_bin(flux, system, bins=system.bins)");
+  if (exact) lines.push("mean = mean_histogram(flux, system)", "law = count_law(flux, system)");
+  if (joint) lines.push("spread = np.sqrt(joint_law(flux, system).variance)");
   else if (exact && poisson) lines.push("spread = np.sqrt(mean)  # no dead time: counts are Poisson's");
   lines.push("", 'figure, (left, right) = plt.subplots(1, 2, figsize=(12, 4), layout="constrained", width_ratios=(2, 1))',
     'left.fill_between(system.time_ns, system.cycles * incident, step="mid", color="0.85", label="photons that arrive")',

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, Literal, Unpack
+from typing import Any, Literal, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,9 +21,6 @@ from mars_lidar.instrument.units import check_delays
 from mars_lidar.light.flux import MAX_RETURNS, Flux
 from mars_lidar.light.stored_flux import StoredFlux
 from mars_lidar.light.timestamps import DrawnTimestamps, Timestamps
-
-if TYPE_CHECKING:
-    pass
 
 _MAX_REGISTRATIONS = 2.0**32  # the event counter of one pixel's random stream
 
@@ -50,7 +47,7 @@ def simulate(
     Parameters
     ----------
     flux
-        Photons at each pixel (H, W).
+        The light, (H, W); one pixel is an image of 1 x 1, N pixels are one row.
     system
         Laser, detector and histogram.
     engine
@@ -127,7 +124,7 @@ def simulate(
         raise TypeError(f"report must be a dictionary, got {type(report).__name__}")
     drawn_by = find_engine(engine, **options)
     task = _task(flux, system, drawn_by, realizations, first_realization, pixel_index, seed, threads, progress)
-    shape = (task.realizations, *flux.shape, system.bins)
+    shape = (task.realizations, *task.flux.shape, system.bins)
     if checks.choice("device", device, ("cpu", "cuda")) == "cuda":
         there: NDArray[Any] = _on_cuda(drawn_by, task, shape, out)
         if report is not None:
@@ -199,12 +196,12 @@ def simulate_timestamps(
         cuda.check(drawn_by, task.flux, task.system)
         records: Records | PhaseRecords = cuda.records(drawn_by, task)
     else:
-        detected = flux.detected(system)
+        detected = task.flux.detected(system)
         expected = float((_share_registered(detected, system) * _expected_arrivals(detected, system)).sum())
         _check_memory((math.ceil(0.5 * expected),), PhaseRecords.BYTES, "timestamps")  # before any work
         records = drawn_by.records(task, expected)
     info = {"system": system.to_dict(), "engine": drawn_by.name, "seed": int(seed), "realization": int(realization)}
-    what = (flux.shape, system.bins, system.histogram_dtype, system.period_ns, system.cycles, info)
+    what = (task.flux.shape, system.bins, system.histogram_dtype, system.period_ns, system.cycles, info)
     if isinstance(records, PhaseRecords):
         return DrawnTimestamps.of(records.cycle, records.phase, records.offsets, *what)
     return Timestamps(records.times * system.period_ns, records.cycle, records.bin, records.offsets, *what)
@@ -245,8 +242,7 @@ def _task(
         raise TypeError(f"flux must be a Flux, got {type(flux).__name__}")
     if not isinstance(system, System):
         raise TypeError(f"system must be a System, got {type(system).__name__}")
-    if isinstance(flux, StoredFlux):
-        flux = flux[:]  # whole, or a MemoryError that says so
+    flux = flux[:] if isinstance(flux, StoredFlux) else flux.image  # whole, or a MemoryError that says so
     first = checks.integer(first_name, first_realization, low=0, high=2**32 - 1)
     number = checks.integer("realizations", realizations, low=1, high=2**32 - first)
     seed = checks.integer("seed", seed, low=0, high=2**64 - 1)
@@ -271,8 +267,8 @@ def _task(
     return Task(flux, system, number, first, index, seed, team, progress)
 
 
-def _pixel_index(pixel_index: ArrayLike | None, shape: tuple[int, int]) -> NDArray[np.uint32]:
-    pixels = shape[0] * shape[1]
+def _pixel_index(pixel_index: ArrayLike | None, shape: tuple[int, ...]) -> NDArray[np.uint32]:
+    pixels = math.prod(shape)
     if pixel_index is None:
         return np.arange(pixels, dtype=np.uint32)
     index = np.asarray(checks.even_rows("pixel_index", checks.unmasked("pixel_index", pixel_index)))

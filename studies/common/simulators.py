@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mars_lidar import CountLaw, System, count_law, registration_pdf
+from mars_lidar import CountLaw, Flux, System, count_law, registration_pdf
 from mars_lidar._base.types import FloatArray
 from mars_lidar.engines import ENGINES
 from mars_lidar.statistics import photons_per_bin
@@ -45,7 +45,7 @@ class Prediction:
     sampled: int = 0
 
 
-Shape = Callable[[FloatArray, FloatArray, System], FloatArray]
+Shape = Callable[[Flux, System], FloatArray]
 Predict = Callable[[FloatArray, FloatArray, System], Prediction]
 
 
@@ -70,14 +70,14 @@ def simulators(sampled: int, seed: int, training: Training | None = None) -> lis
 
     def matched(signal: FloatArray, background: FloatArray, system: System) -> Prediction:
         """What a table holds of the exact law, and an engine with a table draws: four cumulants."""
-        cumulants = count_law(signal, background, system, "exact").cumulants
-        shape = exposure(signal, background, system)
+        flux = centred(signal, background, system)
+        cumulants, shape = count_law(flux, system, "exact").cumulants, exposure(flux, system)
         return Prediction(cumulants[:, 0], cumulants[:, 1], matched_pmf(cumulants), shape)
 
     def neural(signal: FloatArray, background: FloatArray, system: System) -> Prediction:
         engine = _trained(system.replace(cycles=1, start="armed"), plan)
-        shape = engine.registration_pdf(signal, background, system)
-        return _of_law(engine.count_law(signal, background, system), shape)
+        flux = centred(signal, background, system)
+        return _of_law(engine.count_law(flux, system), engine.registration_pdf(flux, system))
 
     evaluated = [
         Simulator("poisson", "Poisson", _by_law(arrival_shape, method="poisson")),
@@ -100,15 +100,21 @@ def _of_law(law: CountLaw, shape: FloatArray) -> Prediction:
 
 
 def _by_law(shape: Shape, **law: Any) -> Predict:
-    return lambda signal, background, system: _of_law(
-        count_law(signal, background, system, **law), shape(signal, background, system)
-    )
+    def predict(signal: FloatArray, background: FloatArray, system: System) -> Prediction:
+        flux = centred(signal, background, system)
+        return _of_law(count_law(flux, system, **law), shape(flux, system))
+
+    return predict
 
 
-def arrival_shape(signal: FloatArray, background: FloatArray, system: System) -> FloatArray:
+def centred(signal: FloatArray, background: FloatArray, system: System) -> Flux:
+    """Light whose return is in the middle of the period."""
+    return Flux(signal, background, 0.5 * system.period_ns)
+
+
+def arrival_shape(flux: Flux, system: System) -> FloatArray:
     """Shape (cells, bins) of the arrivals, which is that of the flux."""
-    flux = zip(signal, background, strict=True)
-    shape = np.stack([photons_per_bin(s, b, system, bins=system.bins) for s, b in flux])
+    shape = photons_per_bin(flux, system, bins=system.bins)
     return np.asarray(shape / shape.sum(-1, keepdims=True), dtype=np.float64)
 
 

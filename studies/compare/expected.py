@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +12,6 @@ from numpy.typing import NDArray
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
-from mars_lidar.plot.views import law_arguments
 from mars_lidar.statistics import ConvergenceError, count_law, exposure_moments, joint_law, mean_histogram
 from mars_lidar.statistics.distance import Pmf
 from studies.compare.sample import Moments
@@ -77,19 +75,18 @@ class Expected:
 def pixel_law(flux: Flux, system: System, y: int, x: int, window: NDArray[np.bool_], threads: int) -> PixelLaw | str:
     """Exact law of pixel (y, x), or why there is none: no convergence, a detector without exact statistics."""
     try:
-        arguments = law_arguments(flux, system, y, x)
-        law = count_law(system=system, threads=threads, **arguments)
-        histogram = mean_histogram(system=system, threads=threads, **arguments)
+        law = count_law(flux[y, x], system, threads=threads)
+        histogram = mean_histogram(flux[y, x], system, threads=threads)
         pmf = Pmf(int(law.support[0]), law.pmf)
     except (ConvergenceError, ValueError) as error:
         return str(error)
-    return PixelLaw(law.cumulants, pmf, histogram, *_joint(arguments, system, window))
+    return PixelLaw(law.cumulants, pmf, histogram, *_joint(flux[y, x], system, window))
 
 
-def _joint(arguments: dict[str, Any], system: System, window: NDArray[np.bool_]) -> tuple[FloatArray | None, float]:
+def _joint(pixel: Flux, system: System, window: NDArray[np.bool_]) -> tuple[FloatArray | None, float]:
     """`PixelLaw.window` and `.lag1`, as far as the closed form has them in a second or so."""
     try:
-        joint = joint_law(system=system, **arguments)
+        joint = joint_law(pixel, system)
         moments = np.array(joint.window(window.astype(np.float64))) if window.any() else None
     except (ConvergenceError, ValueError):
         return None, math.nan
@@ -119,10 +116,10 @@ def expected_counts(flux: Flux, system: System, threads: int, budget_s: float) -
         try:
             in_time(first, y.size)
             cumulants[part] = exposure_moments(
-                system=system.replace(bins=1),
+                flux.pixels(y[part] * flux.shape[1] + x[part]),
+                system.replace(bins=1),
                 threads=threads,
                 progress=in_time,
-                **_arguments(flux, system, y[part], x[part], shaped),
             ).cumulants
         except ConvergenceError:
             continue
@@ -130,14 +127,6 @@ def expected_counts(flux: Flux, system: System, threads: int, budget_s: float) -
             break
     mean, variance = (cumulants[:, k].reshape(rows.shape) for k in (0, 1))
     return Expected(step, mean, variance, time.perf_counter() - began)
-
-
-def _arguments(flux: Flux, system: System, y: NDArray[np.intp], x: NDArray[np.intp], shaped: bool) -> dict[str, Any]:
-    """Some pixels as `exposure_moments` takes them; one only where each has a shape of its own."""
-    if shaped:
-        return law_arguments(flux, system, int(y[0]), int(x[0]))
-    delay = np.nan_to_num(flux.delay_ns[y, x])
-    return {"signal": flux.signal[y, x], "background": flux.background[y, x], "delay_ns": delay}
 
 
 class _OutOfTimeError(Exception):

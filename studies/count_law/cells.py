@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mars_lidar import System, count_law, registration_pdf
+from mars_lidar import Flux, System, count_law, registration_pdf
 from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics.distance import Pmf, kl_divergence, wasserstein
 from studies import Tell
@@ -22,7 +22,7 @@ from studies.common.sample import (
     paper_grids,
     system_of,
 )
-from studies.common.simulators import Prediction, arrival_shape, simulators
+from studies.common.simulators import Prediction, arrival_shape, centred, simulators
 from studies.neural.pairs import Training
 
 FIGURES = ("wasserstein", "kl", "mean", "variance")  # distances of a law to the truth, in this order
@@ -148,7 +148,7 @@ def _system_cells(settings: Settings, grid: Grid, dead_ns: float, truth: str, nu
     training = Training(steps=settings.steps, pairs=settings.pairs, held_out=min(500, settings.pairs))
     asked = simulators(settings.sampled, seed + (1 << 40), training)
     predictions = {one.name: one.predict(signal, background, system) for one in asked}
-    cumulants = count_law(signal, background, system, "exact").cumulants
+    cumulants = count_law(Flux(signal, background, 0.5 * system.period_ns), system, "exact").cumulants
     random = np.random.default_rng([settings.seed, number])
     cells = []
     for k in range(signal.size):
@@ -236,11 +236,12 @@ def shape_sweep(settings: Settings, tell: Tell) -> dict[str, FloatArray]:
     found: dict[str, list[FloatArray]] = {name: [] for name in SHAPES}
     for dead in settings.dead_sweep:
         system = settings.system(PERIOD_NS, dead * PERIOD_NS)
-        truth = registration_pdf(signal, background, system, "exposure")
+        flux = centred(signal, background, system)
+        truth = registration_pdf(flux, system, "exposure")
         shapes = {
-            "poisson": arrival_shape(signal, background, system),
-            "renewal": registration_pdf(signal, background, system, "chain"),
-            "mars_edge": registration_pdf(signal, background, system, "chain", rearm="edge"),
+            "poisson": arrival_shape(flux, system),
+            "renewal": registration_pdf(flux, system, "chain"),
+            "mars_edge": registration_pdf(flux, system, "chain", rearm="edge"),
         }
         for name, shape in shapes.items():
             found[name].append(0.5 * np.abs(shape - truth).sum(-1))

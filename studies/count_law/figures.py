@@ -164,12 +164,12 @@ def dead_time(settings: Settings, truth: str) -> Figure:
     seed = settings.seed << 16
     before = simulate(flux, system, engine="poisson", seed=seed)[0, 0, 0]
     after = simulate(flux, system, engine=truth, seed=seed + 1)[0, 0, 0]
-    arrivals = system.cycles * (signal + background) * arrival_shape(np.array([signal]), np.array([background]), system)
-    registered = exposure_moments(signal, background, system).histogram
+    arrivals = system.cycles * (signal + background) * arrival_shape(flux, system)
+    registered = exposure_moments(flux, system).histogram
     time_ns = (np.arange(system.bins) + 0.5) * (PERIOD_NS / system.bins)
     figure, axes = panels(2.6, 1, 2, sharex=True)
     for ax, counts, mean, words in (
-        (axes[0, 0], before, arrivals[0], "before: arrivals"),
+        (axes[0, 0], before, arrivals, "before: arrivals"),
         (axes[0, 1], after, registered, f"after, $t_d$ = {dead:g} $t_r$: registrations"),
     ):
         ax.step(time_ns, counts, where="mid", color=MUTED, lw=0.5, label="one exposure")

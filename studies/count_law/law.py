@@ -137,7 +137,7 @@ def _cells(
     cube = simulate(flux, system.replace(bins=1), realizations=settings.realizations, seed=seed)
     counts = cube.reshape(settings.realizations, signal.size)
     random = np.random.default_rng([settings.seed, number])
-    batch = laws_of(signal, background, system)
+    batch = laws_of(Flux(signal, background, 0.5 * system.period_ns), system)
     exact = batch["exact"]
     cells = []
     for k in range(signal.size):
@@ -178,11 +178,9 @@ def second_look(settings: Settings, cells: list[Cell], tell: Tell) -> list[tuple
     return found
 
 
-def laws_of(
-    signal: FloatArray, background: FloatArray, system: System, delay_ns: float | None = None
-) -> dict[str, CountLaw]:
+def laws_of(flux: Flux, system: System) -> dict[str, CountLaw]:
     """Every law in closed form, of cells (cells,)."""
-    law = partial(count_law, signal, background, system, delay_ns=delay_ns)
+    law = partial(count_law, flux, system)
     marked = {"mars": law("mars"), "mars_edge": law("mars", rearm="edge")}
     return {"exact": law("exact")} | marked | {name: law(name) for name in ("renewal", "poisson")}
 

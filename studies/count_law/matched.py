@@ -11,7 +11,7 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from mars_lidar import System, count_law
+from mars_lidar import Flux, System, count_law
 from mars_lidar._base.types import FloatArray
 from mars_lidar.plot.style import COLOURS
 from mars_lidar.statistics.distance import total_variation
@@ -120,7 +120,7 @@ def drawn(settings: Settings, tell: Tell) -> list[Part]:
 
 def measure(kind: str, system: System, signal: FloatArray, background: FloatArray) -> Part:
     """Distances of the matched law and of the best Gaussian to the exact law of each cell."""
-    exact = count_law(signal, background, system)
+    exact = count_law(Flux(signal, background, 0.5 * system.period_ns), system)
     windows = matched_pmf(exact.cumulants)
     matched, gaussian = np.empty(signal.size), np.empty(signal.size)
     for k, window in enumerate(windows):

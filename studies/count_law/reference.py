@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from mars_lidar import Flux
 from mars_lidar.statistics import distance
 from mars_lidar.statistics.distance import Pmf
 from studies import Facts, Request
@@ -63,7 +64,7 @@ def compare(name: str, case: dict[str, Any], draws: int, random: np.random.Gener
     sample = Pmf(int(counts.min()), frequency)
     mean = float((counts * (times / size)).sum())
 
-    laws = laws_of(np.array([signal]), np.array([background]), system, delay)
+    laws = laws_of(Flux([signal], background, delay), system)
     pmfs, exact = pmfs_of(laws, 0), laws["exact"].cumulants[0]
     noise = distance.sampling_floor(pmfs["exact"], size, draws, random)
     found = []

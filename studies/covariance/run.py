@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mars_lidar import System, holding_time_covariance
+from mars_lidar import Flux, System, holding_time_covariance
 from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics.chain import Rearm
 from studies import Facts, Request, Tell
@@ -129,7 +129,9 @@ def one_cell(settings: Settings, signal: float, background: float, dead_periods:
 
 
 def _cell(settings: Settings, grid: Grid, system: System, signal: float, background: float, rearm: Rearm) -> Cell:
-    full = holding_time_covariance(signal, background, system, lags=CUTOFFS[-1], rearm=rearm, bins=settings.bins)
+    full = holding_time_covariance(
+        Flux(signal, background, 0.5 * system.period_ns), system, lags=CUTOFFS[-1], rearm=rearm, bins=settings.bins
+    )
     terms = LeadingTerms.of(full)
     sums = {cutoff_name(c): terms.cutoff_sum(c) for c in CUTOFFS}
     sums[SPECTRAL_NAME] = terms.spectral_sum(*SPECTRAL)

@@ -110,8 +110,8 @@ def outcome(shown: Shown, exposures: int) -> Outcome:
 def _predicted(system: System) -> tuple[FloatArray | None, tuple[float, float] | None, FloatArray | None]:
     if system.detector.gate_moves or set(system.detector.effects) & set(_SIMULATED_ONLY):
         return None, None, None
-    expected = mean_histogram(SIGNAL, BACKGROUND, system, delay_ns=DELAY_NS)
-    law = count_law(SIGNAL, BACKGROUND, system, delay_ns=DELAY_NS)
+    expected = mean_histogram(Flux(SIGNAL, BACKGROUND, DELAY_NS), system)
+    law = count_law(Flux(SIGNAL, BACKGROUND, DELAY_NS), system)
     pmf = np.zeros(int(law.support[-1]) + 1)
     pmf[law.support] = law.pmf
     return expected, (float(law.mean), float(law.variance)), pmf

@@ -89,15 +89,9 @@ class Case:
             return Flux(self.signal[0] * row, self.background, self.delay[0] * PERIOD_NS)
         return Flux.multi(*parts, Flux(0.0 * row, self.background, 0.0))
 
-    def light(self) -> dict[str, Any]:
-        """Arguments of the predictions: signal or waveform, background, delay; one return only."""
-        if self.waveform is not None:
-            return {"signal": None, "background": self.background, "waveform": self.waveform}
-        return {"signal": self.signal[0], "background": self.background, "delay_ns": self.delay[0] * PERIOD_NS}
-
     @property
     def predictable(self) -> bool:
-        """Whether the predictions take this light: they know one return, or a waveform."""
+        """Whether the predictions are compared: for one return, or a waveform."""
         return self.waveform is not None or len(self.signal) == 1
 
     def facts(self) -> dict[str, Any]:

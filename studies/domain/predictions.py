@@ -67,7 +67,7 @@ class Predictions:
         return self.histogram if self.histogram is not None else None if self.joint is None else self.joint.mean
 
     def _count_law(self) -> list[Check]:
-        law = count_law(system=self.case.system, threads=1, **self.case.light())
+        law = count_law(self.case.flux()[0, 0], self.case.system, threads=1)
         self.law = law
         found = [_sane("count_law", bool(np.isfinite(law.cumulants).all() and law.mean >= 0 and law.variance >= 0))]
         if self.known is not None:
@@ -105,7 +105,7 @@ class Predictions:
         return found
 
     def _histogram(self) -> list[Check]:
-        mean = np.asarray(mean_histogram(system=self.case.system, threads=1, **self.case.light()))
+        mean = np.asarray(mean_histogram(self.case.flux()[0, 0], self.case.system, threads=1))
         self.histogram = mean
         self.windows = Windows.of(self.case, mean)
         least = float(mean.min(initial=0.0))
@@ -118,12 +118,12 @@ class Predictions:
 
     def _stationary(self) -> list[Check]:
         case = self.case
-        shape = np.asarray(registration_pdf(method="stationary", system=case.system, threads=1, **case.light()))
+        shape = np.asarray(registration_pdf(case.flux()[0, 0], case.system, "stationary", threads=1))
         found = [_sane("stationary shape", bool(np.isfinite(shape).all() and abs(shape.sum() - 1.0) < 1e-6))]
         dead = case.system.dead_time_periods
         plain = case.mode == "nonparalyzable" and not case.system.detector.effects
         if plain and dead == round(dead) and case.photons > 0.0:
-            flat = photons_per_bin(system=case.system, bins=case.system.bins, **case.light())
+            flat = photons_per_bin(case.flux()[0, 0], case.system, bins=case.system.bins)
             off = 0.5 * float(np.abs(shape - flat / flat.sum()).sum())
             found.append(_agree("stationary shape", "closed form", "shape", off))
         if case.system.start == "stationary" and self.histogram is not None and self.histogram.sum() > 0.0:
@@ -134,7 +134,7 @@ class Predictions:
 
     def _joint(self) -> list[Check]:
         began = time.process_time()
-        joint = joint_law(system=self.case.system, **self.case.light())
+        joint = joint_law(self.case.flux()[0, 0], self.case.system)
         took = time.process_time() - began
         self.joint = joint
         if self.windows is None:
@@ -158,7 +158,7 @@ class Predictions:
         return found
 
     def _bound(self) -> list[Check]:
-        bound = cramer_rao(system=self.case.system, threads=1, **self.case.light())
+        bound = cramer_rao(self.case.flux()[0, 0], self.case.system, threads=1)
         errors = np.array([bound.signal, bound.background, bound.delay_ns], dtype=np.float64)
         return [_sane("cramer_rao", bool((errors > 0.0).all() and np.isfinite(bound.information).all()))]
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar import Scene, Table, simulate
+from mars_lidar import Flux, Scene, Table, simulate
 from mars_lidar.engines import Engine, MarsEngine, RenewalEngine
 from mars_lidar.learn import CubeStream, Uniform
 from mars_lidar.table.entries import StartPhases
@@ -185,10 +185,10 @@ class Data:
         """
         s, b = (np.geomspace(0.01, 10.0, max(4, points // 4)) for points in self.config.table)
         exact = Table.build(SYSTEM, s, b, threads=1)
-        light = np.meshgrid(exact.signal, exact.background, indexing="ij")
+        light = Flux(*np.meshgrid(exact.signal, exact.background, indexing="ij"), 0.5 * SYSTEM.period_ns)
         engine = NeuralEngine()
-        law = engine.count_law(*light, SYSTEM)
-        shape = engine.registration_pdf(*light, SYSTEM).reshape(-1, SYSTEM.bins).astype(np.float32)
+        law = engine.count_law(light, SYSTEM)
+        shape = engine.registration_pdf(light, SYSTEM).reshape(-1, SYSTEM.bins).astype(np.float32)
         entries = replace(exact.entries, cumulants=law.cumulants.reshape(-1, 4), shape=shape, startup=None)
         return replace(exact, entries=entries, start_phases=StartPhases.none())
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar import Scene, cramer_rao, reconstruct
+from mars_lidar import Flux, Scene, cramer_rao, reconstruct
 from mars_lidar._base.files import beside
 from mars_lidar._base.optional import needed
 from mars_lidar._base.types import FloatArray
@@ -95,7 +95,7 @@ def references(data: Data) -> dict[str, dict[str, float]]:
         for scene in data.test:
             flux = scene.flux(SYSTEM, signal=level(scene, data.config), sbr=sbr)
             lit = flux.signal > 0
-            bound = cramer_rao(flux.signal[lit], flux.background[lit], SYSTEM, delay_ns=flux.delay_ns[lit])
+            bound = cramer_rao(Flux(flux.signal[lit], flux.background[lit], flux.delay_ns[lit]), SYSTEM)
             bounds.append(bound.depth_m)
         rows["Cramer-Rao bound"] = float(np.sqrt(np.mean(np.concatenate(bounds) ** 2)))
         found[f"{sbr:g}"] = rows

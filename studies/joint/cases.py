@@ -50,8 +50,7 @@ class Case:
 
     def law(self, bins: int) -> JointLaw:
         """The closed form of its histogram of so many bins."""
-        light = {"delay_ns": self.delay * PERIOD_NS, "tolerance": TOLERANCE}
-        return joint_law(self.signal, self.background, self.system(bins), **light)
+        return joint_law(self.flux, self.system(bins), tolerance=TOLERANCE)
 
     def histograms(
         self, bins: int, engine: str | Engine, exposures: int, seed: int, report: dict[str, float] | None = None

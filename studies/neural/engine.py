@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from mars_lidar import CountLaw, Flux, System
 from mars_lidar._base.types import FloatArray
@@ -22,7 +22,6 @@ from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.statistics import photons_per_bin
 from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.count_pmf import gaussian_window
-from mars_lidar.statistics.histogram import pixel_of
 from studies.neural.model import NeuralMap
 
 
@@ -91,16 +90,14 @@ class NeuralEngine(Engine):
                     alignment = Alignment.of(task.system, *light, single[1][group.pixels], rate)
             run.draw(Batch.unmixed(group.pixels, as_shapes(pdf), cell, laws, alignment))
 
-    def registration_pdf(
-        self, signal: ArrayLike, background: ArrayLike, system: System, *, delay_ns: ArrayLike | None = None
-    ) -> FloatArray:
-        """PDFs (..., bins) by the network, in place of the chain's: `mars_lidar.registration_pdf`'s arguments."""
-        cells = _cells(signal, background, system, delay_ns)
+    def registration_pdf(self, flux: Flux, system: System) -> FloatArray:
+        """PDFs (..., bins) by the network, in place of the chain's (`mars_lidar.registration_pdf`)."""
+        cells = _cells(flux, system)
         return self._moments(cells)[0].reshape(*cells.shape, system.bins)
 
-    def count_law(self, signal: ArrayLike, background: ArrayLike, system: System) -> CountLaw:
-        """The Gaussian count law of this engine, for cells (...): `mars_lidar.count_law`'s arguments."""
-        cells = _cells(signal, background, system, None)
+    def count_law(self, flux: Flux, system: System) -> CountLaw:
+        """The Gaussian count law of this engine, for pixels (...)."""
+        cells = _cells(flux, system)
         _, mean, variance = self._moments(cells)
         cumulants = np.zeros((*cells.shape, 4))
         cumulants[..., 0], cumulants[..., 1] = mean.reshape(cells.shape), variance.reshape(cells.shape)
@@ -114,9 +111,7 @@ class NeuralEngine(Engine):
         model.check_range(cells.signal, cells.background)
         flux = np.empty((cells.size, system.bins))
         for k in range(cells.size):
-            signal, waveform, delay = pixel_of(cells, k)
-            back = float(cells.background[k])
-            flux[k] = photons_per_bin(signal, back, system, bins=system.bins, delay_ns=delay, waveform=waveform)
+            flux[k] = photons_per_bin(cells.flux(k), system, bins=system.bins)
         pdf = np.full(flux.shape, 1.0 / system.bins)
         mean, variance = np.zeros(cells.size), np.zeros(cells.size)
         lit = cells.signal > 0.0  # a constant flux has a uniform PDF: nothing to ask a network for
@@ -126,6 +121,6 @@ class NeuralEngine(Engine):
         return pdf, mean, variance
 
 
-def _cells(signal: ArrayLike, background: ArrayLike, system: System, delay_ns: ArrayLike | None) -> Cells:
+def _cells(flux: Flux, system: System) -> Cells:
     effects = LIGHT_EFFECTS + TIMING_EFFECTS  # the network refuses those that it was not trained for, by their fields
-    return Cells.of(signal, background, system, delay_ns=delay_ns, what="the neural map", effects=effects)
+    return Cells.of_flux(flux, system, what="the neural map", effects=effects)

@@ -27,7 +27,7 @@ def line(system: System, signal: float, pixels: int) -> dict[str, Any]:
     """Maximum likelihood and bounds of S at one brightness, in units of the Cramer-Rao bound of known armed times."""
     background = signal / SBR
     flux = Flux(np.full(pixels, signal), background, _DELAY_NS)
-    bound = cramer_rao(signal, background, system, delay_ns=_DELAY_NS)
+    bound = cramer_rao(Flux(signal, background, _DELAY_NS), system)
     least = float(bound.signal)
     out: dict[str, Any] = {"detector": system.detector.mode, "S": signal, "bound %": 100.0 * least / signal}
     for cycles in (system.cycles, _LONG):
@@ -61,7 +61,7 @@ def _bounds(
     scale = np.sqrt(np.diag(np.linalg.inv(information)))
     steps = _STEP * np.concatenate([np.zeros((1, 3)), np.diag(scale), -np.diag(scale)])
     points = np.asarray(truth) + steps
-    gradient = np.array([log_likelihood(h, system, *points.T)[1] for h in cube])  # (pixels, 7, 3)
+    gradient = np.array([log_likelihood(h, Flux(*points.T), system)[1] for h in cube])  # (pixels, 7, 3)
     score = gradient[:, 0] * scale
     second = (gradient[:, 1:4] - gradient[:, 4:]) * scale / (2.0 * _STEP)
     second = 0.5 * (second + second.transpose(0, 2, 1)) + score[:, :, None] * score[:, None, :]

@@ -174,7 +174,9 @@ def pair(system: System, signals: tuple[float, float], background: float, apart:
     found = reconstruct(cube, system, returns=MOST).returns
     assert found is not None
     both = found.count == 2
-    bound = returns_bound(signals, background, system, delay_ns=delay)
+    bound = returns_bound(
+        Flux.multi(*(Flux(s, 0.5 * background, tau) for s, tau in zip(signals, delay, strict=True))), system
+    )
     off = {
         "depth": ((found.delay_ns[both, :2] - delay), found.delay_error_ns[both, :2], bound.delay_ns),
         "S": ((found.signal[both, :2] - np.array(signals)), found.signal_error[both, :2], bound.signal),

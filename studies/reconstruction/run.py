@@ -105,7 +105,7 @@ def sweep(system: System, signal: float, pixels: int) -> list[dict[str, Any]]:
     delay = np.random.default_rng(SEED).uniform(0.0, period, pixels)
     cube = simulate(Flux(np.full(pixels, signal), background, delay), system, seed=SEED)[0, 0]
     places = np.linspace(0.0, period, _BOUNDS)
-    bound = cramer_rao(signal, background, system, delay_ns=places)
+    bound = cramer_rao(Flux(signal, background, places), system)
     least = {}
     for name in ("depth_m", "signal"):  # of these delays: a synchronous pixel sees late ones less well
         at = np.exp(np.interp(delay, places, np.log(getattr(bound, name))))
@@ -144,8 +144,8 @@ def window_lines(settings: Settings) -> list[dict[str, Any]]:
     weights = window_weights(PLAIN, delay)
     lines = []
     for signal in settings.signals[:: max(1, len(settings.signals) // 5)]:
-        mean, deviation = window_error(weights, signal, signal / SBR, PLAIN, delay_ns=delay)
-        bound = float(cramer_rao(signal, signal / SBR, PLAIN, delay_ns=delay).signal)
+        mean, deviation = window_error(weights, Flux(signal, signal / SBR, delay), PLAIN)
+        bound = float(cramer_rao(Flux(signal, signal / SBR, delay), PLAIN).signal)
         lines.append(
             {
                 "S": signal,

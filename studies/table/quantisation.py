@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from mars_lidar import System, Table
+from mars_lidar import Flux, System, Table
 from mars_lidar._base.types import FloatArray
 from mars_lidar.plot.style import COLOURS
 from mars_lidar.statistics import Exposure, exposure_moments
@@ -84,7 +84,7 @@ def compute(settings: Settings, tell: Tell) -> list[Cost]:
     costs = []
     for dead_ns in settings.dead_ns:
         system = settings.system(dead_ns)
-        truth = exposure_moments(signal, background, system)
+        truth = exposure_moments(Flux(signal, background, 0.5 * system.period_ns), system)
         for size in settings.sizes:
             began = time.perf_counter()
             table = Table.build(system, signal=(LOW, HIGH, size[0]), background=(LOW, HIGH, size[1]))

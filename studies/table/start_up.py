@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from mars_lidar import Flux
 from mars_lidar.statistics import exposure_moments
 from studies import Facts, Request
 from studies.common.report import Row
@@ -56,11 +57,11 @@ def _measure(dead_ns: float, cycles: int, points: int, delays: int) -> list[Row]
     system = system_of(dead_ns, cycles)
     levels = np.geomspace(*_LEVELS, points)
     shifts = np.arange(1, delays) * system.bins // delays
-    canonical = exposure_moments(levels[:, None], levels, system, tolerance=_TOLERANCE)
+    canonical = exposure_moments(Flux(levels[:, None], levels, 0.5 * system.period_ns), system, tolerance=_TOLERANCE)
     variation, chi_square = [], []
     for shift in shifts:
         own = exposure_moments(
-            levels[:, None], levels, system, delay_ns=0.5 * PERIOD_NS + shift * system.bin_ns, tolerance=_TOLERANCE
+            Flux(levels[:, None], levels, 0.5 * PERIOD_NS + shift * system.bin_ns), system, tolerance=_TOLERANCE
         )
         mean = own.histogram
         count = mean.sum(-1, keepdims=True)

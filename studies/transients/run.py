@@ -50,7 +50,7 @@ def incident() -> FloatArray:
     clear = Flux.multi(Flux(GLASS[0], BACKGROUND, GLASS[1]), Flux(WALL[0], 0.0, WALL[1]))
     waveform = clear.in_fog(SYSTEM, parts=SYSTEM.bins, **FOG).waveform
     assert waveform is not None
-    return np.asarray(waveform[0, 0])
+    return waveform
 
 
 def run(request: Request) -> Facts:
@@ -64,7 +64,7 @@ def run(request: Request) -> Facts:
         request.tell(f"transients: {name}")
         system = SYSTEM.replace(detector=detector)
         cube = simulate(flux, system, seed=SEED)[0, 0].astype(np.float64)
-        expected = mean_histogram(None, BACKGROUND, system, waveform=waveform)
+        expected = mean_histogram(Flux(waveform=waveform, background=BACKGROUND), system)
         shown.append(Seen(name, expected, cube.mean(0), cube.std(0, ddof=1) / np.sqrt(exposures)))
     light = {"glass (S, ns)": GLASS, "wall (S, ns)": WALL, **FOG, "background B": BACKGROUND, "dead_time_ns": DEAD_NS}
     return {

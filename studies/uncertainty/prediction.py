@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from scipy import stats
 
-from mars_lidar import GaussianPulse, System, joint_law
+from mars_lidar import Flux, GaussianPulse, System, joint_law
 from mars_lidar._base.types import FloatArray
 from mars_lidar.learn import expected_histogram
 from studies.uncertainty.data import BACKGROUND, SIGNAL
@@ -60,7 +60,7 @@ def predict(system: System, cells: int) -> list[Predicted]:
 
 def at(signal: float, background: float, system: System) -> Predicted:
     """The prediction at one light; the return is in the middle of the period."""
-    law = joint_law(signal, background, system)
+    law = joint_law(Flux(signal, background, 0.5 * system.period_ns), system)
     exact, mean = law.covariance(), law.mean
     total = mean.sum()
     mars = np.diag(mean) + np.outer(mean, mean) * (law.count_variance / total**2 - 1.0 / total)

@@ -34,7 +34,7 @@ def test_the_simulator_has_the_law_of_one_dead_time() -> None:
         detector=ml.Detector(dead_time_ns=50.0),
         start="stationary",
     )
-    law = ml.registration_pdf(0.4, 0.15, system, "stationary", delay_ns=30.0)
+    law = ml.registration_pdf(ml.Flux(0.4, 0.15, 30.0), system, "stationary")
     counts = np.bincount((t % 100.0 / 2.0).astype(int), minlength=50)
     expected = law / law.sum() * t.size
     # dead time makes counts more even than Poisson's, so that this is a lenient law

@@ -95,7 +95,7 @@ def test_a_replaced_npz_is_not_read_under_the_old_labels(tmp_path):
     io.simulate_to(tmp_path / "cube.npz", ml.Flux(np.full((3, 4), 0.1), 0.1, 40.0), system)
     cube_before = io.load(tmp_path / "cube.npz")
     io.simulate_to(tmp_path / "cube.npz", ml.Flux(np.full((3, 4), 4.0), 0.1, 40.0), system, overwrite=True)
-    with pytest.raises(FileError, match=r"cube\.npz.* was replaced after it was opened"):
+    with pytest.raises(FileError, match=r"cube\.npz.* was changed, replaced or removed after it was opened"):
         np.asarray(cube_before.histogram)
 
 

@@ -33,7 +33,7 @@ def system_of(sigma_bins: float, dead: float, **changes: object) -> ml.System:
 
 def moved(system: ml.System, signal: float, background: float, moves: np.ndarray, level: str = "") -> np.ndarray:
     """Shapes (moves, bins) by the native alignment."""
-    canonical = exposure_moments(signal, background, system)
+    canonical = exposure_moments(ml.Flux(signal, background, 50.0), system)
     delay = 0.5 * PERIOD_NS + moves * BIN_NS
     n = moves.size
     rate = np.full(n, canonical.mean / system.cycles)
@@ -69,7 +69,7 @@ def moved(system: ml.System, signal: float, background: float, moves: np.ndarray
 
 def distance(system: ml.System, signal: float, background: float) -> float:
     """Largest total variation to the exact shape at the moved delays."""
-    exact = exposure_moments(signal, background, system, delay_ns=0.5 * PERIOD_NS + MOVES * BIN_NS).histogram
+    exact = exposure_moments(ml.Flux(signal, background, 0.5 * PERIOD_NS + MOVES * BIN_NS), system).histogram
     exact /= exact.sum(-1, keepdims=True)
     shapes = moved(system, signal, background, MOVES)
     assert shapes.min() >= 0.0
@@ -131,6 +131,6 @@ def test_drawn_histograms_follow_the_aligned_shape():
     flux = ml.Flux(np.full((8, 8), 2.0), 0.3, delay)
     table = Table.build(system, np.array([1.9, 2.0]), np.array([0.3, 0.4]))
     cube = ml.simulate(flux, system, engine="mars", table=table, realizations=8)
-    exact = exposure_moments(2.0, 0.3, system, delay_ns=delay).histogram
+    exact = exposure_moments(ml.Flux(2.0, 0.3, delay), system).histogram
     seen = cube.reshape(-1, BINS).sum(0, dtype=np.int64)
     require({"mean histogram": goodness(seen, exact / exact.sum() * seen.sum())}, "mars, aligned")

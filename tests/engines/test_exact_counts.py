@@ -63,7 +63,7 @@ def window(laws: Mended, k: int) -> Pmf:
 
 def exact(flux: ml.Flux, system: ml.System, pixel: int) -> Pmf:
     delay = float(flux.delay_ns.ravel()[pixel])
-    law = ml.count_law(flux.signal.ravel()[pixel], flux.background.ravel()[pixel], system, delay_ns=delay)
+    law = ml.count_law(ml.Flux(flux.signal.ravel()[pixel], flux.background.ravel()[pixel], delay), system)
     return Pmf(int(law.support[0]), law.pmf)
 
 
@@ -105,7 +105,9 @@ def test_at_the_entries_the_table_keeps_the_law(start: str):
         assert total_variation(window(laws, k), exact(flux, system, pixel)) < 1e-6
     matched = matched_pmf(found.cumulants)
     for row in np.flatnonzero(sure)[::16]:
-        law = ml.count_law(lut.signal[row // lut.background.size], lut.background[row % lut.background.size], system)
+        law = ml.count_law(
+            ml.Flux(lut.signal[row // lut.background.size], lut.background[row % lut.background.size], 50.0), system
+        )
         assert total_variation(matched[row], Pmf(int(law.support[0]), law.pmf)) <= AIM
 
 
@@ -123,7 +125,7 @@ def test_the_nearest_entry_gives_its_own_law():
     node = entries.rows[laws.at[0], 0]
     pixel = entries.pixels[laws.at[0]]
     signal, background = lut.signal[node // lut.background.size], lut.background[node % lut.background.size]
-    law = ml.count_law(signal, background, SYSTEM, delay_ns=float(flux.delay_ns.ravel()[pixel]))
+    law = ml.count_law(ml.Flux(signal, background, float(flux.delay_ns.ravel()[pixel])), SYSTEM)
     assert total_variation(window(laws, 0), Pmf(int(law.support[0]), law.pmf)) < 1e-4
 
 

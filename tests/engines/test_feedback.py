@@ -23,7 +23,7 @@ from harness import (
 )
 from scipy import stats
 
-from mars_lidar import joint_law
+from mars_lidar import Flux, joint_law
 from mars_lidar._base.types import FloatArray
 from mars_lidar.engines import ENGINES
 
@@ -131,10 +131,10 @@ def test_means_of_long_exposures_are_a_small_part_of_their_errors_off(name: str)
     """The rule of the internal grid: 1/20 of a standard deviation in any bin, beside the sample's own error."""
     request = LONG[name]
     law = joint_law(
-        float(request.flux.signal[0, 0]),
-        float(request.flux.background[0, 0]),
+        Flux(
+            float(request.flux.signal[0, 0]), float(request.flux.background[0, 0]), float(request.flux.delay_ns[0, 0])
+        ),
         request.system,
-        delay_ns=float(request.flux.delay_ns[0, 0]),
         tolerance=1e-4,
     )
     x = drawn(Sampler(), request)
@@ -147,7 +147,7 @@ def test_means_of_long_exposures_are_a_small_part_of_their_errors_off(name: str)
 def test_few_counts_have_the_variance_of_their_means_too():
     """Followed to first order alone, quantiles lack the variance of mu: here 0.4 % of that of each bin."""
     request = case(2.0, 5.0, 0.1, 400, bins=512, items=20_000)
-    law = joint_law(2.0, 5.0, request.system, delay_ns=float(request.flux.delay_ns[0, 0]), tolerance=1e-4)
+    law = joint_law(Flux(2.0, 5.0, float(request.flux.delay_ns[0, 0])), request.system, tolerance=1e-4)
     x = drawn(Sampler(), request)
     square = (((x - law.mean) ** 2) / law.variance).mean(1)  # a number for each exposure: bins depend on each other
     z = (square.mean() - 1.0) / (square.std() / np.sqrt(len(x)))

@@ -60,8 +60,7 @@ def test_bins_have_the_mean_and_variance_of_the_joint_law(name: str):
     """Every bin: mean to 1/20 of a standard deviation, variance to 3 %, beside the error of the sample at 5 sigma."""
     request = PULSES[name]
     flux = request.flux
-    light = float(flux.signal[0, 0]), float(flux.background[0, 0])
-    law = ml.joint_law(*light, request.system, delay_ns=float(flux.delay_ns[0, 0]))
+    law = ml.joint_law(flux[0, 0], request.system)
     x = drawn(Sampler(), request).astype(float)
     seen = law.mean > 0.1
     off = (x.mean(0) - law.mean)[seen] / np.sqrt(law.variance[seen])

@@ -37,8 +37,8 @@ def image(height: int = 5, width: int = 7, seed: int = 1) -> ml.Flux:
 
 
 def exact_law(signal: float, background: float, delay_ns: float, system: ml.System = SYSTEM) -> Law:
-    law = ml.count_law(signal, background, system, delay_ns=delay_ns)
-    histogram = exposure_moments(signal, background, system, delay_ns=delay_ns).histogram
+    law = ml.count_law(ml.Flux(signal, background, delay_ns), system)
+    histogram = exposure_moments(ml.Flux(signal, background, delay_ns), system).histogram
     pmf = np.zeros(int(law.support[-1]) + 1)
     pmf[law.support] = law.pmf
     return Law(histogram, pmf)
@@ -71,7 +71,7 @@ def test_the_gaussian_count_is_the_paper_s():
     flux = ml.Flux(np.full((1, 8), 0.9), 0.4, 40.0)
     for given in (None, table()):
         cube = ml.simulate(flux, SYSTEM, engine="mars", table=given, count="gaussian", realizations=3000)
-        exact = ml.count_law(0.9, 0.4, SYSTEM, delay_ns=40.0)
+        exact = ml.count_law(ml.Flux(0.9, 0.4, 40.0), SYSTEM)
         n = np.arange(int(exact.mean + 12 * np.sqrt(exact.variance)))
         from scipy.stats import norm
 

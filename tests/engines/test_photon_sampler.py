@@ -32,7 +32,7 @@ def shapes_of(dead: float, signals: tuple[float, ...], backgrounds: tuple[float,
         start="stationary",
     )
     s, b = np.meshgrid(signals, backgrounds, indexing="ij")
-    return system, as_shapes(exposure_moments(s.ravel(), b.ravel(), system).histogram)
+    return system, as_shapes(exposure_moments(ml.Flux(s.ravel(), b.ravel(), 50.0), system).histogram)
 
 
 class Pixels:

@@ -28,10 +28,10 @@ def test_count_and_shape(with_table: bool):
     table = Table.build(SYSTEM, np.array([1.2, 1.3]), np.array([0.4, 0.5])) if with_table else None
     flux = ml.Flux(np.full((2, 4), signal), background, delay)
     cube = ml.simulate(flux, SYSTEM, engine="renewal", table=table, realizations=1000).reshape(-1, SYSTEM.bins)
-    mean, variance = (float(x) for x in renewal_moments(signal, background, SYSTEM))
+    mean, variance = (float(x) for x in renewal_moments(ml.Flux(signal, background, 0.0), SYSTEM))
     n = np.arange(int(mean + 12 * np.sqrt(variance)))
     pmf = np.diff(stats.norm.cdf((n + 0.5 - mean) / np.sqrt(variance)), prepend=0.0)
-    exact = exposure_moments(signal, background, SYSTEM, delay_ns=delay).histogram
+    exact = exposure_moments(ml.Flux(signal, background, delay), SYSTEM).histogram
     seen = cube.sum(0, dtype=np.int64)
     require(
         {
@@ -48,7 +48,7 @@ def test_waveforms_and_returns_are_solved_at_their_own_delays():
     cube = ml.simulate(both, SYSTEM, engine="renewal", realizations=1000).reshape(-1, SYSTEM.bins)
     parts = SYSTEM.bins * 64
     wave = 0.9 * SYSTEM.pulse.bin_energy(31.7, 100.0, parts) + 0.5 * SYSTEM.pulse.bin_energy(77.7, 100.0, parts)
-    exact = exposure_moments(None, 0.2, SYSTEM, waveform=np.maximum(wave, 0.0)).histogram
+    exact = exposure_moments(ml.Flux(waveform=np.maximum(wave, 0.0), background=0.2), SYSTEM).histogram
     seen = cube.sum(0, dtype=np.int64)
     require({"shape": goodness(seen, exact / exact.sum() * seen.sum())}, "renewal, two returns")
 

@@ -124,14 +124,12 @@ def test_curves_are_python_s(page: Page, name: str):
     told = page.set(**BASE | STATES[name])
     state = page.tab.evaluate("explorer.state")
     system, delay = system_of(state), float(state["delay"])
-    light = (float(state["signal"]), float(state["background"]), system)
+    light = (ml.Flux(float(state["signal"]), float(state["background"]), delay), system)
     assert np.array_equal(told["draw"]["counts"], python_counts(state))
-    assert told["draw"]["incident"] == pytest.approx(
-        photons_per_bin(*light, bins=system.bins, delay_ns=delay), rel=1e-9, abs=1e-12
-    )
-    mean = mean_histogram(*light, delay_ns=delay)
+    assert told["draw"]["incident"] == pytest.approx(photons_per_bin(*light, bins=system.bins), rel=1e-9, abs=1e-12)
+    mean = mean_histogram(*light)
     assert np.abs(np.array(told["mean"]["mean"]) - mean).max() <= 1e-6 * mean.max()
-    law = count_law(*light, delay_ns=delay)
+    law = count_law(*light)
     assert told["mean"]["cumulants"] == pytest.approx([float(law.mean), float(law.variance)], rel=1e-5)
     assert distance(law, told["law"]) <= 2e-5
     if state["mode"] != "nonparalyzable":
@@ -139,7 +137,7 @@ def test_curves_are_python_s(page: Page, name: str):
     elif state["dead"] == 0:
         assert told["spread"] == pytest.approx(np.sqrt(told["mean"]["mean"]))
     else:
-        assert told["spread"] == pytest.approx(np.sqrt(joint_law(*light, delay_ns=delay).variance), rel=1e-3)
+        assert told["spread"] == pytest.approx(np.sqrt(joint_law(*light).variance), rel=1e-3)
 
 
 def distance(law: ml.CountLaw, told: dict[str, Any]) -> float:

@@ -268,7 +268,7 @@ def test_the_page_with_a_cube(server: CubeServer, stored: Path):
         assert told["draw"]["counts"] == np.asarray(cube.histogram[0, 6, 2]).tolist()
         state = page.tab.evaluate("explorer.state")
         assert (state["signal"], state["delay"], state["start"]) == (pytest.approx(0.8), 32.0, "stationary")
-        mean = ml.statistics.mean_histogram(0.8, 0.1, cube.system, delay_ns=32.0)
+        mean = ml.statistics.mean_histogram(ml.Flux(0.8, 0.1, 32.0), cube.system)
         assert np.abs(np.array(told["mean"]["mean"]) - mean).max() <= 1e-6 * mean.max()
         names: dict[str, Any] = {}
         exec(page.tab.inner_text("#python").replace("plt.show()", "plt.close('all')"), names)

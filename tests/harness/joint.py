@@ -26,17 +26,19 @@ class JointLaw:
         flux, system = case.flux, case.system
         background = float(flux.background[0, 0])
         if flux.waveform is not None:
-            return cls(ml.joint_law(None, background, system, waveform=flux.waveform[0, 0], tolerance=tolerance))
+            return cls(
+                ml.joint_law(ml.Flux(waveform=flux.waveform[0, 0], background=background), system, tolerance=tolerance)
+            )
         signals, delays = flux.returns_signal[:, 0, 0], flux.returns_delay_ns[:, 0, 0]
         if len(signals) == 1:
             return cls(
-                ml.joint_law(float(signals[0]), background, system, delay_ns=float(delays[0]), tolerance=tolerance)
+                ml.joint_law(ml.Flux(float(signals[0]), background, float(delays[0])), system, tolerance=tolerance)
             )
         wave = sum(
             s * np.maximum(system.pulse.bin_energy(tau, system.period_ns, _SAMPLES), 0.0)
             for s, tau in zip(signals, delays, strict=True)
         )
-        return cls(ml.joint_law(None, background, system, waveform=wave, tolerance=tolerance))
+        return cls(ml.joint_law(ml.Flux(waveform=wave, background=background), system, tolerance=tolerance))
 
     def cells(self, items: int, most: int) -> NDArray[np.float64]:
         """(cells, bins) weights of at most `most` cells, each with 500 registrations in `items` exposures."""

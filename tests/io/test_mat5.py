@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import struct
+import time
 import zlib
+from io import BytesIO
 from pathlib import Path
 
 import h5py
@@ -12,7 +15,7 @@ from scipy.io import loadmat, savemat
 
 from mars_lidar import io
 from mars_lidar._base.files import FileError, read_mat5, whole
-from mars_lidar._base.mat5 import check_elements
+from mars_lidar._base.mat5 import variables
 
 CONTENT = {
     "a": np.arange(12.0).reshape(3, 4),
@@ -34,10 +37,56 @@ def written(path: Path, *, packed: bool, **content: object) -> Path:
 @pytest.mark.parametrize("packed", [False, True])
 def test_whole_files_pass(packed: bool, tmp_path: Path):
     path = written(tmp_path / "a.mat", packed=packed)
-    check_elements(path)
-    assert (read_mat5(path)["a"] == loadmat(path)["a"]).all()
-    savemat(tmp_path / "four.mat", {"a": np.arange(3.0)}, format="4")
-    assert read_mat5(tmp_path / "four.mat")["a"].size == 3
+    assert [each.name for each in variables(path)] == list(CONTENT)
+    read, scipys = read_mat5(path), loadmat(path)
+    assert read.keys() == scipys.keys()
+    for name in CONTENT:
+        assert repr(read[name]) == repr(scipys[name])
+    assert (read_mat5(path, ["a", "none"])["a"] == CONTENT["a"]).all()
+    assert "b" not in read_mat5(path, ["a"])
+    savemat(tmp_path / "four.mat", {"a": np.arange(3.0), "b": np.eye(2)}, format="4")
+    assert read_mat5(tmp_path / "four.mat", ["a"])["a"].size == 3
+    assert read_mat5(tmp_path / "four.mat")["b"].size == 4
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_what_was_checked_is_what_is_read(packed: bool, tmp_path: Path):
+    """A file that is replaced between the check and the reading ended the process; a cut one still names itself."""
+    path = written(tmp_path / "a.mat", packed=packed)
+    found = {each.name: each for each in variables(path)}
+    content = found["a"].element()
+    damaged = bytearray(path.read_bytes())
+    damaged[136 + 60 :] = bytes(len(damaged) - 196)
+    path.write_bytes(damaged)
+    assert (loadmat(BytesIO(content))["a"] == CONTENT["a"]).all()
+    if packed:
+        with pytest.raises((ValueError, zlib.error)):
+            found["cells"].element()
+
+
+def test_a_packed_variable_with_a_wrong_checksum_is_refused(tmp_path: Path):
+    path = tmp_path / "a.mat"
+    savemat(path, {"a": np.arange(1000.0)}, do_compression=True)
+    content = bytearray(path.read_bytes())
+    content[-2] ^= 1  # of its Adler-32
+    path.write_bytes(content)
+    with pytest.raises(FileError, match=r"a\.mat"):
+        read_mat5(path)
+
+
+def test_a_bomb_of_empty_cells_is_refused(tmp_path: Path):
+    """1.4 million cells in 350 kB: SciPy makes an array of each."""
+    path = tmp_path / "a.mat"
+    savemat(path, {"b": np.zeros(1)})
+    empty = struct.pack("<12I", 14, 40, 6, 8, 6, 0, 5, 8, 0, 0, 1, 0)
+    number = 1_400_000
+    inside = struct.pack("<10I", 6, 8, 1, 0, 5, 8, 1, number, 1 | 1 << 16, 97) + empty * number
+    packed = zlib.compress(struct.pack("<II", 14, len(inside)) + inside, 9)
+    path.write_bytes(path.read_bytes()[:128] + struct.pack("<II", 15, len(packed)) + packed)
+    began = time.process_time()
+    with pytest.raises(FileError, match=r"a\.mat"):
+        read_mat5(path)
+    assert time.process_time() - began < 3.0
 
 
 def test_a_type_that_there_is_not_is_refused(tmp_path: Path):

@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from mars_lidar import Flux
+
 PATH = Path(__file__).parents[2] / "examples" / "train_depth.py"
 
 
@@ -60,7 +62,9 @@ def test_the_data_term_of_the_learned_prior_is_the_likelihood(deepinv):
     gradient = example["Likelihood"]().grad(example["images"](light), y, physics)[0].detach()
     units = (light[0, 0], light[0, 1], torch.tensor(example["PULSE_NS"]).expand(8, 8))
     for row, column in ((0, 0), (3, 4), (7, 2), (5, 5)):
-        _, slope, information = log_likelihood(y[0, :, row, column].numpy(), system, *light[0, :, row, column].numpy())
+        _, slope, information = log_likelihood(
+            y[0, :, row, column].numpy(), Flux(*light[0, :, row, column].numpy()), system
+        )
         for channel, unit in enumerate(units):
             told = -slope[channel] * unit[row, column].item()
             deviation = information[channel, channel] ** 0.5 * unit[row, column].item()

@@ -120,7 +120,7 @@ def test_gradient_at_many_bins_is_that_of_the_exact_mean_histogram():
     at, step = np.array([0.9, 0.4, 61.3]), np.array([1e-2, 1e-2, 1e-2])
     weights = np.cos(np.arange(512.0) / 9)
     both = at + np.concatenate([np.diag(step), -np.diag(step)])
-    exact = ml.statistics.mean_histogram(both[:, 0], both[:, 1], one, delay_ns=both[:, 2], tolerance=1e-6) @ weights
+    exact = ml.statistics.mean_histogram(ml.Flux(both[:, 0], both[:, 1], both[:, 2]), one, tolerance=1e-6) @ weights
     x = point(*at)
     (expected_histogram(*x, one) @ torch.tensor(weights)).backward()
     np.testing.assert_allclose([float(v.grad) for v in x], (exact[:3] - exact[3:]) / (2 * step), rtol=2e-3)
@@ -143,7 +143,7 @@ def test_expected_histogram_is_the_exact_mean(start, dead_ns):
     """
     one = system(dead_ns, bins=50, start=start, cycles=1000)
     s, b, tau = (np.array(x) for x in ([0.7, 3.0, 0.02, 0.0], [0.3, 1.0, 0.01, 0.2], [40.0, 97.0, 3.3, 0.0]))
-    exact = ml.statistics.mean_histogram(s, b, one, delay_ns=tau, tolerance=1e-6)
+    exact = ml.statistics.mean_histogram(ml.Flux(s, b, tau), one, tolerance=1e-6)
     near = (dead_ns + 2.0) % 100.0 < 4.0 and dead_ns % 100.0 > 0.0  # one bin from 0 or a period: hard for the grid
     for refine, error in ((None, 4e-3 if near else 2e-4), (12, 2e-4 if near else 1e-5)):
         found = expected_histogram(*point(s, b, tau), one, refine=refine).detach().numpy()
@@ -162,7 +162,7 @@ def test_efficiency_and_dark_counts_are_those_of_the_exact_mean():
     )
     at = point(*AT)
     mean = expected_histogram(*at, dim, refine=4)
-    exact = ml.statistics.mean_histogram(AT[0], AT[1], dim, delay_ns=AT[2])
+    exact = ml.statistics.mean_histogram(ml.Flux(AT[0], AT[1], AT[2]), dim)
     assert np.abs(mean.detach().numpy() - exact).sum(-1).max() < 2e-3 * exact.sum(-1).min()
     counts = mean.detach().round()
     likely = histogram_log_likelihood(counts, *at, dim)
@@ -184,7 +184,7 @@ def test_narrow_pulse_at_many_bins():
     )
     s, b, tau = (np.array(x) for x in ([0.5, 5.0], [1.0, 0.1], [40.03, 99.99]))
     found = expected_histogram(*point(s, b, tau), one).detach().numpy()
-    exact = ml.statistics.mean_histogram(s, b, one, delay_ns=tau)
+    exact = ml.statistics.mean_histogram(ml.Flux(s, b, tau), one)
     assert (np.abs(found - exact).sum(-1) / 2 < 2e-4 * exact.sum(-1)).all()
 
 
@@ -242,7 +242,7 @@ def test_log_likelihood_is_the_native_one():
     counts = ml.simulate(flux, one, seed=1)[0, 0, 0]
     at = point([0.7, 0.5], [0.3, 0.35], [40.0, 40.5])
     found = histogram_log_likelihood(torch.from_numpy(counts.astype(float)), *at, one)
-    value, gradient, _ = log_likelihood(counts, one, *(x.detach().numpy() for x in at))
+    value, gradient, _ = log_likelihood(counts, ml.Flux(*(x.detach().numpy() for x in at)), one)
     found.sum().backward()
     np.testing.assert_allclose(float((found[0] - found[1]).detach()), value[0] - value[1], rtol=5e-3)
     for k in range(3):

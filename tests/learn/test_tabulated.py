@@ -50,7 +50,7 @@ def test_it_is_the_exact_mean_histogram(sigma_ns, dead_ns, start, error):
     b = np.array([0.05, 1.0, 0.05, 2.0, 1.0, 0.0, 0.99])
     tau = np.array([40.03, 50.0, 99.98, 75.02, 5.0, 0.01, 20.07])
     found = HistogramTable(table)(*point(s, b, tau, dtype=torch.float32)).detach().double().numpy()
-    exact = ml.statistics.mean_histogram(s, b, table.system, delay_ns=tau)
+    exact = ml.statistics.mean_histogram(ml.Flux(s, b, tau), table.system)
     assert (found >= 0.0).all()
     off = np.abs(found - exact).sum(-1) / 2 / exact.sum(-1)
     assert (off < error).all(), off
@@ -107,7 +107,7 @@ def test_it_leads_back_to_the_pixel_of_an_exact_mean(table):
     """From a mean histogram that no table knows, by its gradients alone (L-BFGS), pixel by pixel of a map."""
     true = np.array([[1.0, 0.5, 61.3], [3.0, 1.5, 12.34], [0.5, 0.1, 99.9]])
     one = table.system
-    mean = torch.from_numpy(ml.statistics.mean_histogram(*true.T[:2], one, delay_ns=true[:, 2]))
+    mean = torch.from_numpy(ml.statistics.mean_histogram(ml.Flux(*true.T), one))
     fine = HistogramTable(ml.Table.build(one, (0.2, 5.0, 24), (0.05, 2.0, 16), threads=1)).double()
     x = (torch.from_numpy(true) * torch.tensor([0.8, 1.3, 1.0]) + torch.tensor([0.0, 0.0, 0.4])).requires_grad_()
     optimizer = torch.optim.LBFGS([x], max_iter=60, line_search_fn="strong_wolfe", tolerance_change=1e-12)

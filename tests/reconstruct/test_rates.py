@@ -66,7 +66,7 @@ def test_generalised_coates_inverts_the_exact_mean(dead_ns, start):
     for bins in (250, 1000):
         system = system_of(dead_ns, bins=bins, cycles=2000, start=start)
         rate = photons(system, 1.0, 1.0, 37.0)
-        mean = mean_histogram(1.0, 1.0, system, delay_ns=37.0, tolerance=1e-6)
+        mean = mean_histogram(ml.Flux(1.0, 1.0, 37.0), system, tolerance=1e-6)
         error.append(np.abs(generalised_coates_rates(mean, system) - rate).sum() / rate.sum())
     assert error[1] < 2e-4
     assert error[1] < 0.25 * error[0] + 2e-5
@@ -76,7 +76,7 @@ def test_generalised_coates_inverts_the_exact_mean(dead_ns, start):
 def test_coates_inverts_the_exact_mean(dead_ns, cycles):
     system = system_of(dead_ns, cycles=cycles, mode="synchronous")
     rate = photons(system, 1.0, 0.5, 37.0)
-    mean = mean_histogram(1.0, 0.5, system, delay_ns=37.0)
+    mean = mean_histogram(ml.Flux(1.0, 0.5, 37.0), system)
     found = coates_rates(mean, system)
     assert np.abs(found / rate - 1.0).max() < (1e-9 if dead_ns == 0 else 1e-3)
 
@@ -91,7 +91,7 @@ def test_coates_is_the_textbook_formula():
 
 def test_a_gate_that_stays():
     system = system_of(45.0, mode="gated", gate_start_ns=80.03, gate_width_ns=40.0)
-    mean = mean_histogram(1.0, 1.0, system, delay_ns=95.0, tolerance=1e-6)
+    mean = mean_histogram(ml.Flux(1.0, 1.0, 95.0), system, tolerance=1e-6)
     found = generalised_coates_rates(mean, system)
     rate = photons(system, 1.0, 1.0, 95.0)
     inside = np.r_[402:500, 0:99]
@@ -104,7 +104,7 @@ def test_mchc_has_the_histogram_as_its_fixed_point():
     for dead_ns in (23.0, 64.04, 237.77):
         system = system_of(dead_ns, cycles=10**6)
         rate = photons(system, 1.0, 1.0, 37.0)
-        mean = mean_histogram(1.0, 1.0, system, delay_ns=37.0, tolerance=1e-6)
+        mean = mean_histogram(ml.Flux(1.0, 1.0, 37.0), system, tolerance=1e-6)
         found = mchc_rates(mean, system, tolerance=1e-9)
         assert np.abs(found - rate).sum() / rate.sum() < 1e-3
         known = mchc_rates(mean, system, total=2.0, tolerance=1e-9)
@@ -139,4 +139,4 @@ def test_what_no_method_knows_of_the_detector_is_told(effect):
     with pytest.warns(UserWarning, match=next(iter(effect))):
         ml.reconstruct(cube, odd)
     with pytest.raises(ValueError, match=f"cramer_rao does not do {next(iter(effect))}"):
-        ml.cramer_rao(1.0, 0.5, odd, delay_ns=37.0)
+        ml.cramer_rao(ml.Flux(1.0, 0.5, 37.0), odd)

@@ -25,12 +25,17 @@ def with_dead(dead_ns: float, cycles: int = 4000, **detector) -> ml.System:
     return SYSTEM.replace(cycles=cycles, detector=ml.Detector(dead_time_ns=dead_ns, **detector))
 
 
-def drawn(system: ml.System, signals, background: float, delays, pixels: int, seed: int = 1) -> np.ndarray:
+def pixel(signals, background: float, delays, pixels: int = 1) -> ml.Flux:
+    """Alike pixels of several returns."""
     parts = [
         ml.Flux(np.full(pixels, s), background if k == 0 else 0.0, at)
         for k, (s, at) in enumerate(zip(signals, delays, strict=True))
     ]
-    return ml.simulate(ml.Flux.multi(*parts), system, seed=seed)[0, 0]
+    return ml.Flux.multi(*parts)
+
+
+def drawn(system: ml.System, signals, background: float, delays, pixels: int, seed: int = 1) -> np.ndarray:
+    return ml.simulate(pixel(signals, background, delays, pixels), system, seed=seed)[0, 0]
 
 
 ALONE = {
@@ -99,7 +104,7 @@ def test_both_are_found_and_their_errors_hold(name: str) -> None:
     assert both.mean() > 0.97
     assert np.isnan(found.depth_m[both, 2]).all()
     assert (found.false_alarm[both, :2] < 0.01).all()
-    bound = returns_bound(signals, background, system, delay_ns=delay)
+    bound = returns_bound(pixel(signals, background, delay), system)
     outcomes = {}
     count = int(both.sum())
     for what, error, stated, least in (
@@ -188,12 +193,14 @@ def test_bad_input(change: dict, message: str) -> None:
 
 
 def test_the_bound_of_one_is_that_of_one() -> None:
-    one = ml.cramer_rao(1.0, 0.5, SYSTEM, delay_ns=DELAY)
-    same = returns_bound([1.0], 0.5, SYSTEM, delay_ns=[DELAY])
+    one = ml.cramer_rao(ml.Flux(1.0, 0.5, DELAY), SYSTEM)
+    same = returns_bound(ml.Flux(1.0, 0.5, DELAY), SYSTEM)
     assert same.depth_m[0] == pytest.approx(float(one.depth_m), rel=1e-3)
     assert same.signal[0] == pytest.approx(float(one.signal), rel=1e-3)
-    far = returns_bound([0.5, 0.5], 0.5, SYSTEM, delay_ns=[10.0, 60.0])
-    near = returns_bound([0.5, 0.5], 0.5, SYSTEM, delay_ns=[10.0, 10.5])
+    far = returns_bound(pixel([0.5, 0.5], 0.5, [10.0, 60.0]), SYSTEM)
+    near = returns_bound(pixel([0.5, 0.5], 0.5, [10.0, 10.5]), SYSTEM)
     assert (near.depth_m > 1.5 * far.depth_m).all()
-    with pytest.raises(ValueError, match="signal and delay_ns must be"):
-        returns_bound([1.0, 2.0], 0.5, SYSTEM, delay_ns=[10.0])
+    with pytest.raises(ValueError, match=r"one return in each pixel; several .* `returns_bound`"):
+        ml.cramer_rao(pixel([0.5, 0.5], 0.5, [10.0, 60.0]), SYSTEM)
+    with pytest.raises(ValueError, match="flux must have returns with delays, and background > 0"):
+        returns_bound(pixel([1.0, 2.0], 0.0, [10.0, 20.0]), SYSTEM)

@@ -45,18 +45,18 @@ def view(mode: str, dead: float, start: str = "armed", cycles: int = 40, **chang
     ).replace(**changes)
 
 
-def law_of(case: Case, **pixel: Any) -> Law:
+def law_of(case: Case, flux: ml.Flux) -> Law:
     """What the statistics say about a case."""
-    histogram = mean_histogram(system=case.system, **pixel)
-    shape = ml.registration_pdf(system=case.system, **pixel)
+    histogram = mean_histogram(flux, case.system)
+    shape = ml.registration_pdf(flux, case.system)
     assert shape == pytest.approx(histogram / histogram.sum(), abs=1e-12)
-    law = ml.count_law(system=case.system, **pixel)
+    law = ml.count_law(flux, case.system)
     assert law.mean == pytest.approx(histogram.sum(), rel=1e-3)
     assert law.pmf @ law.support == pytest.approx(float(law.mean), rel=1e-6)
     pmf = np.zeros(law.support[-1] + 1)
     pmf[law.support] = law.pmf
     if case.system.detector.mode == "paralyzable":  # the closed form of mean, variance and shape
-        moments = paralyzable_moments(system=case.system, **pixel)
+        moments = paralyzable_moments(flux, case.system)
         assert law.cumulants[:2] == pytest.approx([float(moments.mean), float(moments.variance)], rel=3e-5)
         histogram = moments.histogram
     return Law(histogram, pmf)
@@ -69,7 +69,7 @@ def test_statistics_are_those_of_the_exact_engine(mode: str, dead: float, start:
     system = view(mode, dead, start)
     signal, background = (1.5, 0.5) if dead < 2 else (0.05, 0.02)
     case = Case(f"{mode}, t_d {dead:g}, {start}", flux_of(signal, background, 0.37), system, 6000)
-    law = law_of(case, signal=signal, background=background, delay_ns=37.0)
+    law = law_of(case, ml.Flux(signal, background, 37.0))
     check(ENGINES["exact"], case, law, {COUNTS, SHAPE})
 
 
@@ -77,7 +77,7 @@ def test_statistics_are_those_of_the_exact_engine(mode: str, dead: float, start:
 def test_waveforms(mode: str):
     wave = two_lobes() / 12
     case = Case(f"{mode}, waveform", flux_of_waveform(wave, 0.3), view(mode, 0.7), 6000)
-    law = law_of(case, signal=None, background=0.3, waveform=wave)
+    law = law_of(case, ml.Flux(waveform=wave, background=0.3))
     check(ENGINES["exact"], case, law, {COUNTS, SHAPE})
 
 
@@ -85,14 +85,14 @@ def test_waveforms(mode: str):
 def test_cells_broadcast(mode: str):
     system, signal, background = view(mode, 0.7), np.array([0.0, 0.3, 2.0]), np.array([[0.1], [0.0]])
     delay = np.array([10.0, 33.0, 99.0])
-    together = mean_histogram(signal, background, system, delay_ns=delay)
+    together = mean_histogram(ml.Flux(signal, background, delay), system)
     assert together.shape == (2, 3, 50)
     for i in range(2):
         for k in range(3):
-            alone = mean_histogram(signal[k], background[i, 0], system, delay_ns=delay[k])
+            alone = mean_histogram(ml.Flux(signal[k], background[i, 0], delay[k]), system)
             assert together[i, k] == pytest.approx(alone, rel=1e-3, abs=1e-7)
     assert together[1, 0].sum() == 0.0
-    assert np.isfinite(ml.registration_pdf(signal, background, system, delay_ns=delay)).all()
+    assert np.isfinite(ml.registration_pdf(ml.Flux(signal, background, delay), system)).all()
 
 
 # Paralyzable
@@ -101,17 +101,17 @@ def test_cells_broadcast(mode: str):
 @pytest.mark.parametrize(("rate", "dead", "cycles"), [(1.0, 0.6, 30), (4.0, 1.3, 20), (0.2, 7.0, 30), (0.2, 7.25, 5)])
 def test_paralyzable_constant_rate(rate: float, dead: float, cycles: int):
     r, t = rate * np.exp(-rate * dead), float(cycles)
-    found = paralyzable_moments(0.0, rate, view("paralyzable", dead, "stationary", cycles))
+    found = paralyzable_moments(ml.Flux(0.0, rate), view("paralyzable", dead, "stationary", cycles))
     near = min(dead, t)
     assert float(found.mean) == pytest.approx(r * t, rel=1e-9)
     assert float(found.variance) == pytest.approx(r * t - r**2 * (2 * t * near - near**2), rel=1e-5)
-    armed = paralyzable_moments(0.0, rate, view("paralyzable", dead, "armed", cycles))
+    armed = paralyzable_moments(ml.Flux(0.0, rate), view("paralyzable", dead, "armed", cycles))
     # the first t_d sees the first arrival and nothing else
     assert float(armed.mean) == pytest.approx(-np.expm1(-rate * near) + r * (t - near), rel=1e-9)
 
 
 def test_paralyzable_without_dead_time_is_poisson():
-    found = paralyzable_moments([0.0, 2.0], 0.5, view("paralyzable", 0.0))
+    found = paralyzable_moments(ml.Flux([0.0, 2.0], 0.5, 50.0), view("paralyzable", 0.0))
     assert found.mean == pytest.approx(40 * np.array([0.5, 2.5]), rel=1e-9)
     assert found.variance == pytest.approx(found.mean, rel=1e-9)
 
@@ -119,7 +119,13 @@ def test_paralyzable_without_dead_time_is_poisson():
 def test_paralyzable_long_exposures_grow_linearly():
     """Mean and variance of 1e8 periods, and what one more period adds."""
     for start in ("armed", "stationary"):
-        a, b, c = (paralyzable_moments(1.0, 0.3, view("paralyzable", 2.4, start, n)) for n in (50, 51, 100_000_000))
+        a, b, c = (
+            paralyzable_moments(
+                ml.Flux(1.0, 0.3, 50.0),
+                view("paralyzable", 2.4, start, n),
+            )
+            for n in (50, 51, 100_000_000)
+        )
         for name in ("mean", "variance"):
             x, y, z = (float(getattr(m, name)) for m in (a, b, c))
             assert z == pytest.approx(x + (y - x) * (100_000_000 - 50), rel=1e-9)
@@ -159,7 +165,7 @@ def by_recursion(system: ml.System, early: float, total: float) -> np.ndarray:
 @pytest.mark.parametrize("rate", [0.05, 0.8, 4.0])
 def test_synchronous_count_law(rate: float, dead: float, start: str):
     system = view("synchronous", dead, start, 60)
-    law = ml.count_law(0.0, rate, system)
+    law = ml.count_law(ml.Flux(0.0, rate), system)
     expected = by_recursion(system, rate * (1.0 - dead % 1.0), rate)
     pmf = np.zeros_like(expected)
     pmf[law.support] = law.pmf
@@ -185,7 +191,7 @@ def test_synchronous_law_by_its_transform(
     system, laws = view("synchronous", dead, start, cycles), []
     for terms in (0, 10**18):
         monkeypatch.setattr(synchronous_module, "_MANY_TERMS", terms)
-        law = ml.count_law(signal, background, system, delay_ns=37.0)
+        law = ml.count_law(ml.Flux(signal, background, 37.0), system)
         laws.append(np.zeros(cycles + 1))
         laws[-1][law.support] = law.pmf
     assert laws[0] == pytest.approx(laws[1], abs=1e-11)
@@ -196,7 +202,7 @@ def test_synchronous_law_by_its_transform(
 def test_synchronous_law_of_long_exposures(dead: float, start: str):
     """A renewal process: N / mu and N sigma^2 / mu^3 registrations, mu and sigma of the periods that one takes."""
     rate, cycles = 1.3, 10**8
-    law = ml.count_law(0.0, rate, view("synchronous", dead, start, cycles))
+    law = ml.count_law(ml.Flux(0.0, rate), view("synchronous", dead, start, cycles))
     q, late = -np.expm1(-rate), np.exp(-rate * (1 - dead % 1)) * -np.expm1(-rate * (dead % 1)) / -np.expm1(-rate)
     mu, spread = np.floor(dead) + 1 + (1 - q) / q + late, (1 - q) / q**2 + late * (1 - late)
     assert law.mean == pytest.approx(cycles / mu, abs=1.0)
@@ -207,7 +213,7 @@ def test_synchronous_law_of_long_exposures(dead: float, start: str):
 @pytest.mark.parametrize("cycles", [1, 1000, 1_000_000])
 def test_synchronous_is_binomial(cycles: int):
     system = view("synchronous", 0.0, cycles=cycles)
-    law = ml.count_law([0.5, 0.0, 3.0], [0.1, 0.0, 1.0], system)
+    law = ml.count_law(ml.Flux([0.5, 0.0, 3.0], [0.1, 0.0, 1.0], 50.0), system)
     q = -np.expm1(-np.array([0.6, 0.0, 4.0]))
     assert law.mean == pytest.approx(cycles * q, rel=1e-9)
     assert law.variance == pytest.approx(cycles * q * (1 - q), rel=1e-6)
@@ -217,7 +223,7 @@ def test_synchronous_is_binomial(cycles: int):
 def test_coates_inverts_the_synchronous_histogram():
     """r_i = ln[(N_r - sum_{k<i} n_k) / (N_r - sum_{k<=i} n_k)] of the mean histogram is the flux (Coates 1968)."""
     system = view("synchronous", 0.0, cycles=500)
-    n = mean_histogram(2.0, 0.7, system, delay_ns=40.0)
+    n = mean_histogram(ml.Flux(2.0, 0.7, 40.0), system)
     left = 500 - np.concatenate([[0.0], np.cumsum(n)])
     photons = 2.0 * system.pulse.bin_energy(40.0, PERIOD_NS, 50) + 0.7 / 50
     assert np.log(left[:-1] / left[1:]) == pytest.approx(photons, rel=1e-9)
@@ -241,7 +247,7 @@ def test_gate_that_is_always_open_has_the_free_law():
     always = ml.Detector(dead_time_ns=63.75, mode="gated", gate_start_ns=20.0, gate_width_ns=100.0)
     for start in ("armed", "stationary"):
         a, b = (
-            exposure_moments(1.5, 0.5, system.replace(detector=d, start=start), delay_ns=37.0)
+            exposure_moments(ml.Flux(1.5, 0.5, 37.0), system.replace(detector=d, start=start))
             for d in (system.detector, always)
         )
         assert b.cumulants == pytest.approx(a.cumulants, rel=1e-7, abs=1e-7)
@@ -253,12 +259,12 @@ def test_gate_shorter_than_the_dead_time():
     system = view("gate", 0.6, bins=1000)
     photons = 1.5 * system.pulse.bin_energy(37.0, PERIOD_NS, 1000) + 0.5 / 1000
     photons[:303], photons[413:] = 0.0, 0.0
-    law = ml.count_law(1.5, 0.5, system, delay_ns=37.0)
+    law = ml.count_law(ml.Flux(1.5, 0.5, 37.0), system)
     q = -np.expm1(-photons.sum())
     assert law.mean == pytest.approx(40 * q, rel=1e-5)
     assert law.variance == pytest.approx(40 * q * (1 - q), rel=1e-4)
     assert law.pmf == pytest.approx(stats.binom.pmf(law.support, 40, q), abs=1e-5)
-    assert mean_histogram(1.5, 0.5, system, delay_ns=37.0) == pytest.approx(40 * first_arrival(photons), abs=1e-4)
+    assert mean_histogram(ml.Flux(1.5, 0.5, 37.0), system) == pytest.approx(40 * first_arrival(photons), abs=1e-4)
 
 
 # Refused
@@ -269,22 +275,22 @@ def test_what_does_not_treat_a_mode_says_so(mode: str):
     system = view(mode, 0.7)
     named = system.detector.mode
     calls = {
-        "count_law of method 'mars'": lambda: ml.count_law(1.0, 1.0, system, "mars"),
-        "count_law of method 'renewal'": lambda: ml.count_law(1.0, 1.0, system, "renewal"),
-        "registration_pdf of method 'chain'": lambda: ml.registration_pdf(1.0, 1.0, system, "chain"),
-        "holding_time_covariance": lambda: ml.holding_time_covariance(1.0, 1.0, system),
-        "mars_moments": lambda: mars_moments(1.0, 1.0, system),
-        "the chain of phases": lambda: PhaseChain.from_flux(1.0, 1.0, system),
-        "renewal_moments": lambda: renewal_moments(1.0, 1.0, system),
-        "renewal_pmf": lambda: renewal_pmf(1.0, 1.0, system, [1]),
+        "count_law of method 'mars'": lambda: ml.count_law(ml.Flux(1.0, 1.0, 50.0), system, "mars"),
+        "count_law of method 'renewal'": lambda: ml.count_law(ml.Flux(1.0, 1.0, 50.0), system, "renewal"),
+        "registration_pdf of method 'chain'": lambda: ml.registration_pdf(ml.Flux(1.0, 1.0, 50.0), system, "chain"),
+        "holding_time_covariance": lambda: ml.holding_time_covariance(ml.Flux(1.0, 1.0, 50.0), system),
+        "mars_moments": lambda: mars_moments(ml.Flux(1.0, 1.0, 50.0), system),
+        "the chain of phases": lambda: PhaseChain.from_flux(ml.Flux(1.0, 1.0, 50.0), system),
+        "renewal_moments": lambda: renewal_moments(ml.Flux(1.0, 1.0, 0.0), system),
+        "renewal_pmf": lambda: renewal_pmf(ml.Flux(1.0, 1.0, 0.0), system, [1]),
     }
     if mode != "paralyzable":
-        calls["paralyzable_moments"] = lambda: paralyzable_moments(1.0, 1.0, system)
+        calls["paralyzable_moments"] = lambda: paralyzable_moments(ml.Flux(1.0, 1.0, 50.0), system)
     if mode == "synchronous":
-        calls["exposure_moments"] = lambda: exposure_moments(1.0, 1.0, system)
+        calls["exposure_moments"] = lambda: exposure_moments(ml.Flux(1.0, 1.0, 50.0), system)
     if mode == "gate":
-        calls["poisson_moments"] = lambda: poisson_moments(1.0, 1.0, system)
-        calls["poisson_pmf"] = lambda: poisson_pmf(1.0, 1.0, system, [1])
+        calls["poisson_moments"] = lambda: poisson_moments(ml.Flux(1.0, 1.0, 0.0), system)
+        calls["poisson_pmf"] = lambda: poisson_pmf(ml.Flux(1.0, 1.0, 0.0), system, [1])
     for what, call in calls.items():
         with pytest.raises(ValueError) as error:
             call()
@@ -299,22 +305,22 @@ def test_moving_gates_are_refused():
     moving = ml.Detector(dead_time_ns=5.0, mode="gated", gate_start_ns=3.0, gate_width_ns=9.0, gate_step_ns=1.0)
     for call in (ml.count_law, mean_histogram, ml.registration_pdf, exposure_moments):
         with pytest.raises(ValueError, match=r"a gate that repeats every period, got gate_step_ns=1; .* simulated"):
-            call(1.0, 1.0, system.replace(detector=moving))
+            call(ml.Flux(1.0, 1.0, 50.0), system.replace(detector=moving))
 
 
 def test_poisson_law_is_that_of_the_gated_arrivals():
     system = view("wrapping gate", 3.0)
-    law = ml.count_law(1.5, 0.5, system, "poisson", delay_ns=37.0)
+    law = ml.count_law(ml.Flux(1.5, 0.5, 37.0), system, "poisson")
     inside = 0.5 * 0.5 + 1.5 * (stats.norm.cdf(3.0 / 2.0) + stats.norm.sf((90 - 37) / 2.0))
     assert law.mean == pytest.approx(40 * inside, rel=1e-9)
 
 
 def test_too_long_dead_times_and_sharp_tolerances_are_refused():
     with pytest.raises(ValueError, match=r"dead_time_ns must be at most 20000 periods .*'paralyzable', got 30000"):
-        paralyzable_moments(1.0, 1.0, view("paralyzable", 3e4))
-    assert mean_histogram(1.0, 1.0, view("paralyzable", 3e4)).sum() == pytest.approx(1.0)
+        paralyzable_moments(ml.Flux(1.0, 1.0, 50.0), view("paralyzable", 3e4))
+    assert mean_histogram(ml.Flux(1.0, 1.0, 50.0), view("paralyzable", 3e4)).sum() == pytest.approx(1.0)
     with pytest.raises(ValueError, match=r"tolerance must be"):
-        paralyzable_moments(1.0, 1.0, view("paralyzable", 1.0), tolerance=0.0)
+        paralyzable_moments(ml.Flux(1.0, 1.0, 50.0), view("paralyzable", 1.0), tolerance=0.0)
     narrow = view("paralyzable", 0.3, pulse=ml.GaussianPulse(sigma_ns=1e-2))
     with pytest.raises(ConvergenceError, match=r"paralyzable statistics of S = 5.*more than 1e-09"):
-        paralyzable_moments(5.0, 1.0, narrow, tolerance=1e-9)
+        paralyzable_moments(ml.Flux(5.0, 1.0, 0.5 * narrow.period_ns), narrow, tolerance=1e-9)

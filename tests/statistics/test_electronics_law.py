@@ -54,7 +54,7 @@ def test_law_at_a_constant_rate():
         reached.append(record.sum())
         record = np.fft.irfft(np.fft.rfft(record, size) * np.fft.rfft(step, size), size)[: wait.size]
     expected = -np.diff([1.0, *reached, 0.0])
-    found = pmf_of(ml.count_law(0.0, rate, view(dead, electronics, cycles=cycles)))
+    found = pmf_of(ml.count_law(ml.Flux(0.0, rate), view(dead, electronics, cycles=cycles)))
     assert found[: expected.size] == pytest.approx(expected[: found.size], abs=2e-3)
     assert found.sum() == pytest.approx(1.0, abs=1e-12)
     mean = expected @ np.arange(expected.size)
@@ -80,10 +80,10 @@ def test_law_of_the_sequential_engine(
 ):
     system = view(dead, electronics, start, cycles, **detector)
     case = Case(f"t_d {dead:g}, t_e {electronics:g}, {start}", flux_of(signal, background, 0.37), system, 4000)
-    law = ml.count_law(signal, background, system, delay_ns=37.0)
-    histogram = mean_histogram(signal, background, system, delay_ns=37.0)
+    law = ml.count_law(ml.Flux(signal, background, 37.0), system)
+    histogram = mean_histogram(ml.Flux(signal, background, 37.0), system)
     check(ENGINES["sequential"], case, Law(histogram, pmf_of(law)), {COUNTS, SHAPE})
-    known = electronics_moments(signal, background, system, delay_ns=37.0)
+    known = electronics_moments(ml.Flux(signal, background, 37.0), system)
     spread = float(np.sqrt(known.variance))
     assert abs(float(law.mean - known.mean)) < 1e-3 * spread
     assert float(law.variance) == pytest.approx(float(known.variance), rel=1e-3)
@@ -92,7 +92,7 @@ def test_law_of_the_sequential_engine(
 def test_waveform():
     wave = two_lobes() / 12
     system = view(0.3, 0.8)
-    law = ml.count_law(None, 0.3, system, waveform=wave)
+    law = ml.count_law(ml.Flux(waveform=wave, background=0.3), system)
     case = Case("waveform", waveform_flux(wave, 0.3), system, 8000)
     check(ENGINES["sequential"], case, Law(None, pmf_of(law)), {COUNTS})
 
@@ -100,21 +100,24 @@ def test_waveform():
 @pytest.mark.parametrize(("dead", "electronics"), [(0.7, 0.5), (0.7, 0.7), (0.0, 0.6)])
 def test_where_one_of_the_two_has_no_effect(dead: float, electronics: float):
     plain = view(max(dead, electronics), 0.0)
-    found, expected = (ml.count_law(2.0, 0.3, system) for system in (view(dead, electronics), plain))
+    found, expected = (ml.count_law(ml.Flux(2.0, 0.3, 50.0), system) for system in (view(dead, electronics), plain))
     assert found.cumulants == pytest.approx(expected.cumulants, rel=1e-7)
     assert pmf_of(found) == pytest.approx(pmf_of(expected), abs=1e-12)
 
 
 @pytest.mark.full
 def test_long_exposures_and_cells():
-    a, b, c = (ml.count_law(2.0, 0.3, view(0.4, 1.3, cycles=n)) for n in (400, 401, 1_000_000))
+    a, b, c = (ml.count_law(ml.Flux(2.0, 0.3, 50.0), view(0.4, 1.3, cycles=n)) for n in (400, 401, 1_000_000))
     slope = b.cumulants - a.cumulants
     assert c.cumulants[:2] == pytest.approx((a.cumulants + slope * (1_000_000 - 400))[:2], rel=1e-3)
     assert c.pmf @ c.support == pytest.approx(float(c.mean), rel=1e-9)
-    both = ml.count_law(np.array([0.0, 2.0]), np.array([0.0, 0.3]), view(0.4, 1.3, cycles=400))
+    both = ml.count_law(
+        ml.Flux(np.array([0.0, 2.0]), np.array([0.0, 0.3]), 50.0),
+        view(0.4, 1.3, cycles=400),
+    )
     assert both.mean == pytest.approx([0.0, float(a.mean)], abs=1e-6)
     assert both.pmf[0, 0] == 1.0
-    assert pmf_of(ml.count_law(1e-9, 1e-9, view(0.4, 1.3)))[0] == pytest.approx(1.0, abs=1e-6)
+    assert pmf_of(ml.count_law(ml.Flux(1e-9, 1e-9, 50.0), view(0.4, 1.3)))[0] == pytest.approx(1.0, abs=1e-6)
 
 
 @pytest.mark.full
@@ -136,14 +139,14 @@ def test_stationary_shape_is_that_of_long_exposures(
 ):
     """Against the recursion of a long exposure, and against records of the sequential engine once it is warm."""
     system = view(dead, electronics, start, 20_000, **detector)
-    shape = ml.registration_pdf(signal, background, system, "stationary", delay_ns=37.0)
+    shape = ml.registration_pdf(ml.Flux(signal, background, 37.0), system, "stationary")
     assert shape.sum() == pytest.approx(1.0, abs=1e-12)
     assert shape.min() >= 0.0
-    long = ml.registration_pdf(signal, background, system, "exposure", delay_ns=37.0)
+    long = ml.registration_pdf(ml.Flux(signal, background, 37.0), system, "exposure")
     assert 0.5 * np.abs(shape - long).sum() < 1e-3
-    again = ml.registration_pdf(signal, background, system.replace(cycles=3), "stationary", delay_ns=37.0)
+    again = ml.registration_pdf(ml.Flux(signal, background, 37.0), system.replace(cycles=3), "stationary")
     np.testing.assert_allclose(again, shape, rtol=1e-9)  # whatever the exposure
-    free = ml.registration_pdf(signal, background, _without_electronics(system), "stationary", delay_ns=37.0)
+    free = ml.registration_pdf(ml.Flux(signal, background, 37.0), _without_electronics(system), "stationary")
     assert 0.5 * np.abs(shape - free).sum() > 5e-3  # the electronics do something
 
 
@@ -156,7 +159,7 @@ def test_stationary_shape_of_the_sequential_engine():
     system = view(0.24, 0.95, "stationary", 10_000)
     flux = flux_of(3.16, 0.12, 0.37)
     drawn = ml.simulate(flux, system, engine="sequential", realizations=50, seed=20_264).reshape(-1, 50)
-    shape = ml.registration_pdf(3.16, 0.12, system, "stationary", delay_ns=37.0)
+    shape = ml.registration_pdf(ml.Flux(3.16, 0.12, 37.0), system, "stationary")
     seen = drawn.sum(0).astype(float)
     assert 0.5 * np.abs(seen / seen.sum() - shape).sum() < 3e-3
     # bins of an exposure are correlated: errors from the scatter between exposures
@@ -168,10 +171,13 @@ def test_stationary_shape_of_the_sequential_engine():
 
 def test_stationary_shape_where_electronics_do_nothing():
     slower = view(0.7, 0.5)
-    same = ml.registration_pdf(2.0, 0.3, slower, "stationary", delay_ns=37.0)
+    same = ml.registration_pdf(ml.Flux(2.0, 0.3, 37.0), slower, "stationary")
     np.testing.assert_array_equal(
-        same, ml.registration_pdf(2.0, 0.3, _without_electronics(slower), "stationary", delay_ns=37.0)
+        same, ml.registration_pdf(ml.Flux(2.0, 0.3, 37.0), _without_electronics(slower), "stationary")
     )
-    alone = ml.registration_pdf(2.0, 0.3, view(0.0, 0.7), "stationary", delay_ns=37.0)
+    alone = ml.registration_pdf(ml.Flux(2.0, 0.3, 37.0), view(0.0, 0.7), "stationary")
     np.testing.assert_allclose(alone, same, rtol=1e-9)
-    np.testing.assert_allclose(ml.registration_pdf([0.0, 1.0], 0.0, view(0.3, 0.7), "stationary")[0], 0.02)
+    np.testing.assert_allclose(
+        ml.registration_pdf(ml.Flux([0.0, 1.0], 0.0, 50.0), view(0.3, 0.7), "stationary")[0],
+        0.02,
+    )

@@ -46,22 +46,23 @@ PIXELS = {
 }
 
 
-def light_of(waveform: np.ndarray | None) -> dict[str, Any]:
-    """Keywords of the light."""
-    return {"delay_ns": 33.3} if waveform is None else {"waveform": waveform}
+def flux_of(name: str) -> ml.Flux:
+    """The light."""
+    signal, background, _, waveform = PIXELS[name]
+    return ml.Flux(signal, background, 33.3) if waveform is None else ml.Flux(waveform=waveform, background=background)
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("name", PIXELS)
 def test_mean_histogram(name: str, monkeypatch: pytest.MonkeyPatch):
     """Every bin as on a grid of its own, and the tolerance in total variation."""
-    signal, background, system, waveform = PIXELS[name]
+    flux, system = flux_of(name), PIXELS[name][2]
     for method in ("exposure", "stationary"):
-        found = ml.registration_pdf(signal, background, system, method, **light_of(waveform))
+        found = ml.registration_pdf(flux, system, method)
         with monkeypatch.context() as patch:
             patch.setattr(cells, "MANY_BINS", 2**20)
             patch.setattr("mars_lidar.statistics.histogram.LAW_STEPS", 10**9)  # a reference may take its time
-            known = ml.registration_pdf(signal, background, system, method, **light_of(waveform))
+            known = ml.registration_pdf(flux, system, method)
         assert 0.5 * np.abs(found - known).sum() < 1e-6
         assert np.abs(found - known).max() < 1e-4 * known.max()
 
@@ -70,10 +71,10 @@ def test_mean_histogram(name: str, monkeypatch: pytest.MonkeyPatch):
 @pytest.mark.parametrize("name", ["warm", "locked", "steps"])
 def test_joint_law(name: str):
     """Variances of windows of one bin and of a fiftieth of the period, of every other bin, and a covariance."""
-    signal, background, system, waveform = PIXELS[name]
+    flux, system = flux_of(name), PIXELS[name][2]
     n = system.bins
-    law = ml.joint_law(signal, background, system, **light_of(waveform))
-    known, _ = joint._refined(Cells.of(signal, background, system, **light_of(waveform)), n, 1e-3)
+    law = ml.joint_law(flux, system)
+    known, _ = joint._refined(Cells.of_flux(flux, system), n, 1e-3)
     assert law.grid_bins < n <= known.grid_bins
     peak = int(np.argmax(known.mean))
     echo = peak + round(system.dead_time_periods % 1.0 * n)
@@ -91,12 +92,15 @@ def test_joint_law(name: str):
 def test_short_exposures():
     """An exposure that is run through: windows of whole coarse bins as the law of these bins has them."""
     system = view(3.923, 20, 0.009, bins=2**18)
-    law, known = ml.joint_law(0.465, 2.72, system), ml.joint_law(0.465, 2.72, system.replace(bins=256))
+    law, known = (
+        ml.joint_law(ml.Flux(0.465, 2.72, 50.0), system),
+        ml.joint_law(ml.Flux(0.465, 2.72, 50.0), system.replace(bins=256)),
+    )
     assert law.settled == known.settled == -1
     windows = np.random.default_rng(1).integers(0, 2, (8, 256)).astype(float)
     fine = law.window(np.repeat(windows, 2**10, axis=-1))
     np.testing.assert_allclose(fine, known.window(windows), rtol=1e-3)
-    direct = mean_histogram(0.465, 2.72, system)
+    direct = mean_histogram(ml.Flux(0.465, 2.72, 50.0), system)
     assert 0.5 * np.abs(law.mean - direct).sum() < 1e-4 * direct.sum()
 
 
@@ -106,7 +110,10 @@ def test_short_exposures():
 def test_two_seconds(bins: int, dead: float):
     """The largest histograms took up to 10 s."""
     system = view(dead, 102, 0.009, bins=bins)
-    for compute in (lambda: mean_histogram(0.465, 2.72, system, threads=1), lambda: ml.joint_law(0.465, 2.72, system)):
+    for compute in (
+        lambda: mean_histogram(ml.Flux(0.465, 2.72, 50.0), system, threads=1),
+        lambda: ml.joint_law(ml.Flux(0.465, 2.72, 50.0), system),
+    ):
         begin = time.process_time()
         compute()
         assert time.process_time() - begin < 2.0
@@ -120,17 +127,17 @@ def test_light_that_cells_do_not_see():
     light = cells.light_before(cell, edges)
     coarse = cells.light_before(cell, np.arange(2**15 + 1) / 2**15)
     assert cells.misplaced(coarse, edges, light) > 0.3
-    histogram = mean_histogram(8.0, 0.2, system, delay_ns=33.3)
-    known = mean_histogram(8.0, 0.2, system.replace(bins=1001), delay_ns=33.3)
+    histogram = mean_histogram(ml.Flux(8.0, 0.2, 33.3), system)
+    known = mean_histogram(ml.Flux(8.0, 0.2, 33.3), system.replace(bins=1001))
     assert abs(histogram[: BINS // 2].sum() - known[:500].sum() - 0.5 * known[500]) < 1e-3 * known.sum()
     with pytest.raises(ConvergenceError, match=r"use fewer bins, .*engine 'exact'"):
-        ml.joint_law(8.0, 0.2, system, delay_ns=33.3)
+        ml.joint_law(ml.Flux(8.0, 0.2, 33.3), system)
 
 
 def test_covariances_of_all_bins_do_not_fit(monkeypatch: pytest.MonkeyPatch):
     """They say what to use, whatever memory the machine has."""
     monkeypatch.setattr("mars_lidar._base.memory.available_bytes", lambda: 2**36)
-    law = ml.joint_law(0.5, 0.2, view(0.45, 100, 0.01))
+    law = ml.joint_law(ml.Flux(0.5, 0.2, 50.0), view(0.45, 100, 0.01))
     for ask in (law.covariance, law.lag, lambda: law.variance):
         with pytest.raises(MemoryError, match="window"):
             ask()

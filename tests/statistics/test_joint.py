@@ -43,7 +43,7 @@ def photons(signal: float, background: float, at: ml.System, bins: int) -> np.nd
 )
 def test_constant_rate(rate: float, dead: float, cycles: int, start: str):
     """Terms of the two ends of the exposure included."""
-    law = joint_law(0.0, rate, system(dead, cycles, bins=16, start=start), tolerance=1e-6)
+    law = joint_law(ml.Flux(0.0, rate), system(dead, cycles, bins=16, start=start), tolerance=1e-6)
     mean, variance = constant_rate_moments(rate, dead, cycles, stationary=start == "stationary")
     assert law.settled >= 0
     assert law.count_mean == pytest.approx(mean, rel=1e-8)
@@ -55,7 +55,7 @@ def test_constant_rate(rate: float, dead: float, cycles: int, start: str):
 def test_a_resonance_just_below_the_period_settles_in_any_long_exposure(dead: float):
     """One pulse blinds until just before the next: locked, but forgotten within a hundred periods; a million here."""
     at = system(dead, cycles=1_000_000, sigma=0.00375)
-    law = joint_law(10.0, 0.01, at)
+    law = joint_law(ml.Flux(10.0, 0.01, 50.0), at)
     assert 0 <= law.settled < 200
     counts = ml.simulate(ml.Flux(10.0, 0.01, 0.5 * PERIOD), at, realizations=150, seed=4).reshape(150, -1).sum(1)
     square = (counts - law.count_mean) ** 2
@@ -67,7 +67,7 @@ def test_a_resonance_just_below_the_period_settles_in_any_long_exposure(dead: fl
 
 
 def test_no_dead_time_is_poisson():
-    law = joint_law(1.5, 0.5, system(0.0, cycles=70))
+    law = joint_law(ml.Flux(1.5, 0.5, 50.0), system(0.0, cycles=70))
     expected = 70 * photons(1.5, 0.5, system(0.0), 64)
     assert law.mean == pytest.approx(expected, rel=1e-12)
     assert law.covariance() == pytest.approx(np.diag(expected), rel=1e-12)
@@ -79,9 +79,9 @@ def test_no_dead_time_is_poisson():
 
 def test_tends_to_poisson_with_the_dead_time():
     """Dead times down to a thousandth of a bin of the grid, where a bin re-arms into itself."""
-    poisson = joint_law(1.5, 0.5, system(0.0))
+    poisson = joint_law(ml.Flux(1.5, 0.5, 50.0), system(0.0))
     change = [
-        joint_law(1.5, 0.5, system(dead), tolerance=1e-5).count_variance / poisson.count_variance - 1
+        joint_law(ml.Flux(1.5, 0.5, 50.0), system(dead), tolerance=1e-5).count_variance / poisson.count_variance - 1
         for dead in (1e-4, 1e-5, 1e-6)
     ]
     assert change[0] / 1e-4 == pytest.approx(change[1] / 1e-5, rel=1e-2)
@@ -92,7 +92,9 @@ def test_tends_to_poisson_with_the_dead_time():
 def test_whole_periods_of_dead_time(whole: int):
     """t_d = k t_r: T = 1 - k lambda 1' / (1 + k Lambda), r = lambda / (1 + k Lambda), in closed form (3.4)."""
     cycles = 10**6
-    law = joint_law(2.0, 0.7, system(float(whole), cycles, bins=32, sigma=0.05, start="stationary"), tolerance=1e-5)
+    law = joint_law(
+        ml.Flux(2.0, 0.7, 50.0), system(float(whole), cycles, bins=32, sigma=0.05, start="stationary"), tolerance=1e-5
+    )
     flux = photons(2.0, 0.7, law.system, 32)
     scale = 1.0 + whole * 2.7
     feedback = np.eye(32) - whole * np.outer(flux, np.ones(32)) / scale
@@ -129,8 +131,8 @@ def systems(number: int, seed: int, **changes: object) -> list[tuple[float, floa
 @pytest.mark.parametrize(("signal", "background", "at", "delay"), systems(40, seed=3))
 def test_count_and_mean_agree_with_the_count_law(signal: float, background: float, at: ml.System, delay: float):
     """Exposures of one period and more, start-up and end included, settled or not."""
-    law = joint_law(signal, background, at, delay_ns=delay, tolerance=1e-4)
-    exact = exposure_moments(signal, background, at, delay_ns=delay, tolerance=1e-6)
+    law = joint_law(ml.Flux(signal, background, delay), at, tolerance=1e-4)
+    exact = exposure_moments(ml.Flux(signal, background, delay), at, tolerance=1e-6)
     assert law.movement <= 1e-4
     assert law.residual < 1e-9
     assert law.count_variance == pytest.approx(float(exact.variance), rel=1e-4, abs=1e-9)
@@ -140,7 +142,7 @@ def test_count_and_mean_agree_with_the_count_law(signal: float, background: floa
 @pytest.mark.parametrize(("signal", "background", "at", "delay"), systems(16, seed=4, cycles=1500))
 def test_closed_form_is_the_limit_of_the_exact_recursion(signal, background, at, delay):
     """The O(n) formula and the recursion through all periods, on one grid: any window with every bin."""
-    law = joint_law(signal, background, at, delay_ns=delay)
+    law = joint_law(ml.Flux(signal, background, delay), at)
     assert law.settled >= 0
     window = (np.arange(64) % 7 < 3).astype(float)
     columns = law._pixel._columns(window[None])[0]
@@ -199,7 +201,9 @@ def plain_feedback(flux: np.ndarray, dead: int) -> tuple[np.ndarray, np.ndarray,
 )
 def test_short_exposures_by_another_recursion(signal, background, dead, cycles, start):
     """Variances of windows of unsettled exposures: generating function, plain bins, Richardson."""
-    law = joint_law(signal, background, system(dead, cycles, bins=16, sigma=0.06, start=start), tolerance=1e-6)
+    law = joint_law(
+        ml.Flux(signal, background, 50.0), system(dead, cycles, bins=16, sigma=0.06, start=start), tolerance=1e-6
+    )
     assert law.settled == -1
     random = np.random.default_rng(5)
     weights = np.vstack([np.ones(16), np.eye(16)[[7, 8, 15]], random.normal(size=(4, 16))])
@@ -222,7 +226,7 @@ def test_short_exposures_by_another_recursion(signal, background, dead, cycles, 
 def test_matrix_by_dense_algebra(signal: float, background: float, dead: float):
     """The whole matrix, leading term: T diag(v) T' on plain bins, Richardson."""
     cycles = 10**8
-    law = joint_law(signal, background, system(dead, cycles, bins=32, sigma=0.05, start="stationary"))
+    law = joint_law(ml.Flux(signal, background, 50.0), system(dead, cycles, bins=32, sigma=0.05, start="stationary"))
     found = []
     for n in (256, 512):
         solution, _, noise = plain_feedback(photons(signal, background, law.system, n), round(dead * n))
@@ -240,7 +244,7 @@ def test_reference(name: str):
     reference = Reference.load(name)
     case, size = reference.case(), reference.realizations
     law = joint_law(
-        reference.signal, reference.background, case.system, delay_ns=reference.delay * PERIOD, tolerance=1e-4
+        ml.Flux(reference.signal, reference.background, reference.delay * PERIOD), case.system, tolerance=1e-4
     )
     often = law.variance * size >= 500
     pairs = often & np.roll(often, -1)

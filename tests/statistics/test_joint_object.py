@@ -24,11 +24,11 @@ def system(dead: float, cycles: int = 1000, bins: int = 64, sigma: float = 0.02,
 
 @pytest.fixture(scope="module")
 def law() -> ml.JointLaw:
-    return ml.joint_law(3.0, 1.0, system(0.64, bins=50), delay_ns=31.0)
+    return ml.joint_law(ml.Flux(3.0, 1.0, 31.0), system(0.64, bins=50))
 
 
 def test_all_ways_to_a_covariance_agree(law: ml.JointLaw):
-    other = ml.joint_law(3.0, 1.0, law.system, delay_ns=31.0)  # makes its matrix first
+    other = ml.joint_law(ml.Flux(3.0, 1.0, 31.0), law.system)  # makes its matrix first
     matrix = other.covariance()
     w, v = np.random.default_rng(1).normal(size=(2, 3, 50))
     size = np.diag(matrix).max()
@@ -48,7 +48,7 @@ def test_all_ways_to_a_covariance_agree(law: ml.JointLaw):
 
 
 def test_short_exposures_have_the_same_interface():
-    law = joint_law(3.0, 1.0, system(0.64, cycles=2, bins=20))
+    law = joint_law(ml.Flux(3.0, 1.0, 50.0), system(0.64, cycles=2, bins=20))
     assert law.settled == -1
     matrix = law.covariance()
     w = np.random.default_rng(2).normal(size=20)
@@ -63,9 +63,9 @@ def test_waveforms_and_measured_pulses():
     shape /= shape.sum()
     sampled = system(0.7).replace(pulse=ml.SampledPulse(shape, PERIOD / 200, origin="first"))
     laws = [
-        joint_law(2.0, 0.5, sampled, delay_ns=0.0, tolerance=1e-4),
-        joint_law(None, 0.5, sampled, waveform=2.0 * shape, tolerance=1e-4),
-        joint_law(None, 0.0, sampled, waveform=2.0 * shape + 0.5 / 200, tolerance=1e-4),
+        joint_law(ml.Flux(2.0, 0.5, 0.0), sampled, tolerance=1e-4),
+        joint_law(ml.Flux(waveform=2.0 * shape, background=0.5), sampled, tolerance=1e-4),
+        joint_law(ml.Flux(waveform=2.0 * shape + 0.5 / 200), sampled, tolerance=1e-4),
     ]
     for law in laws[1:]:
         assert law.mean == pytest.approx(laws[0].mean, rel=1e-9)
@@ -79,15 +79,15 @@ def test_waveforms_and_measured_pulses():
 def test_slow_sweeps_are_solved_all_the_same(signal: float, background: float, dead: float):
     """Where sweeps hardly contract (many background photons in a dead time), a factorisation takes over."""
     at = system(dead, cycles=3000, bins=32)
-    law = joint_law(signal, background, at)
-    exact = exposure_moments(signal, background, at)
+    law = joint_law(ml.Flux(signal, background, 50.0), at)
+    exact = exposure_moments(ml.Flux(signal, background, 50.0), at)
     assert law.residual < 1e-9
     assert law.count_mean == pytest.approx(float(exact.mean), rel=1e-6)
     assert law.count_variance == pytest.approx(float(exact.variance), rel=2e-3)
 
 
 def test_dark_pixel():
-    law = joint_law(0.0, 0.0, system(0.5), delay_ns=float("nan"))
+    law = joint_law(ml.Flux(0.0, 0.0, float("nan")), system(0.5))
     assert law.count_mean == 0
     assert law.count_variance == 0
     assert not law.covariance().any()
@@ -95,16 +95,16 @@ def test_dark_pixel():
 
 def test_bad_input(law: ml.JointLaw):
     at = law.system
-    with pytest.raises(ValueError, match=r"signal must be a scalar \(one pixel\), got shape \(2,\)"):
-        joint_law([1.0, 2.0], 1.0, at)
+    with pytest.raises(ValueError, match=r"flux must be one pixel, such as flux\[0, 0\], got pixels of shape \(2,\)"):
+        joint_law(ml.Flux([1.0, 2.0], 1.0, 50.0), at)
     with pytest.raises(ValueError, match=r"signal must lie in \[0, 1e\+06\] photons per period, got -1"):
-        joint_law(-1.0, 1.0, at)
+        joint_law(ml.Flux(-1.0, 1.0, 50.0), at)
     with pytest.raises(ValueError, match=r"tolerance must be a finite number in \[1e-07, 0\.1\], got 0"):
-        joint_law(1.0, 1.0, at, tolerance=0)
-    with pytest.raises(ValueError, match=r"waveform must be \(T,\) of one pixel, got shape \(2, 3\)"):
-        joint_law(None, 1.0, at, waveform=np.ones((2, 3)))
+        joint_law(ml.Flux(1.0, 1.0, 50.0), at, tolerance=0)
+    with pytest.raises(ValueError, match=r"flux must be one pixel.* shape \(2,\)"):
+        joint_law(ml.Flux(waveform=np.ones((2, 3)), background=1.0), at)
     with pytest.raises(TypeError, match=r"system must be a System, got .*str"):
-        joint_law(1.0, 1.0, "system")
+        joint_law(ml.Flux(1.0, 1.0, 50.0), "system")
     with pytest.raises(ValueError, match=r"weights must be \(\.\.\., 50\), one for each bin, got shape \(3,\)"):
         law.window(np.ones(3))
     with pytest.raises(ValueError, match="weights must be finite, got nan"):
@@ -116,4 +116,4 @@ def test_bad_input(law: ml.JointLaw):
     with pytest.raises(ValueError, match=r"lag must be an integer in \[-50, 50\], got 51"):
         law.lag(51)
     with pytest.raises(ConvergenceError, match=r"S = 20, B = 0 .* t_d = 1\.5 .* does not forget its start .* 300000"):
-        joint_law(20.0, 0.0, system(1.5, cycles=300_000))  # locked to every second pulse
+        joint_law(ml.Flux(20.0, 0.0, 50.0), system(1.5, cycles=300_000))  # locked to every second pulse

@@ -57,7 +57,7 @@ def times_log(x, y):
 )
 def test_constant_rate_pmf(total, dead, cycles):
     """P(N >= n) = P(Gamma(n, 1 / rate) <= t - (n - 1) t_d) for an armed start."""
-    law = count_law(0.0, total, make_system(dead, cycles=cycles), tolerance=1e-6)
+    law = count_law(ml.Flux(0.0, total), make_system(dead, cycles=cycles), tolerance=1e-6)
     n = np.append(law.support, law.support[-1] + 1).astype(float)
     left = np.maximum(cycles - (n - 1) * dead, 0.0)
     at_least = np.where(n == 0, 1.0, stats.gamma.cdf(left, np.maximum(n, 1.0), scale=1 / total))
@@ -84,7 +84,7 @@ def test_constant_rate_pmf(total, dead, cycles):
 )
 def test_pmf_agrees_with_cumulants(signal, background, dead, cycles, start):
     system = make_system(dead, cycles=cycles, start=start, sigma=0.01)
-    law = count_law(signal, background, system, delay_ns=37.0)
+    law = count_law(ml.Flux(signal, background, 37.0), system)
     assert law.pmf.shape == law.support.shape == law.cdf.shape
     assert (law.pmf >= 0).all()
     assert law.pmf.sum() == pytest.approx(1.0, abs=1e-8)
@@ -98,7 +98,7 @@ def test_pmf_agrees_with_cumulants(signal, background, dead, cycles, start):
 
 
 def test_single_cycle_is_bernoulli():
-    law = count_law(0.7, 0.4, make_system(5.5, cycles=4))
+    law = count_law(ml.Flux(0.7, 0.4, 50.0), make_system(5.5, cycles=4))
     p = -math.expm1(-4.4)
     np.testing.assert_allclose(law.pmf[:2], [1 - p, p], rtol=1e-9)
     assert law.support[0] == 0
@@ -107,33 +107,33 @@ def test_single_cycle_is_bernoulli():
 def test_batches():
     system = make_system(0.6375)
     signal, background = np.array([[0.1], [2.0]]), np.array([0.0, 0.3, 3.0])
-    law = count_law(signal, background, system, delay_ns=20.0)
+    law = count_law(ml.Flux(signal, background, 20.0), system)
     assert law.mean.shape == law.variance.shape == law.outside.shape == (2, 3)
     assert law.cumulants.shape == (2, 3, 4)
     assert law.support.shape == law.pmf.shape == law.cdf.shape
     assert law.pmf.shape[:2] == (2, 3)
     for i, j in np.ndindex(2, 3):
-        one = count_law(signal[i, 0], background[j], system, delay_ns=20.0)
+        one = count_law(ml.Flux(signal[i, 0], background[j], 20.0), system)
         size = one.pmf.size
         np.testing.assert_array_equal(law.support[i, j, :size], one.support)
         np.testing.assert_allclose(law.pmf[i, j, :size], one.pmf, atol=1e-8)
         np.testing.assert_allclose(law.pmf[i, j, size:], 0.0)
-    delays = count_law(1.0, 1.0, system, delay_ns=[10.0, 90.0])
+    delays = count_law(ml.Flux(1.0, 1.0, [10.0, 90.0]), system)
     assert delays.mean.shape == (2,)
     assert delays.mean[0] != delays.mean[1]
     assert "cells of shape (2,)" in repr(delays)
 
 
 def test_no_flux():
-    law = count_law(0.0, 0.0, make_system(0.5))
+    law = count_law(ml.Flux(0.0, 0.0), make_system(0.5))
     assert law.mean == law.variance == 0
     assert law.pmf[law.support == 0] == 1.0
-    np.testing.assert_allclose(registration_pdf(0.0, [0.0, 1e-9], make_system(0.5)), 1 / 64, rtol=1e-6)
+    np.testing.assert_allclose(registration_pdf(ml.Flux(0.0, [0.0, 1e-9]), make_system(0.5)), 1 / 64, rtol=1e-6)
 
 
 def test_poisson():
     for dead, method in ((0.0, "exact"), (0.6, "poisson")):
-        law = count_law([1.0, 1e-4], 0.5, make_system(dead), method)
+        law = count_law(ml.Flux([1.0, 1e-4], 0.5, 50.0), make_system(dead), method)
         np.testing.assert_allclose(law.cumulants[0], 1500.0)
         exact = stats.poisson.pmf(law.support, law.mean[:, None])
         inside = law.pmf > 0
@@ -144,8 +144,8 @@ def test_poisson():
 def test_mars_is_the_gaussian_of_the_paper():
     system = make_system(0.6375)
     for rearm in (None, "centre", "edge"):
-        law = count_law([1.0, 0.002], 0.001, system, "mars", rearm=rearm)
-        mean, variance = mars_moments([1.0, 0.002], 0.001, system, rearm=rearm or "centre")
+        law = count_law(ml.Flux([1.0, 0.002], 0.001, 50.0), system, "mars", rearm=rearm)
+        mean, variance = mars_moments(ml.Flux([1.0, 0.002], 0.001, 50.0), system, rearm=rearm or "centre")
         np.testing.assert_array_equal(law.mean, mean)
         np.testing.assert_array_equal(law.variance, variance)
         np.testing.assert_array_equal(law.cumulants[:, 2:], 0.0)
@@ -155,11 +155,14 @@ def test_mars_is_the_gaussian_of_the_paper():
         exact = normal.cdf(law.support + 0.5) - normal.cdf(edges)
         np.testing.assert_allclose(law.pmf[inside], exact[inside], atol=1e-14)
         np.testing.assert_allclose(law.cdf[:, -1], 1.0, atol=1e-14)
-    assert count_law(1.0, 1.0, system, "mars", rearm="edge").mean > count_law(1.0, 1.0, system, "mars").mean
+    assert (
+        count_law(ml.Flux(1.0, 1.0, 50.0), system, "mars", rearm="edge").mean
+        > count_law(ml.Flux(1.0, 1.0, 50.0), system, "mars").mean
+    )
 
 
 def test_renewal_is_the_constant_rate_gaussian():
-    law = count_law(1.0, 1.0, make_system(0.6375), "renewal")
+    law = count_law(ml.Flux(1.0, 1.0, 50.0), make_system(0.6375), "renewal")
     assert law.mean == pytest.approx(2000 / 2.275)
     assert law.variance == pytest.approx(2000 / 2.275**3)
     found = moments_of(law)
@@ -170,7 +173,7 @@ def test_renewal_is_the_constant_rate_gaussian():
 def test_shapes():
     system = make_system(0.6375, bins=128, cycles=100_000)
     methods = ("exposure", "stationary", "chain")
-    shapes = {m: registration_pdf([0.5, 5.0], 1.0, system, m, delay_ns=30.0) for m in methods}
+    shapes = {m: registration_pdf(ml.Flux([0.5, 5.0], 1.0, 30.0), system, m) for m in methods}
     for shape in shapes.values():
         assert shape.shape == (2, 128)
         assert (shape >= 0).all()
@@ -178,10 +181,10 @@ def test_shapes():
     # a long exposure is stationary, the chain re-arms at bin centres
     assert 0.5 * np.abs(shapes["exposure"] - shapes["stationary"]).sum(-1).max() < 1e-5
     assert 0.5 * np.abs(shapes["chain"] - shapes["stationary"]).sum(-1).max() < 5e-4
-    edge = registration_pdf([0.5, 5.0], 1.0, system, "chain", rearm="edge", delay_ns=30.0)
+    edge = registration_pdf(ml.Flux([0.5, 5.0], 1.0, 30.0), system, "chain", rearm="edge")
     assert np.abs(edge - shapes["chain"]).sum() > 1e-4
     # a short one is not
-    short = registration_pdf(0.5, 1.0, system.replace(cycles=3), delay_ns=30.0)
+    short = registration_pdf(ml.Flux(0.5, 1.0, 30.0), system.replace(cycles=3))
     assert 0.5 * np.abs(short - shapes["stationary"][0]).sum() > 0.02
 
 
@@ -189,26 +192,42 @@ def test_waveforms_and_methods():
     system = make_system(0.6375, sigma=0.01)
     wave = 2.0 * system.pulse.bin_energy(40.0, 100.0, 2048)
     for method in ("exact", "mars", "renewal", "poisson"):
-        by_wave = count_law(None, 0.3, system, method, waveform=wave)
-        by_pulse = count_law(2.0, 0.3, system, method, delay_ns=40.0)
+        by_wave = count_law(ml.Flux(waveform=wave, background=0.3), system, method)
+        by_pulse = count_law(ml.Flux(2.0, 0.3, 40.0), system, method)
         np.testing.assert_allclose(by_wave.mean, by_pulse.mean, rtol=1e-5)
         np.testing.assert_allclose(by_wave.variance, by_pulse.variance, rtol=1e-4)
     for method in ("exposure", "stationary", "chain"):
-        by_wave = registration_pdf(None, 0.3, system, method, waveform=wave)
-        by_pulse = registration_pdf(2.0, 0.3, system, method, delay_ns=40.0)
+        by_wave = registration_pdf(ml.Flux(waveform=wave, background=0.3), system, method)
+        by_pulse = registration_pdf(ml.Flux(2.0, 0.3, 40.0), system, method)
         assert 0.5 * np.abs(by_wave - by_pulse).sum() < 1e-3
 
 
 @pytest.mark.parametrize(
     ("call", "error", "message"),
     [
-        (lambda s: count_law(1.0, 1.0, s, "normal"), ValueError, "method must be one of 'exact', .*'normal'"),
-        (lambda s: registration_pdf(1.0, 1.0, s, "exact"), ValueError, "method must be one of 'exposure'"),
-        (lambda s: count_law(1.0, 1.0, s, rearm="edge"), ValueError, "rearm must be None for method 'exact'"),
-        (lambda s: count_law(1.0, 1.0, s, "mars", rearm="left"), ValueError, "rearm must be one of.*'left'"),
-        (lambda s: count_law(-1.0, 1.0, s), ValueError, "signal must lie"),
-        (lambda s: count_law(1.0, 1.0, s, "poisson", delay_ns=np.nan), ValueError, "delay_ns must be finite"),
-        (lambda s: count_law(1.0, 1.0, s, threads=1.5), TypeError, "threads must be an integer"),
+        (
+            lambda s: count_law(ml.Flux(1.0, 1.0, 50.0), s, "normal"),
+            ValueError,
+            "method must be one of 'exact', .*'normal'",
+        ),
+        (
+            lambda s: registration_pdf(ml.Flux(1.0, 1.0, 50.0), s, "exact"),
+            ValueError,
+            "method must be one of 'exposure'",
+        ),
+        (
+            lambda s: count_law(ml.Flux(1.0, 1.0, 50.0), s, rearm="edge"),
+            ValueError,
+            "rearm must be None for method 'exact'",
+        ),
+        (
+            lambda s: count_law(ml.Flux(1.0, 1.0, 50.0), s, "mars", rearm="left"),
+            ValueError,
+            "rearm must be one of.*'left'",
+        ),
+        (lambda s: count_law(ml.Flux(-1.0, 1.0, 50.0), s), ValueError, "signal must lie"),
+        (lambda s: count_law(ml.Flux(1.0, 1.0, np.nan), s, "poisson"), ValueError, "delay_ns must be finite"),
+        (lambda s: count_law(ml.Flux(1.0, 1.0, 50.0), s, threads=1.5), TypeError, "threads must be an integer"),
     ],
 )
 def test_bad_input(call, error, message):
@@ -219,7 +238,7 @@ def test_bad_input(call, error, message):
 def test_a_pmf_that_contradicts_its_cumulants_is_refused(monkeypatch):
     monkeypatch.setattr(pmf_module, "TAIL", 0.2)  # too small a window: the pmf is aliased
     with pytest.raises(ConvergenceError, match=r"S = 1, B = 1 .* disagrees with the cumulants"):
-        _ = count_law(1.0, 1.0, make_system(0.6375)).pmf
+        _ = count_law(ml.Flux(1.0, 1.0, 50.0), make_system(0.6375)).pmf
 
 
 @pytest.mark.full
@@ -236,7 +255,7 @@ def test_random_systems_against_the_exact_engine():
         pulse = ml.SampledPulse(rng.random(12), 20 * sigma) if number % 5 == 0 else None
         start = ("armed", "stationary")[number % 2]
         system = make_system(dead, cycles=cycles, bins=bins, sigma=sigma, start=start, pulse=pulse)
-        law = count_law(signal, background, system, delay_ns=delay, threads=1)
+        law = count_law(ml.Flux(signal, background, delay), system, threads=1)
         flux = ml.Flux(signal, background, delay)
         cube = ml.simulate(flux, system, realizations=2000, seed=number, threads=1)
         counts = cube.sum(-1, dtype=np.int64).ravel()
@@ -262,7 +281,7 @@ def test_reference(path):
     """Total variation below the 99.9 % quantile of its bootstrap under the model, G-test p > 1e-4."""
     case = json.loads(path.read_text())
     system = make_system(case["dead"], cycles=case["cycles"], sigma=case["sigma"])
-    law = count_law(case["S"], case["B"], system, delay_ns=100.0 * case["tau"])
+    law = count_law(ml.Flux(case["S"], case["B"], 100.0 * case["tau"]), system)
     counts = np.repeat([int(n) for n in case["count"]], list(case["count"].values()))
     reals, rng = counts.size, np.random.default_rng(1)
     model = law.pmf / law.pmf.sum()

@@ -47,7 +47,7 @@ def view(dead: float, cycles: int = 1000, sigma: float = 0.01, start: str = "arm
 )
 def test_warm_start_of_a_bright_clock(background: float, dead: float, cycles: int):
     """The mean of a stationary renewal process is that of its rate; the first has raised."""
-    law = ml.count_law(0.0, background, view(dead, cycles, start="stationary"))
+    law = ml.count_law(ml.Flux(0.0, background), view(dead, cycles, start="stationary"))
     mean = background * cycles / (1.0 + background * dead)
     assert law.mean == pytest.approx(mean, rel=1e-6)
     assert law.pmf.sum() == pytest.approx(1.0, abs=1e-9)
@@ -71,14 +71,14 @@ def test_warm_states_by_sweeps_and_by_the_equation(
 ):
     system = view(dead, 30, start="stationary")
     system = system.replace(detector=ml.Detector(dead_time_ns=dead * PERIOD_NS, **detector))
-    swept = ml.count_law([signal, 0.1], background, system, delay_ns=47.0)
-    shape = ml.registration_pdf([signal, 0.1], background, system, "stationary", delay_ns=47.0)
+    swept = ml.count_law(ml.Flux([signal, 0.1], background, 47.0), system)
+    shape = ml.registration_pdf(ml.Flux([signal, 0.1], background, 47.0), system, "stationary")
     assert swept.pmf.shape[0] == 2
     monkeypatch.setattr(cells_module, "_WARM_PERIODS", 1)
-    solved = ml.count_law([signal, 0.1], background, system, delay_ns=47.0)
+    solved = ml.count_law(ml.Flux([signal, 0.1], background, 47.0), system)
     np.testing.assert_allclose(solved.cumulants, swept.cumulants, rtol=1e-8, atol=1e-10)
     np.testing.assert_allclose(solved.pmf, swept.pmf, atol=1e-9)
-    again = ml.registration_pdf([signal, 0.1], background, system, "stationary", delay_ns=47.0)
+    again = ml.registration_pdf(ml.Flux([signal, 0.1], background, 47.0), system, "stationary")
     np.testing.assert_allclose(again, shape, atol=1e-9)
 
 
@@ -94,10 +94,10 @@ def test_warm_states_by_sweeps_and_by_the_equation(
 def test_stationary_shapes_of_locked_pixels(signal: float, background: float, dead: float, sigma: float):
     """Rate and shape: armed + blind = 1, each bin's registrations at least those of the pixel armed a dead time ago."""
     system = view(dead, sigma=sigma, bins=32)
-    shape = ml.registration_pdf(signal, background, system, "stationary", delay_ns=30.0)
+    shape = ml.registration_pdf(ml.Flux(signal, background, 30.0), system, "stationary")
     assert shape.sum() == pytest.approx(1.0, abs=1e-9)
     assert shape.min() >= 0.0
-    other = ml.registration_pdf(signal, background, view(dead + 3.0, sigma=sigma, bins=32), "stationary", delay_ns=30.0)
+    other = ml.registration_pdf(ml.Flux(signal, background, 30.0), view(dead + 3.0, sigma=sigma, bins=32), "stationary")
     np.testing.assert_allclose(other, shape, atol=1e-6)  # whole periods only wait
 
 
@@ -137,7 +137,7 @@ def test_factors_of_locked_pixels(signal: float, background: float, dead: float,
 def test_stationary_shape_without_a_dead_time():
     """The light itself, whatever the width of the pulse."""
     system = view(0.0, 1, 1e-6, bins=2)
-    shape = ml.registration_pdf(1.0, 1e-6, system, "stationary", delay_ns=30.0)
+    shape = ml.registration_pdf(ml.Flux(1.0, 1e-6, 30.0), system, "stationary")
     np.testing.assert_allclose(shape, [(1.0 + 5e-7) / (1.0 + 1e-6), 5e-7 / (1.0 + 1e-6)], rtol=1e-9)
 
 
@@ -166,19 +166,19 @@ def test_wide_laws_from_few_points(
         return used[-1]
 
     monkeypatch.setattr(pmf_module, "_narrow", told)
-    law = ml.count_law(signal, background, system)
+    law = ml.count_law(ml.Flux(signal, background, 50.0), system)
     assert law.pmf.size > 256
     assert used[0] is not None
     assert np.count_nonzero(used[0]) < 100
     monkeypatch.setattr(pmf_module, "_ALL_POINTS", 10**9)
-    every = ml.count_law(signal, background, system)
+    every = ml.count_law(ml.Flux(signal, background, 50.0), system)
     assert every.pmf.size == law.pmf.size
     np.testing.assert_allclose(law.pmf, every.pmf, atol=1e-12)
 
 
 def test_the_law_of_a_hundred_million_periods():
     """125 s once: at t_d = t_r registrations are a renewal process of whole periods and the phase of one photon."""
-    law = ml.count_law(5.0, 1.0, view(1.0, 10**8, 0.00375))
+    law = ml.count_law(ml.Flux(5.0, 1.0, 50.0), view(1.0, 10**8, 0.00375))
     assert law.mean == pytest.approx(6.0 * 1e8 / 7.0, abs=1.0)
     assert law.variance == pytest.approx(float(law.cumulants[1]))
     offset = law.support - law.mean
@@ -221,7 +221,7 @@ def test_locked_laws_of_many_periods(
     pulse: Any = ml.SampledPulse(np.random.default_rng(0).exponential(size=20), bin_ns=1.0)
     if sigma:
         pulse = ml.GaussianPulse(sigma_ns=sigma * PERIOD_NS)
-    law = ml.count_law(signal, background, view(dead, cycles, start=start, pulse=pulse), delay_ns=delay)
+    law = ml.count_law(ml.Flux(signal, background, delay), view(dead, cycles, start=start, pulse=pulse))
     assert law.pmf.sum() == pytest.approx(1.0, abs=1e-7)
     assert law.pmf @ (law.support - law.mean) == pytest.approx(0.0, abs=1e-6)
 
@@ -231,12 +231,14 @@ def test_locked_laws_of_many_periods(
 
 def test_darkness():
     system = view(12127.27, 121_892, bins=24_393)
-    law = ml.count_law(None, 0.0, system, waveform=np.zeros(100))
+    law = ml.count_law(ml.Flux(waveform=np.zeros(100)), system)
     assert law.mean == law.variance == 0.0
     np.testing.assert_array_equal(law.pmf, [1.0])
-    assert mean_histogram(None, 0.0, system, waveform=np.zeros(100)).sum() == 0.0
-    some = ml.count_law([0.0, 1.0], [0.0, 0.5], view(0.6, 100))
-    np.testing.assert_allclose(some.cumulants[1], ml.count_law(1.0, 0.5, view(0.6, 100)).cumulants, rtol=1e-10)
+    assert mean_histogram(ml.Flux(waveform=np.zeros(100)), system).sum() == 0.0
+    some = ml.count_law(ml.Flux([0.0, 1.0], [0.0, 0.5], 50.0), view(0.6, 100))
+    np.testing.assert_allclose(
+        some.cumulants[1], ml.count_law(ml.Flux(1.0, 0.5, 50.0), view(0.6, 100)).cumulants, rtol=1e-10
+    )
     np.testing.assert_array_equal(some.cumulants[0], 0.0)
     assert some.pmf[0, 0] == 1.0
 
@@ -244,7 +246,7 @@ def test_darkness():
 @pytest.mark.parametrize(("cycles", "dead"), [(1, 1e6), (2, 925_385.5), (38, 147_009.02), (1000, 1000.5)])
 def test_one_registration_at_most(cycles: int, dead: float):
     system = view(dead, cycles)
-    law, joint = ml.count_law(0.02, 0.001, system), ml.joint_law(0.02, 0.001, system)
+    law, joint = ml.count_law(ml.Flux(0.02, 0.001, 50.0), system), ml.joint_law(ml.Flux(0.02, 0.001, 50.0), system)
     chance = -math.expm1(-0.021 * cycles)
     np.testing.assert_allclose(law.pmf[:2], [1.0 - chance, chance], atol=1e-9)
     assert joint.count_mean == pytest.approx(chance, rel=1e-6)
@@ -273,7 +275,7 @@ def test_work_of_refused_laws(
 
     monkeypatch.setattr(exposure_module, "_run", told)
     with pytest.raises(ConvergenceError, match="the limit of a law"):
-        ml.count_law(signal, 0.0, view(dead, cycles, sigma, start))
+        ml.count_law(ml.Flux(signal, 0.0, 50.0), view(dead, cycles, sigma, start))
     assert sum(done) <= cells_module.LAW_STEPS
 
 
@@ -283,16 +285,16 @@ def test_work_of_refused_laws(
 def test_joint_law_known_to_settle(monkeypatch: pytest.MonkeyPatch):
     """Given up after some 50 of 300 periods, the fall of the distance so far tells when it is within the tolerance."""
     system = view(2.04, 10**7)
-    law = ml.joint_law(4.0, 0.1, system)
+    law = ml.joint_law(ml.Flux(4.0, 0.1, 50.0), system)
     monkeypatch.setattr(pixel_module, "_MAX_STEPS", 100_000)
-    early = ml.joint_law(4.0, 0.1, system)
+    early = ml.joint_law(ml.Flux(4.0, 0.1, 50.0), system)
     assert early.settled == pytest.approx(law.settled, rel=0.1)
     assert early.settled != law.settled
     assert early.count_variance == pytest.approx(law.count_variance, rel=1e-9)
     np.testing.assert_allclose(early.mean, law.mean, rtol=1e-9)
     for cycles in (800, 10**5):  # not within a third of the exposure; a pixel that has told nothing yet
         with pytest.raises(ConvergenceError, match="engine 'exact'"):
-            ml.joint_law(6.0, 0.05, view(1.97, cycles, bins=1024, sigma=0.002))
+            ml.joint_law(ml.Flux(6.0, 0.05, 50.0), view(1.97, cycles, bins=1024, sigma=0.002))
 
 
 # Refusals
@@ -317,12 +319,12 @@ def test_refusals_say_what_to_use(signal: float, background: float, dead: float,
 
 def test_a_law_that_is_refused_is_to_be_had_elsewhere(monkeypatch: pytest.MonkeyPatch):
     system = view(2.04, 20_000)
-    expected = exposure_moments(4.0, 0.1, system)
+    expected = exposure_moments(ml.Flux(4.0, 0.1, 50.0), system)
     monkeypatch.setattr("mars_lidar.statistics.law.LAW_STEPS", 10_000)
     with pytest.raises(ConvergenceError, match="exposure_moments, which may take"):
-        ml.count_law(4.0, 0.1, system)
-    assert exposure_moments(4.0, 0.1, system).mean == expected.mean
-    assert ml.joint_law(4.0, 0.1, system).count_mean == pytest.approx(float(expected.mean), rel=1e-6)
+        ml.count_law(ml.Flux(4.0, 0.1, 50.0), system)
+    assert exposure_moments(ml.Flux(4.0, 0.1, 50.0), system).mean == expected.mean
+    assert ml.joint_law(ml.Flux(4.0, 0.1, 50.0), system).count_mean == pytest.approx(float(expected.mean), rel=1e-6)
 
 
 def test_a_dead_time_of_many_periods_is_refused_before_the_work():
@@ -334,7 +336,7 @@ def test_a_dead_time_of_many_periods_is_refused_before_the_work():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("mars_lidar.statistics.exposure.native_light", None)
         with pytest.raises(ConvergenceError, match="joint_law"):
-            ml.count_law(4.0, 0.13, system)
+            ml.count_law(ml.Flux(4.0, 0.13, 50.0), system)
 
 
 def test_counts_far_from_zero_are_unwrapped_at_once():
@@ -342,7 +344,7 @@ def test_counts_far_from_zero_are_unwrapped_at_once():
 
     Unwrapping by subtraction took a minute for 1e11 counts.
     """
-    law = ml.count_law(0.0, 1000.0, view(1e-12, 1_000_000))
+    law = ml.count_law(ml.Flux(0.0, 1000.0), view(1e-12, 1_000_000))
     first, p = law.support[0], law.pmf
     known = stats.poisson.pmf(first + np.arange(p.size), 1e9)
     assert np.abs(p - known).max() < 1e-3 * known.max()
@@ -365,17 +367,19 @@ def test_counts_far_from_zero_are_unwrapped_at_once():
         ({"signal": 1j}, TypeError, "signal must be real numbers"),
         ({"delay_ns": math.nan}, ValueError, "delay_ns must be finite"),
         ({"delay_ns": -math.inf}, ValueError, "delay_ns must be finite"),
-        ({"signal": None, "waveform": [1.0, math.nan]}, ValueError, "waveform must lie in"),
-        ({"signal": None, "waveform": [-1.0, 1.0]}, ValueError, "waveform must lie in"),
-        ({"signal": None, "waveform": []}, ValueError, "waveform must"),
+        ({"waveform": [1.0, math.nan]}, ValueError, "waveform must lie in"),
+        ({"waveform": [-1.0, 1.0]}, ValueError, "waveform must lie in"),
+        ({"waveform": []}, ValueError, "waveform must"),
         ({"tolerance": math.nan}, ValueError, "tolerance must be"),
         ({"system": None}, TypeError, "system must be a System"),
     ],
 )
 def test_bad_input(law: Any, change: dict[str, Any], error: type[Exception], told: str):
-    given: dict[str, Any] = {"signal": 1.0, "background": 0.1, "system": view(0.6)} | change
+    given: dict[str, Any] = {"system": view(0.6)} | change
+    light = {"signal": 1.0, "background": 0.1, "delay_ns": 50.0} if "waveform" not in given else {}
+    light |= {name: given.pop(name) for name in ("signal", "background", "delay_ns", "waveform") if name in given}
     with pytest.raises(error, match=told):
-        law(given.pop("signal"), given.pop("background"), given.pop("system"), **given)
+        law(ml.Flux(**light), given.pop("system"), **given)
 
 
 @pytest.mark.parametrize("start", ["armed", "stationary"])
@@ -385,7 +389,7 @@ def test_corners(signal: float, background: float, dead: float, start: str):
     """One period, two bins: no flux, much of it, no dead time, a million periods of it."""
     system = view(dead, 1, start=start, bins=2)
     total = signal + background
-    law = ml.count_law(signal, background, system)
+    law = ml.count_law(ml.Flux(signal, background, 50.0), system)
     if total == 0.0:
         mean = 0.0
     elif dead == 0.0:
@@ -399,16 +403,16 @@ def test_corners(signal: float, background: float, dead: float, start: str):
     assert law.mean == pytest.approx(mean, rel=1e-5, abs=1e-300)
     assert law.pmf.sum() == pytest.approx(1.0, abs=1e-8)
     assert law.pmf.min() >= 0.0
-    histogram = mean_histogram(signal, background, system)
+    histogram = mean_histogram(ml.Flux(signal, background, 50.0), system)
     assert histogram.sum() == pytest.approx(mean, rel=1e-4, abs=1e-300)
     if start == "stationary" and dead == 1e6 and total > 0.0:  # a million periods of history
         with pytest.raises(ConvergenceError, match="use exposure_moments"):
-            ml.joint_law(signal, background, system)
+            ml.joint_law(ml.Flux(signal, background, 50.0), system)
     else:
-        joint = ml.joint_law(signal, background, system)
+        joint = ml.joint_law(ml.Flux(signal, background, 50.0), system)
         assert joint.count_mean == pytest.approx(mean, rel=1e-3, abs=1e-300)
     for method in ("exposure", "stationary"):
-        shape = ml.registration_pdf(signal, background, system, method)  # type: ignore[arg-type]
+        shape = ml.registration_pdf(ml.Flux(signal, background, 50.0), system, method)  # type: ignore[arg-type]
         assert shape.sum() == pytest.approx(1.0, abs=1e-9)
 
 
@@ -420,7 +424,10 @@ def test_corners(signal: float, background: float, dead: float, start: str):
 def test_joint_law_of_many_bins(bins: int):
     """Sweeps over many bins stop at the rounding that these add up: the law of an ordinary pixel has been refused."""
     system = view(0.33, bins=bins)
-    law, known = ml.joint_law(2.0, 0.1, system), exposure_moments(2.0, 0.1, system.replace(bins=2))
+    law, known = (
+        ml.joint_law(ml.Flux(2.0, 0.1, 50.0), system),
+        exposure_moments(ml.Flux(2.0, 0.1, 50.0), system.replace(bins=2)),
+    )
     assert law.count_mean == pytest.approx(float(known.mean), rel=1e-7)
     assert law.count_variance == pytest.approx(float(known.variance), rel=1e-5)
     assert law.mean.reshape(2, -1).sum(-1) == pytest.approx(known.histogram, rel=1e-6)
@@ -432,9 +439,9 @@ def test_joint_law_of_many_bins(bins: int):
 def test_sum_of_a_locked_paralyzable_histogram():
     """One registration in a pulse, all but certainly: 25 of 1e8 were missing where the standard deviation is 21."""
     drawn = draw(158)
-    light = {"signal": drawn.signal, "background": drawn.background, "delay_ns": drawn.delay * PERIOD_NS}
-    law = ml.count_law(system=drawn.system(), **light)
-    total = mean_histogram(system=drawn.system(), **light).sum()
+    flux = ml.Flux(drawn.signal, drawn.background, drawn.delay * PERIOD_NS)
+    law = ml.count_law(flux, drawn.system())
+    total = mean_histogram(flux, drawn.system()).sum()
     assert total == pytest.approx(float(law.mean), abs=1e-3 * math.sqrt(law.variance))
 
     def rate(t: float) -> float:  # in units of the pulse's standard deviation
@@ -451,7 +458,7 @@ def test_sum_of_a_locked_paralyzable_histogram():
 def test_law_of_the_rarest_counts():
     """Five registrations in 1e14 cycles: what a cycle adds to the transform is below the rounding of its value."""
     drawn = draw(191)
-    law = ml.count_law(drawn.signal, drawn.background, drawn.system(), delay_ns=drawn.delay * PERIOD_NS)
+    law = ml.count_law(ml.Flux(drawn.signal, drawn.background, drawn.delay * PERIOD_NS), drawn.system())
     assert law.mean == pytest.approx(4.58244e-6, rel=1e-5)
     assert law.pmf @ law.support == pytest.approx(float(law.mean), rel=1e-7)
     assert law.pmf[2] == pytest.approx(0.5 * law.mean**2, rel=0.01)
@@ -464,15 +471,14 @@ def test_a_warm_state_that_is_not_found_is_refused():
     """Nothing solved was taken for a solution: a uniform shape, and exposures that began armed (signal 1000, just below
     a lock)."""
     system = view(0.9997565745952581, 1, 0.011089244157797067, "stationary", bins=1430)
-    light: dict[str, Any] = {"signal": 1000.0, "background": 0.1484680065940475}
-    delay = 0.890211598817147 * PERIOD_NS
+    flux = ml.Flux(1000.0, 0.1484680065940475, 0.890211598817147 * PERIOD_NS)
     assert left_over(np.ones(3), np.zeros(3)) == math.inf
     assert left_over(np.zeros(3), np.zeros(3)) == 0.0
     for law in (
-        lambda: ml.registration_pdf(**light, system=system, method="stationary", delay_ns=delay),
-        lambda: mean_histogram(**light, system=system, delay_ns=delay),
-        lambda: ml.count_law(**light, system=system, delay_ns=delay),
-        lambda: ml.joint_law(**light, system=system, delay_ns=delay),
+        lambda: ml.registration_pdf(flux, system, "stationary"),
+        lambda: mean_histogram(flux, system),
+        lambda: ml.count_law(flux, system),
+        lambda: ml.joint_law(flux, system),
     ):
         with pytest.raises(ConvergenceError, match=r"engine 'exact'"):
             law()

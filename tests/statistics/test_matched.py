@@ -45,7 +45,7 @@ def exact(dead, cycles, signal, background, start="armed"):
         detector=ml.Detector(dead_time_ns=dead * PERIOD_NS),
         start=start,
     )
-    return ml.count_law(signal, background, system)
+    return ml.count_law(ml.Flux(signal, background, 0.5 * PERIOD_NS), system)
 
 
 def distances(law):

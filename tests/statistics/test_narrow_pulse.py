@@ -42,23 +42,23 @@ def system(
 
 
 def by_count_law(*light: float, view: ml.System, delay_ns: float) -> Figures:
-    law = ml.count_law(*light, view, delay_ns=delay_ns, threads=1)
+    law = ml.count_law(ml.Flux(*light, delay_ns), view, threads=1)
     assert law.pmf.sum() == pytest.approx(1.0, abs=1e-9)
     assert law.pmf @ law.support == pytest.approx(float(law.mean), rel=1e-6)
     return float(law.mean), float(law.variance)
 
 
 def by_joint_law(*light: float, view: ml.System, delay_ns: float) -> Figures:
-    law = ml.joint_law(*light, view, delay_ns=delay_ns)
+    law = ml.joint_law(ml.Flux(*light, delay_ns), view)
     return law.count_mean, law.count_variance
 
 
 def by_histogram(*light: float, view: ml.System, delay_ns: float) -> Figures:
-    return float(mean_histogram(*light, view, delay_ns=delay_ns, threads=1).sum()), 1.0
+    return float(mean_histogram(ml.Flux(*light, delay_ns), view, threads=1).sum()), 1.0
 
 
 def by_paralyzable_moments(*light: float, view: ml.System, delay_ns: float) -> Figures:
-    found = paralyzable_moments(*light, view, delay_ns=delay_ns)
+    found = paralyzable_moments(ml.Flux(*light, delay_ns), view)
     return float(found.mean), float(found.variance)
 
 
@@ -117,7 +117,7 @@ def test_against_photon_by_photon_simulation(delay: float) -> None:
     view, shots = system(1.0, 1e-6), 40_000
     light = 1.5, 0.1, delay * PERIOD_NS
     counts = ml.simulate(ml.Flux(*light), view, engine="sequential", realizations=shots, seed=17).sum(-1).ravel()
-    law = exposure_moments(*light[:2], view, delay_ns=light[2])
+    law = exposure_moments(ml.Flux(*light), view)
     mean, variance = float(law.mean), float(law.variance)
     require(
         {
@@ -138,7 +138,7 @@ def test_phases_of_a_table() -> None:
     told = phases.correction.reshape(4, -1, 4)[:, :, :2]
     for node in range(0, phases.phase.size, 4):
         delay = (0.5 - phases.phase[node]) * PERIOD_NS
-        moved = exposure_moments(cells.signal, cells.background, view, delay_ns=delay).cumulants - entries.cumulants
+        moved = exposure_moments(ml.Flux(cells.signal, cells.background, delay), view).cumulants - entries.cumulants
         assert told[:, node] == pytest.approx(moved[:, :2], abs=1e-3)
 
 

@@ -63,7 +63,7 @@ def constant_rate_pmf(rate: float, dead: float, cycles: float, start: str) -> np
 @pytest.mark.parametrize(("rate", "dead", "cycles"), [(1.3, 0.35, 5), (0.4, 2.7, 30), (4.0, 0.9, 12), (0.8, 1.0, 9)])
 def test_pmf_at_a_constant_rate(rate: float, dead: float, cycles: int, start: str):
     expected = constant_rate_pmf(rate, dead, cycles, start)
-    found = pmf_of(ml.count_law(0.0, rate, view(dead, start, cycles), tolerance=1e-7))
+    found = pmf_of(ml.count_law(ml.Flux(0.0, rate), view(dead, start, cycles), tolerance=1e-7))
     size = min(found.size, expected.size)
     assert expected.sum() == pytest.approx(1.0, abs=1e-9)
     assert found[:size] == pytest.approx(expected[:size], abs=1e-8)
@@ -74,13 +74,13 @@ def test_pmf_at_a_constant_rate(rate: float, dead: float, cycles: int, start: st
 def test_moments_are_the_closed_form_ones(case: Case):
     pixel = ml.Detector(dead_time_ns=case.system.detector.dead_time_ns, mode="paralyzable")
     system = case.system.replace(detector=pixel)
-    flux = pixel_of(case)
-    law = ml.count_law(system=system, tolerance=1e-5, **flux)
-    known = paralyzable_moments(system=system, **flux)
+    flux = case.flux[0, 0]
+    law = ml.count_law(flux, system, tolerance=1e-5)
+    known = paralyzable_moments(flux, system)
     spread = np.sqrt(float(known.variance))
     assert abs(float(law.mean - known.mean)) < 3e-5 * min(spread, float(known.mean)) + 1e-9
     assert float(law.variance) == pytest.approx(float(known.variance), rel=1e-4, abs=1e-8)
-    own = exposure_moments(system=system, tolerance=1e-5, **flux)
+    own = exposure_moments(flux, system, tolerance=1e-5)
     assert 0.5 * np.abs(own.histogram - known.histogram).sum() < 3e-5 * float(known.mean)
     # third and fourth cumulant came by series in s, the pmf by points on the circle
     n = law.support - law.mean
@@ -92,17 +92,10 @@ def test_moments_are_the_closed_form_ones(case: Case):
 def test_the_grid_of_the_histogram_is_not_the_one_of_the_moments(bins: int):
     """However many bins the histogram has, `paralyzable_moments` keeps its tolerance."""
     system = view(0.45, cycles=500, sigma=0.01, bins=bins)
-    found = paralyzable_moments(1.0, 1.0, system, delay_ns=37.0)
-    known = exposure_moments(1.0, 1.0, system.replace(bins=1), delay_ns=37.0, tolerance=1e-7)
+    found = paralyzable_moments(ml.Flux(1.0, 1.0, 37.0), system)
+    known = exposure_moments(ml.Flux(1.0, 1.0, 37.0), system.replace(bins=1), tolerance=1e-7)
     assert float(found.mean) == pytest.approx(float(known.mean), rel=1e-5)
     assert float(found.variance) == pytest.approx(float(known.variance), rel=1e-5)
-
-
-def pixel_of(case: Case) -> dict[str, object]:
-    flux = case.flux
-    if flux.waveform is not None:
-        return {"signal": None, "background": flux.background[0, 0], "waveform": flux.waveform[0, 0]}
-    return {"signal": flux.signal[0, 0], "background": flux.background[0, 0], "delay_ns": flux.delay_ns[0, 0]}
 
 
 @pytest.mark.parametrize("start", ["armed", "stationary"])
@@ -113,8 +106,8 @@ def pixel_of(case: Case) -> dict[str, object]:
 def test_law_of_the_sequential_engine(signal: float, background: float, dead: float, cycles: int, start: str):
     system = view(dead, start, cycles)
     case = Case(f"S {signal:g}, t_d {dead:g}, {start}", flux_of(signal, background, 0.37), system, 8000)
-    law = ml.count_law(signal, background, system, delay_ns=37.0)
-    histogram = exposure_moments(signal, background, system, delay_ns=37.0).histogram
+    law = ml.count_law(ml.Flux(signal, background, 37.0), system)
+    histogram = exposure_moments(ml.Flux(signal, background, 37.0), system).histogram
     check(ENGINES["sequential"], case, Law(histogram, pmf_of(law)), {COUNTS, SHAPE})
 
 
@@ -122,7 +115,7 @@ def test_law_of_the_sequential_engine(signal: float, background: float, dead: fl
 def test_waveform(start: str):
     wave = two_lobes() / 12
     system = view(0.7, start)
-    law = ml.count_law(None, 0.3, system, waveform=wave)
+    law = ml.count_law(ml.Flux(waveform=wave, background=0.3), system)
     case = Case(f"waveform, {start}", waveform_flux(wave, 0.3), system, 12_000)
     check(ENGINES["sequential"], case, Law(None, pmf_of(law)), {COUNTS})
 
@@ -133,7 +126,10 @@ def test_dead_times_round_one_bin_of_the_grid():
     dead = np.array([1e-4, 0.5 * edge, 0.999999 * edge, edge, 1.000001 * edge, 1.5 * edge])
     for d in dead:
         system = view(float(d), cycles=8, sigma=0.05)
-        law, known = ml.count_law(4.0, 1.0, system), paralyzable_moments(4.0, 1.0, system)
+        law, known = (
+            ml.count_law(ml.Flux(4.0, 1.0, 50.0), system),
+            paralyzable_moments(ml.Flux(4.0, 1.0, 50.0), system),
+        )
         assert law.exposure is not None
         assert law.exposure.bins <= 256
         assert law.cumulants[:2] == pytest.approx([float(known.mean), float(known.variance)], rel=1e-4)
@@ -141,24 +137,26 @@ def test_dead_times_round_one_bin_of_the_grid():
 
 
 def test_long_exposures_and_long_dead_times():
-    a, b, c = (ml.count_law(1.0, 0.3, view(2.4, cycles=n)) for n in (200, 201, 100_000_000))
+    a, b, c = (ml.count_law(ml.Flux(1.0, 0.3, 50.0), view(2.4, cycles=n)) for n in (200, 201, 100_000_000))
     assert c.cumulants == pytest.approx(a.cumulants + (b.cumulants - a.cumulants) * (100_000_000 - 200), rel=1e-6)
     assert c.pmf @ c.support == pytest.approx(float(c.mean), rel=1e-8)
     assert c.pmf.sum() == pytest.approx(1.0, abs=1e-5)
-    long = ml.count_law(0.01, 0.005, view(300.25, cycles=2000))
-    known = paralyzable_moments(0.01, 0.005, view(300.25, cycles=2000))
+    long = ml.count_law(ml.Flux(0.01, 0.005, 50.0), view(300.25, cycles=2000))
+    known = paralyzable_moments(ml.Flux(0.01, 0.005, 50.0), view(300.25, cycles=2000))
     assert long.cumulants[:2] == pytest.approx([float(known.mean), float(known.variance)], rel=1e-5)
     assert long.pmf @ long.support == pytest.approx(float(known.mean), rel=1e-5)
 
 
 def test_dark_blinded_and_without_dead_time():
-    dark = ml.count_law(0.0, 0.0, view(0.5))
+    dark = ml.count_law(ml.Flux(0.0, 0.0), view(0.5))
     assert dark.pmf[0] == 1.0
     assert dark.mean == 0.0
     # lambda t_d = 40: the first photon, and nothing ever after
-    blinded = ml.count_law(0.0, 80.0, view(0.5, cycles=10))
+    blinded = ml.count_law(ml.Flux(0.0, 80.0), view(0.5, cycles=10))
     assert pmf_of(blinded)[1] == pytest.approx(1.0, abs=1e-9)
-    free = ml.count_law(1.0, 0.5, view(0.0))
+    free = ml.count_law(ml.Flux(1.0, 0.5, 50.0), view(0.0))
     assert free.variance == pytest.approx(float(free.mean), rel=1e-9)
-    cells = ml.count_law(np.array([0.0, 1.0]), 0.2, view(0.7))
-    assert cells.pmf[0] @ cells.support[0] == pytest.approx(float(ml.count_law(0.0, 0.2, view(0.7)).mean), rel=1e-8)
+    cells = ml.count_law(ml.Flux(np.array([0.0, 1.0]), 0.2, 50.0), view(0.7))
+    assert cells.pmf[0] @ cells.support[0] == pytest.approx(
+        float(ml.count_law(ml.Flux(0.0, 0.2), view(0.7)).mean), rel=1e-8
+    )

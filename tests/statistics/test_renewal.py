@@ -110,7 +110,7 @@ def test_covariances_match_dense_powers(total, dead, rearm):
     [(1.0, 1.0, 0.6375), (10.0, 1.0, 1.0), (10.0, 10.0, 0.6375), (10.0, 0.01, 0.9985), (3.0, 0.05, 1.0)],
 )
 def test_exact_sum_is_the_limit_of_partial_sums(signal, background, dead):
-    terms = holding_time_covariance(signal, background, make_system(dead), lags=2000)
+    terms = holding_time_covariance(ml.Flux(signal, background, 50.0), make_system(dead), lags=2000)
     assert terms.cutoff_sum(2000) == pytest.approx(terms.exact_sum, abs=1e-10 * terms.sigma_ss2)
     assert terms.sigma2 == pytest.approx(terms.sigma_ss2 + 2 * terms.exact_sum, rel=1e-9)
     assert terms.defect < 1e-9
@@ -120,7 +120,7 @@ def test_exact_sum_is_the_limit_of_partial_sums(signal, background, dead):
 
 def test_spectral_rules_against_the_exact_sum():
     """t_d = t_r, S = 10, B = 1: the hardest ordinary cell."""
-    terms = holding_time_covariance(10.0, 1.0, make_system(1.0), bins=512)
+    terms = holding_time_covariance(ml.Flux(10.0, 1.0, 50.0), make_system(1.0), bins=512)
     assert abs(terms.eigenvalues[0] - 1.0) < 1e-9
     assert np.all(np.diff(np.abs(terms.eigenvalues)) < 1e-9)
     exact = terms.exact_sum
@@ -135,7 +135,7 @@ def test_spectral_rules_against_the_exact_sum():
 
 
 def test_spectral_sum_keeps_conjugates_together():
-    terms = holding_time_covariance(10.0, 1.0, make_system(1.0), bins=512)
+    terms = holding_time_covariance(ml.Flux(10.0, 1.0, 50.0), make_system(1.0), bins=512)
     values = terms.eigenvalues
     assert abs(values[1].imag) > 0
     assert values[2] == pytest.approx(values[1].conjugate())
@@ -144,8 +144,8 @@ def test_spectral_sum_keeps_conjugates_together():
 
 def test_left_eigenvectors_where_inverting_the_right_ones_fails():
     """P is so far from normal that V has no usable inverse; left eigenvectors of their own are exact."""
-    terms = holding_time_covariance(10.0, 1.0, make_system(1.0), bins=256, rearm="edge")
-    chain = PhaseChain.from_flux(10.0, 1.0, make_system(1.0), bins=256, rearm="edge")
+    terms = holding_time_covariance(ml.Flux(10.0, 1.0, 50.0), make_system(1.0), bins=256, rearm="edge")
+    chain = PhaseChain.from_flux(ml.Flux(10.0, 1.0, 50.0), make_system(1.0), bins=256, rearm="edge")
     assert np.linalg.cond(np.linalg.eig(chain.dense())[1]) > 1e10
     assert terms.spectral_sum() == pytest.approx(terms.exact_sum, rel=5e-3)
     assert terms.sigma_ss2 + 2 * terms.spectral_sum() > 0
@@ -160,21 +160,21 @@ def test_constant_rate_closed_form(x, dead):
     assert want.mu == pytest.approx(dead + 1 / rate, rel=1e-6)
     assert want.sigma2 == pytest.approx(1 / rate**2, rel=5e-6)
     assert want.covariance_sum == pytest.approx(0.0, abs=1e-12 * want.mu**2)
-    mean, variance = mars_moments(0.0, rate, make_system(dead), bins=2048)
-    mean_renewal, variance_renewal = renewal_moments(0.0, rate, make_system(dead))
+    mean, variance = mars_moments(ml.Flux(0.0, rate), make_system(dead), bins=2048)
+    mean_renewal, variance_renewal = renewal_moments(ml.Flux(0.0, rate), make_system(dead))
     assert mean == pytest.approx(mean_renewal, rel=1e-5)
     assert variance == pytest.approx(variance_renewal, rel=1e-5)
 
 
 def test_no_dead_time_is_poisson():
-    mean, variance = mars_moments(0.5, 0.3, make_system(0.0), bins=4096)
+    mean, variance = mars_moments(ml.Flux(0.5, 0.3, 50.0), make_system(0.0), bins=4096)
     assert mean == pytest.approx(800.0, rel=3e-4)
     assert variance == pytest.approx(mean, rel=3e-4)
 
 
 def test_whole_periods_only_wait():
-    short = holding_times(PhaseChain.from_flux(3.0, 0.5, make_system(0.6375), bins=512))
-    long = holding_times(PhaseChain.from_flux(3.0, 0.5, make_system(200.6375), bins=512))
+    short = holding_times(PhaseChain.from_flux(ml.Flux(3.0, 0.5, 50.0), make_system(0.6375), bins=512))
+    long = holding_times(PhaseChain.from_flux(ml.Flux(3.0, 0.5, 50.0), make_system(200.6375), bins=512))
     assert long.mu == pytest.approx(short.mu + 200.0, rel=1e-12)
     assert long.sigma2 == pytest.approx(short.sigma2, rel=1e-9)
     assert long.covariance_sum == pytest.approx(short.covariance_sum, rel=1e-7)
@@ -184,7 +184,10 @@ def test_edge_rearming_shortens_the_wait_by_half_a_bin():
     system, n = make_system(0.6371), 512
     flat = [holding_times(PhaseChain(np.full(n, 2.0 / n), 0.6371, rearm)) for rearm in ("centre", "edge")]
     assert flat[0].mu - flat[1].mu == pytest.approx(0.5 / n, rel=0.01)
-    assert mars_moments(1.0, 1.0, system, rearm="edge")[0] > mars_moments(1.0, 1.0, system)[0]
+    assert (
+        mars_moments(ml.Flux(1.0, 1.0, 50.0), system, rearm="edge")[0]
+        > mars_moments(ml.Flux(1.0, 1.0, 50.0), system)[0]
+    )
 
 
 def simulate_waits(photons, dead, steps, pixels, seed):
@@ -209,11 +212,11 @@ def simulate_waits(photons, dead, steps, pixels, seed):
 def test_moments_against_simulation(signal, background, dead):
     """Mean and variance of the time of 250 registrations: 4 standard errors, false alarm 1e-4."""
     system, steps, warm, pixels = make_system(dead, sigma=0.01), 290, 40, 6000
-    fine = photons_per_bin(signal, background, system, bins=8192)
+    fine = photons_per_bin(ml.Flux(signal, background, 50.0), system, bins=8192)
     times = simulate_waits(fine, dead, steps + 1, pixels, seed=20)
     waited = times[-1] - times[warm]
     count = steps - warm
-    chain = PhaseChain.from_flux(signal, background, system, bins=4096)
+    chain = PhaseChain.from_flux(ml.Flux(signal, background, 50.0), system, bins=4096)
     law = holding_times(chain)
     gamma = lag_covariances(chain, law, count - 1)
     variance = count * law.sigma_ss2 + 2 * np.sum((count - np.arange(1, count)) * gamma)
@@ -226,24 +229,24 @@ def test_moments_against_simulation(signal, background, dead):
 def test_mars_moments_of_arrays():
     system = make_system(0.6375)
     signal, background = np.array([[0.0], [1.0]]), np.array([0.0, 0.5, 2.0])
-    mean, variance = mars_moments(signal, background, system, bins=256)
+    mean, variance = mars_moments(ml.Flux(signal, background, 50.0), system, bins=256)
     assert mean.shape == variance.shape == (2, 3)
     assert mean[0, 0] == variance[0, 0] == 0.0
-    one = mars_moments(1.0, 0.5, system, bins=256)
+    one = mars_moments(ml.Flux(1.0, 0.5, 50.0), system, bins=256)
     assert (mean[1, 1], variance[1, 1]) == (one[0], one[1])
-    terms = holding_time_covariance(1.0, 0.5, system, bins=256)
+    terms = holding_time_covariance(ml.Flux(1.0, 0.5, 50.0), system, bins=256)
     assert mean[1, 1] == pytest.approx(1000 * 100.0 / terms.mu)
     assert variance[1, 1] == pytest.approx(1000 * 100.0 * terms.sigma2 / terms.mu**3)
 
 
 def test_waveforms_and_sampled_pulses_go_the_same_way():
     system = make_system(0.6375)
-    wave = photons_per_bin(2.0, 0.0, system, bins=1024)
-    by_wave = mars_moments(None, 0.5, system, waveform=wave)
-    by_pulse = mars_moments(2.0, 0.5, system, bins=1024)
+    wave = photons_per_bin(ml.Flux(2.0, 0.0, 50.0), system, bins=1024)
+    by_wave = mars_moments(ml.Flux(waveform=wave, background=0.5), system)
+    by_pulse = mars_moments(ml.Flux(2.0, 0.5, 50.0), system, bins=1024)
     np.testing.assert_allclose(by_wave, by_pulse, rtol=1e-12)
     box = system.replace(pulse=ml.SampledPulse(np.ones(4), bin_ns=0.25))
-    terms = holding_time_covariance(2.0, 0.5, box)
+    terms = holding_time_covariance(ml.Flux(2.0, 0.5, 50.0), box)
     assert terms.sigma2 > 0
     assert terms.defect < 1e-9
 
@@ -256,7 +259,7 @@ def test_random_cells_never_give_a_negative_variance():
             continue
         dead = rng.choice([rng.random(), 10 * rng.random(), rng.integers(0, 5), 1 - 0.003 * rng.random()])
         rearm = "edge" if rng.random() < 0.5 else "centre"
-        chain = PhaseChain.from_flux(signal, background, make_system(dead), bins=512, rearm=rearm)
+        chain = PhaseChain.from_flux(ml.Flux(signal, background, 50.0), make_system(dead), bins=512, rearm=rearm)
         law = holding_times(chain)  # warnings are errors here
         assert law.sigma2 >= 0
         assert law.sigma_ss2 >= 0
@@ -268,23 +271,25 @@ def test_random_cells_never_give_a_negative_variance():
 def test_renewal_pmf_has_the_closed_form_moments(start, rate, dead, cycles):
     system = make_system(dead, cycles=cycles, start=start)
     support = np.arange(400)
-    pmf = renewal_pmf(rate, 0.0, system, support)
-    mean, variance = renewal_moments(rate, 0.0, system, start_up=True)
+    pmf = renewal_pmf(ml.Flux(rate, 0.0, 0.0), system, support)
+    mean, variance = renewal_moments(ml.Flux(rate, 0.0, 0.0), system, start_up=True)
     assert pmf.sum() == pytest.approx(1.0, abs=1e-11)
     assert pmf @ support == pytest.approx(mean, abs=1e-8)
     assert pmf @ (support - pmf @ support) ** 2 == pytest.approx(variance, abs=1e-5)
-    plain = renewal_moments(rate, 0.0, system)
+    plain = renewal_moments(ml.Flux(rate, 0.0, 0.0), system)
     assert abs(plain[0] - mean) <= 0.5
 
 
 def test_baselines_without_dead_time_or_flux():
     system, support = make_system(0.0, cycles=30), np.arange(60)
     for start in ("armed", "stationary"):
-        pmf = renewal_pmf([0.4, 0.0], [0.1, 0.0], system.replace(start=start), support)
+        pmf = renewal_pmf(ml.Flux([0.4, 0.0], [0.1, 0.0], 0.0), system.replace(start=start), support)
         np.testing.assert_allclose(pmf[0], poisson.pmf(support, 15.0), atol=1e-13)
         np.testing.assert_allclose(pmf[1], support == 0)
-    np.testing.assert_allclose(poisson_pmf(0.4, 0.1, system, support), poisson.pmf(support, 15.0), atol=1e-14)
-    mean, variance = poisson_moments([0.4, 0.0], 0.1, system)
+    np.testing.assert_allclose(
+        poisson_pmf(ml.Flux(0.4, 0.1, 0.0), system, support), poisson.pmf(support, 15.0), atol=1e-14
+    )
+    mean, variance = poisson_moments(ml.Flux([0.4, 0.0], 0.1, 0.0), system)
     np.testing.assert_allclose(mean, [15.0, 3.0])
     np.testing.assert_allclose(variance, mean)
 
@@ -292,22 +297,22 @@ def test_baselines_without_dead_time_or_flux():
 def test_bad_input_is_named():
     system = make_system(0.6)
     with pytest.raises(ValueError, match="photons must not all be 0"):
-        holding_time_covariance(0.0, 0.0, system)
+        holding_time_covariance(ml.Flux(0.0, 0.0), system)
     with pytest.raises(ValueError, match="lags must be an integer in"):
-        holding_time_covariance(1.0, 0.0, system, lags=-1)
+        holding_time_covariance(ml.Flux(1.0, 0.0, 50.0), system, lags=-1)
     with pytest.raises(ValueError, match="rearm must be one of"):
-        mars_moments(0.0, 0.0, system, rearm="middle")
-    with pytest.raises(ValueError, match="signal must be"):
-        mars_moments(-1.0, 0.0, system)
-    with pytest.raises(ValueError, match="background must be finite and >= 0"):
-        renewal_moments(1.0, -2.0, system)
+        mars_moments(ml.Flux(0.0, 0.0), system, rearm="middle")
+    with pytest.raises(ValueError, match="signal must lie"):
+        mars_moments(ml.Flux(-1.0, 0.0, 50.0), system)
+    with pytest.raises(ValueError, match="background must lie"):
+        renewal_moments(ml.Flux(1.0, -2.0, 0.0), system)
     with pytest.raises(ValueError, match="support must be >= 0, got -1"):
-        renewal_pmf(1.0, 0.0, system, [-1, 2])
+        renewal_pmf(ml.Flux(1.0, 0.0, 0.0), system, [-1, 2])
     with pytest.raises(TypeError, match="support must be"):
-        poisson_pmf(1.0, 0.0, system, [0.5])
+        poisson_pmf(ml.Flux(1.0, 0.0, 0.0), system, [0.5])
     with pytest.raises(ValueError, match="bins must be at most"):
         moment_matrices(PhaseChain(np.full(9000, 1e-4), 0.5))
-    terms = holding_time_covariance(1.0, 1.0, system, bins=32)
+    terms = holding_time_covariance(ml.Flux(1.0, 1.0, 50.0), system, bins=32)
     with pytest.raises(ValueError, match="tolerance must be"):
         terms.automatic_sum(0.0)
     with pytest.raises(ValueError, match="cutoff must be"):

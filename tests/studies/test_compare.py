@@ -50,7 +50,7 @@ class CountTimesShape(Engine):
         ENGINES["exact"].histogram(task, exact)
         number = exact.sum(1, dtype=np.int64)
         flux, system = task.flux, task.system
-        shape = ml.registration_pdf(flux.signal, flux.background, system, delay_ns=flux.delay_ns, threads=1)
+        shape = ml.registration_pdf(ml.Flux(flux.signal, flux.background, flux.delay_ns), system, threads=1)
         shape = np.tile(shape.reshape(-1, system.bins), (task.realizations, 1))
         random = np.random.default_rng([task.seed, task.first_realization])
         out[:] = random.multinomial(number, shape / shape.sum(1, keepdims=True))
@@ -144,14 +144,14 @@ def test_a_wrong_joint_law_is_found_and_nothing_else():
 def test_a_small_bias_of_the_image_is_found(found):
     dimmed, flux = found.scenes["dimmed"], found.flux
     assert dimmed.relative_bias.wrong
-    darker = ml.count_law(0.97 * flux.signal, 0.97 * flux.background, SYSTEM, delay_ns=flux.delay_ns)
+    darker = ml.count_law(ml.Flux(0.97 * flux.signal, 0.97 * flux.background, flux.delay_ns), SYSTEM)
     expected = float(darker.mean.sum() / found.expected.mean.sum()) - 1.0
     z = (dimmed.relative_bias.value - expected) / dimmed.relative_bias.error
     require({"relative bias": p_value(z)}, "compare: a darker scene")
 
 
 def test_predictions_are_those_of_the_count_law(found):
-    law = ml.count_law(found.flux.signal, found.flux.background, SYSTEM, delay_ns=found.flux.delay_ns)
+    law = ml.count_law(ml.Flux(found.flux.signal, found.flux.background, found.flux.delay_ns), SYSTEM)
     assert np.allclose(found.expected.mean, law.mean, rtol=1e-6)
     assert np.allclose(found.expected.variance, law.variance, rtol=1e-3)
     y, x = found.pixels["dim"]

@@ -166,7 +166,7 @@ def test_what_hangs_is_stopped_and_what_crashes_is_told(monkeypatch: pytest.Monk
     ],
 )
 def test_closed_forms(case: Case, name: str) -> None:
-    form, law = known(case), ml.count_law(system=case.system, **case.light())
+    form, law = known(case), ml.count_law(case.flux()[0, 0], case.system)
     assert form is not None
     assert form.name == name
     assert form.mean == pytest.approx(float(law.mean), rel=1e-6, abs=1e-9)
@@ -183,7 +183,7 @@ def test_closed_forms(case: Case, name: str) -> None:
 def test_two_samples_keep_their_level() -> None:
     """p-values of one engine against itself are even."""
     case = pixel()
-    windows = Windows.of(case, ml.statistics.mean_histogram(system=case.system, **case.light()))
+    windows = Windows.of(case, ml.statistics.mean_histogram(case.flux()[0, 0], case.system))
     p: dict[str, list[float]] = {}
     for k in range(60):
         for check in two_samples(*(simulated("exact", case, 300, 2 * k + i, windows) for i in (0, 1))):

@@ -221,7 +221,7 @@ def test_count_bias_is_that_of_the_laws():
     for scene in scenes:
         flux = scene.flux(system, signal=config.photons * float(scene.reflectivity.mean()), sbr=1.0)
         truth["poisson"].append(system.cycles * (flux.signal + flux.background).ravel())
-        moments = exposure_moments(flux.signal.ravel(), flux.background.ravel(), system, delay_ns=flux.delay_ns.ravel())
+        moments = exposure_moments(ml.Flux(flux.signal.ravel(), flux.background.ravel(), flux.delay_ns.ravel()), system)
         truth["exact"].append(moments.mean)
         truth["variance"].append(moments.variance)
     flat = {name: np.concatenate(values) for name, values in truth.items()}

@@ -45,15 +45,15 @@ def held_out() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def test_pdf_is_within_a_fiftieth_of_the_chain(held_out):
     signal, background, delay = held_out
-    chain = ml.registration_pdf(signal, background, SYSTEM, "chain", delay_ns=delay)
-    found = NEURAL.registration_pdf(signal, background, SYSTEM, delay_ns=delay)
+    chain = ml.registration_pdf(ml.Flux(signal, background, delay), SYSTEM, "chain")
+    found = NEURAL.registration_pdf(ml.Flux(signal, background, delay), SYSTEM)
     np.testing.assert_allclose(found.sum(-1), 1.0, rtol=1e-12)
     assert (found >= 0.0).all()
     off = variation(found, chain)
     assert off.max() < WITHIN
     assert off.mean() < WITHIN / 10
     # what a network that ignores its input would score, in the best of frames: each flux at the same delay
-    fixed = ml.registration_pdf(signal, background, SYSTEM, "chain")
+    fixed = ml.registration_pdf(ml.Flux(signal, background, 0.5 * SYSTEM.period_ns), SYSTEM, "chain")
     assert variation(fixed, fixed.mean(0)).mean() > 10 * WITHIN
 
 
@@ -67,30 +67,30 @@ def test_pdf_of_two_returns():
 
 def test_the_delay_is_not_learned_but_exact():
     delay = (200.25 + np.array([0.0, 1.0, 517.0])) * SYSTEM.bin_ns
-    pdf = NEURAL.registration_pdf(3.0, 0.5, SYSTEM, delay_ns=delay)
+    pdf = NEURAL.registration_pdf(ml.Flux(3.0, 0.5, delay), SYSTEM)
     np.testing.assert_allclose(np.roll(pdf[0], 1), pdf[1], atol=1e-7)
     np.testing.assert_allclose(np.roll(pdf[0], 517), pdf[2], atol=1e-7)
 
 
 def test_count_has_the_mean_of_the_chain_and_the_variance_of_one_holding_time(held_out):
     signal, background, _ = (x[:40] for x in held_out)
-    law = NEURAL.count_law(signal, background, SYSTEM)
+    law = NEURAL.count_law(ml.Flux(signal, background, 50.0), SYSTEM)
     for k, (s, b) in enumerate(zip(signal, background, strict=True)):
-        times = holding_times(PhaseChain.from_flux(s, b, SYSTEM))
+        times = holding_times(PhaseChain.from_flux(ml.Flux(s, b, 0.5 * SYSTEM.period_ns), SYSTEM))
         assert law.mean[k] == pytest.approx(SYSTEM.cycles / times.mu, rel=0.01)
         # (3.5) in place of (3.9): t sigma_ss^2 / mu^3
         assert law.variance[k] == pytest.approx(SYSTEM.cycles * times.sigma_ss2 / times.mu**3, rel=0.1)
     # and that is not the variance of the count: the covariances are what the MaRS paper adds
-    exact = ml.count_law(8.0, 0.1, SYSTEM).variance
-    assert NEURAL.count_law(8.0, 0.1, SYSTEM).variance > 1.5 * exact
+    exact = ml.count_law(ml.Flux(8.0, 0.1, 0.5 * SYSTEM.period_ns), SYSTEM).variance
+    assert NEURAL.count_law(ml.Flux(8.0, 0.1, 50.0), SYSTEM).variance > 1.5 * exact
 
 
 def test_engine_draws_its_own_law():
     signal, background, delay = 4.0, 0.7, 31.7
     flux = ml.Flux(np.full((1, 4), signal), background, delay)
     cube = ml.simulate(flux, SYSTEM, engine=NEURAL, realizations=500, seed=3).reshape(-1, SYSTEM.bins)
-    law = NEURAL.count_law(signal, background, SYSTEM)
-    pdf = NEURAL.registration_pdf(signal, background, SYSTEM, delay_ns=delay)
+    law = NEURAL.count_law(ml.Flux(signal, background, 50.0), SYSTEM)
+    pdf = NEURAL.registration_pdf(ml.Flux(signal, background, delay), SYSTEM)
     counts = cube.sum(-1, dtype=np.int64)
     groups = cube.reshape(-1, 32, SYSTEM.bins // 32).sum(-1, dtype=np.int64)
     mean, variance = float(law.mean), float(law.variance)
@@ -112,7 +112,7 @@ def test_without_light_or_without_signal():
     cube = ml.simulate(flux, SYSTEM, engine=NEURAL)
     assert not cube[0, 0, 0].any()
     assert cube[0, 0, 1].sum() > 500
-    assert np.ptp(NEURAL.registration_pdf(0.0, 1.0, SYSTEM)) == 0.0
+    assert np.ptp(NEURAL.registration_pdf(ml.Flux(0.0, 1.0), SYSTEM)) == 0.0
 
 
 @pytest.mark.parametrize(
@@ -128,7 +128,7 @@ def test_another_system_is_refused_by_name(changes, words):
     with pytest.raises(ValueError, match=re.escape(words)):
         ml.simulate(ml.Flux(1.0, 1.0, 5.0), SYSTEM.replace(**changes), engine=NEURAL)
     with pytest.raises(ValueError, match=re.escape(words)):
-        NEURAL.count_law(1.0, 1.0, SYSTEM.replace(**changes))
+        NEURAL.count_law(ml.Flux(1.0, 1.0, 50.0), SYSTEM.replace(**changes))
 
 
 def test_other_fluxes_are_refused():
@@ -146,8 +146,8 @@ def test_cycles_and_start_do_not_matter():
     flux = ml.Flux(1.0, 1.0, 5.0)
     ml.simulate(flux, SYSTEM.replace(cycles=5, start="stationary"), engine=NEURAL)
     thin = SYSTEM.replace(detector=ml.Detector(dead_time_ns=75.0, detection_efficiency=0.5))
-    half = NEURAL.count_law(2.0, 2.0, thin)
-    assert half.mean == NEURAL.count_law(1.0, 1.0, SYSTEM).mean
+    half = NEURAL.count_law(ml.Flux(2.0, 2.0, 50.0), thin)
+    assert half.mean == NEURAL.count_law(ml.Flux(1.0, 1.0, 50.0), SYSTEM).mean
 
 
 @pytest.mark.full

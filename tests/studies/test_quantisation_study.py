@@ -5,6 +5,7 @@ import csv
 import numpy as np
 import pytest
 
+from mars_lidar import Flux
 from mars_lidar.statistics import exposure_moments
 from mars_lidar.table import Table
 from studies.__main__ import main
@@ -32,7 +33,7 @@ def test_no_error_on_the_nodes(interpolation):
     system = quantisation.QUICK.system(75.0)
     table = Table.build(system, signal=(0.1, 10.0, 3), background=(0.1, 10.0, 3))
     signal, background = np.array([0.1, 1.0, 10.0]), np.array([1.0, 10.0, 0.1])
-    truth = exposure_moments(signal, background, system)
+    truth = exposure_moments(Flux(signal, background, 0.5 * system.period_ns), system)
     found = table.lookup(signal, background, interpolation=interpolation)
     errors = quantisation._errors(found.rows, found.weights, found.cumulants, table.shapes(), truth)
     assert all(errors[key].max() < 1e-5 for key in quantisation.ERRORS)

@@ -48,7 +48,7 @@ def test_pipeline_draws_the_law_of_its_table(system):
     cube = out[0, 0].astype(np.int64)
     assert set(stages) == set(STAGES)
     assert sum(stages.values()) > 0
-    expected = ml.statistics.exposure_moments(signal, background, system)
+    expected = ml.statistics.exposure_moments(ml.Flux(signal, background, 0.5 * system.period_ns), system)
     counts = cube.sum(-1)
     z = (counts.mean() - expected.mean) / np.sqrt(expected.variance / pixels)
     # rounding adds a twelfth to the variance
@@ -142,7 +142,7 @@ def test_tables_are_shared_between_exposures(system):
     assert tables.numpy(longer).system == longer
     assert tables.numpy(longer) is tables.numpy(longer)
     assert tables.get(system.replace(bins=32)).system.bins == 32
-    direct = ml.statistics.exposure_moments(0.1, 10.0, longer)
+    direct = ml.statistics.exposure_moments(ml.Flux(0.1, 10.0, 0.5 * longer.period_ns), longer)
     row = tables.numpy(longer).rows(np.array([0.1]), np.array([10.0]))[0]
     assert tables.numpy(longer).mean[row] == pytest.approx(float(direct.mean), rel=1e-6)
     assert tables.numpy(longer).spread[row] == pytest.approx(float(direct.variance) ** 0.5, rel=1e-5)

@@ -49,7 +49,7 @@ def test_the_closed_form_is_the_scatter_of_the_estimate(dead_ns):
     found = at(*light.tolist(), one)
 
     def mean(signal, background, delay):
-        return mean_histogram(signal, background, one, delay_ns=delay, tolerance=1e-6)
+        return mean_histogram(ml.Flux(signal, background, delay), one, tolerance=1e-6)
 
     step = 1e-2
     moved = np.stack(
@@ -63,7 +63,7 @@ def test_the_closed_form_is_the_scatter_of_the_estimate(dead_ns):
         axis=1,
     )
     centre = mean(*light, 50.0)
-    law = ml.count_law(*light, one)
+    law = ml.count_law(ml.Flux(*light, 50.0), one)
     shape = centre / centre.sum()
     assumed = law.mean * (np.diag(shape) - np.outer(shape, shape)) + law.variance * np.outer(shape, shape)
     weights = np.linalg.solve(assumed, moved)

@@ -46,7 +46,7 @@ def test_one_sweep_gives_the_cumulants_at_every_delay(start, dead):
     own = np.empty((5, 4))
     found, settled = corrections(signal, background, system, cumulants=own)
     delay = system.period_ns * (0.5 - PHASES / GRID)
-    exact = exposure_moments(signal[:, None], background[:, None], system, delay_ns=delay, tolerance=1e-5).cumulants
+    exact = exposure_moments(ml.Flux(signal[:, None], background[:, None], delay), system, tolerance=1e-5).cumulants
     spread = np.sqrt(exact[:, :1, 1])[..., None] ** np.arange(1, 5)
     error = (found - (exact - exact[:, :1])) / spread
     assert (settled >= 0).sum() >= 3
@@ -58,7 +58,7 @@ def test_what_the_correction_is_worth():
     """The oracle of the test above would notice if there were none; and t_d = t_r needs none."""
     system = make_system(0.6, cycles=500)
     effect, _ = corrections(10.0, 0.05, system)
-    law = exposure_moments(10.0, 0.05, system)
+    law = exposure_moments(ml.Flux(10.0, 0.05, 0.5 * system.period_ns), system)
     assert np.ptp(effect[0, :, 0]) > 0.3
     assert np.ptp(effect[0, :, 1]) > 0.15 * law.variance
     nothing, _ = corrections(10.0, 0.05, system.replace(detector=ml.Detector(dead_time_ns=100.0)))
@@ -89,7 +89,7 @@ def test_interpolated_over_pixels_and_phases(start):
     signal, background = 10 ** rng.uniform(-1.6, 0.99, 150), 10 ** rng.uniform(-1.2, 0.69, 150)
     delay = rng.uniform(-100, 300, 150)
     moved, canonical = (
-        exposure_moments(signal, background, table.system, delay_ns=d, tolerance=1e-6) for d in (delay, None)
+        exposure_moments(ml.Flux(signal, background, d), table.system, tolerance=1e-6) for d in (delay, None)
     )
     exact = (moved.cumulants - canonical.cumulants)[:, :2]
     found = table.lookup(signal, background, delay_ns=delay).cumulants - table.lookup(signal, background).cumulants
@@ -106,12 +106,12 @@ def test_exposures_that_end_before_they_settle(dead, cycles):
     system = make_system(dead, cycles=cycles)
     signal, background = np.array([0.0, 0.1, 3.0, 10.0]), np.array([0.01, 0.1, 1.0])
     s, b = np.repeat(signal, 3), np.tile(background, 4)
-    entries = exposure_moments(s, b, system)
+    entries = exposure_moments(ml.Flux(s, b, 0.5 * system.period_ns), system)
     phases = start_phases(system, signal, background, entries.cumulants, entries.bins, threads=2)
     assert not phases.settled.all()
     for node in (phases.phase.size // 3, phases.phase.size // 2):
         delay = system.period_ns * (0.5 - phases.phase[node])
-        exact = exposure_moments(s, b, system, delay_ns=delay).cumulants - entries.cumulants
+        exact = exposure_moments(ml.Flux(s, b, delay), system).cumulants - entries.cumulants
         told = phases.correction.reshape(phases.settled.size, -1, 4)[:, node]
         scale = np.maximum(np.sqrt(entries.variance), 0.5)[:, None] ** np.arange(1, 3)
         rows = np.searchsorted(signal, phases.signal)[:, None] * 3 + np.searchsorted(background, phases.background)

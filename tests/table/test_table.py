@@ -29,7 +29,9 @@ def test_entries_are_the_exact_statistics():
     assert shapes.dtype == np.float32
     assert not shapes.flags.writeable
     for i, j in ((0, 0), (0, 7), (5, 0), (12, 20), (32, 24)):
-        exact = exposure_moments(table.signal[i], table.background[j], table.system, tolerance=1e-6)
+        exact = exposure_moments(
+            ml.Flux(table.signal[i], table.background[j], 0.5 * table.system.period_ns), table.system, tolerance=1e-6
+        )
         found = table.lookup(table.signal[i], table.background[j])
         assert found.cumulants[0] == pytest.approx(exact.cumulants, rel=1e-12)
         row = found.rows[0, found.weights[0].argmax()]
@@ -45,7 +47,11 @@ def test_any_number_of_cycles(start, cycles):
     assert table.serves(cycles)
     rng = np.random.default_rng(cycles)
     i, j = rng.integers(0, table.signal.size, 30), rng.integers(0, table.background.size, 30)
-    exact = exposure_moments(table.signal[i], table.background[j], table.system.replace(cycles=cycles), tolerance=1e-6)
+    exact = exposure_moments(
+        ml.Flux(table.signal[i], table.background[j], 0.5 * table.system.period_ns),
+        table.system.replace(cycles=cycles),
+        tolerance=1e-6,
+    )
     found = table.lookup(table.signal[i], table.background[j], cycles=cycles)
     assert found.cumulants == pytest.approx(exact.cumulants, rel=1e-6, abs=1e-6)
     shapes = table.shapes(cycles)[i * table.background.size + j]
@@ -60,7 +66,7 @@ def test_any_number_of_cycles(start, cycles):
 def test_between_entries():
     table = small_table()
     signal, background = off_grid(np.random.default_rng(0), 120)
-    exact = exposure_moments(signal, background, table.system, tolerance=1e-6)
+    exact = exposure_moments(ml.Flux(signal, background, 0.5 * table.system.period_ns), table.system, tolerance=1e-6)
     spread = np.maximum(np.sqrt(exact.variance), 0.5)
     own = exact.histogram / exact.mean[:, None]
     found = table.lookup(signal, background)
@@ -87,7 +93,7 @@ def test_pixels_without_signal_background_or_both():
     masked = table.lookup(0.0, rate, delay_ns=np.nan)
     assert masked.cumulants[0, 0] == pytest.approx(rate * periods / (1 + x) + x**2 / 2 / (1 + x) ** 2, rel=1e-6)
     signal, background = np.array([0.003, 0.012, 0.007, 1.0]), np.array([1.0, 0.02, 0.01, 0.021])
-    exact = exposure_moments(signal, background, table.system, tolerance=1e-6)
+    exact = exposure_moments(ml.Flux(signal, background, 0.5 * table.system.period_ns), table.system, tolerance=1e-6)
     found = table.lookup(signal, background)
     assert (np.abs(found.cumulants - exact.cumulants)[:, 0] / np.sqrt(exact.variance)).max() < 0.005
     assert total_variation(mixed(table, found), exact.histogram / exact.mean[:, None]).max() < 5e-3
@@ -126,18 +132,22 @@ def test_a_pixel_does_not_depend_on_the_others_or_on_threads():
 def test_the_method_of_the_paper():
     table = small_table(method="mars")
     i, j = np.array([3, 20, 32]), np.array([2, 11, 24])
-    mean, variance = mars_moments(table.signal[i], table.background[j], table.system)
+    mean, variance = mars_moments(
+        ml.Flux(table.signal[i], table.background[j], 0.5 * table.system.period_ns), table.system
+    )
     found = table.lookup(table.signal[i], table.background[j], delay_ns=12.0)
     assert found.cumulants[:, 0] == pytest.approx(mean, rel=1e-12)
     assert found.cumulants[:, 1] == pytest.approx(variance, rel=1e-12)
     assert not found.cumulants[:, 2:].any()
-    chain = ml.registration_pdf(table.signal[i], table.background[j], table.system, "chain")
+    chain = ml.registration_pdf(
+        ml.Flux(table.signal[i], table.background[j], 0.5 * table.system.period_ns), table.system, "chain"
+    )
     assert total_variation(table.shapes()[i * table.background.size + j], chain).max() < 1e-6
     assert table.lookup(1.0, 1.0, cycles=2000).cumulants == pytest.approx(
         10 * table.lookup(1.0, 1.0).cumulants, rel=1e-12
     )
     edge = ml.Table.build(table.system, [1.0], [0.5], method="mars", rearm="edge", threads=1)
-    expected = np.ravel(mars_moments(1.0, 0.5, table.system, rearm="edge"))
+    expected = np.ravel(mars_moments(ml.Flux(1.0, 0.5, 0.5 * table.system.period_ns), table.system, rearm="edge"))
     assert edge.lookup(1.0, 0.5).cumulants[0, :2] == pytest.approx(expected, rel=1e-12)
 
 
@@ -152,7 +162,9 @@ def test_short_exposures_serve_no_others():
     system = make_system(0.6, cycles=3)
     table = ml.Table.build(system, [0.0, 1.0, 10.0], [0.0, 0.1, 1.0], threads=1)
     assert not table.serves(4)
-    assert table.lookup(1.0, 0.1).cumulants[0] == pytest.approx(exposure_moments(1.0, 0.1, system).cumulants, rel=1e-12)
+    assert table.lookup(1.0, 0.1).cumulants[0] == pytest.approx(
+        exposure_moments(ml.Flux(1.0, 0.1, 0.5 * system.period_ns), system).cumulants, rel=1e-12
+    )
     with pytest.raises(ValueError, match=r"cycles must be 3 at some of these pixels, got 4: .* at S = .*, B = "):
         table.lookup(1.0, 0.1, cycles=4)
     assert np.isnan(table.shapes(4)).any()

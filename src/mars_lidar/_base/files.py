@@ -20,6 +20,7 @@ import struct
 import warnings
 import zipfile
 from collections.abc import Callable, Iterable, Iterator
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
@@ -266,10 +267,12 @@ def reading(path: str | Path, kind: str = "file") -> Iterator[Path]:
     except Exception as error:
         text = " ".join(str(error).split())
         named = str(source) in text or (isinstance(error, OSError) and error.filename is not None)
-        if named and isinstance(error, MemoryError | OSError):
+        if named and (isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno is not None)):
             raise
-        if named and type(error) is ValueError:
-            raise FileError(str(error)) from error
+        if named and (
+            type(error) is ValueError or isinstance(error, OSError)
+        ):  # an OSError of a library's own, such as Pillow's
+            raise FileError(text) from error
         if isinstance(error, MemoryError):
             raise MemoryError(f"{source}: does not fit in memory ({text[:300]})") from error
         if not (text and isinstance(error, ValueError | TypeError | OSError)):  # such as a KeyError
@@ -299,6 +302,14 @@ def check_source(path: Path) -> None:
         raise FileError(f"{path}: cannot be opened ({error})") from error
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
         raise FileError(f"{path} is no file but a pipe, socket or device")
+
+
+def is_plain_file(path: Path) -> bool | None:
+    """Whether this is a file, and no link to one; None where there is nothing."""
+    try:
+        return stat.S_ISREG(path.lstat().st_mode)
+    except (FileNotFoundError, NotADirectoryError):
+        return None
 
 
 def check_claim(path: Path, nbytes: float, what: str = "its arrays", *, in_parts: bool = False) -> None:
@@ -487,13 +498,15 @@ def read_mat5(path: Path, names: Iterable[str] | None = None) -> dict[str, Any]:
     from scipy.io import loadmat, matlab
 
     with reading(path, "a .mat of version 5"):
-        wanted = None if names is None else list(names)
-        heads = [head for head in mat5.variables(path) if wanted is None or head.name in wanted]
-        check_claim(path, sum(8 * math.prod(head.shape) for head in heads if head.kind != "sparse"))
-        check_claim(path, mat5.check_elements(path, wanted))
+        wanted = None if names is None else set(names)
+        some = [each for each in mat5.variables(path) if wanted is None or each.name in wanted]
+        check_claim(path, sum(8 * math.prod(each.shape) for each in some if each.kind != "sparse"))
+        check_claim(path, sum(each.size for each in some))
+        found: dict[str, Any] = {}
         with warnings.catch_warnings():  # of variables of the same name, the last of which is the variable
             warnings.simplefilter("ignore", matlab.MatReadWarning)
-            found = dict(loadmat(path, variable_names=wanted))
+            for each in some:
+                found |= loadmat(BytesIO(each.element()), variable_names=[each.name])
         for name, value in found.items():
             _check_sparse_within(name, value)
         return found
@@ -501,11 +514,13 @@ def read_mat5(path: Path, names: Iterable[str] | None = None) -> dict[str, Any]:
 
 def _check_sparse_within(name: str, value: Any) -> None:
     """Check a sparse matrix, also in the cells and structures of a variable."""
-    if is_sparse(value):
+    if isinstance(value, np.ndarray):
+        if value.dtype == object:
+            for part in value.ravel():
+                if type(part) is not np.ndarray or part.dtype.hasobject:  # most cells hold numbers
+                    _check_sparse_within(name, part)
+        elif value.dtype.names and value.dtype.hasobject:
+            for field in value.dtype.names:
+                _check_sparse_within(f"{name}.{field}", value[field])
+    elif is_sparse(value):
         check_sparse(name, value, sorted_rows=True)
-    elif isinstance(value, np.ndarray) and value.dtype == object:
-        for part in value.ravel():
-            _check_sparse_within(name, part)
-    elif isinstance(value, np.ndarray) and value.dtype.names and value.dtype.hasobject:
-        for field in value.dtype.names:
-            _check_sparse_within(f"{name}.{field}", value[field])

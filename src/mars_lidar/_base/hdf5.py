@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 SEAL = "sha256"  # the attribute of a file
 CELLS = "#refs#"  # where MATLAB puts what the cells of a v7.3 file hold
 LIBVER = ("v110", "v110")  # HDF5 1.10, of 2016, on: from there all metadata carry checksums, indices of chunks as well
+_DEEPEST = 100  # groups within groups
 _CHUNK_BYTES = 2**20  # HDF5's default chunk cache
 _HEAP = b"GCOL\1\0\0\0"  # begins a collection of texts in HDF5
 # of dimension scales: references, which no reader of ours follows
@@ -118,9 +119,15 @@ def check_links(file: h5py.File, path: Path) -> None:
 
 
 def _links(file: h5py.File) -> list[tuple[str, int]]:
-    """Names and kinds of all links."""
+    """Names and kinds of all links; ValueError where they are so deep that each is looked up for seconds."""
     found: list[tuple[str, int]] = []
-    file.id.links.visit(lambda name, info: found.append((name.decode("utf-8", "replace"), info.type)), info=True)
+
+    def add(name: bytes, info: Any) -> None:
+        if name.count(b"/") > _DEEPEST:
+            raise ValueError(f"it has groups more than {_DEEPEST} deep")
+        found.append((name.decode("utf-8", "replace"), info.type))
+
+    file.id.links.visit(add, info=True)
     return found
 
 

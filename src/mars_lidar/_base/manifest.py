@@ -14,6 +14,7 @@ import hashlib
 import json
 import os
 import re
+import stat
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -221,10 +222,12 @@ def _sum(sums: Mapping[str, str]) -> str:
 def _state(path: Path) -> tuple[int, ...] | None:
     """What changes when a file is written or replaced; None where there is no file."""
     try:
-        told = path.stat()
+        entry = path.stat()
     except (FileNotFoundError, NotADirectoryError):
         return None
-    return told.st_dev, told.st_ino, told.st_size, told.st_mtime_ns, told.st_ctime_ns
+    if not stat.S_ISREG(entry.st_mode):
+        return None
+    return entry.st_dev, entry.st_ino, entry.st_size, entry.st_mtime_ns, entry.st_ctime_ns
 
 
 def _files(store: Path) -> set[str]:

@@ -1,4 +1,4 @@
-"""A look over the elements of a MATLAB file of version 5, before a library follows them blindly.
+"""The elements of a MATLAB file of version 5, checked before a library follows them blindly.
 
 SciPy takes the type of an element as an index into a table and does not look whether it is in it: a damaged one ends
 the process. Layout: MathWorks, MAT-File Format, chapter 1.
@@ -8,196 +8,146 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO
 
-_VALUES = {1, 2, 3, 4, 5, 6, 7, 9, 12, 13, 16, 17, 18}  # numbers and characters
+_VALUES = frozenset({1, 2, 3, 4, 5, 6, 7, 9, 12, 13, 16, 17, 18})  # numbers and characters
 _MATRIX, _COMPRESSED = 14, 15
-_HEADER, _STEP = 128, 2**16
+_HEADER = 128
+_HEAD = 2**10  # more than tags, flags, 32 axes and a name take
 _DEEPEST = 100  # matrices within cells within structures
 _CLASSES = {1: "cell", 2: "struct", 3: "object", 4: "char", 5: "sparse", **dict.fromkeys(range(6, 16), "numbers")}
-_MOST_AXES = 32
-
-Read = Callable[[int], bytes]
+# elements of a file, beside one for each of its bytes: half a million empty cells, which take 2 s and 100 MiB to read
+_MOST_ELEMENTS = 2_500_000
 
 
 @dataclass(frozen=True)
 class Variable:
-    """The head of a variable: its name, class and shape."""
+    """A variable: its head, and where the rest is."""
 
     name: str
     kind: str  # "numbers", "sparse", "cell", "struct", ...
     shape: tuple[int, ...]
+    size: int = 0  # bytes of its element, unpacked
+    _path: Path = field(default=Path(), repr=False)
+    _place: tuple[int, int, int] = (0, 0, 0)  # type, first byte and size in the file
+    _order: str = "<"
+
+    def element(self) -> bytes:
+        """A file with this variable alone, unpacked; of version 4 the whole file.
+
+        ValueError for an element of a type that there is not, also within cells. What is returned is what was checked,
+        whatever becomes of the file.
+        """
+        kind, start, size = self._place
+        if not start:
+            return self._path.read_bytes()
+        with open(self._path, "rb") as stream:
+            header = stream.read(_HEADER)
+            stream.seek(start)
+            content = stream.read(size)
+            if len(content) < size:
+                raise _unreadable("it is cut short")
+        if kind != _COMPRESSED:
+            content = struct.pack(self._order + "II", kind, size) + content
+        else:
+            unpacker = zlib.decompressobj()
+            content = unpacker.decompress(content, self.size)
+            rest = unpacker.decompress(unpacker.unconsumed_tail, 1)  # compares the checksum at the end
+            if len(content) < self.size or rest or not unpacker.eof:
+                raise _unreadable(f"{self.name!r} does not unpack to its {self.size} bytes")
+        _check(content, self._order, _MOST_ELEMENTS + start + size)
+        return header + content
 
 
 def variables(path: Path) -> list[Variable]:
     """Heads of all variables of a file of version 5 or 4, of which only the first bytes are unpacked."""
     with open(path, "rb") as stream:
-        if 0 in (start := stream.read(4)) and len(start) == 4:
-            from scipy.io import whosmat
-
-            kinds = {"sparse", "char"}
-            listed = whosmat(path)
-            return [Variable(name, kind if kind in kinds else "numbers", shape) for name, shape, kind in listed]
-    return [head for _, _, head in _variables(path)]
-
-
-def check_elements(path: Path, names: Iterable[str] | None = None) -> int:
-    """Raise ValueError for an element of a type that there is not, also within cells and packed variables.
-
-    `names`: look into these variables only. Returns the number of bytes that their elements take unpacked.
-    """
-    wanted, total = None if names is None else set(names), 0
-    for order, read, head in _variables(path):
-        if wanted is None or head.name in wanted:
-            kind, size = read.tag(order)
-            _element(read.read, order, kind, size, 0)
-            total += size
-    return total
-
-
-def _variables(path: Path) -> Iterator[tuple[str, _Unpacked | _Plain, Variable]]:
-    """Byte order, the element read from its start again, and the head of each variable."""
-    with open(path, "rb") as stream:
         header = stream.read(_HEADER)
-        if 0 in header[:4]:  # version 4, which has no elements
-            return
-        order = "<" if header[126:128] == b"IM" else ">"
-        end = path.stat().st_size
-        if end < _HEADER:
-            raise ValueError("cannot be read as a .mat of version 5 (it is cut short)")
+    if len(header) >= 4 and 0 in header[:4]:  # version 4, which has no elements
+        from scipy.io import whosmat
+
+        kinds = {"sparse": "sparse", "char": "char"}
+        listed = whosmat(path)
+        return [Variable(name, kinds.get(kind, "numbers"), shape, _path=path) for name, shape, kind in listed]
+    return list(_variables(path, "<" if header[126:128] == b"IM" else ">"))
+
+
+def _variables(path: Path, order: str) -> Iterator[Variable]:
+    end = path.stat().st_size
+    if end < _HEADER:
+        raise _unreadable("it is cut short")
+    with open(path, "rb") as stream:
+        stream.seek(_HEADER)
         while tag := stream.read(8):
             start = stream.tell()
             kind, size = struct.unpack(order + "II", tag.ljust(8, b"\0"))
             if len(tag) < 8 or start + size > end:
-                raise ValueError("cannot be read as a .mat of version 5 (it is cut short)")
-            first = _Unpacked(stream, size) if kind == _COMPRESSED else _Plain(stream, size, tag)
-            head = _head(first, order)
-            stream.seek(start)
-            again = _Unpacked(stream, size) if kind == _COMPRESSED else _Plain(stream, size, tag)
-            yield order, again, head
+                raise _unreadable("it is cut short")
+            first = stream.read(min(size, 4 * _HEAD))
+            content = zlib.decompressobj().decompress(first, _HEAD) if kind == _COMPRESSED else tag + first
+            name, of_class, shape, unpacked = _head(content, order)
+            yield Variable(name, of_class, shape, unpacked, path, (kind, start, size), order)
             stream.seek(start + size)
 
 
-def _head(source: _Unpacked | _Plain, order: str) -> Variable:
-    """Name, class and shape of a variable; of what is no matrix the name is empty."""
-    kind, _ = source.tag(order)
+def _head(content: bytes, order: str) -> tuple[str, str, tuple[int, ...], int]:
+    """Name, class, shape and size of a variable; of what is no matrix the name is empty."""
+    kind, size = struct.unpack(order + "II", content[:8].ljust(8, b"\0"))
     if kind != _MATRIX:
-        return Variable("", "", ())
-    flags = _values(source.read, order, 8)
-    axes = _values(source.read, order, 4 * _MOST_AXES)
-    name = _values(source.read, order, 256)
+        return "", "", (), 8 + size
+    flags, place = _values(content, 8, order)
+    axes, place = _values(content, place, order)
+    name, _ = _values(content, place, order)
     shape = struct.unpack(f"{order}{len(axes) // 4}i", axes[: len(axes) // 4 * 4])
     number = struct.unpack(order + "I", flags[:4])[0] & 0xFF if len(flags) >= 4 else 0
-    return Variable(name.decode("latin1"), _CLASSES.get(number, f"class {number}"), tuple(shape))
+    return name.decode("latin1"), _CLASSES.get(number, f"class {number}"), tuple(shape), 8 + size
 
 
-def _values(read: Read, order: str, most: int) -> bytes:
-    """The bytes of a sub-element, up to `most` of them."""
-    tag = read(8)
+def _values(content: bytes, place: int, order: str) -> tuple[bytes, int]:
+    """The bytes of an element of numbers, and where the next one begins."""
+    tag = content[place : place + 8]
     if len(tag) < 8:
-        return b""
+        return b"", len(content)
     kind, size = struct.unpack(order + "II", tag)
     if (kind & 0xFFFF if kind >> 16 else kind) not in _VALUES:
-        raise ValueError(f"cannot be read as a .mat of version 5 (no element is of type {kind}: is it damaged?)")
+        raise _no_type(kind)
     if kind >> 16:
-        return tag[4 : 4 + min(kind >> 16, 4)]
-    if size > most:
-        raise ValueError(f"cannot be read as a .mat of version 5 (the head of a variable takes {size} bytes)")
-    content = read(size)
-    _skip(read, -size % 8)
-    return content
+        return tag[4 : 4 + min(kind >> 16, 4)], place + 8
+    end = place + 8 + size
+    if end > len(content) and size > _HEAD // 2:
+        raise _unreadable(f"the head of a variable takes {size} bytes")
+    return content[place + 8 : end], end + -size % 8
 
 
-def _element(read: Read, order: str, kind: int, size: int, depth: int) -> None:
-    if kind != _MATRIX:
-        if kind not in _VALUES:
-            raise ValueError(f"cannot be read as a .mat of version 5 (no element is of type {kind}: is it damaged?)")
-        _skip(read, size)
-        return
-    if depth > _DEEPEST:
-        raise ValueError(f"holds cells or structures more than {_DEEPEST} deep")
-    left, unpack = size, struct.Struct(order + "II").unpack
-    while left >= 8:
-        tag = read(8)
-        if len(tag) < 8:
-            return
-        kind, size = unpack(tag)
-        left -= 8
+def _check(content: bytes, order: str, most: int) -> None:
+    """Raise ValueError for an element of a type that there is not, or more than `most` of them."""
+    unpack = struct.Struct(order + "II").unpack_from
+    ends: list[int] = []  # of the matrices that contain the element
+    place, end = 0, len(content)
+    for _ in range(most):
+        while end - place < 8:
+            if not ends:
+                return
+            place, end = end, ends.pop()
+        kind, size = unpack(content, place)
+        place += 8
         if kind == _MATRIX:
-            _element(read, order, kind, size, depth + 1)
-            left -= size
-            continue
-        small = kind >> 16  # a small element: its size, its type and up to four bytes, in the place of a tag
-        if (kind & 0xFFFF if small else kind) not in _VALUES:
-            _element(read, order, kind & 0xFFFF if small else kind, 0, depth)
-        if not small:
-            padded = size + -size % 8
-            if padded <= _STEP:
-                read(padded)
-            else:
-                _skip(read, padded)
-            left -= padded
+            if len(ends) > _DEEPEST:
+                raise ValueError(f"holds cells or structures more than {_DEEPEST} deep")
+            ends.append(end)
+            end = min(end, place + size)
+        elif kind in _VALUES:
+            place += size + 7 & -8
+        elif not kind >> 16 or kind & 0xFFFF not in _VALUES:  # a small one has its size there, and values for a size
+            raise _no_type(kind)
+    raise _unreadable(f"it has more than {most:,} elements: is it damaged?")
 
 
-def _skip(read: Read, size: int) -> None:
-    while size > 0 and (got := len(read(min(size, _STEP)))):
-        size -= got
+def _no_type(kind: int) -> ValueError:
+    return _unreadable(f"no element is of type {kind & 0xFFFF if kind >> 16 else kind}: is it damaged?")
 
 
-class _Plain:
-    """A variable that is not packed, with its tag."""
-
-    def __init__(self, stream: BinaryIO, size: int, tag: bytes) -> None:
-        self.read, self.size, self._tag = stream.read, size, tag
-
-    def tag(self, order: str) -> tuple[int, int]:
-        """Type and size."""
-        kind, size = struct.unpack(order + "II", self._tag)
-        return kind, size
-
-
-class _Unpacked:
-    """What a packed variable holds, read from its start through a buffer."""
-
-    def __init__(self, stream: BinaryIO, size: int) -> None:
-        self._stream, self._left, self._zlib = stream, size, zlib.decompressobj()
-        self._buffer, self._place = b"", 0
-
-    def tag(self, order: str) -> tuple[int, int]:
-        """Type and size of the next element; of none where the variable is cut short."""
-        tag = self.read(8)
-        if len(tag) < 8:
-            return 0, 0
-        kind, size = struct.unpack(order + "II", tag)
-        return kind, size
-
-    def read(self, size: int) -> bytes:
-        """Up to `size` bytes; fewer at the end, or where it is cut short."""
-        end = self._place + size
-        if end <= len(self._buffer):
-            out = self._buffer[self._place : end]
-            self._place = end
-            return out
-        parts, have = [self._buffer[self._place :]], len(self._buffer) - self._place
-        while have < size and (more := self._next()):
-            parts.append(more)
-            have += len(more)
-        self._buffer = b"".join(parts)
-        self._place = min(size, have)
-        return self._buffer[: self._place]
-
-    def _next(self) -> bytes:
-        """The next block of unpacked bytes, empty at the end."""
-        while not self._zlib.eof:
-            packed = self._zlib.unconsumed_tail
-            if not packed:
-                packed = self._stream.read(min(self._left, _STEP))
-                self._left -= len(packed)
-            if not packed:
-                return b""
-            if out := self._zlib.decompress(packed, 16 * _STEP):
-                return out
-        return b""
+def _unreadable(reason: str) -> ValueError:
+    return ValueError(f"cannot be read as a .mat of version 5 ({reason})")

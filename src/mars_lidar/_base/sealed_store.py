@@ -10,13 +10,38 @@ from typing import TYPE_CHECKING, Any
 
 from zarr.storage import LocalStore, WrapperStore
 
-from mars_lidar._base.files import FileError
+from mars_lidar._base.files import FileError, is_plain_file
 
 if TYPE_CHECKING:
     from mars_lidar._base.manifest import Manifest
 
 
-class SealedStore(LocalStore):
+class PlainFiles(LocalStore):
+    """A store of plain files: for a link, a pipe or a device in the place of a file it raises FileError.
+
+    A link in a store of a stranger would be read as counts, whatever it points to; a pipe would never end.
+    """
+
+    async def get(self, key: str, prototype: Any = None, byte_range: Any = None) -> Any:
+        """The bytes of a file, None where there is none."""
+        self._require_file(key)
+        return await super().get(key, prototype, byte_range)
+
+    def get_sync(self, key: str, *, prototype: Any = None, byte_range: Any = None) -> Any:
+        """As `get`."""
+        self._require_file(key)
+        return super().get_sync(key, prototype=prototype, byte_range=byte_range)
+
+    async def get_partial_values(self, prototype: Any, key_ranges: Any) -> list[Any]:
+        """Several of `get`."""
+        return list(await asyncio.gather(*(self.get(key, prototype, part) for key, part in key_ranges)))
+
+    def _require_file(self, key: str) -> None:
+        if is_plain_file(self.root / key) is False:
+            raise FileError(f"{self.root}: {key} is a link, a pipe or a device, which is not read")
+
+
+class SealedStore(PlainFiles):
     """A complete store as it was opened: a file that is missing, empty, changed or exchanged raises FileError.
 
     The look comes after the read, so that a file that is replaced meanwhile is found as well.
@@ -46,10 +71,6 @@ class SealedStore(LocalStore):
         found = super().get_sync(key, prototype=prototype, byte_range=byte_range)
         self._sums.check(key)
         return found
-
-    async def get_partial_values(self, prototype: Any, key_ranges: Any) -> list[Any]:
-        """Several of `get`."""
-        return list(await asyncio.gather(*(self.get(key, prototype, part) for key, part in key_ranges)))
 
 
 class SealedValues(WrapperStore[Any]):

@@ -50,7 +50,10 @@ class SparseCodec(ArrayBytesCodec):
 
     async def _decode_single(self, chunk_data: Buffer, chunk_spec: ArraySpec) -> NDBuffer:
         packed = np.ascontiguousarray(chunk_data.as_numpy_array()).view(np.uint8).reshape(-1)
-        out: NDArray[Any] = np.empty(chunk_spec.shape, chunk_spec.dtype.to_native_dtype())
+        dtype = chunk_spec.dtype.to_native_dtype()
+        if dtype not in (np.uint16, np.uint32):
+            raise ValueError(f"packed counts are uint16 or uint32, not {dtype}")
+        out: NDArray[Any] = np.empty(chunk_spec.shape, dtype)
         await asyncio.to_thread(lambda: _core.unpack_counts(packed, out.reshape(-1)))
         return chunk_spec.prototype.nd_buffer.from_numpy_array(out)
 

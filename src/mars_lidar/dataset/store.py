@@ -58,7 +58,7 @@ class Dataset:
     def __init__(self, path: Path, *, listed: bool = True) -> None:
         import zarr
 
-        from mars_lidar._base.sealed_store import SealedStore
+        from mars_lidar._base.sealed_store import PlainFiles, SealedStore
         from mars_lidar.dataset import codec  # noqa: F401  (registers it)
 
         self.path = path
@@ -69,7 +69,7 @@ class Dataset:
             told = self.attrs.get("format_version")
             raise ValueError(f"{path} has layout version {told}; {FORMAT_VERSION} and {MORE_VERSION} can be read")
         self.sums = manifest.require(path, listed=listed) if self.complete else None
-        store = path if self.sums is None else SealedStore(path, self.sums)
+        store = PlainFiles(path) if self.sums is None else SealedStore(path, self.sums)
         self.group: Any = zarr.open_group(store, mode="r+" if self.sums is None else "r", use_consolidated=False)
         self.recipe = DatasetRecipe.from_dict(json.loads(self.attrs["recipe"]))
 

@@ -58,7 +58,7 @@ class Task:
 
     def __post_init__(self) -> None:
         flux, system = self.flux.detected(self.system), self.system.detected()
-        object.__setattr__(self, "flux", flux)
+        object.__setattr__(self, "flux", flux.image)
         object.__setattr__(self, "system", system)
 
     @property

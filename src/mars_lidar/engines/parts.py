@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from mars_lidar._base.types import Progress
 from mars_lidar.engines.engine import Engine, Task
-from mars_lidar.light.flux import Flux, made
 
 _TICKS = 1000
 _BUFFER_BYTES = 64 << 20  # of histograms drawn aside before they are put in place
@@ -27,21 +26,13 @@ def stage(progress: Progress | None, start: float, end: float) -> Progress | Non
     return told
 
 
-def _pixels_of(flux: Flux, pixels: NDArray[np.int64]) -> Flux:
-    """The flux of some pixels (n,), as an image of one row."""
-    wave, number, every = flux.waveform, len(flux.returns_signal), flux.background.size
-    signal, delay = (a.reshape(number, 1, every)[..., pixels] for a in (flux.returns_signal, flux.returns_delay_ns))
-    background = flux.background.reshape(1, -1)[:, pixels]
-    return made(signal, delay, background, None if wave is None else wave.reshape(1, -1, wave.shape[-1])[:, pixels])
-
-
 def part_of(
     task: Task, pixels: NDArray[np.int64], first: int, realizations: int, progress: Progress | None = None
 ) -> Task:
     """Some pixels (n,) of a task in some of its realizations, `first` the first: each has the bits of the whole."""
     return replace(
         task,
-        flux=_pixels_of(task.flux, pixels),
+        flux=task.flux.pixels(pixels),
         pixel_index=task.pixel_index[pixels],
         first_realization=task.first_realization + first,
         realizations=realizations,

@@ -13,9 +13,8 @@ from mars_lidar._base.types import FloatArray, IndexArray
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
-from mars_lidar.statistics.cells import Cells
+from mars_lidar.statistics.cells import Cells, waveform_parts
 
-_PARTS = 8192  # of the period, at least, in which several returns are written as a waveform
 _BATCH_BYTES = 64 * 2**20  # work area of the statistics of distinct pixels
 _MOST_CELLS = 4096
 _EFFECTS = LIGHT_EFFECTS + TIMING_EFFECTS
@@ -63,17 +62,9 @@ def _doubles(flux: Flux, system: System) -> int:
     if flux.waveform is not None:
         parts = 4 * flux.waveform.shape[-1]
     elif single_return(flux) is None:
-        parts = 4 * _parts(system)
+        parts = 4 * waveform_parts(system)
     law = 40.0 * float(np.sqrt(system.cycles * flux.total.max()))  # a count is no wider than without dead time
     return 12 * system.bins + parts + int(law)
-
-
-def _parts(system: System) -> int:
-    """Parts of a waveform that resolves the pulse."""
-    probe = 2**15
-    peak = float(system.pulse.bin_energy(0.5 * system.period_ns, system.period_ns, probe).max()) * probe
-    wanted = max(_PARTS, min(2**18, 20.0 * peak))  # 20 a peak's width: 50 a standard deviation
-    return system.bins * max(1, int(np.ceil(wanted / system.bins)))
 
 
 def _keys(flux: Flux, system: System, pixels: IndexArray, delays: bool) -> NDArray[np.void]:
@@ -94,19 +85,7 @@ def _keys(flux: Flux, system: System, pixels: IndexArray, delays: bool) -> NDArr
 
 
 def _cells(flux: Flux, system: System, pixels: IndexArray, delays: bool) -> Cells:
-    background = flux.background.reshape(-1)[pixels]
-    if flux.waveform is not None:
-        wave = flux.waveform.reshape(-1, flux.waveform.shape[-1])[pixels]
-        return Cells.of(None, background, system, waveform=wave, effects=_EFFECTS)
-    single = single_return(flux)
-    if single is not None:
-        own = single[1][pixels] if delays else None
-        return Cells.of(single[0][pixels], background, system, delay_ns=own, effects=_EFFECTS)
-    signal = flux.returns_signal.reshape(len(flux.returns_signal), -1)[:, pixels]
-    delay = np.nan_to_num(flux.returns_delay_ns.reshape(len(flux.returns_signal), -1)[:, pixels])
-    parts = _parts(system)
-    wave = np.zeros((pixels.size, parts))
-    for s, tau in zip(signal, delay, strict=True):
-        lit = np.flatnonzero(s > 0)
-        wave[lit] += s[lit, None] * system.pulse.bin_energy(tau[lit], system.period_ns, parts)
-    return Cells.of(None, background, system, waveform=np.maximum(wave, 0.0), effects=_EFFECTS)
+    some = flux.pixels(pixels)
+    if delays or single_return(flux) is None:
+        return Cells.of_flux(some, system, effects=_EFFECTS)
+    return Cells.of(some.signal, some.background, system, effects=_EFFECTS)

@@ -76,9 +76,9 @@ class RenewalEngine(CountTimesShape):
 
 
 def _laws(system: System, signal: FloatArray, background: FloatArray) -> CountLaws:
-    from mars_lidar.statistics.baselines import renewal_moments
+    from mars_lidar.statistics.baselines import renewal_moments_of
 
-    return RoundedGaussian(*renewal_moments(signal, background, system))
+    return RoundedGaussian(*renewal_moments_of(signal + background, system))
 
 
 def _chains(run: Run, group: Group) -> tuple[NDArray[np.float32], FloatArray]:

@@ -11,10 +11,12 @@ from typing import Any
 import numpy as np
 
 from mars_lidar._base import mat5
-from mars_lidar._base.files import open_npz, read_mat5, reading, whole
+from mars_lidar._base.files import check_claim, open_npz, read_mat5, reading, size_on_disk, whole
 from mars_lidar._base.hdf5 import CELLS, open_hdf5
 from mars_lidar._base.sparse import check_sparse, is_sparse
 from mars_lidar.io.store import OnDisk
+
+_FEW_CELLS, _CELL_BYTES = 50_000, 8  # cells of any file; bytes of a file that each of more takes at least
 
 
 @dataclass(frozen=True)
@@ -82,14 +84,25 @@ def hdf5_arrays(path: Path, *, of_matlab: bool = False, deep: bool = True) -> di
             return
         elif of_matlab and item.dtype == h5py.ref_dtype:
             references = np.atleast_2d(whole(item)).T
-            out[name] = np.empty(references.shape, object)
-            for place, reference in np.ndenumerate(references):
-                out[name][place] = _cell(f"{name}[{place}]", item.file[reference])
+            out[name] = _cells(path, name, item.file, references)
         elif item.dtype.kind in "iuf" and item.ndim and not item.attrs.get("MATLAB_empty", 0):
             out[name] = whole(item).T if of_matlab else whole(item)
 
     with open_hdf5(path) as file:
         file.visititems(visit)
+    return out
+
+
+def _cells(path: Path, name: str, file: Any, references: Any) -> Any:
+    """What the cells of MATLAB 7.3 hold, which may be the same for many of them."""
+    if references.size > max(_FEW_CELLS, size_on_disk(path) // _CELL_BYTES):  # each takes some 20 us to open
+        raise ValueError(f"{path}: {name} would have {references.size:,} cells, more than it can fill: is it damaged?")
+    out, claimed = np.empty(references.shape, object), 0
+    for place, reference in np.ndenumerate(references):
+        part = file[reference]
+        claimed += getattr(part, "nbytes", 0)
+        check_claim(path, claimed, name)
+        out[place] = _cell(f"{name}[{place}]", part)
     return out
 
 

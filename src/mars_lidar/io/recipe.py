@@ -185,6 +185,7 @@ class Recipe(_Blocks):
             raise TypeError(f"system must be a System, got {self.system!r}")
         if not isinstance(self.flux, Flux):
             raise TypeError(f"flux must be a Flux, got {self.flux!r}")
+        object.__setattr__(self, "flux", self.flux.image)
         for name, low, high in (
             ("seed", 0, 2**64 - 1),
             ("realizations", 1, 2**32),
@@ -223,7 +224,8 @@ class Recipe(_Blocks):
     @property
     def image(self) -> tuple[int, int]:
         """(H, W)."""
-        return self.flux.shape
+        height, width = self.flux.shape
+        return height, width
 
     @property
     def light_bytes(self) -> int:

@@ -149,14 +149,14 @@ def open_store(path: Path, check: layout.Check = layout.check_format) -> OpenedS
     """Open a store for reading; chunks are read when the histogram is indexed."""
     import zarr
 
+    from mars_lidar._base.sealed_store import PlainFiles, SealedStore
+
     attrs = manifest.root_document(path).get("attributes", {})
     check(path, attrs)
     identity = ""
     if attrs.get("complete") is False:
-        group: Any = zarr.open_group(path, mode="r")
+        group: Any = zarr.open_group(PlainFiles(path, read_only=True), mode="r")
     else:
-        from mars_lidar._base.sealed_store import SealedStore
-
         sums = manifest.require(path)
         identity = sums.identity
         group = zarr.open_group(SealedStore(path, sums), mode="r")

@@ -14,7 +14,7 @@ from mars_lidar._base.arguments import checked, checked_with_masks
 from mars_lidar._base.keywords import constructed_by_name
 from mars_lidar._base.late import late
 from mars_lidar._base.notebook import as_html
-from mars_lidar._base.types import FloatArray
+from mars_lidar._base.types import FloatArray, IndexArray
 from mars_lidar.instrument.system import System
 
 # --- Maps of photons -----------------------------------------------------------------------------------------------
@@ -24,7 +24,7 @@ MAX_PHOTONS = 1e6  # per period; the samplers are tested to 1e3
 
 
 def light_map(name: str, value: ArrayLike, *, photons: bool = True) -> FloatArray:
-    """A scalar or (H, W) as float64 of two axes: photons per period, or any finite number or NaN."""
+    """Numbers of at most two axes as float64: photons per period, or any finite number or NaN."""
     if isinstance(value, np.ma.MaskedArray):  # a masked delay is no return; masked light is refused, not taken as it is
         value = np.where(np.ma.getmaskarray(value), np.nan, value.data)
     array = np.asarray(value)
@@ -32,14 +32,14 @@ def light_map(name: str, value: ArrayLike, *, photons: bool = True) -> FloatArra
         raise TypeError(f"{name} must be real numbers, got dtype {array.dtype}")
     array = array.astype(np.float64)
     if array.ndim > 2:
-        raise ValueError(f"{name} must be a scalar or (H, W), got shape {array.shape}")
+        raise ValueError(f"{name} must be a scalar, (N,) or (H, W), got shape {array.shape}")
     if array.size == 0:
         raise ValueError(f"{name} must have at least one pixel, got shape {array.shape}")
     if photons:
         check_photons(name, array)
     elif np.isinf(array).any():
         raise ValueError(f"{name} must be finite (or NaN where there is no return), got inf")
-    return np.atleast_2d(array)
+    return array
 
 
 def check_photons(name: str, array: FloatArray) -> None:
@@ -47,9 +47,8 @@ def check_photons(name: str, array: FloatArray) -> None:
     if not (array.min() >= 0 and array.max() <= MAX_PHOTONS):  # NaN is neither
         bad = ~((array >= 0) & (array <= MAX_PHOTONS))
         where = tuple(int(k) for k in np.argwhere(bad)[0])
-        raise ValueError(
-            f"{name} must lie in [0, {MAX_PHOTONS:g}] photons per period, got {array[where]} at index {where}"
-        )
+        place = f" at index {where}" if where else ""
+        raise ValueError(f"{name} must lie in [0, {MAX_PHOTONS:g}] photons per period, got {array[where]}{place}")
 
 
 def common_shape(names: Sequence[str], shapes: Sequence[tuple[int, ...]]) -> tuple[int, ...]:
@@ -58,7 +57,7 @@ def common_shape(names: Sequence[str], shapes: Sequence[tuple[int, ...]]) -> tup
         return np.broadcast_shapes(*shapes)
     except ValueError:
         given = ", ".join(f"{n} {s}" for n, s in zip(names, shapes, strict=True))
-        raise ValueError(f"shapes must broadcast to one (H, W), got {given}") from None
+        raise ValueError(f"shapes must broadcast to one, got {given}") from None
 
 
 def broadcast(names: Sequence[str], maps: Sequence[FloatArray]) -> list[FloatArray]:
@@ -68,26 +67,23 @@ def broadcast(names: Sequence[str], maps: Sequence[FloatArray]) -> list[FloatArr
 
 
 def waveform_maps(waveform: ArrayLike, background: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Waveforms (H, W, T) and background (H, W)."""
+    """Waveforms (..., T) and background (...)."""
     wave = np.asarray(checks.unmasked("waveform", waveform))
     if wave.dtype.kind not in "fiub":
         raise TypeError(f"waveform must be real numbers, got dtype {wave.dtype}")
     if wave.ndim not in (1, 2, 3) or wave.size == 0:
-        raise ValueError(f"waveform must be (T,), (W, T) or (H, W, T), got shape {wave.shape}")
+        raise ValueError(f"waveform must be (T,), (N, T) or (H, W, T), got shape {wave.shape}")
     wave = wave.astype(np.float64)
     check_photons("waveform", wave)
-    wave = wave.reshape((1,) * (3 - wave.ndim) + wave.shape)
     check_photons("waveform summed over a period", wave.sum(-1))
     back = light_map("background", background)
-    shape = common_shape(("waveform", "background"), [wave.shape[:2], back.shape])
+    shape = common_shape(("waveform", "background"), [wave.shape[:-1], back.shape])
     return np.broadcast_to(wave, (*shape, wave.shape[-1])), np.broadcast_to(back, shape)
 
 
 def frozen(array: FloatArray) -> FloatArray:
     """A contiguous copy that nobody writes to."""
-    copy = np.ascontiguousarray(array, dtype=np.float64)
-    if copy is array or copy.base is not None:
-        copy = copy.copy()
+    copy = np.array(array, dtype=np.float64, order="C")
     copy.flags.writeable = False
     return copy
 
@@ -100,23 +96,24 @@ MAX_RETURNS = 16
 @constructed_by_name
 @dataclass(frozen=True, eq=False, init=False)
 class Flux:
-    """Expected *detectable* photons per laser period at each pixel (photon detection efficiency included).
+    """The light: expected photons on the pixels per laser period, of one pixel, of a row of pixels or of an image.
 
-    For a detector with a `Detector.detection_efficiency` below 1: photons on the pixel, of which it detects that share.
-
-    The arrival rate at a pixel is periodic: ``lambda(t) = S s(t - tau) + B / t_r`` with the pulse s of the
-    `System`, or any non-negative waveform.
+    What `simulate` draws from and every prediction is of: ``count_law(flux, system)``. The arrival rate at a pixel is
+    periodic, ``lambda(t) = S s(t - tau) + B / t_r`` with the pulse s of the `System`, or any non-negative waveform.
+    Photons are those that the pixel can detect; of a detector with a `Detector.detection_efficiency` below 1, those on
+    the pixel, of which it detects that share.
 
     Parameters
     ----------
     signal
-        Signal photons per period S: scalar or (H, W); or (R, H, W) of R returns in each pixel, 1 to 16, whose delays
-        are then (R, H, W) too. `Flux.multi` puts returns of several fluxes side by side.
+        Signal photons per period S. Scalars are one pixel, (N,) a row of pixels, (H, W) an image; all arguments
+        broadcast. (R, H, W) is an image of R returns in each pixel, 1 to 16, whose delays are then (R, H, W) too;
+        `Flux.multi` puts returns of several fluxes side by side.
     background
-        Background photons per period B, uniform in time: scalar or (H, W).
+        Background photons per period B, uniform in time.
     delay_ns
-        Delay tau of the return, ns: scalar or (H, W), or (R, H, W). Up to a second either way (1e9 ns): it wraps into
-        the laser period. NaN, for "no return", is allowed where the signal is 0.
+        Delay tau of the return, ns. Up to a second either way (1e9 ns): it wraps into the laser period. NaN, for "no
+        return", is allowed where the signal is 0.
     waveform
         Instead of `signal` and `delay_ns`: photons per period in each of T equal parts of the period
         (..., T), as they reach the detector (the pulse of the system is *not* applied), constant inside
@@ -124,19 +121,22 @@ class Flux:
 
     Attributes
     ----------
+    shape
+        () of one pixel, (N,) or (H, W). Predictions have these axes first; `simulate` makes an image of every flux, of
+        1 x 1 or 1 x N pixels (`image`).
     signal, background, delay_ns
-        (H, W), read-only. With several returns `signal` is their sum and `delay_ns` that of the strongest;
+        (...) of that shape, read-only. With several returns `signal` is their sum and `delay_ns` that of the strongest;
         with a waveform `signal` is its sum and `delay_ns` is NaN.
     returns_signal, returns_delay_ns
-        (K, H, W), one row per return (K = 0 with a waveform).
+        (K, ...), one row per return (K = 0 with a waveform).
     waveform
-        (H, W, T) or None.
+        (..., T) or None.
     info
         What made this flux, for the record (scene radiometry puts its achieved means here).
 
     See Also
     --------
-    Scene, simulate, System
+    Scene, simulate, count_law, System
 
     Examples
     --------
@@ -144,8 +144,8 @@ class Flux:
     >>> flux = ml.Flux(signal=[[0.5, 2.0]], background=1.0, delay_ns=[[20.0, 60.0]])
     >>> flux.shape
     (1, 2)
-    >>> flux.signal
-    array([[0.5, 2. ]])
+    >>> flux[0, 1]
+    Flux(one pixel, 1 return, signal 2, background 1 photons per period)
     """
 
     signal: FloatArray
@@ -238,14 +238,14 @@ class Flux:
         return self._scaled(share, dark)
 
     def delay_periods(self, period_ns: float) -> FloatArray:
-        """Delays of the returns (K, H * W) within the period, in periods: [0, 1); 0 where there is no return."""
+        """Delays of the returns (K, pixels) within the period, in periods: [0, 1); 0 where there is no return."""
         pixels = self.background.size
         delay = np.ascontiguousarray(self.returns_delay_ns.reshape(-1, pixels)) / period_ns
         return np.nan_to_num(delay - np.floor(delay), nan=0.0)
 
     @checked
     def with_dark_counts(self, rate_hz: ArrayLike, system: System) -> Flux:
-        """This flux with dark counts at `rate_hz`, counts/s: scalar or (H, W), such as `dark_count_map` draws.
+        """This flux with dark counts at `rate_hz`, counts/s: scalar or of the pixels, such as `dark_count_map` draws.
 
         They are background that the detection efficiency of the system does not reduce (hence divided by it here, for
         `detected` multiplies), uniform in time; a gated pixel has them in its gate only.
@@ -301,47 +301,68 @@ class Flux:
         return flux
 
     @property
-    def shape(self) -> tuple[int, int]:
-        """(H, W)."""
-        h, w = self.background.shape
-        return h, w
+    def shape(self) -> tuple[int, ...]:
+        """() of one pixel, (N,) or (H, W)."""
+        return self.background.shape
+
+    @property
+    def image(self) -> Flux:
+        """The same light as an image (H, W): one pixel is 1 x 1, a row of N pixels 1 x N."""
+        if len(self.shape) == 2:
+            return self
+        shape = (1, *self.shape) if self.shape else (1, 1)
+        signal, delay = (a.reshape(len(a), *shape) for a in (self.returns_signal, self.returns_delay_ns))
+        wave = None if self.waveform is None else self.waveform.reshape(*shape, -1)
+        return made(signal, delay, self.background.reshape(shape), wave, self.info)
 
     @property
     def total(self) -> FloatArray:
-        """Photons per period Lambda = S + B (H, W)."""
+        """Photons per period Lambda = S + B."""
         return self.signal + self.background
 
     def __getitem__(self, key: Any) -> Flux:
-        """Part of the image: ``flux[rows]``, ``flux[rows, columns]``; integers keep their axis, so the part
-        is an image again.
+        """Some of the pixels: ``flux[y, x]`` is one pixel, ``flux[y]`` a row, ``flux[10:20]`` and ``flux[10:20, :5]``
+        are parts of the image.
         """
         keys = key if isinstance(key, tuple) else (key,)
-        if len(keys) > 2:
-            raise IndexError(f"flux has two axes (rows, columns), got {len(keys)} indices")
-        window = tuple(slice(k, k + 1 or None) if isinstance(k, (int, np.integer)) else k for k in keys)
+        if len(keys) > len(self.shape):
+            axes = ("is one pixel", "has one axis (pixels)", "has two axes (rows, columns)")[len(self.shape)]
+            raise IndexError(f"flux {axes}, got {len(keys)} indices")
         for k, n in zip(keys, self.shape, strict=False):
             if isinstance(k, (int, np.integer)) and not -n <= k < n:
                 raise IndexError(f"index {k} is out of range for an axis of {n} pixels")
-            if not isinstance(k, (int, np.integer, slice)):
+            if isinstance(k, bool) or not isinstance(k, (int, np.integer, slice)):
                 raise IndexError(f"flux takes integers and slices, got {k!r}")
-        returns, wave = (slice(None), *window), None if self.waveform is None else self.waveform[window]
+        returns, wave = (slice(None), *keys), None if self.waveform is None else self.waveform[keys]
         part = made(
-            self.returns_signal[returns], self.returns_delay_ns[returns], self.background[window], wave, self.info
+            self.returns_signal[returns],
+            self.returns_delay_ns[returns],
+            np.asarray(self.background[keys]),
+            wave,
+            self.info,
         )
         if 0 in part.shape:
             raise IndexError(f"flux{list(keys)} selects no pixel of {self.shape}")
         return part
 
+    def pixels(self, numbers: IndexArray) -> Flux:
+        """Some pixels (N,) by their numbers, which count row by row."""
+        number, every = len(self.returns_signal), self.background.size
+        signal, delay = (a.reshape(number, every)[:, numbers] for a in (self.returns_signal, self.returns_delay_ns))
+        wave = None if self.waveform is None else self.waveform.reshape(every, -1)[numbers]
+        return made(signal, delay, self.background.reshape(-1)[numbers], wave, self.info)
+
     def _repr_html_(self) -> str:
         return as_html(self, {"signal (photons per period)": self.signal, "background": self.background})
 
     def __repr__(self) -> str:
-        h, w = self.shape
+        pixels = " x ".join(map(str, self.shape)) + " pixels" if self.shape else "one pixel"
         what = f"waveform of {self.waveform.shape[-1]}" if self.waveform is not None else ""
         what = what or (f"{len(self.returns_signal)} returns" if len(self.returns_signal) > 1 else "1 return")
+        mean = "mean " if self.shape else ""
         return (
-            f"Flux({h} x {w} pixels, {what}, mean signal {self.signal.mean():.4g}, "
-            f"mean background {self.background.mean():.4g} photons per period)"
+            f"Flux({pixels}, {what}, {mean}signal {self.signal.mean():.4g}, "
+            f"{mean}background {self.background.mean():.4g} photons per period)"
         )
 
 
@@ -362,11 +383,11 @@ def made(
     waveform: FloatArray | None,
     info: dict[str, Any] | None = None,
 ) -> Flux:
-    """A flux of checked parts: returns (K, H, W), background (H, W), and waveforms (H, W, T) or None."""
+    """A flux of checked parts: returns (K, ...), background (...), and waveforms (..., T) or None."""
     lost = np.isnan(delay_ns)
     if lost.any() and (lost := lost & (signal > 0)).any():
         where = tuple(int(k) for k in np.argwhere(lost)[0][1:])
-        raise ValueError(f"delay_ns must be finite where signal > 0, got NaN at pixel {where}")
+        raise ValueError(f"delay_ns must be finite where signal > 0, got NaN{f' at pixel {where}' if where else ''}")
     if (far := np.abs(delay_ns) > MAX_DELAY_NS).any():
         raise ValueError(
             f"delay_ns must be within {MAX_DELAY_NS:g} ns either way, got {delay_ns[far][0]:g}; give it modulo the "

@@ -41,7 +41,7 @@ class StoredFlux(Flux):
         rows: Callable[[slice], Flux],
         info: dict[str, Any] | None = None,
     ) -> None:
-        maps = Flux(signal, background, 0.0)
+        maps = Flux(signal, background, 0.0).image
         none = np.empty((0, *maps.shape))
         for name, value in {
             "signal": maps.signal,
@@ -69,7 +69,8 @@ class StoredFlux(Flux):
         rows = keys[0]
         height = self.shape[0]
         if isinstance(rows, (int, np.integer)) and -height <= rows < height:
-            rows = slice(int(rows) % height, int(rows) % height + 1)
+            row = int(rows) % height
+            return self._make(slice(row, row + 1))[(0, *keys[1:])]
         if not isinstance(rows, slice) or len(keys) > 2:
             return super().__getitem__(key)  # which says what is wrong
         wanted = range(height)[rows]

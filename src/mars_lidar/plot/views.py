@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +17,8 @@ from mars_lidar.io.recipe import Recipe
 from mars_lidar.light.flux import Flux
 from mars_lidar.reconstruct import METHODS, reconstruct
 from mars_lidar.reconstruct.quality import depth_lag_m
+from mars_lidar.statistics import ConvergenceError, mean_histogram, photons_per_bin
+from mars_lidar.statistics.histogram import histogram_effects
 
 _READ_BYTES = 64 * 2**20
 _PREDICTED_CYCLES = 20_000  # an exposure whose state never settles costs some 10 us a period
@@ -52,6 +53,7 @@ def example_pixels(flux: Flux, depth_m: NDArray[np.float64]) -> dict[str, tuple[
     Bright and dim are the 98th and the 5th percentile of the signal among pixels with a return; the edge is
     the steepest step in depth. The rim of the image is left out, where recorded images have their artefacts.
     """
+    flux = flux.image
     if np.shape(depth_m) != flux.shape:
         raise ValueError(f"depth_m must be {flux.shape} as the flux, got shape {np.shape(depth_m)}")
     inside, order = by_signal(flux)
@@ -103,19 +105,9 @@ def instrument(system: System) -> str:
 @checked
 def incident_rate(flux: Flux, system: System, y: int, x: int) -> NDArray[np.float64]:
     """Photons per period in each bin (bins,) that reach pixel (y, x), before gate and dead time."""
+    flux = flux.image
     y, x = (checks.integer(name, k, low=0, high=n - 1) for name, k, n in zip("yx", (y, x), flux.shape, strict=True))
-    background = np.full(system.bins, flux.background[y, x] / system.bins)
-    if flux.waveform is not None:
-        wave = flux.waveform[y, x]
-        cumulative = np.concatenate([[0.0], np.cumsum(wave)])
-        edges = np.linspace(0.0, wave.size, system.bins + 1)
-        background += np.diff(np.interp(edges, np.arange(wave.size + 1), cumulative))
-        return background
-    rate = background
-    for s, tau in zip(flux.returns_signal[:, y, x], flux.returns_delay_ns[:, y, x], strict=True):
-        if s > 0:
-            rate = rate + s * system.pulse.bin_energy(tau, system.period_ns, system.bins)
-    return rate
+    return photons_per_bin(flux[y, x], system.detected(), bins=system.bins)
 
 
 def predicted_counts(cube: Cube, y: int, x: int) -> NDArray[np.float64] | None:
@@ -124,39 +116,21 @@ def predicted_counts(cube: Cube, y: int, x: int) -> NDArray[np.float64] | None:
     None where that takes too long for a picture, does not converge, or is not known: behind a gate that moves, with
     limits on events. The engine "poisson" has no dead time: its mean is the detected rate, inside of the gate.
     """
-    from mars_lidar.statistics import ConvergenceError, mean_histogram
-    from mars_lidar.statistics.histogram import histogram_effects
-
     system, flux = cube.system, cube.flux
     effects = system.detector.effects
     if system.detector.gate_moves or not set(effects) <= set(histogram_effects(system)):
         return None
     if cube.engine == "poisson" and system.detector.mode != "gated":
-        return incident_rate(flux[y, x].detected(system), system, 0, 0) * system.cycles
+        return photons_per_bin(flux[y, x], system, bins=system.bins) * system.cycles
     if system.cycles > _PREDICTED_CYCLES and system.detector.mode != "paralyzable":  # whose mean has a closed form
         return None
     if cube.engine == "poisson":
         system = system.replace(detector=replace(system.detector, dead_time_ns=0.0))
     tolerance = 1e-2 if "electronics_dead_time_ns" in effects else 1e-4  # seconds each beyond that
     try:
-        return mean_histogram(system=system, tolerance=tolerance, **law_arguments(flux, system, y, x))
+        return mean_histogram(flux[y, x], system, tolerance=tolerance)
     except ConvergenceError:
         return None
-
-
-def law_arguments(flux: Flux, system: System, y: int, x: int) -> dict[str, Any]:
-    """Pixel (y, x) as `count_law` and `exposure_moments` take it; several returns become a fine waveform."""
-    background = float(flux.background[y, x])
-    waveform = None if flux.waveform is None else flux.waveform[y, x]
-    returns = zip(flux.returns_signal[:, y, x], flux.returns_delay_ns[:, y, x], strict=True)
-    lit = [(float(s), float(tau)) for s, tau in returns if s > 0]
-    if waveform is None and len(lit) > 1:
-        parts = system.bins * max(1, 8192 // system.bins)
-        waveform = np.sum([s * system.pulse.bin_energy(tau, system.period_ns, parts) for s, tau in lit], axis=0)
-    if waveform is not None:
-        return {"signal": None, "background": background, "waveform": np.maximum(waveform, 0.0)}
-    signal, delay = lit[0] if lit else (0.0, 0.0)
-    return {"signal": signal, "background": background, "delay_ns": delay}
 
 
 @checked

@@ -14,6 +14,7 @@ from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.detector import require_effects
 from mars_lidar.instrument.effects import LIGHT_EFFECTS
 from mars_lidar.instrument.system import System
+from mars_lidar.light.flux import Flux
 from mars_lidar.reconstruct.histogram_record import core_ns, open_bins, relative_width
 
 _SINGULAR = 1e-11  # of the largest eigenvalue, all of size 1 to 3: rounding of the sums over the bins is 1e-15 of it
@@ -44,9 +45,7 @@ class HistogramBound:
 
 
 @checked
-def cramer_rao(
-    signal: ArrayLike, background: ArrayLike, system: System, *, delay_ns: ArrayLike, threads: int | None = None
-) -> HistogramBound:
+def cramer_rao(flux: Flux, system: System, *, threads: int | None = None) -> HistogramBound:
     """Least standard deviations of S, B and depth from a histogram, whatever the method.
 
     The information of registrations at the rate l_j in the armed time of bin j is that of a Poisson process,
@@ -56,14 +55,11 @@ def cramer_rao(
 
     Parameters
     ----------
-    signal, background
-        S and B > 0, photons per period as a `Flux` has them (on the pixel, where the detector has an efficiency, and
-        without its dark counts); they broadcast with `delay_ns` to (...).
+    flux
+        One return and background > 0 in each pixel (...).
     system
         Detectors of mode nonparalyzable, synchronous, or gated with a gate that stays, without effects beyond detection
         efficiency and dark counts.
-    delay_ns
-        Delay of the return, ns.
     threads
         As `exposure_moments`.
 
@@ -78,7 +74,7 @@ def cramer_rao(
     ...     period_ns=100.0, cycles=1000, bins=128,
     ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
     ... )
-    >>> bound = ml.cramer_rao(1.0, 1.0, system, delay_ns=40.0)
+    >>> bound = ml.cramer_rao(ml.Flux(signal=1.0, background=1.0, delay_ns=40.0), system)
     >>> round(1000 * float(bound.depth_m), 1)  # mm
     8.2
     """
@@ -89,12 +85,14 @@ def cramer_rao(
         raise TypeError(f"system must be a System, got {type(system).__name__}")
     MaximumLikelihood().check(system)
     require_effects("cramer_rao", system.detector, LIGHT_EFFECTS, _simulate_instead)
-    mean = mean_histogram(signal, background, system, delay_ns=delay_ns, threads=threads)  # checks the arguments
-    s, b, tau = np.broadcast_arrays(*(np.asarray(x, np.float64) for x in (signal, background, delay_ns)))
+    if len(flux.returns_signal) != 1:
+        raise ValueError("flux must have one return in each pixel; several returns of one pixel have `returns_bound`")
+    s, b, tau = flux.signal, flux.background, flux.delay_ns
     if not (b > 0).all():
         raise ValueError(f"background must be > 0, got {b[~(b > 0)].flat[0]}")
     if not np.isfinite(tau).all():
         raise ValueError(f"delay_ns must be finite, got {tau[~np.isfinite(tau)].flat[0]}")
+    mean = mean_histogram(flux, system, threads=threads)
     energy, slope, share = _pulse_bins(system, tau)
     information = _information(system, mean, s[..., None, None], b, energy[..., None, :], slope[..., None, :], share)
     deviation = np.sqrt(_inverse_diagonal(information))
@@ -103,26 +101,25 @@ def cramer_rao(
 
 
 @checked
-def returns_bound(
-    signal: ArrayLike, background: float, system: System, *, delay_ns: ArrayLike, threads: int | None = None
-) -> HistogramBound:
+def returns_bound(flux: Flux, system: System, *, threads: int | None = None) -> HistogramBound:
     """Least standard deviations of every return of one pixel that has several, each with an unknown S and delay.
 
-    As `cramer_rao`, for S (K,), B and delays (K,), ns: returns that overlap are known less well than alone.
+    As `cramer_rao`, for the K returns of a pixel (`Flux.multi`): those that overlap are known less well than alone.
     """
     from mars_lidar.reconstruct.maximum_likelihood import MaximumLikelihood
     from mars_lidar.statistics import mean_histogram
+    from mars_lidar.statistics.cells import one_pixel
 
     MaximumLikelihood().check(system)
     require_effects("returns_bound", system.detector, LIGHT_EFFECTS, _simulate_instead)
-    s, tau = (np.atleast_1d(np.asarray(values, np.float64)) for values in (signal, delay_ns))
-    if s.shape != tau.shape or s.ndim != 1:
-        raise ValueError(f"signal and delay_ns must be (K,), of the same returns, got {s.shape} and {tau.shape}")
-    back = np.asarray(checks.real("background", background, low=0.0, strict_low=True))
+    pixel = one_pixel(flux)
+    s, tau, back = pixel.returns_signal, pixel.returns_delay_ns, pixel.background
+    if not (s.size and np.isfinite(tau).all() and back > 0):
+        raise ValueError("flux must have returns with delays, and background > 0")
     edges = np.linspace(0.0, system.period_ns, system.bins * _WAVEFORM_PARTS + 1)
     waves = [np.diff(system.pulse.wrapped_cumulative(edges - at, system.period_ns)) for at in tau]
     wave = np.maximum(np.tensordot(s, np.array(waves), 1), 0.0)
-    mean = mean_histogram(None, back, system, waveform=wave, threads=threads)
+    mean = mean_histogram(Flux(waveform=wave, background=back), system, threads=threads)
     energy, slope, share = _pulse_bins(system, tau)
     information = _information(system, mean, s[:, None], back, energy, slope, share)
     deviation = np.sqrt(_inverse_diagonal(information))
@@ -155,9 +152,7 @@ def _information(
 
 
 @checked
-def window_error(
-    weights: ArrayLike, signal: float, background: float, system: System, *, delay_ns: float
-) -> tuple[FloatArray, FloatArray]:
+def window_error(weights: ArrayLike, flux: Flux, system: System) -> tuple[FloatArray, FloatArray]:
     """Mean and standard deviation (...) of linear estimates ``weights @ h`` (..., bins) under dead time.
 
     Exact, by `joint_law`: bins of one histogram are not independent, so the Poisson error of a window is wrong
@@ -165,7 +160,7 @@ def window_error(
     """
     from mars_lidar.statistics import joint_law
 
-    mean, variance = joint_law(signal, background, system, delay_ns=delay_ns).window(weights)
+    mean, variance = joint_law(flux, system).window(weights)
     return mean, np.sqrt(variance)
 
 

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from mars_lidar._base import arguments, checks
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
+from mars_lidar.light.flux import Flux
 from mars_lidar.reconstruct.fit_quality import FALSE_ALARM, fit_quality, holds_for
 from mars_lidar.reconstruct.histogram_record import recording_of, relative_width
 from mars_lidar.reconstruct.histograms import Histograms, checked
@@ -128,19 +129,17 @@ class MaximumLikelihood(Method):
 
 
 @arguments.checked
-def log_likelihood(
-    histogram: ArrayLike, system: System, signal: ArrayLike, background: ArrayLike, delay_ns: ArrayLike
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+def log_likelihood(histogram: ArrayLike, flux: Flux, system: System) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Log likelihood of one histogram, up to a constant, with gradient and Fisher information (R9).
 
     Parameters
     ----------
     histogram
         (bins,) counts.
+    flux
+        Hypotheses (...) of the light: one return and background > 0 each.
     system
         How they were recorded.
-    signal, background, delay_ns
-        S and B > 0, photons per period, and delay, ns: they broadcast to (...).
 
     Returns
     -------
@@ -153,9 +152,9 @@ def log_likelihood(
         raise ValueError(f"histogram must be ({system.bins},), of one pixel, got shape {np.shape(histogram)}")
     given, _ = checked(histogram, system, 1)
     MaximumLikelihood().check(system)
-    s, b, tau = np.broadcast_arrays(*(np.asarray(x, np.float64) for x in (signal, background, delay_ns)))
-    if not ((s >= 0) & (b > 0) & np.isfinite(s + b + tau)).all():
-        raise ValueError("signal must be >= 0, background > 0 and delay_ns finite")
+    s, b, tau = flux.signal, flux.background, flux.delay_ns
+    if len(flux.returns_signal) != 1 or not ((b > 0) & np.isfinite(tau)).all():
+        raise ValueError("flux must have one return of finite delay and background > 0 in each pixel")
     at = np.ascontiguousarray(np.stack([s.ravel(), b.ravel(), tau.ravel() / system.period_ns], axis=-1))
     out = np.empty((len(at), 13))
     _core.histogram_log_likelihood(recording_of(system), given.counts[0].astype(np.float64), at, out)

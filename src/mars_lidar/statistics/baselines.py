@@ -6,53 +6,49 @@ Equation numbers refer to docs/theory.md, section 6.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.detector import MODES
 from mars_lidar.instrument.system import System
+from mars_lidar.light.flux import Flux
 from mars_lidar.statistics.gate import require_mode
 
 _WITHOUT_GATE = MODES[:3]  # the light inside a gate depends on the delay, which is not an argument here
 
 
 @checked
-def poisson_moments(signal: ArrayLike, background: ArrayLike, system: System) -> tuple[FloatArray, FloatArray]:
+def poisson_moments(flux: Flux, system: System) -> tuple[FloatArray, FloatArray]:
     """Mean and variance of the count without dead time, both N_r (S + B) (6.1).
 
-    `signal` and `background` are S and B in photons per period, scalars or arrays that broadcast; the results
-    have the broadcast shape.
+    Of the shape of the flux.
     """
     require_mode("poisson_moments", system, _WITHOUT_GATE)
-    mean = system.cycles * _total(signal, background, system)
+    mean = system.cycles * flux.detected(system).total
     return mean, mean.copy()
 
 
 @checked
-def poisson_pmf(signal: ArrayLike, background: ArrayLike, system: System, support: ArrayLike) -> FloatArray:
-    """Probability of each count in `support` (k,) without dead time: (..., k), leading axes those of S, B."""
+def poisson_pmf(flux: Flux, system: System, support: ArrayLike) -> FloatArray:
+    """Probability of each count in `support` (k,) without dead time: (..., k), leading axes those of the flux."""
     from scipy.special import gammaln, xlogy
 
     require_mode("poisson_pmf", system, _WITHOUT_GATE)
     counts = _counts(support)
-    mean = system.cycles * _total(signal, background, system)[..., None]
+    mean = system.cycles * flux.detected(system).total[..., None]
     return np.asarray(np.exp(xlogy(counts, mean) - mean - gammaln(counts + 1.0)), dtype=np.float64)
 
 
 @checked
-def renewal_moments(
-    signal: ArrayLike, background: ArrayLike, system: System, *, start_up: bool = False
-) -> tuple[FloatArray, FloatArray]:
+def renewal_moments(flux: Flux, system: System, *, start_up: bool = False) -> tuple[FloatArray, FloatArray]:
     """Mean and variance of the count of a constant-rate renewal process of equal energy.
 
     Parameters
     ----------
-    signal, background
-        S and B, photons per period: scalars or arrays that broadcast.
+    flux, system
+        The light of pixels of shape (...), and what registers it.
     start_up
         False: the long-exposure law of the MaRS paper's baseline, mean lambda t / (1 + x) and variance
         lambda t / (1 + x)^3 with x = lambda t_d (6.2). True: with the constant terms of the start of the
@@ -61,10 +57,14 @@ def renewal_moments(
     Returns
     -------
     tuple
-        mean, variance: arrays of the broadcast shape.
+        mean, variance: arrays (...).
     """
     require_mode("renewal_moments", system)
-    total = _total(signal, background, system)
+    return renewal_moments_of(flux.detected(system).total, system, start_up=start_up)
+
+
+def renewal_moments_of(total: FloatArray, system: System, *, start_up: bool = False) -> tuple[FloatArray, FloatArray]:
+    """`renewal_moments` of `total` detected photons per period (...)."""
     x = total * system.dead_time_periods
     mean = system.cycles * total / (1.0 + x)
     variance = system.cycles * total / (1.0 + x) ** 3
@@ -77,13 +77,13 @@ def renewal_moments(
 
 
 @checked
-def renewal_pmf(signal: ArrayLike, background: ArrayLike, system: System, support: ArrayLike) -> FloatArray:
+def renewal_pmf(flux: Flux, system: System, support: ArrayLike) -> FloatArray:
     """Exact count law of the constant-rate renewal process, start of the exposure included (6.4, 6.5).
 
     Parameters
     ----------
-    signal, background
-        S and B, photons per period: scalars or arrays that broadcast to a shape (...).
+    flux, system
+        The light of pixels of shape (...), and what registers it.
     support
         (k,) counts, integers >= 0.
 
@@ -94,7 +94,7 @@ def renewal_pmf(signal: ArrayLike, background: ArrayLike, system: System, suppor
     """
     require_mode("renewal_pmf", system)
     counts = _counts(support)
-    rate = _total(signal, background, system)[..., None]
+    rate = flux.detected(system).total[..., None]
     below = _survival(counts, rate, system) - _survival(counts + 1.0, rate, system)
     return np.asarray(np.maximum(below, 0.0), dtype=np.float64)
 
@@ -121,21 +121,6 @@ def _survival(counts: FloatArray, rate: FloatArray, system: System) -> FloatArra
     # the first wait of a stationary pixel has the density (1 - F) / mean, F the law of the later waits (6.5)
     at_least = (integral(np.maximum(counts - 1.0, 0.0)) - integral(counts)) * rate / (1.0 + rate * dead)
     return np.asarray(np.where(counts == 0.0, 1.0, at_least), dtype=np.float64)
-
-
-def _total(signal: ArrayLike, background: ArrayLike, system: System) -> FloatArray:
-    """Detected photons per period, dark counts included."""
-    arrays = []
-    for name, value in (("signal", signal), ("background", background)):
-        array: NDArray[Any] = np.asarray(value)
-        if array.dtype.kind not in "fiu":
-            raise TypeError(f"{name} must be real numbers, got dtype {array.dtype}")
-        bad = ~(np.isfinite(array) & (array >= 0))
-        if bad.any():
-            raise ValueError(f"{name} must be finite and >= 0 photons per period, got {array[bad].flat[0]}")
-        arrays.append(array.astype(np.float64))
-    dark = system.detector.dark_count_hz * system.period_ns * 1e-9
-    return np.asarray((arrays[0] + arrays[1]) * system.detector.detection_efficiency + dark, dtype=np.float64)
 
 
 def _counts(support: ArrayLike) -> FloatArray:

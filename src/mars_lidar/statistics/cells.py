@@ -26,12 +26,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
+from mars_lidar._base.memory import check_memory
 from mars_lidar._base.native import _core
 from mars_lidar._base.types import FloatArray, IndexArray
 from mars_lidar.instrument.detector import Mode
 from mars_lidar.instrument.effects import LIGHT_EFFECTS
 from mars_lidar.instrument.pulse import SampledPulse
 from mars_lidar.instrument.system import System
+from mars_lidar.light.flux import Flux
+from mars_lidar.light.stored_flux import StoredFlux
 from mars_lidar.statistics.gate import PLAIN, open_parts, require_mode
 
 # --- Arguments -----------------------------------------------------------------------------------------------------
@@ -93,59 +96,45 @@ _CHAIN_BINS_PER_WIDTH = 7.5  # bins in 1 / max s, which is 2.507 sigma for a Gau
 
 
 @checked
-def photons_per_bin(
-    signal: float | None,
-    background: float,
-    system: System,
-    *,
-    bins: int | None = None,
-    delay_ns: float | None = None,
-    waveform: ArrayLike | None = None,
-) -> FloatArray:
-    """Photons per bin and period of one pixel, exact integrals over each bin (1.2).
+def photons_per_bin(flux: Flux, system: System, *, bins: int | None = None) -> FloatArray:
+    """Detected photons per bin and period, exact integrals over each bin (1.2).
 
     Parameters
     ----------
-    signal, background
-        S and B, photons per period, >= 0. With a waveform `signal` is None.
+    flux
+        The light, of any number of returns, or a waveform.
     bins
         Bins of the statistics grid; None: the smallest multiple of the histogram's bins that is at least 512
         and resolves the pulse (bin at most sigma / 3 of a Gaussian), or the waveform's samples.
-    delay_ns
-        Delay of the return, ns; None: half the period.
-    waveform
-        (T,) photons per period in T equal parts of the period, constant within each; replaces the signal.
 
     Returns
     -------
     NDArray
-        (bins,).
+        (..., bins), the leading axes those of the flux.
     """
-    back = checks.real("background", background, low=0.0, high=MAX_PHOTONS)
+    flux = flux.detected(system)
     if bins is not None:
         bins = checks.integer("bins", bins, low=1, high=_MAX_BINS)
-    if waveform is not None:
-        if signal is not None or delay_ns is not None:
-            raise ValueError("waveform replaces signal and delay_ns: give it alone, or with background")
-        wave = _waveform(waveform)
-        n = bins or _bins_for_waveform(wave.size, system.bins)
-        cumulative = np.concatenate([[0.0], np.cumsum(wave)])
-        edges = np.arange(n + 1) * (wave.size / n)
-        energy = np.diff(np.interp(edges, np.arange(wave.size + 1), cumulative))
-        return _detected(np.maximum(energy, 0.0) + back / n, system)
-    if signal is None:
-        raise ValueError("signal must be given (photons per period), or a waveform instead of it")
-    total = checks.real("signal", signal, low=0.0, high=MAX_PHOTONS)
-    delay = 0.5 * system.period_ns if delay_ns is None else checks.real("delay_ns", delay_ns)
+    if flux.waveform is not None:
+        size = flux.waveform.shape[-1]
+        n = bins or _bins_for_waveform(size, system.bins)
+        before = np.concatenate([np.zeros((*flux.shape, 1)), np.cumsum(flux.waveform, -1)], -1)
+        at = np.minimum(np.arange(n + 1) * (size / n), size)
+        part = np.minimum(at.astype(np.int64), size - 1)
+        until = before[..., part] + (at - part) * flux.waveform[..., part]
+        return np.asarray(np.maximum(np.diff(until), 0.0) + flux.background[..., None] / n)
     n = bins or default_bins(system)
-    energy = system.pulse.bin_energy(delay, system.period_ns, n)
-    return _detected(total * np.maximum(energy, 0.0) + back / n, system)
+    light = np.broadcast_to(flux.background[..., None] / n, (*flux.shape, n)).copy()
+    for signal, delay_ns in zip(flux.returns_signal, np.nan_to_num(flux.returns_delay_ns), strict=True):
+        light += signal[..., None] * np.maximum(system.pulse.bin_energy(delay_ns, system.period_ns, n), 0.0)
+    return light
 
 
-def _detected(light: FloatArray, system: System) -> FloatArray:
-    """`Flux.detected` on a grid (bins,)."""
-    dark = system.detector.dark_count_hz * system.period_ns * 1e-9
-    return np.asarray(light * system.detector.detection_efficiency + dark / light.size, dtype=np.float64)
+def one_pixel(flux: Flux) -> Flux:
+    """The flux, which must be that of a single pixel."""
+    if flux.background.size != 1:
+        raise ValueError(f"flux must be one pixel, such as flux[0, 0], got pixels of shape {flux.shape}")
+    return flux if flux.shape == () else flux[(0,) * len(flux.shape)]
 
 
 def default_bins(system: System) -> int:
@@ -176,23 +165,18 @@ def whole_bins(dead: float, bins: int) -> tuple[int, int, float]:
     return (whole + 1, 0, fraction) if shift == bins else (whole, shift, fraction)
 
 
-def cell_name(signal: float | None, background: float, system: System) -> str:
-    """(S, B, t_d) in words, for warnings and errors; a signal of None is a waveform."""
-    what = "waveform" if signal is None else f"S = {signal:g}"
-    return f"{what}, B = {background:g} photons per period, t_d = {system.dead_time_periods:g} periods"
+def cell_name(flux: Flux, system: System) -> str:
+    """(S, B, t_d) of one pixel in words, for warnings and errors."""
+    what = "waveform" if flux.waveform is not None else f"S = {flux.signal:g}"
+    return f"{what}, B = {flux.background:g} photons per period, t_d = {system.dead_time_periods:g} periods"
 
 
-def _waveform(waveform: ArrayLike) -> FloatArray:
-    wave = np.asarray(waveform)
-    if wave.dtype.kind not in "fiu":
-        raise TypeError(f"waveform must be real numbers, got dtype {wave.dtype}")
-    if wave.ndim != 1 or wave.size == 0:
-        raise ValueError(f"waveform must be (T,) with T >= 1, got shape {wave.shape}")
-    bad = ~((wave >= 0) & (wave <= MAX_PHOTONS))
-    if bad.any():
-        k = int(np.argmax(bad))
-        raise ValueError(f"waveform must lie in [0, {MAX_PHOTONS:g}] photons per period, got waveform[{k}] = {wave[k]}")
-    return wave.astype(np.float64)
+def waveform_parts(system: System) -> int:
+    """Parts of a waveform of several returns: at least 8192, 50 in a standard deviation of the pulse."""
+    probe = 2**15
+    peak = float(system.pulse.bin_energy(0.5 * system.period_ns, system.period_ns, probe).max()) * probe
+    wanted = max(2**13, min(2**18, 20.0 * peak))
+    return system.bins * max(1, math.ceil(wanted / system.bins))
 
 
 # --- Pulses narrower than a cell -----------------------------------------------------------------------------------
@@ -425,6 +409,34 @@ class Cells:
         phase -= np.floor(phase)
         return cls(system, total.shape, flat(total), flat(back), phase, None, np.zeros(total.size, np.int64))
 
+    @classmethod
+    def of_flux(
+        cls,
+        flux: Flux,
+        system: System,
+        *,
+        what: str = "this statistic",
+        modes: tuple[Mode, ...] = PLAIN,
+        effects: tuple[str, ...] = LIGHT_EFFECTS,
+    ) -> Cells:
+        """The pixels of a flux; several returns of a pixel are written as a waveform that resolves the pulse."""
+        if isinstance(flux, StoredFlux):
+            flux = flux[:]
+        named: dict[str, Any] = {"what": what, "modes": modes, "effects": effects}
+        if flux.waveform is not None:
+            return cls.of(None, flux.background, system, waveform=flux.waveform, **named)
+        if ((flux.returns_signal > 0).sum(0) <= 1).all():
+            return cls.of(flux.signal, flux.background, system, delay_ns=flux.delay_ns, **named)
+        pixels, parts = flux.background.size, waveform_parts(system)
+        check_memory(16 * pixels * parts, "the waveforms of several returns", "take rows: flux[rows]")
+        waveform = np.zeros((pixels, parts))
+        signals, delays = (a.reshape(-1, pixels) for a in (flux.returns_signal, flux.returns_delay_ns))
+        for signal, delay_ns in zip(signals, delays, strict=True):
+            lit = np.flatnonzero(signal > 0)
+            waveform[lit] += signal[lit, None] * system.pulse.bin_energy(delay_ns[lit], system.period_ns, parts)
+        waveform = np.maximum(waveform, 0.0).reshape(*flux.shape, parts)
+        return cls.of(None, flux.background, system, waveform=waveform, **named)
+
     @property
     def native_flux(self) -> tuple[FloatArray, FloatArray]:
         """Photons per period (cells,) of the shapes of `energies` and of a flat background, for the native core.
@@ -444,6 +456,13 @@ class Cells:
     def total(self) -> FloatArray:
         """Photons per period (cells,), inside the gate if there is one."""
         return np.asarray(sum(self.native_flux), dtype=np.float64)
+
+    def flux(self, index: int) -> Flux:
+        """The light of one cell."""
+        if self.waveform is not None:
+            wave = self.signal[index] * self.waveform[self.row[index]]
+            return Flux(waveform=wave, background=self.background[index])
+        return Flux(self.signal[index], self.background[index], self.delay[index] * self.system.period_ns)
 
     def part(self, index: IndexArray | slice) -> Cells:
         """The selected cells, flat."""

@@ -20,7 +20,8 @@ from mars_lidar._base import checks
 from mars_lidar._base.brief import brief
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
-from mars_lidar.statistics.cells import MAX_PHOTONS, cell_name, photons_per_bin
+from mars_lidar.light.flux import Flux
+from mars_lidar.statistics.cells import MAX_PHOTONS, cell_name, one_pixel, photons_per_bin
 from mars_lidar.statistics.gate import require_mode
 from mars_lidar.statistics.phase_chain import ConvergenceError, Feedback, Solution, cyclic_recursion
 
@@ -151,19 +152,17 @@ class PhaseChain:
     @classmethod
     def from_flux(
         cls,
-        signal: float | None,
-        background: float,
+        flux: Flux,
         system: System,
         *,
         rearm: Rearm = "centre",
         bins: int | None = None,
-        delay_ns: float | None = None,
-        waveform: ArrayLike | None = None,
     ) -> PhaseChain:
         """The chain of one pixel; arguments as `photons_per_bin`. For mode ``"nonparalyzable"`` only."""
         require_mode("the chain of phases", system)
-        photons = photons_per_bin(signal, background, system, bins=bins, delay_ns=delay_ns, waveform=waveform)
-        return cls(photons, system.dead_time_periods, rearm, cell_name(signal, background, system))
+        pixel = one_pixel(flux)
+        photons = photons_per_bin(pixel, system, bins=bins)
+        return cls(photons, system.dead_time_periods, rearm, cell_name(pixel, system))
 
     @property
     def bins(self) -> int:

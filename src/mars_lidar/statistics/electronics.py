@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
@@ -23,6 +23,7 @@ from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.detector import Mode
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
+from mars_lidar.light.flux import Flux
 from mars_lidar.statistics.cells import Cells, photons_before
 from mars_lidar.statistics.count_pmf import MARGIN, REACH, Pmf, exact_windows
 from mars_lidar.statistics.exposure import Moments, refined_moments, stationary_histogram
@@ -240,12 +241,9 @@ ElectronicsMoments = Moments
 
 @checked
 def electronics_moments(
-    signal: ArrayLike | None,
-    background: ArrayLike,
+    flux: Flux,
     system: System,
     *,
-    delay_ns: ArrayLike | None = None,
-    waveform: ArrayLike | None = None,
     tolerance: float = 1e-3,
 ) -> ElectronicsMoments:
     """Mean and variance of the number of records, and their mean histogram, with `Detector.electronics_dead_time_ns`.
@@ -254,8 +252,8 @@ def electronics_moments(
 
     Parameters
     ----------
-    signal, background, delay_ns, waveform
-        As `exposure_moments`: photons per period, scalars or arrays that broadcast to (...).
+    flux, system
+        The light of pixels of shape (...), and what registers it.
     tolerance
         The grid is refined until doubling it moves mean and variance, or their limits for fine grids, by less than
         this in standard deviations of N (or relative to themselves, if that is larger), and the shape by less in
@@ -274,12 +272,9 @@ def electronics_moments(
         Naming the cell, where the grid that would be needed does not fit in 1 GiB, or the exposure is too long to be
         run through before its state repeats.
     """
-    cells = Cells.of(
-        signal,
-        background,
+    cells = Cells.of_flux(
+        flux,
         system,
-        delay_ns=delay_ns,
-        waveform=waveform,
         what="electronics_moments",
         modes=ELECTRONICS_MODES,
         effects=(*LIGHT_EFFECTS, "electronics_dead_time_ns", *TIMING_EFFECTS),

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
@@ -29,6 +29,7 @@ from mars_lidar._base.types import FloatArray, IndexArray, Progress
 from mars_lidar.instrument.detector import Mode
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
+from mars_lidar.light.flux import Flux
 from mars_lidar.statistics.cells import Cells, fine_histograms, meets_itself, photons_before
 from mars_lidar.statistics.joint_grid import FoldedGrid
 from mars_lidar.statistics.phase_chain import ConvergenceError
@@ -309,12 +310,9 @@ _ENERGY_STEPS = 10.0  # cost of the light of a bin, in steps of the native recur
 
 @checked
 def exposure_moments(
-    signal: ArrayLike | None,
-    background: ArrayLike,
+    flux: Flux,
     system: System,
     *,
-    delay_ns: ArrayLike | None = None,
-    waveform: ArrayLike | None = None,
     tolerance: float = 1e-4,
     threads: int | None = None,
     progress: Progress | None = None,
@@ -325,13 +323,8 @@ def exposure_moments(
 
     Parameters
     ----------
-    signal, background
-        S and B, photons per period in [0, 1e6]: scalars or arrays that broadcast to (...).
-    delay_ns
-        Delay of the return, ns, scalar or array that broadcasts with them; None: half the period. With an
-        armed start the count law depends on the delay.
-    waveform
-        (..., T) photons per period in T equal parts of the period, instead of `signal` and `delay_ns`.
+    flux, system
+        The light of pixels of shape (...), and what registers it.
     tolerance
         The statistics grid is refined until `Exposure.movement` is below this, in [1e-9, 0.1].
     threads
@@ -350,12 +343,9 @@ def exposure_moments(
         Naming the cell, where no grid up to 2^20 bins meets the tolerance, or where the state has not
         repeated after some 10^5 to 10^7 periods of an exposure that is longer still.
     """
-    cells = Cells.of(
-        signal,
-        background,
+    cells = Cells.of_flux(
+        flux,
         system,
-        delay_ns=delay_ns,
-        waveform=waveform,
         what="exposure_moments",
         modes=_MODES,
         effects=LIGHT_EFFECTS + TIMING_EFFECTS,

@@ -6,7 +6,6 @@ from dataclasses import replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
@@ -14,6 +13,7 @@ from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.detector import MODES
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
+from mars_lidar.light.flux import Flux
 from mars_lidar.statistics.cells import LAW_STEPS, Cells, fine_histograms
 from mars_lidar.statistics.chain import PhaseChain
 from mars_lidar.statistics.electronics import ELECTRONICS_MODES, LAW_EFFORT, moments, stationary_records
@@ -28,12 +28,9 @@ from mars_lidar.statistics.timing import recorded
 
 @checked
 def mean_histogram(
-    signal: ArrayLike | None,
-    background: ArrayLike,
+    flux: Flux,
     system: System,
     *,
-    delay_ns: ArrayLike | None = None,
-    waveform: ArrayLike | None = None,
     tolerance: float = 1e-4,
     threads: int | None = None,
 ) -> FloatArray:
@@ -43,12 +40,9 @@ def mean_histogram(
     and includes jitter, code widths and, for modes ``"nonparalyzable"`` and ``"gated"``, the dead time of the
     electronics (to 1e-3, see `electronics_moments`).
     """
-    cells = Cells.of(
-        signal,
-        background,
+    cells = Cells.of_flux(
+        flux,
         system,
-        delay_ns=delay_ns,
-        waveform=waveform,
         what="mean_histogram",
         modes=MODES,
         effects=histogram_effects(system),
@@ -93,13 +87,10 @@ _SHAPES = ("exposure", "stationary", "chain")
 
 @checked
 def registration_pdf(
-    signal: ArrayLike | None,
-    background: ArrayLike,
+    flux: Flux,
     system: System,
     method: Literal["exposure", "stationary", "chain"] = "exposure",
     *,
-    delay_ns: ArrayLike | None = None,
-    waveform: ArrayLike | None = None,
     rearm: Literal["centre", "edge"] | None = None,
     tolerance: float = 1e-4,
     threads: int | None = None,
@@ -108,8 +99,8 @@ def registration_pdf(
 
     Parameters
     ----------
-    signal, background, delay_ns, waveform, tolerance, threads
-        As `count_law`; arrays broadcast to (...).
+    flux, system, tolerance, threads
+        As `count_law`.
     method
         - ``"exposure"``: mean histogram of the finite exposure, the mean of measurements,
         - ``"stationary"``: that of one period of a stationary pixel,
@@ -136,18 +127,15 @@ def registration_pdf(
     ...     period_ns=100.0, cycles=1000, bins=128,
     ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
     ... )
-    >>> pdf = ml.registration_pdf(1.0, 1.0, system, delay_ns=40.0)
+    >>> pdf = ml.registration_pdf(ml.Flux(signal=1.0, background=1.0, delay_ns=40.0), system)
     >>> pdf.shape
     (128,)
     """
     checks.choice("method", method, _SHAPES)
     edge = rearm_of(rearm, method == "chain", f"method {method!r}")
-    cells = Cells.of(
-        signal,
-        background,
+    cells = Cells.of_flux(
+        flux,
         system,
-        delay_ns=delay_ns,
-        waveform=waveform,
         what=f"registration_pdf of method {method!r}",
         modes=PLAIN if method == "chain" else MODES,
         effects=LIGHT_EFFECTS if method == "chain" else histogram_effects(system),
@@ -175,20 +163,11 @@ def rearm_of(rearm: str | None, used: bool, by: str) -> Literal["centre", "edge"
     return "edge" if checks.choice("rearm", rearm, ("centre", "edge")) == "edge" else "centre"
 
 
-def pixel_of(cells: Cells, k: int) -> tuple[float | None, FloatArray | None, float | None]:
-    """Signal, waveform and delay of one cell as the chain takes them."""
-    if cells.waveform is not None:
-        return None, cells.signal[k] * cells.waveform[cells.row[k]], None
-    return float(cells.signal[k]), None, float(cells.delay[k]) * cells.system.period_ns
-
-
 def chain_of(cells: Cells, k: int, edge: Literal["centre", "edge"] = "centre") -> PhaseChain | None:
     """The chain of one cell; None where there is no flux."""
-    background = float(cells.background[k])
-    if cells.signal[k] + background == 0.0:
+    if cells.signal[k] + cells.background[k] == 0.0:
         return None
-    signal, waveform, delay = pixel_of(cells, k)
-    return PhaseChain.from_flux(signal, background, cells.system, rearm=edge, delay_ns=delay, waveform=waveform)
+    return PhaseChain.from_flux(cells.flux(k), cells.system, rearm=edge)
 
 
 def _chain_shapes(cells: Cells, edge: Literal["centre", "edge"]) -> FloatArray:

@@ -32,7 +32,16 @@ from mars_lidar._base.notebook import as_html
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
-from mars_lidar.statistics.cells import MANY_BINS, Cells, light_before, meets_itself, misplaced, registered_before
+from mars_lidar.light.flux import Flux
+from mars_lidar.statistics.cells import (
+    MANY_BINS,
+    Cells,
+    light_before,
+    meets_itself,
+    misplaced,
+    one_pixel,
+    registered_before,
+)
 from mars_lidar.statistics.exposure import recorded_light
 from mars_lidar.statistics.joint_grid import FoldedGrid
 from mars_lidar.statistics.phase_chain import ConvergenceError
@@ -393,24 +402,19 @@ _BLOCK = 64  # windows solved together
 
 @checked
 def joint_law(
-    signal: float | None,
-    background: float,
+    flux: Flux,
     system: System,
     *,
-    delay_ns: float | None = None,
-    waveform: ArrayLike | None = None,
     tolerance: float = 1e-3,
 ) -> JointLaw:
     """Exact mean and covariance of the histogram of one pixel, for an exposure of `System.cycles` periods.
 
     Parameters
     ----------
-    signal, background
-        S and B, photons per period in [0, 1e6]: one pixel, scalars. With a waveform `signal` is None.
-    delay_ns
-        Delay of the return, ns; None: half the period.
-    waveform
-        (T,) photons per period in T equal parts of the period, instead of `signal` and `delay_ns`.
+    flux
+        The light of one pixel, such as ``flux[y, x]``.
+    system
+        Laser, detector and histogram.
     tolerance
         The grid is refined until `JointLaw.movement` is below this, in [1e-7, 0.1]. The error is smaller: for
         smooth pulses the method is of fourth order.
@@ -442,24 +446,16 @@ def joint_law(
     ...     period_ns=100.0, cycles=1000, bins=128,
     ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
     ... )
-    >>> law = ml.joint_law(1.0, 1.0, system, delay_ns=40.0)
+    >>> law = ml.joint_law(ml.Flux(signal=1.0, background=1.0, delay_ns=40.0), system)
     >>> law.covariance().shape
     (128, 128)
     >>> bool(law.covariance().sum() < law.variance.sum())  # bins exclude each other
     True
     """
     tolerance = checks.real("tolerance", tolerance, low=1e-7, high=0.1)
-    for name, value in (("signal", signal), ("background", background), ("delay_ns", delay_ns)):
-        if value is not None and np.ndim(value) != 0:
-            raise ValueError(f"{name} must be a scalar (one pixel), got shape {np.shape(value)}")
-    if waveform is not None and np.ndim(waveform) != 1:
-        raise ValueError(f"waveform must be (T,) of one pixel, got shape {np.shape(waveform)}")
-    cells = Cells.of(
-        signal,
-        background,
+    cells = Cells.of_flux(
+        one_pixel(flux),
         system,
-        delay_ns=delay_ns,
-        waveform=waveform,
         what="joint_law",
         effects=LIGHT_EFFECTS + TIMING_EFFECTS,
     )
@@ -554,7 +550,7 @@ class JointLaw:
     ...     period_ns=100.0, cycles=1000, bins=128,
     ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
     ... )
-    >>> law = ml.joint_law(1.0, 1.0, system, delay_ns=40.0)
+    >>> law = ml.joint_law(ml.Flux(signal=1.0, background=1.0, delay_ns=40.0), system)
     >>> law.mean.shape, law.variance.shape
     ((128,), (128,))
     """

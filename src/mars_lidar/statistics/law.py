@@ -7,7 +7,6 @@ from functools import cached_property
 from typing import Any, Literal, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
@@ -17,6 +16,7 @@ from mars_lidar._base.types import FloatArray, IndexArray
 from mars_lidar.instrument.detector import MODES
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
+from mars_lidar.light.flux import Flux
 from mars_lidar.statistics.cells import LAW_STEPS, Cells
 from mars_lidar.statistics.count_pmf import Pmf, exact_windows, gaussian_window, poisson_window
 from mars_lidar.statistics.electronics import record_windows
@@ -56,7 +56,8 @@ class CountLaw:
     ...     period_ns=100.0, cycles=1000, bins=128,
     ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
     ... )
-    >>> law = ml.count_law(1.0, 1.0, system, delay_ns=40.0)
+    >>> light = ml.Flux(signal=1.0, background=1.0, delay_ns=40.0)
+    >>> law = ml.count_law(light, system)
     >>> bool(abs(law.pmf.sum() - 1) < 1e-9)
     True
     >>> int(law.support[law.pmf.argmax()])
@@ -143,13 +144,10 @@ class CountLaw:
 
 @checked
 def count_law(
-    signal: ArrayLike | None,
-    background: ArrayLike,
+    flux: Flux,
     system: System,
     method: Method = "exact",
     *,
-    delay_ns: ArrayLike | None = None,
-    waveform: ArrayLike | None = None,
     rearm: Literal["centre", "edge"] | None = None,
     tolerance: float = 1e-4,
     threads: int | None = None,
@@ -158,8 +156,8 @@ def count_law(
 
     Parameters
     ----------
-    signal, background
-        S and B, photons per period in [0, 1e6]: scalars or arrays that broadcast to (...).
+    flux
+        The light of pixels of shape (...); with an armed start the law depends on the delay.
     system
         Laser, detector and histogram (whose bins do not matter here).
     method
@@ -170,12 +168,6 @@ def count_law(
         - ``"renewal"``: the Gaussian of a constant-rate renewal process of equal energy, mean
           lambda t / (1 + lambda t_d) and variance lambda t / (1 + lambda t_d)^3,
         - ``"poisson"``: no dead time, the law of the arrivals (inside of the gate) for every mode.
-    delay_ns
-        Delay of the return, ns; None: half the period. With ``"exact"`` an array may broadcast with S and B:
-        an armed start makes the law depend on the delay.
-    waveform
-        Photons per period in T equal parts of the period, instead of `signal` (None) and `delay_ns`:
-        (..., T), or (T,) for ``"mars"``.
     rearm
         ``"centre"`` (default) or ``"edge"`` of the bin, for ``"mars"`` only: where its chain re-arms.
     tolerance
@@ -199,20 +191,18 @@ def count_law(
     ...     period_ns=100.0, cycles=1000, bins=128,
     ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
     ... )
-    >>> law = ml.count_law(1.0, 1.0, system, delay_ns=40.0)
+    >>> light = ml.Flux(signal=1.0, background=1.0, delay_ns=40.0)
+    >>> law = ml.count_law(light, system)
     >>> round(float(law.mean), 2), round(float(law.variance), 2)
     (815.17, 127.32)
-    >>> round(float(ml.count_law(1.0, 1.0, system, method="poisson").variance), 2)
+    >>> round(float(ml.count_law(light, system, method="poisson").variance), 2)
     2000.0
     """
     checks.choice("method", method, _METHODS)
     edge = rearm_of(rearm, method == "mars", f"method {method!r}")
-    cells = Cells.of(
-        signal,
-        background,
+    cells = Cells.of_flux(
+        flux,
         system,
-        delay_ns=delay_ns,
-        waveform=waveform,
         what=f"count_law of method {method!r}",
         modes=PLAIN if method in ("mars", "renewal") else MODES,
         effects=histogram_effects(system) if method == "exact" else LIGHT_EFFECTS + TIMING_EFFECTS,
@@ -244,9 +234,9 @@ def count_law(
 def _gaussian_moments(method: str, cells: Cells, edge: Literal["centre", "edge"]) -> tuple[FloatArray, FloatArray]:
     """Mean and variance (cells,) of the Gaussian laws."""
     if method == "renewal":
-        from mars_lidar.statistics.baselines import renewal_moments
+        from mars_lidar.statistics.baselines import renewal_moments_of
 
-        return renewal_moments(cells.signal, cells.background, cells.system)
+        return renewal_moments_of(cells.signal + cells.background, cells.system)
 
     mean, variance = np.zeros(cells.size), np.zeros(cells.size)
     for k in range(cells.size):

@@ -11,12 +11,12 @@ import math
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
+from mars_lidar.light.flux import Flux
 from mars_lidar.statistics.cells import Cells, knots, photons_before
 from mars_lidar.statistics.exposure import MOST_BINS, Moments
 from mars_lidar.statistics.phase_chain import ConvergenceError
@@ -31,20 +31,17 @@ ParalyzableMoments = Moments
 
 @checked
 def paralyzable_moments(
-    signal: ArrayLike | None,
-    background: ArrayLike,
+    flux: Flux,
     system: System,
     *,
-    delay_ns: ArrayLike | None = None,
-    waveform: ArrayLike | None = None,
     tolerance: float = 1e-5,
 ) -> ParalyzableMoments:
     """Mean and variance of the count and mean histogram of a pixel of mode ``"paralyzable"``, both starts.
 
     Parameters
     ----------
-    signal, background, delay_ns, waveform
-        As `exposure_moments`: photons per period, scalars or arrays that broadcast to (...).
+    flux, system
+        The light of pixels of shape (...), and what registers it.
     tolerance
         The grid is refined until doubling it moves mean and variance by less than this, relative to
         themselves, and the shape by less in total variation; in [1e-9, 0.1].
@@ -61,12 +58,9 @@ def paralyzable_moments(
     ConvergenceError
         Naming the cell, where no grid up to 2^20 bins meets the tolerance.
     """
-    cells = Cells.of(
-        signal,
-        background,
+    cells = Cells.of_flux(
+        flux,
         system,
-        delay_ns=delay_ns,
-        waveform=waveform,
         what="paralyzable_moments",
         modes=("paralyzable",),
     )

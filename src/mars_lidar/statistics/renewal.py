@@ -11,13 +11,13 @@ import warnings
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.brief import brief
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
+from mars_lidar.light.flux import Flux
 from mars_lidar.statistics.cells import cell_name, default_bins, photons_per_bin
 from mars_lidar.statistics.chain import PhaseChain, Rearm, Stationary, stationary_from
 from mars_lidar.statistics.gate import require_mode
@@ -202,14 +202,11 @@ def holding_times(chain: PhaseChain) -> HoldingTimes:
 
 @checked
 def mars_moments(
-    signal: ArrayLike | None,
-    background: ArrayLike,
+    flux: Flux,
     system: System,
     *,
     rearm: Rearm = "centre",
     bins: int | None = None,
-    delay_ns: float | None = None,
-    waveform: ArrayLike | None = None,
 ) -> tuple[FloatArray, FloatArray]:
     """Mean and variance of the MaRS count law N ~ Normal(t / mu, t sigma^2 / mu^3), t the exposure (3.11).
 
@@ -218,31 +215,28 @@ def mars_moments(
 
     Parameters
     ----------
-    signal, background
-        S and B, photons per period: scalars or arrays that broadcast.
+    flux, system
+        The light of pixels of shape (...), and what registers it.
     rearm
         ``"centre"``, or ``"edge"`` for the re-arming of Rapp's code.
-    bins, delay_ns, waveform
+    bins
         As `photons_per_bin`.
 
     Returns
     -------
     tuple
-        mean, variance: arrays of the broadcast shape (0-d for scalars); 0, 0 where there is no flux.
+        mean, variance: arrays (...); 0, 0 where there is no flux.
     """
     require_mode("mars_moments", system)
     checks.choice("rearm", rearm, ("centre", "edge"))
-    given = np.asarray(np.nan if signal is None else signal, dtype=np.float64)
-    s, b = np.broadcast_arrays(given, np.asarray(background, dtype=np.float64))
-    mean, variance = np.zeros(s.shape), np.zeros(s.shape)
-    if bins is None and waveform is None:
+    mean, variance = np.zeros(flux.shape), np.zeros(flux.shape)
+    if bins is None and flux.waveform is None:
         bins = default_bins(system)
-    for index in np.ndindex(s.shape):
-        s_pixel, b_pixel = None if signal is None else float(s[index]), float(b[index])
-        photons = photons_per_bin(s_pixel, b_pixel, system, bins=bins, delay_ns=delay_ns, waveform=waveform)
+    for index in np.ndindex(flux.shape):
+        photons = photons_per_bin(flux[index], system, bins=bins)
         if not photons.any():
             continue
-        cell = cell_name(s_pixel, b_pixel, system)
+        cell = cell_name(flux[index], system)
         times = holding_times(PhaseChain(photons, system.dead_time_periods, rearm, cell))
         mean[index] = system.cycles / times.mu
         variance[index] = system.cycles * times.sigma2 / times.mu**3

@@ -11,13 +11,14 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.brief import brief
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
+from mars_lidar.light.flux import Flux
 from mars_lidar.statistics.chain import PhaseChain, Rearm
 from mars_lidar.statistics.gate import require_mode
 from mars_lidar.statistics.renewal import HoldingTimes, holding_times, lag_covariances, weighted_waits
@@ -161,27 +162,26 @@ class HoldingTimeCovariance:
 
 @checked
 def holding_time_covariance(
-    signal: float | None,
-    background: float,
+    flux: Flux,
     system: System,
     *,
     lags: int = 20,
     rearm: Rearm = "centre",
     bins: int | None = None,
-    delay_ns: float | None = None,
-    waveform: ArrayLike | None = None,
 ) -> HoldingTimeCovariance:
     """Covariances of the times between registrations, and their sum by every rule.
 
     Parameters
     ----------
-    signal, background
-        S and B, photons per period, not both 0.
+    flux
+        The light of one pixel, not 0.
+    system
+        Laser, detector and histogram.
     lags
         Lag covariances to compute, >= 0.
     rearm
         ``"centre"``, or ``"edge"`` for the re-arming of Rapp's code.
-    bins, delay_ns, waveform
+    bins
         As `photons_per_bin`; the delay only shifts the phases on the grid.
 
     Raises
@@ -202,15 +202,13 @@ def holding_time_covariance(
     ...     period_ns=100.0, cycles=1000, bins=128,
     ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
     ... )
-    >>> covariance = ml.holding_time_covariance(1.0, 1.0, system)
+    >>> covariance = ml.holding_time_covariance(ml.Flux(signal=1.0, background=1.0, delay_ns=50.0), system)
     >>> round(covariance.mu, 1)  # mean time between registrations, ns
     122.7
     """
     require_mode("holding_time_covariance", system)
     lags = checks.integer("lags", lags, low=0, high=_MAX_LAGS)
-    chain = PhaseChain.from_flux(
-        signal, background, system, rearm=rearm, bins=bins, delay_ns=delay_ns, waveform=waveform
-    )
+    chain = PhaseChain.from_flux(flux, system, rearm=rearm, bins=bins)
     times = holding_times(chain)
     unit = system.period_ns**2
     gamma = lag_covariances(chain, times, lags) * unit

@@ -20,6 +20,7 @@ from mars_lidar._base.native import _core
 from mars_lidar._base.progress import of_part
 from mars_lidar._base.types import FloatArray, IndexArray, Progress
 from mars_lidar.instrument.system import System
+from mars_lidar.light.flux import Flux
 from mars_lidar.statistics.cells import Cells, cell_name, default_bins, flat, reals, with_delays
 from mars_lidar.statistics.chain import PhaseChain, Rearm
 from mars_lidar.statistics.count_pmf import Pmf, guessed_windows
@@ -489,7 +490,7 @@ def renewal_entries(
         for k in range(start, stop):
             photons = signal[k] * energy + background[k] / bins
             if photons.any():
-                name = cell_name(float(signal[k]), float(background[k]), system)
+                name = cell_name(Flux(signal[k], background[k], 0.5 * system.period_ns), system)
                 times = holding_times(PhaseChain(photons, system.dead_time_periods, rearm, name))
                 rates[k, :2] = 1.0 / times.mu, times.sigma2 / times.mu**3
                 shape[k] = times.stationary.pdf.reshape(system.bins, -1).sum(-1)

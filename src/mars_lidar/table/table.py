@@ -29,6 +29,7 @@ from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import FloatArray, Progress
 from mars_lidar._version import __version__
 from mars_lidar.instrument.system import System
+from mars_lidar.light.flux import Flux
 from mars_lidar.statistics.chain import Rearm
 from mars_lidar.statistics.distance import Pmf, total_variation
 from mars_lidar.statistics.exposure import exposure_moments, normalised
@@ -491,7 +492,7 @@ class Table:
         signal, background = (random_pixels(rng, axis, samples, True) for axis in (self.signal, self.background))
         delay = rng.uniform(0.0, system.period_ns, samples)
         law = self.lookup(signal, background, delay_ns=delay, cycles=system.cycles)
-        exact = count_law(signal, background, system, delay_ns=delay, tolerance=self.tolerance, threads=threads)
+        exact = count_law(Flux(signal, background, delay), system, tolerance=self.tolerance, threads=threads)
         matched = matched_pmf(law.cumulants, threads=threads)
         off = np.array([total_variation(w, Pmf(int(exact.support[k, 0]), exact.pmf[k])) for k, w in enumerate(matched)])
         good = law.trusted()
@@ -532,7 +533,7 @@ class Table:
         system = self.system.replace(cycles=cycles)
         shift = rng.integers(0, system.bins, signal.size)
         delay = 0.5 * system.period_ns + shift * system.bin_ns
-        exact = exposure_moments(signal, background, system, delay_ns=delay, tolerance=self.tolerance, threads=threads)
+        exact = exposure_moments(Flux(signal, background, delay), system, tolerance=self.tolerance, threads=threads)
         law = self.lookup(signal, background, delay_ns=delay, cycles=cycles, interpolation=interpolation)
         turned = np.stack([np.roll(row, k) for row, k in zip(mixed, shift, strict=True)])
         return deviations(law.cumulants, exact.cumulants), 0.5 * np.abs(turned - normalised(exact.histogram)).sum(-1)

@@ -43,7 +43,7 @@ def from_attributes(
     if version != FORMAT_VERSION:
         raise ValueError(f"these timestamps have layout version {version}; version {FORMAT_VERSION} can be read")
     height, width = (int(n) for n in attrs["shape"])
-    if counts.size != height * width or int(counts.sum()) != times_ns.size:
+    if min(height, width) < 1 or counts.size != height * width or int(counts.sum()) != times_ns.size:
         raise ValueError(f"{times_ns.size} photons do not make an image of {height} x {width}")
     offsets = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
     return Timestamps(

@@ -1,0 +1,129 @@
+"""Every prediction is of (flux, system): a pixel, a row, an image; one return, several, a waveform."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import mars_lidar as ml
+from mars_lidar import statistics
+from tests.harness.ledger import require
+
+SYSTEM = ml.System(
+    period_ns=100.0,
+    cycles=200,
+    bins=32,
+    pulse=ml.GaussianPulse(sigma_ns=2.0),
+    detector=ml.Detector(dead_time_ns=60.0),
+)
+IMAGE = ml.Flux(np.array([[0.5, 2.0, 0.0], [1.0, 0.1, 3.0]]), 0.3, np.array([[20.0, 40.0, np.nan], [60.0, 80.0, 10.0]]))
+PIXEL = IMAGE[0, 1]
+OF_PIXELS: dict[str, Callable[[ml.Flux], Any]] = {
+    "count_law": lambda flux: ml.count_law(flux, SYSTEM).cumulants,
+    "mars": lambda flux: ml.count_law(flux, SYSTEM, "mars").mean,
+    "renewal": lambda flux: ml.count_law(flux, SYSTEM, "renewal").mean,
+    "poisson": lambda flux: ml.count_law(flux, SYSTEM, "poisson").mean,
+    "mean_histogram": lambda flux: statistics.mean_histogram(flux, SYSTEM),
+    "registration_pdf": lambda flux: ml.registration_pdf(flux, SYSTEM),
+    "chain": lambda flux: ml.registration_pdf(flux, SYSTEM, "chain"),
+    "exposure_moments": lambda flux: statistics.exposure_moments(flux, SYSTEM).histogram,
+    "photons_per_bin": lambda flux: statistics.photons_per_bin(flux, SYSTEM),
+    "mars_moments": lambda flux: statistics.mars_moments(flux, SYSTEM)[1],
+    "renewal_moments": lambda flux: statistics.renewal_moments(flux, SYSTEM)[1],
+    "poisson_moments": lambda flux: statistics.poisson_moments(flux, SYSTEM)[1],
+}
+
+
+@pytest.mark.parametrize("name", OF_PIXELS)
+def test_axes_are_those_of_the_flux(name: str) -> None:
+    """A pixel has none, a row one, an image two, and each pixel of an image is what it is alone."""
+    of = OF_PIXELS[name]
+    image, row, pixel = of(IMAGE), of(IMAGE[0]), of(PIXEL)
+    rest = np.shape(pixel)
+    assert np.shape(image) == (2, 3, *rest)
+    assert np.shape(row) == (3, *rest)
+    np.testing.assert_allclose(image[0], row, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(row[1], pixel, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["joint_law", "holding_time_covariance"])
+def test_laws_of_one_pixel_ask_for_one(name: str) -> None:
+    getattr(ml, name)(PIXEL, SYSTEM)
+    getattr(ml, name)(IMAGE[0:1, 1:2], SYSTEM)
+    with pytest.raises(ValueError, match=r"flux must be one pixel, such as flux\[0, 0\], got pixels of shape \(2, 3\)"):
+        getattr(ml, name)(IMAGE, SYSTEM)
+
+
+def test_every_prediction_takes_flux_and_system_first() -> None:
+    """By their signatures; laws of given numbers (`matched_pmf`, cumulants) and of given rates have no light."""
+    found = {}
+    for home in (statistics, import_module("mars_lidar.reconstruct")):
+        for name in home.__all__:
+            thing = getattr(home, name)
+            if inspect.isfunction(thing):
+                found[name] = list(inspect.signature(thing).parameters)
+    light = {name: names for name, names in found.items() if "flux" in names}
+    assert len(light) >= 15, sorted(light)
+    for name, names in light.items():
+        first = names.index("flux")
+        assert names[first + 1] == "system", name
+    for name, names in found.items():
+        assert not {"signal", "background", "delay_ns", "waveform"} <= set(names), name
+        assert not ({"signal", "background"} <= set(names)), name
+
+
+def test_several_returns_are_those_of_the_exact_engine() -> None:
+    """Count and mean histogram of a pane and a wall, by 4,000 exposures."""
+    flux = ml.Flux.multi(ml.Flux(0.6, 0.2, 20.0), ml.Flux(1.5, 0.1, 71.0))
+    exposures = 4000
+    drawn = ml.simulate(flux, SYSTEM, realizations=exposures, seed=5)[:, 0, 0].astype(np.float64)
+    law, joint = ml.count_law(flux, SYSTEM), ml.joint_law(flux, SYSTEM)
+    mean = statistics.mean_histogram(flux, SYSTEM)
+    assert mean.sum() == pytest.approx(float(law.mean), rel=1e-4)
+    counts = drawn.sum(-1)
+    z = (drawn.mean(0) - mean) / np.sqrt(joint.variance / exposures)
+    ratio = counts.var() / float(law.variance) * exposures
+    require(
+        {
+            "mean": 2.0 * stats.norm.sf(abs(counts.mean() - law.mean) / np.sqrt(law.variance / exposures)),
+            "variance": 2.0 * min(stats.chi2.cdf(ratio, exposures - 1), stats.chi2.sf(ratio, exposures - 1)),
+            "bins": len(z) * 2.0 * stats.norm.sf(np.abs(z).max()),
+        },
+        "two returns",
+    )
+
+
+def test_a_dark_return_changes_nothing() -> None:
+    """Of several returns with one lit the law is exactly that of the lit one, not that of a waveform."""
+    more = ml.Flux.multi(ml.Flux(0.0, 0.3, 10.0), ml.Flux(2.0, 0.0, 40.0))
+    np.testing.assert_array_equal(ml.count_law(more, SYSTEM).cumulants, ml.count_law(PIXEL, SYSTEM).cumulants)
+
+
+def test_photons_are_the_integral_of_the_light() -> None:
+    """Returns, a waveform finer and coarser than the bins, efficiency and dark counts."""
+    dim = SYSTEM.replace(detector=ml.Detector(dead_time_ns=60.0, detection_efficiency=0.4, dark_count_hz=1e6))
+    for flux in (
+        IMAGE,
+        ml.Flux.multi(IMAGE, ml.Flux(0.3, 0.1, 50.0)),
+        ml.Flux(waveform=np.arange(7.0), background=0.5),
+    ):
+        total = statistics.photons_per_bin(flux, dim, bins=96).sum(-1)
+        np.testing.assert_allclose(total, flux.total * 0.4 + 0.1, rtol=1e-12)
+    wave = np.array([1.0, 0.0, 3.0])
+    photons = statistics.photons_per_bin(ml.Flux(waveform=wave, background=0.6), SYSTEM, bins=6)
+    np.testing.assert_allclose(photons, np.repeat(wave, 2) / 2 + 0.1, rtol=1e-12)
+
+
+def test_simulate_makes_an_image_of_every_flux() -> None:
+    assert ml.simulate(PIXEL, SYSTEM).shape == (1, 1, 1, 32)
+    assert ml.simulate(IMAGE[1], SYSTEM, realizations=2).shape == (2, 1, 3, 32)
+    np.testing.assert_array_equal(
+        ml.simulate(IMAGE[1], SYSTEM, pixel_index=[3, 4, 5])[0, 0], ml.simulate(IMAGE, SYSTEM)[0, 1]
+    )
+    assert ml.simulate_timestamps(PIXEL, SYSTEM).histogram().shape == (1, 1, 32)

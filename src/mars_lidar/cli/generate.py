@@ -93,8 +93,8 @@ def generate(
 
         if sum((begin, part is not None, finish, dry_run)) > 1:
             raise ValueError("--begin, --part, --finish and --dry-run are four steps: give one of them")
-        if (begin or part or finish) and (workers is not None or scheduler is not None):
-            raise ValueError("--begin, --part and --finish need no --workers and no --scheduler")
+        if (part or finish) and (workers is not None or scheduler is not None):
+            raise ValueError("--part and --finish need no --workers and no --scheduler")
         if (part or finish) and (source is not None or resume or overwrite):
             raise ValueError("--part and --finish go on with the store: no SOURCE, --resume or --overwrite")
         if part is not None:
@@ -131,7 +131,7 @@ def generate(
         if begin:
             if recipe is None:
                 raise ValueError("--begin needs a SOURCE")
-            tell(dataset.begin(recipe, out, resume=resume, overwrite=overwrite))
+            tell(dataset.begin(recipe, out, resume=resume, overwrite=overwrite, workers=workers, scheduler=scheduler))
             return
         here = workers is None and scheduler is None and not (resume and out.exists())
         if here and recipe is not None and (told := str(dataset.quick_advice(recipe, threads))):

@@ -67,8 +67,21 @@ def reach(scheduler: str | None) -> None:
         _client(distributed, scheduler).close()
 
 
+@dataclass(frozen=True)
+class Crew:
+    """Workers: an executor that runs what they are given, and the number of their threads that are there now."""
+
+    executor: Executor
+    threads: Callable[[], int]
+
+    def team(self, dataset: Dataset, threads: int) -> Team:
+        """For the parts of a dataset, each made on so many threads."""
+        run = Run(str(dataset.path.resolve()), uuid.uuid4().hex, threads, __version__, fingerprint())
+        return Team(self.executor, partial(make_parts, run), self.threads, _AHEAD, _LEAST_QUEUED, _TASKS_PER_S)
+
+
 @contextlib.contextmanager
-def team(dataset: Dataset, workers: int | None, threads: int, scheduler: str | None) -> Iterator[Team]:
+def crew(workers: int | None, scheduler: str | None) -> Iterator[Crew]:
     """`workers` processes of this machine, or the workers of the `scheduler` at that address."""
     distributed = needed(*_LIBRARY)
     with contextlib.ExitStack() as after:
@@ -89,9 +102,8 @@ def team(dataset: Dataset, workers: int | None, threads: int, scheduler: str | N
         if scheduler is not None and client.dashboard_link:
             print(f"mars-lidar: dashboard of the cluster: {client.dashboard_link}", file=sys.stderr)
         executor = client.get_executor(pure=False)
-        run = Run(str(dataset.path.resolve()), uuid.uuid4().hex, threads, __version__, fingerprint())
         try:
-            yield Team(executor, partial(make_parts, run), _Workers(client), _AHEAD, _LEAST_QUEUED, _TASKS_PER_S)
+            yield Crew(executor, _Workers(client))
         except (
             CancelledError,
             distributed.client.FutureCancelledError,

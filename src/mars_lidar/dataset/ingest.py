@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shutil
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
@@ -22,39 +26,87 @@ from mars_lidar.dataset.arrays import (
     histogram_blocks,
     mark,
 )
+from mars_lidar.dataset.cluster import Crew
 from mars_lidar.dataset.recipe import DatasetRecipe
+from mars_lidar.dataset.sample_content import Shown
 from mars_lidar.dataset.scenes import SceneWriter
-from mars_lidar.dataset.sources import candidates, scenes, seed_of
+from mars_lidar.dataset.sources import Candidate, candidates, scenes, seed_of, several
 from mars_lidar.dataset.write import fingerprint
 from mars_lidar.io.layout import Variable
 from mars_lidar.io.scan import Problem
 from mars_lidar.io.zarr_store import add
 
+_BATCH = 16  # scenes that a worker reads at a time: 0.1 s of small ones
+_AHEAD, _LEAST_AHEAD = 3, 64  # such batches given out per worker thread, and at least: where no worker is there yet
 
-def create(path: Path, recipe: DatasetRecipe, folder: Path) -> None:
-    """Begin a store: every scene read, checked, and written; every array laid out.
 
-    Where no scene can be used a ValueError says why, and nothing is left at `path`.
+def create(path: Path, recipe: DatasetRecipe, folder: Path, crew: Crew | None = None) -> None:
+    """Begin a store, or go on with one that was stopped: every scene read, checked, and written; every array laid out.
+
+    The workers of a `crew` read the scenes, but for rendered light. Where no scene can be used a ValueError says why,
+    and nothing is left at `path`.
     """
     found, problems = candidates(recipe.scenes, folder)
-    group = writer = None
-    for candidate in found:
-        for one in scenes(candidate, recipe, None if writer is None else writer.shape):
-            if isinstance(one, Problem):
-                problems.append(one)
-                continue
-            name, scene = one
-            if writer is None:  # nothing on the disk is touched before there is something to put on it
-                histogram_blocks(recipe, 1, scene.shape)
-                group = begin(path, recipe)
-                writer = SceneWriter(group, len(found) * (recipe.crops if recipe.crop else 1))
-            writer.add(name, scene)
+    most = len(found) * (recipe.crops if recipe.crop else 1)
+    source = hashlib.sha256("\n".join(one.name for one in found).encode()).hexdigest()
+    writer = SceneWriter.resumed(path, most, source)
+    if writer is not None:
+        problems = [Problem(Path(each), reason) for each, reason in writer.problems]
+    done = (0, 0) if writer is None else writer.position
+    if any("transient" in entry for entry in recipe.scenes):
+        crew = None  # it stays in its file until it is written
+
+    def shape() -> tuple[int, int] | None:
+        return None if writer is None else writer.shape
+
+    for *place, one in _read(found, done[0], recipe, shape, crew):
+        if tuple(place) < done:
+            continue
+        if isinstance(one, Problem):
+            problems.append(one)
+            continue
+        name, scene = one
+        if writer is None:  # nothing on the disk is touched before there is something to put on it
+            histogram_blocks(recipe, 1, scene.shape)
+            writer = SceneWriter(begin(path, recipe), most, path, source)
+        writer.problems = [[str(each.path), each.reason] for each in problems]
+        writer.add(name, scene, (place[0], place[1] + 1))
     if writer is None:
         told = "\n".join(f"  {problem}" for problem in problems[:5])
         more = f"\n  and {len(problems) - 5} more" if len(problems) > 5 else ""
         raise ValueError(f"none of the scenes can be used:\n{told}{more}")
     writer.finish()
-    lay_out(group, recipe, writer, problems)
+    lay_out(writer.store, recipe, writer, problems)
+
+
+def _read(
+    found: list[Candidate],
+    number: int,
+    recipe: DatasetRecipe,
+    shape: Callable[[], tuple[int, int] | None],
+    crew: Crew | None,
+) -> Iterator[tuple[int, int, tuple[str, Shown] | Problem]]:
+    """What the candidates from a number on give: candidate, place among its scenes, and the scene or the problem."""
+    while number < len(found) and (crew is None or shape() is None):
+        for place, one in enumerate(scenes(found[number], recipe, shape())):
+            yield number, place, one
+        number += 1
+    if crew is None:
+        return
+    step = max(1, _BATCH // (recipe.crops if recipe.crop else 1))
+    coming, given = iter(range(number, len(found), step)), deque[tuple[int, Future[Any]]]()
+    while True:
+        while len(given) < max(_LEAST_AHEAD, _AHEAD * crew.threads()):
+            first = next(coming, None)
+            if first is None:
+                break
+            given.append((first, crew.executor.submit(several, found[first : first + step], recipe, shape())))
+        if not given:
+            return
+        first, future = given.popleft()
+        for offset, results in enumerate(future.result()):
+            for place, one in enumerate(results):
+                yield first + offset, place, one
 
 
 def begin(path: Path, recipe: DatasetRecipe) -> Any:

@@ -34,7 +34,7 @@ from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import Progress
 from mars_lidar._version import __version__
 from mars_lidar.dataset import cluster
-from mars_lidar.dataset.cluster import LOOK_S, Team
+from mars_lidar.dataset.cluster import LOOK_S, Crew, Team
 from mars_lidar.dataset.ingest import create
 from mars_lidar.dataset.recipe import DatasetRecipe
 from mars_lidar.dataset.store import Dataset, Item, open_dataset
@@ -149,22 +149,15 @@ def generate(
     began = time.perf_counter()
     progress = shown(progress, "generating")
     target = _target(out)
-    if workers is not None and scheduler is not None:
-        raise ValueError("workers start a cluster and scheduler joins one: give one of them")
-    threads, workers = (
-        None if value is None else checks.integer(name, value, low=1, high=1024)
-        for name, value in (("threads", threads), ("workers", workers))
-    )
-    if workers is not None or scheduler is not None:
-        cluster.reach(scheduler)  # before the scenes are read
-    with _begun(recipe, target, resume, overwrite) as (store, dataset):
+    threads = None if threads is None else checks.integer("threads", threads, low=1, high=1024)
+    with _begun(recipe, target, resume, overwrite, _crew(workers, scheduler)) as (store, dataset, crew):
         dataset.tidy()
         todo = [] if dataset.complete else dataset.missing()
         before = sum(1 for _ in dataset.items()) - len(todo)
         totals = _Totals(before, before + len(todo), progress)
-        team = _here(dataset, len(todo), threads)
-        if workers is not None or scheduler is not None:
-            team = cluster.team(dataset, workers, threads or 1, scheduler)
+        team: AbstractContextManager[Team] = _here(dataset, len(todo), threads)
+        if crew is not None:
+            team = contextlib.nullcontext(crew.team(dataset, threads or 1))
         _make(dataset, team, todo, totals)
         if not dataset.complete:
             dataset.tidy()  # of workers that were killed while others went on
@@ -180,6 +173,8 @@ def begin(
     *,
     resume: bool = False,
     overwrite: bool = False,
+    workers: int | None = None,
+    scheduler: str | None = None,
 ) -> Generated:
     """Begin a dataset whose parts other processes make: read its scenes, and lay out its arrays.
 
@@ -190,9 +185,11 @@ def begin(
     ----------
     recipe, out, resume, overwrite
         As for `generate`.
+    workers, scheduler
+        As for `generate`: they read the scenes.
     """
     began, target = time.perf_counter(), _target(out)
-    with _begun(recipe, target, resume, overwrite) as (_, dataset):
+    with _begun(recipe, target, resume, overwrite, _crew(workers, scheduler)) as (_, dataset, _):
         return _Totals(0, 0, None).generated(target, dataset, time.perf_counter() - began)
 
 
@@ -271,11 +268,28 @@ def _target(out: str | Path) -> Path:
     return target
 
 
+def _crew(workers: int | None, scheduler: str | None) -> AbstractContextManager[Crew | None]:
+    """Workers that are not there before they are needed; ValueError where there cannot be any."""
+    if workers is not None and scheduler is not None:
+        raise ValueError("workers start a cluster and scheduler joins one: give one of them")
+    if workers is None and scheduler is None:
+        return contextlib.nullcontext()
+    cluster.reach(scheduler)  # before the scenes are read
+    return cluster.crew(None if workers is None else checks.integer("workers", workers, low=1, high=1024), scheduler)
+
+
 @contextlib.contextmanager
 def _begun(
-    recipe: DatasetRecipe | dict[str, Any] | str | Path | None, target: Path, resume: bool, overwrite: bool
-) -> Iterator[tuple[Path, Dataset]]:
-    """The store that is written, and the dataset in it, its scenes read; alone with it, and errors say what is left."""
+    recipe: DatasetRecipe | dict[str, Any] | str | Path | None,
+    target: Path,
+    resume: bool,
+    overwrite: bool,
+    workers: AbstractContextManager[Crew | None],
+) -> Iterator[tuple[Path, Dataset, Crew | None]]:
+    """The store that is written, the dataset in it, its scenes read, and who reads and makes it.
+
+    No other process writes the store meanwhile, and errors say what is on the disk.
+    """
     if resume and overwrite:
         raise ValueError("resume and overwrite exclude each other")
     wanted, folder = read_recipe(recipe)
@@ -293,13 +307,15 @@ def _begun(
         elif wanted is None:
             raise ValueError(f"{target} does not exist: there is nothing to resume, and no recipe is given")
         check_target(target, folder=True, overwrite=overwrite or there)
-        with _told(store, target):
-            if not there or not dataset.planned:
-                if wanted is None:
-                    raise ValueError(f"{target} was stopped before its scenes were in: give the recipe again to resume")
-                create(store, wanted, folder)
+        begun = there and dataset.planned
+        if not begun and wanted is None:
+            raise ValueError(f"{target} was stopped before its scenes were in: give the recipe again to resume")
+        with _told(store, target), workers as crew:
+            if not begun:
+                assert wanted is not None
+                create(store, wanted, folder, crew)
                 dataset = open_dataset(store, allow_incomplete=True)
-            yield store, dataset
+            yield store, dataset, crew
 
 
 def _opened(target: Path) -> tuple[Path, Dataset]:

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 from collections.abc import Sequence
 from dataclasses import asdict
 from functools import cached_property
@@ -41,20 +42,51 @@ from mars_lidar.scene.scene import Scene
 _DOUBLE = np.dtype(np.float64)
 _READ_BYTES = 4 << 20  # of one map: scenes are read this many at once, each read costs a millisecond
 _RATE_BYTES = 8 << 20  # of a chunk of rendered light
+_NOTES = "ingest.jsonl"  # while scenes are written: a line for each shard of them, from which a stopped run goes on
+_ARRAYS = ("depth", "reflectivity", "background", "layer_depth", "layer_reflectivity", "transient", "total")
 _LAYERS = ("layer_depth", "layer_reflectivity")
 
 
 class SceneWriter:
     """Takes scenes one by one into the group ``scenes`` of a new store; memory for one shard of maps."""
 
-    def __init__(self, group: Any, most: int) -> None:
-        self._group = group.create_group("scenes")
-        self._most = most
+    def __init__(self, store: Any, most: int, path: Path, source: str) -> None:
+        self.store = store
+        self._group = store.require_group("scenes")
+        self._most, self._source = most, source
+        self._notes = path / "scenes" / _NOTES
         self._arrays: dict[str, Any] = {}
         self._held: list[Shown] = []
         self._kinds: list[str] = []
         self.names: list[str] = []
-        self._written = 0
+        self.position = (0, 0)
+        self.problems: list[list[str]] = []
+        self._written = self._noted = 0
+
+    @classmethod
+    def resumed(cls, path: Path, most: int, source: str) -> SceneWriter | None:
+        """Goes on with a store whose scenes were stopped; None where there is none, or of another `source`."""
+        import zarr
+
+        notes = path / "scenes" / _NOTES
+        if not notes.is_file():
+            return None
+        lines = [line for line in notes.read_text("utf-8").splitlines(keepends=True) if line.endswith("\n")]
+        told = [json.loads(line) for line in lines]
+        if not told or any(one["source"] != source for one in told):
+            return None
+        writer = cls(zarr.open_group(path, mode="r+", use_consolidated=False), most, path, source)
+        writer.names = [name for one in told for name in one["names"]]
+        writer._kinds = [kind for one in told for kind in one["kinds"]]
+        writer.problems = [problem for one in told for problem in one["problems"]]
+        writer.position = tuple(told[-1]["position"])
+        writer._written, writer._noted = len(writer.names), len(writer.problems)
+        for name, array in [(each, writer._group[each]) for each in _ARRAYS if (path / "scenes" / each).is_dir()]:
+            array.resize((most, *array.shape[1:]))  # it was cut to its length where `finish` had begun
+            writer._arrays[name] = array
+        for name in ("name", "kind"):
+            shutil.rmtree(path / "scenes" / name, ignore_errors=True)
+        return writer
 
     @property
     def shape(self) -> tuple[int, int] | None:
@@ -66,8 +98,8 @@ class SceneWriter:
         """Whether each scene so far is one surface in clear air."""
         return not any(self._kinds)
 
-    def add(self, name: str, scene: Shown) -> None:
-        """One more scene."""
+    def add(self, name: str, scene: Shown, position: tuple[int, int]) -> None:
+        """One more scene; `position` is the place after it among all candidates, `problems` are those before it."""
         if not self._arrays:
             for array, unit in (("depth", "m"), ("reflectivity", "1"), ("background", "relative")):
                 self._arrays[array] = self._maps(array, (self._most, *scene.shape), ("scene", "y", "x"), unit)
@@ -79,6 +111,7 @@ class SceneWriter:
         self.names.append(name)
         self._kinds.append(_kind(scene))
         self._held.append(scene)
+        self.position = position
         if len(self._held) == self._arrays["depth"].shards[0]:
             self._flush()
 
@@ -90,6 +123,7 @@ class SceneWriter:
         add(self._group, [Variable("name", ("scene",), np.array(self.names, object), "", "name of the scene")])
         if not self.plain:
             add(self._group, [Variable("kind", ("scene", "letter"), _rows(self._kinds), "1", "what it is, JSON")])
+        self._notes.unlink(missing_ok=True)
         return self._written
 
     def _flush(self) -> None:
@@ -102,6 +136,16 @@ class SceneWriter:
                 maps["background"] = [nothing if one is None else one for one in light]
             for name, values in maps.items():
                 self._arrays[name][part] = np.stack(values)
+            note = {
+                "source": self._source,
+                "position": self.position,
+                "names": self.names[part],
+                "kinds": self._kinds[part],
+                "problems": self.problems[self._noted :],
+            }
+            with open(self._notes, "a", encoding="utf-8") as lines:
+                lines.write(json.dumps(note) + "\n")
+            self._noted = len(self.problems)
         self._written = part.stop
         self._held.clear()
 

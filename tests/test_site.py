@@ -171,7 +171,13 @@ def test_commands_can_be_copied(site: Path):
 
 def test_equations_are_in_the_pages(site: Path):
     """Equations are HTML already, all could be read, and they have the numbers that the code cites."""
-    for name, number in {"theory_exposure": 27, "detectors": 23, "feedback": 5, "theory_exact": 5, "theory": 4}.items():
+    for name, number in {
+        "theory_exposure": 27,
+        "theory_detectors": 23,
+        "feedback": 5,
+        "theory_exact": 5,
+        "theory": 4,
+    }.items():
         text = (site / f"{name}.html").read_text()
         assert f">{number}<" in text or f">({number})<" in text or f"\\tag{{{number}" in text, name
     for name in pages_of(site):

@@ -124,6 +124,34 @@ def test_bright_pulses_armed_again_within(name: str):
     check(Sampler(), AGAIN[name], ENGINES["exact"], {COUNTS, SHAPE, JOINT})
 
 
+BACKGROUND = {  # the total swung for ever in a fifth of such pixels, or they took 0.1 s in laps
+    "1.6 periods": case(1.0, 10.0, 1.6, 1_000_000, bins=64, items=2000),
+    "1.6 periods, brighter": case(7.0, 18.0, 1.6, 10_000_000, bins=64, items=2000),
+    "2.5 periods": case(1.0, 15.0, 2.5, 1_000_000, bins=64, items=2000),
+    "below a period": case(5.0, 18.0, 0.7273, 10_000_000, bins=64, items=2000),
+}
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("name", BACKGROUND)
+def test_bright_background_settles_to_its_joint_law(name: str):
+    """Every eigenmode of the covariance: mean and variance, and few exposures that are not drawn by the sweeps."""
+    request, report = BACKGROUND[name], dict[str, float]()
+    signal, background, delay = (
+        float(light[0, 0]) for light in (request.flux.signal, request.flux.background, request.flux.delay_ns)
+    )
+    flux = ml.Flux(np.full((1, request.items), signal), background, delay)
+    x = ml.simulate(flux, request.system, engine="feedback", seed=4, report=report)[0, 0].astype(float)
+    assert report[GIVEN] <= 0.01 * request.items
+    law = ml.joint_law(signal, background, request.system, delay_ns=delay)
+    size = np.sqrt(law.variance)
+    value, mode = np.linalg.eigh(law.covariance() / np.outer(size, size))
+    seen = value > 1e-3 * value.max()
+    y = ((x - law.mean) / size) @ mode[:, seen] / np.sqrt(value[seen])
+    assert np.abs(y.mean(0)).max() < 0.05 + 5.0 / np.sqrt(len(x))
+    assert np.abs(y.var(0) - 1.0).max() < 0.05 + 5.0 * np.sqrt(2.0 / len(x))
+
+
 # The kernel's own word
 
 
@@ -132,7 +160,9 @@ def statuses(request: Case, laps: int) -> np.ndarray[Any, Any]:
     out = np.full((task.items, request.system.bins), 7, request.system.histogram_dtype)
     status = np.empty((3, task.pixel_index.size), np.uint8)
     kinds = np.ones(request.system.bins, np.uint8)
-    _core.feedback_histogram(task.job, task.pulse, out, np.arange(task.pixel_index.size), status, kinds, laps, 1)
+    every = np.arange(task.pixel_index.size)
+    grids = np.array([every.size]), np.ascontiguousarray(kinds[None]), np.array([laps], np.int32)
+    _core.feedback_histogram(task.job, task.pulse, out, every, status, *grids, 1)
     assert (out[(status != Reason.DRAWN).reshape(-1)] == 7).all(), "a refused row is not written"
     return status
 
@@ -160,7 +190,7 @@ def test_laps_are_checked(laps: int):
 
 def test_reports_count_by_reason():
     report: dict[str, float] = {}
-    flux = ml.Flux([[20.0, 1.0, 1.0]], [[2.0, 1.0, 60.0]], 60.0)
+    flux = ml.Flux([[20.0, 1.0, 1.0]], [[2.0, 1.0, 400.0]], 60.0)
     ml.simulate(flux, SYSTEM.replace(cycles=3000), engine="feedback", seed=1, report=report)
     assert report[GIVEN] == 2
     assert report[f"{GIVEN}, locked, short exposure"] == 1

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -10,11 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.native import _core
-from mars_lidar._base.types import IndexArray
 from mars_lidar.cuda.kernels import feedback_histograms, overflow
 from mars_lidar.cuda.machine import Cuda
 from mars_lidar.engines.engine import Task
-from mars_lidar.engines.feedback_rule import Grid, Plan, sweep_pixels
+from mars_lidar.engines.feedback_rule import Group, Plan, sweep_pixels
 from mars_lidar.engines.parts import part_of
 
 _LANES = 32  # a warp: its threads' rows lie side by side
@@ -34,9 +33,9 @@ def feedback_histogram(task: Task, out: Any, machine: Cuda, draw_exactly: Draw, 
 
     cube = out.reshape(task.realizations, task.pixel_index.size, task.system.bins)
 
-    def sweep(part: Task, first: int, group: IndexArray, grid: Grid) -> NDArray[np.uint8]:
+    def sweep(part: Task, first: int, groups: Sequence[Group]) -> NDArray[np.uint8]:
         rows = cube[first : first + part.realizations].reshape(-1, part.system.bins)
-        return _launch(part, rows, group, grid, arrays, machine, warps)
+        return np.concatenate([_launch(part, rows, group, arrays, machine, warps) for group in groups], 1)
 
     every = np.arange(task.pixel_index.size)
     rest = sweep_pixels(replace(task, progress=None), Plan.of(task, every), every, sweep)
@@ -65,12 +64,12 @@ def _arrays(task: Task, machine: Cuda) -> dict[str, Any]:
 
 
 def _launch(
-    task: Task, out: Any, pixels: IndexArray, grid: Grid, common: dict[str, Any], machine: Cuda, warps: int | None
+    task: Task, out: Any, group: Group, common: dict[str, Any], machine: Cuda, warps: int | None
 ) -> NDArray[np.uint8]:
-    """Draw some pixels (n,) on one internal grid; the status (realizations, n) of each exposure."""
-    on = (grid.kinds, grid.laps)
+    """Draw the pixels (n,) of one internal grid; the status (realizations, n) of each exposure."""
+    pixels, on = group.pixels, (group.kinds, group.laps)
     cells = _core.feedback_grid(task.job, *on)
-    work = _core.feedback_warp_bytes(cells["place"].size - 1, grid.laps)
+    work = _core.feedback_warp_bytes(cells["place"].size - 1, group.laps)
     kernel = feedback_histograms(out.dtype.itemsize == 4)
     held = machine.resident(kernel, _LANES, 0) if warps is None else warps
     held = max(1, min(held, _WORK_BYTES // work))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from mars_lidar._base.native import _core
 from mars_lidar.engines.engine import Engine, Task
 from mars_lidar.engines.exact import ExactEngine
-from mars_lidar.engines.feedback_rule import Grid, Plan, Reason, Rest, draw_rest, sweep_pixels
+from mars_lidar.engines.feedback_rule import Group, Plan, Reason, Rest, draw_rest, sweep_pixels
 from mars_lidar.engines.parts import draw_pixels, stage
 from mars_lidar.engines.poisson import PoissonEngine
 
@@ -79,16 +80,18 @@ class FeedbackEngine(Engine):
 
         cube = out.reshape(task.realizations, -1, task.system.bins)
 
-        def sweep(part: Task, first: int, group: NDArray[np.int64], grid: Grid) -> NDArray[np.uint8]:
-            status = np.empty((part.realizations, group.size), np.uint8)
+        def sweep(part: Task, first: int, groups: Sequence[Group]) -> NDArray[np.uint8]:
+            every = np.concatenate([group.pixels for group in groups])
+            status = np.empty((part.realizations, every.size), np.uint8)
             _core.feedback_histogram(
                 part.job,
                 part.pulse,
                 cube[first : first + part.realizations].reshape(-1, part.system.bins),
-                group,
+                every,
                 status,
-                grid.kinds,
-                grid.laps,
+                np.array([group.pixels.size for group in groups]),
+                np.stack([group.kinds for group in groups]),
+                np.array([group.laps for group in groups], np.int32),
                 part.threads,
                 self.level,
                 part.progress,

@@ -81,9 +81,10 @@ class Grids:
             grids.of[at] = known[key]
 
         alone = np.flatnonzero(~several)
-        corners = _corner_of(task.flux, pixels[alone])
-        for corner, (kinds, sweeps) in _corner_grids(task, corners, start).items():
-            put(alone[(corners == corner).all(-1)], kinds, sweeps)
+        corners, which = _corners_of(task.flux, pixels[alone])
+        known_grids = _corner_grids(task, corners, start)
+        for number, corner in enumerate(corners):
+            put(alone[which == number], *known_grids[corner])
         some = np.flatnonzero(several)
         halvings, needed = _even_halvings(task, pixels[some], start)
         for k in np.unique(halvings):
@@ -149,19 +150,33 @@ def _even_halvings(task: Task, pixels: IndexArray, start: KindArray) -> tuple[In
 # Pixels of a single return: the same cells for all, because every lane begins half a period before its return
 
 
-def _corner_of(flux: Flux, pixels: IndexArray) -> IndexArray:
-    """Powers (n, 2) of the least level of signal and background that each pixel does not exceed."""
-
-    def power(light: FloatArray, least: int) -> IndexArray:
-        level = np.log(np.maximum(light, float(_LEVELS) ** least)) / math.log(_LEVELS)
-        return np.asarray(np.ceil(level - 1e-12), np.int64)
-
-    light = (flux.signal.reshape(-1)[pixels], flux.background.reshape(-1)[pixels])
-    return np.stack([power(*some) for some in zip(light, _DIMMEST, strict=True)], -1)
-
-
 Corner = tuple[int, int]
 Known = dict[Corner, tuple[KindArray | None, int]]
+
+
+def _corners_of(flux: Flux, pixels: IndexArray) -> tuple[list[Corner], IndexArray]:
+    """Corners, powers of the least level of signal and background that a pixel does not exceed; (n,) which is whose."""
+
+    def power(light: FloatArray, least: int) -> IndexArray:
+        level = np.searchsorted(_level_edges(least), light)  # the first level that is not below
+        return np.asarray(level + least, np.int64)
+
+    of_signal, of_background = (
+        power(light.reshape(-1)[pixels], least)
+        for light, least in zip((flux.signal, flux.background), _DIMMEST, strict=True)
+    )
+    keys, which = np.unique(of_signal * _CODE + of_background, return_inverse=True)
+    signal = np.floor_divide(keys + _CODE // 2, _CODE)
+    return list(zip(signal.tolist(), (keys - signal * _CODE).tolist(), strict=True)), which
+
+
+_CODE = 4096  # of two powers in one number: each is far below half of it
+
+
+@lru_cache(maxsize=2)
+def _level_edges(least: int) -> FloatArray:
+    """Levels of light from the power `least` on, as far as doubles go: whole powers are exact."""
+    return np.ldexp(1.0, int(math.log2(_LEVELS)) * np.arange(least, 500))
 
 
 @lru_cache(maxsize=64)
@@ -170,14 +185,13 @@ def _known(system: System) -> Known:
     return {}
 
 
-def _corner_grids(task: Task, corners: IndexArray, start: KindArray) -> Known:
-    """Grids of levels of light (n, 2), None where they have too many cells."""
+def _corner_grids(task: Task, corners: list[Corner], start: KindArray) -> Known:
+    """Grids of levels of light, None where they have too many cells."""
     known = _known(task.system)
-    wanted: list[Corner] = [(int(s), int(b)) for s, b in np.unique(corners, axis=0)]
-    new = [corner for corner in wanted if corner not in known]
+    new = [corner for corner in corners if corner not in known]
     if new:
         known.update(_refined(task, new, start))
-    return {corner: known[corner] for corner in wanted}
+    return known
 
 
 def _refined(task: Task, corners: list[Corner], start: KindArray) -> Known:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Any, NamedTuple
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mars_lidar._base.types import IndexArray
 from mars_lidar.engines.engine import Engine, Task
 from mars_lidar.engines.feedback_grid import MOST_SWEEPS, Grids, KindArray
-from mars_lidar.engines.parts import draw_pixels, stage
+from mars_lidar.engines.parts import draw_pixels
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 
@@ -65,15 +65,16 @@ _WORDS = {
 }
 
 
-class Grid(NamedTuple):
-    """Halvings (bins,) of the bins, and periods of a piece of the exposure."""
+class Group(NamedTuple):
+    """Pixels (n,) that are drawn on one grid: halvings (bins,) of the bins, and periods of a piece of the exposure."""
 
+    pixels: IndexArray
     kinds: KindArray
     laps: int
 
 
-Sweep = Callable[[Task, int, IndexArray, Grid], StatusArray]
-"""Draws some pixels (n,) of a task on one grid and returns the status (realizations, n) of each exposure.
+Sweep = Callable[[Task, int, Sequence[Group]], StatusArray]
+"""Draws groups of the pixels of a task and returns the status (realizations, n) of each exposure, group after group.
 
 The number is the task's first realization in the output.
 """
@@ -148,25 +149,31 @@ def sweep_pixels(
     # lanes go through their sweeps together: neighbours in background need about as many
     able = np.flatnonzero(plan.reason == Reason.DRAWN)
     able = able[np.argsort(task.flux.background.reshape(-1)[pixels[able]], kind="stable")]
-    done, share = 0, 1.0 / max(able.size, 1)
 
-    def draw(wanted: IndexArray, laps: IndexArray) -> None:
-        nonlocal done
-        for number, lap in np.unique(np.stack([grid[wanted], laps], -1), axis=0):
-            group = wanted[(grid[wanted] == number) & (laps == lap)]
-            part = replace(task, progress=stage(task.progress, done * share, (done + group.size) * share))
-            used = Grid(plan.grids.kinds[number], int(lap))
-            status[:, group] = sweep(part, 0, np.ascontiguousarray(pixels[group]), used)
-            done += int((status[0, group] < Reason.LAPS).sum())
+    def draw(part: Task, first: int, wanted: IndexArray, laps: IndexArray) -> IndexArray:
+        """Status (realizations, n) of `wanted` (n,), pixels of one grid and number of laps together."""
+        back = np.empty((part.realizations, wanted.size), np.uint8)
+        if wanted.size == 0:
+            return back
+        key = grid[wanted] * 256 + laps
+        order = np.argsort(key, kind="stable")
+        keys, begin = np.unique(key[order], return_index=True)
+        groups = [
+            Group(np.ascontiguousarray(pixels[some]), plan.grids.kinds[k // 256], int(k % 256))
+            for k, some in zip(keys, np.split(wanted[order], begin[1:]), strict=True)
+        ]
+        back[:, order] = sweep(part, first, groups)
+        return back
 
-    draw(able, np.ones_like(able))
+    status[:, able] = draw(task, 0, able, np.ones_like(able))
     slow = able[status[0, able] >= Reason.LAPS]
     laps = status[0, slow].astype(np.int64) - Reason.LAPS
     large = cells[slow] * laps > MOST_LAP_CELLS
     dear = np.zeros_like(large) if worth is None else cells[slow] * laps > worth[slow]
     status[:, slow[dear]] = Reason.DEAR
     status[:, slow[large]] = Reason.CELLS
-    draw(slow[~large & ~dear], laps[~large & ~dear])
+    far = ~large & ~dear
+    status[:, slow[far]] = draw(replace(task, progress=None), 0, slow[far], laps[far])
     of_laps = np.ones(pixels.size, np.int64)
     of_laps[slow] = laps
     long = expected_registrations(task.flux, task.system).reshape(-1)[pixels] > TRY_FROM * cells * of_laps
@@ -176,10 +183,7 @@ def sweep_pixels(
             first, seed = task.first_realization + int(one), task.seed ^ (attempt * _OTHER_NUMBERS % 2**64)
             part = replace(task, realizations=1, first_realization=first, seed=seed, progress=None)
             again = np.flatnonzero(unsettled[one])
-            for number, lap in np.unique(np.stack([grid[again], of_laps[again]], -1), axis=0):
-                group = again[(grid[again] == number) & (of_laps[again] == lap)]
-                used = Grid(plan.grids.kinds[number], int(lap))
-                status[one, group] = sweep(part, int(one), np.ascontiguousarray(pixels[group]), used)[0]
+            status[one, again] = draw(part, int(one), again, of_laps[again])[0]
         unsettled &= status == Reason.UNSETTLED
     return Rest.of(task, pixels, status)
 

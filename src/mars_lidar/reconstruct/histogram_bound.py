@@ -50,8 +50,8 @@ def cramer_rao(flux: Flux, system: System, *, threads: int | None = None) -> His
 
     The information of registrations at the rate l_j in the armed time of bin j is that of a Poisson process,
     ``I = sum_j E[D_j] (dl_j)(dl_j)' / l_j``, with E[D_j] = E[h_j] / l_j the mean armed time; a bin that hides the times
-    inside of it keeps the share (x / sinh x)^2 of that, x = l_j / 2 (R18). The armed time is taken as known: that a
-    histogram hides what the ends of the exposure took from it is not in the bound (docs/reconstruction.md, section 3).
+    inside of it keeps the fraction (x / sinh x)^2 of that, x = l_j / 2 (R18). The armed time is taken as known: the
+    information that the ends of the exposure hide is not subtracted (docs/theory_reconstruction.md, section 3).
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Depth and signal of an image from a few photons a pixel: docs/reconstruction.md, section 10.
+"""Depth and signal of an image from a few photons a pixel: docs/theory_reconstruction.md, section 7.
 
 Each pixel's posterior on the two comb trees of the image, then planes through the photons about it; trained, two small
 networks choose among the posterior's peaks and weigh the planes.

@@ -1,4 +1,4 @@
-"""The pulse on the cells of delay in which an image is reconstructed: docs/reconstruction.md, section 10."""
+"""The pulse on the cells of delay in which an image is reconstructed: docs/theory_reconstruction.md, section 7."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Depth from a few photons a pixel, stage by stage: docs/reconstruction.md, section 10.
+"""Depth from a few photons a pixel, stage by stage: docs/theory_reconstruction.md, section 7.
 
 Sum-product on the two comb trees of each pixel (Bleyer and Gelautz, VISAPP 2008, with sums for maxima), and planes
 through the photons about the delays that it gives. All in cells of delay, photons, and sigma of the pulse.

@@ -35,12 +35,12 @@ class MaximumLikelihood(Method):
         Take the bias of first order off the maximum (Cox and Snell, J. R. Stat. Soc. B 30, 248, 1968; R19): some
         tenths of a standard error in bright pixels of short exposures, whose errors it makes smaller too.
     returns
-        Of each pixel up to so many are looked for, in [1, 8]: one more is taken for as long as twice the gain in log
-        likelihood by it is more than what the others and the background reach anywhere in the period with probability
-        `false_alarm` (R23; docs/reconstruction.md, section 9). Signal, delay and background are those of the strongest
-        then, beside the others.
+        Largest number of returns for each pixel, in [1, 8]. Returns are added as long as twice the gain of the log
+        likelihood exceeds what noise reaches anywhere in the period with probability `false_alarm` (R23 of
+        docs/theory_reconstruction.md, section 6). `signal` and `delay_ns` are then those of the strongest return.
     tested
-        Test the fit of each pixel, of one return and a free-running detector (docs/reconstruction.md, section 11).
+        Test the fit of each pixel of one return and a free-running detector
+        (docs/theory_reconstruction.md, section 8).
     """
 
     starts: int = 3

@@ -31,7 +31,7 @@ class Returns:
         (..., K) standard errors from the observed information; NaN where it does not bound them.
     false_alarm
         (..., K) probability that a return which is not there would have gained so much likelihood, anywhere in the
-        period (docs/reconstruction.md, section 9).
+        period (docs/theory_reconstruction.md, section 6).
     """
 
     count: NDArray[np.uint8]

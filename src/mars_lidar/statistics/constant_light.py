@@ -2,7 +2,8 @@
 
 Straka, Grygar, Hloušek, Ježek, "Counting statistics of actively quenched SPADs under continuous illumination",
 J. Lightwave Technol. 38, 4765 (2020), arXiv 2001.10036; Krause, Walenta, "Exponential-recovery model for free-running
-SPADs with capacity-induced dead-time imperfections", arXiv 2507.10361 (2025); docs/detectors.md, (15), (16), (22).
+SPADs with capacity-induced dead-time imperfections", arXiv 2507.10361 (2025). Equations (15), (16) and (22) of
+docs/theory_detectors.md.
 """
 
 from __future__ import annotations

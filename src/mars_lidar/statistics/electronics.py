@@ -1,10 +1,10 @@
 """Free-running pixels behind electronics with a dead time of their own: count law, mean histogram, stationary shape.
 
-An avalanche is recorded iff t_e has passed since the last record; the pixel keeps detecting meanwhile, blind for t_d
-after each avalanche. Records form a Markov-renewal process whose state is the phase of a record: docs/detectors.md,
-equations (10) to (13). Its transition probabilities are the kernel (10) folded over the periods. The stationary law of
-the phases is the mean histogram of a stationary pixel (20), the case of Rapp et al., IEEE TSP 2019. Weighting each
-record with z gives the generating function of the number of records, and on the unit circle its law (19).
+An avalanche is recorded iff t_e has passed since the last record; the pixel keeps detecting meanwhile, dead for t_d
+after each avalanche. Records form a Markov-renewal process whose state is the phase of a record: equations (10) to (13)
+of docs/theory_detectors.md. Its transition probabilities are the kernel (10) folded over the periods. The stationary
+law of the phases is the mean histogram of a stationary pixel (20), the case of Rapp et al., IEEE TSP 2019. Weighting
+each record with z gives the generating function of the number of records, and on the unit circle its law (19).
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Exact statistics of a finite exposure: cumulants of the count and the mean histogram, by the delay recursion.
 
 The result includes the start, the end and the mixing of the exposure; nothing is assumed stationary or Gaussian, or
-truncated. Derivation and equation numbers: docs/theory_exposure.md; of paralyzable pixels: docs/detectors.md, equations
-(1) and (17). `refined_moments` refines the grid until two grids agree.
+truncated. Derivation and equation numbers: docs/theory_exposure.md; of paralyzable pixels: docs/theory_detectors.md,
+equations (1) and (17). `refined_moments` refines the grid until two grids agree.
 
 Without a dead time every photon is registered, and every bin is Poisson.
 

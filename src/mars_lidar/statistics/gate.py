@@ -1,7 +1,7 @@
 """Check of the modes and effects of the detector that a statistic treats, and the open parts of a gate.
 
 A gate that repeats every period makes a gated pixel a free-running one that sees the flux inside of the gate, so that
-the exposure recursion holds for it with that flux: docs/detectors.md.
+the exposure recursion holds for it with that flux: docs/theory_detectors.md.
 """
 
 from __future__ import annotations

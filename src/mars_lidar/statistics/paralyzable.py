@@ -2,7 +2,7 @@
 
 An arrival is registered iff no other came within the dead time before it. The rate of registrations is therefore
 r(t) = lambda(t) exp(-(C(t) - C(t - t_d))), with the integrated flux C, and registrations further apart than the dead
-time are independent. Equation numbers: docs/detectors.md.
+time are independent. Equation numbers: docs/theory_detectors.md.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 Every armed period registers with probability q = 1 - e^-Lambda, at a phase with the law of the first arrival,
 independently of all others. A registration occupies 1 + K periods, or 2 + K where it comes after 1 - f, with t_d =
-K + f. The count is thus a renewal process of whole periods: docs/detectors.md, equations (4) to (7).
+K + f. The count is thus a renewal process of whole periods: docs/theory_detectors.md, equations (4) to (7).
 """
 
 from __future__ import annotations

@@ -138,7 +138,8 @@ class Batch : private BatchPixels {
         const bool respond = some != 0;
         if (respond) {
             set_noise();
-            double moved_by[kTeam] = {};  // N less its mean
+            double moved_by[kTeam] = {}, step_before[kTeam] = {}, damping[kTeam];  // N less its mean
+            for (int i = 0; i < kTeam; ++i) damping[i] = 1.0;
             for (int64_t k = 0; k < row(n_ + 1); ++k) old[k] = 0.0f;
             for (int i = 0; i < kTeam; ++i) armed[i] = 0.0f;
             for (int sweep = 0; some && sweep < kLinearSweeps; ++sweep) {
@@ -148,7 +149,7 @@ class Batch : private BatchPixels {
                 for (int i = 0; i < kTeam; ++i) {
                     if (!active[i]) continue;
                     const double moved = (static_cast<double>(old[row(n_) + i]) - moved_by[i]) * share_[i];
-                    moved_by[i] += moved;
+                    moved_by[i] += damped(moved, step_before[i], damping[i]);
                     armed[i] = static_cast<float>(-grid_.folded() * moved_by[i]);
                     active[i] = change[i] > 0.5f || grid_.folded() * size(moved) > 0.25 ? 1 : 0;
                     some |= active[i];
@@ -171,6 +172,15 @@ class Batch : private BatchPixels {
         }
     }
 
+    // A step of N. By 1 / (1 + K sum w) it is right for a history that has settled; where sweeps settle slowly, the total
+    // follows N by more than it will in the end, and N would swing for ever. So steps are halved where they turn back by
+    // more than half of what they were.
+    static double damped(double step, double& before, double& damping) {
+        if (step * before < 0.0 && size(step) > 0.5 * size(before) && damping > 0.125) damping *= 0.5;
+        before = step;
+        return damping * step;
+    }
+
     // K N is a real number here: rounded to an integer, the total would jump by sum w where K N steps by one.
     void set_blind() {
         for (int i = 0; i < kTeam; ++i) {
@@ -186,6 +196,8 @@ class Batch : private BatchPixels {
         const Quantiles quantiles{work_.alpha, work_.beta, work_.dither, work_.split, work_.exact, key0_, key1_};
         alignas(64) int32_t change[kTeam];
         float last[kTeam];
+        double step_before[kTeam] = {}, damping[kTeam];
+        for (int i = 0; i < kTeam; ++i) damping[i] = 1.0;
         const int sweeps = grid_.laps > 1 ? kLapSweeps : kIntegerSweeps;
         const int64_t end = row(grid_.path());
         for (int i = 0; i < kTeam; ++i) last[i] = 0.0f;
@@ -202,7 +214,7 @@ class Batch : private BatchPixels {
                     const double seen = static_cast<double>(static_cast<uint32_t>(work_.history[0][end + i]));
                     const double step = (seen - number_[i]) * share_[i];
                     turn = grid_.folded() * total_[i] * size(step);
-                    number_[i] += step;
+                    number_[i] += damped(step, step_before[i], damping[i]);
                 }
                 const float moved = static_cast<float>(change[i]);
                 const bool settled = grid_.laps > 1

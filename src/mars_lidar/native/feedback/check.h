@@ -22,7 +22,7 @@ struct FineRates {
     double *dark_fire, *dark_refire, *lit_fire, *lit_refire;
 
     FineRates(const FeedbackCheck& c, double*& memory) : check(c) {
-        const int64_t row = kRow, lit = c.lit_end - c.lit_begin;
+        const int64_t row = kJudged, lit = c.lit_end - c.lit_begin;
         auto take = [&](int64_t rows) {
             double* const at = memory;
             memory += rows * row;
@@ -33,8 +33,9 @@ struct FineRates {
         lit_fire = take(lit);
         lit_refire = take(lit);
         for (int k = 0; k < kKinds; ++k)
-            set_rates(c.dark_photons + k * row, dark_fire + k * row, dark_refire + k * row);
-        for (int64_t k = 0; k < lit; ++k) set_rates(c.lit_photons + k * row, lit_fire + k * row, lit_refire + k * row);
+            set_rates<double, kJudged>(c.dark_photons + k * row, dark_fire + k * row, dark_refire + k * row);
+        for (int64_t k = 0; k < lit; ++k)
+            set_rates<double, kJudged>(c.lit_photons + k * row, lit_fire + k * row, lit_refire + k * row);
     }
     const double* fire(int32_t j) const { return pick(j, dark_fire, lit_fire); }
     const double* refire(int32_t j) const { return pick(j, dark_refire, lit_refire); }
@@ -42,35 +43,40 @@ struct FineRates {
 
  private:
     const double* pick(int32_t j, const double* dark, const double* lit) const {
-        return j >= check.lit_begin && j < check.lit_end ? lit + static_cast<int64_t>(j - check.lit_begin) * kRow
-                                                         : dark + static_cast<int64_t>(check.fine->kind[j]) * kRow;
+        return j >= check.lit_begin && j < check.lit_end ? lit + static_cast<int64_t>(j - check.lit_begin) * kJudged
+                                                         : dark + static_cast<int64_t>(check.fine->kind[j]) * kJudged;
     }
 };
 
-// A row of lanes of a sweep; in place, `out` is that of the sweep before.
-MARS_NOINLINE void mean_step(const double* __restrict__ p, const double* __restrict__ q, const double* late,
-                             const double* early, double part, double turns, const double* __restrict__ gone,
-                             const int64_t* __restrict__ active, double* __restrict__ c, double* __restrict__ re,
-                             double* __restrict__ moved, double* out) {
-    alignas(64) double sum[kTeam], then[kTeam];
-    for (int i = 0; i < kTeam; ++i) {
-        then[i] = late[i] - part * (late[i] - early[i]) - turns * gone[i];
-        sum[i] = c[i] + p[i] * (1.0 - (c[i] - re[i])) + q[i] * (then[i] - re[i]);
+// One cell of a sweep, in place: `out` is the row of the sweep before. C' = (1 - p) C + p (1 + RA) + q (RA' - RA), so that
+// a cell waits for the one before for a multiplication and an addition only.
+struct MeanSweep {
+    alignas(64) double c[kJudged] = {}, re[kJudged], gone[kJudged];
+    alignas(64) double moved[kJudged] = {}, least[kJudged];  // the largest move of a sum, the fewest armed
+    alignas(64) int64_t active[kJudged];
+
+    MARS_NOINLINE void step(const double* __restrict__ p, const double* __restrict__ q, const double* late,
+                            const double* early, double part, double turns, double* out) {
+        alignas(64) double now[kJudged];
+        for (int i = 0; i < kJudged; ++i) {
+            const double then = late[i] - part * (late[i] - early[i]) - turns * gone[i];
+            const double more = p[i] * (1.0 + re[i]) + q[i] * (then - re[i]), before = out[i];
+            const double sum = (1.0 - p[i]) * c[i] + more, armed = 1.0 - (sum - then);
+            const double up = sum - before, size = up > -up ? up : -up;
+            moved[i] = size > moved[i] ? size : moved[i];
+            least[i] = armed < least[i] ? armed : least[i];
+            re[i] = then;
+            c[i] = sum;
+            now[i] = active[i] ? sum : before;
+        }
+        for (int i = 0; i < kJudged; ++i) out[i] = now[i];
     }
-    for (int i = 0; i < kTeam; ++i) {
-        const double before = out[i], now = active[i] ? sum[i] : before;
-        const double step = now > before ? now - before : before - now;
-        moved[i] = step > moved[i] ? step : moved[i];
-        re[i] = then[i];
-        c[i] = now;
-        out[i] = now;
-    }
-}
+};
 
 // What a cell of the grid makes of the finer grid's mean.
 struct Residual {
-    alignas(64) double square[kTeam];                         // r^2 / (v + |r|)
-    alignas(64) double own[kTeam], begin[kTeam], end[kTeam];  // its parts: light in the cell, RA at either edge
+    alignas(64) double square[kJudged];                             // r^2 / (v + |r|)
+    alignas(64) double own[kJudged], begin[kJudged], end[kJudged];  // its parts: light in the cell, RA at either edge
 
     // Of both grids: RA at the cell's edges. `fire`, `light` of the two finer cells.
     MARS_NOINLINE void set(const double* __restrict__ fire0, const double* __restrict__ fire1,
@@ -78,7 +84,7 @@ struct Residual {
                            const double* __restrict__ from, const double* __restrict__ to,
                            const double* __restrict__ re, const double* __restrict__ then,
                            const double* __restrict__ off, const double* __restrict__ next_off) {
-        for (int i = 0; i < kTeam; ++i) {
+        for (int i = 0; i < kJudged; ++i) {
             const double l = light0[i] + light1[i], p = fire0[i] + fire1[i] - fire0[i] * fire1[i];
             const double series = l * (0.5 - l * (1.0 / 6 - l * (1.0 / 24 - l * (1.0 / 120 - l * (1.0 / 720)))));
             const double q = l < 0.02 ? series : 1.0 - p / l;
@@ -108,52 +114,55 @@ class GridCheck {
 
  private:
     static constexpr int kSweeps = 200;
-    static constexpr double kStill = 4e-4;  // D^2 by the last sweep's move at most: r_j = p_j times this, of |r_j|
+    static constexpr double kStill = 4e-4;  // D^2 by the last sweep's move at most
     static constexpr double kRounding = 1e-13;
 
-    double* row(int32_t j) const { return sums_ + static_cast<int64_t>(j) * kRow; }
+    double* row(int32_t j) const { return sums_ + static_cast<int64_t>(j) * kJudged; }
 
     // RA of the finer grid at its edge e.
     void rearmed(int32_t e, double* out) const {
         const FeedbackEdge& edge = fine_.edge[e];
         const double *late = row(edge.late), *early = row(edge.early), *total = row(fine_.cells);
-        for (int i = 0; i < kTeam; ++i) out[i] = late[i] - edge.part * (late[i] - early[i]) - edge.turns * total[i];
+        for (int i = 0; i < kJudged; ++i) out[i] = late[i] - edge.part * (late[i] - early[i]) - edge.turns * total[i];
     }
 
-    // The mean of the finer grid per period at K = 0; each lane ends by itself.
+    // The mean of the finer grid per period at K = 0; each lane ends by itself: where the last sweep's move m, which
+    // leaves r_j = p_j m at most, is less than kStill of D^2. That is at most N_r m^2 sum p / (m + the fewest armed).
     void solve() {
         const int32_t n = fine_.cells;
-        alignas(64) double total[kTeam] = {}, still[kTeam], c[kTeam], re[kTeam], gone[kTeam], moved[kTeam];
-        alignas(64) int64_t active[kTeam];
+        alignas(64) double fired[kJudged] = {};
         for (int32_t j = 0; j < n; ++j) {
             const double* p = rates_.fire(j);
-            for (int i = 0; i < kTeam; ++i) total[i] += p[i];
+            for (int i = 0; i < kJudged; ++i) fired[i] += p[i];
         }
-        for (int i = 0; i < kTeam; ++i) {
-            still[i] = kStill / ((total[i] > 1.0 ? total[i] : 1.0) * check_.exposures);
-            still[i] = still[i] > kRounding ? still[i] : kRounding;
-            total[i] /= 1.0 + total[i] * (fine_.dead_time - fine_.whole);
-            active[i] = 1;
+        MeanSweep mean;
+        alignas(64) double total[kJudged];
+        for (int i = 0; i < kJudged; ++i) {
+            total[i] = fired[i] / (1.0 + fired[i] * (fine_.dead_time - fine_.whole));
+            mean.active[i] = 1;
             check_.sweeps[i] = kSweeps + 1;
         }
         for (int32_t j = 0; j <= n; ++j)
-            for (int i = 0; i < kTeam; ++i) row(j)[i] = fine_.place[j] * total[i];
+            for (int i = 0; i < kJudged; ++i) row(j)[i] = fine_.place[j] * total[i];
         for (int sweep = 1; sweep <= kSweeps; ++sweep) {
-            rearmed(0, re);
-            for (int i = 0; i < kTeam; ++i) {
-                gone[i] = row(n)[i];
-                c[i] = moved[i] = row(0)[i] = 0.0;
+            rearmed(0, mean.re);
+            for (int i = 0; i < kJudged; ++i) {
+                mean.gone[i] = row(n)[i];
+                mean.c[i] = mean.moved[i] = row(0)[i] = 0.0;
+                mean.least[i] = 1.0;
             }
             for (int32_t j = 0; j < n; ++j) {
                 const FeedbackEdge& edge = fine_.edge[j + 1];
-                mean_step(rates_.fire(j), rates_.refire(j), row(edge.late), row(edge.early),
-                          static_cast<double>(edge.part), edge.turns, gone, active, c, re, moved, row(j + 1));
+                mean.step(rates_.fire(j), rates_.refire(j), row(edge.late), row(edge.early),
+                          static_cast<double>(edge.part), edge.turns, row(j + 1));
             }
             bool some = false;
-            for (int i = 0; i < kTeam; ++i) {
-                if (!active[i]) continue;
-                if (moved[i] <= still[i]) {
-                    active[i] = 0;
+            for (int i = 0; i < kJudged; ++i) {
+                if (!mean.active[i]) continue;
+                const double moved = mean.moved[i], armed = mean.least[i] > 0.0 ? mean.least[i] : 0.0;
+                const double off = check_.exposures * fired[i] * moved * (moved / (moved + armed));
+                if (moved <= kRounding || off <= kStill) {
+                    mean.active[i] = 0;
                     check_.sweeps[i] = sweep;
                 } else {
                     some = true;
@@ -167,16 +176,16 @@ class GridCheck {
     void judge() {
         const FeedbackGrid& grid = *check_.coarse;
         const double* const total = row(fine_.cells);
-        alignas(64) double re[kTeam], then[kTeam], off[kTeam], next_off[kTeam], scale[kTeam];
+        alignas(64) double re[kJudged], then[kJudged], off[kJudged], next_off[kJudged], scale[kJudged];
         // RA of the grid less that of the finer one at the edge e of the grid, and the latter
         auto at_edge = [&](int32_t e, double* exact, double* difference) {
             rearmed(2 * e, exact);
             const FeedbackEdge& edge = grid.edge[e];
             const double *late = row(2 * edge.late), *early = row(2 * edge.early);
-            for (int i = 0; i < kTeam; ++i)
+            for (int i = 0; i < kJudged; ++i)
                 difference[i] = late[i] - edge.part * (late[i] - early[i]) - edge.turns * total[i] - exact[i];
         };
-        for (int i = 0; i < kTeam; ++i) {
+        for (int i = 0; i < kJudged; ++i) {
             scale[i] = check_.exposures / (1.0 + fine_.whole * total[i]);
             check_.square[i] = 0.0;
         }
@@ -188,13 +197,13 @@ class GridCheck {
             at_edge(j + 1, then, next_off);
             residual.set(rates_.fire(2 * j), rates_.fire(2 * j + 1), rates_.photons(2 * j), rates_.photons(2 * j + 1),
                          row(2 * j), row(2 * j + 2), re, then, off, next_off);
-            for (int i = 0; i < kTeam; ++i) check_.square[i] += scale[i] * residual.square[i];
+            for (int i = 0; i < kJudged; ++i) check_.square[i] += scale[i] * residual.square[i];
             if (check_.bins) {
                 add(bin, scale, residual.own);
                 add(bin_of(grid.edge[j].early), scale, residual.begin);
                 add(bin_of(grid.edge[j + 1].early), scale, residual.end);
             }
-            for (int i = 0; i < kTeam; ++i) {
+            for (int i = 0; i < kJudged; ++i) {
                 re[i] = then[i];
                 off[i] = next_off[i];
             }
@@ -206,8 +215,8 @@ class GridCheck {
         return bin < fine_.bins ? bin : fine_.bins - 1;
     }
     void add(int32_t bin, const double* scale, const double* part) const {
-        double* const to = check_.bins + static_cast<int64_t>(bin) * kRow;
-        for (int i = 0; i < kTeam; ++i) to[i] += scale[i] * part[i];
+        double* const to = check_.bins + static_cast<int64_t>(bin) * kJudged;
+        for (int i = 0; i < kJudged; ++i) to[i] += scale[i] * part[i];
     }
 
     const FeedbackCheck& check_;

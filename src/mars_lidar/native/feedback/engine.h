@@ -12,13 +12,16 @@ namespace mars {
 
 struct PulseTable;
 
-// Which pixels of a job are drawn, and on which internal grid.
+// Which pixels of a job are drawn, and on which internal grids: first those of the first grid, then of the next.
 struct FeedbackCall {
     const int64_t* pixels;  // (number) of the job
     int64_t number;
     FeedbackStatus* status;  // (realizations, number): what became of each
-    const uint8_t* kinds;    // (bins): 2^kind cells for each bin, from half a period before the strongest return on
-    int32_t laps;            // periods of a piece
+    int64_t grids;
+    const int64_t* sizes;  // (grids) pixels of each
+    const uint8_t*
+        kinds;            // (grids, bins): 2^kind cells for each bin, from half a period before the strongest return on
+    const int32_t* laps;  // (grids) periods of a piece
 };
 
 // Histograms out (items, bins), of the pixels and realizations whose status is kDrawn; the other rows are left alone.

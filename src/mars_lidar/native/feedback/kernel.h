@@ -109,20 +109,25 @@ inline int64_t feedback_bytes(int64_t cells, int64_t laps, int64_t lit) {
     return 4 * (periodic + whole) + photons + 4 * (path + row) + 4 * laps * cells * kTeams + 64 * 32;  // room to align
 }
 
+// Pixels that are judged together: few, so that their rows of doubles stay in the second-level cache.
+constexpr int kJudged = 8;
+
 // A batch of pixels whose mean on a grid is judged by a grid of half its cells' width (feedback/check.h).
 struct FeedbackCheck {
     const FeedbackGrid *coarse, *fine;
-    const double* dark_photons;  // (kKinds, kTeam) ...
+    const double* dark_photons;  // (kKinds, kJudged) ...
     int32_t lit_begin, lit_end;
     const double* lit_photons;  // ... as in FeedbackBatch, of the finer grid
     double exposures;           // N_r
     double* memory;             // `feedback_check_doubles` of scratch
-    double* square;             // (kTeam): D^2
-    int32_t* sweeps;            // (kTeam): until the mean was settled, 201 where it was not
-    double* bins;               // (bins, kTeam): parts of D^2 that narrower cells would lessen, 0 at first; or null
+    double* square;             // (kJudged): D^2
+    int32_t* sweeps;            // (kJudged): until the mean was settled, 201 where it was not
+    double* bins;               // (bins, kJudged): parts of D^2 that narrower cells would lessen, 0 at first; or null
 };
 
-inline int64_t feedback_check_doubles(int64_t cells, int64_t lit) { return (2 * kKinds + 2 * lit + cells + 1) * kRow; }
+inline int64_t feedback_check_doubles(int64_t cells, int64_t lit) {
+    return (2 * kKinds + 2 * lit + cells + 1) * kJudged;
+}
 
 #if !defined(__CUDACC_RTC__)
 MARS_DECLARE_KERNEL(void, feedback_check_, const FeedbackCheck& check)

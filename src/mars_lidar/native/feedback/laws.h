@@ -14,9 +14,9 @@ MARS_INLINE double floor_of(double x) {
 }
 
 // A row of p = 1 - e^-l and q = 1 - p / l: Taylor series at l / 64, then six times 1 - e^-2x = p (2 - p).
-template <class Real>
+template <class Real, int lanes = kTeam>
 MARS_NOINLINE void set_rates(const double* photons, Real* fire, Real* refire) {
-    for (int i = 0; i < kTeam; ++i) {
+    for (int i = 0; i < lanes; ++i) {
         const double l = photons[i] < 40.0 ? photons[i] : 40.0, x = l * 0x1p-6;
         double p = 1.0;
         p = 1.0 - p * x * (1.0 / 12);

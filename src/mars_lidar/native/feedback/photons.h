@@ -49,32 +49,32 @@ struct PulseEnergy {
 };
 
 // The lanes' photons as FeedbackBatch wants them. Each lane begins half a period before its strongest return.
-class LanePhotons {
+template <int lanes>
+class PhotonsOf {
  public:
-    int32_t first_bin[kTeam];
-    double dark[kKinds * kTeam];
+    int32_t first_bin[lanes];
+    double dark[kKinds * lanes];
     int32_t lit_begin, lit_end;
 
     // `lit` has room for all cells, `row` from one to the next.
-    LanePhotons(const Job& job, const PulseEnergy& energy, const FeedbackGrid& grid, const int64_t* pixels, double* lit,
-                int64_t row)
+    PhotonsOf(const Job& job, const PulseEnergy& energy, const FeedbackGrid& grid, const int64_t* pixels, double* lit,
+              int64_t row)
         : grid_(grid), low_(energy.low), high_(energy.high), lit_(lit), row_(row) {
-        for (int i = 0; i < kTeam; ++i) {
+        for (int i = 0; i < lanes; ++i) {
             first_bin[i] = place(job, pixels[i]);
-            for (int k = 0; k < kKinds; ++k) dark[k * kTeam + i] = job.background[pixels[i]] * grid.width[k];
+            for (int k = 0; k < kKinds; ++k) dark[k * lanes + i] = job.background[pixels[i]] * grid.width[k];
         }
         set_range(job, pixels);
         for (int32_t j = lit_begin; j < lit_end; ++j) {
-            const double* level = dark + kTeam * grid_.kind[j];
-            for (int i = 0; i < kTeam; ++i) lit_[(j - lit_begin) * row_ + i] = level[i];
+            const double* level = dark + lanes * grid_.kind[j];
+            for (int i = 0; i < lanes; ++i) lit_[(j - lit_begin) * row_ + i] = level[i];
         }
-        for (int i = 0; i < kTeam; ++i) {
+        for (int i = 0; i < lanes; ++i)
             for (int64_t k = 0; k < job.returns; ++k) {
                 const double photons = job.signal[k * job.pixels + pixels[i]];
                 if (photons > 0.0) add_return(energy, photons, offset(job, k, pixels[i], i), i);
             }
-            if (job.waveform) add_waveform(job, pixels[i], i);
-        }
+        if (job.waveform) add_waveforms(job, pixels);
     }
 
  private:
@@ -109,7 +109,7 @@ class LanePhotons {
         lit_begin = job.waveform ? 0 : grid_.cells;
         lit_end = job.waveform ? grid_.cells : 0;
         bool round = false;  // a pulse goes on at the other end
-        for (int i = 0; i < kTeam; ++i)
+        for (int i = 0; i < lanes; ++i)
             for (int64_t k = 0; k < job.returns; ++k) {
                 if (!(job.signal[k * job.pixels + pixels[i]] > 0.0)) continue;
                 const double at = offset(job, k, pixels[i], i);
@@ -143,16 +143,17 @@ class LanePhotons {
         }
     }
 
-    // A rate that is constant on samples: photons before a cell's edge, differenced.
-    void add_waveform(const Job& job, int64_t pixel, int lane) {
-        const double* photons = job.waveform + pixel * job.samples;
+    // Rates that are constant on samples.
+    void add_waveforms(const Job& job, const int64_t* pixels) {
         const double scale = static_cast<double>(job.samples);
         for (int32_t j = 0; j < grid_.cells; ++j) {
-            const double from = grid_.place[j] * scale, to = grid_.place[j + 1] * scale;
-            double sum = 0.0;
-            for (int64_t k = static_cast<int64_t>(from); k < job.samples && static_cast<double>(k) < to; ++k)
-                sum += photons[k] * (std::min(to, k + 1.0) - std::max(from, static_cast<double>(k)));
-            lit_[j * row_ + lane] += std::max(0.0, sum);
+            const double to = grid_.place[j + 1] * scale;
+            for (double from = grid_.place[j] * scale; from < to;) {
+                const int64_t k = std::min(static_cast<int64_t>(from), job.samples - 1);
+                const double next = k + 1 < job.samples ? std::min(to, k + 1.0) : to, width = next - from;
+                for (int i = 0; i < lanes; ++i) lit_[j * row_ + i] += width * job.waveform[pixels[i] * job.samples + k];
+                from = next;
+            }
         }
     }
 
@@ -161,6 +162,7 @@ class LanePhotons {
     double* const lit_;        // photons of the cells from lit_begin on
     const int64_t row_;
 };
+using LanePhotons = PhotonsOf<kTeam>;
 
 }  // namespace MARS_LEVEL
 }  // namespace mars

@@ -9,13 +9,14 @@ inline namespace MARS_LEVEL {
 namespace {
 
 // Most sweeps of the mean and of the adjoint, and of integers in one lap.
-constexpr int kMeanSweeps = 160, kIntegerSweeps = 40;
+constexpr int kMeanSweeps = 240, kIntegerSweeps = 120;
 constexpr double kSettled = 0.04;    // a move of the history that ends a lane, in standard deviations of the count
 constexpr double kMeanError = 8e-6;  // of the mean per period: float32 sums, and the last sweep's change
 constexpr float kSlowest =
-    0.85f;  // contraction of a sweep beyond which, or more sweeps than integers have, several laps are needed
-constexpr float kLinearFrom = 0.2f;      // and from which the linear response is worth its sweeps
-constexpr double kLeastVariance = 12.0;  // of the count, for each whole period of dead time: 0.2 to 0.5 are added
+    0.95f;  // contraction of a sweep beyond which, or more sweeps than integers have, several laps are needed
+constexpr float kSlowFromPeriods = 0.85f;  // and from which ghosts count where whole periods of the dead time are blind
+constexpr float kLinearFrom = 0.2f;        // and from which the linear response is worth its sweeps
+constexpr double kLeastVariance = 12.0;    // of the count, for each whole period of dead time: 0.2 to 0.5 are added
 
 class BatchPixels {
  protected:
@@ -135,7 +136,9 @@ class BatchPixels {
             const double most = 8.0 * deviation_[i] + 8.0 + 2.0 * total_[i] + error;
             if (!(most < 0x1p30)) refuse(i, FeedbackStatus::kSlow);
             allowed_[i] = static_cast<int32_t>(most < 0x1p30 ? most : 0.0);
-            const double still = variance_matters(i) ? kSettled * deviation_[i] : 0.0;
+            // what a last move leaves to be moved is rho / (1 - rho) times as much
+            const double ahead = rate_[i] < 0.5f ? 1.0 : 2.0 - 2.0 * static_cast<double>(rate_[i]);
+            const double still = variance_matters(i) ? kSettled * ahead * deviation_[i] : 0.0;
             still_[i] = still > 1.0 ? static_cast<float>(still) : 1.0f;
         }
     }
@@ -155,7 +158,15 @@ class BatchPixels {
             least_[i] = 1;
             for (float left = once; left > 0.03f && least_[i] < kIntegerSweeps / 2; left *= once) ++least_[i];
         }
-        if (grid_.whole > 0 || !some) return;
+        if (!some) return;
+        if (grid_.whole > 0) {
+            for (int i = 0; i < kTeam; ++i) {
+                const float count = kModes * rate_[i];
+                const bool slow = rate_[i] > kSlowFromPeriods && count > kGhostsOfDeviation * deviation_[i];
+                if (grid_.laps == 1 && slow && refused_[i] == FeedbackStatus::kDrawn) ask_for_laps(i);
+            }
+            return;
+        }
         expected_ghosts(grid_, work_.rates, work_.sums, work_.spare_sums, rate_, ghosts);
         for (int i = 0; i < kTeam; ++i) {
             if (refused_[i] != FeedbackStatus::kDrawn) continue;

@@ -1,4 +1,4 @@
-// Depth from a few photons a pixel, stage by stage, on threads: docs/reconstruction.md, section 10. Delays in cells.
+// Depth from a few photons a pixel, stage by stage, on threads (docs/theory_reconstruction.md, section 7). Delays in cells.
 #pragma once
 #include <cstdint>
 #include <string>

@@ -1,5 +1,5 @@
-// The inner loops of depth from a few photons a pixel (docs/reconstruction.md, section 10), compiled once per vector level
-// (lanes/levels.h). They allocate nothing: `scratch` is lent by image/engine.cpp, whose sizes are stated at each.
+// The inner loops of depth from a few photons a pixel (docs/theory_reconstruction.md, section 7), compiled once per vector
+// level (lanes/levels.h). They allocate nothing: image/engine.cpp lends `scratch`, whose size is stated at each.
 // Delays are in cells, of which a period has `cells`, a multiple of 16.
 #pragma once
 #include <cstdint>

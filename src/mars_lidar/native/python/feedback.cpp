@@ -10,22 +10,32 @@
 namespace mars {
 namespace {
 
-void check_grid(const Job& job, const Vector<const int64_t>& pixels, const Vector<const uint8_t>& kinds) {
-    if (size_of(kinds) != job.bins) throw nb::value_error("kinds must be (bins)");
+void check_pixels(const Job& job, const Vector<const int64_t>& pixels) {
     for (int64_t k = 0; k < size_of(pixels); ++k)
         if (pixels.data()[k] < 0 || pixels.data()[k] >= job.pixels) throw nb::value_error("pixels must be of the job");
 }
 
 template <class Count>
 void histogram(const BoundJob& job, const PulseTable& pulse, Matrix<Count> out, Vector<const int64_t> pixels,
-               Matrix<uint8_t> status, Vector<const uint8_t> kinds, int32_t laps, int threads, const std::string& level,
-               const nb::object& progress) {
+               Matrix<uint8_t> status, Vector<const int64_t> sizes,
+               nb::ndarray<const uint8_t, nb::ndim<2>, nb::c_contig> kinds, Vector<const int32_t> laps, int threads,
+               const std::string& level, const nb::object& progress) {
     check_out(job, out);
     if (static_cast<int64_t>(status.shape(0)) != job.realizations || status.shape(1) != pixels.shape(0))
         throw nb::value_error("status must be (realizations, pixels)");
-    check_grid(job, pixels, kinds);
-    const FeedbackCall call{pixels.data(), size_of(pixels), reinterpret_cast<FeedbackStatus*>(status.data()),
-                            kinds.data(), laps};
+    check_pixels(job, pixels);
+    const int64_t grids = size_of(sizes);
+    expect("kinds must be (grids, bins)", {grids, job.bins}, kinds);
+    expect("laps must be (grids)", {grids}, laps);
+    int64_t all = 0;
+    for (int64_t g = 0; g < grids; ++g) {
+        if (sizes.data()[g] < 0) throw nb::value_error("sizes must be 0 or more");
+        all += sizes.data()[g];
+    }
+    if (all != size_of(pixels)) throw nb::value_error("sizes must add up to the pixels");
+    const FeedbackCall call{pixels.data(), all,          reinterpret_cast<FeedbackStatus*>(status.data()),
+                            grids,         sizes.data(), kinds.data(),
+                            laps.data()};
     Count* const cube = out.data();
     watched(progress, [&](const Watch& watch) { feedback_histogram(job, pulse, cube, call, threads, level, watch); });
 }
@@ -33,7 +43,8 @@ void histogram(const BoundJob& job, const PulseTable& pulse, Matrix<Count> out, 
 void judge(const BoundJob& job, const PulseTable& pulse, Vector<const int64_t> pixels, Vector<const uint8_t> kinds,
            Vector<double> distance, Vector<int32_t> sweeps, nb::ndarray<double, nb::ndim<2>, nb::c_contig> bins,
            int threads) {
-    check_grid(job, pixels, kinds);
+    check_pixels(job, pixels);
+    if (size_of(kinds) != job.bins) throw nb::value_error("kinds must be (bins)");
     const int64_t number = size_of(pixels), wanted = static_cast<int64_t>(bins.shape(0));
     expect("distance and sweeps must be (pixels)", {number}, distance, sweeps);
     expect("bins must be (pixels or 0, bins)", {wanted == 0 ? 0 : number, job.bins}, bins);
@@ -46,7 +57,7 @@ void judge(const BoundJob& job, const PulseTable& pulse, Vector<const int64_t> p
 template <class Count>
 void define(nb::module_& module, const char* about) {
     module.def("feedback_histogram", &histogram<Count>, "job"_a, "pulse"_a, "out"_a.noconvert(), "pixels"_a,
-               "status"_a.noconvert(), "kinds"_a, "laps"_a, "threads"_a, "level"_a = "",
+               "status"_a.noconvert(), "sizes"_a, "kinds"_a, "laps"_a, "threads"_a, "level"_a = "",
                "progress"_a.none() = nb::none(), about);
 }
 
@@ -54,10 +65,11 @@ void define(nb::module_& module, const char* about) {
 
 void bind_feedback(nb::module_& module) {
     const char* about =
-        "Histograms out (realizations * pixels, bins) of some pixels by cyclic feedback on 2^kinds internal cells for "
-        "each bin (kinds (bins,), counted from half a period before the pixel's strongest return on), in pieces of "
-        "some "
-        "laps. status (realizations, pixels): 0 drawn, else why its row is not written; 64 and more: it needs that "
+        "Histograms out (realizations * pixels, bins) of some pixels by cyclic feedback: sizes (grids,) of them on "
+        "each "
+        "of some grids of 2^kinds internal cells for each bin (kinds (grids, bins), counted from half a period before "
+        "the pixel's strongest return on), in pieces of laps (grids,) periods. status (realizations, pixels): 0 drawn, "
+        "else why its row is not written; 64 and more: it needs that "
         "many "
         "laps less 64.";
     module.def(

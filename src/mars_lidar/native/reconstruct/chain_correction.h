@@ -1,4 +1,4 @@
-// Markov-chain histogram correction (Rapp et al., IEEE TSP 2019): docs/reconstruction.md, section 4.
+// Markov-chain histogram correction (Rapp et al., IEEE TSP 2019): docs/theory_reconstruction.md, section 4.
 #pragma once
 #include <cmath>
 #include <vector>

@@ -1,5 +1,5 @@
-// Rates behind a histogram, by each correction: none, the passes in which the pixel was armed (docs/reconstruction.md, section
-// 1), and the Markov chain (section 4); and the estimates from their windows (section 5).
+// Rates of a histogram by each correction: none, the passes in which the pixel was armed (section 1 of
+// docs/theory_reconstruction.md), and the Markov chain (section 4); and the estimates from their windows (section 5).
 #pragma once
 #include <algorithm>
 #include <cmath>

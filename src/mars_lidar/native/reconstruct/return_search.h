@@ -1,4 +1,5 @@
-// Where a further return may be, and how far the likelihood gains by one when there is none: docs/reconstruction.md, section 9.
+// Where a further return may be, and how far the likelihood gains by one when there is none
+// (docs/theory_reconstruction.md, section 6).
 #pragma once
 #include <algorithm>
 #include <cmath>

@@ -1,5 +1,5 @@
-// The likelihood of one pixel's histogram as a function of the background and of several returns: docs/reconstruction.md,
-// section 9. The passes that the ends of the exposure take are at their mean here (R3).
+// The likelihood of one pixel's histogram as a function of the background and of several returns
+// (docs/theory_reconstruction.md, section 6). The passes that the ends of the exposure take are at their mean here (R3).
 #pragma once
 #include <algorithm>
 #include <cmath>

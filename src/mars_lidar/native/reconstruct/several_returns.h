@@ -1,5 +1,5 @@
-// How many returns a pixel has, each with its errors: docs/reconstruction.md, section 9. One more is taken for as long as
-// the likelihood gains by it what background or the returns that there are would reach with a given probability.
+// The number of returns of a pixel, each with its errors (docs/theory_reconstruction.md, section 6). Returns are added as
+// long as the gain of the likelihood exceeds what background and the present returns would reach with a given probability.
 #pragma once
 #include <algorithm>
 #include <cmath>

@@ -1,5 +1,5 @@
 // Delay by a matched filter or the peak, signal and background by the window around it, from rates (bins) of a pixel:
-// docs/reconstruction.md, section 5.
+// docs/theory_reconstruction.md, section 5.
 #pragma once
 #include <algorithm>
 #include <cmath>

@@ -23,6 +23,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+from mars_lidar._base.buckets import in_bucket
 from mars_lidar._base.optional import needed
 from mars_lidar._version import __version__
 from mars_lidar.dataset.store import Dataset, Item, open_dataset
@@ -76,7 +77,8 @@ class Crew:
 
     def team(self, dataset: Dataset, threads: int) -> Team:
         """For the parts of a dataset, each made on so many threads."""
-        run = Run(str(dataset.path.resolve()), uuid.uuid4().hex, threads, __version__, fingerprint())
+        path = str(dataset.path if in_bucket(dataset.path) else dataset.path.resolve())
+        run = Run(path, uuid.uuid4().hex, threads, __version__, fingerprint())
         return Team(self.executor, partial(make_parts, run), self.threads, _AHEAD, _LEAST_QUEUED, _TASKS_PER_S)
 
 

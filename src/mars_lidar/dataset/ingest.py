@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from mars_lidar._base.buckets import in_bucket, remove, zarr_store
 from mars_lidar._version import __version__
 from mars_lidar.dataset import samples
 from mars_lidar.dataset.arrays import (
@@ -46,9 +47,9 @@ def create(path: Path, recipe: DatasetRecipe, folder: Path, crew: Crew | None = 
     The workers of a `crew` read the scenes, but for rendered light. Where no scene can be used a ValueError says why,
     and nothing is left at `path`.
     """
-    found, problems = candidates(recipe.scenes, folder)
-    most = len(found) * (recipe.crops if recipe.crop else 1)
-    source = hashlib.sha256("\n".join(one.name for one in found).encode()).hexdigest()
+    listed, problems = candidates(recipe.scenes, folder)
+    most = len(listed) * (recipe.crops if recipe.crop else 1)
+    source = hashlib.sha256("\n".join(result.name for result in listed).encode()).hexdigest()
     writer = SceneWriter.resumed(path, most, source)
     if writer is not None:
         problems = [Problem(Path(each), reason) for each, reason in writer.problems]
@@ -59,54 +60,54 @@ def create(path: Path, recipe: DatasetRecipe, folder: Path, crew: Crew | None = 
     def shape() -> tuple[int, int] | None:
         return None if writer is None else writer.shape
 
-    for *place, one in _read(found, done[0], recipe, shape, crew):
+    for *place, result in _read(listed, done[0], recipe, shape, crew):
         if tuple(place) < done:
             continue
-        if isinstance(one, Problem):
-            problems.append(one)
+        if isinstance(result, Problem):
+            problems.append(result)
             continue
-        name, scene = one
+        name, scene = result
         if writer is None:  # nothing on the disk is touched before there is something to put on it
             histogram_blocks(recipe, 1, scene.shape)
             writer = SceneWriter(begin(path, recipe), most, path, source)
         writer.problems = [[str(each.path), each.reason] for each in problems]
         writer.add(name, scene, (place[0], place[1] + 1))
     if writer is None:
-        told = "\n".join(f"  {problem}" for problem in problems[:5])
+        text = "\n".join(f"  {problem}" for problem in problems[:5])
         more = f"\n  and {len(problems) - 5} more" if len(problems) > 5 else ""
-        raise ValueError(f"none of the scenes can be used:\n{told}{more}")
+        raise ValueError(f"none of the scenes can be used:\n{text}{more}")
     writer.finish()
     lay_out(writer.store, recipe, writer, problems)
 
 
 def _read(
-    found: list[Candidate],
+    listed: list[Candidate],
     number: int,
     recipe: DatasetRecipe,
     shape: Callable[[], tuple[int, int] | None],
     crew: Crew | None,
 ) -> Iterator[tuple[int, int, tuple[str, Shown] | Problem]]:
     """What the candidates from a number on give: candidate, place among its scenes, and the scene or the problem."""
-    while number < len(found) and (crew is None or shape() is None):
-        for place, one in enumerate(scenes(found[number], recipe, shape())):
-            yield number, place, one
+    while number < len(listed) and (crew is None or shape() is None):
+        for place, result in enumerate(scenes(listed[number], recipe, shape())):
+            yield number, place, result
         number += 1
     if crew is None:
         return
     step = max(1, _BATCH // (recipe.crops if recipe.crop else 1))
-    coming, given = iter(range(number, len(found), step)), deque[tuple[int, Future[Any]]]()
+    coming, given = iter(range(number, len(listed), step)), deque[tuple[int, Future[Any]]]()
     while True:
         while len(given) < max(_LEAST_AHEAD, _AHEAD * crew.threads()):
             first = next(coming, None)
             if first is None:
                 break
-            given.append((first, crew.executor.submit(several, found[first : first + step], recipe, shape())))
+            given.append((first, crew.executor.submit(several, listed[first : first + step], recipe, shape())))
         if not given:
             return
         first, future = given.popleft()
         for offset, results in enumerate(future.result()):
-            for place, one in enumerate(results):
-                yield first + offset, place, one
+            for place, result in enumerate(results):
+                yield first + offset, place, result
 
 
 def begin(path: Path, recipe: DatasetRecipe) -> Any:
@@ -115,7 +116,7 @@ def begin(path: Path, recipe: DatasetRecipe) -> Any:
 
     if path.exists():
         (path / "zarr.json").unlink(missing_ok=True)  # from now on it is no store
-        shutil.rmtree(path)
+        remove(path) if in_bucket(path) else shutil.rmtree(path)
     attrs = {
         "complete": False,
         "stage": "scenes",
@@ -125,7 +126,7 @@ def begin(path: Path, recipe: DatasetRecipe) -> Any:
         "bits": fingerprint(),
         "recipe": recipe.to_json(),
     }
-    return zarr.create_group(path, zarr_format=3, attributes=attrs)
+    return zarr.create_group(zarr_store(path), zarr_format=3, attributes=attrs)
 
 
 def lay_out(group: Any, recipe: DatasetRecipe, writer: SceneWriter, problems: list[Problem]) -> None:
@@ -134,11 +135,11 @@ def lay_out(group: Any, recipe: DatasetRecipe, writer: SceneWriter, problems: li
     assert shape is not None
     add(group, coordinates(recipe, names, shape))
     number = samples.count_samples(recipe, len(names))
-    for name, (told, unit) in MAPS.items():
-        create_maps(group, name, (number, *shape), np.dtype(np.float32), ("sample", "y", "x"), told, unit)
+    for name, (text, unit) in MAPS.items():
+        create_maps(group, name, (number, *shape), np.dtype(np.float32), ("sample", "y", "x"), text, unit)
     create_histogram(group, recipe, number, shape)
-    plain = [[str(one.path), one.reason] for one in problems]
-    systems = [one.to_dict() for one in recipe.systems]
+    plain = [[str(result.path), result.reason] for result in problems]
+    systems = [result.to_dict() for result in recipe.systems]
     attrs: dict[str, Any] = {"stage": "counts", "systems": json.dumps(systems), "problems": plain}
     if not writer.plain:
         attrs["format_version"] = MORE_VERSION
@@ -149,10 +150,10 @@ def coordinates(recipe: DatasetRecipe, names: list[str], shape: tuple[int, int])
     """Every small array, of scenes of these names and shape (H, W)."""
     number = samples.count_samples(recipe, len(names))
     parts = [samples.sample_parts(recipe, k) for k in range(number)]
-    texts = [one.to_json() for one in recipe.systems]
+    texts = [result.to_json() for result in recipe.systems]
     seeds = [seed_of(recipe, names[scene], texts[system], s, b) for scene, system, s, b in parts]
     scene, system, signal, sbr = (np.array(column) for column in zip(*parts, strict=True))
-    periods = np.array([one.period_ns for one in recipe.systems])
+    periods = np.array([result.period_ns for result in recipe.systems])
     scene_name = np.array([names[k] for k in scene], object)
     of_sample = ("sample",)
     variables = [

@@ -20,6 +20,7 @@ from typing import Any
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
+from mars_lidar._base.buckets import in_bucket, place_of
 from mars_lidar._base.files import (
     IncompleteFileError,
     Interrupted,
@@ -262,7 +263,7 @@ def _share(items: list[Item], which: int, of: int) -> list[Item]:
 
 
 def _target(out: str | Path) -> Path:
-    target = Path(out)
+    target: Path = place_of(out)
     if target.suffix != ".zarr":
         raise ValueError(f"out must end in .zarr, got {str(target)!r}")
     return target
@@ -293,20 +294,22 @@ def _begun(
     if resume and overwrite:
         raise ValueError("resume and overwrite exclude each other")
     wanted, folder = read_recipe(recipe)
-    check_target(target, folder=True, overwrite=overwrite or resume)
+    if not (in_bucket(target) and resume):
+        check_target(target, folder=True, overwrite=overwrite or resume)
     with _alone(target):  # what is there is looked at under the lock: before, another run may have finished it
-        beside = successor(target)
+        beside = target if in_bucket(target) else successor(target)
         if overwrite and beside.exists():
             shutil.rmtree(beside)  # of a stopped run that is started again
         replacing = overwrite and target.exists()  # by a store that is made beside it, or one that was begun so
         store = beside if replacing or (resume and beside.exists()) else target
         there = store.exists() and resume
         if there:
-            dataset = open_dataset(store, allow_incomplete=True)
+            dataset = open_dataset(str(store), allow_incomplete=True)
             _check_same(store, dataset, wanted)
         elif wanted is None:
             raise ValueError(f"{target} does not exist: there is nothing to resume, and no recipe is given")
-        check_target(target, folder=True, overwrite=overwrite or there)
+        if not (in_bucket(target) and there):
+            check_target(target, folder=True, overwrite=overwrite or there)
         begun = there and dataset.planned
         if not begun and wanted is None:
             raise ValueError(f"{target} was stopped before its scenes were in: give the recipe again to resume")
@@ -314,14 +317,14 @@ def _begun(
             if not begun:
                 assert wanted is not None
                 create(store, wanted, folder, crew)
-                dataset = open_dataset(store, allow_incomplete=True)
+                dataset = open_dataset(str(store), allow_incomplete=True)
             yield store, dataset, crew
 
 
 def _opened(target: Path) -> tuple[Path, Dataset]:
     """The store that `begin` began, made by this version."""
-    store = successor(target) if successor(target).exists() else target
-    dataset = open_dataset(store, allow_incomplete=True)
+    store = target if in_bucket(target) or not successor(target).exists() else successor(target)
+    dataset = open_dataset(str(store), allow_incomplete=True)
     _check_same(store, dataset, None)
     if not dataset.planned:
         raise IncompleteFileError(f"{store} was stopped before its scenes were in: --begin --resume goes on")
@@ -333,7 +336,7 @@ def _in_place(store: Path, target: Path, dataset: Dataset) -> Dataset:
     if store == target:
         return dataset
     exchange(store, target)
-    return open_dataset(target)
+    return open_dataset(str(target))
 
 
 @contextlib.contextmanager
@@ -346,8 +349,8 @@ def _told(store: Path, target: Path) -> Iterator[None]:
     except RuntimeError as error:
         if "thread" not in str(error):
             raise
-        told = f"{error}: give fewer threads, or more memory; {_left(store, target)}"
-        raise WriteError(errno.EAGAIN, told) from error
+        text = f"{error}: give fewer threads, or more memory; {_left(store, target)}"
+        raise WriteError(errno.EAGAIN, text) from error
     except OSError as error:
         if isinstance(error, FileNotFoundError | FileExistsError) and not store.exists():
             raise
@@ -410,9 +413,12 @@ def _here(dataset: Dataset, parts: int, threads: int | None) -> Iterator[Team]:
     teams = max(1, min(team, parts, BUFFER_BYTES // chunk))
     stop, local = threading.Event(), threading.local()
 
+    makers: list[Maker] = []
+
     def make(items: Sequence[Item]) -> list[Made | Failed]:
         if not hasattr(local, "maker"):
             local.maker = Maker(dataset, max(1, team // teams), stop)
+            makers.append(local.maker)
         return [local.maker.attempt(item) for item in items]
 
     with ThreadPoolExecutor(teams) as pool:
@@ -421,6 +427,8 @@ def _here(dataset: Dataset, parts: int, threads: int | None) -> Iterator[Team]:
         except BaseException:
             stop.set()  # the simulator looks at it every 50 ms, and the pool waits for all threads
             raise
+        for maker in makers:
+            maker.note()
 
 
 def _make_all(team: AbstractContextManager[Team], todo: Sequence[Item], add: Callable[[Made], None]) -> None:
@@ -478,19 +486,20 @@ def _check_same(target: Path, dataset: Dataset, wanted: DatasetRecipe | None) ->
 
 def _left(store: Path, target: Path) -> str:
     """What is on the disk, for the text of an error."""
-    free = shutil.disk_usage(target.parent).free
     try:
         dataset = Dataset(store)
         if not dataset.planned:
             raise ValueError
         dataset.tidy()
         total, missing = sum(1 for _ in dataset.items()), len(dataset.missing())
-        told = f"{total - missing} of {total} parts of {store} are written, marked incomplete"
+        text = f"{total - missing} of {total} parts of {store} are written, marked incomplete"
     except (OSError, ValueError, KeyError):
-        told = f"{store} is left behind without counts, marked incomplete"
+        text = f"{store} is left behind without counts, marked incomplete"
     if store != target:
-        told += f", and {target} is what it was before"
-    return f"{told} ({free / 1e9:.3g} GB free there): continue with --resume (resume=True)"
+        text += f", and {target} is what it was before"
+    if not in_bucket(target):
+        text += f" ({shutil.disk_usage(target.parent).free / 1e9:.3g} GB free there)"
+    return f"{text}: continue with --resume (resume=True)"
 
 
 @contextlib.contextmanager
@@ -499,6 +508,9 @@ def _alone(target: Path, *, shared: bool = False) -> Iterator[None]:
 
     Processes that make parts of it (`shared`) hold it together.
     """
+    if in_bucket(target):  # an object store has no locks
+        yield
+        return
     lock = target.with_name(target.name + ".lock")
     while True:
         with open_own(lock) as held:

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.buckets import in_bucket, put
 from mars_lidar.dataset.arrays import MAPS, with_zeros
 from mars_lidar.dataset.sample_content import Shown
 from mars_lidar.dataset.samples import sample_parts
@@ -27,6 +28,7 @@ from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.simulate import simulate
 
+_NOTE_S = 10.0  # between two writes of the digests in an object store: what a killed worker loses is read again
 _KEPT = 4  # scenes and fluxes that a maker remembers: neighbours in the order of parts share them
 
 
@@ -71,6 +73,8 @@ class Maker:
         self._scene = lru_cache(_KEPT)(lambda number: dataset.scenes.read(number))
         self.flux = lru_cache(_KEPT)(self._lit)  # photons of a sample
         self._last: tuple[tuple[int, ...], Flux] | None = None
+        self._lines: list[str] = []
+        self._noted_at = time.monotonic()
         self._note: Path | None = None  # its own, so that writers on many machines need not wait for each other
 
     def attempt(self, item: Item, pauses_s: Sequence[float] = (0.2, 1.0, 5.0)) -> Made | Failed:
@@ -103,12 +107,24 @@ class Maker:
 
     def _noted(self, path: Path, size: int, digest: str) -> None:
         """Append a line on a file that was written: `Dataset.finish` then reads none of them again."""
+        line = f"{digest} {size} {path.relative_to(self.dataset.path).as_posix()}\n"
         if self._note is None:
             folder = self.dataset.digests
-            folder.mkdir(exist_ok=True)
+            if not in_bucket(folder):
+                folder.mkdir(exist_ok=True)
             self._note = folder / f"{secrets.token_hex(8)}.txt"
+        if in_bucket(self._note):  # nothing can be appended to an object
+            self._lines.append(line)
+            self.note(wait_s=_NOTE_S)
+            return
         with open(self._note, "a", encoding="utf-8") as lines:
-            lines.write(f"{digest} {size} {path.relative_to(self.dataset.path).as_posix()}\n")
+            lines.write(line)
+
+    def note(self, wait_s: float = 0.0) -> None:
+        """Write the lines of an object store, unless they were written within so many seconds."""
+        if self._lines and self._note is not None and time.monotonic() - self._noted_at >= wait_s:
+            put(self._note, "".join(self._lines).encode())
+            self._noted_at = time.monotonic()
 
     def _packed(self, item: Item) -> Iterator[bytes | None]:
         """The chunks of a shard, one after the other."""

@@ -13,7 +13,7 @@ from benchmarks.floor import Bandwidth
 from benchmarks.report import Goal, Section
 from benchmarks.timing import in_turn
 from benchmarks.workload import SEED, system
-from mars_lidar.reconstruct import METHODS
+from mars_lidar.reconstruction import METHODS
 
 CUBE_PIXELS = 128 * 128  # what times are scaled to
 GOAL_CUBE_S = 10.0

@@ -20,7 +20,7 @@ from mars_lidar.cuda.exact import exact_histogram
 from mars_lidar.cuda.machine import Cuda, cupy_with_device
 from mars_lidar.engines import Engine, find_engine
 from mars_lidar.engines.engine import Task
-from mars_lidar.simulate import _task
+from mars_lidar.simulation import _task
 from mars_lidar.table import Table
 
 RESULTS = Path(__file__).parent / "results"

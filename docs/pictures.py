@@ -29,13 +29,13 @@ def main() -> None:
     system = ml.System(period_ns=100.0, cycles=4000, bins=512, pulse=pulse, detector=detector)
     flux = scene.flux(system, signal=1.0, sbr=1.0)
     cube = ml.simulate(flux, system, seed=0)[0]
-    found = ml.reconstruct(cube, system)
+    estimate = ml.reconstruct(cube, system)
     row, column = PIXEL
     light = ml.statistics.photons_per_bin(flux[PIXEL], system, bins=512)
     mean = ml.statistics.mean_histogram(flux[PIXEL], system)
 
     fig, axes = plt.subplot_mosaic([["counts", "depth"], ["histogram", "histogram"]], figsize=(7.2, 6.0))
-    for name, values, title in (("counts", cube.sum(-1), "counts"), ("depth", found.depth_m, "depth from them (m)")):
+    for name, values, title in (("counts", cube.sum(-1), "counts"), ("depth", estimate.depth_m, "depth from them (m)")):
         image = axes[name].imshow(values, cmap={"counts": "magma", "depth": "viridis"}[name])
         axes[name].set(title=title, xticks=[], yticks=[])
         axes[name].plot(column, row, "o", mfc="none", mec="w", mew=2)

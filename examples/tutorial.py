@@ -53,10 +53,10 @@ ml.joint_law(flux[y, x], system)
 # **Reconstruct**, and compare with the truth.
 
 # %%
-found = ml.reconstruct(counts, system)
-error_m = np.abs(found.depth_m[0] - scene.depth_m)[found.seen[0]]
-print(f"median error {1e3 * np.median(error_m):.1f} mm over {100 * found.seen.mean():.1f} % of the pixels")
-found
+estimate = ml.reconstruct(counts, system)
+error_m = np.abs(estimate.depth_m[0] - scene.depth_m)[estimate.seen[0]]
+print(f"median error {1e3 * np.median(error_m):.1f} mm over {100 * estimate.seen.mean():.1f} % of the pixels")
+estimate
 
 # %% [markdown]
 # **On to files**: `ml.io.simulate_to("cube.zarr", flux, system)` for cubes of any size, `ml.io.load`,

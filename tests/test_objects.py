@@ -12,7 +12,7 @@ import mars_lidar as ml
 from mars_lidar import io, statistics
 from mars_lidar._base.brief import brief
 from mars_lidar.engines import MarsEngine
-from mars_lidar.reconstruct import HistogramBound
+from mars_lidar.reconstruction import HistogramBound
 
 SYSTEM = ml.System(
     period_ns=100.0, cycles=200, bins=64, pulse=ml.GaussianPulse(sigma_ns=0.5), detector=ml.Detector(dead_time_ns=40.0)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 import inspect
+import pkgutil
 import re
 import subprocess
 import sys
@@ -155,3 +157,11 @@ def test_wheels_and_recipe_follow_the_project():
     assert run == {*settings["project"]["dependencies"], "python" + settings["project"]["requires-python"]}
     host = {line.replace(" ", "") for line in recipe["requirements"]["host"]}
     assert set(settings["build-system"]["requires"]) <= host
+
+
+def test_no_function_hides_a_module():
+    """`ml.reconstruct` is a function, and no module of the package has its name."""
+    for each in pkgutil.iter_modules(ml.__path__):
+        if not each.name.startswith("_"):
+            module = importlib.import_module(f"mars_lidar.{each.name}")
+            assert getattr(ml, each.name) is module, each.name

@@ -21,7 +21,7 @@ def test_python():
     space: dict[str, object] = {}
     exec(own, space)
     assert space["cube"].shape == (1, 48, 64, 1024)
-    assert np.nanmedian(np.abs(space["found"].depth_m - space["depth_m"])) < 0.02
+    assert np.nanmedian(np.abs(space["estimate"].depth_m - space["depth_m"])) < 0.02
     for code in more:  # each goes on where the one before ended
         exec(code, space)
 

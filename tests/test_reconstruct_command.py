@@ -15,10 +15,10 @@ from mars_lidar import io
 from mars_lidar.cli import app
 from mars_lidar.io import recipe as recipes
 from mars_lidar.io.maps import load_maps
-from mars_lidar.reconstruct import METHODS
-from mars_lidar.reconstruct import stored as stored_module
-from mars_lidar.reconstruct.quality import map_error
-from mars_lidar.reconstruct.stored import reconstruct_stored
+from mars_lidar.reconstruction import METHODS
+from mars_lidar.reconstruction import stored as stored_module
+from mars_lidar.reconstruction.quality import map_error
+from mars_lidar.reconstruction.stored import reconstruct_stored
 from studies.__main__ import main
 from studies.common.report import MAX_FIGURE_BYTES
 

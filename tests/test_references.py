@@ -40,7 +40,7 @@ RIDDLES = {"found", "told", "seen", "one", "shown", "kept", "left", "mended", "e
 MOST_RIDDLES = {
     ".": 1,
     "_base": 29,
-    "calibrate": 12,
+    "calibration": 12,
     "cli": 49,
     "cuda": 4,
     "dataset": 110,
@@ -50,7 +50,7 @@ MOST_RIDDLES = {
     "learn": 2,
     "light": 3,
     "plot": 10,
-    "reconstruct": 33,
+    "reconstruction": 33,
     "statistics": 1,
 }
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import fnmatch
 import functools
-import importlib
 import inspect
 import itertools
 import math
@@ -25,7 +24,7 @@ import typer
 from typer.testing import CliRunner
 
 import mars_lidar as ml
-from mars_lidar import io, plot, statistics
+from mars_lidar import io, plot, reconstruction, statistics
 from mars_lidar.cli import app
 from mars_lidar.dataset import DatasetRecipe, Light, estimate, export, open_dataset, read_sparse, read_view, verify
 from mars_lidar.io.maps import load_maps, save_maps
@@ -38,7 +37,6 @@ FLUX = ml.Flux(np.full((2, 3), 0.5), 0.1, 40.0)
 PIXEL = ml.Flux(0.5, 0.1, 40.0)
 SYNCHRONOUS = SYSTEM.replace(detector=ml.Detector(dead_time_ns=30.0, mode="synchronous"))
 PARALYZABLE = SYSTEM.replace(detector=ml.Detector(dead_time_ns=30.0, mode="paralyzable"))
-calibrate, reconstruction = (importlib.import_module(f"mars_lidar.{name}") for name in ("calibrate", "reconstruct"))
 SCENE = ml.Scene(np.full((2, 3), 2.0), np.full((2, 3), 0.5))
 NUMBERS = itertools.count()
 RECIPE = {"scenes": {"example": "room", "size": [3, 4]}, "systems": [SYSTEM], "light": {"signal": 0.5}}

@@ -2,9 +2,9 @@
 Pile-up against the Poisson model
 =================================
 
-A bright surface at 40 ns, behind a pixel that is blind for 75 ns after each photon that it registers. A model without
-dead time (Poisson) predicts the grey rate; the pixel registers far fewer photons, too many of them early, and a
-shadow follows the pulse. The exact mean needs no simulation, and the simulation agrees with it. The program prints
+A bright surface at a delay of 40 ns, and a pixel with a dead time of 75 ns. A model without dead time (Poisson)
+predicts the grey histogram; the pixel registers far fewer photons, too many of them early, and a shadow follows the
+pulse. The exact mean, computed without simulation, agrees with the simulated counts. The program prints
 ``45% of the photons are registered.``
 """
 

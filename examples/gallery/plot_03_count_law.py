@@ -2,10 +2,10 @@
 The law of the count against 10,000 draws
 =========================================
 
-How many photons does a pixel register in an exposure? `mars_lidar.count_law` answers exactly, start and end of the
-exposure included, and ten thousand simulated exposures follow it. The Gaussian of the MaRS paper is close where
-counts are many; that of a renewal process at a constant rate of equal energy is too wide: a pulse comes when it
-comes. The program prints ``Variance 7.08 drawn, 7.11 by the exact law.``
+`mars_lidar.count_law` computes the exact distribution of the number of registered photons, including the start and the
+end of the exposure; ten thousand simulated exposures follow it. The Gaussian of the MaRS paper is close for large
+counts. The renewal law of constant light with equal energy is too wide, because pulsed light makes registrations more
+regular. The program prints ``Variance 7.08 drawn, 7.11 by the exact law.``
 """
 
 import matplotlib.pyplot as plt

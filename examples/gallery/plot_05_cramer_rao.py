@@ -2,10 +2,9 @@
 Depth error against the Cramer-Rao bound
 ========================================
 
-From dim to bright light: the error of the depth that each method finds, and the least that any unbiased one can have.
-Methods that do not model the dead time stop following the bound where pile-up begins: more light makes them worse.
-Bars are standard errors of 1000 exposures. At S = 10 one fit in 1000 fails,
-and has no standard error. The program prints
+The depth error of each method from dim to bright light, and the least error of any unbiased estimator. Methods that
+do not model the dead time depart from the bound where pile-up begins: more light makes them worse. Bars are standard
+errors over 1000 exposures. At S = 10 one fit in 1000 fails and has no standard error. The program prints
 ``Maximum likelihood: 1.01 of the bound, S from 0.04 to 6.``
 """
 

@@ -2,9 +2,9 @@
 Four modes of a detector in the same light
 ==========================================
 
-The same photons on four pixels: free running, where photons in the dead time are lost; paralyzable, where they
-prolong it; synchronous, which registers the first photon of each laser period; gated, which sees nothing outside of
-its gate. Dots are simulated, lines are the exact mean. The program prints ``The paralyzable pixel registers 82% of
+The same light on four pixels: free-running, where photons in the dead time are lost; paralyzable, where they
+prolong it; synchronous, which registers the first photon of each laser period; gated, which registers nothing outside
+of its gate. Dots are simulated, lines are the exact mean. The program prints ``The paralyzable pixel registers 82% of
 the free-running one's photons.``
 """
 

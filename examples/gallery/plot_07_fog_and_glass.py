@@ -2,9 +2,9 @@
 Fog and glass
 =============
 
-The same wall in clear air, behind a pane of glass, and in fog. A pane is a second return in every pixel; fog is light
-from everywhere before the wall, and less of it from the wall. In a pixel with dead time the early light hides the
-late. The program prints ``Counts of the wall: 76,903 in clear air, 7,358 in fog.``
+The same wall in clear air, behind a pane of glass, and in fog. A pane adds a return to every pixel; fog scatters light
+back from every depth in front of the wall and attenuates the wall's. Registrations of the early light cost the wall
+further ones, by dead time. The program prints ``Counts of the wall: 76,903 in clear air, 7,358 in fog.``
 """
 
 import matplotlib.pyplot as plt

@@ -2,17 +2,17 @@
 A rendered transient through a SPAD to a reconstruction
 =======================================================
 
-A renderer gives light over time for each pixel, here a wall with a second bounce that comes later. Scaled to photons
-it goes through the pixel's pulse and dead time; the generalised Coates correction needs no model of the light and
-gives it back, down to the noise of bins that were seldom armed. The program prints ``The second bounce: 17% of its
-photons registered.``
+A renderer gives light over time for each pixel, here a wall with a later second bounce. It is scaled to photons,
+convolved with the pulse and registered by a pixel with dead time. The generalised Coates correction recovers it
+without a model of the light, apart from the noise of bins that were seldom armed. The program prints
+``The second bounce: 17% of its photons registered.``
 """
 
 import matplotlib.pyplot as plt
 import numpy as np
 
 import mars_lidar as ml
-from mars_lidar.reconstruct import generalised_coates_rates
+from mars_lidar.reconstruction import generalised_coates_rates
 
 y, x = np.mgrid[-1:1:24j, -1:1:32j]
 after_ns = 0.1 * np.arange(600) - (15 + 6 * (x**2 + y**2))[..., None]  # since the wall's return

@@ -2,9 +2,9 @@
 A measured stream calibrated
 ============================
 
-A laboratory gives photon times (PTU, Photon-HDF5, .mat, .npz). `mars_lidar.calibrate` finds light and detector behind
-them, each with an error, says whether the model fits, and names what is suspect. Here the stream is simulated; its
-pixel has afterpulses, which nobody gave: they are found, and the result has them.
+From the photon times of a laboratory (PTU, Photon-HDF5, .mat, .npz), `mars_lidar.calibrate` estimates light and
+detector with errors, tests whether the model fits, and names effects outside of the model. Here the stream is
+simulated, with afterpulses of which the model is not informed: they are detected and fitted.
 """
 
 import matplotlib.pyplot as plt

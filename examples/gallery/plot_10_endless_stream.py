@@ -2,9 +2,9 @@
 A network on an endless stream
 ==============================
 
-`mars_lidar.learn.CubeStream` simulates cubes as PyTorch asks for them: scenes and light that never come again. Three
-convolutions learn in seconds, on a processor, to place the return of a dim scene in its bin; beside them the matched
-filter, which sees one pixel at a time. From the left: the true depth, the matched filter's, the network's.
+`mars_lidar.learn.CubeStream` simulates cubes as PyTorch requests them: scenes and light that never repeat. A network
+of three convolutions learns in seconds, on a processor, the bin of the return in dim scenes. The matched filter, for
+comparison, uses one pixel at a time. From the left: the true depth, the matched filter's, the network's.
 The program prints ``The network's median error is below the matched filter's: True.``
 """
 

@@ -2,9 +2,9 @@
 The joint law, and why count times shape is not enough
 ======================================================
 
-Dead time ties the bins of a histogram together. Simulators that draw a count and then distribute it over the mean
-shape (MaRS, and every multinomial) have the right mean of each bin and the right count, but not the covariance: two
-bins less than a dead time apart exclude each other. `mars_lidar.joint_law` gives the covariance exactly. The program
+Dead time correlates the bins of a histogram. Simulators that draw a count and distribute it over the mean shape (MaRS,
+and every multinomial) have the right mean of each bin and the right count, but the wrong covariance: a registration
+excludes others less than a dead time away. `mars_lidar.joint_law` gives the covariance exactly. The program
 prints ``Variance of the counts at the pulse: 157 by the exact law, 109 by count times shape.``
 """
 

@@ -2,10 +2,10 @@
 One photon a pixel
 ==================
 
-A room of which each pixel registers one photon of the laser on average, and one of the background, in the whole
-exposure. Alone, half of the pixels have no depth, or that of a background photon. Method ``image`` takes the
-pixels around into account, and says how sure it is: pixels whose depth may be that of another surface have no
-interval. The program prints ``Wrong depths: 55% alone, 1.7% by the image.``
+In this room each pixel registers on average one signal and one background photon in the whole exposure. Estimated
+alone, half of the pixels have no depth, or that of a background photon. Method ``image`` uses the neighbouring pixels
+and states its uncertainty: pixels whose depth may be that of another surface have no interval. The program prints
+``Wrong depths: 55% alone, 1.7% by the image.``
 """
 
 import matplotlib.pyplot as plt

@@ -8,21 +8,21 @@ distance,
 .. math:: z = \tfrac12 c \tau, \qquad \text{1 ns of delay is 15 cm.}
 
 A distant or dark surface returns less than a photon per pulse. A *single-photon avalanche diode* (SPAD) registers
-such light: one photon triggers an avalanche of charge, a clock notes its time. The avalanche must then be stopped and
-the diode recharged, and until that is done the detector is blind. This *dead time* :math:`t_d` is some 20 to 100 ns,
-longer than the pulse and often a good part of the time between two pulses. All that is peculiar to single-photon
-LiDAR follows from it.
+such light: one photon triggers an avalanche of charge, and a clock records its time. The avalanche must then be
+quenched and the diode recharged. During this *dead time* :math:`t_d`, some 20 to 100 ns, the detector registers
+nothing. It is longer than the pulse and often a large part of the time between two pulses, and it causes most of what
+is special about single-photon LiDAR.
 
 The laser repeats the pulse thousands of times with a period :math:`t_r`, and the times since the last pulse are
 sorted into the bins of a *histogram*. Light is measured in photons per period: :math:`S` *signal* photons from the
 pulse, :math:`B` *background* photons from the sun or lamps, which arrive at any time. Both are expected numbers:
-photons arrive at random (a Poisson process).
+photons arrive at random (an inhomogeneous Poisson process).
 
-Photons, and photons that count
+Arriving and registered photons
 -------------------------------
 
-The detector in a few lines: draw the arrivals of some periods, and register each that comes later than a dead time
-after the registration before it. Arrivals that find the detector blind change nothing.
+The detector in a few lines: draw the arrivals of some periods, and register each arrival that is at least a dead time
+later than the previous registration. Arrivals during the dead time have no effect.
 """
 
 import matplotlib.pyplot as plt
@@ -61,7 +61,7 @@ for click in clicks:
     ax.axvspan(click, click + dead_time_ns, ymax=0.45, color="C1", alpha=0.2, lw=0)
 ax.eventplot([photons, clicks], lineoffsets=[1.6, 0.5], linelengths=0.7, colors=["0.4", "C1"])
 ax.set(xlim=(0, 600), ylim=(0, 2.2), yticks=[0.5, 1.6], yticklabels=["registered", "photons"], xlabel="time (ns)")
-ax.set_title("Six laser periods (grey lines); the blind time after each registration is shaded")
+ax.set_title("Six laser periods (grey lines); the dead time after each registration is shaded")
 plt.show()
 
 # %%
@@ -69,10 +69,10 @@ plt.show()
 # -------------------------------------
 #
 # The pulse has a width, here a standard deviation of 2 ns. If many photons arrive with each pulse, the *first* of
-# them is on the front of the pulse; it makes the detector blind, and the photons of the middle, where the light is,
-# are never registered. So the histogram's peak moves towards the detector as the light grows. For :math:`S = 0.2` it
-# is where the light is, for :math:`S = 20` it is early, although a hundred times more photons arrive. ``ml.simulate``
-# draws such histograms without visiting the photons that are lost:
+# them lies on the leading edge of the pulse. It starts the dead time, and the photons of the centre of the pulse are
+# never registered. The peak of the histogram therefore moves to earlier times as the light grows: for
+# :math:`S = 0.2` it coincides with the light, for :math:`S = 20` it is early, although a hundred times more photons
+# arrive. ``ml.simulate`` draws such histograms without drawing the lost photons:
 
 pulse, detector = ml.GaussianPulse(sigma_ns=2.0), ml.Detector(dead_time_ns=dead_time_ns)
 system = ml.System(period_ns=period_ns, cycles=2000, bins=128, pulse=pulse, detector=detector)
@@ -90,8 +90,8 @@ axes[0].legend(loc="upper left")
 plt.show()
 
 # %%
-# The error is not noise: another thousand pulses would not remove it. Over a range of light, the depth of the fullest
-# bin of the *exact mean* histogram (``mean_histogram``, no simulation) beside the truth:
+# This error is a bias, not noise: more pulses do not remove it. The depth of the fullest bin of the *exact mean*
+# histogram (``mean_histogram``, no simulation), compared with the truth over a range of light:
 
 signals = np.geomspace(0.05, 100, 40)
 fine = system.replace(bins=1024)
@@ -110,5 +110,5 @@ print(f"At S = 20 the fullest bin is {at_20:.0f} cm too short.")
 # %%
 # The last line printed is ``At S = 20 the fullest bin is 52 cm too short.``
 #
-# What comes next: :doc:`lesson_2_pile_up` says how the shape bends, in formulas. Related: the modes of real detectors
-# in :doc:`/detectors`, and how to simulate a scene in :doc:`/start`.
+# Next: :doc:`lesson_2_pile_up` derives the shape of the histogram. Related: the modes of real detectors in
+# :doc:`/detectors`, and how to simulate a scene in :doc:`/start`.

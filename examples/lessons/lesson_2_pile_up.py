@@ -2,25 +2,25 @@ r"""
 2 Pile-up
 =========
 
-*Pile-up* is the bending of a histogram because earlier photons hide later ones. It is simplest where the detector
-starts every period armed and registers its first photon only (mode ``"synchronous"``, the classical time-correlated
-photon counting).
+*Pile-up* is the distortion of a histogram by registrations of early photons, which prevent those of later ones. It is
+simplest for a detector that starts every period armed and registers only the first photon (mode ``"synchronous"``,
+classical time-correlated single-photon counting, TCSPC).
 
 Let :math:`l_j` be the expected photons in bin :math:`j` of one period and :math:`F_j = \sum_{k<j} l_k` those before
-it. No photon of a Poisson process comes before bin :math:`j` with probability :math:`\mathrm e^{-F_j}`, and at least
-one in it with :math:`1 - \mathrm e^{-l_j}`, so that
+it. With probability :math:`\mathrm e^{-F_j}` no photon of the Poisson process arrives before bin :math:`j`, and with
+:math:`1 - \mathrm e^{-l_j}` at least one arrives in it, so that
 
 .. math:: P(\text{registered in bin } j) = \mathrm e^{-F_j}\,\bigl(1 - \mathrm e^{-l_j}\bigr). \tag{1}
 
-The factor :math:`\mathrm e^{-F_j}` is the pile-up: each bin is seen through a filter that all the light before it has
-darkened. A uniform background becomes a falling exponential, and a pulse leans to the left.
+The factor :math:`\mathrm e^{-F_j}` is the pile-up: all the light before a bin attenuates its counts. A uniform
+background becomes a decaying exponential, and a pulse is skewed towards early times.
 """
 
 import matplotlib.pyplot as plt
 import numpy as np
 
 import mars_lidar as ml
-from mars_lidar.reconstruct import coates_rates
+from mars_lidar.reconstruction import coates_rates
 
 pulse = ml.GaussianPulse(sigma_ns=2.0)
 detector = ml.Detector(dead_time_ns=0.0, mode="synchronous")
@@ -42,20 +42,19 @@ axes[0].legend(loc="upper left")
 plt.show()
 
 # %%
-# With a twentieth of a photon per period (left) counts and light agree, which is why laboratories keep to "5 % of the
-# pulses". That rule throws 95 % of the pulses away. Equation (1) needs no such rule, since it can be inverted.
+# At a twentieth of a photon per period (left) counts and light agree; hence the laboratory rule to register photons
+# from at most 5 % of the pulses. That rule wastes 95 % of the pulses, and since (1) can be inverted it is not needed.
 #
-# Undoing it
-# ----------
+# Correcting pile-up
+# ------------------
 #
-# Of :math:`N_r` periods, those that registered before bin :math:`j` were blind in it; the others were armed. With
+# Of :math:`N_r` periods, those that registered before bin :math:`j` were dead in it; the others were armed. With
 # :math:`n_j` counts,
 #
 # .. math:: \text{armed}_j = N_r - \sum_{k<j} n_k,
 #    \qquad \hat l_j = -\ln\Bigl(1 - \frac{n_j}{\text{armed}_j}\Bigr). \tag{2}
 #
-# This is Coates' estimator (1968): count in how many periods the bin had a chance at all. It is exact for this
-# detector, and noisy where few periods are still armed.
+# This is Coates' estimator (1968). It is exact for this detector, and noisy where few periods are still armed.
 
 counts = ml.simulate(ml.Flux(2.0, 2.0, 60.0), system, seed=3)[0, 0, 0].astype(float)
 light = ml.statistics.photons_per_bin(ml.Flux(2.0, 2.0, 60.0), system, bins=128)
@@ -78,6 +77,6 @@ print(f"Photons between 31 and 70 ns: the counts lose {lost:.0%}, the correction
 # The last line printed is
 # ``Photons between 31 and 70 ns: the counts lose 82%, the correction is off by -1.8%.``
 #
-# A *free-running* detector is not armed by the laser: its dead time reaches over from one period to the next, and
-# both formulas fail. What replaces them is in :doc:`lesson_3_dead_time`. Theory: :doc:`/theory_exposure`. How-to:
-# :doc:`/reconstruction`.
+# A *free-running* detector is not armed by the laser: its dead time extends from one period into the next, and
+# equations (1) and (2) do not hold. Next: :doc:`lesson_3_dead_time`. Theory: :doc:`/theory_detectors` (this mode).
+# How-to: :doc:`/reconstruction`.

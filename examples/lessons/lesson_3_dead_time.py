@@ -2,20 +2,21 @@ r"""
 3 What dead time does to counts, shapes and correlations
 ========================================================
 
-A free-running detector is armed again as soon as its dead time :math:`t_d` is over, wherever in the laser period that
-is. Three things then differ from counting without dead time.
+A free-running detector is armed again as soon as its dead time :math:`t_d` is over, at any phase of the laser period.
+Its histogram differs from a Poisson histogram in three ways.
 
 Counts: fewer, and more regular
 -------------------------------
 
-Under constant light of rate :math:`\lambda` a registration costs a dead time and a wait of mean :math:`1/\lambda`.
-Renewal theory gives for a long exposure :math:`t`
+Under constant light of rate :math:`\lambda`, successive registrations are a dead time and a wait of mean
+:math:`1/\lambda` apart. Renewal theory gives for the count :math:`N` of a long exposure :math:`t`
 
 .. math:: \mathsf E N = \frac{\lambda t}{1 + \lambda t_d},
    \qquad \frac{\operatorname{Var} N}{\mathsf E N} = \frac{1}{(1 + \lambda t_d)^2}. \tag{1}
 
-A Poisson count has the ratio 1. Under pulsed light it can fall by orders of magnitude: the detector *locks* to the
-laser. The exact law of the count, ``ml.count_law``, for the same mean light as a bright pulse and as constant light:
+For a Poisson count the ratio is 1. Under pulsed light it can be orders of magnitude smaller: the registrations *lock*
+to the laser pulses (mode locking). The exact law of the count, ``ml.count_law``, for pulsed and for constant light of
+the same mean:
 """
 
 import matplotlib.pyplot as plt
@@ -48,9 +49,10 @@ plt.show()
 # Shapes: shadows and echoes
 # --------------------------
 #
-# After a bright return nearly all detectors are blind at the same time, and armed again at the same time. So a strong
-# return casts a *shadow* of length :math:`t_d`, and at its end counts jump above what the background alone gives: an
-# echo where nothing is. Shown is the chance of being armed, counts over light: the histogram divided by what arrives.
+# A bright return is registered in nearly every period, so that in nearly every period the detector is dead for the
+# following :math:`t_d`, and re-arms at the same phase. The return casts a *shadow* of length :math:`t_d`, and at its
+# end the counts rise above the level of the background: a false echo. The figure shows the probability of being armed,
+# which is the histogram divided by the light:
 
 fig, ax = plt.subplots()
 short = system.replace(detector=ml.Detector(dead_time_ns=40.0))
@@ -71,8 +73,8 @@ plt.show()
 # Correlations: bins are not independent
 # --------------------------------------
 #
-# One registration forbids others for a dead time, so neighbouring bins compete: their counts are negatively
-# correlated, and bins a dead time apart positively. ``ml.joint_law`` has the exact covariance of all bins of a finite
+# One registration excludes others for a dead time, so that the counts of neighbouring bins are negatively correlated,
+# and those of bins a dead time apart positively. ``ml.joint_law`` gives the exact covariance of all bins of a finite
 # exposure:
 
 joint = ml.joint_law(ml.Flux(5.0, 0.5, 40.0), system)
@@ -95,7 +97,7 @@ print(f"Counts of the ten bins around the return: their sum has {window:.2f} of 
 # %%
 # The last line printed is
 # ``Counts of the ten bins around the return: their sum has 0.19 of the variance of independent bins.``
-# An error bar that adds the variances of bins is wrong by the root of that.
+# An error bar from the sum of the bins' variances is too long by the inverse square root of that number.
 #
 # Next: :doc:`lesson_4_depth`. Theory: :doc:`/theory_exposure` (counts and shapes), :doc:`/joint_law` (correlations),
 # :doc:`/theory` (the Markov-renewal view of the MaRS paper).

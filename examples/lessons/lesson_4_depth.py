@@ -2,18 +2,18 @@ r"""
 4 From counts back to depth
 ===========================
 
-A histogram is given, and how it was recorded: period, bins, number of periods, pulse, dead time. Wanted are the
-depth, the signal :math:`S` and the background :math:`B`. The idea of :doc:`lesson_2_pile_up` carries over to a
-free-running detector: **count in how many periods each bin was armed.** A registration in bin :math:`k` blinds the
-detector for the bins of the following dead time, so with :math:`d = t_d / (\text{bin width})` and bins counted round
-the period
+Given are a histogram and how it was recorded: period, bins, number of periods :math:`N_r`, pulse, dead time
+:math:`t_d`. To be estimated are the depth, the signal :math:`S` and the background :math:`B`. The correction of
+:doc:`lesson_2_pile_up` carries over to a free-running detector: **count in how many periods each bin was armed.** A
+registration in bin :math:`k` makes the detector dead in the bins of the following dead time. With
+:math:`d = t_d / (\text{bin width})` and bins counted round the period
 
 .. math:: \text{armed}_j \approx N_r - \sum_{k = j - d}^{j - 1} n_k,
    \qquad \hat l_j = -\ln\Bigl(1 - \frac{n_j}{\text{armed}_j}\Bigr). \tag{1}
 
-The histogram corrects itself. ``generalised_coates_rates`` does this with fractions of bins; *maximum likelihood*
-adds that the light is a pulse of known shape on a uniform background, and finds the :math:`S, B, \tau` under which
-the counts, given the armed periods, are most probable:
+``generalised_coates_rates`` computes (1) with fractions of bins. *Maximum likelihood* also uses that the light is a
+pulse of known shape on a uniform background, and maximises over :math:`S, B, \tau` the probability of the counts given
+the armed periods:
 
 .. math:: \begin{aligned}
    \log L(S, B, \tau) &= \sum_j n_j \log\bigl(1 - \mathrm e^{-l_j}\bigr) - (\text{armed}_j - n_j)\, l_j, \\
@@ -24,26 +24,26 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import mars_lidar as ml
-from mars_lidar.reconstruct import generalised_coates_rates
+from mars_lidar.reconstruction import generalised_coates_rates
 
 pulse, detector = ml.GaussianPulse(sigma_ns=2.0), ml.Detector(dead_time_ns=75.0)
 system = ml.System(period_ns=100.0, cycles=20_000, bins=128, pulse=pulse, detector=detector)
 truth = ml.Flux(signal=3.0, background=1.0, delay_ns=60.0)
 counts = ml.simulate(truth, system, seed=4)[0, 0, 0]  # or your own: np.load("histogram.npy")
 
-found = ml.reconstruct(counts, system)
+estimate = ml.reconstruct(counts, system)
 light = ml.statistics.photons_per_bin(truth, system, bins=128)
 
 fig, ax = plt.subplots()
 ax.fill_between(system.time_ns, light, step="mid", color="0.85", label="light")
 ax.step(system.time_ns, counts / system.cycles, where="mid", label="counts per period")
 ax.plot(system.time_ns, generalised_coates_rates(counts, system), ".", label="equation (1)")
-ax.axvline(float(found.delay_ns), color="C2", label="maximum likelihood")
+ax.axvline(float(estimate.delay_ns), color="C2", label="maximum likelihood")
 ax.set(yscale="log", xlabel="time in the period (ns)", ylabel="photons per bin and period")
 ax.legend(loc="upper left")
 plt.show()
-depth = f"Depth {found.depth_m:.4f} m, standard error {1e3 * found.depth_error_m:.1f} mm"
-print(f"{depth}; S = {found.signal:.2f}, B = {found.background:.3f}")
+depth = f"Depth {estimate.depth_m:.4f} m, standard error {1e3 * estimate.depth_error_m:.1f} mm"
+print(f"{depth}; S = {estimate.signal:.2f}, B = {estimate.background:.3f}")
 
 # %%
 # The program prints ``Depth 8.9925 m, standard error 3.1 mm; S = 2.98, B = 1.001``; the truth is 8.9938 m, 3 and 1.

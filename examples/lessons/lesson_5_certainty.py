@@ -2,22 +2,22 @@ r"""
 5 How sure can one be?
 ======================
 
-An estimate without an error bar is half a result. Two numbers answer the question.
+An estimate needs a standard error, and a bound shows whether a better estimator could exist.
 
-**The standard error** of the estimate at hand, from the curvature of the log-likelihood: with :math:`\theta = (S, B,
+**The standard error** of an estimate follows from the curvature of the log-likelihood: with :math:`\theta = (S, B,
 \tau)`
 
 .. math:: \operatorname{Cov} \hat\theta \approx \Bigl[-\frac{\partial^2 \log L}
    {\partial \theta\, \partial \theta'}\Bigr]^{-1}. \tag{1}
 
-**The Cramér-Rao bound**, the least standard error that any unbiased estimator can have under the true light,
+**The Cramér-Rao bound** is the least standard error of any unbiased estimator under the true light:
 
 .. math:: \operatorname{Cov} \hat\theta \ge I(\theta)^{-1}, \qquad I_{ab} = \sum_j \mathsf E[\text{armed}_j]\,
    \frac{\mathrm e^{-l_j}}{1 - \mathrm e^{-l_j}}\,
    \frac{\partial l_j}{\partial \theta_a}\, \frac{\partial l_j}{\partial \theta_b}. \tag{2}
 
-Dead time enters by the expected armed periods alone. Light that cannot be registered carries no information, but it
-blinds: so the bound itself stops falling, while the error of an estimator that ignores dead time rises.
+Dead time enters through the expected armed periods alone. More light leaves fewer armed periods, so that the bound
+itself stops decreasing; the error of an estimator that ignores dead time increases.
 """
 
 import matplotlib.pyplot as plt
@@ -46,15 +46,15 @@ ax.legend()
 plt.show()
 
 # %%
-# Are the error bars honest?
+# Coverage of the error bars
 # --------------------------
 #
-# If they are, the error over its stated standard error is a normal number: 68 % within one, 95 % within two. Checked
-# on the 400 exposures of each signal. This is the test to ask of every method, a network's included
-# (:doc:`/studies/README`).
+# If the standard errors are right, the error divided by its standard error is a standard normal number: 68 % within
+# one, 95 % within two. The figure tests this on the 400 exposures of each signal. Every method should pass this test,
+# a network included (:doc:`/results/README`).
 
-found = ml.reconstruct(cube, system)
-pull = (found.delay_ns - delay_ns) / found.delay_error_ns
+estimate = ml.reconstruct(cube, system)
+pull = (estimate.delay_ns - delay_ns) / estimate.delay_error_ns
 
 fig, ax = plt.subplots()
 for within, color in ((1, "C0"), (2, "C1")):
@@ -78,5 +78,5 @@ print(f"{once:.0%} of all depths are within one standard error, {twice:.0%} with
 # %%
 # The last line printed is ``69% of all depths are within one standard error, 95% within two.``
 #
-# That was the path. From here: :doc:`/howto` by what you have and want, :doc:`/gallery/index` for pictures of much
-# else, :doc:`/explanation` for the derivations.
+# This was the last lesson. Next: :doc:`/howto` for recipes, :doc:`/gallery/index` for further examples,
+# :doc:`/explanation` for the derivations.

@@ -1,5 +1,5 @@
 // Delay and light from histograms, by the largest bin and by the native maximum-likelihood estimator; what that is told of
-// a system is as reconstruct/histogram_record.py has it.
+// a system is as reconstruction/histogram_record.py has it.
 import { GATED, deadTimeOn, sharpness } from "./light.js";
 
 const SYNCHRONOUS = 2, CELLS_PER_SIGMA = 32, REACH = 8.5, CORE = 2.9677379253417944; // 0.15 % lie beyond so many sigma

@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING
 
 from mars_lidar._version import __version__
-from mars_lidar.calibrate import Calibration, calibrate
+from mars_lidar.calibration import Calibration, calibrate
 from mars_lidar.instrument.avalanches import Afterpulsing, Crosstalk
 from mars_lidar.instrument.dark_counts import dark_count_map
 from mars_lidar.instrument.effects import Jitter, SampledJitter
@@ -12,9 +12,9 @@ from mars_lidar.instrument.system import Detector, System
 from mars_lidar.instrument.units import UnitWarning
 from mars_lidar.light.flux import Flux
 from mars_lidar.light.timestamps import Timestamps
-from mars_lidar.reconstruct import Reconstruction, cramer_rao, reconstruct
+from mars_lidar.reconstruction import Reconstruction, cramer_rao, reconstruct
 from mars_lidar.scene.scene import Scene
-from mars_lidar.simulate import simulate, simulate_timestamps
+from mars_lidar.simulation import simulate, simulate_timestamps
 from mars_lidar.statistics import (
     CountLaw,
     JointLaw,

@@ -13,7 +13,7 @@ from mars_lidar._base.types import FloatArray
 from mars_lidar.engines import Engine
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
-from mars_lidar.simulate import simulate
+from mars_lidar.simulation import simulate
 from studies.compare.expected import Expected
 from studies.compare.sample import Estimate, score
 

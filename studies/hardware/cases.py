@@ -22,7 +22,7 @@ from mars_lidar import (
     calibrate,
     simulate_timestamps,
 )
-from mars_lidar.calibrate.curves import Realizations
+from mars_lidar.calibration.curves import Realizations
 from studies import Tell
 
 PERIOD_NS, DEAD_NS, SIGMA_NS, DELAY_NS, BINS = 1e3 / 7.5, 85.0, 0.5, 40.0, 1024

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from mars_lidar.calibrate.curves import Realizations
+from mars_lidar.calibration.curves import Realizations
 from mars_lidar.plot.style import COLOURS, MUTED
 from studies.common.draw import panels
 from studies.hardware.cases import Case

@@ -14,9 +14,9 @@ from matplotlib.figure import Figure
 from mars_lidar import Detector, Flux, GaussianPulse, SampledPulse, Scene, System, reconstruct, simulate
 from mars_lidar._base.types import FloatArray
 from mars_lidar.plot.figures import _draw_map, _limits
-from mars_lidar.reconstruct import Reconstruction
-from mars_lidar.reconstruct.histogram_record import relative_width
-from mars_lidar.reconstruct.image_network import networks
+from mars_lidar.reconstruction import Reconstruction
+from mars_lidar.reconstruction.histogram_record import relative_width
+from mars_lidar.reconstruction.image_network import networks
 from studies import Facts, Request
 from studies.common.draw import panels
 from studies.common.report import Row

@@ -18,8 +18,8 @@ import numpy as np
 
 from mars_lidar import __version__
 from mars_lidar._base.optional import needed
-from mars_lidar.reconstruct import image_stages as stages
-from mars_lidar.reconstruct.image_network import (
+from mars_lidar.reconstruction import image_stages as stages
+from mars_lidar.reconstruction.image_network import (
     CARD,
     CHANNELS,
     HIDDEN,
@@ -30,8 +30,8 @@ from mars_lidar.reconstruct.image_network import (
     Floats,
     Networks,
 )
-from mars_lidar.reconstruct.image_pulse import CELLS_PER_SIGMA, Cells, cells_of
-from mars_lidar.reconstruct.photons import Photons
+from mars_lidar.reconstruction.image_pulse import CELLS_PER_SIGMA, Cells, cells_of
+from mars_lidar.reconstruction.photons import Photons
 from studies import Tell
 from studies.image import scenes
 
@@ -313,7 +313,7 @@ def _card(plan: Plan, facts: dict[str, float], seconds: float, torch: str) -> di
             "side": [17, 1000000],
         },
         "limits": "one surface a pixel; Gaussian pulses (others run, coverage as the study of the method states)",
-        "command": "python -m studies image --train --out src/mars_lidar/reconstruct",
+        "command": "python -m studies image --train --out src/mars_lidar/reconstruction",
         "seed": plan.seed,
         "steps": [plan.choose_steps, plan.weigh_steps],
         "processor_seconds": round(seconds),

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from mars_lidar.plot.figures import _draw_map, _limits
 from mars_lidar.plot.style import COLOURS, INK
-from mars_lidar.reconstruct import METHODS
+from mars_lidar.reconstruction import METHODS
 from studies.common.draw import legend_below, panels
 from studies.common.report import Row
 from studies.reconstruction.run import Picture

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from mars_lidar import Detector, Flux, Reconstruction, Scene, System, cramer_rao, reconstruct, simulate
-from mars_lidar.reconstruct import METHODS, Flags, window_error, window_weights
+from mars_lidar.reconstruction import METHODS, Flags, window_error, window_weights
 from studies import Facts, Request
 from studies.common.report import Row
 from studies.common.sample import system_of

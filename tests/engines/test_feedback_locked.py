@@ -143,7 +143,7 @@ def test_bright_background_settles_to_its_joint_law(name: str):
     flux = ml.Flux(np.full((1, request.items), signal), background, delay)
     x = ml.simulate(flux, request.system, engine="feedback", seed=4, report=report)[0, 0].astype(float)
     assert report[GIVEN] <= 0.01 * request.items
-    law = ml.joint_law(signal, background, request.system, delay_ns=delay)
+    law = ml.joint_law(ml.Flux(signal, background, delay), request.system)
     size = np.sqrt(law.variance)
     value, mode = np.linalg.eigh(law.covariance() / np.outer(size, size))
     seen = value > 1e-3 * value.max()

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from test_page import golden_of_page
 
 import mars_lidar as ml
-from mars_lidar.reconstruct import reconstruct
+from mars_lidar.reconstruction import reconstruct
 from mars_lidar.statistics import count_law, joint_law, mean_histogram, photons_per_bin
 
 pytestmark = pytest.mark.full

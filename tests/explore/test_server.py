@@ -27,7 +27,7 @@ from mars_lidar import explore, io
 from mars_lidar.cli import app
 from mars_lidar.explore import CubeServer, page_text
 from mars_lidar.explore.settings import settings_of
-from mars_lidar.reconstruct import reconstruct
+from mars_lidar.reconstruction import reconstruct
 
 SHAPE = (9, 14)
 

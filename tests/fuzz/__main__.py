@@ -12,88 +12,96 @@ import tempfile
 import time
 from pathlib import Path
 
-from tests.fuzz.formats import make
+from tests.fuzz.formats import READERS, make
 from tests.fuzz.run import BAD, fuzz
 from tests.fuzz.server import Server
+
+KINDS = ("read", "refused", *BAD)
+HEAD = f"""# Mutated files
+
+Mutations of a good file of each format, each read in a process of its own with limits of memory and time; made by
+`python -m tests.fuzz --examples N --seed S` at the commit that the row names (Python {platform.python_version()}).
+*Read*: as a file may be whose mutation changed nothing that matters, or numbers without a checksum; *refused*: by one
+error that names the file. The other columns are faults: an error without the file's name, one of a library, the end of
+the process, more than 10 s of CPU or 1 GiB, or a refusal that takes more than 3 s or 200 MiB. Most s, most MiB: CPU
+time and memory of the dearest refusal, above the process before it.
+
+| format | {" | ".join(KINDS)} | most s | most MiB | commit, date, N, S |
+|---|{"--:|" * (len(KINDS) + 2)}---|
+"""
 
 
 def head() -> str:
     """The commit of this checkout, in short."""
-    return subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True
-    ).stdout.strip()
+    command = ["git", "rev-parse", "--short", "HEAD"]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
 
-parser = argparse.ArgumentParser(description=__doc__)
-parser.add_argument("--examples", type=int, default=500, help="of each format")
-parser.add_argument("--seed", type=int, default=1)
-parser.add_argument("--only", default="", help="names that contain this")
-parser.add_argument("--keep", type=Path, default=Path("fuzz_bad"), help="folder for the inputs that fared badly")
-parser.add_argument("--commit", default="", help="of the code that is read, for the report; default: of this folder")
-parser.add_argument("--out", type=Path, help="a Markdown file to write the table to")
-given = parser.parse_args()
-kinds = ("read", "refused", *BAD)
-rows: list[tuple[str, collections.Counter[str]]] = []
-cost: list[tuple[float, float]] = []  # most CPU seconds and MiB of a file that was refused
-total: collections.Counter[str] = collections.Counter()
-began = time.monotonic()
-with tempfile.TemporaryDirectory() as folder:
-    good = Path(folder) / "good"
-    good.mkdir()
-    names = [name for name in make(good) if given.only in name]
-    server = Server()
-    print(f"{'':22}" + "".join(f"{kind:>9}" for kind in kinds), flush=True)
-    for name in names:
-        counts: collections.Counter[str] = collections.Counter()
-        seen: collections.Counter[str] = collections.Counter()
-        longest = largest = 0.0
+def write(out: Path, rows: dict[str, list[str]]) -> None:
+    """Put rows into the table of a report; those of other formats stay."""
+    table = dict(rows)
+    for line in out.read_text(encoding="utf-8").splitlines() if out.is_file() else ():
+        cells = [cell.strip() for cell in line.strip("| ").split("|")]
+        if cells[0] in READERS and len(cells) == len(KINDS) + 4:
+            table.setdefault(cells[0], cells[1:])
+    table = {name: table[name] for name in READERS if name in table}
+    sums = [sum(int(row[k]) for row in table.values()) for k in range(len(KINDS))]
+    most = [f"{max(float(row[k]) for row in table.values()):g}" for k in (-3, -2)]
+    table[f"all {sum(sums)}"] = [*map(str, sums), *most, ""]
+    lines = (f"| {name} | {' | '.join(row)} |\n" for name, row in table.items())
+    out.write_text(HEAD + "".join(lines), encoding="utf-8")
 
-        def tell(found: dict, path: Path, name=name, counts=counts, seen=seen) -> None:
-            global longest, largest
-            counts[found["kind"]] += 1
-            if found["kind"] == "refused":
-                longest, largest = max(longest, found["seconds"]), max(largest, found["mib"])
-            if found["kind"] in BAD:
-                label = found["told"][:60]
-                seen[label] += 1
-                if seen[label] <= 2:
-                    kept = given.keep / f"{given.seed}_{sum(counts.values())}_{name.replace('/', '_')}"
-                    given.keep.mkdir(parents=True, exist_ok=True)
-                    (shutil.copytree if path.is_dir() else shutil.copy)(path, kept)
-                    print(f"  {found['kind']}: {kept}: {found['told'][:300]}", flush=True)
 
-        fuzz(name, good, Path(folder), server, given.examples, given.seed, tell)
-        print(f"{name:22}" + "".join(f"{counts[kind]:9}" for kind in kinds), flush=True)
-        total += counts
-        rows.append((name, counts))
-        cost.append((longest, largest))
-    print(f"{'all ' + str(sum(total.values())):22}" + "".join(f"{total[kind]:9}" for kind in kinds))
-    print(f"{time.monotonic() - began:.0f} s")
-    server.close()
-if given.out:
-    words = [
-        "# Mutated files",
-        "",
-        f"Made by `python -m tests.fuzz --examples {given.examples} --seed {given.seed}` on {datetime.date.today()} at "
-        f"{given.commit or head()}, Python {platform.python_version()}: {given.examples} mutations of a good file of "
-        "each format, each read in a "
-        "process of its own with limits of memory and time. *Read*: as a file may be whose mutation changed nothing "
-        "that matters, or numbers without a checksum; *refused*: by one error that names the file. The other columns "
-        "are faults: an error without the file's name, one of a library, the end of the process, more than 10 s of CPU "
-        "or 1 GiB, or a refusal that takes more than 3 s or 200 MiB. Most s, most MiB: CPU time and memory of the "
-        "dearest refusal, above the process before it.",
-        "",
-        "| format | " + " | ".join(kinds) + " | most s | most MiB |",
-        "|---|" + "--:|" * (len(kinds) + 2),
-        *(
-            f"| {name} | " + " | ".join(str(counts[kind]) for kind in kinds) + f" | {most_s:.2f} | {most_mib:.0f} |"
-            for (name, counts), (most_s, most_mib) in zip(
-                [*rows, (f"all {sum(total.values())}", total)],
-                [*cost, (max(one for one, _ in cost), max(one for _, one in cost))],
-                strict=True,
-            )
-        ),
-        "",
-    ]
-    given.out.write_text("\n".join(words), encoding="utf-8")
-raise SystemExit(1 if any(total[kind] for kind in BAD) else 0)
+def main() -> int:
+    """Exit code: 1 for a fault."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--examples", type=int, default=500, help="of each format")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--only", default="", help="names that contain one of these, with commas between them")
+    parser.add_argument("--keep", type=Path, default=Path("fuzz_bad"), help="folder for the inputs that fared badly")
+    parser.add_argument(
+        "--commit", default="", help="of the code that is read, for the report; default: of this folder"
+    )
+    parser.add_argument("--out", type=Path, help="a Markdown file whose table gets these rows, format by format")
+    given = parser.parse_args()
+    code = f"{given.commit or head()}, {datetime.date.today()}, {given.examples}, {given.seed}"
+    total: collections.Counter[str] = collections.Counter()
+    began = time.monotonic()
+    with tempfile.TemporaryDirectory() as folder:
+        good = Path(folder) / "good"
+        good.mkdir()
+        names = [name for name in make(good) if any(part in name for part in given.only.split(","))]
+        server = Server()
+        print(f"{'':22}" + "".join(f"{kind:>9}" for kind in KINDS), flush=True)
+        for name in names:
+            counts: collections.Counter[str] = collections.Counter()
+            refusals: list[tuple[float, float]] = [(0.0, 0.0)]  # CPU seconds and MiB
+            errors: collections.Counter[str] = collections.Counter()
+
+            def add(outcome: dict, path: Path, name=name, counts=counts, refusals=refusals, errors=errors) -> None:
+                kind, error = outcome["kind"], outcome["told"]
+                counts[kind] += 1
+                if kind == "refused":
+                    refusals.append((outcome["seconds"], outcome["mib"]))
+                if kind in BAD:
+                    errors[error[:60]] += 1
+                    if errors[error[:60]] <= 2:
+                        copy = given.keep / f"{given.seed}_{sum(counts.values())}_{name.replace('/', '_')}"
+                        given.keep.mkdir(parents=True, exist_ok=True)
+                        (shutil.copytree if path.is_dir() else shutil.copy)(path, copy)
+                        print(f"  {kind}: {copy}: {error[:300]}", flush=True)
+
+            fuzz(name, good, Path(folder), server, given.examples, given.seed, add)
+            print(f"{name:22}" + "".join(f"{counts[kind]:9}" for kind in KINDS), flush=True)
+            total += counts
+            if given.out:
+                most_s, most_mib = (max(column) for column in zip(*refusals, strict=True))
+                row = [*(str(counts[kind]) for kind in KINDS), f"{most_s:.2f}", f"{most_mib:.0f}", code]
+                write(given.out, {name: row})
+        print(f"{'all ' + str(sum(total.values())):22}" + "".join(f"{total[kind]:9}" for kind in KINDS))
+        print(f"{time.monotonic() - began:.0f} s")
+        server.close()
+    return 1 if any(total[kind] for kind in BAD) else 0
+
+
+raise SystemExit(main())

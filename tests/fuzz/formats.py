@@ -97,12 +97,15 @@ READERS: dict[str, Callable[[Path], Any]] = {
     "system.json": ml.System.load,
     "recipe.yaml": DatasetRecipe.load,
     "scene.yaml": lambda path: read_view(path, SYSTEM),
-    **dict.fromkeys(["counts.csv", "counts.npy", "counts.h5", "counts.mat"], lambda path: foreign_cube(path, SYSTEM)),
+    **dict.fromkeys(
+        ["counts.csv", "counts.npy", "counts.h5", "counts.mat", "pages.tif"], lambda path: foreign_cube(path, SYSTEM)
+    ),
     **dict.fromkeys(
         ["sparse.mat", "packed.mat", "sparse73.mat", "sparse.npz", "cells.mat", "cells73.mat"],
         lambda path: foreign_cube(path, SYSTEM, variable="spad[2]" if path.name.startswith("cells") else None),
     ),
     **dict.fromkeys(["external.h5", "virtual.h5", "linked.h5"], _elsewhere),
+    "four.mat": lambda path: foreign_cube(path, SYSTEM, variable="counts"),
     "window.mat": lambda path: foreign_cube(path, SYSTEM, unit_ns=1.0, window_ns=(200.0, 250.0)),
     "stream.csv": lambda path: ml.Timestamps.load(path, period_ns=100.0, unit_ns=1.0).histogram(),
     "pulse.csv": lambda path: _measured(path, 0.1, "peak"),
@@ -193,11 +196,14 @@ def make(folder: Path) -> list[str]:
     np.save(folder / "counts.npy", counts)
     savemat(folder / "counts.mat", {"counts": counts})
     np.savetxt(folder / "counts.csv", counts[0, 0], fmt="%d")
+    pages = [Image.fromarray(counts[:, :, k].astype(np.uint16)) for k in range(32)]
+    pages[0].save(folder / "pages.tif", save_all=True, append_images=pages[1:])
     with h5py.File(folder / "counts.h5", "w") as file:
         file["counts"] = counts
     matrix = sparse.csc_matrix(counts.transpose(1, 0, 2).reshape(12, 32).astype(float))
     savemat(folder / "sparse.mat", {"spad": matrix})
     savemat(folder / "packed.mat", {"spad": matrix}, do_compression=True)
+    savemat(folder / "four.mat", {"counts": counts[0], "depth": counts[0] + 1.0}, format="4")
     sparse.save_npz(folder / "sparse.npz", matrix)
     both = np.empty((1, 2), object)
     both[0, 0], both[0, 1] = counts.astype(float), matrix

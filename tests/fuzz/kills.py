@@ -49,6 +49,7 @@ WRITERS = {
     "generate": "set.zarr",
     "overwrite": "old.zarr",
     "cube.zarr": "cube.zarr",
+    "replaced.zarr": "replaced.zarr",
     "cube.h5": "cube.h5",
     "cube.npz": "cube.npz",
     "cube.mat": "cube.mat",
@@ -94,9 +95,9 @@ def is_good(what: str, path: Path) -> bool:
         with io.load(path) as cube:
             return bool(np.asarray(cube.histogram).any()) and cube.complete
     except (io.IncompleteFileError, FileNotFoundError):
-        return path.suffix == ".zarr"
+        return what == "cube.zarr"
     except ValueError:
-        return path.suffix == ".zarr" and not (path / "zarr.json").exists()
+        return what == "cube.zarr" and not (path / "zarr.json").exists()
 
 
 def kills(number: int, seed: int, folder: Path) -> collections.Counter[str]:
@@ -106,10 +107,11 @@ def kills(number: int, seed: int, folder: Path) -> collections.Counter[str]:
     run("overwrite", source, source, None)
     lasts = {what: run(what, folder / f"timed_{name}", source, None) for what, name in WRITERS.items()}
     shutil.copytree(source, folder / "old.zarr")
+    run("replaced.zarr", folder / "replaced.zarr", source, None)
     for k in range(number):
         what, name = list(WRITERS.items())[k % len(WRITERS)]
         path = folder / name
-        if what != "overwrite" and path.exists():
+        if what not in ("overwrite", "replaced.zarr") and path.exists():
             shutil.rmtree(path) if path.is_dir() else path.unlink()
         after = float(random.random()) * lasts[what]
         run(what, path, source, after)

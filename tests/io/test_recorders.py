@@ -146,20 +146,24 @@ def test_absolute_times(tmp_path, suffix, unit_ns):
     assert np.array_equal(np.sort(bare.clock), np.sort(clock))
 
 
-def test_t3r_has_histograms_but_no_periods(tmp_path):
-    """TimeHarp 200: its clock of 100 ns is not the laser's; phconvert takes the channel from other bits."""
-    pytest.importorskip("phconvert", reason="phconvert (extra io) is not installed")
+@pytest.mark.parametrize("version", [b"5.0", b"6.0"])
+def test_t3r_has_histograms_but_no_periods(tmp_path, version):
+    """TimeHarp 200: its clock of 100 ns is not the laser's."""
     cycle, fine, channel = parts(0.04)
     clock = (cycle * PERIOD_NS / 100.0).astype(np.int64)
     words = (1 << 30) | (channel << 28) | (fine << 16) | (clock % 65536)
     records = with_wraps(clock, words, 65536, 0x800 << 16)
     records = np.insert(records, 5, 1 << 16)  # a marker, no overflow
-    header = struct.pack("<16s6s6s18s2s256s", b"TimeHarp 200", b"5.0", b"1.0", b"01/01/26", b"\r\n", b"")
+    if version == b"5.0":
+        header = struct.pack("<16s6s6s18s2s256s", b"TimeHarp 200", version, b"1.0", b"01/01/26", b"\r\n", b"")
+        names = b""
+    else:
+        header, names = text(b"TimeHarp 200", version), struct.pack("<16s8s", b"TimeHarp 200", b"2.0")
     header += struct.pack("<19i", 4096, 1, 32, 4, 1, *([0] * 14)) + bytes(64 + 36 + 36)
-    header += struct.pack("<5if", 1, 0, 0, 0, 0, 0.04)
-    header += struct.pack("<13i", 100, 0, 0, 0, 0, 0, 0, 20_000_000, 0, 0, 0, records.size, 0)
+    header += names + struct.pack("<5if", 1, 0, 0, 0, 0, 0.04)
+    tags = [100, 0, 0, 0, 0, 0, 0, 20_000_000, 0, 0, 0, records.size, 3]
     path = tmp_path / "a.t3r"
-    path.write_bytes(header + records.astype("<u4").tobytes())
+    path.write_bytes(header + struct.pack("<13i", *tags) + bytes(12) + records.astype("<u4").tobytes())
     found = files.recorded(path)
     assert (found.clock_ns, found.period_ns) == (pytest.approx(100.0), None)
     assert np.array_equal(found.clock, clock)
@@ -172,6 +176,18 @@ def test_t3r_has_histograms_but_no_periods(tmp_path):
         ml.Timestamps.load(path)
     with pytest.raises(ValueError, match="must count laser periods of 50 ns"):
         ml.Timestamps.load(path, period_ns=50.0)
+    content = path.read_bytes()
+    for damaged, reason in (
+        (content[:-400], "cut short"),
+        (content[:300], "cut short"),
+        (content.replace(version, b"7.0", 1), "no .t3r of format 5.0 or 6.0"),
+        (header + struct.pack("<13i", *(-1, *tags[1:])) + content[-4 * records.size :], "its clocks are -1 ns"),
+        (header + struct.pack("<13i", *tags[:12], -2) + content[-4 * records.size :], "image header -2"),
+        (header + struct.pack("<13i", *tags[:11], -5, 3) + content[-4 * records.size :], "tells of -5 records"),
+    ):
+        path.write_bytes(damaged)
+        with pytest.raises(ValueError, match=f"a\\.t3r.*{reason}"):
+            files.recorded(path)
 
 
 def becker(path: Path, clock_is_sync: int, marker: bool = False) -> Path:

@@ -53,7 +53,7 @@ def test_learned_prior(deepinv):
 def test_the_data_term_of_the_learned_prior_is_the_likelihood(deepinv):
     """The gradient that deepinv follows beside that of the native likelihood, to 2 % of its standard deviation."""
     from mars_lidar.learn import LidarPhysics
-    from mars_lidar.reconstruct import log_likelihood
+    from mars_lidar.reconstruction import log_likelihood
 
     example = runpy.run_path(str(PATH.with_name("learned_prior.py")))
     system, physics = example["SYSTEM"], LidarPhysics(example["SYSTEM"])

@@ -14,7 +14,7 @@ from mars_lidar.learn import (
     forward,
     histogram_log_likelihood,
 )
-from mars_lidar.reconstruct.maximum_likelihood import log_likelihood
+from mars_lidar.reconstruction.maximum_likelihood import log_likelihood
 
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated")  # torch's own forward mode calls it
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
-from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,7 @@ import pytest
 from scipy import stats
 
 import mars_lidar as ml
-from mars_lidar import statistics
+from mars_lidar import reconstruction, statistics
 from tests.harness.ledger import require
 
 SYSTEM = ml.System(
@@ -63,7 +62,7 @@ def test_laws_of_one_pixel_ask_for_one(name: str) -> None:
 def test_every_prediction_takes_flux_and_system_first() -> None:
     """By their signatures; laws of given numbers (`matched_pmf`, cumulants) and of given rates have no light."""
     found = {}
-    for home in (statistics, import_module("mars_lidar.reconstruct")):
+    for home in (statistics, reconstruction):
         for name in home.__all__:
             thing = getattr(home, name)
             if inspect.isfunction(thing):

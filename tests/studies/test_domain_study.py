@@ -11,7 +11,7 @@ from scipy import stats
 
 import mars_lidar as ml
 from mars_lidar.instrument.effects import EFFECTS
-from mars_lidar.reconstruct.histogram_bound import _variances
+from mars_lidar.reconstruction.histogram_bound import _variances
 from mars_lidar.statistics import ConvergenceError
 from mars_lidar.statistics.distance import neighbours
 from studies.__main__ import main

@@ -7,8 +7,8 @@ import json
 import numpy as np
 import pytest
 
-from mars_lidar.reconstruct import image_stages as stages
-from mars_lidar.reconstruct.image_network import CARD, WEIGHTS, Networks, weigh
+from mars_lidar.reconstruction import image_stages as stages
+from mars_lidar.reconstruction.image_network import CARD, WEIGHTS, Networks, weigh
 from studies.__main__ import main
 from studies.common.report import MAX_FIGURE_BYTES
 

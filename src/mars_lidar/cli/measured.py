@@ -9,8 +9,8 @@ import typer
 
 from mars_lidar._base import checks
 from mars_lidar._base.files import read_npy
-from mars_lidar.calibrate import Calibration, CubeCalibration, calibrate_cube
-from mars_lidar.calibrate import calibrate as calibrated
+from mars_lidar.calibration import Calibration, CubeCalibration, calibrate_cube
+from mars_lidar.calibration import calibrate as calibrated
 from mars_lidar.cli.console import MISFIT, check_picture, refuse_existing, reported, save_picture, table
 from mars_lidar.cli.groups import argument, examples
 from mars_lidar.cli.options import of_output

@@ -26,13 +26,13 @@ from mars_lidar.cli.console import (
 from mars_lidar.cli.foreign import ForeignOptions
 from mars_lidar.cli.groups import argument, examples, option
 from mars_lidar.cli.options import out as out_option
-from mars_lidar.reconstruct import METHODS, Flags, MaximumLikelihood, Method, Reconstruction
-from mars_lidar.reconstruct.keep import KEEP, common_delay, has_later_light, keep_return
-from mars_lidar.reconstruct.reconstruction import ATTENUATIONS
+from mars_lidar.reconstruction import METHODS, Flags, MaximumLikelihood, Method, Reconstruction
+from mars_lidar.reconstruction.keep import KEEP, common_delay, has_later_light, keep_return
+from mars_lidar.reconstruction.reconstruction import ATTENUATIONS
 
 if TYPE_CHECKING:
     from mars_lidar.io import Cube
-    from mars_lidar.reconstruct.stored import Timed
+    from mars_lidar.reconstruction.stored import Timed
 
 RECONSTRUCT_EPILOG = examples(
     "mars-lidar reconstruct room.zarr -o maps.zarr",
@@ -93,7 +93,7 @@ def reconstruct(
     with reported():
         began = time.perf_counter()
         from mars_lidar.io.maps import check_maps_output, save_maps
-        from mars_lidar.reconstruct.stored import reconstruct_stored
+        from mars_lidar.reconstruction.stored import reconstruct_stored
 
         png = out.with_suffix(".png")
         check_maps_output(out, overwrite=overwrite)
@@ -201,7 +201,7 @@ def _methods(text: str, cube: Cube) -> list[str]:
 
 def _show(cube: Cube, found: dict[str, Timed]) -> None:
     """One line a method on standard output."""
-    from mars_lidar.reconstruct.quality import errors_against, ssim_available
+    from mars_lidar.reconstruction.quality import errors_against, ssim_available
 
     realizations, height, width, _ = cube.shape
     head = ["method", "seconds", "seen %", "saturated %", "misfit %"]

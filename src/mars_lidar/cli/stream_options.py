@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from mars_lidar._base.types import FloatArray
-from mars_lidar.calibrate.calibration import GIVEN
+from mars_lidar.calibration.calibration import GIVEN
 from mars_lidar.cli.console import two_integers
 from mars_lidar.cli.groups import group, panel
 from mars_lidar.cli.options import of_system

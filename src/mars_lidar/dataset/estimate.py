@@ -25,7 +25,7 @@ from mars_lidar.dataset.shard import packer
 from mars_lidar.dataset.sources import Candidate, candidates, scenes
 from mars_lidar.io.advice import Advice, advice
 from mars_lidar.io.scan import Problem
-from mars_lidar.simulate import simulate
+from mars_lidar.simulation import simulate
 
 _SCENES, _PROBES = 4, 8
 _BASE_BYTES = 220 * 2**20  # of the interpreter with NumPy, SciPy and Zarr

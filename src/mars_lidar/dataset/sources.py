@@ -26,7 +26,7 @@ from mars_lidar.light.flux import Flux
 from mars_lidar.light.fog import Fog
 from mars_lidar.scene.layers import LayeredScene
 from mars_lidar.scene.scene import Scene
-from mars_lidar.simulate import _check_registrations
+from mars_lidar.simulation import _check_registrations
 
 _TRIES = 20  # places tried for a crop with a return in it
 _LIGHT = ("bin_ns", "start_ns", "name", "channel")  # keys that tell how a file of rendered light is read

@@ -26,7 +26,7 @@ from mars_lidar.instrument.detector import Detector
 from mars_lidar.instrument.pulse import GaussianPulse
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
-from mars_lidar.simulate import simulate
+from mars_lidar.simulation import simulate
 
 _NOTE_S = 10.0  # between two writes of the digests in an object store: what a killed worker loses is read again
 _KEPT = 4  # scenes and fluxes that a maker remembers: neighbours in the order of parts share them

@@ -20,7 +20,7 @@ import numpy as np
 
 from mars_lidar.explore.settings import light_of, settings_of, truth_of
 from mars_lidar.io import Cube
-from mars_lidar.reconstruct import reconstruct
+from mars_lidar.reconstruction import reconstruct
 
 _PLACE = '<script type="application/json" id="cube">null</script>'
 _MOST_PIXELS = 2**16  # of one answer, or one row

@@ -11,7 +11,7 @@ from mars_lidar.instrument.effects import LIGHT_EFFECTS
 from mars_lidar.instrument.pulse import GaussianPulse
 from mars_lidar.instrument.system import System
 from mars_lidar.io import Cube
-from mars_lidar.reconstruct import reconstruct
+from mars_lidar.reconstruction import reconstruct
 
 _TOLD = (*LIGHT_EFFECTS, "afterpulsing", "twilight_ns", "electronics_dead_time_ns", "jitter")
 

@@ -12,7 +12,7 @@ from mars_lidar.engines.feedback_rule import expected_registrations
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.light.stored_flux import StoredFlux
-from mars_lidar.simulate import simulate
+from mars_lidar.simulation import simulate
 
 _SHORT_S = 1e-7  # an event, by the slowest engine: where all events of a run take less than a second, nothing is drawn
 _PROBE_S = 0.1  # drawn at least, or the whole image; in two steps, unless the first takes longer than

@@ -15,7 +15,7 @@ from mars_lidar.io.cube import SUFFIXES, Cube, load, one_exposure, save
 from mars_lidar.io.streams import photon_hdf5, ptu_stream
 from mars_lidar.io.streams.files import STREAM_SUFFIXES, is_stream
 from mars_lidar.light.timestamps import Timestamps
-from mars_lidar.simulate import simulate_timestamps
+from mars_lidar.simulation import simulate_timestamps
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from mars_lidar.io import zarr_store
 from mars_lidar.io.cube import Cube, check_output, load, open_writer
 from mars_lidar.io.recipe import Recipe
 from mars_lidar.light.flux import Flux
-from mars_lidar.simulate import simulate
+from mars_lidar.simulation import simulate
 from mars_lidar.table import Table, cache
 
 

@@ -25,8 +25,8 @@ from mars_lidar.instrument.system import System
 from mars_lidar.learn.forward import check_detector, expected_histogram
 from mars_lidar.learn.tabulated import HistogramTable
 from mars_lidar.light.flux import Flux
-from mars_lidar.reconstruct.reconstruction import reconstruct
-from mars_lidar.simulate import simulate
+from mars_lidar.reconstruction.reconstruction import reconstruct
+from mars_lidar.simulation import simulate
 from mars_lidar.table import Table
 
 

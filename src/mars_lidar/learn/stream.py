@@ -34,7 +34,7 @@ from mars_lidar.learn.ranges import LogUniform, Range, SystemRange, as_range, as
 from mars_lidar.learn.scenes import Recipe, Sample, as_source, example_of
 from mars_lidar.scene.radiometry import AMBIENTS, ATTENUATIONS
 from mars_lidar.scene.scene import Scene
-from mars_lidar.simulate import simulate
+from mars_lidar.simulation import simulate
 
 # --- Ranks and workers ---------------------------------------------------------------------------------------------
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from mars_lidar.io import Cube
-    from mars_lidar.reconstruct import Reconstruction, Returns
+    from mars_lidar.reconstruction import Reconstruction, Returns
 
 _MAP_INCHES = 2.35
 

@@ -12,8 +12,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from mars_lidar.calibrate import Calibration
-    from mars_lidar.calibrate.curves import Curves
+    from mars_lidar.calibration import Calibration
+    from mars_lidar.calibration.curves import Curves
 
 
 def calibration_figure(result: Calibration, title: str = "") -> Figure:

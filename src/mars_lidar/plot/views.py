@@ -15,8 +15,8 @@ from mars_lidar.io.cube import Cube
 from mars_lidar.io.layout import MEASURED
 from mars_lidar.io.recipe import Recipe
 from mars_lidar.light.flux import Flux
-from mars_lidar.reconstruct import METHODS, reconstruct
-from mars_lidar.reconstruct.quality import depth_lag_m
+from mars_lidar.reconstruction import METHODS, reconstruct
+from mars_lidar.reconstruction.quality import depth_lag_m
 from mars_lidar.statistics import ConvergenceError, mean_histogram, photons_per_bin
 from mars_lidar.statistics.histogram import histogram_effects
 

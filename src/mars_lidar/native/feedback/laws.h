@@ -138,7 +138,9 @@ MARS_NOINLINE void place_rearmed(const FeedbackGrid& grid, const float* sums, co
             const float u = (static_cast<float>(shares[i]) + 0.5f) * 0x1p-16f, m = number[i] * left[i];
             const float spread = m > 1.0f ? (m - 1.0f) / (m * m) : 0.0f, variance = g * rest * spread;
             const float wide = root(3.0f * variance), even = g + wide * (2.0f * u - 1.0f);
-            const float often = g / (g + rest * spread), odd = u < often ? g + rest * spread : 0.0f;
+            // the rarer side: all of it in so many exposures, or nothing
+            const float step = nearer + (1.0f - nearer) * spread, some = u * step < nearer ? step : 0.0f;
+            const float odd = g < rest ? some : 1.0f - some;
             const float share = left[i] * (wide <= nearer ? even : odd);
             const float x = share * 0x1p16f + 0.5f;
             left[i] = share;

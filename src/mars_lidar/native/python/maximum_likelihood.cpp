@@ -1,6 +1,11 @@
 // Bindings of the maximum-likelihood estimator and of its likelihood; reconstruct/maximizer.h
 // and several_returns.h have the loops over a pixel.
+#include <memory>
+
+#include "reconstruct/fit_quality.h"
 #include "reconstruct/several_returns.h"
+
+#include <nanobind/stl/vector.h>
 
 #include "python/bindings.h"
 #include "python/count_rows.h"
@@ -11,17 +16,30 @@ namespace {
 
 constexpr int64_t kChunk = 64;  // pixels
 
+// `tests`: how the histograms would have been recorded with a longer and a shorter dead time and a wider pulse, for the
+// quality of each fit; or none.
 void maximum_likelihood(const HistogramRecord& recording, Histograms histogram, int starts, double least_gain,
-                        bool less_bias, Matrix<double> out, Vector<uint8_t> flags, int threads, nb::object progress) {
+                        bool less_bias, Matrix<double> out, Vector<uint8_t> flags,
+                        const std::vector<const HistogramRecord*>& tests, Matrix<double> quality, int threads,
+                        nb::object progress) {
     const int64_t pixels = static_cast<int64_t>(histogram.shape(0));
     expect("histogram must be (pixels, bins)", {pixels, recording.bins}, histogram);
     expect("out must be (pixels, 8)", {pixels, kMaximumColumns}, out);
     expect("flags must be (pixels)", {pixels}, flags);
+    expect("quality must be (pixels, 5), or (0, 5) without tests", {tests.empty() ? 0 : pixels, kQualityColumns},
+           quality);
+    if (!tests.empty() && tests.size() != 3) throw nb::value_error("tests must be three recordings, or none");
+    for (const HistogramRecord* test : tests)
+        if (test == nullptr || test->bins != recording.bins) throw nb::value_error("tests must have the same bins");
     const ReconstructionJob job{starts, least_gain, less_bias};
     const CountRows counts = rows_of(histogram);
     run_watched_items(pixels, kChunk, threads, progress, [&] {
-        return [&, maximizer = Maximizer(recording, job)](int64_t p) mutable {
-            maximizer(counts, p, out.data() + p * kMaximumColumns, flags.data() + p);
+        std::shared_ptr<FitQuality> test;
+        if (!tests.empty()) test = std::make_shared<FitQuality>(QualityJob{recording, *tests[0], *tests[1], *tests[2]});
+        return [&, test, maximizer = Maximizer(recording, job)](int64_t p) mutable {
+            double* const row = out.data() + p * kMaximumColumns;
+            maximizer(counts, p, row, flags.data() + p);
+            if (test) (*test)(maximizer.passes(), row[0], row[1], row[2], quality.data() + p * kQualityColumns);
         };
     });
 }
@@ -44,6 +62,24 @@ void several_returns(const HistogramRecord& recording, Histograms histogram, int
                     returns.data() + p * most * kReturnColumns);
         };
     });
+}
+
+// Of light (pixels, 3) of S, B and delay in periods, NaN without a return.
+void expected_registrations(const HistogramRecord& recording, Histograms histogram, Matrix<const double> light,
+                            Matrix<double> out) {
+    const int64_t pixels = static_cast<int64_t>(histogram.shape(0));
+    expect("histogram must be (pixels, bins)", {pixels, recording.bins}, histogram);
+    expect("light must be (pixels, 3)", {pixels, 3}, light);
+    expect("out must be (pixels, bins)", {pixels, recording.bins}, out);
+    const CountRows counts = rows_of(histogram);
+    ArmedPasses passes(recording.bins);
+    FitQuality quality({recording, recording, recording, recording});
+    for (int64_t p = 0; p < pixels; ++p) {
+        const double* at = light.data() + 3 * p;
+        passes.set(recording, counts, p);
+        quality.expect(passes, at[0], at[1], at[2]);
+        std::copy(quality.expected().begin(), quality.expected().end(), out.data() + p * recording.bins);
+    }
 }
 
 void log_likelihood(const HistogramRecord& recording, Vector<const double> histogram, Matrix<const double> at,
@@ -73,12 +109,15 @@ void log_likelihood(const HistogramRecord& recording, Vector<const double> histo
 
 void bind_maximum_likelihood(nb::module_& module) {
     module.def("maximum_likelihood", &maximum_likelihood, "recording"_a, "histogram"_a.noconvert(), nb::kw_only(),
-               "starts"_a, "least_gain"_a, "less_bias"_a, "out"_a.noconvert(), "flags"_a.noconvert(), "threads"_a,
-               "progress"_a.none(), "ML of (S, B, delay) of each pixel: out (pixels, 8), flags (pixels).");
+               "starts"_a, "least_gain"_a, "less_bias"_a, "out"_a.noconvert(), "flags"_a.noconvert(), "tests"_a,
+               "quality"_a.noconvert(), "threads"_a, "progress"_a.none(),
+               "ML of (S, B, delay) of each pixel: out (pixels, 8), flags (pixels), quality of the fit (pixels, 5).");
     module.def("several_returns", &several_returns, "recording"_a, "histogram"_a.noconvert(), nb::kw_only(), "most"_a,
                "starts"_a, "false_alarm"_a, "out"_a.noconvert(), "flags"_a.noconvert(), "returns"_a.noconvert(),
                "threads"_a, "progress"_a.none(),
                "Further returns of each pixel: returns (pixels, most x (delay, S, errors, chance)).");
+    module.def("expected_registrations", &expected_registrations, "recording"_a, "histogram"_a.noconvert(), "light"_a,
+               "out"_a.noconvert(), "Of each bin, given the registrations before: out (pixels, bins).");
     module.def("histogram_log_likelihood", &log_likelihood, "recording"_a, "histogram"_a, "at"_a, "out"_a.noconvert(),
                "whole"_a = true,
                "Value, gradient and information at points (S, B, delay); `whole`: bin by bin round the period.");

@@ -1,4 +1,5 @@
-// The laser periods in which a pixel was armed in each bin, from its own histogram: docs/reconstruction.md, section 1.
+// The laser periods in which a pixel was armed in each bin, from its own histogram:
+// docs/theory_reconstruction.md, section 1.
 #pragma once
 #include <algorithm>
 #include <cmath>
@@ -31,6 +32,19 @@ struct ArmedPasses {
         before[0] = 0.0;
         for (int64_t j = 0; j < n; ++j) before[j + 1] = before[j] + count[j];
         total = before[n];
+        arm(r);
+    }
+
+    // Of the same histogram, recorded otherwise.
+    void set(const HistogramRecord& r, const ArmedPasses& other) {
+        count = other.count;
+        before = other.before;
+        total = other.total;
+        arm(r);
+    }
+
+ private:
+    void arm(const HistogramRecord& r) {
         if (r.synchronous)
             set_synchronous(r);
         else if (r.below_bin())
@@ -39,7 +53,6 @@ struct ArmedPasses {
             set_free(r);
     }
 
- private:
     // Share of the registrations whose effect `p` period edges later still lies within the exposure (R3). From a
     // stationary start those before the exposure make up for the rest.
     static double within(const HistogramRecord& r, int64_t p) {
@@ -64,22 +77,30 @@ struct ArmedPasses {
             whole[k] = within_sum(r, r.whole + k - 1);
         }
         for (int64_t k = 0; k < 3; ++k) edge[k] = within(r, r.whole + k);
-        for (int64_t j = 0; j < n; ++j) {
-            const int wraps = j < r.shift ? 1 : 0;  // the registration one dead time ago lies in an earlier period
-            const int64_t q = j - r.shift + (wraps ? n : 0);
-            const bool further = q == 0;
-            const int64_t q2 = further ? n - 1 : q - 1;
+        // Bins from `low` to `high`, for which the registration one dead time ago lies `ago` bins before, `wraps` periods
+        // earlier in phase; `further`: and the bin before that in the period before.
+        auto arm_bins = [&](int64_t low, int64_t high, int64_t ago, int wraps, bool further) {
+            const int64_t earlier = ago + 1 - (further ? n : 0);
+            const bool inside = turns[wraps] == 0.0;
             const double weight = edge[wraps], weight2 = edge[wraps + (further ? 1 : 0)];
-            double blind;  // (R1): registrations of the preceding whole bins of the dead time
-            if (turns[wraps] == 0.0)
-                blind = before[j] - before[q];
-            else
-                blind = before[j] + whole[wraps] * total + weight * (total - before[q]);
-            blind += f * weight2 * count[q2];
-            rearmed[j] = early * weight * count[q] + late * weight2 * count[q2];
-            raw[j] = periods - blind;
-            armed[j] = std::max({raw[j], count[j] - rearmed[j], 0.0});
-        }
+            const double w = inside ? 1.0 : weight, all = inside ? 0.0 : (whole[wraps] + weight) * total;
+            const double early_weight = early * weight, late_weight = late * weight2, f_weight = f * weight2;
+            const double *h = count.data(), *upto = before.data();
+            double* __restrict const again = rearmed.data(), * __restrict const left = raw.data();
+            double* __restrict const to = armed.data();
+            for (int64_t j = low; j < high; ++j) {
+                // (R1): registrations of the preceding whole bins of the dead time
+                const double last = h[j - earlier], blind = upto[j] + all - w * upto[j - ago] + f_weight * last;
+                const double inside_bin = early_weight * h[j - ago] + late_weight * last, passed = periods - blind;
+                again[j] = inside_bin;
+                left[j] = passed;
+                const double least = h[j] - inside_bin, most = passed > least ? passed : least;
+                to[j] = most > 0.0 ? most : 0.0;  // std::max branches
+            }
+        };
+        arm_bins(0, r.shift, r.shift - n, 1, false);
+        arm_bins(r.shift, r.shift + 1, r.shift, 0, true);
+        arm_bins(r.shift + 1, n, r.shift, 0, false);
     }
 
     void set_below_bin(const HistogramRecord& r) {

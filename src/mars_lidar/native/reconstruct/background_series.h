@@ -1,5 +1,5 @@
 // The likelihood of the bins that hold background only, as a power series in its photons per bin: one pass over the
-// histogram, after which any stretch of the period costs O(1). docs/reconstruction.md, section 3, (R10).
+// histogram, after which any stretch of the period costs O(1). docs/theory_reconstruction.md, section 3, (R10).
 #pragma once
 #include <array>
 #include <vector>

@@ -6,7 +6,6 @@
 #include <vector>
 
 #include "lanes/kernels.h"
-#include "reconstruct/correlation_kernel.h"
 #include "reconstruct/pixel_likelihood.h"
 #include "reconstruct/pulse_template.h"
 
@@ -27,10 +26,8 @@ class DelaySearch {
         step_ = pulse.step;
         for (const double s : pulse.energy) energy_.push_back(static_cast<float>(s));
         points_ = r_.bins / step_;
-        const int64_t whole = (points_ + kCorrelatedTogether - 1) / kCorrelatedTogether * kCorrelatedTogether;
-        length_ = whole + static_cast<int64_t>(energy_.size()) / step_ + 1;
-        count_rows_.resize(step_ * length_);
-        time_rows_.resize(step_ * length_);
+        const int64_t whole = correlated_points(points_);
+        length_ = correlated_length(points_, static_cast<int64_t>(energy_.size()), step_);
         gain_.resize(energy_.size());
         score_.resize(whole);
         score2_.resize(whole);
@@ -43,10 +40,9 @@ class DelaySearch {
         const double flat = likelihood.count() / likelihood.time();
         extend(passes);
         // Score of a weak pulse over a flat rate, over its standard deviation (R11).
-        arrange(count_, count_rows_);
-        arrange(time_, time_rows_);
-        correlate(count_rows_, energy_.data(), score_);
-        correlate(time_rows_, energy_.data(), score2_);
+        const float* const counts = in_rows(count_, shift_, step_, length_, count_rows_);
+        correlate(counts, energy_.data(), score_);
+        correlate(in_rows(time_, shift_, step_, length_, time_rows_), energy_.data(), score2_);
         for (int64_t g = 0; g < points_; ++g) {
             const double expected = flat * score2_[g];
             z_[g] = (score_[g] - expected) / std::sqrt(std::max(expected, 1e-6));
@@ -68,7 +64,7 @@ class DelaySearch {
             std::max((inside - back * time) / std::max(weighted, 1e-9), 1.0 / std::max(weighted, 1e-9));
         // Gain of the likelihood for that S and B at every delay (R12).
         for (int64_t i = 0; i < taps; ++i) gain_[i] = static_cast<float>(std::log1p(signal * energy_[i] / back));
-        correlate(count_rows_, gain_.data(), score_);
+        correlate(counts, gain_.data(), score_);
         for (int64_t g = 0; g < points_; ++g) score_[g] -= static_cast<float>(signal) * score2_[g];
         int found = 0;
         std::array<int64_t, kMost> at{};
@@ -99,30 +95,22 @@ class DelaySearch {
     void extend(const ArmedPasses& passes) {
         const int64_t n = r_.bins, taps = static_cast<int64_t>(energy_.size());
         shift_ = ((first_ % n) + n) % n;
-        count_.resize(2 * n + taps);
-        time_.resize(2 * n + taps);
+        const int64_t end = std::max(2 * n + taps, shift_ + length_);
+        count_.resize(end);
+        time_.resize(end);
         for (int64_t j = 0; j < n; ++j) {
             const double share = r_.share(j);
             count_[j] = share > 0.0 ? static_cast<float>(passes.count[j]) : 0.0f;
             time_[j] = static_cast<float>(share * passes.time(r_, j));
         }
-        for (int64_t j = n; j < 2 * n + taps; ++j) {
-            count_[j] = count_[j - n];
-            time_[j] = time_[j - n];
+        for (int64_t from = n; from < end; from += n) {
+            std::copy_n(count_.begin(), std::min(n, end - from), count_.begin() + from);
+            std::copy_n(time_.begin(), std::min(n, end - from), time_.begin() + from);
         }
     }
 
-    void correlate(const std::vector<float>& rows, const float* weights, std::vector<float>& out) const {
-        correlate_({rows.data(), weights, length_, static_cast<int64_t>(energy_.size()), points_, step_, out.data()});
-    }
-    // Values (2 n + taps) from the template's first bin on, in rows.
-    void arrange(const std::vector<float>& values, std::vector<float>& rows) const {
-        const int64_t end = static_cast<int64_t>(values.size());
-        for (int64_t q = 0; q < step_; ++q)
-            for (int64_t m = 0; m < length_; ++m) {
-                const int64_t at = shift_ + m * step_ + q;
-                rows[q * length_ + m] = at < end ? values[at] : 0.0f;
-            }
+    void correlate(const float* rows, const float* weights, std::vector<float>& out) const {
+        correlate_({rows, weights, length_, static_cast<int64_t>(energy_.size()), points_, step_, out.data()});
     }
 
     const HistogramRecord& r_;

@@ -1,4 +1,4 @@
-// How many passes of the pulse the ends of the exposure leave out: docs/reconstruction.md, section 3, (R9a). A
+// How many passes of the pulse the ends of the exposure leave out: docs/theory_reconstruction.md, section 3, (R9a). A
 // histogram says so on average only; where few passes are left at the pulse, the likelihood weighs what they may have
 // been.
 #pragma once

@@ -1,5 +1,5 @@
 // How a histogram was recorded, as the estimators see it: dead time, exposure, gate and pulse. Times in laser periods.
-// Equation numbers (R1) ... are those of docs/reconstruction.md.
+// Equation numbers (R1) ... are those of docs/theory_reconstruction.md.
 #pragma once
 #include <algorithm>
 #include <cmath>

@@ -1,4 +1,4 @@
-// First-order bias of the maximum of a pixel's likelihood: docs/reconstruction.md, section 3, (R19) and (R20). What is
+// First-order bias of the maximum of a pixel's likelihood (docs/theory_reconstruction.md, section 3, R19 and R20). What is
 // left at the pulse of a bright pixel are few passes; the maximum then stands some tenths of a standard error too high.
 #pragma once
 #include <algorithm>

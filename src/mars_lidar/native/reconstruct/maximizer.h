@@ -1,4 +1,5 @@
-// Maximum likelihood of signal, background and delay of one pixel: docs/reconstruction.md, section 3. Climbs by Fisher scoring
+// Maximum likelihood of signal, background and delay of one pixel (docs/theory_reconstruction.md, section 3). Climbs by
+// Fisher scoring
 // from several delays, compares with no signal at all, and takes off the first-order bias where that is asked for.
 #pragma once
 #include <algorithm>
@@ -160,6 +161,9 @@ class Maximizer {
         if (best.at[0] == 0.0) out[2] = NAN;
         errors(best, out + 3);
     }
+
+    // Of the last histogram.
+    const ArmedPasses& passes() const { return passes_; }
 
  private:
     // Takes off the first-order bias of the maximum, at most a standard error of it, and of S never more than S.

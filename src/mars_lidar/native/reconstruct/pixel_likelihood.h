@@ -1,5 +1,5 @@
-// The likelihood of one pixel's histogram as a function of signal, background and delay: docs/reconstruction.md,
-// section 3. O(bins that the pulse reaches) per evaluation: the rest of the period enters by sums.
+// The likelihood of one pixel's histogram as a function of signal, background and delay:
+// docs/theory_reconstruction.md, section 3. O(bins that the pulse reaches) per evaluation: the rest of the period enters by sums.
 #pragma once
 #include <cmath>
 

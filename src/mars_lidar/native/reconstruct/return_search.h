@@ -7,6 +7,7 @@
 #include <utility>
 #include <vector>
 
+#include "lanes/kernels.h"
 #include "reconstruct/pulse_template.h"
 #include "reconstruct/returns_likelihood.h"
 #include "reconstruct/solve.h"
@@ -53,15 +54,15 @@ class ReturnSearch {
             const double scale = a == 0 ? 1.0 / static_cast<double>(r_.bins) : a % 2 == 1 ? 1.0 : point.at[a - 1];
             extend(nuisance_[a], [&](int64_t j) { return scale * (by ? by[j] : r_.share(j)) * likelihood.info()[j]; });
         }
-        score_at_.resize(points_);
-        variance_.resize(points_);
-        beside_.resize(points_);
         along_.resize(points_ * kUnknowns);
         left_.assign(points_ * kUnknowns, 0.0);
-        correlate(energy_, score_, score_at_.data(), 1);
-        correlate(squared_, info_, variance_.data(), 1);
-        correlate(shifted_, info_, beside_.data(), 1);
-        for (int a = 0; a < unknowns; ++a) correlate(energy_, nuisance_[a], along_.data() + a, kUnknowns);
+        correlate(energy_, score_, score_at_);
+        correlate(squared_, info_, variance_);
+        correlate(shifted_, info_, beside_);
+        for (int a = 0; a < unknowns; ++a) {
+            correlate(energy_, nuisance_[a], one_along_);
+            for (int64_t g = 0; g < points_; ++g) along_[g * kUnknowns + a] = one_along_[g];
+        }
         for (int64_t g = 0; g < points_; ++g) {
             double *along = &along_[g * kUnknowns], *left = &left_[g * kUnknowns], known = 0.0;
             for (int a = 0; a < unknowns; ++a) {
@@ -103,25 +104,27 @@ class ReturnSearch {
     template <class Of>
     void extend(std::vector<double>& out, const Of& of) const {
         const int64_t n = r_.bins, taps = static_cast<int64_t>(energy_.size());
-        out.resize(2 * n + taps);
+        const int64_t end = std::max(2 * n + taps, shift() + length_of_rows());
+        out.resize(end);
         for (int64_t j = 0; j < n; ++j) out[j] = of(j) * r_.share(j);
-        for (int64_t j = n; j < 2 * n + taps; ++j) out[j] = out[j - n];
+        for (int64_t from = n; from < end; from += n)
+            std::copy_n(out.begin(), std::min(n, end - from), out.begin() + from);
     }
 
-    // out[stride g] = sum over i of weights[i] values[start(g) + i]: several g side by side, whose sums do not wait for
-    // each other, each added up in the order of i.
-    void correlate(const std::vector<double>& weights, const std::vector<double>& values, double* out,
-                   int64_t stride) const {
-        constexpr int64_t together = 8;
-        const size_t taps = weights.size();
-        for (int64_t g = 0; g < points_; g += together) {
-            double sum[together] = {};
-            const double* from[together];
-            for (int64_t k = 0; k < together; ++k) from[k] = values.data() + start(std::min(g + k, points_ - 1));
-            for (size_t i = 0; i < taps; ++i)
-                for (int64_t k = 0; k < together; ++k) sum[k] += weights[i] * from[k][i];
-            for (int64_t k = 0; k < std::min(together, points_ - g); ++k) out[stride * (g + k)] = sum[k];
-        }
+    // out[g] = sum over i of weights[i] values[start(g) + i].
+    void correlate(const std::vector<double>& weights, const std::vector<double>& values, std::vector<double>& out) {
+        const int64_t taps = static_cast<int64_t>(weights.size());
+        out.resize(correlated_points(points_));
+        const double* const rows = in_rows(values, shift(), step_, length_of_rows(), rows_);
+        correlate_({rows, weights.data(), length_of_rows(), taps, points_, step_, out.data()});
+    }
+    int64_t length_of_rows() const { return correlated_length(points_, static_cast<int64_t>(energy_.size()), step_); }
+
+    // The angle of a cosine. Neighbouring directions differ little: a series there, to 1e-9.
+    static double angle_of(double cosine) {
+        const double u = 1.0 - cosine;
+        if (!(u > 0.0 && u < 0.05)) return std::acos(std::clamp(cosine, -1.0, 1.0));
+        return std::sqrt(2.0 * u) * (1.0 + u * (1.0 / 12 + u * (3.0 / 160 + u * (5.0 / 896 + u * 35.0 / 18432))));
     }
 
     // The sum of the angles between the directions of neighbouring delays that are left.
@@ -137,7 +140,7 @@ class ReturnSearch {
                 for (int64_t i = apart; i < taps; ++i) both += energy_[i] * energy_[i - apart] * info_[from + i];
             }
             for (int a = 0; a < unknowns; ++a) both -= along_[g * kUnknowns + a] * left_[h * kUnknowns + a];
-            return std::acos(std::clamp(both / std::sqrt(variance_[g] * variance_[h]), -1.0, 1.0));
+            return angle_of(both / std::sqrt(variance_[g] * variance_[h]));
         };
         for (int64_t g = 0; g < points_; ++g) {
             if (!(variance_[g] > 0.0)) continue;
@@ -166,11 +169,12 @@ class ReturnSearch {
     }
 
     const HistogramRecord& r_;
+    void (*correlate_)(const FineCorrelation&) = kernel_at<const FineCorrelation&>("", MARS_KERNELS(correlate_finely_));
     int64_t first_ = 0, step_ = 1, points_ = 1;
     double length_ = 0.0;
     std::vector<int64_t> place_;             // (points + 1) bins
     std::vector<double> squared_, shifted_;  // of the energy: its square, and times itself a step before
-    std::vector<double> energy_, score_, info_, score_at_, variance_, beside_, along_, left_;
+    std::vector<double> energy_, score_, info_, score_at_, variance_, beside_, along_, left_, one_along_, rows_;
     std::vector<std::vector<double>> nuisance_;
 };
 

@@ -53,27 +53,46 @@ class ReturnsLikelihood {
         }
     }
 
-    // Value, gradient and information at `point.at`. `whole`: every bin singly, and `score` and `info` of all of them.
-    void operator()(ReturnsPoint& point, bool whole = false) {
+    // Value, gradient and information at `point.at`.
+    void operator()(ReturnsPoint& point) { evaluate<true>(point, false); }
+
+    // Gradient and information, every bin singly, and `score` and `info` of all of them; the value stays.
+    void scores(ReturnsPoint& point) { evaluate<false>(point, true); }
+
+    // Of the last evaluation: derivatives of the logarithm of the likelihood by the photons of each bin (bins), the
+    // information on them, and energy and slope (bins) of a return's pulse.
+    const std::vector<double>& score() const { return score_; }
+    const std::vector<double>& info() const { return info_; }
+    const double* energy(int k) const { return energy_.data() + k * r_.bins; }
+    const double* slope(int k) const { return slope_.data() + k * r_.bins; }
+
+    double time() const { return time_; }  // armed time of the open bins, bins x periods
+
+ private:
+    template <bool valued>
+    void evaluate(ReturnsPoint& point, bool whole) {
         const int64_t n = r_.bins;
         const double* x = point.at;
         const double flat = x[0] / static_cast<double>(n);
         whole = whole || flat > kDim;
         reach(point);
-        point.value = 0.0;
+        if (valued) point.value = 0.0;
         std::fill(point.gradient, point.gradient + kUnknowns, 0.0);
         for (auto& row : point.information) std::fill(row, row + kUnknowns, 0.0);
         double count = count_, time = time_, shares = shares_;
         const double step = 1.0 / static_cast<double>(n);
+        const Pass alone(flat, true);  // of a bin without a pulse
         auto each = [&](int64_t j) {
             const double share = r_.share(j);
             score_[j] = info_[j] = 0.0;
             if (share <= 0.0) return;
-            const BinTerm term =
-                bin_term(r_, passes_->count[j], passes_->armed[j], passes_->rearmed[j], rate_[j] + flat * share);
+            const double h = passes_->count[j], armed = passes_->armed[j], rearmed = passes_->rearmed[j];
+            const BinTerm term = share == 1.0 && rate_[j] == 0.0
+                                     ? bin_term<valued>(r_, h, armed, rearmed, flat, alone)
+                                     : bin_term<valued>(r_, h, armed, rearmed, rate_[j] + flat * share);
             score_[j] = term.score;
             info_[j] = term.info;
-            point.value += term.value;
+            if (valued) point.value += term.value;
             point.gradient[0] += term.score * share * step;
             point.information[0][0] += term.info * share * step * share * step;
             count -= passes_->count[j];
@@ -86,7 +105,7 @@ class ReturnsLikelihood {
             for (const int64_t j : reached_) each(j);
         if (!whole && time > 0.0) {
             count = std::max(count, 0.0);
-            point.value += count * std::log(flat) + shares - flat * time;
+            if (valued) point.value += count * std::log(flat) + shares - flat * time;
             point.gradient[0] += (count / flat - time) * step;
             point.information[0][0] += time / flat * step * step;
         }
@@ -125,16 +144,6 @@ class ReturnsLikelihood {
         }
     }
 
-    // Of the last evaluation: derivatives of the logarithm of the likelihood by the photons of each bin (bins), the
-    // information on them, and energy and slope (bins) of a return's pulse.
-    const std::vector<double>& score() const { return score_; }
-    const std::vector<double>& info() const { return info_; }
-    const double* energy(int k) const { return energy_.data() + k * r_.bins; }
-    const double* slope(int k) const { return slope_.data() + k * r_.bins; }
-
-    double time() const { return time_; }  // armed time of the open bins, bins x periods
-
- private:
     // Rates, energies and slopes of the bins that the pulses reach.
     void reach(const ReturnsPoint& point) {
         for (const int64_t j : reached_) {

@@ -40,7 +40,7 @@ class SeveralReturns {
         bool settled = climb(best, -HUGE_VAL);
         chance_[0] = first_chance(one[6]);
         while (settled) {
-            likelihood_(best, true);
+            likelihood_.scores(best);
             if (!search_(best, likelihood_, hints_)) break;
             const double least = search_.least_gain(job_.false_alarm);
             if (hints_.empty() || hints_[0].gain < kTold * least) break;
@@ -76,7 +76,7 @@ class SeveralReturns {
         // of the first return: over a background, by the same count of places
         ReturnsPoint none;
         none.at[0] = std::max(flat(), least_);
-        likelihood_(none, true);
+        likelihood_.scores(none);
         return search_(none, likelihood_, hints_) ? search_.chance(gain) : NAN;
     }
 

@@ -1,0 +1,606 @@
+"""The verb `calibrate`: a recorded stream to its light, its detector, a verdict, and what may be wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked
+from mars_lidar._base.brief import brief
+from mars_lidar._base.types import FloatArray
+from mars_lidar.calibration import start, suspects
+from mars_lidar.calibration.curves import Curves, Realizations, curves, realizations
+from mars_lidar.calibration.fit import Effort, Fit, Fitted, draws
+from mars_lidar.calibration.look import Look, look_at
+from mars_lidar.calibration.model import Model, all_carriers
+from mars_lidar.calibration.recording import Recording, recording_of, recording_of_arrivals
+from mars_lidar.calibration.suspects import Drift, Score
+from mars_lidar.instrument.avalanches import Afterpulsing
+from mars_lidar.instrument.detector import Detector
+from mars_lidar.instrument.effects import LIGHT_EFFECTS, Jitter
+from mars_lidar.instrument.pulse import GaussianPulse, Pulse
+from mars_lidar.instrument.system import MAX_CYCLES, System
+from mars_lidar.light.flux import Flux
+from mars_lidar.light.timestamps import Timestamps
+
+_LEAST_PHOTONS = 300  # below them the counts of the cells have no normal law
+_MOST_RETURNS = 4
+_MOST_EFFECTS = 2  # that are taken in one after the other
+_WAVE_BINS = 256  # of a free light, at most
+_PULSE = 5.0  # standard deviations of the brightest window over the period, below which there is no pulse
+_SAME_TIME = 0.01  # share of records at exactly the time of the one before, that no photons are
+_ATTEMPTS = 3  # fits of a stream, each with simulated streams of its own, of which the first that converges is taken
+_SEEDS_OF_A_FIT = 1_000_000  # between the seeds of two attempts
+LEVEL = 0.01  # false-alarm probability of the verdict
+
+PARAMETERS = ("dead_time_ns", "jitter_ns", "pulse_sigma_ns")
+_FIELDS = (
+    "mode",
+    "afterpulse_probability",
+    "afterpulse_delay_ns",
+    "twilight_ns",
+    "recovery_ns",
+    "electronics_dead_time_ns",
+)
+GIVEN = (*PARAMETERS, *_FIELDS)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A parameter: its value, standard error, and 95 % interval; the error is 0 where the value was given.
+
+    `note` says what its numbers cannot: that it was given, not detected, or not identified.
+    """
+
+    value: float
+    error: float
+    low: float
+    high: float
+    note: str = ""
+
+    def __str__(self) -> str:
+        if self.error == 0.0:
+            return f"{self.value:.6g} ({self.note or 'given'})"
+        if self.note:
+            return f"{self.value:.4g} (95 %: {self.low:.3g} to {self.high:.3g}), {self.note}"
+        digits = int(np.clip(np.ceil(np.log10(max(abs(self.value), 1e-12) / self.error)) + 2, 3, 12))
+        return f"{self.value:.{digits}g} ± {self.error:.2g}"
+
+
+@dataclass(frozen=True)
+class Suspect:
+    """What the stream shows beyond the plain model.
+
+    `z` standard deviations of its score, `size` with `error` in the units of its option, `gain` of the misfit when it
+    is taken in (standard deviations of the misfit), `option` that gives it, `included` whether the result has it.
+    """
+
+    name: str
+    z: float
+    size: float
+    error: float
+    gain: float
+    option: str
+    included: bool
+
+    def __str__(self) -> str:
+        size = "" if np.isnan(self.size) else f" {self.size:.3g} ± {self.error:.2g}"
+        gain = "" if np.isnan(self.gain) else f", taking it in gains {self.gain:.1f} standard deviations of the misfit"
+        state = "in the result" if self.included else f"not in the result: {self.option}"
+        clear = f"{self.z:.1f} standard deviations{gain}" if self.z > 0.0 else f"no score of its own{gain}"
+        return f"{self.name}{size} ({clear}); {state}"
+
+
+@dataclass(frozen=True)
+class Limit:
+    """An effect that was not detected: 95 % upper limit in units of `name`, and what it would shift at that size."""
+
+    name: str
+    words: str
+    limit: float
+    shifts: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """A recorded stream's light and detector, made by `calibrate`.
+
+    Attributes
+    ----------
+    look
+        What the file holds, before any model.
+    estimates
+        By name: ``signal``, ``background`` (photons per period), ``delay_ns``, ``width_ns`` (sigma of the recorded
+        pulse, jitter included), ``pulse_sigma_ns``, ``jitter_ns`` (sigma), ``dead_time_ns``, and those of the effects
+        in the result, in the units of `Detector`. With several returns ``signal_1``, ``delay_ns_1``, ...
+    p_value
+        Probability of a misfit as large if the model holds, drift included; NaN with ``look=True``.
+    suspects
+        What the stream shows beyond the plain model, the clearest first.
+    limits
+        Effects that were not detected, each with its upper limit.
+    drift
+        Light and delay by parts of the recording, or None for a short one.
+    system, flux
+        The instrument and the light of these estimates, to simulate with; None with ``look=True``.
+    waveform, waveform_error
+        Light (bins,) in photons per period and bin, of a free shape; else None.
+    """
+
+    look: Look
+    estimates: dict[str, Estimate]
+    p_value: float
+    suspects: tuple[Suspect, ...]
+    limits: tuple[Limit, ...]
+    drift: Drift | None
+    system: System | None
+    flux: Flux | None
+    waveform: FloatArray | None
+    waveform_error: FloatArray | None
+    recording: Recording
+    fitted: Fitted | None
+    level: float = LEVEL
+
+    __repr__ = brief
+
+    @property
+    def total(self) -> float:
+        """All light, photons per period."""
+        light = (
+            e.value for name, e in self.estimates.items() if name.split("_")[0] in ("signal", "background", "light")
+        )
+        return float(sum(light))
+
+    @property
+    def fits(self) -> bool:
+        """Whether the model is not rejected, at `level`."""
+        return bool(self.p_value >= self.level)
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        """What is wrong with the recording or the model, a sentence each."""
+        return (*self.look.problems, *(str(suspect) for suspect in self.suspects if not suspect.included))
+
+    @property
+    def verdict(self) -> str:
+        """In one sentence."""
+        if self.fitted is None:
+            return "not fitted"
+        included = [suspect.name for suspect in self.suspects if suspect.included]
+        model = "the model" + (f" with {' and '.join(included)}" if included else "")
+        if not self.fitted.converged:
+            return f"no light of this shape and dead time describes the stream: {model} was not fitted"
+        if self.fits:
+            return f"p = {self.p_value:.2g}: {model} is not rejected at the {self.level:.0%} level"
+        return f"p = {self.p_value:.2g}: {model} does not fit"
+
+    def curves(self, seed: int = 0) -> Curves:
+        """Histograms of the recording beside those of the fit, for a picture."""
+        model = None if self.fitted is None else self.fitted.model
+        theta = None if model is None or self.fitted is None else model.bounded(self.fitted.theta)
+        return curves(self.recording, model, theta, seed)
+
+    def realizations(self, cycles: int, *, simulated: int = 4000, seed: int = 0) -> Realizations:
+        """Law of the count in pieces of `cycles` laser periods beside the model's, of `simulated` pieces (T6)."""
+        if self.fitted is None or not self.recording.laser:
+            raise ValueError("realizations need a fit and a laser period: calibrate without look=True")
+        number = checks.integer("cycles", cycles, low=1, high=MAX_CYCLES)
+        drawn = checks.integer("simulated", simulated, low=200, high=10**7)
+        model = self.fitted.model
+        return realizations(self.recording, model, model.bounded(self.fitted.theta), number, drawn, seed)
+
+    def __getattr__(self, name: str) -> float:
+        estimates: dict[str, Estimate] = object.__getattribute__(self, "estimates")
+        if name in estimates:
+            return estimates[name].value
+        raise AttributeError(f"{type(self).__name__} has no attribute {name!r}; estimates: {', '.join(estimates)}")
+
+
+@checked
+def calibrate(
+    times: Timestamps | Sequence[Timestamps] | ArrayLike,
+    given: System | Detector | Mapping[str, Any] | None = None,
+    *,
+    pulse: Pulse | Literal["gaussian", "free"] = "gaussian",
+    returns: int = 1,
+    look: bool = False,
+    pooled: bool = False,
+    unit_ns: float = 0.0,
+    level: float = LEVEL,
+    seed: int = 0,
+) -> Calibration:
+    """Light and detector of the stream of one free-running pixel, with errors, a verdict, and suspects.
+
+    Counts of the stream by phase, interval and both are compared with those of streams that the exact engine draws, and
+    the stated errors are the scatter of that very estimate over such streams (docs/calibration.md). Effects of the
+    detector that the counts show are taken in one after the other, by the refit that fits best.
+
+    Parameters
+    ----------
+    times
+        The stream of one pixel (`Timestamps.load`, `Timestamps.pixel`), or a sequence of recordings of that pixel; or
+        (n,) times in ns of a recording without a laser, in constant light. Nothing but times, period and clock is used.
+    given
+        What is known, and is not fitted: a mapping of ``dead_time_ns``, ``jitter_ns`` (sigma), ``pulse_sigma_ns`` (of
+        the light, without the jitter) and fields of `Detector` (``afterpulse_probability`` with
+        ``afterpulse_delay_ns``, ``twilight_ns``, ``recovery_ns``, ``electronics_dead_time_ns``, ``mode``); a
+        `Detector`; or a `System`, whose pulse is then known too.
+    pulse
+        A `Pulse` of known shape, without the jitter; ``"gaussian"``, of unknown width; or ``"free"``: any light, bin by
+        bin.
+    returns
+        Number of returns, 1 to 4.
+    look
+        Stop before the fit: what the file holds.
+    pooled
+        All pixels of `times` are recordings of one and the same pixel.
+    unit_ns
+        Unit of the clock of an array of times, ns; 0: real numbers.
+    level
+        False-alarm probability of the verdict.
+    seed
+        Of the simulated streams; the result depends on it within its errors.
+
+    Raises
+    ------
+    ValueError
+        Several pixels without `pooled`, fewer than 300 registrations, or records that are no photons.
+    """
+    number = checks.integer("returns", returns, low=1, high=_MOST_RETURNS)
+    alpha = checks.real("level", level, low=0.0, high=0.5, strict_low=True)
+    for name, value in (("look", look), ("pooled", pooled)):
+        if not isinstance(value, bool):
+            raise TypeError(f"{name} must be True or False, got {value!r}")
+    start_seed = checks.integer("seed", seed, low=0, high=2**31)
+    recording = _recorded(times, pooled, checks.real("unit_ns", unit_ns, low=0.0))
+    shape, fields, fixed = _known(given, pulse)
+    seen = look_at(recording)
+    if look:
+        return Calibration(seen, {}, float("nan"), (), (), None, None, None, None, None, recording, None, alpha)
+    if recording.photons < _LEAST_PHOTONS:
+        raise ValueError(
+            f"times must hold at least {_LEAST_PHOTONS} registrations to be calibrated, got {recording.photons}; "
+            "look=True describes a shorter recording"
+        )
+    if seen.same_time > _SAME_TIME * recording.photons and seen.unit_ns == 0.0:
+        raise ValueError(
+            f"times must be of photons one after the other, got {seen.same_time:,} of {recording.photons:,} at exactly "
+            "the time of the one before"
+        )
+    return _Run(recording, seen, shape, number, fields, fixed, alpha, start_seed).result()
+
+
+def _recorded(times: Any, pooled: bool, unit_ns: float) -> Recording:
+    """The recording of streams, or of an array of times without a laser."""
+    streams = isinstance(times, Sequence) and len(times) > 0 and all(isinstance(t, Timestamps) for t in times)
+    if streams or isinstance(times, Timestamps):
+        return recording_of(times, pooled=pooled)
+    return recording_of_arrivals(times, unit_ns)
+
+
+def _known(
+    given: System | Detector | Mapping[str, Any] | None, pulse: Pulse | str
+) -> tuple[Pulse | str, dict[str, Any], dict[str, float]]:
+    """Shape of the pulse, fields of the detector, and fixed parameters, from what is given."""
+    if isinstance(pulse, str):
+        checks.choice("pulse", pulse, ("gaussian", "free"))
+    elif not isinstance(pulse, Pulse):
+        raise TypeError(f"pulse must be a Pulse, 'gaussian' or 'free', got {pulse!r}")
+    if isinstance(given, System):
+        return _known(given.detector, given.pulse if pulse == "gaussian" else pulse)
+    if isinstance(given, Detector):
+        return pulse, *_of_detector(given)
+    if given is None:
+        return pulse, {}, {}
+    known = dict(checks.known_keys("given", given, GIVEN))
+    fixed: dict[str, float] = {}
+    if "pulse_sigma_ns" in known:
+        sigma = checks.real("pulse_sigma_ns", known.pop("pulse_sigma_ns"), low=0.0, strict_low=True)
+        if pulse != "gaussian":
+            raise ValueError("the pulse is given once: choose pulse or pulse_sigma_ns")
+        pulse = GaussianPulse(sigma_ns=sigma)
+    if "dead_time_ns" in known:
+        fixed["dead_time_ns"] = checks.real("dead_time_ns", known.pop("dead_time_ns"), low=0.0)
+    if "jitter_ns" in known:
+        fixed["jitter2"] = checks.real("jitter_ns", known.pop("jitter_ns"), low=0.0) ** 2
+    probability, delay = known.pop("afterpulse_probability", None), known.pop("afterpulse_delay_ns", None)
+    if (probability is None) != (delay is None):
+        raise ValueError("afterpulse_probability and afterpulse_delay_ns belong together: give both, or neither")
+    if probability is not None:
+        known["afterpulsing"] = Afterpulsing(probability=float(probability), delay_ns=float(delay))
+    Detector(dead_time_ns=fixed.get("dead_time_ns", known.get("twilight_ns", 0.0)), **known)  # checks the fields
+    return pulse, known, fixed
+
+
+def _of_detector(detector: Detector) -> tuple[dict[str, Any], dict[str, float]]:
+    if detector.mode not in ("nonparalyzable", "paralyzable"):
+        raise ValueError(f"given must be a free-running detector, got mode {detector.mode!r}")
+    for name in ("crosstalk", "max_events_per_exposure", "code_density"):
+        if name in detector.effects:
+            raise ValueError(f"given must not have {name}: the stream of one pixel does not show it")
+    bare = detector.without(*LIGHT_EFFECTS)
+    fixed = {"dead_time_ns": bare.dead_time_ns, "jitter2": 0.0}
+    fields: dict[str, Any] = {"mode": bare.mode} if bare.mode != "nonparalyzable" else {}
+    for name in bare.effects:
+        if name == "jitter" and isinstance(bare.jitter, Jitter) and bare.jitter.tail_fraction == 0.0:
+            fixed["jitter2"] = bare.jitter.std_ns**2
+        else:
+            fields[name] = getattr(bare, name)
+    return fields, fixed
+
+
+class _Run:
+    """One calibration: the model, its fit, and what follows from it."""
+
+    def __init__(
+        self,
+        recording: Recording,
+        look: Look,
+        shape: Pulse | str,
+        returns: int,
+        fields: dict[str, Any],
+        fixed: dict[str, float],
+        level: float,
+        seed: int,
+    ) -> None:
+        self.recording, self.look, self.level = recording, look, level
+        self.fixed = fixed
+        self.seed = seed
+        self.fit = Fit(recording, Effort(), seed + 1)
+        told = tuple(fields.items())
+        self.wave: tuple[FloatArray, FloatArray] | None = None
+        pulse = shape if isinstance(shape, Pulse) else None
+        if pulse is not None:
+            pulse.check(recording.period_ns)
+        self.flat = not recording.laser
+        if shape == "free":
+            self.wave = start.free_waveform(recording, _WAVE_BINS)
+            model = Model(recording.clock, 0, waveform=self.wave[0] / self.wave[0].sum(), fields=told)
+        elif self.flat or start.brightest_window(recording) < _PULSE:
+            self.flat = True
+            model = Model(recording.clock, 0, fields=told)
+        else:
+            model = Model(recording.clock, returns, pulse=pulse, fields=told)
+        self.model = model
+
+    def result(self) -> Calibration:
+        """The fit, the effects that it takes in, and what they leave."""
+        fitted = self.first()
+        included: list[tuple[Score, suspects.Named]] = []
+        listed = suspects.scores(self.fit, fitted) if fitted.converged else []
+        for _ in range(_MOST_EFFECTS if fitted.converged else 0):
+            better = suspects.refitted(self.fit, fitted, listed)
+            if better is None:
+                break
+            used = next(score for score in listed if score.effect is better[1].effect)
+            fitted = better[0]
+            included.append((used, better[1]))
+            listed = suspects.scores(self.fit, fitted)
+        drift = suspects.drift(self.fit, fitted) if fitted.converged else None
+        return self.assembled(fitted, included, listed, drift)
+
+    def first(self) -> Fitted:
+        """The fit of the plain model, from the better of two starts; with other streams where it did not converge."""
+        for attempt in range(_ATTEMPTS):
+            self.fit = Fit(self.recording, Effort(), self.seed + 1 + attempt * _SEEDS_OF_A_FIT)
+            fitted = self._attempt()
+            if fitted.converged:
+                break
+        return fitted
+
+    def _attempt(self) -> Fitted:
+        """A fit with the streams of `fit`."""
+        fit, model = self.fit, self.model
+        width_known = model.returns == 0 or model.pulse is not None
+        tried = []
+        begin = start.starts(fit, self.recording, model, self.fixed)
+        free = np.array(
+            [
+                k
+                for k, name in enumerate(model.names)
+                if name not in self.fixed and not (width_known and name == "width2")
+            ],
+            np.intp,
+        )
+        first = float(min(self.recording.photons, fit.effort.first))
+        for _, theta in begin[:2]:
+            spread = np.diag(start.first_spread(model, theta)[free])
+            theta, root, misfit, _ = fit.steps(model, theta, spread, free, first, 3)
+            tried.append((misfit, theta, root))
+        _, theta, root = min(tried, key=lambda trial: trial[0])
+        theta, root, _, settled = fit.steps(model, theta, root, free, float(self.recording.photons), 10)
+        return fit.finish(model, theta, root, free, settled)
+
+    def assembled(
+        self,
+        fitted: Fitted,
+        included: list[tuple[Score, suspects.Named]],
+        listed: list[Score],
+        drift: Drift | None,
+    ) -> Calibration:
+        """The result of the last fit."""
+        growth = _growth(fitted, drift)
+        estimates = _estimates(fitted, self.fixed, growth)
+        named: list[Suspect] = []
+        for score, refit in included:
+            name = score.effect.names[0]
+            shown = "electronics_dead_time_ns" if name == "electronics_excess" else name
+            at = estimates.get(shown, Estimate(np.nan, np.nan, np.nan, np.nan))
+            named.append(
+                Suspect(score.effect.words, refit.z, at.value, at.error, refit.gain, f"given {shown}", included=True)
+            )
+        p = fitted.p_value if fitted.converged else 0.0
+        if drift is not None:
+            p = min(1.0, 2.0 * min(p, drift.probability))
+            for k in np.flatnonzero(drift.drifts):
+                change = drift.change[k] / (drift.values[:, k].mean() if k == 0 else 1.0)
+                words = "drift of the light, relative" if k == 0 else f"drift of {drift.names[k]}, ns"
+                error = abs(drift.change[k] / drift.trend[k]) * abs(change / drift.change[k])
+                option = "calibrate parts of the recording; the errors include what the parts scatter"
+                named.append(Suspect(words, abs(drift.trend[k]), change, error, np.nan, option, included=False))
+        families = {suspect.name for suspect in named}
+        for score in listed if p < self.level else ():
+            if score.z > suspects.NAMED and score.effect.words not in families:
+                families.add(score.effect.words)
+                option = f"given {score.effect.names[0]}"
+                named.append(
+                    Suspect(score.effect.words, score.z, score.size, score.error, np.nan, option, included=False)
+                )
+        if p < self.level and not any(not suspect.included for suspect in named):
+            worst, z = _worst_cells(fitted)
+            if z > suspects.NAMED or not fitted.converged:
+                advice = "pulse='free', or returns=2" if worst.startswith("phases") else "no option of the model"
+                named.append(Suspect(worst, z, np.nan, np.nan, np.nan, advice, included=False))
+        centre = fitted.model.bounded(fitted.theta)
+        cycles = int(np.clip(self.recording.exposure, 1, MAX_CYCLES))
+        wave = error = None
+        if self.wave is not None:
+            scale = float(centre[0] / self.wave[0].sum())
+            wave, error = scale * self.wave[0], scale * self.wave[1]
+        if not fitted.converged:
+            estimates = {}
+        return Calibration(
+            self.look,
+            estimates,
+            p,
+            tuple(sorted(named, key=lambda suspect: (not suspect.included, -suspect.z))),
+            _limits(fitted, listed),
+            drift,
+            fitted.model.system(centre, cycles, 1024) if estimates and self.recording.laser else None,
+            fitted.model.flux(centre) if estimates and self.recording.laser else None,
+            wave,
+            error,
+            self.recording,
+            fitted,
+            self.level,
+        )
+
+
+def _growth(fitted: Fitted, drift: Drift | None) -> FloatArray:
+    """Factor (p,) on the errors of the light, by the scatter of parts of the recording, where they drift."""
+    out = np.ones(fitted.model.size)
+    if drift is None:
+        return out
+    for k, name in enumerate(drift.names):
+        if drift.drifts[k]:
+            which = [i for i, own in enumerate(fitted.model.names[: fitted.model.light]) if (own == name) or k == 0]
+            out[which] = np.maximum(out[which], drift.growth[k])
+    return out
+
+
+def _estimates(fitted: Fitted, fixed: dict[str, float], growth: FloatArray) -> dict[str, Estimate]:
+    """What is printed, written and drawn, from draws of the law of the parameters."""
+    model = fitted.model
+    scale = growth[fitted.free]
+    covariance = fitted.unbounded_covariance * np.outer(scale, scale)
+    drawn = draws(model, fitted.unbounded, covariance, fitted.free)
+    centre = model.bounded(fitted.theta)
+    if drawn is None:  # the estimate lies beyond what a detector can have
+        spread = np.random.default_rng(0).standard_normal((2000, len(fitted.free))) * np.sqrt(np.diag(covariance))
+        drawn = np.tile(centre, (2000, 1))
+        drawn[:, fitted.free] += spread
+        drawn = model.bounded(drawn)
+    names = model.names
+    k = model.light
+    free = {names[i] for i in fitted.free}
+    out: dict[str, Estimate] = {}
+
+    def put(name: str, value: float, sample: FloatArray, *needs: str, note: str = "") -> None:
+        if not free & set(needs):
+            out[name] = Estimate(value, 0.0, value, value, "given")
+            return
+        low, high = np.quantile(sample, (0.025, 0.975))
+        out[name] = Estimate(value, float(sample.std()), float(low), float(high), note)
+
+    light = names[0] if model.returns else "light"  # all of it
+    put(light, float(centre[0]), drawn[:, 0], names[0])
+    for i in range(1, k):
+        period = model.clock.period_ns
+        wrapped = names[i].startswith("delay")
+        put(names[i], float(centre[i] % period if wrapped else centre[i]), drawn[:, i], names[i])
+    width2, jitter2 = drawn[:, k], drawn[:, k + 1]
+    sd = float(np.sqrt(np.diag(covariance))[list(fitted.free).index(k + 1)]) if "jitter2" in free else 0.0
+    note = ""
+    if sd:
+        if fitted.unbounded[k + 1] < 2.0 * sd:
+            note = "not detected"
+        if model.gaussian and np.quantile(jitter2, 0.975) > 0.97 * centre[k] and note:
+            note = "not identified: any share of the recorded width"
+    if model.gaussian:
+        put("width_ns", float(centre[k] ** 0.5), np.sqrt(width2), "width2")
+        own = np.sqrt(np.maximum(width2 - jitter2, 0.0))
+        shared = note if note.startswith("not identified") else ""
+        put("pulse_sigma_ns", float(max(centre[k] - centre[k + 1], 0.0) ** 0.5), own, "width2", note=shared)
+    put("jitter_ns", float(centre[k + 1] ** 0.5), np.sqrt(jitter2), "jitter2", note=note)
+    at = k + 3
+    dead, observed = drawn[:, k + 2], float(centre[k + 2])
+    dead_name = "dead_time_ns"
+    for effect in model.effects:
+        columns = drawn[:, at : at + len(effect.names)]
+        values = centre[at : at + len(effect.names)]
+        if effect.names[0] == "electronics_excess":
+            put("electronics_dead_time_ns", observed, dead, "dead_time_ns")
+            put("dead_time_ns", observed / (1.0 + float(values[0])), dead / (1.0 + columns[:, 0]), "electronics_excess")
+            dead_name = ""
+        elif effect.names[0] == "afterpulse_probability":  # in the option's units: those lost in the dead time included
+            delay = effect.delay_ns
+            pairs = zip(columns[:, 0], dead, strict=True)
+            carriers = np.array([all_carriers(after, delay, hold) for after, hold in pairs])
+            everything = all_carriers(float(values[0]), delay, observed)
+            put("afterpulse_probability", everything, carriers, "afterpulse_probability")
+            ratio = 2.0**0.5  # of neighbours on the grid of delays, halfway
+            out["afterpulse_delay_ns"] = Estimate(
+                delay, delay * (ratio - 1.0), delay / ratio, delay * ratio, "the best of a grid in steps of 2"
+            )
+            put("afterpulses_after_dead_time", float(values[0]), columns[:, 0], "afterpulse_probability")
+        elif not effect.onoff:
+            put(effect.names[0], float(values[0]), columns[:, 0], effect.names[0])
+        at += len(effect.names)
+    if dead_name:
+        put(dead_name, observed, dead, "dead_time_ns")
+    return out
+
+
+def _limits(fitted: Fitted, listed: list[Score]) -> tuple[Limit, ...]:
+    """Upper limits of effects that were not detected, of each the weakest delay or kind."""
+    best: dict[str, Limit] = {}
+    names = [fitted.model.names[k] for k in fitted.free]
+    errors = np.sqrt(np.diag(fitted.covariance))
+    for score in listed:
+        name = score.effect.names[0]
+        if score.z > suspects.NAMED or score.effect.onoff:
+            continue
+        size = min(score.limit, score.effect.most[0])
+        shifts = {
+            own: float(shift * size)
+            for own, shift, error in zip(names, score.shift, errors, strict=True)
+            if abs(shift * size) > error
+        }
+        if name not in best or size > best[name].limit:
+            best[name] = Limit(name, score.effect.words, size, shifts)
+    return tuple(best.values())
+
+
+def _worst_cells(fitted: Fitted) -> tuple[str, float]:
+    """The group of cells that fits worst, in words, and its standard deviations."""
+    cells = fitted.batch.cells
+    middle = cells.phases + cells.gap_edges.size + 1
+    groups = {
+        "phases: shape of the light": slice(0, cells.phases),
+        "intervals": slice(cells.phases, middle),
+        "intervals by phase": slice(middle, None),
+    }
+    worst, most = "", -np.inf
+    for words, part in groups.items():
+        used = np.flatnonzero(fitted.offset[part] > 5.0) + (part.start or 0)
+        scale = fitted.fresh[:, used].std(0)
+        drawn = ((fitted.fresh[:, used] / scale) ** 2).sum(1)
+        z = (float(((fitted.left[used] / scale) ** 2).sum()) - drawn.mean()) / drawn.std()
+        if z > most:
+            worst, most = words, float(z)
+    return worst, most

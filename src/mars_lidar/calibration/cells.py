@@ -1,0 +1,99 @@
+"""A stream as counts in cells: phases, intervals, and a table of both, laid where streams of the model differ."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar._base.types import FloatArray, IndexArray
+from mars_lidar.calibration.model import Model
+from mars_lidar.calibration.recording import Recording
+
+_PHASES = 2**15  # cells of the table from phase to class
+_SHIFT = 0.37  # of such a cell: no edge lies where a clock ticks
+_QUANTILES = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98, 0.995)  # of intervals
+_AGES = (0.002, 0.02, 0.08, 0.2, 0.45, 0.75)  # quantiles of intervals that divide the table
+
+
+class Cells:
+    """Counts of a stream: phases; intervals; (interval, phase at its begin, does it end in a pulse).
+
+    The edges follow from streams that the model draws, never from the data: cells that follow the data would be biased.
+    Intervals are resolved down to those of which the exposure has less than one, for the edge of the dead time.
+    """
+
+    def __init__(self, model: Model, theta: FloatArray, pilot: list[FloatArray], photons: float) -> None:
+        period, unit = model.clock.period_ns, model.clock.unit_ns
+        self.period, self.clock = period, model.clock
+        gaps = np.sort(np.concatenate([np.diff(t) for t in pilot]))
+        phases = np.concatenate([t / period - np.floor(t / period) for t in pilot])
+        edges, lit = self._layout(model, theta, phases)
+        centre = (np.arange(_PHASES) + 0.5) / _PHASES
+        self.phase_of: IndexArray = np.searchsorted(edges, centre)
+        coarse = np.unique(np.concatenate([np.linspace(0.0, 1.0, 6)[1:-1], lit.ravel()]))
+        inside = np.zeros(_PHASES, bool)
+        for low, high in lit:
+            inside |= (centre - low) % 1.0 < (high - low) % 1.0
+        self.class_of: NDArray[np.int32] = (2 * np.searchsorted(coarse, centre)).astype(np.int32)
+        self.lit_of: NDArray[np.int32] = inside.astype(np.int32)
+        self.kinds, self.phases = 2 * (coarse.size + 1), edges.size + 1
+        ratio = gaps.size / max(photons, 1.0)
+        fine = max(0.7, 2.0 / ratio) * 1.5 ** np.arange(60)
+        rank = np.r_[fine[fine < 0.15 * photons], photons * np.array(_QUANTILES)] * ratio
+        place = gaps[np.minimum(rank.astype(int), gaps.size - 1)]
+        ages = self._between(gaps[(np.array(_AGES) * gaps.size).astype(int)], unit)
+        self.gap_edges = np.union1d(self._between(place, unit), ages)
+        self.gap_edges = self.gap_edges[self.gap_edges > 0.0]
+        ages = ages[ages > 0.0]
+        self.age_of: NDArray[np.int32] = np.searchsorted(ages, np.append(self.gap_edges, np.inf)).astype(np.int32)
+        self.ages = ages.size + 1
+        self.size = self.phases + self.gap_edges.size + 1 + self.ages * self.kinds
+
+    @staticmethod
+    def _layout(model: Model, theta: FloatArray, phases: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Edges of the phase cells, and the stretches (n, 2) of bright light, in periods."""
+        period, unit = model.clock.period_ns, model.clock.unit_ns
+        edges, lit = [np.linspace(0.0, 1.0, 13)[1:-1]], []
+        if model.waveform is not None or model.pulse is not None:
+            edges.append(np.quantile(phases, np.linspace(0.0, 1.0, 33)[1:-1]))
+        if model.waveform is not None:
+            dense = np.bincount((phases * 32).astype(int) % 32, minlength=32)
+            bright = np.flatnonzero(dense > 1.5 * np.median(dense))
+            lit = [(k / 32, (k + 1) / 32) for k in bright]
+        width = float(np.sqrt(theta[model.light] + unit**2 / 12)) if model.waveform is None else 0.0
+        if model.pulse is not None and model.returns:  # by the scatter of the phases about the delay
+            off = (phases - theta[2] / period + 0.5) % 1.0 - 0.5
+            dense, at = np.histogram(off, 512)
+            dense = np.maximum(dense - np.median(dense), 0.0)
+            middle = 0.5 * (at[1:] + at[:-1])
+            mean = (dense * middle).sum() / max(dense.sum(), 1.0)
+            width = period * float(np.sqrt((dense * (middle - mean) ** 2).sum() / max(dense.sum(), 1.0)))
+        for r in range(model.returns):
+            delay = theta[2 + 2 * r]
+            peak = np.arange(-5.0, 5.01, 0.5) * width + delay
+            if unit > 0.4 * width:  # edges between the units of the clock
+                peak = np.unique(np.round(peak / unit)) * unit
+            edges.append(peak / period % 1.0)
+            lit.append(((delay - 3 * width) / period % 1.0, (delay + 3 * width) / period % 1.0))
+        return np.unique(np.concatenate(edges)), np.array(lit).reshape(-1, 2)
+
+    @staticmethod
+    def _between(edges: FloatArray, unit: float) -> FloatArray:
+        """Edges of intervals, between the units of a clock."""
+        return np.unique((np.floor(edges / unit + 1e-6) + 0.5) * unit) if unit > 0.0 else np.unique(edges)
+
+    def __call__(self, t: FloatArray) -> FloatArray:
+        """Counts (size,) of one stretch of recorded times (n,)."""
+        x: FloatArray = t * (1.0 / self.period) + _SHIFT / _PHASES
+        x -= np.floor(x)
+        at: IndexArray = np.floor(x * _PHASES).astype(np.intp)
+        gap: IndexArray = np.searchsorted(self.gap_edges, np.diff(t))
+        phases = np.bincount(self.phase_of[at], minlength=self.phases)
+        gaps = np.bincount(gap, minlength=self.gap_edges.size + 1)
+        cell = self.age_of[gap] * self.kinds + self.class_of[at[:-1]] + self.lit_of[at[1:]]
+        table = np.bincount(cell, minlength=self.ages * self.kinds)
+        return np.concatenate([phases, gaps, table]).astype(np.float64)
+
+    def of(self, recording: Recording) -> FloatArray:
+        """Counts (size,) of a recording, all stretches together."""
+        return np.asarray(np.sum([self(piece) for piece in recording.pieces], axis=0))

@@ -1,0 +1,152 @@
+"""Histograms of a calibrated recording beside those of its model: what a picture draws, and the law of the count."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mars_lidar._base.types import FloatArray
+from mars_lidar.calibration.fit import LIGHTS
+from mars_lidar.calibration.model import Model
+from mars_lidar.calibration.recording import Recording
+from mars_lidar.statistics.distance import Pmf, kl_divergence, total_variation
+
+_INTERVALS, _PHASES, _AGES = 200, 256, 60  # cells of a picture
+_RATIO = 4.0  # photons of the model's streams over those of the recording
+_MOST = 4_000_000  # photons of these streams, in all
+_RESAMPLED = 400  # samples of the sampling floor
+
+
+@dataclass(frozen=True, eq=False)
+class Curves:
+    """Counts of intervals (200,) and phases (256,), recorded and of the model, and residuals (60,) by age."""
+
+    interval_edges_ns: FloatArray
+    intervals: FloatArray
+    fitted_intervals: FloatArray | None
+    phase_edges_ns: FloatArray
+    phases: FloatArray
+    fitted_phases: FloatArray | None
+    recovery_edges_ns: FloatArray
+    recovery: FloatArray | None
+
+
+@dataclass(frozen=True, eq=False)
+class Realizations:
+    """Law of the count in pieces of the recording beside the model's (T6 of the MaRS paper).
+
+    `counts` (realizations,); `measured` and `predicted` frequencies; distances with what samples of this size from the
+    predicted law have: mean and 99 % quantile of the total variation, mean of the Kullback-Leibler divergence in nats.
+    """
+
+    cycles: int
+    counts: FloatArray
+    measured: Pmf
+    predicted: Pmf
+    total_variation: float
+    total_variation_floor: tuple[float, float]
+    kl: float
+    kl_floor: float
+
+    def __str__(self) -> str:
+        mean, high = self.total_variation_floor
+        return (
+            f"{self.counts.size:,} realizations of {self.cycles:,} periods, {self.counts.mean():.6g} counts each: "
+            f"total variation {self.total_variation:.4g}, sampling floor {mean:.4g} (99 %: {high:.4g}); "
+            f"KL {self.kl:.4g} nats, floor {self.kl_floor:.4g}"
+        )
+
+
+def curves(recording: Recording, model: Model | None, theta: FloatArray | None, seed: int) -> Curves:
+    """Histograms of the recording, and of the model at `theta` where there is one."""
+    period, unit = recording.period_ns, recording.clock.unit_ns
+    gaps = np.concatenate([np.diff(piece) for piece in recording.pieces])
+    top = float(np.quantile(gaps, 0.99)) * 1.05
+    edges = _edges(0.0, top, _INTERVALS, unit)
+    low, high = np.quantile(gaps, (0.0005, 0.5))
+    ages = _edges(max(low - 0.1 * (high - low), 0.0), high + (high - low), _AGES, unit)
+    places = np.linspace(0.0, period, _PHASES + 1)
+    phase = np.concatenate([piece - np.floor(piece / period) * period for piece in recording.pieces])
+    fitted: list[FloatArray] = []
+    residual = None
+    recorded = [np.histogram(gaps, edges)[0], np.histogram(phase, places)[0], np.histogram(gaps, ages)[0]]
+    if model is not None and theta is not None:
+        total = min(_RATIO * recording.photons, _MOST)
+        cycles = max(2, round(recording.exposure * total / recording.photons / LIGHTS))
+        streams = model.streams(np.tile(theta, (LIGHTS, 1)), cycles, seed)
+        scale = recording.exposure / (cycles * LIGHTS)
+        made = np.concatenate([np.diff(t) for t in streams])
+        where = np.concatenate([t - np.floor(t / period) * period for t in streams])
+        fitted = [
+            scale * np.histogram(made, edges)[0],
+            scale * np.histogram(where, places)[0],
+            scale * np.histogram(made, ages)[0],
+        ]
+        expected = fitted[2]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            residual = (recorded[2] - expected) / np.sqrt(np.maximum(expected, 1.0) * (1.0 + scale))
+        residual[expected < 3.0] = np.nan
+    return Curves(
+        edges,
+        recorded[0].astype(float),
+        fitted[0] if fitted else None,
+        places,
+        recorded[1].astype(float),
+        fitted[1] if fitted else None,
+        ages,
+        residual,
+    )
+
+
+def _edges(low: float, high: float, number: int, unit: float) -> FloatArray:
+    """Edges of cells, between the units of a clock."""
+    edges = np.linspace(low, high, number + 1)
+    if unit == 0.0:
+        return edges
+    whole = np.unique((np.floor(edges / unit) + 0.5) * unit)
+    return np.asarray(whole if whole.size > 2 else np.array([-0.5, 0.5, 1.5]) * unit)
+
+
+def realizations(
+    recording: Recording, model: Model, theta: FloatArray, cycles: int, simulated: int, seed: int
+) -> Realizations:
+    """Counts in pieces of `cycles` periods, against `simulated` pieces of the model's streams."""
+    length = cycles * recording.period_ns
+
+    def cut(t: FloatArray, end: float) -> FloatArray:
+        number = int(end // length)
+        return np.diff(np.searchsorted(t, np.arange(number + 1) * length))
+
+    counts = np.concatenate(
+        [cut(piece, own * recording.period_ns) for piece, own in zip(recording.pieces, recording.cycles, strict=True)]
+    )
+    if counts.size < 20:
+        raise ValueError(
+            f"cycles must leave at least 20 realizations of a recording of {recording.exposure:,.0f} periods, got "
+            f"{cycles:,}: {counts.size}"
+        )
+    each = -(-simulated // LIGHTS) + 1
+    streams = model.streams(np.tile(theta, (LIGHTS, 1)), each * cycles, seed)
+    drawn = np.concatenate([cut(t, each * length)[1:] for t in streams])  # the first begins with an armed pixel
+    low, high = int(min(counts.min(), drawn.min())), int(max(counts.max(), drawn.max()))
+    measured, predicted = Pmf.of_counts(counts), Pmf.of_counts(drawn)
+    law, sample = predicted.on(low, high), measured.on(low, high)
+    random = np.random.default_rng(seed)
+    floor = []
+    for _ in range(_RESAMPLED):  # two samples of one law: the recording's size and the simulation's
+        a = random.multinomial(counts.size, law) / counts.size
+        b = random.multinomial(drawn.size, law) / drawn.size
+        floor.append((0.5 * np.abs(a - b).sum(), float(kl_divergence(a[None], b)[0])))
+    variation, divergence = np.array(floor).T
+    finite = divergence[np.isfinite(divergence)]
+    return Realizations(
+        cycles,
+        counts,
+        measured,
+        predicted,
+        total_variation(measured, predicted),
+        (float(variation.mean()), float(np.quantile(variation, 0.99))),
+        float(kl_divergence(sample[None], law)[0]),
+        float(finite.mean()) if finite.size else float("nan"),
+    )

@@ -1,0 +1,392 @@
+"""The fit: counts of the recorded stream against counts of streams that the exact engine draws at random parameters.
+
+For streams of parameters theta_k about a centre c, counts regress as s_k = a + J (theta_k - c) + e_k. With W the
+inverse covariance of e, G = (J' W J)^-1 J' W turns recorded counts into a step, and a last, fresh batch of streams
+gives the bias, slope and scatter of that very estimator (simulated method of moments: McFadden, Econometrica 57, 995,
+1989; Gourieroux, Monfort, Renault, J. Appl. Econometrics 8, S85, 1993). Counts are linear in the exposure, so streams
+may be shorter than the recording.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar._base.types import FloatArray
+from mars_lidar.calibration.cells import Cells
+from mars_lidar.calibration.model import Effect, Model
+from mars_lidar.calibration.recording import Recording
+
+SETTINGS = 32  # detectors of a batch
+LIGHTS = 8  # lights of each, in one call of the engine
+_SPREAD = 2.0  # of a batch about its centre, in standard errors of a stream of its own length
+_NEAR = 3.0  # the same of the last batches, in standard errors of the recording
+_SETTLED = 1.0  # standard errors that the last estimate may lie from the centre of its streams
+_LONGEST = 3.0  # of a move of that centre
+_FAR = 5.0  # standard errors that the centre may move before cells are laid anew
+_RECENTRED = 4  # last batches, at most
+_PULSES = 8  # widths of a batch
+_CUMULATED = 10.0  # intervals expected up to an edge, for a normal law of their number
+_DRAWS = 20_000  # of the law of the estimate, for its bounds
+
+
+@dataclass(frozen=True)
+class Effort:
+    """Photons of simulated streams.
+
+    `stream` least photons of each, `batch` photons of a batch at most and `share` of the recording's photons that a
+    batch has at least, below that bound; `first` photons of the recording that the first steps weigh.
+    """
+
+    stream: int = 2_000
+    batch: float = 4e6
+    share: float = 12.0
+    first: int = 8_000
+
+    def of(self, photons: float) -> int:
+        """Photons of each stream of a batch, for this many of the recording."""
+        number = SETTINGS * LIGHTS
+        wanted = max(self.stream, self.share * photons / number)
+        return int(min(photons, max(min(wanted, self.batch / number), 2.0 * photons / number)))
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """A linear law of the counts about a centre, for an exposure: offset (c,), slope (c, p), weight (c, c)."""
+
+    cells: Cells
+    centre: FloatArray
+    offset: FloatArray
+    slope: FloatArray
+    weight: FloatArray
+    counts: FloatArray  # (streams, c) in units of the exposure
+    residual: FloatArray
+    ratio: float  # exposure of the law over that of a simulated stream
+    theta: FloatArray
+
+    @property
+    def common(self) -> NDArray[np.bool_]:
+        """(c,) cells that are not too rare to have a normal law in streams this short."""
+        return np.asarray(self.offset > 2.0 * max(1.0, self.ratio / 4.0))
+
+    def estimator(self, free: NDArray[np.intp], prior: FloatArray | None = None) -> FloatArray:
+        """G (free, c), with an optional prior precision (free, free)."""
+        jacobian = self.slope[:, free]
+        information = jacobian.T @ self.weight @ jacobian
+        if prior is not None:
+            information = information + prior
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+        inverse = np.linalg.pinv(information * np.outer(scale, scale), rcond=1e-10) * np.outer(scale, scale)
+        return np.asarray(inverse @ jacobian.T @ self.weight)
+
+
+def counted(
+    model: Model, cells: Cells, rows: FloatArray, exposure: float, seed: int, extra: tuple[Effect, ...] = ()
+) -> FloatArray:
+    """Counts (rows, c) of simulated streams, one for each row of parameters; `LIGHTS` rows share a detector."""
+    return np.array(
+        [
+            cells(t)
+            for k in range(0, len(rows), LIGHTS)
+            for t in model.streams(rows[k : k + LIGHTS], max(2, round(exposure)), seed + k, extra)
+        ]
+    )
+
+
+def design(model: Model, centre: FloatArray, root: FloatArray, free: NDArray[np.intp], seed: int) -> FloatArray:
+    """Parameters (streams, p), normal of covariance root root' about the centre; `LIGHTS` rows share a detector."""
+    from scipy.stats import norm, qmc
+
+    cov = np.zeros((model.size, model.size))
+    cov[np.ix_(free, free)] = root @ root.T
+    lit, det = free[free < model.light], free[free >= model.light]
+
+    def normal(rows: int, columns: int, seed: int) -> FloatArray:
+        if columns == 0:
+            return np.zeros((rows, 0))
+        uniform = qmc.Sobol(columns, seed=seed).random_base2(int(np.ceil(np.log2(rows))))[:rows]
+        z = norm.ppf(0.002 + 0.996 * uniform)
+        z -= z.mean(0)
+        return np.asarray(z / z.std(0))
+
+    rows = np.tile(centre, (SETTINGS * LIGHTS, 1))
+    within = cov[np.ix_(lit, lit)]
+    if det.size:
+        between = cov[np.ix_(det, det)]
+        z = normal(SETTINGS, det.size, seed) @ _root(between).T
+        rows[:, det] += np.repeat(z, LIGHTS, 0)
+        rows = model.bounded(rows)
+        gain = cov[np.ix_(lit, det)] @ np.linalg.pinv(between, rcond=1e-10)
+        rows[:, lit] += (rows[:, det] - centre[det]) @ gain.T
+        within = within - gain @ cov[np.ix_(det, lit)]
+    rows[:, lit] += normal(len(rows), lit.size, seed + 1) @ _root(within).T
+    rows = model.bounded(rows)
+    rows[:, det] = np.repeat(rows[::LIGHTS, det], LIGHTS, 0)
+    return _few_pulses(model, rows) if model.light in det else rows
+
+
+def _few_pulses(model: Model, rows: FloatArray) -> FloatArray:
+    """Rows whose pulses are of `_PULSES` widths: the tables of a pulse cost as much as a stream."""
+    width2, jitter2 = rows[:, model.light], rows[:, model.light + 1]
+    sigma = np.sqrt(np.maximum(width2 - jitter2, 0.0))
+    order = np.argsort(sigma, kind="stable")
+    for part in np.array_split(order.reshape(-1, LIGHTS), _PULSES):
+        sigma[part] = sigma[part].mean()
+    out = rows.copy()
+    out[:, model.light] = sigma**2 + jitter2
+    return out
+
+
+def _root(cov: FloatArray) -> FloatArray:
+    """A root of a covariance that rounding may have made indefinite."""
+    scale = np.sqrt(np.maximum(np.diag(cov), 1e-300))
+    values, vectors = np.linalg.eigh(cov / np.outer(scale, scale))
+    return np.asarray(scale[:, None] * vectors * np.sqrt(np.maximum(values, 1e-9)))
+
+
+def regression(
+    cells: Cells,
+    theta: FloatArray,
+    centre: FloatArray,
+    counts: FloatArray,
+    ratio: float,
+    free: NDArray[np.intp],
+) -> Batch:
+    """The linear law of counts (streams, c), in units of an exposure `ratio` times as long as theirs."""
+    y = counts * ratio
+    x = (theta - centre)[:, free]
+    scale = np.maximum(np.abs(x).max(0), 1e-300)
+    terms = np.c_[np.ones(len(x)), x / scale]
+    inverse = np.linalg.pinv(terms.T @ terms)
+    fitted = inverse @ terms.T @ y
+    residual = y - terms @ fitted
+    freedom = len(y) - terms.shape[1]
+    # a cell that few streams reach has a variance of its own count at least, as Poisson's
+    variance = (residual**2).sum(0) / freedom / ratio
+    variance = np.maximum(variance, 0.25 * y.mean(0) + 0.5 / len(y))
+    strength = fitted[1:] ** 2 / (np.diag(inverse)[1:, None] * variance * ratio)
+    slope = np.zeros((y.shape[1], centre.size))
+    slope[:, free] = (fitted[1:] * np.maximum(0.0, 1.0 - 2.0 / np.maximum(strength, 1e-9)) / scale[:, None]).T
+    e = residual / np.sqrt(variance * ratio)
+    correlation = e.T @ e / freedom
+    off = correlation - np.diag(np.diag(correlation))
+    noise = (1.0 - correlation**2) / freedom
+    # Ledoit and Wolf, J. Multivar. Anal. 88, 365 (2004): shrinking to no correlation
+    shrink = np.clip((noise.sum() - np.trace(noise)) / max((off**2).sum(), 1e-9), 0.1, 0.95)
+    weight = np.linalg.inv((1.0 - shrink) * off + np.eye(len(off))) / np.sqrt(np.outer(variance, variance))
+    return Batch(cells, centre, fitted[0], slope, weight, y, residual, ratio, theta)
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """A fit that fresh streams have judged: parameters (p,), covariance of the free ones, misfit, and its law."""
+
+    model: Model
+    free: NDArray[np.intp]
+    theta: FloatArray
+    covariance: FloatArray
+    unbounded: FloatArray  # (p,) before the bounds of what a detector can have
+    unbounded_covariance: FloatArray
+    scatter: FloatArray  # (free, free) that of the estimator for the recording's exposure, simulations aside
+    batch: Batch  # cells and weights
+    offset: FloatArray  # (c,) expected counts at the centre of the last streams
+    estimator: FloatArray  # (free, c): parameters less that centre, by counts less their offset
+    jacobian: FloatArray  # (c, free)
+    left: FloatArray  # (c,) counts that the fit leaves
+    fresh: FloatArray  # (streams, c) the same of fresh streams, of the recording's exposure
+    misfit: float
+    misfit_z: float
+    p_value: float
+    converged: bool
+
+
+def physical(
+    model: Model, theta: FloatArray, covariance: FloatArray, free: NDArray[np.intp]
+) -> tuple[FloatArray, FloatArray]:
+    """Mean and covariance of a normal law within what a detector can have: jitter no wider than the recorded pulse."""
+    draw = draws(model, theta, covariance, free)
+    if draw is None:
+        return model.bounded(theta), covariance
+    return draw.mean(0), np.atleast_2d(np.cov(draw[:, free].T))
+
+
+def draws(model: Model, theta: FloatArray, covariance: FloatArray, free: NDArray[np.intp]) -> FloatArray | None:
+    """Parameters (n, p) of that law, or None where hardly any lies within the bounds."""
+    root = _root(covariance)
+    rows = np.tile(theta, (_DRAWS, 1))
+    rows[:, free] += np.random.default_rng(0).standard_normal((_DRAWS, len(free))) @ root.T
+    inside = (np.abs(model.bounded(rows) - rows)[:, free] <= 1e-12 * np.abs(theta[free])).all(1)
+    return rows[inside] if inside.sum() >= 200 else None
+
+
+class Fit:
+    """Gauss-Newton from a starting point to the whole recording, and the last batches."""
+
+    def __init__(self, recording: Recording, effort: Effort, seed: int) -> None:
+        self.recording, self.effort, self.seed = recording, effort, seed
+        self.calls = 0
+
+    def next_seed(self) -> int:
+        """A seed that no batch has had."""
+        self.calls += 1
+        return self.seed * 100_003 + self.calls * 1_009
+
+    def exposure(self, photons: float) -> float:
+        """Laser periods in which the recording has this many photons."""
+        return self.recording.exposure * photons / self.recording.photons
+
+    def cells(self, model: Model, theta: FloatArray, photons: float) -> Cells:
+        """Cells of a law for this many photons, by streams at `theta`."""
+        size = self.exposure(self.effort.of(photons))
+        pilot = model.streams(np.tile(theta, (LIGHTS, 1)), max(2, round(size)), self.next_seed())
+        return Cells(model, theta, [t for t in pilot if t.size > 2], photons)
+
+    def law(
+        self,
+        model: Model,
+        theta: FloatArray,
+        root: FloatArray,
+        free: NDArray[np.intp],
+        photons: float,
+        cells: Cells | None = None,
+        spread: float = _SPREAD,
+        before: Batch | None = None,
+    ) -> Batch:
+        """The linear law of counts about `theta` for an exposure of this many photons; with those of `before`."""
+        cells = self.cells(model, theta, photons) if cells is None else cells
+        rows = design(model, theta, spread * (photons / self.effort.of(photons)) ** 0.5 * root, free, self.next_seed())
+        exposure = max(2, round(self.exposure(self.effort.of(photons))))
+        made = counted(model, cells, rows, exposure, self.next_seed())
+        if before is not None:
+            made, rows = np.r_[made, before.counts / before.ratio], np.r_[rows, before.theta]
+        return regression(cells, rows, theta, made, self.exposure(photons) / exposure, free)
+
+    def steps(
+        self,
+        model: Model,
+        theta: FloatArray,
+        root: FloatArray,
+        free: NDArray[np.intp],
+        photons: float,
+        rounds: int,
+        first: float = 0.0,
+    ) -> tuple[FloatArray, FloatArray, float, bool]:
+        """Steps that weigh ever more photons, up to `photons`; parameters, root, misfit a cell, whether it settled."""
+        weighed = float(min(photons, max(first, self.effort.first)))
+        total = float(self.recording.photons)
+        misfit, near = np.inf, False
+        for _ in range(rounds):
+            law = self.law(model, theta, root, free, weighed)
+            seen = law.cells.of(self.recording) * (weighed / total)
+            prior = np.asarray(np.linalg.inv(root @ root.T) / 36.0, np.float64)
+            gain = law.estimator(free, prior)
+            step = gain @ (seen - law.offset)
+            scatter = law.residual @ gain.T
+            cov = scatter.T @ scatter / (len(scatter) - len(free) - 1) / law.ratio
+            full = law.slope[:, free].T @ law.weight @ law.slope[:, free] + prior
+            inverse = np.linalg.inv(full)
+            cov = cov + inverse @ prior @ inverse
+            size = float(np.sqrt(max(float(step @ prior @ step) * 9.0, 0.0) / len(step)))
+            step = step / max(1.0, size / 2.0)
+            moved = theta.copy()
+            moved[free] += step
+            theta = physical(model, moved, cov, free)[0]
+            rest = seen - law.offset - law.slope[:, free] @ step
+            misfit = float(rest @ law.weight @ rest / len(rest)) if size <= 2.0 else np.inf
+            near = size < (0.6 if weighed >= photons else 1.5)
+            grown = min(photons, weighed * 6.0) if near else weighed
+            cov = cov * (weighed / grown)
+            sd = np.sqrt(np.diag(cov))
+            root = _root(cov + np.diag((0.02 * sd) ** 2))
+            if near and weighed >= photons:
+                break
+            weighed = grown
+        return theta, root, misfit, near and weighed >= photons
+
+    def finish(
+        self,
+        model: Model,
+        theta: FloatArray,
+        root: FloatArray,
+        free: NDArray[np.intp],
+        converged: bool,
+        again: bool = True,
+    ) -> Fitted:
+        """The last estimate, and what fresh streams about it say of its slope, bias, scatter and misfit."""
+        photons = float(self.recording.photons)
+        first = self.law(model, theta, root, free, photons)
+        law = self.law(model, theta, root, free, photons, first.cells, before=first)
+        gain = law.estimator(free)
+        seen = law.cells.of(self.recording)
+        centre, size = theta, np.zeros(len(free))
+        for trial in range(_RECENTRED):
+            near = self.law(model, centre, root, free, photons, law.cells, spread=_NEAR / law.ratio**0.5)
+            y = near.counts  # of streams near the estimate, in the recording's exposure
+            moved = (near.theta - centre)[:, free]
+            terms = np.c_[np.ones(len(y)), moved]
+            slope, *_ = np.linalg.lstsq(terms, (y - near.offset) @ gain.T, rcond=None)
+            local = slope[1:].T
+            estimator = np.linalg.pinv(local) @ gain
+            rest = (y - near.offset) @ estimator.T - moved
+            scatter = np.cov(rest.T).reshape(len(free), len(free))
+            cov = scatter * (1.0 / law.ratio + 1.0 / len(y))
+            raw = centre.copy()
+            raw[free] += estimator @ (seen - near.offset) - rest.mean(0)
+            mean, truncated = physical(model, raw, cov, free)
+            size = np.abs((mean - centre)[free]) / np.sqrt(np.diag(cov))
+            if size.max() < _SETTLED or trial == _RECENTRED - 1:
+                break
+            centre = centre + (mean - centre) / max(1.0, float(size.max()) / _LONGEST)
+        sd = np.sqrt(np.diag(cov))
+        if again and (np.abs((centre - theta)[free]) > _FAR * sd).any():  # cells and weights were laid elsewhere
+            return self.finish(model, centre, _root(cov), free, converged, again=False)
+        jacobian = law.slope[:, free] @ local
+        project = np.eye(len(seen)) - jacobian @ estimator
+        fresh = near.residual @ project.T
+        fresh = (fresh - fresh.mean(0)) / np.sqrt(law.ratio) * np.sqrt(len(y) / (len(y) - terms.shape[1]))
+        left = project @ (seen - near.offset)
+        misfit, z, p = _misfit(left, fresh, law, near)
+        return Fitted(
+            model=model,
+            free=free,
+            theta=mean,
+            covariance=truncated,
+            unbounded=raw,
+            unbounded_covariance=cov,
+            scatter=scatter / law.ratio,
+            batch=law,
+            offset=near.offset,
+            estimator=estimator,
+            jacobian=jacobian,
+            left=left,
+            fresh=fresh,
+            misfit=misfit,
+            misfit_z=z,
+            p_value=p,
+            converged=converged and bool(size.max() < _LONGEST),
+        )
+
+
+def _misfit(left: FloatArray, fresh: FloatArray, law: Batch, near: Batch) -> tuple[float, float, float]:
+    """Weighed square of the counts that the fit leaves, its standard deviations above fresh streams', probability.
+
+    The probability is that of two tests together: the weighed square of all cells, and the largest departure of the
+    cumulated intervals, which sees a few missing or early intervals at the edge of the dead time.
+    """
+    from scipy.stats import gamma, norm
+
+    used = law.common
+    noise = 1.0 + law.ratio / len(near.counts)
+    weight = law.weight[np.ix_(used, used)]
+    drawn = np.einsum("ki,ij,kj->k", fresh[:, used], weight, fresh[:, used])
+    mine = float(left[used] @ weight @ left[used]) / noise
+    shape = drawn.mean() ** 2 / drawn.var()
+    square = float(gamma.sf(mine, shape, scale=drawn.mean() / shape))
+    gaps = slice(law.cells.phases, law.cells.phases + law.cells.gap_edges.size)
+    enough = np.cumsum(near.offset[gaps]) > _CUMULATED
+    departure = np.abs(np.cumsum(left[gaps])) / (np.cumsum(fresh[:, gaps], axis=1).std(0) * noise**0.5)
+    most = float(departure[enough].max(initial=0.0))
+    edge = float(min(1.0, 2.0 * enough.sum() * norm.sf(most)))
+    return mine, float((mine - drawn.mean()) / drawn.std()), min(1.0, 2.0 * min(square, edge))

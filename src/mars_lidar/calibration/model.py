@@ -1,0 +1,223 @@
+"""The model of a recorded stream: light and detector as a vector of parameters, and streams drawn at it."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from mars_lidar._base.types import FloatArray
+from mars_lidar.calibration.recording import Clock
+from mars_lidar.instrument.avalanches import Afterpulsing
+from mars_lidar.instrument.detector import Detector
+from mars_lidar.instrument.effects import Jitter
+from mars_lidar.instrument.pulse import GaussianPulse, Pulse
+from mars_lidar.instrument.system import System
+from mars_lidar.light.flux import Flux
+from mars_lidar.simulation import simulate_timestamps
+
+_NARROWEST = 2e-6  # periods: the narrowest pulse that the engines draw
+_WIDEST = 0.3  # sigma of a recorded pulse, periods: a wider one is hardly told from background
+_WIDEST_JITTER = 0.0499  # periods: the widest that `Jitter` takes
+_DELAYS = (0.4, 0.8, 1.6, 3.2, 6.4)  # dead times: delays of afterpulses that are tried
+_MOST_CARRIERS = 0.95  # of an avalanche
+Fields = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Effect:
+    """What a detector may do beside dead time and jitter.
+
+    `names` of its parameters, each an option of the detector; `start` values that a test for it tries; `most` the
+    largest ones; `apply` makes the fields of a `Detector` with it; `words` for a table;
+    `delay_ns` that of afterpulses, one of a grid; `onoff` where it has no size.
+    """
+
+    names: tuple[str, ...]
+    start: tuple[float, ...]
+    least: tuple[float, ...]
+    most: tuple[float, ...]
+    apply: Callable[[Fields, tuple[float, ...]], Fields]
+    words: str
+    delay_ns: float = float("nan")
+    onoff: bool = False
+
+
+def all_carriers(after: float, delay_ns: float, dead_time_ns: float) -> float:
+    """Carriers of an avalanche of which `after` outlive its dead time; fewer than one, as `Afterpulsing` has it."""
+    return float(min(after * np.exp(min(dead_time_ns / delay_ns, 50.0)), _MOST_CARRIERS))
+
+
+def effects(dead_time_ns: float) -> tuple[Effect, ...]:
+    """Effects that are looked for in a stream of a detector with this dead time."""
+    dead = dead_time_ns
+
+    def afterpulses(delay: float) -> Callable[[Fields, tuple[float, ...]], Fields]:
+        def apply(fields: Fields, value: tuple[float, ...]) -> Fields:
+            if value[0] < 1e-7:
+                return fields
+            carriers = all_carriers(value[0], delay, fields["dead_time_ns"])
+            return fields | {"afterpulsing": Afterpulsing(probability=carriers, delay_ns=delay)}
+
+        return apply
+
+    def electronics(fields: Fields, value: tuple[float, ...]) -> Fields:
+        observed = fields["dead_time_ns"]  # that of the electronics, over a detector that is ready earlier
+        return fields | {"electronics_dead_time_ns": observed, "dead_time_ns": observed / (1.0 + value[0])}
+
+    listed = [
+        Effect(
+            ("afterpulse_probability",), (0.03,), (0.0,), (0.5,), afterpulses(scale * dead), "afterpulses", scale * dead
+        )
+        for scale in _DELAYS
+    ]
+    return (
+        *listed,
+        Effect(
+            ("twilight_ns",),
+            (min(1.0, 0.2 * dead),),
+            (0.0,),
+            (dead,),
+            lambda fields, value: fields | {"twilight_ns": min(value[0], fields["dead_time_ns"])},
+            "twilight pulses",
+        ),
+        Effect(
+            ("recovery_ns",),
+            (0.03 * dead,),
+            (0.0,),
+            (2.0 * dead,),
+            lambda fields, value: fields | {"recovery_ns": value[0]},
+            "slow recovery",
+        ),
+        Effect(
+            ("electronics_excess",),
+            (0.25,),
+            (0.0,),
+            (19.0,),
+            electronics,
+            "electronics with a dead time of their own",
+        ),
+        Effect(
+            ("paralyzable",),
+            (1.0,),
+            (0.0,),
+            (1.0,),
+            lambda fields, value: fields | ({"mode": "paralyzable"} if value[0] > 0.5 else {}),
+            "paralyzable detector",
+            onoff=True,
+        ),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """Parameters, in this order: background, (signal, delay) of each return, width2, jitter2, dead time, effects.
+
+    Photons a period, ns and ns^2. `width2` is the variance of the recorded pulse, jitter included. With a `waveform`
+    (shares of the light in equal parts of the period, jitter not included) there is no return, and the background is
+    all light. With a `pulse` its shape is known, before any jitter, and `width2` means nothing.
+    """
+
+    clock: Clock
+    returns: int
+    pulse: Pulse | None = None
+    waveform: FloatArray | None = None
+    effects: tuple[Effect, ...] = ()
+    fields: tuple[tuple[str, Any], ...] = ()  # of the detector, as given
+
+    @property
+    def gaussian(self) -> bool:
+        """Whether the pulse is a Gaussian of unknown width."""
+        return self.pulse is None and self.waveform is None and self.returns > 0
+
+    @property
+    def light(self) -> int:
+        """Parameters of the light that a call of the engine varies from stream to stream."""
+        return 1 + 2 * self.returns
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of all parameters."""
+        several = self.returns > 1
+        light = [
+            f"{name}{f'_{k + 1}' if several else ''}" for k in range(self.returns) for name in ("signal", "delay_ns")
+        ]
+        more = [name for effect in self.effects for name in effect.names]
+        return ("background", *light, "width2", "jitter2", "dead_time_ns", *more)
+
+    @property
+    def size(self) -> int:
+        """Number of parameters."""
+        return self.light + 3 + sum(len(effect.names) for effect in self.effects)
+
+    def bounded(self, theta: FloatArray) -> FloatArray:
+        """Parameters (..., p) within what a detector can have."""
+        out = np.array(theta, float)
+        k = self.light
+        out[..., 0] = np.maximum(out[..., 0], 1e-7)
+        for r in range(self.returns):
+            out[..., 1 + 2 * r] = np.maximum(out[..., 1 + 2 * r], 0.0)
+        widths = np.array([_NARROWEST, _WIDEST]) * self.clock.period_ns
+        out[..., k] = np.clip(out[..., k], *(widths**2))
+        most = np.full_like(out[..., k], (_WIDEST_JITTER * self.clock.period_ns) ** 2)
+        if self.gaussian:
+            most = np.minimum(most, out[..., k])
+        out[..., k + 1] = np.clip(out[..., k + 1], 0.0, most)
+        out[..., k + 2] = np.maximum(out[..., k + 2], 0.0)
+        at = k + 3
+        for effect in self.effects:
+            for low, high in zip(effect.least, effect.most, strict=True):
+                out[..., at] = np.clip(out[..., at], low, high)
+                at += 1
+        return out
+
+    def system(self, theta: FloatArray, cycles: int, bins: int = 16, extra: tuple[Effect, ...] = ()) -> System:
+        """The instrument of parameters (p,), with further effects at their starting values."""
+        k = self.light
+        theta = self.bounded(theta)
+        width2, jitter2 = float(theta[k]), float(theta[k + 1])
+        fields: Fields = dict(self.fields) | {"dead_time_ns": float(theta[k + 2])}
+        at = k + 3
+        for effect in self.effects:
+            fields = effect.apply(fields, tuple(map(float, theta[at : at + len(effect.names)])))
+            at += len(effect.names)
+        for effect in extra:
+            fields = effect.apply(fields, effect.start)
+        least = _NARROWEST * self.clock.period_ns
+        if jitter2 > least**2:
+            fields["jitter"] = Jitter(sigma_ns=jitter2**0.5)
+        pulse = self.pulse or GaussianPulse(sigma_ns=float(f"{max(max(width2 - jitter2, 0.0) ** 0.5, least):.9g}"))
+        return System(
+            period_ns=self.clock.period_ns, cycles=cycles, bins=bins, pulse=pulse, detector=Detector(**fields)
+        )
+
+    def flux(self, rows: FloatArray) -> Flux:
+        """Light (1, rows) of parameters (rows, p)."""
+        rows = self.bounded(np.atleast_2d(rows))
+        if self.waveform is not None:
+            return Flux(waveform=(rows[:, :1] * self.waveform)[None])
+        back = rows[None, :, 0]
+        if self.returns == 0:
+            return Flux(np.zeros_like(back), back, np.zeros_like(back))
+        period = self.clock.period_ns
+        signal = np.stack([rows[None, :, 1 + 2 * r] for r in range(self.returns)])
+        delay = np.stack([rows[None, :, 2 + 2 * r] % period for r in range(self.returns)])
+        return Flux(signal, back, delay) if self.returns > 1 else Flux(signal[0], back, delay[0])
+
+    def streams(self, rows: FloatArray, cycles: int, seed: int, extra: tuple[Effect, ...] = ()) -> list[FloatArray]:
+        """Recorded times of a stream for each row of (rows, p); the detector is that of the first row."""
+        rows = np.atleast_2d(rows)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # a trial value may look like one in another unit
+            system = self.system(rows[0], cycles, extra=extra)
+            made = simulate_timestamps(self.flux(rows), system, seed=seed, threads=1)
+        t, at = made.times_ns, made.offsets
+        return [self.clock.record(t[a:b]) for a, b in pairwise(at)]
+
+    def with_effect(self, effect: Effect) -> Model:
+        """This model with one effect more."""
+        return replace(self, effects=(*self.effects, effect))

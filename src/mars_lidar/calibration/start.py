@@ -1,0 +1,189 @@
+"""Where the fit begins: light with the dead time taken off, and a dead time for each of several jitters."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mars_lidar._base.types import FloatArray
+from mars_lidar.calibration.fit import LIGHTS, Fit
+from mars_lidar.calibration.model import Model
+from mars_lidar.calibration.recording import Recording
+
+_SHARES = (0.0, 0.03, 0.1, 0.3, 0.6, 0.9, 0.99)  # of the recorded width that may be jitter
+_MOST_BINS = 2**14
+
+
+def free_light(t: FloatArray, period: float, hold: float, bins: int) -> tuple[FloatArray, FloatArray]:
+    """Registrations and passes while armed (bins,) over the period, from `hold` after each registration on.
+
+    Their ratio is the light, photons a period in each bin, whatever its shape and whatever the dead time.
+    """
+    a = np.floor((t[:-1] + hold) * (bins / period)).astype(np.int64)
+    b = np.floor(t[1:] * (bins / period)).astype(np.int64)
+    late = b > a
+    a, b = a[late], b[late]
+    hits = np.bincount(b % bins, minlength=bins)
+    first, length = (a + 1) % bins, b - a
+    change = np.bincount(first, minlength=2 * bins + 1) - np.bincount(first + length % bins, minlength=2 * bins + 1)
+    passes = np.cumsum(change)[: 2 * bins]
+    return hits.astype(float), (passes[:bins] + passes[bins:] + (length // bins).sum()).astype(float)
+
+
+def light(t: FloatArray, model: Model, hold: float) -> FloatArray:
+    """Background, signal and delay of each return, and variance of the recorded pulse, by matched filters."""
+    period, unit = model.clock.period_ns, model.clock.unit_ns
+    bins = int(np.clip(period / max(unit, 1e-9), 64, _MOST_BINS))
+    hits, passes = free_light(t, period, hold, bins)
+    rate = hits / np.maximum(passes, 1.0)
+    cell = period / bins
+    place = (np.arange(bins) + 0.5) * cell
+    outside = np.ones(bins, bool)
+    faint = max(float(np.median(rate)), 0.3 * hits.sum() / max(passes.sum(), 1.0))
+    found, variance = [], 0.0
+    for _ in range(model.returns):
+        best = (-np.inf, 0, 1)
+        masked_hits, masked_passes = np.where(outside, hits, faint * passes), passes
+        for m in np.unique(np.round(1.5 ** np.arange(30)).astype(int)):  # boxes of every width
+            if m > bins // 4:
+                break
+            sums = [np.cumsum(np.r_[0.0, x, x[: m - 1]]) for x in (masked_hits, masked_passes)]
+            inside, armed = (c[m:] - c[:-m] for c in sums)
+            z = (inside - faint * armed) / np.sqrt(inside + 1.0)
+            best = max(best, (float(z.max()), int(z.argmax()), int(m)))
+        _, at, m = best
+        peak, least = (at + m / 2) * cell, max(0.8 * m, 2) * cell
+        reach = 1.6 * least
+        for _ in range(4):
+            off = (place - peak + period / 2) % period - period / 2
+            inside = np.abs(off) < reach
+            rest = outside & ~inside
+            faint = max(float(np.median(rate[rest])), float(hits[rest].sum() / max(passes[rest].sum(), 1.0)))
+            extra = (rate - faint)[inside & outside]
+            near = off[inside & outside]
+            signal = max(float(extra.sum()), 1e-4)
+            mean = float(np.clip((extra * near).sum() / signal, -reach, reach))
+            var = max(float((extra * (near - mean) ** 2).sum() / signal), (0.2 * m * cell) ** 2)
+            peak += mean
+            reach = float(np.clip(4.5 * np.sqrt(var), least, 0.3 * period))
+        outside &= ~inside
+        found += [signal, peak % period]
+        variance = variance or var
+    own = max(variance - unit**2 / 12, 0.0025 * variance, (0.15 * unit) ** 2)
+    back = max(faint * bins if model.returns else float(rate.sum()), 1e-5)
+    return np.array([back, *found, own])
+
+
+def starts(fit: Fit, recording: Recording, model: Model, fixed: dict[str, float]) -> list[tuple[float, FloatArray]]:
+    """(misfit, parameters), the best first: for jitters from none to all of the recorded width."""
+    names = model.names
+    k = model.light
+    photons = min(recording.photons, fit.effort.first)
+    t = recording.pieces[0]
+    t = t[: 12 * photons]
+    low = np.sort(np.diff(t))
+    n = low.size
+    ranks = np.unique(np.minimum([1, 5, 20, max(30, n // 500), max(60, n // 100), max(120, n // 30)], n - 1))
+    observed = low[ranks]
+    hold = observed[-3] + 3 * (observed[-3] - observed[0]) + 2 * model.clock.unit_ns
+    hold = max(hold, fixed.get("dead_time_ns", 0.0) + 2 * model.clock.unit_ns)
+    if model.returns == 0:
+        total = float(free_waveform(recording, 64)[0].sum())
+        first = np.array([total, max((observed[-3] - observed[0]) / 4, 0.3 * model.clock.unit_ns) ** 2])
+    else:
+        first = light(t, model, hold)
+    found = []
+    cycles = max(2, round(fit.exposure(photons)))
+    for share in _SHARES:
+        theta = np.zeros(model.size)
+        theta[: k + 1] = first
+        for name, value in fixed.items():
+            theta[names.index(name)] = value
+        jitter2 = fixed.get("jitter2", share * theta[k])
+        theta[k + 1] = jitter2
+        theta[k + 2] = fixed.get("dead_time_ns", max(observed[0], 0.05 * observed[-1]) + 2 * np.sqrt(jitter2))
+        at = k + 3
+        for effect in model.effects:
+            for name, value in zip(effect.names, effect.start, strict=True):
+                theta[at] = fixed.get(name, value)
+                at += 1
+        if "dead_time_ns" not in fixed:
+            theta = with_edge(fit, model, theta, low)
+        cells = fit.cells(model, theta, photons)
+        rows = np.array([cells(x) for x in model.streams(np.tile(theta, (LIGHTS, 1)), cycles, fit.next_seed())])
+        seen = cells.of(recording) * (photons / recording.photons)
+        r = (2 * np.sqrt(seen + 0.375) - 2 * np.sqrt(rows + 0.375).mean(0)) ** 2
+        found.append((float(r.sum()), theta))
+        if "jitter2" in fixed:
+            break
+    return sorted(found, key=lambda pair: pair[0])
+
+
+def with_edge(fit: Fit, model: Model, theta: FloatArray, low: FloatArray) -> FloatArray:
+    """Parameters with the dead time at which simulated streams have the smallest intervals of `low` (n,), sorted."""
+    n, k = low.size, model.light
+    ranks = np.unique(np.minimum([1, 5, 20, max(30, n // 500), max(60, n // 100), max(120, n // 30)], n - 1))
+    observed = low[ranks]
+    cycles = max(2, round(fit.exposure(min(fit.recording.photons, fit.effort.first))))
+    for _ in range(4):
+        streams = model.streams(np.tile(theta, (4, 1)), cycles, fit.next_seed())
+        made = np.sort(np.concatenate([np.diff(x) for x in streams]))
+        here = made[np.minimum((ranks / n * made.size).astype(int), made.size - 1)]
+        theta = theta.copy()
+        theta[k + 2] = max(theta[k + 2] + float((observed - here)[1:-1].mean()), 0.05 * observed[0])
+    return theta
+
+
+def first_spread(model: Model, theta: FloatArray) -> FloatArray:
+    """Standard deviations (p,) of the first batch about a start."""
+    unit, k = model.clock.unit_ns, model.light
+    width = float(np.sqrt(theta[k] + unit**2 / 12))
+    out = np.zeros(model.size)
+    out[0] = 0.15 * theta[0]
+    for r in range(model.returns):
+        out[1 + 2 * r] = 0.1 * theta[1 + 2 * r] + 0.02 * theta[0]
+        out[2 + 2 * r] = 0.3 * width
+    out[k] = 0.3 * width**2
+    out[k + 1] = 0.25 * theta[k]
+    out[k + 2] = 0.3 * width + 0.5 * unit
+    at = k + 3
+    for effect in model.effects:
+        for value in effect.start:
+            out[at] = 0.4 * max(value, abs(theta[at]))
+            at += 1
+    return out
+
+
+def safe_hold(recording: Recording) -> float:
+    """Time after a registration, ns, from which on the pixel is armed: past the edge of the intervals."""
+    gaps = np.sort(np.concatenate([np.diff(piece) for piece in recording.pieces]))
+    low, edge = gaps[min(1, gaps.size - 1)], gaps[max(30, gaps.size // 500) % gaps.size]
+    return float(edge + 3.0 * (edge - low) + 2.0 * recording.clock.unit_ns)
+
+
+def free_waveform(recording: Recording, most: int) -> tuple[FloatArray, FloatArray]:
+    """Light (bins,) in photons per period and bin, and its standard errors, dead time removed, whatever its shape."""
+    period, unit = recording.period_ns, recording.clock.unit_ns
+    units = round(period / unit) if unit else 0
+    bins = most
+    if units and abs(period / unit - units) < 1e-3:  # whole units in each bin
+        bins = max((n for n in range(1, most + 1) if units % n == 0), default=1)
+        bins = bins if bins >= most // 8 else most
+    hold = safe_hold(recording)
+    hits, passes = np.zeros(bins), np.zeros(bins)
+    for piece in recording.pieces:
+        more = free_light(piece, period, hold, bins)
+        hits, passes = hits + more[0], passes + more[1]
+    passes = np.maximum(passes, 1.0)
+    return np.maximum(hits, 1e-3) / passes, np.sqrt(hits + 1.0) / passes
+
+
+def brightest_window(recording: Recording) -> float:
+    """Standard deviations by which the brightest window of the period exceeds the median light."""
+    rate, error = free_waveform(recording, 512)
+    faint = float(np.median(rate))
+    variance, best = error**2, -np.inf
+    for m in (1, 2, 4, 8, 16, 32, 64):
+        inside = sum(np.roll(rate, -k) for k in range(m)) - m * faint
+        noise = np.sqrt(sum(np.roll(variance, -k) for k in range(m)))
+        best = max(best, float((inside / noise).max()))
+    return best

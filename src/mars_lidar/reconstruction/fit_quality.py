@@ -1,0 +1,66 @@
+"""Goodness of fit of reconstructed pixels: does each histogram agree with the law of its own estimate?
+
+`native/reconstruct/fit_quality.h` computes the statistics of each pixel: docs/theory_reconstruction.md, section 8.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mars_lidar._base.types import FloatArray
+from mars_lidar.instrument.system import System
+from mars_lidar.reconstruction.histogram_record import recording_of
+
+if TYPE_CHECKING:
+    from mars_lidar._base.native import _core
+
+FALSE_ALARM = 1e-3  # of `Flags.MISFIT`, a pixel
+COLUMNS = 5  # of the native statistics of a pixel
+_DEAD_TIME = 1.2  # factor of the dead times, longer and shorter, ...
+_WIDTH = 1.1  # ... and of the pulse whose score is computed
+
+
+def tested_recordings(system: System) -> list[_core.HistogramRecord]:
+    """The changes whose scores are computed, longer, shorter, wider; none where armed passes do not follow.
+
+    They do where the detector is free-running, without a gate, and exposed for much longer than its dead time.
+    """
+    if system.detector.mode != "nonparalyzable" or system.cycles <= 4.0 * max(1.0, system.dead_time_periods):
+        return []
+    return [
+        recording_of(system, longer=_DEAD_TIME),
+        recording_of(system, longer=1.0 / _DEAD_TIME),
+        recording_of(system, wider=_WIDTH),
+    ]
+
+
+@dataclass(frozen=True, eq=False)
+class Quality:
+    """Four tests of each pixel (pixels,) and their common p-value; NaN where there are too few photons.
+
+    `chi2` of pooled cells with `freedom` degrees; `longer`, `shorter` and `wider` in standard deviations: positive
+    where a longer or a shorter dead time, a wider pulse would fit better.
+    """
+
+    chi2: FloatArray
+    freedom: FloatArray
+    longer: FloatArray
+    shorter: FloatArray
+    wider: FloatArray
+    p_value: FloatArray
+
+
+def quality_of(statistics: FloatArray) -> Quality:
+    """From the native statistics (pixels, 5)."""
+    from scipy.special import gammaincc, ndtr
+
+    chi2, freedom, longer, shorter, wider = np.ascontiguousarray(statistics.T)
+    scores = [2.0 * ndtr(-np.abs(wider)), ndtr(-longer), ndtr(-shorter)]
+    each = np.stack([gammaincc(0.5 * np.maximum(freedom, 1.0), 0.5 * chi2), *scores])
+    tests = (~np.isnan(each)).sum(0)
+    least = np.where(np.isnan(each), np.inf, each).min(0)
+    p_value = np.where(np.isnan(chi2), np.nan, np.minimum(1.0, np.maximum(tests, 1) * least))
+    return Quality(chi2, freedom, longer, shorter, wider, p_value)

@@ -1,0 +1,227 @@
+"""How well depth and flux can be known: the Cramer-Rao bound, and the errors of linear window estimates."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked
+from mars_lidar._base.brief import brief
+from mars_lidar._base.types import FloatArray
+from mars_lidar.instrument.detector import require_effects
+from mars_lidar.instrument.effects import LIGHT_EFFECTS
+from mars_lidar.instrument.system import System
+from mars_lidar.light.flux import Flux
+from mars_lidar.reconstruction.histogram_record import core_ns, open_bins, relative_width
+
+_SINGULAR = 1e-11  # of the largest eigenvalue, all of size 1 to 3: rounding of the sums over the bins is 1e-15 of it
+_WAVEFORM_PARTS = 8  # of a bin, in which the light of several returns is taken as even
+
+
+@dataclass(frozen=True, eq=False)
+class HistogramBound:
+    """Cramer-Rao bound of (S, B, delay) for pixels of shape (...).
+
+    Attributes
+    ----------
+    information
+        (..., 3, 3) Fisher information of (S, B, delay in ns); of several returns (2 K + 1, 2 K + 1) of (all S, B, all
+        delays).
+    signal, background, delay_ns, depth_m
+        (...) least standard deviations of unbiased estimates; inf where nothing is known of them. Of several returns
+        (K,), but for the background.
+    """
+
+    information: FloatArray
+    signal: FloatArray
+    background: FloatArray
+    delay_ns: FloatArray
+    depth_m: FloatArray
+
+    __repr__ = brief
+
+
+@checked
+def cramer_rao(flux: Flux, system: System, *, threads: int | None = None) -> HistogramBound:
+    """Least standard deviations of S, B and depth from a histogram, whatever the method.
+
+    The information of registrations at the rate l_j in the armed time of bin j is that of a Poisson process,
+    ``I = sum_j E[D_j] (dl_j)(dl_j)' / l_j``, with E[D_j] = E[h_j] / l_j the mean armed time; a bin that hides the times
+    inside of it keeps the fraction (x / sinh x)^2 of that, x = l_j / 2 (R18). The armed time is taken as known: the
+    information that the ends of the exposure hide is not subtracted (docs/theory_reconstruction.md, section 3).
+
+    Parameters
+    ----------
+    flux
+        One return and background > 0 in each pixel (...).
+    system
+        Detectors of mode nonparalyzable, synchronous, or gated with a gate that stays, without effects beyond detection
+        efficiency and dark counts.
+    threads
+        As `exposure_moments`.
+
+    See Also
+    --------
+    reconstruct
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> bound = ml.cramer_rao(ml.Flux(signal=1.0, background=1.0, delay_ns=40.0), system)
+    >>> round(1000 * float(bound.depth_m), 1)  # mm
+    8.2
+    """
+    from mars_lidar.reconstruction.maximum_likelihood import MaximumLikelihood
+    from mars_lidar.statistics import mean_histogram
+
+    if not isinstance(system, System):
+        raise TypeError(f"system must be a System, got {type(system).__name__}")
+    MaximumLikelihood().check(system)
+    require_effects("cramer_rao", system.detector, LIGHT_EFFECTS, _simulate_instead)
+    if len(flux.returns_signal) != 1:
+        raise ValueError("flux must have one return in each pixel; several returns of one pixel have `returns_bound`")
+    s, b, tau = flux.signal, flux.background, flux.delay_ns
+    if not (b > 0).all():
+        raise ValueError(f"background must be > 0, got {b[~(b > 0)].flat[0]}")
+    if not np.isfinite(tau).all():
+        raise ValueError(f"delay_ns must be finite, got {tau[~np.isfinite(tau)].flat[0]}")
+    mean = mean_histogram(flux, system, threads=threads)
+    energy, slope, share = _pulse_bins(system, tau)
+    information = _information(system, mean, s[..., None, None], b, energy[..., None, :], slope[..., None, :], share)
+    deviation = np.sqrt(_inverse_diagonal(information))
+    of_signal, of_background, of_delay = np.moveaxis(deviation, -1, 0)
+    return HistogramBound(information, of_signal, of_background, of_delay, system.depth_m(of_delay))
+
+
+@checked
+def returns_bound(flux: Flux, system: System, *, threads: int | None = None) -> HistogramBound:
+    """Least standard deviations of every return of one pixel that has several, each with an unknown S and delay.
+
+    As `cramer_rao`, for the K returns of a pixel (`Flux.multi`): those that overlap are known less well than alone.
+    """
+    from mars_lidar.reconstruction.maximum_likelihood import MaximumLikelihood
+    from mars_lidar.statistics import mean_histogram
+    from mars_lidar.statistics.cells import one_pixel
+
+    MaximumLikelihood().check(system)
+    require_effects("returns_bound", system.detector, LIGHT_EFFECTS, _simulate_instead)
+    pixel = one_pixel(flux)
+    s, tau, back = pixel.returns_signal, pixel.returns_delay_ns, pixel.background
+    if not (s.size and np.isfinite(tau).all() and back > 0):
+        raise ValueError("flux must have returns with delays, and background > 0")
+    edges = np.linspace(0.0, system.period_ns, system.bins * _WAVEFORM_PARTS + 1)
+    waves = [np.diff(system.pulse.wrapped_cumulative(edges - at, system.period_ns)) for at in tau]
+    wave = np.maximum(np.tensordot(s, np.array(waves), 1), 0.0)
+    mean = mean_histogram(Flux(waveform=wave, background=back), system, threads=threads)
+    energy, slope, share = _pulse_bins(system, tau)
+    information = _information(system, mean, s[:, None], back, energy, slope, share)
+    deviation = np.sqrt(_inverse_diagonal(information))
+    count = s.size
+    of_delay = deviation[count + 1 :]
+    return HistogramBound(information, deviation[:count], deviation[count], of_delay, system.depth_m(of_delay))
+
+
+def _information(
+    system: System,
+    mean: FloatArray,
+    signal: FloatArray,
+    background: FloatArray,
+    energy: FloatArray,
+    slope: FloatArray,
+    share: FloatArray,
+) -> FloatArray:
+    """(R18) of (all S, B, all delays) from S (..., K, 1), B (...), and energy and its slope (..., K, bins)."""
+    seen = system.detector.detection_efficiency  # of the photons; dark counts come on top of them
+    dark = 1e-9 * system.detector.dark_count_hz * system.period_ns
+    flat = share / system.bins
+    rate = seen * (signal * energy).sum(-2) + (seen * background[..., None] + dark) * flat
+    by_background = np.broadcast_to(flat, rate.shape)[..., None, :]
+    gradient = seen * np.concatenate([energy, by_background, signal * slope], axis=-2)
+    weight = np.where(rate > 0, mean / np.where(rate > 0, rate, 1.0) ** 2, 0.0)  # E[D] / l = E[h] / l^2
+    if system.detector.mode == "synchronous" or system.detector.dead_time_ns >= system.bin_ns:
+        x = np.clip(0.5 * rate, 1e-6, 300.0)
+        weight = weight * (x / np.sinh(x)) ** 2
+    return np.asarray(np.einsum("...j,...aj,...bj->...ab", weight, gradient, gradient))
+
+
+@checked
+def window_error(weights: ArrayLike, flux: Flux, system: System) -> tuple[FloatArray, FloatArray]:
+    """Mean and standard deviation (...) of linear estimates ``weights @ h`` (..., bins) under dead time.
+
+    Exact, by `joint_law`: bins of one histogram are not independent, so the Poisson error of a window is wrong
+    (docs/joint_law.md). For the estimates of signal that `MatchedFilter` and `Peak` take from windows, say.
+    """
+    from mars_lidar.statistics import joint_law
+
+    mean, variance = joint_law(flux, system).window(weights)
+    return mean, np.sqrt(variance)
+
+
+@checked
+def window_weights(system: System, delay_ns: float) -> FloatArray:
+    """Weights (bins,) with which `weights @ h` is the signal that a window around a delay gives (R16)."""
+    tau = checks.real("delay_ns", delay_ns)
+    energy, _, share = _pulse_bins(system, np.asarray(tau))
+    low, high = core_ns(system)
+    first, last = np.floor((tau + low) / system.bin_ns), np.ceil((tau + high) / system.bin_ns)
+    inside = np.zeros(system.bins, bool)
+    inside[np.arange(int(first), max(int(last), int(first) + 1)) % system.bins] = True
+    inside &= share > 0
+    outside = ~inside & (share > 0)
+    ratio = share[inside].sum() / share[outside].sum()
+    weights = np.where(inside, 1.0, np.where(outside, -ratio, 0.0))
+    return np.asarray(weights / (energy[inside].sum() * system.cycles), dtype=np.float64)
+
+
+def _pulse_bins(system: System, delay_ns: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Energy of the pulse in the open part of each bin (..., bins), its derivative by the delay (1/ns), open shares."""
+    low, high = open_bins(system)
+    if low.size == 0:
+        edges = np.arange(system.bins + 1) / system.bins
+        low, high = edges[:-1], edges[1:]
+    period, step = system.period_ns, 1e-4 * min(system.bin_ns, relative_width(system) * system.period_ns)
+
+    def energy_at(delay: FloatArray) -> FloatArray:
+        at = delay[..., None]
+        before = system.pulse.wrapped_cumulative(low * period - at, period)
+        return np.asarray(system.pulse.wrapped_cumulative(high * period - at, period) - before)
+
+    slope = (energy_at(delay_ns + step) - energy_at(delay_ns - step)) / (2.0 * step)
+    return np.maximum(energy_at(delay_ns), 0.0), slope, (high - low) * system.bins
+
+
+def _simulate_instead(_: str) -> str:
+    return ", and neither do the estimators: reconstruct simulated cubes (engine 'exact') to see their errors"
+
+
+def _inverse_diagonal(information: FloatArray) -> FloatArray:
+    """Diagonal of the inverse (..., n); what nothing is known of is inf and left out of the rest.
+
+    So is what cannot be told from something else: the signal from the background, say, in a single bin.
+    """
+    size = information.shape[-1]
+    flat = information.reshape(-1, size, size)
+    out = np.full((len(flat), size), np.inf)
+    for row, matrix in zip(out, flat, strict=True):
+        known = np.diag(matrix) > 0
+        if known.any():
+            row[known] = _variances(matrix[np.ix_(known, known)])
+    return out.reshape(information.shape[:-1])
+
+
+def _variances(information: FloatArray) -> FloatArray:
+    """Diagonal of the inverse of a matrix of positive diagonal, inf where a direction without information reaches."""
+    size = np.sqrt(np.diag(information))
+    value, vector = np.linalg.eigh(information / np.outer(size, size))
+    blank = value <= _SINGULAR * value[-1]
+    if not blank.any():
+        return np.asarray(np.diag(np.linalg.inv(information)))
+    seen = (vector[:, ~blank] ** 2 / value[~blank]).sum(-1) / size**2
+    return np.asarray(np.where((vector[:, blank] ** 2).sum(-1) > _SINGULAR, np.inf, seen))

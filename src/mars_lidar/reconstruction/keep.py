@@ -1,0 +1,85 @@
+"""Which of several returns of a pixel becomes its depth, and whether most first returns are one reflection."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar._base import checks
+from mars_lidar.reconstruction.method import Flags
+from mars_lidar.reconstruction.reconstruction import Reconstruction
+
+KEEP = ("strongest", "nearest", "farthest")
+_SAME_BINS = 3  # width of what counts as one place
+_MOSTLY = 0.5  # share of the pixels
+_EXCESS = 5.0  # standard deviations by which a later return rises above the median bin of the whole image
+
+
+def keep_return(
+    found: Reconstruction, keep: str = "strongest", from_ns: float = 0.0, attenuation: str = "none"
+) -> Reconstruction:
+    """The maps (...) of one return of each pixel, of those not nearer than `from_ns` after the laser pulse.
+
+    `found` was looked for with ``returns=2`` or more: an internal reflection is then a return of its own, whose counts
+    and dead time the likelihood accounts for, and is left out here. Pixels without a return there are flagged.
+    `attenuation` is that of the reconstruction; its level stays.
+    """
+    checks.choice("keep", keep, KEEP)
+    first = checks.real("from_ns", from_ns, low=0.0, high=found.system.period_ns)
+    every = found.returns
+    if every is None:
+        raise ValueError("keep and from_ns choose among several returns: reconstruct with returns=2 or more")
+    allowed = np.isfinite(every.delay_ns) & (every.delay_ns >= first)
+    order = {"strongest": every.signal, "nearest": -every.delay_ns, "farthest": every.delay_ns}[keep]
+    place = np.argmax(np.where(allowed, order, -np.inf), axis=-1)[..., None]
+    lacking = ~allowed.any(-1)
+
+    def chosen(values: NDArray[Any], without: float = math.nan) -> NDArray[Any]:
+        return np.where(lacking, without, np.take_along_axis(values, place, -1)[..., 0])
+
+    signal, depth = chosen(every.signal, 0.0), chosen(every.depth_m)
+    returned = signal * depth**2 if attenuation == "inverse_square" else signal
+    return replace(
+        found,
+        delay_ns=chosen(every.delay_ns),
+        depth_m=depth,
+        signal=signal,
+        reflectivity=np.nan_to_num(returned) / found.level,
+        delay_error_ns=chosen(every.delay_error_ns),
+        depth_error_m=chosen(every.depth_error_m),
+        signal_error=chosen(every.signal_error),
+        flags=np.where(lacking, found.flags | np.uint8(Flags.NO_SIGNAL), found.flags).astype(np.uint8),
+    )
+
+
+def common_delay(found: Reconstruction) -> tuple[float, float] | None:
+    """(share of the pixels, delay in ns) where more than half of the first returns stand in the same few bins."""
+    every = found.returns
+    first = found.delay_ns if every is None else np.where(every.count > 0, every.delay_ns[..., 0], np.nan)
+    delays = first[found.seen & np.isfinite(first)]
+    if delays.size < 2:
+        return None
+    bins, width = found.system.bins, found.system.bin_ns
+    counts = np.bincount((delays / width).astype(np.int64) % bins, minlength=bins)
+    together = np.sum([np.roll(counts, -k) for k in range(_SAME_BINS)], axis=0)
+    place = int(np.argmax(together))
+    share = float(together[place]) / delays.size
+    inside = (delays / width - place) % bins < _SAME_BINS
+    return (share, float(np.median(delays[inside]))) if share > _MOSTLY else None
+
+
+def has_later_light(counts: NDArray[Any], found: Reconstruction, delay_ns: float) -> bool:
+    """Whether the counts of all pixels together (bins,) show light elsewhere than at a delay and its pulse."""
+    system = found.system
+    low, high = system.pulse.support_ns()
+    since = (system.time_ns - delay_ns) % system.period_ns
+    near = (since < high + 2 * system.bin_ns) | (since > system.period_ns + low - 2 * system.bin_ns)
+    rest = counts[~near & (counts > 0)].astype(np.float64)
+    if rest.size < 2:
+        return False
+    floor = float(np.median(rest))
+    return float(rest.max()) > floor + _EXCESS * math.sqrt(max(floor, 1.0)) * math.sqrt(1.0 + math.log(rest.size))

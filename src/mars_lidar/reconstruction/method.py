@@ -1,0 +1,206 @@
+"""What a reconstruction method is: the contract, written once; the leaves stay silent."""
+
+from __future__ import annotations
+
+import warnings
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, fields
+from enum import IntFlag
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mars_lidar._base import checks
+from mars_lidar._base.types import FloatArray
+from mars_lidar.instrument.detector import Mode
+from mars_lidar.instrument.effects import LIGHT_EFFECTS
+from mars_lidar.instrument.system import System
+from mars_lidar.reconstruction.histogram_record import check_window, recording_of
+from mars_lidar.reconstruction.histograms import Histograms, checked
+
+Filter = Literal["log", "linear"]
+FILTERS = ("log", "linear")
+
+_NONE, _PASSES, _CHAIN = range(3)  # corrections, as the native core numbers them
+_LOCATORS = {"peak": 0, "linear": 1, "log": 2}
+
+
+class Flags(IntFlag):
+    """What is to be said of a pixel; 0 where nothing is."""
+
+    EMPTY = 1
+    """No registrations: signal and background 0, no depth."""
+    NO_SIGNAL = 2
+    """No signal that stands out from the background."""
+    SATURATED = 4
+    """Bins that registered whenever they could: the rate has no upper bound."""
+    UNCONVERGED = 8
+    """The iteration did not come to rest."""
+    MORE_RETURNS = 16
+    """There is light of further returns than the most that were asked for."""
+    FILLED = 32
+    """An outlier is likelier than not, or nothing came: the delay is that of the pixels around."""
+    MISFIT = 64
+    """The histogram is not one of the estimate's (p below 1e-3): a wrong dead time or pulse, another return."""
+
+
+@dataclass(frozen=True, eq=False)
+class Estimates:
+    """What a method found, each (pixels,); None for what it does not give.
+
+    Delay in periods, the rest in photons per period.
+    """
+
+    signal: FloatArray
+    background: FloatArray
+    delay: FloatArray
+    flags: NDArray[np.uint8]
+    signal_error: FloatArray | None = None
+    background_error: FloatArray | None = None
+    delay_error: FloatArray | None = None
+    significance: FloatArray | None = field(default=None)
+    half_width: FloatArray | None = None  # of the 90 % interval of the delay
+    outlier: FloatArray | None = None  # probability that the delay is another surface's
+    p_value: FloatArray | None = None  # of the fit; NaN where too few photons tell
+    longer: FloatArray | None = None  # scores, standard deviations: where a longer dead time, ...
+    shorter: FloatArray | None = None  # ... a shorter one, ...
+    wider: FloatArray | None = None  # ... a wider pulse would fit better
+    returns: FloatArray | None = None  # (pixels, most, len(RETURN_COLUMNS)), NaN beyond those of a pixel
+
+    @staticmethod
+    def joined(parts: Sequence[Estimates]) -> Estimates:
+        """Those of several sets of pixels, one after the other."""
+        values = {each.name: [getattr(part, each.name) for part in parts] for each in fields(Estimates)}
+        return Estimates(**{name: np.concatenate(v) for name, v in values.items() if v[0] is not None})
+
+
+class Method(ABC):
+    """A way from histograms to depth and signal."""
+
+    name: ClassVar[str]
+    modes: ClassVar[tuple[Mode, ...]]  # of the detector, that the method holds for
+    assumes: ClassVar[str]  # in words, for tables
+    windows: ClassVar[bool] = True  # signal and background come from inside and outside of a window
+    of_images: ClassVar[bool] = False  # each pixel's estimate depends on those around it: cubes (..., H, W, bins)
+
+    def check(self, system: System) -> None:
+        """Raise ValueError, naming mode and method, for a system that this method does not hold for."""
+        mode = system.detector.mode
+        if mode not in self.modes:
+            able = " or ".join(repr(each.name) for each in _known() if mode in each.modes)
+            raise ValueError(
+                f"method {self.name!r} is not for detectors of mode {mode!r}, only for "
+                f"{', '.join(map(repr, self.modes))}; use {able}"
+            )
+        if system.detector.gate_moves:
+            raise ValueError(
+                f"method {self.name!r} needs a gate that repeats every period, got "
+                f"gate_step_ns={system.detector.gate_step_ns:g}"
+            )
+        if self.windows:
+            check_window(self.name, system)
+        recording_of(system)
+
+    @abstractmethod
+    def estimate(self, histograms: Histograms) -> Estimates:
+        """Estimates of every pixel; the system is one that `check` let pass."""
+
+
+def _known(kind: Any = None) -> Iterator[type[Method]]:
+    """All methods that were defined, in that order."""
+    for each in (kind or Method).__subclasses__():
+        if hasattr(each, "name"):
+            yield each
+        yield from _known(each)
+
+
+def tell_effects(system: System) -> None:
+    """Warn of what the detector does and no method knows: a histogram shows it, and the estimates take it for light."""
+    beyond = [name for name in system.detector.effects if name not in LIGHT_EFFECTS]
+    if beyond:
+        warnings.warn(
+            f"no method of reconstruction knows {', '.join(beyond)} of the detector: estimates are biased by it, which "
+            "their standard errors do not tell",
+            UserWarning,
+            stacklevel=3,
+        )
+
+
+@dataclass(frozen=True)
+class RateMethod(Method):
+    """A method that corrects the rates, finds the delay by a filter on them, and signal and background by its window.
+
+    `filter` on the rates: as `MatchedFilter`.
+    """
+
+    filter: Filter = "log"
+
+    correction: ClassVar[int] = _PASSES
+
+    def __post_init__(self) -> None:
+        checks.choice("filter", self.filter, FILTERS)
+
+    @property
+    def settings(self) -> dict[str, float]:
+        """Of the correction, as the native core names them."""
+        return {"steps": 0, "tolerance": 0.0}
+
+    def estimate(self, histograms: Histograms) -> Estimates:
+        """Delay by the filter, signal and background by its window, and their standard errors."""
+        return window_estimates(histograms, self.filter, self.correction, **self.settings)
+
+    def rates(self, cube: ArrayLike, system: System, threads: int | None, total: ArrayLike | None = None) -> FloatArray:
+        """Photons per period in each bin (..., bins) behind the histograms (..., bins); `total` (...) of each."""
+        from mars_lidar._base.native import _core
+
+        given, shape = checked(cube, system, threads)
+        self.check(system)
+        flat = None
+        if total is not None:
+            known = np.asarray(total, np.float64)
+            if known.shape not in ((), tuple(shape)):
+                raise ValueError(f"total must be a number or {tuple(shape)} as the pixels, got shape {known.shape}")
+            flat = np.ascontiguousarray(np.broadcast_to(known, shape).reshape(-1))
+            if not ((flat > 0) & np.isfinite(flat)).all():
+                raise ValueError("total must be finite and positive, photons per period")
+        out, flags = np.empty(given.counts.shape), np.empty(len(given.counts), np.uint8)
+        settings: Any = self.settings
+        _core.corrected_rates(
+            given.recording,
+            given.counts,
+            correction=self.correction,
+            **settings,
+            total=flat,
+            out=out,
+            flags=flags,
+            threads=given.threads,
+        )
+        return out.reshape(*shape, system.bins)
+
+
+def window_estimates(
+    given: Histograms, locator: str, correction: int = _NONE, *, steps: float = 0, tolerance: float = 0.0
+) -> Estimates:
+    """Delay by a filter or the peak, signal and background by the window around it, of corrected rates."""
+    from mars_lidar._base.native import _core
+
+    out, flags = np.empty((len(given.counts), 5)), np.empty(len(given.counts), np.uint8)
+    _core.window_estimates(
+        given.recording,
+        given.counts,
+        correction=correction,
+        locator=_LOCATORS[locator],
+        steps=int(steps),
+        tolerance=tolerance,
+        total=None,
+        out=out,
+        flags=flags,
+        threads=given.threads,
+        progress=given.progress,
+    )
+    signal, background, delay, signal_error, background_error = np.ascontiguousarray(out.T)
+    if correction != _PASSES:
+        return Estimates(signal, background, delay, flags)
+    return Estimates(signal, background, delay, flags, signal_error, background_error)

@@ -1,0 +1,321 @@
+"""The verb: histogram cube to depth and reflectivity."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import Any, Literal, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mars_lidar._base import checks
+from mars_lidar._base.brief import brief
+from mars_lidar._base.notebook import as_html
+from mars_lidar._base.types import FloatArray, Progress
+from mars_lidar.instrument.system import System
+from mars_lidar.reconstruction.centroid import Centroid
+from mars_lidar.reconstruction.coates import Coates, GeneralisedCoates
+from mars_lidar.reconstruction.fit_quality import FALSE_ALARM
+from mars_lidar.reconstruction.histograms import checked
+from mars_lidar.reconstruction.image import Image, UntrainedImage
+from mars_lidar.reconstruction.matched_filter import MatchedFilter, Peak
+from mars_lidar.reconstruction.maximum_likelihood import MaximumLikelihood
+from mars_lidar.reconstruction.mchc import ChainCorrection
+from mars_lidar.reconstruction.method import Estimates, Flags, Method, tell_effects
+from mars_lidar.reconstruction.returns import MOST_RETURNS, Returns, returns_of
+
+ATTENUATIONS = ("none", "inverse_square")
+
+METHODS: dict[str, Method] = {
+    method.name: method
+    for method in (
+        MaximumLikelihood(),
+        GeneralisedCoates(),
+        ChainCorrection(),
+        Coates(),
+        MatchedFilter(),
+        Centroid(),
+        Peak(),
+        Image(),
+        UntrainedImage(),
+    )
+}
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Reconstruction:
+    """What was found in a cube (..., bins): maps of shape (...), usually (H, W) or (realizations, H, W).
+
+    Attributes
+    ----------
+    method
+        Name of the method.
+    system
+        How the cube was recorded.
+    delay_ns, depth_m
+        Delay tau in [0, period), ns, and depth c tau / 2, m; NaN where there is no estimate.
+    signal, background
+        S and B, detectable photons per laser period: a detection efficiency and dark counts are in them. B is that of
+        the whole period, also behind a gate.
+    reflectivity
+        S over `level`, times depth^2 where the light falls off with it.
+    level
+        Signal photons per period of a surface of reflectivity 1 (at 1 m where the light falls off).
+    delay_error_ns, depth_error_m, signal_error, background_error
+        Standard errors, or None where the method gives none; NaN where an estimate lies on its bound.
+    significance
+        Root of twice the gain in log likelihood by the signal, in standard deviations about; or None.
+    flags
+        (...) uint8, `Flags`.
+    p_value
+        Probability of a histogram as far from the estimate's law; NaN for too few photons, None where the method has
+        no law.
+    longer, shorter, wider
+        Scores of a longer and of a shorter dead time and of a wider pulse, standard deviations; see `advice`.
+    returns
+        Every return of each pixel, where several were asked for; then the maps above are those of the strongest.
+    delay_half_width_ns, depth_half_width_m
+        Half width of the 90 % interval of delay and depth, of methods ``"image"`` and ``"image_untrained"``; NaN where
+        an outlier is too likely for one.
+    outlier
+        (...) probability that the depth is that of another surface, of the same methods.
+
+    See Also
+    --------
+    reconstruct
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> maps = ml.reconstruct(ml.simulate(ml.Flux(1.0, 1.0, 40.0), system, seed=0)[0], system)
+    >>> maps.depth_m.shape
+    (1, 1)
+    >>> maps.method
+    'maximum_likelihood'
+    """
+
+    method: str
+    system: System
+    delay_ns: FloatArray
+    depth_m: FloatArray
+    signal: FloatArray
+    background: FloatArray
+    reflectivity: FloatArray
+    level: float
+    delay_error_ns: FloatArray | None
+    depth_error_m: FloatArray | None
+    signal_error: FloatArray | None
+    background_error: FloatArray | None
+    significance: FloatArray | None
+    flags: NDArray[np.uint8]
+    p_value: FloatArray | None = None
+    longer: FloatArray | None = None
+    shorter: FloatArray | None = None
+    wider: FloatArray | None = None
+    returns: Returns | None = None
+    delay_half_width_ns: FloatArray | None = None
+    depth_half_width_m: FloatArray | None = None
+    outlier: FloatArray | None = None
+
+    __repr__ = brief
+
+    def _repr_html_(self) -> str:
+        image = self.depth_m.ndim > 1 and (slice(0, 1),) * (self.depth_m.ndim - 2)
+        first = {"depth (m)": self.depth_m, "reflectivity": self.reflectivity}
+        return as_html(self, {} if image is False else {k: v[image].reshape(v.shape[-2:]) for k, v in first.items()})
+
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """(...) whether a return was seen: a depth, and a signal above the background."""
+        return _seen(self.depth_m, self.flags)
+
+    @property
+    def misfits(self) -> float:
+        """Share of the pixels with a p-value that the estimate does not fit; NaN without p-values."""
+        if self.p_value is None or not np.isfinite(self.p_value).any():
+            return float("nan")
+        return float((self.p_value[np.isfinite(self.p_value)] < FALSE_ALARM).mean())
+
+    @property
+    def advice(self) -> str:
+        """What would fit more of the pixels, in words; empty where the share of misfits is that of false alarms."""
+        tested = 0 if self.p_value is None else int(np.isfinite(self.p_value).sum())
+        if tested == 0 or self.misfits * tested <= FALSE_ALARM * tested + 4.0 * (FALSE_ALARM * tested) ** 0.5 + 1.0:
+            return ""
+        means = {}
+        for name, values in (("longer", self.longer), ("shorter", self.shorter), ("wider", self.wider)):
+            if values is not None and np.isfinite(values).any():
+                some = values[np.isfinite(values)]
+                means[name] = float(some.mean() * some.size**0.5)
+        words = {"longer": "a longer dead time", "shorter": "a shorter dead time", "wider": "a wider pulse"}
+        best = max(means, key=lambda name: abs(means[name]) if name == "wider" else means[name], default="")
+        if not best or abs(means[best]) < 5.0:
+            return "none of dead time and pulse alone: another return, a drift, or an effect of the detector"
+        text = "a narrower pulse" if best == "wider" and means[best] < 0.0 else words[best]
+        return f"{text} ({abs(means[best]):.0f} standard deviations over all pixels)"
+
+    def maps(self) -> dict[str, NDArray[Any]]:
+        """The maps that this method gives, by name."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
+
+
+@runtime_checkable
+class Recorded(Protocol):
+    """Counts with the system that recorded them, such as `mars_lidar.io.Cube`."""
+
+    @property
+    def system(self) -> System:
+        """How they were recorded."""
+
+    @property
+    def histogram(self) -> Any:
+        """(..., bins)."""
+
+
+def reconstruct(
+    cube: ArrayLike | Recorded,
+    system: System | None = None,
+    method: str | Method = "maximum_likelihood",
+    *,
+    level: float | None = None,
+    attenuation: Literal["none", "inverse_square"] = "none",
+    returns: int = 1,
+    threads: int | None = None,
+    progress: Progress | bool | None = None,
+) -> Reconstruction:
+    """Depth, signal and background of every pixel of a histogram cube.
+
+    Parameters
+    ----------
+    cube
+        (..., bins) counts, whole numbers of any type, e.g. (realizations, H, W, bins) of `simulate`.
+        Or a cube of `mars_lidar.io.load`, which carries its system.
+    system
+        How they were recorded. Flux is periodic, with the system's pulse. None: the system that the cube carries.
+    method
+        A name in `mars_lidar.reconstruction.METHODS` (default ``"maximum_likelihood"``; docs/reconstruction.md says
+        what each assumes), or a `Method` of your own settings. Each refuses detectors that it does not hold for.
+        ``"image"``, for images (..., H, W, bins) of 1 to 20 photons a pixel, takes the pixels around into account.
+    level
+        Detectable signal photons per period of a surface of reflectivity 1 (at 1 m, with
+        ``attenuation="inverse_square"``).
+        None: so that the mean reflectivity of the pixels with a return is 1, which makes it relative.
+    attenuation
+        As in `Scene.flux`: ``"inverse_square"`` makes reflectivity proportional to S times depth squared.
+    returns
+        Returns to look for in each pixel, 1 to 8: panes of glass, foliage. Each is tested, and all of them are in
+        `Reconstruction.returns`. Of ``"maximum_likelihood"`` alone.
+    threads
+        Threads to run on; default: all processors this process may use. The result does not depend on it.
+    progress
+        Called as ``progress(done, total)`` a few times a second; an exception from it stops the run.
+
+    Returns
+    -------
+    Reconstruction
+        Maps of shape (...).
+
+    See Also
+    --------
+    Reconstruction, cramer_rao, simulate
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> counts = ml.simulate(ml.Flux(1.0, 1.0, 40.0), system, seed=0)[0]
+    >>> maps = ml.reconstruct(counts, system)
+    >>> bool((abs(maps.delay_ns - 40.0) < 5 * maps.delay_error_ns).all())
+    True
+    """
+    if isinstance(cube, Recorded):
+        system, cube = cube.system if system is None else system, np.asarray(cube.histogram)
+    if system is None:
+        raise TypeError("system must be given for an array of counts (a cube of mars_lidar.io.load carries its own)")
+    used = with_returns(find_method(method), returns)
+    checks.choice("attenuation", attenuation, ATTENUATIONS)
+    if level is not None:
+        level = checks.real("level", level, low=0.0, strict_low=True)
+    given, shape = checked(cube, system, threads, progress)
+    if given.counts.dtype.kind == "f" and (given.counts != np.round(given.counts)).any():
+        part = given.counts[given.counts != np.round(given.counts)].flat[0]
+        raise ValueError(
+            f"cube must hold whole counts, got {part}: add exposures up, and tell it by cycles of the system"
+        )
+    used.check(system)
+    tell_effects(system)
+    return assembled(used.name, system, used.estimate(given), shape, level, attenuation)
+
+
+def find_method(method: str | Method) -> Method:
+    """The method of that name, of default settings, or the method itself."""
+    if isinstance(method, Method):
+        return method
+    return METHODS[checks.choice("method", method, tuple(METHODS))]
+
+
+def with_returns(method: Method, returns: int) -> Method:
+    """The method, looking for so many returns of each pixel."""
+    if checks.integer("returns", returns, low=1, high=MOST_RETURNS) == 1:
+        return method
+    if not isinstance(method, MaximumLikelihood):
+        raise ValueError(
+            f"returns={returns} needs the likelihood, which method {method.name!r} has not; use 'maximum_likelihood'"
+        )
+    return replace(method, returns=int(returns))
+
+
+def assembled(
+    name: str, system: System, found: Estimates, shape: tuple[int, ...], level: float | None, attenuation: str
+) -> Reconstruction:
+    """The result (...) from the estimates of a method (pixels,)."""
+    period = system.period_ns
+
+    def mapped(values: FloatArray | None, unit: float = 1.0) -> FloatArray | None:
+        return None if values is None else (values * unit).reshape(shape)
+
+    delay = (found.delay - np.floor(found.delay)).reshape(shape) * period
+    delay = np.where(delay >= period, 0.0, delay)
+    depth, signal = system.depth_m(delay), found.signal.reshape(shape)
+    returned = signal * depth**2 if attenuation == "inverse_square" else signal
+    flags = found.flags.reshape(shape)
+    if level is None:
+        seen = _seen(depth, flags)
+        level = (float(returned[seen].mean()) if seen.any() else 0.0) or 1.0
+    return Reconstruction(
+        method=name,
+        system=system,
+        delay_ns=delay,
+        depth_m=depth,
+        signal=signal,
+        background=found.background.reshape(shape),
+        reflectivity=returned / level,
+        level=level,
+        delay_error_ns=mapped(found.delay_error, period),
+        depth_error_m=mapped(found.delay_error, float(system.depth_m(period))),
+        signal_error=mapped(found.signal_error),
+        background_error=mapped(found.background_error),
+        significance=mapped(found.significance),
+        p_value=mapped(found.p_value),
+        longer=mapped(found.longer),
+        shorter=mapped(found.shorter),
+        wider=mapped(found.wider),
+        flags=flags,
+        returns=returns_of(found.returns, system, shape),
+        delay_half_width_ns=mapped(found.half_width, period),
+        depth_half_width_m=mapped(found.half_width, float(system.depth_m(period))),
+        outlier=mapped(found.outlier),
+    )
+
+
+def _seen(depth: FloatArray, flags: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    lacking = np.uint8(Flags.EMPTY | Flags.NO_SIGNAL | Flags.FILLED)
+    return np.asarray(np.isfinite(depth) & ((flags & lacking) == 0), dtype=np.bool_)

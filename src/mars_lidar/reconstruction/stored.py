@@ -1,0 +1,134 @@
+"""Reconstruction of a stored cube, part by part: its counts never need to fit in memory."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mars_lidar._base import checks
+from mars_lidar._base.progress import shown
+from mars_lidar._base.threads import thread_count
+from mars_lidar._base.types import Progress
+from mars_lidar.reconstruction.histograms import checked
+from mars_lidar.reconstruction.image import Image
+from mars_lidar.reconstruction.method import Estimates, Method, tell_effects
+from mars_lidar.reconstruction.photons import Photons
+from mars_lidar.reconstruction.reconstruction import Reconstruction, assembled, find_method, with_returns
+
+if TYPE_CHECKING:
+    from mars_lidar.io import Cube
+
+_CHUNK_BYTES = 4 * 2**20
+
+
+@dataclass(frozen=True, eq=False)
+class Timed:
+    """A reconstruction (realizations, H, W) and the seconds that it took, reading left out."""
+
+    found: Reconstruction
+    seconds: float
+
+
+def reconstruct_stored(
+    cube: Cube,
+    methods: Sequence[str | Method] = ("maximum_likelihood",),
+    *,
+    level: float | None = None,
+    attenuation: str | None = None,
+    returns: int = 1,
+    threads: int | None = None,
+    progress: Progress | bool | None = None,
+) -> dict[str, Timed]:
+    """Reconstruct a cube of `mars_lidar.io.load` with several methods, reading each part of its counts once.
+
+    Parameters
+    ----------
+    cube
+        The cube. Without `level`, its own: that with which a known scene's reflectivity became its signal.
+    methods
+        Names or methods of different names.
+    level, attenuation, returns, threads, progress
+        As `mars_lidar.reconstruct`; attenuation None: that with which the flux was made, if it says so.
+
+    Returns
+    -------
+    dict
+        By name of the method.
+    """
+    progress = shown(progress, "reconstructing")
+    system, recipe = cube.system, cube.recipe
+    used = [with_returns(find_method(method), returns) for method in methods]
+    for method in used:
+        method.check(system)
+    tell_effects(system)
+    if attenuation is None:
+        attenuation = "none" if cube.measured else str(cube.flux.info.get("attenuation", "none"))
+    scale = true_level(cube, attenuation) if level is None else checks.real("level", level, low=0.0, strict_low=True)
+    team = thread_count(threads)
+    shape = cube.shape[:3]
+    buffers: dict[str, dict[str, np.ndarray]] = {method.name: {} for method in used}
+    seconds = dict.fromkeys(buffers, 0.0)
+    total, done = len(used) * shape[0] * shape[1] * shape[2], 0
+    blocks = recipe.blocks(recipe.chunks(_CHUNK_BYTES))
+
+    def keep(method: Method, found: Estimates, images: slice, rows: slice) -> None:
+        for field in fields(found):
+            values = getattr(found, field.name)
+            if values is None:
+                continue
+            whole = buffers[method.name].setdefault(field.name, np.empty((*shape, *values.shape[1:]), values.dtype))
+            part = whole[images, rows]
+            part[...] = values.reshape(part.shape)
+
+    of_images = [method for method in used if isinstance(method, Image)]
+    gathered: dict[int, list[Photons]] = {}  # by image, rows of it: of whole images only the photons are held
+    for images, rows in blocks:
+        counts, block = checked(np.asarray(cube.histogram[images, rows]), system, team)
+        for method in used:
+            if isinstance(method, Image):
+                continue
+            began = time.perf_counter()
+            found = method.estimate(counts)
+            seconds[method.name] += time.perf_counter() - began
+            keep(method, found, images, rows)
+            done += len(counts.counts)
+            if progress is not None:
+                progress(done, total)
+        if not of_images:
+            continue
+        for k, part in zip(range(images.start, images.stop), counts.counts.reshape(*block, -1), strict=True):
+            gathered.setdefault(k, []).append(Photons.of(part.reshape(-1, system.bins), *block[1:]))
+            if sum(each.height for each in gathered[k]) < shape[1]:
+                continue
+            photons = Photons.joined(gathered.pop(k))
+            for method in of_images:
+                began = time.perf_counter()
+                found = method.of_photons(photons, system, team)
+                seconds[method.name] += time.perf_counter() - began
+                keep(method, found, slice(k, k + 1), slice(0, shape[1]))
+                done += shape[1] * shape[2]
+                if progress is not None:
+                    progress(done, total)
+    results = {}
+    for method in used:
+        found = Estimates(
+            **{name: values.reshape(-1, *values.shape[3:]) for name, values in buffers[method.name].items()}
+        )
+        results[method.name] = Timed(
+            assembled(method.name, system, found, shape, scale, attenuation), seconds[method.name]
+        )
+    return results
+
+
+def true_level(cube: Cube, attenuation: str) -> float | None:
+    """Detectable signal of a surface of reflectivity 1 in the scene behind a cube; None where there is no scene."""
+    if cube.reflectivity is None:
+        return None
+    light = cube.reflectivity * (cube.depth_m**-2.0 if attenuation == "inverse_square" else 1.0)
+    signal = cube.flux.signal * cube.system.detector.detection_efficiency
+    lit = (signal > 0) & np.isfinite(light) & (light > 0)
+    return float(signal[lit].sum() / light[lit].sum()) if lit.any() else None

@@ -1,0 +1,143 @@
+"""Pulls of `calibrate` over random streams of the independent simulator: ``python -m tests.calibration.sweep 0 40``.
+
+A stream a number: light, jitter, clock, period, dead time and photons are drawn from the seed of that number; with
+``--effect NAME`` the detector has that effect too. Prints a line a stream, and the spread of the pulls.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import replace
+
+import numpy as np
+
+import mars_lidar as ml
+from tests.calibration.photon_by_photon import Truth, as_timestamps, photon_by_photon
+
+EFFECTS = {
+    "afterpulses": {"afterpulses": 0.03, "afterpulse_delay": 100.0},
+    "twilight": {"twilight": 0.5},
+    "recovery": {"recovery": 2.0},
+    "paralyzable": {"paralyzable": True},
+    "electronics": {"electronics": 1.2},  # times the dead time
+    "drift": {"drift": 0.05},
+}
+NAMES = {
+    "afterpulses": "afterpulses",
+    "twilight": "twilight pulses",
+    "recovery": "slow recovery",
+    "paralyzable": "paralyzable detector",
+    "electronics": "electronics with a dead time of their own",
+    "drift": "drift of the light, relative",
+}
+PULLED = ("background", "signal", "delay_ns", "width_ns", "dead_time_ns")
+
+
+def random_truth(number: int) -> tuple[Truth, int]:
+    """A pixel and the photons of its recording."""
+    random = np.random.default_rng(7000 + number)
+
+    def between(low: float, high: float) -> float:
+        return float(np.exp(random.uniform(np.log(low), np.log(high))))
+
+    period = between(15.0, 400.0)
+    unit = float(random.choice([0.004, 0.016, 0.064, 0.25, 0.0]))
+    locked = bool(random.random() < 0.6)
+    if unit and random.random() < 0.5:
+        period = round(period / unit) * unit
+    dead = between(15.0, 150.0)
+    signal, background = between(0.03, 3.0), between(0.02, 3.0)
+    sigma = min(between(0.02, 1.0), period / 30)
+    kind = random.random()
+    jitter = 0.0
+    if kind > 0.85:
+        jitter = float(random.uniform(0.05, 0.33)) * dead
+    elif kind > 0.3:
+        jitter = between(0.02, 0.5)
+    photons = int(between(5e3, 1.2e5))
+    truth = Truth(
+        signal=signal,
+        background=background,
+        delay=float(random.uniform(0.0, period)),
+        sigma=sigma,
+        dead=dead,
+        period=period,
+        jitter=min(jitter, period / 20),
+        unit=unit,
+        locked=locked,
+    )
+    return truth, photons
+
+
+def with_effect(truth: Truth, effect: str | None) -> Truth:
+    """The pixel with one of `EFFECTS`."""
+    more = dict(EFFECTS.get(effect or "", {}))
+    if "electronics" in more:
+        more["electronics"] = more["electronics"] * truth.dead
+    return replace(truth, **more)
+
+
+def pulls(result: ml.Calibration, truth: Truth) -> np.ndarray:
+    """(estimate - truth) / stated error of `PULLED`, NaN where there is none."""
+    true = {
+        "background": truth.background,
+        "signal": truth.signal,
+        "delay_ns": truth.delay,
+        "width_ns": truth.width,
+        "dead_time_ns": truth.dead,
+    }
+    out = []
+    for name in PULLED:
+        estimate = result.estimates.get(name)
+        if estimate is None or not estimate.error > 0.0:
+            out.append(np.nan)
+            continue
+        off = estimate.value - true[name]
+        if name == "delay_ns":
+            off = (off + truth.period / 2) % truth.period - truth.period / 2
+        out.append(off / estimate.error)
+    return np.array(out)
+
+
+def main() -> None:
+    """The command."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("first", type=int)
+    parser.add_argument("last", type=int)
+    parser.add_argument("--effect", choices=list(EFFECTS))
+    parser.add_argument("--photons", type=int)
+    asked = parser.parse_args()
+    rows, refused, wrong, named, spent = [], 0, 0, 0, 0.0
+    for number in range(asked.first, asked.last):
+        truth, photons = random_truth(number)
+        truth = with_effect(truth, asked.effect)
+        t, cycles = photon_by_photon(truth, asked.photons or photons, number)
+        began = time.process_time()
+        result = ml.calibrate(as_timestamps(t, truth, cycles), seed=number)
+        seconds = time.process_time() - began
+        spent += seconds
+        z = pulls(result, truth)
+        rows.append(z)
+        refused += not result.fits
+        suspects = [suspect.name for suspect in result.suspects]
+        named += NAMES.get(asked.effect or "", "") in suspects
+        wrong += any(name != NAMES.get(asked.effect or "") for name in suspects)
+        far = "  <<" if (np.abs(z) > 4.0).any() or not result.fits or (suspects and not asked.effect) else ""
+        print(
+            f"{number} {t.size:,} photons {seconds:.1f} s p={result.p_value:.2g} {np.round(z, 1)} {suspects}{far}",
+            flush=True,
+        )
+        if far:
+            print("    ", truth, {name: str(value) for name, value in result.estimates.items()}, flush=True)
+    table = np.array(rows)
+    print("parameters       ", PULLED)
+    print("sd of pulls      ", np.round(np.nanstd(table, axis=0), 2))
+    print("largest          ", np.round(np.nanmax(np.abs(table), axis=0), 1))
+    print("beyond 4.5       ", (np.abs(table) > 4.5).sum(0), "of", len(table))
+    print("without an error ", np.isnan(table).sum(0))
+    print(f"verdict misfit {refused}, named {named}, other suspects {wrong}, of {len(table)}; {spent:.0f} CPU-s")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,159 @@
+"""Goodness of fit of reconstructed pixels: stated false alarms, wrong dead times and pulses flagged with advice."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import binom, chi2, norm
+
+import mars_lidar as ml
+from mars_lidar.reconstruction import Flags
+from mars_lidar.reconstruction.fit_quality import quality_of
+from mars_lidar.reconstruction.histograms import checked
+from mars_lidar.reconstruction.maximum_likelihood import MaximumLikelihood
+
+PIXELS = (20, 20)
+
+
+def system(dead: float = 50.0, sigma: float = 0.3, bins: int = 500) -> ml.System:
+    return ml.System(
+        period_ns=100.0,
+        cycles=8000,
+        bins=bins,
+        pulse=ml.GaussianPulse(sigma_ns=sigma),
+        detector=ml.Detector(dead_time_ns=dead),
+    )
+
+
+def cube(signal: float, background: float, truth: ml.System, seed: int) -> np.ndarray:
+    delay = np.random.default_rng(seed).uniform(0.0, 100.0, PIXELS)
+    return ml.simulate(ml.Flux(np.full(PIXELS, signal), background, delay), truth, seed=seed)[0]
+
+
+@pytest.mark.parametrize(("signal", "background"), [(0.6, 0.4), (0.05, 0.05), (3.0, 0.5)])
+def test_pixels_of_the_model_fit(signal: float, background: float) -> None:
+    """No more p-values below 1 % of 400 than chance has at 1e-4, and half of them not far from above a half."""
+    found = ml.reconstruct(cube(signal, background, system(), 1), system(), threads=1)
+    assert found.p_value is not None
+    small = int((found.p_value < 0.01).sum())
+    assert binom.sf(small - 1, found.p_value.size, 0.01) > 1e-4
+    assert 0.3 < (found.p_value < 0.5).mean() < 0.6  # four tests together are conservative in the middle
+    assert found.misfits < 0.015
+    assert found.advice == ""
+
+
+@pytest.mark.parametrize(
+    ("dead", "sigma", "words"),
+    [
+        (5.0, 0.3, "a longer dead time"),
+        (40.0, 0.3, "a longer dead time"),
+        (60.0, 0.3, "a shorter dead time"),
+        (50.0, 0.15, "a wider pulse"),
+        (50.0, 0.6, "a narrower pulse"),
+        (50.0, 0.03, "a wider pulse"),
+    ],
+)
+def test_a_wrong_dead_time_or_pulse_is_flagged_in_99_of_100(dead: float, sigma: float, words: str) -> None:
+    """At 5,000 photons a pixel."""
+    counts = cube(0.6, 0.4, system(), 2)
+    assert 4500 < counts.sum(-1).mean() < 5600
+    found = ml.reconstruct(counts, system(dead, sigma), threads=1)
+    assert (found.flags & Flags.MISFIT > 0).mean() >= 0.99
+    assert found.advice.startswith(words)
+
+
+def test_a_dead_time_of_several_periods_and_a_dim_pixel() -> None:
+    truth = system(dead=230.0)
+    found = ml.reconstruct(cube(0.8, 0.4, truth, 3), truth, threads=1)
+    assert found.misfits < 0.015
+    empty = ml.reconstruct(np.zeros((2, 500), np.uint16), system(), threads=1)
+    assert np.isnan(empty.p_value).all()
+    assert not (empty.flags & Flags.MISFIT).any()
+
+
+def armed_time(counts: np.ndarray, truth: ml.System, dead_ns: float) -> np.ndarray:
+    """Armed time (bins,) in periods by definition: a registration, anywhere in its bin, blinds the next `dead_ns`.
+
+    Of an exposure that goes on as it began, so that no end of it is counted.
+    """
+    bins, fine = truth.bins, 40
+    blind = np.zeros(bins)
+    for apart in range(int(np.ceil(dead_ns / truth.bin_ns)) + 2):
+        place = np.subtract.outer(np.arange(fine), np.arange(fine)) / fine + apart  # of each pair of places, in bins
+        share = ((place > 0.0) & (place < dead_ns / truth.bin_ns)).mean()
+        share += 0.5 * (place == 0.0).mean()
+        blind += share * np.roll(counts, apart)
+    return truth.cycles - blind
+
+
+@pytest.mark.parametrize("dead", [10.0, 50.0, 130.0])
+def test_statistics_are_those_of_their_definition(dead: float) -> None:
+    """Chi-square of cells, and scores by weighted least squares: p-values to 2 %, scores to 0.05."""
+    truth = ml.System(
+        period_ns=100.0,
+        cycles=8000,
+        bins=250,
+        pulse=ml.GaussianPulse(sigma_ns=1.0),
+        detector=ml.Detector(dead_time_ns=dead),
+        start="stationary",
+    )
+    delay = np.array([[20.0, 45.5, 70.3, 99.8]])
+    counts = ml.simulate(ml.Flux(np.full_like(delay, 0.6), 0.4, delay), truth, seed=4)[0]
+    fit = MaximumLikelihood().estimate(checked(counts, truth, 1)[0])
+    assert fit.p_value is not None
+    assert fit.longer is not None
+    assert fit.shorter is not None
+    assert fit.wider is not None
+    edges = np.arange(truth.bins + 1) * truth.bin_ns
+
+    def share(delay_ns: float, width: float = 1.0) -> np.ndarray:
+        return np.diff(truth.pulse.wrapped_cumulative((edges - delay_ns) / width, truth.period_ns / width))
+
+    for k, h in enumerate(counts[0].astype(float)):
+        time = armed_time(h, truth, dead)
+        at, step = fit.delay[k] * truth.period_ns, 1e-3
+        rate = fit.signal[k] * share(at) + fit.background[k] / truth.bins
+        expected = rate * time
+        cells = min(64, int(expected.sum() / 8.0))
+        cell = ((np.cumsum(expected) - 0.5 * expected) / expected.sum() * cells).astype(int)
+        h_cells, e_cells = np.bincount(cell, h), np.bincount(cell, expected)
+        used = e_cells > 0.0
+        square = ((h_cells - e_cells)[used] ** 2 / e_cells[used]).sum()
+        root = np.sqrt(expected)
+        residual = (h - expected) / root
+        tangent = np.stack([share(at), np.ones(truth.bins), (share(at + step) - share(at - step)) / step]) * time / root
+
+        changes = [rate * (armed_time(h, truth, x * dead) - time) for x in (1.2, 1.0 / 1.2)]
+        changes.append((share(at, 1.1) - share(at)) * time)
+        free = [x / root - tangent.T @ np.linalg.lstsq(tangent.T, x / root, rcond=None)[0] for x in changes]
+        longer, shorter, wider = (float(x @ residual / np.linalg.norm(x)) for x in free)
+        assert (fit.longer[k], fit.shorter[k], fit.wider[k]) == pytest.approx((longer, shorter, wider), abs=0.05)
+        p = [chi2.sf(square, used.sum() - 3), norm.sf(longer), norm.sf(shorter), 2.0 * norm.sf(abs(wider))]
+        assert fit.p_value[k] == pytest.approx(min(1.0, 4.0 * min(p)), rel=0.05)
+
+
+def test_p_value_of_statistics() -> None:
+    """Bonferroni over the tests that there are; none without photons."""
+    nan = np.nan
+    table = np.array([[60.0, 50.0, nan, nan, nan], [60.0, 50.0, 3.5, -1.0, 0.1], [nan, 0.0, nan, nan, nan]])
+    p = quality_of(table).p_value
+    assert p[:2] == pytest.approx([chi2.sf(60.0, 50), 4.0 * norm.sf(3.5)])
+    assert np.isnan(p[2])
+
+
+@pytest.mark.parametrize("dead", [0.0, 0.1, 0.22, 0.5])
+def test_short_dead_times_fit(dead: float) -> None:
+    """Dead times of about a bin (0.2 ns): a bin's own registrations must not decide their score."""
+    truth = system(dead=dead)
+    found = ml.reconstruct(cube(0.0, 0.3, truth, 5), truth, threads=1)
+    assert found.p_value is not None
+    small = int((found.p_value < 0.01).sum())
+    assert binom.sf(small - 1, found.p_value.size, 0.01) > 1e-4
+
+
+def test_a_pulse_away_from_its_delay() -> None:
+    """Samples that begin 20 ns after the delay: wider, it lies elsewhere."""
+    pulse = ml.SampledPulse(values=[*([0.0] * 50), 1.0, 3.0, 2.0, 1.0], bin_ns=0.4, origin="first")
+    truth = system().replace(pulse=pulse)
+    found = ml.reconstruct(cube(0.6, 0.4, truth, 6), truth, threads=1)
+    assert found.misfits < 0.015

@@ -1,0 +1,236 @@
+"""Depth from a few photons a pixel: against the exact posterior of a chain, the truth, and what a detector does."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from harness import require
+from scipy import stats
+
+import mars_lidar as ml
+from mars_lidar.reconstruction import METHODS, Flags
+from mars_lidar.reconstruction import image as image_module
+from mars_lidar.reconstruction import image_stages as stages
+from mars_lidar.reconstruction.image_pulse import cells_of
+from mars_lidar.reconstruction.photons import Photons
+
+SIGMA = 0.6
+SYSTEM = ml.System(
+    period_ns=100.0,
+    cycles=1000,
+    bins=250,
+    pulse=ml.GaussianPulse(sigma_ns=SIGMA),
+    detector=ml.Detector(dead_time_ns=75.0),
+)
+BOTH = "image", "image_untrained"
+
+
+def drawn(delay: np.ndarray, photons: float, sbr: float = 1.0, system: ml.System = SYSTEM, seed: int = 1) -> np.ndarray:
+    level = photons / system.cycles
+    return ml.simulate(ml.Flux(np.full(delay.shape, level), level / sbr, delay), system, seed=seed)[0]
+
+
+def off_by(found: ml.Reconstruction, delay: np.ndarray) -> np.ndarray:
+    period = found.system.period_ns
+    return (found.delay_ns - delay + 0.5 * period) % period - 0.5 * period
+
+
+def roof(side: int = 32) -> np.ndarray:
+    """Two slopes and a step of 20 ns between them, ns."""
+    y, x = np.mgrid[:side, :side]
+    return 30.0 + 0.08 * y + np.where(x < side // 2, 0.0, 20.0) + 0.05 * np.abs(x - side // 2)
+
+
+def test_a_line_of_pixels_has_the_exact_posterior_of_its_chain():
+    """Both combs of one row are the chain itself: forward and backward with the prior's matrix, in double precision."""
+    cube = drawn(np.linspace(40.0, 46.0, 9)[None], 1.0)
+    photons, cells = Photons.of(cube.reshape(-1, 250), 1, 9), cells_of(SYSTEM)
+    light = stages.first_light(photons, cells)
+    whole = slice(0, 1), slice(0, 9)
+    posterior, _, likelihood, _, _ = stages.volumes(photons, cells, light, *whole, 1, 1)
+    n = cells.count
+    tap = np.exp(-0.5 * (np.arange(4) / (stages.STEP_SIGMA * cells.sigma)) ** 2)
+    tap /= tap[0] + 2.0 * tap[1:].sum()
+    step = np.full((n, n), stages.JUMP / n)
+    for k in range(n):
+        for o in range(-3, 4):
+            step[k, (k + o) % n] += (1.0 - stages.WIDE - stages.JUMP) * tap[abs(o)]
+        for o in range(-15, 16):
+            step[k, (k + o) % n] += stages.WIDE * (2.0 if o == 0 else 1.0) / 32.0
+    alone = likelihood[0].astype(np.float64)
+    before, after = [np.full(n, 1.0 / n)], [np.full(n, 1.0 / n)]
+    for j in range(8):
+        before.append(_unit(step.T @ (before[-1] * alone[j])))
+        after.append(_unit(step.T @ (after[-1] * alone[8 - j])))
+    exact = np.stack([_unit(before[j] * alone[j] * after[8 - j]) for j in range(9)])
+    np.testing.assert_allclose(posterior[0], exact, atol=2e-6)
+
+
+def _unit(x: np.ndarray) -> np.ndarray:
+    return x / x.sum()
+
+
+def test_likelihood_of_a_pixel():
+    """Of photons over uniform background, averaged over three ratios: computed directly."""
+    rng = np.random.default_rng(3)
+    counts = np.zeros((1, 1, 250), np.uint16)
+    counts[0, 0, rng.integers(0, 250, 5)] = [1, 2, 1, 1, 3]
+    photons, cells = Photons.of(counts.reshape(1, 250), 1, 1), cells_of(SYSTEM)
+    light = stages.Light(np.array([[2.0]]), np.array([[3.0]]), np.zeros((1, 1), bool))
+    found = stages.volumes(photons, cells, light, slice(0, 1), slice(0, 1), 1, 1)[2][0, 0]
+    delay = (np.arange(cells.count) + 0.5) / cells.count * 100.0
+    time, number = (photons.bin + 0.5) * 0.4, photons.number
+    exact = np.zeros(cells.count)
+    for factor, share in ((0.4, 0.3), (1.0, 0.45), (2.5, 0.25)):
+        ratio, late = factor * 2.0 / 3.0, (time[:, None] - delay + 50.0) % 100.0 - 50.0
+        edges = stats.norm.cdf(late + 0.2, scale=SIGMA) - stats.norm.cdf(late - 0.2, scale=SIGMA)
+        exact += share * np.prod(((1.0 + ratio * 250.0 * edges) / (1.0 + ratio)) ** number[:, None], axis=0)
+    # a photon's place within its cell is rounded to 1/32: 0.01 sigma
+    np.testing.assert_allclose(found, exact / exact.mean(), rtol=0.12, atol=0.02 * found.max())
+
+
+@pytest.mark.parametrize("method", BOTH)
+def test_depth_where_each_pixel_alone_has_none(method):
+    delay = roof()
+    cube = drawn(delay, 2.0)
+    found, alone = ml.reconstruct(cube, SYSTEM, method), ml.reconstruct(cube, SYSTEM)
+    off = np.abs(off_by(found, delay))
+    assert (off > 3.0 * SIGMA).mean() < 0.02 < 0.3 < (~(np.abs(off_by(alone, delay)) < 3.0 * SIGMA)).mean()
+    assert np.median(off) < 0.25 * SIGMA
+    stated = np.isfinite(found.delay_half_width_ns)
+    assert stated.mean() > 0.85
+    # pixels share photons: nine of them count as one
+    inside, count = (off <= found.delay_half_width_ns)[stated].mean(), int(stated.sum() / 9)
+    require({"coverage": float(stats.binom.cdf(np.floor(inside * count), count, 0.9))}, f"intervals of {method}")
+    assert found.signal.mean() == pytest.approx(2.0 / SYSTEM.cycles, rel=0.1)
+    assert found.background.mean() == pytest.approx(2.0 / SYSTEM.cycles, rel=0.1)
+    assert found.outlier.min() >= 0.0
+    assert found.outlier.max() <= 1.0
+
+
+@pytest.mark.parametrize(
+    "system",
+    [
+        replace(SYSTEM, cycles=30, detector=ml.Detector(dead_time_ns=150.0)),
+        replace(SYSTEM, cycles=40, detector=ml.Detector(dead_time_ns=0.0, mode="synchronous")),
+        replace(SYSTEM, detector=ml.Detector(dead_time_ns=30.0, mode="gated", gate_start_ns=20.0, gate_width_ns=50.0)),
+        replace(SYSTEM, pulse=ml.SampledPulse(np.exp(-np.arange(0.0, 4.0, 0.05) / 0.6), 0.05)),
+        replace(SYSTEM, bins=32),
+        replace(SYSTEM, bins=8192, pulse=ml.GaussianPulse(sigma_ns=0.012)),
+    ],
+    ids=["blind", "synchronous", "gated", "a measured pulse", "coarse bins", "more cells than one pass takes"],
+)
+def test_systems(system):
+    """Delay and signal, whatever the detector hides: no more bias than a tenth of the pulse or of the signal."""
+    # within a bin nothing tells where: the slopes cross some
+    delay = 30.0 + (2.0 if system.bins < 64 else 0.02) * (roof() - 30.0)
+    found = ml.reconstruct(drawn(delay, 5.0, system=system), system, "image")
+    width = max(getattr(system.pulse, "sigma_ns", SIGMA), 0.3 * system.bin_ns)
+    off = off_by(found, delay)
+    assert (np.abs(off) > 3.0 * width).mean() < 0.03
+    near = np.abs(off) < 3.0 * width
+    assert abs(off[near].mean()) < 0.1 * width
+    assert found.signal.mean() == pytest.approx(5.0 / system.cycles, rel=0.1)
+
+
+def test_over_the_end_of_the_period():
+    delay = roof() + 50.0 + 15.0
+    found = ml.reconstruct(drawn(delay, 3.0), SYSTEM, "image")
+    assert (np.abs(off_by(found, delay)) > 3.0 * SIGMA).mean() < 0.02
+
+
+def test_hot_and_missing_pixels():
+    """Hot ones say nothing about delays, missing ones are filled and said to be; neither disturbs those around."""
+    delay, rng = roof(), np.random.default_rng(5)
+    hot, missing = rng.random(delay.shape) < 0.01, rng.random(delay.shape) < 0.01
+    level = 10.0 / SYSTEM.cycles
+    flux = ml.Flux(np.full(delay.shape, level), level * np.where(hot, 50.0, 1.0), delay)
+    cube = np.where(missing[..., None], 0, ml.simulate(flux, SYSTEM, seed=2)[0])
+    found = ml.reconstruct(cube, SYSTEM, "image")
+    assert (found.flags[missing] & Flags.FILLED > 0).all()
+    assert np.isnan(found.delay_half_width_ns[missing]).all()
+    assert not found.seen[missing].any()
+    off = np.abs(off_by(found, delay))
+    assert np.median(off[hot]) < SIGMA
+    assert (off[~hot & ~missing] > 3.0 * SIGMA).mean() < 0.01
+    assert np.median(found.background[hot]) > 20.0 * level
+
+
+def test_bright_pixels_are_estimated_alone():
+    system = replace(SYSTEM, cycles=20_000)
+    cube = drawn(roof(16), 500.0, system=system)
+    found, alone = ml.reconstruct(cube, system, "image"), ml.reconstruct(cube, system)
+    assert np.array_equal(found.delay_ns, alone.delay_ns)
+    assert (found.outlier < 0.01).all()
+
+
+def test_parts_of_an_image_give_what_the_whole_gives(monkeypatch):
+    """Parts overlap; a message from beyond the overlap hardly counts."""
+    delay = roof(72)
+    cube = drawn(delay, 2.0)
+    whole = ml.reconstruct(cube, SYSTEM, "image")
+    assert len(list(stages.parts(72, 72, cells_of(SYSTEM).count))) == 1
+    monkeypatch.setattr(stages, "VOLUME_BYTES", 70 * 70 * 4 * cells_of(SYSTEM).count)
+    assert len(list(stages.parts(72, 72, cells_of(SYSTEM).count))) > 1
+    monkeypatch.setattr(image_module, "_BLOCK_PIXELS", 72 * 10)  # exact: a network's reach is finite
+    parts = ml.reconstruct(cube, SYSTEM, "image")
+    assert (np.abs(parts.delay_ns - whole.delay_ns) < 0.1 * SIGMA).mean() > 0.995
+
+
+def test_blocks_and_threads_do_not_matter(monkeypatch):
+    cube = np.stack([drawn(roof(24), 1.0, seed=seed) for seed in (1, 2)])
+    for method in BOTH:
+        both = ml.reconstruct(cube, SYSTEM, method, threads=2)
+        with monkeypatch.context() as patch:
+            patch.setattr(image_module, "_BLOCK_PIXELS", 24 * 5)
+            for k in range(2):
+                one = ml.reconstruct(cube[k].astype(np.int64), SYSTEM, method, threads=1)
+                for name, values in one.maps().items():
+                    if name != "reflectivity":  # over the mean of its own image
+                        assert np.array_equal(getattr(both, name)[k], values, equal_nan=True), (method, name)
+
+
+def test_nothing_there():
+    empty = ml.reconstruct(np.zeros((4, 5, 250), np.uint16), SYSTEM, "image")
+    assert (empty.flags & Flags.EMPTY > 0).all()
+    assert np.isnan(empty.depth_m).all()
+    assert (empty.signal == 0.0).all()
+    dark = ml.simulate(ml.Flux(np.zeros((32, 32)), 0.005, 0.0), SYSTEM, seed=4)[0]
+    found = ml.reconstruct(dark, SYSTEM, "image_untrained")
+    assert np.median(found.outlier) > 0.3
+    assert np.isfinite(found.delay_half_width_ns).mean() < 0.05
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 40), (40, 1), (3, 2)])
+def test_any_shape(shape):
+    found = ml.reconstruct(drawn(np.full(shape, 50.0), 8.0), SYSTEM, "image")
+    assert np.median(np.abs(found.delay_ns - 50.0)) < SIGMA
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"cube": np.ones((9, 250), np.uint16)}, r"'image' needs images, a cube \(..., H, W, bins\)"),
+        ({"returns": 2}, "returns=2 needs the likelihood"),
+        ({"system": replace(SYSTEM, detector=ml.Detector(dead_time_ns=5.0, mode="paralyzable"))}, "'paralyzable'"),
+    ],
+)
+def test_bad_input(change, message):
+    given = {"cube": np.zeros((3, 3, 250), np.uint16), "system": SYSTEM, "method": "image", **change}
+    with pytest.raises(ValueError, match=message):
+        ml.reconstruct(**given)
+
+
+def test_the_networks_run_only_where_their_card_says_so(monkeypatch):
+    card = image_module.networks().card
+    low, high = card["holds_for"]["signal"]
+    assert image_module.networks().holds_for(signal=2.0, background=2.0, cells=256, side=64)
+    for change in ({"signal": 1.1 * high}, {"signal": 0.9 * low}, {"background": 1e4}, {"cells": 10}, {"side": 5}):
+        given = {"signal": 2.0, "background": 2.0, "cells": 256, "side": 64} | change
+        assert not image_module.networks().holds_for(**given), change
+    cube = drawn(roof(16), 2.0)
+    assert {"image", "image_untrained"} <= set(METHODS)
+    small = {name: ml.reconstruct(cube, SYSTEM, name) for name in BOTH}  # 16 pixels a side: below the card's least
+    assert np.array_equal(small["image"].delay_ns, small["image_untrained"].delay_ns)

@@ -1,0 +1,303 @@
+"""Maximum likelihood: derivatives, bias, and variance at the bound, by simulation."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from harness import require
+from scipy import stats
+
+import mars_lidar as ml
+from mars_lidar import _core
+from mars_lidar.reconstruction import METHODS, Flags, MaximumLikelihood, log_likelihood, window_error, window_weights
+from mars_lidar.reconstruction.histogram_record import recording_of
+
+PERIOD = 100.0
+PLAIN = ml.System(
+    period_ns=PERIOD,
+    cycles=4000,
+    bins=500,
+    pulse=ml.GaussianPulse(sigma_ns=0.5),
+    detector=ml.Detector(dead_time_ns=75.3),
+)
+
+
+def with_dead(dead_ns: float, **more) -> ml.System:
+    detector = {k: more.pop(k) for k in list(more) if k.startswith("gate") or k == "mode"}
+    return PLAIN.replace(detector=ml.Detector(dead_time_ns=dead_ns, **detector), **more)
+
+
+SYSTEMS = {
+    "plain": (PLAIN, 1.0, 1.0, 37.013),
+    "no dead time": (with_dead(0.0), 2.0, 1.0, 37.013),
+    "below one bin": (with_dead(0.1), 1.0, 1.0, 37.013),
+    "several periods": (with_dead(253.3, cycles=10_000), 2.0, 0.5, 99.95),
+    "whole period": (with_dead(100.0), 5.0, 0.5, 37.0),
+    "stationary": (with_dead(85.0, start="stationary"), 1.0, 2.0, 37.0),
+    "coarse bins": (with_dead(75.0, bins=100), 3.0, 1.0, 37.03),
+    "synchronous": (with_dead(0.0, mode="synchronous"), 1.0, 1.0, 37.0),
+    "synchronous, dead": (with_dead(75.0, mode="synchronous"), 1.0, 1.0, 37.0),
+    "gated": (with_dead(45.0, mode="gated", gate_start_ns=80.03, gate_width_ns=40.0), 1.0, 1.0, 97.0),
+    "bright background": (with_dead(20.0, cycles=10_000), 2.0, 30.0, 37.0),
+    "two lobes": (
+        PLAIN.replace(pulse=ml.SampledPulse(np.r_[np.hanning(40), 0.4 * np.hanning(60)], 0.05)),
+        1.0,
+        1.0,
+        37.0,
+    ),
+}
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_unbiased_and_at_the_bound(name):
+    """Means, variances and stated errors of 2000 exposures; the bound is computed from other code."""
+    system, signal, background, delay = SYSTEMS[name]
+    pixels = 2000
+    cube = ml.simulate(ml.Flux(np.full((1, pixels), signal), background, delay), system, seed=7)[0, 0]
+    found = ml.reconstruct(cube, system)
+    assert not (found.flags & ~np.uint8(Flags.MISFIT)).any()
+    bound = ml.cramer_rao(ml.Flux(signal, background, delay), system)
+    lag = (found.delay_ns - delay + 0.5 * PERIOD) % PERIOD - 0.5 * PERIOD
+    outcomes = {}
+    for what, error, stated, least in (
+        ("signal", found.signal - signal, found.signal_error, bound.signal),
+        ("background", found.background - background, found.background_error, bound.background),
+        ("delay", lag, found.delay_error_ns, bound.delay_ns),
+    ):
+        # second order, and places within a bin: 0.03 sd are allowed for
+        z = max(abs(error.mean()) / least - 0.03, 0.0) * np.sqrt(pixels)
+        outcomes[f"{what}, bias"] = 2 * stats.norm.sf(z)
+        assert np.median(stated) == pytest.approx(least, rel=0.06)
+        # "within 10 % of the bound": the sample deviation, less than which the bound is exceeded by chance at most
+        square = (error.std() / (1.1 * least)) ** 2 * pixels
+        outcomes[f"{what}, above 1.1 bounds"] = float(stats.chi2.sf(square, pixels - 1))
+        square = (error.std() / (0.97 * least)) ** 2 * pixels
+        outcomes[f"{what}, below the bound"] = float(stats.chi2.cdf(square, pixels - 1))
+    require(outcomes, f"maximum likelihood, {name}")
+
+
+@pytest.mark.full
+@pytest.mark.parametrize(
+    ("system", "signal", "bias"),
+    [
+        (PLAIN.replace(cycles=1000, detector=ml.Detector(dead_time_ns=75.0)), 5.6, 0.2),
+        (with_dead(0.0, mode="synchronous", cycles=1000), 3.14, 0.12),
+        (with_dead(150.0, start="stationary", cycles=1000), 5.6, 0.15),
+    ],
+)
+def test_bias_is_taken_off(system, signal, bias):
+    """Bright pixels of short exposures: the maximum stands too high; of second order up to 0.1 sd is left."""
+    pixels, delay = 3000, 50.013
+    cube = ml.simulate(ml.Flux(np.full((1, pixels), signal), signal, delay), system, seed=12)[0, 0]
+    bound = float(ml.cramer_rao(ml.Flux(signal, signal, delay), system).signal)
+    errors = {
+        less: (ml.reconstruct(cube, system, MaximumLikelihood(less_bias=less)).signal - signal) / bound
+        for less in (False, True)
+    }
+    assert errors[False].mean() > bias
+    assert errors[True].std() < 0.98 * errors[False].std()
+    z = max(abs(errors[True].mean()) - 0.1, 0.0) / errors[True].std() * np.sqrt(pixels)
+    require({"bias": 2 * stats.norm.sf(z)}, "bias of the maximum")
+
+
+def test_the_bound_knows_efficiency_and_dark_counts():
+    """It is that of the light that the pixel sees, in units of the light that falls on it."""
+    share, dark_hz = 0.4, 2e6
+    dim = PLAIN.replace(detector=ml.Detector(dead_time_ns=75.0, detection_efficiency=share, dark_count_hz=dark_hz))
+    seen = PLAIN.replace(detector=ml.Detector(dead_time_ns=75.0))
+    dark = 1e-9 * dark_hz * PERIOD
+    bound = ml.cramer_rao(ml.Flux(2.0, 0.5, 37.0), dim)
+    same = ml.cramer_rao(ml.Flux(2.0 * share, 0.5 * share + dark, 37.0), seen)
+    assert bound.signal * share == pytest.approx(float(same.signal), rel=1e-12)
+    assert bound.background * share == pytest.approx(float(same.background), rel=1e-12)
+    assert bound.depth_m == pytest.approx(float(same.depth_m), rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"background": 0.0}, "background must be > 0, got 0.0"),
+        ({"signal": -1.0}, "signal must lie in .* got -1.0"),
+        ({"delay_ns": math.nan}, "delay_ns must be finite.* got NaN"),
+    ],
+)
+def test_bad_arguments_of_the_bound_are_named(change, words):
+    given = {"signal": 1.0, "background": 1.0, "delay_ns": 37.0} | change
+    with pytest.raises(ValueError, match=words):
+        ml.cramer_rao(ml.Flux(**given), PLAIN)
+
+
+# few passes are left at the pulse, so that it matters what the ends of the exposure leave of them
+ENDS = {
+    "ends": (with_dead(75.0, cycles=1000), 10.0, 10.0, 50.013),
+    "ends, stationary": (with_dead(75.0, start="stationary", cycles=1000), 10.0, 10.0, 50.013),
+    "ends, two periods": (with_dead(185.0, cycles=600), 10.0, 1.0, 50.013),
+}
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("name", [*SYSTEMS, *ENDS])
+def test_derivatives(name):
+    """Gradient by finite differences; information as the variance of the gradient, and of other code's formula."""
+    system, signal, background, delay = (SYSTEMS | ENDS)[name]
+    pixels = 4000 if name in ENDS else 600
+    cube = ml.simulate(ml.Flux(np.full((1, pixels), signal), background, delay), system, seed=11)[0, 0]
+    at = np.array([1.1 * signal, 0.9 * background, delay + 0.07])
+    h = cube[0]
+    _, gradient, _ = log_likelihood(h, ml.Flux(*at), system)
+    for k, step in enumerate(1e-4 * np.array([signal, background, system.bin_ns])):
+        move = np.eye(3)[k] * step
+        values = [log_likelihood(h, ml.Flux(*(at + sign * move)), system)[0] for sign in (1, -1)]
+        slope = (values[0] - values[1]) / (2 * step)
+        scale = np.sqrt(log_likelihood(h, ml.Flux(*at), system)[2][k, k])
+        assert slope == pytest.approx(gradient[k], abs=2e-3 * scale, rel=1e-5)
+    scores = np.array([log_likelihood(h, ml.Flux(signal, background, delay), system)[1] for h in cube])
+    information = np.mean(
+        [log_likelihood(h, ml.Flux(signal, background, delay), system)[2] for h in cube[:100]], axis=0
+    )
+    unit = np.sqrt(np.diag(information))
+    whitened = np.linalg.solve(np.linalg.cholesky(information / np.outer(unit, unit)), (scores / unit).T)
+    outcomes = {}
+    for k in range(3):  # standard normal, were the information exact; 6 % is allowed for
+        square = float(whitened[k] @ whitened[k])
+        p = (stats.chi2.sf(square / 1.06, pixels), stats.chi2.cdf(square * 1.06, pixels))
+        outcomes[f"score {k}"] = min(1.0, 2 * float(min(p)))
+    require(outcomes, f"likelihood's gradient, {name}")
+
+
+@pytest.mark.parametrize(
+    ("dead", "background", "gate"),
+    [(75.0, 30.0, {}), (20.3, 90.0, {}), (75.0, 30.0, {"mode": "gated", "gate_start_ns": 20.1, "gate_width_ns": 60.0})],
+)
+def test_background_in_one_sum_is_that_of_its_bins(dead: float, background: float, gate: dict):
+    """The series of the bins without a pulse against each of them: up to a constant, at any delay and brightness."""
+    system = with_dead(dead, **gate)
+    record = recording_of(system)
+    h = ml.simulate(ml.Flux(3.0, background, [[37.0]]), system, seed=3)[0, 0, 0].astype(float)
+    places = ((s, f * background, d) for s in (0.5, 4.0) for f in (0.9, 1.05) for d in (2.0, 37.01, 97.0))
+    at = np.array(list(places)) / [1.0, 1.0, PERIOD]
+    series, whole = np.empty((2, len(at), 13))
+    _core.histogram_log_likelihood(record, h, at, series, whole=False)
+    _core.histogram_log_likelihood(record, h, at, whole, whole=True)
+    assert (series[:, 0] - series[0, 0]) == pytest.approx(whole[:, 0] - whole[0, 0], abs=2e-5)
+    scale = np.sqrt(np.maximum(whole[:, [4, 8, 12]], 1e-9))  # of a gradient: the root of its information
+    assert (series[:, 1:4] - whole[:, 1:4]) / scale == pytest.approx(np.zeros((len(at), 3)), abs=1e-6)
+
+
+def test_delay_wherever_the_pulse_is_narrow_or_wide():
+    for sigma, bins in ((0.05, 500), (20.0, 200), (0.5, 64)):
+        system = PLAIN.replace(pulse=ml.GaussianPulse(sigma_ns=sigma), bins=bins)
+        delays = np.linspace(0.0, 99.9, 64)[None]
+        found = ml.reconstruct(ml.simulate(ml.Flux(4.0, 0.5, delays), system, seed=2)[0], system)
+        lag = (found.delay_ns - delays + 50.0) % 100.0 - 50.0
+        # narrow pulses are lost inside of a bin: what is known of the delay is the bin
+        assert np.abs(lag).max() < max(6.0 * found.delay_error_ns[np.isfinite(found.delay_error_ns)].max(), 0.25)
+
+
+def test_pixels_without_signal_are_flagged():
+    flux = ml.Flux(np.zeros((1, 4000)), 0.5, 0.0)
+    cube = ml.simulate(flux, PLAIN.replace(cycles=400), seed=5)[0, 0]
+    found = ml.reconstruct(cube, PLAIN.replace(cycles=400))
+    missed = int((found.flags & Flags.NO_SIGNAL == 0).sum())
+    require({"false alarms": float(stats.binom.sf(missed - 1, 4000, 0.015))}, "signal seen where there is none")
+    assert (found.signal + found.background).mean() == pytest.approx(0.5, rel=0.01)  # the pulse takes what it can
+
+
+def test_empty_saturated_and_impossible_pixels():
+    system = PLAIN.replace(cycles=100)
+    cube = np.zeros((4, 500), np.uint16)
+    cube[1, 200] = 1
+    cube[2, 300] = 100  # fired in every period
+    cube[3] = 50_000  # no pixel with this dead time can
+    found = ml.reconstruct(cube, system)
+    flags = Flags
+    assert found.flags[0] == flags.EMPTY
+    assert np.isnan(found.depth_m[0])
+    assert found.signal[0] == 0.0
+    assert found.flags[2] & flags.SATURATED
+    assert found.flags[3] & flags.SATURATED
+    assert not found.seen[0]
+    for method in ("generalised_coates", "mchc", "matched_filter", "peak"):
+        other = ml.reconstruct(cube, system, method)
+        assert other.flags[0] & flags.EMPTY
+        assert np.isnan(other.depth_m[0])
+
+
+def test_threads_and_types_do_not_matter():
+    flux = ml.Flux(np.geomspace(0.01, 10, 300)[None], 1.0, 50.0)
+    cube = ml.simulate(flux, PLAIN, seed=1)[0]
+    for method in METHODS.values():
+        if PLAIN.detector.mode not in method.modes or method.of_images:
+            continue
+        one = ml.reconstruct(cube, PLAIN, method, threads=1)
+        for other in (
+            ml.reconstruct(cube, PLAIN, method, threads=3),
+            ml.reconstruct(cube.astype(np.int64), PLAIN, method),
+            ml.reconstruct(cube.astype(float), PLAIN, method),
+        ):
+            for name, values in one.maps().items():
+                assert np.array_equal(values, getattr(other, name), equal_nan=True), (method.name, name)
+
+
+def test_window_error_is_that_of_the_raw_estimate():
+    """The joint law gives mean and spread of the window estimate that `peak` and `matched_filter` make."""
+    system = PLAIN.replace(cycles=1000)
+    cube = ml.simulate(ml.Flux(np.full((1, 4000), 1.0), 1.0, 37.0), system, seed=9)[0, 0]
+    weights = window_weights(system, 37.0)
+    mean, deviation = window_error(weights, ml.Flux(1.0, 1.0, 37.0), system)
+    sample = cube @ weights
+    z = (sample.mean() - mean) / deviation * np.sqrt(4000)
+    square = sample.var() / deviation**2 * 4000
+    require(
+        {
+            "mean": 2 * stats.norm.sf(abs(z)),
+            "deviation": 2 * min(stats.chi2.sf(square, 3999), stats.chi2.cdf(square, 3999)),
+        },
+        "window estimate",
+    )
+    independent = np.sqrt(weights**2 @ cube.mean(0))  # what Poisson bins would have
+    assert abs(independent / deviation - 1) > 0.02
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"method": "coates"}, "'coates' is not for detectors of mode 'nonparalyzable'"),
+        ({"method": "best"}, "method must be one of"),
+        ({"cube": np.zeros((3, 7), np.uint16)}, r"cube must be \(..., 500\)"),
+        ({"cube": np.full((1, 500), np.nan)}, "finite counts"),
+        ({"cube": np.full((1, 500), -1)}, "counts >= 0"),
+        ({"level": 0.0}, "level must be"),
+        ({"attenuation": "cubic"}, "attenuation must be one of"),
+        ({"threads": 0}, "threads must be"),
+        ({"system": with_dead(75.0, mode="paralyzable")}, "not for detectors of mode 'paralyzable'"),
+        (
+            {"system": with_dead(45.0, mode="gated", gate_start_ns=0.0, gate_width_ns=9.0, gate_step_ns=1.0)},
+            "needs a gate that repeats",
+        ),
+        (
+            {"system": PLAIN.replace(pulse=ml.GaussianPulse(sigma_ns=30.0)), "method": "matched_filter"},
+            "use 'maximum_likelihood'",
+        ),
+        ({"system": with_dead(0.1), "method": "mchc"}, "at least one bin"),
+    ],
+)
+def test_bad_input(change, message):
+    arguments = {"cube": np.ones((2, 500), np.uint16), "system": PLAIN, **change}
+    with pytest.raises((ValueError, TypeError), match=message):
+        ml.reconstruct(**arguments)
+
+
+def test_reflectivity_is_signal_over_level():
+    depth = np.array([[1.0, 2.0, 4.0]])
+    flux = ml.Flux([[4.0, 1.0, 0.25]], 0.1, PLAIN.delay_ns(depth))
+    cube = ml.simulate(flux, PLAIN.replace(cycles=100_000), seed=1)[0]
+    system = dataclasses.replace(PLAIN, cycles=100_000)
+    absolute = ml.reconstruct(cube, system, level=4.0, attenuation="inverse_square")
+    assert absolute.reflectivity == pytest.approx(np.ones((1, 3)), rel=0.05)
+    relative = ml.reconstruct(cube, system)
+    assert relative.reflectivity.mean() == pytest.approx(1.0)

@@ -1,0 +1,142 @@
+"""Corrections of histograms, against mean histograms that are known exactly."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import mars_lidar as ml
+from mars_lidar.reconstruction import coates_rates, generalised_coates_rates, mchc_rates
+from mars_lidar.statistics import mean_histogram
+
+PERIOD = 100.0
+
+
+def system_of(dead_ns: float, *, bins: int = 500, cycles: int = 1000, sigma_ns: float = 1.0, **more) -> ml.System:
+    detector = {k: more.pop(k) for k in list(more) if k.startswith("gate") or k == "mode"}
+    return ml.System(
+        period_ns=PERIOD,
+        cycles=cycles,
+        bins=bins,
+        pulse=ml.GaussianPulse(sigma_ns=sigma_ns),
+        detector=ml.Detector(dead_time_ns=dead_ns, **detector),
+        **more,
+    )
+
+
+def photons(system: ml.System, signal: float, background: float, delay_ns: float) -> np.ndarray:
+    return signal * system.pulse.bin_energy(delay_ns, PERIOD, system.bins) + background / system.bins
+
+
+def recursion(rate: np.ndarray, cycles: int, shift: int) -> np.ndarray:
+    """Mean histogram of an armed exposure on bins whose registrations re-arm at a uniform place `shift` bins later.
+
+    Written from section 5 of the model: A = P(armed), bin by bin through the whole exposure, no period folded.
+    """
+    n = rate.size
+    past = np.zeros(n * cycles)
+    armed = 1.0
+    for t in range(n * cycles):
+        rearmed = past[t - shift] if t >= shift else 0.0
+        fired = -np.expm1(-rate[t % n])
+        after = armed * (1.0 - fired) + rearmed * fired / rate[t % n]
+        past[t] = armed + rearmed - after
+        armed = after
+    return past.reshape(cycles, n).sum(0)
+
+
+@pytest.mark.parametrize(("shift", "cycles"), [(7, 400), (23, 400), (64, 400), (64 * 3 + 5, 400)])
+def test_generalised_coates_inverts_the_recursion(shift, cycles):
+    """Exactly, but for the exposure's ends, which are known on average over the cycles."""
+    n = 64
+    system = system_of(shift / n * PERIOD, bins=n, cycles=cycles, sigma_ns=3.0)
+    rate = photons(system, 1.5, 1.0, 37.0)
+    mean = recursion(rate, cycles, shift)
+    error = np.abs(generalised_coates_rates(mean, system) / rate - 1.0).max()
+    careless = generalised_coates_rates(mean, system.replace(start="stationary"))
+    assert error < 3e-4
+    assert error < 0.2 * np.abs(careless / rate - 1.0).max()
+
+
+@pytest.mark.parametrize("dead_ns", [0.0, 0.3, 7.0, 64.04, 99.97, 100.0, 237.77])
+@pytest.mark.parametrize("start", ["armed", "stationary"])
+def test_generalised_coates_inverts_the_exact_mean(dead_ns, start):
+    """The mean histogram in continuous time, any dead time: what is left is the flux's change inside of bins."""
+    error = []
+    for bins in (250, 1000):
+        system = system_of(dead_ns, bins=bins, cycles=2000, start=start)
+        rate = photons(system, 1.0, 1.0, 37.0)
+        mean = mean_histogram(ml.Flux(1.0, 1.0, 37.0), system, tolerance=1e-6)
+        error.append(np.abs(generalised_coates_rates(mean, system) - rate).sum() / rate.sum())
+    assert error[1] < 2e-4
+    assert error[1] < 0.25 * error[0] + 2e-5
+
+
+@pytest.mark.parametrize(("dead_ns", "cycles"), [(0.0, 1), (0.0, 1000), (64.0, 1000), (237.0, 1000)])
+def test_coates_inverts_the_exact_mean(dead_ns, cycles):
+    system = system_of(dead_ns, cycles=cycles, mode="synchronous")
+    rate = photons(system, 1.0, 0.5, 37.0)
+    mean = mean_histogram(ml.Flux(1.0, 0.5, 37.0), system)
+    found = coates_rates(mean, system)
+    assert np.abs(found / rate - 1.0).max() < (1e-9 if dead_ns == 0 else 1e-3)
+
+
+def test_coates_is_the_textbook_formula():
+    system = system_of(0.0, bins=4, cycles=100, sigma_ns=5.0, mode="synchronous")
+    h = np.array([10, 20, 0, 30])
+    found = coates_rates(h, system)
+    assert found == pytest.approx(np.log([100 / 90, 90 / 70, 1.0, 70 / 40]), abs=1e-12)
+    assert np.isinf(coates_rates([10, 90, 0, 0], system)[1])
+
+
+def test_a_gate_that_stays():
+    system = system_of(45.0, mode="gated", gate_start_ns=80.03, gate_width_ns=40.0)
+    mean = mean_histogram(ml.Flux(1.0, 1.0, 95.0), system, tolerance=1e-6)
+    found = generalised_coates_rates(mean, system)
+    rate = photons(system, 1.0, 1.0, 95.0)
+    inside = np.r_[402:500, 0:99]
+    assert np.abs(found[inside] / rate[inside] - 1.0).max() < 2e-3
+    assert not found[102:398].any()
+
+
+def test_mchc_has_the_histogram_as_its_fixed_point():
+    """On a long exposure it agrees with generalised Coates, which finds the same rates by another way."""
+    for dead_ns in (23.0, 64.04, 237.77):
+        system = system_of(dead_ns, cycles=10**6)
+        rate = photons(system, 1.0, 1.0, 37.0)
+        mean = mean_histogram(ml.Flux(1.0, 1.0, 37.0), system, tolerance=1e-6)
+        found = mchc_rates(mean, system, tolerance=1e-9)
+        assert np.abs(found - rate).sum() / rate.sum() < 1e-3
+        known = mchc_rates(mean, system, total=2.0, tolerance=1e-9)
+        assert known.sum() == pytest.approx(2.0, rel=1e-12)
+        assert np.abs(known - rate).sum() / rate.sum() < 1e-3
+
+
+def test_one_cycle_of_an_armed_pixel():
+    """Nothing lies before the exposure: the correction is Coates' own where one photon fills the period."""
+    free = system_of(99.0, bins=50, cycles=1, sigma_ns=5.0)
+    clock = system_of(0.0, bins=50, cycles=1, sigma_ns=5.0, mode="synchronous")
+    mean = np.linspace(0.0, 0.015, 50)
+    assert generalised_coates_rates(mean, free)[:49] == pytest.approx(coates_rates(mean, clock)[:49], abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    "effect",
+    [{"electronics_dead_time_ns": 80.0}, {"jitter": ml.Jitter(sigma_ns=0.5)}, {"max_events_per_period": 1}],
+    ids=["electronics", "jitter", "limit"],
+)
+def test_what_no_method_knows_of_the_detector_is_told(effect):
+    plain = ml.System(
+        period_ns=100.0,
+        cycles=100,
+        bins=100,
+        pulse=ml.GaussianPulse(sigma_ns=1.0),
+        detector=ml.Detector(dead_time_ns=50.0, detection_efficiency=0.5),
+    )
+    cube = ml.simulate(ml.Flux(1.0, 0.5, 37.0), plain)
+    ml.reconstruct(cube, plain)  # no word of an efficiency
+    odd = plain.replace(detector=ml.Detector(dead_time_ns=50.0, **effect))
+    with pytest.warns(UserWarning, match=next(iter(effect))):
+        ml.reconstruct(cube, odd)
+    with pytest.raises(ValueError, match=f"cramer_rao does not do {next(iter(effect))}"):
+        ml.cramer_rao(ml.Flux(1.0, 0.5, 37.0), odd)

@@ -27,7 +27,7 @@ class Afterpulsing:
     """Carriers that an avalanche leaves in traps and that are released later: each is an arrival like a photon.
 
     Every avalanche leaves a Poisson number of them (Straka et al., J. Lightwave Technol. 38, 4765 (2020), arXiv
-    2001.10036), with independent delays counted from the avalanche. One that is released while the pixel is blind is
+    2001.10036), with independent delays counted from the avalanche. One that is released during the dead time is
     lost; one that finds it armed triggers an avalanche, which leaves carriers again.
 
     Parameters
@@ -35,7 +35,7 @@ class Afterpulsing:
     probability
         Mean number of carriers per avalanche, in (0, 1), those included that will be lost in the dead time. With
         exponential delays the share e^(-t_d / delay) of them outlives the dead time of its own avalanche: an
-        afterpulse probability p behind a dead time, as data sheets have it, is
+        afterpulse probability p after a dead time, as data sheets state it, is
         ``Afterpulsing.after_dead_time(probability=p, ...)``.
     delay_ns
         Mean of exponential delays, ns. Either this, or

@@ -38,16 +38,16 @@ class Detector:
     Parameters
     ----------
     dead_time_ns
-        After a registration the pixel is blind for this long, across period edges. 0, a fraction of the
+        After a registration the pixel is dead for this long, across period edges. 0, a fraction of the
         laser period or many periods.
     mode
-        - ``"nonparalyzable"``: free running; photons that arrive while the pixel is blind have no effect,
+        - ``"nonparalyzable"``: free-running; photons that arrive during the dead time have no effect,
         - ``"paralyzable"``: free running; every arrival, registered or not, begins the dead time anew, so that
           an arrival is registered iff none came within the dead time before it,
         - ``"synchronous"``: armed at the start of each laser period, registers the first photon and nothing
           more until the next; a dead time that is not over at the start of a period costs that whole period,
         - ``"gated"``: photons outside of the gate do not exist; inside, as ``"nonparalyzable"``. Where the gate
-          opens while the pixel is blind, the pixel is armed when its dead time is over.
+          opens during the dead time, the pixel is armed when its dead time ends.
     gate_start_ns, gate_width_ns
         The gate is open on [start, start + width) of each period; one that reaches beyond the end of the period
         continues at its beginning. The start is taken modulo the period, the width is at most the period. Both
@@ -173,7 +173,7 @@ class Detector:
     def preset(cls, name: str) -> Detector:
         """A detector as published, by its name in `mars_lidar.instrument.presets.PRESETS` (docs/detectors.md).
 
-        `dataclasses.replace` changes fields. Efficiencies are left at 1: they go with the wavelength.
+        `dataclasses.replace` changes fields. Efficiencies stay at 1, because they depend on the wavelength.
         """
         return cls(**preset(name))
 

@@ -49,7 +49,7 @@ class Effect:
 
     kind
         What it changes. ``"light"``: the flux only (`Flux.detected`), which every engine and statistic takes.
-        ``"avalanche"``: what an avalanche leaves behind, further arrivals in the same pixel or in its neighbours.
+        ``"avalanche"``: further arrivals that an avalanche causes in the same pixel or in its neighbours.
         ``"recording"``: which registrations of a pixel are recorded; ``"timing"``: at what time, but not how many.
     off
         The value that switches it off: the bits of the ideal pixel.

@@ -131,7 +131,7 @@ class Jitter:
 @constructed_by_name
 @dataclass(frozen=True)
 class SampledJitter:
-    """A measured jitter: the density of the delay of a record behind its avalanche, constant on samples.
+    """A measured jitter: the density of the delay of a record after its avalanche, constant on samples.
 
     Parameters
     ----------

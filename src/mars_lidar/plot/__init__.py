@@ -1,7 +1,7 @@
 """Pictures of histogram cubes, for screens and papers.
 
-Every figure is a `matplotlib.figure.Figure` and touches no global state of matplotlib: nothing is shown, no
-backend is chosen, and figures can be made in any thread. ``figure.savefig(path)`` writes one.
+Every figure is a `matplotlib.figure.Figure` and changes no global state of matplotlib: no window opens, no
+backend is selected, and figures can be made in any thread. ``figure.savefig(path)`` writes one.
 """
 
 from mars_lidar.plot.figures import map_image, overview, pixel_histogram

@@ -37,7 +37,7 @@ def overview(
 ) -> Figure:
     """Depth, reflectivity, total counts, peak-bin depth, and the histograms of a few pixels.
 
-    A measured cube is shown with the light that maximum likelihood finds in it, in place of the true one.
+    For a measured cube the maximum likelihood estimate replaces the true light.
 
     Parameters
     ----------

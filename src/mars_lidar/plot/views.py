@@ -153,7 +153,7 @@ def _peak_offset_ns(system: System) -> float:
 def fitted(cube: Cube, realization: int) -> Cube:
     """One exposure of a measured cube with the flux that maximum likelihood finds in it; a simulated one as it is.
 
-    The flux is that of detectable photons, so the system is `System.detected`. Depth is NaN where no return is seen.
+    The flux is that of detectable photons, so the system is `System.detected`. Depth is NaN where there is no return.
     Detectors that maximum likelihood does not hold for are fitted by the first of the other methods that does.
     """
     if not cube.measured:

@@ -31,9 +31,9 @@ class Coates(RateMethod):
 
 @checked
 def coates_rates(cube: ArrayLike, system: System, *, threads: int | None = None) -> FloatArray:
-    """Photons per period in each bin (..., bins) behind the histograms (..., bins) of a synchronous detector.
+    """Photons per period in each bin (..., bins) from histograms (..., bins) of a synchronous detector.
 
-    Infinite in bins that registered in every period that was left.
+    Infinite in bins that registered in every remaining armed period.
     """
     return Coates().rates(cube, system, threads)
 
@@ -52,7 +52,7 @@ class GeneralisedCoates(RateMethod):
 
 @checked
 def generalised_coates_rates(cube: ArrayLike, system: System, *, threads: int | None = None) -> FloatArray:
-    """Photons per period in each bin (..., bins) behind the histograms (..., bins) of a free-running detector.
+    """Photons per period in each bin (..., bins) from histograms (..., bins) of a free-running detector.
 
     Whatever the waveform: no pulse is assumed. Bins that registered whenever they could are infinite. The variance of
     a bin's rate l is about l^2 / h, h its registrations, and bins are independent of each other.

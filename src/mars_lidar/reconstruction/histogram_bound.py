@@ -202,9 +202,9 @@ def _simulate_instead(_: str) -> str:
 
 
 def _inverse_diagonal(information: FloatArray) -> FloatArray:
-    """Diagonal of the inverse (..., n); what nothing is known of is inf and left out of the rest.
+    """Diagonal of the inverse (..., n); parameters without information are inf and excluded from the rest.
 
-    So is what cannot be told from something else: the signal from the background, say, in a single bin.
+    So are parameters that cannot be distinguished, such as signal and background in a single bin.
     """
     size = information.shape[-1]
     flat = information.reshape(-1, size, size)

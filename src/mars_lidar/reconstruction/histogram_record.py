@@ -65,7 +65,7 @@ def pulse_width(sharpness: float) -> float:
 
 
 def check_window(what: str, system: System) -> None:
-    """Raise ValueError where no background could be seen beside the window of the signal."""
+    """Raise ValueError where the window of the signal leaves no bins for the background."""
     low, high = core_ns(system)
     most = 0.75 * system.detector.gate_periods(system.period_ns)[2] * system.period_ns
     if high - low > most:

@@ -28,11 +28,11 @@ class MaximumLikelihood(Method):
     starts
         The likelihood is climbed from this many delays, the best of a grid over the period, in [1, 8].
     false_alarm
-        Pixels without signal that are not flagged as such, as a share of them, about: a signal counts as seen where
-        twice its gain in log likelihood is more than what background reaches with this probability anywhere in the
-        period.
+        False-alarm probability: the approximate fraction of pixels without signal that are not flagged. A signal is
+        detected where twice its gain in log likelihood exceeds the level that background reaches anywhere in the
+        period with this probability.
     less_bias
-        Take the bias of first order off the maximum (Cox and Snell, J. R. Stat. Soc. B 30, 248, 1968; R19): some
+        Subtract the first-order bias of the maximum (Cox and Snell, J. R. Stat. Soc. B 30, 248, 1968; R19): some
         tenths of a standard error in bright pixels of short exposures, whose errors it makes smaller too.
     returns
         Largest number of returns for each pixel, in [1, 8]. Returns are added as long as twice the gain of the log

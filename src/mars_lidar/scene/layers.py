@@ -18,7 +18,7 @@ MOST = 16  # layers, and returns of a pixel
 
 
 class LayeredScene:
-    """Surfaces seen by the same pixels, one return each.
+    """Several surfaces in the same pixels, one return each.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ class LayeredScene:
     def behind_pane(
         cls, scene: Scene | LayeredScene, depth_m: float, reflectivity: float, transmission: float = 1.0
     ) -> LayeredScene:
-        """A scene seen through a pane at one range.
+        """A scene behind a pane at one range.
 
         Parameters
         ----------

@@ -41,7 +41,7 @@ def keep(save: Callable[..., None], own: Path) -> None:
 
 
 def files(folder: Path | None = None) -> list[Path]:
-    """Tables in the cache, and what unfinished writing left there."""
+    """Tables in the cache, and unfinished files there."""
     where = directory() if folder is None else folder
     if not where.is_dir():
         return []

@@ -341,7 +341,7 @@ class Table:
             ``"bilinear"``: the mean histogram is a mixture of four, linear in S and in B; cumulants are bicubic in
             their logarithms. ``"nearest"``: the nearest entry, as in the paper.
         outside
-            ``"error"``, or ``"exact"``: pixels beyond the axes are left to the caller, marked in `Lookup.outside`.
+            ``"error"``, or ``"exact"``: pixels beyond the axes are marked in `Lookup.outside` for the caller.
         threads
             Threads to run on; the result does not depend on it.
 

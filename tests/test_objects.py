@@ -58,7 +58,7 @@ def objects(tmp_path_factory) -> dict[str, Any]:
         "lookup": table.lookup(np.array([0.5]), np.array([0.5])),
         "engine": MarsEngine(table=table, count="matched"),
         "stored cube": io.load(stored),
-        "cube": io.Cube(histogram=cube, recipe=io.Recipe(system=SYSTEM, flux=flux, realizations=2)),
+        "cube": io.Cube.of(cube, io.Recipe(system=SYSTEM, flux=flux, realizations=2)),
     }
 
 

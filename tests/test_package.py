@@ -113,6 +113,7 @@ def test_where_a_module_calls_one_above_it():
         for name in re.findall(r'late\("([^"]+)"\)', path.read_text())
     ]
     assert sorted(used) == [
+        "io/cube.py: plot.figures:overview",
         "light/flux.py: light.fog:in_fog",
         "light/flux.py: light.transient:Transient",
         "light/timestamps.py: io.streams.files:load",

@@ -29,10 +29,7 @@ SYSTEM = ml.System(
 
 def cube_of(flux: ml.Flux, system: ml.System = SYSTEM, engine: str = "exact", realizations: int = 1) -> io.Cube:
     counts = ml.simulate(flux, system, engine=engine, realizations=realizations)
-    return io.Cube(
-        histogram=counts,
-        recipe=io.Recipe(system=system, flux=flux, engine=engine, realizations=realizations),
-    )
+    return io.Cube.of(counts, io.Recipe(system=system, flux=flux, engine=engine, realizations=realizations))
 
 
 def step(height: int = 9, width: int = 12) -> ml.Flux:
@@ -204,3 +201,40 @@ def test_a_headline_names_what_is_not_plain():
         "1,000 bins of 100 ps; 2,000 laser periods of 100 ns; dead time 0 ns, synchronous, dark count, "
         "max events per exposure"
     )
+
+
+def test_an_array_of_counts_is_drawn_and_saved_with_its_system(tmp_path):
+    """With its light as the cube of it; without, as counts that were measured; alone, it is said what to give."""
+    flux = step()
+    counts = ml.simulate(flux, SYSTEM, realizations=2, seed=4)
+    cube = ml.Cube(counts, SYSTEM, flux)
+    assert (cube.shape, cube.measured, cube.engine) == (counts.shape, False, "")
+    assert np.array_equal(cube.flux.signal, flux.signal)
+    assert ml.Cube(counts[0], SYSTEM).measured
+    assert ml.Cube(counts[0, 0, 0].astype(float), SYSTEM).shape == (1, 1, 1, SYSTEM.bins)
+    assert np.array_equal(ml.reconstruct(cube).depth_m, ml.reconstruct(counts, SYSTEM).depth_m, equal_nan=True)
+    plot.pixel_histogram(counts, 3, 4, system=SYSTEM, flux=flux).savefig(tmp_path / "a.png")
+    plot.pixel_histogram(cube, 3, 4).savefig(tmp_path / "b.png")
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+    assert "simulated, realization 1" in cube.plot(realization=1).texts[-1].get_text()
+    plot.overview(counts, SYSTEM)  # measured: with the light that is fitted
+    for name, save in (("a.zarr", lambda at: io.save(at, counts, SYSTEM, flux)), ("b.h5", cube.save)):
+        save(tmp_path / name)
+        with io.load(tmp_path / name) as back:
+            assert np.array_equal(back.histogram[...], counts)
+            assert np.array_equal(back.flux.signal, flux.signal)
+    told = r"cube must be a Cube, or an array of counts beside the system that recorded them .*got ndarray alone"
+    for call in (lambda: plot.pixel_histogram(counts, 0, 0), lambda: io.save(tmp_path / "c.h5", counts)):
+        with pytest.raises(TypeError, match=told):
+            call()
+    with pytest.raises(TypeError, match="a Cube has its own"):
+        io.save(tmp_path / "c.h5", cube, SYSTEM)
+    for wrong, message in (
+        (counts - 0.5, "whole numbers"),
+        (counts.astype(int) - 10**6, r"counts must lie in \[0, 65535\]"),
+        (counts[..., 1:], r"counts must be \(realizations, H, W, 128\)"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            ml.Cube(wrong, SYSTEM)
+    with pytest.raises(ValueError, match="flux must have the pixels of the counts, 9 x 12, got"):
+        ml.Cube(counts, SYSTEM, ml.Flux(1.0, 0.1, 3.0))

@@ -133,6 +133,7 @@ CALLS: dict[str, Callable[[Path], tuple[Callable[..., Any], dict[str, Any]]]] = 
     "simulate": lambda _: (ml.simulate, {"flux": FLUX, "system": SYSTEM}),
     "simulate_timestamps": lambda _: (ml.simulate_timestamps, {"flux": FLUX, "system": SYSTEM}),
     "reconstruct": lambda _: (ml.reconstruct, {"cube": counts(), "system": SYSTEM}),
+    "Cube": lambda _: (ml.Cube, {"counts": counts(), "system": SYSTEM, "flux": FLUX}),
     "cramer_rao": lambda _: (
         ml.cramer_rao,
         {"flux": PIXEL, "system": SYSTEM},

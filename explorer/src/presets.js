@@ -13,5 +13,5 @@ export const PRESETS = [
   { name: "A locked pixel counts like a clock", changes: { ...FREE, signal: 20, background: 0.1, delay: 60, dead: 175 },
     sentence: "A dead time of 175 ns ends between two bright pulses, so every second pulse is registered: 1000 counts of 2000 periods in every exposure. A Poisson count would scatter by 32." },
   { name: "Dim light, honest errors", changes: { ...FREE, signal: 0.03, background: 0.03, delay: 60, log: 0 },
-    sentence: "60 signal photons in 2000 periods: maximum likelihood gives the depth with its standard error, about 4 cm, as the scatter of Draw again shows; the fullest bin has no error to give." },
+    sentence: "60 signal photons in 2000 periods: maximum likelihood gives the depth with its standard error, 4 to 5 cm, as the scatter of Draw again shows; the fullest bin has no error to give." },
 ];

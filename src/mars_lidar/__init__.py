@@ -30,6 +30,7 @@ __all__ = [
     "Calibration",
     "CountLaw",
     "Crosstalk",
+    "Cube",
     "Detector",
     "Flux",
     "GaussianPulse",
@@ -68,12 +69,13 @@ if TYPE_CHECKING:
     from mars_lidar import plot as plot
     from mars_lidar.dataset import Generated as Generated
     from mars_lidar.dataset import generate as generate
+    from mars_lidar.io import Cube as Cube
     from mars_lidar.io import to_xarray as to_xarray
 else:
     from importlib import import_module
 
     _LATER = ("io", "learn", "plot")  # with what they import, only where they are used: `ml.io.load`
-    _HOMES = {"Generated": "dataset", "generate": "dataset", "to_xarray": "io"}
+    _HOMES = {"Cube": "io", "Generated": "dataset", "generate": "dataset", "to_xarray": "io"}
 
     def __getattr__(name: str) -> object:
         if name in _LATER:

@@ -78,7 +78,7 @@ def test_the_photons_of_a_cube_are_its_counts(tmp_path):
         times = io.photons(cube, realization=1)
         assert np.array_equal(times.histogram(), cube.histogram[1])
         assert (times.info["realization"], times.info["source"]) == (6, "a test")
-        other = io.Cube(histogram=np.asarray(cube.histogram) + np.uint16(1), recipe=cube.recipe)
+        other = io.Cube.of(np.asarray(cube.histogram) + np.uint16(1), cube.recipe)
         with pytest.raises(ValueError, match="the photons of row 0 do not have the counts"):
             io.photons(other)
 

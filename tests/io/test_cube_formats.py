@@ -168,7 +168,7 @@ def test_a_finer_depth_map_becomes_bin_hr(tmp_path):
     depth = np.full((48, 40), 4.0)
     depth[0, 0] = np.nan
     counts = ml.simulate(flux, system, realizations=3)
-    cube = io.Cube(histogram=counts, recipe=io.Recipe(system=system, flux=flux, realizations=3))
+    cube = io.Cube.of(counts, io.Recipe(system=system, flux=flux, realizations=3))
     io.save_mat(tmp_path / "a.mat", cube, realization=2, depth_hr_m=depth)
     read = io.read_mat(tmp_path / "a.mat")
     assert np.array_equal(read.histogram, counts[2])

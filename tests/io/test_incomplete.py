@@ -197,7 +197,7 @@ def test_a_file_that_finds_no_room_says_so_and_leaves_nothing(tmp_path, name, mo
     maps = {f"method {k}": ml.reconstruct(cube, system, "peak") for k in range(12)}
     target = tmp_path / name
     writes = {
-        "a": lambda: io.save(target, io.Cube(histogram=cube, recipe=io.Recipe(system=system, flux=flux))),
+        "a": lambda: io.save(target, io.Cube.of(cube, io.Recipe(system=system, flux=flux))),
         "s": lambda: times.save(target),
         "t": lambda: table.save(target),
         "m": lambda: save_maps(target, maps),

@@ -183,7 +183,7 @@ def test_a_cube_in_memory_is_saved(tmp_path, suffix):
     flux = one_return()
     made = io.Recipe(system=SYSTEM, flux=flux, engine="poisson", seed=9, realizations=2)
     counts = ml.simulate(flux, SYSTEM, engine="poisson", realizations=2, seed=9)
-    io.save(tmp_path / f"cube{suffix}", io.Cube(histogram=counts, recipe=made))
+    io.save(tmp_path / f"cube{suffix}", io.Cube.of(counts, made))
     with io.load(tmp_path / f"cube{suffix}") as cube:
         assert np.array_equal(np.asarray(cube.histogram), counts)
         assert cube.registrations == counts.sum()
@@ -201,8 +201,8 @@ def test_verify_sees_a_single_changed_count(tmp_path):
 def test_counts_that_do_not_belong_to_the_recipe_are_refused(tmp_path):
     made = io.Recipe(system=SYSTEM, flux=one_return())
     with pytest.raises(ValueError, match=r"histogram must have the shape \(1, 6, 5, 64\)"):
-        io.Cube(histogram=np.zeros((1, 6, 5, 65), np.uint16), recipe=made)
-    wrong = io.Cube(histogram=np.zeros((1, 6, 5, 64), np.float32), recipe=made)
+        io.Cube.of(np.zeros((1, 6, 5, 65), np.uint16), made)
+    wrong = io.Cube.of(np.zeros((1, 6, 5, 64), np.float32), made)
     with pytest.raises(TypeError, match="histogram must be uint16 for this system, got float32"):
         io.save(tmp_path / "cube.h5", wrong)
     assert list(tmp_path.iterdir()) == []

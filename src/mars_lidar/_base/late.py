@@ -1,8 +1,8 @@
 """Methods of a lower layer whose work is done by a higher one: found by name, when they are called.
 
-`Timestamps.save`, `Timestamps.load` and `Scene.from_rgbd` belong to classes that know of no file format, and
-`Flux.in_fog` and `Flux.from_transient` to one that knows of no model of light. These are the only places where a
-module calls one above it: docs/architecture.md lists them, tests/test_package.py counts them.
+`Timestamps.save`, `Timestamps.load` and `Scene.from_rgbd` belong to classes that know of no file format, `Flux.in_fog`
+and `Flux.from_transient` to one that knows of no model of light, `Cube.plot` to one that draws nothing. These are the
+only places where a module calls one above it: docs/architecture.md lists them, tests/test_package.py counts them.
 """
 
 from __future__ import annotations

@@ -146,7 +146,7 @@ class Dataset:
             reflectivity=shown.reflectivity if known.any() else None,
             source=self.scene_names()[scene],
         )
-        return Cube(histogram=np.asarray(self.histogram[number]), recipe=recipe, version=self.attrs["version"])
+        return Cube.of(np.asarray(self.histogram[number]), recipe, version=self.attrs["version"])
 
     def scene_names(self) -> list[str]:
         """Names of all scenes."""

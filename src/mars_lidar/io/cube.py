@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
+from dataclasses import MISSING, dataclass, field, fields
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
-from mars_lidar._base.arguments import checked
+from mars_lidar._base.arguments import checked, checked_with_masks
 from mars_lidar._base.brief import brief
 from mars_lidar._base.buckets import url_of
 from mars_lidar._base.files import (
@@ -25,6 +25,7 @@ from mars_lidar._base.files import (
     reading,
     unfinished_of,
 )
+from mars_lidar._base.late import late
 from mars_lidar._base.memory import check_memory
 from mars_lidar._base.notebook import as_html
 from mars_lidar.instrument.system import System
@@ -45,9 +46,23 @@ _MODULES = {
 SUFFIXES = tuple(_MODULES)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, init=False)
 class Cube:
-    """A histogram cube and what is behind it: the recipe that makes it again, or how it was measured.
+    """A histogram cube: counts, the system that recorded them, and the light where it is known.
+
+    What `io.load`, `io.foreign_cube` and `io.from_histograms` give, and `reconstruct`, `plot` and `io.save` take.
+
+    Parameters
+    ----------
+    counts
+        (realizations, H, W, bins) whole numbers, as `simulate` returns them; of one exposure, of a row of pixels and of
+        one pixel the leading axes may be left out.
+    system
+        Laser, detector and histogram.
+    flux
+        The light of the pixels, where it is known.
+    depth_m, reflectivity
+        Maps (H, W) of the scene, beside a flux; depth is c tau / 2 by default.
 
     Attributes
     ----------
@@ -66,6 +81,22 @@ class Cube:
         The file, or None for a cube in memory or at a `url`.
     url
         Where a cube that is read from elsewhere lies; "" for others.
+
+    See Also
+    --------
+    simulate, reconstruct
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> flux = ml.Flux(signal=[[0.5, 2.0]], background=1.0, delay_ns=[[20.0, 60.0]])
+    >>> cube = ml.Cube(ml.simulate(flux, system), system, flux)
+    >>> cube.shape
+    (1, 1, 2, 128)
     """
 
     histogram: CountArray
@@ -81,12 +112,50 @@ class Cube:
 
     __repr__ = brief
 
-    def __post_init__(self) -> None:
-        if tuple(self.histogram.shape) != self.recipe.shape:
+    @checked_with_masks
+    def __init__(
+        self,
+        counts: ArrayLike,
+        system: System,
+        flux: Flux | None = None,
+        *,
+        depth_m: ArrayLike | None = None,
+        reflectivity: ArrayLike | None = None,
+    ) -> None:
+        array = _whole_numbers(counts, system)
+        realizations, height, width, _ = array.shape
+        recipe: Recipe | Recording
+        if flux is None:
+            if depth_m is not None or reflectivity is not None:
+                raise TypeError("depth_m and reflectivity stand beside a flux, which is not given")
+            recipe = Recording(system=system, pixels=(height, width), realizations=realizations)
+        else:
+            if flux.image.shape != (height, width):
+                raise ValueError(f"flux must have the pixels of the counts, {height} x {width}, got {flux.shape}")
+            maps: Any = {"depth_m": depth_m, "reflectivity": reflectivity}
+            recipe = Recipe(system=system, flux=flux, realizations=realizations, engine="", **maps)
+        vars(self).update(vars(Cube.of(array, recipe)))
+
+    @classmethod
+    def of(cls, histogram: CountArray, recipe: Recipe | Recording, **known: Any) -> Cube:
+        """A cube by what made or recorded it; `known` are further attributes."""
+        if tuple(histogram.shape) != recipe.shape:
             raise ValueError(
-                f"histogram must have the shape {self.recipe.shape} of its recipe "
-                f"(realizations, H, W, bins), got {tuple(self.histogram.shape)}"
+                f"histogram must have the shape {recipe.shape} of its recipe "
+                f"(realizations, H, W, bins), got {tuple(histogram.shape)}"
             )
+        cube = cls.__new__(cls)
+        default = {each.name: each.default for each in fields(cls) if each.default is not MISSING}
+        vars(cube).update(default | known | {"histogram": histogram, "recipe": recipe})
+        return cube
+
+    def save(self, path: str | Path, *, overwrite: bool = False) -> None:
+        """Write the cube to a file: `io.save`."""
+        save(path, self, overwrite=overwrite)
+
+    def plot(self, **options: Any) -> Any:
+        """A figure of maps and of the histograms of a few pixels: `plot.overview`, whose options it takes."""
+        return late("plot.figures:overview")(self, **options)
 
     def _repr_html_(self) -> str:
         y, x = self.shape[1] // 2, self.shape[2] // 2
@@ -170,9 +239,46 @@ class Cube:
         self.close()
 
 
+def _whole_numbers(counts: ArrayLike, system: System) -> NDArray[Any]:
+    """Counts (realizations, H, W, bins) of the type of the system's histograms."""
+    array = np.asarray(checks.numbers("counts", checks.unmasked("counts", counts)))
+    if not 1 <= array.ndim <= 4 or array.size == 0 or array.shape[-1] != system.bins:
+        raise ValueError(f"counts must be (realizations, H, W, {system.bins}), got shape {array.shape}")
+    largest = np.iinfo(system.histogram_dtype).max
+    if array.dtype.kind == "f" and not (array == np.floor(array)).all():
+        raise ValueError("counts must be whole numbers")
+    if array.min() < 0 or array.max() > largest:
+        raise ValueError(f"counts must lie in [0, {largest}], got {array.min():g} to {array.max():g}")
+    whole = array.astype(system.histogram_dtype, copy=False)
+    return whole.reshape((1,) * (4 - whole.ndim) + whole.shape)
+
+
+def as_cube(cube: Cube | ArrayLike, system: System | None, flux: Flux | None = None) -> Cube:
+    """The cube, or one of an array of counts and the system that recorded them."""
+    if isinstance(cube, Cube):
+        if system is not None or flux is not None:
+            raise TypeError("system and flux stand beside an array of counts: a Cube has its own")
+        return cube
+    if system is None:
+        raise TypeError(
+            "cube must be a Cube, or an array of counts beside the system that recorded them (system=...), "
+            f"got {type(cube).__name__} alone"
+        )
+    return Cube(cube, system, flux)
+
+
 @checked
-def save(path: str | Path, cube: Cube, *, overwrite: bool = False) -> None:
+def save(
+    path: str | Path,
+    cube: Cube | ArrayLike,
+    system: System | None = None,
+    flux: Flux | None = None,
+    *,
+    overwrite: bool = False,
+) -> None:
     """Write a cube to a ``.zarr``, ``.h5``, ``.hdf5``, ``.npz``, ``.mat`` or ``.ptu``.
+
+    Of an array of counts with the `system` that recorded them, and its light where it is known, it makes a cube.
 
     Raises
     ------
@@ -181,6 +287,7 @@ def save(path: str | Path, cube: Cube, *, overwrite: bool = False) -> None:
     OSError
         `path` exists and `overwrite` is false, or cannot be written.
     """
+    cube = as_cube(cube, system, flux)
     check_output(path, cube.recipe, overwrite=overwrite)
     with open_writer(path, cube.recipe) as writer:
         copy_counts(cube, writer)
@@ -199,7 +306,7 @@ def one_exposure(cube: Cube, realization: int) -> Cube:
     """Exposure `realization` of a cube, in memory."""
     k = checks.integer("realization", realization, low=0, high=cube.shape[0] - 1)
     recipe = cube.recipe.replace(realizations=1, first_realization=cube.recipe.first_realization + k)
-    return Cube(histogram=np.asarray(cube.histogram[k : k + 1]), recipe=recipe, version=cube.version)
+    return Cube.of(np.asarray(cube.histogram[k : k + 1]), recipe, version=cube.version)
 
 
 def _load_again(path: str | Path, allow_incomplete: bool, identity: str) -> Cube:
@@ -264,9 +371,9 @@ def _opened(store: OpenedStore, source: Path, allow_incomplete: bool, url: str =
             raise ValueError(f"{url or source} has no variable 'histogram': its writing stopped at the very start")
         recipe = layout.recipe_from(store.attrs, store.arrays, int(histogram.shape[0]))
         total = store.attrs.get("registrations")
-        return Cube(
-            histogram=histogram,
-            recipe=recipe,
+        return Cube.of(
+            histogram,
+            recipe,
             complete=complete,
             registrations=None if total is None else int(total),
             version=str(store.attrs["version"]),

@@ -83,7 +83,7 @@ def from_histograms(
         whole[..., (first + np.arange(ordered.shape[-1])) % system.bins] = ordered
     realizations, height, width, _ = whole.shape
     recording = Recording(system=recorded, pixels=(height, width), realizations=realizations, source=source)
-    return Cube(histogram=whole, recipe=recording, registrations=int(whole.sum(dtype=np.uint64)))
+    return Cube.of(whole, recording, registrations=int(whole.sum(dtype=np.uint64)))
 
 
 @checked

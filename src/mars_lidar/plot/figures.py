@@ -6,11 +6,14 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
+from mars_lidar.instrument.system import System
+from mars_lidar.io.cube import Cube, as_cube
 from mars_lidar.io.layout import MEASURED
+from mars_lidar.light.flux import Flux
 from mars_lidar.plot.pixel import draw_pixel, quiet_corner
 from mars_lidar.plot.style import COLOURS, DPI, MISSING, style
 from mars_lidar.plot.views import count_maps, depth_error_m, example_pixels, fitted, incident_rate, instrument
@@ -18,8 +21,6 @@ from mars_lidar.plot.views import count_maps, depth_error_m, example_pixels, fit
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-    from mars_lidar.io import Cube
 
 _Pixels = dict[str, tuple[int, int]]
 _GAP_INCHES, _BAR_INCHES = 0.3, 0.86  # below a map, for the title of the next, and beside it, for its colour bar
@@ -29,7 +30,9 @@ _WIDEST_INCHES, _NARROW_INCHES = 2.45, 1.7  # of a map; a narrower one has a sho
 
 @checked
 def overview(
-    cube: Cube,
+    cube: Cube | ArrayLike,
+    system: System | None = None,
+    flux: Flux | None = None,
     *,
     realization: int = 0,
     pixels: Sequence[tuple[int, int]] | None = None,
@@ -42,7 +45,10 @@ def overview(
     Parameters
     ----------
     cube
-        A cube in memory or on disk; only one realization is read, in bands of rows.
+        A cube in memory or on disk, of which only one realization is read, in bands of rows; or counts as `simulate`
+        returns them.
+    system, flux
+        Beside an array of counts: how they were recorded, and the light where it is known.
     realization
         Which one, counted from the start of the cube.
     pixels
@@ -55,7 +61,7 @@ def overview(
     ValueError
         `realization` or a pixel outside of the cube.
     """
-    cube, realization, chosen = _checked(cube, realization, pixels)
+    cube, realization, chosen = _checked(as_cube(cube, system, flux), realization, pixels)
     totals, peaks_m = count_maps(cube, realization)
     with style():
         from matplotlib.figure import Figure
@@ -97,8 +103,20 @@ def overview(
 
 
 @checked
-def pixel_histogram(cube: Cube, y: int, x: int, *, realization: int = 0) -> Figure:
-    """Histogram of one pixel over the period and around its return, beside the incident rate's shape."""
+def pixel_histogram(
+    cube: Cube | ArrayLike,
+    y: int,
+    x: int,
+    *,
+    system: System | None = None,
+    flux: Flux | None = None,
+    realization: int = 0,
+) -> Figure:
+    """Histogram of one pixel over the period and around its return, beside the incident rate's shape.
+
+    Of a cube, or of counts as `simulate` returns them with their `system` and, where it is known, their `flux`.
+    """
+    cube = as_cube(cube, system, flux)
     y = checks.integer("y", y, low=0, high=cube.shape[1] - 1)
     x = checks.integer("x", x, low=0, high=cube.shape[2] - 1)
     cube, realization, chosen = _checked(cube, realization, [(y, x)])
@@ -221,7 +239,8 @@ def _headline(cube: Cube, realization: int) -> str:
     system, flux = cube.system, cube.flux
     _, height, width, _ = cube.shape
     which = f", realization {cube.recipe.first_realization + realization}" if cube.shape[0] > 1 else ""
-    made = "measured" if cube.engine == MEASURED else f"{cube.engine} engine{which}"
+    made = "measured" if cube.engine == MEASURED else f"{cube.engine} engine{which}".strip()
+    made = made if cube.engine else f"simulated{which}"
     return (
         f"{height} × {width} pixels, {instrument(system)}; mean S = {flux.signal.mean():.3g}, "
         f"B = {flux.background.mean():.3g} photons per period; {made}"

@@ -179,4 +179,4 @@ def fitted(cube: Cube, realization: int) -> Cube:
         depth_m=np.where(with_return, estimate.depth_m, np.nan),
         source=cube.recipe.source,
     )
-    return Cube(histogram=counts[None], recipe=recipe, version=cube.version)
+    return Cube.of(counts[None], recipe, version=cube.version)

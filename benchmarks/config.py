@@ -29,7 +29,7 @@ class Config:
     dense_bins: int = 1024
     table_entries: int = 512  # of 25,600
     starts: int = 10  # of the interpreter, for the time of import
-    commands: int = 3  # runs of the command line
+    commands: int = 3  # runs of the command line, and fresh interpreters of each user's call
 
     @property
     def threads(self) -> int:

@@ -12,7 +12,6 @@ import pytest
 from scipy import integrate, special, stats
 
 import mars_lidar as ml
-from benchmarks.law_map import disagreements, draw, laws
 from mars_lidar.statistics import ConvergenceError, exposure_moments, mean_histogram
 from mars_lidar.statistics import cells as cells_module
 from mars_lidar.statistics import count_pmf as pmf_module
@@ -20,6 +19,7 @@ from mars_lidar.statistics import exposure as exposure_module
 from mars_lidar.statistics import joint as pixel_module
 from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.joint_grid import FoldedGrid, left_over
+from tests.harness.law_map import disagreements, draw, laws
 
 PERIOD_NS = 100.0
 
@@ -489,7 +489,7 @@ def test_a_warm_state_that_is_not_found_is_refused():
 def test_random_systems(first: int):
     for seed in range(first, first + 8):
         drawn, values, unhelpful = draw(seed), {}, []
-        if drawn.electronics or drawn.dead > 300.0 or drawn.bins > 4096:  # right, but slow: `benchmarks.law_map`
+        if drawn.electronics or drawn.dead > 300.0 or drawn.bins > 4096:  # right, but slow: `tests.harness.law_map`
             continue
         for name, law in laws(drawn).items():
             try:

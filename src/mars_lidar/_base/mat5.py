@@ -101,6 +101,8 @@ def _head(content: bytes, order: str) -> tuple[str, str, tuple[int, ...], int]:
     axes, place = _values(content, place, order)
     name, _ = _values(content, place, order)
     shape = struct.unpack(f"{order}{len(axes) // 4}i", axes[: len(axes) // 4 * 4])
+    if min(shape, default=0) < 0:
+        raise _unreadable(f"{name!r} has the shape {shape}")
     number = struct.unpack(order + "I", flags[:4])[0] & 0xFF if len(flags) >= 4 else 0
     return name.decode("latin1"), _CLASSES.get(number, f"class {number}"), tuple(shape), 8 + size
 

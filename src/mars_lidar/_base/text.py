@@ -18,7 +18,8 @@ def read_column(path: Path) -> NDArray[np.float64]:
         try:
             rows.append([float(part) for part in line.replace(",", " ").replace(";", " ").split()])
         except ValueError:
-            if rows:  # lines of words are only above the numbers
+            like_numbers = all(part[0] in "+-.0123456789" for part in line.replace(",", " ").replace(";", " ").split())
+            if rows or like_numbers:  # lines of words are only above the numbers
                 raise ValueError(f"line {line[:40]!r} holds no numbers") from None
     rows = [row for row in rows if row]
     if not rows or {len(row) for row in rows} not in ({1}, {2}):

@@ -124,6 +124,8 @@ def capture_in(opened: UnchangedFile, file: Any) -> Capture | None:
         return None
     data = file[name]
     check_data(opened.path, data, name, in_parts=True)
+    if data.dtype.kind not in "fiu":
+        raise ValueError(f"{opened.path}: {name} must be real numbers, got {data.dtype}")
     told = [_metres(file, key) for key in _TIMES[name]]
     width, start = (None if one is None else one / SPEED_OF_LIGHT_M_PER_NS for one in told)
     return Capture(opened, name, axes, tuple(data.shape), width, start)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base import checks
 from mars_lidar._version import __version__
 from mars_lidar.light.timestamps import Timestamps
 
@@ -42,9 +43,11 @@ def from_attributes(
     version = attrs.get("format_version", FORMAT_VERSION)
     if version != FORMAT_VERSION:
         raise ValueError(f"these timestamps have layout version {version}; version {FORMAT_VERSION} can be read")
-    height, width = (int(n) for n in attrs["shape"])
-    if min(height, width) < 1 or counts.size != height * width or int(counts.sum()) != times_ns.size:
+    height, width = (checks.integer("shape", n, low=1, high=2**32) for n in attrs["shape"])
+    if counts.size != height * width or int(counts.sum()) != times_ns.size:
         raise ValueError(f"{times_ns.size} photons do not make an image of {height} x {width}")
+    if attrs["dtype"] not in ("uint16", "uint32") or not isinstance(attrs["info"], dict):
+        raise ValueError(f"dtype must be uint16 or uint32 and info a dictionary, got {attrs['dtype']!r}")
     offsets = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
     return Timestamps(
         np.ascontiguousarray(times_ns, np.float64),
@@ -52,10 +55,10 @@ def from_attributes(
         np.ascontiguousarray(bin_, np.int32),
         offsets.astype(np.int64),
         (height, width),
-        int(attrs["bins"]),
+        checks.integer("bins", attrs["bins"], low=1, high=2**31 - 1),
         np.dtype(str(attrs["dtype"])),
-        float(attrs["period_ns"]),
-        int(attrs["cycles"]),
+        checks.real("period_ns", attrs["period_ns"], low=0.0, strict_low=True),
+        checks.integer("cycles", attrs["cycles"], low=1, high=2**31),
         dict(attrs["info"]),
     )
 

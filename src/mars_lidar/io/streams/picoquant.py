@@ -33,6 +33,10 @@ def as_ptu(path: Path) -> io.BytesIO:
     number = tags["TTResult_NumberOfRecords"]
     if len(words) != image or not 0 <= number <= (len(raw) - begin) // 4:
         raise ValueError(f"{path} is cut short: its header tells of {number} records")
+    if number == 0 and len(raw) > begin:
+        raise ValueError(
+            f"{path} was not finished: its header tells of no records, and {(len(raw) - begin) // 4} follow"
+        )
     if len(words) >= 8 and words[:2] == (3, _LSM):
         tags |= {"Measurement_SubMode": 3, "ImgHdr_Dimensions": 3, "ImgHdr_Ident": _LSM}
         tags |= dict(zip(_IMAGE, words[2:8], strict=True))

@@ -98,6 +98,9 @@ def open_store(path: Path) -> OpenedStore:
         if image.shape != (*shape[:3], 1, shape[3]):
             made = f"{image.shape[:3]} instead of {shape[:3]} (realization, y, x)"
             raise ValueError(f"{path} is damaged: its records make an image of {made}")
+        total = int(image.sum(dtype=np.uint64))
+        if total != attrs["registrations"]:
+            raise ValueError(f"{path} is damaged: its image has {total} of {attrs['registrations']} registrations")
         return np.ascontiguousarray(image[:, :, :, 0])
 
     return OpenedStore(attrs, arrays | {"histogram": OnDisk(LazyCounts(shape, recipe.dtype, counts), path)})

@@ -1,4 +1,4 @@
-"""``python -m benchmarks.law_map``: where in the declared domain laws are slow, refuse or disagree with each other.
+"""``python -m tests.harness.law_map``: where in the declared domain laws are slow, refuse or disagree with each other.
 
 Draws random systems over the Limits of the README, with extra weight near locks (dead times just below k periods, and
 k halves) and at the extremes; times each law of each system in a process of its own, catches what it raises, and

@@ -1,0 +1,150 @@
+"""Files that an adversary wrote from the documentation alone; each of these was once read wrongly, or took too long."""
+
+from __future__ import annotations
+
+import json
+import os
+import struct
+import time
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from store_cases import SYSTEM, one_return
+
+import mars_lidar as ml
+from mars_lidar import io
+from mars_lidar._base.files import FileError
+from mars_lidar._base.text import read_column
+from mars_lidar.dataset import open_dataset
+
+PATTERN = 77  # bytes of a file that is not part of the store
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs links and pipes")
+@pytest.mark.parametrize("instead", ["link", "pipe", "device"])
+def test_a_chunk_of_an_incomplete_store_is_a_plain_file(tmp_path, instead):
+    """A link was read as counts, whatever it points to; a pipe never ended."""
+    path = tmp_path / "cube.zarr"
+    io.simulate_to(path, one_return(), SYSTEM)
+    for name, change in (
+        ("zarr.json", lambda d: (d.pop("consolidated_metadata", None), d["attributes"].update(complete=False))),
+        ("histogram/zarr.json", lambda d: d.update(codecs=[{"name": "bytes", "configuration": {"endian": "little"}}])),
+    ):
+        document = json.loads((path / name).read_text())
+        change(document)
+        (path / name).write_text(json.dumps(document))
+    (path / "manifest.sha256").unlink()
+    (tmp_path / "secret").write_bytes(bytes([PATTERN]) * 2 * 6 * 5 * 64)
+    chunk = next(each for each in sorted((path / "histogram/c").rglob("*")) if each.is_file())
+    chunk.unlink()
+    {
+        "link": lambda: chunk.symlink_to(tmp_path / "secret"),
+        "pipe": lambda: os.mkfifo(chunk),
+        "device": lambda: chunk.symlink_to("/dev/zero"),
+    }[instead]()
+    with io.load(path, allow_incomplete=True) as cube, pytest.raises(FileError, match="is a link, a pipe or a device"):
+        np.asarray(cube.histogram)
+
+
+def test_packed_counts_are_of_a_type_of_counts(tmp_path):
+    recipe = {"scenes": {"example": "room", "size": [3, 4]}, "systems": [SYSTEM], "light": {"signal": 0.5}}
+    ml.generate(recipe | {"store": {"layout": "sparse"}}, tmp_path / "set.zarr")
+    for name, change in (
+        ("zarr.json", lambda d: d["attributes"].update(complete=False)),
+        ("histogram/zarr.json", lambda d: d.update(data_type="float64", fill_value=0.0)),
+    ):
+        document = json.loads((tmp_path / "set.zarr" / name).read_text())
+        change(document)
+        (tmp_path / "set.zarr" / name).write_text(json.dumps(document))
+    stored = open_dataset(tmp_path / "set.zarr", allow_incomplete=True)
+    with pytest.raises(FileError, match=r"set\.zarr"):
+        np.asarray(stored.histogram)
+
+
+def test_cells_of_one_array_and_deep_groups_end_soon(tmp_path):
+    """35 kB with four million references; 3,000 groups within each other, which HDF5 looks up one by one."""
+    with h5py.File(tmp_path / "cells.mat", "w") as file:
+        file["a"] = np.ones(3)
+        shape = (2000, 2000)
+        file.create_dataset("spad", shape, h5py.ref_dtype, chunks=shape, compression="gzip")[...] = file["a"].ref
+    with h5py.File(tmp_path / "many.mat", "w") as file:
+        file.create_dataset("a", data=np.zeros((100, 1000, 100)), chunks=(100, 1000, 100), compression="gzip")
+        file.create_dataset("spad", (1, 1000), h5py.ref_dtype)[...] = file["a"].ref
+    with h5py.File(tmp_path / "deep.h5", "w") as file:
+        group = file
+        for _ in range(3000):
+            group = group.create_group("g")
+        group["counts"] = np.ones((3, 4, 64))
+    for name in ("cells.mat", "many.mat", "deep.h5"):
+        began = time.process_time()
+        with pytest.raises(FileError, match=name.replace(".", r"\.")):
+            io.foreign_cube(tmp_path / name, SYSTEM)
+        assert time.process_time() - began < 3.0
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("period_ns", float("nan")),
+        ("period_ns", -1.0),
+        ("cycles", 0),
+        ("cycles", 1.5),
+        ("bins", 0),
+        ("bins", 2**63),
+        ("dtype", "float64"),
+        ("dtype", "O"),
+        ("shape", [-6, -5]),
+        ("info", []),
+    ],
+)
+def test_attributes_of_a_stream_are_checked(tmp_path, name, value):
+    ml.simulate_timestamps(one_return(), SYSTEM).save(tmp_path / "a.npz")
+    with np.load(tmp_path / "a.npz") as archive:
+        arrays = {each: archive[each] for each in archive.files}
+    attributes = json.loads(arrays["attributes"].item()) | {name: value}
+    arrays["attributes"] = np.asarray(json.dumps(attributes))
+    np.savez(tmp_path / "b.npz", **arrays)
+    with pytest.raises(FileError, match=rf"b\.npz.*{name}"):
+        ml.Timestamps.load(tmp_path / "b.npz")
+
+
+@pytest.mark.parametrize(
+    ("tag", "value"),
+    [
+        ("MeasDesc_GlobalResolution", -1.0),
+        ("MeasDesc_GlobalResolution", 1e300),
+        ("ImgHdr_TimePerPixel", 1e-320),
+        ("ImgHdr_LineStart", 0),
+        ("MarsLidar_Photons", 3),
+    ],
+)
+def test_tags_of_a_ptu_that_move_its_photons_are_refused(tmp_path, tag, value):
+    """Each gave another image, with fewer counts than the file tells of."""
+    pytest.importorskip("ptufile")
+    path = tmp_path / "cube.ptu"
+    io.simulate_to(path, one_return(), SYSTEM)
+    content = bytearray(path.read_bytes())
+    struct.pack_into("<d" if isinstance(value, float) else "<q", content, content.index(tag.encode()) + 40, value)
+    path.write_bytes(content)
+    with pytest.raises(FileError, match=r"cube\.ptu"):
+        np.asarray(io.load(path).histogram)
+
+
+def test_numbers_above_a_column_are_no_words(tmp_path: Path):
+    """0x10 was taken for the name of a column, and left out."""
+    for text in ("0x10\n1\n2\n", "1e\n2\n"):
+        (tmp_path / "a.csv").write_text(text)
+        with pytest.raises(ValueError, match="holds no numbers"):
+            read_column(tmp_path / "a.csv")
+    (tmp_path / "a.csv").write_text("# made 2026-11-23\nt_ns, counts\n1, 2\n3, 4\n")
+    assert read_column(tmp_path / "a.csv").tolist() == [2.0, 4.0]
+
+
+def test_text_is_no_capture(tmp_path):
+    with h5py.File(tmp_path / "a.hdf5", "w") as file:
+        file["H"], file["H_format"] = np.full((8, 4, 3), b"1.0"), 1
+        file["delta_t"], file["t_start"] = 0.3, 0.0
+    with pytest.raises(ValueError, match=r"a\.hdf5.*real numbers"):
+        io.read_transient(tmp_path / "a.hdf5").rows(slice(0, 2))

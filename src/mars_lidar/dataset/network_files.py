@@ -121,7 +121,7 @@ def export(
         appears when all is written; what stops the writing leaves nothing under its name.
     layout
         One of `LAYOUTS`; or ``"webdataset"``: tar files ``shard-000000.tar``, ... of about 256 MiB for WebDataset, in
-        which an exposure is ``SAMPLE-REALIZATION`` with ``counts.npy`` (H, W, bins), a ``.npy`` for each map, and
+        which an exposure is ``SAMPLE-REALIZATION`` with an array of counts (H, W, bins), a ``.npy`` for each map, and
         ``json``, its numbers and its system.
     fill
         Give pixels without a return the depth, bin and rates of the nearest pixel with one. Otherwise their bin is 0,

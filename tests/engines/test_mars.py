@@ -251,3 +251,37 @@ def test_bad_input(call, kind, fragments):
         call(image())
     for fragment in fragments:
         assert fragment in str(error.value)
+
+
+# Start-up of short armed exposures, which a table turns with the pulse
+
+
+def ticking(cycles: int, start: str = "armed") -> ml.System:
+    return ml.System(
+        period_ns=100.0,
+        cycles=cycles,
+        bins=128,
+        pulse=ml.GaussianPulse(sigma_ns=1.0),
+        detector=ml.Detector(dead_time_ns=87.331),
+        start=start,
+    )
+
+
+@pytest.mark.parametrize(
+    ("cycles", "delay", "misplaced"), [(40, 12.7, 4.9), (40, 0.3, 5.2), (300, 12.7, 4.7), (1, 12.7, 1.1)]
+)
+def test_a_table_says_what_the_start_up_misplaces(cycles: int, delay: float, misplaced: float):
+    system = ticking(cycles)
+    table = ml.Table.build(system, signal=np.geomspace(3.6, 4.1, 4), background=np.geomspace(7.0, 8.0, 4))
+    flux, report = ml.Flux(np.full((2, 2), 3.84), 7.38, delay), dict[str, float]()
+    with pytest.warns(UserWarning, match="leave the table out"):
+        ml.simulate(flux, system, engine="mars", table=table, report=report)
+    exact = exposure_moments(flux, system)
+    assert report["start_up_error"] * float(np.asarray(exact.mean).flat[0]) == pytest.approx(misplaced, abs=0.2)
+
+
+@pytest.mark.parametrize("system", [ticking(40, "stationary"), ticking(1000)])
+def test_a_table_without_a_start_up_is_silent(system: ml.System, recwarn: pytest.WarningsRecorder):
+    table = ml.Table.build(system, signal=np.geomspace(3.6, 4.1, 4), background=np.geomspace(7.0, 8.0, 4))
+    ml.simulate(ml.Flux(np.full((2, 2), 3.84), 7.38, 12.7), system, engine="mars", table=table)
+    assert not recwarn.list

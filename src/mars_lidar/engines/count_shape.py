@@ -48,6 +48,7 @@ class CountTimesShape(Engine):
         if self.reader is None:
             self._evaluate(run, pixels)
             return
+        self.reader.warn_of_start_up(task)
         left = [self._look_up(run, self.reader, pixels[k : k + PIXELS]) for k in range(0, pixels.size, PIXELS)]
         self._evaluate(run, np.concatenate(left))
 

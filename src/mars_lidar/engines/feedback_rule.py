@@ -150,7 +150,7 @@ def sweep_pixels(
     able = np.flatnonzero(plan.reason == Reason.DRAWN)
     able = able[np.argsort(task.flux.background.reshape(-1)[pixels[able]], kind="stable")]
 
-    def draw(part: Task, first: int, wanted: IndexArray, laps: IndexArray) -> IndexArray:
+    def draw(part: Task, first: int, wanted: IndexArray, laps: IndexArray) -> StatusArray:
         """Status (realizations, n) of `wanted` (n,), pixels of one grid and number of laps together."""
         back = np.empty((part.realizations, wanted.size), np.uint8)
         if wanted.size == 0:

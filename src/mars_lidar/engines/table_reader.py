@@ -5,6 +5,7 @@ And exact laws of the count for pixels whose four cumulants do not fix it.
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from hashlib import blake2b
 from typing import TYPE_CHECKING, Any, Literal
@@ -30,6 +31,11 @@ if TYPE_CHECKING:
     from mars_lidar.table import Table
 
 
+MISPLACED = (
+    6.0  # registrations of an exposure at most, by its start-up: docs/table.md, section 4, and what it was measured on
+)
+MISPLACED_SHARE = 0.01  # of the registrations, that a warning says
+_LOOKED_AT = 16  # pixels of a call
 PIXELS = 2**17  # looked up at a time: 14 MiB
 _INTERPOLATIONS = ("bilinear", "nearest")
 _OUTSIDE = ("error", "exact")
@@ -108,6 +114,46 @@ class TableReader:
                 f"table must reach every pixel, but {int(beyond.sum())} of {beyond.size} lie outside of it: "
                 f"{', '.join(told)} photons per period; build it over that range, or give outside='exact' "
                 "(--table-outside exact) to evaluate each of those by itself, which takes some ms"
+            )
+
+    def warn_of_start_up(self, task: Task) -> None:
+        """Warn, before anything is drawn, where a short armed exposure has its start-up in the wrong place.
+
+        A start-up misplaces at most some registrations, so that only short exposures are evaluated, and of them some of
+        the brightest pixels. The report says by how much: ``start_up_error``.
+        """
+        system, single = task.system, single_return(task.flux)
+        assert single is not None  # see check
+        if system.start != "armed" or system.dead_time_periods == 0.0 or self.table.method != "exposure":
+            return
+        signal, delay, background = single[0], single[1], task.flux.background.reshape(-1)
+        total = signal + background
+        expected = system.cycles * total / (1.0 + total * system.dead_time_periods)
+        within = (signal > 0.0) & (signal >= self.table.signal[0]) & (signal <= self.table.signal[-1])
+        within &= (background >= self.table.background[0]) & (background <= self.table.background[-1])
+        some = np.flatnonzero(within & (expected * MISPLACED_SHARE < MISPLACED))
+        some = some[np.argsort(-total[some], kind="stable")][:_LOOKED_AT]
+        if not some.size:
+            return
+        error = self.table.start_up_error(
+            signal[some],
+            background[some],
+            delay[some],
+            cycles=system.cycles,
+            interpolation=self.interpolation,
+            threads=task.threads,
+        )
+        worst = int(np.argmax(error))
+        task.report["start_up_error"] = float(error[worst])
+        if error[worst] > MISPLACED_SHARE:
+            at = some[worst]
+            warnings.warn(
+                f"table places {error[worst]:.2g} of the registrations ({error[worst] * expected[at]:.2g} of "
+                f"{expected[at]:.3g}) wrongly at S = {signal[at]:.3g}, B = {background[at]:.3g}, "
+                f"delay_ns = {delay[at]:.4g}: its shapes are those of one delay, and in {system.cycles} cycles from an "
+                "armed start the start-up counts; leave the table out, or take engine 'exact'",
+                UserWarning,
+                stacklevel=2,
             )
 
     def read(self, task: Task, pixels: IndexArray) -> tuple[Entries, IndexArray]:

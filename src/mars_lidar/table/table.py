@@ -519,6 +519,36 @@ class Table:
         except ConvergenceError:  # the law of a random pixel between the entries, which is much of a locked one
             return None
 
+    def start_up_error(
+        self,
+        signal: FloatArray,
+        background: FloatArray,
+        delay_ns: FloatArray,
+        *,
+        cycles: int | None = None,
+        interpolation: Interpolation = "bilinear",
+        threads: int | None = None,
+    ) -> FloatArray:
+        """Share (P,) of the registrations that the shape places wrongly because it is that of the canonical delay.
+
+        Total variation between the table's shape, moved to the delay (P,) by whole bins, and the exact one there, less
+        the same at the canonical delay. Each pixel is evaluated twice by itself.
+        """
+        periods = self._cycles(cycles)
+        system = self.system.replace(cycles=periods)
+        entries = self.lookup(signal, background, cycles=periods, interpolation=interpolation)
+        shapes = self.shapes(periods)
+        mixed = np.stack([w @ shapes[r] for r, w in zip(entries.rows, entries.weights, strict=True)])
+        half = 0.5 * system.period_ns
+        shift = np.rint((np.asarray(delay_ns) - half) / system.bin_ns).astype(np.int64) % system.bins
+        errors = []
+        for turns in (shift, np.zeros_like(shift)):
+            flux = Flux(signal, background, half + turns * system.bin_ns)
+            exact = exposure_moments(flux, system, tolerance=self.tolerance, threads=threads)
+            turned = np.stack([np.roll(row, k) for row, k in zip(mixed, turns, strict=True)])
+            errors.append(0.5 * np.abs(turned - normalised(exact.histogram).reshape(turned.shape)).sum(-1))
+        return np.asarray(np.maximum(errors[0] - errors[1], 0.0))
+
     def _delayed(
         self,
         interpolation: Interpolation,

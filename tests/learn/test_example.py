@@ -34,7 +34,7 @@ def test_it_is_short():
 
 @pytest.mark.nightly
 def test_own_prior():
-    """Shortened: intervals of a flow on pixels that it has not seen; 4 standard errors and what a short training costs."""
+    """Shortened: intervals of a flow on new pixels; 4 standard errors and what a short training costs."""
     pytest.importorskip("sbi")
     example = runpy.run_path(str(PATH.with_name("own_prior.py")))
     shares, error = example["coverage"](example["train"](8192, 15), 256, 200)

@@ -171,6 +171,16 @@ def test_what_an_earlier_run_did_is_no_part_of_the_speed(monkeypatch, capsys):
         (lambda: ml.Flux(signals=1.0), "did you mean 'signal'"),
         (lambda: ml.Scene(depth=np.ones((2, 2))), "did you mean 'depth_m'"),
         (lambda: ml.Detector(), "missing a required argument: 'dead_time_ns'"),
+        (
+            lambda: ml.count_law(ml.Flux(1.0, 0.1, 5.0), SYSTEM, metod="mars"),
+            r"count_law has no argument 'metod' .*'method'",
+        ),
+        (lambda: ml.reconstruct([1], SYSTEM, return_=2), r"reconstruct has no argument 'return_' .*'returns'"),
+        (
+            lambda: ml.simulate(ml.Flux(0.0, 1.0), SYSTEM, "exact"),
+            "simulate takes flux, system by position and all other",
+        ),
+        (lambda: ml.count_law(ml.Flux(0.0, 1.0)), "count_law: missing a required argument: 'system'"),
     ],
 )
 def test_a_wrong_keyword_names_the_argument_that_was_meant(call, message):

@@ -43,7 +43,7 @@ MOST_RIDDLES = {
     "calibration": 12,
     "cli": 49,
     "cuda": 4,
-    "dataset": 110,
+    "dataset": 74,
     "engines": 21,
     "explore": 8,
     "io": 113,

@@ -85,7 +85,7 @@ def _arrivals(truth: Truth, first: int, count: int, cycles: int, random: np.rand
 class _Pixel:
     def __init__(self, truth: Truth, random: np.random.Generator) -> None:
         self.truth, self.random = truth, random
-        self.ready, self.fired = -np.inf, -np.inf
+        self.ready = -np.inf
         self.carriers: list[float] = []
         self.records: list[float] = []
         p = truth.afterpulses
@@ -98,9 +98,8 @@ class _Pixel:
     def fire(self, t: float) -> None:
         """An avalanche: blind for the dead time, carriers in traps, a record where the electronics are ready."""
         truth = self.truth
-        if not truth.electronics or t - self.fired >= truth.electronics:
+        if not self.records or t - self.records[-1] >= truth.electronics:
             self.records.append(t)
-        self.fired = t
         self.ready = t + truth.dead
         if self.mean:
             for _ in range(self.random.poisson(self.mean)):

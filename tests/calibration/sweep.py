@@ -1,14 +1,18 @@
 """Pulls of `calibrate` over random streams of the independent simulator: ``python -m tests.calibration.sweep 0 40``.
 
 A stream a number: light, jitter, clock, period, dead time and photons are drawn from the seed of that number; with
-``--effect NAME`` the detector has that effect too. Prints a line a stream, and the spread of the pulls.
+``--effect NAME`` the detector has that effect too. Prints a line a stream, and the spread of the pulls; with ``--keep
+FILE`` results are appended to that file, a JSON object a line, and streams that it has are not calibrated again.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import time
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -107,36 +111,54 @@ def main() -> None:
     parser.add_argument("last", type=int)
     parser.add_argument("--effect", choices=list(EFFECTS))
     parser.add_argument("--photons", type=int)
+    parser.add_argument("--keep", type=Path)
     asked = parser.parse_args()
-    rows, refused, wrong, named, spent = [], 0, 0, 0, 0.0
+    done: dict[int, dict[str, Any]] = {}
+    if asked.keep is not None and asked.keep.exists():
+        for line in asked.keep.read_text().splitlines():
+            row = json.loads(line)
+            if (row["effect"], row["asked"]) == (asked.effect, asked.photons):
+                done[row["number"]] = row
+    rows = []
     for number in range(asked.first, asked.last):
-        truth, photons = random_truth(number)
-        truth = with_effect(truth, asked.effect)
-        t, cycles = photon_by_photon(truth, asked.photons or photons, number)
-        began = time.process_time()
-        result = ml.calibrate(as_timestamps(t, truth, cycles), seed=number)
-        seconds = time.process_time() - began
-        spent += seconds
-        z = pulls(result, truth)
-        rows.append(z)
-        refused += not result.fits
-        suspects = [suspect.name for suspect in result.suspects]
-        named += NAMES.get(asked.effect or "", "") in suspects
-        wrong += any(name != NAMES.get(asked.effect or "") for name in suspects)
-        far = "  <<" if (np.abs(z) > 4.0).any() or not result.fits or (suspects and not asked.effect) else ""
-        print(
-            f"{number} {t.size:,} photons {seconds:.1f} s p={result.p_value:.2g} {np.round(z, 1)} {suspects}{far}",
-            flush=True,
-        )
-        if far:
-            print("    ", truth, {name: str(value) for name, value in result.estimates.items()}, flush=True)
-    table = np.array(rows)
+        row = done.get(number) or calibrated(number, asked.effect, asked.photons)
+        rows.append(row)
+        if number not in done and asked.keep is not None:
+            with asked.keep.open("a") as file:
+                file.write(json.dumps(row) + "\n")
+        print(f"{number} {row['photons']:,} photons {row['seconds']:.1f} s p={row['p']:.2g}", end=" ")
+        print(np.round(np.array(row["pulls"], float), 1), row["suspects"], flush=True)
+    table = np.array([row["pulls"] for row in rows], float)
+    named = sum(NAMES.get(asked.effect or "", "") in row["suspects"] for row in rows)
+    others = sum(any(name != NAMES.get(asked.effect or "") for name in row["suspects"]) for row in rows)
     print("parameters       ", PULLED)
     print("sd of pulls      ", np.round(np.nanstd(table, axis=0), 2))
     print("largest          ", np.round(np.nanmax(np.abs(table), axis=0), 1))
     print("beyond 4.5       ", (np.abs(table) > 4.5).sum(0), "of", len(table))
     print("without an error ", np.isnan(table).sum(0))
-    print(f"verdict misfit {refused}, named {named}, other suspects {wrong}, of {len(table)}; {spent:.0f} CPU-s")
+    print(f"p below 1 % {sum(row['p'] < 0.01 for row in rows)}, named {named}, other suspects {others}, of {len(rows)}")
+    print(
+        f"{np.mean([row['seconds'] for row in rows]):.1f} CPU-s each, largest {max(row['seconds'] for row in rows):.1f}"
+    )
+
+
+def calibrated(number: int, effect: str | None, photons: int | None) -> dict[str, Any]:
+    """The pulls, p-value, suspects and time of one stream."""
+    truth, own = random_truth(number)
+    truth = with_effect(truth, effect)
+    t, cycles = photon_by_photon(truth, photons or own, number)
+    began = time.process_time()
+    result = ml.calibrate(as_timestamps(t, truth, cycles), seed=number)
+    return {
+        "number": number,
+        "effect": effect,
+        "asked": photons,
+        "photons": t.size,
+        "seconds": time.process_time() - began,
+        "p": float(result.p_value),
+        "pulls": [None if np.isnan(z) else float(z) for z in pulls(result, truth)],
+        "suspects": [suspect.name for suspect in result.suspects],
+    }
 
 
 if __name__ == "__main__":

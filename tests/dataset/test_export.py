@@ -198,3 +198,34 @@ def test_what_cannot_be_exported_is_refused_before_any_file(store: Path, tmp_pat
         export(tmp_path / "wide.zarr", tmp_path / "set", layout="deepsensorfusion")
     assert not (tmp_path / "set").exists()
     assert set(LAYOUTS) == {"lindell", "deepsensorfusion", "sun", "gutierrez"}
+
+
+@pytest.mark.full
+@pytest.mark.filterwarnings("default")
+def test_webdataset_reads_its_tars(tmp_path, recipe, monkeypatch):
+    """The exposures of WebDataset's own loader are those of the store."""
+    webdataset = pytest.importorskip("webdataset")
+    from mars_lidar.dataset import network_files
+
+    monkeypatch.setattr(network_files, "_TAR_BYTES", 5 * 12 * 10 * 32 * 2)  # five exposures
+    ml.generate(recipe, tmp_path / "set.zarr")
+    done = export(tmp_path / "set.zarr", tmp_path / "tars", layout="webdataset")
+    assert done.files == 24
+    names = (tmp_path / "tars" / "list.txt").read_text().split()
+    assert len(names) == 5
+    stored = dataset.open_dataset(tmp_path / "set.zarr")
+    urls = [str(tmp_path / "tars" / name) for name in names]
+    found = set()
+    for one in webdataset.WebDataset(urls, shardshuffle=False).decode():
+        numbers = one["json"]
+        sample, realization = numbers["sample"], numbers["realization"]
+        assert one["__key__"] == f"{sample:07d}-{realization:05d}"
+        np.testing.assert_array_equal(one["counts.npy"], stored.histogram[sample, realization])
+        for name in ("depth", "reflectivity", "signal", "background", "delay"):
+            np.testing.assert_array_equal(one[f"{name}.npy"], stored.maps[name][sample])
+        assert ml.System.from_dict(numbers["system"]) in stored.recipe.systems
+        assert numbers["seed"] == int(stored.seeds[sample])
+        found.add((sample, realization))
+    assert len(found) == 24
+    with pytest.raises(ValueError, match="fill belongs to"):
+        export(tmp_path / "set.zarr", tmp_path / "more", layout="webdataset", fill=True)

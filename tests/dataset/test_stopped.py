@@ -10,12 +10,14 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
-from dataset.conftest import files
+from dataset.conftest import SYSTEM, files
 
 import mars_lidar as ml
 from mars_lidar import io
-from mars_lidar.dataset import DatasetRecipe, open_dataset
+from mars_lidar.dataset import DatasetRecipe, begin, finish, ingest, make_part, open_dataset, verify
+from mars_lidar.dataset.sources import candidates
 
 _SCRIPT = """
 import json, os, resource, signal, sys
@@ -183,3 +185,144 @@ def test_what_is_taken_away_while_it_is_made_is_missed(tmp_path, recipe, what):
         ml.generate(recipe, out, progress=progress, threads=1)
     with pytest.raises((ValueError, FileNotFoundError)):
         open_dataset(out)
+
+
+# --- Parts by processes that do not know of each other -------------------------------------------------------------
+
+_COMMAND = [sys.executable, "-m", "mars_lidar", "generate"]
+
+
+@pytest.mark.full
+def test_begin_four_parts_and_finish_as_shell_jobs_make_the_same_store(tmp_path, recipe, whole):
+    (tmp_path / "recipe.yaml").write_text(DatasetRecipe.from_dict(recipe).to_json())
+    out = tmp_path / "set.zarr"
+
+    def job(*options: str) -> subprocess.Popen[str]:
+        return subprocess.Popen([*_COMMAND, *options, "-o", str(out)], stderr=subprocess.PIPE, text=True)
+
+    def ended(jobs: list[subprocess.Popen[str]]) -> list[tuple[int, str]]:
+        return [(each.wait(), each.communicate()[1]) for each in jobs]
+
+    assert ended([job(str(tmp_path / "recipe.yaml"), "--begin")])[0][0] == 0
+    assert [code for code, _ in ended([job("--part", f"{k}/4", "--threads", "1") for k in (1, 2, 4)])] == [0, 0, 0]
+    ((code, words),) = ended([job("--finish")])
+    assert code == 2
+    assert "shards of" in words
+    assert "are missing, the first" in words
+    assert [code for code, _ in ended([job("--part", "3/4")])] == [0]
+    assert [code for code, _ in ended([job("--finish")])] == [0]
+    assert files(out) == whole
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["recipe.yaml", "set.zarr", "whole.zarr"]
+
+
+def test_finish_reads_no_shard_again(tmp_path, recipe, monkeypatch):
+    from mars_lidar._base import manifest
+
+    begin(recipe, tmp_path / "set.zarr")
+    for k in (2, 1):
+        make_part(tmp_path / "set.zarr", (k, 2))
+    real, read = manifest._hash, []
+    monkeypatch.setattr(manifest, "_hash", lambda path: read.append(path) or real(path))
+    finish(tmp_path / "set.zarr")
+    assert read
+    assert not [path for path in read if "/histogram/c/" in str(path) or "set.zarr/depth/c/" in str(path)]
+    monkeypatch.undo()
+    assert not list(manifest.damage(tmp_path / "set.zarr"))
+    assert verify(tmp_path / "set.zarr").good
+
+
+def test_parts_that_cannot_be_made_are_refused(tmp_path, recipe, monkeypatch):
+    out = tmp_path / "set.zarr"
+    with pytest.raises(FileNotFoundError):
+        make_part(out, (1, 2))
+    begin(recipe, out)
+    for part in ((0, 2), (3, 2)):
+        with pytest.raises(ValueError, match="must be an integer"):
+            make_part(out, part)
+    with pytest.raises(FileExistsError, match="exists already"):
+        begin(recipe, out)
+    monkeypatch.setattr("mars_lidar.dataset.run.fingerprint", lambda: "other")
+    with pytest.raises(ValueError, match="draws other counts"):
+        make_part(out, (1, 2))
+
+
+# --- Scenes --------------------------------------------------------------------------------------------------------
+
+
+def _folder_of_scenes(folder: Path, number: int) -> Path:
+    """Depths (npy) of random planes, every seventh unusable."""
+    folder.mkdir()
+    random = np.random.default_rng(3)
+    for k in range(number):
+        depth = np.full((12, 10), 0.0 if k % 7 == 6 else random.uniform(2.0, 9.0)) + 0.01 * np.arange(10)
+        np.save(folder / f"{k:03d}_depth.npy", depth if k % 7 < 6 else np.full_like(depth, np.nan))
+    return folder
+
+
+@pytest.fixture
+def of_files(tmp_path, recipe, monkeypatch) -> dict:
+    monkeypatch.setattr("mars_lidar.dataset.arrays._SHARD_BYTES", 8 * 12 * 10 * 8)  # eight scenes
+    return recipe | {"scenes": {"path": str(_folder_of_scenes(tmp_path / "data", 40))}, "systems": [SYSTEM]}
+
+
+@pytest.mark.full
+@pytest.mark.filterwarnings("ignore:.*no image was found")
+@pytest.mark.parametrize("crop", [None, {"size": [6, 5], "count": 3}])
+def test_scenes_that_were_stopped_are_not_read_again(tmp_path, of_files, monkeypatch, crop):
+    recipe = of_files | ({} if crop is None else {"crop": crop})
+    ml.generate(recipe, tmp_path / "whole.zarr")
+    assert len(open_dataset(tmp_path / "whole.zarr").problems) == 5
+    real, calls = ingest.scenes, []
+
+    def scenes(candidate, *rest):
+        calls.append(candidate.name)
+        if len(calls) == 30:
+            raise KeyboardInterrupt
+        yield from real(candidate, *rest)
+
+    monkeypatch.setattr(ingest, "scenes", scenes)
+    with pytest.raises(io.Interrupted, match="continue with --resume"):
+        ml.generate(recipe, tmp_path / "set.zarr")
+    ml.generate(recipe, tmp_path / "set.zarr", resume=True)
+    assert len(calls) < 55  # 30, and those of the last shard of scenes
+    assert files(tmp_path / "set.zarr") == files(tmp_path / "whole.zarr")
+
+
+@pytest.mark.full
+@pytest.mark.filterwarnings("default")
+@pytest.mark.parametrize("kind", ["files", "mixed"])
+def test_workers_read_the_same_scenes(tmp_path, of_files, kind):
+    recipe = dict(of_files)
+    if kind == "mixed":
+        fog = {"extinction_per_m": 0.1, "backscatter": 0.3}
+        pane = {"depth_m": 1.5, "reflectivity": 0.1}
+        recipe["scenes"] = [recipe["scenes"], {"example": "room", "size": [12, 10], "seeds": [0, 3], "fog": fog}]
+        recipe["scenes"].append({"example": "room", "size": [12, 10], "seeds": [1], "pane": pane})
+    ml.generate(recipe, tmp_path / "one.zarr")
+    begin(recipe, tmp_path / "two.zarr", workers=2)
+    make_part(tmp_path / "two.zarr", (1, 1))
+    finish(tmp_path / "two.zarr")
+    assert files(tmp_path / "one.zarr") == files(tmp_path / "two.zarr")
+
+
+def test_seeds_do_not_depend_on_how_a_path_is_spelled(tmp_path, monkeypatch):
+    _folder_of_scenes(tmp_path / "data", 2)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "below").mkdir()
+    found = set()
+    for folder, spelled in (
+        *((Path(), each) for each in ("data", "./data", "data/", "below/../data", str(tmp_path / "data"))),
+        (tmp_path, "data"),
+        (tmp_path / "below", "../data"),
+    ):
+        with pytest.warns(UserWarning, match="no image was found"):
+            listed, _ = candidates([{"path": spelled}], folder)
+        found.add(tuple(each.name for each in listed))
+    assert found == {("data/000_depth.npy", "data/001_depth.npy")}
+    for folder, spelled in ((Path(), "./data/000_depth.npy"), (tmp_path / "below", "../data/000_depth.npy")):
+        (one,), _ = candidates([{"path": spelled}], folder)
+        assert one.name == "000_depth.npy"
+    _folder_of_scenes(tmp_path / "below" / "data", 2)
+    with pytest.warns(UserWarning, match="no image was found"):
+        listed, _ = candidates([{"path": "data"}, {"path": "below/data"}], Path())
+    assert [each.name for each in listed][1:3] == [f"{tmp_path.name}/data/001_depth.npy", "below/data/000_depth.npy"]

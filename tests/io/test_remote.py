@@ -17,8 +17,8 @@ from store_cases import SYSTEM, one_return
 from typer.testing import CliRunner
 
 from mars_lidar import io
+from mars_lidar._base.buckets import url_of
 from mars_lidar.cli import app
-from mars_lidar.io.remote import url_of
 
 fsspec = pytest.importorskip("fsspec", reason="fsspec (extra remote) is not installed")
 pytest.importorskip("aiohttp", reason="aiohttp (extra remote) is not installed")

@@ -26,6 +26,7 @@ from mars_lidar._base.checks import did_you_mean, numbers, unmasked, whole
 
 P = ParamSpec("P")
 R = TypeVar("R")
+C = TypeVar("C", bound=type)
 _NUMBERS = {int, float, bool, type(None)}
 _ARRAYS = ("ArrayLike", "NDArray", "FloatArray", "IndexArray", "CountArray")
 
@@ -81,10 +82,7 @@ def checked(function: Callable[P, R], masks: bool = False) -> Callable[P, R]:
 
     @functools.wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
-        try:
-            given = signature.bind(*args, **kwargs).arguments
-        except TypeError:  # one too many, or too few: Python says which
-            return function(*args, **kwargs)
+        given = _bound(function.__qualname__, signature, args, kwargs)
         if not rules:
             rules.update(_rules(function, signature))
         for name, value in given.items():
@@ -93,6 +91,57 @@ def checked(function: Callable[P, R], masks: bool = False) -> Callable[P, R]:
         return function(*args, **kwargs)
 
     return call
+
+
+def explained(function: Callable[P, R]) -> Callable[P, R]:
+    """Explain a call that Python refuses, as `checked` does, and leave the values of arguments to the function."""
+    signature = inspect.signature(function)
+
+    @functools.wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        try:
+            return function(*args, **kwargs)
+        except TypeError:  # of the call itself, or from within
+            _bound(function.__qualname__, signature, args, kwargs)
+            raise
+
+    return call
+
+
+def constructed_by_name(cls: C) -> C:
+    """Apply `explained` to the constructor of a class, unless that is checked."""
+    function = cls.__init__  # type: ignore[misc]
+    if not hasattr(function, "__wrapped__"):
+        cls.__init__ = explained(function)  # type: ignore[misc]
+    return cls
+
+
+def _bound(name: str, signature: inspect.Signature, args: tuple[Any, ...], kwargs: dict[str, Any]) -> dict[str, Any]:
+    """The arguments of a call by their names; TypeError names the argument that was meant, or the form of the call.
+
+    ``Detector(dead_time=50)``: "Detector has no argument 'dead_time' (did you mean 'dead_time_ns'?)";
+    ``GaussianPulse(0.3)``: "GaussianPulse takes its arguments by name: GaussianPulse(sigma_ns=...)".
+    """
+    try:
+        return signature.bind(*args, **kwargs).arguments
+    except TypeError as error:
+        problem = str(error)
+    called = name.removesuffix(".__init__")
+    parameters = [each for each in signature.parameters.values() if each.name not in ("self", "cls")]
+    allowed = tuple(each.name for each in parameters)
+    others = any(each.kind is each.VAR_KEYWORD for each in parameters)
+    unknown = [] if others else [key for key in kwargs if key not in allowed]
+    if unknown:
+        meant = did_you_mean(unknown[0], allowed)
+        raise TypeError(f"{called} has no argument {unknown[0]!r}{meant}; arguments: {', '.join(allowed)}") from None
+    first = [each.name for each in parameters if each.kind is each.POSITIONAL_OR_KEYWORD]
+    if "positional" in problem and first:
+        raise TypeError(f"{called} takes {', '.join(first)} by position and all other arguments by name")
+    if "positional" in problem:
+        required = [f"{each.name}=..." for each in parameters if each.default is inspect.Parameter.empty]
+        form = ", ".join(required) or f"{allowed[0]}=..."
+        raise TypeError(f"{called} takes its arguments by name: {called}({form})")
+    raise TypeError(f"{called}: {problem}")
 
 
 def checked_with_masks(function: Callable[P, R]) -> Callable[P, R]:

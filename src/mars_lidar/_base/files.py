@@ -28,6 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base import mat5
+from mars_lidar._base.buckets import in_bucket
 from mars_lidar._base.memory import check_memory
 from mars_lidar._base.sparse import check_sparse, is_sparse
 
@@ -226,6 +227,12 @@ def reason(error: OSError) -> str:
 
 def check_target(path: Path, *, folder: bool, overwrite: bool) -> None:
     """Raise OSError unless `path` can be written to; `folder` says whether the format is a directory."""
+    if in_bucket(path):
+        if overwrite:
+            raise ValueError(f"{path}: a store in an object store is not overwritten: remove it first")
+        if path.exists():
+            raise FileExistsError(f"{path} exists already; choose another name or remove it")
+        return
     parent = path.parent
     if not parent.is_dir():
         raise FileNotFoundError(f"out must lie in an existing folder, got {str(path)!r}")
@@ -258,8 +265,9 @@ def reading(path: str | Path, kind: str = "file") -> Iterator[Path]:
     FileError
         Anything else: a pipe or a device, which would never end; a damaged file, whatever its library raised.
     """
-    source = Path(path)
-    check_source(source)
+    source = path if in_bucket(path) else Path(path)
+    if not in_bucket(source):
+        check_source(source)
     try:
         yield source
     except (FileError, ImportError):  # of a door inside of this one; `MissingLibraryError`, which says what to install
@@ -318,7 +326,9 @@ def check_claim(path: Path, nbytes: float, what: str = "its arrays", *, in_parts
     Nothing that was ever recorded is smaller by 512 times when it is packed; a bomb, or a damaged header, is.
     """
     given = os.environ.get(LIMIT)
-    if given is None:
+    if in_bucket(path):
+        limit = math.inf
+    elif given is None:
         limit = float(_packed_limit(size_on_disk(path), in_parts))
     else:
         try:

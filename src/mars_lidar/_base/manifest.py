@@ -21,6 +21,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+from mars_lidar._base.buckets import in_bucket, put, sizes
 from mars_lidar._base.files import FileError, check_claim, reading, replacing
 
 NAME = "manifest.sha256"
@@ -31,20 +32,28 @@ SUM = "manifest_sha256"  # attribute of the root document: the the sum over the 
 _THREADS = 4  # hashing runs without Python's lock
 
 
-def seal(store: Path, attrs: dict[str, Any]) -> None:
-    """Put these attributes into the root document, with a manifest of everything as it is then."""
+def seal(store: Path, attrs: dict[str, Any], digests: Mapping[str, str] | None = None) -> None:
+    """Put these attributes into the root document, with a manifest of everything as it is then.
+
+    Files whose `digests` (SHA-256) are given are not read again.
+    """
     document = json.loads((store / _ROOT).read_bytes())
     document["attributes"].update(attrs | {"manifest": NAME})
     for name in document.get("consolidated_metadata", {}).get("metadata", {}):
         if not (store / name / _ROOT).is_file():
             raise FileNotFoundError(f"{store / name / _ROOT} was taken away while the store was written")
     names = sorted(_files(store) - {_ROOT, NAME})
+    told = {name: digests[name] for name in names if name in digests} if digests else {}
+    others = [name for name in names if name not in told]
     with ThreadPoolExecutor(_THREADS) as pool:
-        told = dict(zip(names, pool.map(lambda name: _hash(store / name), names), strict=True))
+        told.update(zip(others, pool.map(lambda name: _hash(store / name), others), strict=True))
     document["attributes"][SUM] = _sum(told)
     root = json.dumps(document, indent=2).encode()
     told[_ROOT] = hashlib.sha256(root).hexdigest()
     for name, content in ((NAME, _lines(told)), (_ROOT, root)):
+        if in_bucket(store):
+            put(store / name, content)
+            continue
         with replacing(store / name) as stream:
             stream.write(content)
 
@@ -127,10 +136,37 @@ class Manifest:
         self._known[name] = before
         return content
 
+    def line(self, name: str) -> str | None:
+        """The sum of a file; None where the store was written without it."""
+        return self._sums.get(name)
+
     def _error(self, reason: str) -> FileError:
         return FileError(
             f"{self._store} is damaged, or was replaced or removed after it was opened: {reason}; open it again"
         )
+
+
+class ManifestInBucket(Manifest):
+    """The sums of a store in an object store: an object that is read is compared each time."""
+
+    def is_known(self, name: str) -> bool:
+        """Never: nothing tells that an object is still the same but its content."""
+        return False
+
+    def check(self, name: str) -> None:
+        """Raise FileError unless the object is as it was written, or is absent and has no line."""
+        if name in self or (self._store / name).exists():
+            self.read(name)
+
+    def read(self, name: str) -> bytes:
+        """The content of an object, as it was when the store was sealed."""
+        try:
+            content = (self._store / name).read_bytes()
+        except FileNotFoundError:
+            raise self._error(f"{name} is missing") from None
+        if hashlib.sha256(content).hexdigest() != self._sums.get(name):
+            raise self._error(f"{name} is not as it was written")
+        return content
 
 
 def told(store: Path) -> str:
@@ -147,7 +183,7 @@ def require(store: Path, *, listed: bool = True) -> Manifest:
     if wrong:
         more = f", and {len(wrong) - 3} more" if len(wrong) > 3 else ""
         raise FileError(f"{store} is damaged: {', '.join(wrong[:3])}{more}")
-    return Manifest(store, sums, documents)
+    return (ManifestInBucket if in_bucket(store) else Manifest)(store, sums, documents)
 
 
 def damage(store: Path, *, every: bool = True) -> list[str]:
@@ -168,7 +204,7 @@ def _compared(
     states: dict[str, tuple[int, ...]] = {}
 
     def digest(name: str) -> str:
-        if (state := _state(store / name)) is not None:
+        if not in_bucket(store) and (state := _state(store / name)) is not None:
             states[name] = state
         return _hash(store / name)
 
@@ -227,6 +263,8 @@ def _state(path: Path) -> tuple[int, ...] | None:
 
 def _files(store: Path) -> set[str]:
     """Relative paths of all regular files."""
+    if in_bucket(store):
+        return set(sizes(store))
     found = set()
     for folder, _, names in os.walk(store):
         inside = os.path.relpath(folder, store)
@@ -236,5 +274,7 @@ def _files(store: Path) -> set[str]:
 
 
 def _hash(path: Path) -> str:
+    if in_bucket(path):
+        return hashlib.sha256(path.read_bytes()).hexdigest()
     with open(path, "rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()

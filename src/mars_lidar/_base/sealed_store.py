@@ -76,7 +76,7 @@ class SealedStore(PlainFiles):
 class SealedValues(WrapperStore[Any]):
     """A complete store that lies elsewhere: what is fetched whole, as chunks are, is compared with its sum."""
 
-    def __init__(self, store: Any, sums: Mapping[str, str], url: str) -> None:
+    def __init__(self, store: Any, sums: Mapping[str, str] | Manifest, url: str) -> None:
         super().__init__(store)
         self._sums, self._url = sums, url
 
@@ -86,7 +86,7 @@ class SealedValues(WrapperStore[Any]):
     async def get(self, key: str, prototype: Any, byte_range: Any = None) -> Any:
         """The bytes at a key, None where the store was written without it."""
         found = await self._store.get(key, prototype, byte_range)
-        wanted = self._sums.get(key)
+        wanted = self._sums.get(key) if isinstance(self._sums, Mapping) else self._sums.line(key)
         if wanted is None:
             return found
         if found is None:

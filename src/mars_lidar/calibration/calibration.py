@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -349,7 +349,7 @@ class _Run:
         seed: int,
     ) -> None:
         self.recording, self.look, self.level = recording, look, level
-        self.fixed = fixed
+        self.shape, self.returns, self.fields, self.fixed = shape, returns, fields, fixed
         self.seed = seed
         self.fit = Fit(recording, Effort(), seed + 1)
         told = tuple(fields.items())
@@ -371,9 +371,10 @@ class _Run:
     def result(self) -> Calibration:
         """The fit, the effects that it takes in, and what they leave."""
         fitted = self.first()
+        wrong = () if fitted.converged and fitted.p_value >= self.level else self.wrong_values(fitted)
         included: list[tuple[Score, suspects.Named]] = []
         listed = suspects.scores(self.fit, fitted) if fitted.converged else []
-        for _ in range(_MOST_EFFECTS if fitted.converged else 0):
+        for _ in range(_MOST_EFFECTS if fitted.converged and not wrong else 0):
             better = suspects.refitted(self.fit, fitted, listed)
             if better is None:
                 break
@@ -382,7 +383,37 @@ class _Run:
             included.append((used, better[1]))
             listed = suspects.scores(self.fit, fitted)
         drift = suspects.drift(self.fit, fitted) if fitted.converged else None
-        return self.assembled(fitted, included, listed, drift)
+        return self.assembled(fitted, included, [] if wrong else listed, drift, wrong)
+
+    def wrong_values(self, fitted: Fitted) -> tuple[Suspect, ...]:
+        """Given values without which the stream fits, each with the estimate that takes its place."""
+        out = []
+        without: list[tuple[str, Any, Pulse | str, dict[str, Any], dict[str, float]]] = []
+        for name, value in self.fixed.items():
+            free_of_it = {key: own for key, own in self.fixed.items() if key != name}
+            jitter = name == "jitter2"
+            without.append(
+                ("jitter_ns" if jitter else name, value**0.5 if jitter else value, self.shape, self.fields, free_of_it)
+            )
+        for name, whole in self.fields.items():
+            rest = {key: own for key, own in self.fields.items() if key != name}
+            without.append((name, whole, self.shape, rest, self.fixed))
+        if isinstance(self.shape, Pulse):
+            known: Any = self.shape.sigma_ns if isinstance(self.shape, GaussianPulse) else self.shape
+            without.append(("pulse_sigma_ns", known, "gaussian", self.fields, self.fixed))
+        for name, given, shape, fields, fixed in without:
+            run = _Run(self.recording, self.look, shape, self.returns, fields, fixed, self.level, self.seed)
+            free = run.first()
+            if not free.converged or free.p_value < self.level:
+                continue
+            at = _estimates(free, fixed, np.ones(free.model.size)).get(name, Estimate(np.nan, np.nan, np.nan, np.nan))
+            printed = f"{given:g}" if isinstance(given, float) else str(given)
+            gain = fitted.misfit_z - free.misfit_z if fitted.converged else float("nan")
+            z = abs(at.value - given) / at.error if isinstance(given, float) and at.error > 0.0 else 0.0
+            words = f"given {name} = {printed}, where the stream has"
+            option = f"leave it out, and p = {free.p_value:.2g}"
+            out.append(Suspect(words, z, at.value, at.error, gain, option, included=False))
+        return tuple(out)
 
     def first(self) -> Fitted:
         """The fit of the plain model, from the better of two starts; with other streams where it did not converge."""
@@ -414,7 +445,8 @@ class _Run:
             tried.append((misfit, theta, root))
         _, theta, root = min(tried, key=lambda trial: trial[0])
         theta, root, _, settled = fit.steps(model, theta, root, free, float(self.recording.photons), 10)
-        return fit.finish(model, theta, root, free, settled)
+        final = fit.finish(model, theta, root, free)
+        return replace(final, converged=final.converged and (settled or final.p_value >= self.level))
 
     def assembled(
         self,
@@ -422,11 +454,12 @@ class _Run:
         included: list[tuple[Score, suspects.Named]],
         listed: list[Score],
         drift: Drift | None,
+        wrong: tuple[Suspect, ...] = (),
     ) -> Calibration:
         """The result of the last fit."""
         growth = _growth(fitted, drift)
         estimates = _estimates(fitted, self.fixed, growth)
-        named: list[Suspect] = []
+        named: list[Suspect] = list(wrong)
         for score, refit in included:
             name = score.effect.names[0]
             shown = "electronics_dead_time_ns" if name == "electronics_excess" else name
@@ -445,7 +478,7 @@ class _Run:
                 named.append(Suspect(words, abs(drift.trend[k]), change, error, np.nan, option, included=False))
         families = {suspect.name for suspect in named}
         for score in listed if p < self.level else ():
-            if score.z > suspects.NAMED and score.effect.words not in families:
+            if score.z > suspects.clear(listed) and score.effect.words not in families:
                 families.add(score.effect.words)
                 option = f"given {score.effect.names[0]}"
                 named.append(
@@ -453,7 +486,7 @@ class _Run:
                 )
         if p < self.level and not any(not suspect.included for suspect in named):
             worst, z = _worst_cells(fitted)
-            if z > suspects.NAMED or not fitted.converged:
+            if z > suspects.clear(listed) or not fitted.converged:
                 advice = "pulse='free', or returns=2" if worst.startswith("phases") else "no option of the model"
                 named.append(Suspect(worst, z, np.nan, np.nan, np.nan, advice, included=False))
         centre = fitted.model.bounded(fitted.theta)
@@ -541,23 +574,19 @@ def _estimates(fitted: Fitted, fixed: dict[str, float], growth: FloatArray) -> d
     dead, observed = drawn[:, k + 2], float(centre[k + 2])
     dead_name = "dead_time_ns"
     for effect in model.effects:
-        columns = drawn[:, at : at + len(effect.names)]
+        columns = drawn[:, at : at + len(effect.names)].copy()
         values = centre[at : at + len(effect.names)]
         if effect.names[0] == "electronics_excess":
             put("electronics_dead_time_ns", observed, dead, "dead_time_ns")
             put("dead_time_ns", observed / (1.0 + float(values[0])), dead / (1.0 + columns[:, 0]), "electronics_excess")
             dead_name = ""
         elif effect.names[0] == "afterpulse_probability":  # in the option's units: those lost in the dead time included
-            delay = effect.delay_ns
-            pairs = zip(columns[:, 0], dead, strict=True)
-            carriers = np.array([all_carriers(after, delay, hold) for after, hold in pairs])
-            everything = all_carriers(float(values[0]), delay, observed)
-            put("afterpulse_probability", everything, carriers, "afterpulse_probability")
-            ratio = 2.0**0.5  # of neighbours on the grid of delays, halfway
-            out["afterpulse_delay_ns"] = Estimate(
-                delay, delay * (ratio - 1.0), delay / ratio, delay * ratio, "the best of a grid in steps of 2"
-            )
-            put("afterpulses_after_dead_time", float(values[0]), columns[:, 0], "afterpulse_probability")
+            after, delay = float(values[0]), float(np.exp(values[1]))
+            columns[:, 1] = np.exp(columns[:, 1])
+            carriers = np.array([all_carriers(*each) for each in np.c_[columns, dead]])
+            put("afterpulse_probability", all_carriers(after, delay, observed), carriers, *effect.names)
+            put("afterpulse_delay_ns", delay, columns[:, 1], effect.names[1])
+            put("afterpulses_after_dead_time", after, columns[:, 0], "afterpulse_probability")
         elif not effect.onoff:
             put(effect.names[0], float(values[0]), columns[:, 0], effect.names[0])
         at += len(effect.names)
@@ -573,7 +602,7 @@ def _limits(fitted: Fitted, listed: list[Score]) -> tuple[Limit, ...]:
     errors = np.sqrt(np.diag(fitted.covariance))
     for score in listed:
         name = score.effect.names[0]
-        if score.z > suspects.NAMED or score.effect.onoff:
+        if score.z > suspects.clear(listed) or score.effect.onoff:
             continue
         size = min(score.limit, score.effect.most[0])
         shifts = {

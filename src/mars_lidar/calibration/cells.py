@@ -10,6 +10,7 @@ from mars_lidar.calibration.model import Model
 from mars_lidar.calibration.recording import Recording
 
 _PHASES = 2**15  # cells of the table from phase to class
+_OFF = 0.5 + 1.0 / 64.0 / np.pi  # units of a clock from a tick to an edge
 _SHIFT = 0.37  # of such a cell: no edge lies where a clock ticks
 _QUANTILES = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98, 0.995)  # of intervals
 _AGES = (0.002, 0.02, 0.08, 0.2, 0.45, 0.75)  # quantiles of intervals that divide the table
@@ -79,8 +80,8 @@ class Cells:
 
     @staticmethod
     def _between(edges: FloatArray, unit: float) -> FloatArray:
-        """Edges of intervals, between the units of a clock."""
-        return np.unique((np.floor(edges / unit + 1e-6) + 0.5) * unit) if unit > 0.0 else np.unique(edges)
+        """Edges of intervals, between the units of a clock; off their middle, where a period of half units may end."""
+        return np.unique((np.floor(edges / unit + 1e-6) + _OFF) * unit) if unit > 0.0 else np.unique(edges)
 
     def __call__(self, t: FloatArray) -> FloatArray:
         """Counts (size,) of one stretch of recorded times (n,)."""

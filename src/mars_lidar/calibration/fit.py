@@ -19,15 +19,16 @@ from mars_lidar.calibration.cells import Cells
 from mars_lidar.calibration.model import Effect, Model
 from mars_lidar.calibration.recording import Recording
 
-SETTINGS = 32  # detectors of a batch
-LIGHTS = 8  # lights of each, in one call of the engine
+SETTINGS = 16  # detectors of a batch
+LIGHTS = 16  # lights of each, in one call of the engine
 _SPREAD = 2.0  # of a batch about its centre, in standard errors of a stream of its own length
+_LONGER = 4.0  # times the photons of the last law, whose closer parameters resolve the edge of a dead time
 _NEAR = 3.0  # the same of the last batches, in standard errors of the recording
 _SETTLED = 1.0  # standard errors that the last estimate may lie from the centre of its streams
 _LONGEST = 3.0  # of a move of that centre
 _FAR = 5.0  # standard errors that the centre may move before cells are laid anew
 _RECENTRED = 4  # last batches, at most
-_PULSES = 8  # widths of a batch
+_PULSES = 4  # widths of a batch
 _CUMULATED = 10.0  # intervals expected up to an edge, for a normal law of their number
 _DRAWS = 20_000  # of the law of the estimate, for its bounds
 
@@ -45,11 +46,11 @@ class Effort:
     share: float = 12.0
     first: int = 8_000
 
-    def of(self, photons: float) -> int:
-        """Photons of each stream of a batch, for this many of the recording."""
+    def of(self, photons: float, times: float = 1.0) -> int:
+        """Photons of each stream of a batch, for this many of the recording; `times` as many in all, for an edge."""
         number = SETTINGS * LIGHTS
-        wanted = max(self.stream, self.share * photons / number)
-        return int(min(photons, max(min(wanted, self.batch / number), 2.0 * photons / number)))
+        wanted = times * max(self.stream, min(self.share * photons, self.batch) / number)
+        return int(min(photons, max(wanted, 2.0 * photons / number)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,47 +97,46 @@ def counted(
 
 
 def design(model: Model, centre: FloatArray, root: FloatArray, free: NDArray[np.intp], seed: int) -> FloatArray:
-    """Parameters (streams, p), normal of covariance root root' about the centre; `LIGHTS` rows share a detector."""
-    from scipy.stats import norm, qmc
+    """Parameters (streams, p), normal of covariance root root' about the centre; `LIGHTS` rows share a detector.
 
+    Jitter varies from row to row, the pulse from one detector to the next, in `_PULSES` widths: the tables of a pulse
+    cost as much as a stream.
+    """
+    random = np.random.default_rng(seed)
+    k = model.light
+    split = np.eye(model.size)  # from the recorded width to that of the pulse, without the jitter
+    split[k, k + 1] = -1.0 if model.gaussian else 0.0
     cov = np.zeros((model.size, model.size))
     cov[np.ix_(free, free)] = root @ root.T
-    lit, det = free[free < model.light], free[free >= model.light]
+    cov = split @ cov @ split.T
+    det = free[(free == k) | (free > k + 1)]
+    lit = np.setdiff1d(free, det)
 
-    def normal(rows: int, columns: int, seed: int) -> FloatArray:
-        if columns == 0:
-            return np.zeros((rows, 0))
-        uniform = qmc.Sobol(columns, seed=seed).random_base2(int(np.ceil(np.log2(rows))))[:rows]
-        z = norm.ppf(0.002 + 0.996 * uniform)
-        z -= z.mean(0)
-        return np.asarray(z / z.std(0))
+    def normal(rows: int, columns: int) -> FloatArray:
+        """Deviates (rows, columns) without correlation, of variance 1."""
+        z = random.standard_normal((rows, columns))
+        return np.asarray(np.linalg.qr(z - z.mean(0))[0] * rows**0.5)
 
-    rows = np.tile(centre, (SETTINGS * LIGHTS, 1))
+    away = np.zeros((SETTINGS * LIGHTS, model.size))
     within = cov[np.ix_(lit, lit)]
     if det.size:
         between = cov[np.ix_(det, det)]
-        z = normal(SETTINGS, det.size, seed) @ _root(between).T
-        rows[:, det] += np.repeat(z, LIGHTS, 0)
-        rows = model.bounded(rows)
+        settings = normal(SETTINGS, det.size) @ _root(between).T
+        if k in det:
+            for part in np.array_split(np.argsort(settings[:, 0]), _PULSES):
+                settings[part, 0] = settings[part, 0].mean()
+        away[:, det] = np.repeat(settings, LIGHTS, 0)
         gain = cov[np.ix_(lit, det)] @ np.linalg.pinv(between, rcond=1e-10)
-        rows[:, lit] += (rows[:, det] - centre[det]) @ gain.T
+        away[:, lit] = away[:, det] @ gain.T
         within = within - gain @ cov[np.ix_(det, lit)]
-    rows[:, lit] += normal(len(rows), lit.size, seed + 1) @ _root(within).T
-    rows = model.bounded(rows)
-    rows[:, det] = np.repeat(rows[::LIGHTS, det], LIGHTS, 0)
-    return _few_pulses(model, rows) if model.light in det else rows
-
-
-def _few_pulses(model: Model, rows: FloatArray) -> FloatArray:
-    """Rows whose pulses are of `_PULSES` widths: the tables of a pulse cost as much as a stream."""
-    width2, jitter2 = rows[:, model.light], rows[:, model.light + 1]
-    sigma = np.sqrt(np.maximum(width2 - jitter2, 0.0))
-    order = np.argsort(sigma, kind="stable")
-    for part in np.array_split(order.reshape(-1, LIGHTS), _PULSES):
-        sigma[part] = sigma[part].mean()
-    out = rows.copy()
-    out[:, model.light] = sigma**2 + jitter2
-    return out
+    away[:, lit] += normal(len(away), lit.size) @ _root(within).T
+    at = centre @ split.T + away
+    least = (1e-3 * centre[k]) if model.gaussian else -np.inf
+    at[:, k] = np.maximum(at[:, k], least)  # the same in all rows of a detector
+    at[:, k + 1] = np.maximum(at[:, k + 1], 0.0)
+    rows = model.bounded(at @ np.linalg.inv(split).T)
+    rows[:, k + 3 :] = np.repeat(rows[::LIGHTS, k + 3 :], LIGHTS, 0)
+    return rows
 
 
 def _root(cov: FloatArray) -> FloatArray:
@@ -252,15 +252,14 @@ class Fit:
         photons: float,
         cells: Cells | None = None,
         spread: float = _SPREAD,
-        before: Batch | None = None,
+        times: float = 1.0,
     ) -> Batch:
-        """The linear law of counts about `theta` for an exposure of this many photons; with those of `before`."""
+        """The linear law of counts about `theta` for an exposure of this many photons."""
         cells = self.cells(model, theta, photons) if cells is None else cells
-        rows = design(model, theta, spread * (photons / self.effort.of(photons)) ** 0.5 * root, free, self.next_seed())
-        exposure = max(2, round(self.exposure(self.effort.of(photons))))
+        size = self.effort.of(photons, times)
+        rows = design(model, theta, spread * (photons / size) ** 0.5 * root, free, self.next_seed())
+        exposure = max(2, round(self.exposure(size)))
         made = counted(model, cells, rows, exposure, self.next_seed())
-        if before is not None:
-            made, rows = np.r_[made, before.counts / before.ratio], np.r_[rows, before.theta]
         return regression(cells, rows, theta, made, self.exposure(photons) / exposure, free)
 
     def steps(
@@ -311,18 +310,17 @@ class Fit:
         theta: FloatArray,
         root: FloatArray,
         free: NDArray[np.intp],
-        converged: bool,
         again: bool = True,
     ) -> Fitted:
         """The last estimate, and what fresh streams about it say of its slope, bias, scatter and misfit."""
         photons = float(self.recording.photons)
-        first = self.law(model, theta, root, free, photons)
-        law = self.law(model, theta, root, free, photons, first.cells, before=first)
+        law = self.law(model, theta, root, free, photons, times=_LONGER)
+        nearby = _NEAR * (self.effort.of(photons) / photons) ** 0.5
         gain = law.estimator(free)
         seen = law.cells.of(self.recording)
         centre, size = theta, np.zeros(len(free))
         for trial in range(_RECENTRED):
-            near = self.law(model, centre, root, free, photons, law.cells, spread=_NEAR / law.ratio**0.5)
+            near = self.law(model, centre, root, free, photons, law.cells, spread=nearby)
             y = near.counts  # of streams near the estimate, in the recording's exposure
             moved = (near.theta - centre)[:, free]
             terms = np.c_[np.ones(len(y)), moved]
@@ -331,7 +329,7 @@ class Fit:
             estimator = np.linalg.pinv(local) @ gain
             rest = (y - near.offset) @ estimator.T - moved
             scatter = np.cov(rest.T).reshape(len(free), len(free))
-            cov = scatter * (1.0 / law.ratio + 1.0 / len(y))
+            cov = scatter * (1.0 / near.ratio + 1.0 / len(y))
             raw = centre.copy()
             raw[free] += estimator @ (seen - near.offset) - rest.mean(0)
             mean, truncated = physical(model, raw, cov, free)
@@ -341,11 +339,11 @@ class Fit:
             centre = centre + (mean - centre) / max(1.0, float(size.max()) / _LONGEST)
         sd = np.sqrt(np.diag(cov))
         if again and (np.abs((centre - theta)[free]) > _FAR * sd).any():  # cells and weights were laid elsewhere
-            return self.finish(model, centre, _root(cov), free, converged, again=False)
+            return self.finish(model, centre, _root(cov), free, again=False)
         jacobian = law.slope[:, free] @ local
         project = np.eye(len(seen)) - jacobian @ estimator
         fresh = near.residual @ project.T
-        fresh = (fresh - fresh.mean(0)) / np.sqrt(law.ratio) * np.sqrt(len(y) / (len(y) - terms.shape[1]))
+        fresh = (fresh - fresh.mean(0)) / np.sqrt(near.ratio) * np.sqrt(len(y) / (len(y) - terms.shape[1]))
         left = project @ (seen - near.offset)
         misfit, z, p = _misfit(left, fresh, law, near)
         return Fitted(
@@ -355,7 +353,7 @@ class Fit:
             covariance=truncated,
             unbounded=raw,
             unbounded_covariance=cov,
-            scatter=scatter / law.ratio,
+            scatter=scatter / near.ratio,
             batch=law,
             offset=near.offset,
             estimator=estimator,
@@ -365,7 +363,7 @@ class Fit:
             misfit=misfit,
             misfit_z=z,
             p_value=p,
-            converged=converged and bool(size.max() < _LONGEST),
+            converged=bool(size.max() < _LONGEST),
         )
 
 
@@ -375,18 +373,18 @@ def _misfit(left: FloatArray, fresh: FloatArray, law: Batch, near: Batch) -> tup
     The probability is that of two tests together: the weighed square of all cells, and the largest departure of the
     cumulated intervals, which sees a few missing or early intervals at the edge of the dead time.
     """
-    from scipy.stats import gamma, norm
+    from scipy.special import gammaincc, ndtr
 
     used = law.common
-    noise = 1.0 + law.ratio / len(near.counts)
+    noise = 1.0 + near.ratio / len(near.counts)
     weight = law.weight[np.ix_(used, used)]
     drawn = np.einsum("ki,ij,kj->k", fresh[:, used], weight, fresh[:, used])
     mine = float(left[used] @ weight @ left[used]) / noise
     shape = drawn.mean() ** 2 / drawn.var()
-    square = float(gamma.sf(mine, shape, scale=drawn.mean() / shape))
+    square = float(gammaincc(shape, mine * shape / drawn.mean()))
     gaps = slice(law.cells.phases, law.cells.phases + law.cells.gap_edges.size)
     enough = np.cumsum(near.offset[gaps]) > _CUMULATED
     departure = np.abs(np.cumsum(left[gaps])) / (np.cumsum(fresh[:, gaps], axis=1).std(0) * noise**0.5)
     most = float(departure[enough].max(initial=0.0))
-    edge = float(min(1.0, 2.0 * enough.sum() * norm.sf(most)))
+    edge = float(min(1.0, 2.0 * enough.sum() * ndtr(-most)))
     return mine, float((mine - drawn.mean()) / drawn.std()), min(1.0, 2.0 * min(square, edge))

@@ -23,7 +23,7 @@ from mars_lidar.simulation import simulate_timestamps
 _NARROWEST = 2e-6  # periods: the narrowest pulse that the engines draw
 _WIDEST = 0.3  # sigma of a recorded pulse, periods: a wider one is hardly told from background
 _WIDEST_JITTER = 0.0499  # periods: the widest that `Jitter` takes
-_DELAYS = (0.4, 0.8, 1.6, 3.2, 6.4)  # dead times: delays of afterpulses that are tried
+_DELAYS = (0.4, 0.8, 1.6, 3.2, 6.4)  # dead times: mean delays of afterpulses whose scores are compared before a refit
 _MOST_CARRIERS = 0.95  # of an avalanche
 Fields = dict[str, Any]
 
@@ -32,9 +32,9 @@ Fields = dict[str, Any]
 class Effect:
     """What a detector may do beside dead time and jitter.
 
-    `names` of its parameters, each an option of the detector; `start` values that a test for it tries; `most` the
-    largest ones; `apply` makes the fields of a `Detector` with it; `words` for a table;
-    `delay_ns` that of afterpulses, one of a grid; `onoff` where it has no size.
+    `names` of its parameters, the first its size, the others logarithms; `start` values that a test for it tries;
+    `least` and `most` the bounds; `apply` makes the fields of a `Detector` with it; `words` for a table; `onoff` where
+    it has no size.
     """
 
     names: tuple[str, ...]
@@ -43,7 +43,6 @@ class Effect:
     most: tuple[float, ...]
     apply: Callable[[Fields, tuple[float, ...]], Fields]
     words: str
-    delay_ns: float = float("nan")
     onoff: bool = False
 
 
@@ -56,14 +55,10 @@ def effects(dead_time_ns: float) -> tuple[Effect, ...]:
     """Effects that are looked for in a stream of a detector with this dead time."""
     dead = dead_time_ns
 
-    def afterpulses(delay: float) -> Callable[[Fields, tuple[float, ...]], Fields]:
-        def apply(fields: Fields, value: tuple[float, ...]) -> Fields:
-            if value[0] < 1e-7:
-                return fields
-            carriers = all_carriers(value[0], delay, fields["dead_time_ns"])
-            return fields | {"afterpulsing": Afterpulsing(probability=carriers, delay_ns=delay)}
-
-        return apply
+    def afterpulses(fields: Fields, value: tuple[float, ...]) -> Fields:
+        after, delay = value[0], float(np.exp(value[1]))
+        carriers = all_carriers(after, delay, fields["dead_time_ns"])
+        return fields | ({"afterpulsing": Afterpulsing(probability=carriers, delay_ns=delay)} if carriers > 0 else {})
 
     def electronics(fields: Fields, value: tuple[float, ...]) -> Fields:
         observed = fields["dead_time_ns"]  # that of the electronics, over a detector that is ready earlier
@@ -71,7 +66,12 @@ def effects(dead_time_ns: float) -> tuple[Effect, ...]:
 
     listed = [
         Effect(
-            ("afterpulse_probability",), (0.03,), (0.0,), (0.5,), afterpulses(scale * dead), "afterpulses", scale * dead
+            ("afterpulse_probability", "log_afterpulse_delay"),
+            (0.03, float(np.log(scale * dead))),
+            (0.0, float(np.log(_DELAYS[0] * dead / 2.0))),
+            (0.5, float(np.log(_DELAYS[-1] * dead * 2.0))),
+            afterpulses,
+            "afterpulses",
         )
         for scale in _DELAYS
     ]
@@ -175,8 +175,10 @@ class Model:
                 at += 1
         return out
 
-    def system(self, theta: FloatArray, cycles: int, bins: int = 16, extra: tuple[Effect, ...] = ()) -> System:
-        """The instrument of parameters (p,), with further effects at their starting values."""
+    def system(
+        self, theta: FloatArray, cycles: int, bins: int = 16, extra: tuple[Effect, ...] = (), jitter: bool = True
+    ) -> System:
+        """The instrument of parameters (p,), with further effects at their starting values, with or without jitter."""
         k = self.light
         theta = self.bounded(theta)
         width2, jitter2 = float(theta[k]), float(theta[k + 1])
@@ -188,7 +190,7 @@ class Model:
         for effect in extra:
             fields = effect.apply(fields, effect.start)
         least = _NARROWEST * self.clock.period_ns
-        if jitter2 > least**2:
+        if jitter and jitter2 > least**2:
             fields["jitter"] = Jitter(sigma_ns=jitter2**0.5)
         pulse = self.pulse or GaussianPulse(sigma_ns=float(f"{max(max(width2 - jitter2, 0.0) ** 0.5, least):.9g}"))
         return System(
@@ -209,14 +211,22 @@ class Model:
         return Flux(signal, back, delay) if self.returns > 1 else Flux(signal[0], back, delay[0])
 
     def streams(self, rows: FloatArray, cycles: int, seed: int, extra: tuple[Effect, ...] = ()) -> list[FloatArray]:
-        """Recorded times of a stream for each row of (rows, p); the detector is that of the first row."""
-        rows = np.atleast_2d(rows)
+        """Recorded times of a stream for each row of (rows, p); the detector is that of the first row, but its jitter.
+
+        The jitter of a recorded time is drawn here, a normal deviate each, so that it may differ from row to row and
+        no table of its shape is built for each value.
+        """
+        rows = self.bounded(np.atleast_2d(rows))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a trial value may look like one in another unit
-            system = self.system(rows[0], cycles, extra=extra)
+            system = self.system(rows[0], cycles, extra=extra, jitter=False)
             made = simulate_timestamps(self.flux(rows), system, seed=seed, threads=1)
-        t, at = made.times_ns, made.offsets
-        return [self.clock.record(t[a:b]) for a, b in pairwise(at)]
+        random = np.random.default_rng(seed)
+        t = made.times_ns
+        sigma = np.sqrt(rows[:, self.light + 1])
+        if (sigma > _NARROWEST * self.clock.period_ns).any():
+            t += np.repeat(sigma, np.diff(made.offsets)) * random.standard_normal(t.size)
+        return [self.clock.record(t[a:b]) for a, b in pairwise(made.offsets)]
 
     def with_effect(self, effect: Effect) -> Model:
         """This model with one effect more."""

@@ -11,6 +11,7 @@ from mars_lidar.calibration.recording import Recording
 
 _SHARES = (0.0, 0.03, 0.1, 0.3, 0.6, 0.9, 0.99)  # of the recorded width that may be jitter
 _MOST_BINS = 2**14
+_WINDOWS = 64  # of the period, for the median light
 
 
 def free_light(t: FloatArray, period: float, hold: float, bins: int) -> tuple[FloatArray, FloatArray]:
@@ -38,7 +39,9 @@ def light(t: FloatArray, model: Model, hold: float) -> FloatArray:
     cell = period / bins
     place = (np.arange(bins) + 0.5) * cell
     outside = np.ones(bins, bool)
-    faint = max(float(np.median(rate)), 0.3 * hits.sum() / max(passes.sum(), 1.0))
+    # the median of windows with enough photons for one
+    coarse = [np.add.reduceat(x, np.linspace(0, bins, _WINDOWS, endpoint=False).astype(int)) for x in (hits, passes)]
+    faint = max(float(np.median(coarse[0] / np.maximum(coarse[1], 1.0))), 1e-3 / max(passes.sum(), 1.0))
     found, variance = [], 0.0
     for _ in range(model.returns):
         best = (-np.inf, 0, 1)
@@ -48,7 +51,9 @@ def light(t: FloatArray, model: Model, hold: float) -> FloatArray:
                 break
             sums = [np.cumsum(np.r_[0.0, x, x[: m - 1]]) for x in (masked_hits, masked_passes)]
             inside, armed = (c[m:] - c[:-m] for c in sums)
-            z = (inside - faint * armed) / np.sqrt(inside + 1.0)
+            expected = np.maximum(faint * armed, 1e-9)
+            more = np.maximum(inside, expected)
+            z = more * np.log(more / expected) - (more - expected)  # log likelihood ratio of a brighter window
             best = max(best, (float(z.max()), int(z.argmax()), int(m)))
         _, at, m = best
         peak, least = (at + m / 2) * cell, max(0.8 * m, 2) * cell
@@ -57,7 +62,7 @@ def light(t: FloatArray, model: Model, hold: float) -> FloatArray:
             off = (place - peak + period / 2) % period - period / 2
             inside = np.abs(off) < reach
             rest = outside & ~inside
-            faint = max(float(np.median(rate[rest])), float(hits[rest].sum() / max(passes[rest].sum(), 1.0)))
+            faint = float((hits[rest].sum() + 1e-3) / max(passes[rest].sum(), 1.0))
             extra = (rate - faint)[inside & outside]
             near = off[inside & outside]
             signal = max(float(extra.sum()), 1e-4)
@@ -147,8 +152,8 @@ def first_spread(model: Model, theta: FloatArray) -> FloatArray:
     out[k + 2] = 0.3 * width + 0.5 * unit
     at = k + 3
     for effect in model.effects:
-        for value in effect.start:
-            out[at] = 0.4 * max(value, abs(theta[at]))
+        for number, value in enumerate(effect.start):
+            out[at] = 0.4 * (max(value, theta[at]) if number == 0 else 1.0)
             at += 1
     return out
 

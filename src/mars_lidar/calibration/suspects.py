@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,17 +13,14 @@ from mars_lidar.calibration.model import Effect, Model, effects
 from mars_lidar.calibration.recording import Recording
 from mars_lidar.calibration.start import first_spread, with_edge
 
-_STREAMS = 4 * LIGHTS  # that tell the direction of an effect
-NAMED = 4.0  # standard deviations of a score beyond which an effect is refitted: 3e-5 by chance
-_CLEAR = 2.5  # errors of the size of an effect that has no score of its own
-_FINISHED = 2  # refits that fresh streams judge
-_MISFIT = 1e-3  # probability of the misfit below which effects without a clear score are refitted too
-_FACTOR = 100.0  # of the probability of the misfit, for a refit that gains less in its square
-_GAIN = 2.0  # standard deviations of the misfit that a refit must gain
+_DIRECTION = 12.0  # photons of the streams that give the direction of an effect, over those of the recording
+_MOST = 2e6  # of these photons
+FALSE_ALARM = 0.005  # probability that a plain recording gets a suspect; again that of a drift
+_ROUNDS = 5  # of steps with an effect more; the last streams tell whether they were enough
+_REFITTED = 2  # effects, that fresh streams judge
+_MISFIT = 1e-3  # probability of the misfit below which effects without a clear score are refitted, and their gain in it
 _PARTS = 16  # of a recording, for drift
 _PART_PHOTONS = 300  # of a part, at least
-_DRIFTS = 3.0  # standard deviations of a trend: 0.3 % by chance
-_SCATTERS = 1e-4  # probability of a scatter of the parts as large
 
 
 @dataclass(frozen=True)
@@ -55,9 +52,11 @@ def scores(fit: Fit, fitted: Fitted) -> list[Score]:
     have |= {"paralyzable"} if "mode" in have else set()
     centre = model.bounded(fitted.theta)
     photons = float(fit.recording.photons)
-    exposure = max(2, round(fit.exposure(fit.effort.of(photons))))
-    rows = np.tile(centre, (_STREAMS, 1))
-    plain = counted(model, law.cells, rows, exposure, fit.next_seed()).mean(0) * law.ratio
+    simulated = min(_DIRECTION * photons, max(_MOST, photons))
+    exposure = max(2, round(fit.exposure(simulated / LIGHTS)))
+    ratio = fit.exposure(photons) / exposure
+    rows = np.tile(centre, (LIGHTS, 1))
+    plain = counted(model, law.cells, rows, exposure, fit.next_seed()).mean(0) * ratio
     listed = []
     used = law.common
     dead = float(centre[model.light + 2])
@@ -65,18 +64,27 @@ def scores(fit: Fit, fitted: Fitted) -> list[Score]:
         if effect.names[0] in have:
             continue
         try:
-            made = counted(model, law.cells, rows, exposure, fit.next_seed(), (effect,)).mean(0) * law.ratio
+            made = counted(model, law.cells, rows, exposure, fit.next_seed(), (effect,)).mean(0) * ratio
         except ValueError:  # a detector cannot have both
             continue
-        change = (made - plain) / effect.start[0]
+        change = made - plain
+        noise = (np.maximum(plain, 0.5) + np.maximum(made, 0.5)) * ratio / LIGHTS
+        change = change * np.maximum(0.0, 1.0 - 2.0 * noise / np.maximum(change**2, 1e-300)) / effect.start[0]
         shift = fitted.estimator @ change
         way = change - fitted.jacobian @ shift
         along = np.zeros_like(way)
         along[used] = law.weight[np.ix_(used, used)] @ way[used]
         along /= max(float(way @ along), 1e-300)
-        spread = float((fitted.fresh @ along).std()) * (1.0 + law.ratio / _STREAMS) ** 0.5
+        spread = float((fitted.fresh @ along).std()) * (1.0 + 2.0 * ratio / LIGHTS) ** 0.5
         listed.append(Score(effect, float(fitted.left @ along), spread, shift))
     return sorted(listed, key=lambda score: -score.z)
+
+
+def clear(listed: list[Score]) -> float:
+    """Standard deviations of a score that one of these effects has by chance with a probability of `FALSE_ALARM`."""
+    from scipy.special import ndtri
+
+    return float(-ndtri(FALSE_ALARM / max(len(listed), 1)))
 
 
 @dataclass(frozen=True)
@@ -88,7 +96,7 @@ class Named:
     gain: float
 
 
-_Stepped = tuple[Model, FloatArray, FloatArray, NDArray[np.intp], bool, float]
+_Stepped = tuple[Model, FloatArray, FloatArray, NDArray[np.intp]]
 
 
 def refitted(fit: Fit, fitted: Fitted, listed: list[Score]) -> tuple[Fitted, Named] | None:
@@ -97,68 +105,46 @@ def refitted(fit: Fit, fitted: Fitted, listed: list[Score]) -> tuple[Fitted, Nam
     Effects are named by the refit: a slow recovery may have the score of a paralyzable detector, and one that the
     dead time has taken up has no score at all. So where the misfit is clear, effects without a score are tried too.
     """
-    clear = [score for score in listed if score.z > NAMED]
-    best = _best(fit, fitted, clear, listed)
+    limit = clear(listed)
+    best = _best(fit, fitted, [score for score in listed if score.z > limit], limit)
     if best is None and fitted.p_value < _MISFIT:
-        families = {score.effect.names[0] for score in clear}
-        best = _best(fit, fitted, [score for score in listed if score.effect.names[0] not in families], listed)
+        best = _best(fit, fitted, [score for score in listed if score.z <= limit], limit)
     return best
 
 
-def _best(fit: Fit, fitted: Fitted, tried: list[Score], listed: list[Score]) -> tuple[Fitted, Named] | None:
+def _best(fit: Fit, fitted: Fitted, tried: list[Score], limit: float) -> tuple[Fitted, Named] | None:
     trials: list[tuple[float, Score, _Stepped]] = []
     families: set[str] = set()
     for score in tried:
-        family = score.effect.names[0]
-        if family in families:
+        if score.effect.names[0] in families:
             continue
-        families.add(family)
-        grid = sorted((s for s in listed if s.effect.names[0] == family), key=lambda s: s.effect.delay_ns)
-        place, least = grid.index(score), np.inf  # upwards: scores prefer short delays, unlike refits
-        while place < len(grid):
-            trial = _stepped(fit, fitted, grid[place])
-            if trial is None or trial[-1] >= least:
-                break
-            least = trial[-1]
-            trials.append((least, grid[place], trial))
-            place += 1
+        families.add(score.effect.names[0])
+        trial = _stepped(fit, fitted, score)
+        if trial is not None:
+            trials.append((trial[0], score, trial[1]))
     best: tuple[Fitted, Named] | None = None
-    finals: list[tuple[Fitted, Named]] = []
-    for _, score, (model, theta, root, free, settled, _) in sorted(trials, key=lambda trial: trial[0])[:_FINISHED]:
-        final = fit.finish(model, theta, root, free, settled)
-        named = Named(score.effect, score.z, fitted.misfit_z - final.misfit_z)
-        gains = named.gain > _GAIN or final.p_value > max(_FACTOR * fitted.p_value, _MISFIT)
-        if score.z <= NAMED and not score.effect.onoff:  # without a score of its own: its size must be clear
-            gains = gains and final.theta[-1] > _CLEAR * final.covariance[-1, -1] ** 0.5
-        if gains and final.converged:
-            finals.append((final, named))
-            if best is None or final.misfit_z < best[0].misfit_z:
-                best = final, named
+    for _, score, (model, theta, root, free) in sorted(trials, key=lambda trial: trial[0])[:_REFITTED]:
+        final = fit.finish(model, theta, root, free)
+        if final.converged and (best is None or final.misfit_z < best[0].misfit_z):
+            best = final, Named(score.effect, score.z, fitted.misfit_z - final.misfit_z)
     if best is None:
         return None
-    # delays of a grid that fit about as well: their difference is part of the error
-    for final, named in finals:
-        same = named.effect.names == best[1].effect.names and final is not best[0]
-        if same and final.misfit_z < best[0].misfit_z + _GAIN:
-            off = (final.theta - best[0].theta)[best[0].free]
-            more = np.outer(off, off)
-            wider = replace(
-                best[0],
-                covariance=best[0].covariance + more,
-                unbounded_covariance=best[0].unbounded_covariance + more,
-            )
-            best = wider, best[1]
-    return best
+    final, named = best
+    if named.effect.onoff:
+        clear_size = named.z > limit
+    else:
+        clear_size = final.theta[fitted.model.size] > limit * final.covariance[(k := len(fitted.free)), k] ** 0.5
+    return best if clear_size or fitted.p_value < _MISFIT * final.p_value else None
 
 
-def _stepped(fit: Fit, fitted: Fitted, score: Score) -> _Stepped | None:
-    """Parameters with one effect more, and the misfit; None where a detector cannot have it beside the others."""
+def _stepped(fit: Fit, fitted: Fitted, score: Score) -> tuple[float, _Stepped] | None:
+    """Misfit and parameters with one effect more; None where a detector cannot have it beside the others."""
     model, effect = fitted.model.with_effect(score.effect), score.effect
-    size = effect.start[0] if effect.onoff else float(np.clip(score.size, 0.3 * effect.start[0], effect.most[0]))
+    size = effect.start[0]
     moved = fitted.theta.copy()
-    moved[fitted.free] -= score.shift * min(size, effect.start[0])
-    if fitted.model.light + 2 in fitted.free and effect.names[0] == "recovery_ns":
-        moved, size = fitted.theta.copy(), effect.start[0]  # the dead time has taken up what it could of them
+    if not effect.onoff and score.size > 0.0:
+        size = min(score.size, effect.most[0])
+        moved[fitted.free] -= score.shift * min(size, effect.start[0])
     theta = model.bounded(np.r_[moved, size, effect.start[1:]])
     spread = first_spread(model, theta)
     own = np.sqrt(np.diag(fitted.covariance))
@@ -167,13 +153,13 @@ def _stepped(fit: Fit, fitted: Fitted, score: Score) -> _Stepped | None:
     free = np.r_[fitted.free, np.array(more, np.intp)].astype(np.intp)
     photons = float(fit.recording.photons)
     try:
-        if effect.names[0] == "recovery_ns" and fitted.model.light + 2 in fitted.free:
+        if fitted.model.light + 2 in fitted.free:  # which has taken up what it could of the effect
             gaps = np.diff(fit.recording.pieces[0][: 12 * fit.effort.first])
             theta = with_edge(fit, model, theta, np.sort(gaps))
-        theta, root, misfit, settled = fit.steps(model, theta, np.diag(spread[free]), free, photons, 5, photons / 6.0)
+        theta, root, misfit, _ = fit.steps(model, theta, np.diag(spread[free]), free, photons, _ROUNDS, photons / 6.0)
     except (ValueError, np.linalg.LinAlgError):
         return None
-    return model, theta, root, free, settled, misfit
+    return misfit, (model, theta, root, free)
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,22 +180,26 @@ class Drift:
     growth: FloatArray
 
     @property
+    def _trend_p(self) -> FloatArray:
+        from scipy.special import ndtr
+
+        return np.asarray(2.0 * ndtr(-np.abs(self.trend)))
+
+    @property
     def probability(self) -> float:
         """Probability of a trend or a scatter as large in a constant recording, all parameters together."""
-        from scipy.stats import norm
-
-        p = np.r_[2.0 * norm.sf(np.abs(self.trend)), self.p_value]
+        p = np.r_[self._trend_p, self.p_value]
         return float(1.0 - (1.0 - p.min()) ** p.size)
 
     @property
     def drifts(self) -> NDArray[np.bool_]:
         """(p,) which parameters are not constant."""
-        return (np.abs(self.trend) > _DRIFTS) | (self.p_value < _SCATTERS)
+        return np.asarray(np.minimum(self._trend_p, self.p_value) < FALSE_ALARM / (2 * self.p_value.size))
 
 
 def drift(fit: Fit, fitted: Fitted) -> Drift | None:
     """Light and delay of parts of the recording, by the estimator of the whole; None for a short recording."""
-    from scipy.stats import chi2
+    from scipy.special import chdtrc
 
     recording: Recording = fit.recording
     number = int(min(_PARTS, recording.photons // _PART_PHOTONS))
@@ -236,7 +226,7 @@ def drift(fit: Fit, fitted: Fitted) -> Drift | None:
     place = np.linspace(-0.5, 0.5, len(parts))
     slope = place @ (x - x.mean(0)) / (place @ place)
     square = (((x - x.mean(0)) / sd) ** 2).sum(0)
-    p = np.array([float(chi2.sf(value, len(parts) - 1)) for value in square])
+    p = np.array([float(chdtrc(len(parts) - 1, value)) for value in square])
     begins = np.cumsum([0.0, *(part.exposure for part in parts)])
     middle = 0.5 * (begins[1:] + begins[:-1]) * recording.period_ns * 1e-9
     about = np.r_[

@@ -18,10 +18,12 @@ EXPORT_EPILOG = examples(
 def export(
     dataset: Path = argument("A dataset that mars-lidar generate wrote."),
     out: Path = out_option("A new folder.", panel=None),
-    layout: str = option("Whose loader reads it: lindell, deepsensorfusion, sun or gutierrez.", default=...),
+    layout: str = option(
+        "Whose loader reads it: lindell, deepsensorfusion, sun, gutierrez or webdataset.", default=...
+    ),
     fill: bool = option("Pixels without a return take depth and rates of the nearest with one.", default=False),
 ) -> None:
-    """Write a dataset as the files that depth networks of the field load: one .mat an exposure, and their list."""
+    """Write a dataset as the files that depth networks load: one .mat an exposure and their list, or tars."""
     with reported():
         from mars_lidar.dataset.network_files import export as exported
 

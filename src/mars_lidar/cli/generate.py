@@ -77,6 +77,9 @@ def generate(
     ),
     resume: bool = of_output("Continue what was stopped.", default=False),
     overwrite: bool = of_output("Replace an existing dataset.", default=False),
+    begin: bool = of_output("Read the scenes and lay the store out; --part jobs make its counts.", default=False),
+    part: str | None = of_output("Make part K of N of a store that --begin began, in any order.", metavar="K/N"),
+    finish: bool = of_output("Check that all parts are there, and mark the store complete.", default=False),
     dry_run: bool = of_output("Tell size, time and memory; write nothing.", default=False),
 ) -> None:
     """Simulate a dataset: scenes x systems x levels of light x realizations, into one Zarr store.
@@ -88,6 +91,20 @@ def generate(
     with reported():
         from mars_lidar import dataset
 
+        if sum((begin, part is not None, finish, dry_run)) > 1:
+            raise ValueError("--begin, --part, --finish and --dry-run are four steps: give one of them")
+        if (part or finish) and (workers is not None or scheduler is not None):
+            raise ValueError("--part and --finish need no --workers and no --scheduler")
+        if (part or finish) and (source is not None or resume or overwrite):
+            raise ValueError("--part and --finish go on with the store: no SOURCE, --resume or --overwrite")
+        if part is not None:
+            numbers = _part(part)
+            with progress_bar("generating") as progress:
+                tell(dataset.make_part(out, numbers, threads=threads, progress=progress))
+            return
+        if finish:
+            tell(dataset.finish(out))
+            return
         of_systems = bool(system) or changes != SystemChanges() or effects != Effects()
         replaced = {
             "size": _size("--size", size),
@@ -110,6 +127,11 @@ def generate(
             if recipe is None:
                 raise ValueError("--dry-run needs a source")
             tell_estimate(dataset.estimate(recipe, out, threads=threads))
+            return
+        if begin:
+            if recipe is None:
+                raise ValueError("--begin needs a SOURCE")
+            tell(dataset.begin(recipe, out, resume=resume, overwrite=overwrite, workers=workers, scheduler=scheduler))
             return
         here = workers is None and scheduler is None and not (resume and out.exists())
         if here and recipe is not None and (told := str(dataset.quick_advice(recipe, threads))):
@@ -179,6 +201,13 @@ def _recipe(
                 raise ValueError("--depth-unit-m and --focal-px belong to RGB-D")
             scene = {"transient": str(source)}
     return DatasetRecipe.from_dict({"systems": [DEFAULT_SYSTEM], **replaced, "scenes": scene})
+
+
+def _part(text: str) -> tuple[int, int]:
+    which, _, of = text.partition("/")
+    if not (which.isdecimal() and of.isdecimal() and 1 <= int(which) <= int(of)):
+        raise ValueError(f"--part must be K/N with K from 1 to N, got {text!r}")
+    return int(which), int(of)
 
 
 def _given(**values: Any) -> dict[str, Any]:

@@ -16,7 +16,10 @@ if TYPE_CHECKING:
     from mars_lidar.dataset.read import read_sparse as read_sparse
     from mars_lidar.dataset.recipe import DatasetRecipe as DatasetRecipe
     from mars_lidar.dataset.run import Generated as Generated
+    from mars_lidar.dataset.run import begin as begin
+    from mars_lidar.dataset.run import finish as finish
     from mars_lidar.dataset.run import generate as generate
+    from mars_lidar.dataset.run import make_part as make_part
     from mars_lidar.dataset.schema import json_schema as json_schema
     from mars_lidar.dataset.store import Dataset as Dataset
     from mars_lidar.dataset.store import open_dataset as open_dataset
@@ -29,7 +32,7 @@ _HOMES = {
     **dict.fromkeys(("Dataset", "open_dataset"), "store"),
     **dict.fromkeys(("Estimate", "estimate", "quick_advice"), "estimate"),
     **dict.fromkeys(("Exported", "export"), "network_files"),
-    **dict.fromkeys(("Generated", "generate"), "run"),
+    **dict.fromkeys(("Generated", "begin", "finish", "generate", "make_part"), "run"),
     **dict.fromkeys(("Verified", "verify"), "verify"),
     **dict.fromkeys(("View", "read_view"), "view"),
     "DatasetRecipe": "recipe",

@@ -31,10 +31,10 @@ def histogram_blocks(
     recipe: DatasetRecipe, number: int, shape: tuple[int, int]
 ) -> tuple[tuple[int, ...], np.dtype[Any], tuple[int, ...], tuple[int, ...]]:
     """Shape, type, chunk and shard of the histogram; ValueError for an image with crosstalk larger than a chunk."""
-    dtype = np.result_type(*(one.histogram_dtype for one in recipe.systems))
+    dtype = np.result_type(*(each.histogram_dtype for each in recipe.systems))
     whole = (number, recipe.realizations, *shape, recipe.systems[0].bins)
     chunk = samples.fitting(whole, (1, 1, 1, 1, whole[-1]), dtype.itemsize, recipe.chunk_mib * 2**20)
-    if chunk[2:4] != shape and any(one.detector.crosstalk is not None for one in recipe.systems):
+    if chunk[2:4] != shape and any(each.detector.crosstalk is not None for each in recipe.systems):
         needed = math.prod(whole[2:]) * dtype.itemsize / 2**20
         raise ValueError(
             "with crosstalk an image is made at once, for its pixels depend on each other: "

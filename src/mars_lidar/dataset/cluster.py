@@ -9,7 +9,6 @@ given to another one: its files appear by a rename, so half a part does not exis
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import logging
 import math
 import os
@@ -24,15 +23,11 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+from mars_lidar._base.buckets import in_bucket
 from mars_lidar._base.optional import needed
 from mars_lidar._version import __version__
 from mars_lidar.dataset.store import Dataset, Item, open_dataset
-from mars_lidar.dataset.write import Failed, Made, Maker
-from mars_lidar.instrument.detector import Detector
-from mars_lidar.instrument.pulse import GaussianPulse
-from mars_lidar.instrument.system import System
-from mars_lidar.light.flux import Flux
-from mars_lidar.simulation import simulate
+from mars_lidar.dataset.write import Failed, Made, Maker, fingerprint
 
 _LIBRARY = "distributed", "making parts by workers", "cluster"
 _AHEAD = 3  # tasks given out per worker thread: none waits for the scheduler, and a million are not queued at once
@@ -73,8 +68,22 @@ def reach(scheduler: str | None) -> None:
         _client(distributed, scheduler).close()
 
 
+@dataclass(frozen=True)
+class Crew:
+    """Workers: an executor that runs what they are given, and the number of their threads that are there now."""
+
+    executor: Executor
+    threads: Callable[[], int]
+
+    def team(self, dataset: Dataset, threads: int) -> Team:
+        """For the parts of a dataset, each made on so many threads."""
+        path = str(dataset.path if in_bucket(dataset.path) else dataset.path.resolve())
+        run = Run(path, uuid.uuid4().hex, threads, __version__, fingerprint())
+        return Team(self.executor, partial(make_parts, run), self.threads, _AHEAD, _LEAST_QUEUED, _TASKS_PER_S)
+
+
 @contextlib.contextmanager
-def team(dataset: Dataset, workers: int | None, threads: int, scheduler: str | None) -> Iterator[Team]:
+def crew(workers: int | None, scheduler: str | None) -> Iterator[Crew]:
     """`workers` processes of this machine, or the workers of the `scheduler` at that address."""
     distributed = needed(*_LIBRARY)
     with contextlib.ExitStack() as after:
@@ -95,9 +104,8 @@ def team(dataset: Dataset, workers: int | None, threads: int, scheduler: str | N
         if scheduler is not None and client.dashboard_link:
             print(f"mars-lidar: dashboard of the cluster: {client.dashboard_link}", file=sys.stderr)
         executor = client.get_executor(pure=False)
-        run = Run(str(dataset.path.resolve()), uuid.uuid4().hex, threads, __version__, fingerprint())
         try:
-            yield Team(executor, partial(make_parts, run), _Workers(client), _AHEAD, _LEAST_QUEUED, _TASKS_PER_S)
+            yield Crew(executor, _Workers(client))
         except (
             CancelledError,
             distributed.client.FutureCancelledError,
@@ -145,20 +153,6 @@ def _silent() -> Iterator[None]:
         yield
     finally:
         logger.setLevel(before)
-
-
-def fingerprint() -> str:
-    """Hash of a small exact cube: the same wherever the package draws the same bits."""
-    system = System(
-        period_ns=100.0,
-        cycles=50,
-        bins=16,
-        pulse=GaussianPulse(sigma_ns=2.0),
-        detector=Detector(dead_time_ns=40.0),
-    )
-    flux = Flux([[0.1, 1.0, 5.0, 0.0]], [[0.3, 0.1, 0.0, 2.0]], [[10.0, 50.0, 90.0, 0.0]])
-    counts = simulate(flux, system, realizations=2, seed=1, threads=1)
-    return hashlib.sha256(counts.astype("<u4").tobytes()).hexdigest()[:16]
 
 
 def make_parts(run: Run, items: Sequence[Item]) -> list[Made | Failed]:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.arguments import checked
+from mars_lidar._base.buckets import url_of
 from mars_lidar._base.threads import thread_count
 from mars_lidar.dataset import samples
 from mars_lidar.dataset.arrays import MAPS, histogram_blocks
@@ -83,12 +84,14 @@ def estimate(
     """
 
     team = thread_count(threads)
-    parent = None if out is None else Path(out).absolute().parent
+    parent = None if out is None or url_of(out) is not None else Path(out).absolute().parent
     if parent is not None and not parent.is_dir():
         raise FileNotFoundError(f"out must lie in an existing folder, got {str(out)!r}")
     plan, found, problems, looked, each_s = _looked_at(recipe)
     if not looked:
-        raise ValueError("none of the scenes looked at can be used:\n" + "\n".join(f"  {one}" for one in problems[:5]))
+        raise ValueError(
+            "none of the scenes looked at can be used:\n" + "\n".join(f"  {each}" for each in problems[:5])
+        )
     number = len(found) * (plan.crops if plan.crop else 1)
     total = samples.count_samples(plan, number)
     image = looked[0].shape
@@ -97,7 +100,7 @@ def estimate(
     dense = math.prod(shape) * dtype.itemsize
     pixels = math.prod(image)
     maps = 4 * len(MAPS) * pixels * total + sum(map(_scene_bytes, looked)) // len(looked) * number
-    parts = max(one.waveform_parts(system) for one in looked for system in plan.systems)
+    parts = max(each.waveform_parts(system) for each in looked for system in plan.systems)
     block = making_bytes(chunk, dtype.itemsize, parts)
     shards = math.prod(samples.grid(shape, shard))
     teams = max(1, min(team, shards, BUFFER_BYTES // block))
@@ -132,7 +135,7 @@ def quick_advice(recipe: DatasetRecipe | dict[str, Any] | str | Path, threads: i
             made = plan.realizations * total
             told.append(advice(flux, plan.systems[system], plan.engine, realizations=made, threads=threads))
     reading = each_s * len(found)
-    return Advice(*(reading + float(np.mean([getattr(one, name) for one in told])) for name in ("seconds", "auto_s")))
+    return Advice(*(reading + float(np.mean([getattr(each, name) for each in told])) for name in ("seconds", "auto_s")))
 
 
 def _looked_at(
@@ -146,11 +149,11 @@ def _looked_at(
     chosen = sorted({round(k) for k in np.linspace(0, len(found) - 1, most)})
     good: list[Shown] = []
     for k in chosen:
-        for one in scenes(found[k], plan, good[0].shape if good else None):
-            if isinstance(one, Problem):
-                problems.append(one)
+        for each in scenes(found[k], plan, good[0].shape if good else None):
+            if isinstance(each, Problem):
+                problems.append(each)
             else:
-                good.append(one[1])
+                good.append(each[1])
     return plan, found, problems, good, (time.perf_counter() - began) / max(1, len(chosen))
 
 

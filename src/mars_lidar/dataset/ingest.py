@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shutil
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from mars_lidar._base.buckets import in_bucket, remove, zarr_store
 from mars_lidar._version import __version__
 from mars_lidar.dataset import samples
 from mars_lidar.dataset.arrays import (
@@ -22,38 +27,87 @@ from mars_lidar.dataset.arrays import (
     histogram_blocks,
     mark,
 )
+from mars_lidar.dataset.cluster import Crew
 from mars_lidar.dataset.recipe import DatasetRecipe
+from mars_lidar.dataset.sample_content import Shown
 from mars_lidar.dataset.scenes import SceneWriter
-from mars_lidar.dataset.sources import candidates, scenes, seed_of
+from mars_lidar.dataset.sources import Candidate, candidates, scenes, seed_of, several
+from mars_lidar.dataset.write import fingerprint
 from mars_lidar.io.layout import Variable
 from mars_lidar.io.scan import Problem
 from mars_lidar.io.zarr_store import add
 
+_BATCH = 16  # scenes that a worker reads at a time: 0.1 s of small ones
+_AHEAD, _LEAST_AHEAD = 3, 64  # such batches given out per worker thread, and at least: where no worker is there yet
 
-def create(path: Path, recipe: DatasetRecipe, folder: Path) -> None:
-    """Begin a store: every scene read, checked, and written; every array laid out.
 
-    Where no scene can be used a ValueError says why, and nothing is left at `path`.
+def create(path: Path, recipe: DatasetRecipe, folder: Path, crew: Crew | None = None) -> None:
+    """Begin a store, or go on with one that was stopped: every scene read, checked, and written; every array laid out.
+
+    The workers of a `crew` read the scenes, but for rendered light. Where no scene can be used a ValueError says why,
+    and nothing is left at `path`.
     """
-    found, problems = candidates(recipe.scenes, folder)
-    group = writer = None
-    for candidate in found:
-        for one in scenes(candidate, recipe, None if writer is None else writer.shape):
-            if isinstance(one, Problem):
-                problems.append(one)
-                continue
-            name, scene = one
-            if writer is None:  # nothing on the disk is touched before there is something to put on it
-                histogram_blocks(recipe, 1, scene.shape)
-                group = begin(path, recipe)
-                writer = SceneWriter(group, len(found) * (recipe.crops if recipe.crop else 1))
-            writer.add(name, scene)
+    listed, problems = candidates(recipe.scenes, folder)
+    most = len(listed) * (recipe.crops if recipe.crop else 1)
+    source = hashlib.sha256("\n".join(result.name for result in listed).encode()).hexdigest()
+    writer = SceneWriter.resumed(path, most, source)
+    if writer is not None:
+        problems = [Problem(Path(each), reason) for each, reason in writer.problems]
+    done = (0, 0) if writer is None else writer.position
+    if any("transient" in entry for entry in recipe.scenes):
+        crew = None  # it stays in its file until it is written
+
+    def shape() -> tuple[int, int] | None:
+        return None if writer is None else writer.shape
+
+    for *place, result in _read(listed, done[0], recipe, shape, crew):
+        if tuple(place) < done:
+            continue
+        if isinstance(result, Problem):
+            problems.append(result)
+            continue
+        name, scene = result
+        if writer is None:  # nothing on the disk is touched before there is something to put on it
+            histogram_blocks(recipe, 1, scene.shape)
+            writer = SceneWriter(begin(path, recipe), most, path, source)
+        writer.problems = [[str(each.path), each.reason] for each in problems]
+        writer.add(name, scene, (place[0], place[1] + 1))
     if writer is None:
-        told = "\n".join(f"  {problem}" for problem in problems[:5])
+        text = "\n".join(f"  {problem}" for problem in problems[:5])
         more = f"\n  and {len(problems) - 5} more" if len(problems) > 5 else ""
-        raise ValueError(f"none of the scenes can be used:\n{told}{more}")
+        raise ValueError(f"none of the scenes can be used:\n{text}{more}")
     writer.finish()
-    lay_out(group, recipe, writer, problems)
+    lay_out(writer.store, recipe, writer, problems)
+
+
+def _read(
+    listed: list[Candidate],
+    number: int,
+    recipe: DatasetRecipe,
+    shape: Callable[[], tuple[int, int] | None],
+    crew: Crew | None,
+) -> Iterator[tuple[int, int, tuple[str, Shown] | Problem]]:
+    """What the candidates from a number on give: candidate, place among its scenes, and the scene or the problem."""
+    while number < len(listed) and (crew is None or shape() is None):
+        for place, result in enumerate(scenes(listed[number], recipe, shape())):
+            yield number, place, result
+        number += 1
+    if crew is None:
+        return
+    step = max(1, _BATCH // (recipe.crops if recipe.crop else 1))
+    coming, given = iter(range(number, len(listed), step)), deque[tuple[int, Future[Any]]]()
+    while True:
+        while len(given) < max(_LEAST_AHEAD, _AHEAD * crew.threads()):
+            first = next(coming, None)
+            if first is None:
+                break
+            given.append((first, crew.executor.submit(several, listed[first : first + step], recipe, shape())))
+        if not given:
+            return
+        first, future = given.popleft()
+        for offset, results in enumerate(future.result()):
+            for place, result in enumerate(results):
+                yield first + offset, place, result
 
 
 def begin(path: Path, recipe: DatasetRecipe) -> Any:
@@ -62,16 +116,17 @@ def begin(path: Path, recipe: DatasetRecipe) -> Any:
 
     if path.exists():
         (path / "zarr.json").unlink(missing_ok=True)  # from now on it is no store
-        shutil.rmtree(path)
+        remove(path) if in_bucket(path) else shutil.rmtree(path)
     attrs = {
         "complete": False,
         "stage": "scenes",
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
         "version": __version__,
+        "bits": fingerprint(),
         "recipe": recipe.to_json(),
     }
-    return zarr.create_group(path, zarr_format=3, attributes=attrs)
+    return zarr.create_group(zarr_store(path), zarr_format=3, attributes=attrs)
 
 
 def lay_out(group: Any, recipe: DatasetRecipe, writer: SceneWriter, problems: list[Problem]) -> None:
@@ -80,11 +135,11 @@ def lay_out(group: Any, recipe: DatasetRecipe, writer: SceneWriter, problems: li
     assert shape is not None
     add(group, coordinates(recipe, names, shape))
     number = samples.count_samples(recipe, len(names))
-    for name, (told, unit) in MAPS.items():
-        create_maps(group, name, (number, *shape), np.dtype(np.float32), ("sample", "y", "x"), told, unit)
+    for name, (text, unit) in MAPS.items():
+        create_maps(group, name, (number, *shape), np.dtype(np.float32), ("sample", "y", "x"), text, unit)
     create_histogram(group, recipe, number, shape)
-    plain = [[str(one.path), one.reason] for one in problems]
-    systems = [one.to_dict() for one in recipe.systems]
+    plain = [[str(result.path), result.reason] for result in problems]
+    systems = [result.to_dict() for result in recipe.systems]
     attrs: dict[str, Any] = {"stage": "counts", "systems": json.dumps(systems), "problems": plain}
     if not writer.plain:
         attrs["format_version"] = MORE_VERSION
@@ -95,10 +150,10 @@ def coordinates(recipe: DatasetRecipe, names: list[str], shape: tuple[int, int])
     """Every small array, of scenes of these names and shape (H, W)."""
     number = samples.count_samples(recipe, len(names))
     parts = [samples.sample_parts(recipe, k) for k in range(number)]
-    texts = [one.to_json() for one in recipe.systems]
+    texts = [result.to_json() for result in recipe.systems]
     seeds = [seed_of(recipe, names[scene], texts[system], s, b) for scene, system, s, b in parts]
     scene, system, signal, sbr = (np.array(column) for column in zip(*parts, strict=True))
-    periods = np.array([one.period_ns for one in recipe.systems])
+    periods = np.array([result.period_ns for result in recipe.systems])
     scene_name = np.array([names[k] for k in scene], object)
     of_sample = ("sample",)
     variables = [

@@ -10,7 +10,11 @@ The keys, units and names are those that the loaders of these networks read:
 
 from __future__ import annotations
 
+import io
+import json
+import math
 import re
+import tarfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +29,7 @@ from mars_lidar._base.files import beside
 from mars_lidar._base.memory import check_memory
 from mars_lidar._base.progress import shown
 from mars_lidar._base.types import Progress
+from mars_lidar.dataset.arrays import MAPS
 from mars_lidar.dataset.network_keys import Exposure, check_size, psf, pulse_in_bins
 from mars_lidar.dataset.samples import sample_parts
 from mars_lidar.dataset.store import Dataset, open_dataset
@@ -33,6 +38,8 @@ from mars_lidar.instrument.system import System
 from mars_lidar.io.mat import write_variables
 
 _NAMES = {"intensity_hr": "intensity"}  # what another name is stored under
+WEBDATASET = "webdataset"
+_TAR_BYTES = 256 * 2**20  # of counts
 _MONOCULAR_M = 10.0  # depth of grey value 255 in SPADnet's images
 
 
@@ -113,7 +120,9 @@ def export(
         A folder that is not there yet, or is empty. The loader's list in it, ``list.txt``, holds a file a line. It
         appears when all is written; what stops the writing leaves nothing under its name.
     layout
-        One of `LAYOUTS`.
+        One of `LAYOUTS`; or ``"webdataset"``: tar files ``shard-000000.tar``, ... of about 256 MiB for WebDataset, in
+        which an exposure is ``SAMPLE-REALIZATION`` with an array of counts (H, W, bins), a ``.npy`` for each map, and
+        ``json``, its numbers and its system.
     fill
         Give pixels without a return the depth, bin and rates of the nearest pixel with one. Otherwise their bin is 0,
         and loaders that divide rates by their sum make NaN of them.
@@ -129,10 +138,18 @@ def export(
     """
     told = shown(progress, "exporting")
     source = dataset if isinstance(dataset, Dataset) else open_dataset(dataset)
-    chosen = LAYOUTS[checks.choice("layout", layout, tuple(LAYOUTS))]
+    checks.choice("layout", layout, (*LAYOUTS, WEBDATASET))
     folder = Path(out)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise FileExistsError(f"{folder} exists already and is not an empty folder")
+    if layout == WEBDATASET:
+        if fill:
+            raise ValueError("fill belongs to the layouts of networks; webdataset has the maps as they are")
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with beside(folder, folder=True) as unfinished:
+            written = _write_tars(unfinished, source, told)
+        return Exported(written, folder / "list.txt", ())
+    chosen = LAYOUTS[layout]
     replaced = ("intensity", ".mat") if chosen.lists == _INTENSITY else ()  # by loaders, in the whole path
     if any(word in str(folder) for word in replaced) or len(str(folder).split()) != 1:
         raise ValueError(f"out must not have {' or '.join((*replaced, 'a blank'))} in its path, got {str(folder)!r}")
@@ -148,6 +165,49 @@ def export(
     with beside(folder, folder=True) as unfinished:
         written = _write(unfinished, folder, source, chosen, fill, told)
     return Exported(written, folder / "list.txt", tuple(_notes(layout, chosen, (height, width, bins))))
+
+
+def _write_tars(folder: Path, source: Dataset, progress: Progress | None) -> int:
+    """Write tar files of all exposures, and the list of their names; returns how many exposures."""
+    samples, realizations = source.histogram.shape[:2]
+    nbytes = math.prod(source.histogram.shape[2:]) * source.histogram.dtype.itemsize
+    of_a_tar = max(1, _TAR_BYTES // nbytes)
+    systems, names = [each.to_dict() for each in source.recipe.systems], source.scene_names()
+    places = [(sample, realization) for sample in range(samples) for realization in range(realizations)]
+    listed = []
+    for first in range(0, len(places), of_a_tar):
+        listed.append(f"shard-{len(listed):06d}.tar")
+        with tarfile.open(folder / listed[-1], "x", format=tarfile.PAX_FORMAT) as tar:
+            for number, (sample, realization) in enumerate(places[first : first + of_a_tar], first + 1):
+                scene, system, signal, sbr = sample_parts(source.recipe, sample)
+                numbers = {
+                    "sample": sample,
+                    "realization": realization,
+                    "scene": scene,
+                    "scene_name": names[scene],
+                    "system": systems[system],
+                    "signal_level": signal,
+                    "sbr": sbr if math.isfinite(sbr) else "inf",
+                    "seed": int(source.seeds[sample]),
+                }
+                arrays = {"counts": np.asarray(source.histogram[sample, realization])}
+                arrays |= {name: np.asarray(source.maps[name][sample]) for name in MAPS}
+                content = {f"{name}.npy": _npy(values) for name, values in arrays.items()}
+                content["json"] = json.dumps(numbers).encode()
+                for suffix, data in content.items():
+                    entry = tarfile.TarInfo(f"{sample:07d}-{realization:05d}.{suffix}")
+                    entry.size = len(data)
+                    tar.addfile(entry, io.BytesIO(data))
+                if progress is not None:
+                    progress(number, len(places))
+    (folder / "list.txt").write_text("".join(f"{name}\n" for name in listed))
+    return len(places)
+
+
+def _npy(values: NDArray[Any]) -> bytes:
+    stream = io.BytesIO()
+    np.save(stream, values)
+    return stream.getvalue()
 
 
 def _write(folder: Path, final: Path, source: Dataset, chosen: Layout, fill: bool, told: Progress | None) -> int:

@@ -54,7 +54,7 @@ def read_sparse(dataset: Dataset | str | Path, sample: int, realization: int = 0
         first, second, row, column, time = np.unravel_index(position, chunk)
         mine = (first == sample % chunk[0]) & (second == realization % chunk[1])
         parts.append(((y * rows + row[mine]) * width + x * columns + column[mine], time[mine], count[mine]))
-    row, column, count = (np.concatenate(one) for one in zip(*parts, strict=True))
+    row, column, count = (np.concatenate(column) for column in zip(*parts, strict=True))
     if columns < width:
         order = np.lexsort((column, row))
         row, column, count = row[order], column[order], count[order]

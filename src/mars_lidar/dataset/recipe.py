@@ -84,10 +84,10 @@ class DatasetRecipe:
         light["levels"] = plain_levels(self.light)
         return {
             "seed": self.seed,
-            "scenes": [dict(one) for one in self.scenes],
+            "scenes": [dict(each) for each in self.scenes],
             "size": list(self.size) if isinstance(self.size, tuple) else self.size,
             "crop": None if self.crop is None else {"size": list(self.crop), "count": self.crops},
-            "systems": [one.to_dict() for one in self.systems],
+            "systems": [each.to_dict() for each in self.systems],
             "light": {name: value for name, value in light.items() if value is not None},
             "engine": self.engine,
             "realizations": self.realizations,
@@ -117,13 +117,13 @@ class DatasetRecipe:
         systems = _systems(root["systems"], folder or Path())
         engine = values.checked(("engine",), _engine, root["engine"], systems)
         scenes, light = read_scenes(root["scenes"]), read_light(root.get("light") or {})
-        if any("transient" in one for one in scenes):
+        if any("transient" in each for each in scenes):
             refuse_for_transients(light)
         if light.photons_per_unit is not None:
-            told = (
+            text = (
                 "photons_per_unit is for a single transient (simulate, compare): the samples of a dataset have a signal"
             )
-            raise RecipeError(("light", "photons_per_unit"), told)
+            raise RecipeError(("light", "photons_per_unit"), text)
         return cls(
             scenes=scenes,
             systems=systems,

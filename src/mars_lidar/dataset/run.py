@@ -20,17 +20,26 @@ from typing import Any
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.files import Interrupted, WriteError, check_target, exchange, open_own, successor
+from mars_lidar._base.buckets import in_bucket, place_of
+from mars_lidar._base.files import (
+    IncompleteFileError,
+    Interrupted,
+    WriteError,
+    check_target,
+    exchange,
+    open_own,
+    successor,
+)
 from mars_lidar._base.progress import shown
 from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import Progress
 from mars_lidar._version import __version__
 from mars_lidar.dataset import cluster
-from mars_lidar.dataset.cluster import LOOK_S, Team
+from mars_lidar.dataset.cluster import LOOK_S, Crew, Team
 from mars_lidar.dataset.ingest import create
 from mars_lidar.dataset.recipe import DatasetRecipe
 from mars_lidar.dataset.store import Dataset, Item, open_dataset
-from mars_lidar.dataset.write import Failed, Made, Maker
+from mars_lidar.dataset.write import Failed, Made, Maker, fingerprint
 from mars_lidar.io.scan import Problem
 
 _NAMED = 5  # parts that an error names
@@ -140,73 +149,212 @@ def generate(
     """
     began = time.perf_counter()
     progress = shown(progress, "generating")
-    target = Path(out)
+    target = _target(out)
+    threads = None if threads is None else checks.integer("threads", threads, low=1, high=1024)
+    with _begun(recipe, target, resume, overwrite, _crew(workers, scheduler)) as (store, dataset, crew):
+        dataset.tidy()
+        todo = [] if dataset.complete else dataset.missing()
+        before = sum(1 for _ in dataset.items()) - len(todo)
+        totals = _Totals(before, before + len(todo), progress)
+        team: AbstractContextManager[Team] = _here(dataset, len(todo), threads)
+        if crew is not None:
+            team = contextlib.nullcontext(crew.team(dataset, threads or 1))
+        _make(dataset, team, todo, totals)
+        if not dataset.complete:
+            dataset.tidy()  # of workers that were killed while others went on
+            dataset.finish()
+        dataset = _in_place(store, target, dataset)
+    return totals.generated(target, dataset, time.perf_counter() - began)
+
+
+@checked
+def begin(
+    recipe: DatasetRecipe | dict[str, Any] | str | Path,
+    out: str | Path,
+    *,
+    resume: bool = False,
+    overwrite: bool = False,
+    workers: int | None = None,
+    scheduler: str | None = None,
+) -> Generated:
+    """Begin a dataset whose parts other processes make: read its scenes, and lay out its arrays.
+
+    After it `make_part` runs anywhere, in any order and at the same time, such as in the jobs of an array; then
+    `finish`. The store is that of `generate`, byte for byte.
+
+    Parameters
+    ----------
+    recipe, out, resume, overwrite
+        As for `generate`.
+    workers, scheduler
+        As for `generate`: they read the scenes.
+    """
+    began, target = time.perf_counter(), _target(out)
+    with _begun(recipe, target, resume, overwrite, _crew(workers, scheduler)) as (_, dataset, _):
+        return _Totals(0, 0, None).generated(target, dataset, time.perf_counter() - began)
+
+
+@checked
+def make_part(
+    out: str | Path,
+    part: tuple[int, int],
+    *,
+    threads: int | None = None,
+    progress: Progress | bool | None = None,
+) -> Generated:
+    """Make the K-th of N parts of a dataset that `begin` began; what is there already is not made again.
+
+    Parameters
+    ----------
+    out
+        The store.
+    part
+        (K, N), K from 1 to N.
+    threads, progress
+        As for `generate`.
+    """
+    began, target = time.perf_counter(), _target(out)
+    which = checks.integer("K", part[0], low=1, high=2**31)
+    of = checks.integer("N", part[1], low=which, high=2**31)
+    with _alone(target, shared=True):
+        store, dataset = _opened(target)
+        if dataset.complete:
+            return _Totals(0, 0, None).generated(target, dataset, time.perf_counter() - began)
+        if dataset.attrs.get("bits") != fingerprint():
+            raise ValueError(f"this machine draws other counts than that on which {store} was begun")
+        with _told(store, target):
+            mine = _share(list(dataset.items()), which, of)
+            todo = dataset.missing(mine)
+            totals = _Totals(len(mine) - len(todo), len(mine), shown(progress, "generating"))
+            _make(dataset, _here(dataset, len(todo), threads), todo, totals)
+    return totals.generated(target, dataset, time.perf_counter() - began)
+
+
+@checked
+def finish(out: str | Path) -> Generated:
+    """Mark a dataset complete whose parts were all made by `make_part`; ValueError where one is missing.
+
+    Only what its writer noted no digest of is read again.
+    """
+    began, target = time.perf_counter(), _target(out)
+    with _alone(target):
+        store, dataset = _opened(target)
+        with _told(store, target):
+            if not dataset.complete:
+                dataset.tidy()
+                if missing := dataset.missing():
+                    total = sum(1 for _ in dataset.items())
+                    raise IncompleteFileError(
+                        f"{len(missing)} of {total} shards of {store} are missing, the first "
+                        f"{dataset.files(missing[0])[0]}: run the --part jobs that did not end well again"
+                    )
+                dataset.finish()
+            dataset = _in_place(store, target, dataset)
+    return _Totals(0, 0, None).generated(target, dataset, time.perf_counter() - began)
+
+
+def _share(items: list[Item], which: int, of: int) -> list[Item]:
+    """Contiguous parts of the maps and of the counts: neighbours share scenes."""
+    out = []
+    for kind in ("maps", "histogram"):
+        some = [item for item in items if item.kind == kind]
+        out += some[(which - 1) * len(some) // of : which * len(some) // of]
+    return out
+
+
+def _target(out: str | Path) -> Path:
+    target: Path = place_of(out)
     if target.suffix != ".zarr":
         raise ValueError(f"out must end in .zarr, got {str(target)!r}")
-    if resume and overwrite:
-        raise ValueError("resume and overwrite exclude each other")
+    return target
+
+
+def _crew(workers: int | None, scheduler: str | None) -> AbstractContextManager[Crew | None]:
+    """Workers that are not there before they are needed; ValueError where there cannot be any."""
     if workers is not None and scheduler is not None:
         raise ValueError("workers start a cluster and scheduler joins one: give one of them")
-    threads, workers = (
-        None if value is None else checks.integer(name, value, low=1, high=1024)
-        for name, value in (("threads", threads), ("workers", workers))
-    )
+    if workers is None and scheduler is None:
+        return contextlib.nullcontext()
+    cluster.reach(scheduler)  # before the scenes are read
+    return cluster.crew(None if workers is None else checks.integer("workers", workers, low=1, high=1024), scheduler)
+
+
+@contextlib.contextmanager
+def _begun(
+    recipe: DatasetRecipe | dict[str, Any] | str | Path | None,
+    target: Path,
+    resume: bool,
+    overwrite: bool,
+    workers: AbstractContextManager[Crew | None],
+) -> Iterator[tuple[Path, Dataset, Crew | None]]:
+    """The store that is written, the dataset in it, its scenes read, and who reads and makes it.
+
+    No other process writes the store meanwhile, and errors say what is on the disk.
+    """
+    if resume and overwrite:
+        raise ValueError("resume and overwrite exclude each other")
     wanted, folder = read_recipe(recipe)
-    check_target(target, folder=True, overwrite=overwrite or resume)
-    if workers is not None or scheduler is not None:
-        cluster.reach(scheduler)  # before the scenes are read
+    if not (in_bucket(target) and resume):
+        check_target(target, folder=True, overwrite=overwrite or resume)
     with _alone(target):  # what is there is looked at under the lock: before, another run may have finished it
-        beside = successor(target)
+        beside = target if in_bucket(target) else successor(target)
         if overwrite and beside.exists():
             shutil.rmtree(beside)  # of a stopped run that is started again
         replacing = overwrite and target.exists()  # by a store that is made beside it, or one that was begun so
         store = beside if replacing or (resume and beside.exists()) else target
         there = store.exists() and resume
         if there:
-            dataset = open_dataset(store, allow_incomplete=True)
+            dataset = open_dataset(str(store), allow_incomplete=True)
             _check_same(store, dataset, wanted)
         elif wanted is None:
             raise ValueError(f"{target} does not exist: there is nothing to resume, and no recipe is given")
-        check_target(target, folder=True, overwrite=overwrite or there)
-        try:
-            if not there or not dataset.planned:
-                if wanted is None:
-                    raise ValueError(f"{target} was stopped before its scenes were in: give the recipe again to resume")
-                create(store, wanted, folder)
-                dataset = open_dataset(store, allow_incomplete=True)
-            dataset.tidy()
-            todo = [] if dataset.complete else dataset.missing()
-            for item in todo:
-                for damaged in dataset.files(item):  # else Zarr would read it before it is replaced
-                    damaged.unlink(missing_ok=True)
-            before = sum(1 for _ in dataset.items()) - len(todo)
-            totals = _Totals(before, before + len(todo), progress)
-            if todo:
-                team = _here(dataset, len(todo), threads)
-                if workers is not None or scheduler is not None:
-                    team = cluster.team(dataset, workers, threads or 1, scheduler)
-                _make_all(team, todo, totals.add)
-            if not dataset.complete:
-                dataset.tidy()  # of workers that were killed while others went on
-                dataset.finish()
-            if store != target:
-                exchange(store, target)
-                dataset = open_dataset(target)
-        except KeyboardInterrupt:
-            raise Interrupted(f"interrupted; {_left(store, target)}") from None
-        except RuntimeError as error:
-            if "thread" not in str(error):
-                raise
-            told = f"{error}: give fewer threads, or more memory; {_left(store, target)}"
-            raise WriteError(errno.EAGAIN, told) from error
-        except OSError as error:
-            if isinstance(error, FileNotFoundError | FileExistsError) and not store.exists():
-                raise
-            raise WriteError(error.errno, f"{error.strerror or error}; {_left(store, target)}") from error
-    problems = tuple(dataset.problems)
-    shape = tuple(dataset.histogram.shape)
-    seconds = time.perf_counter() - began
-    return Generated(target, shape, problems, len(todo), before, totals.simulate_s, totals.write_s, seconds)
+        if not (in_bucket(target) and there):
+            check_target(target, folder=True, overwrite=overwrite or there)
+        begun = there and dataset.planned
+        if not begun and wanted is None:
+            raise ValueError(f"{target} was stopped before its scenes were in: give the recipe again to resume")
+        with _told(store, target), workers as crew:
+            if not begun:
+                assert wanted is not None
+                create(store, wanted, folder, crew)
+                dataset = open_dataset(str(store), allow_incomplete=True)
+            yield store, dataset, crew
+
+
+def _opened(target: Path) -> tuple[Path, Dataset]:
+    """The store that `begin` began, made by this version."""
+    store = target if in_bucket(target) or not successor(target).exists() else successor(target)
+    dataset = open_dataset(str(store), allow_incomplete=True)
+    _check_same(store, dataset, None)
+    if not dataset.planned:
+        raise IncompleteFileError(f"{store} was stopped before its scenes were in: --begin --resume goes on")
+    return store, dataset
+
+
+def _in_place(store: Path, target: Path, dataset: Dataset) -> Dataset:
+    """The complete dataset under the name that it was asked for."""
+    if store == target:
+        return dataset
+    exchange(store, target)
+    return open_dataset(str(target))
+
+
+@contextlib.contextmanager
+def _told(store: Path, target: Path) -> Iterator[None]:
+    """Errors of the file system, of threads, and Ctrl-C say what is on the disk."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise Interrupted(f"interrupted; {_left(store, target)}") from None
+    except RuntimeError as error:
+        if "thread" not in str(error):
+            raise
+        text = f"{error}: give fewer threads, or more memory; {_left(store, target)}"
+        raise WriteError(errno.EAGAIN, text) from error
+    except OSError as error:
+        if isinstance(error, FileNotFoundError | FileExistsError) and not store.exists():
+            raise
+        raise WriteError(error.errno, f"{error.strerror or error}; {_left(store, target)}") from error
 
 
 def read_recipe(recipe: DatasetRecipe | dict[str, Any] | str | Path | None) -> tuple[DatasetRecipe | None, Path]:
@@ -223,6 +371,7 @@ class _Totals:
 
     def __init__(self, done: int, total: int, progress: Progress | None) -> None:
         self._done, self._total, self._progress = done, total, progress
+        self._before = done
         if progress is not None:
             progress(done, total)  # what an earlier run has done, before this one begins
         self.simulate_s = self.write_s = 0.0
@@ -233,6 +382,21 @@ class _Totals:
         self.write_s += made.write_s
         if self._progress is not None:
             self._progress(self._done, self._total)
+
+    def generated(self, target: Path, dataset: Dataset, seconds: float) -> Generated:
+        """The result of a run."""
+        problems, shape = tuple(dataset.problems), tuple(dataset.histogram.shape)
+        made = self._done - self._before
+        return Generated(target, shape, problems, made, self._before, self.simulate_s, self.write_s, seconds)
+
+
+def _make(dataset: Dataset, team: AbstractContextManager[Team], todo: Sequence[Item], totals: _Totals) -> None:
+    """Make parts that are not there."""
+    for item in todo:
+        for damaged in dataset.files(item):  # else Zarr would read it before it is replaced
+            damaged.unlink(missing_ok=True)
+    if todo:
+        _make_all(team, todo, totals.add)
 
 
 @contextlib.contextmanager
@@ -249,9 +413,12 @@ def _here(dataset: Dataset, parts: int, threads: int | None) -> Iterator[Team]:
     teams = max(1, min(team, parts, BUFFER_BYTES // chunk))
     stop, local = threading.Event(), threading.local()
 
+    makers: list[Maker] = []
+
     def make(items: Sequence[Item]) -> list[Made | Failed]:
         if not hasattr(local, "maker"):
             local.maker = Maker(dataset, max(1, team // teams), stop)
+            makers.append(local.maker)
         return [local.maker.attempt(item) for item in items]
 
     with ThreadPoolExecutor(teams) as pool:
@@ -260,6 +427,8 @@ def _here(dataset: Dataset, parts: int, threads: int | None) -> Iterator[Team]:
         except BaseException:
             stop.set()  # the simulator looks at it every 50 ms, and the pool waits for all threads
             raise
+        for maker in makers:
+            maker.note()
 
 
 def _make_all(team: AbstractContextManager[Team], todo: Sequence[Item], add: Callable[[Made], None]) -> None:
@@ -317,24 +486,31 @@ def _check_same(target: Path, dataset: Dataset, wanted: DatasetRecipe | None) ->
 
 def _left(store: Path, target: Path) -> str:
     """What is on the disk, for the text of an error."""
-    free = shutil.disk_usage(target.parent).free
     try:
         dataset = Dataset(store)
         if not dataset.planned:
             raise ValueError
         dataset.tidy()
         total, missing = sum(1 for _ in dataset.items()), len(dataset.missing())
-        told = f"{total - missing} of {total} parts of {store} are written, marked incomplete"
+        text = f"{total - missing} of {total} parts of {store} are written, marked incomplete"
     except (OSError, ValueError, KeyError):
-        told = f"{store} is left behind without counts, marked incomplete"
+        text = f"{store} is left behind without counts, marked incomplete"
     if store != target:
-        told += f", and {target} is what it was before"
-    return f"{told} ({free / 1e9:.3g} GB free there): continue with --resume (resume=True)"
+        text += f", and {target} is what it was before"
+    if not in_bucket(target):
+        text += f" ({shutil.disk_usage(target.parent).free / 1e9:.3g} GB free there)"
+    return f"{text}: continue with --resume (resume=True)"
 
 
 @contextlib.contextmanager
-def _alone(target: Path) -> Iterator[None]:
-    """Hold a lock beside the store while it is written; a lock of a process that was killed holds nobody up."""
+def _alone(target: Path, *, shared: bool = False) -> Iterator[None]:
+    """Hold a lock beside the store while it is written; a lock of a process that was killed holds nobody up.
+
+    Processes that make parts of it (`shared`) hold it together.
+    """
+    if in_bucket(target):  # an object store has no locks
+        yield
+        return
     lock = target.with_name(target.name + ".lock")
     while True:
         with open_own(lock) as held:
@@ -344,7 +520,7 @@ def _alone(target: Path) -> Iterator[None]:
                 yield
                 return
             try:
-                fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                fcntl.flock(held, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
             except BlockingIOError:
                 raise ValueError(f"{target} is being written by another process (its lock is {lock})") from None
             except OSError:  # a file system without locks
@@ -354,5 +530,8 @@ def _alone(target: Path) -> Iterator[None]:
             try:
                 yield
             finally:
-                lock.unlink(missing_ok=True)
+                with contextlib.suppress(OSError):  # the last of those that share it takes it away
+                    if shared:
+                        fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    lock.unlink(missing_ok=True)
             return

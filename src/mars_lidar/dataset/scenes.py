@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 from collections.abc import Sequence
 from dataclasses import asdict
 from functools import cached_property
@@ -25,6 +26,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.buckets import in_bucket
 from mars_lidar._base.files import reading
 from mars_lidar.dataset import samples
 from mars_lidar.dataset.arrays import create_maps
@@ -41,20 +43,51 @@ from mars_lidar.scene.scene import Scene
 _DOUBLE = np.dtype(np.float64)
 _READ_BYTES = 4 << 20  # of one map: scenes are read this many at once, each read costs a millisecond
 _RATE_BYTES = 8 << 20  # of a chunk of rendered light
+_NOTES = "ingest.jsonl"  # while scenes are written: a line for each shard of them, from which a stopped run goes on
+_ARRAYS = ("depth", "reflectivity", "background", "layer_depth", "layer_reflectivity", "transient", "total")
 _LAYERS = ("layer_depth", "layer_reflectivity")
 
 
 class SceneWriter:
     """Takes scenes one by one into the group ``scenes`` of a new store; memory for one shard of maps."""
 
-    def __init__(self, group: Any, most: int) -> None:
-        self._group = group.create_group("scenes")
-        self._most = most
+    def __init__(self, store: Any, most: int, path: Path, source: str) -> None:
+        self.store = store
+        self._group = store.require_group("scenes")
+        self._most, self._source = most, source
+        self._notes = path / "scenes" / _NOTES
         self._arrays: dict[str, Any] = {}
         self._held: list[Shown] = []
         self._kinds: list[str] = []
         self.names: list[str] = []
-        self._written = 0
+        self.position = (0, 0)
+        self.problems: list[list[str]] = []
+        self._written = self._noted = 0
+
+    @classmethod
+    def resumed(cls, path: Path, most: int, source: str) -> SceneWriter | None:
+        """Goes on with a store whose scenes were stopped; None where there is none, or of another `source`."""
+        import zarr
+
+        notes = path / "scenes" / _NOTES
+        if in_bucket(path) or not notes.is_file():
+            return None
+        lines = [line for line in notes.read_text("utf-8").splitlines(keepends=True) if line.endswith("\n")]
+        details = [json.loads(line) for line in lines]
+        if not details or any(each["source"] != source for each in details):
+            return None
+        writer = cls(zarr.open_group(path, mode="r+", use_consolidated=False), most, path, source)
+        writer.names = [name for each in details for name in each["names"]]
+        writer._kinds = [kind for each in details for kind in each["kinds"]]
+        writer.problems = [problem for each in details for problem in each["problems"]]
+        writer.position = tuple(details[-1]["position"])
+        writer._written, writer._noted = len(writer.names), len(writer.problems)
+        for name, array in [(each, writer._group[each]) for each in _ARRAYS if (path / "scenes" / each).is_dir()]:
+            array.resize((most, *array.shape[1:]))  # it was cut to its length where `finish` had begun
+            writer._arrays[name] = array
+        for name in ("name", "kind"):
+            shutil.rmtree(path / "scenes" / name, ignore_errors=True)
+        return writer
 
     @property
     def shape(self) -> tuple[int, int] | None:
@@ -66,8 +99,8 @@ class SceneWriter:
         """Whether each scene so far is one surface in clear air."""
         return not any(self._kinds)
 
-    def add(self, name: str, scene: Shown) -> None:
-        """One more scene."""
+    def add(self, name: str, scene: Shown, position: tuple[int, int]) -> None:
+        """One more scene; `position` is the place after it among all candidates, `problems` are those before it."""
         if not self._arrays:
             for array, unit in (("depth", "m"), ("reflectivity", "1"), ("background", "relative")):
                 self._arrays[array] = self._maps(array, (self._most, *scene.shape), ("scene", "y", "x"), unit)
@@ -79,6 +112,7 @@ class SceneWriter:
         self.names.append(name)
         self._kinds.append(_kind(scene))
         self._held.append(scene)
+        self.position = position
         if len(self._held) == self._arrays["depth"].shards[0]:
             self._flush()
 
@@ -90,18 +124,34 @@ class SceneWriter:
         add(self._group, [Variable("name", ("scene",), np.array(self.names, object), "", "name of the scene")])
         if not self.plain:
             add(self._group, [Variable("kind", ("scene", "letter"), _rows(self._kinds), "1", "what it is, JSON")])
+        if not in_bucket(self._notes):
+            self._notes.unlink(missing_ok=True)
         return self._written
 
     def _flush(self) -> None:
         part = slice(self._written, self._written + len(self._held))
         if self._held:
             nothing = np.full(self._held[0].shape, np.nan)
-            light = [None if isinstance(one, Rendered) else one.scene.background for one in self._held]
-            maps = {"depth": [one.depth_m for one in self._held], "reflectivity": [o.reflectivity for o in self._held]}
-            if any(one is not None for one in light):
-                maps["background"] = [nothing if one is None else one for one in light]
+            light = [None if isinstance(each, Rendered) else each.scene.background for each in self._held]
+            maps = {
+                "depth": [each.depth_m for each in self._held],
+                "reflectivity": [o.reflectivity for o in self._held],
+            }
+            if any(each is not None for each in light):
+                maps["background"] = [nothing if each is None else each for each in light]
             for name, values in maps.items():
                 self._arrays[name][part] = np.stack(values)
+            note = {
+                "source": self._source,
+                "position": self.position,
+                "names": self.names[part],
+                "kinds": self._kinds[part],
+                "problems": self.problems[self._noted :],
+            }
+            if not in_bucket(self._notes):  # there a stopped run reads its scenes again
+                with open(self._notes, "a", encoding="utf-8") as lines:
+                    lines.write(json.dumps(note) + "\n")
+            self._noted = len(self.problems)
         self._written = part.stop
         self._held.clear()
 
@@ -110,9 +160,9 @@ class SceneWriter:
             shape = (self._most, MOST - 1, *scene.shape)
             for name, unit in zip(_LAYERS, ("m", "1"), strict=True):
                 self._arrays[name] = self._maps(name, shape, ("scene", "layer", "y", "x"), unit)
-        behind = scene.layers[1:]
-        self._arrays[_LAYERS[0]][number, : len(behind)] = np.stack([one.depth_m for one in behind])
-        self._arrays[_LAYERS[1]][number, : len(behind)] = np.stack([one.reflectivity for one in behind])
+        others = scene.layers[1:]
+        self._arrays[_LAYERS[0]][number, : len(others)] = np.stack([each.depth_m for each in others])
+        self._arrays[_LAYERS[1]][number, : len(others)] = np.stack([each.reflectivity for each in others])
 
     def _write_light(self, number: int, scene: Rendered) -> None:
         height, width, bins = scene.transient.values.shape
@@ -158,9 +208,9 @@ class SceneReader:
 
     def _shown(self, number: int) -> Shown:
         depth, reflectivity, background = self._first_layer(number)
-        told = self.kind(number)
-        if "transient" in told:
-            light, array = told["transient"], self._group["transient"]
+        details = self.kind(number)
+        if "transient" in details:
+            light, array = details["transient"], self._group["transient"]
             bins = light["bins"]
             rates = Rows((*array.shape[1:3], bins), lambda rows: np.asarray(array[number, rows, :, :bins]))
             totals = np.asarray(self._group["total"][number])
@@ -168,28 +218,28 @@ class SceneReader:
             return Rendered(transient, depth, reflectivity, light["pulse"])
         first = Scene(depth, reflectivity, None if np.isnan(background).all() else background)
         scene: Scene | LayeredScene = first
-        if "layers" in told:
-            more = told["layers"] - 1
+        if "layers" in details:
+            more = details["layers"] - 1
             others = map(Scene, *(np.asarray(self._group[name][number, :more]) for name in _LAYERS))
             scene = LayeredScene([first, *others])
-        return Surfaces(scene, Fog(**told["fog"]) if "fog" in told else None)
+        return Surfaces(scene, Fog(**details["fog"]) if "fog" in details else None)
 
     def kind(self, number: int) -> dict[str, Any]:
         """What is more than one surface in clear air."""
-        told: dict[str, Any] = json.loads(self._kinds[number]) if self._kinds and self._kinds[number] else {}
-        return told
+        details: dict[str, Any] = json.loads(self._kinds[number]) if self._kinds and self._kinds[number] else {}
+        return details
 
     def waveform_parts(self, systems: Sequence[System]) -> int:
         """Most parts of the period in waveforms of samples; 0 where returns are enough."""
         one_of_each = {text: number for number, text in enumerate(self._kinds) if text}
         shown = [self.read(number) for number in one_of_each.values()]
-        return max((one.waveform_parts(system) for one in shown for system in systems), default=0)
+        return max((each.waveform_parts(system) for each in shown for system in systems), default=0)
 
     def names(self) -> list[str]:
         """Names of all scenes."""
         with reading(self._path, "scenes of a dataset"):
             stored = self._group["name"]
-            return _texts(stored) if stored.ndim > 1 else [str(one) for one in stored[...]]  # of a version before
+            return _texts(stored) if stored.ndim > 1 else [str(each) for each in stored[...]]  # of a version before
 
     @cached_property
     def _kinds(self) -> list[str]:
@@ -212,10 +262,10 @@ class SceneReader:
 
 
 def _kind(scene: Shown) -> str:
-    told: dict[str, Any] = {}
+    details: dict[str, Any] = {}
     if isinstance(scene, Rendered):
         light = scene.transient
-        told["transient"] = {
+        details["transient"] = {
             "bins": light.values.shape[2],
             "bin_ns": light.bin_ns,
             "start_ns": light.start_ns,
@@ -223,10 +273,10 @@ def _kind(scene: Shown) -> str:
         }
     else:
         if len(scene.layers) > 1:
-            told["layers"] = len(scene.layers)
+            details["layers"] = len(scene.layers)
         if scene.fog is not None:
-            told["fog"] = asdict(scene.fog)
-    return json.dumps(told) if told else ""
+            details["fog"] = asdict(scene.fog)
+    return json.dumps(details) if details else ""
 
 
 def _rows(texts: Sequence[str]) -> NDArray[np.uint8]:

@@ -6,14 +6,18 @@ as the packing. Here a chunk is packed while it is still in the processor's cach
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
+import io
 import itertools
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.buckets import in_bucket, put
 from mars_lidar._base.files import replacing
 from mars_lidar._base.native import _core
 
@@ -29,7 +33,7 @@ def chunks_of(region: Region, chunk: tuple[int, ...], shard: tuple[int, ...]) ->
             slice(area.start + first, min(area.start + first + step, area.stop))
             for area, first, step in zip(region, corner, chunk, strict=True)
         )
-        yield part if all(one.start < one.stop for one in part) else None
+        yield part if all(axis.start < axis.stop for axis in part) else None
 
 
 def packer(layout: str, dtype: np.dtype[Any]) -> Callable[[NDArray[Any]], bytes]:
@@ -61,17 +65,36 @@ def is_good(data: bytes) -> bool:
     return int(value(data[:-4])).to_bytes(4, "little") == data[-4:]
 
 
-def write_shard(path: Path, chunks: Iterator[bytes | None]) -> None:
-    """Write the chunks of a shard, in C order, None for those beyond the array; the file appears by a rename."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+def write_shard(path: Path, chunks: Iterator[bytes | None]) -> tuple[int, str]:
+    """Write the chunks of a shard, in C order, None for those beyond the array; the file appears by a rename.
+
+    Returns its size and its SHA-256.
+    """
     places: list[int] = []
-    offset = 0
-    with replacing(path) as stream:
+    offset, digest = 0, hashlib.sha256()
+    with _whole(path) as stream:
         for data in chunks:
             if data is None:
                 places += [_NONE, _NONE]
                 continue
             stream.write(data)
+            digest.update(data)
             places += [offset, len(data)]
             offset += len(data)
-        stream.write(with_sum(np.array(places, "<u8").tobytes()))
+        index = with_sum(np.array(places, "<u8").tobytes())
+        stream.write(index)
+        digest.update(index)
+    return offset + len(index), digest.hexdigest()
+
+
+@contextlib.contextmanager
+def _whole(path: Path) -> Iterator[BinaryIO]:
+    """A stream whose content appears at `path` at the end, or not at all."""
+    if in_bucket(path):
+        content = io.BytesIO()
+        yield content
+        put(path, content.getvalue())
+        return
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as stream:
+        yield stream

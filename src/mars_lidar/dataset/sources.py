@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -48,6 +49,7 @@ def candidates(entries: Sequence[dict[str, Any]], folder: Path) -> tuple[list[Ca
     """
     found: list[Candidate] = []
     problems: list[Problem] = []
+    roots = _root_names(entries, folder)
     for entry in entries:
         before = len(found)
         if "example" in entry:
@@ -55,11 +57,12 @@ def candidates(entries: Sequence[dict[str, Any]], folder: Path) -> tuple[list[Ca
             continue
         if "transient" in entry:
             for path, load in _transients(entry, folder):
-                name = _named(entry["transient"], folder, path)
+                name = _named(roots, _root(entry, folder), path)
                 found.append(_sized(Candidate(name, path, load, name), entry))
             continue
         for file in _files(entry, folder, problems):
-            name = _named(entry["path"], folder, file.depth) + ("" if file.index is None else f", frame {file.index}")
+            name = _named(roots, _root(entry, folder), file.depth)
+            name += "" if file.index is None else f", frame {file.index}"
             found += _behind_all(_sized(Candidate(name, file.depth, partial(_surfaces, file), name), entry), entry)
         if len(found) == before and not problems:
             raise ValueError(f"{folder / entry['path']}: no scene found; docs/formats.md tells what is one")
@@ -101,6 +104,13 @@ def scenes(
         else:
             shape = scene.shape
             yield name, scene
+
+
+def several(
+    some: Sequence[Candidate], recipe: DatasetRecipe, shape: tuple[int, int] | None
+) -> list[list[tuple[str, Shown] | Problem]]:
+    """What each of several candidates gives; runs on workers."""
+    return [list(scenes(one, recipe, shape)) for one in some]
 
 
 def seed_of(recipe: DatasetRecipe, scene: str, system: str, signal: float, sbr: float) -> int:
@@ -158,14 +168,15 @@ def _transients(entry: dict[str, Any], folder: Path) -> Iterator[tuple[Path, Cal
     elif not root.is_file():
         raise ValueError(f"{root}: no such file or folder")
     for file in files:
+        yield file, partial(_rendered, file, options, entry.get("pulse", True))
 
-        def load(file: Path = file) -> Rendered:
-            transient = read_transient(file, **options)
-            nothing = np.full(transient.shape, np.nan)
-            told = {"depth": nothing, "reflectivity": nothing} | read_truth(file, transient.shape)
-            return Rendered(transient, told["depth"], told["reflectivity"], entry.get("pulse", True))
 
-        yield file, load
+def _rendered(file: Path, options: dict[str, Any], pulse: bool) -> Rendered:
+    """A file of rendered light, with the depth and reflectivity that it holds."""
+    transient = read_transient(file, **options)
+    nothing = np.full(transient.shape, np.nan)
+    truth = {"depth": nothing, "reflectivity": nothing} | read_truth(file, transient.shape)
+    return Rendered(transient, truth["depth"], truth["reflectivity"], pulse)
 
 
 def _chosen(files: list[SceneFile], entry: dict[str, Any]) -> list[SceneFile]:
@@ -179,24 +190,41 @@ def _chosen(files: list[SceneFile], entry: dict[str, Any]) -> list[SceneFile]:
     return [one for one in files if one.index in wanted]
 
 
-def _named(given: str, folder: Path, path: Path) -> str:
-    """A file as the recipe gives it, or as it lies in the folder that the recipe gives."""
-    root = folder / given
-    inside = ""
-    if path != root:
-        inside = "/" + (path.relative_to(root) if path.is_relative_to(root) else path).as_posix()
-    return given.rstrip("/") + inside
+def _root(entry: dict[str, Any], folder: Path) -> Path:
+    """Absolute path of the file or folder that an entry gives; links are not followed."""
+    return Path(os.path.abspath(folder / entry["transient" if "transient" in entry else "path"]))
+
+
+def _root_names(entries: Sequence[dict[str, Any]], folder: Path) -> dict[Path, str]:
+    """Name of each file or folder of a recipe: the last parts of its path, as few as tell them all apart.
+
+    So names, which go into seeds, do not depend on how a path is spelled or where the data lie.
+    """
+    roots = {_root(entry, folder) for entry in entries if "example" not in entry}
+    for number in range(1, max((len(root.parts) for root in roots), default=1) + 1):
+        names = {root: "/".join(root.parts[-number:]) for root in roots}
+        if len(set(names.values())) == len(roots):
+            return names
+    return {root: root.as_posix() for root in roots}
+
+
+def _named(roots: dict[Path, str], root: Path, path: Path) -> str:
+    """A file by the name of what the recipe gives, and its place in it."""
+    own = Path(os.path.abspath(path))
+    if own == root:
+        return roots[root]
+    return f"{roots[root]}/{(own.relative_to(root) if own.is_relative_to(root) else own).as_posix()}"
 
 
 def _examples(entry: dict[str, Any]) -> Iterator[Candidate]:
     name, size = entry["example"], entry["size"]
     for seed in listed_numbers(entry["seeds"]):
         called = f"{name}, size {size}, seed {seed}"
+        yield Candidate(called, Path(called), partial(_example, name, _side(size), seed), called)
 
-        def load(seed: int = seed) -> Shown:
-            return Surfaces(Scene.example(name, _side(size), seed))
 
-        yield Candidate(called, Path(called), load, called)
+def _example(name: str, size: Any, seed: int) -> Shown:
+    return Surfaces(Scene.example(name, size, seed))
 
 
 def _sized(whole: Candidate, entry: dict[str, Any]) -> Candidate:
@@ -205,7 +233,11 @@ def _sized(whole: Candidate, entry: dict[str, Any]) -> Candidate:
     if size is None:
         return whole
     name, place = (f"{text}, size {size}" for text in (whole.name, whole.place))
-    return Candidate(name, whole.path, lambda: whole.load().resize(_side(size)), place)
+    return Candidate(name, whole.path, partial(_resized, whole.load, _side(size)), place)
+
+
+def _resized(load: Callable[[], Shown], size: Any) -> Shown:
+    return load().resize(size)
 
 
 def _side(size: Any) -> Any:
@@ -229,14 +261,15 @@ def _behind_all(clear: Candidate, entry: dict[str, Any]) -> Iterator[Candidate]:
     for fog in entry.get("fog") or [None]:
         told = [] if pane is None else [f"pane {pane['depth_m']!r} {pane['reflectivity']!r} {pane['transmission']!r}"]
         told += [] if fog is None else [f"fog {fog['extinction_per_m']!r} {fog['backscatter']!r} {fog['nearest_m']!r}"]
-
-        def load(fog: Any = fog) -> Shown:
-            shown = clear.load()
-            assert isinstance(shown, Surfaces)
-            scene = shown.scene if pane is None else LayeredScene.behind_pane(shown.scene, **pane)
-            return Surfaces(scene, None if fog is None else Fog(**fog))
-
+        load = partial(_behind, clear.load, pane, fog)
         yield Candidate(", ".join([clear.name, *told]), clear.path, load, clear.place)
+
+
+def _behind(load: Callable[[], Shown], pane: dict[str, float] | None, fog: dict[str, float] | None) -> Shown:
+    shown = load()
+    assert isinstance(shown, Surfaces)
+    scene = shown.scene if pane is None else LayeredScene.behind_pane(shown.scene, **pane)
+    return Surfaces(scene, None if fog is None else Fog(**fog))
 
 
 def _cropped(scene: Shown, size: tuple[int, int], name: str, seed: int) -> Shown:

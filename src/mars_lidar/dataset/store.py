@@ -15,7 +15,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
+import shutil
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -26,6 +27,7 @@ from numpy.typing import NDArray
 
 from mars_lidar._base import checks, manifest
 from mars_lidar._base.arguments import checked
+from mars_lidar._base.buckets import in_bucket, place_of, remove, sizes, zarr_store
 from mars_lidar._base.files import INCOMPLETE_SUFFIX, FileError, IncompleteFileError, reading
 from mars_lidar.dataset.arrays import FORMAT, FORMAT_VERSION, MAPS, MORE_VERSION, mark, with_zeros
 from mars_lidar.dataset.recipe import DatasetRecipe
@@ -57,7 +59,7 @@ class Dataset:
     def __init__(self, path: Path, *, listed: bool = True) -> None:
         import zarr
 
-        from mars_lidar._base.sealed_store import PlainFiles, SealedStore
+        from mars_lidar._base.sealed_store import PlainFiles, SealedStore, SealedValues
         from mars_lidar.dataset import codec  # noqa: F401  (registers it)
 
         self.path = path
@@ -65,10 +67,14 @@ class Dataset:
         if self.attrs.get("format") != FORMAT:
             raise ValueError(f"{path} is not a dataset written by mars-lidar (no attribute format = {FORMAT!r})")
         if self.attrs.get("format_version") not in (FORMAT_VERSION, MORE_VERSION):
-            told = self.attrs.get("format_version")
-            raise ValueError(f"{path} has layout version {told}; {FORMAT_VERSION} and {MORE_VERSION} can be read")
+            version = self.attrs.get("format_version")
+            raise ValueError(f"{path} has layout version {version}; {FORMAT_VERSION} and {MORE_VERSION} can be read")
         self.sums = manifest.require(path, listed=listed) if self.complete else None
-        store = PlainFiles(path) if self.sums is None else SealedStore(path, self.sums)
+        store: Any = zarr_store(path, read_only=self.sums is not None)
+        if in_bucket(path):
+            store = store if self.sums is None else SealedValues(store, self.sums, str(path))
+        else:
+            store = PlainFiles(path) if self.sums is None else SealedStore(path, self.sums)
         self.group: Any = zarr.open_group(store, mode="r+" if self.sums is None else "r", use_consolidated=False)
         self.recipe = DatasetRecipe.from_dict(json.loads(self.attrs["recipe"]))
 
@@ -160,18 +166,34 @@ class Dataset:
         names = ("histogram",) if item.kind == "histogram" else tuple(MAPS)
         return [self.path.joinpath(name, "c", *map(str, item.shard)) for name in names]
 
-    def missing(self) -> list[Item]:
-        """Parts that are not there, or whose files were cut short."""
+    def missing(self, items: Iterable[Item] | None = None) -> list[Item]:
+        """Those of some parts, or of all, that are not there, or whose files were cut short."""
+        if in_bucket(self.path):  # objects are whole or not there
+            there = sizes(self.path)
+            return [
+                item
+                for item in (self.items() if items is None else items)
+                if not all(file.relative_to(self.path).as_posix() in there for file in self.files(item))
+            ]
+        noted = self.written()
 
         def whole(item: Item) -> bool:
             array = self.histogram if item.kind == "histogram" else self.maps["depth"]
             chunks = math.prod(n // step for n, step in zip(array.shards, array.chunks, strict=True))
-            return all(file.is_file() and _whole(file, chunks) for file in self.files(item))
+            for file in self.files(item):
+                if not file.is_file():
+                    return False
+                size, _ = noted.get(file.relative_to(self.path).as_posix(), (-1, ""))
+                if file.stat().st_size != size and not _whole(file, chunks):
+                    return False
+            return True
 
-        return [item for item in self.items() if not whole(item)]
+        return [item for item in (self.items() if items is None else items) if not whole(item)]
 
     def gone(self) -> list[Path]:
         """Files that are not there."""
+        if in_bucket(self.path):
+            return [file for item in self.missing() for file in self.files(item)]
         return [file for item in self.items() for file in self.files(item) if not file.is_file()]
 
     def unlisted(self) -> str:
@@ -194,9 +216,26 @@ class Dataset:
         assert self.sums is not None, "incomplete stores are not read by name"
         return self.sums.read(name)
 
+    @property
+    def digests(self) -> Path:
+        """Folder of the lines that writers append while the store is incomplete: SHA-256, size and name of a file."""
+        return self.path / "histogram" / "digests"  # Zarr looks at all else in a group, but not in an array
+
+    def written(self) -> dict[str, tuple[int, str]]:
+        """Size and SHA-256 of files by name, as their writers noted them."""
+        noted: dict[str, tuple[int, str]] = {}
+        if in_bucket(self.path) and not self.digests.exists():
+            return noted
+        for file in sorted(self.digests.glob("*.txt"), key=str):
+            for line in file.read_text("utf-8").splitlines():
+                digest, size, name = (*line.split(" ", 2), "", "")[:3]
+                if name and size.isdecimal() and len(digest) == 64:  # the last line of a killed writer may be cut
+                    noted[name] = int(size), digest
+        return noted
+
     def tidy(self) -> None:
         """Remove what a writer that was killed left behind: files that were not renamed yet."""
-        for name in ("", "histogram", *MAPS):
+        for name in () if in_bucket(self.path) else ("", "histogram", *MAPS):
             for pattern in ("*.partial", f"*{INCOMPLETE_SUFFIX}"):  # of Zarr, and of ours
                 for leftover in (self.path / name).rglob(pattern) if name else self.path.glob(pattern):
                     leftover.unlink(missing_ok=True)
@@ -207,8 +246,21 @@ class Dataset:
             raise FileNotFoundError(f"{gone[0]} was taken away while the others were made, the first of {len(gone)}")
         if "consolidated_metadata" not in manifest.root_document(self.path):  # stopped just before it
             mark(self.group, {})
-        manifest.seal(self.path, {"stage": "done", "complete": True})
+        noted = self.written()
+        if in_bucket(self.path):
+            there = sizes(self.path)
+            digests = {name: digest for name, (size, digest) in noted.items() if there.get(name) == size}
+            if noted:
+                remove(self.digests)
+        else:
+            digests = {name: digest for name, (size, digest) in noted.items() if _has_size(self.path / name, size)}
+            shutil.rmtree(self.digests, ignore_errors=True)
+        manifest.seal(self.path, {"stage": "done", "complete": True}, digests)
         self.attrs = manifest.root_document(self.path)["attributes"]
+
+
+def _has_size(file: Path, size: int) -> bool:
+    return file.is_file() and file.stat().st_size == size
 
 
 def _whole(file: Path, chunks: int) -> bool:
@@ -236,7 +288,7 @@ def open_dataset(path: str | Path, *, allow_incomplete: bool = False, listed: bo
     Parameters
     ----------
     path
-        Its folder.
+        Its folder, or a URL of an object store (extra ``remote``).
     allow_incomplete
         Open it also where its generation did not finish.
     listed
@@ -250,7 +302,7 @@ def open_dataset(path: str | Path, *, allow_incomplete: bool = False, listed: bo
     IncompleteFileError
         Its generation did not finish (a ValueError).
     """
-    with reading(path, "a dataset of mars-lidar") as source:
+    with reading(place_of(path), "a dataset of mars-lidar") as source:
         dataset = Dataset(source, listed=listed)
         if not (dataset.complete or allow_incomplete):
             raise IncompleteFileError(f"{path} is incomplete: its generation did not finish; continue it with --resume")

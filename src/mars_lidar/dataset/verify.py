@@ -111,16 +111,16 @@ def _labels(dataset: Dataset) -> Iterator[str]:
 def _compare(maker: Maker, region: tuple[slice, ...]) -> str:
     """Empty, or what is wrong with a chunk."""
     dataset = maker.dataset
-    told = ", ".join(f"{part.start}:{part.stop}" for part in region[:4])
+    text = ", ".join(f"{part.start}:{part.stop}" for part in region[:4])
     try:
         stored = np.asarray(dataset.histogram[region])
         maps = {name: np.asarray(dataset.maps[name][region[0]]) for name in MAPS}
         wrong = int(np.count_nonzero(stored != maker.counts(region)))
         made = maker.maps(region[0])
     except FileError as error:
-        return f"histogram[{told}] cannot be read: {' '.join(str(error).split())}"
+        return f"histogram[{text}] cannot be read: {' '.join(str(error).split())}"
     if wrong:
-        return f"histogram[{told}] differs in {wrong} bins"
+        return f"histogram[{text}] differs in {wrong} bins"
     for name, again in made.items():
         if not np.array_equal(maps[name], again, equal_nan=True):
             return f"{name}[{region[0].start}:{region[0].stop}] differs"

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base import checks
-from mars_lidar._base.keywords import constructed_by_name
+from mars_lidar._base.arguments import constructed_by_name
 
 _MAX_GENERATIONS = 1_000_000
 _MAX_SAMPLES = 2**24

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
-from mars_lidar._base.keywords import constructed_by_name
+from mars_lidar._base.arguments import constructed_by_name
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.pulse import FWHM_PER_SIGMA, SampledPulse
 

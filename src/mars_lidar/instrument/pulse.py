@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
-from mars_lidar._base.keywords import by_name, constructed_by_name
+from mars_lidar._base.arguments import checked, constructed_by_name
 from mars_lidar._base.native import _core
 from mars_lidar._base.notebook import as_html
 
@@ -129,7 +129,7 @@ class GaussianPulse(Pulse):
         object.__setattr__(self, "sigma_ns", checks.real("sigma_ns", self.sigma_ns, low=0.0, strict_low=True))
 
     @classmethod
-    @by_name
+    @checked
     def from_fwhm(cls, *, fwhm_ns: float) -> GaussianPulse:
         """Gaussian pulse of full width at half maximum `fwhm_ns` (ns)."""
         return cls(sigma_ns=checks.real("fwhm_ns", fwhm_ns, low=0.0, strict_low=True) / FWHM_PER_SIGMA)

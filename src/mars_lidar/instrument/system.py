@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
-from mars_lidar._base.arguments import checked
+from mars_lidar._base.arguments import checked, constructed_by_name
 from mars_lidar._base.brief import brief
 from mars_lidar._base.files import check_claim, reading
-from mars_lidar._base.keywords import constructed_by_name
 from mars_lidar._base.notebook import as_html
 from mars_lidar._base.yaml import Lines, located, read_yaml
 from mars_lidar.instrument.detector import Detector as Detector

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked, checked_with_masks
 from mars_lidar._base.brief import brief
+from mars_lidar._base.buckets import url_of
 from mars_lidar._base.files import (
     INCOMPLETE_SUFFIX,
     FileError,
@@ -30,7 +31,7 @@ from mars_lidar._base.notebook import as_html
 from mars_lidar.instrument.system import System
 from mars_lidar.io import layout
 from mars_lidar.io.recipe import Recipe, Recording
-from mars_lidar.io.remote import open_url, url_of
+from mars_lidar.io.remote import open_url
 from mars_lidar.io.store import CountArray, OpenedStore, Writer
 from mars_lidar.light.flux import Flux
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -18,17 +17,6 @@ from mars_lidar._base.files import FileError
 from mars_lidar._base.optional import MissingLibraryError, needed
 from mars_lidar.io import layout
 from mars_lidar.io.store import OnDisk, OpenedStore
-
-_URL = re.compile(r"^((?:[A-Za-z][\w+.-]*::)*[A-Za-z][\w+.-]+):/+(.*)$")  # a drive, C:\, is none
-
-
-def url_of(path: str | Path) -> str | None:
-    """The URL that a text is, also after `Path` has taken its second slash; None for a file."""
-    found = _URL.match(str(path))
-    if found is None:
-        return None
-    scheme, rest = found.groups()
-    return f"{scheme}://{'/' if scheme.endswith('file') else ''}{rest}"
 
 
 class Elsewhere(OnDisk):

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base import checks
+from mars_lidar._base.buckets import in_bucket
 from mars_lidar._base.files import FileError
 from mars_lidar._base.memory import check_memory
 from mars_lidar._base.native import _core
@@ -132,6 +133,7 @@ class StoredDataset(torch.utils.data.IterableDataset[dict[str, Any]]):
         self._stores: list[Dataset] | None = [
             open_dataset(each, listed=os.environ.get("LOCAL_RANK", "0") in ("", "0")) for each in self.paths
         ]
+        self._process = os.getpid()
         self._identities = [store.identity for store in self._stores]
         self._shape = _common_shape(self._stores)
         self._exposures = Exposures(self._stores, samples)
@@ -323,7 +325,9 @@ class StoredDataset(torch.utils.data.IterableDataset[dict[str, Any]]):
         return torch.from_numpy(rows.astype(np.int64)).to(self._dtype)
 
     def _opened(self) -> list[Dataset]:
-        if self._stores is None:
+        forked = self._process != os.getpid() and any(in_bucket(store.path) for store in self._stores or ())
+        if self._stores is None or forked:  # connections do not survive a fork
+            self._process = os.getpid()
             stores = [open_dataset(each, listed=False) for each in self.paths]
             for store, identity in zip(stores, self._identities, strict=True):
                 if store.identity != identity:

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
-from mars_lidar._base.arguments import checked, checked_with_masks
-from mars_lidar._base.keywords import constructed_by_name
+from mars_lidar._base.arguments import checked, checked_with_masks, constructed_by_name
 from mars_lidar._base.late import late
 from mars_lidar._base.notebook import as_html
 from mars_lidar._base.types import FloatArray, IndexArray

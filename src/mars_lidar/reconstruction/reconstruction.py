@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
+from mars_lidar._base.arguments import explained
 from mars_lidar._base.brief import brief
 from mars_lidar._base.notebook import as_html
 from mars_lidar._base.types import FloatArray, Progress
@@ -177,6 +178,7 @@ class Recorded(Protocol):
         """(..., bins)."""
 
 
+@explained
 def reconstruct(
     cube: ArrayLike | Recorded,
     system: System | None = None,

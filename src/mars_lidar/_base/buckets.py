@@ -1,0 +1,63 @@
+"""Stores in object stores: paths of universal_pathlib, which have the methods of `Path`, and what files have beside.
+
+An object appears whole under its name or not at all. There are no renames, no locks, and no folders.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+from mars_lidar._base.optional import needed
+
+_URL = re.compile(r"^((?:[A-Za-z][\w+.-]*::)*[A-Za-z][\w+.-]+):/+(.*)$")  # a drive, C:\, is none
+
+
+def url_of(path: str | Path) -> str | None:
+    """The URL that a text is, also after `Path` has taken its second slash; None for a file."""
+    match = _URL.match(str(path))
+    if match is None:
+        return None
+    scheme, rest = match.groups()
+    return f"{scheme}://{'/' if scheme.endswith('file') else ''}{rest}"
+
+
+def place_of(path: Any) -> Any:
+    """A `Path`, or a path of an object store for a URL (``s3://bucket/set.zarr``)."""
+    if in_bucket(path):
+        return path
+    url = url_of(path)
+    return Path(path) if url is None else needed("upath", url, "remote").UPath(url)
+
+
+def in_bucket(path: Any) -> bool:
+    """Whether this is a path of an object store."""
+    return hasattr(path, "fs")
+
+
+def zarr_store(path: Any, *, read_only: bool = False) -> Any:
+    """What Zarr opens: the path itself, or its store for a URL."""
+    if not in_bucket(path):
+        return path
+    from zarr.storage import FsspecStore
+
+    return FsspecStore.from_url(str(path), read_only=read_only)
+
+
+def put(path: Any, content: bytes) -> None:
+    """Write an object."""
+    path.fs.pipe_file(path.path, content)
+
+
+def sizes(folder: Any) -> dict[str, int]:
+    """Bytes of all objects below a path, by their names from there on; the object store is asked anew."""
+    folder.fs.invalidate_cache()
+    prefix = folder.path.rstrip("/") + "/"
+    listed = folder.fs.find(folder.path, detail=True)
+    return {str(name).partition(prefix)[2] or str(name): int(told["size"]) for name, told in listed.items()}
+
+
+def remove(folder: Any) -> None:
+    """Remove all objects below a path."""
+    folder.fs.rm(folder.path, recursive=True)

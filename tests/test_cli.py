@@ -322,7 +322,7 @@ def test_a_full_disk_is_exit_code_1(tmp_path, monkeypatch):
     monkeypatch.setattr(Writer, "write", full)
     done = run("simulate", "--scene", "room", *SMALL, "-o", tmp_path / "a.zarr")
     assert done.exit_code == 1
-    left = f"{tmp_path / 'a.zarr'} is left behind, marked incomplete: --resume (resume=True) continues it"
+    left = f"{tmp_path / 'a.zarr'} stays, marked incomplete: --resume (resume=True) continues it"
     assert done.stderr == f"mars-lidar: failed: No space left on device; {left}\n"
     assert "complete       NO: the simulation did not finish" in run("info", tmp_path / "a.zarr").output
     done = run("view", tmp_path / "a.zarr", "-o", tmp_path / "a.png")
@@ -354,7 +354,7 @@ def test_a_stopped_run_is_left_incomplete(tmp_path, how):
     if how == signal.SIGINT:
         assert time.monotonic() - stopped < 5.0  # promised within a second; test machines are busy
         assert process.returncode == 130
-        assert f"mars-lidar: interrupted; {out} is left behind, marked incomplete: --resume" in told
+        assert f"mars-lidar: interrupted; {out} stays, marked incomplete: --resume" in told
     else:
         assert process.returncode == -signal.SIGKILL
     assert not (tmp_path / "a.png").exists()

@@ -46,9 +46,9 @@ def test_an_image_beside_its_depth_becomes_the_reflectivity(tmp_path, name):
     with xarray.open_zarr(tmp_path / "set.zarr") as data:
         share = data.reflectivity.values[0]
         assert share[:, -1].mean() > 10 * share[:, 0].mean()
-        assert data.scene_name.values.tolist() == ["./s00_depth.png"]
+        assert data.scene_name.values.tolist() == ["s00_depth.png"]
     with xarray.open_zarr(tmp_path / "set.zarr", group="scenes") as data:
-        assert data["name"].values.tolist() == ["./s00_depth.png"]
+        assert data["name"].values.tolist() == ["s00_depth.png"]
 
 
 def test_a_folder_without_any_image_says_so(tmp_path):

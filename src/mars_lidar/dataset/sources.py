@@ -198,14 +198,17 @@ def _root(entry: dict[str, Any], folder: Path) -> Path:
 def _root_names(entries: Sequence[dict[str, Any]], folder: Path) -> dict[Path, str]:
     """Name of each file or folder of a recipe: the last parts of its path, as few as tell them all apart.
 
-    So names, which go into seeds, do not depend on how a path is spelled or where the data lie.
+    So names, which go into seeds, do not depend on how a path is spelled or where the data lie. The folder of the
+    recipe itself, which it calls ``.``, has the empty name.
     """
-    roots = {_root(entry, folder) for entry in entries if "example" not in entry}
+    own = Path(os.path.abspath(folder))
+    roots = {_root(entry, folder) for entry in entries if "example" not in entry} - {own}
+    names: dict[Path, str] = {}
     for number in range(1, max((len(root.parts) for root in roots), default=1) + 1):
         names = {root: "/".join(root.parts[-number:]) for root in roots}
         if len(set(names.values())) == len(roots):
-            return names
-    return {root: root.as_posix() for root in roots}
+            break
+    return {own: "", **names}
 
 
 def _named(roots: dict[Path, str], root: Path, path: Path) -> str:
@@ -213,7 +216,8 @@ def _named(roots: dict[Path, str], root: Path, path: Path) -> str:
     own = Path(os.path.abspath(path))
     if own == root:
         return roots[root]
-    return f"{roots[root]}/{(own.relative_to(root) if own.is_relative_to(root) else own).as_posix()}"
+    inside = (own.relative_to(root) if own.is_relative_to(root) else own).as_posix()
+    return f"{roots[root]}/{inside}" if roots[root] else inside
 
 
 def _examples(entry: dict[str, Any]) -> Iterator[Candidate]:

@@ -20,7 +20,6 @@ import torch
 from mars_lidar import Flux, System, cramer_rao, reconstruct
 from mars_lidar._base.optional import needed
 from mars_lidar._base.types import FloatArray
-from mars_lidar.reconstruction import MaximumLikelihood
 from studies import Facts, Request
 from studies.common.kept import chosen, fixed, kept
 from studies.downstream.data import CONFIGS, MAIN, PAIR, Config, Data, instrument, truths
@@ -30,7 +29,7 @@ from studies.downstream.prediction import of_scenes
 METHODS = {  # that need no training
     "matched filter": "matched_filter",
     "generalised Coates": "generalised_coates",
-    "maximum likelihood": MaximumLikelihood(tested=False),
+    "maximum likelihood": "maximum_likelihood",
 }
 LIGHT_M_PER_NS = 0.299792458 / 2.0  # of depth
 _GAUSSIAN: dict[str, Any] = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}  # SSIM's window

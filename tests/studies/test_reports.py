@@ -51,6 +51,8 @@ def test_every_name_that_a_report_prints_is_a_study():
     assert set(STUDIES) == NAMES
     printed = set()
     for text in (ROOT / "docs").rglob("*.md"):
+        if (ROOT / "docs" / "copied") in text.parents:  # made with the site; the changelog names studies that are gone
+            continue
         for command in re.findall(r"python -m studies ([a-z-][a-z -]*)", text.read_text(encoding="utf-8")):
             printed |= {word for word in command.split(" --")[0].split() if not word.startswith("-")}
     assert (

@@ -201,7 +201,8 @@ def simulate_timestamps(
         _check_memory((math.ceil(0.5 * expected),), PhaseRecords.BYTES, "timestamps")  # before any work
         records = drawn_by.records(task, expected)
     info = {"system": system.to_dict(), "engine": drawn_by.name, "seed": int(seed), "realization": int(realization)}
-    what = (task.flux.shape, system.bins, system.histogram_dtype, system.period_ns, system.cycles, info)
+    height, width = task.flux.shape
+    what = ((height, width), system.bins, system.histogram_dtype, system.period_ns, system.cycles, info)
     if isinstance(records, PhaseRecords):
         return DrawnTimestamps.of(records.cycle, records.phase, records.offsets, *what)
     return Timestamps(records.times * system.period_ns, records.cycle, records.bin, records.offsets, *what)

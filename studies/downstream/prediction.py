@@ -65,7 +65,7 @@ def _sums(bins: int) -> FloatArray:
     """Sums (features, bins) that a network sees of a histogram whose return is in the middle."""
     place = (np.arange(bins) - (bins - WINDOW) // 2) % bins
     feature = np.where(place < WINDOW, place, WINDOW + (place - WINDOW) * COARSE // (bins - WINDOW))
-    return (feature == np.arange(WINDOW + COARSE)[:, None]).astype(float)
+    return np.asarray(feature == np.arange(WINDOW + COARSE)[:, None], dtype=np.float64)
 
 
 def _jacobian(signal: float, background: float, system: System) -> FloatArray:

@@ -265,8 +265,9 @@ def reading(path: str | Path, kind: str = "file") -> Iterator[Path]:
     FileError
         Anything else: a pipe or a device, which would never end; a damaged file, whatever its library raised.
     """
-    source = path if in_bucket(path) else Path(path)
-    if not in_bucket(source):
+    source: Any = path  # of an object store, as it is
+    if not in_bucket(path):
+        source = Path(path)
         check_source(source)
     try:
         yield source
@@ -516,7 +517,7 @@ def read_mat5(path: Path, names: Iterable[str] | None = None) -> dict[str, Any]:
         with warnings.catch_warnings():  # of variables of the same name, the last of which is the variable
             warnings.simplefilter("ignore", matlab.MatReadWarning)
             for each in some:
-                found |= loadmat(BytesIO(each.element()), variable_names=[each.name])
+                found |= loadmat(BytesIO(each.element()), variable_names=[each.name])  # type: ignore[arg-type]  # files too
         for name, value in found.items():
             _check_sparse_within(name, value)
         return found

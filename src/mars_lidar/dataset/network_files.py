@@ -174,7 +174,7 @@ def _write_tars(folder: Path, source: Dataset, progress: Progress | None) -> int
     of_a_tar = max(1, _TAR_BYTES // nbytes)
     systems, names = [each.to_dict() for each in source.recipe.systems], source.scene_names()
     places = [(sample, realization) for sample in range(samples) for realization in range(realizations)]
-    listed = []
+    listed: list[str] = []
     for first in range(0, len(places), of_a_tar):
         listed.append(f"shard-{len(listed):06d}.tar")
         with tarfile.open(folder / listed[-1], "x", format=tarfile.PAX_FORMAT) as tar:

@@ -42,14 +42,15 @@ class StoredFlux(Flux):
         info: dict[str, Any] | None = None,
     ) -> None:
         maps = Flux(signal, background, 0.0).image
-        none = np.empty((0, *maps.shape))
+        height, width = maps.shape
+        none = np.empty((0, height, width))
         for name, value in {
             "signal": maps.signal,
             "background": maps.background,
             "delay_ns": np.full(maps.shape, np.nan),
             "returns_signal": none,
             "returns_delay_ns": none,
-            "waveform": Waveforms((*maps.shape, parts), rows),
+            "waveform": Waveforms((height, width, parts), rows),
             "info": dict(info or {}),
             "_make": rows,
         }.items():

@@ -69,8 +69,9 @@ void bind_packing(nb::module_& module) {
     module.def("unpack_counts", &unpack<uint16_t>, "packed"_a, "out"_a.noconvert(),
                "Fill `out` (n,) with what `pack_counts` packed.");
     module.def("unpack_counts", &unpack<uint32_t>, "packed"_a, "out"_a.noconvert());
-    module.def("unpack_batch", &unpack_batch<uint16_t>, "packed"_a, "out"_a.noconvert(),
-               "Fill row k of `out` (n, size) with what packed[k] holds; a ValueError where an integer type is too small.");
+    module.def(
+        "unpack_batch", &unpack_batch<uint16_t>, "packed"_a, "out"_a.noconvert(),
+        "Fill row k of `out` (n, size) with what packed[k] holds; a ValueError where an integer type is too small.");
     module.def("unpack_batch", &unpack_batch<uint32_t>, "packed"_a, "out"_a.noconvert());
     module.def("unpack_batch", &unpack_batch<int16_t>, "packed"_a, "out"_a.noconvert());
     module.def("unpack_batch", &unpack_batch<int32_t>, "packed"_a, "out"_a.noconvert());

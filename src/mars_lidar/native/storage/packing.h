@@ -89,7 +89,7 @@ class Unpacker {
     Counts above_;
     uint64_t next_ = 0, size_;
 
-   public:
+ public:
     explicit Unpacker(const Packed& source)
         : bits_{source.data.data() + kHeader, source.data.data() + source.data.size() - kPadding}, size_(source.size) {}
 

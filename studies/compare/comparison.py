@@ -155,6 +155,7 @@ def compare(
     budget = checks.real("budget_s", budget_s, low=0.0, strict_low=True)
     seed = checks.integer("seed", seed, low=0, high=2**64 - 1)
     team = thread_count(threads)
+    flux = flux.image
     depth = np.asarray(system.depth_m(flux.delay_ns % system.period_ns)) if depth_m is None else np.asarray(depth_m)
     if depth.shape != flux.shape:
         raise ValueError(f"depth_m must have the shape {flux.shape} of the flux, got {depth.shape}")

@@ -154,7 +154,7 @@ def along(settings: Settings, axis: Axis, tell: Tell) -> list[Point]:
 def teaser(settings: Settings, tell: Tell) -> list[Point]:
     """Many exposures of one pixel, S = B = 1."""
     cycles, realizations = settings.teaser
-    flux, seen = Flux(1.0, 1.0, 0.5 * PERIOD_NS), system(settings, cycles)
+    flux, seen = Flux([[1.0]], 1.0, 0.5 * PERIOD_NS), system(settings, cycles)
     runs = {one.name: one.prepare(flux, seen, realizations) for one in contenders(Tables(settings.axis_table))}
     timed = _least(runs, _memory(flux, seen, realizations), settings)
     tell("runtime: teaser")

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import os
 import secrets
 import subprocess
 import sys
+import warnings
 from collections.abc import Iterator
 
 import numpy as np
@@ -41,6 +43,9 @@ def bucket(monkeypatch) -> Iterator[str]:
     s3fs.S3FileSystem().mkdir(name)
     yield f"s3://{name}"
     s3fs.S3FileSystem.clear_instance_cache()
+    with warnings.catch_warnings():  # s3fs leaves its sessions to the collector, which would warn in another test
+        warnings.simplefilter("ignore", ResourceWarning)
+        gc.collect()
     started.stop()
 
 

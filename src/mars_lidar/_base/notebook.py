@@ -40,4 +40,4 @@ def as_html(thing: object, panels: Mapping[str, Any]) -> str:
 
 def _has_values(values: Any) -> bool:
     parts = values if isinstance(values, tuple) else (values,)
-    return all(part is not None and np.size(part) and np.isfinite(part).any() for part in parts)
+    return all(np.ndim(part) > 0 and np.size(part) and np.isfinite(part).any() for part in parts)

@@ -75,7 +75,9 @@ class HistogramTable(torch.nn.Module):
         given = inputs(signal, background, delay_ns)
         for name, values, axis in zip(("signal", "background"), given, (self.signal, self.background), strict=False):
             low, high = float(axis[0]), float(axis[-1])
-            least, most = (float(end) for end in values_of(values).aminmax()) if values.numel() else (low, high)
+            least, most = (
+                (float(end) for end in values_of(values).detach().aminmax()) if values.numel() else (low, high)
+            )
             if not (low <= least and most <= high):
                 raise ValueError(
                     f"{name} must lie in the table's [{low:g}, {high:g}] photons per period, got {least:g} to {most:g}"

@@ -58,6 +58,7 @@ def test_a_killed_worker_loses_nothing(tmp_path, recipe, cluster):
 @pytest.mark.full
 def test_a_cluster_that_starts_with_no_worker_fills(tmp_path, recipe):
     """Adaptive clusters start workers by the length of the queue; three parts in flight reached two of eight."""
+    recipe |= {"realizations": 300}  # more work than the first worker does while the second starts
     ml.generate(recipe, tmp_path / "one.zarr")
     workers = []
     with distributed.LocalCluster(

@@ -27,7 +27,7 @@ from mars_lidar.dataset.write import Maker
 PAGE = Path(__file__).parents[1] / "docs" / "scale.md"
 BEGIN, END = "<!-- python -m benchmarks.scale -->", "<!-- end -->"
 CUBES, CUBES_OF_A_PART = 1_000_000, 8
-CLIENT_S = 2.5e-3  # of the dask client for a task, measured on this machine
+CLIENT_S = 2.5e-3  # of the dask client for a task: an earlier measurement, not repeated by this program
 DISK_BYTES_S = 2e9
 
 

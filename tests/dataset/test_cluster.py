@@ -65,6 +65,7 @@ def test_a_cluster_that_starts_with_no_worker_fills(tmp_path, recipe):
         n_workers=0, threads_per_worker=1, dashboard_address=None, memory_limit=0, silence_logs=50
     ) as started:
         started.adapt(minimum=0, maximum=2, interval="100ms", wait_count=100, target_duration="1ms")
+        assert not started.workers
         ml.generate(
             recipe,
             tmp_path / "two.zarr",

@@ -11,7 +11,6 @@ import mars_lidar as ml
 
 FLAGS = doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS
 WITHOUT = {"Generated", "Pulse", "UnitWarning"}  # a result, a base class and a warning
-WITHOUT |= {"Calibration", "calibrate"}  # some seconds: docs/calibration.md
 PUBLIC = sorted(name for name in ml.__all__ if callable(getattr(ml, name)))
 
 

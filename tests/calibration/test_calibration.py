@@ -101,10 +101,11 @@ def test_a_period_of_half_units_fits(seed: int) -> None:
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("effect", ["afterpulses", "recovery", "paralyzable"])
+@pytest.mark.parametrize("effect", ["afterpulses", "twilight", "recovery", "paralyzable", "electronics"])
 def test_an_effect_is_named(effect: str) -> None:
+    """In 100,000 photons; electronics in 300,000, of which 100,000 hold 4.5 standard deviations at most."""
     truth = with_effect(BASE, effect)
-    result = ml.calibrate(stream(truth, 100_000, 5))
+    result = ml.calibrate(stream(truth, 300_000 if effect == "electronics" else 100_000, 5))
     assert NAMES[effect] in [suspect.name for suspect in result.suspects]
 
 
@@ -186,3 +187,26 @@ def test_pulls_of_random_streams() -> None:
     spread = np.nanstd(table, axis=0)
     assert (spread > 0.75).all()
     assert (spread < 1.35).all()
+
+
+def test_native_counts_are_those_of_numpy() -> None:
+    """Times on the recorder's grid and counts in cells, of three streams with jitter, against NumPy: equal."""
+    from mars_lidar.calibration.cells import Cells
+    from mars_lidar.calibration.model import Model
+    from mars_lidar.calibration.recording import Clock
+
+    rows = np.array([[0.15, 0.4, 30.0, 0.1, variance, 50.0] for variance in (0.0, 0.01, 0.05)])
+    for clock in (Clock(100.0), Clock(100.3, 0.064, 0.5, locked=False), Clock(100.3, 0.25, 0.5, locked=True)):
+        model = Model(clock, 1)
+        streams = model.streams(rows, 4000, 3)
+        for t in streams:
+            assert (np.diff(t) >= 0.0).all()
+            if clock.unit_ns and not clock.locked:
+                assert np.abs(t / clock.unit_ns % 1.0 - 0.5).max() < 1e-6
+        cells = Cells(model, rows[0], list(streams), 1e4)
+        gaps = slice(cells.phases, cells.phases + cells.gap_edges.size + 1)
+        for t, counts in zip(streams, cells.count(streams), strict=True):
+            edges = np.r_[-np.inf, np.nextafter(cells.gap_edges, np.inf), np.inf]  # an interval at an edge is below it
+            assert (counts[gaps] == np.histogram(np.diff(t), edges)[0]).all()
+            assert counts[: cells.phases].sum() == t.size
+            assert counts[gaps.stop :].sum() == t.size - 1

@@ -28,3 +28,39 @@ def test_dead_time_and_pulse_are_found_from_wrong_ones(dead: float, sigma: float
 def test_too_few_photons_are_refused() -> None:
     with pytest.raises(ValueError, match="1000 registrations"):
         calibrate_cube(np.ones((3, 500), np.uint16), system())
+
+
+@pytest.mark.full
+def test_a_free_response_and_the_dead_time_beside_it() -> None:
+    """A pulse with a tail of 1 ns: no sample beyond 4.5 stated errors after the shift that no cube shows."""
+    t = np.arange(60) * 0.1
+    shape = np.exp(-0.5 * ((t - 1.0) / 0.25) ** 2) + 0.3 * np.exp(-np.maximum(t - 1.0, 0.0)) * (t > 1.0)
+    pulse = ml.SampledPulse(shape, bin_ns=0.1, origin="centroid")
+    random = np.random.default_rng(3)
+    light = random.uniform(0.2, 0.8, (8, 8)), random.uniform(0.1, 0.6, (8, 8)), random.uniform(0.0, 100.0, (8, 8))
+    counts = ml.simulate(ml.Flux(*light), system(bins=1000).replace(pulse=pulse), seed=5)[0]
+    result = calibrate_cube(counts, system(45.0, 0.3, bins=1000), pulse="free")
+    dead = result.estimates["dead_time_ns"]
+    assert abs(dead.value - 50.0) < 4.5 * dead.error
+    assert result.fits
+    response = result.system.pulse
+    assert isinstance(response, ml.SampledPulse)
+    assert result.response_error is not None
+    shares, errors = (each / response.values.sum() for each in (response.values, result.response_error))
+    edges = np.arange(shares.size + 1) * response.bin_ns
+    edges = edges - (shares * 0.5 * (edges[1:] + edges[:-1])).sum()
+    worst = [
+        np.abs((shares - np.diff(pulse.cumulative(edges + d))) / errors).max() for d in np.arange(-0.1, 0.1, 0.002)
+    ]
+    assert min(worst) < 4.5
+
+
+@pytest.mark.full
+def test_a_single_pixel_states_its_depth_and_light() -> None:
+    truth = system(bins=1000)
+    counts = ml.simulate(ml.Flux(0.5, 0.3, 40.0), truth, seed=2)[0]
+    result = calibrate_cube(counts[0, 0], truth)
+    for name, true in (("signal", 0.5), ("background", 0.3), ("delay_ns", 40.0), ("depth_m", 40.0 * 0.1498962290)):
+        assert abs(result.estimates[name].value - true) < 4.5 * result.estimates[name].error
+    assert result.counts.shape == (1, 1000)
+    assert result.flux.signal[0, 0] == result.estimates["signal"].value

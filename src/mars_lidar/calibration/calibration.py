@@ -130,6 +130,26 @@ class Calibration:
         The instrument and the light of these estimates, to simulate with; None with ``look=True``.
     waveform, waveform_error
         Light (bins,) in photons per period and bin, of a free shape; else None.
+    recording
+        The recorded times, as `curves` and `realizations` read them.
+
+    See Also
+    --------
+    calibrate
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=5000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=0.3), detector=ml.Detector(dead_time_ns=50.0),
+    ... )
+    >>> times = ml.simulate_timestamps(ml.Flux(0.4, 0.15, 30.0), system, seed=1)
+    >>> result = ml.calibrate(times, look=True)
+    >>> result.verdict
+    'not fitted'
+    >>> result.look.registrations == times.times_ns.size
+    True
     """
 
     look: Look
@@ -180,13 +200,19 @@ class Calibration:
         return f"p = {self.p_value:.2g}: {model} does not fit"
 
     def curves(self, seed: int = 0) -> Curves:
-        """Histograms of the recording beside those of the fit, for a picture."""
+        """Histograms of the recording beside those of the fit, for a picture; of the recording alone without a fit."""
         model = None if self.fitted is None else self.fitted.model
         theta = None if model is None or self.fitted is None else model.bounded(self.fitted.theta)
         return curves(self.recording, model, theta, seed)
 
     def realizations(self, cycles: int, *, simulated: int = 4000, seed: int = 0) -> Realizations:
-        """Law of the count in pieces of `cycles` laser periods beside the model's, of `simulated` pieces (T6)."""
+        """Law of the count in pieces of `cycles` laser periods beside the model's, of `simulated` pieces (T6).
+
+        Raises
+        ------
+        ValueError
+            No fit (``look=True``), no laser, or fewer than 20 such pieces in the recording.
+        """
         if self.fitted is None or not self.recording.laser:
             raise ValueError("realizations need a fit and a laser period: calibrate without look=True")
         number = checks.integer("cycles", cycles, low=1, high=MAX_CYCLES)
@@ -246,10 +272,38 @@ def calibrate(
     seed
         Of the simulated streams; the result depends on it within its errors.
 
+    Returns
+    -------
+    Calibration
+        Estimates with errors, verdict, suspects, limits, drift, and the system and flux to simulate with.
+
     Raises
     ------
+    TypeError
+        `times` that are neither `Timestamps` nor numbers, a `pulse` that is none, switches other than True or False.
     ValueError
-        Several pixels without `pooled`, fewer than 300 registrations, or records that are no photons.
+        Several pixels without `pooled`, fewer than 300 registrations, records that are no photons, recordings of
+        different periods; a detector that is not free-running or has effects that one pixel does not show; the pulse
+        given twice, or afterpulses with a probability and no delay.
+
+    See Also
+    --------
+    Calibration, Timestamps, simulate_timestamps, reconstruct
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=5000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=0.3), detector=ml.Detector(dead_time_ns=50.0),
+    ... )
+    >>> times = ml.simulate_timestamps(ml.Flux(0.4, 0.15, 30.0), system, seed=1)
+    >>> result = ml.calibrate(times)
+    >>> result.fits
+    True
+    >>> dead_time = result.estimates["dead_time_ns"]
+    >>> abs(dead_time.value - 50.0) < 4.0 * dead_time.error
+    True
     """
     number = checks.integer("returns", returns, low=1, high=_MOST_RETURNS)
     alpha = checks.real("level", level, low=0.0, high=0.5, strict_low=True)
@@ -360,7 +414,8 @@ class _Run:
         self.flat = not recording.laser
         if shape == "free":
             self.wave = start.free_waveform(recording, _WAVE_BINS)
-            model = Model(recording.clock, 0, waveform=self.wave[0] / self.wave[0].sum(), fields=told)
+            shares, errors = (part / self.wave[0].sum() for part in self.wave)
+            model = Model(recording.clock, 0, None, shares, errors, recording.exposure, fields=told)
         elif self.flat or start.brightest_window(recording) < _PULSE:
             self.flat = True
             model = Model(recording.clock, 0, fields=told)

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mars_lidar._base.types import FloatArray, IndexArray
-from mars_lidar.calibration.model import Model
+from mars_lidar._base.native import _core
+from mars_lidar._base.types import FloatArray
+from mars_lidar.calibration.model import Model, Streams
 from mars_lidar.calibration.recording import Recording
 
 _PHASES = 2**15  # cells of the table from phase to class
 _OFF = 0.5 + 1.0 / 64.0 / np.pi  # units of a clock from a tick to an edge
 _SHIFT = 0.37  # of such a cell: no edge lies where a clock ticks
+_CLASSES = 12  # parts of the period in the table, beside the stretches of bright light
 _QUANTILES = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98, 0.995)  # of intervals
 _AGES = (0.002, 0.02, 0.08, 0.2, 0.45, 0.75)  # quantiles of intervals that divide the table
 
@@ -25,19 +26,16 @@ class Cells:
 
     def __init__(self, model: Model, theta: FloatArray, pilot: list[FloatArray], photons: float) -> None:
         period, unit = model.clock.period_ns, model.clock.unit_ns
-        self.period, self.clock = period, model.clock
         gaps = np.sort(np.concatenate([np.diff(t) for t in pilot]))
         phases = np.concatenate([t / period - np.floor(t / period) for t in pilot])
         edges, lit = self._layout(model, theta, phases)
         centre = (np.arange(_PHASES) + 0.5) / _PHASES
-        self.phase_of: IndexArray = np.searchsorted(edges, centre)
-        coarse = np.unique(np.concatenate([np.linspace(0.0, 1.0, 6)[1:-1], lit.ravel()]))
+        phase_of = np.searchsorted(edges, centre).astype(np.int32)
+        coarse = np.unique(np.concatenate([np.linspace(0.0, 1.0, _CLASSES + 1)[1:-1], lit.ravel()]))
         inside = np.zeros(_PHASES, bool)
         for low, high in lit:
             inside |= (centre - low) % 1.0 < (high - low) % 1.0
-        self.class_of: NDArray[np.int32] = (2 * np.searchsorted(coarse, centre)).astype(np.int32)
-        self.lit_of: NDArray[np.int32] = inside.astype(np.int32)
-        self.kinds, self.phases = 2 * (coarse.size + 1), edges.size + 1
+        self.phases = edges.size + 1
         ratio = gaps.size / max(photons, 1.0)
         fine = max(0.7, 2.0 / ratio) * 1.5 ** np.arange(60)
         rank = np.r_[fine[fine < 0.15 * photons], photons * np.array(_QUANTILES)] * ratio
@@ -46,14 +44,25 @@ class Cells:
         self.gap_edges = np.union1d(self._between(place, unit), ages)
         self.gap_edges = self.gap_edges[self.gap_edges > 0.0]
         ages = ages[ages > 0.0]
-        self.age_of: NDArray[np.int32] = np.searchsorted(ages, np.append(self.gap_edges, np.inf)).astype(np.int32)
-        self.ages = ages.size + 1
-        self.size = self.phases + self.gap_edges.size + 1 + self.ages * self.kinds
+        self.native = _core.StreamCells(
+            period_ns=period,
+            shift=_SHIFT / _PHASES,
+            phase_of=phase_of,
+            class_of=(2 * np.searchsorted(coarse, centre)).astype(np.int32),
+            lit_of=inside.astype(np.int32),
+            gap_edges=self.gap_edges,
+            age_of=np.searchsorted(ages, np.append(self.gap_edges, np.inf)).astype(np.int32),
+            phases=self.phases,
+            classes=2 * (coarse.size + 1),
+            ages=ages.size + 1,
+        )
+        self.size = self.native.size
 
     @staticmethod
     def _layout(model: Model, theta: FloatArray, phases: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Edges of the phase cells, and the stretches (n, 2) of bright light, in periods."""
-        period, unit = model.clock.period_ns, model.clock.unit_ns
+        clock = model.clock
+        period, unit = clock.period_ns, clock.unit_ns
         edges, lit = [np.linspace(0.0, 1.0, 13)[1:-1]], []
         if model.waveform is not None or model.pulse is not None:
             edges.append(np.quantile(phases, np.linspace(0.0, 1.0, 33)[1:-1]))
@@ -72,7 +81,7 @@ class Cells:
         for r in range(model.returns):
             delay = theta[2 + 2 * r]
             peak = np.arange(-5.0, 5.01, 0.5) * width + delay
-            if unit > 0.4 * width:  # edges between the units of the clock
+            if unit > 0.4 * width and clock.repeats:  # edges between the units of the clock
                 peak = np.unique(np.round(peak / unit)) * unit
             edges.append(peak / period % 1.0)
             lit.append(((delay - 3 * width) / period % 1.0, (delay + 3 * width) / period % 1.0))
@@ -83,18 +92,13 @@ class Cells:
         """Edges of intervals, between the units of a clock; off their middle, where a period of half units may end."""
         return np.unique((np.floor(edges / unit + 1e-6) + _OFF) * unit) if unit > 0.0 else np.unique(edges)
 
-    def __call__(self, t: FloatArray) -> FloatArray:
-        """Counts (size,) of one stretch of recorded times (n,)."""
-        x: FloatArray = t * (1.0 / self.period) + _SHIFT / _PHASES
-        x -= np.floor(x)
-        at: IndexArray = np.floor(x * _PHASES).astype(np.intp)
-        gap: IndexArray = np.searchsorted(self.gap_edges, np.diff(t))
-        phases = np.bincount(self.phase_of[at], minlength=self.phases)
-        gaps = np.bincount(gap, minlength=self.gap_edges.size + 1)
-        cell = self.age_of[gap] * self.kinds + self.class_of[at[:-1]] + self.lit_of[at[1:]]
-        table = np.bincount(cell, minlength=self.ages * self.kinds)
-        return np.concatenate([phases, gaps, table]).astype(np.float64)
+    def count(self, streams: Streams) -> FloatArray:
+        """Counts (streams, size)."""
+        counts = np.empty((streams.offsets.size - 1, self.size))
+        _core.count_streams(self.native, streams.times, streams.offsets, counts)
+        return counts
 
     def of(self, recording: Recording) -> FloatArray:
         """Counts (size,) of a recording, all stretches together."""
-        return np.asarray(np.sum([self(piece) for piece in recording.pieces], axis=0))
+        offsets = np.cumsum([0, *(piece.size for piece in recording.pieces)])
+        return np.asarray(self.count(Streams(np.concatenate(recording.pieces), offsets)).sum(0))

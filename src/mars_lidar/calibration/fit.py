@@ -27,9 +27,11 @@ _NEAR = 3.0  # the same of the last batches, in standard errors of the recording
 _SETTLED = 1.0  # standard errors that the last estimate may lie from the centre of its streams
 _LONGEST = 3.0  # of a move of that centre
 _FAR = 5.0  # standard errors that the centre may move before cells are laid anew
+_WIDEST = 2.0  # spreads of a first batch that later ones may have
+_VARIED = 0.5  # of the recorded variance of the pulse, the most that a batch's standard deviation may be
 _RECENTRED = 4  # last batches, at most
 _PULSES = 4  # widths of a batch
-_CUMULATED = 10.0  # intervals expected up to an edge, for a normal law of their number
+_CUMULATED = 100.0  # intervals expected up to an edge, for a normal law of their number
 _DRAWS = 20_000  # of the law of the estimate, for its bounds
 
 
@@ -87,12 +89,9 @@ def counted(
     model: Model, cells: Cells, rows: FloatArray, exposure: float, seed: int, extra: tuple[Effect, ...] = ()
 ) -> FloatArray:
     """Counts (rows, c) of simulated streams, one for each row of parameters; `LIGHTS` rows share a detector."""
-    return np.array(
-        [
-            cells(t)
-            for k in range(0, len(rows), LIGHTS)
-            for t in model.streams(rows[k : k + LIGHTS], max(2, round(exposure)), seed + k, extra)
-        ]
+    cycles = max(2, round(exposure))
+    return np.concatenate(
+        [cells.count(model.streams(rows[k : k + LIGHTS], cycles, seed + k, extra)) for k in range(0, len(rows), LIGHTS)]
     )
 
 
@@ -257,7 +256,11 @@ class Fit:
         """The linear law of counts about `theta` for an exposure of this many photons."""
         cells = self.cells(model, theta, photons) if cells is None else cells
         size = self.effort.of(photons, times)
-        rows = design(model, theta, spread * (photons / size) ** 0.5 * root, free, self.next_seed())
+        wide = spread * (photons / size) ** 0.5 * root
+        if model.gaussian and model.light in free:  # counts are no linear function of a variance down to none
+            k = int(np.flatnonzero(free == model.light)[0])
+            wide[k] *= min(1.0, _VARIED * theta[model.light] / max(float(np.linalg.norm(wide[k])), 1e-300))
+        rows = design(model, theta, wide, free, self.next_seed())
         exposure = max(2, round(self.exposure(size)))
         made = counted(model, cells, rows, exposure, self.next_seed())
         return regression(cells, rows, theta, made, self.exposure(photons) / exposure, free)
@@ -276,6 +279,7 @@ class Fit:
         weighed = float(min(photons, max(first, self.effort.first)))
         total = float(self.recording.photons)
         misfit, near = np.inf, False
+        widest = _WIDEST * np.sqrt(np.diag(root @ root.T))  # more is of counts that hardly depend on a parameter
         for _ in range(rounds):
             law = self.law(model, theta, root, free, weighed)
             seen = law.cells.of(self.recording) * (weighed / total)
@@ -298,7 +302,8 @@ class Fit:
             grown = min(photons, weighed * 6.0) if near else weighed
             cov = cov * (weighed / grown)
             sd = np.sqrt(np.diag(cov))
-            root = _root(cov + np.diag((0.02 * sd) ** 2))
+            narrowed = np.minimum(1.0, widest / sd)
+            root = _root((cov + np.diag((0.02 * sd) ** 2)) * np.outer(narrowed, narrowed))
             if near and weighed >= photons:
                 break
             weighed = grown
@@ -345,7 +350,8 @@ class Fit:
         fresh = near.residual @ project.T
         fresh = (fresh - fresh.mean(0)) / np.sqrt(near.ratio) * np.sqrt(len(y) / (len(y) - terms.shape[1]))
         left = project @ (seen - near.offset)
-        misfit, z, p = _misfit(left, fresh, law, near)
+        dead = np.flatnonzero(free == model.light + 2)
+        misfit, z, p = _misfit(left, fresh, law, near, seen, float(sd[dead[0]]) if dead.size else 0.0)
         return Fitted(
             model=model,
             free=free,
@@ -367,7 +373,9 @@ class Fit:
         )
 
 
-def _misfit(left: FloatArray, fresh: FloatArray, law: Batch, near: Batch) -> tuple[float, float, float]:
+def _misfit(
+    left: FloatArray, fresh: FloatArray, law: Batch, near: Batch, seen: FloatArray, dead_error: float
+) -> tuple[float, float, float]:
     """Weighed square of the counts that the fit leaves, its standard deviations above fresh streams', probability.
 
     The probability is that of two tests together: the weighed square of all cells, and the largest departure of the
@@ -383,8 +391,34 @@ def _misfit(left: FloatArray, fresh: FloatArray, law: Batch, near: Batch) -> tup
     shape = drawn.mean() ** 2 / drawn.var()
     square = float(gammaincc(shape, mine * shape / drawn.mean()))
     gaps = slice(law.cells.phases, law.cells.phases + law.cells.gap_edges.size)
-    enough = np.cumsum(near.offset[gaps]) > _CUMULATED
+    cumulated = np.cumsum(near.offset[gaps])
+    enough = cumulated > _CUMULATED
     departure = np.abs(np.cumsum(left[gaps])) / (np.cumsum(fresh[:, gaps], axis=1).std(0) * noise**0.5)
     most = float(departure[enough].max(initial=0.0))
-    edge = float(min(1.0, 2.0 * enough.sum() * ndtr(-most)))
-    return mine, float((mine - drawn.mean()) / drawn.std()), min(1.0, 2.0 * min(square, edge))
+    late = 2.0 * enough.sum() * float(ndtr(-most))
+    first = _edge_probability(law.cells.gap_edges, cumulated, np.cumsum(seen[gaps]), dead_error)
+    return mine, float((mine - drawn.mean()) / drawn.std()), min(1.0, 2.0 * min(square, late + first))
+
+
+def _edge_probability(edges: FloatArray, expected: FloatArray, recorded: FloatArray, dead_error: float) -> float:
+    """Probability of a cumulated number of the shortest intervals as far from Poisson's law, of any edge.
+
+    `expected` (n,) intervals below `edges` (n,). Those of another dead time are the same, later by the difference: the
+    dead time within two of its standard errors for which they are most probable is taken. No linear law is used, which
+    the begin of the intervals does not have.
+    """
+    from scipy.special import gammainc, gammaincc
+
+    few = expected <= _CUMULATED
+    number = int(few.sum())
+    if number < 2:
+        return 1.0
+    at = np.r_[2.0 * edges[0] - edges[1], edges]
+    best = 0.0
+    for shift in np.linspace(-2.0, 2.0, 21) * dead_error:
+        mean = np.maximum(np.interp(edges[few] - shift, at, np.r_[0.0, expected]), 1e-3)
+        count = recorded[few]
+        above = np.where(count > 0.0, gammainc(np.maximum(count, 1e-9), mean), 1.0)  # of so many or more
+        below = gammaincc(count + 1.0, mean)
+        best = max(best, float(np.minimum(above, below).min()))
+    return min(1.0, 2.0 * number * best)

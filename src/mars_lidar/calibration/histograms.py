@@ -1,4 +1,4 @@
-"""What all pixels of a histogram cube share: dead time, pulse width, offset of the period, background floor.
+"""What all pixels of a histogram cube share: dead time, pulse width or a free response, background floor.
 
 Registrations h_j of a bin are expected to be e_j = l_j D_j, the light times the passes for which the pixel was armed,
 and differ from it by a martingale of variance e_j. So sum_j h_j log e_j - e_j is a quasi-likelihood (Wedderburn,
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,11 +18,13 @@ from mars_lidar._base import checks
 from mars_lidar._base.brief import brief
 from mars_lidar._base.types import FloatArray
 from mars_lidar.calibration.calibration import Estimate
-from mars_lidar.instrument.pulse import GaussianPulse
-from mars_lidar.instrument.system import System
+from mars_lidar.instrument.pulse import GaussianPulse, SampledPulse
+from mars_lidar.instrument.system import SPEED_OF_LIGHT_M_PER_NS, System
+from mars_lidar.light.flux import Flux
 from mars_lidar.reconstruction.fit_quality import tested_recordings
 from mars_lidar.reconstruction.histograms import Histograms, checked
 from mars_lidar.reconstruction.maximum_likelihood import MaximumLikelihood
+from mars_lidar.reconstruction.method import Estimates
 
 _PIXELS = 32  # that are fitted, the brightest
 _GRID = 13  # dead times of the first search, over a period
@@ -37,9 +39,14 @@ class CubeCalibration:
     ----------
     estimates
         ``dead_time_ns``, ``pulse_sigma_ns`` (of a Gaussian, jitter included), and ``background_floor``, photons per
-        period of the darkest fitted pixel, which none of them is below.
+        period of the darkest fitted pixel, which none of them is below. Of a single pixel ``signal``, ``background``,
+        ``delay_ns`` and ``depth_m`` too.
     system
-        The system given, with these.
+        The system given, with these; with ``pulse="free"`` its pulse is a `SampledPulse` in samples of a bin.
+    response_error
+        Standard errors of the samples of that pulse, in units of its `values`; else None.
+    counts, flux
+        The fitted pixels, the brightest first: histograms (pixels, bins), and their light, an image of one row.
     p_values
         (pixels,) of the fitted pixels: probability of a histogram as far from its own law.
     """
@@ -47,6 +54,9 @@ class CubeCalibration:
     estimates: dict[str, Estimate]
     system: System
     p_values: FloatArray
+    response_error: FloatArray | None
+    counts: FloatArray
+    flux: Flux
 
     __repr__ = brief
 
@@ -62,8 +72,12 @@ class CubeCalibration:
         return bool((self.p_values < 0.01).sum() <= expected + 4.0 * expected**0.5 + 1.0)
 
 
-def calibrate_cube(cube: ArrayLike, system: System) -> CubeCalibration:
-    """Dead time and pulse width that all pixels of a cube (..., bins) share, with errors.
+def calibrate_cube(
+    cube: ArrayLike, system: System, *, pulse: Literal["gaussian", "free"] = "gaussian"
+) -> CubeCalibration:
+    """Dead time and pulse that all pixels of a cube (..., bins) share, with errors.
+
+    Depth and an offset of the histograms from the laser pulse are one unknown, so that no offset is estimated.
 
     Parameters
     ----------
@@ -72,6 +86,9 @@ def calibrate_cube(cube: ArrayLike, system: System) -> CubeCalibration:
     system
         How they were recorded, with a free-running detector: its dead time and the width of its pulse are where the
         search begins, and are replaced by estimates.
+    pulse
+        ``"gaussian"``, of unknown width; or ``"free"``: a response in samples of a bin, over ten standard deviations of
+        the Gaussian that fits best on either side, whose centroid is the delay of a pixel.
 
     Raises
     ------
@@ -80,6 +97,7 @@ def calibrate_cube(cube: ArrayLike, system: System) -> CubeCalibration:
     """
     from scipy.optimize import minimize
 
+    checks.choice("pulse", pulse, ("gaussian", "free"))
     given, _ = checked(cube, system, 1)
     if not tested_recordings(system):
         raise ValueError(
@@ -114,19 +132,106 @@ def calibrate_cube(cube: ArrayLike, system: System) -> CubeCalibration:
     best = minimize(loss, np.array(start), method="Nelder-Mead", options=options)
     at = np.asarray(best.x, np.float64)
     errors = np.array([_half_width(loss, at, k, float(best.fun)) for k in range(2)])
-    final = trial(at)
+    final, response_error = trial(at), None
+    if pulse == "free":
+        # a dead time just below a period looks like the tail of a pulse, so that each is tried with its own response
+        reach = int(min(np.ceil(10.0 * np.exp(at[1]) / system.bin_ns) + 2, system.bins // 2 - 1))
+        trials = [_with_response(some, trial(np.array([d, at[1]])), reach, 1)[0] for d in (at[0], *grid)]
+        final = max(trials, key=lambda each: _log_likelihood(some, each))
+        for near in (most / _GRID, 0.2 * most / _GRID):
+            dead, errors[0] = _dead_time(some, final, near)
+            final = final.replace(detector=replace(final.detector, dead_time_ns=dead))
+            final, response_error = _with_response(some, final, reach, 2)
     light = MaximumLikelihood().estimate(Histograms(some, final, 1))
     p_values = np.asarray(light.p_value)
-    darkest = int(np.argmin(light.background))
-    floor = float(light.background[darkest])
-    floor_error = 0.0 if light.background_error is None else float(np.nan_to_num(light.background_error[darkest]))
     sigma = float(np.exp(at[1]))
-    estimates = {
-        "dead_time_ns": _normal(final.detector.dead_time_ns, errors[0]),
-        "pulse_sigma_ns": _normal(sigma, sigma * errors[1]),
-        "background_floor": _normal(floor, floor_error),
-    }
-    return CubeCalibration(estimates, final, p_values[np.isfinite(p_values)])
+    estimates = {"dead_time_ns": _normal(final.detector.dead_time_ns, errors[0])}
+    if pulse == "gaussian":
+        estimates["pulse_sigma_ns"] = _normal(sigma, sigma * errors[1])
+    estimates["background_floor"] = _of_pixel(light, "background", int(np.argmin(light.background)))
+    if len(given.counts) == 1:
+        metre = 0.5 * SPEED_OF_LIGHT_M_PER_NS
+        estimates["signal"] = _of_pixel(light, "signal", 0)
+        estimates["background"] = _of_pixel(light, "background", 0)
+        estimates["delay_ns"] = _of_pixel(light, "delay", 0, final.period_ns)
+        estimates["depth_m"] = _of_pixel(light, "delay", 0, final.period_ns * metre)
+    flux = Flux(light.signal[None], np.maximum(light.background, 0.0)[None], light.delay[None] * final.period_ns)
+    return CubeCalibration(
+        estimates, final, p_values[np.isfinite(p_values)], response_error, np.asarray(some, np.float64), flux
+    )
+
+
+def _of_pixel(light: Estimates, name: str, k: int, unit: float = 1.0) -> Estimate:
+    """An estimate of pixel k, with the other parameters of the cube at their estimates."""
+    errors = getattr(light, f"{name}_error")
+    return _normal(unit * float(getattr(light, name)[k]), 0.0 if errors is None else unit * float(errors[k]))
+
+
+def _with_response(
+    counts: FloatArray, system: System, reach: int, rounds: int, steps: int = 60
+) -> tuple[System, FloatArray]:
+    """The system with the most likely response in `reach` bins on either side, and the standard errors of its samples.
+
+    A bin j of pixel k expects D_kj (B_k / bins + S_k sum_m a_kjm r_m), with r the response, a the share of its sample
+    m that falls into the bin at the pixel's delay, and D the armed passes: maximized by expectation and maximization
+    (Shepp and Vardi, IEEE Trans. Med. Imaging 1, 113, 1982), then the light of each pixel again.
+    """
+    from scipy.sparse import csr_matrix
+
+    pixels, bins = counts.shape
+    width = system.period_ns / bins
+    samples = 2 * reach
+    error = np.zeros(samples)
+    edges = (np.arange(samples + 1) - reach) * width
+    response = np.maximum(np.diff(system.pulse.cumulative(edges)), 1e-6)
+    for _ in range(rounds):
+        light = MaximumLikelihood().estimate(Histograms(counts, system, 1))
+        passes = _armed_passes(counts, system)
+        first = light.delay * bins - reach  # where the first sample begins, in bins
+        whole = np.floor(first).astype(int)
+        share = first - whole  # of a sample that falls into the bin after
+        sample = np.arange(samples)
+        row = np.arange(pixels)[:, None] * bins
+        rows = np.stack([row + (whole[:, None] + sample) % bins, row + (whole[:, None] + sample + 1) % bins])
+        weight = np.stack([1.0 - share, share])[:, :, None] * np.ones(samples)
+        weight = weight * light.signal[None, :, None] * passes.ravel()[rows]
+        columns = np.broadcast_to(sample, rows.shape)
+        to_bins = csr_matrix((weight.ravel(), (rows.ravel(), columns.ravel())), (pixels * bins, samples))
+        floor = (passes * light.background[:, None] / bins).ravel()
+        recorded, exposed = counts.ravel(), np.maximum(np.asarray(to_bins.sum(0)).ravel(), 1e-9)
+        for _ in range(steps):
+            expected = np.maximum(to_bins @ response + floor, 1e-9)
+            response = response * (to_bins.T @ (recorded / expected)) / exposed
+        information = (to_bins.T @ to_bins.multiply((1.0 / expected)[:, None])).toarray()
+        error = np.sqrt(np.diag(np.linalg.pinv(information, rcond=1e-10, hermitian=True)))
+        system = system.replace(pulse=SampledPulse(response, bin_ns=width, origin="centroid"))
+    return system, error
+
+
+def _armed_passes(counts: FloatArray, system: System) -> FloatArray:
+    """Armed passes (pixels, bins) of each bin: what a light of one photon a bin would record."""
+    from mars_lidar._base.native import _core
+
+    bins = counts.shape[1]
+    light = np.tile([0.0, float(bins), 0.0], (len(counts), 1))
+    expected = np.empty(counts.shape)
+    _core.expected_registrations(Histograms(counts, system, 1).recording, counts, light, expected)
+    return expected
+
+
+def _dead_time(counts: FloatArray, system: System, reach: float) -> tuple[float, float]:
+    """The most likely dead time within `reach` of that of the system, and its standard error, with its pulse."""
+    from scipy.optimize import minimize_scalar
+
+    def loss(at: FloatArray) -> float:
+        detector = replace(system.detector, dead_time_ns=float(max(at[0], 0.0)))
+        return -_log_likelihood(counts, system.replace(detector=detector))
+
+    dead = system.detector.dead_time_ns
+    best = minimize_scalar(
+        lambda d: loss(np.array([d])), bounds=(max(dead - reach, 0.0), dead + reach), method="bounded"
+    )
+    return float(best.x), _half_width(loss, np.array([best.x]), 0, float(best.fun))
 
 
 def _normal(value: float, error: float) -> Estimate:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
+from mars_lidar._base.native import _core
 from mars_lidar._base.types import FloatArray
 from mars_lidar.calibration.recording import Clock
 from mars_lidar.instrument.avalanches import Afterpulsing
@@ -18,6 +20,7 @@ from mars_lidar.instrument.effects import Jitter
 from mars_lidar.instrument.pulse import GaussianPulse, Pulse
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
+from mars_lidar.light.timestamps import DrawnTimestamps
 from mars_lidar.simulation import simulate_timestamps
 
 _NARROWEST = 2e-6  # periods: the narrowest pulse that the engines draw
@@ -114,18 +117,33 @@ def effects(dead_time_ns: float) -> tuple[Effect, ...]:
 
 
 @dataclass(frozen=True, eq=False)
+class Streams:
+    """Recorded times (n,) of several streams one after the other, stream k in ``offsets[k]`` to ``offsets[k + 1]``."""
+
+    times: FloatArray
+    offsets: NDArray[np.int64]
+
+    def __iter__(self) -> Iterator[FloatArray]:
+        return (self.times[a:b] for a, b in pairwise(self.offsets))
+
+
+@dataclass(frozen=True, eq=False)
 class Model:
     """Parameters, in this order: background, (signal, delay) of each return, width2, jitter2, dead time, effects.
 
     Photons a period, ns and ns^2. `width2` is the variance of the recorded pulse, jitter included. With a `waveform`
     (shares of the light in equal parts of the period, jitter not included) there is no return, and the background is
-    all light. With a `pulse` its shape is known, before any jitter, and `width2` means nothing.
+    all light. `waveform_error` are the standard errors of these shares by a recording of `exposure` periods: simulated
+    streams have light that differs so much from the waveform, more in shorter ones as their counts do.
+    With a `pulse` its shape is known, before any jitter, and `width2` means nothing.
     """
 
     clock: Clock
     returns: int
     pulse: Pulse | None = None
     waveform: FloatArray | None = None
+    waveform_error: FloatArray | None = None
+    exposure: float = 1.0
     effects: tuple[Effect, ...] = ()
     fields: tuple[tuple[str, Any], ...] = ()  # of the detector, as given
 
@@ -210,7 +228,17 @@ class Model:
         delay = np.stack([rows[None, :, 2 + 2 * r] % period for r in range(self.returns)])
         return Flux(signal, back, delay) if self.returns > 1 else Flux(signal[0], back, delay[0])
 
-    def streams(self, rows: FloatArray, cycles: int, seed: int, extra: tuple[Effect, ...] = ()) -> list[FloatArray]:
+    def _varied(self, flux: Flux, cycles: int, seed: int) -> Flux:
+        """The light with shapes that are as uncertain as the waveform; the same where that is known."""
+        if self.waveform is None or self.waveform_error is None or flux.waveform is None:
+            return flux
+        light = flux.waveform.sum(-1, keepdims=True)
+        variance = self.waveform_error**2 * (self.exposure / cycles)
+        scale = variance / self.waveform  # of gamma laws, which have no negative light
+        shape = np.random.default_rng(seed).gamma(self.waveform / scale, size=flux.waveform.shape) * scale
+        return Flux(waveform=light * shape / shape.sum(-1, keepdims=True))
+
+    def streams(self, rows: FloatArray, cycles: int, seed: int, extra: tuple[Effect, ...] = ()) -> Streams:
         """Recorded times of a stream for each row of (rows, p); the detector is that of the first row, but its jitter.
 
         The jitter of a recorded time is drawn here, a normal deviate each, so that it may differ from row to row and
@@ -220,13 +248,17 @@ class Model:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a trial value may look like one in another unit
             system = self.system(rows[0], cycles, extra=extra, jitter=False)
-            made = simulate_timestamps(self.flux(rows), system, seed=seed, threads=1)
-        random = np.random.default_rng(seed)
-        t = made.times_ns
+            flux = self._varied(self.flux(rows), cycles, seed)
+            made = cast(DrawnTimestamps, simulate_timestamps(flux, system, seed=seed, threads=1))
         sigma = np.sqrt(rows[:, self.light + 1])
-        if (sigma > _NARROWEST * self.clock.period_ns).any():
-            t += np.repeat(sigma, np.diff(made.offsets)) * random.standard_normal(t.size)
-        return [self.clock.record(t[a:b]) for a, b in pairwise(made.offsets)]
+        sigma[sigma <= _NARROWEST * self.clock.period_ns] = 0.0
+        number = made.phase.size if sigma.any() else 0
+        deviates = np.random.default_rng(seed).standard_normal(number, dtype=np.float32)
+        times = np.empty(made.phase.size)
+        _core.recorded_times(
+            made.cycle, made.phase, made.offsets, sigma_ns=sigma, deviates=deviates, grid=self.clock.grid, out=times
+        )
+        return Streams(times, made.offsets)
 
     def with_effect(self, effect: Effect) -> Model:
         """This model with one effect more."""

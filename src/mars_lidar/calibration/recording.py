@@ -32,15 +32,16 @@ class Clock:
     offset: float = 0.0
     locked: bool = False
 
-    def record(self, t: FloatArray) -> FloatArray:
-        """Recorded times (n,), sorted, of avalanches at `t` (n,), ns, jitter included."""
-        if t.size > 1 and (t[1:] < t[:-1]).any():
-            t = np.sort(t, kind="stable")
-        if self.unit_ns == 0.0:
-            return t
-        start = np.floor(t * (1.0 / self.period_ns)) * self.period_ns if self.locked else 0.0
-        steps = np.floor((t - start) * (1.0 / self.unit_ns) + (0.5 - self.offset))
-        return np.asarray((steps + self.offset) * self.unit_ns + start)
+    @property
+    def repeats(self) -> bool:
+        """Whether the grid lies at the same phases of each laser period, for a thousand of them at least."""
+        units = self.period_ns / self.unit_ns if self.unit_ns else 0.5
+        return self.locked or abs(units - round(units)) < 1e-3
+
+    @property
+    def grid(self) -> tuple[float, float, float, bool]:
+        """(period, unit, offset, locked), as native code takes it."""
+        return self.period_ns, self.unit_ns, self.offset, self.locked
 
 
 @dataclass(frozen=True, eq=False)

@@ -130,10 +130,12 @@ def _best(fit: Fit, fitted: Fitted, tried: list[Score], limit: float) -> tuple[F
     if best is None:
         return None
     final, named = best
-    if named.effect.onoff:
-        clear_size = named.z > limit
-    else:
-        clear_size = final.theta[fitted.model.size] > limit * final.covariance[(k := len(fitted.free)), k] ** 0.5
+    if named.z > limit:  # of electronics the size may be wide: a short dead time of the detector acts as a long one
+        return best
+    clear_size = (
+        not named.effect.onoff
+        and final.theta[fitted.model.size] > limit * final.covariance[(k := len(fitted.free)), k] ** 0.5
+    )
     return best if clear_size or fitted.p_value < _MISFIT * final.p_value else None
 
 

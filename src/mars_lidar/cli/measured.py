@@ -16,6 +16,7 @@ from mars_lidar.cli.groups import argument, examples
 from mars_lidar.cli.options import of_output
 from mars_lidar.cli.options import out as out_option
 from mars_lidar.cli.stream_options import KnownOptions, StreamOptions
+from mars_lidar.instrument.pulse import SampledPulse
 from mars_lidar.instrument.system import MAX_CYCLES, SPEED_OF_LIGHT_M_PER_NS, System
 
 CALIBRATE_EPILOG = examples(
@@ -53,16 +54,19 @@ def calibrate(
         from mars_lidar.io.streams.photons import NoLaserError
 
         check_picture(picture, overwrite)
+        cube = stream.suffix in (".npy", ".zarr")
         if out is not None:
             if out.suffix not in (".yaml", ".yml", ".json"):
                 raise ValueError(f"--out must end in .yaml, .yml or .json, got {str(out)!r}")
-            if known.free or look:
+            if look or (known.free and not cube):
                 raise ValueError("--out needs a fitted pulse: leave out --free and --look, or --out")
             refuse_existing(out, overwrite)
         if cycles is not None:
             checks.integer("--cycles", cycles, low=1, high=MAX_CYCLES)
-        if stream.suffix in (".npy", ".zarr"):
-            if not _cube(stream, known, out).fits:
+        if cube:
+            if look or cycles is not None or known.given or known.pulse.build() is not None or known.returns != 1:
+                raise ValueError("a cube takes --system, --free, --out and --picture: its options are not a stream's")
+            if not _cube(stream, known, out, picture).fits:
                 raise typer.Exit(MISFIT)
             return
         given, shape = known.known(), known.shape()
@@ -93,8 +97,8 @@ def calibrate(
             raise typer.Exit(MISFIT)
 
 
-def _cube(path: Path, known: KnownOptions, out: Path | None) -> CubeCalibration:
-    """What the pixels of a cube share: printed, and written as a system."""
+def _cube(path: Path, known: KnownOptions, out: Path | None, picture: Path | None) -> CubeCalibration:
+    """What the pixels of a cube share: printed, written as a system, and drawn as the brightest pixel with its law."""
     if path.suffix == ".zarr":
         from mars_lidar.io import load
 
@@ -107,16 +111,31 @@ def _cube(path: Path, known: KnownOptions, out: Path | None) -> CubeCalibration:
                 f"{path} needs --system: laser period, cycles and bins of its histograms, and where to begin"
             )
         system, counts = System.load(known.system), read_npy(path)
-    result = calibrate_cube(counts, system)
+    result = calibrate_cube(counts, system, pulse="free" if known.free else "gaussian")
     rows = [("file", f"{path}: {counts.size // counts.shape[-1]:,} histograms of {counts.shape[-1]:,} bins")]
     units = {"background_floor": " photons per period, of the darkest of them"}
+    units |= {name: _UNITS[name] for name in ("signal", "background")}
     rows += [(name, f"{estimate}{units.get(name, '')}") for name, estimate in result.estimates.items()]
+    if isinstance(result.system.pulse, SampledPulse) and result.response_error is not None:
+        pulse = result.system.pulse
+        worst = 100.0 * float(result.response_error.max() / pulse.values.max())
+        rows.append(
+            (
+                "response",
+                f"{pulse.values.size} samples of {pulse.bin_ns:.5g} ns, errors up to {worst:.2g} % of its peak",
+            )
+        )
     verdict = "their histograms fit" if result.fits else "their histograms do NOT fit: another return, or an effect"
     rows.append(("verdict", f"{100 * result.misfits:.3g} % of {result.p_values.size} pixels have p < 1 %: {verdict}"))
     table(rows)
     if out is not None:
         result.system.save(out)
         table([("wrote", str(out))])
+    if picture is not None:
+        from mars_lidar.plot.figures import pixel_histogram
+
+        save_picture(pixel_histogram(result.counts[None], 0, 0, system=result.system, flux=result.flux), picture)
+        table([("picture", str(picture))])
     return result
 
 

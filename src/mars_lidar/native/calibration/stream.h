@@ -1,0 +1,105 @@
+// A stream of one pixel as a recorder writes it, and its counts in cells (src/mars_lidar/calibration/cells.py).
+#pragma once
+#include <algorithm>
+#include <cstdint>
+#include <utility>
+#include <vector>
+
+namespace mars {
+
+// The whole number below x, by a conversion: the baseline's std::floor is a call.
+inline double whole_below(double x) {
+    const double whole = static_cast<double>(static_cast<int64_t>(x));
+    return whole > x ? whole - 1.0 : whole;
+}
+
+// What a recorder writes for a time: the nearest point of a grid. `unit` its spacing (0: any real number), `offset` where
+// its points lie, in units; `locked` whether the grid begins anew with each laser pulse.
+struct RecorderClock {
+    double period;
+    double unit;
+    double offset;
+    bool locked;
+
+    double operator()(double t) const {
+        if (unit == 0.0) return t;
+        const double start = locked ? whole_below(t * (1.0 / period)) * period : 0.0;
+        const double steps = whole_below((t - start) * (1.0 / unit) + (0.5 - offset));
+        return (steps + offset) * unit + start;
+    }
+};
+
+// Sorts times of which jitter has exchanged few.
+inline void sort_nearly_sorted(double* t, int64_t n) {
+    for (int64_t k = 1; k < n; ++k) {
+        const double value = t[k];
+        int64_t at = k;
+        for (; at > 0 && t[at - 1] > value; --at) t[at] = t[at - 1];
+        t[at] = value;
+    }
+}
+
+// Cells of a stream: of phases, of intervals, and of (class of the interval, class of the phase at its begin, does it
+// end in a pulse), in this order. `phase_of`, `class_of` (even numbers) and `lit_of` (0 or 1) have one entry for each of
+// equal parts of the period; `age_of` one for each cell of the intervals.
+struct StreamCells {
+    double period, shift;  // shift of the parts, in periods
+    std::vector<int32_t> phase_of, class_of, lit_of;
+    std::vector<double> gap_edges;
+    std::vector<int32_t> age_of;
+    int64_t phases, classes, ages;
+
+    int64_t gaps() const { return static_cast<int64_t>(gap_edges.size()) + 1; }
+    int64_t size() const { return phases + gaps() + ages * classes; }
+};
+
+// Counts streams, each interval by a look-up in equal parts up to the last edge.
+class StreamCounter {
+ public:
+    explicit StreamCounter(const StreamCells& cells) : cells_(cells), first_(kParts + 1) {
+        const double top = cells.gap_edges.empty() ? 1.0 : cells.gap_edges.back();
+        scale_ = kParts / top;
+        for (int64_t k = 0; k <= kParts; ++k) {
+            const double begin = static_cast<double>(k) / scale_ * (1.0 - 1e-9);
+            first_[k] =
+                std::lower_bound(cells.gap_edges.begin(), cells.gap_edges.end(), begin) - cells.gap_edges.begin();
+        }
+    }
+
+    // Adds the counts of sorted times t (n) to out (size).
+    void operator()(const double* t, int64_t n, double* out) const {
+        double* const gaps = out + cells_.phases;
+        double* const table = gaps + cells_.gaps();
+        const double rate = 1.0 / cells_.period, parts = static_cast<double>(cells_.phase_of.size());
+        int64_t begin = 0;  // class of the phase of the time before
+        for (int64_t k = 0; k < n; ++k) {
+            double phase = t[k] * rate + cells_.shift;
+            phase -= whole_below(phase);
+            const size_t part = std::min(static_cast<size_t>(phase * parts), cells_.phase_of.size() - 1);
+            out[cells_.phase_of[part]] += 1.0;
+            if (k > 0) {
+                const int64_t gap = gap_of(t[k] - t[k - 1]);
+                gaps[gap] += 1.0;
+                table[cells_.age_of[gap] * cells_.classes + begin + cells_.lit_of[part]] += 1.0;
+            }
+            begin = cells_.class_of[part];
+        }
+    }
+
+ private:
+    static constexpr int64_t kParts = 4096;
+
+    // Number of edges below an interval.
+    int64_t gap_of(double interval) const {
+        const double place = interval * scale_;
+        int64_t gap = first_[place < kParts ? static_cast<int64_t>(place) : kParts];
+        while (gap < static_cast<int64_t>(cells_.gap_edges.size()) && cells_.gap_edges[gap] < interval) ++gap;
+        return gap;
+    }
+
+    const StreamCells& cells_;
+    std::vector<int64_t> first_;
+    double scale_ = 1.0;
+};
+
+}  // namespace mars

@@ -3,8 +3,8 @@
 ``python -m tests.calibration.electronics_bound``
 
 Streams of a detector of 50 ns behind electronics of 60 ns, and of a detector of 60 ns, are counted in fine cells of
-(interval, phase at its begin); the chi-square between both, less what light, pulse, jitter and dead time can take up and
-less the noise of the simulation, grows with the photons and is the square of the largest score.
+(interval, phase at its begin); the chi-square between both, less what light, pulse, jitter and dead time can take up
+and less the noise of the simulation, grows with the photons and is the square of the largest score.
 """
 
 from __future__ import annotations

@@ -54,8 +54,8 @@ ml.joint_law(flux[y, x], system)
 
 # %%
 estimate = ml.reconstruct(counts, system)
-error_m = np.abs(estimate.depth_m[0] - scene.depth_m)[estimate.seen[0]]
-print(f"median error {1e3 * np.median(error_m):.1f} mm over {100 * estimate.seen.mean():.1f} % of the pixels")
+error_m = np.abs(estimate.depth_m[0] - scene.depth_m)[estimate.detected[0]]
+print(f"median error {1e3 * np.median(error_m):.1f} mm over {100 * estimate.detected.mean():.1f} % of the pixels")
 estimate
 
 # %% [markdown]

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.memory import check_memory
-from mars_lidar._base.progress import shown
+from mars_lidar._base.progress import callback_of
 from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import FloatArray, Progress
 from mars_lidar.engines import Engine, EngineOptions, check_detector, find_engine
@@ -248,7 +248,7 @@ def _task(
     number = checks.integer("realizations", realizations, low=1, high=2**32 - first)
     seed = checks.integer("seed", seed, low=0, high=2**64 - 1)
     team = thread_count(threads)
-    progress = shown(progress, "simulating")
+    progress = callback_of(progress, "simulating")
     if len(flux.returns_signal) > MAX_RETURNS:
         raise ValueError(
             f"flux must have at most {MAX_RETURNS} returns, got {len(flux.returns_signal)}; use a waveform"

@@ -30,7 +30,7 @@ from mars_lidar._base.files import (
     open_own,
     successor,
 )
-from mars_lidar._base.progress import shown
+from mars_lidar._base.progress import callback_of
 from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import Progress
 from mars_lidar._version import __version__
@@ -148,7 +148,7 @@ def generate(
     (2, 1, 8, 12, 64)
     """
     began = time.perf_counter()
-    progress = shown(progress, "generating")
+    progress = callback_of(progress, "generating")
     target = _target(out)
     threads = None if threads is None else checks.integer("threads", threads, low=1, high=1024)
     with _begun(recipe, target, resume, overwrite, _crew(workers, scheduler)) as (store, dataset, crew):
@@ -225,7 +225,7 @@ def make_part(
         with _told(store, target):
             mine = _share(list(dataset.items()), which, of)
             todo = dataset.missing(mine)
-            totals = _Totals(len(mine) - len(todo), len(mine), shown(progress, "generating"))
+            totals = _Totals(len(mine) - len(todo), len(mine), callback_of(progress, "generating"))
             _make(dataset, _here(dataset, len(todo), threads), todo, totals)
     return totals.generated(target, dataset, time.perf_counter() - began)
 

@@ -160,8 +160,8 @@ def _draw_maps(
     if cube.reflectivity is not None:
         _draw_map(axes[1], cube.reflectivity, "reflectivity", "gray", None, "Reflectivity")
     else:
-        shown = cube.flux.signal
-        _draw_map(axes[1], shown, "photons per period", "gray", _limits(shown) if fit else None, f"Signal{fit}")
+        signal = cube.flux.signal
+        _draw_map(axes[1], signal, "photons per period", "gray", _limits(signal) if fit else None, f"Signal{fit}")
     _draw_map(axes[2], totals, "registrations", "magma", _limits(totals), "Total counts")
     note = "Peak-bin depth"
     error = np.abs(depth_error_m(cube, peaks_m))

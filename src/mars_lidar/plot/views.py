@@ -166,7 +166,7 @@ def fitted(cube: Cube, realization: int) -> Cube:
             METHODS[name].check(system)
             break
     estimate = reconstruct(counts, system, name)
-    with_return = estimate.seen & np.isfinite(estimate.signal)
+    with_return = estimate.detected & np.isfinite(estimate.signal)
     flux = Flux(
         np.where(with_return, estimate.signal, 0.0),
         np.where(np.isfinite(estimate.background), estimate.background, 0.0),

@@ -138,12 +138,12 @@ def _information(
     share: FloatArray,
 ) -> FloatArray:
     """(R18) of (all S, B, all delays) from S (..., K, 1), B (...), and energy and its slope (..., K, bins)."""
-    seen = system.detector.detection_efficiency  # of the photons; dark counts come on top of them
+    efficiency = system.detector.detection_efficiency  # of the photons; dark counts come on top of them
     dark = 1e-9 * system.detector.dark_count_hz * system.period_ns
     flat = share / system.bins
-    rate = seen * (signal * energy).sum(-2) + (seen * background[..., None] + dark) * flat
+    rate = efficiency * (signal * energy).sum(-2) + (efficiency * background[..., None] + dark) * flat
     by_background = np.broadcast_to(flat, rate.shape)[..., None, :]
-    gradient = seen * np.concatenate([energy, by_background, signal * slope], axis=-2)
+    gradient = efficiency * np.concatenate([energy, by_background, signal * slope], axis=-2)
     weight = np.where(rate > 0, mean / np.where(rate > 0, rate, 1.0) ** 2, 0.0)  # E[D] / l = E[h] / l^2
     if system.detector.mode == "synchronous" or system.detector.dead_time_ns >= system.bin_ns:
         x = np.clip(0.5 * rate, 1e-6, 300.0)
@@ -223,5 +223,5 @@ def _variances(information: FloatArray) -> FloatArray:
     blank = value <= _SINGULAR * value[-1]
     if not blank.any():
         return np.asarray(np.diag(np.linalg.inv(information)))
-    seen = (vector[:, ~blank] ** 2 / value[~blank]).sum(-1) / size**2
-    return np.asarray(np.where((vector[:, blank] ** 2).sum(-1) > _SINGULAR, np.inf, seen))
+    variances = (vector[:, ~blank] ** 2 / value[~blank]).sum(-1) / size**2
+    return np.asarray(np.where((vector[:, blank] ** 2).sum(-1) > _SINGULAR, np.inf, variances))

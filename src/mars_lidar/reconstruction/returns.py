@@ -50,8 +50,8 @@ def returns_of(values: FloatArray | None, system: System, shape: tuple[int, ...]
     """Those (..., K) of the estimates (pixels, K, columns) of a method; None where it looks for one only."""
     if values is None:
         return None
-    found = values.reshape(*shape, *values.shape[1:])
-    delay, signal, delay_error, signal_error, false_alarm = np.moveaxis(found, -1, 0)
+    columns = values.reshape(*shape, *values.shape[1:])
+    delay, signal, delay_error, signal_error, false_alarm = np.moveaxis(columns, -1, 0)
     period = system.period_ns
     delay = np.where(delay >= 1.0, 0.0, delay) * period
     return Returns(

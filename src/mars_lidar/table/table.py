@@ -24,7 +24,7 @@ from mars_lidar._base.arguments import checked
 from mars_lidar._base.brief import brief
 from mars_lidar._base.files import reading, reason
 from mars_lidar._base.memory import check_memory
-from mars_lidar._base.progress import of_part, shown
+from mars_lidar._base.progress import callback_of, of_part
 from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import FloatArray, Progress
 from mars_lidar._version import __version__
@@ -179,7 +179,7 @@ class Table:
         tolerance = checks.real("tolerance", tolerance, low=1e-9, high=0.1)
         if not isinstance(check_law, bool):
             raise TypeError(f"check_law must be True or False, got {check_law!r}")
-        progress = shown(progress, "building a table")
+        progress = callback_of(progress, "building a table")
         recipe = Recipe(method, rearm, tolerance, thread_count(threads))
         began = time.perf_counter()
         if goal is None:

@@ -91,7 +91,7 @@ class Jitter:
         return np.asarray(ndtr(t / self.sigma_ns) - self.tail_fraction * late, dtype=np.float64)
 
     def integral(self, t_ns: ArrayLike) -> FloatArray:
-        """Integral of `cumulative` from -infinity to t (...), ns."""
+        """Integral of `cumulative` from -infinity to `t_ns` (...), ns."""
         from scipy.special import ndtr
 
         t = np.asarray(t_ns, dtype=np.float64)
@@ -113,7 +113,7 @@ class Jitter:
         return np.asarray(np.where(x > -5.0, near, np.exp(exponent) * ndtr(z - ratio)), dtype=np.float64)
 
     def check(self, period_ns: float) -> None:
-        """Sigma from 1e-6 to 1/20 period: 8.5 sigma lie within half a period. The tail's mean up to a period."""
+        """Sigma from 1e-6 to 1/20 of `period_ns`: 8.5 sigma lie within half a period. The tail's mean up to it."""
         if not 1e-6 * period_ns <= self.sigma_ns <= 0.05 * period_ns:
             raise ValueError(
                 f"sigma_ns of a jitter must lie in [{1e-6 * period_ns:g}, {0.05 * period_ns:g}] ns "
@@ -204,7 +204,7 @@ class SampledJitter:
         return self.shape.cumulative(t_ns)
 
     def integral(self, t_ns: ArrayLike) -> FloatArray:
-        """Integral of `cumulative` from -infinity to t (...), ns."""
+        """Integral of `cumulative` from -infinity to `t_ns` (...), ns: quadratic on each sample."""
         t, edges = np.asarray(t_ns, dtype=np.float64), self._edges()
         level = self.cumulative(edges)
         below = np.concatenate([[0.0], np.cumsum(0.5 * (level[1:] + level[:-1]) * np.diff(edges))])

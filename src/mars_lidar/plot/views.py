@@ -26,10 +26,46 @@ _PREDICTED_CYCLES = 20_000  # an exposure whose state never settles costs some 1
 
 @checked
 def count_maps(cube: Cube, realization: int = 0) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Total counts (H, W), and the depth (H, W) in m at the largest bin: NaN where nothing was counted.
+    """Total counts, and the depth at the largest bin.
 
     The depth is that of the bin's centre, with the distance between the pulse's peak and its origin taken
     off; modulo the unambiguous range. The first of several equal bins is taken.
+
+    Parameters
+    ----------
+    cube
+        A cube in memory or on disk, read in bands of rows.
+    realization
+        Which exposure, counted from the start of the cube.
+
+    Returns
+    -------
+    tuple
+        Counts (H, W), and depth (H, W) in m: NaN where nothing was counted.
+
+    Raises
+    ------
+    TypeError
+        No cube.
+    ValueError
+        A realization outside of the cube.
+
+    See Also
+    --------
+    depth_error_m, overview
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> flux = ml.Flux(signal=1.0, background=0.1, delay_ns=40.0)
+    >>> cube = ml.Cube(ml.simulate(flux, system, seed=0), system, flux)
+    >>> totals, depth_m = ml.plot.count_maps(cube)
+    >>> totals.shape, abs(float(depth_m[0, 0]) - 6.0) < 0.3
+    ((1, 1), True)
     """
     realizations, height, width, bins = cube.shape
     realization = checks.integer("realization", realization, low=0, high=realizations - 1)
@@ -52,6 +88,41 @@ def example_pixels(flux: Flux, depth_m: NDArray[np.float64]) -> dict[str, tuple[
 
     Bright and dim are the 98th and the 5th percentile of the signal among pixels with a return; the edge is
     the steepest step in depth. The rim of the image is left out, where recorded images have their artefacts.
+
+    Parameters
+    ----------
+    flux
+        The light of the image (H, W).
+    depth_m
+        (H, W) depth, m; NaN without a return.
+
+    Returns
+    -------
+    dict
+        Row and column by name.
+
+    Raises
+    ------
+    TypeError
+        No `Flux`, or a depth that is no array of numbers.
+    ValueError
+        A depth of another shape than the flux.
+
+    See Also
+    --------
+    overview
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> scene = ml.Scene.example("room", size=32)
+    >>> flux = scene.flux(system, signal=0.5, sbr=2.0)
+    >>> sorted(ml.plot.example_pixels(flux, scene.depth_m))
+    ['bright', 'dim', 'edge']
     """
     flux = flux.image
     if np.shape(depth_m) != flux.shape:
@@ -104,7 +175,42 @@ def instrument(system: System) -> str:
 
 @checked
 def incident_rate(flux: Flux, system: System, y: int, x: int) -> NDArray[np.float64]:
-    """Photons per period in each bin (bins,) that reach pixel (y, x), before gate and dead time."""
+    """Photons per period in each bin that reach a pixel, before gate and dead time.
+
+    Parameters
+    ----------
+    flux, system
+        The light of the image (H, W), photons per period, and what registers it.
+    y, x
+        Row and column of the pixel, from 0.
+
+    Returns
+    -------
+    NDArray
+        (bins,) expected photons per period.
+
+    Raises
+    ------
+    TypeError
+        No `Flux` or no `System`.
+    ValueError
+        A pixel outside of the image.
+
+    See Also
+    --------
+    pixel_histogram, mars_lidar.statistics.photons_per_bin
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> rate = ml.plot.incident_rate(ml.Flux(1.0, 0.5, 40.0), system, 0, 0)
+    >>> round(float(rate.sum()), 6)  # S + B
+    1.5
+    """
     flux = flux.image
     y, x = (checks.integer(name, k, low=0, high=n - 1) for name, k, n in zip("yx", (y, x), flux.shape, strict=True))
     return photons_per_bin(flux[y, x], system.detected(), bins=system.bins)
@@ -135,7 +241,44 @@ def predicted_counts(cube: Cube, y: int, x: int) -> NDArray[np.float64] | None:
 
 @checked
 def depth_error_m(cube: Cube, estimate_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Estimated minus true depth (H, W), m, modulo the unambiguous range; NaN where either is missing."""
+    """Estimated minus true depth, modulo the unambiguous range.
+
+    Parameters
+    ----------
+    cube
+        A cube whose true depth is known, or fitted.
+    estimate_m
+        (H, W) depth, m; NaN where there is none.
+
+    Returns
+    -------
+    NDArray
+        (H, W) difference, m; NaN where either is missing.
+
+    Raises
+    ------
+    TypeError
+        No cube, or estimates that are no array of numbers.
+    ValueError
+        Estimates of another shape than the image.
+
+    See Also
+    --------
+    count_maps
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> flux = ml.Flux(signal=1.0, background=0.1, delay_ns=40.0)
+    >>> cube = ml.Cube(ml.simulate(flux, system, seed=0), system, flux)
+    >>> error_m = ml.plot.depth_error_m(cube, ml.reconstruct(cube).depth_m[0])
+    >>> abs(float(error_m[0, 0])) < 0.05
+    True
+    """
     if np.shape(estimate_m) != cube.shape[1:3]:
         raise ValueError(f"estimate_m must be {cube.shape[1:3]} as the cube, got shape {np.shape(estimate_m)}")
     return depth_lag_m(cube.system, np.asarray(estimate_m), cube.depth_m)

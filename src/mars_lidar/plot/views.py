@@ -6,12 +6,12 @@ from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
 from mars_lidar.instrument.system import System
-from mars_lidar.io.cube import Cube
+from mars_lidar.io.cube import Cube, as_cube
 from mars_lidar.io.layout import MEASURED
 from mars_lidar.io.recipe import Recipe
 from mars_lidar.light.flux import Flux
@@ -25,12 +25,15 @@ _PREDICTED_CYCLES = 20_000  # an exposure whose state never settles costs some 1
 
 
 @checked
-def count_maps(cube: Cube, realization: int = 0) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def count_maps(
+    cube: Cube | ArrayLike, realization: int = 0, *, system: System | None = None
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Total counts (H, W), and the depth (H, W) in m at the largest bin: NaN where nothing was counted.
 
-    The depth is that of the bin's centre, with the distance between the pulse's peak and its origin taken
-    off; modulo the unambiguous range. The first of several equal bins is taken.
+    Of a cube, or of counts as `simulate` returns them with their `system`. The depth is that of the bin's centre, with
+    the distance between the pulse's peak and its origin taken off; modulo the unambiguous range. The first of several equal bins is taken.
     """
+    cube = as_cube(cube, system)
     realizations, height, width, bins = cube.shape
     realization = checks.integer("realization", realization, low=0, high=realizations - 1)
     totals = np.empty((height, width), np.int64)
@@ -134,8 +137,18 @@ def predicted_counts(cube: Cube, y: int, x: int) -> NDArray[np.float64] | None:
 
 
 @checked
-def depth_error_m(cube: Cube, estimate_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Estimated minus true depth (H, W), m, modulo the unambiguous range; NaN where either is missing."""
+def depth_error_m(
+    cube: Cube | ArrayLike,
+    estimate_m: NDArray[np.float64],
+    *,
+    system: System | None = None,
+    flux: Flux | None = None,
+) -> NDArray[np.float64]:
+    """Estimated minus true depth (H, W), m, modulo the unambiguous range; NaN where either is missing.
+
+    Of a cube, or of counts as `simulate` returns them with their `system` and `flux`, whose delays are the truth.
+    """
+    cube = as_cube(cube, system, flux)
     if np.shape(estimate_m) != cube.shape[1:3]:
         raise ValueError(f"estimate_m must be {cube.shape[1:3]} as the cube, got shape {np.shape(estimate_m)}")
     return depth_lag_m(cube.system, np.asarray(estimate_m), cube.depth_m)

@@ -31,7 +31,8 @@ def count_maps(
     """Total counts (H, W), and the depth (H, W) in m at the largest bin: NaN where nothing was counted.
 
     Of a cube, or of counts as `simulate` returns them with their `system`. The depth is that of the bin's centre, with
-    the distance between the pulse's peak and its origin taken off; modulo the unambiguous range. The first of several equal bins is taken.
+    the distance between the pulse's peak and its origin taken off; modulo the unambiguous range. The first of several
+    equal bins is taken.
     """
     cube = as_cube(cube, system)
     realizations, height, width, bins = cube.shape

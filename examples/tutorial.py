@@ -43,7 +43,7 @@ ml.plot.map_image(counts[0].sum(-1), "registrations")
 # %%
 y, x = 20, 30
 law = ml.count_law(flux[y, x], system)
-print(f"drawn {counts[0, y, x].sum()}, expected {law.mean:.1f} ± {np.sqrt(law.variance):.1f}")
+print(f"drawn {counts[0, y, x].sum()}, expected {law.mean:.1f} ± {law.std:.1f}")
 law
 
 # %%

@@ -272,7 +272,7 @@ CALLS: dict[str, Callable[[Path], tuple[Callable[..., Any], dict[str, Any]]]] = 
     "plot.map_image": lambda _: (plot.map_image, {"values": np.ones((2, 3)), "label": "depth"}),
     "plot.overview": lambda at: (plot.overview, {"cube": io.load(at / "cube.zarr")}),
     "plot.pixel_histogram": lambda at: (plot.pixel_histogram, {"cube": io.load(at / "cube.zarr"), "y": 0, "x": 0}),
-    "Table.lookup": lambda _: (table().lookup, {"signal": 0.5, "background": 0.5}),
+    "Table.lookup": lambda _: (table().lookup, {"flux": PIXEL}),
     "dataset.Light": lambda _: (Light, {}),
     "load_maps": lambda at: (load_maps, {"path": at / "maps.npz"}),
 }
@@ -339,7 +339,6 @@ ACCEPTED: dict[tuple[str, str, str], str] = {
     ("*", "out", "None"): "as if it were not given",
     ("io.Recipe", "depth_m", "None"): "as if it were not given",
     ("statistics.PhaseChain", "cell", "*"): "free text, for messages",
-    ("Table.lookup", "*", "shape"): "of an image of any shape",
     ("plot.map_image", "label", "*"): "free text",
     ("plot.overview", "title", "*"): "free text",
     ("Timestamps.pixel", "*", "-1"): "from the end, as everywhere in Python",
@@ -375,6 +374,7 @@ ANCESTORS = {
     **dict.fromkeys(("RecipeError", "FileError", "IncompleteFileError", "UnicodeDecodeError"), ("ValueError",)),
 }
 UNDOCUMENTED = {name for name in CALLS if name.startswith("io.")} | {"calibrate", "Cube", "to_xarray"}
+UNDOCUMENTED |= {"estimate", "open_dataset", "dataset.verify", "dataset.Light", "read_sparse", "read_view", "load_maps"}
 
 
 def accepted(call: str, argument: str, label: str) -> bool:

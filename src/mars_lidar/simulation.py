@@ -186,6 +186,8 @@ def simulate_timestamps(
 
     Raises
     ------
+    TypeError
+        An argument of another type, or an unknown keyword.
     ValueError
         As `simulate`; also for an engine that draws histograms only.
     MemoryError

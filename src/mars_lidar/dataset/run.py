@@ -135,6 +135,8 @@ def generate(
 
     Raises
     ------
+    FileNotFoundError
+        The recipe or a file that it names.
     ValueError, TypeError
         A bad recipe or argument; nothing was written.
     FileExistsError

@@ -47,6 +47,8 @@ class Afterpulsing:
 
     Raises
     ------
+    TypeError
+        A probability or delay that is no number.
     ValueError
         A probability outside (0, 1), a delay that is not positive, or both `delay_ns` and `delays`.
 
@@ -184,6 +186,8 @@ class Crosstalk:
 
     Raises
     ------
+    TypeError
+        A probability that is no number; a kernel of another kind.
     ValueError
         A probability outside (0, 1], or weights that are not (3, 3), finite, non-negative and 0 in the middle.
 

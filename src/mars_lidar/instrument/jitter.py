@@ -32,6 +32,8 @@ class Jitter:
 
     Raises
     ------
+    TypeError
+        A width or fraction that is no number.
     ValueError
         `sigma_ns` is not positive, or one of `tail_ns` and `tail_fraction` is 0 without the other.
 
@@ -144,6 +146,8 @@ class SampledJitter:
 
     Raises
     ------
+    TypeError
+        Values or times that are no numbers.
     ValueError
         Samples that are not 1-D, finite and non-negative, or sum to 0.
 
@@ -214,7 +218,7 @@ class SampledJitter:
         return np.asarray(area + np.maximum(t - edges[-1], 0.0), dtype=np.float64)
 
     def check(self, period_ns: float) -> None:
-        """The record fits in the period."""
+        """The record fits in the period `period_ns`."""
         self.shape.check(period_ns)
 
     def to_dict(self) -> dict[str, Any]:

@@ -129,6 +129,8 @@ class GaussianPulse(Pulse):
 
     Raises
     ------
+    TypeError
+        A width that is no number.
     ValueError
         `sigma_ns` is not positive and finite; `System` asks for 1e-6 to 1 period.
 
@@ -220,6 +222,8 @@ class SampledPulse(Pulse):
 
     Raises
     ------
+    TypeError
+        Values or times that are no numbers.
     ValueError
         Samples that are not 1-D, finite and non-negative, or sum to 0; `System` asks that the record fits in a period.
 

@@ -802,7 +802,7 @@ def _passed(
         share = mean / mean.sum(-1, keepdim=True).clamp_min(1e-300) if parts > 1 else 1.0
         fine = (counts.unsqueeze(-1) * share).flatten(-2) if parts > 1 else counts
         blind, late, rearmed = _rearmings(fine, delay, system)
-        late, rearmed = (one.reshape(*one.shape[:-1], system.bins, parts) for one in (late, rearmed))
+        late, rearmed = (x.reshape(*x.shape[:-1], system.bins, parts) for x in (late, rearmed))
         within = rearmed.sum(-1)
         start = torch.maximum(system.cycles - blind[..., ::parts], (counts - within).clamp_min(0.0))
         armed, means = start, []

@@ -81,7 +81,7 @@ class HistogramTable(torch.nn.Module):
             if len(axis) < 2:
                 raise ValueError(f"table must have at least two values of {name}, got one")
         s, b = torch.cartesian_prod(*axes).unbind(-1)
-        mean = table.lookup(s.numpy(), b.numpy(), interpolation="nearest", cycles=system.cycles).cumulants[:, :1]
+        mean = table.at(s.numpy(), b.numpy(), interpolation="nearest", cycles=system.cycles).cumulants[:, :1]
         self.system = system
         self.signal: torch.Tensor
         self.background: torch.Tensor

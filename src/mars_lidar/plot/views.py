@@ -6,12 +6,12 @@ from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
 from mars_lidar.instrument.system import System
-from mars_lidar.io.cube import Cube
+from mars_lidar.io.cube import Cube, as_cube
 from mars_lidar.io.layout import MEASURED
 from mars_lidar.io.recipe import Recipe
 from mars_lidar.light.flux import Flux
@@ -25,7 +25,9 @@ _PREDICTED_CYCLES = 20_000  # an exposure whose state never settles costs some 1
 
 
 @checked
-def count_maps(cube: Cube, realization: int = 0) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def count_maps(
+    cube: Cube | ArrayLike, realization: int = 0, *, system: System | None = None
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Total counts, and the depth at the largest bin.
 
     The depth is that of the bin's centre, with the distance between the pulse's peak and its origin taken
@@ -34,9 +36,11 @@ def count_maps(cube: Cube, realization: int = 0) -> tuple[NDArray[np.int64], NDA
     Parameters
     ----------
     cube
-        A cube in memory or on disk, read in bands of rows.
+        A cube in memory or on disk, read in bands of rows; or counts as `simulate` returns them.
     realization
         Which exposure, counted from the start of the cube.
+    system
+        Beside an array of counts: how they were recorded.
 
     Returns
     -------
@@ -46,7 +50,7 @@ def count_maps(cube: Cube, realization: int = 0) -> tuple[NDArray[np.int64], NDA
     Raises
     ------
     TypeError
-        No cube.
+        No cube, or no array of counts with its system.
     ValueError
         A realization outside of the cube.
 
@@ -61,12 +65,12 @@ def count_maps(cube: Cube, realization: int = 0) -> tuple[NDArray[np.int64], NDA
     ...     period_ns=100.0, cycles=1000, bins=128,
     ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
     ... )
-    >>> flux = ml.Flux(signal=1.0, background=0.1, delay_ns=40.0)
-    >>> cube = ml.Cube(ml.simulate(flux, system, seed=0), system, flux)
-    >>> totals, depth_m = ml.plot.count_maps(cube)
+    >>> counts = ml.simulate(ml.Flux(signal=1.0, background=0.1, delay_ns=40.0), system, seed=0)
+    >>> totals, depth_m = ml.plot.count_maps(counts, system=system)
     >>> totals.shape, abs(float(depth_m[0, 0]) - 6.0) < 0.3
     ((1, 1), True)
     """
+    cube = as_cube(cube, system)
     realizations, height, width, bins = cube.shape
     realization = checks.integer("realization", realization, low=0, high=realizations - 1)
     totals = np.empty((height, width), np.int64)
@@ -240,15 +244,23 @@ def predicted_counts(cube: Cube, y: int, x: int) -> NDArray[np.float64] | None:
 
 
 @checked
-def depth_error_m(cube: Cube, estimate_m: NDArray[np.float64]) -> NDArray[np.float64]:
+def depth_error_m(
+    cube: Cube | ArrayLike,
+    estimate_m: NDArray[np.float64],
+    *,
+    system: System | None = None,
+    flux: Flux | None = None,
+) -> NDArray[np.float64]:
     """Estimated minus true depth, modulo the unambiguous range.
 
     Parameters
     ----------
     cube
-        A cube whose true depth is known, or fitted.
+        A cube whose true depth is known, or fitted; or counts as `simulate` returns them.
     estimate_m
         (H, W) depth, m; NaN where there is none.
+    system, flux
+        Beside an array of counts: how they were recorded, and the light, whose delays are the truth.
 
     Returns
     -------
@@ -258,7 +270,7 @@ def depth_error_m(cube: Cube, estimate_m: NDArray[np.float64]) -> NDArray[np.flo
     Raises
     ------
     TypeError
-        No cube, or estimates that are no array of numbers.
+        No cube, or no array of counts with its system; estimates that are no array of numbers.
     ValueError
         Estimates of another shape than the image.
 
@@ -274,11 +286,12 @@ def depth_error_m(cube: Cube, estimate_m: NDArray[np.float64]) -> NDArray[np.flo
     ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
     ... )
     >>> flux = ml.Flux(signal=1.0, background=0.1, delay_ns=40.0)
-    >>> cube = ml.Cube(ml.simulate(flux, system, seed=0), system, flux)
-    >>> error_m = ml.plot.depth_error_m(cube, ml.reconstruct(cube).depth_m[0])
-    >>> abs(float(error_m[0, 0])) < 0.05
+    >>> counts = ml.simulate(flux, system, seed=0)
+    >>> depth_m = ml.reconstruct(counts, system).depth_m[0]
+    >>> abs(float(ml.plot.depth_error_m(counts, depth_m, system=system, flux=flux)[0, 0])) < 0.05
     True
     """
+    cube = as_cube(cube, system, flux)
     if np.shape(estimate_m) != cube.shape[1:3]:
         raise ValueError(f"estimate_m must be {cube.shape[1:3]} as the cube, got shape {np.shape(estimate_m)}")
     return depth_lag_m(cube.system, np.asarray(estimate_m), cube.depth_m)

@@ -222,12 +222,12 @@ class PhaseChain:
         """Mass armed at the *start* of each bin (n,), when `mass` (n,) is registered in each bin (2.4)."""
         return cyclic_recursion(self.keep, self.rekeep * self.rearmed(mass), self.loss)
 
-    def left(self, x: ArrayLike) -> FloatArray:
+    def forward(self, x: ArrayLike) -> FloatArray:
         """The product x P of a distribution `x` (n,) with the transition matrix, in O(n) (2.4)."""
         mass = _vector("x", x, self.bins)
         return self.armed(mass) * self.fire + self.refire * self.rearmed(mass)
 
-    def right(self, y: ArrayLike) -> FloatArray:
+    def backward(self, y: ArrayLike) -> FloatArray:
         """The product P y: expectation of `y` (n,) one registration later, in O(n) (2.5)."""
         values = _vector("y", y, self.bins)
         ahead = cyclic_recursion(self.keep, self.fire * values, self.loss, backward=True)
@@ -288,9 +288,9 @@ def stationary_from(chain: PhaseChain, solution: Solution) -> Stationary:
     weight = np.maximum(solution.x, 0.0)
     pdf = weight / weight.sum()
     # The rounding error of the solution is absolute; one step of the chain, which only adds, makes it relative.
-    pdf = chain.left(pdf)
+    pdf = chain.forward(pdf)
     pdf /= pdf.sum()
-    residual = float(np.abs(chain.left(pdf) - pdf).sum())
+    residual = float(np.abs(chain.forward(pdf) - pdf).sum())
     if not residual < 1e-9:
         raise ConvergenceError(f"{chain.describe()}: stationary distribution with residual {residual:.2e}")
     mean = float(solution.x.sum())

@@ -101,6 +101,11 @@ class Exposure:
         """Variance of N (...), never negative."""
         return self.cumulants[..., 1]
 
+    @property
+    def std(self) -> FloatArray:
+        """Standard deviation of N (...)."""
+        return np.sqrt(self.variance)
+
 
 @dataclass(frozen=True, eq=False)
 class Moments:
@@ -138,6 +143,11 @@ class Moments:
     bins: IndexArray
 
     __repr__ = brief
+
+    @property
+    def std(self) -> FloatArray:
+        """Standard deviation of N (...)."""
+        return np.sqrt(self.variance)
 
 
 def darkness(result: Exposure, which: NDArray[np.bool_], bins: int) -> None:

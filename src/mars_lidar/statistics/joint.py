@@ -596,6 +596,11 @@ class JointLaw:
         """(bins,) variances of the bins."""
         return self.lag(0)
 
+    @property
+    def std(self) -> FloatArray:
+        """(bins,) standard deviations of the bins."""
+        return np.sqrt(self.variance)
+
     def window(self, weights: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Mean and variance of ``weights @ H``.
 

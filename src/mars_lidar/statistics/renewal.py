@@ -210,7 +210,7 @@ def lag_covariances(chain: PhaseChain, times: HoldingTimes, lags: int) -> FloatA
     out = np.empty(lags)
     for k in range(lags):
         out[k] = row @ value
-        value = chain.right(value)
+        value = chain.backward(value)
         value -= times.stationary.pdf @ value  # rounding would reintroduce the mean
     return out
 
@@ -278,7 +278,7 @@ def holding_times(chain: PhaseChain) -> HoldingTimes:
     between = float(pdf @ (mean - mu) ** 2)
     sigma_ss2 = float(pdf @ variance) + between
 
-    rest = value - chain.right(value) - (mean - mu)
+    rest = value - chain.backward(value) - (mean - mu)
     defect = max(
         abs(mu * stationary.rate - 1.0),
         float(np.abs(rest).max()) / (mu + float(np.abs(value).max())),

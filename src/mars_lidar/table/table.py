@@ -100,7 +100,7 @@ class Table:
     ...     pulse=ml.GaussianPulse(sigma_ns=2.0), detector=ml.Detector(dead_time_ns=75.0),
     ... )
     >>> table = ml.Table.build(system, signal=(0.1, 2.0, 6), background=(0.1, 1.0, 4), tolerance=1e-3)
-    >>> pixel = table.lookup(0.5, 0.5, delay_ns=30.0)
+    >>> pixel = table.lookup(ml.Flux(0.5, 0.5, 30.0))
     >>> pixel.cumulants[0, :2].round()  # mean and variance of the count
     array([587., 202.])
     >>> cube = ml.simulate(ml.Flux(0.5, 0.5, 30.0), system, engine="mars", table=table)
@@ -325,23 +325,20 @@ class Table:
     @checked
     def lookup(
         self,
-        signal: ArrayLike,
-        background: ArrayLike,
+        flux: Flux,
         *,
-        delay_ns: ArrayLike | None = None,
         cycles: int | None = None,
         interpolation: Interpolation = "bilinear",
         outside: Literal["error", "exact"] = "error",
         threads: int | None = 1,
     ) -> Lookup:
-        """Entries for pixels.
+        """Entries for the pixels of a flux.
 
         Parameters
         ----------
-        signal, background, delay_ns
-            S and B, photons per period, and delay of the return, ns: scalars or arrays that broadcast; P is the
-            number of their elements in C order. The delay is of no account where S is 0, and may be NaN there;
-            None: the canonical t_r / 2 everywhere.
+        flux
+            Light of one return a pixel, detected photons per period (`Flux.detected`); P is the number of its pixels,
+            in C order.
         cycles
             Laser periods of the exposure; None: the system's.
         interpolation
@@ -354,8 +351,31 @@ class Table:
 
         Raises
         ------
+        TypeError
+            Naming `flux`, where it is no `Flux`.
         ValueError
-            Naming the range that lies outside of the table; or the entry that does not hold for `cycles`.
+            Naming the range that lies outside of the table; the entry that does not hold for `cycles`; or the flux,
+            where it has a waveform or several returns.
+        """
+        if flux.waveform is not None or len(flux.returns_signal) != 1:
+            raise ValueError("flux must have one return a pixel: a table has none for waveforms or several returns")
+        light = flux.signal, flux.background, flux.delay_ns
+        return self.at(*light, cycles=cycles, interpolation=interpolation, outside=outside, threads=threads)
+
+    def at(
+        self,
+        signal: ArrayLike,
+        background: ArrayLike,
+        delay_ns: ArrayLike | None = None,
+        *,
+        cycles: int | None = None,
+        interpolation: Interpolation = "bilinear",
+        outside: Literal["error", "exact"] = "error",
+        threads: int | None = 1,
+    ) -> Lookup:
+        """`lookup` of arrays `signal`, `background` and `delay_ns` that broadcast, for engines.
+
+        Without delays, at the canonical t_r / 2; `cycles`, `interpolation`, `outside` and `threads` as there.
         """
         checks.choice("interpolation", interpolation, INTERPOLATIONS)
         checks.choice("outside", outside, OUTSIDE)
@@ -458,7 +478,7 @@ class Table:
         signal, background = (random_pixels(rng, axis, samples, below) for axis in (self.signal, self.background))
         recipe = Recipe(self.method, self.rearm, self.tolerance, thread_count(threads))
         exact = recipe.entries(signal, background, system)
-        looked_up = self.lookup(signal, background, cycles=periods, interpolation=interpolation)
+        looked_up = self.at(signal, background, cycles=periods, interpolation=interpolation)
         shapes = self.shapes(periods)
         mixed = np.stack([w @ shapes[r] for r, w in zip(looked_up.rows, looked_up.weights, strict=True)])
         error = deviations(looked_up.cumulants, exact.cumulants)
@@ -500,7 +520,7 @@ class Table:
         system = self.system if cycles is None else self.system.replace(cycles=cycles)
         signal, background = (random_pixels(rng, axis, samples, True) for axis in (self.signal, self.background))
         delay = rng.uniform(0.0, system.period_ns, samples)
-        law = self.lookup(signal, background, delay_ns=delay, cycles=system.cycles)
+        law = self.at(signal, background, delay, cycles=system.cycles)
         exact = count_law(Flux(signal, background, delay), system, tolerance=self.tolerance, threads=threads)
         matched = matched_pmf(law.cumulants, threads=threads)
         off = np.array([total_variation(w, Pmf(int(exact.support[k, 0]), exact.pmf[k])) for k, w in enumerate(matched)])
@@ -546,7 +566,7 @@ class Table:
         """
         periods = self._cycles(cycles)
         system = self.system.replace(cycles=periods)
-        entries = self.lookup(signal, background, cycles=periods, interpolation=interpolation)
+        entries = self.at(signal, background, cycles=periods, interpolation=interpolation)
         shapes = self.shapes(periods)
         mixed = np.stack([w @ shapes[r] for r, w in zip(entries.rows, entries.weights, strict=True)])
         half = 0.5 * system.period_ns
@@ -574,7 +594,7 @@ class Table:
         shift = rng.integers(0, system.bins, signal.size)
         delay = 0.5 * system.period_ns + shift * system.bin_ns
         exact = exposure_moments(Flux(signal, background, delay), system, tolerance=self.tolerance, threads=threads)
-        law = self.lookup(signal, background, delay_ns=delay, cycles=cycles, interpolation=interpolation)
+        law = self.at(signal, background, delay, cycles=cycles, interpolation=interpolation)
         turned = np.stack([np.roll(row, k) for row, k in zip(mixed, shift, strict=True)])
         return deviations(law.cumulants, exact.cumulants), 0.5 * np.abs(turned - normalised(exact.histogram)).sum(-1)
 

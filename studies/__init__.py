@@ -30,7 +30,7 @@ class Request:
 
     `truth` is the engine whose simulation the study "count-law" takes for true; `stream` a measured photon stream for
     the study "hardware"; `config` the size of "downstream"; `seed` another sweep of the study "domain"; `rgbd` a
-    folder of RGB-D pairs for the study "image".
+    folder of RGB-D pairs and `captures` one of measured cubes for the study "image".
     """
 
     out: Path
@@ -42,6 +42,7 @@ class Request:
     config: str = "small"
     seed: int | None = None
     rgbd: Path | None = None
+    captures: Path | None = None
 
 
 class OtherRunsError(ValueError):

@@ -183,7 +183,7 @@ def _thin(scene: Scene, system: System, photons: float, results: Results) -> dic
             off[name] = ~(np.abs(each.depth_m - scene.depth_m) < most)
     single = results["maximum_likelihood"]
     assert isinstance(single, Reconstruction)
-    seen = sticks & single.seen & ~off["maximum_likelihood"]
+    seen = sticks & single.detected & ~off["maximum_likelihood"]
     line = {"photons": photons}
     line |= {f"{name}, off %": 100.0 * float(x[sticks].mean()) for name, x in off.items()}
     return line | {

@@ -151,7 +151,7 @@ def test_hot_and_missing_pixels():
     found = ml.reconstruct(cube, SYSTEM, "image")
     assert (found.flags[missing] & Flags.FILLED > 0).all()
     assert np.isnan(found.delay_half_width_ns[missing]).all()
-    assert not found.seen[missing].any()
+    assert not found.detected[missing].any()
     off = np.abs(off_by(found, delay))
     assert np.median(off[hot]) < SIGMA
     assert (off[~hot & ~missing] > 3.0 * SIGMA).mean() < 0.01

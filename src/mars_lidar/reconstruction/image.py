@@ -47,6 +47,28 @@ class Image(Method):
     efficiency
         (H, W) of each pixel, as a share of that of the others, 0 for pixels that see nothing; None: all alike. Signal
         and background are those of a pixel of the map's mean.
+
+    Raises
+    ------
+    ValueError
+        An efficiency that is no such map; ``check``: a detector that this method does not hold for.
+
+    See Also
+    --------
+    UntrainedImage, MaximumLikelihood, mars_lidar.reconstruct
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> scene = ml.Scene.example("room", size=32)
+    >>> counts = ml.simulate(scene.flux(system, signal=0.002, sbr=1.0), system, seed=0)  # 2 photons a pixel
+    >>> maps = ml.reconstruct(counts, system, ml.reconstruction.Image())
+    >>> bool(((abs(maps.depth_m[0] - scene.depth_m) < 0.5).mean()) > 0.85)
+    True
     """
 
     efficiency: FloatArray | None = None
@@ -68,7 +90,7 @@ class Image(Method):
         object.__setattr__(self, "efficiency", given / given[given > 0.0].mean())
 
     def estimate(self, histograms: Histograms) -> Estimates:
-        """Estimates of each image of counts (..., H, W, bins)."""
+        """Estimates of each image of the counts (..., H, W, bins) in `histograms`."""
         if len(histograms.image) < 2:
             raise ValueError(
                 f"method {self.name!r} needs images, a cube (..., H, W, bins), got leading axes {histograms.image}"
@@ -83,7 +105,7 @@ class Image(Method):
         return Estimates.joined(found)
 
     def of_photons(self, photons: Photons, system: System, threads: int) -> Estimates:
-        """Estimates of one image."""
+        """Estimates of one image from its `photons` (times by pixel), recorded by `system`, on so many `threads`."""
         image = photons.height, photons.width
         if self.efficiency is not None and self.efficiency.shape != image:
             raise ValueError(f"efficiency must be of the image's {image} pixels, got shape {self.efficiency.shape}")
@@ -95,7 +117,35 @@ class Image(Method):
 
 @dataclass(frozen=True, eq=False)
 class UntrainedImage(Image):
-    """As `Image`, with nothing trained: the largest peak of the posterior, and the largest window that agrees."""
+    """As `Image`, with nothing trained: the largest peak of the posterior, and the largest window that agrees.
+
+    Parameters
+    ----------
+    efficiency
+        As of `Image`.
+
+    Raises
+    ------
+    ValueError
+        An efficiency that is no such map; ``check``: a detector that this method does not hold for.
+
+    See Also
+    --------
+    Image, mars_lidar.reconstruct
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> scene = ml.Scene.example("room", size=32)
+    >>> counts = ml.simulate(scene.flux(system, signal=0.005, sbr=1.0), system, seed=0)  # 5 photons a pixel
+    >>> maps = ml.reconstruct(counts, system, ml.reconstruction.UntrainedImage())
+    >>> bool(((abs(maps.depth_m[0] - scene.depth_m) < 0.5).mean()) > 0.85)
+    True
+    """
 
     name = "image_untrained"
 

@@ -48,4 +48,4 @@ def capture(name: str, cube: Cube) -> Capture:
     counts = np.asarray(cube.histogram[0])
     alone = reconstruct(counts, cube.system, threads=1)
     signal = alone.signal * cube.system.cycles * cube.system.detector.detection_efficiency
-    return Capture(name, counts, cube.system, alone.delay_ns, signal, alone.seen & (signal > FEWEST))
+    return Capture(name, counts, cube.system, alone.delay_ns, signal, alone.detected & (signal > FEWEST))

@@ -428,7 +428,7 @@ def _here(dataset: Dataset, parts: int, threads: int | None) -> Iterator[Team]:
             stop.set()  # the simulator looks at it every 50 ms, and the pool waits for all threads
             raise
         for maker in makers:
-            maker.note()
+            maker.notes.write()
 
 
 def _make_all(team: AbstractContextManager[Team], todo: Sequence[Item], add: Callable[[Made], None]) -> None:

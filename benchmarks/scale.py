@@ -114,7 +114,7 @@ def table() -> str:
     random, costs = np.random.default_rng(20261123), of_a_task()
     number = CUBES // CUBES_OF_A_PART
     rows = [
-        "| S | workers | disk, GB/s | parts a task | tasks | scheduler: time | workers busy | jobs: time | workers busy |",
+        "| S | workers | disk, GB/s | parts a task | tasks | scheduler: time | workers busy | jobs: time | busy |",
         "|---:|---:|---:|---:|---:|---:|---:|---:|---:|",
     ]
     facts = []
@@ -128,8 +128,8 @@ def table() -> str:
             took, busy, tasks = with_scheduler(parts, workers, disk, number, costs, random)
             alone, share = by_jobs(parts, workers, disk, number, random)
             rows.append(
-                f"| {signal:g} | {workers} | {disk / 1e9:g} | {-(-number // tasks)} | {tasks:,} | {_span(took)} | {100 * busy:.0f} % | "
-                f"{_span(alone)} | {100 * share:.0f} % |"
+                f"| {signal:g} | {workers} | {disk / 1e9:g} | {-(-number // tasks)} | {tasks:,} "
+                f"| {_span(took)} | {100 * busy:.0f} % | {_span(alone)} | {100 * share:.0f} % |"
             )
 
     (client, of_client), (scheduler, of_scheduler) = ((1e3 * task, 1e3 * part) for task, part in costs.values())
@@ -137,8 +137,8 @@ def table() -> str:
     note = (
         f"A million cubes on 1, 10 and 100 nodes of 16 cores, one file system for all; {date}, processor times on\n"
         f"{processor()}: {'; '.join(facts)}; a task\n"
-        f"{client:.1f} ms of the client and {scheduler:.1f} ms of the scheduler, each further part in it {of_client:.2f} "
-        f"and {of_scheduler:.2f} ms."
+        f"{client:.1f} ms of the client and {scheduler:.1f} ms of the scheduler, each further part in it "
+        f"{of_client:.2f} and {of_scheduler:.2f} ms."
     )
     return "\n".join([*rows, "", note])
 

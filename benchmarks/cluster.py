@@ -78,7 +78,7 @@ class _Fixed(Team):
         super().__init__(*arguments)
         object.__setattr__(self, "_parts", parts)
 
-    def parts_of_a_task(self, seconds: float) -> int:
+    def parts_of_a_task(self, seconds: float, remaining: int) -> int:
         return int(self._parts)  # type: ignore[attr-defined]
 
 

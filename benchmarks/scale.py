@@ -68,36 +68,34 @@ def with_scheduler(
     random: np.random.Generator,
 ) -> tuple[float, float, int]:
     """Seconds until the last part, share of the time in which workers make parts, and tasks."""
-    mean = float(parts.seconds.mean())
     team = Team(None, None, lambda: workers, _AHEAD, _LEAST_QUEUED, _TASKS_PER_S)  # type: ignore[arg-type]
-    of_a_task, capacity = team.parts_of_a_task(mean), team.capacity()
     times = random.choice(parts.seconds, number)
-    sums = np.add.reduceat(times, np.arange(0, number, of_a_task))
-    sizes = np.diff(np.append(np.arange(0, number, of_a_task), number)) * parts.nbytes
+    tasks: list[tuple[float, int]] = []  # seconds and parts of each
     events: list[tuple[float, int, str]] = []  # when, which task, what happens to it: it comes, is made, is on disk
     waiting, idle = deque[int](), workers
-    client_s, scheduler_s = (task + (of_a_task - 1) * part for task, part in costs.values())
-    client = scheduler = disk = 0.0
+    client = scheduler = disk = now = mean = 0.0  # the mean is not known before a task has ended
     given = ended = 0
-    now = 0.0
-    while ended < len(sums):
-        while given < len(sums) and given - ended < capacity:
+    while ended < len(tasks) or given < number:
+        while given < number and len(tasks) - ended < team.capacity():
+            count = min(team.parts_of_a_task(mean, number - given), number - given)
+            tasks.append((float(times[given : given + count].sum()), count))
+            given += count
+            client_s, scheduler_s = (task + (count - 1) * part for task, part in costs.values())
             client = max(client, now) + client_s
             scheduler = max(scheduler, client) + scheduler_s
-            heapq.heappush(events, (scheduler, given, "comes"))
-            given += 1
+            heapq.heappush(events, (scheduler, len(tasks) - 1, "comes"))
         now, task, what = heapq.heappop(events)
         if what == "comes":
             waiting.append(task)
         elif what == "made":
-            disk = max(disk, now) + float(sizes[task]) / disk_bytes_s
+            disk = max(disk, now) + tasks[task][1] * parts.nbytes / disk_bytes_s
             heapq.heappush(events, (disk, task, "written"))
         else:
-            ended, idle = ended + 1, idle + 1
+            ended, idle, mean = ended + 1, idle + 1, float(parts.seconds.mean())
         while waiting and idle:
             task, idle = waiting.popleft(), idle - 1
-            heapq.heappush(events, (now + float(sums[task]), task, "made"))
-    return now, float(times.sum()) / (workers * now), len(sums)
+            heapq.heappush(events, (now + tasks[task][0], task, "made"))
+    return now, float(times.sum()) / (workers * now), len(tasks)
 
 
 def by_jobs(
@@ -114,8 +112,8 @@ def table() -> str:
     random, costs = np.random.default_rng(20261123), of_a_task()
     number = CUBES // CUBES_OF_A_PART
     rows = [
-        "| S | workers | disk, GB/s | parts a task | tasks | scheduler: time | workers busy | jobs: time | busy |",
-        "|---:|---:|---:|---:|---:|---:|---:|---:|---:|",
+        "| S | workers | disk, GB/s | tasks | scheduler: time | workers busy | jobs: time | busy |",
+        "|---:|---:|---:|---:|---:|---:|---:|---:|",
     ]
     facts = []
     for signal in (1.0, 0.1):
@@ -128,7 +126,7 @@ def table() -> str:
             took, busy, tasks = with_scheduler(parts, workers, disk, number, costs, random)
             alone, share = by_jobs(parts, workers, disk, number, random)
             rows.append(
-                f"| {signal:g} | {workers} | {disk / 1e9:g} | {-(-number // tasks)} | {tasks:,} "
+                f"| {signal:g} | {workers} | {disk / 1e9:g} | {tasks:,} "
                 f"| {_span(took)} | {100 * busy:.0f} % | {_span(alone)} | {100 * share:.0f} % |"
             )
 

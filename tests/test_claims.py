@@ -14,9 +14,8 @@ def tiers_of(name: str) -> set[str]:
     """Tiers that a test function, or the functions of a file of tests, belong to."""
     file, _, wanted = name.partition("::")
     tree = ast.parse((ROOT / file).read_text(encoding="utf-8"))
-    whole = file.startswith("tests/learn/") or any(
-        isinstance(node, ast.Assign) and "pytest.mark.full" in ast.unparse(node) for node in tree.body
-    )
+    of_learn = file.startswith("tests/learn/")  # see its conftest
+    whole = of_learn or any(isinstance(node, ast.Assign) and "mark.full" in ast.unparse(node) for node in tree.body)
     tests = [
         node
         for node in tree.body

@@ -40,6 +40,8 @@ class Timestamps:
         Bins of the histogram.
     period_ns, cycles
         Laser period, ns, and laser periods of the exposure.
+    dtype
+        Of a histogram of them, uint16 or uint32.
     info
         Where they come from: ``system`` (as `System.to_dict` gives it), ``engine``, ``seed``, ``realization``,
         ``source``, ``unit_ns`` (resolution of the clock that recorded them), as far as they are known.
@@ -169,7 +171,7 @@ class Timestamps:
         return loaded
 
     def pixel(self, y: int, x: int) -> Timestamps:
-        """The registrations of one pixel, as views."""
+        """The registrations of the pixel in row `y` and column `x`, as views."""
         k = self._place(y, x)
         part = slice(self.offsets[k], self.offsets[k + 1])
         offsets = np.array([0, self.offsets[k + 1] - self.offsets[k]], np.int64)

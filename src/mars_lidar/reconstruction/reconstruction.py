@@ -222,6 +222,14 @@ def reconstruct(
     Reconstruction
         Maps of shape (...).
 
+    Raises
+    ------
+    TypeError
+        Counts that are no array of numbers, or without a system; an argument of another kind.
+    ValueError
+        Counts that are no whole numbers >= 0, or of another number of bins than the system; an unknown method, or one
+        that does not hold for the detector; a level or a number of returns out of range.
+
     See Also
     --------
     Reconstruction, cramer_rao, simulate

@@ -35,6 +35,8 @@ _METHODS = get_args(Method)
 class CountLaw:
     """Law of the number N of registrations in an exposure, for cells of shape (...); made by `count_law`.
 
+    `support`, `pmf` and `cdf` are computed when they are first asked for.
+
     Attributes
     ----------
     system
@@ -43,10 +45,10 @@ class CountLaw:
         Method of `count_law`.
     cumulants
         (..., 4) mean, variance, third and fourth cumulant of N.
+    windows
+        Function that gives the probabilities of the cells, called when they are first asked for.
     exposure
         The `Exposure` of an exact law (its histogram has a single bin), else None.
-
-    `support`, `pmf` and `cdf` are computed on first use and cached.
 
     See Also
     --------
@@ -189,6 +191,15 @@ def count_law(
     -------
     CountLaw
         For cells of shape (...).
+
+    Raises
+    ------
+    TypeError
+        No `Flux` or no `System`.
+    ValueError
+        An unknown `method`, a tolerance out of range, or a detector that the method does not describe.
+    ConvergenceError
+        Naming the cell, where no grid meets the tolerance, or where the exposure is too long to be run through.
 
     See Also
     --------

@@ -83,6 +83,8 @@ class Table:
         Of the exposure statistics.
     provenance
         How the table came to be: version, request, axes in words, seconds, and the error measured at the end.
+    entries, start_phases
+        Cumulants and shapes of every entry, and what the delay adds to the cumulants (docs/table.md, 1 and 3).
     laws
         Exact laws of the count at those entries whose four cumulants do not fix it (`statistics.matched.trusted`).
 
@@ -209,7 +211,8 @@ class Table:
     ) -> Table:
         """`build`, or the same table from the user's cache (docs/table.md, 7), which keeps what is built.
 
-        Where nothing can be written there, the table is built, with a warning.
+        Arguments, `options` included, are those of `build`. Where nothing can be written there, the table is built,
+        with a warning.
         """
         own, existing = cls._search(system, signal, background, options)
         if existing is None:
@@ -230,7 +233,8 @@ class Table:
     def cached_path(cls, system: System, signal: Grid, background: Grid, **options: Any) -> Path:
         """File of the table in the cache; built and put there where it is not.
 
-        A table made for another number of cycles is taken where every entry of it holds for those of `system`.
+        Arguments, `options` included, are those of `build`. A table made for another number of cycles is taken where
+        every entry of it holds for those of `system`.
         """
         own, existing = cls._search(system, signal, background, options)
         if existing is None:
@@ -261,7 +265,10 @@ class Table:
 
     @checked
     def save(self, path: str | Path, *, overwrite: bool = False) -> None:
-        """Write to an HDF5 file (.h5, .hdf5), which appears under its name when it is complete."""
+        """Write to an HDF5 file `path` (.h5, .hdf5), which appears under its name when it is complete.
+
+        An existing file is an error but with `overwrite`.
+        """
         made_for = self.system.replace(cycles=self.entries.cycles)
         header = {
             "system": made_for.to_json(),
@@ -279,7 +286,7 @@ class Table:
     @classmethod
     @checked
     def load(cls, path: str | Path, system: System | None = None) -> Table:
-        """The table of a file, for `system` (None: for the one it was made for).
+        """The table of the file `path`, for `system` (None: for the one it was made for).
 
         Raises
         ------
@@ -366,7 +373,10 @@ class Table:
         outside: Literal["error", "exact"] = "error",
         threads: int | None = 1,
     ) -> Lookup:
-        """`lookup` of arrays that broadcast, for engines; without delays, at the canonical t_r / 2."""
+        """`lookup` of arrays `signal`, `background` and `delay_ns` that broadcast, for engines.
+
+        Without delays, at the canonical t_r / 2; `cycles`, `interpolation`, `outside` and `threads` as there.
+        """
         checks.choice("interpolation", interpolation, INTERPOLATIONS)
         checks.choice("outside", outside, OUTSIDE)
         periods = self._cycles(cycles)
@@ -456,6 +466,8 @@ class Table:
         samples, seed
             Pixels, log-uniform over the axes, with random delays; with ``"bilinear"`` one in eight lies between 0
             and the lowest value, where the axis has a 0.
+        threads
+            Threads to run on; default: all processors that this process may use.
         """
         checks.choice("interpolation", interpolation, INTERPOLATIONS)
         samples = checks.integer("samples", samples, low=1, high=1_000_000)
@@ -501,7 +513,7 @@ class Table:
     ) -> LawError:
         """Total variation, on random pixels, between the count law that the table leads to and the exact one.
 
-        Some 10 to 20 ms a pixel. Parameters as `quantisation_error`.
+        Some 10 to 20 ms a pixel. `samples`, `seed`, `cycles` and `threads` as for `quantisation_error`.
         """
         samples = checks.integer("samples", samples, low=1, high=100_000)
         rng = np.random.default_rng(checks.integer("seed", seed, low=0, high=2**64 - 1))
@@ -548,8 +560,9 @@ class Table:
     ) -> FloatArray:
         """Share (P,) of the registrations that the shape places wrongly because it is that of the canonical delay.
 
-        Total variation between the table's shape, moved to the delay (P,) by whole bins, and the exact one there, less
-        the same at the canonical delay. Each pixel is evaluated twice by itself.
+        Total variation between the table's shape, moved to the delay `delay_ns` (P,) by whole bins, and the exact one
+        there, less the same at the canonical delay. Each pixel is evaluated twice by itself. `interpolation` and
+        `cycles` are those of `lookup`, `threads` those of `quantisation_error`.
         """
         periods = self._cycles(cycles)
         system = self.system.replace(cycles=periods)

@@ -68,7 +68,7 @@ def create(path: Path, recipe: DatasetRecipe, folder: Path, crew: Crew | None = 
             continue
         name, scene = result
         if writer is None:  # nothing on the disk is touched before there is something to put on it
-            histogram_blocks(recipe, 1, scene.shape)
+            histogram_blocks(recipe, samples.count_samples(recipe, most), scene.shape)
             writer = SceneWriter(begin(path, recipe), most, path, source)
         writer.problems = [[str(each.path), each.reason] for each in problems]
         writer.add(name, scene, (place[0], place[1] + 1))

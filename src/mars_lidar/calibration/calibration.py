@@ -130,8 +130,15 @@ class Calibration:
         The instrument and the light of these estimates, to simulate with; None with ``look=True``.
     waveform, waveform_error
         Light (bins,) in photons per period and bin, of a free shape; else None.
-    recording
-        The recorded times, as `curves` and `realizations` read them.
+    recording, fitted
+        The recorded times and the fit, as `curves` and `realizations` read them; no fit with ``look=True``.
+    level
+        False-alarm probability of the verdict.
+
+    Raises
+    ------
+    AttributeError
+        A name that is neither an attribute nor an estimate: ``result.dead_time_ns`` is that estimate's value.
 
     See Also
     --------
@@ -200,13 +207,13 @@ class Calibration:
         return f"p = {self.p_value:.2g}: {model} does not fit"
 
     def curves(self, seed: int = 0) -> Curves:
-        """Histograms of the recording beside those of the fit, for a picture; of the recording alone without a fit."""
+        """Histograms of the recording beside those of the fit, by streams of `seed`; the recording's alone without one."""
         model = None if self.fitted is None else self.fitted.model
         theta = None if model is None or self.fitted is None else model.bounded(self.fitted.theta)
         return curves(self.recording, model, theta, seed)
 
     def realizations(self, cycles: int, *, simulated: int = 4000, seed: int = 0) -> Realizations:
-        """Law of the count in pieces of `cycles` laser periods beside the model's, of `simulated` pieces (T6).
+        """Law of the count in pieces of `cycles` laser periods beside the model's, of `simulated` pieces of streams of `seed` (T6).
 
         Raises
         ------

@@ -207,13 +207,13 @@ class Calibration:
         return f"p = {self.p_value:.2g}: {model} does not fit"
 
     def curves(self, seed: int = 0) -> Curves:
-        """Histograms of the recording beside those of the fit, by streams of `seed`; the recording's alone without one."""
+        """Histograms of the recording, and of the fit by streams of `seed`, for a picture."""
         model = None if self.fitted is None else self.fitted.model
         theta = None if model is None or self.fitted is None else model.bounded(self.fitted.theta)
         return curves(self.recording, model, theta, seed)
 
     def realizations(self, cycles: int, *, simulated: int = 4000, seed: int = 0) -> Realizations:
-        """Law of the count in pieces of `cycles` laser periods beside the model's, of `simulated` pieces of streams of `seed` (T6).
+        """Law of the count in pieces of `cycles` laser periods beside the model's, `simulated` by `seed` (T6).
 
         Raises
         ------

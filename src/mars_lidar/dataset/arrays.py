@@ -24,6 +24,10 @@ MAPS = {
     "delay": ("delay of the return", "ns"),
 }
 _SHARD_BYTES = 16 * 2**20  # of one map
+_SHARD_MIB, _LARGEST_MIB = 64.0, 1024.0  # of counts, where the recipe gives no shard_mib: larger in a large dataset
+_SHARDS = 20_000  # files of counts for which shards are made larger: more slow down each listing of their folder
+_MOST_SHARDS = 100_000  # that a recipe may ask for
+FLAT_KEYS = {"name": "default", "separator": "."}  # chunk c.5.0.0.0.0 is a file, and not a file in five folders
 _COORDINATES = "scene scene_name system signal_level sbr period_ns seed"  # for xarray, as CF has it
 
 
@@ -40,7 +44,17 @@ def histogram_blocks(
             "with crosstalk an image is made at once, for its pixels depend on each other: "
             f"store.chunk_mib must be at least {needed:.4g}, got {recipe.chunk_mib:g}"
         )
-    shard = samples.fitting(whole, chunk, dtype.itemsize, recipe.shard_mib * 2**20)
+    shard_mib = recipe.shard_mib
+    if shard_mib is None:
+        enough = math.prod(whole) * dtype.itemsize / _SHARDS / 2**20
+        shard_mib = max(min(max(_SHARD_MIB, enough), _LARGEST_MIB), recipe.chunk_mib)
+    shard = samples.fitting(whole, chunk, dtype.itemsize, shard_mib * 2**20)
+    shards = math.prod(samples.grid(whole, shard))
+    if shards > _MOST_SHARDS:
+        raise ValueError(
+            f"store.shard_mib must be larger, got {shard_mib:g}: {shards:,} files would lie in one folder, at most "
+            f"{_MOST_SHARDS:,} may; or write several datasets, StoredDataset reads them as one"
+        )
     return whole, dtype, chunk, shard
 
 
@@ -54,6 +68,7 @@ def create_histogram(group: Any, recipe: DatasetRecipe, number: int, shape: tupl
         chunks=chunk,
         shards=shard,
         dimension_names=DIMS,
+        chunk_key_encoding=FLAT_KEYS,
         attributes={"long_name": "registrations per bin", "units": "count", "coordinates": _COORDINATES},
         **packing(recipe.layout, dtype),
     )
@@ -84,6 +99,7 @@ def create_maps(
         compressors=blosc(dtype, "zstd", 1, "shuffle"),
         fill_value=np.nan,
         dimension_names=dims,
+        chunk_key_encoding=FLAT_KEYS,
         attributes={"long_name": told, "units": unit},
     )
 

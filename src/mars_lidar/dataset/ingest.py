@@ -34,7 +34,7 @@ from mars_lidar.dataset.scenes import SceneWriter
 from mars_lidar.dataset.sources import Candidate, candidates, scenes, seed_of, several
 from mars_lidar.dataset.write import fingerprint
 from mars_lidar.io.layout import Variable
-from mars_lidar.io.scan import Problem
+from mars_lidar.io.scene_files import Problem
 from mars_lidar.io.zarr_store import add
 
 _BATCH = 16  # scenes that a worker reads at a time: 0.1 s of small ones
@@ -68,7 +68,7 @@ def create(path: Path, recipe: DatasetRecipe, folder: Path, crew: Crew | None = 
             continue
         name, scene = result
         if writer is None:  # nothing on the disk is touched before there is something to put on it
-            histogram_blocks(recipe, 1, scene.shape)
+            histogram_blocks(recipe, samples.count_samples(recipe, most), scene.shape)
             writer = SceneWriter(begin(path, recipe), most, path, source)
         writer.problems = [[str(each.path), each.reason] for each in problems]
         writer.add(name, scene, (place[0], place[1] + 1))

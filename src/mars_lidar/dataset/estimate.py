@@ -23,7 +23,7 @@ from mars_lidar.dataset.sample_content import Rendered, Shown
 from mars_lidar.dataset.shard import packer
 from mars_lidar.dataset.sources import Candidate, candidates, scenes
 from mars_lidar.io.advice import Advice, advice
-from mars_lidar.io.scan import Problem
+from mars_lidar.io.scene_files import Problem
 from mars_lidar.simulation import simulate
 
 _SCENES, _PROBES = 4, 8

@@ -35,7 +35,7 @@ from mars_lidar.dataset.scenes import SceneWriter
 from mars_lidar.dataset.sources import Candidate, candidates, scenes, seed_of, several
 from mars_lidar.dataset.write import fingerprint
 from mars_lidar.io.layout import Variable
-from mars_lidar.io.scan import Problem
+from mars_lidar.io.scene_files import Problem
 from mars_lidar.io.zarr_store import add
 
 _BATCH = 16  # scenes that a worker reads at a time: 0.1 s of small ones

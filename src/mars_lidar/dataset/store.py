@@ -46,7 +46,7 @@ from mars_lidar.dataset.scenes import SceneReader
 from mars_lidar.dataset.shard import digests_of, is_good
 from mars_lidar.io.cube import Cube
 from mars_lidar.io.recipe import Recipe
-from mars_lidar.io.scan import Problem
+from mars_lidar.io.scene_files import Problem
 from mars_lidar.io.store import OnDisk
 from mars_lidar.light.transient import Transient
 from mars_lidar.scene.layers import LayeredScene

@@ -138,7 +138,7 @@ class Calibration:
     Raises
     ------
     AttributeError
-        A name that is neither an attribute nor an estimate: ``result.dead_time_ns`` is that estimate's value.
+        A name that is neither an attribute nor an estimate; the name of an estimate gives its value.
 
     See Also
     --------
@@ -213,7 +213,7 @@ class Calibration:
         return curves(self.recording, model, theta, seed)
 
     def realizations(self, cycles: int, *, simulated: int = 4000, seed: int = 0) -> Realizations:
-        """Law of the count in pieces of `cycles` laser periods beside the model's, `simulated` by `seed` (T6).
+        """Law of the count in pieces of `cycles` periods beside that of `simulated` pieces drawn with `seed` (T6).
 
         Raises
         ------

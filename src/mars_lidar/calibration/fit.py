@@ -374,7 +374,7 @@ class Fit:
 
 
 def _misfit(
-    left: FloatArray, fresh: FloatArray, law: Batch, near: Batch, seen: FloatArray, dead_error: float
+    left: FloatArray, fresh: FloatArray, law: Batch, near: Batch, recorded: FloatArray, dead_error: float
 ) -> tuple[float, float, float]:
     """Weighed square of the counts that the fit leaves, its standard deviations above fresh streams', probability.
 
@@ -396,7 +396,7 @@ def _misfit(
     departure = np.abs(np.cumsum(left[gaps])) / (np.cumsum(fresh[:, gaps], axis=1).std(0) * noise**0.5)
     most = float(departure[enough].max(initial=0.0))
     late = 2.0 * enough.sum() * float(ndtr(-most))
-    first = _edge_probability(law.cells.gap_edges, cumulated, np.cumsum(seen[gaps]), dead_error)
+    first = _edge_probability(law.cells.gap_edges, cumulated, np.cumsum(recorded[gaps]), dead_error)
     return mine, float((mine - drawn.mean()) / drawn.std()), min(1.0, 2.0 * min(square, late + first))
 
 

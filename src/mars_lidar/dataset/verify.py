@@ -12,13 +12,12 @@ import numpy as np
 from mars_lidar._base import checks, manifest
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.files import FileError, reading
-from mars_lidar._base.progress import shown
+from mars_lidar._base.progress import callback_of
 from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import Progress
 from mars_lidar._version import other_version
-from mars_lidar.dataset.arrays import MAPS
+from mars_lidar.dataset.arrays import MAPS, block, grid
 from mars_lidar.dataset.ingest import coordinates
-from mars_lidar.dataset.samples import block, grid
 from mars_lidar.dataset.store import Dataset, open_dataset
 from mars_lidar.dataset.write import Maker
 
@@ -71,7 +70,7 @@ def verify(
     threads, progress
         As for `mars_lidar.generate`.
     """
-    progress = shown(progress, "verifying")
+    progress = callback_of(progress, "verifying")
     dataset = open_dataset(path)
     array = dataset.histogram
     places = grid(array.shape, array.chunks)

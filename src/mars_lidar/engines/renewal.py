@@ -8,11 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.types import FloatArray, IndexArray
-from mars_lidar.engines.alignment import Alignment
 from mars_lidar.engines.count_shape import CountTimesShape, as_shapes
 from mars_lidar.engines.counts import CountLaws, RoundedGaussian
-from mars_lidar.engines.options import Interpolation, Outside
-from mars_lidar.engines.pixels import Group, groups, single_return
+from mars_lidar.engines.engine import Interpolation, Outside
+from mars_lidar.engines.pixels import Alignment, Group, groups, single_return
 from mars_lidar.engines.synthesis import Batch, Run
 from mars_lidar.engines.table_reader import Entries, TableReader
 from mars_lidar.instrument.system import System
@@ -38,6 +37,28 @@ class RenewalEngine(CountTimesShape):
         As for `MarsEngine`; pixels beyond the grid get their own chain.
     level
         Forces one of ``_core.levels()`` (vector widths); it changes speed only.
+
+    Raises
+    ------
+    TypeError
+        A table that is none.
+    ValueError
+        An unknown `interpolation`, `outside` or `level`; those of a table without one.
+
+    See Also
+    --------
+    MarsEngine, mars_lidar.simulate
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> engine = ml.engines.RenewalEngine()
+    >>> ml.simulate(ml.Flux(1.0, 1.0, 40.0), system, engine=engine, seed=0).shape
+    (1, 1, 1, 128)
     """
 
     name = "renewal"

@@ -49,8 +49,38 @@ def bin_photons(
     ----------
     signal, background, delay_ns
         Tensors (...) of one floating type and device that broadcast: S and B photons per period, delay in ns.
+    system
+        Laser, detector and histogram.
     refine
         Parts that each bin is cut into.
+
+    Returns
+    -------
+    torch.Tensor
+        (..., bins x refine) photons per period.
+
+    Raises
+    ------
+    TypeError
+        Light that is no floating tensor, or of half precision; no `System`.
+    ValueError
+        Negative photons, a delay that is not finite, shapes that do not broadcast, `refine` out of range.
+
+    See Also
+    --------
+    expected_histogram, mars_lidar.statistics.photons_per_bin
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> import torch
+    >>> photons = ml.learn.bin_photons(torch.tensor(1.0), torch.tensor(0.5), torch.tensor(40.0), system)
+    >>> tuple(photons.shape), round(float(photons.sum()), 4)  # S + B
+    ((128,), 1.5)
     """
     signal, background, delay_ns = inputs(signal, background, delay_ns)
     return photons_in(signal, background, delay_ns, system, checks.integer("refine", refine, low=1, high=2**16))
@@ -468,18 +498,41 @@ def expected_histogram(
         Parts that each bin is cut into for the solution; None: four to a sigma of the pulse, eight where the dead
         time is within 8 sigma of 0 or of whole periods (1 for a measured pulse).
 
+    Returns
+    -------
+    torch.Tensor
+        (..., bins) registrations in `System.cycles` periods.
+
     Raises
     ------
-    ValueError, TypeError
+    TypeError, ValueError
         Bad arguments; a detector that this form does not describe; forward mode within forward mode, of which PyTorch
         drops a part without a word: take ``jacfwd(jacrev(f))``, which is ``hessian(f)``.
     ConvergenceError
         Where the equation is not solved to 1e-9.
 
+    See Also
+    --------
+    HistogramTable, histogram_log_likelihood, mars_lidar.statistics.mean_histogram
+
     Notes
     -----
     O(bins) a pixel, in double precision, on the CPU or a GPU (`mars_lidar.learn.forward`). At less cost and to
     the accuracy of a table: `HistogramTable`.
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> import torch
+    >>> signal, background, delay_ns = (torch.tensor(x, requires_grad=True) for x in (1.0, 1.0, 40.0))
+    >>> mean = ml.learn.expected_histogram(signal, background, delay_ns, system)
+    >>> mean.sum().backward()
+    >>> round(mean.sum().item()), round(signal.grad.item())  # registrations, and the change with a photon of signal
+    (815, 167)
     """
     check_detector(system, light=True)
     _refuse_nested_forward()

@@ -23,11 +23,47 @@ from mars_lidar.reconstruction.histogram_record import relative_width
 
 @checked
 def armed_periods(histogram: torch.Tensor, system: System) -> torch.Tensor:
-    """Periods D (..., bins) in which the pixel was armed in each bin, estimated from its histogram (..., bins).
+    """Periods in which the pixel was armed in each bin, estimated from its histogram.
 
     ``N_r`` less the registrations whose dead time covers the bin (Gupta et al., ICCV 2019); a registration in the bin
     and a re-arming count half. What the dead time covers after the end of the exposure is taken for its beginning,
     where the pixel was armed (or blind from before): D is at most t_d / t_r + 1 periods off, whatever the exposure.
+
+    Parameters
+    ----------
+    histogram
+        (..., bins) counts.
+    system
+        How they were recorded: non-paralyzable, without gate.
+
+    Returns
+    -------
+    torch.Tensor
+        (..., bins) periods D.
+
+    Raises
+    ------
+    TypeError
+        Counts that are no tensor; no `System`.
+    ValueError
+        Another number of bins; a detector that this form does not describe.
+
+    See Also
+    --------
+    histogram_log_likelihood, mars_lidar.reconstruction.generalised_coates_rates
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> import torch
+    >>> counts = torch.from_numpy(ml.simulate(ml.Flux(1.0, 1.0, 40.0), system, seed=0)[0, 0, 0].astype("float64"))
+    >>> armed = ml.learn.armed_periods(counts, system)
+    >>> tuple(armed.shape), bool((armed < 1000).all())
+    ((128,), True)
     """
     check_detector(system, light=True)
     histogram = _counts(histogram, system)
@@ -63,6 +99,22 @@ def histogram_log_likelihood(
     system
         Non-paralyzable, without gate, or effects beyond detection efficiency and dark counts.
 
+    Returns
+    -------
+    torch.Tensor
+        (...) log likelihoods.
+
+    Raises
+    ------
+    TypeError
+        Counts or light that are no tensors of a suitable type; no `System`.
+    ValueError
+        Another number of bins, negative counts, no background; a detector that this form does not describe.
+
+    See Also
+    --------
+    expected_histogram, armed_periods, mars_lidar.reconstruction.log_likelihood
+
     Notes
     -----
     Unbiased to 0.1 of the Cramer-Rao bound's standard deviation at 1000 cycles, for bins of up to 3 widths (sigma) of
@@ -70,7 +122,21 @@ def histogram_log_likelihood(
     the bias in these units grows with the square root of the cycles). Not so where fewer than about one of the
     passes of the pulse ends without registration in an exposure that began armed: 0.3 to 0.7. Cost: O(bins) for
     bins below a third of the pulse's width; in wider ones the bins that the pulse reaches are cut into parts of a third
-    of it, into parts of an eighth where dead time re-arms the pixel within the pulse (docs/learn.md has the times).
+    of it, of an eighth where dead time re-arms the pixel within the pulse (docs/learn.md has the times).
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> import torch
+    >>> counts = torch.from_numpy(ml.simulate(ml.Flux(1.0, 1.0, 40.0), system, seed=0)[0, 0, 0].astype("int64"))
+    >>> delay_ns = torch.tensor([38.0, 40.0])
+    >>> value = ml.learn.histogram_log_likelihood(counts, torch.tensor(1.0), torch.tensor(1.0), delay_ns, system)
+    >>> bool(value[1] > value[0])
+    True
     """
     histogram = _counts(histogram, system)
     check_detector(system, light=True)

@@ -28,7 +28,7 @@ from mars_lidar._base.resample import image_size
 from mars_lidar._base.threads import thread_count
 from mars_lidar.engines import Engine, check_detector, find_engine
 from mars_lidar.instrument.system import System
-from mars_lidar.io.scan import SceneFile
+from mars_lidar.io.scene_files import SceneFile
 from mars_lidar.learn.needed import torch
 from mars_lidar.learn.ranges import LogUniform, Range, SystemRange, as_range, as_systems
 from mars_lidar.learn.scenes import Recipe, Sample, as_source, example_of
@@ -424,6 +424,23 @@ class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
     ------
     ValueError, TypeError
         A bad argument, or settings that make no instrument at an end of their range.
+
+    See Also
+    --------
+    StoredDataset, SystemRange, mars_lidar.simulate
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> stream = ml.learn.CubeStream(system, "room", size=16, batch_size=2, signal=0.5, sbr=2.0, epoch_size=4, seed=1)
+    >>> for batch in stream:
+    ...     print(tuple(batch["counts"].shape), tuple(batch["depth"].shape))
+    (2, 128, 16, 16) (2, 16, 16)
+    (2, 128, 16, 16) (2, 16, 16)
     """
 
     def __init__(
@@ -493,7 +510,7 @@ class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
         return f"CubeStream({given}, seed={self._recipe.seed}, epoch {self.epoch})"
 
     def set_epoch(self, epoch: int, start: int = 0) -> None:
-        """Choose the epoch of the next pass, and its first sample: the one before which an earlier run stopped.
+        """Choose the `epoch` of the next pass and its first sample `start`, before which an earlier run stopped.
 
         Without it the first pass is epoch 0 and each gives the next one; with ``repeat=True`` all give the same. After
         n batches a loader has given samples up to ``n * batch_size * world_size``; from there the batches of the rest
@@ -542,7 +559,7 @@ class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
         return state | {"start": min(start, self._end)}
 
     def load_state_dict(self, state: dict[str, int]) -> None:
-        """Go on where `state_dict` was taken; the settings must be the same.
+        """Go on where `state_dict` gave `state`; the settings must be the same.
 
         A pass that was at its end then gives nothing more, and the one after it is the next epoch.
         """
@@ -561,7 +578,7 @@ class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
             self.set_epoch(state["epoch"], state["start"])
 
     def sample(self, index: int) -> Sample:
-        """Scene, Flux, System and seed of a sample of this epoch, not simulated."""
+        """Scene, Flux, System and seed of sample `index` of this epoch, not simulated."""
         return self._recipe.sample(self.epoch, checks.integer("index", index, low=0, high=self._end - 1))
 
     def __len__(self) -> int:

@@ -30,6 +30,7 @@ from mars_lidar.instrument.detector import Mode
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
+from mars_lidar.statistics.budget import MOMENTS, Budget
 from mars_lidar.statistics.cells import Cells, fine_histograms, meets_itself, photons_before
 from mars_lidar.statistics.joint_grid import FoldedGrid
 from mars_lidar.statistics.phase_chain import ConvergenceError
@@ -64,6 +65,21 @@ class Exposure:
         in standard deviations (or relative, if that is larger), of the other cumulants relative to
         themselves or to the power of the standard deviation, and of the shape in total variation. The error
         of the result is smaller: the method is of fourth order for smooth pulses.
+
+    See Also
+    --------
+    exposure_moments, CountLaw
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> exposure = ml.statistics.exposure_moments(ml.Flux(1.0, 1.0, 40.0), system)
+    >>> exposure.cumulants.shape, exposure.histogram.shape
+    ((4,), (128,))
     """
 
     cumulants: FloatArray
@@ -86,6 +102,11 @@ class Exposure:
         """Variance of N (...), never negative."""
         return self.cumulants[..., 1]
 
+    @property
+    def std(self) -> FloatArray:
+        """Standard deviation of N (...)."""
+        return np.sqrt(self.variance)
+
 
 @dataclass(frozen=True, eq=False)
 class Moments:
@@ -99,6 +120,22 @@ class Moments:
         (..., bins) mean records per bin; sums to the mean.
     bins
         (...) bins per period of the final grid, which need not be those of the histogram.
+
+    See Also
+    --------
+    electronics_moments, paralyzable_moments
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> paralyzable = system.replace(detector=ml.Detector(dead_time_ns=75.0, mode="paralyzable"))
+    >>> moments = ml.statistics.paralyzable_moments(ml.Flux(1.0, 1.0, 40.0), paralyzable)
+    >>> bool(abs(moments.histogram.sum() - moments.mean) < 1e-6)
+    True
     """
 
     mean: FloatArray
@@ -107,6 +144,11 @@ class Moments:
     bins: IndexArray
 
     __repr__ = brief
+
+    @property
+    def std(self) -> FloatArray:
+        """Standard deviation of N (...)."""
+        return np.sqrt(self.variance)
 
 
 def darkness(result: Exposure, which: NDArray[np.bool_], bins: int) -> None:
@@ -339,9 +381,29 @@ def exposure_moments(
 
     Raises
     ------
+    TypeError
+        No `Flux` or no `System`.
+    ValueError
+        A tolerance out of range; a detector of mode ``"synchronous"``, with a moving gate, or with effects that this
+        law does not describe.
     ConvergenceError
         Naming the cell, where no grid up to 2^20 bins meets the tolerance, or where the state has not
         repeated after some 10^5 to 10^7 periods of an exposure that is longer still.
+
+    See Also
+    --------
+    count_law, mean_histogram, Exposure
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> exposure = ml.statistics.exposure_moments(ml.Flux(1.0, 1.0, 40.0), system)
+    >>> round(float(exposure.mean), 1), round(float(exposure.variance), 1)
+    (815.2, 127.3)
     """
     cells = Cells.of_flux(
         flux,
@@ -374,11 +436,11 @@ def refined_moments(
     tolerance: float,
     threads: int | None,
     progress: Progress | None = None,
-    steps: int | None = None,
+    budget: Budget = MOMENTS,
 ) -> Exposure:
     """`exposure_moments` of checked cells, histogram in `out_bins` bins; each cell is refined separately.
 
-    ConvergenceError where a cell would take more than about `steps` bins x periods on all its grids.
+    ConvergenceError where a cell would take more than its `budget` of the recursion.
     """
     tolerance = checks.real("tolerance", tolerance, low=1e-9, high=0.1)
     team = thread_count(threads)
@@ -394,11 +456,11 @@ def refined_moments(
         if not pending.size:
             return shaped(result, cells.shape)
     shared = math.gcd(bins // 2, out_bins)
-    coarse = _run(cells.part(pending), bins // 2, shared, team, progress, steps)
+    coarse = _run(cells.part(pending), bins // 2, shared, team, progress, budget)
     last = spent = _spent(coarse, cells)
     while True:
-        _affordable(cells, pending, spent + 2.0 * last, steps)
-        fine = _run(cells.part(pending), bins, out_bins, team, progress, steps)
+        _affordable(cells, pending, spent + 2.0 * last, budget)
+        fine = _run(cells.part(pending), bins, out_bins, team, progress, budget)
         last = _spent(fine, cells)
         spent = spent + last
         moved = movement(coarse, fine)
@@ -437,37 +499,38 @@ def _before(system: System) -> float:
     return RATES_STEPS if system.detector.mode == "paralyzable" else _ENERGY_STEPS
 
 
-def _affordable(cells: Cells, pending: IndexArray, after: FloatArray, steps: int | None) -> None:
-    """Raise ConvergenceError for a cell whose next pass would exceed `steps`."""
-    beyond = after > (math.inf if steps is None else steps)
+def _affordable(cells: Cells, pending: IndexArray, after: FloatArray, budget: Budget) -> None:
+    """Raise ConvergenceError for a cell whose next pass would exceed the budget."""
+    beyond = after > budget.recursion
     if beyond.any():
-        k = int(pending[int(np.argmax(beyond))])
-        why = f"the next grid would exceed {steps:.1g} bins x periods, the limit of a law"
-        raise ConvergenceError(f"exposure statistics of {cells.name(k)}: {why}; {_instead(cells, steps)}")
+        k_pending = int(np.argmax(beyond))
+        k = int(pending[k_pending])
+        seconds = [budget.recursion_seconds(cost) for cost in (float(after[k_pending]), budget.recursion)]
+        why = f"it would take about {seconds[0]:.2g} s, and the limit of a law is {seconds[1]:.1g} s"
+        raise ConvergenceError(f"exposure statistics of {cells.name(k)}: {why}; {_instead(cells, budget)}")
 
 
-def _too_long(cells: Cells, steps: int | None) -> str:
+def _too_long(cells: Cells, budget: Budget) -> str:
     return (
         "the state of the pixel does not repeat from period to period, and the exposure is too long to be run to its "
-        f"end; {_instead(cells, steps)}"
+        f"end; {_instead(cells, budget)}"
     )
 
 
-def _instead(cells: Cells, steps: int | None) -> str:
-    slower = steps is not None and not meets_itself(cells)
+def _instead(cells: Cells, budget: Budget) -> str:
+    slower = budget is not MOMENTS and not meets_itself(cells)
     return cells.alternatives("exposure_moments, which may take some minutes") if slower else cells.instead
 
 
 def _run(
-    cells: Cells, bins: int, out_bins: int, threads: int, progress: Progress | None, steps: int | None = None
+    cells: Cells, bins: int, out_bins: int, threads: int, progress: Progress | None, budget: Budget = MOMENTS
 ) -> Exposure:
     """One pass of the recursion over all cells on one grid."""
     cells.check_history(bins)
-    if steps is not None:
-        steps = int(steps / cells.step_cost(bins))
+    steps = None if budget is MOMENTS else budget.one_pass / cells.step_cost(bins)
     periods = min(3.0 * (cells.system.dead_time_periods + 1.0), cells.system.cycles) + _before(cells.system)
     if steps is not None and periods * bins > steps:
-        raise ConvergenceError(f"exposure statistics of {cells.name(0)}: {_too_long(cells, steps)}")
+        raise ConvergenceError(f"exposure statistics of {cells.name(0)}: {_too_long(cells, budget)}")
     result = blank(cells, out_bins)
     for part in cells.chunks(bins, out_bins):
         some = cells.part(part)
@@ -484,7 +547,7 @@ def _run(
     lost = result.settled == UNSETTLED
     if lost.any():
         k = int(np.argmax(lost))
-        raise ConvergenceError(f"exposure statistics of {cells.name(k)}: {_too_long(cells, steps)}")
+        raise ConvergenceError(f"exposure statistics of {cells.name(k)}: {_too_long(cells, budget)}")
     result.bins[:] = bins
     return result
 

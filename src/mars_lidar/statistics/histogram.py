@@ -14,9 +14,10 @@ from mars_lidar.instrument.detector import MODES
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
-from mars_lidar.statistics.cells import LAW_STEPS, Cells, fine_histograms
+from mars_lidar.statistics.budget import LAW
+from mars_lidar.statistics.cells import Cells, fine_histograms
 from mars_lidar.statistics.chain import PhaseChain
-from mars_lidar.statistics.electronics import ELECTRONICS_MODES, LAW_EFFORT, moments, stationary_records
+from mars_lidar.statistics.electronics import ELECTRONICS_MODES, moments, stationary_records
 from mars_lidar.statistics.exposure import normalised, refined_moments, stationary_histogram
 from mars_lidar.statistics.gate import PLAIN
 from mars_lidar.statistics.paralyzable import paralyzable_histograms
@@ -34,11 +35,49 @@ def mean_histogram(
     tolerance: float = 1e-4,
     threads: int | None = None,
 ) -> FloatArray:
-    """Mean histogram (..., bins) of the finite exposure, exact for every mode of the detector.
+    """Mean histogram of the finite exposure, exact for every mode of the detector.
 
-    Parameters and errors are those of `exposure_moments`; a gate must not move. The histogram sums to the mean count
-    and includes jitter, code widths and, for modes ``"nonparalyzable"`` and ``"gated"``, the dead time of the
-    electronics (to 1e-3, see `electronics_moments`).
+    It sums to the mean count and includes jitter, code widths and, for modes ``"nonparalyzable"`` and ``"gated"``, the
+    dead time of the electronics (to 1e-3, see `electronics_moments`).
+
+    Parameters
+    ----------
+    flux, system
+        The light of pixels of shape (...), photons per period, and what registers it; a gate must not move.
+    tolerance
+        The grid is refined until the result moves by less than this, in [1e-9, 0.1] (`Exposure.movement`).
+    threads
+        Threads to run on; default: all processors that this process may use.
+
+    Returns
+    -------
+    NDArray
+        (..., bins) expected registrations in `System.cycles` periods.
+
+    Raises
+    ------
+    TypeError
+        No `Flux` or no `System`.
+    ValueError
+        A tolerance out of range, a moving gate, or effects whose mean is not known (afterpulses, crosstalk).
+    ConvergenceError
+        Naming the cell, where no grid meets the tolerance or the exposure is too long to be run through.
+
+    See Also
+    --------
+    registration_pdf, photons_per_bin, joint_law
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> light = ml.Flux(signal=1.0, background=1.0, delay_ns=40.0)
+    >>> mean = ml.statistics.mean_histogram(light, system)
+    >>> mean.shape, round(float(mean.sum()), 1)
+    ((128,), 815.2)
     """
     cells = Cells.of_flux(
         flux,
@@ -64,7 +103,7 @@ def mean_histograms(cells: Cells, tolerance: float, threads: int | None) -> Floa
 def _registrations(cells: Cells, bins: int, tolerance: float, threads: int | None) -> FloatArray:
     mode = cells.system.detector.mode
     if "electronics_dead_time_ns" in cells.system.detector.effects:
-        return moments(cells, max(tolerance, 1e-3), LAW_EFFORT).histogram.reshape(cells.size, bins)
+        return moments(cells, max(tolerance, 1e-3), LAW).histogram.reshape(cells.size, bins)
     if mode == "synchronous":
         armed = first_arrivals(cells)
         registered = np.maximum(armed.sum(-1), np.finfo(float).tiny)
@@ -74,7 +113,7 @@ def _registrations(cells: Cells, bins: int, tolerance: float, threads: int | Non
         return paralyzable_histograms(cells, tolerance)
 
     def compute(some: Cells, bins: int) -> FloatArray:
-        exposure = refined_moments(some, bins, tolerance=tolerance, threads=threads, steps=LAW_STEPS)
+        exposure = refined_moments(some, bins, tolerance=tolerance, threads=threads, budget=LAW)
         return exposure.histogram.reshape(some.size, bins)
 
     return fine_histograms(cells, bins, tolerance, compute)
@@ -115,6 +154,15 @@ def registration_pdf(
     NDArray
         (..., bins), non-negative; sums to 1 over the last axis. A cell without any flux has the uniform
         shape, the limit of little background.
+
+    Raises
+    ------
+    TypeError
+        No `Flux` or no `System`.
+    ValueError
+        An unknown `method`, `rearm` without ``"chain"``, or a detector that the method does not describe.
+    ConvergenceError
+        Naming the cell, where no grid meets the tolerance.
 
     See Also
     --------

@@ -33,6 +33,7 @@ from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
+from mars_lidar.statistics.budget import LAW, advice
 from mars_lidar.statistics.cells import (
     MANY_BINS,
     Cells,
@@ -49,11 +50,9 @@ from mars_lidar.statistics.timing import Timing, is_timed
 
 # --- One pixel on one grid -----------------------------------------------------------------------------------------
 
-INSTEAD = "use exposure_moments (count and mean histogram), or simulate it with engine 'exact'"
+INSTEAD = advice("exposure_moments (count and mean histogram)")
 _SETTLED = 1e-9  # total variation from the stationary state at which the start is forgotten
-_MAX_STEPS = 40_000_000  # bins x periods after which an exposure counts as not settling: half a second
 _MANY_BINS = 2**16  # bins of a grid beyond which fewer windows are compared: a window takes long
-_MAX_RECURSION = 2**22  # bins x periods of an exposure that is run through for every window
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,7 +203,7 @@ class Pixel:
                     cycles=grid.cycles,
                     state=self.state,
                     tolerance=_SETTLED,
-                    max_steps=_MAX_STEPS,
+                    max_steps=LAW.forgetting,
                     total=total,
                 )
             )
@@ -212,7 +211,7 @@ class Pixel:
         except ConvergenceError as error:
             raise ConvergenceError(f"joint law of {cells.name(0)}: {error}; {INSTEAD}") from None
         if self.law is None:
-            if self.settled == -2 or bins * (grid.cycles + grid.whole) > _MAX_RECURSION:
+            if self.settled == -2 or bins * (grid.cycles + grid.whole) > LAW.run_through:
                 raise ConvergenceError(
                     f"joint law of {cells.name(0)}: the pixel does not forget its start before the exposure ends, "
                     f"and {bins} bins x {grid.cycles} periods are too many to run through; {INSTEAD}"
@@ -425,19 +424,23 @@ def joint_law(
 
     Raises
     ------
+    TypeError
+        No `Flux` or no `System`.
+    ValueError
+        Several pixels, a tolerance out of range, or a detector that this law does not describe.
     ConvergenceError
         Naming the pixel, where no grid up to 2^17 bins meets the tolerance, or where the exposure does not
         forget its start and is too long to be run through bin by bin (more than 2^22 bins x periods).
+
+    See Also
+    --------
+    count_law, simulate
 
     Notes
     -----
     The result includes the terms of the start and of the end of the exposure; nothing is assumed stationary. Where
     the exposure is too short to forget its start (`settled` is -1) every window is run through all periods, which
     is exact too but costs O(bins x cycles) a window instead of O(bins).
-
-    See Also
-    --------
-    count_law, simulate
 
     Examples
     --------
@@ -592,6 +595,11 @@ class JointLaw:
         """(bins,) variances of the bins."""
         return self.lag(0)
 
+    @property
+    def std(self) -> FloatArray:
+        """(bins,) standard deviations of the bins."""
+        return np.sqrt(self.variance)
+
     def window(self, weights: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Mean and variance of ``weights @ H``.
 
@@ -614,7 +622,7 @@ class JointLaw:
         return (w @ self.mean).reshape(shape)[()], np.maximum(variance, 0.0).reshape(shape)[()]
 
     def covariance_of(self, first: ArrayLike, second: ArrayLike) -> FloatArray:
-        """Covariances (...) of ``first @ H`` and ``second @ H``, weights (..., bins) that broadcast."""
+        """Covariances (...) of ``first @ H`` and ``second @ H``; weights `first` and `second` (..., bins) broadcast."""
         a, b = np.asarray(first), np.asarray(second)
         try:
             a, b = np.broadcast_arrays(a, b)
@@ -628,7 +636,7 @@ class JointLaw:
         return np.concatenate([self._pixel.covariances(x, y) for x, y in parts]).reshape(shape)[()]
 
     def lag(self, lag: int = 1) -> FloatArray:
-        """(bins,) covariances of bin j with bin j + lag, round the period; lag 0: variances. May raise MemoryError."""
+        """Covariances (bins,) of bin j with bin j + `lag`, round the period; at 0 variances. May raise MemoryError."""
         n = self.mean.size
         lag = checks.integer("lag", lag, low=-n, high=n)
         if self._pixel is None:

@@ -45,7 +45,7 @@ class NumpyTable:
         rows = np.arange(table.signal.size * table.background.size).reshape(table.signal.size, -1)
         inner = rows[-signal.size :, -background.size :].ravel()
         nodes = np.repeat(signal, background.size), np.tile(background, signal.size)
-        moments = table.lookup(*nodes, cycles=system.cycles, interpolation="nearest").cumulants
+        moments = table.at(*nodes, cycles=system.cycles, interpolation="nearest").cumulants
         shapes = table.shapes(system.cycles)[inner]
         return cls(
             low=(float(logs[0][0]), float(logs[1][0])),

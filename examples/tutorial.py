@@ -43,7 +43,7 @@ ml.plot.map_image(counts[0].sum(-1), "registrations")
 # %%
 y, x = 20, 30
 law = ml.count_law(flux[y, x], system)
-print(f"drawn {counts[0, y, x].sum()}, expected {law.mean:.1f} ± {np.sqrt(law.variance):.1f}")
+print(f"drawn {counts[0, y, x].sum()}, expected {law.mean:.1f} ± {law.std:.1f}")
 law
 
 # %%
@@ -54,8 +54,8 @@ ml.joint_law(flux[y, x], system)
 
 # %%
 estimate = ml.reconstruct(counts, system)
-error_m = np.abs(estimate.depth_m[0] - scene.depth_m)[estimate.seen[0]]
-print(f"median error {1e3 * np.median(error_m):.1f} mm over {100 * estimate.seen.mean():.1f} % of the pixels")
+error_m = np.abs(estimate.depth_m[0] - scene.depth_m)[estimate.detected[0]]
+print(f"median error {1e3 * np.median(error_m):.1f} mm over {100 * estimate.detected.mean():.1f} % of the pixels")
 estimate
 
 # %% [markdown]

@@ -29,8 +29,9 @@ class Request:
     """What is asked of a study: output folder, quick or full, reference data, who hears of progress.
 
     `truth` is the engine whose simulation the study "count-law" takes for true; `stream` a measured photon stream for
-    the study "hardware"; `config` the size of "downstream"; `seed` another sweep of the study "domain"; `rgbd` a
-    folder of RGB-D pairs for the study "image".
+    the study "hardware"; `config` the size of "downstream"; `seed` and `systems` another sweep, and its size, of the
+    studies "domain" and "long-exposures"; `rgbd` a folder of RGB-D pairs and `captures` one of measured cubes for the
+    study "image".
     """
 
     out: Path
@@ -41,7 +42,9 @@ class Request:
     stream: Path | None = None
     config: str = "small"
     seed: int | None = None
+    systems: int | None = None
     rgbd: Path | None = None
+    captures: Path | None = None
 
 
 class OtherRunsError(ValueError):

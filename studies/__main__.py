@@ -45,9 +45,12 @@ def _parser(command: str) -> argparse.ArgumentParser:
         "(default: %(default)s); with --quick a tiny one, seconds"
     )
     add("--config", choices=("small", "full"), default="small", help=words)
-    add("--seed", type=int, metavar="N", help="another sweep (study 'domain')")
+    add("--seed", type=int, metavar="N", help="another sweep (studies 'domain', 'long-exposures')")
+    add("--systems", type=int, metavar="N", help="systems of a sweep (studies 'domain', 'long-exposures')")
     words = "folder of RGB-D pairs, NAME_depth.png and NAME_colors.png or Middlebury folders (study 'image')"
     add("--rgbd", type=Path, metavar="DIR", help=words)
+    words = "folder of measured cubes, .zarr, .h5 or .npz, as `mars_lidar.io.save` writes them (study 'image')"
+    add("--captures", type=Path, metavar="DIR", help=words)
     words = "instead of the study 'image', train its networks, and write weights and card into --out"
     add("--train", action="store_true", help=words)
     return parser
@@ -77,8 +80,12 @@ def main(arguments: Sequence[str] | None = None, command: str = "python -m studi
         parser.error(f"--stream must be a file, got {str(given.stream)!r}")
     if given.train and given.studies != ["image"]:
         parser.error(f"--train is of study 'image' alone, got {' '.join(given.studies)}")
-    if given.rgbd is not None and not given.rgbd.is_dir():
-        parser.error(f"--rgbd must be a folder, got {str(given.rgbd)!r}")
+    for name in ("rgbd", "captures"):
+        folder = getattr(given, name)
+        if folder is not None and not folder.is_dir():
+            parser.error(f"--{name} must be a folder, got {str(folder)!r}")
+    if given.systems is not None and given.systems < 1:
+        parser.error(f"--systems must be at least 1, got {given.systems}")
     try:
         given.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:

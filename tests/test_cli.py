@@ -54,6 +54,33 @@ def test_one_command_writes_a_cube_and_a_picture(tmp_path):
         assert (data.attrs["engine"], data.attrs["seed"], data.attrs["complete"]) == ("exact", 3, True)
 
 
+@pytest.mark.parametrize("engine", ["feedback", "auto"])
+@pytest.mark.parametrize(
+    ("light", "reason"),
+    [
+        (["--cycles", 50], "short exposure"),
+        (["--cycles", 10_000, "--signal", 2, "--sbr", 0.01], "slow sweeps"),
+        (["--cycles", 3000, "--signal", 40, "--sbr", 40], "locked, short exposure"),
+        (["--cycles", 10_000, "--dead-time-ns", 1e-4], "too many cells"),
+    ],
+)
+def test_pixels_given_to_the_exact_engine_are_said(tmp_path, engine, light, reason):
+    """Each number of the report about them, and every reason, stands on the terminal."""
+    out, small = tmp_path / "room.npz", ["--size", 4, "--bins", 64, "--seed", 3]
+    done = run("simulate", "--scene", "room", *small, *light, "--engine", engine, "-o", out, "--no-picture")
+    assert done.exit_code == 0, done.output
+    told = " ".join(done.output.split())
+    cube, report = io.load(out), dict[str, float]()
+    ml.simulate(cube.flux, cube.system, engine=engine, seed=3, report=report)
+    about = {name: number for name, number in report.items() if "exact" in name}
+    assert about
+    if engine == "feedback":
+        assert about[f"pixels given to exact, {reason}"] > 0
+    for name, number in about.items():
+        what, _, why = name.partition(", ")
+        assert f"{what}{f' ({why})' if why else ''} {number:,.0f}" in told
+
+
 @pytest.mark.parametrize("suffix", [".h5", ".npz", ".zarr"])
 def test_every_option_of_the_run_reaches_the_file(tmp_path, suffix):
     np.save(tmp_path / "irf.npy", np.exp(-np.arange(50) / 9.0))

@@ -1,25 +1,136 @@
-"""The examples of the docstrings run, and every public verb and class of the package has one."""
+"""Docstrings of the public names: every parameter is described and typed, examples run, and errors are documented.
+
+Public is what the packages export and what the reference lists (docs/reference.md).
+"""
 
 from __future__ import annotations
 
 import doctest
+import importlib
 import inspect
+import re
+import warnings
+from collections.abc import Callable, Iterator
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
 
 import pytest
 
 import mars_lidar as ml
 
+pytest.importorskip("torch")  # learn
+numpydoc = pytest.importorskip("numpydoc.docscrape")
+
 FLAGS = doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS
-WITHOUT = {"Generated", "Pulse", "UnitWarning"}  # a result, a base class and a warning
-WITHOUT |= {"Calibration", "calibrate"}  # some seconds: docs/calibration.md
-PUBLIC = sorted(name for name in ml.__all__ if callable(getattr(ml, name)))
+REFERENCE = Path(__file__).resolve().parents[1] / "docs" / "reference.md"
+PACKAGES = ("", "io", "learn", "plot", "reconstruction", "statistics")
+# Examples of these take some seconds, which docs/calibration.md runs.
+WITHOUT_EXAMPLE = {"Calibration", "calibrate"}
+# What has no example, See also or section Raises yet, by the start of its name: this may only shrink.
+UNFINISHED = ("io.", "Calibration", "Cube", "calibrate", "to_xarray")
 
 
-@pytest.mark.parametrize("name", [name for name in PUBLIC if name not in WITHOUT])
+def _resolve(dotted: str) -> Any:
+    thing: Any = ml
+    for name in filter(None, dotted.split(".")):
+        thing = getattr(thing, name) if hasattr(thing, name) else importlib.import_module(f"{thing.__name__}.{name}")
+    return thing
+
+
+@lru_cache(maxsize=1)
+def public() -> dict[str, Any]:
+    """Public functions and classes by their shortest names below the package."""
+    names = {f"{package}.{name}" for package in PACKAGES for name in _resolve(package).__all__ if package}
+    names |= set(ml.__all__)
+    module = ""
+    for line in REFERENCE.read_text(encoding="utf-8").splitlines():
+        if match := re.match(r"\.\. currentmodule:: mars_lidar\.?(\S*)", line):
+            module = match[1]
+        elif match := re.match(r"   ([\w.]+)$", line):
+            names.add(f"{module}.{match[1]}".strip("."))
+    things: dict[int, tuple[str, Any]] = {}
+    for name in sorted(names, key=lambda each: (len(each), each)):
+        thing = _resolve(name)
+        if callable(thing):
+            things.setdefault(id(thing), (name, thing))
+    return dict(sorted(things.values()))
+
+
+def _sections(thing: Any) -> Any:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return numpydoc.NumpyDocString(inspect.getdoc(thing) or "")
+
+
+def _described(thing: Any) -> dict[str, str]:
+    """Descriptions by the names in the sections Parameters and Attributes."""
+    entries = [
+        entry for section in ("Parameters", "Other Parameters", "Attributes") for entry in _sections(thing)[section]
+    ]
+    return {name.strip(" *"): "".join(entry.desc) for entry in entries for name in entry.name.split(",")}
+
+
+def _parameters(thing: Any) -> list[inspect.Parameter]:
+    if isinstance(thing, type) and (issubclass(thing, BaseException) or "enum" in str(type(thing))):
+        return []
+    try:
+        parameters = inspect.signature(thing).parameters.values()
+    except (TypeError, ValueError):  # a typed dictionary: its keys are attributes
+        return []
+    return [each for each in parameters if each.name not in ("self", "cls") and not each.name.startswith("_")]
+
+
+def _methods(thing: Any) -> Iterator[tuple[str, Callable[..., Any]]]:
+    if isinstance(thing, type):
+        for name, member in vars(thing).items():
+            function = getattr(member, "__func__", member)
+            if not name.startswith("_") and inspect.isfunction(function):
+                yield name, function
+
+
+@pytest.mark.parametrize("name", [name for name in public() if name not in WITHOUT_EXAMPLE])
 def test_the_example_of_a_docstring(name: str):
-    text = inspect.getdoc(getattr(ml, name)) or ""
-    assert "See Also\n--------" in text
+    text = inspect.getdoc(public()[name]) or ""
     test = doctest.DocTestParser().get_doctest(text, {}, name, None, None)
-    assert test.examples
+    if not test.examples:
+        assert name.startswith(UNFINISHED) or issubclass(public()[name], BaseException)
+        pytest.skip("no example yet" if name.startswith(UNFINISHED) else "an error has none")
     results = doctest.DocTestRunner(optionflags=FLAGS).run(test)
     assert results.failed == 0
+
+
+@pytest.mark.parametrize("name", public())
+def test_sections(name: str):
+    """See also; and for what takes arguments that may be wrong, Raises."""
+    thing = public()[name]
+    sections = _sections(thing)
+    missing = [section for section in ("See Also",) if not sections[section]]
+    results = isinstance(thing, type) and bool(sections["Attributes"]) and not sections["Parameters"]
+    if _parameters(thing) and not results and not sections["Raises"] and not getattr(thing, "_abstract", False):
+        missing.append("Raises")
+    assert not missing or name.startswith(UNFINISHED), f"{name} has no section {missing}"
+
+
+@pytest.mark.parametrize("name", public())
+def test_every_parameter_is_described_and_typed(name: str):
+    """Of functions and constructors under Parameters (or Attributes); of methods there, or by name in the text."""
+    thing = public()[name]
+    described = _described(thing)
+    problems = [each.name for each in _parameters(thing) if not described.get(each.name)]
+    problems += [f"{each.name} has no type" for each in _parameters(thing) if each.annotation is each.empty]
+    unknown = {each.name.strip(" *") for entry in _sections(thing)["Parameters"] for each in [entry]}
+    unknown = {part.strip(" *") for each in unknown for part in each.split(",")} - {
+        each.name for each in _parameters(thing)
+    }
+    problems += [f"{each} is no parameter" for each in unknown if _parameters(thing)]
+    for method, function in _methods(thing):
+        text = (inspect.getdoc(function) or "") + (inspect.getdoc(thing) or "")
+        known = _described(function) | described
+        problems += [
+            f"{method}({each.name})"
+            for each in _parameters(function)
+            if not known.get(each.name) and not re.search(rf"`[^`]*\b{each.name}\b[^`]*`", text)
+        ]
+        problems += [f"{method} has no text"] if not inspect.getdoc(function) else []
+    assert not problems or name.startswith(UNFINISHED), f"{name}: {problems}"

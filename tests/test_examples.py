@@ -11,7 +11,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 LESSONS = sorted(ROOT.glob("examples/lessons/lesson_*.py"))
-GALLERY = sorted(path for path in ROOT.glob("examples/gallery/plot_*.py") if "measured_stream" not in path.name)
+GALLERY = sorted(ROOT.glob("examples/gallery/plot_*.py"))
 _NEEDS = {"plot_10_endless_stream": "torch"}
 
 

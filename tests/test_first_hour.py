@@ -141,11 +141,11 @@ def test_depth_is_judged_in_the_table_as_in_the_picture(tmp_path):
     io.simulate_to(tmp_path / "a.zarr", flux, SYSTEM)
     with io.load(tmp_path / "a.zarr") as cube:
         found = ml.reconstruct(cube)
-        assert 0.0 < found.seen.mean() < 1.0
-        drawn = depth_error_m(cube, np.where(found.seen[0], found.depth_m[0], np.nan))
+        assert 0.0 < found.detected.mean() < 1.0
+        drawn = depth_error_m(cube, np.where(found.detected[0], found.depth_m[0], np.nan))
         told = errors_against(cube, found)["depth"]
     assert told.rmse == pytest.approx(float(np.sqrt(np.nanmean(drawn**2))))
-    assert told.missing == pytest.approx(1.0 - float(found.seen.mean()))
+    assert told.missing == pytest.approx(1.0 - float(found.detected.mean()))
 
 
 def test_what_an_earlier_run_did_is_no_part_of_the_speed(monkeypatch, capsys):

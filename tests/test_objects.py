@@ -55,7 +55,7 @@ def objects(tmp_path_factory) -> dict[str, Any]:
         "look": light.look,
         "estimate": light.estimates["signal"],
         "table": table,
-        "lookup": table.lookup(np.array([0.5]), np.array([0.5])),
+        "lookup": table.at(np.array([0.5]), np.array([0.5])),
         "engine": MarsEngine(table=table, count="matched"),
         "stored cube": io.load(stored),
         "cube": io.Cube.of(cube, io.Recipe(system=SYSTEM, flux=flux, realizations=2)),

@@ -123,6 +123,10 @@ def test_peak_depth_knows_what_the_delay_of_a_measured_pulse_refers_to(origin):
     _, estimate = plot.count_maps(cube)
     # the sample of the peak is two bins wide: either of them may hold most counts
     assert np.abs(plot.depth_error_m(cube, estimate)).max() < system.depth_m(0.6)
+    counts = np.asarray(cube.histogram)
+    assert np.array_equal(plot.count_maps(counts, system=cube.system)[1], estimate)
+    error = plot.depth_error_m(counts, estimate, system=cube.system, flux=cube.flux)
+    assert np.allclose(error, plot.depth_error_m(cube, estimate))
 
 
 def test_depth_is_missing_where_nothing_was_counted():

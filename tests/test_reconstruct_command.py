@@ -42,7 +42,7 @@ def test_reflectivity_is_right_behind_a_detection_efficiency(tmp_path):
     words = (*SMALL[:-1], 8, "--detection-efficiency", share, "--cycles", 3000, "--no-picture", "-o", out)
     assert run("simulate", "--scene", "room", *words).exit_code == 0
     with io.load(out) as stored:
-        found = reconstruct_stored(stored, ["maximum_likelihood"])["maximum_likelihood"].found
+        found = reconstruct_stored(stored, ["maximum_likelihood"])["maximum_likelihood"].result
         ratio = found.reflectivity[0] / stored.reflectivity
         np.testing.assert_allclose(found.signal[0] / stored.flux.signal, share, rtol=0.15)
     assert np.median(ratio) == pytest.approx(1.0, abs=0.02)
@@ -185,13 +185,13 @@ def test_without_scikit_image_only_ssim_is_missing(cube, tmp_path, monkeypatch):
 
 def test_parts_make_the_whole(cube, monkeypatch):
     with io.load(cube) as stored:
-        whole = reconstruct_stored(stored, ["generalised_coates"])["generalised_coates"].found
+        whole = reconstruct_stored(stored, ["generalised_coates"])["generalised_coates"].result
         for module, name in ((recipes, "BLOCK_BYTES"), (stored_module, "_CHUNK_BYTES")):
             monkeypatch.setattr(module, name, 3 * 12 * 256 * 2)  # three rows at a time
         seen = []
         parts = reconstruct_stored(stored, ["generalised_coates"], progress=lambda *at: seen.append(at))
     for name, values in whole.maps().items():
-        assert np.array_equal(values, getattr(parts["generalised_coates"].found, name), equal_nan=True)
+        assert np.array_equal(values, getattr(parts["generalised_coates"].result, name), equal_nan=True)
     assert len(seen) == 8
     assert seen[-1] == (288, 288)
 

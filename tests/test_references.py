@@ -1,7 +1,8 @@
-"""Names in backticks in docstrings and docs exist; riddling names in the package do not come back.
+"""Names in backticks in docstrings and docs exist, and so do the pages, sections and equations that source code cites;
+riddling names in the package do not come back.
 
 A name of this package in backticks (`statistics.matched_pmf`, `System.start`, `io/cube.py`) is a reference that a
-reader follows; a rename that forgets it fails here.
+reader follows, and so is `docs/table.md, section 3`: a rename that forgets it fails here.
 """
 
 from __future__ import annotations
@@ -37,22 +38,7 @@ PLACEHOLDERS = ("NAME", "SCENE", "FILE")
 # Names that do not say what they hold, in assignments, arguments, functions and classes. The count of a folder may
 # only fall: whoever removes some lowers its number here.
 RIDDLES = {"found", "told", "seen", "one", "shown", "kept", "left", "mended", "elsewhere", "purse", "dear", "behind"}
-MOST_RIDDLES = {
-    ".": 1,
-    "_base": 29,
-    "calibration": 12,
-    "cli": 49,
-    "cuda": 4,
-    "dataset": 74,
-    "engines": 21,
-    "explore": 8,
-    "io": 113,
-    "learn": 2,
-    "light": 3,
-    "plot": 10,
-    "reconstruction": 33,
-    "statistics": 1,
-}
+MOST_RIDDLES = {"calibration": 12, "cli": 49, "dataset": 74, "engines": 21, "io": 113, "plot": 3, "reconstruction": 16}
 
 
 @lru_cache(maxsize=1)
@@ -208,6 +194,82 @@ def test_source_files_in_backticks_exist():
         and not any(name.endswith("/" + quoted.removeprefix("/")) for name in files)
     ]
     assert not missing, "\n".join(missing)
+
+
+# --- Pages that source code cites ------------------------------------------------------------------------------------
+
+PAGE = r"docs/([\w/]+)\.md"
+NUMBER = r"[RPL]?\d+(?:\.\d)?[a-z]?"
+COMMENT = re.compile(r"//[^\n]*|/\*.*?\*/", re.DOTALL)
+CITED_SECTION = re.compile(rf"{PAGE},? \(?sections? (\d+(?:\.\d)?)|sections? (\d+(?:\.\d)?) of {PAGE}")
+CITED_HEADING = re.compile(rf'{PAGE}, "([^"]+)"')
+# Numbers of equations that cannot be anything else: (R9a), (4.3), "eq. 14" or "eq. 9, 11"; and those beside a page.
+CITED_NUMBER = re.compile(rf"(?<![\w)])\(([RPL]\d+[a-z]?|\d\.\d)\)|\beq\. ({NUMBER})(?:, ({NUMBER}))?\)")
+BESIDE_PAGE = re.compile(rf"{PAGE},? (?:eq\.|equations?)? ?\(?({NUMBER})\)?(?: (?:to|and) \(?({NUMBER})\)?)?(?![\w.])")
+BEFORE_PAGE = re.compile(rf"(?:eq\.|equations?|\() ?({NUMBER})\)? of {PAGE}")
+
+
+def _comments(path: Path) -> str:
+    """All comments of a C++ or JavaScript file, or all of a Python file, as running text."""
+    text = path.read_text(encoding="utf-8")
+    if path.suffix != ".py":
+        text = "\n".join(COMMENT.findall(text))
+    return re.sub(r"\s*\n\s*(?://|\*(?!\*)|#)?\s*", " ", text)
+
+
+@lru_cache
+def _equations(page: str) -> frozenset[str]:
+    """Numbers of the equations of a page: its tags, and those that stand in its text."""
+    text = (ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8")
+    return frozenset(re.findall(rf"\\tag\{{({NUMBER})\}}", text) + re.findall(r"(?<!\w)\(([RPL]\d+[a-z]?)\)", text))
+
+
+@lru_cache
+def _headings(page: str) -> frozenset[str]:
+    text = (ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8")
+    return frozenset(re.findall(r"^#+ +(.+?) *$", text, flags=re.MULTILINE))
+
+
+def _citing() -> list[Path]:
+    patterns = ("src/mars_lidar/**/*.py", "src/mars_lidar/native/**/*", "explorer/native/*", "explorer/src/*")
+    kinds = (".py", ".h", ".cpp", ".cu", ".js")
+    return sorted(path for each in patterns for path in ROOT.glob(each) if path.suffix in kinds)
+
+
+def test_pages_and_sections_that_code_cites_exist():
+    missing = []
+    for path in _citing():
+        text, place = _comments(path), path.relative_to(ROOT)
+        pages = {page for page in re.findall(PAGE, text) if (ROOT / "docs" / f"{page}.md").is_file()}
+        missing += [f"{place}: docs/{page}.md" for page in set(re.findall(PAGE, text)) - pages]
+        for page, section, other_section, other_page in CITED_SECTION.findall(text):
+            page, section = page or other_page, section or other_section
+            if page in pages and not any(re.match(rf"{section}\.? ", heading) for heading in _headings(page)):
+                missing.append(f"{place}: docs/{page}.md, section {section}")
+        for page, heading in CITED_HEADING.findall(text):
+            if page in pages and heading not in _headings(page):
+                missing.append(f'{place}: docs/{page}.md, "{heading}"')
+    assert not missing, "\n".join(missing)
+
+
+def test_equations_that_native_code_cites_exist():
+    """Each number of an equation is one of a page that its file cites, or its folder where the file cites none."""
+    sources = {path: _comments(path) for path in _citing() if path.suffix != ".py"}
+    folders: dict[Path, set[str]] = {}
+    for path, text in sources.items():
+        folders.setdefault(path.parent, set()).update(re.findall(PAGE, text))
+    missing, resolved = [], 0
+    for path, text in sources.items():
+        place, pages = path.relative_to(ROOT), set(re.findall(PAGE, text)) or folders[path.parent]
+        known = {number for page in pages for number in _equations(page)}
+        cited = {number for match in CITED_NUMBER.findall(text) for number in match if number}
+        missing += [f"{place}: ({number}), which none of {sorted(pages)} has" for number in sorted(cited - known)]
+        beside = [(page, number) for page, *numbers in BESIDE_PAGE.findall(text) for number in numbers if number]
+        beside += [(page, number) for number, page in BEFORE_PAGE.findall(text)]
+        missing += [f"{place}: docs/{page}.md, ({number})" for page, number in beside if number not in _equations(page)]
+        resolved += len(cited) + len(beside)
+    assert not missing, "\n".join(missing)
+    assert resolved > 60
 
 
 def _riddles(tree: ast.Module) -> int:

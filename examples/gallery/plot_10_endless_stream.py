@@ -9,7 +9,7 @@ The program prints ``The network's median error is below the matched filter's: T
 """
 
 import matplotlib.pyplot as plt
-from torch import from_numpy, nn, optim
+from torch import from_numpy, manual_seed, nn, optim
 
 import mars_lidar as ml
 from mars_lidar.learn import CubeStream, LogUniform
@@ -17,6 +17,7 @@ from mars_lidar.learn import CubeStream, LogUniform
 pulse, detector = ml.GaussianPulse(sigma_ns=1.5), ml.Detector(dead_time_ns=75.0)
 system = ml.System(period_ns=100.0, cycles=100, bins=64, pulse=pulse, detector=detector)
 layers = nn.Conv2d(64, 64, 1), nn.ReLU(), nn.Conv2d(64, 32, 3, padding=1), nn.ReLU(), nn.Conv2d(32, 64, 3, padding=1)
+manual_seed(0)  # weights before training
 net = nn.Sequential(*layers)
 optimizer = optim.AdamW(net.parameters(), 3e-3)
 for batch in CubeStream(system, size=32, batch_size=8, epoch_size=8 * 60, signal=LogUniform(0.02, 0.5), seed=1):

@@ -1,5 +1,5 @@
 // Registrations of a paralyzable pixel on the grid of the native recursion, as statistics/paralyzable_rate.py has them
-// (docs/detectors.md, equations 1 and 17).
+// (docs/theory_detectors.md, (1) and (17)).
 import { PARTS, differences, edgesOf, photonsBefore } from "./light.js";
 
 const ORDERS = 4;

@@ -1,5 +1,5 @@
 // The exact law of a synchronous pixel: an armed period registers with probability q = 1 - e^-Lambda and costs 1 + K or
-// 2 + K periods (docs/detectors.md, equations 4 to 7). The generating function of its count is carried from period to
+// 2 + K periods (docs/theory_detectors.md, (4) to (7)). The generating function of its count is carried from period to
 // period; statistics/synchronous.py has the same law by sums.
 import { edgesOf, photonsBefore, sum } from "./light.js";
 

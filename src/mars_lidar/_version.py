@@ -7,5 +7,5 @@ def other_version(made_by: object) -> str:
     """What is added where counts differ: empty, or, in brackets after a space, that another version made them."""
     if made_by in (None, "", __version__):
         return ""
-    told = f"made by mars-lidar {made_by}, this is {__version__}"
-    return f" ({told}: another version may draw other counts of the same law; {made_by} makes these again)"
+    versions = f"made by mars-lidar {made_by}, this is {__version__}"
+    return f" ({versions}: another version may draw other counts of the same law; {made_by} makes these again)"

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.memory import check_memory
-from mars_lidar._base.progress import shown
+from mars_lidar._base.progress import callback_of
 from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import FloatArray, Progress
 from mars_lidar.engines import Engine, EngineOptions, check_detector, find_engine
@@ -157,8 +157,26 @@ def simulate_timestamps(
 ) -> Timestamps:
     """Registration times of an image in one realization.
 
-    Parameters are those of `simulate`; the result is in the processor's memory on every device. The histogram of the
-    result equals ``simulate(..., first_realization=realization)[0]`` of the same seed exactly.
+    The histogram of the result equals ``simulate(..., first_realization=realization)[0]`` of the same seed exactly.
+
+    Parameters
+    ----------
+    flux, system
+        The light (H, W), photons per period, and what registers it.
+    engine
+        ``"exact"`` (default) or ``"sequential"``, or an `Engine`.
+    realization
+        Number of the exposure, from 0.
+    pixel_index
+        Place of each pixel in a larger image, as for `simulate`.
+    seed
+        Integer in [0, 2**64).
+    threads
+        Threads to run on; default: all processors this process may use. The result does not depend on it.
+    device
+        ``"cpu"`` (default) or ``"cuda"``; the result is in the processor's memory on every device.
+    progress
+        As for `simulate`.
 
     Returns
     -------
@@ -168,6 +186,8 @@ def simulate_timestamps(
 
     Raises
     ------
+    TypeError
+        An argument of another type, or an unknown keyword.
     ValueError
         As `simulate`; also for an engine that draws histograms only.
     MemoryError
@@ -248,7 +268,7 @@ def _task(
     number = checks.integer("realizations", realizations, low=1, high=2**32 - first)
     seed = checks.integer("seed", seed, low=0, high=2**64 - 1)
     team = thread_count(threads)
-    progress = shown(progress, "simulating")
+    progress = callback_of(progress, "simulating")
     if len(flux.returns_signal) > MAX_RETURNS:
         raise ValueError(
             f"flux must have at most {MAX_RETURNS} returns, got {len(flux.returns_signal)}; use a waveform"

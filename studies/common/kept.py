@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from threading import Lock
 from typing import Any, TypeVar
 
 import numpy as np
@@ -37,6 +38,28 @@ def kept(path: Path, make: Callable[[], Any], tell: Tell) -> Any:
         _save_whole(path, json.dumps(make()) + "\n")
         tell(f"{path.parent.name}: {path.stem}")
     return json.loads(path.read_text())
+
+
+class Lines:
+    """JSON records by number, one a line of a file that is only appended to: a study that was stopped goes on with it.
+
+    The first line is the configuration; a file of another one is refused. A last line that was cut short is dropped.
+    """
+
+    def __init__(self, path: Path, config: Mapping[str, Any]) -> None:
+        self.path, self.records, self._lock = path, dict[int, Any](), Lock()
+        head = json.dumps(config)
+        lines = path.read_text(encoding="utf-8").split("\n")[:-1] if path.exists() else []
+        if lines and lines[0] != head:
+            raise OtherRunsError(f"{path} holds runs of another configuration; give another --out, or delete it")
+        self.records.update(json.loads(line) for line in lines[1:])
+        _save_whole(path, "\n".join(lines or [head]) + "\n")
+
+    def add(self, number: int, record: Any) -> None:
+        """Keep a record; from any thread."""
+        self.records[number] = record
+        with self._lock, self.path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps([number, record]) + "\n")
 
 
 def _save_whole(path: Path, text: str) -> None:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.memory import check_memory
-from mars_lidar._base.progress import shown
+from mars_lidar._base.progress import callback_of
 from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import Progress
 from mars_lidar.engines import ENGINES, Engine, find_engine
@@ -167,7 +167,7 @@ def compare(
 
     skipped = _refusals(chosen, flux, system, against)
     runs = {name: engine for name, engine in chosen.items() if name not in skipped}
-    steps = _Steps(shown(progress, "comparing"), 1 + len(runs) * (1 + len(places)))
+    steps = _Steps(callback_of(progress, "comparing"), 1 + len(runs) * (1 + len(places)))
     expected = expected_counts(flux, system, team, budget)
     steps.done()
     scenes: dict[str, SceneStatistics] = {}

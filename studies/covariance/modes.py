@@ -49,8 +49,8 @@ class LeadingTerms(HoldingTimeCovariance):
     @cached_property
     def _modes(self) -> tuple[ComplexArray, ComplexArray]:
         chain, times = self._chain, self._times
-        values, right = _eigenpairs(chain.right, chain.bins, chain.describe())
-        others, left = _eigenpairs(chain.left, chain.bins, chain.describe())
+        values, right = _eigenpairs(chain.backward, chain.bins, chain.describe())
+        others, left = _eigenpairs(chain.forward, chain.bins, chain.describe())
         partner = _partners(values, others, chain.describe())
         left = left[:, partner]
         pdf = times.stationary.pdf

@@ -8,7 +8,9 @@ Checks allow for what the thing checked states of itself (`slack`).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,19 +21,48 @@ from mars_lidar.statistics.distance import neighbours
 from studies.domain.samples import Sample
 
 Numbers = NDArray[np.int64]
+FIRST_LEVEL = 1e-4  # of a check, for a case to be drawn again with fresh numbers
+POWER = 0.9  # with which a check rejects an effect of `Check.detects`
 LEAST = 40.0  # expected events of a cell of a chi-square test
 EVENTS = 400  # events from which a variance is compared
 
 
 @dataclass(frozen=True)
 class Check:
-    """One comparison of two parties, named as `a` and `b`; `p` of the null hypothesis that they agree."""
+    """One comparison of two parties, named as `a` and `b`; `p` of the null hypothesis that they agree.
+
+    `detects`: effect that it would reject at the first level with a probability of `POWER`, NaN where there is no
+    chance in it.
+    """
 
     a: str
     b: str
     what: str
     p: float
     effect: float
+    detects: float = math.nan
+
+
+@lru_cache(maxsize=512)
+def _reach(number: int = 1) -> float:
+    """Standard errors that the mean of one of `number` must be off to be detected."""
+    return float(stats.norm.isf(FIRST_LEVEL / (2.0 * number)) + stats.norm.ppf(POWER))
+
+
+@lru_cache(maxsize=512)
+def _variation(freedom: int) -> float:
+    """Total variation of two laws of which chi-square of that many degrees tells one exposure from the other, at most.
+
+    Half the root of the noncentrality: the distance in chi-square bounds the total variation. By Patnaik's
+    approximation; divided by the root of the number of exposures.
+    """
+    limit = float(stats.chi2.isf(FIRST_LEVEL, freedom))
+    low, high = 0.0, 4.0 * limit
+    for _ in range(50):
+        middle = 0.5 * (low + high)
+        detected = float(stats.ncx2.sf(limit, freedom, middle)) >= POWER
+        low, high = (low, middle) if detected else (middle, high)
+    return 0.5 * math.sqrt(high)
 
 
 def against_law(sample: Sample, oracle: str, first: int, pmf: FloatArray) -> list[Check]:
@@ -48,7 +79,8 @@ def against_law(sample: Sample, oracle: str, first: int, pmf: FloatArray) -> lis
     if expected.size > 1 and expected.min() > 0.5 * LEAST:
         p = float(stats.chi2.sf(((observed - expected) ** 2 / expected).sum(), expected.size - 1))
         variation = 0.5 * float(np.abs(observed - expected).sum()) / n
-        checks.append(Check(sample.engine, oracle, "law of the count", p, variation))
+        detects = _variation(expected.size - 1) / math.sqrt(n)
+        checks.append(Check(sample.engine, oracle, "law of the count", p, variation, detects))
     return checks
 
 
@@ -77,7 +109,8 @@ def mean_of(
     p[still] = np.maximum(p[still], np.exp(-np.abs(off[still]) * n))
     with np.errstate(over="ignore"):
         worst = float(np.max(np.where(p < 1.0, np.abs(off) / np.maximum(sd, 1e-12), 0.0), initial=0.0))
-    return [Check(sample.engine, oracle, what, float(min(1.0, p.size * p.min(initial=1.0))), worst)]
+    detects = float(np.median(slack / np.maximum(sd, 1e-12))) + _reach(p.size) / math.sqrt(n)
+    return [Check(sample.engine, oracle, what, float(min(1.0, p.size * p.min(initial=1.0))), worst, detects)]
 
 
 def variances_of(sample: Sample, oracle: str, names: list[str], x: Numbers, variance: FloatArray) -> list[Check]:
@@ -92,9 +125,8 @@ def variances_of(sample: Sample, oracle: str, names: list[str], x: Numbers, vari
         if error is None:
             continue
         z = np.log(second * n / (n - 1) / known) / np.sqrt(error)
-        found.append(
-            Check(sample.engine, oracle, name, float(2.0 * stats.norm.sf(abs(z))), float(second / known - 1.0))
-        )
+        p, detects = float(2.0 * stats.norm.sf(abs(z))), _reach() * math.sqrt(error)
+        found.append(Check(sample.engine, oracle, name, p, float(second / known - 1.0), detects))
     return found
 
 
@@ -107,13 +139,14 @@ def covariance_of(sample: Sample, oracle: str, name: str, x: FloatArray, y: Floa
         return []
     size = float(np.sqrt(max(a.var() * b.var(), 1e-300)))
     off = float(product.mean() * n / (n - 1) - known)
-    return [Check(sample.engine, oracle, name, float(2.0 * stats.norm.sf(abs(off) / error)), off / size)]
+    p, detects = float(2.0 * stats.norm.sf(abs(off) / error)), _reach() * float(error) / size
+    return [Check(sample.engine, oracle, name, p, off / size, detects)]
 
 
 def rare(sample: Sample, oracle: str, what: str, events: int, expected: float) -> Check:
     """Few events against a small expectation, by Poisson's law."""
     p = float(_poisson(np.array([events], float), np.array([expected]), np.array([0.01 * expected]))[0])
-    return Check(sample.engine, oracle, what, p, events - expected)
+    return Check(sample.engine, oracle, what, p, events - expected)  # events: no unit that others share
 
 
 def two_samples(a: Sample, b: Sample) -> list[Check]:
@@ -136,7 +169,8 @@ def two_samples(a: Sample, b: Sample) -> list[Check]:
         p = 2.0 * stats.t.sf(z, min(n, m) - 1.0)
         sd = np.sqrt(np.maximum(spread, 1e-300))
         off = float((np.abs(x.mean(0) - y.mean(0)) / sd).max())
-        checks.append(Check(a.engine, b.engine, "mean histogram", float(min(1.0, p.size * p.min())), off))
+        detects = _reach(p.size) * math.sqrt(1.0 / n + 1.0 / m)
+        checks.append(Check(a.engine, b.engine, "mean histogram", float(min(1.0, p.size * p.min())), off, detects))
     for k, name in enumerate(("variance of the count", "variance of the window", "variance of the echo")):
         u, v = a.windows[:, k].astype(float), b.windows[:, k].astype(float)
         checks += _two_variances(a, b, name, u, v)
@@ -154,7 +188,7 @@ def _two_variances(a: Sample, b: Sample, name: str, u: FloatArray, v: FloatArray
         return []
     ratio = float(u.var() / v.var())
     p = float(2.0 * stats.norm.sf(abs(np.log(ratio)) / np.sqrt(errors[0] + errors[1])))
-    return [Check(a.engine, b.engine, name, p, ratio - 1.0)]
+    return [Check(a.engine, b.engine, name, p, ratio - 1.0, _reach() * math.sqrt(errors[0] + errors[1]))]
 
 
 def _log_variance_error(x: FloatArray) -> float | None:
@@ -172,7 +206,9 @@ def homogeneous(a: str, b: str, what: str, table: NDArray[np.int64]) -> Check:
         return Check(a, b, what, 1.0, 0.0)
     p = float(stats.chi2_contingency(merged, correction=False).pvalue)
     rows = merged / merged.sum(1, keepdims=True)
-    return Check(a, b, what, p, 0.5 * float(np.abs(rows[0] - rows[1]).sum()))
+    size = 1.0 / math.sqrt(float((1.0 / merged.sum(1)).sum()))
+    effect, detects = 0.5 * float(np.abs(rows[0] - rows[1]).sum()), _variation(merged.shape[1] - 1) / size
+    return Check(a, b, what, p, effect, detects)
 
 
 def _poisson(events: FloatArray, expected: FloatArray, slack: FloatArray) -> FloatArray:

@@ -2,37 +2,44 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
 
 from mars_lidar._base.threads import thread_count
 from studies import Facts, Request
+from studies.common.kept import Lines
 from studies.common.report import number
-from studies.domain import judge, sweep, verdict, watch
+from studies.domain import checks, judge, sweep, verdict, watch
 from studies.domain.figures import decades, maps
 from studies.domain.judge import Budget
 from studies.domain.sweep import Judged, Settings
 from studies.domain.verdict import ENGINES, FAILED, LAWS, SLOW, SUBJECTS, VERIFIED
 
-SEED = 20_261_122
-FULL = Settings(2000, SEED, Budget(4e5, 4e6, 800), 100_000)
+SEED = 20_261_124
+FULL = Settings(3000, SEED, Budget(4e5, 4e6, 800), 100_000)
 QUICK = Settings(60, SEED, Budget(4e5, 4e6, 800), 3_000)
+_UNITS = {  # of the effects of comparisons
+    "mean": "standard deviations of one exposure",
+    "variance": "relative",
+    "covariance": "correlation",
+}
 _LISTED = 40  # failures that the report names; all are in domain_failures.csv
 
 
 def run(request: Request) -> Facts:
     """The sweep and its maps."""
     settings = QUICK if request.quick else FULL
-    if request.seed is not None:
-        settings = replace(settings, seed=request.seed)
+    settings = replace(settings, seed=request.seed or settings.seed, systems=request.systems or settings.systems)
+    lines = Lines(request.out / "domain.jsonl", {"seed": settings.seed, "budget": asdict(settings.budget)})
     began = time.monotonic()
     judged: list[Judged] = []
-    for case in sweep.sweep(settings, request.tell, min(thread_count(None), settings.systems)):
+    for case in sweep.sweep(settings, request.tell, lines, min(thread_count(None), settings.systems)):
         judged.append(case)
         if len(judged) % 50 == 0:
             request.tell(f"{len(judged)} of {settings.systems} systems, {time.monotonic() - began:.0f} s")
@@ -41,6 +48,7 @@ def run(request: Request) -> Facts:
     return {
         "s": settings,
         "judged": judged,
+        "checks": checks,
         "judge": judge,
         "watch": watch,
         "second_level": verdict.second_level(settings.checks),
@@ -51,6 +59,8 @@ def run(request: Request) -> Facts:
         "ranges": [_range(judged, subject) for subject in SUBJECTS],
         "slow": [_slow(judged, subject) for subject in LAWS],
         "drawn": _drawn(judged),
+        "power": _power(judged),
+        "seconds": sum(one.seconds for one in judged),
         "rows": cases,
         "figures": maps(cases),
     }
@@ -125,3 +135,23 @@ def _drawn(judged: Sequence[Judged]) -> list[dict[str, Any]]:
             }
         )
     return rows
+
+
+def _power(judged: Sequence[Judged]) -> list[dict[str, Any]]:
+    """What deviation comparisons detect, by kind."""
+    detects: dict[str, list[float]] = {}
+    for one in judged:
+        for check in (check for outcome in one.outcomes for check in outcome.checks if math.isfinite(check.detects)):
+            kind = check.what.partition(" of ")[0] if check.what.startswith(("variance", "mean of")) else check.what
+            detects.setdefault(kind, []).append(check.detects)
+    return [
+        {
+            "comparison": kind,
+            "unit": next((unit for start, unit in _UNITS.items() if kind.startswith(start)), "total variation"),
+            "made": len(values),
+            "best tenth": float(np.quantile(values, 0.1)),
+            "median": float(np.median(values)),
+            "worst tenth": float(np.quantile(values, 0.9)),
+        }
+        for kind, values in sorted(detects.items())
+    ]

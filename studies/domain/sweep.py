@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from queue import SimpleQueue
+from typing import Any
 
 from studies import Tell
+from studies.common.kept import Lines
 from studies.domain.case import Case
-from studies.domain.checks import Check
+from studies.domain.checks import FIRST_LEVEL, Check
 from studies.domain.judge import Budget
 from studies.domain.systems import draw
 from studies.domain.verdict import (
     FAILED,
-    FIRST_LEVEL,
     UNJUDGED,
     VERIFIED,
     Outcome,
@@ -40,7 +40,10 @@ class Settings:
 
 @dataclass
 class Judged:
-    """A case with its outcomes; `failing`: checks that both drawings reject; `suspects`: the first did."""
+    """A case with its outcomes; `failing`: checks that both drawings reject; `suspects`: the first did.
+
+    `seconds` of processor time.
+    """
 
     case: Case
     outcomes: list[Outcome]
@@ -48,20 +51,44 @@ class Judged:
     suspects: list[Check]
     seconds: float
 
+    def record(self) -> dict[str, Any]:
+        """Plain data, from which `of_record` makes it again."""
+        outcomes = [asdict(outcome) for outcome in self.outcomes]
+        failing, suspects = ([asdict(check) for check in some] for some in (self.failing, self.suspects))
+        return {"outcomes": outcomes, "failing": failing, "suspects": suspects, "seconds": self.seconds}
+
+    @classmethod
+    def of_record(cls, case: Case, record: dict[str, Any]) -> Judged:
+        """A case that was judged before."""
+
+        def checks(some: list[dict[str, Any]]) -> list[Check]:
+            return [Check(**each) for each in some]
+
+        outcomes = [Outcome(**(each | {"checks": checks(each["checks"])})) for each in record["outcomes"]]
+        return cls(case, outcomes, checks(record["failing"]), checks(record["suspects"]), record["seconds"])
+
     @property
     def checks(self) -> int:
         """Comparisons made in the first drawing."""
         return sum(len(outcome.checks) for outcome in self.outcomes)
 
 
-def sweep(settings: Settings, tell: Tell, workers: int = 1) -> Iterator[Judged]:
-    """Judge system after system, in order, `workers` at a time, each in a process of its own."""
+def sweep(settings: Settings, tell: Tell, lines: Lines, workers: int = 1) -> Iterator[Judged]:
+    """Judge system after system, in order, `workers` at a time, each in a process of its own.
+
+    Those that `lines` has are taken from there, all others added.
+    """
     idle: SimpleQueue[Watched] = SimpleQueue()
 
     def judged(number: int) -> Judged:
+        case = draw(settings.seed, number)
+        if number in lines.records:
+            return Judged.of_record(case, lines.records[number])
         watched = idle.get()
         try:
-            return judge_case(draw(settings.seed, number), settings, watched, settings.seed * 1_000_003 + number)
+            one = judge_case(case, settings, watched, settings.seed * 1_000_003 + number)
+            lines.add(number, one.record())
+            return one
         finally:
             idle.put(watched)
 
@@ -76,7 +103,7 @@ def sweep(settings: Settings, tell: Tell, workers: int = 1) -> Iterator[Judged]:
 
 def judge_case(case: Case, settings: Settings, watched: Watched, seed: int) -> Judged:
     """First drawing; a second one, of other random numbers and `AGAIN` times the size, where a check looks wrong."""
-    began = time.monotonic()
+    before = watched.seconds
     outcomes = watched.judge(case, 10_000 * seed, settings.budget)
     suspects = [check for outcome in outcomes for check in outcome.checks if not check.p >= FIRST_LEVEL]
     failing: list[Check] = []
@@ -95,7 +122,7 @@ def judge_case(case: Case, settings: Settings, watched: Watched, seed: int) -> J
                 failing.append(found)
     for party, checks in blamed(failing).items():
         _blame(outcomes, party, checks)
-    return Judged(case, outcomes, failing, suspects, time.monotonic() - began)
+    return Judged(case, outcomes, failing, suspects, watched.seconds - before)
 
 
 def _blame(outcomes: list[Outcome], party: str, checks: list[Check]) -> None:

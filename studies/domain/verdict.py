@@ -7,7 +7,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 
 from mars_lidar.statistics import ConvergenceError
-from studies.domain.checks import Check
+from studies.domain.checks import FIRST_LEVEL, Check
 
 VERIFIED, REFUSED, HANDED, SLOW, FAILED, UNJUDGED = (
     "verified",
@@ -41,7 +41,6 @@ _ADVICE = re.compile(
     r"\b(use|engines?|instead|simulat\w*|give|take|methods?|shorter|fewer|must|at most|at least|mode)\b", re.IGNORECASE
 )
 
-FIRST_LEVEL = 1e-4  # of a check, for a case to be drawn again with fresh numbers
 FAMILY_LEVEL = 1e-3  # of the sweep: both drawings of a check reject
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import time
 from collections.abc import Sequence
 from multiprocessing.connection import Connection
 from types import TracebackType
@@ -27,6 +28,7 @@ class Watched:
 
     def __init__(self, patience: float = PATIENCE) -> None:
         self.patience = patience
+        self.seconds = 0.0  # of processor time, of all processes so far; of those that were stopped their patience
         self.process: multiprocessing.process.BaseProcess | None = None
         self.pipe: Connection | None = None
 
@@ -60,13 +62,16 @@ class Watched:
         subject = "between steps"
         try:
             self.pipe.send((case, seed, budget, list(skip), patience))
-            while not isinstance(told := self.pipe.recv(), list):
+            while isinstance(told := self.pipe.recv(), str):
                 subject = told
         except (EOFError, OSError):
+            self.seconds += patience
             if self._ended() in (-signal.SIGPROF, -signal.SIGALRM):
                 return Outcome(subject, SLOW, patience, f"stopped after {patience:g} s")
             return Outcome(subject, FAILED, 0.0, "the process ended")
-        return told
+        outcomes, seconds = told
+        self.seconds += seconds
+        return list(outcomes)
 
     def _start(self) -> None:
         context: Any = multiprocessing.get_context("spawn")
@@ -100,9 +105,10 @@ def _work(pipe: Connection) -> None:
                 pipe.send(subject if what == "begin" else "between steps")
 
             _timers(patience)
+            began = time.process_time()
             outcomes = judge(case, seed, budget, tell, skip)
             _timers(0.0)
-            pipe.send(outcomes)
+            pipe.send((outcomes, time.process_time() - began))
         except (EOFError, KeyboardInterrupt, BrokenPipeError):
             return
 

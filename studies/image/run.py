@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import csv
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from mars_lidar import Detector, Flux, GaussianPulse, SampledPulse, Scene, System, reconstruct, simulate
+from mars_lidar import Detector, GaussianPulse, SampledPulse, Scene, System, reconstruct, simulate
 from mars_lidar._base.types import FloatArray
 from mars_lidar.plot.figures import _draw_map, _limits
 from mars_lidar.reconstruction import Reconstruction
@@ -20,6 +21,7 @@ from mars_lidar.reconstruction.image_network import networks
 from studies import Facts, Request
 from studies.common.draw import panels
 from studies.common.report import Row
+from studies.image import captures, large, total_variation, two_returns
 from studies.image.scenes import busier, light
 
 SEED = 41
@@ -33,23 +35,28 @@ SYSTEM = System(
     detector=Detector(dead_time_ns=75.0),
 )
 # seeds of scenes "random" which nobody looked at, nor any of their results, before the code and the weights were frozen
-FROZEN = (20261201, 20261202, 20261203, 20261204, 20261205)
+FROZEN = (20261211, 20261212, 20261213, 20261214, 20261215)
+# what reconstruct(neighbourhood=4) of version 0.2.0 made of the same cubes, judged as the others
+NEIGHBOURHOOD = Path(__file__).with_name("neighbourhood.csv")
 SHOWN = "random", 1.0, 1.0  # scene, photons and ratio of the picture
-METHODS = ("maximum_likelihood", "pooled matched filter", "image_untrained", "image")
+METHODS = "maximum_likelihood", "pooled matched filter", "total variation", "image_untrained", "image"
+Results = dict[str, Reconstruction | FloatArray]  # of a method, or of "total variation" and "truth" depths in m
 
 
 @dataclass(frozen=True)
 class Settings:
-    """Side of the images, mean photons of signal of a pixel, and signal to background."""
+    """Side of the images, mean photons of signal of a pixel, signal to background, and sides of the other parts."""
 
     size: int
     photons: tuple[float, ...]
     sbr: tuple[float, ...]
     frozen: int
+    two: int
+    large: tuple[int, ...]
 
 
-FULL = Settings(64, (1.0, 2.0, 5.0, 10.0), (0.03, 0.3, 1.0, 3.0), len(FROZEN))
-QUICK = Settings(24, (2.0,), (1.0,), 0)  # no frozen scene: a quick look is a look
+FULL = Settings(64, (1.0, 2.0, 5.0, 10.0), (0.03, 0.3, 1.0, 3.0), len(FROZEN), 48, (256, 2048))
+QUICK = Settings(24, (2.0,), (1.0,), 0, 16, (64,))  # no frozen scene: a quick look is a look
 
 
 def systems() -> dict[str, System]:
@@ -105,7 +112,7 @@ def run(request: Request) -> Facts:
         shown |= rgbd(request.rgbd, settings.size)
     rows: list[Row] = []
     thin: list[Row] = []
-    maps: Mapping[str, Reconstruction | FloatArray] = {}
+    maps: Results = {}
 
     def add(part: str, name: str, scene: Scene, system: System, photons: float, sbr: float, words: str) -> None:
         nonlocal maps
@@ -132,10 +139,22 @@ def run(request: Request) -> Facts:
         frozen = Scene.example("random", settings.size, seed=seed)
         for photons in settings.photons[:3]:
             add("frozen", f"random {seed}", frozen, SYSTEM, photons, 1.0, "100 ns")
+    for each in captures.captures(request.captures) if request.captures is not None else ():
+        for photons in settings.photons[:3]:
+            request.tell(f"image: capture {each.name}, {photons:g} photons")
+            rows.extend(
+                {"part": "captures", "scene": each.name, "photons": photons} | x for x in thinned(each, photons)
+            )
+    if request.captures is None:
+        request.tell("image: no folder of real captures was given (--captures): left out")
     bright = replace(SYSTEM, cycles=20_000)
     add("bright", "room", shown["room"], bright, 500.0, 1.0, "20,000 cycles")
+    request.tell("image: two returns, large images")
     return {
         "s": settings,
+        "tv_weight": total_variation.WEIGHT,
+        "fewest": captures.FEWEST,
+        "false_alarm": two_returns.FALSE,
         "card": networks().card,
         "by_light": _table(rows, "scenes", ("photons", "sbr")),
         "by_scene": _table(rows, "scenes", ("scene",)),
@@ -143,15 +162,18 @@ def run(request: Request) -> Facts:
         "blind": _table(rows, "dead time", ("system",)),
         "frozen": _table(rows, "frozen", ("photons",)),
         "bright": _table(rows, "bright", ("photons",)),
+        "captures": _table(rows, "captures", ("scene", "photons")),
+        "before": _before(rows),
+        "two": two_returns.rows(settings.two, SYSTEM, SEED),
+        "large": large.rows(settings.large, SYSTEM, 2.0, 1.0),
+        "coverage": _coverage(rows),
         "thin": thin,
         "rows": rows,
         "figures": {"": _figure(maps, settings)},
     }
 
 
-def _thin(
-    scene: Scene, system: System, photons: float, results: Mapping[str, Reconstruction | FloatArray]
-) -> dict[str, float]:
+def _thin(scene: Scene, system: System, photons: float, results: Results) -> dict[str, float]:
     """Of the pixels of the sticks, and of those that maximum likelihood sees: how many are off by each method."""
     most = OUTLIER_SIGMA * float(system.depth_m(relative_width(system) * system.period_ns))
     sticks = scene.depth_m < 5.0
@@ -161,7 +183,7 @@ def _thin(
             off[name] = ~(np.abs(each.depth_m - scene.depth_m) < most)
     single = results["maximum_likelihood"]
     assert isinstance(single, Reconstruction)
-    seen = sticks & single.seen & ~off["maximum_likelihood"]
+    seen = sticks & single.detected & ~off["maximum_likelihood"]
     line = {"photons": photons}
     line |= {f"{name}, off %": 100.0 * float(x[sticks].mean()) for name, x in off.items()}
     return line | {
@@ -178,24 +200,48 @@ def _nearest(settings: Settings) -> tuple[float, float]:
     )
 
 
-def case(
-    scene: Scene, system: System, photons: float, sbr: float
-) -> tuple[list[dict[str, Any]], dict[str, Reconstruction | FloatArray]]:
+def case(scene: Scene, system: System, photons: float, sbr: float) -> tuple[list[dict[str, Any]], Results]:
     """A line for each method; and the reconstructions, with the truth, m, under "truth"."""
     flux = light(scene, system, photons, sbr)
     cube = simulate(flux, system, seed=SEED, threads=1)[0]
+    truth = np.asarray(flux.delay_ns)
+    signal = np.asarray(flux.signal) * system.detector.detection_efficiency
+    valid = np.isfinite(truth) & (signal > 0.0)
+    lines, results = compared(cube, system, truth, signal, valid)
+    return lines, {"truth": np.asarray(system.depth_m(truth))} | results
+
+
+def thinned(capture: captures.Capture, photons: float) -> list[dict[str, Any]]:
+    """A line for each method, of a real capture of which so many signal photons a pixel were left."""
+    counts, share = capture.thinned(photons, SEED)
+    signal = capture.signal * share / (capture.system.cycles * capture.system.detector.detection_efficiency)
+    return compared(counts.astype(np.uint16), capture.system, capture.delay_ns, signal, capture.valid)[0]
+
+
+def compared(
+    cube: np.ndarray, system: System, truth: FloatArray, signal: FloatArray, valid: np.ndarray
+) -> tuple[list[dict[str, Any]], Results]:
+    """A line for each method, and the reconstructions, of a cube whose true delays, ns, and signals are known."""
     lines: list[dict[str, Any]] = []
-    results: dict[str, Reconstruction | FloatArray] = {"truth": np.asarray(system.depth_m(flux.delay_ns))}
+    results: Results = {}
     for method in METHODS:
         began = time.process_time()
-        if method == "pooled matched filter":
-            found = reconstruct(_pooled(cube), system, "matched_filter", threads=1)
+        delay, width, light_found = truth, None, None
+        if method == "total variation":
+            delay = total_variation.total_variation(cube, system)
+            results[method] = np.asarray(system.depth_m(delay))
         else:
-            found = reconstruct(cube, system, method, threads=1)
+            pooled = method == "pooled matched filter"
+            found = reconstruct(
+                *((_pooled(cube), system, "matched_filter") if pooled else (cube, system, method)), threads=1
+            )
+            delay, width, results[method] = found.delay_ns, found.delay_half_width_ns, found
+            if width is None and found.delay_error_ns is not None:
+                width = 1.645 * found.delay_error_ns
+            light_found = found.signal / (POOLED**2 if pooled else 1)
         seconds = time.process_time() - began
-        results[method] = found
-        scale = POOLED**2 if method == "pooled matched filter" else 1
-        lines.append({"method": method} | judged(found, flux, system, scale) | {"s": seconds})
+        judgement = judged(delay, width, light_found, system, truth, signal, valid)
+        lines.append({"method": method} | judgement | {"s": seconds})
     return lines, results
 
 
@@ -207,26 +253,78 @@ def _pooled(cube: np.ndarray) -> np.ndarray:
     return np.asarray(windows.sum((-1, -2)), np.uint32)
 
 
-def judged(found: Reconstruction, flux: Flux, system: System, scale: float = 1.0) -> dict[str, float]:
-    """Errors of depth and signal against the truth; coverage of 90 % intervals and the share that has one."""
+def judged(
+    delay: FloatArray,
+    width: FloatArray | None,
+    signal: FloatArray | None,
+    system: System,
+    true_delay: FloatArray,
+    true_signal: FloatArray,
+    valid: np.ndarray,
+) -> dict[str, float]:
+    """Errors of delays, ns, and signals where `valid`; coverage of 90 % intervals and the share that has one."""
     period = system.period_ns
-    valid = np.isfinite(flux.delay_ns) & (flux.signal > 0)
-    off = (found.delay_ns - flux.delay_ns + 0.5 * period) % period - 0.5 * period
+    off = (delay - true_delay + 0.5 * period) % period - 0.5 * period
     near = np.abs(off) < OUTLIER_SIGMA * relative_width(system) * period
     off_mm = 1e3 * np.asarray(system.depth_m(np.abs(off)))
-    width = found.delay_half_width_ns
-    if width is None and found.delay_error_ns is not None:
-        width = 1.645 * found.delay_error_ns
     stated = valid & np.isfinite(off) & (np.isfinite(width) if width is not None else False)
-    signal = found.signal / scale - flux.signal * system.detector.detection_efficiency
+    light_off = float("nan")
+    if signal is not None:
+        light_off = float(np.sqrt(np.nanmean((signal - true_signal)[valid] ** 2)) / true_signal[valid].mean())
     return {
         "off %": 100.0 * float((valid & ~near).sum() / valid.sum()),
         "median mm": float(np.nanmedian(off_mm[valid])),
         "RMSE m": float(np.sqrt(np.nanmean(off_mm[valid] ** 2)) / 1e3),
         "in 90 %": 100.0 * float((np.abs(off) <= width)[stated].mean()) if stated.any() else float("nan"),
         "answered %": 100.0 * float(stated.sum() / valid.sum()),
-        "signal RMSE": float(np.sqrt(np.nanmean(signal[valid] ** 2)) / flux.signal[valid].mean()),
+        "signal RMSE": light_off,
     }
+
+
+def _before(rows: Iterable[Row]) -> list[Row]:
+    """Method "image" beside ``neighbourhood=4`` of version 0.2.0, on the same cubes: means over the scenes of both."""
+    with NEIGHBOURHOOD.open(encoding="utf-8") as file:
+        saved = {(x["scene"], float(x["photons"]), float(x["sbr"])): x for x in csv.DictReader(file)}
+    pairs: dict[tuple[float, float], list[tuple[Row, Row]]] = {}
+    for row in rows:
+        if row["part"] != "scenes" or row["method"] != "image":
+            continue
+        at = row["scene"], row["photons"], row["sbr"]
+        if at in saved:
+            pairs.setdefault(at[1:], []).append((row, saved[at]))
+    out: list[Row] = []
+    for (photons, sbr), both in pairs.items():
+        new, old = (
+            {k: np.mean([float(x[j][k]) for x in both]) for k in both[0][1] if k not in ("scene",)} for j in (0, 1)
+        )
+        out.append(
+            {
+                "photons": photons,
+                "sbr": sbr,
+                "scenes": len(both),
+                "off %, image": new["off %"],
+                "neighbourhood": old["off %"],
+                "ratio": new["off %"] / old["off %"],
+                "signal RMSE, image": new["signal RMSE"],
+                "of neighbourhood": old["signal RMSE"],
+                "dB": 20.0 * float(np.log10(new["signal RMSE"] / old["signal RMSE"])),
+            }
+        )
+    return out
+
+
+def _coverage(rows: Iterable[Row]) -> list[Row]:
+    """Share of the intervals of method "image" that hold, least, mean and largest over the scenes, for each light."""
+    groups: dict[tuple[float, float], list[tuple[float, float]]] = {}
+    for row in rows:
+        if row["part"] == "scenes" and row["method"] == "image":
+            groups.setdefault((row["photons"], row["sbr"]), []).append((row["in 90 %"], row["answered %"]))
+    out: list[Row] = []
+    for (photons, sbr), values in groups.items():
+        inside, answered = np.array(values).T
+        line = {"photons": photons, "sbr": sbr, "least %": inside.min(), "mean %": inside.mean()}
+        out.append(line | {"largest %": inside.max(), "answered %": answered.mean()})
+    return out
 
 
 def _table(rows: Iterable[Row], part: str, keys: tuple[str, ...]) -> list[Row]:
@@ -246,7 +344,7 @@ def _table(rows: Iterable[Row], part: str, keys: tuple[str, ...]) -> list[Row]:
     return out
 
 
-def _figure(maps: Mapping[str, Reconstruction | FloatArray], settings: Settings) -> Figure:
+def _figure(maps: Results, settings: Settings) -> Figure:
     """Depth: the truth and each method."""
     figure, axes = panels(1.35, 1, len(maps))
     truth = np.asarray(maps["truth"])

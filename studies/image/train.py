@@ -19,11 +19,13 @@ import numpy as np
 from mars_lidar import __version__
 from mars_lidar._base.optional import needed
 from mars_lidar.reconstruction import image_stages as stages
+from mars_lidar.reconstruction.image import LEVEL
 from mars_lidar.reconstruction.image_network import (
     CARD,
     CHANNELS,
     HIDDEN,
     OFFSETS,
+    OUTLIER_SIGMA,
     PEAKS,
     RADII,
     WEIGHTS,
@@ -37,8 +39,9 @@ from studies.image import scenes
 
 INPUTS = 3 * len(OFFSETS) + 3
 PLANES = len(RADII) + 1
-CHANNELS_IN = 5 * len(RADII) + 8
-OUTLIER_SIGMA = 3.0
+SIGNALS = PLANES + 1
+CHANNELS_IN = 5 * len(RADII) + 9
+OUTPUTS = PLANES + SIGNALS + 5
 _REACHED = 6.0  # sigma, up to which an error counts
 _HELD_OUT = 12  # every so many-th image
 
@@ -47,14 +50,15 @@ _HELD_OUT = 12  # every so many-th image
 class Plan:
     """How much is trained, and from which seed."""
 
-    images: int = 320
+    images: int = 400
+    calibration: int = 48  # images, of other content and pulses, by which the intervals are calibrated
     choose_steps: int = 2000
-    weigh_steps: int = 1500
+    weigh_steps: int = 4000
     seed: int = 20261123
 
 
 FULL = Plan()
-QUICK = Plan(images=24, choose_steps=40, weigh_steps=40)
+QUICK = Plan(images=24, calibration=4, choose_steps=40, weigh_steps=40)
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,11 +84,13 @@ def train(out: Path, plan: Plan = FULL, tell: Tell = str) -> list[Path]:
     tell(f"image: {len(images)} images drawn, {time.process_time() - began:.0f} s of processor time")
     choose, facts = _train_choose(torch, images, plan, tell)
     first = Networks(_flat(choose), {}, {})
-    weigh, more = _train_weigh(torch, images, first, plan, tell)
+    held = [_weighed(torch, image, first) for image in images]
+    weigh, more = _train_weigh(torch, held, plan, tell)
+    factor, others = _calibrated(torch, weigh, first, plan, tell)
     out.mkdir(parents=True, exist_ok=True)
     arrays: dict[str, Any] = {"choose": _flat(choose), **_layers(weigh)}
     np.savez(out / WEIGHTS.name, **arrays)
-    card = _card(plan, facts | more, time.process_time() - began, torch.__version__)
+    card = _card(plan, factor, facts | more | others, time.process_time() - began, torch.__version__)
     (out / CARD.name).write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
     return [out / WEIGHTS.name, out / CARD.name]
 
@@ -179,35 +185,34 @@ def _symmetries() -> np.ndarray:
     return np.array(orders)
 
 
-def _train_weigh(
-    torch: Any, images: list[_Prepared], first: Networks, plan: Plan, tell: Tell
-) -> tuple[Any, dict[str, float]]:
+def _weighed(torch: Any, image: _Prepared, first: Networks) -> dict[str, Any]:
+    """What the second network reads and mixes of an image, and the truth."""
+    chosen = stages.choice(image.photons, image.cells, image.light, first, 1)
+    light = stages.light_at(image.photons, image.cells, chosen.delay, image.light, 1)
+    seen = stages.photometry(image.photons, image.cells, chosen.delay, light, 1)
+    plane = stages.planes(seen, image.cells, 0, image.photons.height, 1)
+    maps = stages.plane_features(plane, chosen, light, seen, image.cells, slice(0, image.photons.height))
+    off = gap(image.truth, chosen.delay, image.cells.count) / image.cells.sigma
+    of_network = {name: torch.from_numpy(values) for name, values in zip(("x", "delays", "signals"), maps, strict=True)}
+    mean = float(np.exp(image.signal)[image.valid].mean()) if image.valid.any() else 1.0
+    return of_network | {
+        "off": torch.from_numpy(off.reshape(image.valid.shape).astype(np.float32)),
+        "valid": torch.from_numpy(image.valid),
+        "signal": torch.from_numpy(image.signal),
+        "mean": torch.full(image.valid.shape, mean),
+    }
+
+
+def _train_weigh(torch: Any, held: list[dict[str, Any]], plan: Plan, tell: Tell) -> tuple[Any, dict[str, float]]:
     """The network that weighs planes and signals, and says how far off it is."""
     rng = np.random.default_rng(plan.seed + 1)
-    held: list[dict[str, Any]] = []
-    for image in images:
-        chosen = stages.choice(image.photons, image.cells, image.light, first, 1)
-        light = stages.light_at(image.photons, image.cells, chosen.delay, image.light, 1)
-        seen = stages.photometry(image.photons, image.cells, chosen.delay, light, 1)
-        plane = stages.planes(seen, image.cells, 0, image.photons.height, 1)
-        maps = stages.plane_features(plane, chosen, light, seen, image.cells, slice(0, image.photons.height))
-        off = gap(image.truth, chosen.delay, image.cells.count) / image.cells.sigma
-        held.append(
-            {name: torch.from_numpy(values) for name, values in zip(("x", "delays", "signals"), maps, strict=True)}
-            | {
-                "off": torch.from_numpy(off.reshape(image.valid.shape).astype(np.float32)),
-                "valid": torch.from_numpy(image.valid),
-                "signal": torch.from_numpy(image.signal),
-            }
-        )
     test = list(range(0, len(held), _HELD_OUT))
     rest = [k for k in range(len(held)) if k % _HELD_OUT]
     net = _weigh_net(torch)
     optimiser = torch.optim.AdamW(net.parameters(), 1e-3, weight_decay=1e-3)
     rate = torch.optim.lr_scheduler.OneCycleLR(optimiser, 5e-3, total_steps=plan.weigh_steps)
-    value = 0.0
     for step in range(plan.weigh_steps):
-        loss, _, _ = _weigh_loss(torch, net, [held[k] for k in rng.choice(rest, 4)], step % 8)
+        loss, _ = _weigh_loss(torch, net, [held[k] for k in rng.choice(rest, 4)], step % 8)
         optimiser.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(net.parameters(), 1.0)
@@ -215,14 +220,37 @@ def _train_weigh(
         rate.step()
         if step % 400 == 399 or step == plan.weigh_steps - 1:
             with torch.no_grad():
-                judged, error, valid = _weigh_loss(torch, net, [held[k] for k in test], 0)
-            value = float(judged)
-            median, outliers = float(error[valid].median()), float((error[valid] > OUTLIER_SIGMA).float().mean())
-            tell(
-                f"image: weighing, step {step + 1}, loss of held-out images {value:.4f}, "
-                f"median {median:.4f} sigma, outliers {outliers:.2%}"
-            )
-    return net, {"loss_held_out": value, "median_sigma_held_out": median, "outliers_held_out": outliers}
+                judged, of = _weigh_loss(torch, net, [held[k] for k in test], 0)
+            facts = {"loss_held_out": float(judged), **_facts(of)}
+            tell(f"image: weighing, step {step + 1}, held-out images: {facts}")
+    return net, facts
+
+
+def _facts(of: dict[str, Any]) -> dict[str, float]:
+    """Of images that no network was trained on."""
+    error, half = of["error"][of["valid"]], of["half"][of["valid"]]
+    stated = (half < OUTLIER_SIGMA) & (of["doubt"][of["valid"]] < 1.0 - LEVEL)
+    off = ((of["estimate"].exp() - of["signal"].exp()) / of["mean"])[of["valid"]]
+    return {
+        "median_sigma_held_out": float(error.median()),
+        "outliers_held_out": float((error > OUTLIER_SIGMA).float().mean()),
+        "coverage_held_out": float((error < half)[stated].float().mean()),
+        "answered_held_out": float(stated.float().mean()),
+        "signal_error_held_out": float((off**2).mean().sqrt()),
+    }
+
+
+def _calibrated(torch: Any, net: Any, first: Networks, plan: Plan, tell: Tell) -> tuple[float, dict[str, float]]:
+    """The factor by which intervals hold in images of content and pulses that no network was trained on."""
+    images = (_prepared(scenes.example(scenes.CALIBRATION + k, plan.seed)) for k in range(plan.calibration))
+    with torch.no_grad():
+        _, of = _weigh_loss(torch, net, [_weighed(torch, image, first) for image in images], 0)
+    stated = of["valid"] & (of["half"] < OUTLIER_SIGMA) & (of["doubt"] < 1.0 - LEVEL)
+    ratio = (of["error"] / of["half"])[stated]
+    factor = float(ratio.quantile(LEVEL)) if len(ratio) else 1.0
+    facts = {name.replace("held_out", "calibration"): value for name, value in _facts(of).items()}
+    tell(f"image: calibration, factor {factor:.4f}, without it {facts}")
+    return factor, facts
 
 
 def _weigh_net(torch: Any) -> Any:
@@ -235,7 +263,7 @@ def _weigh_net(torch: Any) -> Any:
             self.enter = nn.Conv2d(CHANNELS_IN, CHANNELS, 1)
             self.first = nn.Conv2d(CHANNELS, CHANNELS, 3, **around)
             self.second = nn.Conv2d(CHANNELS, CHANNELS, 3, **around)
-            self.leave = nn.Conv2d(CHANNELS, 2 * PLANES + 4, 1)
+            self.leave = nn.Conv2d(CHANNELS, OUTPUTS, 1)
             nn.init.zeros_(self.leave.weight)
             nn.init.zeros_(self.leave.bias)
 
@@ -248,28 +276,39 @@ def _weigh_net(torch: Any) -> Any:
     return Weigh()
 
 
-def _weigh_loss(torch: Any, net: Any, images: list[dict[str, Any]], turn: int) -> tuple[Any, Any, Any]:
-    """Laplace likelihood of delay and log signal, cross entropy of outliers; errors in sigma, and where they count."""
+def _weigh_loss(torch: Any, net: Any, images: list[dict[str, Any]], turn: int) -> tuple[Any, dict[str, Any]]:
+    """Proper scores of what is stated, and the maps that they judge.
+
+    Laplace likelihood of delays and log signals, squared error of signals, cross entropy of outliers, and of the half
+    width the quantile's loss, on its logarithm.
+    """
 
     def stacked(name: str) -> Any:
         values = torch.stack([image[name] for image in images])
         values = values.transpose(-1, -2) if turn & 4 else values
         return values.flip([axis for axis, bit in ((-1, 1), (-2, 2)) if turn & bit])
 
-    x, delays, signals, off, valid, signal = map(stacked, ("x", "delays", "signals", "off", "valid", "signal"))
-    o, k = net(x), PLANES
-    delay = (torch.softmax(o[:, :k], 1) * delays).sum(1) + 0.3 * o[:, 2 * k + 3].clamp(-3.0, 3.0)
-    log_scale, logit = o[:, 2 * k].clamp(-4.0, 3.0) - 1.5, o[:, 2 * k + 1] - 2.0
-    estimate = torch.logsumexp(torch.log_softmax(o[:, k : 2 * k], 1) + signals, 1)
-    signal_scale = o[:, 2 * k + 2].clamp(-4.0, 3.0) - 1.0
+    names = "x", "delays", "signals", "off", "valid", "signal", "mean"
+    x, delays, signals, off, valid, signal, mean = map(stacked, names)
+    o = net(x)
+    weight, share, rest = o[:, :PLANES], o[:, PLANES : PLANES + SIGNALS], o[:, PLANES + SIGNALS :].unbind(1)
+    delay = (torch.softmax(weight, 1) * delays).sum(1) + 0.3 * rest[3].clamp(-3.0, 3.0)
+    log_scale, logit = rest[0].clamp(-4.0, 3.0) - 1.5, rest[1] - 2.0
+    signal_scale, log_half = rest[2].clamp(-4.0, 3.0) - 1.0, rest[4].clamp(-4.0, 3.0) - 0.7
+    estimate = torch.logsumexp(torch.log_softmax(share, 1) + signals, 1)
     error = (delay - off).abs()
     outlier = (error.detach() > OUTLIER_SIGMA).float()
     near = error.clamp(max=_REACHED)
     depth = (near * torch.exp(-log_scale) + log_scale) * (1.0 - outlier) + 0.05 * near
     doubt = torch.nn.functional.binary_cross_entropy_with_logits(logit, outlier, reduction="none")
-    light = (estimate - signal).abs() * torch.exp(-signal_scale) + signal_scale
-    loss = (depth + doubt)[valid].mean() + 0.3 * light[valid & (outlier < 1.0)].mean()
-    return loss, error, valid
+    beyond = torch.log(error.detach().clamp(1e-3, 100.0)) - log_half
+    interval = torch.maximum(LEVEL * beyond, (LEVEL - 1.0) * beyond)
+    light = (estimate.detach() - signal).abs() * torch.exp(-signal_scale) + signal_scale
+    photometry = ((estimate.exp() - signal.exp()) / mean).clamp(-3.0, 3.0) ** 2
+    inside = valid & (outlier < 1.0)
+    loss = (depth + doubt + interval)[valid].mean() + 0.1 * light[inside].mean() + 2.0 * photometry[valid].mean()
+    maps = {"error": error, "half": log_half.exp(), "doubt": torch.sigmoid(logit), "estimate": estimate}
+    return loss, maps | {"signal": signal, "valid": valid, "mean": mean}
 
 
 def _flat(net: Any) -> np.ndarray:
@@ -290,16 +329,19 @@ def _layers(net: Any) -> dict[str, np.ndarray]:
     return out
 
 
-def _card(plan: Plan, facts: dict[str, float], seconds: float, torch: str) -> dict[str, Any]:
+def _card(plan: Plan, factor: float, facts: dict[str, float], seconds: float, torch: str) -> dict[str, Any]:
     cells = [CELLS_PER_SIGMA * scenes.PERIOD_NS / sigma for sigma in scenes.SIGMA_NS]
     return {
         "what": "weights of the two networks of reconstruct(method='image')",
         "trained_on": f"{plan.images} images of {scenes.SIDE} x {scenes.SIDE} pixels: this package's scenes 'room' and "
-        "'random', two of three with relief, texture and thin things added, photons by its engine 'exact'",
+        "'random', and clutter; two of three with relief, texture and thin things added; photons by its engine 'exact'",
+        "calibrated_on": f"{plan.calibration} images of other content, folds and triangles, and other pulses",
+        "interval_factor": factor,
         "ranges": {
             "signal photons a pixel, mean": scenes.SIGNAL,
             "signal to background": scenes.SBR,
             "pulse sigma, laser periods": [sigma / scenes.PERIOD_NS for sigma in scenes.SIGMA_NS],
+            "pulses": "Gaussian; of every third image with an exponential tail and a second lobe",
             "dead time, laser periods": [dead / scenes.PERIOD_NS for dead in scenes.DEAD_TIME_NS],
             "cycles": scenes.CYCLES,
             "bins": scenes.BINS,
@@ -312,7 +354,7 @@ def _card(plan: Plan, facts: dict[str, float], seconds: float, torch: str) -> di
             "cells": [0.5 * min(cells), 2.0 * max(cells)],
             "side": [17, 1000000],
         },
-        "limits": "one surface a pixel; Gaussian pulses (others run, coverage as the study of the method states)",
+        "limits": "one surface a pixel",
         "command": "python -m studies image --train --out src/mars_lidar/reconstruction",
         "seed": plan.seed,
         "steps": [plan.choose_steps, plan.weigh_steps],

@@ -91,7 +91,7 @@ def compute(settings: Settings, tell: Tell) -> list[Cost]:
             seconds = time.perf_counter() - began
             shapes = table.shapes()
             for interpolation in INTERPOLATIONS:
-                found = table.lookup(signal, background, interpolation=interpolation)
+                found = table.at(signal, background, interpolation=interpolation)
                 errors = _errors(found.rows, found.weights, found.cumulants, shapes, truth)
                 costs.append(Cost(dead_ns, size, interpolation, errors, seconds, shapes.nbytes / 1e6))
             tell(f"quantisation: t_d = {dead_ns:g} ns, {size[0]} x {size[1]} in {seconds:.1f} s")

@@ -40,7 +40,7 @@ def doubted(seed: int = 0, pixels: int = 400, start: str = "armed", cycles: int 
         return ml.Flux(lut.signal[row][None], lut.background[column][None], 50.0)
     signal, background = rng.uniform(2.0, 9.0, pixels), np.exp(rng.uniform(np.log(0.02), np.log(0.6), pixels))
     delay = rng.uniform(0.0, 100.0, pixels)
-    bad = ~lut.lookup(signal, background, delay_ns=delay, cycles=cycles).trusted()
+    bad = ~lut.at(signal, background, delay_ns=delay, cycles=cycles).trusted()
     return ml.Flux(signal[bad][None], background[bad][None], delay[bad][None])
 
 
@@ -80,7 +80,7 @@ def test_between_the_entries_the_law_is_exact(start: str, cycles: int):
 def test_the_four_cumulants_would_not_do():
     """What the exact laws are for: at some of these pixels the law of the cumulants is beyond the aim."""
     lut, flux = table(), doubted()
-    found = lut.lookup(flux.signal, flux.background, delay_ns=flux.delay_ns)
+    found = lut.lookup(flux)
     from mars_lidar.statistics.matched import matched_pmf
 
     off = [total_variation(law, exact(flux, SYSTEM, k)) for k, law in enumerate(matched_pmf(found.cumulants)[:80])]
@@ -90,7 +90,7 @@ def test_the_four_cumulants_would_not_do():
 @pytest.mark.parametrize("start", ["armed", "stationary"])
 def test_at_the_entries_the_table_keeps_the_law(start: str):
     lut, system = table(start), SYSTEM.replace(start=start)
-    found = lut.lookup(np.repeat(lut.signal, lut.background.size), np.tile(lut.background, lut.signal.size))
+    found = lut.at(np.repeat(lut.signal, lut.background.size), np.tile(lut.background, lut.signal.size))
     from mars_lidar.statistics.matched import matched_pmf
 
     sure = found.trusted()
@@ -149,7 +149,7 @@ def test_usual_pixels_are_drawn_as_before():
     )
     mixed = ml.Flux(*(np.concatenate([some[0, :5], others])[None] for some, others in parts))
     lut = table()
-    sure = lut.lookup(mixed.signal, mixed.background, delay_ns=mixed.delay_ns).trusted()
+    sure = lut.at(mixed.signal, mixed.background, delay_ns=mixed.delay_ns).trusted()
     assert 0 < sure.sum() < 10
     cubes = {
         count: ml.simulate(mixed, SYSTEM, engine="mars", table=lut, count=count, realizations=50)

@@ -10,7 +10,7 @@ from harness import require
 from scipy import stats
 
 import mars_lidar as ml
-from mars_lidar.reconstruction import METHODS, Flags
+from mars_lidar.reconstruction import METHODS, Flags, Image, UntrainedImage
 from mars_lidar.reconstruction import image as image_module
 from mars_lidar.reconstruction import image_stages as stages
 from mars_lidar.reconstruction.image_pulse import cells_of
@@ -78,7 +78,7 @@ def test_likelihood_of_a_pixel():
     counts = np.zeros((1, 1, 250), np.uint16)
     counts[0, 0, rng.integers(0, 250, 5)] = [1, 2, 1, 1, 3]
     photons, cells = Photons.of(counts.reshape(1, 250), 1, 1), cells_of(SYSTEM)
-    light = stages.Light(np.array([[2.0]]), np.array([[3.0]]), np.zeros((1, 1), bool))
+    light = stages.Light(np.array([[2.0]]), np.array([[3.0]]), np.zeros((1, 1), bool), np.ones((1, 1)))
     found = stages.volumes(photons, cells, light, slice(0, 1), slice(0, 1), 1, 1)[2][0, 0]
     delay = (np.arange(cells.count) + 0.5) / cells.count * 100.0
     time, number = (photons.bin + 0.5) * 0.4, photons.number
@@ -118,7 +118,7 @@ def test_depth_where_each_pixel_alone_has_none(method):
         replace(SYSTEM, detector=ml.Detector(dead_time_ns=30.0, mode="gated", gate_start_ns=20.0, gate_width_ns=50.0)),
         replace(SYSTEM, pulse=ml.SampledPulse(np.exp(-np.arange(0.0, 4.0, 0.05) / 0.6), 0.05)),
         replace(SYSTEM, bins=32),
-        replace(SYSTEM, bins=8192, pulse=ml.GaussianPulse(sigma_ns=0.012)),
+        replace(SYSTEM, bins=65536, pulse=ml.GaussianPulse(sigma_ns=0.012)),
     ],
     ids=["blind", "synchronous", "gated", "a measured pulse", "coarse bins", "more cells than one pass takes"],
 )
@@ -151,11 +151,60 @@ def test_hot_and_missing_pixels():
     found = ml.reconstruct(cube, SYSTEM, "image")
     assert (found.flags[missing] & Flags.FILLED > 0).all()
     assert np.isnan(found.delay_half_width_ns[missing]).all()
-    assert not found.seen[missing].any()
+    assert not found.detected[missing].any()
     off = np.abs(off_by(found, delay))
     assert np.median(off[hot]) < SIGMA
     assert (off[~hot & ~missing] > 3.0 * SIGMA).mean() < 0.01
     assert np.median(found.background[hot]) > 20.0 * level
+
+
+def test_efficiency_of_each_pixel():
+    """Told the map, signal is that of the surface; not told it, that of surface times pixel."""
+    delay, rng = roof(48), np.random.default_rng(8)
+    share = rng.choice([0.0, 0.3, 1.0, 2.0], delay.shape, p=[0.02, 0.3, 0.4, 0.28])
+    share[:, :24] *= 0.5  # half of the array, too
+    share /= share[share > 0.0].mean()
+    level = 4.0 / SYSTEM.cycles
+    cube = ml.simulate(ml.Flux(level * share, level * share, delay), SYSTEM, seed=3)[0]
+    for method in (Image, UntrainedImage):
+        found = ml.reconstruct(cube, SYSTEM, method(efficiency=5.0 * share))
+        sees = share > 0.0
+        assert (found.flags[~sees] & Flags.FILLED > 0).all()
+        assert found.signal[sees].mean() == pytest.approx(level, rel=0.05)
+        assert found.background[sees].mean() == pytest.approx(level, rel=0.05)
+        assert (np.abs(off_by(found, delay)) > 3.0 * SIGMA).mean() < 0.01
+        not_told = ml.reconstruct(cube, SYSTEM, method())
+        error, other = (float(np.sqrt(((x.signal - level)[sees] ** 2).mean())) for x in (found, not_told))
+        assert error < 0.5 * other
+
+
+@pytest.mark.parametrize(
+    ("efficiency", "message"),
+    [
+        (np.ones(9), r"efficiency must be an image \(H, W\)"),
+        (-np.ones((3, 3)), r"of numbers of 0 or more"),
+        (np.full((3, 3), np.nan), r"of numbers of 0 or more"),
+        (np.zeros((3, 3)), r"not all 0"),
+        (np.ones((4, 3)), r"of the image's \(3, 3\) pixels, got shape \(4, 3\)"),
+    ],
+)
+def test_bad_efficiency(efficiency, message):
+    with pytest.raises(ValueError, match=message):
+        ml.reconstruct(np.zeros((3, 3, 250), np.uint16), SYSTEM, Image(efficiency=efficiency))
+
+
+def test_exposures_added_up_are_one_longer_exposure():
+    """Two exposures of 1000 cycles as one of 2000: as good as one that was taken so."""
+    delay = roof()
+    longer = replace(SYSTEM, cycles=2000)
+    both = sum(drawn(delay, 1.0, seed=seed).astype(np.int64) for seed in (1, 2))
+    flux = ml.Flux(np.full(delay.shape, 1e-3), 1e-3, delay)
+    off = []
+    for cube in (both, ml.simulate(flux, longer, seed=1)[0]):
+        found = ml.reconstruct(cube, longer, "image")
+        assert found.signal.mean() == pytest.approx(1e-3, rel=0.1)
+        off.append(np.median(np.abs(off_by(found, delay))))
+    assert max(off) < 0.25 * SIGMA
 
 
 def test_bright_pixels_are_estimated_alone():

@@ -220,7 +220,7 @@ def test_empty_saturated_and_impossible_pixels():
     assert found.signal[0] == 0.0
     assert found.flags[2] & flags.SATURATED
     assert found.flags[3] & flags.SATURATED
-    assert not found.seen[0]
+    assert not found.detected[0]
     for method in ("generalised_coates", "mchc", "matched_filter", "peak"):
         other = ml.reconstruct(cube, system, method)
         assert other.flags[0] & flags.EMPTY

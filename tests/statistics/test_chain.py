@@ -75,9 +75,9 @@ def test_products_match_the_dense_matrix(total, dead, rearm):
     chain = PhaseChain(bumpy(total), dead, rearm)
     matrix, rng = chain.dense(), np.random.default_rng(0)
     x, y = rng.random(chain.bins), rng.random(chain.bins)
-    np.testing.assert_allclose(chain.left(x), x @ matrix, rtol=1e-13, atol=1e-300)
-    np.testing.assert_allclose(chain.right(y), matrix @ y, rtol=1e-13)
-    assert x @ chain.right(y) == pytest.approx(chain.left(x) @ y, rel=1e-13)
+    np.testing.assert_allclose(chain.forward(x), x @ matrix, rtol=1e-13, atol=1e-300)
+    np.testing.assert_allclose(chain.backward(y), matrix @ y, rtol=1e-13)
+    assert x @ chain.backward(y) == pytest.approx(chain.forward(x) @ y, rel=1e-13)
 
 
 def test_dense_matrix_is_the_law_of_the_first_arrival():
@@ -230,7 +230,7 @@ def test_bad_input_is_named():
     with pytest.raises(ValueError, match="rearm must be one of 'centre', 'edge', got 'middle'"):
         PhaseChain(np.ones(4), 0.5, "middle")
     with pytest.raises(ValueError, match=r"x must be \(4,\), got shape \(3,\)"):
-        PhaseChain(np.ones(4), 0.5).left(np.ones(3))
+        PhaseChain(np.ones(4), 0.5).forward(np.ones(3))
     with pytest.raises(ValueError, match="signal must lie"):
         photons_per_bin(ml.Flux(-1.0, 0.0, 50.0), system)
     with pytest.raises(ValueError, match="background must lie"):

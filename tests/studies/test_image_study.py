@@ -7,19 +7,71 @@ import json
 import numpy as np
 import pytest
 
+import mars_lidar as ml
+from mars_lidar import io
 from mars_lidar.reconstruction import image_stages as stages
 from mars_lidar.reconstruction.image_network import CARD, WEIGHTS, Networks, weigh
 from studies.__main__ import main
 from studies.common.report import MAX_FIGURE_BYTES
+from studies.image import captures, total_variation
+
+SYSTEM = ml.System(
+    period_ns=100.0,
+    cycles=20_000,
+    bins=250,
+    pulse=ml.GaussianPulse(sigma_ns=0.6),
+    detector=ml.Detector(dead_time_ns=20.0),
+)
 
 
 @pytest.mark.full
 def test_study(tmp_path):
-    assert main(["image", "--quick", "--out", str(tmp_path)]) == 0
+    room = ml.Scene.example("room", 24).flux(SYSTEM, signal=100.0 / SYSTEM.cycles, sbr=1.0)
+    (tmp_path / "captures").mkdir()
+    io.save(tmp_path / "captures" / "measured.npz", io.from_histograms(ml.simulate(room, SYSTEM, seed=1)[0], SYSTEM))
+    folder = str(tmp_path / "captures")
+    assert main(["image", "--quick", "--captures", folder, "--out", str(tmp_path)]) == 0
     text = (tmp_path / "image.md").read_text()
     assert "Quick form" in text
+    assert "| measured | 2 | image |" in text
     assert 5_000 < (tmp_path / "image.png").stat().st_size < MAX_FIGURE_BYTES
     assert (tmp_path / "image.csv").stat().st_size > 1000
+
+
+def test_a_capture_is_thinned_to_so_many_photons(tmp_path):
+    """Each photon is kept by chance; true is what all of them say."""
+    delay = np.full((12, 12), 40.0)
+    flux = ml.Flux(np.full(delay.shape, 50.0 / SYSTEM.cycles), 50.0 / SYSTEM.cycles, delay)
+    io.save(tmp_path / "bright.npz", io.from_histograms(ml.simulate(flux, SYSTEM, seed=2)[0], SYSTEM))
+    (capture,) = captures.captures(tmp_path)
+    assert capture.name == "bright"
+    assert capture.valid.mean() > 0.95
+    assert np.median(np.abs(capture.delay_ns - 40.0)) < 0.3
+    counts, share = capture.thinned(2.0, seed=3)
+    assert share == pytest.approx(2.0 / 50.0, rel=0.1)
+    expected = share * capture.counts.sum()
+    assert abs(counts.sum() - expected) < 6.0 * np.sqrt(expected)
+    assert (counts <= capture.counts).all()
+
+
+def test_a_folder_that_is_none_is_refused(capsys):
+    with pytest.raises(SystemExit):
+        main(["image", "--captures", "/nowhere"])
+    assert "--captures must be a folder" in capsys.readouterr().err
+
+
+def test_total_variation_denoises():
+    """Least squares plus variation of one edge: both levels move by the weight over their width (Strong and Chan)."""
+    image = np.zeros((8, 8))
+    image[:, 4:] = 1.0
+    found = total_variation.denoised(image, 0.5, projections=1000)
+    np.testing.assert_allclose(found, np.where(image > 0.5, 1.0 - 0.5 / 4.0, 0.5 / 4.0), atol=0.01)
+    delay = 30.0 + 0.02 * np.add.outer(np.arange(24.0), np.arange(24.0))
+    system = SYSTEM.replace(cycles=1000)
+    flux = ml.Flux(np.full(delay.shape, 5e-3), 5e-3, delay)
+    off = total_variation.total_variation(ml.simulate(flux, system, seed=4)[0], system) - delay
+    assert np.median(np.abs(off)) < 0.3
+    assert (np.abs(off) > 1.8).mean() < 0.02
 
 
 @pytest.mark.full
@@ -27,7 +79,7 @@ def test_training_twice_gives_the_same_bits(tmp_path, monkeypatch):
     pytest.importorskip("torch")
     from studies.image import train
 
-    monkeypatch.setattr(train, "QUICK", train.Plan(images=14, choose_steps=3, weigh_steps=3))
+    monkeypatch.setattr(train, "QUICK", train.Plan(images=14, calibration=2, choose_steps=3, weigh_steps=3))
     for name in ("a", "b"):
         assert main(["image", "--train", "--quick", "--out", str(tmp_path / name)]) == 0
     assert (tmp_path / "a" / WEIGHTS.name).read_bytes() == (tmp_path / "b" / WEIGHTS.name).read_bytes()

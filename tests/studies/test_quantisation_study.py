@@ -34,7 +34,7 @@ def test_no_error_on_the_nodes(interpolation):
     table = Table.build(system, signal=(0.1, 10.0, 3), background=(0.1, 10.0, 3))
     signal, background = np.array([0.1, 1.0, 10.0]), np.array([1.0, 10.0, 0.1])
     truth = exposure_moments(Flux(signal, background, 0.5 * system.period_ns), system)
-    found = table.lookup(signal, background, interpolation=interpolation)
+    found = table.at(signal, background, interpolation=interpolation)
     errors = quantisation._errors(found.rows, found.weights, found.cumulants, table.shapes(), truth)
     assert all(errors[key].max() < 1e-5 for key in quantisation.ERRORS)
     shifted = quantisation._errors(

@@ -93,7 +93,7 @@ def test_interpolated_over_pixels_and_phases(start):
         for d in (delay, 0.5 * table.system.period_ns)
     )
     exact = (moved.cumulants - canonical.cumulants)[:, :2]
-    found = table.lookup(signal, background, delay_ns=delay).cumulants - table.lookup(signal, background).cumulants
+    found = table.at(signal, background, delay_ns=delay).cumulants - table.at(signal, background).cumulants
     scale = np.maximum(np.sqrt(moved.variance), 0.5)[:, None] ** np.arange(1, 3)
     assert (np.abs(found[:, :2] - exact) / scale).max() < 2e-3
     effect = (np.abs(exact) / scale).max(0)
@@ -129,7 +129,7 @@ def test_against_photon_by_photon_simulation():
         .sum(-1)
         .ravel()
     )
-    mean, variance, _, fourth = table.lookup(signal, background, delay_ns=delay).cumulants[0]
+    mean, variance, _, fourth = table.at(signal, background, delay_ns=delay).cumulants[0]
     noise = np.sqrt((fourth + 2 * variance**2) / shots)
     require(
         {
@@ -138,5 +138,5 @@ def test_against_photon_by_photon_simulation():
         },
         "table at a delay of 1 ns",
     )
-    canonical = table.lookup(signal, background).cumulants[0, 0]
+    canonical = table.at(signal, background).cumulants[0, 0]
     assert abs(canonical - mean) > 10 * np.sqrt(variance / shots)  # which the canonical law would not have passed

@@ -37,7 +37,7 @@ def test_a_file_says_what_the_table_said(tmp_path, method):
     assert (table.laws.row.size > 0) == (method == "exposure")
     for cycles in (None, 1000):
         assert np.array_equal(read.shapes(cycles), table.shapes(cycles))
-        a, b = (t.lookup([0.4, 3.0, 0.0], 1.3, delay_ns=[3.0, 70.0, 1.0], cycles=cycles) for t in (read, table))
+        a, b = (t.at([0.4, 3.0, 0.0], 1.3, delay_ns=[3.0, 70.0, 1.0], cycles=cycles) for t in (read, table))
         for name in ("rows", "weights", "cumulants"):
             assert np.array_equal(getattr(a, name), getattr(b, name))
 
@@ -59,7 +59,7 @@ def test_another_system_is_refused(tmp_path, change, told):
     with pytest.raises(ValueError, match=f"is a table of another system: {told}"):
         ml.Table.load(tmp_path / "t.h5", table.system.replace(**change))
     longer = ml.Table.load(tmp_path / "t.h5", table.system.replace(cycles=900))
-    assert np.array_equal(longer.lookup(1.0, 1.0).cumulants, table.lookup(1.0, 1.0, cycles=900).cumulants)
+    assert np.array_equal(longer.at(1.0, 1.0).cumulants, table.at(1.0, 1.0, cycles=900).cumulants)
     assert np.array_equal(longer.shapes(), table.shapes(900))
 
 
@@ -132,7 +132,7 @@ def test_a_damaged_file_in_the_cache_is_replaced(own_cache):
     (file,) = own_cache.iterdir()
     file.write_bytes(file.read_bytes()[:3000])
     table = ml.Table.cached(system, [0.5, 1.0], [0.2, 0.4], threads=1)
-    assert table.lookup(1.0, 0.4).cumulants[0, 0] > 0
+    assert table.at(1.0, 0.4).cumulants[0, 0] > 0
 
 
 def test_where_the_cache_is(tmp_path, monkeypatch):
@@ -177,6 +177,6 @@ def test_a_cache_that_cannot_be_written_costs_the_next_build_and_no_more(tmp_pat
     system = small_table().system
     with pytest.warns(UserWarning, match=r"cannot be kept in .*file.cache .*MARS_LIDAR_CACHE"):
         table = ml.Table.cached(system, [0.5, 1.0], [0.2, 0.4], threads=1)
-    assert table.lookup(0.7, 0.3).cumulants.shape == (1, 4)
+    assert table.at(0.7, 0.3).cumulants.shape == (1, 4)
     with pytest.raises(OSError):  # a path cannot be given
         ml.Table.cached_path(system, [0.5, 1.0], [0.2, 0.4], threads=1)

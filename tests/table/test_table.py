@@ -32,7 +32,7 @@ def test_entries_are_the_exact_statistics():
         exact = exposure_moments(
             ml.Flux(table.signal[i], table.background[j], 0.5 * table.system.period_ns), table.system, tolerance=1e-6
         )
-        found = table.lookup(table.signal[i], table.background[j])
+        found = table.at(table.signal[i], table.background[j])
         assert found.cumulants[0] == pytest.approx(exact.cumulants, rel=1e-12)
         row = found.rows[0, found.weights[0].argmax()]
         assert row == i * 25 + j
@@ -52,7 +52,7 @@ def test_any_number_of_cycles(start, cycles):
         table.system.replace(cycles=cycles),
         tolerance=1e-6,
     )
-    found = table.lookup(table.signal[i], table.background[j], cycles=cycles)
+    found = table.at(table.signal[i], table.background[j], cycles=cycles)
     assert found.cumulants == pytest.approx(exact.cumulants, rel=1e-6, abs=1e-6)
     shapes = table.shapes(cycles)[i * table.background.size + j]
     lit = exact.mean > 0
@@ -69,8 +69,8 @@ def test_between_entries():
     exact = exposure_moments(ml.Flux(signal, background, 0.5 * table.system.period_ns), table.system, tolerance=1e-6)
     spread = np.maximum(np.sqrt(exact.variance), 0.5)
     own = exact.histogram / exact.mean[:, None]
-    found = table.lookup(signal, background)
-    near = table.lookup(signal, background, interpolation="nearest")
+    found = table.at(signal, background)
+    near = table.at(signal, background, interpolation="nearest")
     assert np.abs(found.weights.sum(-1) - 1).max() < 1e-12
     assert found.weights.min() >= 0
     assert set(np.unique(near.weights)) == {0.0, 1.0}
@@ -84,17 +84,17 @@ def test_between_entries():
 def test_pixels_without_signal_background_or_both():
     """Zero is a value of the axes: masked pixels and dark ones are answered, with linear continuation."""
     table = small_table()
-    nothing = table.lookup(0.0, 0.0)
+    nothing = table.at(0.0, 0.0)
     assert not nothing.cumulants.any()
     assert mixed(table, nothing)[0] == pytest.approx(1 / 32)
     # constant rate, armed: physics of one line
     rate, dead, periods = table.background[9], 0.6, table.system.cycles
     x = rate * dead
-    masked = table.lookup(0.0, rate, delay_ns=np.nan)
+    masked = table.at(0.0, rate, delay_ns=np.nan)
     assert masked.cumulants[0, 0] == pytest.approx(rate * periods / (1 + x) + x**2 / 2 / (1 + x) ** 2, rel=1e-6)
     signal, background = np.array([0.003, 0.012, 0.007, 1.0]), np.array([1.0, 0.02, 0.01, 0.021])
     exact = exposure_moments(ml.Flux(signal, background, 0.5 * table.system.period_ns), table.system, tolerance=1e-6)
-    found = table.lookup(signal, background)
+    found = table.at(signal, background)
     assert (np.abs(found.cumulants - exact.cumulants)[:, 0] / np.sqrt(exact.variance)).max() < 0.005
     assert total_variation(mixed(table, found), exact.histogram / exact.mean[:, None]).max() < 5e-3
 
@@ -102,17 +102,28 @@ def test_pixels_without_signal_background_or_both():
 def test_pixels_beyond_the_axes():
     table = small_table()
     with pytest.raises(ValueError, match=r"signal must lie in the table's \[0, 10\].*got 0.5 to 11 \(1 of 2 pixels"):
-        table.lookup([0.5, 11.0], 1.0)
+        table.at([0.5, 11.0], 1.0)
     with pytest.raises(ValueError, match="background must lie in"):
-        table.lookup(0.5, 6.0)
-    found = table.lookup([[0.5, 11.0], [2.0, 3.0]], 1.0, outside="exact")
+        table.at(0.5, 6.0)
+    found = table.at([[0.5, 11.0], [2.0, 3.0]], 1.0, outside="exact")
     assert found.outside.tolist() == [False, True, False, False]
     assert np.isnan(found.cumulants[1]).all()
     assert found.rows[1].tolist() == [0, 0, 0, 0]
     assert found.weights[1].tolist() == [1, 0, 0, 0]
-    assert np.array_equal(found.cumulants[[0, 2, 3]], table.lookup([0.5, 2.0, 3.0], 1.0).cumulants)
+    assert np.array_equal(found.cumulants[[0, 2, 3]], table.at([0.5, 2.0, 3.0], 1.0).cumulants)
     assert not found.trusted()[1]
-    assert table.lookup([11.0, 12.0], 1.0, outside="exact").outside.all()
+    assert table.at([11.0, 12.0], 1.0, outside="exact").outside.all()
+
+
+def test_the_light_may_be_a_flux():
+    table = small_table()
+    flux = ml.Flux([[0.5, 0.0], [2.0, 3.0]], 1.0, [[10.0, np.nan], [70.0, 90.0]])
+    looked_up, arrays = table.lookup(flux), table.at(flux.signal, flux.background, flux.delay_ns)
+    for name in ("rows", "weights", "cumulants", "outside"):
+        assert np.array_equal(getattr(looked_up, name), getattr(arrays, name))
+    for several in (ml.Flux.multi(flux, flux), ml.Flux(waveform=np.ones(8), background=1.0)):
+        with pytest.raises(ValueError, match="flux must have one return a pixel"):
+            table.lookup(several)
 
 
 def test_a_pixel_does_not_depend_on_the_others_or_on_threads():
@@ -120,9 +131,9 @@ def test_a_pixel_does_not_depend_on_the_others_or_on_threads():
     rng = np.random.default_rng(3)
     signal, background = off_grid(rng, 3000)
     delay = rng.uniform(0, 100, 3000)
-    whole = table.lookup(signal, background, delay_ns=delay)
-    again = table.lookup(signal, background, delay_ns=delay, threads=3)
-    part = table.lookup(signal[700:900], background[700:900], delay_ns=delay[700:900])
+    whole = table.at(signal, background, delay_ns=delay)
+    again = table.at(signal, background, delay_ns=delay, threads=3)
+    part = table.at(signal[700:900], background[700:900], delay_ns=delay[700:900])
     for name in ("rows", "weights", "cumulants"):
         assert np.array_equal(getattr(whole, name), getattr(again, name))
         assert np.array_equal(getattr(whole, name)[700:900], getattr(part, name))
@@ -135,7 +146,7 @@ def test_the_method_of_the_paper():
     mean, variance = mars_moments(
         ml.Flux(table.signal[i], table.background[j], 0.5 * table.system.period_ns), table.system
     )
-    found = table.lookup(table.signal[i], table.background[j], delay_ns=12.0)
+    found = table.at(table.signal[i], table.background[j], delay_ns=12.0)
     assert found.cumulants[:, 0] == pytest.approx(mean, rel=1e-12)
     assert found.cumulants[:, 1] == pytest.approx(variance, rel=1e-12)
     assert not found.cumulants[:, 2:].any()
@@ -143,17 +154,15 @@ def test_the_method_of_the_paper():
         ml.Flux(table.signal[i], table.background[j], 0.5 * table.system.period_ns), table.system, "chain"
     )
     assert total_variation(table.shapes()[i * table.background.size + j], chain).max() < 1e-6
-    assert table.lookup(1.0, 1.0, cycles=2000).cumulants == pytest.approx(
-        10 * table.lookup(1.0, 1.0).cumulants, rel=1e-12
-    )
+    assert table.at(1.0, 1.0, cycles=2000).cumulants == pytest.approx(10 * table.at(1.0, 1.0).cumulants, rel=1e-12)
     edge = ml.Table.build(table.system, [1.0], [0.5], method="mars", rearm="edge", threads=1)
     expected = np.ravel(mars_moments(ml.Flux(1.0, 0.5, 0.5 * table.system.period_ns), table.system, rearm="edge"))
-    assert edge.lookup(1.0, 0.5).cumulants[0, :2] == pytest.approx(expected, rel=1e-12)
+    assert edge.at(1.0, 0.5).cumulants[0, :2] == pytest.approx(expected, rel=1e-12)
 
 
 def test_no_dead_time_is_poisson():
     table = ml.Table.build(make_system(0.0), (0.1, 10, 12), (0.1, 10, 8), threads=1)
-    found = table.lookup(2.0, 0.3, delay_ns=17.0, cycles=3)
+    found = table.at(2.0, 0.3, delay_ns=17.0, cycles=3)
     assert found.cumulants[0] == pytest.approx(3 * 2.3, rel=0.02)
     assert np.ptp(found.cumulants[0]) < 1e-9
 
@@ -162,15 +171,15 @@ def test_short_exposures_serve_no_others():
     system = make_system(0.6, cycles=3)
     table = ml.Table.build(system, [0.0, 1.0, 10.0], [0.0, 0.1, 1.0], threads=1)
     assert not table.serves(4)
-    assert table.lookup(1.0, 0.1).cumulants[0] == pytest.approx(
+    assert table.at(1.0, 0.1).cumulants[0] == pytest.approx(
         exposure_moments(ml.Flux(1.0, 0.1, 0.5 * system.period_ns), system).cumulants, rel=1e-12
     )
     with pytest.raises(ValueError, match=r"cycles must be 3 at some of these pixels, got 4: .* at S = .*, B = "):
-        table.lookup(1.0, 0.1, cycles=4)
+        table.at(1.0, 0.1, cycles=4)
     assert np.isnan(table.shapes(4)).any()
     long = small_table()
     with pytest.raises(ValueError, match=r"repeats only after \d+ periods"):
-        long.lookup(9.0, 4.0, cycles=2)
+        long.at(9.0, 4.0, cycles=2)
 
 
 def test_the_measured_error_is_the_error():
@@ -276,7 +285,7 @@ def test_bad_lookups():
         ({"cycles": 0}, ValueError, "cycles must be an integer"),
     ):
         with pytest.raises(error, match=told):
-            table.lookup(**({"signal": 1.0, "background": 1.0} | given))
+            table.at(**({"signal": 1.0, "background": 1.0} | given))
 
 
 def test_progress_and_stopping():

@@ -38,16 +38,16 @@ class _Array:
         return cls
 
 
-class _Elsewhere(type):
+class _NameOnly(type):
     """A class whose module is not imported here: values are compared with it by the names of their classes."""
 
-    def __getitem__(cls, _: Any) -> _Elsewhere:
+    def __getitem__(cls, _: Any) -> _NameOnly:
         return cls
 
-    def __getattr__(cls, name: str) -> _Elsewhere:
+    def __getattr__(cls, name: str) -> _NameOnly:
         if name.startswith("__"):
             raise AttributeError(name)
-        return _Elsewhere(name, (), {})
+        return _NameOnly(name, (), {})
 
 
 class _Names(Mapping[str, Any]):
@@ -61,7 +61,7 @@ class _Names(Mapping[str, Any]):
             return _Array
         if name in self._scope:
             return self._scope[name]
-        return getattr(builtins, name, None) or _Elsewhere(name, (), {})
+        return getattr(builtins, name, None) or _NameOnly(name, (), {})
 
     def __iter__(self) -> Any:
         return iter(self._scope)
@@ -152,7 +152,7 @@ def checked_with_masks(function: Callable[P, R]) -> Callable[P, R]:
 def _rules(function: Callable[..., Any], signature: inspect.Signature) -> dict[str, tuple[Any, ...]]:
     """Members of the union of each parameter; none where one of them is not for this module to judge."""
     names = _Names(getattr(inspect.unwrap(function), "__globals__", {}))
-    found: dict[str, tuple[Any, ...]] = {}
+    rules: dict[str, tuple[Any, ...]] = {}
     for name, parameter in signature.parameters.items():
         if parameter.annotation is parameter.empty or parameter.kind in (
             parameter.VAR_POSITIONAL,
@@ -164,8 +164,8 @@ def _rules(function: Callable[..., Any], signature: inspect.Signature) -> dict[s
             annotation = eval(annotation.strip("'\""), {}, names)
         members = tuple(_members(annotation))
         if set(members) - _NUMBERS and all(_known(member) for member in members):
-            found[name] = members
-    return found or {"": ()}
+            rules[name] = members
+    return rules or {"": ()}
 
 
 def _members(annotation: Any) -> list[Any]:
@@ -203,7 +203,7 @@ def _require(name: str, value: Any, members: tuple[Any, ...], masks: bool) -> No
     choices = [word for each in members if typing.get_origin(each) is typing.Literal for word in each.__args__]
     if choices and (isinstance(value, str) or len(members) == 1):
         raise ValueError(f"{name} must be {_words(members)}, got {value!r}{did_you_mean(value, choices)}")
-    raise TypeError(f"{name} must be {_words(members)}, got {_told(value)}")
+    raise TypeError(f"{name} must be {_words(members)}, got {_described(value)}")
 
 
 def _fits(value: Any, member: Any, paths: bool) -> bool:
@@ -212,7 +212,7 @@ def _fits(value: Any, member: Any, paths: bool) -> bool:
         return any(value is choice or (type(value) is type(choice) and value == choice) for choice in member.__args__)
     if origin is _Array or (origin is str and paths):
         return False
-    if isinstance(origin, _Elsewhere):
+    if isinstance(origin, _NameOnly):
         return any(each.__name__ == origin.__name__ for each in type(value).__mro__)
     if origin is float:
         return isinstance(value, Real) and not isinstance(value, bool | np.bool_)
@@ -256,6 +256,6 @@ def _words(members: tuple[Any, ...]) -> str:
     return " or ".join(said)
 
 
-def _told(value: Any) -> str:
-    shown = f"{value!r:.80} " if isinstance(value, str | float | int) and not isinstance(value, bool) else ""
-    return f"{shown}{'None' if value is None else type(value).__name__}"
+def _described(value: Any) -> str:
+    text = f"{value!r:.80} " if isinstance(value, str | float | int) and not isinstance(value, bool) else ""
+    return f"{text}{'None' if value is None else type(value).__name__}"

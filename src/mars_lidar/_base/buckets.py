@@ -55,7 +55,7 @@ def sizes(folder: Any) -> dict[str, int]:
     folder.fs.invalidate_cache()
     prefix = folder.path.rstrip("/") + "/"
     listed = folder.fs.find(folder.path, detail=True)
-    return {str(name).partition(prefix)[2] or str(name): int(told["size"]) for name, told in listed.items()}
+    return {str(name).partition(prefix)[2] or str(name): int(entry["size"]) for name, entry in listed.items()}
 
 
 def remove(folder: Any) -> None:

@@ -74,11 +74,11 @@ def numbers(name: str, value: Any) -> Any:
         try:
             dtype = np.asarray(value).dtype
         except Exception as error:  # whatever makes an array of it, such as a tensor on another device
-            told = " ".join(str(error).split())
-            raise TypeError(f"{name} must be real numbers, got {type(value).__name__} ({told[:200]})") from None
+            why = " ".join(str(error).split())
+            raise TypeError(f"{name} must be real numbers, got {type(value).__name__} ({why[:200]})") from None
     if dtype.kind not in "biuf":
-        shown = type(value).__name__ if dtype.kind == "O" else f"dtype {dtype}"
-        raise TypeError(f"{name} must be real numbers, got {shown}")
+        given = type(value).__name__ if dtype.kind == "O" else f"dtype {dtype}"
+        raise TypeError(f"{name} must be real numbers, got {given}")
     return value
 
 

@@ -62,16 +62,16 @@ class Interrupted(KeyboardInterrupt):
 
 
 @contextlib.contextmanager
-def telling(left: Callable[[], str]) -> Iterator[None]:
-    """What stops the writing inside tells what is `left` on the disk, which tidies up: `WriteError`, `Interrupted`."""
+def telling(clean_up: Callable[[], str]) -> Iterator[None]:
+    """On an error while writing, run `clean_up` and put its text into `WriteError` or `Interrupted`."""
     try:
         yield
     except OSError as error:
-        raise WriteError(error.errno, f"{reason(error)}; {left()}") from error
+        raise WriteError(error.errno, f"{reason(error)}; {clean_up()}") from error
     except KeyboardInterrupt:
-        raise Interrupted(f"interrupted; {left()}") from None
+        raise Interrupted(f"interrupted; {clean_up()}") from None
     except BaseException:
-        left()
+        clean_up()
         raise
 
 
@@ -362,14 +362,14 @@ def open_npz(path: Path, stream: Any = None, *, beside: str = "") -> Iterator[Np
     with reading(path, "an .npz"):
         with zipfile.ZipFile(stream or path) as archive:
             members = archive.infolist()
-            check_claim(path, sum(one.file_size for one in members if one.filename != f"{beside}.npy"))
-            for one in members:
-                with archive.open(one) as member:
+            check_claim(path, sum(entry.file_size for entry in members if entry.filename != f"{beside}.npy"))
+            for entry in members:
+                with archive.open(entry) as member:
                     shape, dtype, _ = npy_header(member)
                     nbytes = math.prod(shape) * dtype.itemsize
-                    if nbytes > one.file_size:
-                        raise ValueError(f"{one.filename} cannot hold an array of shape {shape}")
-                    if one.filename == f"{beside}.npy":
+                    if nbytes > entry.file_size:
+                        raise ValueError(f"{entry.filename} cannot hold an array of shape {shape}")
+                    if entry.filename == f"{beside}.npy":
                         check_claim(path, nbytes, beside, in_parts=True)
         if stream is not None:
             stream.seek(0)
@@ -513,14 +513,14 @@ def read_mat5(path: Path, names: Iterable[str] | None = None) -> dict[str, Any]:
         some = [each for each in mat5.variables(path) if wanted is None or each.name in wanted]
         check_claim(path, sum(8 * math.prod(each.shape) for each in some if each.kind != "sparse"))
         check_claim(path, sum(each.size for each in some))
-        found: dict[str, Any] = {}
+        variables: dict[str, Any] = {}
         with warnings.catch_warnings():  # of variables of the same name, the last of which is the variable
             warnings.simplefilter("ignore", matlab.MatReadWarning)
             for each in some:
-                found |= loadmat(BytesIO(each.element()), variable_names=[each.name])  # type: ignore[arg-type]  # files too
-        for name, value in found.items():
+                variables |= loadmat(BytesIO(each.element()), variable_names=[each.name])  # type: ignore[arg-type]  # files too
+        for name, value in variables.items():
             _check_sparse_within(name, value)
-        return found
+        return variables
 
 
 def _check_sparse_within(name: str, value: Any) -> None:

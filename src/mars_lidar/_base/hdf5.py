@@ -120,15 +120,15 @@ def check_links(file: h5py.File, path: Path) -> None:
 
 def _links(file: h5py.File) -> list[tuple[str, int]]:
     """Names and kinds of all links; ValueError where they are so deep that each is looked up for seconds."""
-    found: list[tuple[str, int]] = []
+    links: list[tuple[str, int]] = []
 
     def add(name: bytes, info: Any) -> None:
         if name.count(b"/") > _DEEPEST:
             raise ValueError(f"it has groups more than {_DEEPEST} deep")
-        found.append((name.decode("utf-8", "replace"), info.type))
+        links.append((name.decode("utf-8", "replace"), info.type))
 
     file.id.links.visit(add, info=True)
-    return found
+    return links
 
 
 def check_heaps(path: Path) -> None:
@@ -187,16 +187,16 @@ def _sum(file: h5py.File, read: Callable[[Any], NDArray[Any]]) -> str:
 
     def add(node: Any) -> None:
         attrs = {name: _plain(node.attrs[name]) for name in node.attrs if name not in _SCALES | {SEAL}}
-        told: list[Any] = [node.name, attrs]
+        parts: list[Any] = [node.name, attrs]
         if hasattr(node, "shape"):
-            told += [str(node.dtype), node.shape, node.chunks, node.fletcher32]
+            parts += [str(node.dtype), node.shape, node.chunks, node.fletcher32]
             if not node.fletcher32:
                 values = read(node)
                 if node.dtype.hasobject:
-                    told.append(_plain(values))
+                    parts.append(_plain(values))
                 else:
                     total.update(np.ascontiguousarray(values).data)
-        total.update(json.dumps(told, sort_keys=True, default=repr).encode())
+        total.update(json.dumps(parts, sort_keys=True, default=repr).encode())
 
     names: list[str] = []
     file.visit(names.append)

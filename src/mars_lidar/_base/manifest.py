@@ -43,14 +43,14 @@ def seal(store: Path, attrs: dict[str, Any], digests: Mapping[str, str] | None =
         if not (store / name / _ROOT).is_file():
             raise FileNotFoundError(f"{store / name / _ROOT} was taken away while the store was written")
     names = sorted(_files(store) - {_ROOT, NAME})
-    told = {name: digests[name] for name in names if name in digests} if digests else {}
-    others = [name for name in names if name not in told]
+    sums = {name: digests[name] for name in names if name in digests} if digests else {}
+    others = [name for name in names if name not in sums]
     with ThreadPoolExecutor(_THREADS) as pool:
-        told.update(zip(others, pool.map(lambda name: _hash(store / name), others), strict=True))
-    document["attributes"][SUM] = _sum(told)
+        sums.update(zip(others, pool.map(lambda name: _hash(store / name), others), strict=True))
+    document["attributes"][SUM] = _sum(sums)
     root = json.dumps(document, indent=2).encode()
-    told[_ROOT] = hashlib.sha256(root).hexdigest()
-    for name, content in ((NAME, _lines(told)), (_ROOT, root)):
+    sums[_ROOT] = hashlib.sha256(root).hexdigest()
+    for name, content in ((NAME, _lines(sums)), (_ROOT, root)):
         if in_bucket(store):
             put(store / name, content)
             continue
@@ -169,7 +169,7 @@ class ManifestInBucket(Manifest):
         return content
 
 
-def told(store: Path) -> str:
+def description(store: Path) -> str:
     """For people: what opening a store has made sure of."""
     return f"every file of its {NAME} is there"
 
@@ -218,7 +218,7 @@ def lines_of(text: str) -> dict[str, str]:
 
 
 def compared(
-    told: Mapping[str, str],
+    sums: Mapping[str, str],
     there: set[str] | None,
     digest: Callable[[str], str],
     every: bool = False,
@@ -228,17 +228,19 @@ def compared(
 
     `stated` is the sum over the lines that the root document has.
     """
-    if stated != _sum(told):
+    if stated != _sum(sums):
         yield f"its {NAME} is not that of its {_ROOT}"
     if there is not None:
-        yield from (f"{name} is missing" for name in told if name not in there)
+        yield from (f"{name} is missing" for name in sums if name not in there)
         more = {name for name in there if name.rpartition("/")[2] == _ROOT or _CHUNK.search(name)}
-        yield from (f"{name} is not in its {NAME}" for name in sorted(more - set(told)))
-    known = set(told) if there is None else there
-    names = sorted(name for name in told if name in known and (every or _SMALL.search(name)))
+        yield from (f"{name} is not in its {NAME}" for name in sorted(more - set(sums)))
+    known = set(sums) if there is None else there
+    names = sorted(name for name in sums if name in known and (every or _SMALL.search(name)))
     with ThreadPoolExecutor(_THREADS) as pool:
-        found = list(pool.map(digest, names))
-    yield from (f"{name} is not as it was written" for name, now in zip(names, found, strict=True) if told[name] != now)
+        digests = list(pool.map(digest, names))
+    yield from (
+        f"{name} is not as it was written" for name, now in zip(names, digests, strict=True) if sums[name] != now
+    )
 
 
 def _lines(sums: Mapping[str, str]) -> bytes:
@@ -265,12 +267,12 @@ def _files(store: Path) -> set[str]:
     """Relative paths of all regular files."""
     if in_bucket(store):
         return set(sizes(store))
-    found = set()
+    files = set()
     for folder, _, names in os.walk(store):
         inside = os.path.relpath(folder, store)
         prefix = "" if inside == "." else inside.replace(os.sep, "/") + "/"
-        found |= {prefix + name for name in names if os.path.isfile(os.path.join(folder, name))}
-    return found
+        files |= {prefix + name for name in names if os.path.isfile(os.path.join(folder, name))}
+    return files
 
 
 def _hash(path: Path) -> str:

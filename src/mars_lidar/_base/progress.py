@@ -14,7 +14,7 @@ LONG_S = 10.0
 """Seconds; a longer run is announced before it starts, or as soon as its time is known."""
 
 
-def shown(progress: Any, label: str) -> Progress | None:
+def callback_of(progress: Any, label: str) -> Progress | None:
     """The callback that an argument `progress` means: a function, True for a `Bar`, None or False for nothing."""
     if progress is None or progress is False:
         return None

@@ -59,18 +59,18 @@ class SealedStore(PlainFiles):
 
     async def get(self, key: str, prototype: Any = None, byte_range: Any = None) -> Any:
         """The bytes of a file, None where the store was written without it."""
-        found = await super().get(key, prototype, byte_range)
+        content = await super().get(key, prototype, byte_range)
         if key not in self._sums:
             self._sums.check(key)
         elif not self._sums.is_known(key):
             await asyncio.to_thread(self._sums.check, key)
-        return found
+        return content
 
     def get_sync(self, key: str, *, prototype: Any = None, byte_range: Any = None) -> Any:
         """As `get`."""
-        found = super().get_sync(key, prototype=prototype, byte_range=byte_range)
+        content = super().get_sync(key, prototype=prototype, byte_range=byte_range)
         self._sums.check(key)
-        return found
+        return content
 
 
 class SealedValues(WrapperStore[Any]):
@@ -85,12 +85,12 @@ class SealedValues(WrapperStore[Any]):
 
     async def get(self, key: str, prototype: Any, byte_range: Any = None) -> Any:
         """The bytes at a key, None where the store was written without it."""
-        found = await self._store.get(key, prototype, byte_range)
+        content = await self._store.get(key, prototype, byte_range)
         wanted = self._sums.get(key) if isinstance(self._sums, Mapping) else self._sums.line(key)
         if wanted is None:
-            return found
-        if found is None:
+            return content
+        if content is None:
             raise FileError(f"{self._url} is damaged or was removed: {key} is missing")
-        if byte_range is None and hashlib.sha256(found.as_buffer_like()).hexdigest() != wanted:
+        if byte_range is None and hashlib.sha256(content.as_buffer_like()).hexdigest() != wanted:
             raise FileError(f"{self._url} is damaged or was replaced: {key} is not as it was written; open it again")
-        return found
+        return content

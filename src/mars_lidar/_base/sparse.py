@@ -57,10 +57,10 @@ def dense_counts(name: str, matrix: Any) -> NDArray[Any]:
 
 def _counts_type(matrix: Any) -> np.dtype[Any]:
     """uint32 where the stored elements are counts, each of which comes once, else the type of the matrix."""
-    kept: np.dtype[Any] = np.dtype(matrix.dtype)
+    stored: np.dtype[Any] = np.dtype(matrix.dtype)
     data = matrix.data if matrix.format in (*_COMPRESSED, *_EXPANDED) else None
-    if data is None or kept.kind not in "iuf" or (matrix.format == "coo" and not matrix.has_canonical_format):
-        return kept
+    if data is None or stored.kind not in "iuf" or (matrix.format == "coo" and not matrix.has_canonical_format):
+        return stored
     with np.errstate(invalid="ignore"):
         are_counts = bool(((data >= 0) & (data == np.floor(data))).all()) and float(data.sum()) < _MOST
-    return np.dtype(np.uint32) if are_counts and kept.itemsize > 4 else kept
+    return np.dtype(np.uint32) if are_counts and stored.itemsize > 4 else stored

@@ -132,10 +132,10 @@ def reconstruct(
         if keep is not None or from_ns is not None:
             own = "none" if stored.measured else str(stored.flux.info.get("attenuation", "none"))
             chosen = keep or "strongest", from_ns or 0.0, attenuation or own
-            found = {name: replace(each, found=keep_return(each.found, *chosen)) for name, each in found.items()}
+            found = {name: replace(each, result=keep_return(each.result, *chosen)) for name, each in found.items()}
         else:
             _tell_reflection(stored, found)
-        results = {name: each.found for name, each in found.items()}
+        results = {name: each.result for name, each in found.items()}
         _show(stored, found)  # first: a disk that is full takes nothing from what is known
         save_maps(out, results, source=str(cube), overwrite=overwrite)
         rows = [("maps", str(out))]
@@ -170,7 +170,7 @@ def _with_false_alarm(names: list[str], false_alarm: float | None) -> list[str |
 
 def _tell_reflection(cube: Cube, found: dict[str, Timed]) -> None:
     """A warning where most first returns stand in the same few bins and there is light beyond."""
-    first = next(iter(found.values())).found
+    first = next(iter(found.values())).result
     common = common_delay(first)
     if common is None:
         return
@@ -214,8 +214,8 @@ def _show(cube: Cube, found: dict[str, Timed]) -> None:
     realizations, height, width, _ = cube.shape
     head = ["method", "seconds", "seen %", "saturated %", "misfit %"]
     lines: list[list[str]] = []
-    errors = {name: errors_against(cube, each.found) for name, each in found.items()}
-    several = any(each.found.returns is not None for each in found.values())
+    errors = {name: errors_against(cube, each.result) for name, each in found.items()}
+    several = any(each.result.returns is not None for each in found.values())
     if several:
         head += ["2 returns %", "3 or more %"]
     kinds = list(next(iter(errors.values()), {}))
@@ -226,16 +226,16 @@ def _show(cube: Cube, found: dict[str, Timed]) -> None:
         unit, wide = ("mm", "depth") if kind == "depth" else ("", kind)
         head += [f"{wide} RMSE {unit}".strip(), "median", "PSNR dB", *ssim]
     for name, each in found.items():
-        flags = each.found.flags
+        flags = each.result.flags
         line = [
             name,
             f"{each.seconds:.3g}",
-            f"{100.0 * each.found.seen.mean():.4g}",
+            f"{100.0 * each.result.detected.mean():.4g}",
             f"{100.0 * ((flags & Flags.SATURATED) > 0).mean():.3g}",
-            "-" if math.isnan(each.found.misfits) else f"{100.0 * each.found.misfits:.3g}",
+            "-" if math.isnan(each.result.misfits) else f"{100.0 * each.result.misfits:.3g}",
         ]
         if several:
-            count = np.zeros(1) if each.found.returns is None else each.found.returns.count
+            count = np.zeros(1) if each.result.returns is None else each.result.returns.count
             line += [f"{100.0 * (count == 2).mean():.4g}", f"{100.0 * (count > 2).mean():.4g}"]
         for kind in kinds:
             off, scale = errors[name][kind], 1e3 if kind == "depth" else 1.0
@@ -249,8 +249,8 @@ def _show(cube: Cube, found: dict[str, Timed]) -> None:
         shown.add_row(*line)
     screen().print(shown)
     for name, each in found.items():
-        if advice := each.found.advice:
-            share = f"{100.0 * each.found.misfits:.3g} % of the pixels do not fit (0.1 % do so by chance)"
+        if advice := each.result.advice:
+            share = f"{100.0 * each.result.misfits:.3g} % of the pixels do not fit (0.1 % do so by chance)"
             say(f"warning: {name}: {share}; would fit better: {advice}; mars-lidar calibrate CUBE finds the value")
 
 
@@ -267,7 +267,7 @@ def _save_cloud(path: Path, results: dict[str, Reconstruction], focal_px: float,
             error_m=every.depth_error_m[0],
             overwrite=overwrite,
         )
-    depth, share = np.where(found.seen, found.depth_m, np.nan)[0], found.reflectivity[0]
+    depth, share = np.where(found.detected, found.depth_m, np.nan)[0], found.reflectivity[0]
     error = None if found.depth_error_m is None else found.depth_error_m[0]
     return save_cloud(path, depth, focal_px, intensity=share, error_m=error, overwrite=overwrite)
 

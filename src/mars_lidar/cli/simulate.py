@@ -271,15 +271,20 @@ def _summary(written: Written, png: Path | None, began: float, out: Path) -> Non
             "time": f"{span(written.simulate_s)} simulating{each}; {span(written.write_s)} writing; "
             f"{span(time.perf_counter() - began)} in all",
         }
-    if written.report:  # seconds by stage, numbers of pixels
-        rows["engine"] = ", ".join(
-            f"{name[:-2]} {value:.3g} s" if name.endswith("_s") else f"{name.replace('_', ' ')} {value:,.0f}"
-            for name, value in written.report.items()
-        )
+    if written.report:
+        rows["engine"] = ", ".join(reported_words(*entry) for entry in written.report.items())
     rows["cube" if written.path == out else "capture"] = str(out)
     if png is not None:
         rows["picture"] = str(png)
     print_table(rows)
+
+
+def reported_words(name: str, value: float) -> str:
+    """An entry of an engine's report: seconds of a stage, or a number of pixels, the reason in brackets."""
+    if name.endswith("_s"):
+        return f"{name[:-2]} {value:.3g} s"
+    what, _, reason = name.replace("_", " ").partition(", ")
+    return f"{what} ({reason}) {value:,.0f}" if reason else f"{what} {value:,.0f}"
 
 
 def each_ns(number: float) -> str:

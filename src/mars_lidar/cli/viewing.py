@@ -114,7 +114,7 @@ def _rows(cube: Cube) -> dict[str, str]:
     count, height, width, bins = cube.shape
     complete = "yes" if cube.complete else "NO: the simulation did not finish"
     if cube.complete and cube.path is not None and cube.path.suffix == ".zarr":
-        complete += f"; {manifest.told(cube.path)}"
+        complete += f"; {manifest.description(cube.path)}"
     if cube.progress:
         complete += f"; {cube.progress}"
     stored = "elsewhere" if cube.path is None else f"{size_on_disk(cube.path) / 1e6:,.4g} MB on disk"

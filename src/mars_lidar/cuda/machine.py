@@ -77,14 +77,14 @@ class Cuda:
     def launch(self, kernel: Kernel, blocks: int, lanes: int, argument: bytes, shared: int = 0) -> None:
         """Queue a kernel of one argument."""
         # a structure passed by value: an array of no dimensions
-        told = np.frombuffer(argument, np.dtype((np.void, len(argument)))).reshape(())
-        self._compiled(kernel, shared)((blocks,), (lanes,), (told,), shared_mem=shared)
+        structure = np.frombuffer(argument, np.dtype((np.void, len(argument)))).reshape(())
+        self._compiled(kernel, shared)((blocks,), (lanes,), (structure,), shared_mem=shared)
 
     def _compiled(self, kernel: Kernel, shared: int) -> Any:
-        found = compiled(kernel, int(self._device.id))
+        function = compiled(kernel, int(self._device.id))
         if shared > _PLAIN_SHARED:
-            found.max_dynamic_shared_size_bytes = shared
-        return found
+            function.max_dynamic_shared_size_bytes = shared
+        return function
 
 
 @lru_cache(maxsize=64)

@@ -61,11 +61,11 @@ def mars_histogram(engine: MarsEngine, task: Task, out: Any, machine: Cuda) -> N
     assert reader is not None  # see cuda.check
     single = single_return(task.flux)
     assert single is not None
-    inside, left = _on_grid(reader.table, single[0], task.flux.background.reshape(-1))
+    inside, outside = _on_grid(reader.table, single[0], task.flux.background.reshape(-1))
     if inside.size:
         _Launches(engine, reader, task, machine).draw(out, inside)
-    if left.size:
-        _on_host(engine, task, out, machine, left)
+    if outside.size:
+        _on_host(engine, task, out, machine, outside)
     if task.progress is not None:
         machine.host(out[:1, :1])  # all is done
         task.progress(task.items, task.items)
@@ -219,10 +219,10 @@ class _Launches:
 
 def _table_there(table: Table, cycles: int, dead_time: float, frame: Frame, machine: Cuda) -> TableThere:
     """The table on the machine; that of the last number of cycles stays as long as the table lives."""
-    kept = _tables.setdefault(table, {})
+    resident = _tables.setdefault(table, {})
     key = machine.key
-    if key in kept and kept[key].cycles == cycles:
-        return kept[key]
+    if key in resident and resident[key].cycles == cycles:
+        return resident[key]
     entries, phases, own = table.entries, table.start_phases, cycles == table.entries.cycles
     axes = {
         "signal_axis": table.signal,
@@ -244,7 +244,7 @@ def _table_there(table: Table, cycles: int, dead_time: float, frame: Frame, mach
         here |= {f"{name}.{part}": array for part, array in _core.table_axis(axis).items()}
     there = TableThere(cycles, axes, {name: machine.array(array) for name, array in here.items()})
     machine.host(there.arrays["energy"])  # all is there, for other streams too
-    kept[key] = there
+    resident[key] = there
     return there
 
 

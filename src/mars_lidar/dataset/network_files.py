@@ -27,7 +27,7 @@ from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.files import beside
 from mars_lidar._base.memory import check_memory
-from mars_lidar._base.progress import shown
+from mars_lidar._base.progress import callback_of
 from mars_lidar._base.types import Progress
 from mars_lidar.dataset.arrays import MAPS
 from mars_lidar.dataset.network_keys import Exposure, check_size, psf, pulse_in_bins
@@ -136,7 +136,7 @@ def export(
     OSError
         `out` has something in it, or cannot be written.
     """
-    told = shown(progress, "exporting")
+    told = callback_of(progress, "exporting")
     source = dataset if isinstance(dataset, Dataset) else open_dataset(dataset)
     checks.choice("layout", layout, (*LAYOUTS, WEBDATASET))
     folder = Path(out)

@@ -30,7 +30,7 @@ from mars_lidar._base.files import (
     open_own,
     successor,
 )
-from mars_lidar._base.progress import shown
+from mars_lidar._base.progress import callback_of
 from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import Progress
 from mars_lidar._version import __version__
@@ -68,6 +68,20 @@ class Generated:
     See Also
     --------
     generate
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import mars_lidar as ml
+    >>> system = {
+    ...     "period_ns": 100.0, "cycles": 200, "bins": 64,
+    ...     "pulse": {"kind": "gaussian", "sigma_ns": 1.0}, "detector": {"dead_time_ns": 75.0},
+    ... }
+    >>> recipe = {"scenes": {"example": "room", "size": [8, 12]}, "systems": system, "light": {"signal": 0.5}}
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     done = ml.generate(recipe, f"{folder}/set.zarr")
+    >>> done.path.name, done.problems
+    ('set.zarr', ())
     """
 
     path: Path
@@ -121,6 +135,8 @@ def generate(
 
     Raises
     ------
+    FileNotFoundError
+        The recipe or a file that it names.
     ValueError, TypeError
         A bad recipe or argument; nothing was written.
     FileExistsError
@@ -148,7 +164,7 @@ def generate(
     (2, 1, 8, 12, 64)
     """
     began = time.perf_counter()
-    progress = shown(progress, "generating")
+    progress = callback_of(progress, "generating")
     target = _target(out)
     threads = None if threads is None else checks.integer("threads", threads, low=1, high=1024)
     with _begun(recipe, target, resume, overwrite, _crew(workers, scheduler)) as (store, dataset, crew):
@@ -188,6 +204,37 @@ def begin(
         As for `generate`.
     workers, scheduler
         As for `generate`: they read the scenes.
+
+    Returns
+    -------
+    Generated
+
+    Raises
+    ------
+    TypeError, ValueError
+        A bad recipe or argument; nothing was written.
+    FileExistsError
+        `out` exists, and neither `resume` nor `overwrite` is given.
+
+    See Also
+    --------
+    make_part, finish, mars_lidar.generate
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from mars_lidar import dataset
+    >>> system = {
+    ...     "period_ns": 100.0, "cycles": 200, "bins": 64,
+    ...     "pulse": {"kind": "gaussian", "sigma_ns": 1.0}, "detector": {"dead_time_ns": 75.0},
+    ... }
+    >>> recipe = {"scenes": {"example": "room", "size": [8, 12]}, "systems": system, "light": {"signal": [0.1, 1.0]}}
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     begun = dataset.begin(recipe, f"{folder}/set.zarr")
+    ...     parts = [dataset.make_part(f"{folder}/set.zarr", (k, 2)) for k in (1, 2)]  # anywhere, in any order
+    ...     done = dataset.finish(f"{folder}/set.zarr")
+    >>> done.shape  # (samples, realizations, H, W, bins)
+    (2, 1, 8, 12, 64)
     """
     began, target = time.perf_counter(), _target(out)
     with _begun(recipe, target, resume, overwrite, _crew(workers, scheduler)) as (_, dataset, _):
@@ -212,6 +259,38 @@ def make_part(
         (K, N), K from 1 to N.
     threads, progress
         As for `generate`.
+
+    Returns
+    -------
+    Generated
+
+    Raises
+    ------
+    TypeError
+        Arguments of another kind.
+    ValueError
+        A part that is not K of N; a store that `begin` did not begin, or whose version or bits are others.
+    FileNotFoundError
+        No store.
+
+    See Also
+    --------
+    begin, finish
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from mars_lidar import dataset
+    >>> system = {
+    ...     "period_ns": 100.0, "cycles": 200, "bins": 64,
+    ...     "pulse": {"kind": "gaussian", "sigma_ns": 1.0}, "detector": {"dead_time_ns": 75.0},
+    ... }
+    >>> recipe = {"scenes": {"example": "room", "size": [8, 12]}, "systems": system, "light": {"signal": 0.5}}
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     begun = dataset.begin(recipe, f"{folder}/set.zarr")
+    ...     made = dataset.make_part(f"{folder}/set.zarr", (1, 1))
+    >>> made.parts
+    2
     """
     began, target = time.perf_counter(), _target(out)
     which = checks.integer("K", part[0], low=1, high=2**31)
@@ -225,16 +304,54 @@ def make_part(
         with _told(store, target):
             mine = _share(list(dataset.items()), which, of)
             todo = dataset.missing(mine)
-            totals = _Totals(len(mine) - len(todo), len(mine), shown(progress, "generating"))
+            totals = _Totals(len(mine) - len(todo), len(mine), callback_of(progress, "generating"))
             _make(dataset, _here(dataset, len(todo), threads), todo, totals)
     return totals.generated(target, dataset, time.perf_counter() - began)
 
 
 @checked
 def finish(out: str | Path) -> Generated:
-    """Mark a dataset complete whose parts were all made by `make_part`; ValueError where one is missing.
+    """Mark a dataset complete whose parts were all made by `make_part`.
 
-    Only what its writer noted no digest of is read again.
+    Only files whose writer noted no digest are read again.
+
+    Parameters
+    ----------
+    out
+        The store.
+
+    Returns
+    -------
+    Generated
+
+    Raises
+    ------
+    TypeError
+        A path that is none.
+    ValueError
+        A part is missing.
+    FileNotFoundError
+        No store.
+
+    See Also
+    --------
+    begin, make_part
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from mars_lidar import dataset
+    >>> system = {
+    ...     "period_ns": 100.0, "cycles": 200, "bins": 64,
+    ...     "pulse": {"kind": "gaussian", "sigma_ns": 1.0}, "detector": {"dead_time_ns": 75.0},
+    ... }
+    >>> recipe = {"scenes": {"example": "room", "size": [8, 12]}, "systems": system, "light": {"signal": 0.5}}
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     begun = dataset.begin(recipe, f"{folder}/set.zarr")
+    ...     made = dataset.make_part(f"{folder}/set.zarr", (1, 1))
+    ...     done = dataset.finish(f"{folder}/set.zarr")
+    >>> done.shape
+    (1, 1, 8, 12, 64)
     """
     began, target = time.perf_counter(), _target(out)
     with _alone(target):

@@ -12,7 +12,7 @@ import numpy as np
 from mars_lidar._base import checks, manifest
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.files import FileError, reading
-from mars_lidar._base.progress import shown
+from mars_lidar._base.progress import callback_of
 from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import Progress
 from mars_lidar._version import other_version
@@ -71,7 +71,7 @@ def verify(
     threads, progress
         As for `mars_lidar.generate`.
     """
-    progress = shown(progress, "verifying")
+    progress = callback_of(progress, "verifying")
     dataset = open_dataset(path)
     array = dataset.histogram
     places = grid(array.shape, array.chunks)

@@ -179,6 +179,16 @@ class Engine(ABC):
 
     Sampling is reproducible: it depends on the flux, the system, the seed, and on the pixel index and number
     of the realization, never on threads, chunks, or what else is simulated in the same call.
+
+    See Also
+    --------
+    find_engine, mars_lidar.simulate
+
+    Examples
+    --------
+    >>> from mars_lidar.engines import Engine, find_engine
+    >>> isinstance(find_engine("exact"), Engine)
+    True
     """
 
     name: ClassVar[str]
@@ -198,18 +208,18 @@ class Engine(ABC):
         return {}
 
     def check(self, flux: Flux, system: System) -> None:  # noqa: B027  (most engines take everything)
-        """Raise ValueError, naming the field, for what this engine cannot do."""
+        """Raise ValueError, naming the field, for what of `flux` and `system` this engine cannot do."""
 
     @abstractmethod
     def histogram(self, task: Task, out: NDArray[Any]) -> None:
-        """Fill `out` (items, bins), C-contiguous, of the system's histogram dtype."""
+        """Fill `out` (items, bins), C-contiguous, of the histogram dtype of the system of `task`."""
 
     def counts(self, task: Task) -> NDArray[np.int64]:
-        """Registrations of each exposure (items,), with the draws of `histogram`."""
+        """Registrations of each exposure (items,) of `task`, with the draws of `histogram`."""
         raise ValueError(f"engine {self.name!r} draws histograms only, not single registrations; use 'exact'")
 
     def records(self, task: Task, expected: float) -> Records | PhaseRecords:
-        """Every registration, with the draws of `histogram`, of which about `expected` are to be expected in all.
+        """Every registration of `task`, with the draws of `histogram`; `expected`: about how many there will be.
 
         Here in two passes, `counts` and `timestamps`.
         """
@@ -218,7 +228,7 @@ class Engine(ABC):
         return records
 
     def timestamps(self, task: Task, records: Records) -> None:
-        """Fill `records`, allocated from `counts`, with the draws of `histogram`."""
+        """Fill `records`, allocated from `counts`, with the draws of `histogram` for `task`."""
         raise ValueError(f"engine {self.name!r} draws histograms only, not timestamps; use 'exact'")
 
 

@@ -26,17 +26,16 @@ class FeedbackEngine(Engine):
     ``H = lambda (N_r + e - G H) + M``; the law is right bin by bin and jointly (docs/feedback.md).
     The cost is that of some sweeps over the bins, whatever the number of cycles.
 
-    Pixels whose sweeps would not forget their past within a period (locked ones, of a bright pulse or background and a
-    dead time just below a period) are cut into pieces of several periods that go through their bins together, with
-    numbers of their own in each.
+    Pixels whose sweeps would not forget their past within a period, or whose count hardly varies (locked ones, of a
+    bright pulse or background), are cut into pieces of several periods that go through their bins together, with
+    numbers of their own in each; the whole periods of a dead time are left out of the pieces.
 
     The internal grid is judged by its own mean: bins are cut until no linear function of the histogram is off by more
     than a twentieth of its standard deviation.
 
     Pixels that it cannot do are given to the exact engine, by a rule on the pixel and the system alone: exposures
-    below 100 dead times, sweeps that contract too slowly (some 15 or more background photons per dead time), counts
-    that hardly vary under a dead time of more than a period, locked pixels below 1e4 periods, more than 65,536
-    internal cells.
+    below 100 dead times, sweeps that contract too slowly (some 15 or more background photons per dead time), locked
+    pixels below 1e4 periods, more than 65,536 internal cells.
     Every drawn exposure is checked before it is written: its history must agree with itself, arm no negative number
     of exposures, and have a count that its law allows; else that exposure is drawn by the exact engine. Without dead
     time the bins are independent Poisson numbers.
@@ -45,7 +44,8 @@ class FeedbackEngine(Engine):
     forces one of ``_core.levels()``.
 
     Reports ``pixels given to exact`` and ``exposures drawn again by exact``, and each of them by reason where there
-    are any, such as ``pixels given to exact, slow sweeps``.
+    are any, such as ``pixels given to exact, slow sweeps``; and where there are any, ``exposures drawn again by
+    feedback``, with other numbers of the same law.
     """
 
     name = "feedback"

@@ -36,7 +36,6 @@ class Reason(IntEnum):
 
     DRAWN = 0
     SLOW = 1
-    LOCKED = 2
     FEW = 3
     UNSETTLED = 4
     NEGATIVE = 5
@@ -54,7 +53,6 @@ class Reason(IntEnum):
 
 _WORDS = {
     Reason.SLOW: "slow sweeps",
-    Reason.LOCKED: "narrow count law",
     Reason.FEW: "locked, short exposure",
     Reason.UNSETTLED: "unsettled",
     Reason.NEGATIVE: "negative armed",
@@ -178,6 +176,7 @@ def sweep_pixels(
     of_laps[slow] = laps
     long = expected_registrations(task.flux, task.system).reshape(-1)[pixels] > TRY_FROM * cells * of_laps
     unsettled = (status == Reason.UNSETTLED) & long
+    tried = int(unsettled.sum())
     for attempt in range(1, MOST_TRIES + 1):
         for one in np.flatnonzero(unsettled.any(1)):
             first, seed = task.first_realization + int(one), task.seed ^ (attempt * _OTHER_NUMBERS % 2**64)
@@ -185,6 +184,8 @@ def sweep_pixels(
             again = np.flatnonzero(unsettled[one])
             status[one, again] = draw(part, int(one), again, of_laps[again])[0]
         unsettled &= status == Reason.UNSETTLED
+    if tried:
+        task.report["exposures drawn again by feedback"] = float(tried - unsettled.sum())
     return Rest.of(task, pixels, status)
 
 

@@ -52,11 +52,33 @@ class MarsEngine(CountTimesShape):
     level
         Forces one of ``_core.levels()`` (vector widths); it changes speed only.
 
+    Raises
+    ------
+    TypeError
+        A table that is none.
+    ValueError
+        An unknown `count`, `interpolation`, `outside` or `level`; those of a table without one.
+
+    See Also
+    --------
+    RenewalEngine, mars_lidar.Table, mars_lidar.simulate
+
     Notes
     -----
     Seconds of the stages go to the report: ``lookup_s``, ``evaluation_s``, ``counts_s``, ``sampling_s`` (alignment
     included), and ``pixels_evaluated``, those that no table was used for. With a table, ``pixels_exact_count`` had
     their count's law evaluated beside it, by ``laws_evaluated`` distinct evaluations.
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> engine = ml.engines.MarsEngine(count="gaussian")
+    >>> ml.simulate(ml.Flux(1.0, 1.0, 40.0), system, engine=engine, seed=0).shape
+    (1, 1, 1, 128)
     """
 
     name = "mars"

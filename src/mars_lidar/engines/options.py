@@ -15,6 +15,8 @@ Outside = Literal["error", "exact"]
 class EngineOptions(TypedDict, total=False):
     """Arguments of the constructors of engines; None, or left out: the engine's default.
 
+    Attributes
+    ----------
     table
         For ``"mars"`` and ``"renewal"``: the lookup table (`mars_lidar.Table`).
     count
@@ -24,6 +26,17 @@ class EngineOptions(TypedDict, total=False):
         For a table: ``"bilinear"`` (default) or ``"nearest"`` (the paper's).
     outside
         For a table, of pixels beyond its range: ``"error"`` (default), or ``"exact"``, some ms each.
+
+    See Also
+    --------
+    find_engine, mars_lidar.simulate
+
+    Examples
+    --------
+    >>> from mars_lidar.engines import EngineOptions, find_engine
+    >>> options = EngineOptions(count="gaussian")
+    >>> find_engine("mars", **options).name
+    'mars'
     """
 
     table: Table | None

@@ -52,7 +52,36 @@ def check_detector(engine: Engine, system: System) -> None:
 
 
 def find_engine(engine: str | Engine, **options: Unpack[EngineOptions]) -> Engine:
-    """The engine of that name, of default settings but for the options that are not None; or the engine itself."""
+    """The engine of a name, or the engine itself.
+
+    Parameters
+    ----------
+    engine
+        A name, as for `mars_lidar.simulate`, such as ``"exact"``, ``"auto"`` or ``"mars"``; or an `Engine`.
+    options
+        `EngineOptions`; those that are None have the engine's defaults.
+
+    Returns
+    -------
+    Engine
+
+    Raises
+    ------
+    TypeError
+        Neither a name nor an `Engine`; an option that this engine does not have.
+    ValueError
+        An unknown name.
+
+    See Also
+    --------
+    EngineOptions, mars_lidar.simulate
+
+    Examples
+    --------
+    >>> from mars_lidar.engines import find_engine
+    >>> find_engine("mars", count="gaussian").name
+    'mars'
+    """
     chosen = given(options)
     if isinstance(engine, Engine):
         found = engine

@@ -38,6 +38,28 @@ class RenewalEngine(CountTimesShape):
         As for `MarsEngine`; pixels beyond the grid get their own chain.
     level
         Forces one of ``_core.levels()`` (vector widths); it changes speed only.
+
+    Raises
+    ------
+    TypeError
+        A table that is none.
+    ValueError
+        An unknown `interpolation`, `outside` or `level`; those of a table without one.
+
+    See Also
+    --------
+    MarsEngine, mars_lidar.simulate
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> engine = ml.engines.RenewalEngine()
+    >>> ml.simulate(ml.Flux(1.0, 1.0, 40.0), system, engine=engine, seed=0).shape
+    (1, 1, 1, 128)
     """
 
     name = "renewal"

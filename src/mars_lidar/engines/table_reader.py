@@ -163,7 +163,7 @@ class TableReader:
         system = task.system
         signal, delay = single[0][pixels], single[1][pixels]
         background = np.ascontiguousarray(task.flux.background.reshape(-1)[pixels])
-        look = self.table.lookup(
+        look = self.table.at(
             signal,
             background,
             delay_ns=delay,
@@ -211,7 +211,7 @@ def table_record(table: Table) -> dict[str, Any]:
     The hash is of what a cube depends on: axes, shapes, and cumulants at the nodes.
     """
     signal, background = (np.ascontiguousarray(axis, dtype=np.float64) for axis in (table.signal, table.background))
-    nodes = table.lookup(np.repeat(signal, background.size), np.tile(background, signal.size), interpolation="nearest")
+    nodes = table.at(np.repeat(signal, background.size), np.tile(background, signal.size), interpolation="nearest")
     digest = blake2b(digest_size=16)
     for part in (signal, background, nodes.cumulants, table.shapes()):
         digest.update(np.ascontiguousarray(part).data)

@@ -61,14 +61,14 @@ class CubeServer:
         self._word = f"/{secrets.token_urlsafe(16)}"
         text = page_text()
         if cube is not None:
-            told = json.dumps(self._told(cube, name), allow_nan=False).replace("<", "\\u003c")
-            text = text.replace(_PLACE, _PLACE.replace("null", told, 1))
+            document = json.dumps(self._description(cube, name), allow_nan=False).replace("<", "\\u003c")
+            text = text.replace(_PLACE, _PLACE.replace("null", document, 1))
         self._page = text.encode()
         try:
             self._server = _Server(("127.0.0.1", port), _handler(self))
         except OSError as error:
-            told = f"port {port} of 127.0.0.1: {error.strerror}; give another (--port)"
-            raise OSError(error.errno, told) from None
+            message = f"port {port} of 127.0.0.1: {error.strerror}; give another (--port)"
+            raise OSError(error.errno, message) from None
         self.hosts = tuple(f"{name}:{self._server.server_port}" for name in ("127.0.0.1", "localhost"))  # that may ask
         self.url = f"http://{self.hosts[0]}{self._word}/"
 
@@ -99,7 +99,7 @@ class CubeServer:
             warnings.simplefilter("ignore")
             return {"/pixel": self._pixel, "/rows": self._rows}[what](self.cube, given)
 
-    def _told(self, cube: Cube, name: str) -> dict[str, Any]:
+    def _description(self, cube: Cube, name: str) -> dict[str, Any]:
         settings, reason = settings_of(cube.system)
         images, height, width, _ = cube.shape
         return {
@@ -118,8 +118,8 @@ class CubeServer:
             _whole(name, given, size) for name, size in zip(("image", "row", "column"), cube.shape, strict=False)
         )
         counts = np.asarray(cube.histogram[image, row, column])
-        told = {"counts": counts.tolist(), "light": light_of(cube, image, row, column, counts)}
-        return "application/json", json.dumps(told, allow_nan=False).encode()
+        answer = {"counts": counts.tolist(), "light": light_of(cube, image, row, column, counts)}
+        return "application/json", json.dumps(answer, allow_nan=False).encode()
 
     def _rows(self, cube: Cube, given: dict[str, str]) -> tuple[str, bytes]:
         """Counts of the pixels of some rows, and their delays in ns, NaN for none: float64."""

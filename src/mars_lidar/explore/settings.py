@@ -13,13 +13,13 @@ from mars_lidar.instrument.system import System
 from mars_lidar.io import Cube
 from mars_lidar.reconstruction import reconstruct
 
-_TOLD = (*LIGHT_EFFECTS, "afterpulsing", "twilight_ns", "electronics_dead_time_ns", "jitter")
+_SUPPORTED = (*LIGHT_EFFECTS, "afterpulsing", "twilight_ns", "electronics_dead_time_ns", "jitter")
 
 
 def settings_of(system: System) -> tuple[dict[str, Any], str]:
     """What the page's sliders are set to for a system, and why it has no exact law there, or nothing."""
     detector = system.detector
-    told: dict[str, Any] = {
+    settings: dict[str, Any] = {
         "period": system.period_ns,
         "cycles": system.cycles,
         "bins": system.bins,
@@ -31,25 +31,25 @@ def settings_of(system: System) -> tuple[dict[str, Any], str]:
         "twilight": detector.twilight_ns,
         "electronics": detector.electronics_dead_time_ns,
     }
-    untold = [name for name in detector.effects if name not in _TOLD]
+    unsupported = [name for name in detector.effects if name not in _SUPPORTED]
     if isinstance(system.pulse, GaussianPulse):
-        told["sigma"] = system.pulse.sigma_ns
+        settings["sigma"] = system.pulse.sigma_ns
     else:
-        untold.append("a measured pulse")
+        unsupported.append("a measured pulse")
     if detector.mode == "gated":
-        told |= {"gateStart": detector.gate_start_ns, "gateWidth": detector.gate_width_ns}
+        settings |= {"gateStart": detector.gate_start_ns, "gateWidth": detector.gate_width_ns}
     if detector.gate_moves:
-        untold.append("a gate that moves")
+        unsupported.append("a gate that moves")
     after, jitter = detector.afterpulsing, detector.jitter
     if after is not None and (after.delay_ns is None or after.generations is not None):
-        untold.append("sampled or limited afterpulses")
+        unsupported.append("sampled or limited afterpulses")
     elif after is not None:
-        told |= {"afterpulses": after.probability, "trapDelay": after.delay_ns}
+        settings |= {"afterpulses": after.probability, "trapDelay": after.delay_ns}
     if jitter is not None and getattr(jitter, "tail_fraction", 1.0) > 0.0:
-        untold.append("a jitter that is not Gaussian")
+        unsupported.append("a jitter that is not Gaussian")
     elif jitter is not None:
-        told["jitter"] = getattr(jitter, "sigma_ns", 0.0)
-    return told, f"This page draws no law for {' and '.join(untold)}." if untold else ""
+        settings["jitter"] = getattr(jitter, "sigma_ns", 0.0)
+    return settings, f"This page draws no law for {' and '.join(unsupported)}." if unsupported else ""
 
 
 def truth_of(cube: Cube) -> str:
@@ -72,12 +72,12 @@ def light_of(cube: Cube, image: int, row: int, column: int, counts: NDArray[Any]
         delay = float(flux.returns_delay_ns.reshape(1, *flux.shape)[0, row, column])
     else:
         try:
-            found = reconstruct(counts, system)
+            estimate = reconstruct(counts, system)
         except ValueError:  # a mode or a pulse that it does not hold for
             return None
         share = system.detector.detection_efficiency
         dark = system.detector.dark_count_hz * system.period_ns * 1e-9
-        signal, delay = float(found.signal) / share, float(found.delay_ns)
-        background = max(float(found.background) - dark, 0.0) / share
+        signal, delay = float(estimate.signal) / share, float(estimate.delay_ns)
+        background = max(float(estimate.background) - dark, 0.0) / share
     delay = delay % system.period_ns if np.isfinite(delay) else 0.0
     return {"signal": signal, "background": background, "delay": delay}

@@ -47,6 +47,8 @@ class Afterpulsing:
 
     Raises
     ------
+    TypeError
+        A probability or delay that is no number.
     ValueError
         A probability outside (0, 1), a delay that is not positive, or both `delay_ns` and `delays`.
 
@@ -101,7 +103,10 @@ class Afterpulsing:
     def after_dead_time(
         cls, *, probability: float, delay_ns: float, dead_time_ns: float, generations: int | None = None
     ) -> Afterpulsing:
-        """Exponential delays with `probability` afterpulses per avalanche after its dead time."""
+        """Exponential delays with `probability` afterpulses per avalanche after its dead time.
+
+        `delay_ns` is their mean, `dead_time_ns` that of the detector, `generations` as here.
+        """
         after_dead = checks.real("probability", probability, low=0.0, high=1.0, strict_low=True)
         delay = checks.real("delay_ns", delay_ns, low=0.0, strict_low=True)
         dead = checks.real("dead_time_ns", dead_time_ns, low=0.0)
@@ -134,7 +139,7 @@ class Afterpulsing:
         return np.asarray(below / below[-1] if below[-1] > 0 else below)
 
     def check(self, period_ns: float) -> None:
-        """Raise ValueError for delays that are out of all proportion to the laser period."""
+        """Raise ValueError for delays that are out of all proportion to the laser period `period_ns`."""
         most = _MAX_DELAY_PERIODS * period_ns
         if self.mean_delay_ns > most:
             raise ValueError(
@@ -181,6 +186,8 @@ class Crosstalk:
 
     Raises
     ------
+    TypeError
+        A probability that is no number; a kernel of another kind.
     ValueError
         A probability outside (0, 1], or weights that are not (3, 3), finite, non-negative and 0 in the middle.
 
@@ -235,7 +242,7 @@ class Crosstalk:
 
     @classmethod
     def from_dict(cls, data: Any) -> Crosstalk:
-        """The crosstalk that `to_dict` described; ``kernel: 4`` without quotes is understood."""
+        """The crosstalk that `to_dict` described by `data`; ``kernel: 4`` without quotes is understood."""
         known = dict(checks.known_keys("crosstalk", data, ("probability", "kernel")))
         if "probability" not in known:
             raise ValueError("crosstalk must give probability")

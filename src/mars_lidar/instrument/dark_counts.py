@@ -40,6 +40,8 @@ def dark_count_map(
 
     Raises
     ------
+    TypeError
+        A rate, factor or shape that is no number.
     ValueError
         A shape that is not (H, W), or a number out of its range.
 

@@ -35,6 +35,9 @@ _MAX_GATE_NS = 1e12  # a start or a step is taken modulo the period: far beyond 
 class Detector:
     """A single-photon detector pixel.
 
+    Fields from `detection_efficiency` on are effects, in the order in which they act (docs/detectors.md); all are off
+    by default.
+
     Parameters
     ----------
     dead_time_ns
@@ -57,8 +60,6 @@ class Detector:
     gate_cycles
         ... every so many periods, for a gate that is moved during the exposure. Default: 0 and 1, a gate that
         stays.
-
-    Effects, in the order in which they act (docs/detectors.md); all are off by default:
 
     detection_efficiency
         Probability, fill factor included, that a photon of the `Flux` triggers an avalanche; in (0, 1]. 1: the flux
@@ -171,7 +172,7 @@ class Detector:
 
     @classmethod
     def preset(cls, name: str) -> Detector:
-        """A detector as published, by its name in `mars_lidar.instrument.presets.PRESETS` (docs/detectors.md).
+        """A detector as published, by its `name` in `mars_lidar.instrument.presets.PRESETS` (docs/detectors.md).
 
         `dataclasses.replace` changes fields. Efficiencies stay at 1, because they depend on the wavelength.
         """
@@ -217,7 +218,7 @@ class Detector:
         return tuple(on)
 
     def without(self, *names: str) -> Detector:
-        """This detector with some effects switched off."""
+        """This detector without the effects of these field `names`."""
         return dataclasses.replace(self, **{name: effects.FIELDS[name].off for name in names})
 
     @property
@@ -226,14 +227,14 @@ class Detector:
         return bool(self.gate_step_ns)
 
     def gate_periods(self, period_ns: float) -> tuple[float, float, float]:
-        """Start and step in [0, 1), and width in (0, 1], in laser periods; the whole period without a gate."""
+        """Start and step in [0, 1), and width in (0, 1], in periods of `period_ns`; the whole period without a gate."""
         if self.gate_start_ns is None or self.gate_width_ns is None or self.gate_step_ns is None:
             return 0.0, 0.0, 1.0
         start, step = self.gate_start_ns % period_ns / period_ns, self.gate_step_ns % period_ns / period_ns
         return start % 1.0, step % 1.0, min(self.gate_width_ns / period_ns, 1.0)
 
     def check(self, period_ns: float, bins: int, start: str) -> None:
-        """Raise ValueError, naming the field, for what makes no sense at this laser period, binning and start."""
+        """Raise ValueError, naming the field, for what makes no sense at this `period_ns`, `bins` and `start`."""
         if self.jitter is not None:
             self.jitter.check(period_ns)
         if self.afterpulsing is not None:
@@ -272,7 +273,7 @@ class Detector:
 
     @classmethod
     def from_dict(cls, data: Any) -> Detector:
-        """The detector that `to_dict` described; ``preset: NAME`` stands for the fields of a preset."""
+        """The detector that `to_dict` described by `data`; ``preset: NAME`` stands for the fields of a preset."""
         names = tuple(field.name for field in dataclasses.fields(cls))
         known = dict(checks.known_keys("detector", data, (*names, "preset")))
         if "preset" in known:

@@ -32,6 +32,8 @@ class Jitter:
 
     Raises
     ------
+    TypeError
+        A width or fraction that is no number.
     ValueError
         `sigma_ns` is not positive, or one of `tail_ns` and `tail_fraction` is 0 without the other.
 
@@ -91,7 +93,7 @@ class Jitter:
         return np.asarray(ndtr(t / self.sigma_ns) - self.tail_fraction * late, dtype=np.float64)
 
     def integral(self, t_ns: ArrayLike) -> FloatArray:
-        """Integral of `cumulative` from -infinity to t (...), ns."""
+        """Integral of `cumulative` from -infinity to `t_ns` (...), ns."""
         from scipy.special import ndtr
 
         t = np.asarray(t_ns, dtype=np.float64)
@@ -113,7 +115,7 @@ class Jitter:
         return np.asarray(np.where(x > -5.0, near, np.exp(exponent) * ndtr(z - ratio)), dtype=np.float64)
 
     def check(self, period_ns: float) -> None:
-        """Sigma from 1e-6 to 1/20 period: 8.5 sigma lie within half a period. The tail's mean up to a period."""
+        """Sigma from 1e-6 to 1/20 of `period_ns`: 8.5 sigma lie within half a period. The tail's mean up to it."""
         if not 1e-6 * period_ns <= self.sigma_ns <= 0.05 * period_ns:
             raise ValueError(
                 f"sigma_ns of a jitter must lie in [{1e-6 * period_ns:g}, {0.05 * period_ns:g}] ns "
@@ -144,6 +146,8 @@ class SampledJitter:
 
     Raises
     ------
+    TypeError
+        Values or times that are no numbers.
     ValueError
         Samples that are not 1-D, finite and non-negative, or sum to 0.
 
@@ -204,7 +208,7 @@ class SampledJitter:
         return self.shape.cumulative(t_ns)
 
     def integral(self, t_ns: ArrayLike) -> FloatArray:
-        """Integral of `cumulative` from -infinity to t (...), ns."""
+        """Integral of `cumulative` from -infinity to `t_ns` (...), ns: quadratic on each sample."""
         t, edges = np.asarray(t_ns, dtype=np.float64), self._edges()
         level = self.cumulative(edges)
         below = np.concatenate([[0.0], np.cumsum(0.5 * (level[1:] + level[:-1]) * np.diff(edges))])
@@ -214,7 +218,7 @@ class SampledJitter:
         return np.asarray(area + np.maximum(t - edges[-1], 0.0), dtype=np.float64)
 
     def check(self, period_ns: float) -> None:
-        """The record fits in the period."""
+        """The record fits in the period `period_ns`."""
         self.shape.check(period_ns)
 
     def to_dict(self) -> dict[str, Any]:

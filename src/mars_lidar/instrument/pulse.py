@@ -29,7 +29,19 @@ _ORIGINS = ("peak", "centroid", "first")
 
 
 class Pulse(ABC):
-    """A pulse shape s(t), unit energy. Concrete pulses are final, frozen, hashable and serialisable."""
+    """A pulse shape s(t), unit energy. Concrete pulses are final, frozen, hashable and serialisable.
+
+    See Also
+    --------
+    GaussianPulse, SampledPulse
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> pulse = ml.GaussianPulse(sigma_ns=1.0)
+    >>> isinstance(pulse, ml.Pulse), float(pulse.cumulative(0.0))
+    (True, 0.5)
+    """
 
     @abstractmethod
     def support_ns(self) -> tuple[float, float]:
@@ -41,7 +53,7 @@ class Pulse(ABC):
 
     @abstractmethod
     def check(self, period_ns: float) -> None:
-        """Raise ValueError where this pulse cannot be used at the given laser period."""
+        """Raise ValueError where this pulse cannot be used at the laser period `period_ns`."""
 
     @abstractmethod
     def to_dict(self) -> dict[str, Any]:
@@ -58,7 +70,7 @@ class Pulse(ABC):
         return as_html(self, {"pulse (1/ns) over the time after the delay (ns)": (edges[1:], density)})
 
     def wrapped_cumulative(self, t_ns: ArrayLike, period_ns: float) -> NDArray[np.float64]:
-        """Energy of the periodic pulse train in (-inf, t], counted from a fixed origin: grows by 1 a period.
+        """Energy until `t_ns` of the pulse train of period `period_ns`, from a fixed origin: grows by 1 a period.
 
         Differences of it are exact energies of an interval, wrap-around included.
         """
@@ -88,6 +100,10 @@ class Pulse(ABC):
         ----------
         delay_ns
             Delay of the return (...), ns.
+        period_ns
+            Laser period, ns.
+        bins
+            Bins of the period.
 
         Returns
         -------
@@ -102,12 +118,19 @@ class Pulse(ABC):
 @constructed_by_name
 @dataclass(frozen=True, kw_only=True)
 class GaussianPulse(Pulse):
-    """Gaussian pulse of standard deviation `sigma_ns` (ns), centred on the delay.
+    """Gaussian pulse, centred on the delay.
 
     FWHM = 2.355 sigma; `GaussianPulse.from_fwhm(fwhm_ns=...)` takes that instead.
 
+    Parameters
+    ----------
+    sigma_ns
+        Standard deviation, ns.
+
     Raises
     ------
+    TypeError
+        A width that is no number.
     ValueError
         `sigma_ns` is not positive and finite; `System` asks for 1e-6 to 1 period.
 
@@ -144,7 +167,7 @@ class GaussianPulse(Pulse):
         return -_GAUSSIAN_REACH * self.sigma_ns, _GAUSSIAN_REACH * self.sigma_ns
 
     def cumulative(self, t_ns: ArrayLike) -> NDArray[np.float64]:
-        """Phi(t / sigma), relatively accurate in the lower tail."""
+        """Phi(t / sigma) of times `t_ns`, relatively accurate in the lower tail."""
         from scipy.special import ndtr
 
         return np.asarray(ndtr(np.asarray(t_ns, dtype=np.float64) / self.sigma_ns), dtype=np.float64)
@@ -161,7 +184,7 @@ class GaussianPulse(Pulse):
         return total
 
     def check(self, period_ns: float) -> None:
-        """Sigma between 1e-6 and 1 period: narrower is a delta to the sampler, wider is a flat background."""
+        """Sigma between 1e-6 and 1 times `period_ns`: narrower is a delta to the sampler, wider is flat."""
         if not 1e-6 * period_ns <= self.sigma_ns <= period_ns:
             raise ValueError(
                 f"sigma_ns must lie in [{1e-6 * period_ns:g}, {period_ns:g}] ns (1e-6 to 1 period), "
@@ -199,6 +222,8 @@ class SampledPulse(Pulse):
 
     Raises
     ------
+    TypeError
+        Values or times that are no numbers.
     ValueError
         Samples that are not 1-D, finite and non-negative, or sum to 0; `System` asks that the record fits in a period.
 
@@ -278,12 +303,12 @@ class SampledPulse(Pulse):
         )
 
     def cumulative(self, t_ns: ArrayLike) -> NDArray[np.float64]:
-        """Piecewise linear: the density is constant on each sample."""
+        """Energy before `t_ns`, piecewise linear: the density is constant on each sample."""
         x = (np.asarray(t_ns, dtype=np.float64) - self._start_ns) / self.bin_ns
         return np.asarray(np.interp(x, np.arange(self._cumulative.size), self._cumulative), dtype=np.float64)
 
     def check(self, period_ns: float) -> None:
-        """The record fits in the period."""
+        """The record fits in the period `period_ns`."""
         length = self.values.size * self.bin_ns
         if length > period_ns * (1 + 1e-9):
             raise ValueError(

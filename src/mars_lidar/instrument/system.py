@@ -163,12 +163,12 @@ class System:
 
     @checked
     def delay_ns(self, depth_m: ArrayLike) -> NDArray[np.float64]:
-        """Round-trip time 2 z / c of depths (...) in m, in ns, not wrapped."""
+        """Round-trip time 2 z / c of depths `depth_m` (...) in m, in ns, not wrapped."""
         return 2.0 / SPEED_OF_LIGHT_M_PER_NS * np.asarray(depth_m, dtype=np.float64)
 
     @checked
     def depth_m(self, delay_ns: ArrayLike) -> NDArray[np.float64]:
-        """Depth c tau / 2 of delays (...) in ns, in m."""
+        """Depth c tau / 2 of delays `delay_ns` (...) in ns, in m."""
         return 0.5 * SPEED_OF_LIGHT_M_PER_NS * np.asarray(delay_ns, dtype=np.float64)
 
     @property
@@ -195,7 +195,7 @@ class System:
         return np.dtype(np.uint16 if self.max_bin_count <= np.iinfo(np.uint16).max else np.uint32)
 
     def replace(self, **changes: Any) -> System:
-        """A copy with some fields changed."""
+        """A copy with some fields changed; `changes` are arguments of `System`."""
         return dataclasses.replace(self, **changes)
 
     def to_dict(self) -> dict[str, Any]:
@@ -211,7 +211,7 @@ class System:
 
     @classmethod
     def from_dict(cls, data: Any) -> System:
-        """The system that `to_dict` described; unknown or missing keys are errors that name them."""
+        """The system that `to_dict` described by `data`; unknown or missing keys are errors that name them."""
         names = tuple(field.name for field in dataclasses.fields(cls))
         known = dict(checks.known_keys("system", data, names))
         missing = [name for name in names if name not in known and name != "start"]
@@ -223,7 +223,7 @@ class System:
 
     @classmethod
     def preset(cls, name: str) -> System:
-        """An instrument by its name in `mars_lidar.instrument.presets.INSTRUMENTS`, with its laser and time bins.
+        """An instrument by its `name` in `mars_lidar.instrument.presets.INSTRUMENTS`, with its laser and time bins.
 
         Where each value is from, or that it is an assumption, stands in docs/detectors.md and in the file that
         ``mars-lidar init --preset NAME`` writes. ValueError for one that is a detector alone (`Detector.preset`).
@@ -242,7 +242,7 @@ class System:
     @classmethod
     @checked
     def from_json(cls, text: str) -> System:
-        """The system that `to_json` wrote."""
+        """The system that `to_json` wrote as `text`."""
         try:
             document = json.loads(text)
         except ValueError as error:
@@ -251,7 +251,7 @@ class System:
 
     @checked
     def save(self, path: str | Path) -> None:
-        """Write to a ``.json``, ``.yaml`` or ``.yml`` file."""
+        """Write to a ``.json``, ``.yaml`` or ``.yml`` file `path`."""
         target = Path(path)
         if target.suffix == ".json":
             target.write_text(json.dumps(self.to_dict(), indent=2) + "\n")
@@ -265,7 +265,7 @@ class System:
     @classmethod
     @checked
     def load(cls, path: str | Path) -> System:
-        """Read what `save` wrote; an error names the file, the line and the key."""
+        """Read the file `path` that `save` wrote; an error names the file, the line and the key."""
         source = Path(path)
         if source.suffix not in (".json", ".yaml", ".yml"):
             raise ValueError(f"path must end in .json, .yaml or .yml, got {str(path)!r}")

@@ -10,7 +10,23 @@ from mars_lidar.instrument.pulse import FWHM_PER_SIGMA, GaussianPulse, Pulse
 
 
 class UnitWarning(UserWarning):
-    """A possible value that is likely meant in another unit."""
+    """A possible value that is likely meant in another unit.
+
+    See Also
+    --------
+    System
+
+    Examples
+    --------
+    >>> import warnings
+    >>> import mars_lidar as ml
+    >>> pulse, detector = ml.GaussianPulse(sigma_ns=500.0), ml.Detector(dead_time_ns=75.0)  # sigma was meant in ps
+    >>> with warnings.catch_warnings(record=True) as caught:
+    ...     warnings.simplefilter("always")
+    ...     system = ml.System(period_ns=1000.0, cycles=10, bins=64, pulse=pulse, detector=detector)
+    >>> {warning.category.__name__ for warning in caught}
+    {'UnitWarning'}
+    """
 
 
 # time from which a value is unusual, in ns and in laser periods; and from which it is meant as it is, in ns

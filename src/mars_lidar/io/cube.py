@@ -370,13 +370,18 @@ def _opened(store: OpenedStore, source: Path, allow_incomplete: bool, url: str =
         if histogram is None:
             raise ValueError(f"{url or source} has no variable 'histogram': its writing stopped at the very start")
         recipe = layout.recipe_from(store.attrs, store.arrays, int(histogram.shape[0]))
+        if tuple(histogram.shape) != recipe.shape or histogram.dtype != recipe.dtype:
+            raise ValueError(
+                f"{url or source} is damaged: its histogram must be {recipe.dtype} {recipe.shape}, "
+                f"got {histogram.dtype} {tuple(histogram.shape)}"
+            )
         total = store.attrs.get("registrations")
         return Cube.of(
             histogram,
             recipe,
             complete=complete,
             registrations=None if total is None else int(total),
-            version=str(store.attrs["version"]),
+            version=store.attrs["version"],
             path=None if url else source,
             url=url,
             progress=store.progress,

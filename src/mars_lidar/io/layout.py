@@ -155,12 +155,15 @@ def recipe_from(attrs: Mapping[str, Any], arrays: Mapping[str, Any], realization
     def read(name: str) -> NDArray[Any]:
         return values(arrays[name])
 
+    for name in ("system", "engine", "source", "version"):
+        if not isinstance(attrs[name], str):
+            raise ValueError(f"the attribute {name} must be a text, got {attrs[name]!r}: it is damaged")
     if attrs["engine"] == MEASURED:
         return Recording(
             system=System.from_json(attrs["system"]),
             pixels=(len(read("y")), len(read("x"))),
             realizations=realizations,
-            source=str(attrs["source"]),
+            source=attrs["source"],
         )
     flux: Flux
     system = System.from_json(attrs["system"])
@@ -182,20 +185,31 @@ def recipe_from(attrs: Mapping[str, Any], arrays: Mapping[str, Any], realization
     recipe = Recipe(
         system=system,
         flux=flux,
-        engine=str(attrs["engine"]),
+        engine=attrs["engine"],
         seed=int(attrs["seed"]),
         realizations=realizations,
         first_realization=int(attrs["first_realization"]),
         pixel_index=read("pixel_index").ravel() if "pixel_index" in arrays else None,
         depth_m=read("depth"),
         reflectivity=read("reflectivity") if "reflectivity" in arrays else None,
-        source=str(attrs["source"]),
+        source=attrs["source"],
         settings=json.loads(attrs.get("engine_settings", "{}")),
     )
-    for told in variables(recipe):
-        if told.dims == (told.name,) and told.name in arrays and not np.array_equal(read(told.name), told.data):
-            raise ValueError(f"the coordinate {told.name} is not that of its system and flux: it is damaged")
+    for variable in variables(recipe):
+        if variable.name in arrays:
+            _check_variable(variable, arrays[variable.name])
     return recipe
+
+
+def _check_variable(expected: Variable, stored: Any) -> None:
+    """Raise ValueError unless the file has the variable as `variables` gives it for the recipe that was read of it."""
+    name, shape, dtype = expected.name, tuple(expected.data.shape), np.dtype(expected.data.dtype)
+    if tuple(stored.shape) != shape or stored.dtype != dtype:
+        raise ValueError(f"{name} must be {dtype} {shape}, got {stored.dtype} {tuple(stored.shape)}: it is damaged")
+    if expected.dims == (name,) and not np.array_equal(values(stored), expected.data):
+        raise ValueError(f"the coordinate {name} is not that of its system and flux: it is damaged")
+    if name in ("depth", "reflectivity") and np.isinf(expected.data).any():
+        raise ValueError(f"{name} must be finite, or NaN where there is no return, got inf: it is damaged")
 
 
 def check_format(path: Path, attrs: Mapping[str, Any]) -> None:

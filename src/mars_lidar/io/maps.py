@@ -133,6 +133,21 @@ def _check(found: Mapping[str, NDArray[Any]], attrs: Mapping[str, Any]) -> None:
     if missing:
         raise ValueError(f"has no variable {missing[0]!r}")
     shape = tuple(found[dim].size for dim in DIMS)
+    for dim, size in zip(DIMS[1:], shape[1:], strict=True):
+        if not (found[dim].dtype.kind in "iu" and np.array_equal(found[dim], np.arange(size))):
+            raise ValueError(f"the coordinate {dim} must be 0 to {size - 1}, got {found[dim].dtype} {found[dim].shape}")
+    methods = found["method"]
+    if methods.ndim != 1 or methods.dtype.kind not in "UT" or len(set(methods.tolist())) != len(methods):
+        raise ValueError(f"method must be names, each once, got {methods.dtype} {methods.shape}")
+    levels = json.loads(attrs["level"])
+    if not isinstance(levels, dict) or {*levels} != {*methods.tolist()}:
+        raise ValueError(f"the attribute level must have a number for each method, got {attrs['level']!r}")
+    for method, level in levels.items():
+        if not isinstance(level, int | float) or isinstance(level, bool) or level < 0.0:
+            raise ValueError(f"the level of {method} must be a number >= 0, got {level!r}")
+    for name in ("source", "version"):
+        if not isinstance(attrs[name], str):
+            raise ValueError(f"the attribute {name} must be a text, got {attrs[name]!r}")
     for name in (*_VARIABLES, *_OF_RETURNS):
         values = found.get(name)
         if name in _OF_RETURNS and values is not None:

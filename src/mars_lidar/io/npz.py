@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar._base.files import UnchangedFile, beside, npy_header, open_npz
+from mars_lidar._base.files import FileError, UnchangedFile, beside, npy_header, open_npz
 from mars_lidar._base.memory import check_memory
 from mars_lidar.io import layout
 from mars_lidar.io.recipe import BLOCK_BYTES, Recipe, Recording
@@ -78,11 +78,12 @@ def open_store(path: Path, check: layout.Check = layout.check_format) -> OpenedS
         check(path, attrs)
         arrays: dict[str, Any] = {name: found[name] for name in found.files if name not in ("attributes", "histogram")}
         if "histogram" in found.files:
-            arrays["histogram"] = OnDisk(_counts(opened), path)
+            arrays["histogram"] = OnDisk(_counts(opened, attrs.get("registrations")), path)
     return OpenedStore(attrs, arrays)
 
 
-def _counts(opened: UnchangedFile) -> LazyCounts:
+def _counts(opened: UnchangedFile, registrations: int | None) -> LazyCounts:
+    """The counts of an archive, which must add up to what its attribute says."""
     name = "histogram.npy"
     with zipfile.ZipFile(opened.path) as found, found.open(name) as member:
         shape, dtype, _ = npy_header(member)
@@ -91,6 +92,9 @@ def _counts(opened: UnchangedFile) -> LazyCounts:
         size = math.prod(shape) * dtype.itemsize
         check_memory(size, f"the counts of {opened.path}", "a .zarr or .h5 is read in parts")
         with opened.unchanged() as path, zipfile.ZipFile(path) as found, found.open(name) as member:
-            return np.asarray(np.lib.format.read_array(member, allow_pickle=False))
+            counts = np.asarray(np.lib.format.read_array(member, allow_pickle=False))
+        if registrations is not None and counts.sum(dtype=np.uint64) != registrations:
+            raise FileError(f"{opened.path} is damaged: its counts are not the {registrations:,} that it says")
+        return counts
 
     return LazyCounts(shape, dtype, read)

@@ -11,7 +11,7 @@ from pathlib import Path
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.files import check_claim, reading
-from mars_lidar._base.progress import shown
+from mars_lidar._base.progress import callback_of
 from mars_lidar._base.types import Progress
 from mars_lidar.io.rgbd import middlebury, nyu
 from mars_lidar.scene.scene import Scene
@@ -117,7 +117,7 @@ def scan(
         raise ValueError(f"image must be two texts that go with a pattern, got {image!r}")
     if pattern is not None and manifest is not None:
         raise ValueError("scenes come from a pattern or from a manifest, got both")
-    progress = shown(progress, "reading")
+    progress = callback_of(progress, "reading")
     problems: list[Problem] = []
     if manifest is None and pattern is None and (root / MANIFEST).is_file():
         manifest = root / MANIFEST

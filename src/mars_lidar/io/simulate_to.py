@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import manifest
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.progress import of_part, shown
+from mars_lidar._base.progress import callback_of, of_part
 from mars_lidar._base.types import Progress
 from mars_lidar.engines import EngineOptions, find_engine
 from mars_lidar.engines.options import given
@@ -113,7 +113,7 @@ def simulate_to(
     WriteError, Interrupted
         Stopped half way. A Zarr store is left marked incomplete; the other formats leave nothing.
     """
-    progress = shown(progress, "simulating")
+    progress = callback_of(progress, "simulating")
     drawn_by = find_engine(engine, **options)
     recipe = Recipe(
         system=system,
@@ -208,7 +208,7 @@ def verify(
     A cube that was made with a table needs that `table`; another one is refused. Of a Zarr store every byte is compared
     with its manifest as well.
     """
-    progress = shown(progress, "verifying")
+    progress = callback_of(progress, "verifying")
     recipe = _repeatable(cube.simulation("simulating again"), table)
     if cube.path is not None and cube.path.suffix == ".zarr" and manifest.damage(cube.path):
         return False

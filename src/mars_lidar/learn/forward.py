@@ -50,8 +50,38 @@ def bin_photons(
     ----------
     signal, background, delay_ns
         Tensors (...) of one floating type and device that broadcast: S and B photons per period, delay in ns.
+    system
+        Laser, detector and histogram.
     refine
         Parts that each bin is cut into.
+
+    Returns
+    -------
+    torch.Tensor
+        (..., bins x refine) photons per period.
+
+    Raises
+    ------
+    TypeError
+        Light that is no floating tensor, or of half precision; no `System`.
+    ValueError
+        Negative photons, a delay that is not finite, shapes that do not broadcast, `refine` out of range.
+
+    See Also
+    --------
+    expected_histogram, mars_lidar.statistics.photons_per_bin
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> import torch
+    >>> photons = ml.learn.bin_photons(torch.tensor(1.0), torch.tensor(0.5), torch.tensor(40.0), system)
+    >>> tuple(photons.shape), round(float(photons.sum()), 4)  # S + B
+    ((128,), 1.5)
     """
     signal, background, delay_ns = inputs(signal, background, delay_ns)
     return photons_in(signal, background, delay_ns, system, checks.integer("refine", refine, low=1, high=2**16))
@@ -468,18 +498,41 @@ def expected_histogram(
     refine
         Parts that each bin is cut into for the solution; None: four to a sigma of the pulse (1 for a measured pulse).
 
+    Returns
+    -------
+    torch.Tensor
+        (..., bins) registrations in `System.cycles` periods.
+
     Raises
     ------
-    ValueError, TypeError
+    TypeError, ValueError
         Bad arguments; a detector that this form does not describe; forward mode within forward mode, of which PyTorch
         drops a part without a word: take ``jacfwd(jacrev(f))``, which is ``hessian(f)``.
     ConvergenceError
         Where the equation is not solved to 1e-9.
 
+    See Also
+    --------
+    HistogramTable, histogram_log_likelihood, mars_lidar.statistics.mean_histogram
+
     Notes
     -----
     O(bins) a pixel, in double precision, on the CPU or a GPU (`mars_lidar.learn.forward`). At less cost and to
     the accuracy of a table: `HistogramTable`.
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> import torch
+    >>> signal, background, delay_ns = (torch.tensor(x, requires_grad=True) for x in (1.0, 1.0, 40.0))
+    >>> mean = ml.learn.expected_histogram(signal, background, delay_ns, system)
+    >>> mean.sum().backward()
+    >>> round(mean.sum().item()), round(signal.grad.item())  # registrations, and the change with a photon of signal
+    (815, 167)
     """
     check_detector(system, light=True)
     _refuse_nested_forward()
@@ -588,11 +641,47 @@ def _summed(fine: torch.Tensor, parts: int) -> torch.Tensor:
 
 @checked
 def armed_periods(histogram: torch.Tensor, system: System) -> torch.Tensor:
-    """Periods D (..., bins) in which the pixel was armed in each bin, estimated from its histogram (..., bins).
+    """Periods in which the pixel was armed in each bin, estimated from its histogram.
 
     ``N_r`` less the registrations whose dead time covers the bin (Gupta et al., ICCV 2019); a registration in the bin
     and a re-arming count half. What the dead time covers after the end of the exposure is taken for its beginning,
     where the pixel was armed (or blind from before): D is at most t_d / t_r + 1 periods off, whatever the exposure.
+
+    Parameters
+    ----------
+    histogram
+        (..., bins) counts.
+    system
+        How they were recorded: non-paralyzable, without gate.
+
+    Returns
+    -------
+    torch.Tensor
+        (..., bins) periods D.
+
+    Raises
+    ------
+    TypeError
+        Counts that are no tensor; no `System`.
+    ValueError
+        Another number of bins; a detector that this form does not describe.
+
+    See Also
+    --------
+    histogram_log_likelihood, mars_lidar.reconstruction.generalised_coates_rates
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> import torch
+    >>> counts = torch.from_numpy(ml.simulate(ml.Flux(1.0, 1.0, 40.0), system, seed=0)[0, 0, 0].astype("float64"))
+    >>> armed = ml.learn.armed_periods(counts, system)
+    >>> tuple(armed.shape), bool((armed < 1000).all())
+    ((128,), True)
     """
     check_detector(system, light=True)
     histogram = _counts(histogram, system)
@@ -628,6 +717,22 @@ def histogram_log_likelihood(
     system
         Non-paralyzable, without gate, or effects beyond detection efficiency and dark counts.
 
+    Returns
+    -------
+    torch.Tensor
+        (...) log likelihoods.
+
+    Raises
+    ------
+    TypeError
+        Counts or light that are no tensors of a suitable type; no `System`.
+    ValueError
+        Another number of bins, negative counts, no background; a detector that this form does not describe.
+
+    See Also
+    --------
+    expected_histogram, armed_periods, mars_lidar.reconstruction.log_likelihood
+
     Notes
     -----
     Unbiased to 0.1 of the Cramer-Rao bound's standard deviation at 1000 cycles, for bins of up to 3 widths (sigma) of
@@ -636,6 +741,20 @@ def histogram_log_likelihood(
     passes of the pulse ends without registration in an exposure that began armed: 0.3 to 0.7. Cost: O(bins) for
     bins below a third of the pulse's width; wider bins are cut into parts of a third of it, of an eighth where
     dead time re-arms the pixel within the pulse.
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> import torch
+    >>> counts = torch.from_numpy(ml.simulate(ml.Flux(1.0, 1.0, 40.0), system, seed=0)[0, 0, 0].astype("int64"))
+    >>> delay_ns = torch.tensor([38.0, 40.0])
+    >>> value = ml.learn.histogram_log_likelihood(counts, torch.tensor(1.0), torch.tensor(1.0), delay_ns, system)
+    >>> bool(value[1] > value[0])
+    True
     """
     histogram = _counts(histogram, system)
     check_detector(system, light=True)
@@ -683,7 +802,7 @@ def _passed(
         share = mean / mean.sum(-1, keepdim=True).clamp_min(1e-300) if parts > 1 else 1.0
         fine = (counts.unsqueeze(-1) * share).flatten(-2) if parts > 1 else counts
         blind, late, rearmed = _rearmings(fine, delay, system)
-        late, rearmed = (one.reshape(*one.shape[:-1], system.bins, parts) for one in (late, rearmed))
+        late, rearmed = (x.reshape(*x.shape[:-1], system.bins, parts) for x in (late, rearmed))
         within = rearmed.sum(-1)
         start = torch.maximum(system.cycles - blind[..., ::parts], (counts - within).clamp_min(0.0))
         armed, means = start, []

@@ -19,7 +19,31 @@ from mars_lidar.instrument.system import System
 
 @dataclass(frozen=True)
 class Uniform:
-    """Any number in [low, high], all equally likely."""
+    """Any number in [low, high], all equally likely.
+
+    Parameters
+    ----------
+    low, high
+        Ends of the range, in the unit of what is drawn.
+
+    Raises
+    ------
+    TypeError
+        An end that is no number.
+    ValueError
+        An end that is not finite, or `low` above `high`.
+
+    See Also
+    --------
+    LogUniform, Choice, SystemRange, CubeStream
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from mars_lidar.learn import Uniform
+    >>> 20.0 <= Uniform(20.0, 100.0).draw(np.random.default_rng(0)) <= 100.0
+    True
+    """
 
     low: float
     high: float
@@ -34,7 +58,7 @@ class Uniform:
             raise ValueError(f"low must be at most high, got {self.low:g} and {self.high:g}")
 
     def draw(self, random: np.random.Generator) -> float:
-        """One number."""
+        """One number, by the generator `random`."""
         return float(random.uniform(self.low, self.high))
 
     @property
@@ -45,19 +69,67 @@ class Uniform:
 
 @dataclass(frozen=True)
 class LogUniform(Uniform):
-    """A positive number in [low, high] whose logarithm is uniform: every factor of two is equally likely."""
+    """A positive number in [low, high] whose logarithm is uniform: every factor of two is equally likely.
+
+    Parameters
+    ----------
+    low, high
+        Ends of the range, > 0, in the unit of what is drawn.
+
+    Raises
+    ------
+    TypeError
+        An end that is no number.
+    ValueError
+        An end that is not finite and > 0, or `low` above `high`.
+
+    See Also
+    --------
+    Uniform, Choice, SystemRange, CubeStream
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from mars_lidar.learn import LogUniform
+    >>> 0.01 <= LogUniform(0.01, 1.0).draw(np.random.default_rng(0)) <= 1.0
+    True
+    """
 
     _positive: ClassVar[bool] = True
 
     def draw(self, random: np.random.Generator) -> float:
-        """One number."""
+        """One number, by the generator `random`."""
         drawn = math.exp(random.uniform(math.log(self.low), math.log(self.high)))
         return min(max(drawn, self.low), self.high)  # the rounding of exp stays inside
 
 
 @dataclass(frozen=True)
 class Choice:
-    """Uniform distribution over a list of numbers."""
+    """Uniform distribution over a list of numbers.
+
+    Parameters
+    ----------
+    values
+        The numbers, at least one, in the unit of what is drawn.
+
+    Raises
+    ------
+    TypeError
+        No list of numbers, or an empty one.
+    ValueError
+        A number that is NaN.
+
+    See Also
+    --------
+    Uniform, LogUniform, SystemRange, CubeStream
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from mars_lidar.learn import Choice
+    >>> Choice((50.0, 75.0)).draw(np.random.default_rng(0)) in (50.0, 75.0)
+    True
+    """
 
     values: tuple[float, ...]
 
@@ -67,7 +139,7 @@ class Choice:
         object.__setattr__(self, "values", tuple(_number("values", number) for number in self.values))
 
     def draw(self, random: np.random.Generator) -> float:
-        """One of them."""
+        """One of them, by the generator `random`."""
         return self.values[int(random.integers(len(self.values)))]
 
     @property
@@ -111,8 +183,26 @@ class SystemRange:
 
     Raises
     ------
+    TypeError
+        A base that is no `System`; a setting that is neither a number nor a range.
     ValueError
         A setting that makes no instrument: all ends of the ranges are tried in all combinations.
+
+    See Also
+    --------
+    CubeStream, LogUniform
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import mars_lidar as ml
+    >>> base = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> systems = ml.learn.SystemRange(base=base, dead_time_ns=ml.learn.LogUniform(20, 100))
+    >>> 20.0 <= systems.draw(np.random.default_rng(0)).detector.dead_time_ns <= 100.0
+    True
     """
 
     base: System
@@ -134,7 +224,7 @@ class SystemRange:
         self.corners()
 
     def draw(self, random: np.random.Generator) -> System:
-        """One instrument."""
+        """One instrument, by the generator `random`."""
         return self._system({name: given.draw(random) for name, given in self._ranges().items()})
 
     def corners(self) -> list[System]:

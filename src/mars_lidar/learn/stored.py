@@ -92,6 +92,25 @@ class StoredDataset(torch.utils.data.IterableDataset[dict[str, Any]]):
     ValueError, TypeError
         A bad argument; a dataset that is incomplete or none; stores that do not go together; fewer exposures than ranks
         with ``uneven="drop"``.
+
+    See Also
+    --------
+    CubeStream, mars_lidar.generate
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import mars_lidar as ml
+    >>> system = {
+    ...     "period_ns": 100.0, "cycles": 200, "bins": 64,
+    ...     "pulse": {"kind": "gaussian", "sigma_ns": 1.0}, "detector": {"dead_time_ns": 75.0},
+    ... }
+    >>> recipe = {"scenes": {"example": "room", "size": [8, 12]}, "systems": system, "light": {"signal": [0.1, 1.0]}}
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     done = ml.generate(recipe, f"{folder}/set.zarr")
+    ...     batch = next(iter(ml.learn.StoredDataset(done.path, batch_size=2)))
+    >>> tuple(batch["counts"].shape)  # (B, bins, H, W)
+    (2, 64, 8, 12)
     """
 
     def __init__(
@@ -170,7 +189,7 @@ class StoredDataset(torch.utils.data.IterableDataset[dict[str, Any]]):
         return self._passes.first[0] + max(self._passes.begun - 1, 0)
 
     def set_epoch(self, epoch: int) -> None:
-        """Choose the order of the next pass, as with `DistributedSampler`; without it each pass is the next epoch."""
+        """Choose the order of the next pass: `epoch`, as with `DistributedSampler`; without it the next one."""
         self._begin_at(checks.integer("epoch", epoch, low=0, high=2**62), 0, 0)
 
     def _begin_at(self, epoch: int, start: int, workers: int) -> None:
@@ -209,7 +228,7 @@ class StoredDataset(torch.utils.data.IterableDataset[dict[str, Any]]):
         return {"seed": self._seed, "epoch": self.epoch, "start": min(start + given, len(self)), "workers": first}
 
     def load_state_dict(self, state: Mapping[str, int]) -> None:
-        """Go on where `state_dict` was taken, with any number of workers; the other settings must be the same.
+        """Go on where `state_dict` gave `state`, with any number of workers; the other settings must be the same.
 
         A pass that was at its end then gives nothing more, and the next one is the next epoch.
         """

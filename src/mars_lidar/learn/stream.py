@@ -419,6 +419,23 @@ class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
     ------
     ValueError, TypeError
         A bad argument, or settings that make no instrument at an end of their range.
+
+    See Also
+    --------
+    StoredDataset, SystemRange, mars_lidar.simulate
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> stream = ml.learn.CubeStream(system, "room", size=16, batch_size=2, signal=0.5, sbr=2.0, epoch_size=4, seed=1)
+    >>> for batch in stream:
+    ...     print(tuple(batch["counts"].shape), tuple(batch["depth"].shape))
+    (2, 128, 16, 16) (2, 16, 16)
+    (2, 128, 16, 16) (2, 16, 16)
     """
 
     def __init__(
@@ -488,7 +505,7 @@ class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
         return f"CubeStream({given}, seed={self._recipe.seed}, epoch {self.epoch})"
 
     def set_epoch(self, epoch: int, start: int = 0) -> None:
-        """Choose the epoch of the next pass, and its first sample: the one before which an earlier run stopped.
+        """Choose the `epoch` of the next pass and its first sample `start`, before which an earlier run stopped.
 
         Without it the first pass is epoch 0 and each gives the next one; with ``repeat=True`` all give the same. After
         n batches a loader has given samples up to ``n * batch_size * world_size``; from there the batches of the rest
@@ -535,7 +552,7 @@ class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
         return state | {"start": min(start, self._end)}
 
     def load_state_dict(self, state: dict[str, int]) -> None:
-        """Go on where `state_dict` was taken; the settings must be the same.
+        """Go on where `state_dict` gave `state`; the settings must be the same.
 
         A pass that was at its end then gives nothing more, and the one after it is the next epoch.
         """
@@ -554,7 +571,7 @@ class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
             self.set_epoch(state["epoch"], state["start"])
 
     def sample(self, index: int) -> Sample:
-        """Scene, Flux, System and seed of a sample of this epoch, not simulated."""
+        """Scene, Flux, System and seed of sample `index` of this epoch, not simulated."""
         return self._recipe.sample(self.epoch, checks.integer("index", index, low=0, high=self._end - 1))
 
     def __len__(self) -> int:

@@ -42,10 +42,30 @@ class HistogramTable(torch.nn.Module):
     TypeError, ValueError
         No table; one that does not hold for `cycles`; another detector. `forward`: pixels outside of the table.
 
+    See Also
+    --------
+    expected_histogram, mars_lidar.Table
+
     Notes
     -----
     A module: ``.to("cuda")`` moves the table, ``.double()`` evaluates in double precision (float32 otherwise). It holds
     ``4 x nodes x bins`` bytes of histograms; a gradient needs some tens of MB besides.
+
+    Examples
+    --------
+    >>> import torch
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=64,
+    ...     pulse=ml.GaussianPulse(sigma_ns=2.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> table = ml.Table.build(system, signal=(0.1, 2.0, 6), background=(0.1, 1.0, 4), tolerance=1e-3)
+    >>> model = ml.learn.HistogramTable(table)
+    >>> signal, background, delay_ns = (torch.tensor([x], requires_grad=True) for x in (0.5, 0.5, 30.0))
+    >>> mean = model(signal, background, delay_ns)
+    >>> mean.sum().backward()
+    >>> tuple(mean.shape), bool(signal.grad > 0)
+    ((1, 64), True)
     """
 
     def __init__(self, table: Table, *, cycles: int | None = None) -> None:
@@ -61,7 +81,7 @@ class HistogramTable(torch.nn.Module):
             if len(axis) < 2:
                 raise ValueError(f"table must have at least two values of {name}, got one")
         s, b = torch.cartesian_prod(*axes).unbind(-1)
-        mean = table.lookup(s.numpy(), b.numpy(), interpolation="nearest", cycles=system.cycles).cumulants[:, :1]
+        mean = table.at(s.numpy(), b.numpy(), interpolation="nearest", cycles=system.cycles).cumulants[:, :1]
         self.system = system
         self.signal: torch.Tensor
         self.background: torch.Tensor
@@ -71,7 +91,13 @@ class HistogramTable(torch.nn.Module):
         self.register_buffer("histograms", torch.from_numpy((mean * table.shapes(system.cycles)).astype("float32")))
 
     def forward(self, signal: torch.Tensor, background: torch.Tensor, delay_ns: torch.Tensor) -> torch.Tensor:
-        """Expected registrations (..., bins), in the type of `signal`; arguments as for `bin_photons`."""
+        """Expected registrations (..., bins), in the type of `signal`; light as for `bin_photons`.
+
+        Parameters
+        ----------
+        signal, background, delay_ns
+            Tensors (...) within the table's range, as for `bin_photons`.
+        """
         given = inputs(signal, background, delay_ns)
         for name, values, axis in zip(("signal", "background"), given, (self.signal, self.background), strict=False):
             low, high = float(axis[0]), float(axis[-1])

@@ -133,6 +133,14 @@ class Flux:
     info
         What made this flux, for the record (scene radiometry puts its achieved means here).
 
+    Raises
+    ------
+    TypeError
+        Light that is no array of real numbers.
+    ValueError
+        Negative or infinite photons, delays that are not finite where there is signal, shapes that do not broadcast,
+        more than 16 returns, or a waveform beside signal or delay.
+
     See Also
     --------
     Scene, simulate, count_law, System
@@ -214,7 +222,7 @@ class Flux:
     def from_transient(
         cls, values: ArrayLike, system: System, *, bin_ns: float, start_ns: float = 0.0, **level: Any
     ) -> Flux:
-        """The flux of a rendered transient (H, W, T): light in bins of `bin_ns` from the time `start_ns`.
+        """The flux of a rendered transient: light `values` (H, W, T) in bins of `bin_ns` from the time `start_ns`.
 
         `level` takes the arguments of `mars_lidar.io.Transient.flux`: ``signal`` or ``photons_per_unit``, and
         ``sbr``, ``dark_count_hz``, ``pulse``, ``parts``. Files are read by `mars_lidar.io.read_transient`.
@@ -237,7 +245,7 @@ class Flux:
         return self._scaled(share, dark)
 
     def delay_periods(self, period_ns: float) -> FloatArray:
-        """Delays of the returns (K, pixels) within the period, in periods: [0, 1); 0 where there is no return."""
+        """Delays of the returns (K, pixels) in periods of `period_ns`, in [0, 1); 0 where there is no return."""
         pixels = self.background.size
         delay = np.ascontiguousarray(self.returns_delay_ns.reshape(-1, pixels)) / period_ns
         return np.nan_to_num(delay - np.floor(delay), nan=0.0)
@@ -345,7 +353,7 @@ class Flux:
         return part
 
     def pixels(self, numbers: IndexArray) -> Flux:
-        """Some pixels (N,) by their numbers, which count row by row."""
+        """Some pixels (N,) by their `numbers`, which count row by row."""
         number, every = len(self.returns_signal), self.background.size
         signal, delay = (a.reshape(number, every)[:, numbers] for a in (self.returns_signal, self.returns_delay_ns))
         wave = None if self.waveform is None else self.waveform.reshape(every, -1)[numbers]

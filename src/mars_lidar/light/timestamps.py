@@ -40,6 +40,8 @@ class Timestamps:
         Bins of the histogram.
     period_ns, cycles
         Laser period, ns, and laser periods of the exposure.
+    dtype
+        Of a histogram of them, uint16 or uint32.
     info
         Where they come from: ``system`` (as `System.to_dict` gives it), ``engine``, ``seed``, ``realization``,
         ``source``, ``unit_ns`` (resolution of the clock that recorded them), as far as they are known.
@@ -76,9 +78,9 @@ class Timestamps:
         for name, kind in (("times_ns", "f"), ("cycle", "iu"), ("bin", "iu"), ("offsets", "iu")):
             array = checks.unmasked(name, getattr(self, name))
             if not isinstance(array, np.ndarray) or array.ndim != 1 or array.dtype.kind not in kind:
-                told = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else type(array).__name__
+                given = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else type(array).__name__
                 numbers = "real numbers" if kind == "f" else "integers"
-                raise TypeError(f"{name} must be a NumPy array (n,) of {numbers}, got {told}")
+                raise TypeError(f"{name} must be a NumPy array (n,) of {numbers}, got {given}")
         height, width = self.shape
         offsets, number = self.offsets, self.times_ns.size
         if offsets.size != height * width + 1 or offsets[0] != 0 or (np.diff(offsets) < 0).any():
@@ -106,8 +108,8 @@ class Timestamps:
     @property
     def system(self) -> System | None:
         """Laser, detector and histogram, or None where they are not known (a measured stream)."""
-        told = self.info.get("system")
-        return None if told is None else System.from_dict(told)
+        stored = self.info.get("system")
+        return None if stored is None else System.from_dict(stored)
 
     def _repr_html_(self) -> str:
         return as_html(self, {"photons": np.diff(self.offsets).reshape(self.shape)})
@@ -169,7 +171,7 @@ class Timestamps:
         return loaded
 
     def pixel(self, y: int, x: int) -> Timestamps:
-        """The registrations of one pixel, as views."""
+        """The registrations of the pixel in row `y` and column `x`, as views."""
         k = self._place(y, x)
         part = slice(self.offsets[k], self.offsets[k + 1])
         offsets = np.array([0, self.offsets[k + 1] - self.offsets[k]], np.int64)
@@ -265,7 +267,7 @@ class DrawnTimestamps(Timestamps):
         k = self._place(y, x)
         part = slice(self.offsets[k], self.offsets[k + 1])
         offsets = np.array([0, self.offsets[k + 1] - self.offsets[k]], np.int64)
-        one = self.of(
+        pixel = self.of(
             self.cycle[part],
             self.phase[part],
             offsets,
@@ -276,5 +278,5 @@ class DrawnTimestamps(Timestamps):
             self.cycles,
             self.info,
         )
-        vars(one).update({name: vars(self)[name][part] for name in ("times_ns", "bin") if name in vars(self)})
-        return one
+        vars(pixel).update({name: vars(self)[name][part] for name in ("times_ns", "bin") if name in vars(self)})
+        return pixel

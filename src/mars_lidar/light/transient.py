@@ -300,7 +300,8 @@ class Transient:
         """Light of some rows (rows, W, T), checked."""
         values = np.asarray(self.values[rows])
         if values.dtype.kind not in "fiu":
-            raise TypeError(f"{self._named}values must be real numbers, got dtype {values.dtype}")
+            error = ValueError if self.source else TypeError  # of a file, or of an argument
+            raise error(f"{self._named}values must be real numbers, got dtype {values.dtype}")
         light = values.astype(np.float64)
         wrong = ~((light >= 0.0) & (light < np.inf))
         if wrong.any():

@@ -56,10 +56,33 @@ def overview(
     title
         Headline; by default a line on the system.
 
+    Returns
+    -------
+    matplotlib.figure.Figure
+        ``figure.savefig(path)`` writes it.
+
     Raises
     ------
+    TypeError
+        No cube, or no array of counts with its system; pixels that are no pairs.
     ValueError
-        `realization` or a pixel outside of the cube.
+        `realization` or a pixel outside of the cube; other than 1 to 6 pixels.
+
+    See Also
+    --------
+    pixel_histogram, map_image
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> flux = ml.Scene.example("room", size=12).flux(system, signal=0.5, sbr=2.0)
+    >>> figure = ml.plot.overview(ml.simulate(flux, system, seed=0), system, flux)
+    >>> len(figure.axes) > 6
+    True
     """
     cube, realization, chosen = _checked(as_cube(cube, system, flux), realization, pixels)
     totals, peaks_m = count_maps(cube, realization)
@@ -114,7 +137,44 @@ def pixel_histogram(
 ) -> Figure:
     """Histogram of one pixel over the period and around its return, beside the incident rate's shape.
 
-    Of a cube, or of counts as `simulate` returns them with their `system` and, where it is known, their `flux`.
+    Parameters
+    ----------
+    cube
+        A cube, or counts as `simulate` returns them.
+    y, x
+        Row and column of the pixel, from 0.
+    system, flux
+        Beside an array of counts: how they were recorded, and the light where it is known.
+    realization
+        Which exposure, counted from the start of the cube.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    TypeError
+        No cube, or no array of counts with its system.
+    ValueError
+        A pixel or a realization outside of the cube.
+
+    See Also
+    --------
+    overview, incident_rate
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> flux = ml.Flux(signal=1.0, background=0.5, delay_ns=40.0)
+    >>> counts = ml.simulate(flux, system, seed=0)
+    >>> figure = ml.plot.pixel_histogram(counts, 0, 0, system=system, flux=flux)
+    >>> [float(size) for size in figure.get_size_inches()]
+    [7.0, 2.5]
     """
     cube = as_cube(cube, system, flux)
     y = checks.integer("y", y, low=0, high=cube.shape[1] - 1)
@@ -130,7 +190,40 @@ def pixel_histogram(
 
 @checked
 def map_image(values: NDArray[Any], label: str, *, cmap: str = "viridis") -> Figure:
-    """A map (H, W) with a colour bar; `label` names the quantity and its unit, NaN is grey."""
+    """A map with a colour bar; NaN is grey.
+
+    Parameters
+    ----------
+    values
+        (H, W) numbers.
+    label
+        Name of the quantity and its unit, for the colour bar.
+    cmap
+        Name of a colour map of matplotlib.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    TypeError
+        Values that are no array of numbers.
+    ValueError
+        Values that are no map (H, W), or a colour map that matplotlib does not have.
+
+    See Also
+    --------
+    overview
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import mars_lidar as ml
+    >>> figure = ml.plot.map_image(np.eye(4), "depth (m)")
+    >>> figure.axes[0].images[0].get_array().shape
+    (4, 4)
+    """
     values = np.asarray(values)
     if values.ndim != 2 or values.size == 0:
         raise ValueError(f"values must be a map (H, W), got shape {values.shape}")
@@ -160,8 +253,8 @@ def _draw_maps(
     if cube.reflectivity is not None:
         _draw_map(axes[1], cube.reflectivity, "reflectivity", "gray", None, "Reflectivity")
     else:
-        shown = cube.flux.signal
-        _draw_map(axes[1], shown, "photons per period", "gray", _limits(shown) if fit else None, f"Signal{fit}")
+        signal = cube.flux.signal
+        _draw_map(axes[1], signal, "photons per period", "gray", _limits(signal) if fit else None, f"Signal{fit}")
     _draw_map(axes[2], totals, "registrations", "magma", _limits(totals), "Total counts")
     note = "Peak-bin depth"
     error = np.abs(depth_error_m(cube, peaks_m))

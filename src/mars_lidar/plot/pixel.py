@@ -51,9 +51,9 @@ def draw_pixel(
     whole.plot(*_steps(edges, expected), color=MUTED, lw=0.8, label="incident rate, same total")
     if predicted is not None:
         whole.plot(*_steps(edges, predicted), color=INK, lw=0.9, label="predicted mean")
-    told = "fitted delay" if cube.engine == MEASURED else "true delay"
+    label = "fitted delay" if cube.engine == MEASURED else "true delay"
     for k, tau in enumerate(delays):
-        whole.axvline(tau, color=MUTED, lw=0.7, ls=(0, (3, 2)), zorder=0, label=told if k == 0 else None)
+        whole.axvline(tau, color=MUTED, lw=0.7, ls=(0, (3, 2)), zorder=0, label=label if k == 0 else None)
     whole.set_xlim(0.0, system.period_ns)
     top = max(float(counts.max()), float(expected.max()), 1.0)
     if top > _LOG_FROM:

@@ -58,8 +58,8 @@ def reconstruction(cube: Cube, results: Mapping[str, Reconstruction], *, realiza
             _draw_map(axes[0, 0], depth, "depth (m)", "viridis", depth_limits, "Truth: depth")
             axes[0, 1].set_axis_off()
             _draw_map(axes[0, 2], truth, unit, "gray", share_limits, f"Truth: {what}")
-        for row, (name, found) in zip(axes[int(known) + len(results) :], several.items(), strict=True):
-            _draw_returns(row, name, found, realization)
+        for row, (name, returns) in zip(axes[int(known) + len(results) :], several.items(), strict=True):
+            _draw_returns(row, name, returns, realization)
         for row, (name, each) in zip(axes[int(known) : int(known) + len(results)], pick.items(), strict=True):
             title = name.replace("_", " ")
             _draw_map(row[0], each["depth"], "depth (m)", "viridis", depth_limits, title)
@@ -70,15 +70,15 @@ def reconstruction(cube: Cube, results: Mapping[str, Reconstruction], *, realiza
                     rmse = _metres(float(np.sqrt(np.nanmean(error**2))))
                     note = f"error: RMSE {rmse}, median {_metres(float(np.nanmedian(np.abs(error))))}"
                 _draw_map(row[1], 1e3 * error, "depth error (mm)", "RdBu_r", (-1e3 * scale, 1e3 * scale), note)
-            own = known and _elsewhere(each["share"], truth)
+            own = known and _needs_own_scale(each["share"], truth)
             limits = _limits(each["share"]) if own else share_limits
             _draw_map(row[-1], each["share"], unit, "gray", limits, f"{what}, a scale of its own" if own else what)
     return figure
 
 
-def _draw_returns(row: Any, name: str, found: Returns, realization: int) -> None:
+def _draw_returns(row: Any, name: str, returns: Returns, realization: int) -> None:
     """Of a method that looked for several: how many, and the nearest and the farthest of those pixels."""
-    count, depth = found.count[realization].astype(np.int64), found.depth_m[realization]
+    count, depth = returns.count[realization].astype(np.int64), returns.depth_m[realization]
     most = depth.shape[-1]
     where = np.where(count > 1, 1.0, np.nan)
     farthest = np.take_along_axis(depth, np.maximum(count, 1)[..., None] - 1, axis=-1)[..., 0]
@@ -90,16 +90,16 @@ def _draw_returns(row: Any, name: str, found: Returns, realization: int) -> None
         _draw_map(row[1], where * depth[..., 0], "depth (m)", "viridis", limits, "nearest of several")
 
 
-def _elsewhere(share: Any, truth: Any) -> bool:
+def _needs_own_scale(share: Any, truth: Any) -> bool:
     """Whether a map would be black or white on the scale of the truth, as of methods that know no dead time."""
     lit = (share > 0) & (truth > 0)
     return bool(lit.any()) and not 0.5 <= float(np.median(share[lit] / truth[lit])) <= 2.0
 
 
-def _maps(found: Reconstruction, what: str, realization: int) -> dict[str, Any]:
-    count = len(found.depth_m)
+def _maps(result: Reconstruction, what: str, realization: int) -> dict[str, Any]:
+    count = len(result.depth_m)
     if not 0 <= realization < count:
         raise ValueError(f"realization must be an integer in [0, {count - 1}], got {realization}")
-    seen = found.seen[realization]
-    depth = np.where(seen, found.depth_m[realization], np.nan)
-    return {"depth": depth, "share": np.where(seen, getattr(found, what)[realization], 0.0)}
+    detected = result.detected[realization]
+    depth = np.where(detected, result.depth_m[realization], np.nan)
+    return {"depth": depth, "share": np.where(detected, getattr(result, what)[realization], 0.0)}

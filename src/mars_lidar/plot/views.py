@@ -6,12 +6,12 @@ from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
 from mars_lidar.instrument.system import System
-from mars_lidar.io.cube import Cube
+from mars_lidar.io.cube import Cube, as_cube
 from mars_lidar.io.layout import MEASURED
 from mars_lidar.io.recipe import Recipe
 from mars_lidar.light.flux import Flux
@@ -25,12 +25,52 @@ _PREDICTED_CYCLES = 20_000  # an exposure whose state never settles costs some 1
 
 
 @checked
-def count_maps(cube: Cube, realization: int = 0) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Total counts (H, W), and the depth (H, W) in m at the largest bin: NaN where nothing was counted.
+def count_maps(
+    cube: Cube | ArrayLike, realization: int = 0, *, system: System | None = None
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Total counts, and the depth at the largest bin.
 
     The depth is that of the bin's centre, with the distance between the pulse's peak and its origin taken
     off; modulo the unambiguous range. The first of several equal bins is taken.
+
+    Parameters
+    ----------
+    cube
+        A cube in memory or on disk, read in bands of rows; or counts as `simulate` returns them.
+    realization
+        Which exposure, counted from the start of the cube.
+    system
+        Beside an array of counts: how they were recorded.
+
+    Returns
+    -------
+    tuple
+        Counts (H, W), and depth (H, W) in m: NaN where nothing was counted.
+
+    Raises
+    ------
+    TypeError
+        No cube, or no array of counts with its system.
+    ValueError
+        A realization outside of the cube.
+
+    See Also
+    --------
+    depth_error_m, overview
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> counts = ml.simulate(ml.Flux(signal=1.0, background=0.1, delay_ns=40.0), system, seed=0)
+    >>> totals, depth_m = ml.plot.count_maps(counts, system=system)
+    >>> totals.shape, abs(float(depth_m[0, 0]) - 6.0) < 0.3
+    ((1, 1), True)
     """
+    cube = as_cube(cube, system)
     realizations, height, width, bins = cube.shape
     realization = checks.integer("realization", realization, low=0, high=realizations - 1)
     totals = np.empty((height, width), np.int64)
@@ -52,6 +92,41 @@ def example_pixels(flux: Flux, depth_m: NDArray[np.float64]) -> dict[str, tuple[
 
     Bright and dim are the 98th and the 5th percentile of the signal among pixels with a return; the edge is
     the steepest step in depth. The rim of the image is left out, where recorded images have their artefacts.
+
+    Parameters
+    ----------
+    flux
+        The light of the image (H, W).
+    depth_m
+        (H, W) depth, m; NaN without a return.
+
+    Returns
+    -------
+    dict
+        Row and column by name.
+
+    Raises
+    ------
+    TypeError
+        No `Flux`, or a depth that is no array of numbers.
+    ValueError
+        A depth of another shape than the flux.
+
+    See Also
+    --------
+    overview
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> scene = ml.Scene.example("room", size=32)
+    >>> flux = scene.flux(system, signal=0.5, sbr=2.0)
+    >>> sorted(ml.plot.example_pixels(flux, scene.depth_m))
+    ['bright', 'dim', 'edge']
     """
     flux = flux.image
     if np.shape(depth_m) != flux.shape:
@@ -104,7 +179,42 @@ def instrument(system: System) -> str:
 
 @checked
 def incident_rate(flux: Flux, system: System, y: int, x: int) -> NDArray[np.float64]:
-    """Photons per period in each bin (bins,) that reach pixel (y, x), before gate and dead time."""
+    """Photons per period in each bin that reach a pixel, before gate and dead time.
+
+    Parameters
+    ----------
+    flux, system
+        The light of the image (H, W), photons per period, and what registers it.
+    y, x
+        Row and column of the pixel, from 0.
+
+    Returns
+    -------
+    NDArray
+        (bins,) expected photons per period.
+
+    Raises
+    ------
+    TypeError
+        No `Flux` or no `System`.
+    ValueError
+        A pixel outside of the image.
+
+    See Also
+    --------
+    pixel_histogram, mars_lidar.statistics.photons_per_bin
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> rate = ml.plot.incident_rate(ml.Flux(1.0, 0.5, 40.0), system, 0, 0)
+    >>> round(float(rate.sum()), 6)  # S + B
+    1.5
+    """
     flux = flux.image
     y, x = (checks.integer(name, k, low=0, high=n - 1) for name, k, n in zip("yx", (y, x), flux.shape, strict=True))
     return photons_per_bin(flux[y, x], system.detected(), bins=system.bins)
@@ -134,8 +244,54 @@ def predicted_counts(cube: Cube, y: int, x: int) -> NDArray[np.float64] | None:
 
 
 @checked
-def depth_error_m(cube: Cube, estimate_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Estimated minus true depth (H, W), m, modulo the unambiguous range; NaN where either is missing."""
+def depth_error_m(
+    cube: Cube | ArrayLike,
+    estimate_m: NDArray[np.float64],
+    *,
+    system: System | None = None,
+    flux: Flux | None = None,
+) -> NDArray[np.float64]:
+    """Estimated minus true depth, modulo the unambiguous range.
+
+    Parameters
+    ----------
+    cube
+        A cube whose true depth is known, or fitted; or counts as `simulate` returns them.
+    estimate_m
+        (H, W) depth, m; NaN where there is none.
+    system, flux
+        Beside an array of counts: how they were recorded, and the light, whose delays are the truth.
+
+    Returns
+    -------
+    NDArray
+        (H, W) difference, m; NaN where either is missing.
+
+    Raises
+    ------
+    TypeError
+        No cube, or no array of counts with its system; estimates that are no array of numbers.
+    ValueError
+        Estimates of another shape than the image.
+
+    See Also
+    --------
+    count_maps
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> flux = ml.Flux(signal=1.0, background=0.1, delay_ns=40.0)
+    >>> counts = ml.simulate(flux, system, seed=0)
+    >>> depth_m = ml.reconstruct(counts, system).depth_m[0]
+    >>> abs(float(ml.plot.depth_error_m(counts, depth_m, system=system, flux=flux)[0, 0])) < 0.05
+    True
+    """
+    cube = as_cube(cube, system, flux)
     if np.shape(estimate_m) != cube.shape[1:3]:
         raise ValueError(f"estimate_m must be {cube.shape[1:3]} as the cube, got shape {np.shape(estimate_m)}")
     return depth_lag_m(cube.system, np.asarray(estimate_m), cube.depth_m)
@@ -166,7 +322,7 @@ def fitted(cube: Cube, realization: int) -> Cube:
             METHODS[name].check(system)
             break
     estimate = reconstruct(counts, system, name)
-    with_return = estimate.seen & np.isfinite(estimate.signal)
+    with_return = estimate.detected & np.isfinite(estimate.signal)
     flux = Flux(
         np.where(with_return, estimate.signal, 0.0),
         np.where(np.isfinite(estimate.background), estimate.background, 0.0),

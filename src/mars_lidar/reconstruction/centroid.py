@@ -33,13 +33,13 @@ class Centroid(Peak):
 
     def estimate(self, histograms: Histograms) -> Estimates:
         """Delay, and signal and background of the window round the peak."""
-        found = super().estimate(histograms)
-        delay = found.delay.copy()
+        estimates = super().estimate(histograms)
+        delay = estimates.delay.copy()
         rows = max(1, _BLOCK // (2 * _reach(histograms.system) + 1))
         for first in range(0, delay.size, rows):
             part = slice(first, first + rows)
-            delay[part] = _centred(histograms, found.background[part], delay[part], first)
-        return replace(found, delay=delay)
+            delay[part] = _centred(histograms, estimates.background[part], delay[part], first)
+        return replace(estimates, delay=delay)
 
 
 def _reach(system: System) -> int:

@@ -21,7 +21,34 @@ from mars_lidar.reconstruction.method import RateMethod
 class Coates(RateMethod):
     """Rates ``l_j = ln[E_j / (E_j - h_j)]``, E_j the armed periods without a registration before bin j (R4, R8).
 
-    `filter` on the rates: as `MatchedFilter`.
+    For detectors of mode ``"synchronous"``.
+
+    Parameters
+    ----------
+    filter
+        On the rates: as for `MatchedFilter`.
+
+    Raises
+    ------
+    ValueError
+        A filter that is none; ``check``: a detector of another mode.
+
+    See Also
+    --------
+    coates_rates, GeneralisedCoates, mars_lidar.reconstruct
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> system = system.replace(detector=ml.Detector(dead_time_ns=75.0, mode="synchronous"))
+    >>> counts = ml.simulate(ml.Flux(1.0, 1.0, 40.0), system, seed=0)
+    >>> maps = ml.reconstruct(counts, system, ml.reconstruction.Coates(filter="linear"))
+    >>> abs(float(maps.delay_ns[0, 0, 0]) - 40.0) < 1.0
+    True
     """
 
     name = "coates"
@@ -31,9 +58,45 @@ class Coates(RateMethod):
 
 @checked
 def coates_rates(cube: ArrayLike, system: System, *, threads: int | None = None) -> FloatArray:
-    """Photons per period in each bin (..., bins) from histograms (..., bins) of a synchronous detector.
+    """Photons per period in each bin from histograms of a synchronous detector.
 
-    Infinite in bins that registered in every remaining armed period.
+    Parameters
+    ----------
+    cube
+        (..., bins) counts.
+    system
+        How they were recorded: mode ``"synchronous"``.
+    threads
+        Threads to run on; default: all processors that this process may use.
+
+    Returns
+    -------
+    NDArray
+        (..., bins) photons per period; infinite in bins that registered in every remaining armed period.
+
+    Raises
+    ------
+    TypeError
+        Counts that are no array of numbers, or no `System`.
+    ValueError
+        Counts that are no whole numbers >= 0, or more than the periods; another mode; effects that this does not undo.
+
+    See Also
+    --------
+    Coates, generalised_coates_rates
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> system = system.replace(detector=ml.Detector(dead_time_ns=75.0, mode="synchronous"))
+    >>> counts = ml.simulate(ml.Flux(1.0, 0.1, 40.0), system, seed=0)
+    >>> rates = ml.reconstruction.coates_rates(counts, system)
+    >>> rates.shape, int(rates[0, 0, 0].argmax())  # the bin of 40 ns
+    ((1, 1, 1, 128), 51)
     """
     return Coates().rates(cube, system, threads)
 
@@ -43,6 +106,32 @@ class GeneralisedCoates(RateMethod):
     """Rates with which every bin registers as often as it did, given when the histogram says the pixel was armed (R8).
 
     `filter` on the rates: as `MatchedFilter`.
+
+    Parameters
+    ----------
+    filter
+        On the rates: as for `MatchedFilter`.
+
+    Raises
+    ------
+    ValueError
+        A filter that is none; ``check``: a detector of another mode.
+
+    See Also
+    --------
+    generalised_coates_rates, Coates, mars_lidar.reconstruct
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> counts = ml.simulate(ml.Flux(1.0, 1.0, 40.0), system, seed=0)
+    >>> maps = ml.reconstruct(counts, system, ml.reconstruction.GeneralisedCoates(filter="linear"))
+    >>> abs(float(maps.delay_ns[0, 0, 0]) - 40.0) < 1.0
+    True
     """
 
     name = "generalised_coates"
@@ -52,9 +141,46 @@ class GeneralisedCoates(RateMethod):
 
 @checked
 def generalised_coates_rates(cube: ArrayLike, system: System, *, threads: int | None = None) -> FloatArray:
-    """Photons per period in each bin (..., bins) from histograms (..., bins) of a free-running detector.
+    """Photons per period in each bin from histograms of a free-running detector.
 
-    Whatever the waveform: no pulse is assumed. Bins that registered whenever they could are infinite. The variance of
-    a bin's rate l is about l^2 / h, h its registrations, and bins are independent of each other.
+    Whatever the waveform: no pulse is assumed. The variance of a bin's rate l is about l^2 / h, h its registrations,
+    and bins are independent of each other.
+
+    Parameters
+    ----------
+    cube
+        (..., bins) counts.
+    system
+        How they were recorded.
+    threads
+        Threads to run on; default: all processors that this process may use.
+
+    Returns
+    -------
+    NDArray
+        (..., bins) photons per period; infinite in bins that registered whenever they could.
+
+    Raises
+    ------
+    TypeError
+        Counts that are no array of numbers, or no `System`.
+    ValueError
+        Counts that are no whole numbers >= 0, or more than the periods allow; a detector that this does not hold for.
+
+    See Also
+    --------
+    GeneralisedCoates, coates_rates, mars_lidar.reconstruct
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> counts = ml.simulate(ml.Flux(1.0, 1.0, 40.0), system, seed=0)
+    >>> rates = ml.reconstruction.generalised_coates_rates(counts, system)
+    >>> rates.shape, round(float(rates.sum()), 1)  # S + B = 2
+    ((1, 1, 1, 128), 1.9)
     """
     return GeneralisedCoates().rates(cube, system, threads)

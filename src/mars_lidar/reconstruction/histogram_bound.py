@@ -33,6 +33,21 @@ class HistogramBound:
     signal, background, delay_ns, depth_m
         (...) least standard deviations of unbiased estimates; inf where nothing is known of them. Of several returns
         (K,), but for the background.
+
+    See Also
+    --------
+    mars_lidar.cramer_rao, returns_bound
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> bound = ml.cramer_rao(ml.Flux(1.0, 1.0, 40.0), system)
+    >>> bound.information.shape, round(float(bound.signal), 2)
+    ((3, 3), 0.05)
     """
 
     information: FloatArray
@@ -62,6 +77,20 @@ def cramer_rao(flux: Flux, system: System, *, threads: int | None = None) -> His
         efficiency and dark counts.
     threads
         As `exposure_moments`.
+
+    Returns
+    -------
+    HistogramBound
+        Standard deviations (...), and the information.
+
+    Raises
+    ------
+    TypeError
+        No `Flux` or no `System`.
+    ValueError
+        Several returns, no background, or a detector that this bound does not hold for.
+    ConvergenceError
+        Naming the cell, where the mean histogram was not reached.
 
     See Also
     --------
@@ -105,6 +134,43 @@ def returns_bound(flux: Flux, system: System, *, threads: int | None = None) -> 
     """Least standard deviations of every return of one pixel that has several, each with an unknown S and delay.
 
     As `cramer_rao`, for the K returns of a pixel (`Flux.multi`): those that overlap are known less well than alone.
+
+    Parameters
+    ----------
+    flux
+        One pixel with K returns and background > 0, as `Flux.multi` makes it.
+    system
+        As for `mars_lidar.cramer_rao`.
+    threads
+        Threads to run on; default: all processors that this process may use.
+
+    Returns
+    -------
+    HistogramBound
+        Standard deviations (K,) of every return, and of the background.
+
+    Raises
+    ------
+    TypeError
+        No `Flux` or no `System`.
+    ValueError
+        Several pixels, no background, or a detector that this bound does not hold for.
+
+    See Also
+    --------
+    mars_lidar.cramer_rao, Returns
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> flux = ml.Flux.multi(ml.Flux(1.0, 0.5, 30.0), ml.Flux(0.5, 0.0, 33.0))
+    >>> bound = ml.reconstruction.returns_bound(flux, system)
+    >>> (1000 * bound.depth_m).round(0)  # mm
+    array([ 9., 21.])
     """
     from mars_lidar.reconstruction.maximum_likelihood import MaximumLikelihood
     from mars_lidar.statistics import mean_histogram
@@ -138,12 +204,12 @@ def _information(
     share: FloatArray,
 ) -> FloatArray:
     """(R18) of (all S, B, all delays) from S (..., K, 1), B (...), and energy and its slope (..., K, bins)."""
-    seen = system.detector.detection_efficiency  # of the photons; dark counts come on top of them
+    efficiency = system.detector.detection_efficiency  # of the photons; dark counts come on top of them
     dark = 1e-9 * system.detector.dark_count_hz * system.period_ns
     flat = share / system.bins
-    rate = seen * (signal * energy).sum(-2) + (seen * background[..., None] + dark) * flat
+    rate = efficiency * (signal * energy).sum(-2) + (efficiency * background[..., None] + dark) * flat
     by_background = np.broadcast_to(flat, rate.shape)[..., None, :]
-    gradient = seen * np.concatenate([energy, by_background, signal * slope], axis=-2)
+    gradient = efficiency * np.concatenate([energy, by_background, signal * slope], axis=-2)
     weight = np.where(rate > 0, mean / np.where(rate > 0, rate, 1.0) ** 2, 0.0)  # E[D] / l = E[h] / l^2
     if system.detector.mode == "synchronous" or system.detector.dead_time_ns >= system.bin_ns:
         x = np.clip(0.5 * rate, 1e-6, 300.0)
@@ -153,10 +219,47 @@ def _information(
 
 @checked
 def window_error(weights: ArrayLike, flux: Flux, system: System) -> tuple[FloatArray, FloatArray]:
-    """Mean and standard deviation (...) of linear estimates ``weights @ h`` (..., bins) under dead time.
+    """Mean and standard deviation of linear estimates ``weights @ h`` under dead time.
 
     Exact, by `joint_law`: bins of one histogram are not independent, so the Poisson error of a window is wrong
     (docs/joint_law.md). For the estimates of signal that `MatchedFilter` and `Peak` take from windows, say.
+
+    Parameters
+    ----------
+    weights
+        (..., bins) real numbers.
+    flux, system
+        The light of one pixel, photons per period, and what registers it.
+
+    Returns
+    -------
+    tuple
+        Mean and standard deviation, each (...).
+
+    Raises
+    ------
+    TypeError
+        No `Flux` or no `System`; weights that are no array of numbers.
+    ValueError
+        Weights of another number of bins; several pixels.
+    ConvergenceError
+        As for `mars_lidar.joint_law`.
+
+    See Also
+    --------
+    window_weights, mars_lidar.joint_law
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> weights = ml.reconstruction.window_weights(system, 40.0)
+    >>> mean, error = ml.reconstruction.window_error(weights, ml.Flux(0.1, 0.1, 40.0), system)
+    >>> round(float(mean), 3), round(float(error), 3)  # of S = 0.1: dead time is not corrected
+    (0.089, 0.009)
     """
     from mars_lidar.statistics import joint_law
 
@@ -166,7 +269,43 @@ def window_error(weights: ArrayLike, flux: Flux, system: System) -> tuple[FloatA
 
 @checked
 def window_weights(system: System, delay_ns: float) -> FloatArray:
-    """Weights (bins,) with which `weights @ h` is the signal that a window around a delay gives (R16)."""
+    """Weights with which ``weights @ h`` is the signal that a window around a delay gives (R16).
+
+    Parameters
+    ----------
+    system
+        How the histogram was recorded.
+    delay_ns
+        Centre of the window, ns.
+
+    Returns
+    -------
+    NDArray
+        (bins,) weights.
+
+    Raises
+    ------
+    TypeError
+        No `System`, or a delay that is no number.
+    ValueError
+        A delay that is not finite; a pulse that leaves too little of the period free.
+
+    See Also
+    --------
+    window_error, MatchedFilter
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> weights = ml.reconstruction.window_weights(system, 40.0)
+    >>> counts = ml.simulate(ml.Flux(0.02, 0.02, 40.0), system, seed=0)[0, 0, 0]
+    >>> round(float(weights @ counts), 2)  # S = 0.02
+    0.02
+    """
     tau = checks.real("delay_ns", delay_ns)
     energy, _, share = _pulse_bins(system, np.asarray(tau))
     low, high = core_ns(system)
@@ -223,5 +362,5 @@ def _variances(information: FloatArray) -> FloatArray:
     blank = value <= _SINGULAR * value[-1]
     if not blank.any():
         return np.asarray(np.diag(np.linalg.inv(information)))
-    seen = (vector[:, ~blank] ** 2 / value[~blank]).sum(-1) / size**2
-    return np.asarray(np.where((vector[:, blank] ** 2).sum(-1) > _SINGULAR, np.inf, seen))
+    variances = (vector[:, ~blank] ** 2 / value[~blank]).sum(-1) / size**2
+    return np.asarray(np.where((vector[:, blank] ** 2).sum(-1) > _SINGULAR, np.inf, variances))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
-from mars_lidar._base.progress import shown
+from mars_lidar._base.progress import callback_of
 from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import Progress
 from mars_lidar.instrument.system import System
@@ -45,7 +45,7 @@ def checked(
     if not isinstance(system, System):
         raise TypeError(f"system must be a System, got {type(system).__name__}")
     team = thread_count(threads)
-    progress = shown(progress, "reconstructing")
+    progress = callback_of(progress, "reconstructing")
     counts = np.asarray(checks.even_rows("cube", checks.unmasked("cube", cube)))
     if counts.dtype.kind in "OUS":
         raise TypeError(f"cube must be an array of counts (of a loaded cube its histogram), got {type(cube).__name__}")

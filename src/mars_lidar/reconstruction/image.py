@@ -15,7 +15,7 @@ from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
 from mars_lidar.reconstruction import image_stages as stages
 from mars_lidar.reconstruction.histograms import Histograms
-from mars_lidar.reconstruction.image_network import RADII, REACH, Floats, Networks, networks, weigh
+from mars_lidar.reconstruction.image_network import OUTLIER_SIGMA, RADII, REACH, Floats, Networks, networks, weigh
 from mars_lidar.reconstruction.image_pulse import CELLS_PER_SIGMA, Cells, cell_count, cells_of
 from mars_lidar.reconstruction.maximum_likelihood import MaximumLikelihood
 from mars_lidar.reconstruction.method import Estimates, Flags, Method
@@ -36,12 +36,42 @@ _NOT_ALONE = np.uint8(Flags.EMPTY | Flags.NO_SIGNAL | Flags.SATURATED | Flags.UN
 _NORMAL = 1.645  # standard errors to either side that hold 90 % of a normal distribution
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Image(Method):
     """Depth and signal of every pixel from its photons and those of the image around it, trained where that holds.
 
     Intervals hold the delay with probability `LEVEL`; none is given where an outlier is likelier than the rest.
+
+    Parameters
+    ----------
+    efficiency
+        (H, W) of each pixel, as a share of that of the others, 0 for pixels that see nothing; None: all alike. Signal
+        and background are those of a pixel of the map's mean.
+
+    Raises
+    ------
+    ValueError
+        An efficiency that is no such map; ``check``: a detector that this method does not hold for.
+
+    See Also
+    --------
+    UntrainedImage, MaximumLikelihood, mars_lidar.reconstruct
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> scene = ml.Scene.example("room", size=32)
+    >>> counts = ml.simulate(scene.flux(system, signal=0.002, sbr=1.0), system, seed=0)  # 2 photons a pixel
+    >>> maps = ml.reconstruct(counts, system, ml.reconstruction.Image())
+    >>> bool(((abs(maps.depth_m[0] - scene.depth_m) < 0.5).mean()) > 0.85)
+    True
     """
+
+    efficiency: FloatArray | None = None
 
     name = "image"
     modes = ("nonparalyzable", "synchronous", "gated")
@@ -49,8 +79,18 @@ class Image(Method):
     windows = False
     of_images = True
 
+    def __post_init__(self) -> None:
+        if self.efficiency is None:
+            return
+        given = np.array(self.efficiency, np.float64)
+        if given.ndim != 2 or not np.isfinite(given).all() or (given < 0.0).any() or not given.any():
+            raise ValueError(
+                f"efficiency must be an image (H, W) of numbers of 0 or more, not all 0, got shape {given.shape}"
+            )
+        object.__setattr__(self, "efficiency", given / given[given > 0.0].mean())
+
     def estimate(self, histograms: Histograms) -> Estimates:
-        """Estimates of each image of counts (..., H, W, bins)."""
+        """Estimates of each image of the counts (..., H, W, bins) in `histograms`."""
         if len(histograms.image) < 2:
             raise ValueError(
                 f"method {self.name!r} needs images, a cube (..., H, W, bins), got leading axes {histograms.image}"
@@ -65,16 +105,47 @@ class Image(Method):
         return Estimates.joined(found)
 
     def of_photons(self, photons: Photons, system: System, threads: int) -> Estimates:
-        """Estimates of one image."""
-        return _estimate(photons, system, self._networks(), threads)
+        """Estimates of one image from its `photons` (times by pixel), recorded by `system`, on so many `threads`."""
+        image = photons.height, photons.width
+        if self.efficiency is not None and self.efficiency.shape != image:
+            raise ValueError(f"efficiency must be of the image's {image} pixels, got shape {self.efficiency.shape}")
+        return _estimate(photons, system, self.efficiency, self._networks(), threads)
 
     def _networks(self) -> Networks | None:
         return networks()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class UntrainedImage(Image):
-    """As `Image`, with nothing trained: the largest peak of the posterior, and the largest window that agrees."""
+    """As `Image`, with nothing trained: the largest peak of the posterior, and the largest window that agrees.
+
+    Parameters
+    ----------
+    efficiency
+        As of `Image`.
+
+    Raises
+    ------
+    ValueError
+        An efficiency that is no such map; ``check``: a detector that this method does not hold for.
+
+    See Also
+    --------
+    Image, mars_lidar.reconstruct
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> scene = ml.Scene.example("room", size=32)
+    >>> counts = ml.simulate(scene.flux(system, signal=0.005, sbr=1.0), system, seed=0)  # 5 photons a pixel
+    >>> maps = ml.reconstruct(counts, system, ml.reconstruction.UntrainedImage())
+    >>> bool(((abs(maps.depth_m[0] - scene.depth_m) < 0.5).mean()) > 0.85)
+    True
+    """
 
     name = "image_untrained"
 
@@ -84,19 +155,25 @@ class UntrainedImage(Image):
 
 @dataclass(frozen=True, eq=False)
 class _Result:
-    """In cells and photons, each (pixels,); `scale` of a Laplace distribution, cells; `doubt`: chance of an outlier."""
+    """In cells and photons, each (pixels,); `scale` of a Laplace distribution, cells; `doubt`: chance of an outlier.
+
+    `half`: half the width of the interval, cells, NaN where none is stated.
+    """
 
     delay: FloatArray
     scale: FloatArray
     doubt: FloatArray
+    half: FloatArray
     signal: FloatArray
     signal_scale: FloatArray  # of its logarithm
 
 
-def _estimate(photons: Photons, system: System, nets: Networks | None, threads: int) -> Estimates:
+def _estimate(
+    photons: Photons, system: System, efficiency: FloatArray | None, nets: Networks | None, threads: int
+) -> Estimates:
     blurs = _blurs(system)
     cells = cells_of(system, blurs[0])
-    light = stages.first_light(photons, cells)
+    light = stages.first_light(photons, cells, efficiency)
     delay = stages.first_delays(photons, cells, light, threads)
     light = stages.light_at(photons, cells, delay, light, threads)
     here = ~light.missing
@@ -124,12 +201,19 @@ def _estimate(photons: Photons, system: System, nets: Networks | None, threads: 
         result = _trained(seen, chosen, light, cells, nets, threads)
     assert result is not None
     estimates = _estimates(result, light, photons, system, cells)
-    _alone(estimates, np.flatnonzero(seen.number.ravel() > _ALONE), photons, system, cells, threads)
+    bright = np.flatnonzero(seen.number.ravel() > _ALONE)
+    _alone(estimates, bright, light.efficiency.ravel()[bright], photons, system, cells, threads)
     return estimates
 
 
 def _alone(
-    estimates: Estimates, pixels: NDArray[np.int64], photons: Photons, system: System, cells: Cells, threads: int
+    estimates: Estimates,
+    pixels: NDArray[np.int64],
+    efficiency: FloatArray,
+    photons: Photons,
+    system: System,
+    cells: Cells,
+    threads: int,
 ) -> None:
     """Maximum likelihood of the brightest pixels, each alone, where it finds the same surface."""
     step = max(1, _ALONE_BYTES // (4 * system.bins))
@@ -142,9 +226,11 @@ def _alone(
         own = MaximumLikelihood().estimate(Histograms(counts, system, threads))
         off = (own.delay - estimates.delay[part] + 0.5) % 1.0 - 0.5
         same = (np.abs(off) * cells.count < 3.0 * cells.sigma) & (own.flags & _NOT_ALONE == 0)
-        to = part[same]
-        for name in ("signal", "background", "delay", "signal_error", "delay_error"):
+        to, share = part[same], efficiency[begin : begin + step][same]
+        for name in ("delay", "delay_error"):
             getattr(estimates, name)[to] = getattr(own, name)[same]
+        for name in ("signal", "background", "signal_error"):
+            getattr(estimates, name)[to] = getattr(own, name)[same] / share
         if estimates.half_width is not None and own.delay_error is not None:
             estimates.half_width[to] = _NORMAL * own.delay_error[same]
         estimates.flags[to] = own.flags[same]
@@ -208,11 +294,13 @@ def _untrained(seen: stages.Photometry, chosen: stages.Choice, cells: Cells, thr
     rows = [[x.ravel() for x in _agreeing(seen, cells, rows, threads)] for rows in _blocks(seen)]
     offset, error, signal, light = (np.concatenate(each) for each in zip(*rows, strict=True))
     doubt = np.clip(1.0 - chosen.broad.astype(np.float64), 0.0, 1.0)
+    # the window's error knows nothing of what is rough within it; half the posterior's spread does
+    scale = _SCALE * np.hypot(error * cells.sigma, 0.5 * chosen.spread.astype(np.float64))
     return _Result(
         delay=seen.delay.ravel().astype(np.float64) + offset * cells.sigma,
-        # the window's error knows nothing of what is rough within it; half the posterior's spread does
-        scale=_SCALE * np.hypot(error * cells.sigma, 0.5 * chosen.spread.astype(np.float64)),
+        scale=scale,
         doubt=doubt,
+        half=half_width(scale, doubt),
         signal=np.maximum(signal.astype(np.float64), 0.02),
         signal_scale=np.sqrt(0.5 / np.maximum(light, 0.5)),
     )
@@ -235,11 +323,17 @@ def _trained(
         kept = slice(rows.start - wide.start, rows.stop - wide.start)
         outputs = weigh(features, nets.weigh, threads)[:, kept]
         parts.append([x.ravel() for x in combined(outputs, delays[:, kept], log_signal[:, kept])])
-    offset, log_scale, logit, signal, signal_scale = (np.concatenate(each) for each in zip(*parts, strict=True))
+    offset, log_scale, logit, log_half, signal, signal_scale = (
+        np.concatenate(each) for each in zip(*parts, strict=True)
+    )
+    doubt = 1.0 / (1.0 + np.exp(-logit))
+    half = float(nets.card["interval_factor"]) * np.exp(log_half)
+    half[(half > OUTLIER_SIGMA) | (doubt > 1.0 - LEVEL)] = np.nan
     return _Result(
         delay=seen.delay.ravel().astype(np.float64) + offset * cells.sigma,
         scale=np.exp(log_scale) * cells.sigma,
-        doubt=1.0 / (1.0 + np.exp(-logit)),
+        doubt=doubt,
+        half=half * cells.sigma,
         signal=np.exp(signal),
         signal_scale=np.exp(signal_scale),
     )
@@ -247,22 +341,24 @@ def _trained(
 
 def combined(
     outputs: Floats, delays: Floats, log_signal: Floats
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Offset and log of its Laplace scale in sigma, logit of an outlier, log of the signal and of its scale.
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Of `outputs` (delays + signals + 5, H, W), where delays and signals are weighed: six images.
 
-    Of outputs (2 planes + 4, H, W): weights of delays, of log signal, then both scales, logit and a residual.
+    Offset, log of its Laplace scale and of half its interval in sigma, logit of an outlier between them, log of the
+    signal and of its scale.
     """
-    k = len(delays)
+    k, m = len(delays), len(log_signal)
     o = outputs.astype(np.float64)
-    weight, share = _softmax(o[:k]), _softmax(o[k : 2 * k])
-    offset = (weight * delays).sum(0) + 0.3 * np.clip(o[2 * k + 3], -3.0, 3.0)
+    weight, share, rest = _softmax(o[:k]), _softmax(o[k : k + m]), o[k + m :]
+    offset = (weight * delays).sum(0) + 0.3 * np.clip(rest[3], -3.0, 3.0)
     signal = np.log((share * np.exp(log_signal)).sum(0))
     return (
         offset,
-        np.clip(o[2 * k], -4.0, 3.0) - 1.5,
-        o[2 * k + 1] - 2.0,
+        np.clip(rest[0], -4.0, 3.0) - 1.5,
+        rest[1] - 2.0,
+        np.clip(rest[4], -4.0, 3.0) - 0.7,
         signal,
-        np.clip(o[2 * k + 2], -4.0, 3.0) - 1.0,
+        np.clip(rest[2], -4.0, 3.0) - 1.0,
     )
 
 
@@ -286,9 +382,7 @@ def _estimates(result: _Result, light: stages.Light, photons: Photons, system: S
     empty = photons.first[-1] == 0
     delay = (result.delay / cells.count) % 1.0
     fill = (result.doubt > FILLED_ABOVE) | light.missing.ravel()
-    with np.errstate(invalid="ignore"):
-        half = half_width(result.scale / cells.count, result.doubt)
-    half[fill] = np.nan
+    half = np.where(fill, np.nan, result.half / cells.count)
     delay = filled(delay.reshape(shape), fill.reshape(shape)).ravel()
     flags = np.where(fill, Flags.FILLED, 0).astype(np.uint8)
     flags[np.diff(photons.first) == 0] |= np.uint8(Flags.EMPTY) if empty else np.uint8(0)

@@ -24,6 +24,7 @@ CHANNELS = 32  # of the network that weighs
 OFFSETS = tuple((y, x) for y in range(-2, 3) for x in range(-2, 3)) + tuple(
     (step * y, step * x) for step in (4, 8) for y in (-1, 0, 1) for x in (-1, 0, 1) if (y, x) != (0, 0)
 )
+OUTLIER_SIGMA = 3.0  # from which on an error is an outlier
 REACH = 2  # pixels that the second network reads to each side
 
 Floats = NDArray[np.float32]
@@ -61,7 +62,7 @@ def offsets() -> tuple[NDArray[np.int32], NDArray[np.int32]]:
 
 
 def weigh(features: Floats, weights: dict[str, Floats], threads: int) -> Floats:
-    """Outputs (2 planes + 4, H, W) of the second network for features (channels, H, W): see `image_stages`."""
+    """Outputs of the second network for features (channels, H, W), as `combined` in image.py reads them."""
     f = _convolved(features, weights, "enter", False, threads)
     f = f + _convolved(f, weights, "first", True, threads)
     f = f + _convolved(f, weights, "second", True, threads)

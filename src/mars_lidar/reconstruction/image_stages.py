@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mars_lidar._base.types import FloatArray
 from mars_lidar.reconstruction.image_network import HIDDEN, OFFSETS, PEAKS, RADII, Floats, Networks, offsets
-from mars_lidar.reconstruction.image_pulse import Cells
+from mars_lidar.reconstruction.image_pulse import NEAR, Cells
 from mars_lidar.reconstruction.photons import Photons
 
 # the prior of a step to the next pixel: Gaussian of so many sigma; shares within 15 cells, and to anywhere
@@ -34,11 +34,15 @@ _MARGIN = RADII[-1]
 
 @dataclass(frozen=True, eq=False)
 class Light:
-    """Signal and background of each pixel (H, W), photons of an exposure that is never blind, and where none came."""
+    """Signal and background of each pixel (H, W), photons of an exposure that is never blind, and where none came.
+
+    They are those of a pixel of mean efficiency; `efficiency` (H, W) is each pixel's own, relative to the mean.
+    """
 
     signal: FloatArray
     background: FloatArray
     missing: NDArray[np.bool_]
+    efficiency: FloatArray
 
     @property
     def ratio(self) -> Floats:
@@ -111,14 +115,15 @@ def survey(photons: Photons, cells: Cells) -> float:
     return float(np.sqrt(np.clip((counts[0] / counts[1] - by_chance) / (0.8 - by_chance), 1e-3, 0.9)))
 
 
-def first_light(photons: Photons, cells: Cells) -> Light:
+def first_light(photons: Photons, cells: Cells, efficiency: FloatArray | None = None) -> Light:
     """Signal and background before any delay is known: one share of signal, background as the pixels have photons."""
     share = survey(photons, cells)
     total = photons.total()
-    missing = _missing(total)
-    background = _background((1.0 - share) * total, np.where(missing, 0.0, 1.0))
-    mean = total[~missing].mean() if (~missing).any() else 0.0
-    return Light(np.full(total.shape, max(share * mean, 0.02)), background, missing)
+    relative = np.ones(total.shape) if efficiency is None else efficiency
+    missing = _missing(total, relative)
+    background = _background((1.0 - share) * total, np.where(missing, 0.0, relative))
+    mean = total[~missing].sum() / max(relative[~missing].sum(), 1e-9)
+    return Light(np.full(total.shape, max(share * mean, 0.02)), background, missing, relative)
 
 
 def light_at(photons: Photons, cells: Cells, delay: Floats, light: Light, threads: int) -> Light:
@@ -133,7 +138,7 @@ def light_at(photons: Photons, cells: Cells, delay: Floats, light: Light, thread
     inside = near.reshape(shape) - background * share * seen
     around = _mean(inside * (seen > 0), _SURROUNDINGS)
     signal = around / np.maximum(_mean(seen, _SURROUNDINGS), 1e-6) / cells.inside
-    return Light(np.maximum(signal, 0.1 * background * share + 0.02), background, light.missing)
+    return Light(np.maximum(signal, 0.1 * background * share + 0.02), background, light.missing, light.efficiency)
 
 
 def _mean(values: FloatArray, side: int) -> FloatArray:
@@ -142,14 +147,14 @@ def _mean(values: FloatArray, side: int) -> FloatArray:
     return np.asarray(np.maximum(uniform_filter(values, side, mode="nearest"), -1e30))
 
 
-def _missing(total: FloatArray) -> NDArray[np.bool_]:
-    """Pixels (H, W) without a registration where those around have so many that this is no chance."""
+def _missing(total: FloatArray, efficiency: FloatArray) -> NDArray[np.bool_]:
+    """Pixels (H, W) without a registration where those around have so many that this is no chance, or that see none."""
     if min(total.shape) < 2:
-        return np.zeros(total.shape, bool)
+        return np.asarray(efficiency == 0.0)
     present = (total > 0).astype(np.float64)
     around = _mean(np.minimum(total, 4.0 * np.median(total) + 4.0), _SURROUNDINGS)
     around /= np.maximum(_mean(present, _SURROUNDINGS), 1e-3)
-    return np.asarray((total == 0) & (np.exp(-0.5 * around) < _MISSING))
+    return np.asarray((efficiency == 0.0) | ((total == 0) & (np.exp(-0.5 * around * efficiency) < _MISSING)))
 
 
 def _background(count: FloatArray, exposure: FloatArray) -> FloatArray:
@@ -341,7 +346,9 @@ def centroids(photons: Photons, cells: Cells, delay: Floats, light: Light, steps
         out=out,
         threads=threads,
     )
-    return np.ascontiguousarray(out.T, np.float64)
+    columns = np.ascontiguousarray(out.T, np.float64)
+    columns[2:4] *= light.efficiency.ravel()
+    return columns
 
 
 @dataclass(frozen=True, eq=False)
@@ -384,7 +391,7 @@ def planes(seen: Photometry, cells: Cells, first: int, last: int, threads: int) 
 def plane_features(
     plane: Floats, chosen: Choice, light: Light, seen: Photometry, cells: Cells, rows: slice
 ) -> tuple[Floats, Floats, Floats]:
-    """What the second network reads (channels, rows, W), and mixes: delays in sigma, log signal (planes, rows, W)."""
+    """What the second network reads (channels, rows, W), and mixes: delays in sigma, log signal (choices, rows, W)."""
     shape = plane.shape[:2]
 
     def part(values: Floats) -> Floats:
@@ -394,6 +401,7 @@ def plane_features(
     own = part(np.asarray(light.signal, np.float32))
     background = part(np.asarray(light.background, np.float32))
     number = part(seen.number)
+    efficiency = part(np.asarray(light.efficiency, np.float32))
     log_signal = np.log(np.concatenate([own[..., None], np.maximum(plane[..., 5], 0.02)], -1))
     features = np.concatenate(
         [
@@ -409,8 +417,10 @@ def plane_features(
                     0.5 * np.log(part(chosen.mass) + 1e-3),
                     0.5 * np.log(np.maximum(part(chosen.confidence), 0.0) + 1e-3),
                     np.log(np.maximum(background, 0.02) * (5.0 * cells.sigma / cells.count)),
-                    np.clip(number - np.maximum(plane[..., 1, 5], 0.02), -10.0, 10.0),
+                    np.clip(number - np.maximum(plane[..., 1, 5], 0.02) * efficiency, -10.0, 10.0),
                     0.5 * np.log(np.clip(1.0 - part(chosen.broad), 1e-3, 1.0)),
+                    # of a Gaussian 0: how much finer than its width a pulse tells the delay
+                    np.full(shape, 2.0 * np.log(cells.near / (2.0 * NEAR * cells.sigma)), np.float32),
                 ],
                 -1,
             ),
@@ -418,6 +428,8 @@ def plane_features(
         -1,
     )
     delays = np.concatenate([np.zeros((*shape, 1), np.float32), delay], -1)
+    alone = np.log(np.maximum(number / np.maximum(part(seen.exposure), 0.05), 0.02))
+    log_signal = np.concatenate([log_signal, alone[..., None]], -1)
 
     def planar(values: Floats) -> Floats:
         return np.ascontiguousarray(values.transpose(2, 0, 1), np.float32)

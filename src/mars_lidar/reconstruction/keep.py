@@ -20,7 +20,7 @@ _EXCESS = 5.0  # standard deviations by which a later return rises above the med
 
 
 def keep_return(
-    found: Reconstruction, keep: str = "strongest", from_ns: float = 0.0, attenuation: str = "none"
+    result: Reconstruction, keep: str = "strongest", from_ns: float = 0.0, attenuation: str = "none"
 ) -> Reconstruction:
     """The maps (...) of one return of each pixel, of those not nearer than `from_ns` after the laser pulse.
 
@@ -29,8 +29,8 @@ def keep_return(
     `attenuation` is that of the reconstruction; its level stays.
     """
     checks.choice("keep", keep, KEEP)
-    first = checks.real("from_ns", from_ns, low=0.0, high=found.system.period_ns)
-    every = found.returns
+    first = checks.real("from_ns", from_ns, low=0.0, high=result.system.period_ns)
+    every = result.returns
     if every is None:
         raise ValueError("keep and from_ns choose among several returns: reconstruct with returns=2 or more")
     allowed = np.isfinite(every.delay_ns) & (every.delay_ns >= first)
@@ -44,26 +44,26 @@ def keep_return(
     signal, depth = chosen(every.signal, 0.0), chosen(every.depth_m)
     returned = signal * depth**2 if attenuation == "inverse_square" else signal
     return replace(
-        found,
+        result,
         delay_ns=chosen(every.delay_ns),
         depth_m=depth,
         signal=signal,
-        reflectivity=np.nan_to_num(returned) / found.level,
+        reflectivity=np.nan_to_num(returned) / result.level,
         delay_error_ns=chosen(every.delay_error_ns),
         depth_error_m=chosen(every.depth_error_m),
         signal_error=chosen(every.signal_error),
-        flags=np.where(lacking, found.flags | np.uint8(Flags.NO_SIGNAL), found.flags).astype(np.uint8),
+        flags=np.where(lacking, result.flags | np.uint8(Flags.NO_SIGNAL), result.flags).astype(np.uint8),
     )
 
 
-def common_delay(found: Reconstruction) -> tuple[float, float] | None:
+def common_delay(result: Reconstruction) -> tuple[float, float] | None:
     """(share of the pixels, delay in ns) where more than half of the first returns stand in the same few bins."""
-    every = found.returns
-    first = found.delay_ns if every is None else np.where(every.count > 0, every.delay_ns[..., 0], np.nan)
-    delays = first[found.seen & np.isfinite(first)]
+    every = result.returns
+    first = result.delay_ns if every is None else np.where(every.count > 0, every.delay_ns[..., 0], np.nan)
+    delays = first[result.detected & np.isfinite(first)]
     if delays.size < 2:
         return None
-    bins, width = found.system.bins, found.system.bin_ns
+    bins, width = result.system.bins, result.system.bin_ns
     counts = np.bincount((delays / width).astype(np.int64) % bins, minlength=bins)
     together = np.sum([np.roll(counts, -k) for k in range(_SAME_BINS)], axis=0)
     place = int(np.argmax(together))
@@ -72,9 +72,9 @@ def common_delay(found: Reconstruction) -> tuple[float, float] | None:
     return (share, float(np.median(delays[inside]))) if share > _MOSTLY else None
 
 
-def has_later_light(counts: NDArray[Any], found: Reconstruction, delay_ns: float) -> bool:
+def has_later_light(counts: NDArray[Any], result: Reconstruction, delay_ns: float) -> bool:
     """Whether the counts of all pixels together (bins,) show light elsewhere than at a delay and its pulse."""
-    system = found.system
+    system = result.system
     low, high = system.pulse.support_ns()
     since = (system.time_ns - delay_ns) % system.period_ns
     near = (since < high + 2 * system.bin_ns) | (since > system.period_ns + low - 2 * system.bin_ns)

@@ -38,6 +38,29 @@ class MaximumLikelihood(Method):
         Largest number of returns for each pixel, in [1, 8]. Returns are added as long as twice the gain of the log
         likelihood exceeds what noise reaches anywhere in the period with probability `false_alarm` (R23 of
         docs/theory_reconstruction.md, section 6). `signal` and `delay_ns` are then those of the strongest return.
+
+    Raises
+    ------
+    TypeError
+        Settings that are no numbers.
+    ValueError
+        Settings out of range; ``check``: a detector that this method does not hold for.
+
+    See Also
+    --------
+    Image, log_likelihood, mars_lidar.cramer_rao, mars_lidar.reconstruct
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> counts = ml.simulate(ml.Flux(1.0, 0.1, 40.0), system, seed=0)
+    >>> maps = ml.reconstruct(counts, system, ml.reconstruction.MaximumLikelihood(false_alarm=1e-3))
+    >>> bool(abs(maps.delay_ns - 40.0)[0, 0, 0] < 5 * maps.delay_error_ns[0, 0, 0])
+    True
     """
 
     starts: int = 3
@@ -56,7 +79,7 @@ class MaximumLikelihood(Method):
         checks.real("false_alarm", self.false_alarm, low=1e-12, high=0.5)
 
     def least_gain(self, system: System) -> float:
-        """Twice the gain of the log likelihood above which a signal counts as seen.
+        """Twice the gain of the log likelihood above which a signal of `system` counts as detected.
 
         At one delay it is the square of a normal number where that is positive; a period holds about 1 / sigma
         delays that are independent.
@@ -65,7 +88,7 @@ class MaximumLikelihood(Method):
         return float(NormalDist().inv_cdf(1.0 - self.false_alarm / places) ** 2)
 
     def estimate(self, histograms: Histograms) -> Estimates:
-        """The estimates, their standard errors, the significance of the signal, and whether they fit."""
+        """Estimates, standard errors, significance of the signal, and test of fit, of each of the `histograms`."""
         from mars_lidar._base.native import _core
 
         pixels = len(histograms.counts)
@@ -145,6 +168,29 @@ def log_likelihood(histogram: ArrayLike, flux: Flux, system: System) -> tuple[Fl
     -------
     tuple
         Value (...), gradient (..., 3) and information (..., 3, 3) with respect to (S, B, delay in ns).
+
+    Raises
+    ------
+    TypeError
+        No `Flux` or no `System`; counts that are no array of numbers.
+    ValueError
+        Counts of another number of bins; hypotheses without background; a detector that this does not hold for.
+
+    See Also
+    --------
+    MaximumLikelihood, mars_lidar.learn.histogram_log_likelihood
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> counts = ml.simulate(ml.Flux(1.0, 1.0, 40.0), system, seed=0)[0, 0, 0]
+    >>> value, gradient, information = ml.reconstruction.log_likelihood(counts, ml.Flux(1.0, 1.0, [39.0, 40.0]), system)
+    >>> bool(value[1] > value[0]), gradient.shape, information.shape
+    (True, (2, 3), (2, 3, 3))
     """
     from mars_lidar._base.native import _core
 

@@ -28,6 +28,28 @@ class ChainCorrection(RateMethod):
         On the rates: as `MatchedFilter`.
     iterations, tolerance
         Stops when the rates move by less than `tolerance` of their sum, or after so many iterations.
+
+    Raises
+    ------
+    ValueError
+        A filter, a number of iterations or a tolerance that is none; ``check``: a detector of another mode than
+        ``"nonparalyzable"``, or a dead time below one bin.
+
+    See Also
+    --------
+    mchc_rates, GeneralisedCoates, mars_lidar.reconstruct
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> counts = ml.simulate(ml.Flux(1.0, 1.0, 40.0), system, seed=0)
+    >>> maps = ml.reconstruct(counts, system, ml.reconstruction.ChainCorrection(filter="linear"))
+    >>> abs(float(maps.delay_ns[0, 0, 0]) - 40.0) < 1.0
+    True
     """
 
     iterations: int = 60
@@ -45,7 +67,7 @@ class ChainCorrection(RateMethod):
         checks.real("tolerance", self.tolerance, low=0.0, high=0.1, strict_low=True)
 
     def check(self, system: System) -> None:
-        """As any method; and the dead time is at least one bin."""
+        """As any method does for a `system`; and the dead time is at least one bin."""
         super().check(system)
         if system.detector.dead_time_ns < system.bin_ns:
             raise ValueError(
@@ -69,9 +91,49 @@ def mchc_rates(
     tolerance: float = 1e-5,
     threads: int | None = None,
 ) -> FloatArray:
-    """Photons per period in each bin (..., bins) behind the histograms (..., bins), by `ChainCorrection`.
+    """Photons per period in each bin behind histograms, by `ChainCorrection`.
 
-    `total`: photons per period in all, a scalar or (...), where they are known, from the times between registrations
-    for instance.
+    Parameters
+    ----------
+    cube
+        (..., bins) counts.
+    system
+        How they were recorded.
+    total
+        Photons per period in all, a scalar or (...), where they are known, from the times between registrations
+        for instance; None: the sum of `generalised_coates_rates`.
+    iterations, tolerance
+        As for `ChainCorrection`.
+    threads
+        Threads to run on; default: all processors that this process may use.
+
+    Returns
+    -------
+    NDArray
+        (..., bins) photons per period.
+
+    Raises
+    ------
+    TypeError
+        Counts that are no array of numbers, or no `System`.
+    ValueError
+        Counts that are no whole numbers >= 0 or of another number of bins; arguments out of range; a detector that the
+        method does not hold for.
+
+    See Also
+    --------
+    ChainCorrection, generalised_coates_rates
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> counts = ml.simulate(ml.Flux(1.0, 1.0, 40.0), system, seed=0)
+    >>> rates = ml.reconstruction.mchc_rates(counts, system)
+    >>> rates.shape, round(float(rates.sum()), 1)  # S + B = 2
+    ((1, 1, 1, 128), 1.9)
     """
     return ChainCorrection(iterations=iterations, tolerance=tolerance).rates(cube, system, threads, total)

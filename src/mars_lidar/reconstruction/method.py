@@ -28,7 +28,27 @@ _LOCATORS = {"peak": 0, "linear": 1, "log": 2}
 
 
 class Flags(IntFlag):
-    """What is to be said of a pixel; 0 where nothing is."""
+    """Statements on a pixel, as bits; 0 where there are none.
+
+    ``EMPTY``: no counts. ``NO_SIGNAL``: no return beyond what background reaches. ``SATURATED``: S or B has no upper
+    bound. ``UNCONVERGED``: the iteration stopped early. ``MORE_RETURNS``: more returns than were asked for. ``FILLED``:
+    from the pixels around. ``MISFIT``: the test of fit rejects the estimate.
+
+    Parameters
+    ----------
+    value
+        Sum of the bits.
+
+    See Also
+    --------
+    Reconstruction
+
+    Examples
+    --------
+    >>> from mars_lidar.reconstruction import Flags
+    >>> Flags(10) == Flags.NO_SIGNAL | Flags.UNCONVERGED
+    True
+    """
 
     EMPTY = 1
     """No registrations: signal and background 0, no depth."""
@@ -77,7 +97,18 @@ class Estimates:
 
 
 class Method(ABC):
-    """A way from histograms to depth and signal."""
+    """A way from histograms to depth and signal.
+
+    See Also
+    --------
+    mars_lidar.reconstruct, MaximumLikelihood
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> isinstance(ml.reconstruction.METHODS["peak"], ml.reconstruction.Method)
+    True
+    """
 
     name: ClassVar[str]
     modes: ClassVar[tuple[Mode, ...]]  # of the detector, that the method holds for
@@ -86,7 +117,7 @@ class Method(ABC):
     of_images: ClassVar[bool] = False  # each pixel's estimate depends on those around it: cubes (..., H, W, bins)
 
     def check(self, system: System) -> None:
-        """Raise ValueError, naming mode and method, for a system that this method does not hold for."""
+        """Raise ValueError, naming mode and method, for a `system` that this method does not hold for."""
         mode = system.detector.mode
         if mode not in self.modes:
             able = " or ".join(repr(each.name) for each in _known() if mode in each.modes)
@@ -105,7 +136,7 @@ class Method(ABC):
 
     @abstractmethod
     def estimate(self, histograms: Histograms) -> Estimates:
-        """Estimates of every pixel; the system is one that `check` let pass."""
+        """Estimates of every pixel of `histograms`, whose system is one that `check` let pass."""
 
 
 def _known(kind: Any = None) -> Iterator[type[Method]]:

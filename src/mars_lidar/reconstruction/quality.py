@@ -88,7 +88,7 @@ def _mean_ssim(truth: FloatArray, images: FloatArray, known: BoolArray, span: fl
     return float(np.mean(means))
 
 
-def errors_against(cube: Cube, found: Reconstruction) -> dict[str, MapError]:
+def errors_against(cube: Cube, result: Reconstruction) -> dict[str, MapError]:
     """Errors of depth, in m modulo the unambiguous range, and of reflectivity or else signal, of a known scene.
 
     Depth is judged where a return was seen, as in the picture of `mars_lidar.plot.reconstruction`: elsewhere the
@@ -100,15 +100,15 @@ def errors_against(cube: Cube, found: Reconstruction) -> dict[str, MapError]:
     lit = cube.flux.signal > 0
     if (lit & np.isfinite(cube.depth_m)).any():
         truth = np.where(lit, cube.depth_m, np.nan)
-        lag = depth_lag_m(cube.system, found.depth_m, truth)
-        out["depth"] = map_error(truth, np.where(found.seen, truth + lag, np.nan))
+        lag = depth_lag_m(cube.system, result.depth_m, truth)
+        out["depth"] = map_error(truth, np.where(result.detected, truth + lag, np.nan))
     if lit.any():
         if cube.reflectivity is not None:
-            out["reflectivity"] = map_error(np.where(lit, cube.reflectivity, np.nan), found.reflectivity)
+            out["reflectivity"] = map_error(np.where(lit, cube.reflectivity, np.nan), result.reflectivity)
         else:
-            strongest = found.returns is not None and len(cube.flux.returns_signal) > 0
+            strongest = result.returns is not None and len(cube.flux.returns_signal) > 0
             signal = cube.flux.returns_signal.max(0) if strongest else cube.flux.signal
-            out["signal"] = map_error(np.where(lit, signal, np.nan), found.signal)
+            out["signal"] = map_error(np.where(lit, signal, np.nan), result.signal)
     return out
 
 

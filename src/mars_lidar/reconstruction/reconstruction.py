@@ -130,9 +130,9 @@ class Reconstruction:
         return as_html(self, {} if image is False else {k: v[image].reshape(v.shape[-2:]) for k, v in first.items()})
 
     @property
-    def seen(self) -> NDArray[np.bool_]:
-        """(...) whether a return was seen: a depth, and a signal above the background."""
-        return _seen(self.depth_m, self.flags)
+    def detected(self) -> NDArray[np.bool_]:
+        """(...) whether a return was detected: a depth, and a signal above the background."""
+        return _detected(self.depth_m, self.flags)
 
     @property
     def misfits(self) -> float:
@@ -222,6 +222,14 @@ def reconstruct(
     Reconstruction
         Maps of shape (...).
 
+    Raises
+    ------
+    TypeError
+        Counts that are no array of numbers, or without a system; an argument of another kind.
+    ValueError
+        Counts that are no whole numbers >= 0, or of another number of bins than the system; an unknown method, or one
+        that does not hold for the detector; a level or a number of returns out of range.
+
     See Also
     --------
     Reconstruction, cramer_rao, simulate
@@ -276,7 +284,7 @@ def with_returns(method: Method, returns: int) -> Method:
 
 
 def assembled(
-    name: str, system: System, found: Estimates, shape: tuple[int, ...], level: float | None, attenuation: str
+    name: str, system: System, estimates: Estimates, shape: tuple[int, ...], level: float | None, attenuation: str
 ) -> Reconstruction:
     """The result (...) from the estimates of a method (pixels,)."""
     period = system.period_ns
@@ -284,40 +292,40 @@ def assembled(
     def mapped(values: FloatArray | None, unit: float = 1.0) -> FloatArray | None:
         return None if values is None else (values * unit).reshape(shape)
 
-    delay = (found.delay - np.floor(found.delay)).reshape(shape) * period
+    delay = (estimates.delay - np.floor(estimates.delay)).reshape(shape) * period
     delay = np.where(delay >= period, 0.0, delay)
-    depth, signal = system.depth_m(delay), found.signal.reshape(shape)
+    depth, signal = system.depth_m(delay), estimates.signal.reshape(shape)
     returned = signal * depth**2 if attenuation == "inverse_square" else signal
-    flags = found.flags.reshape(shape)
+    flags = estimates.flags.reshape(shape)
     if level is None:
-        seen = _seen(depth, flags)
-        level = (float(returned[seen].mean()) if seen.any() else 0.0) or 1.0
+        detected = _detected(depth, flags)
+        level = (float(returned[detected].mean()) if detected.any() else 0.0) or 1.0
     return Reconstruction(
         method=name,
         system=system,
         delay_ns=delay,
         depth_m=depth,
         signal=signal,
-        background=found.background.reshape(shape),
+        background=estimates.background.reshape(shape),
         reflectivity=returned / level,
         level=level,
-        delay_error_ns=mapped(found.delay_error, period),
-        depth_error_m=mapped(found.delay_error, float(system.depth_m(period))),
-        signal_error=mapped(found.signal_error),
-        background_error=mapped(found.background_error),
-        significance=mapped(found.significance),
-        p_value=mapped(found.p_value),
-        longer=mapped(found.longer),
-        shorter=mapped(found.shorter),
-        wider=mapped(found.wider),
+        delay_error_ns=mapped(estimates.delay_error, period),
+        depth_error_m=mapped(estimates.delay_error, float(system.depth_m(period))),
+        signal_error=mapped(estimates.signal_error),
+        background_error=mapped(estimates.background_error),
+        significance=mapped(estimates.significance),
+        p_value=mapped(estimates.p_value),
+        longer=mapped(estimates.longer),
+        shorter=mapped(estimates.shorter),
+        wider=mapped(estimates.wider),
         flags=flags,
-        returns=returns_of(found.returns, system, shape),
-        delay_half_width_ns=mapped(found.half_width, period),
-        depth_half_width_m=mapped(found.half_width, float(system.depth_m(period))),
-        outlier=mapped(found.outlier),
+        returns=returns_of(estimates.returns, system, shape),
+        delay_half_width_ns=mapped(estimates.half_width, period),
+        depth_half_width_m=mapped(estimates.half_width, float(system.depth_m(period))),
+        outlier=mapped(estimates.outlier),
     )
 
 
-def _seen(depth: FloatArray, flags: NDArray[np.uint8]) -> NDArray[np.bool_]:
+def _detected(depth: FloatArray, flags: NDArray[np.uint8]) -> NDArray[np.bool_]:
     lacking = np.uint8(Flags.EMPTY | Flags.NO_SIGNAL | Flags.FILLED)
     return np.asarray(np.isfinite(depth) & ((flags & lacking) == 0), dtype=np.bool_)

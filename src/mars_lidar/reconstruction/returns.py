@@ -32,6 +32,22 @@ class Returns:
     false_alarm
         (..., K) probability that a return which is not there would have gained so much likelihood, anywhere in the
         period (docs/theory_reconstruction.md, section 6).
+
+    See Also
+    --------
+    MaximumLikelihood, returns_bound, mars_lidar.reconstruct
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> flux = ml.Flux.multi(ml.Flux(1.0, 0.1, 30.0), ml.Flux(0.5, 0.0, 60.0))
+    >>> maps = ml.reconstruct(ml.simulate(flux, system, seed=0), system, returns=2)
+    >>> int(maps.returns.count[0, 0, 0]), maps.returns.depth_m[0, 0, 0].round(1)
+    (2, array([4.5, 9. ]))
     """
 
     count: NDArray[np.uint8]
@@ -50,8 +66,8 @@ def returns_of(values: FloatArray | None, system: System, shape: tuple[int, ...]
     """Those (..., K) of the estimates (pixels, K, columns) of a method; None where it looks for one only."""
     if values is None:
         return None
-    found = values.reshape(*shape, *values.shape[1:])
-    delay, signal, delay_error, signal_error, false_alarm = np.moveaxis(found, -1, 0)
+    columns = values.reshape(*shape, *values.shape[1:])
+    delay, signal, delay_error, signal_error, false_alarm = np.moveaxis(columns, -1, 0)
     period = system.period_ns
     delay = np.where(delay >= 1.0, 0.0, delay) * period
     return Returns(

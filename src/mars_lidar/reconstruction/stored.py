@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mars_lidar._base import checks
-from mars_lidar._base.progress import shown
+from mars_lidar._base.progress import callback_of
 from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import Progress
 from mars_lidar.reconstruction.histograms import checked
@@ -29,7 +29,7 @@ _CHUNK_BYTES = 4 * 2**20
 class Timed:
     """A reconstruction (realizations, H, W) and the seconds that it took, reading left out."""
 
-    found: Reconstruction
+    result: Reconstruction
     seconds: float
 
 
@@ -59,7 +59,7 @@ def reconstruct_stored(
     dict
         By name of the method.
     """
-    progress = shown(progress, "reconstructing")
+    progress = callback_of(progress, "reconstructing")
     system, recipe = cube.system, cube.recipe
     used = [with_returns(find_method(method), returns) for method in methods]
     for method in used:
@@ -75,9 +75,9 @@ def reconstruct_stored(
     total, done = len(used) * shape[0] * shape[1] * shape[2], 0
     blocks = recipe.blocks(recipe.chunks(_CHUNK_BYTES))
 
-    def keep(method: Method, found: Estimates, images: slice, rows: slice) -> None:
-        for field in fields(found):
-            values = getattr(found, field.name)
+    def keep(method: Method, estimates: Estimates, images: slice, rows: slice) -> None:
+        for field in fields(estimates):
+            values = getattr(estimates, field.name)
             if values is None:
                 continue
             whole = buffers[method.name].setdefault(field.name, np.empty((*shape, *values.shape[1:]), values.dtype))
@@ -92,9 +92,9 @@ def reconstruct_stored(
             if isinstance(method, Image):
                 continue
             began = time.perf_counter()
-            found = method.estimate(counts)
+            estimates = method.estimate(counts)
             seconds[method.name] += time.perf_counter() - began
-            keep(method, found, images, rows)
+            keep(method, estimates, images, rows)
             done += len(counts.counts)
             if progress is not None:
                 progress(done, total)
@@ -107,19 +107,19 @@ def reconstruct_stored(
             photons = Photons.joined(gathered.pop(k))
             for method in of_images:
                 began = time.perf_counter()
-                found = method.of_photons(photons, system, team)
+                estimates = method.of_photons(photons, system, team)
                 seconds[method.name] += time.perf_counter() - began
-                keep(method, found, slice(k, k + 1), slice(0, shape[1]))
+                keep(method, estimates, slice(k, k + 1), slice(0, shape[1]))
                 done += shape[1] * shape[2]
                 if progress is not None:
                     progress(done, total)
     results = {}
     for method in used:
-        found = Estimates(
+        estimates = Estimates(
             **{name: values.reshape(-1, *values.shape[3:]) for name, values in buffers[method.name].items()}
         )
         results[method.name] = Timed(
-            assembled(method.name, system, found, shape, scale, attenuation), seconds[method.name]
+            assembled(method.name, system, estimates, shape, scale, attenuation), seconds[method.name]
         )
     return results
 

@@ -24,6 +24,38 @@ def poisson_moments(flux: Flux, system: System) -> tuple[FloatArray, FloatArray]
     """Mean and variance of the count without dead time, both N_r (S + B) (6.1).
 
     Of the shape of the flux.
+
+    Parameters
+    ----------
+    flux, system
+        The light of pixels of shape (...), photons per period, and what registers it.
+
+    Returns
+    -------
+    tuple
+        mean, variance: arrays (...).
+
+    Raises
+    ------
+    TypeError
+        No `Flux` or no `System`.
+    ValueError
+        Light or effects that have no such law.
+
+    See Also
+    --------
+    poisson_pmf, renewal_moments, count_law
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> mean, variance = ml.statistics.poisson_moments(ml.Flux(1.0, 1.0, 40.0), system)
+    >>> float(mean), float(variance)
+    (2000.0, 2000.0)
     """
     require_mode("poisson_moments", system, _WITHOUT_GATE)
     mean = system.cycles * flux.detected(system).total
@@ -32,7 +64,42 @@ def poisson_moments(flux: Flux, system: System) -> tuple[FloatArray, FloatArray]
 
 @checked
 def poisson_pmf(flux: Flux, system: System, support: ArrayLike) -> FloatArray:
-    """Probability of each count in `support` (k,) without dead time: (..., k), leading axes those of the flux."""
+    """Probability of each count without dead time.
+
+    Parameters
+    ----------
+    flux, system
+        The light of pixels of shape (...), photons per period, and what registers it.
+    support
+        (k,) counts, integers >= 0.
+
+    Returns
+    -------
+    NDArray
+        (..., k) probabilities.
+
+    Raises
+    ------
+    TypeError
+        No `Flux` or no `System`.
+    ValueError
+        Counts that are no whole numbers >= 0.
+
+    See Also
+    --------
+    poisson_moments, renewal_pmf
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> pmf = ml.statistics.poisson_pmf(ml.Flux(1.0, 1.0, 40.0), system, range(1500, 2500))
+    >>> round(float(pmf.sum()), 6)
+    1.0
+    """
     from scipy.special import gammaln, xlogy
 
     require_mode("poisson_pmf", system, _WITHOUT_GATE)
@@ -58,6 +125,28 @@ def renewal_moments(flux: Flux, system: System, *, start_up: bool = False) -> tu
     -------
     tuple
         mean, variance: arrays (...).
+
+    Raises
+    ------
+    TypeError
+        No `Flux` or no `System`.
+    ValueError
+        A detector of another mode than ``"nonparalyzable"``, or with effects that this law does not describe.
+
+    See Also
+    --------
+    renewal_pmf, poisson_moments, count_law
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> mean, variance = ml.statistics.renewal_moments(ml.Flux(1.0, 1.0, 40.0), system)
+    >>> round(float(mean), 1), round(float(variance), 1)  # the exact law's: 815.2, 127.3
+    (800.0, 128.0)
     """
     require_mode("renewal_moments", system)
     return renewal_moments_of(flux.detected(system).total, system, start_up=start_up)
@@ -91,6 +180,28 @@ def renewal_pmf(flux: Flux, system: System, support: ArrayLike) -> FloatArray:
     -------
     NDArray
         (..., k) probabilities; each to about 1e-13 absolute.
+
+    Raises
+    ------
+    TypeError
+        No `Flux` or no `System`.
+    ValueError
+        Counts that are no whole numbers >= 0; a detector that this law does not describe.
+
+    See Also
+    --------
+    renewal_moments, poisson_pmf, count_law
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> pmf = ml.statistics.renewal_pmf(ml.Flux(1.0, 1.0, 40.0), system, range(600, 1000))
+    >>> round(float(pmf.sum()), 6)
+    1.0
     """
     require_mode("renewal_pmf", system)
     counts = _counts(support)

@@ -103,6 +103,8 @@ def photons_per_bin(flux: Flux, system: System, *, bins: int | None = None) -> F
     ----------
     flux
         The light, of any number of returns, or a waveform.
+    system
+        Laser, detector and histogram.
     bins
         Bins of the statistics grid; None: the smallest multiple of the histogram's bins that is at least 512
         and resolves the pulse (bin at most sigma / 3 of a Gaussian), or the waveform's samples.
@@ -111,6 +113,28 @@ def photons_per_bin(flux: Flux, system: System, *, bins: int | None = None) -> F
     -------
     NDArray
         (..., bins), the leading axes those of the flux.
+
+    Raises
+    ------
+    TypeError
+        No `Flux` or no `System`.
+    ValueError
+        `bins` that are no whole number >= 1; light that does not fit the system.
+
+    See Also
+    --------
+    mean_histogram, PhaseChain
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> photons = ml.statistics.photons_per_bin(ml.Flux(1.0, 1.0, 40.0), system, bins=128)
+    >>> photons.shape, round(float(photons.sum()), 6)  # S + B
+    ((128,), 2.0)
     """
     flux = flux.detected(system)
     if bins is not None:

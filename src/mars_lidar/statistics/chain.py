@@ -49,6 +49,21 @@ class Stationary:
         Gauss-Seidel sweeps and Krylov steps spent; 0 where no iteration was needed.
     method
         ``"sweeps"``, ``"gmres"`` or ``"lu"``: what converged.
+
+    See Also
+    --------
+    PhaseChain
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> law = ml.statistics.PhaseChain.from_flux(ml.Flux(1.0, 1.0, 40.0), system).stationary()
+    >>> round(float(law.pdf.sum()), 9), law.residual < 1e-9
+    (1.0, True)
     """
 
     pdf: FloatArray
@@ -91,6 +106,28 @@ class PhaseChain:
         (n,) probability q of passing a bin armed at its start, and p = 1 - q of firing in it.
     rekeep, refire
         (n,) the same, q' and p', for the part of the bin after re-arming.
+
+    Raises
+    ------
+    TypeError
+        Photons that are no array of real numbers.
+    ValueError
+        Photons that are negative, not finite or all 0; a dead time below 0; an unknown `rearm`.
+
+    See Also
+    --------
+    holding_times, registration_pdf
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> chain = ml.statistics.PhaseChain.from_flux(ml.Flux(1.0, 1.0, 40.0), system)
+    >>> round(chain.stationary().rate, 3)  # registrations per period
+    0.815
     """
 
     photons: FloatArray
@@ -158,7 +195,10 @@ class PhaseChain:
         rearm: Rearm = "centre",
         bins: int | None = None,
     ) -> PhaseChain:
-        """The chain of one pixel; arguments as `photons_per_bin`. For mode ``"nonparalyzable"`` only."""
+        """The chain of one pixel `flux` of a `system` of mode ``"nonparalyzable"``.
+
+        `rearm` is that of the chain, `bins` as for `photons_per_bin`.
+        """
         require_mode("the chain of phases", system)
         pixel = one_pixel(flux)
         photons = photons_per_bin(pixel, system, bins=bins)
@@ -182,13 +222,13 @@ class PhaseChain:
         """Mass armed at the *start* of each bin (n,), when `mass` (n,) is registered in each bin (2.4)."""
         return cyclic_recursion(self.keep, self.rekeep * self.rearmed(mass), self.loss)
 
-    def left(self, x: ArrayLike) -> FloatArray:
-        """The product x P of a distribution (n,) with the transition matrix, in O(n) (2.4)."""
+    def forward(self, x: ArrayLike) -> FloatArray:
+        """The product x P of a distribution `x` (n,) with the transition matrix, in O(n) (2.4)."""
         mass = _vector("x", x, self.bins)
         return self.armed(mass) * self.fire + self.refire * self.rearmed(mass)
 
-    def right(self, y: ArrayLike) -> FloatArray:
-        """The product P y: expectation of y (n,) one registration later, in O(n) (2.5)."""
+    def backward(self, y: ArrayLike) -> FloatArray:
+        """The product P y: expectation of `y` (n,) one registration later, in O(n) (2.5)."""
         values = _vector("y", y, self.bins)
         ahead = cyclic_recursion(self.keep, self.fire * values, self.loss, backward=True)
         return self.at_rearming(self.refire * values + self.rekeep * np.roll(ahead, -1))
@@ -231,7 +271,7 @@ class PhaseChain:
         return stationary_from(self, self.solve(adjoint=False))
 
     def solve(self, *, adjoint: bool) -> Solution:
-        """w of A w = p (2.8), or o of A^T o = 1 (3.8); a failure names the cell."""
+        """w of A w = p (2.8), or where `adjoint` o of A^T o = 1 (3.8); a failure names the cell."""
         try:
             return self.feedback().solve(adjoint=adjoint)
         except ConvergenceError as error:
@@ -248,9 +288,9 @@ def stationary_from(chain: PhaseChain, solution: Solution) -> Stationary:
     weight = np.maximum(solution.x, 0.0)
     pdf = weight / weight.sum()
     # The rounding error of the solution is absolute; one step of the chain, which only adds, makes it relative.
-    pdf = chain.left(pdf)
+    pdf = chain.forward(pdf)
     pdf /= pdf.sum()
-    residual = float(np.abs(chain.left(pdf) - pdf).sum())
+    residual = float(np.abs(chain.forward(pdf) - pdf).sum())
     if not residual < 1e-9:
         raise ConvergenceError(f"{chain.describe()}: stationary distribution with residual {residual:.2e}")
     mean = float(solution.x.sum())

@@ -42,6 +42,28 @@ def constant_light_rate(rate_hz: float, detector: Detector) -> float:
     detector
         Of mode ``"nonparalyzable"``, without crosstalk or a longer dead time of the electronics, and afterpulses of all
         generations, not together with `recovery_ns`.
+
+    Returns
+    -------
+    float
+        Registrations per second.
+
+    Raises
+    ------
+    TypeError
+        A rate that is no number; no `Detector`.
+    ValueError
+        A negative rate, or a detector whose mean rate is not known (see `detector`).
+
+    See Also
+    --------
+    Detector, count_law
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> round(ml.statistics.constant_light_rate(1e7, ml.Detector(dead_time_ns=50.0)))  # 1e7 / (1 + 0.5)
+    6666667
     """
     light = checks.real("rate_hz", rate_hz, low=0.0, high=MAX_RATE_HZ)
     require_effects("constant_light_rate", detector, _EFFECTS, lambda _: "; simulate it with engine 'sequential'")

@@ -266,11 +266,29 @@ def electronics_moments(
 
     Raises
     ------
+    TypeError
+        No `Flux` or no `System`.
     ValueError
         For arguments out of range, another mode, other effects.
     ConvergenceError
         Naming the cell, where the grid that would be needed does not fit in 1 GiB, or the exposure is too long to be
         run through before its state repeats.
+
+    See Also
+    --------
+    count_law, mean_histogram, exposure_moments
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> slow = system.replace(cycles=100, detector=ml.Detector(dead_time_ns=20.0, electronics_dead_time_ns=90.0))
+    >>> moments = ml.statistics.electronics_moments(ml.Flux(0.5, 0.5, 40.0), slow)
+    >>> round(float(moments.mean), 1)  # records in 100 periods
+    54.9
     """
     cells = Cells.of_flux(
         flux,

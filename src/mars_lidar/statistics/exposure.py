@@ -64,6 +64,21 @@ class Exposure:
         in standard deviations (or relative, if that is larger), of the other cumulants relative to
         themselves or to the power of the standard deviation, and of the shape in total variation. The error
         of the result is smaller: the method is of fourth order for smooth pulses.
+
+    See Also
+    --------
+    exposure_moments, CountLaw
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> exposure = ml.statistics.exposure_moments(ml.Flux(1.0, 1.0, 40.0), system)
+    >>> exposure.cumulants.shape, exposure.histogram.shape
+    ((4,), (128,))
     """
 
     cumulants: FloatArray
@@ -86,6 +101,11 @@ class Exposure:
         """Variance of N (...), never negative."""
         return self.cumulants[..., 1]
 
+    @property
+    def std(self) -> FloatArray:
+        """Standard deviation of N (...)."""
+        return np.sqrt(self.variance)
+
 
 @dataclass(frozen=True, eq=False)
 class Moments:
@@ -99,6 +119,22 @@ class Moments:
         (..., bins) mean records per bin; sums to the mean.
     bins
         (...) bins per period of the final grid, which need not be those of the histogram.
+
+    See Also
+    --------
+    electronics_moments, paralyzable_moments
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> paralyzable = system.replace(detector=ml.Detector(dead_time_ns=75.0, mode="paralyzable"))
+    >>> moments = ml.statistics.paralyzable_moments(ml.Flux(1.0, 1.0, 40.0), paralyzable)
+    >>> bool(abs(moments.histogram.sum() - moments.mean) < 1e-6)
+    True
     """
 
     mean: FloatArray
@@ -107,6 +143,11 @@ class Moments:
     bins: IndexArray
 
     __repr__ = brief
+
+    @property
+    def std(self) -> FloatArray:
+        """Standard deviation of N (...)."""
+        return np.sqrt(self.variance)
 
 
 def darkness(result: Exposure, which: NDArray[np.bool_], bins: int) -> None:
@@ -339,9 +380,29 @@ def exposure_moments(
 
     Raises
     ------
+    TypeError
+        No `Flux` or no `System`.
+    ValueError
+        A tolerance out of range; a detector of mode ``"synchronous"``, with a moving gate, or with effects that this
+        law does not describe.
     ConvergenceError
         Naming the cell, where no grid up to 2^20 bins meets the tolerance, or where the state has not
         repeated after some 10^5 to 10^7 periods of an exposure that is longer still.
+
+    See Also
+    --------
+    count_law, mean_histogram, Exposure
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> exposure = ml.statistics.exposure_moments(ml.Flux(1.0, 1.0, 40.0), system)
+    >>> round(float(exposure.mean), 1), round(float(exposure.variance), 1)
+    (815.2, 127.3)
     """
     cells = Cells.of_flux(
         flux,

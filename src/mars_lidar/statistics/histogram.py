@@ -34,11 +34,49 @@ def mean_histogram(
     tolerance: float = 1e-4,
     threads: int | None = None,
 ) -> FloatArray:
-    """Mean histogram (..., bins) of the finite exposure, exact for every mode of the detector.
+    """Mean histogram of the finite exposure, exact for every mode of the detector.
 
-    Parameters and errors are those of `exposure_moments`; a gate must not move. The histogram sums to the mean count
-    and includes jitter, code widths and, for modes ``"nonparalyzable"`` and ``"gated"``, the dead time of the
-    electronics (to 1e-3, see `electronics_moments`).
+    It sums to the mean count and includes jitter, code widths and, for modes ``"nonparalyzable"`` and ``"gated"``, the
+    dead time of the electronics (to 1e-3, see `electronics_moments`).
+
+    Parameters
+    ----------
+    flux, system
+        The light of pixels of shape (...), photons per period, and what registers it; a gate must not move.
+    tolerance
+        The grid is refined until the result moves by less than this, in [1e-9, 0.1] (`Exposure.movement`).
+    threads
+        Threads to run on; default: all processors that this process may use.
+
+    Returns
+    -------
+    NDArray
+        (..., bins) expected registrations in `System.cycles` periods.
+
+    Raises
+    ------
+    TypeError
+        No `Flux` or no `System`.
+    ValueError
+        A tolerance out of range, a moving gate, or effects whose mean is not known (afterpulses, crosstalk).
+    ConvergenceError
+        Naming the cell, where no grid meets the tolerance or the exposure is too long to be run through.
+
+    See Also
+    --------
+    registration_pdf, photons_per_bin, joint_law
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> light = ml.Flux(signal=1.0, background=1.0, delay_ns=40.0)
+    >>> mean = ml.statistics.mean_histogram(light, system)
+    >>> mean.shape, round(float(mean.sum()), 1)
+    ((128,), 815.2)
     """
     cells = Cells.of_flux(
         flux,
@@ -115,6 +153,15 @@ def registration_pdf(
     NDArray
         (..., bins), non-negative; sums to 1 over the last axis. A cell without any flux has the uniform
         shape, the limit of little background.
+
+    Raises
+    ------
+    TypeError
+        No `Flux` or no `System`.
+    ValueError
+        An unknown `method`, `rearm` without ``"chain"``, or a detector that the method does not describe.
+    ConvergenceError
+        Naming the cell, where no grid meets the tolerance.
 
     See Also
     --------

@@ -425,19 +425,23 @@ def joint_law(
 
     Raises
     ------
+    TypeError
+        No `Flux` or no `System`.
+    ValueError
+        Several pixels, a tolerance out of range, or a detector that this law does not describe.
     ConvergenceError
         Naming the pixel, where no grid up to 2^17 bins meets the tolerance, or where the exposure does not
         forget its start and is too long to be run through bin by bin (more than 2^22 bins x periods).
+
+    See Also
+    --------
+    count_law, simulate
 
     Notes
     -----
     The result includes the terms of the start and of the end of the exposure; nothing is assumed stationary. Where
     the exposure is too short to forget its start (`settled` is -1) every window is run through all periods, which
     is exact too but costs O(bins x cycles) a window instead of O(bins).
-
-    See Also
-    --------
-    count_law, simulate
 
     Examples
     --------
@@ -592,6 +596,11 @@ class JointLaw:
         """(bins,) variances of the bins."""
         return self.lag(0)
 
+    @property
+    def std(self) -> FloatArray:
+        """(bins,) standard deviations of the bins."""
+        return np.sqrt(self.variance)
+
     def window(self, weights: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Mean and variance of ``weights @ H``.
 
@@ -614,7 +623,7 @@ class JointLaw:
         return (w @ self.mean).reshape(shape)[()], np.maximum(variance, 0.0).reshape(shape)[()]
 
     def covariance_of(self, first: ArrayLike, second: ArrayLike) -> FloatArray:
-        """Covariances (...) of ``first @ H`` and ``second @ H``, weights (..., bins) that broadcast."""
+        """Covariances (...) of ``first @ H`` and ``second @ H``; weights `first` and `second` (..., bins) broadcast."""
         a, b = np.asarray(first), np.asarray(second)
         try:
             a, b = np.broadcast_arrays(a, b)
@@ -628,7 +637,7 @@ class JointLaw:
         return np.concatenate([self._pixel.covariances(x, y) for x, y in parts]).reshape(shape)[()]
 
     def lag(self, lag: int = 1) -> FloatArray:
-        """(bins,) covariances of bin j with bin j + lag, round the period; lag 0: variances. May raise MemoryError."""
+        """Covariances (bins,) of bin j with bin j + `lag`, round the period; at 0 variances. May raise MemoryError."""
         n = self.mean.size
         lag = checks.integer("lag", lag, low=-n, high=n)
         if self._pixel is None:

@@ -34,16 +34,20 @@ _METHODS = get_args(Method)
 class CountLaw:
     """Law of the number N of registrations in an exposure, for cells of shape (...); made by `count_law`.
 
+    `support`, `pmf` and `cdf` are computed when they are first asked for.
+
     Attributes
     ----------
+    system
+        Laser, detector and histogram.
     method
         Method of `count_law`.
     cumulants
         (..., 4) mean, variance, third and fourth cumulant of N.
+    windows
+        Function that gives the probabilities of the cells, called when they are first asked for.
     exposure
         The `Exposure` of an exact law (its histogram has a single bin), else None.
-
-    `support`, `pmf` and `cdf` are computed on first use and cached.
 
     See Also
     --------
@@ -66,11 +70,13 @@ class CountLaw:
 
     def __init__(
         self,
+        system: System,
         method: str,
         cumulants: FloatArray,
         windows: Callable[[], list[Pmf]],
         exposure: Exposure | None = None,
     ) -> None:
+        self.system = system
         self.method = method
         self.cumulants = cumulants
         self.exposure = exposure
@@ -85,6 +91,11 @@ class CountLaw:
     def variance(self) -> FloatArray:
         """Var N (...)."""
         return self.cumulants[..., 1]
+
+    @property
+    def std(self) -> FloatArray:
+        """Standard deviation of N (...)."""
+        return np.sqrt(self.variance)
 
     @cached_property
     def _windows(self) -> list[Pmf]:
@@ -180,6 +191,15 @@ def count_law(
     CountLaw
         For cells of shape (...).
 
+    Raises
+    ------
+    TypeError
+        No `Flux` or no `System`.
+    ValueError
+        An unknown `method`, a tolerance out of range, or a detector that the method does not describe.
+    ConvergenceError
+        Naming the cell, where no grid meets the tolerance, or where the exposure is too long to be run through.
+
     See Also
     --------
     joint_law, registration_pdf, simulate
@@ -212,19 +232,20 @@ def count_law(
     if method == "exact" and (slow or system.detector.mode == "synchronous"):
         windows = record_windows(cells, max(tolerance, 1e-3), team) if slow else synchronous_windows(cells)
         recorded_cumulants = np.array([cumulants_of(window) for window in windows]).reshape(*cells.shape, 4)
-        return CountLaw(method, recorded_cumulants, lambda: windows)
+        return CountLaw(system, method, recorded_cumulants, lambda: windows)
     if method == "exact":
         exposure = refined_moments(cells, 1, tolerance=tolerance, threads=team, steps=LAW_STEPS)
         flat, bins = exposure.cumulants.reshape(-1, 4), exposure.bins.reshape(-1)
-        return CountLaw(method, exposure.cumulants, lambda: exact_windows(cells, flat, bins, team), exposure)
+        return CountLaw(system, method, exposure.cumulants, lambda: exact_windows(cells, flat, bins, team), exposure)
     if method == "poisson":
         means = system.cycles * cells.total
         cumulants = np.repeat(means[:, None], 4, axis=1).reshape(*cells.shape, 4)
-        return CountLaw(method, cumulants, lambda: [poisson_window(float(m)) for m in means])
+        return CountLaw(system, method, cumulants, lambda: [poisson_window(float(m)) for m in means])
     mean, variance = _gaussian_moments(method, cells, edge)
     cumulants = np.zeros((*cells.shape, 4))
     cumulants[..., 0], cumulants[..., 1] = mean.reshape(cells.shape), variance.reshape(cells.shape)
     return CountLaw(
+        system,
         method,
         cumulants,
         lambda: [gaussian_window(float(m), float(v)) for m, v in zip(mean, variance, strict=True)],

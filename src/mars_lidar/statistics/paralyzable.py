@@ -53,10 +53,28 @@ def paralyzable_moments(
 
     Raises
     ------
+    TypeError
+        No `Flux` or no `System`.
     ValueError
         For arguments out of range, another mode, or a dead time of more than 20,000 periods.
     ConvergenceError
         Naming the cell, where no grid up to 2^20 bins meets the tolerance.
+
+    See Also
+    --------
+    count_law, exposure_moments
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> paralyzable = system.replace(detector=ml.Detector(dead_time_ns=75.0, mode="paralyzable"))
+    >>> moments = ml.statistics.paralyzable_moments(ml.Flux(1.0, 1.0, 40.0), paralyzable)
+    >>> round(float(moments.mean), 1)  # a free-running pixel registers 815.2
+    545.7
     """
     cells = Cells.of_flux(
         flux,

@@ -31,7 +31,12 @@ _WORST = 1e-10  # largest backward error of a solution
 
 
 class ConvergenceError(ArithmeticError):
-    """A computation did not reach its accuracy; the message names the cell and the figure reached."""
+    """A computation did not reach its accuracy; the message names the cell and the figure reached.
+
+    See Also
+    --------
+    count_law, exposure_moments
+    """
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,6 +33,28 @@ class MomentMatrices:
 
     `mean` mu_ij and `variance` sigma_ij^2 of W; `q_mu` = P.mean, `q_mu2` = P.mean.mean and
     `q_s2` = P.variance, element by element.
+
+    Attributes
+    ----------
+    mean, variance
+        (n, n) mean mu_ij and variance sigma_ij^2 of the holding time, laser periods and their squares.
+    q_mu, q_mu2, q_s2
+        (n, n) P.mean, P.mean.mean and P.variance, element by element, with P the transition matrix.
+
+    See Also
+    --------
+    moment_matrices, holding_times
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> chain = ml.statistics.PhaseChain.from_flux(ml.Flux(1.0, 1.0, 40.0), system, bins=128)
+    >>> ml.statistics.moment_matrices(chain).mean.shape
+    (128, 128)
     """
 
     mean: FloatArray
@@ -69,6 +91,22 @@ class HoldingTimes:
     defect
         Largest relative disagreement among independent routes to the same figures: mu from pi and from the
         feedback equation, the residual of the equation for z, sigma2 and sigma_ss2 + 2 covariance_sum.
+
+    See Also
+    --------
+    holding_times, HoldingTimeCovariance
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> chain = ml.statistics.PhaseChain.from_flux(ml.Flux(1.0, 1.0, 40.0), system)
+    >>> times = ml.statistics.holding_times(chain)
+    >>> round(times.mu, 3), round(times.sigma2, 3)  # periods, periods squared
+    (1.227, 0.235)
     """
 
     stationary: Stationary
@@ -86,7 +124,40 @@ class HoldingTimes:
 
 @checked
 def moment_matrices(chain: PhaseChain) -> MomentMatrices:
-    """Dense moments of the holding time, for studies and tests: O(n^2) memory, n at most 8192."""
+    """Dense moments of the holding time, for studies and tests: O(n^2) memory, n at most 8192.
+
+    Parameters
+    ----------
+    chain
+        The chain of one pixel, of n <= 8192 bins.
+
+    Returns
+    -------
+    MomentMatrices
+
+    Raises
+    ------
+    TypeError
+        No `PhaseChain`.
+    ValueError
+        A chain of more bins, whose matrices would not fit.
+
+    See Also
+    --------
+    holding_times, MomentMatrices
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> chain = ml.statistics.PhaseChain.from_flux(ml.Flux(1.0, 1.0, 40.0), system, bins=128)
+    >>> dense = ml.statistics.moment_matrices(chain)
+    >>> bool(abs(dense.q_mu.sum(1) - ml.statistics.holding_times(chain).mean).max() < 1e-9)
+    True
+    """
     n = chain.bins
     if n > _MAX_DENSE:
         raise ValueError(f"bins must be at most {_MAX_DENSE} for dense matrices, got {n}")
@@ -139,7 +210,7 @@ def lag_covariances(chain: PhaseChain, times: HoldingTimes, lags: int) -> FloatA
     out = np.empty(lags)
     for k in range(lags):
         out[k] = row @ value
-        value = chain.right(value)
+        value = chain.backward(value)
         value -= times.stationary.pdf @ value  # rounding would reintroduce the mean
     return out
 
@@ -148,8 +219,19 @@ def lag_covariances(chain: PhaseChain, times: HoldingTimes, lags: int) -> FloatA
 def holding_times(chain: PhaseChain) -> HoldingTimes:
     """All moments of the holding times without truncation, from two feedback solutions, O(n).
 
+    Parameters
+    ----------
+    chain
+        The chain of one pixel.
+
+    Returns
+    -------
+    HoldingTimes
+
     Raises
     ------
+    TypeError
+        No `PhaseChain`.
     ConvergenceError
         Where a solution did not converge.
 
@@ -157,6 +239,21 @@ def holding_times(chain: PhaseChain) -> HoldingTimes:
     -----
     RuntimeWarning
         Where independent routes to one figure disagree by more than 1e-7; the message names the cell.
+
+    See Also
+    --------
+    HoldingTimes, holding_time_covariance
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> chain = ml.statistics.PhaseChain.from_flux(ml.Flux(1.0, 1.0, 40.0), system)
+    >>> round(1.0 / ml.statistics.holding_times(chain).mu, 3)  # registrations per period
+    0.815
     """
     n = chain.bins
     forward, dual = chain.solve(adjoint=False), chain.solve(adjoint=True)
@@ -181,7 +278,7 @@ def holding_times(chain: PhaseChain) -> HoldingTimes:
     between = float(pdf @ (mean - mu) ** 2)
     sigma_ss2 = float(pdf @ variance) + between
 
-    rest = value - chain.right(value) - (mean - mu)
+    rest = value - chain.backward(value) - (mean - mu)
     defect = max(
         abs(mu * stationary.rate - 1.0),
         float(np.abs(rest).max()) / (mu + float(np.abs(value).max())),
@@ -226,6 +323,31 @@ def mars_moments(
     -------
     tuple
         mean, variance: arrays (...); 0, 0 where there is no flux.
+
+    Raises
+    ------
+    TypeError
+        No `Flux` or no `System`.
+    ValueError
+        `rearm` or `bins` out of range; a detector of another mode than ``"nonparalyzable"``, or with effects that the
+        chain does not describe.
+    ConvergenceError
+        Where a solution did not converge; the message names the cell.
+
+    See Also
+    --------
+    count_law, exposure_moments, holding_times
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> mean, variance = ml.statistics.mars_moments(ml.Flux(1.0, 1.0, 40.0), system)
+    >>> round(float(mean), 1), round(float(variance), 1)
+    (815.1, 127.3)
     """
     require_mode("mars_moments", system)
     checks.choice("rearm", rearm, ("centre", "edge"))

@@ -51,6 +51,23 @@ class HoldingTimeCovariance:
         sigma_ss2 + 2 exact_sum, computed as a sum of squares: never negative.
     defect
         Relative disagreement of independent routes to mu, exact_sum and sigma2 (see `HoldingTimes`).
+
+    See Also
+    --------
+    holding_time_covariance, HoldingTimes
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> covariance = ml.holding_time_covariance(ml.Flux(1.0, 1.0, 40.0), system)
+    >>> covariance.gamma.shape, covariance.automatic_rule()
+    ((20,), (6, 1))
+    >>> bool(abs(covariance.automatic_sum() - covariance.exact_sum) < 1e-3 * covariance.sigma_ss2)
+    True
     """
 
     gamma: FloatArray
@@ -71,7 +88,7 @@ class HoldingTimeCovariance:
         return self._times.stationary.pdf
 
     def cutoff_sum(self, cutoff: int) -> float:
-        """gamma_1 + ... + gamma_cutoff: the fixed cut-off (4.1); 0 for a cut-off of 0."""
+        """gamma_1 + ... + gamma_cutoff, ns^2: the sum over the first `cutoff` lags (4.1); 0 for none."""
         cutoff = checks.integer("cutoff", cutoff, low=0, high=_MAX_LAGS)
         if cutoff <= self.gamma.size:
             return float(self.gamma[:cutoff].sum())
@@ -123,7 +140,7 @@ class HoldingTimeCovariance:
         return best
 
     def automatic_sum(self, tolerance: float = 1e-3) -> float:
-        """`spectral_sum` at the lags and modes of `automatic_rule`."""
+        """`spectral_sum` at the lags and modes of `automatic_rule`, of the same `tolerance`."""
         lags, modes = self.automatic_rule(tolerance)
         return self.spectral_sum(lags, modes)
 
@@ -186,6 +203,8 @@ def holding_time_covariance(
 
     Raises
     ------
+    TypeError
+        No `Flux` or no `System`.
     ValueError
         For arguments out of range, and for a flux of 0: without registrations there are no holding times.
     ConvergenceError

@@ -549,7 +549,7 @@ class Lookup:
     ...     pulse=ml.GaussianPulse(sigma_ns=2.0), detector=ml.Detector(dead_time_ns=75.0),
     ... )
     >>> table = ml.Table.build(system, signal=(0.1, 2.0, 6), background=(0.1, 1.0, 4), tolerance=1e-3)
-    >>> pixels = table.lookup([0.5, 9.0], 0.5, outside="exact")
+    >>> pixels = table.lookup(ml.Flux([0.5, 9.0], 0.5, 30.0), outside="exact")
     >>> pixels.outside
     array([False,  True])
     >>> pixels.rows.shape

@@ -24,7 +24,7 @@ from mars_lidar._base.arguments import checked
 from mars_lidar._base.brief import brief
 from mars_lidar._base.files import reading, reason
 from mars_lidar._base.memory import check_memory
-from mars_lidar._base.progress import of_part, shown
+from mars_lidar._base.progress import callback_of, of_part
 from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import FloatArray, Progress
 from mars_lidar._version import __version__
@@ -83,6 +83,8 @@ class Table:
         Of the exposure statistics.
     provenance
         How the table came to be: version, request, axes in words, seconds, and the error measured at the end.
+    entries, start_phases
+        Cumulants and shapes of every entry, and what the delay adds to the cumulants (docs/table.md, 1 and 3).
     laws
         Exact laws of the count at those entries whose four cumulants do not fix it (`statistics.matched.trusted`).
 
@@ -98,7 +100,7 @@ class Table:
     ...     pulse=ml.GaussianPulse(sigma_ns=2.0), detector=ml.Detector(dead_time_ns=75.0),
     ... )
     >>> table = ml.Table.build(system, signal=(0.1, 2.0, 6), background=(0.1, 1.0, 4), tolerance=1e-3)
-    >>> pixel = table.lookup(0.5, 0.5, delay_ns=30.0)
+    >>> pixel = table.lookup(ml.Flux(0.5, 0.5, 30.0))
     >>> pixel.cumulants[0, :2].round()  # mean and variance of the count
     array([587., 202.])
     >>> cube = ml.simulate(ml.Flux(0.5, 0.5, 30.0), system, engine="mars", table=table)
@@ -179,7 +181,7 @@ class Table:
         tolerance = checks.real("tolerance", tolerance, low=1e-9, high=0.1)
         if not isinstance(check_law, bool):
             raise TypeError(f"check_law must be True or False, got {check_law!r}")
-        progress = shown(progress, "building a table")
+        progress = callback_of(progress, "building a table")
         recipe = Recipe(method, rearm, tolerance, thread_count(threads))
         began = time.perf_counter()
         if goal is None:
@@ -209,7 +211,8 @@ class Table:
     ) -> Table:
         """`build`, or the same table from the user's cache (docs/table.md, 7), which keeps what is built.
 
-        Where nothing can be written there, the table is built, with a warning.
+        Arguments, `options` included, are those of `build`. Where nothing can be written there, the table is built,
+        with a warning.
         """
         own, existing = cls._search(system, signal, background, options)
         if existing is None:
@@ -230,7 +233,8 @@ class Table:
     def cached_path(cls, system: System, signal: Grid, background: Grid, **options: Any) -> Path:
         """File of the table in the cache; built and put there where it is not.
 
-        A table made for another number of cycles is taken where every entry of it holds for those of `system`.
+        Arguments, `options` included, are those of `build`. A table made for another number of cycles is taken where
+        every entry of it holds for those of `system`.
         """
         own, existing = cls._search(system, signal, background, options)
         if existing is None:
@@ -261,7 +265,10 @@ class Table:
 
     @checked
     def save(self, path: str | Path, *, overwrite: bool = False) -> None:
-        """Write to an HDF5 file (.h5, .hdf5), which appears under its name when it is complete."""
+        """Write to an HDF5 file `path` (.h5, .hdf5), which appears under its name when it is complete.
+
+        An existing file is an error but with `overwrite`.
+        """
         made_for = self.system.replace(cycles=self.entries.cycles)
         header = {
             "system": made_for.to_json(),
@@ -279,7 +286,7 @@ class Table:
     @classmethod
     @checked
     def load(cls, path: str | Path, system: System | None = None) -> Table:
-        """The table of a file, for `system` (None: for the one it was made for).
+        """The table of the file `path`, for `system` (None: for the one it was made for).
 
         Raises
         ------
@@ -318,23 +325,20 @@ class Table:
     @checked
     def lookup(
         self,
-        signal: ArrayLike,
-        background: ArrayLike,
+        flux: Flux,
         *,
-        delay_ns: ArrayLike | None = None,
         cycles: int | None = None,
         interpolation: Interpolation = "bilinear",
         outside: Literal["error", "exact"] = "error",
         threads: int | None = 1,
     ) -> Lookup:
-        """Entries for pixels.
+        """Entries for the pixels of a flux.
 
         Parameters
         ----------
-        signal, background, delay_ns
-            S and B, photons per period, and delay of the return, ns: scalars or arrays that broadcast; P is the
-            number of their elements in C order. The delay is of no account where S is 0, and may be NaN there;
-            None: the canonical t_r / 2 everywhere.
+        flux
+            Light of one return a pixel, detected photons per period (`Flux.detected`); P is the number of its pixels,
+            in C order.
         cycles
             Laser periods of the exposure; None: the system's.
         interpolation
@@ -347,8 +351,31 @@ class Table:
 
         Raises
         ------
+        TypeError
+            Naming `flux`, where it is no `Flux`.
         ValueError
-            Naming the range that lies outside of the table; or the entry that does not hold for `cycles`.
+            Naming the range that lies outside of the table; the entry that does not hold for `cycles`; or the flux,
+            where it has a waveform or several returns.
+        """
+        if flux.waveform is not None or len(flux.returns_signal) != 1:
+            raise ValueError("flux must have one return a pixel: a table has none for waveforms or several returns")
+        light = flux.signal, flux.background, flux.delay_ns
+        return self.at(*light, cycles=cycles, interpolation=interpolation, outside=outside, threads=threads)
+
+    def at(
+        self,
+        signal: ArrayLike,
+        background: ArrayLike,
+        delay_ns: ArrayLike | None = None,
+        *,
+        cycles: int | None = None,
+        interpolation: Interpolation = "bilinear",
+        outside: Literal["error", "exact"] = "error",
+        threads: int | None = 1,
+    ) -> Lookup:
+        """`lookup` of arrays `signal`, `background` and `delay_ns` that broadcast, for engines.
+
+        Without delays, at the canonical t_r / 2; `cycles`, `interpolation`, `outside` and `threads` as there.
         """
         checks.choice("interpolation", interpolation, INTERPOLATIONS)
         checks.choice("outside", outside, OUTSIDE)
@@ -439,6 +466,8 @@ class Table:
         samples, seed
             Pixels, log-uniform over the axes, with random delays; with ``"bilinear"`` one in eight lies between 0
             and the lowest value, where the axis has a 0.
+        threads
+            Threads to run on; default: all processors that this process may use.
         """
         checks.choice("interpolation", interpolation, INTERPOLATIONS)
         samples = checks.integer("samples", samples, low=1, high=1_000_000)
@@ -449,7 +478,7 @@ class Table:
         signal, background = (random_pixels(rng, axis, samples, below) for axis in (self.signal, self.background))
         recipe = Recipe(self.method, self.rearm, self.tolerance, thread_count(threads))
         exact = recipe.entries(signal, background, system)
-        looked_up = self.lookup(signal, background, cycles=periods, interpolation=interpolation)
+        looked_up = self.at(signal, background, cycles=periods, interpolation=interpolation)
         shapes = self.shapes(periods)
         mixed = np.stack([w @ shapes[r] for r, w in zip(looked_up.rows, looked_up.weights, strict=True)])
         error = deviations(looked_up.cumulants, exact.cumulants)
@@ -484,14 +513,14 @@ class Table:
     ) -> LawError:
         """Total variation, on random pixels, between the count law that the table leads to and the exact one.
 
-        Some 10 to 20 ms a pixel. Parameters as `quantisation_error`.
+        Some 10 to 20 ms a pixel. `samples`, `seed`, `cycles` and `threads` as for `quantisation_error`.
         """
         samples = checks.integer("samples", samples, low=1, high=100_000)
         rng = np.random.default_rng(checks.integer("seed", seed, low=0, high=2**64 - 1))
         system = self.system if cycles is None else self.system.replace(cycles=cycles)
         signal, background = (random_pixels(rng, axis, samples, True) for axis in (self.signal, self.background))
         delay = rng.uniform(0.0, system.period_ns, samples)
-        law = self.lookup(signal, background, delay_ns=delay, cycles=system.cycles)
+        law = self.at(signal, background, delay, cycles=system.cycles)
         exact = count_law(Flux(signal, background, delay), system, tolerance=self.tolerance, threads=threads)
         matched = matched_pmf(law.cumulants, threads=threads)
         off = np.array([total_variation(w, Pmf(int(exact.support[k, 0]), exact.pmf[k])) for k, w in enumerate(matched)])
@@ -531,12 +560,13 @@ class Table:
     ) -> FloatArray:
         """Share (P,) of the registrations that the shape places wrongly because it is that of the canonical delay.
 
-        Total variation between the table's shape, moved to the delay (P,) by whole bins, and the exact one there, less
-        the same at the canonical delay. Each pixel is evaluated twice by itself.
+        Total variation between the table's shape, moved to the delay `delay_ns` (P,) by whole bins, and the exact one
+        there, less the same at the canonical delay. Each pixel is evaluated twice by itself. `interpolation` and
+        `cycles` are those of `lookup`, `threads` those of `quantisation_error`.
         """
         periods = self._cycles(cycles)
         system = self.system.replace(cycles=periods)
-        entries = self.lookup(signal, background, cycles=periods, interpolation=interpolation)
+        entries = self.at(signal, background, cycles=periods, interpolation=interpolation)
         shapes = self.shapes(periods)
         mixed = np.stack([w @ shapes[r] for r, w in zip(entries.rows, entries.weights, strict=True)])
         half = 0.5 * system.period_ns
@@ -564,7 +594,7 @@ class Table:
         shift = rng.integers(0, system.bins, signal.size)
         delay = 0.5 * system.period_ns + shift * system.bin_ns
         exact = exposure_moments(Flux(signal, background, delay), system, tolerance=self.tolerance, threads=threads)
-        law = self.lookup(signal, background, delay_ns=delay, cycles=cycles, interpolation=interpolation)
+        law = self.at(signal, background, delay, cycles=cycles, interpolation=interpolation)
         turned = np.stack([np.roll(row, k) for row, k in zip(mixed, shift, strict=True)])
         return deviations(law.cumulants, exact.cumulants), 0.5 * np.abs(turned - normalised(exact.histogram)).sum(-1)
 

@@ -49,7 +49,7 @@ def from_attributes(
     if attrs["dtype"] not in ("uint16", "uint32") or not isinstance(attrs["info"], dict):
         raise ValueError(f"dtype must be uint16 or uint32 and info a dictionary, got {attrs['dtype']!r}")
     offsets = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
-    return Timestamps(
+    stream = Timestamps(
         np.ascontiguousarray(times_ns, np.float64),
         np.ascontiguousarray(cycle, np.int32),
         np.ascontiguousarray(bin_, np.int32),
@@ -61,6 +61,10 @@ def from_attributes(
         checks.integer("cycles", attrs["cycles"], low=1, high=2**31),
         dict(attrs["info"]),
     )
+    system = stream.system
+    if system is not None and (system.period_ns, system.bins) != (stream.period_ns, stream.bins):
+        raise ValueError(f"period_ns and bins must be those of its system {system}, got {stream}")
+    return stream
 
 
 def fine_times(times: Timestamps, fine: int, part: slice = slice(None)) -> NDArray[np.int64]:

@@ -57,7 +57,7 @@ class Batch : private BatchPixels {
             if (!done) return true;
             check_draws(draw);
             if (!write_histograms(batch_, work_.history[0], drawing_, draw)) return false;
-            if (grid_.remainder > 0 && !draw_remainders(draw)) return false;
+            if (grid_.laps > 1 && !draw_remainders(draw)) return false;
         }
         return true;
     }
@@ -75,7 +75,7 @@ class Batch : private BatchPixels {
         }
         alignas(64) uint32_t words[kTeam], other[kTeam];
         Uniforms uniforms;
-        for (int i = 0; i < kTeam; ++i) fewest_[i] = static_cast<float>(grid_.pieces);
+        for (int i = 0; i < kTeam; ++i) fewest_[i] = static_cast<float>(pieces_[i]);
         for (int32_t lap = 0, t = 0; lap < grid_.laps; ++lap) {
             MeanLaw law(grid_, work_.rates, work_.sums, scale_);
             for (int32_t j = 0; j < n_; ++j, ++t) {
@@ -101,12 +101,14 @@ class Batch : private BatchPixels {
             const int32_t edge = batch_.first_bin[i] == 0 ? 0 : grid_.bin_cell[grid_.bins - batch_.first_bin[i]];
             exposure_.edge[i] = edge;
             exposure_.active[i] = drawing_[i] ? -1 : 0;
-            spare_[i] = exposure_.start[i] = exposure_.end[i] = 0;
-            exposure_.rank[i] = static_cast<int32_t>(number_of_the_end(i, 1u) * grid_.pieces);
+            spare_[i] = late_[i] = exposure_.start[i] = exposure_.end[i] = 0;
+            exposure_.rank[i] = static_cast<int32_t>(number_of_the_end(i, 1u) * pieces_[i]);
             if (grid_.folded() > 0) spare_[i] = blind_at_an_end(i, 1u, exposure_.end[i]);
             if (!grid_.stationary) continue;
             const int32_t blind = blind_at_an_end(i, 2u, exposure_.start[i]);
-            if (grid_.laps > 1)
+            if (shortened())
+                late_[i] = blind;
+            else if (grid_.laps > 1)
                 exposure_.start[i] += blind * n_;
             else
                 spare_[i] -= blind;
@@ -129,7 +131,7 @@ class Batch : private BatchPixels {
         alignas(64) int32_t slow[kTeam], active[kTeam];
         int32_t some = 0;
         for (int i = 0; i < kTeam; ++i) {
-            number_[i] = grid_.pieces * share_[i] * total_[i];
+            number_[i] = pieces_[i] * share_[i] * total_[i];
             slow[i] = active[i] =
                 drawing_[i] && grid_.laps == 1 && (grid_.folded() > 0 || rate_[i] > kLinearFrom) ? 1 : 0;
             some |= active[i];
@@ -185,7 +187,7 @@ class Batch : private BatchPixels {
     void set_blind() {
         for (int i = 0; i < kTeam; ++i) {
             const double blind = grid_.folded() * number_[i], whole = floor_of(blind);
-            exposure_.armed[i] = grid_.pieces - static_cast<int32_t>(whole) + spare_[i];
+            exposure_.armed[i] = pieces_[i] - static_cast<int32_t>(whole) + spare_[i];
             exposure_.part[i] = static_cast<float>(blind - whole);
         }
     }
@@ -244,10 +246,18 @@ class Batch : private BatchPixels {
                 status(i, draw) = FeedbackStatus::kUnsettled;
             else if (overdrawn_[i])
                 status(i, draw) = FeedbackStatus::kNegative;
-            else if (size > allowed_[i])
+            else if (size > allowed_[i] || remaining(i) < 0.0)
                 status(i, draw) = FeedbackStatus::kUnlikely;
             drawing_[i] = status(i, draw) == FeedbackStatus::kDrawn;
         }
+    }
+
+    // Periods of the exposure after its pieces.
+    double remaining(int i) const {
+        const double whole = shortened() ? grid_.whole : 0;
+        const double taken =
+            whole * static_cast<double>(static_cast<uint32_t>(work_.history[0][row(grid_.path()) + i]));
+        return cycles() - static_cast<double>(pieces_[i]) * grid_.laps - taken - late_[i];
     }
 
     bool draw_remainders(int32_t draw) {
@@ -255,7 +265,7 @@ class Batch : private BatchPixels {
         for (int i = 0; i < kTeam; ++i) {
             if (!drawing_[i]) continue;
             const Remainder rest(grid_, work_.history[0] + i, work_.photons + i, exposure_.edge[i], exposure_.rank[i],
-                                 {key0_[i], key1_[i]});
+                                 remaining(i), {key0_[i], key1_[i]});
             rest.walk([&](int32_t cell) { fits = add_registration(batch_, i, draw, cell) && fits; });
         }
         return fits;
@@ -268,6 +278,7 @@ class Batch : private BatchPixels {
     bool drawing_[kTeam];
     bool overdrawn_[kTeam];  // fewer than no exposures armed in the last sweep
     int32_t spare_[kTeam];   // whole periods blind beyond the end, less those at the start
+    int32_t late_[kTeam];    // whole periods blind at the start, of an exposure whose pieces leave them out
     double number_[kTeam];   // N of a piece, real
 };
 

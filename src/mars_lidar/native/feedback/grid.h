@@ -11,7 +11,6 @@
 namespace mars {
 
 constexpr int64_t kMostCells = int64_t{1} << 28;  // of all laps, that 32 bits count with room to spare
-constexpr const char* kLapsMust = "laps must be 1, or from the dead time and a period on, at most 190";
 
 // The grid with the arrays into which its plain struct points.
 class CellGrid {
@@ -21,7 +20,7 @@ class CellGrid {
     // `kinds` (bins): 2^kind cells for each bin of the lanes' period; `laps` of the integer sweeps. `finer`: so many
     // halvings more.
     CellGrid(const Job& job, const uint8_t* kinds, int32_t laps, int finer = 0) {
-        if (laps < 1 || laps > kMostLaps) throw std::invalid_argument(kLapsMust);
+        if (laps < 1 || laps > kMostLaps) throw std::invalid_argument("laps must be 1 to 190");
         int64_t number = 0;
         for (int32_t b = 0; b < job.bins; ++b) {
             if (kinds[b] + finer >= kKinds) throw std::invalid_argument("kinds must be below 17");
@@ -43,9 +42,8 @@ class CellGrid {
 
         grid.bins = job.bins;
         grid.dead_time = job.dead_time;
+        grid.cycles = job.cycles;
         grid.laps = laps;
-        grid.pieces = job.cycles / laps;
-        grid.remainder = job.cycles % laps;
         grid.stationary = job.stationary;
         grid.whole = static_cast<int32_t>(job.dead_time);
         double rest = (job.dead_time - grid.whole) * job.bins;  // in bins
@@ -55,7 +53,6 @@ class CellGrid {
             grid.whole -= 1;
             rest += job.bins;
         }
-        if (laps > 1 && laps < grid.whole + 2) throw std::invalid_argument(kLapsMust);
         set_edges(rest);
         set_laps();
         grid.edge = edge_.data();
@@ -98,14 +95,14 @@ class CellGrid {
         }
     }
 
-    // Every lap looks back a dead time, the first ones to the last ones.
+    // Every lap looks back a dead time less its whole periods, the first ones to the last ones.
     void set_laps() {
         const int32_t n = grid.cells, path = grid.path();
         grid.lap_watch = path;
         for (int32_t t = 0; t <= path; ++t) {
             const int32_t lap = t == 0 ? 0 : (t - 1) / n;
             FeedbackEdge edge = edge_[static_cast<size_t>(t - lap * n)];
-            int32_t from = lap - edge.turns - (grid.laps > 1 ? grid.whole : 0);
+            int32_t from = lap - edge.turns;
             edge.turns = 0;
             for (; from < 0; from += grid.laps) ++edge.turns;
             edge.late += from * n;

@@ -32,8 +32,9 @@ constexpr int kKinds = 17;
 // One laser period on n internal cells; dead time K periods and a rest of at least two cells, at most one period and
 // a cell. All lanes share the grid; theirs is the period from the lane's first bin on. Made by feedback/grid.h.
 //
-// The integer sweeps run round a circle of L laser periods (laps), which pieces of the exposure go through together;
-// L = 1, or L > K + 1. What the pieces leave of the exposure, less than L periods, is drawn photon by photon.
+// The integer sweeps run round a circle of L laser periods (laps), which pieces of the exposure go through together.
+// Several laps leave the K whole periods of each dead time out: a registration takes K periods from the exposure and
+// moves no phase. What the pieces leave of the exposure is drawn photon by photon.
 struct FeedbackGrid {
     int32_t cells;                 // n
     int32_t bins;                  // of the histogram
@@ -46,13 +47,12 @@ struct FeedbackGrid {
     const uint8_t* kind;           // (n) k of each cell
     double width[kKinds];          // of the cells of each kind, in periods
     double dead_time;              // in periods
+    int32_t cycles;                // N_r
     int32_t laps;                  // L
-    int32_t pieces;                // floor(N_r / L)
-    int32_t remainder;             // N_r - L pieces
     bool stationary;
 
     int32_t path() const { return cells * laps; }  // cells of all laps
-    // Whole periods of the dead time that a sweep of one period leaves to the term K N; several laps look back to them.
+    // Whole periods of the dead time that a sweep of one period leaves to the term K N; several laps leave them out.
     int32_t folded() const { return laps == 1 ? whole : 0; }
 };
 
@@ -60,7 +60,6 @@ struct FeedbackGrid {
 enum class FeedbackStatus : uint8_t {
     kDrawn = 0,
     kSlow = 1,       // the sweeps contract too slowly: all of a pixel
-    kLocked = 2,     // a count law narrower than whole blind periods resolve: all of a pixel
     kFew = 3,        // too few pieces of the exposure for the laps that it needs: all of a pixel
     kUnsettled = 4,  // its sweeps did not end
     kNegative = 5,   // fewer than no exposures armed

@@ -11,7 +11,7 @@ namespace {
 // Most sweeps of the mean and of the adjoint, and of integers in one lap.
 constexpr int kMeanSweeps = 240, kIntegerSweeps = 120;
 constexpr double kSettled = 0.04;    // a move of the history that ends a lane, in standard deviations of the count
-constexpr double kMeanError = 8e-6;  // of the mean per period: float32 sums, and the last sweep's change
+constexpr double kMeanError = 8e-6;  // of the mean per period, or of a count: float32 sums, and the last sweep's change
 constexpr float kSlowest =
     0.95f;  // contraction of a sweep beyond which, or more sweeps than integers have, several laps are needed
 constexpr float kSlowFromPeriods = 0.85f;  // and from which ghosts count where whole periods of the dead time are blind
@@ -32,7 +32,9 @@ class BatchPixels {
     static float clip(float x) { return x > 1e-12f ? x : 1e-12f; }
     static float lesser(float x, float y) { return x < y ? x : y; }
     static double size(double x) { return x < 0.0 ? -x : x; }
-    double cycles() const { return static_cast<double>(grid_.pieces) * grid_.laps + grid_.remainder; }
+    double cycles() const { return grid_.cycles; }
+    // Whether whole periods of the dead time are left out: pieces then take K periods more for each registration.
+    bool shortened() const { return grid_.laps > 1 && grid_.whole > 0; }
     void refuse(int i, FeedbackStatus why) {
         if (refused_[i] == FeedbackStatus::kDrawn) refused_[i] = why;
     }
@@ -104,14 +106,22 @@ class BatchPixels {
             needs_laps_[i] = rate_[i] > kSlowest || taken[i] > kIntegerSweeps;
             total_[i] = static_cast<double>(work_.sums[row(n_) + i]);
             share_[i] = 1.0 / (1.0 + grid_.whole * total_[i]);
-            scale_[i] = static_cast<float>(grid_.pieces * share_[i]);
+            set_pieces(i, cycles());
         }
+    }
+
+    // As many pieces as fit into so many periods of the exposure.
+    void set_pieces(int i, double periods) {
+        const double pieces = floor_of((shortened() ? periods * share_[i] : periods) / grid_.laps);
+        pieces_[i] = pieces > 0.0 ? static_cast<int32_t>(pieces) : 0;
+        scale_[i] = static_cast<float>(grid_.folded() > 0 ? pieces_[i] * share_[i] : pieces_[i]);
     }
 
     // How far a count may be from its mean: 8 standard deviations, the ends of the exposure, and the mean's own error.
     // Where sweeps settle slowly, or in laps, by the variance of the count's law; elsewhere by what a contraction of
-    // rho allows it to be, N (1 + rho) / (1 - rho). Where whole periods of the dead time are blind, the total is found
-    // by a fixed point to half a count: such pixels are refused where the law is narrower.
+    // rho allows it to be, N (1 + rho) / (1 - rho). Where whole periods of the dead time are blind, one lap finds the
+    // total by a fixed point to half a count: pixels need several where the law is narrower. The pieces of several laps
+    // are so few that they and the periods that their registrations take fit into the exposure.
     void bound_counts() {
         bool some = false;
         for (int i = 0; i < kTeam; ++i) some = some || variance_matters(i);
@@ -127,13 +137,20 @@ class BatchPixels {
         }
         for (int i = 0; i < kTeam; ++i) {
             mean_[i] = cycles() * share_[i] * total_[i];
+            const double narrower = shortened() ? 1.0 : share_[i] * share_[i];
             const double law = variance_matters(i)
-                                   ? variance[i] * grid_.laps * share_[i] * share_[i]
+                                   ? variance[i] * grid_.laps * narrower
                                    : mean_[i] * static_cast<double>((1.0f + rate_[i]) / (1.0f - rate_[i]));
-            if (grid_.folded() > 0 && law < kLeastVariance * grid_.folded()) refuse(i, FeedbackStatus::kLocked);
+            if (grid_.folded() > 0 && law < kLeastVariance * grid_.folded()) needs_laps_[i] = true;
             deviation_[i] = root(law > 0.0 ? law : 0.0);
-            const double error = kMeanError * mean_[i] / static_cast<double>(1.0f - lesser(rate_[i], kSlowest));
+            const double error = kMeanError * cycles() * share_[i] * (total_[i] > 1.0 ? total_[i] : 1.0) /
+                                 static_cast<double>(1.0f - lesser(rate_[i], kSlowest));
             const double most = 8.0 * deviation_[i] + 8.0 + 2.0 * total_[i] + error;
+            if (shortened()) {
+                set_pieces(i, cycles() - grid_.whole * (most + 2.0));
+                mean_[i] = static_cast<double>(pieces_[i]) * grid_.laps * total_[i];
+                if (pieces_[i] < kFewestPieces) refuse(i, FeedbackStatus::kFew);
+            }
             if (!(most < 0x1p30)) refuse(i, FeedbackStatus::kSlow);
             allowed_[i] = static_cast<int32_t>(most < 0x1p30 ? most : 0.0);
             // what a last move leaves to be moved is rho / (1 - rho) times as much
@@ -163,7 +180,8 @@ class BatchPixels {
             for (int i = 0; i < kTeam; ++i) {
                 const float count = kModes * rate_[i];
                 const bool slow = rate_[i] > kSlowFromPeriods && count > kGhostsOfDeviation * deviation_[i];
-                if (grid_.laps == 1 && slow && refused_[i] == FeedbackStatus::kDrawn) ask_for_laps(i);
+                const bool few = armed[i] < kFewestArmed;
+                if (grid_.laps == 1 && (few || slow) && refused_[i] == FeedbackStatus::kDrawn) ask_for_laps(i);
             }
             return;
         }
@@ -179,11 +197,12 @@ class BatchPixels {
         }
     }
 
-    // Refuses a lane with the number of laps that it needs: an exposure is armed again every K + 1 of them.
+    // Refuses a lane with the number of laps that it needs.
     void ask_for_laps(int i) {
-        const int32_t laps = laps_needed(forgotten_[i]) * (grid_.whole + 1);
+        const int32_t laps = laps_needed(forgotten_[i]);
         if (laps == grid_.laps) return;
-        const bool short_of = cycles() < kFewestLapCycles || cycles() < kFewestPieces * laps;
+        const double periods = cycles() * share_[i];  // without those that registrations take
+        const bool short_of = periods < kFewestLapCycles || periods < kFewestPieces * laps;
         refuse(i, laps > kMostLaps ? FeedbackStatus::kSlow
                   : short_of       ? FeedbackStatus::kFew
                                    : static_cast<FeedbackStatus>(static_cast<int>(FeedbackStatus::kLaps) + laps));
@@ -203,9 +222,10 @@ class BatchPixels {
     alignas(64) float scale_[kTeam];  // M / (1 + K sum w): exposures for each unit of w
     int32_t forgotten_[kTeam];        // sweep by which the mean has forgotten its start
     int32_t least_[kTeam];            // integer sweeps, at least
+    int32_t pieces_[kTeam];           // of the exposure: N_r with one lap
     double total_[kTeam];             // sum w
     double share_[kTeam];             // 1 / (1 + K sum w)
-    double mean_[kTeam];              // of the count of the exposure
+    double mean_[kTeam];              // of the count of the exposure, or of its pieces
     double deviation_[kTeam];         // its standard deviation, or a bound
     int32_t allowed_[kTeam];          // by how much a count may differ
     float still_[kTeam];              // a move of the history that ends a lane's sweeps

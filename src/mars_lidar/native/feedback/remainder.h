@@ -1,7 +1,8 @@
 // What the laps of the feedback engine leave of an exposure: its last periods, fewer than the laps, photon by photon.
 //
-// The pieces of the exposure are one after another in time, each of L periods. Which of them is the last is decided by
-// its rank among those blind at the end of the laps (Exposure::rank); it goes on from there by itself.
+// The pieces of the exposure are one after another in time, each of L periods and K for each of its registrations. Which
+// of them is the last is decided by its rank among those blind at the end of the laps (Exposure::rank); it goes on from
+// there by itself.
 #pragma once
 #include "feedback/workspace.h"
 #include "numbers/elementary.h"
@@ -15,8 +16,8 @@ constexpr uint32_t kRemainderStage = 3u;  // of the counter: not the numbers of 
 class Remainder {
  public:
     Remainder(const FeedbackGrid& grid, const int32_t* history, const double* photons, int32_t edge, int32_t rank,
-              Pair<uint32_t> key)
-        : grid_(grid), history_(history), photons_(photons), edge_(edge), rank_(rank), key_(key) {}
+              double periods, Pair<uint32_t> key)
+        : grid_(grid), history_(history), photons_(photons), edge_(edge), rank_(rank), periods_(periods), key_(key) {}
 
     // Calls registered(cell) for every registration.
     template <class F>
@@ -25,7 +26,7 @@ class Remainder {
         const double all = before(n), start = grid_.place[edge_];
         if (!(all > 0.0)) return;
         double time = blind();
-        for (uint32_t event = 0; time < grid_.remainder; ++event) {
+        for (uint32_t event = 0; time < periods_; ++event) {
             const double from = start + time, turns = floor_of(from);
             const int32_t here = last(n, [&](int32_t j) { return grid_.place[j] <= from - turns; });
             const double inside = (from - turns - grid_.place[here]) / (grid_.place[here + 1] - grid_.place[here]);
@@ -36,7 +37,7 @@ class Remainder {
             const double step = before(there + 1) - before(there), width = grid_.place[there + 1] - grid_.place[there];
             const double share = step > 0.0 ? (rest - before(there)) / step : 0.0;
             time = round + grid_.place[there] + (share < 1.0 ? share : 1.0) * width - start;
-            if (!(time < grid_.remainder)) return;
+            if (!(time < periods_)) return;
             registered(there);
             time += grid_.dead_time;
         }
@@ -73,7 +74,7 @@ class Remainder {
         const int32_t t = last(path, [&](int32_t at) { return count(at) < index; }), lap = t / grid_.cells;
         const int32_t j = t - lap * grid_.cells;
         const double at = lap + grid_.place[j] + uniform(0) * (grid_.place[j + 1] - grid_.place[j]);
-        const double left = grid_.dead_time - (end - at);
+        const double left = grid_.dead_time - grid_.whole - (end - at);
         return left > 0.0 ? left : 0.0;
     }
 
@@ -81,6 +82,7 @@ class Remainder {
     const int32_t* history_;
     const double* photons_;
     const int32_t edge_, rank_;
+    const double periods_;  // that remain
     const Pair<uint32_t> key_;
 };
 

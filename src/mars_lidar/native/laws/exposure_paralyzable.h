@@ -1,5 +1,5 @@
 // The delay recursion of a paralyzable pixel through one laser period. With G(t) = E z^N(t) and the rate r(t) of
-// registrations (eq. 1 of docs/detectors.md, whose numbers are those here),
+// registrations (docs/theory_detectors.md, (1), whose numbers are those here),
 //     G' = (z - 1) r(t) G(t - t_d),   G = 1 before the exposure                                        (17)
 // so that what a dead time delays is G itself, and the coefficients are moments of r.
 #pragma once

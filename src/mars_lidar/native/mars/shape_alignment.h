@@ -3,7 +3,7 @@
 // Inside a bin the density of registrations is lambda(x) A(x), lambda the pixel's own flux, known exactly, and A the
 // mean armed fraction. A pixel is armed unless it registered within the last dead time, so the shape itself gives A
 // at every edge: A(x) = 1 - [H(x) - H(x - t_d)], H the mean registrations per period up to x (docs/theory_mars.md,
-// 2). Between edges A follows the depletion by the bin's own photons. A shift of the binned values themselves
+// (2.1)). Between edges A follows the depletion by the bin's own photons. A shift of the binned values themselves
 // would smear a narrow pulse over another bin.
 #pragma once
 #include "mars/shape_mixture.h"

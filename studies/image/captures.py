@@ -1,0 +1,51 @@
+"""Real captures, thinned to a few photons a pixel, and judged by what all of their photons say."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar import System, reconstruct
+from mars_lidar._base.types import FloatArray
+from mars_lidar.io import SUFFIXES, Cube, load
+
+FEWEST = 20.0  # signal photons of a pixel of the whole capture, from which on its depth is taken for true
+
+
+@dataclass(frozen=True, eq=False)
+class Capture:
+    """Counts (H, W, bins) of a measured cube, its system; delay, ns, and signal photons of it, and where they are."""
+
+    name: str
+    counts: NDArray[np.generic]
+    system: System
+    delay_ns: FloatArray
+    signal: FloatArray
+    valid: NDArray[np.bool_]
+
+    def thinned(self, photons: float, seed: int) -> tuple[NDArray[np.int64], float]:
+        """Counts of which each photon was kept by chance, so that `photons` of signal remain a pixel; and the share.
+
+        A capture of little light is then as one of less; a pixel that was often dead is not.
+        """
+        share = min(1.0, photons / float(self.signal[self.valid].mean()))
+        return np.random.default_rng(seed).binomial(self.counts.astype(np.int64), share), share
+
+
+def captures(folder: Path) -> Iterator[Capture]:
+    """The first image of each cube in a folder; `mars_lidar.io.foreign_cube` reads those of another program."""
+    for path in sorted(folder.iterdir()):
+        if path.suffix in SUFFIXES:
+            yield capture(path.stem, load(path))
+
+
+def capture(name: str, cube: Cube) -> Capture:
+    """A cube, with maximum likelihood of all its photons for the truth where these are enough."""
+    counts = np.asarray(cube.histogram[0])
+    alone = reconstruct(counts, cube.system, threads=1)
+    signal = alone.signal * cube.system.cycles * cube.system.detector.detection_efficiency
+    return Capture(name, counts, cube.system, alone.delay_ns, signal, alone.detected & (signal > FEWEST))

@@ -1,0 +1,66 @@
+"""Processor time and memory of method "image" on large images, each in a process of its own."""
+
+from __future__ import annotations
+
+import resource
+import sys
+import time
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+
+import numpy as np
+
+from mars_lidar import System
+from mars_lidar.reconstruction import Image
+from mars_lidar.reconstruction.photons import Photons
+from studies.common.report import Row
+
+_ROWS = 64  # drawn at a time
+_OF_RUSAGE = 2**20 if sys.platform == "darwin" else 2**10  # bytes or kilobytes, of a MB
+
+
+def rows(sides: tuple[int, ...], system: System, photons: float, sbr: float) -> list[Row]:
+    """Seconds of one processor and the memory at most, above that of the photons themselves too, for each size."""
+    out: list[Row] = []
+    for side in sides:
+        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as alone:
+            out.append(alone.submit(_cost, side, system, photons, sbr).result())
+    return out
+
+
+def _cost(side: int, system: System, photons: float, sbr: float) -> Row:
+    given, delay = drawn(side, system, photons, sbr)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / _OF_RUSAGE
+    began, at = time.process_time(), time.perf_counter()
+    found = Image().of_photons(given, system, 1)
+    seconds, wall = time.process_time() - began, time.perf_counter() - at
+    off = np.abs((found.delay - delay + 0.5) % 1.0 - 0.5) * system.period_ns
+    return {
+        "pixels": f"{side} x {side}",
+        "processor s": seconds,
+        "wall s": wall,
+        "memory at most, MB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / _OF_RUSAGE,
+        "before, MB": before,
+        "off %": 100.0 * float((off > 3.0 * system.pulse.sigma_ns).mean()),  # type: ignore[attr-defined]
+    }
+
+
+def drawn(side: int, system: System, photons: float, sbr: float, seed: int = 7) -> tuple[Photons, np.ndarray]:
+    """Photons of slopes with steps of 25 pixels a side between them, without dead time, and true delays in periods."""
+    rng = np.random.default_rng(seed)
+    sigma = system.pulse.sigma_ns / system.period_ns  # type: ignore[attr-defined]
+    level = rng.uniform(0.2, 0.8, (side // 25 + 1, side // 25 + 1))
+    parts, delays = [], []
+    for top in range(0, side, _ROWS):
+        y, x = np.mgrid[top : min(top + _ROWS, side), :side]
+        delay = (level[y // 25, x // 25] + 0.02 * sigma * (x % 25) + 0.1 * sigma * (y % 25)).ravel()
+        signal, background = rng.poisson(photons, delay.size), rng.poisson(photons / sbr, delay.size)
+        pixel = np.concatenate([np.repeat(np.arange(delay.size), n) for n in (signal, background)])
+        late = rng.normal(0.0, sigma, signal.sum())
+        at = np.concatenate([np.repeat(delay, signal) + late, rng.random(background.sum())])
+        flat = pixel * system.bins + (at % 1.0 * system.bins).astype(np.int64) % system.bins
+        entry, number = np.unique(flat, return_counts=True)
+        first = np.searchsorted(entry // system.bins, np.arange(delay.size + 1))
+        parts.append(Photons(len(y), side, first, (entry % system.bins).astype(np.int32), number.astype(np.float32)))
+        delays.append(delay)
+    return Photons.joined(parts), np.concatenate(delays)

@@ -1,0 +1,121 @@
+"""Own files that a stranger opened with NumPy, changed and saved again: all sums are right, the content is not."""
+
+from __future__ import annotations
+
+import json
+
+import h5py
+import numpy as np
+import pytest
+from store_cases import SYSTEM, one_return
+
+import mars_lidar as ml
+from mars_lidar import io
+from mars_lidar._base.files import FileError
+from mars_lidar.io.maps import load_maps, save_maps
+
+
+def rewrite(path, name, change):
+    """Replace one member of an archive; of the attributes, a dictionary."""
+    with np.load(path) as archive:
+        members = dict(archive)
+    if name == "attributes":
+        attributes = json.loads(members[name].item())
+        change(attributes)
+        members[name] = np.asarray(json.dumps(attributes))
+    else:
+        members[name] = change(members[name])
+    np.savez(path, **members)
+
+
+COUNTS = {
+    "negative": lambda counts: -counts.astype(np.int64),
+    "NaN": lambda counts: np.where(counts > 0, counts, np.nan),
+    "fractions": lambda counts: counts + 0.25,
+    "complex": lambda counts: counts + 1j,
+    "truth": lambda counts: counts > 0,
+    "text": lambda counts: np.full(counts.shape, "abc"),
+    "records": lambda counts: np.zeros(counts.shape, [("a", "i4")]),
+    "times": lambda counts: np.zeros(counts.shape, "M8[ns]"),
+    "of twice the type": lambda counts: counts.astype(np.uint32),
+    "doubled": lambda counts: 2 * counts,
+    "none": np.zeros_like,
+    "of one row fewer": lambda counts: counts[:, 1:],
+    "of one exposure more": lambda counts: np.concatenate([counts, counts[:1]]),
+}
+
+
+@pytest.mark.parametrize("counts", COUNTS)
+def test_counts_of_an_archive_are_counts_and_add_up(tmp_path, counts):
+    path = tmp_path / "cube.npz"
+    io.simulate_to(path, one_return(), SYSTEM)
+    rewrite(path, "histogram", COUNTS[counts])
+    with pytest.raises(FileError, match=r"cube\.npz"):
+        np.asarray(io.load(path).histogram)
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("depth", lambda depth: np.full(depth.shape, np.inf)),
+        ("depth", lambda depth: depth > 0),
+        ("depth", lambda depth: np.full(depth.shape, 2**63 - 1)),
+        ("signal", lambda signal: np.array(0.0)),
+        ("signal", lambda signal: signal > 0),
+        ("delay", lambda delay: delay.astype(np.float32)),
+        ("attributes", lambda told: told.update(engine=0)),
+        ("attributes", lambda told: told.update(version={})),
+        ("attributes", lambda told: told.update(source=[1])),
+    ],
+)
+def test_the_light_and_the_attributes_of_an_archive_are_what_we_write(tmp_path, name, change):
+    path = tmp_path / "cube.npz"
+    io.simulate_to(path, one_return(), SYSTEM)
+    rewrite(path, name, change)
+    with pytest.raises(FileError, match=r"cube\.npz"):
+        io.load(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("y", lambda y: y[::-1]),
+        ("x", lambda x: x.astype(str)),
+        ("x", lambda x: x[None]),
+        ("realization", lambda numbers: numbers + 0.5),
+        ("method", lambda names: np.arange(len(names))),
+        ("method", lambda names: names[None]),
+        ("attributes", lambda told: told.update(level="{}")),
+        ("attributes", lambda told: told.update(level='{"maximum_likelihood": "high"}')),
+        ("attributes", lambda told: told.update(level='{"maximum_likelihood": -1}')),
+        ("attributes", lambda told: told.update(level=3)),
+        ("attributes", lambda told: told.update(source=None)),
+        ("attributes", lambda told: told.update(version=1)),
+    ],
+)
+def test_the_labels_of_maps_are_what_we_write(tmp_path, name, change):
+    path = tmp_path / "maps.npz"
+    cube = ml.Cube(ml.simulate(one_return(), SYSTEM), SYSTEM)
+    save_maps(path, {"maximum_likelihood": ml.reconstruct(cube)}, source="a test")
+    assert load_maps(path)[1]["source"] == "a test"
+    rewrite(path, name, change)
+    with pytest.raises(FileError, match=r"maps\.npz"):
+        load_maps(path)
+
+
+@pytest.mark.parametrize("system", ["", {}, {"period_ns": 1.0}, [1], SYSTEM.replace(bins=2 * SYSTEM.bins).to_dict()])
+def test_a_stream_has_the_system_of_its_photons(tmp_path, system):
+    path = tmp_path / "photons.npz"
+    ml.simulate_timestamps(one_return(), SYSTEM).save(path)
+    rewrite(path, "attributes", lambda told: told["info"].update(system=system))
+    with pytest.raises(FileError, match=r"photons\.npz"):
+        ml.Timestamps.load(path)
+
+
+@pytest.mark.parametrize("values", [np.ones((2, 2, 8), bool), np.ones((2, 2, 8), complex), np.ones((2, 2, 8), "S3")])
+def test_light_of_another_type_is_an_error_of_the_file(tmp_path, values):
+    """It was a TypeError, as if the caller had given it."""
+    with h5py.File(tmp_path / "light.h5", "w") as file:
+        file["transient"] = values
+    with pytest.raises(ValueError, match=r"light\.h5.*real numbers"):
+        io.read_transient(tmp_path / "light.h5", bin_ns=0.5).flux(SYSTEM, signal=1.0)

@@ -307,9 +307,9 @@ def dataset_rows(path: Path) -> list[tuple[str, str]] | None:
     array, recipe = stored.histogram, stored.recipe
     levels = ", ".join(f"{s:g}/{b:g}" for s, b in recipe.light.levels[:8])
     problems = len(stored.problems)
-    whole = (
-        f"yes; {manifest.description(path)}" if stored.complete else "NO: all parts are there; continue with --resume"
-    )
+    whole = "NO: all parts are there; continue with --resume"
+    if stored.complete:
+        whole = f"yes; {manifest.description(path)}"
     return [
         *rows,
         ("complete", f"NO: {total - len(left)} of {total} parts are there; continue with --resume" if left else whole),

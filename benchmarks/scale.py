@@ -1,8 +1,8 @@
 """`python -m benchmarks.scale`: the table of docs/scale.md, a simulation of the scheduler with measured part times.
 
 Parts are measured by processor time on one thread, in this process. The simulation has their times, drawn anew, the
-rules of `mars_lidar.dataset.cluster` for what is given out, a client that needs `CLIENT_S` a task, one after the other,
-and one file system, which writes `DISK_BYTES_S` for all workers together.
+rules of `mars_lidar.dataset.cluster` for what is given out, the client and the scheduler, each of which handles tasks
+one after the other in the time that `benchmarks.cluster` measures, and one file system for all workers together.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-import mars_lidar as ml
+from benchmarks.cluster import of_a_task, recipe
 from benchmarks.machine import processor
 from mars_lidar.dataset import begin, open_dataset
 from mars_lidar.dataset.cluster import _AHEAD, _LEAST_QUEUED, _TASKS_PER_S, Team
@@ -26,9 +26,14 @@ from mars_lidar.dataset.write import Maker
 
 PAGE = Path(__file__).parents[1] / "docs" / "scale.md"
 BEGIN, END = "<!-- python -m benchmarks.scale -->", "<!-- end -->"
-CUBES, CUBES_OF_A_PART = 1_000_000, 8
-CLIENT_S = 2.5e-3  # of the dask client for a task: an earlier measurement, not repeated by this program
-DISK_BYTES_S = 2e9
+CUBES, CUBES_OF_A_PART = 1_000_000, 50  # the shards that a recipe of so many cubes gets
+PLANS = (
+    (16, 2e9),
+    (160, 2e9),
+    (160, 20e9),
+    (1600, 2e9),
+    (1600, 50e9),
+)  # workers, and bytes a second of the file system
 
 
 @dataclass(frozen=True)
@@ -39,24 +44,10 @@ class Parts:
     nbytes: float
 
 
-def measured(signal: float, parts: int = 12) -> Parts:
-    """Parts of eight cubes of 64 x 64 x 1024 at 1000 cycles, SBR 1, layout sparse."""
-    system = ml.System(
-        period_ns=1e3 / 7.5,
-        cycles=1000,
-        bins=1024,
-        pulse=ml.GaussianPulse(sigma_ns=0.5),
-        detector=ml.Detector(dead_time_ns=75.0),
-    )
+def measured(signal: float, parts: int = 4) -> Parts:
+    """Parts of `CUBES_OF_A_PART` cubes of 64 x 64 x 1024 at 1000 cycles, SBR 1, layout sparse."""
     with tempfile.TemporaryDirectory() as folder:
-        recipe = {
-            "scenes": {"example": "room", "size": 64, "seeds": {"count": parts}},
-            "systems": [system],
-            "light": {"signal": signal},
-            "realizations": CUBES_OF_A_PART,
-            "store": {"layout": "sparse"},
-        }
-        begin(recipe, Path(folder) / "set.zarr")
+        begin(recipe(parts, CUBES_OF_A_PART, signal), Path(folder) / "set.zarr")
         dataset = open_dataset(Path(folder) / "set.zarr", allow_incomplete=True)
         maker, seconds, nbytes = Maker(dataset, 1), [], 0
         for item in dataset.items():
@@ -68,51 +59,60 @@ def measured(signal: float, parts: int = 12) -> Parts:
     return Parts(np.array(seconds), nbytes / len(seconds))
 
 
-def with_scheduler(parts: Parts, workers: int, number: int, random: np.random.Generator) -> tuple[float, float, int]:
+def with_scheduler(
+    parts: Parts,
+    workers: int,
+    disk_bytes_s: float,
+    number: int,
+    costs: dict[str, tuple[float, float]],
+    random: np.random.Generator,
+) -> tuple[float, float, int]:
     """Seconds until the last part, share of the time in which workers make parts, and tasks."""
-    mean = float(parts.seconds.mean())
     team = Team(None, None, lambda: workers, _AHEAD, _LEAST_QUEUED, _TASKS_PER_S)  # type: ignore[arg-type]
-    of_a_task, capacity = team.parts_of_a_task(mean), team.capacity()
     times = random.choice(parts.seconds, number)
-    sums = np.add.reduceat(times, np.arange(0, number, of_a_task))
-    sizes = np.diff(np.append(np.arange(0, number, of_a_task), number)) * parts.nbytes
+    tasks: list[tuple[float, int]] = []  # seconds and parts of each
     events: list[tuple[float, int, str]] = []  # when, which task, what happens to it: it comes, is made, is on disk
     waiting, idle = deque[int](), workers
-    client = disk = 0.0
+    client = scheduler = disk = now = mean = 0.0  # the mean is not known before a task has ended
     given = ended = 0
-    now = 0.0
-    while ended < len(sums):
-        while given < len(sums) and given - ended < capacity:
-            client = max(client, now) + CLIENT_S
-            heapq.heappush(events, (client, given, "comes"))
-            given += 1
+    while ended < len(tasks) or given < number:
+        while given < number and len(tasks) - ended < team.capacity():
+            count = min(team.parts_of_a_task(mean, number - given), number - given)
+            tasks.append((float(times[given : given + count].sum()), count))
+            given += count
+            client_s, scheduler_s = (task + (count - 1) * part for task, part in costs.values())
+            client = max(client, now) + client_s
+            scheduler = max(scheduler, client) + scheduler_s
+            heapq.heappush(events, (scheduler, len(tasks) - 1, "comes"))
         now, task, what = heapq.heappop(events)
         if what == "comes":
             waiting.append(task)
         elif what == "made":
-            disk = max(disk, now) + float(sizes[task]) / DISK_BYTES_S
+            disk = max(disk, now) + tasks[task][1] * parts.nbytes / disk_bytes_s
             heapq.heappush(events, (disk, task, "written"))
         else:
-            ended, idle = ended + 1, idle + 1
+            ended, idle, mean = ended + 1, idle + 1, float(parts.seconds.mean())
         while waiting and idle:
             task, idle = waiting.popleft(), idle - 1
-            heapq.heappush(events, (now + float(sums[task]), task, "made"))
-    return now, float(times.sum()) / (workers * now), len(sums)
+            heapq.heappush(events, (now + tasks[task][0], task, "made"))
+    return now, float(times.sum()) / (workers * now), len(tasks)
 
 
-def by_jobs(parts: Parts, jobs: int, number: int, random: np.random.Generator) -> tuple[float, float]:
+def by_jobs(
+    parts: Parts, jobs: int, disk_bytes_s: float, number: int, random: np.random.Generator
+) -> tuple[float, float]:
     """The same for `--part K/N` with as many jobs as workers."""
     times = [float(each.sum()) for each in np.array_split(random.choice(parts.seconds, number), jobs)]
-    last = max(max(times), number * parts.nbytes / DISK_BYTES_S)
+    last = max(max(times), number * parts.nbytes / disk_bytes_s)
     return last, sum(times) / (jobs * last)
 
 
 def table() -> str:
     """The block of the page."""
-    random = np.random.default_rng(20261123)
+    random, costs = np.random.default_rng(20261123), of_a_task()
     number = CUBES // CUBES_OF_A_PART
     rows = [
-        "| S | workers | parts a task | tasks | scheduler: time | workers busy | jobs: time | workers busy |",
+        "| S | workers | disk, GB/s | tasks | scheduler: time | workers busy | jobs: time | busy |",
         "|---:|---:|---:|---:|---:|---:|---:|---:|",
     ]
     facts = []
@@ -122,18 +122,21 @@ def table() -> str:
             f"S = {signal:g}: {1e3 * parts.seconds.mean() / CUBES_OF_A_PART:.1f} ms and "
             f"{parts.nbytes / CUBES_OF_A_PART / 1e6:.2f} MB a cube"
         )
-        for workers in (16, 160, 1600):
-            took, busy, tasks = with_scheduler(parts, workers, number, random)
-            alone, share = by_jobs(parts, workers, number, random)
+        for workers, disk in PLANS:
+            took, busy, tasks = with_scheduler(parts, workers, disk, number, costs, random)
+            alone, share = by_jobs(parts, workers, disk, number, random)
             rows.append(
-                f"| {signal:g} | {workers} | {-(-number // tasks)} | {tasks:,} | {_span(took)} | {100 * busy:.0f} % | "
-                f"{_span(alone)} | {100 * share:.0f} % |"
+                f"| {signal:g} | {workers} | {disk / 1e9:g} | {tasks:,} "
+                f"| {_span(took)} | {100 * busy:.0f} % | {_span(alone)} | {100 * share:.0f} % |"
             )
+
+    (client, of_client), (scheduler, of_scheduler) = ((1e3 * task, 1e3 * part) for task, part in costs.values())
     date = datetime.datetime.now(datetime.UTC).date()
     note = (
-        f"A million cubes on 1, 10 and 100 nodes of 16 cores; {date}, part times measured on {processor()} by\n"
-        f"processor time ({'; '.join(facts)}), a disk of {DISK_BYTES_S / 1e9:g} GB/s for all workers,\n"
-        f"{1e3 * CLIENT_S:g} ms of the client for a task."
+        f"A million cubes on 1, 10 and 100 nodes of 16 cores, one file system for all; {date}, processor times on\n"
+        f"{processor()}: {'; '.join(facts)}; a task\n"
+        f"{client:.1f} ms of the client and {scheduler:.1f} ms of the scheduler, each further part in it "
+        f"{of_client:.2f} and {of_scheduler:.2f} ms."
     )
     return "\n".join([*rows, "", note])
 

@@ -144,6 +144,11 @@ def epochs(config: Config, bandwidth: Bandwidth) -> Section:
                 opened = StoredDataset(store, batch_size=batch)
                 cases[f"{layout}, first epoch"] = lambda s=store: sum(1 for _ in StoredDataset(s, batch_size=batch))
                 cases[f"{layout}, later epochs"] = lambda d=opened: sum(1 for _ in d)
+                examples = StoredDataset(store)
+                if layout == "sparse":
+                    cases["sparse, examples that the loader collates"] = lambda d=examples: sum(
+                        1 for _ in torch.utils.data.DataLoader(d, batch_size=batch)
+                    )
             stream = CubeStream(
                 _system(config), "room", size=SIDE, epoch_size=4 * scenes, batch_size=batch, signal=level, sbr=1.0,
                 threads=1, ahead=0,

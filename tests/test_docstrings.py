@@ -38,17 +38,20 @@ def _resolve(dotted: str) -> Any:
     return thing
 
 
-@lru_cache(maxsize=1)
-def public() -> dict[str, Any]:
-    """Public functions and classes by their shortest names below the package."""
-    names = {f"{package}.{name}" for package in PACKAGES for name in _resolve(package).__all__ if package}
-    names |= set(ml.__all__)
+def _in_the_reference() -> Iterator[str]:
     module = ""
     for line in REFERENCE.read_text(encoding="utf-8").splitlines():
         if match := re.match(r"\.\. currentmodule:: mars_lidar\.?(\S*)", line):
             module = match[1]
         elif match := re.match(r"   ([\w.]+)$", line):
-            names.add(f"{module}.{match[1]}".strip("."))
+            yield f"{module}.{match[1]}".strip(".")
+
+
+@lru_cache(maxsize=1)
+def public() -> dict[str, Any]:
+    """Public functions and classes by their shortest names below the package."""
+    names = {f"{package}.{name}" for package in PACKAGES for name in _resolve(package).__all__ if package}
+    names |= {*ml.__all__, *_in_the_reference()}
     things: dict[int, tuple[str, Any]] = {}
     for name in sorted(names, key=lambda each: (len(each), each)):
         thing = _resolve(name)
@@ -98,6 +101,11 @@ def test_the_example_of_a_docstring(name: str):
         pytest.skip("no example yet" if name.startswith(UNFINISHED) else "an error has none")
     results = doctest.DocTestRunner(optionflags=FLAGS).run(test)
     assert results.failed == 0
+
+
+def test_every_public_name_has_a_page():
+    pages = {id(_resolve(name)) for name in _in_the_reference()}
+    assert not [name for name, thing in public().items() if id(thing) not in pages]
 
 
 @pytest.mark.parametrize("name", public())

@@ -81,17 +81,6 @@ def test_public_names_are_documented(name: str):
                 assert inspect.getdoc(getattr(thing, member)), f"{name}.{member}"
 
 
-@pytest.mark.parametrize("name", ["simulate", "simulate_timestamps"])
-def test_every_argument_is_documented_and_typed(name: str):
-    function = getattr(ml, name)
-    text = inspect.getdoc(function)
-    for parameter in inspect.signature(function).parameters.values():
-        assert parameter.annotation is not inspect.Parameter.empty
-        if name == "simulate":  # the other refers to it
-            many = parameter.kind is inspect.Parameter.VAR_KEYWORD
-            assert f"\n{'**' if many else ''}{parameter.name}\n" in text
-
-
 def test_every_option_of_an_engine_is_documented_where_it_is_given():
     text = inspect.getdoc(ml.simulate)
     for name in EngineOptions.__annotations__:

@@ -82,10 +82,13 @@ def test_parts_in_flight_follow_the_workers_that_are_there():
     assert team.capacity() == 512
     threads[0] = 320
     assert team.capacity() == 960
-    assert team.parts_of_a_task(0.0) == 1
-    assert team.parts_of_a_task(10.0) == 1
-    assert team.parts_of_a_task(0.5) == 13  # 320 workers make 640 such parts a second: 49 tasks
-    assert team.parts_of_a_task(1e-6) == 1000
+    many = 1_000_000
+    assert team.parts_of_a_task(0.0, many) == 1
+    assert team.parts_of_a_task(10.0, many) == 1
+    assert team.parts_of_a_task(0.5, many) == 13  # 320 workers make 640 such parts a second: 49 tasks
+    assert team.parts_of_a_task(1e-6, many) == 1000
+    assert team.parts_of_a_task(0.5, 1000) == 3  # of the last parts each worker gets some
+    assert team.parts_of_a_task(0.5, 100) == 1
 
 
 def test_a_worker_of_another_version_is_refused_before_it_writes(tmp_path):

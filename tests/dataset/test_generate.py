@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import warnings
 from pathlib import Path
 
@@ -16,7 +17,7 @@ import mars_lidar as ml
 from mars_lidar import io
 from mars_lidar._base import manifest
 from mars_lidar.dataset import DatasetRecipe, estimate, open_dataset, read_sparse, verify
-from mars_lidar.dataset.arrays import with_zeros
+from mars_lidar.dataset.arrays import histogram_blocks, with_zeros
 from tests.harness.command import command_line
 
 
@@ -153,13 +154,13 @@ def test_damage_is_found(tmp_path, recipe):
     with_zeros(zarr.open_group(tmp_path / "set.zarr", mode="r+", use_consolidated=False)["histogram"])[5, 1] = counts
     told = verify(tmp_path / "set.zarr", chunks=None)
     assert not told.good
-    assert "histogram/c/5/0/0/0/0 is not as it was written" in told.different[0]
-    assert "histogram/c/5/0/0/0/0 is not as it was written" in told.different[1]
+    assert "histogram/c.5.0.0.0.0 is not as it was written" in told.different[0]
+    assert "histogram/c.5.0.0.0.0 is not as it was written" in told.different[1]
     manifest.seal(tmp_path / "set.zarr", {})  # a manifest that agrees with what is there
     told = verify(tmp_path / "set.zarr", chunks=None)
     assert told.different[0].startswith("histogram[5:6, 1:2, ")
     assert "differs in 1 bins" in told.different[0]
-    shard = max((tmp_path / "set.zarr/histogram/c").rglob("*"), key=lambda one: one.stat().st_size * one.is_file())
+    shard = max((tmp_path / "set.zarr/histogram").glob("c.*"), key=lambda path: path.stat().st_size)
     content = bytearray(shard.read_bytes())
     content[30] ^= 4
     shard.write_bytes(content)
@@ -256,6 +257,26 @@ def test_estimates_come_near(tmp_path, recipe):
     assert told.shape == (8, 3, 48, 48, 32)
     assert told.bytes - maps == pytest.approx(found, rel=0.25)
     assert told.memory_bytes < 1.5 * 2**30
+
+
+def test_many_shards(tmp_path, recipe):
+    """All are files of one folder; in a large dataset they are larger, unless the recipe gives their size."""
+    ml.generate(recipe, tmp_path / "set.zarr")
+    shards = list((tmp_path / "set.zarr/histogram").glob("c.*"))
+    assert len(shards) > 8
+    assert not any(path.is_dir() for path in (tmp_path / "set.zarr/histogram").iterdir())
+    for samples, most in ((8, 1), (1_000_000, 20_500), (30_000_000, 100_000)):
+        plan = DatasetRecipe.from_dict(recipe | {"store": {}})
+        whole, dtype, _, shard = histogram_blocks(plan, samples, (64, 64))
+        assert math.prod(-(-n // step) for n, step in zip(whole, shard, strict=True)) <= most
+        assert most == 1 or math.prod(shard) * dtype.itemsize >= 30 * 2**20
+    with pytest.raises(ValueError, match=r"store\.shard_mib must be larger, got 0\.01: 200,000 files"):
+        ml.generate(
+            recipe | {"scenes": {"example": "room", "size": [12, 10]}, "realizations": 100_000}
+            | {"store": {"chunk_mib": 0.01, "shard_mib": 0.01}, "light": {"signal": [0.1, 1.0]}, "systems": SYSTEM},
+            tmp_path / "many.zarr",
+        )  # fmt: skip
+    assert not (tmp_path / "many.zarr").exists()
 
 
 def test_bad_arguments(tmp_path, recipe):

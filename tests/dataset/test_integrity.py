@@ -124,11 +124,11 @@ def test_changed_labels_coordinates_and_inputs_are_found_without_a_manifest_too(
         with pytest.raises(FileError, match=f"{name}/c/0 is not as it was written"):
             verify(dataset, chunks=1)
         group[name][...] = was
-    scene = dataset / "scenes/depth/c/0/0/0"
+    scene = dataset / "scenes/depth/c.0.0.0"
     was_there = scene.read_bytes()
     scene.write_bytes(was_there[:-1] + b"\0")
     found = verify(dataset).different
-    assert found[0] == "scenes/depth/c/0/0/0 is not as it was written"
+    assert found[0] == "scenes/depth/c.0.0.0 is not as it was written"
     assert "cannot be read" in found[1]
     scene.write_bytes(was_there)
     (dataset / manifest.NAME).rename(dataset / "away")

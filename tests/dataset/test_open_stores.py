@@ -100,28 +100,28 @@ def test_a_replaced_npz_is_not_read_under_the_old_labels(tmp_path):
 
 
 def test_empty_and_exchanged_shards(store):
-    shards = sorted(path for path in (store / "histogram/c").rglob("*") if path.is_file())
+    shards = sorted((store / "histogram").glob("c.*"))
     contents = [path.read_bytes() for path in shards]
     shards[0].write_bytes(contents[1])
     shards[1].write_bytes(contents[0])
-    with pytest.raises(FileError, match=r"histogram/c/.* is not as it was written"):
+    with pytest.raises(FileError, match=r"histogram/c\..* is not as it was written"):
         np.asarray(open_dataset(store).histogram)
     shards[0].write_bytes(b"")
-    with pytest.raises(FileError, match=r"histogram/c/.* is not as it was written"):
+    with pytest.raises(FileError, match=r"histogram/c\..* is not as it was written"):
         np.asarray(open_dataset(store).histogram)
 
 
 def test_a_line_that_is_taken_out_of_the_manifest_is_missed(store):
     path = store / manifest.NAME
     lines = path.read_text().splitlines(keepends=True)
-    gone = next(line for line in lines if "histogram/c/" in line)
+    gone = next(line for line in lines if "histogram/c." in line)
     path.write_text("".join(line for line in lines if line != gone))
     with pytest.raises(FileError, match=r"its manifest\.sha256 is not that of its zarr\.json"):
         open_dataset(store)
     path.write_text("".join(lines))
     (store / gone.split()[1]).unlink()
     manifest.seal(store, {})  # as if it had been written so
-    with pytest.raises(FileError, match=r"histogram/c/.* is not in its manifest"):
+    with pytest.raises(FileError, match=r"histogram/c\..* is not in its manifest"):
         open_dataset(store)
 
 

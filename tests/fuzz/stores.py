@@ -91,7 +91,7 @@ def attack(kind: str, store: Path, other: Path, random: np.random.Generator) -> 
         shutil.copytree(other, store)
         return "the store replaced"
     files = sorted(path for path in store.rglob("*") if path.is_file() and path.stat().st_size)
-    chunks = [path for path in files if "/c/" in path.as_posix()]
+    chunks = [path for path in files if "/c/" in path.as_posix() or path.name.startswith("c.")]
     file = chunks[random.integers(len(chunks))] if random.random() < 0.8 else files[random.integers(len(files))]
     inside = file.relative_to(store)
     content = file.read_bytes()

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from mars_lidar import _core
 from mars_lidar.statistics import ConvergenceError, PhaseChain
 from mars_lidar.statistics import cells as cells_module
 from mars_lidar.statistics import exposure as exposure_module
+from mars_lidar.statistics.budget import MOMENTS
 from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.exposure import exposure_moments, native_light, stationary_histogram
 
@@ -252,7 +254,7 @@ def test_convergence_errors_name_the_cell(monkeypatch):
     with pytest.raises(ConvergenceError, match=r"S = 200, B = 1 .* still move"):
         exposure_moments(ml.Flux([200.0], 1.0, 50.0), make_system(0.001, bins=1, sigma=0.05), tolerance=1e-8)
     monkeypatch.undo()
-    monkeypatch.setattr(cells_module, "_MAX_STEPS", 1)
+    monkeypatch.setattr(cells_module, "MOMENTS", replace(MOMENTS, one_pass=1))
     slow = make_system(1.97, cycles=10**6, bins=1)
     with pytest.raises(ConvergenceError, match=r"S = 10, B = 0.01 .*does not repeat"):
         exposure_moments(ml.Flux(10.0, 0.01, 50.0), slow)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 
 import mars_lidar as ml
 from mars_lidar.statistics import cells, joint
+from mars_lidar.statistics.budget import LAW
 from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.histogram import mean_histogram
 from mars_lidar.statistics.phase_chain import ConvergenceError
@@ -61,7 +63,8 @@ def test_mean_histogram(name: str, monkeypatch: pytest.MonkeyPatch):
         found = ml.registration_pdf(flux, system, method)
         with monkeypatch.context() as patch:
             patch.setattr(cells, "MANY_BINS", 2**20)
-            patch.setattr("mars_lidar.statistics.histogram.LAW_STEPS", 10**9)  # a reference may take its time
+            longer = replace(LAW, recursion=1e9, one_pass=1e9)  # a reference may take its time
+            patch.setattr("mars_lidar.statistics.histogram.LAW", longer)
             known = ml.registration_pdf(flux, system, method)
         assert 0.5 * np.abs(found - known).sum() < 1e-6
         assert np.abs(found - known).max() < 1e-4 * known.max()

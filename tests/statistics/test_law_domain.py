@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -17,6 +18,7 @@ from mars_lidar.statistics import cells as cells_module
 from mars_lidar.statistics import count_pmf as pmf_module
 from mars_lidar.statistics import exposure as exposure_module
 from mars_lidar.statistics import joint as pixel_module
+from mars_lidar.statistics.budget import LAW
 from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.joint_grid import FoldedGrid, left_over
 from tests.harness.law_map import disagreements, draw, laws
@@ -202,7 +204,7 @@ def test_laws_on_a_lattice_take_all_points(monkeypatch: pytest.MonkeyPatch, latt
     monkeypatch.setattr(pmf_module, "characteristic", transform)
     variance = 0.3 * 10_000 * lattice**2
     size = 2 * math.ceil(8 * math.sqrt(variance))
-    found = pmf_module._narrow(Cells.of(1.0, 1.0, system), size, 128, 1, variance, pmf_module.StepBudget())
+    found = pmf_module._narrow(Cells.of(1.0, 1.0, system), size, 128, 1, variance, pmf_module.Remaining())
     assert (found is not None) == seen
 
 
@@ -276,7 +278,7 @@ def test_work_of_refused_laws(
     monkeypatch.setattr(exposure_module, "_run", told)
     with pytest.raises(ConvergenceError, match="the limit of a law"):
         ml.count_law(ml.Flux(signal, 0.0, 50.0), view(dead, cycles, sigma, start))
-    assert sum(done) <= cells_module.LAW_STEPS
+    assert sum(done) <= LAW.recursion
 
 
 # The joint law of an exposure that forgets its start long before its end
@@ -286,7 +288,7 @@ def test_joint_law_known_to_settle(monkeypatch: pytest.MonkeyPatch):
     """Given up after some 50 of 300 periods, the fall of the distance so far tells when it is within the tolerance."""
     system = view(2.04, 10**7)
     law = ml.joint_law(ml.Flux(4.0, 0.1, 50.0), system)
-    monkeypatch.setattr(pixel_module, "_MAX_STEPS", 100_000)
+    monkeypatch.setattr(pixel_module, "LAW", replace(LAW, forgetting=100_000))
     early = ml.joint_law(ml.Flux(4.0, 0.1, 50.0), system)
     assert early.settled == pytest.approx(law.settled, rel=0.1)
     assert early.settled != law.settled
@@ -320,7 +322,7 @@ def test_refusals_say_what_to_use(signal: float, background: float, dead: float,
 def test_a_law_that_is_refused_is_to_be_had_elsewhere(monkeypatch: pytest.MonkeyPatch):
     system = view(2.04, 20_000)
     expected = exposure_moments(ml.Flux(4.0, 0.1, 50.0), system)
-    monkeypatch.setattr("mars_lidar.statistics.law.LAW_STEPS", 10_000)
+    monkeypatch.setattr("mars_lidar.statistics.law.LAW", replace(LAW, recursion=1e4, one_pass=1e4))
     with pytest.raises(ConvergenceError, match="exposure_moments, which may take"):
         ml.count_law(ml.Flux(4.0, 0.1, 50.0), system)
     assert exposure_moments(ml.Flux(4.0, 0.1, 50.0), system).mean == expected.mean

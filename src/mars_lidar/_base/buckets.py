@@ -50,6 +50,14 @@ def put(path: Any, content: bytes) -> None:
     path.fs.pipe_file(path.path, content)
 
 
+def content_of(path: Any) -> bytes:
+    """The bytes of a file or an object; of an object as it is now, whatever an earlier listing of its folder says."""
+    if in_bucket(path):
+        path.fs.invalidate_cache(path.path)
+    content: bytes = path.read_bytes()
+    return content
+
+
 def sizes(folder: Any) -> dict[str, int]:
     """Bytes of all objects below a path, by their names from there on; the object store is asked anew."""
     folder.fs.invalidate_cache()

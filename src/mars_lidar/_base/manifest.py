@@ -27,7 +27,7 @@ from mars_lidar._base.files import FileError, check_claim, reading, replacing
 NAME = "manifest.sha256"
 _ROOT = "zarr.json"
 _SMALL = re.compile(r"(^|/)zarr\.json$|^[^/]+/c/\d+$")  # documents, and arrays of one dimension: coordinates
-_CHUNK = re.compile(r"(^|/)c(/\d+)+$")
+_CHUNK = re.compile(r"(^|/)c([/.]\d+)+$")
 SUM = "manifest_sha256"  # attribute of the root document: the the sum over the lines of all other files
 _THREADS = 4  # hashing runs without Python's lock
 

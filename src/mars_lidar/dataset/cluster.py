@@ -54,11 +54,16 @@ class Team:
         """Tasks that are given out at a time."""
         return max(self.least_queued, self.ahead * self.threads())
 
-    def parts_of_a_task(self, seconds: float) -> int:
-        """Parts that one task makes, where each takes so many seconds (0: not known yet)."""
-        if seconds <= 0.0:
+    def parts_of_a_task(self, seconds: float, remaining: int) -> int:
+        """Parts that one task makes, where each takes so many seconds (0: not known yet).
+
+        As many as keep the scheduler at its rate, but of the remaining parts of a run no more than a worker's share.
+        """
+        workers = self.threads()
+        if seconds <= 0.0 or workers == 0:
             return 1
-        return max(1, min(_LARGEST_TASK, math.ceil(self.threads() / (seconds * self.tasks_per_s))))
+        enough = math.ceil(workers / (seconds * self.tasks_per_s))
+        return max(1, min(_LARGEST_TASK, enough, remaining // workers))
 
 
 def reach(scheduler: str | None) -> None:

@@ -15,7 +15,7 @@ from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.files import FileError, reading
 from mars_lidar._base.native import _core
-from mars_lidar.dataset.samples import grid
+from mars_lidar.dataset.arrays import grid
 from mars_lidar.dataset.shard import is_good
 from mars_lidar.dataset.store import Dataset, open_dataset
 
@@ -137,7 +137,7 @@ def read_block(dataset: Dataset, place: tuple[int, int], maps: Sequence[str]) ->
     array = dataset.histogram
     with reading(dataset.path, "a dataset of mars-lidar"):
         files = {
-            (y, x): dataset.read("/".join(map(str, ("histogram", "c", *place, y, x, 0))))
+            (y, x): dataset.read("histogram/" + array.metadata.encode_chunk_key((*place, y, x, 0)))
             for y, x in np.ndindex(grid(array.shape[2:4], array.shards[2:4]))
         }
         some = slice(place[0] * array.shards[0], (place[0] + 1) * array.shards[0])
@@ -160,7 +160,7 @@ def _packed(dataset: Dataset, place: tuple[int, ...]) -> NDArray[np.uint8]:
     each = tuple(shard // chunk for shard, chunk in zip(array.shards, array.chunks, strict=True))
     shard = tuple(p // n for p, n in zip(place, each, strict=True))
     inside = int(np.ravel_multi_index(tuple(p % n for p, n in zip(place, each, strict=True)), each))
-    path = dataset.path.joinpath("histogram", "c", *map(str, shard))
+    path = dataset.path / "histogram" / array.metadata.encode_chunk_key(shard)
     with reading(dataset.path, "a dataset of mars-lidar"):
         dataset.check(path)
         with open(path, "rb") as stream:

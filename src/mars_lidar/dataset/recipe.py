@@ -62,7 +62,8 @@ class DatasetRecipe:
     layout
         ``"sparse"``: bins that are not zero, packed; ``"dense"``: readable by every Zarr library.
     chunk_mib, shard_mib
-        Upper limits of a chunk (what is read at once) and a shard (a file), as dense counts.
+        Upper limits of a chunk (what is read at once) and a shard (a file), as dense counts. shard_mib None: 64, in
+        large datasets more.
     """
 
     scenes: tuple[dict[str, Any], ...]
@@ -76,7 +77,7 @@ class DatasetRecipe:
     seed: int = 0
     layout: str = "dense"
     chunk_mib: float = 8.0
-    shard_mib: float = 64.0
+    shard_mib: float | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data from which `from_dict` makes an equal recipe: the form of the YAML file, files read in."""
@@ -91,7 +92,11 @@ class DatasetRecipe:
             "light": {name: value for name, value in light.items() if value is not None},
             "engine": self.engine,
             "realizations": self.realizations,
-            "store": {"layout": self.layout, "chunk_mib": self.chunk_mib, "shard_mib": self.shard_mib},
+            "store": {
+                "layout": self.layout,
+                "chunk_mib": self.chunk_mib,
+                **({} if self.shard_mib is None else {"shard_mib": self.shard_mib}),
+            },
         }
 
     def to_json(self) -> str:
@@ -110,9 +115,8 @@ class DatasetRecipe:
         """
         root = values.read_mapping((), data, ROOT, needed=("scenes", "systems"))
         crop, store = root.get("crop", {}), root.get("store") or values.read_mapping(("store",), {}, STORE)
-        store.setdefault("shard_mib", max(64.0, store["chunk_mib"]))
-        chunk, shard = store["chunk_mib"], store["shard_mib"]
-        if shard < chunk:
+        chunk, shard = store["chunk_mib"], store.get("shard_mib")
+        if shard is not None and shard < chunk:
             raise RecipeError(("store", "shard_mib"), f"shard_mib must be at least chunk_mib, {chunk:g}, got {shard:g}")
         systems = _systems(root["systems"], folder or Path())
         engine = values.checked(("engine",), _engine, root["engine"], systems)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import itertools
 import json
 import math
 import os
@@ -40,7 +39,7 @@ from mars_lidar.dataset.ingest import create
 from mars_lidar.dataset.recipe import DatasetRecipe
 from mars_lidar.dataset.store import Dataset, Item, open_dataset
 from mars_lidar.dataset.write import Failed, Made, Maker, fingerprint
-from mars_lidar.io.scan import Problem
+from mars_lidar.io.scene_files import Problem
 
 _NAMED = 5  # parts that an error names
 BUFFER_BYTES = 512 * 2**20  # of all chunks that are made at the same time on one machine
@@ -545,19 +544,18 @@ def _here(dataset: Dataset, parts: int, threads: int | None) -> Iterator[Team]:
             stop.set()  # the simulator looks at it every 50 ms, and the pool waits for all threads
             raise
         for maker in makers:
-            maker.note()
+            maker.notes.write()
 
 
 def _make_all(team: AbstractContextManager[Team], todo: Sequence[Item], add: Callable[[Made], None]) -> None:
     """Make parts, some of them at a time; raises WriteError at the end where some could not be written."""
-    waiting, failed, seconds = iter(todo), list[Failed](), 0.0
+    given, failed, seconds = 0, list[Failed](), 0.0
     with team as crew:
         running: set[Future[list[Made | Failed]]] = set()
         while True:
-            while len(running) < crew.capacity():
-                batch = list(itertools.islice(waiting, crew.parts_of_a_task(seconds)))
-                if not batch:
-                    break
+            while len(running) < crew.capacity() and given < len(todo):
+                batch = todo[given : given + crew.parts_of_a_task(seconds, len(todo) - given)]
+                given += len(batch)
                 running.add(crew.executor.submit(crew.make, batch))
             if not running:
                 break

@@ -14,10 +14,11 @@ All float64; the last five are there where a scene needs them.
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
@@ -28,9 +29,9 @@ from numpy.typing import NDArray
 
 from mars_lidar._base.buckets import in_bucket
 from mars_lidar._base.files import reading
-from mars_lidar.dataset import samples
-from mars_lidar.dataset.arrays import create_maps
+from mars_lidar.dataset.arrays import FLAT_KEYS, create_maps, fitting, grid
 from mars_lidar.dataset.sample_content import Rendered, Shown, Surfaces
+from mars_lidar.dataset.shard import DigestNotes
 from mars_lidar.instrument.system import System
 from mars_lidar.io.layout import Variable
 from mars_lidar.io.store import OnDisk
@@ -55,7 +56,8 @@ class SceneWriter:
         self.store = store
         self._group = store.require_group("scenes")
         self._most, self._source = most, source
-        self._notes = path / "scenes" / _NOTES
+        self._notes, self._path = path / "scenes" / _NOTES, path
+        self._digests = DigestNotes(path)
         self._arrays: dict[str, Any] = {}
         self._held: list[Shown] = []
         self._kinds: list[str] = []
@@ -126,7 +128,19 @@ class SceneWriter:
             add(self._group, [Variable("kind", ("scene", "letter"), _rows(self._kinds), "1", "what it is, JSON")])
         if not in_bucket(self._notes):
             self._notes.unlink(missing_ok=True)
+        for name in set(self._arrays) & {*_LAYERS, "total"}:  # their shards fill up scene by scene
+            self._note(name, range(-(-self._written // self._arrays[name].shards[0])))
+        self._digests.write()
         return self._written
+
+    def _note(self, name: str, places: Iterable[int]) -> None:
+        """Note the digests of the files of an array at some places along its scenes."""
+        array = self._arrays[name]
+        blocks = grid(array.shape[1:], (array.shards or array.chunks)[1:])
+        for place in itertools.product(places, *map(range, blocks)):
+            path = self._path / "scenes" / name / array.metadata.encode_chunk_key(place)
+            if path.exists():  # where all values are the fill value there is none
+                self._digests.add_content(path)
 
     def _flush(self) -> None:
         part = slice(self._written, self._written + len(self._held))
@@ -141,6 +155,7 @@ class SceneWriter:
                 maps["background"] = [nothing if each is None else each for each in light]
             for name, values in maps.items():
                 self._arrays[name][part] = np.stack(values)
+                self._note(name, [part.start // self._arrays[name].shards[0]])
             note = {
                 "source": self._source,
                 "position": self.position,
@@ -172,10 +187,11 @@ class SceneWriter:
                 "transient",
                 shape=shape,
                 dtype=_DOUBLE,
-                chunks=samples.fitting((1, *shape[1:]), (1, 1, 1, bins), _DOUBLE.itemsize, _RATE_BYTES),
+                chunks=fitting((1, *shape[1:]), (1, 1, 1, bins), _DOUBLE.itemsize, _RATE_BYTES),
                 compressors=blosc(_DOUBLE, "zstd", 1, "shuffle"),
                 fill_value=0.0,
                 dimension_names=("scene", "y", "x", "bin"),
+                chunk_key_encoding=FLAT_KEYS,
                 attributes={"long_name": "rendered light per bin", "units": "relative"},
             )
             dims = ("scene", "y", "x")
@@ -188,6 +204,7 @@ class SceneWriter:
             rows = slice(first, min(first + step, height))
             array[number, rows, :, :bins] = scene.transient.rows(rows)
         self._arrays["total"][number] = scene.transient.totals
+        self._note("transient", [number])
 
     def _maps(self, name: str, shape: tuple[int, ...], dims: tuple[str, ...], unit: str) -> Any:
         return create_maps(self._group, name, shape, _DOUBLE, dims, name.replace("_", " of the "), unit)

@@ -1,4 +1,4 @@
-"""Writing a shard of counts chunk by chunk (Zarr v3, sharding codec, index at the end).
+"""Writing a shard of counts chunk by chunk (Zarr v3, sharding codec, index at the end), and digests of written files.
 
 zarr-python takes a whole shard at once: it copies every chunk into a fresh array before it packs it, which cost as much
 as the packing. Here a chunk is packed while it is still in the processor's cache, and a shard is never in memory.
@@ -10,6 +10,8 @@ import contextlib
 import hashlib
 import io
 import itertools
+import secrets
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -17,10 +19,11 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar._base.buckets import in_bucket, put
+from mars_lidar._base.buckets import content_of, in_bucket, put
 from mars_lidar._base.files import replacing
 from mars_lidar._base.native import _core
 
+_NOTE_S = 10.0  # between two writes of digests in an object store: what a killed worker loses is read again
 _NONE = 2**64 - 1  # offset and length of a chunk that is not there
 Region = tuple[slice, ...]
 
@@ -98,3 +101,43 @@ def _whole(path: Path) -> Iterator[BinaryIO]:
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as stream:
         yield stream
+
+
+def digests_of(store: Path) -> Path:
+    """Folder of the notes of an incomplete store: Zarr looks at all else in a group, but not in an array."""
+    return store / "histogram" / "digests"
+
+
+class DigestNotes:
+    """Notes SHA-256, size and name of each file that a writer has written: `Dataset.finish` reads none of them again.
+
+    Each writer has a file of its own, so that writers on many machines need not wait for each other.
+    """
+
+    def __init__(self, store: Path) -> None:
+        self._store = store
+        self._file = digests_of(store) / f"{secrets.token_hex(8)}.txt"
+        self._lines: list[str] = []
+        self._written_at = time.monotonic()
+
+    def add(self, path: Path, size: int, digest: str) -> None:
+        """Note a file."""
+        line = f"{digest} {size} {path.relative_to(self._store).as_posix()}\n"
+        if in_bucket(self._store):  # nothing can be appended to an object
+            self._lines.append(line)
+            self.write(_NOTE_S)
+            return
+        self._file.parent.mkdir(parents=True, exist_ok=True)
+        with open(self._file, "a", encoding="utf-8") as lines:
+            lines.write(line)
+
+    def add_content(self, path: Path) -> None:
+        """Note a file that has just been written, by its content."""
+        content = content_of(path)
+        self.add(path, len(content), hashlib.sha256(content).hexdigest())
+
+    def write(self, wait_s: float = 0.0) -> None:
+        """Write the notes on an object store, unless they were written within so many seconds."""
+        if self._lines and time.monotonic() - self._written_at >= wait_s:
+            put(self._file, "".join(self._lines).encode())
+            self._written_at = time.monotonic()

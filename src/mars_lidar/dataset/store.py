@@ -27,17 +27,26 @@ from numpy.typing import NDArray
 
 from mars_lidar._base import checks, manifest
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.buckets import in_bucket, place_of, remove, sizes, zarr_store
+from mars_lidar._base.buckets import content_of, in_bucket, place_of, remove, sizes, zarr_store
 from mars_lidar._base.files import INCOMPLETE_SUFFIX, FileError, IncompleteFileError, reading
-from mars_lidar.dataset.arrays import FORMAT, FORMAT_VERSION, MAPS, MORE_VERSION, mark, with_zeros
+from mars_lidar.dataset.arrays import (
+    FORMAT,
+    FORMAT_VERSION,
+    MAPS,
+    MORE_VERSION,
+    block,
+    grid,
+    mark,
+    sample_parts,
+    with_zeros,
+)
 from mars_lidar.dataset.recipe import DatasetRecipe
 from mars_lidar.dataset.sample_content import Rendered
-from mars_lidar.dataset.samples import block, grid, sample_parts
 from mars_lidar.dataset.scenes import SceneReader
-from mars_lidar.dataset.shard import is_good
+from mars_lidar.dataset.shard import digests_of, is_good
 from mars_lidar.io.cube import Cube
 from mars_lidar.io.recipe import Recipe
-from mars_lidar.io.scan import Problem
+from mars_lidar.io.scene_files import Problem
 from mars_lidar.io.store import OnDisk
 from mars_lidar.light.transient import Transient
 from mars_lidar.scene.layers import LayeredScene
@@ -163,8 +172,8 @@ class Dataset:
 
     def files(self, item: Item) -> list[Path]:
         """The files of a part."""
-        names = ("histogram",) if item.kind == "histogram" else tuple(MAPS)
-        return [self.path.joinpath(name, "c", *map(str, item.shard)) for name in names]
+        arrays = {"histogram": self.histogram} if item.kind == "histogram" else self.maps
+        return [self.path / name / array.metadata.encode_chunk_key(item.shard) for name, array in arrays.items()]
 
     def missing(self, items: Iterable[Item] | None = None) -> list[Item]:
         """Those of some parts, or of all, that are not there, or whose files were cut short."""
@@ -216,18 +225,14 @@ class Dataset:
         assert self.sums is not None, "incomplete stores are not read by name"
         return self.sums.read(name)
 
-    @property
-    def digests(self) -> Path:
-        """Folder of the lines that writers append while the store is incomplete: SHA-256, size and name of a file."""
-        return self.path / "histogram" / "digests"  # Zarr looks at all else in a group, but not in an array
-
     def written(self) -> dict[str, tuple[int, str]]:
         """Size and SHA-256 of files by name, as their writers noted them."""
         noted: dict[str, tuple[int, str]] = {}
-        if in_bucket(self.path) and not self.digests.exists():
+        folder = digests_of(self.path)
+        if in_bucket(self.path) and not folder.exists():
             return noted
-        for file in sorted(self.digests.glob("*.txt"), key=str):
-            for line in file.read_text("utf-8").splitlines():
+        for file in sorted(folder.glob("*.txt"), key=str):
+            for line in content_of(file).decode().splitlines():
                 digest, size, name = (*line.split(" ", 2), "", "")[:3]
                 if name and size.isdecimal() and len(digest) == 64:  # the last line of a killed writer may be cut
                     noted[name] = int(size), digest
@@ -251,10 +256,10 @@ class Dataset:
             there = sizes(self.path)
             digests = {name: digest for name, (size, digest) in noted.items() if there.get(name) == size}
             if noted:
-                remove(self.digests)
+                remove(digests_of(self.path))
         else:
             digests = {name: digest for name, (size, digest) in noted.items() if _has_size(self.path / name, size)}
-            shutil.rmtree(self.digests, ignore_errors=True)
+            shutil.rmtree(digests_of(self.path), ignore_errors=True)
         manifest.seal(self.path, {"stage": "done", "complete": True}, digests)
         self.attrs = manifest.root_document(self.path)["attributes"]
 

@@ -4,23 +4,19 @@ from __future__ import annotations
 
 import errno
 import hashlib
-import secrets
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar._base.buckets import in_bucket, put
-from mars_lidar.dataset.arrays import MAPS, with_zeros
+from mars_lidar.dataset.arrays import MAPS, sample_parts, with_zeros
 from mars_lidar.dataset.sample_content import Shown
-from mars_lidar.dataset.samples import sample_parts
-from mars_lidar.dataset.shard import chunks_of, packer, write_shard
+from mars_lidar.dataset.shard import DigestNotes, chunks_of, packer, write_shard
 from mars_lidar.dataset.store import Dataset, Item
 from mars_lidar.instrument.detector import Detector
 from mars_lidar.instrument.pulse import GaussianPulse
@@ -28,7 +24,6 @@ from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.simulation import simulate
 
-_NOTE_S = 10.0  # between two writes of the digests in an object store: what a killed worker loses is read again
 _KEPT = 4  # scenes and fluxes that a maker remembers: neighbours in the order of parts share them
 
 
@@ -73,9 +68,7 @@ class Maker:
         self._scene = lru_cache(_KEPT)(lambda number: dataset.scenes.read(number))
         self.flux = lru_cache(_KEPT)(self._lit)  # photons of a sample
         self._last: tuple[tuple[int, ...], Flux] | None = None
-        self._lines: list[str] = []
-        self._noted_at = time.monotonic()
-        self._note: Path | None = None  # its own, so that writers on many machines need not wait for each other
+        self.notes = DigestNotes(dataset.path)
 
     def attempt(self, item: Item, pauses_s: Sequence[float] = (0.2, 1.0, 5.0)) -> Made | Failed:
         """`make`, again after each pause where the file system fails for a moment; other errors are raised."""
@@ -86,7 +79,8 @@ class Maker:
                 if error.errno not in TRANSIENT:
                     raise
                 if pause is None:
-                    return Failed(self.dataset.files(item)[0].name, error.errno, error.strerror or str(error))
+                    name = self.dataset.files(item)[0].relative_to(self.dataset.path).as_posix()
+                    return Failed(name, error.errno, error.strerror or str(error))
                 time.sleep(pause)
         raise AssertionError("the last attempt returns")
 
@@ -97,34 +91,12 @@ class Maker:
             for name, values in self.maps(item.region[0]).items():
                 with_zeros(self.dataset.group[name])[item.region] = values
             for path in self.dataset.files(item):
-                content = path.read_bytes()
-                self._noted(path, len(content), hashlib.sha256(content).hexdigest())
+                self.notes.add_content(path)
             return Made(0.0, time.perf_counter() - began)
         self._simulate_s = 0.0
         (path,) = self.dataset.files(item)
-        self._noted(path, *write_shard(path, self._packed(item)))
+        self.notes.add(path, *write_shard(path, self._packed(item)))
         return Made(self._simulate_s, time.perf_counter() - began - self._simulate_s)
-
-    def _noted(self, path: Path, size: int, digest: str) -> None:
-        """Append a line on a file that was written: `Dataset.finish` then reads none of them again."""
-        line = f"{digest} {size} {path.relative_to(self.dataset.path).as_posix()}\n"
-        if self._note is None:
-            folder = self.dataset.digests
-            if not in_bucket(folder):
-                folder.mkdir(exist_ok=True)
-            self._note = folder / f"{secrets.token_hex(8)}.txt"
-        if in_bucket(self._note):  # nothing can be appended to an object
-            self._lines.append(line)
-            self.note(wait_s=_NOTE_S)
-            return
-        with open(self._note, "a", encoding="utf-8") as lines:
-            lines.write(line)
-
-    def note(self, wait_s: float = 0.0) -> None:
-        """Write the lines of an object store, unless they were written within so many seconds."""
-        if self._lines and self._note is not None and time.monotonic() - self._noted_at >= wait_s:
-            put(self._note, "".join(self._lines).encode())
-            self._noted_at = time.monotonic()
 
     def _packed(self, item: Item) -> Iterator[bytes | None]:
         """The chunks of a shard, one after the other."""

@@ -35,6 +35,7 @@ from mars_lidar.instrument.pulse import SampledPulse
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.light.stored_flux import StoredFlux
+from mars_lidar.statistics.budget import MOMENTS, advice
 from mars_lidar.statistics.gate import PLAIN, open_parts, require_mode
 
 # --- Arguments -----------------------------------------------------------------------------------------------------
@@ -335,14 +336,10 @@ def _extent(cells: Cells) -> tuple[float, float]:
 _MIN_BINS = 128  # bins of the coarsest first grid
 _MAX_FIRST_BINS = 2**14  # bins of the finest first grid; refinement goes beyond where the tolerance demands it
 _BINS_PER_WIDTH = 4.0 * math.sqrt(math.pi)  # bins in 1 / integral of s^2, 2 sqrt(pi) sigma: a bin is sigma / 2
-_MAX_STEPS = 4_000_000_000  # bins x periods after which a cell counts as not settling: minutes
-LAW_STEPS = 26_000_000  # bins x periods that a law may take: 2 s
 # Sweeps towards the stationary state: at most 400, or 10^7 bins x sweeps, at least 4; beyond, `warm_history` solves it
 _WARM_PERIODS, _WARM_STEPS, _LEAST_WARM = 400, 10_000_000, 4
 _CHUNK_BYTES = 64 << 20  # memory of the energies and histograms computed together
-_MAX_HISTORY_BYTES = 1 << 30  # memory of the registrations of one dead time, in each thread
 _NEAR_BYTES, _MIDDLE_BYTES = 1 << 19, 1 << 25  # history: 15 to 60 ns a step; up to 100 ns; beyond, 100 to 350 ns
-_SIMULATE = "simulate it with engine 'exact'"
 _SETTLED = 1e-12  # relative change of the state per period at which it counts as repeating (20)
 
 
@@ -527,7 +524,7 @@ class Cells:
         """Advice for an error: use one of `names`, or `instead`."""
         if self.system.detector.mode == "nonparalyzable" and not meets_itself(self):
             names = (*names, "joint_law (mean, variance and mean histogram)", "method 'mars' (a Gaussian)")
-        return f"use {', '.join(names)}, or {_SIMULATE}" if names else _SIMULATE
+        return advice(*names)
 
     @property
     def _sharpness(self) -> float:
@@ -564,12 +561,12 @@ class Cells:
             followed_edges(self.part(slice(0, 1)), bins, self.follow)[0] if self.follow else np.arange(bins + 1) / bins
         )
 
-    def grid(self, bins: int, out_bins: int, steps: int | None = None) -> _core.ExposureGrid:
-        """The native grid of `bins` bins per period; a cell fails after `steps` bins x periods (None: 4e9)."""
+    def grid(self, bins: int, out_bins: int, steps: float | None = None) -> _core.ExposureGrid:
+        """The native grid of `bins` bins per period; a cell fails after `steps` bins x periods (None: minutes)."""
         whole, shift, fraction = whole_bins(self.system.dead_time_periods, bins)
         return _core.ExposureGrid(
             cycles=self.system.cycles,
-            max_periods=max(10_000, _MAX_STEPS // bins) if steps is None else max(1, steps // bins),
+            max_periods=max(10_000, int(MOMENTS.one_pass / bins)) if steps is None else max(1, int(steps / bins)),
             whole=whole,
             bins=bins,
             out_bins=out_bins,
@@ -600,11 +597,11 @@ class Cells:
     def check_history(self, bins: int) -> None:
         """Raise MemoryError where the registrations of one dead time do not fit in memory."""
         needed = int(self.grid(bins, 1).bytes)
-        if needed > _MAX_HISTORY_BYTES:
+        if needed > MOMENTS.history:
             raise MemoryError(
                 f"exposure statistics of {self.name(0)}: {bins} bins per period need "
                 f"{needed / 2**30:.3g} GiB to remember one dead time, at most "
-                f"{_MAX_HISTORY_BYTES / 2**30:g} GiB are allowed; {self.instead}"
+                f"{MOMENTS.history / 2**30:g} GiB are allowed; {self.instead}"
             )
 
     def energies(self, bins: int) -> tuple[FloatArray, NDArray[np.int32]]:

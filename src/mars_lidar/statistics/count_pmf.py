@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from mars_lidar._base.native import _core
 from mars_lidar._base.types import FloatArray, IndexArray
+from mars_lidar.statistics.budget import LAW
 from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.exposure import NOT_WARM, UNSETTLED, native_light, refined_moments, warm_history
 from mars_lidar.statistics.phase_chain import ConvergenceError
@@ -92,7 +93,6 @@ def gaussian_window(mean: float, variance: float) -> Pmf:
 
 # --- The generating function and its cost --------------------------------------------------------------------------
 
-_MAX_STEPS = 80_000_000  # bins x periods x batches of points for the law of one cell: a second
 _LANES = 8  # points of the circle evaluated together
 # Bytes of the history beyond which a step costs 4 times as much (as for a dead time below one bin), and 24 times
 _NEAR_BYTES, _FAR_BYTES, _FAR = 1 << 20, 1 << 26, 4.0
@@ -100,28 +100,28 @@ _PERIOD_BINS = 128.0  # bins that take as long as the work done once a period
 
 
 class TooLongError(ConvergenceError):
-    """The state did not repeat within the step budget of a law."""
+    """The state did not repeat within the budget of a law."""
 
 
-class StepBudget:
-    """Remaining steps (bins x periods, `_LANES` points at once) for the law of one cell; `share` of the full budget."""
+class Remaining:
+    """Steps of `Budget.transform` that the law of one cell may still take; at first a `share` of all."""
 
     def __init__(self, share: float = 1.0) -> None:
-        self.steps = share * _MAX_STEPS
+        self.steps = share * LAW.transform
 
 
 def characteristic(
-    cells: Cells, z_re: FloatArray, z_im: FloatArray | None, bins: int, threads: int, budget: StepBudget | None = None
+    cells: Cells, z_re: FloatArray, z_im: FloatArray | None, bins: int, threads: int, remaining: Remaining | None = None
 ) -> tuple[FloatArray, FloatArray]:
     """E z^N (re, im) of each cell at its points z (cells, points); without `z_im` log E z^N at real z."""
-    budget, batches = budget or StepBudget(), math.ceil(z_re.shape[1] / _LANES)
+    remaining, batches = remaining or Remaining(), math.ceil(z_re.shape[1] / _LANES)
     dead = cells.system.dead_time_periods
     reach = 256.0 * bins * (min(dead, float(cells.system.cycles)) + 1.0)
     cost = 6.0 * _FAR if reach > _FAR_BYTES else _FAR if reach > _NEAR_BYTES or dead * bins < 1.0 else 1.0
     cost *= 1.0 + _PERIOD_BINS / bins
     # at real points the registrations of every period of a dead time are summed
     cost *= 1.0 + (min(dead, float(cells.system.cycles)) / bins if z_im is None else 0.0)
-    steps = max(int(budget.steps / cost) // batches, bins)
+    steps = max(int(remaining.steps / cost) // batches, bins)
     grid = cells.grid(bins, 1, steps)
     re, im = np.empty(z_re.shape), np.empty(z_re.shape)
     settled = np.empty(z_re.shape, np.int64)
@@ -154,7 +154,7 @@ def characteristic(
             f"variance and two more cumulants are known; for the law {cells.instead}"
         )
     taken = np.where(settled >= 0, settled, cells.system.cycles).mean(-1).max()
-    budget.steps = max(budget.steps - float(taken) * bins * batches * cost, 1.0)
+    remaining.steps = max(remaining.steps - float(taken) * bins * batches * cost, 1.0)
     return re, im
 
 
@@ -282,7 +282,7 @@ def _supports(
     unit = np.minimum(1.0 / np.maximum(spread, 1e-300), np.minimum(growth, _MAX_TILT) / _TILTS[-1])
     tilt = _TILTS * unit[:, None]
     tilt = np.concatenate([tilt, -tilt], axis=1)
-    log_value = characteristic(cells, np.exp(tilt), None, bins, threads, StepBudget(_FOR_SUPPORT))[0]
+    log_value = characteristic(cells, np.exp(tilt), None, bins, threads, Remaining(_FOR_SUPPORT))[0]
     with np.errstate(invalid="ignore"):
         # P(N >= edge) <= tail for a positive tilt, P(N <= edge) <= tail for a negative one
         edge = (log_value - math.log(TAIL)) / tilt
@@ -322,12 +322,12 @@ def _window(cell: Cells, first: int, last: int, outside: float, bins: int, threa
     """Exact pmf of one cell on the counts `first` to `last`."""
     from scipy.fft import irfft  # of lengths with a large prime factor twice as fast as NumPy's
 
-    counts, budget = last - first + 1, StepBudget()
+    counts, remaining = last - first + 1, Remaining()
     size = counts + counts % 2
-    value = _narrow(cell, size, bins, threads, variance, budget) if size > _ALL_POINTS else None
+    value = _narrow(cell, size, bins, threads, variance, remaining) if size > _ALL_POINTS else None
     if value is None:
         angle = 2.0 * np.pi * np.arange(size // 2 + 1) / size
-        re, im = characteristic(cell, np.cos(angle)[None], np.sin(angle)[None], bins, threads, budget)
+        re, im = characteristic(cell, np.cos(angle)[None], np.sin(angle)[None], bins, threads, remaining)
         value = re[0] - 1j * im[0]
     # the transform has e^(-i angle n): the conjugate; index n mod size holds count n (23)
     folded = np.asarray(irfft(value, size))
@@ -335,7 +335,7 @@ def _window(cell: Cells, first: int, last: int, outside: float, bins: int, threa
 
 
 def _narrow(
-    cell: Cells, size: int, bins: int, threads: int, variance: float, budget: StepBudget
+    cell: Cells, size: int, bins: int, threads: int, variance: float, remaining: Remaining
 ) -> NDArray[np.complex128] | None:
     """Conjugate of E z^N at the points (size // 2 + 1,) of the circle, evaluated where it is not 0; None if unproven.
 
@@ -355,7 +355,7 @@ def _narrow(
     end = 0
     while end < angle.size:
         some = slice(end, min(end + step, angle.size))
-        re, im = characteristic(cell, np.cos(angle[some])[None], np.sin(angle[some])[None], bins, threads, budget)
+        re, im = characteristic(cell, np.cos(angle[some])[None], np.sin(angle[some])[None], bins, threads, remaining)
         value[some] = re[0] - 1j * im[0]
         end = some.stop
         if np.abs(value[some]).max() <= _QUIET:
@@ -363,10 +363,10 @@ def _narrow(
     spread = math.sqrt(variance * shorter / cycles)
     begin = min(4.0 / spread, np.pi)
     between = np.geomspace(angle[min(end, angle.size - 1)], max(begin, angle[min(end, angle.size - 1)]), 16)
-    re, im = characteristic(cell, np.cos(between)[None], np.sin(between)[None], bins, threads, budget)
+    re, im = characteristic(cell, np.cos(between)[None], np.sin(between)[None], bins, threads, remaining)
     beyond = np.linspace(begin, np.pi, 2 + math.ceil((np.pi - begin) * spread / 0.3))
     brief = replace(cell, system=cell.system.replace(cycles=shorter))
-    short_re, short_im = characteristic(brief, np.cos(beyond)[None], np.sin(beyond)[None], bins, threads, budget)
+    short_re, short_im = characteristic(brief, np.cos(beyond)[None], np.sin(beyond)[None], bins, threads, remaining)
     highest = float(np.hypot(short_re, short_im).max())
     faint = float(np.hypot(re, im).max()) <= 10.0 * _QUIET
     return value if faint and highest ** (cycles / shorter) <= 1e-3 * _QUIET else None

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,7 @@ from mars_lidar.instrument.detector import Mode
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
+from mars_lidar.statistics.budget import LAW, MOMENTS, Budget, advice
 from mars_lidar.statistics.cells import Cells, photons_before
 from mars_lidar.statistics.count_pmf import MARGIN, REACH, Pmf, exact_windows
 from mars_lidar.statistics.exposure import Moments, refined_moments, stationary_histogram
@@ -38,23 +39,10 @@ _BLOCK = 64  # bins advanced together
 Rows = NDArray[Any]  # real or complex
 
 
-@dataclass(frozen=True)
-class Effort:
-    """Largest cost of a statistic: entries of the kernel, multiplications for moments and for points of a law."""
-
-    numbers: int
-    moments: float
-    points: float
-
-    @property
-    def instead(self) -> str:
-        """Advice for the error of a statistic that exceeds this cost."""
-        goes_on = self.numbers < MOST_EFFORT.numbers
-        return f"{'use electronics_moments, which may take longer, or ' * goes_on}simulate it with engine 'exact'"
-
-
-MOST_EFFORT = Effort(1 << 27, 4e10, 3e11)  # kernel 1 GiB, moments half a minute
-LAW_EFFORT = Effort(1 << 24, 1.2e9, 2e10)  # count laws and histograms: 2 s
+def _instead(budget: Budget) -> str:
+    """Advice for the error of a statistic that exceeds its budget."""
+    larger = budget.record_kernel < MOMENTS.record_kernel
+    return advice(*(["electronics_moments, which may take longer"] if larger else []))
 
 
 class RecordGrid:
@@ -73,18 +61,18 @@ class RecordGrid:
         Periods that the kernel spans.
     """
 
-    def __init__(self, cell: Cells, bins: int, electronics: float, effort: Effort = MOST_EFFORT) -> None:
-        self.cell, self.bins, self.cycles, self.effort = cell, bins, cell.system.cycles, effort
+    def __init__(self, cell: Cells, bins: int, electronics: float, budget: Budget = MOMENTS) -> None:
+        self.cell, self.bins, self.cycles, self.budget = cell, bins, cell.system.cycles, budget
         before = photons_before(cell, np.arange(bins + 1) / bins)[0]
         self.photons = np.maximum(np.diff(before), 0.0)
         self.shift, self.part = bins_of(cell.system.dead_time_periods, bins)
         self.off, self.off_part = bins_of(electronics, bins)
         self.steps = self.off + self.shift + 4
         self.periods = (self.steps + bins) // bins + 2
-        if self.steps * bins > effort.numbers:
+        if self.steps * bins > budget.record_kernel:
             raise ConvergenceError(
                 f"statistics of {cell.name(0)}, t_e = {electronics:g} periods: {bins} bins per period are not enough, "
-                f"and more take too long or do not fit in 1 GiB; {effort.instead}"
+                f"and more take too long or do not fit in 1 GiB; {_instead(budget)}"
             )
         self.kernel, self.late = self._kernel()
         self.first, self.first_armed = self._first()
@@ -300,7 +288,7 @@ def electronics_moments(
     return moments(cells, tolerance)
 
 
-def moments(cells: Cells, tolerance: float, effort: Effort = MOST_EFFORT) -> ElectronicsMoments:
+def moments(cells: Cells, tolerance: float, budget: Budget = MOMENTS) -> ElectronicsMoments:
     """`electronics_moments` of checked cells."""
     tolerance = checks.real("tolerance", tolerance, low=1e-6, high=0.1)
     out = cells.system
@@ -318,7 +306,7 @@ def moments(cells: Cells, tolerance: float, effort: Effort = MOST_EFFORT) -> Ele
         grid = exposure.bins.reshape(-1)
     else:
         for k in range(cells.size):
-            mean[k], variance[k], histogram[k], grid[k] = refined(bare.part(slice(k, k + 1)), slower, tolerance, effort)
+            mean[k], variance[k], histogram[k], grid[k] = refined(bare.part(slice(k, k + 1)), slower, tolerance, budget)
     if timing is not None:
         histogram = timing.forward(histogram)
     shape = cells.shape
@@ -350,22 +338,22 @@ def coarsest_grid(cell: Cells) -> int:
 
 
 def refined(
-    cell: Cells, electronics_ns: float, tolerance: float, effort: Effort = MOST_EFFORT
+    cell: Cells, electronics_ns: float, tolerance: float, budget: Budget = MOMENTS
 ) -> tuple[float, float, FloatArray, int]:
     """Mean, variance, mean histogram and bins of the final grid, for one cell of `without_electronics`."""
     system = cell.system
     out, electronics = system.bins, electronics_ns / system.period_ns
     bins = coarsest_grid(cell)
-    coarse, before = _Run(cell, bins, electronics, effort), None
-    remaining = effort.moments - coarse.spent
+    coarse, before = _Run(cell, bins, electronics, budget), None
+    remaining = budget.record_moments - coarse.spent
     while True:
         bins *= 2
         if 4.0 * coarse.spent > remaining:  # as many periods, twice the bins, kernels twice as long
             raise ConvergenceError(
                 f"electronics_moments of {cell.name(0)}: {bins} bins per period take too long, and fewer are not "
-                f"enough; {effort.instead}"
+                f"enough; {_instead(budget)}"
             )
-        fine = _Run(cell, bins, electronics, replace(effort, moments=remaining))
+        fine = _Run(cell, bins, electronics, replace(budget, record_moments=remaining))
         remaining -= fine.spent
         # the error is quadratic in the bin width: extrapolate to the limit (Richardson)
         limit = np.array([fine.mean, fine.variance])
@@ -413,18 +401,18 @@ def rebinned(cell: Cells, fine: FloatArray, coarse: FloatArray, out: int) -> Flo
 class _Run:
     """Moments of one pixel on one grid, by running through the exposure period by period."""
 
-    def __init__(self, cell: Cells, bins: int, electronics: float, effort: Effort) -> None:
+    def __init__(self, cell: Cells, bins: int, electronics: float, budget: Budget) -> None:
         self.cycles = cell.system.cycles
         self.mean = self.variance = self.spent = 0.0  # spent: multiplications
         self.rate = np.zeros(bins)
         if float(cell.total[0]) > 0.0:
-            self._run(RecordGrid(cell, bins, electronics, effort))
+            self._run(RecordGrid(cell, bins, electronics, budget))
 
     def _run(self, grid: RecordGrid) -> None:
         """Records period by period, and the number of those before each (12), (13)."""
         run = RecordRun(grid, np.array([1.0, 0.0]), lambda now: np.stack([now[0], now[0] + now[1]]))
         a_period = grid.bins * (grid.shift + 64.0) + _A_BLOCK * len(run.blocks)
-        budget = min(self.cycles, max(100, int(grid.effort.moments / a_period)))
+        periods = min(self.cycles, max(100, int(grid.budget.record_moments / a_period)))
         pairs, growth, steady, last = 0.0, 0.0, 0, np.zeros((2, grid.bins))
         for period in range(self.cycles):
             now = run.period()
@@ -441,10 +429,10 @@ class _Run:
                 self.rate += remaining * records
                 pairs += remaining * float(weighted.sum()) + 0.5 * remaining * (remaining + 1.0) * growth
                 break
-            if period >= budget:
+            if period >= periods:
                 raise ConvergenceError(
-                    f"electronics_moments of {grid.cell.name(0)}: the state does not repeat within {budget} periods; "
-                    f"{grid.effort.instead}"
+                    f"electronics_moments of {grid.cell.name(0)}: the state does not repeat within {periods} periods; "
+                    f"{_instead(grid.budget)}"
                 )
         self.mean = float(self.rate.sum())
         self.variance = 2.0 * pairs + self.mean - self.mean**2  # E N (N - 1) is twice the pairs
@@ -476,10 +464,10 @@ def _shape(cell: Cells, electronics_ns: float, out: int, tolerance: float) -> Fl
         return np.zeros(out)
     electronics = electronics_ns / cell.system.period_ns
     bins = coarsest_grid(cell)
-    coarse = _phases(RecordGrid(cell, bins, electronics, LAW_EFFORT))
+    coarse = _phases(RecordGrid(cell, bins, electronics, LAW))
     while True:
         bins *= 2
-        fine = _phases(RecordGrid(cell, bins, electronics, LAW_EFFORT))
+        fine = _phases(RecordGrid(cell, bins, electronics, LAW))
         if 0.5 * float(np.abs(fine.reshape(-1, 2).sum(-1) - coarse).sum()) <= tolerance:
             return rebinned(cell, fine, coarse, out)
         coarse = fine
@@ -556,16 +544,16 @@ def record_windows(cells: Cells, tolerance: float, threads: int) -> list[Pmf]:
 def _window(cell: Cells, electronics_ns: float, tolerance: float) -> Pmf:
     if float(cell.total[0]) == 0.0:
         return Pmf(0, np.ones(1), 0.0)
-    mean, variance, _, bins = refined(cell, electronics_ns, tolerance, LAW_EFFORT)
+    mean, variance, _, bins = refined(cell, electronics_ns, tolerance, LAW)
     electronics = electronics_ns / cell.system.period_ns
-    grids = [RecordGrid(cell, n, electronics, LAW_EFFORT) for n in (bins, bins // 2)]
+    grids = [RecordGrid(cell, n, electronics, LAW) for n in (bins, bins // 2)]
     most = math.floor(cell.system.cycles / electronics) + 1
     spread = math.sqrt(variance)
     half = math.ceil(REACH * spread + MARGIN)
-    budget = [LAW_EFFORT.points]  # multiplications
+    remaining = [LAW.record_points]  # multiplications
     while True:
         first, last = max(math.floor(mean) - half, 0), min(math.ceil(mean) + half, most)
-        fine, coarse = (_folded(grid, first, last, budget) for grid in grids)
+        fine, coarse = (_folded(grid, first, last, remaining) for grid in grids)
         pmf = fine + (fine - coarse) / 3.0  # the limit for fine grids
         ends = max(pmf[0] if first > 0 else 0.0, pmf[-1] if last < most else 0.0)
         if abs(ends) <= _EDGE:
@@ -588,10 +576,10 @@ def _window(cell: Cells, electronics_ns: float, tolerance: float) -> Pmf:
     return Pmf(first, pmf / pmf.sum(), outside)
 
 
-def _folded(grid: RecordGrid, first: int, last: int, budget: list[float]) -> FloatArray:
+def _folded(grid: RecordGrid, first: int, last: int, remaining: list[float]) -> FloatArray:
     """P(N = n) for n from `first` to `last`, by (23) of docs/theory_exposure.md.
 
-    `budget` is a list of the remaining multiplications, from which the cost is subtracted.
+    `remaining` is a list of the multiplications left of the budget, from which the cost is subtracted.
     """
     counts = last - first + 1
     size = counts + counts % 2
@@ -599,14 +587,14 @@ def _folded(grid: RecordGrid, first: int, last: int, budget: list[float]) -> Flo
     value = np.zeros(angle.size, np.complex128)
     for start in range(0, angle.size, _POINTS):
         some = np.exp(1j * angle[start : start + _POINTS])
-        value[start : start + _POINTS] = _values(grid, some, budget)
+        value[start : start + _POINTS] = _values(grid, some, remaining)
         if np.abs(value[start : start + _POINTS]).max() < _QUIET:  # the transform of a long exposure vanishes beyond
             break
     folded = np.fft.irfft(value.conj(), size)
     return np.asarray(folded[np.arange(first, last + 1) % size], dtype=np.float64)
 
 
-def _values(grid: RecordGrid, z: ComplexArray, budget: list[float]) -> ComplexArray:
+def _values(grid: RecordGrid, z: ComplexArray, remaining: list[float]) -> ComplexArray:
     """E z^N at points z (points,) of the unit circle: records (12), each weighted with z (19)."""
 
     def weigh(now: Rows) -> Rows:
@@ -619,7 +607,7 @@ def _values(grid: RecordGrid, z: ComplexArray, budget: list[float]) -> ComplexAr
     a_period = 4.0 * grid.bins * (grid.shift + 64.0)  # multiplications per point
     for period in range(grid.cycles):
         records, earlier = run.period(), value
-        budget[0] -= a_period * index.size
+        remaining[0] -= a_period * index.size
         value = value + (z[index] - 1.0) * records.sum(-1)
         state = np.concatenate([records, run.armed[:, None], value[:, None]], axis=1)
         # as native/laws/exposure_characteristic.h: the state repeats up to a factor, fitted by least squares
@@ -638,7 +626,7 @@ def _values(grid: RecordGrid, z: ComplexArray, budget: list[float]) -> ComplexAr
                 break
             index, value, before, ratio, streak = index[rest], value[rest], before[rest], ratio[rest], streak[rest]
             run.keep(rest, weigh)
-        if budget[0] < 0.0:
+        if remaining[0] < 0.0:
             raise ConvergenceError(
                 f"count law of {grid.cell.name(0)} behind electronics with a dead time: the state does not repeat "
                 f"within {period + 1} periods; electronics_moments has mean and variance, or simulate it with engine "

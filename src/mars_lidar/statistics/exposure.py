@@ -30,6 +30,7 @@ from mars_lidar.instrument.detector import Mode
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
+from mars_lidar.statistics.budget import MOMENTS, Budget
 from mars_lidar.statistics.cells import Cells, fine_histograms, meets_itself, photons_before
 from mars_lidar.statistics.joint_grid import FoldedGrid
 from mars_lidar.statistics.phase_chain import ConvergenceError
@@ -435,11 +436,11 @@ def refined_moments(
     tolerance: float,
     threads: int | None,
     progress: Progress | None = None,
-    steps: int | None = None,
+    budget: Budget = MOMENTS,
 ) -> Exposure:
     """`exposure_moments` of checked cells, histogram in `out_bins` bins; each cell is refined separately.
 
-    ConvergenceError where a cell would take more than about `steps` bins x periods on all its grids.
+    ConvergenceError where a cell would take more than its `budget` of the recursion.
     """
     tolerance = checks.real("tolerance", tolerance, low=1e-9, high=0.1)
     team = thread_count(threads)
@@ -455,11 +456,11 @@ def refined_moments(
         if not pending.size:
             return shaped(result, cells.shape)
     shared = math.gcd(bins // 2, out_bins)
-    coarse = _run(cells.part(pending), bins // 2, shared, team, progress, steps)
+    coarse = _run(cells.part(pending), bins // 2, shared, team, progress, budget)
     last = spent = _spent(coarse, cells)
     while True:
-        _affordable(cells, pending, spent + 2.0 * last, steps)
-        fine = _run(cells.part(pending), bins, out_bins, team, progress, steps)
+        _affordable(cells, pending, spent + 2.0 * last, budget)
+        fine = _run(cells.part(pending), bins, out_bins, team, progress, budget)
         last = _spent(fine, cells)
         spent = spent + last
         moved = movement(coarse, fine)
@@ -498,37 +499,38 @@ def _before(system: System) -> float:
     return RATES_STEPS if system.detector.mode == "paralyzable" else _ENERGY_STEPS
 
 
-def _affordable(cells: Cells, pending: IndexArray, after: FloatArray, steps: int | None) -> None:
-    """Raise ConvergenceError for a cell whose next pass would exceed `steps`."""
-    beyond = after > (math.inf if steps is None else steps)
+def _affordable(cells: Cells, pending: IndexArray, after: FloatArray, budget: Budget) -> None:
+    """Raise ConvergenceError for a cell whose next pass would exceed the budget."""
+    beyond = after > budget.recursion
     if beyond.any():
-        k = int(pending[int(np.argmax(beyond))])
-        why = f"the next grid would exceed {steps:.1g} bins x periods, the limit of a law"
-        raise ConvergenceError(f"exposure statistics of {cells.name(k)}: {why}; {_instead(cells, steps)}")
+        k_pending = int(np.argmax(beyond))
+        k = int(pending[k_pending])
+        seconds = [budget.recursion_seconds(cost) for cost in (float(after[k_pending]), budget.recursion)]
+        why = f"it would take about {seconds[0]:.2g} s, and the limit of a law is {seconds[1]:.1g} s"
+        raise ConvergenceError(f"exposure statistics of {cells.name(k)}: {why}; {_instead(cells, budget)}")
 
 
-def _too_long(cells: Cells, steps: int | None) -> str:
+def _too_long(cells: Cells, budget: Budget) -> str:
     return (
         "the state of the pixel does not repeat from period to period, and the exposure is too long to be run to its "
-        f"end; {_instead(cells, steps)}"
+        f"end; {_instead(cells, budget)}"
     )
 
 
-def _instead(cells: Cells, steps: int | None) -> str:
-    slower = steps is not None and not meets_itself(cells)
+def _instead(cells: Cells, budget: Budget) -> str:
+    slower = budget is not MOMENTS and not meets_itself(cells)
     return cells.alternatives("exposure_moments, which may take some minutes") if slower else cells.instead
 
 
 def _run(
-    cells: Cells, bins: int, out_bins: int, threads: int, progress: Progress | None, steps: int | None = None
+    cells: Cells, bins: int, out_bins: int, threads: int, progress: Progress | None, budget: Budget = MOMENTS
 ) -> Exposure:
     """One pass of the recursion over all cells on one grid."""
     cells.check_history(bins)
-    if steps is not None:
-        steps = int(steps / cells.step_cost(bins))
+    steps = None if budget is MOMENTS else budget.one_pass / cells.step_cost(bins)
     periods = min(3.0 * (cells.system.dead_time_periods + 1.0), cells.system.cycles) + _before(cells.system)
     if steps is not None and periods * bins > steps:
-        raise ConvergenceError(f"exposure statistics of {cells.name(0)}: {_too_long(cells, steps)}")
+        raise ConvergenceError(f"exposure statistics of {cells.name(0)}: {_too_long(cells, budget)}")
     result = blank(cells, out_bins)
     for part in cells.chunks(bins, out_bins):
         some = cells.part(part)
@@ -545,7 +547,7 @@ def _run(
     lost = result.settled == UNSETTLED
     if lost.any():
         k = int(np.argmax(lost))
-        raise ConvergenceError(f"exposure statistics of {cells.name(k)}: {_too_long(cells, steps)}")
+        raise ConvergenceError(f"exposure statistics of {cells.name(k)}: {_too_long(cells, budget)}")
     result.bins[:] = bins
     return result
 

@@ -33,6 +33,7 @@ from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
+from mars_lidar.statistics.budget import LAW, advice
 from mars_lidar.statistics.cells import (
     MANY_BINS,
     Cells,
@@ -49,11 +50,9 @@ from mars_lidar.statistics.timing import Timing, is_timed
 
 # --- One pixel on one grid -----------------------------------------------------------------------------------------
 
-INSTEAD = "use exposure_moments (count and mean histogram), or simulate it with engine 'exact'"
+INSTEAD = advice("exposure_moments (count and mean histogram)")
 _SETTLED = 1e-9  # total variation from the stationary state at which the start is forgotten
-_MAX_STEPS = 40_000_000  # bins x periods after which an exposure counts as not settling: half a second
 _MANY_BINS = 2**16  # bins of a grid beyond which fewer windows are compared: a window takes long
-_MAX_RECURSION = 2**22  # bins x periods of an exposure that is run through for every window
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,7 +203,7 @@ class Pixel:
                     cycles=grid.cycles,
                     state=self.state,
                     tolerance=_SETTLED,
-                    max_steps=_MAX_STEPS,
+                    max_steps=LAW.forgetting,
                     total=total,
                 )
             )
@@ -212,7 +211,7 @@ class Pixel:
         except ConvergenceError as error:
             raise ConvergenceError(f"joint law of {cells.name(0)}: {error}; {INSTEAD}") from None
         if self.law is None:
-            if self.settled == -2 or bins * (grid.cycles + grid.whole) > _MAX_RECURSION:
+            if self.settled == -2 or bins * (grid.cycles + grid.whole) > LAW.run_through:
                 raise ConvergenceError(
                     f"joint law of {cells.name(0)}: the pixel does not forget its start before the exposure ends, "
                     f"and {bins} bins x {grid.cycles} periods are too many to run through; {INSTEAD}"

@@ -17,7 +17,8 @@ from mars_lidar.instrument.detector import MODES
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
-from mars_lidar.statistics.cells import LAW_STEPS, Cells
+from mars_lidar.statistics.budget import LAW
+from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.count_pmf import Pmf, exact_windows, gaussian_window, poisson_window
 from mars_lidar.statistics.electronics import record_windows
 from mars_lidar.statistics.exposure import Exposure, refined_moments
@@ -234,7 +235,7 @@ def count_law(
         recorded_cumulants = np.array([cumulants_of(window) for window in windows]).reshape(*cells.shape, 4)
         return CountLaw(system, method, recorded_cumulants, lambda: windows)
     if method == "exact":
-        exposure = refined_moments(cells, 1, tolerance=tolerance, threads=team, steps=LAW_STEPS)
+        exposure = refined_moments(cells, 1, tolerance=tolerance, threads=team, budget=LAW)
         flat, bins = exposure.cumulants.reshape(-1, 4), exposure.bins.reshape(-1)
         return CountLaw(system, method, exposure.cumulants, lambda: exact_windows(cells, flat, bins, team), exposure)
     if method == "poisson":

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.types import FloatArray
+from mars_lidar.statistics.budget import LAW, advice
 from mars_lidar.statistics.cells import Cells, photons_before
 from mars_lidar.statistics.count_pmf import Pmf
 from mars_lidar.statistics.phase_chain import ConvergenceError
@@ -21,14 +22,12 @@ _TAIL = 1e-13  # probability outside the support, at either end
 _SPREAD = 9.0  # half width of the sum over late registrations, in standard deviations of their number
 _CHUNK = 1 << 20  # terms of (6) computed together
 _SUMS = 6  # incomplete beta functions in a term of (6)
-_MAX_TERMS = 1 << 23  # terms of (6) of one cell: a second
 _MANY_TERMS, _MANY_COUNTS = 1 << 18, 20  # terms, and counts at the lower end, from which the transform (21) is used
 _REACH = 11.0  # half width of the law, and of its transform, in standard deviations
 _POINTS = 32  # points of the circle evaluated together
 _FAINT = 1e-15  # modulus of the transform below which it counts as 0
-_MAX_TRANSFORM = 30_000_000  # points x counts of one cell
 _LOOSE_TAIL = 1e-10  # probability outside the support of a law by its transform
-_INSTEAD = "use fewer cycles, or simulate it with engine 'exact'"
+_INSTEAD = advice("fewer cycles")
 
 
 def first_arrivals(cells: Cells) -> FloatArray:
@@ -190,7 +189,7 @@ class _Count:
                 survival += (c * np.exp(k * a + (k - 1.0) * b - 1j * np.remainder(room * t, 2.0 * np.pi))).real
             if not keep.any():  # the moduli of both factors decrease monotonically with the angle up to pi
                 return np.asarray(np.clip(survival, 0.0, 1.0), dtype=np.float64)
-            if (start + _POINTS) * k.size > _MAX_TRANSFORM:
+            if (start + _POINTS) * k.size > LAW.synchronous_points:
                 break
         raise ConvergenceError(
             f"count law of {self.name}: the count is nearly constant because the dead time spans period starts, and "
@@ -199,10 +198,10 @@ class _Count:
 
     def _check(self, counts: float, most: int) -> None:
         terms = counts * _SUMS * self._spread(float(most))
-        if terms > _MAX_TERMS:
+        if terms > LAW.synchronous_terms:
             raise ConvergenceError(
                 f"count law of {self.name}: {terms:.2g} terms are too many for mode 'synchronous' with a dead time "
-                f"that spans period starts (at most {_MAX_TERMS:.2g}); {_INSTEAD}"
+                f"that spans period starts (at most {LAW.synchronous_terms:.2g}); {_INSTEAD}"
             )
 
     def _last(self, chance: float, most: int) -> int:

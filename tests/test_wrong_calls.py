@@ -29,8 +29,6 @@ from mars_lidar.cli import app
 from mars_lidar.dataset import DatasetRecipe, Light, estimate, export, open_dataset, read_sparse, read_view, verify
 from mars_lidar.io.maps import load_maps, save_maps
 
-docscrape = pytest.importorskip("numpydoc.docscrape")
-
 SYSTEM = ml.System(
     period_ns=100.0, cycles=20, bins=16, pulse=ml.GaussianPulse(sigma_ns=2.0), detector=ml.Detector(dead_time_ns=30.0)
 )
@@ -431,6 +429,7 @@ def test_wrong_arguments_are_refused_by_name(here, name):
 @pytest.mark.parametrize("name", CALLS)
 def test_errors_of_wrong_arguments_are_documented(here, name):
     """Each class of error above stands in the section Raises of the function or class that raises it."""
+    docscrape = pytest.importorskip("numpydoc.docscrape")
     call = CALLS[name](here)[0]
     home = inspect.unwrap(call)
     if name in UNDOCUMENTED or not (inspect.isclass(call) or "." not in home.__qualname__):

@@ -63,7 +63,7 @@ class HoldingTimeCovariance:
     ...     period_ns=100.0, cycles=1000, bins=128,
     ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
     ... )
-    >>> covariance = ml.holding_time_covariance(ml.Flux(1.0, 1.0, 40.0), system)
+    >>> covariance = ml.holding_time_covariance(ml.Flux(1.0, 1.0, 40.0), system, bins=128)
     >>> covariance.gamma.shape, covariance.automatic_rule()
     ((20,), (6, 1))
     >>> bool(abs(covariance.automatic_sum() - covariance.exact_sum) < 1e-3 * covariance.sigma_ss2)

@@ -116,8 +116,8 @@ class HoldingTimeCovariance:
     def automatic_rule(self, tolerance: float = 1e-3) -> tuple[int, int]:
         """The cheapest (lags, modes) whose neglected modes stay below `tolerance` x sigma_ss2 (4.3).
 
-        The neglected part is bounded through the gap: |gamma_l| <= sigma_ss2, and modes beyond the p-th fall
-        at least like |lambda_(p+1)|^l. The bound is rigorous for a normal P; P is not, so the first lags, in
+        The neglected part is bounded through the gap: ``|gamma_l| <= sigma_ss2``, and modes beyond the p-th fall
+        at least like ``|lambda_(p+1)|^l``. The bound is rigorous for a normal P; P is not, so the first lags, in
         which non-normality shows, are summed exactly: at least six.
         """
         tolerance = checks.real("tolerance", tolerance, low=0.0, high=1.0, strict_low=True)

@@ -22,7 +22,7 @@ from mars_lidar.cuda.kernels import (
     source,
 )
 from mars_lidar.cuda.mars import LANES
-from mars_lidar.engines.alignment import pulse_frame
+from mars_lidar.engines.pixels import pulse_frame
 from mars_lidar.instrument.detector import Detector
 from mars_lidar.instrument.pulse import GaussianPulse
 from mars_lidar.instrument.system import System

@@ -21,7 +21,7 @@ from mars_lidar._base.progress import callback_of
 from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import Progress
 from mars_lidar.engines import ENGINES, Engine, find_engine
-from mars_lidar.engines.image_table import image_table
+from mars_lidar.engines.table_reader import image_table
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.statistics import ConvergenceError

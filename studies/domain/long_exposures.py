@@ -14,8 +14,7 @@ from mars_lidar import Detector, GaussianPulse, JointLaw, Pulse, SampledPulse, S
 from mars_lidar._base.types import FloatArray
 from mars_lidar.engines.engine import Task
 from mars_lidar.engines.exact import ExactEngine
-from mars_lidar.engines.feedback import FeedbackEngine
-from mars_lidar.engines.feedback_rule import draw_rest
+from mars_lidar.engines.feedback import FeedbackEngine, draw_rest
 from mars_lidar.statistics import ConvergenceError
 from studies import Facts, Request
 from studies.common.kept import Lines

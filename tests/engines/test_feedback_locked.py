@@ -14,7 +14,7 @@ from scipy import stats
 import mars_lidar as ml
 from mars_lidar import _core
 from mars_lidar.engines import ENGINES
-from mars_lidar.engines.feedback_rule import Reason
+from mars_lidar.engines.feedback import Reason
 
 PERIOD_NS = 1e3 / 7.5
 

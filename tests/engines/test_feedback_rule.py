@@ -16,9 +16,8 @@ from mars_lidar import Detector, System, _core
 from mars_lidar.engines.auto import AutoEngine
 from mars_lidar.engines.engine import Task
 from mars_lidar.engines.exact import ExactEngine
-from mars_lidar.engines.feedback import FeedbackEngine
+from mars_lidar.engines.feedback import FeedbackEngine, expected_registrations
 from mars_lidar.engines.feedback_grid import GOAL, Grids, cells_of
-from mars_lidar.engines.feedback_rule import expected_registrations
 
 # What is given to other engines
 

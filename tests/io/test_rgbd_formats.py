@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from mars_lidar import io
 from mars_lidar.cli import app
 from mars_lidar.io.rgbd import read_rgbd
-from mars_lidar.io.rgbd.pfm import read_pfm
+from mars_lidar.io.rgbd.pixels import read_pfm
 from mars_lidar.scene.scene import Scene
 
 SHARED = Path(__file__).resolve().parents[2].parent / "shared" / "data"

@@ -275,7 +275,7 @@ def test_nothing_is_left_of_a_stream_that_fails(tmp_path, monkeypatch):
 
 
 def test_a_layout_from_the_future_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr("mars_lidar.io.streams.attributes.FORMAT_VERSION", 2)
+    monkeypatch.setattr("mars_lidar.io.streams.photons.FORMAT_VERSION", 2)
     photons().save(tmp_path / "photons.npz")
     monkeypatch.undo()
     with pytest.raises(ValueError, match=r"photons\.npz.*layout version 2; version 1 can be read"):

@@ -51,7 +51,7 @@ def convert(
     """Write a cube or a photon stream in another format, and tell what the other format cannot hold."""
     with reported():
         from mars_lidar.dataset.store import is_dataset
-        from mars_lidar.io.convert import convert as converted
+        from mars_lidar.io.conversion import convert as converted
 
         if is_dataset(source):
             raise ValueError(f"{source} is a dataset: mars-lidar export writes it as the files that networks load")
@@ -73,7 +73,7 @@ def convert(
 
 def _imported(foreign: ForeignOptions, source: Path, target: Path, overwrite: bool) -> Converted:
     from mars_lidar.io import save
-    from mars_lidar.io.convert import Converted
+    from mars_lidar.io.conversion import Converted
 
     with foreign.opened(source) as cube:
         save(target, cube, overwrite=overwrite)
@@ -94,7 +94,7 @@ def timestamps(
     The histogram of the photons is the cube's exposure, count by count; this is checked.
     """
     with reported():
-        from mars_lidar.io.convert import photons, resolution_ns
+        from mars_lidar.io.conversion import photons, resolution_ns
         from mars_lidar.io.cube import load
         from mars_lidar.io.streams.files import check_output
 

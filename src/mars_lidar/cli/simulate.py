@@ -159,7 +159,7 @@ def _table(
     file: Path | None, system: System, engine: str, flux: Flux, outside: str | None, threads: int | None
 ) -> tuple[Table | None, str | None]:
     """The table that is given; or for an engine that would evaluate each pixel, one of the image's range."""
-    from mars_lidar.engines.image_table import image_table
+    from mars_lidar.engines.table_reader import image_table
 
     if file is not None and str(file) != "none":
         return Table.load(file, system), outside

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from mars_lidar._base.native import _core
 from mars_lidar.cuda.kernels import feedback_histograms, overflow
 from mars_lidar.cuda.machine import Cuda
-from mars_lidar.engines.engine import Task
-from mars_lidar.engines.feedback_rule import Group, Plan, sweep_pixels
-from mars_lidar.engines.parts import part_of
+from mars_lidar.engines.engine import Task, part_of
+from mars_lidar.engines.feedback import Group, Plan, sweep_pixels
 
 _LANES = 32  # a warp: its threads' rows lie side by side
 _WORK_BYTES = 4 << 30  # of all warps that run at the same time, at most

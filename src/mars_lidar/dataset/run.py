@@ -39,7 +39,7 @@ from mars_lidar.dataset.ingest import create
 from mars_lidar.dataset.recipe import DatasetRecipe
 from mars_lidar.dataset.store import Dataset, Item, open_dataset
 from mars_lidar.dataset.write import Failed, Made, Maker, fingerprint
-from mars_lidar.io.scan import Problem
+from mars_lidar.io.scene_files import Problem
 
 _NAMED = 5  # parts that an error names
 BUFFER_BYTES = 512 * 2**20  # of all chunks that are made at the same time on one machine

@@ -18,9 +18,9 @@ from mars_lidar.dataset.recipe import DatasetRecipe
 from mars_lidar.dataset.sample_content import Rendered, Shown, Surfaces
 from mars_lidar.dataset.values import listed_numbers
 from mars_lidar.engines import find_engine
-from mars_lidar.io.rgbd import middlebury, nyu
+from mars_lidar.io.rgbd import collections
 from mars_lidar.io.rgbd.layered import is_layered, read_layers
-from mars_lidar.io.scan import BAD_FILE, Problem, SceneFile, scan
+from mars_lidar.io.scene_files import BAD_FILE, Problem, SceneFile, scan
 from mars_lidar.io.transient import SUFFIXES, read_transient, read_truth
 from mars_lidar.light.flux import Flux
 from mars_lidar.light.fog import Fog
@@ -129,7 +129,7 @@ def _files(entry: dict[str, Any], folder: Path, problems: list[Problem]) -> Iter
     image = entry.get("image")
     if path.is_dir():
         manifest = folder / entry["manifest"] if "manifest" in entry else None
-        if not middlebury.is_scene(path) or "pattern" in entry or manifest is not None:
+        if not collections.is_middlebury(path) or "pattern" in entry or manifest is not None:
             if image is not None and not (isinstance(image, list) and len(image) == 2):
                 raise ValueError(f"image must be two texts that go with pattern for the folder {path}, got {image!r}")
             pair = None if image is None else (image[0], image[1])
@@ -148,7 +148,7 @@ def _files(entry: dict[str, Any], folder: Path, problems: list[Problem]) -> Iter
     if path.suffix.lower() != ".mat" or not path.is_file():
         yield from _chosen([own], entry)
         return
-    frames = range(nyu.frames(path))
+    frames = range(collections.nyu_frames(path))
     options.pop("depth_unit_m", None)
     yield from _chosen([SceneFile(depth=path, image=own.image, index=k, **options) for k in frames], entry)
 

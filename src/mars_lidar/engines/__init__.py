@@ -1,8 +1,7 @@
 """Engines: one file each, under the names that `simulate` takes."""
 
-from mars_lidar.engines.engine import Engine
+from mars_lidar.engines.engine import Engine, EngineOptions
 from mars_lidar.engines.mars import MarsEngine
-from mars_lidar.engines.options import EngineOptions
 from mars_lidar.engines.registry import ANY_SYSTEM, ENGINES, check_detector, find_engine
 from mars_lidar.engines.renewal import RenewalEngine
 

@@ -8,11 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar.engines.engine import Engine, Task
+from mars_lidar.engines.engine import Engine, Task, stage
 from mars_lidar.engines.exact import ExactEngine
-from mars_lidar.engines.feedback import FeedbackEngine
-from mars_lidar.engines.feedback_rule import Plan, draw_rest, expected_registrations
-from mars_lidar.engines.parts import stage
+from mars_lidar.engines.feedback import FeedbackEngine, Plan, draw_rest, expected_registrations
 
 BREAK_EVEN = 4.0
 """Registrations per internal cell above which feedback is the faster engine.

@@ -1,11 +1,12 @@
-"""What an engine is: the contract, written once; the leaves stay silent."""
+"""What an engine is: the contract, written once; options of engines; pixels of one task drawn by several of them."""
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +27,7 @@ from mars_lidar.light.records import record_bins, record_times
 
 if TYPE_CHECKING:
     from mars_lidar._base.native import _core
-
+    from mars_lidar.table import Table
 
 IN_PARTS = (
     "simulate rows (flux[rows] with pixel_index) or realizations (first_realization) one after another, "
@@ -250,3 +251,136 @@ _EVERYTHING: dict[str, Any] = {  # recorded, when it happens
     "tail_fraction": 0.0,
     "code_edges": None,
 }
+
+
+Count = Literal["exact", "matched", "gaussian"]
+Interpolation = Literal["bilinear", "nearest"]
+Outside = Literal["error", "exact"]
+
+
+class EngineOptions(TypedDict, total=False):
+    """Arguments of the constructors of engines; None, or left out: the engine's default.
+
+    Attributes
+    ----------
+    table
+        For ``"mars"`` and ``"renewal"``: the lookup table (`mars_lidar.Table`).
+    count
+        For ``"mars"``: the law of the count, ``"exact"`` (default), ``"matched"`` (to four cumulants) or
+        ``"gaussian"`` (the paper's).
+    interpolation
+        For a table: ``"bilinear"`` (default) or ``"nearest"`` (the paper's).
+    outside
+        For a table, of pixels beyond its range: ``"error"`` (default), or ``"exact"``, some ms each.
+
+    See Also
+    --------
+    find_engine, mars_lidar.simulate
+
+    Examples
+    --------
+    >>> from mars_lidar.engines import EngineOptions, find_engine
+    >>> options = EngineOptions(count="gaussian")
+    >>> find_engine("mars", **options).name
+    'mars'
+    """
+
+    table: Table | None
+    count: Count | None
+    interpolation: Interpolation | None
+    outside: Outside | None
+
+
+NAMES = tuple(EngineOptions.__annotations__)
+
+
+def given(options: EngineOptions) -> dict[str, Any]:
+    """The options that are not None; TypeError for a name that is none of them."""
+    for name in options:
+        if name not in NAMES:
+            raise TypeError(f"{name!r} is no argument of this function, nor an option of an engine: {', '.join(NAMES)}")
+    return {name: value for name, value in options.items() if value is not None}
+
+
+_TICKS = 1000
+_BUFFER_BYTES = 64 << 20  # of histograms drawn aside before they are put in place
+
+
+def stage(progress: Progress | None, start: float, end: float) -> Progress | None:
+    """A progress callback for one of several calls: from `start` to `end` of the whole."""
+    if progress is None:
+        return None
+
+    def told(done: int, total: int) -> object:
+        return progress(round(_TICKS * (start + (end - start) * done / max(total, 1))), _TICKS)
+
+    return told
+
+
+def part_of(
+    task: Task, pixels: NDArray[np.int64], first: int, realizations: int, progress: Progress | None = None
+) -> Task:
+    """Some pixels (n,) of a task in some of its realizations, `first` the first: each has the bits of the whole."""
+    return replace(
+        task,
+        flux=task.flux.pixels(pixels),
+        pixel_index=task.pixel_index[pixels],
+        first_realization=task.first_realization + first,
+        realizations=realizations,
+        report={},
+        progress=progress,
+    )
+
+
+def draw_pixels(engine: Engine, task: Task, out: NDArray[Any], pixels: NDArray[np.int64]) -> None:
+    """Fill the rows of `pixels` (n,) in `out` (items, bins) with `engine`'s histograms, the bits of the whole."""
+    if pixels.size == 0:
+        return
+    every = task.pixel_index.size
+    if pixels.size == every:
+        engine.histogram(task, out)
+        return
+    cube = out.reshape(task.realizations, every, task.system.bins)
+    row = task.system.bins * out.itemsize
+    wide = max(1, min(pixels.size, _BUFFER_BYTES // row))
+    deep = max(1, min(task.realizations, _BUFFER_BYTES // (row * wide)))
+    steps = [(p, r) for p in range(0, pixels.size, wide) for r in range(0, task.realizations, deep)]
+    for k, (first_pixel, first) in enumerate(steps):
+        some = pixels[first_pixel : first_pixel + wide]
+        number = min(deep, task.realizations - first)
+        progress = stage(task.progress, k / len(steps), (k + 1) / len(steps))
+        part = part_of(task, some, first, number, progress)
+        rows = np.empty((part.items, task.system.bins), out.dtype)
+        engine.histogram(part, rows)
+        cube[first : first + number, some] = rows.reshape(number, some.size, task.system.bins)
+
+
+MOST_TWILIGHT_PHOTONS = 5.0
+"""Photons within `twilight_ns` above which the phase of ticks is remembered for longer than the engines warm up.
+
+A tick, a dead time that ends with a twilight pulse, is followed by another with the probability 1 - e^-photons, so that
+phases are remembered for some e^photons ticks: 150 of them at 5, against 256 turns before the exposure (`sequential`).
+"""
+
+
+def check_start(flux: Flux, system: System) -> None:
+    """Raise ValueError for a stationary start that twilight pulses keep from settling before the exposure.
+
+    Ticks follow each other on background, or where the same pulses lie in the twilight of the next dead time too: where
+    that is a whole number of periods but for less than the twilight.
+    """
+    period, detector = system.period_ns, system.detector
+    if system.start != "stationary" or detector.twilight_ns == 0.0:
+        return
+    flux = flux.detected(system)
+    apart = abs(detector.dead_time_ns / period - round(detector.dead_time_ns / period)) * period
+    pulses = math.ceil(detector.twilight_ns / period) if apart < detector.twilight_ns else 0
+    photons = flux.background * (detector.twilight_ns / period) + (flux.total - flux.background) * pulses
+    worst = float(np.max(photons, initial=0.0))
+    if worst > MOST_TWILIGHT_PHOTONS:
+        raise ValueError(
+            f"start must be 'armed' where more than {MOST_TWILIGHT_PHOTONS:g} photons may arrive within "
+            f"detector.twilight_ns of the end of one dead time after another, got 'stationary' with {worst:.3g}: such "
+            "a pixel ticks once in every dead time and does not settle; simulate a longer armed exposure and leave out "
+            "its beginning"
+        )

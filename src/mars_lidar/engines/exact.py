@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from mars_lidar._base.memory import available_bytes, check_memory
 from mars_lidar._base.native import _core
-from mars_lidar.engines.engine import IN_PARTS, Engine, PhaseRecords, Records, Task
-from mars_lidar.engines.warm_start import check_start
+from mars_lidar.engines.engine import IN_PARTS, Engine, PhaseRecords, Records, Task, check_start
 from mars_lidar.instrument.detector import MODES
 from mars_lidar.instrument.effects import EFFECTS
 from mars_lidar.instrument.system import System

@@ -1,20 +1,27 @@
-"""The feedback engine: the whole integer histogram at once, at a cost that does not grow with the exposure."""
+"""The feedback engine: the whole integer histogram at once, at a cost that does not grow with the exposure.
+
+Which exposures it draws, on which internal grid, and which are drawn exactly instead.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
-from typing import Any
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from enum import IntEnum
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.native import _core
-from mars_lidar.engines.engine import Engine, Task
+from mars_lidar._base.types import IndexArray
+from mars_lidar.engines.engine import Engine, Task, draw_pixels, stage
 from mars_lidar.engines.exact import ExactEngine
-from mars_lidar.engines.feedback_rule import Group, Plan, Reason, Rest, draw_rest, sweep_pixels
-from mars_lidar.engines.parts import draw_pixels, stage
+from mars_lidar.engines.feedback_grid import MOST_SWEEPS, Grids, KindArray
 from mars_lidar.engines.poisson import PoissonEngine
+from mars_lidar.instrument.system import System
+from mars_lidar.light.flux import Flux
 
 
 class FeedbackEngine(Engine):
@@ -99,3 +106,191 @@ class FeedbackEngine(Engine):
             return status
 
         return sweep_pixels(task, plan or Plan.of(task, pixels), pixels, sweep, worth)
+
+
+StatusArray = NDArray[np.uint8]
+
+FEWEST_PERIODS = 100  # per dead time, rounded up to periods: shorter exposures are drawn exactly
+MOST_LAP_CELLS = 2**18  # of all laps: 150 MB for each thread
+MOST_TRIES = 3  # more, of an exposure whose sweeps did not end: other numbers of the same law
+TRY_FROM = 128.0
+"""Registrations for each cell above which an unsettled exposure is tried again: below, the exact engine is quicker.
+
+A try takes a batch of 32 lanes, most of them idle.
+"""
+_OTHER_NUMBERS = 0x278DDE6E5FD29E45  # of the seed, for each try
+
+
+class Reason(IntEnum):
+    """What became of an exposure: `FeedbackStatus` of native/feedback/kernel.h, and reasons known before."""
+
+    DRAWN = 0
+    SLOW = 1
+    FEW = 3
+    UNSETTLED = 4
+    NEGATIVE = 5
+    UNLIKELY = 6
+    SHORT = 16
+    CELLS = 18
+    DEAR = 19
+    LAPS = 64  # and more: of a pixel that needs that many laps less 64
+
+    @property
+    def words(self) -> str:
+        """As a report names it."""
+        return _WORDS[self]
+
+
+_WORDS = {
+    Reason.SLOW: "slow sweeps",
+    Reason.FEW: "locked, short exposure",
+    Reason.UNSETTLED: "unsettled",
+    Reason.NEGATIVE: "negative armed",
+    Reason.UNLIKELY: "unlikely count",
+    Reason.SHORT: "short exposure",
+    Reason.CELLS: "too many cells",
+    Reason.DEAR: "quicker exactly",
+}
+
+
+class Group(NamedTuple):
+    """Pixels (n,) that are drawn on one grid: halvings (bins,) of the bins, and periods of a piece of the exposure."""
+
+    pixels: IndexArray
+    kinds: KindArray
+    laps: int
+
+
+Sweep = Callable[[Task, int, Sequence[Group]], StatusArray]
+"""Draws groups of the pixels of a task and returns the status (realizations, n) of each exposure, group after group.
+
+The number is the task's first realization in the output.
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class Rest:
+    """What is to be drawn exactly: whole pixels (n,), and single exposures of others, (m,) realization and pixel."""
+
+    pixels: IndexArray
+    realization: IndexArray
+    pixel: IndexArray
+
+    @classmethod
+    def of(cls, task: Task, pixels: IndexArray, status: StatusArray) -> Rest:
+        """From the status (realizations, n) of `pixels` (n,); the task's report counts them by reason."""
+        all_of_it = (status != Reason.DRAWN).all(0) & (status == status[:1]).all(0)
+        some = np.where(all_of_it, Reason.DRAWN, status)
+        for about, codes in (("pixels given to exact", status[0, all_of_it]), ("exposures drawn again by exact", some)):
+            reasons, numbers = np.unique(codes[codes != Reason.DRAWN], return_counts=True)
+            task.report[about] = float(numbers.sum())
+            for reason, number in zip(reasons, numbers, strict=True):
+                task.report[f"{about}, {Reason(reason).words}"] = float(number)
+        realization, column = np.nonzero(some)
+        return cls(np.sort(pixels[all_of_it]), realization, pixels[column])
+
+    def blocks(self, realizations: int) -> Iterator[tuple[int, int, IndexArray]]:
+        """What is to be drawn as first realization of the call, number of them, and pixels."""
+        if self.pixels.size:
+            yield 0, realizations, self.pixels
+        for one in np.unique(self.realization):
+            yield int(one), 1, np.sort(self.pixel[self.realization == one])
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What is known of pixels (n,) before their sweeps.
+
+    `reason` why sweeps are not even tried, or DRAWN.
+    """
+
+    grids: Grids
+    reason: StatusArray
+
+    @classmethod
+    def of(cls, task: Task, pixels: IndexArray) -> Plan:
+        """For some pixels (n,) of a task."""
+        reason = np.zeros(pixels.size, np.uint8)
+        if task.system.cycles < FEWEST_PERIODS * math.ceil(task.system.dead_time_periods):
+            reason[:] = Reason.SHORT
+            return cls(Grids.coarsest(task, pixels.size), reason)
+        grids = Grids.checked(task, pixels)
+        reason[grids.sweeps > MOST_SWEEPS] = Reason.SLOW
+        reason[grids.of < 0] = Reason.CELLS
+        return cls(grids, reason)
+
+    def part(self, some: NDArray[np.bool_]) -> Plan:
+        """For those of its pixels (n,) that are true."""
+        grids = Grids(self.grids.kinds, self.grids.of[some], self.grids.sweeps[some])
+        return Plan(grids, self.reason[some])
+
+
+def sweep_pixels(
+    task: Task, plan: Plan, pixels: IndexArray, sweep: Sweep, worth: NDArray[np.float64] | None = None
+) -> Rest:
+    """Draw `pixels` (n,) of a plan group by group of one grid, those again that ask for laps; return the others.
+
+    `worth` (n,): cells of all laps beyond which another engine is quicker for a pixel.
+    """
+    grid, cells = plan.grids.of, plan.grids.cells()
+    status = np.tile(plan.reason, (task.realizations, 1))
+    # lanes go through their sweeps together: neighbours in background need about as many
+    able = np.flatnonzero(plan.reason == Reason.DRAWN)
+    able = able[np.argsort(task.flux.background.reshape(-1)[pixels[able]], kind="stable")]
+
+    def draw(part: Task, first: int, wanted: IndexArray, laps: IndexArray) -> StatusArray:
+        """Status (realizations, n) of `wanted` (n,), pixels of one grid and number of laps together."""
+        back = np.empty((part.realizations, wanted.size), np.uint8)
+        if wanted.size == 0:
+            return back
+        key = grid[wanted] * 256 + laps
+        order = np.argsort(key, kind="stable")
+        keys, begin = np.unique(key[order], return_index=True)
+        groups = [
+            Group(np.ascontiguousarray(pixels[some]), plan.grids.kinds[k // 256], int(k % 256))
+            for k, some in zip(keys, np.split(wanted[order], begin[1:]), strict=True)
+        ]
+        back[:, order] = sweep(part, first, groups)
+        return back
+
+    status[:, able] = draw(task, 0, able, np.ones_like(able))
+    slow = able[status[0, able] >= Reason.LAPS]
+    laps = status[0, slow].astype(np.int64) - Reason.LAPS
+    large = cells[slow] * laps > MOST_LAP_CELLS
+    dear = np.zeros_like(large) if worth is None else cells[slow] * laps > worth[slow]
+    status[:, slow[dear]] = Reason.DEAR
+    status[:, slow[large]] = Reason.CELLS
+    far = ~large & ~dear
+    status[:, slow[far]] = draw(replace(task, progress=None), 0, slow[far], laps[far])
+    of_laps = np.ones(pixels.size, np.int64)
+    of_laps[slow] = laps
+    long = expected_registrations(task.flux, task.system).reshape(-1)[pixels] > TRY_FROM * cells * of_laps
+    unsettled = (status == Reason.UNSETTLED) & long
+    tried = int(unsettled.sum())
+    for attempt in range(1, MOST_TRIES + 1):
+        for one in np.flatnonzero(unsettled.any(1)):
+            first, seed = task.first_realization + int(one), task.seed ^ (attempt * _OTHER_NUMBERS % 2**64)
+            part = replace(task, realizations=1, first_realization=first, seed=seed, progress=None)
+            again = np.flatnonzero(unsettled[one])
+            status[one, again] = draw(part, int(one), again, of_laps[again])[0]
+        unsettled &= status == Reason.UNSETTLED
+    if tried:
+        task.report["exposures drawn again by feedback"] = float(tried - unsettled.sum())
+    return Rest.of(task, pixels, status)
+
+
+def expected_registrations(flux: Flux, system: System) -> NDArray[np.float64]:
+    """Registrations of an exposure (H, W) under a constant rate of the same energy: N_r Lambda / (1 + Lambda t_d)."""
+    return np.asarray(system.cycles * flux.total / (1.0 + flux.total * system.dead_time_periods))
+
+
+def draw_rest(engine: Engine, task: Task, out: NDArray[Any], rest: Rest) -> None:
+    """Fill the rows of `rest` in `out` (items, bins) with `engine`'s histograms."""
+    cube = out.reshape(task.realizations, task.pixel_index.size, task.system.bins)
+    for first, number, pixels in rest.blocks(task.realizations):
+        part = task
+        if number < task.realizations:
+            first_realization = task.first_realization + first
+            part = replace(task, realizations=number, first_realization=first_realization, progress=None)
+        rows = cube[first : first + number].reshape(-1, task.system.bins)
+        draw_pixels(engine, replace(part, report={}), rows, pixels)

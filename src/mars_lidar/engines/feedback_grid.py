@@ -85,7 +85,8 @@ class Grids:
         known_grids = _corner_grids(task, corners, start)
         for number, corner in enumerate(corners):
             put(alone[which == number], *known_grids[corner])
-        some = np.flatnonzero(several)
+        some = np.flatnonzero(several)  # judged together: neighbours in background need about as many sweeps
+        some = some[np.argsort(task.flux.background.reshape(-1)[pixels[some]], kind="stable")]
         halvings, needed = _even_halvings(task, pixels[some], start)
         for k in np.unique(halvings):
             at = halvings == k
@@ -137,9 +138,10 @@ def _even_halvings(task: Task, pixels: IndexArray, start: KindArray) -> tuple[In
         for k in np.unique(halvings[open_]):
             at = open_[halvings[open_] == k]
             distance, sweeps[at], _ = _judge(task, pixels[at], np.asarray(start + k, np.uint8))
-            more = np.ceil(np.log2(np.maximum(distance / GOAL, 1e-9)) / 2.0).astype(np.int64)
             far = (distance > GOAL) & (sweeps[at] <= MOST_SWEEPS)
-            halvings[at[far]] += np.clip(more[far], 1, _STEP)
+            # distances fall with the square of the width; whether so many halvings do is judged in the next round
+            more = np.ceil(0.5 * np.log2(np.minimum(distance[far] / GOAL, 4.0**_STEP)))
+            halvings[at[far]] += np.maximum(more, 1).astype(np.int64)
             halvings[at[far & (halvings[at] > most)]] = most + 1 if k < most else -1
             halvings[at[far & (k < most) & (halvings[at] > most)]] = most
             rest.append(at[far & (halvings[at] >= 0)])

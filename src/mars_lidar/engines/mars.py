@@ -8,7 +8,7 @@ from mars_lidar._base import checks
 from mars_lidar._base.types import FloatArray, IndexArray
 from mars_lidar.engines.count_shape import CountTimesShape, as_shapes
 from mars_lidar.engines.counts import CountLaws, Matched, Mended, Poisson, RoundedGaussian, Tabulated
-from mars_lidar.engines.options import Count, Interpolation, Outside
+from mars_lidar.engines.engine import Count, Interpolation, Outside
 from mars_lidar.engines.pixels import Group, groups
 from mars_lidar.engines.synthesis import Batch, Run
 from mars_lidar.engines.table_reader import Entries, TableReader, exact_laws, untrusted

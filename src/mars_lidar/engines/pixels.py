@@ -1,9 +1,11 @@
-"""The pixels of a flux, one return each or evaluated as waveforms, and which of them are alike."""
+"""The pixels of a flux: one return each or waveforms, which are alike, and how shapes are moved to their delays."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from hashlib import blake2b
 
 import numpy as np
@@ -11,6 +13,7 @@ from numpy.typing import NDArray
 
 from mars_lidar._base.types import FloatArray, IndexArray
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
+from mars_lidar.instrument.pulse import Pulse
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.statistics.cells import Cells, waveform_parts
@@ -89,3 +92,111 @@ def _cells(flux: Flux, system: System, pixels: IndexArray, delays: bool) -> Cell
     if delays or single_return(flux) is None:
         return Cells.of_flux(some, system, effects=_EFFECTS)
     return Cells.of(some.signal, some.background, system, effects=_EFFECTS)
+
+
+_OUTSIDE = 1e-6  # energy of the pulse before the frame, and behind it
+_STEPS_PER_WIDTH = 64  # energies per standard deviation of the pulse, linear between
+_CELLS_PER_WIDTH = 16  # and cells where registrations of the pulse re-arm inside the pulse
+_NARROW_BINS = 4.0  # standard deviations in bins from which a bin needs no cells
+_MOST_ENERGIES = 2**22
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """Energy of the pulse at the canonical delay t_r / 2 in the bins that it reaches.
+
+    Attributes
+    ----------
+    first
+        First of them.
+    cells
+        Cells of a bin that the sampler needs for this dead time.
+    energy
+        (parts + 1, bins of the frame) float32: energy from a bin's start to part p of it.
+    """
+
+    first: int
+    cells: int
+    energy: NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """How shapes of the canonical delay become those of the pixels.
+
+    `shift` (pixels,) periods in [0, 1); `signal`, `background` (pixels,) photons per period; `rate` (pixels,) mean
+    registrations per period.
+    """
+
+    shift: FloatArray
+    signal: FloatArray
+    background: FloatArray
+    rate: FloatArray
+    frame: Frame
+
+    @classmethod
+    def of(
+        cls, system: System, signal: FloatArray, background: FloatArray, delay_ns: FloatArray, rate: FloatArray
+    ) -> Alignment:
+        """From the pixels' own S, B, delays and registrations per period."""
+        return cls(shift_of(delay_ns, system.period_ns), signal, background, rate, pulse_frame(system))
+
+    def part(self, pixels: slice) -> Alignment:
+        """That of some of the pixels."""
+        return Alignment(
+            self.shift[pixels], self.signal[pixels], self.background[pixels], self.rate[pixels], self.frame
+        )
+
+
+def shift_of(delay_ns: FloatArray, period_ns: float) -> FloatArray:
+    """By how much delays (pixels,) are behind the canonical one: periods in [0, 1)."""
+    shift = np.nan_to_num(delay_ns / period_ns) - 0.5
+    shift -= np.floor(shift)
+    shift[shift >= 1.0] = 0.0
+    return shift
+
+
+def pulse_frame(system: System) -> Frame:
+    """The frame of a system's pulse."""
+    dead = system.dead_time_periods
+    return _frame(system.pulse, system.period_ns, system.bins, dead - math.floor(dead))
+
+
+@lru_cache(maxsize=16)
+def _frame(pulse: Pulse, period_ns: float, bins: int, dead_fraction: float) -> Frame:
+    low, high = pulse.support_ns()
+    t = np.linspace(low, high, 4097)
+    energy = pulse.cumulative(t)
+    early = t[max(0, int(np.searchsorted(energy, _OUTSIDE)) - 1)]
+    late = t[min(t.size - 1, int(np.searchsorted(energy, 1.0 - _OUTSIDE)))]
+    width = period_ns / bins
+    first = math.floor((0.5 * period_ns + early) / width)
+    size = min(bins, math.floor((0.5 * period_ns + late) / width) - first + 1)
+    if size == bins:
+        first = 0
+    deviation = _deviation(pulse, period_ns) / width  # in bins
+    parts = _power_of_two(_STEPS_PER_WIDTH / deviation, 8, max(8, min(4096, _MOST_ENERGIES // size)))
+    cells = 1
+    near = min(dead_fraction, 1.0 - dead_fraction) * bins  # of the dead time to whole periods, bins
+    if deviation < _NARROW_BINS and near < size + 1:
+        cells = _power_of_two(_CELLS_PER_WIDTH / deviation, 1, min(64, parts))
+        while cells > 1 and size * cells > 8192:  # a record full of narrow features
+            cells //= 2
+    place = (first + np.arange(size))[None, :] + np.arange(parts + 1)[:, None] / parts
+    below = pulse.wrapped_cumulative(place * width - 0.5 * period_ns, period_ns)
+    return Frame(first % bins, cells, np.ascontiguousarray((below - below[0]).astype(np.float32)))
+
+
+def _deviation(pulse: Pulse, period_ns: float) -> float:
+    """Standard deviation, ns, of the Gaussian with the pulse's equivalent width 1 / integral of s^2."""
+    low, high = pulse.support_ns()
+    squares = float(np.sum(np.diff(pulse.cumulative(np.linspace(low, high, 4097))) ** 2)) * 4096.0 / (high - low)
+    return min(1.0 / squares / (2.0 * math.sqrt(math.pi)), period_ns)
+
+
+def _power_of_two(wanted: float, low: int, high: int) -> int:
+    """The power of two next above `wanted`, kept in [low, high]."""
+    power = 1 << math.ceil(math.log2(max(wanted, 1.0)))
+    while power > high:
+        power //= 2
+    return max(power, low)

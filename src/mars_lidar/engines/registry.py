@@ -6,11 +6,10 @@ from typing import Unpack
 
 from mars_lidar._base import checks
 from mars_lidar.engines.auto import AutoEngine
-from mars_lidar.engines.engine import Engine
+from mars_lidar.engines.engine import Engine, EngineOptions, given
 from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.engines.feedback import FeedbackEngine
 from mars_lidar.engines.mars import MarsEngine
-from mars_lidar.engines.options import EngineOptions, given
 from mars_lidar.engines.poisson import PoissonEngine
 from mars_lidar.engines.renewal import RenewalEngine
 from mars_lidar.engines.sequential import SequentialEngine

@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.native import _core
-from mars_lidar.engines.engine import Engine, Records, Task
-from mars_lidar.engines.warm_start import check_start
+from mars_lidar.engines.engine import Engine, Records, Task, check_start
 from mars_lidar.instrument.detector import MODES
 from mars_lidar.instrument.effects import EFFECTS
 from mars_lidar.instrument.system import System

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.types import FloatArray, IndexArray, Progress
-from mars_lidar.engines.alignment import Alignment
 from mars_lidar.engines.counts import CountLaws, Streams
 from mars_lidar.engines.engine import Task
+from mars_lidar.engines.pixels import Alignment
 
 _BATCH = 2**20  # exposures whose counts are held at a time: 8 MiB
 

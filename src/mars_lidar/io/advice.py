@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from mars_lidar._base.progress import LONG_S, span
 from mars_lidar.engines import ENGINES, Engine, EngineOptions, check_detector, find_engine
-from mars_lidar.engines.feedback_rule import expected_registrations
+from mars_lidar.engines.feedback import expected_registrations
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.light.stored_flux import StoredFlux

@@ -28,7 +28,7 @@ from mars_lidar._base import checks
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.pulse import GaussianPulse, Pulse
 from mars_lidar.instrument.system import System
-from mars_lidar.io.scan import SceneFile, scan
+from mars_lidar.io.scene_files import SceneFile, scan
 from mars_lidar.learn.needed import torch
 from mars_lidar.learn.ranges import Range, SystemList, SystemRange
 from mars_lidar.light.flux import Flux

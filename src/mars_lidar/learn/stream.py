@@ -28,7 +28,7 @@ from mars_lidar._base.resample import image_size
 from mars_lidar._base.threads import thread_count
 from mars_lidar.engines import Engine, check_detector, find_engine
 from mars_lidar.instrument.system import System
-from mars_lidar.io.scan import SceneFile
+from mars_lidar.io.scene_files import SceneFile
 from mars_lidar.learn.needed import torch
 from mars_lidar.learn.ranges import LogUniform, Range, SystemRange, as_range, as_systems
 from mars_lidar.learn.scenes import Recipe, Sample, as_source, example_of

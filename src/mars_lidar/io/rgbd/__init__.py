@@ -12,9 +12,7 @@ from mars_lidar._base import checks
 from mars_lidar._base.files import FileError, open_npz, reading
 from mars_lidar._base.types import FloatArray
 from mars_lidar.io.named_arrays import mat_arrays
-from mars_lidar.io.rgbd import middlebury, nyu, pixels
-from mars_lidar.io.rgbd.exr import read_exr
-from mars_lidar.io.rgbd.pfm import read_pfm
+from mars_lidar.io.rgbd import collections, pixels
 
 _DEPTH_IMAGES = (".png", ".tif", ".tiff")
 _DEPTH_FLOATS = (".pfm", ".exr")
@@ -44,9 +42,9 @@ def read_rgbd(
       file), and ``background`` (relative, >= 0).
     - ``.mat``: an array ``depth`` or the only one, (H, W), metres, or `depth_unit_m` each; or the labelled data set
       of NYUv2 (MATLAB v7.3): ``depths`` in metres and ``images`` of frame `index`, from 0. See
-      `mars_lidar.io.rgbd.nyu`.
+      `mars_lidar.io.rgbd.collections`.
     - a folder of Middlebury 2005 or 2006 with ``disp1.png``, ``view1.png`` and ``dmin.txt``, or of 2014 or
-      2021 with ``disp0.pfm``, ``im0.png`` and ``calib.txt``. See `mars_lidar.io.rgbd.middlebury`.
+      2021 with ``disp0.pfm``, ``im0.png`` and ``calib.txt``. See `mars_lidar.io.rgbd.collections`.
 
     Reflectivity, from `image_path`, else from what comes with the depth, else 1 everywhere (only relative
     values matter to a flux):
@@ -81,7 +79,7 @@ def _read(
     source: Path, image: Path | None, unit: float | None, focal: float | None, index: int | None, most: float | None
 ) -> tuple[FloatArray, FloatArray, FloatArray | None]:
     suffix = source.suffix.lower()
-    frames = suffix == ".mat" and source.is_file() and nyu.is_labelled(source)
+    frames = suffix == ".mat" and source.is_file() and collections.is_nyu(source)
     if (index is not None) != frames:
         told = "needs index, the frame from 0" if index is None else f"has no frames, got index {index!r}"
         raise ValueError(f"{source}: {told}")
@@ -89,20 +87,20 @@ def _read(
     if source.is_dir():
         if unit is not None:
             raise ValueError(f"{source}: depth_unit_m does not apply to a Middlebury folder, got {unit:g}")
-        depth, own_image = middlebury.read(source)
+        depth, own_image = collections.read_middlebury(source)
         image = own_image if image is None else image
     elif suffix == ".mat" and not frames:
         depth = _depth(source, _matlab(source), unit)
     elif suffix == ".mat":
         if unit is not None:
             raise ValueError(f"{source}: depth_unit_m does not apply to NYUv2, which is in metres, got {unit:g}")
-        metres, colours = nyu.read_frame(source, index)
+        metres, colours = collections.read_nyu(source, index)
         depth = _depth(source, metres, 1.0)
         reflectivity = pixels.luminance(source, colours)
     elif suffix == ".npz":
         depth, reflectivity, background = _npz(source, unit)
     else:
-        read = {".pfm": read_pfm, ".exr": read_exr}.get(suffix, pixels.array)
+        read = {".pfm": pixels.read_pfm, ".exr": pixels.read_exr}.get(suffix, pixels.array)
         depth = _depth(source, read(source), unit)
     if image is not None:
         reflectivity = pixels.reflectivity(image, pixels.array(image))

@@ -1,4 +1,10 @@
-"""Pixels of files: decoding images and arrays, luminance of colours, checks that name the file."""
+"""Pixels of files: decoding images, arrays, PFM and OpenEXR, luminance of colours, checks that name the file.
+
+A PFM, the portable float map, has three lines of text, then 32-bit floats, the bottom row first. The lines are ``Pf``
+(one channel) or ``PF`` (three), the width and height, and a number whose sign gives the byte order: negative for
+little-endian. Its magnitude is a scale that no depth data set uses (Middlebury 2014 puts 1/255 there for its viewer),
+and it is ignored here as everywhere. OpenEXR needs the library of that name, of the extra ``io``.
+"""
 
 from __future__ import annotations
 
@@ -11,13 +17,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar._base.files import FileError, check_claim, read_npy, reading
+from mars_lidar._base.files import FileError, check_claim, check_source, read_npy, reading
+from mars_lidar._base.optional import needed
 from mars_lidar._base.types import FloatArray
 
 if TYPE_CHECKING:
     from PIL.Image import Image
 
 _PIXEL_BYTES = 4 + 3 * 8  # of a colour image: as it is stored, and as linear light
+_DEPTHS = ("Z", "V", "Depth", "depth")  # last part of a channel's name in a layer: ViewLayer.Depth.Z of Blender
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # Rec. 709, the primaries of sRGB
 
 
@@ -43,6 +51,70 @@ def decoded(image: Image) -> NDArray[Any]:
         return np.array(image.convert(image.palette.mode if image.palette else "RGB"))
     values = np.array(image)
     return values.astype(np.uint16) if image.format == "PNG" and values.dtype == np.int32 else values
+
+
+def read_pfm(path: Path) -> NDArray[np.float32]:
+    """Values (H, W), or (H, W, 3), float32, the top row first; a ValueError begins with the file."""
+    content = path.read_bytes()
+    lines = content.split(b"\n", 3)
+    if len(lines) < 4 or lines[0].strip() not in (b"Pf", b"PF"):
+        raise ValueError(f"{path}: cannot be read (not a PFM: it must begin with a line Pf or PF)")
+    channels = 3 if lines[0].strip() == b"PF" else 1
+    try:
+        width, height = (int(n) for n in lines[1].split())
+        scale = float(lines[2])
+    except ValueError:
+        width = height = 0
+        scale = math.nan
+    if width < 1 or height < 1 or not scale or not math.isfinite(scale):
+        told = (lines[1][:40] + b" / " + lines[2][:40]).decode("ascii", "replace")
+        raise ValueError(f"{path}: cannot be read (not a PFM: width, height and scale are {told!r})")
+    expected = 4 * width * height * channels
+    if len(lines[3]) < expected:
+        raise ValueError(f"{path}: cannot be read (cut short: {len(lines[3])} of {expected} bytes of values)")
+    values: NDArray[Any] = np.frombuffer(lines[3], "<f4" if scale < 0 else ">f4", width * height * channels)
+    shape = (height, width) if channels == 1 else (height, width, 3)
+    return np.ascontiguousarray(values.reshape(shape)[::-1], dtype=np.float32)
+
+
+def read_exr(path: Path) -> NDArray[Any]:
+    """The depth (H, W): the channel Z, else that of a layer (``*.Depth.Z``), Y, the only one, or grey written as RGB.
+
+    A ValueError begins with the file: several channels of which none is depth, colours, or no EXR that can be read.
+    """
+    openexr = needed("OpenEXR", f"{path}: depth in .exr")
+    check_source(path)
+    with open(path, "rb") as file:
+        magic = file.read(4)
+    if not magic == b"\x76\x2f\x31\x01":  # the library would write to standard error
+        raise ValueError(f"{path}: cannot be read (not an OpenEXR file)")
+    with reading(path, "an OpenEXR file"):
+        with openexr.File(str(path), header_only=True) as file:
+            low, high = file.header()["dataWindow"]
+            claimed = math.prod(int(b) - int(a) + 1 for a, b in zip(low, high, strict=True))
+            check_claim(path, 8 * claimed * max(1, len(file.channels())), "its pixels")
+        with openexr.File(str(path), separate_channels=True) as file:
+            found = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
+    return _depth_channel(path, found)
+
+
+def _depth_channel(path: Path, found: dict[str, NDArray[Any]]) -> NDArray[Any]:
+    told = ", ".join(sorted(found)) or "none"
+    for name in ("Z", "Y") if len(found) > 1 else tuple(found):
+        if name in found:
+            return found[name]
+    layers = [name for name in found if name.rpartition(".")[2] in _DEPTHS]
+    deep = [name for name in layers if "depth" in name.lower()] or [name for name in layers if name.endswith("Z")]
+    if len(deep) == 1:
+        return found[deep[0]]
+    if deep:
+        raise ValueError(f"{path}: has several channels of depth: {', '.join(deep)}; write one of them")
+    grey = [found[name] for name in ("R", "G", "B") if name in found]
+    if grey and all(np.array_equal(one, grey[0], equal_nan=True) for one in grey):
+        return grey[0]
+    if len(grey) > 1:
+        raise ValueError(f"{path}: holds colours, not depth: its channels are {told}")
+    raise ValueError(f"{path}: must have a channel of depth (Z, *.Depth.Z) or one channel, got {told}")
 
 
 def reflectivity(path: Path, stored: NDArray[Any]) -> FloatArray:

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from mars_lidar._base.files import open_npz
 from mars_lidar._base.text import read_column
 from mars_lidar.io.named_arrays import mat_arrays
-from mars_lidar.io.streams.attributes import of_pixels
-from mars_lidar.io.streams.photons import NoLaserError, Photons
+from mars_lidar.io.streams.photons import NoLaserError, Photons, of_pixels
 from mars_lidar.light.timestamps import Timestamps
 
 _BINS = 1024  # of times that are no whole numbers of a unit, where none are asked for

@@ -21,8 +21,7 @@ from mars_lidar._base.files import (
     unfinished_of,
 )
 from mars_lidar.io.streams import picoquant
-from mars_lidar.io.streams.attributes import FORMAT, attributes, from_attributes
-from mars_lidar.io.streams.photons import Photons
+from mars_lidar.io.streams.photons import FORMAT, Photons, attributes, from_attributes
 from mars_lidar.light.timestamps import Timestamps
 
 STREAM_SUFFIXES = (".npz", ".ptu", ".h5", ".hdf5")

@@ -25,8 +25,7 @@ from numpy.typing import NDArray
 from mars_lidar._base.files import finished_name, whole
 from mars_lidar._base.hdf5 import open_hdf5, seal
 from mars_lidar._base.optional import needed
-from mars_lidar.io.streams.attributes import attributes, fine_times, of_fine_times
-from mars_lidar.io.streams.photons import Photons
+from mars_lidar.io.streams.photons import Photons, attributes, fine_times, of_fine_times
 from mars_lidar.light.timestamps import Timestamps
 
 _GROUP, _ATTRIBUTES = "mars_lidar", "attributes"  # below /user, which the format leaves to its writers

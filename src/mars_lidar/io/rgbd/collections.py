@@ -1,4 +1,12 @@
-"""Stereo scenes of Middlebury (vision.middlebury.edu/stereo/data): depth from disparity.
+"""The layouts of two collections of scenes: NYUv2 and Middlebury.
+
+The labelled data set of NYUv2 is ``nyu_depth_v2_labeled.mat``: 1449 frames of depth and colour.
+
+It is a MATLAB v7.3 file, that is HDF5 with MATLAB's axes reversed: ``depths`` (N, W, H) in metres, holes filled
+by its authors, and ``images`` (N, 3, W, H), 8 bits. Depth is perpendicular to the image plane (focal length
+about 519 px; N. Silberman et al., ECCV 2012).
+
+Middlebury has a folder for each stereo scene (vision.middlebury.edu/stereo/data): depth from disparity.
 
 2005 and 2006, ``disp1.png``, ``view1.png``, ``dmin.txt``: depth is ``f b / (d + d_min)``, f = 3740 px and b =
 160 mm at full size. The stored d is in pixels of the *full* size at full, half and third size alike (the data
@@ -16,14 +24,19 @@ Depth is perpendicular to the image plane in all of them.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mars_lidar._base import checks
+from mars_lidar._base.files import check_claim
+from mars_lidar._base.hdf5 import open_hdf5
 from mars_lidar._base.types import FloatArray
 from mars_lidar.io.rgbd import pixels
-from mars_lidar.io.rgbd.pfm import read_pfm
 
 _FILES_2005 = ("disp1.png", "view1.png", "dmin.txt")
 _FILES_2014 = ("disp0.pfm", "im0.png", "calib.txt")
@@ -31,12 +44,53 @@ _FOCAL_2005_PX = 3740.0
 _BASELINE_2005_M = 0.160
 
 
-def is_scene(folder: Path) -> bool:
+def is_nyu(path: Path) -> bool:
+    """Whether a .mat is of version 7.3 and has NYUv2's ``depths`` or ``images``."""
+    import h5py
+
+    if not h5py.is_hdf5(path):
+        return False
+    with open_hdf5(path) as file:
+        return "depths" in file or "images" in file
+
+
+def nyu_frames(path: Path) -> int:
+    """Number of frames in the file."""
+    with _nyu(path) as file:
+        return int(file["depths"].shape[0])
+
+
+def read_nyu(path: Path, index: Any) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Depth (H, W), m, and colours (H, W, 3), uint8, of a frame; only this frame is read."""
+    with _nyu(path) as file:
+        depths, images = file["depths"], file["images"]
+        k = checks.integer("index", index, low=0, high=int(depths.shape[0]) - 1)
+        check_claim(path, 4 * 8 * depths[:1].size, f"frame {k}")
+        depth, image = np.asarray(depths[k]), np.asarray(images[k])
+    return depth.T, image.transpose(2, 1, 0)
+
+
+@contextmanager
+def _nyu(path: Path) -> Iterator[Any]:
+    import h5py
+
+    with open_hdf5(path, "NYUv2's labelled .mat, of MATLAB v7.3") as file:
+        for name in ("depths", "images"):
+            if not isinstance(file.get(name), h5py.Dataset):
+                raise ValueError(f"{path}: must hold 'depths' and 'images' as NYUv2 does, got {', '.join(file)}")
+        depths, images = file["depths"], file["images"]
+        if depths.ndim != 3 or images.shape != (depths.shape[0], 3, *depths.shape[1:]) or depths.size == 0:
+            told = f"{pixels.describe(depths)} and {pixels.describe(images)}"
+            raise ValueError(f"{path}: depths must be (N, W, H) and images (N, 3, W, H), got {told}")
+        yield file
+
+
+def is_middlebury(folder: Path) -> bool:
     """Whether the folder has the disparities of a scene, of either layout."""
     return any((folder / files[0]).is_file() for files in (_FILES_2005, _FILES_2014))
 
 
-def read(folder: Path) -> tuple[FloatArray, Path]:
+def read_middlebury(folder: Path) -> tuple[FloatArray, Path]:
     """Depth (H, W) in m, NaN where it is unknown, and the path of the left image."""
     newer = any((folder / name).is_file() for name in (_FILES_2014[0], _FILES_2014[2]))
     files, years = (_FILES_2014, "2014/2021") if newer else (_FILES_2005, "2005/2006")
@@ -67,7 +121,7 @@ def _depth_2005(folder: Path) -> FloatArray:
 
 def _depth_2014(folder: Path) -> FloatArray:
     focal_px, baseline_mm, offset_px = _calibration(folder / "calib.txt")
-    disparity = pixels.floats(folder / "disp0.pfm", "disparity", read_pfm(folder / "disp0.pfm"))
+    disparity = pixels.floats(folder / "disp0.pfm", "disparity", pixels.read_pfm(folder / "disp0.pfm"))
     shifted = disparity + offset_px
     usable = np.isfinite(disparity) & (disparity > 0.0) & (shifted > 0.0)
     depth = 1e-3 * baseline_mm * focal_px / np.where(usable, shifted, np.nan)

@@ -13,7 +13,7 @@ from mars_lidar._base.arguments import checked
 from mars_lidar._base.files import check_claim, reading
 from mars_lidar._base.progress import callback_of
 from mars_lidar._base.types import Progress
-from mars_lidar.io.rgbd import middlebury, nyu
+from mars_lidar.io.rgbd import collections
 from mars_lidar.scene.scene import Scene
 
 BAD_FILE = (ValueError, TypeError, OSError, MemoryError)  # what a scene that cannot be used raises
@@ -185,7 +185,7 @@ def _matching(root: Path, pattern: str, image: tuple[str, str] | None, problems:
 
 
 def _recognised(root: Path, problems: list[Problem]) -> Iterator[SceneFile]:
-    if middlebury.is_scene(root):
+    if collections.is_middlebury(root):
         yield SceneFile(depth=root)
         return
     try:
@@ -209,10 +209,10 @@ def _frames(path: Path, image: Path | None, problems: list[Problem]) -> Iterator
         yield SceneFile(depth=path, image=image)
         return
     try:
-        if not nyu.is_labelled(path):
+        if not collections.is_nyu(path):
             yield SceneFile(depth=path, image=image)
             return
-        count = nyu.frames(path)
+        count = collections.nyu_frames(path)
     except BAD_FILE as error:
         problems.append(Problem.of(path, error))
         return

@@ -17,7 +17,7 @@ from mars_lidar._base.arguments import checked
 from mars_lidar._base.progress import callback_of, of_part
 from mars_lidar._base.types import Progress
 from mars_lidar.engines import EngineOptions, find_engine
-from mars_lidar.engines.options import given
+from mars_lidar.engines.engine import given
 from mars_lidar.engines.table_reader import table_record
 from mars_lidar.instrument.system import System
 from mars_lidar.io import zarr_store

@@ -27,8 +27,6 @@ from mars_lidar.dataset import DatasetRecipe, Light, estimate, export, open_data
 from mars_lidar.io.maps import load_maps, save_maps
 from tests.harness.command import command_line, options_of
 
-docscrape = pytest.importorskip("numpydoc.docscrape")
-
 SYSTEM = ml.System(
     period_ns=100.0, cycles=20, bins=16, pulse=ml.GaussianPulse(sigma_ns=2.0), detector=ml.Detector(dead_time_ns=30.0)
 )
@@ -429,6 +427,7 @@ def test_wrong_arguments_are_refused_by_name(here, name):
 @pytest.mark.parametrize("name", CALLS)
 def test_errors_of_wrong_arguments_are_documented(here, name):
     """Each class of error above stands in the section Raises of the function or class that raises it."""
+    docscrape = pytest.importorskip("numpydoc.docscrape")
     call = CALLS[name](here)[0]
     home = inspect.unwrap(call)
     if name in UNDOCUMENTED or not (inspect.isclass(call) or "." not in home.__qualname__):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from importlib.util import find_spec
 from typing import Any
 
 import pytest
@@ -66,10 +65,6 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if deselected:
         config.hook.pytest_deselected(items=deselected)
         items[:] = [item for item in items if item not in set(deselected)]
-
-
-def pytest_report_header() -> str | None:
-    return None if find_spec("torch") else "tests/learn is left out: it needs PyTorch (extra learn)"
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:

@@ -14,8 +14,7 @@ def tiers_of(name: str) -> set[str]:
     """Tiers that a test function, or the functions of a file of tests, belong to."""
     file, _, wanted = name.partition("::")
     tree = ast.parse((ROOT / file).read_text(encoding="utf-8"))
-    of_learn = file.startswith("tests/learn/")  # see its conftest
-    whole = of_learn or any(isinstance(node, ast.Assign) and "mark.full" in ast.unparse(node) for node in tree.body)
+    whole = any(isinstance(node, ast.Assign) and "pytest.mark.full" in ast.unparse(node) for node in tree.body)
     tests = [
         node
         for node in tree.body
@@ -24,7 +23,7 @@ def tiers_of(name: str) -> set[str]:
     assert tests, name
     marked = [any("mark.full" in ast.unparse(decorator) for decorator in node.decorator_list) for node in tests]
     if not wanted:
-        return {"full"} if whole or all(marked) else {"fast"}
+        return {"fast"} if not all(marked) else {"full"}
     return {"full" if whole or any(marked) else "fast"}
 
 

@@ -351,6 +351,6 @@ def _figure(maps: Results, settings: Settings) -> Figure:
     for ax, (name, each) in zip(axes[0], maps.items(), strict=True):
         depth = each.depth_m if isinstance(each, Reconstruction) else each
         last = "depth (m)" if ax is axes[0, -1] else ""
-        _draw_map(ax, depth, last, "viridis", _limits(truth), name.replace("_", " "))
+        _draw_map(ax, depth, last, "viridis", _limits(truth), name.replace("_", " ").replace(" ", "\n", 1))
         ax.images[0].set_interpolation("nearest")
     return figure

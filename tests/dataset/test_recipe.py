@@ -10,7 +10,7 @@ from dataset.conftest import SYSTEM
 
 from mars_lidar._base.yaml import read_yaml
 from mars_lidar.dataset import DatasetRecipe
-from mars_lidar.dataset.samples import count_samples, fitting, sample_parts
+from mars_lidar.dataset.arrays import count_samples, fitting, sample_parts
 
 TEXT = """\
 seed: 3

@@ -1,22 +1,8 @@
-"""Everything here is of the full tier, has PyTorch on one thread, and is left out where there is none."""
+"""Everything here has PyTorch on one thread."""
 
 from __future__ import annotations
 
-from importlib.util import find_spec
-from pathlib import Path
-
 import pytest
-
-HERE = Path(__file__).parent
-
-
-def pytest_ignore_collect(collection_path: Path) -> bool | None:
-    return True if collection_path.name.startswith("test_") and find_spec("torch") is None else None
-
-
-def pytest_itemcollected(item: pytest.Item) -> None:
-    if HERE in item.path.parents:
-        item.add_marker(pytest.mark.full)
 
 
 @pytest.fixture(autouse=True)

@@ -1,13 +1,13 @@
-"""The arrays of a dataset: names, units, chunks, shards and codecs."""
+"""The samples of a dataset and its arrays: numbering, names, units, chunks, shards and codecs."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from mars_lidar.dataset import samples
 from mars_lidar.dataset.recipe import DatasetRecipe
 from mars_lidar.io.zarr_store import blosc, consolidated
 
@@ -31,13 +31,53 @@ FLAT_KEYS = {"name": "default", "separator": "."}  # chunk c.5.0.0.0.0 is a file
 _COORDINATES = "scene scene_name system signal_level sbr period_ns seed"  # for xarray, as CF has it
 
 
+def count_samples(recipe: DatasetRecipe, scenes: int) -> int:
+    """Scenes x systems x levels."""
+    return scenes * len(recipe.systems) * len(recipe.light.levels)
+
+
+def sample_parts(recipe: DatasetRecipe, sample: int) -> tuple[int, int, float, float]:
+    """Scene, system, signal and sbr of a sample; levels vary fastest, then systems."""
+    rest, level = divmod(sample, len(recipe.light.levels))
+    scene, system = divmod(rest, len(recipe.systems))
+    return scene, system, *recipe.light.levels[level]
+
+
+def fitting(shape: Sequence[int], unit: Sequence[int], itemsize: int, most_bytes: float) -> tuple[int, ...]:
+    """The largest block of whole `unit` of an array of `shape` below `most_bytes`, filled from the last axis.
+
+    An axis is begun only where those behind it are whole, so that a block is one piece of the array in C order; it is
+    cut into equal parts.
+    """
+    block = list(unit)
+    for axis in reversed(range(len(shape))):
+        units = math.ceil(shape[axis] / unit[axis])
+        room = max(1, int(most_bytes // (math.prod(block) * itemsize)))
+        parts = math.ceil(units / min(units, room))
+        block[axis] = unit[axis] * math.ceil(units / parts)
+        if parts > 1:
+            break
+    return tuple(block)
+
+
+def grid(shape: Sequence[int], steps: Sequence[int]) -> tuple[int, ...]:
+    """How many blocks of `steps` there are along each axis."""
+    return tuple(math.ceil(n / step) for n, step in zip(shape, steps, strict=True))
+
+
+def block(place: Sequence[int], steps: Sequence[int], shape: Sequence[int]) -> tuple[slice, ...]:
+    """The part of an array that is the block at a place of the grid."""
+    every = zip(place, steps, shape, strict=True)
+    return tuple(slice(k * step, min((k + 1) * step, n)) for k, step, n in every)
+
+
 def histogram_blocks(
     recipe: DatasetRecipe, number: int, shape: tuple[int, int]
 ) -> tuple[tuple[int, ...], np.dtype[Any], tuple[int, ...], tuple[int, ...]]:
     """Shape, type, chunk and shard of the histogram; ValueError for an image with crosstalk larger than a chunk."""
     dtype = np.result_type(*(each.histogram_dtype for each in recipe.systems))
     whole = (number, recipe.realizations, *shape, recipe.systems[0].bins)
-    chunk = samples.fitting(whole, (1, 1, 1, 1, whole[-1]), dtype.itemsize, recipe.chunk_mib * 2**20)
+    chunk = fitting(whole, (1, 1, 1, 1, whole[-1]), dtype.itemsize, recipe.chunk_mib * 2**20)
     if chunk[2:4] != shape and any(each.detector.crosstalk is not None for each in recipe.systems):
         needed = math.prod(whole[2:]) * dtype.itemsize / 2**20
         raise ValueError(
@@ -48,8 +88,8 @@ def histogram_blocks(
     if shard_mib is None:
         enough = math.prod(whole) * dtype.itemsize / _SHARDS / 2**20
         shard_mib = max(min(max(_SHARD_MIB, enough), _LARGEST_MIB), recipe.chunk_mib)
-    shard = samples.fitting(whole, chunk, dtype.itemsize, shard_mib * 2**20)
-    shards = math.prod(samples.grid(whole, shard))
+    shard = fitting(whole, chunk, dtype.itemsize, shard_mib * 2**20)
+    shards = math.prod(grid(whole, shard))
     if shards > _MOST_SHARDS:
         raise ValueError(
             f"store.shard_mib must be larger, got {shard_mib:g}: {shards:,} files would lie in one folder, at most "
@@ -95,7 +135,7 @@ def create_maps(
         shape=shape,
         dtype=dtype,
         chunks=chunk,
-        shards=samples.fitting(shape, chunk, dtype.itemsize, _SHARD_BYTES),
+        shards=fitting(shape, chunk, dtype.itemsize, _SHARD_BYTES),
         compressors=blosc(dtype, "zstd", 1, "shuffle"),
         fill_value=np.nan,
         dimension_names=dims,

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.buckets import url_of
 from mars_lidar._base.threads import thread_count
-from mars_lidar.dataset import samples
-from mars_lidar.dataset.arrays import MAPS, histogram_blocks
+from mars_lidar.dataset.arrays import MAPS, count_samples, grid, histogram_blocks, sample_parts
 from mars_lidar.dataset.recipe import DatasetRecipe
 from mars_lidar.dataset.run import BUFFER_BYTES, making_bytes, read_recipe
 from mars_lidar.dataset.sample_content import Rendered, Shown
@@ -93,7 +92,7 @@ def estimate(
             "none of the scenes looked at can be used:\n" + "\n".join(f"  {each}" for each in problems[:5])
         )
     number = len(found) * (plan.crops if plan.crop else 1)
-    total = samples.count_samples(plan, number)
+    total = count_samples(plan, number)
     image = looked[0].shape
     shape, dtype, chunk, shard = histogram_blocks(plan, total, image)
     seconds, ratio = _probe(plan, looked, chunk, shard[1], dtype)
@@ -102,7 +101,7 @@ def estimate(
     maps = 4 * len(MAPS) * pixels * total + sum(map(_scene_bytes, looked)) // len(looked) * number
     parts = max(each.waveform_parts(system) for each in looked for system in plan.systems)
     block = making_bytes(chunk, dtype.itemsize, parts)
-    shards = math.prod(samples.grid(shape, shard))
+    shards = math.prod(grid(shape, shard))
     teams = max(1, min(team, shards, BUFFER_BYTES // block))
     return Estimate(
         scenes=number,
@@ -126,11 +125,11 @@ def quick_advice(recipe: DatasetRecipe | dict[str, Any] | str | Path, threads: i
         plan, found, _, looked, each_s = _looked_at(recipe, 1)
         if not looked:
             return Advice(0.0)
-        total = samples.count_samples(plan, len(found) * (plan.crops if plan.crop else 1))
-        chosen = sorted({round(k) for k in np.linspace(0, samples.count_samples(plan, 1) - 1, 3)})
+        total = count_samples(plan, len(found) * (plan.crops if plan.crop else 1))
+        chosen = sorted({round(k) for k in np.linspace(0, count_samples(plan, 1) - 1, 3)})
         told = []
         for sample in chosen:
-            _, system, signal, sbr = samples.sample_parts(plan, sample)
+            _, system, signal, sbr = sample_parts(plan, sample)
             flux = looked[0].flux(plan.systems[system], plan.light, signal, sbr)
             made = plan.realizations * total
             told.append(advice(flux, plan.systems[system], plan.engine, realizations=made, threads=threads))
@@ -171,13 +170,13 @@ def _probe(
     `shard` exposures of a sample are made one after the other.
     """
     random = np.random.default_rng(0)
-    every = samples.count_samples(plan, len(looked))
+    every = count_samples(plan, len(looked))
     rows, columns = chunk[2], chunk[3]
     seconds, packed, dense, exposures = 0.0, 0, 0, 0
     pack = packer(plan.layout, dtype)
     together = min(shard, plan.realizations)  # exposures that share a flux
     for k, sample in enumerate(random.choice(every, min(every, _PROBES), replace=False)):
-        scene, system, signal, sbr = samples.sample_parts(plan, int(sample))
+        scene, system, signal, sbr = sample_parts(plan, int(sample))
         flux = looked[scene].flux(plan.systems[system], plan.light, signal, sbr)
         y, x = (int(random.integers(n - m + 1)) for n, m in zip(looked[0].shape, (rows, columns), strict=True))
         began = time.perf_counter()

@@ -15,17 +15,18 @@ import numpy as np
 
 from mars_lidar._base.buckets import in_bucket, remove, zarr_store
 from mars_lidar._version import __version__
-from mars_lidar.dataset import samples
 from mars_lidar.dataset.arrays import (
     FORMAT,
     FORMAT_VERSION,
     MAPS,
     MORE_VERSION,
     PHOTONS,
+    count_samples,
     create_histogram,
     create_maps,
     histogram_blocks,
     mark,
+    sample_parts,
 )
 from mars_lidar.dataset.cluster import Crew
 from mars_lidar.dataset.recipe import DatasetRecipe
@@ -68,7 +69,7 @@ def create(path: Path, recipe: DatasetRecipe, folder: Path, crew: Crew | None = 
             continue
         name, scene = result
         if writer is None:  # nothing on the disk is touched before there is something to put on it
-            histogram_blocks(recipe, samples.count_samples(recipe, most), scene.shape)
+            histogram_blocks(recipe, count_samples(recipe, most), scene.shape)
             writer = SceneWriter(begin(path, recipe), most, path, source)
         writer.problems = [[str(each.path), each.reason] for each in problems]
         writer.add(name, scene, (place[0], place[1] + 1))
@@ -134,7 +135,7 @@ def lay_out(group: Any, recipe: DatasetRecipe, writer: SceneWriter, problems: li
     names, shape = writer.names, writer.shape
     assert shape is not None
     add(group, coordinates(recipe, names, shape))
-    number = samples.count_samples(recipe, len(names))
+    number = count_samples(recipe, len(names))
     for name, (text, unit) in MAPS.items():
         create_maps(group, name, (number, *shape), np.dtype(np.float32), ("sample", "y", "x"), text, unit)
     create_histogram(group, recipe, number, shape)
@@ -148,8 +149,8 @@ def lay_out(group: Any, recipe: DatasetRecipe, writer: SceneWriter, problems: li
 
 def coordinates(recipe: DatasetRecipe, names: list[str], shape: tuple[int, int]) -> list[Variable]:
     """Every small array, of scenes of these names and shape (H, W)."""
-    number = samples.count_samples(recipe, len(names))
-    parts = [samples.sample_parts(recipe, k) for k in range(number)]
+    number = count_samples(recipe, len(names))
+    parts = [sample_parts(recipe, k) for k in range(number)]
     texts = [result.to_json() for result in recipe.systems]
     seeds = [seed_of(recipe, names[scene], texts[system], s, b) for scene, system, s, b in parts]
     scene, system, signal, sbr = (np.array(column) for column in zip(*parts, strict=True))

@@ -15,7 +15,7 @@ from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.files import FileError, reading
 from mars_lidar._base.native import _core
-from mars_lidar.dataset.samples import grid
+from mars_lidar.dataset.arrays import grid
 from mars_lidar.dataset.shard import is_good
 from mars_lidar.dataset.store import Dataset, open_dataset
 

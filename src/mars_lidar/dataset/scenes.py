@@ -29,8 +29,7 @@ from numpy.typing import NDArray
 
 from mars_lidar._base.buckets import in_bucket
 from mars_lidar._base.files import reading
-from mars_lidar.dataset import samples
-from mars_lidar.dataset.arrays import FLAT_KEYS, create_maps
+from mars_lidar.dataset.arrays import FLAT_KEYS, create_maps, fitting, grid
 from mars_lidar.dataset.sample_content import Rendered, Shown, Surfaces
 from mars_lidar.dataset.shard import DigestNotes
 from mars_lidar.instrument.system import System
@@ -137,7 +136,7 @@ class SceneWriter:
     def _note(self, name: str, places: Iterable[int]) -> None:
         """Note the digests of the files of an array at some places along its scenes."""
         array = self._arrays[name]
-        blocks = samples.grid(array.shape[1:], (array.shards or array.chunks)[1:])
+        blocks = grid(array.shape[1:], (array.shards or array.chunks)[1:])
         for place in itertools.product(places, *map(range, blocks)):
             path = self._path / "scenes" / name / array.metadata.encode_chunk_key(place)
             if path.exists():  # where all values are the fill value there is none
@@ -188,7 +187,7 @@ class SceneWriter:
                 "transient",
                 shape=shape,
                 dtype=_DOUBLE,
-                chunks=samples.fitting((1, *shape[1:]), (1, 1, 1, bins), _DOUBLE.itemsize, _RATE_BYTES),
+                chunks=fitting((1, *shape[1:]), (1, 1, 1, bins), _DOUBLE.itemsize, _RATE_BYTES),
                 compressors=blosc(_DOUBLE, "zstd", 1, "shuffle"),
                 fill_value=0.0,
                 dimension_names=("scene", "y", "x", "bin"),

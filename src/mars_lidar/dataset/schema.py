@@ -55,14 +55,14 @@ def _kinds(more: Fields) -> dict[str, Any]:
     made = []
     for kind, fields in KINDS.items():
         every = values.schema_of({**SINGLE[kind], **fields, **more})
-        made.append(every | ({"anyOf": [{"required": [one]} for one in ("path", "depth")]} if kind == "path" else {}))
+        made.append(every | ({"anyOf": [{"required": [name]} for name in ("path", "depth")]} if kind == "path" else {}))
         if kind != "path":
             made[-1]["required"] = [kind]
     return {"anyOf": made}
 
 
-def _one_or_more(one: dict[str, Any], told: dict[str, Any]) -> dict[str, Any]:
-    return {**told, "anyOf": [one, {"type": "array", "items": one, "minItems": 1}]}
+def _one_or_more(entry: dict[str, Any], about: dict[str, Any]) -> dict[str, Any]:
+    return {**about, "anyOf": [entry, {"type": "array", "items": entry, "minItems": 1}]}
 
 
 def _system() -> dict[str, Any]:
@@ -78,23 +78,23 @@ def _pulse() -> dict[str, Any]:
     gaussian = {"kind": {"const": "gaussian"}, **_of_class(GaussianPulse)["properties"]}
     gaussian["fwhm_ns"] = {"type": "number", "description": "Full width at half maximum, ns, instead of sigma_ns."}
     sampled: dict[str, Any] = {"kind": {"const": "sampled"}}
-    told = _told(SampledPulse)
-    sampled["values"] = {"type": "array", "items": {"type": "number"}, "description": told.get("values", "")}
-    sampled["bin_ns"] = {"type": "number", "description": told.get("bin_ns", "")}
-    sampled["origin"] = {"enum": ["peak", "centroid", "first"], "description": told.get("origin", "")}
+    sentences = _sentences(SampledPulse)
+    sampled["values"] = {"type": "array", "items": {"type": "number"}, "description": sentences.get("values", "")}
+    sampled["bin_ns"] = {"type": "number", "description": sentences.get("bin_ns", "")}
+    sampled["origin"] = {"enum": ["peak", "centroid", "first"], "description": sentences.get("origin", "")}
     closed = {"type": "object", "additionalProperties": False}
-    return {"anyOf": [{**closed, "properties": one, "required": ["kind"]} for one in (gaussian, sampled)]}
+    return {"anyOf": [{**closed, "properties": kind, "required": ["kind"]} for kind in (gaussian, sampled)]}
 
 
 def _of_class(kind: Any) -> dict[str, Any]:
     """Schema of the plain form of a frozen dataclass of the package: types of its fields, texts of its docstring."""
-    hints, told = get_type_hints(kind), _told(kind)
+    hints, sentences = get_type_hints(kind), _sentences(kind)
     properties: dict[str, Any] = {}
     needed = []
     for field in dataclasses.fields(kind):
         properties[field.name] = _of_type(hints[field.name])
-        if field.name in told:
-            properties[field.name]["description"] = told[field.name]
+        if field.name in sentences:
+            properties[field.name]["description"] = sentences[field.name]
         if field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
             needed.append(field.name)
     made = {"type": "object", "properties": properties, "additionalProperties": False}
@@ -108,7 +108,7 @@ def _of_type(kind: Any) -> dict[str, Any]:
     if origin is Literal:
         return {"enum": list(get_args(kind))}
     if origin in (Union, types.UnionType):
-        inner = [_of_type(one) for one in get_args(kind) if one is not type(None)]
+        inner = [_of_type(each) for each in get_args(kind) if each is not type(None)]
         return inner[0] if len(inner) == 1 else {"anyOf": inner}
     if origin in (tuple, list, np.ndarray):
         return {"type": "array", "items": {"type": "number"}}
@@ -121,8 +121,8 @@ def _of_type(kind: Any) -> dict[str, Any]:
     return {"type": "object"}
 
 
-def _told(kind: type) -> dict[str, str]:
+def _sentences(kind: type) -> dict[str, str]:
     """First sentence on each parameter in a docstring."""
-    found = re.findall(r"^    (\w[\w, ]*)\n((?:        .*\n|\n)+)", kind.__doc__ or "", flags=re.MULTILINE)
-    sentences = {names: " ".join(text.split()).split(". ")[0] for names, text in found}
-    return {name.strip(): text for names, text in sentences.items() for name in names.split(",")}
+    parameters = re.findall(r"^    (\w[\w, ]*)\n((?:        .*\n|\n)+)", kind.__doc__ or "", flags=re.MULTILINE)
+    first = {names: " ".join(text.split()).split(". ")[0] for names, text in parameters}
+    return {name.strip(): text for names, text in first.items() for name in names.split(",")}

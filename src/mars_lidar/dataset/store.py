@@ -29,10 +29,19 @@ from mars_lidar._base import checks, manifest
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.buckets import content_of, in_bucket, place_of, remove, sizes, zarr_store
 from mars_lidar._base.files import INCOMPLETE_SUFFIX, FileError, IncompleteFileError, reading
-from mars_lidar.dataset.arrays import FORMAT, FORMAT_VERSION, MAPS, MORE_VERSION, mark, with_zeros
+from mars_lidar.dataset.arrays import (
+    FORMAT,
+    FORMAT_VERSION,
+    MAPS,
+    MORE_VERSION,
+    block,
+    grid,
+    mark,
+    sample_parts,
+    with_zeros,
+)
 from mars_lidar.dataset.recipe import DatasetRecipe
 from mars_lidar.dataset.sample_content import Rendered
-from mars_lidar.dataset.samples import block, grid, sample_parts
 from mars_lidar.dataset.scenes import SceneReader
 from mars_lidar.dataset.shard import digests_of, is_good
 from mars_lidar.io.cube import Cube

@@ -28,12 +28,12 @@ class Field:
 Fields = dict[str, Field]
 
 
-def _field(told: str, read: Callable[[Key, Any], Any], **schema: Any) -> Field:
-    return Field(read, {"description": told, **schema} if told else schema)
+def _field(about: str, read: Callable[[Key, Any], Any], **schema: Any) -> Field:
+    return Field(read, {"description": about, **schema} if about else schema)
 
 
 def real(
-    told: str, *, low: float = -math.inf, high: float = math.inf, strict_low: bool = False, infinite: bool = False
+    about: str, *, low: float = -math.inf, high: float = math.inf, strict_low: bool = False, infinite: bool = False
 ) -> Field:
     """A number in [low, high]; inf too, where it may be `infinite`."""
     limits: dict[str, Any] = {"type": ["number", "string"] if infinite else "number"}
@@ -50,31 +50,31 @@ def real(
             return math.inf
         return float(checked(key, lambda: checks.real(key_name(key), given, low=low, high=high, strict_low=strict_low)))
 
-    return _field(told, read, **limits)
+    return _field(about, read, **limits)
 
 
-def integer(told: str, *, low: int, high: int, name: str | None = None) -> Field:
+def integer(about: str, *, low: int, high: int, name: str | None = None) -> Field:
     """An integer in [low, high]."""
 
     def read(key: Key, value: Any) -> int:
         return int(checked(key, lambda: checks.integer(name or key_name(key), number(value), low=low, high=high)))
 
-    return _field(told, read, type="integer", minimum=low, maximum=high)
+    return _field(about, read, type="integer", minimum=low, maximum=high)
 
 
-def choice(told: str, allowed: tuple[str, ...]) -> Field:
+def choice(about: str, allowed: tuple[str, ...]) -> Field:
     """One of some words."""
-    return _field(told, lambda key, value: checked(key, checks.choice, key_name(key), value, allowed), enum=[*allowed])
+    return _field(about, lambda key, value: checked(key, checks.choice, key_name(key), value, allowed), enum=[*allowed])
 
 
-def text(told: str) -> Field:
+def text(about: str) -> Field:
     """A text that is not empty."""
-    return _field(told, _kind(str, "a text"), type="string", minLength=1)
+    return _field(about, _kind(str, "a text"), type="string", minLength=1)
 
 
-def flag(told: str) -> Field:
+def flag(about: str) -> Field:
     """True or false."""
-    return _field(told, _kind(bool, "true or false"), type="boolean")
+    return _field(about, _kind(bool, "true or false"), type="boolean")
 
 
 def _kind(kind: type, words: str) -> Callable[[Key, Any], Any]:
@@ -89,10 +89,10 @@ def _kind(kind: type, words: str) -> Callable[[Key, Any], Any]:
 _SIDE = integer("", low=1, high=MAX_SIDE)
 
 
-def size(told: str) -> Field:
+def size(about: str) -> Field:
     """The longer side of an image, or [height, width]."""
     both = {"type": "array", "items": _SIDE.schema, "minItems": 2, "maxItems": 2}
-    return _field(told, read_size, anyOf=[_SIDE.schema, both])
+    return _field(about, read_size, anyOf=[_SIDE.schema, both])
 
 
 def read_size(key: Key, value: Any) -> int | list[int]:
@@ -100,14 +100,14 @@ def read_size(key: Key, value: Any) -> int | list[int]:
     if isinstance(value, list | tuple):
         if len(value) != 2:
             raise RecipeError(key, f"{key_name(key)} must be an integer or [height, width], got {value!r}")
-        return [_SIDE.read(key, one) for one in value]
+        return [_SIDE.read(key, side) for side in value]
     side: int = _SIDE.read(key, value)
     return side
 
 
-def numbers(told: str, name: str) -> Field:
+def numbers(about: str, name: str) -> Field:
     """A list of integers, or ``{first, count}``."""
-    one = integer("", low=0, high=2**64 - 1, name=name)
+    entry = integer("", low=0, high=2**64 - 1, name=name)
     run: Fields = {
         "first": integer("The first one.", low=0, high=2**63).or_else(0),
         "count": integer("How many.", low=1, high=2**20),
@@ -118,13 +118,13 @@ def numbers(told: str, name: str) -> Field:
             return read_mapping(key, value, run, needed=("count",))
         if not isinstance(value, list) or not value:
             raise RecipeError(key, f"{name} must be a list of integers, or first and count, got {value!r}")
-        found = [one.read((*key, k), each) for k, each in enumerate(value)]
-        if len(set(found)) < len(found):
-            raise RecipeError(key, f"{name} must differ from each other, got {found}")
-        return found
+        listed = [entry.read((*key, k), each) for k, each in enumerate(value)]
+        if len(set(listed)) < len(listed):
+            raise RecipeError(key, f"{name} must differ from each other, got {listed}")
+        return listed
 
-    listed = {"type": "array", "items": one.schema, "minItems": 1}
-    return _field(told, read, anyOf=[listed, schema_of(run, needed=("count",))])
+    schema = {"type": "array", "items": entry.schema, "minItems": 1}
+    return _field(about, read, anyOf=[schema, schema_of(run, needed=("count",))])
 
 
 def listed_numbers(value: Any) -> list[int]:
@@ -134,26 +134,26 @@ def listed_numbers(value: Any) -> list[int]:
     return list(value)
 
 
-def mapping(told: str, fields: Fields, needed: tuple[str, ...] = ()) -> Field:
+def mapping(about: str, fields: Fields, needed: tuple[str, ...] = ()) -> Field:
     """Keys of their own."""
-    return _field(told, lambda key, value: read_mapping(key, value, fields, needed), **schema_of(fields, needed))
+    return _field(about, lambda key, value: read_mapping(key, value, fields, needed), **schema_of(fields, needed))
 
 
-def several(one: Field) -> Field:
+def several(item: Field) -> Field:
     """One, or a list of them; read as a list."""
 
     def read(key: Key, value: Any) -> list[Any]:
         if not isinstance(value, list):
-            return [one.read(key, value)]
-        return [one.read((*key, k), each) for k, each in enumerate(value)]
+            return [item.read(key, value)]
+        return [item.read((*key, k), each) for k, each in enumerate(value)]
 
-    alone = {name: value for name, value in one.schema.items() if name != "description"}
-    return _field(one.schema["description"], read, anyOf=[alone, {"type": "array", "items": alone, "minItems": 1}])
+    alone = {name: value for name, value in item.schema.items() if name != "description"}
+    return _field(item.schema["description"], read, anyOf=[alone, {"type": "array", "items": alone, "minItems": 1}])
 
 
-def other(told: str, schema: dict[str, Any]) -> Field:
+def other(about: str, schema: dict[str, Any]) -> Field:
     """A value that is read elsewhere."""
-    return _field(told, lambda key, value: value, **schema)
+    return _field(about, lambda key, value: value, **schema)
 
 
 def read_mapping(
@@ -162,24 +162,24 @@ def read_mapping(
     """The values of a mapping of known keys, defaults among them; what is None is left out."""
     name = name or key_name(key) or "the recipe"
     given: dict[str, Any] = checked(key, checks.known_keys, name, data, tuple(fields))
-    for one in needed:
-        if given.get(one) is None:
-            raise RecipeError(key, f"{name} must give {one}")
-    told: dict[str, Any] = {}
+    for each in needed:
+        if given.get(each) is None:
+            raise RecipeError(key, f"{name} must give {each}")
+    result: dict[str, Any] = {}
     for each, field in fields.items():
         value = given.get(each)
         if value is not None:
-            told[each] = field.read((*key, each), value)
+            result[each] = field.read((*key, each), value)
         elif field.default is not None:
-            told[each] = field.default
-    return told
+            result[each] = field.default
+    return result
 
 
 def schema_of(fields: Fields, needed: tuple[str, ...] = ()) -> dict[str, Any]:
     """JSON Schema of a mapping."""
     properties = {name: field.schema for name, field in fields.items()}
-    told: dict[str, Any] = {"type": "object", "properties": properties, "additionalProperties": False}
-    return told | {"required": [*needed]} if needed else told
+    result: dict[str, Any] = {"type": "object", "properties": properties, "additionalProperties": False}
+    return result | {"required": [*needed]} if needed else result
 
 
 def key_name(key: Key) -> str:

@@ -16,9 +16,8 @@ from mars_lidar._base.progress import callback_of
 from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import Progress
 from mars_lidar._version import other_version
-from mars_lidar.dataset.arrays import MAPS
+from mars_lidar.dataset.arrays import MAPS, block, grid
 from mars_lidar.dataset.ingest import coordinates
-from mars_lidar.dataset.samples import block, grid
 from mars_lidar.dataset.store import Dataset, open_dataset
 from mars_lidar.dataset.write import Maker
 

@@ -14,9 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar.dataset.arrays import MAPS, with_zeros
+from mars_lidar.dataset.arrays import MAPS, sample_parts, with_zeros
 from mars_lidar.dataset.sample_content import Shown
-from mars_lidar.dataset.samples import sample_parts
 from mars_lidar.dataset.shard import DigestNotes, chunks_of, packer, write_shard
 from mars_lidar.dataset.store import Dataset, Item
 from mars_lidar.instrument.detector import Detector

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import torch
@@ -15,6 +16,7 @@ from benchmarks.timing import in_turn
 from mars_lidar.learn import HistogramTable, expected_histogram, histogram_log_likelihood
 
 PIXELS = 64
+_MANY = 512  # where calls of PyTorch would count otherwise
 
 
 def forward(config: Config, bandwidth: Bandwidth) -> Section:
@@ -25,6 +27,7 @@ def forward(config: Config, bandwidth: Bandwidth) -> Section:
     try:
         for bins in sorted({64, config.bins}):
             _rows(section, bins, config, bandwidth)
+            _coarse(section, bins, config)
     finally:
         torch.set_num_threads(threads)
     return section
@@ -77,6 +80,45 @@ def _rows(section: Section, bins: int, config: Config, bandwidth: Bandwidth) -> 
         )
 
 
+def _coarse(section: Section, bins: int, config: Config) -> None:
+    """The likelihood where bins are cut, beside its plain form: by the width of a bin, and re-armed in the pulse."""
+    random = np.random.default_rng(0)
+    s, b = np.exp(random.uniform(np.log(0.05), np.log(2.0), (2, _MANY)))
+    counts = torch.from_numpy(random.poisson(30.0, (_MANY, bins)).astype(float))
+    cases: dict[str, Callable[[], object]] = {}
+    for sigmas, dead, words in (
+        (0.34, 50.0, " (not cut)"),
+        *(
+            (wide, dead, words)
+            for wide in (1.0, 3.0)
+            for dead, words in ((75.0, ""), (99.0, ", re-armed in the pulse"))
+        ),
+    ):
+        system = ml.System(
+            period_ns=100.0,
+            cycles=config.cycles,
+            bins=bins,
+            pulse=ml.GaussianPulse(sigma_ns=100.0 / bins / sigmas),
+            detector=ml.Detector(dead_time_ns=dead),
+        )
+        at = [torch.from_numpy(one) for one in (s, b, random.uniform(0.0, 100.0, _MANY))]
+        name = f"histogram_log_likelihood, bins of {sigmas:g} sigma{words}"
+        model = partial(histogram_log_likelihood, counts, system=system)
+        cases[name], cases[name + ", gradient"] = partial(model, *at), partial(_gradient, model, at)
+    timings = in_turn(cases, config)
+    for name in list(cases)[::2]:
+        value, both = timings[name], timings[name + ", gradient"]
+        section.rows.append(
+            {
+                "case": name,
+                "bins": bins,
+                "value, CPU us a pixel": 1e6 * min(value.cpu) / _MANY,
+                "value and gradient": 1e6 * min(both.cpu) / _MANY,
+                "write floor us": None,
+            }
+        )
+
+
 def _gradient(model: Callable[..., torch.Tensor], at: list[torch.Tensor]) -> list[torch.Tensor | None]:
     leaves = [one.clone().requires_grad_() for one in at]
     model(*leaves).square().sum().backward()
@@ -87,5 +129,5 @@ _NOTE = (
     "{pixels} pixels, S and B log-uniform on [0.05, 2], any delay, sigma 0.5 ns, t_d = 75 ns, stationary start; one "
     "thread. "
     "mean_histogram: the native recursion through the exposure, without gradients (several pixels share a vector). "
-    "Floor: to write the histogram in float32."
+    "Floor: to write the histogram in float32. Bins of so many sigma: double, t_d = 75 of 100 ns, or 99 ns."
 )

@@ -185,14 +185,18 @@ def _display_math(writer: Any, node: nodes.math_block) -> None:
 
 def _commands() -> str:
     """The command line, as it describes itself."""
-    import typer
-    from typer.cli import get_docs_for_click
-
     from mars_lidar.cli import app
+    from mars_lidar.cli.options import describe
 
-    command = typer.main.get_command(app)
-    text = get_docs_for_click(obj=command, ctx=typer.Context(command), name="mars-lidar", title="Command line")
-    return re.sub(r"\[/?(?:bold|dim)\]", "", text)
+    for name in app:
+        if not name.startswith("-"):
+            describe(app[name])
+    text = app.generate_docs(output_format="markdown").replace("# mars-lidar\n", "# Command line\n", 1)
+    overview, *sections = re.split(r"(?m)^(?=## mars-lidar [a-z])", text)
+    commands = {name: app[name].help_epilogue for name in app}
+    examples = [commands.get(section.split()[2]) for section in sections]
+    ends = [f"```text\n{example}\n```\n\n" if example else "" for example in (app.help_epilogue, *examples)]
+    return "".join(section + end for section, end in zip((overview, *sections), ends, strict=True))
 
 
 _katex_style()

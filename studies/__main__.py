@@ -41,7 +41,7 @@ def _parser(command: str) -> argparse.ArgumentParser:
     )
     add("--truth", choices=("sequential", "exact"), default="sequential", help=words)
     words = (
-        "size of the study 'downstream': a quarter of an hour of one core, or two hours of it "
+        "size of the study 'downstream': some five minutes of one core, or some twenty "
         "(default: %(default)s); with --quick a tiny one, seconds"
     )
     add("--config", choices=("small", "full"), default="small", help=words)

@@ -25,14 +25,13 @@ from harness import (
 )
 from scipy import stats
 from test_reproducibility import image
-from typer.testing import CliRunner
 
 import mars_lidar as ml
 from mars_lidar import _core, io, statistics
-from mars_lidar.cli import app
 from mars_lidar.engines import ENGINES
 from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.statistics import constant_light_rate
+from tests.harness.command import command_line
 
 BOTH = ["exact", "sequential"]
 EXPONENTIAL = ml.Afterpulsing(probability=0.3, delay_ns=60.0)
@@ -361,7 +360,7 @@ def test_round_trip_and_preset():
 
 def test_command_line(tmp_path: Path):
     def run(*options: str) -> Any:
-        return CliRunner().invoke(app, ["simulate", "--scene", "room", "--size", "4", "--no-picture", *options])
+        return command_line(["simulate", "--scene", "room", "--size", "4", "--no-picture", *options])
 
     file = tmp_path / "module.npz"
     done = run("--detector", "excelitas-spcm-aqrh", "--twilight-ns", "1.5", "-o", str(file))

@@ -9,15 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 from test_reproducibility import SHAPE, drawn, image
-from typer.testing import CliRunner
 
 import mars_lidar as ml
 from mars_lidar import _core, io
-from mars_lidar.cli import app
 from mars_lidar.engines import ENGINES
 from mars_lidar.engines.engine import Engine, Task
 from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.plot.views import predicted_counts
+from tests.harness.command import command_line
 
 GATE = {"mode": "gated", "gate_start_ns": 83.0, "gate_width_ns": 31.0}
 MOVING = GATE | {"gate_step_ns": -7.3, "gate_cycles": 3}
@@ -249,7 +248,7 @@ def test_most_registrations_of_a_synchronous_bin(dead: float, cycles: int, most:
 @pytest.mark.full
 def test_command_line(tmp_path):
     def run(*arguments: object):
-        return CliRunner().invoke(app, [str(a) for a in arguments])
+        return command_line([str(a) for a in arguments])
 
     small = ["simulate", "--scene", "room", "--size", 8, "--cycles", 20, "--bins", 32, "--no-picture"]
     gate = ["--mode", "gated", "--gate-start-ns", 30, "--gate-width-ns", 20, "--gate-step-ns", 5, "--gate-cycles", 2]

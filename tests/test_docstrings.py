@@ -10,8 +10,9 @@ import importlib
 import inspect
 import re
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import lru_cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +20,12 @@ import pytest
 
 import mars_lidar as ml
 
-pytest.importorskip("torch")  # learn
 numpydoc = pytest.importorskip("numpydoc.docscrape")
 
 FLAGS = doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS
 REFERENCE = Path(__file__).resolve().parents[1] / "docs" / "reference.md"
-PACKAGES = ("", "io", "learn", "plot", "reconstruction", "statistics")
+WITH_TORCH = find_spec("torch") is not None
+PACKAGES = ("", "io", "plot", "reconstruction", "statistics", *(["learn"] if WITH_TORCH else []))
 # Examples of these take some seconds, which docs/calibration.md runs.
 WITHOUT_EXAMPLE = {"Calibration", "calibrate"}
 # What has no example, See also or section Raises yet, by the start of its name: this may only shrink.
@@ -43,7 +44,7 @@ def _in_the_reference() -> Iterator[str]:
     for line in REFERENCE.read_text(encoding="utf-8").splitlines():
         if match := re.match(r"\.\. currentmodule:: mars_lidar\.?(\S*)", line):
             module = match[1]
-        elif match := re.match(r"   ([\w.]+)$", line):
+        elif (match := re.match(r"   ([\w.]+)$", line)) and (WITH_TORCH or module != "learn"):
             yield f"{module}.{match[1]}".strip(".")
 
 
@@ -92,7 +93,13 @@ def _methods(thing: Any) -> Iterator[tuple[str, Callable[..., Any]]]:
                 yield name, function
 
 
-@pytest.mark.parametrize("name", [name for name in public() if name not in WITHOUT_EXAMPLE])
+def _named(names: Iterable[str]) -> list[Any]:
+    """Those of learn, which load PyTorch, are of the full tier."""
+    full = pytest.mark.full
+    return [pytest.param(name, id=name, marks=full if name.startswith("learn.") else ()) for name in names]
+
+
+@pytest.mark.parametrize("name", _named(name for name in public() if name not in WITHOUT_EXAMPLE))
 def test_the_example_of_a_docstring(name: str):
     text = inspect.getdoc(public()[name]) or ""
     test = doctest.DocTestParser().get_doctest(text, {}, name, None, None)
@@ -108,7 +115,7 @@ def test_every_public_name_has_a_page():
     assert not [name for name, thing in public().items() if id(thing) not in pages]
 
 
-@pytest.mark.parametrize("name", public())
+@pytest.mark.parametrize("name", _named(public()))
 def test_sections(name: str):
     """See also; and for what takes arguments that may be wrong, Raises."""
     thing = public()[name]
@@ -120,7 +127,7 @@ def test_sections(name: str):
     assert not missing or name.startswith(UNFINISHED), f"{name} has no section {missing}"
 
 
-@pytest.mark.parametrize("name", public())
+@pytest.mark.parametrize("name", _named(public()))
 def test_every_parameter_is_described_and_typed(name: str):
     """Of functions and constructors under Parameters (or Attributes); of methods there, or by name in the text."""
     thing = public()[name]

@@ -6,7 +6,6 @@ import dataclasses
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import mars_lidar as ml
 from mars_lidar import (
@@ -20,10 +19,10 @@ from mars_lidar import (
     dark_count_map,
     io,
 )
-from mars_lidar.cli import app
 from mars_lidar.engines import ENGINES
 from mars_lidar.instrument.effects import EFFECTS, FIELDS, TIMING_EFFECTS
 from mars_lidar.plot.views import predicted_counts
+from tests.harness.command import command_line
 
 REAL = Detector(
     dead_time_ns=20.0,
@@ -50,7 +49,7 @@ def system(detector: Detector = REAL, **changes: object) -> System:
 
 
 def run(*arguments: object) -> tuple[int, str]:
-    done = CliRunner().invoke(app, [str(a) for a in arguments])
+    done = command_line([str(a) for a in arguments])
     return done.exit_code, done.output
 
 

@@ -11,15 +11,14 @@ import numpy as np
 import pytest
 import xarray
 from PIL import Image
-from typer.testing import CliRunner
 
 import mars_lidar as ml
 from mars_lidar import io
 from mars_lidar._base import progress as bars
-from mars_lidar.cli import app
 from mars_lidar.cli.simulate import each_ns
 from mars_lidar.io.advice import advice
 from studies.compare.comparison import compare
+from tests.harness.command import command_line
 
 SYSTEM = ml.System(
     period_ns=100.0, cycles=50, bins=64, pulse=ml.GaussianPulse(sigma_ns=0.5), detector=ml.Detector(dead_time_ns=50.0)
@@ -28,7 +27,7 @@ RECIPE = "scenes: {path: .}\nsystems: {file: spad.yaml}\nlight: {signal: 1, sbr:
 
 
 def run(*arguments: object):
-    return CliRunner().invoke(app, [str(a) for a in arguments])
+    return command_line([str(a) for a in arguments])
 
 
 def write_depth(path, side: int = 8) -> None:
@@ -77,7 +76,7 @@ def test_whole_floats_are_integers_everywhere(tmp_path):
         assert (cube.system.cycles, cube.shape[1]) == (100, 10)
     done = run("simulate", "--scene", "room", "--cycles", "1.5e0", "-o", tmp_path / "b.zarr")
     assert done.exit_code == 2
-    assert "'1.5e0' is not an integer" in done.output
+    assert "--cycles must be an integer, got '1.5e0'" in done.output
 
 
 def test_words_that_are_nearly_right_are_guessed():
@@ -199,7 +198,7 @@ def test_objects_are_drawn_in_a_notebook():
 
 
 def test_small_words():
-    from mars_lidar.cli.dataset_tables import files
+    from mars_lidar.cli.dataset import files
 
     assert [each_ns(3.0), each_ns(3020.0)] == ["3 ns", "3.02 µs"]
     assert [files(0), files(1), files(2)] == ["nothing", "1 file", "2 files"]

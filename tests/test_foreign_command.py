@@ -9,7 +9,7 @@ import pytest
 from scipy.io import savemat
 
 import mars_lidar as ml
-from mars_lidar.cli import app
+from mars_lidar.cli import main
 
 SYSTEM = ml.System(
     period_ns=40.0,
@@ -29,9 +29,7 @@ def counts() -> np.ndarray:
 
 
 def run(*words: object) -> int:
-    with pytest.raises(SystemExit) as stop:
-        app([str(word) for word in words])
-    return int(stop.value.code or 0)
+    return main([str(word) for word in words])
 
 
 def test_reconstruct_from_a_bare_array(tmp_path: Path, counts: np.ndarray) -> None:

@@ -6,15 +6,14 @@ import sys
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import mars_lidar as ml
 from mars_lidar import io
-from mars_lidar.cli import app
 from mars_lidar.dataset import open_dataset
 from mars_lidar.io import recipe as recipes
 from mars_lidar.io import zarr_store
 from mars_lidar.io.store import Writer
+from tests.harness.command import command_line
 
 SYSTEM = ml.System(
     period_ns=100.0, cycles=40, bins=64, pulse=ml.GaussianPulse(sigma_ns=0.5), detector=ml.Detector(dead_time_ns=50.0)
@@ -22,7 +21,7 @@ SYSTEM = ml.System(
 
 
 def run(*arguments: object):
-    return CliRunner().invoke(app, [str(a) for a in arguments])
+    return command_line([str(a) for a in arguments])
 
 
 @pytest.fixture

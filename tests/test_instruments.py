@@ -5,11 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 import mars_lidar as ml
-from mars_lidar.cli import app
 from mars_lidar.instrument.presets import ASSUMED, INSTRUMENTS, PRESETS, sourced, table
+from tests.harness.command import command_line
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -21,7 +20,7 @@ def test_the_documentation_is_the_declaration():
 @pytest.mark.parametrize("name", PRESETS)
 def test_every_preset_of_a_detector_can_be_written(tmp_path, name):
     path = tmp_path / "system.yaml"
-    assert CliRunner().invoke(app, ["init", "--preset", name, str(path)]).exit_code == 0
+    assert command_line(["init", "--preset", name, str(path)]).exit_code == 0
     assert ml.System.load(path).detector == ml.Detector.preset(name)
 
 
@@ -30,7 +29,7 @@ def test_a_file_of_it_is_that_system(tmp_path, name):
     for _, source in sourced(name).values():
         assert source.startswith(ASSUMED) or len(source) > len("DS000000")
     path = tmp_path / "system.yaml"
-    done = CliRunner().invoke(app, ["init", "--preset", name, str(path)])
+    done = command_line(["init", "--preset", name, str(path)])
     assert done.exit_code == 0, done.output
     system = ml.System.load(path)
     assert system.detector == ml.Detector.preset(name)

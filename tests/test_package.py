@@ -26,7 +26,7 @@ HEAVY = (
     "xarray",
     "h5py",
     "PIL",
-    "typer",
+    "cyclopts",
     "rich",
     "yaml",
     "torch",

@@ -10,26 +10,25 @@ import numpy as np
 import pytest
 from scipy import sparse
 from scipy.io import savemat
-from typer.testing import CliRunner
 
 import mars_lidar as ml
 from mars_lidar import io
-from mars_lidar.cli import app
 from mars_lidar.dataset.network_files import export
 from mars_lidar.io.foreign import foreign_cube
 from mars_lidar.io.maps import load_maps
+from tests.harness.command import command_line
 
 KNOWN = ["--cycles", "2000", "--dead-time-ns", "10", "--pulse-sigma-ns", "0.5"]
 
 
 def run(*arguments: object) -> str:
-    done = CliRunner(env={"COLUMNS": "2000", "TERM": "dumb"}).invoke(app, [str(each) for each in arguments])
+    done = command_line([str(each) for each in arguments])
     assert done.exit_code == 0, done.output
     return " ".join(done.output.split())
 
 
 def refused(*arguments: object) -> str:
-    done = CliRunner(env={"COLUMNS": "2000", "TERM": "dumb"}).invoke(app, [str(each) for each in arguments])
+    done = command_line([str(each) for each in arguments])
     assert done.exit_code == 2, done.output
     return " ".join(done.output.split())
 

@@ -8,11 +8,9 @@ import sys
 import numpy as np
 import pytest
 import xarray
-from typer.testing import CliRunner
 
 import mars_lidar as ml
 from mars_lidar import io
-from mars_lidar.cli import app
 from mars_lidar.io import recipe as recipes
 from mars_lidar.io.maps import load_maps
 from mars_lidar.reconstruction import METHODS
@@ -21,12 +19,13 @@ from mars_lidar.reconstruction.quality import map_error
 from mars_lidar.reconstruction.stored import reconstruct_stored
 from studies.__main__ import main
 from studies.common.report import MAX_FIGURE_BYTES
+from tests.harness.command import command_line
 
 SMALL = ("--size", 12, "--cycles", 300, "--bins", 256, "--signal", 2)
 
 
 def run(*words):
-    return CliRunner().invoke(app, [str(word) for word in words])
+    return command_line([str(word) for word in words])
 
 
 @pytest.fixture(scope="module")

@@ -7,19 +7,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from typer.main import get_command
-from typer.testing import CliRunner
 
 import mars_lidar as ml
 from mars_lidar import io
-from mars_lidar.cli import app
-from studies.compare.command import app as compare_app
+from studies.compare.command import compare_app
+from studies.compare.command import main as compare_main
+from tests.harness.command import command_line, options_of
 
 SMALL = ["--period-ns", "20", "--cycles", "30", "--bins", "64", "--dead-time-ns", "5"]
 
 
 def run(*arguments: object):
-    return CliRunner().invoke(app, [str(a) for a in arguments])
+    return command_line([str(a) for a in arguments])
 
 
 def simulated(path, *arguments: object):
@@ -37,19 +36,12 @@ def transient(tmp_path):
 
 
 def compared(*arguments: object):
-    return CliRunner().invoke(compare_app, [str(each) for each in arguments])
-
-
-def options_of(*names: str) -> dict[str, object]:
-    command = get_command(app)
-    for name in names:
-        command = command.commands[name]
-    return {opt: p.help for p in command.params for opt in p.opts if opt.startswith("--")}
+    return command_line([str(each) for each in arguments], main=compare_main)
 
 
 def test_the_commands_that_take_a_system_take_the_same_options():
-    simulate, table = options_of("simulate"), options_of("table", "build")
-    compare = {opt: p.help for p in get_command(compare_app).params for opt in p.opts if opt.startswith("--")}
+    every = options_of("simulate"), options_of("table", "build"), options_of(app=compare_app())
+    simulate, table, compare = ({name: each.parameter.help for name, each in options.items()} for options in every)
     system = list(simulate)[list(simulate).index("--system") : list(simulate).index("--max-events-per-exposure") + 1]
     assert len(system) > 30
     assert {"--detector", "--mode", "--jitter-fwhm-ns", "--electronics-dead-time-ns", "--crosstalk"} < set(system)

@@ -15,21 +15,17 @@ import re
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import h5py
 import numpy as np
 import pytest
-import typer
-from typer.testing import CliRunner
 
 import mars_lidar as ml
 from mars_lidar import io, plot, reconstruction, statistics
-from mars_lidar.cli import app
 from mars_lidar.dataset import DatasetRecipe, Light, estimate, export, open_dataset, read_sparse, read_view, verify
 from mars_lidar.io.maps import load_maps, save_maps
-
-docscrape = pytest.importorskip("numpydoc.docscrape")
+from tests.harness.command import command_line, options_of
 
 SYSTEM = ml.System(
     period_ns=100.0, cycles=20, bins=16, pulse=ml.GaussianPulse(sigma_ns=2.0), detector=ml.Detector(dead_time_ns=30.0)
@@ -431,6 +427,7 @@ def test_wrong_arguments_are_refused_by_name(here, name):
 @pytest.mark.parametrize("name", CALLS)
 def test_errors_of_wrong_arguments_are_documented(here, name):
     """Each class of error above stands in the section Raises of the function or class that raises it."""
+    docscrape = pytest.importorskip("numpydoc.docscrape")
     call = CALLS[name](here)[0]
     home = inspect.unwrap(call)
     if name in UNDOCUMENTED or not (inspect.isclass(call) or "." not in home.__qualname__):
@@ -483,16 +480,10 @@ TAKEN: dict[tuple[str, str, str], str] = {}
 
 def options(command: str) -> Iterator[tuple[str, type]]:
     """(name, type) of the options of a command that take a value."""
-    found: Any = typer.main.get_command(app)
-    for word in command.split():
-        found = found.commands[word]
-    for one in found.params:
-        if getattr(one, "opts", [""])[0].startswith("-") and not one.is_flag:
-            kind = one.type_descriptor.annotation
-            yield (
-                max(one.opts, key=len),
-                next((k for k in WORDS if isinstance(kind, type) and issubclass(kind, k)), str),
-            )
+    for name, argument in options_of(*command.split()).items():
+        if not argument.is_flag():
+            hints = {argument.hint, *get_args(argument.hint)}
+            yield name, next((kind for kind in WORDS if kind in hints), str)
 
 
 def command_outcomes(command: str, here: Path, seen: set[str]) -> Iterator[tuple[str, str, str, str]]:
@@ -503,14 +494,14 @@ def command_outcomes(command: str, here: Path, seen: set[str]) -> Iterator[tuple
         seen.add(option)
         for word in WORDS[kind]:
             arguments = [*command.split(), *map(str, COMMANDS[command](here)), f"{option}={word}"]
-            done = CliRunner(env={"COLUMNS": "2000", "TERM": "dumb"}).invoke(app, arguments)
+            done = command_line(arguments)
             told = " ".join(done.output.split())
             if done.exit_code == 0:
                 given = (command, option, word)
                 took = any(all(map(fnmatch.fnmatch, given, entry)) for entry in TAKEN)
                 yield option, word, "documented" if took else "taken", told
             else:
-                ours = done.exit_code in (1, 2) and isinstance(done.exception, SystemExit)
+                ours = done.exit_code in (1, 2)
                 named = option in told or option[2:].replace("-", "_") in told or (word != "" and word in told)
                 yield option, word, "refused" if ours and named else "unnamed", told
 
@@ -519,7 +510,7 @@ def command_outcomes(command: str, here: Path, seen: set[str]) -> Iterator[tuple
 def test_wrong_options_are_refused_by_name(here):
     seen: set[str] = set()
     for command, make in COMMANDS.items():
-        done = CliRunner().invoke(app, [*command.split(), *map(str, make(here))])
+        done = command_line([*command.split(), *map(str, make(here))])
         assert done.exit_code == 0, (command, done.output)
         found = list(command_outcomes(command, here, seen))
         assert not [one for one in found if one[2] in ("taken", "unnamed")], command

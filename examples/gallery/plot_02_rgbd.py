@@ -25,7 +25,7 @@ estimate = ml.reconstruct(cube[0], system)
 ml.io.save_cloud("room.ply", estimate.depth_m, focal_px=110.0, intensity=estimate.signal, overwrite=True)
 
 x, y, z = np.moveaxis(ml.io.points(estimate.depth_m, focal_px=110.0), -1, 0)
-fig = plt.figure(figsize=(8.2, 3.3))
+fig = plt.figure(figsize=(8.2, 3.3), layout="none")
 counts = fig.add_subplot(121, title="Counts", xlabel="column", ylabel="row")
 counts.imshow(cube[0].sum(-1), cmap="gray")
 cloud = fig.add_subplot(122, projection="3d", xlim=(-3, 3), ylim=(1, 8), zlim=(-2, 2), elev=15, azim=-75)

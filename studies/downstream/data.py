@@ -16,7 +16,7 @@ from mars_lidar.engines import Engine, MarsEngine, RenewalEngine
 from mars_lidar.learn import CubeStream, Uniform
 from mars_lidar.table.entries import StartPhases
 from studies.common.sample import PERIOD_NS, system_of
-from studies.common.windows import FEATURES, WINDOW, features
+from studies.common.windows import WINDOW, features, number
 from studies.neural import NeuralEngine
 
 WORDS = {
@@ -43,9 +43,9 @@ class Sizes:
     """
 
     name: str = "networks"
-    steps: tuple[int, int] = (1600, 1000)
-    batch: tuple[int, int] = (2, 4)
-    crops: int = 256
+    steps: tuple[int, int] = (1000, 600)
+    batch: tuple[int, int] = (1, 2)
+    crops: int = 160
     crop: int = 32
     train: tuple[int, int] = (1000, 100)
     test: tuple[int, int] = (3000, 12)
@@ -62,8 +62,9 @@ class Sizes:
 class Config:
     """Which networks are trained: `arms` at `MAIN` and every ratio, `PAIR` at the dead times `dead` and ratio 1.
 
-    Networks of equal `sizes` are shared: what one configuration has trained, another uses. `spatial` seeds of the
-    spatial network, at `MAIN`; `lines` dead times of the closed form, in periods.
+    Networks of equal `sizes` are shared: what one configuration has trained, another uses. `seeds` at `MAIN`, one at
+    the others; `spatial`: the spatial network beside it, of `PAIR` every seed, of the rest the first; `lines` dead
+    times of the closed form, in periods.
     """
 
     name: str
@@ -72,7 +73,7 @@ class Config:
     sbr: tuple[float, ...] = (1.0, 0.6)
     dead: tuple[float, ...] = (0.95, 0.1, 0.3, 0.75)
     seeds: int = 3
-    spatial: int = 0
+    spatial: bool = False
     lines: tuple[float, ...] = (0.1, 0.2, 0.3, 0.45, 0.5625, 0.75, 0.95)
 
 
@@ -91,7 +92,7 @@ _TINY = Sizes(
 )
 CONFIGS = {
     "small": Config(name="small", seeds=1, dead=(0.95,), lines=(0.75,)),
-    "full": Config(name="full", spatial=3),
+    "full": Config(name="full", spatial=True),
     "tiny": Config(
         name="tiny",
         sizes=_TINY,
@@ -99,7 +100,7 @@ CONFIGS = {
         sbr=(1.0,),
         dead=(0.1,),
         seeds=2,
-        spatial=1,
+        spatial=True,
         lines=(0.1, MAIN),
     ),
 }
@@ -133,7 +134,7 @@ def _random(sizes: Sizes, *numbers: int) -> np.random.Generator:
 
 @dataclass(frozen=True, eq=False)
 class Pixels:
-    """What a network sees of images (N, H, W, FEATURES), float32, and the middle of each pixel's window, in bins.
+    """What a network sees of images (N, H, W, features), float32, and the middle of each pixel's window, in bins.
 
     `wanted` (N, H, W, 2), float32: reflectivity, and the delay from the middle of the window, in bins, NaN where the
     window does not hold it.
@@ -142,16 +143,19 @@ class Pixels:
     seen: NDArray[np.float32]
     middle: FloatArray
     wanted: NDArray[np.float32]
+    dead: float  # time, in periods
 
     @classmethod
-    def empty(cls, *shape: int) -> Pixels:
+    def empty(cls, system: System, *shape: int) -> Pixels:
         """Memory for images of `shape` (N, H, W)."""
-        return cls(np.empty((*shape, FEATURES), np.float32), np.empty(shape), np.empty((*shape, 2), np.float32))
+        dead = system.dead_time_periods
+        seen = np.empty((*shape, number(system.bins, dead)), np.float32)
+        return cls(seen, np.empty(shape), np.empty((*shape, 2), np.float32), dead)
 
     def put(self, k: int, counts: NDArray[Any], reflectivity: Any, delay: Any) -> None:
         """Image k: histograms (H, W, bins), and maps of reflectivity and of the delay in bins."""
         bins = counts.shape[-1]
-        seen, middle = features(counts.reshape(-1, bins))
+        seen, middle = features(counts.reshape(-1, bins), self.dead)
         self.seen[k], self.middle[k] = seen.reshape(self.seen[k].shape), middle.reshape(self.middle[k].shape)
         away = (np.asarray(delay) - self.middle[k] + 0.5 * bins) % bins - 0.5 * bins
         self.wanted[k, ..., 0] = reflectivity
@@ -169,6 +173,8 @@ class Data:
         first, number = sizes.test
         self.test = [test_scene(first + k, sizes) for k in range(number)]
         self.gold = lru_cache(1)(self._gold)  # histograms (N, H, W, bins) of the gold standard
+        self.of_gold = lru_cache(1)(self._of_gold)
+        self.training = lru_cache(1)(self._training)  # shared by a pixel and a spatial network
         self._table = lru_cache(None)(self._built)
 
     def _gold(self, dead: float, sbr: float) -> NDArray[Any]:
@@ -184,13 +190,19 @@ class Data:
 
     def tested(self, arm: str, dead: float, sbr: float, *, gold: bool) -> Pixels:
         """The test scenes by a simulator, or by the gold standard."""
+        return self.of_gold(dead, sbr) if gold else self._tested(arm, dead, sbr)
+
+    def _of_gold(self, dead: float, sbr: float) -> Pixels:
+        return self._tested(None, dead, sbr)
+
+    def _tested(self, arm: str | None, dead: float, sbr: float) -> Pixels:
         system, shape = instrument(dead), self.test[0].shape
-        pixels = Pixels.empty(len(self.test), *shape)
+        pixels = Pixels.empty(system, len(self.test), *shape)
         cube = np.empty((1, *shape, system.bins), system.histogram_dtype)
         for k, flux in enumerate(self.fluxes(dead, sbr)):
-            if not gold:
+            if arm is not None:
                 self._drawn(self.engine(arm, dead), flux, system, k, _OWN, cube)
-            counts = self.gold(dead, sbr)[k] if gold else cube[0]
+            counts = self.gold(dead, sbr)[k] if arm is None else cube[0]
             pixels.put(k, counts, flux.signal / self.sizes.photons, flux.delay_ns / system.bin_ns)
         return pixels
 
@@ -198,7 +210,7 @@ class Data:
         seed = (self.sizes.seed << 8) + stream
         simulate(flux, system, engine=engine, first_realization=k, seed=seed, threads=1, out=out)
 
-    def training(self, arm: str, dead: float, sbr: float, seed: int) -> Pixels:
+    def _training(self, arm: str, dead: float, sbr: float, seed: int) -> Pixels:
         """Crops of the training rooms, no exposure twice; the same light for every simulator.
 
         The mean signal is drawn from the range that whole rooms have: what a crop's own is, is for the network to see.
@@ -220,7 +232,7 @@ class Data:
             threads=1,
             ahead=0,
         )
-        pixels = Pixels.empty(sizes.crops, sizes.crop, sizes.crop)
+        pixels = Pixels.empty(system, sizes.crops, sizes.crop, sizes.crop)
         for k, batch in enumerate(stream):
             signal, delay = (batch["flux"][name][0].double().numpy() for name in ("signal", "delay"))
             pixels.put(k, batch["counts"][0].numpy(), signal / sizes.photons, delay / system.bin_ns)

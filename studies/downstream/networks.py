@@ -10,7 +10,6 @@ from torch import Tensor, nn
 
 from mars_lidar._base.types import FloatArray
 from studies.common.intervals import Steps, likelihood
-from studies.common.windows import FEATURES
 from studies.downstream.data import Pixels
 
 OUTPUTS = 2  # reflectivity, and the delay from the middle of the window, in bins
@@ -21,15 +20,15 @@ _RATES = {"pixel": 6e-3, "spatial": 4e-3}  # largest of AdamW: at 2e-3 1,200 ste
 
 
 class Network(nn.Module):
-    """Means and log-variances (N, H, W, OUTPUTS) of features (N, H, W, FEATURES) that `standardise` has scaled.
+    """Means and log-variances (N, H, W, OUTPUTS) of `features` (N, H, W, features) that `standardise` has scaled.
 
     ``pixel``: each pixel by itself, three hidden layers; ``spatial``: two residual blocks of 3 x 3 convolutions.
     """
 
-    def __init__(self, kind: str) -> None:
+    def __init__(self, kind: str, features: int) -> None:
         super().__init__()
-        width = 128 if kind == "pixel" else 64
-        self.stem = nn.Linear(FEATURES, width)
+        width = 96 if kind == "pixel" else 64
+        self.stem = nn.Linear(features, width)
         inner = [nn.SiLU(), nn.Linear(width, width)]
         self.inner = nn.Sequential(*inner, nn.SiLU(), nn.Linear(width, width)) if kind == "pixel" else nn.Identity()
 
@@ -39,7 +38,7 @@ class Network(nn.Module):
 
         self.blocks = nn.ModuleList(block() for _ in range(0 if kind == "pixel" else 2))
         self.head = nn.Sequential(nn.SiLU(), nn.Linear(width, 2 * OUTPUTS))
-        self.seen_mean, self.seen_scale = nn.Buffer(torch.zeros(FEATURES)), nn.Buffer(torch.ones(FEATURES))
+        self.seen_mean, self.seen_scale = nn.Buffer(torch.zeros(features)), nn.Buffer(torch.ones(features))
         self.wanted_mean, self.wanted_scale = nn.Buffer(torch.zeros(OUTPUTS)), nn.Buffer(torch.ones(OUTPUTS))
 
     def standardise(self, pixels: Pixels) -> None:
@@ -63,7 +62,7 @@ class Network(nn.Module):
 def trained(kind: str, pixels: Pixels, *, steps: int, batch: int, seed: int) -> Network:
     """A network; `batch` images a step, or as many pixels of any images for the pixel network."""
     torch.manual_seed(seed)
-    network = Network(kind)
+    network = Network(kind, pixels.seen.shape[-1])
     network.standardise(pixels)
     optimizer = Steps(network, steps, _RATES[kind])
     seen, wanted = torch.from_numpy(pixels.seen), torch.from_numpy(pixels.wanted)

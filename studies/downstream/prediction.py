@@ -3,7 +3,7 @@
 Near a pixel's light theta = (S, B, delay) the features are f = m + J (theta' - theta) + noise. A network that is
 trained under the covariance C learns the estimate that is best there, theta + F^-1 J' C^-1 (f - m) with F = J' C^-1 J,
 and its variance F^-1. Under the true covariance C* the error has F^-1 J' C^-1 C* C^-1 J F^-1 instead. Features are the
-sums that the networks see: the bins of the window about the return, and coarse parts of the rest.
+sums that the networks see (`studies/common/windows.py`).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from scipy import stats
 from mars_lidar import Flux, System, joint_law
 from mars_lidar._base.types import FloatArray
 from mars_lidar.learn import expected_histogram
-from studies.common.windows import COARSE, WINDOW
+from studies.common.windows import WINDOW, starts
 
 _STEP = 1e-3  # of S and B, relative, and of the delay in ns: central differences of a function that is known to 1e-12
 _LEAST = 0.02  # photons per period: a dimmer return says nothing of its delay
@@ -51,7 +51,7 @@ def at(signal: float, background: float, system: System, *, summed: bool = True)
     mars = np.diag(mean) + np.outer(mean, mean) * (law.count_variance / total**2 - 1.0 / total)
     moved = _jacobian(signal, background, system)
     if summed:
-        sums = _sums(system.bins)
+        sums = _sums(system)
         exact, mars, moved = sums @ exact @ sums.T, sums @ mars @ sums.T, sums @ moved
     weights = {name: np.linalg.solve(one, moved) for name, one in (("mars", mars), ("exact", exact))}
     inverse = np.linalg.inv(moved.T @ weights["mars"])
@@ -61,11 +61,11 @@ def at(signal: float, background: float, system: System, *, summed: bool = True)
     return Predicted(signal, background, claimed, error, least)
 
 
-def _sums(bins: int) -> FloatArray:
+def _sums(system: System) -> FloatArray:
     """Sums (features, bins) that a network sees of a histogram whose return is in the middle."""
-    place = (np.arange(bins) - (bins - WINDOW) // 2) % bins
-    feature = np.where(place < WINDOW, place, WINDOW + (place - WINDOW) * COARSE // (bins - WINDOW))
-    return np.asarray(feature == np.arange(WINDOW + COARSE)[:, None], dtype=np.float64)
+    first = starts(system.bins, system.dead_time_periods)
+    place = (np.arange(system.bins) - (system.bins - WINDOW) // 2) % system.bins
+    return np.asarray(np.searchsorted(first, place, side="right") - 1 == np.arange(len(first))[:, None], np.float64)
 
 
 def _jacobian(signal: float, background: float, system: System) -> FloatArray:

@@ -52,13 +52,15 @@ class Run:
 
 
 def runs(config: Config) -> Iterator[Run]:
-    """All networks: the pixel networks seed by seed, then the spatial ones."""
+    """All networks, seed by seed; a spatial network follows the pixel network of the same data."""
     for seed in range(config.seeds):
         for sbr in config.sbr:
-            yield from (Run("pixel", arm, MAIN, sbr, seed) for arm in config.arms)
-        yield from (Run("pixel", arm, dead, 1.0, seed) for dead in config.dead for arm in PAIR)
-    for seed in range(config.spatial):
-        yield from (Run("spatial", arm, MAIN, sbr, seed) for sbr in config.sbr for arm in config.arms)
+            for arm in config.arms:
+                yield Run("pixel", arm, MAIN, sbr, seed)
+                if config.spatial and (seed == 0 or arm in PAIR):
+                    yield Run("spatial", arm, MAIN, sbr, seed)
+        if seed == 0:
+            yield from (Run("pixel", arm, dead, 1.0, seed) for dead in config.dead for arm in PAIR)
 
 
 def run(request: Request) -> Facts:
@@ -72,7 +74,7 @@ def run(request: Request) -> Facts:
     data, every = Data(config.sizes), list(runs(config))
     tell(f"downstream: {sum(not (folder / one.file).exists() for one in every)} of {len(every)} networks to train")
     found = {one: kept(folder / one.file, partial(train_and_test, one, data), tell) for one in every}
-    places = [(MAIN, sbr) for sbr in config.sbr] + [(dead, 1.0) for dead in config.dead]
+    places = [(MAIN, sbr) for sbr in config.sbr]
     bounds = {
         (dead, sbr): kept(folder / f"methods-dead{dead:g}-sbr{sbr:g}.json", partial(methods, data, dead, sbr), tell)
         for dead, sbr in places

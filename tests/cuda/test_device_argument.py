@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import mars_lidar as ml
-from mars_lidar.cli import app
+from tests.harness.command import command_line
 
 FLUX = ml.Flux(np.full((2, 3), 2.0), 0.5, np.linspace(10.0, 80.0, 6).reshape(2, 3))
 SYSTEM = ml.System(
@@ -56,10 +55,10 @@ def test_the_command_line_says_what_is_missing(monkeypatch: pytest.MonkeyPatch, 
     monkeypatch.setitem(sys.modules, "cupy", None)
     out = tmp_path / "room.zarr"
     arguments = ["simulate", "--scene", "room", "--size", "4", "--cycles", "200", "--device", "cuda", "--out", str(out)]
-    done = CliRunner().invoke(app, [*arguments, "--engine", "feedback"])
+    done = command_line([*arguments, "--engine", "feedback"])
     assert done.exit_code == 2
     assert "mars-lidar[cuda12]" in done.stderr
-    done = CliRunner().invoke(app, [*arguments, "--engine", "mars"])
+    done = command_line([*arguments, "--engine", "mars"])
     assert done.exit_code == 2
     assert "table must be given for engine 'mars' on device 'cuda'" in done.stderr
     assert not out.exists()

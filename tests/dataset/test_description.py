@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 import xarray
 import yaml
-from typer.testing import CliRunner
 
 import mars_lidar as ml
 from mars_lidar import io
-from mars_lidar.cli import app
 from mars_lidar.dataset import DatasetRecipe, json_schema, read_view
 from mars_lidar.dataset.scene_entries import KINDS
+from tests.harness.command import command_line
 
 SYSTEM = ml.System(
     period_ns=100.0, cycles=30, bins=32, pulse=ml.GaussianPulse(sigma_ns=0.5), detector=ml.Detector(dead_time_ns=50.0)
@@ -25,7 +24,7 @@ LIGHT = {"signal": 0.7, "sbr": 2.0}
 
 
 def run(*arguments: object):
-    return CliRunner().invoke(app, [str(a) for a in arguments])
+    return command_line([str(a) for a in arguments])
 
 
 @pytest.mark.full

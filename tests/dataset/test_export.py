@@ -14,7 +14,7 @@ from scipy.io import loadmat
 
 import mars_lidar as ml
 from mars_lidar import dataset
-from mars_lidar.cli import app
+from mars_lidar.cli import main
 from mars_lidar.dataset.network_files import LAYOUTS, export
 
 SYSTEM = ml.System(
@@ -171,9 +171,7 @@ def test_spadnet(store: Path, tmp_path: Path) -> None:
 
 
 def test_convert_points_to_export(store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as stop:
-        app(["convert", str(store), str(tmp_path / "set.h5")])
-    assert stop.value.code == 2
+    assert main(["convert", str(store), str(tmp_path / "set.h5")]) == 2
     assert "mars-lidar export" in capsys.readouterr().err
 
 

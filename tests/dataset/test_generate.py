@@ -12,14 +12,13 @@ import pytest
 import xarray
 import zarr
 from dataset.conftest import SYSTEM, files
-from typer.testing import CliRunner
 
 import mars_lidar as ml
 from mars_lidar import io
 from mars_lidar._base import manifest
-from mars_lidar.cli import app
 from mars_lidar.dataset import DatasetRecipe, estimate, open_dataset, read_sparse, verify
 from mars_lidar.dataset.arrays import histogram_blocks, with_zeros
+from tests.harness.command import command_line
 
 
 @pytest.mark.full
@@ -117,7 +116,7 @@ def test_bad_files_are_told_and_left_out(tmp_path, recipe):
         "a_depth.png",
         "c_depth.png",
     ]
-    ran = CliRunner().invoke(app, ["info", str(tmp_path / "set.zarr")])
+    ran = command_line(["info", str(tmp_path / "set.zarr")])
     assert ran.exit_code == 0
     assert "f_depth.png" in ran.stdout
     for name in ("a", "c", "f"):
@@ -166,7 +165,7 @@ def test_damage_is_found(tmp_path, recipe):
     content[30] ^= 4
     shard.write_bytes(content)
     assert "cannot be read" in " ".join(verify(tmp_path / "set.zarr", chunks=None).different)
-    ran = CliRunner().invoke(app, ["verify", str(tmp_path / "set.zarr"), "--all"])
+    ran = command_line(["verify", str(tmp_path / "set.zarr"), "--all"])
     assert ran.exit_code == 1
     assert "NO: " in ran.stdout
 
@@ -174,13 +173,13 @@ def test_damage_is_found(tmp_path, recipe):
 def test_the_command(tmp_path):
     name = str(tmp_path / "set.zarr")
     options = ["--size", "12,10", "--scene-seeds", "2", "--cycles", "20", "--bins", "16", "--signal", "1"]
-    ran = CliRunner().invoke(app, ["generate", "room", *options, "--sbr", "2", "-o", name, "--dry-run"])
+    ran = command_line(["generate", "room", *options, "--sbr", "2", "-o", name, "--dry-run"])
     assert ran.exit_code == 0, ran.output
     assert "2 × 1 × 12 × 10 × 16" in ran.stdout
     assert not Path(name).exists()
-    ran = CliRunner().invoke(app, ["generate", "room", *options, "--sbr", "2", "-o", name])
+    ran = command_line(["generate", "room", *options, "--sbr", "2", "-o", name])
     assert ran.exit_code == 0, ran.output
-    assert CliRunner().invoke(app, ["verify", name]).exit_code == 0
+    assert command_line(["verify", name]).exit_code == 0
     for bad, told in (
         (["room", "--crop", "x"], "--crop must be one integer"),
         (["room", "--focal-px", "3"], "belong to RGB-D"),
@@ -188,7 +187,7 @@ def test_the_command(tmp_path):
         (["--resume", "--seed", "3"], "takes the recipe of the store"),
         ([], "SOURCE is missing"),
     ):
-        ran = CliRunner().invoke(app, ["generate", *bad, "-o", str(tmp_path / "b.zarr"), "--layout", "dense"])
+        ran = command_line(["generate", *bad, "-o", str(tmp_path / "b.zarr"), "--layout", "dense"])
         assert ran.exit_code == 2, ran.output
         assert told in ran.output
     assert not (tmp_path / "b.zarr").exists()
@@ -196,8 +195,7 @@ def test_the_command(tmp_path):
 
 def test_the_command_takes_every_option_of_a_system(tmp_path):
     name = str(tmp_path / "set.zarr")
-    ran = CliRunner().invoke(
-        app,
+    ran = command_line(
         [
             "generate",
             "room",

@@ -11,17 +11,16 @@ import numpy as np
 import pytest
 import zarr
 from dataset.conftest import files
-from typer.testing import CliRunner
 
 import mars_lidar as ml
 from mars_lidar import io
 from mars_lidar._base import manifest
 from mars_lidar._base.files import FileError
-from mars_lidar.cli import app
 from mars_lidar.dataset import open_dataset, verify
 from mars_lidar.dataset.scenes import SceneReader
 from mars_lidar.io.maps import load_maps, save_maps
 from mars_lidar.io.store import OnDisk
+from tests.harness.command import command_line
 
 FLIPS = int(os.environ.get("MARS_LIDAR_FLIPS", "200"))
 SYSTEM = ml.System(
@@ -144,10 +143,10 @@ def test_changed_labels_coordinates_and_inputs_are_found_without_a_manifest_too(
 
 def test_opening_says_what_it_made_sure_of(dataset, cube):
     for path in (dataset, cube):
-        told = CliRunner().invoke(app, ["info", str(path)]).output
+        told = command_line(["info", str(path)]).output
         assert "every file of its manifest.sha256 is there" in " ".join(told.split())
     (cube / "histogram/c/0/0/0/0").unlink()
-    refused = CliRunner().invoke(app, ["info", str(cube)])
+    refused = command_line(["info", str(cube)])
     assert refused.exit_code == 2
     assert "histogram/c/0/0/0/0 is missing" in refused.output
 

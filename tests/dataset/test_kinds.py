@@ -14,13 +14,12 @@ import scipy.io
 import xarray
 from dataset.conftest import SYSTEM, files
 from dataset.test_stopped import stopped
-from typer.testing import CliRunner
 
 import mars_lidar as ml
 from mars_lidar import io
-from mars_lidar.cli import app
 from mars_lidar.dataset import DatasetRecipe, estimate, open_dataset, verify
 from mars_lidar.scene.layers import LayeredScene
+from tests.harness.command import command_line
 
 SHAPE = (12, 10)
 FOGS = [
@@ -87,7 +86,7 @@ def test_transients(tmp_path, of_transients, renders):
     assert verify(tmp_path / "set.zarr", chunks=None).good
     assert stored.attrs["format_version"] == 2
     np.testing.assert_array_equal(stored.scene(1).rows(slice(2, 5)), light(1, 90)[2:5])
-    ran = CliRunner().invoke(app, ["info", str(tmp_path / "set.zarr")])
+    ran = command_line(["info", str(tmp_path / "set.zarr")])
     assert ran.exit_code == 0, ran.output
     assert "transient" in ran.stdout
 
@@ -256,6 +255,6 @@ def test_bad_transients(tmp_path, of_transients, renders):
 def test_the_command_takes_a_transient(tmp_path, renders):
     name = str(tmp_path / "set.zarr")
     options = ["--cycles", "20", "--bins", "16", "--period-ns", "100", "--signal", "1", "-o", name]
-    ran = CliRunner().invoke(app, ["generate", str(renders / "b.h5"), *options])
+    ran = command_line(["generate", str(renders / "b.h5"), *options])
     assert ran.exit_code == 0, ran.output
-    assert CliRunner().invoke(app, ["verify", name, "--all"]).exit_code == 0
+    assert command_line(["verify", name, "--all"]).exit_code == 0

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import mars_lidar as ml
 from mars_lidar import io
-from mars_lidar.cli import app
 from mars_lidar.table import Table
+from tests.harness.command import command_line
 
 SYSTEM = ml.System(
     period_ns=100.0,
@@ -93,18 +92,18 @@ def test_command_line(tmp_path, table: Table):
         "gaussian",
     ]
     more = ["--table", str(tmp_path / "table.h5"), "--interpolation", "nearest", "-o", str(tmp_path / "a.zarr")]
-    done = CliRunner().invoke(app, [*arguments, *more])
+    done = command_line([*arguments, *more])
     assert done.exit_code == 0, done.output
     assert "sampling" in done.output
     assert "pixels evaluated" in done.output
     with io.load(tmp_path / "a.zarr") as cube:
         assert cube.settings["interpolation"] == "nearest"
         assert io.verify(cube, table=table)
-    told = CliRunner().invoke(app, ["info", str(tmp_path / "a.zarr")])
+    told = command_line(["info", str(tmp_path / "a.zarr")])
     assert "count gaussian" in told.output
     assert "table" in told.output
-    wrong = CliRunner().invoke(app, [*arguments, "--dead-time-ns", "40", *more[:-1], str(tmp_path / "b.zarr")])
+    wrong = command_line([*arguments, "--dead-time-ns", "40", *more[:-1], str(tmp_path / "b.zarr")])
     assert wrong.exit_code == 2
-    refused = CliRunner().invoke(app, [*arguments[:-4], "--engine", "exact", *more[:2], "-o", str(tmp_path / "c.npz")])
+    refused = command_line([*arguments[:-4], "--engine", "exact", *more[:2], "-o", str(tmp_path / "c.npz")])
     assert refused.exit_code == 2
     assert "table" in refused.stderr

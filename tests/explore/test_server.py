@@ -20,14 +20,13 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 from explorer_page import Page, chromium
-from typer.testing import CliRunner
 
 import mars_lidar as ml
 from mars_lidar import explore, io
-from mars_lidar.cli import app
 from mars_lidar.explore import CubeServer, page_text
 from mars_lidar.explore.settings import settings_of
 from mars_lidar.reconstruction import reconstruct
+from tests.harness.command import command_line
 
 SHAPE = (9, 14)
 
@@ -215,12 +214,12 @@ def test_an_installation_without_the_page(monkeypatch: pytest.MonkeyPatch, tmp_p
     monkeypatch.setattr(explore.server, "files", lambda _: tmp_path)
     with pytest.raises(FileNotFoundError, match="explorer/build"):
         page_text()
-    result = CliRunner().invoke(app, ["explore", "--no-browser"])
+    result = command_line(["explore", "--no-browser"])
     assert result.exit_code == 2
 
 
 def test_bad_input():
-    result = CliRunner().invoke(app, ["explore", "nothing.zarr", "--no-browser"])
+    result = command_line(["explore", "nothing.zarr", "--no-browser"])
     assert result.exit_code == 2
     assert "does not exist" in result.stderr
 
@@ -229,7 +228,7 @@ def test_bad_input():
 def test_ctrl_c_ends_it(stored: Path):
     code = (  # SIGINT is ignored where the tests run in the background of a shell
         "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-        "from mars_lidar.cli import main; main()"
+        "import sys; from mars_lidar.cli import main; sys.exit(main())"
     )
     command = [sys.executable, "-c", code, "explore", str(stored), "--no-browser"]
     run = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, bufsize=1)

@@ -13,7 +13,7 @@ import numpy as np
 
 import mars_lidar as ml
 from mars_lidar import io
-from mars_lidar.cli.pulse_options import _measured
+from mars_lidar.cli.system_options import _measured
 from mars_lidar.dataset import DatasetRecipe, open_dataset, read_sparse
 from mars_lidar.dataset.view import read_view
 from mars_lidar.io.foreign import foreign_cube

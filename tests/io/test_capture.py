@@ -9,12 +9,11 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import mars_lidar as ml
 from mars_lidar import io
-from mars_lidar.cli import app
 from mars_lidar.io.capture import read_capture
+from tests.harness.command import command_line
 
 C_M_PER_NS = 0.299792458
 BIN_M, START_M, BINS, SIDE = 0.012, 0.6, 200, 4
@@ -171,7 +170,7 @@ def test_the_command_and_a_reconstruction(tmp_path, kind):
     """`simulate --like`: photons through a SPAD, in the bins of the render; the hidden point is where it was."""
     render, _ = write(tmp_path / "render.hdf5", f"tal {kind}")
     out = tmp_path / "capture.hdf5"
-    told = CliRunner().invoke(app, ["simulate", "--like", str(render), *OPTIONS, "-o", str(out), "--no-picture"])
+    told = command_line(["simulate", "--like", str(render), *OPTIONS, "-o", str(out), "--no-picture"])
     assert told.exit_code == 0, told.output
     assert sorted(one.name for one in tmp_path.iterdir()) == ["capture.hdf5", "render.hdf5"]
     axes = [np.linspace(-0.4, 0.4, 9), np.linspace(-0.4, 0.4, 9), np.linspace(0.4, 1.0, 7)]
@@ -179,7 +178,7 @@ def test_the_command_and_a_reconstruction(tmp_path, kind):
     best = points[int(np.argmax(backprojected(out, points)))]
     assert np.abs(best - HIDDEN).max() < 0.01
     cube = tmp_path / "cube.zarr"  # any other suffix is a cube with those bins
-    told = CliRunner().invoke(app, ["simulate", "--like", str(render), *OPTIONS, "-o", str(cube), "--no-picture"])
+    told = command_line(["simulate", "--like", str(render), *OPTIONS, "-o", str(cube), "--no-picture"])
     assert told.exit_code == 0, told.output
     counts = io.load(cube).histogram[0]
     assert np.array_equal(io.read_transient(out).rows(slice(0, None)), counts)
@@ -194,7 +193,7 @@ def test_what_does_not_fit_is_refused(tmp_path):
         (["--period-ns", "5"], "must be a whole number of bins"),
         (["--realizations", "2"], "holds one exposure"),
     ):
-        told = CliRunner().invoke(app, ["simulate", "--like", str(render), *options, "-o", out])
+        told = command_line(["simulate", "--like", str(render), *options, "-o", out])
         assert told.exit_code == 2, told.output
         assert words in told.output
     other = tmp_path / "other.hdf5"
@@ -245,7 +244,7 @@ print(int(data.H.sum()), *points[np.unravel_index(found.argmax(), found.shape)])
 def test_tal_reconstructs_what_is_written(tmp_path, layout):
     render, _ = write(tmp_path / "render.hdf5", layout)
     out = tmp_path / "capture.hdf5"
-    told = CliRunner().invoke(app, ["simulate", "--like", str(render), *OPTIONS, "--no-picture", "-o", str(out)])
+    told = command_line(["simulate", "--like", str(render), *OPTIONS, "--no-picture", "-o", str(out)])
     assert told.exit_code == 0, told.output
     done = subprocess.run(
         [str(TAL), "-c", BY_TAL, str(out), layout.split()[0]], capture_output=True, text=True, check=False

@@ -7,11 +7,10 @@ import importlib.util
 import numpy as np
 import pytest
 from store_cases import SYSTEM, one_return
-from typer.testing import CliRunner
 
 import mars_lidar as ml
 from mars_lidar import io
-from mars_lidar.cli import app
+from tests.harness.command import command_line
 
 HAVE = {name: importlib.util.find_spec(name) is not None for name in ("ptufile", "phconvert")}
 needs_ptu = pytest.mark.skipif(not HAVE["ptufile"], reason="ptufile (extra io) is not installed")
@@ -19,7 +18,7 @@ needs_all = pytest.mark.skipif(not all(HAVE.values()), reason="ptufile and phcon
 
 
 def run(*arguments: object):
-    return CliRunner().invoke(app, [str(a) for a in arguments])
+    return command_line([str(a) for a in arguments])
 
 
 @needs_ptu

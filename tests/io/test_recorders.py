@@ -7,13 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import mars_lidar as ml
 from mars_lidar import io
-from mars_lidar.cli import app
 from mars_lidar.io.recorder import recorded
 from mars_lidar.io.streams import files
+from tests.harness.command import command_line
 
 pytest.importorskip("ptufile", reason="ptufile (extra io) is not installed")
 PERIOD_NS, CYCLES = 50.0, 5000
@@ -312,21 +311,20 @@ def test_a_laser_scanning_pt3(tmp_path):
 
 def test_commands_take_them(tmp_path):
     """`info` lists channels, `calibrate` takes a channel, `reconstruct` and `convert` the histograms."""
-    runner = CliRunner()
     path = pt3(tmp_path / "a.pt3")
-    told = runner.invoke(app, ["info", str(path)])
+    told = command_line(["info", str(path)])
     assert told.exit_code == 0, told.output
     channel = parts(0.016)[2]
     assert f"0: {int((channel == 0).sum()):,} photons" in told.output
     assert f"2: {int((channel == 2).sum()):,} photons" in told.output
-    told = runner.invoke(app, ["calibrate", str(path), "--pixel", "0,2", "--look"])
+    told = command_line(["calibrate", str(path), "--pixel", "0,2", "--look"])
     assert told.exit_code == 0, told.output
     assert "rate" in told.output
     scan, counts = scanned(tmp_path)
     known = ["--variable", "channel 0", "--dead-time-ns", "0", "--pulse-sigma-ns", "0.5"]
-    told = runner.invoke(app, ["reconstruct", str(scan), *known, "-o", str(tmp_path / "maps.npz")])
+    told = command_line(["reconstruct", str(scan), *known, "-o", str(tmp_path / "maps.npz")])
     assert told.exit_code == 0, told.output
-    told = runner.invoke(app, ["convert", str(scan), str(tmp_path / "cube.zarr"), *known])
+    told = command_line(["convert", str(scan), str(tmp_path / "cube.zarr"), *known])
     assert told.exit_code == 0, told.output
     cube = io.load(tmp_path / "cube.zarr")
     assert np.array_equal(cube.histogram[:], counts[:, :, :, 0])

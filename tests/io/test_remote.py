@@ -14,11 +14,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from store_cases import SYSTEM, one_return
-from typer.testing import CliRunner
 
 from mars_lidar import io
 from mars_lidar._base.buckets import url_of
-from mars_lidar.cli import app
+from tests.harness.command import command_line
 
 fsspec = pytest.importorskip("fsspec", reason="fsspec (extra remote) is not installed")
 pytest.importorskip("aiohttp", reason="aiohttp (extra remote) is not installed")
@@ -75,11 +74,11 @@ def test_memory_and_web(store, tmp_path):
     check(in_memory(store), store)
     with served(tmp_path) as url:
         check(f"{url}/a.zarr", store)
-        told = CliRunner().invoke(app, ["info", f"{url}/a.zarr"])
+        told = command_line(["info", f"{url}/a.zarr"])
         assert told.exit_code == 0, told.output
         assert f"{url}/a.zarr (mars-lidar" in told.output
         out = tmp_path / "maps.npz"
-        told = CliRunner().invoke(app, ["reconstruct", f"{url}/a.zarr", "--no-picture", "-o", str(out)])
+        told = command_line(["reconstruct", f"{url}/a.zarr", "--no-picture", "-o", str(out)])
         assert told.exit_code == 0, told.output
         with pytest.raises(ValueError, match=r"nothing\.zarr: there is no Zarr store"):
             io.load(f"{url}/nothing.zarr")

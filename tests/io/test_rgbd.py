@@ -5,13 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from typer.testing import CliRunner
 
 from mars_lidar import io
-from mars_lidar.cli import app
 from mars_lidar.io.rgbd import read_rgbd
 from mars_lidar.io.rgbd.layered import read_layers
 from mars_lidar.scene.scene import Scene
+from tests.harness.command import command_line
 
 SHARED = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "rgbd"
 NAN = np.nan
@@ -310,11 +309,11 @@ def test_depths_beyond_the_largest_are_no_return(tmp_path):
     assert np.array_equal(np.isnan(layers[1].depth_m), depth + 1.0 > 5.5)
     out = tmp_path / "out.npz"
     options = ["--depth", str(path), "--max-depth-m", "5", "--cycles", "100", "--no-picture", "-o", str(out)]
-    told = CliRunner().invoke(app, ["simulate", *options])
+    told = command_line(["simulate", *options])
     assert told.exit_code == 0, told.output
     assert np.array_equal(np.isnan(io.load(out).depth_m), depth > 5.0)
     options = ["-o", str(tmp_path / "set.zarr"), "--cycles", "100", "--max-depth-m", "5"]
-    told = CliRunner().invoke(app, ["generate", str(path), *options])
+    told = command_line(["generate", str(path), *options])
     assert told.exit_code == 0, told.output
 
 

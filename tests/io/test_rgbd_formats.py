@@ -9,13 +9,12 @@ import h5py
 import numpy as np
 import pytest
 from PIL import Image
-from typer.testing import CliRunner
 
 from mars_lidar import io
-from mars_lidar.cli import app
 from mars_lidar.io.rgbd import read_rgbd
 from mars_lidar.io.rgbd.pixels import read_pfm
 from mars_lidar.scene.scene import Scene
+from tests.harness.command import command_line
 
 SHARED = Path(__file__).resolve().parents[2].parent / "shared" / "data"
 NAN, INF = np.nan, np.inf
@@ -182,12 +181,12 @@ def test_bad_nyu(tmp_path):
 def test_the_command_takes_a_frame(tmp_path):
     nyu(tmp_path / "nyu.mat")
     arguments = ["simulate", "--depth", tmp_path / "nyu.mat", "--cycles", "5", "--bins", "16", "--no-picture"]
-    done = CliRunner().invoke(app, [str(a) for a in (*arguments, "--index", 1, "-o", tmp_path / "a.npz")])
+    done = command_line([str(a) for a in (*arguments, "--index", 1, "-o", tmp_path / "a.npz")])
     assert done.exit_code == 0, done.output
     with io.load(tmp_path / "a.npz") as cube:
         assert cube.depth_m[0, 0] == 9.0
         assert "frame 1" in cube.recipe.source
-    done = CliRunner().invoke(app, [str(a) for a in (*arguments, "-o", tmp_path / "b.npz")])
+    done = command_line([str(a) for a in (*arguments, "-o", tmp_path / "b.npz")])
     assert (done.exit_code, "index tells which" in " ".join(done.output.split())) == (2, True)
 
 

@@ -9,14 +9,13 @@ import h5py
 import numpy as np
 import pytest
 from scipy.io import savemat
-from typer.testing import CliRunner
 
 import mars_lidar as ml
 from mars_lidar import io
-from mars_lidar.cli import app
 from mars_lidar.io import layout
 from mars_lidar.light import stored_flux
 from mars_lidar.light.stored_flux import StoredFlux
+from tests.harness.command import command_line
 
 SYSTEM = ml.System(
     period_ns=100.0,
@@ -107,7 +106,7 @@ def test_the_command_goes_from_a_file_to_a_cube_and_a_picture(transient, tmp_pat
     common = ["simulate", "--transient", tmp_path / "t.npy", "--period-ns", 100, "--cycles", 50, "-o", out]
 
     def run(*more: object) -> object:
-        return CliRunner().invoke(app, [str(a) for a in (*common, *more)])
+        return command_line([str(a) for a in (*common, *more)])
 
     done = run("--transient-bin-ns", 0.5, "--bins", 200, "--signal", 0.5, "--sbr", 4, "--no-transient-pulse")
     assert done.exit_code == 0, done.output
@@ -115,7 +114,7 @@ def test_the_command_goes_from_a_file_to_a_cube_and_a_picture(transient, tmp_pat
     with io.load(out) as cube:
         flux = transient.flux(cube.system, signal=0.5, sbr=4.0, pulse=False)
         assert np.array_equal(np.asarray(cube.histogram), ml.simulate(flux, cube.system))
-    told = CliRunner().invoke(app, ["info", str(out)]).output
+    told = command_line(["info", str(out)]).output
     for word in ("waveform of 200 parts", "t.npy", "pulse_convolved False"):
         assert word in told
     twice = "light must give one of signal and photons_per_unit, got both"

@@ -7,6 +7,7 @@ import math
 import pickle
 import sys
 import threading
+import time
 import warnings
 
 import numpy as np
@@ -159,6 +160,27 @@ def test_the_parent_of_workers_does_not_know_where_they_are():
     assert dataset.state_dict() == {"seed": 3, "epoch": 1, "start": 0}
     with pytest.raises(ValueError, match="with 2 workers, this one has no"):
         dataset.load_state_dict({"seed": 3, "epoch": 0, "start": 0, "given": 1, "workers": 2})
+
+
+@pytest.mark.full
+@pytest.mark.filterwarnings("ignore:This DataLoader will create")
+@pytest.mark.parametrize(("workers", "then", "taken"), [(2, 3, 2), (3, 2, 5), (0, 2, 3)])
+def test_a_plain_loader_resumes_twice_with_other_numbers_of_workers(workers, then, taken):
+    """Also where the workers of the second part have made all of it when the state is asked for."""
+    wanted = indices(stream(batch_size=3))
+    first = stream(batch_size=3)
+    begun = iter(loader(first, workers, batch_size=None))
+    assert indices(itertools.islice(begun, 2)) == wanted[:2]
+    second = stream(batch_size=3)
+    second.load_state_dict(first.state_dict(batches=2))
+    going_on = loader(second, then, batch_size=None, prefetch_factor=8)
+    assert indices(itertools.islice(iter(going_on), taken)) == wanted[2 : 2 + taken]
+    until = time.monotonic() + 20.0
+    while not second._passes._shared[2] and time.monotonic() < until:
+        time.sleep(0.01)
+    third = stream(batch_size=3)
+    third.load_state_dict(second.state_dict(batches=taken))
+    assert indices(third) == wanted[2 + taken :]
 
 
 @pytest.mark.parametrize(("batch_size", "told"), [(3, "stacks the batches"), (None, "worker by worker")])

@@ -6,11 +6,11 @@ import json
 import math
 
 import pytest
-from typer.testing import CliRunner
 
-from studies.compare.command import app
+from studies.compare.command import main
 from studies.compare.sample import Estimate
 from studies.compare.tables import cell, with_error
+from tests.harness.command import command_line
 
 SMALL = ["--scene", "room", "--size", "12", "--cycles", "50", "--bins", "64"]
 SMALL += ["--realizations", "300", "--budget-s", "600"]
@@ -20,7 +20,7 @@ SMALL += ["--realizations", "300", "--budget-s", "600"]
 def test_the_command_prints_draws_and_writes_numbers(tmp_path):
     out, numbers = tmp_path / "c.png", tmp_path / "c.json"
     arguments = [*SMALL, "--engines", "exact, poisson", "--pixels", "2", "--repeats", "2", "-o", str(out)]
-    done = CliRunner().invoke(app, [*arguments, "--json", str(numbers)])
+    done = command_line([*arguments, "--json", str(numbers)], main=main)
     assert done.exit_code == 0, done.output
     assert out.read_bytes().startswith(b"\x89PNG")
     lines = done.stdout.splitlines()
@@ -39,7 +39,7 @@ def test_the_command_prints_draws_and_writes_numbers(tmp_path):
         drawn = bright["exact"]["window"][name]
         assert drawn["z"] == pytest.approx((drawn["value"] - predicted) / drawn["error"], rel=0.2)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["c.json", "c.png"]
-    again = CliRunner().invoke(app, arguments)
+    again = command_line(arguments, main=main)
     assert (again.exit_code, "exists already" in again.stderr) == (2, True)
 
 
@@ -57,7 +57,7 @@ def test_the_command_prints_draws_and_writes_numbers(tmp_path):
 def test_bad_input_of_the_command_is_exit_code_2(tmp_path, monkeypatch, arguments, words):
     monkeypatch.chdir(tmp_path)
     out = [] if "-o" in arguments else ["-o", "c.png"]
-    done = CliRunner().invoke(app, [*SMALL, "--pixels", "1", "--repeats", "1", *out, *arguments])
+    done = command_line([*SMALL, "--pixels", "1", "--repeats", "1", *out, *arguments], main=main)
     assert done.exit_code == 2
     assert words in done.stderr
     assert len(done.stderr.splitlines()) == 1
@@ -67,7 +67,7 @@ def test_bad_input_of_the_command_is_exit_code_2(tmp_path, monkeypatch, argument
 def test_own_pixels_are_compared(tmp_path):
     out = tmp_path / "c.svg"
     own = ["--engines", "exact", "--repeats", "1", "--pixel", "3,4", "--pixel", "7,8"]
-    done = CliRunner().invoke(app, [*SMALL, *own, "-o", str(out)])
+    done = command_line([*SMALL, *own, "-o", str(out)], main=main)
     assert done.exit_code == 0, done.output
     assert "3,4 pixel (y 3, x 4)" in done.stdout
     assert "7,8 pixel (y 7, x 8)" in done.stdout

@@ -4,12 +4,11 @@ import h5py
 import numpy as np
 import pytest
 from table.cases import make_system, small_table
-from typer.testing import CliRunner
 
 import mars_lidar as ml
-from mars_lidar.cli import app
 from mars_lidar.table import cache, storage
 from mars_lidar.table.axes import axis_values
+from tests.harness.command import command_line
 
 
 @pytest.fixture
@@ -19,7 +18,7 @@ def own_cache(tmp_path, monkeypatch):
 
 
 def run(*arguments):
-    return CliRunner().invoke(app, [str(a) for a in arguments])
+    return command_line([str(a) for a in arguments])
 
 
 @pytest.mark.full
@@ -165,7 +164,7 @@ def test_commands(tmp_path, own_cache):
         assert run("table", "build", *small, *bad).exit_code == 2
     assert run("table", "info", tmp_path / "no.h5").exit_code == 2
     (own_cache / "notes.txt").write_text("mine")
-    assert "nothing was removed" in CliRunner().invoke(app, ["table", "clear"], input="n\n").output
+    assert "nothing was removed" in command_line(["table", "clear"], input="n\n").output
     assert "removed 2 files" in run("table", "clear", "--yes").output
     assert [p.name for p in own_cache.iterdir()] == ["notes.txt"]
     assert "holds no tables" in run("table", "clear", "--yes").output

@@ -1,94 +1,76 @@
 """The command `mars-lidar`.
 
-Exit codes: 0 done, 1 failed (disk full, a bug), 2 bad input, 130 interrupted.
+Exit codes: 0 done, 1 failed (disk full, a bug), 2 bad input, 3 a model that does not fit, 130 interrupted.
 """
 
 from __future__ import annotations
 
 import io
 import sys
-from collections.abc import Callable
-from typing import Annotated, Any
+from collections.abc import Sequence
 
-import typer
+from cyclopts import App, Group
 
-from mars_lidar.cli.convert import CONVERT_EPILOG, TIMESTAMPS_EPILOG, convert, timestamps
-from mars_lidar.cli.explore import EXPLORE_EPILOG, explore
-from mars_lidar.cli.export import EXPORT_EPILOG, export
-from mars_lidar.cli.generate import GENERATE_EPILOG, generate, verify
-from mars_lidar.cli.groups import flowing_help, grouped
-from mars_lidar.cli.info import info, view
-from mars_lidar.cli.init import init, schema
-from mars_lidar.cli.measured import CALIBRATE_EPILOG, calibrate
-from mars_lidar.cli.reconstruct import RECONSTRUCT_EPILOG, reconstruct
-from mars_lidar.cli.simulate import EPILOG, simulate
-from mars_lidar.cli.table import app as table_app
+from mars_lidar._version import __version__
+from mars_lidar.cli.console import run
+from mars_lidar.cli.options import COMMAND_LINE
 
-app = typer.Typer(
+_EXAMPLES = """\
+A first run:
+  mars-lidar simulate --scene room -o room.zarr
+  mars-lidar info room.zarr
+  mars-lidar view room.zarr --pixel 40,64 -o pixel.png
+
+mars-lidar COMMAND --help describes a command.
+Exit codes: 0 done, 1 failed, 2 bad input, 3 a model that does not fit, 130 interrupted."""
+
+app = App(
     name="mars-lidar",
-    add_completion=False,
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,  # a traceback means a bug, and is wanted whole in a report
-    rich_markup_mode="rich",
-    context_settings={"help_option_names": ["-h", "--help"]},
+    help="Exact, fast simulation of single-photon LiDAR histograms under SPAD dead time.",
+    help_epilogue=_EXAMPLES,
+    **COMMAND_LINE,
+    version=f"mars-lidar {__version__}",
 )
-
-
-def _add(command: Callable[..., None], epilog: str | None = None, **more: Any) -> None:
-    app.command(help=flowing_help(command), epilog=epilog, **more)(grouped(command))
-
-
-for _command, _epilog in (
-    (simulate, EPILOG),
-    (generate, GENERATE_EPILOG),
-    (verify, None),
-    (export, EXPORT_EPILOG),
-    (info, None),
-    (view, None),
-    (convert, CONVERT_EPILOG),
-    (timestamps, TIMESTAMPS_EPILOG),
-    (calibrate, CALIBRATE_EPILOG),
-    (reconstruct, RECONSTRUCT_EPILOG),
-):
-    _add(_command, _epilog, no_args_is_help=True)
-_add(explore, EXPLORE_EPILOG)
-_add(init)
-_add(schema)
-app.add_typer(table_app, name="table")
-
-
-_EPILOG = "\n\n".join(
-    (
-        "[bold]A first run[/bold]",
-        "mars-lidar simulate --scene room -o room.zarr",
-        "mars-lidar info room.zarr",
-        "mars-lidar view room.zarr --pixel 40,64 -o pixel.png",
-        "Exit codes: 0 done, 1 failed, 2 bad input, 3 a model that does not fit, 130 interrupted. "
-        "[bold]mars-lidar COMMAND --help[/bold] says more.",
-    )
+_COMMANDS = {  # heading: {command: (module, summary)}; the module is imported when the command is used
+    "Simulate": {
+        "simulate": ("simulate", "Simulate the histograms of a scene: a cube and a picture of it."),
+        "generate": ("dataset", "Simulate a dataset of many scenes, systems and levels of light."),
+        "verify": ("dataset", "Simulate chunks of a dataset again and compare every count."),
+        "export": ("dataset", "Write a dataset as the files that depth networks load."),
+        "timestamps": ("convert", "Write the photons of a cube one by one, with their times."),
+        "table": ("table", "Build, describe and clear lookup tables over signal and background."),
+    },
+    "Look at files": {
+        "info": ("viewing", "Describe a cube, a dataset or a file of another program."),
+        "view": ("viewing", "Draw depth, reflectivity, counts and a few histograms."),
+        "explore": ("viewing", "Show pixels and their exact laws in a browser."),
+    },
+    "Reconstruct and calibrate": {
+        "reconstruct": ("reconstruct", "Reconstruct depth and reflectivity from a cube."),
+        "calibrate": ("calibrate", "Fit light and detector to a measured photon stream."),
+    },
+    "Write files": {
+        "convert": ("convert", "Write a cube or a photon stream in another format."),
+        "init": ("init", "Write a commented system file to start from."),
+        "schema": ("init", "Write the JSON Schema of scene, recipe or system files, for editors."),
+    },
+}
+for _heading, _summaries in _COMMANDS.items():
+    _group = Group.create_ordered(_heading)
+    for _place, (_name, (_module, _summary)) in enumerate(_summaries.items()):
+        _command = f"mars_lidar.cli.{_module}:{_name}_command"
+        app.command(_command, name=_name, help=_summary, group=_group, sort_key=_place)
+app.register_install_completion_command(
+    help="Let the shell complete commands and options: bash, zsh, fish, PowerShell.", help_epilogue="", **COMMAND_LINE
 )
+_group = Group.create_ordered("Options")
+for _name in ("--help", "--version", "--install-completion"):
+    app[_name].group = _group
 
 
-def _version(asked: bool) -> None:
-    if asked:
-        from mars_lidar._version import __version__
-
-        print(f"mars-lidar {__version__}")
-        raise typer.Exit
-
-
-@app.callback(epilog=_EPILOG)
-def _root(
-    version: Annotated[
-        bool, typer.Option("--version", help="Print the version and stop.", is_eager=True, callback=_version)
-    ] = False,
-) -> None:
-    """Exact, fast simulation of single-photon LiDAR histograms under SPAD dead time."""
-
-
-def main() -> None:
-    """Entry point of the command `mars-lidar`."""
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Entry point of the command `mars-lidar`; returns the exit code."""
     for stream in (sys.stdout, sys.stderr):  # a sign that a terminal or a pipe cannot show is no error
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
-    app()
+    return run(app, sys.argv[1:] if arguments is None else arguments)

@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import contextlib
+import difflib
 import re
 import sys
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
 
-import typer
+from cyclopts import App
+from cyclopts import exceptions as wrong
 
-from mars_lidar._base.files import beside
+from mars_lidar._base.checks import did_you_mean
+from mars_lidar._base.files import WriteError, beside
 from mars_lidar._base.progress import Bar
-from mars_lidar.cli.groups import OPTIONS
+from mars_lidar.cli.options import describe
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -23,8 +27,8 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 FAILED, BAD_INPUT, MISFIT, INTERRUPTED = 1, 2, 3, 130
-_PIPE = 250  # columns where nobody is watching
-_FIELDS = {  # of the package, where an option has another name
+_PIPE = 250  # columns of output that is piped or written to a file
+_FIELDS = {  # arguments of the package and the options that give them under another name
     "sigma_ns": "pulse_sigma_ns",
     "fwhm_ns": "pulse_fwhm_ns",
     "values": "pulse_file",
@@ -42,42 +46,144 @@ def say(message: str) -> None:
     print(f"mars-lidar: {message}", file=sys.stderr)
 
 
-@contextlib.contextmanager
-def reported() -> Iterator[None]:
-    """Turn what goes wrong into one line and an exit code; anything unforeseen keeps its traceback."""
-    from mars_lidar.io import Interrupted, WriteError
+# --- Errors ---------------------------------------------------------------------------------------------------------
 
+
+def run(app: App, tokens: Sequence[str]) -> int:
+    """Run a command line; the exit code, after one line on standard error where it is not 0.
+
+    What is unforeseen keeps its traceback: it is a bug, and the report of it needs all of it.
+    """
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("always", UserWarning)
-            told: set[str] = set()
-            warnings.showwarning = partial(_show_warning, told)
-            yield
-    except Interrupted as stop:
-        say(str(stop))
-        raise typer.Exit(INTERRUPTED) from None
-    except KeyboardInterrupt:
-        say("interrupted")
-        raise typer.Exit(INTERRUPTED) from None
+            warnings.showwarning = partial(_show_warning, set())
+            _refuse_empty(tokens)
+            command = _command(app, tokens)
+            describe(command)
+            code = app(tokens, exit_on_error=False, print_error=False, result_action="return_value")
+        asked = command.default_command or any(token.startswith("-") for token in tokens)
+        return code or (0 if asked else BAD_INPUT)
+    except wrong.MissingArgumentError as error:
+        if list(tokens) == list(error.command_chain or ()):  # the command alone: its help
+            app.help_print(tokens)
+        else:
+            say(usage_message(error, app.name[0]))
+        return BAD_INPUT
+    except wrong.CycloptsError as error:
+        say(usage_message(error, app.name[0]))
+        return BAD_INPUT
+    except KeyboardInterrupt as stop:  # `Interrupted` says what remains on the disk
+        say(str(stop) or "interrupted")
+        return INTERRUPTED
     except WriteError as error:
         say(f"failed: {error.strerror}")
-        raise typer.Exit(FAILED) from None
+        return FAILED
     except (FileNotFoundError, FileExistsError, IsADirectoryError, NotADirectoryError) as error:
-        say(_of_file(error))
-        raise typer.Exit(BAD_INPUT) from None
+        say(_file_message(error))
+        return BAD_INPUT
     except BrokenPipeError:
         raise
     except OSError as error:
-        say(f"failed: {_of_file(error)}")
-        raise typer.Exit(FAILED) from None
+        say(f"failed: {_file_message(error)}")
+        return FAILED
     except (ValueError, TypeError, OverflowError, MemoryError) as error:
-        say(_with_options(" ".join(str(error).split())) or type(error).__name__)
-        raise typer.Exit(BAD_INPUT) from None
+        say(_with_options(" ".join(str(error).split()), tokens) or type(error).__name__)
+        return BAD_INPUT
+
+
+def _command(app: App, tokens: Sequence[str]) -> App:
+    """The command, or group of commands, that the first words name."""
+    for token in tokens:
+        if token.startswith("-") or token not in app:
+            break
+        app = app[token]
+    return app
+
+
+def _refuse_empty(tokens: Sequence[str]) -> None:
+    """Raise for an empty value: a shell makes one of a variable that is not set, and as a path it is this folder."""
+    for before, token in pairwise(["", *tokens]):
+        option, equals, value = token.partition("=")
+        if token == "" or (token.startswith("-") and equals and not value):
+            name = before if token == "" else option
+            raise ValueError(f"{name if name.startswith('-') else 'an argument'} is empty: give a value")
+
+
+def usage_message(error: wrong.CycloptsError, program: str) -> str:
+    """What is wrong with a command line, in the words of its options, and the page that helps."""
+    commands = " ".join((program, *(error.command_chain or ())))
+    return f"{_usage_message(error, commands)} ({commands} --help)"
+
+
+def _usage_message(error: wrong.CycloptsError, commands: str) -> str:
+    if isinstance(error, wrong.UnknownOptionError):
+        option = (error.token.keyword or error.token.value).partition("=")[0]
+        options = [name for argument in error.argument_collection for name in argument.names]
+        return f"{commands} has no option {option}{_suggestion(option, options)}"
+    if isinstance(error, wrong.UnknownCommandError) and error.unused_tokens and error.app is not None:
+        token = error.unused_tokens[0]
+        kind = "option" if token.startswith("-") else "command"
+        return f"{commands} has no {kind} {token}{_suggestion(token, list(error.app))}"
+    if isinstance(error, wrong.MissingArgumentError) and error.argument is not None:
+        if error.keyword is not None:
+            return f"{error.keyword} needs a value"
+        name, help = error.argument.name, str(error.argument.parameter.help)
+        return f"{name if name.startswith('-') else name.upper()} is missing: {help.rstrip('.')}"
+    if isinstance(error, wrong.UnusedCliTokensError) and error.unused_tokens:
+        return f"unexpected argument {error.unused_tokens[0]!r}"
+    if isinstance(error, wrong.RepeatArgumentError):
+        return f"{error.token.keyword} is given twice"
+    if isinstance(error, wrong.CoercionError) and error.token is not None:
+        name = error.token.keyword or (error.argument.name.upper() if error.argument else "")
+        if error.msg is not None:
+            return f"{name} {error.msg}"
+        value = error.token.value
+        if get_origin(error.target_type) is Literal:
+            choices = get_args(error.target_type)
+            return f"{name} must be one of {', '.join(map(repr, choices))}, got {value!r}{did_you_mean(value, choices)}"
+        if error.target_type is bool:
+            return f"{name} takes no value, got {value!r}"
+    return str(error)
+
+
+def _suggestion(word: str, names: Sequence[str]) -> str:
+    """The names that `word` may be meant to be."""
+    word = word.replace("_", "-")
+    close = [name for name in names if name.startswith("--") and name.startswith(word)]
+    close += difflib.get_close_matches(word, names, n=3, cutoff=0.7)
+    close = list(dict.fromkeys(close))[:3]
+    return f"; did you mean {' or '.join(close)}?" if close else ""
+
+
+def _with_options(message: str, tokens: Sequence[str]) -> str:
+    """A message of the package, which names arguments, with the options that they were given by."""
+    options = [token.partition("=")[0] for token in tokens if token.startswith("--")]
+    given = {"out": "--out", "target": "TARGET"} | {option[2:].replace("-", "_"): option for option in options}
+    given |= {field: given[option] for field, option in _FIELDS.items() if option in given and field not in given}
+    for name, option in given.items():
+        message = re.sub(rf"(?<![\w./:'-])(?:light\.)?{re.escape(name)}(?= (must|needs|belongs)\b|=)", option, message)
+    return message
+
+
+def _file_message(error: OSError) -> str:
+    if error.filename is not None and error.strerror:
+        return f"{error.filename}: {error.strerror}"
+    return error.strerror or str(error)
+
+
+def _show_warning(printed: set[str], message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
+    if issubclass(category, UserWarning) and str(message) not in printed:
+        printed.add(str(message))
+        say(f"warning: {message}")
+
+
+# --- Progress, files and tables -------------------------------------------------------------------------------------
 
 
 @contextlib.contextmanager
 def progress_bar(label: str) -> Iterator[Bar]:
-    """A callback (done, total) that says how far a run is, and is gone at its end."""
+    """A callback (done, total) that draws how far a run is, and is removed at its end."""
     bar = Bar(label)
     try:
         yield bar
@@ -105,24 +211,6 @@ def refuse_existing(out: Path | None, overwrite: bool, ways: str = "--overwrite 
         raise FileExistsError(f"{out} exists already; give {ways}")
 
 
-def two_integers(option: str, text: str, form: str = "Y,X (row, column)") -> tuple[int, int]:
-    """What an option of this form gives, such as the pixel (y, x) of ``--pixel Y,X``."""
-    try:
-        first, second = (int(part) for part in text.split(","))
-    except ValueError:
-        raise ValueError(f"{option} must be two integers {form}, got {text!r}") from None
-    return first, second
-
-
-def two_numbers(option: str, text: str, form: str) -> tuple[float, float]:
-    """What an option of this form gives, such as START,STOP."""
-    try:
-        first, second = (float(part) for part in text.split(","))
-    except ValueError:
-        raise ValueError(f"{option} must be two numbers {form}, got {text!r}") from None
-    return first, second
-
-
 def save_picture(figure: Figure, out: Path) -> None:
     """Write a figure beside its name and rename it when it is whole."""
     options: dict[str, Any] = {"pil_kwargs": {"compress_level": 4}} if out.suffix == ".png" else {}
@@ -130,9 +218,9 @@ def save_picture(figure: Figure, out: Path) -> None:
         figure.savefig(unfinished, format=out.suffix[1:], **options)
 
 
-def table(told: Mapping[str, str] | Sequence[tuple[str, str]]) -> None:
+def table(content: Mapping[str, str] | Sequence[tuple[str, str]]) -> None:
     """Two columns on standard output: a label, and text that is never cut; plain where it is piped."""
-    rows = told.items() if isinstance(told, Mapping) else told
+    rows = content.items() if isinstance(content, Mapping) else content
     if not sys.stdout.isatty():
         for label, text in rows:
             print(f"{label:<14} {text}")
@@ -149,7 +237,7 @@ def table(told: Mapping[str, str] | Sequence[tuple[str, str]]) -> None:
 
 
 def screen() -> Console:
-    """Standard output; where nobody is watching nothing is folded."""
+    """Standard output; without a terminal no line is folded."""
     from rich.console import Console
 
     return Console(highlight=False) if sys.stdout.isatty() else Console(highlight=False, width=_PIPE)
@@ -160,7 +248,7 @@ def grid(title: str, columns: Sequence[str]) -> Table:
     from rich.table import Table
     from rich.text import Text
 
-    shown = Table(
+    empty = Table(
         title=Text(title, style="bold") if title else None,
         title_justify="left",
         box=None,
@@ -169,25 +257,5 @@ def grid(title: str, columns: Sequence[str]) -> Table:
         header_style="dim",
     )
     for k, name in enumerate(columns):
-        shown.add_column(Text(name), justify="left" if k == 0 else "right", overflow="fold")
-    return shown
-
-
-def _with_options(message: str) -> str:
-    """A message of the package, which names arguments, with the options that they were given by."""
-    given = OPTIONS.get()
-    for name, option in {**{field: given[of] for field, of in _FIELDS.items() if of in given}, **given}.items():
-        message = re.sub(rf"(?<![\w./:'-])(?:light\.)?{name}(?= (must|needs|belongs)\b|=)", option, message)
-    return message
-
-
-def _of_file(error: OSError) -> str:
-    if error.filename is not None and error.strerror:
-        return f"{error.filename}: {error.strerror}"
-    return error.strerror or str(error)
-
-
-def _show_warning(told: set[str], message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
-    if issubclass(category, UserWarning) and str(message) not in told:
-        told.add(str(message))
-        say(f"warning: {message}")
+        empty.add_column(Text(name), justify="left" if k == 0 else "right", overflow="fold")
+    return empty

@@ -3,72 +3,75 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
-from mars_lidar.cli.console import progress_bar, reported, table
+from mars_lidar.cli.console import progress_bar, table
 from mars_lidar.cli.foreign import ForeignOptions
-from mars_lidar.cli.groups import argument, examples, option
-from mars_lidar.cli.options import out as out_option
-from mars_lidar.cli.simulate import tell_time
+from mars_lidar.cli.options import Integer, Number, argument, command, examples, option, out_option
+from mars_lidar.cli.simulate import say_time
 
 if TYPE_CHECKING:
     from mars_lidar.io import Converted
 
-CONVERT_EPILOG = examples(
+
+CONVERT_EXAMPLES = examples(
     "mars-lidar convert room.zarr room.h5",
     "mars-lidar convert set.zarr first.mat --realization 0",
     "mars-lidar convert lab.ptu lab.h5 --bins 1024",
     "mars-lidar convert face.mat face.zarr --variable counts --system camera.yaml",
-    "Cubes: .zarr .h5 .npz .mat .ptu. Photon streams: .npz .ptu .h5 (Photon-HDF5). .ptu and Photon-HDF5 need "
+    notes="Cubes: .zarr .h5 .npz .mat .ptu. Photon streams: .npz .ptu .h5 (Photon-HDF5). .ptu and Photon-HDF5 need "
     "pip install 'mars-lidar[io]'. docs/formats.md tells what is in each.",
 )
-TIMESTAMPS_EPILOG = examples(
+TIMESTAMPS_EXAMPLES = examples(
     "mars-lidar simulate --scene room -o room.zarr",
     "mars-lidar timestamps room.zarr -o room.ptu",
     "mars-lidar timestamps set.zarr --realization 3 -o photons.h5",
 )
 
 _LARGE_IMAGE = 5e8
-_CLOCK_PS = option(
-    "Of a stream in a .ptu: least unit of its times, ps. Programs that make an image of it have a bin for each.",
-    "the finest, 32768 to a period",
-)
-_OVERWRITE = option("Replace an existing file.", default=False)
+ClockPs = Annotated[
+    Number | None,
+    option(
+        "Of a stream in a .ptu: least unit of its times, ps. Programs that make an image of it have a bin for each.",
+        "the finest, 32768 to a period",
+    ),
+]
+Overwrite = Annotated[bool, option("Replace an existing file.")]
 
 
 def convert(
-    source: Path = argument(
-        "A cube, a photon stream (of a lab, too: .ptu, Photon-HDF5), or histograms of another program."
-    ),
-    target: Path = argument("The new file; its suffix names the format."),
-    realization: int | None = option("Of a cube, this exposure alone, from 0; a .mat holds one."),
+    source: Annotated[
+        Path, argument("A cube, a photon stream (of a lab, too: .ptu, Photon-HDF5), or histograms of another program.")
+    ],
+    target: Annotated[Path, argument("The new file; its suffix names the format.")],
+    /,
     *,
-    foreign: ForeignOptions,
-    bins: int | None = option("Histogram bins of a recorded stream.", "its finest clock"),
-    clock_ps: float | None = _CLOCK_PS,
-    overwrite: bool = _OVERWRITE,
+    realization: Annotated[Integer | None, option("Of a cube, this exposure alone, from 0; a .mat holds one.")] = None,
+    foreign: ForeignOptions = ForeignOptions(),
+    bins: Annotated[Integer | None, option("Histogram bins of a recorded stream.", "its finest clock")] = None,
+    clock_ps: ClockPs = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Write a cube or a photon stream in another format, and tell what the other format cannot hold."""
-    with reported():
-        from mars_lidar.dataset.store import is_dataset
-        from mars_lidar.io.conversion import convert as converted
+    from mars_lidar.dataset.store import is_dataset
+    from mars_lidar.io.conversion import convert as converted
 
-        if is_dataset(source):
-            raise ValueError(f"{source} is a dataset: mars-lidar export writes it as the files that networks load")
-        if foreign.of_histograms(source):
-            done = _imported(foreign, source, target, overwrite)
-        else:
-            done = converted(
-                source,
-                target,
-                realization=realization,
-                period_ns=foreign.period_ns,
-                bins=bins,
-                clock_ps=clock_ps,
-                overwrite=overwrite,
-            )
-        rows = [("wrote", str(done.path)), ("content", done.content)]
-        table(rows + [("lost", text) for text in done.lost or ("nothing",)])
+    if is_dataset(source):
+        raise ValueError(f"{source} is a dataset: mars-lidar export writes it as the files that networks load")
+    if foreign.of_histograms(source):
+        done = _imported(foreign, source, target, overwrite)
+    else:
+        done = converted(
+            source,
+            target,
+            realization=realization,
+            period_ns=foreign.period_ns,
+            bins=bins,
+            clock_ps=clock_ps,
+            overwrite=overwrite,
+        )
+    rows = [("wrote", str(done.path)), ("content", done.content)]
+    table(rows + [("lost", text) for text in done.lost or ("nothing",)])
 
 
 def _imported(foreign: ForeignOptions, source: Path, target: Path, overwrite: bool) -> Converted:
@@ -82,32 +85,37 @@ def _imported(foreign: ForeignOptions, source: Path, target: Path, overwrite: bo
 
 
 def timestamps(
-    cube: Path = argument("A cube written by mars-lidar."),
-    out: Path = out_option("The stream: .npz, .ptu or .h5 (Photon-HDF5).", panel=None),
-    realization: int = option("Which exposure, from 0 in the file.", default=0),
-    threads: int | None = option("Threads.", "all cores"),
-    clock_ps: float | None = _CLOCK_PS,
-    overwrite: bool = _OVERWRITE,
+    cube: Annotated[Path, argument("A cube written by mars-lidar.")],
+    /,
+    *,
+    out: Annotated[Path, out_option("The stream: .npz, .ptu or .h5 (Photon-HDF5).", option)],
+    realization: Annotated[Integer, option("Which exposure, from 0 in the file.", "0")] = 0,
+    threads: Annotated[Integer | None, option("Threads.", "all cores")] = None,
+    clock_ps: ClockPs = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Write the photons of a stored cube, one by one, with their times: the cube is simulated again.
 
     The histogram of the photons is the cube's exposure, count by count; this is checked.
     """
-    with reported():
-        from mars_lidar.io.conversion import photons, resolution_ns
-        from mars_lidar.io.cube import load
-        from mars_lidar.io.streams.files import check_output
+    from mars_lidar.io.conversion import photons, resolution_ns
+    from mars_lidar.io.cube import load
+    from mars_lidar.io.streams.files import check_output
 
-        check_output(out, overwrite=overwrite, clock_ps=clock_ps)
-        with load(cube) as stored, progress_bar("simulating") as progress:
-            tell_time(stored.flux, stored.system, stored.engine, 1, threads, {})
-            times = photons(stored, realization=realization, threads=threads, progress=progress)
-        times.save(out, overwrite=overwrite, clock_ps=clock_ps)
-        unit = resolution_ns(out, times, clock_ps)
-        height, width = times.shape
-        told = "as simulated" if unit == 0.0 else f"in units of {1e3 * unit:.4g} ps; cycles and bins are exact"
-        image = 2 * height * width * times.period_ns / unit if out.suffix == ".ptu" else 0.0
-        if image > _LARGE_IMAGE:
-            told += f"; other programs make an image of {image / 1e9:.2g} GB of it, --clock-ps a smaller one"
-        content = f"{len(times):,} photons of {height} × {width} pixels"
-        table({"wrote": str(out), "content": content, "times": told})
+    check_output(out, overwrite=overwrite, clock_ps=clock_ps)
+    with load(cube) as stored, progress_bar("simulating") as progress:
+        say_time(stored.flux, stored.system, stored.engine, 1, threads, {})
+        times = photons(stored, realization=realization, threads=threads, progress=progress)
+    times.save(out, overwrite=overwrite, clock_ps=clock_ps)
+    unit = resolution_ns(out, times, clock_ps)
+    height, width = times.shape
+    told = "as simulated" if unit == 0.0 else f"in units of {1e3 * unit:.4g} ps; cycles and bins are exact"
+    image = 2 * height * width * times.period_ns / unit if out.suffix == ".ptu" else 0.0
+    if image > _LARGE_IMAGE:
+        told += f"; other programs make an image of {image / 1e9:.2g} GB of it, --clock-ps a smaller one"
+    content = f"{len(times):,} photons of {height} × {width} pixels"
+    table({"wrote": str(out), "content": content, "times": told})
+
+
+convert_command = command(convert, CONVERT_EXAMPLES)
+timestamps_command = command(timestamps, TIMESTAMPS_EXAMPLES)

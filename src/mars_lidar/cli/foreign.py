@@ -1,52 +1,69 @@
-"""Cubes of the command line: files of mars-lidar, and those of other programs with what they do not tell."""
+"""Cubes of the command line: files of mars-lidar, and histograms of other programs with options for what they lack."""
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
+from cyclopts import Parameter
 
-from mars_lidar.cli.console import two_integers, two_numbers
-from mars_lidar.cli.groups import group, panel
-from mars_lidar.cli.options import DETECTOR, SYSTEM
-from mars_lidar.cli.pulse_options import PulseOptions
+from mars_lidar.cli.options import (
+    DetectorName,
+    Integer,
+    Number,
+    SystemFile,
+    Text,
+    foreign_option,
+    two_integers,
+    two_numbers,
+)
+from mars_lidar.cli.system_options import PulseOptions
 from mars_lidar.instrument.system import Detector, System
 
 if TYPE_CHECKING:
     from mars_lidar.io import Cube
     from mars_lidar.io.recorder import Recorded
 
-_of_file = panel("A file of another program")
+
 _BINS = 1e-6  # relative difference by which a period may miss a whole number of bins
 _NEEDED = "--system, or --bin-ps (or --period-ns), --cycles, --dead-time-ns (or --detector) and --pulse-sigma-ns"
 
 
-@group
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
 class ForeignOptions:
     """What a file of another program does not tell of its histograms; nothing is needed for one of mars-lidar."""
 
-    system: Path | None = SYSTEM
-    bin_ns: float | None = _of_file("Width of a histogram bin, ns ...")
-    bin_ps: float | None = _of_file("... or ps.")
-    period_ns: float | None = _of_file("Laser period, ns.", "the histogram's length")
-    cycles: int | None = _of_file("Laser periods that each histogram was accumulated over.")
-    detector: str | None = DETECTOR
-    dead_time_ns: float | None = _of_file("Dead time after a registration, ns.")
+    system: SystemFile = None
+    bin_ns: Annotated[Number | None, foreign_option("Width of a histogram bin, ns ...")] = None
+    bin_ps: Annotated[Number | None, foreign_option("... or ps.")] = None
+    period_ns: Annotated[Number | None, foreign_option("Laser period, ns.", "the histogram's length")] = None
+    cycles: Annotated[Integer | None, foreign_option("Laser periods that each histogram was accumulated over.")] = None
+    detector: DetectorName = None
+    dead_time_ns: Annotated[Number | None, foreign_option("Dead time after a registration, ns.")] = None
     pulse: PulseOptions = PulseOptions()
-    start_ns: float = _of_file("Time from the laser pulse to the first bin (a gate), ns.", default=0.0)
-    variable: str | None = _of_file("Name of the array, of a file with several; NAME[3] of a MATLAB cell of arrays.")
-    axes: str | None = _of_file(
-        "What its dimensions are, e.g. tyx; n exposures, (yx) or (xy) pixels row by row or column by column.",
-        "time last, or where the system's bins fit",
-        metavar="NYXT",
-    )
-    image: str | None = _of_file("Height and width of (yx) or (xy).", metavar="H,W")
-    unit_ns: float | None = _of_file("Unit of photon times, ns.")
-    window_ns: str | None = _of_file(
-        "Of photon times that count from the laser pulse: those in this window alone, ns.", metavar="START,STOP"
-    )
+    start_ns: Annotated[Number, foreign_option("Time from the laser pulse to the first bin (a gate), ns.", "0.0")] = 0.0
+    variable: Annotated[
+        Text | None, foreign_option("Name of the array, of a file with several; NAME[3] of a MATLAB cell of arrays.")
+    ] = None
+    axes: Annotated[
+        Text | None,
+        foreign_option(
+            "What its dimensions are, e.g. tyx; n exposures, (yx) or (xy) pixels row by row or column by column.",
+            "time last, or where the system's bins fit",
+            metavar="NYXT",
+        ),
+    ] = None
+    image: Annotated[Text | None, foreign_option("Height and width of (yx) or (xy).", metavar="H,W")] = None
+    unit_ns: Annotated[Number | None, foreign_option("Unit of photon times, ns.")] = None
+    window_ns: Annotated[
+        Text | None,
+        foreign_option(
+            "Of photon times that count from the laser pulse: those in this window alone, ns.", metavar="START,STOP"
+        ),
+    ] = None
 
     @property
     def _given(self) -> list[str]:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Annotated
 
 from mars_lidar._base import checks
-from mars_lidar.cli.console import refuse_existing, reported, table
-from mars_lidar.cli.groups import argument, option
-from mars_lidar.cli.options import out as out_option
+from mars_lidar.cli.console import refuse_existing, table
+from mars_lidar.cli.options import Text, argument, command, option, out_option
 from mars_lidar.cli.system_options import DEFAULT_SYSTEM
 from mars_lidar.instrument.effects import FIELDS
 from mars_lidar.instrument.presets import INSTRUMENTS, PRESETS, sourced
@@ -84,41 +84,50 @@ def of_instrument(name: str) -> str:
 
 
 def schema(
-    file: str = argument("Of which file: scene, recipe or system. [dim]Default: recipe.[/dim]", "recipe"),
-    out: Path | None = out_option("A .json file, else standard output.", None, panel=None),
+    file: Annotated[
+        Text,
+        argument("Which file it describes: scene, recipe or system.", "recipe", choices=("scene", "recipe", "system")),
+    ] = "recipe",
+    /,
+    *,
+    out: Annotated[Path | None, out_option("A .json file, else standard output.", option)] = None,
 ) -> None:
     """Write the JSON Schema of a scene file, a recipe or a system file, with which editors complete and check keys.
 
     In the first line of the YAML file:  # yaml-language-server: $schema=recipe.json
     """
-    with reported():
-        from mars_lidar.dataset.schema import json_schema
+    from mars_lidar.dataset.schema import json_schema
 
-        text = json.dumps(json_schema(file), indent=1, ensure_ascii=False) + "\n"
-        if out is None:
-            print(text, end="")
-            return
-        out.write_text(text, encoding="utf-8")
-        table([("wrote", str(out))])
+    text = json.dumps(json_schema(file), indent=1, ensure_ascii=False) + "\n"
+    if out is None:
+        print(text, end="")
+        return
+    out.write_text(text, encoding="utf-8")
+    table([("wrote", str(out))])
 
 
 def init(
-    file: Path = argument("Where to write it: .yaml or .yml. [dim]Default: system.yaml.[/dim]", _FILE),
-    out: Path | None = out_option("The same, as with the other commands.", None, panel=None),
-    preset: str | None = option(f"An instrument: {', '.join(PRESETS)}."),
-    overwrite: bool = option("Replace an existing file.", default=False),
+    file: Annotated[Path, argument("Where to write it: .yaml or .yml.", "system.yaml")] = _FILE,
+    /,
+    *,
+    out: Annotated[Path | None, out_option("The same, as with the other commands.", option)] = None,
+    preset: Annotated[Text | None, option(f"An instrument: {', '.join(PRESETS)}.")] = None,
+    overwrite: Annotated[bool, option("Replace an existing file.")] = False,
 ) -> None:
     """Write a commented YAML file that describes a system: laser, detector, histogram.
 
     Edit it and pass it on:  mars-lidar simulate --scene room --system system.yaml -o room.zarr
     """
-    with reported():
-        if out is not None:
-            if file != _FILE and file != out:
-                raise ValueError(f"give the file once, got {str(file)!r} and --out {str(out)!r}")
-            file = out
-        if file.suffix not in (".yaml", ".yml"):
-            raise ValueError(f"FILE must end in .yaml or .yml, got {str(file)!r}")
-        refuse_existing(file, overwrite)
-        file.write_text(commented(file) if preset is None else of_instrument(preset))
-        table([("wrote", str(file))])
+    if out is not None:
+        if file != _FILE and file != out:
+            raise ValueError(f"give the file once, got {str(file)!r} and --out {str(out)!r}")
+        file = out
+    if file.suffix not in (".yaml", ".yml"):
+        raise ValueError(f"FILE must end in .yaml or .yml, got {str(file)!r}")
+    refuse_existing(file, overwrite)
+    file.write_text(commented(file) if preset is None else of_instrument(preset))
+    table([("wrote", str(file))])
+
+
+init_command = command(init)
+schema_command = command(schema)

@@ -6,26 +6,16 @@ import math
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
 from mars_lidar._base import checks
 from mars_lidar._base.files import check_target
 from mars_lidar._base.progress import span
-from mars_lidar.cli.console import (
-    grid,
-    progress_bar,
-    refuse_existing,
-    reported,
-    save_picture,
-    say,
-    screen,
-    table,
-)
+from mars_lidar.cli.console import grid, progress_bar, refuse_existing, save_picture, say, screen, table
 from mars_lidar.cli.foreign import ForeignOptions
-from mars_lidar.cli.groups import argument, examples, option
-from mars_lidar.cli.options import out as out_option
+from mars_lidar.cli.options import Integer, Number, Text, argument, command, examples, option, out_option
 from mars_lidar.reconstruction import METHODS, Flags, MaximumLikelihood, Method, Reconstruction
 from mars_lidar.reconstruction.keep import KEEP, common_delay, has_later_light, keep_return
 from mars_lidar.reconstruction.reconstruction import ATTENUATIONS
@@ -34,7 +24,8 @@ if TYPE_CHECKING:
     from mars_lidar.io import Cube
     from mars_lidar.reconstruction.stored import Timed
 
-RECONSTRUCT_EPILOG = examples(
+
+RECONSTRUCT_EXAMPLES = examples(
     "mars-lidar reconstruct room.zarr -o maps.zarr",
     "mars-lidar reconstruct room.zarr --method all -o maps.h5",
     "mars-lidar reconstruct dim.zarr --method image -o maps.zarr",
@@ -42,101 +33,118 @@ RECONSTRUCT_EPILOG = examples(
     "mars-lidar reconstruct face.npy --bin-ps 80 --cycles 20000 --dead-time-ns 50 --pulse-fwhm-ns 0.3 -o face.zarr",
     "mars-lidar reconstruct glass.zarr --returns 3 -o maps.zarr --cloud glass.ply --focal-px 110",
     "mars-lidar reconstruct room.zarr --method maximum_likelihood,peak --no-picture -o maps.npz",
-    f"Methods: {', '.join(METHODS)}. docs/reconstruction.md says what each assumes, and for which detectors.",
+    notes=f"Methods: {', '.join(METHODS)}. docs/reconstruction.md says what each assumes, and for which detectors.",
 )
 
 
 def reconstruct(
-    cube: Path = argument(
-        "A cube: .zarr, .h5, .hdf5, .npz, .mat or .ptu; or histograms of others: also .npy, .tif, .csv."
-    ),
+    cube: Annotated[
+        Path, argument("A cube: .zarr, .h5, .hdf5, .npz, .mat or .ptu; or histograms of others: also .npy, .tif, .csv.")
+    ],
+    /,
     *,
-    foreign: ForeignOptions,
-    out: Path = out_option("The maps: .zarr, .h5, .hdf5 or .npz.", panel=None),
-    method: str = option(
-        "One or more methods, separated by commas, or all that suit the detector; image for 1 to 10 photons a pixel.",
-        default="maximum_likelihood",
-    ),
-    level: float | None = option(
-        "Signal photons per period of a surface of reflectivity 1.", "that of the cube's scene, or mean reflectivity 1"
-    ),
-    attenuation: str | None = option(
-        "none or inverse_square: reflectivity is signal times depth squared.", "as the cube was simulated"
-    ),
-    returns: int = option(
-        "Returns to look for in each pixel, each tested (glass, foliage). Needs maximum_likelihood.",
-        default=1,
-        min=1,
-        max=8,
-    ),
-    keep: str | None = option("Of --returns: strongest, nearest or farthest becomes the depth.", "strongest"),
-    from_ns: float | None = option(
-        "Returns nearer than this, ns after the pulse, such as an internal reflection, are modelled and left out.",
-        "all",
-    ),
-    false_alarm: float | None = option(
-        "Share of the pixels without signal in which noise passes for it, at most; of maximum_likelihood.", "0.01"
-    ),
-    threads: int | None = option("Threads.", "all cores", min=1),
-    cloud: Path | None = option(
-        "Points of the first method and exposure, .ply, with reflectivity (of --returns: signal, every return a point) "
-        "and standard error of depth."
-    ),
-    focal_px: float | None = option("Focal length of the image in pixels, for --cloud."),
-    picture: bool = option("Draw the maps beside OUT, as .png.", "yes", "--picture/--no-picture", default=True),
-    overwrite: bool = option("Replace existing files.", default=False),
+    foreign: ForeignOptions = ForeignOptions(),
+    out: Annotated[Path, out_option("The maps: .zarr, .h5, .hdf5 or .npz.", option)],
+    method: Annotated[
+        Text,
+        option(
+            "Methods, separated by commas, or all that suit the detector; image for 1 to 10 photons a pixel.",
+            "maximum_likelihood",
+        ),
+    ] = "maximum_likelihood",
+    level: Annotated[
+        Number | None,
+        option(
+            "Signal photons per period of a surface of reflectivity 1.",
+            "that of the cube's scene, or mean reflectivity 1",
+        ),
+    ] = None,
+    attenuation: Annotated[
+        Text | None,
+        option("none or inverse_square: reflectivity is signal times depth squared.", "as the cube was simulated"),
+    ] = None,
+    returns: Annotated[
+        Integer,
+        option("Returns to look for in each pixel, each tested (glass, foliage). Needs maximum_likelihood.", "1"),
+    ] = 1,
+    keep: Annotated[
+        Text | None, option("Of --returns: strongest, nearest or farthest becomes the depth.", "strongest")
+    ] = None,
+    from_ns: Annotated[
+        Number | None,
+        option(
+            "Returns nearer than this, ns after the pulse, such as an internal reflection, are modelled and left out.",
+            "all",
+        ),
+    ] = None,
+    false_alarm: Annotated[
+        Number | None,
+        option(
+            "Share of the pixels without signal in which noise passes for it, at most; of maximum_likelihood.", "0.01"
+        ),
+    ] = None,
+    threads: Annotated[Integer | None, option("Threads.", "all cores")] = None,
+    cloud: Annotated[
+        Path | None,
+        option(
+            "Write the points of the first method and exposure, .ply, with reflectivity and standard error of depth; "
+            "with --returns, every return is a point, with its signal."
+        ),
+    ] = None,
+    focal_px: Annotated[Number | None, option("Focal length of the image in pixels, for --cloud.")] = None,
+    picture: Annotated[bool, option("Draw the maps beside OUT, as .png.", "yes", negative="--no-picture")] = True,
+    overwrite: Annotated[bool, option("Replace existing files.")] = False,
 ) -> None:
     """Reconstruct depth and reflectivity of every pixel of a cube, and compare them with the truth where it is known.
 
     The counts are read in parts, so a .zarr or .h5 of any size will do.
     """
-    with reported():
-        began = time.perf_counter()
-        from mars_lidar.io.maps import check_maps_output, save_maps
-        from mars_lidar.reconstruction.stored import reconstruct_stored
+    began = time.perf_counter()
+    from mars_lidar.io.maps import check_maps_output, save_maps
+    from mars_lidar.reconstruction.stored import reconstruct_stored
 
-        png = out.with_suffix(".png")
-        check_maps_output(out, overwrite=overwrite)
-        refuse_existing(png, overwrite or not picture, "--overwrite, --no-picture or another --out")
-        if out.resolve() == cube.resolve():
-            raise ValueError(f"--out must not be the cube itself, got {str(out)!r}")
-        if (cloud is None) != (focal_px is None):
-            raise ValueError("--cloud and --focal-px belong together: points need the camera's focal length")
+    png = out.with_suffix(".png")
+    check_maps_output(out, overwrite=overwrite)
+    refuse_existing(png, overwrite or not picture, "--overwrite, --no-picture or another --out")
+    if out.resolve() == cube.resolve():
+        raise ValueError(f"--out must not be the cube itself, got {str(out)!r}")
+    if (cloud is None) != (focal_px is None):
+        raise ValueError("--cloud and --focal-px belong together: points need the camera's focal length")
+    if picture:
+        from mars_lidar.plot.reconstruction import reconstruction
+    if cloud is not None:
+        check_target(cloud, folder=False, overwrite=overwrite)
+    if attenuation is not None:
+        checks.choice("--attenuation", attenuation, ATTENUATIONS)
+    several = _several(returns, keep, from_ns)
+    with foreign.opened(cube) as stored:
+        names = _methods(method, stored)
+        with progress_bar("reconstructing") as progress:
+            found = reconstruct_stored(
+                stored,
+                _with_false_alarm(names, false_alarm),
+                level=level,
+                attenuation=attenuation,
+                returns=several,
+                threads=threads,
+                progress=progress,
+            )
+        if keep is not None or from_ns is not None:
+            own = "none" if stored.measured else str(stored.flux.info.get("attenuation", "none"))
+            chosen = keep or "strongest", from_ns or 0.0, attenuation or own
+            found = {name: replace(each, result=keep_return(each.result, *chosen)) for name, each in found.items()}
+        else:
+            _tell_reflection(stored, found)
+        results = {name: each.result for name, each in found.items()}
+        _show(stored, found)  # first: a disk that is full takes nothing from what is known
+        save_maps(out, results, source=str(cube), overwrite=overwrite)
+        rows = [("maps", str(out))]
+        if cloud is not None and focal_px is not None:
+            rows.append(("cloud", f"{cloud}, {_save_cloud(cloud, results, focal_px, overwrite):,} points"))
         if picture:
-            from mars_lidar.plot.reconstruction import reconstruction
-        if cloud is not None:
-            check_target(cloud, folder=False, overwrite=overwrite)
-        if attenuation is not None:
-            checks.choice("--attenuation", attenuation, ATTENUATIONS)
-        several = _several(returns, keep, from_ns)
-        with foreign.opened(cube) as stored:
-            names = _methods(method, stored)
-            with progress_bar("reconstructing") as progress:
-                found = reconstruct_stored(
-                    stored,
-                    _with_false_alarm(names, false_alarm),
-                    level=level,
-                    attenuation=attenuation,
-                    returns=several,
-                    threads=threads,
-                    progress=progress,
-                )
-            if keep is not None or from_ns is not None:
-                own = "none" if stored.measured else str(stored.flux.info.get("attenuation", "none"))
-                chosen = keep or "strongest", from_ns or 0.0, attenuation or own
-                found = {name: replace(each, result=keep_return(each.result, *chosen)) for name, each in found.items()}
-            else:
-                _tell_reflection(stored, found)
-            results = {name: each.result for name, each in found.items()}
-            _show(stored, found)  # first: a disk that is full takes nothing from what is known
-            save_maps(out, results, source=str(cube), overwrite=overwrite)
-            rows = [("maps", str(out))]
-            if cloud is not None and focal_px is not None:
-                rows.append(("cloud", f"{cloud}, {_save_cloud(cloud, results, focal_px, overwrite):,} points"))
-            if picture:
-                save_picture(reconstruction(stored, results), png)
-                rows.append(("picture", str(png)))
-        table([*rows, ("time", f"{span(time.perf_counter() - began)} in all")])
+            save_picture(reconstruction(stored, results), png)
+            rows.append(("picture", str(png)))
+    table([*rows, ("time", f"{span(time.perf_counter() - began)} in all")])
 
 
 def _several(returns: int, keep: str | None, from_ns: float | None) -> int:
@@ -262,3 +270,6 @@ def _save_cloud(path: Path, results: dict[str, Reconstruction], focal_px: float,
     depth, share = np.where(found.detected, found.depth_m, np.nan)[0], found.reflectivity[0]
     error = None if found.depth_error_m is None else found.depth_error_m[0]
     return save_cloud(path, depth, focal_px, intensity=share, error_m=error, overwrite=overwrite)
+
+
+reconstruct_command = command(reconstruct, RECONSTRUCT_EXAMPLES)

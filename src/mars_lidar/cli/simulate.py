@@ -5,19 +5,30 @@ from __future__ import annotations
 import contextlib
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 from mars_lidar._base.progress import span
-from mars_lidar.cli.console import progress_bar, refuse_existing, reported, save_picture, say
+from mars_lidar.cli.console import progress_bar, refuse_existing, save_picture, say
 from mars_lidar.cli.console import table as print_table
-from mars_lidar.cli.effect_options import Effects
-from mars_lidar.cli.groups import examples
-from mars_lidar.cli.options import SEED, THREADS, of_output, of_run
-from mars_lidar.cli.options import out as out_option
-from mars_lidar.cli.scene_options import LightOptions, SceneOptions, of_scene
-from mars_lidar.cli.scene_view import alike, seen
-from mars_lidar.cli.system_options import SystemOptions
+from mars_lidar.cli.options import (
+    SCENE_KINDS,
+    Integer,
+    LightOptions,
+    SceneOptions,
+    Seed,
+    Text,
+    Threads,
+    command,
+    examples,
+    out_option,
+    output_option,
+    read_scene,
+    run_option,
+    scene_option,
+)
+from mars_lidar.cli.system_options import Effects, SystemOptions
 from mars_lidar.engines import ENGINES, EngineOptions
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
@@ -26,8 +37,9 @@ from mars_lidar.table import Table
 
 if TYPE_CHECKING:
     from mars_lidar.io import Written
+    from mars_lidar.io.capture import Capture
 
-EPILOG = examples(
+SIMULATE_EXAMPLES = examples(
     "mars-lidar simulate --scene room -o room.zarr",
     "mars-lidar simulate --scene room --signal 0.1 --sbr 0.2 --dead-time-ns 30 --cycles 5000 -o dim.zarr",
     "mars-lidar simulate --depth depth.png --image colour.png --realizations 10 --seed 7 -o set.zarr",
@@ -39,49 +51,76 @@ EPILOG = examples(
     "mars-lidar simulate --scene room --pulse-file irf.npy --pulse-bin-ns 0.008 -o measured.npz",
     "mars-lidar simulate --scene room --jitter-fwhm-ns 0.1 --electronics-dead-time-ns 100 -o real.zarr",
     "mars-lidar simulate --scene room --detector excelitas-spcm-aqrh -o module.zarr",
-    "S and B are expected detectable photons per laser period; with --detection-efficiency, photons on the pixel. "
-    "Dead time bends histograms where S + B is not small.",
+    notes="S and B are expected detectable photons per laser period; with --detection-efficiency, photons on the "
+    "pixel. Dead time bends histograms where S + B is not small.",
 )
 
 
 def simulate(
     *,
-    scene: SceneOptions,
-    instrument: SystemOptions,
-    effects: Effects,
-    light: LightOptions,
-    engine: str = of_run(
-        "exact; feedback (long exposures, at a cost independent of them); auto (the faster of these, pixel by pixel); "
-        "mars (count law x mean histogram); sequential (slow, independent gold standard); renewal, poisson "
-        "(baselines).",
-        default="exact",
-    ),
-    table: Path | None = of_run(
-        "For --engine mars and renewal: a table of this system (mars-lidar table build), or none: every distinct pixel "
-        "is evaluated by itself, some ms each.",
-        "one over the image's range, built and kept in the cache",
-    ),
-    count: str | None = of_run(
-        "For --engine mars: the law of the count: exact, matched (to four cumulants, faster with --table) or gaussian "
-        "(the paper's).",
-        "exact",
-    ),
-    interpolation: str | None = of_run("Of --table: bilinear or nearest.", "bilinear"),
-    table_outside: str | None = of_run(
-        "Of --table, for pixels beyond its range: error, or exact (each is evaluated by itself, some ms).", "error"
-    ),
-    realizations: int = of_run("Independent exposures of the image.", default=1),
-    seed: int = SEED,
-    threads: int | None = THREADS,
-    device: str = of_run("cpu, or cuda: the current GPU, with the same counts.", default="cpu"),
-    out: Path = out_option("The cube: .zarr (any size, written as it is simulated), .h5, .hdf5, .npz, .mat or .ptu."),
-    overwrite: bool = of_output("Replace an existing cube and picture.", default=False),
-    resume: bool = of_output("Continue a .zarr that was interrupted: the same command, the same bits.", default=False),
-    like: Path | None = of_scene(
-        "A capture (tal, mitransient, Zaragoza's HDF5): its light, in its bins; to -o of .hdf5 or .h5 a capture of the "
-        "same layout is written."
-    ),
-    picture: bool = of_output("A PNG overview beside the cube.", "yes", "--picture/--no-picture", default=True),
+    scene: SceneOptions = SceneOptions(),
+    instrument: SystemOptions = SystemOptions(),
+    effects: Effects = Effects(),
+    light: LightOptions = LightOptions(),
+    engine: Annotated[
+        Text,
+        run_option(
+            "exact; feedback (its cost does not grow with the exposure); auto (the faster of these, pixel by pixel); "
+            "mars (count law x mean histogram); sequential (slow, an independent reference); renewal, poisson "
+            "(baselines).",
+            "exact",
+            choices=tuple(ENGINES),
+        ),
+    ] = "exact",
+    table: Annotated[
+        Path | None,
+        run_option(
+            "For --engine mars and renewal: a table of this system (mars-lidar table build), or none: every distinct "
+            "pixel is evaluated by itself, some ms each.",
+            "one over the image's range, built once and stored in the cache",
+        ),
+    ] = None,
+    count: Annotated[
+        Text | None,
+        run_option(
+            "For --engine mars: the law of the count: exact, matched (to four cumulants, faster with --table) or "
+            "gaussian (the paper's).",
+            "exact",
+            choices=("exact", "matched", "gaussian"),
+        ),
+    ] = None,
+    interpolation: Annotated[
+        Text | None, run_option("Of --table: bilinear or nearest.", "bilinear", choices=("bilinear", "nearest"))
+    ] = None,
+    table_outside: Annotated[
+        Text | None,
+        run_option(
+            "Of --table, for pixels beyond its range: error, or exact (each is evaluated by itself, some ms).",
+            "error",
+            choices=("error", "exact"),
+        ),
+    ] = None,
+    realizations: Annotated[Integer, run_option("Independent exposures of the image.", "1")] = 1,
+    seed: Seed = 0,
+    threads: Threads = None,
+    device: Annotated[
+        Text, run_option("cpu, or cuda: the current GPU, with the same counts.", "cpu", choices=("cpu", "cuda"))
+    ] = "cpu",
+    out: Annotated[
+        Path, out_option("The cube: .zarr (any size, written as it is simulated), .h5, .hdf5, .npz, .mat or .ptu.")
+    ],
+    overwrite: Annotated[bool, output_option("Replace an existing cube and picture.")] = False,
+    resume: Annotated[
+        bool, output_option("Continue a .zarr that was interrupted: the same command, the same bits.")
+    ] = False,
+    like: Annotated[
+        Path | None,
+        scene_option(
+            "Simulate the light of a capture (tal, mitransient, Zaragoza's HDF5) in its bins; with --out .hdf5 or .h5 "
+            "the result is a capture of the same layout."
+        ),
+    ] = None,
+    picture: Annotated[bool, output_option("A PNG overview beside the cube.", "yes", negative="--no-picture")] = True,
 ) -> None:
     """Simulate histograms of a scene under dead time, and write the cube with a picture of it.
 
@@ -91,7 +130,7 @@ def simulate(
     from mars_lidar.io import load, save_capture, simulate_to
     from mars_lidar.io.capture import CAPTURE_SUFFIXES
 
-    with reported(), contextlib.ExitStack() as after:
+    with contextlib.ExitStack() as after:
         began = time.perf_counter()
         png = out.with_suffix(".png")
         kept = not (overwrite or resume)
@@ -99,7 +138,7 @@ def simulate(
         refuse_existing(out, not kept)
         system, capture = instrument.build(effects), None
         if like is not None:
-            capture, system, scene = alike(like, instrument, system, scene)
+            capture, system, scene = capture_scene(like, instrument, system, scene)
             if realizations != 1:
                 raise ValueError(f"--like writes a capture, which holds one exposure, not {realizations}")
         target = out
@@ -108,7 +147,7 @@ def simulate(
                 raise ValueError("a capture is written when all is simulated: leave out --resume")
             folder = after.enter_context(tempfile.TemporaryDirectory(prefix=".mars-lidar-", dir=out.parent))
             target = Path(folder) / "cube.zarr"
-        view = seen(scene, light, system, in_parts=True)
+        view = read_scene(scene, light, system, in_parts=True)
         lookup, table_outside = _table(table, system, engine, view.flux, table_outside, threads)
         chosen: EngineOptions = {
             "table": lookup,
@@ -117,7 +156,7 @@ def simulate(
             "outside": table_outside,  # type: ignore[typeddict-item]
         }
         if device == "cpu":
-            tell_time(view.flux, system, engine, realizations, threads, chosen)
+            say_time(view.flux, system, engine, realizations, threads, chosen)
         with progress_bar("simulating") as progress:
             written = simulate_to(
                 target,
@@ -144,7 +183,35 @@ def simulate(
         _summary(written, png if picture else None, began, out)
 
 
-def tell_time(
+def capture_scene(
+    like: Path, instrument: SystemOptions, system: System, scene: SceneOptions
+) -> tuple[Capture, System, SceneOptions]:
+    """A capture, `system` with its time bins, and its light from time 0 on as the scene.
+
+    The period is that of the capture's bins, or --period-ns, of a whole number of them; bin 0 is the capture's bin 0.
+    """
+    from mars_lidar.io.capture import read_capture
+
+    changes = instrument.changes
+    names = (*SCENE_KINDS, "transient_bin_ns", "transient_start_ns")
+    conflicts = [name for name in names if getattr(scene, name) is not None] + ["bins"] * (changes.bins is not None)
+    if conflicts:
+        conflict = conflicts[0].replace("_", "-")
+        raise ValueError(f"--like takes light and time bins from {like}: leave out --{conflict}")
+    capture = read_capture(like)
+    width, bins = float(capture.bin_ns or 0.0), capture.image[2]
+    if changes.period_ns is not None:
+        bins = round(changes.period_ns / width)
+        if bins < capture.image[2] or abs(changes.period_ns / width - bins) > 1e-6 * bins:
+            raise ValueError(
+                f"--period-ns must be a whole number of bins of {width:.7g} ns, {capture.image[2]} at least "
+                f"({capture.image[2] * width:.7g} ns), got {changes.period_ns:g}"
+            )
+    light = replace(scene, transient=like, transient_start_ns=0.0)
+    return capture, system.replace(period_ns=bins * width, bins=bins), light
+
+
+def say_time(
     flux: Flux, system: System, engine: str, realizations: int, threads: int | None, options: EngineOptions
 ) -> None:
     """Say how long a long run will take, and what is faster."""
@@ -223,3 +290,6 @@ def reported_words(name: str, value: float) -> str:
 def each_ns(number: float) -> str:
     """Nanoseconds, or microseconds, in words."""
     return f"{number:.3g} ns" if number < 999.5 else f"{number / 1e3:.3g} µs"
+
+
+simulate_command = command(simulate, SIMULATE_EXAMPLES)

@@ -1,16 +1,201 @@
-"""The system of a command line: a file, single options, or a file with some values replaced."""
+"""The system of a command line: a file, single options, or a file with some values replaced by options."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from mars_lidar.cli.effect_options import Effects
-from mars_lidar.cli.groups import group
-from mars_lidar.cli.options import DETECTOR, SYSTEM, of_system
-from mars_lidar.cli.pulse_options import PulseOptions
-from mars_lidar.instrument.pulse import GaussianPulse
+import numpy as np
+from cyclopts import Parameter
+
+from mars_lidar._base import checks
+from mars_lidar._base.files import read_npy, reading
+from mars_lidar._base.text import read_column
+from mars_lidar.cli.options import DetectorName, Integer, Number, SystemFile, Text, effect_option, system_option
+from mars_lidar.instrument.effects import FIELDS
+from mars_lidar.instrument.pulse import GaussianPulse, Pulse, SampledPulse
 from mars_lidar.instrument.system import Detector, System
+
+# --- Effects --------------------------------------------------------------------------------------------------------
+
+
+def _effect(name: str) -> Any:
+    """The option of an effect that is one number, as `mars_lidar.instrument.effects.FIELDS` declares it."""
+    effect = FIELDS[name]
+    assert effect.help is not None
+    return effect_option(effect.help, effect.default or "")
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class LightEffects:
+    """What changes the light that a pixel counts; None: as in the file."""
+
+    detection_efficiency: Annotated[Number | None, _effect("detection_efficiency")] = None
+    dark_count_hz: Annotated[Number | None, _effect("dark_count_hz")] = None
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class StreamEffects:
+    """Effects of the detector that the stream of one pixel shows; None: as in the file."""
+
+    afterpulse_probability: Annotated[
+        Number | None,
+        effect_option(
+            "Mean number of trapped carriers that an avalanche leaves, those lost in the dead time included ...", "0"
+        ),
+    ] = None
+    afterpulse_delay_ns: Annotated[
+        Number | None, effect_option("... and their mean delay after the avalanche, ns.")
+    ] = None
+    twilight_ns: Annotated[Number | None, _effect("twilight_ns")] = None
+    recovery_ns: Annotated[Number | None, _effect("recovery_ns")] = None
+    electronics_dead_time_ns: Annotated[Number | None, _effect("electronics_dead_time_ns")] = None
+    max_events_per_period: Annotated[Integer | None, _effect("max_events_per_period")] = None
+    jitter_fwhm_ns: Annotated[
+        Number | None, effect_option("Gaussian timing jitter: full width at half maximum, ns.")
+    ] = None
+    jitter_tail_ns: Annotated[Number | None, effect_option("Mean of the exponential tail of the jitter, ns ...")] = None
+    jitter_tail_fraction: Annotated[Number | None, effect_option("... and share of the events that are in it.")] = None
+    jitter_file: Annotated[Path | None, effect_option("Measured jitter instead: 1-D .npy array of its density.")] = None
+    jitter_bin_ns: Annotated[Number | None, effect_option("Sample width of --jitter-file, ns.")] = None
+    code_density_file: Annotated[
+        Path | None,
+        effect_option("TDC non-linearity: 1-D .npy array of relative code widths; their number divides the bins."),
+    ] = None
+
+    def given(self) -> dict[str, Any]:
+        """Fields of `Detector`, as plain data."""
+        told: dict[str, Any] = {name: getattr(self, name) for name in FIELDS if hasattr(self, name)}
+        told["jitter"] = self._jitter()
+        probability, delay_ns = self.afterpulse_probability, self.afterpulse_delay_ns
+        if (probability is None) != (delay_ns is None):
+            raise ValueError("--afterpulse-probability and --afterpulse-delay-ns belong together: both, or neither")
+        if probability is not None:
+            told["afterpulsing"] = {"probability": probability, "delay_ns": delay_ns}
+        if self.code_density_file is not None:
+            told["code_density"] = read_array("--code-density-file", self.code_density_file)
+        return {name: value for name, value in told.items() if value is not None}
+
+    def _jitter(self) -> dict[str, Any] | None:
+        gaussian = {
+            "fwhm_ns": self.jitter_fwhm_ns,
+            "tail_ns": self.jitter_tail_ns,
+            "tail_fraction": self.jitter_tail_fraction,
+        }
+        gaussian = {name: value for name, value in gaussian.items() if value is not None}
+        if self.jitter_fwhm_ns is not None:
+            checks.real("--jitter-fwhm-ns", self.jitter_fwhm_ns, low=0.0, strict_low=True)
+        if self.jitter_file is not None:
+            if gaussian:
+                raise ValueError("the jitter is given once: choose --jitter-file or --jitter-fwhm-ns and its tail")
+            if self.jitter_bin_ns is None:
+                raise ValueError(f"--jitter-file {self.jitter_file} needs --jitter-bin-ns, its samples' width in ns")
+            values = read_array("--jitter-file", self.jitter_file)
+            return {"kind": "sampled", "values": values.tolist(), "bin_ns": self.jitter_bin_ns}
+        if self.jitter_bin_ns is not None:
+            raise ValueError("--jitter-bin-ns belongs to --jitter-file, which is not given")
+        if gaussian and self.jitter_fwhm_ns is None:
+            raise ValueError("--jitter-tail-ns and --jitter-tail-fraction need --jitter-fwhm-ns")
+        return {"kind": "gaussian", **gaussian} if gaussian else None
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class Effects(StreamEffects, LightEffects):
+    """Effects of the detector; None: as in the file."""
+
+    crosstalk: Annotated[
+        Number | None,
+        effect_option("Mean number of neighbours that an avalanche triggers; with --engine sequential.", "0"),
+    ] = None
+    crosstalk_kernel: Annotated[Text | None, effect_option("Which neighbours: 4 or 8.", "8")] = None
+    max_events_per_exposure: Annotated[Integer | None, _effect("max_events_per_exposure")] = None
+
+    def given(self) -> dict[str, Any]:
+        """Fields of `Detector`, as plain data."""
+        told = super().given()
+        if self.crosstalk is None:
+            told.pop("crosstalk", None)
+            if self.crosstalk_kernel is not None:
+                raise ValueError("--crosstalk-kernel belongs to --crosstalk, which is not given")
+        else:
+            told["crosstalk"] = {"probability": self.crosstalk, "kernel": self.crosstalk_kernel or "8"}
+        return told
+
+
+def read_array(option: str, file: Path) -> Any:
+    """The values of a .npy, .csv or .txt file that `option` names; of text, a column, or times and values."""
+    if file.suffix in (".csv", ".txt"):
+        with reading(file, "a column of numbers"):
+            values = read_column(file)
+    elif file.suffix != ".npy":
+        raise ValueError(f"{option} must be a 1-D .npy array, or a column as .csv or .txt, got {str(file)!r}")
+    else:
+        values = read_npy(file)
+    if values.ndim != 1 or values.dtype.kind not in "fiu" or not (np.isfinite(values) & (values >= 0)).all():
+        raise ValueError(f"{file}: {option} must be finite numbers >= 0, (n,), got {values.dtype} {values.shape}")
+    return values
+
+
+_SIGMA = "Gaussian pulse: standard deviation, ns."
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class PulseOptions:
+    """A Gaussian pulse or a measured one; None: not given."""
+
+    pulse_sigma_ns: Annotated[Number | None, system_option(_SIGMA, "0.5")] = None
+    pulse_fwhm_ns: Annotated[Number | None, system_option("Gaussian pulse: full width at half maximum, ns.")] = None
+    pulse_file: Annotated[
+        Path | None, system_option("Measured impulse response: 1-D .npy array, or a column as .csv or .txt.")
+    ] = None
+    pulse_bin_ns: Annotated[Number | None, system_option("Sample width of --pulse-file, ns.")] = None
+    pulse_origin: Annotated[
+        Text | None, system_option("What a delay refers to in --pulse-file: peak, centroid or first.", "peak")
+    ] = None
+
+    def build(self) -> Pulse | None:
+        """The pulse that is meant, or None where none is given."""
+        one_of = (
+            ("--pulse-sigma-ns", self.pulse_sigma_ns),
+            ("--pulse-fwhm-ns", self.pulse_fwhm_ns),
+            ("--pulse-file", self.pulse_file),
+        )
+        given = [name for name, value in one_of if value is not None]
+        if len(given) > 1:
+            raise ValueError(f"the pulse is given once: choose one of {' and '.join(given)}")
+        if self.pulse_file is None and (self.pulse_bin_ns is not None or self.pulse_origin is not None):
+            raise ValueError("--pulse-bin-ns and --pulse-origin belong to --pulse-file, which is not given")
+        if self.pulse_sigma_ns is not None:
+            return GaussianPulse(sigma_ns=self.pulse_sigma_ns)
+        if self.pulse_fwhm_ns is not None:
+            return GaussianPulse.from_fwhm(fwhm_ns=self.pulse_fwhm_ns)
+        if self.pulse_file is None:
+            return None
+        if self.pulse_bin_ns is None:
+            raise ValueError(f"--pulse-file {self.pulse_file} needs --pulse-bin-ns, the width of its samples in ns")
+        return _measured(self.pulse_file, self.pulse_bin_ns, self.pulse_origin or "peak")
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class FittedPulseOptions(PulseOptions):
+    """Options of the pulse of a stream: a Gaussian is fitted if none is given."""
+
+    pulse_sigma_ns: Annotated[Number | None, system_option(_SIGMA, "fitted")] = None
+
+
+def _measured(file: Path, bin_ns: float, origin: str) -> SampledPulse:
+    values = read_array("--pulse-file", file)
+    try:
+        return SampledPulse(values, bin_ns, origin)
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{file}: {error}") from error
+
 
 DEFAULT_SYSTEM = System(
     period_ns=1e3 / 7.5,
@@ -23,28 +208,37 @@ DEFAULT_SYSTEM = System(
 _DETECTOR = ("dead_time_ns", "mode", "gate_start_ns", "gate_width_ns", "gate_step_ns", "gate_cycles")
 
 
-@group
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
 class SystemChanges:
     """Single values of a system, in place of those of a file or of the default one; None: as there."""
 
-    period_ns: float | None = of_system("Laser period, ns.", "133.33, 7.5 MHz")
-    detector: str | None = DETECTOR
-    dead_time_ns: float | None = of_system("Dead time after a registration, ns.", "75")
-    mode: str | None = of_system(
-        "When the pixel registers: nonparalyzable, paralyzable (every arrival restarts the dead time), synchronous "
-        "(armed at each pulse, first photon only) or gated (with --gate-start-ns, --gate-width-ns).",
-        "nonparalyzable",
+    period_ns: Annotated[Number | None, system_option("Laser period, ns.", "133.33, 7.5 MHz")] = None
+    detector: DetectorName = None
+    dead_time_ns: Annotated[Number | None, system_option("Dead time after a registration, ns.", "75")] = None
+    mode: Annotated[
+        Text | None,
+        system_option(
+            "When the pixel registers: nonparalyzable, paralyzable (every arrival restarts the dead time), synchronous "
+            "(armed at each pulse, first photon only) or gated (with --gate-start-ns, --gate-width-ns).",
+            "nonparalyzable",
+        ),
+    ] = None
+    gate_start_ns: Annotated[Number | None, system_option("Mode gated: opening of the gate in each period, ns.")] = None
+    gate_width_ns: Annotated[Number | None, system_option("Mode gated: width of the gate, at most the period, ns.")] = (
+        None
     )
-    gate_start_ns: float | None = of_system("Mode gated: opening of the gate in each period, ns.")
-    gate_width_ns: float | None = of_system("Mode gated: width of the gate, at most the period, ns.")
-    gate_step_ns: float | None = of_system("Mode gated: the opening advances by this, ns ...", "0")
-    gate_cycles: int | None = of_system("... every so many periods.", "1")
-    cycles: int | None = of_system("Laser periods per exposure.", "1000")
-    bins: int | None = of_system("Histogram bins per period.", "1024")
+    gate_step_ns: Annotated[Number | None, system_option("Mode gated: the opening advances by this, ns ...", "0")] = (
+        None
+    )
+    gate_cycles: Annotated[Integer | None, system_option("... every so many periods.", "1")] = None
+    cycles: Annotated[Integer | None, system_option("Laser periods per exposure.", "1000")] = None
+    bins: Annotated[Integer | None, system_option("Histogram bins per period.", "1024")] = None
     pulse: PulseOptions = PulseOptions()
-    start: str | None = of_system(
-        "Pixel at the start of an exposure: armed (ready) or stationary (warmed up).", "armed"
-    )
+    start: Annotated[
+        Text | None,
+        system_option("Pixel at the start of an exposure: armed (ready) or stationary (warmed up).", "armed"),
+    ] = None
 
     def of(self, file: Path | None, effects: Effects | None = None) -> System:
         """The system of a file, or the default one, so changed."""
@@ -57,15 +251,16 @@ class SystemChanges:
         given = {name: value for name, value in single.items() if value is not None}
         given |= {} if effects is None else effects.given()
         if given:
-            changes["detector"] = with_given(base.detector, given)
+            changes["detector"] = with_changes(base.detector, given)
         return base.replace(**{name: value for name, value in changes.items() if value is not None})
 
 
-@group
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
 class SystemOptions:
     """A system: a file or the default one, and single options in place of its values."""
 
-    system: Path | None = SYSTEM
+    system: SystemFile = None
     changes: SystemChanges = SystemChanges()
 
     def build(self, effects: Effects | None = None) -> System:
@@ -73,7 +268,7 @@ class SystemOptions:
         return self.changes.of(self.system, effects)
 
 
-def with_given(base: Detector, given: dict[str, Any]) -> Detector:
+def with_changes(base: Detector, given: dict[str, Any]) -> Detector:
     """`base` with what is given in place of its values; a gate of the file goes with its mode."""
     known = base.to_dict()
     if given.get("mode", base.mode) != base.mode:

@@ -1,110 +1,120 @@
-"""`mars-lidar table`: build the lookup table of a system, say what is in a file or in the cache, clear the cache."""
+"""`mars-lidar table`: build the lookup table of a system, describe a file or the cache, clear the cache."""
 
 from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-import typer
+from cyclopts import App
 
 from mars_lidar._base.progress import span
-from mars_lidar.cli.console import progress_bar, refuse_existing, reported, table
-from mars_lidar.cli.effect_options import Effects
-from mars_lidar.cli.groups import argument, grouped, option, panel
-from mars_lidar.cli.options import THREADS, of_output
-from mars_lidar.cli.options import out as out_option
-from mars_lidar.cli.system_options import SystemOptions
+from mars_lidar.cli.console import progress_bar, refuse_existing, table
+from mars_lidar.cli.options import (
+    COMMAND_LINE,
+    Number,
+    Text,
+    Threads,
+    argument,
+    command,
+    describe,
+    grid_option,
+    option,
+    out_option,
+    output_option,
+)
+from mars_lidar.cli.system_options import Effects, SystemOptions
 from mars_lidar.table import Table, cache
 from mars_lidar.table.error import QuantisationError
 
-app = typer.Typer(no_args_is_help=True, rich_markup_mode="rich", help="Lookup tables over (S, B).")
-
-_of_grid = panel("Grid")
 _ALLOWED = 0.05  # standard deviations of the mean count, up to which a table is told to be good
 _DEPTHS = 1024  # values of a delay axis, where there had to be one: the paper's 108 GB
 _PAPER_BYTES = "105 MB, 108 GB with delays"
 
 
-@app.command()
-@grouped
 def build(
     *,
-    instrument: SystemOptions,
-    effects: Effects,
-    signal: str = _of_grid(
-        "Signal axis, photons per period, log-spaced; 0 is added.",
-        "0.01,10,256",
-        default="0.01,10,256",
-        metavar="LOW,HIGH,POINTS",
-    ),
-    background: str = _of_grid(
-        "Background axis, likewise.", "0.01,10,100", default="0.01,10,100", metavar="LOW,HIGH,POINTS"
-    ),
-    method: str = _of_grid("exposure (exact, start-up included) or mars (the paper's).", default="exposure"),
-    rearm: str = _of_grid("For mars: re-arming at the centre or the edge of a bin.", default="centre"),
-    refine: float | None = _of_grid("Insert points until the error between them, in total variation, is below this."),
-    check_law: bool = _of_grid("Compare count laws with exact ones at the end.", default=False),
-    threads: int | None = THREADS,
-    out: Path | None = out_option("The table: .h5 or .hdf5. [dim]Default: the cache.[/dim]", None, panel=None),
-    overwrite: bool = of_output("Replace an existing table.", default=False),
+    instrument: SystemOptions = SystemOptions(),
+    effects: Effects = Effects(),
+    signal: Annotated[
+        Text,
+        grid_option(
+            "Signal axis, photons per period, log-spaced; 0 is added.", "0.01,10,256", metavar="LOW,HIGH,POINTS"
+        ),
+    ] = "0.01,10,256",
+    background: Annotated[
+        Text, grid_option("Background axis, likewise.", "0.01,10,100", metavar="LOW,HIGH,POINTS")
+    ] = "0.01,10,100",
+    method: Annotated[
+        Text, grid_option("exposure (exact, start-up included) or mars (the paper's).", "exposure")
+    ] = "exposure",
+    rearm: Annotated[Text, grid_option("For mars: re-arming at the centre or the edge of a bin.", "centre")] = "centre",
+    refine: Annotated[
+        Number | None, grid_option("Insert points until the error between them, in total variation, is below this.")
+    ] = None,
+    check_law: Annotated[bool, grid_option("Compare count laws with exact ones at the end.")] = False,
+    threads: Threads = None,
+    out: Annotated[Path | None, out_option("The table: .h5 or .hdf5. Without it: the cache.", option)] = None,
+    overwrite: Annotated[bool, output_option("Replace an existing table.")] = False,
 ) -> None:
     """Build the table of a system and write it to a file, or to the cache, where it may be already."""
-    with reported():
-        began = time.perf_counter()
-        refuse_existing(out, overwrite)
-        system = instrument.build(effects)
-        axes = _grid("--signal", signal), _grid("--background", background)
-        chosen: dict[str, Any] = {
-            "method": method,
-            "rearm": rearm,
-            "refine": refine,
-            "check_law": check_law,
-            "threads": threads,
-        }
-        with progress_bar("building") as progress:
-            if out is None:
-                path = Table.cached_path(system, *axes, progress=progress, **chosen)
-            else:
-                Table.build(system, *axes, progress=progress, **chosen).save(out, overwrite=overwrite)
-                path = out
-        table(_rows(path) | {"time": f"{span(time.perf_counter() - began)} in all"})
+    began = time.perf_counter()
+    refuse_existing(out, overwrite)
+    system = instrument.build(effects)
+    axes = _grid("--signal", signal), _grid("--background", background)
+    chosen: dict[str, Any] = {
+        "method": method,
+        "rearm": rearm,
+        "refine": refine,
+        "check_law": check_law,
+        "threads": threads,
+    }
+    with progress_bar("building") as progress:
+        if out is None:
+            path = Table.cached_path(system, *axes, progress=progress, **chosen)
+        else:
+            Table.build(system, *axes, progress=progress, **chosen).save(out, overwrite=overwrite)
+            path = out
+    table(_rows(path) | {"time": f"{span(time.perf_counter() - began)} in all"})
 
 
-@app.command()
-@grouped
 def info(
-    file: Path | None = argument("A table: .h5 or .hdf5. Without it: the cache.", None),
+    file: Annotated[Path | None, argument("A table: .h5 or .hdf5. Without it: the cache.")] = None,
+    /,
 ) -> None:
     """Say what is in a table, or which tables the cache holds."""
-    with reported():
-        if file is not None:
-            table(_rows(file))
-            return
-        found = cache.files()
-        total = sum(path.stat().st_size for path in found)
-        rows = [("cache", f"{cache.directory()}: {len(found)} files, {total / 1e6:,.4g} MB")]
-        table(rows + [(f"{path.stat().st_size / 1e6:,.4g} MB", _line(path)) for path in found])
+    if file is not None:
+        table(_rows(file))
+        return
+    found = cache.files()
+    total = sum(path.stat().st_size for path in found)
+    rows = [("cache", f"{cache.directory()}: {len(found)} files, {total / 1e6:,.4g} MB")]
+    table(rows + [(f"{path.stat().st_size / 1e6:,.4g} MB", _line(path)) for path in found])
 
 
-@app.command()
-@grouped
 def clear(
-    yes: bool = option("Do not ask.", None, "--yes", "-y", default=False),
+    *,
+    yes: Annotated[bool, option("Do not ask.", "", "--yes", "-y")] = False,
 ) -> None:
     """Remove the tables in the cache."""
-    with reported():
-        found = cache.files()
-        if not found:
-            print(f"{cache.directory()} holds no tables")
-            return
-        total = sum(path.stat().st_size for path in found)
-        asked = f"remove {len(found)} files, {total / 1e6:,.4g} MB, from {cache.directory()}?"
-        if not yes and not typer.confirm(asked):
-            print("nothing was removed")
-            return
-        count, freed = cache.clear()
-        print(f"removed {count} files, {freed / 1e6:,.4g} MB")
+    found = cache.files()
+    if not found:
+        print(f"{cache.directory()} holds no tables")
+        return
+    total = sum(path.stat().st_size for path in found)
+    question = f"remove {len(found)} files, {total / 1e6:,.4g} MB, from {cache.directory()}?"
+    if not yes and not _confirmed(question):
+        print("nothing was removed")
+        return
+    count, freed = cache.clear()
+    print(f"removed {count} files, {freed / 1e6:,.4g} MB")
+
+
+def _confirmed(question: str) -> bool:
+    try:
+        return input(f"{question} [y/N]: ").strip().lower() in ("y", "yes")
+    except EOFError:  # there is nobody to ask
+        return False
 
 
 def _grid(name: str, text: str) -> tuple[float, float, int]:
@@ -196,3 +206,15 @@ def _line(path: Path) -> str:
         f"{path.name}: {found.method}, S {told['signal']}, B {told['background']}, {system.bins} bins, "
         f"{system.cycles:,} cycles, dead time {system.detector.dead_time_ns:.6g} ns of {system.period_ns:.6g} ns"
     )
+
+
+table_command = App(
+    name="table",
+    help="Build, describe and clear lookup tables over signal S and background B.",
+    help_epilogue="",
+    **COMMAND_LINE,
+)
+for _place, _command in enumerate((command(build), command(info), command(clear))):
+    _command.sort_key = _place
+    describe(_command)
+    table_command.command(_command)

@@ -63,7 +63,7 @@ class Effect:
         The fields of the native job (avalanche) or of its recording (recording, timing) for a value and the laser
         period, ns; times in periods. None for light.
     help, default
-        Of the option of the command line that has its name; None: it has options of its own (cli/effect_options.py).
+        Of the option of the command line that has its name; None: it has options of its own (cli/system_options.py).
     """
 
     kind: Kind

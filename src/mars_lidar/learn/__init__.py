@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING
 from mars_lidar._base.late import names_of
 
 if TYPE_CHECKING:
-    from mars_lidar.learn.forward import armed_periods as armed_periods
     from mars_lidar.learn.forward import bin_photons as bin_photons
     from mars_lidar.learn.forward import expected_histogram as expected_histogram
-    from mars_lidar.learn.forward import histogram_log_likelihood as histogram_log_likelihood
     from mars_lidar.learn.inverse import LidarLikelihood as LidarLikelihood
     from mars_lidar.learn.inverse import LidarPhysics as LidarPhysics
+    from mars_lidar.learn.likelihood import armed_periods as armed_periods
+    from mars_lidar.learn.likelihood import histogram_log_likelihood as histogram_log_likelihood
     from mars_lidar.learn.ranges import Choice as Choice
     from mars_lidar.learn.ranges import LogUniform as LogUniform
     from mars_lidar.learn.ranges import SystemRange as SystemRange
@@ -34,10 +34,10 @@ _HOMES = {
     "StoredDataset": "stored",
     "SystemRange": "ranges",
     "Uniform": "ranges",
-    "armed_periods": "forward",
+    "armed_periods": "likelihood",
     "bin_photons": "forward",
     "expected_histogram": "forward",
-    "histogram_log_likelihood": "forward",
+    "histogram_log_likelihood": "likelihood",
 }
 __getattr__ = names_of(__name__, _HOMES)  # PyTorch is loaded by whoever uses it
 __all__ = [name for name in _HOMES if _HOMES[name] != "inverse"]  # `import *` would ask for deepinv

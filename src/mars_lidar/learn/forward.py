@@ -1,4 +1,4 @@
-"""Expected histograms and their likelihood under dead time, differentiable in signal, background and delay (PyTorch).
+"""Expected histograms under dead time, differentiable in signal, background and delay (PyTorch).
 
 Registrations round the laser period under dead time: a linear equation in each pixel, solved at a cost of O(bins).
 
@@ -34,7 +34,6 @@ from mars_lidar.instrument.effects import LIGHT_EFFECTS
 from mars_lidar.instrument.pulse import GaussianPulse, Pulse, SampledPulse
 from mars_lidar.instrument.system import System
 from mars_lidar.learn.needed import torch
-from mars_lidar.reconstruction.histogram_record import relative_width
 from mars_lidar.statistics.phase_chain import ConvergenceError
 
 # --- Photons of each bin -------------------------------------------------------------------------------------------
@@ -145,7 +144,7 @@ def check_values(signal: torch.Tensor, background: torch.Tensor, delay_ns: torch
         raise ValueError("signal and background must be >= 0 and delay_ns finite")
 
 
-_HALF = (torch.float16, torch.bfloat16)
+HALF = (torch.float16, torch.bfloat16)
 
 
 def alike(*given: torch.Tensor) -> list[torch.Tensor]:
@@ -153,7 +152,7 @@ def alike(*given: torch.Tensor) -> list[torch.Tensor]:
     for name, tensor in zip(("signal", "background", "delay_ns"), given, strict=True):
         if not isinstance(tensor, torch.Tensor) or not tensor.is_floating_point():
             raise TypeError(f"{name} must be a tensor of floating point numbers, got {tensor!r}")
-        if tensor.dtype in _HALF:
+        if tensor.dtype in HALF:
             raise TypeError(f"{name} must be of single or double precision, got {tensor.dtype}")
     try:
         return list(torch.broadcast_tensors(*given))  # type: ignore[no-untyped-call]
@@ -486,8 +485,8 @@ def expected_histogram(
     adds where it began armed (docs/joint_law.md, 3.2 and 4.6). Derivatives are those of the solution, by solutions
     of the same equation or of the transposed one, not of the steps that led there. Exact, up to the grid, where the
     exposure forgets its start before its end; `mars_lidar.statistics.mean_histogram` needs no such condition. The
-    error of the grid falls with the square of `refine`: at the default a total variation below 1e-4, but some 1e-3
-    where the dead time is within a bin of 0 or of whole periods.
+    error of the grid falls with the square of `refine`: at the default a total variation below 2e-4, and 1e-3
+    where the dead time is within 8 sigma of 0 or of whole periods (bins of up to 3 sigma).
 
     Parameters
     ----------
@@ -496,7 +495,8 @@ def expected_histogram(
     system
         Non-paralyzable, without gate, or effects beyond detection efficiency and dark counts.
     refine
-        Parts that each bin is cut into for the solution; None: four to a sigma of the pulse (1 for a measured pulse).
+        Parts that each bin is cut into for the solution; None: four to a sigma of the pulse, eight where the dead
+        time is within 8 sigma of 0 or of whole periods (1 for a measured pulse).
 
     Returns
     -------
@@ -541,12 +541,20 @@ def expected_histogram(
     if given[0].numel() == 0:
         return given[0].new_empty((*given[0].shape, system.bins))
     if refine is None:
-        pulse = system.pulse
-        refine = max(1, math.ceil(_FINE * system.bin_ns / pulse.sigma_ns)) if isinstance(pulse, GaussianPulse) else 1
+        refine = _refined(system)
     parts = checks.integer("refine", refine, low=1, high=2**16)
     flat = [tensor.reshape(-1) for tensor in given]
     out: torch.Tensor = _Expected.apply(*flat, system, parts)[0]  # type: ignore[no-untyped-call]
     return out.reshape(*given[0].shape, system.bins)
+
+
+def _refined(system: System) -> int:
+    """Parts of a bin: twice as many where a pixel that registered the pulse is re-armed within a pulse."""
+    if not isinstance(system.pulse, GaussianPulse):
+        return 1
+    sigma, beyond = system.pulse.sigma_ns, math.remainder(system.detector.dead_time_ns, system.period_ns)
+    fine = _FINE * (2.0 if abs(beyond) < 8.0 * sigma else 1.0)
+    return max(1, math.ceil(fine * system.bin_ns / sigma))
 
 
 class _Expected(torch.autograd.Function):
@@ -634,225 +642,3 @@ def _refuse_nested_forward() -> None:
 
 def _summed(fine: torch.Tensor, parts: int) -> torch.Tensor:
     return fine.reshape(len(fine), -1, parts).sum(-1)
-
-
-# --- The likelihood ------------------------------------------------------------------------------------------------
-
-
-@checked
-def armed_periods(histogram: torch.Tensor, system: System) -> torch.Tensor:
-    """Periods in which the pixel was armed in each bin, estimated from its histogram.
-
-    ``N_r`` less the registrations whose dead time covers the bin (Gupta et al., ICCV 2019); a registration in the bin
-    and a re-arming count half. What the dead time covers after the end of the exposure is taken for its beginning,
-    where the pixel was armed (or blind from before): D is at most t_d / t_r + 1 periods off, whatever the exposure.
-
-    Parameters
-    ----------
-    histogram
-        (..., bins) counts.
-    system
-        How they were recorded: non-paralyzable, without gate.
-
-    Returns
-    -------
-    torch.Tensor
-        (..., bins) periods D.
-
-    Raises
-    ------
-    TypeError
-        Counts that are no tensor; no `System`.
-    ValueError
-        Another number of bins; a detector that this form does not describe.
-
-    See Also
-    --------
-    histogram_log_likelihood, mars_lidar.reconstruction.generalised_coates_rates
-
-    Examples
-    --------
-    >>> import mars_lidar as ml
-    >>> system = ml.System(
-    ...     period_ns=100.0, cycles=1000, bins=128,
-    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
-    ... )
-    >>> import torch
-    >>> counts = torch.from_numpy(ml.simulate(ml.Flux(1.0, 1.0, 40.0), system, seed=0)[0, 0, 0].astype("float64"))
-    >>> armed = ml.learn.armed_periods(counts, system)
-    >>> tuple(armed.shape), bool((armed < 1000).all())
-    ((128,), True)
-    """
-    check_detector(system, light=True)
-    histogram = _counts(histogram, system)
-    counts = histogram if histogram.is_floating_point() else histogram.to(torch.float64)
-    if system.dead_time_periods == 0.0:
-        return torch.full_like(counts, float(system.cycles))
-    delay = Delay(system.dead_time_periods, system.bins)
-    covered = delay.blind(counts) + 0.5 * (counts - delay.rearmed(counts))
-    return (system.cycles - covered).clamp_min(0.0)
-
-
-@checked
-def histogram_log_likelihood(
-    histogram: torch.Tensor,
-    signal: torch.Tensor,
-    background: torch.Tensor,
-    delay_ns: torch.Tensor,
-    system: System,
-) -> torch.Tensor:
-    """Log likelihood (...) of histograms (..., bins), up to a constant; its negative is a loss that needs no truth.
-
-    ``sum_j h_j log m_j + (P_j - h_j) log((P_j - m_j) / (P_j - h_j))``: of the P_j passes in which the pixel was armed
-    at the start of bin j or re-armed in it, m_j are expected to register. P_j comes from the registrations one dead
-    time earlier, so nothing is solved: O(bins). Where the pulse is not wide beside a bin, registrations are
-    distributed over parts of their bin as the light and the dead time have them.
-
-    Parameters
-    ----------
-    histogram
-        Counts, integers or of single or double precision.
-    signal, background, delay_ns
-        As for `bin_photons`; background must be > 0.
-    system
-        Non-paralyzable, without gate, or effects beyond detection efficiency and dark counts.
-
-    Returns
-    -------
-    torch.Tensor
-        (...) log likelihoods.
-
-    Raises
-    ------
-    TypeError
-        Counts or light that are no tensors of a suitable type; no `System`.
-    ValueError
-        Another number of bins, negative counts, no background; a detector that this form does not describe.
-
-    See Also
-    --------
-    expected_histogram, armed_periods, mars_lidar.reconstruction.log_likelihood
-
-    Notes
-    -----
-    Unbiased to 0.1 of the Cramer-Rao bound's standard deviation at 1000 cycles, for bins of up to 3 widths (sigma) of
-    the pulse, S up to 10, B up to 5 and any dead time (200 random instruments against the exact mean histogram;
-    the bias in these units grows with the square root of the cycles). Not so where fewer than about one of the
-    passes of the pulse ends without registration in an exposure that began armed: 0.3 to 0.7. Cost: O(bins) for
-    bins below a third of the pulse's width; wider bins are cut into parts of a third of it, of an eighth where
-    dead time re-arms the pixel within the pulse.
-
-    Examples
-    --------
-    >>> import mars_lidar as ml
-    >>> system = ml.System(
-    ...     period_ns=100.0, cycles=1000, bins=128,
-    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
-    ... )
-    >>> import torch
-    >>> counts = torch.from_numpy(ml.simulate(ml.Flux(1.0, 1.0, 40.0), system, seed=0)[0, 0, 0].astype("int64"))
-    >>> delay_ns = torch.tensor([38.0, 40.0])
-    >>> value = ml.learn.histogram_log_likelihood(counts, torch.tensor(1.0), torch.tensor(1.0), delay_ns, system)
-    >>> bool(value[1] > value[0])
-    True
-    """
-    histogram = _counts(histogram, system)
-    check_detector(system, light=True)
-    given = inputs(signal, background, delay_ns)
-    signal, background, delay_ns = (tensor.double() for tensor in given)
-    signal, background, system = detected(signal, background, system)
-    counts = histogram.double()
-    if system.dead_time_periods == 0.0:
-        photons = photons_in(signal, background, delay_ns, system, 1)
-        value = torch.xlogy(counts, photons) - system.cycles * photons
-    else:
-        value = _passed(counts, signal, background, delay_ns, system, *_cut(system))
-    return value.sum(-1).to(given[0].dtype)
-
-
-def _cut(system: System) -> tuple[int, int]:
-    """Parts of a bin, and rounds in which registrations are distributed over them.
-
-    The error falls with the square of the parts. Most are needed where a pixel that registered the pulse is re-armed
-    within the pulse of a later period. Measured over random instruments (tests/learn/test_likelihood.py).
-    """
-    width = relative_width(system) * system.period_ns
-    beyond = (system.detector.dead_time_ns + 0.5 * system.period_ns) % system.period_ns - 0.5 * system.period_ns
-    if isinstance(system.pulse, GaussianPulse):
-        span = 8.0 * width
-    else:
-        low, high = system.pulse.support_ns()
-        span = high - low
-    if abs(beyond) < span:
-        return max(4, math.ceil(8.0 * system.bin_ns / width)), 8
-    return (1, 1) if system.bin_ns <= 0.35 * width else (max(2, math.ceil(3.5 * system.bin_ns / width)), 2)
-
-
-def _passed(
-    counts: torch.Tensor, signal: Any, background: Any, delay_ns: Any, system: System, parts: int, rounds: int
-) -> torch.Tensor:
-    """Terms (..., bins) of the likelihood: bins in `parts`, registrations distributed over them in `rounds`."""
-    photons = photons_in(signal, background, delay_ns, system, parts)
-    delay = Delay(system.dead_time_periods, photons.shape[-1])
-    shape = (*photons.shape[:-1], system.bins, parts)
-    light = photons.reshape(shape)
-    p, q = fired(light)
-    mean = torch.exp(light - light.cumsum(-1)) * p if parts > 1 else p  # of a pixel armed at the start of the bin
-    for _ in range(rounds):
-        share = mean / mean.sum(-1, keepdim=True).clamp_min(1e-300) if parts > 1 else 1.0
-        fine = (counts.unsqueeze(-1) * share).flatten(-2) if parts > 1 else counts
-        blind, late, rearmed = _rearmings(fine, delay, system)
-        late, rearmed = (x.reshape(*x.shape[:-1], system.bins, parts) for x in (late, rearmed))
-        within = rearmed.sum(-1)
-        start = torch.maximum(system.cycles - blind[..., ::parts], (counts - within).clamp_min(0.0))
-        armed, means = start, []
-        for k in range(parts):
-            again = late[..., k] * q[..., k]
-            means.append(armed * p[..., k] + again)
-            armed = armed * (1.0 - p[..., k]) + rearmed[..., k] - again
-        mean = torch.stack(means, -1)
-    expected, rest = mean.sum(-1), start + within - counts
-    silent = (start + within - expected).clamp_min(1e-12)
-    return torch.xlogy(counts, expected.clamp_min(1e-300)) + torch.xlogy(rest, silent / rest.clamp_min(1e-12))
-
-
-def _rearmings(counts: torch.Tensor, delay: Delay, system: System) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Of registrations (..., bins): passes blind at the start of each bin, and re-armings in it, in two measures.
-
-    Re-armings fall into the first `part` or into the rest of a bin. The first measure counts them as evenly spread
-    ones of the same armed time, the second as they are. Beyond the end of an armed exposure there are none.
-    """
-    n, d, f, whole = counts.shape[-1], delay.shift, delay.part, delay.whole
-    last = [_within(system, whole + k) for k in range(3)]
-    sums = [sum(_within(system, p) for p in range(1, whole + k)) for k in range(2)]
-    near, far = torch.roll(counts, d, -1), torch.roll(counts, d + 1, -1)
-    wraps = (torch.arange(n, device=counts.device) < d).long()
-    far_wraps = (torch.arange(n, device=counts.device) < d + 1).long()
-    weight = counts.new_tensor(last)[wraps]
-    far = counts.new_tensor(last)[far_wraps] * far
-    before = torch.nn.functional.pad(counts.cumsum(-1), (1, 0))
-    total, before = before[..., -1:], before[..., :-1]
-    since = torch.roll(before, d, -1)  # registrations of the period before those that the dead time covers
-    covered = counts.new_tensor(sums)[wraps] * total + weight * (total - since)
-    turns = wraps + whole
-    blind = before + torch.where(turns == 0, -since, covered) + f * far
-    near = weight * near
-    return blind, (1.0 - f) ** 2 * near + f * (2.0 - f) * far, (1.0 - f) * near + f * far
-
-
-def _within(system: System, periods: int) -> float:
-    """Share of the registrations whose effect that many periods later lies within the exposure.
-
-    Those before a stationary exposure make up for the rest.
-    """
-    return 1.0 if system.start == "stationary" else max(0.0, 1.0 - periods / system.cycles)
-
-
-def _counts(histogram: torch.Tensor, system: System) -> torch.Tensor:
-    """Counts (..., bins), checked."""
-    if not isinstance(histogram, torch.Tensor) or histogram.shape[-1:] != (system.bins,):
-        given = getattr(histogram, "shape", histogram)
-        raise ValueError(f"histogram must be a tensor (..., {system.bins}), got {given!r}")
-    if histogram.dtype in _HALF:
-        raise TypeError(f"histogram must be of integers, or of single or double precision, got {histogram.dtype}")
-    return histogram

@@ -24,7 +24,8 @@ except RuntimeError as _error:  # of torchvision, where its operators are not th
 from mars_lidar._base import checks
 from mars_lidar.engines import Engine, find_engine
 from mars_lidar.instrument.system import System
-from mars_lidar.learn.forward import check_detector, expected_histogram, histogram_log_likelihood
+from mars_lidar.learn.forward import check_detector, expected_histogram
+from mars_lidar.learn.likelihood import histogram_log_likelihood
 from mars_lidar.learn.tabulated import HistogramTable
 from mars_lidar.light.flux import Flux
 from mars_lidar.reconstruction.histogram_record import relative_width

@@ -124,6 +124,11 @@ class Passes:
         return int(self._shared[1]) if self.begun == 0 or (self.begun == 1 and not self._shared[2]) else 0
 
     @property
+    def begun_from(self) -> int:
+        """First sample of the last pass begun, also where workers that ran ahead have ended it, or of the next one."""
+        return int(self._shared[1]) if self.begun <= 1 else 0
+
+    @property
     def by_workers(self) -> bool:
         """Whether the last pass was begun by workers of a loader."""
         return bool(int(self._shared[3:].max()) & _BY_WORKER)
@@ -548,7 +553,9 @@ class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
                 "were taken; or use torchdata's StatefulDataLoader, whose own state_dict knows"
             )
         given = self._given if batches is None else checks.integer("batches", batches, low=0, high=_LAST)
-        start = (self._pass_start if batches is None else self._passes.start) + given * (self._batch or 1) * self._world
+        start = (self._pass_start if batches is None else self._passes.begun_from) + given * (
+            self._batch or 1
+        ) * self._world
         return state | {"start": min(start, self._end)}
 
     def load_state_dict(self, state: dict[str, int]) -> None:

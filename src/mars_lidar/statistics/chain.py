@@ -42,7 +42,7 @@ class Stationary:
     rate
         Registrations per period (2.9); 1 / rate is the mean holding time in periods.
     residual
-        sum |pdf P - pdf|, by an O(n) product; a weak test where the chain mixes slowly.
+        ``sum |pdf P - pdf|``, by an O(n) product; a weak test where the chain mixes slowly.
     error
         Componentwise backward error of the feedback equation (2.8), which does not depend on the mixing.
     sweeps

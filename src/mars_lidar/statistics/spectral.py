@@ -63,7 +63,7 @@ class HoldingTimeCovariance:
     ...     period_ns=100.0, cycles=1000, bins=128,
     ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
     ... )
-    >>> covariance = ml.holding_time_covariance(ml.Flux(1.0, 1.0, 40.0), system)
+    >>> covariance = ml.holding_time_covariance(ml.Flux(1.0, 1.0, 40.0), system, bins=128)
     >>> covariance.gamma.shape, covariance.automatic_rule()
     ((20,), (6, 1))
     >>> bool(abs(covariance.automatic_sum() - covariance.exact_sum) < 1e-3 * covariance.sigma_ss2)
@@ -116,8 +116,8 @@ class HoldingTimeCovariance:
     def automatic_rule(self, tolerance: float = 1e-3) -> tuple[int, int]:
         """The cheapest (lags, modes) whose neglected modes stay below `tolerance` x sigma_ss2 (4.3).
 
-        The neglected part is bounded through the gap: |gamma_l| <= sigma_ss2, and modes beyond the p-th fall
-        at least like |lambda_(p+1)|^l. The bound is rigorous for a normal P; P is not, so the first lags, in
+        The neglected part is bounded through the gap: ``|gamma_l| <= sigma_ss2``, and modes beyond the p-th fall
+        at least like ``|lambda_(p+1)|^l``. The bound is rigorous for a normal P; P is not, so the first lags, in
         which non-normality shows, are summed exactly: at least six.
         """
         tolerance = checks.real("tolerance", tolerance, low=0.0, high=1.0, strict_low=True)

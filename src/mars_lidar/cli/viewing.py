@@ -1,20 +1,18 @@
-"""`mars-lidar info` and `mars-lidar view`: what is in a file, in words and as a picture."""
+"""`mars-lidar info`, `view` and `explore`: a file in words, as a picture, and in a browser."""
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
-from mars_lidar._base import manifest
+from mars_lidar._base import checks, manifest
 from mars_lidar._base.files import size_on_disk
 from mars_lidar._version import other_version
-from mars_lidar.cli.console import FAILED, check_picture, progress_bar, reported, save_picture, table, two_integers
-from mars_lidar.cli.dataset_tables import dataset_rows
+from mars_lidar.cli.console import FAILED, check_picture, progress_bar, save_picture, say, table
+from mars_lidar.cli.dataset import dataset_rows
 from mars_lidar.cli.foreign import ForeignOptions, foreign_rows, is_foreign
-from mars_lidar.cli.groups import argument, option
-from mars_lidar.cli.options import out as out_option
+from mars_lidar.cli.options import Integer, Text, argument, command, examples, option, out_option, two_integers
 from mars_lidar.instrument.detector import Detector
 from mars_lidar.light.flux import Flux
 
@@ -23,73 +21,81 @@ if TYPE_CHECKING:
 
 
 def info(
-    file: Path = argument("A cube: .zarr (also a URL), .h5, .hdf5, .npz, .mat or .ptu; a dataset; a file of others."),
-    verify: bool = option("Simulate again and compare every count; exit code 1 if they differ.", default=False),
-) -> None:
+    file: Annotated[
+        Path, argument("A cube: .zarr (also a URL), .h5, .hdf5, .npz, .mat or .ptu; a dataset; a file of others.")
+    ],
+    /,
+    *,
+    verify: Annotated[bool, option("Simulate again and compare every count; exit code 1 if they differ.")] = False,
+) -> int | None:
     """Say what is in a cube or a dataset: system, flux, engine, size, whether it is complete, how to open it."""
     from mars_lidar.io import IncompleteFileError, load
     from mars_lidar.io import verify as same_again
 
-    with reported():
-        rows = dataset_rows(file)
-        if rows is not None:
-            if verify:
-                raise ValueError(f"{file} is a dataset: mars-lidar verify {file} makes its chunks again")
-            table(rows)
-            return
-        try:
-            cube = load(file, allow_incomplete=True)
-        except IncompleteFileError as error:  # nothing in it can be read
-            table([("file", str(file)), ("complete", f"NO: {error}")])
-            return
-        except ValueError as error:
-            if not is_foreign(file, error):
-                raise
-            table(foreign_rows(file))
-            return
-        with cube:
-            table(_rows(cube))
-            if not verify:
-                return
-            if not cube.complete:
-                raise ValueError(f"{file} is incomplete: there is nothing to verify")
-            with progress_bar("verifying") as progress:
-                same = same_again(cube, progress=progress)
-            damaged = (manifest.damage(file) if file.suffix == ".zarr" else []) or ["counts differ"]
-            different = f"NO: {damaged[0]}{other_version(cube.version)}"
-            table([("verified", "simulated again, every count is the same" if same else different)])
-            if not same:
-                raise typer.Exit(FAILED)
+    rows = dataset_rows(file)
+    if rows is not None:
+        if verify:
+            raise ValueError(f"{file} is a dataset: mars-lidar verify {file} makes its chunks again")
+        table(rows)
+        return None
+    try:
+        cube = load(file, allow_incomplete=True)
+    except IncompleteFileError as error:  # nothing in it can be read
+        table([("file", str(file)), ("complete", f"NO: {error}")])
+        return None
+    except ValueError as error:
+        if not is_foreign(file, error):
+            raise
+        table(foreign_rows(file))
+        return None
+    with cube:
+        table(_rows(cube))
+        if not verify:
+            return None
+        if not cube.complete:
+            raise ValueError(f"{file} is incomplete: there is nothing to verify")
+        with progress_bar("verifying") as progress:
+            same = same_again(cube, progress=progress)
+        damaged = (manifest.damage(file) if file.suffix == ".zarr" else []) or ["counts differ"]
+        different = f"NO: {damaged[0]}{other_version(cube.version)}"
+        table([("verified", "simulated again, every count is the same" if same else different)])
+        if not same:
+            return FAILED
+    return None
 
 
 def view(
-    file: Path = argument(
-        "A cube: .zarr, .h5, .hdf5, .npz, .mat, .ptu; a dataset; histograms of others: also .npy, .tif, .csv."
-    ),
+    file: Annotated[
+        Path,
+        argument(
+            "A cube: .zarr, .h5, .hdf5, .npz, .mat, .ptu; a dataset; histograms of others: also .npy, .tif, .csv."
+        ),
+    ],
+    /,
     *,
-    foreign: ForeignOptions,
-    out: Path = out_option("The picture: .png, .pdf or .svg.", panel=None),
-    pixel: list[str] | None = option(
-        "Pixel whose histogram is drawn; up to 6 times.", "a bright, a dim and an edge pixel", metavar="Y,X"
-    ),
-    realization: int = option("Which exposure, counted from 0 in this file.", default=0),
-    sample: int | None = option("Of a dataset: which sample.", "0"),
-    overwrite: bool = option("Replace an existing picture.", default=False),
+    foreign: ForeignOptions = ForeignOptions(),
+    out: Annotated[Path, out_option("The picture: .png, .pdf or .svg.", option)],
+    pixel: Annotated[
+        list[Text] | None,
+        option("Pixel whose histogram is drawn; up to 6 times.", "a bright, a dim and an edge pixel", metavar="Y,X"),
+    ] = None,
+    realization: Annotated[Integer, option("Which exposure, counted from 0 in this file.", "0")] = 0,
+    sample: Annotated[Integer | None, option("Of a dataset: which sample.", "0")] = None,
+    overwrite: Annotated[bool, option("Replace an existing picture.")] = False,
 ) -> None:
     """Draw depth, reflectivity, total counts, peak-bin depth, and the histograms of a few pixels.
 
     Each histogram stands beside the incident rate, scaled to the same total: the difference is pile-up. A measured cube
     is shown with the light that maximum likelihood finds in it.
     """
-    with reported():
-        check_picture(out, overwrite)
-        pixels = None if not pixel else [two_integers("--pixel", text) for text in pixel]
-        with opened(file, sample, foreign) as cube:
-            from mars_lidar.plot import overview
+    check_picture(out, overwrite)
+    pixels = None if not pixel else [two_integers("--pixel", text) for text in pixel]
+    with opened(file, sample, foreign) as cube:
+        from mars_lidar.plot import overview
 
-            figure = overview(cube, realization=realization, pixels=pixels)
-        save_picture(figure, out)
-        table([("picture", str(out))])
+        figure = overview(cube, realization=realization, pixels=pixels)
+    save_picture(figure, out)
+    table([("picture", str(out))])
 
 
 def opened(file: Path, sample: int | None, foreign: ForeignOptions) -> Cube:
@@ -178,3 +184,53 @@ def _short(value: Any) -> str:
     if isinstance(value, tuple):
         return f"of {len(value)} values"
     return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+EXPLORE_EXAMPLES = examples(
+    "mars-lidar explore",
+    "mars-lidar explore room.zarr",
+    "mars-lidar explore room.zarr --no-browser --port 8000",
+)
+
+
+def explore(
+    file: Annotated[
+        Path | None,
+        argument(
+            "A cube, a sample of a dataset, or histograms of another program, as mars-lidar view takes them.",
+            "the page's own picture",
+        ),
+    ] = None,
+    /,
+    *,
+    foreign: ForeignOptions = ForeignOptions(),
+    sample: Annotated[Integer | None, option("Of a dataset: which sample.", "0")] = None,
+    port: Annotated[Integer, option("Port on the loopback address.", "0, one that is free")] = 0,
+    browser: Annotated[
+        bool, option("Open the page in the browser of this machine.", "yes", negative="--no-browser")
+    ] = True,
+) -> None:
+    """Show pixels with their exact laws in a browser: what dead time does, with sliders; and a cube, pixel by pixel.
+
+    The page is served on 127.0.0.1 alone, until Ctrl-C; parts of the cube are read as they are looked at.
+    """
+    from mars_lidar.explore import CubeServer
+
+    with contextlib.ExitStack() as stack:
+        cube = None if file is None else stack.enter_context(opened(file, sample, foreign))
+        checks.integer("--port", port, low=0, high=65535)
+        server = CubeServer(cube, "" if file is None else str(file), port=port)
+        stack.callback(server.close)
+        table([("page", server.url), ("end", "Ctrl-C")])
+        if browser:
+            import webbrowser
+
+            if not webbrowser.open(server.url):
+                say("no browser was found: open the page in one")
+        with contextlib.suppress(KeyboardInterrupt):
+            server.serve()
+
+
+info_command = command(info)
+view_command = command(view)
+explore_command = command(explore, EXPLORE_EXAMPLES)

@@ -1,0 +1,285 @@
+"""`mars-lidar calibrate`: from a measured photon stream to its light, its detector and a verdict."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from cyclopts import Parameter
+
+from mars_lidar._base import checks
+from mars_lidar._base.files import read_npy
+from mars_lidar._base.types import FloatArray
+from mars_lidar.calibration import Calibration, CubeCalibration, calibrate_cube
+from mars_lidar.calibration import calibrate as calibrated
+from mars_lidar.calibration.calibration import GIVEN
+from mars_lidar.cli.console import MISFIT, check_picture, refuse_existing, save_picture, table
+from mars_lidar.cli.options import (
+    Integer,
+    Number,
+    Text,
+    argument,
+    command,
+    examples,
+    out_option,
+    output_option,
+    stream_option,
+    system_option,
+    two_integers,
+)
+from mars_lidar.cli.system_options import FittedPulseOptions
+from mars_lidar.instrument.pulse import Pulse
+from mars_lidar.instrument.system import MAX_CYCLES, SPEED_OF_LIGHT_M_PER_NS, System
+from mars_lidar.light.timestamps import Timestamps
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class StreamOptions:
+    """One pixel of a photon stream; None: as the file has it."""
+
+    pixel: Annotated[Text | None, stream_option("Pixel (channel c is 0,c).", "the brightest", metavar="Y,X")] = None
+    period_ns: Annotated[Number | None, stream_option("Laser period, ns, where the file does not have it.")] = None
+    bins: Annotated[Integer | None, stream_option("Histogram bins of the period.", "the file's clock")] = None
+    unit_ns: Annotated[Number | None, stream_option("Unit of the times in a .mat or .npz, ns.")] = None
+    variable: Annotated[Text | None, stream_option("Variable of a .mat or .npz that holds the times.")] = None
+
+    def arrivals(self, stream: Path) -> tuple[FloatArray, float, list[tuple[str, str]]]:
+        """Times (n,) and clock unit, ns, of a recording without a laser, and rows that describe the file."""
+        from mars_lidar.io.streams.files import recorded
+
+        found = recorded(stream, unit_ns=self.unit_ns, variable=self.variable)
+        channels, counts = np.unique(found.detector[found.detector >= 0], return_counts=True)
+        if not channels.size:
+            raise ValueError(f"{stream} holds no photons")
+        y, x = (0, int(channels[counts.argmax()])) if self.pixel is None else two_integers("--pixel", self.pixel)
+        if y != 0 or x not in channels:
+            raise ValueError(f"--pixel must be 0,C with a channel C of {', '.join(map(str, channels))}, got ({y}, {x})")
+        times = found.clock[found.detector == x].astype(np.float64) * found.clock_ns
+        rows = [("file", f"{stream}: {int(counts.sum()):,} photons"), ("channel", f"{x}: {times.size:,} photons")]
+        return times, found.clock_ns, rows
+
+    def load(self, stream: Path) -> tuple[Timestamps, list[tuple[str, str]]]:
+        """The stream of one pixel, and rows that describe file and pixel."""
+        asked = None if self.pixel is None else two_integers("--pixel", self.pixel)
+        times = Timestamps.load(
+            stream, period_ns=self.period_ns, bins=self.bins, unit_ns=self.unit_ns, variable=self.variable
+        )
+        height, width = times.shape
+        rows = [("file", f"{stream}: {len(times):,} photons of {height} × {width} pixels")]
+        if asked is None:
+            y, x = (int(k) for k in np.unravel_index(int(times.counts.argmax()), times.shape))
+        else:
+            y, x = asked
+            if not (0 <= y < height and 0 <= x < width):
+                raise ValueError(f"--pixel must lie in y 0 to {height - 1}, x 0 to {width - 1}, got ({y}, {x})")
+        pixel = times.pixel(y, x)
+        if height * width > 1:
+            how = ", the brightest" if asked is None else ""
+            rows.append(("pixel", f"({y}, {x}){how}: {len(pixel):,} photons"))
+        return pixel, rows
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class KnownOptions:
+    """What is known of pulse and detector, and the shape of the light."""
+
+    given: Annotated[
+        list[Text] | None,
+        system_option(
+            f"What is known and not fitted: NAME=VALUE, once for each; {', '.join(GIVEN)}.", metavar="NAME=VALUE"
+        ),
+    ] = None
+    system: Annotated[
+        Path | None, system_option("YAML or JSON file with a known pulse and detector, in place of --given.")
+    ] = None
+    pulse: FittedPulseOptions = FittedPulseOptions()
+    free: Annotated[bool, system_option("Any shape of light, bin by bin: fluorescence, haze, many surfaces.")] = False
+    returns: Annotated[Integer, system_option("Returns (surfaces) in the pixel.", "1")] = 1
+
+    def known(self) -> System | dict[str, Any] | None:
+        """The argument `given` of `calibrate`."""
+        if self.system is not None:
+            if self.given:
+                raise ValueError("the detector is given once: choose --system or --given")
+            return System.load(self.system)
+        values: dict[str, Any] = {}
+        for text in self.given or ():
+            name, equals, value = text.partition("=")
+            name = name.strip().replace("-", "_")
+            if not equals or name not in GIVEN:
+                raise ValueError(f"--given must be NAME=VALUE with a NAME of {', '.join(GIVEN)}, got {text!r}")
+            if name == "mode":
+                values[name] = value.strip()
+                continue
+            try:
+                values[name] = float(value)
+            except ValueError:
+                raise ValueError(f"--given {name} must be a number, got {value!r}") from None
+        return values or None
+
+    def shape(self) -> Pulse | Literal["gaussian", "free"]:
+        """The argument `pulse` of `calibrate`."""
+        pulse = self.pulse.build()
+        if self.free and pulse is not None:
+            raise ValueError("the light has one shape: choose --free or a pulse")
+        return "free" if self.free else pulse or "gaussian"
+
+
+CALIBRATE_EXAMPLES = examples(
+    "mars-lidar calibrate lab.ptu --look",
+    "mars-lidar calibrate lab.ptu -o lab.yaml --picture lab.png",
+    "mars-lidar calibrate lab.ptu --given dead_time_ns=50 --given jitter_ns=0.1",
+    "mars-lidar calibrate photons.mat --variable tPhoton --unit-ns 0.064 --period-ns 50.048 --free",
+    "mars-lidar calibrate lab.ptu --pixel 0,2 --pulse-file irf.npy --pulse-bin-ns 0.008 --cycles 9975",
+    "mars-lidar calibrate face.npy --system lab.yaml -o face.yaml",
+    notes="Exit code 3 where the model does not fit the stream. docs/calibration.md has the whole recipe.",
+)
+_UNITS = {"signal": " photons per period", "background": " photons per period", "light": " photons per period"}
+
+
+def calibrate(
+    stream: Annotated[
+        Path,
+        argument(
+            "Photon stream: .ptu, .pt2, .pt3, .ht2, .ht3, .t3r, .spc, Photon-HDF5, .mat, .npz; or a cube: .zarr, .npy."
+        ),
+    ],
+    /,
+    *,
+    source: StreamOptions = StreamOptions(),
+    known: KnownOptions = KnownOptions(),
+    look: Annotated[bool, output_option("Stop before the fit: what the file holds.")] = False,
+    seed: Annotated[Integer, output_option("Seed of the simulated streams.", "0")] = 0,
+    out: Annotated[Path | None, out_option("The calibrated system, .yaml or .json, to simulate with.")] = None,
+    picture: Annotated[Path | None, output_option("A picture: .png, .pdf or .svg.")] = None,
+    cycles: Annotated[
+        Integer | None, output_option("Laser periods of a realization: compare the law of their counts too.")
+    ] = None,
+    overwrite: Annotated[bool, output_option("Replace existing files.")] = False,
+) -> int | None:
+    """Light and detector of a photon stream, each with an error, a verdict, and what is suspect.
+
+    Nothing is assumed but what --given says; of a simulated stream only the photons are used. Without a laser: dead
+    time, jitter and afterpulses in constant light. Of a cube: dead time and pulse width that its pixels share.
+    """
+    from mars_lidar.io.streams.photons import NoLaserError
+
+    check_picture(picture, overwrite)
+    if out is not None:
+        if out.suffix not in (".yaml", ".yml", ".json"):
+            raise ValueError(f"--out must end in .yaml, .yml or .json, got {str(out)!r}")
+        if known.free or look:
+            raise ValueError("--out needs a fitted pulse: leave out --free and --look, or --out")
+        refuse_existing(out, overwrite)
+    if cycles is not None:
+        checks.integer("--cycles", cycles, low=1, high=MAX_CYCLES)
+    if stream.suffix in (".npy", ".zarr"):
+        if not _cube(stream, known, out).fits:
+            return MISFIT
+        return None
+    given, shape = known.known(), known.shape()
+    try:
+        times, rows = source.load(stream)
+        result = calibrated(times, given, pulse=shape, returns=known.returns, look=look, seed=seed)
+    except NoLaserError as error:
+        if out is not None or cycles is not None:
+            raise ValueError(f"{error}; --out and --cycles need a laser period") from error
+        arrivals, unit, rows = source.arrivals(stream)
+        result = calibrated(arrivals, given, look=look, unit_ns=unit, seed=seed)
+    table(rows + look_rows(result) + ([] if look else fit_rows(result)))
+    written = []
+    if cycles is not None and not look:
+        counts = result.realizations(cycles)
+        table([("counts", str(counts))])
+    if out is not None and result.system is not None:
+        result.system.save(out)
+        written.append(("wrote", str(out)))
+    if picture is not None:
+        from mars_lidar.plot.stream import calibration_figure
+
+        save_picture(calibration_figure(result, stream.name), picture)
+        written.append(("picture", str(picture)))
+    if written:
+        table(written)
+    if not look and not result.fits:
+        return MISFIT
+    return None
+
+
+def _cube(path: Path, known: KnownOptions, out: Path | None) -> CubeCalibration:
+    """What the pixels of a cube share: printed, and written as a system."""
+    if path.suffix == ".zarr":
+        from mars_lidar.io import load
+
+        with load(path) as cube:
+            system = cube.system if known.system is None else System.load(known.system)
+            counts = np.asarray(cube.histogram)
+    else:
+        if known.system is None:
+            raise ValueError(
+                f"{path} needs --system: laser period, cycles and bins of its histograms, and where to begin"
+            )
+        system, counts = System.load(known.system), read_npy(path)
+    result = calibrate_cube(counts, system)
+    rows = [("file", f"{path}: {counts.size // counts.shape[-1]:,} histograms of {counts.shape[-1]:,} bins")]
+    units = {"background_floor": " photons per period, of the darkest of them"}
+    rows += [(name, f"{estimate}{units.get(name, '')}") for name, estimate in result.estimates.items()]
+    verdict = "their histograms fit" if result.fits else "their histograms do NOT fit: another return, or an effect"
+    rows.append(("verdict", f"{100 * result.misfits:.3g} % of {result.p_values.size} pixels have p < 1 %: {verdict}"))
+    table(rows)
+    if out is not None:
+        result.system.save(out)
+        table([("wrote", str(out))])
+    return result
+
+
+def look_rows(result: Calibration) -> list[tuple[str, str]]:
+    """Clock, laser, rate, intervals, and what is odd about them."""
+    look = result.look
+    clock = f", clock unit {1e3 * look.unit_ns:.5g} ps" if look.unit_ns else ""
+    if look.unit_ns and look.locked:
+        clock += " from each laser pulse"
+    laser = f"none recorded; {look.seconds:.4g} s{clock}"
+    if result.recording.laser:
+        laser = f"period {look.period_ns:.7g} ns ({1e3 / look.period_ns:.5g} MHz), {look.cycles:,.0f} periods, "
+        laser += f"{look.seconds:.4g} s{clock}"
+    per = f", {look.per_period:.5g} a period" if result.recording.laser else ""
+    low, middle, high = look.quantiles_ns
+    rows = [
+        ("laser", laser),
+        ("rate", f"{look.rate_per_s:,.6g} counts/s{per}"),
+        ("intervals", f"smallest {look.smallest_ns[0]:.6g} ns; 1, 50, 99 %: {low:.5g}, {middle:.5g}, {high:.5g} ns"),
+    ]
+    return rows + [("problem", text) for text in look.problems]
+
+
+def fit_rows(result: Calibration) -> list[tuple[str, str]]:
+    """Estimates, limits, drift, suspects, and the verdict."""
+    rows = []
+    for name, estimate in result.estimates.items():
+        text = f"{estimate}{_UNITS.get(name.split('_')[0], '')}"
+        if name.startswith("delay") and estimate.error:
+            text += f", {0.5 * SPEED_OF_LIGHT_M_PER_NS * estimate.value:.6g} m"
+        rows.append((name, text))
+    if result.waveform is not None:
+        rows.append(("light", f"free shape of {result.waveform.size} bins, {result.waveform.sum():.6g} a period"))
+    for limit in result.limits:
+        shifts = ", ".join(f"{name} by {shift:+.2g}" for name, shift in limit.shifts.items())
+        at = f"; at that size it would move {shifts}" if shifts else ""
+        rows.append(("not detected", f"{limit.words}: {limit.name} below {limit.limit:.3g} (95 %){at}"))
+    if result.drift is not None:
+        drift = result.drift
+        for k, name in enumerate(drift.names):
+            if drift.drifts[k]:
+                rows.append(("drift", f"{name}: errors grown {drift.growth[k]:.2f} times by the scatter of parts"))
+        if not drift.drifts.any():
+            rows.append(("drift", f"none in {drift.times_s.size} parts of the recording (p = {drift.probability:.2g})"))
+    rows += [("suspect", str(suspect)) for suspect in result.suspects]
+    return [*rows, ("verdict", result.verdict)]
+
+
+calibrate_command = command(calibrate, CALIBRATE_EXAMPLES)

@@ -1,0 +1,400 @@
+"""`mars-lidar generate`, `verify` and `export`: training sets from scenes, their check, and files for networks."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from mars_lidar._base import manifest
+from mars_lidar._base.files import size_on_disk
+from mars_lidar._base.progress import span
+from mars_lidar.cli.console import BAD_INPUT, FAILED, progress_bar, say, table
+from mars_lidar.cli.options import (
+    Ambient,
+    Attenuation,
+    Integer,
+    Number,
+    Numbers,
+    Text,
+    Threads,
+    argument,
+    command,
+    examples,
+    light_option,
+    option,
+    out_option,
+    output_option,
+    run_option,
+    scenes_option,
+    system_option,
+)
+from mars_lidar.cli.system_options import DEFAULT_SYSTEM, Effects, SystemChanges
+from mars_lidar.scene.scene import Scene
+
+if TYPE_CHECKING:
+    from mars_lidar.dataset import DatasetRecipe
+    from mars_lidar.dataset.estimate import Estimate
+    from mars_lidar.dataset.run import Generated
+    from mars_lidar.io import Problem
+
+
+GENERATE_EXAMPLES = examples(
+    "mars-lidar generate recipe.yaml -o set.zarr --dry-run",
+    "mars-lidar generate recipe.yaml -o set.zarr --resume",
+    "mars-lidar generate room --size 64 --scene-seeds 100 --signal 0.1 --signal 1 --sbr 0.5 -o rooms.zarr",
+    "mars-lidar generate nyu_depth_v2_labeled.mat --focal-px 519 --crop 64 --crops 4 -o nyu.zarr",
+    "mars-lidar generate recipe.yaml -o set.zarr --scheduler tcp://10.0.0.1:8786",
+    notes="Recipes: docs/generate.md. Clusters: docs/scale.md.",
+)
+_RECIPES = (".yaml", ".yml")
+_TRANSIENTS = (".h5", ".hdf5")  # a depth is never in one; the other files of transients need a recipe
+
+
+def generate(
+    source: Annotated[
+        Path | None,
+        argument(
+            "A recipe (.yaml, .yml), a built-in scene (room), RGB-D (a file or a folder), or a rendered transient "
+            "(.h5, .hdf5)."
+        ),
+    ] = None,
+    /,
+    *,
+    size: Annotated[
+        Text | None,
+        scenes_option("Resample every scene: the longer side, or HEIGHT,WIDTH.", "as it is; room: 128", metavar="SIDE"),
+    ] = None,
+    crop: Annotated[
+        Text | None, scenes_option("Cut out parts at random places: side, or HEIGHT,WIDTH.", metavar="SIDE")
+    ] = None,
+    crops: Annotated[Integer | None, scenes_option("Parts per scene.", "1")] = None,
+    scene_seeds: Annotated[Integer | None, scenes_option("Built-in scene: that many, of seeds 0, 1, ...", "1")] = None,
+    depth_unit_m: Annotated[
+        Number | None, scenes_option("RGB-D: metres per stored unit of depth.", "0.001 for images, 1 for arrays")
+    ] = None,
+    focal_px: Annotated[
+        Number | None,
+        scenes_option(
+            "RGB-D: focal length, pixels of the file: turns depth along the axis into range along the ray.",
+            "depth as it is",
+        ),
+    ] = None,
+    max_depth_m: Annotated[Number | None, scenes_option("RGB-D: depths beyond this are no return, m.", "none")] = None,
+    system: Annotated[
+        list[Path] | None,
+        system_option(
+            "YAML or JSON file (see mars-lidar init), repeated for several; single options replace its values."
+        ),
+    ] = None,
+    changes: SystemChanges = SystemChanges(),
+    effects: Effects = Effects(),
+    signal: Annotated[
+        Numbers | None, light_option("Mean signal photons per laser period, repeated for several levels.", "1")
+    ] = None,
+    sbr: Annotated[
+        Numbers | None,
+        light_option("Mean signal / mean ambient photons, repeated for several: each with each signal.", "1"),
+    ] = None,
+    attenuation: Attenuation = None,
+    ambient: Ambient = None,
+    engine: Annotated[Text | None, run_option("As for mars-lidar simulate.", "exact")] = None,
+    realizations: Annotated[Integer | None, run_option("Exposures of each sample.", "1")] = None,
+    seed: Annotated[Integer | None, run_option("Seed of the dataset.", "0")] = None,
+    threads: Threads = None,
+    workers: Annotated[Integer | None, run_option("Worker processes on this machine (extra cluster).")] = None,
+    scheduler: Annotated[
+        Text | None, run_option("Address of a dask scheduler whose workers see --out (extra cluster).")
+    ] = None,
+    out: Annotated[Path, out_option("The dataset, NAME.zarr.")],
+    layout: Annotated[
+        Text | None,
+        output_option(
+            "dense (any Zarr library reads it) or sparse (bins that are not zero, packed: smaller in dim light).",
+            "dense",
+        ),
+    ] = None,
+    resume: Annotated[bool, output_option("Continue what was stopped.")] = False,
+    overwrite: Annotated[bool, output_option("Replace an existing dataset.")] = False,
+    begin: Annotated[
+        bool, output_option("Read the scenes and lay the store out; --part jobs make its counts.")
+    ] = False,
+    part: Annotated[
+        Text | None, output_option("Make part K of N of a store that --begin began, in any order.", metavar="K/N")
+    ] = None,
+    finish: Annotated[bool, output_option("Check that all parts are there, and mark the store complete.")] = False,
+    dry_run: Annotated[bool, output_option("Tell size, time and memory; write nothing.")] = False,
+) -> int | None:
+    """Simulate a dataset: scenes x systems x levels of light x realizations, into one Zarr store.
+
+    With a recipe, options replace its values. The store does not depend on threads, workers or interruptions: the
+    same recipe gives the same files, byte for byte. Files that cannot be used are left out and told at the end.
+    Fog, panes, folders of transients and all else that has no option stand in a recipe.
+    """
+    from mars_lidar import dataset
+
+    if sum((begin, part is not None, finish, dry_run)) > 1:
+        raise ValueError("--begin, --part, --finish and --dry-run are four steps: give one of them")
+    if (part or finish) and (workers is not None or scheduler is not None):
+        raise ValueError("--part and --finish need no --workers and no --scheduler")
+    if (part or finish) and (source is not None or resume or overwrite):
+        raise ValueError("--part and --finish go on with the store: no SOURCE, --resume or --overwrite")
+    if part is not None:
+        numbers = _part(part)
+        with progress_bar("generating") as progress:
+            tell(dataset.make_part(out, numbers, threads=threads, progress=progress))
+        return None
+    if finish:
+        tell(dataset.finish(out))
+        return None
+    of_systems = bool(system) or changes != SystemChanges() or effects != Effects()
+    replaced = {
+        "size": _size("--size", size),
+        "crop": None if crop is None else {"size": _size("--crop", crop), "count": crops or 1},
+        "systems": [changes.of(file, effects) for file in system or (None,)] if of_systems else None,
+        "light": _given(signal=signal or None, sbr=sbr or None, attenuation=attenuation, ambient=ambient) or None,
+        "engine": engine,
+        "realizations": realizations,
+        "seed": seed,
+        "store": None if layout is None else {"layout": layout},
+    }
+    replaced = _given(**replaced)
+    if source is not None and source.suffix in _RECIPES and not system and "systems" in replaced:
+        raise ValueError("with a recipe, single options of the system need the --system whose values they replace")
+    if crops is not None and crop is None:
+        raise ValueError("--crops belongs to --crop, which is not given")
+    rgbd = _given(depth_unit_m=depth_unit_m, focal_px=focal_px, max_depth_m=max_depth_m)
+    recipe = _recipe(source, replaced, scene_seeds, rgbd, resume)
+    if dry_run:
+        if recipe is None:
+            raise ValueError("--dry-run needs a source")
+        return tell_estimate(dataset.estimate(recipe, out, threads=threads))
+    if begin:
+        if recipe is None:
+            raise ValueError("--begin needs a SOURCE")
+        tell(dataset.begin(recipe, out, resume=resume, overwrite=overwrite, workers=workers, scheduler=scheduler))
+        return None
+    here = workers is None and scheduler is None and not (resume and out.exists())
+    if here and recipe is not None and (told := str(dataset.quick_advice(recipe, threads))):
+        say(told)
+    with progress_bar("generating") as progress:
+        done = dataset.generate(
+            recipe,
+            out,
+            resume=resume,
+            overwrite=overwrite,
+            threads=threads,
+            workers=workers,
+            scheduler=scheduler,
+            progress=progress,
+        )
+    tell(done)
+    return None
+
+
+def verify(
+    path: Annotated[Path, argument("A dataset that generate wrote.")],
+    /,
+    *,
+    chunks: Annotated[Integer, option("How many, chosen at random.", "16")] = 16,
+    every: Annotated[bool, option("All of them.", "", "--all")] = False,
+    seed: Annotated[Integer, option("Seed of the choice.", "0")] = 0,
+    threads: Annotated[Integer | None, option("Threads.", "all cores")] = None,
+) -> int | None:
+    """Simulate random chunks of a dataset again and compare every count; exit code 1 if they differ."""
+    from mars_lidar.dataset import verify as verified
+
+    with progress_bar("verifying") as progress:
+        told = verified(path, chunks=None if every else chunks, seed=seed, threads=threads, progress=progress)
+    if told.good:
+        table([("verified", f"{told.chunks} of {told.of} chunks simulated again, every count is the same")])
+        return None
+    table([("verified", f"NO: see below; {told.chunks} of {told.of} chunks simulated again")])
+    for line in told.different:
+        say(line)
+    return FAILED
+
+
+def _recipe(
+    source: Path | None, replaced: dict[str, Any], scene_seeds: int | None, rgbd: dict[str, Any], resume: bool
+) -> DatasetRecipe | None:
+    from mars_lidar.dataset.recipe import DatasetRecipe
+
+    if source is None:
+        if not resume:
+            raise ValueError("SOURCE is missing: a recipe, a built-in scene, or RGB-D")
+        if replaced or scene_seeds is not None or rgbd:
+            raise ValueError("--resume without SOURCE takes the recipe of the store: no other options")
+        return None
+    if source.suffix in _RECIPES:
+        if scene_seeds is not None or rgbd:
+            raise ValueError("--scene-seeds, --depth-unit-m and --focal-px stand in the recipe's scenes")
+        return DatasetRecipe.load(source, **replaced)
+    if str(source) in Scene.example_names():
+        if rgbd:
+            raise ValueError("--depth-unit-m and --focal-px belong to RGB-D")
+        scene: dict[str, Any] = {"example": str(source), "seeds": {"count": scene_seeds or 1}}
+        scene["size"] = replaced.pop("size", 128)
+    else:
+        if scene_seeds is not None:
+            raise ValueError(f"--scene-seeds belongs to a built-in scene, and {source} is none")
+        scene = {"path": str(source), **rgbd}
+        if source.suffix.lower() in _TRANSIENTS:
+            if rgbd:
+                raise ValueError("--depth-unit-m and --focal-px belong to RGB-D")
+            scene = {"transient": str(source)}
+    return DatasetRecipe.from_dict({"systems": [DEFAULT_SYSTEM], **replaced, "scenes": scene})
+
+
+def _part(text: str) -> tuple[int, int]:
+    which, _, of = text.partition("/")
+    if not (which.isdecimal() and of.isdecimal() and 1 <= int(which) <= int(of)):
+        raise ValueError(f"--part must be K/N with K from 1 to N, got {text!r}")
+    return int(which), int(of)
+
+
+def _given(**values: Any) -> dict[str, Any]:
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def _size(option: str, text: str | None) -> Any:
+    if text is None:
+        return None
+    try:
+        numbers = [int(part) for part in text.split(",", 1)]
+    except ValueError:
+        raise ValueError(f"{option} must be one integer or HEIGHT,WIDTH, got {text!r}") from None
+    return numbers[0] if len(numbers) == 1 else numbers
+
+
+EXPORT_EXAMPLES = examples(
+    "mars-lidar generate room --size 64 --scene-seeds 20 -o rooms.zarr",
+    "mars-lidar export rooms.zarr --layout lindell --fill -o lindell",
+    notes="docs/formats.md tells what is in each file.",
+)
+
+
+def export(
+    dataset: Annotated[Path, argument("A dataset that mars-lidar generate wrote.")],
+    /,
+    *,
+    out: Annotated[Path, out_option("A new folder.", option)],
+    layout: Annotated[Text, option("Whose loader reads it: lindell, deepsensorfusion, sun, gutierrez or webdataset.")],
+    fill: Annotated[bool, option("Pixels without a return take depth and rates of the nearest with one.")] = False,
+) -> None:
+    """Write a dataset as the files that depth networks load: one .mat an exposure and their list, or tars."""
+    from mars_lidar.dataset.network_files import export as exported
+
+    with progress_bar("exporting") as progress:
+        done = exported(dataset, out, layout=layout, fill=fill, progress=progress)
+    rows = [("wrote", f"{done.files} exposures in {out}"), ("list", str(done.listed))]
+    table(rows + [("note", text) for text in done.notes])
+
+
+def dataset_rows(path: Path) -> list[tuple[str, str]] | None:
+    """What `mars-lidar info` tells of a dataset; None for anything else."""
+    from mars_lidar.dataset.store import is_dataset, open_dataset
+
+    if not is_dataset(path):
+        return None
+    stored = open_dataset(path, allow_incomplete=True)
+    rows = [("file", f"{path} (mars-lidar {stored.attrs['version']})")]
+    if not stored.planned:
+        return [*rows, ("complete", "NO: stopped before its scenes were in; generate it again with --resume")]
+    left = [] if stored.complete else stored.missing()
+    total = sum(1 for _ in stored.items())
+    array, recipe = stored.histogram, stored.recipe
+    levels = ", ".join(f"{s:g}/{b:g}" for s, b in recipe.light.levels[:8])
+    problems = len(stored.problems)
+    whole = "NO: all parts are there; continue with --resume"
+    if stored.complete:
+        whole = f"yes; {manifest.description(path)}"
+    return [
+        *rows,
+        ("complete", f"NO: {total - len(left)} of {total} parts are there; continue with --resume" if left else whole),
+        ("counts", f"{_shape(array.shape)} {array.dtype}, {recipe.layout}"),
+        (
+            "size",
+            f"{_bytes(math.prod(array.shape) * array.dtype.itemsize)} dense, {_bytes(size_on_disk(path))} on disk",
+        ),
+        ("chunk", f"{_dimensions(array.chunks)} of a shard of {_dimensions(array.shards)}"),
+        ("engine", f"{recipe.engine}, seed {recipe.seed}"),
+        *((f"system {k}", one.to_json()) for k, one in enumerate(recipe.systems)),
+        ("light", f"signal/sbr {levels}{', ...' if len(recipe.light.levels) > 8 else ''}"),
+        ("scenes", ", ".join(json.dumps(one) for one in recipe.scenes)),
+        ("left out", files(problems)),
+        *(("", str(problem)) for problem in stored.problems[:20]),
+        ("open with", f"xarray.open_zarr({str(path)!r})"),
+    ]
+
+
+def tell(done: Generated) -> None:
+    """What `generate` did."""
+    exposures = math.prod(done.shape[:4])
+    busy = done.simulate_s + done.write_s
+    share = f"; {100 * done.simulate_s / busy:.0f} % of the threads' time simulating" if busy else ""
+    before = f", {done.parts_before} were there" if done.parts_before else ""
+    table(
+        {
+            "generated": _shape(done.shape),
+            "parts": f"{done.parts} made{before}",
+            "time": f"{done.seconds:.3g} s for {exposures:,} pixel exposures{share}",
+            "dataset": f"{done.path}, {_bytes(size_on_disk(done.path))}",
+            "open with": f"xarray.open_zarr({str(done.path)!r})",
+            "left out": files(len(done.problems)),
+        }
+    )
+    _tell_problems(done.problems)
+
+
+def _tell_problems(problems: tuple[Problem, ...]) -> None:
+    for problem in problems:
+        say(f"left out: {problem}")
+
+
+def tell_estimate(told: Estimate) -> int | None:
+    """What `--dry-run` expects; exit code 2 where the disk is too small."""
+    shards = f"{told.shards:,} shard{'s' * (told.shards > 1)}"
+    rows = [
+        ("dataset", _shape(told.shape)),
+        ("scenes", f"{told.scenes:,}"),
+        ("size", f"about {_bytes(told.bytes)} on disk, of {_bytes(told.dense_bytes)} dense; {shards}"),
+        ("chunk", _dimensions(told.chunk)),
+        ("time", f"about {span(told.seconds)} on {told.threads} threads of this machine"),
+        ("memory", f"at most {_bytes(told.memory_bytes)}"),
+    ]
+    short = told.free_bytes is not None and told.bytes > told.free_bytes
+    if told.free_bytes is not None:
+        rows.append(("disk", f"{_bytes(told.free_bytes)} free{': NOT ENOUGH' if short else ''}"))
+    table(rows)
+    _tell_problems(told.problems)
+    if short:
+        return BAD_INPUT
+    return None
+
+
+def _shape(shape: tuple[int, ...]) -> str:
+    return f"{_dimensions(shape)} (sample, realization, y, x, time)"
+
+
+def _dimensions(shape: tuple[int, ...]) -> str:
+    return " × ".join(map(str, shape))
+
+
+def files(number: int) -> str:
+    """How many files, in words."""
+    return f"{number:,} file{'s' * (number > 1)}" if number else "nothing"
+
+
+def _bytes(number: float) -> str:
+    for unit in ("B", "kB", "MB", "GB", "TB"):
+        if number < 1000 or unit == "TB":
+            break
+        number /= 1000
+    return f"{number:.3g} {unit}"
+
+
+generate_command = command(generate, GENERATE_EXAMPLES)
+verify_command = command(verify)
+export_command = command(export, EXPORT_EXAMPLES)

@@ -1,0 +1,56 @@
+"""The command line run in this process: its exit code and what it prints."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from cyclopts import App
+from cyclopts.argument import Argument
+
+from mars_lidar.cli import app as mars_lidar
+from mars_lidar.cli import main
+
+
+@dataclass(frozen=True)
+class Done:
+    """A command that ended; `output` is both streams in the order of their lines."""
+
+    exit_code: int
+    stdout: str
+    stderr: str
+    output: str
+
+
+class _Stream(io.StringIO):
+    def __init__(self, both: io.StringIO) -> None:
+        super().__init__()
+        self.both = both
+
+    def write(self, text: str) -> int:
+        self.both.write(text)
+        return super().write(text)
+
+
+def command_line(arguments: Sequence[str], *, input: str = "", main: Callable[[Sequence[str]], int] = main) -> Done:
+    """Run ``mars-lidar ARGUMENTS``, or another `main`."""
+    both = io.StringIO()
+    out, err, stdin = _Stream(both), _Stream(both), sys.stdin
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        sys.stdin = io.StringIO(input)
+        try:
+            code = main([str(argument) for argument in arguments])
+        finally:
+            sys.stdin = stdin
+    return Done(code, out.getvalue(), err.getvalue(), both.getvalue())
+
+
+def options_of(*commands: str, app: App = mars_lidar) -> dict[str, Argument]:
+    """The arguments of a command by the longest name of their option."""
+    for command in commands:
+        app = app[command]
+    arguments = [argument for argument in app.assemble_argument_collection() if argument.name.startswith("--")]
+    return {argument.name: argument for argument in arguments}

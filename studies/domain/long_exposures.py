@@ -29,7 +29,7 @@ TOLERANCE = 1e-4  # of the closed form
 _FEWEST = 30.0  # expected counts of a bin in the whole sample, for its mean; in one exposure, for its variance
 _WINDOWS = 24  # linear functions of the histogram that are compared beside the bins
 _MOST_PIXELS = 64
-_REDRAWN, _TIMES = 8, 10  # systems of the most redrawn exposures, that so many times as many exposures are drawn of
+_REDRAWN, _TIMES = 2, 10  # systems of the most redrawn exposures, that so many times as many exposures are drawn of
 
 
 @dataclass(frozen=True)

@@ -101,7 +101,7 @@ class NeuralEngine(Engine):
         cumulants = np.zeros((*cells.shape, 4))
         cumulants[..., 0], cumulants[..., 1] = mean.reshape(cells.shape), variance.reshape(cells.shape)
         moments = list(zip(mean, variance, strict=True))
-        return CountLaw(self.name, cumulants, lambda: [gaussian_window(float(m), float(v)) for m, v in moments])
+        return CountLaw(system, self.name, cumulants, lambda: [gaussian_window(float(m), float(v)) for m, v in moments])
 
     def _moments(self, cells: Cells) -> tuple[FloatArray, FloatArray, FloatArray]:
         """PDFs (cells, bins), means and variances (cells,): uniform, 0 and 0 where there is no light."""

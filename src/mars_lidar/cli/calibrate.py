@@ -250,7 +250,7 @@ def _cube(path: Path, known: KnownOptions, out: Path | None, picture: Path | Non
     if picture is not None:
         from mars_lidar.plot.figures import pixel_histogram
 
-        save_picture(pixel_histogram(result.counts[None], 0, 0, system=result.system, flux=result.flux), picture)
+        save_picture(pixel_histogram(result.counts[None], 0, 0, system=result.system), picture)
         table([("picture", str(picture))])
     return result
 

@@ -109,7 +109,8 @@ def histogram_log_likelihood(
     TypeError
         Counts or light that are no tensors of a suitable type; no `System`.
     ValueError
-        Another number of bins, negative counts, no background; a detector that this form does not describe.
+        Another number of bins; a detector that this form does not describe. The values of counts and light are not
+        checked, which would wait for the device: negative ones give numbers without a meaning.
 
     See Also
     --------

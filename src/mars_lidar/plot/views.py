@@ -21,7 +21,6 @@ from mars_lidar.statistics import ConvergenceError, mean_histogram, photons_per_
 from mars_lidar.statistics.histogram import histogram_effects
 
 _READ_BYTES = 64 * 2**20
-_PREDICTED_CYCLES = 20_000  # an exposure whose state never settles costs some 10 us a period
 
 
 @checked
@@ -232,8 +231,6 @@ def predicted_counts(cube: Cube, y: int, x: int) -> NDArray[np.float64] | None:
         return None
     if cube.engine == "poisson" and system.detector.mode != "gated":
         return photons_per_bin(flux[y, x], system, bins=system.bins) * system.cycles
-    if system.cycles > _PREDICTED_CYCLES and system.detector.mode != "paralyzable":  # whose mean has a closed form
-        return None
     if cube.engine == "poisson":
         system = system.replace(detector=replace(system.detector, dead_time_ns=0.0))
     tolerance = 1e-2 if "electronics_dead_time_ns" in effects else 1e-4  # seconds each beyond that

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+from typing import Any
+
 import numpy as np
 
 from mars_lidar._base.native import _core
@@ -44,7 +47,7 @@ class Cells:
         self.gap_edges = np.union1d(self._between(place, unit), ages)
         self.gap_edges = self.gap_edges[self.gap_edges > 0.0]
         ages = ages[ages > 0.0]
-        self.native = _core.StreamCells(
+        self._arguments: dict[str, Any] = dict(
             period_ns=period,
             shift=_SHIFT / _PHASES,
             phase_of=phase_of,
@@ -56,7 +59,15 @@ class Cells:
             classes=2 * (coarse.size + 1),
             ages=ages.size + 1,
         )
-        self.size = self.native.size
+        self.size = int(self._native.size)
+
+    @cached_property
+    def _native(self) -> _core.StreamCells:
+        return _core.StreamCells(**self._arguments)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the native cells, which cannot be pickled and are made again."""
+        return {name: value for name, value in vars(self).items() if name != "_native"}
 
     @staticmethod
     def _layout(model: Model, theta: FloatArray, phases: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -95,7 +106,7 @@ class Cells:
     def count(self, streams: Streams) -> FloatArray:
         """Counts (streams, size)."""
         counts = np.empty((streams.offsets.size - 1, self.size))
-        _core.count_streams(self.native, streams.times, streams.offsets, counts)
+        _core.count_streams(self._native, streams.times, streams.offsets, counts)
         return counts
 
     def of(self, recording: Recording) -> FloatArray:

@@ -47,18 +47,18 @@ class Cells:
         self.gap_edges = np.union1d(self._between(place, unit), ages)
         self.gap_edges = self.gap_edges[self.gap_edges > 0.0]
         ages = ages[ages > 0.0]
-        self._arguments: dict[str, Any] = dict(
-            period_ns=period,
-            shift=_SHIFT / _PHASES,
-            phase_of=phase_of,
-            class_of=(2 * np.searchsorted(coarse, centre)).astype(np.int32),
-            lit_of=inside.astype(np.int32),
-            gap_edges=self.gap_edges,
-            age_of=np.searchsorted(ages, np.append(self.gap_edges, np.inf)).astype(np.int32),
-            phases=self.phases,
-            classes=2 * (coarse.size + 1),
-            ages=ages.size + 1,
-        )
+        self._arguments: dict[str, Any] = {
+            "period_ns": period,
+            "shift": _SHIFT / _PHASES,
+            "phase_of": phase_of,
+            "class_of": (2 * np.searchsorted(coarse, centre)).astype(np.int32),
+            "lit_of": inside.astype(np.int32),
+            "gap_edges": self.gap_edges,
+            "age_of": np.searchsorted(ages, np.append(self.gap_edges, np.inf)).astype(np.int32),
+            "phases": self.phases,
+            "classes": 2 * (coarse.size + 1),
+            "ages": ages.size + 1,
+        }
         self.size = int(self._native.size)
 
     @cached_property

@@ -64,6 +64,7 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
+    from mars_lidar import dataset as dataset
     from mars_lidar import io as io
     from mars_lidar import learn as learn
     from mars_lidar import plot as plot
@@ -74,7 +75,7 @@ if TYPE_CHECKING:
 else:
     from importlib import import_module
 
-    _LATER = ("io", "learn", "plot")  # with what they import, only where they are used: `ml.io.load`
+    _LATER = ("dataset", "io", "learn", "plot")  # with what they import, only where they are used: `ml.io.load`
     _HOMES = {"Cube": "io", "Generated": "dataset", "generate": "dataset", "to_xarray": "io"}
 
     def __getattr__(name: str) -> object:

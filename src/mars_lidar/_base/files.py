@@ -50,15 +50,30 @@ class FileError(ValueError):
 
 
 class IncompleteFileError(FileError):
-    """The file was left by a simulation that did not finish."""
+    """The file was left by a simulation that did not finish.
+
+    See Also
+    --------
+    load
+    """
 
 
 class WriteError(OSError):
-    """The file could not be written (a full disk, say); its text says what is left on disk."""
+    """The file could not be written (a full disk, say); its text says what is left on disk.
+
+    See Also
+    --------
+    Interrupted, simulate_to
+    """
 
 
 class Interrupted(KeyboardInterrupt):
-    """Ctrl-C while a file was written; its text says what is left on disk."""
+    """Ctrl-C while a file was written; its text says what is left on disk.
+
+    See Also
+    --------
+    WriteError, simulate_to
+    """
 
 
 @contextlib.contextmanager

@@ -7,7 +7,12 @@ from typing import Any
 
 
 class MissingLibraryError(ImportError, ValueError):
-    """What was asked for needs a library that is not installed."""
+    """What was asked for needs a library that is not installed.
+
+    See Also
+    --------
+    load
+    """
 
 
 def needed(module: str, what: str, extra: str = "io") -> Any:

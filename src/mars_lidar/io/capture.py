@@ -160,11 +160,17 @@ def save_capture(path: str | Path, cube: Cube, like: str | Path, *, overwrite: b
         A capture of tal, mitransient, or the Zaragoza data set: everything but the light is copied from it, grids of
         laser and sensor, ``t_start``, ``scene_info``. Of colours and bounces the first one holds the counts. The recipe
         is in the attribute ``mars_lidar`` of the file, which those programs pass over.
+    overwrite
+        Replace an existing file.
 
     Raises
     ------
     ValueError
         Sizes or widths that differ.
+
+    See Also
+    --------
+    read_transient, mars_lidar.Flux.from_transient
     """
     target, source = Path(path), read_capture(like)
     if target.suffix.lower() not in CAPTURE_SUFFIXES:

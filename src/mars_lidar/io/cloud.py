@@ -25,6 +25,21 @@ def points(depth_m: ArrayLike, focal_px: float) -> FloatArray:
         Range along the ray, as `mars_lidar.Scene` and `mars_lidar.Reconstruction` have it.
     focal_px
         Focal length in pixels of this image; its centre is the principal point.
+
+    Raises
+    ------
+    ValueError, TypeError
+        Ranges that are no (H, W) or (H, W, K) real numbers, or a focal length that is not positive.
+
+    See Also
+    --------
+    save_cloud
+
+    Examples
+    --------
+    >>> from mars_lidar import io
+    >>> io.points([[2.0, 2.0], [2.0, 2.0]], focal_px=100.0).shape
+    (2, 2, 3)
     """
     depth = np.asarray(depth_m, np.float64)
     if depth.ndim not in (2, 3):
@@ -72,6 +87,18 @@ def save_cloud(
         Another suffix, or maps of different shapes.
     OSError
         `path` exists and `overwrite` is false, or cannot be written.
+
+    See Also
+    --------
+    points
+
+    Examples
+    --------
+    >>> import pathlib, tempfile
+    >>> folder = pathlib.Path(tempfile.mkdtemp())
+    >>> from mars_lidar import io
+    >>> io.save_cloud(folder / "wall.ply", [[2.0, 2.0], [2.0, float("nan")]], focal_px=100.0)
+    3
     """
     target = Path(path)
     if target.suffix != ".ply":

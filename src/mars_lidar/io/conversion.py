@@ -30,6 +30,26 @@ class Converted:
         What is in it, in words.
     lost
         What the source has and the new file has not, a sentence each.
+
+    See Also
+    --------
+    convert
+
+    Examples
+    --------
+    >>> import pathlib, tempfile
+    >>> folder = pathlib.Path(tempfile.mkdtemp())
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> flux = ml.Flux(signal=[[0.5, 2.0]], background=1.0, delay_ns=[[20.0, 60.0]])
+    >>> cube = ml.Cube(ml.simulate(flux, system), system, flux)
+    >>> cube.save(folder / "room.npz")
+    >>> done = ml.io.convert(folder / "room.npz", folder / "room.h5")
+    >>> done.path.name, done.lost
+    ('room.h5', ())
     """
 
     path: Path
@@ -73,6 +93,25 @@ def convert(
         Files of the wrong kind, damaged, incomplete, or beyond what the target's format can hold.
     OSError
         The target exists and `overwrite` is false, or cannot be written.
+
+    See Also
+    --------
+    photons, load, save
+
+    Examples
+    --------
+    >>> import pathlib, tempfile
+    >>> folder = pathlib.Path(tempfile.mkdtemp())
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> flux = ml.Flux(signal=[[0.5, 2.0]], background=1.0, delay_ns=[[20.0, 60.0]])
+    >>> cube = ml.Cube(ml.simulate(flux, system), system, flux)
+    >>> cube.save(folder / "room.npz")
+    >>> ml.io.convert(folder / "room.npz", folder / "room.h5").content
+    'cube 1 × 1 × 2 × 128 (realization, y, x, time)'
     """
     old, new = Path(source), Path(target)
     allowed = sorted({*SUFFIXES, *STREAM_SUFFIXES})
@@ -121,6 +160,25 @@ def photons(
     ValueError
         The photons do not have the stored counts (another version made the cube), or the engine draws
         histograms only.
+
+    See Also
+    --------
+    mars_lidar.simulate_timestamps, convert
+
+    Examples
+    --------
+    >>> import pathlib, tempfile
+    >>> folder = pathlib.Path(tempfile.mkdtemp())
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> path = folder / "pair.npz"
+    >>> written = ml.io.simulate_to(path, ml.Flux([[0.5, 2.0]], 1.0, [[20.0, 60.0]]), system)
+    >>> times = ml.io.photons(ml.io.load(path))
+    >>> len(times) == written.registrations
+    True
     """
     k = checks.integer("realization", realization, low=0, high=cube.shape[0] - 1)
     arguments = cube.simulation("the time of each photon").part(slice(k, k + 1), slice(0, cube.shape[1]))

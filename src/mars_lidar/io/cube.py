@@ -82,6 +82,11 @@ class Cube:
     url
         Where a cube that is read from elsewhere lies; "" for others.
 
+    Raises
+    ------
+    ValueError, TypeError
+        Counts, light or maps of shapes that do not fit the system or each other; counts that are no whole numbers >= 0.
+
     See Also
     --------
     simulate, reconstruct
@@ -150,7 +155,7 @@ class Cube:
         return cube
 
     def save(self, path: str | Path, *, overwrite: bool = False) -> None:
-        """Write the cube to a file: `io.save`."""
+        """Write the cube to a file, as `io.save` does; `overwrite` replaces an existing one."""
         save(path, self, overwrite=overwrite)
 
     def plot(self, **options: Any) -> Any:
@@ -280,12 +285,42 @@ def save(
 
     Of an array of counts with the `system` that recorded them, and its light where it is known, it makes a cube.
 
+    Parameters
+    ----------
+    path
+        The file; its suffix chooses the format.
+    cube
+        A `Cube`, or counts as `mars_lidar.simulate` returns them.
+    system, flux
+        Beside counts: what recorded them, and the light where it is known.
+    overwrite
+        Replace an existing file.
+
     Raises
     ------
     ValueError
         Another suffix, or a cube that the format cannot hold.
     OSError
         `path` exists and `overwrite` is false, or cannot be written.
+
+    See Also
+    --------
+    load, Cube, simulate_to
+
+    Examples
+    --------
+    >>> import pathlib, tempfile
+    >>> folder = pathlib.Path(tempfile.mkdtemp())
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> flux = ml.Flux(signal=[[0.5, 2.0]], background=1.0, delay_ns=[[20.0, 60.0]])
+    >>> cube = ml.Cube(ml.simulate(flux, system), system, flux)
+    >>> ml.io.save(folder / "pair.npz", cube)
+    >>> ml.io.load(folder / "pair.npz").shape
+    (1, 1, 2, 128)
     """
     cube = as_cube(cube, system, flux)
     check_output(path, cube.recipe, overwrite=overwrite)
@@ -338,6 +373,26 @@ def load(path: str | Path, *, allow_incomplete: bool = False) -> Cube:
         The file was left by an unfinished run (a ValueError).
     FileError
         Not a cube of mars-lidar, or damaged (a ValueError that names the file); a store that lacks a part.
+
+    See Also
+    --------
+    save, foreign_cube, Cube
+
+    Examples
+    --------
+    >>> import pathlib, tempfile
+    >>> folder = pathlib.Path(tempfile.mkdtemp())
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> flux = ml.Flux(signal=[[0.5, 2.0]], background=1.0, delay_ns=[[20.0, 60.0]])
+    >>> cube = ml.Cube(ml.simulate(flux, system), system, flux)
+    >>> cube.save(folder / "pair.h5")
+    >>> with ml.io.load(folder / "pair.h5") as stored:
+    ...     stored.shape
+    (1, 1, 2, 128)
     """
     url = url_of(path)
     if url is not None:

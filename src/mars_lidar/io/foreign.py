@@ -102,6 +102,24 @@ def foreign_cube(
     ------
     FileNotFoundError, ValueError
         No such file, not readable, or not what the arguments say; the message names the file.
+
+    See Also
+    --------
+    from_histograms, from_photon_times, load
+
+    Examples
+    --------
+    >>> import pathlib, tempfile
+    >>> folder = pathlib.Path(tempfile.mkdtemp())
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> import numpy as np
+    >>> np.save(folder / "counts.npy", np.ones((4, 6, 128), int))
+    >>> ml.io.foreign_cube(folder / "counts.npy", system).shape
+    (1, 4, 6, 128)
     """
     found = read_counts(path, variable=variable, axes=axes, image=image, bins=system.bins)
     return found.cube(system, start_ns=start_ns, unit_ns=unit_ns, window_ns=window_ns)

@@ -51,6 +51,15 @@ def to_xarray(
     xarray.Dataset
         ``histogram`` (realization, y, x, time), and what is known of the light.
 
+    Raises
+    ------
+    TypeError
+        Counts without the system that recorded them, or a cube beside a system of its own.
+    ValueError
+        Shapes that do not fit.
+    MissingLibraryError
+        xarray (extra ``io``) is not installed.
+
     See Also
     --------
     simulate

@@ -65,6 +65,23 @@ def from_histograms(
     ------
     ValueError, TypeError
         Shapes that do not fit, counts that are no counts or more than the system can register; nothing was done.
+
+    See Also
+    --------
+    foreign_cube, from_photon_times, mars_lidar.reconstruct
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> import numpy as np
+    >>> ml.io.from_histograms(np.ones((4, 6, 128), int), system).shape
+    (1, 4, 6, 128)
+    >>> ml.io.from_histograms(np.ones((40, 24), int), system, axes="t(xy)", image=(4, 6), start_ns=25.0).shape
+    (1, 4, 6, 128)
     """
     if not isinstance(system, System):
         raise TypeError(f"system must be a System, got {type(system).__name__}")
@@ -119,6 +136,22 @@ def from_photon_times(
     ------
     ValueError, TypeError
         Times that are no numbers >= 0, or shapes that do not fit; no photon in the window.
+
+    See Also
+    --------
+    from_histograms, foreign_cube
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> import numpy as np
+    >>> times_ns = np.array([20.1, 120.2, 220.3])
+    >>> ml.io.from_photon_times(times_ns, system).registrations
+    3
     """
     if not isinstance(system, System):
         raise TypeError(f"system must be a System, got {type(system).__name__}")

@@ -102,6 +102,25 @@ class Recording(_Blocks):
         Exposures of it.
     source
         Free text: where the counts came from.
+
+    Raises
+    ------
+    ValueError, TypeError
+        A size or a number of realizations below 1, or no `System`.
+
+    See Also
+    --------
+    from_histograms, Recipe
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> ml.io.from_histograms([[0, 3] * 64], system).recipe.pixels
+    (1, 1)
     """
 
     system: System
@@ -137,7 +156,7 @@ class Recording(_Blocks):
         return np.full(self.pixels, np.nan)
 
     def replace(self, **changes: Any) -> Recording:
-        """A copy with some fields changed."""
+        """A copy with some fields changed: `changes`, by their names."""
         changes.pop("first_realization", None)  # its exposures have no numbers
         return dataclasses.replace(self, **changes)
 
@@ -163,6 +182,26 @@ class Recipe(_Blocks):
     settings
         What the cube depends on beside system, flux and seed, as plain data: `Engine.settings`. It is what a file
         keeps of the options.
+
+    Raises
+    ------
+    ValueError, TypeError
+        An argument that `mars_lidar.simulate` would refuse, or maps of another shape than the flux.
+
+    See Also
+    --------
+    simulate_to, regenerate
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> recipe = ml.io.Recipe(system=system, flux=ml.Flux([[0.5, 2.0]], 1.0, [[20.0, 60.0]]), seed=7)
+    >>> ml.io.regenerate(recipe).shape
+    (1, 1, 2, 128)
     """
 
     system: System
@@ -235,7 +274,7 @@ class Recipe(_Blocks):
     def part(self, realizations: slice, rows: slice) -> dict[str, Any]:
         """Arguments with which `mars_lidar.simulate` makes this part alone, the same bits as in the whole.
 
-        Both slices count from the start of this cube and have explicit ends.
+        Both slices, `realizations` and `rows`, count from the start of this cube and have explicit ends.
         """
         height, width = self.flux.shape
         if self.system.detector.crosstalk is not None and (rows.start, rows.stop) != (0, height):
@@ -257,7 +296,7 @@ class Recipe(_Blocks):
         }
 
     def replace(self, **changes: Any) -> Recipe:
-        """A copy with some fields changed."""
+        """A copy with some fields changed: `changes`, by their names."""
         return dataclasses.replace(self, **changes)
 
 

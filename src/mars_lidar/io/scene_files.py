@@ -28,7 +28,43 @@ _IMAGE_WORDS = ("rgb", "colors", "color", "colours", "colour", "image", "images"
 
 @dataclass(frozen=True, kw_only=True)
 class SceneFile:
-    """Where a scene is; `load` reads it. The arguments are those of `mars_lidar.Scene.from_rgbd`."""
+    """Where a scene is; `load` reads it. The arguments are those of `mars_lidar.Scene.from_rgbd`.
+
+    Parameters
+    ----------
+    depth
+        File or folder of the depth.
+    image
+        Image whose luminance is the reflectivity; None: the reflectivity is 1.
+    index
+        Frame of a file that has several.
+    depth_unit_m
+        Metres per stored unit.
+    focal_px
+        Focal length, pixels: turns depth along the axis into range along the ray.
+    max_depth_m
+        Depths beyond this are no return, m.
+
+    Raises
+    ------
+    ValueError, TypeError
+        By `load`: a file that is missing, damaged or of the wrong kind; the message names it.
+
+    See Also
+    --------
+    scan, mars_lidar.Scene.from_rgbd
+
+    Examples
+    --------
+    >>> import pathlib, tempfile
+    >>> folder = pathlib.Path(tempfile.mkdtemp())
+    >>> import numpy as np
+    >>> from mars_lidar import io
+    >>> np.save(folder / "depth.npy", np.full((32, 48), 3.0))
+    >>> scene = io.SceneFile(depth=folder / "depth.npy").load()
+    >>> scene.shape
+    (32, 48)
+    """
 
     depth: Path
     image: Path | None = None
@@ -45,14 +81,33 @@ class SceneFile:
 
 @dataclass(frozen=True)
 class Problem:
-    """A file that cannot be used, and why."""
+    """A file that cannot be used, and why.
+
+    Attributes
+    ----------
+    path
+        The file.
+    reason
+        What is wrong with it, a sentence.
+
+    See Also
+    --------
+    scan
+
+    Examples
+    --------
+    >>> import pathlib
+    >>> from mars_lidar import io
+    >>> io.Problem(pathlib.Path("depth.png"), "it is empty").reason
+    'it is empty'
+    """
 
     path: Path
     reason: str
 
     @classmethod
     def of(cls, path: Path, error: Exception) -> Problem:
-        """What an error tells."""
+        """The file at `path` with the message of an `error`."""
         return cls(path, " ".join(str(error).split()) or type(error).__name__)
 
     def __str__(self) -> str:
@@ -90,6 +145,10 @@ def scan(
 
     Parameters
     ----------
+    folder
+        Where to look.
+    pattern, image, manifest
+        What is a scene there, as above.
     depth_unit_m, focal_px, max_depth_m
         As for `mars_lidar.Scene.from_rgbd`, for all scenes; a manifest's own values come first.
     check
@@ -106,6 +165,23 @@ def scan(
     ------
     ValueError, TypeError
         A folder or manifest that does not exist, a manifest without a column ``depth``, or a bad argument.
+
+    See Also
+    --------
+    SceneFile, mars_lidar.generate
+
+    Examples
+    --------
+    >>> import pathlib, tempfile
+    >>> folder = pathlib.Path(tempfile.mkdtemp())
+    >>> import numpy as np
+    >>> from mars_lidar import io
+    >>> from PIL import Image
+    >>> np.save(folder / "0001_depth.npy", np.full((32, 48), 3.0))
+    >>> Image.new("L", (48, 32), 128).save(folder / "0001.png")
+    >>> scenes, problems = io.scan(folder)
+    >>> [scene.depth.name for scene in scenes], problems
+    (['0001_depth.npy'], [])
     """
     for name, value in (("depth_unit_m", depth_unit_m), ("focal_px", focal_px), ("max_depth_m", max_depth_m)):
         if value is not None:

@@ -42,6 +42,23 @@ class Written:
         Seconds spent in the engine and on the file.
     report
         What the engine had to tell beside the counts, numbers by name, added up.
+
+    See Also
+    --------
+    simulate_to
+
+    Examples
+    --------
+    >>> import pathlib, tempfile
+    >>> folder = pathlib.Path(tempfile.mkdtemp())
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> written = ml.io.simulate_to(folder / "pair.npz", ml.Flux([[0.5, 2.0]], 1.0, [[20.0, 60.0]]), system)
+    >>> written.path.name, written.registrations
+    ('pair.npz', 1630)
     """
 
     path: Path
@@ -112,6 +129,23 @@ def simulate_to(
         An ``.npz`` that could not be read back in this machine's memory.
     WriteError, Interrupted
         Stopped half way. A Zarr store is left marked incomplete; the other formats leave nothing.
+
+    See Also
+    --------
+    mars_lidar.simulate, load, Written
+
+    Examples
+    --------
+    >>> import pathlib, tempfile
+    >>> folder = pathlib.Path(tempfile.mkdtemp())
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> written = ml.io.simulate_to(folder / "pair.zarr", ml.Flux([[0.5, 2.0]], 1.0, [[20.0, 60.0]]), system)
+    >>> ml.io.load(written.path).registrations == written.registrations
+    True
     """
     progress = callback_of(progress, "simulating")
     drawn_by = find_engine(engine, **options)
@@ -187,6 +221,30 @@ def regenerate(
     -------
     NDArray
         (realizations, rows, W, bins): the bits of the cube, with the same engine on the same version.
+
+    Raises
+    ------
+    ValueError, TypeError
+        A part outside of the cube, another table than the cube's, or a measured cube, which has no recipe.
+
+    See Also
+    --------
+    verify, photons
+
+    Examples
+    --------
+    >>> import pathlib, tempfile
+    >>> folder = pathlib.Path(tempfile.mkdtemp())
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> path = folder / "pair.npz"
+    >>> written = ml.io.simulate_to(path, ml.Flux([[0.5, 2.0]], 1.0, [[20.0, 60.0]]), system)
+    >>> cube = ml.io.load(path)
+    >>> bool((ml.io.regenerate(cube) == cube.histogram).all())
+    True
     """
     recipe = _repeatable(cube.simulation("simulating again") if isinstance(cube, Cube) else cube, table)
     parts = []
@@ -207,6 +265,40 @@ def verify(
 
     A cube that was made with a table needs that `table`; another one is refused. Of a Zarr store every byte is compared
     with its manifest as well.
+
+    Parameters
+    ----------
+    cube
+        What `load` returned.
+    threads
+        As for `mars_lidar.simulate`.
+    progress
+        Called as ``progress(done, total)``; True: a bar.
+    table
+        The table that the cube was made with, if there was one.
+
+    Raises
+    ------
+    ValueError, TypeError
+        A measured or incomplete cube, or another table than the cube's.
+
+    See Also
+    --------
+    regenerate, load
+
+    Examples
+    --------
+    >>> import pathlib, tempfile
+    >>> folder = pathlib.Path(tempfile.mkdtemp())
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> path = folder / "pair.npz"
+    >>> written = ml.io.simulate_to(path, ml.Flux([[0.5, 2.0]], 1.0, [[20.0, 60.0]]), system)
+    >>> ml.io.verify(ml.io.load(path))
+    True
     """
     progress = callback_of(progress, "verifying")
     recipe = _repeatable(cube.simulation("simulating again"), table)

@@ -35,6 +35,25 @@ class SpadMat:
         Signal over background.
     photons
         Mean signal photons of a pixel.
+
+    See Also
+    --------
+    read_mat, save_mat
+
+    Examples
+    --------
+    >>> import pathlib, tempfile
+    >>> folder = pathlib.Path(tempfile.mkdtemp())
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> flux = ml.Flux(signal=[[0.5, 2.0]], background=1.0, delay_ns=[[20.0, 60.0]])
+    >>> cube = ml.Cube(ml.simulate(flux, system), system, flux)
+    >>> ml.io.save_mat(folder / "spad.mat", cube)
+    >>> ml.io.read_mat(folder / "spad.mat").histogram.shape
+    (1, 2, 128)
     """
 
     histogram: NDArray[Any]
@@ -49,10 +68,34 @@ class SpadMat:
 def read_mat(path: str | Path) -> SpadMat:
     """Read a file of this layout, of mars-lidar or of others.
 
+    Parameters
+    ----------
+    path
+        The ``.mat``.
+
     Raises
     ------
     ValueError
         Not such a file, or damaged; the message starts with the file.
+
+    See Also
+    --------
+    save_mat, SpadMat
+
+    Examples
+    --------
+    >>> import pathlib, tempfile
+    >>> folder = pathlib.Path(tempfile.mkdtemp())
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> flux = ml.Flux(signal=[[0.5, 2.0]], background=1.0, delay_ns=[[20.0, 60.0]])
+    >>> cube = ml.Cube(ml.simulate(flux, system), system, flux)
+    >>> ml.io.save_mat(folder / "spad.mat", cube)
+    >>> ml.io.read_mat(folder / "spad.mat").bin.shape
+    (1, 2)
     """
     with reading(path, "a .mat of counts") as source:
         return _spad(source, mat.read_variables(source))
@@ -117,6 +160,25 @@ def save_mat(
         A bad argument, or a cube that the format cannot hold.
     OSError
         `path` exists and `overwrite` is false, or cannot be written.
+
+    See Also
+    --------
+    read_mat, save
+
+    Examples
+    --------
+    >>> import pathlib, tempfile
+    >>> folder = pathlib.Path(tempfile.mkdtemp())
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> flux = ml.Flux(signal=[[0.5, 2.0]], background=1.0, delay_ns=[[20.0, 60.0]])
+    >>> cube = ml.Cube(ml.simulate(flux, system), system, flux)
+    >>> ml.io.save_mat(folder / "spad.mat", cube)
+    >>> round(ml.io.read_mat(folder / "spad.mat").sbr, 2)
+    1.25
     """
     target = Path(path)
     if target.suffix != ".mat":

@@ -64,6 +64,20 @@ def read_transient(
     ValueError
         A file that is missing, damaged or of the wrong kind, or does not tell its bin width: the message starts
         with the file.
+
+    See Also
+    --------
+    Transient, mars_lidar.Flux.from_transient
+
+    Examples
+    --------
+    >>> import pathlib, tempfile
+    >>> folder = pathlib.Path(tempfile.mkdtemp())
+    >>> import numpy as np
+    >>> from mars_lidar import io
+    >>> np.save(folder / "render.npy", np.ones((4, 6, 50)))
+    >>> io.read_transient(folder / "render.npy", bin_ns=0.1).bin_ns
+    0.1
     """
     source = Path(path)
     if not source.is_file():

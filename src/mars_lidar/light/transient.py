@@ -103,6 +103,22 @@ class Transient:
         Where it comes from, for the record.
     totals
         (H, W), sums over all bins, where they are known already: else the values are read once for them.
+
+    Raises
+    ------
+    ValueError, TypeError
+        Values of another shape, negative or no numbers; a width that is not positive.
+
+    See Also
+    --------
+    read_transient, mars_lidar.Flux.from_transient
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from mars_lidar import io
+    >>> io.Transient(np.ones((4, 6, 50)), bin_ns=0.1, start_ns=3.0).values.shape
+    (4, 6, 50)
     """
 
     @checked
@@ -145,7 +161,7 @@ class Transient:
 
     @checked
     def resize(self, size: int | tuple[int, int]) -> Transient:
-        """At another size, (H, W) or the longer side: mean light over the area of the new pixels; nothing is read."""
+        """At another `size`, (H, W) or the longer side: mean light over the area of the new pixels; nothing is read."""
         return self._with(resized(self.values, new_size(size, self.shape)))
 
     def _with(self, values: RateArray) -> Transient:
@@ -274,8 +290,9 @@ class Transient:
     ) -> StoredFlux:
         """The flux as `flux` gives it, for a transient larger than memory: rows are read when they are used.
 
-        `mars_lidar.io.simulate_to` takes it band by band. Parameters and errors are those of `flux`; the transient
-        is read once at this call, for its `totals`.
+        `mars_lidar.io.simulate_to` takes it band by band. Parameters (`system`, `signal`, `photons_per_unit`, `sbr`,
+        `dark_count_hz`, `pulse`, `parts`) and errors are those of `flux`; the transient is read once at this call, for
+        its `totals`.
         """
 
         level: dict[str, Any] = {"signal": signal, "photons_per_unit": photons_per_unit, "sbr": sbr}
@@ -297,7 +314,7 @@ class Transient:
         return f"{self.source}: " if self.source else ""
 
     def rows(self, rows: slice) -> FloatArray:
-        """Light of some rows (rows, W, T), checked."""
+        """Light of some `rows` (rows, W, T), checked."""
         values = np.asarray(self.values[rows])
         if values.dtype.kind not in "fiu":
             error = ValueError if self.source else TypeError  # of a file, or of an argument

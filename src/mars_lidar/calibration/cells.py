@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 
+from mars_lidar._base.cached import cached_property
 from mars_lidar._base.native import _core
 from mars_lidar._base.types import FloatArray
 from mars_lidar.calibration.model import Model, Streams

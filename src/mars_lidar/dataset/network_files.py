@@ -17,7 +17,6 @@ import re
 import tarfile
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +25,7 @@ from numpy.typing import NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
+from mars_lidar._base.cached import cached_property
 from mars_lidar._base.files import beside
 from mars_lidar._base.memory import check_memory
 from mars_lidar._base.progress import callback_of

@@ -20,7 +20,6 @@ import math
 import shutil
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.buckets import in_bucket
+from mars_lidar._base.cached import cached_property
 from mars_lidar._base.files import reading
 from mars_lidar.dataset.arrays import FLAT_KEYS, create_maps, fitting, grid
 from mars_lidar.dataset.sample_content import Rendered, Shown, Surfaces

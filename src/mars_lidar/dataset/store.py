@@ -18,7 +18,6 @@ import math
 import shutil
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +27,7 @@ from numpy.typing import NDArray
 from mars_lidar._base import checks, manifest
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.buckets import content_of, in_bucket, place_of, remove, sizes, zarr_store
+from mars_lidar._base.cached import cached_property
 from mars_lidar._base.files import INCOMPLETE_SUFFIX, FileError, IncompleteFileError, reading
 from mars_lidar.dataset.arrays import (
     FORMAT,

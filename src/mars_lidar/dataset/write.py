@@ -8,12 +8,13 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.cached import cached_property
 from mars_lidar.dataset.arrays import MAPS, sample_parts, with_zeros
 from mars_lidar.dataset.sample_content import Shown
 from mars_lidar.dataset.shard import DigestNotes, chunks_of, packer, write_shard

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.cached import cached_property
 from mars_lidar._base.memory import check_memory
 from mars_lidar._base.types import Progress
 from mars_lidar.instrument.detector import MODES, Detector, Mode

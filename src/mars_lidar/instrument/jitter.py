@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -12,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import constructed_by_name
+from mars_lidar._base.cached import cached_property
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.pulse import FWHM_PER_SIGMA, SampledPulse
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
+from mars_lidar._base.cached import cached_property
 from mars_lidar._base.late import late
 from mars_lidar._base.notebook import as_html
 from mars_lidar.instrument.system import System

@@ -18,7 +18,6 @@ import math
 from abc import abstractmethod
 from copy import copy
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,6 +25,7 @@ from numpy.typing import ArrayLike
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.brief import brief
+from mars_lidar._base.cached import cached_property
 from mars_lidar._base.memory import check_memory
 from mars_lidar._base.native import _core
 from mars_lidar._base.notebook import as_html

@@ -9,12 +9,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mars_lidar._base.cached import cached_property
 from mars_lidar._base.native import _core
 from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics.cells import Cells, whole_bins

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cached_property
 from typing import Any, Literal, get_args
 
 import numpy as np
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
+from mars_lidar._base.cached import cached_property
 from mars_lidar._base.notebook import as_html
 from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import FloatArray, IndexArray

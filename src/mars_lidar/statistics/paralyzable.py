@@ -8,12 +8,12 @@ time are independent. Equation numbers: docs/theory_detectors.md.
 from __future__ import annotations
 
 import math
-from functools import cached_property
 
 import numpy as np
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
+from mars_lidar._base.cached import cached_property
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux

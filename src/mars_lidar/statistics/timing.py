@@ -10,11 +10,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.cached import cached_property
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.effects import TIMING_EFFECTS, code_edges
 from mars_lidar.instrument.system import System

@@ -250,10 +250,7 @@ def test_table():
 @pytest.mark.full
 def test_long_exposures_are_those_of_the_closed_form(tmp_path):
     assert main(["long-exposures", "--quick", "--out", str(tmp_path)]) == 0
-    rows = [row for row in read_csv(tmp_path / "long_exposures.csv") if int(row["cells"])]
-    assert len(rows) == 3
-    for row in rows:  # 1000 exposures
-        assert float(row["largest"]) < 0.05 + 5.5 / np.sqrt(1000)
-        assert abs(float(row["count"])) < 0.05 + 5.5 / np.sqrt(1000)
-        assert float(row["var bins"]) == pytest.approx(1.0, abs=5.5 * np.sqrt(2 / 1000 / 64))
-    assert "3 of 3 systems" in (tmp_path / "long_exposures.md").read_text()
+    outcomes = [row["outcome"] for row in read_csv(tmp_path / "long_exposures.csv")]
+    assert outcomes.count("right") >= 3
+    assert "wrong" not in outcomes
+    assert f"{outcomes.count('right')} " in (tmp_path / "long_exposures.md").read_text()

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.brief import brief
+from mars_lidar._base.threads import one_blas_thread
 from mars_lidar._base.types import FloatArray
 from mars_lidar.calibration import start, suspects
 from mars_lidar.calibration.curves import Curves, Realizations, curves, realizations
@@ -235,6 +236,7 @@ class Calibration:
 
 
 @checked
+@one_blas_thread
 def calibrate(
     times: Timestamps | Sequence[Timestamps] | ArrayLike,
     given: System | Detector | Mapping[str, Any] | None = None,

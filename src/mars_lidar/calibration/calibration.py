@@ -541,7 +541,7 @@ class _Run:
                 option = "calibrate parts of the recording; the errors include what the parts scatter"
                 named.append(Suspect(words, abs(drift.trend[k]), change, error, np.nan, option, included=False))
         families = {suspect.name for suspect in named}
-        for score in listed if p < self.level else ():
+        for score in listed:
             if score.z > suspects.clear(listed) and score.effect.words not in families:
                 families.add(score.effect.words)
                 option = f"given {score.effect.names[0]}"

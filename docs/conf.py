@@ -188,9 +188,7 @@ def _commands() -> str:
     from mars_lidar.cli import app
     from mars_lidar.cli.options import describe
 
-    for name in app:
-        if not name.startswith("-"):
-            describe(app[name])
+    describe(app)
     text = app.generate_docs(output_format="markdown").replace("# mars-lidar\n", "# Command line\n", 1)
     overview, *sections = re.split(r"(?m)^(?=## mars-lidar [a-z])", text)
     commands = {name: app[name].help_epilogue for name in app}

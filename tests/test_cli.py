@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -405,6 +406,45 @@ def test_help_teaches_and_starts_light():
     code = f"import sys, mars_lidar.cli; print(*({heavy!r} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == ""
+
+
+def install_completion(home: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    env = {name: value for name, value in os.environ.items() if name not in ("ZSH", "ZSH_CUSTOM")} | {"HOME": str(home)}
+    return subprocess.run(command("--install-completion", *arguments), env=env, capture_output=True, text=True)
+
+
+@pytest.mark.skipif(shutil.which("bash") is None or sys.platform == "win32", reason="needs bash")
+def test_bash_completes_commands_and_options_once_installed(tmp_path):
+    (tmp_path / ".bashrc").write_text("export OWN=1\n")
+    done = install_completion(tmp_path, "--shell", "bash")
+    assert done.returncode == 0, done.stderr
+    script = tmp_path / ".local/share/bash-completion/completions/mars-lidar"
+    changed = {path for path in tmp_path.rglob("*") if path.is_file()}
+    assert changed == {script, tmp_path / ".bashrc"}
+    assert all(str(path) in done.stdout for path in changed)
+    for words, expected in {
+        "mars-lidar recon": "reconstruct",
+        "mars-lidar table ": "build clear info",
+        "mars-lidar reconstruct --meth": "--method",
+        "mars-lidar simulate --detec": "--detection-efficiency --detector",
+    }.items():
+        ask = f"""
+            source ~/.bashrc; [[ $OWN == 1 ]]
+            COMP_LINE='{words}' COMP_POINT={len(words)} COMP_WORDS=({words!s} {"''" if words.endswith(" ") else ""})
+            COMP_CWORD=$((${{#COMP_WORDS[@]}} - 1))
+            $(complete -p mars-lidar | sed 's/.*-F \\([^ ]*\\) .*/\\1/')
+            printf '%s\\n' "${{COMPREPLY[@]}}" | sort | xargs"""
+        replies = subprocess.run(
+            ["bash", "--norc", "-c", ask], env=os.environ | {"HOME": str(tmp_path)}, capture_output=True, text=True
+        )
+        assert replies.stdout.strip() == expected, (words, replies.stderr)
+
+
+def test_a_completion_that_is_refused_changes_nothing(tmp_path):
+    done = install_completion(tmp_path, "--shell", "tcsh")
+    assert done.returncode == 2
+    assert "--shell must be one of 'zsh', 'bash', 'fish', 'powershell', got 'tcsh'" in done.stderr
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_nothing_is_written_into_a_store(tmp_path):

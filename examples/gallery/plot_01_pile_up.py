@@ -2,10 +2,12 @@
 Pile-up against the Poisson model
 =================================
 
-A bright surface at a delay of 40 ns, and a pixel with a dead time of 75 ns. A model without dead time (Poisson)
-predicts the grey histogram; the pixel registers far fewer photons, too many of them early, and a shadow follows the
-pulse. The exact mean, computed without simulation, agrees with the simulated counts. The program prints
+A pixel with a dead time of 75 ns receives light from a bright surface at a delay of 40 ns. A model without dead time
+(Poisson) predicts the grey histogram; the pixel registers far fewer photons, too many of them early, and a shadow
+follows the pulse. The exact mean, computed without simulation, agrees with the simulated counts. The program prints
 ``45% of the photons are registered.``
+
+Theory: :doc:`/theory_exposure`.
 """
 
 import matplotlib.pyplot as plt

@@ -6,6 +6,8 @@ The law of the count against 10,000 draws
 end of the exposure; ten thousand simulated exposures follow it. The Gaussian of the MaRS paper is close for large
 counts. The renewal law of constant light with equal energy is too wide, because pulsed light makes registrations more
 regular. The program prints ``Variance 7.08 drawn, 7.11 by the exact law.``
+
+Theory: :doc:`/theory_exposure`, :doc:`/theory`.
 """
 
 import matplotlib.pyplot as plt

@@ -2,10 +2,12 @@
 Depth error against the Cramer-Rao bound
 ========================================
 
-The depth error of each method from dim to bright light, and the least error of any unbiased estimator. Methods that
-do not model the dead time depart from the bound where pile-up begins: more light makes them worse. Bars are standard
-errors over 1000 exposures. At S = 10 one fit in 1000 fails and has no standard error. The program prints
-``Maximum likelihood: 1.01 of the bound, S from 0.04 to 6.``
+The depth error of each method from dim to bright light, beside the Cramer-Rao bound: the least error of any unbiased
+estimator. Methods that do not model the dead time depart from the bound where pile-up begins: more light makes them
+worse. Bars are standard errors over 1000 exposures. At S = 10 one fit in 1000 fails and has no standard error. The
+program prints ``Maximum likelihood: 1.01 of the bound, S from 0.04 to 6.``
+
+Theory: :doc:`/theory_reconstruction`.
 """
 
 import matplotlib.pyplot as plt

@@ -6,6 +6,8 @@ The same light on four pixels: free-running, where photons in the dead time are 
 prolong it; synchronous, which registers the first photon of each laser period; gated, which registers nothing outside
 of its gate. Dots are simulated, lines are the exact mean. The program prints ``The paralyzable pixel registers 82% of
 the free-running one's photons.``
+
+Theory: :doc:`/theory_detectors`. How-to: :doc:`/detectors`.
 """
 
 import matplotlib.pyplot as plt

@@ -3,8 +3,11 @@ Fog and glass
 =============
 
 The same wall in clear air, behind a pane of glass, and in fog. A pane adds a return to every pixel; fog scatters light
-back from every depth in front of the wall and attenuates the wall's. Registrations of the early light cost the wall
-further ones, by dead time. The program prints ``Counts of the wall: 76,903 in clear air, 7,358 in fog.``
+back from every depth in front of the wall and attenuates the wall's light. The early light also makes the pixel dead
+when the wall's light arrives, so that the wall loses further counts. The program prints ``Counts of the wall: 76,903 in
+clear air, 7,358 in fog.``
+
+How-to: :doc:`/transients`.
 """
 
 import matplotlib.pyplot as plt

@@ -6,6 +6,8 @@ A renderer gives light over time for each pixel, here a wall with a later second
 convolved with the pulse and registered by a pixel with dead time. The generalised Coates correction recovers it
 without a model of the light, apart from the noise of bins that were seldom armed. The program prints
 ``The second bounce: 17% of its photons registered.``
+
+How-to: :doc:`/transients`. Theory: :doc:`/theory_reconstruction`.
 """
 
 import matplotlib.pyplot as plt

@@ -7,6 +7,8 @@ detector with errors, tests whether the model fits, and names effects outside of
 simulated, with afterpulses of which the model is not informed: they are detected and fitted. Left, the times between
 successive registrations: none within the dead time, and a slow decay after it. Right, the times in the laser period.
 The program prints ``Detected: afterpulses. Dead time within 2 standard errors of 50 ns: True.``
+
+How-to: :doc:`/calibration`. Theory: :doc:`/calibration_method`.
 """
 
 import matplotlib.pyplot as plt

@@ -6,6 +6,8 @@ A network on an endless stream
 of three convolutions learns in seconds, on a processor, the bin of the return in dim scenes. The matched filter, for
 comparison, uses one pixel at a time. From the left: the true depth, the matched filter's, the network's.
 The program prints ``The network's median error is below the matched filter's: True.``
+
+How-to: :doc:`/learn`.
 """
 
 import matplotlib.pyplot as plt

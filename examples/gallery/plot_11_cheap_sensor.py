@@ -6,6 +6,8 @@ The same room and light with an ideal detector and with one of a few euros: dark
 crosstalk, electronics that record one event a period, a converter with uneven codes. Each effect is an option of the
 detector. The depth is that of the largest bin.
 The program prints ``Median depth error: 14 mm ideal, 33 mm cheap.``
+
+How-to: :doc:`/detectors`. Theory: :doc:`/theory_detectors`.
 """
 
 import matplotlib.pyplot as plt

@@ -6,6 +6,8 @@ Dead time correlates the bins of a histogram. Simulators that draw a count and d
 and every multinomial) have the right mean of each bin and the right count, but the wrong covariance: a registration
 excludes others less than a dead time away. `mars_lidar.joint_law` gives the covariance exactly. The program
 prints ``Variance of the counts at the pulse: 157 by the exact law, 109 by count times shape.``
+
+Theory: :doc:`/joint_law`.
 """
 
 import matplotlib.pyplot as plt

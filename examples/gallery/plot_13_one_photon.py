@@ -6,6 +6,8 @@ In this room each pixel registers on average one signal and one background photo
 alone, half of the pixels have no depth, or that of a background photon. Method ``image`` uses the neighbouring pixels
 and states its uncertainty: pixels whose depth may be that of another surface have no interval. The program prints
 ``Wrong depths: 55% alone, 1.8% by the image.``
+
+How-to: :doc:`/reconstruction`. Theory: :doc:`/theory_reconstruction`.
 """
 
 import matplotlib.pyplot as plt

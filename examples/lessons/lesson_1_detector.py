@@ -42,13 +42,13 @@ def arrivals(signal: float, background: float, periods: int) -> np.ndarray:
 
 
 def registered(times: np.ndarray) -> np.ndarray:
-    """Of them those that the detector registers."""
-    kept, ready = [], -np.inf
+    """Those of the times at which the detector is armed."""
+    accepted, armed_from = [], -np.inf
     for time in times:
-        if time >= ready:
-            kept.append(time)
-            ready = time + dead_time_ns
-    return np.array(kept)
+        if time >= armed_from:
+            accepted.append(time)
+            armed_from = time + dead_time_ns
+    return np.array(accepted)
 
 
 photons = arrivals(1.5, 1.5, 6)

@@ -73,22 +73,22 @@ plt.show()
 # Correlations: bins are not independent
 # --------------------------------------
 #
-# One registration excludes others for a dead time, so that the counts of neighbouring bins are negatively correlated,
-# and those of bins a dead time apart positively. ``ml.joint_law`` gives the exact covariance of all bins of a finite
-# exposure:
+# One registration excludes all others for a dead time. The bins of the return compete for one registration per period,
+# and with the background: what one bin gains, others lose (blue). Two registrations often follow each other after the
+# dead time of 75 ns and before the next return, so that background bins 75 to 100 ns apart, which in the period is also
+# 0 to 25 ns apart, gain together (red). ``ml.joint_law`` gives the exact covariance of all bins of a finite exposure:
 
 joint = ml.joint_law(ml.Flux(5.0, 0.5, 40.0), system)
 covariance = joint.covariance()
 spread = np.sqrt(np.diag(covariance))
 correlation = covariance / np.outer(spread, spread)
 np.fill_diagonal(correlation, np.nan)
-limit = np.nanmax(np.abs(correlation))
 
 fig, ax = plt.subplots(figsize=(4.6, 3.8))
-image = ax.imshow(correlation, cmap="RdBu_r", vmin=-limit, vmax=limit, origin="lower", extent=(0, 100, 0, 100))
-fig.colorbar(image, label="correlation of two bins")
+image = ax.imshow(correlation, cmap="RdBu_r", vmin=-0.05, vmax=0.05, origin="lower", extent=(0, 100, 0, 100))
+fig.colorbar(image, label="correlation of two bins", extend="min")
 ax.set(xlabel="time of one bin (ns)", ylabel="time of the other (ns)")
-ax.set_title("S = 5, B = 0.5, return at 40 ns")
+ax.set_title(f"S = 5, B = 0.5, return at 40 ns; least {np.nanmin(correlation):.2f}")
 plt.show()
 near = slice(35, 45)
 window = covariance[near, near].sum() / np.trace(covariance[near, near])

@@ -117,7 +117,7 @@ export class Figure {
     const facts = [["Arriving photons, mean", digits(photons, 5)], ["Registered, this exposure", draw.registered.toLocaleString("en")]];
     if (mean) {
       facts.push(["Registered, exact mean", `${digits(mean.cumulants[0], 6)} ± ${digits(Math.sqrt(mean.cumulants[1]), 3)}`]);
-      if (mean.cumulants[0] > 0) facts.push(["Variance over mean", digits(mean.cumulants[1] / mean.cumulants[0], 3)], ["Photons lost", `${digits(100 * (1 - mean.cumulants[0] / photons), 3)} %`]);
+      if (mean.cumulants[0] > 0) facts.push(["Variance over mean", digits(mean.cumulants[1] / mean.cumulants[0], 3)], ["Photons lost", `${digits(Math.abs(+(100 * (1 - mean.cumulants[0] / photons)).toFixed(9)), 3)} %`]);
     }
     const known = truth.signal > 0, where = metres(truth.delay, period), range = metres(1, period);
     const off = (depth) => { // the shorter way round the range

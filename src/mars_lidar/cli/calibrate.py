@@ -50,16 +50,16 @@ class StreamOptions:
         """Times (n,) and clock unit, ns, of a recording without a laser, and rows that describe the file."""
         from mars_lidar.io.streams.files import recorded
 
-        found = recorded(stream, unit_ns=self.unit_ns, variable=self.variable)
-        channels, counts = np.unique(found.detector[found.detector >= 0], return_counts=True)
+        recording = recorded(stream, unit_ns=self.unit_ns, variable=self.variable)
+        channels, counts = np.unique(recording.detector[recording.detector >= 0], return_counts=True)
         if not channels.size:
             raise ValueError(f"{stream} holds no photons")
         y, x = (0, int(channels[counts.argmax()])) if self.pixel is None else two_integers("--pixel", self.pixel)
         if y != 0 or x not in channels:
             raise ValueError(f"--pixel must be 0,C with a channel C of {', '.join(map(str, channels))}, got ({y}, {x})")
-        times = found.clock[found.detector == x].astype(np.float64) * found.clock_ns
+        times = recording.clock[recording.detector == x].astype(np.float64) * recording.clock_ns
         rows = [("file", f"{stream}: {int(counts.sum()):,} photons"), ("channel", f"{x}: {times.size:,} photons")]
-        return times, found.clock_ns, rows
+        return times, recording.clock_ns, rows
 
     def load(self, stream: Path) -> tuple[Timestamps, list[tuple[str, str]]]:
         """The stream of one pixel, and rows that describe file and pixel."""
@@ -161,9 +161,10 @@ def calibrate(
     ] = None,
     overwrite: Annotated[bool, output_option("Replace existing files.")] = False,
 ) -> int | None:
-    """Light and detector of a photon stream, each with an error, a verdict, and what is suspect.
+    """Fit light and detector to a measured photon stream.
 
-    Nothing is assumed but what --given says; of a simulated stream only the photons are used. Without a laser: dead
+    Each estimate has a standard error; a verdict says whether the model fits, and what is suspect where it does not.
+    Only what --given states is assumed; of a simulated stream only the photons are used. Without a laser: dead
     time, jitter and afterpulses in constant light. Of a cube: dead time and pulse width that its pixels share.
     """
     from mars_lidar.io.streams.photons import NoLaserError

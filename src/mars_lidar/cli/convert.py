@@ -52,7 +52,10 @@ def convert(
     clock_ps: ClockPs = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Write a cube or a photon stream in another format, and tell what the other format cannot hold."""
+    """Write a cube or a photon stream in another format.
+
+    What the other format cannot hold is listed.
+    """
     from mars_lidar.dataset.store import is_dataset
     from mars_lidar.io.conversion import convert as converted
 
@@ -94,9 +97,9 @@ def timestamps(
     clock_ps: ClockPs = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Write the photons of a stored cube, one by one, with their times: the cube is simulated again.
+    """Write the photons of a cube one by one, with their times.
 
-    The histogram of the photons is the cube's exposure, count by count; this is checked.
+    The cube is simulated again. The histogram of the photons is the cube's exposure, count by count; this is checked.
     """
     from mars_lidar.io.conversion import photons, resolution_ns
     from mars_lidar.io.cube import load
@@ -109,12 +112,12 @@ def timestamps(
     times.save(out, overwrite=overwrite, clock_ps=clock_ps)
     unit = resolution_ns(out, times, clock_ps)
     height, width = times.shape
-    told = "as simulated" if unit == 0.0 else f"in units of {1e3 * unit:.4g} ps; cycles and bins are exact"
+    resolution = "as simulated" if unit == 0.0 else f"in units of {1e3 * unit:.4g} ps; cycles and bins are exact"
     image = 2 * height * width * times.period_ns / unit if out.suffix == ".ptu" else 0.0
     if image > _LARGE_IMAGE:
-        told += f"; other programs make an image of {image / 1e9:.2g} GB of it, --clock-ps a smaller one"
+        resolution += f"; other programs make an image of {image / 1e9:.2g} GB of it, --clock-ps a smaller one"
     content = f"{len(times):,} photons of {height} × {width} pixels"
-    table({"wrote": str(out), "content": content, "times": told})
+    table({"wrote": str(out), "content": content, "times": resolution})
 
 
 convert_command = command(convert, CONVERT_EXAMPLES)

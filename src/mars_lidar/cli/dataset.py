@@ -126,11 +126,12 @@ def generate(
     finish: Annotated[bool, output_option("Check that all parts are there, and mark the store complete.")] = False,
     dry_run: Annotated[bool, output_option("Tell size, time and memory; write nothing.")] = False,
 ) -> int | None:
-    """Simulate a dataset: scenes x systems x levels of light x realizations, into one Zarr store.
+    """Simulate a dataset of many scenes, systems and levels of light.
 
-    With a recipe, options replace its values. The store does not depend on threads, workers or interruptions: the
-    same recipe gives the same files, byte for byte. Files that cannot be used are left out and told at the end.
-    Fog, panes, folders of transients and all else that has no option stand in a recipe.
+    Every scene with every system, level of light and realization, into one Zarr store. With a recipe, options
+    replace its values. The store does not depend on threads, workers or interruptions: the same recipe gives the
+    same files, byte for byte. Files that cannot be used are left out, and listed at the end. Fog, panes, folders of
+    transients and all else that has no option stand in a recipe.
     """
     from mars_lidar import dataset
 
@@ -176,8 +177,8 @@ def generate(
         tell(dataset.begin(recipe, out, resume=resume, overwrite=overwrite, workers=workers, scheduler=scheduler))
         return None
     here = workers is None and scheduler is None and not (resume and out.exists())
-    if here and recipe is not None and (told := str(dataset.quick_advice(recipe, threads))):
-        say(told)
+    if here and recipe is not None and (advice := str(dataset.quick_advice(recipe, threads))):
+        say(advice)
     with progress_bar("generating") as progress:
         done = dataset.generate(
             recipe,
@@ -202,16 +203,19 @@ def verify(
     seed: Annotated[Integer, option("Seed of the choice.", "0")] = 0,
     threads: Annotated[Integer | None, option("Threads.", "all cores")] = None,
 ) -> int | None:
-    """Simulate random chunks of a dataset again and compare every count; exit code 1 if they differ."""
+    """Simulate chunks of a dataset again and compare every count.
+
+    The chunks are chosen at random; exit code 1 if a count differs.
+    """
     from mars_lidar.dataset import verify as verified
 
     with progress_bar("verifying") as progress:
-        told = verified(path, chunks=None if every else chunks, seed=seed, threads=threads, progress=progress)
-    if told.good:
-        table([("verified", f"{told.chunks} of {told.of} chunks simulated again, every count is the same")])
+        checked = verified(path, chunks=None if every else chunks, seed=seed, threads=threads, progress=progress)
+    if checked.good:
+        table([("verified", f"{checked.chunks} of {checked.of} chunks simulated again, every count is the same")])
         return None
-    table([("verified", f"NO: see below; {told.chunks} of {told.of} chunks simulated again")])
-    for line in told.different:
+    table([("verified", f"NO: see below; {checked.chunks} of {checked.of} chunks simulated again")])
+    for line in checked.different:
         say(line)
     return FAILED
 
@@ -283,7 +287,10 @@ def export(
     layout: Annotated[Text, option("Whose loader reads it: lindell, deepsensorfusion, sun, gutierrez or webdataset.")],
     fill: Annotated[bool, option("Pixels without a return take depth and rates of the nearest with one.")] = False,
 ) -> None:
-    """Write a dataset as the files that depth networks load: one .mat an exposure and their list, or tars."""
+    """Write a dataset as the files that depth networks load.
+
+    One .mat for each exposure and a list of them, or tar archives.
+    """
     from mars_lidar.dataset.network_files import export as exported
 
     with progress_bar("exporting") as progress:
@@ -302,17 +309,17 @@ def dataset_rows(path: Path) -> list[tuple[str, str]] | None:
     rows = [("file", f"{path} (mars-lidar {stored.attrs['version']})")]
     if not stored.planned:
         return [*rows, ("complete", "NO: stopped before its scenes were in; generate it again with --resume")]
-    left = [] if stored.complete else stored.missing()
+    missing = [] if stored.complete else stored.missing()
     total = sum(1 for _ in stored.items())
     array, recipe = stored.histogram, stored.recipe
     levels = ", ".join(f"{s:g}/{b:g}" for s, b in recipe.light.levels[:8])
     problems = len(stored.problems)
-    whole = "NO: all parts are there; continue with --resume"
+    whole = f"NO: {total - len(missing)} of {total} parts are there; continue with --resume"
     if stored.complete:
         whole = f"yes; {manifest.description(path)}"
     return [
         *rows,
-        ("complete", f"NO: {total - len(left)} of {total} parts are there; continue with --resume" if left else whole),
+        ("complete", whole),
         ("counts", f"{_shape(array.shape)} {array.dtype}, {recipe.layout}"),
         (
             "size",
@@ -320,9 +327,9 @@ def dataset_rows(path: Path) -> list[tuple[str, str]] | None:
         ),
         ("chunk", f"{_dimensions(array.chunks)} of a shard of {_dimensions(array.shards)}"),
         ("engine", f"{recipe.engine}, seed {recipe.seed}"),
-        *((f"system {k}", one.to_json()) for k, one in enumerate(recipe.systems)),
+        *((f"system {k}", system.to_json()) for k, system in enumerate(recipe.systems)),
         ("light", f"signal/sbr {levels}{', ...' if len(recipe.light.levels) > 8 else ''}"),
-        ("scenes", ", ".join(json.dumps(one) for one in recipe.scenes)),
+        ("scenes", ", ".join(json.dumps(scene) for scene in recipe.scenes)),
         ("left out", files(problems)),
         *(("", str(problem)) for problem in stored.problems[:20]),
         ("open with", f"xarray.open_zarr({str(path)!r})"),
@@ -353,22 +360,22 @@ def _tell_problems(problems: tuple[Problem, ...]) -> None:
         say(f"left out: {problem}")
 
 
-def tell_estimate(told: Estimate) -> int | None:
+def tell_estimate(expected: Estimate) -> int | None:
     """What `--dry-run` expects; exit code 2 where the disk is too small."""
-    shards = f"{told.shards:,} shard{'s' * (told.shards > 1)}"
+    shards = f"{expected.shards:,} shard{'s' * (expected.shards > 1)}"
     rows = [
-        ("dataset", _shape(told.shape)),
-        ("scenes", f"{told.scenes:,}"),
-        ("size", f"about {_bytes(told.bytes)} on disk, of {_bytes(told.dense_bytes)} dense; {shards}"),
-        ("chunk", _dimensions(told.chunk)),
-        ("time", f"about {span(told.seconds)} on {told.threads} threads of this machine"),
-        ("memory", f"at most {_bytes(told.memory_bytes)}"),
+        ("dataset", _shape(expected.shape)),
+        ("scenes", f"{expected.scenes:,}"),
+        ("size", f"about {_bytes(expected.bytes)} on disk, of {_bytes(expected.dense_bytes)} dense; {shards}"),
+        ("chunk", _dimensions(expected.chunk)),
+        ("time", f"about {span(expected.seconds)} on {expected.threads} threads of this machine"),
+        ("memory", f"at most {_bytes(expected.memory_bytes)}"),
     ]
-    short = told.free_bytes is not None and told.bytes > told.free_bytes
-    if told.free_bytes is not None:
-        rows.append(("disk", f"{_bytes(told.free_bytes)} free{': NOT ENOUGH' if short else ''}"))
+    short = expected.free_bytes is not None and expected.bytes > expected.free_bytes
+    if expected.free_bytes is not None:
+        rows.append(("disk", f"{_bytes(expected.free_bytes)} free{': NOT ENOUGH' if short else ''}"))
     table(rows)
-    _tell_problems(told.problems)
+    _tell_problems(expected.problems)
     if short:
         return BAD_INPUT
     return None

@@ -91,30 +91,31 @@ class ForeignOptions:
                     f"{path} is not a cube written by mars-lidar; for one of others give {_NEEDED}"
                 ) from error
         if path.suffix in SUFFIXES and path.suffix not in FOREIGN_SUFFIXES:
-            told = ", ".join(f"--{name.replace('_', '-')}" for name in self._given)
-            raise ValueError(f"{path} tells all of its histograms: {told} must be left out")
+            options = ", ".join(f"--{name.replace('_', '-')}" for name in self._given)
+            raise ValueError(f"{path} describes its histograms completely: leave out {options}")
         base = self._file()
-        found = read_counts(
+        contents = read_counts(
             path,
             variable=self.variable,
             axes=self.axes,
             image=None if self.image is None else two_integers("--image", self.image, "H,W"),
             bins=None if base is None else base.bins,
         )
-        length = None if found.counts is None else found.counts.shape[-1]
-        whole = self if found.recorder is None or base is not None else self._completed(found.recorder, length)
+        length = None if contents.counts is None else contents.counts.shape[-1]
+        whole = self if contents.recorder is None or base is not None else self._completed(contents.recorder, length)
         window = None if self.window_ns is None else two_numbers("--window-ns", self.window_ns, "START,STOP in ns")
         system = base or whole._system(path, length)
-        return found.cube(system, start_ns=self.start_ns, unit_ns=self.unit_ns, window_ns=window)
+        return contents.cube(system, start_ns=self.start_ns, unit_ns=self.unit_ns, window_ns=window)
 
-    def _completed(self, told: Recorded, length: int | None) -> ForeignOptions:
+    def _completed(self, recorder: Recorded, length: int | None) -> ForeignOptions:
         """With what the recorder tells, where no option does: the period is as many of its bins as fill it best."""
-        width = told.bin_ns if self.bin_ns is None and self.bin_ps is None else None
+        width = recorder.bin_ns if self.bin_ns is None and self.bin_ps is None else None
         if width is None:
-            return self if self.cycles is not None else replace(self, cycles=told.cycles)
-        period = self.period_ns or told.period_ns or (width * length if length else None)
+            return self if self.cycles is not None else replace(self, cycles=recorder.cycles)
+        period = self.period_ns or recorder.period_ns or (width * length if length else None)
         whole = None if period is None else max(round(period / width), length or 1) * width
-        return replace(self, bin_ns=width, period_ns=whole, cycles=told.cycles if self.cycles is None else self.cycles)
+        cycles = recorder.cycles if self.cycles is None else self.cycles
+        return replace(self, bin_ns=width, period_ns=whole, cycles=cycles)
 
     def _file(self) -> System | None:
         if self.system is None:
@@ -122,21 +123,21 @@ class ForeignOptions:
         single = ("bin_ns", "bin_ps", "period_ns", "cycles", "detector", "dead_time_ns")
         given = [name for name in single if getattr(self, name) is not None]
         if given or self.pulse != PulseOptions():
-            told = ", ".join(f"--{name.replace('_', '-')}" for name in given) or "a pulse"
-            raise ValueError(f"--system tells all of the system: it and {told} exclude each other")
+            excluded = ", ".join(f"--{name.replace('_', '-')}" for name in given) or "a pulse"
+            raise ValueError(f"--system describes the whole system: it and {excluded} exclude each other")
         return System.load(self.system)
 
     def _system(self, path: Path, length: int | None) -> System:
         pulse = self.pulse.build()
         missing = [
-            told
-            for told, there in (
+            name
+            for name, given in (
                 ("--cycles", self.cycles is not None),
                 ("--dead-time-ns", self.dead_time_ns is not None or self.detector is not None),
                 ("--pulse-sigma-ns", pulse is not None),
                 ("--bin-ps", (self.bin_ns, self.bin_ps, self.period_ns) != (None, None, None)),
             )
-            if not there
+            if not given
         ]
         if missing or pulse is None or self.cycles is None:
             raise ValueError(f"{path} does not tell how it was recorded: give {', '.join(missing)}, or --system")
@@ -198,19 +199,19 @@ def _recorder_rows(path: Path) -> list[tuple[str, str]]:
     if path.suffix == ".sdt":
         scan = recorded(path)
     else:
-        found = photons_of(path)
+        recording = photons_of(path)
         streams = [("a channel's stream", "mars-lidar calibrate --pixel 0,C")]
-        clock = f"{1e3 * found.clock_ns:.7g} ps"
-        if found.fine is None:
+        clock = f"{1e3 * recording.clock_ns:.7g} ps"
+        if recording.fine is None:
             rows.append(("clock", f"absolute times in units of {clock} (T2)"))
         else:
-            laser = "laser periods" if found.period_ns else "its own, not the laser's"
-            fine = f"{1e3 * found.fine_ns:.5g} ps"
+            laser = "laser periods" if recording.period_ns else "its own, not the laser's"
+            fine = f"{1e3 * recording.fine_ns:.5g} ps"
             rows.append(("clock", f"{laser}, {clock}; photons in units of {fine} after the pulse"))
             scan = recorded(path)
-        for channel, number in zip(*np.unique(found.detector, return_counts=True), strict=True):
-            told = f"{channel}: {number:,} photons" if channel >= 0 else f"sync: {number:,} pulses"
-            rows.append(("channel", told))
+        for channel, number in zip(*np.unique(recording.detector, return_counts=True), strict=True):
+            events = "photons" if channel >= 0 else "pulses"
+            rows.append(("channel", f"{channel if channel >= 0 else 'sync'}: {number:,} {events}"))
     if scan is not None:
         for name, array in scan.arrays.items():
             rows.append(("histograms", f"{name}: {' × '.join(map(str, array.shape))}, {int(array.sum()):,} photons"))

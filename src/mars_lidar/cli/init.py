@@ -92,7 +92,9 @@ def schema(
     *,
     out: Annotated[Path | None, out_option("A .json file, else standard output.", option)] = None,
 ) -> None:
-    """Write the JSON Schema of a scene file, a recipe or a system file, with which editors complete and check keys.
+    """Write the JSON Schema of scene, recipe or system files, for editors.
+
+    With it an editor completes and checks keys.
 
     In the first line of the YAML file:  # yaml-language-server: $schema=recipe.json
     """
@@ -114,7 +116,9 @@ def init(
     preset: Annotated[Text | None, option(f"An instrument: {', '.join(PRESETS)}.")] = None,
     overwrite: Annotated[bool, option("Replace an existing file.")] = False,
 ) -> None:
-    """Write a commented YAML file that describes a system: laser, detector, histogram.
+    """Write a commented system file to start from.
+
+    The YAML file describes laser, detector and histogram.
 
     Edit it and pass it on:  mars-lidar simulate --scene room --system system.yaml -o room.zarr
     """

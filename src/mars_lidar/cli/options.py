@@ -100,8 +100,12 @@ COMMAND_LINE: dict[str, Any] = {
 
 
 def describe(command: App) -> None:
-    """Make the docstring of a command its help, as paragraphs without line ends: the screen's width folds them."""
-    if command.default_command is not None:
+    """Make docstrings the help of a command or of all in a group, without line ends: the screen's width folds them."""
+    if command.default_command is None:
+        for name in command:
+            if not name.startswith("-"):
+                describe(command[name])
+    else:
         paragraphs = (command.default_command.__doc__ or "").split("\n\n")
         command.help = "\n\n".join(" ".join(paragraph.split()) for paragraph in paragraphs)
 

@@ -95,9 +95,10 @@ def reconstruct(
     picture: Annotated[bool, option("Draw the maps beside OUT, as .png.", "yes", negative="--no-picture")] = True,
     overwrite: Annotated[bool, option("Replace existing files.")] = False,
 ) -> None:
-    """Reconstruct depth and reflectivity of every pixel of a cube, and compare them with the truth where it is known.
+    """Reconstruct depth and reflectivity from a cube.
 
-    The counts are read in parts, so a .zarr or .h5 of any size will do.
+    The maps are compared with the truth where the cube has it. The counts are read in parts, so a .zarr or .h5 of
+    any size will do.
     """
     began = time.perf_counter()
     from mars_lidar.io.maps import check_maps_output, save_maps
@@ -120,7 +121,7 @@ def reconstruct(
     with foreign.opened(cube) as stored:
         names = _methods(method, stored)
         with progress_bar("reconstructing") as progress:
-            found = reconstruct_stored(
+            timed = reconstruct_stored(
                 stored,
                 _with_false_alarm(names, false_alarm),
                 level=level,
@@ -132,11 +133,11 @@ def reconstruct(
         if keep is not None or from_ns is not None:
             own = "none" if stored.measured else str(stored.flux.info.get("attenuation", "none"))
             chosen = keep or "strongest", from_ns or 0.0, attenuation or own
-            found = {name: replace(each, result=keep_return(each.result, *chosen)) for name, each in found.items()}
+            timed = {name: replace(each, result=keep_return(each.result, *chosen)) for name, each in timed.items()}
         else:
-            _tell_reflection(stored, found)
-        results = {name: each.result for name, each in found.items()}
-        _show(stored, found)  # first: a disk that is full takes nothing from what is known
+            _tell_reflection(stored, timed)
+        results = {name: each.result for name, each in timed.items()}
+        _show(stored, timed)  # first: a disk that is full takes nothing from what is known
         save_maps(out, results, source=str(cube), overwrite=overwrite)
         rows = [("maps", str(out))]
         if cloud is not None and focal_px is not None:
@@ -168,9 +169,9 @@ def _with_false_alarm(names: list[str], false_alarm: float | None) -> list[str |
     return [MaximumLikelihood(false_alarm=share) if name == "maximum_likelihood" else name for name in names]
 
 
-def _tell_reflection(cube: Cube, found: dict[str, Timed]) -> None:
+def _tell_reflection(cube: Cube, timed: dict[str, Timed]) -> None:
     """A warning where most first returns stand in the same few bins and there is light beyond."""
-    first = next(iter(found.values())).result
+    first = next(iter(timed.values())).result
     common = common_delay(first)
     if common is None:
         return
@@ -207,15 +208,15 @@ def _methods(text: str, cube: Cube) -> list[str]:
     return list(dict.fromkeys(asked))
 
 
-def _show(cube: Cube, found: dict[str, Timed]) -> None:
+def _show(cube: Cube, timed: dict[str, Timed]) -> None:
     """One line a method on standard output."""
     from mars_lidar.reconstruction.quality import errors_against, ssim_available
 
     realizations, height, width, _ = cube.shape
-    head = ["method", "seconds", "seen %", "saturated %", "misfit %"]
+    head = ["method", "seconds", "detected %", "saturated %", "misfit %"]
     lines: list[list[str]] = []
-    errors = {name: errors_against(cube, each.result) for name, each in found.items()}
-    several = any(each.result.returns is not None for each in found.values())
+    errors = {name: errors_against(cube, each.result) for name, each in timed.items()}
+    several = any(each.result.returns is not None for each in timed.values())
     if several:
         head += ["2 returns %", "3 or more %"]
     kinds = list(next(iter(errors.values()), {}))
@@ -225,7 +226,7 @@ def _show(cube: Cube, found: dict[str, Timed]) -> None:
     for kind in kinds:
         unit, wide = ("mm", "depth") if kind == "depth" else ("", kind)
         head += [f"{wide} RMSE {unit}".strip(), "median", "PSNR dB", *ssim]
-    for name, each in found.items():
+    for name, each in timed.items():
         flags = each.result.flags
         line = [
             name,
@@ -242,13 +243,13 @@ def _show(cube: Cube, found: dict[str, Timed]) -> None:
             values = (scale * off.rmse, scale * off.median, off.psnr, *([off.ssim] if ssim else []))
             line += ["-" if math.isnan(value) else f"{value:.4g}" for value in values]
         lines.append(line)
-    told = ", errors against the cube's own truth" if kinds else ""
-    print(f"{realizations} × {height} × {width} pixels{told}")
-    shown = grid("", head)
+    comparison = ", errors against the cube's own truth" if kinds else ""
+    print(f"{realizations} × {height} × {width} pixels{comparison}")
+    rows = grid("", head)
     for line in lines:
-        shown.add_row(*line)
-    screen().print(shown)
-    for name, each in found.items():
+        rows.add_row(*line)
+    screen().print(rows)
+    for name, each in timed.items():
         if advice := each.result.advice:
             share = f"{100.0 * each.result.misfits:.3g} % of the pixels do not fit (0.1 % do so by chance)"
             say(f"warning: {name}: {share}; would fit better: {advice}; mars-lidar calibrate CUBE finds the value")
@@ -257,8 +258,8 @@ def _show(cube: Cube, found: dict[str, Timed]) -> None:
 def _save_cloud(path: Path, results: dict[str, Reconstruction], focal_px: float, overwrite: bool) -> int:
     from mars_lidar.io import save_cloud
 
-    found = next(iter(results.values()))
-    if (every := found.returns) is not None:
+    result = next(iter(results.values()))
+    if (every := result.returns) is not None:
         return save_cloud(
             path,
             every.depth_m[0],
@@ -267,8 +268,8 @@ def _save_cloud(path: Path, results: dict[str, Reconstruction], focal_px: float,
             error_m=every.depth_error_m[0],
             overwrite=overwrite,
         )
-    depth, share = np.where(found.detected, found.depth_m, np.nan)[0], found.reflectivity[0]
-    error = None if found.depth_error_m is None else found.depth_error_m[0]
+    depth, share = np.where(result.detected, result.depth_m, np.nan)[0], result.reflectivity[0]
+    error = None if result.depth_error_m is None else result.depth_error_m[0]
     return save_cloud(path, depth, focal_px, intensity=share, error_m=error, overwrite=overwrite)
 
 

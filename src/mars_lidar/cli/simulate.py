@@ -122,7 +122,7 @@ def simulate(
     ] = None,
     picture: Annotated[bool, output_option("A PNG overview beside the cube.", "yes", negative="--no-picture")] = True,
 ) -> None:
-    """Simulate histograms of a scene under dead time, and write the cube with a picture of it.
+    """Simulate the histograms of a scene: a cube and a picture of it.
 
     The file holds all that is needed to make the cube again. xarray.open_zarr(OUT) opens a .zarr with named
     dimensions and units; mars_lidar.io.load(OUT) opens any of the formats.
@@ -133,9 +133,9 @@ def simulate(
     with contextlib.ExitStack() as after:
         began = time.perf_counter()
         png = out.with_suffix(".png")
-        kept = not (overwrite or resume)
-        refuse_existing(png, not (picture and kept), "--overwrite, --no-picture or another --out")
-        refuse_existing(out, not kept)
+        may_exist = overwrite or resume
+        refuse_existing(png, may_exist or not picture, "--overwrite, --no-picture or another --out")
+        refuse_existing(out, may_exist)
         system, capture = instrument.build(effects), None
         if like is not None:
             capture, system, scene = capture_scene(like, instrument, system, scene)
@@ -217,9 +217,9 @@ def say_time(
     """Say how long a long run will take, and what is faster."""
     from mars_lidar.io.advice import advice
 
-    told = str(advice(flux, system, engine, realizations=realizations, threads=threads, options=options))
-    if told:
-        say(told)
+    text = str(advice(flux, system, engine, realizations=realizations, threads=threads, options=options))
+    if text:
+        say(text)
 
 
 def _table(

@@ -68,16 +68,16 @@ class StreamEffects:
 
     def given(self) -> dict[str, Any]:
         """Fields of `Detector`, as plain data."""
-        told: dict[str, Any] = {name: getattr(self, name) for name in FIELDS if hasattr(self, name)}
-        told["jitter"] = self._jitter()
+        fields: dict[str, Any] = {name: getattr(self, name) for name in FIELDS if hasattr(self, name)}
+        fields["jitter"] = self._jitter()
         probability, delay_ns = self.afterpulse_probability, self.afterpulse_delay_ns
         if (probability is None) != (delay_ns is None):
             raise ValueError("--afterpulse-probability and --afterpulse-delay-ns belong together: both, or neither")
         if probability is not None:
-            told["afterpulsing"] = {"probability": probability, "delay_ns": delay_ns}
+            fields["afterpulsing"] = {"probability": probability, "delay_ns": delay_ns}
         if self.code_density_file is not None:
-            told["code_density"] = read_array("--code-density-file", self.code_density_file)
-        return {name: value for name, value in told.items() if value is not None}
+            fields["code_density"] = read_array("--code-density-file", self.code_density_file)
+        return {name: value for name, value in fields.items() if value is not None}
 
     def _jitter(self) -> dict[str, Any] | None:
         gaussian = {
@@ -116,14 +116,14 @@ class Effects(StreamEffects, LightEffects):
 
     def given(self) -> dict[str, Any]:
         """Fields of `Detector`, as plain data."""
-        told = super().given()
+        fields = super().given()
         if self.crosstalk is None:
-            told.pop("crosstalk", None)
+            fields.pop("crosstalk", None)
             if self.crosstalk_kernel is not None:
                 raise ValueError("--crosstalk-kernel belongs to --crosstalk, which is not given")
         else:
-            told["crosstalk"] = {"probability": self.crosstalk, "kernel": self.crosstalk_kernel or "8"}
-        return told
+            fields["crosstalk"] = {"probability": self.crosstalk, "kernel": self.crosstalk_kernel or "8"}
+        return fields
 
 
 def read_array(option: str, file: Path) -> Any:

@@ -17,7 +17,6 @@ from mars_lidar.cli.options import (
     Threads,
     argument,
     command,
-    describe,
     grid_option,
     option,
     out_option,
@@ -86,10 +85,10 @@ def info(
     if file is not None:
         table(_rows(file))
         return
-    found = cache.files()
-    total = sum(path.stat().st_size for path in found)
-    rows = [("cache", f"{cache.directory()}: {len(found)} files, {total / 1e6:,.4g} MB")]
-    table(rows + [(f"{path.stat().st_size / 1e6:,.4g} MB", _line(path)) for path in found])
+    files = cache.files()
+    total = sum(path.stat().st_size for path in files)
+    rows = [("cache", f"{cache.directory()}: {len(files)} files, {total / 1e6:,.4g} MB")]
+    table(rows + [(f"{path.stat().st_size / 1e6:,.4g} MB", _line(path)) for path in files])
 
 
 def clear(
@@ -97,12 +96,12 @@ def clear(
     yes: Annotated[bool, option("Do not ask.", "", "--yes", "-y")] = False,
 ) -> None:
     """Remove the tables in the cache."""
-    found = cache.files()
-    if not found:
+    files = cache.files()
+    if not files:
         print(f"{cache.directory()} holds no tables")
         return
-    total = sum(path.stat().st_size for path in found)
-    question = f"remove {len(found)} files, {total / 1e6:,.4g} MB, from {cache.directory()}?"
+    total = sum(path.stat().st_size for path in files)
+    question = f"remove {len(files)} files, {total / 1e6:,.4g} MB, from {cache.directory()}?"
     if not yes and not _confirmed(question):
         print("nothing was removed")
         return
@@ -126,33 +125,33 @@ def _grid(name: str, text: str) -> tuple[float, float, int]:
 
 
 def _rows(path: Path) -> dict[str, str]:
-    found = Table.load(path)
-    system, told, made = found.system, found.provenance, found.provenance["error"]
-    size, shapes, enough = path.stat().st_size, found.entries.shape.nbytes, found.entries.enough
+    stored = Table.load(path)
+    system, provenance, made = stored.system, stored.provenance, stored.provenance["error"]
+    size, shapes, enough = path.stat().st_size, stored.entries.shape.nbytes, stored.entries.enough
     never, later = int((enough < 0).sum()), int(enough.max())
     if never:
         serves = f"{system.cycles:,}; {never} entries have not settled by then and serve no other number"
     else:
         serves = f"any number from {later:,} on (made for {system.cycles:,})"
-    method = found.method + (f", re-arming at the {found.rearm}" if found.method == "mars" else "")
+    method = stored.method + (f", re-arming at the {stored.rearm}" if stored.method == "mars" else "")
     rows = {
-        "table": f"{path} (mars-lidar {told['version']}, built in {told['build_s']:.3g} s)",
+        "table": f"{path} (mars-lidar {provenance['version']}, built in {provenance['build_s']:.3g} s)",
         "method": method,
-        "signal": told["signal"],
-        "background": told["background"],
+        "signal": provenance["signal"],
+        "background": provenance["background"],
         "size": f"{size / 1e6:,.4g} MB, shapes {shapes / 1e6:,.4g} MB of them; with a delay axis of {_DEPTHS} values "
         f"{shapes * _DEPTHS / 1e9:,.4g} GB (the paper: {_PAPER_BYTES})",
         "cycles": serves,
-        "exact laws": _laws(found),
+        "exact laws": _laws(stored),
         "system": f"period {system.period_ns:.6g} ns, {system.bins} bins, {system.pulse!r}, dead time "
         f"{system.detector.dead_time_ns:.6g} ns, start {system.start}",
         "start phases": f"{phases}"
-        if (phases := found.start_phases.phase.size)
+        if (phases := stored.start_phases.phase.size)
         else "none: nothing depends on the delay",
         f"error at {made['cycles']:,} cycles": _error(made),
-        "error at any": _any_error(told.get("error_longest"), never),
+        "error at any": _any_error(provenance.get("error_longest"), never),
     }
-    law = told.get("law")
+    law = provenance.get("law")
     if law is not None:
         rows["count law"] = (
             f"{law['samples']} random pixels: total variation {law['mean']:.2g}, at most {law['largest']:.2g}; "
@@ -187,34 +186,33 @@ def _any_error(longest: dict[str, Any] | None, unsettled: int) -> str:
     )
 
 
-def _laws(found: Table) -> str:
-    number, entries = found.laws.row.size, found.entries.enough.size
-    if found.method == "mars":
+def _laws(stored: Table) -> str:
+    number, entries = stored.laws.row.size, stored.entries.enough.size
+    if stored.method == "mars":
         return "none: the paper's count is a Gaussian"
     if not number:
         return "none kept: four cumulants fix the law of every entry, or the file is of an older format"
-    return f"{number:,} of {entries:,} entries keep the law of their count, {found.laws.pmf.nbytes / 1e6:,.3g} MB"
+    return f"{number:,} of {entries:,} entries keep the law of their count, {stored.laws.pmf.nbytes / 1e6:,.3g} MB"
 
 
 def _line(path: Path) -> str:
     try:
-        found = Table.load(path)
+        stored = Table.load(path)
     except (OSError, ValueError, KeyError) as error:
         return f"{path.name}: cannot be read ({error})"
-    system, told = found.system, found.provenance
+    system, provenance = stored.system, stored.provenance
     return (
-        f"{path.name}: {found.method}, S {told['signal']}, B {told['background']}, {system.bins} bins, "
+        f"{path.name}: {stored.method}, S {provenance['signal']}, B {provenance['background']}, {system.bins} bins, "
         f"{system.cycles:,} cycles, dead time {system.detector.dead_time_ns:.6g} ns of {system.period_ns:.6g} ns"
     )
 
 
 table_command = App(
     name="table",
-    help="Build, describe and clear lookup tables over signal S and background B.",
+    help="Build, describe and clear lookup tables over signal and background.",
     help_epilogue="",
     **COMMAND_LINE,
 )
 for _place, _command in enumerate((command(build), command(info), command(clear))):
     _command.sort_key = _place
-    describe(_command)
     table_command.command(_command)

@@ -28,7 +28,10 @@ def info(
     *,
     verify: Annotated[bool, option("Simulate again and compare every count; exit code 1 if they differ.")] = False,
 ) -> int | None:
-    """Say what is in a cube or a dataset: system, flux, engine, size, whether it is complete, how to open it."""
+    """Describe a cube, a dataset or a file of another program.
+
+    System, light, engine and size; whether the file is complete, and how to open it.
+    """
     from mars_lidar.io import IncompleteFileError, load
     from mars_lidar.io import verify as same_again
 
@@ -83,10 +86,11 @@ def view(
     sample: Annotated[Integer | None, option("Of a dataset: which sample.", "0")] = None,
     overwrite: Annotated[bool, option("Replace an existing picture.")] = False,
 ) -> None:
-    """Draw depth, reflectivity, total counts, peak-bin depth, and the histograms of a few pixels.
+    """Draw depth, reflectivity, counts and a few histograms.
 
-    Each histogram stands beside the incident rate, scaled to the same total: the difference is pile-up. A measured cube
-    is shown with the light that maximum likelihood finds in it.
+    Beside the true depth stands that of the fullest bin. Each histogram stands beside the incident rate, scaled to
+    the same total: the difference is pile-up. A measured cube is shown with the light that maximum likelihood finds
+    in it.
     """
     check_picture(out, overwrite)
     pixels = None if not pixel else [two_integers("--pixel", text) for text in pixel]
@@ -173,11 +177,11 @@ def _light(flux: Flux) -> dict[str, str]:
 def _gate(detector: Detector) -> dict[str, str]:
     if detector.gate_start_ns is None:
         return {}
-    told = f"{detector.gate_width_ns:.6g} ns from {detector.gate_start_ns:.6g} ns of each period"
+    text = f"{detector.gate_width_ns:.6g} ns from {detector.gate_start_ns:.6g} ns of each period"
     if detector.gate_moves:
         every = "every period" if detector.gate_cycles == 1 else f"every {detector.gate_cycles} periods"
-        told += f", moved by {detector.gate_step_ns:.6g} ns {every}"
-    return {"gate": told}
+        text += f", moved by {detector.gate_step_ns:.6g} ns {every}"
+    return {"gate": text}
 
 
 def _short(value: Any) -> str:
@@ -210,9 +214,10 @@ def explore(
         bool, option("Open the page in the browser of this machine.", "yes", negative="--no-browser")
     ] = True,
 ) -> None:
-    """Show pixels with their exact laws in a browser: what dead time does, with sliders; and a cube, pixel by pixel.
+    """Show pixels and their exact laws in a browser.
 
-    The page is served on 127.0.0.1 alone, until Ctrl-C; parts of the cube are read as they are looked at.
+    Sliders show what dead time does; a cube is shown pixel by pixel. The page is served on 127.0.0.1 alone, until
+    Ctrl-C; parts of the cube are read as they are looked at.
     """
     from mars_lidar.explore import CubeServer
 

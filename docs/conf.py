@@ -244,9 +244,9 @@ TITLES = {
     "results/count_law_sequential/count_law": "Count laws against simulation photon by photon (T1)",
     "results/sanitize_address": "The native core under the address sanitizer",
     "results/sanitize_thread": "The native core under the thread sanitizer",
-    "copied/benchmarks/default": "Benchmarks: Intel Xeon",
-    "copied/benchmarks/epyc": "Benchmarks: AMD EPYC",
-    "copied/benchmarks/full": "Benchmarks: AMD EPYC, more cases",
+    "copied/benchmarks/default": "Benchmarks: this version",
+    "copied/benchmarks/epyc": "Benchmarks: version 0.1.0",
+    "copied/benchmarks/full": "Benchmarks: version 0.1.0, more cases",
 }
 
 

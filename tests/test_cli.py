@@ -465,6 +465,14 @@ def test_help_flows(monkeypatch):
     assert "opens a .zarr with named dimensions and units" in run("simulate", "--help").output
 
 
+def test_examples_of_the_help_can_be_copied_from_a_narrow_screen(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    for name in ("simulate", "generate", "calibrate", "reconstruct", "explore", "convert", "export", "timestamps"):
+        examples = run(name, "--help").output.split("Examples:\n")[1].split("\n\n")[0]
+        commands = examples.replace("\\\n", " ").splitlines()
+        assert all(line.startswith("  mars-lidar ") for line in commands), examples
+
+
 def test_a_pipe_without_unicode_gets_plain_text(tmp_path):
     out = tmp_path / "a.zarr"
     assert run("simulate", "--scene", "room", *SMALL, "--no-picture", "-o", out).exit_code == 0

@@ -262,7 +262,7 @@ def test_any_shape(shape):
     ("change", "message"),
     [
         ({"cube": np.ones((9, 250), np.uint16)}, r"'image' needs images, a cube \(..., H, W, bins\)"),
-        ({"returns": 2}, "returns=2 needs the likelihood"),
+        ({"returns": 2}, "returns=2 needs method 'maximum_likelihood', got 'image'"),
         ({"system": replace(SYSTEM, detector=ml.Detector(dead_time_ns=5.0, mode="paralyzable"))}, "'paralyzable'"),
     ],
 )

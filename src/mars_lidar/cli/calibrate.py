@@ -90,7 +90,7 @@ class KnownOptions:
     given: Annotated[
         list[Text] | None,
         system_option(
-            f"What is known and not fitted: NAME=VALUE, once for each; {', '.join(GIVEN)}.", metavar="NAME=VALUE"
+            f"A known value, which is not fitted, NAME=VALUE, once for each; {', '.join(GIVEN)}.", metavar="NAME=VALUE"
         ),
     ] = None
     system: Annotated[
@@ -152,7 +152,7 @@ def calibrate(
     *,
     source: StreamOptions = StreamOptions(),
     known: KnownOptions = KnownOptions(),
-    look: Annotated[bool, output_option("Stop before the fit: what the file holds.")] = False,
+    look: Annotated[bool, output_option("Describe the file and stop before the fit.")] = False,
     seed: Annotated[Integer, output_option("Seed of the simulated streams.", "0")] = 0,
     out: Annotated[Path | None, out_option("The calibrated system, .yaml or .json, to simulate with.")] = None,
     picture: Annotated[Path | None, output_option("A picture: .png, .pdf or .svg.")] = None,

@@ -20,7 +20,7 @@ CONVERT_EXAMPLES = examples(
     "mars-lidar convert lab.ptu lab.h5 --bins 1024",
     "mars-lidar convert face.mat face.zarr --variable counts --system camera.yaml",
     notes="Cubes: .zarr .h5 .npz .mat .ptu. Photon streams: .npz .ptu .h5 (Photon-HDF5). .ptu and Photon-HDF5 need "
-    "pip install 'mars-lidar[io]'. docs/formats.md tells what is in each.",
+    "pip install 'mars-lidar[io]'. docs/formats.md describes each.",
 )
 TIMESTAMPS_EXAMPLES = examples(
     "mars-lidar simulate --scene room -o room.zarr",
@@ -41,7 +41,7 @@ Overwrite = Annotated[bool, option("Replace an existing file.")]
 
 def convert(
     source: Annotated[
-        Path, argument("A cube, a photon stream (of a lab, too: .ptu, Photon-HDF5), or histograms of another program.")
+        Path, argument("A cube, a photon stream (also of a lab: .ptu, Photon-HDF5), or histograms of another program.")
     ],
     target: Annotated[Path, argument("The new file; its suffix names the format.")],
     /,

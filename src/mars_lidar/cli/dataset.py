@@ -115,16 +115,16 @@ def generate(
             "dense",
         ),
     ] = None,
-    resume: Annotated[bool, output_option("Continue what was stopped.")] = False,
+    resume: Annotated[bool, output_option("Continue a stopped run.")] = False,
     overwrite: Annotated[bool, output_option("Replace an existing dataset.")] = False,
     begin: Annotated[
-        bool, output_option("Read the scenes and lay the store out; --part jobs make its counts.")
+        bool, output_option("Read the scenes and create the store without counts, which --part jobs make.")
     ] = False,
     part: Annotated[
         Text | None, output_option("Make part K of N of a store that --begin began, in any order.", metavar="K/N")
     ] = None,
     finish: Annotated[bool, output_option("Check that all parts are there, and mark the store complete.")] = False,
-    dry_run: Annotated[bool, output_option("Tell size, time and memory; write nothing.")] = False,
+    dry_run: Annotated[bool, output_option("Print size, time and memory; write nothing.")] = False,
 ) -> int | None:
     """Simulate a dataset of many scenes, systems and levels of light.
 
@@ -275,7 +275,7 @@ def _size(option: str, text: str | None) -> Any:
 EXPORT_EXAMPLES = examples(
     "mars-lidar generate room --size 64 --scene-seeds 20 -o rooms.zarr",
     "mars-lidar export rooms.zarr --layout lindell --fill -o lindell",
-    notes="docs/formats.md tells what is in each file.",
+    notes="docs/formats.md describes each file.",
 )
 
 

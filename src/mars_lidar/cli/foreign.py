@@ -51,7 +51,7 @@ class ForeignOptions:
     axes: Annotated[
         Text | None,
         foreign_option(
-            "What its dimensions are, e.g. tyx; n exposures, (yx) or (xy) pixels row by row or column by column.",
+            "Its dimensions, e.g. tyx; n exposures, (yx) or (xy) pixels row by row or column by column.",
             "time last, or where the system's bins fit",
             metavar="NYXT",
         ),

@@ -112,7 +112,7 @@ def init(
     file: Annotated[Path, argument("Where to write it: .yaml or .yml.", "system.yaml")] = _FILE,
     /,
     *,
-    out: Annotated[Path | None, out_option("The same, as with the other commands.", option)] = None,
+    out: Annotated[Path | None, out_option("Another way to give FILE.", option)] = None,
     preset: Annotated[Text | None, option(f"An instrument: {', '.join(PRESETS)}.")] = None,
     overwrite: Annotated[bool, option("Replace an existing file.")] = False,
 ) -> None:

@@ -6,6 +6,8 @@ An option is a field of a dataclass, or a keyword of a command, annotated with i
 
 from __future__ import annotations
 
+import re
+import textwrap
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -116,8 +118,11 @@ def command(function: Callable[..., int | None], epilogue: str = "") -> App:
 
 
 def examples(*lines: str, notes: str = "") -> str:
-    """The end of a command's help."""
-    return "\n".join(("Examples:", *(f"  {line}" for line in lines), *(("", notes) if notes else ())))
+    """The end of a command's help; long commands are continued, so that they can be copied from a narrow screen."""
+    wrap = partial(textwrap.wrap, width=74, break_long_words=False, break_on_hyphens=False)
+    together = (re.sub(" (?!-)", "\xa0", line) for line in lines)  # an option and its value
+    continued = (" \\\n      ".join(wrap(line)).replace("\xa0", " ") for line in together)
+    return "\n".join(("Examples:", *(f"  {line}" for line in continued), *(("", notes) if notes else ())))
 
 
 # --- Options of several commands ------------------------------------------------------------------------------------

@@ -39,7 +39,10 @@ RECONSTRUCT_EXAMPLES = examples(
 
 def reconstruct(
     cube: Annotated[
-        Path, argument("A cube: .zarr, .h5, .hdf5, .npz, .mat or .ptu; or histograms of others: also .npy, .tif, .csv.")
+        Path,
+        argument(
+            "A cube: .zarr, .h5, .hdf5, .npz, .mat or .ptu; or histograms of another program: also .npy, .tif, .csv."
+        ),
     ],
     /,
     *,
@@ -68,7 +71,8 @@ def reconstruct(
         option("Returns to look for in each pixel, each tested (glass, foliage). Needs maximum_likelihood.", "1"),
     ] = 1,
     keep: Annotated[
-        Text | None, option("Of --returns: strongest, nearest or farthest becomes the depth.", "strongest")
+        Text | None,
+        option("With --returns: the return whose depth is taken, strongest, nearest or farthest.", "strongest"),
     ] = None,
     from_ns: Annotated[
         Number | None,
@@ -80,7 +84,8 @@ def reconstruct(
     false_alarm: Annotated[
         Number | None,
         option(
-            "Share of the pixels without signal in which noise passes for it, at most; of maximum_likelihood.", "0.01"
+            "Largest share of the pixels without signal in which noise passes for a return; of maximum_likelihood.",
+            "0.01",
         ),
     ] = None,
     threads: Annotated[Integer | None, option("Threads.", "all cores")] = None,

@@ -52,7 +52,7 @@ SIMULATE_EXAMPLES = examples(
     "mars-lidar simulate --scene room --jitter-fwhm-ns 0.1 --electronics-dead-time-ns 100 -o real.zarr",
     "mars-lidar simulate --scene room --detector excelitas-spcm-aqrh -o module.zarr",
     notes="S and B are expected detectable photons per laser period; with --detection-efficiency, photons on the "
-    "pixel. Dead time bends histograms where S + B is not small.",
+    "pixel. Dead time distorts histograms where S + B is not small.",
 )
 
 
@@ -90,12 +90,13 @@ def simulate(
         ),
     ] = None,
     interpolation: Annotated[
-        Text | None, run_option("Of --table: bilinear or nearest.", "bilinear", choices=("bilinear", "nearest"))
+        Text | None,
+        run_option("Between the entries of --table: bilinear or nearest.", "bilinear", choices=("bilinear", "nearest")),
     ] = None,
     table_outside: Annotated[
         Text | None,
         run_option(
-            "Of --table, for pixels beyond its range: error, or exact (each is evaluated by itself, some ms).",
+            "For pixels beyond the range of --table: error, or exact (each is evaluated by itself, some ms).",
             "error",
             choices=("error", "exact"),
         ),

@@ -56,7 +56,7 @@ def build(
     out: Annotated[Path | None, out_option("The table: .h5 or .hdf5. Without it: the cache.", option)] = None,
     overwrite: Annotated[bool, output_option("Replace an existing table.")] = False,
 ) -> None:
-    """Build the table of a system and write it to a file, or to the cache, where it may be already."""
+    """Build the table of a system, in a file or in the cache; a cached table is not built again."""
     began = time.perf_counter()
     refuse_existing(out, overwrite)
     system = instrument.build(effects)
@@ -81,7 +81,7 @@ def info(
     file: Annotated[Path | None, argument("A table: .h5 or .hdf5. Without it: the cache.")] = None,
     /,
 ) -> None:
-    """Say what is in a table, or which tables the cache holds."""
+    """Describe a table, or list the tables in the cache."""
     if file is not None:
         table(_rows(file))
         return

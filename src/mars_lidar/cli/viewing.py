@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 
 def info(
     file: Annotated[
-        Path, argument("A cube: .zarr (also a URL), .h5, .hdf5, .npz, .mat or .ptu; a dataset; a file of others.")
+        Path,
+        argument("A cube: .zarr (also a URL), .h5, .hdf5, .npz, .mat or .ptu; a dataset; a file of another program."),
     ],
     /,
     *,
@@ -71,7 +72,7 @@ def view(
     file: Annotated[
         Path,
         argument(
-            "A cube: .zarr, .h5, .hdf5, .npz, .mat, .ptu; a dataset; histograms of others: also .npy, .tif, .csv."
+            "A cube: .zarr, .h5, .hdf5, .npz, .mat, .ptu; a dataset; histograms of another program: also .npy, .tif, .csv."
         ),
     ],
     /,
@@ -103,7 +104,7 @@ def view(
 
 
 def opened(file: Path, sample: int | None, foreign: ForeignOptions) -> Cube:
-    """A cube, histograms of others, or a sample of a dataset."""
+    """A cube, histograms of another program, or a sample of a dataset."""
     from mars_lidar.dataset.store import is_dataset, open_dataset
 
     if is_dataset(file):

@@ -277,9 +277,7 @@ def with_returns(method: Method, returns: int) -> Method:
     if checks.integer("returns", returns, low=1, high=MOST_RETURNS) == 1:
         return method
     if not isinstance(method, MaximumLikelihood):
-        raise ValueError(
-            f"returns={returns} needs the likelihood, which method {method.name!r} has not; use 'maximum_likelihood'"
-        )
+        raise ValueError(f"returns={returns} needs method 'maximum_likelihood', got {method.name!r}")
     return replace(method, returns=int(returns))
 
 

@@ -72,7 +72,8 @@ def view(
     file: Annotated[
         Path,
         argument(
-            "A cube: .zarr, .h5, .hdf5, .npz, .mat, .ptu; a dataset; histograms of another program: also .npy, .tif, .csv."
+            "A cube: .zarr, .h5, .hdf5, .npz, .mat, .ptu; a dataset; histograms of another program: "
+            "also .npy, .tif, .csv."
         ),
     ],
     /,

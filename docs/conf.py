@@ -193,7 +193,8 @@ def _commands() -> str:
     overview, *sections = re.split(r"(?m)^(?=## mars-lidar [a-z])", text)
     commands = {name: app[name].help_epilogue for name in app}
     examples = [commands.get(section.split()[2]) for section in sections]
-    ends = [f"```text\n{example}\n```\n\n" if example else "" for example in (app.help_epilogue, *examples)]
+    parts = [example.partition("\n\n") if example else None for example in (app.help_epilogue, *examples)]
+    ends = [f"```text\n{part[0]}\n```\n\n{part[2]}\n\n" if part else "" for part in parts]
     return "".join(section + end for section, end in zip((overview, *sections), ends, strict=True))
 
 
@@ -272,6 +273,22 @@ def _describe_pictures(app: Sphinx, doctree: nodes.document) -> None:
             image["alt"] = f"{title}: picture {number}, described in the text beside it"
 
 
+def _mark_long_cells(app: Sphinx, doctree: nodes.document) -> None:
+    """Marks cells of much text, which are wider than their longest word also where the table is wider than the page."""
+    for entry in doctree.findall(nodes.entry):
+        if len(entry.astext()) > 90:
+            entry["classes"].append("long")
+
+
+def _drop_private_bases(app: Sphinx, doctree: nodes.document) -> None:
+    """Removes "Bases: object" and bases that have no page of their own."""
+    public = {path.stem.rsplit(".", 1)[-1] for path in (ROOT / "docs" / "api").glob("*.rst")}
+    for paragraph in list(doctree.findall(nodes.paragraph)):
+        label, _, bases = paragraph.astext().partition(": ")
+        if label == "Bases" and not public.intersection(re.split(r"[^\w]+", bases)):
+            paragraph.parent.remove(paragraph)
+
+
 def _take_explorer(app: Sphinx, error: Exception | None) -> None:
     if not error:
         target = Path(app.outdir) / "explorer" / "index.html"
@@ -285,6 +302,8 @@ def setup(app: Sphinx) -> None:
     app.connect("source-read", _title)
     app.connect("autodoc-process-docstring", _document_types, priority=400)  # before numpydoc, 500
     app.connect("doctree-read", _describe_pictures)
+    app.connect("doctree-read", _drop_private_bases)
+    app.connect("doctree-read", _mark_long_cells)
     app.connect("build-finished", lambda app, error: FORMULAS.close())
     app.add_html_math_renderer("katex", inline_renderers=(_inline_math, None), block_renderers=(_display_math, None))
     app.connect("build-finished", _take_explorer)

@@ -54,7 +54,8 @@ plt.show()
 # .. math:: \text{armed}_j = N_r - \sum_{k<j} n_k,
 #    \qquad \hat l_j = -\ln\Bigl(1 - \frac{n_j}{\text{armed}_j}\Bigr). \tag{2}
 #
-# This is Coates' estimator (1968). It is exact for this detector, and noisy where few periods are still armed.
+# This is Coates' estimator (1968), the maximum likelihood for this detector. It is noisy where few periods are still
+# armed.
 
 counts = ml.simulate(ml.Flux(2.0, 2.0, 60.0), system, seed=3)[0, 0, 0].astype(float)
 light = ml.statistics.photons_per_bin(ml.Flux(2.0, 2.0, 60.0), system, bins=128)

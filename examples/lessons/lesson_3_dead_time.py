@@ -15,8 +15,8 @@ Under constant light of rate :math:`\lambda`, successive registrations are a dea
    \qquad \frac{\operatorname{Var} N}{\mathsf E N} = \frac{1}{(1 + \lambda t_d)^2}. \tag{1}
 
 For a Poisson count the ratio is 1. Under pulsed light it can be orders of magnitude smaller: the registrations *lock*
-to the laser pulses (mode locking). The exact law of the count, ``ml.count_law``, for pulsed and for constant light of
-the same mean:
+to the laser pulses (mode locking). The figure shows the exact law of the count, ``ml.count_law``, for pulsed and for
+constant light of the same mean:
 """
 
 import matplotlib.pyplot as plt
@@ -73,8 +73,8 @@ plt.show()
 # Correlations: bins are not independent
 # --------------------------------------
 #
-# One registration excludes all others for a dead time. The bins of the return compete for one registration per period,
-# and with the background: what one bin gains, others lose (blue). Two registrations often follow each other after the
+# One registration excludes all others for a dead time. The bins of the return compete with each other, and with the
+# background, for one registration per period: what one bin gains, others lose (blue). Two registrations often follow each other after the
 # dead time of 75 ns and before the next return, so that background bins 75 to 100 ns apart, which in the period is also
 # 0 to 25 ns apart, gain together (red). ``ml.joint_law`` gives the exact covariance of all bins of a finite exposure:
 

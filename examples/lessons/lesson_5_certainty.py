@@ -51,7 +51,7 @@ plt.show()
 #
 # If the standard errors are right, the error divided by its standard error is a standard normal number: 68 % within
 # one, 95 % within two. The figure tests this on the 400 exposures of each signal. Every method should pass this test,
-# a network included (:doc:`/results/README`).
+# a network included (:doc:`/downstream`).
 
 estimate = ml.reconstruct(cube, system)
 pull = (estimate.delay_ns - delay_ns) / estimate.delay_error_ns

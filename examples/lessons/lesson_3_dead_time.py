@@ -74,9 +74,10 @@ plt.show()
 # --------------------------------------
 #
 # One registration excludes all others for a dead time. The bins of the return compete with each other, and with the
-# background, for one registration per period: what one bin gains, others lose (blue). Two registrations often follow each other after the
-# dead time of 75 ns and before the next return, so that background bins 75 to 100 ns apart, which in the period is also
-# 0 to 25 ns apart, gain together (red). ``ml.joint_law`` gives the exact covariance of all bins of a finite exposure:
+# background, for one registration per period: what one bin gains, others lose (blue). Two registrations often follow
+# each other after the dead time of 75 ns and before the next return, so that background bins 75 to 100 ns apart, which
+# in the period is also 0 to 25 ns apart, gain together (red). ``ml.joint_law`` gives the exact covariance of all bins
+# of a finite exposure:
 
 joint = ml.joint_law(ml.Flux(5.0, 0.5, 40.0), system)
 covariance = joint.covariance()

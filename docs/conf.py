@@ -198,6 +198,11 @@ def _commands() -> str:
     return "".join(section + end for section, end in zip((overview, *sections), ends, strict=True))
 
 
+for page in (ROOT / "docs" / "api").glob("*.rst"):  # of names that have gone
+    if f" {page.stem.removeprefix('mars_lidar.')}\n" not in (ROOT / "docs" / "reference.md").read_text(
+        encoding="utf-8"
+    ):
+        page.unlink()
 _katex_style()
 for copied in COPIES.items():
     _copy(*copied)
@@ -215,7 +220,7 @@ def _annotations(thing: Any, section: str) -> dict[str, str]:
         except (TypeError, ValueError):
             return {}
         return {p.name: str(p.annotation) for p in parameters if p.annotation is not p.empty}
-    types: dict[str, str] = {}
+    types = _annotations(thing, "Parameters")
     for base in reversed(getattr(thing, "__mro__", ())):
         types |= {name: str(text) for name, text in inspect.get_annotations(base).items()}
         for name, member in vars(base).items():
@@ -236,8 +241,10 @@ def _document_types(app: Sphinx, what: str, name: str, thing: Any, options: Any,
             types = _annotations(thing, heading[1]) if heading else {}
         elif types and re.fullmatch(r"\*{0,2}\w+(, \w+)*", line):
             of_names = [types.get(each.strip("* ")) for each in line.split(",")]
-            if of_names[0] is not None and len(set(of_names)) == 1:
-                lines[number] = f"{line} : " + re.sub(r"_(?!\w)", r"\_", of_names[0])  # not a link of reStructuredText
+            known = list(dict.fromkeys(filter(None, of_names)))
+            if len(known) == 1 or None not in of_names:  # of each name, unless all have the same
+                text = known[0] if len(known) == 1 else ", ".join(map(str, of_names))
+                lines[number] = f"{line} : " + re.sub(r"_(?!\w)", r"\_", text)  # not a link of reStructuredText
 
 
 # Reports that one program made more than once, each with a title of its own.

@@ -473,6 +473,15 @@ def test_examples_of_the_help_can_be_copied_from_a_narrow_screen(monkeypatch):
         assert all(line.startswith("  mars-lidar ") for line in commands), examples
 
 
+@pytest.mark.parametrize("arguments", [("--help",), ("simulate", "--help"), ("schema",)], ids=" ".join)
+def test_a_reader_that_stops_ends_it_without_a_traceback(arguments):
+    reading, writing = os.pipe()
+    os.close(reading)
+    with open(writing, "wb") as pipe:
+        done = subprocess.run(command(*arguments), stdout=pipe, stderr=subprocess.PIPE, text=True)
+    assert (done.returncode, done.stderr) == (1, "")
+
+
 def test_a_pipe_without_unicode_gets_plain_text(tmp_path):
     out = tmp_path / "a.zarr"
     assert run("simulate", "--scene", "room", *SMALL, "--no-picture", "-o", out).exit_code == 0

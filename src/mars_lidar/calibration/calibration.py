@@ -69,8 +69,8 @@ class Estimate:
             return f"{self.value:.6g} ({self.note or 'given'})"
         if self.note:
             return f"{self.value:.4g} (95 %: {self.low:.3g} to {self.high:.3g}), {self.note}"
-        digits = int(np.clip(np.ceil(np.log10(max(abs(self.value), 1e-12) / self.error)) + 2, 3, 12))
-        return f"{self.value:.{digits}g} ± {self.error:.2g}"
+        decimals = int(np.clip(1 - np.floor(np.log10(self.error)), 0, 15)) if np.isfinite(self.error) else 6
+        return f"{self.value:.{decimals}f} ± {self.error:.{decimals}f}"
 
 
 @dataclass(frozen=True)

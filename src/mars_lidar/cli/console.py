@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+import os
 import re
 import sys
 import warnings
@@ -62,6 +63,7 @@ def run(app: App, tokens: Sequence[str]) -> int:
             command = _command(app, tokens)
             describe(command)
             code = app(tokens, exit_on_error=False, print_error=False, result_action="return_value")
+            sys.stdout.flush()
         asked = command.default_command or any(token.startswith("-") for token in tokens)
         return code or (0 if asked else BAD_INPUT)
     except wrong.MissingArgumentError as error:
@@ -83,13 +85,25 @@ def run(app: App, tokens: Sequence[str]) -> int:
         say(_file_message(error))
         return BAD_INPUT
     except BrokenPipeError:
-        raise
+        if not _reader_has_left():
+            raise
+        return FAILED
     except OSError as error:
         say(f"failed: {_file_message(error)}")
         return FAILED
     except (ValueError, TypeError, OverflowError, MemoryError) as error:
         say(_with_options(" ".join(str(error).split()), tokens) or type(error).__name__)
         return BAD_INPUT
+
+
+def _reader_has_left() -> bool:
+    """Whether standard output is a closed pipe, as after ``| head``; the rest of it is then discarded."""
+    try:
+        os.write(sys.stdout.fileno(), b"\n")
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return True
+    return False
 
 
 def _command(app: App, tokens: Sequence[str]) -> App:

@@ -43,8 +43,9 @@ def _intervals(ax: Axes, curves: Curves, result: Calibration) -> None:
         ax.axvline(dead.value, color=MUTED, lw=0.7, label=f"dead time {dead} ns")
     ax.set(yscale="log", xlabel="time between registrations (ns)", ylabel="intervals", xlim=(edges[0], edges[-1]))
     ax.set_ylim(bottom=0.5)
+    ax.set_ylim(top=20.0 * ax.get_ylim()[1])  # room for the legend
     ax.set_title("Intervals", loc="left")
-    ax.legend(frameon=False)
+    ax.legend(frameon=False, loc="upper right")
 
 
 def _phases(ax: Axes, curves: Curves, result: Calibration) -> None:

@@ -4,12 +4,12 @@ from mars_lidar.statistics.baselines import poisson_moments, poisson_pmf, renewa
 from mars_lidar.statistics.cells import photons_per_bin
 from mars_lidar.statistics.chain import PhaseChain, Stationary
 from mars_lidar.statistics.constant_light import constant_light_rate
-from mars_lidar.statistics.electronics import ElectronicsMoments, electronics_moments
-from mars_lidar.statistics.exposure import Exposure, exposure_moments
+from mars_lidar.statistics.electronics import electronics_moments
+from mars_lidar.statistics.exposure import Exposure, Moments, exposure_moments
 from mars_lidar.statistics.histogram import mean_histogram
 from mars_lidar.statistics.joint import JointLaw, joint_law
 from mars_lidar.statistics.law import CountLaw, count_law, registration_pdf
-from mars_lidar.statistics.paralyzable import ParalyzableMoments, paralyzable_moments
+from mars_lidar.statistics.paralyzable import paralyzable_moments
 from mars_lidar.statistics.phase_chain import ConvergenceError
 from mars_lidar.statistics.renewal import (
     HoldingTimes,
@@ -23,13 +23,12 @@ from mars_lidar.statistics.spectral import HoldingTimeCovariance, holding_time_c
 __all__ = [
     "ConvergenceError",
     "CountLaw",
-    "ElectronicsMoments",
     "Exposure",
     "HoldingTimeCovariance",
     "HoldingTimes",
     "JointLaw",
     "MomentMatrices",
-    "ParalyzableMoments",
+    "Moments",
     "PhaseChain",
     "Stationary",
     "constant_light_rate",

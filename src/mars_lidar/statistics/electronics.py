@@ -224,16 +224,13 @@ _A_BLOCK = 2e4  # multiplications that take as long as the overhead of a block
 _SETTLED = 1e-11  # relative change per period at which the state counts as repeating
 
 
-ElectronicsMoments = Moments
-
-
 @checked
 def electronics_moments(
     flux: Flux,
     system: System,
     *,
     tolerance: float = 1e-3,
-) -> ElectronicsMoments:
+) -> Moments:
     """Mean and variance of the number of records, and their mean histogram, with `Detector.electronics_dead_time_ns`.
 
     For modes ``"nonparalyzable"`` and ``"gated"`` (a gate that stays), both starts.
@@ -249,7 +246,7 @@ def electronics_moments(
 
     Returns
     -------
-    ElectronicsMoments
+    Moments
         For cells of shape (...).
 
     Raises
@@ -288,7 +285,7 @@ def electronics_moments(
     return moments(cells, tolerance)
 
 
-def moments(cells: Cells, tolerance: float, budget: Budget = MOMENTS) -> ElectronicsMoments:
+def moments(cells: Cells, tolerance: float, budget: Budget = MOMENTS) -> Moments:
     """`electronics_moments` of checked cells."""
     tolerance = checks.real("tolerance", tolerance, low=1e-6, high=0.1)
     out = cells.system
@@ -310,7 +307,7 @@ def moments(cells: Cells, tolerance: float, budget: Budget = MOMENTS) -> Electro
     if timing is not None:
         histogram = timing.forward(histogram)
     shape = cells.shape
-    return ElectronicsMoments(
+    return Moments(
         mean.reshape(shape), variance.reshape(shape), histogram.reshape(*shape, out.bins), grid.reshape(shape)
     )
 

@@ -26,16 +26,13 @@ _ROUNDING = 1e-12  # relative rounding error of a mean
 _MAX_WHOLE = 20_000  # whole periods of a dead time; the variance sums over each
 
 
-ParalyzableMoments = Moments
-
-
 @checked
 def paralyzable_moments(
     flux: Flux,
     system: System,
     *,
     tolerance: float = 1e-5,
-) -> ParalyzableMoments:
+) -> Moments:
     """Mean and variance of the count and mean histogram of a pixel of mode ``"paralyzable"``, both starts.
 
     Parameters
@@ -48,7 +45,7 @@ def paralyzable_moments(
 
     Returns
     -------
-    ParalyzableMoments
+    Moments
         For cells of shape (...).
 
     Raises
@@ -99,7 +96,7 @@ def paralyzable_histograms(cells: Cells, tolerance: float) -> FloatArray:
     return _refined(cells, tolerance, with_variance=False).histogram.reshape(cells.size, -1)
 
 
-def _refined(cells: Cells, tolerance: float, *, with_variance: bool) -> ParalyzableMoments:
+def _refined(cells: Cells, tolerance: float, *, with_variance: bool) -> Moments:
     tolerance = checks.real("tolerance", tolerance, low=1e-9, high=0.1)
     system = cells.system
     mean, variance, bins = np.empty(cells.size), np.empty(cells.size), np.empty(cells.size, np.int64)
@@ -132,7 +129,7 @@ def _refined(cells: Cells, tolerance: float, *, with_variance: bool) -> Paralyza
         if not with_variance:  # the limit for fine grids
             histogram[k] = np.maximum(fine.histogram + (fine.histogram - coarse.histogram) / 3.0, 0.0)
     shape = cells.shape
-    return ParalyzableMoments(
+    return Moments(
         mean.reshape(shape), variance.reshape(shape), histogram.reshape(*shape, system.bins), bins.reshape(shape)
     )
 

@@ -250,6 +250,7 @@ def _document_types(app: Sphinx, what: str, name: str, thing: Any, options: Any,
 # Reports that one program made more than once, each with a title of its own.
 TITLES = {
     "results/count_law_sequential/count_law": "Count laws against simulation photon by photon (T1)",
+    "results/image": "One to ten photons a pixel, every method",
     "results/sanitize_address": "The native core under the address sanitizer",
     "results/sanitize_thread": "The native core under the thread sanitizer",
     "copied/benchmarks/default": "Benchmarks: this version",

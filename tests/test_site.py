@@ -19,6 +19,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests" / "explore"))
 from explorer_page import chromium  # noqa: E402
 
+fcntl = pytest.importorskip("fcntl", reason="the site is built on systems with POSIX locks")
 pytestmark = pytest.mark.full
 SITE = Path(os.environ.get("SITE_UNDER_TEST", ROOT / "build" / "site"))
 SOURCES = (
@@ -78,9 +79,12 @@ def site() -> Path:
     sources = [path for pattern in SOURCES for path in ROOT.glob(pattern)]
     newest = max(path.stat().st_mtime for path in sources if not str(path.relative_to(ROOT)).startswith(GENERATED))
     index = SITE / "index.html"
-    if not index.is_file() or index.stat().st_mtime < newest:
-        command = [sys.executable, "-m", "sphinx", "-W", "-q", "-E", "-b", "html", "docs", str(SITE)]
-        subprocess.run(command, cwd=ROOT, check=True, env=os.environ | {"MPLBACKEND": "Agg"})
+    SITE.parent.mkdir(parents=True, exist_ok=True)
+    with open(SITE.parent / "site.lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # one process of the tests builds, the others wait for it
+        if not index.is_file() or index.stat().st_mtime < newest:
+            command = [sys.executable, "-m", "sphinx", "-W", "-q", "-E", "-b", "html", "docs", str(SITE)]
+            subprocess.run(command, cwd=ROOT, check=True, env=os.environ | {"MPLBACKEND": "Agg"})
     return SITE
 
 
@@ -160,6 +164,16 @@ def test_text_can_be_read(site: Path, browser: Any, scheme: str):
                 wrong[name] = low[:5]
     tab.close()
     assert not wrong, "\n".join(f"{name}: {low}" for name, low in wrong.items())
+
+
+def test_each_page_has_a_title_of_its_own(site: Path):
+    """So that results of a search and tabs can be told apart."""
+    titles: dict[str, list[str]] = {}
+    for name in pages_of(site):
+        heading = re.search(r"<h1>(.*?)<a", (site / name).read_text(), re.DOTALL)
+        assert heading, name
+        titles.setdefault(re.sub(r"<[^>]+>", "", heading[1]), []).append(name)
+    assert not [names for names in titles.values() if len(names) > 1]
 
 
 def test_commands_can_be_copied(site: Path):

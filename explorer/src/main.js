@@ -145,7 +145,14 @@ async function begin() {
   const canvases = () => [...document.querySelectorAll(".chart canvas")];
   at("csv").onclick = () => saveTable(figure.results, settings());
   at("png").onclick = () => savePicture(canvases(), `mars-lidar explorer: ${settings()}`);
-  at("presets").append(...(told ? [] : PRESETS.map((preset) => Object.assign(document.createElement("a"), { href: `#${toHash(presetState(preset))}`, textContent: preset.name }))));
+  at("presets").append(...(told ? [] : PRESETS.map((preset) => Object.assign(document.createElement("a"), { href: `#${toHash(presetState(preset))}`, textContent: preset.name,
+    onclick: (event) => { // the state first: an address still to be written would replace the link's before it is read
+      if (event.ctrlKey || event.metaKey || event.shiftKey) return; // a new tab
+      event.preventDefault();
+      clearTimeout(linkTimer);
+      history.pushState(null, "", event.currentTarget.href);
+      set(presetState(preset));
+    } }))));
   const copied = (button, text) => async () => {
     await navigator.clipboard.writeText(text());
     const label = button.textContent;
@@ -172,9 +179,9 @@ async function begin() {
       : `${cubes.length - same.length} of ${cubes.length} golden cubes differ: please report this with your browser's name.`;
     return cubes;
   };
-  addEventListener("hashchange", () => {
+  addEventListener("hashchange", (event) => {
     if (told) return; // its address is written, and read when the page loads
-    const answer = fromHash(location.hash, pixels);
+    const answer = fromHash(new URL(event.newURL).hash, pixels);
     set(answer.state, answer.changed);
   });
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => figure.restyle());

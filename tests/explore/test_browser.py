@@ -445,6 +445,27 @@ def preset(page: Page, name: str) -> dict[str, Any]:
     return page.drawn()
 
 
+def test_a_preset_is_taken_though_an_address_is_still_to_be_written(page: Page):
+    """A link clicked within the pause after a slider's last change; the way back leads to the state before it."""
+    page.set(**BASE)
+    page.tab.wait_for_timeout(600)  # this state's address is written
+    before = page.tab.evaluate("location.hash")
+    taken = page.tab.evaluate(
+        """() => {
+            explorer.set({ signal: 7 });
+            [...document.querySelectorAll("#presets a")][0].click();
+            return explorer.state.signal;
+        }"""
+    )
+    assert taken == 20
+    page.tab.wait_for_timeout(600)
+    assert page.tab.evaluate("explorer.state.signal") == 20
+    assert page.drawn()["state"]["signal"] == 20
+    page.tab.evaluate("history.back()")
+    page.until(f"explorer.state.signal === {BASE['signal']}")
+    assert page.tab.evaluate("location.hash") == before
+
+
 def test_presets_show_what_their_sentences_say(page: Page):
     told = preset(page, "More light, worse depth")
     assert "3.4 ns early, half a metre" in page.tab.inner_text("#story")

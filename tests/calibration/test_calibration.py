@@ -195,7 +195,7 @@ def test_native_counts_are_those_of_numpy() -> None:
     from mars_lidar.calibration.model import Model
     from mars_lidar.calibration.recording import Clock
 
-    rows = np.array([[0.15, 0.4, 30.0, 0.1, variance, 50.0] for variance in (0.0, 0.01, 0.05)])
+    rows = np.array([[0.15, 0.4, 30.0, 0.316, angle, 50.0] for angle in (0.0, 0.3, 0.8)])
     for clock in (Clock(100.0), Clock(100.3, 0.064, 0.5, locked=False), Clock(100.3, 0.25, 0.5, locked=True)):
         model = Model(clock, 1)
         streams = model.streams(rows, 4000, 3)

@@ -370,7 +370,7 @@ def _known(
     if "dead_time_ns" in known:
         fixed["dead_time_ns"] = checks.real("dead_time_ns", known.pop("dead_time_ns"), low=0.0)
     if "jitter_ns" in known:
-        fixed["jitter2"] = checks.real("jitter_ns", known.pop("jitter_ns"), low=0.0) ** 2
+        fixed["jitter"] = checks.real("jitter_ns", known.pop("jitter_ns"), low=0.0)
     probability, delay = known.pop("afterpulse_probability", None), known.pop("afterpulse_delay_ns", None)
     if (probability is None) != (delay is None):
         raise ValueError("afterpulse_probability and afterpulse_delay_ns belong together: give both, or neither")
@@ -387,11 +387,11 @@ def _of_detector(detector: Detector) -> tuple[dict[str, Any], dict[str, float]]:
         if name in detector.effects:
             raise ValueError(f"given must not have {name}: the stream of one pixel does not show it")
     bare = detector.without(*LIGHT_EFFECTS)
-    fixed = {"dead_time_ns": bare.dead_time_ns, "jitter2": 0.0}
+    fixed = {"dead_time_ns": bare.dead_time_ns, "jitter": 0.0}
     fields: dict[str, Any] = {"mode": bare.mode} if bare.mode != "nonparalyzable" else {}
     for name in bare.effects:
         if name == "jitter" and isinstance(bare.jitter, Jitter) and bare.jitter.tail_fraction == 0.0:
-            fixed["jitter2"] = bare.jitter.std_ns**2
+            fixed["jitter"] = bare.jitter.std_ns
         else:
             fields[name] = getattr(bare, name)
     return fields, fixed
@@ -415,7 +415,6 @@ class _Run:
         self.shape, self.returns, self.fields, self.fixed = shape, returns, fields, fixed
         self.seed = seed
         self.fit = Fit(recording, Effort(), seed + 1)
-        told = tuple(fields.items())
         self.wave: tuple[FloatArray, FloatArray] | None = None
         pulse = shape if isinstance(shape, Pulse) else None
         if pulse is not None:
@@ -424,13 +423,13 @@ class _Run:
         if shape == "free":
             self.wave = start.free_waveform(recording, _WAVE_BINS)
             shares, errors = (part / self.wave[0].sum() for part in self.wave)
-            model = Model(recording.clock, 0, None, shares, errors, recording.exposure, fields=told)
+            model = Model(recording.clock, 0, None, shares, errors, recording.exposure)
         elif self.flat or start.brightest_window(recording) < _PULSE:
             self.flat = True
-            model = Model(recording.clock, 0, fields=told)
+            model = Model(recording.clock, 0)
         else:
-            model = Model(recording.clock, returns, pulse=pulse, fields=told)
-        self.model = model
+            model = Model(recording.clock, returns, pulse=pulse)
+        self.model = replace(model, fields=tuple(fields.items()), jitter_given="jitter" in fixed)
 
     def result(self) -> Calibration:
         """The fit, the effects that it takes in, and what they leave."""
@@ -455,10 +454,8 @@ class _Run:
         without: list[tuple[str, Any, Pulse | str, dict[str, Any], dict[str, float]]] = []
         for name, value in self.fixed.items():
             free_of_it = {key: own for key, own in self.fixed.items() if key != name}
-            jitter = name == "jitter2"
-            without.append(
-                ("jitter_ns" if jitter else name, value**0.5 if jitter else value, self.shape, self.fields, free_of_it)
-            )
+            printed = "jitter_ns" if name == "jitter" else name
+            without.append((printed, value, self.shape, self.fields, free_of_it))
         for name, whole in self.fields.items():
             rest = {key: own for key, own in self.fields.items() if key != name}
             without.append((name, whole, self.shape, rest, self.fixed))
@@ -498,13 +495,13 @@ class _Run:
             [
                 k
                 for k, name in enumerate(model.names)
-                if name not in self.fixed and not (width_known and name == "width2")
+                if name not in self.fixed and not (width_known and name == "width")
             ],
             np.intp,
         )
         first = float(min(self.recording.photons, fit.effort.first))
         for _, theta in begin[:2]:
-            spread = np.diag(start.first_spread(model, theta)[free])
+            spread = np.diag(model.scale(theta)[free])
             theta, root, misfit, _ = fit.steps(model, theta, spread, free, first, 3)
             tried.append((misfit, theta, root))
         _, theta, root = min(tried, key=lambda trial: trial[0])
@@ -594,13 +591,12 @@ def _estimates(fitted: Fitted, fixed: dict[str, float], growth: FloatArray) -> d
     """What is printed, written and drawn, from draws of the law of the parameters."""
     model = fitted.model
     scale = growth[fitted.free]
-    covariance = fitted.unbounded_covariance * np.outer(scale, scale)
+    covariance = fitted.covariance * np.outer(scale, scale)
     drawn = draws(model, fitted.unbounded, covariance, fitted.free)
     centre = model.bounded(fitted.theta)
     if drawn is None:  # the estimate lies beyond what a detector can have
-        spread = np.random.default_rng(0).standard_normal((2000, len(fitted.free))) * np.sqrt(np.diag(covariance))
         drawn = np.tile(centre, (2000, 1))
-        drawn[:, fitted.free] += spread
+        drawn[:, fitted.free] = np.random.default_rng(0).multivariate_normal(centre[fitted.free], covariance, 2000)
         drawn = model.bounded(drawn)
     names = model.names
     k = model.light
@@ -612,7 +608,7 @@ def _estimates(fitted: Fitted, fixed: dict[str, float], growth: FloatArray) -> d
             out[name] = Estimate(value, 0.0, value, value, "given")
             return
         low, high = np.quantile(sample, (0.025, 0.975))
-        out[name] = Estimate(value, float(sample.std()), float(low), float(high), note)
+        out[name] = Estimate(value, float(((sample - value) ** 2).mean() ** 0.5), float(low), float(high), note)
 
     light = names[0] if model.returns else "light"  # all of it
     put(light, float(centre[0]), drawn[:, 0], names[0])
@@ -620,20 +616,20 @@ def _estimates(fitted: Fitted, fixed: dict[str, float], growth: FloatArray) -> d
         period = model.clock.period_ns
         wrapped = names[i].startswith("delay")
         put(names[i], float(centre[i] % period if wrapped else centre[i]), drawn[:, i], names[i])
-    width2, jitter2 = drawn[:, k], drawn[:, k + 1]
-    sd = float(np.sqrt(np.diag(covariance))[list(fitted.free).index(k + 1)]) if "jitter2" in free else 0.0
+    pulses, jitters = model.widths(drawn)
+    pulse, jitter = map(float, model.widths(centre))
     note = ""
-    if sd:
+    if "jitter" in free:
+        sd = float(np.sqrt(np.diag(covariance))[list(fitted.free).index(k + 1)])
         if fitted.unbounded[k + 1] < 2.0 * sd:
             note = "not detected"
-        if model.gaussian and np.quantile(jitter2, 0.975) > 0.97 * centre[k] and note:
+        if note and model.split and np.quantile(jitters, 0.975) > 0.985 * centre[k]:
             note = "not identified: any share of the recorded width"
     if model.gaussian:
-        put("width_ns", float(centre[k] ** 0.5), np.sqrt(width2), "width2")
-        own = np.sqrt(np.maximum(width2 - jitter2, 0.0))
+        put("width_ns", float(centre[k]), drawn[:, k], "width")
         shared = note if note.startswith("not identified") else ""
-        put("pulse_sigma_ns", float(max(centre[k] - centre[k + 1], 0.0) ** 0.5), own, "width2", note=shared)
-    put("jitter_ns", float(centre[k + 1] ** 0.5), np.sqrt(jitter2), "jitter2", note=note)
+        put("pulse_sigma_ns", pulse, pulses, "width", note=shared)
+    put("jitter_ns", jitter, jitters, "jitter", note=note)
     at = k + 3
     dead, observed = drawn[:, k + 2], float(centre[k + 2])
     dead_name = "dead_time_ns"

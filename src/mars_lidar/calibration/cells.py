@@ -81,7 +81,7 @@ class Cells:
             dense = np.bincount((phases * 32).astype(int) % 32, minlength=32)
             bright = np.flatnonzero(dense > 1.5 * np.median(dense))
             lit = [(k / 32, (k + 1) / 32) for k in bright]
-        width = float(np.sqrt(theta[model.light] + unit**2 / 12)) if model.waveform is None else 0.0
+        width = float(np.sqrt(theta[model.light] ** 2 + unit**2 / 12)) if model.waveform is None else 0.0
         if model.pulse is not None and model.returns:  # by the scatter of the phases about the delay
             off = (phases - theta[2] / period + 0.5) % 1.0 - 0.5
             dense, at = np.histogram(off, 512)

@@ -19,16 +19,16 @@ from mars_lidar.calibration.cells import Cells
 from mars_lidar.calibration.model import Effect, Model
 from mars_lidar.calibration.recording import Recording
 
-SETTINGS = 16  # detectors of a batch
+SETTINGS = 32  # detectors of a batch
 LIGHTS = 16  # lights of each, in one call of the engine
 _SPREAD = 2.0  # of a batch about its centre, in standard errors of a stream of its own length
-_LONGER = 4.0  # times the photons of the last law, whose closer parameters resolve the edge of a dead time
+_MORE = 2  # times the streams of the last law, about closer parameters, where counts near the end of a dead time are linear
+_LONGER = 4.0  # times the photons of each of the last streams, which need not differ as much
 _NEAR = 3.0  # the same of the last batches, in standard errors of the recording
 _SETTLED = 1.0  # standard errors that the last estimate may lie from the centre of its streams
 _LONGEST = 3.0  # of a move of that centre
 _FAR = 5.0  # standard errors that the centre may move before cells are laid anew
-_WIDEST = 2.0  # spreads of a first batch that later ones may have
-_VARIED = 0.5  # of the recorded variance of the pulse, the most that a batch's standard deviation may be
+_WIDEST = 2.0  # of a batch, in `Model.scale`
 _RECENTRED = 4  # last batches, at most
 _PULSES = 4  # widths of a batch
 _CUMULATED = 100.0  # intervals expected up to an edge, for a normal law of their number
@@ -49,7 +49,7 @@ class Effort:
     first: int = 8_000
 
     def of(self, photons: float, times: float = 1.0) -> int:
-        """Photons of each stream of a batch, for this many of the recording; `times` as many in all, for an edge."""
+        """Photons of each stream of a batch, for this many of the recording; `times` as many for the last batches."""
         number = SETTINGS * LIGHTS
         wanted = times * max(self.stream, min(self.share * photons, self.batch) / number)
         return int(min(photons, max(wanted, 2.0 * photons / number)))
@@ -95,7 +95,9 @@ def counted(
     )
 
 
-def design(model: Model, centre: FloatArray, root: FloatArray, free: NDArray[np.intp], seed: int) -> FloatArray:
+def design(
+    model: Model, centre: FloatArray, root: FloatArray, free: NDArray[np.intp], seed: int, number: int = SETTINGS
+) -> FloatArray:
     """Parameters (streams, p), normal of covariance root root' about the centre; `LIGHTS` rows share a detector.
 
     Jitter varies from row to row, the pulse from one detector to the next, in `_PULSES` widths: the tables of a pulse
@@ -103,11 +105,13 @@ def design(model: Model, centre: FloatArray, root: FloatArray, free: NDArray[np.
     """
     random = np.random.default_rng(seed)
     k = model.light
-    split = np.eye(model.size)  # from the recorded width to that of the pulse, without the jitter
-    split[k, k + 1] = -1.0 if model.gaussian else 0.0
+    polar = np.eye(model.size)  # from width and angle to the standard deviations of pulse and jitter
+    if model.split:
+        cos, sin = np.cos(centre[k + 1]), np.sin(centre[k + 1])
+        polar[k : k + 2, k : k + 2] = [[cos, -centre[k] * sin], [sin, centre[k] * cos]]
     cov = np.zeros((model.size, model.size))
     cov[np.ix_(free, free)] = root @ root.T
-    cov = split @ cov @ split.T
+    cov = polar @ cov @ polar.T
     det = free[(free == k) | (free > k + 1)]
     lit = np.setdiff1d(free, det)
 
@@ -116,25 +120,34 @@ def design(model: Model, centre: FloatArray, root: FloatArray, free: NDArray[np.
         z = random.standard_normal((rows, columns))
         return np.asarray(np.linalg.qr(z - z.mean(0))[0] * rows**0.5)
 
-    away = np.zeros((SETTINGS * LIGHTS, model.size))
+    away = np.zeros((number * LIGHTS, model.size))
     within = cov[np.ix_(lit, lit)]
+    groups = [np.arange(len(away))]
     if det.size:
         between = cov[np.ix_(det, det)]
-        settings = normal(SETTINGS, det.size) @ _root(between).T
+        settings = normal(number, det.size) @ _root(between).T
         if k in det:
-            for part in np.array_split(np.argsort(settings[:, 0]), _PULSES):
+            parts = np.array_split(np.argsort(settings[:, 0]), _PULSES)
+            groups = [(part[:, None] * LIGHTS + np.arange(LIGHTS)).ravel() for part in parts]
+            for part in parts:
                 settings[part, 0] = settings[part, 0].mean()
         away[:, det] = np.repeat(settings, LIGHTS, 0)
         gain = cov[np.ix_(lit, det)] @ np.linalg.pinv(between, rcond=1e-10)
         away[:, lit] = away[:, det] @ gain.T
         within = within - gain @ cov[np.ix_(det, lit)]
     away[:, lit] += normal(len(away), lit.size) @ _root(within).T
-    at = centre @ split.T + away
-    least = (1e-3 * centre[k]) if model.gaussian else -np.inf
-    at[:, k] = np.maximum(at[:, k], least)  # the same in all rows of a detector
-    at[:, k + 1] = np.maximum(at[:, k + 1], 0.0)
-    rows = model.bounded(at @ np.linalg.inv(split).T)
-    rows[:, k + 3 :] = np.repeat(rows[::LIGHTS, k + 3 :], LIGHTS, 0)
+    rows = centre + away @ np.linalg.inv(polar).T
+    rows[:, k : k + 2] = np.abs(rows[:, k : k + 2])
+    if model.split:
+        rows[:, k + 1] = np.arcsin(np.abs(np.sin(rows[:, k + 1])))
+    rows = model.bounded(rows)
+    if model.gaussian:
+        for group in groups:
+            pulse, jitter = model.widths(rows[group])
+            pulse = np.full_like(pulse, pulse.mean())
+            rows[group, k] = np.hypot(pulse, jitter)
+            if model.split:
+                rows[group, k + 1] = np.arctan2(jitter, pulse)
     return rows
 
 
@@ -180,14 +193,13 @@ def regression(
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """A fit that fresh streams have judged: parameters (p,), covariance of the free ones, misfit, and its law."""
+    """A fit that fresh streams have judged: most probable parameters (p,), covariance of the free ones, misfit."""
 
     model: Model
     free: NDArray[np.intp]
     theta: FloatArray
-    covariance: FloatArray
+    covariance: FloatArray  # before these bounds
     unbounded: FloatArray  # (p,) before the bounds of what a detector can have
-    unbounded_covariance: FloatArray
     scatter: FloatArray  # (free, free) that of the estimator for the recording's exposure, simulations aside
     batch: Batch  # cells and weights
     offset: FloatArray  # (c,) expected counts at the centre of the last streams
@@ -201,14 +213,26 @@ class Fitted:
     converged: bool
 
 
-def physical(
-    model: Model, theta: FloatArray, covariance: FloatArray, free: NDArray[np.intp]
-) -> tuple[FloatArray, FloatArray]:
-    """Mean and covariance of a normal law within what a detector can have: jitter no wider than the recorded pulse."""
-    draw = draws(model, theta, covariance, free)
-    if draw is None:
-        return model.bounded(theta), covariance
-    return draw.mean(0), np.atleast_2d(np.cov(draw[:, free].T))
+def most_probable(model: Model, theta: FloatArray, covariance: FloatArray, free: NDArray[np.intp]) -> FloatArray:
+    """The most probable parameters (p,) of a normal law within what a detector can have.
+
+    One parameter after the other, the one farthest beyond its bound first, is set to that bound, and the others to
+    their mean given that value.
+    """
+    sd = np.sqrt(np.diag(covariance))
+    theta, at_bound = theta.copy(), np.zeros(len(free), bool)
+    for _ in free:
+        beyond = np.where(at_bound, 0.0, (model.bounded(theta) - theta)[free] / sd)
+        worst = int(np.abs(beyond).argmax())
+        if beyond[worst] == 0.0:
+            break
+        at_bound[worst] = True
+        fixed, rest = np.flatnonzero(at_bound), np.flatnonzero(~at_bound)
+        off = (model.bounded(theta) - theta)[free[fixed]]
+        gain = covariance[np.ix_(rest, fixed)] @ np.linalg.pinv(covariance[np.ix_(fixed, fixed)])
+        theta[free[rest]] += gain @ off
+        theta[free[fixed]] += off
+    return model.bounded(theta)
 
 
 def draws(model: Model, theta: FloatArray, covariance: FloatArray, free: NDArray[np.intp]) -> FloatArray | None:
@@ -218,6 +242,16 @@ def draws(model: Model, theta: FloatArray, covariance: FloatArray, free: NDArray
     rows[:, free] += np.random.default_rng(0).standard_normal((_DRAWS, len(free))) @ root.T
     inside = (np.abs(model.bounded(rows) - rows)[:, free] <= 1e-12 * np.abs(theta[free])).all(1)
     return rows[inside] if inside.sum() >= 200 else None
+
+
+def _inverse(fisher: FloatArray, prior: FloatArray, root: FloatArray) -> FloatArray:
+    """Covariance of an information and a prior precision; noise may have made the information indefinite.
+
+    Directions that it hardly determines are those of coordinates in which root root' is the unit matrix.
+    """
+    values, vectors = np.linalg.eigh(root.T @ fisher @ root)
+    whole = (vectors * np.maximum(values, 1e-2)) @ vectors.T + root.T @ prior @ root
+    return np.asarray(root @ np.linalg.inv(whole) @ root.T)
 
 
 class Fit:
@@ -251,16 +285,15 @@ class Fit:
         photons: float,
         cells: Cells | None = None,
         spread: float = _SPREAD,
+        more: int = 1,
         times: float = 1.0,
     ) -> Batch:
         """The linear law of counts about `theta` for an exposure of this many photons."""
         cells = self.cells(model, theta, photons) if cells is None else cells
         size = self.effort.of(photons, times)
-        wide = spread * (photons / size) ** 0.5 * root
-        if model.gaussian and model.light in free:  # counts are no linear function of a variance down to none
-            k = int(np.flatnonzero(free == model.light)[0])
-            wide[k] *= min(1.0, _VARIED * theta[model.light] / max(float(np.linalg.norm(wide[k])), 1e-300))
-        rows = design(model, theta, wide, free, self.next_seed())
+        linear = np.diag((_WIDEST * model.scale(theta)[free]) ** -2.0)
+        wide = _root(np.linalg.inv(np.linalg.inv(spread**2 * photons / size * root @ root.T) + linear))
+        rows = design(model, theta, wide, free, self.next_seed(), more * SETTINGS)
         exposure = max(2, round(self.exposure(size)))
         made = counted(model, cells, rows, exposure, self.next_seed())
         return regression(cells, rows, theta, made, self.exposure(photons) / exposure, free)
@@ -279,7 +312,6 @@ class Fit:
         weighed = float(min(photons, max(first, self.effort.first)))
         total = float(self.recording.photons)
         misfit, near = np.inf, False
-        widest = _WIDEST * np.sqrt(np.diag(root @ root.T))  # more is of counts that hardly depend on a parameter
         for _ in range(rounds):
             law = self.law(model, theta, root, free, weighed)
             seen = law.cells.of(self.recording) * (weighed / total)
@@ -295,15 +327,14 @@ class Fit:
             step = step / max(1.0, size / 2.0)
             moved = theta.copy()
             moved[free] += step
-            theta = physical(model, moved, cov, free)[0]
+            theta = most_probable(model, moved, cov, free)
             rest = seen - law.offset - law.slope[:, free] @ step
             misfit = float(rest @ law.weight @ rest / len(rest)) if size <= 2.0 else np.inf
             near = size < (0.6 if weighed >= photons else 1.5)
             grown = min(photons, weighed * 6.0) if near else weighed
             cov = cov * (weighed / grown)
-            sd = np.sqrt(np.diag(cov))
-            narrowed = np.minimum(1.0, widest / sd)
-            root = _root((cov + np.diag((0.02 * sd) ** 2)) * np.outer(narrowed, narrowed))
+            cov = cov + np.diag(0.02**2 * np.diag(cov))
+            root = _root(cov)
             if near and weighed >= photons:
                 break
             weighed = grown
@@ -319,28 +350,39 @@ class Fit:
     ) -> Fitted:
         """The last estimate, and what fresh streams about it say of its slope, bias, scatter and misfit."""
         photons = float(self.recording.photons)
-        law = self.law(model, theta, root, free, photons, times=_LONGER)
-        nearby = _NEAR * (self.effort.of(photons) / photons) ** 0.5
+        law = self.law(model, theta, root, free, photons, spread=_SPREAD / _MORE**0.5, more=_MORE, times=_LONGER)
+        nearby = _NEAR * (self.effort.of(photons, _LONGER) / photons) ** 0.5
         gain = law.estimator(free)
         seen = law.cells.of(self.recording)
         centre, size = theta, np.zeros(len(free))
         for trial in range(_RECENTRED):
-            near = self.law(model, centre, root, free, photons, law.cells, spread=nearby)
+            near = self.law(model, centre, root, free, photons, law.cells, spread=nearby, times=_LONGER)
             y = near.counts  # of streams near the estimate, in the recording's exposure
             moved = (near.theta - centre)[:, free]
             terms = np.c_[np.ones(len(y)), moved]
-            slope, *_ = np.linalg.lstsq(terms, (y - near.offset) @ gain.T, rcond=None)
+            inverse = np.linalg.pinv(terms.T @ terms)
+            slope = inverse @ terms.T @ (y - near.offset) @ gain.T
             local = slope[1:].T
-            estimator = np.linalg.pinv(local) @ gain
-            rest = (y - near.offset) @ estimator.T - moved
-            scatter = np.cov(rest.T).reshape(len(free), len(free))
-            cov = scatter * (1.0 / near.ratio + 1.0 / len(y))
+            rest = (y - near.offset) @ gain.T - terms @ slope
+            noise = np.atleast_2d(rest.T @ rest) / (len(y) - terms.shape[1])
+            away = gain @ (seen - near.offset) - slope[0]
+            information, prior = np.linalg.inv(noise), model.precision(free)
+            place = np.r_[1.0, np.linalg.pinv(local) @ away]  # where the law is read, for its own noise there
+            for _ in range(2):
+                scale = 1.0 / (1.0 / near.ratio + place @ inverse @ place)
+                # the square of the slope is too large by that of its noise
+                fisher = scale * (local.T @ information @ local - len(free) * inverse[1:, 1:])
+                cov = _inverse(fisher, prior, root)
+                solve = scale * cov @ local.T @ information
+                place[1:] = solve @ away + cov @ prior @ (model.middle(centre) - centre)[free]
+            estimator = solve @ gain
             raw = centre.copy()
-            raw[free] += estimator @ (seen - near.offset) - rest.mean(0)
-            mean, truncated = physical(model, raw, cov, free)
+            raw[free] += place[1:]
+            mean = most_probable(model, raw, cov, free)
             size = np.abs((mean - centre)[free]) / np.sqrt(np.diag(cov))
-            if size.max() < _SETTLED or trial == _RECENTRED - 1:
+            if trial and (size.max() < _SETTLED or trial == _RECENTRED - 1):
                 break
+            root = _root(cov)
             centre = centre + (mean - centre) / max(1.0, float(size.max()) / _LONGEST)
         sd = np.sqrt(np.diag(cov))
         if again and (np.abs((centre - theta)[free]) > _FAR * sd).any():  # cells and weights were laid elsewhere
@@ -356,10 +398,9 @@ class Fit:
             model=model,
             free=free,
             theta=mean,
-            covariance=truncated,
             unbounded=raw,
-            unbounded_covariance=cov,
-            scatter=scatter / near.ratio,
+            covariance=cov,
+            scatter=solve @ noise @ solve.T / near.ratio,
             batch=law,
             offset=near.offset,
             estimator=estimator,

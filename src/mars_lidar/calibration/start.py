@@ -31,7 +31,7 @@ def free_light(t: FloatArray, period: float, hold: float, bins: int) -> tuple[Fl
 
 
 def light(t: FloatArray, model: Model, hold: float) -> FloatArray:
-    """Background, signal and delay of each return, and variance of the recorded pulse, by matched filters."""
+    """Background, signal and delay of each return, and width of the recorded pulse, by matched filters."""
     period, unit = model.clock.period_ns, model.clock.unit_ns
     bins = int(np.clip(period / max(unit, 1e-9), 64, _MOST_BINS))
     hits, passes = free_light(t, period, hold, bins)
@@ -75,7 +75,7 @@ def light(t: FloatArray, model: Model, hold: float) -> FloatArray:
         variance = variance or var
     own = max(variance - unit**2 / 12, 0.0025 * variance, (0.15 * unit) ** 2)
     back = max(faint * bins if model.returns else float(rate.sum()), 1e-5)
-    return np.array([back, *found, own])
+    return np.array([back, *found, own**0.5])
 
 
 def starts(fit: Fit, recording: Recording, model: Model, fixed: dict[str, float]) -> list[tuple[float, FloatArray]]:
@@ -93,7 +93,7 @@ def starts(fit: Fit, recording: Recording, model: Model, fixed: dict[str, float]
     hold = max(hold, fixed.get("dead_time_ns", 0.0) + 2 * model.clock.unit_ns)
     if model.returns == 0:
         total = float(free_waveform(recording, 64)[0].sum())
-        first = np.array([total, max((observed[-3] - observed[0]) / 4, 0.3 * model.clock.unit_ns) ** 2])
+        first = np.array([total, max((observed[-3] - observed[0]) / 4, 0.3 * model.clock.unit_ns)])
     else:
         first = light(t, model, hold)
     found = []
@@ -103,9 +103,9 @@ def starts(fit: Fit, recording: Recording, model: Model, fixed: dict[str, float]
         theta[: k + 1] = first
         for name, value in fixed.items():
             theta[names.index(name)] = value
-        jitter2 = fixed.get("jitter2", share * theta[k])
-        theta[k + 1] = jitter2
-        theta[k + 2] = fixed.get("dead_time_ns", max(observed[0], 0.05 * observed[-1]) + 2 * np.sqrt(jitter2))
+        theta[k + 1] = fixed.get("jitter", np.arcsin(share**0.5) if model.split else share**0.5 * theta[k])
+        jitter = float(model.widths(theta)[1])
+        theta[k + 2] = fixed.get("dead_time_ns", max(observed[0], 0.05 * observed[-1]) + 2 * jitter)
         at = k + 3
         for effect in model.effects:
             for name, value in zip(effect.names, effect.start, strict=True):
@@ -118,7 +118,7 @@ def starts(fit: Fit, recording: Recording, model: Model, fixed: dict[str, float]
         seen = cells.of(recording) * (photons / recording.photons)
         r = (2 * np.sqrt(seen + 0.375) - 2 * np.sqrt(rows + 0.375).mean(0)) ** 2
         found.append((float(r.sum()), theta))
-        if "jitter2" in fixed:
+        if "jitter" in fixed:
             break
     return sorted(found, key=lambda pair: pair[0])
 
@@ -136,26 +136,6 @@ def with_edge(fit: Fit, model: Model, theta: FloatArray, low: FloatArray) -> Flo
         theta = theta.copy()
         theta[k + 2] = max(theta[k + 2] + float((observed - here)[1:-1].mean()), 0.05 * observed[0])
     return theta
-
-
-def first_spread(model: Model, theta: FloatArray) -> FloatArray:
-    """Standard deviations (p,) of the first batch about a start."""
-    unit, k = model.clock.unit_ns, model.light
-    width = float(np.sqrt(theta[k] + unit**2 / 12))
-    out = np.zeros(model.size)
-    out[0] = 0.15 * theta[0]
-    for r in range(model.returns):
-        out[1 + 2 * r] = 0.1 * theta[1 + 2 * r] + 0.02 * theta[0]
-        out[2 + 2 * r] = 0.3 * width
-    out[k] = 0.3 * width**2
-    out[k + 1] = 0.25 * theta[k]
-    out[k + 2] = 0.3 * width + 0.5 * unit
-    at = k + 3
-    for effect in model.effects:
-        for number, value in enumerate(effect.start):
-            out[at] = 0.4 * (max(value, theta[at]) if number == 0 else 1.0)
-            at += 1
-    return out
 
 
 def safe_hold(recording: Recording) -> float:

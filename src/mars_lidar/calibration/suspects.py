@@ -11,7 +11,7 @@ from mars_lidar._base.types import FloatArray
 from mars_lidar.calibration.fit import LIGHTS, Fit, Fitted, counted
 from mars_lidar.calibration.model import Effect, Model, effects
 from mars_lidar.calibration.recording import Recording
-from mars_lidar.calibration.start import first_spread, with_edge
+from mars_lidar.calibration.start import with_edge
 
 _DIRECTION = 12.0  # photons of the streams that give the direction of an effect, over those of the recording
 _MOST = 2e6  # of these photons
@@ -148,7 +148,7 @@ def _stepped(fit: Fit, fitted: Fitted, score: Score) -> tuple[float, _Stepped] |
         size = min(score.size, effect.most[0])
         moved[fitted.free] -= score.shift * min(size, effect.start[0])
     theta = model.bounded(np.r_[moved, size, effect.start[1:]])
-    spread = first_spread(model, theta)
+    spread = model.scale(theta)
     own = np.sqrt(np.diag(fitted.covariance))
     spread[fitted.free] = np.minimum(spread[fitted.free], np.maximum(8.0 * own, 1e-12))
     more = [] if effect.onoff else range(fitted.model.size, model.size)

@@ -82,26 +82,36 @@ def with_effect(truth: Truth, effect: str | None) -> Truth:
     return replace(truth, **more)
 
 
+def true_values(truth: Truth) -> tuple[float, ...]:
+    """Those of `PULLED`."""
+    return truth.background, truth.signal, truth.delay, truth.width, truth.dead
+
+
 def pulls(result: ml.Calibration, truth: Truth) -> np.ndarray:
     """(estimate - truth) / stated error of `PULLED`, NaN where there is none."""
-    true = {
-        "background": truth.background,
-        "signal": truth.signal,
-        "delay_ns": truth.delay,
-        "width_ns": truth.width,
-        "dead_time_ns": truth.dead,
-    }
     out = []
-    for name in PULLED:
+    for name, true in zip(PULLED, true_values(truth), strict=True):
         estimate = result.estimates.get(name)
         if estimate is None or not estimate.error > 0.0:
             out.append(np.nan)
             continue
-        off = estimate.value - true[name]
+        off = estimate.value - true
         if name == "delay_ns":
             off = (off + truth.period / 2) % truth.period - truth.period / 2
         out.append(off / estimate.error)
     return np.array(out)
+
+
+def outside(result: ml.Calibration, truth: Truth) -> list[str]:
+    """Names of `PULLED` whose true values lie outside of the 95 % intervals."""
+    out = []
+    for name, true in zip(PULLED, true_values(truth), strict=True):
+        estimate = result.estimates.get(name)
+        if estimate is not None:
+            wraps = (0.0, truth.period, -truth.period) if name == "delay_ns" else (0.0,)
+            if not any(estimate.low <= true + wrap <= estimate.high for wrap in wraps):
+                out.append(name)
+    return out
 
 
 def main() -> None:
@@ -133,8 +143,11 @@ def main() -> None:
     others = sum(any(name != NAMES.get(asked.effect or "") for name in row["suspects"]) for row in rows)
     print("parameters       ", PULLED)
     print("sd of pulls      ", np.round(np.nanstd(table, axis=0), 2))
+    print("rms of pulls     ", np.round(np.sqrt(np.nanmean(table**2, axis=0)), 2))
     print("largest          ", np.round(np.nanmax(np.abs(table), axis=0), 1))
     print("beyond 4.5       ", (np.abs(table) > 4.5).sum(0), "of", len(table))
+    missed = [name for row in rows for name in row["outside"]]
+    print("outside of 95 %  ", [missed.count(name) for name in PULLED])
     print("without an error ", np.isnan(table).sum(0))
     print(f"p below 1 % {sum(row['p'] < 0.01 for row in rows)}, named {named}, other suspects {others}, of {len(rows)}")
     print(
@@ -157,6 +170,7 @@ def calibrated(number: int, effect: str | None, photons: int | None) -> dict[str
         "seconds": time.process_time() - began,
         "p": float(result.p_value),
         "pulls": [None if np.isnan(z) else float(z) for z in pulls(result, truth)],
+        "outside": outside(result, truth),
         "suspects": [suspect.name for suspect in result.suspects],
     }
 

@@ -19,7 +19,7 @@ from mars_lidar.calibration.curves import Curves, Realizations, curves, realizat
 from mars_lidar.calibration.fit import Effort, Fit, Fitted, draws
 from mars_lidar.calibration.look import Look, look_at
 from mars_lidar.calibration.model import Model, all_carriers
-from mars_lidar.calibration.recording import Recording, recording_of, recording_of_arrivals
+from mars_lidar.calibration.recording import LEAST_PHOTONS, Recording, recording_of, recording_of_arrivals
 from mars_lidar.calibration.suspects import Drift, Score
 from mars_lidar.instrument.avalanches import Afterpulsing
 from mars_lidar.instrument.detector import Detector
@@ -29,14 +29,10 @@ from mars_lidar.instrument.system import MAX_CYCLES, System
 from mars_lidar.light.flux import Flux
 from mars_lidar.light.timestamps import Timestamps
 
-_LEAST_PHOTONS = 300  # below them the counts of the cells have no normal law
-_MOST_RETURNS = 4
 _MOST_EFFECTS = 2  # that are taken in one after the other
 _WAVE_BINS = 256  # of a free light, at most
-_PULSE = 5.0  # standard deviations of the brightest window over the period, below which there is no pulse
 _SAME_TIME = 0.01  # share of records at exactly the time of the one before, that no photons are
 _ATTEMPTS = 3  # fits of a stream, each with simulated streams of its own, of which the first that converges is taken
-_SEEDS_OF_A_FIT = 1_000_000  # between the seeds of two attempts
 LEVEL = 0.01  # false-alarm probability of the verdict
 
 PARAMETERS = ("dead_time_ns", "jitter_ns", "pulse_sigma_ns")
@@ -314,7 +310,7 @@ def calibrate(
     >>> abs(dead_time.value - 50.0) < 4.0 * dead_time.error
     True
     """
-    number = checks.integer("returns", returns, low=1, high=_MOST_RETURNS)
+    number = checks.integer("returns", returns, low=1, high=4)
     alpha = checks.real("level", level, low=0.0, high=0.5, strict_low=True)
     for name, value in (("look", look), ("pooled", pooled)):
         if not isinstance(value, bool):
@@ -325,9 +321,9 @@ def calibrate(
     seen = look_at(recording)
     if look:
         return Calibration(seen, {}, float("nan"), (), (), None, None, None, None, None, recording, None, alpha)
-    if recording.photons < _LEAST_PHOTONS:
+    if recording.photons < LEAST_PHOTONS:
         raise ValueError(
-            f"times must hold at least {_LEAST_PHOTONS} registrations to be calibrated, got {recording.photons}; "
+            f"times must hold at least {LEAST_PHOTONS} registrations to be calibrated, got {recording.photons}; "
             "look=True describes a shorter recording"
         )
     if seen.same_time > _SAME_TIME * recording.photons and seen.unit_ns == 0.0:
@@ -414,7 +410,7 @@ class _Run:
         self.recording, self.look, self.level = recording, look, level
         self.shape, self.returns, self.fields, self.fixed = shape, returns, fields, fixed
         self.seed = seed
-        self.fit = Fit(recording, Effort(), seed + 1)
+        self.fit = Fit(recording, Effort(), (seed, 0))
         self.wave: tuple[FloatArray, FloatArray] | None = None
         pulse = shape if isinstance(shape, Pulse) else None
         if pulse is not None:
@@ -424,7 +420,7 @@ class _Run:
             self.wave = start.free_waveform(recording, _WAVE_BINS)
             shares, errors = (part / self.wave[0].sum() for part in self.wave)
             model = Model(recording.clock, 0, None, shares, errors, recording.exposure)
-        elif self.flat or start.brightest_window(recording) < _PULSE:
+        elif self.flat or start.brightest_window(recording) > suspects.FALSE_ALARM:
             self.flat = True
             model = Model(recording.clock, 0)
         else:
@@ -479,7 +475,7 @@ class _Run:
     def first(self) -> Fitted:
         """The fit of the plain model, from the better of two starts; with other streams where it did not converge."""
         for attempt in range(_ATTEMPTS):
-            self.fit = Fit(self.recording, Effort(), self.seed + 1 + attempt * _SEEDS_OF_A_FIT)
+            self.fit = Fit(self.recording, Effort(), (self.seed, attempt))
             fitted = self._attempt()
             if fitted.converged:
                 break
@@ -501,11 +497,11 @@ class _Run:
         )
         first = float(min(self.recording.photons, fit.effort.first))
         for _, theta in begin[:2]:
-            spread = np.diag(model.scale(theta)[free])
-            theta, root, misfit, _ = fit.steps(model, theta, spread, free, first, 3)
+            spread = np.diag(0.5 * model.scale(theta)[free])
+            theta, root, misfit, _ = fit.steps(model, theta, spread, free, first)
             tried.append((misfit, theta, root))
         _, theta, root = min(tried, key=lambda trial: trial[0])
-        theta, root, _, settled = fit.steps(model, theta, root, free, float(self.recording.photons), 10)
+        theta, root, _, settled = fit.steps(model, theta, root, free, float(self.recording.photons))
         final = fit.finish(model, theta, root, free)
         return replace(final, converged=final.converged and (settled or final.p_value >= self.level))
 

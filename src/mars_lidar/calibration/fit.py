@@ -21,32 +21,33 @@ from mars_lidar.calibration.recording import Recording
 
 SETTINGS = 32  # detectors of a batch
 LIGHTS = 16  # lights of each, in one call of the engine
-_SPREAD = 2.0  # of a batch about its centre, in standard errors of a stream of its own length
-_MORE = 2  # times the streams of the last law, about closer parameters, where counts near the end of a dead time are linear
-_LONGER = 4.0  # times the photons of each of the last streams, which need not differ as much
-_NEAR = 3.0  # the same of the last batches, in standard errors of the recording
-_SETTLED = 1.0  # standard errors that the last estimate may lie from the centre of its streams
-_LONGEST = 3.0  # of a move of that centre
-_FAR = 5.0  # standard errors that the centre may move before cells are laid anew
-_WIDEST = 2.0  # of a batch, in `Model.scale`
-_RECENTRED = 4  # last batches, at most
-_PULSES = 4  # widths of a batch
+_NEAR = 3.0  # standard errors of the recording about the estimate, from which the last streams are drawn
 _CUMULATED = 100.0  # intervals expected up to an edge, for a normal law of their number
-_DRAWS = 20_000  # of the law of the estimate, for its bounds
 
 
 @dataclass(frozen=True)
 class Effort:
-    """Photons of simulated streams.
+    """Photons of simulated streams, and how many of these: it is traded for time and for the noise of the errors.
 
     `stream` least photons of each, `batch` photons of a batch at most and `share` of the recording's photons that a
-    batch has at least, below that bound; `first` photons of the recording that the first steps weigh.
+    batch has at least, below that bound; `first` photons of the recording that the first steps weigh, `rounds` steps
+    at most. `spread` of a batch about its centre, in standard errors of a stream of its length. Of the last streams
+    `longer` is the factor on their photons, so that they need not differ as much, `more` that on the number of those
+    which give the weights, and `recentred` the number of batches at most. `widths` of the pulse in a batch: the tables
+    of a pulse cost as much as a stream. `draws` from the law of the estimate, for its bounds.
     """
 
     stream: int = 2_000
     batch: float = 4e6
     share: float = 12.0
     first: int = 8_000
+    rounds: int = 10
+    spread: float = 2.0
+    longer: float = 4.0
+    more: int = 2
+    recentred: int = 4
+    widths: int = 8
+    draws: int = 20_000
 
     def of(self, photons: float, times: float = 1.0) -> int:
         """Photons of each stream of a batch, for this many of the recording; `times` as many for the last batches."""
@@ -96,23 +97,17 @@ def counted(
 
 
 def design(
-    model: Model, centre: FloatArray, root: FloatArray, free: NDArray[np.intp], seed: int, number: int = SETTINGS
+    model: Model, centre: FloatArray, root: FloatArray, free: NDArray[np.intp], seed: int, number: int, widths: int
 ) -> FloatArray:
     """Parameters (streams, p), normal of covariance root root' about the centre; `LIGHTS` rows share a detector.
 
-    Jitter varies from row to row, the pulse from one detector to the next, in `_PULSES` widths: the tables of a pulse
-    cost as much as a stream.
+    Pulses are of `widths` widths, each the mean of those that it takes the place of; the jitter makes up for it.
     """
     random = np.random.default_rng(seed)
     k = model.light
-    polar = np.eye(model.size)  # from width and angle to the standard deviations of pulse and jitter
-    if model.split:
-        cos, sin = np.cos(centre[k + 1]), np.sin(centre[k + 1])
-        polar[k : k + 2, k : k + 2] = [[cos, -centre[k] * sin], [sin, centre[k] * cos]]
     cov = np.zeros((model.size, model.size))
     cov[np.ix_(free, free)] = root @ root.T
-    cov = polar @ cov @ polar.T
-    det = free[(free == k) | (free > k + 1)]
+    det = free[(free >= k) & ((free != k + 1) | model.split)]
     lit = np.setdiff1d(free, det)
 
     def normal(rows: int, columns: int) -> FloatArray:
@@ -120,34 +115,29 @@ def design(
         z = random.standard_normal((rows, columns))
         return np.asarray(np.linalg.qr(z - z.mean(0))[0] * rows**0.5)
 
-    away = np.zeros((number * LIGHTS, model.size))
+    rows = np.tile(centre, (number * LIGHTS, 1))
     within = cov[np.ix_(lit, lit)]
-    groups = [np.arange(len(away))]
     if det.size:
         between = cov[np.ix_(det, det)]
-        settings = normal(number, det.size) @ _root(between).T
-        if k in det:
-            parts = np.array_split(np.argsort(settings[:, 0]), _PULSES)
-            groups = [(part[:, None] * LIGHTS + np.arange(LIGHTS)).ravel() for part in parts]
-            for part in parts:
-                settings[part, 0] = settings[part, 0].mean()
-        away[:, det] = np.repeat(settings, LIGHTS, 0)
+        away = np.repeat(normal(number, det.size) @ _root(between).T, LIGHTS, 0)
         gain = cov[np.ix_(lit, det)] @ np.linalg.pinv(between, rcond=1e-10)
-        away[:, lit] = away[:, det] @ gain.T
+        rows[:, det] += away
+        rows[:, lit] += away @ gain.T
         within = within - gain @ cov[np.ix_(det, lit)]
-    away[:, lit] += normal(len(away), lit.size) @ _root(within).T
-    rows = centre + away @ np.linalg.inv(polar).T
+    rows[:, lit] += normal(len(rows), lit.size) @ _root(within).T
     rows[:, k : k + 2] = np.abs(rows[:, k : k + 2])
     if model.split:
         rows[:, k + 1] = np.arcsin(np.abs(np.sin(rows[:, k + 1])))
     rows = model.bounded(rows)
     if model.gaussian:
-        for group in groups:
-            pulse, jitter = model.widths(rows[group])
-            pulse = np.full_like(pulse, pulse.mean())
-            rows[group, k] = np.hypot(pulse, jitter)
+        width, (pulse, jitter) = rows[::LIGHTS, k], model.widths(rows[::LIGHTS])
+        for part in np.array_split(np.argsort(pulse), widths):
+            mean = pulse[part].mean()
+            around = np.sqrt(np.maximum(width[part] ** 2 - mean**2, 0.0)) if model.split else jitter[part]
+            at = (part[:, None] * LIGHTS + np.arange(LIGHTS)).ravel()
+            rows[at, k] = np.repeat(np.hypot(mean, around), LIGHTS)
             if model.split:
-                rows[group, k + 1] = np.arctan2(jitter, pulse)
+                rows[at, k + 1] = np.repeat(np.arctan2(around, mean), LIGHTS)
     return rows
 
 
@@ -238,8 +228,8 @@ def most_probable(model: Model, theta: FloatArray, covariance: FloatArray, free:
 def draws(model: Model, theta: FloatArray, covariance: FloatArray, free: NDArray[np.intp]) -> FloatArray | None:
     """Parameters (n, p) of that law, or None where hardly any lies within the bounds."""
     root = _root(covariance)
-    rows = np.tile(theta, (_DRAWS, 1))
-    rows[:, free] += np.random.default_rng(0).standard_normal((_DRAWS, len(free))) @ root.T
+    rows = np.tile(theta, (Effort.draws, 1))
+    rows[:, free] += np.random.default_rng(0).standard_normal((Effort.draws, len(free))) @ root.T
     inside = (np.abs(model.bounded(rows) - rows)[:, free] <= 1e-12 * np.abs(theta[free])).all(1)
     return rows[inside] if inside.sum() >= 200 else None
 
@@ -247,24 +237,23 @@ def draws(model: Model, theta: FloatArray, covariance: FloatArray, free: NDArray
 def _inverse(fisher: FloatArray, prior: FloatArray, root: FloatArray) -> FloatArray:
     """Covariance of an information and a prior precision; noise may have made the information indefinite.
 
-    Directions that it hardly determines are those of coordinates in which root root' is the unit matrix.
+    It is that of streams from within `_NEAR` standard errors root, and errors beyond them are not claimed.
     """
     values, vectors = np.linalg.eigh(root.T @ fisher @ root)
-    whole = (vectors * np.maximum(values, 1e-2)) @ vectors.T + root.T @ prior @ root
+    whole = (vectors * np.maximum(values, _NEAR**-2.0)) @ vectors.T + root.T @ prior @ root
     return np.asarray(root @ np.linalg.inv(whole) @ root.T)
 
 
 class Fit:
     """Gauss-Newton from a starting point to the whole recording, and the last batches."""
 
-    def __init__(self, recording: Recording, effort: Effort, seed: int) -> None:
-        self.recording, self.effort, self.seed = recording, effort, seed
-        self.calls = 0
+    def __init__(self, recording: Recording, effort: Effort, seed: tuple[int, ...]) -> None:
+        self.recording, self.effort = recording, effort
+        self._random = np.random.default_rng(seed)
 
     def next_seed(self) -> int:
         """A seed that no batch has had."""
-        self.calls += 1
-        return self.seed * 100_003 + self.calls * 1_009
+        return int(self._random.integers(2**53))
 
     def exposure(self, photons: float) -> float:
         """Laser periods in which the recording has this many photons."""
@@ -284,16 +273,17 @@ class Fit:
         free: NDArray[np.intp],
         photons: float,
         cells: Cells | None = None,
-        spread: float = _SPREAD,
+        spread: float | None = None,
         more: int = 1,
         times: float = 1.0,
     ) -> Batch:
         """The linear law of counts about `theta` for an exposure of this many photons."""
         cells = self.cells(model, theta, photons) if cells is None else cells
         size = self.effort.of(photons, times)
-        linear = np.diag((_WIDEST * model.scale(theta)[free]) ** -2.0)
+        spread = self.effort.spread if spread is None else spread
+        linear = np.diag(model.scale(theta)[free] ** -2.0)
         wide = _root(np.linalg.inv(np.linalg.inv(spread**2 * photons / size * root @ root.T) + linear))
-        rows = design(model, theta, wide, free, self.next_seed(), more * SETTINGS)
+        rows = design(model, theta, wide, free, self.next_seed(), more * SETTINGS, self.effort.widths)
         exposure = max(2, round(self.exposure(size)))
         made = counted(model, cells, rows, exposure, self.next_seed())
         return regression(cells, rows, theta, made, self.exposure(photons) / exposure, free)
@@ -305,14 +295,13 @@ class Fit:
         root: FloatArray,
         free: NDArray[np.intp],
         photons: float,
-        rounds: int,
         first: float = 0.0,
     ) -> tuple[FloatArray, FloatArray, float, bool]:
         """Steps that weigh ever more photons, up to `photons`; parameters, root, misfit a cell, whether it settled."""
         weighed = float(min(photons, max(first, self.effort.first)))
         total = float(self.recording.photons)
         misfit, near = np.inf, False
-        for _ in range(rounds):
+        for _ in range(self.effort.rounds):
             law = self.law(model, theta, root, free, weighed)
             seen = law.cells.of(self.recording) * (weighed / total)
             prior = np.asarray(np.linalg.inv(root @ root.T) / 36.0, np.float64)
@@ -350,13 +339,15 @@ class Fit:
     ) -> Fitted:
         """The last estimate, and what fresh streams about it say of its slope, bias, scatter and misfit."""
         photons = float(self.recording.photons)
-        law = self.law(model, theta, root, free, photons, spread=_SPREAD / _MORE**0.5, more=_MORE, times=_LONGER)
-        nearby = _NEAR * (self.effort.of(photons, _LONGER) / photons) ** 0.5
+        effort = self.effort
+        closer = effort.spread / effort.more**0.5  # counts near the end of a dead time are linear over short distances
+        law = self.law(model, theta, root, free, photons, None, closer, effort.more, effort.longer)
+        nearby = _NEAR * (effort.of(photons, effort.longer) / photons) ** 0.5
         gain = law.estimator(free)
         seen = law.cells.of(self.recording)
         centre, size = theta, np.zeros(len(free))
-        for trial in range(_RECENTRED):
-            near = self.law(model, centre, root, free, photons, law.cells, spread=nearby, times=_LONGER)
+        for trial in range(effort.recentred):
+            near = self.law(model, centre, root, free, photons, law.cells, nearby, times=effort.longer)
             y = near.counts  # of streams near the estimate, in the recording's exposure
             moved = (near.theta - centre)[:, free]
             terms = np.c_[np.ones(len(y)), moved]
@@ -380,12 +371,12 @@ class Fit:
             raw[free] += place[1:]
             mean = most_probable(model, raw, cov, free)
             size = np.abs((mean - centre)[free]) / np.sqrt(np.diag(cov))
-            if trial and (size.max() < _SETTLED or trial == _RECENTRED - 1):
+            if trial and (size.max() < 1.0 or trial == effort.recentred - 1):
                 break
             root = _root(cov)
-            centre = centre + (mean - centre) / max(1.0, float(size.max()) / _LONGEST)
+            centre = centre + (mean - centre) / max(1.0, float(size.max()) / _NEAR)
         sd = np.sqrt(np.diag(cov))
-        if again and (np.abs((centre - theta)[free]) > _FAR * sd).any():  # cells and weights were laid elsewhere
+        if again and (np.abs((centre - theta)[free]) > _NEAR * sd).any():  # cells and weights were laid elsewhere
             return self.finish(model, centre, _root(cov), free, again=False)
         jacobian = law.slope[:, free] @ local
         project = np.eye(len(seen)) - jacobian @ estimator
@@ -410,7 +401,7 @@ class Fit:
             misfit=misfit,
             misfit_z=z,
             p_value=p,
-            converged=bool(size.max() < _LONGEST),
+            converged=bool(size.max() < _NEAR),
         )
 
 

@@ -26,7 +26,6 @@ from mars_lidar.simulation import simulate_timestamps
 _NARROWEST = 2e-6  # periods: the narrowest pulse that the engines draw
 _WIDEST = 0.3  # sigma of a recorded pulse, periods: a wider one is hardly told from background
 _WIDEST_JITTER = 0.05  # periods: the widest that `Jitter` takes
-_DELAYS = (0.4, 0.8, 1.6, 3.2, 6.4)  # dead times: mean delays of afterpulses whose scores are compared before a refit
 _MOST_CARRIERS = 0.95  # of an avalanche
 Fields = dict[str, Any]
 
@@ -67,16 +66,17 @@ def effects(dead_time_ns: float) -> tuple[Effect, ...]:
         observed = fields["dead_time_ns"]  # that of the electronics, over a detector that is ready earlier
         return fields | {"electronics_dead_time_ns": observed, "dead_time_ns": observed / (1.0 + value[0])}
 
+    middle, reach = float(np.log(1.6 * dead)), float(np.log(8.0))  # mean delays from a fifth to 13 dead times
     listed = [
         Effect(
             ("afterpulse_probability", "log_afterpulse_delay"),
-            (0.03, float(np.log(scale * dead))),
-            (0.0, float(np.log(_DELAYS[0] * dead / 2.0))),
-            (0.5, float(np.log(_DELAYS[-1] * dead * 2.0))),
+            (0.03, middle + place * reach),
+            (0.0, middle - reach),
+            (0.5, middle + reach),
             afterpulses,
             "afterpulses",
         )
-        for scale in _DELAYS
+        for place in (-0.5, 0.0, 0.5)
     ]
     return (
         *listed,
@@ -134,7 +134,7 @@ class Model:
     Photons a period, and ns. `width` is the standard deviation of the recorded pulse, jitter included, and the jitter
     an angle, in radians: that of the point whose coordinates are the standard deviations of pulse and jitter, at the
     distance `width`. Counts are smooth in both where one of the two vanishes; in variances they are not. Where the
-    jitter is given (`jitter_given`) or the pulse is no Gaussian of unknown width, the jitter is in ns. With a `waveform`
+    jitter is given (`jitter_given`) or the pulse is no Gaussian of unknown width, it is in ns. With a `waveform`
     (shares of the light in equal parts of the period, jitter not included) there is no return, and the background is
     all light. `waveform_error` are the standard errors of these shares by a recording of `exposure` periods: simulated
     streams have light that differs so much from the waveform, more in shorter ones as their counts do.
@@ -213,20 +213,21 @@ class Model:
         return np.sqrt(np.maximum(width**2 - jitter**2, 0.0)), jitter
 
     def scale(self, theta: FloatArray) -> FloatArray:
-        """Changes (p,) of parameters over which counts are about linear functions of them."""
+        """Changes (p,) of parameters over which counts are about linear functions of them, as a batch varies them."""
         k, unit = self.light, self.clock.unit_ns
         width = float(np.hypot(theta[k], unit / 12**0.5))
         out = np.zeros(self.size)
-        out[0] = 0.15 * theta[0]
-        out[1:k:2] = 0.1 * theta[1:k:2] + 0.02 * theta[0]
-        out[2:k:2] = 0.3 * width
-        out[k] = 0.15 * width
-        out[k + 1] = 0.3 * (1.0 if self.split else width)
-        out[k + 2] = 0.3 * width + 0.5 * unit
-        starts = [value for effect in self.effects for value in (effect.start[0], *(1.0 for _ in effect.start[1:]))]
-        sizes = [i for effect in self.effects for i in range(len(effect.start))]
-        at = np.where(np.array(sizes) == 0, theta[k + 3 :], 0.0)
-        out[k + 3 :] = 0.4 * np.maximum(starts, at)
+        out[0] = 0.3 * theta[0]
+        out[1:k:2] = 0.2 * theta[1:k:2] + 0.04 * theta[0]
+        out[2:k:2] = 0.6 * width
+        out[k] = 0.3 * width
+        out[k + 1] = 0.6 * (1.0 if self.split else width)
+        out[k + 2] = 0.6 * width + unit
+        at = k + 3
+        for effect in self.effects:
+            out[at : at + len(effect.start)] = 0.8
+            out[at] *= max(effect.start[0], theta[at])
+            at += len(effect.start)
         return out
 
     def middle(self, theta: FloatArray) -> FloatArray:

@@ -9,7 +9,6 @@ from mars_lidar.calibration.fit import LIGHTS, Fit
 from mars_lidar.calibration.model import Model
 from mars_lidar.calibration.recording import Recording
 
-_SHARES = (0.0, 0.03, 0.1, 0.3, 0.6, 0.9, 0.99)  # of the recorded width that may be jitter
 _MOST_BINS = 2**14
 _WINDOWS = 64  # of the period, for the median light
 
@@ -98,12 +97,12 @@ def starts(fit: Fit, recording: Recording, model: Model, fixed: dict[str, float]
         first = light(t, model, hold)
     found = []
     cycles = max(2, round(fit.exposure(photons)))
-    for share in _SHARES:
+    for angle in np.linspace(0.0, np.pi / 2.0, 7):  # from no jitter to a width of jitter alone
         theta = np.zeros(model.size)
         theta[: k + 1] = first
         for name, value in fixed.items():
             theta[names.index(name)] = value
-        theta[k + 1] = fixed.get("jitter", np.arcsin(share**0.5) if model.split else share**0.5 * theta[k])
+        theta[k + 1] = fixed.get("jitter", angle if model.split else np.sin(angle) * theta[k])
         jitter = float(model.widths(theta)[1])
         theta[k + 2] = fixed.get("dead_time_ns", max(observed[0], 0.05 * observed[-1]) + 2 * jitter)
         at = k + 3
@@ -163,12 +162,14 @@ def free_waveform(recording: Recording, most: int) -> tuple[FloatArray, FloatArr
 
 
 def brightest_window(recording: Recording) -> float:
-    """Standard deviations by which the brightest window of the period exceeds the median light."""
+    """Probability that light without a pulse has a window as bright above the median, of all windows."""
+    from scipy.special import ndtr
+
     rate, error = free_waveform(recording, 512)
     faint = float(np.median(rate))
     variance, best = error**2, -np.inf
-    for m in (1, 2, 4, 8, 16, 32, 64):
+    for m in 2 ** np.arange(7):
         inside = sum(np.roll(rate, -k) for k in range(m)) - m * faint
         noise = np.sqrt(sum(np.roll(variance, -k) for k in range(m)))
         best = max(best, float((inside / noise).max()))
-    return best
+    return float(7 * rate.size * ndtr(-best))

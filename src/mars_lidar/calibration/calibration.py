@@ -19,7 +19,7 @@ from mars_lidar.calibration.curves import Curves, Realizations, curves, realizat
 from mars_lidar.calibration.fit import Effort, Fit, Fitted, draws
 from mars_lidar.calibration.look import Look, look_at
 from mars_lidar.calibration.model import Model, all_carriers
-from mars_lidar.calibration.recording import LEAST_PHOTONS, Recording, recording_of, recording_of_arrivals
+from mars_lidar.calibration.recording import FALSE_ALARM, LEAST_PHOTONS, Recording, recording_of, recording_of_arrivals
 from mars_lidar.calibration.suspects import Drift, Score
 from mars_lidar.instrument.avalanches import Afterpulsing
 from mars_lidar.instrument.detector import Detector
@@ -29,10 +29,7 @@ from mars_lidar.instrument.system import MAX_CYCLES, System
 from mars_lidar.light.flux import Flux
 from mars_lidar.light.timestamps import Timestamps
 
-_MOST_EFFECTS = 2  # that are taken in one after the other
-_WAVE_BINS = 256  # of a free light, at most
 _SAME_TIME = 0.01  # share of records at exactly the time of the one before, that no photons are
-_ATTEMPTS = 3  # fits of a stream, each with simulated streams of its own, of which the first that converges is taken
 LEVEL = 0.01  # false-alarm probability of the verdict
 
 PARAMETERS = ("dead_time_ns", "jitter_ns", "pulse_sigma_ns")
@@ -207,7 +204,7 @@ class Calibration:
         """Histograms of the recording, and of the fit by streams of `seed`, for a picture."""
         model = None if self.fitted is None else self.fitted.model
         theta = None if model is None or self.fitted is None else model.bounded(self.fitted.theta)
-        return curves(self.recording, model, theta, seed)
+        return curves(self.recording, model, theta, seed, (200, 256, 60))
 
     def realizations(self, cycles: int, *, simulated: int = 4000, seed: int = 0) -> Realizations:
         """Law of the count in pieces of `cycles` periods beside that of `simulated` pieces drawn with `seed` (T6).
@@ -318,20 +315,20 @@ def calibrate(
     start_seed = checks.integer("seed", seed, low=0, high=2**31)
     recording = _recorded(times, pooled, checks.real("unit_ns", unit_ns, low=0.0))
     shape, fields, fixed = _known(given, pulse)
-    seen = look_at(recording)
+    described = look_at(recording)
     if look:
-        return Calibration(seen, {}, float("nan"), (), (), None, None, None, None, None, recording, None, alpha)
+        return Calibration(described, {}, float("nan"), (), (), None, None, None, None, None, recording, None, alpha)
     if recording.photons < LEAST_PHOTONS:
         raise ValueError(
             f"times must hold at least {LEAST_PHOTONS} registrations to be calibrated, got {recording.photons}; "
             "look=True describes a shorter recording"
         )
-    if seen.same_time > _SAME_TIME * recording.photons and seen.unit_ns == 0.0:
+    if described.same_time > _SAME_TIME * recording.photons and described.unit_ns == 0.0:
         raise ValueError(
-            f"times must be of photons one after the other, got {seen.same_time:,} of {recording.photons:,} at exactly "
-            "the time of the one before"
+            f"times must be of photons one after the other, got {described.same_time:,} of {recording.photons:,} at "
+            "exactly the time of the one before"
         )
-    return _Run(recording, seen, shape, number, fields, fixed, alpha, start_seed).result()
+    return _Run(recording, described, shape, number, fields, fixed, alpha, start_seed).result()
 
 
 def _recorded(times: Any, pooled: bool, unit_ns: float) -> Recording:
@@ -417,10 +414,10 @@ class _Run:
             pulse.check(recording.period_ns)
         self.flat = not recording.laser
         if shape == "free":
-            self.wave = start.free_waveform(recording, _WAVE_BINS)
+            self.wave = start.free_waveform(recording, self.fit.effort.shape_bins)
             shares, errors = (part / self.wave[0].sum() for part in self.wave)
             model = Model(recording.clock, 0, None, shares, errors, recording.exposure)
-        elif self.flat or start.brightest_window(recording) > suspects.FALSE_ALARM:
+        elif self.flat or start.brightest_window(recording) > FALSE_ALARM:
             self.flat = True
             model = Model(recording.clock, 0)
         else:
@@ -433,7 +430,7 @@ class _Run:
         wrong = () if fitted.converged and fitted.p_value >= self.level else self.wrong_values(fitted)
         included: list[tuple[Score, suspects.Named]] = []
         listed = suspects.scores(self.fit, fitted) if fitted.converged else []
-        for _ in range(_MOST_EFFECTS if fitted.converged and not wrong else 0):
+        for _ in range(self.fit.effort.effects if fitted.converged and not wrong else 0):
             better = suspects.refitted(self.fit, fitted, listed)
             if better is None:
                 break
@@ -474,7 +471,7 @@ class _Run:
 
     def first(self) -> Fitted:
         """The fit of the plain model, from the better of two starts; with other streams where it did not converge."""
-        for attempt in range(_ATTEMPTS):
+        for attempt in range(self.fit.effort.attempts):
             self.fit = Fit(self.recording, Effort(), (self.seed, attempt))
             fitted = self._attempt()
             if fitted.converged:
@@ -519,10 +516,10 @@ class _Run:
         named: list[Suspect] = list(wrong)
         for score, refit in included:
             name = score.effect.names[0]
-            shown = "electronics_dead_time_ns" if name == "electronics_excess" else name
-            at = estimates.get(shown, Estimate(np.nan, np.nan, np.nan, np.nan))
+            printed = "electronics_dead_time_ns" if name == "electronics_excess" else name
+            at = estimates.get(printed, Estimate(np.nan, np.nan, np.nan, np.nan))
             named.append(
-                Suspect(score.effect.words, refit.z, at.value, at.error, refit.gain, f"given {shown}", included=True)
+                Suspect(score.effect.words, refit.z, at.value, at.error, refit.gain, f"given {printed}", included=True)
             )
         p = fitted.p_value if fitted.converged else 0.0
         if drift is not None:
@@ -685,7 +682,7 @@ def _worst_cells(fitted: Fitted) -> tuple[str, float]:
         used = np.flatnonzero(fitted.offset[part] > 5.0) + (part.start or 0)
         scale = fitted.fresh[:, used].std(0)
         drawn = ((fitted.fresh[:, used] / scale) ** 2).sum(1)
-        z = (float(((fitted.left[used] / scale) ** 2).sum()) - drawn.mean()) / drawn.std()
+        z = (float(((fitted.rest[used] / scale) ** 2).sum()) - drawn.mean()) / drawn.std()
         if z > most:
             worst, most = words, float(z)
     return worst, most

@@ -19,8 +19,7 @@ from mars_lidar.calibration.cells import Cells
 from mars_lidar.calibration.model import Effect, Model
 from mars_lidar.calibration.recording import Recording
 
-SETTINGS = 32  # detectors of a batch
-LIGHTS = 16  # lights of each, in one call of the engine
+LIGHTS = 16  # streams of one detector, in one call of the engine
 _NEAR = 3.0  # standard errors of the recording about the estimate, from which the last streams are drawn
 _CUMULATED = 100.0  # intervals expected up to an edge, for a normal law of their number
 
@@ -29,14 +28,18 @@ _CUMULATED = 100.0  # intervals expected up to an edge, for a normal law of thei
 class Effort:
     """Photons of simulated streams, and how many of these: it is traded for time and for the noise of the errors.
 
-    `stream` least photons of each, `batch` photons of a batch at most and `share` of the recording's photons that a
-    batch has at least, below that bound; `first` photons of the recording that the first steps weigh, `rounds` steps
-    at most. `spread` of a batch about its centre, in standard errors of a stream of its length. Of the last streams
-    `longer` is the factor on their photons, so that they need not differ as much, `more` that on the number of those
-    which give the weights, and `recentred` the number of batches at most. `widths` of the pulse in a batch: the tables
-    of a pulse cost as much as a stream. `draws` from the law of the estimate, for its bounds.
+    `settings` detectors of a batch, of `LIGHTS` streams each; `stream` least photons of each, `batch` photons of a
+    batch at most and `share` of the recording's photons that a batch has at least, below that bound; `first` photons
+    of the recording that the first steps weigh, `rounds` steps at most. `spread` of a batch about its centre, in
+    standard errors of a stream of its length. Of the last streams `longer` is the factor on their photons, so that
+    they need not differ as much, `more` that on the number of those which give the weights, and `recentred` the number
+    of batches at most. `widths` of the pulse in a batch: the tables of a pulse cost as much as a stream. `draws` from
+    the law of the estimate, for its bounds. `attempts` to fit a stream, each with simulated streams of its own, of
+    which the first that converges is taken; `effects` taken in, one after the other, and `refits` with an effect more
+    that fresh streams judge; `shape_bins` of a free light, at most.
     """
 
+    settings: int = 32
     stream: int = 2_000
     batch: float = 4e6
     share: float = 12.0
@@ -48,10 +51,14 @@ class Effort:
     recentred: int = 4
     widths: int = 8
     draws: int = 20_000
+    attempts: int = 3
+    effects: int = 2
+    refits: int = 2
+    shape_bins: int = 256
 
     def of(self, photons: float, times: float = 1.0) -> int:
         """Photons of each stream of a batch, for this many of the recording; `times` as many for the last batches."""
-        number = SETTINGS * LIGHTS
+        number = self.settings * LIGHTS
         wanted = times * max(self.stream, min(self.share * photons, self.batch) / number)
         return int(min(photons, max(wanted, 2.0 * photons / number)))
 
@@ -149,12 +156,7 @@ def _root(cov: FloatArray) -> FloatArray:
 
 
 def regression(
-    cells: Cells,
-    theta: FloatArray,
-    centre: FloatArray,
-    counts: FloatArray,
-    ratio: float,
-    free: NDArray[np.intp],
+    cells: Cells, theta: FloatArray, centre: FloatArray, counts: FloatArray, ratio: float, free: NDArray[np.intp]
 ) -> Batch:
     """The linear law of counts (streams, c), in units of an exposure `ratio` times as long as theirs."""
     y = counts * ratio
@@ -195,7 +197,7 @@ class Fitted:
     offset: FloatArray  # (c,) expected counts at the centre of the last streams
     estimator: FloatArray  # (free, c): parameters less that centre, by counts less their offset
     jacobian: FloatArray  # (c, free)
-    left: FloatArray  # (c,) counts that the fit leaves
+    rest: FloatArray  # (c,) counts that the fit leaves
     fresh: FloatArray  # (streams, c) the same of fresh streams, of the recording's exposure
     misfit: float
     misfit_z: float
@@ -282,8 +284,9 @@ class Fit:
         size = self.effort.of(photons, times)
         spread = self.effort.spread if spread is None else spread
         linear = np.diag(model.scale(theta)[free] ** -2.0)
-        wide = _root(np.linalg.inv(np.linalg.inv(spread**2 * photons / size * root @ root.T) + linear))
-        rows = design(model, theta, wide, free, self.next_seed(), more * SETTINGS, self.effort.widths)
+        precision = np.linalg.inv(spread**2 * photons / size * root @ root.T) + linear
+        wide = _root(np.asarray(np.linalg.inv(precision), np.float64))
+        rows = design(model, theta, wide, free, self.next_seed(), more * self.effort.settings, self.effort.widths)
         exposure = max(2, round(self.exposure(size)))
         made = counted(model, cells, rows, exposure, self.next_seed())
         return regression(cells, rows, theta, made, self.exposure(photons) / exposure, free)
@@ -303,10 +306,10 @@ class Fit:
         misfit, near = np.inf, False
         for _ in range(self.effort.rounds):
             law = self.law(model, theta, root, free, weighed)
-            seen = law.cells.of(self.recording) * (weighed / total)
+            recorded = law.cells.of(self.recording) * (weighed / total)
             prior = np.asarray(np.linalg.inv(root @ root.T) / 36.0, np.float64)
             gain = law.estimator(free, prior)
-            step = gain @ (seen - law.offset)
+            step = gain @ (recorded - law.offset)
             scatter = law.residual @ gain.T
             cov = scatter.T @ scatter / (len(scatter) - len(free) - 1) / law.ratio
             full = law.slope[:, free].T @ law.weight @ law.slope[:, free] + prior
@@ -317,7 +320,7 @@ class Fit:
             moved = theta.copy()
             moved[free] += step
             theta = most_probable(model, moved, cov, free)
-            rest = seen - law.offset - law.slope[:, free] @ step
+            rest = recorded - law.offset - law.slope[:, free] @ step
             misfit = float(rest @ law.weight @ rest / len(rest)) if size <= 2.0 else np.inf
             near = size < (0.6 if weighed >= photons else 1.5)
             grown = min(photons, weighed * 6.0) if near else weighed
@@ -330,12 +333,7 @@ class Fit:
         return theta, root, misfit, near and weighed >= photons
 
     def finish(
-        self,
-        model: Model,
-        theta: FloatArray,
-        root: FloatArray,
-        free: NDArray[np.intp],
-        again: bool = True,
+        self, model: Model, theta: FloatArray, root: FloatArray, free: NDArray[np.intp], again: bool = True
     ) -> Fitted:
         """The last estimate, and what fresh streams about it say of its slope, bias, scatter and misfit."""
         photons = float(self.recording.photons)
@@ -344,7 +342,7 @@ class Fit:
         law = self.law(model, theta, root, free, photons, None, closer, effort.more, effort.longer)
         nearby = _NEAR * (effort.of(photons, effort.longer) / photons) ** 0.5
         gain = law.estimator(free)
-        seen = law.cells.of(self.recording)
+        recorded = law.cells.of(self.recording)
         centre, size = theta, np.zeros(len(free))
         for trial in range(effort.recentred):
             near = self.law(model, centre, root, free, photons, law.cells, nearby, times=effort.longer)
@@ -356,7 +354,7 @@ class Fit:
             local = slope[1:].T
             rest = (y - near.offset) @ gain.T - terms @ slope
             noise = np.atleast_2d(rest.T @ rest) / (len(y) - terms.shape[1])
-            away = gain @ (seen - near.offset) - slope[0]
+            away = gain @ (recorded - near.offset) - slope[0]
             information, prior = np.linalg.inv(noise), model.precision(free)
             place = np.r_[1.0, np.linalg.pinv(local) @ away]  # where the law is read, for its own noise there
             for _ in range(2):
@@ -379,12 +377,12 @@ class Fit:
         if again and (np.abs((centre - theta)[free]) > _NEAR * sd).any():  # cells and weights were laid elsewhere
             return self.finish(model, centre, _root(cov), free, again=False)
         jacobian = law.slope[:, free] @ local
-        project = np.eye(len(seen)) - jacobian @ estimator
+        project = np.eye(len(recorded)) - jacobian @ estimator
         fresh = near.residual @ project.T
         fresh = (fresh - fresh.mean(0)) / np.sqrt(near.ratio) * np.sqrt(len(y) / (len(y) - terms.shape[1]))
-        left = project @ (seen - near.offset)
+        rest = project @ (recorded - near.offset)
         dead = np.flatnonzero(free == model.light + 2)
-        misfit, z, p = _misfit(left, fresh, law, near, seen, float(sd[dead[0]]) if dead.size else 0.0)
+        misfit, z, p = _misfit(rest, fresh, law, near, recorded, float(sd[dead[0]]) if dead.size else 0.0)
         return Fitted(
             model=model,
             free=free,
@@ -396,7 +394,7 @@ class Fit:
             offset=near.offset,
             estimator=estimator,
             jacobian=jacobian,
-            left=left,
+            rest=rest,
             fresh=fresh,
             misfit=misfit,
             misfit_z=z,
@@ -406,7 +404,7 @@ class Fit:
 
 
 def _misfit(
-    left: FloatArray, fresh: FloatArray, law: Batch, near: Batch, recorded: FloatArray, dead_error: float
+    rest: FloatArray, fresh: FloatArray, law: Batch, near: Batch, recorded: FloatArray, dead_error: float
 ) -> tuple[float, float, float]:
     """Weighed square of the counts that the fit leaves, its standard deviations above fresh streams', probability.
 
@@ -419,13 +417,13 @@ def _misfit(
     noise = 1.0 + near.ratio / len(near.counts)
     weight = law.weight[np.ix_(used, used)]
     drawn = np.einsum("ki,ij,kj->k", fresh[:, used], weight, fresh[:, used])
-    mine = float(left[used] @ weight @ left[used]) / noise
+    mine = float(rest[used] @ weight @ rest[used]) / noise
     shape = drawn.mean() ** 2 / drawn.var()
     square = float(gammaincc(shape, mine * shape / drawn.mean()))
     gaps = slice(law.cells.phases, law.cells.phases + law.cells.gap_edges.size)
     cumulated = np.cumsum(near.offset[gaps])
     enough = cumulated > _CUMULATED
-    departure = np.abs(np.cumsum(left[gaps])) / (np.cumsum(fresh[:, gaps], axis=1).std(0) * noise**0.5)
+    departure = np.abs(np.cumsum(rest[gaps])) / (np.cumsum(fresh[:, gaps], axis=1).std(0) * noise**0.5)
     most = float(departure[enough].max(initial=0.0))
     late = 2.0 * enough.sum() * float(ndtr(-most))
     first = _edge_probability(law.cells.gap_edges, cumulated, np.cumsum(recorded[gaps]), dead_error)

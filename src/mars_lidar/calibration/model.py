@@ -66,53 +66,26 @@ def effects(dead_time_ns: float) -> tuple[Effect, ...]:
         observed = fields["dead_time_ns"]  # that of the electronics, over a detector that is ready earlier
         return fields | {"electronics_dead_time_ns": observed, "dead_time_ns": observed / (1.0 + value[0])}
 
+    def twilight(fields: Fields, value: tuple[float, ...]) -> Fields:
+        return fields | {"twilight_ns": min(value[0], fields["dead_time_ns"])}
+
+    def recovery(fields: Fields, value: tuple[float, ...]) -> Fields:
+        return fields | {"recovery_ns": value[0]}
+
+    def paralyzable(fields: Fields, value: tuple[float, ...]) -> Fields:
+        return fields | ({"mode": "paralyzable"} if value[0] > 0.5 else {})
+
+    after = ("afterpulse_probability", "log_afterpulse_delay")
     middle, reach = float(np.log(1.6 * dead)), float(np.log(8.0))  # mean delays from a fifth to 13 dead times
-    listed = [
-        Effect(
-            ("afterpulse_probability", "log_afterpulse_delay"),
-            (0.03, middle + place * reach),
-            (0.0, middle - reach),
-            (0.5, middle + reach),
-            afterpulses,
-            "afterpulses",
-        )
-        for place in (-0.5, 0.0, 0.5)
-    ]
+    least, most = (0.0, middle - reach), (0.5, middle + reach)
+    starts = [(0.03, middle + place * reach) for place in (-0.5, 0.0, 0.5)]
+    own = "electronics with a dead time of their own"
     return (
-        *listed,
-        Effect(
-            ("twilight_ns",),
-            (min(1.0, 0.2 * dead),),
-            (0.0,),
-            (dead,),
-            lambda fields, value: fields | {"twilight_ns": min(value[0], fields["dead_time_ns"])},
-            "twilight pulses",
-        ),
-        Effect(
-            ("recovery_ns",),
-            (0.03 * dead,),
-            (0.0,),
-            (2.0 * dead,),
-            lambda fields, value: fields | {"recovery_ns": value[0]},
-            "slow recovery",
-        ),
-        Effect(
-            ("electronics_excess",),
-            (0.25,),
-            (0.0,),
-            (19.0,),
-            electronics,
-            "electronics with a dead time of their own",
-        ),
-        Effect(
-            ("paralyzable",),
-            (1.0,),
-            (0.0,),
-            (1.0,),
-            lambda fields, value: fields | ({"mode": "paralyzable"} if value[0] > 0.5 else {}),
-            "paralyzable detector",
-            onoff=True,
-        ),
+        *(Effect(after, start, least, most, afterpulses, "afterpulses") for start in starts),
+        Effect(("twilight_ns",), (min(1.0, 0.2 * dead),), (0.0,), (dead,), twilight, "twilight pulses"),
+        Effect(("recovery_ns",), (0.03 * dead,), (0.0,), (2.0 * dead,), recovery, "slow recovery"),
+        Effect(("electronics_excess",), (0.25,), (0.0,), (19.0,), electronics, own),
+        Effect(("paralyzable",), (1.0,), (0.0,), (1.0,), paralyzable, "paralyzable detector", onoff=True),
     )
 
 

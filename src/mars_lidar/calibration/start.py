@@ -41,7 +41,7 @@ def light(t: FloatArray, model: Model, hold: float) -> FloatArray:
     # the median of windows with enough photons for one
     coarse = [np.add.reduceat(x, np.linspace(0, bins, _WINDOWS, endpoint=False).astype(int)) for x in (hits, passes)]
     faint = max(float(np.median(coarse[0] / np.maximum(coarse[1], 1.0))), 1e-3 / max(passes.sum(), 1.0))
-    found, variance = [], 0.0
+    peaks, variance = [], 0.0
     for _ in range(model.returns):
         best = (-np.inf, 0, 1)
         masked_hits, masked_passes = np.where(outside, hits, faint * passes), passes
@@ -70,11 +70,11 @@ def light(t: FloatArray, model: Model, hold: float) -> FloatArray:
             peak += mean
             reach = float(np.clip(4.5 * np.sqrt(var), least, 0.3 * period))
         outside &= ~inside
-        found += [signal, peak % period]
+        peaks += [signal, peak % period]
         variance = variance or var
     own = max(variance - unit**2 / 12, 0.0025 * variance, (0.15 * unit) ** 2)
     back = max(faint * bins if model.returns else float(rate.sum()), 1e-5)
-    return np.array([back, *found, own**0.5])
+    return np.array([back, *peaks, own**0.5])
 
 
 def starts(fit: Fit, recording: Recording, model: Model, fixed: dict[str, float]) -> list[tuple[float, FloatArray]]:
@@ -95,7 +95,7 @@ def starts(fit: Fit, recording: Recording, model: Model, fixed: dict[str, float]
         first = np.array([total, max((observed[-3] - observed[0]) / 4, 0.3 * model.clock.unit_ns)])
     else:
         first = light(t, model, hold)
-    found = []
+    trials = []
     cycles = max(2, round(fit.exposure(photons)))
     for angle in np.linspace(0.0, np.pi / 2.0, 7):  # from no jitter to a width of jitter alone
         theta = np.zeros(model.size)
@@ -114,12 +114,12 @@ def starts(fit: Fit, recording: Recording, model: Model, fixed: dict[str, float]
             theta = with_edge(fit, model, theta, low)
         cells = fit.cells(model, theta, photons)
         rows = cells.count(model.streams(np.tile(theta, (LIGHTS, 1)), cycles, fit.next_seed()))
-        seen = cells.of(recording) * (photons / recording.photons)
-        r = (2 * np.sqrt(seen + 0.375) - 2 * np.sqrt(rows + 0.375).mean(0)) ** 2
-        found.append((float(r.sum()), theta))
+        recorded = cells.of(recording) * (photons / recording.photons)
+        r = (2 * np.sqrt(recorded + 0.375) - 2 * np.sqrt(rows + 0.375).mean(0)) ** 2
+        trials.append((float(r.sum()), theta))
         if "jitter" in fixed:
             break
-    return sorted(found, key=lambda pair: pair[0])
+    return sorted(trials, key=lambda pair: pair[0])
 
 
 def with_edge(fit: Fit, model: Model, theta: FloatArray, low: FloatArray) -> FloatArray:

@@ -10,13 +10,11 @@ from numpy.typing import NDArray
 from mars_lidar._base.types import FloatArray
 from mars_lidar.calibration.fit import LIGHTS, Fit, Fitted, counted
 from mars_lidar.calibration.model import Effect, Model, effects
-from mars_lidar.calibration.recording import LEAST_PHOTONS, Recording
+from mars_lidar.calibration.recording import FALSE_ALARM, LEAST_PHOTONS, Recording
 from mars_lidar.calibration.start import with_edge
 
-FALSE_ALARM = 0.005  # probability that a plain recording gets a suspect; again that of a drift
 _MISFIT = 1e-3  # probability of the misfit below which effects without a clear score are refitted, and their gain in it
 _PARTS = 16  # of a recording, for drift: a trend then has 14 degrees of freedom
-_MOST_REFITTED = 2  # effects whose refits fresh streams judge: the two with the least misfit
 
 
 @dataclass(frozen=True)
@@ -72,7 +70,7 @@ def scores(fit: Fit, fitted: Fitted) -> list[Score]:
         along[used] = law.weight[np.ix_(used, used)] @ way[used]
         along /= max(float(way @ along), 1e-300)
         spread = float((fitted.fresh @ along).std()) * (1.0 + 2.0 * ratio / LIGHTS) ** 0.5
-        listed.append(Score(effect, float(fitted.left @ along), spread, shift))
+        listed.append(Score(effect, float(fitted.rest @ along), spread, shift))
     return sorted(listed, key=lambda score: -score.z)
 
 
@@ -119,7 +117,7 @@ def _best(fit: Fit, fitted: Fitted, tried: list[Score], limit: float) -> tuple[F
         if trial is not None:
             trials.append((trial[0], score, trial[1]))
     best: tuple[Fitted, Named] | None = None
-    for _, score, (model, theta, root, free) in sorted(trials, key=lambda trial: trial[0])[:_MOST_REFITTED]:
+    for _, score, (model, theta, root, free) in sorted(trials, key=lambda trial: trial[0])[: fit.effort.refits]:
         final = fit.finish(model, theta, root, free)
         if final.converged and (best is None or final.misfit_z < best[0].misfit_z):
             best = final, Named(score.effect, score.z, fitted.misfit_z - final.misfit_z)

@@ -195,7 +195,8 @@ class Calibration:
         included = [suspect.name for suspect in self.suspects if suspect.included]
         model = "the model" + (f" with {' and '.join(included)}" if included else "")
         if not self.fitted.converged:
-            return f"no light of this shape and dead time describes the stream: {model} was not fitted"
+            remedy = "give what is known (dead_time_ns, jitter_ns), pulse='free', returns=2, or a longer recording"
+            return f"the fit of {model} did not converge, nothing is estimated: {remedy}"
         if self.fits:
             return f"p = {self.p_value:.2g}: {model} is not rejected at the {self.level:.0%} level"
         return f"p = {self.p_value:.2g}: {model} does not fit"

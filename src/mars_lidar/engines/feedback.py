@@ -18,8 +18,9 @@ from mars_lidar._base.native import _core
 from mars_lidar._base.types import IndexArray
 from mars_lidar.engines.engine import Engine, Task, draw_pixels, stage
 from mars_lidar.engines.exact import ExactEngine
-from mars_lidar.engines.feedback_grid import MOST_SWEEPS, Grids, KindArray
+from mars_lidar.engines.feedback_grid import Grids, KindArray
 from mars_lidar.engines.poisson import PoissonEngine
+from mars_lidar.engines.tolerances import TOLERANCES
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 
@@ -110,14 +111,6 @@ class FeedbackEngine(Engine):
 
 StatusArray = NDArray[np.uint8]
 
-FEWEST_PERIODS = 100  # per dead time, rounded up to periods: shorter exposures are drawn exactly
-MOST_LAP_CELLS = 2**18  # of all laps: 150 MB for each thread
-MOST_TRIES = 3  # more, of an exposure whose sweeps did not end: other numbers of the same law
-TRY_FROM = 128.0
-"""Registrations for each cell above which an unsettled exposure is tried again: below, the exact engine is quicker.
-
-A try takes a batch of 32 lanes, most of them idle.
-"""
 _OTHER_NUMBERS = 0x278DDE6E5FD29E45  # of the seed, for each try
 
 
@@ -211,11 +204,11 @@ class Plan:
     def of(cls, task: Task, pixels: IndexArray) -> Plan:
         """For some pixels (n,) of a task."""
         reason = np.zeros(pixels.size, np.uint8)
-        if task.system.cycles < FEWEST_PERIODS * math.ceil(task.system.dead_time_periods):
+        if task.system.cycles < TOLERANCES.fewest_dead_times * math.ceil(task.system.dead_time_periods):
             reason[:] = Reason.SHORT
             return cls(Grids.coarsest(task, pixels.size), reason)
         grids = Grids.checked(task, pixels)
-        reason[grids.sweeps > MOST_SWEEPS] = Reason.SLOW
+        reason[grids.sweeps > TOLERANCES.mean_sweeps] = Reason.SLOW
         reason[grids.of < 0] = Reason.CELLS
         return cls(grids, reason)
 
@@ -256,7 +249,7 @@ def sweep_pixels(
     status[:, able] = draw(task, 0, able, np.ones_like(able))
     slow = able[status[0, able] >= Reason.LAPS]
     laps = status[0, slow].astype(np.int64) - Reason.LAPS
-    large = cells[slow] * laps > MOST_LAP_CELLS
+    large = cells[slow] * laps > TOLERANCES.lap_cells
     dear = np.zeros_like(large) if worth is None else cells[slow] * laps > worth[slow]
     status[:, slow[dear]] = Reason.DEAR
     status[:, slow[large]] = Reason.CELLS
@@ -264,10 +257,10 @@ def sweep_pixels(
     status[:, slow[far]] = draw(replace(task, progress=None), 0, slow[far], laps[far])
     of_laps = np.ones(pixels.size, np.int64)
     of_laps[slow] = laps
-    long = expected_registrations(task.flux, task.system).reshape(-1)[pixels] > TRY_FROM * cells * of_laps
+    long = expected_registrations(task.flux, task.system).reshape(-1)[pixels] > TOLERANCES.try_from * cells * of_laps
     unsettled = (status == Reason.UNSETTLED) & long
     tried = int(unsettled.sum())
-    for attempt in range(1, MOST_TRIES + 1):
+    for attempt in range(1, TOLERANCES.tries + 1):
         for one in np.flatnonzero(unsettled.any(1)):
             first, seed = task.first_realization + int(one), task.seed ^ (attempt * _OTHER_NUMBERS % 2**64)
             part = replace(task, realizations=1, first_realization=first, seed=seed, progress=None)

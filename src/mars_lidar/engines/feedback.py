@@ -111,8 +111,6 @@ class FeedbackEngine(Engine):
 
 StatusArray = NDArray[np.uint8]
 
-_OTHER_NUMBERS = 0x278DDE6E5FD29E45  # of the seed, for each try
-
 
 class Reason(IntEnum):
     """What became of an exposure: `FeedbackStatus` of native/feedback/kernel.h, and reasons known before."""
@@ -125,7 +123,7 @@ class Reason(IntEnum):
     UNLIKELY = 6
     SHORT = 16
     CELLS = 18
-    DEAR = 19
+    SLOWER = 19
     LAPS = 64  # and more: of a pixel that needs that many laps less 64
 
     @property
@@ -142,7 +140,7 @@ _WORDS = {
     Reason.UNLIKELY: "unlikely count",
     Reason.SHORT: "short exposure",
     Reason.CELLS: "too many cells",
-    Reason.DEAR: "quicker exactly",
+    Reason.SLOWER: "quicker exactly",
 }
 
 
@@ -186,8 +184,8 @@ class Rest:
         """What is to be drawn as first realization of the call, number of them, and pixels."""
         if self.pixels.size:
             yield 0, realizations, self.pixels
-        for one in np.unique(self.realization):
-            yield int(one), 1, np.sort(self.pixel[self.realization == one])
+        for number in np.unique(self.realization):
+            yield int(number), 1, np.sort(self.pixel[self.realization == number])
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,8 +212,7 @@ class Plan:
 
     def part(self, some: NDArray[np.bool_]) -> Plan:
         """For those of its pixels (n,) that are true."""
-        grids = Grids(self.grids.kinds, self.grids.of[some], self.grids.sweeps[some])
-        return Plan(grids, self.reason[some])
+        return Plan(self.grids.part(some), self.reason[some])
 
 
 def sweep_pixels(
@@ -250,10 +247,10 @@ def sweep_pixels(
     slow = able[status[0, able] >= Reason.LAPS]
     laps = status[0, slow].astype(np.int64) - Reason.LAPS
     large = cells[slow] * laps > TOLERANCES.lap_cells
-    dear = np.zeros_like(large) if worth is None else cells[slow] * laps > worth[slow]
-    status[:, slow[dear]] = Reason.DEAR
+    slower = np.zeros_like(large) if worth is None else cells[slow] * laps > worth[slow]
+    status[:, slow[slower]] = Reason.SLOWER
     status[:, slow[large]] = Reason.CELLS
-    far = ~large & ~dear
+    far = ~large & ~slower
     status[:, slow[far]] = draw(replace(task, progress=None), 0, slow[far], laps[far])
     of_laps = np.ones(pixels.size, np.int64)
     of_laps[slow] = laps
@@ -261,11 +258,11 @@ def sweep_pixels(
     unsettled = (status == Reason.UNSETTLED) & long
     tried = int(unsettled.sum())
     for attempt in range(1, TOLERANCES.tries + 1):
-        for one in np.flatnonzero(unsettled.any(1)):
-            first, seed = task.first_realization + int(one), task.seed ^ (attempt * _OTHER_NUMBERS % 2**64)
+        for row in np.flatnonzero(unsettled.any(1)):
+            first, seed = task.first_realization + int(row), task.seed ^ (attempt * TOLERANCES.other_numbers % 2**64)
             part = replace(task, realizations=1, first_realization=first, seed=seed, progress=None)
-            again = np.flatnonzero(unsettled[one])
-            status[one, again] = draw(part, int(one), again, of_laps[again])[0]
+            again = np.flatnonzero(unsettled[row])
+            status[row, again] = draw(part, int(row), again, of_laps[again])[0]
         unsettled &= status == Reason.UNSETTLED
     if tried:
         task.report["exposures drawn again by feedback"] = float(tried - unsettled.sum())

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,59 +29,74 @@ class Grids:
 
     `kinds`: grids, (bins,) each: a bin has 2^kind cells, counted from half a period before the strongest return on.
     `of`: index (n,) of a pixel's grid, -1 where none of at most `Tolerances.cells` cells will do. `sweeps` (n,): until
-    the mean settles, `Tolerances.mean_sweeps` + 1 where it does not.
+    the mean settles, `Tolerances.mean_sweeps` + 1 where it does not. `armed` (n,): about how many exposures are armed
+    in the cell that has the fewest.
     """
 
     kinds: list[KindArray]
     of: IndexArray
     sweeps: IndexArray
+    armed: FloatArray
 
     @classmethod
     def coarsest(cls, task: Task, number: int) -> Grids:
         """The widest cells that the sweeps allow, for `number` pixels."""
         start = coarsest(task.system)
-        of = np.zeros(number, np.int64) if cells_of(start) <= TOLERANCES.cells else np.full(number, -1)
-        return cls([start], of, np.zeros(number, np.int64))
+        of = np.full(number, 0 if cells_of(start) <= TOLERANCES.cells else -1)
+        return cls([start], of, np.zeros(number, np.int64), np.full(number, float(task.system.cycles)))
 
     @classmethod
     def checked(cls, task: Task, pixels: IndexArray) -> Grids:
         """The grids of `pixels` (n,) of a task: each depends on the pixel and the system alone."""
-        start = coarsest(task.system)
+        grids, start = cls.coarsest(task, pixels.size), coarsest(task.system)
         if cells_of(start) > TOLERANCES.cells:
-            return cls.coarsest(task, pixels.size)
-        several = np.full(pixels.size, task.flux.waveform is not None)
-        if task.flux.waveform is None:
-            several = (task.flux.returns_signal.reshape(-1, task.pixel_index.size)[:, pixels] > 0.0).sum(0) > 1
-        known: dict[bytes, int] = {}
-        grids = cls([], np.full(pixels.size, -1), np.zeros(pixels.size, np.int64))
+            return grids
+        alone = judged_alone(task, pixels)
+        numbers = {start.tobytes(): 0}
 
-        def put(at: IndexArray, kinds: KindArray | None, sweeps: IndexArray | int) -> None:
-            grids.sweeps[at] = sweeps
-            if kinds is None:
-                return
-            key = kinds.tobytes()
-            if key not in known:
-                known[key] = len(grids.kinds)
+        def put(at: IndexArray, kinds: KindArray | None, sweeps: IndexArray | int, armed: FloatArray | float) -> None:
+            grids.sweeps[at], grids.armed[at] = sweeps, armed
+            number = -1 if kinds is None else numbers.setdefault(kinds.tobytes(), len(grids.kinds))
+            if kinds is not None and number == len(grids.kinds):
                 grids.kinds.append(kinds)
-            grids.of[at] = known[key]
+            grids.of[at] = number
 
-        alone = np.flatnonzero(~several)
-        corners, which = _corners_of(task.flux, pixels[alone])
-        known_grids = _corner_grids(task, corners, start)
+        sharing = np.flatnonzero(~alone)
+        corners, which = _corners_of(task.flux, pixels[sharing])
+        known = _corner_grids(task, corners, start)
         for number, corner in enumerate(corners):
-            put(alone[which == number], *known_grids[corner])
-        some = np.flatnonzero(several)  # judged together: neighbours in background need about as many sweeps
+            put(sharing[which == number], *known[corner])
+        some = np.flatnonzero(alone)  # judged together: neighbours in background need about as many sweeps
         some = some[np.argsort(task.flux.background.reshape(-1)[pixels[some]], kind="stable")]
-        halvings, needed = _even_halvings(task, pixels[some], start)
+        halvings, sweeps, armed = _even_halvings(task, pixels[some], start)
         for k in np.unique(halvings):
             at = halvings == k
-            put(some[at], None if k < 0 else np.asarray(start + k, np.uint8), needed[at])
+            put(some[at], None if k < 0 else np.asarray(start + k, np.uint8), sweeps[at], armed[at])
         return grids
+
+    def part(self, some: NDArray[np.bool_]) -> Grids:
+        """Those of its pixels (n,) that are true."""
+        return Grids(self.kinds, self.of[some], self.sweeps[some], self.armed[some])
+
+    def laps(self) -> IndexArray:
+        """Periods of a piece (n,) of the exposure as far as `armed` tells; the kernel decides (native/feedback/laps.h).
+
+        A history is forgotten to 3e-3 within about half the sweeps that the mean takes.
+        """
+        return np.where(self.armed < TOLERANCES.few_armed, np.maximum(self.sweeps // 2, 3), 1)
 
     def cells(self) -> IndexArray:
         """Cells (n,) of a period."""
         each = np.array([cells_of(kinds) for kinds in self.kinds] + [TOLERANCES.cells + 1])
         return np.asarray(each[self.of])
+
+
+def judged_alone(task: Task, pixels: IndexArray) -> NDArray[np.bool_]:
+    """Which of the pixels (n,) have a grid of their own: waveforms and several returns."""
+    if task.flux.waveform is not None:
+        return np.ones(pixels.size, np.bool_)
+    returns = task.flux.returns_signal.reshape(-1, task.pixel_index.size)[:, pixels]
+    return np.asarray((returns > 0.0).sum(0) > 1)
 
 
 def cells_of(kinds: KindArray) -> int:
@@ -105,50 +121,67 @@ def coarsest(system: System) -> KindArray:
     return np.full(system.bins, least_power(1, short, 0, TOLERANCES.halvings), np.uint8)
 
 
-def _judge(
-    task: Task, pixels: IndexArray, kinds: KindArray, *, parts: bool = False
-) -> tuple[FloatArray, IndexArray, FloatArray]:
-    """Distances (n,), sweeps (n,) and, where wanted, the bins' parts (n, bins) of its square."""
-    distance, sweeps = np.empty(pixels.size), np.empty(pixels.size, np.int32)
-    bins = np.empty((pixels.size if parts else 0, task.system.bins))
-    _core.feedback_check(
-        task.job, task.pulse, np.ascontiguousarray(pixels), kinds, distance, sweeps, bins, task.threads
-    )
-    return TOLERANCES.richardson * distance, sweeps.astype(np.int64), TOLERANCES.richardson**2 * bins
+class Check(NamedTuple):
+    """What is known of a grid for some pixels (n,): see `Grids`; `parts` (n, bins) of the squared distances."""
+
+    distance: FloatArray
+    sweeps: IndexArray
+    armed: FloatArray
+    parts: FloatArray
+
+    @classmethod
+    def of(cls, task: Task, pixels: IndexArray, kinds: KindArray, *, parts: bool = False) -> Check:
+        """Judge a grid; `parts` (0, bins) where they are not wanted."""
+        both, sweeps = np.empty((2, pixels.size)), np.empty(pixels.size, np.int32)
+        bins = np.empty((pixels.size if parts else 0, task.system.bins))
+        _core.feedback_check(
+            task.job, task.pulse, np.ascontiguousarray(pixels), kinds, both, sweeps, bins, task.threads
+        )
+        limit = TOLERANCES.richardson
+        return cls(limit * both[0], sweeps.astype(np.int64), both[1], limit**2 * bins)
 
 
-def _even_halvings(task: Task, pixels: IndexArray, start: KindArray) -> tuple[IndexArray, IndexArray]:
-    """How often all cells of each pixel (n,) must be halved, -1 where that is too often; sweeps (n,)."""
+def _even_halvings(task: Task, pixels: IndexArray, start: KindArray) -> tuple[IndexArray, IndexArray, FloatArray]:
+    """How often all cells of each pixel (n,) must be halved, -1 where that is too often; sweeps, fewest armed (n,)."""
     halvings, sweeps = np.zeros(pixels.size, np.int64), np.zeros(pixels.size, np.int64)
+    armed = np.zeros(pixels.size)
     most = (TOLERANCES.cells // cells_of(start)).bit_length() - 1
     open_ = np.arange(pixels.size)
     while open_.size:
         rest = []
         for k in np.unique(halvings[open_]):
             at = open_[halvings[open_] == k]
-            distance, sweeps[at], _ = _judge(task, pixels[at], np.asarray(start + k, np.uint8))
+            distance, sweeps[at], armed[at], _ = Check.of(task, pixels[at], np.asarray(start + k, np.uint8))
             far = (distance > TOLERANCES.mean_distance) & (sweeps[at] <= TOLERANCES.mean_sweeps)
             # distances fall with the square of the width; whether so many halvings do is judged in the next round
-            halvings[at[far]] += least_power(
-                2, distance[far] / TOLERANCES.mean_distance, 1, TOLERANCES.halvings_at_once
-            )
+            ratio = distance[far] / TOLERANCES.mean_distance
+            halvings[at[far]] += least_power(2, ratio, 1, TOLERANCES.halvings_at_once)
             halvings[at[far & (halvings[at] > most)]] = most + 1 if k < most else -1
             halvings[at[far & (k < most) & (halvings[at] > most)]] = most
             rest.append(at[far & (halvings[at] >= 0)])
         open_ = np.concatenate(rest)
-    return halvings, sweeps
+    return halvings, sweeps, armed
 
 
 # Pixels of a single return: the same cells for all, because every lane begins half a period before its return
 
 
 Corner = tuple[int, int]
-Known = dict[Corner, tuple[KindArray | None, int]]
+
+
+class CornerGrid(NamedTuple):
+    """The grid of a level of light, None where it has too many cells; sweeps and fewest armed as in `Grids`."""
+
+    kinds: KindArray | None
+    sweeps: int
+    armed: float
+
+
+Known = dict[Corner, CornerGrid]
 
 
 def _corners_of(flux: Flux, pixels: IndexArray) -> tuple[list[Corner], IndexArray]:
     """Corners, powers of the least level of signal and background that a pixel does not exceed; (n,) which is whose."""
-
     dimmest, most = TOLERANCES.dimmest, 500  # as far as doubles go
     signal, background = (
         least_power(TOLERANCES.light_octaves, light.reshape(-1)[pixels], low, most)
@@ -160,12 +193,12 @@ def _corners_of(flux: Flux, pixels: IndexArray) -> tuple[list[Corner], IndexArra
 
 @lru_cache(maxsize=64)
 def _known(system: System) -> Known:
-    """Grids and sweeps of the levels of light that were met so far."""
+    """Grids of the levels of light that were met so far."""
     return {}
 
 
 def _corner_grids(task: Task, corners: list[Corner], start: KindArray) -> Known:
-    """Grids of levels of light, None where they have too many cells."""
+    """Grids of levels of light."""
     known = _known(task.system)
     new = [corner for corner in corners if corner not in known]
     if new:
@@ -176,9 +209,7 @@ def _corner_grids(task: Task, corners: list[Corner], start: KindArray) -> Known:
 def _refined(task: Task, corners: list[Corner], start: KindArray) -> Known:
     """Cut bins where they make the mean wrong, until it is not; corners of one grid are judged in one call."""
     system, each = task.system, 4 * len(TOLERANCES.delays)
-    powers = np.array(
-        [[(s - i, b - j) for i in (0, 1) for j in (0, 1)] for s, b in corners],
-    )
+    powers = np.array([[(s - i, b - j) for i in (0, 1) for j in (0, 1)] for s, b in corners])
     light = np.repeat(np.ldexp(1.0, TOLERANCES.light_octaves * powers).reshape(-1, 2), len(TOLERANCES.delays), axis=0)
     delay = (system.bins // 2 + np.tile(TOLERANCES.delays, 4 * len(corners))) * (system.period_ns / system.bins)
     flux = Flux(light[None, :, 0], light[None, :, 1], delay[None])
@@ -194,28 +225,24 @@ def _refined(task: Task, corners: list[Corner], start: KindArray) -> Known:
         for members in groups.values():
             kinds = grids[members[0]]
             pixels = (np.array([corners.index(corner) for corner in members])[:, None] * each + np.arange(each)).ravel()
-            distances, sweeps, parts = _judge(judged, pixels, kinds, parts=True)
-            for corner, distance, needed, part in zip(
-                members,
-                distances.reshape(-1, each),
-                sweeps.reshape(-1, each),
-                parts.reshape(-1, each, system.bins),
-                strict=True,
-            ):
-                settled, median = needed <= TOLERANCES.mean_sweeps, int(np.median(needed))
-                fine = not settled.any() or distance[settled].max() <= TOLERANCES.mean_distance
+            checks = Check.of(judged, pixels, kinds, parts=True)
+            for k, corner in enumerate(members):
+                own = slice(k * each, (k + 1) * each)
+                settled = checks.sweeps[own] <= TOLERANCES.mean_sweeps
+                distance, parts = checks.distance[own][settled], checks.parts[own][settled]
+                fine = not settled.any() or distance.max() <= TOLERANCES.mean_distance
+                grid = CornerGrid(kinds, int(np.median(checks.sweeps[own])), float(np.median(checks.armed[own])))
                 if fine:
-                    before, done[corner] = corner in done, (kinds, median)
+                    before, done[corner] = corner in done, grid
                 if not settled.any() or (corner in done and (not fine or before)):
-                    del grids[corner]  # the one narrower grid is kept
+                    del grids[corner]  # the narrower grid stays
                     continue
-                grids[corner] = _recut(
-                    kinds, start if rounds <= TOLERANCES.joining_rounds else kinds, distance[settled], part[settled]
-                )
+                widest = start if rounds <= TOLERANCES.joining_rounds else kinds
+                grids[corner] = _recut(kinds, widest, distance, parts)
                 if fine and cells_of(grids[corner]) > TOLERANCES.worthwhile * cells_of(kinds):
                     del grids[corner]
                 elif cells_of(grids[corner]) > TOLERANCES.cells:
-                    done[corner] = None, median
+                    done[corner] = grid._replace(kinds=None)
                     del grids[corner]
     return done
 
@@ -229,15 +256,10 @@ def _recut(kinds: KindArray, widest: KindArray, distance: FloatArray, parts: Flo
     """
     worst = (parts * np.maximum(distance**2 / np.maximum(parts.sum(-1), 1e-300), 1.0)[:, None]).max(0)
     now = kinds.astype(np.int64)
-    cells, goal, fine = (
-        (1 << now).astype(np.float64),
-        (0.8 * TOLERANCES.mean_distance) ** 2,
-        bool(distance.max() <= TOLERANCES.mean_distance),
-    )
-    least, most = (
-        widest.astype(np.int64) - now,
-        np.minimum(0 if fine else TOLERANCES.halvings_at_once, TOLERANCES.halvings - now),
-    )
+    cells, goal = (1 << now).astype(np.float64), (0.8 * TOLERANCES.mean_distance) ** 2
+    fine = bool(distance.max() <= TOLERANCES.mean_distance)
+    least = widest.astype(np.int64) - now
+    most = np.minimum(0 if fine else TOLERANCES.halvings_at_once, TOLERANCES.halvings - now)
 
     def halvings(level: float) -> IndexArray:
         return np.clip(least_power(5, worst / (level * cells), -TOLERANCES.halvings, TOLERANCES.halvings), least, most)

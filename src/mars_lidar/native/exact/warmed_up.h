@@ -25,8 +25,7 @@ namespace mars {
 template <class Light>
 class WarmedUp {
  public:
-    WarmedUp(const Job& job, int64_t pixel, Light light)
-        : job_(job), light_(std::move(light)) {
+    WarmedUp(const Job& job, int64_t pixel, Light light) : job_(job), light_(std::move(light)) {
         const double dead = job.dead_time, total = light_.total();
         if (job.mode == DetectorMode::kParalyzable) {
             start_ = -paralyzable_warm_up(dead, total);

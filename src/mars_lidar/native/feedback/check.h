@@ -145,6 +145,7 @@ class GridCheck {
             for (int i = 0; i < kJudged; ++i) {
                 if (!mean.active[i]) continue;
                 const double moved = mean.moved[i], armed = mean.least[i] > 0.0 ? mean.least[i] : 0.0;
+                check_.armed[i] = armed * check_.exposures / (1.0 + fine_.whole * row(n)[i]);
                 const double off = check_.exposures * fired[i] * moved * (moved / (moved + armed));
                 if (moved <= kRounding || off <= kStill) {
                     mean.active[i] = 0;

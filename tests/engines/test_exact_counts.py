@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -13,6 +14,7 @@ from mars_lidar.engines import MarsEngine
 from mars_lidar.engines.counts import Matched, PartlyReplaced, Streams, Tabulated
 from mars_lidar.engines.synthesis import Run
 from mars_lidar.engines.table_reader import Entries
+from mars_lidar.engines.tolerances import TOLERANCES
 from mars_lidar.statistics.distance import Pmf, total_variation
 from mars_lidar.table import Table
 
@@ -166,8 +168,9 @@ def test_parts_batches_and_threads_do_not_show(monkeypatch: pytest.MonkeyPatch):
 
     flux = doubted(pixels=160)
     whole = ml.simulate(flux, SYSTEM, engine="mars", table=table(), realizations=3, threads=2)
-    monkeypatch.setattr(_synthesis, "_BATCH", 4)
-    monkeypatch.setattr(_count_shape, "PIXELS", 11)
+    small = replace(TOLERANCES, batch_exposures=4, looked_up=11)
+    monkeypatch.setattr(_synthesis, "TOLERANCES", small)
+    monkeypatch.setattr(_count_shape, "TOLERANCES", small)
     monkeypatch.setattr(_pmf, "_BLOCK", 3)
     assert np.array_equal(whole, ml.simulate(flux, SYSTEM, engine="mars", table=table(), realizations=3, threads=1))
     index = np.arange(flux.signal.size).reshape(1, -1)[:, 7:20]

@@ -24,7 +24,7 @@ from mars_lidar.statistics import (
     renewal_moments,
     renewal_pmf,
 )
-from mars_lidar.statistics import synchronous as synchronous_module
+from mars_lidar.statistics.tolerances import TOL
 
 DEAD = [0.0, 0.4, 1.0, 1.7, 5.02, 60.0]
 GATES = {"gate": (0.303, 0.11), "wrapping gate": (0.9, 0.5), "narrow gate": (0.38, 0.002)}
@@ -190,7 +190,7 @@ def test_synchronous_law_by_its_transform(
 ):
     system, laws = view("synchronous", dead, start, cycles), []
     for terms in (0, 10**18):
-        monkeypatch.setattr(synchronous_module, "_MANY_TERMS", terms)
+        monkeypatch.setitem(vars(TOL), "synchronous_terms", terms)
         law = ml.count_law(ml.Flux(signal, background, 37.0), system)
         laws.append(np.zeros(cycles + 1))
         laws[-1][law.support] = law.pmf

@@ -15,6 +15,7 @@ from mars_lidar.statistics.budget import LAW
 from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.histogram import mean_histogram
 from mars_lidar.statistics.phase_chain import ConvergenceError
+from mars_lidar.statistics.tolerances import TOL
 
 BINS = 150_001  # no grid of a power of two is a multiple of it
 
@@ -62,7 +63,7 @@ def test_mean_histogram(name: str, monkeypatch: pytest.MonkeyPatch):
     for method in ("exposure", "stationary"):
         found = ml.registration_pdf(flux, system, method)
         with monkeypatch.context() as patch:
-            patch.setattr(cells, "MANY_BINS", 2**20)
+            patch.setitem(vars(TOL), "many_bins", 2**20)
             longer = replace(LAW, recursion=1e9, one_pass=1e9)  # a reference may take its time
             patch.setattr("mars_lidar.statistics.histogram.LAW", longer)
             known = ml.registration_pdf(flux, system, method)

@@ -30,7 +30,7 @@ MAX_CYCLES = 100_000_000  # of a simulation: the sampler counts periods in 32 bi
 _MOST_CYCLES = 2**53  # of a recording: the integers that doubles hold
 _MAX_BINS = 2**20
 _LINED_BYTES = 2**16  # bytes up to which JSON is read as YAML, a hundred times slower, so that errors state the line
-_MAX_DEAD_PERIODS = 2**20
+MAX_DEAD_PERIODS = 2**20
 
 
 @constructed_by_name
@@ -108,15 +108,15 @@ class System:
         except ValueError as error:
             hint = period_hint(self.period_ns)
             raise ValueError(f"{hint}; {error}" if hint else str(error)) from error
-        if self.dead_time_periods > _MAX_DEAD_PERIODS:
+        if self.dead_time_periods > MAX_DEAD_PERIODS:
             raise ValueError(
-                f"dead_time_ns must be at most {_MAX_DEAD_PERIODS} periods of {self.period_ns:g} ns, "
+                f"dead_time_ns must be at most {MAX_DEAD_PERIODS} periods of {self.period_ns:g} ns, "
                 f"got {self.detector.dead_time_ns:g} ns"
             )
         self.detector.check(self.period_ns, self.bins, self.start)
-        if self.electronics_dead_time_periods > _MAX_DEAD_PERIODS:
+        if self.electronics_dead_time_periods > MAX_DEAD_PERIODS:
             raise ValueError(
-                f"electronics_dead_time_ns must be at most {_MAX_DEAD_PERIODS} periods of {self.period_ns:g} ns, "
+                f"electronics_dead_time_ns must be at most {MAX_DEAD_PERIODS} periods of {self.period_ns:g} ns, "
                 f"got {self.detector.electronics_dead_time_ns:g} ns"
             )
         check_units(self.period_ns, self.pulse, self.detector)

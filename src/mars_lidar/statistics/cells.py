@@ -33,14 +33,13 @@ from mars_lidar.instrument.detector import Mode
 from mars_lidar.instrument.effects import LIGHT_EFFECTS
 from mars_lidar.instrument.pulse import SampledPulse
 from mars_lidar.instrument.system import System
-from mars_lidar.light.flux import Flux
+from mars_lidar.light.flux import MAX_PHOTONS, Flux
 from mars_lidar.light.stored_flux import StoredFlux
 from mars_lidar.statistics.budget import MOMENTS, advice
 from mars_lidar.statistics.gate import PLAIN, open_parts, require_mode
+from mars_lidar.statistics.tolerances import TOL
 
 # --- Arguments -----------------------------------------------------------------------------------------------------
-
-MAX_PHOTONS = 1e6  # photons per period, the most that are accepted: 1e13 photons/s at 10 MHz
 
 
 def reals(name: str, value: ArrayLike) -> FloatArray:
@@ -90,11 +89,6 @@ def flat(array: NDArray[Any]) -> FloatArray:
 
 # --- Grid of the phase chain ---------------------------------------------------------------------------------------
 
-_MAX_BINS = 2**20  # bins per period of a statistics grid: 8 MiB an array
-_MAX_COMMON = 2**14  # bins of a grid that holds both the samples of a waveform and the bins of the histogram
-_CHAIN_MIN_BINS = 512  # with fewer the discretisation of the chain is visible in the count variance
-_CHAIN_BINS_PER_WIDTH = 7.5  # bins in 1 / max s, which is 2.507 sigma for a Gaussian: a bin is sigma / 3
-
 
 @checked
 def photons_per_bin(flux: Flux, system: System, *, bins: int | None = None) -> FloatArray:
@@ -139,7 +133,7 @@ def photons_per_bin(flux: Flux, system: System, *, bins: int | None = None) -> F
     """
     flux = flux.detected(system)
     if bins is not None:
-        bins = checks.integer("bins", bins, low=1, high=_MAX_BINS)
+        bins = checks.integer("bins", bins, low=1, high=TOL.most_bins)
     if flux.waveform is not None:
         size = flux.waveform.shape[-1]
         n = bins or _bins_for_waveform(size, system.bins)
@@ -166,15 +160,15 @@ def default_bins(system: System) -> int:
     """Bins of the statistics grid when none are asked for: a multiple of `System.bins`, pulse resolved."""
     probe = 2**15
     peak = float(system.pulse.bin_energy(0.5 * system.period_ns, system.period_ns, probe).max())
-    wanted = max(_CHAIN_MIN_BINS, _CHAIN_BINS_PER_WIDTH * peak * probe)
-    return min(system.bins * math.ceil(wanted / system.bins), max(system.bins, _MAX_BINS))
+    wanted = max(TOL.unrefined_bins, TOL.chain_bins_per_width * peak * probe)
+    return min(system.bins * math.ceil(wanted / system.bins), max(system.bins, TOL.most_bins))
 
 
 def _bins_for_waveform(samples: int, bins: int) -> int:
     """A multiple of the histogram's bins, and of the samples where that is not too many."""
     common = math.lcm(samples, bins)
-    step = common if common <= _MAX_COMMON else bins
-    return step * math.ceil(max(_CHAIN_MIN_BINS, samples) / step)
+    step = common if common <= TOL.most_first_bins else bins
+    return step * math.ceil(max(TOL.unrefined_bins, samples) / step)
 
 
 def whole_bins(dead: float, bins: int) -> tuple[int, int, float]:
@@ -206,17 +200,6 @@ def waveform_parts(system: System) -> int:
 
 # --- Pulses narrower than a cell -----------------------------------------------------------------------------------
 
-_PROBE = 2**12  # samples of the pulse's support from which its width is computed
-_DETECTED = 8.0  # a pulse of sigma >= 1/8 bin is detected by the refinement of the grid, which then resolves it
-_RESOLVED = 0.5  # a pulse of sigma >= 2 bins is resolved: finer bins change nothing
-_MOST_BINS = 2**15  # equal bins per period; more take seconds a cell
-_ROUNDING = 1e-12  # relative deviation from a whole number of periods that is rounding
-_BLOCKS = 4  # fewest blocks of the period, so that none holds the beginning and, wrapped, the end of one pulse
-_LEAST_CELLS = 8  # fewest bins of a block on a grid that follows the pulse, half of them on the pulse
-_PULSE_CELLS = 512  # bins per period of the first grid that follows the pulse
-_KNOTS = 8.0  # grid points per standard deviation of the pulse
-_LONGEST = 64.0  # support of a pulse, in its standard deviations, up to which a grid that follows it resolves it
-
 
 def needed_bins(cells: Cells, coarsest: int) -> int:
     """Number of equal bins that resolves the pulse; 0 where `coarsest` equal bins suffice.
@@ -224,7 +207,7 @@ def needed_bins(cells: Cells, coarsest: int) -> int:
     The bin is one standard deviation of the pulse, or a third of the time between the end of a pulse and the
     re-arming of the pixels that it blinded.
     """
-    return _bins_of_pulse(cells) if _meets_itself(cells, coarsest, _DETECTED) else 0
+    return _bins_of_pulse(cells) if _meets_itself(cells, coarsest, TOL.detected_bins) else 0
 
 
 def followed_bins(cells: Cells, coarsest: int, out_bins: int) -> int:
@@ -233,26 +216,26 @@ def followed_bins(cells: Cells, coarsest: int, out_bins: int) -> int:
     Bins may be uneven only where the dead time is a whole number of periods: a pixel then re-arms in the bin of its
     registration. They are used where `coarsest` equal bins do not resolve the pulse.
     """
-    if not _is_whole(cells) or not _meets_itself(cells, coarsest, _RESOLVED):
+    if not _is_whole(cells) or not _meets_itself(cells, coarsest, TOL.resolved_bins):
         return 0
     sigma, length = _extent(cells)
     blocks = _blocks(out_bins)
-    bins = blocks * max(_LEAST_CELLS, 4 * math.ceil(_PULSE_CELLS / (4 * blocks)))
-    return bins if length <= _LONGEST * sigma and bins < _bins_of_pulse(cells) else 0
+    bins = blocks * max(TOL.block_bins, 4 * math.ceil(TOL.unrefined_bins / (4 * blocks)))
+    return bins if length <= TOL.longest_pulse * sigma and bins < _bins_of_pulse(cells) else 0
 
 
 def meets_itself(cells: Cells) -> bool:
     """Whether pixels re-arm within the next pulse and resolving it takes more than 2^15 equal bins."""
-    return not _is_whole(cells) and _meets_itself(cells, _MOST_BINS, _RESOLVED)
+    return not _is_whole(cells) and _meets_itself(cells, TOL.most_even_bins, TOL.resolved_bins)
 
 
 def _meets_itself(cells: Cells, coarsest: int, resolved: float) -> bool:
-    """Whether sigma is below 1 / (`resolved` `coarsest`) periods and pixels re-arm within the pulse."""
+    """Whether sigma is below `resolved` of `coarsest` equal bins and pixels re-arm within the pulse."""
     dead = cells.system.dead_time_periods
     if cells.waveform is not None or dead == 0.0 or not (cells.signal > 0.0).any():
         return False
     sigma, length = _extent(cells)
-    return sigma * coarsest * resolved < 1.0 and _apart(cells) < length + 3.0 / coarsest
+    return sigma * coarsest < resolved and _apart(cells) < length + 3.0 / coarsest
 
 
 def _bins_of_pulse(cells: Cells) -> int:
@@ -307,7 +290,7 @@ def knots(cells: Cells, bins: int, halved: float) -> FloatArray:
     if isinstance(pulse, SampledPulse):
         at = np.linspace(low, high, round((high - low) * period / pulse.bin_ns) + 1)
     elif _extent(cells)[0] * bins < 1.0:
-        at = np.linspace(low, high, math.ceil(_KNOTS * halved * (high - low) / _extent(cells)[0]))
+        at = np.linspace(low, high, math.ceil(TOL.knots_per_sigma * halved * (high - low) / _extent(cells)[0]))
     else:
         at = np.empty(0)
     at = cells.delay[0] + at
@@ -315,32 +298,23 @@ def knots(cells: Cells, bins: int, halved: float) -> FloatArray:
 
 
 def _blocks(out_bins: int) -> int:
-    return out_bins * math.ceil(_BLOCKS / out_bins)
+    return out_bins * math.ceil(TOL.pulse_blocks / out_bins)
 
 
 def _is_whole(cells: Cells) -> bool:
     """Whether the dead time is a whole number of periods."""
-    return _apart(cells) <= _ROUNDING * max(1.0, cells.system.dead_time_periods)
+    return _apart(cells) <= TOL.rounding * max(1.0, cells.system.dead_time_periods)
 
 
 def _extent(cells: Cells) -> tuple[float, float]:
     """Standard deviation of a Gaussian as narrow as the pulse, and the pulse's length, in periods."""
     low, high = cells.system.pulse.support_ns()
-    energy = np.diff(cells.system.pulse.cumulative(np.linspace(low, high, _PROBE + 1)))
+    energy = np.diff(cells.system.pulse.cumulative(np.linspace(low, high, TOL.pulse_samples + 1)))
     length = (high - low) / cells.system.period_ns
-    return length / (_PROBE * float(np.sum(energy**2)) * 2.0 * math.sqrt(math.pi)), length
+    return length / (TOL.pulse_samples * float(np.sum(energy**2)) * 2.0 * math.sqrt(math.pi)), length
 
 
 # --- Pixels on the grid --------------------------------------------------------------------------------------------
-
-_MIN_BINS = 128  # bins of the coarsest first grid
-_MAX_FIRST_BINS = 2**14  # bins of the finest first grid; refinement goes beyond where the tolerance demands it
-_BINS_PER_WIDTH = 4.0 * math.sqrt(math.pi)  # bins in 1 / integral of s^2, 2 sqrt(pi) sigma: a bin is sigma / 2
-# Sweeps towards the stationary state: at most 400, or 10^7 bins x sweeps, at least 4; beyond, `warm_history` solves it
-_WARM_PERIODS, _WARM_STEPS, _LEAST_WARM = 400, 10_000_000, 4
-_CHUNK_BYTES = 64 << 20  # memory of the energies and histograms computed together
-_NEAR_BYTES, _MIDDLE_BYTES = 1 << 19, 1 << 25  # history: 15 to 60 ns a step; up to 100 ns; beyond, 100 to 350 ns
-_SETTLED = 1e-12  # relative change of the state per period at which it counts as repeating (20)
 
 
 @dataclass(frozen=True, eq=False)
@@ -502,7 +476,7 @@ class Cells:
     def resolved(self, out_bins: int) -> Cells:
         """These cells, with bins that follow the pulse where resolving it takes too many equal bins."""
         even = replace(self, follow=0)
-        follow = out_bins if followed_bins(even, max(_MAX_FIRST_BINS, out_bins), out_bins) else 0
+        follow = out_bins if followed_bins(even, max(TOL.most_first_bins, out_bins), out_bins) else 0
         return self if follow == self.follow else replace(self, follow=follow)
 
     def name(self, index: int) -> str:
@@ -542,7 +516,7 @@ class Cells:
 
     def first_bins(self, out_bins: int) -> int:
         """Bins of the first grid: `usual_bins`, or more where a narrower pulse must be resolved."""
-        most = max(_MAX_FIRST_BINS, out_bins)
+        most = max(TOL.most_first_bins, out_bins)
         if self.follow:
             return followed_bins(self, most, out_bins)
         return _multiple(max(self.usual_bins(out_bins), needed_bins(self, most)), out_bins)
@@ -551,8 +525,9 @@ class Cells:
         """Even multiple of `out_bins` whose bins are at most sigma / 2 of pulse or gate wide, at most some 2^14."""
         sharpness = self._sharpness
         gate_width = self.system.detector.gate_periods(self.system.period_ns)[2]
-        sharpness = max(sharpness, 1.0 / max(gate_width, 1.0 / _MAX_FIRST_BINS))
-        wanted = min(max(_MIN_BINS, _BINS_PER_WIDTH * sharpness), _MAX_FIRST_BINS)
+        sharpness = max(sharpness, 1.0 / max(gate_width, 1.0 / TOL.most_first_bins))
+        # 1 / sharpness is 2 sqrt(pi) sigma of a Gaussian: a bin is sigma / 2
+        wanted = min(max(TOL.first_bins, 4.0 * math.sqrt(math.pi) * sharpness), TOL.most_first_bins)
         return _multiple(wanted, out_bins)
 
     def edges(self, bins: int) -> FloatArray:
@@ -573,8 +548,8 @@ class Cells:
             shift=shift,
             fraction=fraction,
             stationary=self.system.start == "stationary",
-            tolerance=_SETTLED,
-            warm_periods=min(_WARM_PERIODS, max(_LEAST_WARM, _WARM_STEPS // bins)),
+            tolerance=TOL.repeats,
+            warm_periods=min(TOL.warm_periods, max(TOL.least_warm_periods, TOL.warm_steps // bins)),
         )
 
     def chunks(self, bins: int, out_bins: int) -> Iterator[slice]:
@@ -585,14 +560,14 @@ class Cells:
             per_cell, least = 8 * (40 * bins + 2 * out_bins), 1
         elif self.waveform is None and np.unique(self.delay).size == 1 and not self._all_in_shapes:
             per_cell = 16 * out_bins + 128
-        step = max(least, _CHUNK_BYTES // per_cell)
+        step = max(least, TOL.chunk_bytes // per_cell)
         for start in range(0, self.size, step):
             yield slice(start, min(start + step, self.size))
 
     def step_cost(self, bins: int) -> float:
         """Cost of one bin and period relative to a history of one dead time that fits in the cache (1, 2 or 6)."""
         remembered = self.grid(bins, 1).bytes
-        return 1.0 if remembered <= _NEAR_BYTES else 2.0 if remembered <= _MIDDLE_BYTES else 6.0
+        return 1.0 if remembered <= TOL.near_bytes else 2.0 if remembered <= TOL.middle_bytes else 6.0
 
     def check_history(self, bins: int) -> None:
         """Raise MemoryError where the registrations of one dead time do not fit in memory."""
@@ -677,17 +652,12 @@ def _photons_before(cells: Cells, edges: FloatArray) -> FloatArray:
 
 # --- Histograms of very many bins ----------------------------------------------------------------------------------
 
-MANY_BINS = 2**17  # bins of a histogram beyond which a coarser grid and interpolation are faster
-_FINE_CELLS = (2**15, 2**17)  # bins of the coarser grids, tried in turn
-_LEAST_KNOTS = 4  # knots of a cubic spline
-_DARK = 1e-12  # share of all photons below which a bin adds no knot: division by it amplifies rounding
-
 
 def fine_histograms(
     cells: Cells, bins: int, tolerance: float, compute: Callable[[Cells, int], FloatArray]
 ) -> FloatArray:
     """Histograms (cells, bins) of ``compute(cells, bins)``, interpolated from fewer bins within `tolerance`."""
-    if bins <= MANY_BINS:
+    if bins <= TOL.many_bins:
         return compute(cells, bins)
     return np.concatenate([_fine(cells.part(slice(k, k + 1)), bins, tolerance, compute) for k in range(cells.size)])
 
@@ -695,7 +665,7 @@ def fine_histograms(
 def _fine(cell: Cells, bins: int, tolerance: float, compute: Callable[[Cells, int], FloatArray]) -> FloatArray:
     edges = np.arange(bins + 1) / bins
     light = light_before(cell, edges)
-    for few in _FINE_CELLS:
+    for few in TOL.cells_of_many:
         before = light_before(cell, np.arange(few + 1) / few)
         if before[-1] == 0.0 or misplaced(before, edges, light) > 2.0 * tolerance:
             continue
@@ -737,13 +707,13 @@ def registered_before(before: FloatArray, counts: FloatArray, light: FloatArray)
     """
     from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
-    lit = np.diff(before) > _DARK * before[-1]
+    lit = np.diff(before) > TOL.rounding * before[-1]
     at = np.concatenate([[True], lit])
     at[-1] |= not lit.any()
     total = np.concatenate([[0.0], np.cumsum(counts)])
     photons, so_far = before[at], total[at]
     photons[-1], so_far[-1] = before[-1], total[-1]
-    if photons.size < _LEAST_KNOTS:
+    if photons.size < 4:  # too few knots for a cubic
         return np.asarray(np.interp(light, photons, so_far))
     armed = np.maximum(np.diff(so_far) / np.diff(photons), 0.0)
     most = 3.0 * np.minimum(np.append(armed[0], armed), np.append(armed, armed[-1]))

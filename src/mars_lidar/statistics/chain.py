@@ -19,16 +19,15 @@ from numpy.typing import ArrayLike
 from mars_lidar._base import checks
 from mars_lidar._base.brief import brief
 from mars_lidar._base.types import FloatArray
-from mars_lidar.instrument.system import System
-from mars_lidar.light.flux import Flux
-from mars_lidar.statistics.cells import MAX_PHOTONS, cell_name, one_pixel, photons_per_bin
+from mars_lidar.instrument.system import MAX_DEAD_PERIODS, System
+from mars_lidar.light.flux import MAX_PHOTONS, Flux
+from mars_lidar.statistics.cells import cell_name, one_pixel, photons_per_bin
 from mars_lidar.statistics.gate import require_mode
 from mars_lidar.statistics.phase_chain import ConvergenceError, Feedback, Solution, cyclic_recursion
 
 Rearm = Literal["centre", "edge"]
 
 _REARMS = get_args(Rearm)
-_LONGEST = 2.0**31  # dead time, periods: beyond, its fraction of a bin has no digits, and nothing registers twice
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +158,7 @@ class PhaseChain:
         total = float(photons.sum())
         if not total > 0:
             raise ValueError("photons must not all be 0: without flux there is no registration and no chain")
-        dead = checks.real("dead_time", self.dead_time, low=0.0, high=_LONGEST)
+        dead = checks.real("dead_time", self.dead_time, low=0.0, high=MAX_DEAD_PERIODS)
         checks.choice("rearm", self.rearm, _REARMS)
         photons.flags.writeable = False
         n = photons.size

@@ -23,6 +23,7 @@ from mars_lidar.statistics.gate import PLAIN
 from mars_lidar.statistics.paralyzable import paralyzable_histograms
 from mars_lidar.statistics.synchronous import cumulants_of, first_arrivals, synchronous_windows
 from mars_lidar.statistics.timing import recorded
+from mars_lidar.statistics.tolerances import TOL
 
 # --- Mean histogram ------------------------------------------------------------------------------------------------
 
@@ -103,7 +104,7 @@ def mean_histograms(cells: Cells, tolerance: float, threads: int | None) -> Floa
 def _registrations(cells: Cells, bins: int, tolerance: float, threads: int | None) -> FloatArray:
     mode = cells.system.detector.mode
     if "electronics_dead_time_ns" in cells.system.detector.effects:
-        return moments(cells, max(tolerance, 1e-3), LAW).histogram.reshape(cells.size, bins)
+        return moments(cells, max(tolerance, TOL.records), LAW).histogram.reshape(cells.size, bins)
     if mode == "synchronous":
         armed = first_arrivals(cells)
         registered = np.maximum(armed.sum(-1), np.finfo(float).tiny)

@@ -27,6 +27,7 @@ from mars_lidar.statistics.histogram import chain_of, histogram_effects, rearm_o
 from mars_lidar.statistics.histogram import registration_pdf as registration_pdf
 from mars_lidar.statistics.renewal import holding_times
 from mars_lidar.statistics.synchronous import cumulants_of, synchronous_windows
+from mars_lidar.statistics.tolerances import TOL
 
 Method = Literal["exact", "mars", "renewal", "poisson"]
 _METHODS = get_args(Method)
@@ -231,7 +232,7 @@ def count_law(
     team = thread_count(threads)
     slow = "electronics_dead_time_ns" in cells.system.detector.effects
     if method == "exact" and (slow or system.detector.mode == "synchronous"):
-        windows = record_windows(cells, max(tolerance, 1e-3), team) if slow else synchronous_windows(cells)
+        windows = record_windows(cells, max(tolerance, TOL.records), team) if slow else synchronous_windows(cells)
         recorded_cumulants = np.array([cumulants_of(window) for window in windows]).reshape(*cells.shape, 4)
         return CountLaw(system, method, recorded_cumulants, lambda: windows)
     if method == "exact":

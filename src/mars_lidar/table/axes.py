@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.types import FloatArray
-from mars_lidar.statistics.cells import MAX_PHOTONS
+from mars_lidar.light.flux import MAX_PHOTONS
 
 Grid = tuple[float, float, int] | ArrayLike
 

@@ -24,7 +24,7 @@ from mars_lidar.light.flux import Flux
 from mars_lidar.statistics.cells import Cells, cell_name, default_bins, flat, reals, with_delays
 from mars_lidar.statistics.chain import PhaseChain, Rearm
 from mars_lidar.statistics.count_pmf import Pmf, guessed_windows
-from mars_lidar.statistics.exposure import UNSETTLED, _run, blank, native_light, normalised, refined_moments
+from mars_lidar.statistics.exposure import Settled, _run, blank, native_light, normalised, refined_moments
 from mars_lidar.statistics.matched import trusted
 from mars_lidar.statistics.phase_chain import ConvergenceError
 from mars_lidar.statistics.renewal import holding_times
@@ -356,8 +356,8 @@ def _corrections(cells: Cells, bins: int, phase: FloatArray, threads: int) -> tu
         phase=np.rint(np.interp(phase, cells.edges(bins), np.arange(bins + 1))).astype(np.int32),
         correction=out,
     )
-    if (settled == UNSETTLED).any():
-        k = int(np.argmax(settled == UNSETTLED))
+    if (settled == Settled.UNSETTLED).any():
+        k = int(np.argmax(settled == Settled.UNSETTLED))
         raise ConvergenceError(
             f"start-phase correction of {cells.name(k)}: the state of the pixel does not repeat from period to "
             "period for so long that the exposure cannot be run to its end"

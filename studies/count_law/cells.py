@@ -8,8 +8,9 @@ import numpy as np
 
 from mars_lidar import Flux, System, count_law, registration_pdf
 from mars_lidar._base.types import FloatArray
-from mars_lidar.statistics.distance import Pmf, kl_divergence, wasserstein
+from mars_lidar.statistics.count_pmf import Pmf, kl_divergence
 from studies import Tell
+from studies.common.distance import wasserstein
 from studies.common.sample import (
     NEAR_NS,
     PERIOD_NS,

@@ -10,10 +10,9 @@ import numpy as np
 
 from mars_lidar import CountLaw, Flux, System, count_law, simulate
 from mars_lidar._base.types import FloatArray
-from mars_lidar.statistics import distance
-from mars_lidar.statistics.count_pmf import gaussian_window
-from mars_lidar.statistics.distance import Pmf, total_variation
+from mars_lidar.statistics.count_pmf import Pmf, gaussian_window, total_variation
 from studies import Facts, Request, Tell
+from studies.common import distance
 from studies.common.report import Row, picked
 from studies.common.sample import PERIOD_NS, log_points, system_of
 

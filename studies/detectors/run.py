@@ -13,8 +13,9 @@ from mars_lidar import Detector, Flux, GaussianPulse, System, count_law, simulat
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.effects import AVALANCHE_EFFECTS
 from mars_lidar.statistics import mean_histogram
-from mars_lidar.statistics.distance import Pmf, g_test
+from mars_lidar.statistics.count_pmf import Pmf
 from studies import Facts, Request
+from studies.common.distance import g_test
 from studies.common.sample import settings_of
 
 SIGNAL, BACKGROUND, DELAY_NS, DEAD_NS = 1.0, 1.0, 37.0, 45.0

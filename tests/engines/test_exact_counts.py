@@ -13,7 +13,7 @@ from mars_lidar.engines import MarsEngine
 from mars_lidar.engines.counts import Matched, Mended, Streams, Tabulated
 from mars_lidar.engines.synthesis import Run
 from mars_lidar.engines.table_reader import Entries
-from mars_lidar.statistics.distance import Pmf, total_variation
+from mars_lidar.statistics.count_pmf import Pmf, total_variation
 from mars_lidar.statistics.tolerances import TOL
 from mars_lidar.table import Table
 

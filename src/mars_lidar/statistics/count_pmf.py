@@ -57,6 +57,21 @@ class Pmf:
         return self.first + self.p.size - 1
 
 
+def total_variation(a: Pmf, b: Pmf) -> float:
+    """Half the sum of |difference| over all counts."""
+    if a.last < b.first or b.last < a.first:
+        return 0.5 * float(a.p.sum() + b.p.sum())
+    low, high = min(a.first, b.first), max(a.last, b.last)
+    return 0.5 * float(np.abs(a.on(low, high) - b.on(low, high)).sum())
+
+
+def kl_divergence(sample: FloatArray, law: FloatArray) -> FloatArray:
+    """KL(sample || law) (...) in nats, pmfs (..., w) and (w,) on the same counts; floored at `Tolerances.tail`."""
+    log_law = np.log(np.maximum(law, TOL.tail))
+    log_sample = np.log(np.where(sample > 0, sample, 1.0))
+    return np.asarray((sample * (log_sample - log_law)).sum(-1), dtype=np.float64)
+
+
 def poisson_window(mean: float) -> Pmf:
     """Poisson law, exact without dead time; the support follows from Bernstein's bounds of the two tails."""
     from scipy.special import gammaln, xlogy

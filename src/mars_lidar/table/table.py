@@ -31,7 +31,7 @@ from mars_lidar._version import __version__
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.statistics.chain import Rearm
-from mars_lidar.statistics.distance import Pmf, total_variation
+from mars_lidar.statistics.count_pmf import Pmf, total_variation
 from mars_lidar.statistics.exposure import exposure_moments, normalised
 from mars_lidar.statistics.gate import require_mode
 from mars_lidar.statistics.law import count_law

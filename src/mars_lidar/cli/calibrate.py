@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
-from cyclopts import Parameter
 
 from mars_lidar._base import checks
 from mars_lidar._base.files import read_npy
@@ -16,35 +14,36 @@ from mars_lidar.calibration import Calibration, CubeCalibration, calibrate_cube
 from mars_lidar.calibration import calibrate as calibrated
 from mars_lidar.calibration.calibration import GIVEN
 from mars_lidar.cli.console import MISFIT, check_picture, refuse_existing, save_picture, table
-from mars_lidar.cli.options import (
-    Integer,
-    Number,
-    Text,
-    argument,
-    command,
-    examples,
-    out_option,
-    output_option,
-    stream_option,
-    system_option,
-    two_integers,
-)
+from mars_lidar.cli.options import Integer, Number, OutPath, Text, command, examples, options, two_integers
 from mars_lidar.cli.system_options import FittedPulseOptions
 from mars_lidar.instrument.pulse import Pulse, SampledPulse
 from mars_lidar.instrument.system import MAX_CYCLES, SPEED_OF_LIGHT_M_PER_NS, System
 from mars_lidar.light.timestamps import Timestamps
 
 
-@Parameter(name="*")
-@dataclass(frozen=True, kw_only=True)
+@options
 class StreamOptions:
-    """One pixel of a photon stream; None: as the file has it."""
+    """One pixel of a photon stream; None: as the file has it.
 
-    pixel: Annotated[Text | None, stream_option("Pixel (channel c is 0,c).", "the brightest", metavar="Y,X")] = None
-    period_ns: Annotated[Number | None, stream_option("Laser period, ns, where the file does not have it.")] = None
-    bins: Annotated[Integer | None, stream_option("Histogram bins of the period.", "the file's clock")] = None
-    unit_ns: Annotated[Number | None, stream_option("Unit of the times in a .mat or .npz, ns.")] = None
-    variable: Annotated[Text | None, stream_option("Variable of a .mat or .npz that holds the times.")] = None
+    Stream
+    ------
+    pixel : Y,X
+        Pixel (channel c is 0,c). [default: the brightest]
+    period_ns
+        Laser period, ns, where the file does not have it.
+    bins
+        Histogram bins of the period. [default: the file's clock]
+    unit_ns
+        Unit of the times in a .mat or .npz, ns.
+    variable
+        Variable of a .mat or .npz that holds the times.
+    """
+
+    pixel: Text | None = None
+    period_ns: Number | None = None
+    bins: Integer | None = None
+    unit_ns: Number | None = None
+    variable: Text | None = None
 
     def arrivals(self, stream: Path) -> tuple[FloatArray, float, list[tuple[str, str]]]:
         """Times (n,) and clock unit, ns, of a recording without a laser, and rows that describe the file."""
@@ -82,23 +81,28 @@ class StreamOptions:
         return pixel, rows
 
 
-@Parameter(name="*")
-@dataclass(frozen=True, kw_only=True)
+@options
 class KnownOptions:
-    """What is known of pulse and detector, and the shape of the light."""
+    """What is known of pulse and detector, and the shape of the light.
 
-    given: Annotated[
-        list[Text] | None,
-        system_option(
-            f"A known value, which is not fitted, NAME=VALUE, once for each; {', '.join(GIVEN)}.", metavar="NAME=VALUE"
-        ),
-    ] = None
-    system: Annotated[
-        Path | None, system_option("YAML or JSON file with a known pulse and detector, in place of --given.")
-    ] = None
+    System
+    ------
+    given : NAME=VALUE
+        A known value, which is not fitted, NAME=VALUE, once for each; dead_time_ns, jitter_ns, pulse_sigma_ns, mode,
+        afterpulse_probability, afterpulse_delay_ns, twilight_ns, recovery_ns, electronics_dead_time_ns.
+    system
+        YAML or JSON file with a known pulse and detector, in place of --given.
+    free
+        Any shape of light, bin by bin: fluorescence, haze, many surfaces.
+    returns
+        Returns (surfaces) in the pixel. [default: 1]
+    """
+
+    given: list[Text] | None = None
+    system: Path | None = None
     pulse: FittedPulseOptions = FittedPulseOptions()
-    free: Annotated[bool, system_option("Any shape of light, bin by bin: fluorescence, haze, many surfaces.")] = False
-    returns: Annotated[Integer, system_option("Returns (surfaces) in the pixel.", "1")] = 1
+    free: bool = False
+    returns: Integer = 1
 
     def known(self) -> System | dict[str, Any] | None:
         """The argument `given` of `calibrate`."""
@@ -142,30 +146,43 @@ _UNITS = {"signal": " photons per period", "background": " photons per period", 
 
 
 def calibrate(
-    stream: Annotated[
-        Path,
-        argument(
-            "Photon stream: .ptu, .pt2, .pt3, .ht2, .ht3, .t3r, .spc, Photon-HDF5, .mat, .npz; or a cube: .zarr, .npy."
-        ),
-    ],
+    stream: Path,
     /,
     *,
     source: StreamOptions = StreamOptions(),
     known: KnownOptions = KnownOptions(),
-    look: Annotated[bool, output_option("Describe the file and stop before the fit.")] = False,
-    seed: Annotated[Integer, output_option("Seed of the simulated streams.", "0")] = 0,
-    out: Annotated[Path | None, out_option("The calibrated system, .yaml or .json, to simulate with.")] = None,
-    picture: Annotated[Path | None, output_option("A picture: .png, .pdf or .svg.")] = None,
-    cycles: Annotated[
-        Integer | None, output_option("Laser periods of a realization: compare the law of their counts too.")
-    ] = None,
-    overwrite: Annotated[bool, output_option("Replace existing files.")] = False,
+    look: bool = False,
+    seed: Integer = 0,
+    out: OutPath | None = None,
+    picture: Path | None = None,
+    cycles: Integer | None = None,
+    overwrite: bool = False,
 ) -> int | None:
     """Fit light and detector to a measured photon stream.
 
     Each estimate has a standard error; a verdict says whether the model fits, and what is suspect where it does not.
     Only what --given states is assumed; of a simulated stream only the photons are used. Without a laser: dead
     time, jitter and afterpulses in constant light. Of a cube: dead time and pulse width that its pixels share.
+
+    Arguments
+    ---------
+    stream
+        Photon stream: .ptu, .pt2, .pt3, .ht2, .ht3, .t3r, .spc, Photon-HDF5, .mat, .npz; or a cube: .zarr, .npy.
+
+    Output
+    ------
+    look
+        Describe the file and stop before the fit.
+    seed
+        Seed of the simulated streams. [default: 0]
+    out
+        The calibrated system, .yaml or .json, to simulate with.
+    picture
+        A picture: .png, .pdf or .svg.
+    cycles
+        Laser periods of a realization: compare the law of their counts too.
+    overwrite
+        Replace existing files.
     """
     from mars_lidar.io.streams.photons import NoLaserError
 

@@ -6,22 +6,11 @@ import time
 from pathlib import Path
 from typing import Annotated, Any
 
-from cyclopts import App
+from cyclopts import App, Parameter
 
 from mars_lidar._base.progress import span
 from mars_lidar.cli.console import progress_bar, refuse_existing, table
-from mars_lidar.cli.options import (
-    COMMAND_LINE,
-    Number,
-    Text,
-    Threads,
-    argument,
-    command,
-    grid_option,
-    option,
-    out_option,
-    output_option,
-)
+from mars_lidar.cli.options import COMMAND_LINE, Integer, Number, OutPath, Text, command
 from mars_lidar.cli.system_options import Effects, SystemOptions
 from mars_lidar.table import Table, cache
 from mars_lidar.table.error import QuantisationError
@@ -35,28 +24,48 @@ def build(
     *,
     instrument: SystemOptions = SystemOptions(),
     effects: Effects = Effects(),
-    signal: Annotated[
-        Text,
-        grid_option(
-            "Signal axis, photons per period, log-spaced; 0 is added.", "0.01,10,256", metavar="LOW,HIGH,POINTS"
-        ),
-    ] = "0.01,10,256",
-    background: Annotated[
-        Text, grid_option("Background axis, likewise.", "0.01,10,100", metavar="LOW,HIGH,POINTS")
-    ] = "0.01,10,100",
-    method: Annotated[
-        Text, grid_option("exposure (exact, start-up included) or mars (the paper's).", "exposure")
-    ] = "exposure",
-    rearm: Annotated[Text, grid_option("For mars: re-arming at the centre or the edge of a bin.", "centre")] = "centre",
-    refine: Annotated[
-        Number | None, grid_option("Insert points until the error between them, in total variation, is below this.")
-    ] = None,
-    check_law: Annotated[bool, grid_option("Compare count laws with exact ones at the end.")] = False,
-    threads: Threads = None,
-    out: Annotated[Path | None, out_option("The table: .h5 or .hdf5. Without it: the cache.", option)] = None,
-    overwrite: Annotated[bool, output_option("Replace an existing table.")] = False,
+    signal: Text = "0.01,10,256",
+    background: Text = "0.01,10,100",
+    method: Text = "exposure",
+    rearm: Text = "centre",
+    refine: Number | None = None,
+    check_law: bool = False,
+    threads: Integer | None = None,
+    out: OutPath | None = None,
+    overwrite: bool = False,
 ) -> None:
-    """Build the table of a system, in a file or in the cache; a cached table is not built again."""
+    """Build the table of a system, in a file or in the cache; a cached table is not built again.
+
+    Grid
+    ----
+    signal : LOW,HIGH,POINTS
+        Signal axis, photons per period, log-spaced; 0 is added. [default: 0.01,10,256]
+    background : LOW,HIGH,POINTS
+        Background axis, likewise. [default: 0.01,10,100]
+    method
+        exposure (exact, start-up included) or mars (the paper's). [default: exposure]
+    rearm
+        For mars: re-arming at the centre or the edge of a bin. [default: centre]
+    refine
+        Insert points until the error between them, in total variation, is below this.
+    check_law
+        Compare count laws with exact ones at the end.
+
+    Simulation
+    ----------
+    threads
+        Threads; the counts do not depend on it. [default: all cores]
+
+    Options
+    -------
+    out
+        The table: .h5 or .hdf5. Without it: the cache.
+
+    Output
+    ------
+    overwrite
+        Replace an existing table.
+    """
     began = time.perf_counter()
     refuse_existing(out, overwrite)
     system = instrument.build(effects)
@@ -78,10 +87,16 @@ def build(
 
 
 def info(
-    file: Annotated[Path | None, argument("A table: .h5 or .hdf5. Without it: the cache.")] = None,
+    file: Path | None = None,
     /,
 ) -> None:
-    """Describe a table, or list the tables in the cache."""
+    """Describe a table, or list the tables in the cache.
+
+    Arguments
+    ---------
+    file
+        A table: .h5 or .hdf5. Without it: the cache.
+    """
     if file is not None:
         table(_rows(file))
         return
@@ -93,9 +108,15 @@ def info(
 
 def clear(
     *,
-    yes: Annotated[bool, option("Do not ask.", "", "--yes", "-y")] = False,
+    yes: Annotated[bool, Parameter(("--yes", "-y"))] = False,
 ) -> None:
-    """Remove the tables in the cache."""
+    """Remove the tables in the cache.
+
+    Options
+    -------
+    yes
+        Do not ask.
+    """
     files = cache.files()
     if not files:
         print(f"{cache.directory()} holds no tables")

@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-_MOST_VALUES = 4  # values of an array or sequence that is written out; larger ones by type and shape
-_MOST_TEXT = 240  # characters of other values, such as a system inside a result
+from mars_lidar._base.tolerances import TOL
 
 
 def brief(self: Any) -> str:
@@ -29,13 +28,13 @@ def _is_default(field: dataclasses.Field[Any], value: Any) -> bool:
 
 
 def _value_text(value: Any) -> str:
-    if isinstance(value, np.ndarray) and value.size > _MOST_VALUES:
+    if isinstance(value, np.ndarray) and value.size > TOL.shown_values:
         return f"<{value.dtype} {value.shape}>"
     if isinstance(value, np.ndarray):
         return np.array2string(value, precision=6, separator=", ", max_line_width=10**6).replace("\n", "")
     if isinstance(value, np.generic):
         value = value.item()
-    if isinstance(value, list | tuple) and len(value) > _MOST_VALUES:
+    if isinstance(value, list | tuple) and len(value) > TOL.shown_values:
         return f"<{type(value).__name__} of {len(value)}>"
     text = repr(value)
-    return text if len(text) <= _MOST_TEXT else f"{type(value).__name__}(...)"
+    return text if len(text) <= TOL.shown_text else f"{type(value).__name__}(...)"

@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-_LARGEST = 160  # pixels of a map on its longer side: more than the picture has
-_INCHES, _DPI = 1.7, 75
+from mars_lidar._base.tolerances import TOL
 
 
 def as_html(thing: object, panels: Mapping[str, Any]) -> str:
@@ -22,14 +21,14 @@ def as_html(thing: object, panels: Mapping[str, Any]) -> str:
         return text
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(2.0 * _INCHES * len(drawn), _INCHES), dpi=_DPI, layout="constrained")
+    figure = Figure(figsize=(3.4 * len(drawn), 1.7), dpi=75, layout="constrained")
     for ax, (name, values) in zip(figure.subplots(1, len(drawn), squeeze=False).flat, drawn.items(), strict=True):
         ax.set_title(name, fontsize=7)
         ax.tick_params(labelsize=6)
         if isinstance(values, tuple):
             ax.plot(*values, lw=0.8, drawstyle="steps-mid")
             continue
-        step = max(1, max(values.shape) // _LARGEST)
+        step = max(1, max(values.shape) // TOL.map_pixels)
         figure.colorbar(ax.imshow(values[::step, ::step]), ax=ax).ax.tick_params(labelsize=6)
         ax.set_xticks([])
         ax.set_yticks([])

@@ -17,7 +17,8 @@ from mars_lidar.cli.console import MISFIT, check_picture, refuse_existing, save_
 from mars_lidar.cli.options import Integer, Number, OutPath, Text, command, examples, options, two_integers
 from mars_lidar.cli.system_options import FittedPulseOptions
 from mars_lidar.instrument.pulse import Pulse, SampledPulse
-from mars_lidar.instrument.system import MAX_CYCLES, SPEED_OF_LIGHT_M_PER_NS, System
+from mars_lidar.instrument.system import SPEED_OF_LIGHT_M_PER_NS, System
+from mars_lidar.instrument.tolerances import TOL
 from mars_lidar.light.timestamps import Timestamps
 
 
@@ -195,7 +196,7 @@ def calibrate(
             raise ValueError("--out needs a fitted pulse: leave out --free and --look, or --out")
         refuse_existing(out, overwrite)
     if cycles is not None:
-        checks.integer("--cycles", cycles, low=1, high=MAX_CYCLES)
+        checks.integer("--cycles", cycles, low=1, high=TOL.cycles)
     if cube:
         if look or cycles is not None or known.given or known.pulse.build() is not None or known.returns != 1:
             raise ValueError("a cube takes --system, --free, --out and --picture: its options are not a stream's")

@@ -33,8 +33,9 @@ from mars_lidar.instrument.detector import Mode
 from mars_lidar.instrument.effects import LIGHT_EFFECTS
 from mars_lidar.instrument.pulse import SampledPulse
 from mars_lidar.instrument.system import System
-from mars_lidar.light.flux import MAX_PHOTONS, Flux
+from mars_lidar.light.flux import Flux
 from mars_lidar.light.stored_flux import StoredFlux
+from mars_lidar.light.tolerances import TOL as LIGHT
 from mars_lidar.statistics.budget import MOMENTS, advice
 from mars_lidar.statistics.gate import PLAIN, open_parts, require_mode
 from mars_lidar.statistics.tolerances import TOL
@@ -53,11 +54,11 @@ def reals(name: str, value: ArrayLike) -> FloatArray:
 
 
 def photons(name: str, value: ArrayLike) -> FloatArray:
-    """Photons per period as doubles, checked to lie in [0, MAX_PHOTONS]."""
+    """Photons per period as doubles, checked to lie in [0, LIGHT.photons]."""
     array = reals(name, value)
-    bad = ~((array >= 0) & (array <= MAX_PHOTONS))
+    bad = ~((array >= 0) & (array <= LIGHT.photons))
     if bad.any():
-        raise ValueError(f"{name} must lie in [0, {MAX_PHOTONS:g}] photons per period, got {array[bad].flat[0]}")
+        raise ValueError(f"{name} must lie in [0, {LIGHT.photons:g}] photons per period, got {array[bad].flat[0]}")
     return array
 
 

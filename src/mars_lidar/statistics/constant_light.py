@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
 from mars_lidar.instrument.detector import Detector, require_effects
-from mars_lidar.instrument.effects import LIGHT_EFFECTS, MAX_RATE_HZ, TIMING_EFFECTS
+from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
+from mars_lidar.instrument.tolerances import TOL as INSTRUMENT
 from mars_lidar.statistics.phase_chain import ConvergenceError
 from mars_lidar.statistics.tolerances import TOL
 
@@ -63,7 +64,7 @@ def constant_light_rate(rate_hz: float, detector: Detector) -> float:
     >>> round(ml.statistics.constant_light_rate(1e7, ml.Detector(dead_time_ns=50.0)))  # 1e7 / (1 + 0.5)
     6666667
     """
-    light = checks.real("rate_hz", rate_hz, low=0.0, high=MAX_RATE_HZ)
+    light = checks.real("rate_hz", rate_hz, low=0.0, high=INSTRUMENT.rate_hz)
     require_effects("constant_light_rate", detector, _EFFECTS, lambda _: "; simulate it with engine 'sequential'")
     if detector.mode != "nonparalyzable":
         raise ValueError(f"constant_light_rate treats mode 'nonparalyzable' only, got {detector.mode!r}")

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import csv
 import datetime
+import importlib
 import math
 import os
 import platform
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -34,13 +35,17 @@ def write(request: Request, name: str, study: ModuleType, facts: Mapping[str, An
     gets their paths. Returns all paths.
 
     The Markdown is made of the Jinja template beside the module `study`: that of its name, ``report.md.jinja`` beside a
-    ``run.py``. It gives the `facts`; the module itself, with its constants, is `study` there.
+    ``run.py``. It gives the `facts`; `study` there is the module with its constants, and those of a ``settings.py``
+    beside it.
     """
     text, module = request.out / f"{name}.md", Path(str(study.__file__))
+    settings = f"{study.__package__}.settings"
+    shared = vars(importlib.import_module(settings)) if module.with_name("settings.py").exists() else {}
+    names = SimpleNamespace(**{**shared, **vars(study)})
     template = module.with_name(f"{'report' if module.stem == 'run' else module.stem}.md.jinja")
     drawn: Mapping[str, Figure] = facts.get("figures", {})
     figures = [save_figure(request.out / f"{f'{name}_{key}' if key else name}.png", one) for key, one in drawn.items()]
-    text.write_text(render(request, template, {"study": study, **facts, "figures": figures}), encoding="utf-8")
+    text.write_text(render(request, template, {"study": names, **facts, "figures": figures}), encoding="utf-8")
     paths = [text, *figures]
     for key, rows in {"": facts.get("rows", ()), **facts.get("tables", {})}.items():
         path = request.out / f"{f'{name}_{key}' if key else name}.csv"

@@ -63,6 +63,11 @@ def chance_error(n: int, m: int) -> float:
     return float(np.sqrt((n + m + 1) / (12.0 * n * m)))
 
 
+def chance(exposures: int) -> float:
+    """Standard error of the AUC of two samples of one law, half of the `exposures` of each held out."""
+    return chance_error(exposures - exposures // 2, exposures - exposures // 2)
+
+
 def _model(kind: str, seed: int) -> Any:
     if kind == QDA:
         from sklearn.discriminant_analysis import QuadraticDiscriminantAnalysis

@@ -23,8 +23,8 @@ from studies.common.sample import (
     paper_grids,
     system_of,
 )
-from studies.common.simulators import Prediction, arrival_shape, centred, simulators
 from studies.neural.pairs import Training
+from studies.neural.simulators import Prediction, arrival_shape, centred, simulators
 
 FIGURES = ("wasserstein", "kl", "mean", "variance")  # distances of a law to the truth, in this order
 _NEGLIGIBLE = 1e-10  # probability of a count left out of a resampling, per exposure drawn

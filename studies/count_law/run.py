@@ -10,8 +10,8 @@ import numpy as np
 from mars_lidar.statistics.tolerances import TOL
 from studies import Facts, Request
 from studies.common.report import Row, picked
-from studies.common.simulators import simulators
 from studies.count_law.cells import FIGURES, FULL, QUICK, Cell, compute, shape_sweep
+from studies.neural.simulators import simulators
 
 PAPER = {  # T1 of arXiv 2512.04924: Wasserstein, KL, mean difference, variance difference
     "poisson": (7966.130, 24.208, 7966.130, 9257.464),

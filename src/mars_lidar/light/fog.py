@@ -113,9 +113,8 @@ def _farthest(lit: NDArray[np.bool_], depth: FloatArray) -> FloatArray:
 def _cloud(farthest: FloatArray, alpha: float, first: float, reach_m: float, number: int) -> FloatArray:
     """Part of the backscatter in each part of the period (H, W, number), of fog up to the farthest return.
 
-    `reach_m` is the range of one period. What returns after `TOL.fog_periods` periods is spread evenly
-    over the period: by then the density, ~ 1 / z^2, changes by 2 / 256 within one, and z_0 / (256 reach_m) of the light
-    is still to come.
+    `reach_m` is the range of one period. What returns after 256 periods is spread evenly over the period: by then the
+    density, ~ 1 / z^2, changes by 2 / 256 within one, and z_0 / (256 reach_m) of the light is still to come.
     """
     reached = min(float(farthest.max()), first + 0.5 * TOL.fog_depths / alpha) / reach_m
     periods = min(TOL.fog_periods, 1 << math.ceil(math.log2(max(1.0, math.floor(reached) + 1.0))))

@@ -16,8 +16,10 @@ from numpy.typing import NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
+from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.detector import Detector, require_effects
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
+from mars_lidar.instrument.system import System
 from mars_lidar.instrument.tolerances import TOL as INSTRUMENT
 from mars_lidar.statistics.phase_chain import ConvergenceError
 from mars_lidar.statistics.tolerances import TOL
@@ -88,6 +90,15 @@ def constant_light_rate(rate_hz: float, detector: Detector) -> float:
     parts = max(1, min(math.ceil(40 * rate * (traps.bin_ns or 0.0)), TOL.sampled_delays // len(traps.delays or (0,))))
     density = np.repeat(np.diff(traps.edges_below) / parts, parts) * traps.probability
     return 1e9 / _sampled(rate, dead, twilight, density, (traps.bin_ns or 0.0) / parts)
+
+
+def renewal_moments(photons: FloatArray, system: System) -> tuple[FloatArray, FloatArray]:
+    """Mean and variance of a count under constant light in a long exposure, (6.2) of docs/theory.md.
+
+    `photons` (...) are those detected in a period.
+    """
+    x = photons * system.dead_time_periods
+    return system.cycles * photons / (1.0 + x), system.cycles * photons / (1.0 + x) ** 3
 
 
 def _wait(rate: float, recovery: float) -> float:

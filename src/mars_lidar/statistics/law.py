@@ -19,6 +19,7 @@ from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.statistics.budget import LAW
 from mars_lidar.statistics.cells import Cells
+from mars_lidar.statistics.constant_light import renewal_moments
 from mars_lidar.statistics.count_pmf import Pmf, exact_windows, gaussian_window, poisson_window
 from mars_lidar.statistics.electronics import record_windows
 from mars_lidar.statistics.exposure import Exposure, refined_moments
@@ -257,9 +258,7 @@ def count_law(
 def _gaussian_moments(method: str, cells: Cells, edge: Literal["centre", "edge"]) -> tuple[FloatArray, FloatArray]:
     """Mean and variance (cells,) of the Gaussian laws."""
     if method == "renewal":
-        from mars_lidar.statistics.baselines import renewal_moments_of
-
-        return renewal_moments_of(cells.signal + cells.background, cells.system)
+        return renewal_moments(cells.signal + cells.background, cells.system)
 
     mean, variance = np.zeros(cells.size), np.zeros(cells.size)
     for k in range(cells.size):

@@ -26,7 +26,7 @@ from mars_lidar.cli.options import (
     documented,
     examples,
     read_scene,
-    two_integers,
+    two,
 )
 from mars_lidar.cli.system_options import Effects, SystemOptions
 from mars_lidar.engines import ENGINES
@@ -103,7 +103,7 @@ def compare(
     check_new(numbers, overwrite)
     asked = [] if engines is None else engines.split(",")
     names = [checks.choice("--engines", name.strip(), tuple(ENGINES)) for name in asked]
-    places = {text.replace(" ", ""): two_integers("--pixel", text) for text in pixel or ()}
+    places = {text.replace(" ", ""): two("--pixel", text) for text in pixel or ()}
     system = instrument.build(effects)
     view = read_scene(scene, light, system)
     with progress_bar("comparing") as progress:

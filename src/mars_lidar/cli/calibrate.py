@@ -13,8 +13,8 @@ from mars_lidar._base.types import FloatArray
 from mars_lidar.calibration import Calibration, CubeCalibration, calibrate_cube
 from mars_lidar.calibration import calibrate as calibrated
 from mars_lidar.calibration.calibration import GIVEN
-from mars_lidar.cli.console import MISFIT, check_picture, refuse_existing, save_picture, table
-from mars_lidar.cli.options import Integer, Number, OutPath, Text, command, examples, options, two_integers
+from mars_lidar.cli.console import Exit, check_picture, refuse_existing, save_picture, table
+from mars_lidar.cli.options import Integer, Number, OutPath, Text, command, examples, options, two
 from mars_lidar.cli.system_options import FittedPulseOptions
 from mars_lidar.instrument.pulse import Pulse, SampledPulse
 from mars_lidar.instrument.system import SPEED_OF_LIGHT_M_PER_NS, System
@@ -54,7 +54,7 @@ class StreamOptions:
         channels, counts = np.unique(recording.detector[recording.detector >= 0], return_counts=True)
         if not channels.size:
             raise ValueError(f"{stream} holds no photons")
-        y, x = (0, int(channels[counts.argmax()])) if self.pixel is None else two_integers("--pixel", self.pixel)
+        y, x = (0, int(channels[counts.argmax()])) if self.pixel is None else two("--pixel", self.pixel)
         if y != 0 or x not in channels:
             raise ValueError(f"--pixel must be 0,C with a channel C of {', '.join(map(str, channels))}, got ({y}, {x})")
         times = recording.clock[recording.detector == x].astype(np.float64) * recording.clock_ns
@@ -63,7 +63,7 @@ class StreamOptions:
 
     def load(self, stream: Path) -> tuple[Timestamps, list[tuple[str, str]]]:
         """The stream of one pixel, and rows that describe file and pixel."""
-        asked = None if self.pixel is None else two_integers("--pixel", self.pixel)
+        asked = None if self.pixel is None else two("--pixel", self.pixel)
         times = Timestamps.load(
             stream, period_ns=self.period_ns, bins=self.bins, unit_ns=self.unit_ns, variable=self.variable
         )
@@ -200,9 +200,7 @@ def calibrate(
     if cube:
         if look or cycles is not None or known.given or known.pulse.build() is not None or known.returns != 1:
             raise ValueError("a cube takes --system, --free, --out and --picture: its options are not a stream's")
-        if not _cube(stream, known, out, picture).fits:
-            return MISFIT
-        return None
+        return None if _cube(stream, known, out, picture).fits else Exit.MISFIT
     given, shape = known.known(), known.shape()
     try:
         times, rows = source.load(stream)
@@ -215,8 +213,7 @@ def calibrate(
     table(rows + look_rows(result) + ([] if look else fit_rows(result)))
     written = []
     if cycles is not None and not look:
-        counts = result.realizations(cycles)
-        table([("counts", str(counts))])
+        table([("counts", str(result.realizations(cycles)))])
     if out is not None and result.system is not None:
         result.system.save(out)
         written.append(("wrote", str(out)))
@@ -227,9 +224,7 @@ def calibrate(
         written.append(("picture", str(picture)))
     if written:
         table(written)
-    if not look and not result.fits:
-        return MISFIT
-    return None
+    return None if look or result.fits else Exit.MISFIT
 
 
 def _cube(path: Path, known: KnownOptions, out: Path | None, picture: Path | None) -> CubeCalibration:
@@ -254,12 +249,8 @@ def _cube(path: Path, known: KnownOptions, out: Path | None, picture: Path | Non
     if isinstance(result.system.pulse, SampledPulse) and result.response_error is not None:
         pulse = result.system.pulse
         worst = 100.0 * float(result.response_error.max() / pulse.values.max())
-        rows.append(
-            (
-                "response",
-                f"{pulse.values.size} samples of {pulse.bin_ns:.5g} ns, errors up to {worst:.2g} % of its peak",
-            )
-        )
+        samples = f"{pulse.values.size} samples of {pulse.bin_ns:.5g} ns"
+        rows.append(("response", f"{samples}, errors up to {worst:.2g} % of its peak"))
     verdict = "their histograms fit" if result.fits else "their histograms do NOT fit: another return, or an effect"
     rows.append(("verdict", f"{100 * result.misfits:.3g} % of {result.p_values.size} pixels have p < 1 %: {verdict}"))
     table(rows)

@@ -12,7 +12,7 @@ from cyclopts import Parameter
 from mars_lidar._base import manifest
 from mars_lidar._base.files import size_on_disk
 from mars_lidar._base.progress import span
-from mars_lidar.cli.console import BAD_INPUT, FAILED, progress_bar, say, table
+from mars_lidar.cli.console import Exit, progress_bar, say, table
 from mars_lidar.cli.options import Integer, Number, Numbers, OutPath, Text, command, examples
 from mars_lidar.cli.system_options import DEFAULT_SYSTEM, Effects, SystemChanges
 from mars_lidar.scene.scene import Scene
@@ -161,9 +161,8 @@ def generate(
     if (part or finish) and (source is not None or resume or overwrite):
         raise ValueError("--part and --finish go on with the store: no SOURCE, --resume or --overwrite")
     if part is not None:
-        numbers = _part(part)
         with progress_bar("generating") as progress:
-            tell(dataset.make_part(out, numbers, threads=threads, progress=progress))
+            tell(dataset.make_part(out, _part(part), threads=threads, progress=progress))
         return None
     if finish:
         tell(dataset.finish(out))
@@ -186,30 +185,19 @@ def generate(
         raise ValueError("--crops belongs to --crop, which is not given")
     rgbd = _given(depth_unit_m=depth_unit_m, focal_px=focal_px, max_depth_m=max_depth_m)
     recipe = _recipe(source, replaced, scene_seeds, rgbd, resume)
-    if dry_run:
-        if recipe is None:
-            raise ValueError("--dry-run needs a source")
+    if (dry_run or begin) and recipe is None:
+        raise ValueError(f"--{'dry-run' if dry_run else 'begin'} needs a SOURCE")
+    if dry_run and recipe is not None:
         return tell_estimate(dataset.estimate(recipe, out, threads=threads))
-    if begin:
-        if recipe is None:
-            raise ValueError("--begin needs a SOURCE")
-        tell(dataset.begin(recipe, out, resume=resume, overwrite=overwrite, workers=workers, scheduler=scheduler))
+    where: dict[str, Any] = {"resume": resume, "overwrite": overwrite, "workers": workers, "scheduler": scheduler}
+    if begin and recipe is not None:
+        tell(dataset.begin(recipe, out, **where))
         return None
     here = workers is None and scheduler is None and not (resume and out.exists())
     if here and recipe is not None and (advice := str(dataset.quick_advice(recipe, threads))):
         say(advice)
     with progress_bar("generating") as progress:
-        done = dataset.generate(
-            recipe,
-            out,
-            resume=resume,
-            overwrite=overwrite,
-            threads=threads,
-            workers=workers,
-            scheduler=scheduler,
-            progress=progress,
-        )
-    tell(done)
+        tell(dataset.generate(recipe, out, threads=threads, progress=progress, **where))
     return None
 
 
@@ -246,13 +234,11 @@ def verify(
 
     with progress_bar("verifying") as progress:
         checked = verified(path, chunks=None if every else chunks, seed=seed, threads=threads, progress=progress)
-    if checked.good:
-        table([("verified", f"{checked.chunks} of {checked.of} chunks simulated again, every count is the same")])
-        return None
-    table([("verified", f"NO: see below; {checked.chunks} of {checked.of} chunks simulated again")])
+    again = f"{checked.chunks} of {checked.of} chunks simulated again"
+    table([("verified", f"{again}, every count is the same" if checked.good else f"NO: see below; {again}")])
     for line in checked.different:
         say(line)
-    return FAILED
+    return None if checked.good else Exit.FAILED
 
 
 def _recipe(
@@ -271,18 +257,15 @@ def _recipe(
             raise ValueError("--scene-seeds, --depth-unit-m and --focal-px stand in the recipe's scenes")
         return DatasetRecipe.load(source, **replaced)
     if str(source) in Scene.example_names():
-        if rgbd:
-            raise ValueError("--depth-unit-m and --focal-px belong to RGB-D")
         scene: dict[str, Any] = {"example": str(source), "seeds": {"count": scene_seeds or 1}}
         scene["size"] = replaced.pop("size", 128)
+    elif scene_seeds is not None:
+        raise ValueError(f"--scene-seeds belongs to a built-in scene, and {source} is none")
     else:
-        if scene_seeds is not None:
-            raise ValueError(f"--scene-seeds belongs to a built-in scene, and {source} is none")
-        scene = {"path": str(source), **rgbd}
-        if source.suffix.lower() in _TRANSIENTS:
-            if rgbd:
-                raise ValueError("--depth-unit-m and --focal-px belong to RGB-D")
-            scene = {"transient": str(source)}
+        transient = source.suffix.lower() in _TRANSIENTS
+        scene = {"transient": str(source)} if transient else {"path": str(source), **rgbd}
+    if rgbd and "path" not in scene:
+        raise ValueError("--depth-unit-m and --focal-px belong to RGB-D")
     return DatasetRecipe.from_dict({"systems": [DEFAULT_SYSTEM], **replaced, "scenes": scene})
 
 
@@ -425,9 +408,7 @@ def tell_estimate(expected: Estimate) -> int | None:
         rows.append(("disk", f"{_bytes(expected.free_bytes)} free{': NOT ENOUGH' if short else ''}"))
     table(rows)
     _tell_problems(expected.problems)
-    if short:
-        return BAD_INPUT
-    return None
+    return Exit.BAD_INPUT if short else None
 
 
 def _shape(shape: tuple[int, ...]) -> str:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 from cyclopts import Parameter
 
-from mars_lidar.cli.options import Integer, Number, Text, options, two_integers, two_numbers
+from mars_lidar.cli.options import Integer, Number, Text, options, two
 from mars_lidar.cli.system_options import PulseOptions
 from mars_lidar.instrument.presets import PRESETS
 from mars_lidar.instrument.system import Detector, System
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from mars_lidar.io.recorder import Recorded
 
 
-_BINS = 1e-6  # relative difference by which a period may miss a whole number of bins
 _NEEDED = "--system, or --bin-ps (or --period-ns), --cycles, --dead-time-ns (or --detector) and --pulse-sigma-ns"
 
 
@@ -109,12 +108,13 @@ class ForeignOptions:
             path,
             variable=self.variable,
             axes=self.axes,
-            image=None if self.image is None else two_integers("--image", self.image, "H,W"),
+            image=None if self.image is None else two("--image", self.image, "integers H,W"),
             bins=None if base is None else base.bins,
         )
         length = None if contents.counts is None else contents.counts.shape[-1]
         whole = self if contents.recorder is None or base is not None else self._completed(contents.recorder, length)
-        window = None if self.window_ns is None else two_numbers("--window-ns", self.window_ns, "START,STOP in ns")
+        between, form = self.window_ns, "numbers START,STOP in ns"
+        window = None if between is None else two("--window-ns", between, form, float)
         system = base or whole._system(path, length)
         return contents.cube(system, start_ns=self.start_ns, unit_ns=self.unit_ns, window_ns=window)
 
@@ -170,7 +170,7 @@ class ForeignOptions:
                 raise ValueError(f"{path} holds photon times: give --period-ns and --bin-ps")
             return (length * width, length) if width is not None else (float(self.period_ns or 0.0), length)
         bins = self.period_ns / width
-        if abs(bins - round(bins)) > _BINS * bins:
+        if abs(bins - round(bins)) > 1e-6 * bins:  # the digits that a period is stated with
             below, above = int(bins) * width, (int(bins) + 1) * width
             raise ValueError(
                 f"--period-ns must be a whole number of bins of {width:g} ns, got {self.period_ns:g}; "

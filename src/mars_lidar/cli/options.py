@@ -53,6 +53,7 @@ def _numbers(kind: Any, tokens: Any) -> list[float]:
 
 
 T = TypeVar("T")
+N = TypeVar("N", int, float)
 Integer = Annotated[int, Parameter(converter=_integer, metavar="INTEGER")]
 Number = Annotated[float, Parameter(converter=_number, metavar="NUMBER")]
 Numbers = Annotated[list[float], Parameter(converter=_numbers, metavar="NUMBER")]
@@ -153,21 +154,14 @@ def examples(*lines: str, notes: str = "") -> str:
 # --- Options of several commands ------------------------------------------------------------------------------------
 
 
-def two_integers(option: str, text: str, form: str = "Y,X (row, column)") -> tuple[int, int]:
-    """The value of an option of this form, such as the pixel (y, x) of ``--pixel Y,X``."""
+def two(
+    option: str, text: str, form: str = "integers Y,X (row, column)", kind: Callable[[str], N] = int
+) -> tuple[N, N]:
+    """The value of an option of two numbers, such as the pixel (y, x) of ``--pixel Y,X``."""
     try:
-        first, second = (int(part) for part in text.split(","))
+        first, second = (kind(part) for part in text.split(","))
     except ValueError:
-        raise ValueError(f"{option} must be two integers {form}, got {text!r}") from None
-    return first, second
-
-
-def two_numbers(option: str, text: str, form: str) -> tuple[float, float]:
-    """The value of an option of this form, such as START,STOP."""
-    try:
-        first, second = (float(part) for part in text.split(","))
-    except ValueError:
-        raise ValueError(f"{option} must be two numbers {form}, got {text!r}") from None
+        raise ValueError(f"{option} must be two {form}, got {text!r}") from None
     return first, second
 
 

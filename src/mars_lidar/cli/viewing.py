@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 from mars_lidar._base import checks, manifest
 from mars_lidar._base.files import size_on_disk
 from mars_lidar._version import other_version
-from mars_lidar.cli.console import FAILED, check_picture, progress_bar, save_picture, say, table
+from mars_lidar.cli.console import Exit, check_picture, progress_bar, save_picture, say, table
 from mars_lidar.cli.dataset import dataset_rows
 from mars_lidar.cli.foreign import ForeignOptions, foreign_rows, is_foreign
-from mars_lidar.cli.options import Integer, OutPath, Switch, Text, command, examples, two_integers
+from mars_lidar.cli.options import Integer, OutPath, Switch, Text, command, examples, two
 from mars_lidar.instrument.detector import Detector
 from mars_lidar.light.flux import Flux
 
@@ -70,9 +70,7 @@ def info(
         damaged = (manifest.damage(file) if file.suffix == ".zarr" else []) or ["counts differ"]
         different = f"NO: {damaged[0]}{other_version(cube.version)}"
         table([("verified", "simulated again, every count is the same" if same else different)])
-        if not same:
-            return FAILED
-    return None
+        return None if same else Exit.FAILED
 
 
 def view(
@@ -111,7 +109,7 @@ def view(
         Replace an existing picture.
     """
     check_picture(out, overwrite)
-    pixels = None if not pixel else [two_integers("--pixel", text) for text in pixel]
+    pixels = None if not pixel else [two("--pixel", text) for text in pixel]
     with opened(file, sample, foreign) as cube:
         from mars_lidar.plot import overview
 

@@ -33,62 +33,18 @@ from mars_lidar.instrument.detector import Mode
 from mars_lidar.instrument.effects import LIGHT_EFFECTS
 from mars_lidar.instrument.pulse import SampledPulse
 from mars_lidar.instrument.system import System
-from mars_lidar.light.flux import Flux
+from mars_lidar.light.flux import Flux, check_photons
 from mars_lidar.light.stored_flux import StoredFlux
-from mars_lidar.light.tolerances import TOL as LIGHT
 from mars_lidar.statistics.budget import MOMENTS, advice
 from mars_lidar.statistics.gate import PLAIN, open_parts, require_mode
 from mars_lidar.statistics.tolerances import TOL
 
-# --- Arguments -----------------------------------------------------------------------------------------------------
-
-
-def reals(name: str, value: ArrayLike) -> FloatArray:
-    """Real numbers as doubles; refuses an empty array."""
-    array = np.asarray(value)
-    if array.dtype.kind not in "fiu":
-        raise TypeError(f"{name} must be real numbers, got dtype {array.dtype}")
-    if array.size == 0:
-        raise ValueError(f"{name} must not be empty, got shape {array.shape}")
-    return array.astype(np.float64)
-
-
-def photons(name: str, value: ArrayLike) -> FloatArray:
-    """Photons per period as doubles, checked to lie in [0, LIGHT.photons]."""
-    array = reals(name, value)
-    bad = ~((array >= 0) & (array <= LIGHT.photons))
-    if bad.any():
-        raise ValueError(f"{name} must lie in [0, {LIGHT.photons:g}] photons per period, got {array[bad].flat[0]}")
-    return array
-
-
-def broadcast(names: tuple[str, ...], *arrays: NDArray[Any]) -> list[NDArray[Any]]:
-    """Arrays broadcast to one shape; an error states `names` and shapes."""
-    try:
-        return list(np.broadcast_arrays(*arrays))
-    except ValueError:
-        shapes = ", ".join(f"{n} {a.shape}" for n, a in zip(names, arrays, strict=False))
-        raise ValueError(f"shapes must broadcast, got {shapes}") from None
-
-
-def with_delays(
-    signal: FloatArray, background: FloatArray, delay_ns: ArrayLike | None, period_ns: float
-) -> list[NDArray[Any]]:
-    """Signal, background and delay (ns) of one shape; the delay defaults to half the period, NaN: no return."""
-    given = reals("delay_ns", 0.5 * period_ns if delay_ns is None else delay_ns)
-    signal, background, delay = broadcast(("signal", "background", "delay_ns"), signal, background, given)
-    bad = ~np.isfinite(delay) & ~(np.isnan(delay) & (signal == 0))
-    if bad.any():
-        raise ValueError(f"delay_ns must be finite (NaN for no return where signal is 0), got {delay[bad].flat[0]}")
-    return [signal, background, delay]
+# --- Light on a grid ----------------------------------------------------------------------------------------------
 
 
 def flat(array: NDArray[Any]) -> FloatArray:
     """(cells,) doubles, contiguous."""
     return np.ascontiguousarray(array.reshape(-1), dtype=np.float64)
-
-
-# --- Grid of the phase chain ---------------------------------------------------------------------------------------
 
 
 @checked
@@ -159,10 +115,14 @@ def one_pixel(flux: Flux) -> Flux:
 
 def default_bins(system: System) -> int:
     """Bins of the statistics grid when none are asked for: a multiple of `System.bins`, pulse resolved."""
-    probe = 2**15
-    peak = float(system.pulse.bin_energy(0.5 * system.period_ns, system.period_ns, probe).max())
-    wanted = max(TOL.unrefined_bins, TOL.chain_bins_per_width * peak * probe)
+    wanted = max(TOL.unrefined_bins, TOL.chain_bins_per_width * _peak(system))
     return min(system.bins * math.ceil(wanted / system.bins), max(system.bins, TOL.most_bins))
+
+
+def _peak(system: System) -> float:
+    """Largest density of the pulse, per period."""
+    probe = 2**15
+    return float(system.pulse.bin_energy(0.5 * system.period_ns, system.period_ns, probe).max()) * probe
 
 
 def _bins_for_waveform(samples: int, bins: int) -> int:
@@ -193,9 +153,7 @@ def cell_name(flux: Flux, system: System) -> str:
 
 def waveform_parts(system: System) -> int:
     """Parts of a waveform of several returns: at least 8192, 50 in a standard deviation of the pulse."""
-    probe = 2**15
-    peak = float(system.pulse.bin_energy(0.5 * system.period_ns, system.period_ns, probe).max()) * probe
-    wanted = max(2**13, min(2**18, 20.0 * peak))
+    wanted = max(2**13, min(2**18, 20.0 * _peak(system)))
     return system.bins * max(1, math.ceil(wanted / system.bins))
 
 
@@ -366,41 +324,27 @@ class Cells:
         modes: tuple[Mode, ...] = PLAIN,
         effects: tuple[str, ...] = LIGHT_EFFECTS,
     ) -> Cells:
-        """Cells from checked and broadcast arguments; `waveform` (..., T) broadcasts over its leading axes.
+        """Cells of numbers that `Flux` has checked; they broadcast, a `waveform` (..., T) over its leading axes.
 
         The cells hold the flux of detected photons and the system that detects all of it (`System.detected`). `what`
         names the statistic in errors; ValueError where it does not treat the detector's mode or effects.
         """
-        if not isinstance(system, System):
-            raise TypeError(f"system must be a System, got {type(system).__name__}")
         require_mode(what, system, modes, effects)
         share, dark = system.detector.detection_efficiency, system.detector.dark_count_hz * system.period_ns * 1e-9
-        back = photons("background", background)
+        back = np.asarray(background, dtype=np.float64)
         if share != 1.0 or dark > 0.0:
-            system, back = system.detected(), photons("background with dark counts", back * share + dark)
+            system, back = system.detected(), back * share + dark
+            check_photons("background with dark counts", back)
         if waveform is not None:
-            if signal is not None or delay_ns is not None:
-                raise ValueError("waveform replaces signal and delay_ns: give it alone, or with background")
-            wave = photons("waveform", waveform) * share
-            if wave.ndim == 0 or wave.shape[-1] == 0:
-                raise ValueError(f"waveform must be (..., T) with T >= 1, got shape {wave.shape}")
-            total = photons("waveform summed over a period", wave.sum(-1))
-            rows = np.arange(total.size).reshape(total.shape)
-            total, back, rows = broadcast(("waveform", "background", "waveform"), total, back, rows)
+            wave = np.asarray(waveform, dtype=np.float64) * share
+            total = wave.sum(-1)
+            total, back, rows = np.broadcast_arrays(total, back, np.arange(total.size).reshape(total.shape))
             unit = wave.reshape(-1, wave.shape[-1])
             unit = unit / np.maximum(unit.sum(-1, keepdims=True), np.finfo(float).tiny)
-            return cls(
-                system,
-                total.shape,
-                flat(total),
-                flat(back),
-                np.zeros(total.size),
-                unit,
-                np.ascontiguousarray(rows.reshape(-1), dtype=np.int64),
-            )
-        if signal is None:
-            raise ValueError("signal must be given (photons per period), or a waveform instead of it")
-        total, back, delay = with_delays(photons("signal", signal) * share, back, delay_ns, system.period_ns)
+            row = np.ascontiguousarray(rows.reshape(-1), dtype=np.int64)
+            return cls(system, total.shape, flat(total), flat(back), np.zeros(total.size), unit, row)
+        delay = 0.5 * system.period_ns if delay_ns is None else np.asarray(delay_ns, dtype=np.float64)
+        total, back, delay = np.broadcast_arrays(np.asarray(signal, dtype=np.float64) * share, back, delay)
         phase = np.nan_to_num(flat(delay) / system.period_ns)
         phase -= np.floor(phase)
         return cls(system, total.shape, flat(total), flat(back), phase, None, np.zeros(total.size, np.int64))
@@ -462,17 +406,9 @@ class Cells:
 
     def part(self, index: IndexArray | slice) -> Cells:
         """The selected cells, flat."""
-        signal = self.signal[index]
-        return Cells(
-            self.system,
-            signal.shape,
-            signal,
-            self.background[index],
-            self.delay[index],
-            self.waveform,
-            self.row[index],
-            self.follow,
-        )
+        signal, row = self.signal[index], self.row[index]
+        light = signal, self.background[index], self.delay[index]
+        return Cells(self.system, signal.shape, *light, self.waveform, row, self.follow)
 
     def resolved(self, out_bins: int) -> Cells:
         """These cells, with bins that follow the pulse where resolving it takes too many equal bins."""

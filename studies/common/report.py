@@ -18,7 +18,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from benchmarks.machine import processor
-from mars_lidar._base.optional import needed
+from mars_lidar._base.imports import needed
 
 if TYPE_CHECKING:
     from studies import Request
@@ -162,7 +162,7 @@ def save_figure(path: Path, figure: Figure) -> Path:
 def machine() -> str:
     """Processor, processors of this process, vector level and system, in one line."""
     from mars_lidar import _core
-    from mars_lidar._base.threads import thread_count
+    from mars_lidar._base.resources import thread_count
 
     return (
         f"{processor()}, {thread_count(None)} processors used, {_core.levels()[0]}, "

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from mars_lidar import Flux, System, cramer_rao, reconstruct
-from mars_lidar._base.optional import needed
+from mars_lidar._base.imports import needed
 from mars_lidar._base.types import FloatArray
 from studies import Facts, Request
 from studies.common.kept import chosen, fixed, kept

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import rankdata
 
-from mars_lidar._base.optional import needed
+from mars_lidar._base.imports import needed
 from mars_lidar._base.types import FloatArray
 
 QDA, BOOSTING, FOREST = "QDA", "gradient boosting", "random forest"

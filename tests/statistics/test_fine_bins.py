@@ -140,7 +140,7 @@ def test_light_that_cells_do_not_see():
 
 def test_covariances_of_all_bins_do_not_fit(monkeypatch: pytest.MonkeyPatch):
     """They say what to use, whatever memory the machine has."""
-    monkeypatch.setattr("mars_lidar._base.memory.available_bytes", lambda: 2**36)
+    monkeypatch.setattr("mars_lidar._base.resources.available_bytes", lambda: 2**36)
     law = ml.joint_law(ml.Flux(0.5, 0.2, 50.0), view(0.45, 100, 0.01))
     for ask in (law.covariance, law.lag, lambda: law.variance):
         with pytest.raises(MemoryError, match="window"):

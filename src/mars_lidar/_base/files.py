@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from mars_lidar._base import mat5
 from mars_lidar._base.buckets import in_bucket
-from mars_lidar._base.memory import check_memory
+from mars_lidar._base.resources import check_memory
 from mars_lidar._base.sparse import check_sparse, is_sparse
 from mars_lidar._base.tolerances import TOL
 
@@ -546,3 +546,20 @@ def _check_sparse_within(name: str, value: Any) -> None:
                 _check_sparse_within(f"{name}.{field}", value[field])
     elif is_sparse(value):
         check_sparse(name, value, sorted_rows=True)
+
+
+def read_column(path: Path) -> NDArray[np.float64]:
+    """The last of one or two columns of numbers in a text file, below lines of words; else a ValueError."""
+    check_claim(path, 64 * path.stat().st_size)
+    rows: list[list[float]] = []
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+        try:
+            rows.append([float(part) for part in line.replace(",", " ").replace(";", " ").split()])
+        except ValueError:
+            like_numbers = all(part[0] in "+-.0123456789" for part in line.replace(",", " ").replace(";", " ").split())
+            if rows or like_numbers:  # lines of words are only above the numbers
+                raise ValueError(f"line {line[:40]!r} holds no numbers") from None
+    rows = [row for row in rows if row]
+    if not rows or {len(row) for row in rows} not in ({1}, {2}):
+        raise ValueError("numbers as text are one column, or times and values")
+    return np.asarray(rows)[:, -1]

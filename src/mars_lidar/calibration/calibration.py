@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.brief import brief
-from mars_lidar._base.threads import one_blas_thread
+from mars_lidar._base.display import brief
+from mars_lidar._base.resources import one_blas_thread
 from mars_lidar._base.types import FloatArray
 from mars_lidar.calibration import start, suspects
 from mars_lidar.calibration.curves import Curves, Realizations, curves, realizations

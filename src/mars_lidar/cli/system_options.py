@@ -9,8 +9,7 @@ import numpy as np
 from cyclopts import Parameter
 
 from mars_lidar._base import checks
-from mars_lidar._base.files import read_npy, reading
-from mars_lidar._base.text import read_column
+from mars_lidar._base.files import read_column, read_npy, reading
 from mars_lidar.cli.options import Integer, Number, Text, options
 from mars_lidar.instrument.effects import FIELDS
 from mars_lidar.instrument.presets import PRESETS

@@ -11,8 +11,7 @@ import numpy as np
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import constructed_by_name
-from mars_lidar._base.brief import brief
-from mars_lidar._base.notebook import as_html
+from mars_lidar._base.display import as_html, brief
 from mars_lidar.instrument import effects
 from mars_lidar.instrument.avalanches import Afterpulsing, Crosstalk
 from mars_lidar.instrument.effects import Jitter, SampledJitter

@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked, constructed_by_name
+from mars_lidar._base.display import as_html
 from mars_lidar._base.native import _core
-from mars_lidar._base.notebook import as_html
 from mars_lidar.instrument.tolerances import TOL
 
 FWHM_PER_SIGMA = 2.0 * math.sqrt(2.0 * math.log(2.0))

@@ -14,9 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked, constructed_by_name
-from mars_lidar._base.brief import brief
+from mars_lidar._base.display import as_html, brief
 from mars_lidar._base.files import check_claim, reading
-from mars_lidar._base.notebook import as_html
 from mars_lidar._base.yaml import Lines, located, read_yaml
 from mars_lidar.instrument.detector import Detector as Detector
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS

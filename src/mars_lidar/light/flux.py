@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked, checked_with_masks, constructed_by_name
-from mars_lidar._base.late import late
-from mars_lidar._base.notebook import as_html
+from mars_lidar._base.display import as_html
+from mars_lidar._base.imports import late
 from mars_lidar._base.types import FloatArray, IndexArray
 from mars_lidar.instrument.system import System
 from mars_lidar.light.tolerances import TOL

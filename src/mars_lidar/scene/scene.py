@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked, checked_with_masks, constructed_by_name
+from mars_lidar._base.display import as_html
 from mars_lidar._base.files import reading
-from mars_lidar._base.late import late
-from mars_lidar._base.notebook import as_html
+from mars_lidar._base.imports import late
 from mars_lidar._base.resample import area_mean, image_size, nearest, new_size, window
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System

@@ -26,18 +26,60 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.memory import check_memory
 from mars_lidar._base.native import _core
+from mars_lidar._base.resources import check_memory
 from mars_lidar._base.types import FloatArray, IndexArray
-from mars_lidar.instrument.detector import Mode
+from mars_lidar.instrument.detector import Mode, require_effects
 from mars_lidar.instrument.effects import LIGHT_EFFECTS
 from mars_lidar.instrument.pulse import SampledPulse
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux, check_photons
 from mars_lidar.light.stored_flux import StoredFlux
 from mars_lidar.statistics.budget import MOMENTS, advice
-from mars_lidar.statistics.gate import PLAIN, open_parts, require_mode
 from mars_lidar.statistics.tolerances import TOL
+
+# --- Detectors that a statistic treats -----------------------------------------------------------------------------
+# A gate that repeats every period makes a gated pixel a free-running one that detects the flux inside of the gate, so
+# that the exposure recursion holds for it with that flux: docs/theory_detectors.md.
+
+PLAIN: tuple[Mode, ...] = ("nonparalyzable",)
+_INSTEAD = {
+    "nonparalyzable": "",
+    "paralyzable": "; count_law, exposure_moments, mean_histogram and registration_pdf have its exact statistics",
+    "synchronous": "; count_law, mean_histogram and registration_pdf have its exact statistics",
+    "gated": "; count_law, exposure_moments, mean_histogram and registration_pdf have its exact statistics",
+}
+
+
+def require_mode(
+    what: str, system: System, modes: tuple[Mode, ...] = PLAIN, effects: tuple[str, ...] = LIGHT_EFFECTS
+) -> None:
+    """Raise ValueError, with an alternative, where `what` does not treat the mode or an effect of the detector."""
+    require_effects(what, system.detector, effects, _simulated)
+    mode = system.detector.mode
+    if mode not in modes:
+        allowed = " and ".join(map(repr, modes))
+        raise ValueError(
+            f"{what} is for detectors of mode {allowed}, got {mode!r}{_INSTEAD[mode]}; any mode can be simulated"
+        )
+    if system.detector.gate_moves:
+        raise ValueError(
+            f"{what} needs a gate that repeats every period, got gate_step_ns={system.detector.gate_step_ns:g}; "
+            "a moving gate can be simulated"
+        )
+
+
+def _simulated(effect: str) -> str:
+    able = "'sequential'" if effect == "crosstalk" else "'exact' or 'sequential'"
+    return f"; simulate it with engine {able}"
+
+
+def open_parts(system: System) -> tuple[tuple[float, float], ...]:
+    """Parts [low, high) of the period [0, 1), in order, in which a fixed gate is open."""
+    start, _, width = system.detector.gate_periods(system.period_ns)
+    end = start + width
+    return ((start, end),) if end <= 1.0 else ((0.0, end - 1.0), (start, 1.0))
+
 
 # --- Light on a grid ----------------------------------------------------------------------------------------------
 

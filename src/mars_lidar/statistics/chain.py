@@ -17,14 +17,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
-from mars_lidar._base.brief import brief
+from mars_lidar._base.display import brief
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
 from mars_lidar.instrument.tolerances import TOL
 from mars_lidar.light.flux import Flux
 from mars_lidar.light.tolerances import TOL as LIGHT
-from mars_lidar.statistics.cells import cell_name, one_pixel, photons_per_bin
-from mars_lidar.statistics.gate import require_mode
+from mars_lidar.statistics.cells import cell_name, one_pixel, photons_per_bin, require_mode
 from mars_lidar.statistics.phase_chain import ConvergenceError, Feedback, Solution, cyclic_recursion
 
 Rearm = Literal["centre", "edge"]

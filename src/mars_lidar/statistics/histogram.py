@@ -15,11 +15,10 @@ from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.statistics.budget import LAW
-from mars_lidar.statistics.cells import Cells, fine_histograms
+from mars_lidar.statistics.cells import PLAIN, Cells, fine_histograms
 from mars_lidar.statistics.chain import PhaseChain
 from mars_lidar.statistics.electronics import ELECTRONICS_MODES, moments, stationary_records
 from mars_lidar.statistics.exposure import normalised, refined_moments, stationary_histogram
-from mars_lidar.statistics.gate import PLAIN
 from mars_lidar.statistics.paralyzable import paralyzable_histograms
 from mars_lidar.statistics.synchronous import cumulants_of, first_arrivals, synchronous_windows
 from mars_lidar.statistics.timing import recorded

@@ -24,11 +24,10 @@ from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.brief import brief
 from mars_lidar._base.cached import cached_property
-from mars_lidar._base.memory import check_memory
+from mars_lidar._base.display import as_html, brief
 from mars_lidar._base.native import _core
-from mars_lidar._base.notebook import as_html
+from mars_lidar._base.resources import check_memory
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System

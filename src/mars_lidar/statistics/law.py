@@ -10,20 +10,19 @@ import numpy as np
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.cached import cached_property
-from mars_lidar._base.notebook import as_html
-from mars_lidar._base.threads import thread_count
+from mars_lidar._base.display import as_html
+from mars_lidar._base.resources import thread_count
 from mars_lidar._base.types import FloatArray, IndexArray
 from mars_lidar.instrument.detector import MODES
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.statistics.budget import LAW
-from mars_lidar.statistics.cells import Cells
+from mars_lidar.statistics.cells import PLAIN, Cells
 from mars_lidar.statistics.constant_light import renewal_moments
 from mars_lidar.statistics.count_pmf import Pmf, exact_windows, gaussian_window, poisson_window
 from mars_lidar.statistics.electronics import record_windows
 from mars_lidar.statistics.exposure import Exposure, refined_moments
-from mars_lidar.statistics.gate import PLAIN
 from mars_lidar.statistics.histogram import chain_of, histogram_effects, rearm_of
 from mars_lidar.statistics.histogram import registration_pdf as registration_pdf
 from mars_lidar.statistics.renewal import holding_times

@@ -14,13 +14,12 @@ import numpy as np
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.brief import brief
+from mars_lidar._base.display import brief
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
-from mars_lidar.statistics.cells import cell_name, default_bins, photons_per_bin
+from mars_lidar.statistics.cells import cell_name, default_bins, photons_per_bin, require_mode
 from mars_lidar.statistics.chain import PhaseChain, Rearm, Stationary, stationary_from
-from mars_lidar.statistics.gate import require_mode
 from mars_lidar.statistics.phase_chain import cyclic_recursion
 from mars_lidar.statistics.tolerances import TOL
 

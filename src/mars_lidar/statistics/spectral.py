@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.brief import brief
 from mars_lidar._base.cached import cached_property
+from mars_lidar._base.display import brief
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
+from mars_lidar.statistics.cells import require_mode
 from mars_lidar.statistics.chain import PhaseChain, Rearm
-from mars_lidar.statistics.gate import require_mode
 from mars_lidar.statistics.renewal import HoldingTimes, holding_times, lag_covariances, weighted_waits
 from mars_lidar.statistics.tolerances import TOL
 

@@ -17,7 +17,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests" / "explore"))
-from explorer_page import chromium  # noqa: E402
+from explorer_page import WAIT_MS, chromium  # noqa: E402
 
 fcntl = pytest.importorskip("fcntl", reason="the site is built on systems with POSIX locks")
 pytestmark = pytest.mark.full
@@ -94,6 +94,12 @@ def browser() -> Iterator[Any]:
         yield started
 
 
+def new_tab(browser: Any, **context: Any) -> Any:
+    tab = browser.new_page(**context)
+    tab.set_default_timeout(WAIT_MS)
+    return tab
+
+
 FACTS = """() => ({
   scroll: Math.max(...[document.documentElement, ...document.querySelectorAll(".bd-article-container")]
     .map((e) => e.scrollWidth - e.clientWidth)),
@@ -112,7 +118,7 @@ def weight(file: Path) -> int:
 def test_every_page_on_a_telephone(site: Path, browser: Any):
     """390 px wide: no sideways scroll, one first heading and no level left out, pictures described, nothing to complain
     about, below 1 MB but for pictures and the explorer, and nothing from another host."""
-    tab = browser.new_page(viewport={"width": 390, "height": 844})
+    tab = new_tab(browser, viewport={"width": 390, "height": 844})
     said: list[str] = []
     asked: list[str] = []
     tab.on("console", lambda message: said.append(message.text) if message.type == "error" else None)
@@ -154,7 +160,7 @@ def test_every_page_on_a_telephone(site: Path, browser: Any):
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_text_can_be_read(site: Path, browser: Any, scheme: str):
     """The contrast of all text of the pages without their API is that of WCAG AA."""
-    tab = browser.new_page(viewport={"width": 1400, "height": 900}, color_scheme=scheme, offline=True)
+    tab = new_tab(browser, viewport={"width": 1400, "height": 900}, color_scheme=scheme, offline=True)
     wrong = {}
     for name in pages_of(site):
         if not name.startswith(("api/", "copied/benchmarks")):
@@ -203,10 +209,10 @@ def test_equations_are_in_the_pages(site: Path):
 
 
 def test_a_search_finds_lessons_before_reports(site: Path, browser: Any):
-    tab = browser.new_page()
+    tab = new_tab(browser)
     for words, first in {"dead+time": "lessons/lesson_3", "pile-up": "lessons/lesson_2"}.items():
         tab.goto(f"{(site / 'search.html').as_uri()}?q={words}")
-        tab.wait_for_function("document.querySelectorAll('#search-results li a').length > 9", timeout=30_000)
+        tab.wait_for_function("document.querySelectorAll('#search-results li a').length > 9")
         links = tab.evaluate(
             "[...document.querySelectorAll('#search-results li a')].map((a) => a.getAttribute('href'))"
         )

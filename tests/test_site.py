@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import html
 import itertools
 import os
 import re
@@ -180,6 +181,22 @@ def test_each_page_has_a_title_of_its_own(site: Path):
         assert heading, name
         titles.setdefault(re.sub(r"<[^>]+>", "", heading[1]), []).append(name)
     assert not [names for names in titles.values() if len(names) > 1]
+
+
+@pytest.mark.parametrize("folder", ["lessons", "gallery"])
+def test_programs_print_what_their_texts_state(site: Path, folder: str):
+    """The site runs them, and shows what they print."""
+    programs = sorted(ROOT.glob(f"examples/{folder}/*_[0-9]*.py"))
+    assert programs
+    for program in programs:
+        page = (site / folder / f"{program.stem}.html").read_text(encoding="utf-8")
+        outputs = re.findall(r'"sphx-glr-script-out[^>]*>.*?<pre>(.*?)</pre>', page, re.DOTALL)
+        printed = html.unescape(re.sub(r"<[^>]+>", "", "".join(outputs))).splitlines()
+        prose = re.sub(r"\s*\n(?:# ?)?\s*", " ", program.read_text(encoding="utf-8"))
+        stated = re.findall(r"print(?:s|ed is) ``([^`]+)``", prose)
+        assert stated[-1] == printed[-1], program.name
+        assert set(stated) <= set(printed), program.name
+        assert all(re.search(r"\d|True", line) for line in stated), program.name
 
 
 def test_commands_can_be_copied(site: Path):

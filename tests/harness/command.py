@@ -65,7 +65,7 @@ def listen_to_ctrl_c() -> None:
 
 
 def stopped(process: subprocess.Popen[str], how: signal.Signals) -> tuple[str, float]:
-    """Stop a process by a signal: what it printed from then on, and the seconds of a processor that it took until its end.
+    """Stop a process by a signal: what it printed, and the seconds of a processor that it took from then to its end.
 
     Other work on the machine lengthens the time by a clock, and not that of a processor.
     """

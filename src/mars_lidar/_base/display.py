@@ -71,3 +71,11 @@ def as_html(thing: object, panels: Mapping[str, Any]) -> str:
 def _has_values(values: Any) -> bool:
     parts = values if isinstance(values, tuple) else (values,)
     return all(np.ndim(part) > 0 and np.size(part) and np.isfinite(part).any() for part in parts)
+
+
+def measured(value: float, error: float) -> str:
+    """A value and its standard error, to two digits of the error; the value alone where it has none, "-" for NaN."""
+    if not 0.0 < error < np.inf:
+        return "-" if np.isnan(value) else f"{value:.4g}"
+    decimals = int(np.clip(1 - np.floor(np.log10(error)), 0, 15))
+    return f"{value:.{decimals}f} ± {error:.{decimals}f}"

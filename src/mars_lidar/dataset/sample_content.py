@@ -13,7 +13,8 @@ from mars_lidar._base.types import FloatArray
 from mars_lidar.dataset.light import Light
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
-from mars_lidar.light.fog import PARTS_PER_BIN, Fog
+from mars_lidar.light.fog import Fog
+from mars_lidar.light.tolerances import TOL
 from mars_lidar.light.transient import Transient, parts_of
 from mars_lidar.scene.layers import LayeredScene
 from mars_lidar.scene.scene import Scene
@@ -60,7 +61,7 @@ class Surfaces:
 
     def waveform_parts(self, system: System) -> int:
         """Parts of the period in its waveforms; 0 where returns are enough."""
-        return 0 if self.fog is None else PARTS_PER_BIN * system.bins
+        return 0 if self.fog is None else TOL.parts_per_bin * system.bins
 
     def flux(
         self, system: System, light: Light, signal: float, sbr: float, dark: float | None = None, *, tell: bool = False

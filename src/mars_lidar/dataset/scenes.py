@@ -37,8 +37,9 @@ from mars_lidar.io.layout import Variable
 from mars_lidar.io.store import OnDisk
 from mars_lidar.io.zarr_store import add, blosc
 from mars_lidar.light.fog import Fog
+from mars_lidar.light.tolerances import TOL
 from mars_lidar.light.transient import Rows, Transient
-from mars_lidar.scene.layers import MOST, LayeredScene
+from mars_lidar.scene.layers import LayeredScene
 from mars_lidar.scene.scene import Scene
 
 _DOUBLE = np.dtype(np.float64)
@@ -172,7 +173,7 @@ class SceneWriter:
 
     def _write_layers(self, number: int, scene: Surfaces) -> None:
         if _LAYERS[0] not in self._arrays:
-            shape = (self._most, MOST - 1, *scene.shape)
+            shape = (self._most, TOL.returns - 1, *scene.shape)
             for name, unit in zip(_LAYERS, ("m", "1"), strict=True):
                 self._arrays[name] = self._maps(name, shape, ("scene", "layer", "y", "x"), unit)
         others = scene.layers[1:]

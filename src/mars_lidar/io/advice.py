@@ -6,7 +6,8 @@ import math
 import time
 from dataclasses import dataclass
 
-from mars_lidar._base.progress import LONG_S, span
+from mars_lidar._base.progress import span
+from mars_lidar._base.tolerances import TOL
 from mars_lidar.engines import ENGINES, Engine, EngineOptions, check_detector, find_engine
 from mars_lidar.engines.feedback import expected_registrations
 from mars_lidar.instrument.system import System
@@ -32,7 +33,7 @@ class Advice:
 
     def __str__(self) -> str:
         """One line, empty for a run that is not long."""
-        if self.seconds < LONG_S:
+        if self.seconds < TOL.long_s:
             return ""
         faster = f"; --engine auto: about {span(self.auto_s)}, same law" if self.auto_s * _WORTH < self.seconds else ""
         return f"about {span(self.seconds)} on this machine{faster}"
@@ -61,7 +62,7 @@ def advice(
     if events * _SHORT_S < 1.0 and not by_pixel:
         return Advice(0.0)
     seconds = realizations * _measured(flux, system, drawn_by, threads)
-    if seconds < LONG_S or drawn_by.name != "exact":
+    if seconds < TOL.long_s or drawn_by.name != "exact":
         return Advice(seconds)
     auto = ENGINES["auto"]
     try:

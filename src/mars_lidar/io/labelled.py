@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mars_lidar._base.arguments import checked_with_masks
-from mars_lidar._base.optional import needed
+from mars_lidar._base.imports import needed
 from mars_lidar.instrument.system import System
 from mars_lidar.io import layout
 from mars_lidar.io.cube import Cube

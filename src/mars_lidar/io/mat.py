@@ -33,7 +33,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import mat5
 from mars_lidar._base.files import FileError, beside, read_mat5
-from mars_lidar._base.memory import check_memory
+from mars_lidar._base.resources import check_memory
 from mars_lidar._base.sparse import is_sparse
 from mars_lidar.instrument.system import System
 from mars_lidar.io import layout

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mars_lidar._base import manifest
 from mars_lidar._base.files import FileError
-from mars_lidar._base.optional import MissingLibraryError, needed
+from mars_lidar._base.imports import MissingLibraryError, needed
 from mars_lidar.io import layout
 from mars_lidar.io.store import OnDisk, OpenedStore
 

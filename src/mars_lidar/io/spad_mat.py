@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.files import check_target, reading
-from mars_lidar._base.memory import check_memory
+from mars_lidar._base.resources import check_memory
 from mars_lidar._base.sparse import dense_counts, is_sparse
 from mars_lidar.io import mat
 from mars_lidar.io.cube import Cube, copy_counts, one_exposure

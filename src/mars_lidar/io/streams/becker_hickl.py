@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mars_lidar._base.optional import needed
+from mars_lidar._base.imports import needed
 from mars_lidar.io.streams.photons import Photons
 
 _SYNC = 1  # SP_MST_CLK: the macro clock is the laser's sync; 0: one of its own, others: the sync divided

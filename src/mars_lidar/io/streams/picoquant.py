@@ -11,7 +11,7 @@ import struct
 from pathlib import Path
 from typing import Any
 
-from mars_lidar._base.optional import needed
+from mars_lidar._base.imports import needed
 
 SUFFIXES = (".pt2", ".pt3", ".ht2", ".ht3")
 _HYDRA_INPUTS, _HYDRA_INPUT_BYTES = 664, 20

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.files import UnchangedFile, beside
-from mars_lidar._base.memory import check_memory
-from mars_lidar._base.optional import needed
+from mars_lidar._base.imports import needed
+from mars_lidar._base.resources import check_memory
 from mars_lidar.io import layout
 from mars_lidar.io.recipe import Recipe
 from mars_lidar.io.store import LazyCounts, OnDisk, OpenedStore, Writer

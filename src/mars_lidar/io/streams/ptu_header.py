@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.files import open_npz, reading
-from mars_lidar._base.optional import needed
+from mars_lidar._base.imports import needed
 from mars_lidar._version import __version__
 from mars_lidar.io.streams import picoquant
 

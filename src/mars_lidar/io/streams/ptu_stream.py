@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.files import IncompleteFileError
-from mars_lidar._base.optional import needed
+from mars_lidar._base.imports import needed
 from mars_lidar.io.streams import ptu_header
 from mars_lidar.io.streams.photons import Photons, attributes, fine_times, of_fine_times
 from mars_lidar.light.timestamps import Timestamps

@@ -16,7 +16,7 @@ import mars_lidar as ml
 from mars_lidar import io
 from mars_lidar._base import progress as bars
 from mars_lidar.cli.simulate import each_ns
-from mars_lidar.io.advice import advice
+from mars_lidar.io.simulated_file import _Probe, advice
 from studies.compare.comparison import compare
 from tests.harness.command import command_line
 
@@ -229,8 +229,8 @@ def test_the_time_told_is_about_the_time_taken():
 
 def test_commands_say_how_long_they_take(tmp_path, monkeypatch):
     monkeypatch.setattr("mars_lidar._base.progress.LONG_S", 1e-9)
-    monkeypatch.setattr("mars_lidar.io.advice.LONG_S", 1e-9)
-    monkeypatch.setattr("mars_lidar.io.advice._SHORT_S", 1.0)
+    monkeypatch.setattr("mars_lidar.io.simulated_file.LONG_S", 1e-9)
+    monkeypatch.setattr("mars_lidar.io.simulated_file._PROBE", _Probe(event_s=1.0))
     small = ["--size", "8", "--cycles", "50", "--bins", "64"]
     words = "on this machine"
     done = run("simulate", "--scene", "room", *small, "--no-picture", "-o", tmp_path / "a.zarr")

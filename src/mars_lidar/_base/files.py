@@ -116,6 +116,12 @@ def beside(target: Path, *, folder: bool = False) -> Iterator[Path]:
             os.replace(path, target)
 
 
+def write_text(target: Path, text: str) -> None:
+    """Write a file of text, whole or not at all; one at `target` is replaced."""
+    with beside(target) as unfinished:
+        unfinished.write_text(text, encoding="utf-8")
+
+
 def _remove_leftovers(target: Path) -> None:
     """Remove what killed runs left beside `target`: a run that is alive holds a lock."""
     for leftover in unfinished_of(target):

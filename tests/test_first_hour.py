@@ -220,7 +220,7 @@ def test_a_long_run_is_told_before_with_what_is_faster():
 
 def test_the_time_told_is_about_the_time_taken(monkeypatch):
     """By the time of a processor, which other work on the machine does not change."""
-    monkeypatch.setattr("mars_lidar.io.advice.time.perf_counter", time.process_time)
+    monkeypatch.setattr("mars_lidar.io.simulated_file.time.perf_counter", time.process_time)
     system = SYSTEM.replace(cycles=40_000)
     flux = ml.Scene.example("room", size=48).flux(system, signal=1.0, sbr=1.0)
     began = time.process_time()

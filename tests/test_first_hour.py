@@ -15,6 +15,7 @@ from PIL import Image
 import mars_lidar as ml
 from mars_lidar import io
 from mars_lidar._base import progress as bars
+from mars_lidar._base.tolerances import TOL
 from mars_lidar.cli.simulate import each_ns
 from mars_lidar.io.simulated_file import _Probe, advice
 from studies.compare.comparison import compare
@@ -230,8 +231,7 @@ def test_the_time_told_is_about_the_time_taken(monkeypatch):
 
 
 def test_commands_say_how_long_they_take(tmp_path, monkeypatch):
-    monkeypatch.setattr("mars_lidar._base.progress.LONG_S", 1e-9)
-    monkeypatch.setattr("mars_lidar.io.simulated_file.LONG_S", 1e-9)
+    monkeypatch.setitem(vars(TOL), "long_s", 1e-9)
     monkeypatch.setattr("mars_lidar.io.simulated_file._PROBE", _Probe(event_s=1.0))
     small = ["--size", "8", "--cycles", "50", "--bins", "64"]
     words = "on this machine"

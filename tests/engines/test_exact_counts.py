@@ -13,7 +13,8 @@ from mars_lidar.engines import MarsEngine
 from mars_lidar.engines.counts import Matched, Mended, Streams, Tabulated
 from mars_lidar.engines.synthesis import Run
 from mars_lidar.engines.table_reader import Entries
-from mars_lidar.statistics.distance import Pmf, total_variation
+from mars_lidar.statistics.count_pmf import Pmf, total_variation
+from mars_lidar.statistics.tolerances import TOL
 from mars_lidar.table import Table
 
 AIM = 0.002
@@ -162,13 +163,12 @@ def test_usual_pixels_are_drawn_as_before():
 def test_parts_batches_and_threads_do_not_show(monkeypatch: pytest.MonkeyPatch):
     from mars_lidar.engines import count_shape as _count_shape
     from mars_lidar.engines import synthesis as _synthesis
-    from mars_lidar.statistics import count_pmf as _pmf
 
     flux = doubted(pixels=160)
     whole = ml.simulate(flux, SYSTEM, engine="mars", table=table(), realizations=3, threads=2)
     monkeypatch.setattr(_synthesis, "_BATCH", 4)
     monkeypatch.setattr(_count_shape, "PIXELS", 11)
-    monkeypatch.setattr(_pmf, "_BLOCK", 3)
+    monkeypatch.setitem(vars(TOL), "block", 3)
     assert np.array_equal(whole, ml.simulate(flux, SYSTEM, engine="mars", table=table(), realizations=3, threads=1))
     index = np.arange(flux.signal.size).reshape(1, -1)[:, 7:20]
     part = ml.simulate(flux[:, 7:20], SYSTEM, engine="mars", table=table(), realizations=3, pixel_index=index)

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
 
 from mars_lidar._base import checks
 from mars_lidar._base.files import write_text
 from mars_lidar.cli.console import refuse_existing, table
-from mars_lidar.cli.options import Text, argument, command, option, out_option
+from mars_lidar.cli.options import OutPath, Text, command
 from mars_lidar.cli.system_options import DEFAULT_SYSTEM
 from mars_lidar.instrument.effects import FIELDS
 from mars_lidar.instrument.presets import INSTRUMENTS, PRESETS, sourced
@@ -85,19 +84,26 @@ def of_instrument(name: str) -> str:
 
 
 def schema(
-    file: Annotated[
-        Text,
-        argument("Which file it describes: scene, recipe or system.", "recipe", choices=("scene", "recipe", "system")),
-    ] = "recipe",
+    file: Text = "recipe",
     /,
     *,
-    out: Annotated[Path | None, out_option("A .json file, else standard output.", option)] = None,
+    out: OutPath | None = None,
 ) -> None:
     """Write the JSON Schema of scene, recipe or system files, for editors.
 
     With it an editor completes and checks keys.
 
     In the first line of the YAML file:  # yaml-language-server: $schema=recipe.json
+
+    Arguments
+    ---------
+    file : {scene, recipe, system}
+        Which file it describes: scene, recipe or system. [default: recipe]
+
+    Options
+    -------
+    out
+        A .json file, else standard output.
     """
     from mars_lidar.dataset.recipe import json_schema
 
@@ -110,18 +116,32 @@ def schema(
 
 
 def init(
-    file: Annotated[Path, argument("Where to write it: .yaml or .yml.", "system.yaml")] = _FILE,
+    file: Path = _FILE,
     /,
     *,
-    out: Annotated[Path | None, out_option("Another way to give FILE.", option)] = None,
-    preset: Annotated[Text | None, option(f"An instrument: {', '.join(PRESETS)}.")] = None,
-    overwrite: Annotated[bool, option("Replace an existing file.")] = False,
+    out: OutPath | None = None,
+    preset: Text | None = None,
+    overwrite: bool = False,
 ) -> None:
     """Write a commented system file to start from.
 
     The YAML file describes laser, detector and histogram.
 
     Edit it and pass it on:  mars-lidar simulate --scene room --system system.yaml -o room.zarr
+
+    Arguments
+    ---------
+    file
+        Where to write it: .yaml or .yml. [default: system.yaml]
+
+    Options
+    -------
+    out
+        Another way to give FILE.
+    preset
+        An instrument: $presets.
+    overwrite
+        Replace an existing file.
     """
     if out is not None:
         if file != _FILE and file != out:

@@ -24,7 +24,7 @@ from functools import partial
 from typing import Any
 
 from mars_lidar._base.buckets import in_bucket
-from mars_lidar._base.optional import needed
+from mars_lidar._base.imports import needed
 from mars_lidar._version import __version__
 from mars_lidar.dataset.store import Dataset, Item, open_dataset
 from mars_lidar.dataset.write import Failed, Made, Maker, fingerprint

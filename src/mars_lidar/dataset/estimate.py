@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.buckets import url_of
-from mars_lidar._base.threads import thread_count
+from mars_lidar._base.resources import thread_count
 from mars_lidar.dataset.arrays import MAPS, count_samples, grid, histogram_blocks, sample_parts
 from mars_lidar.dataset.recipe import DatasetRecipe
 from mars_lidar.dataset.run import BUFFER_BYTES, making_bytes, read_recipe

@@ -30,7 +30,7 @@ from mars_lidar._base.files import (
     successor,
 )
 from mars_lidar._base.progress import callback_of
-from mars_lidar._base.threads import thread_count
+from mars_lidar._base.resources import thread_count
 from mars_lidar._base.types import Progress
 from mars_lidar._version import __version__
 from mars_lidar.dataset import cluster

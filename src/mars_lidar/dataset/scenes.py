@@ -40,9 +40,10 @@ from mars_lidar.io.layout import Variable
 from mars_lidar.io.store import OnDisk
 from mars_lidar.io.zarr_store import add, blosc
 from mars_lidar.light.flux import Flux
-from mars_lidar.light.fog import PARTS_PER_BIN, Fog
+from mars_lidar.light.fog import Fog
+from mars_lidar.light.tolerances import TOL
 from mars_lidar.light.transient import Rows, Transient, parts_of
-from mars_lidar.scene.layers import MOST, LayeredScene
+from mars_lidar.scene.layers import LayeredScene
 from mars_lidar.scene.scene import Scene
 
 
@@ -87,7 +88,7 @@ class Surfaces:
 
     def waveform_parts(self, system: System) -> int:
         """Parts of the period in its waveforms; 0 where returns are enough."""
-        return 0 if self.fog is None else PARTS_PER_BIN * system.bins
+        return 0 if self.fog is None else TOL.parts_per_bin * system.bins
 
     def flux(
         self, system: System, light: Light, signal: float, sbr: float, dark: float | None = None, *, tell: bool = False
@@ -292,7 +293,7 @@ class SceneWriter:
 
     def _write_layers(self, number: int, scene: Surfaces) -> None:
         if _LAYERS[0] not in self._arrays:
-            shape = (self._most, MOST - 1, *scene.shape)
+            shape = (self._most, TOL.returns - 1, *scene.shape)
             for name, unit in zip(_LAYERS, ("m", "1"), strict=True):
                 self._arrays[name] = self._maps(name, shape, ("scene", "layer", "y", "x"), unit)
         others = scene.layers[1:]

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.cached import cached_property
-from mars_lidar._base.memory import check_memory
+from mars_lidar._base.resources import check_memory
 from mars_lidar._base.types import Progress
 from mars_lidar.instrument.detector import MODES, Detector, Mode
 from mars_lidar.instrument.effects import (
@@ -24,7 +24,7 @@ from mars_lidar.instrument.effects import (
 )
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
-from mars_lidar.light.records import record_bins, record_times
+from mars_lidar.light.timestamps import record_bins, record_times
 
 if TYPE_CHECKING:
     from mars_lidar._base.native import _core

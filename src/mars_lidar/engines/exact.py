@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar._base.memory import available_bytes, check_memory
 from mars_lidar._base.native import _core
+from mars_lidar._base.resources import available_bytes, check_memory
 from mars_lidar.engines.engine import IN_PARTS, Engine, PhaseRecords, Records, Task, check_start
 from mars_lidar.instrument.detector import MODES
 from mars_lidar.instrument.effects import EFFECTS

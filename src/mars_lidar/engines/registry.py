@@ -14,7 +14,8 @@ from mars_lidar.engines.poisson import PoissonEngine
 from mars_lidar.engines.renewal import RenewalEngine
 from mars_lidar.engines.sequential import SequentialEngine
 from mars_lidar.instrument.detector import require_effects
-from mars_lidar.instrument.system import MAX_CYCLES, System
+from mars_lidar.instrument.system import System
+from mars_lidar.instrument.tolerances import TOL
 
 ENGINES: dict[str, Engine] = {
     engine.name: engine
@@ -34,8 +35,8 @@ ANY_SYSTEM = tuple(name for name, engine in ENGINES.items() if engine.any_system
 
 def check_detector(engine: Engine, system: System) -> None:
     """Raise ValueError, naming the engines to use, where `engine` does not do the detector's mode or effects."""
-    if system.cycles > MAX_CYCLES:
-        raise ValueError(f"cycles must be an integer in [1, {MAX_CYCLES}] to be simulated, got {system.cycles}")
+    if system.cycles > TOL.cycles:
+        raise ValueError(f"cycles must be an integer in [1, {TOL.cycles}] to be simulated, got {system.cycles}")
     mode = system.detector.mode
     if mode not in engine.modes:
         able = " or ".join(repr(name) for name, each in ENGINES.items() if mode in each.modes)

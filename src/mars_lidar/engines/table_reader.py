@@ -294,7 +294,7 @@ def image_table(
     without one, fewer than `FEWEST` distinct pixels. What lies beyond it (S = 0 or B = 0) is evaluated: give
     ``outside="exact"``.
     """
-    from mars_lidar.statistics.gate import require_mode
+    from mars_lidar.statistics.cells import require_mode
     from mars_lidar.table import Table
 
     try:

@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked, checked_with_masks
-from mars_lidar._base.brief import brief
 from mars_lidar._base.buckets import url_of
+from mars_lidar._base.display import as_html, brief
 from mars_lidar._base.files import (
     INCOMPLETE_SUFFIX,
     FileError,
@@ -25,10 +25,8 @@ from mars_lidar._base.files import (
     reading,
     unfinished_of,
 )
-from mars_lidar._base.late import late
-from mars_lidar._base.memory import check_memory
-from mars_lidar._base.notebook import as_html
-from mars_lidar._base.optional import needed
+from mars_lidar._base.imports import late, needed
+from mars_lidar._base.resources import check_memory
 from mars_lidar.instrument.system import System
 from mars_lidar.io import layout
 from mars_lidar.io.recipe import Recipe, Recording

@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 
 from mars_lidar._base import mat5
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.files import NpyFile, check_claim, npy_header, open_npz, read_npy, reading, whole
+from mars_lidar._base.files import NpyFile, check_claim, npy_header, open_npz, read_column, read_npy, reading, whole
 from mars_lidar._base.hdf5 import CELLS, open_hdf5
 from mars_lidar._base.sparse import check_sparse, dense_bytes, is_sparse
-from mars_lidar._base.text import read_column
 from mars_lidar.instrument.system import System
 from mars_lidar.io.cube import Cube
 from mars_lidar.io.measured import from_histograms, from_photon_times, in_order

@@ -35,7 +35,7 @@ from numpy.typing import ArrayLike, NDArray
 from mars_lidar._base import mat5
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.files import FileError, beside, check_target, read_mat5, reading
-from mars_lidar._base.memory import check_memory
+from mars_lidar._base.resources import check_memory
 from mars_lidar._base.sparse import dense_counts, is_sparse
 from mars_lidar.instrument.system import System
 from mars_lidar.io import layout

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked, checked_with_masks
-from mars_lidar._base.memory import check_memory
+from mars_lidar._base.resources import check_memory
 from mars_lidar._base.sparse import dense_bytes, dense_counts, is_sparse
 from mars_lidar.instrument.system import System
 from mars_lidar.io.cube import Cube

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.files import FileError, UnchangedFile, beside, npy_header, open_npz
-from mars_lidar._base.memory import check_memory
+from mars_lidar._base.resources import check_memory
 from mars_lidar.io import layout
 from mars_lidar.io.recipe import BLOCK_BYTES, Recipe, Recording
 from mars_lidar.io.store import LazyCounts, OnDisk, OpenedStore, Writer

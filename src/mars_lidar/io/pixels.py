@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.files import FileError, check_claim, check_source, read_npy, reading
-from mars_lidar._base.optional import needed
+from mars_lidar._base.imports import needed
 from mars_lidar._base.types import FloatArray
 
 if TYPE_CHECKING:

@@ -14,7 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import manifest
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.progress import LONG_S, callback_of, of_part, span
+from mars_lidar._base.progress import callback_of, of_part, span
+from mars_lidar._base.tolerances import TOL
 from mars_lidar._base.types import Progress
 from mars_lidar.engines import ENGINES, Engine, EngineOptions, check_detector, find_engine
 from mars_lidar.engines.engine import given
@@ -404,7 +405,7 @@ class Advice:
 
     def __str__(self) -> str:
         """One line, empty for a run that is not long."""
-        if self.seconds < LONG_S:
+        if self.seconds < TOL.long_s:
             return ""
         faster = (
             f"; --engine auto: about {span(self.auto_s)}, same law" if self.auto_s * _PROBE.worth < self.seconds else ""
@@ -435,7 +436,7 @@ def advice(
     if events * _PROBE.event_s < 1.0 and not by_pixel:
         return Advice(0.0)
     seconds = realizations * _measured(flux, system, drawn_by, threads)
-    if seconds < LONG_S or drawn_by.name != "exact":
+    if seconds < TOL.long_s or drawn_by.name != "exact":
         return Advice(seconds)
     auto = ENGINES["auto"]
     try:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.files import FileError, reading, whole
-from mars_lidar._base.memory import check_memory
+from mars_lidar._base.resources import check_memory
 from mars_lidar.light.transient import RateArray
 
 

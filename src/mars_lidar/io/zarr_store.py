@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from mars_lidar._base import manifest
 from mars_lidar._base.files import FileError, alone, beside, exchange, successor, telling
-from mars_lidar._base.optional import MissingLibraryError, needed
+from mars_lidar._base.imports import MissingLibraryError, needed
 from mars_lidar.io import layout
 from mars_lidar.io.recipe import Recipe, Recording
 from mars_lidar.io.store import OnDisk, OpenedStore, Writer

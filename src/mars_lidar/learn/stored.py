@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from mars_lidar._base import checks
 from mars_lidar._base.buckets import in_bucket
 from mars_lidar._base.files import FileError
-from mars_lidar._base.memory import check_memory
 from mars_lidar._base.native import _core
+from mars_lidar._base.resources import check_memory
 from mars_lidar.dataset.arrays import MAPS, sample_parts
 from mars_lidar.dataset.store import Block, Dataset, open_dataset, read_block
 from mars_lidar.learn.needed import torch

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar._base.files import open_npz
-from mars_lidar._base.text import read_column
+from mars_lidar._base.files import open_npz, read_column
 from mars_lidar.io.named_arrays import mat_arrays
 from mars_lidar.io.streams.photons import NoLaserError, Photons, of_pixels
 from mars_lidar.light.timestamps import Timestamps

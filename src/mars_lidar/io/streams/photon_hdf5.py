@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from mars_lidar._base.files import finished_name, whole
 from mars_lidar._base.hdf5 import open_hdf5, seal
-from mars_lidar._base.optional import needed
+from mars_lidar._base.imports import needed
 from mars_lidar.io.streams.photons import Photons, attributes, fine_times, of_fine_times
 from mars_lidar.light.timestamps import Timestamps
 

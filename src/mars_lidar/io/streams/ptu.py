@@ -36,8 +36,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.files import IncompleteFileError, UnchangedFile, beside, open_npz, reading
-from mars_lidar._base.memory import check_memory
-from mars_lidar._base.optional import needed
+from mars_lidar._base.imports import needed
+from mars_lidar._base.resources import check_memory
 from mars_lidar._version import __version__
 from mars_lidar.io import layout
 from mars_lidar.io.recipe import Recipe

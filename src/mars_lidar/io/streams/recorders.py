@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.files import check_claim, reading
-from mars_lidar._base.optional import needed
+from mars_lidar._base.imports import needed
 from mars_lidar.io.streams import files, ptu
 from mars_lidar.io.streams.photons import BEFORE_PTU, Photons
 

@@ -278,6 +278,12 @@ def _show_pixel(results: dict[str, Reconstruction]) -> None:
                 depth = words(light.depth_m, light.depth_error_m, place)
                 rows.add_row(name, str(at[0]), depth, words(light.signal, light.signal_error, place), background, fit)
     screen().print(rows)
+    for name, result in results.items():
+        if result.misfits > 0.0:  # NaN without p-values
+            say(
+                f"warning: {name}: the histogram does not fit the estimate: dead time or pulse may be wrong, or there "
+                "is another return, a drift or an effect of the detector; mars-lidar calibrate CUBE finds the value"
+            )
 
 
 def _save_cloud(path: Path, results: dict[str, Reconstruction], focal_px: float, overwrite: bool) -> int:

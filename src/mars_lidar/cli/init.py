@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 from mars_lidar._base import checks
+from mars_lidar._base.files import write_text
 from mars_lidar.cli.console import refuse_existing, table
 from mars_lidar.cli.options import OutPath, Text, command
 from mars_lidar.cli.system_options import DEFAULT_SYSTEM
@@ -104,13 +105,13 @@ def schema(
     out
         A .json file, else standard output.
     """
-    from mars_lidar.dataset.schema import json_schema
+    from mars_lidar.dataset.recipe import json_schema
 
     text = json.dumps(json_schema(file), indent=1, ensure_ascii=False) + "\n"
     if out is None:
         print(text, end="")
         return
-    out.write_text(text, encoding="utf-8")
+    write_text(out, text)
     table([("wrote", str(out))])
 
 
@@ -149,7 +150,7 @@ def init(
     if file.suffix not in (".yaml", ".yml"):
         raise ValueError(f"FILE must end in .yaml or .yml, got {str(file)!r}")
     refuse_existing(file, overwrite)
-    file.write_text(commented(file) if preset is None else of_instrument(preset))
+    write_text(file, commented(file) if preset is None else of_instrument(preset))
     table([("wrote", str(file))])
 
 

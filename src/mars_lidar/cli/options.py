@@ -21,7 +21,7 @@ from mars_lidar.instrument.effects import FIELDS
 from mars_lidar.instrument.presets import PRESETS
 
 if TYPE_CHECKING:
-    from mars_lidar.dataset.view import View
+    from mars_lidar.dataset.sources import View
     from mars_lidar.instrument.system import System
 
 
@@ -254,7 +254,7 @@ class LightOptions:
     ambient: Text | None = None
 
 
-# Options by the kind of scene. Without the kind they are the keys of `mars_lidar.dataset.scene_entries`.
+# Options by the kind of scene. Without the kind they are the keys of `mars_lidar.dataset.recipe`.
 SCENE_KINDS = {
     "scene": ("size", "scene_seed"),
     "depth": ("size", "image", "depth_unit_m", "focal_px", "index", "max_depth_m"),
@@ -264,7 +264,7 @@ SCENE_KINDS = {
 
 def read_scene(scene: SceneOptions, light: LightOptions, system: System, *, in_parts: bool = False) -> View:
     """The scene and light of these options under `system`; with `in_parts`, a transient is read in bands on use."""
-    from mars_lidar.dataset.view import read_view
+    from mars_lidar.dataset.sources import read_view
 
     kinds = [name for name in SCENE_KINDS if getattr(scene, name) is not None]
     if len(kinds) != 1:

@@ -210,7 +210,7 @@ def say_time(
     flux: Flux, system: System, engine: str, realizations: int, threads: int | None, options: EngineOptions
 ) -> None:
     """Say how long a long run will take, and what is faster."""
-    from mars_lidar.io.advice import advice
+    from mars_lidar.io.simulated_file import advice
 
     text = str(advice(flux, system, engine, realizations=realizations, threads=threads, options=options))
     if text:

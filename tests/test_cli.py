@@ -18,7 +18,7 @@ import xarray
 import mars_lidar as ml
 from mars_lidar import io
 from mars_lidar.cli.system_options import DEFAULT_SYSTEM
-from tests.harness.command import command_line
+from tests.harness.command import command_line, listen_to_ctrl_c, stopped
 
 SMALL = ["--size", "12", "--cycles", "50", "--bins", "64"]
 
@@ -30,11 +30,6 @@ def run(*arguments: object):
 def command(*arguments: object) -> list[str]:
     code = "import sys; sys.argv[0] = 'mars-lidar'; from mars_lidar.cli import main; sys.exit(main())"
     return [sys.executable, "-c", code, *(str(a) for a in arguments)]
-
-
-def listen_to_ctrl_c() -> None:
-    """In a child: shells start background processes, and so whole test runs, with Ctrl-C ignored."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def test_one_command_writes_a_cube_and_a_picture(tmp_path):
@@ -375,11 +370,9 @@ def test_a_stopped_run_is_left_incomplete(tmp_path, how):
     )
     _wait_for(out / "histogram" / "zarr.json")
     time.sleep(0.3)
-    stopped = time.monotonic()
-    process.send_signal(how)
-    _, told = process.communicate(timeout=30)
+    told, seconds = stopped(process, how)
     if how == signal.SIGINT:
-        assert time.monotonic() - stopped < 5.0  # promised within a second; test machines are busy
+        assert seconds < 2.0  # of two threads: promised within a second
         assert process.returncode == 130
         assert f"mars-lidar: interrupted; {out} stays, marked incomplete: --resume" in told
     else:
@@ -391,7 +384,7 @@ def test_a_stopped_run_is_left_incomplete(tmp_path, how):
 
 
 def _wait_for(path: Path) -> None:
-    end = time.monotonic() + 30.0
+    end = time.monotonic() + 300.0
     while not path.exists():
         assert time.monotonic() < end, f"{path} did not appear"
         time.sleep(0.05)

@@ -218,13 +218,15 @@ def test_a_long_run_is_told_before_with_what_is_faster():
     assert "auto" not in str(advice(flux, gated))  # which cannot do it
 
 
-def test_the_time_told_is_about_the_time_taken():
+def test_the_time_told_is_about_the_time_taken(monkeypatch):
+    """By the time of a processor, which other work on the machine does not change."""
+    monkeypatch.setattr("mars_lidar.io.advice.time.perf_counter", time.process_time)
     system = SYSTEM.replace(cycles=40_000)
     flux = ml.Scene.example("room", size=48).flux(system, signal=1.0, sbr=1.0)
-    began = time.perf_counter()
-    ml.simulate(flux, system, realizations=4)
-    spent = time.perf_counter() - began
-    assert spent / 6 < advice(flux, system, realizations=4).seconds < 6 * spent  # other work on the machine included
+    began = time.process_time()
+    ml.simulate(flux, system, realizations=4, threads=1)
+    spent = time.process_time() - began
+    assert spent / 2 < advice(flux, system, realizations=4, threads=1).seconds < 2 * spent
 
 
 def test_commands_say_how_long_they_take(tmp_path, monkeypatch):

@@ -87,6 +87,7 @@ async function begin() {
     const key = told ? state.method + state.image : PICTURE_KEYS.map((name) => state[name]).join();
     if (key !== painted && !figureAlone) {
       painted = key;
+      lastPicture = {}; // the picture that still stands is that of the state before
       clearTimeout(timer);
       painter.stop();
       timer = setTimeout(paint, PAUSE_MS);
@@ -103,7 +104,7 @@ async function begin() {
 
   async function paint() {
     const mine = painted, current = state, range = (SPEED_OF_LIGHT / 2) * current.period;
-    const found = lastPicture = {};
+    const found = lastPicture;
     const tell = (share) => { if (mine === painted) at("progress").textContent = share < 1 ? `${Math.round(100 * share)} %` : ""; };
     try {
       await source.picture(current, painter, networks, tell, (some) => {

@@ -1,4 +1,4 @@
-"""Short ``repr`` of public objects, which fits on a screen."""
+"""Short ``repr`` of public objects, which fits on a screen, and numbers with their errors."""
 
 from __future__ import annotations
 
@@ -39,3 +39,11 @@ def _value_text(value: Any) -> str:
         return f"<{type(value).__name__} of {len(value)}>"
     text = repr(value)
     return text if len(text) <= _MOST_TEXT else f"{type(value).__name__}(...)"
+
+
+def measured(value: float, error: float) -> str:
+    """A value and its standard error, to two digits of the error; the value alone where it has none, "-" for NaN."""
+    if not 0.0 < error < np.inf:
+        return "-" if np.isnan(value) else f"{value:.4g}"
+    decimals = int(np.clip(1 - np.floor(np.log10(error)), 0, 15))
+    return f"{value:.{decimals}f} ± {error:.{decimals}f}"

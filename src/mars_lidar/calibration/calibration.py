@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.brief import brief
+from mars_lidar._base.brief import brief, measured
 from mars_lidar._base.threads import one_blas_thread
 from mars_lidar._base.types import FloatArray
 from mars_lidar.calibration import start, suspects
@@ -69,8 +69,7 @@ class Estimate:
             return f"{self.value:.6g} ({self.note or 'given'})"
         if self.note:
             return f"{self.value:.4g} (95 %: {self.low:.3g} to {self.high:.3g}), {self.note}"
-        decimals = int(np.clip(1 - np.floor(np.log10(self.error)), 0, 15)) if np.isfinite(self.error) else 6
-        return f"{self.value:.{decimals}f} ± {self.error:.{decimals}f}"
+        return measured(self.value, self.error) if np.isfinite(self.error) else f"{self.value:.6f} ± {self.error}"
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 FAILED, BAD_INPUT, MISFIT, INTERRUPTED = 1, 2, 3, 130
-_PIPE = 250  # columns of output that is piped or written to a file
+_PIPED_COLUMNS = 250  # columns of output that is piped or written to a file
 _FIELDS = {  # arguments of the package and the options that give them under another name
     "sigma_ns": "pulse_sigma_ns",
     "fwhm_ns": "pulse_fwhm_ns",
@@ -254,7 +254,7 @@ def screen() -> Console:
     """Standard output; without a terminal no line is folded."""
     from rich.console import Console
 
-    return Console(highlight=False) if sys.stdout.isatty() else Console(highlight=False, width=_PIPE)
+    return Console(highlight=False) if sys.stdout.isatty() else Console(highlight=False, width=_PIPED_COLUMNS)
 
 
 def grid(title: str, columns: Sequence[str]) -> Table:

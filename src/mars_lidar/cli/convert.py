@@ -28,7 +28,7 @@ TIMESTAMPS_EXAMPLES = examples(
     "mars-lidar timestamps set.zarr --realization 3 -o photons.h5",
 )
 
-_LARGE_IMAGE = 5e8
+_LARGE_IMAGE = 5e8  # bytes
 ClockPs = Annotated[
     Number | None,
     option(

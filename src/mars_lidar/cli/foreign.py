@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from mars_lidar.io.recorder import Recorded
 
 
-_BINS = 1e-6  # relative difference by which a period may miss a whole number of bins
+_PERIOD_TOLERANCE = 1e-6  # relative difference by which a period may miss a whole number of bins
 _NEEDED = "--system, or --bin-ps (or --period-ns), --cycles, --dead-time-ns (or --detector) and --pulse-sigma-ns"
 
 
@@ -159,7 +159,7 @@ class ForeignOptions:
                 raise ValueError(f"{path} holds photon times: give --period-ns and --bin-ps")
             return (length * width, length) if width is not None else (float(self.period_ns or 0.0), length)
         bins = self.period_ns / width
-        if abs(bins - round(bins)) > _BINS * bins:
+        if abs(bins - round(bins)) > _PERIOD_TOLERANCE * bins:
             below, above = int(bins) * width, (int(bins) + 1) * width
             raise ValueError(
                 f"--period-ns must be a whole number of bins of {width:g} ns, got {self.period_ns:g}; "

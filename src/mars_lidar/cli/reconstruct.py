@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 
 from mars_lidar._base import checks
+from mars_lidar._base.brief import measured
 from mars_lidar._base.files import check_target
 from mars_lidar._base.progress import span
 from mars_lidar.cli.console import grid, progress_bar, refuse_existing, save_picture, say, screen, table
@@ -21,7 +22,9 @@ from mars_lidar.reconstruction.keep import KEEP, common_delay, has_later_light, 
 from mars_lidar.reconstruction.reconstruction import ATTENUATIONS
 
 if TYPE_CHECKING:
+    from mars_lidar._base.types import FloatArray
     from mars_lidar.io import Cube
+    from mars_lidar.reconstruction import Returns
     from mars_lidar.reconstruction.stored import Timed
 
 
@@ -254,10 +257,32 @@ def _show(cube: Cube, timed: dict[str, Timed]) -> None:
     for line in lines:
         rows.add_row(*line)
     screen().print(rows)
+    if (height, width) == (1, 1):
+        _show_pixel({name: each.result for name, each in timed.items()})
     for name, each in timed.items():
         if advice := each.result.advice:
             share = f"{100.0 * each.result.misfits:.3g} % of the pixels do not fit (0.1 % do so by chance)"
             say(f"warning: {name}: {share}; would fit better: {advice}; mars-lidar calibrate CUBE finds the value")
+
+
+def _show_pixel(results: dict[str, Reconstruction]) -> None:
+    """The estimates of a cube of one pixel: a line for each method, exposure and return."""
+
+    def words(values: FloatArray | None, errors: FloatArray | None, place: tuple[int, ...]) -> str:
+        return "-" if values is None else measured(float(values[place]), math.nan if errors is None else errors[place])
+
+    rows = grid("", ["method", "exposure", "depth (m)", "S", "B", "p-value"])
+    for name, result in results.items():
+        for at in np.ndindex(result.depth_m.shape):
+            light: Reconstruction | Returns = result
+            places: list[tuple[int, ...]] = [at]
+            if result.returns is not None and result.returns.count[at] > 1:
+                light, places = result.returns, [(*at, k) for k in range(int(result.returns.count[at]))]
+            background, fit = words(result.background, result.background_error, at), words(result.p_value, None, at)
+            for place in places:
+                depth = words(light.depth_m, light.depth_error_m, place)
+                rows.add_row(name, str(at[0]), depth, words(light.signal, light.signal_error, place), background, fit)
+    screen().print(rows)
 
 
 def _save_cloud(path: Path, results: dict[str, Reconstruction], focal_px: float, overwrite: bool) -> int:

@@ -26,8 +26,8 @@ from mars_lidar.cli.system_options import Effects, SystemOptions
 from mars_lidar.table import Table, cache
 from mars_lidar.table.error import QuantisationError
 
-_ALLOWED = 0.05  # standard deviations of the mean count, up to which a table is told to be good
-_DEPTHS = 1024  # values of a delay axis, where there had to be one: the paper's 108 GB
+_MEAN_ERROR_SD = 0.05  # standard deviations of the mean count, up to which a table counts as accurate
+_AXIS_DELAYS = 1024  # values of a delay axis, where there had to be one: the paper's 108 GB
 _PAPER_BYTES = "105 MB, 108 GB with delays"
 
 
@@ -139,8 +139,8 @@ def _rows(path: Path) -> dict[str, str]:
         "method": method,
         "signal": provenance["signal"],
         "background": provenance["background"],
-        "size": f"{size / 1e6:,.4g} MB, shapes {shapes / 1e6:,.4g} MB of them; with a delay axis of {_DEPTHS} values "
-        f"{shapes * _DEPTHS / 1e9:,.4g} GB (the paper: {_PAPER_BYTES})",
+        "size": f"{size / 1e6:,.4g} MB, shapes {shapes / 1e6:,.4g} MB of them; with a delay axis of "
+        f"{_AXIS_DELAYS} values {shapes * _AXIS_DELAYS / 1e9:,.4g} GB (the paper: {_PAPER_BYTES})",
         "cycles": serves,
         "exact laws": _laws(stored),
         "system": f"period {system.period_ns:.6g} ns, {system.bins} bins, {system.pulse!r}, dead time "
@@ -177,12 +177,12 @@ def _any_error(longest: dict[str, Any] | None, unsettled: int) -> str:
     if longest is None:
         return f"{grows}; at long exposures it was not measured when this table was built"
     error = QuantisationError(**longest)
-    within = error.cycles_within(_ALLOWED)
+    within = error.cycles_within(_MEAN_ERROR_SD)
     mean, variance = max(error.mean_max, error.delayed_mean_max), max(error.variance_max, error.delayed_variance_max)
     limit = "any number" if within >= error.cycles else f"up to some {within:.2g}"
     return (
         f"{grows}: at {error.cycles:,} cycles {mean:.2g} at most, variance {variance:.2g}; the mean is within "
-        f"{_ALLOWED:g} standard deviations for {limit} of cycles"
+        f"{_MEAN_ERROR_SD:g} standard deviations for {limit} of cycles"
     )
 
 

@@ -75,7 +75,7 @@ def mean_histogram(
     ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
     ... )
     >>> light = ml.Flux(signal=1.0, background=1.0, delay_ns=40.0)
-    >>> mean = ml.statistics.mean_histogram(light, system)
+    >>> mean = ml.mean_histogram(light, system)
     >>> mean.shape, round(float(mean.sum()), 1)
     ((128,), 815.2)
     """

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import mars_lidar as ml
-from mars_lidar._base import memory as _memory
+from mars_lidar._base import resources as _memory
 from mars_lidar.engines import ANY_SYSTEM, ENGINES
 from mars_lidar.engines.engine import Task
 from tests.harness.command import listen_to_ctrl_c, stopped

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar import __version__
+from mars_lidar._base.imports import needed
 from mars_lidar._base.native import _core
-from mars_lidar._base.optional import needed
 from mars_lidar.reconstruction.image import solver_of
 from mars_lidar.reconstruction.image_network import CARD, LIMITS, WEIGHTS, networks_of
 from mars_lidar.reconstruction.image_pulse import CELLS_PER_SIGMA, settings_of

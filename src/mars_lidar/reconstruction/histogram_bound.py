@@ -9,8 +9,7 @@ from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.brief import brief
-from mars_lidar._base.notebook import as_html
+from mars_lidar._base.display import as_html, brief
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.detector import require_effects
 from mars_lidar.instrument.effects import LIGHT_EFFECTS

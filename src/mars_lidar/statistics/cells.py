@@ -175,9 +175,9 @@ def _bins_for_waveform(samples: int, bins: int) -> int:
 
 
 def whole_bins(dead: float, bins: int) -> tuple[int, int, float]:
-    """A dead time in periods as whole periods, whole bins of the rest, and the fraction of a bin that is left."""
+    """A dead time in periods as whole periods, whole bins of the rest, and the remaining fraction of a bin."""
     whole = math.floor(dead)
-    position = (dead - whole) * bins  # whole periods apart first: else they cost digits of the fraction
+    position = (dead - whole) * bins  # whole periods are split off first, or they would cost digits of the fraction
     shift = math.floor(position)
     fraction = position - shift
     if fraction < 1e-9:

@@ -86,6 +86,7 @@ async function begin() {
     const key = told ? state.method + state.image : PICTURE_KEYS.map((name) => state[name]).join();
     if (key !== painted && !figureAlone) {
       painted = key;
+      lastPicture = {}; // the picture that still stands is that of the state before
       clearTimeout(timer);
       painter.stop();
       timer = setTimeout(paint, PAUSE_MS);
@@ -102,7 +103,7 @@ async function begin() {
 
   async function paint() {
     const mine = painted, current = state, range = (SPEED_OF_LIGHT / 2) * current.period;
-    const found = lastPicture = {};
+    const found = lastPicture;
     const tell = (share) => { if (mine === painted) at("progress").textContent = share < 1 ? `${Math.round(100 * share)} %` : ""; };
     try {
       await source.picture(current, painter, tell, (some) => {

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from mars_lidar import __version__
-from mars_lidar._base.optional import needed
+from mars_lidar._base.imports import needed
 from mars_lidar.reconstruction import image_stages as stages
 from mars_lidar.reconstruction.image import LEVEL
 from mars_lidar.reconstruction.image_network import (

@@ -166,7 +166,7 @@ def test_what_is_no_request_gets_the_policy_too(server: CubeServer):
 
 @pytest.mark.full
 def test_silent_connections_hold_few_threads_and_end(monkeypatch):
-    monkeypatch.setattr("mars_lidar.explore.server._SILENT_S", 0.5)
+    monkeypatch.setattr("mars_lidar.explore.server._IDLE_TIMEOUT_S", 0.5)
     running = CubeServer()
     thread = threading.Thread(target=running.serve)
     thread.start()

@@ -12,10 +12,10 @@ import mars_lidar as ml
 from mars_lidar import _core
 from mars_lidar.statistics import ConvergenceError, PhaseChain
 from mars_lidar.statistics import cells as cells_module
-from mars_lidar.statistics import exposure as exposure_module
 from mars_lidar.statistics.budget import MOMENTS
 from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.exposure import exposure_moments, native_light, stationary_histogram
+from mars_lidar.statistics.tolerances import TOL
 
 REFERENCE = Path(__file__).parents[3] / "shared" / "reference"
 
@@ -250,7 +250,7 @@ def test_waveforms():
 
 
 def test_convergence_errors_name_the_cell(monkeypatch):
-    monkeypatch.setattr(exposure_module, "MOST_BINS", 256)
+    monkeypatch.setitem(vars(TOL), "most_bins", 256)
     with pytest.raises(ConvergenceError, match=r"S = 200, B = 1 .* still move"):
         exposure_moments(ml.Flux([200.0], 1.0, 50.0), make_system(0.001, bins=1, sigma=0.05), tolerance=1e-8)
     monkeypatch.undo()

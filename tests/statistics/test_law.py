@@ -10,8 +10,8 @@ from scipy import stats
 
 import mars_lidar as ml
 from mars_lidar.statistics import ConvergenceError, mars_moments
-from mars_lidar.statistics import count_pmf as pmf_module
 from mars_lidar.statistics.law import count_law, registration_pdf
+from mars_lidar.statistics.tolerances import TOL
 
 REFERENCE = Path(__file__).parents[3] / "shared" / "reference"
 
@@ -236,7 +236,7 @@ def test_bad_input(call, error, message):
 
 
 def test_a_pmf_that_contradicts_its_cumulants_is_refused(monkeypatch):
-    monkeypatch.setattr(pmf_module, "TAIL", 0.2)  # too small a window: the pmf is aliased
+    monkeypatch.setitem(vars(TOL), "tail", 0.2)  # too small a window: the pmf is aliased
     with pytest.raises(ConvergenceError, match=r"S = 1, B = 1 .* disagrees with the cumulants"):
         _ = count_law(ml.Flux(1.0, 1.0, 50.0), make_system(0.6375)).pmf
 

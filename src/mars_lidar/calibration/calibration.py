@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.brief import brief
-from mars_lidar._base.threads import one_blas_thread
+from mars_lidar._base.display import brief, measured
+from mars_lidar._base.resources import one_blas_thread
 from mars_lidar._base.types import FloatArray
 from mars_lidar.calibration import start, suspects
 from mars_lidar.calibration.curves import Curves, Realizations, curves, realizations
@@ -25,7 +25,8 @@ from mars_lidar.instrument.avalanches import Afterpulsing
 from mars_lidar.instrument.detector import Detector
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, Jitter
 from mars_lidar.instrument.pulse import GaussianPulse, Pulse
-from mars_lidar.instrument.system import MAX_CYCLES, System
+from mars_lidar.instrument.system import System
+from mars_lidar.instrument.tolerances import TOL
 from mars_lidar.light.flux import Flux
 from mars_lidar.light.timestamps import Timestamps
 
@@ -69,8 +70,7 @@ class Estimate:
             return f"{self.value:.6g} ({self.note or 'given'})"
         if self.note:
             return f"{self.value:.4g} (95 %: {self.low:.3g} to {self.high:.3g}), {self.note}"
-        decimals = int(np.clip(1 - np.floor(np.log10(self.error)), 0, 15)) if np.isfinite(self.error) else 6
-        return f"{self.value:.{decimals}f} ± {self.error:.{decimals}f}"
+        return measured(self.value, self.error) if np.isfinite(self.error) else f"{self.value:.6f} ± {self.error}"
 
 
 @dataclass(frozen=True)
@@ -223,7 +223,7 @@ class Calibration:
         """
         if self.fitted is None or not self.recording.laser:
             raise ValueError("realizations need a fit and a laser period: calibrate without look=True")
-        number = checks.integer("cycles", cycles, low=1, high=MAX_CYCLES)
+        number = checks.integer("cycles", cycles, low=1, high=TOL.cycles)
         drawn = checks.integer("simulated", simulated, low=200, high=10**7)
         model = self.fitted.model
         return realizations(self.recording, model, model.bounded(self.fitted.theta), number, drawn, seed)
@@ -554,7 +554,7 @@ class _Run:
                 advice = "pulse='free', or returns=2" if worst.startswith("phases") else "no option of the model"
                 named.append(Suspect(worst, z, np.nan, np.nan, np.nan, advice, included=False))
         centre = fitted.model.bounded(fitted.theta)
-        cycles = int(np.clip(self.recording.exposure, 1, MAX_CYCLES))
+        cycles = int(np.clip(self.recording.exposure, 1, TOL.cycles))
         wave = error = None
         if self.wave is not None:
             scale = float(centre[0] / self.wave[0].sum())

@@ -10,7 +10,7 @@ from mars_lidar._base.types import FloatArray
 from mars_lidar.calibration.fit import LIGHTS
 from mars_lidar.calibration.model import Model
 from mars_lidar.calibration.recording import Recording
-from mars_lidar.statistics.distance import Pmf, kl_divergence, total_variation
+from mars_lidar.statistics.count_pmf import Pmf, kl_divergence, total_variation
 
 _INTERVALS, _PHASES, _AGES = 200, 256, 60  # cells of a picture
 _RATIO = 4.0  # photons of the model's streams over those of the recording

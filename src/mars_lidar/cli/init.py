@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
 
 from mars_lidar._base import checks
+from mars_lidar._base.files import write_text
 from mars_lidar.cli.console import refuse_existing, table
-from mars_lidar.cli.options import Text, argument, command, option, out_option
+from mars_lidar.cli.options import OutPath, Text, command
 from mars_lidar.cli.system_options import DEFAULT_SYSTEM
 from mars_lidar.instrument.effects import FIELDS
 from mars_lidar.instrument.presets import INSTRUMENTS, PRESETS, sourced
@@ -84,43 +84,64 @@ def of_instrument(name: str) -> str:
 
 
 def schema(
-    file: Annotated[
-        Text,
-        argument("Which file it describes: scene, recipe or system.", "recipe", choices=("scene", "recipe", "system")),
-    ] = "recipe",
+    file: Text = "recipe",
     /,
     *,
-    out: Annotated[Path | None, out_option("A .json file, else standard output.", option)] = None,
+    out: OutPath | None = None,
 ) -> None:
     """Write the JSON Schema of scene, recipe or system files, for editors.
 
     With it an editor completes and checks keys.
 
     In the first line of the YAML file:  # yaml-language-server: $schema=recipe.json
+
+    Arguments
+    ---------
+    file : {scene, recipe, system}
+        Which file it describes: scene, recipe or system. [default: recipe]
+
+    Options
+    -------
+    out
+        A .json file, else standard output.
     """
-    from mars_lidar.dataset.schema import json_schema
+    from mars_lidar.dataset.recipe import json_schema
 
     text = json.dumps(json_schema(file), indent=1, ensure_ascii=False) + "\n"
     if out is None:
         print(text, end="")
         return
-    out.write_text(text, encoding="utf-8")
+    write_text(out, text)
     table([("wrote", str(out))])
 
 
 def init(
-    file: Annotated[Path, argument("Where to write it: .yaml or .yml.", "system.yaml")] = _FILE,
+    file: Path = _FILE,
     /,
     *,
-    out: Annotated[Path | None, out_option("Another way to give FILE.", option)] = None,
-    preset: Annotated[Text | None, option(f"An instrument: {', '.join(PRESETS)}.")] = None,
-    overwrite: Annotated[bool, option("Replace an existing file.")] = False,
+    out: OutPath | None = None,
+    preset: Text | None = None,
+    overwrite: bool = False,
 ) -> None:
     """Write a commented system file to start from.
 
     The YAML file describes laser, detector and histogram.
 
     Edit it and pass it on:  mars-lidar simulate --scene room --system system.yaml -o room.zarr
+
+    Arguments
+    ---------
+    file
+        Where to write it: .yaml or .yml. [default: system.yaml]
+
+    Options
+    -------
+    out
+        Another way to give FILE.
+    preset
+        An instrument: $presets.
+    overwrite
+        Replace an existing file.
     """
     if out is not None:
         if file != _FILE and file != out:
@@ -129,7 +150,7 @@ def init(
     if file.suffix not in (".yaml", ".yml"):
         raise ValueError(f"FILE must end in .yaml or .yml, got {str(file)!r}")
     refuse_existing(file, overwrite)
-    file.write_text(commented(file) if preset is None else of_instrument(preset))
+    write_text(file, commented(file) if preset is None else of_instrument(preset))
     table([("wrote", str(file))])
 
 

@@ -23,15 +23,15 @@ from mars_lidar.io import Cube
 from mars_lidar.reconstruction import reconstruct
 
 _PLACE = '<script type="application/json" id="cube">null</script>'
-_MOST_PIXELS = 2**16  # of one answer, or one row
+_MAX_PIXELS = 2**16  # of one answer, or one row
 _METHODS = {"peak": "peak", "likelihood": "maximum_likelihood"}
 _POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' 'wasm-unsafe-eval' blob:; worker-src blob:; "
     "style-src 'unsafe-inline'; img-src data: blob:; connect-src 'self'; base-uri 'none'; form-action 'none'; "
     "frame-ancestors 'none'"
 )
-_SILENT_S = 10.0  # a connection that says nothing for so long is closed
-_MOST_CONNECTIONS = 32  # at a time, each a thread: a browser opens six to a host
+_IDLE_TIMEOUT_S = 10.0  # a connection that says nothing for so long is closed
+_MAX_CONNECTIONS = 32  # at a time, each a thread: a browser opens six to a host
 
 
 def page_text() -> str:
@@ -125,7 +125,7 @@ class CubeServer:
         """Counts of the pixels of some rows, and their delays in ns, NaN for none: float64."""
         images, height, width, _ = cube.shape
         image, first = _whole("image", given, images), _whole("first", given, height)
-        rows, most = int(given["rows"]), min(height - first, max(1, _MOST_PIXELS // width))
+        rows, most = int(given["rows"]), min(height - first, max(1, _MAX_PIXELS // width))
         if not 1 <= rows <= most:
             raise ValueError(f"rows must lie in [1, {most}], got {rows}")
         counts = np.asarray(cube.histogram[image, first : first + rows])
@@ -145,7 +145,7 @@ class _Server(ThreadingHTTPServer):
     daemon_threads = True
 
     def __init__(self, *args: Any) -> None:
-        self._free = threading.Semaphore(_MOST_CONNECTIONS)
+        self._free = threading.Semaphore(_MAX_CONNECTIONS)
         super().__init__(*args)
 
     def process_request(self, request: Any, client_address: Any) -> None:
@@ -179,7 +179,7 @@ def _handler(server: CubeServer) -> type[BaseHTTPRequestHandler]:
     class Handler(BaseHTTPRequestHandler):
         server_version = "mars-lidar"
         sys_version = ""
-        timeout = _SILENT_S
+        timeout = _IDLE_TIMEOUT_S
 
         def do_GET(self) -> None:
             if self.headers.get("Host", "") not in server.hosts:

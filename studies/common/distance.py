@@ -8,19 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.types import FloatArray
-from mars_lidar.statistics.count_pmf import Pmf as Pmf
+from mars_lidar.statistics.count_pmf import Pmf
 
 _POOLED = 5.0  # expected counts below which cells of a G-test are pooled
-KL_FLOOR = 1e-12  # lower bound of a law's probabilities in a Kullback-Leibler divergence, which keeps it finite
 _NEGLIGIBLE = 1e-10  # expected counts below which the bootstrap pools the classes into one
-
-
-def total_variation(a: Pmf, b: Pmf) -> float:
-    """Half the sum of |difference| over all counts."""
-    if a.last < b.first or b.last < a.first:
-        return 0.5 * float(a.p.sum() + b.p.sum())
-    low, high = min(a.first, b.first), max(a.last, b.last)
-    return 0.5 * float(np.abs(a.on(low, high) - b.on(low, high)).sum())
 
 
 def sampling_floor(law: Pmf, size: int, draws: int, random: np.random.Generator) -> FloatArray:
@@ -70,36 +61,6 @@ def g_test(law: Pmf, sample: Pmf, size: int, *, any_mean: bool = False) -> float
     return float(chi2.sf(max(square, 0.0), e.size - 1 - any_mean))
 
 
-def two_sample_g_test(first: Pmf, first_size: int, second: Pmf, second_size: int, *, any_mean: bool = False) -> float:
-    """p-value of the hypothesis that two samples follow one law; counts expected fewer than 5 times are pooled.
-
-    `any_mean`: as for `g_test`, of the difference of the two means.
-    """
-    from scipy.stats import chi2, chi2_contingency
-
-    low, high = min(first.first, second.first), max(first.last, second.last)
-    table = np.stack([first.on(low, high) * first_size, second.on(low, high) * second_size])
-    expected = table.sum(0) * min(first_size, second_size) / (first_size + second_size)
-    common = expected >= _POOLED
-    table = np.column_stack([table[:, common], table[:, ~common].sum(1)])
-    if table.shape[1] > 2 and table[:, -1].sum() * min(first_size, second_size) < _POOLED * (first_size + second_size):
-        rarest = int(table[:, :-1].sum(0).argmin())
-        table[:, rarest] += table[:, -1]
-        table = table[:, :-1]
-    table = table[:, table.sum(0) > 0]
-    if table.shape[1] < 2:
-        return 1.0
-    test = chi2_contingency(table, correction=False, lambda_="log-likelihood")
-    square, freedom = float(test.statistic), int(test.dof)
-    if any_mean and freedom > 1:
-        both = (first_size * first.on(low, high) + second_size * second.on(low, high)) / (first_size + second_size)
-        counts = low + np.arange(both.size)
-        variance = float(both @ (counts - both @ counts) ** 2) * (1.0 / first_size + 1.0 / second_size)
-        square -= float((first.on(low, high) - second.on(low, high)) @ counts) ** 2 / max(variance, 1e-300)
-        freedom -= 1
-    return float(chi2.sf(max(square, 0.0), freedom))
-
-
 def neighbours(expected: FloatArray, least: float) -> NDArray[np.int64]:
     """First index (groups,) of groups of neighbouring cells with an expected sum of at least `least`.
 
@@ -135,10 +96,3 @@ def variance_score(cumulants: FloatArray, sample: Pmf, size: int, variance: floa
 def wasserstein(sample: FloatArray, law: FloatArray) -> FloatArray:
     """First Wasserstein distance (...) of pmfs (..., w) to a pmf (w,), on the same consecutive counts."""
     return np.asarray(np.abs(np.cumsum(sample - law, axis=-1)).sum(-1), dtype=np.float64)
-
-
-def kl_divergence(sample: FloatArray, law: FloatArray) -> FloatArray:
-    """KL(sample || law) (...) in nats, pmfs (..., w) and (w,) on the same counts; `law` floored at `KL_FLOOR`."""
-    log_law = np.log(np.maximum(law, KL_FLOOR))
-    log_sample = np.log(np.where(sample > 0, sample, 1.0))
-    return np.asarray((sample * (log_sample - log_law)).sum(-1), dtype=np.float64)

@@ -18,7 +18,7 @@ from mars_lidar import CountLaw, Flux, System, count_law, registration_pdf
 from mars_lidar._base.types import FloatArray
 from mars_lidar.engines import ENGINES
 from mars_lidar.statistics import photons_per_bin
-from mars_lidar.statistics.distance import Pmf
+from mars_lidar.statistics.count_pmf import Pmf
 from mars_lidar.statistics.matched import matched_pmf
 from studies.common.sample import draw
 from studies.neural.pairs import Training

@@ -1,4 +1,4 @@
-"""Methods of a lower layer whose work is done by a higher one: found by name, when they are called.
+"""Modules that are imported when they are needed: of optional libraries, and of higher layers.
 
 `Timestamps.save`, `Timestamps.load` and `Scene.from_rgbd` belong to classes that know of no file format, `Flux.in_fog`
 and `Flux.from_transient` to one that knows of no model of light, `Cube.plot` to one that draws nothing. These are the
@@ -7,6 +7,7 @@ only places where a module calls one above it: docs/architecture.md lists them, 
 
 from __future__ import annotations
 
+import importlib
 import sys
 from collections.abc import Callable
 from importlib import import_module
@@ -35,3 +36,22 @@ def names_of(package: str, homes: dict[str, str]) -> Callable[[str], Any]:
         return getattr(module, name)
 
     return get
+
+
+class MissingLibraryError(ImportError, ValueError):
+    """What was asked for needs a library that is not installed.
+
+    See Also
+    --------
+    load
+    """
+
+
+def needed(module: str, what: str, extra: str = "io") -> Any:
+    """The module, or an error that says how to install it, by which extra; `what` names the format."""
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise MissingLibraryError(
+            f"{what} needs the library {module.partition('.')[0]}: pip install 'mars-lidar[{extra}]' ({error})"
+        ) from error

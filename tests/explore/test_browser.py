@@ -202,6 +202,29 @@ def test_the_picture_by_maximum_likelihood(page: Page, cube: tuple[dict[str, Any
     page.set(method="peak")
 
 
+def test_the_picture_by_the_photons_around(page: Page):
+    """Some photons a pixel, by the same native code and weights: Python's but for the rounding of logarithms."""
+    given = BASE | {"signal": 0.004, "background": 0.004, "cycles": 1000, "bins": 256, "seed": 5, "method": "image"}
+    page.set(**given)
+    page.tab.wait_for_timeout(600)
+    page.until("explorer.picture.whole")
+    delay, half = (
+        np.array(page.tab.evaluate(f"Array.from(explorer.picture.{name})"), float) for name in ("delay", "halfWidth")
+    )
+    flux, system = scene(page.tab.evaluate("explorer.state"))
+    expected = reconstruct(page.picture().reshape(64, 64, -1), system, "image")
+    off = np.abs((delay - expected.delay_ns.ravel() / 100.0 + 0.5) % 1.0 - 0.5) * 100.0
+    assert np.mean(off < 1e-3) > 0.99  # ns: where two peaks are as likely, rounding decides
+    stated = np.isfinite(half)
+    assert np.mean(stated == np.isfinite(expected.delay_half_width_ns.ravel())) > 0.99
+    both = stated & np.isfinite(expected.delay_half_width_ns.ravel())
+    assert np.mean(np.abs(half * 100.0 - expected.delay_half_width_ns.ravel())[both] < 1e-3) > 0.99
+    error = np.abs((delay - flux.delay_ns.ravel() / 100.0 + 0.5) % 1.0 - 0.5) * 100.0
+    assert np.mean(error > 3.0 * system.pulse.sigma_ns) < 0.05  # of each pixel's fullest bin: most
+    assert "fullest bin" in page.tab.inner_text("#error")
+    page.set(**BASE | {"method": "peak"})
+
+
 @pytest.mark.parametrize("place", [(12, 40), (50, 3)])
 def test_a_click_shows_that_pixel(page: Page, cube: tuple[dict[str, Any], NDArray[np.uint32]], place: tuple[int, int]):
     _, drawn = cube

@@ -13,13 +13,13 @@ from mars_lidar.engines.poisson import PoissonEngine
 from mars_lidar.statistics.count_pmf import Pmf, kl_divergence
 from mars_lidar.statistics.tolerances import TOL
 from studies.__main__ import main
-from studies.common import simulators
 from studies.common.distance import wasserstein
 from studies.common.report import MAX_FIGURE_BYTES
 from studies.common.sample import draw
 from studies.count_law import cells as cells_of
 from studies.count_law import run as count_law
 from studies.count_law.run import shape_sweep
+from studies.neural import simulators
 
 
 @pytest.fixture(scope="module")

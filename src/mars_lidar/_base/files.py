@@ -94,6 +94,7 @@ def beside(target: Path, *, folder: bool = False) -> Iterator[Path]:
     """
     _remove_leftovers(target)
     path = _created(target, folder)
+    created = os.lstat(path)
 
     def removed() -> str:
         _remove(path)
@@ -103,10 +104,18 @@ def beside(target: Path, *, folder: bool = False) -> Iterator[Path]:
         with contextlib.suppress(OSError):  # a file system without locks: leftovers are then nobody's to remove
             lock.enter_context(_held(path))
         yield path
+        if not os.path.samestat(os.lstat(path), created):  # in a shared folder, perhaps by a link
+            raise FileExistsError(f"{path} was replaced by another program while it was being written")
         if folder:
             exchange(path, target)
         else:
             os.replace(path, target)
+
+
+def write_text(target: Path, text: str) -> None:
+    """Write a file of text, whole or not at all; one at `target` is replaced."""
+    with beside(target) as unfinished:
+        unfinished.write_text(text, encoding="utf-8")
 
 
 def _remove_leftovers(target: Path) -> None:

@@ -16,7 +16,7 @@ from mars_lidar.instrument.system import Detector, System
 
 if TYPE_CHECKING:
     from mars_lidar.io import Cube
-    from mars_lidar.io.recorder import Recorded
+    from mars_lidar.io.streams.recorders import Recorded
 
 
 _NEEDED = "--system, or --bin-ps (or --period-ns), --cycles, --dead-time-ns (or --detector) and --pulse-sigma-ns"
@@ -191,7 +191,7 @@ def is_foreign(path: Path, error: ValueError) -> bool:
 def foreign_rows(path: Path) -> list[tuple[str, str]]:
     """What `mars-lidar info` tells of a file of another program."""
     from mars_lidar.io.foreign import listed
-    from mars_lidar.io.recorder import RECORDER_SUFFIXES
+    from mars_lidar.io.streams.recorders import RECORDER_SUFFIXES
 
     if path.suffix.lower() in RECORDER_SUFFIXES:
         return _recorder_rows(path)
@@ -202,8 +202,8 @@ def foreign_rows(path: Path) -> list[tuple[str, str]]:
 
 def _recorder_rows(path: Path) -> list[tuple[str, str]]:
     """What a photon counter recorded: its clocks, the photons of each channel, and the images of a scan."""
-    from mars_lidar.io.recorder import recorded
     from mars_lidar.io.streams.files import recorded as photons_of
+    from mars_lidar.io.streams.recorders import recorded
 
     rows = [("file", f"{path} (not written by mars-lidar)")]
     scan, streams = None, []
@@ -226,6 +226,6 @@ def _recorder_rows(path: Path) -> list[tuple[str, str]]:
     if scan is not None:
         for name, array in scan.arrays.items():
             rows.append(("histograms", f"{name}: {' × '.join(map(str, array.shape))}, {int(array.sum()):,} photons"))
-        rows += [("left out", text) for text in scan.told]
+        rows += [("left out", text) for text in scan.notes]
         rows.append(("reconstruct with", _NEEDED + "; bins and cycles as far as the file tells them"))
     return rows + streams

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked, constructed_by_name
 from mars_lidar._base.display import as_html, brief
-from mars_lidar._base.files import check_claim, reading
+from mars_lidar._base.files import check_claim, reading, write_text
 from mars_lidar._base.yaml import Lines, located, read_yaml
 from mars_lidar.instrument.detector import Detector as Detector
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
@@ -249,11 +249,11 @@ class System:
         """Write to a ``.json``, ``.yaml`` or ``.yml`` file `path`."""
         target = Path(path)
         if target.suffix == ".json":
-            target.write_text(json.dumps(self.to_dict(), indent=2) + "\n")
+            write_text(target, json.dumps(self.to_dict(), indent=2) + "\n")
         elif target.suffix in (".yaml", ".yml"):
             import yaml
 
-            target.write_text(yaml.safe_dump(self.to_dict(), sort_keys=False))
+            write_text(target, yaml.safe_dump(self.to_dict(), sort_keys=False))
         else:
             raise ValueError(f"path must end in .json, .yaml or .yml, got {str(path)!r}")
 

@@ -67,8 +67,8 @@ def read_pfm(path: Path) -> NDArray[np.float32]:
         width = height = 0
         scale = math.nan
     if width < 1 or height < 1 or not scale or not math.isfinite(scale):
-        told = (lines[1][:40] + b" / " + lines[2][:40]).decode("ascii", "replace")
-        raise ValueError(f"{path}: cannot be read (not a PFM: width, height and scale are {told!r})")
+        header = (lines[1][:40] + b" / " + lines[2][:40]).decode("ascii", "replace")
+        raise ValueError(f"{path}: cannot be read (not a PFM: width, height and scale are {header!r})")
     expected = 4 * width * height * channels
     if len(lines[3]) < expected:
         raise ValueError(f"{path}: cannot be read (cut short: {len(lines[3])} of {expected} bytes of values)")
@@ -94,27 +94,27 @@ def read_exr(path: Path) -> NDArray[Any]:
             claimed = math.prod(int(b) - int(a) + 1 for a, b in zip(low, high, strict=True))
             check_claim(path, 8 * claimed * max(1, len(file.channels())), "its pixels")
         with openexr.File(str(path), separate_channels=True) as file:
-            found = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
-    return _depth_channel(path, found)
+            channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
+    return _depth_channel(path, channels)
 
 
-def _depth_channel(path: Path, found: dict[str, NDArray[Any]]) -> NDArray[Any]:
-    told = ", ".join(sorted(found)) or "none"
-    for name in ("Z", "Y") if len(found) > 1 else tuple(found):
-        if name in found:
-            return found[name]
-    layers = [name for name in found if name.rpartition(".")[2] in _DEPTHS]
+def _depth_channel(path: Path, channels: dict[str, NDArray[Any]]) -> NDArray[Any]:
+    names = ", ".join(sorted(channels)) or "none"
+    for name in ("Z", "Y") if len(channels) > 1 else tuple(channels):
+        if name in channels:
+            return channels[name]
+    layers = [name for name in channels if name.rpartition(".")[2] in _DEPTHS]
     deep = [name for name in layers if "depth" in name.lower()] or [name for name in layers if name.endswith("Z")]
     if len(deep) == 1:
-        return found[deep[0]]
+        return channels[deep[0]]
     if deep:
         raise ValueError(f"{path}: has several channels of depth: {', '.join(deep)}; write one of them")
-    grey = [found[name] for name in ("R", "G", "B") if name in found]
-    if grey and all(np.array_equal(one, grey[0], equal_nan=True) for one in grey):
+    grey = [channels[name] for name in ("R", "G", "B") if name in channels]
+    if grey and all(np.array_equal(channel, grey[0], equal_nan=True) for channel in grey):
         return grey[0]
     if len(grey) > 1:
-        raise ValueError(f"{path}: holds colours, not depth: its channels are {told}")
-    raise ValueError(f"{path}: must have a channel of depth (Z, *.Depth.Z) or one channel, got {told}")
+        raise ValueError(f"{path}: holds colours, not depth: its channels are {names}")
+    raise ValueError(f"{path}: must have a channel of depth (Z, *.Depth.Z) or one channel, got {names}")
 
 
 def reflectivity(path: Path, stored: NDArray[Any]) -> FloatArray:
@@ -145,8 +145,7 @@ def luminance(path: Path, stored: NDArray[Any]) -> FloatArray:
     if encoded.ndim == 2:
         encoded = encoded[:, :, None]
     if encoded.ndim != 3 or encoded.size == 0 or encoded.shape[2] not in (1, 2, 3, 4):
-        told = describe(stored)
-        raise FileError(f"{path}: image must be grey or RGB, (H, W) or (H, W, 1 to 4), got {told}")
+        raise FileError(f"{path}: image must be grey or RGB, (H, W) or (H, W, 1 to 4), got {describe(stored)}")
     colours = encoded[:, :, : 3 if encoded.shape[2] >= 3 else 1]
     light = np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
     luminance: FloatArray = light[:, :, 0] if light.shape[2] == 1 else np.minimum(light @ _LUMINANCE, 1.0)

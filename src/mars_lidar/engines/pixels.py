@@ -18,6 +18,8 @@ from mars_lidar.instrument.pulse import Pulse
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.statistics.cells import Cells, waveform_parts
+from mars_lidar.statistics.timing import is_timed
+from mars_lidar.statistics.tolerances import TOL
 
 _EFFECTS = LIGHT_EFFECTS + TIMING_EFFECTS
 
@@ -66,7 +68,8 @@ def _doubles(flux: Flux, system: System) -> int:
     elif single_return(flux) is None:
         parts = 4 * waveform_parts(system)
     law = 40.0 * float(np.sqrt(system.cycles * flux.total.max()))  # a count is no wider than without dead time
-    return 12 * system.bins + parts + int(law)
+    bins = TOL.most_parts if is_timed(system) else system.bins
+    return 12 * bins + parts + int(law)
 
 
 def _keys(flux: Flux, system: System, pixels: IndexArray, delays: bool) -> NDArray[np.void]:

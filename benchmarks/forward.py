@@ -91,7 +91,7 @@ def _coarse(section: Section, bins: int, config: Config) -> None:
         *(
             (wide, dead, words)
             for wide in (1.0, 3.0)
-            for dead, words in ((75.0, ""), (99.0, ", re-armed in the pulse"))
+            for dead, words in ((75.0, ""), (99.0, ", re-armed in the pulse"), (51.0, ", after two dead times"))
         ),
     ):
         system = ml.System(

@@ -3,9 +3,10 @@
 A registration blinds its pixel for the dead time, so that the registrations of the preceding dead time give the passes
 in which the pixel is armed at the start of a bin, and those of one dead time earlier the passes that re-arm in it. Both
 need to know where in their bins registrations lie. In a bin of even light they are spread evenly; in the bins that
-the pulse reaches they are not, and these alone are cut into cells. Registrations of a bin are distributed over its
-cells as a pixel registers that is armed as the histogram says, cell by cell. Where the passes that re-arm under the
-pulse are themselves registrations of the pulse, that distribution is its own cause, and is found by repetition.
+the pulse reaches they are not, and these alone are cut into parts, in which light and registrations are linear.
+Registrations of a bin are distributed over its parts as a pixel registers that is armed as the histogram says, part by
+part. Where the passes that re-arm under the pulse are themselves registrations of the pulse, that distribution depends
+on itself, and is the fixed point of an iteration.
 """
 
 from __future__ import annotations
@@ -121,9 +122,10 @@ def histogram_log_likelihood(
     Unbiased to 0.1 of the Cramer-Rao bound's standard deviation at 1000 cycles, for bins of up to 3 widths (sigma) of
     the pulse, S up to 10, B up to 5 and any dead time (200 random instruments against the exact mean histogram;
     the bias in these units grows with the square root of the cycles). Not so where fewer than about one of the
-    passes of the pulse ends without registration in an exposure that began armed: 0.3 to 0.7. Cost: O(bins) for
-    bins below a third of the pulse's width; in wider ones the bins that the pulse reaches are cut into parts of a third
-    of it, of an eighth where dead time re-arms the pixel within the pulse (docs/learn.md has the times).
+    passes of the pulse ends without registration in an exposure that began armed: 0.3 to 0.7. Where the window of
+    bins that are cut moves by a bin, the value jumps by about 3e-7. Cost: O(bins); where
+    bins are wider than a third of the pulse's width, or dead time re-arms the pixel within the pulse, the bins that the
+    pulse reaches are cut into parts of a third of it (docs/learn.md has the times).
 
     Examples
     --------
@@ -196,8 +198,8 @@ def _cut(system: System) -> tuple[int, int, bool]:
     """Parts of a bin, rounds in which registrations are distributed over them, and whether those that follow are cut.
 
     One round does where a dead time leads from no bin of the pulse to another; five where it does, of the same period
-    or of a later one. Where two dead times lead from pulse to pulse, the bins between them, one dead time after the
-    pulse, matter as much as those of the pulse. Measured over random instruments (tests/learn/test_likelihood.py).
+    or of a later one. Where two dead times lead from pulse to pulse, the bins that they lead to matter as much as those
+    of the pulse. Measured over random instruments (tests/learn/test_likelihood.py).
     """
     width = relative_width(system) * system.period_ns
     low, high = _reach(system)
@@ -213,7 +215,7 @@ def _cut(system: System) -> tuple[int, int, bool]:
 class _CutBins:
     """The bins of each pixel that the pulse reaches, W in all, cut into m parts; `place` (..., W) their numbers.
 
-    `after`: those one dead time later are among them.
+    `after`: those one and two dead times later are among them.
 
     `distributed` sets the registrations that are `expected` in the parts (..., W, m), and the `passes` (..., W) in
     which the pixel is armed at the start of a bin or re-armed in it. Light and registrations are linear within a part.
@@ -234,8 +236,8 @@ class _CutBins:
         self._delay, self._fine = Delay(system.dead_time_periods, n), Delay(system.dead_time_periods, n * m)
         low, high = _reach(system)
         wide, back = math.ceil((high - low) / system.bin_ns) + 1, self._delay.shift + 1
-        offsets = {k % n for k in (*range(wide), *(range(back - 1, back + wide) if after else ()))}
-        offsets = {k: number for number, k in enumerate(sorted(offsets))}
+        reached = {k % n for turn in range(3 if after else 1) for k in range(turn * (back - 1), turn * back + wide)}
+        offsets = {k: number for number, k in enumerate(sorted(reached))}
         delay_ns = torch.remainder(delay_ns, period)
         first = torch.floor((delay_ns.detach() + low) / system.bin_ns).long().unsqueeze(-1)
         self.place = (first + torch.tensor(list(offsets), device=counts.device)) % n
@@ -304,7 +306,7 @@ class _CutBins:
         return every.index_select(-2, self._own).unflatten(-2, (-1, 2))
 
     def _set_rearming(self, slopes: torch.Tensor | float) -> None:
-        """Weights of earlier registrations in what re-arms in a part: all, those that register in it, those that do not.
+        """Weights of earlier registrations: in what re-arms in a part, in what of it registers there, in the rest.
 
         A part is re-armed by the last (1 - f) of one earlier part and the first f of the next. With light 1 + b (x -
         1/2) over the part and registrations 1 + a (x - 1/2) over theirs, these shares are (1 - f, f) -/+ a f (1 - f) /

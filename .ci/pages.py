@@ -24,6 +24,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))  # a script's own folder, also where it is imported
@@ -157,7 +158,7 @@ def run_page(page: Path, environment: str) -> None:
 
 
 def main() -> None:
-    """Run them all, a process and a folder for each page; the first that fails ends it."""
+    """Run them all, as many pages at once as there are processors; the first that fails ends it."""
     environment, *names = sys.argv[1:]
     assert environment in ("core", "extras", "page"), __doc__
     if environment == "page":
@@ -171,17 +172,33 @@ def main() -> None:
         }
         if environment == "extras":  # pages about the studies are read in a checkout
             env["PYTHONPATH"] = os.pathsep.join(filter(None, [env.get("PYTHONPATH"), str(ROOT)]))
-        for page in [ROOT / name for name in names] or pages():
-            if not chosen(page, environment):
-                continue
-            begun = time.perf_counter()
-            with tempfile.TemporaryDirectory() as folder:
-                command = [sys.executable, __file__, "page", str(page), environment]
-                done = subprocess.run(command, env=env, cwd=folder, check=False, stdin=subprocess.DEVNULL)
-            seconds = time.perf_counter() - begun
-            print(f"== {page.relative_to(ROOT)}: {seconds:.1f} s", flush=True)
-            if done.returncode:
-                raise SystemExit(f"{page.relative_to(ROOT)} does not run")
+        wanted = [page for page in [ROOT / name for name in names] or pages() if chosen(page, environment)]
+        with ThreadPoolExecutor(os.cpu_count()) as workers:  # each waits for a process
+            runs = {workers.submit(_page_alone, page, environment, env): page.relative_to(ROOT) for page in wanted}
+            for run in as_completed(runs):
+                done, seconds = run.result()
+                print(done.stdout, end="")
+                print(f"== {runs[run]}: {seconds:.1f} s", flush=True)
+                if done.returncode:
+                    workers.shutdown(cancel_futures=True)
+                    raise SystemExit(f"{runs[run]} does not run")
+
+
+def _page_alone(page: Path, environment: str, env: dict[str, str]) -> tuple[subprocess.CompletedProcess[str], float]:
+    """A page in a process and a folder of its own: what it printed, and the seconds that it took."""
+    begun = time.perf_counter()
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, __file__, "page", str(page), environment]
+        done = subprocess.run(
+            command,
+            env=env,
+            cwd=folder,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+    return done, time.perf_counter() - begun
 
 
 if __name__ == "__main__":

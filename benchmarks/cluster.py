@@ -22,7 +22,7 @@ from typing import Any
 import mars_lidar as ml
 from benchmarks.machine import processor
 from mars_lidar.dataset import begin, finish, open_dataset
-from mars_lidar.dataset.cluster import Run, Team, crew
+from mars_lidar.dataset.cluster import Dispatch, Run, Team, crew
 from mars_lidar.dataset.run import _make_all
 from mars_lidar.dataset.store import Item
 from mars_lidar.dataset.write import Made, Maker
@@ -58,7 +58,7 @@ def of_a_task() -> dict[str, tuple[float, float]]:
             with crew(None, address) as there:
                 run = Run("/there/set.zarr", "a" * 32, 1, "0.3.0", "b" * 16)
                 make = partial(_nothing, run)
-                team = _Fixed(there.executor, make, there.threads, 3, 512, parts=parts)
+                team = _Fixed(there.executor, make, there.threads, Dispatch(), parts=parts)
                 _make_all(nullcontext(team), items[: 50 * parts], lambda _: None)
                 before, client = spent(), time.process_time()
                 _make_all(nullcontext(team), items, lambda _: None)

@@ -21,7 +21,7 @@ import numpy as np
 from benchmarks.cluster import of_a_task, recipe
 from benchmarks.machine import processor
 from mars_lidar.dataset import begin, open_dataset
-from mars_lidar.dataset.cluster import _AHEAD, _LEAST_QUEUED, _TASKS_PER_S, Team
+from mars_lidar.dataset.cluster import Dispatch, Team
 from mars_lidar.dataset.write import Maker
 
 PAGE = Path(__file__).parents[1] / "docs" / "scale.md"
@@ -68,7 +68,7 @@ def with_scheduler(
     random: np.random.Generator,
 ) -> tuple[float, float, int]:
     """Seconds until the last part, share of the time in which workers make parts, and tasks."""
-    team = Team(None, None, lambda: workers, _AHEAD, _LEAST_QUEUED, _TASKS_PER_S)  # type: ignore[arg-type]
+    team = Team(None, None, lambda: workers, Dispatch())  # type: ignore[arg-type]
     times = random.choice(parts.seconds, number)
     tasks: list[tuple[float, int]] = []  # seconds and parts of each
     events: list[tuple[float, int, str]] = []  # when, which task, what happens to it: it comes, is made, is on disk

@@ -16,7 +16,7 @@ from benchmarks.machine import processor
 from benchmarks.storage import epochs
 from benchmarks.timing import in_turn
 from mars_lidar.dataset import Light
-from mars_lidar.dataset.sample_content import Rendered, Surfaces
+from mars_lidar.dataset.scenes import Rendered, Surfaces
 from mars_lidar.light.fog import Fog
 from mars_lidar.light.transient import Transient
 

@@ -10,7 +10,7 @@ from dataclasses import fields
 from functools import partial
 from pathlib import Path
 
-from mars_lidar._base.optional import MissingLibraryError
+from mars_lidar._base.imports import MissingLibraryError
 from studies import STUDIES, OtherRunsError, Request, run
 
 

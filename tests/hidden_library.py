@@ -36,7 +36,7 @@ def says(error: BaseException | str, extra: str) -> None:
 def check_names(extra: str) -> int:
     """Every public name of every public package: there, or a line that names the extra."""
     import mars_lidar
-    from mars_lidar._base.optional import MissingLibraryError
+    from mars_lidar._base.imports import MissingLibraryError
 
     missing = 0
     packages = [mars_lidar.__name__]

@@ -338,7 +338,7 @@ def test_memory_for_timestamps_is_estimated_before_they_are_counted(monkeypatch)
         "mars_lidar.engines.exact.ExactEngine.counts", lambda *_: pytest.fail("the exposure was counted")
     )
     bright = ml.Flux(np.full((100, 100), 20.0), 1.0, 20.0)
-    monkeypatch.setattr("mars_lidar._base.memory.available_bytes", lambda: 2**20)
+    monkeypatch.setattr("mars_lidar._base.resources.available_bytes", lambda: 2**20)
     with pytest.raises(MemoryError, match="timestamps of shape"):
         ml.simulate_timestamps(bright, SYSTEM)
 

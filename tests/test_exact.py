@@ -20,10 +20,10 @@ from scipy import stats
 
 import mars_lidar as ml
 from mars_lidar.engines import ENGINES
-from mars_lidar.instrument.system import MAX_CYCLES
+from mars_lidar.instrument.tolerances import TOL
 
 GAUSSIAN = ml.GaussianPulse(sigma_ns=1.0)
-LONGEST = MAX_CYCLES
+LONGEST = TOL.cycles
 
 
 def system(**changes: object) -> ml.System:

@@ -15,8 +15,9 @@ from PIL import Image
 import mars_lidar as ml
 from mars_lidar import io
 from mars_lidar._base import progress as bars
+from mars_lidar._base.tolerances import TOL
 from mars_lidar.cli.simulate import each_ns
-from mars_lidar.io.advice import advice
+from mars_lidar.io.simulated_file import _Probe, advice
 from studies.compare.comparison import compare
 from tests.harness.command import command_line
 
@@ -218,19 +219,20 @@ def test_a_long_run_is_told_before_with_what_is_faster():
     assert "auto" not in str(advice(flux, gated))  # which cannot do it
 
 
-def test_the_time_told_is_about_the_time_taken():
+def test_the_time_told_is_about_the_time_taken(monkeypatch):
+    """By the time of a processor, which other work on the machine does not change."""
+    monkeypatch.setattr("mars_lidar.io.simulated_file.time.perf_counter", time.process_time)
     system = SYSTEM.replace(cycles=40_000)
     flux = ml.Scene.example("room", size=48).flux(system, signal=1.0, sbr=1.0)
-    began = time.perf_counter()
-    ml.simulate(flux, system, realizations=4)
-    spent = time.perf_counter() - began
-    assert spent / 6 < advice(flux, system, realizations=4).seconds < 6 * spent  # other work on the machine included
+    began = time.process_time()
+    ml.simulate(flux, system, realizations=4, threads=1)
+    spent = time.process_time() - began
+    assert spent / 2 < advice(flux, system, realizations=4, threads=1).seconds < 2 * spent
 
 
 def test_commands_say_how_long_they_take(tmp_path, monkeypatch):
-    monkeypatch.setattr("mars_lidar._base.progress.LONG_S", 1e-9)
-    monkeypatch.setattr("mars_lidar.io.advice.LONG_S", 1e-9)
-    monkeypatch.setattr("mars_lidar.io.advice._SHORT_S", 1.0)
+    monkeypatch.setitem(vars(TOL), "long_s", 1e-9)
+    monkeypatch.setattr("mars_lidar.io.simulated_file._PROBE", _Probe(event_s=1.0))
     small = ["--size", "8", "--cycles", "50", "--bins", "64"]
     words = "on this machine"
     done = run("simulate", "--scene", "room", *small, "--no-picture", "-o", tmp_path / "a.zarr")

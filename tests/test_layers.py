@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import mars_lidar as ml
-from mars_lidar.io.rgbd.layered import read_layers
+from mars_lidar.io.rgbd import read_layers
 from mars_lidar.light.fog import Fog
 from mars_lidar.light.transient import Transient
 from mars_lidar.scene.layers import LayeredScene

@@ -113,10 +113,10 @@ def test_stops_inside_a_long_pixel():
         raise KeyboardInterrupt
 
     case = Case(cycles=2**29, signal=50.0)
-    begun = time.perf_counter()
+    begun = time.process_time()
     with pytest.raises(KeyboardInterrupt):
         _core.sequential_counts(case.job(), case.pulse, np.empty(1, np.int64), 1, progress)
-    assert time.perf_counter() - begun < 2.0
+    assert time.process_time() - begun < 2.0
 
 
 @pytest.mark.parametrize("name", ["gaussian", "wrapped", "wide", "returns", "sampled", "waveform", "narrow"])

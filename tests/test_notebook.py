@@ -39,6 +39,7 @@ def objects(tmp_path_factory) -> dict[str, object]:
         "several laws": ml.count_law(ml.Flux([0.5, 0.6], 0.1, 50.0), SYSTEM),
         "joint law": ml.joint_law(ml.Flux(0.5, 0.1, 50.0), SYSTEM),
         "reconstruction": ml.reconstruct(cube),
+        "bound": ml.cramer_rao(flux, SYSTEM),
         "one pixel": ml.reconstruct(cube.histogram[0, 4, 5], SYSTEM),
     }
 

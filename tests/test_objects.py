@@ -10,7 +10,7 @@ import pytest
 
 import mars_lidar as ml
 from mars_lidar import io, statistics
-from mars_lidar._base.brief import brief
+from mars_lidar._base.display import brief
 from mars_lidar.engines import MarsEngine
 from mars_lidar.reconstruction import HistogramBound
 

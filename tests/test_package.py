@@ -34,6 +34,14 @@ HEAVY = (
 )
 
 
+def test_a_name_of_a_package_is_named_with_its_place():
+    with pytest.raises(AttributeError, match=r"it is mars_lidar\.statistics\.exposure_moments$"):
+        ml.exposure_moments  # noqa: B018
+    with pytest.raises(AttributeError, match=r"no attribute 'histogram'$"):
+        ml.histogram  # noqa: B018
+    assert set(ml.__all__) <= set(dir(ml))
+
+
 def test_version_is_that_of_the_project():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert ml.__version__ == project["version"]

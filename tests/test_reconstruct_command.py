@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import csv
+import itertools
+import re
 import sys
 
 import numpy as np
 import pytest
 import xarray
+from PIL import Image
 
 import mars_lidar as ml
 from mars_lidar import io
@@ -46,6 +49,50 @@ def test_reflectivity_is_right_behind_a_detection_efficiency(tmp_path):
         ratio = found.reflectivity[0] / stored.reflectivity
         np.testing.assert_allclose(found.signal[0] / stored.flux.signal, share, rtol=0.15)
     assert np.median(ratio) == pytest.approx(1.0, abs=0.02)
+
+
+LIGHT = ml.Flux(0.3, 0.3, 40.0)
+RECORDED = ml.System(
+    period_ns=100.0,
+    cycles=20_000,
+    bins=1000,
+    pulse=ml.GaussianPulse.from_fwhm(fwhm_ns=0.3),
+    detector=ml.Detector(dead_time_ns=50.0),
+)
+OPTIONS = {"--bin-ps": 100, "--cycles": 20_000, "--dead-time-ns": 50, "--pulse-fwhm-ns": 0.3}
+
+
+def test_a_single_pixel_is_told_in_numbers_and_drawn_as_a_histogram(tmp_path):
+    np.save(tmp_path / "hist.npy", ml.simulate(LIGHT, RECORDED, seed=1)[0, 0, 0])
+    words = itertools.chain(*OPTIONS.items())
+    done = run("reconstruct", tmp_path / "hist.npy", *words, "-o", tmp_path / "maps.npz")
+    assert done.exit_code == 0, done.output
+    rows = [line for line in done.stdout.splitlines() if "±" in line]
+    assert len(rows) == 1
+    numbers = [float(number) for number in re.findall(r"[\d.]+", rows[0])]
+    _, depth, depth_error, signal, signal_error, background, background_error, p_value = numbers
+    for value, error, truth in (
+        (depth, depth_error, RECORDED.depth_m(40.0)),
+        (signal, signal_error, 0.3),
+        (background, background_error, 0.3),
+    ):
+        assert abs(value - truth) < 4.0 * error  # a false alarm in 6e-5 of the seeds
+        assert error < 0.03 * truth
+    assert p_value > 1e-3
+    assert "warning" not in done.stderr
+    maps, _ = load_maps(tmp_path / "maps.npz")
+    assert depth == pytest.approx(maps["depth"].item(), abs=depth_error / 10)
+    with Image.open(tmp_path / "maps.png") as picture:
+        assert picture.width > 2 * picture.height  # a period and its return, side by side; maps would be squares
+
+
+@pytest.mark.parametrize("wrong", [("--dead-time-ns", 5), ("--pulse-fwhm-ns", 0.03)])
+def test_a_single_pixel_of_a_wrong_system_is_warned_of(tmp_path, wrong):
+    np.save(tmp_path / "hist.npy", ml.simulate(LIGHT, RECORDED, seed=1)[0, 0, 0])
+    words = itertools.chain(*(OPTIONS | dict([wrong])).items())
+    done = run("reconstruct", tmp_path / "hist.npy", *words, "--no-picture", "-o", tmp_path / "maps.npz")
+    assert done.exit_code == 0, done.output
+    assert "warning: maximum_likelihood: the histogram does not fit the estimate" in done.stderr
 
 
 @pytest.mark.full

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import html
 import itertools
 import os
 import re
@@ -17,7 +18,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests" / "explore"))
-from explorer_page import chromium  # noqa: E402
+from explorer_page import WAIT_MS, chromium  # noqa: E402
 
 fcntl = pytest.importorskip("fcntl", reason="the site is built on systems with POSIX locks")
 pytestmark = pytest.mark.full
@@ -94,6 +95,12 @@ def browser() -> Iterator[Any]:
         yield started
 
 
+def new_tab(browser: Any, **context: Any) -> Any:
+    tab = browser.new_page(**context)
+    tab.set_default_timeout(WAIT_MS)
+    return tab
+
+
 FACTS = """() => ({
   scroll: Math.max(...[document.documentElement, ...document.querySelectorAll(".bd-article-container")]
     .map((e) => e.scrollWidth - e.clientWidth)),
@@ -112,7 +119,7 @@ def weight(file: Path) -> int:
 def test_every_page_on_a_telephone(site: Path, browser: Any):
     """390 px wide: no sideways scroll, one first heading and no level left out, pictures described, nothing to complain
     about, below 1 MB but for pictures and the explorer, and nothing from another host."""
-    tab = browser.new_page(viewport={"width": 390, "height": 844})
+    tab = new_tab(browser, viewport={"width": 390, "height": 844})
     said: list[str] = []
     asked: list[str] = []
     tab.on("console", lambda message: said.append(message.text) if message.type == "error" else None)
@@ -154,7 +161,7 @@ def test_every_page_on_a_telephone(site: Path, browser: Any):
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_text_can_be_read(site: Path, browser: Any, scheme: str):
     """The contrast of all text of the pages without their API is that of WCAG AA."""
-    tab = browser.new_page(viewport={"width": 1400, "height": 900}, color_scheme=scheme, offline=True)
+    tab = new_tab(browser, viewport={"width": 1400, "height": 900}, color_scheme=scheme, offline=True)
     wrong = {}
     for name in pages_of(site):
         if not name.startswith(("api/", "copied/benchmarks")):
@@ -174,6 +181,22 @@ def test_each_page_has_a_title_of_its_own(site: Path):
         assert heading, name
         titles.setdefault(re.sub(r"<[^>]+>", "", heading[1]), []).append(name)
     assert not [names for names in titles.values() if len(names) > 1]
+
+
+@pytest.mark.parametrize("folder", ["lessons", "gallery"])
+def test_programs_print_what_their_texts_state(site: Path, folder: str):
+    """The site runs them, and shows what they print."""
+    programs = sorted(ROOT.glob(f"examples/{folder}/*_[0-9]*.py"))
+    assert programs
+    for program in programs:
+        page = (site / folder / f"{program.stem}.html").read_text(encoding="utf-8")
+        outputs = re.findall(r'"sphx-glr-script-out[^>]*>.*?<pre>(.*?)</pre>', page, re.DOTALL)
+        printed = html.unescape(re.sub(r"<[^>]+>", "", "".join(outputs))).splitlines()
+        prose = re.sub(r"\s*\n(?:# ?)?\s*", " ", program.read_text(encoding="utf-8"))
+        stated = re.findall(r"print(?:s|ed is) ``([^`]+)``", prose)
+        assert stated[-1] == printed[-1], program.name
+        assert set(stated) <= set(printed), program.name
+        assert all(re.search(r"\d|True", line) for line in stated), program.name
 
 
 def test_commands_can_be_copied(site: Path):
@@ -203,10 +226,10 @@ def test_equations_are_in_the_pages(site: Path):
 
 
 def test_a_search_finds_lessons_before_reports(site: Path, browser: Any):
-    tab = browser.new_page()
+    tab = new_tab(browser)
     for words, first in {"dead+time": "lessons/lesson_3", "pile-up": "lessons/lesson_2"}.items():
         tab.goto(f"{(site / 'search.html').as_uri()}?q={words}")
-        tab.wait_for_function("document.querySelectorAll('#search-results li a').length > 9", timeout=30_000)
+        tab.wait_for_function("document.querySelectorAll('#search-results li a').length > 9")
         links = tab.evaluate(
             "[...document.querySelectorAll('#search-results li a')].map((a) => a.getAttribute('href'))"
         )

@@ -13,10 +13,10 @@ import mars_lidar as ml
 import studies
 from mars_lidar.statistics import ConvergenceError, count_law
 from mars_lidar.statistics.chain import PhaseChain
-from mars_lidar.statistics.count_pmf import gaussian_window
-from mars_lidar.statistics.distance import Pmf, g_test, sampling_floor, total_variation, variance_score
+from mars_lidar.statistics.count_pmf import Pmf, gaussian_window, total_variation
 from studies import STUDIES, Request
 from studies.__main__ import main
+from studies.common.distance import g_test, sampling_floor, variance_score
 from studies.common.report import MAX_FIGURE_BYTES, table
 from studies.count_law import law
 from studies.covariance import modes

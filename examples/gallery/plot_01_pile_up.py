@@ -18,7 +18,7 @@ pulse, detector = ml.GaussianPulse(sigma_ns=1.0), ml.Detector(dead_time_ns=75.0)
 system = ml.System(period_ns=1e3 / 7.5, cycles=200_000, bins=256, pulse=pulse, detector=detector)
 flux = ml.Flux(signal=1.0, background=1.0, delay_ns=40.0)  # photons per laser period
 counts = ml.simulate(flux, system, seed=0)[0, 0, 0]
-mean = ml.statistics.mean_histogram(flux, system)
+mean = ml.mean_histogram(flux, system)
 poisson = ml.simulate(flux, system, engine="poisson", seed=0)[0, 0, 0]
 
 fig, ax = plt.subplots()

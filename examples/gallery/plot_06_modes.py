@@ -29,7 +29,7 @@ for ax, (mode, gate) in zip(axes.flat, modes.items(), strict=True):
     counts = ml.simulate(flux, system, seed=0)[0, 0, 0]
     counted[mode] = counts.sum()
     ax.plot(system.time_ns, counts, ".", ms=2)
-    ax.plot(system.time_ns, ml.statistics.mean_histogram(flux, system), lw=1)
+    ax.plot(system.time_ns, ml.mean_histogram(flux, system), lw=1)
     ax.set(title=f"{mode}: {counts.sum():,} counts", ylim=(-0.3, 10_000))
     ax.set_yscale("symlog", linthresh=1.0)  # zeros have a place
 fig.supxlabel("time in the laser period (ns)", fontsize=9)

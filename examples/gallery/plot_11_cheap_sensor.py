@@ -4,7 +4,7 @@ A cheap sensor
 
 The same room and light with an ideal detector and with one of a few euros: dark counts, jitter with a tail, optical
 crosstalk, electronics that record one event a period, a converter with uneven codes. Each effect is an option of the
-detector. The depth is that of the largest bin.
+detector. The depth is that of the fullest bin.
 The program prints ``Median depth error: 14 mm ideal, 33 mm cheap.``
 
 How-to: :doc:`/detectors`. Theory: :doc:`/theory_detectors`.
@@ -31,6 +31,6 @@ for (image, plot), name, options in zip(axes, ("ideal", "cheap"), ({}, flaws), s
     plot.plot(system.time_ns, cube.mean((0, 1)), drawstyle="steps-mid", lw=0.8)
     plot.set(yscale="log", ylim=(0.05, 10), ylabel="mean counts per bin")
 axes[1, 1].set(xlabel="time in the laser period (ns)")
-fig.colorbar(shown, ax=axes[:, 0], label="depth of the largest bin (m)", location="left")
+fig.colorbar(shown, ax=axes[:, 0], label="depth of the fullest bin (m)", location="left")
 plt.show()
 print(f"Median depth error: {errors_mm['ideal']:.0f} mm ideal, {errors_mm['cheap']:.0f} mm cheap.")

@@ -32,6 +32,6 @@ for ax, (title, depth) in zip(axes.flat, shown.items(), strict=False):
 fig.colorbar(picture, ax=axes[:, 0], label="depth (m)", location="left")
 width = axes[1, 1].imshow(1000 * image.depth_half_width_m, cmap="magma", vmax=150)
 axes[1, 1].set(title="half of the 90 % interval (mm)", xticks=[], yticks=[])
-fig.colorbar(width, ax=axes[:, 1])
+fig.colorbar(width, ax=axes[1, 1])
 plt.show()
 print(f"Wrong depths: {shares['each pixel alone']:.0%} alone, {shares['image']:.1%} by the image.")

@@ -95,7 +95,7 @@ plt.show()
 
 signals = np.geomspace(0.05, 100, 40)
 fine = system.replace(bins=1024)
-means = [ml.statistics.mean_histogram(ml.Flux(signal, 0.1, delay_ns), fine) for signal in signals]
+means = [ml.mean_histogram(ml.Flux(signal, 0.1, delay_ns), fine) for signal in signals]
 early_ns = np.array([delay_ns - fine.time_ns[mean.argmax()] for mean in means])
 
 fig, ax = plt.subplots()

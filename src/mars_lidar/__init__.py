@@ -21,6 +21,7 @@ from mars_lidar.statistics import (
     count_law,
     holding_time_covariance,
     joint_law,
+    mean_histogram,
     registration_pdf,
 )
 from mars_lidar.table import Lookup, QuantisationError, Table
@@ -56,6 +57,7 @@ __all__ = [
     "generate",
     "holding_time_covariance",
     "joint_law",
+    "mean_histogram",
     "reconstruct",
     "registration_pdf",
     "simulate",
@@ -83,7 +85,9 @@ else:
             return import_module(f"mars_lidar.{name}")
         if name in _HOMES:
             return getattr(import_module(f"mars_lidar.{_HOMES[name]}"), name)
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        packages = [import_module(f"mars_lidar.{package}") for package in ("engines", "reconstruction", "statistics")]
+        place = next((f"; it is {package.__name__}.{name}" for package in packages if name in package.__all__), "")
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}{place}")
 
     def __dir__() -> list[str]:
-        return sorted({*globals(), *_LATER, *_HOMES})
+        return sorted({*__all__, *_LATER, "engines", "reconstruction", "statistics"})

@@ -10,17 +10,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.memory import check_memory
 from mars_lidar._base.progress import callback_of
-from mars_lidar._base.threads import thread_count
+from mars_lidar._base.resources import check_memory, thread_count
 from mars_lidar._base.types import FloatArray, Progress
 from mars_lidar.engines import Engine, EngineOptions, check_detector, find_engine
 from mars_lidar.engines.engine import IN_PARTS, PhaseRecords, Records, Task
 from mars_lidar.instrument.system import System
 from mars_lidar.instrument.units import check_delays
-from mars_lidar.light.flux import MAX_RETURNS, Flux
+from mars_lidar.light.flux import Flux
 from mars_lidar.light.stored_flux import StoredFlux
 from mars_lidar.light.timestamps import DrawnTimestamps, Timestamps
+from mars_lidar.light.tolerances import TOL
 
 _MAX_REGISTRATIONS = 2.0**32  # the event counter of one pixel's random stream
 
@@ -269,9 +269,9 @@ def _task(
     seed = checks.integer("seed", seed, low=0, high=2**64 - 1)
     team = thread_count(threads)
     progress = callback_of(progress, "simulating")
-    if len(flux.returns_signal) > MAX_RETURNS:
+    if len(flux.returns_signal) > TOL.returns:
         raise ValueError(
-            f"flux must have at most {MAX_RETURNS} returns, got {len(flux.returns_signal)}; use a waveform"
+            f"flux must have at most {TOL.returns} returns, got {len(flux.returns_signal)}; use a waveform"
         )
     _check_registrations(flux.detected(system), system)
     lit = flux.returns_delay_ns[flux.returns_signal > 0.0]

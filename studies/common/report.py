@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import csv
 import datetime
+import importlib
 import math
 import os
 import platform
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from benchmarks.machine import processor
-from mars_lidar._base.optional import needed
+from mars_lidar._base.imports import needed
 
 if TYPE_CHECKING:
     from studies import Request
@@ -34,13 +35,17 @@ def write(request: Request, name: str, study: ModuleType, facts: Mapping[str, An
     gets their paths. Returns all paths.
 
     The Markdown is made of the Jinja template beside the module `study`: that of its name, ``report.md.jinja`` beside a
-    ``run.py``. It gives the `facts`; the module itself, with its constants, is `study` there.
+    ``run.py``. It gives the `facts`; `study` there is the module with its constants, and those of a ``settings.py``
+    beside it.
     """
     text, module = request.out / f"{name}.md", Path(str(study.__file__))
+    settings = f"{study.__package__}.settings"
+    shared = vars(importlib.import_module(settings)) if module.with_name("settings.py").exists() else {}
+    names = SimpleNamespace(**{**shared, **vars(study)})
     template = module.with_name(f"{'report' if module.stem == 'run' else module.stem}.md.jinja")
     drawn: Mapping[str, Figure] = facts.get("figures", {})
     figures = [save_figure(request.out / f"{f'{name}_{key}' if key else name}.png", one) for key, one in drawn.items()]
-    text.write_text(render(request, template, {"study": study, **facts, "figures": figures}), encoding="utf-8")
+    text.write_text(render(request, template, {"study": names, **facts, "figures": figures}), encoding="utf-8")
     paths = [text, *figures]
     for key, rows in {"": facts.get("rows", ()), **facts.get("tables", {})}.items():
         path = request.out / f"{f'{name}_{key}' if key else name}.csv"
@@ -157,7 +162,7 @@ def save_figure(path: Path, figure: Figure) -> Path:
 def machine() -> str:
     """Processor, processors of this process, vector level and system, in one line."""
     from mars_lidar import _core
-    from mars_lidar._base.threads import thread_count
+    from mars_lidar._base.resources import thread_count
 
     return (
         f"{processor()}, {thread_count(None)} processors used, {_core.levels()[0]}, "

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
-from cyclopts import App
+from cyclopts import App, Parameter
 
 from mars_lidar._base import checks
 from mars_lidar._base.files import beside
@@ -16,34 +16,21 @@ from mars_lidar._base.progress import span
 from mars_lidar.cli.console import check_new, check_picture, progress_bar, save_picture, table
 from mars_lidar.cli.console import run as execute
 from mars_lidar.cli.options import (
-    COMMAND_LINE,
     Integer,
     LightOptions,
     Number,
+    OutPath,
     SceneOptions,
-    Seed,
     Text,
-    Threads,
-    examples,
-    out_option,
-    output_option,
     read_scene,
-    run_option,
-    two_integers,
+    two,
 )
+from mars_lidar.cli.options import command as as_command
 from mars_lidar.cli.system_options import Effects, SystemOptions
 from mars_lidar.engines import ENGINES
 from studies.compare.comparison import compare as run
 from studies.compare.figures import comparison
 from studies.compare.tables import as_data, show
-
-_EXAMPLES = examples(
-    "python -m studies compare --scene room --size 64 -o compare.png",
-    "python -m studies compare --scene room --engines exact,poisson --signal 0.1 --realizations 40000 -o dim.png",
-    "python -m studies compare --depth depth.png --system spad.yaml --against sequential --json all.json -o all.pdf",
-    notes="Values that deviate by more than 5 standard errors are red and marked with !. Numbers in brackets are the "
-    "standard error in the last digits.",
-)
 
 
 def compare(
@@ -52,40 +39,72 @@ def compare(
     instrument: SystemOptions = SystemOptions(),
     effects: Effects = Effects(),
     light: LightOptions = LightOptions(),
-    engines: Annotated[Text | None, run_option("Engines, separated by commas.", "all there are")] = None,
-    against: Annotated[Text, run_option("The reference engine, run in any case.", "exact")] = "exact",
-    realizations: Annotated[
-        Integer, run_option("Exposures of each representative pixel and engine.", "10000")
-    ] = 10_000,
-    pixels: Annotated[
-        Integer,
-        run_option("Representative pixels: bright, dim, edge, median, most and least photons, in this order.", "4"),
-    ] = 4,
-    pixel: Annotated[
-        list[Text] | None, run_option("A pixel of your own (row, column) instead; up to 6 times.", metavar="Y,X")
-    ] = None,
-    repeats: Annotated[Integer, run_option("Timed cubes of the whole image.", "5")] = 5,
-    budget_s: Annotated[
-        Number, run_option("Seconds for an engine's cubes, and again for its pixels; then it draws fewer.", "4.0")
-    ] = 4.0,
-    seed: Seed = 0,
-    threads: Threads = None,
-    out: Annotated[Path, out_option("The picture: .png, .pdf or .svg.")],
-    numbers: Annotated[Path | None, output_option("All numbers as JSON, into this file.", "", "--json")] = None,
-    overwrite: Annotated[bool, output_option("Replace an existing picture and JSON file.")] = False,
+    engines: Text | None = None,
+    against: Text = "exact",
+    realizations: Integer = 10_000,
+    pixels: Integer = 4,
+    pixel: list[Text] | None = None,
+    repeats: Integer = 5,
+    budget_s: Number = 4.0,
+    seed: Integer = 0,
+    threads: Integer | None = None,
+    out: OutPath,
+    numbers: Annotated[Path | None, Parameter("--json")] = None,
+    overwrite: bool = False,
 ) -> None:
     """Run several engines on one scene: time, count and joint statistics side by side, with a picture.
 
     Everything is compared with the exact finite-exposure statistics ("predicted"), and where there is no
     prediction with the reference engine. The joint statistics are the variance of the count in the +-3 sigma
     signal window and the covariance of neighbouring bins: what count x shape models get wrong.
+
+    Simulation
+    ----------
+    engines
+        Engines, separated by commas. [default: all there are]
+    against
+        The reference engine, run in any case. [default: exact]
+    realizations
+        Exposures of each representative pixel and engine. [default: 10000]
+    pixels
+        Representative pixels: bright, dim, edge, median, most and least photons, in this order. [default: 4]
+    pixel : Y,X
+        A pixel of your own (row, column) instead; up to 6 times.
+    repeats
+        Timed cubes of the whole image. [default: 5]
+    budget_s
+        Seconds for an engine's cubes, and again for its pixels; then it draws fewer. [default: 4.0]
+    seed
+        Seed: the same command gives the same counts. [default: 0]
+    threads
+        Threads; the counts do not depend on it. [default: all cores]
+
+    Output
+    ------
+    out
+        The picture: .png, .pdf or .svg.
+    numbers
+        All numbers as JSON, into this file.
+    overwrite
+        Replace an existing picture and JSON file.
+
+    Examples
+    --------
+    python -m studies compare --scene room --size 64 -o compare.png
+    python -m studies compare --scene room --engines exact,poisson --signal 0.1 --realizations 40000 -o dim.png
+    python -m studies compare --depth depth.png --system spad.yaml --against sequential --json all.json -o all.pdf
+
+    Notes
+    -----
+    Values that deviate by more than 5 standard errors are red and marked with !. Numbers in brackets are the standard
+    error in the last digits.
     """
     began = time.perf_counter()
     check_picture(out, overwrite)
     check_new(numbers, overwrite)
     asked = [] if engines is None else engines.split(",")
     names = [checks.choice("--engines", name.strip(), tuple(ENGINES)) for name in asked]
-    places = {text.replace(" ", ""): two_integers("--pixel", text) for text in pixel or ()}
+    places = {text.replace(" ", ""): two("--pixel", text) for text in pixel or ()}
     system = instrument.build(effects)
     view = read_scene(scene, light, system)
     with progress_bar("comparing") as progress:
@@ -116,7 +135,7 @@ def compare(
 
 def compare_app(command: str = "python -m studies compare") -> App:
     """The command line of the study, called `command`."""
-    return App(name=command, default_command=compare, help_epilogue=_EXAMPLES, **COMMAND_LINE)
+    return as_command(compare, command)
 
 
 def main(arguments: Sequence[str], command: str = "python -m studies compare") -> int:

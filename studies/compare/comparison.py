@@ -16,9 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base import checks
-from mars_lidar._base.memory import check_memory
 from mars_lidar._base.progress import callback_of
-from mars_lidar._base.threads import thread_count
+from mars_lidar._base.resources import check_memory, thread_count
 from mars_lidar._base.types import Progress
 from mars_lidar.engines import ENGINES, Engine, find_engine
 from mars_lidar.engines.table_reader import image_table

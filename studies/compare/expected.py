@@ -13,7 +13,7 @@ from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.statistics import ConvergenceError, count_law, exposure_moments, joint_law, mean_histogram
-from mars_lidar.statistics.distance import Pmf
+from mars_lidar.statistics.count_pmf import Pmf
 from studies.compare.sample import Moments
 
 _PIXELS = 4096  # of an image, at most: a larger one is predicted on a coarser grid

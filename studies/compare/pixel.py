@@ -16,7 +16,7 @@ from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.plot.views import by_signal, example_pixels, incident_rate, with_pixels
 from mars_lidar.simulation import simulate
-from mars_lidar.statistics.distance import Pmf
+from mars_lidar.statistics.count_pmf import Pmf
 from studies.compare.expected import PixelLaw
 from studies.compare.sample import Distance, Estimate, Moments, Sample, law_distance, ratio, score, shape_distance
 

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.types import FloatArray
-from mars_lidar.statistics.distance import Pmf, neighbours, sampling_floor, total_variation
+from mars_lidar.statistics.count_pmf import Pmf, total_variation
+from studies.common.distance import neighbours, sampling_floor
 
 SIGNIFICANT = 5.0  # standard scores from which a deviation is called wrong: 6e-7 by chance
 _LARGEST_SCORE = 37.0  # of a p-value that a double still holds

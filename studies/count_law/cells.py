@@ -8,8 +8,9 @@ import numpy as np
 
 from mars_lidar import Flux, System, count_law, registration_pdf
 from mars_lidar._base.types import FloatArray
-from mars_lidar.statistics.distance import Pmf, kl_divergence, wasserstein
+from mars_lidar.statistics.count_pmf import Pmf, kl_divergence
 from studies import Tell
+from studies.common.distance import wasserstein
 from studies.common.sample import (
     NEAR_NS,
     PERIOD_NS,
@@ -22,8 +23,8 @@ from studies.common.sample import (
     paper_grids,
     system_of,
 )
-from studies.common.simulators import Prediction, arrival_shape, centred, simulators
 from studies.neural.pairs import Training
+from studies.neural.simulators import Prediction, arrival_shape, centred, simulators
 
 FIGURES = ("wasserstein", "kl", "mean", "variance")  # distances of a law to the truth, in this order
 _NEGLIGIBLE = 1e-10  # probability of a count left out of a resampling, per exposure drawn

@@ -15,8 +15,8 @@ from mars_lidar.plot.style import COLOURS, INK, MUTED
 from mars_lidar.statistics import exposure_moments
 from studies.common.draw import legend_below, panels
 from studies.common.sample import PERIOD_NS
-from studies.common.simulators import arrival_shape
 from studies.count_law.cells import FIGURES, SHAPES, Cell, Settings
+from studies.neural.simulators import arrival_shape
 
 PANELS = ((0.07, 0.07, 25.0), (0.5, 0.5, 50.0), (4.0, 0.5, 75.0), (10.0, 10.0, 100.0))  # nearest cells are drawn
 HISTOGRAM = (2.0, 1.0, 0.6375)  # S, B in photons per period, dead time in periods

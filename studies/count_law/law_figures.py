@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from mars_lidar.plot.style import COLOURS, INK, MUTED
 from studies.common.draw import legend_below, maps, panels
-from studies.count_law.law import LAWS, Cell, Settings
+from studies.count_law.settings import LAWS, Cell, Settings
 
 _LOW, _HIGH = 3e-3, 1.0  # total variation on the colour scales
 _LOW_EXACT = 1e-3  # where there is no sampling noise

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mars_lidar import Flux, System, count_law
 from mars_lidar._base.types import FloatArray
 from mars_lidar.plot.style import COLOURS
-from mars_lidar.statistics.distance import total_variation
+from mars_lidar.statistics.count_pmf import total_variation
 from mars_lidar.statistics.matched import matched_pmf, trusted
 from studies import Facts, Request, Tell
 from studies.common.draw import maps

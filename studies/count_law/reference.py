@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 
 from mars_lidar import Flux
-from mars_lidar.statistics import distance
-from mars_lidar.statistics.distance import Pmf
+from mars_lidar.statistics.count_pmf import Pmf, total_variation
 from studies import Facts, Request
+from studies.common import distance
 from studies.common.sample import system_of
-from studies.count_law.law import LAWS, laws_of, pmfs_of
+from studies.count_law.law import laws_of, pmfs_of
+from studies.count_law.settings import LAWS
 
 DRAWS, QUICK_DRAWS = 20_000, 500
 SEED = 20262
@@ -80,7 +81,7 @@ def compare(name: str, case: dict[str, Any], draws: int, random: np.random.Gener
             # what the sample's mean and variance scatter by is known from the exact law
             "z_mean": distance.mean_score(expected, float(exact[1]), mean, size),
             "z_variance": distance.variance_score(exact, sample, size, variance),
-            "distance": distance.total_variation(pmf, sample),
+            "distance": total_variation(pmf, sample),
             "floor": float(noise.mean()),
             "limit": float(np.quantile(noise, 0.999)),
             "p_value": distance.g_test(pmf, sample, size),

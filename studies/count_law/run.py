@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from mars_lidar.statistics.distance import KL_FLOOR
+from mars_lidar.statistics.tolerances import TOL
 from studies import Facts, Request
 from studies.common.report import Row, picked
-from studies.common.simulators import simulators
 from studies.count_law.cells import FIGURES, FULL, QUICK, Cell, compute, shape_sweep
+from studies.neural.simulators import simulators
 
 PAPER = {  # T1 of arXiv 2512.04924: Wasserstein, KL, mean difference, variance difference
     "poisson": (7966.130, 24.208, 7966.130, 9257.464),
@@ -86,7 +86,7 @@ def run(request: Request) -> Facts:
     return {
         "s": settings,
         "truth": request.truth,
-        "kl_floor": KL_FLOOR,
+        "kl_floor": TOL.tail,
         "sampled": [name for name in first if first[name].noise > 1.0],
         "grids": {name: [_row(one, said, here) for one, said in words.items()] for name, here in by_grid.items()},
         "keys": FIGURES,

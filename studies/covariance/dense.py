@@ -10,7 +10,7 @@ import numpy as np
 from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics import HoldingTimeCovariance, moment_matrices
 from studies import Tell
-from studies.covariance.run import SPECTRAL, SPECTRAL_NAME, Cell, Settings
+from studies.covariance.settings import SPECTRAL, SPECTRAL_NAME, Cell, Settings
 
 
 def dense_checks(settings: Settings, cells: list[Cell], extra: int, tell: Tell) -> list[dict[str, Any]]:

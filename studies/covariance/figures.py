@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from mars_lidar.plot.style import COLOURS, INK, MUTED
 from studies.common.draw import legend_below, maps, panels
-from studies.covariance.run import (
+from studies.covariance.settings import (
     CUTOFFS,
     SPECTRAL_NAME,
     TOLERANCES,

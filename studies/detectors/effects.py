@@ -10,7 +10,8 @@ from mars_lidar import Afterpulsing, Crosstalk, Detector, Flux, GaussianPulse, J
 from mars_lidar.statistics import constant_light_rate
 from studies import Facts, Request
 from studies.common.sample import settings_of
-from studies.detectors.run import LIGHT, SEED, outcome, row, shown_as
+from studies.detectors.run import outcome, row
+from studies.detectors.settings import LIGHT, SEED, shown_as
 
 CODES = tuple(1.0 + 0.25 * np.sin(2.0 * np.pi * k / 8.0) for k in range(8))
 SHOWN = (

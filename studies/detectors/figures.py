@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from mars_lidar.plot.style import COLOURS, INK, MUTED
 from studies.common.draw import legend_below, panels
-from studies.detectors.run import BACKGROUND, DELAY_NS, REACH, SIGNAL, Outcome
+from studies.detectors.settings import BACKGROUND, DELAY_NS, REACH, SIGNAL, Outcome
 
 
 def draw_all(outcomes: Sequence[Outcome]) -> dict[str, Figure]:

@@ -3,70 +3,22 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mars_lidar import Detector, Flux, GaussianPulse, System, count_law, simulate_timestamps
+from mars_lidar import Flux, GaussianPulse, System, count_law, simulate_timestamps
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.effects import AVALANCHE_EFFECTS
 from mars_lidar.statistics import mean_histogram
-from mars_lidar.statistics.distance import Pmf, g_test
+from mars_lidar.statistics.count_pmf import Pmf
 from studies import Facts, Request
+from studies.common.distance import g_test
 from studies.common.sample import settings_of
+from studies.detectors.settings import BACKGROUND, DELAY_NS, LIGHT, REACH, SEED, SHOWN, SIGNAL, Outcome, Shown
 
-SIGNAL, BACKGROUND, DELAY_NS, DEAD_NS = 1.0, 1.0, 37.0, 45.0
-LIGHT = {"signal S": SIGNAL, "background B": BACKGROUND, "delay_ns": DELAY_NS, "dead_time_ns": DEAD_NS}
-SEED = 20
-REACH = 3.0  # periods of inter-registration times that are shown
 _BINS_OF_INTERVALS = 150
 _SIMULATED_ONLY = (*AVALANCHE_EFFECTS, "max_events_per_period", "max_events_per_exposure")
-
-
-@dataclass(frozen=True)
-class Shown:
-    """A detector, its name in figures and tables, and the figure it belongs to."""
-
-    name: str
-    figure: str
-    detector: Detector
-
-
-def shown_as(name: str, figure: str, **changes: Any) -> Shown:
-    """A detector of the common dead time but for `changes`."""
-    return Shown(name, figure, Detector(**{"dead_time_ns": DEAD_NS, **changes}))
-
-
-SHOWN = (
-    shown_as("non-paralyzable", ""),
-    shown_as("paralyzable", "paralyzable", mode="paralyzable"),
-    shown_as("synchronous, no dead time", "synchronous", dead_time_ns=0.0, mode="synchronous"),
-    shown_as("synchronous", "synchronous", mode="synchronous"),
-    shown_as("gated", "gated", mode="gated", gate_start_ns=20.0, gate_width_ns=40.0),
-    shown_as(
-        "moving gate", "gated", mode="gated", gate_start_ns=0.0, gate_width_ns=30.0, gate_step_ns=1.0, gate_cycles=5
-    ),
-)
-
-
-@dataclass(frozen=True, eq=False)
-class Outcome:
-    """One detector: simulated, and predicted where there is a prediction.
-
-    `histogram` and `intervals` are means per exposure; `counts` (exposures,). `law` (n,) is P(N = n), or None.
-    """
-
-    shown: Shown
-    system: System
-    counts: NDArray[np.int64]
-    histogram: FloatArray
-    histogram_error: FloatArray
-    intervals: FloatArray
-    expected: FloatArray | None
-    moments: tuple[float, float] | None
-    law: FloatArray | None
 
 
 def run(request: Request) -> Facts:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from mars_lidar._base.types import FloatArray
-from mars_lidar.statistics.distance import neighbours
+from studies.common.distance import neighbours
 from studies.domain.samples import Sample
 
 Numbers = NDArray[np.int64]

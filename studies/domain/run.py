@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from mars_lidar._base.threads import thread_count
+from mars_lidar._base.resources import thread_count
 from studies import Facts, Request
 from studies.common.kept import Lines
 from studies.common.report import number

@@ -9,8 +9,7 @@ configurations share the networks that they have in common.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import partial
 from typing import Any
 
@@ -18,13 +17,14 @@ import numpy as np
 import torch
 
 from mars_lidar import Flux, System, cramer_rao, reconstruct
-from mars_lidar._base.optional import needed
+from mars_lidar._base.imports import needed
 from mars_lidar._base.types import FloatArray
 from studies import Facts, Request
 from studies.common.kept import chosen, fixed, kept
-from studies.downstream.data import CONFIGS, MAIN, PAIR, Config, Data, instrument, truths
+from studies.downstream.data import CONFIGS, MAIN, Data, instrument, truths
 from studies.downstream.networks import predicted, trained
 from studies.downstream.prediction import of_scenes
+from studies.downstream.settings import Run, runs
 
 METHODS = {  # that need no training
     "matched filter": "matched_filter",
@@ -33,34 +33,6 @@ METHODS = {  # that need no training
 }
 LIGHT_M_PER_NS = 0.299792458 / 2.0  # of depth
 _GAUSSIAN: dict[str, Any] = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}  # SSIM's window
-
-
-@dataclass(frozen=True)
-class Run:
-    """One network: its kind, the simulator of its data, dead time in periods, ratio, seed."""
-
-    kind: str
-    arm: str
-    dead: float
-    sbr: float
-    seed: int
-
-    @property
-    def file(self) -> str:
-        """Of its result."""
-        return f"{self.kind}-{self.arm}-dead{self.dead:g}-sbr{self.sbr:g}-{self.seed}.json"
-
-
-def runs(config: Config) -> Iterator[Run]:
-    """All networks, seed by seed; a spatial network follows the pixel network of the same data."""
-    for seed in range(config.seeds):
-        for sbr in config.sbr:
-            for arm in config.arms:
-                yield Run("pixel", arm, MAIN, sbr, seed)
-                if config.spatial and (seed == 0 or arm in PAIR):
-                    yield Run("spatial", arm, MAIN, sbr, seed)
-        if seed == 0:
-            yield from (Run("pixel", arm, dead, 1.0, seed) for dead in config.dead for arm in PAIR)
 
 
 def run(request: Request) -> Facts:

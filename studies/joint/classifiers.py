@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import rankdata
 
-from mars_lidar._base.optional import needed
+from mars_lidar._base.imports import needed
 from mars_lidar._base.types import FloatArray
 
 QDA, BOOSTING, FOREST = "QDA", "gradient boosting", "random forest"
@@ -61,6 +61,11 @@ def auc(low: FloatArray, high: FloatArray) -> tuple[float, float]:
 def chance_error(n: int, m: int) -> float:
     """Standard error of the AUC of two samples of one continuous law (Mann and Whitney, 1947)."""
     return float(np.sqrt((n + m + 1) / (12.0 * n * m)))
+
+
+def chance(exposures: int) -> float:
+    """Standard error of the AUC of two samples of one law, half of the `exposures` of each held out."""
+    return chance_error(exposures - exposures // 2, exposures - exposures // 2)
 
 
 def _model(kind: str, seed: int) -> Any:

@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 
 from mars_lidar.plot.style import COLOURS, DPI, INK, MISSING
 from studies.common.draw import WIDTH, legend_below
+from studies.joint.classifiers import chance
 from studies.joint.outcomes import ENGINES, TESTS, Outcome, Settings
-from studies.joint.run import chance
 
 _LINEAR = 0.02  # from chance, where the axis turns from linear to logarithmic
 _TICKS = (-0.02, 0.0, 0.02, 0.1, 0.5)

@@ -21,7 +21,7 @@ from studies.joint import cases, classifiers, outcomes
 from studies.joint.cases import AGAIN
 from studies.joint.outcomes import ENGINES, FULL, QUICK, TESTS, Outcome, Settings
 
-__all__ = ["cases", "chance", "run"]  # the first for the report
+__all__ = ["cases", "run"]  # the first for the report
 
 RATIOS = cases.RATIOS[:3]
 _SEEN = 4.0  # standard errors beyond which a figure is marked
@@ -29,15 +29,10 @@ _WORST = 5  # random systems listed
 _LEAST_P = 1e-100  # told as a number
 
 
-def chance(exposures: int) -> float:
-    """Standard error of the AUC of two samples of one law, half of the `exposures` of each held out."""
-    return classifiers.chance_error(exposures - exposures // 2, exposures - exposures // 2)
-
-
 def auc_score(outcome: Outcome, test: str, settings: Settings) -> float:
     """AUC less 1/2 in standard errors of chance: standard normal if the two samples have one law."""
     exposures = settings.random_exposures if outcome.random else settings.exposures
-    return (outcome.aucs[test][0] - 0.5) / chance(exposures)
+    return (outcome.aucs[test][0] - 0.5) / classifiers.chance(exposures)
 
 
 def run(request: Request) -> Facts:
@@ -63,7 +58,7 @@ def run(request: Request) -> Facts:
         "gone": given_to_exact(found),
         "refused": [f"{o.engine} {o.case.name}" for o in found if o.instead == "refused"],
         "asked": sum(o.engine == "feedback" for o in found),
-        "band": [2 * chance(n) for n in (settings.exposures, settings.random_exposures)],
+        "band": [2 * classifiers.chance(n) for n in (settings.exposures, settings.random_exposures)],
         "aucs": {
             test: crossed(
                 (o.case.name, o.engine, marked(o.aucs[test], seen(o, test)) if o.aucs else o.instead)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from mars_lidar._base.optional import MissingLibraryError
+from mars_lidar._base.imports import MissingLibraryError
 
 try:
     import torch

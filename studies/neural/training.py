@@ -14,7 +14,7 @@ from torch import Tensor
 
 from mars_lidar import System
 from mars_lidar._base import checks
-from mars_lidar.statistics.gate import require_mode
+from mars_lidar.statistics.cells import require_mode
 from studies.common.report import save_csv, save_figure
 from studies.neural.model import NeuralMap
 from studies.neural.network import PdfAutoencoder, canonical, one_thread, rolled

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mars_lidar import Flux, System, cramer_rao, reconstruct, simulate
 from mars_lidar.reconstruction import Flags, MaximumLikelihood, log_likelihood
-from studies.reconstruction.run import PLAIN, SBR, SEED, SYNCHRONOUS
+from studies.reconstruction.settings import PLAIN, SBR, SEED, SYNCHRONOUS
 
 _DELAY_NS = 50.0  # both ends of the exposure matter there
 _LONG = 20_000  # cycles

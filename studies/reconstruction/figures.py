@@ -12,7 +12,7 @@ from mars_lidar.plot.style import COLOURS, INK
 from mars_lidar.reconstruction import METHODS
 from studies.common.draw import legend_below, panels
 from studies.common.report import Row
-from studies.reconstruction.run import Picture
+from studies.reconstruction.settings import Picture
 
 _ALONE = [name for name, method in METHODS.items() if not method.of_images]
 _COLOUR = dict(zip(_ALONE, (*COLOURS, INK), strict=True))

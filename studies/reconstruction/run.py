@@ -3,48 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from mars_lidar import Detector, Flux, Reconstruction, Scene, System, cramer_rao, reconstruct, simulate
+from mars_lidar import Flux, Scene, System, cramer_rao, reconstruct, simulate
 from mars_lidar.reconstruction import METHODS, Flags, window_error, window_weights
 from studies import Facts, Request
 from studies.common.report import Row
-from studies.common.sample import system_of
+from studies.reconstruction.settings import (
+    BRIGHT,
+    FULL,
+    KNOWN,
+    OUTLIER_SIGMAS,
+    PLAIN,
+    QUICK,
+    SBR,
+    SEED,
+    SYNCHRONOUS,
+    Picture,
+    Settings,
+)
 
-SEED = 9
-SBR = 1.0
-OUTLIER_SIGMAS = 4.0  # of the pulse: further off the pulse itself was missed
-_DEAD_NS = 75.0
 _BOUNDS = 17  # delays at which the bound is computed; between them its logarithm is interpolated
-KNOWN = 10.0  # %, of S: a bound above it is not reached by any estimate (section "Near the bound")
-BRIGHT = 3.0  # mean signal photons per period of the picture
-PLAIN = system_of(_DEAD_NS, 1000)
-SYNCHRONOUS = PLAIN.replace(detector=Detector(dead_time_ns=0.0, mode="synchronous"))
-
-
-@dataclass(frozen=True)
-class Settings:
-    """Levels of signal photons per period, pixels at each, side of the picture's image."""
-
-    signals: tuple[float, ...]
-    pixels: int
-    size: int
-
-
-FULL = Settings(tuple(float(s) for s in np.geomspace(0.003, 10.0, 15)), 1000, 48)
-QUICK = Settings((0.03, 0.3, 3.0), 100, 24)
-
-
-@dataclass(frozen=True, eq=False)
-class Picture:
-    """A bright room: true depth (H, W), m, and what two methods make of it."""
-
-    depth_m: Any
-    signal: Any
-    found: dict[str, Reconstruction]
 
 
 def run(request: Request) -> Facts:

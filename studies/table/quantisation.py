@@ -16,7 +16,7 @@ from mars_lidar import Flux, System, Table
 from mars_lidar._base.types import FloatArray
 from mars_lidar.plot.style import COLOURS
 from mars_lidar.statistics import Exposure, exposure_moments
-from mars_lidar.statistics.distance import total_variation
+from mars_lidar.statistics.count_pmf import total_variation
 from mars_lidar.statistics.matched import matched_pmf
 from studies import Facts, Request, Tell
 from studies.common.draw import legend_below, panels

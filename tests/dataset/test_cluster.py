@@ -78,7 +78,7 @@ def test_a_cluster_that_starts_with_no_worker_fills(tmp_path, recipe):
 
 def test_parts_in_flight_follow_the_workers_that_are_there():
     threads = [0]
-    team = cluster_module.Team(None, None, lambda: threads[0], 3, 512, 50.0)  # type: ignore[arg-type]
+    team = cluster_module.Team(None, None, lambda: threads[0], cluster_module.Dispatch(3, 512, 50.0))  # type: ignore[arg-type]
     assert team.capacity() == 512
     threads[0] = 320
     assert team.capacity() == 960

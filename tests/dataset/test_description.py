@@ -12,7 +12,7 @@ import yaml
 import mars_lidar as ml
 from mars_lidar import io
 from mars_lidar.dataset import DatasetRecipe, json_schema, read_view
-from mars_lidar.dataset.scene_entries import KINDS
+from mars_lidar.dataset.recipe import KINDS
 from tests.harness.command import command_line
 
 SYSTEM = ml.System(

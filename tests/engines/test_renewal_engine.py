@@ -9,7 +9,7 @@ from harness.pvalues import goodness
 from scipy import stats
 
 import mars_lidar as ml
-from mars_lidar.statistics import exposure_moments, renewal_moments
+from mars_lidar.statistics import exposure_moments
 from mars_lidar.table import Table
 
 SYSTEM = ml.System(
@@ -28,7 +28,8 @@ def test_count_and_shape(with_table: bool):
     table = Table.build(SYSTEM, np.array([1.2, 1.3]), np.array([0.4, 0.5])) if with_table else None
     flux = ml.Flux(np.full((2, 4), signal), background, delay)
     cube = ml.simulate(flux, SYSTEM, engine="renewal", table=table, realizations=1000).reshape(-1, SYSTEM.bins)
-    mean, variance = (float(x) for x in renewal_moments(ml.Flux(signal, background, 0.0), SYSTEM))
+    renewal = ml.count_law(ml.Flux(signal, background, 0.0), SYSTEM, "renewal")
+    mean, variance = float(renewal.mean), float(renewal.variance)
     n = np.arange(int(mean + 12 * np.sqrt(variance)))
     pmf = np.diff(stats.norm.cdf((n + 0.5 - mean) / np.sqrt(variance)), prepend=0.0)
     exact = exposure_moments(ml.Flux(signal, background, delay), SYSTEM).histogram

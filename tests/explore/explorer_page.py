@@ -28,7 +28,7 @@ def chromium() -> Iterator[Any]:
         found = str(own) if own.exists() else next(filter(None, map(shutil.which, _NAMES)), None)
         if found is None:
             pytest.skip("needs a Chromium: of the system, or by `playwright install chromium`")
-        browser = playwright.chromium.launch(executable_path=found, args=["--no-sandbox"])
+        browser = playwright.chromium.launch(executable_path=found, args=["--no-sandbox"], timeout=WAIT_MS)
         try:
             yield browser
         finally:

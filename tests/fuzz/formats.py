@@ -15,11 +15,11 @@ import mars_lidar as ml
 from mars_lidar import io
 from mars_lidar.cli.system_options import _measured
 from mars_lidar.dataset import DatasetRecipe, open_dataset, read_sparse
-from mars_lidar.dataset.view import read_view
+from mars_lidar.dataset.sources import read_view
 from mars_lidar.io.foreign import foreign_cube
 from mars_lidar.io.maps import load_maps, save_maps
-from mars_lidar.io.recorder import recorded
-from mars_lidar.io.rgbd.layered import read_layers
+from mars_lidar.io.rgbd import read_layers
+from mars_lidar.io.streams.recorders import recorded
 from mars_lidar.io.transient import read_truth
 
 SYSTEM = ml.System(

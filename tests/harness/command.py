@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import io
+import signal
+import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import psutil
 from cyclopts import App
 from cyclopts.argument import Argument
 
@@ -54,3 +57,25 @@ def options_of(*commands: str, app: App = mars_lidar) -> dict[str, Argument]:
         app = app[command]
     arguments = [argument for argument in app.assemble_argument_collection() if argument.name.startswith("--")]
     return {argument.name: argument for argument in arguments}
+
+
+def listen_to_ctrl_c() -> None:
+    """In a child: shells start background processes, and so whole test runs, with Ctrl-C ignored."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+def stopped(process: subprocess.Popen[str], how: signal.Signals) -> tuple[str, float]:
+    """Stop a process by a signal: what it printed, and the seconds of a processor that it took from then to its end.
+
+    Other work on the machine lengthens the time by a clock, and not that of a processor.
+    """
+    before, taken = _children_s(), sum(psutil.Process(process.pid).cpu_times()[:2])
+    process.send_signal(how)
+    out, err = process.communicate(timeout=300.0)
+    return (out or "") + (err or ""), _children_s() - before - taken
+
+
+def _children_s() -> float:
+    """Seconds of a processor that the children that have ended took."""
+    used = psutil.Process().cpu_times()
+    return used.children_user + used.children_system

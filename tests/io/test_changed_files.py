@@ -12,6 +12,7 @@ from store_cases import SYSTEM, one_return
 
 from mars_lidar import io
 from mars_lidar._base.files import FileError, NpyFile
+from mars_lidar._base.tolerances import TOL
 
 LIGHT = np.random.default_rng(1).random((40, 5, 60))
 
@@ -82,7 +83,7 @@ def test_a_cube_that_changes_is_not_read(tmp_path, suffix, change):
 @pytest.mark.parametrize("order", ["C", "F"])
 @pytest.mark.parametrize("shape", [(7,), (6, 5), (40, 5, 60), (9, 2, 3, 4), (0, 3)])
 def test_rows_of_a_npy_are_those_of_numpy(tmp_path, monkeypatch, shape, order):
-    monkeypatch.setattr("mars_lidar._base.files._SLAB_BYTES", 700)
+    monkeypatch.setitem(vars(TOL), "slab_bytes", 700)
     values = np.asarray(np.random.default_rng(2).random(shape), order=order)
     np.save(tmp_path / "a.npy", values)
     file = NpyFile(tmp_path / "a.npy")

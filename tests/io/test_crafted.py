@@ -15,8 +15,7 @@ from store_cases import SYSTEM, one_return
 
 import mars_lidar as ml
 from mars_lidar import io
-from mars_lidar._base.files import FileError
-from mars_lidar._base.text import read_column
+from mars_lidar._base.files import FileError, read_column
 from mars_lidar.dataset import open_dataset
 
 PATTERN = 77  # bytes of a file that is not part of the store

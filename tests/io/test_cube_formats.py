@@ -15,7 +15,7 @@ from store_cases import SYSTEM, one_return
 
 import mars_lidar as ml
 from mars_lidar import io
-from mars_lidar._base import optional
+from mars_lidar._base.imports import MissingLibraryError
 from mars_lidar.io import mat, recipe
 from mars_lidar.plot.views import incident_rate
 
@@ -249,7 +249,7 @@ def test_a_missing_library_is_named(tmp_path, monkeypatch):
     with pytest.raises(io.MissingLibraryError, match=r"a \.ptu needs the library ptufile: pip install"):
         io.simulate_to(tmp_path / "a.ptu", one_return(), SYSTEM)
     assert list(tmp_path.iterdir()) == []
-    assert issubclass(optional.MissingLibraryError, ImportError)
+    assert issubclass(MissingLibraryError, ImportError)
 
 
 @pytest.mark.parametrize("suffix", [".mat", PTU])

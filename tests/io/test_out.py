@@ -68,7 +68,7 @@ def test_labelled_arrays_that_do_not_fit_are_refused() -> None:
     array = np.zeros((2, 3, 64), np.uint16)
     with pytest.raises(TypeError, match="system must be a System"):
         ml.to_xarray(array)
-    with pytest.raises(ValueError, match="pixels of the cube"):
+    with pytest.raises(ValueError, match="pixels of the counts"):
         ml.to_xarray(array, SYSTEM, ml.Flux(1.0, 1.0, 1.0))
     with pytest.raises(ValueError, match="must be"):
         ml.to_xarray(array[..., :60], SYSTEM)

@@ -10,8 +10,8 @@ import pytest
 
 import mars_lidar as ml
 from mars_lidar import io
-from mars_lidar.io.recorder import recorded
 from mars_lidar.io.streams import files
+from mars_lidar.io.streams.recorders import recorded
 from tests.harness.command import command_line
 
 pytest.importorskip("ptufile", reason="ptufile (extra io) is not installed")
@@ -272,7 +272,7 @@ def test_scanned_image(tmp_path):
     path, counts = scanned(tmp_path)
     found = recorded(path)
     assert (found.bin_ns, found.period_ns, found.cycles) == (pytest.approx(0.5), pytest.approx(50.0), 500)
-    assert found.told == ()
+    assert found.notes == ()
     for k in range(2):
         assert np.array_equal(found.arrays[f"channel {k}"], counts[:, :, :, k])
     system = SYSTEM.replace(bins=100, cycles=500, detector=ml.Detector(dead_time_ns=0.0))

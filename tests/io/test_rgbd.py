@@ -7,8 +7,7 @@ import pytest
 from PIL import Image
 
 from mars_lidar import io
-from mars_lidar.io.rgbd import read_rgbd
-from mars_lidar.io.rgbd.layered import read_layers
+from mars_lidar.io.rgbd import read_layers, read_rgbd
 from mars_lidar.scene.scene import Scene
 from tests.harness.command import command_line
 

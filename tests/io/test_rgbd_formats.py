@@ -11,8 +11,8 @@ import pytest
 from PIL import Image
 
 from mars_lidar import io
+from mars_lidar.io.pixels import read_pfm
 from mars_lidar.io.rgbd import read_rgbd
-from mars_lidar.io.rgbd.pixels import read_pfm
 from mars_lidar.scene.scene import Scene
 from tests.harness.command import command_line
 

@@ -14,7 +14,7 @@ from store_cases import SUFFIXES, SYSTEM, one_return
 
 import mars_lidar as ml
 from mars_lidar import io
-from mars_lidar._base import memory
+from mars_lidar._base import resources as memory
 from mars_lidar.io import recipe
 
 

@@ -12,9 +12,8 @@ from scipy.io import savemat
 
 import mars_lidar as ml
 from mars_lidar import io
-from mars_lidar.io import layout
-from mars_lidar.light import stored_flux
 from mars_lidar.light.stored_flux import StoredFlux
+from mars_lidar.light.tolerances import TOL
 from tests.harness.command import command_line
 
 SYSTEM = ml.System(
@@ -37,8 +36,7 @@ def transient(tmp_path) -> io.Transient:
 @pytest.fixture
 def small_bands(monkeypatch):
     """What is larger than two rows counts as large."""
-    monkeypatch.setattr(stored_flux, "BAND_BYTES", 2 * 8 * 3 * 200)
-    monkeypatch.setattr(layout, "BAND_BYTES", 2 * 8 * 3 * 200)
+    monkeypatch.setitem(vars(TOL), "band_bytes", 2 * 8 * 3 * 200)
 
 
 def test_parts_are_those_of_the_flux_in_memory(transient):
@@ -148,9 +146,9 @@ _CHILD = """
 import resource, sys
 import mars_lidar as ml
 from mars_lidar import io
-from mars_lidar.light import stored_flux
+from mars_lidar.light.tolerances import TOL
 from mars_lidar.io import recipe
-stored_flux.BAND_BYTES = recipe.BLOCK_BYTES = 8 * 2**20
+vars(TOL)["band_bytes"] = recipe.BLOCK_BYTES = 8 * 2**20
 transient = io.read_transient(sys.argv[1])
 system = ml.System(period_ns=100.0, cycles=5, bins=64, pulse=ml.GaussianPulse(sigma_ns=1.0),
                    detector=ml.Detector(dead_time_ns=30.0))

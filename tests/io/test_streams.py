@@ -13,7 +13,7 @@ from store_cases import SYSTEM, one_return
 
 import mars_lidar as ml
 from mars_lidar import io
-from mars_lidar.io.streams import ptu_header
+from mars_lidar.io.streams import ptu
 
 
 def needs(library: str, suffix: str):
@@ -268,7 +268,7 @@ def test_nothing_is_left_of_a_stream_that_fails(tmp_path, monkeypatch):
     def interrupted(*_: object):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(ptu_header, "set_integer", interrupted)
+    monkeypatch.setattr(ptu, "set_integer", interrupted)
     with pytest.raises(KeyboardInterrupt):
         photons().save(tmp_path / "photons.ptu")
     assert list(tmp_path.iterdir()) == []

@@ -47,6 +47,22 @@ def test_names_are_random_and_files_new(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["a.bin"]
 
 
+@pytest.mark.parametrize("folder", [False, True])
+def test_a_link_put_in_its_place_while_it_is_written_is_no_success(folder, tmp_path):
+    precious = tmp_path / "precious"
+    precious.write_text("mine")
+
+    def interfere() -> None:
+        with beside(tmp_path / "a", folder=folder) as path:
+            path.rename(tmp_path / "away")
+            path.symlink_to(precious)
+
+    with pytest.raises(io.WriteError, match="replaced by another program"):
+        interfere()
+    assert precious.read_text() == "mine"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["away", "precious"]
+
+
 def test_a_file_keeps_what_it_was_where_writing_fails(tmp_path):
     target = tmp_path / "a.bin"
     target.write_text("before")

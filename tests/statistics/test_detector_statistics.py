@@ -19,12 +19,8 @@ from mars_lidar.statistics import (
     mars_moments,
     mean_histogram,
     paralyzable_moments,
-    poisson_moments,
-    poisson_pmf,
-    renewal_moments,
-    renewal_pmf,
 )
-from mars_lidar.statistics import synchronous as synchronous_module
+from mars_lidar.statistics.tolerances import TOL
 
 DEAD = [0.0, 0.4, 1.0, 1.7, 5.02, 60.0]
 GATES = {"gate": (0.303, 0.11), "wrapping gate": (0.9, 0.5), "narrow gate": (0.38, 0.002)}
@@ -190,7 +186,7 @@ def test_synchronous_law_by_its_transform(
 ):
     system, laws = view("synchronous", dead, start, cycles), []
     for terms in (0, 10**18):
-        monkeypatch.setattr(synchronous_module, "_MANY_TERMS", terms)
+        monkeypatch.setitem(vars(TOL), "synchronous_terms", terms)
         law = ml.count_law(ml.Flux(signal, background, 37.0), system)
         laws.append(np.zeros(cycles + 1))
         laws[-1][law.support] = law.pmf
@@ -281,16 +277,11 @@ def test_what_does_not_treat_a_mode_says_so(mode: str):
         "holding_time_covariance": lambda: ml.holding_time_covariance(ml.Flux(1.0, 1.0, 50.0), system),
         "mars_moments": lambda: mars_moments(ml.Flux(1.0, 1.0, 50.0), system),
         "the chain of phases": lambda: PhaseChain.from_flux(ml.Flux(1.0, 1.0, 50.0), system),
-        "renewal_moments": lambda: renewal_moments(ml.Flux(1.0, 1.0, 0.0), system),
-        "renewal_pmf": lambda: renewal_pmf(ml.Flux(1.0, 1.0, 0.0), system, [1]),
     }
     if mode != "paralyzable":
         calls["paralyzable_moments"] = lambda: paralyzable_moments(ml.Flux(1.0, 1.0, 50.0), system)
     if mode == "synchronous":
         calls["exposure_moments"] = lambda: exposure_moments(ml.Flux(1.0, 1.0, 50.0), system)
-    if mode == "gate":
-        calls["poisson_moments"] = lambda: poisson_moments(ml.Flux(1.0, 1.0, 0.0), system)
-        calls["poisson_pmf"] = lambda: poisson_pmf(ml.Flux(1.0, 1.0, 0.0), system, [1])
     for what, call in calls.items():
         with pytest.raises(ValueError) as error:
             call()

@@ -15,6 +15,7 @@ from mars_lidar.statistics.budget import LAW
 from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.histogram import mean_histogram
 from mars_lidar.statistics.phase_chain import ConvergenceError
+from mars_lidar.statistics.tolerances import TOL
 
 BINS = 150_001  # no grid of a power of two is a multiple of it
 
@@ -62,7 +63,7 @@ def test_mean_histogram(name: str, monkeypatch: pytest.MonkeyPatch):
     for method in ("exposure", "stationary"):
         found = ml.registration_pdf(flux, system, method)
         with monkeypatch.context() as patch:
-            patch.setattr(cells, "MANY_BINS", 2**20)
+            patch.setitem(vars(TOL), "many_bins", 2**20)
             longer = replace(LAW, recursion=1e9, one_pass=1e9)  # a reference may take its time
             patch.setattr("mars_lidar.statistics.histogram.LAW", longer)
             known = ml.registration_pdf(flux, system, method)
@@ -139,7 +140,7 @@ def test_light_that_cells_do_not_see():
 
 def test_covariances_of_all_bins_do_not_fit(monkeypatch: pytest.MonkeyPatch):
     """They say what to use, whatever memory the machine has."""
-    monkeypatch.setattr("mars_lidar._base.memory.available_bytes", lambda: 2**36)
+    monkeypatch.setattr("mars_lidar._base.resources.available_bytes", lambda: 2**36)
     law = ml.joint_law(ml.Flux(0.5, 0.2, 50.0), view(0.45, 100, 0.01))
     for ask in (law.covariance, law.lag, lambda: law.variance):
         with pytest.raises(MemoryError, match="window"):

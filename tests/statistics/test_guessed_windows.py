@@ -6,8 +6,7 @@ import pytest
 import mars_lidar as ml
 from mars_lidar.statistics import count_pmf as _pmf
 from mars_lidar.statistics.cells import Cells
-from mars_lidar.statistics.count_pmf import exact_windows, guessed_windows
-from mars_lidar.statistics.distance import total_variation
+from mars_lidar.statistics.count_pmf import exact_windows, guessed_windows, total_variation
 from mars_lidar.statistics.exposure import refined_moments
 
 SYSTEM = ml.System(

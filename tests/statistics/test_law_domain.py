@@ -14,13 +14,13 @@ from scipy import integrate, special, stats
 
 import mars_lidar as ml
 from mars_lidar.statistics import ConvergenceError, exposure_moments, mean_histogram
-from mars_lidar.statistics import cells as cells_module
 from mars_lidar.statistics import count_pmf as pmf_module
 from mars_lidar.statistics import exposure as exposure_module
 from mars_lidar.statistics import joint as pixel_module
 from mars_lidar.statistics.budget import LAW
 from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.joint_grid import FoldedGrid, left_over
+from mars_lidar.statistics.tolerances import TOL
 from tests.harness.law_map import disagreements, draw, laws
 
 PERIOD_NS = 100.0
@@ -76,7 +76,7 @@ def test_warm_states_by_sweeps_and_by_the_equation(
     swept = ml.count_law(ml.Flux([signal, 0.1], background, 47.0), system)
     shape = ml.registration_pdf(ml.Flux([signal, 0.1], background, 47.0), system, "stationary")
     assert swept.pmf.shape[0] == 2
-    monkeypatch.setattr(cells_module, "_WARM_PERIODS", 1)
+    monkeypatch.setitem(vars(TOL), "warm_periods", 1)
     solved = ml.count_law(ml.Flux([signal, 0.1], background, 47.0), system)
     np.testing.assert_allclose(solved.cumulants, swept.cumulants, rtol=1e-8, atol=1e-10)
     np.testing.assert_allclose(solved.pmf, swept.pmf, atol=1e-9)
@@ -172,7 +172,7 @@ def test_wide_laws_from_few_points(
     assert law.pmf.size > 256
     assert used[0] is not None
     assert np.count_nonzero(used[0]) < 100
-    monkeypatch.setattr(pmf_module, "_ALL_POINTS", 10**9)
+    monkeypatch.setitem(vars(TOL), "all_points", 10**9)
     every = ml.count_law(ml.Flux(signal, background, 50.0), system)
     assert every.pmf.size == law.pmf.size
     np.testing.assert_allclose(law.pmf, every.pmf, atol=1e-12)

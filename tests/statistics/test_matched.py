@@ -8,8 +8,7 @@ from harness import goodness, require
 from scipy import stats
 
 import mars_lidar as ml
-from mars_lidar.statistics.count_pmf import gaussian_window
-from mars_lidar.statistics.distance import Pmf, total_variation
+from mars_lidar.statistics.count_pmf import Pmf, gaussian_window, total_variation
 from mars_lidar.statistics.matched import matched_counts, matched_pmf, trusted
 from studies.__main__ import main
 from studies.common.report import MAX_FIGURE_BYTES

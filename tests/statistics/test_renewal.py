@@ -1,7 +1,10 @@
 """Holding times, their covariances and the asymptotic count law (docs/theory.md, sections 3, 4 and 6)."""
 
+from functools import partial
+
 import numpy as np
 import pytest
+from harness import armed_count_pmf, constant_rate_moments, stationary_count_pmf, system_of
 from scipy.stats import poisson
 
 import mars_lidar as ml
@@ -12,10 +15,6 @@ from mars_lidar.statistics import (
     mars_moments,
     moment_matrices,
     photons_per_bin,
-    poisson_moments,
-    poisson_pmf,
-    renewal_moments,
-    renewal_pmf,
 )
 from mars_lidar.statistics.renewal import lag_covariances, row_moments, weighted_waits
 
@@ -35,15 +34,7 @@ def bumpy(total, n=80, seed=3):
     return photons * (total / photons.sum())
 
 
-def make_system(dead_periods, cycles=1000, start="armed", sigma=0.00375):
-    return ml.System(
-        period_ns=100.0,
-        cycles=cycles,
-        bins=1024,
-        pulse=ml.GaussianPulse(sigma_ns=100.0 * sigma),
-        detector=ml.Detector(dead_time_ns=100.0 * dead_periods),
-        start=start,
-    )
+make_system = partial(system_of, bins=1024)
 
 
 @pytest.mark.parametrize(("total", "dead", "rearm"), CASES)
@@ -161,9 +152,9 @@ def test_constant_rate_closed_form(x, dead):
     assert want.sigma2 == pytest.approx(1 / rate**2, rel=5e-6)
     assert want.covariance_sum == pytest.approx(0.0, abs=1e-12 * want.mu**2)
     mean, variance = mars_moments(ml.Flux(0.0, rate), make_system(dead), bins=2048)
-    mean_renewal, variance_renewal = renewal_moments(ml.Flux(0.0, rate), make_system(dead))
-    assert mean == pytest.approx(mean_renewal, rel=1e-5)
-    assert variance == pytest.approx(variance_renewal, rel=1e-5)
+    renewal = ml.count_law(ml.Flux(0.0, rate), make_system(dead), "renewal")
+    assert mean == pytest.approx(renewal.mean, rel=1e-5)
+    assert variance == pytest.approx(renewal.variance, rel=1e-5)
 
 
 def test_no_dead_time_is_poisson():
@@ -268,30 +259,29 @@ def test_random_cells_never_give_a_negative_variance():
 
 @pytest.mark.parametrize("start", ["armed", "stationary"])
 @pytest.mark.parametrize(("rate", "dead", "cycles"), [(0.4, 0.6375, 200), (3.0, 1.7, 300), (0.05, 0.3, 40)])
-def test_renewal_pmf_has_the_closed_form_moments(start, rate, dead, cycles):
-    system = make_system(dead, cycles=cycles, start=start)
-    support = np.arange(400)
-    pmf = renewal_pmf(ml.Flux(rate, 0.0, 0.0), system, support)
-    mean, variance = renewal_moments(ml.Flux(rate, 0.0, 0.0), system, start_up=True)
+def test_the_law_of_constant_light_is_a_renewal_process(start, rate, dead, cycles):
+    """(6.4), (6.5), and the moments (6.3); the long exposure of (6.2) is off by less than half a count."""
+    system, armed = make_system(dead, cycles=cycles, start=start), start == "armed"
+    pmf = (armed_count_pmf if armed else stationary_count_pmf)(rate, dead, cycles, 400)
+    support = np.arange(pmf.size)
+    law = ml.count_law(ml.Flux(0.0, rate), system)
+    on = pmf[np.minimum(law.support, pmf.size - 1)]
+    np.testing.assert_allclose(law.pmf, on, atol=1e-9)
+    mean, variance = constant_rate_moments(rate, dead, cycles, stationary=not armed)
     assert pmf.sum() == pytest.approx(1.0, abs=1e-11)
     assert pmf @ support == pytest.approx(mean, abs=1e-8)
     assert pmf @ (support - pmf @ support) ** 2 == pytest.approx(variance, abs=1e-5)
-    plain = renewal_moments(ml.Flux(rate, 0.0, 0.0), system)
-    assert abs(plain[0] - mean) <= 0.5
+    assert abs(ml.count_law(ml.Flux(0.0, rate), system, "renewal").mean - mean) <= 0.5
 
 
-def test_baselines_without_dead_time_or_flux():
-    system, support = make_system(0.0, cycles=30), np.arange(60)
+def test_without_dead_time_the_count_is_poisson():
+    system = make_system(0.0, cycles=30)
     for start in ("armed", "stationary"):
-        pmf = renewal_pmf(ml.Flux([0.4, 0.0], [0.1, 0.0], 0.0), system.replace(start=start), support)
-        np.testing.assert_allclose(pmf[0], poisson.pmf(support, 15.0), atol=1e-13)
-        np.testing.assert_allclose(pmf[1], support == 0)
-    np.testing.assert_allclose(
-        poisson_pmf(ml.Flux(0.4, 0.1, 0.0), system, support), poisson.pmf(support, 15.0), atol=1e-14
-    )
-    mean, variance = poisson_moments(ml.Flux([0.4, 0.0], 0.1, 0.0), system)
-    np.testing.assert_allclose(mean, [15.0, 3.0])
-    np.testing.assert_allclose(variance, mean)
+        for method in ("exact", "poisson"):
+            law = ml.count_law(ml.Flux([0.4, 0.0], [0.1, 0.0], 0.0), system.replace(start=start), method)
+            np.testing.assert_allclose(law.pmf[0], poisson.pmf(law.support[0], 15.0), atol=1e-13)
+            np.testing.assert_allclose(law.pmf[1], law.support[1] == 0)
+            np.testing.assert_allclose(law.variance, law.mean)
 
 
 def test_bad_input_is_named():
@@ -305,11 +295,7 @@ def test_bad_input_is_named():
     with pytest.raises(ValueError, match="signal must lie"):
         mars_moments(ml.Flux(-1.0, 0.0, 50.0), system)
     with pytest.raises(ValueError, match="background must lie"):
-        renewal_moments(ml.Flux(1.0, -2.0, 0.0), system)
-    with pytest.raises(ValueError, match="support must be >= 0, got -1"):
-        renewal_pmf(ml.Flux(1.0, 0.0, 0.0), system, [-1, 2])
-    with pytest.raises(TypeError, match="support must be"):
-        poisson_pmf(ml.Flux(1.0, 0.0, 0.0), system, [0.5])
+        mars_moments(ml.Flux(1.0, -2.0, 0.0), system)
     with pytest.raises(ValueError, match="bins must be at most"):
         moment_matrices(PhaseChain(np.full(9000, 1e-4), 0.5))
     terms = holding_time_covariance(ml.Flux(1.0, 1.0, 50.0), system, bins=32)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mars_lidar.statistics.distance import Pmf
+from mars_lidar.statistics.count_pmf import Pmf
 from studies.compare.sample import Moments, Sample, law_distance, ratio, shape_distance
 
 

@@ -13,8 +13,8 @@ import mars_lidar as ml
 from mars_lidar.instrument.effects import EFFECTS
 from mars_lidar.reconstruction.histogram_bound import _variances
 from mars_lidar.statistics import ConvergenceError
-from mars_lidar.statistics.distance import neighbours
 from studies.__main__ import main
+from studies.common.distance import neighbours
 from studies.common.report import MAX_FIGURE_BYTES
 from studies.domain import judge as judging
 from studies.domain import verdict

@@ -9,7 +9,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from mars_lidar._base.optional import needed
+from mars_lidar._base.imports import needed
 
 _URL = re.compile(r"^((?:[A-Za-z][\w+.-]*::)*[A-Za-z][\w+.-]+):/+(.*)$")  # a drive, C:\, is none
 

@@ -29,18 +29,14 @@ from numpy.typing import NDArray
 
 from mars_lidar._base import mat5
 from mars_lidar._base.buckets import in_bucket
-from mars_lidar._base.memory import check_memory
+from mars_lidar._base.resources import check_memory
 from mars_lidar._base.sparse import check_sparse, is_sparse
+from mars_lidar._base.tolerances import TOL
 
 if TYPE_CHECKING:
     from numpy.lib.npyio import NpzFile
 
 LIMIT = "MARS_LIDAR_READ_GIB"  # of the environment: what the arrays of one file may take in memory
-_FEW_CHUNKS, _CHUNK_ENTRY = 10_000, 4  # of HDF5: so many anywhere; bytes of a file that each of more takes at least
-_SLAB_BYTES = 16 * 2**20  # of a .npy that is read in passes
-_TIMES = 512  # without it: so many times the file, or, if that is more, what follows
-_LEAST_IN_PARTS, _LEAST_WHOLE = 512 * 2**20, 64 * 2**20  # bytes
-_SMALL_FILE, _MOST_OF_SMALL = 10**6, 128 * 2**20  # no smaller file takes more memory than this before it is refused
 INCOMPLETE_SUFFIX = ".incomplete"  # of the sibling that a file is written to, after eight random digits
 _UNFINISHED = re.compile(r"(\.[0-9a-f]{8})?\.incomplete$")
 
@@ -98,6 +94,7 @@ def beside(target: Path, *, folder: bool = False) -> Iterator[Path]:
     """
     _remove_leftovers(target)
     path = _created(target, folder)
+    created = os.lstat(path)
 
     def removed() -> str:
         _remove(path)
@@ -107,10 +104,18 @@ def beside(target: Path, *, folder: bool = False) -> Iterator[Path]:
         with contextlib.suppress(OSError):  # a file system without locks: leftovers are then nobody's to remove
             lock.enter_context(_held(path))
         yield path
+        if not os.path.samestat(os.lstat(path), created):  # in a shared folder, perhaps by a link
+            raise FileExistsError(f"{path} was replaced by another program while it was being written")
         if folder:
             exchange(path, target)
         else:
             os.replace(path, target)
+
+
+def write_text(target: Path, text: str) -> None:
+    """Write a file of text, whole or not at all; one at `target` is replaced."""
+    with beside(target) as unfinished:
+        unfinished.write_text(text, encoding="utf-8")
 
 
 def _remove_leftovers(target: Path) -> None:
@@ -363,9 +368,9 @@ def check_claim(path: Path, nbytes: float, what: str = "its arrays", *, in_parts
 def _packed_limit(size: int, in_parts: bool) -> int:
     """Bytes that the arrays of a file of this size may claim."""
     if in_parts:
-        return max(_LEAST_IN_PARTS, _TIMES * size)
-    limit = max(_LEAST_WHOLE, _TIMES * size)
-    return limit if size >= _SMALL_FILE else min(limit, _MOST_OF_SMALL)
+        return max(TOL.least_in_parts, TOL.packed * size)
+    limit = max(TOL.least_whole, TOL.packed * size)
+    return limit if size >= TOL.small_file else min(limit, TOL.most_of_small)
 
 
 @contextlib.contextmanager
@@ -442,7 +447,7 @@ class NpyFile:
         """Rows of an array whose first axis varies fastest: the whole file passes, in slabs."""
         height, each = self.shape[0], math.prod(self.shape[1:])
         values = np.empty((each, last - first), self.dtype)
-        step = max(1, _SLAB_BYTES // max(1, height * self.dtype.itemsize))
+        step = max(1, TOL.slab_bytes // max(1, height * self.dtype.itemsize))
         for k in range(0, each, step):
             lines = min(step, each - k)
             values[k : k + lines] = self._next(stream, lines * height).reshape(lines, height)[:, first:last]
@@ -495,7 +500,7 @@ def check_data(path: Path, data: Any, name: str, *, in_parts: bool = False) -> N
         check_inside(path, data)
         steps = zip(data.shape, data.chunks or data.shape, strict=True)
         count = math.prod(-(-size // max(1, step)) for size, step in steps)
-        if count > max(_FEW_CHUNKS, size_on_disk(path) // _CHUNK_ENTRY):
+        if count > max(TOL.listed_chunks, size_on_disk(path) // TOL.chunk_entry):
             raise FileError(f"{path}: {name} would have {count} chunks, more than it can list: is it damaged?")
     check_claim(path, math.prod(data.shape) * data.dtype.itemsize, name, in_parts=in_parts)
 
@@ -550,3 +555,20 @@ def _check_sparse_within(name: str, value: Any) -> None:
                 _check_sparse_within(f"{name}.{field}", value[field])
     elif is_sparse(value):
         check_sparse(name, value, sorted_rows=True)
+
+
+def read_column(path: Path) -> NDArray[np.float64]:
+    """The last of one or two columns of numbers in a text file, below lines of words; else a ValueError."""
+    check_claim(path, 64 * path.stat().st_size)
+    rows: list[list[float]] = []
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+        try:
+            rows.append([float(part) for part in line.replace(",", " ").replace(";", " ").split()])
+        except ValueError:
+            like_numbers = all(part[0] in "+-.0123456789" for part in line.replace(",", " ").replace(";", " ").split())
+            if rows or like_numbers:  # lines of words are only above the numbers
+                raise ValueError(f"line {line[:40]!r} holds no numbers") from None
+    rows = [row for row in rows if row]
+    if not rows or {len(row) for row in rows} not in ({1}, {2}):
+        raise ValueError("numbers as text are one column, or times and values")
+    return np.asarray(rows)[:, -1]

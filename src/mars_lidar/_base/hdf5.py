@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.files import FileError, check_inside, reading, whole
+from mars_lidar._base.tolerances import TOL
 
 if TYPE_CHECKING:
     import h5py
@@ -28,8 +29,6 @@ if TYPE_CHECKING:
 SEAL = "sha256"  # the attribute of a file
 CELLS = "#refs#"  # where MATLAB puts what the cells of a v7.3 file hold
 LIBVER = ("v110", "v110")  # HDF5 1.10, of 2016, on: from there all metadata carry checksums, indices of chunks as well
-_DEEPEST = 100  # groups within groups
-_CHUNK_BYTES = 2**20  # HDF5's default chunk cache
 _HEAP = b"GCOL\1\0\0\0"  # begins a collection of texts in HDF5
 # of dimension scales: references, which no reader of ours follows
 _SCALES = {"CLASS", "NAME", "DIMENSION_LIST", "REFERENCE_LIST", "DIMENSION_LABELS"}
@@ -123,8 +122,8 @@ def _links(file: h5py.File) -> list[tuple[str, int]]:
     links: list[tuple[str, int]] = []
 
     def add(name: bytes, info: Any) -> None:
-        if name.count(b"/") > _DEEPEST:
-            raise ValueError(f"it has groups more than {_DEEPEST} deep")
+        if name.count(b"/") > TOL.nested:
+            raise ValueError(f"it has groups more than {TOL.nested} deep")
         links.append((name.decode("utf-8", "replace"), info.type))
 
     file.id.links.visit(add, info=True)
@@ -159,7 +158,7 @@ def with_checksums(shape: tuple[int, ...], dtype: Any) -> dict[str, Any]:
         return {}
     chunk, nbytes = [1] * len(shape), np.dtype(dtype).itemsize
     for axis in reversed(range(len(shape))):
-        chunk[axis] = max(1, min(shape[axis], _CHUNK_BYTES // nbytes))
+        chunk[axis] = max(1, min(shape[axis], TOL.chunk_cache // nbytes))
         nbytes *= chunk[axis]
     return {"chunks": tuple(chunk), "fletcher32": True} if shape else {}
 

@@ -23,13 +23,13 @@ from typing import Any
 
 from mars_lidar._base.buckets import in_bucket, put, sizes
 from mars_lidar._base.files import FileError, check_claim, reading, replacing
+from mars_lidar._base.tolerances import TOL
 
 NAME = "manifest.sha256"
 _ROOT = "zarr.json"
 _SMALL = re.compile(r"(^|/)zarr\.json$|^[^/]+/c/\d+$")  # documents, and arrays of one dimension: coordinates
 _CHUNK = re.compile(r"(^|/)c([/.]\d+)+$")
 SUM = "manifest_sha256"  # attribute of the root document: the the sum over the lines of all other files
-_THREADS = 4  # hashing runs without Python's lock
 
 
 def seal(store: Path, attrs: dict[str, Any], digests: Mapping[str, str] | None = None) -> None:
@@ -45,7 +45,7 @@ def seal(store: Path, attrs: dict[str, Any], digests: Mapping[str, str] | None =
     names = sorted(_files(store) - {_ROOT, NAME})
     sums = {name: digests[name] for name in names if name in digests} if digests else {}
     others = [name for name in names if name not in sums]
-    with ThreadPoolExecutor(_THREADS) as pool:
+    with ThreadPoolExecutor(TOL.hash_threads) as pool:
         sums.update(zip(others, pool.map(lambda name: _hash(store / name), others), strict=True))
     document["attributes"][SUM] = _sum(sums)
     root = json.dumps(document, indent=2).encode()
@@ -236,7 +236,7 @@ def compared(
         yield from (f"{name} is not in its {NAME}" for name in sorted(more - set(sums)))
     known = set(sums) if there is None else there
     names = sorted(name for name in sums if name in known and (every or _SMALL.search(name)))
-    with ThreadPoolExecutor(_THREADS) as pool:
+    with ThreadPoolExecutor(TOL.hash_threads) as pool:
         digests = list(pool.map(digest, names))
     yield from (
         f"{name} is not as it was written" for name, now in zip(names, digests, strict=True) if sums[name] != now

@@ -10,16 +10,20 @@ import struct
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from enum import IntEnum
 from pathlib import Path
 
+from mars_lidar._base.tolerances import TOL
+
 _VALUES = frozenset({1, 2, 3, 4, 5, 6, 7, 9, 12, 13, 16, 17, 18})  # numbers and characters
-_MATRIX, _COMPRESSED = 14, 15
-_HEADER = 128
-_HEAD = 2**10  # more than tags, flags, 32 axes and a name take
-_DEEPEST = 100  # matrices within cells within structures
 _CLASSES = {1: "cell", 2: "struct", 3: "object", 4: "char", 5: "sparse", **dict.fromkeys(range(6, 16), "numbers")}
-# elements of a file, beside one for each of its bytes: half a million empty cells, which take 2 s and 100 MiB to read
-_MOST_ELEMENTS = 2_500_000
+
+
+class _Kind(IntEnum):
+    """Types of elements that contain others."""
+
+    MATRIX = 14
+    COMPRESSED = 15
 
 
 @dataclass(frozen=True)
@@ -44,12 +48,12 @@ class Variable:
         if not start:
             return self._path.read_bytes()
         with open(self._path, "rb") as stream:
-            header = stream.read(_HEADER)
+            header = stream.read(TOL.mat_header)
             stream.seek(start)
             content = stream.read(size)
             if len(content) < size:
                 raise _unreadable("it is cut short")
-        if kind != _COMPRESSED:
+        if kind != _Kind.COMPRESSED:
             content = struct.pack(self._order + "II", kind, size) + content
         else:
             unpacker = zlib.decompressobj()
@@ -57,14 +61,14 @@ class Variable:
             rest = unpacker.decompress(unpacker.unconsumed_tail, 1)  # compares the checksum at the end
             if len(content) < self.size or rest or not unpacker.eof:
                 raise _unreadable(f"{self.name!r} does not unpack to its {self.size} bytes")
-        _check(content, self._order, _MOST_ELEMENTS + start + size)
+        _check(content, self._order, TOL.mat_elements + start + size)
         return header + content
 
 
 def variables(path: Path) -> list[Variable]:
     """Heads of all variables of a file of version 5 or 4, of which only the first bytes are unpacked."""
     with open(path, "rb") as stream:
-        header = stream.read(_HEADER)
+        header = stream.read(TOL.mat_header)
     if len(header) >= 4 and 0 in header[:4]:  # version 4, which has no elements
         from scipy.io import whosmat
 
@@ -76,17 +80,17 @@ def variables(path: Path) -> list[Variable]:
 
 def _variables(path: Path, order: str) -> Iterator[Variable]:
     end = path.stat().st_size
-    if end < _HEADER:
+    if end < TOL.mat_header:
         raise _unreadable("it is cut short")
     with open(path, "rb") as stream:
-        stream.seek(_HEADER)
+        stream.seek(TOL.mat_header)
         while tag := stream.read(8):
             start = stream.tell()
             kind, size = struct.unpack(order + "II", tag.ljust(8, b"\0"))
             if len(tag) < 8 or start + size > end:
                 raise _unreadable("it is cut short")
-            first = stream.read(min(size, 4 * _HEAD))
-            content = zlib.decompressobj().decompress(first, _HEAD) if kind == _COMPRESSED else tag + first
+            first = stream.read(min(size, 4 * TOL.mat_head))
+            content = zlib.decompressobj().decompress(first, TOL.mat_head) if kind == _Kind.COMPRESSED else tag + first
             name, of_class, shape, unpacked = _head(content, order)
             yield Variable(name, of_class, shape, unpacked, path, (kind, start, size), order)
             stream.seek(start + size)
@@ -95,7 +99,7 @@ def _variables(path: Path, order: str) -> Iterator[Variable]:
 def _head(content: bytes, order: str) -> tuple[str, str, tuple[int, ...], int]:
     """Name, class, shape and size of a variable; of what is no matrix the name is empty."""
     kind, size = struct.unpack(order + "II", content[:8].ljust(8, b"\0"))
-    if kind != _MATRIX:
+    if kind != _Kind.MATRIX:
         return "", "", (), 8 + size
     flags, place = _values(content, 8, order)
     axes, place = _values(content, place, order)
@@ -118,7 +122,7 @@ def _values(content: bytes, place: int, order: str) -> tuple[bytes, int]:
     if kind >> 16:
         return tag[4 : 4 + min(kind >> 16, 4)], place + 8
     end = place + 8 + size
-    if end > len(content) and size > _HEAD // 2:
+    if end > len(content) and size > TOL.mat_head // 2:
         raise _unreadable(f"the head of a variable takes {size} bytes")
     return content[place + 8 : end], end + -size % 8
 
@@ -135,9 +139,9 @@ def _check(content: bytes, order: str, most: int) -> None:
             place, end = end, ends.pop()
         kind, size = unpack(content, place)
         place += 8
-        if kind == _MATRIX:
-            if len(ends) > _DEEPEST:
-                raise ValueError(f"holds cells or structures more than {_DEEPEST} deep")
+        if kind == _Kind.MATRIX:
+            if len(ends) > TOL.nested:
+                raise ValueError(f"holds cells or structures more than {TOL.nested} deep")
             ends.append(end)
             end = min(end, place + size)
         elif kind in _VALUES:

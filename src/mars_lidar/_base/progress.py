@@ -6,12 +6,8 @@ import sys
 import time
 from typing import Any
 
+from mars_lidar._base.tolerances import TOL
 from mars_lidar._base.types import Progress
-
-_PATIENCE_S = 0.5  # a line that would vanish at once is not drawn
-_OFTEN_S, _SELDOM_S = 0.2, 30.0  # between lines on a terminal, and in a log
-LONG_S = 10.0
-"""Seconds; a longer run is announced before it starts, or as soon as its time is known."""
 
 
 def callback_of(progress: Any, label: str) -> Progress | None:
@@ -55,16 +51,16 @@ class Bar:
         now = time.monotonic()
         spent = now - self._began
         if self._before is None:
-            self._before = done if done < total and spent < _PATIENCE_S else 0
+            self._before = done if done < total and spent < TOL.patience_s else 0
         if done >= total:
             self.close()
-        elif self._live and done and spent > _PATIENCE_S and now - self._last > _OFTEN_S:
+        elif self._live and done and spent > TOL.patience_s and now - self._last > TOL.often_s:
             self._last = now
             text = self._text(done, total, spent)
             sys.stderr.write("\r" + text.ljust(self._width))
             sys.stderr.flush()
             self._width = len(text)
-        elif not self._live and (now - self._last > _SELDOM_S or self._first_is_due(done, total, spent)):
+        elif not self._live and (now - self._last > TOL.seldom_s or self._first_is_due(done, total, spent)):
             self._last, self._warned = now, True
             print(f"mars-lidar: {self._text(done, total, spent)}", file=sys.stderr, flush=True)
 
@@ -77,7 +73,7 @@ class Bar:
 
     def _first_is_due(self, done: int, total: int, spent: float) -> bool:
         own, rest = done - (self._before or 0), total - (self._before or 0)
-        return not self._warned and own > 0 and own >= 0.05 * rest and spent > 2.0 and spent * rest / own > LONG_S
+        return not self._warned and own > 0 and own >= 0.05 * rest and spent > 2.0 and spent * rest / own > TOL.long_s
 
     def _text(self, done: int, total: int, spent: float) -> str:
         own = done - (self._before or 0)

@@ -8,16 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base import checks
+from mars_lidar._base.tolerances import TOL
 from mars_lidar._base.types import FloatArray
-
-MAX_SIDE = 1 << 13
 
 
 def image_size(size: Any) -> tuple[int, int]:
     """(height, width), checked."""
     if len(size) != 2:
         raise ValueError(f"size must be one integer or (height, width), got {size!r}")
-    height, width = (checks.integer("size", n, low=1, high=MAX_SIDE) for n in size)
+    height, width = (checks.integer("size", n, low=1, high=TOL.image_side) for n in size)
     return height, width
 
 
@@ -25,7 +24,7 @@ def new_size(size: Any, old: tuple[int, int]) -> tuple[int, int]:
     """(H, W) that `size` means for an image of size `old`: as given, or the longer side with the aspect ratio kept."""
     if isinstance(size, tuple | list):
         return image_size(size)
-    longer = checks.integer("size", size, low=1, high=MAX_SIDE)
+    longer = checks.integer("size", size, low=1, high=TOL.image_side)
     height, width = (max(1, round(longer * n / max(old))) for n in old)
     return height, width
 

@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.tolerances import TOL
+
 _COMPRESSED, _EXPANDED = ("csr", "csc", "bsr"), ("coo", "dia")
-_MOST = 2**32  # counts of 32 bits
 
 
 def is_sparse(value: Any) -> bool:
@@ -62,5 +63,5 @@ def _counts_type(matrix: Any) -> np.dtype[Any]:
     if data is None or stored.kind not in "iuf" or (matrix.format == "coo" and not matrix.has_canonical_format):
         return stored
     with np.errstate(invalid="ignore"):
-        are_counts = bool(((data >= 0) & (data == np.floor(data))).all()) and float(data.sum()) < _MOST
+        are_counts = bool(((data >= 0) & (data == np.floor(data))).all()) and float(data.sum()) < TOL.counts
     return np.dtype(np.uint32) if are_counts and stored.itemsize > 4 else stored

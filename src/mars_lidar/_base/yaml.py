@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from mars_lidar._base.files import FileError, reading
+from mars_lidar._base.tolerances import TOL
 
 Key = tuple[str | int, ...]  # ("scenes", 0, "path")
 Lines = dict[Key, int]
@@ -29,7 +30,6 @@ _SCALARS = {  # of the core schema, YAML 1.2.2, 10.3.2, with the characters that
         list("-+.0123456789"),
     ),
 }
-_MOST_BYTES, _MOST_NODES = 2**20, 2**17  # PyYAML reads a megabyte in 10 s
 
 
 class RecipeError(ValueError):
@@ -68,13 +68,13 @@ def opened(path: Path) -> Iterator[tuple[Any, Any]]:
     import yaml
 
     with reading(path, "YAML"):
-        if path.stat().st_size > _MOST_BYTES:
-            raise ValueError(f"{path}: a YAML file may have {_MOST_BYTES} bytes, got {path.stat().st_size}")
+        if path.stat().st_size > TOL.yaml_bytes:
+            raise ValueError(f"{path}: a YAML file may have {TOL.yaml_bytes} bytes, got {path.stat().st_size}")
         made = loader()(path.read_text(encoding="utf-8-sig"))
         try:
             node = made.get_single_node()
-            if _expanded(node, {}) > _MOST_NODES:
-                raise ValueError(f"{path}: may have {_MOST_NODES} values, its aliases (*) counted where they stand")
+            if _expanded(node, {}) > TOL.yaml_nodes:
+                raise ValueError(f"{path}: may have {TOL.yaml_nodes} values, its aliases (*) counted where they stand")
             yield made, node
         except yaml.MarkedYAMLError as error:
             line = "" if error.problem_mark is None else f":{error.problem_mark.line + 1}"
@@ -86,7 +86,7 @@ def opened(path: Path) -> Iterator[tuple[Any, Any]]:
 def _expanded(node: Any, known: dict[int, int]) -> int:
     """Number of nodes below this one; those of an alias count each time it is used."""
     if id(node) not in known:
-        known[id(node)] = _MOST_NODES + 1  # of a node that contains itself
+        known[id(node)] = TOL.yaml_nodes + 1  # of a node that contains itself
         inner = getattr(node, "value", None)
         children = inner if isinstance(inner, list) else []
         known[id(node)] = 1 + sum(

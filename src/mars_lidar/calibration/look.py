@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mars_lidar._base.brief import brief
+from mars_lidar._base.display import brief
 from mars_lidar._base.types import FloatArray
 from mars_lidar.calibration.periodicity import other_period
 from mars_lidar.calibration.recording import Recording

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
-from cyclopts import Parameter
 
 from mars_lidar._base import checks
 from mars_lidar._base.files import read_npy
@@ -15,36 +13,38 @@ from mars_lidar._base.types import FloatArray
 from mars_lidar.calibration import Calibration, CubeCalibration, calibrate_cube
 from mars_lidar.calibration import calibrate as calibrated
 from mars_lidar.calibration.calibration import GIVEN
-from mars_lidar.cli.console import MISFIT, check_picture, refuse_existing, save_picture, table
-from mars_lidar.cli.options import (
-    Integer,
-    Number,
-    Text,
-    argument,
-    command,
-    examples,
-    out_option,
-    output_option,
-    stream_option,
-    system_option,
-    two_integers,
-)
+from mars_lidar.cli.console import Exit, check_picture, refuse_existing, save_picture, table
+from mars_lidar.cli.options import Integer, Number, OutPath, Text, command, options, two
 from mars_lidar.cli.system_options import FittedPulseOptions
 from mars_lidar.instrument.pulse import Pulse, SampledPulse
-from mars_lidar.instrument.system import MAX_CYCLES, SPEED_OF_LIGHT_M_PER_NS, System
+from mars_lidar.instrument.system import SPEED_OF_LIGHT_M_PER_NS, System
+from mars_lidar.instrument.tolerances import TOL
 from mars_lidar.light.timestamps import Timestamps
 
 
-@Parameter(name="*")
-@dataclass(frozen=True, kw_only=True)
+@options
 class StreamOptions:
-    """One pixel of a photon stream; None: as the file has it."""
+    """One pixel of a photon stream; None: as the file has it.
 
-    pixel: Annotated[Text | None, stream_option("Pixel (channel c is 0,c).", "the brightest", metavar="Y,X")] = None
-    period_ns: Annotated[Number | None, stream_option("Laser period, ns, where the file does not have it.")] = None
-    bins: Annotated[Integer | None, stream_option("Histogram bins of the period.", "the file's clock")] = None
-    unit_ns: Annotated[Number | None, stream_option("Unit of the times in a .mat or .npz, ns.")] = None
-    variable: Annotated[Text | None, stream_option("Variable of a .mat or .npz that holds the times.")] = None
+    Stream
+    ------
+    pixel : Y,X
+        Pixel (channel c is 0,c). [default: the brightest]
+    period_ns
+        Laser period, ns, where the file does not have it.
+    bins
+        Histogram bins of the period. [default: the file's clock]
+    unit_ns
+        Unit of the times in a .mat or .npz, ns.
+    variable
+        Variable of a .mat or .npz that holds the times.
+    """
+
+    pixel: Text | None = None
+    period_ns: Number | None = None
+    bins: Integer | None = None
+    unit_ns: Number | None = None
+    variable: Text | None = None
 
     def arrivals(self, stream: Path) -> tuple[FloatArray, float, list[tuple[str, str]]]:
         """Times (n,) and clock unit, ns, of a recording without a laser, and rows that describe the file."""
@@ -54,7 +54,7 @@ class StreamOptions:
         channels, counts = np.unique(recording.detector[recording.detector >= 0], return_counts=True)
         if not channels.size:
             raise ValueError(f"{stream} holds no photons")
-        y, x = (0, int(channels[counts.argmax()])) if self.pixel is None else two_integers("--pixel", self.pixel)
+        y, x = (0, int(channels[counts.argmax()])) if self.pixel is None else two("--pixel", self.pixel)
         if y != 0 or x not in channels:
             raise ValueError(f"--pixel must be 0,C with a channel C of {', '.join(map(str, channels))}, got ({y}, {x})")
         times = recording.clock[recording.detector == x].astype(np.float64) * recording.clock_ns
@@ -63,7 +63,7 @@ class StreamOptions:
 
     def load(self, stream: Path) -> tuple[Timestamps, list[tuple[str, str]]]:
         """The stream of one pixel, and rows that describe file and pixel."""
-        asked = None if self.pixel is None else two_integers("--pixel", self.pixel)
+        asked = None if self.pixel is None else two("--pixel", self.pixel)
         times = Timestamps.load(
             stream, period_ns=self.period_ns, bins=self.bins, unit_ns=self.unit_ns, variable=self.variable
         )
@@ -82,23 +82,28 @@ class StreamOptions:
         return pixel, rows
 
 
-@Parameter(name="*")
-@dataclass(frozen=True, kw_only=True)
+@options
 class KnownOptions:
-    """What is known of pulse and detector, and the shape of the light."""
+    """What is known of pulse and detector, and the shape of the light.
 
-    given: Annotated[
-        list[Text] | None,
-        system_option(
-            f"A known value, which is not fitted, NAME=VALUE, once for each; {', '.join(GIVEN)}.", metavar="NAME=VALUE"
-        ),
-    ] = None
-    system: Annotated[
-        Path | None, system_option("YAML or JSON file with a known pulse and detector, in place of --given.")
-    ] = None
+    System
+    ------
+    given : NAME=VALUE
+        A known value, which is not fitted, NAME=VALUE, once for each; dead_time_ns, jitter_ns, pulse_sigma_ns, mode,
+        afterpulse_probability, afterpulse_delay_ns, twilight_ns, recovery_ns, electronics_dead_time_ns.
+    system
+        YAML or JSON file with a known pulse and detector, in place of --given.
+    free
+        Any shape of light, bin by bin: fluorescence, haze, many surfaces.
+    returns
+        Returns (surfaces) in the pixel. [default: 1]
+    """
+
+    given: list[Text] | None = None
+    system: Path | None = None
     pulse: FittedPulseOptions = FittedPulseOptions()
-    free: Annotated[bool, system_option("Any shape of light, bin by bin: fluorescence, haze, many surfaces.")] = False
-    returns: Annotated[Integer, system_option("Returns (surfaces) in the pixel.", "1")] = 1
+    free: bool = False
+    returns: Integer = 1
 
     def known(self) -> System | dict[str, Any] | None:
         """The argument `given` of `calibrate`."""
@@ -129,43 +134,60 @@ class KnownOptions:
         return "free" if self.free else pulse or "gaussian"
 
 
-CALIBRATE_EXAMPLES = examples(
-    "mars-lidar calibrate lab.ptu --look",
-    "mars-lidar calibrate lab.ptu -o lab.yaml --picture lab.png",
-    "mars-lidar calibrate lab.ptu --given dead_time_ns=50 --given jitter_ns=0.1",
-    "mars-lidar calibrate photons.mat --variable tPhoton --unit-ns 0.064 --period-ns 50.048 --free",
-    "mars-lidar calibrate lab.ptu --pixel 0,2 --pulse-file irf.npy --pulse-bin-ns 0.008 --cycles 9975",
-    "mars-lidar calibrate face.npy --system lab.yaml -o face.yaml",
-    notes="Exit code 3 where the model does not fit the stream. docs/calibration.md has the whole recipe.",
-)
 _UNITS = {"signal": " photons per period", "background": " photons per period", "light": " photons per period"}
 
 
 def calibrate(
-    stream: Annotated[
-        Path,
-        argument(
-            "Photon stream: .ptu, .pt2, .pt3, .ht2, .ht3, .t3r, .spc, Photon-HDF5, .mat, .npz; or a cube: .zarr, .npy."
-        ),
-    ],
+    stream: Path,
     /,
     *,
     source: StreamOptions = StreamOptions(),
     known: KnownOptions = KnownOptions(),
-    look: Annotated[bool, output_option("Describe the file and stop before the fit.")] = False,
-    seed: Annotated[Integer, output_option("Seed of the simulated streams.", "0")] = 0,
-    out: Annotated[Path | None, out_option("The calibrated system, .yaml or .json, to simulate with.")] = None,
-    picture: Annotated[Path | None, output_option("A picture: .png, .pdf or .svg.")] = None,
-    cycles: Annotated[
-        Integer | None, output_option("Laser periods of a realization: compare the law of their counts too.")
-    ] = None,
-    overwrite: Annotated[bool, output_option("Replace existing files.")] = False,
+    look: bool = False,
+    seed: Integer = 0,
+    out: OutPath | None = None,
+    picture: Path | None = None,
+    cycles: Integer | None = None,
+    overwrite: bool = False,
 ) -> int | None:
     """Fit light and detector to a measured photon stream.
 
     Each estimate has a standard error; a verdict says whether the model fits, and what is suspect where it does not.
     Only what --given states is assumed; of a simulated stream only the photons are used. Without a laser: dead
     time, jitter and afterpulses in constant light. Of a cube: dead time and pulse width that its pixels share.
+
+    Arguments
+    ---------
+    stream
+        Photon stream: .ptu, .pt2, .pt3, .ht2, .ht3, .t3r, .spc, Photon-HDF5, .mat, .npz; or a cube: .zarr, .npy.
+
+    Output
+    ------
+    look
+        Describe the file and stop before the fit.
+    seed
+        Seed of the simulated streams. [default: 0]
+    out
+        The calibrated system, .yaml or .json, to simulate with.
+    picture
+        A picture: .png, .pdf or .svg.
+    cycles
+        Laser periods of a realization: compare the law of their counts too.
+    overwrite
+        Replace existing files.
+
+    Examples
+    --------
+    mars-lidar calibrate lab.ptu --look
+    mars-lidar calibrate lab.ptu -o lab.yaml --picture lab.png
+    mars-lidar calibrate lab.ptu --given dead_time_ns=50 --given jitter_ns=0.1
+    mars-lidar calibrate photons.mat --variable tPhoton --unit-ns 0.064 --period-ns 50.048 --free
+    mars-lidar calibrate lab.ptu --pixel 0,2 --pulse-file irf.npy --pulse-bin-ns 0.008 --cycles 9975
+    mars-lidar calibrate face.npy --system lab.yaml -o face.yaml
+
+    Notes
+    -----
+    Exit code 3 where the model does not fit the stream. docs/calibration.md has the whole recipe.
     """
     from mars_lidar.io.streams.photons import NoLaserError
 
@@ -178,13 +200,11 @@ def calibrate(
             raise ValueError("--out needs a fitted pulse: leave out --free and --look, or --out")
         refuse_existing(out, overwrite)
     if cycles is not None:
-        checks.integer("--cycles", cycles, low=1, high=MAX_CYCLES)
+        checks.integer("--cycles", cycles, low=1, high=TOL.cycles)
     if cube:
         if look or cycles is not None or known.given or known.pulse.build() is not None or known.returns != 1:
             raise ValueError("a cube takes --system, --free, --out and --picture: its options are not a stream's")
-        if not _cube(stream, known, out, picture).fits:
-            return MISFIT
-        return None
+        return None if _cube(stream, known, out, picture).fits else Exit.MISFIT
     given, shape = known.known(), known.shape()
     try:
         times, rows = source.load(stream)
@@ -197,8 +217,7 @@ def calibrate(
     table(rows + look_rows(result) + ([] if look else fit_rows(result)))
     written = []
     if cycles is not None and not look:
-        counts = result.realizations(cycles)
-        table([("counts", str(counts))])
+        table([("counts", str(result.realizations(cycles)))])
     if out is not None and result.system is not None:
         result.system.save(out)
         written.append(("wrote", str(out)))
@@ -209,9 +228,7 @@ def calibrate(
         written.append(("picture", str(picture)))
     if written:
         table(written)
-    if not look and not result.fits:
-        return MISFIT
-    return None
+    return None if look or result.fits else Exit.MISFIT
 
 
 def _cube(path: Path, known: KnownOptions, out: Path | None, picture: Path | None) -> CubeCalibration:
@@ -236,12 +253,8 @@ def _cube(path: Path, known: KnownOptions, out: Path | None, picture: Path | Non
     if isinstance(result.system.pulse, SampledPulse) and result.response_error is not None:
         pulse = result.system.pulse
         worst = 100.0 * float(result.response_error.max() / pulse.values.max())
-        rows.append(
-            (
-                "response",
-                f"{pulse.values.size} samples of {pulse.bin_ns:.5g} ns, errors up to {worst:.2g} % of its peak",
-            )
-        )
+        samples = f"{pulse.values.size} samples of {pulse.bin_ns:.5g} ns"
+        rows.append(("response", f"{samples}, errors up to {worst:.2g} % of its peak"))
     verdict = "their histograms fit" if result.fits else "their histograms do NOT fit: another return, or an effect"
     rows.append(("verdict", f"{100 * result.misfits:.3g} % of {result.p_values.size} pixels have p < 1 %: {verdict}"))
     table(rows)
@@ -301,4 +314,4 @@ def fit_rows(result: Calibration) -> list[tuple[str, str]]:
     return [*rows, ("verdict", result.verdict)]
 
 
-calibrate_command = command(calibrate, CALIBRATE_EXAMPLES)
+calibrate_command = command(calibrate)

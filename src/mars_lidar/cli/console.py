@@ -9,6 +9,7 @@ import re
 import sys
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
+from enum import IntEnum
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -27,8 +28,6 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-FAILED, BAD_INPUT, MISFIT, INTERRUPTED = 1, 2, 3, 130
-_PIPE = 250  # columns of output that is piped or written to a file
 _FIELDS = {  # arguments of the package and the options that give them under another name
     "sigma_ns": "pulse_sigma_ns",
     "fwhm_ns": "pulse_fwhm_ns",
@@ -40,6 +39,15 @@ _FIELDS = {  # arguments of the package and the options that give them under ano
     "start_ns": "transient_start_ns",
     "bin_ns": "transient_bin_ns",
 }
+
+
+class Exit(IntEnum):
+    """Exit codes besides 0."""
+
+    FAILED = 1
+    BAD_INPUT = 2
+    MISFIT = 3  # of a model
+    INTERRUPTED = 130
 
 
 def say(message: str) -> None:
@@ -65,35 +73,35 @@ def run(app: App, tokens: Sequence[str]) -> int:
             code = app(tokens, exit_on_error=False, print_error=False, result_action="return_value")
             sys.stdout.flush()
         asked = command.default_command or any(token.startswith("-") for token in tokens)
-        return code or (0 if asked else BAD_INPUT)
+        return code or (0 if asked else Exit.BAD_INPUT)
     except wrong.MissingArgumentError as error:
         if list(tokens) == list(error.command_chain or ()):  # the command alone: its help
             app.help_print(tokens)
         else:
             say(usage_message(error, app.name[0]))
-        return BAD_INPUT
+        return Exit.BAD_INPUT
     except wrong.CycloptsError as error:
         say(usage_message(error, app.name[0]))
-        return BAD_INPUT
+        return Exit.BAD_INPUT
     except KeyboardInterrupt as stop:  # `Interrupted` says what remains on the disk
         say(str(stop) or "interrupted")
-        return INTERRUPTED
+        return Exit.INTERRUPTED
     except WriteError as error:
         say(f"failed: {error.strerror}")
-        return FAILED
+        return Exit.FAILED
     except (FileNotFoundError, FileExistsError, IsADirectoryError, NotADirectoryError) as error:
         say(_file_message(error))
-        return BAD_INPUT
+        return Exit.BAD_INPUT
     except BrokenPipeError:
         if not _reader_has_left():
             raise
-        return FAILED
+        return Exit.FAILED
     except OSError as error:
         say(f"failed: {_file_message(error)}")
-        return FAILED
+        return Exit.FAILED
     except (ValueError, TypeError, OverflowError, MemoryError) as error:
         say(_with_options(" ".join(str(error).split()), tokens) or type(error).__name__)
-        return BAD_INPUT
+        return Exit.BAD_INPUT
 
 
 def _reader_has_left() -> bool:
@@ -251,10 +259,10 @@ def table(content: Mapping[str, str] | Sequence[tuple[str, str]]) -> None:
 
 
 def screen() -> Console:
-    """Standard output; without a terminal no line is folded."""
+    """Standard output; without a terminal no line below 250 columns is folded."""
     from rich.console import Console
 
-    return Console(highlight=False) if sys.stdout.isatty() else Console(highlight=False, width=_PIPE)
+    return Console(highlight=False) if sys.stdout.isatty() else Console(highlight=False, width=250)
 
 
 def grid(title: str, columns: Sequence[str]) -> Table:

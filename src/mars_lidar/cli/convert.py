@@ -3,58 +3,65 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 from mars_lidar.cli.console import progress_bar, table
 from mars_lidar.cli.foreign import ForeignOptions
-from mars_lidar.cli.options import Integer, Number, argument, command, examples, option, out_option
+from mars_lidar.cli.options import Integer, Number, OutPath, command
 from mars_lidar.cli.simulate import say_time
 
 if TYPE_CHECKING:
     from mars_lidar.io import Converted
 
 
-CONVERT_EXAMPLES = examples(
-    "mars-lidar convert room.zarr room.h5",
-    "mars-lidar convert set.zarr first.mat --realization 0",
-    "mars-lidar convert lab.ptu lab.h5 --bins 1024",
-    "mars-lidar convert face.mat face.zarr --variable counts --system camera.yaml",
-    notes="Cubes: .zarr .h5 .npz .mat .ptu. Photon streams: .npz .ptu .h5 (Photon-HDF5). .ptu and Photon-HDF5 need "
-    "pip install 'mars-lidar[io]'. docs/formats.md describes each.",
-)
-TIMESTAMPS_EXAMPLES = examples(
-    "mars-lidar simulate --scene room -o room.zarr",
-    "mars-lidar timestamps room.zarr -o room.ptu",
-    "mars-lidar timestamps set.zarr --realization 3 -o photons.h5",
-)
-
 _LARGE_IMAGE = 5e8
-ClockPs = Annotated[
-    Number | None,
-    option(
-        "Of a stream in a .ptu: least unit of its times, ps. Programs that make an image of it have a bin for each.",
-        "the finest, 32768 to a period",
-    ),
-]
-Overwrite = Annotated[bool, option("Replace an existing file.")]
 
 
 def convert(
-    source: Annotated[
-        Path, argument("A cube, a photon stream (also of a lab: .ptu, Photon-HDF5), or histograms of another program.")
-    ],
-    target: Annotated[Path, argument("The new file; its suffix names the format.")],
+    source: Path,
+    target: Path,
     /,
     *,
-    realization: Annotated[Integer | None, option("Of a cube, this exposure alone, from 0; a .mat holds one.")] = None,
+    realization: Integer | None = None,
     foreign: ForeignOptions = ForeignOptions(),
-    bins: Annotated[Integer | None, option("Histogram bins of a recorded stream.", "its finest clock")] = None,
-    clock_ps: ClockPs = None,
-    overwrite: Overwrite = False,
+    bins: Integer | None = None,
+    clock_ps: Number | None = None,
+    overwrite: bool = False,
 ) -> None:
     """Write a cube or a photon stream in another format.
 
     What the other format cannot hold is listed.
+
+    Arguments
+    ---------
+    source
+        A cube, a photon stream (also of a lab: .ptu, Photon-HDF5), or histograms of another program.
+    target
+        The new file; its suffix names the format.
+
+    Options
+    -------
+    realization
+        Of a cube, this exposure alone, from 0; a .mat holds one.
+    bins
+        Histogram bins of a recorded stream. [default: its finest clock]
+    clock_ps
+        Of a stream in a .ptu: least unit of its times, ps. Programs that make an image of it have a bin for each.
+        [default: the finest, 32768 to a period]
+    overwrite
+        Replace an existing file.
+
+    Examples
+    --------
+    mars-lidar convert room.zarr room.h5
+    mars-lidar convert set.zarr first.mat --realization 0
+    mars-lidar convert lab.ptu lab.h5 --bins 1024
+    mars-lidar convert face.mat face.zarr --variable counts --system camera.yaml
+
+    Notes
+    -----
+    Cubes: .zarr .h5 .npz .mat .ptu. Photon streams: .npz .ptu .h5 (Photon-HDF5). .ptu and Photon-HDF5 need pip install
+    'mars-lidar[io]'. docs/formats.md describes each.
     """
     from mars_lidar.dataset.store import is_dataset
     from mars_lidar.io.conversion import convert as converted
@@ -88,18 +95,43 @@ def _imported(foreign: ForeignOptions, source: Path, target: Path, overwrite: bo
 
 
 def timestamps(
-    cube: Annotated[Path, argument("A cube written by mars-lidar.")],
+    cube: Path,
     /,
     *,
-    out: Annotated[Path, out_option("The stream: .npz, .ptu or .h5 (Photon-HDF5).", option)],
-    realization: Annotated[Integer, option("Which exposure, from 0 in the file.", "0")] = 0,
-    threads: Annotated[Integer | None, option("Threads.", "all cores")] = None,
-    clock_ps: ClockPs = None,
-    overwrite: Overwrite = False,
+    out: OutPath,
+    realization: Integer = 0,
+    threads: Integer | None = None,
+    clock_ps: Number | None = None,
+    overwrite: bool = False,
 ) -> None:
     """Write the photons of a cube one by one, with their times.
 
     The cube is simulated again. The histogram of the photons is the cube's exposure, count by count; this is checked.
+
+    Arguments
+    ---------
+    cube
+        A cube written by mars-lidar.
+
+    Options
+    -------
+    out
+        The stream: .npz, .ptu or .h5 (Photon-HDF5).
+    realization
+        Which exposure, from 0 in the file. [default: 0]
+    threads
+        Threads. [default: all cores]
+    clock_ps
+        Of a stream in a .ptu: least unit of its times, ps. Programs that make an image of it have a bin for each.
+        [default: the finest, 32768 to a period]
+    overwrite
+        Replace an existing file.
+
+    Examples
+    --------
+    mars-lidar simulate --scene room -o room.zarr
+    mars-lidar timestamps room.zarr -o room.ptu
+    mars-lidar timestamps set.zarr --realization 3 -o photons.h5
     """
     from mars_lidar.io.conversion import photons, resolution_ns
     from mars_lidar.io.cube import load
@@ -120,5 +152,5 @@ def timestamps(
     table({"wrote": str(out), "content": content, "times": resolution})
 
 
-convert_command = command(convert, CONVERT_EXAMPLES)
-timestamps_command = command(timestamps, TIMESTAMPS_EXAMPLES)
+convert_command = command(convert)
+timestamps_command = command(timestamps)

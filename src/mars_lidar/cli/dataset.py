@@ -7,29 +7,13 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+from cyclopts import Parameter
+
 from mars_lidar._base import manifest
 from mars_lidar._base.files import size_on_disk
 from mars_lidar._base.progress import span
-from mars_lidar.cli.console import BAD_INPUT, FAILED, progress_bar, say, table
-from mars_lidar.cli.options import (
-    Ambient,
-    Attenuation,
-    Integer,
-    Number,
-    Numbers,
-    Text,
-    Threads,
-    argument,
-    command,
-    examples,
-    light_option,
-    option,
-    out_option,
-    output_option,
-    run_option,
-    scenes_option,
-    system_option,
-)
+from mars_lidar.cli.console import Exit, progress_bar, say, table
+from mars_lidar.cli.options import Integer, Number, Numbers, OutPath, Text, command
 from mars_lidar.cli.system_options import DEFAULT_SYSTEM, Effects, SystemChanges
 from mars_lidar.scene.scene import Scene
 
@@ -40,91 +24,42 @@ if TYPE_CHECKING:
     from mars_lidar.io import Problem
 
 
-GENERATE_EXAMPLES = examples(
-    "mars-lidar generate recipe.yaml -o set.zarr --dry-run",
-    "mars-lidar generate recipe.yaml -o set.zarr --resume",
-    "mars-lidar generate room --size 64 --scene-seeds 100 --signal 0.1 --signal 1 --sbr 0.5 -o rooms.zarr",
-    "mars-lidar generate nyu_depth_v2_labeled.mat --focal-px 519 --crop 64 --crops 4 -o nyu.zarr",
-    "mars-lidar generate recipe.yaml -o set.zarr --scheduler tcp://10.0.0.1:8786",
-    notes="Recipes: docs/generate.md. Clusters: docs/scale.md.",
-)
 _RECIPES = (".yaml", ".yml")
 _TRANSIENTS = (".h5", ".hdf5")  # a depth is never in one; the other files of transients need a recipe
 
 
 def generate(
-    source: Annotated[
-        Path | None,
-        argument(
-            "A recipe (.yaml, .yml), a built-in scene (room), RGB-D (a file or a folder), or a rendered transient "
-            "(.h5, .hdf5)."
-        ),
-    ] = None,
+    source: Path | None = None,
     /,
     *,
-    size: Annotated[
-        Text | None,
-        scenes_option("Resample every scene: the longer side, or HEIGHT,WIDTH.", "as it is; room: 128", metavar="SIDE"),
-    ] = None,
-    crop: Annotated[
-        Text | None, scenes_option("Cut out parts at random places: side, or HEIGHT,WIDTH.", metavar="SIDE")
-    ] = None,
-    crops: Annotated[Integer | None, scenes_option("Parts per scene.", "1")] = None,
-    scene_seeds: Annotated[Integer | None, scenes_option("Built-in scene: that many, of seeds 0, 1, ...", "1")] = None,
-    depth_unit_m: Annotated[
-        Number | None, scenes_option("RGB-D: metres per stored unit of depth.", "0.001 for images, 1 for arrays")
-    ] = None,
-    focal_px: Annotated[
-        Number | None,
-        scenes_option(
-            "RGB-D: focal length, pixels of the file: turns depth along the axis into range along the ray.",
-            "depth as it is",
-        ),
-    ] = None,
-    max_depth_m: Annotated[Number | None, scenes_option("RGB-D: depths beyond this are no return, m.", "none")] = None,
-    system: Annotated[
-        list[Path] | None,
-        system_option(
-            "YAML or JSON file (see mars-lidar init), repeated for several; single options replace its values."
-        ),
-    ] = None,
+    size: Text | None = None,
+    crop: Text | None = None,
+    crops: Integer | None = None,
+    scene_seeds: Integer | None = None,
+    depth_unit_m: Number | None = None,
+    focal_px: Number | None = None,
+    max_depth_m: Number | None = None,
+    system: list[Path] | None = None,
     changes: SystemChanges = SystemChanges(),
     effects: Effects = Effects(),
-    signal: Annotated[
-        Numbers | None, light_option("Mean signal photons per laser period, repeated for several levels.", "1")
-    ] = None,
-    sbr: Annotated[
-        Numbers | None,
-        light_option("Mean signal / mean ambient photons, repeated for several: each with each signal.", "1"),
-    ] = None,
-    attenuation: Attenuation = None,
-    ambient: Ambient = None,
-    engine: Annotated[Text | None, run_option("As for mars-lidar simulate.", "exact")] = None,
-    realizations: Annotated[Integer | None, run_option("Exposures of each sample.", "1")] = None,
-    seed: Annotated[Integer | None, run_option("Seed of the dataset.", "0")] = None,
-    threads: Threads = None,
-    workers: Annotated[Integer | None, run_option("Worker processes on this machine (extra cluster).")] = None,
-    scheduler: Annotated[
-        Text | None, run_option("Address of a dask scheduler whose workers see --out (extra cluster).")
-    ] = None,
-    out: Annotated[Path, out_option("The dataset, NAME.zarr.")],
-    layout: Annotated[
-        Text | None,
-        output_option(
-            "dense (any Zarr library reads it) or sparse (bins that are not zero, packed: smaller in dim light).",
-            "dense",
-        ),
-    ] = None,
-    resume: Annotated[bool, output_option("Continue a stopped run.")] = False,
-    overwrite: Annotated[bool, output_option("Replace an existing dataset.")] = False,
-    begin: Annotated[
-        bool, output_option("Read the scenes and create the store without counts, which --part jobs make.")
-    ] = False,
-    part: Annotated[
-        Text | None, output_option("Make part K of N of a store that --begin began, in any order.", metavar="K/N")
-    ] = None,
-    finish: Annotated[bool, output_option("Check that all parts are there, and mark the store complete.")] = False,
-    dry_run: Annotated[bool, output_option("Print size, time and memory; write nothing.")] = False,
+    signal: Numbers | None = None,
+    sbr: Numbers | None = None,
+    attenuation: Text | None = None,
+    ambient: Text | None = None,
+    engine: Text | None = None,
+    realizations: Integer | None = None,
+    seed: Integer | None = None,
+    threads: Integer | None = None,
+    workers: Integer | None = None,
+    scheduler: Text | None = None,
+    out: OutPath,
+    layout: Text | None = None,
+    resume: bool = False,
+    overwrite: bool = False,
+    begin: bool = False,
+    part: Text | None = None,
+    finish: bool = False,
+    dry_run: bool = False,
 ) -> int | None:
     """Simulate a dataset of many scenes, systems and levels of light.
 
@@ -132,6 +67,94 @@ def generate(
     replace its values. The store does not depend on threads, workers or interruptions: the same recipe gives the
     same files, byte for byte. Files that cannot be used are left out, and listed at the end. Fog, panes, folders of
     transients and all else that has no option stand in a recipe.
+
+    Arguments
+    ---------
+    source
+        A recipe (.yaml, .yml), a built-in scene (room), RGB-D (a file or a folder), or a rendered transient (.h5,
+        .hdf5).
+
+    Scenes
+    ------
+    size : SIDE
+        Resample every scene: the longer side, or HEIGHT,WIDTH. [default: as it is; room: 128]
+    crop : SIDE
+        Cut out parts at random places: side, or HEIGHT,WIDTH.
+    crops
+        Parts per scene. [default: 1]
+    scene_seeds
+        Built-in scene: that many, of seeds 0, 1, ... [default: 1]
+    depth_unit_m
+        RGB-D: metres per stored unit of depth. [default: 0.001 for images, 1 for arrays]
+    focal_px
+        RGB-D: focal length, pixels of the file: turns depth along the axis into range along the ray. [default: depth as
+        it is]
+    max_depth_m
+        RGB-D: depths beyond this are no return, m. [default: none]
+
+    System
+    ------
+    system
+        YAML or JSON file (see mars-lidar init), repeated for several; single options replace its values.
+
+    Light
+    -----
+    signal
+        Mean signal photons per laser period, repeated for several levels. [default: 1]
+    sbr
+        Mean signal / mean ambient photons, repeated for several: each with each signal. [default: 1]
+    attenuation : {none, inverse_square}
+        Signal against depth z: none or inverse_square (1 / z^2). [default: none]
+    ambient : {uniform, reflectivity, map}
+        Ambient light over the image: uniform, reflectivity, or map (of the scene). [default: map where the scene has
+        one, else uniform]
+
+    Simulation
+    ----------
+    engine
+        As for mars-lidar simulate. [default: exact]
+    realizations
+        Exposures of each sample. [default: 1]
+    seed
+        Seed of the dataset. [default: 0]
+    threads
+        Threads; the counts do not depend on it. [default: all cores]
+    workers
+        Worker processes on this machine (extra cluster).
+    scheduler
+        Address of a dask scheduler whose workers see --out (extra cluster).
+
+    Output
+    ------
+    out
+        The dataset, NAME.zarr.
+    layout
+        dense (any Zarr library reads it) or sparse (bins that are not zero, packed: smaller in dim light). [default:
+        dense]
+    resume
+        Continue a stopped run.
+    overwrite
+        Replace an existing dataset.
+    begin
+        Read the scenes and create the store without counts, which --part jobs make.
+    part : K/N
+        Make part K of N of a store that --begin began, in any order.
+    finish
+        Check that all parts are there, and mark the store complete.
+    dry_run
+        Print size, time and memory; write nothing.
+
+    Examples
+    --------
+    mars-lidar generate recipe.yaml -o set.zarr --dry-run
+    mars-lidar generate recipe.yaml -o set.zarr --resume
+    mars-lidar generate room --size 64 --scene-seeds 100 --signal 0.1 --signal 1 --sbr 0.5 -o rooms.zarr
+    mars-lidar generate nyu_depth_v2_labeled.mat --focal-px 519 --crop 64 --crops 4 -o nyu.zarr
+    mars-lidar generate recipe.yaml -o set.zarr --scheduler tcp://10.0.0.1:8786
+
+    Notes
+    -----
+    Recipes: docs/generate.md. Clusters: docs/scale.md.
     """
     from mars_lidar import dataset
 
@@ -142,9 +165,8 @@ def generate(
     if (part or finish) and (source is not None or resume or overwrite):
         raise ValueError("--part and --finish go on with the store: no SOURCE, --resume or --overwrite")
     if part is not None:
-        numbers = _part(part)
         with progress_bar("generating") as progress:
-            tell(dataset.make_part(out, numbers, threads=threads, progress=progress))
+            tell(dataset.make_part(out, _part(part), threads=threads, progress=progress))
         return None
     if finish:
         tell(dataset.finish(out))
@@ -167,57 +189,60 @@ def generate(
         raise ValueError("--crops belongs to --crop, which is not given")
     rgbd = _given(depth_unit_m=depth_unit_m, focal_px=focal_px, max_depth_m=max_depth_m)
     recipe = _recipe(source, replaced, scene_seeds, rgbd, resume)
-    if dry_run:
-        if recipe is None:
-            raise ValueError("--dry-run needs a source")
+    if (dry_run or begin) and recipe is None:
+        raise ValueError(f"--{'dry-run' if dry_run else 'begin'} needs a SOURCE")
+    if dry_run and recipe is not None:
         return tell_estimate(dataset.estimate(recipe, out, threads=threads))
-    if begin:
-        if recipe is None:
-            raise ValueError("--begin needs a SOURCE")
-        tell(dataset.begin(recipe, out, resume=resume, overwrite=overwrite, workers=workers, scheduler=scheduler))
+    where: dict[str, Any] = {"resume": resume, "overwrite": overwrite, "workers": workers, "scheduler": scheduler}
+    if begin and recipe is not None:
+        tell(dataset.begin(recipe, out, **where))
         return None
     here = workers is None and scheduler is None and not (resume and out.exists())
     if here and recipe is not None and (advice := str(dataset.quick_advice(recipe, threads))):
         say(advice)
     with progress_bar("generating") as progress:
-        done = dataset.generate(
-            recipe,
-            out,
-            resume=resume,
-            overwrite=overwrite,
-            threads=threads,
-            workers=workers,
-            scheduler=scheduler,
-            progress=progress,
-        )
-    tell(done)
+        tell(dataset.generate(recipe, out, threads=threads, progress=progress, **where))
     return None
 
 
 def verify(
-    path: Annotated[Path, argument("A dataset that generate wrote.")],
+    path: Path,
     /,
     *,
-    chunks: Annotated[Integer, option("How many, chosen at random.", "16")] = 16,
-    every: Annotated[bool, option("All of them.", "", "--all")] = False,
-    seed: Annotated[Integer, option("Seed of the choice.", "0")] = 0,
-    threads: Annotated[Integer | None, option("Threads.", "all cores")] = None,
+    chunks: Integer = 16,
+    every: Annotated[bool, Parameter(("--all",))] = False,
+    seed: Integer = 0,
+    threads: Integer | None = None,
 ) -> int | None:
     """Simulate chunks of a dataset again and compare every count.
 
     The chunks are chosen at random; exit code 1 if a count differs.
+
+    Arguments
+    ---------
+    path
+        A dataset that generate wrote.
+
+    Options
+    -------
+    chunks
+        How many, chosen at random. [default: 16]
+    every
+        All of them.
+    seed
+        Seed of the choice. [default: 0]
+    threads
+        Threads. [default: all cores]
     """
     from mars_lidar.dataset import verify as verified
 
     with progress_bar("verifying") as progress:
         checked = verified(path, chunks=None if every else chunks, seed=seed, threads=threads, progress=progress)
-    if checked.good:
-        table([("verified", f"{checked.chunks} of {checked.of} chunks simulated again, every count is the same")])
-        return None
-    table([("verified", f"NO: see below; {checked.chunks} of {checked.of} chunks simulated again")])
+    again = f"{checked.chunks} of {checked.of} chunks simulated again"
+    table([("verified", f"{again}, every count is the same" if checked.good else f"NO: see below; {again}")])
     for line in checked.different:
         say(line)
-    return FAILED
+    return None if checked.good else Exit.FAILED
 
 
 def _recipe(
@@ -236,18 +261,15 @@ def _recipe(
             raise ValueError("--scene-seeds, --depth-unit-m and --focal-px stand in the recipe's scenes")
         return DatasetRecipe.load(source, **replaced)
     if str(source) in Scene.example_names():
-        if rgbd:
-            raise ValueError("--depth-unit-m and --focal-px belong to RGB-D")
         scene: dict[str, Any] = {"example": str(source), "seeds": {"count": scene_seeds or 1}}
         scene["size"] = replaced.pop("size", 128)
+    elif scene_seeds is not None:
+        raise ValueError(f"--scene-seeds belongs to a built-in scene, and {source} is none")
     else:
-        if scene_seeds is not None:
-            raise ValueError(f"--scene-seeds belongs to a built-in scene, and {source} is none")
-        scene = {"path": str(source), **rgbd}
-        if source.suffix.lower() in _TRANSIENTS:
-            if rgbd:
-                raise ValueError("--depth-unit-m and --focal-px belong to RGB-D")
-            scene = {"transient": str(source)}
+        transient = source.suffix.lower() in _TRANSIENTS
+        scene = {"transient": str(source)} if transient else {"path": str(source), **rgbd}
+    if rgbd and "path" not in scene:
+        raise ValueError("--depth-unit-m and --focal-px belong to RGB-D")
     return DatasetRecipe.from_dict({"systems": [DEFAULT_SYSTEM], **replaced, "scenes": scene})
 
 
@@ -272,24 +294,40 @@ def _size(option: str, text: str | None) -> Any:
     return numbers[0] if len(numbers) == 1 else numbers
 
 
-EXPORT_EXAMPLES = examples(
-    "mars-lidar generate room --size 64 --scene-seeds 20 -o rooms.zarr",
-    "mars-lidar export rooms.zarr --layout lindell --fill -o lindell",
-    notes="docs/formats.md describes each file.",
-)
-
-
 def export(
-    dataset: Annotated[Path, argument("A dataset that mars-lidar generate wrote.")],
+    dataset: Path,
     /,
     *,
-    out: Annotated[Path, out_option("A new folder.", option)],
-    layout: Annotated[Text, option("Whose loader reads it: lindell, deepsensorfusion, sun, gutierrez or webdataset.")],
-    fill: Annotated[bool, option("Pixels without a return take depth and rates of the nearest with one.")] = False,
+    out: OutPath,
+    layout: Text,
+    fill: bool = False,
 ) -> None:
     """Write a dataset as the files that depth networks load.
 
     One .mat for each exposure and a list of them, or tar archives.
+
+    Arguments
+    ---------
+    dataset
+        A dataset that mars-lidar generate wrote.
+
+    Options
+    -------
+    out
+        A new folder.
+    layout
+        Whose loader reads it: lindell, deepsensorfusion, sun, gutierrez or webdataset.
+    fill
+        Pixels without a return take depth and rates of the nearest with one.
+
+    Examples
+    --------
+    mars-lidar generate room --size 64 --scene-seeds 20 -o rooms.zarr
+    mars-lidar export rooms.zarr --layout lindell --fill -o lindell
+
+    Notes
+    -----
+    docs/formats.md describes each file.
     """
     from mars_lidar.dataset.network_files import export as exported
 
@@ -376,9 +414,7 @@ def tell_estimate(expected: Estimate) -> int | None:
         rows.append(("disk", f"{_bytes(expected.free_bytes)} free{': NOT ENOUGH' if short else ''}"))
     table(rows)
     _tell_problems(expected.problems)
-    if short:
-        return BAD_INPUT
-    return None
+    return Exit.BAD_INPUT if short else None
 
 
 def _shape(shape: tuple[int, ...]) -> str:
@@ -402,6 +438,6 @@ def _bytes(number: float) -> str:
     return f"{number:.3g} {unit}"
 
 
-generate_command = command(generate, GENERATE_EXAMPLES)
+generate_command = command(generate)
 verify_command = command(verify)
-export_command = command(export, EXPORT_EXAMPLES)
+export_command = command(export)

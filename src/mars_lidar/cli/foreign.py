@@ -2,68 +2,78 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from cyclopts import Parameter
 
-from mars_lidar.cli.options import (
-    DetectorName,
-    Integer,
-    Number,
-    SystemFile,
-    Text,
-    foreign_option,
-    two_integers,
-    two_numbers,
-)
+from mars_lidar.cli.options import Integer, Number, Text, options, two
 from mars_lidar.cli.system_options import PulseOptions
+from mars_lidar.instrument.presets import PRESETS
 from mars_lidar.instrument.system import Detector, System
 
 if TYPE_CHECKING:
     from mars_lidar.io import Cube
-    from mars_lidar.io.recorder import Recorded
+    from mars_lidar.io.streams.recorders import Recorded
 
 
-_BINS = 1e-6  # relative difference by which a period may miss a whole number of bins
 _NEEDED = "--system, or --bin-ps (or --period-ns), --cycles, --dead-time-ns (or --detector) and --pulse-sigma-ns"
 
 
-@Parameter(name="*")
-@dataclass(frozen=True, kw_only=True)
+@options
 class ForeignOptions:
-    """What a file of another program does not tell of its histograms; nothing is needed for one of mars-lidar."""
+    """What a file of another program does not tell of its histograms; nothing is needed for one of mars-lidar.
 
-    system: SystemFile = None
-    bin_ns: Annotated[Number | None, foreign_option("Width of a histogram bin, ns ...")] = None
-    bin_ps: Annotated[Number | None, foreign_option("... or ps.")] = None
-    period_ns: Annotated[Number | None, foreign_option("Laser period, ns.", "the histogram's length")] = None
-    cycles: Annotated[Integer | None, foreign_option("Laser periods that each histogram was accumulated over.")] = None
-    detector: DetectorName = None
-    dead_time_ns: Annotated[Number | None, foreign_option("Dead time after a registration, ns.")] = None
+    System
+    ------
+    system
+        YAML or JSON file (see mars-lidar init); single options replace its values.
+    detector
+        Published detector, in place of the file's (docs/detectors.md): $presets.
+
+    A file of another program
+    -------------------------
+    bin_ns
+        Width of a histogram bin, ns ...
+    bin_ps
+        ... or ps.
+    period_ns
+        Laser period, ns. [default: the histogram's length]
+    cycles
+        Laser periods that each histogram was accumulated over.
+    dead_time_ns
+        Dead time after a registration, ns.
+    start_ns
+        Time from the laser pulse to the first bin (a gate), ns. [default: 0.0]
+    variable
+        Name of the array, of a file with several; NAME[3] of a MATLAB cell of arrays.
+    axes : NYXT
+        Its dimensions, e.g. tyx; n exposures, (yx) or (xy) pixels row by row or column by column. [default: time last,
+        or where the system's bins fit]
+    image : H,W
+        Height and width of (yx) or (xy).
+    unit_ns
+        Unit of photon times, ns.
+    window_ns : START,STOP
+        Of photon times that count from the laser pulse: those in this window alone, ns.
+    """
+
+    system: Path | None = None
+    bin_ns: Number | None = None
+    bin_ps: Number | None = None
+    period_ns: Number | None = None
+    cycles: Integer | None = None
+    detector: Annotated[Text | None, Parameter(choices=tuple(PRESETS))] = None
+    dead_time_ns: Number | None = None
     pulse: PulseOptions = PulseOptions()
-    start_ns: Annotated[Number, foreign_option("Time from the laser pulse to the first bin (a gate), ns.", "0.0")] = 0.0
-    variable: Annotated[
-        Text | None, foreign_option("Name of the array, of a file with several; NAME[3] of a MATLAB cell of arrays.")
-    ] = None
-    axes: Annotated[
-        Text | None,
-        foreign_option(
-            "Its dimensions, e.g. tyx; n exposures, (yx) or (xy) pixels row by row or column by column.",
-            "time last, or where the system's bins fit",
-            metavar="NYXT",
-        ),
-    ] = None
-    image: Annotated[Text | None, foreign_option("Height and width of (yx) or (xy).", metavar="H,W")] = None
-    unit_ns: Annotated[Number | None, foreign_option("Unit of photon times, ns.")] = None
-    window_ns: Annotated[
-        Text | None,
-        foreign_option(
-            "Of photon times that count from the laser pulse: those in this window alone, ns.", metavar="START,STOP"
-        ),
-    ] = None
+    start_ns: Number = 0.0
+    variable: Text | None = None
+    axes: Text | None = None
+    image: Text | None = None
+    unit_ns: Number | None = None
+    window_ns: Text | None = None
 
     @property
     def _given(self) -> list[str]:
@@ -98,12 +108,13 @@ class ForeignOptions:
             path,
             variable=self.variable,
             axes=self.axes,
-            image=None if self.image is None else two_integers("--image", self.image, "H,W"),
+            image=None if self.image is None else two("--image", self.image, "integers H,W"),
             bins=None if base is None else base.bins,
         )
         length = None if contents.counts is None else contents.counts.shape[-1]
         whole = self if contents.recorder is None or base is not None else self._completed(contents.recorder, length)
-        window = None if self.window_ns is None else two_numbers("--window-ns", self.window_ns, "START,STOP in ns")
+        between, form = self.window_ns, "numbers START,STOP in ns"
+        window = None if between is None else two("--window-ns", between, form, float)
         system = base or whole._system(path, length)
         return contents.cube(system, start_ns=self.start_ns, unit_ns=self.unit_ns, window_ns=window)
 
@@ -159,7 +170,7 @@ class ForeignOptions:
                 raise ValueError(f"{path} holds photon times: give --period-ns and --bin-ps")
             return (length * width, length) if width is not None else (float(self.period_ns or 0.0), length)
         bins = self.period_ns / width
-        if abs(bins - round(bins)) > _BINS * bins:
+        if abs(bins - round(bins)) > 1e-6 * bins:  # the digits that a period is stated with
             below, above = int(bins) * width, (int(bins) + 1) * width
             raise ValueError(
                 f"--period-ns must be a whole number of bins of {width:g} ns, got {self.period_ns:g}; "
@@ -180,7 +191,7 @@ def is_foreign(path: Path, error: ValueError) -> bool:
 def foreign_rows(path: Path) -> list[tuple[str, str]]:
     """What `mars-lidar info` tells of a file of another program."""
     from mars_lidar.io.foreign import listed
-    from mars_lidar.io.recorder import RECORDER_SUFFIXES
+    from mars_lidar.io.streams.recorders import RECORDER_SUFFIXES
 
     if path.suffix.lower() in RECORDER_SUFFIXES:
         return _recorder_rows(path)
@@ -191,8 +202,8 @@ def foreign_rows(path: Path) -> list[tuple[str, str]]:
 
 def _recorder_rows(path: Path) -> list[tuple[str, str]]:
     """What a photon counter recorded: its clocks, the photons of each channel, and the images of a scan."""
-    from mars_lidar.io.recorder import recorded
     from mars_lidar.io.streams.files import recorded as photons_of
+    from mars_lidar.io.streams.recorders import recorded
 
     rows = [("file", f"{path} (not written by mars-lidar)")]
     scan, streams = None, []
@@ -215,6 +226,6 @@ def _recorder_rows(path: Path) -> list[tuple[str, str]]:
     if scan is not None:
         for name, array in scan.arrays.items():
             rows.append(("histograms", f"{name}: {' × '.join(map(str, array.shape))}, {int(array.sum()):,} photons"))
-        rows += [("left out", text) for text in scan.told]
+        rows += [("left out", text) for text in scan.notes]
         rows.append(("reconstruct with", _NEEDED + "; bins and cycles as far as the file tells them"))
     return rows + streams

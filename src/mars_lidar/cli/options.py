@@ -1,26 +1,27 @@
 """Options that several commands take: how one is declared, and those of scene and light.
 
-An option is a field of a dataclass, or a keyword of a command, annotated with its type and with what one of the
-`*_option` functions below makes of its help. A command that takes such a dataclass has all of its options.
+An option is a field of a class, or a keyword of a command, with its type; its help stands in the docstring of these.
 """
 
 from __future__ import annotations
 
+import inspect
 import re
 import textwrap
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, dataclass_transform, get_type_hints
 
 from cyclopts import App, Group, Parameter
 
 from mars_lidar._base import checks
+from mars_lidar.instrument.effects import FIELDS
 from mars_lidar.instrument.presets import PRESETS
 
 if TYPE_CHECKING:
-    from mars_lidar.dataset.view import View
+    from mars_lidar.dataset.sources import View
     from mars_lidar.instrument.system import System
 
 
@@ -51,43 +52,72 @@ def _numbers(kind: Any, tokens: Any) -> list[float]:
     return [_number(kind, [token]) for token in tokens]
 
 
+T = TypeVar("T")
+N = TypeVar("N", int, float)
 Integer = Annotated[int, Parameter(converter=_integer, metavar="INTEGER")]
 Number = Annotated[float, Parameter(converter=_number, metavar="NUMBER")]
 Numbers = Annotated[list[float], Parameter(converter=_numbers, metavar="NUMBER")]
 Text = Annotated[str, Parameter(metavar="TEXT")]
 
 
-def option(help: str, default: str = "", *names: str, **more: Any) -> Parameter:
-    """An option called after its parameter, or `names`; `default`: the words for its default in the help."""
-    return Parameter(names or None, help=help, show_default=default or False, show_choices=False, **more)
+Switch = Annotated[bool, Parameter(negative_bool="no-")]
+OutPath = Annotated[Path, Parameter(("--out", "-o"))]
+
+PANELS = {  # headings of the help of a command, in their order
+    title: Group.create_ordered(title)
+    for title in (
+        "Scene (one of --scene, --depth and --transient)",
+        "Rendered transient (with --transient)",
+        "Scenes",
+        "Stream",
+        "System",
+        "A file of another program",
+        "Effects of the detector (off by default)",
+        "Light",
+        "Grid",
+        "Simulation",
+        "Output",
+    )
+}
+_ENTRY = re.compile(r"(\w+)(?: : (.+))?\n((?: {4}.+\n)+)")
 
 
-def argument(help: str, default: str = "", **more: Any) -> Parameter:
-    """A positional argument."""
-    return Parameter(help=help, show_default=default or False, show_choices=False, **more)
+def _sections(target: Any) -> dict[str, str]:
+    """The sections of a docstring by their titles; the words before them have the title ""."""
+    first, *others = re.split(r"\n\n(.+)\n-+\n", f"{inspect.cleandoc(target.__doc__ or '')}\n")
+    return {"": first, **dict(zip(others[::2], others[1::2], strict=True))}
 
 
-def panel(title: str) -> Callable[..., Parameter]:
-    """`option` for those that stand under one heading of the help; the headings stand in the order of these calls."""
-    return partial(option, group=Group.create_ordered(title))
+def documented(target: Any) -> Any:
+    """Give the options of a class or function the words of its docstring.
+
+    A section of the docstring is a panel of the help ("Arguments" and "Options" are those of the command line itself).
+    An entry is a name, its metavariable or {choices}, and its help, which may end in [default: words]; `$presets`
+    stands for the names of `PRESETS`. An effect without an entry has the words of `mars_lidar.instrument.effects`.
+    """
+    hints, own = get_type_hints(target, include_extras=True), target.__annotations__
+    entries: dict[str, dict[str, Any]] = {}
+    for name, effect in FIELDS.items():
+        if name in own and effect.help is not None:
+            group = PANELS["Effects of the detector (off by default)"]
+            entries[name] = {"help": effect.help, "show_default": effect.default or False, "group": group}
+    for title, body in _sections(target).items():
+        for name, form, words in _ENTRY.findall(f"{body}\n"):
+            text = " ".join(words.split()).replace("$presets", ", ".join(PRESETS))
+            help, _, default = text.partition(" [default: ")
+            entry = entries[name] = {"help": help, "show_default": default.removesuffix("]") or False}
+            entry |= {"group": PANELS[title]} if title in PANELS else {}
+            if form:
+                entry |= {"choices": form[1:-1].split(", ")} if form.startswith("{") else {"metavar": form}
+    for name, entry in entries.items():
+        own[name] = Annotated[hints[name], Parameter(show_choices=False, **entry)]
+    return target
 
 
-scene_option = panel("Scene (one of --scene, --depth and --transient)")
-transient_option = panel("Rendered transient (with --transient)")
-scenes_option = panel("Scenes")
-stream_option = panel("Stream")
-system_option = panel("System")
-foreign_option = panel("A file of another program")
-effect_option = panel("Effects of the detector (off by default)")
-light_option = panel("Light")
-grid_option = panel("Grid")
-run_option = panel("Simulation")
-output_option = panel("Output")
-
-
-def out_option(help: str, make: Callable[..., Parameter] = output_option, **more: Any) -> Parameter:
-    """Where a command writes to: -o, --out."""
-    return make(help, "", "--out", "-o", **more)
+@dataclass_transform(frozen_default=True, kw_only_default=True)
+def options(cls: type[T]) -> type[T]:
+    """A class of options: a command with a parameter of it has all of them, under their own names."""
+    return Parameter(name="*")(dataclass(frozen=True, kw_only=True)(documented(cls)))
 
 
 # --- How a command is declared --------------------------------------------------------------------------------------
@@ -108,160 +138,134 @@ def describe(command: App) -> None:
             if not name.startswith("-"):
                 describe(command[name])
     else:
-        paragraphs = (command.default_command.__doc__ or "").split("\n\n")
+        paragraphs = _sections(command.default_command)[""].split("\n\n")
         command.help = "\n\n".join(" ".join(paragraph.split()) for paragraph in paragraphs)
 
 
-def command(function: Callable[..., int | None], epilogue: str = "") -> App:
-    """The command that a function is."""
-    return App(name=function.__name__, default_command=function, help_epilogue=epilogue, **COMMAND_LINE)
+def command(function: Callable[..., int | None], name: str | None = None, **words: str) -> App:
+    """The command that a function is, called like it or `name`; `words` replace $KEY in the notes of its docstring."""
+    end = _examples(_sections(function))
+    for key, value in words.items():
+        end = end.replace(f"${key}", value)
+    called = name or function.__name__
+    return App(name=called, default_command=documented(function), help_epilogue=end, **COMMAND_LINE)
 
 
-def examples(*lines: str, notes: str = "") -> str:
+def _examples(sections: dict[str, str]) -> str:
     """The end of a command's help; long commands are continued, so that they can be copied from a narrow screen."""
+    if "Examples" not in sections:
+        return ""
     wrap = partial(textwrap.wrap, width=74, break_long_words=False, break_on_hyphens=False)
-    together = (re.sub(" (?!-)", "\xa0", line) for line in lines)  # an option and its value
+    together = (re.sub(" (?!-)", "\xa0", line) for line in sections["Examples"].split("\n") if line)  # option and value
     continued = (" \\\n      ".join(wrap(line)).replace("\xa0", " ") for line in together)
+    notes = " ".join(sections.get("Notes", "").split())
     return "\n".join(("Examples:", *(f"  {line}" for line in continued), *(("", notes) if notes else ())))
 
 
 # --- Options of several commands ------------------------------------------------------------------------------------
 
-SystemFile = Annotated[
-    Path | None, system_option("YAML or JSON file (see mars-lidar init); single options replace its values.")
-]
-DetectorName = Annotated[
-    Text | None,
-    system_option(
-        f"Published detector, in place of the file's (docs/detectors.md): {', '.join(PRESETS)}.", choices=tuple(PRESETS)
-    ),
-]
-Seed = Annotated[Integer, run_option("Seed: the same command gives the same counts.", "0")]
-Threads = Annotated[Integer | None, run_option("Threads; the counts do not depend on it.", "all cores")]
-Attenuation = Annotated[
-    Text | None,
-    light_option(
-        "Signal against depth z: none or inverse_square (1 / z^2).", "none", choices=("none", "inverse_square")
-    ),
-]
-Ambient = Annotated[
-    Text | None,
-    light_option(
-        "Ambient light over the image: uniform, reflectivity, or map (of the scene).",
-        "map where the scene has one, else uniform",
-        choices=("uniform", "reflectivity", "map"),
-    ),
-]
 
-
-def two_integers(option: str, text: str, form: str = "Y,X (row, column)") -> tuple[int, int]:
-    """The value of an option of this form, such as the pixel (y, x) of ``--pixel Y,X``."""
+def two(
+    option: str, text: str, form: str = "integers Y,X (row, column)", kind: Callable[[str], N] = int
+) -> tuple[N, N]:
+    """The value of an option of two numbers, such as the pixel (y, x) of ``--pixel Y,X``."""
     try:
-        first, second = (int(part) for part in text.split(","))
+        first, second = (kind(part) for part in text.split(","))
     except ValueError:
-        raise ValueError(f"{option} must be two integers {form}, got {text!r}") from None
-    return first, second
-
-
-def two_numbers(option: str, text: str, form: str) -> tuple[float, float]:
-    """The value of an option of this form, such as START,STOP."""
-    try:
-        first, second = (float(part) for part in text.split(","))
-    except ValueError:
-        raise ValueError(f"{option} must be two numbers {form}, got {text!r}") from None
+        raise ValueError(f"{option} must be two {form}, got {text!r}") from None
     return first, second
 
 
 # --- Scene and light ------------------------------------------------------------------------------------------------
 
 
-@Parameter(name="*")
-@dataclass(frozen=True, kw_only=True)
+@options
 class SceneOptions:
-    """One of a built-in scene, depth, and a transient; None: not given."""
+    """One of a built-in scene, depth, and a transient; None: not given.
 
-    scene: Annotated[
-        Text | None,
-        scene_option(
-            "A built-in scene: room, or random (another for each --scene-seed). "
-            "Or a .yaml file of scene or transient, and light (docs/formats.md)."
-        ),
-    ] = None
-    size: Annotated[
-        Integer | None,
-        scene_option(
-            "Image size in pixels: square for --scene; the longer side, resampled, for --depth.",
-            "128 for --scene, the file's own for --depth",
-        ),
-    ] = None
-    scene_seed: Annotated[Integer | None, scene_option("Arrangement of the built-in scene.", "0")] = None
-    depth: Annotated[
-        Path | None,
-        scene_option(
-            "Depth: 16-bit PNG or TIFF in mm, .pfm, .exr, .npy or .npz in m, NYUv2's .mat, or a Middlebury folder."
-        ),
-    ] = None
-    image: Annotated[Path | None, scene_option("Image that belongs to --depth: its luminance is the reflectivity.")] = (
-        None
-    )
-    depth_unit_m: Annotated[
-        Number | None, scene_option("Metres per stored unit of --depth.", "0.001 for images, 1 for arrays")
-    ] = None
-    focal_px: Annotated[
-        Number | None,
-        scene_option(
-            "Focal length, pixels: turns depth along the axis into range along the ray.", "depth as it is stored"
-        ),
-    ] = None
-    index: Annotated[Integer | None, scene_option("Frame of a NYUv2 .mat given as --depth, from 0.")] = None
-    max_depth_m: Annotated[
-        Number | None, scene_option("Pixels of --depth beyond this depth, m, have no return.", "no limit")
-    ] = None
-    transient: Annotated[
-        Path | None,
-        scene_option(
-            "Rendered transient (y, x, time), read in bands: .npy, .npz, .h5, .hdf5 (tal and mitransient too), .mat."
-        ),
-    ] = None
-    transient_bin_ns: Annotated[
-        Number | None, transient_option("Width of its time bins, ns.", "as stated in the file")
-    ] = None
-    transient_start_ns: Annotated[
-        Number | None, transient_option("Travel time at its first bin, ns.", "as stated in the file, else 0")
-    ] = None
-    transient_name: Annotated[Text | None, transient_option("Which array of the file.", "transient")] = None
-    transient_channel: Annotated[
-        Integer | None, transient_option("Which channel of a file (y, x, time, channel), from 0.")
-    ] = None
-    transient_pulse: Annotated[
-        bool | None,
-        transient_option(
-            "Convolve with the system's pulse; --no-transient-pulse where the transient contains it already.",
-            "yes",
-            negative="--no-transient-pulse",
-        ),
-    ] = None
-    photons_per_unit: Annotated[
-        Number | None,
-        transient_option("Instead of --signal: detectable photons per period for one unit of its light."),
-    ] = None
+    Scene (one of --scene, --depth and --transient)
+    -----------------------------------------------
+    scene
+        A built-in scene: room, or random (another for each --scene-seed). Or a .yaml file of scene or transient, and
+        light (docs/formats.md).
+    size
+        Image size in pixels: square for --scene; the longer side, resampled, for --depth. [default: 128 for --scene,
+        the file's own for --depth]
+    scene_seed
+        Arrangement of the built-in scene. [default: 0]
+    depth
+        Depth: 16-bit PNG or TIFF in mm, .pfm, .exr, .npy or .npz in m, NYUv2's .mat, or a Middlebury folder.
+    image
+        Image that belongs to --depth: its luminance is the reflectivity.
+    depth_unit_m
+        Metres per stored unit of --depth. [default: 0.001 for images, 1 for arrays]
+    focal_px
+        Focal length, pixels: turns depth along the axis into range along the ray. [default: depth as it is stored]
+    index
+        Frame of a NYUv2 .mat given as --depth, from 0.
+    max_depth_m
+        Pixels of --depth beyond this depth, m, have no return. [default: no limit]
+    transient
+        Rendered transient (y, x, time), read in bands: .npy, .npz, .h5, .hdf5 (tal and mitransient too), .mat.
+
+    Rendered transient (with --transient)
+    -------------------------------------
+    transient_bin_ns
+        Width of its time bins, ns. [default: as stated in the file]
+    transient_start_ns
+        Travel time at its first bin, ns. [default: as stated in the file, else 0]
+    transient_name
+        Which array of the file. [default: transient]
+    transient_channel
+        Which channel of a file (y, x, time, channel), from 0.
+    transient_pulse
+        Convolve with the system's pulse; --no-transient-pulse where the transient contains it already. [default: yes]
+    photons_per_unit
+        Instead of --signal: detectable photons per period for one unit of its light.
+    """
+
+    scene: Text | None = None
+    size: Integer | None = None
+    scene_seed: Integer | None = None
+    depth: Path | None = None
+    image: Path | None = None
+    depth_unit_m: Number | None = None
+    focal_px: Number | None = None
+    index: Integer | None = None
+    max_depth_m: Number | None = None
+    transient: Path | None = None
+    transient_bin_ns: Number | None = None
+    transient_start_ns: Number | None = None
+    transient_name: Text | None = None
+    transient_channel: Integer | None = None
+    transient_pulse: Switch | None = None
+    photons_per_unit: Number | None = None
 
 
-@Parameter(name="*")
-@dataclass(frozen=True, kw_only=True)
+@options
 class LightOptions:
-    """Levels of light; None: the default, or as in the scene's file."""
+    """Levels of light; None: the default, or as in the scene's file.
 
-    signal: Annotated[
-        Number | None,
-        light_option("Mean signal S over the pixels with a return or light, detectable photons per laser period.", "1"),
-    ] = None
-    sbr: Annotated[Number | None, light_option("Mean signal / mean ambient photons per period.", "1")] = None
-    attenuation: Attenuation = None
-    ambient: Ambient = None
+    Light
+    -----
+    signal
+        Mean signal S over the pixels with a return or light, detectable photons per laser period. [default: 1]
+    sbr
+        Mean signal / mean ambient photons per period. [default: 1]
+    attenuation : {none, inverse_square}
+        Signal against depth z: none or inverse_square (1 / z^2). [default: none]
+    ambient : {uniform, reflectivity, map}
+        Ambient light over the image: uniform, reflectivity, or map (of the scene). [default: map where the scene has
+        one, else uniform]
+    """
+
+    signal: Number | None = None
+    sbr: Number | None = None
+    attenuation: Text | None = None
+    ambient: Text | None = None
 
 
-# Options by the kind of scene. Without the kind they are the keys of `mars_lidar.dataset.scene_entries`.
+# Options by the kind of scene. Without the kind they are the keys of `mars_lidar.dataset.recipe`.
 SCENE_KINDS = {
     "scene": ("size", "scene_seed"),
     "depth": ("size", "image", "depth_unit_m", "focal_px", "index", "max_depth_m"),
@@ -271,7 +275,7 @@ SCENE_KINDS = {
 
 def read_scene(scene: SceneOptions, light: LightOptions, system: System, *, in_parts: bool = False) -> View:
     """The scene and light of these options under `system`; with `in_parts`, a transient is read in bands on use."""
-    from mars_lidar.dataset.view import read_view
+    from mars_lidar.dataset.sources import read_view
 
     kinds = [name for name in SCENE_KINDS if getattr(scene, name) is not None]
     if len(kinds) != 1:

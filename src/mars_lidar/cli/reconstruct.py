@@ -6,104 +6,104 @@ import math
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mars_lidar._base import checks
+from mars_lidar._base.display import measured
 from mars_lidar._base.files import check_target
 from mars_lidar._base.progress import span
 from mars_lidar.cli.console import grid, progress_bar, refuse_existing, save_picture, say, screen, table
 from mars_lidar.cli.foreign import ForeignOptions
-from mars_lidar.cli.options import Integer, Number, Text, argument, command, examples, option, out_option
+from mars_lidar.cli.options import Integer, Number, OutPath, Switch, Text, command
 from mars_lidar.reconstruction import METHODS, Flags, MaximumLikelihood, Method, Reconstruction
 from mars_lidar.reconstruction.keep import KEEP, common_delay, has_later_light, keep_return
 from mars_lidar.reconstruction.reconstruction import ATTENUATIONS
 
 if TYPE_CHECKING:
+    from mars_lidar._base.types import FloatArray
     from mars_lidar.io import Cube
+    from mars_lidar.reconstruction import Returns
     from mars_lidar.reconstruction.stored import Timed
 
 
-RECONSTRUCT_EXAMPLES = examples(
-    "mars-lidar reconstruct room.zarr -o maps.zarr",
-    "mars-lidar reconstruct room.zarr --method all -o maps.h5",
-    "mars-lidar reconstruct dim.zarr --method image -o maps.zarr",
-    "mars-lidar reconstruct room.zarr -o maps.npz --cloud room.ply --focal-px 110",
-    "mars-lidar reconstruct face.npy --bin-ps 80 --cycles 20000 --dead-time-ns 50 --pulse-fwhm-ns 0.3 -o face.zarr",
-    "mars-lidar reconstruct glass.zarr --returns 3 -o maps.zarr --cloud glass.ply --focal-px 110",
-    "mars-lidar reconstruct room.zarr --method maximum_likelihood,peak --no-picture -o maps.npz",
-    notes=f"Methods: {', '.join(METHODS)}. docs/reconstruction.md says what each assumes, and for which detectors.",
-)
-
-
 def reconstruct(
-    cube: Annotated[
-        Path,
-        argument(
-            "A cube: .zarr, .h5, .hdf5, .npz, .mat or .ptu; or histograms of another program: also .npy, .tif, .csv."
-        ),
-    ],
+    cube: Path,
     /,
     *,
     foreign: ForeignOptions = ForeignOptions(),
-    out: Annotated[Path, out_option("The maps: .zarr, .h5, .hdf5 or .npz.", option)],
-    method: Annotated[
-        Text,
-        option(
-            "Methods, separated by commas, or all that suit the detector; image for 1 to 10 photons a pixel.",
-            "maximum_likelihood",
-        ),
-    ] = "maximum_likelihood",
-    level: Annotated[
-        Number | None,
-        option(
-            "Signal photons per period of a surface of reflectivity 1.",
-            "that of the cube's scene, or mean reflectivity 1",
-        ),
-    ] = None,
-    attenuation: Annotated[
-        Text | None,
-        option("none or inverse_square: reflectivity is signal times depth squared.", "as the cube was simulated"),
-    ] = None,
-    returns: Annotated[
-        Integer,
-        option("Returns to look for in each pixel, each tested (glass, foliage). Needs maximum_likelihood.", "1"),
-    ] = 1,
-    keep: Annotated[
-        Text | None,
-        option("With --returns: the return whose depth is taken, strongest, nearest or farthest.", "strongest"),
-    ] = None,
-    from_ns: Annotated[
-        Number | None,
-        option(
-            "Returns nearer than this, ns after the pulse, such as an internal reflection, are modelled and left out.",
-            "all",
-        ),
-    ] = None,
-    false_alarm: Annotated[
-        Number | None,
-        option(
-            "Largest share of the pixels without signal in which noise passes for a return; of maximum_likelihood.",
-            "0.01",
-        ),
-    ] = None,
-    threads: Annotated[Integer | None, option("Threads.", "all cores")] = None,
-    cloud: Annotated[
-        Path | None,
-        option(
-            "Write the points of the first method and exposure, .ply, with reflectivity and standard error of depth; "
-            "with --returns, every return is a point, with its signal."
-        ),
-    ] = None,
-    focal_px: Annotated[Number | None, option("Focal length of the image in pixels, for --cloud.")] = None,
-    picture: Annotated[bool, option("Draw the maps beside OUT, as .png.", "yes", negative="--no-picture")] = True,
-    overwrite: Annotated[bool, option("Replace existing files.")] = False,
+    out: OutPath,
+    method: Text = "maximum_likelihood",
+    level: Number | None = None,
+    attenuation: Text | None = None,
+    returns: Integer = 1,
+    keep: Text | None = None,
+    from_ns: Number | None = None,
+    false_alarm: Number | None = None,
+    threads: Integer | None = None,
+    cloud: Path | None = None,
+    focal_px: Number | None = None,
+    picture: Switch = True,
+    overwrite: bool = False,
 ) -> None:
     """Reconstruct depth and reflectivity from a cube.
 
     The maps are compared with the truth where the cube has it. The counts are read in parts, so a .zarr or .h5 of
     any size will do.
+
+    Arguments
+    ---------
+    cube
+        A cube: .zarr, .h5, .hdf5, .npz, .mat or .ptu; or histograms of another program: also .npy, .tif, .csv.
+
+    Options
+    -------
+    out
+        The maps: .zarr, .h5, .hdf5 or .npz.
+    method
+        Methods, separated by commas, or all that suit the detector; image for 1 to 10 photons a pixel. [default:
+        maximum_likelihood]
+    level
+        Signal photons per period of a surface of reflectivity 1. [default: that of the cube's scene, or mean
+        reflectivity 1]
+    attenuation
+        none or inverse_square: reflectivity is signal times depth squared. [default: as the cube was simulated]
+    returns
+        Returns to look for in each pixel, each tested (glass, foliage). Needs maximum_likelihood. [default: 1]
+    keep
+        With --returns: the return whose depth is taken, strongest, nearest or farthest. [default: strongest]
+    from_ns
+        Returns nearer than this, ns after the pulse, such as an internal reflection, are modelled and left out.
+        [default: all]
+    false_alarm
+        Largest share of the pixels without signal in which noise passes for a return; of maximum_likelihood. [default:
+        0.01]
+    threads
+        Threads. [default: all cores]
+    cloud
+        Write the points of the first method and exposure, .ply, with reflectivity and standard error of depth; with
+        --returns, every return is a point, with its signal.
+    focal_px
+        Focal length of the image in pixels, for --cloud.
+    picture
+        Draw the maps beside OUT, as .png. [default: yes]
+    overwrite
+        Replace existing files.
+
+    Examples
+    --------
+    mars-lidar reconstruct room.zarr -o maps.zarr
+    mars-lidar reconstruct room.zarr --method all -o maps.h5
+    mars-lidar reconstruct dim.zarr --method image -o maps.zarr
+    mars-lidar reconstruct room.zarr -o maps.npz --cloud room.ply --focal-px 110
+    mars-lidar reconstruct face.npy --bin-ps 80 --cycles 20000 --dead-time-ns 50 --pulse-fwhm-ns 0.3 -o face.zarr
+    mars-lidar reconstruct glass.zarr --returns 3 -o maps.zarr --cloud glass.ply --focal-px 110
+    mars-lidar reconstruct room.zarr --method maximum_likelihood,peak --no-picture -o maps.npz
+
+    Notes
+    -----
+    Methods: $methods. docs/reconstruction.md says what each assumes, and for which detectors.
     """
     began = time.perf_counter()
     from mars_lidar.io.maps import check_maps_output, save_maps
@@ -254,10 +254,38 @@ def _show(cube: Cube, timed: dict[str, Timed]) -> None:
     for line in lines:
         rows.add_row(*line)
     screen().print(rows)
+    if (height, width) == (1, 1):
+        _show_pixel({name: each.result for name, each in timed.items()})
     for name, each in timed.items():
         if advice := each.result.advice:
             share = f"{100.0 * each.result.misfits:.3g} % of the pixels do not fit (0.1 % do so by chance)"
             say(f"warning: {name}: {share}; would fit better: {advice}; mars-lidar calibrate CUBE finds the value")
+
+
+def _show_pixel(results: dict[str, Reconstruction]) -> None:
+    """The estimates of a cube of one pixel: a line for each method, exposure and return."""
+
+    def words(values: FloatArray | None, errors: FloatArray | None, place: tuple[int, ...]) -> str:
+        return "-" if values is None else measured(float(values[place]), math.nan if errors is None else errors[place])
+
+    rows = grid("", ["method", "exposure", "depth (m)", "S", "B", "p-value"])
+    for name, result in results.items():
+        for at in np.ndindex(result.depth_m.shape):
+            light: Reconstruction | Returns = result
+            places: list[tuple[int, ...]] = [at]
+            if result.returns is not None and result.returns.count[at] > 1:
+                light, places = result.returns, [(*at, k) for k in range(int(result.returns.count[at]))]
+            background, fit = words(result.background, result.background_error, at), words(result.p_value, None, at)
+            for place in places:
+                depth = words(light.depth_m, light.depth_error_m, place)
+                rows.add_row(name, str(at[0]), depth, words(light.signal, light.signal_error, place), background, fit)
+    screen().print(rows)
+    for name, result in results.items():
+        if result.misfits > 0.0:  # NaN without p-values
+            say(
+                f"warning: {name}: the histogram does not fit the estimate: dead time or pulse may be wrong, or there "
+                "is another return, a drift or an effect of the detector; mars-lidar calibrate CUBE finds the value"
+            )
 
 
 def _save_cloud(path: Path, results: dict[str, Reconstruction], focal_px: float, overwrite: bool) -> int:
@@ -278,4 +306,4 @@ def _save_cloud(path: Path, results: dict[str, Reconstruction], focal_px: float,
     return save_cloud(path, depth, focal_px, intensity=share, error_m=error, overwrite=overwrite)
 
 
-reconstruct_command = command(reconstruct, RECONSTRUCT_EXAMPLES)
+reconstruct_command = command(reconstruct, methods=", ".join(METHODS))

@@ -9,6 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+from cyclopts import Parameter
+
 from mars_lidar._base.progress import span
 from mars_lidar.cli.console import progress_bar, refuse_existing, save_picture, say
 from mars_lidar.cli.console import table as print_table
@@ -16,17 +18,12 @@ from mars_lidar.cli.options import (
     SCENE_KINDS,
     Integer,
     LightOptions,
+    OutPath,
     SceneOptions,
-    Seed,
+    Switch,
     Text,
-    Threads,
     command,
-    examples,
-    out_option,
-    output_option,
     read_scene,
-    run_option,
-    scene_option,
 )
 from mars_lidar.cli.system_options import Effects, SystemOptions
 from mars_lidar.engines import ENGINES, EngineOptions
@@ -39,22 +36,6 @@ if TYPE_CHECKING:
     from mars_lidar.io import Written
     from mars_lidar.io.capture import Capture
 
-SIMULATE_EXAMPLES = examples(
-    "mars-lidar simulate --scene room -o room.zarr",
-    "mars-lidar simulate --scene room --signal 0.1 --sbr 0.2 --dead-time-ns 30 --cycles 5000 -o dim.zarr",
-    "mars-lidar simulate --depth depth.png --image colour.png --realizations 10 --seed 7 -o set.zarr",
-    "mars-lidar simulate --depth art/ --system spad.yaml --attenuation inverse_square -o art.h5",
-    "mars-lidar simulate --scene room --mode gated --gate-start-ns 30 --gate-width-ns 20 -o gated.zarr",
-    "mars-lidar simulate --scene room --engine mars --table room.h5 --cycles 100000 -o long.zarr",
-    "mars-lidar simulate --transient render.hdf5 --signal 0.5 --sbr 5 -o transient.zarr",
-    "mars-lidar simulate --like render.hdf5 --signal 0.5 --sbr 5 -o capture.hdf5",
-    "mars-lidar simulate --scene room --pulse-file irf.npy --pulse-bin-ns 0.008 -o measured.npz",
-    "mars-lidar simulate --scene room --jitter-fwhm-ns 0.1 --electronics-dead-time-ns 100 -o real.zarr",
-    "mars-lidar simulate --scene room --detector excelitas-spcm-aqrh -o module.zarr",
-    notes="S and B are expected detectable photons per laser period; with --detection-efficiency, photons on the "
-    "pixel. Dead time distorts histograms where S + B is not small.",
-)
-
 
 def simulate(
     *,
@@ -62,71 +43,86 @@ def simulate(
     instrument: SystemOptions = SystemOptions(),
     effects: Effects = Effects(),
     light: LightOptions = LightOptions(),
-    engine: Annotated[
-        Text,
-        run_option(
-            "exact; feedback (its cost does not grow with the exposure); auto (the faster of these, pixel by pixel); "
-            "mars (count law x mean histogram); sequential (slow, an independent reference); renewal, poisson "
-            "(baselines).",
-            "exact",
-            choices=tuple(ENGINES),
-        ),
-    ] = "exact",
-    table: Annotated[
-        Path | None,
-        run_option(
-            "For --engine mars and renewal: a table of this system (mars-lidar table build), or none: every distinct "
-            "pixel is evaluated by itself, some ms each.",
-            "one over the image's range, built once and stored in the cache",
-        ),
-    ] = None,
-    count: Annotated[
-        Text | None,
-        run_option(
-            "For --engine mars: the law of the count: exact, matched (to four cumulants, faster with --table) or "
-            "gaussian (the paper's).",
-            "exact",
-            choices=("exact", "matched", "gaussian"),
-        ),
-    ] = None,
-    interpolation: Annotated[
-        Text | None,
-        run_option("Between the entries of --table: bilinear or nearest.", "bilinear", choices=("bilinear", "nearest")),
-    ] = None,
-    table_outside: Annotated[
-        Text | None,
-        run_option(
-            "For pixels beyond the range of --table: error, or exact (each is evaluated by itself, some ms).",
-            "error",
-            choices=("error", "exact"),
-        ),
-    ] = None,
-    realizations: Annotated[Integer, run_option("Independent exposures of the image.", "1")] = 1,
-    seed: Seed = 0,
-    threads: Threads = None,
-    device: Annotated[
-        Text, run_option("cpu, or cuda: the current GPU, with the same counts.", "cpu", choices=("cpu", "cuda"))
-    ] = "cpu",
-    out: Annotated[
-        Path, out_option("The cube: .zarr (any size, written as it is simulated), .h5, .hdf5, .npz, .mat or .ptu.")
-    ],
-    overwrite: Annotated[bool, output_option("Replace an existing cube and picture.")] = False,
-    resume: Annotated[
-        bool, output_option("Continue a .zarr that was interrupted: the same command, the same bits.")
-    ] = False,
-    like: Annotated[
-        Path | None,
-        scene_option(
-            "Simulate the light of a capture (tal, mitransient, Zaragoza's HDF5) in its bins; with --out .hdf5 or .h5 "
-            "the result is a capture of the same layout."
-        ),
-    ] = None,
-    picture: Annotated[bool, output_option("A PNG overview beside the cube.", "yes", negative="--no-picture")] = True,
+    engine: Annotated[Text, Parameter(choices=tuple(ENGINES))] = "exact",
+    table: Path | None = None,
+    count: Text | None = None,
+    interpolation: Text | None = None,
+    table_outside: Text | None = None,
+    realizations: Integer = 1,
+    seed: Integer = 0,
+    threads: Integer | None = None,
+    device: Text = "cpu",
+    out: OutPath,
+    overwrite: bool = False,
+    resume: bool = False,
+    like: Path | None = None,
+    picture: Switch = True,
 ) -> None:
     """Simulate the histograms of a scene: a cube and a picture of it.
 
     The file holds all that is needed to make the cube again. xarray.open_zarr(OUT) opens a .zarr with named
     dimensions and units; mars_lidar.io.load(OUT) opens any of the formats.
+
+    Simulation
+    ----------
+    engine
+        exact; feedback (its cost does not grow with the exposure); auto (the faster of these, pixel by pixel); mars
+        (count law x mean histogram); sequential (slow, an independent reference); renewal, poisson (baselines).
+        [default: exact]
+    table
+        For --engine mars and renewal: a table of this system (mars-lidar table build), or none: every distinct pixel is
+        evaluated by itself, some ms each. [default: one over the image's range, built once and stored in the cache]
+    count : {exact, matched, gaussian}
+        For --engine mars: the law of the count: exact, matched (to four cumulants, faster with --table) or gaussian
+        (the paper's). [default: exact]
+    interpolation : {bilinear, nearest}
+        Between the entries of --table: bilinear or nearest. [default: bilinear]
+    table_outside : {error, exact}
+        For pixels beyond the range of --table: error, or exact (each is evaluated by itself, some ms). [default: error]
+    realizations
+        Independent exposures of the image. [default: 1]
+    seed
+        Seed: the same command gives the same counts. [default: 0]
+    threads
+        Threads; the counts do not depend on it. [default: all cores]
+    device : {cpu, cuda}
+        cpu, or cuda: the current GPU, with the same counts. [default: cpu]
+
+    Output
+    ------
+    out
+        The cube: .zarr (any size, written as it is simulated), .h5, .hdf5, .npz, .mat or .ptu.
+    overwrite
+        Replace an existing cube and picture.
+    resume
+        Continue a .zarr that was interrupted: the same command, the same bits.
+    picture
+        A PNG overview beside the cube. [default: yes]
+
+    Scene (one of --scene, --depth and --transient)
+    -----------------------------------------------
+    like
+        Simulate the light of a capture (tal, mitransient, Zaragoza's HDF5) in its bins; with --out .hdf5 or .h5 the
+        result is a capture of the same layout.
+
+    Examples
+    --------
+    mars-lidar simulate --scene room -o room.zarr
+    mars-lidar simulate --scene room --signal 0.1 --sbr 0.2 --dead-time-ns 30 --cycles 5000 -o dim.zarr
+    mars-lidar simulate --depth depth.png --image colour.png --realizations 10 --seed 7 -o set.zarr
+    mars-lidar simulate --depth art/ --system spad.yaml --attenuation inverse_square -o art.h5
+    mars-lidar simulate --scene room --mode gated --gate-start-ns 30 --gate-width-ns 20 -o gated.zarr
+    mars-lidar simulate --scene room --engine mars --table room.h5 --cycles 100000 -o long.zarr
+    mars-lidar simulate --transient render.hdf5 --signal 0.5 --sbr 5 -o transient.zarr
+    mars-lidar simulate --like render.hdf5 --signal 0.5 --sbr 5 -o capture.hdf5
+    mars-lidar simulate --scene room --pulse-file irf.npy --pulse-bin-ns 0.008 -o measured.npz
+    mars-lidar simulate --scene room --jitter-fwhm-ns 0.1 --electronics-dead-time-ns 100 -o real.zarr
+    mars-lidar simulate --scene room --detector excelitas-spcm-aqrh -o module.zarr
+
+    Notes
+    -----
+    S and B are expected detectable photons per laser period; with --detection-efficiency, photons on the pixel. Dead
+    time distorts histograms where S + B is not small.
     """
     from mars_lidar.io import load, save_capture, simulate_to
     from mars_lidar.io.capture import CAPTURE_SUFFIXES
@@ -216,7 +212,7 @@ def say_time(
     flux: Flux, system: System, engine: str, realizations: int, threads: int | None, options: EngineOptions
 ) -> None:
     """Say how long a long run will take, and what is faster."""
-    from mars_lidar.io.advice import advice
+    from mars_lidar.io.simulated_file import advice
 
     text = str(advice(flux, system, engine, realizations=realizations, threads=threads, options=options))
     if text:
@@ -293,4 +289,4 @@ def each_ns(number: float) -> str:
     return f"{number:.3g} ns" if number < 999.5 else f"{number / 1e3:.3g} µs"
 
 
-simulate_command = command(simulate, SIMULATE_EXAMPLES)
+simulate_command = command(simulate)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,61 +9,60 @@ import numpy as np
 from cyclopts import Parameter
 
 from mars_lidar._base import checks
-from mars_lidar._base.files import read_npy, reading
-from mars_lidar._base.text import read_column
-from mars_lidar.cli.options import DetectorName, Integer, Number, SystemFile, Text, effect_option, system_option
+from mars_lidar._base.files import read_column, read_npy, reading
+from mars_lidar.cli.options import Integer, Number, Text, options
 from mars_lidar.instrument.effects import FIELDS
+from mars_lidar.instrument.presets import PRESETS
 from mars_lidar.instrument.pulse import GaussianPulse, Pulse, SampledPulse
 from mars_lidar.instrument.system import Detector, System
 
 # --- Effects --------------------------------------------------------------------------------------------------------
 
 
-def _effect(name: str) -> Any:
-    """The option of an effect that is one number, as `mars_lidar.instrument.effects.FIELDS` declares it."""
-    effect = FIELDS[name]
-    assert effect.help is not None
-    return effect_option(effect.help, effect.default or "")
-
-
-@Parameter(name="*")
-@dataclass(frozen=True, kw_only=True)
+@options
 class LightEffects:
     """What changes the light that a pixel counts; None: as in the file."""
 
-    detection_efficiency: Annotated[Number | None, _effect("detection_efficiency")] = None
-    dark_count_hz: Annotated[Number | None, _effect("dark_count_hz")] = None
+    detection_efficiency: Number | None = None
+    dark_count_hz: Number | None = None
 
 
-@Parameter(name="*")
-@dataclass(frozen=True, kw_only=True)
+@options
 class StreamEffects:
-    """Effects of the detector that the stream of one pixel shows; None: as in the file."""
+    """Effects of the detector that the stream of one pixel shows; None: as in the file.
 
-    afterpulse_probability: Annotated[
-        Number | None,
-        effect_option(
-            "Mean number of trapped carriers that an avalanche leaves, those lost in the dead time included ...", "0"
-        ),
-    ] = None
-    afterpulse_delay_ns: Annotated[
-        Number | None, effect_option("... and their mean delay after the avalanche, ns.")
-    ] = None
-    twilight_ns: Annotated[Number | None, _effect("twilight_ns")] = None
-    recovery_ns: Annotated[Number | None, _effect("recovery_ns")] = None
-    electronics_dead_time_ns: Annotated[Number | None, _effect("electronics_dead_time_ns")] = None
-    max_events_per_period: Annotated[Integer | None, _effect("max_events_per_period")] = None
-    jitter_fwhm_ns: Annotated[
-        Number | None, effect_option("Gaussian timing jitter: full width at half maximum, ns.")
-    ] = None
-    jitter_tail_ns: Annotated[Number | None, effect_option("Mean of the exponential tail of the jitter, ns ...")] = None
-    jitter_tail_fraction: Annotated[Number | None, effect_option("... and share of the events that are in it.")] = None
-    jitter_file: Annotated[Path | None, effect_option("Measured jitter instead: 1-D .npy array of its density.")] = None
-    jitter_bin_ns: Annotated[Number | None, effect_option("Sample width of --jitter-file, ns.")] = None
-    code_density_file: Annotated[
-        Path | None,
-        effect_option("TDC non-linearity: 1-D .npy array of relative code widths; their number divides the bins."),
-    ] = None
+    Effects of the detector (off by default)
+    ----------------------------------------
+    afterpulse_probability
+        Mean number of trapped carriers that an avalanche leaves, those lost in the dead time included ... [default: 0]
+    afterpulse_delay_ns
+        ... and their mean delay after the avalanche, ns.
+    jitter_fwhm_ns
+        Gaussian timing jitter: full width at half maximum, ns.
+    jitter_tail_ns
+        Mean of the exponential tail of the jitter, ns ...
+    jitter_tail_fraction
+        ... and share of the events that are in it.
+    jitter_file
+        Measured jitter instead: 1-D .npy array of its density.
+    jitter_bin_ns
+        Sample width of --jitter-file, ns.
+    code_density_file
+        TDC non-linearity: 1-D .npy array of relative code widths; their number divides the bins.
+    """
+
+    afterpulse_probability: Number | None = None
+    afterpulse_delay_ns: Number | None = None
+    twilight_ns: Number | None = None
+    recovery_ns: Number | None = None
+    electronics_dead_time_ns: Number | None = None
+    max_events_per_period: Integer | None = None
+    jitter_fwhm_ns: Number | None = None
+    jitter_tail_ns: Number | None = None
+    jitter_tail_fraction: Number | None = None
+    jitter_file: Path | None = None
+    jitter_bin_ns: Number | None = None
+    code_density_file: Path | None = None
 
     def given(self) -> dict[str, Any]:
         """Fields of `Detector`, as plain data."""
@@ -102,17 +100,21 @@ class StreamEffects:
         return {"kind": "gaussian", **gaussian} if gaussian else None
 
 
-@Parameter(name="*")
-@dataclass(frozen=True, kw_only=True)
+@options
 class Effects(StreamEffects, LightEffects):
-    """Effects of the detector; None: as in the file."""
+    """Effects of the detector; None: as in the file.
 
-    crosstalk: Annotated[
-        Number | None,
-        effect_option("Mean number of neighbours that an avalanche triggers; with --engine sequential.", "0"),
-    ] = None
-    crosstalk_kernel: Annotated[Text | None, effect_option("Which neighbours: 4 or 8.", "8")] = None
-    max_events_per_exposure: Annotated[Integer | None, _effect("max_events_per_exposure")] = None
+    Effects of the detector (off by default)
+    ----------------------------------------
+    crosstalk
+        Mean number of neighbours that an avalanche triggers; with --engine sequential. [default: 0]
+    crosstalk_kernel
+        Which neighbours: 4 or 8. [default: 8]
+    """
+
+    crosstalk: Number | None = None
+    crosstalk_kernel: Text | None = None
+    max_events_per_exposure: Integer | None = None
 
     def given(self) -> dict[str, Any]:
         """Fields of `Detector`, as plain data."""
@@ -143,20 +145,29 @@ def read_array(option: str, file: Path) -> Any:
 _SIGMA = "Gaussian pulse: standard deviation, ns."
 
 
-@Parameter(name="*")
-@dataclass(frozen=True, kw_only=True)
+@options
 class PulseOptions:
-    """A Gaussian pulse or a measured one; None: not given."""
+    """A Gaussian pulse or a measured one; None: not given.
 
-    pulse_sigma_ns: Annotated[Number | None, system_option(_SIGMA, "0.5")] = None
-    pulse_fwhm_ns: Annotated[Number | None, system_option("Gaussian pulse: full width at half maximum, ns.")] = None
-    pulse_file: Annotated[
-        Path | None, system_option("Measured impulse response: 1-D .npy array, or a column as .csv or .txt.")
-    ] = None
-    pulse_bin_ns: Annotated[Number | None, system_option("Sample width of --pulse-file, ns.")] = None
-    pulse_origin: Annotated[
-        Text | None, system_option("What a delay refers to in --pulse-file: peak, centroid or first.", "peak")
-    ] = None
+    System
+    ------
+    pulse_sigma_ns
+        Gaussian pulse: standard deviation, ns. [default: 0.5]
+    pulse_fwhm_ns
+        Gaussian pulse: full width at half maximum, ns.
+    pulse_file
+        Measured impulse response: 1-D .npy array, or a column as .csv or .txt.
+    pulse_bin_ns
+        Sample width of --pulse-file, ns.
+    pulse_origin
+        What a delay refers to in --pulse-file: peak, centroid or first. [default: peak]
+    """
+
+    pulse_sigma_ns: Number | None = None
+    pulse_fwhm_ns: Number | None = None
+    pulse_file: Path | None = None
+    pulse_bin_ns: Number | None = None
+    pulse_origin: Text | None = None
 
     def build(self) -> Pulse | None:
         """The pulse that is meant, or None where none is given."""
@@ -181,12 +192,17 @@ class PulseOptions:
         return _measured(self.pulse_file, self.pulse_bin_ns, self.pulse_origin or "peak")
 
 
-@Parameter(name="*")
-@dataclass(frozen=True, kw_only=True)
+@options
 class FittedPulseOptions(PulseOptions):
-    """Options of the pulse of a stream: a Gaussian is fitted if none is given."""
+    """Options of the pulse of a stream: a Gaussian is fitted if none is given.
 
-    pulse_sigma_ns: Annotated[Number | None, system_option(_SIGMA, "fitted")] = None
+    System
+    ------
+    pulse_sigma_ns
+        Gaussian pulse: standard deviation, ns. [default: fitted]
+    """
+
+    pulse_sigma_ns: Number | None = None
 
 
 def _measured(file: Path, bin_ns: float, origin: str) -> SampledPulse:
@@ -208,37 +224,49 @@ DEFAULT_SYSTEM = System(
 _DETECTOR = ("dead_time_ns", "mode", "gate_start_ns", "gate_width_ns", "gate_step_ns", "gate_cycles")
 
 
-@Parameter(name="*")
-@dataclass(frozen=True, kw_only=True)
+@options
 class SystemChanges:
-    """Single values of a system, in place of those of a file or of the default one; None: as there."""
+    """Single values of a system, in place of those of a file or of the default one; None: as there.
 
-    period_ns: Annotated[Number | None, system_option("Laser period, ns.", "133.33, 7.5 MHz")] = None
-    detector: DetectorName = None
-    dead_time_ns: Annotated[Number | None, system_option("Dead time after a registration, ns.", "75")] = None
-    mode: Annotated[
-        Text | None,
-        system_option(
-            "When the pixel registers: nonparalyzable, paralyzable (every arrival restarts the dead time), synchronous "
-            "(armed at each pulse, first photon only) or gated (with --gate-start-ns, --gate-width-ns).",
-            "nonparalyzable",
-        ),
-    ] = None
-    gate_start_ns: Annotated[Number | None, system_option("Mode gated: opening of the gate in each period, ns.")] = None
-    gate_width_ns: Annotated[Number | None, system_option("Mode gated: width of the gate, at most the period, ns.")] = (
-        None
-    )
-    gate_step_ns: Annotated[Number | None, system_option("Mode gated: the opening advances by this, ns ...", "0")] = (
-        None
-    )
-    gate_cycles: Annotated[Integer | None, system_option("... every so many periods.", "1")] = None
-    cycles: Annotated[Integer | None, system_option("Laser periods per exposure.", "1000")] = None
-    bins: Annotated[Integer | None, system_option("Histogram bins per period.", "1024")] = None
+    System
+    ------
+    period_ns
+        Laser period, ns. [default: 133.33, 7.5 MHz]
+    detector
+        Published detector, in place of the file's (docs/detectors.md): $presets.
+    dead_time_ns
+        Dead time after a registration, ns. [default: 75]
+    mode
+        When the pixel registers: nonparalyzable, paralyzable (every arrival restarts the dead time), synchronous (armed
+        at each pulse, first photon only) or gated (with --gate-start-ns, --gate-width-ns). [default: nonparalyzable]
+    gate_start_ns
+        Mode gated: opening of the gate in each period, ns.
+    gate_width_ns
+        Mode gated: width of the gate, at most the period, ns.
+    gate_step_ns
+        Mode gated: the opening advances by this, ns ... [default: 0]
+    gate_cycles
+        ... every so many periods. [default: 1]
+    cycles
+        Laser periods per exposure. [default: 1000]
+    bins
+        Histogram bins per period. [default: 1024]
+    start
+        Pixel at the start of an exposure: armed (ready) or stationary (warmed up). [default: armed]
+    """
+
+    period_ns: Number | None = None
+    detector: Annotated[Text | None, Parameter(choices=tuple(PRESETS))] = None
+    dead_time_ns: Number | None = None
+    mode: Text | None = None
+    gate_start_ns: Number | None = None
+    gate_width_ns: Number | None = None
+    gate_step_ns: Number | None = None
+    gate_cycles: Integer | None = None
+    cycles: Integer | None = None
+    bins: Integer | None = None
     pulse: PulseOptions = PulseOptions()
-    start: Annotated[
-        Text | None,
-        system_option("Pixel at the start of an exposure: armed (ready) or stationary (warmed up).", "armed"),
-    ] = None
+    start: Text | None = None
 
     def of(self, file: Path | None, effects: Effects | None = None) -> System:
         """The system of a file, or the default one, so changed."""
@@ -255,12 +283,17 @@ class SystemChanges:
         return base.replace(**{name: value for name, value in changes.items() if value is not None})
 
 
-@Parameter(name="*")
-@dataclass(frozen=True, kw_only=True)
+@options
 class SystemOptions:
-    """A system: a file or the default one, and single options in place of its values."""
+    """A system: a file or the default one, and single options in place of its values.
 
-    system: SystemFile = None
+    System
+    ------
+    system
+        YAML or JSON file (see mars-lidar init); single options replace its values.
+    """
+
+    system: Path | None = None
     changes: SystemChanges = SystemChanges()
 
     def build(self, effects: Effects | None = None) -> System:

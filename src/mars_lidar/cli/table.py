@@ -6,57 +6,62 @@ import time
 from pathlib import Path
 from typing import Annotated, Any
 
-from cyclopts import App
+from cyclopts import App, Parameter
 
 from mars_lidar._base.progress import span
 from mars_lidar.cli.console import progress_bar, refuse_existing, table
-from mars_lidar.cli.options import (
-    COMMAND_LINE,
-    Number,
-    Text,
-    Threads,
-    argument,
-    command,
-    grid_option,
-    option,
-    out_option,
-    output_option,
-)
+from mars_lidar.cli.options import COMMAND_LINE, Integer, Number, OutPath, Text, command
 from mars_lidar.cli.system_options import Effects, SystemOptions
 from mars_lidar.table import Table, cache
 from mars_lidar.table.error import QuantisationError
-
-_ALLOWED = 0.05  # standard deviations of the mean count, up to which a table is told to be good
-_DEPTHS = 1024  # values of a delay axis, where there had to be one: the paper's 108 GB
-_PAPER_BYTES = "105 MB, 108 GB with delays"
 
 
 def build(
     *,
     instrument: SystemOptions = SystemOptions(),
     effects: Effects = Effects(),
-    signal: Annotated[
-        Text,
-        grid_option(
-            "Signal axis, photons per period, log-spaced; 0 is added.", "0.01,10,256", metavar="LOW,HIGH,POINTS"
-        ),
-    ] = "0.01,10,256",
-    background: Annotated[
-        Text, grid_option("Background axis, likewise.", "0.01,10,100", metavar="LOW,HIGH,POINTS")
-    ] = "0.01,10,100",
-    method: Annotated[
-        Text, grid_option("exposure (exact, start-up included) or mars (the paper's).", "exposure")
-    ] = "exposure",
-    rearm: Annotated[Text, grid_option("For mars: re-arming at the centre or the edge of a bin.", "centre")] = "centre",
-    refine: Annotated[
-        Number | None, grid_option("Insert points until the error between them, in total variation, is below this.")
-    ] = None,
-    check_law: Annotated[bool, grid_option("Compare count laws with exact ones at the end.")] = False,
-    threads: Threads = None,
-    out: Annotated[Path | None, out_option("The table: .h5 or .hdf5. Without it: the cache.", option)] = None,
-    overwrite: Annotated[bool, output_option("Replace an existing table.")] = False,
+    signal: Text = "0.01,10,256",
+    background: Text = "0.01,10,100",
+    method: Text = "exposure",
+    rearm: Text = "centre",
+    refine: Number | None = None,
+    check_law: bool = False,
+    threads: Integer | None = None,
+    out: OutPath | None = None,
+    overwrite: bool = False,
 ) -> None:
-    """Build the table of a system, in a file or in the cache; a cached table is not built again."""
+    """Build the table of a system, in a file or in the cache; a cached table is not built again.
+
+    Grid
+    ----
+    signal : LOW,HIGH,POINTS
+        Signal axis, photons per period, log-spaced; 0 is added. [default: 0.01,10,256]
+    background : LOW,HIGH,POINTS
+        Background axis, likewise. [default: 0.01,10,100]
+    method
+        exposure (exact, start-up included) or mars (the paper's). [default: exposure]
+    rearm
+        For mars: re-arming at the centre or the edge of a bin. [default: centre]
+    refine
+        Insert points until the error between them, in total variation, is below this.
+    check_law
+        Compare count laws with exact ones at the end.
+
+    Simulation
+    ----------
+    threads
+        Threads; the counts do not depend on it. [default: all cores]
+
+    Options
+    -------
+    out
+        The table: .h5 or .hdf5. Without it: the cache.
+
+    Output
+    ------
+    overwrite
+        Replace an existing table.
+    """
     began = time.perf_counter()
     refuse_existing(out, overwrite)
     system = instrument.build(effects)
@@ -78,10 +83,16 @@ def build(
 
 
 def info(
-    file: Annotated[Path | None, argument("A table: .h5 or .hdf5. Without it: the cache.")] = None,
+    file: Path | None = None,
     /,
 ) -> None:
-    """Describe a table, or list the tables in the cache."""
+    """Describe a table, or list the tables in the cache.
+
+    Arguments
+    ---------
+    file
+        A table: .h5 or .hdf5. Without it: the cache.
+    """
     if file is not None:
         table(_rows(file))
         return
@@ -93,9 +104,15 @@ def info(
 
 def clear(
     *,
-    yes: Annotated[bool, option("Do not ask.", "", "--yes", "-y")] = False,
+    yes: Annotated[bool, Parameter(("--yes", "-y"))] = False,
 ) -> None:
-    """Remove the tables in the cache."""
+    """Remove the tables in the cache.
+
+    Options
+    -------
+    yes
+        Do not ask.
+    """
     files = cache.files()
     if not files:
         print(f"{cache.directory()} holds no tables")
@@ -139,8 +156,8 @@ def _rows(path: Path) -> dict[str, str]:
         "method": method,
         "signal": provenance["signal"],
         "background": provenance["background"],
-        "size": f"{size / 1e6:,.4g} MB, shapes {shapes / 1e6:,.4g} MB of them; with a delay axis of {_DEPTHS} values "
-        f"{shapes * _DEPTHS / 1e9:,.4g} GB (the paper: {_PAPER_BYTES})",
+        "size": f"{size / 1e6:,.4g} MB, shapes {shapes / 1e6:,.4g} MB of them; with a delay axis of 1024 values "
+        f"{shapes * 1024 / 1e9:,.4g} GB (the paper: 105 MB, 108 GB with delays)",
         "cycles": serves,
         "exact laws": _laws(stored),
         "system": f"period {system.period_ns:.6g} ns, {system.bins} bins, {system.pulse!r}, dead time "
@@ -177,12 +194,13 @@ def _any_error(longest: dict[str, Any] | None, unsettled: int) -> str:
     if longest is None:
         return f"{grows}; at long exposures it was not measured when this table was built"
     error = QuantisationError(**longest)
-    within = error.cycles_within(_ALLOWED)
+    allowed = 0.05  # standard deviations of the mean count: invisible beside the count's own scatter
+    within = error.cycles_within(allowed)
     mean, variance = max(error.mean_max, error.delayed_mean_max), max(error.variance_max, error.delayed_variance_max)
     limit = "any number" if within >= error.cycles else f"up to some {within:.2g}"
     return (
         f"{grows}: at {error.cycles:,} cycles {mean:.2g} at most, variance {variance:.2g}; the mean is within "
-        f"{_ALLOWED:g} standard deviations for {limit} of cycles"
+        f"{allowed:g} standard deviations for {limit} of cycles"
     )
 
 

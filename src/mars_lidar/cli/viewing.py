@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import contextlib
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 from mars_lidar._base import checks, manifest
 from mars_lidar._base.files import size_on_disk
 from mars_lidar._version import other_version
-from mars_lidar.cli.console import FAILED, check_picture, progress_bar, save_picture, say, table
+from mars_lidar.cli.console import Exit, check_picture, progress_bar, save_picture, say, table
 from mars_lidar.cli.dataset import dataset_rows
 from mars_lidar.cli.foreign import ForeignOptions, foreign_rows, is_foreign
-from mars_lidar.cli.options import Integer, Text, argument, command, examples, option, out_option, two_integers
+from mars_lidar.cli.options import Integer, OutPath, Switch, Text, command, two
 from mars_lidar.instrument.detector import Detector
 from mars_lidar.light.flux import Flux
 
@@ -21,17 +21,24 @@ if TYPE_CHECKING:
 
 
 def info(
-    file: Annotated[
-        Path,
-        argument("A cube: .zarr (also a URL), .h5, .hdf5, .npz, .mat or .ptu; a dataset; a file of another program."),
-    ],
+    file: Path,
     /,
     *,
-    verify: Annotated[bool, option("Simulate again and compare every count; exit code 1 if they differ.")] = False,
+    verify: bool = False,
 ) -> int | None:
     """Describe a cube, a dataset or a file of another program.
 
     System, light, engine and size; whether the file is complete, and how to open it.
+
+    Arguments
+    ---------
+    file
+        A cube: .zarr (also a URL), .h5, .hdf5, .npz, .mat or .ptu; a dataset; a file of another program.
+
+    Options
+    -------
+    verify
+        Simulate again and compare every count; exit code 1 if they differ.
     """
     from mars_lidar.io import IncompleteFileError, load
     from mars_lidar.io import verify as same_again
@@ -63,39 +70,46 @@ def info(
         damaged = (manifest.damage(file) if file.suffix == ".zarr" else []) or ["counts differ"]
         different = f"NO: {damaged[0]}{other_version(cube.version)}"
         table([("verified", "simulated again, every count is the same" if same else different)])
-        if not same:
-            return FAILED
-    return None
+        return None if same else Exit.FAILED
 
 
 def view(
-    file: Annotated[
-        Path,
-        argument(
-            "A cube: .zarr, .h5, .hdf5, .npz, .mat, .ptu; a dataset; histograms of another program: "
-            "also .npy, .tif, .csv."
-        ),
-    ],
+    file: Path,
     /,
     *,
     foreign: ForeignOptions = ForeignOptions(),
-    out: Annotated[Path, out_option("The picture: .png, .pdf or .svg.", option)],
-    pixel: Annotated[
-        list[Text] | None,
-        option("Pixel whose histogram is drawn; up to 6 times.", "a bright, a dim and an edge pixel", metavar="Y,X"),
-    ] = None,
-    realization: Annotated[Integer, option("Which exposure, counted from 0 in this file.", "0")] = 0,
-    sample: Annotated[Integer | None, option("Of a dataset: which sample.", "0")] = None,
-    overwrite: Annotated[bool, option("Replace an existing picture.")] = False,
+    out: OutPath,
+    pixel: list[Text] | None = None,
+    realization: Integer = 0,
+    sample: Integer | None = None,
+    overwrite: bool = False,
 ) -> None:
     """Draw depth, reflectivity, counts and a few histograms.
 
     Beside the true depth stands that of the fullest bin. Each histogram stands beside the incident rate, scaled to
     the same total: the difference is pile-up. A measured cube is shown with the light that maximum likelihood finds
     in it.
+
+    Arguments
+    ---------
+    file
+        A cube: .zarr, .h5, .hdf5, .npz, .mat, .ptu; a dataset; histograms of another program: also .npy, .tif, .csv.
+
+    Options
+    -------
+    out
+        The picture: .png, .pdf or .svg.
+    pixel : Y,X
+        Pixel whose histogram is drawn; up to 6 times. [default: a bright, a dim and an edge pixel]
+    realization
+        Which exposure, counted from 0 in this file. [default: 0]
+    sample
+        Of a dataset: which sample. [default: 0]
+    overwrite
+        Replace an existing picture.
     """
     check_picture(out, overwrite)
-    pixels = None if not pixel else [two_integers("--pixel", text) for text in pixel]
+    pixels = None if not pixel else [two("--pixel", text) for text in pixel]
     with opened(file, sample, foreign) as cube:
         from mars_lidar.plot import overview
 
@@ -192,34 +206,40 @@ def _short(value: Any) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-EXPLORE_EXAMPLES = examples(
-    "mars-lidar explore",
-    "mars-lidar explore room.zarr",
-    "mars-lidar explore room.zarr --no-browser --port 8000",
-)
-
-
 def explore(
-    file: Annotated[
-        Path | None,
-        argument(
-            "A cube, a sample of a dataset, or histograms of another program, as mars-lidar view takes them.",
-            "the page's own picture",
-        ),
-    ] = None,
+    file: Path | None = None,
     /,
     *,
     foreign: ForeignOptions = ForeignOptions(),
-    sample: Annotated[Integer | None, option("Of a dataset: which sample.", "0")] = None,
-    port: Annotated[Integer, option("Port on the loopback address.", "0, one that is free")] = 0,
-    browser: Annotated[
-        bool, option("Open the page in the browser of this machine.", "yes", negative="--no-browser")
-    ] = True,
+    sample: Integer | None = None,
+    port: Integer = 0,
+    browser: Switch = True,
 ) -> None:
     """Show pixels and their exact laws in a browser.
 
     Sliders show what dead time does; a cube is shown pixel by pixel. The page is served on 127.0.0.1 alone, until
     Ctrl-C; parts of the cube are read as they are looked at.
+
+    Arguments
+    ---------
+    file
+        A cube, a sample of a dataset, or histograms of another program, as mars-lidar view takes them. [default: the
+        page's own picture]
+
+    Options
+    -------
+    sample
+        Of a dataset: which sample. [default: 0]
+    port
+        Port on the loopback address. [default: 0, one that is free]
+    browser
+        Open the page in the browser of this machine. [default: yes]
+
+    Examples
+    --------
+    mars-lidar explore
+    mars-lidar explore room.zarr
+    mars-lidar explore room.zarr --no-browser --port 8000
     """
     from mars_lidar.explore import CubeServer
 
@@ -240,4 +260,4 @@ def explore(
 
 info_command = command(info)
 view_command = command(view)
-explore_command = command(explore, EXPLORE_EXAMPLES)
+explore_command = command(explore)

@@ -126,7 +126,13 @@ def packing(layout: str, dtype: np.dtype[Any]) -> dict[str, Any]:
 
 
 def create_maps(
-    group: Any, name: str, shape: tuple[int, ...], dtype: np.dtype[Any], dims: tuple[str, ...], told: str, unit: str
+    group: Any,
+    name: str,
+    shape: tuple[int, ...],
+    dtype: np.dtype[Any],
+    dims: tuple[str, ...],
+    long_name: str,
+    unit: str,
 ) -> Any:
     """Create an array of maps: one of them is a chunk."""
     chunk = (1, *shape[1:])
@@ -140,7 +146,7 @@ def create_maps(
         fill_value=np.nan,
         dimension_names=dims,
         chunk_key_encoding=FLAT_KEYS,
-        attributes={"long_name": told, "units": unit},
+        attributes={"long_name": long_name, "units": unit},
     )
 
 

@@ -24,19 +24,25 @@ from functools import partial
 from typing import Any
 
 from mars_lidar._base.buckets import in_bucket
-from mars_lidar._base.optional import needed
+from mars_lidar._base.imports import needed
 from mars_lidar._version import __version__
 from mars_lidar.dataset.store import Dataset, Item, open_dataset
 from mars_lidar.dataset.write import Failed, Made, Maker, fingerprint
 
 _LIBRARY = "distributed", "making parts by workers", "cluster"
-_AHEAD = 3  # tasks given out per worker thread: none waits for the scheduler, and a million are not queued at once
-_LEAST_QUEUED = 512  # tasks: an adaptive cluster starts workers by the length of its queue, from none if need be
-_TASKS_PER_S = 50.0  # that the scheduler is asked to handle; it handles some hundred
-_LARGEST_TASK = 1000  # parts, so that a worker that is lost loses no more
 LOOK_S = 1.0  # between two looks at the workers that are there, and for whom there may be parts
 TIMEOUT_S = 20.0  # for a scheduler to answer
 _local = threading.local()
+
+
+@dataclass(frozen=True)
+class Dispatch:
+    """How many tasks are given out at a time, and how large they are."""
+
+    ahead: int = 3  # tasks per worker thread: none waits for the scheduler, and a million are not queued at once
+    least_queued: int = 512  # tasks: an adaptive cluster starts workers, also the first, by the length of its queue
+    tasks_per_s: float = 50.0  # that the scheduler is asked to handle; it handles some hundred
+    largest_task: int = 1000  # parts, so that a worker that is lost loses no more
 
 
 @dataclass(frozen=True)
@@ -46,13 +52,11 @@ class Team:
     executor: Executor
     make: Callable[[Sequence[Item]], list[Made | Failed]]
     threads: Callable[[], int]
-    ahead: int = 1
-    least_queued: int = 1
-    tasks_per_s: float = math.inf
+    dispatch: Dispatch = Dispatch(ahead=1, least_queued=1, tasks_per_s=math.inf)  # of threads
 
     def capacity(self) -> int:
         """Tasks that are given out at a time."""
-        return max(self.least_queued, self.ahead * self.threads())
+        return max(self.dispatch.least_queued, self.dispatch.ahead * self.threads())
 
     def parts_of_a_task(self, seconds: float, remaining: int) -> int:
         """Parts that one task makes, where each takes so many seconds (0: not known yet).
@@ -62,8 +66,8 @@ class Team:
         workers = self.threads()
         if seconds <= 0.0 or workers == 0:
             return 1
-        enough = math.ceil(workers / (seconds * self.tasks_per_s))
-        return max(1, min(_LARGEST_TASK, enough, remaining // workers))
+        enough = math.ceil(workers / (seconds * self.dispatch.tasks_per_s))
+        return max(1, min(self.dispatch.largest_task, enough, remaining // workers))
 
 
 def reach(scheduler: str | None) -> None:
@@ -84,7 +88,7 @@ class Crew:
         """For the parts of a dataset, each made on so many threads."""
         path = str(dataset.path if in_bucket(dataset.path) else dataset.path.resolve())
         run = Run(path, uuid.uuid4().hex, threads, __version__, fingerprint())
-        return Team(self.executor, partial(make_parts, run), self.threads, _AHEAD, _LEAST_QUEUED, _TASKS_PER_S)
+        return Team(self.executor, partial(make_parts, run), self.threads, Dispatch())
 
 
 @contextlib.contextmanager
@@ -117,8 +121,8 @@ def crew(workers: int | None, scheduler: str | None) -> Iterator[Crew]:
             distributed.scheduler.KilledWorker,
             distributed.comm.CommClosedError,
         ) as error:
-            told = " ".join(str(error).split()) or type(error).__name__
-            raise ConnectionError(f"the scheduler or its workers were lost ({told})") from error
+            text = " ".join(str(error).split()) or type(error).__name__
+            raise ConnectionError(f"the scheduler or its workers were lost ({text})") from error
         except BaseException:
             with contextlib.suppress(Exception):  # a scheduler that is gone has nothing to cancel
                 executor.shutdown(wait=False)

@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.buckets import url_of
-from mars_lidar._base.threads import thread_count
+from mars_lidar._base.resources import thread_count
 from mars_lidar.dataset.arrays import MAPS, count_samples, grid, histogram_blocks, sample_parts
 from mars_lidar.dataset.recipe import DatasetRecipe
 from mars_lidar.dataset.run import BUFFER_BYTES, making_bytes, read_recipe
-from mars_lidar.dataset.sample_content import Rendered, Shown
+from mars_lidar.dataset.scenes import Content, Rendered
 from mars_lidar.dataset.shard import packer
 from mars_lidar.dataset.sources import Candidate, candidates, scenes
-from mars_lidar.io.advice import Advice, advice
 from mars_lidar.io.scene_files import Problem
+from mars_lidar.io.simulated_file import Advice, advice
 from mars_lidar.simulation import simulate
 
 _SCENES, _PROBES = 4, 8
@@ -86,12 +86,12 @@ def estimate(
     parent = None if out is None or url_of(out) is not None else Path(out).absolute().parent
     if parent is not None and not parent.is_dir():
         raise FileNotFoundError(f"out must lie in an existing folder, got {str(out)!r}")
-    plan, found, problems, looked, each_s = _looked_at(recipe)
+    plan, listed, problems, looked, each_s = _looked_at(recipe)
     if not looked:
         raise ValueError(
             "none of the scenes looked at can be used:\n" + "\n".join(f"  {each}" for each in problems[:5])
         )
-    number = len(found) * (plan.crops if plan.crop else 1)
+    number = len(listed) * (plan.crops if plan.crop else 1)
     total = count_samples(plan, number)
     image = looked[0].shape
     shape, dtype, chunk, shard = histogram_blocks(plan, total, image)
@@ -109,7 +109,7 @@ def estimate(
         dense_bytes=dense,
         bytes=int(dense * ratio) + maps,
         free_bytes=None if parent is None else shutil.disk_usage(parent).free,
-        seconds=seconds * math.prod(shape[1:4]) * total / team + each_s * len(found),
+        seconds=seconds * math.prod(shape[1:4]) * total / team + each_s * len(listed),
         threads=team,
         memory_bytes=_BASE_BYTES + teams * (2 * block + 5 * 2**24) + 16 * pixels * 64,  # chunks, and shards of maps
         shards=shards,
@@ -122,48 +122,50 @@ def quick_advice(recipe: DatasetRecipe | dict[str, Any] | str | Path, threads: i
     """How long `generate` will take about, from one scene: quick also where a chunk takes minutes."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # generate itself tells them
-        plan, found, _, looked, each_s = _looked_at(recipe, 1)
+        plan, listed, _, looked, each_s = _looked_at(recipe, 1)
         if not looked:
             return Advice(0.0)
-        total = count_samples(plan, len(found) * (plan.crops if plan.crop else 1))
+        total = count_samples(plan, len(listed) * (plan.crops if plan.crop else 1))
         chosen = sorted({round(k) for k in np.linspace(0, count_samples(plan, 1) - 1, 3)})
-        told = []
+        times = []
         for sample in chosen:
             _, system, signal, sbr = sample_parts(plan, sample)
             flux = looked[0].flux(plan.systems[system], plan.light, signal, sbr)
             made = plan.realizations * total
-            told.append(advice(flux, plan.systems[system], plan.engine, realizations=made, threads=threads))
-    reading = each_s * len(found)
-    return Advice(*(reading + float(np.mean([getattr(each, name) for each in told])) for name in ("seconds", "auto_s")))
+            times.append(advice(flux, plan.systems[system], plan.engine, realizations=made, threads=threads))
+    reading = each_s * len(listed)
+    return Advice(
+        *(reading + float(np.mean([getattr(each, name) for each in times])) for name in ("seconds", "auto_s"))
+    )
 
 
 def _looked_at(
     recipe: Any, most: int = _SCENES
-) -> tuple[DatasetRecipe, list[Candidate], list[Problem], list[Shown], float]:
+) -> tuple[DatasetRecipe, list[Candidate], list[Problem], list[Content], float]:
     """The recipe, its scenes, what is bad, some scenes of one size, and the seconds that reading one took."""
     plan, folder = read_recipe(recipe)
     assert plan is not None
-    found, problems = candidates(plan.scenes, folder)
+    listed, problems = candidates(plan.scenes, folder)
     began = time.perf_counter()
-    chosen = sorted({round(k) for k in np.linspace(0, len(found) - 1, most)})
-    good: list[Shown] = []
+    chosen = sorted({round(k) for k in np.linspace(0, len(listed) - 1, most)})
+    good: list[Content] = []
     for k in chosen:
-        for each in scenes(found[k], plan, good[0].shape if good else None):
+        for each in scenes(listed[k], plan, good[0].shape if good else None):
             if isinstance(each, Problem):
                 problems.append(each)
             else:
                 good.append(each[1])
-    return plan, found, problems, good, (time.perf_counter() - began) / max(1, len(chosen))
+    return plan, listed, problems, good, (time.perf_counter() - began) / max(1, len(chosen))
 
 
-def _scene_bytes(shown: Shown) -> int:
+def _scene_bytes(content: Content) -> int:
     """Bytes of one scene in the store, not packed."""
-    maps = 3 + shown.transient.values.shape[2] if isinstance(shown, Rendered) else 2 * len(shown.layers)
-    return 8 * maps * math.prod(shown.shape)
+    maps = 3 + content.transient.values.shape[2] if isinstance(content, Rendered) else 2 * len(content.layers)
+    return 8 * maps * math.prod(content.shape)
 
 
 def _probe(
-    plan: DatasetRecipe, looked: list[Shown], chunk: tuple[int, ...], shard: int, dtype: np.dtype[Any]
+    plan: DatasetRecipe, looked: list[Content], chunk: tuple[int, ...], shard: int, dtype: np.dtype[Any]
 ) -> tuple[float, float]:
     """Seconds of one thread per exposure of a pixel, and bytes on disk over dense bytes.
 
@@ -189,7 +191,7 @@ def _probe(
             size = len(pack(counts))
             return time.perf_counter() - began, counts, size
 
-        spent, counts, size = min((once() for _ in range(2)), key=lambda told: told[0])
+        spent, counts, size = min((once() for _ in range(2)), key=lambda timed: timed[0])
         seconds, packed, dense = seconds + spent, packed + size, dense + counts.nbytes
         exposures += rows * columns
     return seconds / exposures, packed / dense

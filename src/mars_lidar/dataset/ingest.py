@@ -30,8 +30,7 @@ from mars_lidar.dataset.arrays import (
 )
 from mars_lidar.dataset.cluster import Crew
 from mars_lidar.dataset.recipe import DatasetRecipe
-from mars_lidar.dataset.sample_content import Shown
-from mars_lidar.dataset.scenes import SceneWriter
+from mars_lidar.dataset.scenes import Content, SceneWriter
 from mars_lidar.dataset.sources import Candidate, candidates, scenes, seed_of, several
 from mars_lidar.dataset.write import fingerprint
 from mars_lidar.io.layout import Variable
@@ -87,7 +86,7 @@ def _read(
     recipe: DatasetRecipe,
     shape: Callable[[], tuple[int, int] | None],
     crew: Crew | None,
-) -> Iterator[tuple[int, int, tuple[str, Shown] | Problem]]:
+) -> Iterator[tuple[int, int, tuple[str, Content] | Problem]]:
     """What the candidates from a number on give: candidate, place among its scenes, and the scene or the problem."""
     while number < len(listed) and (crew is None or shape() is None):
         for place, result in enumerate(scenes(listed[number], recipe, shape())):

@@ -27,19 +27,17 @@ from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.cached import cached_property
 from mars_lidar._base.files import beside
-from mars_lidar._base.memory import check_memory
 from mars_lidar._base.progress import callback_of
+from mars_lidar._base.resources import check_memory
 from mars_lidar._base.types import FloatArray, Progress
 from mars_lidar.dataset.arrays import MAPS, sample_parts
-from mars_lidar.dataset.read import read_sparse
-from mars_lidar.dataset.store import Dataset, open_dataset
+from mars_lidar.dataset.store import Dataset, open_dataset, read_sparse
 from mars_lidar.dataset.write import Maker
 from mars_lidar.instrument.system import System
 from mars_lidar.io import mat
 from mars_lidar.io.mat import write_variables
 from mars_lidar.light.flux import Flux
 
-_MAT_BYTES = 2**31 - 2**16  # of a variable in a v5 file
 _PULSE_BINS, _PULSE_PEAK = 16, 6  # what `deepsensorfusion` reads: the pulse in so many bins, its peak in that one
 _PULSE_LEAST = 0.999  # of its energy
 _NAMES = {"intensity_hr": "intensity"}  # what another name is stored under
@@ -141,7 +139,7 @@ def export(
     OSError
         `out` has something in it, or cannot be written.
     """
-    told = callback_of(progress, "exporting")
+    report = callback_of(progress, "exporting")
     source = dataset if isinstance(dataset, Dataset) else open_dataset(dataset)
     checks.choice("layout", layout, (*LAYOUTS, WEBDATASET))
     folder = Path(out)
@@ -152,7 +150,7 @@ def export(
             raise ValueError("fill belongs to the layouts of networks; webdataset has the maps as they are")
         folder.parent.mkdir(parents=True, exist_ok=True)
         with beside(folder, folder=True) as unfinished:
-            written = _write_tars(unfinished, source, told)
+            written = _write_tars(unfinished, source, report)
         return Exported(written, folder / "list.txt", ())
     chosen = LAYOUTS[layout]
     replaced = ("intensity", ".mat") if chosen.lists == _INTENSITY else ()  # by loaders, in the whole path
@@ -168,7 +166,7 @@ def export(
             pulse_in_bins(system, np.zeros((1, 1)), np.ones((1, 1)))
     folder.parent.mkdir(parents=True, exist_ok=True)
     with beside(folder, folder=True) as unfinished:
-        written = _write(unfinished, folder, source, chosen, fill, told)
+        written = _write(unfinished, folder, source, chosen, fill, report)
     return Exported(written, folder / "list.txt", tuple(_notes(layout, chosen, (height, width, bins))))
 
 
@@ -215,7 +213,7 @@ def _npy(values: NDArray[Any]) -> bytes:
     return stream.getvalue()
 
 
-def _write(folder: Path, final: Path, source: Dataset, chosen: Layout, fill: bool, told: Progress | None) -> int:
+def _write(folder: Path, final: Path, source: Dataset, chosen: Layout, fill: bool, report: Progress | None) -> int:
     """Write the files of all exposures into `folder`, which will be `final`; returns how many exposures."""
     samples, realizations = source.histogram.shape[:2]
     maker, written = Maker(source), 0
@@ -245,8 +243,8 @@ def _write(folder: Path, final: Path, source: Dataset, chosen: Layout, fill: boo
             if entry not in listed:
                 listed.append(entry)
             written += 1
-            if told is not None:
-                told(written, samples * realizations)
+            if report is not None:
+                report(written, samples * realizations)
     (folder / "list.txt").write_text("".join(f"{entry}\n" for entry in listed))
     if chosen.pictures:
         (folder / "blacklist.txt").write_text("")
@@ -256,7 +254,7 @@ def _write(folder: Path, final: Path, source: Dataset, chosen: Layout, fill: boo
 def _notes(name: str, layout: Layout, shape: tuple[int, ...]) -> list[str]:
     out = []
     if layout.size and shape[: len(layout.size)] != layout.size:
-        sizes = [" x ".join(map(str, one)) for one in (layout.size, shape[: len(layout.size)])]
+        sizes = [" x ".join(map(str, size)) for size in (layout.size, shape[: len(layout.size)])]
         out.append(f"the loader of {name} has {sizes[0]} written into it, and these files hold {sizes[1]}")
     if layout.pictures:
         out.append("*_pred.png hold one depth each, the median of the scene: put a monocular network's in their place")
@@ -299,9 +297,9 @@ class Exposure:
             from scipy.ndimage import distance_transform_edt
 
             self._place = tuple(distance_transform_edt(~lit, return_distances=False, return_indices=True))
-        shown = maker.scene(sample)
-        self._depth: FloatArray = np.nan_to_num(np.where(lit, shown.depth_m, 0.0)[self._place])
-        reflectivity = np.nan_to_num(shown.reflectivity)
+        content = maker.scene(sample)
+        self._depth: FloatArray = np.nan_to_num(np.where(lit, content.depth_m, 0.0)[self._place])
+        reflectivity = np.nan_to_num(content.reflectivity)
         self._reflectivity: FloatArray = reflectivity / max(1.0, float(reflectivity.max(initial=0.0)))
 
     @cached_property
@@ -345,8 +343,8 @@ class Exposure:
         return np.asarray(pulse_in_bins(self._system, delay, self._flux.signal)[self._place])
 
     def _median(self) -> NDArray[np.float64]:
-        seen = self._depth[self._depth > 0]
-        return np.full(self._depth.shape, np.median(seen) if seen.size else 0.0)
+        known = self._depth[self._depth > 0]
+        return np.full(self._depth.shape, np.median(known) if known.size else 0.0)
 
     def _photons(self, per_period: NDArray[np.float64]) -> float:
         """Of an exposure before dead time, mean over pixels."""
@@ -416,5 +414,5 @@ def psf(system: System) -> NDArray[np.float64]:
 
 def check_size(name: str, size: int) -> None:
     """Raise ValueError where a variable of `size` bytes does not fit a MATLAB v5 file."""
-    if size > _MAT_BYTES:
+    if size > mat.MAX_BYTES:
         raise ValueError(f"a variable of a .mat (v5) takes less than 2 GiB, and {name} would {size / 2**30:.3g} GiB")

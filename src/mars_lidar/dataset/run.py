@@ -30,7 +30,7 @@ from mars_lidar._base.files import (
     successor,
 )
 from mars_lidar._base.progress import callback_of
-from mars_lidar._base.threads import thread_count
+from mars_lidar._base.resources import thread_count
 from mars_lidar._base.types import Progress
 from mars_lidar._version import __version__
 from mars_lidar.dataset import cluster
@@ -300,7 +300,7 @@ def make_part(
             return _Totals(0, 0, None).generated(target, dataset, time.perf_counter() - began)
         if dataset.attrs.get("bits") != fingerprint():
             raise ValueError(f"this machine draws other counts than that on which {store} was begun")
-        with _told(store, target):
+        with _explained(store, target):
             mine = _share(list(dataset.items()), which, of)
             todo = dataset.missing(mine)
             totals = _Totals(len(mine) - len(todo), len(mine), callback_of(progress, "generating"))
@@ -355,7 +355,7 @@ def finish(out: str | Path) -> Generated:
     began, target = time.perf_counter(), _target(out)
     with _alone(target):
         store, dataset = _opened(target)
-        with _told(store, target):
+        with _explained(store, target):
             if not dataset.complete:
                 dataset.tidy()
                 if missing := dataset.missing():
@@ -429,7 +429,7 @@ def _begun(
         begun = there and dataset.planned
         if not begun and wanted is None:
             raise ValueError(f"{target} was stopped before its scenes were in: give the recipe again to resume")
-        with _told(store, target), workers as crew:
+        with _explained(store, target), workers as crew:
             if not begun:
                 assert wanted is not None
                 create(store, wanted, folder, crew)
@@ -456,21 +456,21 @@ def _in_place(store: Path, target: Path, dataset: Dataset) -> Dataset:
 
 
 @contextlib.contextmanager
-def _told(store: Path, target: Path) -> Iterator[None]:
+def _explained(store: Path, target: Path) -> Iterator[None]:
     """Errors of the file system, of threads, and Ctrl-C say what is on the disk."""
     try:
         yield
     except KeyboardInterrupt:
-        raise Interrupted(f"interrupted; {_left(store, target)}") from None
+        raise Interrupted(f"interrupted; {_remaining(store, target)}") from None
     except RuntimeError as error:
         if "thread" not in str(error):
             raise
-        text = f"{error}: give fewer threads, or more memory; {_left(store, target)}"
+        text = f"{error}: give fewer threads, or more memory; {_remaining(store, target)}"
         raise WriteError(errno.EAGAIN, text) from error
     except OSError as error:
         if isinstance(error, FileNotFoundError | FileExistsError) and not store.exists():
             raise
-        raise WriteError(error.errno, f"{error.strerror or error}; {_left(store, target)}") from error
+        raise WriteError(error.errno, f"{error.strerror or error}; {_remaining(store, target)}") from error
 
 
 def read_recipe(recipe: DatasetRecipe | dict[str, Any] | str | Path | None) -> tuple[DatasetRecipe | None, Path]:
@@ -599,7 +599,7 @@ def _check_same(target: Path, dataset: Dataset, wanted: DatasetRecipe | None) ->
             )
 
 
-def _left(store: Path, target: Path) -> str:
+def _remaining(store: Path, target: Path) -> str:
     """What is on the disk, for the text of an error."""
     try:
         dataset = Dataset(store)

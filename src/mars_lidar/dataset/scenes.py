@@ -1,6 +1,6 @@
-"""The scenes of a dataset in its store, group ``scenes``: written one by one, read again when a sample needs one.
+"""What a sample shows (surfaces, in clear air or in fog, or rendered light), and where a store has it.
 
-::
+The group ``scenes`` is written scene by scene, and read again when a sample needs one::
 
     depth, reflectivity, background  (scene, y, x)         as they were read; of the first layer
     name                             (scene)               text; (scene, letter) in UTF-8 before 0.3
@@ -18,8 +18,9 @@ import itertools
 import json
 import math
 import shutil
+import warnings
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,17 +30,137 @@ from numpy.typing import NDArray
 from mars_lidar._base.buckets import in_bucket
 from mars_lidar._base.cached import cached_property
 from mars_lidar._base.files import reading
+from mars_lidar._base.resample import area_mean, nearest, new_size, window
+from mars_lidar._base.types import FloatArray
 from mars_lidar.dataset.arrays import FLAT_KEYS, create_maps, fitting, grid
-from mars_lidar.dataset.sample_content import Rendered, Shown, Surfaces
+from mars_lidar.dataset.recipe import Light
 from mars_lidar.dataset.shard import DigestNotes
 from mars_lidar.instrument.system import System
 from mars_lidar.io.layout import Variable
 from mars_lidar.io.store import OnDisk
 from mars_lidar.io.zarr_store import add, blosc
+from mars_lidar.light.flux import Flux
 from mars_lidar.light.fog import Fog
-from mars_lidar.light.transient import Rows, Transient
-from mars_lidar.scene.layers import MOST, LayeredScene
+from mars_lidar.light.tolerances import TOL
+from mars_lidar.light.transient import Rows, Transient, parts_of
+from mars_lidar.scene.layers import LayeredScene
 from mars_lidar.scene.scene import Scene
+
+
+@dataclass(frozen=True)
+class Surfaces:
+    """A scene, or one of several layers, lit by the laser; perhaps in fog."""
+
+    scene: Scene | LayeredScene
+    fog: Fog | None = None
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(H, W)."""
+        return self.scene.shape
+
+    @property
+    def layers(self) -> tuple[Scene, ...]:
+        """All of them; one of an ordinary scene."""
+        return self.scene.layers if isinstance(self.scene, LayeredScene) else (self.scene,)
+
+    @property
+    def depth_m(self) -> FloatArray:
+        """Depth of the first layer, m, NaN where it has no surface."""
+        return self.scene.depth_m
+
+    @property
+    def reflectivity(self) -> FloatArray:
+        """Reflectivity of the first layer."""
+        return self.scene.reflectivity
+
+    @property
+    def lit(self) -> bool:
+        """Whether light returns from any pixel."""
+        return any((layer.reflectivity[layer.valid] > 0.0).any() for layer in self.layers)
+
+    def resize(self, size: int | tuple[int, int]) -> Surfaces:
+        """At another size."""
+        return replace(self, scene=self.scene.resize(size))
+
+    def __getitem__(self, key: Any) -> Surfaces:
+        return replace(self, scene=self.scene[key])
+
+    def waveform_parts(self, system: System) -> int:
+        """Parts of the period in its waveforms; 0 where returns are enough."""
+        return 0 if self.fog is None else TOL.parts_per_bin * system.bins
+
+    def flux(
+        self, system: System, light: Light, signal: float, sbr: float, dark: float | None = None, *, tell: bool = False
+    ) -> Flux:
+        """Photons; pixels without return or beyond the range are no matter for every sample, unless to `tell` them."""
+        with warnings.catch_warnings():
+            if not tell:
+                warnings.simplefilter("ignore", UserWarning)
+            clear = self.scene.flux(
+                system,
+                signal=signal,
+                sbr=sbr,
+                attenuation=light.attenuation,  # type: ignore[arg-type]  # checked by the recipe
+                ambient=light.ambient,  # type: ignore[arg-type]
+                dark_count_hz=light.dark_count_hz if dark is None else dark,
+            )
+        return clear if self.fog is None else self.fog.before(clear, system, signal)
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """Rendered light; depth and reflectivity are NaN where nobody tells them."""
+
+    transient: Transient
+    depth_m: FloatArray
+    reflectivity: FloatArray
+    pulse: bool = True
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(H, W)."""
+        return self.transient.shape
+
+    @property
+    def lit(self) -> bool:
+        """Whether any pixel has light."""
+        return bool((self.transient.totals > 0.0).any())
+
+    def resize(self, size: int | tuple[int, int]) -> Rendered:
+        """At another size: mean light, nearest depth."""
+        height, width = new_size(size, self.shape)
+        place = np.ix_(nearest(self.shape[0], height), nearest(self.shape[1], width))
+        share = area_mean(area_mean(self.reflectivity, height, axis=0), width, axis=1)
+        return replace(
+            self, transient=self.transient.resize((height, width)), depth_m=self.depth_m[place], reflectivity=share
+        )
+
+    def __getitem__(self, key: Any) -> Rendered:
+        keys = window("transient", key, self.shape)
+        depth, share = self.depth_m[keys], self.reflectivity[keys]
+        return replace(self, transient=self.transient[keys], depth_m=depth, reflectivity=share)
+
+    def waveform_parts(self, system: System) -> int:
+        """Parts of the period in its waveforms."""
+        return parts_of(self.transient, system)
+
+    def flux(
+        self, system: System, light: Light, signal: float, sbr: float, dark: float | None = None, *, tell: bool = False
+    ) -> Flux:
+        """Photons, made row by row as they are used."""
+        return self.transient.stored_flux(
+            system,
+            signal=signal if light.photons_per_unit is None else None,
+            photons_per_unit=light.photons_per_unit,
+            sbr=sbr,
+            pulse=self.pulse,
+            dark_count_hz=light.dark_count_hz if dark is None else dark,
+        )
+
+
+Content = Surfaces | Rendered
+
 
 _DOUBLE = np.dtype(np.float64)
 _READ_BYTES = 4 << 20  # of one map: scenes are read this many at once, each read costs a millisecond
@@ -59,7 +180,7 @@ class SceneWriter:
         self._notes, self._path = path / "scenes" / _NOTES, path
         self._digests = DigestNotes(path)
         self._arrays: dict[str, Any] = {}
-        self._held: list[Shown] = []
+        self._held: list[Content] = []
         self._kinds: list[str] = []
         self.names: list[str] = []
         self.position = (0, 0)
@@ -101,7 +222,7 @@ class SceneWriter:
         """Whether each scene so far is one surface in clear air."""
         return not any(self._kinds)
 
-    def add(self, name: str, scene: Shown, position: tuple[int, int]) -> None:
+    def add(self, name: str, scene: Content, position: tuple[int, int]) -> None:
         """One more scene; `position` is the place after it among all candidates, `problems` are those before it."""
         if not self._arrays:
             for array, unit in (("depth", "m"), ("reflectivity", "1"), ("background", "relative")):
@@ -172,7 +293,7 @@ class SceneWriter:
 
     def _write_layers(self, number: int, scene: Surfaces) -> None:
         if _LAYERS[0] not in self._arrays:
-            shape = (self._most, MOST - 1, *scene.shape)
+            shape = (self._most, TOL.returns - 1, *scene.shape)
             for name, unit in zip(_LAYERS, ("m", "1"), strict=True):
                 self._arrays[name] = self._maps(name, shape, ("scene", "layer", "y", "x"), unit)
         others = scene.layers[1:]
@@ -218,12 +339,12 @@ class SceneReader:
         self._group = {name: OnDisk(array, path) for name, array in group.arrays()}
         self._block: tuple[int, tuple[NDArray[np.float64], ...] | None] = (0, None)
 
-    def read(self, number: int) -> Shown:
+    def read(self, number: int) -> Content:
         """A scene as it was read from its source; rendered light stays on disk."""
         with reading(self._path, "scenes of a dataset"):
-            return self._shown(number)
+            return self._content(number)
 
-    def _shown(self, number: int) -> Shown:
+    def _content(self, number: int) -> Content:
         depth, reflectivity, background = self._first_layer(number)
         details = self.kind(number)
         if "transient" in details:
@@ -249,8 +370,8 @@ class SceneReader:
     def waveform_parts(self, systems: Sequence[System]) -> int:
         """Most parts of the period in waveforms of samples; 0 where returns are enough."""
         one_of_each = {text: number for number, text in enumerate(self._kinds) if text}
-        shown = [self.read(number) for number in one_of_each.values()]
-        return max((each.waveform_parts(system) for each in shown for system in systems), default=0)
+        contents = [self.read(number) for number in one_of_each.values()]
+        return max((each.waveform_parts(system) for each in contents for system in systems), default=0)
 
     def names(self) -> list[str]:
         """Names of all scenes."""
@@ -278,7 +399,7 @@ class SceneReader:
         return tuple(values[number - first] for values in maps)
 
 
-def _kind(scene: Shown) -> str:
+def _kind(scene: Content) -> str:
     details: dict[str, Any] = {}
     if isinstance(scene, Rendered):
         light = scene.transient

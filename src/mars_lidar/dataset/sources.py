@@ -1,4 +1,7 @@
-"""From the scenes of a recipe to scenes one by one: read, resized, cropped, named; bad ones told and left out."""
+"""From the scenes of a recipe to scenes one by one: read, resized, cropped, named; bad ones are listed and omitted.
+
+A `View` is one scene with its light, which `simulate` takes.
+"""
 
 from __future__ import annotations
 
@@ -13,13 +16,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from mars_lidar.dataset.recipe import DatasetRecipe
-from mars_lidar.dataset.sample_content import Rendered, Shown, Surfaces
+from mars_lidar._base.arguments import checked
+from mars_lidar._base.yaml import Key, Lines, RecipeError, located, read_yaml
+from mars_lidar.dataset.recipe import DatasetRecipe, read_light, read_scene, refuse_for_transients
+from mars_lidar.dataset.scenes import Content, Rendered, Surfaces
 from mars_lidar.dataset.values import listed_numbers
 from mars_lidar.engines import find_engine
-from mars_lidar.io.rgbd import collections
-from mars_lidar.io.rgbd.layered import is_layered, read_layers
+from mars_lidar.instrument.system import System
+from mars_lidar.io import rgbd
 from mars_lidar.io.scene_files import BAD_FILE, Problem, SceneFile, scan
 from mars_lidar.io.transient import SUFFIXES, read_transient, read_truth
 from mars_lidar.light.flux import Flux
@@ -38,7 +44,7 @@ class Candidate:
 
     name: str
     path: Path
-    load: Callable[[], Shown]
+    load: Callable[[], Content]
     place: str
 
 
@@ -47,35 +53,35 @@ def candidates(entries: Sequence[dict[str, Any]], folder: Path) -> tuple[list[Ca
 
     A source that does not exist, or holds no scene at all, is a ValueError.
     """
-    found: list[Candidate] = []
+    listed: list[Candidate] = []
     problems: list[Problem] = []
     roots = _root_names(entries, folder)
     for entry in entries:
-        before = len(found)
+        before = len(listed)
         if "example" in entry:
-            found += [one for clear in _examples(entry) for one in _behind_all(clear, entry)]
+            listed += [each for clear in _examples(entry) for each in _behind_all(clear, entry)]
             continue
         if "transient" in entry:
             for path, load in _transients(entry, folder):
                 name = _named(roots, _root(entry, folder), path)
-                found.append(_sized(Candidate(name, path, load, name), entry))
+                listed.append(_sized(Candidate(name, path, load, name), entry))
             continue
         for file in _files(entry, folder, problems):
             name = _named(roots, _root(entry, folder), file.depth)
             name += "" if file.index is None else f", frame {file.index}"
-            found += _behind_all(_sized(Candidate(name, file.depth, partial(_surfaces, file), name), entry), entry)
-        if len(found) == before and not problems:
+            listed += _behind_all(_sized(Candidate(name, file.depth, partial(_surfaces, file), name), entry), entry)
+        if len(listed) == before and not problems:
             raise ValueError(f"{folder / entry['path']}: no scene found; docs/formats.md tells what is one")
-    names = [one.name for one in found]
+    names = [each.name for each in listed]
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
         raise ValueError(f"scenes must differ from each other, got {twice} twice")
-    return found, problems
+    return listed, problems
 
 
 def scenes(
     candidate: Candidate, recipe: DatasetRecipe, shape: tuple[int, int] | None
-) -> Iterator[tuple[str, Shown] | Problem]:
+) -> Iterator[tuple[str, Content] | Problem]:
     """What a candidate gives: itself or its crops by name, checked against all levels and systems; or what is wrong.
 
     `shape` is that of the dataset, None while it is not known.
@@ -108,9 +114,9 @@ def scenes(
 
 def several(
     some: Sequence[Candidate], recipe: DatasetRecipe, shape: tuple[int, int] | None
-) -> list[list[tuple[str, Shown] | Problem]]:
+) -> list[list[tuple[str, Content] | Problem]]:
     """What each of several candidates gives; runs on workers."""
-    return [list(scenes(one, recipe, shape)) for one in some]
+    return [list(scenes(candidate, recipe, shape)) for candidate in some]
 
 
 def seed_of(recipe: DatasetRecipe, scene: str, system: str, signal: float, sbr: float) -> int:
@@ -119,8 +125,8 @@ def seed_of(recipe: DatasetRecipe, scene: str, system: str, signal: float, sbr: 
     A sample keeps its seed whatever other scenes, systems and levels a recipe has. 64 bits of BLAKE2b: among a
     million samples two have the same one with a probability of 3e-8.
     """
-    told = json.dumps([recipe.seed, scene, system, repr(signal), repr(sbr)])
-    return int.from_bytes(hashlib.blake2b(told.encode(), digest_size=8).digest(), "little")
+    text = json.dumps([recipe.seed, scene, system, repr(signal), repr(sbr)])
+    return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "little")
 
 
 def _files(entry: dict[str, Any], folder: Path, problems: list[Problem]) -> Iterator[SceneFile]:
@@ -129,7 +135,7 @@ def _files(entry: dict[str, Any], folder: Path, problems: list[Problem]) -> Iter
     image = entry.get("image")
     if path.is_dir():
         manifest = folder / entry["manifest"] if "manifest" in entry else None
-        if not collections.is_middlebury(path) or "pattern" in entry or manifest is not None:
+        if not rgbd.is_middlebury(path) or "pattern" in entry or manifest is not None:
             if image is not None and not (isinstance(image, list) and len(image) == 2):
                 raise ValueError(f"image must be two texts that go with pattern for the folder {path}, got {image!r}")
             pair = None if image is None else (image[0], image[1])
@@ -148,7 +154,7 @@ def _files(entry: dict[str, Any], folder: Path, problems: list[Problem]) -> Iter
     if path.suffix.lower() != ".mat" or not path.is_file():
         yield from _chosen([own], entry)
         return
-    frames = range(collections.nyu_frames(path))
+    frames = range(rgbd.nyu_frames(path))
     options.pop("depth_unit_m", None)
     yield from _chosen([SceneFile(depth=path, image=own.image, index=k, **options) for k in frames], entry)
 
@@ -160,7 +166,7 @@ def _transients(entry: dict[str, Any], folder: Path) -> Iterator[tuple[Path, Cal
     files = [root]
     if root.is_dir():
         every = sorted(root.glob(entry.get("pattern", "**/*")))
-        files = [one for one in every if one.is_file() and ("pattern" in entry or one.suffix.lower() in SUFFIXES)]
+        files = [each for each in every if each.is_file() and ("pattern" in entry or each.suffix.lower() in SUFFIXES)]
         if not files:
             raise ValueError(f"{root}: no transient found, a file {', '.join(SUFFIXES)}")
     elif "pattern" in entry:
@@ -183,11 +189,11 @@ def _chosen(files: list[SceneFile], entry: dict[str, Any]) -> list[SceneFile]:
     if "frames" not in entry:
         return files
     wanted = set(listed_numbers(entry["frames"]))
-    have = {one.index for one in files if one.index is not None}
+    have = {file.index for file in files if file.index is not None}
     if wanted - have:
-        told = f"0 to {len(have) - 1}" if have else "no frames"
-        raise ValueError(f"frames must be among those of {entry['path']} ({told}), got {min(wanted - have)}")
-    return [one for one in files if one.index in wanted]
+        numbers = f"0 to {len(have) - 1}" if have else "no frames"
+        raise ValueError(f"frames must be among those of {entry['path']} ({numbers}), got {min(wanted - have)}")
+    return [file for file in files if file.index in wanted]
 
 
 def _root(entry: dict[str, Any], folder: Path) -> Path:
@@ -227,7 +233,7 @@ def _examples(entry: dict[str, Any]) -> Iterator[Candidate]:
         yield Candidate(called, Path(called), partial(_example, name, _side(size), seed), called)
 
 
-def _example(name: str, size: Any, seed: int) -> Shown:
+def _example(name: str, size: Any, seed: int) -> Content:
     return Surfaces(Scene.example(name, size, seed))
 
 
@@ -240,7 +246,7 @@ def _sized(whole: Candidate, entry: dict[str, Any]) -> Candidate:
     return Candidate(name, whole.path, partial(_resized, whole.load, _side(size)), place)
 
 
-def _resized(load: Callable[[], Shown], size: Any) -> Shown:
+def _resized(load: Callable[[], Content], size: Any) -> Content:
     return load().resize(size)
 
 
@@ -248,11 +254,11 @@ def _side(size: Any) -> Any:
     return tuple(size) if isinstance(size, list) else size
 
 
-def _surfaces(file: SceneFile) -> Shown:
+def _surfaces(file: SceneFile) -> Content:
     """A scene, or the layers of an ``.npz``."""
-    if is_layered(file.depth):
+    if rgbd.is_layered(file.depth):
         options = {name: getattr(file, name) for name in ("depth_unit_m", "focal_px", "max_depth_m")}
-        return Surfaces(read_layers(file.depth, **options))
+        return Surfaces(rgbd.read_layers(file.depth, **options))
     return Surfaces(file.load())
 
 
@@ -263,20 +269,22 @@ def _behind_all(clear: Candidate, entry: dict[str, Any]) -> Iterator[Candidate]:
     """
     pane = entry.get("pane")
     for fog in entry.get("fog") or [None]:
-        told = [] if pane is None else [f"pane {pane['depth_m']!r} {pane['reflectivity']!r} {pane['transmission']!r}"]
-        told += [] if fog is None else [f"fog {fog['extinction_per_m']!r} {fog['backscatter']!r} {fog['nearest_m']!r}"]
-        load = partial(_behind, clear.load, pane, fog)
-        yield Candidate(", ".join([clear.name, *told]), clear.path, load, clear.place)
+        before = [] if pane is None else [f"pane {pane['depth_m']!r} {pane['reflectivity']!r} {pane['transmission']!r}"]
+        before += (
+            [] if fog is None else [f"fog {fog['extinction_per_m']!r} {fog['backscatter']!r} {fog['nearest_m']!r}"]
+        )
+        load = partial(_obscured, clear.load, pane, fog)
+        yield Candidate(", ".join([clear.name, *before]), clear.path, load, clear.place)
 
 
-def _behind(load: Callable[[], Shown], pane: dict[str, float] | None, fog: dict[str, float] | None) -> Shown:
-    shown = load()
-    assert isinstance(shown, Surfaces)
-    scene = shown.scene if pane is None else LayeredScene.behind_pane(shown.scene, **pane)
+def _obscured(load: Callable[[], Content], pane: dict[str, float] | None, fog: dict[str, float] | None) -> Content:
+    content = load()
+    assert isinstance(content, Surfaces)
+    scene = content.scene if pane is None else LayeredScene.behind_pane(content.scene, **pane)
     return Surfaces(scene, None if fog is None else Fog(**fog))
 
 
-def _cropped(scene: Shown, size: tuple[int, int], name: str, seed: int) -> Shown:
+def _cropped(scene: Content, size: tuple[int, int], name: str, seed: int) -> Content:
     height, width = scene.shape
     if size[0] > height or size[1] > width:
         raise ValueError(f"is {height} × {width} pixels, smaller than a crop of {size[0]} × {size[1]}")
@@ -290,7 +298,7 @@ def _cropped(scene: Shown, size: tuple[int, int], name: str, seed: int) -> Shown
     raise ValueError(f"no pixel with a return in {_TRIES} crops of {size[0]} × {size[1]}")
 
 
-def _check_levels(scene: Shown, recipe: DatasetRecipe) -> None:
+def _check_levels(scene: Content, recipe: DatasetRecipe) -> None:
     """Raise ValueError where a level cannot be had of a scene: before anything is simulated."""
     light, engine = recipe.light, find_engine(recipe.engine)
     unit_sbr = 1.0 if any(math.isfinite(sbr) for _, sbr in light.levels) else math.inf
@@ -317,3 +325,92 @@ def _at_level(unit: Flux, signal: float, ambient: float, dark: float) -> Flux:
     if unit.waveform is not None:
         return Flux(waveform=signal * unit.waveform, background=background)
     return Flux(signal * unit.returns_signal, background, unit.returns_delay_ns)
+
+
+_PATHS = ("depth", "path", "image", "manifest", "transient")
+
+
+@dataclass(frozen=True)
+class View:
+    """Flux, true depth (m) and reflectivity of one scene, None where unknown, and what it is in words."""
+
+    flux: Flux
+    depth_m: NDArray[Any] | None
+    reflectivity: NDArray[Any] | None
+    source: str
+
+
+@checked
+def read_view(scene: dict[str, Any] | str | Path, system: System, *, whole: bool = True, **replaced: Any) -> View:
+    """The one scene that a description means, lit under `system`.
+
+    Parameters
+    ----------
+    scene
+        A YAML file, or its content: an entry of a recipe's `scenes` that means one scene, such as ``{"example":
+        "room", "fog": {"extinction_per_m": 0.1, "backscatter": 0.3}}``, ``{"depth": "depth.png", "image": "rgb.jpg"}``
+        or ``{"transient": "render.hdf5"}``, and beside it ``light``, as in a recipe, of one level (docs/formats.md).
+    system
+        Laser, detector and histogram.
+    whole
+        False: a transient's waveforms are made in bands of rows, as they are used (`StoredFlux`).
+    **replaced
+        Keys that take other values, those of `light` in a dictionary; None: as in the description.
+
+    Raises
+    ------
+    ValueError
+        ``FILE:LINE: what is wrong``, or what is wrong with the dictionary; several scenes or levels.
+    """
+    changes = {name: value for name, value in replaced.items() if value is not None and name != "light"}
+    shining = {name: value for name, value in (replaced.get("light") or {}).items() if value is not None}
+    if isinstance(scene, dict):
+        return _view(_merged(scene, changes, shining), system, whole)
+    file = Path(scene)
+    if not file.is_file():
+        raise ValueError(f"{file}: no such file")
+    data, lines = read_yaml(file)
+    given = {(name,) for name in changes} | {("light", name) for name in shining}
+    own: Lines = {key: line for key, line in lines.items() if key[:1] not in given and key[:2] not in given}
+    with located(file, own, lambda key: key[:1] in given or key[:2] in given):
+        if isinstance(data, dict):  # files of a description are relative to it
+            data |= {name: str(file.parent / data[name]) for name in _PATHS if isinstance(data.get(name), str)}
+        return _view(_merged(data, changes, shining), system, whole)
+
+
+def _merged(data: Any, changes: dict[str, Any], shining: dict[str, Any]) -> Any:
+    if not isinstance(data, dict):
+        return data
+    light = data.get("light") or {}
+    if isinstance(light, dict):
+        if "signal" in shining or "photons_per_unit" in shining:  # the level is one of the two
+            light = {name: value for name, value in light.items() if name not in ("signal", "photons_per_unit")}
+        light = light | shining
+    return data | changes | {"light": light}
+
+
+def _view(data: Any, system: System, whole: bool) -> View:
+    given = {name: value for name, value in data.items() if name != "light"} if isinstance(data, dict) else data
+    entry = read_scene((), given)
+    key: Key = ("light",)
+    light = read_light(data["light"], key)
+    if "transient" in entry:
+        refuse_for_transients(light, key)
+    elif light.photons_per_unit is not None:
+        raise RecipeError((*key, "photons_per_unit"), "photons_per_unit belongs to a transient")
+    if len(light.levels) > 1:
+        raise RecipeError(key, f"light must be one level of one scene, got {len(light.levels)}; generate takes several")
+    listed, problems = candidates([entry], Path())
+    if problems or len(listed) != 1:
+        problem = (
+            "; ".join(map(str, problems))
+            or f"{len(listed)} are named (of frames, index tells which); generate takes several"
+        )
+        raise RecipeError((), f"there must be one scene: {problem}")
+    content = listed[0].load()
+    (signal, sbr), maps = light.levels[0], (content.depth_m, content.reflectivity)
+    flux = content.flux(system, light, signal, sbr, tell=True)
+    depth, share = (None if np.isnan(values).all() else values for values in maps)
+    kind = next(name for name in ("example", "depth", "path", "transient") if name in given)
+    image = f", image {entry['image']}" if "image" in entry else ""
+    return View(flux[:] if whole else flux, depth, share, f"{kind} {listed[0].name}{image}")

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from mars_lidar._base import checks
-from mars_lidar._base.resample import MAX_SIDE
+from mars_lidar._base.tolerances import TOL
 from mars_lidar._base.yaml import Key, RecipeError
 
 
@@ -86,7 +86,7 @@ def _kind(kind: type, words: str) -> Callable[[Key, Any], Any]:
     return read
 
 
-_SIDE = integer("", low=1, high=MAX_SIDE)
+_SIDE = integer("", low=1, high=TOL.image_side)
 
 
 def size(about: str) -> Field:

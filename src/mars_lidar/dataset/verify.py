@@ -13,7 +13,7 @@ from mars_lidar._base import checks, manifest
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.files import FileError, reading
 from mars_lidar._base.progress import callback_of
-from mars_lidar._base.threads import thread_count
+from mars_lidar._base.resources import thread_count
 from mars_lidar._base.types import Progress
 from mars_lidar._version import other_version
 from mars_lidar.dataset.arrays import MAPS, block, grid

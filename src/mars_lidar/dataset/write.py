@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mars_lidar._base.cached import cached_property
 from mars_lidar.dataset.arrays import MAPS, sample_parts, with_zeros
-from mars_lidar.dataset.sample_content import Shown
+from mars_lidar.dataset.scenes import Content
 from mars_lidar.dataset.shard import DigestNotes, chunks_of, packer, write_shard
 from mars_lidar.dataset.store import Dataset, Item
 from mars_lidar.instrument.detector import Detector
@@ -188,7 +188,7 @@ class Maker:
             self._last = key, self.flux(sample)[rows, columns]
         return self._last[1]
 
-    def scene(self, sample: int) -> Shown:
+    def scene(self, sample: int) -> Content:
         """What a sample shows."""
         return self._scene(sample_parts(self.dataset.recipe, sample)[0])
 

@@ -14,7 +14,8 @@ from mars_lidar.engines.poisson import PoissonEngine
 from mars_lidar.engines.renewal import RenewalEngine
 from mars_lidar.engines.sequential import SequentialEngine
 from mars_lidar.instrument.detector import require_effects
-from mars_lidar.instrument.system import MAX_CYCLES, System
+from mars_lidar.instrument.system import System
+from mars_lidar.instrument.tolerances import TOL
 
 ENGINES: dict[str, Engine] = {
     engine.name: engine
@@ -34,8 +35,8 @@ ANY_SYSTEM = tuple(name for name, engine in ENGINES.items() if engine.any_system
 
 def check_detector(engine: Engine, system: System) -> None:
     """Raise ValueError, naming the engines to use, where `engine` does not do the detector's mode or effects."""
-    if system.cycles > MAX_CYCLES:
-        raise ValueError(f"cycles must be an integer in [1, {MAX_CYCLES}] to be simulated, got {system.cycles}")
+    if system.cycles > TOL.cycles:
+        raise ValueError(f"cycles must be an integer in [1, {TOL.cycles}] to be simulated, got {system.cycles}")
     mode = system.detector.mode
     if mode not in engine.modes:
         able = " or ".join(repr(name) for name, each in ENGINES.items() if mode in each.modes)
@@ -83,19 +84,18 @@ def find_engine(engine: str | Engine, **options: Unpack[EngineOptions]) -> Engin
     """
     chosen = given(options)
     if isinstance(engine, Engine):
-        found = engine
         if chosen:
             name = next(iter(chosen))
             raise TypeError(f"{name} must be None where engine is an Engine, which has its own, got {chosen[name]!r}")
-        return found
+        return engine
     if engine == "neural":
         raise ValueError(
             "engine 'neural' is no longer in the package: from a checkout, give studies.neural.NeuralEngine(), "
             "which simulate takes as engine (docs/neural.md)"
         )
-    found = ENGINES[checks.choice("engine", engine, tuple(ENGINES))]
+    default = ENGINES[checks.choice("engine", engine, tuple(ENGINES))]
     for name in chosen:
-        if name not in found.options:
-            takes = ", ".join(found.options) if found.options else "none"
+        if name not in default.options:
+            takes = ", ".join(default.options) if default.options else "none"
             raise TypeError(f"{name} must be None for engine {engine!r} (its options: {takes}), got {chosen[name]!r}")
-    return type(found)(**chosen) if chosen else found
+    return type(default)(**chosen) if chosen else default

@@ -97,9 +97,9 @@ class RenewalEngine(CountTimesShape):
 
 
 def _laws(system: System, signal: FloatArray, background: FloatArray) -> CountLaws:
-    from mars_lidar.statistics.baselines import renewal_moments_of
+    from mars_lidar.statistics.constant_light import renewal_moments
 
-    return RoundedGaussian(*renewal_moments_of(signal + background, system))
+    return RoundedGaussian(*renewal_moments(signal + background, system))
 
 
 def _chains(run: Run, group: Group) -> tuple[NDArray[np.float32], FloatArray]:

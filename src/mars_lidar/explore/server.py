@@ -18,20 +18,21 @@ from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 
+from mars_lidar._base.types import FloatArray
 from mars_lidar.explore.settings import light_of, settings_of, truth_of
 from mars_lidar.io import Cube
 from mars_lidar.reconstruction import reconstruct
 
 _PLACE = '<script type="application/json" id="cube">null</script>'
-_MOST_PIXELS = 2**16  # of one answer, or one row
-_METHODS = {"peak": "peak", "likelihood": "maximum_likelihood"}
+_MAX_PIXELS = 2**16  # of one answer, or one row
+_METHODS = {"peak": "peak", "likelihood": "maximum_likelihood", "image": "image"}
 _POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' 'wasm-unsafe-eval' blob:; worker-src blob:; "
     "style-src 'unsafe-inline'; img-src data: blob:; connect-src 'self'; base-uri 'none'; form-action 'none'; "
     "frame-ancestors 'none'"
 )
-_SILENT_S = 10.0  # a connection that says nothing for so long is closed
-_MOST_CONNECTIONS = 32  # at a time, each a thread: a browser opens six to a host
+_IDLE_TIMEOUT_S = 10.0  # a connection that says nothing for so long is closed
+_MAX_CONNECTIONS = 32  # at a time, each a thread: a browser opens six to a host
 
 
 def page_text() -> str:
@@ -58,6 +59,7 @@ class CubeServer:
     def __init__(self, cube: Cube | None = None, name: str = "", *, port: int = 0) -> None:
         self.cube = cube
         self._lock = threading.Lock()  # of the file
+        self._image, self._delay_ns = -1, np.empty(0)  # the last image by method "image"
         self._word = f"/{secrets.token_urlsafe(16)}"
         text = page_text()
         if cube is not None:
@@ -125,7 +127,7 @@ class CubeServer:
         """Counts of the pixels of some rows, and their delays in ns, NaN for none: float64."""
         images, height, width, _ = cube.shape
         image, first = _whole("image", given, images), _whole("first", given, height)
-        rows, most = int(given["rows"]), min(height - first, max(1, _MOST_PIXELS // width))
+        rows, most = int(given["rows"]), min(height - first, max(1, _MAX_PIXELS // width))
         if not 1 <= rows <= most:
             raise ValueError(f"rows must lie in [1, {most}], got {rows}")
         counts = np.asarray(cube.histogram[image, first : first + rows])
@@ -135,8 +137,19 @@ class CubeServer:
                 raise ValueError("the file does not tell the true depth")
             delay = cube.flux.returns_delay_ns.reshape(-1, height, width)[0, first : first + rows]
         else:
-            delay = reconstruct(counts, cube.system, _METHODS[given["method"]]).delay_ns
+            method = _METHODS[given["method"]]
+            if method == "image":
+                delay = self._image_delay_ns(cube, image)[first : first + rows]
+            else:
+                delay = reconstruct(counts, cube.system, method).delay_ns
         return "application/octet-stream", np.stack([totals, delay]).astype("<f8").tobytes()
+
+    def _image_delay_ns(self, cube: Cube, image: int) -> FloatArray:
+        """Delays (H, W) of a whole image, each from the photons around it; those of the last image are stored."""
+        if self._image != image:
+            counts = np.asarray(cube.histogram[image])
+            self._delay_ns, self._image = reconstruct(counts, cube.system, "image").delay_ns, image
+        return self._delay_ns
 
 
 class _Server(ThreadingHTTPServer):
@@ -145,7 +158,7 @@ class _Server(ThreadingHTTPServer):
     daemon_threads = True
 
     def __init__(self, *args: Any) -> None:
-        self._free = threading.Semaphore(_MOST_CONNECTIONS)
+        self._free = threading.Semaphore(_MAX_CONNECTIONS)
         super().__init__(*args)
 
     def process_request(self, request: Any, client_address: Any) -> None:
@@ -179,7 +192,7 @@ def _handler(server: CubeServer) -> type[BaseHTTPRequestHandler]:
     class Handler(BaseHTTPRequestHandler):
         server_version = "mars-lidar"
         sys_version = ""
-        timeout = _SILENT_S
+        timeout = _IDLE_TIMEOUT_S
 
         def do_GET(self) -> None:
             if self.headers.get("Host", "") not in server.hosts:

@@ -11,10 +11,8 @@ from numpy.typing import NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import constructed_by_name
+from mars_lidar.instrument.tolerances import TOL
 
-_MAX_GENERATIONS = 1_000_000
-_MAX_SAMPLES = 2**24
-_MAX_DELAY_PERIODS = 1e6
 _KERNELS = {
     "4": ((0.0, 1.0, 0.0), (1.0, 0.0, 1.0), (0.0, 1.0, 0.0)),
     "8": ((1.0, 1.0, 1.0), (1.0, 0.0, 1.0), (1.0, 1.0, 1.0)),
@@ -89,7 +87,7 @@ class Afterpulsing:
             set_field(self, "delays", _density(self.delays))
             set_field(self, "bin_ns", checks.real("bin_ns", self.bin_ns, low=0.0, strict_low=True))
         if self.generations is not None:
-            number = checks.integer("generations", self.generations, low=1, high=_MAX_GENERATIONS)
+            number = checks.integer("generations", self.generations, low=1, high=TOL.generations)
             set_field(self, "generations", number)
 
     def __repr__(self) -> str:
@@ -140,7 +138,7 @@ class Afterpulsing:
 
     def check(self, period_ns: float) -> None:
         """Raise ValueError for delays that are out of all proportion to the laser period `period_ns`."""
-        most = _MAX_DELAY_PERIODS * period_ns
+        most = TOL.delay_periods * period_ns
         if self.mean_delay_ns > most:
             raise ValueError(
                 f"delays of afterpulsing must be at most {most:g} ns in the mean (1e6 periods), "
@@ -253,9 +251,9 @@ class Crosstalk:
 
 def _density(values: Any) -> tuple[float, ...]:
     samples = np.asarray(values)
-    if samples.dtype.kind not in "fiu" or samples.ndim != 1 or not 1 <= samples.size <= _MAX_SAMPLES:
+    if samples.dtype.kind not in "fiu" or samples.ndim != 1 or not 1 <= samples.size <= TOL.delay_samples:
         raise ValueError(
-            f"delays of afterpulsing must be 1 to {_MAX_SAMPLES} samples (n,) of a density, "
+            f"delays of afterpulsing must be 1 to {TOL.delay_samples} samples (n,) of a density, "
             f"got shape {samples.shape} of {samples.dtype}"
         )
     samples = samples.astype(np.float64)

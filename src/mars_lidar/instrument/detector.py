@@ -11,23 +11,18 @@ import numpy as np
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import constructed_by_name
-from mars_lidar._base.brief import brief
-from mars_lidar._base.notebook import as_html
+from mars_lidar._base.display import as_html, brief
 from mars_lidar.instrument import effects
 from mars_lidar.instrument.avalanches import Afterpulsing, Crosstalk
 from mars_lidar.instrument.effects import Jitter, SampledJitter
 from mars_lidar.instrument.presets import preset
+from mars_lidar.instrument.tolerances import TOL
 
 Mode = Literal["nonparalyzable", "paralyzable", "synchronous", "gated"]
 MODES: tuple[Mode, ...] = ("nonparalyzable", "paralyzable", "synchronous", "gated")
 
 _RECOVERING: tuple[Mode, ...] = ("nonparalyzable", "gated")
-_MAX_RECOVERY_PERIODS = 1e6  # beyond it a pixel that has rested would not be told from one that has not
 _GATE = ("gate_start_ns", "gate_width_ns", "gate_step_ns", "gate_cycles")
-_MAX_GATE_CYCLES = 100_000_000
-_MIN_GATE_PERIODS = 1e-5  # phases have 24 bits: at 1e-6 periods the counts behind a gate were 4 % off
-_NOTEBOOK_POINTS = 301  # points of the curve in a notebook, more than its pixels
-_MAX_GATE_NS = 1e12  # a start or a step is taken modulo the period: far beyond it no digits are left
 
 
 @constructed_by_name
@@ -157,13 +152,13 @@ class Detector:
         set_field(
             self,
             "gate_start_ns",
-            checks.real("gate_start_ns", self.gate_start_ns, low=-_MAX_GATE_NS, high=_MAX_GATE_NS),
+            checks.real("gate_start_ns", self.gate_start_ns, low=-TOL.gate_ns, high=TOL.gate_ns),
         )
         set_field(self, "gate_width_ns", checks.real("gate_width_ns", self.gate_width_ns, low=0.0, strict_low=True))
         step = 0.0 if self.gate_step_ns is None else self.gate_step_ns
-        set_field(self, "gate_step_ns", checks.real("gate_step_ns", step, low=-_MAX_GATE_NS, high=_MAX_GATE_NS))
+        set_field(self, "gate_step_ns", checks.real("gate_step_ns", step, low=-TOL.gate_ns, high=TOL.gate_ns))
         cycles = 1 if self.gate_cycles is None else self.gate_cycles
-        set_field(self, "gate_cycles", checks.integer("gate_cycles", cycles, low=1, high=_MAX_GATE_CYCLES))
+        set_field(self, "gate_cycles", checks.integer("gate_cycles", cycles, low=1, high=TOL.cycles))
         if self.gate_cycles != 1 and self.gate_step_ns == 0.0:
             raise ValueError(
                 "gate_cycles is the number of periods that a moving gate stays in place: give gate_step_ns too, "
@@ -181,7 +176,7 @@ class Detector:
     def _repr_html_(self) -> str:
         """Draw the sensitivity over the time since the last registration."""
         blind, slow = self.dead_time_ns, self.recovery_ns
-        t = np.linspace(0.0, 1.5 * blind + 5.0 * slow or 1.0, _NOTEBOOK_POINTS)
+        t = np.linspace(0.0, 1.5 * blind + 5.0 * slow or 1.0, TOL.curve_points)
         after = np.maximum(t - blind, 0.0)
         recovered = 1.0 - np.exp(-after / slow) if slow else 1.0
         sensitivity = np.where(t < blind, 0.0, self.detection_efficiency * recovered)
@@ -239,9 +234,9 @@ class Detector:
             self.jitter.check(period_ns)
         if self.afterpulsing is not None:
             self.afterpulsing.check(period_ns)
-        if self.recovery_ns > _MAX_RECOVERY_PERIODS * period_ns:
+        if self.recovery_ns > TOL.delay_periods * period_ns:
             raise ValueError(
-                f"recovery_ns must be at most {_MAX_RECOVERY_PERIODS * period_ns:g} ns (1e6 periods), "
+                f"recovery_ns must be at most {TOL.delay_periods * period_ns:g} ns (1e6 periods), "
                 f"got {self.recovery_ns:g}"
             )
         if self.code_density is not None and bins % len(self.code_density):
@@ -249,7 +244,7 @@ class Detector:
                 f"code_density must have a number of codes that divides the {bins} bins of the histogram, "
                 f"got {len(self.code_density)}"
             )
-        least, most = _MIN_GATE_PERIODS * period_ns, period_ns * (1 + 1e-12)
+        least, most = TOL.gate_periods * period_ns, period_ns * (1 + 1e-12)
         if self.gate_width_ns is not None and not least <= self.gate_width_ns <= most:
             raise ValueError(
                 f"gate_width_ns must lie in [{least:g}, {period_ns:g}] ns (1e-5 to 1 period), "

@@ -23,6 +23,7 @@ from mars_lidar.instrument.jitter import Jitter as Jitter
 from mars_lidar.instrument.jitter import SampledJitter as SampledJitter
 from mars_lidar.instrument.jitter import jitter_from_dict
 from mars_lidar.instrument.pulse import GaussianPulse, Pulse
+from mars_lidar.instrument.tolerances import TOL
 
 # --- Native forms of pulses ----------------------------------------------------------------------------------------
 
@@ -34,10 +35,6 @@ def native_pulse(pulse: Pulse, period_ns: float) -> _core.PulseTable:
 
 
 # --- Effects -------------------------------------------------------------------------------------------------------
-
-MAX_RATE_HZ = 1e12  # dark counts or photons per second, the most that are accepted
-_MAX_EVENTS = 2**31 - 1  # records of an exposure: 32-bit counters
-_MAX_CODES = 2**16  # codes of a TDC
 
 
 Kind = Literal["light", "avalanche", "recording", "timing"]
@@ -90,9 +87,9 @@ def _instance(name: str, value: Any, of: type) -> Any:
 
 def _code_density(value: Any) -> tuple[float, ...]:
     widths = np.asarray(checks.numbers("code_density", checks.unmasked("code_density", value)))
-    if widths.dtype.kind not in "fiu" or widths.ndim != 1 or not 2 <= widths.size <= _MAX_CODES:
+    if widths.dtype.kind not in "fiu" or widths.ndim != 1 or not 2 <= widths.size <= TOL.codes:
         raise ValueError(
-            f"code_density must be 2 to {_MAX_CODES} relative widths of TDC codes (n,), got shape {widths.shape} "
+            f"code_density must be 2 to {TOL.codes} relative widths of TDC codes (n,), got shape {widths.shape} "
             f"of {widths.dtype}"
         )
     widths = widths.astype(np.float64)
@@ -134,7 +131,7 @@ FIELDS: dict[str, Effect] = {
     "dark_count_hz": Effect(
         "light",
         0.0,
-        lambda v: checks.real("dark_count_hz", v, low=0.0, high=MAX_RATE_HZ),
+        lambda v: checks.real("dark_count_hz", v, low=0.0, high=TOL.rate_hz),
         "dark_count_hz: 100.0             # counts/s of every pixel",
         help="Dark counts of every pixel, counts/s, which no efficiency reduces.",
         default="0",
@@ -191,7 +188,7 @@ crosstalk:                       # avalanches trigger neighbours; with the seque
     "max_events_per_period": Effect(
         "recording",
         None,
-        lambda v: checks.integer("max_events_per_period", v, low=1, high=_MAX_EVENTS),
+        lambda v: checks.integer("max_events_per_period", v, low=1, high=TOL.events),
         "max_events_per_period: 1         # the TDC records the first ones only, of a period ...",
         native=lambda v, period_ns: {"most_per_period": v},
         help="Events recorded of a period.",
@@ -200,7 +197,7 @@ crosstalk:                       # avalanches trigger neighbours; with the seque
     "max_events_per_exposure": Effect(
         "recording",
         None,
-        lambda v: checks.integer("max_events_per_exposure", v, low=1, high=_MAX_EVENTS),
+        lambda v: checks.integer("max_events_per_exposure", v, low=1, high=TOL.events),
         "max_events_per_exposure: 1000    # ... and of an exposure",
         native=lambda v, period_ns: {"most_per_exposure": v},
         help="Events recorded of an exposure.",

@@ -130,20 +130,20 @@ def table() -> str:
 # the distribution that goes with Straka et al. (github.com/ivo-s/SPAD-counting-model, apDist_3605H.txt, 81 ps bins),
 # condensed to nine steps. Those up to 57 ns are read off that histogram; how the remaining 6 % spread up to 227 ns is
 # our estimate. Most of them come within a third of a nanosecond.
-_RECOVERY_NS, _STEP_NS = 24.0, 0.324
 _UNTIL_NS = np.array([0.324, 2.43, 8.1, 16.2, 24.3, 32.4, 56.7, 113.4, 226.8])
 _SHARE = np.array([0.593, 0.686, 0.784, 0.846, 0.883, 0.903, 0.938, 0.975, 1.0])
 
 
 def _excelitas_spcm_aqrh() -> dict[str, Any]:
     """Straka et al., J. Lightwave Technol. 38, 4765 (2020), and the program that goes with it."""
-    edges = np.arange(round(_UNTIL_NS[-1] / _STEP_NS) + 1) * _STEP_NS
+    recovery_ns, step_ns = 24.0, 0.324
+    edges = np.arange(round(_UNTIL_NS[-1] / step_ns) + 1) * step_ns
     share = np.diff(np.interp(edges, np.append(0.0, _UNTIL_NS), np.append(0.0, _SHARE)))
-    blind = np.zeros(round(_RECOVERY_NS / _STEP_NS))
+    blind = np.zeros(round(recovery_ns / step_ns))
     return {
-        "dead_time_ns": _RECOVERY_NS,
+        "dead_time_ns": recovery_ns,
         "afterpulsing": Afterpulsing(
-            probability=0.0171, delays=tuple(np.concatenate([blind, share]).round(9)), bin_ns=_RECOVERY_NS / blind.size
+            probability=0.0171, delays=tuple(np.concatenate([blind, share]).round(9)), bin_ns=recovery_ns / blind.size
         ),
         "twilight_ns": 3.2,
     }

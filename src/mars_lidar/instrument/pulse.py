@@ -16,14 +16,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked, constructed_by_name
+from mars_lidar._base.display import as_html
 from mars_lidar._base.native import _core
-from mars_lidar._base.notebook import as_html
+from mars_lidar.instrument.tolerances import TOL
 
-_GAUSSIAN_REACH = 8.5  # half support in sigma: what lies outside, 1e-17, is below one photon in any exposure
-_WIDE = 0.3  # sigma in periods from which a train of pulses is summed as a Fourier series
-_BLOCK = 1 << 15  # times evaluated together
-_NOTEBOOK_POINTS = 300  # points of the curve in a notebook, more than its pixels
-_SMALL = 40.0  # e^-40 is rounding
 FWHM_PER_SIGMA = 2.0 * math.sqrt(2.0 * math.log(2.0))
 _ORIGINS = ("peak", "centroid", "first")
 
@@ -65,7 +61,7 @@ class Pulse(ABC):
 
     def _repr_html_(self) -> str:
         """Draw the pulse over its support."""
-        edges = np.linspace(*self.support_ns(), _NOTEBOOK_POINTS + 1)
+        edges = np.linspace(*self.support_ns(), TOL.curve_points + 1)
         density = np.diff(self.cumulative(edges)) / np.diff(edges)
         return as_html(self, {"pulse (1/ns) over the time after the delay (ns)": (edges[1:], density)})
 
@@ -76,8 +72,8 @@ class Pulse(ABC):
         """
         t = np.asarray(t_ns, dtype=np.float64)
         flat, total = t.reshape(-1), np.empty(t.size)
-        for start in range(0, t.size, _BLOCK):  # what stays in the processor's own memory
-            some = slice(start, start + _BLOCK)
+        for start in range(0, t.size, TOL.times_together):  # what stays in the processor's own memory
+            some = slice(start, start + TOL.times_together)
             total[some] = self._train(flat[some], period_ns)
         return total.reshape(t.shape)
 
@@ -164,7 +160,7 @@ class GaussianPulse(Pulse):
 
     def support_ns(self) -> tuple[float, float]:
         """+-8.5 sigma: 1e-17 of the energy lies outside."""
-        return -_GAUSSIAN_REACH * self.sigma_ns, _GAUSSIAN_REACH * self.sigma_ns
+        return -TOL.gaussian_sigmas * self.sigma_ns, TOL.gaussian_sigmas * self.sigma_ns
 
     def cumulative(self, t_ns: ArrayLike) -> NDArray[np.float64]:
         """Phi(t / sigma) of times `t_ns`, relatively accurate in the lower tail."""
@@ -175,11 +171,11 @@ class GaussianPulse(Pulse):
     def _train(self, t: NDArray[np.float64], period_ns: float) -> NDArray[np.float64]:
         """As of any pulse; of a wide one by its Fourier series, two or three terms for ten and more pulses."""
         share = self.sigma_ns / period_ns
-        if share < _WIDE:
+        if share < TOL.train_periods:
             return super()._train(t, period_ns)
         turn = t / period_ns
         total = turn + 0.5
-        for m in range(1, 1 + math.ceil(math.sqrt(_SMALL / (2.0 * (math.pi * share) ** 2)))):
+        for m in range(1, 1 + math.ceil(math.sqrt(TOL.exponent / (2.0 * (math.pi * share) ** 2)))):
             total += math.exp(-2.0 * (math.pi * m * share) ** 2) / (math.pi * m) * np.sin(2.0 * math.pi * m * turn)
         return total
 

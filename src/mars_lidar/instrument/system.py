@@ -14,23 +14,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked, constructed_by_name
-from mars_lidar._base.brief import brief
-from mars_lidar._base.files import check_claim, reading
-from mars_lidar._base.notebook import as_html
+from mars_lidar._base.display import as_html, brief
+from mars_lidar._base.files import check_claim, reading, write_text
 from mars_lidar._base.yaml import Lines, located, read_yaml
 from mars_lidar.instrument.detector import Detector as Detector
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.presets import sourced
 from mars_lidar.instrument.pulse import Pulse, pulse_from_dict
+from mars_lidar.instrument.tolerances import TOL
 from mars_lidar.instrument.units import check_units, period_hint
 
 SPEED_OF_LIGHT_M_PER_NS = 0.299792458
 _STARTS = ("armed", "stationary")
-MAX_CYCLES = 100_000_000  # of a simulation: the sampler counts periods in 32 bits; ten seconds at 10 MHz
-_MOST_CYCLES = 2**53  # of a recording: the integers that doubles hold
-_MAX_BINS = 2**20
-_LINED_BYTES = 2**16  # bytes up to which JSON is read as YAML, a hundred times slower, so that errors state the line
-_MAX_DEAD_PERIODS = 2**20
 
 
 @constructed_by_name
@@ -96,8 +91,8 @@ class System:
     def __post_init__(self) -> None:
         set_field = object.__setattr__
         set_field(self, "period_ns", checks.real("period_ns", self.period_ns, low=0.0, strict_low=True))
-        set_field(self, "cycles", checks.integer("cycles", self.cycles, low=1, high=_MOST_CYCLES))
-        set_field(self, "bins", checks.integer("bins", self.bins, low=1, high=_MAX_BINS))
+        set_field(self, "cycles", checks.integer("cycles", self.cycles, low=1, high=TOL.recorded_cycles))
+        set_field(self, "bins", checks.integer("bins", self.bins, low=1, high=TOL.bins))
         if not isinstance(self.pulse, Pulse):
             raise TypeError(f"pulse must be a GaussianPulse or a SampledPulse, got {self.pulse!r}")
         if not isinstance(self.detector, Detector):
@@ -108,15 +103,15 @@ class System:
         except ValueError as error:
             hint = period_hint(self.period_ns)
             raise ValueError(f"{hint}; {error}" if hint else str(error)) from error
-        if self.dead_time_periods > _MAX_DEAD_PERIODS:
+        if self.dead_time_periods > TOL.dead_periods:
             raise ValueError(
-                f"dead_time_ns must be at most {_MAX_DEAD_PERIODS} periods of {self.period_ns:g} ns, "
+                f"dead_time_ns must be at most {TOL.dead_periods} periods of {self.period_ns:g} ns, "
                 f"got {self.detector.dead_time_ns:g} ns"
             )
         self.detector.check(self.period_ns, self.bins, self.start)
-        if self.electronics_dead_time_periods > _MAX_DEAD_PERIODS:
+        if self.electronics_dead_time_periods > TOL.dead_periods:
             raise ValueError(
-                f"electronics_dead_time_ns must be at most {_MAX_DEAD_PERIODS} periods of {self.period_ns:g} ns, "
+                f"electronics_dead_time_ns must be at most {TOL.dead_periods} periods of {self.period_ns:g} ns, "
                 f"got {self.detector.electronics_dead_time_ns:g} ns"
             )
         check_units(self.period_ns, self.pulse, self.detector)
@@ -254,11 +249,11 @@ class System:
         """Write to a ``.json``, ``.yaml`` or ``.yml`` file `path`."""
         target = Path(path)
         if target.suffix == ".json":
-            target.write_text(json.dumps(self.to_dict(), indent=2) + "\n")
+            write_text(target, json.dumps(self.to_dict(), indent=2) + "\n")
         elif target.suffix in (".yaml", ".yml"):
             import yaml
 
-            target.write_text(yaml.safe_dump(self.to_dict(), sort_keys=False))
+            write_text(target, yaml.safe_dump(self.to_dict(), sort_keys=False))
         else:
             raise ValueError(f"path must end in .json, .yaml or .yml, got {str(path)!r}")
 
@@ -270,7 +265,7 @@ class System:
         if source.suffix not in (".json", ".yaml", ".yml"):
             raise ValueError(f"path must end in .json, .yaml or .yml, got {str(path)!r}")
         lines: Lines = {}
-        if source.suffix != ".json" or (source.is_file() and source.stat().st_size <= _LINED_BYTES):
+        if source.suffix != ".json" or (source.is_file() and source.stat().st_size <= TOL.lined_bytes):
             data, lines = read_yaml(source)  # JSON is YAML, and YAML has lines
         else:
             with reading(source, "a system"):

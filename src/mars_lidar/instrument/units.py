@@ -7,6 +7,7 @@ import warnings
 
 from mars_lidar.instrument.detector import Detector
 from mars_lidar.instrument.pulse import FWHM_PER_SIGMA, GaussianPulse, Pulse
+from mars_lidar.instrument.tolerances import TOL
 
 
 class UnitWarning(UserWarning):
@@ -31,9 +32,6 @@ class UnitWarning(UserWarning):
 
 # time from which a value is unusual, in ns and in laser periods; and from which it is meant as it is, in ns
 _PULSE, _DEAD, _GATE = (41.0, 0.31, 2e4), (25_000.0, 25.0, 1e6), (0.0, 25.0, 1e6)
-_LONGEST_NS = 1e-6  # of a time in seconds that was taken for ns: a second is the longest anybody has
-_ODD_DELAY = 100.0  # periods from which a median delay is unusual
-_DIGITS = 3  # significant digits of typed values; computed values have more
 
 
 def period_hint(period_ns: float) -> str:
@@ -57,7 +55,8 @@ def check_units(period: float, pulse: Pulse, detector: Detector) -> None:
     if any(value >= meant for _, value, (_, _, meant) in times):
         return  # nobody's laboratory: the far end of the domain, in units of its own
     for name, value, (odd_ns, odd_periods, _) in times:
-        if 0.0 < value < _LONGEST_NS and value < 1e-6 * period and not math.log10(value).is_integer():  # a limit, then
+        limit = value > 0.0 and math.log10(value).is_integer()
+        if 0.0 < value < TOL.seconds_as_ns and value < 1e-6 * period and not limit:
             likely, unit = 1e9 * value, "seconds"
         elif odd_ns <= value and odd_periods * period <= value != period and _typed(name, value):
             likely, unit = 1e-3 * value, "picoseconds"
@@ -69,7 +68,7 @@ def check_units(period: float, pulse: Pulse, detector: Detector) -> None:
 
 def check_delays(median_ns: float, period_ns: float) -> None:
     """Warn of returns that come many periods after their pulse."""
-    if _ODD_DELAY * period_ns <= abs(median_ns) < 1e7:
+    if TOL.unusual_periods * period_ns <= abs(median_ns) < 1e7:
         what = f"delay_ns has a median of {median_ns:g}, {median_ns / period_ns:.3g} laser periods, and wraps into one"
         _warn(
             f"{what}: if it was meant in picoseconds, divide it by 1000; if it comes from depths of a file in "
@@ -80,7 +79,7 @@ def check_delays(median_ns: float, period_ns: float) -> None:
 def _typed(name: str, value: float) -> bool:
     """Whether somebody may have typed it, perhaps as the width at half maximum."""
     values = [value, FWHM_PER_SIGMA * value] if name == "sigma_ns" else [value]
-    return any(abs(float(f"{candidate:.{_DIGITS}g}") - candidate) < 1e-9 * candidate for candidate in values)
+    return any(abs(float(f"{candidate:.{TOL.typed_digits}g}") - candidate) < 1e-9 * candidate for candidate in values)
 
 
 def _warn(text: str) -> None:

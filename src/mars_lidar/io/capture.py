@@ -47,18 +47,18 @@ class Capture:
     @property
     def rows(self) -> str:
         """Axes of the image's rows: the laser's points where there are several, else y of the sensor's."""
-        several = math.prod(self._size.get(one, 1) for one in "XYl") > 1
-        return "".join(one for one in ("XYl" if several else "y") if one in self.axes)
+        several = math.prod(self._size.get(axis, 1) for axis in "XYl") > 1
+        return "".join(axis for axis in ("XYl" if several else "y") if axis in self.axes)
 
     @property
     def columns(self) -> str:
         """Axes of the image's columns."""
-        return "".join(one for one in "xyi" if one in self.axes and one not in self.rows)
+        return "".join(axis for axis in "xyi" if axis in self.axes and axis not in self.rows)
 
     @property
     def image(self) -> tuple[int, int, int]:
         """(H, W, T)."""
-        height, width = (math.prod(self._size[one] for one in axes) for axes in (self.rows, self.columns))
+        height, width = (math.prod(self._size[axis] for axis in axes) for axes in (self.rows, self.columns))
         return height, width, self._size["T"]
 
     @property
@@ -70,10 +70,10 @@ class Capture:
         first, last, _ = rows.indices(self.image[0])
         slab, skipped = self._slab(first, last)
         with self.file.unchanged() as path, open_hdf5(path) as file:
-            found = np.asarray(file[self.name][slab])
+            stored = np.asarray(file[self.name][slab])
         order, rest = self._order
-        image = found.transpose(*order, *rest).reshape(
-            -1, self.image[1], self.image[2], *(found.shape[k] for k in rest)
+        image = stored.transpose(*order, *rest).reshape(
+            -1, self.image[1], self.image[2], *(stored.shape[k] for k in rest)
         )
         return np.asarray(image[skipped : skipped + last - first].sum(axis=tuple(range(3, image.ndim))))
 
@@ -81,15 +81,15 @@ class Capture:
         """Put whole steps of the first axis of the rows, from row `first` on, into a data set of the same shape."""
         slab, _ = self._slab(first, first + len(counts))
         order, rest = self._order
-        place = tuple(0 if k in rest else one for k, one in enumerate(slab))  # the first colour and bounce
-        kept = [k for k in range(len(self.axes)) if k not in rest]
+        place = tuple(0 if k in rest else part for k, part in enumerate(slab))  # the first colour and bounce
+        used = [k for k in range(len(self.axes)) if k not in rest]
         sizes = [len(range(*slab[k].indices(self.shape[k]))) for k in order]
-        data[place] = counts.reshape(sizes).transpose([order.index(k) for k in kept])
+        data[place] = counts.reshape(sizes).transpose([order.index(k) for k in used])
 
     @property
     def _order(self) -> tuple[list[int], list[int]]:
         """Places of the axes of the image, in its order, and of those that are added up."""
-        order = [self.axes.index(one) for one in self.rows + self.columns + "T"]
+        order = [self.axes.index(axis) for axis in self.rows + self.columns + "T"]
         return order, [k for k in range(len(self.axes)) if k not in order]
 
     def _slab(self, first: int, last: int) -> tuple[tuple[slice, ...], int]:
@@ -126,8 +126,8 @@ def capture_in(opened: UnchangedFile, file: Any) -> Capture | None:
     check_data(opened.path, data, name, in_parts=True)
     if data.dtype.kind not in "fiu":
         raise ValueError(f"{opened.path}: {name} must be real numbers, got {data.dtype}")
-    told = [_metres(file, key) for key in _TIMES[name]]
-    width, start = (None if one is None else one / SPEED_OF_LIGHT_M_PER_NS for one in told)
+    times = [_metres(file, key) for key in _TIMES[name]]
+    width, start = (None if time is None else time / SPEED_OF_LIGHT_M_PER_NS for time in times)
     return Capture(opened, name, axes, tuple(data.shape), width, start)
 
 
@@ -138,12 +138,12 @@ def read_capture(path: str | Path) -> Capture:
         raise ValueError(f"{source}: a capture must be one of {', '.join(CAPTURE_SUFFIXES)}")
     opened = UnchangedFile(source)
     with open_hdf5(source, "a capture") as file:
-        found = capture_in(opened, file)
-        if found is None:
+        capture = capture_in(opened, file)
+        if capture is None:
             raise ValueError(f"{source}: no capture of tal ('H', 'H_format') or Zaragoza's ('data', 'deltaT')")
-    if found.bin_ns is None or not found.bin_ns > 0.0:
-        raise ValueError(f"{source}: does not tell the width of a time bin ({_TIMES[found.name][0]})")
-    return found
+    if capture.bin_ns is None or not capture.bin_ns > 0.0:
+        raise ValueError(f"{source}: does not tell the width of a time bin ({_TIMES[capture.name][0]})")
+    return capture
 
 
 @checked
@@ -177,8 +177,8 @@ def save_capture(path: str | Path, cube: Cube, like: str | Path, *, overwrite: b
         raise ValueError(f"path of a capture must end in one of {', '.join(CAPTURE_SUFFIXES)}, got {str(path)!r}")
     exposures, height, width, bins = cube.shape
     if exposures != 1 or (height, width) != source.image[:2] or bins < source.image[2]:
-        told = " x ".join(map(str, source.image))
-        raise ValueError(f"cube must be one exposure of {told} (H, W, T) as {like} is, got {cube.shape}")
+        size = " x ".join(map(str, source.image))
+        raise ValueError(f"cube must be one exposure of {size} (H, W, T) as {like} is, got {cube.shape}")
     if abs(cube.system.bin_ns / float(source.bin_ns or 0.0) - 1.0) > 1e-6:
         raise ValueError(f"cube must have bins of {source.bin_ns:g} ns as {like} has, got {cube.system.bin_ns:g}")
     check_target(target, folder=False, overwrite=overwrite)

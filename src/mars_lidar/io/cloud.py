@@ -105,16 +105,16 @@ def save_cloud(
         raise ValueError(f"path of a point cloud must end in .ply, got {str(path)!r}")
     place = points(depth_m, focal_px)
     columns = {"x": place[..., 0], "y": place[..., 1], "z": place[..., 2]}
-    for name, told, values in (("intensity", "intensity", intensity), ("depth_error", "error_m", error_m)):
+    for name, argument, values in (("intensity", "intensity", intensity), ("depth_error", "error_m", error_m)):
         if values is not None:
             columns[name] = np.asarray(values, np.float64)
             if columns[name].shape != place.shape[:-1]:
                 raise ValueError(
-                    f"{told} must have the shape of depth_m, {place.shape[:-1]}, got {columns[name].shape}"
+                    f"{argument} must have the shape of depth_m, {place.shape[:-1]}, got {columns[name].shape}"
                 )
     check_target(target, folder=False, overwrite=overwrite)
-    seen = np.isfinite(place).all(-1)
-    rows = np.stack([values[seen] for values in columns.values()], axis=-1).astype("<f4")
+    known = np.isfinite(place).all(-1)
+    rows = np.stack([values[known] for values in columns.values()], axis=-1).astype("<f4")
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
     header += [*(f"property float {name}" for name in columns), "end_header", ""]
     with beside(target) as unfinished, open(unfinished, "wb") as file:

@@ -12,7 +12,7 @@ from mars_lidar._base.arguments import checked
 from mars_lidar._base.types import Progress
 from mars_lidar._version import __version__
 from mars_lidar.io.cube import SUFFIXES, Cube, load, one_exposure, save
-from mars_lidar.io.streams import photon_hdf5, ptu_stream
+from mars_lidar.io.streams import photon_hdf5, ptu
 from mars_lidar.io.streams.files import STREAM_SUFFIXES, is_stream
 from mars_lidar.light.timestamps import Timestamps
 from mars_lidar.simulation import simulate_timestamps
@@ -236,7 +236,7 @@ def resolution_ns(path: Path, times: Timestamps, clock_ps: float | None = None) 
     if path.suffix == ".npz":
         return 0.0
     if path.suffix == ".ptu":
-        units = ptu_stream.units_per_bin(times.bins, times.period_ns, clock_ps)
+        units = ptu.units_per_bin(times.bins, times.period_ns, clock_ps)
     else:
         units = photon_hdf5.units_per_bin(times.bins)
     return float(times.period_ns / (times.bins * units))

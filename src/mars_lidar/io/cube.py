@@ -1,4 +1,4 @@
-"""A histogram cube with all that explains it, and the two functions that put it on disk and get it back."""
+"""A histogram cube with all that explains it: put on disk and read back, and as xarray has it."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from contextlib import AbstractContextManager
 from dataclasses import MISSING, dataclass, field, fields
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked, checked_with_masks
-from mars_lidar._base.brief import brief
 from mars_lidar._base.buckets import url_of
+from mars_lidar._base.display import as_html, brief
 from mars_lidar._base.files import (
     INCOMPLETE_SUFFIX,
     FileError,
@@ -25,15 +25,17 @@ from mars_lidar._base.files import (
     reading,
     unfinished_of,
 )
-from mars_lidar._base.late import late
-from mars_lidar._base.memory import check_memory
-from mars_lidar._base.notebook import as_html
+from mars_lidar._base.imports import late, needed
+from mars_lidar._base.resources import check_memory
 from mars_lidar.instrument.system import System
 from mars_lidar.io import layout
 from mars_lidar.io.recipe import Recipe, Recording
-from mars_lidar.io.remote import open_url
 from mars_lidar.io.store import CountArray, OpenedStore, Writer
+from mars_lidar.io.zarr_store import open_url
 from mars_lidar.light.flux import Flux
+
+if TYPE_CHECKING:
+    import xarray
 
 _MODULES = {
     ".zarr": "zarr_store",
@@ -419,8 +421,8 @@ def _opened(store: OpenedStore, source: Path, allow_incomplete: bool, url: str =
     try:
         complete = store.complete and not source.name.endswith(INCOMPLETE_SUFFIX)
         if not (complete or allow_incomplete):
-            told = f" ({store.progress})" if store.progress else ""
-            raise IncompleteFileError(f"{url or source} is incomplete: its simulation did not finish{told}")
+            progress = f" ({store.progress})" if store.progress else ""
+            raise IncompleteFileError(f"{url or source} is incomplete: its simulation did not finish{progress}")
         histogram = store.arrays.get("histogram")
         if histogram is None:
             raise ValueError(f"{url or source} has no variable 'histogram': its writing stopped at the very start")
@@ -473,3 +475,77 @@ def format_of(path: Path, argument: str) -> Any:
     if path.suffix not in _MODULES:
         raise ValueError(f"{argument} must end in one of {', '.join(SUFFIXES)}, got {str(path)!r}")
     return import_module(f"mars_lidar.io.{_MODULES[path.suffix]}")
+
+
+_OF_A_RUN = ("engine", "engine_settings", "seed", "first_realization", "source")
+
+
+@checked_with_masks
+def to_xarray(
+    cube: Cube | ArrayLike,
+    system: System | None = None,
+    flux: Flux | None = None,
+    *,
+    depth_m: ArrayLike | None = None,
+    reflectivity: ArrayLike | None = None,
+) -> xarray.Dataset:
+    """Counts with named dimensions, coordinates and units, as ``xarray.open_zarr`` gives them of our stores.
+
+    Parameters
+    ----------
+    cube
+        A `mars_lidar.io.Cube`, or counts of `mars_lidar.simulate`: (realizations, H, W, bins), or fewer dimensions as
+        `mars_lidar.io.from_histograms` takes them.
+    system
+        How they were recorded; of a `Cube` its own.
+    flux
+        The light behind counts, if it is known, (H, W).
+    depth_m, reflectivity
+        Maps (H, W) of the scene, beside a flux; depth is c tau / 2 by default.
+
+    Returns
+    -------
+    xarray.Dataset
+        ``histogram`` (realization, y, x, time), and what is known of the light.
+
+    Raises
+    ------
+    TypeError
+        Counts without the system that recorded them, or a cube beside a system of its own.
+    ValueError
+        Shapes that do not fit.
+    MissingLibraryError
+        xarray (extra ``io``) is not installed.
+
+    See Also
+    --------
+    simulate
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> ml.to_xarray(ml.simulate(ml.Flux([[0.5, 2.0]], 1.0, [[20.0, 60.0]]), system), system).dims
+    FrozenMappingWarningOnValuesAccess({'realization': 1, 'y': 1, 'x': 2, 'time': 128})
+    """
+    xarray = needed("xarray", "a labelled cube")
+    unnamed = not isinstance(cube, Cube)
+    if isinstance(cube, Cube):
+        if (system, flux, depth_m, reflectivity) != (None, None, None, None):
+            raise TypeError("system, flux, depth_m and reflectivity are for arrays: a Cube has its own")
+    else:
+        if not isinstance(system, System):
+            raise TypeError(f"system must be a System beside an array of counts, got {type(system).__name__}")
+        cube = Cube(cube, system, flux, depth_m=depth_m, reflectivity=reflectivity)
+    variables: dict[str, Any] = {"histogram": (layout.DIMS, np.asarray(cube.histogram), dict(layout.HISTOGRAM_LABELS))}
+    coordinates: dict[str, Any] = {}
+    for variable in layout.variables(cube.recipe):
+        entry = (variable.dims, np.asarray(variable.data), variable.labels)
+        (coordinates if variable.dims == (variable.name,) else variables)[variable.name] = entry
+    attributes: dict[str, Any] = {**layout.attributes(cube.recipe), "complete": True}
+    if unnamed:  # nobody says how an array was made
+        attributes = {name: value for name, value in attributes.items() if name not in _OF_A_RUN}
+    return xarray.Dataset(variables, coordinates, attributes)  # type: ignore[no-any-return]

@@ -14,17 +14,16 @@ from numpy.typing import NDArray
 
 from mars_lidar._base import mat5
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.files import NpyFile, check_claim, npy_header, open_npz, read_npy, reading, whole
+from mars_lidar._base.files import NpyFile, check_claim, npy_header, open_npz, read_column, read_npy, reading, whole
 from mars_lidar._base.hdf5 import CELLS, open_hdf5
 from mars_lidar._base.sparse import check_sparse, dense_bytes, is_sparse
-from mars_lidar._base.text import read_column
 from mars_lidar.instrument.system import System
 from mars_lidar.io.cube import Cube
 from mars_lidar.io.measured import from_histograms, from_photon_times, in_order
 from mars_lidar.io.named_arrays import cell_arrays, hdf5_arrays, mat_arrays
-from mars_lidar.io.recorder import RECORDER_SUFFIXES, Recorded, recorded
-from mars_lidar.io.rgbd.pixels import decoded
+from mars_lidar.io.pixels import decoded
 from mars_lidar.io.streams.bare_stream import cells_of
+from mars_lidar.io.streams.recorders import RECORDER_SUFFIXES, Recorded, recorded
 
 FOREIGN_SUFFIXES = (".npy", ".npz", ".mat", ".h5", ".hdf5", ".tif", ".tiff", ".csv", ".txt", *RECORDER_SUFFIXES)
 
@@ -121,8 +120,8 @@ def foreign_cube(
     >>> ml.io.foreign_cube(folder / "counts.npy", system).shape
     (1, 4, 6, 128)
     """
-    found = read_counts(path, variable=variable, axes=axes, image=image, bins=system.bins)
-    return found.cube(system, start_ns=start_ns, unit_ns=unit_ns, window_ns=window_ns)
+    contents = read_counts(path, variable=variable, axes=axes, image=image, bins=system.bins)
+    return contents.cube(system, start_ns=start_ns, unit_ns=unit_ns, window_ns=window_ns)
 
 
 def read_counts(
@@ -139,11 +138,11 @@ def read_counts(
     name, array = _chosen(source, arrays(source) if told_by is None else told_by.arrays, variable)
     if isinstance(array, np.ndarray) and array.dtype == object:
         return ForeignCounts(source, name, None, array, "")
-    told = _guessed(source, array.shape, bins) if axes is None else axes
+    order = _guessed(source, array.shape, bins) if axes is None else axes
     if is_sparse(array):
         check_claim(source, dense_bytes(array), f"the counts of {name}".rstrip())
     try:
-        return ForeignCounts(source, name, in_order(array, told, image), None, told, told_by)
+        return ForeignCounts(source, name, in_order(array, order, image), None, order, told_by)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{source}: {name or 'the array'}: {error}") from error
 
@@ -155,8 +154,8 @@ def arrays(path: Path) -> dict[str, Any]:
     with reading(path, "arrays of histograms"):
         if path.suffix.lower() in RECORDER_SUFFIXES:
             return dict(recorded(path).arrays)
-        found: dict[str, Any] = _READERS[path.suffix.lower()](path)
-    return {name: array for name, array in found.items() if len(array.shape)}
+        by_name: dict[str, Any] = _READERS[path.suffix.lower()](path)
+    return {name: array for name, array in by_name.items() if len(array.shape)}
 
 
 _MOST_LISTED = 64  # cells of a variable that are opened to say what is in them
@@ -190,18 +189,18 @@ def _in_words(shape: tuple[int, ...], kind: Any) -> str:
 
 
 def _listed_mat(path: Path) -> dict[str, str]:
-    found: dict[str, str] = {}
+    words: dict[str, str] = {}
     for head in mat5.variables(path):
         if head.kind == "cell" and math.prod(head.shape) <= _MOST_LISTED:
             inside = _mat(path, [head.name])
-            found |= {name: _in_words(array.shape, _kind(array)) for name, array in inside.items()}
+            words |= {name: _in_words(array.shape, _kind(array)) for name, array in inside.items()}
             if not inside:
-                found[head.name] = f"cells {_in_words(head.shape, '')}".strip()
+                words[head.name] = f"cells {_in_words(head.shape, '')}".strip()
         elif head.kind == "cell":
-            found[head.name] = f"{_in_words(head.shape, 'cells')}: arrays of photon times, or of one array each"
+            words[head.name] = f"{_in_words(head.shape, 'cells')}: arrays of photon times, or of one array each"
         elif head.kind in ("numbers", "sparse"):
-            found[head.name] = _in_words(head.shape, head.kind)
-    return found
+            words[head.name] = _in_words(head.shape, head.kind)
+    return words
 
 
 def _kind(array: Any) -> Any:
@@ -211,43 +210,43 @@ def _kind(array: Any) -> Any:
 def _listed_hdf5(path: Path, of_matlab: bool) -> dict[str, str]:
     import h5py
 
-    found: dict[str, str] = {}
+    words: dict[str, str] = {}
     with open_hdf5(path) as file:
 
         def visit(name: str, item: Any) -> None:
-            if name.partition("/")[0] == CELLS or any(name.startswith(f"{one}/") for one in found):
+            if name.partition("/")[0] == CELLS or any(name.startswith(f"{each}/") for each in words):
                 return
             if isinstance(item, h5py.Group) and "MATLAB_sparse" in item.attrs:
-                found[name] = _in_words((int(item.attrs["MATLAB_sparse"]), item["jc"].size - 1), "sparse")
+                words[name] = _in_words((int(item.attrs["MATLAB_sparse"]), item["jc"].size - 1), "sparse")
             elif isinstance(item, h5py.Dataset) and item.dtype == h5py.ref_dtype:
                 shape = tuple(item.shape[::-1])
-                cells = enumerate((item.file[one] for one in np.ravel(whole(item)[:_MOST_LISTED])), start=1)
+                cells = enumerate((item.file[each] for each in np.ravel(whole(item)[:_MOST_LISTED])), start=1)
                 deep = {
                     f"{name}[{k}]": _in_words(tuple(part.shape[::-1]), part.dtype)
                     for k, part in cells
                     if isinstance(part, h5py.Dataset) and min(part.shape, default=0) > 1
                 }
-                found.update(deep or {name: _in_words(shape, "cells: arrays of photon times, or of one array each")})
+                words.update(deep or {name: _in_words(shape, "cells: arrays of photon times, or of one array each")})
             elif isinstance(item, h5py.Dataset) and item.dtype.kind in "iuf" and item.ndim:
-                found[name] = _in_words(tuple(item.shape[::-1] if of_matlab else item.shape), item.dtype)
+                words[name] = _in_words(tuple(item.shape[::-1] if of_matlab else item.shape), item.dtype)
 
         file.visititems(visit)
-    return found
+    return words
 
 
-def _chosen(path: Path, found: dict[str, Any], variable: str | None) -> tuple[str, Any]:
-    told = ", ".join(f"{name} {tuple(array.shape)}" for name, array in found.items())
+def _chosen(path: Path, by_name: dict[str, Any], variable: str | None) -> tuple[str, Any]:
+    names = ", ".join(f"{name} {tuple(array.shape)}" for name, array in by_name.items())
     if variable is not None:
-        if variable not in found:
-            raise ValueError(f"{path}: variable must be one of {told or 'none'}, got {variable!r}")
-        return variable, found[variable]
+        if variable not in by_name:
+            raise ValueError(f"{path}: variable must be one of {names or 'none'}, got {variable!r}")
+        return variable, by_name[variable]
     for least in (3, 2, 1):  # an image before a list of pixels before a vector
-        deep = [name for name, array in found.items() if len(array.shape) >= least and np.prod(array.shape) > 1]
+        deep = [name for name, array in by_name.items() if len(array.shape) >= least and np.prod(array.shape) > 1]
         if len(deep) == 1:
-            return deep[0], found[deep[0]]
+            return deep[0], by_name[deep[0]]
         if deep:
-            raise ValueError(f"{path} holds several arrays, give variable: {told}")
-    raise ValueError(f"{path} holds no array of counts" + (f", only {told}" if told else ""))
+            raise ValueError(f"{path} holds several arrays, give variable: {names}")
+    raise ValueError(f"{path} holds no array of counts" + (f", only {names}" if names else ""))
 
 
 def _guessed(path: Path, shape: tuple[int, ...], bins: int | None) -> str:
@@ -288,15 +287,15 @@ def _npz(path: Path) -> dict[str, Any]:
 
 
 def _mat(path: Path, names: list[str] | None = None) -> dict[str, Any]:
-    found = mat_arrays(path, names)
+    variables = mat_arrays(path, names)
     arrays: dict[str, Any] = {}
-    for name, array in found.items():
+    for name, array in variables.items():
         if is_sparse(array):
             arrays[name] = array
         elif isinstance(array, np.ndarray) and array.dtype.kind in "iuf":
             arrays[name] = np.squeeze(array)
-    times = {name: cells for name, cells in cells_of(found).items() if cells.size > 1}
-    return arrays | times | {name: array for name, array in cell_arrays(found).items() if len(array.shape) > 1}
+    times = {name: cells for name, cells in cells_of(variables).items() if cells.size > 1}
+    return arrays | times | {name: array for name, array in cell_arrays(variables).items() if len(array.shape) > 1}
 
 
 def _tiff(path: Path) -> dict[str, Any]:

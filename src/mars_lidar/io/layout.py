@@ -41,7 +41,8 @@ from mars_lidar.instrument.system import System
 from mars_lidar.io.recipe import Recipe, Recording
 from mars_lidar.io.store import OnDisk, values
 from mars_lidar.light.flux import Flux
-from mars_lidar.light.stored_flux import BAND_BYTES, StoredFlux, Waveforms
+from mars_lidar.light.stored_flux import StoredFlux, Waveforms
+from mars_lidar.light.tolerances import TOL
 
 Check = Callable[[Path, Mapping[str, Any]], None]  # of the attributes of a file, before anything else of it is read
 FORMAT = "mars-lidar cube"
@@ -149,7 +150,7 @@ def attributes(recipe: Recipe | Recording) -> dict[str, str | int]:
 def recipe_from(attrs: Mapping[str, Any], arrays: Mapping[str, Any], realizations: int) -> Recipe | Recording:
     """The recipe or the recording that `variables` and `attributes` wrote, of the variables of a file by name.
 
-    Waveforms larger than `BAND_BYTES` stay on disk, where they are there.
+    Waveforms larger than TOL.band_bytes stay on disk, where they are there.
     """
 
     def read(name: str) -> NDArray[Any]:
@@ -170,7 +171,7 @@ def recipe_from(attrs: Mapping[str, Any], arrays: Mapping[str, Any], realization
     background, info = read("background"), json.loads(attrs["flux"])
     if "waveform" in arrays:
         stored = arrays["waveform"]
-        if isinstance(stored, OnDisk) and 8 * math.prod(stored.shape) > BAND_BYTES:
+        if isinstance(stored, OnDisk) and 8 * math.prod(stored.shape) > TOL.band_bytes:
 
             def make(rows: slice) -> Flux:
                 return Flux(waveform=np.asarray(stored[rows]), background=background[rows], info=info)

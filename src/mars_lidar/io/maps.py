@@ -104,11 +104,11 @@ def load_maps(path: str | Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]
     with reading(source, "maps of mars-lidar"):
         _check_suffix("path", source)
         with contextlib.closing(format_of(source, "path").open_store(source, _check_format)) as store:
-            found = {name: values(array) for name, array in store.arrays.items()}
-        if found.get("method", np.empty(0)).dtype.kind == "S":
-            found["method"] = found["method"].astype(str)
-        _check(found, store.attrs)
-        return found, dict(store.attrs)
+            variables = {name: values(array) for name, array in store.arrays.items()}
+        if variables.get("method", np.empty(0)).dtype.kind == "S":
+            variables["method"] = variables["method"].astype(str)
+        _check(variables, store.attrs)
+        return variables, dict(store.attrs)
 
 
 def _check_suffix(name: str, path: Path) -> None:
@@ -123,20 +123,22 @@ def _check_format(path: Path, attrs: Mapping[str, Any]) -> None:
         raise ValueError(f"{path} is damaged: its attribute complete is {attrs['complete']!r}")
 
 
-def _check(found: Mapping[str, NDArray[Any]], attrs: Mapping[str, Any]) -> None:
+def _check(variables: Mapping[str, NDArray[Any]], attrs: Mapping[str, Any]) -> None:
     """Raise ValueError unless these are the maps that `save_maps` writes."""
     version = int(attrs.get("format_version", 0))
     if version != FORMAT_VERSION:
         raise ValueError(f"has layout version {version}; version {FORMAT_VERSION} can be read")
     System.from_json(str(attrs["system"]))
-    missing = [name for name in (*DIMS, "depth", "flags") if name not in found]
+    missing = [name for name in (*DIMS, "depth", "flags") if name not in variables]
     if missing:
         raise ValueError(f"has no variable {missing[0]!r}")
-    shape = tuple(found[dim].size for dim in DIMS)
+    shape = tuple(variables[dim].size for dim in DIMS)
     for dim, size in zip(DIMS[1:], shape[1:], strict=True):
-        if not (found[dim].dtype.kind in "iu" and np.array_equal(found[dim], np.arange(size))):
-            raise ValueError(f"the coordinate {dim} must be 0 to {size - 1}, got {found[dim].dtype} {found[dim].shape}")
-    methods = found["method"]
+        if not (variables[dim].dtype.kind in "iu" and np.array_equal(variables[dim], np.arange(size))):
+            raise ValueError(
+                f"the coordinate {dim} must be 0 to {size - 1}, got {variables[dim].dtype} {variables[dim].shape}"
+            )
+    methods = variables["method"]
     if methods.ndim != 1 or methods.dtype.kind not in "UT" or len(set(methods.tolist())) != len(methods):
         raise ValueError(f"method must be names, each once, got {methods.dtype} {methods.shape}")
     levels = json.loads(attrs["level"])
@@ -149,7 +151,7 @@ def _check(found: Mapping[str, NDArray[Any]], attrs: Mapping[str, Any]) -> None:
         if not isinstance(attrs[name], str):
             raise ValueError(f"the attribute {name} must be a text, got {attrs[name]!r}")
     for name in (*_VARIABLES, *_OF_RETURNS):
-        values = found.get(name)
+        values = variables.get(name)
         if name in _OF_RETURNS and values is not None:
             values = values[..., 0] if values.ndim == len(DIMS) + 1 and values.shape[-1] else values
         if values is not None and (values.shape != shape or values.dtype.kind not in "fiu"):

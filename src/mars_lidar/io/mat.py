@@ -24,6 +24,7 @@ import json
 import struct
 import zlib
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -32,17 +33,19 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import mat5
-from mars_lidar._base.files import FileError, beside, read_mat5
-from mars_lidar._base.memory import check_memory
-from mars_lidar._base.sparse import is_sparse
+from mars_lidar._base.arguments import checked
+from mars_lidar._base.files import FileError, beside, check_target, read_mat5, reading
+from mars_lidar._base.resources import check_memory
+from mars_lidar._base.sparse import dense_counts, is_sparse
 from mars_lidar.instrument.system import System
 from mars_lidar.io import layout
+from mars_lidar.io.cube import Cube, copy_counts, one_exposure
 from mars_lidar.io.recipe import BLOCK_BYTES, Recipe
 from mars_lidar.io.store import LazyCounts, OnDisk, OpenedStore, Writer
 from mars_lidar.light.flux import Flux
 
 UPSAMPLING = 8  # bin_hr over bin: 512 x 512 and 64 x 64 in the files that the networks were trained on
-_MAX_BYTES = 2**31 - 2**16  # a variable of a v5 file, before compression
+MAX_BYTES = 2**31 - 2**16  # a variable of a v5 file, before compression
 _COMPRESSED, _DOUBLE_CLASS, _HEADER_BYTES = 15, 6, 128  # MAT-File Level 5: element type, array class, header
 
 
@@ -55,7 +58,7 @@ def check(recipe: Recipe) -> None:
             f"write them one by one (mars-lidar convert --realization K) or use .h5"
         )
     size = 8 * height * width * bins
-    if size > _MAX_BYTES:
+    if size > MAX_BYTES:
         raise ValueError(
             f"a variable of a .mat (v5) must take less than 2 GiB, and rates of {height} x {width} x {bins} takes "
             f"{size / 2**30:.3g} GiB; use .h5, which MATLAB reads with h5read, or a crop"
@@ -69,17 +72,17 @@ def open_writer(path: Path, recipe: Recipe, bin_hr: NDArray[np.float64] | None =
 
     check(recipe)
     check_memory(3 * 8 * int(np.prod(recipe.shape)), f"the rates of {path}", "a .zarr or .h5 is written in parts")
-    kept: list[Any] = []
+    events: list[Any] = []
 
     def put(realizations: slice, rows: slice, block: NDArray[Any]) -> None:
         y, x, k = np.nonzero(block[0])
-        kept.append((y + rows.start, x, k, block[0][y, x, k]))
+        events.append((y + rows.start, x, k, block[0][y, x, k]))
 
     with beside(path) as unfinished, open(unfinished, "wb") as file:
         writer = Writer(recipe.chunks(BLOCK_BYTES), put)
         yield writer
         _, height, width, bins = recipe.shape
-        y, x, k, counts = (np.concatenate(part) for part in zip(*kept, strict=True))
+        y, x, k, counts = (np.concatenate(part) for part in zip(*events, strict=True))
         spad = sparse.csc_matrix((counts.astype(np.float64), (y + height * x, k)), shape=(height * width, bins))
         first, fine = return_bins(recipe.flux, recipe.system)
         flux = recipe.flux.detected(recipe.system)
@@ -166,8 +169,8 @@ def _rate_bands(flux: Flux, system: System) -> Iterator[NDArray[np.float64]]:
             parts = wave.shape[-1]
             total = np.concatenate([np.zeros((*wave.shape[:2], 1)), wave.cumsum(-1)], axis=-1)
             place = np.linspace(0.0, parts, system.bins + 1)
-            left = np.minimum(place.astype(np.int64), parts - 1)
-            at = total[..., left] + (place - left) * (total[..., left + 1] - total[..., left])
+            below = np.minimum(place.astype(np.int64), parts - 1)
+            at = total[..., below] + (place - below) * (total[..., below + 1] - total[..., below])
             yield np.maximum(np.diff(at, axis=-1), 0.0)
             continue
         band = np.zeros((1, flux.shape[1], system.bins))
@@ -188,8 +191,8 @@ def open_store(path: Path) -> OpenedStore:
             f"{path} is not a cube written by mars-lidar (no variable 'mars_lidar'); "
             f"mars_lidar.io.read_mat reads such files of others"
         )
-    found = read_variables(path)
-    ours = found["mars_lidar"][0, 0]
+    variables = read_variables(path)
+    ours = variables["mars_lidar"][0, 0]
     attrs = json.loads(str(ours["attributes"].item()))
     layout.check_format(path, attrs)
     shapes: Mapping[str, list[int]] = attrs.pop("shapes")
@@ -198,7 +201,7 @@ def open_store(path: Path) -> OpenedStore:
     arrays = {name: np.ascontiguousarray(np.asarray(ours[name]).reshape(shape)) for name, shape in shapes.items()}
     recipe = layout.recipe_from(attrs, arrays, 1)
     _, height, width, bins = recipe.shape
-    spad = found["spad"]
+    spad = variables["spad"]
     if not is_sparse(spad) or spad.shape != (height * width, bins):
         raise ValueError(f"{path}: spad must be sparse (H W, bins) of {(height, width, bins)}, got {spad.shape}")
     most = min(recipe.system.max_bin_count, np.iinfo(recipe.dtype).max)
@@ -226,3 +229,187 @@ def _is_hdf5(path: Path) -> bool:
     import h5py
 
     return bool(h5py.is_hdf5(path))
+
+
+@dataclass(frozen=True, eq=False)
+class SpadMat:
+    """What such a file holds.
+
+    Attributes
+    ----------
+    histogram
+        (H, W, bins) uint16 or uint32, counts.
+    rates
+        (H, W, bins), signal before dead time; of a unit of its own.
+    bin
+        (H, W), bin of the return, from 1.
+    bin_hr
+        (h, w), the same at a finer size, real numbers from 1.
+    sbr
+        Signal over background.
+    photons
+        Mean signal photons of a pixel.
+
+    See Also
+    --------
+    read_mat, save_mat
+
+    Examples
+    --------
+    >>> import pathlib, tempfile
+    >>> folder = pathlib.Path(tempfile.mkdtemp())
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> flux = ml.Flux(signal=[[0.5, 2.0]], background=1.0, delay_ns=[[20.0, 60.0]])
+    >>> cube = ml.Cube(ml.simulate(flux, system), system, flux)
+    >>> ml.io.save_mat(folder / "spad.mat", cube)
+    >>> ml.io.read_mat(folder / "spad.mat").histogram.shape
+    (1, 2, 128)
+    """
+
+    histogram: NDArray[Any]
+    rates: NDArray[np.float64]
+    bin: NDArray[Any]
+    bin_hr: NDArray[np.float64]
+    sbr: float
+    photons: float
+
+
+@checked
+def read_mat(path: str | Path) -> SpadMat:
+    """Read a file of this layout, of mars-lidar or of others.
+
+    Parameters
+    ----------
+    path
+        The ``.mat``.
+
+    Raises
+    ------
+    ValueError
+        Not such a file, or damaged; the message starts with the file.
+
+    See Also
+    --------
+    save_mat, SpadMat
+
+    Examples
+    --------
+    >>> import pathlib, tempfile
+    >>> folder = pathlib.Path(tempfile.mkdtemp())
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> flux = ml.Flux(signal=[[0.5, 2.0]], background=1.0, delay_ns=[[20.0, 60.0]])
+    >>> cube = ml.Cube(ml.simulate(flux, system), system, flux)
+    >>> ml.io.save_mat(folder / "spad.mat", cube)
+    >>> ml.io.read_mat(folder / "spad.mat").bin.shape
+    (1, 2)
+    """
+    with reading(path, "a .mat of counts") as source:
+        return _spad(source, read_variables(source))
+
+
+def _spad(source: Path, variables: dict[str, Any]) -> SpadMat:
+    missing = [name for name in ("spad", "rates", "bin", "bin_hr", "SBR", "photons") if name not in variables]
+    if missing:
+        raise ValueError(f"{source}: has no variable {', '.join(missing)}")
+    spad, rates = variables["spad"], variables["rates"]
+    height, width = variables["bin"].shape
+    bins = rates.shape[-1]
+    if rates.shape != (height, width, bins) or spad.shape != (height * width, bins):
+        raise ValueError(
+            f"{source}: rates must be (H, W, bins) and spad (H W, bins) for bin {(height, width)}, "
+            f"got {rates.shape} and {spad.shape}"
+        )
+    check_memory(16 * height * width * bins, f"the counts of {source}", "read it on a larger machine")
+    dense = dense_counts("spad", spad) if is_sparse(spad) else np.asarray(spad)
+    if not ((dense >= 0) & (dense == np.round(dense)) & (dense < 2**32)).all():
+        raise ValueError(f"{source}: spad must hold counts, whole numbers from 0")
+    kind = np.uint16 if dense.max(initial=0) < 2**16 else np.uint32
+    histogram = dense.astype(kind).reshape(width, height, bins).transpose(1, 0, 2)
+    return SpadMat(
+        np.ascontiguousarray(histogram),
+        np.ascontiguousarray(rates, np.float64),
+        variables["bin"],
+        np.asarray(variables["bin_hr"], np.float64),
+        float(np.ravel(variables["SBR"])[0]),
+        float(np.ravel(variables["photons"])[0]),
+    )
+
+
+@checked
+def save_mat(
+    path: str | Path,
+    cube: Cube,
+    *,
+    realization: int = 0,
+    depth_hr_m: ArrayLike | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Write one exposure of a cube, with a finer depth map for the training of upsampling networks.
+
+    Parameters
+    ----------
+    path
+        ``.mat``.
+    cube
+        What `load` returned, or a cube in memory.
+    realization
+        Which exposure, counted from 0 in the cube.
+    depth_hr_m
+        Depth (8 H, 8 W) in m, or any other size, for ``bin_hr``; NaN = no return. None: the cube's own bins,
+        each repeated 8 x 8 times, which adds no detail.
+    overwrite
+        Replace an existing file.
+
+    Raises
+    ------
+    ValueError, TypeError
+        A bad argument, or a cube that the format cannot hold.
+    OSError
+        `path` exists and `overwrite` is false, or cannot be written.
+
+    See Also
+    --------
+    read_mat, save
+
+    Examples
+    --------
+    >>> import pathlib, tempfile
+    >>> folder = pathlib.Path(tempfile.mkdtemp())
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> flux = ml.Flux(signal=[[0.5, 2.0]], background=1.0, delay_ns=[[20.0, 60.0]])
+    >>> cube = ml.Cube(ml.simulate(flux, system), system, flux)
+    >>> ml.io.save_mat(folder / "spad.mat", cube)
+    >>> round(ml.io.read_mat(folder / "spad.mat").sbr, 2)
+    1.25
+    """
+    target = Path(path)
+    if target.suffix != ".mat":
+        raise ValueError(f"path must end in .mat, got {str(path)!r}")
+    cube.simulation("a .mat")
+    exposure = one_exposure(cube, realization)
+    recipe = exposure.simulation()
+    fine = None
+    if depth_hr_m is not None:
+        depth = np.asarray(depth_hr_m)
+        if depth.ndim != 2 or depth.size == 0 or depth.dtype.kind not in "fiu":
+            raise ValueError(f"depth_hr_m must be real numbers (h, w), got shape {depth.shape} of {depth.dtype}")
+        with np.errstate(invalid="ignore"):
+            if not (np.isnan(depth) | ((depth > 0) & (depth < np.inf))).all():
+                raise ValueError("depth_hr_m must be positive, or NaN for no return")
+        fine = bins_of_delay(recipe.system.delay_ns(depth), recipe.system)
+    check(recipe)
+    check_target(target, folder=False, overwrite=overwrite)
+    with open_writer(target, recipe, fine) as writer:
+        copy_counts(exposure, writer)

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked, checked_with_masks
-from mars_lidar._base.memory import check_memory
+from mars_lidar._base.resources import check_memory
 from mars_lidar._base.sparse import dense_bytes, dense_counts, is_sparse
 from mars_lidar.instrument.system import System
 from mars_lidar.io.cube import Cube
@@ -227,18 +227,18 @@ def in_order(counts: Any, axes: str | None, image: tuple[int, int] | None) -> ND
         raise TypeError(f"counts must be an array of numbers, got {array.dtype}")
     if axes is None and array.ndim not in _AXES:
         raise ValueError(f"counts must be (t,), (pixels, t), (y, x, t) or (n, y, x, t), got shape {array.shape}")
-    told = _AXES[array.ndim] if axes is None else axes
-    names = re.findall(r"\((?:yx|xy)\)|[nyxt]", told)
+    order = _AXES[array.ndim] if axes is None else axes
+    names = re.findall(r"\((?:yx|xy)\)|[nyxt]", order)
     letters = "".join(names).translate({40: None, 41: None})
-    if "".join(names) != told or len(set(letters)) != len(letters) or "t" not in letters:
+    if "".join(names) != order or len(set(letters)) != len(letters) or "t" not in letters:
         raise ValueError(f"axes must be made of n, y, x, t and (yx) or (xy), each once and t among them, got {axes!r}")
     if array.ndim != len(names) or array.size == 0:
-        raise ValueError(f"counts must have the axes {told} and not be empty, got shape {array.shape}")
+        raise ValueError(f"counts must have the axes {order} and not be empty, got shape {array.shape}")
     shape = list(array.shape)
     flat = next((k for k, name in enumerate(names) if name.startswith("(")), None)
     if flat is None:
         if image is not None:
-            raise ValueError(f"image belongs to axes with pixels in brackets, (yx) or (xy), got axes {told}")
+            raise ValueError(f"image belongs to axes with pixels in brackets, (yx) or (xy), got axes {order}")
     else:
         height, width = (1, shape[flat]) if image is None else image
         if height * width != shape[flat]:
@@ -311,9 +311,9 @@ def _cells(cells: Any) -> NDArray[Any]:
     if array.dtype != object:
         if array.ndim != 1:
             raise ValueError(f"cells must be (H, W) of arrays of times, or one array of times, got {array.shape}")
-        one = np.empty((1, 1), object)
-        one[0, 0] = array
-        return one
+        single = np.empty((1, 1), object)
+        single[0, 0] = array
+        return single
     if array.ndim != 2 or array.size == 0:
         raise ValueError(f"cells must be (H, W) of arrays of times, got shape {array.shape}")
     return array

@@ -59,9 +59,9 @@ def mat_arrays(path: Path, names: list[str] | None = None, *, deep: bool = True)
     return _plain(read_mat5(path, names))
 
 
-def _plain(found: dict[str, Any]) -> dict[str, Any]:
+def _plain(variables: dict[str, Any]) -> dict[str, Any]:
     """Without what SciPy tells of the file."""
-    return {name: array for name, array in found.items() if not name.startswith("__")}
+    return {name: array for name, array in variables.items() if not name.startswith("__")}
 
 
 def hdf5_arrays(path: Path, *, of_matlab: bool = False, deep: bool = True) -> dict[str, Any]:
@@ -130,10 +130,10 @@ def _cell(name: str, part: Any) -> Any:
     return values.ravel() if values.size == max((0, *values.shape)) else values.T
 
 
-def cell_arrays(found: dict[str, Any]) -> dict[str, Any]:
+def cell_arrays(variables: dict[str, Any]) -> dict[str, Any]:
     """Arrays in cells of a .mat that are no photon times, by names such as ``spad[2]``, the second, as in MATLAB."""
     out: dict[str, Any] = {}
-    for name, values in found.items():
+    for name, values in variables.items():
         if isinstance(values, np.ndarray) and values.dtype == object:
             out |= {f"{name}[{k}]": cell for k, cell in enumerate(values.ravel(order="F"), start=1) if _is_deep(cell)}
     return out

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.files import FileError, UnchangedFile, beside, npy_header, open_npz
-from mars_lidar._base.memory import check_memory
+from mars_lidar._base.resources import check_memory
 from mars_lidar.io import layout
 from mars_lidar.io.recipe import BLOCK_BYTES, Recipe, Recording
 from mars_lidar.io.store import LazyCounts, OnDisk, OpenedStore, Writer
@@ -73,11 +73,13 @@ def add_attributes(to: zipfile.ZipFile, attrs: Mapping[str, Any]) -> None:
 def open_store(path: Path, check: layout.Check = layout.check_format) -> OpenedStore:
     """Open an archive for reading; all but the counts are read at once."""
     opened = UnchangedFile(path)
-    with open_npz(path, beside="histogram") as found:
-        attrs = json.loads(found["attributes"].item()) if "attributes" in found.files else {}
+    with open_npz(path, beside="histogram") as packed:
+        attrs = json.loads(packed["attributes"].item()) if "attributes" in packed.files else {}
         check(path, attrs)
-        arrays: dict[str, Any] = {name: found[name] for name in found.files if name not in ("attributes", "histogram")}
-        if "histogram" in found.files:
+        arrays: dict[str, Any] = {
+            name: packed[name] for name in packed.files if name not in ("attributes", "histogram")
+        }
+        if "histogram" in packed.files:
             arrays["histogram"] = OnDisk(_counts(opened, attrs.get("registrations")), path)
     return OpenedStore(attrs, arrays)
 
@@ -85,13 +87,13 @@ def open_store(path: Path, check: layout.Check = layout.check_format) -> OpenedS
 def _counts(opened: UnchangedFile, registrations: int | None) -> LazyCounts:
     """The counts of an archive, which must add up to what its attribute says."""
     name = "histogram.npy"
-    with zipfile.ZipFile(opened.path) as found, found.open(name) as member:
+    with zipfile.ZipFile(opened.path) as packed, packed.open(name) as member:
         shape, dtype, _ = npy_header(member)
 
     def read() -> NDArray[Any]:
         size = math.prod(shape) * dtype.itemsize
         check_memory(size, f"the counts of {opened.path}", "a .zarr or .h5 is read in parts")
-        with opened.unchanged() as path, zipfile.ZipFile(path) as found, found.open(name) as member:
+        with opened.unchanged() as path, zipfile.ZipFile(path) as packed, packed.open(name) as member:
             counts = np.asarray(np.lib.format.read_array(member, allow_pickle=False))
         if registrations is not None and counts.sum(dtype=np.uint64) != registrations:
             raise FileError(f"{opened.path} is damaged: its counts are not the {registrations:,} that it says")

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
-from mars_lidar._base.brief import brief
+from mars_lidar._base.display import brief
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.light.stored_flux import StoredFlux

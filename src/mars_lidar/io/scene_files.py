@@ -13,7 +13,7 @@ from mars_lidar._base.arguments import checked
 from mars_lidar._base.files import check_claim, reading
 from mars_lidar._base.progress import callback_of
 from mars_lidar._base.types import Progress
-from mars_lidar.io.rgbd import collections
+from mars_lidar.io import rgbd
 from mars_lidar.scene.scene import Scene
 
 BAD_FILE = (ValueError, TypeError, OSError, MemoryError)  # what a scene that cannot be used raises
@@ -75,8 +75,8 @@ class SceneFile:
 
     def load(self, *, size: int | tuple[int, int] | None = None) -> Scene:
         """Read the scene, at `size` as in `mars_lidar.Scene.resize`."""
-        told = {field.name: getattr(self, field.name) for field in fields(self)}
-        return Scene.from_rgbd(told.pop("depth"), told.pop("image"), size=size, **told)
+        arguments = {field.name: getattr(self, field.name) for field in fields(self)}
+        return Scene.from_rgbd(arguments.pop("depth"), arguments.pop("image"), size=size, **arguments)
 
 
 @dataclass(frozen=True)
@@ -199,28 +199,28 @@ def scan(
         manifest = root / MANIFEST
     if manifest is not None:
         shared = {"depth_unit_m": depth_unit_m, "focal_px": focal_px, "max_depth_m": max_depth_m}
-        found = _listed(Path(manifest), shared, problems)
+        listed = _listed(Path(manifest), shared, problems)
     elif pattern is not None:
-        found = _matching(root, pattern, image, problems)
+        listed = _matching(root, pattern, image, problems)
     else:
-        found = _recognised(root, problems)
-    candidates = list(found)
+        listed = _recognised(root, problems)
+    candidates = list(listed)
     if manifest is None:
         _tell_images(root, candidates)
-        for k, one in enumerate(candidates):
-            own_unit = one.depth.is_dir() or one.depth.suffix.lower() == ".mat"  # these are in metres
+        for k, scene in enumerate(candidates):
+            own_unit = scene.depth.is_dir() or scene.depth.suffix.lower() == ".mat"  # these are in metres
             unit = None if own_unit else depth_unit_m
-            candidates[k] = replace(one, depth_unit_m=unit, focal_px=focal_px, max_depth_m=max_depth_m)
+            candidates[k] = replace(scene, depth_unit_m=unit, focal_px=focal_px, max_depth_m=max_depth_m)
     if not check:
         return candidates, problems
     scenes = []
-    for k, one in enumerate(candidates):
+    for k, scene in enumerate(candidates):
         try:
-            one.load()
+            scene.load()
         except BAD_FILE as error:
-            problems.append(Problem.of(one.depth, error))
+            problems.append(Problem.of(scene.depth, error))
         else:
-            scenes.append(one)
+            scenes.append(scene)
         if progress is not None:
             progress(k + 1, len(candidates))
     return scenes, problems
@@ -261,7 +261,7 @@ def _matching(root: Path, pattern: str, image: tuple[str, str] | None, problems:
 
 
 def _recognised(root: Path, problems: list[Problem]) -> Iterator[SceneFile]:
-    if collections.is_middlebury(root):
+    if rgbd.is_middlebury(root):
         yield SceneFile(depth=root)
         return
     try:
@@ -285,10 +285,10 @@ def _frames(path: Path, image: Path | None, problems: list[Problem]) -> Iterator
         yield SceneFile(depth=path, image=image)
         return
     try:
-        if not collections.is_nyu(path):
+        if not rgbd.is_nyu(path):
             yield SceneFile(depth=path, image=image)
             return
-        count = collections.nyu_frames(path)
+        count = rgbd.nyu_frames(path)
     except BAD_FILE as error:
         problems.append(Problem.of(path, error))
         return
@@ -316,22 +316,22 @@ def _partner(path: Path) -> Path | None:
         stems.append(path.with_suffix(""))
     if path.parent.name.lower() in _DEPTH_FOLDERS:
         above = path.parent.parent
-        for stem in [path.stem, *(one.name for one in stems)]:
+        for stem in [path.stem, *(base.name for base in stems)]:
             stems += [above / word / stem for word in _IMAGE_WORDS]
-    for one in stems:
+    for base in stems:
         for suffix in (*_IMAGE, *map(str.upper, _IMAGE)):
-            found = one.with_name(one.name + suffix)
-            if found.is_file() and found != path:
-                return found
+            image = base.with_name(base.name + suffix)
+            if image.is_file() and image != path:
+                return image
     return None
 
 
-def _tell_images(root: Path, found: list[SceneFile]) -> None:
+def _tell_images(root: Path, scenes: list[SceneFile]) -> None:
     """Warn where no scene of a folder has an image: reflectivity is then the same everywhere, which few want."""
-    alone = [one for one in found if one.image is None and one.depth.suffix.lower() in _DEPTH]
-    if alone and len(alone) == len(found):
+    alone = [scene for scene in scenes if scene.image is None and scene.depth.suffix.lower() in _DEPTH]
+    if alone and len(alone) == len(scenes):
         warnings.warn(
-            f"{root}: no image was found to any of {len(found)} depth files, so that reflectivity is 1 everywhere; "
+            f"{root}: no image was found to any of {len(scenes)} depth files, so that reflectivity is 1 everywhere; "
             f"{alone[0].depth.name} takes one of the same name without 'depth', or with 'rgb', 'color' or 'image' in "
             "place of it; or name the files by pattern and image (--pattern, --image)",
             UserWarning,

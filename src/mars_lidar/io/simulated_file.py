@@ -1,4 +1,4 @@
-"""Simulate straight into a file, and make a cube again: where the verb `simulate` and the files meet."""
+"""Simulate straight into a file, and make a cube again; before that, how long it will take."""
 
 from __future__ import annotations
 
@@ -14,16 +14,19 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import manifest
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.progress import callback_of, of_part
+from mars_lidar._base.progress import callback_of, of_part, span
+from mars_lidar._base.tolerances import TOL
 from mars_lidar._base.types import Progress
-from mars_lidar.engines import EngineOptions, find_engine
+from mars_lidar.engines import ENGINES, Engine, EngineOptions, check_detector, find_engine
 from mars_lidar.engines.engine import given
+from mars_lidar.engines.feedback import expected_registrations
 from mars_lidar.engines.table_reader import table_record
 from mars_lidar.instrument.system import System
 from mars_lidar.io import zarr_store
 from mars_lidar.io.cube import Cube, check_output, load, open_writer
 from mars_lidar.io.recipe import Recipe
 from mars_lidar.light.flux import Flux
+from mars_lidar.light.stored_flux import StoredFlux
 from mars_lidar.simulation import simulate
 from mars_lidar.table import Table, cache
 
@@ -183,14 +186,14 @@ def simulate_to(
     ) as writer:
         for images, rows in list(recipe.blocks(writer.chunks))[writer.begun :]:
             began = time.perf_counter()
-            told: dict[str, float] = {}
+            of_block: dict[str, float] = {}
             tell = _of_the_whole(progress, recipe, images, rows)
-            block = _simulate(recipe, images, rows, threads=threads, progress=tell, report=told, device=device)
+            block = _simulate(recipe, images, rows, threads=threads, progress=tell, report=of_block, device=device)
             ended = time.perf_counter()
             writer.write(images, rows, block)
             simulate_s += ended - began
             write_s += time.perf_counter() - ended
-            for name, value in told.items():
+            for name, value in of_block.items():
                 report[name] = report.get(name, 0.0) + value
     return Written(target, writer.registrations, simulate_s, write_s, report)
 
@@ -359,14 +362,14 @@ def _grid(record: dict[str, Any]) -> str:
 def _try_brightest_pixel(recipe: Recipe, threads: int | None, device: Literal["cpu", "cuda"]) -> None:
     """Let the simulator check its arguments before anything on disk is touched."""
     y, x = (int(k) for k in np.unravel_index(np.argmax(recipe.flux.total), recipe.flux.shape))
-    one = recipe.replace(
+    pixel = recipe.replace(
         flux=recipe.flux[y, x],
         realizations=1,
         pixel_index=np.array([0 if recipe.pixel_index is None else recipe.pixel_index.max()]),
         depth_m=recipe.depth_m[:1, :1],
         reflectivity=None,
     )
-    _simulate(one, slice(0, 1), slice(0, 1), threads=threads, device=device)
+    _simulate(pixel, slice(0, 1), slice(0, 1), threads=threads, device=device)
 
 
 def _of_the_whole(progress: Progress | None, recipe: Recipe, images: slice, rows: slice) -> Progress | None:
@@ -375,3 +378,92 @@ def _of_the_whole(progress: Progress | None, recipe: Recipe, images: slice, rows
     before = images.start * height * width + rows.start * width
     size = (images.stop - images.start) * (rows.stop - rows.start) * width
     return of_part(progress, before, before + size, count * height * width)
+
+
+@dataclass(frozen=True)
+class _Probe:
+    """How a run is timed beforehand. The seconds decide how exact the advice is, and nothing else."""
+
+    event_s: float = 1e-7  # by the slowest engine: where all events of a run take less than a second, nothing is drawn
+    least_s: float = 0.1  # drawn at least, or the whole image; in two steps ...
+    first_s: float = 1.0  # ... unless the first takes longer
+    pixels: int = 16  # of the first step
+    cycles: int = 20_000  # of engines that draw photon by photon: their time is proportional to the exposure
+    worth: float = 3.0  # times faster that another engine must be to be mentioned
+
+
+_PROBE = _Probe()
+_BY_PHOTON = ("exact", "sequential", "poisson")
+
+
+@dataclass(frozen=True)
+class Advice:
+    """Seconds that a run will take about, and those with engine `auto`, NaN where it does not draw the same law."""
+
+    seconds: float
+    auto_s: float = math.nan
+
+    def __str__(self) -> str:
+        """One line, empty for a run that is not long."""
+        if self.seconds < TOL.long_s:
+            return ""
+        faster = (
+            f"; --engine auto: about {span(self.auto_s)}, same law" if self.auto_s * _PROBE.worth < self.seconds else ""
+        )
+        return f"about {span(self.seconds)} on this machine{faster}"
+
+
+def advice(
+    flux: Flux,
+    system: System,
+    engine: str | Engine = "exact",
+    *,
+    realizations: int = 1,
+    threads: int | None = None,
+    options: EngineOptions | None = None,
+) -> Advice:
+    """How long `mars_lidar.simulate` will take, measured on pixels spread over the image, a few tenths of a second.
+
+    Nothing is drawn, and the answer is 0, where a run is short whatever the engine.
+    """
+    drawn_by = find_engine(engine, **(options or {}))
+    if isinstance(flux, StoredFlux) or system.detector.crosstalk is not None:  # not to be had in single pixels
+        return Advice(0.0)
+    events = realizations * float(expected_registrations(flux, system).sum())
+    if drawn_by.name in ("sequential", "poisson"):
+        events = realizations * float(flux.total.sum()) * system.cycles
+    by_pixel = "table" in drawn_by.options and getattr(drawn_by, "reader", None) is None
+    if events * _PROBE.event_s < 1.0 and not by_pixel:
+        return Advice(0.0)
+    seconds = realizations * _measured(flux, system, drawn_by, threads)
+    if seconds < TOL.long_s or drawn_by.name != "exact":
+        return Advice(seconds)
+    auto = ENGINES["auto"]
+    try:
+        check_detector(auto, system)
+        auto.check(flux, system)
+    except ValueError:
+        return Advice(seconds)
+    return Advice(seconds, realizations * _measured(flux, system, auto, threads))
+
+
+def _measured(flux: Flux, system: System, engine: Engine, threads: int | None) -> float:
+    """Seconds for one image: some of its pixels, more of them until it takes long enough to be measured."""
+    share = 1.0
+    if engine.name in _BY_PHOTON and system.cycles > _PROBE.cycles:
+        share = system.cycles / _PROBE.cycles
+        system = system.replace(cycles=_PROBE.cycles)
+    pixels = math.prod(flux.shape)
+    step = max(1, math.isqrt(pixels // _PROBE.pixels))
+    drawn, spent = 0, 0.0
+    while True:
+        some = flux[step // 2 :: step, step // 2 :: step]
+        before, number = (drawn, spent), math.prod(some.shape)
+        began = time.perf_counter()
+        simulate(some, system, engine=engine, threads=threads)
+        drawn, spent = number, time.perf_counter() - began
+        if step == 1 or spent > _PROBE.first_s or (before[0] and spent > _PROBE.least_s):
+            # what the number of pixels does not change, such as a plan, is paid once
+            each = (spent - before[1]) / (drawn - before[0]) if drawn > before[0] else spent / drawn
+            return share * (spent + max(0.0, each) * (pixels - drawn))
+        step = max(1, step // 2)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.files import FileError, reading, whole
-from mars_lidar._base.memory import check_memory
+from mars_lidar._base.resources import check_memory
 from mars_lidar.light.transient import RateArray
 
 
@@ -63,16 +63,16 @@ class OnDisk:
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         size = math.prod(self._array.shape) * self._array.dtype.itemsize
         check_memory(size, f"all values of {self._path}", "index it to read a part")
-        found: NDArray[Any] = self._read(lambda: np.asarray(self._array[...], dtype=dtype))
-        return found.copy() if copy else found
+        array: NDArray[Any] = self._read(lambda: np.asarray(self._array[...], dtype=dtype))
+        return array.copy() if copy else array
 
     def __len__(self) -> int:
         return int(self._array.shape[0])
 
     def whole(self) -> NDArray[Any]:
         """All values, if they are no more than a file of this size can hold."""
-        found: NDArray[Any] = self._read(lambda: whole(self._array))
-        return found
+        array: NDArray[Any] = self._read(lambda: whole(self._array))
+        return array
 
     def _read(self, read: Callable[[], Any]) -> Any:
         try:

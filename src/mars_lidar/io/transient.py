@@ -89,7 +89,7 @@ def read_transient(
 def _read(
     source: Path, bin_ns: float | None, start_ns: float | None, name: str | None, channel: int | None
 ) -> Transient:
-    told: dict[str, float] = {}
+    stated: dict[str, float] = {}
     suffix = source.suffix.lower()
     if suffix == ".npy":
         if name is not None:
@@ -98,15 +98,15 @@ def _read(
     elif suffix in CAPTURE_SUFFIXES and name is None and (capture := _capture(source)) is not None:
         light = Rows(capture.image, capture.read)
         times = {"bin_ns": capture.bin_ns, "start_ns": capture.start_ns}
-        told = {key: value for key, value in times.items() if value is not None}
+        stated = {key: value for key, value in times.items() if value is not None}
     elif suffix in SUFFIXES:
-        light, told = _named(source, name)
+        light, stated = _named(source, name)
     else:
         raise ValueError(f"{source}: a transient must be one of {', '.join(SUFFIXES)}")
-    width = told.get("bin_ns") if bin_ns is None else bin_ns
+    width = stated.get("bin_ns") if bin_ns is None else bin_ns
     if width is None:
         raise ValueError(f"{source}: does not tell the width of a time bin: give bin_ns")
-    start = told.get("start_ns", 0.0) if start_ns is None else start_ns
+    start = stated.get("start_ns", 0.0) if start_ns is None else start_ns
     if len(light.shape) == 4:
         if channel is None or not 0 <= channel < light.shape[3]:
             raise ValueError(f"{source}: has {light.shape[3]} channels: give channel from 0, got {channel!r}")
@@ -121,23 +121,23 @@ def _named(path: Path, name: str | None) -> tuple[Any, dict[str, float]]:
     """An array of a file, of HDF5 with its rows on disk, and the times that stand beside it."""
     opened = UnchangedFile(path)
     with open_arrays(path) as file:
-        name = name or next((one for one in (_NAME, *_CONFOCAL) if one in file.names), _only(file))
+        name = name or next((each for each in (_NAME, *_CONFOCAL) if each in file.names), _only(file))
         if name not in file.names:
             raise ValueError(f"{path}: cannot be read (no array {name!r}, got {', '.join(file.names) or 'nothing'})")
-        found = file.read((name, *_TIMES))
-        stored = found.pop(name)
-        told = {key: float(np.ravel(values(one))[0]) for key, one in found.items()}
+        arrays = file.read((name, *_TIMES))
+        stored = arrays.pop(name)
+        stated = {key: float(np.ravel(values(each))[0]) for key, each in arrays.items()}
         if not isinstance(stored, OnDisk):
-            return stored, told
+            return stored, stated
         check_data(path, stored, name, in_parts=True)
-        told |= {key: float(stored.attrs[key]) for key in _TIMES if key in stored.attrs}
+        stated |= {key: float(stored.attrs[key]) for key in _TIMES if key in stored.attrs}
 
     def read(rows: slice) -> NDArray[Any]:  # the file is open only here
         with opened.unchanged(), open_hdf5(path) as again:
             data = again[name]
             return np.asarray(data[..., rows]).T if file.turned else np.asarray(data[rows])
 
-    return Rows(tuple(stored.shape[::-1] if file.turned else stored.shape), read), told
+    return Rows(tuple(stored.shape[::-1] if file.turned else stored.shape), read), stated
 
 
 def _only(file: NamedArrays) -> str:
@@ -159,24 +159,24 @@ def read_truth(path: str | Path, shape: tuple[int, int]) -> dict[str, FloatArray
     ``.npz``, ``.h5``, ``.hdf5`` and ``.mat`` (turned, as the transient is). A ValueError begins with the file.
     """
     with reading(path, "a transient with depth and reflectivity") as source:
-        told: dict[str, FloatArray] = {}
+        truth: dict[str, FloatArray] = {}
         for name, stored in _truth(source).items():
             if stored.shape != shape or stored.dtype.kind not in "fiu":
                 raise ValueError(f"{source}: {name} must be real numbers {shape}, got {stored.dtype} {stored.shape}")
-            told[name] = stored.astype(np.float64)
-        if "depth" in told:
-            depth = told["depth"]
+            truth[name] = stored.astype(np.float64)
+        if "depth" in truth:
+            depth = truth["depth"]
             if (depth < 0.0).any():
                 raise ValueError(f"{source}: depth must not be negative, got {np.nanmin(depth):g} m")
-            told["depth"] = np.where((depth > 0.0) & (depth < np.inf), depth, np.nan)
-        if "reflectivity" in told and not ((told["reflectivity"] >= 0.0) & (told["reflectivity"] <= 1.0)).all():
+            truth["depth"] = np.where((depth > 0.0) & (depth < np.inf), depth, np.nan)
+        if "reflectivity" in truth and not ((truth["reflectivity"] >= 0.0) & (truth["reflectivity"] <= 1.0)).all():
             raise ValueError(f"{source}: reflectivity must lie in [0, 1]")
-        return told
+        return truth
 
 
 def _truth(path: Path) -> dict[str, NDArray[Any]]:
     if path.suffix.lower() == ".npy":
         return {}
     with open_arrays(path) as file:
-        found = {name: values(array) for name, array in file.read(_TRUTH).items()}
-        return {name: array.T if file.turned else array for name, array in found.items()}
+        arrays = {name: values(array) for name, array in file.read(_TRUTH).items()}
+        return {name: array.T if file.turned else array for name, array in arrays.items()}

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from mars_lidar._base.late import names_of
+from mars_lidar._base.imports import names_of
 
 if TYPE_CHECKING:
     from mars_lidar.learn.forward import bin_photons as bin_photons

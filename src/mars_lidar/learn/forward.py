@@ -484,7 +484,7 @@ def expected_histogram(
     preceding dead time, L those of one dead time ago; e and b are what the dead time that outlasts the exposure
     adds where it began armed (docs/joint_law.md, 3.2 and 4.6). Derivatives are those of the solution, by solutions
     of the same equation or of the transposed one, not of the steps that led there. Exact, up to the grid, where the
-    exposure forgets its start before its end; `mars_lidar.statistics.mean_histogram` needs no such condition. The
+    exposure forgets its start before its end; `mars_lidar.mean_histogram` needs no such condition. The
     error of the grid falls with the square of `refine`: at the default a total variation below 4e-4, and 1e-3
     where the dead time is within 8 sigma of 0 or of whole periods (bins of up to 3 sigma); derivatives are within 4e-3
     of those of the exact mean (norm over the bins; median 1e-4).
@@ -514,7 +514,7 @@ def expected_histogram(
 
     See Also
     --------
-    HistogramTable, histogram_log_likelihood, mars_lidar.statistics.mean_histogram
+    HistogramTable, histogram_log_likelihood, mars_lidar.mean_histogram
 
     Notes
     -----

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from mars_lidar._base.optional import MissingLibraryError
+from mars_lidar._base.imports import MissingLibraryError
 
 try:
     import torch

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mars_lidar._base.optional import MissingLibraryError
+from mars_lidar._base.imports import MissingLibraryError
 
 try:
     import torch as torch

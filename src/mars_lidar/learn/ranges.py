@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from mars_lidar._base import checks
-from mars_lidar._base.brief import brief
+from mars_lidar._base.display import brief
 from mars_lidar.instrument.pulse import GaussianPulse
 from mars_lidar.instrument.system import System
 

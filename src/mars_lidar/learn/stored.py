@@ -21,11 +21,10 @@ from numpy.typing import NDArray
 from mars_lidar._base import checks
 from mars_lidar._base.buckets import in_bucket
 from mars_lidar._base.files import FileError
-from mars_lidar._base.memory import check_memory
 from mars_lidar._base.native import _core
+from mars_lidar._base.resources import check_memory
 from mars_lidar.dataset.arrays import MAPS, sample_parts
-from mars_lidar.dataset.read import Block, read_block
-from mars_lidar.dataset.store import Dataset, open_dataset
+from mars_lidar.dataset.store import Block, Dataset, open_dataset, read_block
 from mars_lidar.learn.needed import torch
 from mars_lidar.learn.stream import Buffers, Passes, rank_of, worker_of
 

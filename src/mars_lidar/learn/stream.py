@@ -23,9 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base import checks
-from mars_lidar._base.memory import check_memory
 from mars_lidar._base.resample import image_size
-from mars_lidar._base.threads import thread_count
+from mars_lidar._base.resources import check_memory, thread_count
 from mars_lidar.engines import Engine, check_detector, find_engine
 from mars_lidar.instrument.system import System
 from mars_lidar.io.scene_files import SceneFile

@@ -11,15 +11,13 @@ from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked, checked_with_masks, constructed_by_name
-from mars_lidar._base.late import late
-from mars_lidar._base.notebook import as_html
+from mars_lidar._base.display import as_html
+from mars_lidar._base.imports import late
 from mars_lidar._base.types import FloatArray, IndexArray
 from mars_lidar.instrument.system import System
+from mars_lidar.light.tolerances import TOL
 
 # --- Maps of photons -----------------------------------------------------------------------------------------------
-
-MAX_DELAY_NS = 1e9  # a second: beyond, float64 does not tell the phase in a laser period to 1e-6 ns
-MAX_PHOTONS = 1e6  # per period; the samplers are tested to 1e3
 
 
 def light_map(name: str, value: ArrayLike, *, photons: bool = True) -> FloatArray:
@@ -43,11 +41,11 @@ def light_map(name: str, value: ArrayLike, *, photons: bool = True) -> FloatArra
 
 def check_photons(name: str, array: FloatArray) -> None:
     """Raise ValueError, naming the first one, for numbers that are no photons per period."""
-    if not (array.min() >= 0 and array.max() <= MAX_PHOTONS):  # NaN is neither
-        bad = ~((array >= 0) & (array <= MAX_PHOTONS))
+    if not (array.min() >= 0 and array.max() <= TOL.photons):  # NaN is neither
+        bad = ~((array >= 0) & (array <= TOL.photons))
         where = tuple(int(k) for k in np.argwhere(bad)[0])
         place = f" at index {where}" if where else ""
-        raise ValueError(f"{name} must lie in [0, {MAX_PHOTONS:g}] photons per period, got {array[where]}{place}")
+        raise ValueError(f"{name} must lie in [0, {TOL.photons:g}] photons per period, got {array[where]}{place}")
 
 
 def common_shape(names: Sequence[str], shapes: Sequence[tuple[int, ...]]) -> tuple[int, ...]:
@@ -88,8 +86,6 @@ def frozen(array: FloatArray) -> FloatArray:
 
 
 # --- The flux ------------------------------------------------------------------------------------------------------
-
-MAX_RETURNS = 16
 
 
 @constructed_by_name
@@ -375,8 +371,8 @@ class Flux:
 
 def _each_return(signal: Any, delay_ns: Any) -> Iterator[tuple[Any, Any]]:
     """Signal and delay (H, W) of each return of arrays (R, H, W)."""
-    if not 1 <= len(signal) <= MAX_RETURNS:
-        raise ValueError(f"signal must be (R, H, W) of 1 to {MAX_RETURNS} returns, got shape {np.shape(signal)}")
+    if not 1 <= len(signal) <= TOL.returns:
+        raise ValueError(f"signal must be (R, H, W) of 1 to {TOL.returns} returns, got shape {np.shape(signal)}")
     if delay_ns is None or np.ndim(delay_ns) != 3 or len(delay_ns) != len(signal):
         given = "None" if delay_ns is None else f"shape {np.shape(delay_ns)}"
         raise ValueError(f"delay_ns must be (R, H, W) as signal of shape {np.shape(signal)} is, got {given}")
@@ -395,9 +391,9 @@ def made(
     if lost.any() and (lost := lost & (signal > 0)).any():
         where = tuple(int(k) for k in np.argwhere(lost)[0][1:])
         raise ValueError(f"delay_ns must be finite where signal > 0, got NaN{f' at pixel {where}' if where else ''}")
-    if (far := np.abs(delay_ns) > MAX_DELAY_NS).any():
+    if (far := np.abs(delay_ns) > TOL.delay_ns).any():
         raise ValueError(
-            f"delay_ns must be within {MAX_DELAY_NS:g} ns either way, got {delay_ns[far][0]:g}; give it modulo the "
+            f"delay_ns must be within {TOL.delay_ns:g} ns either way, got {delay_ns[far][0]:g}; give it modulo the "
             "laser period"
         )
     if waveform is not None:

@@ -10,17 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base import checks
-from mars_lidar._base.memory import check_memory
+from mars_lidar._base.resources import check_memory
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import SPEED_OF_LIGHT_M_PER_NS, System
 from mars_lidar.light.flux import Flux
 from mars_lidar.light.stored_flux import StoredFlux
+from mars_lidar.light.tolerances import TOL
 from mars_lidar.light.transient import through_pulse
-
-PARTS_PER_BIN = 4  # default parts of the waveform per histogram bin
-_BAND_BYTES = 8 * 2**20  # waveforms computed together; the work takes about six times as much
-_DARK = 40.0  # optical depths of the way there and back beyond which nothing comes: e^-40
-_FOLDS = 256  # periods from which light of fog is told apart
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,9 +44,9 @@ class Fog:
 
     def before(self, flux: Flux, system: System, signal: float) -> StoredFlux:
         """Returns of the mean `signal` seen through this fog: `Flux.in_fog`, made row by row as it is used."""
-        parts = PARTS_PER_BIN * system.bins
+        parts = TOL.parts_per_bin * system.bins
         photons = self.backscatter * signal
-        step = max(1, _BAND_BYTES // (8 * flux.shape[1] * parts))
+        step = max(1, TOL.work_bytes // (8 * flux.shape[1] * parts))
 
         def rows(wanted: slice) -> Flux:
             waveform = np.empty((wanted.stop - wanted.start, flux.shape[1], parts))
@@ -85,7 +81,7 @@ def in_fog(
     alpha = checks.real("extinction_per_m", extinction_per_m, low=0.0, strict_low=True)
     photons = checks.real("backscatter", backscatter, low=0.0)
     first = checks.real("nearest_m", nearest_m, low=0.0, strict_low=True)
-    number = PARTS_PER_BIN * system.bins if parts is None else checks.integer("parts", parts, low=1, high=2**20)
+    number = TOL.parts_per_bin * system.bins if parts is None else checks.integer("parts", parts, low=1, high=2**20)
     check_memory(48 * math.prod(flux.shape) * number, "the waveforms", "take rows: flux[rows]")
     lit, depth = _depths(flux)
     info = flux.info | {"extinction_per_m": alpha, "backscatter": photons, "nearest_m": first}
@@ -117,11 +113,11 @@ def _farthest(lit: NDArray[np.bool_], depth: FloatArray) -> FloatArray:
 def _cloud(farthest: FloatArray, alpha: float, first: float, reach_m: float, number: int) -> FloatArray:
     """Part of the backscatter in each part of the period (H, W, number), of fog up to the farthest return.
 
-    `reach_m` is the range of one period. What comes back after `_FOLDS` periods is spread evenly over the period: by
-    then the density, ~ 1 / z^2, changes by 2 / `_FOLDS` within one, and z_0 / (_FOLDS reach_m) of the light is left.
+    `reach_m` is the range of one period. What returns after 256 periods is spread evenly over the period: by then the
+    density, ~ 1 / z^2, changes by 2 / 256 within one, and z_0 / (256 reach_m) of the light is still to come.
     """
-    reached = min(float(farthest.max()), first + 0.5 * _DARK / alpha) / reach_m
-    periods = min(_FOLDS, 1 << math.ceil(math.log2(max(1.0, math.floor(reached) + 1.0))))
+    reached = min(float(farthest.max()), first + 0.5 * TOL.fog_depths / alpha) / reach_m
+    periods = min(TOL.fog_periods, 1 << math.ceil(math.log2(max(1.0, math.floor(reached) + 1.0))))
     edges, before = _folded(alpha, first, reach_m, number, periods)
     until = _share(farthest, alpha, first)[..., None]
     whole = np.minimum(np.floor(farthest / reach_m), periods).astype(np.int64)  # periods passed from end to end

@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mars_lidar._base.memory import check_memory
+from mars_lidar._base.resources import check_memory
 from mars_lidar._base.types import FloatArray
 from mars_lidar.light.flux import Flux, check_photons
-
-BAND_BYTES = 64 * 2**20  # waveforms computed together
+from mars_lidar.light.tolerances import TOL
 
 
 class StoredFlux(Flux):
@@ -124,6 +123,6 @@ class Waveforms:
 
     def bands(self) -> Iterator[slice]:
         """Rows that are made together; together the image."""
-        step = max(1, BAND_BYTES * self.shape[0] // max(self.nbytes, 1))
+        step = max(1, TOL.band_bytes * self.shape[0] // max(self.nbytes, 1))
         for first in range(0, self.shape[0], step):
             yield slice(first, min(first + step, self.shape[0]))

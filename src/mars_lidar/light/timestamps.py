@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.cached import cached_property
-from mars_lidar._base.late import late
-from mars_lidar._base.notebook import as_html
+from mars_lidar._base.display import as_html
+from mars_lidar._base.imports import late
+from mars_lidar._base.native import _core
+from mars_lidar._base.resources import thread_count
 from mars_lidar.instrument.system import System
-from mars_lidar.light.records import record_bins, record_times
 
 
 @dataclass(frozen=True, eq=False)
@@ -280,3 +281,17 @@ class DrawnTimestamps(Timestamps):
         )
         vars(pixel).update({name: vars(self)[name][part] for name in ("times_ns", "bin") if name in vars(self)})
         return pixel
+
+
+def record_times(cycle: NDArray[np.int32], phase: NDArray[np.float32], period_ns: float) -> NDArray[np.float64]:
+    """``(cycle + phase) * period_ns`` (n,); phases that were rounded to 1 lie below it."""
+    out = np.empty(cycle.size)
+    _core.record_times(cycle, phase, period_ns, out, thread_count(None))
+    return out
+
+
+def record_bins(phase: NDArray[np.float32], bins: int) -> NDArray[np.int32]:
+    """Histogram bins (n,) of phases."""
+    out = np.empty(phase.size, np.int32)
+    _core.record_bins(phase, bins, out, thread_count(None))
+    return out

@@ -17,13 +17,14 @@ from numpy.typing import ArrayLike, NDArray
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.cached import cached_property
-from mars_lidar._base.memory import check_memory
 from mars_lidar._base.resample import area_mean, new_size, window
+from mars_lidar._base.resources import check_memory
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.pulse import Pulse
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.light.stored_flux import StoredFlux
+from mars_lidar.light.tolerances import TOL
 
 # --- Parts of rates that stay on disk ------------------------------------------------------------------------------
 
@@ -80,12 +81,6 @@ def resized(values: RateArray, size: tuple[int, int]) -> Rows:
 
 
 # --- The transient -------------------------------------------------------------------------------------------------
-
-_BAND_BYTES = 64 * 2**20
-_WORK_BYTES = 8 * 2**20  # rows folded and convolved together; the work takes about six times as much
-_MAX_PARTS = 2**20
-_MAX_PERIODS = 2**12  # that light may last: each is folded on its own
-_DELAYS = 64  # midpoints inside a part for the pulse's average: error below (part / pulse width)^2 / 1e5
 
 
 class Transient:
@@ -173,7 +168,7 @@ class Transient:
         """Light of each pixel (H, W): the sum over all bins. Reads the whole transient once, band by band."""
         return np.concatenate([self.rows(some).sum(-1) for some in self.bands()])
 
-    def bands(self, band_bytes: int = _BAND_BYTES) -> Iterator[slice]:
+    def bands(self, band_bytes: int = TOL.band_bytes) -> Iterator[slice]:
         """Rows that take at most about `band_bytes` as float64 each, at least one; together the image."""
         height, width, bins = self.values.shape
         step = max(1, band_bytes // (8 * width * bins))
@@ -247,7 +242,7 @@ class Transient:
         if stride != 1 or first >= last:
             raise ValueError(f"rows must select a run of at least one of {self.shape[0]}, got {rows!r}")
         fitting = parts_of(self, system)
-        number = checks.integer("parts", fitting if parts is None else parts, low=1, high=_MAX_PARTS)
+        number = checks.integer("parts", fitting if parts is None else parts, low=1, high=TOL.parts)
         lit = self.totals[self.totals > 0]
         if lit.size == 0:
             raise ValueError(f"{self._named}values must have light in some pixel, got none")
@@ -258,7 +253,7 @@ class Transient:
         size = 8 * (last - first) * self.shape[1] * number
         check_memory(4 * size, "the waveforms of these rows", "take fewer rows at a time")  # Flux keeps a copy
         waveform = np.empty((last - first, self.shape[1], number))
-        step = max(1, _WORK_BYTES // (8 * self.shape[1] * max(number, self.values.shape[2])))
+        step = max(1, TOL.work_bytes // (8 * self.shape[1] * max(number, self.values.shape[2])))
         for begin in range(first, last, step):
             here = slice(begin, min(begin + step, last))
             light = self._on_period(self.rows(here), system.period_ns, number)
@@ -351,11 +346,11 @@ def parts_of(transient: Transient, system: System) -> int:
     """Parts of a waveform as fine as the transient and the histogram; ValueError where its bins are absurd."""
     parts = system.period_ns / transient.bin_ns * (1 - 1e-12)
     periods = (transient.values.shape[2] * transient.bin_ns + abs(transient.start_ns)) / system.period_ns
-    if parts > _MAX_PARTS or periods > _MAX_PERIODS:
+    if parts > TOL.parts or periods > TOL.periods:
         raise ValueError(
             f"{transient.source or 'the transient'}: bin_ns of {transient.bin_ns:g} from {transient.start_ns:g} ns on "
-            f"makes {max(parts, 1.0):.3g} parts of a laser period and {periods:.3g} periods; at most {_MAX_PARTS} and "
-            f"{_MAX_PERIODS} can be: is it in ns?"
+            f"makes {max(parts, 1.0):.3g} parts of a laser period and {periods:.3g} periods; at most {TOL.parts} and "
+            f"{TOL.periods} can be: is it in ns?"
         )
     return max(system.bins, math.ceil(parts))
 
@@ -375,6 +370,6 @@ def _spectrum(pulse: Pulse, period_ns: float, number: int) -> NDArray[np.complex
     """Transform of the pulse's energy in each part, for light that is spread evenly over part 0."""
     part_ns = period_ns / number
     energy = np.zeros(number)
-    for k in range(_DELAYS):
-        energy += pulse.bin_energy((k + 0.5) / _DELAYS * part_ns, period_ns, number)
-    return np.fft.rfft(energy / _DELAYS)
+    for k in range(TOL.delays):
+        energy += pulse.bin_energy((k + 0.5) / TOL.delays * part_ns, period_ns, number)
+    return np.fft.rfft(energy / TOL.delays)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mars_lidar.plot.figures import _draw_map, _limits, _metres
+from mars_lidar.plot.figures import _draw_map, _limits, _metres, pixel_histogram
 from mars_lidar.plot.style import DPI, style
 from mars_lidar.plot.views import depth_error_m
 
@@ -23,6 +23,8 @@ _MAP_INCHES = 2.35
 def reconstruction(cube: Cube, results: Mapping[str, Reconstruction], *, realization: int = 0) -> Figure:
     """Depth, error of depth and reflectivity of each method; errors only where the truth is known.
 
+    Of a single pixel its histogram, beside the true light, or that fitted to a measured one.
+
     Parameters
     ----------
     cube
@@ -33,6 +35,8 @@ def reconstruction(cube: Cube, results: Mapping[str, Reconstruction], *, realiza
         Which one, counted from the start of the cube.
     """
     depth = cube.depth_m
+    if depth.shape == (1, 1):
+        return pixel_histogram(cube, 0, 0, realization=realization)
     known = bool(np.isfinite(depth).any())
     what = "signal" if cube.reflectivity is None else "reflectivity"
     reflectivity = cube.reflectivity

@@ -27,7 +27,7 @@ _READ_BYTES = 64 * 2**20
 def count_maps(
     cube: Cube | ArrayLike, realization: int = 0, *, system: System | None = None
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Total counts, and the depth at the largest bin.
+    """Total counts, and the depth at the fullest bin.
 
     The depth is that of the bin's centre, with the distance between the pulse's peak and its origin taken
     off; modulo the unambiguous range. The first of several equal bins is taken.

@@ -1,4 +1,4 @@
-"""The centre of mass of the counts round the largest bin: depth finer than a bin without a model of the noise.
+"""The centre of mass of the counts round the fullest bin: depth finer than a bin without a model of the noise.
 
 With b the counts that the background leaves in each bin and w the bins of the pulse's core round the peak at t_0::
 
@@ -27,7 +27,7 @@ _BLOCK = 2**22  # counts gathered at a time
 
 @dataclass(frozen=True)
 class Centroid(Peak):
-    """Delay at the centre of mass (1) of the counts round the largest bin, less those of the background."""
+    """Delay at the centre of mass (1) of the counts round the fullest bin, less those of the background."""
 
     name = "centroid"
 

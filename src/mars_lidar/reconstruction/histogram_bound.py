@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.brief import brief
+from mars_lidar._base.display import as_html, brief
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.detector import require_effects
 from mars_lidar.instrument.effects import LIGHT_EFFECTS
@@ -57,6 +57,9 @@ class HistogramBound:
     depth_m: FloatArray
 
     __repr__ = brief
+
+    def _repr_html_(self) -> str:
+        return as_html(self, {"least error of depth (m)": self.depth_m} if self.depth_m.ndim == 2 else {})
 
 
 @checked

@@ -131,7 +131,7 @@ def open_bins(system: System) -> tuple[FloatArray, FloatArray]:
     """The open part [low, high) of each bin, in periods; empty arrays without a gate."""
     if system.detector.mode != "gated":
         return np.empty(0), np.empty(0)
-    from mars_lidar.statistics.gate import open_parts
+    from mars_lidar.statistics.cells import open_parts
 
     bins = system.bins
     edges = np.arange(bins + 1) / bins

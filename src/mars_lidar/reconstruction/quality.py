@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mars_lidar._base.optional import MissingLibraryError, needed
+from mars_lidar._base.imports import MissingLibraryError, needed
 from mars_lidar._base.types import BoolArray, FloatArray
 from mars_lidar.instrument.system import System
 

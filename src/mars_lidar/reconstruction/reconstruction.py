@@ -10,8 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import explained
-from mars_lidar._base.brief import brief
-from mars_lidar._base.notebook import as_html
+from mars_lidar._base.display import as_html, brief
 from mars_lidar._base.types import FloatArray, Progress
 from mars_lidar.instrument.system import System
 from mars_lidar.reconstruction.centroid import Centroid

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar._base.brief import brief
+from mars_lidar._base.display import brief
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from mars_lidar._base import checks
 from mars_lidar._base.progress import callback_of
-from mars_lidar._base.threads import thread_count
+from mars_lidar._base.resources import thread_count
 from mars_lidar._base.types import Progress
 from mars_lidar.reconstruction.histograms import checked
 from mars_lidar.reconstruction.image import Image

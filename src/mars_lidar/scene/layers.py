@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from mars_lidar._base import checks
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
+from mars_lidar.light.tolerances import TOL
 from mars_lidar.scene.radiometry import scene_flux
 from mars_lidar.scene.scene import Scene
-
-MOST = 16  # layers, and returns of a pixel
 
 
 class LayeredScene:
@@ -35,8 +34,8 @@ class LayeredScene:
 
     def __init__(self, layers: Sequence[Scene]) -> None:
         self.layers = tuple(layers)
-        if not 1 <= len(self.layers) <= MOST or not all(isinstance(layer, Scene) for layer in self.layers):
-            raise ValueError(f"layers must be 1 to {MOST} Scenes, got {layers!r}")
+        if not 1 <= len(self.layers) <= TOL.returns or not all(isinstance(layer, Scene) for layer in self.layers):
+            raise ValueError(f"layers must be 1 to {TOL.returns} Scenes, got {layers!r}")
         if len({layer.shape for layer in self.layers}) > 1:
             raise ValueError(f"layers must have one shape, got {[layer.shape for layer in self.layers]}")
         first = self.layers[0]

@@ -25,12 +25,10 @@ from mars_lidar._base.types import FloatArray
 
 Texture = Callable[[FloatArray, FloatArray], FloatArray]
 
-_RAYS = 1 << 14  # cast together: their arrays stay in the second-level cache
 # Four rays round the one through the pixel's centre, on a square turned by atan(1/2): no two share a row or a
 # column, which smooths near-horizontal and near-vertical edges best.
 _EXTRA = ((-0.375, -0.125), (-0.125, 0.375), (0.375, 0.125), (0.125, -0.375))
 _TWO, _FOUR = np.int8(2), np.int8(4)  # numbers of faces and objects take a byte: they are compared again and again
-_CONTRAST = 0.04  # neighbours that differ by more get the extra rays
 
 
 @dataclass(frozen=True)
@@ -141,18 +139,29 @@ class Sphere:
         return np.asarray(cosine * self.texture(np.arctan2(x, -z), np.arcsin(np.clip(y, -1.0, 1.0))))
 
 
-def cast(objects: Sequence[Box | Sphere], camera: Camera, size: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
-    """Depth (range along the ray, m; inf where nothing is hit) and reflectivity in [0, 1], each (H, W)."""
+def cast(
+    objects: Sequence[Box | Sphere],
+    camera: Camera,
+    size: tuple[int, int],
+    *,
+    together: int = 1 << 14,
+    contrast: float = 0.04,
+) -> tuple[FloatArray, FloatArray]:
+    """Depth (range along the ray, m; inf where nothing is hit) and reflectivity in [0, 1], each (H, W).
+
+    Rays are cast `together`, so that their arrays stay in the second-level cache; pixels whose neighbours differ by
+    more than `contrast` get the extra rays.
+    """
     origin = np.array(camera.position)
     row, column = np.mgrid[0 : size[0], 0 : size[1]].astype(np.float64).reshape(2, -1)
     depth, centre = np.empty(row.size), np.empty(row.size)
-    for first in range(0, row.size, _RAYS):
-        part = slice(first, first + _RAYS)
+    for first in range(0, row.size, together):
+        part = slice(first, first + together)
         depth[part], centre[part] = _trace(objects, origin, camera.rays(row[part], column[part], size))
     reflectivity = centre.copy()
-    uneven = np.flatnonzero(_uneven(centre.reshape(size)))
-    for first in range(0, uneven.size, _RAYS // len(_EXTRA)):
-        some = uneven[first : first + _RAYS // len(_EXTRA)]
+    uneven = np.flatnonzero(_uneven(centre.reshape(size), contrast))
+    for first in range(0, uneven.size, together // len(_EXTRA)):
+        some = uneven[first : first + together // len(_EXTRA)]
         down, right = np.array(_EXTRA).T[:, :, None]
         d = camera.rays((row[some] + down).ravel(), (column[some] + right).ravel(), size)
         light = _trace(objects, origin, d)[1].reshape(len(_EXTRA), -1)
@@ -160,11 +169,11 @@ def cast(objects: Sequence[Box | Sphere], camera: Camera, size: tuple[int, int])
     return depth.reshape(size), reflectivity.reshape(size)
 
 
-def _uneven(image: FloatArray) -> NDArray[np.bool_]:
-    """Pixels that differ from one of their four neighbours."""
+def _uneven(image: FloatArray, contrast: float) -> NDArray[np.bool_]:
+    """Pixels that differ from one of their four neighbours by more than `contrast`."""
     uneven = np.zeros(image.shape, dtype=np.bool_)
     for turned, unevenness in ((image, uneven), (image.T, uneven.T)):
-        step = np.abs(turned[1:] - turned[:-1]) > _CONTRAST
+        step = np.abs(turned[1:] - turned[:-1]) > contrast
         unevenness[1:] |= step
         unevenness[:-1] |= step
     return uneven
@@ -203,10 +212,19 @@ def _towards(thing: Box | Sphere, origin: FloatArray, d: FloatArray) -> NDArray[
 
 # --- The scene "room" ----------------------------------------------------------------------------------------------
 
-_TABLE = 128  # texels per side of the noise table, a power of two
-_WIDTH, _HEIGHT, _LENGTH = 5.2, 2.8, 6.9  # the room: x in +-_WIDTH / 2, y from 0, z from 0
-_DOOR = (0.5, 1.5, 2.1)  # the passage behind the back wall: x from, x to, height
-_PASSAGE = 1.55  # its length
+
+@dataclass(frozen=True)
+class _Room:
+    """The room, m: x in +-width / 2, y and z from 0; a door from x to x, and its height, to the passage behind."""
+
+    width: float = 5.2
+    height: float = 2.8
+    length: float = 6.9
+    door: tuple[float, float, float] = (0.5, 1.5, 2.1)
+    passage: float = 1.55
+
+
+_ROOM = _Room()
 
 
 def room(size: tuple[int, int], seed: int) -> tuple[FloatArray, FloatArray]:
@@ -220,19 +238,19 @@ def room(size: tuple[int, int], seed: int) -> tuple[FloatArray, FloatArray]:
 
 def _walls(paint: _Paint) -> list[Box]:
     """The room, its back wall made of three boxes round a door, and the passage behind."""
-    x0, x1, top = _DOOR
-    half = 0.5 * _WIDTH
+    x0, x1, top = _ROOM.door
+    half = 0.5 * _ROOM.width
     wall, side, end = paint.plaster(0.62, 0.07), paint.plaster(0.55, 0.06), paint.plaster(0.42, 0.1)
     floor, ceiling = paint.floor(), paint.plaster(0.78, 0.03)
     back = paint.painting(wall, centre=(-0.78, 1.72), half=(0.72, 0.5))
-    far = 0.5 * (_LENGTH + _PASSAGE)
+    far = 0.5 * (_ROOM.length + _ROOM.passage)
     faces = (side, side, floor, ceiling, wall, end)
-    shell = Box((0.0, 0.5 * _HEIGHT, far), (half, 0.5 * _HEIGHT, far), faces, inside=True)
+    shell = Box((0.0, 0.5 * _ROOM.height, far), (half, 0.5 * _ROOM.height, far), faces, inside=True)
 
     def block(x0: float, x1: float, low: float) -> Box:
-        x, y = 0.5 * (x0 + x1), 0.5 * (low + _HEIGHT)
-        size = (x1 - x, _HEIGHT - y, 0.5 * _PASSAGE)
-        return Box((x, y, _LENGTH + size[2]), size, (side, side, side, side, _moved(back, x, y), wall))
+        x, y = 0.5 * (x0 + x1), 0.5 * (low + _ROOM.height)
+        size = (x1 - x, _ROOM.height - y, 0.5 * _ROOM.passage)
+        return Box((x, y, _ROOM.length + size[2]), size, (side, side, side, side, _moved(back, x, y), wall))
 
     return [shell, block(-half, x0, 0.0), block(x0, x1, top), block(x1, half, 0.0)]
 
@@ -280,19 +298,22 @@ def _furniture(paint: _Paint, rng: np.random.Generator) -> list[Box | Sphere]:
     # A lamp on a thin cord brings something near into the upper half.
     lx, lz, low = near(0.15, 0.25), near(4.6, 0.3), near(2.1, 0.06)
     lamp = Sphere((lx, low, lz), 0.2, paint.lamp())
-    cord = Box((lx, 0.5 * (low + _HEIGHT), lz), (0.012, 0.5 * (_HEIGHT - low), 0.012), (dark,) * 6)
+    cord = Box((lx, 0.5 * (low + _ROOM.height), lz), (0.012, 0.5 * (_ROOM.height - low), 0.012), (dark,) * 6)
     return [crate, parcel, ball, *table, board, post, shelf, lamp, cord]
 
 
 class _Paint:
-    """Textures that share one table of smooth noise."""
+    """Textures that share one table of smooth noise, of `texels` (a power of two) per side."""
+
+    texels = 128
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng = rng
         # Periodic 1/f noise, zero mean and unit variance: one table serves every surface at its own offset.
-        f = np.hypot(np.fft.fftfreq(_TABLE)[:, None], np.fft.rfftfreq(_TABLE)[None, :])
+        n = self.texels
+        f = np.hypot(np.fft.fftfreq(n)[:, None], np.fft.rfftfreq(n)[None, :])
         f[0, 0] = np.inf
-        noise = np.fft.irfft2(np.fft.rfft2(rng.standard_normal((_TABLE, _TABLE))) / f**1.2, (_TABLE, _TABLE))
+        noise = np.fft.irfft2(np.fft.rfft2(rng.standard_normal((n, n))) / f**1.2, (n, n))
         noise = (noise - noise.mean()) / noise.std()
         self._table = np.pad(noise, (0, 1), mode="wrap").ravel()
         self._tones = rng.uniform(-1.0, 1.0, 1024)
@@ -301,8 +322,8 @@ class _Paint:
         """Noise at coordinates in texels, bilinear, periodic."""
         i, j = np.floor(u), np.floor(v)
         a, b = u - i, v - j
-        row, width = i.astype(np.intp) & (_TABLE - 1), _TABLE + 1
-        at = row * width + (j.astype(np.intp) & (_TABLE - 1))
+        row, width = i.astype(np.intp) & (self.texels - 1), self.texels + 1
+        at = row * width + (j.astype(np.intp) & (self.texels - 1))
         t = self._table
         low, high = t[at], t[at + width]
         low += b * (t[at + 1] - low)
@@ -317,7 +338,7 @@ class _Paint:
         return tone
 
     def _offset(self) -> tuple[float, float]:
-        a, b = self._rng.uniform(0.0, _TABLE, 2)
+        a, b = self._rng.uniform(0.0, self.texels, 2)
         return float(a), float(b)
 
     def plaster(self, albedo: float, contrast: float) -> Texture:

@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked, checked_with_masks, constructed_by_name
+from mars_lidar._base.display import as_html
 from mars_lidar._base.files import reading
-from mars_lidar._base.late import late
-from mars_lidar._base.notebook import as_html
+from mars_lidar._base.imports import late
 from mars_lidar._base.resample import area_mean, image_size, nearest, new_size, window
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
@@ -21,7 +21,6 @@ from mars_lidar.light.flux import Flux
 from mars_lidar.scene.radiometry import scene_flux
 
 _EXAMPLES = ("room", "random")
-_MAX_DEPTH_M = 1e9  # beyond the Moon; keeps delays far inside what a double resolves to a picosecond
 
 
 @constructed_by_name
@@ -82,9 +81,9 @@ class Scene:
         depth = _numbers("depth_m", depth_m)
         if depth.ndim != 2 or depth.size == 0:
             raise ValueError(f"depth_m must be (H, W) with at least one pixel, got shape {depth.shape}")
-        with np.errstate(invalid="ignore"):
-            wrong = ~np.isnan(depth) & ~((depth > 0.0) & (depth <= _MAX_DEPTH_M))
-        _refuse("depth_m", depth, wrong, f"in (0, {_MAX_DEPTH_M:g}] m, or NaN for no return")
+        with np.errstate(invalid="ignore"):  # beyond the Moon a double no longer resolves delays to a picosecond
+            wrong = ~np.isnan(depth) & ~((depth > 0.0) & (depth <= 1e9))
+        _refuse("depth_m", depth, wrong, "in (0, 1e+09] m, or NaN for no return")
         share = _like("reflectivity", reflectivity, depth.shape)
         _refuse("reflectivity", share, ~((share >= 0.0) & (share <= 1.0)), "in [0, 1]")
         ambient = None

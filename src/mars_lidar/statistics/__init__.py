@@ -1,6 +1,5 @@
 """Analytic count laws and histogram shapes of one pixel: no scene, no sampling."""
 
-from mars_lidar.statistics.baselines import poisson_moments, poisson_pmf, renewal_moments, renewal_pmf
 from mars_lidar.statistics.cells import photons_per_bin
 from mars_lidar.statistics.chain import PhaseChain, Stationary
 from mars_lidar.statistics.constant_light import constant_light_rate
@@ -43,9 +42,5 @@ __all__ = [
     "moment_matrices",
     "paralyzable_moments",
     "photons_per_bin",
-    "poisson_moments",
-    "poisson_pmf",
     "registration_pdf",
-    "renewal_moments",
-    "renewal_pmf",
 ]

@@ -26,74 +26,67 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.memory import check_memory
 from mars_lidar._base.native import _core
+from mars_lidar._base.resources import check_memory
 from mars_lidar._base.types import FloatArray, IndexArray
-from mars_lidar.instrument.detector import Mode
+from mars_lidar.instrument.detector import Mode, require_effects
 from mars_lidar.instrument.effects import LIGHT_EFFECTS
 from mars_lidar.instrument.pulse import SampledPulse
 from mars_lidar.instrument.system import System
-from mars_lidar.light.flux import Flux
+from mars_lidar.light.flux import Flux, check_photons
 from mars_lidar.light.stored_flux import StoredFlux
 from mars_lidar.statistics.budget import MOMENTS, advice
-from mars_lidar.statistics.gate import PLAIN, open_parts, require_mode
+from mars_lidar.statistics.tolerances import TOL
 
-# --- Arguments -----------------------------------------------------------------------------------------------------
+# --- Detectors that a statistic treats -----------------------------------------------------------------------------
+# A gate that repeats every period makes a gated pixel a free-running one that detects the flux inside of the gate, so
+# that the exposure recursion holds for it with that flux: docs/theory_detectors.md.
 
-MAX_PHOTONS = 1e6  # photons per period, the most that are accepted: 1e13 photons/s at 10 MHz
-
-
-def reals(name: str, value: ArrayLike) -> FloatArray:
-    """Real numbers as doubles; refuses an empty array."""
-    array = np.asarray(value)
-    if array.dtype.kind not in "fiu":
-        raise TypeError(f"{name} must be real numbers, got dtype {array.dtype}")
-    if array.size == 0:
-        raise ValueError(f"{name} must not be empty, got shape {array.shape}")
-    return array.astype(np.float64)
+PLAIN: tuple[Mode, ...] = ("nonparalyzable",)
+_INSTEAD = {
+    "nonparalyzable": "",
+    "paralyzable": "; count_law, exposure_moments, mean_histogram and registration_pdf have its exact statistics",
+    "synchronous": "; count_law, mean_histogram and registration_pdf have its exact statistics",
+    "gated": "; count_law, exposure_moments, mean_histogram and registration_pdf have its exact statistics",
+}
 
 
-def photons(name: str, value: ArrayLike) -> FloatArray:
-    """Photons per period as doubles, checked to lie in [0, MAX_PHOTONS]."""
-    array = reals(name, value)
-    bad = ~((array >= 0) & (array <= MAX_PHOTONS))
-    if bad.any():
-        raise ValueError(f"{name} must lie in [0, {MAX_PHOTONS:g}] photons per period, got {array[bad].flat[0]}")
-    return array
+def require_mode(
+    what: str, system: System, modes: tuple[Mode, ...] = PLAIN, effects: tuple[str, ...] = LIGHT_EFFECTS
+) -> None:
+    """Raise ValueError, with an alternative, where `what` does not treat the mode or an effect of the detector."""
+    require_effects(what, system.detector, effects, _simulated)
+    mode = system.detector.mode
+    if mode not in modes:
+        allowed = " and ".join(map(repr, modes))
+        raise ValueError(
+            f"{what} is for detectors of mode {allowed}, got {mode!r}{_INSTEAD[mode]}; any mode can be simulated"
+        )
+    if system.detector.gate_moves:
+        raise ValueError(
+            f"{what} needs a gate that repeats every period, got gate_step_ns={system.detector.gate_step_ns:g}; "
+            "a moving gate can be simulated"
+        )
 
 
-def broadcast(names: tuple[str, ...], *arrays: NDArray[Any]) -> list[NDArray[Any]]:
-    """Arrays broadcast to one shape; an error states `names` and shapes."""
-    try:
-        return list(np.broadcast_arrays(*arrays))
-    except ValueError:
-        shapes = ", ".join(f"{n} {a.shape}" for n, a in zip(names, arrays, strict=False))
-        raise ValueError(f"shapes must broadcast, got {shapes}") from None
+def _simulated(effect: str) -> str:
+    able = "'sequential'" if effect == "crosstalk" else "'exact' or 'sequential'"
+    return f"; simulate it with engine {able}"
 
 
-def with_delays(
-    signal: FloatArray, background: FloatArray, delay_ns: ArrayLike | None, period_ns: float
-) -> list[NDArray[Any]]:
-    """Signal, background and delay (ns) of one shape; the delay defaults to half the period, NaN: no return."""
-    given = reals("delay_ns", 0.5 * period_ns if delay_ns is None else delay_ns)
-    signal, background, delay = broadcast(("signal", "background", "delay_ns"), signal, background, given)
-    bad = ~np.isfinite(delay) & ~(np.isnan(delay) & (signal == 0))
-    if bad.any():
-        raise ValueError(f"delay_ns must be finite (NaN for no return where signal is 0), got {delay[bad].flat[0]}")
-    return [signal, background, delay]
+def open_parts(system: System) -> tuple[tuple[float, float], ...]:
+    """Parts [low, high) of the period [0, 1), in order, in which a fixed gate is open."""
+    start, _, width = system.detector.gate_periods(system.period_ns)
+    end = start + width
+    return ((start, end),) if end <= 1.0 else ((0.0, end - 1.0), (start, 1.0))
+
+
+# --- Light on a grid ----------------------------------------------------------------------------------------------
 
 
 def flat(array: NDArray[Any]) -> FloatArray:
     """(cells,) doubles, contiguous."""
     return np.ascontiguousarray(array.reshape(-1), dtype=np.float64)
-
-
-# --- Grid of the phase chain ---------------------------------------------------------------------------------------
-
-_MAX_BINS = 2**20  # bins per period of a statistics grid: 8 MiB an array
-_MAX_COMMON = 2**14  # bins of a grid that holds both the samples of a waveform and the bins of the histogram
-_CHAIN_MIN_BINS = 512  # with fewer the discretisation of the chain is visible in the count variance
-_CHAIN_BINS_PER_WIDTH = 7.5  # bins in 1 / max s, which is 2.507 sigma for a Gaussian: a bin is sigma / 3
 
 
 @checked
@@ -139,7 +132,7 @@ def photons_per_bin(flux: Flux, system: System, *, bins: int | None = None) -> F
     """
     flux = flux.detected(system)
     if bins is not None:
-        bins = checks.integer("bins", bins, low=1, high=_MAX_BINS)
+        bins = checks.integer("bins", bins, low=1, high=TOL.most_bins)
     if flux.waveform is not None:
         size = flux.waveform.shape[-1]
         n = bins or _bins_for_waveform(size, system.bins)
@@ -164,23 +157,27 @@ def one_pixel(flux: Flux) -> Flux:
 
 def default_bins(system: System) -> int:
     """Bins of the statistics grid when none are asked for: a multiple of `System.bins`, pulse resolved."""
+    wanted = max(TOL.unrefined_bins, TOL.chain_bins_per_width * _peak(system))
+    return min(system.bins * math.ceil(wanted / system.bins), max(system.bins, TOL.most_bins))
+
+
+def _peak(system: System) -> float:
+    """Largest density of the pulse, per period."""
     probe = 2**15
-    peak = float(system.pulse.bin_energy(0.5 * system.period_ns, system.period_ns, probe).max())
-    wanted = max(_CHAIN_MIN_BINS, _CHAIN_BINS_PER_WIDTH * peak * probe)
-    return min(system.bins * math.ceil(wanted / system.bins), max(system.bins, _MAX_BINS))
+    return float(system.pulse.bin_energy(0.5 * system.period_ns, system.period_ns, probe).max()) * probe
 
 
 def _bins_for_waveform(samples: int, bins: int) -> int:
     """A multiple of the histogram's bins, and of the samples where that is not too many."""
     common = math.lcm(samples, bins)
-    step = common if common <= _MAX_COMMON else bins
-    return step * math.ceil(max(_CHAIN_MIN_BINS, samples) / step)
+    step = common if common <= TOL.most_first_bins else bins
+    return step * math.ceil(max(TOL.unrefined_bins, samples) / step)
 
 
 def whole_bins(dead: float, bins: int) -> tuple[int, int, float]:
-    """A dead time in periods as whole periods, whole bins of the rest, and the fraction of a bin that is left."""
+    """A dead time in periods as whole periods, whole bins of the rest, and the remaining fraction of a bin."""
     whole = math.floor(dead)
-    position = (dead - whole) * bins  # whole periods apart first: else they cost digits of the fraction
+    position = (dead - whole) * bins  # whole periods are split off first, or they would cost digits of the fraction
     shift = math.floor(position)
     fraction = position - shift
     if fraction < 1e-9:
@@ -198,24 +195,11 @@ def cell_name(flux: Flux, system: System) -> str:
 
 def waveform_parts(system: System) -> int:
     """Parts of a waveform of several returns: at least 8192, 50 in a standard deviation of the pulse."""
-    probe = 2**15
-    peak = float(system.pulse.bin_energy(0.5 * system.period_ns, system.period_ns, probe).max()) * probe
-    wanted = max(2**13, min(2**18, 20.0 * peak))
+    wanted = max(2**13, min(2**18, 20.0 * _peak(system)))
     return system.bins * max(1, math.ceil(wanted / system.bins))
 
 
 # --- Pulses narrower than a cell -----------------------------------------------------------------------------------
-
-_PROBE = 2**12  # samples of the pulse's support from which its width is computed
-_DETECTED = 8.0  # a pulse of sigma >= 1/8 bin is detected by the refinement of the grid, which then resolves it
-_RESOLVED = 0.5  # a pulse of sigma >= 2 bins is resolved: finer bins change nothing
-_MOST_BINS = 2**15  # equal bins per period; more take seconds a cell
-_ROUNDING = 1e-12  # relative deviation from a whole number of periods that is rounding
-_BLOCKS = 4  # fewest blocks of the period, so that none holds the beginning and, wrapped, the end of one pulse
-_LEAST_CELLS = 8  # fewest bins of a block on a grid that follows the pulse, half of them on the pulse
-_PULSE_CELLS = 512  # bins per period of the first grid that follows the pulse
-_KNOTS = 8.0  # grid points per standard deviation of the pulse
-_LONGEST = 64.0  # support of a pulse, in its standard deviations, up to which a grid that follows it resolves it
 
 
 def needed_bins(cells: Cells, coarsest: int) -> int:
@@ -224,7 +208,7 @@ def needed_bins(cells: Cells, coarsest: int) -> int:
     The bin is one standard deviation of the pulse, or a third of the time between the end of a pulse and the
     re-arming of the pixels that it blinded.
     """
-    return _bins_of_pulse(cells) if _meets_itself(cells, coarsest, _DETECTED) else 0
+    return _bins_of_pulse(cells) if _meets_itself(cells, coarsest, TOL.detected_bins) else 0
 
 
 def followed_bins(cells: Cells, coarsest: int, out_bins: int) -> int:
@@ -233,26 +217,26 @@ def followed_bins(cells: Cells, coarsest: int, out_bins: int) -> int:
     Bins may be uneven only where the dead time is a whole number of periods: a pixel then re-arms in the bin of its
     registration. They are used where `coarsest` equal bins do not resolve the pulse.
     """
-    if not _is_whole(cells) or not _meets_itself(cells, coarsest, _RESOLVED):
+    if not _is_whole(cells) or not _meets_itself(cells, coarsest, TOL.resolved_bins):
         return 0
     sigma, length = _extent(cells)
     blocks = _blocks(out_bins)
-    bins = blocks * max(_LEAST_CELLS, 4 * math.ceil(_PULSE_CELLS / (4 * blocks)))
-    return bins if length <= _LONGEST * sigma and bins < _bins_of_pulse(cells) else 0
+    bins = blocks * max(TOL.block_bins, 4 * math.ceil(TOL.unrefined_bins / (4 * blocks)))
+    return bins if length <= TOL.longest_pulse * sigma and bins < _bins_of_pulse(cells) else 0
 
 
 def meets_itself(cells: Cells) -> bool:
     """Whether pixels re-arm within the next pulse and resolving it takes more than 2^15 equal bins."""
-    return not _is_whole(cells) and _meets_itself(cells, _MOST_BINS, _RESOLVED)
+    return not _is_whole(cells) and _meets_itself(cells, TOL.most_even_bins, TOL.resolved_bins)
 
 
 def _meets_itself(cells: Cells, coarsest: int, resolved: float) -> bool:
-    """Whether sigma is below 1 / (`resolved` `coarsest`) periods and pixels re-arm within the pulse."""
+    """Whether sigma is below `resolved` of `coarsest` equal bins and pixels re-arm within the pulse."""
     dead = cells.system.dead_time_periods
     if cells.waveform is not None or dead == 0.0 or not (cells.signal > 0.0).any():
         return False
     sigma, length = _extent(cells)
-    return sigma * coarsest * resolved < 1.0 and _apart(cells) < length + 3.0 / coarsest
+    return sigma * coarsest < resolved and _apart(cells) < length + 3.0 / coarsest
 
 
 def _bins_of_pulse(cells: Cells) -> int:
@@ -307,7 +291,7 @@ def knots(cells: Cells, bins: int, halved: float) -> FloatArray:
     if isinstance(pulse, SampledPulse):
         at = np.linspace(low, high, round((high - low) * period / pulse.bin_ns) + 1)
     elif _extent(cells)[0] * bins < 1.0:
-        at = np.linspace(low, high, math.ceil(_KNOTS * halved * (high - low) / _extent(cells)[0]))
+        at = np.linspace(low, high, math.ceil(TOL.knots_per_sigma * halved * (high - low) / _extent(cells)[0]))
     else:
         at = np.empty(0)
     at = cells.delay[0] + at
@@ -315,32 +299,23 @@ def knots(cells: Cells, bins: int, halved: float) -> FloatArray:
 
 
 def _blocks(out_bins: int) -> int:
-    return out_bins * math.ceil(_BLOCKS / out_bins)
+    return out_bins * math.ceil(TOL.pulse_blocks / out_bins)
 
 
 def _is_whole(cells: Cells) -> bool:
     """Whether the dead time is a whole number of periods."""
-    return _apart(cells) <= _ROUNDING * max(1.0, cells.system.dead_time_periods)
+    return _apart(cells) <= TOL.rounding * max(1.0, cells.system.dead_time_periods)
 
 
 def _extent(cells: Cells) -> tuple[float, float]:
     """Standard deviation of a Gaussian as narrow as the pulse, and the pulse's length, in periods."""
     low, high = cells.system.pulse.support_ns()
-    energy = np.diff(cells.system.pulse.cumulative(np.linspace(low, high, _PROBE + 1)))
+    energy = np.diff(cells.system.pulse.cumulative(np.linspace(low, high, TOL.pulse_samples + 1)))
     length = (high - low) / cells.system.period_ns
-    return length / (_PROBE * float(np.sum(energy**2)) * 2.0 * math.sqrt(math.pi)), length
+    return length / (TOL.pulse_samples * float(np.sum(energy**2)) * 2.0 * math.sqrt(math.pi)), length
 
 
 # --- Pixels on the grid --------------------------------------------------------------------------------------------
-
-_MIN_BINS = 128  # bins of the coarsest first grid
-_MAX_FIRST_BINS = 2**14  # bins of the finest first grid; refinement goes beyond where the tolerance demands it
-_BINS_PER_WIDTH = 4.0 * math.sqrt(math.pi)  # bins in 1 / integral of s^2, 2 sqrt(pi) sigma: a bin is sigma / 2
-# Sweeps towards the stationary state: at most 400, or 10^7 bins x sweeps, at least 4; beyond, `warm_history` solves it
-_WARM_PERIODS, _WARM_STEPS, _LEAST_WARM = 400, 10_000_000, 4
-_CHUNK_BYTES = 64 << 20  # memory of the energies and histograms computed together
-_NEAR_BYTES, _MIDDLE_BYTES = 1 << 19, 1 << 25  # history: 15 to 60 ns a step; up to 100 ns; beyond, 100 to 350 ns
-_SETTLED = 1e-12  # relative change of the state per period at which it counts as repeating (20)
 
 
 @dataclass(frozen=True, eq=False)
@@ -391,41 +366,27 @@ class Cells:
         modes: tuple[Mode, ...] = PLAIN,
         effects: tuple[str, ...] = LIGHT_EFFECTS,
     ) -> Cells:
-        """Cells from checked and broadcast arguments; `waveform` (..., T) broadcasts over its leading axes.
+        """Cells of numbers that `Flux` has checked; they broadcast, a `waveform` (..., T) over its leading axes.
 
         The cells hold the flux of detected photons and the system that detects all of it (`System.detected`). `what`
         names the statistic in errors; ValueError where it does not treat the detector's mode or effects.
         """
-        if not isinstance(system, System):
-            raise TypeError(f"system must be a System, got {type(system).__name__}")
         require_mode(what, system, modes, effects)
         share, dark = system.detector.detection_efficiency, system.detector.dark_count_hz * system.period_ns * 1e-9
-        back = photons("background", background)
+        back = np.asarray(background, dtype=np.float64)
         if share != 1.0 or dark > 0.0:
-            system, back = system.detected(), photons("background with dark counts", back * share + dark)
+            system, back = system.detected(), back * share + dark
+            check_photons("background with dark counts", back)
         if waveform is not None:
-            if signal is not None or delay_ns is not None:
-                raise ValueError("waveform replaces signal and delay_ns: give it alone, or with background")
-            wave = photons("waveform", waveform) * share
-            if wave.ndim == 0 or wave.shape[-1] == 0:
-                raise ValueError(f"waveform must be (..., T) with T >= 1, got shape {wave.shape}")
-            total = photons("waveform summed over a period", wave.sum(-1))
-            rows = np.arange(total.size).reshape(total.shape)
-            total, back, rows = broadcast(("waveform", "background", "waveform"), total, back, rows)
+            wave = np.asarray(waveform, dtype=np.float64) * share
+            total = wave.sum(-1)
+            total, back, rows = np.broadcast_arrays(total, back, np.arange(total.size).reshape(total.shape))
             unit = wave.reshape(-1, wave.shape[-1])
             unit = unit / np.maximum(unit.sum(-1, keepdims=True), np.finfo(float).tiny)
-            return cls(
-                system,
-                total.shape,
-                flat(total),
-                flat(back),
-                np.zeros(total.size),
-                unit,
-                np.ascontiguousarray(rows.reshape(-1), dtype=np.int64),
-            )
-        if signal is None:
-            raise ValueError("signal must be given (photons per period), or a waveform instead of it")
-        total, back, delay = with_delays(photons("signal", signal) * share, back, delay_ns, system.period_ns)
+            row = np.ascontiguousarray(rows.reshape(-1), dtype=np.int64)
+            return cls(system, total.shape, flat(total), flat(back), np.zeros(total.size), unit, row)
+        delay = 0.5 * system.period_ns if delay_ns is None else np.asarray(delay_ns, dtype=np.float64)
+        total, back, delay = np.broadcast_arrays(np.asarray(signal, dtype=np.float64) * share, back, delay)
         phase = np.nan_to_num(flat(delay) / system.period_ns)
         phase -= np.floor(phase)
         return cls(system, total.shape, flat(total), flat(back), phase, None, np.zeros(total.size, np.int64))
@@ -487,22 +448,14 @@ class Cells:
 
     def part(self, index: IndexArray | slice) -> Cells:
         """The selected cells, flat."""
-        signal = self.signal[index]
-        return Cells(
-            self.system,
-            signal.shape,
-            signal,
-            self.background[index],
-            self.delay[index],
-            self.waveform,
-            self.row[index],
-            self.follow,
-        )
+        signal, row = self.signal[index], self.row[index]
+        light = signal, self.background[index], self.delay[index]
+        return Cells(self.system, signal.shape, *light, self.waveform, row, self.follow)
 
     def resolved(self, out_bins: int) -> Cells:
         """These cells, with bins that follow the pulse where resolving it takes too many equal bins."""
         even = replace(self, follow=0)
-        follow = out_bins if followed_bins(even, max(_MAX_FIRST_BINS, out_bins), out_bins) else 0
+        follow = out_bins if followed_bins(even, max(TOL.most_first_bins, out_bins), out_bins) else 0
         return self if follow == self.follow else replace(self, follow=follow)
 
     def name(self, index: int) -> str:
@@ -537,12 +490,16 @@ class Cells:
 
     @property
     def finest(self) -> float:
-        """Standard deviation, in periods, of a Gaussian as narrow as the signal."""
-        return float(1.0 / (2.0 * math.sqrt(math.pi) * max(self._sharpness, 1.0)))
+        """Standard deviation, in periods, of a Gaussian as narrow as the signal; of registrations, where it is bright.
+
+        These fall as fast as the signal's first photon comes: of n photons, in an n-th of its width.
+        """
+        photons = max(float(np.max(self.total, initial=0.0)), 1.0)
+        return 1.0 / (2.0 * math.sqrt(math.pi) * max(self._sharpness, 1.0) * photons)
 
     def first_bins(self, out_bins: int) -> int:
         """Bins of the first grid: `usual_bins`, or more where a narrower pulse must be resolved."""
-        most = max(_MAX_FIRST_BINS, out_bins)
+        most = max(TOL.most_first_bins, out_bins)
         if self.follow:
             return followed_bins(self, most, out_bins)
         return _multiple(max(self.usual_bins(out_bins), needed_bins(self, most)), out_bins)
@@ -551,8 +508,9 @@ class Cells:
         """Even multiple of `out_bins` whose bins are at most sigma / 2 of pulse or gate wide, at most some 2^14."""
         sharpness = self._sharpness
         gate_width = self.system.detector.gate_periods(self.system.period_ns)[2]
-        sharpness = max(sharpness, 1.0 / max(gate_width, 1.0 / _MAX_FIRST_BINS))
-        wanted = min(max(_MIN_BINS, _BINS_PER_WIDTH * sharpness), _MAX_FIRST_BINS)
+        sharpness = max(sharpness, 1.0 / max(gate_width, 1.0 / TOL.most_first_bins))
+        # 1 / sharpness is 2 sqrt(pi) sigma of a Gaussian: a bin is sigma / 2
+        wanted = min(max(TOL.first_bins, 4.0 * math.sqrt(math.pi) * sharpness), TOL.most_first_bins)
         return _multiple(wanted, out_bins)
 
     def edges(self, bins: int) -> FloatArray:
@@ -573,8 +531,8 @@ class Cells:
             shift=shift,
             fraction=fraction,
             stationary=self.system.start == "stationary",
-            tolerance=_SETTLED,
-            warm_periods=min(_WARM_PERIODS, max(_LEAST_WARM, _WARM_STEPS // bins)),
+            tolerance=TOL.repeats,
+            warm_periods=min(TOL.warm_periods, max(TOL.least_warm_periods, TOL.warm_steps // bins)),
         )
 
     def chunks(self, bins: int, out_bins: int) -> Iterator[slice]:
@@ -585,14 +543,14 @@ class Cells:
             per_cell, least = 8 * (40 * bins + 2 * out_bins), 1
         elif self.waveform is None and np.unique(self.delay).size == 1 and not self._all_in_shapes:
             per_cell = 16 * out_bins + 128
-        step = max(least, _CHUNK_BYTES // per_cell)
+        step = max(least, TOL.chunk_bytes // per_cell)
         for start in range(0, self.size, step):
             yield slice(start, min(start + step, self.size))
 
     def step_cost(self, bins: int) -> float:
         """Cost of one bin and period relative to a history of one dead time that fits in the cache (1, 2 or 6)."""
         remembered = self.grid(bins, 1).bytes
-        return 1.0 if remembered <= _NEAR_BYTES else 2.0 if remembered <= _MIDDLE_BYTES else 6.0
+        return 1.0 if remembered <= TOL.near_bytes else 2.0 if remembered <= TOL.middle_bytes else 6.0
 
     def check_history(self, bins: int) -> None:
         """Raise MemoryError where the registrations of one dead time do not fit in memory."""
@@ -677,17 +635,12 @@ def _photons_before(cells: Cells, edges: FloatArray) -> FloatArray:
 
 # --- Histograms of very many bins ----------------------------------------------------------------------------------
 
-MANY_BINS = 2**17  # bins of a histogram beyond which a coarser grid and interpolation are faster
-_FINE_CELLS = (2**15, 2**17)  # bins of the coarser grids, tried in turn
-_LEAST_KNOTS = 4  # knots of a cubic spline
-_DARK = 1e-12  # share of all photons below which a bin adds no knot: division by it amplifies rounding
-
 
 def fine_histograms(
     cells: Cells, bins: int, tolerance: float, compute: Callable[[Cells, int], FloatArray]
 ) -> FloatArray:
     """Histograms (cells, bins) of ``compute(cells, bins)``, interpolated from fewer bins within `tolerance`."""
-    if bins <= MANY_BINS:
+    if bins <= TOL.many_bins:
         return compute(cells, bins)
     return np.concatenate([_fine(cells.part(slice(k, k + 1)), bins, tolerance, compute) for k in range(cells.size)])
 
@@ -695,7 +648,7 @@ def fine_histograms(
 def _fine(cell: Cells, bins: int, tolerance: float, compute: Callable[[Cells, int], FloatArray]) -> FloatArray:
     edges = np.arange(bins + 1) / bins
     light = light_before(cell, edges)
-    for few in _FINE_CELLS:
+    for few in TOL.cells_of_many:
         before = light_before(cell, np.arange(few + 1) / few)
         if before[-1] == 0.0 or misplaced(before, edges, light) > 2.0 * tolerance:
             continue
@@ -737,13 +690,13 @@ def registered_before(before: FloatArray, counts: FloatArray, light: FloatArray)
     """
     from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
-    lit = np.diff(before) > _DARK * before[-1]
+    lit = np.diff(before) > TOL.rounding * before[-1]
     at = np.concatenate([[True], lit])
     at[-1] |= not lit.any()
     total = np.concatenate([[0.0], np.cumsum(counts)])
     photons, so_far = before[at], total[at]
     photons[-1], so_far[-1] = before[-1], total[-1]
-    if photons.size < _LEAST_KNOTS:
+    if photons.size < 4:  # too few knots for a cubic
         return np.asarray(np.interp(light, photons, so_far))
     armed = np.maximum(np.diff(so_far) / np.diff(photons), 0.0)
     most = 3.0 * np.minimum(np.append(armed[0], armed), np.append(armed, armed[-1]))

@@ -17,18 +17,18 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
-from mars_lidar._base.brief import brief
+from mars_lidar._base.display import brief
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
+from mars_lidar.instrument.tolerances import TOL
 from mars_lidar.light.flux import Flux
-from mars_lidar.statistics.cells import MAX_PHOTONS, cell_name, one_pixel, photons_per_bin
-from mars_lidar.statistics.gate import require_mode
+from mars_lidar.light.tolerances import TOL as LIGHT
+from mars_lidar.statistics.cells import cell_name, one_pixel, photons_per_bin, require_mode
 from mars_lidar.statistics.phase_chain import ConvergenceError, Feedback, Solution, cyclic_recursion
 
 Rearm = Literal["centre", "edge"]
 
 _REARMS = get_args(Rearm)
-_LONGEST = 2.0**31  # dead time, periods: beyond, its fraction of a bin has no digits, and nothing registers twice
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,14 +152,14 @@ class PhaseChain:
         photons = np.array(self.photons, dtype=np.float64)
         if photons.ndim != 1 or photons.size == 0:
             raise ValueError(f"photons must be (n,) with n >= 1, got shape {photons.shape}")
-        bad = ~((photons >= 0) & (photons <= MAX_PHOTONS))
+        bad = ~((photons >= 0) & (photons <= LIGHT.photons))
         if bad.any():
             k = int(np.argmax(bad))
-            raise ValueError(f"photons must lie in [0, {MAX_PHOTONS:g}] per bin, got photons[{k}] = {photons[k]}")
+            raise ValueError(f"photons must lie in [0, {LIGHT.photons:g}] per bin, got photons[{k}] = {photons[k]}")
         total = float(photons.sum())
         if not total > 0:
             raise ValueError("photons must not all be 0: without flux there is no registration and no chain")
-        dead = checks.real("dead_time", self.dead_time, low=0.0, high=_LONGEST)
+        dead = checks.real("dead_time", self.dead_time, low=0.0, high=TOL.dead_periods)
         checks.choice("rearm", self.rearm, _REARMS)
         photons.flags.writeable = False
         n = photons.size

@@ -16,14 +16,15 @@ from numpy.typing import NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
+from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.detector import Detector, require_effects
-from mars_lidar.instrument.effects import LIGHT_EFFECTS, MAX_RATE_HZ, TIMING_EFFECTS
+from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
+from mars_lidar.instrument.system import System
+from mars_lidar.instrument.tolerances import TOL as INSTRUMENT
+from mars_lidar.statistics.phase_chain import ConvergenceError
+from mars_lidar.statistics.tolerances import TOL
 
 _EFFECTS = (*LIGHT_EFFECTS, "afterpulsing", "twilight_ns", "recovery_ns", *TIMING_EFFECTS)
-_TOLERANCE = 1e-12  # relative change of the mean interval between iterations
-_ROUNDS = 500  # iterations
-_SMALL, _LARGE = 1e-9, 1e3  # photons in a time constant below and above which a series replaces the gamma function
-_MOST_CELLS = 2**22  # cells of sampled delays: 32 MiB an array
 
 
 @checked
@@ -31,8 +32,8 @@ def constant_light_rate(rate_hz: float, detector: Detector) -> float:
     """Mean rate of registrations of a free-running pixel under constant light, counts/s.
 
     Exact without afterpulsing, 1 / (t_d + e^(-lambda alpha) w) with the mean wait w of an armed pixel: 1 / lambda, or
-    r e^a a^-a gamma(a, a), a = lambda r, where its sensitivity returns with the time constant r. With afterpulsing it
-    is exact to first order in the afterpulse probability p: the trapped carriers are replaced by their mean over all
+    1F1(1, 1 + a, a) / lambda, a = lambda r, where its sensitivity returns with the time constant r. With afterpulsing
+    it is exact to first order in the afterpulse probability p: the trapped carriers are replaced by their mean over all
     histories, with an error of the order p^2.
 
     Parameters
@@ -65,7 +66,7 @@ def constant_light_rate(rate_hz: float, detector: Detector) -> float:
     >>> round(ml.statistics.constant_light_rate(1e7, ml.Detector(dead_time_ns=50.0)))  # 1e7 / (1 + 0.5)
     6666667
     """
-    light = checks.real("rate_hz", rate_hz, low=0.0, high=MAX_RATE_HZ)
+    light = checks.real("rate_hz", rate_hz, low=0.0, high=INSTRUMENT.rate_hz)
     require_effects("constant_light_rate", detector, _EFFECTS, lambda _: "; simulate it with engine 'sequential'")
     if detector.mode != "nonparalyzable":
         raise ValueError(f"constant_light_rate treats mode 'nonparalyzable' only, got {detector.mode!r}")
@@ -86,21 +87,27 @@ def constant_light_rate(rate_hz: float, detector: Detector) -> float:
         )
     if traps.delay_ns is not None:
         return 1e9 / _exponential(rate, dead, twilight, traps.probability, traps.delay_ns)
-    parts = min(max(1, math.ceil(40 * rate * (traps.bin_ns or 0.0))), max(1, _MOST_CELLS // len(traps.delays or (0,))))
+    parts = max(1, min(math.ceil(40 * rate * (traps.bin_ns or 0.0)), TOL.sampled_delays // len(traps.delays or (0,))))
     density = np.repeat(np.diff(traps.edges_below) / parts, parts) * traps.probability
     return 1e9 / _sampled(rate, dead, twilight, density, (traps.bin_ns or 0.0) / parts)
 
 
+def renewal_moments(photons: FloatArray, system: System) -> tuple[FloatArray, FloatArray]:
+    """Mean and variance of a count under constant light in a long exposure, (6.2) of docs/theory.md.
+
+    `photons` (...) are those detected in a period.
+    """
+    x = photons * system.dead_time_periods
+    return system.cycles * photons / (1.0 + x), system.cycles * photons / (1.0 + x) ** 3
+
+
 def _wait(rate: float, recovery: float) -> float:
     """Mean wait of an armed pixel, ns: of hazard rate (1 - e^(-u / recovery))."""
-    from scipy.special import gammainc, gammaln
+    from scipy.special import hyp1f1
 
     a = rate * recovery
-    if a < _SMALL:
-        return (1.0 + a) / rate
-    # log of e^a a^-a Gamma(a), by Stirling's series where its terms are large beside it
-    log = a - a * math.log(a) + gammaln(a) if a < _LARGE else 0.5 * math.log(2.0 * math.pi / a) + 1.0 / (12.0 * a)
-    return float(recovery * math.exp(log) * gammainc(a, a))
+    longer = hyp1f1(1.0, 1.0 + a, a) if a < 1e10 else math.sqrt(0.5 * math.pi * a) + 1.0 / 3.0  # to 1e-11
+    return float(longer) / rate
 
 
 def _exponential(rate: float, dead: float, twilight: float, p: float, delay: float) -> float:
@@ -109,7 +116,7 @@ def _exponential(rate: float, dead: float, twilight: float, p: float, delay: flo
 
     scale = min(delay, 1.0 / rate)  # of the integrands
     level, interval = p, math.inf
-    for _ in range(_ROUNDS):
+    for _ in range(TOL.constant_light_rounds):
         released = level * math.exp(-dead / delay)
         again = -math.expm1(-rate * twilight - released * math.expm1(twilight / delay))
 
@@ -124,9 +131,9 @@ def _exponential(rate: float, dead: float, twilight: float, p: float, delay: flo
         part = quad(lambda x: armed(x * scale) * math.exp(-x * scale / delay) * scale, 0.0, 60.0, limit=400)[0]
         decay = again + (1.0 - again) * (1.0 - part / delay)
         level, last, interval = p / (1.0 - math.exp(-dead / delay) * decay), interval, dead + (1.0 - again) * mean
-        if abs(interval - last) <= _TOLERANCE * interval:
+        if abs(interval - last) <= TOL.rounding * interval:
             return interval
-    return interval
+    raise ConvergenceError(f"constant_light_rate of {1e9 * rate:g} photons/s does not converge; simulate it")
 
 
 def _sampled(rate: float, dead: float, twilight: float, density: NDArray[np.float64], cell: float) -> float:
@@ -135,7 +142,7 @@ def _sampled(rate: float, dead: float, twilight: float, density: NDArray[np.floa
 
     n, edges = density.size, np.arange(density.size + 1, dtype=np.float64) * cell
     carriers, interval = density, math.inf
-    for _ in range(_ROUNDS):
+    for _ in range(TOL.constant_light_rounds):
         below = np.concatenate([[0.0], np.cumsum(carriers)])
 
         def between(at: Any, below: NDArray[np.float64] = below) -> NDArray[np.float64]:
@@ -154,6 +161,6 @@ def _sampled(rate: float, dead: float, twilight: float, density: NDArray[np.floa
         trapped = fftconvolve(later, fires[::-1])[n - 1 :]
         carriers = density + (1.0 - again) * np.maximum(trapped, 0.0) + again * free
         last, interval = interval, dead + (1.0 - again) * mean
-        if abs(interval - last) <= _TOLERANCE * interval:
+        if abs(interval - last) <= TOL.rounding * interval:
             return interval
-    return interval
+    raise ConvergenceError(f"constant_light_rate of {1e9 * rate:g} photons/s does not converge; simulate it")

@@ -19,12 +19,11 @@ from mars_lidar._base.native import _core
 from mars_lidar._base.types import FloatArray, IndexArray
 from mars_lidar.statistics.budget import LAW
 from mars_lidar.statistics.cells import Cells
-from mars_lidar.statistics.exposure import NOT_WARM, UNSETTLED, native_light, refined_moments, warm_history
+from mars_lidar.statistics.exposure import Settled, native_light, refined_moments, warm_history
 from mars_lidar.statistics.phase_chain import ConvergenceError
+from mars_lidar.statistics.tolerances import TOL
 
 # --- Support of the count, and closed forms ------------------------------------------------------------------------
-
-TAIL = 1e-12  # bound on the probability outside the support, at either end
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,15 +57,30 @@ class Pmf:
         return self.first + self.p.size - 1
 
 
+def total_variation(a: Pmf, b: Pmf) -> float:
+    """Half the sum of |difference| over all counts."""
+    if a.last < b.first or b.last < a.first:
+        return 0.5 * float(a.p.sum() + b.p.sum())
+    low, high = min(a.first, b.first), max(a.last, b.last)
+    return 0.5 * float(np.abs(a.on(low, high) - b.on(low, high)).sum())
+
+
+def kl_divergence(sample: FloatArray, law: FloatArray) -> FloatArray:
+    """KL(sample || law) (...) in nats, pmfs (..., w) and (w,) on the same counts; floored at `Tolerances.tail`."""
+    log_law = np.log(np.maximum(law, TOL.tail))
+    log_sample = np.log(np.where(sample > 0, sample, 1.0))
+    return np.asarray((sample * (log_sample - log_law)).sum(-1), dtype=np.float64)
+
+
 def poisson_window(mean: float) -> Pmf:
     """Poisson law, exact without dead time; the support follows from Bernstein's bounds of the two tails."""
     from scipy.special import gammaln, xlogy
 
-    reach = -math.log(TAIL)
+    reach = -math.log(TOL.tail)
     low = max(0, math.ceil(mean - math.sqrt(2.0 * reach * mean)))
     high = math.floor(mean + reach / 3.0 + math.sqrt(reach**2 / 9.0 + 2.0 * reach * mean))
     counts = np.arange(low, high + 1)
-    return Pmf(low, np.exp(xlogy(counts, mean) - mean - gammaln(counts + 1.0)), TAIL * (1 + (low > 0)))
+    return Pmf(low, np.exp(xlogy(counts, mean) - mean - gammaln(counts + 1.0)), TOL.tail * (1 + (low > 0)))
 
 
 def gaussian_window(mean: float, variance: float) -> Pmf:
@@ -93,11 +107,6 @@ def gaussian_window(mean: float, variance: float) -> Pmf:
 
 # --- The generating function and its cost --------------------------------------------------------------------------
 
-_LANES = 8  # points of the circle evaluated together
-# Bytes of the history beyond which a step costs 4 times as much (as for a dead time below one bin), and 24 times
-_NEAR_BYTES, _FAR_BYTES, _FAR = 1 << 20, 1 << 26, 4.0
-_PERIOD_BINS = 128.0  # bins that take as long as the work done once a period
-
 
 class TooLongError(ConvergenceError):
     """The state did not repeat within the budget of a law."""
@@ -114,11 +123,12 @@ def characteristic(
     cells: Cells, z_re: FloatArray, z_im: FloatArray | None, bins: int, threads: int, remaining: Remaining | None = None
 ) -> tuple[FloatArray, FloatArray]:
     """E z^N (re, im) of each cell at its points z (cells, points); without `z_im` log E z^N at real z."""
-    remaining, batches = remaining or Remaining(), math.ceil(z_re.shape[1] / _LANES)
+    remaining, batches = remaining or Remaining(), math.ceil(z_re.shape[1] / TOL.lanes)
     dead = cells.system.dead_time_periods
     reach = 256.0 * bins * (min(dead, float(cells.system.cycles)) + 1.0)
-    cost = 6.0 * _FAR if reach > _FAR_BYTES else _FAR if reach > _NEAR_BYTES or dead * bins < 1.0 else 1.0
-    cost *= 1.0 + _PERIOD_BINS / bins
+    slow = reach > TOL.near_transform_bytes or dead * bins < 1.0
+    cost = TOL.far_transform * (6.0 if reach > TOL.far_transform_bytes else 1.0) if slow else 1.0
+    cost *= 1.0 + TOL.period_bins / bins
     # at real points the registrations of every period of a dead time are summed
     cost *= 1.0 + (min(dead, float(cells.system.cycles)) / bins if z_im is None else 0.0)
     steps = max(int(remaining.steps / cost) // batches, bins)
@@ -137,7 +147,7 @@ def characteristic(
         mine: dict[str, Any] = points | {name: x[part] for name, x in points.items() if np.ndim(x)}
         light = native_light(cells.part(part), bins)
         _core.exposure_characteristic(grid=grid, light=light, **mine, threads=threads)
-    cold = np.flatnonzero((settled == NOT_WARM).any(-1))
+    cold = np.flatnonzero((settled == Settled.NOT_WARM).any(-1))
     if cold.size:
         again: dict[str, Any] = points | {
             name: np.ascontiguousarray(x[cold]) for name, x in points.items() if np.ndim(x)
@@ -146,7 +156,7 @@ def characteristic(
         _core.exposure_characteristic(grid=grid, light=light, **again, threads=threads)
         for name, array in (("re", re), ("im", im), ("settled", settled)):
             array[cold] = again[name]
-    lost = (settled == UNSETTLED).any(-1)
+    lost = (settled == Settled.UNSETTLED).any(-1)
     if lost.any():
         raise TooLongError(
             f"count law of {cells.name(int(np.argmax(lost)))}: the state of the pixel does not repeat within "
@@ -161,21 +171,6 @@ def characteristic(
 # --- Probabilities -------------------------------------------------------------------------------------------------
 
 _TILTS = np.array([1.0, 2.0, 3.5, 5.0, 6.5, 8.0, 11.0, 15.0])  # exponential tilts in units of 1 / standard deviation
-_MAX_TILT = 25.0  # largest tilt, per count
-_MAX_LOG_GROWTH = 600.0  # log of E e^(theta N) of one period; the largest double is e^709
-_CONSISTENT = 1e-5  # allowed disagreement of the pmf with the cumulants, in standard deviations
-_CONSISTENT_PER_CYCLE = 1e-13  # the same per extrapolated cycle, for rounding
-MAX_COUNTS = 2**24  # counts of a listed law: 128 MiB
-_FOR_SUPPORT = 0.25  # share of the step budget for the bounds of the support; beyond, the support is guessed
-_WIDE_REACH = 12.0  # half width of that guess, in standard deviations plus one count
-REACH, MARGIN = 7.5, 6.0  # half width of a guessed window: standard deviations, and additional counts
-_WIDEST_GUESS = 1024  # counts of a guessed window
-_EDGE = 1e-10  # largest probability at the ends of a window that contains the law
-_LIKE_CUMULANTS = 0.02  # allowed difference from the assumed mean, in standard deviations
-_BLOCK = 64  # cells evaluated together
-_ALL_POINTS = 256  # counts; a wider law is evaluated only on the points where its transform is not 0
-_QUIET = 1e-15  # modulus of the transform below which it counts as 0
-_SHORT_VARIANCE, _SHORTER = 4.0, 6  # variance of the shorter exposure searched for further peaks; least shortening
 
 
 def exact_windows(cells: Cells, cumulants: FloatArray, bins: IndexArray, threads: int) -> list[Pmf]:
@@ -188,7 +183,7 @@ def exact_windows(cells: Cells, cumulants: FloatArray, bins: IndexArray, threads
     for n in np.unique(bins[~dark]):
         index = np.flatnonzero((bins == n) & ~dark)
         cells.check_history(int(n))
-        for block in np.array_split(index, math.ceil(index.size / _BLOCK)):
+        for block in np.array_split(index, math.ceil(index.size / TOL.block)):
             try:
                 lows, highs, outside = _supports(cells.part(block), cumulants[block], int(n), threads)
             except TooLongError:
@@ -213,7 +208,7 @@ def guessed_windows(
     """
     cells = cells.resolved(1)
     spread = np.sqrt(np.maximum(cumulants[:, 1], 0.0))
-    half = np.ceil(REACH * spread + MARGIN)
+    half = np.ceil(TOL.guess_spreads * spread + TOL.guess_counts)
     size = (8.0 * np.ceil((2.0 * half + 1.0) / 8.0)).astype(np.int64)
     first = np.maximum(np.floor(cumulants[:, 0]) - half, 0.0).astype(np.int64)
     windows: list[Pmf | None] = [None] * cells.size
@@ -221,8 +216,8 @@ def guessed_windows(
     for n, width in np.unique(np.stack([bins, size], -1), axis=0):
         index = np.flatnonzero((bins == n) & (size == width))
         cells.check_history(int(n))
-        for block in np.array_split(index, math.ceil(index.size / _BLOCK)):
-            guessed = width <= _WIDEST_GUESS
+        for block in np.array_split(index, math.ceil(index.size / TOL.block)):
+            guessed = width <= TOL.widest_guess
             pmf = _folded(cells.part(block), first[block], int(width), int(n), threads) if guessed else None
             for k, cell in enumerate(block):
                 candidate = (
@@ -248,11 +243,11 @@ def _if_whole(pmf: FloatArray, first: int, mean: float, spread: float) -> Pmf | 
     """The window if it contains the law: ends below `_EDGE`, nothing negative, sum 1, the assumed mean; else None."""
     away = float(pmf @ (first + np.arange(pmf.size))) - mean
     ends = _ends(pmf, first)
-    if not (ends <= _EDGE and abs(away) <= _LIKE_CUMULANTS * max(spread, 0.5) and float(pmf.min()) >= -_CONSISTENT):
+    if not (ends <= TOL.edge and abs(away) <= TOL.like_mean * max(spread, 0.5) and float(pmf.min()) >= -TOL.consistent):
         return None
-    if not abs(float(pmf.sum()) - 1.0) <= _CONSISTENT:
+    if not abs(float(pmf.sum()) - 1.0) <= TOL.consistent:
         return None
-    return Pmf(first, np.maximum(pmf, 0.0), pmf.size * _EDGE)
+    return Pmf(first, np.maximum(pmf, 0.0), pmf.size * TOL.edge)
 
 
 def _ends(pmf: FloatArray, first: int, most: float = math.inf) -> float:
@@ -275,17 +270,17 @@ def _supports(
     # a period multiplies E e^(theta N) at most by e^(theta (1 + t_r/t_d)) and by exp(Lambda (e^theta - 1))
     dead = cells.system.dead_time_periods
     growth = np.maximum(
-        _MAX_LOG_GROWTH / (1.0 + 1.0 / dead),
-        np.log1p(_MAX_LOG_GROWTH / np.maximum(cells.total, 1e-300)),
+        TOL.most_log_growth / (1.0 + 1.0 / dead),
+        np.log1p(TOL.most_log_growth / np.maximum(cells.total, 1e-300)),
     )
     # the tilts are scaled down to the limit; where large counts are rare, small tilts give the best bounds
-    unit = np.minimum(1.0 / np.maximum(spread, 1e-300), np.minimum(growth, _MAX_TILT) / _TILTS[-1])
+    unit = np.minimum(1.0 / np.maximum(spread, 1e-300), np.minimum(growth, TOL.most_tilt) / _TILTS[-1])
     tilt = _TILTS * unit[:, None]
     tilt = np.concatenate([tilt, -tilt], axis=1)
-    log_value = characteristic(cells, np.exp(tilt), None, bins, threads, Remaining(_FOR_SUPPORT))[0]
+    log_value = characteristic(cells, np.exp(tilt), None, bins, threads, Remaining(TOL.support_share))[0]
     with np.errstate(invalid="ignore"):
         # P(N >= edge) <= tail for a positive tilt, P(N <= edge) <= tail for a negative one
-        edge = (log_value - math.log(TAIL)) / tilt
+        edge = (log_value - math.log(TOL.tail)) / tilt
     up, down = np.split(np.where(np.isfinite(edge), edge, np.nan), 2, axis=1)
     most = _most(cells)
     high = np.fmin.reduce(up, axis=1, initial=most + 1.0)
@@ -293,14 +288,14 @@ def _supports(
     last = np.minimum(np.ceil(high) - 1.0, most)
     first = np.clip(np.floor(low) + 1.0, 0.0, np.floor(mean))
     last = np.maximum(last, np.ceil(mean))
-    if (last - first >= MAX_COUNTS).any():
+    if (last - first >= TOL.most_counts).any():
         k = int(np.argmax(last - first))
         raise ConvergenceError(
             f"count law of {cells.name(k)}: its support of {last[k] - first[k]:.3g} counts exceeds "
-            f"{MAX_COUNTS}; mean, variance and cumulants are known; use method 'mars' or 'renewal' for a Gaussian"
+            f"{TOL.most_counts}; mean, variance and cumulants are known; use method 'mars' or 'renewal' for a Gaussian"
         )
     # no probability lies beyond the smallest and the largest possible count
-    outside = TAIL * ((first > 0).astype(np.float64) + (last < most))
+    outside = TOL.tail * ((first > 0).astype(np.float64) + (last < most))
     return first.astype(np.int64), last.astype(np.int64), outside
 
 
@@ -312,10 +307,10 @@ def _most(cells: Cells) -> float:
 def _guessed_supports(cells: Cells, cumulants: FloatArray) -> tuple[IndexArray, IndexArray, FloatArray]:
     """Supports from mean and variance alone; `_check` verifies that they contain the law."""
     spread, mean = np.sqrt(cumulants[:, 1]), cumulants[:, 0]
-    half = np.ceil(_WIDE_REACH * (spread + 1.0))
+    half = np.ceil(TOL.support_spreads * (spread + 1.0))
     most = _most(cells)
     first, last = np.maximum(np.floor(mean) - half, 0.0), np.minimum(np.ceil(mean) + half, most)
-    return first.astype(np.int64), last.astype(np.int64), (last - first) * _EDGE
+    return first.astype(np.int64), last.astype(np.int64), (last - first) * TOL.edge
 
 
 def _window(cell: Cells, first: int, last: int, outside: float, bins: int, threads: int, variance: float) -> Pmf:
@@ -324,7 +319,7 @@ def _window(cell: Cells, first: int, last: int, outside: float, bins: int, threa
 
     counts, remaining = last - first + 1, Remaining()
     size = counts + counts % 2
-    value = _narrow(cell, size, bins, threads, variance, remaining) if size > _ALL_POINTS else None
+    value = _narrow(cell, size, bins, threads, variance, remaining) if size > TOL.all_points else None
     if value is None:
         angle = 2.0 * np.pi * np.arange(size // 2 + 1) / size
         re, im = characteristic(cell, np.cos(angle)[None], np.sin(angle)[None], bins, threads, remaining)
@@ -344,8 +339,8 @@ def _narrow(
     the transform of a much shorter exposure, where they are wide enough to be found on few points (27).
     """
     cycles = cell.system.cycles
-    shorter = max(1, math.ceil(_SHORT_VARIANCE * cycles / max(variance, 1e-300)))
-    if shorter * _SHORTER > cycles:
+    shorter = max(1, math.ceil(TOL.short_variance * cycles / max(variance, 1e-300)))
+    if shorter * TOL.least_shorter > cycles:
         return None
     angle = 2.0 * np.pi * np.arange(size // 2 + 1) / size
     value = np.zeros(angle.size, np.complex128)
@@ -358,7 +353,7 @@ def _narrow(
         re, im = characteristic(cell, np.cos(angle[some])[None], np.sin(angle[some])[None], bins, threads, remaining)
         value[some] = re[0] - 1j * im[0]
         end = some.stop
-        if np.abs(value[some]).max() <= _QUIET:
+        if np.abs(value[some]).max() <= TOL.faint:
             break
     spread = math.sqrt(variance * shorter / cycles)
     begin = min(4.0 / spread, np.pi)
@@ -368,8 +363,8 @@ def _narrow(
     brief = replace(cell, system=cell.system.replace(cycles=shorter))
     short_re, short_im = characteristic(brief, np.cos(beyond)[None], np.sin(beyond)[None], bins, threads, remaining)
     highest = float(np.hypot(short_re, short_im).max())
-    faint = float(np.hypot(re, im).max()) <= 10.0 * _QUIET
-    return value if faint and highest ** (cycles / shorter) <= 1e-3 * _QUIET else None
+    faint = float(np.hypot(re, im).max()) <= 10.0 * TOL.faint
+    return value if faint and highest ** (cycles / shorter) <= 1e-3 * TOL.faint else None
 
 
 def _check(cells: Cells, cell: int, window: Pmf, cumulants: FloatArray) -> None:
@@ -377,8 +372,8 @@ def _check(cells: Cells, cell: int, window: Pmf, cumulants: FloatArray) -> None:
     pmf: NDArray[np.float64] = window.p
     offset = window.first + np.arange(pmf.size) - cumulants[0]
     spread = max(math.sqrt(cumulants[1]), 1e-3)
-    edge = _EDGE + _CONSISTENT_PER_CYCLE * cells.system.cycles
-    if window.outside > TAIL * 4.0 and _ends(pmf, window.first, _most(cells)) > edge:  # a guessed support
+    edge = TOL.edge + TOL.consistent_per_cycle * cells.system.cycles
+    if window.outside > TOL.tail * 4.0 and _ends(pmf, window.first, _most(cells)) > edge:  # a guessed support
         raise ConvergenceError(
             f"count law of {cells.name(cell)}: it extends beyond {window.first} .. {window.first + pmf.size - 1}, "
             f"the support expected from mean and variance; mean, variance and cumulants are known; for the law "
@@ -387,12 +382,12 @@ def _check(cells: Cells, cell: int, window: Pmf, cumulants: FloatArray) -> None:
     total, mean = float(pmf.sum()), float((pmf * offset).sum())
     variance, least = float((pmf * offset**2).sum()), float(pmf.min())
     # errors of rounding and extrapolation are absolute in probability; for a locked count they may exceed its variance
-    rounding, unit = _CONSISTENT_PER_CYCLE * cells.system.cycles, max(spread, 1.0)
+    rounding, unit = TOL.consistent_per_cycle * cells.system.cycles, max(spread, 1.0)
     error = max(
-        abs(total - 1.0) / (_CONSISTENT + rounding),
-        abs(mean) / (_CONSISTENT * spread + rounding * unit),
-        abs(variance - cumulants[1]) / (_CONSISTENT * spread**2 + rounding * unit**2),
-        -least / (_CONSISTENT + rounding),
+        abs(total - 1.0) / (TOL.consistent + rounding),
+        abs(mean) / (TOL.consistent * spread + rounding * unit),
+        abs(variance - cumulants[1]) / (TOL.consistent * spread**2 + rounding * unit**2),
+        -least / (TOL.consistent + rounding),
     )
     if not error <= 1.0:
         raise ConvergenceError(

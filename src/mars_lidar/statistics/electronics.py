@@ -26,15 +26,14 @@ from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.statistics.budget import LAW, MOMENTS, Budget, advice
 from mars_lidar.statistics.cells import Cells, photons_before
-from mars_lidar.statistics.count_pmf import MARGIN, REACH, Pmf, exact_windows
+from mars_lidar.statistics.count_pmf import Pmf, exact_windows
 from mars_lidar.statistics.exposure import Moments, refined_moments, stationary_histogram
 from mars_lidar.statistics.phase_chain import ConvergenceError
 from mars_lidar.statistics.timing import Timing, is_timed
+from mars_lidar.statistics.tolerances import TOL
 
 # --- From record to record -----------------------------------------------------------------------------------------
 
-_ONE_THREAD = 250_000  # multiplications of a matrix product that BLAS libraries do on one thread
-_BLOCK = 64  # bins advanced together
 
 Rows = NDArray[Any]  # real or complex
 
@@ -140,7 +139,8 @@ class RecordRun:
     def __init__(self, grid: RecordGrid, start: Rows, weigh: Callable[[Rows], Rows]) -> None:
         self.grid, self.start, self.weigh = grid, start, weigh
         n, off, steps = grid.bins, grid.off, grid.steps
-        size = max(1, min(_BLOCK, off, n))  # shorter than t_e, so that no record in a block follows from another in it
+        # shorter than t_e, so that no record in a block follows from another in it
+        size = max(1, min(TOL.block, off, n))
         self.blocks = [_Block(grid, at, min(at + size, n)) for at in range(0, n, size)]
         self.reach = steps + 1
         self.source = np.zeros((start.size, self.reach + n), start.dtype)  # the preceding `reach` bins, then the period
@@ -204,7 +204,7 @@ def product(x: Rows, matrix: FloatArray) -> Rows:
     if np.iscomplexobj(x):
         parts = product(np.concatenate([x.real, x.imag]), matrix)
         return np.asarray(parts[: x.shape[0]] + 1j * parts[x.shape[0] :])
-    step = max(1, _ONE_THREAD // (x.shape[0] * matrix.shape[1]))
+    step = max(1, TOL.blas_thread // (x.shape[0] * matrix.shape[1]))
     out = x[:, :step] @ matrix[:step]
     for at in range(step, matrix.shape[0], step):
         out += x[:, at : at + step] @ matrix[at : at + step]
@@ -220,8 +220,6 @@ def bins_of(periods: float, bins: int) -> tuple[int, float]:
 # --- Moments and mean histogram ------------------------------------------------------------------------------------
 
 ELECTRONICS_MODES: tuple[Mode, ...] = ("nonparalyzable", "gated")
-_A_BLOCK = 2e4  # multiplications that take as long as the overhead of a block
-_SETTLED = 1e-11  # relative change per period at which the state counts as repeating
 
 
 @checked
@@ -408,7 +406,7 @@ class _Run:
     def _run(self, grid: RecordGrid) -> None:
         """Records period by period, and the number of those before each (12), (13)."""
         run = RecordRun(grid, np.array([1.0, 0.0]), lambda now: np.stack([now[0], now[0] + now[1]]))
-        a_period = grid.bins * (grid.shift + 64.0) + _A_BLOCK * len(run.blocks)
+        a_period = grid.bins * (grid.shift + 64.0) + TOL.record_block * len(run.blocks)
         periods = min(self.cycles, max(100, int(grid.budget.record_moments / a_period)))
         pairs, growth, steady, last = 0.0, 0.0, 0, np.zeros((2, grid.bins))
         for period in range(self.cycles):
@@ -419,7 +417,7 @@ class _Run:
             scale, before, growth = float(records.sum()), growth, float((weighted - last[1]).sum())
             moved = max(float(np.abs(records - last[0]).sum()), abs(growth - before))
             self.spent += a_period
-            steady = steady + 1 if moved <= _SETTLED * scale else 0
+            steady = steady + 1 if moved <= TOL.records_repeat * scale else 0
             last = now
             if steady > 3 * grid.periods:
                 remaining = self.cycles - period - 1
@@ -437,18 +435,13 @@ class _Run:
 
 # --- Stationary shape ----------------------------------------------------------------------------------------------
 
-_LEAST_TOLERANCE = 1e-3  # total variation: the accuracy stated for electronics dead time
-_DENSE = 2048  # bins up to which the stationary equations are solved directly
-_TURNS = 2000  # power iterations
-_STANDS = 1e-9  # total variation per iteration, relative to 1 - contraction, at which the iteration has converged
-
 
 def stationary_records(cells: Cells, out: int, *, tolerance: float, threads: int | None) -> FloatArray:
     """Mean histograms (cells, out), of sum 1, of the records of stationary pixels; 0 where there is no flux.
 
     The grid is refined until doubling it moves the shape by less than `tolerance`, at least 1e-3, in total variation.
     """
-    tolerance = max(checks.real("tolerance", tolerance, low=1e-9, high=0.1), _LEAST_TOLERANCE)
+    tolerance = max(checks.real("tolerance", tolerance, low=1e-9, high=0.1), TOL.records)
     bare, slower = without_electronics(cells)
     if slower == 0.0:
         return stationary_histogram(bare, out, tolerance=tolerance, threads=threads)
@@ -474,7 +467,7 @@ def _phases(grid: RecordGrid) -> FloatArray:
     """Stationary law (bins,) of the phase of a record on one grid (20)."""
     matrix = _transitions(grid)
     n = grid.bins
-    if n <= _DENSE:
+    if n <= TOL.direct_bins:
         system = np.eye(n) - matrix.T
         system[-1] = 1.0  # the equations are dependent: the last is replaced by the normalisation
         right = np.zeros(n)
@@ -483,13 +476,13 @@ def _phases(grid: RecordGrid) -> FloatArray:
         return np.asarray(direct / direct.sum())
     law: FloatArray = np.full(n, 1.0 / n)
     moved = math.inf
-    for _ in range(_TURNS):
+    for _ in range(TOL.record_turns):
         following = np.asarray(law @ matrix, dtype=np.float64)
         following /= following.sum()
         before, moved = moved, 0.5 * float(np.abs(following - law).sum())
         law = following
         forgotten = 1.0 - min(moved / before, 1.0) if before > 0.0 else 1.0
-        if moved <= _STANDS * forgotten:
+        if moved <= TOL.record_stands * forgotten:
             return law
     raise ConvergenceError(
         f"stationary shape of {grid.cell.name(0)} behind electronics with a dead time: {n} phases do not settle; use "
@@ -523,11 +516,6 @@ def _transitions(grid: RecordGrid) -> FloatArray:
 
 ComplexArray = NDArray[np.complex128]
 
-_EDGE = 1e-9  # largest probability at the ends of a window that contains the law
-_POINTS = 64  # points of the circle evaluated together
-_QUIET = 1e-17  # modulus of the transform below which it counts as 0
-_LIKE_MOMENTS = 3.0  # allowed disagreement of the pmf with mean and variance, in units of the tolerance
-
 
 def record_windows(cells: Cells, tolerance: float, threads: int) -> list[Pmf]:
     """Pmf of the number of records of each cell; the tolerance is that of `electronics_moments`."""
@@ -546,14 +534,14 @@ def _window(cell: Cells, electronics_ns: float, tolerance: float) -> Pmf:
     grids = [RecordGrid(cell, n, electronics, LAW) for n in (bins, bins // 2)]
     most = math.floor(cell.system.cycles / electronics) + 1
     spread = math.sqrt(variance)
-    half = math.ceil(REACH * spread + MARGIN)
+    half = math.ceil(TOL.guess_spreads * spread + TOL.guess_counts)
     remaining = [LAW.record_points]  # multiplications
     while True:
         first, last = max(math.floor(mean) - half, 0), min(math.ceil(mean) + half, most)
         fine, coarse = (_folded(grid, first, last, remaining) for grid in grids)
         pmf = fine + (fine - coarse) / 3.0  # the limit for fine grids
         ends = max(pmf[0] if first > 0 else 0.0, pmf[-1] if last < most else 0.0)
-        if abs(ends) <= _EDGE:
+        if abs(ends) <= TOL.record_edge:
             break
         half *= 2
     offset = first + np.arange(pmf.size) - mean
@@ -563,13 +551,14 @@ def _window(cell: Cells, electronics_ns: float, tolerance: float) -> Pmf:
         abs(float(pmf @ offset**2) - variance) / max(variance, 1e-6),
         -float(pmf.min()),
     )
-    if not error <= _LIKE_MOMENTS * tolerance:
+    if not error <= TOL.like_moments * tolerance:
         raise ConvergenceError(
             f"count law of {cell.name(0)}, t_e = {electronics:g} periods: its pmf on {first} .. {last} disagrees with "
-            f"mean and variance by {error:.2g} (allowed {_LIKE_MOMENTS * tolerance:.2g}); electronics_moments has those"
+            f"mean and variance by {error:.2g} (allowed {TOL.like_moments * tolerance:.2g}); electronics_moments has "
+            "those"
         )
     pmf = np.maximum(pmf, 0.0)
-    outside = _EDGE * ((first > 0) + (last < most)) * pmf.size
+    outside = TOL.record_edge * ((first > 0) + (last < most)) * pmf.size
     return Pmf(first, pmf / pmf.sum(), outside)
 
 
@@ -582,10 +571,10 @@ def _folded(grid: RecordGrid, first: int, last: int, remaining: list[float]) -> 
     size = counts + counts % 2
     angle = 2.0 * np.pi * np.arange(size // 2 + 1) / size
     value = np.zeros(angle.size, np.complex128)
-    for start in range(0, angle.size, _POINTS):
-        some = np.exp(1j * angle[start : start + _POINTS])
-        value[start : start + _POINTS] = _values(grid, some, remaining)
-        if np.abs(value[start : start + _POINTS]).max() < _QUIET:  # the transform of a long exposure vanishes beyond
+    for start in range(0, angle.size, TOL.block):
+        some = slice(start, start + TOL.block)
+        value[some] = _values(grid, np.exp(1j * angle[some]), remaining)
+        if np.abs(value[some]).max() < TOL.record_faint:  # the transform of a long exposure vanishes beyond
             break
     folded = np.fft.irfft(value.conj(), size)
     return np.asarray(folded[np.arange(first, last + 1) % size], dtype=np.float64)
@@ -611,12 +600,12 @@ def _values(grid: RecordGrid, z: ComplexArray, remaining: list[float]) -> Comple
         size, norm = np.abs(state).sum(-1), np.maximum((np.abs(before) ** 2).sum(-1), 1e-300)
         best = (before.conj() * state).sum(-1) / norm
         moved = np.abs(state - best[:, None] * before).sum(-1) + np.abs(best - ratio) * size
-        streak = np.where(moved <= _SETTLED * size, streak + 1, 0)
+        streak = np.where(moved <= TOL.records_repeat * size, streak + 1, 0)
         before, ratio = state, best
         over = period == grid.cycles - 1
-        done = (streak > 3 * grid.periods) | (np.abs(value) < _QUIET) | over
+        done = (streak > 3 * grid.periods) | (np.abs(value) < TOL.record_faint) | over
         if done.any():
-            ends = done & (np.abs(value) >= _QUIET)  # the others are 0
+            ends = done & (np.abs(value) >= TOL.record_faint)  # the others are 0
             result[index[ends]] = _extrapolated(value[ends], earlier[ends], best[ends], grid.cycles - 1 - period)
             rest = ~done
             if not rest.any():

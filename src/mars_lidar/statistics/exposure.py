@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from enum import IntEnum
 from typing import Any
 
 import numpy as np
@@ -22,9 +23,9 @@ from numpy.typing import NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.brief import brief
+from mars_lidar._base.display import brief
 from mars_lidar._base.native import _core
-from mars_lidar._base.threads import thread_count
+from mars_lidar._base.resources import thread_count
 from mars_lidar._base.types import FloatArray, IndexArray, Progress
 from mars_lidar.instrument.detector import Mode
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
@@ -35,10 +36,17 @@ from mars_lidar.statistics.cells import Cells, fine_histograms, meets_itself, ph
 from mars_lidar.statistics.joint_grid import FoldedGrid
 from mars_lidar.statistics.phase_chain import ConvergenceError
 from mars_lidar.statistics.timing import Timing, is_timed
+from mars_lidar.statistics.tolerances import TOL
 
 # --- Results on one grid and their comparison ----------------------------------------------------------------------
 
-_ORDERS = 4  # cumulants
+
+class Settled(IntEnum):
+    """`Exposure.settled` where it is no number of periods, as native/laws/exposure_kernel.h."""
+
+    RAN_TO_END = -1
+    UNSETTLED = -2  # not within the allowed periods: no result
+    NOT_WARM = -3  # the sweeps did not reach the stationary state to start from: no result
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,9 +170,9 @@ def blank(cells: Cells, out_bins: int) -> Exposure:
     """Uninitialised statistics of the cells."""
     n = cells.size
     return Exposure(
-        cumulants=np.empty((n, _ORDERS)),
+        cumulants=np.empty((n, 4)),
         histogram=np.empty((n, out_bins)),
-        cumulant_rates=np.empty((n, _ORDERS)),
+        cumulant_rates=np.empty((n, 4)),
         histogram_rate=np.empty((n, out_bins)),
         settled=np.empty(n, np.int64),
         bins=np.empty(n, np.int64),
@@ -178,7 +186,7 @@ def movement(coarse: Exposure, fine: Exposure) -> FloatArray:
     floor = 1e-10 * mean + np.finfo(float).tiny  # rounding: the variance of a locked pixel may be 0
     change = np.abs(fine.cumulants - coarse.cumulants)
     worst = change[:, 0] / np.maximum(np.minimum(mean, spread), floor)
-    for k in range(1, _ORDERS):
+    for k in range(1, 4):
         scale = np.maximum(np.abs(fine.cumulants[:, k]), spread ** (k + 1))
         worst = np.maximum(worst, change[:, k] / np.maximum(scale, floor))
     joined = fine.histogram.reshape(*coarse.histogram.shape, -1).sum(-1)
@@ -218,10 +226,7 @@ def normalised(histogram: FloatArray) -> FloatArray:
 
 # --- Rates of a paralyzable pixel ----------------------------------------------------------------------------------
 
-_PARTS = 4  # parts of a bin, in each of which the rates of arrivals now and a dead time ago are constant
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
-_RATE_MOMENTS = 4  # moments 0 to 3
-RATES_STEPS = 120.0  # cost of the rates of a bin, in steps of the native recursion, at most
 
 
 def registration_rates(cells: Cells, bins: int) -> FloatArray:
@@ -232,8 +237,8 @@ def registration_rates(cells: Cells, bins: int) -> FloatArray:
     """
     if cells.follow:  # the bins differ from cell to cell
         rows = [cells.part(slice(k, k + 1)) for k in range(cells.size)]
-        return np.concatenate([_rates(row, row.edges(_PARTS * bins)) for row in rows])
-    return _rates(cells, np.arange(_PARTS * bins + 1) / (_PARTS * bins))
+        return np.concatenate([_rates(row, row.edges(4 * bins)) for row in rows])
+    return _rates(cells, np.arange(4 * bins + 1) / (4 * bins))
 
 
 def _rates(cells: Cells, edges: FloatArray) -> FloatArray:
@@ -254,19 +259,20 @@ def _rates(cells: Cells, edges: FloatArray) -> FloatArray:
 
 def _moments(before: FloatArray, within: FloatArray) -> FloatArray:
     """Moments (cells, bins, 4), extrapolated to fourth order from quarters and halves of bins as in (12)."""
-    fine, coarse = _on_parts(before, within, _PARTS), _on_parts(before[:, ::2], within[:, ::2], _PARTS // 2)
+    fine, coarse = _on_parts(before, within, 4), _on_parts(before[:, ::2], within[:, ::2], 2)
     return np.asarray(fine + (fine - coarse) / 3.0, dtype=np.float64)
 
 
 def _on_parts(before: FloatArray, within: FloatArray, parts: int) -> FloatArray:
+    """Moments 0 to 3, with rates of arrivals now and a dead time ago that are constant in each of `parts` of a bin."""
     photons, rise = np.diff(before), np.diff(within)
-    out = np.zeros((before.shape[0], photons.shape[1] // parts, _RATE_MOMENTS))
+    out = np.zeros((before.shape[0], photons.shape[1] // parts, 4))
     for part in range(parts):
         some, low, more = photons[:, part::parts], within[:, :-1][:, part::parts], rise[:, part::parts]
         for node, weight in zip(0.5 * (_NODES + 1.0), 0.5 * _WEIGHTS, strict=True):
             rate = weight * some * np.exp(-(low + node * more))
             place = 2.0 * (part + node) / parts - 1.0
-            for order in range(_RATE_MOMENTS):
+            for order in range(4):
                 out[:, :, order] += rate * place**order
     return out
 
@@ -303,7 +309,7 @@ def recorded_light(cells: Cells, out_bins: int) -> FloatArray:
 
 
 def _poisson_bins(out_bins: int) -> int:
-    return out_bins * math.ceil(512 / out_bins)
+    return out_bins * math.ceil(TOL.unrefined_bins / out_bins)
 
 
 def without_dead_time(cells: Cells, out_bins: int) -> Exposure:
@@ -318,8 +324,6 @@ def without_dead_time(cells: Cells, out_bins: int) -> Exposure:
 
 
 # --- The stationary start by the feedback equation -----------------------------------------------------------------
-
-NOT_WARM = -3  # `settled` of the native core: the sweeps did not reach the stationary state
 
 
 def warm_history(cells: Cells, which: IndexArray, bins: int) -> FloatArray:
@@ -344,10 +348,7 @@ def warm_history(cells: Cells, which: IndexArray, bins: int) -> FloatArray:
 # --- The recursion -------------------------------------------------------------------------------------------------
 
 _MODES: tuple[Mode, ...] = ("nonparalyzable", "paralyzable", "gated")
-MOST_BINS = 2**20  # bins of the statistics grid (8 MiB an array), unless the histogram itself has more
 _NATIVE = ("cumulants", "cumulant_rates", "histogram", "histogram_rate", "settled")  # arrays that the native core fills
-UNSETTLED = -2  # `settled` of the native core: the state did not repeat within the allowed periods
-_ENERGY_STEPS = 10.0  # cost of the light of a bin, in steps of the native recursion
 
 
 @checked
@@ -450,7 +451,7 @@ def refined_moments(
     result = blank(cells, out_bins)
     pending = np.flatnonzero(cells.total > 0.0)
     bins = cells.first_bins(out_bins)
-    most = max(MOST_BINS, 4 * out_bins, 2 * bins)
+    most = max(TOL.most_bins, 4 * out_bins, 2 * bins)
     if pending.size < cells.size:
         darkness(result, cells.total == 0.0, bins)
         if not pending.size:
@@ -496,7 +497,7 @@ def _spent(done: Exposure, cells: Cells) -> FloatArray:
 
 def _before(system: System) -> float:
     """Cost of the light of a bin, in steps of the native recursion."""
-    return RATES_STEPS if system.detector.mode == "paralyzable" else _ENERGY_STEPS
+    return TOL.rate_steps if system.detector.mode == "paralyzable" else TOL.light_steps
 
 
 def _affordable(cells: Cells, pending: IndexArray, after: FloatArray, budget: Budget) -> None:
@@ -505,8 +506,7 @@ def _affordable(cells: Cells, pending: IndexArray, after: FloatArray, budget: Bu
     if beyond.any():
         k_pending = int(np.argmax(beyond))
         k = int(pending[k_pending])
-        seconds = [budget.recursion_seconds(cost) for cost in (float(after[k_pending]), budget.recursion)]
-        why = f"it would take about {seconds[0]:.2g} s, and the limit of a law is {seconds[1]:.1g} s"
+        why = budget.refusal(float(after[k_pending]))
         raise ConvergenceError(f"exposure statistics of {cells.name(k)}: {why}; {_instead(cells, budget)}")
 
 
@@ -537,14 +537,14 @@ def _run(
         grid = some.grid(bins, out_bins, steps)
         into: dict[str, Any] = {name: vars(result)[name][part] for name in _NATIVE}
         _core.exposure_moments(grid=grid, light=native_light(some, bins), **into, threads=threads, progress=progress)
-        cold = np.flatnonzero(into["settled"] == NOT_WARM)
+        cold = np.flatnonzero(into["settled"] == Settled.NOT_WARM)
         if cold.size:
             again: dict[str, Any] = {name: np.ascontiguousarray(array[cold]) for name, array in into.items()}
             light = native_light(some.part(cold), bins, warm_history(some, cold, bins))
             _core.exposure_moments(grid=grid, light=light, **again, threads=threads, progress=progress)
             for name, array in into.items():
                 array[cold] = again[name]
-    lost = result.settled == UNSETTLED
+    lost = result.settled == Settled.UNSETTLED
     if lost.any():
         k = int(np.argmax(lost))
         raise ConvergenceError(f"exposure statistics of {cells.name(k)}: {_too_long(cells, budget)}")
@@ -572,7 +572,7 @@ def _refined(cells: Cells, out_bins: int, *, tolerance: float, team: int) -> Flo
     result = np.empty((cells.size, out_bins))
     pending = np.arange(cells.size)
     bins = cells.first_bins(out_bins)
-    most = max(MOST_BINS, out_bins)
+    most = max(TOL.most_bins, out_bins)
     shared = math.gcd(bins // 2, out_bins)
     coarse = _stationary(cells, bins // 2, shared, team)
     while pending.size:
@@ -605,7 +605,7 @@ def _stationary(cells: Cells, bins: int, out_bins: int, threads: int) -> FloatAr
             settled=settled[part],
             threads=threads,
         )
-    cold = np.flatnonzero(settled == UNSETTLED)
+    cold = np.flatnonzero(settled == Settled.UNSETTLED)
     if cold.size:
         known = warm_history(cells, cold, bins)[:, : 2 * bins : 2]
         result[cold] = known.reshape(cold.size, out_bins, -1).sum(-1)

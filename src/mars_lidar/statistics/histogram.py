@@ -15,14 +15,14 @@ from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.statistics.budget import LAW
-from mars_lidar.statistics.cells import Cells, fine_histograms
+from mars_lidar.statistics.cells import PLAIN, Cells, fine_histograms
 from mars_lidar.statistics.chain import PhaseChain
 from mars_lidar.statistics.electronics import ELECTRONICS_MODES, moments, stationary_records
 from mars_lidar.statistics.exposure import normalised, refined_moments, stationary_histogram
-from mars_lidar.statistics.gate import PLAIN
 from mars_lidar.statistics.paralyzable import paralyzable_histograms
 from mars_lidar.statistics.synchronous import cumulants_of, first_arrivals, synchronous_windows
 from mars_lidar.statistics.timing import recorded
+from mars_lidar.statistics.tolerances import TOL
 
 # --- Mean histogram ------------------------------------------------------------------------------------------------
 
@@ -75,7 +75,7 @@ def mean_histogram(
     ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
     ... )
     >>> light = ml.Flux(signal=1.0, background=1.0, delay_ns=40.0)
-    >>> mean = ml.statistics.mean_histogram(light, system)
+    >>> mean = ml.mean_histogram(light, system)
     >>> mean.shape, round(float(mean.sum()), 1)
     ((128,), 815.2)
     """
@@ -103,7 +103,7 @@ def mean_histograms(cells: Cells, tolerance: float, threads: int | None) -> Floa
 def _registrations(cells: Cells, bins: int, tolerance: float, threads: int | None) -> FloatArray:
     mode = cells.system.detector.mode
     if "electronics_dead_time_ns" in cells.system.detector.effects:
-        return moments(cells, max(tolerance, 1e-3), LAW).histogram.reshape(cells.size, bins)
+        return moments(cells, max(tolerance, TOL.records), LAW).histogram.reshape(cells.size, bins)
     if mode == "synchronous":
         armed = first_arrivals(cells)
         registered = np.maximum(armed.sum(-1), np.finfo(float).tiny)

@@ -24,35 +24,25 @@ from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.brief import brief
 from mars_lidar._base.cached import cached_property
-from mars_lidar._base.memory import check_memory
+from mars_lidar._base.display import as_html, brief
 from mars_lidar._base.native import _core
-from mars_lidar._base.notebook import as_html
+from mars_lidar._base.resources import check_memory
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.statistics.budget import LAW, advice
-from mars_lidar.statistics.cells import (
-    MANY_BINS,
-    Cells,
-    light_before,
-    meets_itself,
-    misplaced,
-    one_pixel,
-    registered_before,
-)
+from mars_lidar.statistics.cells import Cells, light_before, meets_itself, misplaced, one_pixel, registered_before
 from mars_lidar.statistics.exposure import recorded_light
 from mars_lidar.statistics.joint_grid import FoldedGrid
 from mars_lidar.statistics.phase_chain import ConvergenceError
 from mars_lidar.statistics.timing import Timing, is_timed
+from mars_lidar.statistics.tolerances import TOL
 
 # --- One pixel on one grid -----------------------------------------------------------------------------------------
 
 INSTEAD = advice("exposure_moments (count and mean histogram)")
-_SETTLED = 1e-9  # total variation from the stationary state at which the start is forgotten
-_MANY_BINS = 2**16  # bins of a grid beyond which fewer windows are compared: a window takes long
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,7 +192,7 @@ class Pixel:
                     fraction=grid.fraction,
                     cycles=grid.cycles,
                     state=self.state,
-                    tolerance=_SETTLED,
+                    tolerance=TOL.forgotten,
                     max_steps=LAW.forgetting,
                     total=total,
                 )
@@ -279,7 +269,7 @@ def movement(coarse: Pixel, fine: Pixel) -> float:
     mean = fine.mean.reshape(n, -1).sum(-1)
     total = max(float(mean.sum()), np.finfo(float).tiny)
     shape = 0.5 * float(np.abs(mean - coarse.mean).sum()) / total
-    few = fine.law is None or max(fine.grid.bins, fine.out) > _MANY_BINS  # a window takes long
+    few = fine.law is None or max(fine.grid.bins, fine.out) > TOL.few_windows_bins  # a window takes long
     weights = _monitors(mean, fine.cells.system.dead_time_periods, few)
     means = weights @ mean
     before, after = coarse.monitored(weights), fine.monitored(np.repeat(weights, fine.out // n, axis=-1))
@@ -394,10 +384,6 @@ class TimedPixel(RecordedPixel):
 
 # --- The joint law -------------------------------------------------------------------------------------------------
 
-_MAX_BINS = 2**17  # bins of the grid (a second or two), unless the histogram itself has more
-_CELLS = (2**13, 2**15, 2**16)  # cells of the period for histograms of more than MANY_BINS bins, tried in turn
-_BLOCK = 64  # windows solved together
-
 
 @checked
 def joint_law(
@@ -476,12 +462,12 @@ def _law(cells: Cells, tolerance: float) -> JointLaw:
     if cells.system.dead_time_periods == 0.0 or cells.signal[0] + cells.background[0] == 0.0:
         mean = cells.system.cycles * recorded_light(cells, out)[0]  # independent Poisson bins
         return JointLaw(cells.system, mean, 0.0, out, 0, _pixel=None)
-    if out <= MANY_BINS:
+    if out <= TOL.many_bins:
         law, _ = _refined(cells, out, tolerance)
         return law
     edges = np.arange(out + 1) / out
     light = light_before(cells, edges)
-    for few in _CELLS:
+    for few in TOL.joint_cells_of_many:
         if misplaced(light_before(cells, np.arange(few + 1) / few), edges, light) > 2.0 * tolerance:
             continue
         law, pixel = _refined(cells, few, tolerance)
@@ -490,7 +476,7 @@ def _law(cells: Cells, tolerance: float) -> JointLaw:
         if moved <= tolerance:
             return replace(law, mean=fine.mean, movement=moved, _pixel=fine)
     raise ConvergenceError(
-        f"joint law of {cells.name(0)}: {_CELLS[-1]} cells of the period do not resolve the light in "
+        f"joint law of {cells.name(0)}: {TOL.joint_cells_of_many[-1]} cells of the period do not resolve the light in "
         f"{out} bins; use fewer bins, {INSTEAD.removeprefix('use ')}"
     )
 
@@ -501,7 +487,7 @@ def _refined(cells: Cells, out: int, tolerance: float) -> tuple[JointLaw, Pixel]
     instead = cells.instead if meets_itself(cells) else INSTEAD
     cells = cells.resolved(out)
     bins = cells.first_bins(out)
-    if bins > max(_MAX_BINS, 4 * out):
+    if bins > max(TOL.many_bins, 4 * out):
         raise ConvergenceError(
             f"joint law of {cells.name(0)}: {bins} bins per period are needed to resolve the pulse, within which "
             f"pixels re-arm a dead time later; {instead}"
@@ -513,7 +499,7 @@ def _refined(cells: Cells, out: int, tolerance: float) -> tuple[JointLaw, Pixel]
         if moved <= tolerance:
             return JointLaw(system, fine.mean, moved, bins, fine.settled, _pixel=fine), fine
         bins *= 2
-        if bins > max(_MAX_BINS, 4 * out):
+        if bins > max(TOL.many_bins, 4 * out):
             raise ConvergenceError(
                 f"joint law of {cells.name(0)}: with {bins // 2} bins per period it still moves by {moved:.2g} "
                 f"(tolerance {tolerance:g}); {instead}"
@@ -617,7 +603,7 @@ class JointLaw:
         if self._pixel is None:
             variance = (w * w) @ self.mean
         else:
-            blocks = np.split(w, range(_BLOCK, len(w), _BLOCK))
+            blocks = np.split(w, range(TOL.block, len(w), TOL.block))
             variance = np.concatenate([self._pixel.variances(block) for block in blocks])
         return (w @ self.mean).reshape(shape)[()], np.maximum(variance, 0.0).reshape(shape)[()]
 
@@ -631,7 +617,7 @@ class JointLaw:
         (v, shape), (w, _) = self._rows("first", a), self._rows("second", b)
         if self._pixel is None:
             return np.asarray((v * w) @ self.mean).reshape(shape)[()]
-        step = range(_BLOCK, len(v), _BLOCK)
+        step = range(TOL.block, len(v), TOL.block)
         parts = zip(np.split(v, step), np.split(w, step), strict=True)
         return np.concatenate([self._pixel.covariances(x, y) for x, y in parts]).reshape(shape)[()]
 
@@ -647,8 +633,8 @@ class JointLaw:
         check_memory(8 * n * n, f"lags of {n} bins", "use window() or covariance_of() for the bins of interest")
         covariances = np.empty(n)
         eye = np.eye(n)
-        for start in range(0, n, _BLOCK):
-            j = np.arange(start, min(start + _BLOCK, n))
+        for start in range(0, n, TOL.block):
+            j = np.arange(start, min(start + TOL.block, n))
             if lag % n == 0:
                 covariances[j] = self._pixel.variances(eye[j])
             else:

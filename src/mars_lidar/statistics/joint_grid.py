@@ -19,15 +19,13 @@ from mars_lidar._base.native import _core
 from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics.cells import Cells, whole_bins
 from mars_lidar.statistics.phase_chain import ConvergenceError
+from mars_lidar.statistics.tolerances import TOL
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_matrix
 
 
 # --- The feedback equation by sparse factors -----------------------------------------------------------------------
-
-MOST_FACTORED = 2**14  # bins of an equation that is factorised: a second
-GOOD = 1e-9  # relative residual with which a solution is accepted
 
 
 def factorised(grid: FoldedGrid) -> Callable[..., FloatArray]:
@@ -37,7 +35,7 @@ def factorised(grid: FoldedGrid) -> Callable[..., FloatArray]:
     restored by a rank-one update, which is well conditioned where the state of the pixel is nearly certain: after the
     brightest light. Other places are tried where the residual is too large.
     """
-    if grid.bins > MOST_FACTORED:
+    if grid.bins > TOL.folded_factored:
         raise ConvergenceError(
             f"sweeps do not solve the feedback equation, and it is too large to be factorised on {grid.bins} bins"
         )
@@ -53,10 +51,10 @@ def factorised(grid: FoldedGrid) -> Callable[..., FloatArray]:
         for _ in range(2):
             rest = np.concatenate([(source - grid.apply(x)).reshape(-1), np.zeros(grid.bins)])
             x = x + solve(rest, trans="T")[: 2 * grid.bins].reshape(2, -1)
-        error = left_over(source - grid.apply(x), x)
+        error = relative_residual(source - grid.apply(x), x)
         if best is None or error < least:
             best, least = solve, error
-        if least <= 0.1 * GOOD:
+        if least <= 0.1 * TOL.folded_residual:
             break
     assert best is not None
     return best
@@ -131,17 +129,13 @@ def _matrix(grid: FoldedGrid) -> csc_matrix:
     return csc_matrix(entries, shape=(3 * n, 3 * n))
 
 
-def left_over(rest: FloatArray, x: FloatArray) -> float:
-    """Largest residual `rest` relative to the largest value of the solution `x`; infinite for x = 0 and a residual."""
+def relative_residual(rest: FloatArray, x: FloatArray) -> float:
+    """Largest residual `rest` over the largest value of the solution `x`; infinite for a residual of x = 0."""
     size, largest = float(np.abs(x).max()), float(np.abs(rest).max())
     return largest / size if size > 0.0 else math.inf if largest != 0.0 else 0.0
 
 
 # --- The folded exposure -------------------------------------------------------------------------------------------
-
-_CHECKED = 3  # windows of a block whose residual is checked: first, last and middle
-_SWEEPS = 200  # sweeps; beyond, a factorisation is faster
-_TOLERANCE = 1e-10  # change of a solution per sweep, relative to its largest value
 
 
 @dataclass(eq=False)
@@ -258,14 +252,16 @@ class FoldedGrid:
     @cached_property
     def _flat(self) -> tuple[FloatArray, float]:
         """(2, n) and its total worth: the transposed solution for a window of ones."""
-        y = self._adjoint(np.ones((1, self.bins)), None, _TOLERANCE)[0]
+        y = self._adjoint(np.ones((1, self.bins)), None, TOL.folded_change)[0]
         return y, float(self.worth(y).sum())
 
     def worth(self, y: FloatArray) -> FloatArray:
         """Effect (..., n) of being armed at the start of each bin: alpha of (5.3)."""
         return np.asarray(self.response[0] * y[..., 0, :] + self.response[3] * y[..., 1, :])
 
-    def adjoint(self, mass: FloatArray, moment: FloatArray | None = None, tolerance: float = _TOLERANCE) -> FloatArray:
+    def adjoint(
+        self, mass: FloatArray, moment: FloatArray | None = None, tolerance: float = TOL.folded_change
+    ) -> FloatArray:
         """(m, 2, n) solution of the transposed equations (5.4) for sources (m, n)."""
         y = self._adjoint(mass, moment, tolerance)
         if self.whole:
@@ -286,17 +282,18 @@ class FoldedGrid:
                 mass_in=source[0],
                 moment_in=source[1],
                 out=out,
-                sweeps=_SWEEPS,
-                tolerance=_TOLERANCE,
+                sweeps=TOL.folded_sweeps,
+                tolerance=TOL.folded_change,
             )
             x = np.ascontiguousarray(out.T)
-            self.direct = not (error <= _TOLERANCE and left_over(source - self.apply(x), x) <= GOOD)
+            rest = relative_residual(source - self.apply(x), x)
+            self.direct = not (error <= TOL.folded_change and rest <= TOL.folded_residual)
             self.sweeps = max(self.sweeps, int(done))
         if self.direct:
             x = np.zeros((2, self.bins))
             for _ in range(2):  # iterative refinement: the second round removes the rounding error of the first
-                rest = np.concatenate([(source - self.apply(x)).reshape(-1), np.zeros(self.bins)])
-                x = x + self._factors(rest, trans="T")[: 2 * self.bins].reshape(2, -1)
+                right = np.concatenate([(source - self.apply(x)).reshape(-1), np.zeros(self.bins)])
+                x = x + self._factors(right, trans="T")[: 2 * self.bins].reshape(2, -1)
         self._judge(source - self.apply(x), x)
         return x
 
@@ -317,7 +314,7 @@ class FoldedGrid:
                 moment_in=moment,
                 mass=first,
                 moment=second,
-                sweeps=_SWEEPS,
+                sweeps=TOL.folded_sweeps,
                 tolerance=tolerance,
                 done=done,
                 error=error,
@@ -326,11 +323,11 @@ class FoldedGrid:
             self.direct = not (error <= tolerance).all()
             self.sweeps = max(self.sweeps, int(done.max()))
             if self.unproven > 0 and moment is None and not self.direct:
-                some = np.linspace(0, m - 1, min(m, _CHECKED)).astype(np.int64)
+                some = np.linspace(0, m - 1, min(m, TOL.folded_checked)).astype(np.int64)
                 rest = -self._apply_transposed(y[some])
                 rest[:, 0] += mass[some]
                 self.unproven -= 1
-                self.direct = not left_over(rest, y[some]) <= GOOD
+                self.direct = not relative_residual(rest, y[some]) <= TOL.folded_residual
                 if not self.direct:
                     self._judge(rest, y[some])
         if self.direct:
@@ -347,9 +344,9 @@ class FoldedGrid:
         return y
 
     def _judge(self, rest: FloatArray, x: FloatArray) -> None:
-        error = left_over(rest, x)
+        error = relative_residual(rest, x)
         self.residual = max(self.residual, error)
-        if not error <= GOOD:
+        if not error <= TOL.folded_residual:
             raise ConvergenceError(f"the feedback equation has a relative residual of {error:.1e}")
 
     def _apply_transposed(self, y: FloatArray) -> FloatArray:

@@ -10,23 +10,24 @@ import numpy as np
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.cached import cached_property
-from mars_lidar._base.notebook import as_html
-from mars_lidar._base.threads import thread_count
+from mars_lidar._base.display import as_html
+from mars_lidar._base.resources import thread_count
 from mars_lidar._base.types import FloatArray, IndexArray
 from mars_lidar.instrument.detector import MODES
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.statistics.budget import LAW
-from mars_lidar.statistics.cells import Cells
+from mars_lidar.statistics.cells import PLAIN, Cells
+from mars_lidar.statistics.constant_light import renewal_moments
 from mars_lidar.statistics.count_pmf import Pmf, exact_windows, gaussian_window, poisson_window
 from mars_lidar.statistics.electronics import record_windows
 from mars_lidar.statistics.exposure import Exposure, refined_moments
-from mars_lidar.statistics.gate import PLAIN
 from mars_lidar.statistics.histogram import chain_of, histogram_effects, rearm_of
 from mars_lidar.statistics.histogram import registration_pdf as registration_pdf
 from mars_lidar.statistics.renewal import holding_times
 from mars_lidar.statistics.synchronous import cumulants_of, synchronous_windows
+from mars_lidar.statistics.tolerances import TOL
 
 Method = Literal["exact", "mars", "renewal", "poisson"]
 _METHODS = get_args(Method)
@@ -231,7 +232,7 @@ def count_law(
     team = thread_count(threads)
     slow = "electronics_dead_time_ns" in cells.system.detector.effects
     if method == "exact" and (slow or system.detector.mode == "synchronous"):
-        windows = record_windows(cells, max(tolerance, 1e-3), team) if slow else synchronous_windows(cells)
+        windows = record_windows(cells, max(tolerance, TOL.records), team) if slow else synchronous_windows(cells)
         recorded_cumulants = np.array([cumulants_of(window) for window in windows]).reshape(*cells.shape, 4)
         return CountLaw(system, method, recorded_cumulants, lambda: windows)
     if method == "exact":
@@ -256,9 +257,7 @@ def count_law(
 def _gaussian_moments(method: str, cells: Cells, edge: Literal["centre", "edge"]) -> tuple[FloatArray, FloatArray]:
     """Mean and variance (cells,) of the Gaussian laws."""
     if method == "renewal":
-        from mars_lidar.statistics.baselines import renewal_moments_of
-
-        return renewal_moments_of(cells.signal + cells.background, cells.system)
+        return renewal_moments(cells.signal + cells.background, cells.system)
 
     mean, variance = np.zeros(cells.size), np.zeros(cells.size)
     for k in range(cells.size):

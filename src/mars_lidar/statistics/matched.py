@@ -10,12 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base.native import _core
-from mars_lidar._base.threads import thread_count
+from mars_lidar._base.resources import thread_count
 from mars_lidar._base.types import FloatArray, IndexArray
-from mars_lidar.statistics.count_pmf import MAX_COUNTS, Pmf
-
-_MAX_MEAN = 1e15  # counts; doubles hold integers up to 9e15
-_OUTSIDE = 1.5e-15  # probability of the two normal tails beyond 8 standard deviations
+from mars_lidar.statistics.count_pmf import Pmf
+from mars_lidar.statistics.tolerances import TOL
 
 
 def matched_pmf(cumulants: ArrayLike, *, threads: int | None = None) -> list[Pmf]:
@@ -44,22 +42,22 @@ def matched_pmf(cumulants: ArrayLike, *, threads: int | None = None) -> list[Pmf
     Three forms. A variance of 9 or more, or a smooth law: the quantile is that of E. A. Cornish and R. A.
     Fisher (1938) to the fourth cumulant, rounded, with Sheppard's corrections. Few photons, mode locking,
     saturation: an integer, plus a Panjer count, less a Poisson one (or the mirror image), times a polynomial.
-    The least variance that an integer can have: two integers. `trusted` tells where the result is
-    close to the exact law.
+    The least variance that an integer can have: two integers. `trusted` gives where the
+    result is close to the exact law.
     """
     given, team = _checked(cumulants), thread_count(threads)
     first, last, _ = _support(given, team)
     size = last - first + 1
-    if (size > MAX_COUNTS).any():
+    if (size > TOL.most_counts).any():
         k = int(size.argmax())
         raise ValueError(
-            f"cumulants[{k}] must have a variance for which {MAX_COUNTS} counts suffice, got {given[k, 1]:g}"
+            f"cumulants[{k}] must have a variance for which {TOL.most_counts} counts suffice, got {given[k, 1]:g}"
         )
     start = np.concatenate([[0], np.cumsum(size)])
     flat = np.empty(int(start[-1]))
 
     _core.matched_pmf(cumulants=given, first=first, start=start, out=flat, threads=team)
-    return [Pmf(int(first[k]), flat[start[k] : start[k + 1]].copy(), _OUTSIDE) for k in range(first.size)]
+    return [Pmf(int(first[k]), flat[start[k] : start[k + 1]].copy(), TOL.matched_outside) for k in range(first.size)]
 
 
 def matched_counts(cumulants: ArrayLike, uniform: ArrayLike, *, threads: int | None = None) -> IndexArray:
@@ -103,11 +101,11 @@ def _checked(cumulants: ArrayLike) -> FloatArray:
     given: FloatArray = np.ascontiguousarray(cumulants, dtype=np.float64)
     if given.ndim != 2 or given.shape[1] != 4:
         raise ValueError(f"cumulants must be of shape (cells, 4), got {given.shape}")
-    bad = ~np.isfinite(given).all(-1) | (given[:, 0] < 0) | (given[:, 0] > _MAX_MEAN) | (given[:, 1] < 0)
+    bad = ~np.isfinite(given).all(-1) | (given[:, 0] < 0) | (given[:, 0] > TOL.most_mean) | (given[:, 1] < 0)
     if bad.any():
         k = int(bad.argmax())
         raise ValueError(
-            f"cumulants[{k}] must be finite with a mean in [0, {_MAX_MEAN:g}] and a variance >= 0, "
+            f"cumulants[{k}] must be finite with a mean in [0, {TOL.most_mean:g}] and a variance >= 0, "
             f"got {given[k].tolist()}"
         )
     return given

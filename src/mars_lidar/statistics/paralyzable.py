@@ -18,12 +18,9 @@ from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.statistics.cells import Cells, knots, photons_before
-from mars_lidar.statistics.exposure import MOST_BINS, Moments
+from mars_lidar.statistics.exposure import Moments
 from mars_lidar.statistics.phase_chain import ConvergenceError
-
-_LEAST_SPREAD = 1e-3  # smallest standard deviation of a count relative to Poisson: that of the best locked pixels
-_ROUNDING = 1e-12  # relative rounding error of a mean
-_MAX_WHOLE = 20_000  # whole periods of a dead time; the variance sums over each
+from mars_lidar.statistics.tolerances import TOL
 
 
 @checked
@@ -79,9 +76,9 @@ def paralyzable_moments(
         what="paralyzable_moments",
         modes=("paralyzable",),
     )
-    if system.dead_time_periods > _MAX_WHOLE:
+    if system.dead_time_periods > TOL.paralyzable_periods:
         raise ValueError(
-            f"dead_time_ns must be at most {_MAX_WHOLE} periods for the variance of mode 'paralyzable', "
+            f"dead_time_ns must be at most {TOL.paralyzable_periods} periods for the variance of mode 'paralyzable', "
             f"got {system.dead_time_periods:g} periods"
         )
     return _refined(cells, tolerance, with_variance=True)
@@ -115,12 +112,12 @@ def _refined(cells: Cells, tolerance: float, *, with_variance: bool) -> Moments:
             fine = _Grid(cell, n, knots(cell, usual, n / start), with_variance)
             limit = fine.mean + (fine.mean - coarse.mean) / 3.0  # the error is quadratic in the bin width
             still = with_variance or abs(limit - before) <= max(
-                10.0 * tolerance * min(limit, _LEAST_SPREAD * math.sqrt(limit)), _ROUNDING * limit
+                10.0 * tolerance * min(limit, TOL.least_spread * math.sqrt(limit)), TOL.rounding * limit
             )
             if still and _moved(coarse, fine) <= tolerance:
                 break
             coarse, before, n = fine, limit, 2 * n
-            if n > max(MOST_BINS, 4 * system.bins):
+            if n > max(TOL.most_bins, 4 * system.bins):
                 raise ConvergenceError(
                     f"paralyzable statistics of {cells.name(k)}: with {n // 2} bins per period they still move by "
                     f"more than {tolerance:g}; use a larger tolerance, or simulate it with engine 'exact'"

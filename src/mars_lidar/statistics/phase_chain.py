@@ -18,16 +18,10 @@ import numpy as np
 
 from mars_lidar._base.native import _core
 from mars_lidar._base.types import FloatArray
+from mars_lidar.statistics.tolerances import TOL
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_matrix
-
-
-_SWEEPS = 24  # Gauss-Seidel sweeps before GMRES
-_KRYLOV = 48  # dimension of the Krylov space
-_TOLERANCE = 1e-15  # relative change per sweep
-_GOOD = 1e-12  # backward error that ends an iteration; rounding alone gives 1e-16 to 1e-14
-_WORST = 1e-10  # largest backward error of a solution
 
 
 class ConvergenceError(ArithmeticError):
@@ -79,23 +73,24 @@ class Feedback:
                 raise ConvergenceError("over 700 photons in a bin, dead time below one bin: use more bins")
             return Solution(x, 0.0, 0, "sweeps")
         x = np.zeros(n)
-        steps, error = self._sweep(rhs, x, adjoint, _SWEEPS)
+        steps, error = self._sweep(rhs, x, adjoint, TOL.chain_sweeps)
         method = "sweeps"
         residual = self._residual(rhs, x, adjoint)
-        if not error <= 10.0 * _TOLERANCE or not residual <= _GOOD:
+        if not error <= 10.0 * TOL.chain_change or not residual <= TOL.chain_residual:
             x, more = self._krylov(rhs, x, adjoint)
             steps, method = steps + more, "gmres"
             residual = self._residual(rhs, x, adjoint)
-        if not residual <= _GOOD:
+        if not residual <= TOL.chain_residual:
             x, residual = self._direct(rhs, x, adjoint)
             method = "lu"
-        if not residual <= _WORST:
+        if not residual <= TOL.chain_worst_residual:
             raise ConvergenceError(f"the feedback equation has a backward error of {residual:.1e}")
         return Solution(x, residual, steps, method)
 
     def _sweep(self, rhs: FloatArray, x: FloatArray, adjoint: bool, sweeps: int) -> tuple[int, float]:
 
-        steps, error = _core.feedback_sweeps(self.fire, self.refire, rhs, self.shift, adjoint, sweeps, _TOLERANCE, x)
+        fire, refire, change = self.fire, self.refire, TOL.chain_change
+        steps, error = _core.feedback_sweeps(fire, refire, rhs, self.shift, adjoint, sweeps, change, x)
         return int(steps), float(error)
 
     def _terms(self, x: FloatArray, adjoint: bool) -> tuple[FloatArray, FloatArray]:
@@ -141,7 +136,7 @@ class Feedback:
             goal = 1e-16 * float(np.linalg.norm(x))
             if not float(np.linalg.norm(rest)) > goal:
                 break
-            step, short = gmres(operator, rest, rtol=1e-13, atol=goal, restart=min(n, _KRYLOV), maxiter=1)
+            step, short = gmres(operator, rest, rtol=1e-13, atol=goal, restart=min(n, TOL.chain_krylov), maxiter=1)
             x = x + step
             if short:  # many slow modes: the factorisation is cheaper than another round
                 break

@@ -14,17 +14,14 @@ import numpy as np
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.brief import brief
+from mars_lidar._base.display import brief
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
-from mars_lidar.statistics.cells import cell_name, default_bins, photons_per_bin
+from mars_lidar.statistics.cells import cell_name, default_bins, photons_per_bin, require_mode
 from mars_lidar.statistics.chain import PhaseChain, Rearm, Stationary, stationary_from
-from mars_lidar.statistics.gate import require_mode
 from mars_lidar.statistics.phase_chain import cyclic_recursion
-
-_AGREEMENT = 1e-7  # two independent routes to a moment may differ by this much, relative to its largest term
-_MAX_DENSE = 8192  # bins of dense matrices: 512 MiB each
+from mars_lidar.statistics.tolerances import TOL
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,8 +156,8 @@ def moment_matrices(chain: PhaseChain) -> MomentMatrices:
     True
     """
     n = chain.bins
-    if n > _MAX_DENSE:
-        raise ValueError(f"bins must be at most {_MAX_DENSE} for dense matrices, got {n}")
+    if n > TOL.dense_bins:
+        raise ValueError(f"bins must be at most {TOL.dense_bins} for dense matrices, got {n}")
     matrix = chain.dense()
     j = np.arange(n)
     arm = (j + chain.shift) % n
@@ -285,7 +282,7 @@ def holding_times(chain: PhaseChain) -> HoldingTimes:
         # below 1e-13 mu^2 the variances of one step are rounding, and cancel to it
         abs(sigma_ss2 + 2.0 * covariance_sum - sigma2) / (max(sigma_ss2, sigma2) + 1e-6 * mu**2),
     )
-    if not defect <= _AGREEMENT:
+    if not defect <= TOL.holding_times:
         warnings.warn(
             f"holding times at {chain.describe()}: independent routes agree to {defect:.1e} only "
             f"(mu = {mu:g}, sigma2 = {sigma2:g} periods)",

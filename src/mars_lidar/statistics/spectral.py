@@ -14,20 +14,17 @@ from numpy.typing import NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.brief import brief
 from mars_lidar._base.cached import cached_property
+from mars_lidar._base.display import brief
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
+from mars_lidar.statistics.cells import require_mode
 from mars_lidar.statistics.chain import PhaseChain, Rearm
-from mars_lidar.statistics.gate import require_mode
 from mars_lidar.statistics.renewal import HoldingTimes, holding_times, lag_covariances, weighted_waits
+from mars_lidar.statistics.tolerances import TOL
 
 ComplexArray = NDArray[np.complex128]
-
-_MAX_LAGS = 100_000  # an O(n) product each
-_MAX_EIG = 4096  # bins of an eigen-decomposition, O(n^3)
-_MOST_MODES = 12  # eigenvalues that the automatic rule considers
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +86,7 @@ class HoldingTimeCovariance:
 
     def cutoff_sum(self, cutoff: int) -> float:
         """gamma_1 + ... + gamma_cutoff, ns^2: the sum over the first `cutoff` lags (4.1); 0 for none."""
-        cutoff = checks.integer("cutoff", cutoff, low=0, high=_MAX_LAGS)
+        cutoff = checks.integer("cutoff", cutoff, low=0, high=TOL.most_lags)
         if cutoff <= self.gamma.size:
             return float(self.gamma[:cutoff].sum())
         return float(lag_covariances(self._chain, self._times, cutoff).sum()) * self._unit
@@ -105,7 +102,7 @@ class HoldingTimeCovariance:
         A conjugate pair is never split: one more mode is taken where `modes` would. The paper's rule is
         L = 6, p = 5.
         """
-        lags = checks.integer("lags", lags, low=0, high=_MAX_LAGS)
+        lags = checks.integer("lags", lags, low=0, high=TOL.most_lags)
         modes = checks.integer("modes", modes, low=1, high=self._chain.bins)
         values, weights = self._modes
         count = self._whole_pairs(modes)
@@ -123,7 +120,7 @@ class HoldingTimeCovariance:
         tolerance = checks.real("tolerance", tolerance, low=0.0, high=1.0, strict_low=True)
         size = np.abs(self.eigenvalues)
         best: tuple[int, int] | None = None
-        for modes in range(1, min(_MOST_MODES, size.size - 1) + 1):
+        for modes in range(1, min(TOL.most_modes, size.size - 1) + 1):
             count = self._whole_pairs(modes)
             next_size = float(size[count]) if count < size.size else 0.0
             if next_size >= 1.0:
@@ -131,11 +128,11 @@ class HoldingTimeCovariance:
             lags = 6
             if next_size > 0.0:
                 lags = max(6, math.ceil(math.log(tolerance * (1.0 - next_size)) / math.log(next_size)))
-            if lags <= _MAX_LAGS and (best is None or lags + count < sum(best)):
+            if lags <= TOL.most_lags and (best is None or lags + count < sum(best)):
                 best = lags, count
         if best is None:
             raise ArithmeticError(
-                f"{self._chain.describe()}: no gap in the first {_MOST_MODES} eigenvalues; use exact_sum"
+                f"{self._chain.describe()}: no gap in the first {TOL.most_modes} eigenvalues; use exact_sum"
             )
         return best
 
@@ -159,9 +156,9 @@ class HoldingTimeCovariance:
         """Eigenvalues and the weights (pi Q_mu v_k)(u_k Q_mu 1) in ns^2, by falling magnitude (4.2)."""
         from scipy.linalg import eig
 
-        if self._chain.bins > _MAX_EIG:
+        if self._chain.bins > TOL.eigen_bins:
             raise ValueError(
-                f"bins must be at most {_MAX_EIG} for an eigen-decomposition, got {self._chain.bins}; "
+                f"bins must be at most {TOL.eigen_bins} for an eigen-decomposition, got {self._chain.bins}; "
                 f"exact_sum and cutoff_sum need none"
             )
         # Left eigenvectors from inv(V) have given negative variances: P is strongly non-normal (4.4)
@@ -226,7 +223,7 @@ def holding_time_covariance(
     122.7
     """
     require_mode("holding_time_covariance", system)
-    lags = checks.integer("lags", lags, low=0, high=_MAX_LAGS)
+    lags = checks.integer("lags", lags, low=0, high=TOL.most_lags)
     chain = PhaseChain.from_flux(flux, system, rearm=rearm, bins=bins)
     times = holding_times(chain)
     unit = system.period_ns**2

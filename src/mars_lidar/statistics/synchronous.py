@@ -17,16 +17,8 @@ from mars_lidar.statistics.budget import LAW, advice
 from mars_lidar.statistics.cells import Cells, photons_before
 from mars_lidar.statistics.count_pmf import Pmf
 from mars_lidar.statistics.phase_chain import ConvergenceError
+from mars_lidar.statistics.tolerances import TOL
 
-_TAIL = 1e-13  # probability outside the support, at either end
-_SPREAD = 9.0  # half width of the sum over late registrations, in standard deviations of their number
-_CHUNK = 1 << 20  # terms of (6) computed together
-_SUMS = 6  # incomplete beta functions in a term of (6)
-_MANY_TERMS, _MANY_COUNTS = 1 << 18, 20  # terms, and counts at the lower end, from which the transform (21) is used
-_REACH = 11.0  # half width of the law, and of its transform, in standard deviations
-_POINTS = 32  # points of the circle evaluated together
-_FAINT = 1e-15  # modulus of the transform below which it counts as 0
-_LOOSE_TAIL = 1e-10  # probability outside the support of a law by its transform
 _INSTEAD = advice("fewer cycles")
 
 
@@ -63,7 +55,7 @@ def _log1p(u: NDArray[np.complex128]) -> NDArray[np.complex128]:
 
 
 class _Count:
-    """The count of one pixel, of whose `total` photons a period `early` arrive before 1 - f."""
+    """The count of one pixel; of its `total` photons per period `early` arrive before the phase 1 - f."""
 
     def __init__(self, cells: Cells, name: str, whole: int, early: float, total: float) -> None:
         self.name, self.cycles, self.whole = name, cells.system.cycles, whole
@@ -73,7 +65,7 @@ class _Count:
         self.first = self._first(cells.system.start == "stationary")
 
     def _first(self, stationary: bool) -> FloatArray:
-        """P(first armed period = r) (r,): 1 for r = 0, or of a stationary renewal process, (7)."""
+        """Probabilities (r,) that the first armed period is 0, 1, ...; of a stationary pixel by (7)."""
         if not stationary:
             return np.ones(1)
         longer = np.full(min(self.whole, self.cycles) + 2, self.armed_register)  # P(M > r)
@@ -85,13 +77,14 @@ class _Count:
     def at_least(self, counts: FloatArray) -> FloatArray:
         """P(N >= counts) (n,) (6)."""
         spread = self._spread(float(counts.max()))
-        rows = max(1, int(_CHUNK / (_SUMS * spread)))
+        rows = max(1, int(TOL.synchronous_terms_together / (TOL.synchronous_sums * spread)))
         parts = [self._at_least(counts[k : k + rows], spread) for k in range(0, counts.size, rows)]
         return np.concatenate(parts)
 
     def _spread(self, most: float) -> float:
         """Width of the sum over the number of late registrations, for `most` registrations."""
-        return 1.0 if self.late == 0.0 else 2.0 * (_SPREAD * math.sqrt(most * self.late * (1.0 - self.late)) + 20.0)
+        deviation = math.sqrt(most * self.late * (1.0 - self.late))
+        return 1.0 if self.late == 0.0 else 2.0 * (TOL.synchronous_late * deviation + 20.0)
 
     def _at_least(self, counts: FloatArray, spread: float) -> FloatArray:
         from scipy.special import betainc
@@ -133,16 +126,18 @@ class _Count:
         if self.armed_register == 0.0:
             return Pmf(0, np.ones(1), 0.0)
         low, high = self._reach(most)
-        if low >= _MANY_COUNTS and (high - low) * _SUMS * self._spread(float(most)) > _MANY_TERMS:
+        terms = (high - low) * TOL.synchronous_sums * self._spread(float(most))
+        if low >= TOL.synchronous_counts and terms > TOL.synchronous_terms:
             survival = self._transformed(np.arange(low, high + 2, dtype=np.float64))
-            tail = _LOOSE_TAIL
+            tail = TOL.synchronous_loose_tail
             if not (survival[0] >= 1.0 - tail and survival[-1] <= tail):
                 raise ConvergenceError(f"count law of {self.name}: it extends beyond {low} .. {high}; {_INSTEAD}")
         else:
             self._check((math.log2(most + 1.0) + 1.0) * 2.0, most)
             # rounding error of the sums over the wait for the first armed period
-            tail = _TAIL + (4.0 * np.finfo(float).eps * self.cycles / self.first.size if self.first.size > 2 else 0.0)
-            low, high = self._last(1.0 - tail, most), self._last(_TAIL, most)
+            rounding = 4.0 * np.finfo(float).eps * self.cycles / self.first.size if self.first.size > 2 else 0.0
+            tail = TOL.synchronous_tail + rounding
+            low, high = self._last(1.0 - tail, most), self._last(TOL.synchronous_tail, most)
             self._check(high + 2.0 - low, high)
             survival = self.at_least(np.arange(low, high + 2, dtype=np.float64))
         survival[0], survival[-1] = 1.0, 0.0
@@ -160,7 +155,7 @@ class _Count:
             math.sqrt(mean * ((1.0 - self.armed_register) / self.armed_register**2 + self.late * (1.0 - self.late)))
             / each
         )
-        reach = _REACH * spread + 10.0 + self.first.size / each
+        reach = TOL.synchronous_reach * spread + 10.0 + self.first.size / each
         return max(0, math.floor(mean - reach)), min(most, math.ceil(mean + reach))
 
     def _transformed(self, counts: FloatArray) -> FloatArray:
@@ -169,11 +164,11 @@ class _Count:
         room = self.cycles - 1.0 - (k - 1.0) * (self.whole + 1.0)  # periods that may be lost
         spread = math.sqrt(float(k.max()) * ((1.0 - q) / q**2 + late * (1.0 - late)))
         away = float(np.abs(room - k * (1.0 - q) / q - (k - 1.0) * late).max())
-        half = math.ceil(away + _REACH * spread + n + 64.0 / q)
+        half = math.ceil(away + TOL.synchronous_reach * spread + n + 64.0 / q)
         size, least = 2 * half + 2, float(k.min())
         survival = np.full(k.size, (half + 1.0) / size * float(self.first.sum()))
-        for start in range(1, half + 1, _POINTS):
-            angle = 2.0 * np.pi * np.arange(start, min(start + _POINTS, half + 1)) / size
+        for start in range(1, half + 1, TOL.synchronous_points):
+            angle = 2.0 * np.pi * np.arange(start, min(start + TOL.synchronous_points, half + 1)) / size
             away_from_one = 2.0 * np.sin(0.5 * angle) ** 2 - 1j * np.sin(angle)  # 1 - w
             empty, delayed = -_log1p((1.0 - q) / q * away_from_one), _log1p(-late * away_from_one)
             window = (1.0 - np.exp(1j * angle * (half + 1.0))) / away_from_one
@@ -184,12 +179,12 @@ class _Count:
                 w = np.exp(1j * angle)
                 first += self.first[1] * (w - np.exp(1j * angle * (n - 1.0))) / away_from_one
             weight = 2.0 / size * first * window
-            keep = np.abs(weight) * np.exp(least * empty.real + (least - 1.0) * delayed.real) > _FAINT
+            keep = np.abs(weight) * np.exp(least * empty.real + (least - 1.0) * delayed.real) > TOL.faint
             for c, a, b, t in zip(weight[keep], empty[keep], delayed[keep], angle[keep], strict=True):
                 survival += (c * np.exp(k * a + (k - 1.0) * b - 1j * np.remainder(room * t, 2.0 * np.pi))).real
             if not keep.any():  # the moduli of both factors decrease monotonically with the angle up to pi
                 return np.asarray(np.clip(survival, 0.0, 1.0), dtype=np.float64)
-            if (start + _POINTS) * k.size > LAW.synchronous_points:
+            if (start + TOL.synchronous_points) * k.size > LAW.synchronous_points:
                 break
         raise ConvergenceError(
             f"count law of {self.name}: the count is nearly constant because the dead time spans period starts, and "
@@ -197,7 +192,7 @@ class _Count:
         )
 
     def _check(self, counts: float, most: int) -> None:
-        terms = counts * _SUMS * self._spread(float(most))
+        terms = counts * TOL.synchronous_sums * self._spread(float(most))
         if terms > LAW.synchronous_terms:
             raise ConvergenceError(
                 f"count law of {self.name}: {terms:.2g} terms are too many for mode 'synchronous' with a dead time "

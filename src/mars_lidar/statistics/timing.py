@@ -19,9 +19,7 @@ from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.effects import TIMING_EFFECTS, code_edges
 from mars_lidar.instrument.system import System
 from mars_lidar.statistics.cells import Cells
-
-_PARTS_PER_SIGMA = 24.0  # a part adds 1/6 of its square to the variance: 3e-4 of sigma^2
-_MOST_PARTS = 2**16  # parts of the period: 512 KiB an array
+from mars_lidar.statistics.tolerances import TOL
 
 
 def is_timed(system: System) -> bool:
@@ -41,15 +39,15 @@ def recorded(cells: Cells, compute: Callable[[Cells, int], FloatArray]) -> Float
 class Timing:
     """The map from registrations in equal parts of the period to records in the bins of the histogram.
 
-    `finest` is the standard deviation, in periods, of the narrowest feature of the flux.
+    `finest` is the standard deviation, in periods, of the narrowest feature of the registrations (`Cells.finest`).
     """
 
     def __init__(self, system: System, finest: float) -> None:
         self.system = system
         jitter = system.detector.jitter
-        width = math.hypot(finest, 0.0 if jitter is None else jitter.std_ns / system.period_ns)
-        split = math.ceil(_PARTS_PER_SIGMA / (max(width, 1e-9) * system.bins))
-        split = 2 * max(1, min(split, _MOST_PARTS // system.bins) // 2)
+        width = math.hypot(finest, 0.0 if jitter is None else jitter.finest_ns / system.period_ns)
+        split = math.ceil(TOL.parts_per_sigma / (max(width, 1e-9) * system.bins))
+        split = 2 * max(1, min(split, TOL.most_parts // system.bins) // 2)
         self.parts = system.bins * split
 
     @cached_property

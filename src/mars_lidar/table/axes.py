@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.types import FloatArray
-from mars_lidar.statistics.cells import MAX_PHOTONS
+from mars_lidar.light.tolerances import TOL
 
 Grid = tuple[float, float, int] | ArrayLike
 
@@ -37,8 +37,8 @@ def axis_values(name: str, grid: Grid) -> FloatArray:
     if isinstance(grid, tuple):
         if len(grid) != 3:
             raise ValueError(f"{name} must be (low, high, points) or an array of values, got {grid!r}")
-        low = checks.real(f"{name}[0]", grid[0], low=0.0, high=MAX_PHOTONS, strict_low=True)
-        high = checks.real(f"{name}[1]", grid[1], low=0.0, high=MAX_PHOTONS, strict_low=True)
+        low = checks.real(f"{name}[0]", grid[0], low=0.0, high=TOL.photons, strict_low=True)
+        high = checks.real(f"{name}[1]", grid[1], low=0.0, high=TOL.photons, strict_low=True)
         points = checks.integer(f"{name}[2]", grid[2], low=2, high=MAX_POINTS)
         if not high > low:
             raise ValueError(f"{name} must be (low, high, points) with high > low, got {grid!r}")
@@ -49,8 +49,8 @@ def axis_values(name: str, grid: Grid) -> FloatArray:
     if values.ndim != 1 or not 1 <= values.size <= MAX_POINTS:
         raise ValueError(f"{name} must have shape (n,) with n from 1 to {MAX_POINTS}, got {values.shape}")
     values = values.astype(np.float64)
-    if not ((values >= 0) & (values <= MAX_PHOTONS)).all() or not (np.diff(values) > 0).all():
-        raise ValueError(f"{name} must be strictly ascending photons per period in [0, {MAX_PHOTONS:g}], got {values}")
+    if not ((values >= 0) & (values <= TOL.photons)).all() or not (np.diff(values) > 0).all():
+        raise ValueError(f"{name} must be strictly ascending photons per period in [0, {TOL.photons:g}], got {values}")
     return values
 
 

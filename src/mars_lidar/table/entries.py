@@ -20,11 +20,11 @@ from mars_lidar._base.native import _core
 from mars_lidar._base.progress import of_part
 from mars_lidar._base.types import FloatArray, IndexArray, Progress
 from mars_lidar.instrument.system import System
-from mars_lidar.light.flux import Flux
-from mars_lidar.statistics.cells import Cells, cell_name, default_bins, flat, reals, with_delays
+from mars_lidar.light.flux import Flux, broadcast
+from mars_lidar.statistics.cells import Cells, cell_name, default_bins, flat
 from mars_lidar.statistics.chain import PhaseChain, Rearm
 from mars_lidar.statistics.count_pmf import Pmf, guessed_windows
-from mars_lidar.statistics.exposure import UNSETTLED, _run, blank, native_light, normalised, refined_moments
+from mars_lidar.statistics.exposure import Settled, _run, blank, native_light, normalised, refined_moments
 from mars_lidar.statistics.matched import trusted
 from mars_lidar.statistics.phase_chain import ConvergenceError
 from mars_lidar.statistics.renewal import holding_times
@@ -356,8 +356,8 @@ def _corrections(cells: Cells, bins: int, phase: FloatArray, threads: int) -> tu
         phase=np.rint(np.interp(phase, cells.edges(bins), np.arange(bins + 1))).astype(np.int32),
         correction=out,
     )
-    if (settled == UNSETTLED).any():
-        k = int(np.argmax(settled == UNSETTLED))
+    if (settled == Settled.UNSETTLED).any():
+        k = int(np.argmax(settled == Settled.UNSETTLED))
         raise ConvergenceError(
             f"start-phase correction of {cells.name(k)}: the state of the pixel does not repeat from period to "
             "period for so long that the exposure cannot be run to its end"
@@ -587,8 +587,11 @@ def read_pixels(
     The phase, in [0, 1) periods, is by how much the return comes before the canonical delay, half a period; 0 where
     there is no return.
     """
-    parts = with_delays(reals("signal", signal), reals("background", background), delay_ns, period_ns)
-    s, b, delay = (flat(part) for part in parts)
+    delay_ns = 0.5 * period_ns if delay_ns is None else delay_ns
+    given = [np.asarray(values, dtype=np.float64) for values in (signal, background, delay_ns)]
+    s, b, delay = (flat(part) for part in broadcast(("signal", "background", "delay_ns"), given))
+    if (bad := ~np.isfinite(delay) & ~(np.isnan(delay) & (s == 0))).any():
+        raise ValueError(f"delay_ns must be finite (NaN for no return where signal is 0), got {delay[bad][0]}")
     beyond = np.zeros(s.size, dtype=bool)
     for name, values, axis in (("signal", s, axes[0]), ("background", b, axes[1])):
         if not (values >= 0).all():

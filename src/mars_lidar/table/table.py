@@ -21,19 +21,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.brief import brief
+from mars_lidar._base.display import brief
 from mars_lidar._base.files import reading, reason
-from mars_lidar._base.memory import check_memory
 from mars_lidar._base.progress import callback_of, of_part
-from mars_lidar._base.threads import thread_count
+from mars_lidar._base.resources import check_memory, thread_count
 from mars_lidar._base.types import FloatArray, Progress
 from mars_lidar._version import __version__
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
+from mars_lidar.statistics.cells import require_mode
 from mars_lidar.statistics.chain import Rearm
-from mars_lidar.statistics.distance import Pmf, total_variation
+from mars_lidar.statistics.count_pmf import Pmf, total_variation
 from mars_lidar.statistics.exposure import exposure_moments, normalised
-from mars_lidar.statistics.gate import require_mode
 from mars_lidar.statistics.law import count_law
 from mars_lidar.statistics.matched import matched_pmf
 from mars_lidar.statistics.phase_chain import ConvergenceError

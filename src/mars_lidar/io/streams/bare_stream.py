@@ -12,14 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar._base.files import open_npz
-from mars_lidar._base.text import read_column
+from mars_lidar._base.files import open_npz, read_column
 from mars_lidar.io.named_arrays import mat_arrays
 from mars_lidar.io.streams.photons import NoLaserError, Photons, of_pixels
 from mars_lidar.light.timestamps import Timestamps
 
 _BINS = 1024  # of times that are no whole numbers of a unit, where none are asked for
-_MOST_BINS = 2**20
+_MOST_BINS = 2**20  # of a period, as `bins` may be at most
 _FINEST_NS = 1e-6  # unit that times are counted in that are no whole numbers of one
 _PERIODS = ("syncPeriod", "sync_period", "period")  # names under which files give the laser period, in their unit
 _SUFFIX_NS = {"_ps": 1e-3, "_ns": 1.0, "_us": 1e3, "_s": 1e9}
@@ -31,9 +30,9 @@ def read(
     path: Path, period_ns: float | None, bins: int | None, unit_ns: float | None, variable: str | None
 ) -> Timestamps:
     """Read a stream; see `Timestamps.load`."""
-    found, name, cells, unit = _times(path, unit_ns, variable)
+    variables, name, cells, unit = _times(path, unit_ns, variable)
     if period_ns is None:
-        period_ns = _period(found, unit)
+        period_ns = _period(variables, unit)
     if period_ns is None:
         raise NoLaserError(f"{path} does not tell the laser period: give period_ns")
     raw, pixel, clocked = _flat(path, name, cells)
@@ -79,48 +78,46 @@ def _flat(path: Path, name: str, cells: _Cells) -> tuple[NDArray[np.float64], ND
 def _times(path: Path, unit_ns: float | None, variable: str | None) -> tuple[dict[str, _Cells], str, _Cells, float]:
     """All variables, the name and the cells of the one that holds the times, and their unit, ns."""
     if path.suffix in (".csv", ".txt"):
-        found = {"": _one(read_column(path))}
+        variables = {"": _single(read_column(path))}
     elif path.suffix == ".mat":
-        found = cells_of(mat_arrays(path, deep=False))
+        variables = cells_of(mat_arrays(path, deep=False))
     else:
         with open_npz(path) as archive:
-            found = cells_of({name: np.atleast_1d(archive[name]) for name in archive.files})
-    name, cells = _chosen(path, found, variable)
+            variables = cells_of({name: np.atleast_1d(archive[name]) for name in archive.files})
+    name, cells = _chosen(path, variables, variable)
     unit = unit_ns
     if unit is None:
         unit = next((ns for ending, ns in _SUFFIX_NS.items() if name.endswith(ending)), None)
     if unit is None:
         raise ValueError(f"{path}: nothing tells the unit of {name!r}: give unit_ns (1 if its times are in ns)")
-    return found, name, cells, unit
+    return variables, name, cells, unit
 
 
-def _chosen(path: Path, found: dict[str, _Cells], variable: str | None) -> tuple[str, _Cells]:
+def _chosen(path: Path, variables: dict[str, _Cells], variable: str | None) -> tuple[str, _Cells]:
     """The variable that holds the times: the one named, the only cell array, or the only vector."""
     if variable is not None:
-        if variable not in found:
-            raise ValueError(f"variable must be one of {', '.join(found) or 'none'} in {path}, got {variable!r}")
-        return variable, found[variable]
-    images = [name for name, cells in found.items() if cells.size > 1]
-    vectors = [name for name, cells in found.items() if cells.size == 1 and cells[0, 0].size > 1]
+        if variable not in variables:
+            raise ValueError(f"variable must be one of {', '.join(variables) or 'none'} in {path}, got {variable!r}")
+        return variable, variables[variable]
+    images = [name for name, cells in variables.items() if cells.size > 1]
+    vectors = [name for name, cells in variables.items() if cells.size == 1 and cells[0, 0].size > 1]
     for names in (images, vectors):
         if len(names) == 1:
-            return names[0], found[names[0]]
-    told = ", ".join(images or vectors)
-    raise ValueError(
-        f"{path} has {'several arrays that could be times: ' + told if told else 'no array of times'}; give variable"
-    )
+            return names[0], variables[names[0]]
+    several = f"several arrays that could be times: {', '.join(images or vectors)}"
+    raise ValueError(f"{path} has {several if images or vectors else 'no array of times'}; give variable")
 
 
-def _period(found: dict[str, _Cells], unit: float) -> float | None:
+def _period(variables: dict[str, _Cells], unit: float) -> float | None:
     for name in _PERIODS:
-        if name in found and found[name].size == 1 and found[name][0, 0].size == 1:
-            value = float(found[name][0, 0].ravel()[0]) * unit
+        if name in variables and variables[name].size == 1 and variables[name][0, 0].size == 1:
+            value = float(variables[name][0, 0].ravel()[0]) * unit
             if np.isfinite(value) and value > 0:
                 return value
     return None
 
 
-def _one(values: NDArray[Any]) -> _Cells:
+def _single(values: NDArray[Any]) -> _Cells:
     out = np.empty((1, 1), object)
     out[0, 0] = values.ravel()
     return out
@@ -130,14 +127,14 @@ def _is_times(values: Any) -> bool:
     return isinstance(values, np.ndarray) and values.dtype.kind in "fiu" and values.size == max((0, *values.shape))
 
 
-def cells_of(found: dict[str, Any]) -> dict[str, _Cells]:
+def cells_of(variables: dict[str, Any]) -> dict[str, _Cells]:
     """The vectors and cell arrays of a .mat by name: (H, W) of vectors, (1, 1) for a plain one."""
     out: dict[str, _Cells] = {}
-    for name, values in found.items():
+    for name, values in variables.items():
         if isinstance(values, np.ndarray) and values.dtype == object:
             cells = np.atleast_2d(values)
             if all(_is_times(cell) or (isinstance(cell, np.ndarray) and cell.size == 0) for cell in cells.ravel()):
                 out[name] = cells
         elif _is_times(values):
-            out[name] = _one(values)
+            out[name] = _single(values)
     return out

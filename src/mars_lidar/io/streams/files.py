@@ -20,22 +20,21 @@ from mars_lidar._base.files import (
     reading,
     unfinished_of,
 )
-from mars_lidar.io.streams import picoquant
-from mars_lidar.io.streams.photons import FORMAT, Photons, attributes, from_attributes
+from mars_lidar.io.streams.photons import BEFORE_PTU, FORMAT, Photons, attributes, from_attributes
 from mars_lidar.light.timestamps import Timestamps
 
 STREAM_SUFFIXES = (".npz", ".ptu", ".h5", ".hdf5")
 _MODULES = {  # that read them; of .npz, those of others
     ".npz": "bare_stream",
-    ".ptu": "ptu_stream",
+    ".ptu": "ptu",
     ".h5": "photon_hdf5",
     ".hdf5": "photon_hdf5",
     ".mat": "bare_stream",
     ".csv": "bare_stream",
     ".txt": "bare_stream",
-    **dict.fromkeys(picoquant.SUFFIXES, "ptu_stream"),
-    ".t3r": "timeharp",
-    ".spc": "becker_hickl",
+    **dict.fromkeys(BEFORE_PTU, "ptu"),
+    ".t3r": "recorders",
+    ".spc": "recorders",
 }
 _BARE = (".mat", ".npz", ".csv", ".txt")  # may have no header
 READ_SUFFIXES = tuple(_MODULES)
@@ -66,7 +65,7 @@ def check_output(path: str | Path, *, overwrite: bool = False, clock_ps: float |
             raise ValueError(f"clock_ps belongs to a .ptu, got {str(path)!r}")
     module = _module(Path(path), STREAM_SUFFIXES)
     if Path(path).suffix != ".npz":
-        module.check()
+        module.check_library()
     check_target(Path(path), folder=False, overwrite=overwrite)
 
 
@@ -105,16 +104,16 @@ def load(
         if plain.suffix in STREAM_SUFFIXES:
             times: Timestamps = module.read(source, period_ns, bins)
             return times
-        found: Photons = module.photons(source)
-        return found.timestamps(period_ns, bins)
+        photons: Photons = module.photons(source)
+        return photons.timestamps(period_ns, bins)
 
 
 def recorded(path: Path, *, unit_ns: float | None = None, variable: str | None = None) -> Photons:
     """The photons of another program's file as its recorder counted them; `Timestamps.load` has the arguments."""
     module = _module(path)
     with reading(path, "a photon stream"):
-        found: Photons = module.photons(path, *((unit_ns, variable) if path.suffix in _BARE else ()))
-        return found
+        photons: Photons = module.photons(path, *((unit_ns, variable) if path.suffix in _BARE else ()))
+        return photons
 
 
 def _read_bare(

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from mars_lidar._base.files import finished_name, whole
 from mars_lidar._base.hdf5 import open_hdf5, seal
-from mars_lidar._base.optional import needed
+from mars_lidar._base.imports import needed
 from mars_lidar.io.streams.photons import Photons, attributes, fine_times, of_fine_times
 from mars_lidar.light.timestamps import Timestamps
 
@@ -33,14 +33,14 @@ _PHOTONS = "photon_data"
 _FULL = 2**20  # bytes free on a disk that is taken for full
 
 
-def check() -> None:
+def check_library() -> None:
     """Raise where the library that writes the format is missing."""
     needed("phconvert.hdf5", "Photon-HDF5")
 
 
 def write(path: Path, times: Timestamps) -> None:
     """Write a stream; the caller renames the file when it is whole."""
-    save_photon_hdf5 = needed("phconvert.hdf5", "Photon-HDF5").save_photon_hdf5
+    library = needed("phconvert.hdf5", "Photon-HDF5")
     fine = units_per_bin(times.bins)
     kind = np.uint16 if times.bins * fine <= 2**16 else np.uint32
     nanotimes: NDArray[Any] = fine_times(times, fine).astype(kind)
@@ -86,40 +86,38 @@ def write(path: Path, times: Timestamps) -> None:
         "user": {_GROUP: {_ATTRIBUTES: json.dumps(attributes(times))}},
     }
     try:
-        with warnings.catch_warnings(), open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
-            warnings.simplefilter("ignore")  # of PyTables, about names that are no Python identifiers
-            save_photon_hdf5(
-                content,
-                str(path),
-                overwrite=True,
-                warnings=False,
-                compression={"complevel": 1, "complib": "zlib", "fletcher32": True},
-            )
-    except Exception as error:  # on a full disk PyTables tells a back trace, or phconvert that the file is wrong
-        told = re.search(r"errno = (\d+)", str(error))
-        if told is None and shutil.disk_usage(path.parent).free > _FULL:
+        try:
+            with warnings.catch_warnings(), open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
+                warnings.simplefilter("ignore")  # of PyTables, about names that are no Python identifiers
+                packing = {"complevel": 1, "complib": "zlib", "fletcher32": True}
+                library.save_photon_hdf5(content, str(path), overwrite=True, warnings=False, compression=packing)
+        finally:
+            file = content.get("_data_file")
+            if file is not None and file.isopen:
+                file.close()
+        _name_and_seal(path, finished_name(path))
+    except Exception as error:  # on a full disk PyTables raises a back trace, or phconvert reads other values back
+        number = re.search(r"errno = (\d+)", str(error))
+        full = shutil.disk_usage(path.parent).free < _FULL
+        if number is None and not full and not isinstance(error, library.Invalid_PhotonHDF5):
             raise
-        raise OSError(int(told[1]) if told else errno.ENOSPC, "Photon-HDF5 could not be written") from None
-    finally:
-        file = content.get("_data_file")
-        if file is not None and file.isopen:
-            file.close()
-    _name_and_seal(path, finished_name(path))
+        code = int(number[1]) if number else errno.ENOSPC if full else errno.EIO
+        raise OSError(code, "Photon-HDF5 could not be written") from None
 
 
 def read(path: Path, period_ns: float | None, bins: int | None) -> Timestamps:
     """Read a stream; `period_ns` and `bins` are for files of others."""
     with _opened(path) as file:
-        found = _photons(path, file)
+        photons = _photons(path, file)
         own = file.get(f"user/{_GROUP}/{_ATTRIBUTES}")
         attrs = {} if own is None else json.loads(own[()])  # text or bytes
-    if not attrs or found.fine is None:
-        return found.timestamps(period_ns, bins)
+    if not attrs or photons.fine is None:
+        return photons.timestamps(period_ns, bins)
     if period_ns is not None or bins is not None:
         raise ValueError(f"{path} tells its period and bins: period_ns and bins are for the streams of others")
-    order = np.argsort(found.detector, kind="stable")
-    since, fine = found.fine[order].astype(np.int64), units_per_bin(int(attrs["bins"]))
-    return of_fine_times(attrs, found.clock[order], since, fine, found.detector)
+    order = np.argsort(photons.detector, kind="stable")
+    since, fine = photons.fine[order].astype(np.int64), units_per_bin(int(attrs["bins"]))
+    return of_fine_times(attrs, photons.clock[order], since, fine, photons.detector)
 
 
 def photons(path: Path) -> Photons:

@@ -18,11 +18,21 @@ from mars_lidar._base.files import FileError
 from mars_lidar._version import __version__
 from mars_lidar.light.timestamps import Timestamps
 
+BEFORE_PTU = (".pt2", ".pt3", ".ht2", ".ht3")  # PicoQuant's formats before PTU
 FORMAT = "mars-lidar timestamps"
 FORMAT_VERSION = 1
-_SAME = 1e-3  # relative difference within which a clock counts laser periods
-_SYNCS = 100  # records of a channel that may be a laser's sync
-_EVEN = 1e-2  # spread of their intervals, relative
+
+
+@dataclass(frozen=True)
+class _SyncTolerances:
+    """What is taken for the pulses of a laser in a file that does not name them."""
+
+    period: float = 1e-3  # relative difference of a clock's unit from the period, where the clock counts periods
+    records: int = 100  # of a channel, at least
+    jitter: float = 1e-2  # standard deviation of their intervals, relative
+
+
+_SYNC = _SyncTolerances()
 
 
 class NoLaserError(FileError):
@@ -68,7 +78,7 @@ class Photons:
                 f"{self.source} does not tell the laser period: its clock of {self.clock_ns:g} ns runs free; "
                 "mars-lidar reconstruct takes its histograms, mars-lidar calibrate its dead time"
             )
-        if abs(self.clock_ns / period_ns - 1.0) > _SAME:
+        if abs(self.clock_ns / period_ns - 1.0) > _SYNC.period:
             raise ValueError(
                 f"{self.source}: timestamps must count laser periods of {period_ns:g} ns where there are nanotimes, "
                 f"their unit is {self.clock_ns:g} ns"
@@ -80,14 +90,14 @@ class Photons:
         for channel in np.unique(self.detector):
             sync = self.clock[self.detector == channel].astype(np.int64)
             apart = np.diff(sync)
-            if apart.size < _SYNCS or float(apart.std()) > _EVEN * float(apart.mean()):
+            if apart.size < _SYNC.records or float(apart.std()) > _SYNC.jitter * float(apart.mean()):
                 continue
-            kept = (self.detector != channel) & (self.detector >= 0) & (self.clock >= sync[0])
-            clock = self.clock[kept].astype(np.int64)
+            photon = (self.detector != channel) & (self.detector >= 0) & (self.clock >= sync[0])
+            clock = self.clock[photon].astype(np.int64)
             cycle = np.searchsorted(sync, clock, "right") - 1
             period = float(apart.mean()) * self.clock_ns
             fine = clock - sync[cycle]
-            return measured(cycle, fine, self.clock_ns, self.detector[kept], period, bins, self.source)
+            return measured(cycle, fine, self.clock_ns, self.detector[photon], period, bins, self.source)
         raise NoLaserError(
             f"{self.source} holds absolute times without laser pulses: give period_ns; without a laser, "
             "mars-lidar calibrate gives dead time and afterpulses"

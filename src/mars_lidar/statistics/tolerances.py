@@ -1,0 +1,237 @@
+"""Accuracies, sizes of grids and sizes of blocks of the statistics of one pixel.
+
+What a statistic may cost is in `budget.py`. Every result is checked where it is computed, against a finer grid, a
+residual or known moments, so that a coarse first guess costs time and not accuracy.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Tolerances:
+    """Numbers of the statistics that are no arguments.
+
+    Attributes
+    ----------
+    rounding
+        Relative size of what counts as rounding: eps times the some thousand terms of a sum.
+    repeats
+        Relative change of the state of a pixel per period at which it repeats, (20) of docs/theory_exposure.md.
+    forgotten
+        Total variation from the stationary state at which the joint law takes the start as forgotten.
+    most_bins, most_even_bins
+        Bins per period of any statistics grid (8 MiB an array), and of equal bins where others follow the pulse.
+    first_bins, most_first_bins
+        Bins per period of the coarsest and finest first grid; refinement goes beyond.
+    unrefined_bins
+        Least bins of grids that are not refined, of the phase chain and without a dead time, and of the first grid that
+        follows the pulse: with fewer the discretisation of the chain is visible in the variance of the count.
+    chain_bins_per_width
+        Bins of the phase chain in the width 1 / max s of the pulse, 2.507 sigma of a Gaussian: a bin is sigma / 3.
+    pulse_samples
+        Samples of the support of the pulse from which its width is computed.
+    detected_bins, resolved_bins
+        Grid bins per sigma of the pulse from which refinement of a grid detects the pulse, and from which finer bins
+        change nothing.
+    pulse_blocks, block_bins
+        Fewest blocks of the period on a grid that follows the pulse (no block holds both ends of a wrapped pulse), and
+        fewest bins of a block, half of them on the pulse.
+    knots_per_sigma, longest_pulse
+        Grid points per sigma of a pulse; support of a pulse, in sigma, up to which a grid that follows it resolves it.
+    warm_periods, least_warm_periods, warm_steps
+        Sweeps towards the stationary state, at most, at least, and times bins; beyond, a sparse equation gives it.
+    chunk_bytes
+        Energies and histograms computed together.
+    near_bytes, middle_bytes
+        History of one dead time up to which a step takes 15 to 60 ns, and up to 100 ns; beyond, 100 to 350 ns.
+    many_bins
+        Bins of a histogram beyond which it is interpolated from a coarser grid, and of the largest grid of the joint
+        law (a second or two) for histograms of fewer.
+    cells_of_many, joint_cells_of_many
+        Bins of the coarser grids, tried in turn: mean histogram, and joint law.
+    few_windows_bins
+        Bins of a grid of the joint law beyond which fewer windows are compared: a window takes long.
+    block
+        Cells, windows or bins of a matrix product computed together.
+    sampled_delays
+        Cells of sampled afterpulse delays: 32 MiB an array.
+    constant_light_rounds
+        Iterations for the mean rate under constant light; a divergence is refused.
+    tail
+        Bound on the probability outside the support of a count law, at either end.
+    most_counts
+        Counts of a listed law: 128 MiB.
+    lanes
+        Points of the circle that the native core evaluates together.
+    near_transform_bytes, far_transform_bytes, far_transform, period_bins
+        History of these points beyond which a step costs `far_transform` times as much, as for a dead time below one
+        bin, and six times that; bins that take as long as the work done once a period.
+    most_tilt, most_log_growth
+        Largest exponential tilt per count, and logarithm of E e^(theta N) of one period: the largest double is e^709.
+    consistent, consistent_per_cycle
+        Allowed disagreement of a pmf with its cumulants, in standard deviations, and for rounding per extrapolated
+        cycle.
+    support_share, support_spreads
+        Share of `Budget.transform` for bounds of the support; beyond, its half width is so many standard deviations
+        plus one count.
+    guess_spreads, guess_counts, widest_guess
+        Half width of a window guessed from mean and variance: standard deviations and further counts; most counts.
+    edge, record_edge
+        Largest probability at the ends of a window that contains a law, and a law of records.
+    like_mean
+        Allowed difference from the assumed mean of a guessed law, in standard deviations.
+    all_points
+        Counts up to which a law is evaluated on all points of the circle.
+    faint, record_faint
+        Modulus of a transform that counts as 0, and of one of records.
+    short_variance, least_shorter
+        Variance of the count of the shorter exposure in which further peaks of the transform are looked for, and least
+        ratio of the exposures for which that is faster, (27) of docs/theory_exposure.md.
+    blas_thread
+        Multiplications of a matrix product that BLAS libraries do on one thread.
+    record_block
+        Multiplications that take as long as the overhead of a block of records.
+    records_repeat
+        As `repeats`, behind electronics.
+    records
+        Least tolerance of statistics behind electronics with a dead time, the accuracy that is stated for them.
+    direct_bins
+        Bins up to which the stationary equations of records are solved directly.
+    record_turns, record_stands
+        Power iterations for them, and their total variation per iteration, relative to 1 - contraction, at the end.
+    like_moments
+        Allowed disagreement of a pmf of records with mean and variance, in units of the tolerance.
+    rate_steps, light_steps
+        Cost of the rates of a paralyzable bin, at most, and of the light of another, in steps of the recursion.
+    folded_factored
+        Bins of a feedback equation of the joint law that is factorised: a second.
+    folded_residual, folded_change, folded_sweeps, folded_checked
+        Its relative residual; change per sweep relative to the largest value; sweeps, beyond which a factorisation is
+        faster; windows of a block whose residual is checked.
+    chain_sweeps, chain_krylov
+        Gauss-Seidel sweeps of the phase chain before GMRES, and the dimension of the Krylov space.
+    chain_change, chain_residual, chain_worst_residual
+        Relative change per sweep; backward error that ends an iteration (rounding alone gives 1e-16 to 1e-14); largest
+        one of a solution.
+    holding_times
+        Independent routes to a moment of the holding times may differ by this much, relative to its largest term.
+    dense_bins, eigen_bins
+        Bins of dense matrices (512 MiB each), and of an eigen-decomposition, O(n^3).
+    most_lags, most_modes
+        Lags of a covariance, an O(n) product each; eigenvalues that the automatic rule considers.
+    most_mean, matched_outside
+        Mean of a matched law (doubles hold integers up to 9e15); normal probability beyond 8 standard deviations.
+    least_spread
+        Smallest standard deviation of a count relative to Poisson: that of the best locked pixels.
+    paralyzable_periods
+        Whole periods of a paralyzable dead time; the variance sums over each.
+    synchronous_tail, synchronous_loose_tail
+        Probability outside the support of a synchronous law, at either end, by its sums and by its transform.
+    synchronous_late, synchronous_reach
+        Half width, in standard deviations, of the sum over late registrations, and of the law and its transform.
+    synchronous_terms, synchronous_terms_together, synchronous_sums, synchronous_counts, synchronous_points
+        Terms of (6), and counts at the lower end, from which the transform (21) is used; terms computed together, of so
+        many incomplete beta functions each; points of the circle evaluated together.
+    parts_per_sigma, most_parts
+        Parts of the period per sigma of jitter and light (a part adds 1/6 of its square to the variance: 3e-4 of
+        sigma^2), and at most (512 KiB an array).
+    """
+
+    rounding: float = 1e-12
+    repeats: float = 1e-12
+    forgotten: float = 1e-9
+    most_bins: int = 2**20
+    most_even_bins: int = 2**15
+    first_bins: int = 128
+    most_first_bins: int = 2**14
+    unrefined_bins: int = 512
+    chain_bins_per_width: float = 7.5
+    pulse_samples: int = 2**12
+    detected_bins: float = 1 / 8
+    resolved_bins: float = 2.0
+    pulse_blocks: int = 4
+    block_bins: int = 8
+    knots_per_sigma: float = 8.0
+    longest_pulse: float = 64.0
+    warm_periods: int = 400
+    least_warm_periods: int = 4
+    warm_steps: int = 10_000_000
+    chunk_bytes: int = 64 << 20
+    near_bytes: int = 1 << 19
+    middle_bytes: int = 1 << 25
+    many_bins: int = 2**17
+    cells_of_many: tuple[int, ...] = (2**15, 2**17)
+    joint_cells_of_many: tuple[int, ...] = (2**13, 2**15, 2**16)
+    few_windows_bins: int = 2**16
+    block: int = 64
+    sampled_delays: int = 2**22
+    constant_light_rounds: int = 500
+    tail: float = 1e-12
+    most_counts: int = 2**24
+    lanes: int = 8
+    near_transform_bytes: int = 1 << 20
+    far_transform_bytes: int = 1 << 26
+    far_transform: float = 4.0
+    period_bins: float = 128.0
+    most_tilt: float = 25.0
+    most_log_growth: float = 600.0
+    consistent: float = 1e-5
+    consistent_per_cycle: float = 1e-13
+    support_share: float = 0.25
+    support_spreads: float = 12.0
+    guess_spreads: float = 7.5
+    guess_counts: float = 6.0
+    widest_guess: int = 1024
+    edge: float = 1e-10
+    record_edge: float = 1e-9
+    like_mean: float = 0.02
+    all_points: int = 256
+    faint: float = 1e-15
+    record_faint: float = 1e-17
+    short_variance: float = 4.0
+    least_shorter: int = 6
+    blas_thread: int = 250_000
+    record_block: float = 2e4
+    records_repeat: float = 1e-11
+    records: float = 1e-3
+    direct_bins: int = 2048
+    record_turns: int = 2000
+    record_stands: float = 1e-9
+    like_moments: float = 3.0
+    rate_steps: float = 120.0
+    light_steps: float = 10.0
+    folded_factored: int = 2**14
+    folded_residual: float = 1e-9
+    folded_change: float = 1e-10
+    folded_sweeps: int = 200
+    folded_checked: int = 3
+    chain_sweeps: int = 24
+    chain_krylov: int = 48
+    chain_change: float = 1e-15
+    chain_residual: float = 1e-12
+    chain_worst_residual: float = 1e-10
+    holding_times: float = 1e-7
+    dense_bins: int = 8192
+    eigen_bins: int = 4096
+    most_lags: int = 100_000
+    most_modes: int = 12
+    most_mean: float = 1e15
+    matched_outside: float = 1.5e-15
+    least_spread: float = 1e-3
+    paralyzable_periods: int = 20_000
+    synchronous_tail: float = 1e-13
+    synchronous_loose_tail: float = 1e-10
+    synchronous_late: float = 9.0
+    synchronous_reach: float = 11.0
+    synchronous_terms: int = 1 << 18
+    synchronous_terms_together: int = 1 << 20
+    synchronous_sums: int = 6
+    synchronous_counts: int = 20
+    synchronous_points: int = 32
+    parts_per_sigma: float = 24.0
+    most_parts: int = 2**16
+
+
+TOL = Tolerances()

@@ -103,7 +103,10 @@ class Image(Method):
         if self.efficiency is not None and self.efficiency.shape != image:
             raise ValueError(f"efficiency must be of the image's {image} pixels, got shape {self.efficiency.shape}")
         solver = solver_of(photons, threads, self.efficiency)
-        maps, flags = np.empty((_core.IMAGE_SIZES["maps"], image[0] * image[1])), np.empty(image[0] * image[1], np.uint8)
+        maps, flags = (
+            np.empty((_core.IMAGE_SIZES["maps"], image[0] * image[1])),
+            np.empty(image[0] * image[1], np.uint8),
+        )
         settings = settings_of(system)
         solver.solve(settings, self._networks(), maps=maps, flags=flags)
         delay, half_width, deviation, outlier, signal, signal_error, background, number = maps

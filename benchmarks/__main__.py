@@ -9,21 +9,17 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from benchmarks import (
-    effects,
     engines,
     estimators,
     exposures,
     forward,
     laws,
-    memory,
     numpy_mars,
     paths,
     startup,
     storage,
     stream,
-    sweeps,
     user,
-    waveforms,
 )
 from benchmarks.config import DEFAULT, FULL, QUICK, Config
 from benchmarks.floor import Bandwidth, measure_bandwidth
@@ -35,17 +31,11 @@ RESULTS = Path(__file__).parent / "results"
 SECTIONS: dict[str, Callable[[Config, Bandwidth], Section]] = {
     "exact": engines.exact_levels,
     "user": user.first_calls,
-    "numpy": engines.baselines,
     "pipeline": numpy_mars.pipeline,
     "long": exposures.long_exposures,
-    "flux": sweeps.flux_sweep,
-    "cycles": sweeps.exposure_sweep,
-    "pixels": sweeps.image_sweep,
     "paths": paths.exact_paths,
-    "effects": effects.detector_effects,
-    "waveform": waveforms.waveform_engine,
+    "effects": paths.detector_effects,
     "exposure": laws.exposure_laws,
-    "stationary": laws.stationary_distribution,
     "reconstruction": estimators.reconstruction,
     "calibration": estimators.calibration,
     "codecs": storage.codecs,
@@ -53,7 +43,6 @@ SECTIONS: dict[str, Callable[[Config, Bandwidth], Section]] = {
     "epochs": storage.epochs,
     "stream": stream.stream,
     "forward": forward.forward,
-    "memory": memory.peak_memory,
     "import": startup.import_time,
     "cli": startup.command_line,
 }
@@ -94,9 +83,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     size = parser.add_mutually_exclusive_group()
     size.add_argument("--quick", action="store_true", help="under a minute")
-    size.add_argument(
-        "--full", action="store_true", help="many turns, NumPy's loops and the table unscaled: for the record"
-    )
+    size.add_argument("--full", action="store_true", help="many turns, tables unscaled: for the record")
     parser.add_argument(
         "--only",
         action="append",

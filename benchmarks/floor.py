@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import re
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,7 +72,7 @@ ADDITIONS = 16  # of a round of `_core.addition_chain`
 
 
 @lru_cache(maxsize=1)
-def measured_clock(rounds: int = 400_000, turns: int = 30) -> float | None:
+def clock(rounds: int = 400_000, turns: int = 30) -> float | None:
     """Hertz at which one busy core runs, by a chain of dependent additions, a cycle each; None where there is no chain.
 
     The least time of many turns: what interrupts a turn only makes it longer. Processors run faster than the clock
@@ -89,24 +87,6 @@ def measured_clock(rounds: int = 400_000, turns: int = 30) -> float | None:
         chain(rounds)
         seconds.append(time.perf_counter() - began)
     return ADDITIONS * rounds / min(seconds)
-
-
-def clock() -> float | None:
-    """Hertz of the floor: the measured clock, else the nominal one, else None."""
-    return measured_clock() or nominal_clock()
-
-
-@lru_cache(maxsize=1)
-def nominal_clock() -> float | None:
-    """Hertz, from the processor's description; None where that is not told."""
-    try:
-        text = Path("/proc/cpuinfo").read_text()
-    except OSError:
-        return None
-    found = re.search(r"@ ([\d.]+)GHz", text) or re.search(r"cpu MHz\s*: ([\d.]+)", text)
-    if found is None:
-        return None
-    return float(found[1]) * (1e9 if "GHz" in found[0] else 1e6)
 
 
 @dataclass(frozen=True)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 import mars_lidar as ml
 from benchmarks.config import Config
@@ -26,14 +28,45 @@ def forward(config: Config, bandwidth: Bandwidth) -> Section:
     torch.set_num_threads(1)
     try:
         for bins in sorted({64, config.bins}):
-            _rows(section, bins, config, bandwidth)
-            _coarse(section, bins, config)
+            floor = bandwidth.seconds(4 * bins, threads=1, fresh=False)
+            _timed(section, bins, config, _models(bins, config), PIXELS, floor)
+            _timed(section, bins, config, _coarse(bins, config), _MANY, None)
     finally:
         torch.set_num_threads(threads)
     return section
 
 
-def _rows(section: Section, bins: int, config: Config, bandwidth: Bandwidth) -> None:
+Cases = dict[str, tuple[Callable[..., Any], list[torch.Tensor] | None]]  # functions and where their gradients are taken
+
+
+def _timed(section: Section, bins: int, config: Config, models: Cases, pixels: int, floor: float | None) -> None:
+    cases: dict[str, Callable[[], object]] = {}
+    for name, (model, at) in models.items():
+        cases[name] = partial(model, *(at or ()))
+        if at is not None:
+            cases[name + ", gradient"] = partial(_gradient, model, at)
+    for case in cases.values():  # what PyTorch and SciPy load when they are first needed
+        case()
+    cost = {name: 1e6 * min(timing.cpu) / pixels for name, timing in in_turn(cases, config).items()}
+    section.rows += [
+        {
+            "case": name,
+            "bins": bins,
+            "value, CPU us a pixel": cost[name],
+            "value and gradient": cost.get(name + ", gradient"),
+            "write floor us": None if floor is None else 1e6 * floor,
+        }
+        for name in models
+    ]
+
+
+def _light(random: np.random.Generator, pixels: int, period_ns: float) -> list[NDArray[np.float64]]:
+    """S, B and delays."""
+    s, b = np.exp(random.uniform(np.log(0.05), np.log(2.0), (2, pixels)))
+    return [s, b, random.uniform(0.0, period_ns, pixels)]
+
+
+def _models(bins: int, config: Config) -> Cases:
     system = ml.System(
         period_ns=1e3 / 7.5,
         cycles=config.cycles,
@@ -42,57 +75,31 @@ def _rows(section: Section, bins: int, config: Config, bandwidth: Bandwidth) -> 
         detector=ml.Detector(dead_time_ns=75.0),
         start="stationary",
     )
-    random = np.random.default_rng(0)
-    s, b = np.exp(random.uniform(np.log(0.05), np.log(2.0), (2, PIXELS)))
-    tau = random.uniform(0.0, system.period_ns, PIXELS)
+    s, b, tau = _light(np.random.default_rng(0), PIXELS, system.period_ns)
     table = HistogramTable(ml.Table.build(system, (0.04, 2.1, 6), (0.04, 2.1, 6), threads=1))
     counts = torch.from_numpy(ml.simulate(ml.Flux(s[None], b[None], tau[None]), system, seed=0)[0, 0].astype(float))
+    at, double = ([torch.tensor(one, dtype=dtype) for one in (s, b, tau)] for dtype in (torch.float32, torch.float64))
     armed = system.replace(start="armed")
-    models: dict[str, tuple[Callable[..., torch.Tensor], torch.dtype]] = {
-        "expected_histogram": (lambda *x: expected_histogram(*x, system), torch.float32),
-        "expected_histogram, double": (lambda *x: expected_histogram(*x, system), torch.float64),
-        "expected_histogram, armed start": (lambda *x: expected_histogram(*x, armed), torch.float32),
-        "HistogramTable": (table, torch.float32),
-        "histogram_log_likelihood": (lambda *x: histogram_log_likelihood(counts, *x, system), torch.float32),
+    return {
+        "mean_histogram": (lambda: ml.mean_histogram(ml.Flux(s, b, tau), system, threads=1), None),
+        "expected_histogram": (partial(expected_histogram, system=system), at),
+        "expected_histogram, double": (partial(expected_histogram, system=system), double),
+        "expected_histogram, armed start": (partial(expected_histogram, system=armed), at),
+        "HistogramTable": (table, at),
+        "histogram_log_likelihood": (partial(histogram_log_likelihood, counts, system=system), at),
     }
-    cases: dict[str, Callable[[], object]] = {
-        "mean_histogram": lambda: ml.statistics.mean_histogram(ml.Flux(s, b, tau), system, threads=1)
-    }
-    for name, (model, dtype) in models.items():
-        at = [torch.tensor(one, dtype=dtype) for one in (s, b, tau)]
-        cases[name] = lambda model=model, at=at: model(*at)
-        cases[name + ", gradient"] = lambda model=model, at=at: _gradient(model, at)
-    for case in cases.values():  # what PyTorch and SciPy load when they are first needed
-        case()
-    timings = in_turn(cases, config)
-    floor = bandwidth.seconds(4 * PIXELS * bins, threads=1, fresh=False) / PIXELS
-    for name in ("mean_histogram", *models):
-        value, both = (timings.get(one) for one in (name, name + ", gradient"))
-        assert value is not None
-        section.rows.append(
-            {
-                "case": name,
-                "bins": bins,
-                "value, CPU us a pixel": 1e6 * min(value.cpu) / PIXELS,
-                "value and gradient": None if both is None else 1e6 * min(both.cpu) / PIXELS,
-                "write floor us": 1e6 * floor,
-            }
-        )
 
 
-def _coarse(section: Section, bins: int, config: Config) -> None:
+def _coarse(bins: int, config: Config) -> Cases:
     """The likelihood where bins are cut, beside its plain form: by the width of a bin, and re-armed in the pulse."""
     random = np.random.default_rng(0)
-    s, b = np.exp(random.uniform(np.log(0.05), np.log(2.0), (2, _MANY)))
+    at = [torch.from_numpy(one) for one in _light(random, _MANY, 100.0)]
     counts = torch.from_numpy(random.poisson(30.0, (_MANY, bins)).astype(float))
-    cases: dict[str, Callable[[], object]] = {}
+    cases: Cases = {}
+    again, twice = ", re-armed in the pulse", ", re-armed after two dead times"
     for sigmas, dead, words in (
         (0.34, 50.0, " (not cut)"),
-        *(
-            (wide, dead, words)
-            for wide in (1.0, 3.0)
-            for dead, words in ((75.0, ""), (99.0, ", re-armed in the pulse"))
-        ),
+        *((wide, dead, words) for wide in (1.0, 3.0) for dead, words in ((75.0, ""), (99.0, again), (51.0, twice))),
     ):
         system = ml.System(
             period_ns=100.0,
@@ -101,22 +108,9 @@ def _coarse(section: Section, bins: int, config: Config) -> None:
             pulse=ml.GaussianPulse(sigma_ns=100.0 / bins / sigmas),
             detector=ml.Detector(dead_time_ns=dead),
         )
-        at = [torch.from_numpy(one) for one in (s, b, random.uniform(0.0, 100.0, _MANY))]
         name = f"histogram_log_likelihood, bins of {sigmas:g} sigma{words}"
-        model = partial(histogram_log_likelihood, counts, system=system)
-        cases[name], cases[name + ", gradient"] = partial(model, *at), partial(_gradient, model, at)
-    timings = in_turn(cases, config)
-    for name in list(cases)[::2]:
-        value, both = timings[name], timings[name + ", gradient"]
-        section.rows.append(
-            {
-                "case": name,
-                "bins": bins,
-                "value, CPU us a pixel": 1e6 * min(value.cpu) / _MANY,
-                "value and gradient": 1e6 * min(both.cpu) / _MANY,
-                "write floor us": None,
-            }
-        )
+        cases[name] = partial(histogram_log_likelihood, counts, system=system), at
+    return cases
 
 
 def _gradient(model: Callable[..., torch.Tensor], at: list[torch.Tensor]) -> list[torch.Tensor | None]:

@@ -1,4 +1,4 @@
-"""The analytic half: count laws, shapes and the stationary distribution, beside the dense eigen-solution."""
+"""The analytic half: laws of the count, shapes and the stationary distribution."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from mars_lidar.statistics.count_pmf import guessed_windows
 from mars_lidar.statistics.exposure import exposure_moments, refined_moments
 from mars_lidar.statistics.law import count_law
 
-GOAL_MOMENTS_MS, GOAL_PMF_MS, GOAL_STATIONARY_MS, GOAL_TABLE_S = 3.0, 20.0, 50.0, 30.0
+GOAL_MOMENTS_MS, GOAL_PMF_MS, GOAL_TABLE_S = 3.0, 20.0, 30.0
 TABLE = (256, 100)  # of the paper: S x B, log-spaced on [0.01, 10]
-_SIGNAL, _BACKGROUND = 1.0, 0.5
+_FINE = 16_384  # bins of the stationary distribution
 
 
 def exposure_laws(config: Config, bandwidth: Bandwidth) -> Section:
@@ -38,6 +38,8 @@ def exposure_laws(config: Config, bandwidth: Bandwidth) -> Section:
     narrow = Cells.of(10.0 ** random.uniform(0.3, 1.0, 64), 10.0 ** random.uniform(-2.0, 0.0, 64), instrument)
     known = refined_moments(narrow, 1, tolerance=1e-4, threads=1)
 
+    photons = photons_per_bin(Flux(1.0, 0.5, 0.5 * PERIOD_NS), instrument, bins=_FINE)
+
     cases: dict[str, tuple[int, int, Callable[[], object]]] = {
         "moments and mean histogram": (
             signal.size,
@@ -50,6 +52,11 @@ def exposure_laws(config: Config, bandwidth: Bandwidth) -> Section:
             1,
             lambda: guessed_windows(narrow, known.cumulants, known.bins, 1),
         ),
+        f"stationary distribution, {_FINE} bins": (
+            1,
+            1,
+            lambda: PhaseChain(photons, instrument.dead_time_periods).stationary(),
+        ),
         "table entries, moments and shapes": (
             grid.shape[1],
             every,
@@ -58,7 +65,7 @@ def exposure_laws(config: Config, bandwidth: Bandwidth) -> Section:
     }
     times = in_turn({name: case for name, (_, _, case) in cases.items()}, config)
     section = Section("Laws of a finite exposure", notes=[_EXPOSURE_NOTE])
-    section.rows = [_row(name, config.bins, threads, cells, times[name]) for name, (cells, threads, _) in cases.items()]
+    section.rows = [_row(name, threads, cells, times[name]) for name, (cells, threads, _) in cases.items()]
     cell_ms = {row["case"]: row["ms per (S, B)"] for row in section.rows}
     whole = 1e-3 * cell_ms["table entries, moments and shapes"] * TABLE[0] * TABLE[1]
     scaled = "" if grid.shape[1] == TABLE[0] * TABLE[1] else f", scaled from {grid.shape[1]}"
@@ -75,43 +82,6 @@ def exposure_laws(config: Config, bandwidth: Bandwidth) -> Section:
     return section
 
 
-def stationary_distribution(config: Config, bandwidth: Bandwidth) -> Section:
-    """Ours by O(n) products; the paper's way by a dense matrix and its eigenvectors."""
-    del bandwidth
-    dense, fine = config.dense_bins, config.chain_bins
-    cases: dict[str, Callable[[], object]] = {
-        f"feedback equation, {dense} bins": lambda: _chain(config, dense).stationary(),
-        f"dense matrix and eigenvectors, {dense} bins": lambda: dense_stationary(_chain(config, dense)),
-        f"feedback equation, {fine} bins": lambda: _chain(config, fine).stationary(),
-    }
-    times = in_turn(cases, config)
-    ours, paper, _ = times.values()
-    section = Section("Stationary distribution")
-    section.notes.append(
-        f"S = {_SIGNAL:g}, B = {_BACKGROUND:g}, one (S, B). At {dense} bins the eigenvectors of the dense "
-        f"matrix, the paper's way, take {paper.ratio(ours):.0f} times as long."
-    )
-    for name in cases:
-        bins = fine if str(fine) in name else dense
-        section.rows.append(_row(name, bins, 1, 1, times[name]))
-    found = 1e3 * times[f"feedback equation, {fine} bins"].median
-    section.goals.append(Goal(f"stationary distribution, {fine} bins", found, GOAL_STATIONARY_MS, "ms"))
-    return section
-
-
-def dense_stationary(chain: PhaseChain) -> NDArray[np.float64]:
-    """Stationary distribution as the left eigenvector of the dense transition matrix for the eigenvalue 1."""
-    values, vectors = np.linalg.eig(chain.dense().T)
-    vector = np.abs(vectors[:, np.argmin(np.abs(values - 1.0))])
-    return np.asarray(vector / vector.sum())
-
-
-def _chain(config: Config, bins: int) -> PhaseChain:
-    instrument = system(config)
-    photons = photons_per_bin(Flux(_SIGNAL, _BACKGROUND, 0.5 * PERIOD_NS), instrument, bins=bins)
-    return PhaseChain(photons, instrument.dead_time_periods)
-
-
 def _table_entries(number: int) -> NDArray[np.float64]:
     """(2, number) entries (S, B) of the paper's table, spread evenly over it."""
     axes = np.meshgrid(*(np.geomspace(0.01, 10.0, points) for points in TABLE), indexing="ij")
@@ -120,10 +90,9 @@ def _table_entries(number: int) -> NDArray[np.float64]:
     return every[:, np.sort(order[:number])]
 
 
-def _row(case: str, bins: int, threads: int, cells: int, timing: Timing) -> Row:
+def _row(case: str, threads: int, cells: int, timing: Timing) -> Row:
     return {
         "case": case,
-        "bins": bins,
         "threads": threads,
         "(S, B)": cells,
         "ms": 1e3 * timing.median,

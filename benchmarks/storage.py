@@ -24,12 +24,7 @@ LEVELS = (10.0, 1.0, 0.1, 0.01)  # mean signal photons per period; SBR 1
 GOAL_SHARE, GOAL_SIZE, GOAL_MEMORY_GIB, GOAL_WORKERS = 0.6, 0.2, 1.5, 1.7
 _CODECS: dict[str, Any] = {
     "blosc lz4-5 bitshuffle": Blosc("lz4", 5, Blosc.BITSHUFFLE),
-    "blosc lz4-1 bitshuffle": Blosc("lz4", 1, Blosc.BITSHUFFLE),
     "blosc zstd-1 bitshuffle": Blosc("zstd", 1, Blosc.BITSHUFFLE),
-    "blosc zstd-3 bitshuffle": Blosc("zstd", 3, Blosc.BITSHUFFLE),
-    "blosc zstd-1 shuffle": Blosc("zstd", 1, Blosc.SHUFFLE),
-    "blosc blosclz-1 bitshuffle": Blosc("blosclz", 1, Blosc.BITSHUFFLE),
-    "zstd-1": Zstd(1),
     "zstd-3": Zstd(3),
 }
 

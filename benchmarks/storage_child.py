@@ -15,8 +15,8 @@ import zarr  # noqa: F401  (its import is not part of what is measured)
 
 import mars_lidar as ml
 import mars_lidar.dataset.ingest
+from benchmarks.child import resident
 from benchmarks.config import Config
-from benchmarks.memory_child import _peak
 from benchmarks.storage import SIDE, _system
 
 REALIZATIONS = 8
@@ -54,7 +54,11 @@ def main(what: str, level: float, scenes: int, threads: int, cycles: int, bins: 
         (first, before), (last, done) = told[2], told[-1]
         rate = exposures * (done - before) / done / (last - first)
     size = sum(one.stat().st_size for one in out.rglob("*") if one.is_file()) if out.exists() else 0
-    print(json.dumps({"wall": wall, "cpu": cpu, "bytes": size, "peak": _peak(), "exposures": exposures, "rate": rate}))
+    print(
+        json.dumps(
+            {"wall": wall, "cpu": cpu, "bytes": size, "peak": resident("VmHWM"), "exposures": exposures, "rate": rate}
+        )
+    )
 
 
 if __name__ == "__main__":

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 import os
 import time
 from pathlib import Path
@@ -16,7 +15,7 @@ from torch.utils.data import DataLoader
 import mars_lidar as ml
 from benchmarks.config import Config
 from benchmarks.floor import Bandwidth
-from benchmarks.report import Goal, Row, Section
+from benchmarks.report import Goal, Section
 from benchmarks.timing import in_turn
 from mars_lidar.learn import CubeStream
 from mars_lidar.learn.scenes import Sample
@@ -57,48 +56,34 @@ def stream(config: Config, bandwidth: Bandwidth) -> Section:
             for _ in range(4):  # its memory is taken, scenes are cast
                 next(one)
             cases[name] = lambda one=one: [None for _ in itertools.islice(one, 4)]
-        timings = in_turn(cases, config)
-        engine = min(timings["bare engine"].cpu) / (4 * BATCH)
-        for name, timing in timings.items():
-            cpu, wall = (min(seconds) / (4 * BATCH) for seconds in (timing.cpu, timing.wall))
-            section.rows.append(_row(name, level, 0, cpu, 0.0, wall, engine, floor))
-        shares = [section.rows[-2]["of the engine's rate, CPU"]]
-        for dtype in (None, torch.float32)[: 1 + (level == 1.0)]:
-            name = "loader, counts" if dtype is None else "loader, float32"
+        spent = {
+            (name, 0): (*(min(seconds) / (4 * BATCH) for seconds in (timing.cpu, timing.wall)), 0.0)
+            for name, timing in in_turn(cases, config).items()
+        }
+        for dtype, name in ((None, "loader, counts"), (torch.float32, "loader, float32"))[: 1 + (level == 1.0)]:
             for workers in _numbers(config.threads):
-                received, cpu, wall = _measured(made(dtype), workers, config)
-                section.rows.append(_row(name, level, workers, cpu, received, wall, engine, floor))
-                if dtype is None:
-                    shares.append(section.rows[-1]["of the engine's rate, CPU"])
+                spent[name, workers] = _measured(made(dtype), workers, config)
+        engine = spent["bare engine", 0][0]
+        section.rows += [
+            {
+                "case": name,
+                "S": level,
+                "workers": workers,
+                "CPU ms per cube": 1e3 * cpu,
+                "of it the receiver's": 1e3 * received,
+                "wall ms per cube": 1e3 * wall,
+                "cubes/s": 1.0 / wall,
+                "of the engine's rate, CPU": engine / cpu,
+                "of so many engines' rate, wall": engine / max(1, workers) / wall,
+                "write floor ms": 1e3 * floor,
+            }
+            for (name, workers), (cpu, wall, received) in spent.items()
+        ]
         if level == 1.0:
-            told = [one for one in shares if one is not None]
+            worst = max(cpu for (name, _), (cpu, _, _) in spent.items() if name.endswith("counts"))
             what = "stream over bare engine, S = 1, rate by CPU, worst number of workers"
-            section.goals.append(Goal(what, min(told), GOAL_SHARE, "", True))
+            section.goals.append(Goal(what, engine / worst, GOAL_SHARE, "", True))
     return section
-
-
-def _row(
-    case: str,
-    level: float,
-    workers: int,
-    cpu: float | None,
-    received: float | None,
-    wall: float,
-    engine: float,
-    floor: float,
-) -> Row:
-    return {
-        "case": case,
-        "S": level,
-        "workers": workers,
-        "CPU ms per cube": None if cpu is None else 1e3 * cpu,
-        "of it the receiver's": None if received is None else 1e3 * received,
-        "wall ms per cube": 1e3 * wall,
-        "cubes/s": 1.0 / wall,
-        "of the engine's rate, CPU": None if cpu is None else engine / cpu,
-        "of so many engines' rate, wall": engine / max(1, workers) / wall,
-        "write floor ms": 1e3 * floor,
-    }
 
 
 def _numbers(processors: int) -> list[int]:
@@ -106,29 +91,27 @@ def _numbers(processors: int) -> list[int]:
     return sorted({2**k for k in range(processors.bit_length()) if 2**k < processors} | {processors})
 
 
-def _measured(one: CubeStream, workers: int, config: Config) -> tuple[float | None, float | None, float]:
-    """CPU seconds a cube of this process and of all, and wall seconds: the least of several stretches.
+def _measured(one: CubeStream, workers: int, config: Config) -> tuple[float, float, float]:
+    """CPU seconds a cube of all processes, wall seconds, and this process's share: the least of several stretches.
 
     A stretch begins and ends with all workers idle, as many batches made ahead: it holds the work of what was taken.
     """
     batches: Any = iter(DataLoader(one, batch_size=None, num_workers=workers))
     known = [worker.pid for worker in batches._workers]
-    number, began, found = 4 * workers, time.perf_counter(), []
+    number, began, stretches = 4 * workers, time.perf_counter(), []
     for _ in range(number):  # memory is taken, scenes are cast
         next(batches)
-    while len(found) < 2 or time.perf_counter() - began < config.seconds / 2:
+    while len(stretches) < 2 or time.perf_counter() - began < config.seconds / 2:
         _idle(known)
-        before, start, here = [_seconds(process) for process in known], time.perf_counter(), time.process_time()
+        before, start, here = sum(map(_seconds, known)), time.perf_counter(), time.process_time()
         for _ in range(number):
             next(batches)
-        here = (time.process_time() - here) / (number * BATCH)  # waiting for the workers is not its work
+        here = time.process_time() - here  # waiting for the workers is not its work
         _idle(known)
-        wall = (time.perf_counter() - start) / (number * BATCH)
-        cpu = [(_seconds(process) - spent) / (number * BATCH) for process, spent in zip(known, before, strict=True)]
-        found.append((here + sum(cpu), here, wall))
-    total, received, _ = min(found)
-    wall = min(one[2] for one in found)
-    return (None, None, wall) if math.isnan(total) else (received, total, wall)
+        spent = here + sum(map(_seconds, known)) - before, time.perf_counter() - start, here
+        stretches.append(tuple(seconds / (number * BATCH) for seconds in spent))
+    cpu, _, received = min(stretches)
+    return cpu, min(one[1] for one in stretches), received
 
 
 def _idle(processes: list[int]) -> None:
@@ -141,15 +124,15 @@ def _idle(processes: list[int]) -> None:
 
 
 def _seconds(process: int) -> float:
-    """CPU seconds of a process, all its threads; NaN where the system does not tell."""
+    """CPU seconds of a process, all its threads."""
     fields = _fields(Path(f"/proc/{process}/stat"))
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK") if fields else math.nan
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def _fields(told: Path) -> list[str]:
     try:
         return told.read_text().rpartition(")")[2].split()
-    except OSError:
+    except OSError:  # a thread that has ended
         return []
 
 

@@ -39,6 +39,10 @@ class Timing:
         """Wall time over another's, median over the turns: noise that lasts longer than a turn cancels."""
         return statistics.median(a / b for a, b in zip(self.wall, other.wall, strict=True))
 
+    def cpu_ratio(self, other: Timing) -> float:
+        """The same of CPU time."""
+        return statistics.median(a / b for a, b in zip(self.cpu, other.cpu, strict=True))
+
 
 def in_turn(cases: Mapping[str, Case], config: Config) -> dict[str, Timing]:
     """Run all cases once a turn, each turn beginning with another case, until repeats or seconds are used up.

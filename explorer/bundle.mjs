@@ -1,10 +1,10 @@
-// Puts the page together, in one file that needs nothing else: node bundle.mjs MODULE.wasm PAGE.html
+// Puts the page together, in one file that needs nothing else: node bundle.mjs MODULE.wasm NETWORKS PAGE.html
 import { readFileSync, writeFileSync } from "node:fs";
 import { gzipSync } from "node:zlib";
 import { build } from "esbuild";
 
 const here = (name) => new URL(name, import.meta.url).pathname;
-const [module, page] = process.argv.slice(2);
+const [module, networks, page] = process.argv.slice(2);
 
 async function bundled(entry) {
   const { outputFiles } = await build({
@@ -14,9 +14,15 @@ async function bundled(entry) {
   return outputFiles[0].text.replaceAll("</script", "<\\/script").replaceAll("<!--", "<\\!--");
 }
 
+const packed = (bytes) => gzipSync(bytes, { level: 9 }).toString("base64");
+const card = JSON.parse(readFileSync(`${networks}/image_card.json`, "utf8")), { signal, sbr, cells, side } = card.holds_for;
+const stored = readFileSync(`${networks}/image_weights.npy`); // float16, after a header whose length its bytes 8 and 9 hold
+
 const parts = {
   STYLE: readFileSync(here("node_modules/uplot/dist/uPlot.min.css"), "utf8") + readFileSync(here("src/style.css"), "utf8"),
-  NATIVE: gzipSync(readFileSync(module), { level: 9 }).toString("base64"),
+  NATIVE: packed(readFileSync(module)),
+  WEIGHTS: packed(stored.subarray(10 + stored.readUInt16LE(8))),
+  CARD: JSON.stringify([card.interval_factor, ...signal, ...sbr, ...cells, ...side]),
   WORKER: await bundled("worker.js"),
   MAIN: await bundled("main.js"),
 };

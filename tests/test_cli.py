@@ -16,8 +16,9 @@ import pytest
 import xarray
 
 import mars_lidar as ml
-from mars_lidar import io
+from mars_lidar import _core, io
 from mars_lidar.cli.system_options import DEFAULT_SYSTEM
+from mars_lidar.engines.feedback import Reason
 from tests.harness.command import command_line, listen_to_ctrl_c, stopped
 
 SMALL = ["--size", "12", "--cycles", "50", "--bins", "64"]
@@ -58,6 +59,7 @@ def test_one_command_writes_a_cube_and_a_picture(tmp_path):
         (["--cycles", 10_000, "--signal", 2, "--sbr", 0.01], "slow sweeps"),
         (["--cycles", 3000, "--signal", 40, "--sbr", 40], "locked, short exposure"),
         (["--cycles", 10_000, "--dead-time-ns", 1e-4], "too many cells"),
+        (["--cycles", 30_000, "--signal", 2.3, "--sbr", 0.1], "unsettled"),
     ],
 )
 def test_pixels_given_to_the_exact_engine_are_said(tmp_path, engine, light, reason):
@@ -75,6 +77,24 @@ def test_pixels_given_to_the_exact_engine_are_said(tmp_path, engine, light, reas
     for name, number in about.items():
         what, _, why = name.partition(", ")
         assert f"{what}{f' ({why})' if why else ''} {number:,.0f}" in told
+
+
+@pytest.mark.parametrize("reason", [Reason.UNLIKELY, Reason.NEGATIVE])
+def test_exposures_that_a_check_refuses_are_said(tmp_path, monkeypatch, reason):
+    """What hardly ever happens: the kernel's verdict on the first pixel is replaced."""
+    drawn = _core.feedback_histogram
+
+    def refused(job, pulse, out, pixels, status, *rest):
+        drawn(job, pulse, out, pixels, status, *rest)
+        status[0, 0] = reason
+
+    monkeypatch.setattr(_core, "feedback_histogram", refused)
+    out, light = tmp_path / "room.npz", ["--cycles", 10_000, "--signal", 0.5, "--sbr", 2]
+    done = run("simulate", "--scene", "room", "--size", 4, "--bins", 64, *light, "--engine", "feedback", "-o", out)
+    assert done.exit_code == 0, done.output
+    words = " ".join(done.output.split())
+    assert "pixels given to exact 1" in words
+    assert f"pixels given to exact ({reason.words}) 1" in words
 
 
 @pytest.mark.parametrize("suffix", [".h5", ".npz", ".zarr"])

@@ -199,6 +199,20 @@ def test_mean_histogram_of_records(effects: dict[str, Any], mode: str):
 
 
 @pytest.mark.parametrize(
+    "effects", [{"jitter": Jitter(sigma_ns=0.04, tail_ns=1.3, tail_fraction=0.1)}, {"code_density": CODES}]
+)
+def test_records_of_bright_light_in_wide_bins(effects: dict[str, Any]):
+    """Of bright light the first photon comes at the front of each lobe, within a part of a bin."""
+    lobes = np.random.default_rng(3).exponential(size=130) ** 3
+    lobes[np.arange(130) % 5 > 2] = 0.0
+    detector, pulse = Detector(dead_time_ns=14.66, **effects), ml.SampledPulse(lobes, 0.273, "first")
+    system = System(period_ns=PERIOD_NS, cycles=50, bins=480, pulse=pulse, detector=detector)
+    case = Case("bright", flux_of(35.0, 1e-4, 0.2528), system, 20_000)
+    law = mean_histogram(ml.Flux(35.0, 1e-4, 0.2528 * PERIOD_NS), system)
+    check(ENGINES["exact"], case, Law(histogram=law), {SHAPE})
+
+
+@pytest.mark.parametrize(
     ("dead", "electronics", "start", "cycles"),
     [(17.0, 83.0, "armed", 40), (60.0, 130.0, "stationary", 60), (0.0, 70.0, "armed", 40)],
 )

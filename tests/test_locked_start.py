@@ -46,3 +46,26 @@ def test_the_sequential_engine_begins_in_any_phase_of_a_slow_drift():
     histogram = exposure_moments(ml.Flux(200.0, 0.01, 37.0), system).histogram
     case = Case("drift through a bright pulse", flux_of(200.0, 0.01, 0.37), system, 1000)
     check(ENGINES["sequential"], case, Law(histogram, pmf), {COUNTS})
+
+
+@pytest.mark.parametrize("light", ["pulses", "waveforms"])
+def test_pixels_of_one_light_share_the_state_that_they_start_in(light: str):
+    """In any order among others, with the bits that each has alone."""
+    which = np.array([0, 1, 0, 2, 1, 0, 2, 2])
+    signal, background = np.array([20.0, 30.0, 20.0])[which], np.array([0.5, 0.5, 0.8])[which]
+    flux = ml.Flux(signal[None], background[None], 40.0)
+    if light == "waveforms":
+        shape = np.exp(-0.5 * ((np.arange(64) - 20.0) / 3.0) ** 2)
+        flux = ml.Flux(waveform=signal[None, :, None] * shape / shape.sum(), background=background[None])
+    system = ml.System(
+        period_ns=100.0,
+        cycles=20,
+        bins=64,
+        pulse=ml.GaussianPulse(sigma_ns=2.0),
+        detector=ml.Detector(dead_time_ns=97.0),
+        start="stationary",
+    )
+    cube = ml.simulate(flux, system, realizations=3, seed=4).reshape(3, 8, 64)
+    for k in range(8):
+        alone = ml.simulate(flux[:, k : k + 1], system, realizations=3, seed=4, pixel_index=[[k]])
+        assert np.array_equal(alone.reshape(3, 64), cube[:, k])

@@ -141,7 +141,7 @@ CALLS: dict[str, Callable[[Path], tuple[Callable[..., Any], dict[str, Any]]]] = 
             call,
             {"flux": PIXEL, "system": SYSTEM},
         )
-        for call in (ml.count_law, ml.registration_pdf, ml.joint_law)
+        for call in (ml.count_law, ml.mean_histogram, ml.registration_pdf, ml.joint_law)
     },
     "holding_time_covariance": lambda _: (
         ml.holding_time_covariance,

@@ -6,11 +6,13 @@
 
 #include <algorithm>
 #include <atomic>
+#include <cmath>
 #include <memory>
 #include <vector>
 
 #include "base/integers.h"
 #include "exact/engine.h"
+#include "image/solver.h"
 #include "instrument/job.h"
 #include "instrument/pulse_table.h"
 #include "instrument/recording.h"
@@ -88,6 +90,52 @@ struct Folded {
         }
     }
 };
+
+// `told`: cycles, bins, whole, shift and fraction of the dead time on the bins, stationary, synchronous, first knot of the
+// pulse, cell, width, core low, core high. `curve` (2, knots): energy below each knot, and density. `open` (2, bins): the
+// open part of each bin, or null.
+HistogramRecord record_of(const double* told, int32_t knots, const double* curve, const double* open) {
+    HistogramRecord record;
+    record.cycles = static_cast<int64_t>(told[0]);
+    record.bins = static_cast<int64_t>(told[1]);
+    record.whole = static_cast<int64_t>(told[2]);
+    record.shift = static_cast<int64_t>(told[3]);
+    record.fraction = told[4];
+    record.stationary = told[5] != 0.0;
+    record.synchronous = told[6] != 0.0;
+    record.pulse.low = told[7];
+    record.pulse.cell = told[8];
+    record.width = told[9];
+    record.core_low = told[10];
+    record.core_high = told[11];
+    record.pulse.energy.assign(curve, curve + knots);
+    record.pulse.slope.assign(curve + knots, curve + 2 * static_cast<int64_t>(knots));
+    if (open) {
+        record.low.assign(open, open + record.bins);
+        record.high.assign(open + record.bins, open + 2 * record.bins);
+    }
+    return record;
+}
+
+// The cells of a Gaussian pulse, blurred by a Gaussian, both in periods: as reconstruction/image_pulse.py has it.
+std::unique_ptr<ImageSetting> image_setting(const HistogramRecord& record, double width, double blur) {
+    const double bins = static_cast<double>(record.bins), sigma = std::hypot(width, blur),
+                 each = std::hypot(sigma, 1.0 / std::sqrt(12.0) / bins);
+    const int cells = 16 * static_cast<int>(std::ceil(1.5 / each / 16.0));
+    const double step = 1.0 / (int64_t{cells} * kImagePhases), reach = 8.5 * width + 4.5 * blur + 0.5 / bins;
+    const int64_t first = static_cast<int64_t>(std::floor(-reach / step)),
+                  count = static_cast<int64_t>(std::ceil(reach / step)) - first;
+    std::vector<double> density(count), score(count);
+    double energy = 0.0, moment = 0.0;
+    for (int64_t j = 0; j < count; ++j) {
+        const double x = score[j] = (static_cast<double>(first + j) + 0.5) * step, half = 0.5 / bins;
+        density[j] = (normal_cumulative((x + half) / sigma) - normal_cumulative((x - half) / sigma)) * bins;
+        energy += density[j];
+        moment += density[j] * x;
+    }
+    for (double& x : score) x -= moment / energy;
+    return std::make_unique<ImageSetting>(record, cells, first, density, score, each * cells);
+}
 
 }  // namespace
 
@@ -206,35 +254,68 @@ EMSCRIPTEN_KEEPALIVE double settling_periods(const double* grid_told, const doub
                                              static_cast<int64_t>(most_steps), total.data(), kRun));
 }
 
-// Maximum likelihood of pixels from histograms (pixels, bins), uint32. `told`: cycles, bins, whole, shift and fraction
-// of the dead time on the bins, stationary, synchronous, first knot of the pulse, cell, width, core low, core high.
-// `curve` (2, knots): energy below each knot, and density. `open` (2, bins): the open part of each bin, or null.
-// `out` (pixels, 8) and `flags` (pixels): see Maximizer.
+// Maximum likelihood of pixels from histograms (pixels, bins), uint32, recorded as record_of has it. `out` (pixels, 8) and
+// `flags` (pixels): see Maximizer.
 EMSCRIPTEN_KEEPALIVE void maximum_likelihood(const double* told, int32_t knots, const double* curve, const double* open,
                                              int32_t pixels, const uint32_t* counts, int32_t starts, double least_gain,
                                              double* out, uint8_t* flags) {
-    HistogramRecord record;
-    record.cycles = static_cast<int64_t>(told[0]);
-    record.bins = static_cast<int64_t>(told[1]);
-    record.whole = static_cast<int64_t>(told[2]);
-    record.shift = static_cast<int64_t>(told[3]);
-    record.fraction = told[4];
-    record.stationary = told[5] != 0.0;
-    record.synchronous = told[6] != 0.0;
-    record.pulse.low = told[7];
-    record.pulse.cell = told[8];
-    record.width = told[9];
-    record.core_low = told[10];
-    record.core_high = told[11];
-    record.pulse.energy.assign(curve, curve + knots);
-    record.pulse.slope.assign(curve + knots, curve + 2 * static_cast<int64_t>(knots));
-    if (open) {
-        record.low.assign(open, open + record.bins);
-        record.high.assign(open + record.bins, open + 2 * record.bins);
-    }
+    const HistogramRecord record = record_of(told, knots, curve, open);
     const CountRows rows{counts, CountRows::Type::kUint32, record.bins};
     Maximizer maximizer(record, {starts, least_gain, true});
     for (int32_t p = 0; p < pixels; ++p) maximizer(rows, p, out + int64_t{kMaximumColumns} * p, flags + p);
+}
+
+// Maps (kImageMaps, pixels) of an image of histograms (height, width, bins) from its photons and those around each pixel
+// (image/solver.h), bright pixels by maximum likelihood. `weights` of both networks, whose `card` is the factor of their
+// intervals and the limits (4, 2); of a Gaussian pulse.
+EMSCRIPTEN_KEEPALIVE void image_maps(const double* told, int32_t knots, const double* curve, const double* open,
+                                     int32_t height, int32_t width, const uint32_t* counts, int32_t starts,
+                                     double least_gain, const float* weights, const double* card, double* maps) {
+    const HistogramRecord record = record_of(told, knots, curve, open);
+    const int64_t pixels = int64_t{height} * width, bins = record.bins;
+    std::vector<int64_t> first(1, 0);
+    std::vector<int32_t> bin;
+    std::vector<float> number;
+    for (int64_t p = 0; p < pixels; ++p) {
+        for (int32_t j = 0; j < bins; ++j) {
+            if (counts[p * bins + j] == 0) continue;
+            bin.push_back(j);
+            number.push_back(static_cast<float>(counts[p * bins + j]));
+        }
+        first.push_back(static_cast<int64_t>(bin.size()));
+    }
+    ImageNetworks networks;
+    networks.weights.assign(weights, weights + ImageNetworks::kChoose + ImageNetworks::kWeigh);
+    networks.interval_factor = card[0];
+    std::copy(card + 1, card + 9, &networks.limits[0][0]);
+    constexpr double kMostCells = 4096.0;
+    std::vector<std::unique_ptr<ImageSetting>> settings;
+    settings.push_back(image_setting(record, record.width, 0.0));
+    const int finest = settings[0]->cells;
+    if (finest > kMostCells)
+        for (double blur = 1.5 / (kMostCells - 16.0);; blur *= 0.5) {
+            if (image_setting(record, record.width, 0.5 * blur)->cells >= finest) break;
+            settings.insert(settings.end() - 1, image_setting(record, record.width, blur));
+        }
+    std::vector<const ImageSetting*> given;
+    for (const auto& each : settings) given.push_back(each.get());
+    std::vector<uint8_t> flags(pixels);
+    ImageSolver solver({height, width, first.data(), bin.data(), number.data()}, nullptr, 16 << 20, 1 << 14, 1);
+    solver.solve(given, &networks, maps, flags.data(), {});
+
+    const CountRows rows{counts, CountRows::Type::kUint32, record.bins};
+    Maximizer maximizer(record, {starts, least_gain, true});
+    for (int64_t p = 0; p < pixels; ++p) {
+        if (!(maps[kImageNumber * pixels + p] > kImageBright)) continue;
+        double own[kMaximumColumns], off;
+        uint8_t flag;
+        maximizer(rows, p, own, &flag);
+        off = own[2] - maps[kImageDelay * pixels + p];
+        off -= std::round(off);
+        if (flag || !(std::abs(off) * settings.back()->cells < 3.0 * settings.back()->sigma)) continue;
+        maps[kImageDelay * pixels + p] = own[2];
+        maps[kImageHalfWidth * pixels + p] = 1.6448536269514722 * own[5];  // 90 % of a normal distribution
+    }
 }
 
 }  // extern "C"

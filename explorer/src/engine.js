@@ -4,12 +4,18 @@ const PATIENCE_MS = 30000;
 
 export class Refusal extends Error {}
 
-/** The compiled module, which the page carries compressed as text. */
+/** Bytes that the page carries compressed as text. */
 export async function unpacked(text) {
   const bytes = Uint8Array.from(atob(text.trim()), (letter) => letter.charCodeAt(0));
   const plain = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
-  return WebAssembly.compile(await new Response(plain).arrayBuffer());
+  return new Response(plain).arrayBuffer();
 }
+
+/** Numbers of 16 bits, as floating-point numbers. */
+export const widened = (bytes) => Float32Array.from(new Uint16Array(bytes), (bits) => {
+  const exponent = (bits >> 10) & 31, fraction = bits & 1023;
+  return (bits >> 15 ? -1 : 1) * (exponent ? (1024 + fraction) * 2 ** (exponent - 25) : fraction * 2 ** -24);
+});
 
 export class Engine {
   constructor(module, source) {

@@ -61,6 +61,12 @@ function openBins(system) {
   return open;
 }
 
+/** An image from its photons and those around each pixel: delays (pixels), periods, and half widths of 90 % intervals. */
+export function byImage(native, system, counts, height, width, networks) {
+  const maps = native.imageMaps(recordOf(native, system), counts, height, width, networks), pixels = height * width;
+  return { delay: maps.slice(0, pixels), halfWidth: maps.slice(pixels, 2 * pixels) };
+}
+
 /** Maximum likelihood of pixels: arrays signal, background (photons per period), delay and its error (periods), flags. */
 export function byLikelihood(native, system, counts) {
   const { found, flags } = native.maximumLikelihood(recordOf(native, system), counts);

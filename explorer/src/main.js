@@ -1,6 +1,6 @@
 // The page: state, link, controls, figure and pictures together.
 import { Controls } from "./controls.js";
-import { Engine, Refusal, unpacked } from "./engine.js";
+import { Engine, Refusal, unpacked, widened } from "./engine.js";
 import { picture, savePicture, saveTable, table } from "./export.js";
 import { Figure } from "./figure.js";
 import { INITIAL, SPEED_OF_LIGHT, detected, fromHash, inPeriods, problem, toHash } from "./model.js";
@@ -20,11 +20,12 @@ const LINK_MS = 400; // after the last change, before the address has it: Safari
 async function begin() {
   const told = JSON.parse(at("cube").textContent);
   const source = told ? new CubeSource(told) : new SceneSource();
-  const module = await unpacked(at("native").textContent), worker = at("worker").textContent;
+  const module = await WebAssembly.compile(await unpacked(at("native").textContent)), worker = at("worker").textContent;
   const page = { histogram: at("histogram"), law: at("law"), facts: at("facts"), notes: at("notes"), computing: at("computing") };
   const figureAlone = new URLSearchParams(location.search).has("figure"); // embedded in a page of its own prose
   document.body.classList.toggle("figure-alone", figureAlone);
   const figure = new Figure(page, new Engine(module, worker)), painter = new Engine(module, worker);
+  const networks = { weights: widened(await unpacked(at("weights").textContent)), card: Float64Array.from(JSON.parse(at("card").textContent)) };
   const pixels = source.height * source.width;
   const base = told ? { ...INITIAL, ...source.settings } : INITIAL;
   const first = fromHash(location.hash, pixels, base, source.images);
@@ -106,7 +107,7 @@ async function begin() {
     const found = lastPicture;
     const tell = (share) => { if (mine === painted) at("progress").textContent = share < 1 ? `${Math.round(100 * share)} %` : ""; };
     try {
-      await source.picture(current, painter, tell, (some) => {
+      await source.picture(current, painter, networks, tell, (some) => {
         if (mine !== painted) return;
         Object.assign(found, some);
         showPictures(found, current, range);
@@ -120,8 +121,8 @@ async function begin() {
     }
   }
 
-  function showPictures({ totals, delay }, current, range) {
-    const depth = delay.map((periods) => range * (periods - Math.floor(periods)));
+  function showPictures({ totals, delay, peak }, current, range) {
+    const depths = (delays) => delays.map((periods) => range * (periods - Math.floor(periods))), depth = depths(delay);
     const scale = (values, low, high) => {
       const sorted = Float64Array.from(values).filter((x) => !Number.isNaN(x)).sort();
       return sorted.length ? [sorted[Math.floor(low * (sorted.length - 1))], sorted[Math.ceil(high * (sorted.length - 1))]] : [0, 1];
@@ -130,10 +131,13 @@ async function begin() {
     pictures[0].show(depth, source.height, source.width, scale(source.truth ? source.truth.map((z) => z % range) : depth, 0.01, 0.99), metres);
     pictures[1].show(totals, source.height, source.width, scale(totals, 0, 1), whole);
     if (!source.truth) return;
-    const off = depth.map((z, p) => Math.abs(z - (source.truth[p] % range))).filter((x) => !Number.isNaN(x)).sort();
+    const errors = (z) => z.map((x, p) => Math.abs(x - (source.truth[p] % range))).filter((x) => !Number.isNaN(x)).sort();
+    const off = errors(depth), wide = (3 * SPEED_OF_LIGHT / 2) * current.sigma;
+    const share = (of) => `${Number(((100 * of.filter((x) => x > wide).length) / of.length).toPrecision(2))} %`;
     const lost = depth.length - off.length;
     at("error").textContent = current.method === "truth" ? "" : off.length === 0 ? "No pixel has a depth." :
-      `Median error of the depth ${length(off[Math.floor(off.length / 2)], 3)}${lost ? `, ${lost} pixels without` : ""}.`;
+      `Median error of the depth ${length(off[Math.floor(off.length / 2)], 3)}, ${share(off)} off by more than 3 σ${
+        current.method === "peak" ? "" : ` (by the fullest bin ${share(errors(depths(peak)))})`}${lost ? `, ${lost} pixels without` : ""}.`;
   }
 
   at("method").onchange = (event) => set({ method: event.target.value });

@@ -37,7 +37,7 @@ export const GROUPS = [
   ] },
 ];
 export const NUMBERS = GROUPS.flatMap((group) => group.numbers);
-const CHOICES = { mode: MODES, start: ["armed", "stationary"], method: ["truth", "peak", "likelihood"] };
+const CHOICES = { mode: MODES, start: ["armed", "stationary"], method: ["truth", "peak", "likelihood", "image"] };
 
 /** Where the page begins. `pixel`: of the picture, row * width + column, or -1 for a pixel of its own. */
 export const INITIAL = {

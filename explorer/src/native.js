@@ -101,6 +101,13 @@ export class Native {
         t, record.curve.length / 2, c, o, pixels, h, record.starts, record.leastGain, out, flags));
     return { found: copies[0], flags: copies[1] };
   }
+
+  /** Maps (8 * pixels) of native/image/solver.h, of an image from its photons and those around each pixel. */
+  imageMaps(record, counts, height, width, { weights, card }) {
+    return this.with([record.told, record.curve, record.open, counts, weights, card], [[Float64Array, 8 * height * width]],
+      (t, c, o, h, w, k, out) => this.calls.image_maps(
+        t, record.curve.length / 2, c, o, height, width, h, record.starts, record.leastGain, w, k, out)).copies[0];
+  }
 }
 
 const told = (grid) => new Float64Array([

@@ -3,7 +3,7 @@
 import { Native } from "./native.js";
 import { Refused, exposure } from "./exposure.js";
 import { binVariances } from "./band.js";
-import { byLikelihood, byPeak, hasLikelihood } from "./estimate.js";
+import { byImage, byLikelihood, byPeak, hasLikelihood } from "./estimate.js";
 import { countLaw, nativeCharacteristic, poissonLaw } from "./count_law.js";
 import { goldenBits } from "./golden.js";
 import { photonsIn, sum } from "./light.js";
@@ -79,6 +79,13 @@ const stages = {
       tell((first + SLICE) / pixels);
     }
     return { delay };
+  },
+
+  /** Delays of all pixels of the last picture, each from its photons and those around it. */
+  image({ height, width, networks }) {
+    const { system, cube } = kept;
+    if (!hasLikelihood(system)) throw new Refused("this method does not hold for this mode, pulse or effect");
+    return byImage(native, system, cube, height, width, networks);
   },
 
   /** The cube of the last picture. */

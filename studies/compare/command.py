@@ -16,31 +16,21 @@ from mars_lidar._base.progress import span
 from mars_lidar.cli.console import check_new, check_picture, progress_bar, save_picture, table
 from mars_lidar.cli.console import run as execute
 from mars_lidar.cli.options import (
-    COMMAND_LINE,
     Integer,
     LightOptions,
     Number,
     OutPath,
     SceneOptions,
     Text,
-    documented,
-    examples,
     read_scene,
     two,
 )
+from mars_lidar.cli.options import command as as_command
 from mars_lidar.cli.system_options import Effects, SystemOptions
 from mars_lidar.engines import ENGINES
 from studies.compare.comparison import compare as run
 from studies.compare.figures import comparison
 from studies.compare.tables import as_data, show
-
-_EXAMPLES = examples(
-    "python -m studies compare --scene room --size 64 -o compare.png",
-    "python -m studies compare --scene room --engines exact,poisson --signal 0.1 --realizations 40000 -o dim.png",
-    "python -m studies compare --depth depth.png --system spad.yaml --against sequential --json all.json -o all.pdf",
-    notes="Values that deviate by more than 5 standard errors are red and marked with !. Numbers in brackets are the "
-    "standard error in the last digits.",
-)
 
 
 def compare(
@@ -97,6 +87,17 @@ def compare(
         All numbers as JSON, into this file.
     overwrite
         Replace an existing picture and JSON file.
+
+    Examples
+    --------
+    python -m studies compare --scene room --size 64 -o compare.png
+    python -m studies compare --scene room --engines exact,poisson --signal 0.1 --realizations 40000 -o dim.png
+    python -m studies compare --depth depth.png --system spad.yaml --against sequential --json all.json -o all.pdf
+
+    Notes
+    -----
+    Values that deviate by more than 5 standard errors are red and marked with !. Numbers in brackets are the standard
+    error in the last digits.
     """
     began = time.perf_counter()
     check_picture(out, overwrite)
@@ -134,7 +135,7 @@ def compare(
 
 def compare_app(command: str = "python -m studies compare") -> App:
     """The command line of the study, called `command`."""
-    return App(name=command, default_command=documented(compare), help_epilogue=_EXAMPLES, **COMMAND_LINE)
+    return as_command(compare, command)
 
 
 def main(arguments: Sequence[str], command: str = "python -m studies compare") -> int:

@@ -13,11 +13,12 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from mars_lidar import Detector, GaussianPulse, SampledPulse, Scene, System, reconstruct, simulate
+from mars_lidar._base.native import _core
 from mars_lidar._base.types import FloatArray
 from mars_lidar.plot.figures import _draw_map, _limits
 from mars_lidar.reconstruction import Reconstruction
 from mars_lidar.reconstruction.histogram_record import relative_width
-from mars_lidar.reconstruction.image_network import networks
+from mars_lidar.reconstruction.image_network import card
 from studies import Facts, Request
 from studies.common.draw import panels
 from studies.common.report import Row
@@ -25,7 +26,7 @@ from studies.image import captures, large, total_variation, two_returns
 from studies.image.scenes import busier, light
 
 SEED = 41
-OUTLIER_SIGMA = 3.0
+OUTLIER_SIGMA = _core.IMAGE_OUTLIER_SIGMA
 POOLED = 5  # pixels a side, whose histograms the pooled matched filter adds up
 SYSTEM = System(
     period_ns=100.0,
@@ -155,7 +156,7 @@ def run(request: Request) -> Facts:
         "tv_weight": total_variation.WEIGHT,
         "fewest": captures.FEWEST,
         "false_alarm": two_returns.FALSE,
-        "card": networks().card,
+        "card": card(),
         "by_light": _table(rows, "scenes", ("photons", "sbr")),
         "by_scene": _table(rows, "scenes", ("scene",)),
         "unseen": _table(rows, "systems", ("system",)),

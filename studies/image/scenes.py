@@ -16,7 +16,7 @@ PERIOD_NS = 100.0  # no length enters a network: only ratios to the pulse do
 SIDE = 64  # pixels of a training image
 # the ranges of the draws, from which the card's limits follow
 SIGNAL = 0.5, 20.0  # photons a pixel, mean
-SBR = 0.03, 5.0
+SBR = 0.01, 5.0
 SIGMA_NS = 0.15, 1.5
 DEAD_TIME_NS = 2.0, 200.0
 CYCLES = 100, 300, 1000, 3000

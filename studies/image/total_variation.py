@@ -12,8 +12,8 @@ from scipy.ndimage import uniform_filter
 
 from mars_lidar import System
 from mars_lidar._base.types import FloatArray
-from mars_lidar.reconstruction import image_stages as stages
-from mars_lidar.reconstruction.image_pulse import cells_of
+from mars_lidar.reconstruction.image import solver_of
+from mars_lidar.reconstruction.image_pulse import settings_of
 from mars_lidar.reconstruction.photons import Photons
 
 WEIGHT = 1.0  # of the variation, per sigma: of 0.3, 1, 2 and 4 the best in five images of the training's kind
@@ -23,13 +23,13 @@ _ROUNDS, _STIFFNESS, _PROJECTIONS = 60, 0.5, 25
 def total_variation(cube: np.ndarray, system: System, weight: float = WEIGHT) -> FloatArray:
     """Delays (H, W), ns; the penalty does not wrap: scenes of it end within the period."""
     height, width, bins = cube.shape
-    photons, cells = Photons.of(cube.reshape(-1, bins), height, width), cells_of(system)
-    light = stages.first_light(photons, cells)
-    light = stages.light_at(photons, cells, stages.first_delays(photons, cells, light, 1), light, 1)
-    whole = slice(0, height), slice(0, width)
-    likelihood = stages.volumes(photons, cells, light, *whole, 1, 1)[2]
-    cost = -np.log(likelihood.reshape(-1, cells.count).astype(np.float64) + 1e-12)
-    place = (np.arange(cells.count) + 0.5) / cells.sigma
+    solver = solver_of(Photons.of(cube.reshape(-1, bins), height, width), 1)
+    setting = settings_of(system)[-1]
+    solver.begin(setting)
+    likelihood = solver.volumes().likelihood
+    cells = setting.cells
+    cost = -np.log(likelihood.reshape(-1, cells).astype(np.float64) + 1e-12)
+    place = (np.arange(cells) + 0.5) / setting.sigma
     around = uniform_filter(cost.reshape(height, width, -1), (5, 5, 0), mode="nearest")
     smooth = place[around.argmin(-1)].astype(np.float64)
     dual = np.zeros_like(smooth)
@@ -38,7 +38,7 @@ def total_variation(cube: np.ndarray, system: System, weight: float = WEIGHT) ->
         own = place[(cost + 0.5 * _STIFFNESS * (place - target) ** 2).argmin(1)].reshape(height, width)
         smooth = denoised(own + dual, weight / _STIFFNESS)
         dual += own - smooth
-    return np.asarray(smooth * cells.sigma / cells.count * system.period_ns)
+    return np.asarray(smooth * setting.sigma / cells * system.period_ns)
 
 
 def denoised(image: FloatArray, weight: float, projections: int = _PROJECTIONS) -> FloatArray:

@@ -15,35 +15,24 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mars_lidar import __version__
 from mars_lidar._base.imports import needed
-from mars_lidar.reconstruction import image_stages as stages
-from mars_lidar.reconstruction.image import LEVEL
-from mars_lidar.reconstruction.image_network import (
-    CARD,
-    CHANNELS,
-    HIDDEN,
-    OFFSETS,
-    OUTLIER_SIGMA,
-    PEAKS,
-    RADII,
-    WEIGHTS,
-    Floats,
-    Networks,
-)
-from mars_lidar.reconstruction.image_pulse import CELLS_PER_SIGMA, Cells, cells_of
+from mars_lidar._base.native import _core
+from mars_lidar.reconstruction.image import solver_of
+from mars_lidar.reconstruction.image_network import CARD, LIMITS, WEIGHTS, networks_of
+from mars_lidar.reconstruction.image_pulse import CELLS_PER_SIGMA, settings_of
 from mars_lidar.reconstruction.photons import Photons
 from studies import Tell
 from studies.image import scenes
 
-INPUTS = 3 * len(OFFSETS) + 3
-PLANES = len(RADII) + 1
-SIGNALS = PLANES + 1
-CHANNELS_IN = 5 * len(RADII) + 9
-OUTPUTS = PLANES + SIGNALS + 5
+SIZES = _core.IMAGE_SIZES
+LEVEL, OUTLIER_SIGMA = _core.IMAGE_LEVEL, _core.IMAGE_OUTLIER_SIGMA
+Floats = NDArray[np.float32]
 _REACHED = 6.0  # sigma, up to which an error counts
 _HELD_OUT = 12  # every so many-th image
+UNCALIBRATED = {"interval_factor": 1.0, "holds_for": dict.fromkeys(LIMITS, (0.0, 1e9))}  # of networks in training
 
 
 @dataclass(frozen=True)
@@ -65,9 +54,9 @@ QUICK = Plan(images=24, calibration=4, choose_steps=40, weigh_steps=40)
 class _Prepared:
     """A training image after its first round."""
 
-    photons: Photons
-    cells: Cells
-    light: stages.Light
+    solver: _core.ImageSolver
+    cells: int
+    sigma: float  # cells
     truth: Floats  # (pixels,) delay in cells
     signal: Floats  # (H, W)
     valid: np.ndarray
@@ -83,13 +72,13 @@ def train(out: Path, plan: Plan = FULL, tell: Tell = str) -> list[Path]:
     images = [_prepared(scenes.example(k, plan.seed)) for k in range(plan.images)]
     tell(f"image: {len(images)} images drawn, {time.process_time() - began:.0f} s of processor time")
     choose, facts = _train_choose(torch, images, plan, tell)
-    first = Networks(_flat(choose), {}, {})
-    held = [_weighed(torch, image, first) for image in images]
-    weigh, more = _train_weigh(torch, held, plan, tell)
+    first = networks_of(_flat(choose), UNCALIBRATED)
+    prepared = [_weighed(torch, image, first) for image in images]
+    weigh, more = _train_weigh(torch, prepared, plan, tell)
+    _round(torch, weigh)
     factor, others = _calibrated(torch, weigh, first, plan, tell)
     out.mkdir(parents=True, exist_ok=True)
-    arrays: dict[str, Any] = {"choose": _flat(choose), **_layers(weigh)}
-    np.savez(out / WEIGHTS.name, **arrays)
+    np.save(out / WEIGHTS.name, np.concatenate([_flat(choose), _layers(weigh)]).astype(np.float16))
     card = _card(plan, factor, facts | more | others, time.process_time() - began, torch.__version__)
     (out / CARD.name).write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
     return [out / WEIGHTS.name, out / CARD.name]
@@ -97,13 +86,19 @@ def train(out: Path, plan: Plan = FULL, tell: Tell = str) -> list[Path]:
 
 def _prepared(example: scenes.Example) -> _Prepared:
     height, width, bins = example.counts.shape
-    photons = Photons.of(example.counts.reshape(-1, bins), height, width)
-    cells = cells_of(example.system)
-    light = stages.first_light(photons, cells)
-    light = stages.light_at(photons, cells, stages.first_delays(photons, cells, light, 1), light, 1)
-    truth = np.nan_to_num(example.delay_ns).ravel() / example.system.period_ns % 1.0 * cells.count
+    solver = solver_of(Photons.of(example.counts.reshape(-1, bins), height, width), 1)
+    setting = settings_of(example.system)[-1]
+    solver.begin(setting)
+    truth = np.nan_to_num(example.delay_ns).ravel() / example.system.period_ns % 1.0 * setting.cells
     signal = np.log(np.maximum(example.signal, 0.02)).astype(np.float32)
-    return _Prepared(photons, cells, light, truth.astype(np.float32), signal, example.valid)
+    return _Prepared(solver, setting.cells, setting.sigma, truth.astype(np.float32), signal, example.valid)
+
+
+def _round(torch: Any, net: Any) -> None:
+    """Weights as they are stored, of 16 bits."""
+    with torch.no_grad():
+        for values in net.parameters():
+            values.copy_(values.half().float())
 
 
 def gap(a: Any, b: Any, cells: int) -> Any:
@@ -116,21 +111,17 @@ def _train_choose(torch: Any, images: list[_Prepared], plan: Plan, tell: Tell) -
     rng = np.random.default_rng(plan.seed)
     features, labels, lost, wrong = [], [], [], []
     for k, image in enumerate(images):
-        whole = slice(0, image.photons.height), slice(0, image.photons.width)
-        posterior, broad, likelihood, place, mass = stages.volumes(
-            image.photons, image.cells, image.light, *whole, PEAKS, 1
-        )
-        off = np.abs(gap(place, image.truth[:, None], image.cells.count)) / image.cells.sigma
-        label = np.where(off.min(1) < OUTLIER_SIGMA, off.argmin(1), PEAKS)
-        open_pixels = np.flatnonzero(image.valid.ravel() & (mass[:, 0] < stages._SETTLED))
-        lost.append((label[open_pixels] == PEAKS).mean() if open_pixels.size else 0.0)
+        volumes = image.solver.volumes()
+        mass = volumes.mass
+        off = np.abs(gap(volumes.place, image.truth[:, None], image.cells)) / image.sigma
+        label = np.where(off.min(1) < OUTLIER_SIGMA, off.argmin(1), SIZES["peaks"])
+        open_pixels = np.flatnonzero(image.valid.ravel() & (mass[:, 0] < _core.IMAGE_SETTLED))
+        lost.append((label[open_pixels] == SIZES["peaks"]).mean() if open_pixels.size else 0.0)
         wrong.append((off[open_pixels, 0] >= OUTLIER_SIGMA).mean() if open_pixels.size else 0.0)
         if k % _HELD_OUT == 0 or open_pixels.size == 0:
             continue
         pixel = np.sort(rng.permutation(open_pixels)[:700])
-        signal = np.ascontiguousarray(image.light.signal.ravel(), np.float32)
-        x = stages.candidate_features(posterior, broad, likelihood, place, mass, signal, pixel, 1)
-        features.append(x.astype(np.float16))
+        features.append(image.solver.candidate_features(volumes, pixel).astype(np.float16))
         labels.append(label[pixel])
     tell(f"image: of unsure pixels {np.mean(wrong):.1%} have a wrong first peak, {np.mean(lost):.1%} no right one")
     x = torch.from_numpy(np.concatenate(features))
@@ -150,6 +141,7 @@ def _train_choose(torch: Any, images: list[_Prepared], plan: Plan, tell: Tell) -
         mean = loss.item() if step == 0 else 0.99 * mean + 0.01 * loss.item()
         if step % 500 == 499:
             tell(f"image: choosing, step {step + 1}, cross entropy {mean:.4f}")
+    _round(torch, net)
     return net, {"wrong_first_peak": float(np.mean(wrong)), "cross_entropy": mean}
 
 
@@ -157,9 +149,9 @@ def _choose_net(torch: Any) -> Any:
     class Choose(torch.nn.Module):  # type: ignore[misc]
         def __init__(self) -> None:
             super().__init__()
-            linear, relu = torch.nn.Linear, torch.nn.ReLU
+            linear, relu, hidden = torch.nn.Linear, torch.nn.ReLU, SIZES["hidden"]
             self.layers = torch.nn.Sequential(
-                linear(INPUTS, HIDDEN), relu(), linear(HIDDEN, HIDDEN), relu(), linear(HIDDEN, 1)
+                linear(SIZES["features"], hidden), relu(), linear(hidden, hidden), relu(), linear(hidden, 1)
             )
             self.none = linear(2, 1)
 
@@ -178,21 +170,18 @@ def _symmetries() -> np.ndarray:
         for down in (1, -1):
             for right in (1, -1):
                 order = []
-                for y, x in OFFSETS:
-                    k = OFFSETS.index((down * (x if turned else y), right * (y if turned else x)))
+                for y, x in _core.IMAGE_OFFSETS:
+                    k = _core.IMAGE_OFFSETS.index((down * (x if turned else y), right * (y if turned else x)))
                     order += [3 * k, 3 * k + 1, 3 * k + 2]
-                orders.append([*order, INPUTS - 3, INPUTS - 2, INPUTS - 1])
+                orders.append([*order, *range(SIZES["features"] - 3, SIZES["features"])])
     return np.array(orders)
 
 
-def _weighed(torch: Any, image: _Prepared, first: Networks) -> dict[str, Any]:
+def _weighed(torch: Any, image: _Prepared, first: _core.ImageNetworks) -> dict[str, Any]:
     """What the second network reads and mixes of an image, and the truth."""
-    chosen = stages.choice(image.photons, image.cells, image.light, first, 1)
-    light = stages.light_at(image.photons, image.cells, chosen.delay, image.light, 1)
-    seen = stages.photometry(image.photons, image.cells, chosen.delay, light, 1)
-    plane = stages.planes(seen, image.cells, 0, image.photons.height, 1)
-    maps = stages.plane_features(plane, chosen, light, seen, image.cells, slice(0, image.photons.height))
-    off = gap(image.truth, chosen.delay, image.cells.count) / image.cells.sigma
+    delay, _ = image.solver.choose(first)
+    maps = image.solver.plane_features()
+    off = gap(image.truth, delay, image.cells) / image.sigma
     of_network = {name: torch.from_numpy(values) for name, values in zip(("x", "delays", "signals"), maps, strict=True)}
     mean = float(np.exp(image.signal)[image.valid].mean()) if image.valid.any() else 1.0
     return of_network | {
@@ -203,16 +192,16 @@ def _weighed(torch: Any, image: _Prepared, first: Networks) -> dict[str, Any]:
     }
 
 
-def _train_weigh(torch: Any, held: list[dict[str, Any]], plan: Plan, tell: Tell) -> tuple[Any, dict[str, float]]:
+def _train_weigh(torch: Any, prepared: list[dict[str, Any]], plan: Plan, tell: Tell) -> tuple[Any, dict[str, float]]:
     """The network that weighs planes and signals, and says how far off it is."""
     rng = np.random.default_rng(plan.seed + 1)
-    test = list(range(0, len(held), _HELD_OUT))
-    rest = [k for k in range(len(held)) if k % _HELD_OUT]
+    test = list(range(0, len(prepared), _HELD_OUT))
+    rest = [k for k in range(len(prepared)) if k % _HELD_OUT]
     net = _weigh_net(torch)
     optimiser = torch.optim.AdamW(net.parameters(), 1e-3, weight_decay=1e-3)
     rate = torch.optim.lr_scheduler.OneCycleLR(optimiser, 5e-3, total_steps=plan.weigh_steps)
     for step in range(plan.weigh_steps):
-        loss, _ = _weigh_loss(torch, net, [held[k] for k in rng.choice(rest, 4)], step % 8)
+        loss, _ = _weigh_loss(torch, net, [prepared[k] for k in rng.choice(rest, 4)], step % 8)
         optimiser.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(net.parameters(), 1.0)
@@ -220,7 +209,7 @@ def _train_weigh(torch: Any, held: list[dict[str, Any]], plan: Plan, tell: Tell)
         rate.step()
         if step % 400 == 399 or step == plan.weigh_steps - 1:
             with torch.no_grad():
-                judged, of = _weigh_loss(torch, net, [held[k] for k in test], 0)
+                judged, of = _weigh_loss(torch, net, [prepared[k] for k in test], 0)
             facts = {"loss_held_out": float(judged), **_facts(of)}
             tell(f"image: weighing, step {step + 1}, held-out images: {facts}")
     return net, facts
@@ -240,7 +229,9 @@ def _facts(of: dict[str, Any]) -> dict[str, float]:
     }
 
 
-def _calibrated(torch: Any, net: Any, first: Networks, plan: Plan, tell: Tell) -> tuple[float, dict[str, float]]:
+def _calibrated(
+    torch: Any, net: Any, first: _core.ImageNetworks, plan: Plan, tell: Tell
+) -> tuple[float, dict[str, float]]:
     """The factor by which intervals hold in images of content and pulses that no network was trained on."""
     images = (_prepared(scenes.example(scenes.CALIBRATION + k, plan.seed)) for k in range(plan.calibration))
     with torch.no_grad():
@@ -259,11 +250,11 @@ def _weigh_net(torch: Any) -> Any:
     class Weigh(nn.Module):  # type: ignore[misc, name-defined]
         def __init__(self) -> None:
             super().__init__()
-            around = {"padding": 1, "padding_mode": "replicate"}
-            self.enter = nn.Conv2d(CHANNELS_IN, CHANNELS, 1)
-            self.first = nn.Conv2d(CHANNELS, CHANNELS, 3, **around)
-            self.second = nn.Conv2d(CHANNELS, CHANNELS, 3, **around)
-            self.leave = nn.Conv2d(CHANNELS, OUTPUTS, 1)
+            around, channels = {"padding": 1, "padding_mode": "replicate"}, SIZES["channels"]
+            self.enter = nn.Conv2d(SIZES["plane_features"], channels, 1)
+            self.first = nn.Conv2d(channels, channels, 3, **around)
+            self.second = nn.Conv2d(channels, channels, 3, **around)
+            self.leave = nn.Conv2d(channels, SIZES["outputs"], 1)
             nn.init.zeros_(self.leave.weight)
             nn.init.zeros_(self.leave.bias)
 
@@ -290,8 +281,8 @@ def _weigh_loss(torch: Any, net: Any, images: list[dict[str, Any]], turn: int) -
 
     names = "x", "delays", "signals", "off", "valid", "signal", "mean"
     x, delays, signals, off, valid, signal, mean = map(stacked, names)
-    o = net(x)
-    weight, share, rest = o[:, :PLANES], o[:, PLANES : PLANES + SIGNALS], o[:, PLANES + SIGNALS :].unbind(1)
+    weight, share, rest = net(x).split([SIZES["delays"], SIZES["signals"], 5], 1)
+    rest = rest.unbind(1)
     delay = (torch.softmax(weight, 1) * delays).sum(1) + 0.3 * rest[3].clamp(-3.0, 3.0)
     log_scale, logit = rest[0].clamp(-4.0, 3.0) - 1.5, rest[1] - 2.0
     signal_scale, log_half = rest[2].clamp(-4.0, 3.0) - 1.0, rest[4].clamp(-4.0, 3.0) - 0.7
@@ -312,21 +303,19 @@ def _weigh_loss(torch: Any, net: Any, images: list[dict[str, Any]], turn: int) -
 
 
 def _flat(net: Any) -> np.ndarray:
-    """Weights of the network that chooses, in the order of native/image/kernel.h."""
+    """Weights of the network that chooses, in the order of native/image/solver.h."""
     parts = []
     for layer in (*(net.layers[k] for k in (0, 2, 4)), net.none):
         parts += [layer.weight.detach().numpy().T.ravel(), layer.bias.detach().numpy()]
     return np.ascontiguousarray(np.concatenate(parts), np.float32)
 
 
-def _layers(net: Any) -> dict[str, np.ndarray]:
-    """Weights (inputs * rows * columns, outputs) and biases of the network that weighs."""
-    out = {}
-    for name in ("enter", "first", "second", "leave"):
-        weight = getattr(net, name).weight.detach().numpy()
-        out[f"{name}_weights"] = np.ascontiguousarray(weight.transpose(1, 2, 3, 0).reshape(-1, len(weight)), np.float32)
-        out[f"{name}_bias"] = np.ascontiguousarray(getattr(net, name).bias.detach().numpy(), np.float32)
-    return out
+def _layers(net: Any) -> np.ndarray:
+    """Weights (inputs, rows, columns, outputs) and bias of each layer of the network that weighs, likewise."""
+    parts = []
+    for layer in (net.enter, net.first, net.second, net.leave):
+        parts += [layer.weight.detach().numpy().transpose(1, 2, 3, 0).ravel(), layer.bias.detach().numpy()]
+    return np.ascontiguousarray(np.concatenate(parts), np.float32)
 
 
 def _card(plan: Plan, factor: float, facts: dict[str, float], seconds: float, torch: str) -> dict[str, Any]:

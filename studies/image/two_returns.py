@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from mars_lidar import Flux, Scene, System, reconstruct, simulate
+from mars_lidar._base.native import _core
 from mars_lidar._base.types import FloatArray
 from mars_lidar.reconstruction import MaximumLikelihood
-from mars_lidar.reconstruction import image_stages as stages
-from mars_lidar.reconstruction.image_network import OUTLIER_SIGMA, PEAKS
-from mars_lidar.reconstruction.image_pulse import cells_of
+from mars_lidar.reconstruction.image import solver_of
+from mars_lidar.reconstruction.image_pulse import settings_of
 from mars_lidar.reconstruction.photons import Photons
 from studies.common.report import Row
 
@@ -36,7 +36,10 @@ def rows(size: int, system: System, seed: int, photons: tuple[float, ...] = PHOT
             _, score = seconds(lone, system)
             least = float(np.quantile(score, 1.0 - FALSE))
             delays, score = seconds(pair, system)
-            near = [np.abs(_gap(delays, d[..., None], system)) < OUTLIER_SIGMA * _sigma(system) for d in (behind, pane)]
+            near = [
+                np.abs(_gap(delays, d[..., None], system)) < _core.IMAGE_OUTLIER_SIGMA * _sigma(system)
+                for d in (behind, pane)
+            ]
             found = (near[0] & near[1][..., ::-1]).any(-1) & (score > least)
             line[f"{name}, both found %"] = 100.0 * float(found.mean())
         out.append(line)
@@ -44,7 +47,8 @@ def rows(size: int, system: System, seed: int, photons: tuple[float, ...] = PHOT
 
 
 def _sigma(system: System) -> float:
-    return cells_of(system).sigma / cells_of(system).count * system.period_ns
+    setting = settings_of(system)[-1]
+    return setting.sigma / setting.cells * system.period_ns
 
 
 def _gap(a: FloatArray, b: FloatArray, system: System) -> FloatArray:
@@ -62,13 +66,14 @@ def _alone(cube: np.ndarray, system: System) -> tuple[FloatArray, FloatArray]:
 def _peaks(cube: np.ndarray, system: System) -> tuple[FloatArray, FloatArray]:
     """Delays (H, W, 2) of the two largest peaks apart of each pixel's posterior, and the mass of the smaller."""
     height, width, bins = cube.shape
-    photons, cells = Photons.of(cube.reshape(-1, bins), height, width), cells_of(system)
-    light = stages.first_light(photons, cells)
-    light = stages.light_at(photons, cells, stages.first_delays(photons, cells, light, 1), light, 1)
-    place, mass = stages.volumes(photons, cells, light, slice(0, height), slice(0, width), PEAKS, 1)[3:]
-    apart = np.abs((place - place[:, :1] + 0.5 * cells.count) % cells.count - 0.5 * cells.count)
-    others = np.where(apart > _APART * cells.sigma, mass, 0.0)
+    solver = solver_of(Photons.of(cube.reshape(-1, bins), height, width), 1)
+    setting = settings_of(system)[-1]
+    solver.begin(setting)
+    volumes, cells = solver.volumes(), setting.cells
+    place, mass = volumes.place, volumes.mass
+    apart = np.abs((place - place[:, :1] + 0.5 * cells) % cells - 0.5 * cells)
+    others = np.where(apart > _APART * setting.sigma, mass, 0.0)
     second = others.argmax(1)
     pixels = np.arange(len(place))
-    delays = np.stack([place[:, 0], place[pixels, second]], -1) / cells.count * system.period_ns
+    delays = np.stack([place[:, 0], place[pixels, second]], -1) / cells * system.period_ns
     return delays.reshape(height, width, 2), others[pixels, second].reshape(height, width)

@@ -16,8 +16,8 @@ import numpy as np
 from mars_lidar.calibration.model import Effect, Model, effects
 from mars_lidar.calibration.recording import Clock
 
-AT = np.array([0.15, 0.4, 30.0, 0.1, 0.01, 60.0])  # B, S, delay, variances of pulse and jitter, dead time
-STEPS = np.array([0.01, 0.02, 0.05, 0.02, 0.005, 0.1])
+AT = np.array([0.15, 0.4, 30.0, 0.316, 0.322, 60.0])  # B, S, delay, recorded width, angle of the jitter, dead time
+STEPS = np.array([0.01, 0.02, 0.05, 0.03, 0.1, 0.1])
 GAPS = np.r_[59.5, 60.2, 61, 63, 66, 70:121:5, 130:161:10, 180, 200, 230, 260, 300, 400, 600, 1e9]
 PHASES = np.r_[0:26:5, 28, 29.3, 29.7, 30.0, 30.3, 30.7, 32, 35:101:5]
 

@@ -82,26 +82,36 @@ def with_effect(truth: Truth, effect: str | None) -> Truth:
     return replace(truth, **more)
 
 
+def true_values(truth: Truth) -> tuple[float, ...]:
+    """Those of `PULLED`."""
+    return truth.background, truth.signal, truth.delay, truth.width, truth.dead
+
+
 def pulls(result: ml.Calibration, truth: Truth) -> np.ndarray:
     """(estimate - truth) / stated error of `PULLED`, NaN where there is none."""
-    true = {
-        "background": truth.background,
-        "signal": truth.signal,
-        "delay_ns": truth.delay,
-        "width_ns": truth.width,
-        "dead_time_ns": truth.dead,
-    }
     out = []
-    for name in PULLED:
+    for name, true in zip(PULLED, true_values(truth), strict=True):
         estimate = result.estimates.get(name)
         if estimate is None or not estimate.error > 0.0:
             out.append(np.nan)
             continue
-        off = estimate.value - true[name]
+        off = estimate.value - true
         if name == "delay_ns":
             off = (off + truth.period / 2) % truth.period - truth.period / 2
         out.append(off / estimate.error)
     return np.array(out)
+
+
+def outside(result: ml.Calibration, truth: Truth) -> list[str]:
+    """Names of `PULLED` whose true values lie outside of the 95 % intervals."""
+    out = []
+    for name, true in zip(PULLED, true_values(truth), strict=True):
+        estimate = result.estimates.get(name)
+        if estimate is not None:
+            wraps = (0.0, truth.period, -truth.period) if name == "delay_ns" else (0.0,)
+            if not any(estimate.low <= true + wrap <= estimate.high for wrap in wraps):
+                out.append(name)
+    return out
 
 
 def main() -> None:
@@ -112,6 +122,7 @@ def main() -> None:
     parser.add_argument("--effect", choices=list(EFFECTS))
     parser.add_argument("--photons", type=int)
     parser.add_argument("--keep", type=Path)
+    parser.add_argument("--kept", action="store_true", help="only the streams of FILE, as the table of the docs")
     asked = parser.parse_args()
     done: dict[int, dict[str, Any]] = {}
     if asked.keep is not None and asked.keep.exists():
@@ -121,24 +132,43 @@ def main() -> None:
                 done[row["number"]] = row
     rows = []
     for number in range(asked.first, asked.last):
+        if asked.kept and number not in done:
+            continue
         row = done.get(number) or calibrated(number, asked.effect, asked.photons)
         rows.append(row)
         if number not in done and asked.keep is not None:
             with asked.keep.open("a") as file:
                 file.write(json.dumps(row) + "\n")
-        print(f"{number} {row['photons']:,} photons {row['seconds']:.1f} s p={row['p']:.2g}", end=" ")
-        print(np.round(np.array(row["pulls"], float), 1), row["suspects"], flush=True)
-    table = np.array([row["pulls"] for row in rows], float)
-    named = sum(NAMES.get(asked.effect or "", "") in row["suspects"] for row in rows)
-    others = sum(any(name != NAMES.get(asked.effect or "") for name in row["suspects"]) for row in rows)
-    print("parameters       ", PULLED)
-    print("sd of pulls      ", np.round(np.nanstd(table, axis=0), 2))
-    print("largest          ", np.round(np.nanmax(np.abs(table), axis=0), 1))
-    print("beyond 4.5       ", (np.abs(table) > 4.5).sum(0), "of", len(table))
-    print("without an error ", np.isnan(table).sum(0))
-    print(f"p below 1 % {sum(row['p'] < 0.01 for row in rows)}, named {named}, other suspects {others}, of {len(rows)}")
-    print(
-        f"{np.mean([row['seconds'] for row in rows]):.1f} CPU-s each, largest {max(row['seconds'] for row in rows):.1f}"
+        if not asked.kept:
+            print(f"{number} {row['photons']:,} photons {row['seconds']:.1f} s p={row['p']:.2g}", end=" ")
+            print(np.round(np.array(row["pulls"], float), 1), row["suspects"], flush=True)
+    print(table(rows, NAMES.get(asked.effect or "", "")))
+
+
+def table(rows: list[dict[str, Any]], effect: str) -> str:
+    """Markdown: what the pulls of these streams were, and a line about verdicts and times."""
+    pulled = np.array([row["pulls"] for row in rows], float)
+    missed = [name for row in rows for name in row["outside"]]
+    lines = [
+        ("standard deviation of (estimate - truth) / error", [f"{v:.2f}" for v in np.nanstd(pulled, axis=0)]),
+        ("root mean square", [f"{v:.2f}" for v in np.sqrt(np.nanmean(pulled**2, axis=0))]),
+        ("largest", [f"{v:.1f}" for v in np.nanmax(np.abs(pulled), axis=0)]),
+        ("beyond 4.5", [str(v) for v in (np.abs(pulled) > 4.5).sum(0)]),
+        ("truth outside of the 95 % interval", [f"{missed.count(name) / len(rows):.1%}" for name in PULLED]),
+        ("without an estimate", [str(v) for v in np.isnan(pulled).sum(0)]),
+    ]
+    named = sum(bool(effect) and effect in row["suspects"] for row in rows)
+    others = sum(any(name != effect for name in row["suspects"]) for row in rows)
+    seconds = [row["seconds"] for row in rows]
+    return "\n".join(
+        [
+            "| | B | S | delay | width | dead time |",
+            "|---|---|---|---|---|---|",
+            *(f"| {words} | {' | '.join(values)} |" for words, values in lines),
+            "",
+            f"{len(rows)} streams: p below 1 % in {sum(row['p'] < 0.01 for row in rows)}, effect named in {named}, "
+            f"other suspects in {others}; {np.mean(seconds):.1f} s of a processor each, largest {max(seconds):.1f}.",
+        ]
     )
 
 
@@ -157,6 +187,7 @@ def calibrated(number: int, effect: str | None, photons: int | None) -> dict[str
         "seconds": time.process_time() - began,
         "p": float(result.p_value),
         "pulls": [None if np.isnan(z) else float(z) for z in pulls(result, truth)],
+        "outside": outside(result, truth),
         "suspects": [suspect.name for suspect in result.suspects],
     }
 

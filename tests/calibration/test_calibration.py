@@ -86,6 +86,16 @@ def test_a_wrong_dead_time_that_is_given_is_the_suspect() -> None:
 
 
 @pytest.mark.full
+@pytest.mark.parametrize("number", [2018, 2051, 2105])
+def test_a_pulse_or_a_jitter_that_is_hardly_there(number: int) -> None:
+    """Pulses of .027 and .108 ns in jitters of 8.1 and 13.9, none in .35; by variances 4.0, 3.9, 13.5 errors off."""
+    truth, photons = random_truth(number)
+    result = ml.calibrate(stream(truth, photons, number), seed=number)
+    assert result.fits
+    assert (np.abs(pulls(result, truth)) < 3.5).all()  # 5e-4 by chance, of 15
+
+
+@pytest.mark.full
 def test_a_few_photons_of_a_fine_clock_start_at_the_pulse() -> None:
     """16,384 cells of the period, 5,289 photons: most cells are empty, so their median is no measure of the light."""
     truth, photons = random_truth(4)
@@ -107,6 +117,20 @@ def test_an_effect_is_named(effect: str) -> None:
     truth = with_effect(BASE, effect)
     result = ml.calibrate(stream(truth, 300_000 if effect in ("twilight", "electronics") else 100_000, 5))
     assert NAMES[effect] in [suspect.name for suspect in result.suspects]
+
+
+@pytest.mark.full
+@pytest.mark.parametrize(("probability", "delay"), [(0.1, 100.0), (0.05, 30.0)])
+def test_strong_afterpulses_are_taken_in(probability: float, delay: float) -> None:
+    """Those after the dead time, their mean delay, and the light beside them."""
+    truth = replace(BASE, afterpulses=probability, afterpulse_delay=delay)
+    result = ml.calibrate(stream(truth, 40_000, 1))
+    assert result.fits
+    assert (np.abs(pulls(result, truth)) < FAR).all()
+    for name, value in (("afterpulses_after_dead_time", probability), ("afterpulse_delay_ns", delay)):
+        estimate = result.estimates[name]
+        assert abs(estimate.value - value) < FAR * estimate.error
+        assert estimate.error < 0.5 * value
 
 
 @pytest.mark.full
@@ -195,7 +219,7 @@ def test_native_counts_are_those_of_numpy() -> None:
     from mars_lidar.calibration.model import Model
     from mars_lidar.calibration.recording import Clock
 
-    rows = np.array([[0.15, 0.4, 30.0, 0.1, variance, 50.0] for variance in (0.0, 0.01, 0.05)])
+    rows = np.array([[0.15, 0.4, 30.0, 0.316, angle, 50.0] for angle in (0.0, 0.3, 0.8)])
     for clock in (Clock(100.0), Clock(100.3, 0.064, 0.5, locked=False), Clock(100.3, 0.25, 0.5, locked=True)):
         model = Model(clock, 1)
         streams = model.streams(rows, 4000, 3)

@@ -8,8 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.gpu_resources import mars_steps
-from benchmarks.nvrtc import NotFound, compiled, library
 from mars_lidar.cuda import kernels
 from mars_lidar.cuda.kernels import (
     HEADERS,
@@ -21,6 +19,8 @@ from mars_lidar.cuda.kernels import (
     mars_histograms,
     source,
 )
+from tests.cuda.nvrtc import NotFound, compiled, library
+from tests.cuda.resources import mars_steps
 
 try:
     library()
@@ -63,7 +63,7 @@ def test_the_other_engines_compile_without_spills(architecture: str, kernels: li
 
 @pytest.mark.full
 def test_the_steps_of_the_estimate_compile():
-    """What `benchmarks.gpu_resources` counts the instructions of, alone."""
+    """What `tests.cuda.resources` counts the instructions of, alone."""
     found = mars_steps()
     assert (
         found["mars::two_poisson"].instructions > found["mars::form"].instructions > found["mars::nothing"].instructions

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -10,9 +11,10 @@ from harness import Case, counts_against_law, require, task_of
 
 import mars_lidar as ml
 from mars_lidar.engines import MarsEngine
-from mars_lidar.engines.counts import Matched, Mended, Streams, Tabulated
+from mars_lidar.engines.counts import Matched, PartlyReplaced, Streams, Tabulated
 from mars_lidar.engines.synthesis import Run
 from mars_lidar.engines.table_reader import Entries
+from mars_lidar.engines.tolerances import TOLERANCES
 from mars_lidar.statistics.count_pmf import Pmf, total_variation
 from mars_lidar.statistics.tolerances import TOL
 from mars_lidar.table import Table
@@ -45,18 +47,18 @@ def doubted(seed: int = 0, pixels: int = 400, start: str = "armed", cycles: int 
     return ml.Flux(signal[bad][None], background[bad][None], delay[bad][None])
 
 
-def laws_of(flux: ml.Flux, system: ml.System, **options: str) -> tuple[Mended, Entries, dict[str, float]]:
+def laws_of(flux: ml.Flux, system: ml.System, **options: str) -> tuple[PartlyReplaced, Entries, dict[str, float]]:
     """What the engine draws the counts of these pixels from, the table's entries of them, and its report."""
     engine = MarsEngine(table(system.start), **options)
     task = task_of(Case("pixels", flux, system, flux.signal.size), 1)
     entries, left = engine.reader.read(task, np.arange(flux.signal.size))
     assert left.size == 0
     laws = engine._laws_of(Run(task, np.empty(0)), engine.reader, entries)
-    assert isinstance(laws, Mended)
+    assert isinstance(laws, PartlyReplaced)
     return laws, entries, task.report
 
 
-def window(laws: Mended, k: int) -> Pmf:
+def window(laws: PartlyReplaced, k: int) -> Pmf:
     law = int(laws.others.law[k])
     cumulative = laws.others.cumulative[laws.others.offsets[law] : laws.others.offsets[law + 1]]
     return Pmf(int(laws.others.first[law]), np.diff(cumulative, prepend=0.0))
@@ -166,8 +168,9 @@ def test_parts_batches_and_threads_do_not_show(monkeypatch: pytest.MonkeyPatch):
 
     flux = doubted(pixels=160)
     whole = ml.simulate(flux, SYSTEM, engine="mars", table=table(), realizations=3, threads=2)
-    monkeypatch.setattr(_synthesis, "_BATCH", 4)
-    monkeypatch.setattr(_count_shape, "PIXELS", 11)
+    small = replace(TOLERANCES, batch_exposures=4, looked_up=11)
+    monkeypatch.setattr(_synthesis, "TOLERANCES", small)
+    monkeypatch.setattr(_count_shape, "TOLERANCES", small)
     monkeypatch.setitem(vars(TOL), "block", 3)
     assert np.array_equal(whole, ml.simulate(flux, SYSTEM, engine="mars", table=table(), realizations=3, threads=1))
     index = np.arange(flux.signal.size).reshape(1, -1)[:, 7:20]
@@ -178,7 +181,7 @@ def test_parts_batches_and_threads_do_not_show(monkeypatch: pytest.MonkeyPatch):
 def test_a_part_of_mended_laws_is_mended_alike():
     cumulants = np.tile([[40.0, 3.0, -0.7, 0.3]], (9, 1))
     other = Tabulated.of([Pmf(7, np.array([0.5, 0.5]))], np.zeros(3, np.int64))
-    laws = Mended(Matched(cumulants), np.array([1, 4, 8]), other)
+    laws = PartlyReplaced(Matched(cumulants), np.array([1, 4, 8]), other)
     streams = Streams(np.arange(9, dtype=np.uint32), 4, 0, 1, 1)
     whole = laws.draw(streams)
     assert (whole[:, [1, 4, 8]] < 9).all()

@@ -17,7 +17,8 @@ from mars_lidar.engines.auto import AutoEngine
 from mars_lidar.engines.engine import Task
 from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.engines.feedback import FeedbackEngine, expected_registrations
-from mars_lidar.engines.feedback_grid import GOAL, Grids, cells_of
+from mars_lidar.engines.feedback_grid import Check, Grids, cells_of, least_power
+from mars_lidar.engines.tolerances import TOLERANCES
 
 # What is given to other engines
 
@@ -74,10 +75,8 @@ def test_no_dead_time_is_poisson_at_any_length():
 
 def off(request: Case, kinds: NDArray[np.uint8]) -> float:
     """Distance of a grid's mean histogram from that of one of half its cells' width."""
-    task, distance, sweeps = task_of(request, 1, realizations=1), np.empty(1), np.empty(1, np.int32)
-    parts = np.empty((0, request.system.bins))
-    _core.feedback_check(task.job, task.pulse, np.arange(1), kinds, distance, sweeps, parts, 1)
-    return float(distance[0])
+    check = Check.of(task_of(request, 1, realizations=1), np.arange(1), kinds)
+    return float(check.distance[0]) / TOLERANCES.richardson
 
 
 def test_bins_are_cut_where_light_and_its_echo_are():
@@ -104,8 +103,25 @@ GRIDS = {
 @pytest.mark.parametrize("name", GRIDS)
 def test_the_mean_is_that_of_a_finer_grid_and_no_cell_is_cut_in_vain(name: str):
     kinds = kinds_of(GRIDS[name])
-    assert off(GRIDS[name], kinds) <= GOAL
-    assert off(GRIDS[name], np.maximum(kinds, 1) - 1) > GOAL / 4
+    assert off(GRIDS[name], kinds) <= TOLERANCES.mean_distance
+    assert off(GRIDS[name], np.maximum(kinds, 1) - 1) > TOLERANCES.mean_distance / 4
+
+
+def test_powers_are_the_least_that_are_not_below():
+    """At powers of two and the next double on either side, where a rounded logarithm may be off by one."""
+    for octaves in (1, 2, 5):
+        for k in range(-9, 9):
+            power = 2.0 ** (octaves * k)
+            ratios = np.array([np.nextafter(power, 0.0), power, np.nextafter(power, np.inf)])
+            assert least_power(octaves, ratios, -10, 10).tolist() == [k, k, k + 1]
+    assert least_power(2, np.array([0.0, 1e9]), 1, 4).tolist() == [1, 4]
+
+
+def test_laps_are_foreseen_where_few_are_armed():
+    task = task_of(case(20.0, 0.5, 0.93, 100_000), 1, realizations=1)
+    assert Grids.checked(task, np.arange(1)).laps()[0] >= 3
+    task = task_of(case(1.0, 1.0, 0.6375, 100_000), 1, realizations=1)
+    assert Grids.checked(task, np.arange(1)).laps()[0] == 1
 
 
 def test_flat_light_needs_no_cuts():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tracemalloc
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -13,6 +14,7 @@ from harness.check import COUNTS, SHAPE
 
 import mars_lidar as ml
 from mars_lidar.engines import MarsEngine
+from mars_lidar.engines.tolerances import TOLERANCES
 from mars_lidar.statistics import exposure_moments
 from mars_lidar.table import Table
 
@@ -112,8 +114,9 @@ def test_batches_do_not_show(monkeypatch: pytest.MonkeyPatch):
     from mars_lidar.engines import synthesis as _synthesis
 
     whole = ml.simulate(image(), SYSTEM, engine="mars", table=table(), realizations=5)
-    monkeypatch.setattr(_synthesis, "_BATCH", 4)
-    monkeypatch.setattr(_count_shape, "PIXELS", 11)
+    small = replace(TOLERANCES, batch_exposures=4, looked_up=11)
+    monkeypatch.setattr(_synthesis, "TOLERANCES", small)
+    monkeypatch.setattr(_count_shape, "TOLERANCES", small)
     assert np.array_equal(whole, ml.simulate(image(), SYSTEM, engine="mars", table=table(), realizations=5))
 
 

@@ -86,16 +86,16 @@ def test_a_pixel_and_its_light(server: CubeServer, stored: Path):
             assert told["light"] == expected | {"delay": 0.0 if dark else 20.0 + 3.0 * column + row}
 
 
-@pytest.mark.parametrize("method", ["truth", "peak", "likelihood"])
+@pytest.mark.parametrize("method", ["truth", "peak", "likelihood", "image"])
 def test_rows(server: CubeServer, stored: Path, method: str):
     _, content, _ = got(server, f"/rows?image=1&first=2&rows=3&method={method}")
     totals, delay = np.frombuffer(content, "<f8").reshape(2, 3, SHAPE[1])
     with io.load(stored) as cube:
-        counts, system, flux = np.asarray(cube.histogram[1, 2:5]), cube.system, cube.flux
-    assert np.array_equal(totals, counts.sum(-1))
-    names = {"peak": "peak", "likelihood": "maximum_likelihood"}
-    expected = flux.delay_ns[2:5] if method == "truth" else reconstruct(counts, system, names[method]).delay_ns
-    np.testing.assert_array_equal(delay, expected)
+        counts, system, flux = np.asarray(cube.histogram[1]), cube.system, cube.flux
+    assert np.array_equal(totals, counts[2:5].sum(-1))
+    names = {"peak": "peak", "likelihood": "maximum_likelihood", "image": "image"}
+    expected = flux.delay_ns if method == "truth" else reconstruct(counts, system, names[method]).delay_ns
+    np.testing.assert_array_equal(delay, expected[2:5])
 
 
 def test_parts_of_the_file_are_read_as_they_are_asked_for(stored: Path):

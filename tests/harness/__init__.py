@@ -20,6 +20,7 @@ from harness.cases import (
     measured_pulse,
     random_cases,
     shared,
+    system_of,
     two_lobes,
     waveform_flux,
 )
@@ -67,6 +68,7 @@ __all__ = [
     "same_law",
     "shared",
     "stationary_count_pmf",
+    "system_of",
     "task_of",
     "two_lobes",
     "two_mean_vectors",

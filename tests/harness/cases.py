@@ -29,6 +29,26 @@ class Case:
     items: int  # exposures, a multiple of the number of pixels
 
 
+def system_of(
+    dead: float,
+    cycles: int = 1000,
+    bins: int = 64,
+    *,
+    sigma: float = 0.00375,
+    start: str = "armed",
+    pulse: Pulse | None = None,
+) -> System:
+    """A free-running system; times in periods of 100 ns."""
+    return System(
+        period_ns=PERIOD_NS,
+        cycles=cycles,
+        bins=bins,
+        pulse=pulse or GaussianPulse(sigma_ns=sigma * PERIOD_NS),
+        detector=Detector(dead_time_ns=dead * PERIOD_NS),
+        start=start,  # type: ignore[arg-type]  # checked there
+    )
+
+
 def shared(path: str) -> Path:
     """A file of the project's shared material; the test is skipped where it is absent."""
     file = _SHARED / path

@@ -10,10 +10,11 @@ from harness import require
 from scipy import stats
 
 import mars_lidar as ml
+from mars_lidar._base.native import _core
 from mars_lidar.reconstruction import METHODS, Flags, Image, UntrainedImage
 from mars_lidar.reconstruction import image as image_module
-from mars_lidar.reconstruction import image_stages as stages
-from mars_lidar.reconstruction.image_pulse import cells_of
+from mars_lidar.reconstruction.image_network import LIMITS, card, networks
+from mars_lidar.reconstruction.image_pulse import settings_of
 from mars_lidar.reconstruction.photons import Photons
 
 SIGMA = 0.6
@@ -43,29 +44,33 @@ def roof(side: int = 32) -> np.ndarray:
     return 30.0 + 0.08 * y + np.where(x < side // 2, 0.0, 20.0) + 0.05 * np.abs(x - side // 2)
 
 
+def solver_over(cube: np.ndarray) -> _core.ImageSolver:
+    height, width, bins = cube.shape
+    return image_module.solver_of(Photons.of(cube.reshape(-1, bins), height, width), 1)
+
+
 def test_a_line_of_pixels_has_the_exact_posterior_of_its_chain():
     """Both combs of one row are the chain itself: forward and backward with the prior's matrix, in double precision."""
-    cube = drawn(np.linspace(40.0, 46.0, 9)[None], 1.0)
-    photons, cells = Photons.of(cube.reshape(-1, 250), 1, 9), cells_of(SYSTEM)
-    light = stages.first_light(photons, cells)
-    whole = slice(0, 1), slice(0, 9)
-    posterior, _, likelihood, _, _ = stages.volumes(photons, cells, light, *whole, 1, 1)
-    n = cells.count
-    tap = np.exp(-0.5 * (np.arange(4) / (stages.STEP_SIGMA * cells.sigma)) ** 2)
+    (setting,) = settings_of(SYSTEM)
+    solver = solver_over(drawn(np.linspace(40.0, 46.0, 9)[None], 1.0))
+    solver.begin(setting)
+    volumes = solver.volumes()
+    n, (step_sigma, wide, jump) = setting.cells, _core.IMAGE_PRIOR
+    tap = np.exp(-0.5 * (np.arange(4) / (step_sigma * setting.sigma)) ** 2)
     tap /= tap[0] + 2.0 * tap[1:].sum()
-    step = np.full((n, n), stages.JUMP / n)
+    step = np.full((n, n), jump / n)
     for k in range(n):
         for o in range(-3, 4):
-            step[k, (k + o) % n] += (1.0 - stages.WIDE - stages.JUMP) * tap[abs(o)]
+            step[k, (k + o) % n] += (1.0 - wide - jump) * tap[abs(o)]
         for o in range(-15, 16):
-            step[k, (k + o) % n] += stages.WIDE * (2.0 if o == 0 else 1.0) / 32.0
-    alone = likelihood[0].astype(np.float64)
+            step[k, (k + o) % n] += wide * (2.0 if o == 0 else 1.0) / 32.0
+    alone = volumes.likelihood[0].astype(np.float64)
     before, after = [np.full(n, 1.0 / n)], [np.full(n, 1.0 / n)]
     for j in range(8):
         before.append(_unit(step.T @ (before[-1] * alone[j])))
         after.append(_unit(step.T @ (after[-1] * alone[8 - j])))
     exact = np.stack([_unit(before[j] * alone[j] * after[8 - j]) for j in range(9)])
-    np.testing.assert_allclose(posterior[0], exact, atol=2e-6)
+    np.testing.assert_allclose(volumes.posterior[0], exact, atol=2e-6)
 
 
 def _unit(x: np.ndarray) -> np.ndarray:
@@ -77,18 +82,20 @@ def test_likelihood_of_a_pixel():
     rng = np.random.default_rng(3)
     counts = np.zeros((1, 1, 250), np.uint16)
     counts[0, 0, rng.integers(0, 250, 5)] = [1, 2, 1, 1, 3]
-    photons, cells = Photons.of(counts.reshape(1, 250), 1, 1), cells_of(SYSTEM)
-    light = stages.Light(np.array([[2.0]]), np.array([[3.0]]), np.zeros((1, 1), bool), np.ones((1, 1)))
-    found = stages.volumes(photons, cells, light, slice(0, 1), slice(0, 1), 1, 1)[2][0, 0]
-    delay = (np.arange(cells.count) + 0.5) / cells.count * 100.0
+    (setting,), solver = settings_of(SYSTEM), solver_over(counts)
+    solver.begin(setting)
+    signal, background = (float(x[0]) for x in solver.light())
+    likelihood = solver.volumes().likelihood[0, 0]
+    cells, photons = setting.cells, Photons.of(counts.reshape(1, 250), 1, 1)
+    delay = (np.arange(cells) + 0.5) / cells * 100.0
     time, number = (photons.bin + 0.5) * 0.4, photons.number
-    exact = np.zeros(cells.count)
+    exact = np.zeros(cells)
     for factor, share in ((0.4, 0.3), (1.0, 0.45), (2.5, 0.25)):
-        ratio, late = factor * 2.0 / 3.0, (time[:, None] - delay + 50.0) % 100.0 - 50.0
+        ratio, late = factor * signal / background, (time[:, None] - delay + 50.0) % 100.0 - 50.0
         edges = stats.norm.cdf(late + 0.2, scale=SIGMA) - stats.norm.cdf(late - 0.2, scale=SIGMA)
         exact += share * np.prod(((1.0 + ratio * 250.0 * edges) / (1.0 + ratio)) ** number[:, None], axis=0)
     # a photon's place within its cell is rounded to 1/32: 0.01 sigma
-    np.testing.assert_allclose(found, exact / exact.mean(), rtol=0.12, atol=0.02 * found.max())
+    np.testing.assert_allclose(likelihood, exact / exact.mean(), rtol=0.12, atol=0.02 * likelihood.max())
 
 
 @pytest.mark.parametrize("method", BOTH)
@@ -220,10 +227,17 @@ def test_parts_of_an_image_give_what_the_whole_gives(monkeypatch):
     delay = roof(72)
     cube = drawn(delay, 2.0)
     whole = ml.reconstruct(cube, SYSTEM, "image")
-    assert len(list(stages.parts(72, 72, cells_of(SYSTEM).count))) == 1
-    monkeypatch.setattr(stages, "VOLUME_BYTES", 70 * 70 * 4 * cells_of(SYSTEM).count)
-    assert len(list(stages.parts(72, 72, cells_of(SYSTEM).count))) > 1
-    monkeypatch.setattr(image_module, "_BLOCK_PIXELS", 72 * 10)  # exact: a network's reach is finite
+    (setting,) = settings_of(SYSTEM)
+
+    def parts() -> int:
+        solver = solver_over(cube)
+        solver.begin(setting)
+        return solver.parts()
+
+    assert parts() == 1
+    monkeypatch.setattr(image_module, "VOLUME_BYTES", 70 * 70 * 4 * setting.cells)
+    assert parts() > 1
+    monkeypatch.setattr(image_module, "BLOCK_PIXELS", 72 * 10)  # exact: a network's reach is finite
     parts = ml.reconstruct(cube, SYSTEM, "image")
     assert (np.abs(parts.delay_ns - whole.delay_ns) < 0.1 * SIGMA).mean() > 0.995
 
@@ -233,7 +247,7 @@ def test_blocks_and_threads_do_not_matter(monkeypatch):
     for method in BOTH:
         both = ml.reconstruct(cube, SYSTEM, method, threads=2)
         with monkeypatch.context() as patch:
-            patch.setattr(image_module, "_BLOCK_PIXELS", 24 * 5)
+            patch.setattr(image_module, "BLOCK_PIXELS", 24 * 5)
             for k in range(2):
                 one = ml.reconstruct(cube[k].astype(np.int64), SYSTEM, method, threads=1)
                 for name, values in one.maps().items():
@@ -272,13 +286,12 @@ def test_bad_input(change, message):
         ml.reconstruct(**given)
 
 
-def test_the_networks_run_only_where_their_card_says_so(monkeypatch):
-    card = image_module.networks().card
-    low, high = card["holds_for"]["signal"]
-    assert image_module.networks().holds_for(signal=2.0, background=2.0, cells=256, side=64)
+def test_the_networks_run_only_where_their_card_says_so():
+    low, high = card()["holds_for"][LIMITS[0]]
+    inside = {"signal": 2.0, "background": 2.0, "cells": 256, "side": 64}
+    assert networks().hold_for(**inside)
     for change in ({"signal": 1.1 * high}, {"signal": 0.9 * low}, {"background": 1e4}, {"cells": 10}, {"side": 5}):
-        given = {"signal": 2.0, "background": 2.0, "cells": 256, "side": 64} | change
-        assert not image_module.networks().holds_for(**given), change
+        assert not networks().hold_for(**inside | change), change
     cube = drawn(roof(16), 2.0)
     assert {"image", "image_untrained"} <= set(METHODS)
     small = {name: ml.reconstruct(cube, SYSTEM, name) for name in BOTH}  # 16 pixels a side: below the card's least

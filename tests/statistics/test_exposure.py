@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from harness import system_of
 
 import mars_lidar as ml
 from mars_lidar import _core
@@ -18,18 +19,6 @@ from mars_lidar.statistics.exposure import exposure_moments, native_light, stati
 from mars_lidar.statistics.tolerances import TOL
 
 REFERENCE = Path(__file__).parents[3] / "shared" / "reference"
-
-
-def make_system(dead, *, cycles=1000, bins=64, sigma=0.00375, start="armed", pulse=None):
-    """Times in periods of 100 ns."""
-    return ml.System(
-        period_ns=100.0,
-        cycles=cycles,
-        bins=bins,
-        pulse=pulse or ml.GaussianPulse(sigma_ns=100.0 * sigma),
-        detector=ml.Detector(dead_time_ns=100.0 * dead),
-        start=start,
-    )
 
 
 def on_grid(signal, background, system, n, *, level="", settle=True, delay_ns=None):
@@ -93,7 +82,7 @@ def constant_rate(total, dead, cycles, start):
     ],
 )
 def test_constant_rate(total, dead, cycles, start):
-    result = exposure_moments(ml.Flux(0.0, total), make_system(dead, cycles=cycles, start=start), tolerance=1e-6)
+    result = exposure_moments(ml.Flux(0.0, total), system_of(dead, cycles=cycles, start=start), tolerance=1e-6)
     mean, variance = constant_rate(total, dead, cycles, start)
     assert result.mean == pytest.approx(mean, rel=1e-9)
     assert result.variance == pytest.approx(variance, rel=1e-6)
@@ -104,7 +93,7 @@ def test_constant_rate(total, dead, cycles, start):
 @pytest.mark.parametrize("start", ["armed", "stationary"])
 @pytest.mark.parametrize("dead", [0.6375, 0.633333, 1.62, 2.0])
 def test_order_of_convergence(dead, start):
-    system = make_system(dead, sigma=0.02, cycles=40, start=start)
+    system = system_of(dead, sigma=0.02, cycles=40, start=start)
     values = np.array([on_grid(3.0, 0.7, system, n, delay_ns=33.3)[0] for n in (64, 128, 256, 2048)])
     errors = np.abs(values[:3, :2] - values[3, :2])
     order = 0.5 * np.log2(errors[0] / errors[2])  # over a factor of four: a single step may cancel errors
@@ -114,7 +103,7 @@ def test_order_of_convergence(dead, start):
 
 def test_sampled_pulse_converges_at_second_order():
     pulse = ml.SampledPulse(np.array([1.0, 5.0, 2.0, 0.5]), 1.3)
-    system = make_system(0.6375, pulse=pulse, cycles=40)
+    system = system_of(0.6375, pulse=pulse, cycles=40)
     errors = []
     exact = on_grid(3.0, 0.7, system, 16384, delay_ns=33.3)[0][0]
     for n in (128, 512, 2048):
@@ -125,19 +114,19 @@ def test_sampled_pulse_converges_at_second_order():
 
 @pytest.mark.parametrize("start", ["armed", "stationary"])
 def test_no_dead_time_is_poisson_and_small_ones_lead_there(start):
-    system = make_system(0.0, start=start)
+    system = system_of(0.0, start=start)
     result = exposure_moments(ml.Flux(1.5, 0.5, 30.0), system)
     np.testing.assert_allclose(result.cumulants, 2000.0, rtol=1e-14)
     energy = 1.5 * system.pulse.bin_energy(30.0, 100.0, 64) + 0.5 / 64
     np.testing.assert_allclose(result.histogram, 1000 * energy, rtol=1e-10, atol=1e-12)
-    tiny = exposure_moments(ml.Flux(1.5, 0.5, 30.0), make_system(1e-9, start=start))
+    tiny = exposure_moments(ml.Flux(1.5, 0.5, 30.0), system_of(1e-9, start=start))
     np.testing.assert_allclose(tiny.cumulants, 2000.0, rtol=1e-4)
     np.testing.assert_allclose(tiny.histogram, result.histogram, rtol=1e-5, atol=1e-9)
 
 
 @pytest.mark.parametrize("whole", [1, 3])
 def test_dead_time_of_whole_periods_does_not_distort(whole):
-    system = make_system(float(whole), start="stationary", sigma=0.01)
+    system = system_of(float(whole), start="stationary", sigma=0.01)
     result = exposure_moments(ml.Flux(2.0, 1.0, 50.0), system)
     rate = (2.0 * system.pulse.bin_energy(50.0, 100.0, 64) + 1.0 / 64) / (1 + 3.0 * whole)
     np.testing.assert_allclose(result.histogram, 1000 * rate, rtol=1e-5, atol=1e-9)
@@ -145,7 +134,7 @@ def test_dead_time_of_whole_periods_does_not_distort(whole):
 
 def test_single_registration():
     """An exposure shorter than the dead time registers once or not at all."""
-    result = exposure_moments(ml.Flux(0.7, 0.4, 99.9), make_system(5.5, cycles=4))
+    result = exposure_moments(ml.Flux(0.7, 0.4, 99.9), system_of(5.5, cycles=4))
     p = -math.expm1(-4 * 1.1)
     exact = [p, p * (1 - p), p * (1 - p) * (1 - 2 * p), p * (1 - p) * (1 - 6 * p * (1 - p))]
     np.testing.assert_allclose(result.cumulants, exact, rtol=1e-10)
@@ -154,7 +143,7 @@ def test_single_registration():
 
 @pytest.mark.parametrize(("dead", "cycles"), [(0.6372, 700), (1.9, 900), (0.0004, 300), (10.9, 20000)])
 def test_extrapolation_equals_running_to_the_end(dead, cycles):
-    system = make_system(dead, cycles=cycles, sigma=0.02)
+    system = system_of(dead, cycles=cycles, sigma=0.02)
     fast, settled = on_grid(2.0, 0.8, system, 128)
     slow, never = on_grid(2.0, 0.8, system, 128, settle=False)
     assert never == -1
@@ -164,7 +153,7 @@ def test_extrapolation_equals_running_to_the_end(dead, cycles):
 
 def test_settling_is_not_deceived_by_long_dead_times():
     """For t_d = 10.9 periods nothing happens for periods on end, again and again: far from settled."""
-    system = make_system(10.9, cycles=100_000, sigma=0.02)
+    system = system_of(10.9, cycles=100_000, sigma=0.02)
     result, settled = on_grid(2.0, 0.8, system, 128)
     assert settled > 1000
     # many periods blind, then a wait: mean rate 1 / (t_d + mean wait), as the stationary state says
@@ -174,14 +163,14 @@ def test_settling_is_not_deceived_by_long_dead_times():
 
 
 def test_millions_of_cycles_by_rates():
-    short, long = (exposure_moments(ml.Flux(1.0, 1.0, 50.0), make_system(0.6375, cycles=n)) for n in (10**3, 10**7))
+    short, long = (exposure_moments(ml.Flux(1.0, 1.0, 50.0), system_of(0.6375, cycles=n)) for n in (10**3, 10**7))
     np.testing.assert_allclose(long.cumulants, short.cumulants + (10**7 - 10**3) * short.cumulant_rates, rtol=1e-9)
     np.testing.assert_allclose(long.histogram, short.histogram + (10**7 - 10**3) * short.histogram_rate, rtol=1e-9)
     assert 0 < short.settled < 100
 
 
 def test_stationary_start():
-    system = make_system(1.6375, start="stationary", bins=128)
+    system = system_of(1.6375, start="stationary", bins=128)
     result = exposure_moments(ml.Flux(1.0, 0.5, 30.0), system)
     cells = Cells.of(1.0, 0.5, system, delay_ns=30.0)
     rate = stationary_histogram(cells, 128, tolerance=1e-6, threads=1)[0]
@@ -202,19 +191,19 @@ def test_stationary_start():
 
 def test_locked_pixels_keep_their_digits():
     """Mean 1000, variance 0.045 and below: nothing is lost by cancellation, nothing is negative."""
-    values = [on_grid(10.0, 0.1, make_system(0.976562), n)[0] for n in (1024, 2048)]
+    values = [on_grid(10.0, 0.1, system_of(0.976562), n)[0] for n in (1024, 2048)]
     np.testing.assert_allclose(values[0], values[1], rtol=1e-8)
     assert values[1][1] == pytest.approx(0.045129528, rel=1e-7)
     # almost a Bernoulli variable each period, almost never 0: the cumulants are those of -Poisson
     assert values[1][2] == pytest.approx(-values[1][1], rel=2e-3)
-    locked = exposure_moments(ml.Flux(300.0, 1e-3, 50.0), make_system(0.9))
+    locked = exposure_moments(ml.Flux(300.0, 1e-3, 50.0), system_of(0.9))
     assert locked.mean == pytest.approx(1000.0, abs=1e-9)
     assert 0.0 <= locked.variance < 1e-11
 
 
 @pytest.mark.parametrize("level", ["avx2", "avx512"])
 def test_vector_levels_agree(level):
-    system = make_system(0.6372, cycles=200)
+    system = system_of(0.6372, cycles=200)
     narrowest = on_grid(1.3, 0.6, system, 256, level=_core.levels()[-1])[0]
     if level not in _core.levels():
         pytest.skip(f"this processor does not run {level}")
@@ -222,7 +211,7 @@ def test_vector_levels_agree(level):
 
 
 def test_batch_equals_single():
-    system = make_system(0.6375, bins=7)
+    system = system_of(0.6375, bins=7)
     signal, background = np.array([[0.0], [0.3], [8.0]]), np.array([0.0, 0.01, 2.0])
     batch = exposure_moments(ml.Flux(signal, background, 20.0), system, threads=2)
     assert batch.cumulants.shape == (3, 3, 4)
@@ -239,7 +228,7 @@ def test_batch_equals_single():
 
 
 def test_waveforms():
-    system = make_system(0.6375, bins=32, sigma=0.01)
+    system = system_of(0.6375, bins=32, sigma=0.01)
     sampled = 2.0 * system.pulse.bin_energy(40.0, 100.0, 4096)
     by_pulse = exposure_moments(ml.Flux(2.0, 0.3, 40.0), system)
     by_waveform = exposure_moments(ml.Flux(waveform=np.stack([sampled, 0.5 * sampled]), background=0.3), system)
@@ -252,10 +241,10 @@ def test_waveforms():
 def test_convergence_errors_name_the_cell(monkeypatch):
     monkeypatch.setitem(vars(TOL), "most_bins", 256)
     with pytest.raises(ConvergenceError, match=r"S = 200, B = 1 .* still move"):
-        exposure_moments(ml.Flux([200.0], 1.0, 50.0), make_system(0.001, bins=1, sigma=0.05), tolerance=1e-8)
+        exposure_moments(ml.Flux([200.0], 1.0, 50.0), system_of(0.001, bins=1, sigma=0.05), tolerance=1e-8)
     monkeypatch.undo()
     monkeypatch.setattr(cells_module, "MOMENTS", replace(MOMENTS, one_pass=1))
-    slow = make_system(1.97, cycles=10**6, bins=1)
+    slow = system_of(1.97, cycles=10**6, bins=1)
     with pytest.raises(ConvergenceError, match=r"S = 10, B = 0.01 .*does not repeat"):
         exposure_moments(ml.Flux(10.0, 0.01, 50.0), slow)
 
@@ -270,14 +259,14 @@ def test_convergence_errors_name_the_cell(monkeypatch):
     ],
 )
 def test_bad_input(change, error, message):
-    given = {"flux": ml.Flux(1.0, 1.0, 50.0), "system": make_system(0.6)} | change
+    given = {"flux": ml.Flux(1.0, 1.0, 50.0), "system": system_of(0.6)} | change
     with pytest.raises(error, match=message):
         exposure_moments(**given)
 
 
 def test_history_that_cannot_fit_is_refused():
     with pytest.raises(MemoryError, match=r"t_d = 900000 periods.*GiB"):
-        exposure_moments(ml.Flux(1.0, 1.0, 50.0), make_system(900_000.0, cycles=10**6))
+        exposure_moments(ml.Flux(1.0, 1.0, 50.0), system_of(900_000.0, cycles=10**6))
 
 
 def test_progress_can_stop_the_run():
@@ -285,7 +274,7 @@ def test_progress_can_stop_the_run():
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        exposure_moments(ml.Flux(np.linspace(0.1, 1, 64), 1.0, 50.0), make_system(0.6), progress=stop)
+        exposure_moments(ml.Flux(np.linspace(0.1, 1, 64), 1.0, 50.0), system_of(0.6), progress=stop)
 
 
 @pytest.mark.skipif(not REFERENCE.is_dir(), reason="the reference cases are not beside this checkout")
@@ -295,7 +284,7 @@ def test_reference(path):
     from scipy.stats import chi2
 
     case = json.loads(path.read_text())
-    system = make_system(case["dead"], cycles=case["cycles"], bins=case["bins"], sigma=case["sigma"])
+    system = system_of(case["dead"], cycles=case["cycles"], bins=case["bins"], sigma=case["sigma"])
     result = exposure_moments(ml.Flux(case["S"], case["B"], 100.0 * case["tau"]), system)
     values = np.array([int(n) for n in case["count"]])
     weights = np.array(list(case["count"].values()), dtype=float)

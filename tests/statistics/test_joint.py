@@ -7,9 +7,11 @@ independent simulator. Engines are compared with it in tests/test_engines.py.
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
-from harness import Reference, constant_rate_moments, require
+from harness import Reference, constant_rate_moments, require, system_of
 from harness.reference import REFERENCE_NAMES
 from scipy import stats
 
@@ -17,17 +19,7 @@ import mars_lidar as ml
 from mars_lidar.statistics import exposure_moments, joint_law
 
 PERIOD = 100.0
-
-
-def system(dead: float, cycles: int = 1000, bins: int = 64, sigma: float = 0.02, start: str = "armed") -> ml.System:
-    return ml.System(
-        period_ns=PERIOD,
-        cycles=cycles,
-        bins=bins,
-        pulse=ml.GaussianPulse(sigma_ns=sigma * PERIOD),
-        detector=ml.Detector(dead_time_ns=dead * PERIOD),
-        start=start,
-    )
+system = partial(system_of, sigma=0.02)
 
 
 def photons(signal: float, background: float, at: ml.System, bins: int) -> np.ndarray:

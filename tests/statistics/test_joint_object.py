@@ -2,24 +2,17 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
+from harness import system_of
 
 import mars_lidar as ml
 from mars_lidar.statistics import ConvergenceError, exposure_moments, joint_law
 
 PERIOD = 100.0
-
-
-def system(dead: float, cycles: int = 1000, bins: int = 64, sigma: float = 0.02, start: str = "armed") -> ml.System:
-    return ml.System(
-        period_ns=PERIOD,
-        cycles=cycles,
-        bins=bins,
-        pulse=ml.GaussianPulse(sigma_ns=sigma * PERIOD),
-        detector=ml.Detector(dead_time_ns=dead * PERIOD),
-        start=start,
-    )
+system = partial(system_of, sigma=0.02)
 
 
 @pytest.fixture(scope="module")

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from harness import system_of
 from scipy import stats
 
 import mars_lidar as ml
@@ -14,18 +15,6 @@ from mars_lidar.statistics.law import count_law, registration_pdf
 from mars_lidar.statistics.tolerances import TOL
 
 REFERENCE = Path(__file__).parents[3] / "shared" / "reference"
-
-
-def make_system(dead, *, cycles=1000, bins=64, sigma=0.00375, start="armed", pulse=None):
-    """Times in periods of 100 ns."""
-    return ml.System(
-        period_ns=100.0,
-        cycles=cycles,
-        bins=bins,
-        pulse=pulse or ml.GaussianPulse(sigma_ns=100.0 * sigma),
-        detector=ml.Detector(dead_time_ns=100.0 * dead),
-        start=start,
-    )
 
 
 def moments_of(law):
@@ -57,7 +46,7 @@ def times_log(x, y):
 )
 def test_constant_rate_pmf(total, dead, cycles):
     """P(N >= n) = P(Gamma(n, 1 / rate) <= t - (n - 1) t_d) for an armed start."""
-    law = count_law(ml.Flux(0.0, total), make_system(dead, cycles=cycles), tolerance=1e-6)
+    law = count_law(ml.Flux(0.0, total), system_of(dead, cycles=cycles), tolerance=1e-6)
     n = np.append(law.support, law.support[-1] + 1).astype(float)
     left = np.maximum(cycles - (n - 1) * dead, 0.0)
     at_least = np.where(n == 0, 1.0, stats.gamma.cdf(left, np.maximum(n, 1.0), scale=1 / total))
@@ -83,7 +72,7 @@ def test_constant_rate_pmf(total, dead, cycles):
     ],
 )
 def test_pmf_agrees_with_cumulants(signal, background, dead, cycles, start):
-    system = make_system(dead, cycles=cycles, start=start, sigma=0.01)
+    system = system_of(dead, cycles=cycles, start=start, sigma=0.01)
     law = count_law(ml.Flux(signal, background, 37.0), system)
     assert law.pmf.shape == law.support.shape == law.cdf.shape
     assert (law.pmf >= 0).all()
@@ -98,14 +87,14 @@ def test_pmf_agrees_with_cumulants(signal, background, dead, cycles, start):
 
 
 def test_single_cycle_is_bernoulli():
-    law = count_law(ml.Flux(0.7, 0.4, 50.0), make_system(5.5, cycles=4))
+    law = count_law(ml.Flux(0.7, 0.4, 50.0), system_of(5.5, cycles=4))
     p = -math.expm1(-4.4)
     np.testing.assert_allclose(law.pmf[:2], [1 - p, p], rtol=1e-9)
     assert law.support[0] == 0
 
 
 def test_batches():
-    system = make_system(0.6375)
+    system = system_of(0.6375)
     signal, background = np.array([[0.1], [2.0]]), np.array([0.0, 0.3, 3.0])
     law = count_law(ml.Flux(signal, background, 20.0), system)
     assert law.mean.shape == law.variance.shape == law.outside.shape == (2, 3)
@@ -125,15 +114,15 @@ def test_batches():
 
 
 def test_no_flux():
-    law = count_law(ml.Flux(0.0, 0.0), make_system(0.5))
+    law = count_law(ml.Flux(0.0, 0.0), system_of(0.5))
     assert law.mean == law.variance == 0
     assert law.pmf[law.support == 0] == 1.0
-    np.testing.assert_allclose(registration_pdf(ml.Flux(0.0, [0.0, 1e-9]), make_system(0.5)), 1 / 64, rtol=1e-6)
+    np.testing.assert_allclose(registration_pdf(ml.Flux(0.0, [0.0, 1e-9]), system_of(0.5)), 1 / 64, rtol=1e-6)
 
 
 def test_poisson():
     for dead, method in ((0.0, "exact"), (0.6, "poisson")):
-        law = count_law(ml.Flux([1.0, 1e-4], 0.5, 50.0), make_system(dead), method)
+        law = count_law(ml.Flux([1.0, 1e-4], 0.5, 50.0), system_of(dead), method)
         np.testing.assert_allclose(law.cumulants[0], 1500.0)
         exact = stats.poisson.pmf(law.support, law.mean[:, None])
         inside = law.pmf > 0
@@ -142,7 +131,7 @@ def test_poisson():
 
 
 def test_mars_is_the_gaussian_of_the_paper():
-    system = make_system(0.6375)
+    system = system_of(0.6375)
     for rearm in (None, "centre", "edge"):
         law = count_law(ml.Flux([1.0, 0.002], 0.001, 50.0), system, "mars", rearm=rearm)
         mean, variance = mars_moments(ml.Flux([1.0, 0.002], 0.001, 50.0), system, rearm=rearm or "centre")
@@ -162,7 +151,7 @@ def test_mars_is_the_gaussian_of_the_paper():
 
 
 def test_renewal_is_the_constant_rate_gaussian():
-    law = count_law(ml.Flux(1.0, 1.0, 50.0), make_system(0.6375), "renewal")
+    law = count_law(ml.Flux(1.0, 1.0, 50.0), system_of(0.6375), "renewal")
     assert law.mean == pytest.approx(2000 / 2.275)
     assert law.variance == pytest.approx(2000 / 2.275**3)
     found = moments_of(law)
@@ -171,7 +160,7 @@ def test_renewal_is_the_constant_rate_gaussian():
 
 
 def test_shapes():
-    system = make_system(0.6375, bins=128, cycles=100_000)
+    system = system_of(0.6375, bins=128, cycles=100_000)
     methods = ("exposure", "stationary", "chain")
     shapes = {m: registration_pdf(ml.Flux([0.5, 5.0], 1.0, 30.0), system, m) for m in methods}
     for shape in shapes.values():
@@ -189,7 +178,7 @@ def test_shapes():
 
 
 def test_waveforms_and_methods():
-    system = make_system(0.6375, sigma=0.01)
+    system = system_of(0.6375, sigma=0.01)
     wave = 2.0 * system.pulse.bin_energy(40.0, 100.0, 2048)
     for method in ("exact", "mars", "renewal", "poisson"):
         by_wave = count_law(ml.Flux(waveform=wave, background=0.3), system, method)
@@ -232,13 +221,13 @@ def test_waveforms_and_methods():
 )
 def test_bad_input(call, error, message):
     with pytest.raises(error, match=message):
-        call(make_system(0.5))
+        call(system_of(0.5))
 
 
 def test_a_pmf_that_contradicts_its_cumulants_is_refused(monkeypatch):
     monkeypatch.setitem(vars(TOL), "tail", 0.2)  # too small a window: the pmf is aliased
     with pytest.raises(ConvergenceError, match=r"S = 1, B = 1 .* disagrees with the cumulants"):
-        _ = count_law(ml.Flux(1.0, 1.0, 50.0), make_system(0.6375)).pmf
+        _ = count_law(ml.Flux(1.0, 1.0, 50.0), system_of(0.6375)).pmf
 
 
 @pytest.mark.full
@@ -254,7 +243,7 @@ def test_random_systems_against_the_exact_engine():
         sigma, bins = 10 ** rng.uniform(-2.5, -1), int(rng.choice([2, 16, 100]))
         pulse = ml.SampledPulse(rng.random(12), 20 * sigma) if number % 5 == 0 else None
         start = ("armed", "stationary")[number % 2]
-        system = make_system(dead, cycles=cycles, bins=bins, sigma=sigma, start=start, pulse=pulse)
+        system = system_of(dead, cycles=cycles, bins=bins, sigma=sigma, start=start, pulse=pulse)
         law = count_law(ml.Flux(signal, background, delay), system, threads=1)
         flux = ml.Flux(signal, background, delay)
         cube = ml.simulate(flux, system, realizations=2000, seed=number, threads=1)
@@ -280,7 +269,7 @@ def test_random_systems_against_the_exact_engine():
 def test_reference(path):
     """Total variation below the 99.9 % quantile of its bootstrap under the model, G-test p > 1e-4."""
     case = json.loads(path.read_text())
-    system = make_system(case["dead"], cycles=case["cycles"], sigma=case["sigma"])
+    system = system_of(case["dead"], cycles=case["cycles"], sigma=case["sigma"])
     law = count_law(ml.Flux(case["S"], case["B"], 100.0 * case["tau"]), system)
     counts = np.repeat([int(n) for n in case["count"]], list(case["count"].values()))
     reals, rng = counts.size, np.random.default_rng(1)

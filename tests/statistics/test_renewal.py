@@ -1,8 +1,10 @@
 """Holding times, their covariances and the asymptotic count law (docs/theory.md, sections 3, 4 and 6)."""
 
+from functools import partial
+
 import numpy as np
 import pytest
-from harness import armed_count_pmf, constant_rate_moments, stationary_count_pmf
+from harness import armed_count_pmf, constant_rate_moments, stationary_count_pmf, system_of
 from scipy.stats import poisson
 
 import mars_lidar as ml
@@ -32,15 +34,7 @@ def bumpy(total, n=80, seed=3):
     return photons * (total / photons.sum())
 
 
-def make_system(dead_periods, cycles=1000, start="armed", sigma=0.00375):
-    return ml.System(
-        period_ns=100.0,
-        cycles=cycles,
-        bins=1024,
-        pulse=ml.GaussianPulse(sigma_ns=100.0 * sigma),
-        detector=ml.Detector(dead_time_ns=100.0 * dead_periods),
-        start=start,
-    )
+make_system = partial(system_of, bins=1024)
 
 
 @pytest.mark.parametrize(("total", "dead", "rearm"), CASES)

@@ -9,8 +9,11 @@ import pytest
 
 import mars_lidar as ml
 from mars_lidar import io
-from mars_lidar.reconstruction import image_stages as stages
-from mars_lidar.reconstruction.image_network import CARD, WEIGHTS, Networks, weigh
+from mars_lidar._base.native import _core
+from mars_lidar.reconstruction.image import solver_of
+from mars_lidar.reconstruction.image_network import CARD, WEIGHTS, networks_of
+from mars_lidar.reconstruction.image_pulse import settings_of
+from mars_lidar.reconstruction.photons import Photons
 from studies.__main__ import main
 from studies.common.report import MAX_FIGURE_BYTES
 from studies.image import captures, total_variation
@@ -93,20 +96,25 @@ def test_native_networks_are_those_that_were_trained():
     from studies.image import train
 
     torch.manual_seed(1)
-    net = train._weigh_net(torch)
-    torch.nn.init.normal_(net.leave.weight, std=0.1)
-    x = torch.randn(1, train.CHANNELS_IN, 21, 37)
-    np.testing.assert_allclose(weigh(x[0].numpy(), train._layers(net), 2), net(x)[0].detach().numpy(), atol=1e-5)
-    net, rng = train._choose_net(torch), np.random.default_rng(0)
-    height, width, n = 20, 24, 64
-    posterior = (rng.random((height, width, n)) ** 4).astype(np.float32)
-    pixels = height * width
-    place = (n * rng.random((pixels, train.PEAKS))).astype(np.float32)
-    mass, signal = rng.random((pixels, train.PEAKS)).astype(np.float32), rng.random(pixels).astype(np.float32)
-    given = posterior, posterior, posterior, place, mass, signal, np.arange(0, pixels, 7)
-    features = torch.from_numpy(stages.candidate_features(*given, 1))
-    chances = torch.softmax(net(features), -1).detach().numpy()[:, : train.PEAKS]
-    nets = Networks(train._flat(net), {}, {})
-    chosen, confidence = stages._chosen(*given, nets, 2)
-    assert np.array_equal(chosen, chances.argmax(1))
-    np.testing.assert_allclose(confidence, chances.max(1), atol=1e-6)
+    choose, weigh = train._choose_net(torch), train._weigh_net(torch)
+    torch.nn.init.normal_(weigh.leave.weight, std=0.1)
+    weights = np.concatenate([train._flat(choose), train._layers(weigh)])
+    networks = networks_of(weights, train.UNCALIBRATED)
+    x = torch.randn(1, train.SIZES["plane_features"], 21, 37)
+    outputs = _core.image_weigh(x[0].numpy(), networks, 2)
+    np.testing.assert_allclose(outputs, weigh(x)[0].detach().numpy(), atol=1e-5)
+
+    system = SYSTEM.replace(cycles=1000)
+    flux = ml.Scene.example("room", 24).flux(system, signal=2e-3, sbr=1.0)
+    solver = solver_of(Photons.of(ml.simulate(flux, system, seed=1).reshape(-1, 250), 24, 24), 2)
+    (setting,) = settings_of(system)
+    solver.begin(setting)
+    volumes = solver.volumes()
+    unsure = np.flatnonzero(volumes.mass[:, 0] < _core.IMAGE_SETTLED)
+    assert unsure.size > 50
+    features = torch.from_numpy(solver.candidate_features(volumes, unsure))
+    chances = torch.softmax(choose(features), -1).detach().numpy()[:, : train.SIZES["peaks"]]
+    delay, confidence = solver.choose(networks)
+    np.testing.assert_allclose(confidence[unsure], chances.max(1), atol=1e-6)
+    place = volumes.place[unsure, chances.argmax(1)]
+    assert (np.abs(train.gap(delay[unsure], place, setting.cells)) < 3.5).all()

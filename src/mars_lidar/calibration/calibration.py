@@ -19,7 +19,7 @@ from mars_lidar.calibration.curves import Curves, Realizations, curves, realizat
 from mars_lidar.calibration.fit import Effort, Fit, Fitted, draws
 from mars_lidar.calibration.look import Look, look_at
 from mars_lidar.calibration.model import Model, all_carriers
-from mars_lidar.calibration.recording import Recording, recording_of, recording_of_arrivals
+from mars_lidar.calibration.recording import FALSE_ALARM, LEAST_PHOTONS, Recording, recording_of, recording_of_arrivals
 from mars_lidar.calibration.suspects import Drift, Score
 from mars_lidar.instrument.avalanches import Afterpulsing
 from mars_lidar.instrument.detector import Detector
@@ -30,14 +30,7 @@ from mars_lidar.instrument.tolerances import TOL
 from mars_lidar.light.flux import Flux
 from mars_lidar.light.timestamps import Timestamps
 
-_LEAST_PHOTONS = 300  # below them the counts of the cells have no normal law
-_MOST_RETURNS = 4
-_MOST_EFFECTS = 2  # that are taken in one after the other
-_WAVE_BINS = 256  # of a free light, at most
-_PULSE = 5.0  # standard deviations of the brightest window over the period, below which there is no pulse
 _SAME_TIME = 0.01  # share of records at exactly the time of the one before, that no photons are
-_ATTEMPTS = 3  # fits of a stream, each with simulated streams of its own, of which the first that converges is taken
-_SEEDS_OF_A_FIT = 1_000_000  # between the seeds of two attempts
 LEVEL = 0.01  # false-alarm probability of the verdict
 
 PARAMETERS = ("dead_time_ns", "jitter_ns", "pulse_sigma_ns")
@@ -202,7 +195,8 @@ class Calibration:
         included = [suspect.name for suspect in self.suspects if suspect.included]
         model = "the model" + (f" with {' and '.join(included)}" if included else "")
         if not self.fitted.converged:
-            return f"no light of this shape and dead time describes the stream: {model} was not fitted"
+            remedy = "give what is known (dead_time_ns, jitter_ns), pulse='free', returns=2, or a longer recording"
+            return f"the fit of {model} did not converge, nothing is estimated: {remedy}"
         if self.fits:
             return f"p = {self.p_value:.2g}: {model} is not rejected at the {self.level:.0%} level"
         return f"p = {self.p_value:.2g}: {model} does not fit"
@@ -211,7 +205,7 @@ class Calibration:
         """Histograms of the recording, and of the fit by streams of `seed`, for a picture."""
         model = None if self.fitted is None else self.fitted.model
         theta = None if model is None or self.fitted is None else model.bounded(self.fitted.theta)
-        return curves(self.recording, model, theta, seed)
+        return curves(self.recording, model, theta, seed, (200, 256, 60))
 
     def realizations(self, cycles: int, *, simulated: int = 4000, seed: int = 0) -> Realizations:
         """Law of the count in pieces of `cycles` periods beside that of `simulated` pieces drawn with `seed` (T6).
@@ -314,7 +308,7 @@ def calibrate(
     >>> abs(dead_time.value - 50.0) < 4.0 * dead_time.error
     True
     """
-    number = checks.integer("returns", returns, low=1, high=_MOST_RETURNS)
+    number = checks.integer("returns", returns, low=1, high=4)
     alpha = checks.real("level", level, low=0.0, high=0.5, strict_low=True)
     for name, value in (("look", look), ("pooled", pooled)):
         if not isinstance(value, bool):
@@ -322,20 +316,20 @@ def calibrate(
     start_seed = checks.integer("seed", seed, low=0, high=2**31)
     recording = _recorded(times, pooled, checks.real("unit_ns", unit_ns, low=0.0))
     shape, fields, fixed = _known(given, pulse)
-    seen = look_at(recording)
+    described = look_at(recording)
     if look:
-        return Calibration(seen, {}, float("nan"), (), (), None, None, None, None, None, recording, None, alpha)
-    if recording.photons < _LEAST_PHOTONS:
+        return Calibration(described, {}, float("nan"), (), (), None, None, None, None, None, recording, None, alpha)
+    if recording.photons < LEAST_PHOTONS:
         raise ValueError(
-            f"times must hold at least {_LEAST_PHOTONS} registrations to be calibrated, got {recording.photons}; "
+            f"times must hold at least {LEAST_PHOTONS} registrations to be calibrated, got {recording.photons}; "
             "look=True describes a shorter recording"
         )
-    if seen.same_time > _SAME_TIME * recording.photons and seen.unit_ns == 0.0:
+    if described.same_time > _SAME_TIME * recording.photons and described.unit_ns == 0.0:
         raise ValueError(
-            f"times must be of photons one after the other, got {seen.same_time:,} of {recording.photons:,} at exactly "
-            "the time of the one before"
+            f"times must be of photons one after the other, got {described.same_time:,} of {recording.photons:,} at "
+            "exactly the time of the one before"
         )
-    return _Run(recording, seen, shape, number, fields, fixed, alpha, start_seed).result()
+    return _Run(recording, described, shape, number, fields, fixed, alpha, start_seed).result()
 
 
 def _recorded(times: Any, pooled: bool, unit_ns: float) -> Recording:
@@ -370,7 +364,7 @@ def _known(
     if "dead_time_ns" in known:
         fixed["dead_time_ns"] = checks.real("dead_time_ns", known.pop("dead_time_ns"), low=0.0)
     if "jitter_ns" in known:
-        fixed["jitter2"] = checks.real("jitter_ns", known.pop("jitter_ns"), low=0.0) ** 2
+        fixed["jitter"] = checks.real("jitter_ns", known.pop("jitter_ns"), low=0.0)
     probability, delay = known.pop("afterpulse_probability", None), known.pop("afterpulse_delay_ns", None)
     if (probability is None) != (delay is None):
         raise ValueError("afterpulse_probability and afterpulse_delay_ns belong together: give both, or neither")
@@ -387,11 +381,11 @@ def _of_detector(detector: Detector) -> tuple[dict[str, Any], dict[str, float]]:
         if name in detector.effects:
             raise ValueError(f"given must not have {name}: the stream of one pixel does not show it")
     bare = detector.without(*LIGHT_EFFECTS)
-    fixed = {"dead_time_ns": bare.dead_time_ns, "jitter2": 0.0}
+    fixed = {"dead_time_ns": bare.dead_time_ns, "jitter": 0.0}
     fields: dict[str, Any] = {"mode": bare.mode} if bare.mode != "nonparalyzable" else {}
     for name in bare.effects:
         if name == "jitter" and isinstance(bare.jitter, Jitter) and bare.jitter.tail_fraction == 0.0:
-            fixed["jitter2"] = bare.jitter.std_ns**2
+            fixed["jitter"] = bare.jitter.std_ns
         else:
             fields[name] = getattr(bare, name)
     return fields, fixed
@@ -414,23 +408,22 @@ class _Run:
         self.recording, self.look, self.level = recording, look, level
         self.shape, self.returns, self.fields, self.fixed = shape, returns, fields, fixed
         self.seed = seed
-        self.fit = Fit(recording, Effort(), seed + 1)
-        told = tuple(fields.items())
+        self.fit = Fit(recording, Effort(), (seed, 0))
         self.wave: tuple[FloatArray, FloatArray] | None = None
         pulse = shape if isinstance(shape, Pulse) else None
         if pulse is not None:
             pulse.check(recording.period_ns)
         self.flat = not recording.laser
         if shape == "free":
-            self.wave = start.free_waveform(recording, _WAVE_BINS)
+            self.wave = start.free_waveform(recording, self.fit.effort.shape_bins)
             shares, errors = (part / self.wave[0].sum() for part in self.wave)
-            model = Model(recording.clock, 0, None, shares, errors, recording.exposure, fields=told)
-        elif self.flat or start.brightest_window(recording) < _PULSE:
+            model = Model(recording.clock, 0, None, shares, errors, recording.exposure)
+        elif self.flat or start.brightest_window(recording) > FALSE_ALARM:
             self.flat = True
-            model = Model(recording.clock, 0, fields=told)
+            model = Model(recording.clock, 0)
         else:
-            model = Model(recording.clock, returns, pulse=pulse, fields=told)
-        self.model = model
+            model = Model(recording.clock, returns, pulse=pulse)
+        self.model = replace(model, fields=tuple(fields.items()), jitter_given="jitter" in fixed)
 
     def result(self) -> Calibration:
         """The fit, the effects that it takes in, and what they leave."""
@@ -438,7 +431,7 @@ class _Run:
         wrong = () if fitted.converged and fitted.p_value >= self.level else self.wrong_values(fitted)
         included: list[tuple[Score, suspects.Named]] = []
         listed = suspects.scores(self.fit, fitted) if fitted.converged else []
-        for _ in range(_MOST_EFFECTS if fitted.converged and not wrong else 0):
+        for _ in range(self.fit.effort.effects if fitted.converged and not wrong else 0):
             better = suspects.refitted(self.fit, fitted, listed)
             if better is None:
                 break
@@ -455,10 +448,8 @@ class _Run:
         without: list[tuple[str, Any, Pulse | str, dict[str, Any], dict[str, float]]] = []
         for name, value in self.fixed.items():
             free_of_it = {key: own for key, own in self.fixed.items() if key != name}
-            jitter = name == "jitter2"
-            without.append(
-                ("jitter_ns" if jitter else name, value**0.5 if jitter else value, self.shape, self.fields, free_of_it)
-            )
+            printed = "jitter_ns" if name == "jitter" else name
+            without.append((printed, value, self.shape, self.fields, free_of_it))
         for name, whole in self.fields.items():
             rest = {key: own for key, own in self.fields.items() if key != name}
             without.append((name, whole, self.shape, rest, self.fixed))
@@ -481,8 +472,8 @@ class _Run:
 
     def first(self) -> Fitted:
         """The fit of the plain model, from the better of two starts; with other streams where it did not converge."""
-        for attempt in range(_ATTEMPTS):
-            self.fit = Fit(self.recording, Effort(), self.seed + 1 + attempt * _SEEDS_OF_A_FIT)
+        for attempt in range(self.fit.effort.attempts):
+            self.fit = Fit(self.recording, Effort(), (self.seed, attempt))
             fitted = self._attempt()
             if fitted.converged:
                 break
@@ -498,17 +489,17 @@ class _Run:
             [
                 k
                 for k, name in enumerate(model.names)
-                if name not in self.fixed and not (width_known and name == "width2")
+                if name not in self.fixed and not (width_known and name == "width")
             ],
             np.intp,
         )
         first = float(min(self.recording.photons, fit.effort.first))
         for _, theta in begin[:2]:
-            spread = np.diag(start.first_spread(model, theta)[free])
-            theta, root, misfit, _ = fit.steps(model, theta, spread, free, first, 3)
+            spread = np.diag(0.5 * model.scale(theta)[free])
+            theta, root, misfit, _ = fit.steps(model, theta, spread, free, first)
             tried.append((misfit, theta, root))
         _, theta, root = min(tried, key=lambda trial: trial[0])
-        theta, root, _, settled = fit.steps(model, theta, root, free, float(self.recording.photons), 10)
+        theta, root, _, settled = fit.steps(model, theta, root, free, float(self.recording.photons))
         final = fit.finish(model, theta, root, free)
         return replace(final, converged=final.converged and (settled or final.p_value >= self.level))
 
@@ -526,10 +517,10 @@ class _Run:
         named: list[Suspect] = list(wrong)
         for score, refit in included:
             name = score.effect.names[0]
-            shown = "electronics_dead_time_ns" if name == "electronics_excess" else name
-            at = estimates.get(shown, Estimate(np.nan, np.nan, np.nan, np.nan))
+            printed = "electronics_dead_time_ns" if name == "electronics_excess" else name
+            at = estimates.get(printed, Estimate(np.nan, np.nan, np.nan, np.nan))
             named.append(
-                Suspect(score.effect.words, refit.z, at.value, at.error, refit.gain, f"given {shown}", included=True)
+                Suspect(score.effect.words, refit.z, at.value, at.error, refit.gain, f"given {printed}", included=True)
             )
         p = fitted.p_value if fitted.converged else 0.0
         if drift is not None:
@@ -594,13 +585,12 @@ def _estimates(fitted: Fitted, fixed: dict[str, float], growth: FloatArray) -> d
     """What is printed, written and drawn, from draws of the law of the parameters."""
     model = fitted.model
     scale = growth[fitted.free]
-    covariance = fitted.unbounded_covariance * np.outer(scale, scale)
+    covariance = fitted.covariance * np.outer(scale, scale)
     drawn = draws(model, fitted.unbounded, covariance, fitted.free)
     centre = model.bounded(fitted.theta)
     if drawn is None:  # the estimate lies beyond what a detector can have
-        spread = np.random.default_rng(0).standard_normal((2000, len(fitted.free))) * np.sqrt(np.diag(covariance))
         drawn = np.tile(centre, (2000, 1))
-        drawn[:, fitted.free] += spread
+        drawn[:, fitted.free] = np.random.default_rng(0).multivariate_normal(centre[fitted.free], covariance, 2000)
         drawn = model.bounded(drawn)
     names = model.names
     k = model.light
@@ -612,7 +602,7 @@ def _estimates(fitted: Fitted, fixed: dict[str, float], growth: FloatArray) -> d
             out[name] = Estimate(value, 0.0, value, value, "given")
             return
         low, high = np.quantile(sample, (0.025, 0.975))
-        out[name] = Estimate(value, float(sample.std()), float(low), float(high), note)
+        out[name] = Estimate(value, float(((sample - value) ** 2).mean() ** 0.5), float(low), float(high), note)
 
     light = names[0] if model.returns else "light"  # all of it
     put(light, float(centre[0]), drawn[:, 0], names[0])
@@ -620,20 +610,20 @@ def _estimates(fitted: Fitted, fixed: dict[str, float], growth: FloatArray) -> d
         period = model.clock.period_ns
         wrapped = names[i].startswith("delay")
         put(names[i], float(centre[i] % period if wrapped else centre[i]), drawn[:, i], names[i])
-    width2, jitter2 = drawn[:, k], drawn[:, k + 1]
-    sd = float(np.sqrt(np.diag(covariance))[list(fitted.free).index(k + 1)]) if "jitter2" in free else 0.0
+    pulses, jitters = model.widths(drawn)
+    pulse, jitter = map(float, model.widths(centre))
     note = ""
-    if sd:
+    if "jitter" in free:
+        sd = float(np.sqrt(np.diag(covariance))[list(fitted.free).index(k + 1)])
         if fitted.unbounded[k + 1] < 2.0 * sd:
             note = "not detected"
-        if model.gaussian and np.quantile(jitter2, 0.975) > 0.97 * centre[k] and note:
+        if note and model.split and np.quantile(jitters, 0.975) > 0.985 * centre[k]:
             note = "not identified: any share of the recorded width"
     if model.gaussian:
-        put("width_ns", float(centre[k] ** 0.5), np.sqrt(width2), "width2")
-        own = np.sqrt(np.maximum(width2 - jitter2, 0.0))
+        put("width_ns", float(centre[k]), drawn[:, k], "width")
         shared = note if note.startswith("not identified") else ""
-        put("pulse_sigma_ns", float(max(centre[k] - centre[k + 1], 0.0) ** 0.5), own, "width2", note=shared)
-    put("jitter_ns", float(centre[k + 1] ** 0.5), np.sqrt(jitter2), "jitter2", note=note)
+        put("pulse_sigma_ns", pulse, pulses, "width", note=shared)
+    put("jitter_ns", jitter, jitters, "jitter", note=note)
     at = k + 3
     dead, observed = drawn[:, k + 2], float(centre[k + 2])
     dead_name = "dead_time_ns"
@@ -693,7 +683,7 @@ def _worst_cells(fitted: Fitted) -> tuple[str, float]:
         used = np.flatnonzero(fitted.offset[part] > 5.0) + (part.start or 0)
         scale = fitted.fresh[:, used].std(0)
         drawn = ((fitted.fresh[:, used] / scale) ** 2).sum(1)
-        z = (float(((fitted.left[used] / scale) ** 2).sum()) - drawn.mean()) / drawn.std()
+        z = (float(((fitted.rest[used] / scale) ** 2).sum()) - drawn.mean()) / drawn.std()
         if z > most:
             worst, most = words, float(z)
     return worst, most

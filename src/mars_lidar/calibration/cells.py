@@ -16,8 +16,6 @@ _PHASES = 2**15  # cells of the table from phase to class
 _OFF = 0.5 + 1.0 / 64.0 / np.pi  # units of a clock from a tick to an edge
 _SHIFT = 0.37  # of such a cell: no edge lies where a clock ticks
 _CLASSES = 12  # parts of the period in the table, beside the stretches of bright light
-_QUANTILES = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98, 0.995)  # of intervals
-_AGES = (0.002, 0.02, 0.08, 0.2, 0.45, 0.75)  # quantiles of intervals that divide the table
 
 
 class Cells:
@@ -41,9 +39,12 @@ class Cells:
         self.phases = edges.size + 1
         ratio = gaps.size / max(photons, 1.0)
         fine = max(0.7, 2.0 / ratio) * 1.5 ** np.arange(60)
-        rank = np.r_[fine[fine < 0.15 * photons], photons * np.array(_QUANTILES)] * ratio
+        tail = 0.2 * 0.5 ** np.arange(1, 6)
+        quantiles = np.r_[np.linspace(0.2, 0.8, 7), 1.0 - tail]
+        rank = np.r_[fine[fine < 0.15 * photons], photons * quantiles] * ratio
         place = gaps[np.minimum(rank.astype(int), gaps.size - 1)]
-        ages = self._between(gaps[(np.array(_AGES) * gaps.size).astype(int)], unit)
+        early = (np.arange(1, 7) / 7) ** 3  # quantiles of the intervals that divide the table, more of them short
+        ages = self._between(gaps[(early * gaps.size).astype(int)], unit)
         self.gap_edges = np.union1d(self._between(place, unit), ages)
         self.gap_edges = self.gap_edges[self.gap_edges > 0.0]
         ages = ages[ages > 0.0]
@@ -81,7 +82,7 @@ class Cells:
             dense = np.bincount((phases * 32).astype(int) % 32, minlength=32)
             bright = np.flatnonzero(dense > 1.5 * np.median(dense))
             lit = [(k / 32, (k + 1) / 32) for k in bright]
-        width = float(np.sqrt(theta[model.light] + unit**2 / 12)) if model.waveform is None else 0.0
+        width = float(np.sqrt(theta[model.light] ** 2 + unit**2 / 12)) if model.waveform is None else 0.0
         if model.pulse is not None and model.returns:  # by the scatter of the phases about the delay
             off = (phases - theta[2] / period + 0.5) % 1.0 - 0.5
             dense, at = np.histogram(off, 512)

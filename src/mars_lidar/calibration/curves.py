@@ -7,15 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from mars_lidar._base.types import FloatArray
-from mars_lidar.calibration.fit import LIGHTS
+from mars_lidar.calibration.fit import LIGHTS, Effort
 from mars_lidar.calibration.model import Model
 from mars_lidar.calibration.recording import Recording
 from mars_lidar.statistics.count_pmf import Pmf, kl_divergence, total_variation
 
-_INTERVALS, _PHASES, _AGES = 200, 256, 60  # cells of a picture
 _RATIO = 4.0  # photons of the model's streams over those of the recording
-_MOST = 4_000_000  # photons of these streams, in all
-_RESAMPLED = 400  # samples of the sampling floor
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,21 +55,23 @@ class Realizations:
         )
 
 
-def curves(recording: Recording, model: Model | None, theta: FloatArray | None, seed: int) -> Curves:
-    """Histograms of the recording, and of the model at `theta` where there is one."""
+def curves(
+    recording: Recording, model: Model | None, theta: FloatArray | None, seed: int, sizes: tuple[int, int, int]
+) -> Curves:
+    """Histograms of intervals, phases and ages in `sizes` cells, of the model at `theta` too where it is given."""
     period, unit = recording.period_ns, recording.clock.unit_ns
     gaps = np.concatenate([np.diff(piece) for piece in recording.pieces])
     top = float(np.quantile(gaps, 0.99)) * 1.05
-    edges = _edges(0.0, top, _INTERVALS, unit)
+    edges = _edges(0.0, top, sizes[0], unit)
     low, high = np.quantile(gaps, (0.0005, 0.5))
-    ages = _edges(max(low - 0.1 * (high - low), 0.0), high + (high - low), _AGES, unit)
-    places = np.linspace(0.0, period, _PHASES + 1)
+    ages = _edges(max(low - 0.1 * (high - low), 0.0), high + (high - low), sizes[2], unit)
+    places = np.linspace(0.0, period, sizes[1] + 1)
     phase = np.concatenate([piece - np.floor(piece / period) * period for piece in recording.pieces])
     fitted: list[FloatArray] = []
     residual = None
     recorded = [np.histogram(gaps, edges)[0], np.histogram(phase, places)[0], np.histogram(gaps, ages)[0]]
     if model is not None and theta is not None:
-        total = min(_RATIO * recording.photons, _MOST)
+        total = min(_RATIO * recording.photons, Effort.batch)
         cycles = max(2, round(recording.exposure * total / recording.photons / LIGHTS))
         streams = model.streams(np.tile(theta, (LIGHTS, 1)), cycles, seed)
         scale = recording.exposure / (cycles * LIGHTS)
@@ -109,9 +108,9 @@ def _edges(low: float, high: float, number: int, unit: float) -> FloatArray:
 
 
 def realizations(
-    recording: Recording, model: Model, theta: FloatArray, cycles: int, simulated: int, seed: int
+    recording: Recording, model: Model, theta: FloatArray, cycles: int, simulated: int, seed: int, resampled: int = 400
 ) -> Realizations:
-    """Counts in pieces of `cycles` periods, against `simulated` pieces of the model's streams."""
+    """Counts in pieces of `cycles` periods, against `simulated` pieces of the model's streams; `resampled` floors."""
     length = cycles * recording.period_ns
 
     def cut(t: FloatArray, end: float) -> FloatArray:
@@ -134,7 +133,7 @@ def realizations(
     law, sample = predicted.on(low, high), measured.on(low, high)
     random = np.random.default_rng(seed)
     floor = []
-    for _ in range(_RESAMPLED):  # two samples of one law: the recording's size and the simulation's
+    for _ in range(resampled):  # two samples of one law: the recording's size and the simulation's
         a = random.multinomial(counts.size, law) / counts.size
         b = random.multinomial(drawn.size, law) / drawn.size
         floor.append((0.5 * np.abs(a - b).sum(), float(kl_divergence(a[None], b)[0])))

@@ -19,38 +19,46 @@ from mars_lidar.calibration.cells import Cells
 from mars_lidar.calibration.model import Effect, Model
 from mars_lidar.calibration.recording import Recording
 
-SETTINGS = 16  # detectors of a batch
-LIGHTS = 16  # lights of each, in one call of the engine
-_SPREAD = 2.0  # of a batch about its centre, in standard errors of a stream of its own length
-_LONGER = 4.0  # times the photons of the last law, whose closer parameters resolve the edge of a dead time
-_NEAR = 3.0  # the same of the last batches, in standard errors of the recording
-_SETTLED = 1.0  # standard errors that the last estimate may lie from the centre of its streams
-_LONGEST = 3.0  # of a move of that centre
-_FAR = 5.0  # standard errors that the centre may move before cells are laid anew
-_WIDEST = 2.0  # spreads of a first batch that later ones may have
-_VARIED = 0.5  # of the recorded variance of the pulse, the most that a batch's standard deviation may be
-_RECENTRED = 4  # last batches, at most
-_PULSES = 4  # widths of a batch
+LIGHTS = 16  # streams of one detector, in one call of the engine
+_NEAR = 3.0  # standard errors of the recording about the estimate, from which the last streams are drawn
 _CUMULATED = 100.0  # intervals expected up to an edge, for a normal law of their number
-_DRAWS = 20_000  # of the law of the estimate, for its bounds
 
 
 @dataclass(frozen=True)
 class Effort:
-    """Photons of simulated streams.
+    """Photons of simulated streams, and how many of these: it is traded for time and for the noise of the errors.
 
-    `stream` least photons of each, `batch` photons of a batch at most and `share` of the recording's photons that a
-    batch has at least, below that bound; `first` photons of the recording that the first steps weigh.
+    `settings` detectors of a batch, of `LIGHTS` streams each; `stream` least photons of each, `batch` photons of a
+    batch at most and `share` of the recording's photons that a batch has at least, below that bound; `first` photons
+    of the recording that the first steps weigh, `rounds` steps at most. `spread` of a batch about its centre, in
+    standard errors of a stream of its length. Of the last streams `longer` is the factor on their photons, so that
+    they need not differ as much, `more` that on the number of those which give the weights, and `recentred` the number
+    of batches at most. `widths` of the pulse in a batch: the tables of a pulse cost as much as a stream. `draws` from
+    the law of the estimate, for its bounds. `attempts` to fit a stream, each with simulated streams of its own, of
+    which the first that converges is taken; `effects` taken in, one after the other, and `refits` with an effect more
+    that fresh streams judge; `shape_bins` of a free light, at most.
     """
 
+    settings: int = 32
     stream: int = 2_000
     batch: float = 4e6
     share: float = 12.0
     first: int = 8_000
+    rounds: int = 10
+    spread: float = 2.0
+    longer: float = 4.0
+    more: int = 2
+    recentred: int = 4
+    widths: int = 8
+    draws: int = 20_000
+    attempts: int = 3
+    effects: int = 2
+    refits: int = 2
+    shape_bins: int = 256
 
     def of(self, photons: float, times: float = 1.0) -> int:
-        """Photons of each stream of a batch, for this many of the recording; `times` as many in all, for an edge."""
-        number = SETTINGS * LIGHTS
+        """Photons of each stream of a batch, for this many of the recording; `times` as many for the last batches."""
+        number = self.settings * LIGHTS
         wanted = times * max(self.stream, min(self.share * photons, self.batch) / number)
         return int(min(photons, max(wanted, 2.0 * photons / number)))
 
@@ -95,20 +103,18 @@ def counted(
     )
 
 
-def design(model: Model, centre: FloatArray, root: FloatArray, free: NDArray[np.intp], seed: int) -> FloatArray:
+def design(
+    model: Model, centre: FloatArray, root: FloatArray, free: NDArray[np.intp], seed: int, number: int, widths: int
+) -> FloatArray:
     """Parameters (streams, p), normal of covariance root root' about the centre; `LIGHTS` rows share a detector.
 
-    Jitter varies from row to row, the pulse from one detector to the next, in `_PULSES` widths: the tables of a pulse
-    cost as much as a stream.
+    Pulses are of `widths` widths, each the mean of those that it takes the place of; the jitter makes up for it.
     """
     random = np.random.default_rng(seed)
     k = model.light
-    split = np.eye(model.size)  # from the recorded width to that of the pulse, without the jitter
-    split[k, k + 1] = -1.0 if model.gaussian else 0.0
     cov = np.zeros((model.size, model.size))
     cov[np.ix_(free, free)] = root @ root.T
-    cov = split @ cov @ split.T
-    det = free[(free == k) | (free > k + 1)]
+    det = free[(free >= k) & ((free != k + 1) | model.split)]
     lit = np.setdiff1d(free, det)
 
     def normal(rows: int, columns: int) -> FloatArray:
@@ -116,25 +122,29 @@ def design(model: Model, centre: FloatArray, root: FloatArray, free: NDArray[np.
         z = random.standard_normal((rows, columns))
         return np.asarray(np.linalg.qr(z - z.mean(0))[0] * rows**0.5)
 
-    away = np.zeros((SETTINGS * LIGHTS, model.size))
+    rows = np.tile(centre, (number * LIGHTS, 1))
     within = cov[np.ix_(lit, lit)]
     if det.size:
         between = cov[np.ix_(det, det)]
-        settings = normal(SETTINGS, det.size) @ _root(between).T
-        if k in det:
-            for part in np.array_split(np.argsort(settings[:, 0]), _PULSES):
-                settings[part, 0] = settings[part, 0].mean()
-        away[:, det] = np.repeat(settings, LIGHTS, 0)
+        away = np.repeat(normal(number, det.size) @ _root(between).T, LIGHTS, 0)
         gain = cov[np.ix_(lit, det)] @ np.linalg.pinv(between, rcond=1e-10)
-        away[:, lit] = away[:, det] @ gain.T
+        rows[:, det] += away
+        rows[:, lit] += away @ gain.T
         within = within - gain @ cov[np.ix_(det, lit)]
-    away[:, lit] += normal(len(away), lit.size) @ _root(within).T
-    at = centre @ split.T + away
-    least = (1e-3 * centre[k]) if model.gaussian else -np.inf
-    at[:, k] = np.maximum(at[:, k], least)  # the same in all rows of a detector
-    at[:, k + 1] = np.maximum(at[:, k + 1], 0.0)
-    rows = model.bounded(at @ np.linalg.inv(split).T)
-    rows[:, k + 3 :] = np.repeat(rows[::LIGHTS, k + 3 :], LIGHTS, 0)
+    rows[:, lit] += normal(len(rows), lit.size) @ _root(within).T
+    rows[:, k : k + 2] = np.abs(rows[:, k : k + 2])
+    if model.split:
+        rows[:, k + 1] = np.arcsin(np.abs(np.sin(rows[:, k + 1])))
+    rows = model.bounded(rows)
+    if model.gaussian:
+        width, (pulse, jitter) = rows[::LIGHTS, k], model.widths(rows[::LIGHTS])
+        for part in np.array_split(np.argsort(pulse), widths):
+            mean = pulse[part].mean()
+            around = np.sqrt(np.maximum(width[part] ** 2 - mean**2, 0.0)) if model.split else jitter[part]
+            at = (part[:, None] * LIGHTS + np.arange(LIGHTS)).ravel()
+            rows[at, k] = np.repeat(np.hypot(mean, around), LIGHTS)
+            if model.split:
+                rows[at, k + 1] = np.repeat(np.arctan2(around, mean), LIGHTS)
     return rows
 
 
@@ -146,12 +156,7 @@ def _root(cov: FloatArray) -> FloatArray:
 
 
 def regression(
-    cells: Cells,
-    theta: FloatArray,
-    centre: FloatArray,
-    counts: FloatArray,
-    ratio: float,
-    free: NDArray[np.intp],
+    cells: Cells, theta: FloatArray, centre: FloatArray, counts: FloatArray, ratio: float, free: NDArray[np.intp]
 ) -> Batch:
     """The linear law of counts (streams, c), in units of an exposure `ratio` times as long as theirs."""
     y = counts * ratio
@@ -180,20 +185,19 @@ def regression(
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """A fit that fresh streams have judged: parameters (p,), covariance of the free ones, misfit, and its law."""
+    """A fit that fresh streams have judged: most probable parameters (p,), covariance of the free ones, misfit."""
 
     model: Model
     free: NDArray[np.intp]
     theta: FloatArray
-    covariance: FloatArray
+    covariance: FloatArray  # before these bounds
     unbounded: FloatArray  # (p,) before the bounds of what a detector can have
-    unbounded_covariance: FloatArray
     scatter: FloatArray  # (free, free) that of the estimator for the recording's exposure, simulations aside
     batch: Batch  # cells and weights
     offset: FloatArray  # (c,) expected counts at the centre of the last streams
     estimator: FloatArray  # (free, c): parameters less that centre, by counts less their offset
     jacobian: FloatArray  # (c, free)
-    left: FloatArray  # (c,) counts that the fit leaves
+    rest: FloatArray  # (c,) counts that the fit leaves
     fresh: FloatArray  # (streams, c) the same of fresh streams, of the recording's exposure
     misfit: float
     misfit_z: float
@@ -201,36 +205,57 @@ class Fitted:
     converged: bool
 
 
-def physical(
-    model: Model, theta: FloatArray, covariance: FloatArray, free: NDArray[np.intp]
-) -> tuple[FloatArray, FloatArray]:
-    """Mean and covariance of a normal law within what a detector can have: jitter no wider than the recorded pulse."""
-    draw = draws(model, theta, covariance, free)
-    if draw is None:
-        return model.bounded(theta), covariance
-    return draw.mean(0), np.atleast_2d(np.cov(draw[:, free].T))
+def most_probable(model: Model, theta: FloatArray, covariance: FloatArray, free: NDArray[np.intp]) -> FloatArray:
+    """The most probable parameters (p,) of a normal law within what a detector can have.
+
+    One parameter after the other, the one farthest beyond its bound first, is set to that bound, and the others to
+    their mean given that value.
+    """
+    sd = np.sqrt(np.diag(covariance))
+    theta, at_bound = theta.copy(), np.zeros(len(free), bool)
+    for _ in free:
+        beyond = np.where(at_bound, 0.0, (model.bounded(theta) - theta)[free] / sd)
+        worst = int(np.abs(beyond).argmax())
+        if beyond[worst] == 0.0:
+            break
+        at_bound[worst] = True
+        fixed, rest = np.flatnonzero(at_bound), np.flatnonzero(~at_bound)
+        off = (model.bounded(theta) - theta)[free[fixed]]
+        gain = covariance[np.ix_(rest, fixed)] @ np.linalg.pinv(covariance[np.ix_(fixed, fixed)])
+        theta[free[rest]] += gain @ off
+        theta[free[fixed]] += off
+    return model.bounded(theta)
 
 
 def draws(model: Model, theta: FloatArray, covariance: FloatArray, free: NDArray[np.intp]) -> FloatArray | None:
     """Parameters (n, p) of that law, or None where hardly any lies within the bounds."""
     root = _root(covariance)
-    rows = np.tile(theta, (_DRAWS, 1))
-    rows[:, free] += np.random.default_rng(0).standard_normal((_DRAWS, len(free))) @ root.T
+    rows = np.tile(theta, (Effort.draws, 1))
+    rows[:, free] += np.random.default_rng(0).standard_normal((Effort.draws, len(free))) @ root.T
     inside = (np.abs(model.bounded(rows) - rows)[:, free] <= 1e-12 * np.abs(theta[free])).all(1)
     return rows[inside] if inside.sum() >= 200 else None
+
+
+def _inverse(fisher: FloatArray, prior: FloatArray, root: FloatArray) -> FloatArray:
+    """Covariance of an information and a prior precision; noise may have made the information indefinite.
+
+    It is that of streams from within `_NEAR` standard errors root, and errors beyond them are not claimed.
+    """
+    values, vectors = np.linalg.eigh(root.T @ fisher @ root)
+    whole = (vectors * np.maximum(values, _NEAR**-2.0)) @ vectors.T + root.T @ prior @ root
+    return np.asarray(root @ np.linalg.inv(whole) @ root.T)
 
 
 class Fit:
     """Gauss-Newton from a starting point to the whole recording, and the last batches."""
 
-    def __init__(self, recording: Recording, effort: Effort, seed: int) -> None:
-        self.recording, self.effort, self.seed = recording, effort, seed
-        self.calls = 0
+    def __init__(self, recording: Recording, effort: Effort, seed: tuple[int, ...]) -> None:
+        self.recording, self.effort = recording, effort
+        self._random = np.random.default_rng(seed)
 
     def next_seed(self) -> int:
         """A seed that no batch has had."""
-        self.calls += 1
-        return self.seed * 100_003 + self.calls * 1_009
+        return int(self._random.integers(2**53))
 
     def exposure(self, photons: float) -> float:
         """Laser periods in which the recording has this many photons."""
@@ -250,17 +275,18 @@ class Fit:
         free: NDArray[np.intp],
         photons: float,
         cells: Cells | None = None,
-        spread: float = _SPREAD,
+        spread: float | None = None,
+        more: int = 1,
         times: float = 1.0,
     ) -> Batch:
         """The linear law of counts about `theta` for an exposure of this many photons."""
         cells = self.cells(model, theta, photons) if cells is None else cells
         size = self.effort.of(photons, times)
-        wide = spread * (photons / size) ** 0.5 * root
-        if model.gaussian and model.light in free:  # counts are no linear function of a variance down to none
-            k = int(np.flatnonzero(free == model.light)[0])
-            wide[k] *= min(1.0, _VARIED * theta[model.light] / max(float(np.linalg.norm(wide[k])), 1e-300))
-        rows = design(model, theta, wide, free, self.next_seed())
+        spread = self.effort.spread if spread is None else spread
+        linear = np.diag(model.scale(theta)[free] ** -2.0)
+        precision = np.linalg.inv(spread**2 * photons / size * root @ root.T) + linear
+        wide = _root(np.asarray(np.linalg.inv(precision), np.float64))
+        rows = design(model, theta, wide, free, self.next_seed(), more * self.effort.settings, self.effort.widths)
         exposure = max(2, round(self.exposure(size)))
         made = counted(model, cells, rows, exposure, self.next_seed())
         return regression(cells, rows, theta, made, self.exposure(photons) / exposure, free)
@@ -272,20 +298,18 @@ class Fit:
         root: FloatArray,
         free: NDArray[np.intp],
         photons: float,
-        rounds: int,
         first: float = 0.0,
     ) -> tuple[FloatArray, FloatArray, float, bool]:
         """Steps that weigh ever more photons, up to `photons`; parameters, root, misfit a cell, whether it settled."""
         weighed = float(min(photons, max(first, self.effort.first)))
         total = float(self.recording.photons)
         misfit, near = np.inf, False
-        widest = _WIDEST * np.sqrt(np.diag(root @ root.T))  # more is of counts that hardly depend on a parameter
-        for _ in range(rounds):
+        for _ in range(self.effort.rounds):
             law = self.law(model, theta, root, free, weighed)
-            seen = law.cells.of(self.recording) * (weighed / total)
+            recorded = law.cells.of(self.recording) * (weighed / total)
             prior = np.asarray(np.linalg.inv(root @ root.T) / 36.0, np.float64)
             gain = law.estimator(free, prior)
-            step = gain @ (seen - law.offset)
+            step = gain @ (recorded - law.offset)
             scatter = law.residual @ gain.T
             cov = scatter.T @ scatter / (len(scatter) - len(free) - 1) / law.ratio
             full = law.slope[:, free].T @ law.weight @ law.slope[:, free] + prior
@@ -295,86 +319,92 @@ class Fit:
             step = step / max(1.0, size / 2.0)
             moved = theta.copy()
             moved[free] += step
-            theta = physical(model, moved, cov, free)[0]
-            rest = seen - law.offset - law.slope[:, free] @ step
+            theta = most_probable(model, moved, cov, free)
+            rest = recorded - law.offset - law.slope[:, free] @ step
             misfit = float(rest @ law.weight @ rest / len(rest)) if size <= 2.0 else np.inf
             near = size < (0.6 if weighed >= photons else 1.5)
             grown = min(photons, weighed * 6.0) if near else weighed
             cov = cov * (weighed / grown)
-            sd = np.sqrt(np.diag(cov))
-            narrowed = np.minimum(1.0, widest / sd)
-            root = _root((cov + np.diag((0.02 * sd) ** 2)) * np.outer(narrowed, narrowed))
+            cov = cov + np.diag(0.02**2 * np.diag(cov))
+            root = _root(cov)
             if near and weighed >= photons:
                 break
             weighed = grown
         return theta, root, misfit, near and weighed >= photons
 
     def finish(
-        self,
-        model: Model,
-        theta: FloatArray,
-        root: FloatArray,
-        free: NDArray[np.intp],
-        again: bool = True,
+        self, model: Model, theta: FloatArray, root: FloatArray, free: NDArray[np.intp], again: bool = True
     ) -> Fitted:
         """The last estimate, and what fresh streams about it say of its slope, bias, scatter and misfit."""
         photons = float(self.recording.photons)
-        law = self.law(model, theta, root, free, photons, times=_LONGER)
-        nearby = _NEAR * (self.effort.of(photons) / photons) ** 0.5
+        effort = self.effort
+        closer = effort.spread / effort.more**0.5  # counts near the end of a dead time are linear over short distances
+        law = self.law(model, theta, root, free, photons, None, closer, effort.more, effort.longer)
+        nearby = _NEAR * (effort.of(photons, effort.longer) / photons) ** 0.5
         gain = law.estimator(free)
-        seen = law.cells.of(self.recording)
+        recorded = law.cells.of(self.recording)
         centre, size = theta, np.zeros(len(free))
-        for trial in range(_RECENTRED):
-            near = self.law(model, centre, root, free, photons, law.cells, spread=nearby)
+        for trial in range(effort.recentred):
+            near = self.law(model, centre, root, free, photons, law.cells, nearby, times=effort.longer)
             y = near.counts  # of streams near the estimate, in the recording's exposure
             moved = (near.theta - centre)[:, free]
             terms = np.c_[np.ones(len(y)), moved]
-            slope, *_ = np.linalg.lstsq(terms, (y - near.offset) @ gain.T, rcond=None)
+            inverse = np.linalg.pinv(terms.T @ terms)
+            slope = inverse @ terms.T @ (y - near.offset) @ gain.T
             local = slope[1:].T
-            estimator = np.linalg.pinv(local) @ gain
-            rest = (y - near.offset) @ estimator.T - moved
-            scatter = np.cov(rest.T).reshape(len(free), len(free))
-            cov = scatter * (1.0 / near.ratio + 1.0 / len(y))
+            rest = (y - near.offset) @ gain.T - terms @ slope
+            noise = np.atleast_2d(rest.T @ rest) / (len(y) - terms.shape[1])
+            away = gain @ (recorded - near.offset) - slope[0]
+            information, prior = np.linalg.inv(noise), model.precision(free)
+            place = np.r_[1.0, np.linalg.pinv(local) @ away]  # where the law is read, for its own noise there
+            for _ in range(2):
+                scale = 1.0 / (1.0 / near.ratio + place @ inverse @ place)
+                # the square of the slope is too large by that of its noise
+                fisher = scale * (local.T @ information @ local - len(free) * inverse[1:, 1:])
+                cov = _inverse(fisher, prior, root)
+                solve = scale * cov @ local.T @ information
+                place[1:] = solve @ away + cov @ prior @ (model.middle(centre) - centre)[free]
+            estimator = solve @ gain
             raw = centre.copy()
-            raw[free] += estimator @ (seen - near.offset) - rest.mean(0)
-            mean, truncated = physical(model, raw, cov, free)
+            raw[free] += place[1:]
+            mean = most_probable(model, raw, cov, free)
             size = np.abs((mean - centre)[free]) / np.sqrt(np.diag(cov))
-            if size.max() < _SETTLED or trial == _RECENTRED - 1:
+            if trial and (size.max() < 1.0 or trial == effort.recentred - 1):
                 break
-            centre = centre + (mean - centre) / max(1.0, float(size.max()) / _LONGEST)
+            root = _root(cov)
+            centre = centre + (mean - centre) / max(1.0, float(size.max()) / _NEAR)
         sd = np.sqrt(np.diag(cov))
-        if again and (np.abs((centre - theta)[free]) > _FAR * sd).any():  # cells and weights were laid elsewhere
+        if again and (np.abs((centre - theta)[free]) > _NEAR * sd).any():  # cells and weights were laid elsewhere
             return self.finish(model, centre, _root(cov), free, again=False)
         jacobian = law.slope[:, free] @ local
-        project = np.eye(len(seen)) - jacobian @ estimator
+        project = np.eye(len(recorded)) - jacobian @ estimator
         fresh = near.residual @ project.T
         fresh = (fresh - fresh.mean(0)) / np.sqrt(near.ratio) * np.sqrt(len(y) / (len(y) - terms.shape[1]))
-        left = project @ (seen - near.offset)
+        rest = project @ (recorded - near.offset)
         dead = np.flatnonzero(free == model.light + 2)
-        misfit, z, p = _misfit(left, fresh, law, near, seen, float(sd[dead[0]]) if dead.size else 0.0)
+        misfit, z, p = _misfit(rest, fresh, law, near, recorded, float(sd[dead[0]]) if dead.size else 0.0)
         return Fitted(
             model=model,
             free=free,
             theta=mean,
-            covariance=truncated,
             unbounded=raw,
-            unbounded_covariance=cov,
-            scatter=scatter / near.ratio,
+            covariance=cov,
+            scatter=solve @ noise @ solve.T / near.ratio,
             batch=law,
             offset=near.offset,
             estimator=estimator,
             jacobian=jacobian,
-            left=left,
+            rest=rest,
             fresh=fresh,
             misfit=misfit,
             misfit_z=z,
             p_value=p,
-            converged=bool(size.max() < _LONGEST),
+            converged=bool(size.max() < _NEAR),
         )
 
 
 def _misfit(
-    left: FloatArray, fresh: FloatArray, law: Batch, near: Batch, recorded: FloatArray, dead_error: float
+    rest: FloatArray, fresh: FloatArray, law: Batch, near: Batch, recorded: FloatArray, dead_error: float
 ) -> tuple[float, float, float]:
     """Weighed square of the counts that the fit leaves, its standard deviations above fresh streams', probability.
 
@@ -387,13 +417,13 @@ def _misfit(
     noise = 1.0 + near.ratio / len(near.counts)
     weight = law.weight[np.ix_(used, used)]
     drawn = np.einsum("ki,ij,kj->k", fresh[:, used], weight, fresh[:, used])
-    mine = float(left[used] @ weight @ left[used]) / noise
+    mine = float(rest[used] @ weight @ rest[used]) / noise
     shape = drawn.mean() ** 2 / drawn.var()
     square = float(gammaincc(shape, mine * shape / drawn.mean()))
     gaps = slice(law.cells.phases, law.cells.phases + law.cells.gap_edges.size)
     cumulated = np.cumsum(near.offset[gaps])
     enough = cumulated > _CUMULATED
-    departure = np.abs(np.cumsum(left[gaps])) / (np.cumsum(fresh[:, gaps], axis=1).std(0) * noise**0.5)
+    departure = np.abs(np.cumsum(rest[gaps])) / (np.cumsum(fresh[:, gaps], axis=1).std(0) * noise**0.5)
     most = float(departure[enough].max(initial=0.0))
     late = 2.0 * enough.sum() * float(ndtr(-most))
     first = _edge_probability(law.cells.gap_edges, cumulated, np.cumsum(recorded[gaps]), dead_error)

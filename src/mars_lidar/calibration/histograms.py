@@ -26,7 +26,6 @@ from mars_lidar.reconstruction.histograms import Histograms, checked
 from mars_lidar.reconstruction.maximum_likelihood import MaximumLikelihood
 from mars_lidar.reconstruction.method import Estimates
 
-_PIXELS = 32  # that are fitted, the brightest
 _GRID = 13  # dead times of the first search, over a period
 _DECREASE = 1e-2  # of the log likelihood, to which it is climbed
 
@@ -73,7 +72,7 @@ class CubeCalibration:
 
 
 def calibrate_cube(
-    cube: ArrayLike, system: System, *, pulse: Literal["gaussian", "free"] = "gaussian"
+    cube: ArrayLike, system: System, *, pulse: Literal["gaussian", "free"] = "gaussian", pixels: int = 32
 ) -> CubeCalibration:
     """Dead time and pulse that all pixels of a cube (..., bins) share, with errors.
 
@@ -89,6 +88,8 @@ def calibrate_cube(
     pulse
         ``"gaussian"``, of unknown width; or ``"free"``: a response in samples of a bin, over ten standard deviations of
         the Gaussian that fits best on either side, whose centroid is the delay of a pixel.
+    pixels
+        Pixels that are fitted, at most: the brightest.
 
     Raises
     ------
@@ -105,7 +106,7 @@ def calibrate_cube(
             f"{system.detector.mode!r} and {system.cycles:,} cycles"
         )
     totals = given.counts.sum(1)
-    chosen = np.argsort(totals)[::-1][:_PIXELS]
+    chosen = np.argsort(totals)[::-1][: checks.integer("pixels", pixels, low=1, high=10**6)]
     chosen = chosen[totals[chosen] >= 1000]
     if not chosen.size:
         raise ValueError(f"cube must have a pixel of 1000 registrations, got at most {int(totals.max()):,}")

@@ -25,8 +25,7 @@ from mars_lidar.simulation import simulate_timestamps
 
 _NARROWEST = 2e-6  # periods: the narrowest pulse that the engines draw
 _WIDEST = 0.3  # sigma of a recorded pulse, periods: a wider one is hardly told from background
-_WIDEST_JITTER = 0.0499  # periods: the widest that `Jitter` takes
-_DELAYS = (0.4, 0.8, 1.6, 3.2, 6.4)  # dead times: mean delays of afterpulses whose scores are compared before a refit
+_WIDEST_JITTER = 0.05  # periods: the widest that `Jitter` takes
 _MOST_CARRIERS = 0.95  # of an avalanche
 Fields = dict[str, Any]
 
@@ -67,52 +66,26 @@ def effects(dead_time_ns: float) -> tuple[Effect, ...]:
         observed = fields["dead_time_ns"]  # that of the electronics, over a detector that is ready earlier
         return fields | {"electronics_dead_time_ns": observed, "dead_time_ns": observed / (1.0 + value[0])}
 
-    listed = [
-        Effect(
-            ("afterpulse_probability", "log_afterpulse_delay"),
-            (0.03, float(np.log(scale * dead))),
-            (0.0, float(np.log(_DELAYS[0] * dead / 2.0))),
-            (0.5, float(np.log(_DELAYS[-1] * dead * 2.0))),
-            afterpulses,
-            "afterpulses",
-        )
-        for scale in _DELAYS
-    ]
+    def twilight(fields: Fields, value: tuple[float, ...]) -> Fields:
+        return fields | {"twilight_ns": min(value[0], fields["dead_time_ns"])}
+
+    def recovery(fields: Fields, value: tuple[float, ...]) -> Fields:
+        return fields | {"recovery_ns": value[0]}
+
+    def paralyzable(fields: Fields, value: tuple[float, ...]) -> Fields:
+        return fields | ({"mode": "paralyzable"} if value[0] > 0.5 else {})
+
+    after = ("afterpulse_probability", "log_afterpulse_delay")
+    middle, reach = float(np.log(1.6 * dead)), float(np.log(8.0))  # mean delays from a fifth to 13 dead times
+    least, most = (0.0, middle - reach), (0.5, middle + reach)
+    starts = [(0.03, middle + place * reach) for place in (-0.5, 0.0, 0.5)]
+    own = "electronics with a dead time of their own"
     return (
-        *listed,
-        Effect(
-            ("twilight_ns",),
-            (min(1.0, 0.2 * dead),),
-            (0.0,),
-            (dead,),
-            lambda fields, value: fields | {"twilight_ns": min(value[0], fields["dead_time_ns"])},
-            "twilight pulses",
-        ),
-        Effect(
-            ("recovery_ns",),
-            (0.03 * dead,),
-            (0.0,),
-            (2.0 * dead,),
-            lambda fields, value: fields | {"recovery_ns": value[0]},
-            "slow recovery",
-        ),
-        Effect(
-            ("electronics_excess",),
-            (0.25,),
-            (0.0,),
-            (19.0,),
-            electronics,
-            "electronics with a dead time of their own",
-        ),
-        Effect(
-            ("paralyzable",),
-            (1.0,),
-            (0.0,),
-            (1.0,),
-            lambda fields, value: fields | ({"mode": "paralyzable"} if value[0] > 0.5 else {}),
-            "paralyzable detector",
-            onoff=True,
-        ),
+        *(Effect(after, start, least, most, afterpulses, "afterpulses") for start in starts),
+        Effect(("twilight_ns",), (min(1.0, 0.2 * dead),), (0.0,), (dead,), twilight, "twilight pulses"),
+        Effect(("recovery_ns",), (0.03 * dead,), (0.0,), (2.0 * dead,), recovery, "slow recovery"),
+        Effect(("electronics_excess",), (0.25,), (0.0,), (19.0,), electronics, own),
+        Effect(("paralyzable",), (1.0,), (0.0,), (1.0,), paralyzable, "paralyzable detector", onoff=True),
     )
 
 
@@ -129,13 +102,16 @@ class Streams:
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """Parameters, in this order: background, (signal, delay) of each return, width2, jitter2, dead time, effects.
+    """Parameters, in this order: background, (signal, delay) of each return, width, jitter, dead time, effects.
 
-    Photons a period, ns and ns^2. `width2` is the variance of the recorded pulse, jitter included. With a `waveform`
+    Photons a period, and ns. `width` is the standard deviation of the recorded pulse, jitter included, and the jitter
+    an angle, in radians: that of the point whose coordinates are the standard deviations of pulse and jitter, at the
+    distance `width`. Counts are smooth in both where one of the two vanishes; in variances they are not. Where the
+    jitter is given (`jitter_given`) or the pulse is no Gaussian of unknown width, it is in ns. With a `waveform`
     (shares of the light in equal parts of the period, jitter not included) there is no return, and the background is
     all light. `waveform_error` are the standard errors of these shares by a recording of `exposure` periods: simulated
     streams have light that differs so much from the waveform, more in shorter ones as their counts do.
-    With a `pulse` its shape is known, before any jitter, and `width2` means nothing.
+    With a `pulse` its shape is known, before any jitter, and `width` means nothing.
     """
 
     clock: Clock
@@ -146,11 +122,17 @@ class Model:
     exposure: float = 1.0
     effects: tuple[Effect, ...] = ()
     fields: tuple[tuple[str, Any], ...] = ()  # of the detector, as given
+    jitter_given: bool = False
 
     @property
     def gaussian(self) -> bool:
         """Whether the pulse is a Gaussian of unknown width."""
         return self.pulse is None and self.waveform is None and self.returns > 0
+
+    @property
+    def split(self) -> bool:
+        """Whether the jitter is an unknown part of the recorded width."""
+        return self.gaussian and not self.jitter_given
 
     @property
     def light(self) -> int:
@@ -165,7 +147,7 @@ class Model:
             f"{name}{f'_{k + 1}' if several else ''}" for k in range(self.returns) for name in ("signal", "delay_ns")
         ]
         more = [name for effect in self.effects for name in effect.names]
-        return ("background", *light, "width2", "jitter2", "dead_time_ns", *more)
+        return ("background", *light, "width", "jitter", "dead_time_ns", *more)
 
     @property
     def size(self) -> int:
@@ -179,12 +161,15 @@ class Model:
         out[..., 0] = np.maximum(out[..., 0], 1e-7)
         for r in range(self.returns):
             out[..., 1 + 2 * r] = np.maximum(out[..., 1 + 2 * r], 0.0)
-        widths = np.array([_NARROWEST, _WIDEST]) * self.clock.period_ns
-        out[..., k] = np.clip(out[..., k], *(widths**2))
-        most = np.full_like(out[..., k], (_WIDEST_JITTER * self.clock.period_ns) ** 2)
-        if self.gaussian:
-            most = np.minimum(most, out[..., k])
+        period = self.clock.period_ns
+        out[..., k] = np.clip(out[..., k], _NARROWEST * period, _WIDEST * period)
+        if self.split:
+            most = np.arcsin(np.minimum(_WIDEST_JITTER * period / out[..., k], 1.0))
+        else:
+            most = np.full_like(out[..., k], _WIDEST_JITTER * period)
         out[..., k + 1] = np.clip(out[..., k + 1], 0.0, most)
+        if self.gaussian and self.jitter_given:
+            out[..., k] = np.maximum(out[..., k], out[..., k + 1])
         out[..., k + 2] = np.maximum(out[..., k + 2], 0.0)
         at = k + 3
         for effect in self.effects:
@@ -193,13 +178,49 @@ class Model:
                 at += 1
         return out
 
+    def widths(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Standard deviations (...) of the pulse and of the jitter, ns, of parameters (..., p) within the bounds."""
+        width, jitter = theta[..., self.light], theta[..., self.light + 1]
+        if self.split:
+            return width * np.cos(jitter), width * np.sin(jitter)
+        return np.sqrt(np.maximum(width**2 - jitter**2, 0.0)), jitter
+
+    def scale(self, theta: FloatArray) -> FloatArray:
+        """Changes (p,) of parameters over which counts are about linear functions of them, as a batch varies them."""
+        k, unit = self.light, self.clock.unit_ns
+        width = float(np.hypot(theta[k], unit / 12**0.5))
+        out = np.zeros(self.size)
+        out[0] = 0.3 * theta[0]
+        out[1:k:2] = 0.2 * theta[1:k:2] + 0.04 * theta[0]
+        out[2:k:2] = 0.6 * width
+        out[k] = 0.3 * width
+        out[k + 1] = 0.6 * (1.0 if self.split else width)
+        out[k + 2] = 0.6 * width + unit
+        at = k + 3
+        for effect in self.effects:
+            out[at : at + len(effect.start)] = 0.8
+            out[at] *= max(effect.start[0], theta[at])
+            at += len(effect.start)
+        return out
+
+    def middle(self, theta: FloatArray) -> FloatArray:
+        """Parameters (p,) with an unknown angle in the middle of its range, where its prior is centred."""
+        out = theta.copy()
+        out[self.light + 1] = np.pi / 4.0 if self.split else theta[self.light + 1]
+        return out
+
+    def precision(self, free: NDArray[np.intp]) -> FloatArray:
+        """Prior precision (free, free): an angle that no data tell has the standard deviation of its whole range."""
+        known = self.split & (free == self.light + 1)
+        return np.asarray(np.diag(known * (2.0 / np.pi) ** 2))
+
     def system(
         self, theta: FloatArray, cycles: int, bins: int = 16, extra: tuple[Effect, ...] = (), jitter: bool = True
     ) -> System:
         """The instrument of parameters (p,), with further effects at their starting values, with or without jitter."""
         k = self.light
         theta = self.bounded(theta)
-        width2, jitter2 = float(theta[k]), float(theta[k + 1])
+        sigma, sd = map(float, self.widths(theta))
         fields: Fields = dict(self.fields) | {"dead_time_ns": float(theta[k + 2])}
         at = k + 3
         for effect in self.effects:
@@ -208,9 +229,9 @@ class Model:
         for effect in extra:
             fields = effect.apply(fields, effect.start)
         least = _NARROWEST * self.clock.period_ns
-        if jitter and jitter2 > least**2:
-            fields["jitter"] = Jitter(sigma_ns=jitter2**0.5)
-        pulse = self.pulse or GaussianPulse(sigma_ns=float(f"{max(max(width2 - jitter2, 0.0) ** 0.5, least):.9g}"))
+        if jitter and sd > least:
+            fields["jitter"] = Jitter(sigma_ns=sd)
+        pulse = self.pulse or GaussianPulse(sigma_ns=float(f"{max(sigma, least):.9g}"))
         return System(
             period_ns=self.clock.period_ns, cycles=cycles, bins=bins, pulse=pulse, detector=Detector(**fields)
         )
@@ -250,7 +271,7 @@ class Model:
             system = self.system(rows[0], cycles, extra=extra, jitter=False)
             flux = self._varied(self.flux(rows), cycles, seed)
             made = cast(DrawnTimestamps, simulate_timestamps(flux, system, seed=seed, threads=1))
-        sigma = np.sqrt(rows[:, self.light + 1])
+        sigma = self.widths(rows)[1].copy()
         sigma[sigma <= _NARROWEST * self.clock.period_ns] = 0.0
         number = made.phase.size if sigma.any() else 0
         deviates = np.random.default_rng(seed).standard_normal(number, dtype=np.float32)

@@ -7,17 +7,13 @@ import math
 import numpy as np
 
 from mars_lidar._base.types import FloatArray
-from mars_lidar.calibration.recording import Recording
+from mars_lidar.calibration.recording import FALSE_ALARM, Recording
 
 _CELLS = 2**20  # of the time axis: all of it where the stream is shorter
 _PER_PERIOD = 32  # cells of the given period: lines up to 16 times its frequency
 _SLOWEST = 0.3  # of the laser's frequency
 _STRONG = 40.0  # times the power of light without a period: one of 2^20 lines by chance at e^-40
 _CLEAR = 4.0  # times as strong as the line at the given period
-_SEED = 2
-_HARMONIC = 1e-3  # probability of lines as strong by chance
-_TRIED = 5000  # lines
-_AROUND = 64  # lines on either side, whose median tells what a dead time makes of light without a period
 
 
 def other_period(recording: Recording) -> float | None:
@@ -34,7 +30,7 @@ def other_period(recording: Recording) -> float | None:
     if times.size < 100:
         return None
     if unit := recording.clock.unit_ns:
-        spread = np.random.default_rng(_SEED).random(times.size) - 0.5
+        spread = np.random.default_rng(0).random(times.size) - 0.5
         times = np.maximum(times + unit * spread, 0.0)
     place = np.floor(times / cell).astype(np.int64)
     length = int(2 ** np.ceil(np.log2(place.max() + 1)))
@@ -45,7 +41,7 @@ def other_period(recording: Recording) -> float | None:
         return None
     at_given = _strongest(power, given)
     strong = np.flatnonzero(power[low:] > max(_STRONG, _CLEAR * at_given, 0.25 * float(power[low:].max()))) + low
-    first = next((int(line) for line in strong[:_TRIED] if power[line] > _STRONG * _neighbours(power, int(line))), None)
+    first = next((int(line) for line in strong if power[line] > _STRONG * _neighbours(power, int(line))), None)
     if first is None:
         return None
     first += int(np.argmax(power[first : first + 3]))
@@ -64,7 +60,7 @@ def _is_harmonic(power: FloatArray, line: int, given: float) -> bool:
         return False
     lower = [_strongest(power, k * given) / _neighbours(power, round(k * given)) for k in range(1, number)]
     # the strongest of three lines each
-    return bool(gamma.sf(sum(lower), number - 1) * 3.0 ** (number - 1) < _HARMONIC)
+    return bool(gamma.sf(sum(lower), number - 1) * 3.0 ** (number - 1) < FALSE_ALARM)
 
 
 def _strongest(power: FloatArray, line: float) -> float:
@@ -74,5 +70,6 @@ def _strongest(power: FloatArray, line: float) -> float:
 
 def _neighbours(power: FloatArray, line: int) -> float:
     """Mean power of a line without a period, by the median of those around it but the nearest."""
-    around = np.concatenate([power[max(line - _AROUND, 1) : line - 3], power[line + 4 : line + _AROUND + 1]])
+    reach = 2 * _PER_PERIOD
+    around = np.concatenate([power[max(line - reach, 1) : line - 3], power[line + 4 : line + reach + 1]])
     return max(float(np.median(around)) / math.log(2.0), 1.0)

@@ -15,6 +15,8 @@ from mars_lidar._base.types import FloatArray
 from mars_lidar.light.timestamps import Timestamps
 
 _ON_GRID = 0.02  # units: largest distance from the grid of a clock, for times in float64 over an hour
+FALSE_ALARM = 0.005  # probability of a suspect of a plain recording; of another period; of a pulse; of a drift
+LEAST_PHOTONS = 300  # of a recording or a part of it: below them the counts of the cells have no normal law
 _PROBED = 2000  # times that tell the clock
 _OWN_UNITS = (2**15, 2**16)  # units of the period in our own PTU and Photon-HDF5, at most
 

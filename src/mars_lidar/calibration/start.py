@@ -9,7 +9,6 @@ from mars_lidar.calibration.fit import LIGHTS, Fit
 from mars_lidar.calibration.model import Model
 from mars_lidar.calibration.recording import Recording
 
-_SHARES = (0.0, 0.03, 0.1, 0.3, 0.6, 0.9, 0.99)  # of the recorded width that may be jitter
 _MOST_BINS = 2**14
 _WINDOWS = 64  # of the period, for the median light
 
@@ -31,7 +30,7 @@ def free_light(t: FloatArray, period: float, hold: float, bins: int) -> tuple[Fl
 
 
 def light(t: FloatArray, model: Model, hold: float) -> FloatArray:
-    """Background, signal and delay of each return, and variance of the recorded pulse, by matched filters."""
+    """Background, signal and delay of each return, and width of the recorded pulse, by matched filters."""
     period, unit = model.clock.period_ns, model.clock.unit_ns
     bins = int(np.clip(period / max(unit, 1e-9), 64, _MOST_BINS))
     hits, passes = free_light(t, period, hold, bins)
@@ -42,7 +41,7 @@ def light(t: FloatArray, model: Model, hold: float) -> FloatArray:
     # the median of windows with enough photons for one
     coarse = [np.add.reduceat(x, np.linspace(0, bins, _WINDOWS, endpoint=False).astype(int)) for x in (hits, passes)]
     faint = max(float(np.median(coarse[0] / np.maximum(coarse[1], 1.0))), 1e-3 / max(passes.sum(), 1.0))
-    found, variance = [], 0.0
+    peaks, variance = [], 0.0
     for _ in range(model.returns):
         best = (-np.inf, 0, 1)
         masked_hits, masked_passes = np.where(outside, hits, faint * passes), passes
@@ -71,11 +70,11 @@ def light(t: FloatArray, model: Model, hold: float) -> FloatArray:
             peak += mean
             reach = float(np.clip(4.5 * np.sqrt(var), least, 0.3 * period))
         outside &= ~inside
-        found += [signal, peak % period]
+        peaks += [signal, peak % period]
         variance = variance or var
     own = max(variance - unit**2 / 12, 0.0025 * variance, (0.15 * unit) ** 2)
     back = max(faint * bins if model.returns else float(rate.sum()), 1e-5)
-    return np.array([back, *found, own])
+    return np.array([back, *peaks, own**0.5])
 
 
 def starts(fit: Fit, recording: Recording, model: Model, fixed: dict[str, float]) -> list[tuple[float, FloatArray]]:
@@ -93,19 +92,19 @@ def starts(fit: Fit, recording: Recording, model: Model, fixed: dict[str, float]
     hold = max(hold, fixed.get("dead_time_ns", 0.0) + 2 * model.clock.unit_ns)
     if model.returns == 0:
         total = float(free_waveform(recording, 64)[0].sum())
-        first = np.array([total, max((observed[-3] - observed[0]) / 4, 0.3 * model.clock.unit_ns) ** 2])
+        first = np.array([total, max((observed[-3] - observed[0]) / 4, 0.3 * model.clock.unit_ns)])
     else:
         first = light(t, model, hold)
-    found = []
+    trials = []
     cycles = max(2, round(fit.exposure(photons)))
-    for share in _SHARES:
+    for angle in np.linspace(0.0, np.pi / 2.0, 7):  # from no jitter to a width of jitter alone
         theta = np.zeros(model.size)
         theta[: k + 1] = first
         for name, value in fixed.items():
             theta[names.index(name)] = value
-        jitter2 = fixed.get("jitter2", share * theta[k])
-        theta[k + 1] = jitter2
-        theta[k + 2] = fixed.get("dead_time_ns", max(observed[0], 0.05 * observed[-1]) + 2 * np.sqrt(jitter2))
+        theta[k + 1] = fixed.get("jitter", angle if model.split else np.sin(angle) * theta[k])
+        jitter = float(model.widths(theta)[1])
+        theta[k + 2] = fixed.get("dead_time_ns", max(observed[0], 0.05 * observed[-1]) + 2 * jitter)
         at = k + 3
         for effect in model.effects:
             for name, value in zip(effect.names, effect.start, strict=True):
@@ -115,12 +114,12 @@ def starts(fit: Fit, recording: Recording, model: Model, fixed: dict[str, float]
             theta = with_edge(fit, model, theta, low)
         cells = fit.cells(model, theta, photons)
         rows = cells.count(model.streams(np.tile(theta, (LIGHTS, 1)), cycles, fit.next_seed()))
-        seen = cells.of(recording) * (photons / recording.photons)
-        r = (2 * np.sqrt(seen + 0.375) - 2 * np.sqrt(rows + 0.375).mean(0)) ** 2
-        found.append((float(r.sum()), theta))
-        if "jitter2" in fixed:
+        recorded = cells.of(recording) * (photons / recording.photons)
+        r = (2 * np.sqrt(recorded + 0.375) - 2 * np.sqrt(rows + 0.375).mean(0)) ** 2
+        trials.append((float(r.sum()), theta))
+        if "jitter" in fixed:
             break
-    return sorted(found, key=lambda pair: pair[0])
+    return sorted(trials, key=lambda pair: pair[0])
 
 
 def with_edge(fit: Fit, model: Model, theta: FloatArray, low: FloatArray) -> FloatArray:
@@ -136,26 +135,6 @@ def with_edge(fit: Fit, model: Model, theta: FloatArray, low: FloatArray) -> Flo
         theta = theta.copy()
         theta[k + 2] = max(theta[k + 2] + float((observed - here)[1:-1].mean()), 0.05 * observed[0])
     return theta
-
-
-def first_spread(model: Model, theta: FloatArray) -> FloatArray:
-    """Standard deviations (p,) of the first batch about a start."""
-    unit, k = model.clock.unit_ns, model.light
-    width = float(np.sqrt(theta[k] + unit**2 / 12))
-    out = np.zeros(model.size)
-    out[0] = 0.15 * theta[0]
-    for r in range(model.returns):
-        out[1 + 2 * r] = 0.1 * theta[1 + 2 * r] + 0.02 * theta[0]
-        out[2 + 2 * r] = 0.3 * width
-    out[k] = 0.3 * width**2
-    out[k + 1] = 0.25 * theta[k]
-    out[k + 2] = 0.3 * width + 0.5 * unit
-    at = k + 3
-    for effect in model.effects:
-        for number, value in enumerate(effect.start):
-            out[at] = 0.4 * (max(value, theta[at]) if number == 0 else 1.0)
-            at += 1
-    return out
 
 
 def safe_hold(recording: Recording) -> float:
@@ -183,12 +162,14 @@ def free_waveform(recording: Recording, most: int) -> tuple[FloatArray, FloatArr
 
 
 def brightest_window(recording: Recording) -> float:
-    """Standard deviations by which the brightest window of the period exceeds the median light."""
+    """Probability that light without a pulse has a window as bright above the median, of all windows."""
+    from scipy.special import ndtr
+
     rate, error = free_waveform(recording, 512)
     faint = float(np.median(rate))
     variance, best = error**2, -np.inf
-    for m in (1, 2, 4, 8, 16, 32, 64):
+    for m in 2 ** np.arange(7):
         inside = sum(np.roll(rate, -k) for k in range(m)) - m * faint
         noise = np.sqrt(sum(np.roll(variance, -k) for k in range(m)))
         best = max(best, float((inside / noise).max()))
-    return best
+    return float(7 * rate.size * ndtr(-best))

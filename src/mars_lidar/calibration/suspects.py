@@ -10,17 +10,11 @@ from numpy.typing import NDArray
 from mars_lidar._base.types import FloatArray
 from mars_lidar.calibration.fit import LIGHTS, Fit, Fitted, counted
 from mars_lidar.calibration.model import Effect, Model, effects
-from mars_lidar.calibration.recording import Recording
-from mars_lidar.calibration.start import first_spread, with_edge
+from mars_lidar.calibration.recording import FALSE_ALARM, LEAST_PHOTONS, Recording
+from mars_lidar.calibration.start import with_edge
 
-_DIRECTION = 12.0  # photons of the streams that give the direction of an effect, over those of the recording
-_MOST = 2e6  # of these photons
-FALSE_ALARM = 0.005  # probability that a plain recording gets a suspect; again that of a drift
-_ROUNDS = 5  # of steps with an effect more; the last streams tell whether they were enough
-_REFITTED = 2  # effects, that fresh streams judge
 _MISFIT = 1e-3  # probability of the misfit below which effects without a clear score are refitted, and their gain in it
-_PARTS = 16  # of a recording, for drift
-_PART_PHOTONS = 300  # of a part, at least
+_PARTS = 16  # of a recording, for drift: a trend then has 14 degrees of freedom
 
 
 @dataclass(frozen=True)
@@ -52,7 +46,7 @@ def scores(fit: Fit, fitted: Fitted) -> list[Score]:
     have |= {"paralyzable"} if "mode" in have else set()
     centre = model.bounded(fitted.theta)
     photons = float(fit.recording.photons)
-    simulated = min(_DIRECTION * photons, max(_MOST, photons))
+    simulated = min(fit.effort.share * photons, max(fit.effort.batch, photons))
     exposure = max(2, round(fit.exposure(simulated / LIGHTS)))
     ratio = fit.exposure(photons) / exposure
     rows = np.tile(centre, (LIGHTS, 1))
@@ -76,7 +70,7 @@ def scores(fit: Fit, fitted: Fitted) -> list[Score]:
         along[used] = law.weight[np.ix_(used, used)] @ way[used]
         along /= max(float(way @ along), 1e-300)
         spread = float((fitted.fresh @ along).std()) * (1.0 + 2.0 * ratio / LIGHTS) ** 0.5
-        listed.append(Score(effect, float(fitted.left @ along), spread, shift))
+        listed.append(Score(effect, float(fitted.rest @ along), spread, shift))
     return sorted(listed, key=lambda score: -score.z)
 
 
@@ -123,7 +117,7 @@ def _best(fit: Fit, fitted: Fitted, tried: list[Score], limit: float) -> tuple[F
         if trial is not None:
             trials.append((trial[0], score, trial[1]))
     best: tuple[Fitted, Named] | None = None
-    for _, score, (model, theta, root, free) in sorted(trials, key=lambda trial: trial[0])[:_REFITTED]:
+    for _, score, (model, theta, root, free) in sorted(trials, key=lambda trial: trial[0])[: fit.effort.refits]:
         final = fit.finish(model, theta, root, free)
         if final.converged and (best is None or final.misfit_z < best[0].misfit_z):
             best = final, Named(score.effect, score.z, fitted.misfit_z - final.misfit_z)
@@ -148,7 +142,7 @@ def _stepped(fit: Fit, fitted: Fitted, score: Score) -> tuple[float, _Stepped] |
         size = min(score.size, effect.most[0])
         moved[fitted.free] -= score.shift * min(size, effect.start[0])
     theta = model.bounded(np.r_[moved, size, effect.start[1:]])
-    spread = first_spread(model, theta)
+    spread = 0.5 * model.scale(theta)
     own = np.sqrt(np.diag(fitted.covariance))
     spread[fitted.free] = np.minimum(spread[fitted.free], np.maximum(8.0 * own, 1e-12))
     more = [] if effect.onoff else range(fitted.model.size, model.size)
@@ -158,7 +152,7 @@ def _stepped(fit: Fit, fitted: Fitted, score: Score) -> tuple[float, _Stepped] |
         if fitted.model.light + 2 in fitted.free:  # which has taken up what it could of the effect
             gaps = np.diff(fit.recording.pieces[0][: 12 * fit.effort.first])
             theta = with_edge(fit, model, theta, np.sort(gaps))
-        theta, root, misfit, _ = fit.steps(model, theta, np.diag(spread[free]), free, photons, _ROUNDS, photons / 6.0)
+        theta, root, misfit, _ = fit.steps(model, theta, np.diag(spread[free]), free, photons, photons / 6.0)
     except (ValueError, np.linalg.LinAlgError):
         return None
     return misfit, (model, theta, root, free)
@@ -204,7 +198,7 @@ def drift(fit: Fit, fitted: Fitted) -> Drift | None:
     from scipy.special import chdtrc
 
     recording: Recording = fit.recording
-    number = int(min(_PARTS, recording.photons // _PART_PHOTONS))
+    number = int(min(_PARTS, recording.photons // LEAST_PHOTONS))
     if number < 4:
         return None
     parts = [part for part in recording.parts(number) if part.photons > 20]

@@ -14,7 +14,7 @@ from mars_lidar.calibration import Calibration, CubeCalibration, calibrate_cube
 from mars_lidar.calibration import calibrate as calibrated
 from mars_lidar.calibration.calibration import GIVEN
 from mars_lidar.cli.console import Exit, check_picture, refuse_existing, save_picture, table
-from mars_lidar.cli.options import Integer, Number, OutPath, Text, command, examples, options, two
+from mars_lidar.cli.options import Integer, Number, OutPath, Text, command, options, two
 from mars_lidar.cli.system_options import FittedPulseOptions
 from mars_lidar.instrument.pulse import Pulse, SampledPulse
 from mars_lidar.instrument.system import SPEED_OF_LIGHT_M_PER_NS, System
@@ -134,15 +134,6 @@ class KnownOptions:
         return "free" if self.free else pulse or "gaussian"
 
 
-CALIBRATE_EXAMPLES = examples(
-    "mars-lidar calibrate lab.ptu --look",
-    "mars-lidar calibrate lab.ptu -o lab.yaml --picture lab.png",
-    "mars-lidar calibrate lab.ptu --given dead_time_ns=50 --given jitter_ns=0.1",
-    "mars-lidar calibrate photons.mat --variable tPhoton --unit-ns 0.064 --period-ns 50.048 --free",
-    "mars-lidar calibrate lab.ptu --pixel 0,2 --pulse-file irf.npy --pulse-bin-ns 0.008 --cycles 9975",
-    "mars-lidar calibrate face.npy --system lab.yaml -o face.yaml",
-    notes="Exit code 3 where the model does not fit the stream. docs/calibration.md has the whole recipe.",
-)
 _UNITS = {"signal": " photons per period", "background": " photons per period", "light": " photons per period"}
 
 
@@ -184,6 +175,19 @@ def calibrate(
         Laser periods of a realization: compare the law of their counts too.
     overwrite
         Replace existing files.
+
+    Examples
+    --------
+    mars-lidar calibrate lab.ptu --look
+    mars-lidar calibrate lab.ptu -o lab.yaml --picture lab.png
+    mars-lidar calibrate lab.ptu --given dead_time_ns=50 --given jitter_ns=0.1
+    mars-lidar calibrate photons.mat --variable tPhoton --unit-ns 0.064 --period-ns 50.048 --free
+    mars-lidar calibrate lab.ptu --pixel 0,2 --pulse-file irf.npy --pulse-bin-ns 0.008 --cycles 9975
+    mars-lidar calibrate face.npy --system lab.yaml -o face.yaml
+
+    Notes
+    -----
+    Exit code 3 where the model does not fit the stream. docs/calibration.md has the whole recipe.
     """
     from mars_lidar.io.streams.photons import NoLaserError
 
@@ -310,4 +314,4 @@ def fit_rows(result: Calibration) -> list[tuple[str, str]]:
     return [*rows, ("verdict", result.verdict)]
 
 
-calibrate_command = command(calibrate, CALIBRATE_EXAMPLES)
+calibrate_command = command(calibrate)

@@ -7,26 +7,12 @@ from typing import TYPE_CHECKING
 
 from mars_lidar.cli.console import progress_bar, table
 from mars_lidar.cli.foreign import ForeignOptions
-from mars_lidar.cli.options import Integer, Number, OutPath, command, examples
+from mars_lidar.cli.options import Integer, Number, OutPath, command
 from mars_lidar.cli.simulate import say_time
 
 if TYPE_CHECKING:
     from mars_lidar.io import Converted
 
-
-CONVERT_EXAMPLES = examples(
-    "mars-lidar convert room.zarr room.h5",
-    "mars-lidar convert set.zarr first.mat --realization 0",
-    "mars-lidar convert lab.ptu lab.h5 --bins 1024",
-    "mars-lidar convert face.mat face.zarr --variable counts --system camera.yaml",
-    notes="Cubes: .zarr .h5 .npz .mat .ptu. Photon streams: .npz .ptu .h5 (Photon-HDF5). .ptu and Photon-HDF5 need "
-    "pip install 'mars-lidar[io]'. docs/formats.md describes each.",
-)
-TIMESTAMPS_EXAMPLES = examples(
-    "mars-lidar simulate --scene room -o room.zarr",
-    "mars-lidar timestamps room.zarr -o room.ptu",
-    "mars-lidar timestamps set.zarr --realization 3 -o photons.h5",
-)
 
 _LARGE_IMAGE = 5e8
 
@@ -64,6 +50,18 @@ def convert(
         [default: the finest, 32768 to a period]
     overwrite
         Replace an existing file.
+
+    Examples
+    --------
+    mars-lidar convert room.zarr room.h5
+    mars-lidar convert set.zarr first.mat --realization 0
+    mars-lidar convert lab.ptu lab.h5 --bins 1024
+    mars-lidar convert face.mat face.zarr --variable counts --system camera.yaml
+
+    Notes
+    -----
+    Cubes: .zarr .h5 .npz .mat .ptu. Photon streams: .npz .ptu .h5 (Photon-HDF5). .ptu and Photon-HDF5 need pip install
+    'mars-lidar[io]'. docs/formats.md describes each.
     """
     from mars_lidar.dataset.store import is_dataset
     from mars_lidar.io.conversion import convert as converted
@@ -128,6 +126,12 @@ def timestamps(
         [default: the finest, 32768 to a period]
     overwrite
         Replace an existing file.
+
+    Examples
+    --------
+    mars-lidar simulate --scene room -o room.zarr
+    mars-lidar timestamps room.zarr -o room.ptu
+    mars-lidar timestamps set.zarr --realization 3 -o photons.h5
     """
     from mars_lidar.io.conversion import photons, resolution_ns
     from mars_lidar.io.cube import load
@@ -148,5 +152,5 @@ def timestamps(
     table({"wrote": str(out), "content": content, "times": resolution})
 
 
-convert_command = command(convert, CONVERT_EXAMPLES)
-timestamps_command = command(timestamps, TIMESTAMPS_EXAMPLES)
+convert_command = command(convert)
+timestamps_command = command(timestamps)

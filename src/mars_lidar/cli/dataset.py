@@ -13,7 +13,7 @@ from mars_lidar._base import manifest
 from mars_lidar._base.files import size_on_disk
 from mars_lidar._base.progress import span
 from mars_lidar.cli.console import Exit, progress_bar, say, table
-from mars_lidar.cli.options import Integer, Number, Numbers, OutPath, Text, command, examples
+from mars_lidar.cli.options import Integer, Number, Numbers, OutPath, Text, command
 from mars_lidar.cli.system_options import DEFAULT_SYSTEM, Effects, SystemChanges
 from mars_lidar.scene.scene import Scene
 
@@ -24,14 +24,6 @@ if TYPE_CHECKING:
     from mars_lidar.io import Problem
 
 
-GENERATE_EXAMPLES = examples(
-    "mars-lidar generate recipe.yaml -o set.zarr --dry-run",
-    "mars-lidar generate recipe.yaml -o set.zarr --resume",
-    "mars-lidar generate room --size 64 --scene-seeds 100 --signal 0.1 --signal 1 --sbr 0.5 -o rooms.zarr",
-    "mars-lidar generate nyu_depth_v2_labeled.mat --focal-px 519 --crop 64 --crops 4 -o nyu.zarr",
-    "mars-lidar generate recipe.yaml -o set.zarr --scheduler tcp://10.0.0.1:8786",
-    notes="Recipes: docs/generate.md. Clusters: docs/scale.md.",
-)
 _RECIPES = (".yaml", ".yml")
 _TRANSIENTS = (".h5", ".hdf5")  # a depth is never in one; the other files of transients need a recipe
 
@@ -151,6 +143,18 @@ def generate(
         Check that all parts are there, and mark the store complete.
     dry_run
         Print size, time and memory; write nothing.
+
+    Examples
+    --------
+    mars-lidar generate recipe.yaml -o set.zarr --dry-run
+    mars-lidar generate recipe.yaml -o set.zarr --resume
+    mars-lidar generate room --size 64 --scene-seeds 100 --signal 0.1 --signal 1 --sbr 0.5 -o rooms.zarr
+    mars-lidar generate nyu_depth_v2_labeled.mat --focal-px 519 --crop 64 --crops 4 -o nyu.zarr
+    mars-lidar generate recipe.yaml -o set.zarr --scheduler tcp://10.0.0.1:8786
+
+    Notes
+    -----
+    Recipes: docs/generate.md. Clusters: docs/scale.md.
     """
     from mars_lidar import dataset
 
@@ -290,13 +294,6 @@ def _size(option: str, text: str | None) -> Any:
     return numbers[0] if len(numbers) == 1 else numbers
 
 
-EXPORT_EXAMPLES = examples(
-    "mars-lidar generate room --size 64 --scene-seeds 20 -o rooms.zarr",
-    "mars-lidar export rooms.zarr --layout lindell --fill -o lindell",
-    notes="docs/formats.md describes each file.",
-)
-
-
 def export(
     dataset: Path,
     /,
@@ -322,6 +319,15 @@ def export(
         Whose loader reads it: lindell, deepsensorfusion, sun, gutierrez or webdataset.
     fill
         Pixels without a return take depth and rates of the nearest with one.
+
+    Examples
+    --------
+    mars-lidar generate room --size 64 --scene-seeds 20 -o rooms.zarr
+    mars-lidar export rooms.zarr --layout lindell --fill -o lindell
+
+    Notes
+    -----
+    docs/formats.md describes each file.
     """
     from mars_lidar.dataset.network_files import export as exported
 
@@ -432,6 +438,6 @@ def _bytes(number: float) -> str:
     return f"{number:.3g} {unit}"
 
 
-generate_command = command(generate, GENERATE_EXAMPLES)
+generate_command = command(generate)
 verify_command = command(verify)
-export_command = command(export, EXPORT_EXAMPLES)
+export_command = command(export)

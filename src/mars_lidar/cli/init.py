@@ -14,58 +14,13 @@ from mars_lidar.instrument.effects import FIELDS
 from mars_lidar.instrument.presets import INSTRUMENTS, PRESETS, sourced
 
 _FILE = Path("system.yaml")
-# The values are those of `system_options.DEFAULT_SYSTEM`; a test reads the file back and compares.
-TEMPLATE = """\
-# A system for mars-lidar: laser, detector and histogram.
-# Use it:  mars-lidar simulate --scene room --system {name} -o room.zarr
-# In Python:  system = mars_lidar.System.load("{name}")
-
-# Laser period in ns: 1000 / repetition rate in MHz; this is 7.5 MHz. Depth is unambiguous up to
-# c * period / 2, here 20 m: what lies beyond looks nearer.
-period_ns: 133.33333333333334
-
-# Laser periods per exposure (one histogram); 1000 last 133 microseconds.
-cycles: 1000
-
-# Histogram bins over one period; here 130 ps each, 2 cm of depth.
-bins: 1024
-
-# Shape of the returned pulse, detector response (jitter) included.
-pulse:
-  kind: gaussian
-  sigma_ns: 0.5  # standard deviation; or  fwhm_ns: 1.1774 (FWHM = 2.355 sigma)
-# A measured impulse response instead; its samples must span no more than a period:
-# pulse:
-#   kind: sampled
-#   values: [0, 2, 30, 100, 61, 24, 10, 4, 1, 0]
-#   bin_ns: 0.05
-#   origin: peak  # what the delay of a return refers to: peak, centroid or first (start of sample 0)
-
-detector:
-  dead_time_ns: 75.0  # blind after each registration, across periods; 0, a fraction of a period, or many
-  mode: nonparalyzable  # free running: photons that arrive while blind have no effect
-# Other modes: paralyzable (every photon restarts the dead time), synchronous (armed at the start of each period,
-# first photon only), and gated (photons outside of the gate do not exist):
-# detector:
-#   dead_time_ns: 75.0
-#   mode: gated
-#   gate_start_ns: 30.0  # opens here in each period
-#   gate_width_ns: 20.0  # for this long; may reach round the end of the period
-#   gate_step_ns: 0.0    # moves by this ...
-#   gate_cycles: 1       # ... every so many periods (more than 1 only with a step)
-# A published detector:  preset: thorlabs-spcm20a  (others: docs/detectors.md) with other fields to change
-# Effects, off unless given, in the order in which they act (docs/detectors.md); further lines of detector:
-{effects}
-
-# State of the pixel at the start of an exposure: armed (ready), or stationary (warmed up).
-start: armed
-"""
 
 
 def commented(file: Path) -> str:
-    """The text of the file."""
+    """The text of the file, with the values of `DEFAULT_SYSTEM`."""
     effects = [f"#   {line}" for effect in FIELDS.values() for line in effect.example.splitlines()]
-    return TEMPLATE.format(name=file, effects="\n".join(effects))
+    text = Path(__file__).with_name("template.yaml").read_text(encoding="utf-8")
+    return text.format(name=file, effects="\n".join(effects))
 
 
 def of_instrument(name: str) -> str:

@@ -82,6 +82,12 @@ PANELS = {  # headings of the help of a command, in their order
 _ENTRY = re.compile(r"(\w+)(?: : (.+))?\n((?: {4}.+\n)+)")
 
 
+def _sections(target: Any) -> dict[str, str]:
+    """The sections of a docstring by their titles; the words before them have the title ""."""
+    first, *others = re.split(r"\n\n(.+)\n-+\n", f"{inspect.cleandoc(target.__doc__ or '')}\n")
+    return {"": first, **dict(zip(others[::2], others[1::2], strict=True))}
+
+
 def documented(target: Any) -> Any:
     """Give the options of a class or function the words of its docstring.
 
@@ -95,8 +101,7 @@ def documented(target: Any) -> Any:
         if name in own and effect.help is not None:
             group = PANELS["Effects of the detector (off by default)"]
             entries[name] = {"help": effect.help, "show_default": effect.default or False, "group": group}
-    sections = re.split(r"\n\n(.+)\n-+\n", f"{inspect.cleandoc(target.__doc__)}\n")
-    for title, body in zip(sections[1::2], sections[2::2], strict=True):
+    for title, body in _sections(target).items():
         for name, form, words in _ENTRY.findall(f"{body}\n"):
             text = " ".join(words.split()).replace("$presets", ", ".join(PRESETS))
             help, _, default = text.partition(" [default: ")
@@ -133,21 +138,27 @@ def describe(command: App) -> None:
             if not name.startswith("-"):
                 describe(command[name])
     else:
-        text = re.split(r"\n\n.+\n-+\n", inspect.cleandoc(command.default_command.__doc__ or ""))[0]
-        paragraphs = text.split("\n\n")
+        paragraphs = _sections(command.default_command)[""].split("\n\n")
         command.help = "\n\n".join(" ".join(paragraph.split()) for paragraph in paragraphs)
 
 
-def command(function: Callable[..., int | None], epilogue: str = "") -> App:
-    """The command that a function is."""
-    return App(name=function.__name__, default_command=documented(function), help_epilogue=epilogue, **COMMAND_LINE)
+def command(function: Callable[..., int | None], name: str | None = None, **words: str) -> App:
+    """The command that a function is, called like it or `name`; `words` replace $KEY in the notes of its docstring."""
+    end = _examples(_sections(function))
+    for key, value in words.items():
+        end = end.replace(f"${key}", value)
+    called = name or function.__name__
+    return App(name=called, default_command=documented(function), help_epilogue=end, **COMMAND_LINE)
 
 
-def examples(*lines: str, notes: str = "") -> str:
+def _examples(sections: dict[str, str]) -> str:
     """The end of a command's help; long commands are continued, so that they can be copied from a narrow screen."""
+    if "Examples" not in sections:
+        return ""
     wrap = partial(textwrap.wrap, width=74, break_long_words=False, break_on_hyphens=False)
-    together = (re.sub(" (?!-)", "\xa0", line) for line in lines)  # an option and its value
+    together = (re.sub(" (?!-)", "\xa0", line) for line in sections["Examples"].split("\n") if line)  # option and value
     continued = (" \\\n      ".join(wrap(line)).replace("\xa0", " ") for line in together)
+    notes = " ".join(sections.get("Notes", "").split())
     return "\n".join(("Examples:", *(f"  {line}" for line in continued), *(("", notes) if notes else ())))
 
 

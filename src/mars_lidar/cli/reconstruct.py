@@ -16,7 +16,7 @@ from mars_lidar._base.files import check_target
 from mars_lidar._base.progress import span
 from mars_lidar.cli.console import grid, progress_bar, refuse_existing, save_picture, say, screen, table
 from mars_lidar.cli.foreign import ForeignOptions
-from mars_lidar.cli.options import Integer, Number, OutPath, Switch, Text, command, examples
+from mars_lidar.cli.options import Integer, Number, OutPath, Switch, Text, command
 from mars_lidar.reconstruction import METHODS, Flags, MaximumLikelihood, Method, Reconstruction
 from mars_lidar.reconstruction.keep import KEEP, common_delay, has_later_light, keep_return
 from mars_lidar.reconstruction.reconstruction import ATTENUATIONS
@@ -26,18 +26,6 @@ if TYPE_CHECKING:
     from mars_lidar.io import Cube
     from mars_lidar.reconstruction import Returns
     from mars_lidar.reconstruction.stored import Timed
-
-
-RECONSTRUCT_EXAMPLES = examples(
-    "mars-lidar reconstruct room.zarr -o maps.zarr",
-    "mars-lidar reconstruct room.zarr --method all -o maps.h5",
-    "mars-lidar reconstruct dim.zarr --method image -o maps.zarr",
-    "mars-lidar reconstruct room.zarr -o maps.npz --cloud room.ply --focal-px 110",
-    "mars-lidar reconstruct face.npy --bin-ps 80 --cycles 20000 --dead-time-ns 50 --pulse-fwhm-ns 0.3 -o face.zarr",
-    "mars-lidar reconstruct glass.zarr --returns 3 -o maps.zarr --cloud glass.ply --focal-px 110",
-    "mars-lidar reconstruct room.zarr --method maximum_likelihood,peak --no-picture -o maps.npz",
-    notes=f"Methods: {', '.join(METHODS)}. docs/reconstruction.md says what each assumes, and for which detectors.",
-)
 
 
 def reconstruct(
@@ -102,6 +90,20 @@ def reconstruct(
         Draw the maps beside OUT, as .png. [default: yes]
     overwrite
         Replace existing files.
+
+    Examples
+    --------
+    mars-lidar reconstruct room.zarr -o maps.zarr
+    mars-lidar reconstruct room.zarr --method all -o maps.h5
+    mars-lidar reconstruct dim.zarr --method image -o maps.zarr
+    mars-lidar reconstruct room.zarr -o maps.npz --cloud room.ply --focal-px 110
+    mars-lidar reconstruct face.npy --bin-ps 80 --cycles 20000 --dead-time-ns 50 --pulse-fwhm-ns 0.3 -o face.zarr
+    mars-lidar reconstruct glass.zarr --returns 3 -o maps.zarr --cloud glass.ply --focal-px 110
+    mars-lidar reconstruct room.zarr --method maximum_likelihood,peak --no-picture -o maps.npz
+
+    Notes
+    -----
+    Methods: $methods. docs/reconstruction.md says what each assumes, and for which detectors.
     """
     began = time.perf_counter()
     from mars_lidar.io.maps import check_maps_output, save_maps
@@ -304,4 +306,4 @@ def _save_cloud(path: Path, results: dict[str, Reconstruction], focal_px: float,
     return save_cloud(path, depth, focal_px, intensity=share, error_m=error, overwrite=overwrite)
 
 
-reconstruct_command = command(reconstruct, RECONSTRUCT_EXAMPLES)
+reconstruct_command = command(reconstruct, methods=", ".join(METHODS))

@@ -23,7 +23,6 @@ from mars_lidar.cli.options import (
     Switch,
     Text,
     command,
-    examples,
     read_scene,
 )
 from mars_lidar.cli.system_options import Effects, SystemOptions
@@ -36,22 +35,6 @@ from mars_lidar.table import Table
 if TYPE_CHECKING:
     from mars_lidar.io import Written
     from mars_lidar.io.capture import Capture
-
-SIMULATE_EXAMPLES = examples(
-    "mars-lidar simulate --scene room -o room.zarr",
-    "mars-lidar simulate --scene room --signal 0.1 --sbr 0.2 --dead-time-ns 30 --cycles 5000 -o dim.zarr",
-    "mars-lidar simulate --depth depth.png --image colour.png --realizations 10 --seed 7 -o set.zarr",
-    "mars-lidar simulate --depth art/ --system spad.yaml --attenuation inverse_square -o art.h5",
-    "mars-lidar simulate --scene room --mode gated --gate-start-ns 30 --gate-width-ns 20 -o gated.zarr",
-    "mars-lidar simulate --scene room --engine mars --table room.h5 --cycles 100000 -o long.zarr",
-    "mars-lidar simulate --transient render.hdf5 --signal 0.5 --sbr 5 -o transient.zarr",
-    "mars-lidar simulate --like render.hdf5 --signal 0.5 --sbr 5 -o capture.hdf5",
-    "mars-lidar simulate --scene room --pulse-file irf.npy --pulse-bin-ns 0.008 -o measured.npz",
-    "mars-lidar simulate --scene room --jitter-fwhm-ns 0.1 --electronics-dead-time-ns 100 -o real.zarr",
-    "mars-lidar simulate --scene room --detector excelitas-spcm-aqrh -o module.zarr",
-    notes="S and B are expected detectable photons per laser period; with --detection-efficiency, photons on the "
-    "pixel. Dead time distorts histograms where S + B is not small.",
-)
 
 
 def simulate(
@@ -121,6 +104,25 @@ def simulate(
     like
         Simulate the light of a capture (tal, mitransient, Zaragoza's HDF5) in its bins; with --out .hdf5 or .h5 the
         result is a capture of the same layout.
+
+    Examples
+    --------
+    mars-lidar simulate --scene room -o room.zarr
+    mars-lidar simulate --scene room --signal 0.1 --sbr 0.2 --dead-time-ns 30 --cycles 5000 -o dim.zarr
+    mars-lidar simulate --depth depth.png --image colour.png --realizations 10 --seed 7 -o set.zarr
+    mars-lidar simulate --depth art/ --system spad.yaml --attenuation inverse_square -o art.h5
+    mars-lidar simulate --scene room --mode gated --gate-start-ns 30 --gate-width-ns 20 -o gated.zarr
+    mars-lidar simulate --scene room --engine mars --table room.h5 --cycles 100000 -o long.zarr
+    mars-lidar simulate --transient render.hdf5 --signal 0.5 --sbr 5 -o transient.zarr
+    mars-lidar simulate --like render.hdf5 --signal 0.5 --sbr 5 -o capture.hdf5
+    mars-lidar simulate --scene room --pulse-file irf.npy --pulse-bin-ns 0.008 -o measured.npz
+    mars-lidar simulate --scene room --jitter-fwhm-ns 0.1 --electronics-dead-time-ns 100 -o real.zarr
+    mars-lidar simulate --scene room --detector excelitas-spcm-aqrh -o module.zarr
+
+    Notes
+    -----
+    S and B are expected detectable photons per laser period; with --detection-efficiency, photons on the pixel. Dead
+    time distorts histograms where S + B is not small.
     """
     from mars_lidar.io import load, save_capture, simulate_to
     from mars_lidar.io.capture import CAPTURE_SUFFIXES
@@ -287,4 +289,4 @@ def each_ns(number: float) -> str:
     return f"{number:.3g} ns" if number < 999.5 else f"{number / 1e3:.3g} µs"
 
 
-simulate_command = command(simulate, SIMULATE_EXAMPLES)
+simulate_command = command(simulate)

@@ -12,7 +12,7 @@ from mars_lidar._version import other_version
 from mars_lidar.cli.console import Exit, check_picture, progress_bar, save_picture, say, table
 from mars_lidar.cli.dataset import dataset_rows
 from mars_lidar.cli.foreign import ForeignOptions, foreign_rows, is_foreign
-from mars_lidar.cli.options import Integer, OutPath, Switch, Text, command, examples, two
+from mars_lidar.cli.options import Integer, OutPath, Switch, Text, command, two
 from mars_lidar.instrument.detector import Detector
 from mars_lidar.light.flux import Flux
 
@@ -206,13 +206,6 @@ def _short(value: Any) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-EXPLORE_EXAMPLES = examples(
-    "mars-lidar explore",
-    "mars-lidar explore room.zarr",
-    "mars-lidar explore room.zarr --no-browser --port 8000",
-)
-
-
 def explore(
     file: Path | None = None,
     /,
@@ -241,6 +234,12 @@ def explore(
         Port on the loopback address. [default: 0, one that is free]
     browser
         Open the page in the browser of this machine. [default: yes]
+
+    Examples
+    --------
+    mars-lidar explore
+    mars-lidar explore room.zarr
+    mars-lidar explore room.zarr --no-browser --port 8000
     """
     from mars_lidar.explore import CubeServer
 
@@ -261,4 +260,4 @@ def explore(
 
 info_command = command(info)
 view_command = command(view)
-explore_command = command(explore, EXPLORE_EXAMPLES)
+explore_command = command(explore)

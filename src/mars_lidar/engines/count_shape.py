@@ -12,7 +12,8 @@ from mars_lidar._base.types import FloatArray, IndexArray
 from mars_lidar.engines.counts import CountLaws
 from mars_lidar.engines.engine import Engine, Task
 from mars_lidar.engines.synthesis import Run
-from mars_lidar.engines.table_reader import PIXELS, Entries, TableReader
+from mars_lidar.engines.table_reader import Entries, TableReader
+from mars_lidar.engines.tolerances import TOLERANCES
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.statistics.exposure import normalised
@@ -49,15 +50,16 @@ class CountTimesShape(Engine):
             self._evaluate(run, pixels)
             return
         self.reader.warn_of_start_up(task)
-        left = [self._look_up(run, self.reader, pixels[k : k + PIXELS]) for k in range(0, pixels.size, PIXELS)]
-        self._evaluate(run, np.concatenate(left))
+        step = TOLERANCES.looked_up
+        outside = [self._look_up(run, self.reader, pixels[k : k + step]) for k in range(0, pixels.size, step)]
+        self._evaluate(run, np.concatenate(outside))
 
     def _look_up(self, run: Run, reader: TableReader, pixels: IndexArray) -> IndexArray:
         """Draws the pixels on the grid; returns the others."""
         with run.stage("lookup_s"):
-            entries, left = reader.read(run.task, pixels)
+            entries, outside = reader.read(run.task, pixels)
         run.draw(entries.batch(self._laws_of(run, reader, entries)))
-        return left
+        return outside
 
     @abstractmethod
     def _laws_of(self, run: Run, reader: TableReader, entries: Entries) -> CountLaws:

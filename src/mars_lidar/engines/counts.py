@@ -133,7 +133,7 @@ class Tabulated(CountLaws):
 
 
 @dataclass(frozen=True, eq=False)
-class Mended(CountLaws):
+class PartlyReplaced(CountLaws):
     """Laws of which those of the pixels `at` (ascending) are replaced by `others`, one for each of them."""
 
     laws: CountLaws
@@ -145,7 +145,9 @@ class Mended(CountLaws):
         start, stop = int(pixels.start), int(pixels.stop)
         low, high = (int(k) for k in np.searchsorted(self.at, (start, stop)))
         laws = self.laws.part(pixels)
-        return Mended(laws, self.at[low:high] - start, self.others.part(slice(low, high))) if high > low else laws
+        return (
+            PartlyReplaced(laws, self.at[low:high] - start, self.others.part(slice(low, high))) if high > low else laws
+        )
 
     def fill(self, streams: Streams, out: IndexArray) -> None:
         """Draw counts into `out` (realizations, pixels)."""

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from mars_lidar._base.cached import cached_property
 from mars_lidar._base.resources import check_memory
 from mars_lidar._base.types import Progress
+from mars_lidar.engines.tolerances import TOLERANCES
 from mars_lidar.instrument.detector import MODES, Detector, Mode
 from mars_lidar.instrument.effects import (
     AVALANCHE_EFFECTS,
@@ -112,10 +113,10 @@ class Task:
     def _avalanches(self) -> dict[str, Any]:
         """What avalanches leave behind, as the native job takes it; only what is on."""
         detector = self.system.detector
-        told = native_fields({name: getattr(detector, name) for name in AVALANCHE_EFFECTS}, self.system.period_ns)
+        fields = native_fields({name: getattr(detector, name) for name in AVALANCHE_EFFECTS}, self.system.period_ns)
         if detector.crosstalk is not None:
-            told["height"], told["width"] = self.flux.shape
-        return told
+            fields["height"], fields["width"] = self.flux.shape
+        return fields
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,8 +202,8 @@ class Engine(ABC):
     options: ClassVar[tuple[str, ...]] = ()  # arguments of `simulate` that the engine's constructor takes
 
     def __repr__(self) -> str:
-        told = ", ".join(f"{name}={value!r}" for name, value in self.settings.items())
-        return f"{type(self).__name__}({told})"
+        settings = ", ".join(f"{name}={value!r}" for name, value in self.settings.items())
+        return f"{type(self).__name__}({settings})"
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -303,19 +304,15 @@ def given(options: EngineOptions) -> dict[str, Any]:
     return {name: value for name, value in options.items() if value is not None}
 
 
-_TICKS = 1000
-_BUFFER_BYTES = 64 << 20  # of histograms drawn aside before they are put in place
-
-
 def stage(progress: Progress | None, start: float, end: float) -> Progress | None:
     """A progress callback for one of several calls: from `start` to `end` of the whole."""
     if progress is None:
         return None
 
-    def told(done: int, total: int) -> object:
-        return progress(round(_TICKS * (start + (end - start) * done / max(total, 1))), _TICKS)
+    def stage_progress(done: int, total: int) -> object:
+        return progress(round(TOLERANCES.ticks * (start + (end - start) * done / max(total, 1))), TOLERANCES.ticks)
 
-    return told
+    return stage_progress
 
 
 def part_of(
@@ -343,8 +340,8 @@ def draw_pixels(engine: Engine, task: Task, out: NDArray[Any], pixels: NDArray[n
         return
     cube = out.reshape(task.realizations, every, task.system.bins)
     row = task.system.bins * out.itemsize
-    wide = max(1, min(pixels.size, _BUFFER_BYTES // row))
-    deep = max(1, min(task.realizations, _BUFFER_BYTES // (row * wide)))
+    wide = max(1, min(pixels.size, TOLERANCES.buffer_bytes // row))
+    deep = max(1, min(task.realizations, TOLERANCES.buffer_bytes // (row * wide)))
     steps = [(p, r) for p in range(0, pixels.size, wide) for r in range(0, task.realizations, deep)]
     for k, (first_pixel, first) in enumerate(steps):
         some = pixels[first_pixel : first_pixel + wide]
@@ -354,14 +351,6 @@ def draw_pixels(engine: Engine, task: Task, out: NDArray[Any], pixels: NDArray[n
         rows = np.empty((part.items, task.system.bins), out.dtype)
         engine.histogram(part, rows)
         cube[first : first + number, some] = rows.reshape(number, some.size, task.system.bins)
-
-
-MOST_TWILIGHT_PHOTONS = 5.0
-"""Photons within `twilight_ns` above which the phase of ticks is remembered for longer than the engines warm up.
-
-A tick, a dead time that ends with a twilight pulse, is followed by another with the probability 1 - e^-photons, so that
-phases are remembered for some e^photons ticks: 150 of them at 5, against 256 turns before the exposure (`sequential`).
-"""
 
 
 def check_start(flux: Flux, system: System) -> None:
@@ -378,9 +367,9 @@ def check_start(flux: Flux, system: System) -> None:
     pulses = math.ceil(detector.twilight_ns / period) if apart < detector.twilight_ns else 0
     photons = flux.background * (detector.twilight_ns / period) + (flux.total - flux.background) * pulses
     worst = float(np.max(photons, initial=0.0))
-    if worst > MOST_TWILIGHT_PHOTONS:
+    if worst > TOLERANCES.twilight_photons:
         raise ValueError(
-            f"start must be 'armed' where more than {MOST_TWILIGHT_PHOTONS:g} photons may arrive within "
+            f"start must be 'armed' where more than {TOLERANCES.twilight_photons:g} photons may arrive within "
             f"detector.twilight_ns of the end of one dead time after another, got 'stationary' with {worst:.3g}: such "
             "a pixel ticks once in every dead time and does not settle; simulate a longer armed exposure and leave out "
             "its beginning"

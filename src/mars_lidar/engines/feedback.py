@@ -18,8 +18,9 @@ from mars_lidar._base.native import _core
 from mars_lidar._base.types import IndexArray
 from mars_lidar.engines.engine import Engine, Task, draw_pixels, stage
 from mars_lidar.engines.exact import ExactEngine
-from mars_lidar.engines.feedback_grid import MOST_SWEEPS, Grids, KindArray
+from mars_lidar.engines.feedback_grid import Grids, KindArray
 from mars_lidar.engines.poisson import PoissonEngine
+from mars_lidar.engines.tolerances import TOLERANCES
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 
@@ -110,16 +111,6 @@ class FeedbackEngine(Engine):
 
 StatusArray = NDArray[np.uint8]
 
-FEWEST_PERIODS = 100  # per dead time, rounded up to periods: shorter exposures are drawn exactly
-MOST_LAP_CELLS = 2**18  # of all laps: 150 MB for each thread
-MOST_TRIES = 3  # more, of an exposure whose sweeps did not end: other numbers of the same law
-TRY_FROM = 128.0
-"""Registrations for each cell above which an unsettled exposure is tried again: below, the exact engine is quicker.
-
-A try takes a batch of 32 lanes, most of them idle.
-"""
-_OTHER_NUMBERS = 0x278DDE6E5FD29E45  # of the seed, for each try
-
 
 class Reason(IntEnum):
     """What became of an exposure: `FeedbackStatus` of native/feedback/kernel.h, and reasons known before."""
@@ -132,7 +123,7 @@ class Reason(IntEnum):
     UNLIKELY = 6
     SHORT = 16
     CELLS = 18
-    DEAR = 19
+    SLOWER = 19
     LAPS = 64  # and more: of a pixel that needs that many laps less 64
 
     @property
@@ -149,7 +140,7 @@ _WORDS = {
     Reason.UNLIKELY: "unlikely count",
     Reason.SHORT: "short exposure",
     Reason.CELLS: "too many cells",
-    Reason.DEAR: "quicker exactly",
+    Reason.SLOWER: "quicker exactly",
 }
 
 
@@ -193,8 +184,8 @@ class Rest:
         """What is to be drawn as first realization of the call, number of them, and pixels."""
         if self.pixels.size:
             yield 0, realizations, self.pixels
-        for one in np.unique(self.realization):
-            yield int(one), 1, np.sort(self.pixel[self.realization == one])
+        for number in np.unique(self.realization):
+            yield int(number), 1, np.sort(self.pixel[self.realization == number])
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,18 +202,17 @@ class Plan:
     def of(cls, task: Task, pixels: IndexArray) -> Plan:
         """For some pixels (n,) of a task."""
         reason = np.zeros(pixels.size, np.uint8)
-        if task.system.cycles < FEWEST_PERIODS * math.ceil(task.system.dead_time_periods):
+        if task.system.cycles < TOLERANCES.fewest_dead_times * math.ceil(task.system.dead_time_periods):
             reason[:] = Reason.SHORT
             return cls(Grids.coarsest(task, pixels.size), reason)
         grids = Grids.checked(task, pixels)
-        reason[grids.sweeps > MOST_SWEEPS] = Reason.SLOW
+        reason[grids.sweeps > TOLERANCES.mean_sweeps] = Reason.SLOW
         reason[grids.of < 0] = Reason.CELLS
         return cls(grids, reason)
 
     def part(self, some: NDArray[np.bool_]) -> Plan:
         """For those of its pixels (n,) that are true."""
-        grids = Grids(self.grids.kinds, self.grids.of[some], self.grids.sweeps[some])
-        return Plan(grids, self.reason[some])
+        return Plan(self.grids.part(some), self.reason[some])
 
 
 def sweep_pixels(
@@ -256,23 +246,23 @@ def sweep_pixels(
     status[:, able] = draw(task, 0, able, np.ones_like(able))
     slow = able[status[0, able] >= Reason.LAPS]
     laps = status[0, slow].astype(np.int64) - Reason.LAPS
-    large = cells[slow] * laps > MOST_LAP_CELLS
-    dear = np.zeros_like(large) if worth is None else cells[slow] * laps > worth[slow]
-    status[:, slow[dear]] = Reason.DEAR
+    large = cells[slow] * laps > TOLERANCES.lap_cells
+    slower = np.zeros_like(large) if worth is None else cells[slow] * laps > worth[slow]
+    status[:, slow[slower]] = Reason.SLOWER
     status[:, slow[large]] = Reason.CELLS
-    far = ~large & ~dear
+    far = ~large & ~slower
     status[:, slow[far]] = draw(replace(task, progress=None), 0, slow[far], laps[far])
     of_laps = np.ones(pixels.size, np.int64)
     of_laps[slow] = laps
-    long = expected_registrations(task.flux, task.system).reshape(-1)[pixels] > TRY_FROM * cells * of_laps
+    long = expected_registrations(task.flux, task.system).reshape(-1)[pixels] > TOLERANCES.try_from * cells * of_laps
     unsettled = (status == Reason.UNSETTLED) & long
     tried = int(unsettled.sum())
-    for attempt in range(1, MOST_TRIES + 1):
-        for one in np.flatnonzero(unsettled.any(1)):
-            first, seed = task.first_realization + int(one), task.seed ^ (attempt * _OTHER_NUMBERS % 2**64)
+    for attempt in range(1, TOLERANCES.tries + 1):
+        for row in np.flatnonzero(unsettled.any(1)):
+            first, seed = task.first_realization + int(row), task.seed ^ (attempt * TOLERANCES.other_numbers % 2**64)
             part = replace(task, realizations=1, first_realization=first, seed=seed, progress=None)
-            again = np.flatnonzero(unsettled[one])
-            status[one, again] = draw(part, int(one), again, of_laps[again])[0]
+            again = np.flatnonzero(unsettled[row])
+            status[row, again] = draw(part, int(row), again, of_laps[again])[0]
         unsettled &= status == Reason.UNSETTLED
     if tried:
         task.report["exposures drawn again by feedback"] = float(tried - unsettled.sum())

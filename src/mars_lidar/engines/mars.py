@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from mars_lidar._base import checks
 from mars_lidar._base.types import FloatArray, IndexArray
 from mars_lidar.engines.count_shape import CountTimesShape, as_shapes
-from mars_lidar.engines.counts import CountLaws, Matched, Mended, Poisson, RoundedGaussian, Tabulated
+from mars_lidar.engines.counts import CountLaws, Matched, PartlyReplaced, Poisson, RoundedGaussian, Tabulated
 from mars_lidar.engines.engine import Count, Interpolation, Outside
 from mars_lidar.engines.pixels import Group, groups
 from mars_lidar.engines.synthesis import Batch, Run
@@ -135,7 +135,7 @@ class MarsEngine(CountTimesShape):
         if not at.size:
             return laws
         with run.stage("evaluation_s"):
-            return Mended(laws, at, exact_laws(run, reader, entries, at))
+            return PartlyReplaced(laws, at, exact_laws(run, reader, entries, at))
 
     def _laws(self, system: System, cumulants: FloatArray) -> CountLaws:
         """Laws from cumulants (pixels, 4)."""

@@ -12,14 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.types import FloatArray, IndexArray
+from mars_lidar.engines.tolerances import TOLERANCES
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.pulse import Pulse
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.statistics.cells import Cells, waveform_parts
+from mars_lidar.statistics.timing import is_timed
+from mars_lidar.statistics.tolerances import TOL
 
-_BATCH_BYTES = 64 * 2**20  # work area of the statistics of distinct pixels
-_MOST_CELLS = 4096
 _EFFECTS = LIGHT_EFFECTS + TIMING_EFFECTS
 
 
@@ -51,7 +52,7 @@ def groups(flux: Flux, system: System, pixels: IndexArray, *, delays: bool = Tru
     _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
     order = np.argsort(inverse, kind="stable")
     starts = np.searchsorted(inverse[order], np.arange(first.size + 1))
-    step = int(np.clip(_BATCH_BYTES // (8 * _doubles(flux, system)), 1, _MOST_CELLS))
+    step = int(np.clip(TOLERANCES.statistics_bytes // (8 * _doubles(flux, system)), 1, TOLERANCES.statistics_pixels))
     for low in range(0, first.size, step):
         high = min(low + step, first.size)
         members = order[starts[low] : starts[high]]
@@ -67,7 +68,8 @@ def _doubles(flux: Flux, system: System) -> int:
     elif single_return(flux) is None:
         parts = 4 * waveform_parts(system)
     law = 40.0 * float(np.sqrt(system.cycles * flux.total.max()))  # a count is no wider than without dead time
-    return 12 * system.bins + parts + int(law)
+    bins = TOL.most_parts if is_timed(system) else system.bins
+    return 12 * bins + parts + int(law)
 
 
 def _keys(flux: Flux, system: System, pixels: IndexArray, delays: bool) -> NDArray[np.void]:
@@ -92,13 +94,6 @@ def _cells(flux: Flux, system: System, pixels: IndexArray, delays: bool) -> Cell
     if delays or single_return(flux) is None:
         return Cells.of_flux(some, system, effects=_EFFECTS)
     return Cells.of(some.signal, some.background, system, effects=_EFFECTS)
-
-
-_OUTSIDE = 1e-6  # energy of the pulse before the frame, and behind it
-_STEPS_PER_WIDTH = 64  # energies per standard deviation of the pulse, linear between
-_CELLS_PER_WIDTH = 16  # and cells where registrations of the pulse re-arm inside the pulse
-_NARROW_BINS = 4.0  # standard deviations in bins from which a bin needs no cells
-_MOST_ENERGIES = 2**22
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,19 +162,19 @@ def _frame(pulse: Pulse, period_ns: float, bins: int, dead_fraction: float) -> F
     low, high = pulse.support_ns()
     t = np.linspace(low, high, 4097)
     energy = pulse.cumulative(t)
-    early = t[max(0, int(np.searchsorted(energy, _OUTSIDE)) - 1)]
-    late = t[min(t.size - 1, int(np.searchsorted(energy, 1.0 - _OUTSIDE)))]
+    early = t[max(0, int(np.searchsorted(energy, TOLERANCES.pulse_outside)) - 1)]
+    late = t[min(t.size - 1, int(np.searchsorted(energy, 1.0 - TOLERANCES.pulse_outside)))]
     width = period_ns / bins
     first = math.floor((0.5 * period_ns + early) / width)
     size = min(bins, math.floor((0.5 * period_ns + late) / width) - first + 1)
     if size == bins:
         first = 0
     deviation = _deviation(pulse, period_ns) / width  # in bins
-    parts = _power_of_two(_STEPS_PER_WIDTH / deviation, 8, max(8, min(4096, _MOST_ENERGIES // size)))
+    parts = _power_of_two(TOLERANCES.energies_of_width / deviation, 8, max(8, min(4096, TOLERANCES.energies // size)))
     cells = 1
     near = min(dead_fraction, 1.0 - dead_fraction) * bins  # of the dead time to whole periods, bins
-    if deviation < _NARROW_BINS and near < size + 1:
-        cells = _power_of_two(_CELLS_PER_WIDTH / deviation, 1, min(64, parts))
+    if deviation < TOLERANCES.narrow_bins and near < size + 1:
+        cells = _power_of_two(TOLERANCES.cells_of_width / deviation, 1, min(64, parts))
         while cells > 1 and size * cells > 8192:  # a record full of narrow features
             cells //= 2
     place = (first + np.arange(size))[None, :] + np.arange(parts + 1)[:, None] / parts

@@ -84,19 +84,18 @@ def find_engine(engine: str | Engine, **options: Unpack[EngineOptions]) -> Engin
     """
     chosen = given(options)
     if isinstance(engine, Engine):
-        found = engine
         if chosen:
             name = next(iter(chosen))
             raise TypeError(f"{name} must be None where engine is an Engine, which has its own, got {chosen[name]!r}")
-        return found
+        return engine
     if engine == "neural":
         raise ValueError(
             "engine 'neural' is no longer in the package: from a checkout, give studies.neural.NeuralEngine(), "
             "which simulate takes as engine (docs/neural.md)"
         )
-    found = ENGINES[checks.choice("engine", engine, tuple(ENGINES))]
+    default = ENGINES[checks.choice("engine", engine, tuple(ENGINES))]
     for name in chosen:
-        if name not in found.options:
-            takes = ", ".join(found.options) if found.options else "none"
+        if name not in default.options:
+            takes = ", ".join(default.options) if default.options else "none"
             raise TypeError(f"{name} must be None for engine {engine!r} (its options: {takes}), got {chosen[name]!r}")
-    return type(found)(**chosen) if chosen else found
+    return type(default)(**chosen) if chosen else default

@@ -19,8 +19,7 @@ from mars_lidar._base.types import FloatArray, IndexArray, Progress
 from mars_lidar.engines.counts import CountLaws, Streams
 from mars_lidar.engines.engine import Task
 from mars_lidar.engines.pixels import Alignment
-
-_BATCH = 2**20  # exposures whose counts are held at a time: 8 MiB
+from mars_lidar.engines.tolerances import TOLERANCES
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,8 +95,8 @@ class Run:
     def draw(self, batch: Batch) -> None:
         """All realizations of the batch's pixels."""
         number = self.task.realizations
-        deep = min(number, _BATCH)
-        wide = max(1, _BATCH // deep)
+        deep = min(number, TOLERANCES.batch_exposures)
+        wide = max(1, TOLERANCES.batch_exposures // deep)
         for first in range(0, batch.pixels.size, wide):
             some = batch.part(slice(first, first + wide))
             for realization in range(0, number, deep):

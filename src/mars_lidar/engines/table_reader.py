@@ -21,6 +21,7 @@ from mars_lidar.engines.counts import CountLaws, Tabulated
 from mars_lidar.engines.engine import Task
 from mars_lidar.engines.pixels import Alignment, single_return
 from mars_lidar.engines.synthesis import Batch, Run
+from mars_lidar.engines.tolerances import TOLERANCES
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
@@ -30,12 +31,6 @@ from mars_lidar.statistics.count_pmf import Pmf, guessed_windows
 if TYPE_CHECKING:
     from mars_lidar.table import Table
 
-MISPLACED = (
-    6.0  # registrations of an exposure at most, by its start-up: docs/table.md, section 4, and what it was measured on
-)
-MISPLACED_SHARE = 0.01  # of the registrations, that a warning says
-_LOOKED_AT = 16  # pixels of a call
-PIXELS = 2**17  # looked up at a time: 14 MiB
 _INTERPOLATIONS = ("bilinear", "nearest")
 _OUTSIDE = ("error", "exact")
 
@@ -96,7 +91,7 @@ class TableReader:
 
     def _check_range(self, signal: FloatArray, background: FloatArray) -> None:
         """Every pixel lies on the grid, or has no return, of which nothing but its background has to be known."""
-        beyond, told = np.zeros(signal.size, dtype=bool), []
+        beyond, ranges = np.zeros(signal.size, dtype=bool), []
         for name, photons, axis in (
             ("signal", signal, self.table.signal),
             ("background", background, self.table.background),
@@ -106,12 +101,12 @@ class TableReader:
                 out &= photons > 0.0
             if out.any():
                 low, high = photons[out].min(), photons[out].max()
-                told.append(f"{name} {low:.4g} to {high:.4g} (the table: {axis[0]:g} to {axis[-1]:g})")
+                ranges.append(f"{name} {low:.4g} to {high:.4g} (the table: {axis[0]:g} to {axis[-1]:g})")
             beyond |= out
-        if told:
+        if ranges:
             raise ValueError(
                 f"table must reach every pixel, but {int(beyond.sum())} of {beyond.size} lie outside of it: "
-                f"{', '.join(told)} photons per period; build it over that range, or give outside='exact' "
+                f"{', '.join(ranges)} photons per period; build it over that range, or give outside='exact' "
                 "(--table-outside exact) to evaluate each of those by itself, which takes some ms"
             )
 
@@ -130,8 +125,8 @@ class TableReader:
         expected = system.cycles * total / (1.0 + total * system.dead_time_periods)
         within = (signal > 0.0) & (signal >= self.table.signal[0]) & (signal <= self.table.signal[-1])
         within &= (background >= self.table.background[0]) & (background <= self.table.background[-1])
-        some = np.flatnonzero(within & (expected * MISPLACED_SHARE < MISPLACED))
-        some = some[np.argsort(-total[some], kind="stable")][:_LOOKED_AT]
+        some = np.flatnonzero(within & (expected * TOLERANCES.misplaced_share < TOLERANCES.misplaced))
+        some = some[np.argsort(-total[some], kind="stable")][: TOLERANCES.start_up_pixels]
         if not some.size:
             return
         error = self.table.start_up_error(
@@ -144,7 +139,7 @@ class TableReader:
         )
         worst = int(np.argmax(error))
         task.report["start_up_error"] = float(error[worst])
-        if error[worst] > MISPLACED_SHARE:
+        if error[worst] > TOLERANCES.misplaced_share:
             at = some[worst]
             warnings.warn(
                 f"table places {error[worst]:.2g} of the registrations ({error[worst] * expected[at]:.2g} of "
@@ -197,11 +192,11 @@ _last_shapes: WeakKeyDictionary[Table, tuple[int, NDArray[np.float32], NDArray[n
 
 def _shapes(table: Table, cycles: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Shapes, and the sampler's guides to them."""
-    kept = _last_shapes.get(table)
-    if kept is None or kept[0] != cycles:
+    last = _last_shapes.get(table)
+    if last is None or last[0] != cycles:
         shapes = table.shapes(cycles)
-        kept = _last_shapes[table] = cycles, shapes, np.zeros((len(shapes), 64), np.float32)
-    return kept[1:]
+        last = _last_shapes[table] = cycles, shapes, np.zeros((len(shapes), 64), np.float32)
+    return last[1:]
 
 
 def table_record(table: Table) -> dict[str, Any]:
@@ -236,22 +231,22 @@ def exact_laws(run: Run, reader: TableReader, entries: Entries, at: IndexArray) 
     """Laws of the pixels `at`, each distinct one evaluated once; those that the table keeps are taken from it."""
     keys = _keys(run, reader, entries, at)
     _, first, law = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-    windows = _kept(run, reader, entries, at[first], keys[first])
-    left = np.array([k for k, window in enumerate(windows) if window is None], np.int64)
-    if left.size:
-        signal, background, phase = keys[first[left]].T
-        system, chosen = run.task.system, at[first[left]]
+    windows = _table_laws(run, reader, entries, at[first], keys[first])
+    missing = np.array([k for k, window in enumerate(windows) if window is None], np.int64)
+    if missing.size:
+        signal, background, phase = keys[first[missing]].T
+        system, chosen = run.task.system, at[first[missing]]
         cells = Cells.of(
             signal, background, system, delay_ns=phase * system.period_ns, effects=LIGHT_EFFECTS + TIMING_EFFECTS
         )
         own = reader.table.entries.bins[entries.rows[chosen]]
         bins = np.where(entries.weights[chosen] > 0.0, own, 0).max(-1)  # the finest grid that a corner needed
         tell = run.waiting
-        waiting = None if tell is None else lambda done: tell(done, left.size)
-        found = guessed_windows(cells, entries.cumulants[chosen], bins, run.task.threads, waiting)
-        for k, window in zip(left, found, strict=True):
+        waiting = None if tell is None else lambda done: tell(done, missing.size)
+        evaluated = guessed_windows(cells, entries.cumulants[chosen], bins, run.task.threads, waiting)
+        for k, window in zip(missing, evaluated, strict=True):
             windows[k] = window
-    run.count("laws_evaluated", left.size)
+    run.count("laws_evaluated", missing.size)
     return Tabulated.of([window for window in windows if window is not None], law.reshape(-1).astype(np.int64))
 
 
@@ -266,7 +261,9 @@ def _keys(run: Run, reader: TableReader, entries: Entries, at: IndexArray) -> Fl
     return np.stack([signal, background, np.where(signal > 0.0, phase - np.floor(phase), 0.5)], axis=-1)
 
 
-def _kept(run: Run, reader: TableReader, entries: Entries, pixels: IndexArray, keys: FloatArray) -> list[Pmf | None]:
+def _table_laws(
+    run: Run, reader: TableReader, entries: Entries, pixels: IndexArray, keys: FloatArray
+) -> list[Pmf | None]:
     """Laws that the table keeps: of its entries, for its own number of cycles, at its delay."""
     table = reader.table
     if run.task.system.cycles != table.entries.cycles:
@@ -275,14 +272,10 @@ def _kept(run: Run, reader: TableReader, entries: Entries, pixels: IndexArray, k
     rows = entries.rows[pixels, heaviest]
     signal, background = table.signal[rows // table.background.size], table.background[rows % table.background.size]
     same = (keys[:, 0] == signal) & (keys[:, 1] == background) & (keys[:, 2] == 0.5)
-    return [table.laws.window(int(row)) if kept else None for row, kept in zip(rows, same, strict=True)]
+    return [table.laws.window(int(row)) if its_own else None for row, its_own in zip(rows, same, strict=True)]
 
-
-FEWEST = 400
-"""Distinct pixels from which on a table is built: about as many as it has entries, each of which costs as much."""
 
 _PER_DECADE = {"signal": 58, "background": 16}  # 4 % apart: the mean count is then within some 0.002 deviations
-_NARROW = 1e-3  # half the width of an axis around light that is the same everywhere
 
 
 def image_table(
@@ -291,8 +284,8 @@ def image_table(
     """A table that reaches the pixels of `flux` for `mars` and `renewal`, from the cache or built and put there.
 
     None where there is none to be had or nothing to be gained: waveforms, several returns in a pixel, a detector
-    without one, fewer than `FEWEST` distinct pixels. What lies beyond it (S = 0 or B = 0) is evaluated: give
-    ``outside="exact"``.
+    without one, fewer than `Tolerances.table_pixels` distinct pixels. What lies beyond it (S = 0 or B = 0) is
+    evaluated: give ``outside="exact"``.
     """
     from mars_lidar.statistics.cells import require_mode
     from mars_lidar.table import Table
@@ -306,10 +299,10 @@ def image_table(
     if single is None:
         return None
     signal, background = single[0], light.background.reshape(-1)
-    if len(np.unique(np.stack([*single, background], 1), axis=0)) < FEWEST:
+    if len(np.unique(np.stack([*single, background], 1), axis=0)) < TOLERANCES.table_pixels:
         return None
-    told: dict[str, Any] = {"threads": threads, "progress": progress}
-    return Table.cached(system, _axis("signal", signal), _axis("background", background), **told)
+    options: dict[str, Any] = {"threads": threads, "progress": progress}
+    return Table.cached(system, _axis("signal", signal), _axis("background", background), **options)
 
 
 def _axis(name: str, photons: FloatArray) -> Any:
@@ -318,7 +311,7 @@ def _axis(name: str, photons: FloatArray) -> Any:
     if some.size == 0:
         return np.array([0.0, 1e-6])
     low, high = float(some.min()), float(some.max())
-    if high < low * (1.0 + _NARROW):
-        return np.array([low * (1.0 - _NARROW), high * (1.0 + _NARROW)])
+    if high < low * (1.0 + TOLERANCES.axis_width):
+        return np.array([low * (1.0 - TOLERANCES.axis_width), high * (1.0 + TOLERANCES.axis_width)])
     first, last = math.floor(8 * math.log10(low)), math.ceil(8 * math.log10(high))  # eighths of a decade
     return 10.0 ** (first / 8), 10.0 ** (last / 8), max(2, 1 + (last - first) * _PER_DECADE[name] // 8)

@@ -18,13 +18,14 @@ from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 
+from mars_lidar._base.types import FloatArray
 from mars_lidar.explore.settings import light_of, settings_of, truth_of
 from mars_lidar.io import Cube
 from mars_lidar.reconstruction import reconstruct
 
 _PLACE = '<script type="application/json" id="cube">null</script>'
 _MAX_PIXELS = 2**16  # of one answer, or one row
-_METHODS = {"peak": "peak", "likelihood": "maximum_likelihood"}
+_METHODS = {"peak": "peak", "likelihood": "maximum_likelihood", "image": "image"}
 _POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' 'wasm-unsafe-eval' blob:; worker-src blob:; "
     "style-src 'unsafe-inline'; img-src data: blob:; connect-src 'self'; base-uri 'none'; form-action 'none'; "
@@ -58,6 +59,7 @@ class CubeServer:
     def __init__(self, cube: Cube | None = None, name: str = "", *, port: int = 0) -> None:
         self.cube = cube
         self._lock = threading.Lock()  # of the file
+        self._image, self._delay_ns = -1, np.empty(0)  # the last image by method "image"
         self._word = f"/{secrets.token_urlsafe(16)}"
         text = page_text()
         if cube is not None:
@@ -135,8 +137,19 @@ class CubeServer:
                 raise ValueError("the file does not tell the true depth")
             delay = cube.flux.returns_delay_ns.reshape(-1, height, width)[0, first : first + rows]
         else:
-            delay = reconstruct(counts, cube.system, _METHODS[given["method"]]).delay_ns
+            method = _METHODS[given["method"]]
+            if method == "image":
+                delay = self._image_delay_ns(cube, image)[first : first + rows]
+            else:
+                delay = reconstruct(counts, cube.system, method).delay_ns
         return "application/octet-stream", np.stack([totals, delay]).astype("<f8").tobytes()
+
+    def _image_delay_ns(self, cube: Cube, image: int) -> FloatArray:
+        """Delays (H, W) of a whole image, each from the photons around it; those of the last image are stored."""
+        if self._image != image:
+            counts = np.asarray(cube.histogram[image])
+            self._delay_ns, self._image = reconstruct(counts, cube.system, "image").delay_ns, image
+        return self._delay_ns
 
 
 class _Server(ThreadingHTTPServer):

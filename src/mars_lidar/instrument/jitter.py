@@ -80,6 +80,11 @@ class Jitter:
         f = self.tail_fraction
         return math.sqrt(self.sigma_ns**2 + f * (2.0 - f) * self.tail_ns**2)
 
+    @property
+    def finest_ns(self) -> float:
+        """Standard deviation of its narrowest feature, ns: a tail widens it, and smooths nothing."""
+        return self.sigma_ns
+
     def reach_ns(self) -> tuple[float, float]:
         """Interval outside of which less than 1e-16 of the records lie, ns."""
         return -8.5 * self.sigma_ns, 8.5 * self.sigma_ns + 37.0 * self.tail_ns
@@ -186,6 +191,11 @@ class SampledJitter:
     def std_ns(self) -> float:
         """Standard deviation, ns."""
         return math.sqrt(max(self._moment(2) - self._moment(1) ** 2, 0.0))
+
+    @property
+    def finest_ns(self) -> float:
+        """Standard deviation of its narrowest feature, a sample, ns."""
+        return self.bin_ns / math.sqrt(12.0)
 
     def __repr__(self) -> str:
         return f"SampledJitter({len(self.values)} samples, bin_ns={self.bin_ns:g}, origin={self.origin!r})"

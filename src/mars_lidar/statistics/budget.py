@@ -22,7 +22,7 @@ class Budget:
     forgetting
         Bins x periods within which an exposure forgets its start, for the closed form of the joint law; 12 ns each.
     run_through
-        Bins x periods of an exposure that does not, and that the joint law runs through for every window.
+        Bins x periods of an exposure that does not forget its start: the joint law runs through it for every window.
     record_kernel
         Probabilities from record to record behind electronics with a dead time; 8 bytes each.
     record_moments, record_points
@@ -45,9 +45,9 @@ class Budget:
     synchronous_points: int = 30_000_000
     history: int = 2**30
 
-    def recursion_seconds(self, steps: float) -> float:
-        """Time of `steps` bins x periods of the exposure recursion."""
-        return 8e-8 * steps
+    def refusal(self, steps: float) -> str:
+        """Why `steps` bins x periods of the exposure recursion are refused, in seconds of 80 ns a step."""
+        return f"it would take about {8e-8 * steps:.2g} s, and the limit of a law is {8e-8 * self.recursion:.1g} s"
 
 
 LAW = Budget(recursion=2.6e7, one_pass=2.6e7, record_kernel=2**24, record_moments=1.2e9)

@@ -175,9 +175,9 @@ def _bins_for_waveform(samples: int, bins: int) -> int:
 
 
 def whole_bins(dead: float, bins: int) -> tuple[int, int, float]:
-    """A dead time in periods as whole periods, whole bins of the rest, and the fraction of a bin that is left."""
+    """A dead time in periods as whole periods, whole bins of the rest, and the remaining fraction of a bin."""
     whole = math.floor(dead)
-    position = (dead - whole) * bins  # whole periods apart first: else they cost digits of the fraction
+    position = (dead - whole) * bins  # whole periods are split off first, or they would cost digits of the fraction
     shift = math.floor(position)
     fraction = position - shift
     if fraction < 1e-9:
@@ -490,8 +490,12 @@ class Cells:
 
     @property
     def finest(self) -> float:
-        """Standard deviation, in periods, of a Gaussian as narrow as the signal."""
-        return float(1.0 / (2.0 * math.sqrt(math.pi) * max(self._sharpness, 1.0)))
+        """Standard deviation, in periods, of a Gaussian as narrow as the signal; of registrations, where it is bright.
+
+        These fall as fast as the signal's first photon comes: of n photons, in an n-th of its width.
+        """
+        photons = max(float(np.max(self.total, initial=0.0)), 1.0)
+        return 1.0 / (2.0 * math.sqrt(math.pi) * max(self._sharpness, 1.0) * photons)
 
     def first_bins(self, out_bins: int) -> int:
         """Bins of the first grid: `usual_bins`, or more where a narrower pulse must be resolved."""

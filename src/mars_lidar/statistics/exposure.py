@@ -506,8 +506,7 @@ def _affordable(cells: Cells, pending: IndexArray, after: FloatArray, budget: Bu
     if beyond.any():
         k_pending = int(np.argmax(beyond))
         k = int(pending[k_pending])
-        seconds = [budget.recursion_seconds(cost) for cost in (float(after[k_pending]), budget.recursion)]
-        why = f"it would take about {seconds[0]:.2g} s, and the limit of a law is {seconds[1]:.1g} s"
+        why = budget.refusal(float(after[k_pending]))
         raise ConvergenceError(f"exposure statistics of {cells.name(k)}: {why}; {_instead(cells, budget)}")
 
 

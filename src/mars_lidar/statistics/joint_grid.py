@@ -51,7 +51,7 @@ def factorised(grid: FoldedGrid) -> Callable[..., FloatArray]:
         for _ in range(2):
             rest = np.concatenate([(source - grid.apply(x)).reshape(-1), np.zeros(grid.bins)])
             x = x + solve(rest, trans="T")[: 2 * grid.bins].reshape(2, -1)
-        error = left_over(source - grid.apply(x), x)
+        error = relative_residual(source - grid.apply(x), x)
         if best is None or error < least:
             best, least = solve, error
         if least <= 0.1 * TOL.folded_residual:
@@ -129,8 +129,8 @@ def _matrix(grid: FoldedGrid) -> csc_matrix:
     return csc_matrix(entries, shape=(3 * n, 3 * n))
 
 
-def left_over(rest: FloatArray, x: FloatArray) -> float:
-    """Largest residual `rest` relative to the largest value of the solution `x`; infinite for x = 0 and a residual."""
+def relative_residual(rest: FloatArray, x: FloatArray) -> float:
+    """Largest residual `rest` over the largest value of the solution `x`; infinite for a residual of x = 0."""
     size, largest = float(np.abs(x).max()), float(np.abs(rest).max())
     return largest / size if size > 0.0 else math.inf if largest != 0.0 else 0.0
 
@@ -286,7 +286,7 @@ class FoldedGrid:
                 tolerance=TOL.folded_change,
             )
             x = np.ascontiguousarray(out.T)
-            rest = left_over(source - self.apply(x), x)
+            rest = relative_residual(source - self.apply(x), x)
             self.direct = not (error <= TOL.folded_change and rest <= TOL.folded_residual)
             self.sweeps = max(self.sweeps, int(done))
         if self.direct:
@@ -327,7 +327,7 @@ class FoldedGrid:
                 rest = -self._apply_transposed(y[some])
                 rest[:, 0] += mass[some]
                 self.unproven -= 1
-                self.direct = not left_over(rest, y[some]) <= TOL.folded_residual
+                self.direct = not relative_residual(rest, y[some]) <= TOL.folded_residual
                 if not self.direct:
                     self._judge(rest, y[some])
         if self.direct:
@@ -344,7 +344,7 @@ class FoldedGrid:
         return y
 
     def _judge(self, rest: FloatArray, x: FloatArray) -> None:
-        error = left_over(rest, x)
+        error = relative_residual(rest, x)
         self.residual = max(self.residual, error)
         if not error <= TOL.folded_residual:
             raise ConvergenceError(f"the feedback equation has a relative residual of {error:.1e}")

@@ -42,8 +42,8 @@ def matched_pmf(cumulants: ArrayLike, *, threads: int | None = None) -> list[Pmf
     Three forms. A variance of 9 or more, or a smooth law: the quantile is that of E. A. Cornish and R. A.
     Fisher (1938) to the fourth cumulant, rounded, with Sheppard's corrections. Few photons, mode locking,
     saturation: an integer, plus a Panjer count, less a Poisson one (or the mirror image), times a polynomial.
-    The least variance that an integer can have: two integers. `trusted` tells where the result is
-    close to the exact law.
+    The least variance that an integer can have: two integers. `trusted` gives where the
+    result is close to the exact law.
     """
     given, team = _checked(cumulants), thread_count(threads)
     first, last, _ = _support(given, team)

@@ -55,7 +55,7 @@ def _log1p(u: NDArray[np.complex128]) -> NDArray[np.complex128]:
 
 
 class _Count:
-    """The count of one pixel, of whose `total` photons a period `early` arrive before 1 - f."""
+    """The count of one pixel; of its `total` photons per period `early` arrive before the phase 1 - f."""
 
     def __init__(self, cells: Cells, name: str, whole: int, early: float, total: float) -> None:
         self.name, self.cycles, self.whole = name, cells.system.cycles, whole
@@ -65,7 +65,7 @@ class _Count:
         self.first = self._first(cells.system.start == "stationary")
 
     def _first(self, stationary: bool) -> FloatArray:
-        """P(first armed period = r) (r,): 1 for r = 0, or of a stationary renewal process, (7)."""
+        """Probabilities (r,) that the first armed period is 0, 1, ...; of a stationary pixel by (7)."""
         if not stationary:
             return np.ones(1)
         longer = np.full(min(self.whole, self.cycles) + 2, self.armed_register)  # P(M > r)

@@ -39,13 +39,13 @@ def recorded(cells: Cells, compute: Callable[[Cells, int], FloatArray]) -> Float
 class Timing:
     """The map from registrations in equal parts of the period to records in the bins of the histogram.
 
-    `finest` is the standard deviation, in periods, of the narrowest feature of the flux.
+    `finest` is the standard deviation, in periods, of the narrowest feature of the registrations (`Cells.finest`).
     """
 
     def __init__(self, system: System, finest: float) -> None:
         self.system = system
         jitter = system.detector.jitter
-        width = math.hypot(finest, 0.0 if jitter is None else jitter.std_ns / system.period_ns)
+        width = math.hypot(finest, 0.0 if jitter is None else jitter.finest_ns / system.period_ns)
         split = math.ceil(TOL.parts_per_sigma / (max(width, 1e-9) * system.bins))
         split = 2 * max(1, min(split, TOL.most_parts // system.bins) // 2)
         self.parts = system.bins * split

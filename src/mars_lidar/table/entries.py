@@ -20,7 +20,7 @@ from mars_lidar._base.native import _core
 from mars_lidar._base.progress import of_part
 from mars_lidar._base.types import FloatArray, IndexArray, Progress
 from mars_lidar.instrument.system import System
-from mars_lidar.light.flux import Flux
+from mars_lidar.light.flux import Flux, broadcast
 from mars_lidar.statistics.cells import Cells, cell_name, default_bins, flat
 from mars_lidar.statistics.chain import PhaseChain, Rearm
 from mars_lidar.statistics.count_pmf import Pmf, guessed_windows
@@ -588,7 +588,10 @@ def read_pixels(
     there is no return.
     """
     delay_ns = 0.5 * period_ns if delay_ns is None else delay_ns
-    s, b, delay = (flat(np.asarray(part)) for part in np.broadcast_arrays(signal, background, delay_ns))
+    given = [np.asarray(values, dtype=np.float64) for values in (signal, background, delay_ns)]
+    s, b, delay = (flat(part) for part in broadcast(("signal", "background", "delay_ns"), given))
+    if (bad := ~np.isfinite(delay) & ~(np.isnan(delay) & (s == 0))).any():
+        raise ValueError(f"delay_ns must be finite (NaN for no return where signal is 0), got {delay[bad][0]}")
     beyond = np.zeros(s.size, dtype=bool)
     for name, values, axis in (("signal", s, axes[0]), ("background", b, axes[1])):
         if not (values >= 0).all():

@@ -30,17 +30,27 @@ struct Time {
 
 MARS_INLINE Float magnitude(Float x) { return from_bits(bits(x) & 0x7fffffffu); }
 
-// What is known of the pulse when a loop is compiled; kAny asks its tables: only a sampled pulse has guides.
-enum class PulseKind { kGaussian, kSampled, kAny };
+// What is known of the pulse when a loop is compiled; kAny asks its tables: only a sampled pulse has guides. kGathered is
+// a Gaussian one whose tables are looked into by the gather instructions: exact/gathers.h says where.
+enum class PulseKind { kGaussian, kGathered, kSampled, kAny };
+
+// Entries (2 i, 2 i + 1) of a pulse's table of lines.
+template <PulseKind kind>
+MARS_INLINE void look_up(const float* lines, Int cell, Float& intercept, Float& slope) {
+#if defined(MARS_GATHERS)
+    if constexpr (kind == PulseKind::kGathered) return gather_pair_at_once(lines, cell, intercept, slope);
+#endif
+    gather_pair(lines, cell, intercept, slope);
+}
 
 // Position in the frame of the energy p, signed as in pulse_table.h; `size` is its magnitude.
 template <PulseKind kind>
 MARS_INLINE Float quantile(const PulseView& pulse, Float p, Float size) {
     const Int cell = as_int(bits(size) >> kEnergyShift);
-    if (kind == PulseKind::kAny ? pulse.guides == 0 : kind == PulseKind::kGaussian) {  // the early half, mirrored
+    if (kind == PulseKind::kAny ? pulse.guides == 0 : kind != PulseKind::kSampled) {  // the early half, mirrored
         const UInt late = bits(p) & 0x80000000u;
         Float intercept, slope;
-        gather_pair(pulse.inverse, cell, intercept, slope);
+        look_up<kind>(pulse.inverse, cell, intercept, slope);
         return from_bits(bits(intercept + slope * size) ^ late);
     } else {
         const Mask late = p < 0.0f;
@@ -87,7 +97,7 @@ MARS_INLINE Time next_return(const PulseView& pulse, Time from, Wait wait, Mask 
                             splat(pulse.last_cell));
     const Int cell = truncate(x);
     Float here, slope;
-    gather_pair(pulse.forward, cell, here, slope);
+    look_up<kind>(pulse.forward, cell, here, slope);
     here = here + slope * (x - to_float(cell));
     // by the cell, not the phase: rounding may put a phase at the median into either cell, and only its own sign counts
     Mask late = cell >= pulse.late_cell;

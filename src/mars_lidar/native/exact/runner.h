@@ -112,9 +112,10 @@ struct AnyRule {
 
     MARS_INLINE Time next(const SystemView& system, const Return* returns, Time from, const Draw& drawn, UInt key0,
                           UInt key1, UInt event, Memory& memory) const {
-        return whole
-                   ? next_registration<PulseKind::kAny, true>(system, returns, from, drawn, key0, key1, event, memory)
-                   : next_registration<PulseKind::kAny, false>(system, returns, from, drawn, key0, key1, event, memory);
+        const Time hit =
+            next_registration<PulseKind::kAny, true>(system, returns, from, drawn, key0, key1, event, memory);
+        if (!whole) memory.known = splat(1) < 0;
+        return hit;
     }
     MARS_INLINE Registration arrive(const SystemView& system, const Time& hit, Float delay, UInt event, Time& armed,
                                     Memory& memory, Mask& unseen) const {

@@ -109,13 +109,12 @@ inline void draw_starts(const Job& job, const PulseTable& pulse, const ExactBloc
     GapSearch search;
     cycle.resize(block.items);
     phase.resize(block.items);
-    for (int64_t i = 0; i < std::min(block.items, job.pixels); ++i) {
-        if (block.stop->load(std::memory_order_relaxed)) return;
-        const int64_t pixel = job.pixel(block.first_item + i);
-        const WarmedUp state(job, pixel, PulseLight(job, pulse, pixel));
+    auto pixel = [&](int64_t i) { return job.pixel(block.first_item + i); };
+    auto light = [&](int64_t at) { return PulseLight(job, pulse, at); };
+    visit_warmed_up(job, std::min(block.items, job.pixels), *block.stop, pixel, light, [&](int64_t i, auto& state) {
         for (int64_t k = i; k < block.items; k += job.pixels)  // realizations of this pixel
-            state.draw(job.realization(block.first_item + k), search, cycle[k], phase[k]);
-    }
+            state.draw(job.pixel_index[pixel(i)], job.realization(block.first_item + k), search, cycle[k], phase[k]);
+    });
 }
 
 }  // namespace mars

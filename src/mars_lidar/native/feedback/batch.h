@@ -30,6 +30,7 @@ class Batch : private BatchPixels {
         solve_mean();
         bound_counts();
         ask_where_needed();
+        choose_laps();
         int32_t most = 0;
         for (int i = 0; i < kTeam; ++i) most = batch_.draws[i] > most ? batch_.draws[i] : most;
         for (int32_t draw = 0; draw < most; ++draw) {
@@ -42,14 +43,6 @@ class Batch : private BatchPixels {
             }
             if (!some) continue;
             draw_numbers(draw);
-            if (draw == 0) {  // the numbers came with the means, and these with the fewest exposures armed
-                choose_laps(fewest_);
-                for (int i = 0; i < kTeam; ++i) {
-                    if (drawing_[i]) status(i, draw) = refused_[i];
-                    drawing_[i] = drawing_[i] && refused_[i] == FeedbackStatus::kDrawn;
-                    exposure_.active[i] = drawing_[i] ? -1 : 0;
-                }
-            }
             start_history();
             const bool done = grid_.folded() > 0 ? sweep_integers<true, true>()
                               : grid_.stationary ? sweep_integers<false, true>()
@@ -75,16 +68,12 @@ class Batch : private BatchPixels {
         }
         alignas(64) uint32_t words[kTeam], other[kTeam];
         Uniforms uniforms;
-        for (int i = 0; i < kTeam; ++i) fewest_[i] = static_cast<float>(pieces_[i]);
         for (int32_t lap = 0, t = 0; lap < grid_.laps; ++lap) {
             MeanLaw law(grid_, work_.rates, work_.sums, scale_);
             for (int32_t j = 0; j < n_; ++j, ++t) {
                 draw_words(key0_, key1_, t, words, other);
                 uniforms.set(words);
                 law.next(j);
-                if (lap == 0) {
-                    for (int i = 0; i < kTeam; ++i) fewest_[i] = lesser(law.armed[i], fewest_[i]);
-                }
                 work_.exact[static_cast<int64_t>(t) * kTeams] = law.rare(j, kFewArmed, kFewCounts, kLikely);
                 uint16_t* dither = work_.dither + row(t);
                 uint16_t* split = work_.split + row(t + 1);
@@ -274,7 +263,6 @@ class Batch : private BatchPixels {
     Exposure exposure_;
     alignas(64) uint32_t key0_[kTeam], key1_[kTeam];
     alignas(64) int32_t negative_[kTeam];
-    alignas(64) float fewest_[kTeam];  // exposures armed in any cell
     bool drawing_[kTeam];
     bool overdrawn_[kTeam];  // fewer than no exposures armed in the last sweep
     int32_t spare_[kTeam];   // whole periods blind beyond the end, less those at the start

@@ -11,6 +11,7 @@
 // count. Everything is second order in the width of cells: of the distance to the true mean, three quarters.
 #pragma once
 #include "feedback/laws.h"
+#include "laws/exposure_numbers.h"
 
 namespace mars {
 inline namespace MARS_LEVEL {
@@ -48,29 +49,23 @@ struct FineRates {
     }
 };
 
-// One cell of a sweep, in place: `out` is the row of the sweep before. C' = (1 - p) C + p (1 + RA) + q (RA' - RA), so that
-// a cell waits for the one before for a multiplication and an addition only.
-struct MeanSweep {
-    alignas(64) double c[kJudged] = {}, re[kJudged], gone[kJudged];
-    alignas(64) double moved[kJudged] = {}, least[kJudged];  // the largest move of a sum, the fewest armed
-    alignas(64) int64_t active[kJudged];
+// The judged pixels' doubles in vectors, so that those of a cell stay in registers for the next.
+constexpr int kVectors = kJudged / kReals;
+struct Judged {
+    Real part[kVectors];
 
-    MARS_NOINLINE void step(const double* __restrict__ p, const double* __restrict__ q, const double* late,
-                            const double* early, double part, double turns, double* out) {
-        alignas(64) double now[kJudged];
-        for (int i = 0; i < kJudged; ++i) {
-            const double then = late[i] - part * (late[i] - early[i]) - turns * gone[i];
-            const double more = p[i] * (1.0 + re[i]) + q[i] * (then - re[i]), before = out[i];
-            const double sum = (1.0 - p[i]) * c[i] + more, armed = 1.0 - (sum - then);
-            const double up = sum - before, size = up > -up ? up : -up;
-            moved[i] = size > moved[i] ? size : moved[i];
-            least[i] = armed < least[i] ? armed : least[i];
-            re[i] = then;
-            c[i] = sum;
-            now[i] = active[i] ? sum : before;
-        }
-        for (int i = 0; i < kJudged; ++i) out[i] = now[i];
+    static MARS_INLINE Judged of(const double* from) {
+        Judged row;
+        memcpy(row.part, from, sizeof row.part);
+        return row;
     }
+    MARS_INLINE void put(double* to) const { memcpy(to, part, sizeof part); }
+};
+
+// What a sweep leaves beside the sums: the largest move of one, and the fewest armed.
+struct MeanSweep {
+    alignas(64) double moved[kJudged], least[kJudged];
+    alignas(64) int64_t active[kJudged];
 };
 
 // What a cell of the grid makes of the finer grid's mean.
@@ -145,21 +140,12 @@ class GridCheck {
         for (int32_t j = 0; j <= n; ++j)
             for (int i = 0; i < kJudged; ++i) row(j)[i] = fine_.place[j] * total[i];
         for (int sweep = 1; sweep <= kSweeps; ++sweep) {
-            rearmed(0, mean.re);
-            for (int i = 0; i < kJudged; ++i) {
-                mean.gone[i] = row(n)[i];
-                mean.c[i] = mean.moved[i] = row(0)[i] = 0.0;
-                mean.least[i] = 1.0;
-            }
-            for (int32_t j = 0; j < n; ++j) {
-                const FeedbackEdge& edge = fine_.edge[j + 1];
-                mean.step(rates_.fire(j), rates_.refire(j), row(edge.late), row(edge.early),
-                          static_cast<double>(edge.part), edge.turns, row(j + 1));
-            }
+            sweep_mean(mean);
             bool some = false;
             for (int i = 0; i < kJudged; ++i) {
                 if (!mean.active[i]) continue;
                 const double moved = mean.moved[i], armed = mean.least[i] > 0.0 ? mean.least[i] : 0.0;
+                check_.armed[i] = armed * check_.exposures / (1.0 + fine_.whole * row(n)[i]);
                 const double off = check_.exposures * fired[i] * moved * (moved / (moved + armed));
                 if (moved <= kRounding || off <= kStill) {
                     mean.active[i] = 0;
@@ -170,6 +156,41 @@ class GridCheck {
             }
             if (!some) return;
         }
+    }
+
+    // One sweep, in place: C' = (1 - p) C + p (1 + RA) + q (RA' - RA), so that a cell waits for the one before for a
+    // multiplication and an addition only. Lanes that are not active keep their sums.
+    MARS_NOINLINE void sweep_mean(MeanSweep& mean) const {
+        Judged c{}, moved{}, least, re, gone = Judged::of(row(fine_.cells));
+        RealBits active[kVectors];
+        memcpy(active, mean.active, sizeof active);
+        alignas(64) double first[kJudged];
+        rearmed(0, first);
+        re = Judged::of(first);
+        MARS_UNROLL
+        for (int k = 0; k < kVectors; ++k) least.part[k] = splat(1.0);
+        c.put(row(0));
+        for (int32_t j = 0; j < fine_.cells; ++j) {
+            const FeedbackEdge& edge = fine_.edge[j + 1];
+            const double part = static_cast<double>(edge.part), turns = edge.turns;
+            const Judged p = Judged::of(rates_.fire(j)), q = Judged::of(rates_.refire(j));
+            const Judged late = Judged::of(row(edge.late)), early = Judged::of(row(edge.early));
+            Judged out = Judged::of(row(j + 1));
+            MARS_UNROLL
+            for (int k = 0; k < kVectors; ++k) {
+                const Real then = late.part[k] - part * (late.part[k] - early.part[k]) - turns * gone.part[k];
+                const Real more = p.part[k] * (1.0 + re.part[k]) + q.part[k] * (then - re.part[k]);
+                const Real sum = (1.0 - p.part[k]) * c.part[k] + more, armed = 1.0 - (sum - then);
+                moved.part[k] = larger(moved.part[k], absolute(sum - out.part[k]));
+                least.part[k] = armed < least.part[k] ? armed : least.part[k];
+                re.part[k] = then;
+                c.part[k] = sum;
+                out.part[k] = active[k] ? sum : out.part[k];
+            }
+            out.put(row(j + 1));
+        }
+        moved.put(mean.moved);
+        least.put(mean.least);
     }
 
     // D^2 of the lanes, and the bins' parts.

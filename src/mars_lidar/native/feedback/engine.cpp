@@ -52,7 +52,7 @@ void feedback_check(const Job& job, const PulseTable& pulse, const FeedbackCheck
         const PhotonsOf<kJudged> photons(job, energy.energy, fine.grid, pixel, lit_photons, kJudged);
         const int64_t room = feedback_check_doubles(fine.grid.cells, photons.lit_end - photons.lit_begin);
         parts.assign(call.bins ? static_cast<size_t>(bins) * kJudged : 0, 0.0);
-        double square[kJudged];
+        double square[kJudged], armed[kJudged];
         int32_t sweeps[kJudged];
         FeedbackCheck check{};
         check.coarse = &coarse.grid;
@@ -65,11 +65,13 @@ void feedback_check(const Job& job, const PulseTable& pulse, const FeedbackCheck
         check.memory = memory.of(room);
         check.square = square;
         check.sweeps = sweeps;
+        check.armed = armed;
         check.bins = call.bins ? parts.data() : nullptr;
         kernel(check);
         for (int64_t i = 0; i < kJudged && first + i < number; ++i) {
             call.distance[first + i] = std::sqrt(square[i]);
             call.sweeps[first + i] = sweeps[i];
+            call.armed[first + i] = armed[i];
             for (int64_t b = 0; call.bins && b < bins; ++b)
                 call.bins[(first + i) * bins + b] = parts[static_cast<size_t>(b * kJudged + i)];
         }

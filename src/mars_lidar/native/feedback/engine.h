@@ -31,13 +31,14 @@ void feedback_histogram(const Job& job, const PulseTable& pulse, Count* out, con
                         const std::string& level, const Watch& watch);
 
 // The internal grid `kinds` of some pixels (number), judged by a finer one: D (number), the sweeps that it took
-// (number), and where `bins` is not null the parts (number, bins) of D^2.
+// (number), the fewest exposures armed in a cell (number), and where `bins` is not null the parts (number, bins) of D^2.
 struct FeedbackCheckCall {
     const int64_t* pixels;
     int64_t number;
     const uint8_t* kinds;
     double* distance;
     int32_t* sweeps;
+    double* armed;
     double* bins;
 };
 void feedback_check(const Job& job, const PulseTable& pulse, const FeedbackCheckCall& call, int threads);

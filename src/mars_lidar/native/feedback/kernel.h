@@ -121,6 +121,7 @@ struct FeedbackCheck {
     double* memory;             // `feedback_check_doubles` of scratch
     double* square;             // (kJudged): D^2
     int32_t* sweeps;            // (kJudged): until the mean was settled, 201 where it was not
+    double* armed;              // (kJudged): the fewest exposures armed in any cell
     double* bins;               // (bins, kJudged): parts of D^2 that narrower cells would lessen, 0 at first; or null
 };
 

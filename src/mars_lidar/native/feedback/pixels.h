@@ -162,10 +162,16 @@ class BatchPixels {
 
     bool variance_matters(int i) const { return grid_.folded() > 0 || grid_.laps > 1 || rate_[i] > kLinearFrom; }
 
-    // Lanes for which one lap is not enough, or not this number, are refused with the number that is. `armed`: the
-    // fewest exposures armed in any cell. Also how many sweeps a lane goes through at least.
-    void choose_laps(const float* armed) {
-        alignas(64) float ghosts[kTeam];
+    // Lanes for which one lap is not enough, or not this number, are refused with the number that is. Also how many
+    // sweeps a lane goes through at least.
+    void choose_laps() {
+        alignas(64) float ghosts[kTeam], armed[kTeam];  // the fewest exposures armed in any cell
+        for (int i = 0; i < kTeam; ++i) armed[i] = static_cast<float>(pieces_[i]);
+        MeanLaw law(grid_, work_.rates, work_.sums, scale_);
+        for (int32_t j = 0; j < n_; ++j) {
+            law.next(j);
+            for (int i = 0; i < kTeam; ++i) armed[i] = lesser(law.armed[i], armed[i]);
+        }
         bool some = grid_.laps > 1;
         for (int i = 0; i < kTeam; ++i) {
             some = some || armed[i] < kFewestArmed || rate_[i] > kLinearFrom;

@@ -27,7 +27,7 @@ class DelayExposure {
           below_(r_.bins + 1),
           cell_(s.cells),
           armed_(s.cells) {
-        const PulseTable& pulse = s.pulse;
+        const ImagePulse& pulse = s.pulse;
         const float* const middle = pulse.density + static_cast<int64_t>(pulse.phases / 2) * pulse.span;
         for (int k = 0; k < pulse.span; ++k) sum_ += static_cast<double>(middle[k]);
         flat_ = !r_.gated();
@@ -55,7 +55,7 @@ class DelayExposure {
     // By how much the photons of a pulse at a delay are late on average, in cells, for what was blind about it.
     double lag(int delay) const {
         if (!own_) return 0.0;
-        const PulseTable& pulse = s_.pulse;
+        const ImagePulse& pulse = s_.pulse;
         const float* const middle = pulse.density + static_cast<int64_t>(pulse.phases / 2) * pulse.span;
         double a = 0.0, b = 0.0, plain = 0.0;
         for (int k = 0; k < pulse.span; ++k) {
@@ -92,7 +92,7 @@ class DelayExposure {
             std::fill(armed_.begin(), armed_.end(), 1.0f);
             return;
         }
-        const PulseTable& pulse = s_.pulse;
+        const ImagePulse& pulse = s_.pulse;
         const float* const middle = pulse.density + static_cast<int64_t>(pulse.phases / 2) * pulse.span;
         for (int i = 0; i < s_.cells; ++i) {
             double value = 0.0;

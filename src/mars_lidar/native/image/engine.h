@@ -1,7 +1,7 @@
 // Depth from a few photons a pixel, stage by stage, on threads (docs/theory_reconstruction.md, section 7). Delays in cells.
 #pragma once
 #include <cstdint>
-#include <string>
+#include <vector>
 
 #include "base/parallel.h"
 #include "image/kernel.h"
@@ -34,13 +34,26 @@ struct PulseScore {
     float near_low, near_high;  // the window about the delay in which signal is counted
 };
 
-// What is known of the system: see PulseTable, PulseScore.
+constexpr int kImagePhases = 32;  // of a photon within its cell
+
+// What is known of the system: see ImagePulse, PulseScore. `density` of a registration about its delay, in multiples of
+// uniform light, and `score`, in periods: sample j lies (first + j + 1/2) / kImagePhases cells after the delay.
 struct ImageSetting {
+    ImageSetting(const HistogramRecord& record, int cells, int64_t first, const std::vector<double>& density,
+                 const std::vector<double>& score, double sigma);
+    ImageSetting(const ImageSetting&) = delete;
+    ImageSetting& operator=(const ImageSetting&) = delete;
+
     const HistogramRecord* recording;
     int cells;
-    PulseTable pulse;
+    double sigma;         // standard deviation of a photon's time, cells
+    double near, inside;  // cells of the window in which signal is counted, and the share of the signal there
+    ImagePulse pulse;
     PulseScore score;
     float least;  // exposure of a pulse, relative to background's, below which a delay is excluded
+
+ private:
+    std::vector<float> curve_, score_, table_;
 };
 
 constexpr int kImageColumns = 5;  // of image_centroids

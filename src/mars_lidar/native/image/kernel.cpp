@@ -94,7 +94,7 @@ float multiplied(const float* f, const float* x, int n, float* g) {
 
 void MARS_JOIN(image_likelihood_, MARS_LEVEL)(const ImagePixel& p) {
     constexpr float kFactor[kImageFactors] = {0.4f, 1.0f, 2.5f}, kShare[kImageFactors] = {0.3f, 0.45f, 0.25f};
-    const PulseTable& pulse = *p.pulse;
+    const ImagePulse& pulse = *p.pulse;
     const int n = p.cells, span = pulse.span, length = n + span;
     double count = 0.0, shift[kImageFactors];
     for (int64_t e = 0; e < p.photons; ++e) count += static_cast<double>(p.weight[e]);

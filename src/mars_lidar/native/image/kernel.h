@@ -15,7 +15,7 @@ constexpr int kImageMoments = 7;  // of a plane: see image_planes
 
 // The pulse about a delay, in multiples of uniform light: density[phase * span + k] of a photon at place (phase + 1/2) /
 // phases within its cell, for a delay at the middle of the cell first + k further.
-struct PulseTable {
+struct ImagePulse {
     int phases, first, span;
     float top;  // the largest
     const float* density;
@@ -23,7 +23,7 @@ struct PulseTable {
 
 // Likelihood (cells) of the delay of one pixel, of mean 1. Scratch: 3 (cells + span).
 struct ImagePixel {
-    const PulseTable* pulse;
+    const ImagePulse* pulse;
     int cells;
     int64_t photons;             // entries of time and weight
     const float *time, *weight;  // place in cells, number of photons there

@@ -47,8 +47,7 @@ MARS_INLINE Vector gather_lanes(const Scalar* table, Int index) {
 MARS_INLINE Float gather(const float* table, Int index) { return gather_lanes<Float>(table, index); }
 MARS_INLINE Int gather(const int32_t* table, Int index) { return gather_lanes<Int>(table, index); }
 
-// Entries (2 i, 2 i + 1) of a table of pairs: loads of 64 bits, put together by shuffles. A third of the time of
-// the gather instructions, which are slow where processors guard against data sampling.
+// Entries (2 i, 2 i + 1) of a table of pairs: loads of 64 bits, put together by shuffles.
 #if defined(MARS_X86)
 MARS_INLINE __m128d two_pairs(const float* table, const int32_t* index) {
     const double* pairs = (const double*)table;
@@ -101,6 +100,31 @@ MARS_INLINE void gather_pair(const float* table, Int index, Float& first, Float&
     gather_pair(table, k, first.low, second.low);
     gather_pair(table, k + kHardwareLanes, first.high, second.high);
 }
+
+// The same by the gather instructions.
+#if defined(MARS_LEVEL_avx512)
+#define MARS_GATHERS
+MARS_INLINE void gather_pair_at_once(const float* table, HardInt index, HardFloat& first, HardFloat& second) {
+    const __m512i low = _mm512_i32gather_epi64(_mm512_castsi512_si256((__m512i)index), table, 8);
+    const __m512i high = _mm512_i32gather_epi64(_mm512_extracti64x4_epi64((__m512i)index, 1), table, 8);
+    const __m512i even = _mm512_setr_epi32(0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
+    const __m512i odd = _mm512_setr_epi32(1, 3, 5, 7, 9, 11, 13, 15, 17, 19, 21, 23, 25, 27, 29, 31);
+    first = (HardFloat)_mm512_permutex2var_epi32(low, even, high);
+    second = (HardFloat)_mm512_permutex2var_epi32(low, odd, high);
+}
+#elif defined(MARS_LEVEL_avx2)
+#define MARS_GATHERS
+MARS_INLINE void gather_pair_at_once(const float* table, HardInt index, HardFloat& first, HardFloat& second) {
+    first = (HardFloat)_mm256_i32gather_ps(table, (__m256i)index, 8);
+    second = (HardFloat)_mm256_i32gather_ps(table + 1, (__m256i)index, 8);
+}
+#endif
+#if defined(MARS_GATHERS)
+MARS_INLINE void gather_pair_at_once(const float* table, Int index, Float& first, Float& second) {
+    gather_pair_at_once(table, index.low, first.low, second.low);
+    gather_pair_at_once(table, index.high, first.high, second.high);
+}
+#endif
 
 // Entry `index` of a table of 32, aligned to 64 bytes.
 MARS_INLINE Float of_thirty_two(const float* table, Int index) {

@@ -41,15 +41,22 @@ void histogram(const BoundJob& job, const PulseTable& pulse, Matrix<Count> out, 
 }
 
 void judge(const BoundJob& job, const PulseTable& pulse, Vector<const int64_t> pixels, Vector<const uint8_t> kinds,
-           Vector<double> distance, Vector<int32_t> sweeps, nb::ndarray<double, nb::ndim<2>, nb::c_contig> bins,
-           int threads) {
+           nb::ndarray<double, nb::ndim<2>, nb::c_contig> distance_armed, Vector<int32_t> sweeps,
+           nb::ndarray<double, nb::ndim<2>, nb::c_contig> bins, int threads) {
     check_pixels(job, pixels);
     if (size_of(kinds) != job.bins) throw nb::value_error("kinds must be (bins)");
     const int64_t number = size_of(pixels), wanted = static_cast<int64_t>(bins.shape(0));
-    expect("distance and sweeps must be (pixels)", {number}, distance, sweeps);
+    expect("distance_armed must be (2, pixels)", {2, number}, distance_armed);
+    expect("sweeps must be (pixels)", {number}, sweeps);
     expect("bins must be (pixels or 0, bins)", {wanted == 0 ? 0 : number, job.bins}, bins);
-    const FeedbackCheckCall call{pixels.data(),   number,        kinds.data(),
-                                 distance.data(), sweeps.data(), wanted == 0 ? nullptr : bins.data()};
+    double* const distance = distance_armed.data();
+    const FeedbackCheckCall call{pixels.data(),
+                                 number,
+                                 kinds.data(),
+                                 distance,
+                                 sweeps.data(),
+                                 distance + number,
+                                 wanted == 0 ? nullptr : bins.data()};
     nb::gil_scoped_release free;
     feedback_check(job, pulse, call, threads);
 }
@@ -72,13 +79,14 @@ void bind_feedback(nb::module_& module) {
         "else why its row is not written; 64 and more: it needs that "
         "many "
         "laps less 64.";
-    module.def(
-        "feedback_check", &judge, "job"_a, "pulse"_a, "pixels"_a, "kinds"_a, "distance"_a.noconvert(),
-        "sweeps"_a.noconvert(), "bins"_a.noconvert(), "threads"_a,
-        "Distance (pixels,) of the mean histogram on an internal grid from that of one of half its cells' width, "
-        "in standard deviations of the linear function that shows it best; sweeps (pixels,) of the latter, 201 "
-        "where it does not settle; and what each bin's cells have to do with its square, (pixels, bins), or "
-        "(0, bins) where that is not needed.");
+    module.def("feedback_check", &judge, "job"_a, "pulse"_a, "pixels"_a, "kinds"_a, "distance_armed"_a.noconvert(),
+               "sweeps"_a.noconvert(), "bins"_a.noconvert(), "threads"_a,
+               "distance_armed (2, pixels): distance of the mean histogram on an internal grid from that of one of "
+               "half its cells' width, "
+               "in standard deviations of the linear function that shows it best, and the fewest exposures armed in "
+               "any cell; sweeps (pixels,) of the latter, 201 "
+               "where it does not settle; and what each bin's cells have to do with its square, (pixels, bins), or "
+               "(0, bins) where that is not needed.");
     define<uint16_t>(module, about);
     define<uint32_t>(module, about);
 }

@@ -1,233 +1,228 @@
-// Bindings of the stages of depth from a few photons a pixel; image/engine.h says what each does.
-#include "image/engine.h"
+// Bindings of depth from a few photons a pixel; image/solver.h says what each step does.
+#include <memory>
 
+#include "image/solver.h"
 #include "python/bindings.h"
 #include "python/watched.h"
 
 namespace mars {
 namespace {
 
-using Image = nb::ndarray<float, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
 using Floats = Vector<const float>;
+using Doubles = Vector<const double>;
 
-// A setting together with the arrays into which it points.
+// A setting together with the recording into which it points.
 struct BoundImageSetting : ImageSetting {
-    nb::object arrays;
+    BoundImageSetting(nb::object given, int count, int64_t first, const Doubles& density, const Doubles& score,
+                      double deviation)
+        : ImageSetting(*nb::cast<const HistogramRecord*>(given), count, first,
+                       {density.data(), density.data() + size_of(density)},
+                       {score.data(), score.data() + size_of(score)}, deviation),
+          recorded(std::move(given)) {}
+
+    nb::object recorded;
 };
 
-BoundImageSetting setting_of(nb::handle recording, int cells, int phases, int pulse_first, Matrix<const float> table,
-                             float low, Floats density, Floats score, float near_low, float near_high, float least) {
-    if (cells < 16 || cells % 16 != 0) throw nb::value_error("cells must be a multiple of 16");
-    if (static_cast<int>(table.shape(0)) != phases || static_cast<int>(table.shape(1)) > cells)
-        throw nb::value_error("table must be (phases, at most cells)");
-    if (size_of(density) != size_of(score)) throw nb::value_error("density and score must be of one length");
-    BoundImageSetting out;
-    out.recording = nb::cast<const HistogramRecord*>(recording);
-    out.cells = cells;
-    float top = 0.0f;
-    for (size_t k = 0; k < table.size(); ++k) top = std::max(top, table.data()[k]);
-    out.pulse = {phases, pulse_first, static_cast<int>(table.shape(1)), top, table.data()};
-    out.score = {phases, size_of(density), low, density.data(), score.data(), near_low, near_high};
-    out.least = least;
-    out.arrays = nb::make_tuple(recording, table, density, score);
+// A solver together with the arrays into which it points, and the setting of its last step.
+struct BoundImageSolver {
+    std::unique_ptr<ImageSolver> solver;
+    nb::object arrays;
+    nb::object setting = nb::none();
+};
+
+template <class Number>
+nb::object array_of(std::vector<Number> values, std::initializer_list<size_t> shape) {
+    auto* const kept = new std::vector<Number>(std::move(values));
+    nb::capsule owner(kept, [](void* p) noexcept { delete static_cast<std::vector<Number>*>(p); });
+    return nb::cast(nb::ndarray<nb::numpy, Number>(kept->data(), shape, owner));
+}
+
+ImageNetworks* networks_of(const Floats& weights, double factor, const Matrix<const double>& limits) {
+    const int64_t size = size_of(weights);
+    if (size != ImageNetworks::kChoose && size != ImageNetworks::kChoose + ImageNetworks::kWeigh)
+        throw nb::value_error("weights must be those of the first network, or of both");
+    expect("limits must be (4, 2)", {4, 2}, limits);
+    auto out = std::make_unique<ImageNetworks>();
+    out->weights.assign(weights.data(), weights.data() + size);
+    out->interval_factor = factor;
+    std::copy(limits.data(), limits.data() + 8, &out->limits[0][0]);
+    return out.release();
+}
+
+void make(BoundImageSolver* self, int64_t height, int64_t width, Vector<const int64_t> first, Vector<const int32_t> bin,
+          Floats number, Doubles efficiency, int64_t volume_bytes, int64_t block_pixels, int threads) {
+    if (height < 1 || width < 1 || size_of(first) != height * width + 1)
+        throw nb::value_error("first must be (height * width + 1)");
+    if (size_of(bin) != size_of(number) || first.data()[height * width] != size_of(bin))
+        throw nb::value_error("bin and number must have one entry for each of first");
+    if (size_of(efficiency) != 0 && size_of(efficiency) != height * width)
+        throw nb::value_error("efficiency must be empty or (height * width)");
+    new (self) BoundImageSolver;
+    self->solver = std::make_unique<ImageSolver>(ImagePhotons{height, width, first.data(), bin.data(), number.data()},
+                                                 size_of(efficiency) ? efficiency.data() : nullptr, volume_bytes,
+                                                 block_pixels, threads);
+    self->arrays = nb::make_tuple(first, bin, number, efficiency);
+}
+
+// `settings`: from the widest blur to none.
+void solve(BoundImageSolver& self, nb::list settings, const ImageNetworks* networks, Matrix<double> maps,
+           Vector<uint8_t> flags) {
+    const int64_t pixels = self.solver->pixels();
+    expect("maps must be (maps, pixels)", {kImageMaps, pixels}, maps);
+    if (size_of(flags) != pixels) throw nb::value_error("flags must be (pixels)");
+    std::vector<const ImageSetting*> given;
+    for (nb::handle each : settings) given.push_back(nb::cast<const BoundImageSetting*>(each));
+    if (given.empty()) throw nb::value_error("settings must be at least one");
+    watched(nb::none(),
+            [&](const Watch& watch) { self.solver->solve(given, networks, maps.data(), flags.data(), watch); });
+}
+
+void begin(BoundImageSolver& self, nb::object setting) {
+    const auto* const given = nb::cast<const BoundImageSetting*>(setting);
+    self.setting = setting;
+    watched(nb::none(), [&](const Watch& watch) { self.solver->begin(*given, watch); });
+}
+
+nb::tuple light(const BoundImageSolver& self) {
+    const size_t pixels = static_cast<size_t>(self.solver->pixels());
+    const ImageLight& of = self.solver->light();
+    return nb::make_tuple(array_of(of.signal, {pixels}), array_of(of.background, {pixels}));
+}
+
+// Volumes of a whole image, with its size.
+struct BoundImageVolumes : ImageVolumes {
+    size_t height, width, cells;
+};
+
+BoundImageVolumes volumes(const BoundImageSolver& self) {
+    const ImagePart whole = self.solver->whole();
+    BoundImageVolumes out;
+    watched(nb::none(), [&](const Watch& watch) { self.solver->volumes(whole, kImagePeaks, &out, watch); });
+    out.height = static_cast<size_t>(whole.y1);
+    out.width = static_cast<size_t>(whole.x1);
+    out.cells = out.posterior.size() / (out.height * out.width);
     return out;
 }
 
-ImagePhotons photons_of(int64_t height, int64_t width, const Vector<const int64_t>& first,
-                        const Vector<const int32_t>& bin, const Floats& number) {
-    if (size_of(first) != height * width + 1) throw nb::value_error("first must be (height * width + 1)");
-    if (size_of(bin) != size_of(number) || first.data()[height * width] != size_of(bin))
-        throw nb::value_error("bin and number must have one entry for each of first");
-    return {height, width, first.data(), bin.data(), number.data()};
+// A view of (H, W, cells) or (pixels, peaks) of volumes.
+template <std::vector<float> ImageVolumes::* values, bool in_cells>
+nb::object view(nb::handle_t<BoundImageVolumes> self) {
+    const auto& of = nb::cast<const BoundImageVolumes&>(self);
+    const float* const data = (of.*values).data();
+    if constexpr (in_cells)
+        return nb::cast(nb::ndarray<nb::numpy, const float>(data, {of.height, of.width, of.cells}, self));
+    return nb::cast(nb::ndarray<nb::numpy, const float>(data, {of.height * of.width, kImagePeaks}, self));
 }
 
-void likelihood(const BoundImageSetting& setting, int64_t height, int64_t width, Vector<const int64_t> first,
-                Vector<const int32_t> bin, Floats number, Floats ratio, int64_t y0, int64_t x0, Image out,
-                int threads) {
-    const ImagePhotons photons = photons_of(height, width, first, bin, number);
-    const ImagePart part{y0, y0 + static_cast<int64_t>(out.shape(0)), x0, x0 + static_cast<int64_t>(out.shape(1))};
-    if (y0 < 0 || x0 < 0 || part.y1 > height || part.x1 > width || size_of(ratio) != height * width ||
-        static_cast<int>(out.shape(2)) != setting.cells)
-        throw nb::value_error("out must be (rows, columns, cells) of the image, ratio (height * width)");
+nb::object candidate_features(const BoundImageSolver& self, const BoundImageVolumes& volumes,
+                              Vector<const int64_t> pixel) {
+    const std::vector<int64_t> given(pixel.data(), pixel.data() + size_of(pixel));
+    const int64_t pixels = self.solver->pixels();
+    if (static_cast<int64_t>(volumes.place.size()) != pixels * kImagePeaks)
+        throw nb::value_error("volumes must be those of the same image");
+    for (const int64_t p : given)
+        if (p < 0 || p >= pixels) throw nb::value_error("pixel must lie in the image");
+    std::vector<float> out(given.size() * kImagePeaks * kImageCandidateFeatures);
+    watched(nb::none(),
+            [&](const Watch& watch) { self.solver->candidate_features(volumes, given, out.data(), watch); });
+    return array_of(std::move(out), {given.size(), kImagePeaks, kImageCandidateFeatures});
+}
+
+nb::tuple choose(BoundImageSolver& self, const ImageNetworks* networks) {
     watched(nb::none(), [&](const Watch& watch) {
-        image_likelihood(setting, photons, part, ratio.data(), out.data(), threads, watch);
+        self.solver->choose(networks, watch);
+        self.solver->look(watch);
     });
+    const size_t pixels = static_cast<size_t>(self.solver->pixels());
+    return nb::make_tuple(array_of(self.solver->chosen().delay, {pixels}),
+                          array_of(self.solver->chosen().confidence, {pixels}));
 }
 
-void posterior(Image likelihood, Image one, Image other, nb::tuple narrow, float wide, float jump, Matrix<float> place,
-               Matrix<float> mass, bool broad, int threads) {
-    const int64_t height = static_cast<int64_t>(likelihood.shape(0)), width = static_cast<int64_t>(likelihood.shape(1)),
-                  cells = static_cast<int64_t>(likelihood.shape(2)), peaks = static_cast<int64_t>(place.shape(1));
-    expect("one and other must be of the likelihood's shape", {height, width, cells}, one, other);
-    expect("place and mass must be (pixels, peaks)", {height * width, peaks}, place, mass);
-    if (cells % 16 != 0) throw nb::value_error("cells must be a multiple of 16");
-    ImageLine step{};
-    for (int k = 0; k < 4; ++k) step.narrow[k] = nb::cast<float>(narrow[k]);
-    step.wide = wide;
-    step.jump = jump;
+nb::tuple plane_features(const BoundImageSolver& self) {
+    const ImagePart whole = self.solver->whole();
+    ImagePlaneFeatures out;
+    watched(nb::none(), [&](const Watch& watch) { out = self.solver->plane_features(0, whole.y1, watch); });
+    const size_t height = static_cast<size_t>(whole.y1), width = static_cast<size_t>(whole.x1);
+    return nb::make_tuple(array_of(std::move(out.features), {kImagePlaneFeatures, height, width}),
+                          array_of(std::move(out.delays), {kImageDelays, height, width}),
+                          array_of(std::move(out.log_signals), {kImageSignals, height, width}));
+}
+
+nb::object weigh(nb::ndarray<const float, nb::ndim<3>, nb::c_contig, nb::device::cpu> features,
+                 const ImageNetworks& networks, int threads) {
+    if (features.shape(0) != kImagePlaneFeatures) throw nb::value_error("features must be (features, height, width)");
+    if (networks.weights.size() <= ImageNetworks::kChoose)
+        throw nb::value_error("weights must be those of both networks");
+    const size_t height = features.shape(1), width = features.shape(2);
+    std::vector<float> out;
     watched(nb::none(), [&](const Watch& watch) {
-        image_posterior(likelihood.data(), one.data(), other.data(), height, width, static_cast<int>(cells), step,
-                        static_cast<int>(peaks), place.data(), mass.data(), broad, threads, watch);
+        out = image_weigh(features.data(), static_cast<int64_t>(height), static_cast<int64_t>(width),
+                          networks.weights.data() + ImageNetworks::kChoose, threads, watch);
     });
-}
-
-ImageCandidates candidates_of(const Image& posterior, const Image& broad, const Image& likelihood,
-                              const Matrix<const float>& place, const Matrix<const float>& mass, const Floats& signal,
-                              const Vector<const int64_t>& pixel, const Vector<const int32_t>& down,
-                              const Vector<const int32_t>& right) {
-    ImageCandidates task{};
-    task.height = static_cast<int64_t>(posterior.shape(0));
-    task.width = static_cast<int64_t>(posterior.shape(1));
-    const int64_t cells = static_cast<int64_t>(posterior.shape(2)), peaks = static_cast<int64_t>(place.shape(1)),
-                  pixels = task.height * task.width;
-    expect("broad and likelihood must be of the posterior's shape", {task.height, task.width, cells}, broad,
-           likelihood);
-    expect("place and mass must be (pixels, peaks)", {pixels, peaks}, place, mass);
-    if (size_of(signal) != pixels || size_of(down) != size_of(right) || peaks > kImageLanes)
-        throw nb::value_error("signal must be (pixels), down and right of one length");
-    for (int64_t k = 0; k < size_of(down); ++k)
-        if (std::abs(down.data()[k]) >= task.height || std::abs(right.data()[k]) >= task.width)
-            throw nb::value_error("offsets must be smaller than the image");
-    for (int64_t k = 0; k < size_of(pixel); ++k)
-        if (pixel.data()[k] < 0 || pixel.data()[k] >= pixels) throw nb::value_error("pixel must lie in the image");
-    task.posterior = posterior.data();
-    task.broad = broad.data();
-    task.likelihood = likelihood.data();
-    task.cells = static_cast<int>(cells);
-    task.peaks = static_cast<int>(peaks);
-    task.place = place.data();
-    task.mass = mass.data();
-    task.signal = signal.data();
-    task.pixel = pixel.data();
-    task.count = size_of(pixel);
-    task.down = down.data();
-    task.right = right.data();
-    task.offsets = static_cast<int>(size_of(down));
-    return task;
-}
-
-void features(Image posterior, Image broad, Image likelihood, Matrix<const float> place, Matrix<const float> mass,
-              Floats signal, Vector<const int64_t> pixel, Vector<const int32_t> down, Vector<const int32_t> right,
-              Image out, int threads) {
-    ImageCandidates task = candidates_of(posterior, broad, likelihood, place, mass, signal, pixel, down, right);
-    expect("out must be (pixels, peaks, 3 offsets + 3)", {task.count, task.peaks, 3 * task.offsets + 3}, out);
-    task.features = out.data();
-    watched(nb::none(), [&](const Watch& watch) { image_candidates(task, threads, watch); });
-}
-
-void choose(Image posterior, Image broad, Image likelihood, Matrix<const float> place, Matrix<const float> mass,
-            Floats signal, Vector<const int64_t> pixel, Vector<const int32_t> down, Vector<const int32_t> right,
-            Floats weights, int hidden, Vector<int32_t> chosen, Vector<float> confidence, int threads) {
-    ImageCandidates task = candidates_of(posterior, broad, likelihood, place, mass, signal, pixel, down, right);
-    const int64_t inputs = 3 * task.offsets + 3;
-    if (size_of(weights) != (inputs + 1) * hidden + (hidden + 1) * hidden + hidden + 1 + 3)
-        throw nb::value_error("weights must fit the offsets and `hidden`");
-    if (size_of(chosen) != task.count || size_of(confidence) != task.count)
-        throw nb::value_error("chosen and confidence must have one entry for each of pixel");
-    task.weights = weights.data();
-    task.hidden = hidden;
-    task.chosen = chosen.data();
-    task.confidence = confidence.data();
-    watched(nb::none(), [&](const Watch& watch) { image_candidates(task, threads, watch); });
-}
-
-void centroids(const BoundImageSetting& setting, int64_t height, int64_t width, Vector<const int64_t> first,
-               Vector<const int32_t> bin, Floats number, Floats ratio, Floats delay, int steps, Matrix<float> out,
-               int threads) {
-    const ImagePhotons photons = photons_of(height, width, first, bin, number);
-    expect("out must be (pixels, 5)", {height * width, kImageColumns}, out);
-    if (size_of(ratio) != height * width || size_of(delay) != height * width)
-        throw nb::value_error("ratio and delay must be (pixels)");
-    watched(nb::none(), [&](const Watch& watch) {
-        image_centroids(setting, photons, ratio.data(), delay.data(), steps, out.data(), threads, watch);
-    });
-}
-
-void planes(Image images, int64_t margin, float cells, float sigma, Vector<const int32_t> radii, Matrix<float> out,
-            int threads) {
-    const int64_t height = static_cast<int64_t>(images.shape(1)) - 2 * margin,
-                  width = static_cast<int64_t>(images.shape(2)) - 2 * margin - kImageLanes, windows = size_of(radii);
-    if (images.shape(0) != 4 || height < 1 || width < 1)
-        throw nb::value_error("images must be (4, height + 2 margin, width + 2 margin + 16)");
-    for (int64_t k = 0; k < windows; ++k)
-        if (radii.data()[k] < 0 || radii.data()[k] > margin) throw nb::value_error("radii must lie within the margin");
-    expect("out must be (height * width, windows * 7)", {height * width, windows * kImageMoments}, out);
-    const int64_t size = static_cast<int64_t>(images.shape(1) * images.shape(2));
-    ImagePlanes task{};
-    task.number = images.data();
-    task.offset = task.number + size;
-    task.delay = task.offset + size;
-    task.exposure = task.delay + size;
-    task.width = width;
-    task.margin = margin;
-    task.cells = cells;
-    task.sigma = sigma;
-    task.radii = radii.data();
-    task.windows = static_cast<int>(windows);
-    task.out = out.data();
-    watched(nb::none(), [&](const Watch& watch) { image_planes(task, 0, height, threads, watch); });
-}
-
-void convolve(Image images, Matrix<const float> weights, Floats bias, int side, bool rectified, Image out,
-              int threads) {
-    const int64_t inputs = static_cast<int64_t>(images.shape(0)), outputs = size_of(bias),
-                  height = static_cast<int64_t>(images.shape(1)) - 2,
-                  width = static_cast<int64_t>(images.shape(2)) - 18;
-    if (side != 1 && side != 3) throw nb::value_error("side must be 1 or 3");
-    expect("weights must be (inputs * side * side, outputs)", {inputs * side * side, outputs}, weights);
-    expect("out must be (outputs, height, width)", {outputs, height, width}, out);
-    ImageConvolution task{};
-    task.in = images.data();
-    task.plane = static_cast<int64_t>(images.shape(1) * images.shape(2));
-    task.pitch = static_cast<int64_t>(images.shape(2));
-    task.width = width;
-    task.inputs = static_cast<int>(inputs);
-    task.outputs = static_cast<int>(outputs);
-    task.side = side;
-    task.rectified = rectified;
-    task.weights = weights.data();
-    task.bias = bias.data();
-    task.out = out.data();
-    task.out_plane = height * width;
-    watched(nb::none(), [&](const Watch& watch) { image_convolution(task, height, threads, watch); });
+    return array_of(std::move(out), {kImageOutputs, height, width});
 }
 
 }  // namespace
 
 void bind_image(nb::module_& module) {
     nb::class_<BoundImageSetting>(module, "ImageSetting", "Pulse and cells of depth from a few photons a pixel.")
+        .def(nb::init<nb::object, int, int64_t, Doubles, Doubles, double>(), "recording"_a, nb::kw_only(), "cells"_a,
+             "first"_a, "density"_a, "score"_a, "sigma"_a)
+        .def_ro("cells", &BoundImageSetting::cells)
+        .def_ro("sigma", &BoundImageSetting::sigma);
+
+    nb::class_<ImageNetworks>(module, "ImageNetworks", "Weights of both networks, and where they hold.")
+        .def(nb::new_(&networks_of), "weights"_a, nb::kw_only(), "interval_factor"_a, "limits"_a)
+        .def("hold_for", &ImageNetworks::hold_for, nb::kw_only(), "signal"_a, "background"_a, "cells"_a, "side"_a,
+             "Whether they hold for mean photons a pixel, cells a period and pixels a side.");
+
+    nb::class_<BoundImageVolumes>(module, "ImageVolumes", "Posterior of each pixel of an image, and its peaks.")
+        .def_prop_ro("posterior", &view<&ImageVolumes::posterior, true>, "(H, W, cells).")
+        .def_prop_ro("likelihood", &view<&ImageVolumes::likelihood, true>, "(H, W, cells), of mean 1.")
+        .def_prop_ro("place", &view<&ImageVolumes::place, false>, "(pixels, peaks), cells.")
+        .def_prop_ro("mass", &view<&ImageVolumes::mass, false>, "(pixels, peaks), of the posterior within 2 cells.");
+
+    nb::class_<BoundImageSolver> solver(module, "ImageSolver", "Depth of one image from a few photons a pixel.");
+    solver
+        .def("__init__", &make, nb::kw_only(), "height"_a, "width"_a, "first"_a, "bin"_a, "number"_a, "efficiency"_a,
+             "volume_bytes"_a, "block_pixels"_a, "threads"_a)
+        .def("solve", &solve, "settings"_a, "networks"_a.none(), nb::kw_only(), "maps"_a.noconvert(),
+             "flags"_a.noconvert(), "All steps: `maps` (maps, pixels) of native/image/solver.h, and `flags` (pixels).")
+        .def("begin", &begin, "setting"_a, "The light, from a first round of delays.")
+        .def("light", &light, "Signal and background (pixels), photons of an exposure that is never blind.")
         .def(
-            "__init__",
-            [](BoundImageSetting* self, nb::object recording, int cells, int phases, int first,
-               Matrix<const float> table, float low, Floats density, Floats score, float near_low, float near_high,
-               float least) {
-                new (self) BoundImageSetting(setting_of(recording, cells, phases, first, table, low, density, score,
-                                                        near_low, near_high, least));
-            },
-            "recording"_a, nb::kw_only(), "cells"_a, "phases"_a, "first"_a, "table"_a, "low"_a, "density"_a, "score"_a,
-            "near_low"_a, "near_high"_a, "least"_a);
-    module.def("image_likelihood", &likelihood, "setting"_a, nb::kw_only(), "height"_a, "width"_a, "first"_a, "bin"_a,
-               "number"_a, "ratio"_a, "y0"_a, "x0"_a, "out"_a.noconvert(), "threads"_a,
-               "Likelihoods (rows, columns, cells) of a part of an image.");
-    module.def("image_posterior", &posterior, "likelihood"_a.noconvert(), "one"_a.noconvert(), "other"_a.noconvert(),
-               nb::kw_only(), "narrow"_a, "wide"_a, "jump"_a, "place"_a.noconvert(), "mass"_a.noconvert(), "broad"_a,
-               "threads"_a,
-               "Sum-product on both comb trees: posterior into `one`, its sums over 17 cells into `other`.");
-    module.def("image_features", &features, "posterior"_a.noconvert(), "broad"_a.noconvert(),
-               "likelihood"_a.noconvert(), nb::kw_only(), "place"_a, "mass"_a, "signal"_a, "pixel"_a, "down"_a,
-               "right"_a, "out"_a.noconvert(), "threads"_a,
-               "Features (pixels, peaks, features) of the candidates of some pixels.");
-    module.def("image_choose", &choose, "posterior"_a.noconvert(), "broad"_a.noconvert(), "likelihood"_a.noconvert(),
-               nb::kw_only(), "place"_a, "mass"_a, "signal"_a, "pixel"_a, "down"_a, "right"_a, "weights"_a, "hidden"_a,
-               "chosen"_a.noconvert(), "confidence"_a.noconvert(), "threads"_a,
-               "Index of the candidate of some pixels that a network chooses, and its probability.");
-    module.def("image_centroids", &centroids, "setting"_a, nb::kw_only(), "height"_a, "width"_a, "first"_a, "bin"_a,
-               "number"_a, "ratio"_a, "delay"_a, "steps"_a, "out"_a.noconvert(), "threads"_a,
-               "(pixels, 5): signal photons, their centroid, exposure of pulse and background, photons in the window.");
-    module.def("image_planes", &planes, "images"_a.noconvert(), nb::kw_only(), "margin"_a, "cells"_a, "sigma"_a,
-               "radii"_a, "out"_a.noconvert(), "threads"_a, "Planes of growing windows: (pixels, windows * 7).");
-    module.def("image_convolve", &convolve, "images"_a.noconvert(), nb::kw_only(), "weights"_a, "bias"_a, "side"_a,
-               "rectified"_a, "out"_a.noconvert(), "threads"_a, "Convolution (outputs, height, width) of an image.");
+            "parts", [](const BoundImageSolver& self) { return self.solver->parts(); }, "Parts of the image.")
+        .def("volumes", &volumes, "Posteriors, and the likelihoods that they come from.")
+        .def("candidate_features", &candidate_features, "volumes"_a, "pixel"_a,
+             "(pixels, peaks, features) that the first network reads of some pixels.")
+        .def("choose", &choose, "networks"_a.none(), "Delay, in cells, and confidence (pixels) that are chosen.")
+        .def("plane_features", &plane_features,
+             "(features, H, W) that the second network reads; delays and logarithms of signals that it weighs.");
+    module.def("image_weigh", &weigh, "features"_a, "networks"_a, "threads"_a,
+               "Outputs (outputs, H, W) of the second network.");
+
+    const ImageOffsets offsets;
+    nb::list pixels;
+    for (int k = 0; k < kImageOffsets; ++k) pixels.append(nb::make_tuple(offsets.down[k], offsets.right[k]));
+    nb::dict sizes;
+    sizes["lanes"] = kImageLanes;
+    sizes["phases"] = kImagePhases;
+    sizes["maps"] = static_cast<int>(kImageMaps);
+    sizes["peaks"] = kImagePeaks;
+    sizes["hidden"] = kImageHidden;
+    sizes["channels"] = kImageChannels;
+    sizes["features"] = kImageCandidateFeatures;
+    sizes["plane_features"] = kImagePlaneFeatures;
+    sizes["delays"] = kImageDelays;
+    sizes["signals"] = kImageSignals;
+    sizes["outputs"] = kImageOutputs;
+    module.attr("IMAGE_SIZES") = sizes;
+    module.attr("IMAGE_OFFSETS") = nb::tuple(pixels);
+    module.attr("IMAGE_PRIOR") = nb::make_tuple(kImageStepSigma, kImageWide, kImageJump);
+    module.attr("IMAGE_SETTLED") = kImageSettled;
+    module.attr("IMAGE_OUTLIER_SIGMA") = kImageOutlierSigma;
+    module.attr("IMAGE_BRIGHT") = kImageBright;
+    module.attr("IMAGE_LEVEL") = kImageLevel;
 }
 
 }  // namespace mars

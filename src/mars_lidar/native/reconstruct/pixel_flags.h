@@ -4,6 +4,6 @@
 
 namespace mars {
 
-enum Flag : uint8_t { kEmpty = 1, kNoSignal = 2, kSaturated = 4, kUnconverged = 8, kMoreReturns = 16 };
+enum Flag : uint8_t { kEmpty = 1, kNoSignal = 2, kSaturated = 4, kUnconverged = 8, kMoreReturns = 16, kFilled = 32 };
 
 }  // namespace mars

@@ -29,14 +29,13 @@ void draw_starts(const Job& job, const WaveformBlock& block, std::vector<int32_t
     GapSearch search;
     cycle.resize(block.pixels * block.realizations);
     phase.resize(block.pixels * block.realizations);
-    for (int64_t p = 0, k = 0; p < block.pixels; ++p) {
-        if (block.stop->load(std::memory_order_relaxed)) return;
-        const int64_t pixel = block.first_pixel + p;
-        const WarmedUp state(job, pixel, WaveformLight(job, pixel));
-        const uint32_t first = job.first_realization + static_cast<uint32_t>(block.first_realization);
-        for (int64_t r = 0; r < block.realizations; ++r, ++k)
-            state.draw(first + static_cast<uint32_t>(r), search, cycle[k], phase[k]);
-    }
+    const uint32_t first = job.first_realization + static_cast<uint32_t>(block.first_realization);
+    auto pixel = [&](int64_t p) { return block.first_pixel + p; };
+    auto light = [&](int64_t at) { return WaveformLight(job, at); };
+    visit_warmed_up(job, block.pixels, *block.stop, pixel, light, [&](int64_t p, auto& state) {
+        for (int64_t r = 0, k = p * block.realizations; r < block.realizations; ++r, ++k)
+            state.draw(job.pixel_index[pixel(p)], first + static_cast<uint32_t>(r), search, cycle[k], phase[k]);
+    });
 }
 
 }  // namespace

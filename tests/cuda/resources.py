@@ -1,4 +1,4 @@
-"""What the kernels of `mars_lidar.cuda` take, from compiling them without a GPU: `python -m benchmarks.gpu_resources`.
+"""What the kernels of `mars_lidar.cuda` take, from compiling them without a GPU: `python -m tests.cuda.resources`.
 
 Writes benchmarks/results/gpu-resources.md.
 """
@@ -8,7 +8,6 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from benchmarks.nvrtc import Resources, compiled, compiled_code, version
 from mars_lidar import _core
 from mars_lidar.cuda.kernels import (
     AHEAD,
@@ -26,8 +25,9 @@ from mars_lidar.engines.pixels import pulse_frame
 from mars_lidar.instrument.detector import Detector
 from mars_lidar.instrument.pulse import GaussianPulse
 from mars_lidar.instrument.system import System
+from tests.cuda.nvrtc import Resources, compiled, compiled_code, version
 
-RESULT = Path(__file__).parent / "results" / "gpu-resources.md"
+RESULT = Path(__file__).parents[2] / "benchmarks" / "results" / "gpu-resources.md"
 MODES = ("non-paralyzable", "paralyzable", "synchronous", "gated")
 ARCHITECTURES = ("sm_80", "sm_90")
 # NVIDIA H200 SXM, data sheet and CUDA C++ programming guide (compute capability 9.0)
@@ -75,7 +75,7 @@ def main() -> None:
     lines = [
         "# Kernels on CUDA",
         "",
-        f"Made by `python -m benchmarks.gpu_resources` with NVRTC {version()}; compiled, not run.",
+        f"Made by `python -m tests.cuda.resources` with NVRTC {version()}; compiled, not run.",
         "",
         "## Engine `exact`",
         "",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -138,8 +140,7 @@ def test_counts_of_half_precision_are_refused(half):
 def test_blocks_of_another_size_are_solved_alike(monkeypatch):
     at = point(*AT)
     whole = expected_histogram(*at, system())
-    monkeypatch.setattr(forward, "_ROWS", 1)
-    monkeypatch.setattr(forward, "_BLOCK", 1)
+    monkeypatch.setattr(forward, "TOLERANCES", replace(forward.TOLERANCES, cached_values=1, photons=1))
     parts = expected_histogram(*at, system())
     torch.testing.assert_close(parts, whole, rtol=1e-11, atol=0)
     weights = torch.arange(20.0, dtype=torch.float64)

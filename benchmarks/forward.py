@@ -96,10 +96,11 @@ def _coarse(bins: int, config: Config) -> Cases:
     at = [torch.from_numpy(one) for one in _light(random, _MANY, 100.0)]
     counts = torch.from_numpy(random.poisson(30.0, (_MANY, bins)).astype(float))
     cases: Cases = {}
-    again = ", re-armed in the pulse"
+    again, twice = ", re-armed in the pulse", ", re-armed after two dead times"
     for sigmas, dead, words in (
-        (0.34, 50.0, " (not cut)"), (1.0, 75.0, ""), (1.0, 99.0, again), (3.0, 75.0, ""), (3.0, 99.0, again)
-    ):  # fmt: skip
+        (0.34, 50.0, " (not cut)"),
+        *((wide, dead, words) for wide in (1.0, 3.0) for dead, words in ((75.0, ""), (99.0, again), (51.0, twice))),
+    ):
         system = ml.System(
             period_ns=100.0,
             cycles=config.cycles,

@@ -194,14 +194,42 @@ def test_expected_histogram_is_the_exact_mean(start, dead_ns):
         np.testing.assert_allclose(found, closed, rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.full
+@pytest.mark.parametrize(
+    ("bins", "sigma", "dead", "light"),
+    [
+        (32, 1.3, 42.0, (3.0, 1.0, 40.3)),  # elsewhere
+        (16, 14.0, 91.6, (5.8, 1.7, 34.2)),  # re-armed within the pulse of the next period, locked
+        (128, 0.38, 1.26, (8.7, 0.14, 36.9)),  # within the same pulse
+    ],
+)
+def test_gradients_in_coarse_bins_are_those_of_the_exact_mean(bins, sigma, dead, light):
+    """Differences of the native recursion, of fourth order; norm over the bins to 4e-3, as the docstring says."""
+    one = system(dead, bins=bins, pulse=ml.GaussianPulse(sigma_ns=sigma), cycles=1000)
+    steps = np.diag([1e-3 * light[0], 1e-3 * light[1], 1e-3 * sigma])
+    for step, jacobian in zip(steps, _jacobian(light, one), strict=True):
+        moved = [
+            ml.statistics.mean_histogram(ml.Flux(*(light + k * step)), one, tolerance=1e-9).ravel()
+            for k in (-2, -1, 1, 2)
+        ]
+        exact = (moved[0] - 8.0 * moved[1] + 8.0 * moved[2] - moved[3]) / (12.0 * step.sum())
+        assert np.linalg.norm(jacobian - exact) < 4e-3 * np.linalg.norm(exact)
+
+
+def _jacobian(light, one):
+    at = torch.tensor(light, dtype=torch.float64)
+    return torch.func.jacrev(lambda x: expected_histogram(x[0], x[1], x[2], one))(at).T.numpy()
+
+
 def test_efficiency_and_dark_counts_are_those_of_the_exact_mean():
     """Photons on the pixel in, as everywhere: the model detects a share of them and adds what is dark."""
     dim = system().replace(
         detector=ml.Detector(dead_time_ns=42.3, detection_efficiency=0.3, dark_count_hz=2e6), cycles=2000
     )
-    at = point(*AT)
+    delay_ns = [40.1, 97.0, 3.3]  # at 40.0 the window of cut bins moves by a bin, where the value jumps by 3e-7
+    at = point(*AT[:2], delay_ns)
     mean = expected_histogram(*at, dim, refine=4)
-    exact = ml.statistics.mean_histogram(ml.Flux(AT[0], AT[1], AT[2]), dim)
+    exact = ml.statistics.mean_histogram(ml.Flux(AT[0], AT[1], delay_ns), dim)
     assert np.abs(mean.detach().numpy() - exact).sum(-1).max() < 2e-3 * exact.sum(-1).min()
     counts = mean.detach().round()
     likely = histogram_log_likelihood(counts, *at, dim)

@@ -6,7 +6,9 @@ at the true light must vanish. What remains, times the inverse curvature, is the
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -103,6 +105,15 @@ def test_bias_of_simulated_exposures(bins, sigma, dead, light):
     inverse = torch.linalg.inv(torch.cov(score.T))  # the information, estimated by the scatter of the score
     off = ((score @ inverse).mean(0) / inverse.diagonal().sqrt()).numpy()
     assert (np.abs(off) < 0.1 + 4.0 / exposures**0.5).all(), off
+
+
+@pytest.mark.full
+def test_the_fit_of_the_page_ends_where_reconstruct_does():
+    """64 x 64 pixels of 64 bins by Newton's method on the gradient: the page's own assertions, half an error."""
+    text = (Path(__file__).parents[2] / "docs" / "learn.md").read_text()
+    (code,) = (block for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if "def log_likelihood" in block)
+    assert code.count("\nassert ") == 3
+    exec(code, {"torch": torch, "ml": ml, "histogram_log_likelihood": histogram_log_likelihood})
 
 
 @pytest.mark.full

@@ -485,8 +485,9 @@ def expected_histogram(
     adds where it began armed (docs/joint_law.md, 3.2 and 4.6). Derivatives are those of the solution, by solutions
     of the same equation or of the transposed one, not of the steps that led there. Exact, up to the grid, where the
     exposure forgets its start before its end; `mars_lidar.mean_histogram` needs no such condition. The
-    error of the grid falls with the square of `refine`: at the default a total variation below 2e-4, and 1e-3
-    where the dead time is within 8 sigma of 0 or of whole periods (bins of up to 3 sigma).
+    error of the grid falls with the square of `refine`: at the default a total variation below 4e-4, and 1e-3
+    where the dead time is within 8 sigma of 0 or of whole periods (bins of up to 3 sigma); derivatives are within 4e-3
+    of those of the exact mean (norm over the bins; median 1e-4).
 
     Parameters
     ----------
@@ -495,7 +496,7 @@ def expected_histogram(
     system
         Non-paralyzable, without gate, or effects beyond detection efficiency and dark counts.
     refine
-        Parts that each bin is cut into for the solution; None: four to a sigma of the pulse, eight where the dead
+        Parts that each bin is cut into for the solution; None: four to a sigma of the pulse, 16 where the dead
         time is within 8 sigma of 0 or of whole periods (1 for a measured pulse).
 
     Returns
@@ -549,11 +550,11 @@ def expected_histogram(
 
 
 def _refined(system: System) -> int:
-    """Parts of a bin: twice as many where a pixel that registered the pulse is re-armed within a pulse."""
+    """Parts of a bin: four times as many where a pixel that registered the pulse is re-armed within a pulse."""
     if not isinstance(system.pulse, GaussianPulse):
         return 1
     sigma, beyond = system.pulse.sigma_ns, math.remainder(system.detector.dead_time_ns, system.period_ns)
-    fine = _FINE * (2.0 if abs(beyond) < 8.0 * sigma else 1.0)
+    fine = _FINE * (4.0 if abs(beyond) < 8.0 * sigma else 1.0)
     return max(1, math.ceil(fine * system.bin_ns / sigma))
 
 

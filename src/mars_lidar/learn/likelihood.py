@@ -3,9 +3,10 @@
 A registration blinds its pixel for the dead time, so that the registrations of the preceding dead time give the passes
 in which the pixel is armed at the start of a bin, and those of one dead time earlier the passes that re-arm in it. Both
 need to know where in their bins registrations lie. In a bin of even light they are spread evenly; in the bins that
-the pulse reaches they are not, and these alone are cut into cells. Registrations of a bin are distributed over its
-cells as a pixel registers that is armed as the histogram says, cell by cell. Where the passes that re-arm under the
-pulse are themselves registrations of the pulse, that distribution is its own cause, and is found by repetition.
+the pulse reaches they are not, and these alone are cut into parts, in which light and registrations are linear.
+Registrations of a bin are distributed over its parts as a pixel registers that is armed as the histogram says, part by
+part. Where the passes that re-arm under the pulse are themselves registrations of the pulse, that distribution depends
+on itself, and is the fixed point of an iteration.
 """
 
 from __future__ import annotations
@@ -121,9 +122,10 @@ def histogram_log_likelihood(
     Unbiased to 0.1 of the Cramer-Rao bound's standard deviation at 1000 cycles, for bins of up to 3 widths (sigma) of
     the pulse, S up to 10, B up to 5 and any dead time (200 random instruments against the exact mean histogram;
     the bias in these units grows with the square root of the cycles). Not so where fewer than about one of the
-    passes of the pulse ends without registration in an exposure that began armed: 0.3 to 0.7. Cost: O(bins) for
-    bins below a third of the pulse's width; in wider ones the bins that the pulse reaches are cut into parts of a third
-    of it, of an eighth where dead time re-arms the pixel within the pulse (docs/learn.md has the times).
+    passes of the pulse ends without registration in an exposure that began armed: 0.3 to 0.7. Where the window of
+    bins that are cut moves by a bin, the value jumps by about 3e-7. Cost: O(bins); where
+    bins are wider than a third of the pulse's width, or dead time re-arms the pixel within the pulse, the bins that the
+    pulse reaches are cut into parts of a third of it (docs/learn.md has the times).
 
     Examples
     --------
@@ -155,7 +157,7 @@ def histogram_log_likelihood(
 
 def _passed(counts: torch.Tensor, signal: Any, background: Any, delay_ns: Any, system: System) -> torch.Tensor:
     """Terms (..., bins) of the likelihood."""
-    parts, rounds, everywhere = _cut(system)
+    parts, rounds, after = _cut(system)
     if parts > 1:
         shape = torch.broadcast_shapes(counts.shape[:-1], signal.shape)  # type: ignore[no-untyped-call]
         counts = counts.expand(*shape, system.bins)
@@ -164,7 +166,7 @@ def _passed(counts: torch.Tensor, signal: Any, background: Any, delay_ns: Any, s
     delay = Delay(system.dead_time_periods, system.bins)
     nearer: Any = 1.0 - delay.part
     if parts > 1:
-        pulse = _CutBins(counts, signal, background, delay_ns, system, parts, everywhere)
+        pulse = _CutBins(counts, signal, background, delay_ns, system, parts, after)
         nearer = pulse.distributed(rounds)
     blind, near, far = _rearmings(counts, delay, system, nearer)
     p, q = fired(photons)
@@ -179,7 +181,10 @@ def _passed(counts: torch.Tensor, signal: Any, background: Any, delay_ns: Any, s
     return torch.xlogy(counts, expected.clamp_min(1e-300)) + torch.xlogy(rest, silent / rest.clamp_min(1e-12))
 
 
-_REACH = 5.5  # sigma of a Gaussian pulse on each side; beyond it there is 4e-8 of its light
+_PART = 0.35  # widths of the pulse in which light and registrations pass for linear
+_STEEPEST = 2.0  # slope over a part at which light, linear in it, is 0 at one end
+_DARKEST = 600.0  # photons in a bin beyond which no pixel stays armed through it; exp of more overflows
+_REACH = 5.0  # sigma of a Gaussian pulse on each side; beyond it there is 6e-7 of its light
 
 
 def _reach(system: System) -> tuple[float, float]:
@@ -190,28 +195,30 @@ def _reach(system: System) -> tuple[float, float]:
 
 
 def _cut(system: System) -> tuple[int, int, bool]:
-    """Parts of a bin, rounds in which registrations are distributed over them, and whether all bins are cut.
+    """Parts of a bin, rounds in which registrations are distributed over them, and whether those that follow are cut.
 
-    The error falls with the square of the parts. Most are needed where a pixel that registered the pulse is re-armed
-    within the pulse, of the same period or of a later one; elsewhere one round does, or two where the bins, not the
-    pulses, meet. Where two dead times lead from pulse to pulse, the bins between them matter as much as those of the
-    pulse. Measured over random instruments (tests/learn/test_likelihood.py).
+    One round does where a dead time leads from no bin of the pulse to another; five where it does, of the same period
+    or of a later one. Where two dead times lead from pulse to pulse, the bins that they lead to matter as much as those
+    of the pulse. Measured over random instruments (tests/learn/test_likelihood.py).
     """
     width = relative_width(system) * system.period_ns
-    low, high = (-4.0 * width, 4.0 * width) if isinstance(system.pulse, GaussianPulse) else _reach(system)
+    low, high = _reach(system)
+    parts = max(2, math.ceil(system.bin_ns / (_PART * width)))
     once, twice = (abs(math.remainder(k * system.detector.dead_time_ns, system.period_ns)) for k in (1, 2))
     if once < high - low:
-        return max(4, math.ceil(8.0 * system.bin_ns / width)), 8, False
-    if system.bin_ns <= 0.35 * width:
+        return parts, 5, False
+    if system.bin_ns <= _PART * width:
         return 1, 1, False
-    return max(2, math.ceil(3.5 * system.bin_ns / width)), 2, twice < high - low + system.bin_ns
+    return parts, 2, twice < high - low + system.bin_ns
 
 
 class _CutBins:
-    """The W bins of each pixel that the pulse reaches, or all, cut into m parts; `place` (..., W) their numbers.
+    """The bins of each pixel that the pulse reaches, W in all, cut into m parts; `place` (..., W) their numbers.
+
+    `after`: those one and two dead times later are among them.
 
     `distributed` sets the registrations that are `expected` in the parts (..., W, m), and the `passes` (..., W) in
-    which the pixel is armed at the start of a bin or re-armed in it.
+    which the pixel is armed at the start of a bin or re-armed in it. Light and registrations are linear within a part.
     """
 
     def __init__(
@@ -222,80 +229,117 @@ class _CutBins:
         delay_ns: Any,
         system: System,
         parts: int,
-        everywhere: bool,
+        after: bool,
     ) -> None:
         n, m, period = system.bins, parts, system.period_ns
-        self._counts, self._system, self._parts = counts, system, m
-        self._delay, fine = Delay(system.dead_time_periods, n), Delay(system.dead_time_periods, n * m)
+        self._counts, self._system = counts, system
+        self._delay, self._fine = Delay(system.dead_time_periods, n), Delay(system.dead_time_periods, n * m)
         low, high = _reach(system)
-        wide = n if everywhere else min(n, math.ceil((high - low) / system.bin_ns) + 1)
+        wide, back = math.ceil((high - low) / system.bin_ns) + 1, self._delay.shift + 1
+        reached = {k % n for turn in range(3 if after else 1) for k in range(turn * (back - 1), turn * back + wide)}
+        offsets = {k: number for number, k in enumerate(sorted(reached))}
         delay_ns = torch.remainder(delay_ns, period)
-        first = torch.floor((delay_ns.detach() + low) / system.bin_ns).long() if wide < n else delay_ns.long() * 0
-        first = first.unsqueeze(-1)
-        numbers = torch.arange(wide * m + 1, device=counts.device)
-        self.place = (first + numbers[:wide]) % n
-        cells = first * m + numbers
-        energy = wrapped_energy(system, cells.to(signal.dtype) * (period / (n * m)) - delay_ns.unsqueeze(-1))
-        light = signal.unsqueeze(-1) * energy.diff(dim=-1).clamp_min(0.0) + background.unsqueeze(-1) / (n * m)
-        light = light.unflatten(-1, (wide, m))
+        first = torch.floor((delay_ns.detach() + low) / system.bin_ns).long().unsqueeze(-1)
+        self.place = (first + torch.tensor(list(offsets), device=counts.device)) % n
+        # edges of the parts of each bin, and of a part more on either side, for the slopes
+        cells = (self.place * m).unsqueeze(-1) + torch.arange(-1, m + 2, device=counts.device)
+        energy = wrapped_energy(system, cells.to(signal.dtype) * (period / (n * m)) - delay_ns[..., None, None])
+        light = signal[..., None, None] * energy.diff(dim=-1).clamp_min(0.0) + background[..., None, None] / (n * m)
+        self._slope = (0.5 * (light[..., 2:] - light[..., :-2]) / light[..., 1:-1]).clamp(-_STEEPEST, _STEEPEST)
+        light = light[..., 1:-1]
         self._p, self._q = fired(light)
-        self.expected = torch.exp(light - light.cumsum(-1)) * self._p  # of a pixel armed at the start of the bin
+        since = light.cumsum(-1).clamp_max(_DARKEST)
+        self._armed, self._lit = torch.exp(light - since), torch.exp(since)
+        self.expected = self._armed * self._p  # of a pixel armed at the start of the bin
         self.passes = self.expected.sum(-1)
-        # the bins one dead time earlier, some of which may be of the pulse themselves
-        back = -(-(fine.shift + 1) // m)
-        self._from = back * m - fine.shift
-        number = -(-(self._from + wide * m) // m)
-        near = [(k - back) % n for k in range(number)]
-        self._own = [k if k < wide else None for k in near]
-        earlier = (first - back + torch.arange(number, device=counts.device)) % n
-        self._earlier = counts.gather(-1, earlier)
-        wraps = [cells[..., :-1] % (n * m) < fine.shift + k for k in range(2)]
-        within = [_within(system, self._delay.whole + k) for k in range(2)]
-        self._near, self._far = (torch.where(wrap, within[1], within[0]).to(counts.dtype) for wrap in wraps)
-        self._near, self._far = (1.0 - fine.part) * self._near, fine.part * self._far
-        self._part = fine.part
+        # the two bins one dead time earlier than each, some of which may be of these themselves
+        own = [offsets.get((k - back + turn) % n, len(offsets)) for k in offsets for turn in range(2)]
+        self._chained, self._own = min(own) < len(offsets), torch.tensor(own, device=counts.device)
+        earlier = (self.place.unsqueeze(-1) - back + torch.arange(2, device=counts.device)) % n
+        self._earlier = counts.gather(-1, earlier.flatten(-2)).unflatten(-1, earlier.shape[-2:])
+        self._mine = counts.gather(-1, self.place)
+        shares = [_within(system, self._delay.whole + k) for k in range(2)]
+        wraps = [cells[..., 1:-2] < self._fine.shift + k for k in range(2)]
+        self._weights = [torch.where(wrap, shares[1], shares[0]).to(light) for wrap in wraps]
 
     def distributed(self, rounds: int) -> torch.Tensor:
-        """Share (..., bins) of each bin's registrations that re-arm the pixel in the nearer of two bins."""
-        m, part, counts = self._parts, self._delay.part, self._counts
+        """Share (..., bins) of each bin's registrations that re-arm the pixel in the nearer of two bins.
+
+        Rounds of a fixed point, from the third on from the least residual on the line through the last two
+        (Anderson 1965), bin by bin. The slopes of the registrations are taken from the first two rounds.
+        """
+        part, counts, m = self._delay.part, self._counts, self.expected.shape[-1]
         even = counts.new_full((*self.place.shape[:-1], m), 1.0 / m)
         nearer = ((1.0 - part) * m - torch.arange(m, dtype=counts.dtype, device=counts.device)).clamp(0.0, 1.0)
+        split = 0.5 * nearer * (1.0 - nearer)  # of a slope of 1 the excess in the later share
         evenly = torch.full_like(counts, 1.0 - part)
-        chained = any(own is not None for own in self._own)
-        shares = evenly
-        mine = counts.gather(-1, self.place)
-        for turn in range(rounds if chained else 1):
-            spread = self._spread()
-            if chained:
-                shares = evenly.scatter(-1, self.place, (spread * nearer).sum(-1))
-            if chained or turn == 0:
-                blind = _rearmings(counts, self._delay, self._system, shares)[0].gather(-1, self.place)
-            sources = torch.stack([even if own is None else spread[..., own, :] for own in self._own], -2)
-            self._pass(mine, blind, (self._earlier.unsqueeze(-1) * sources).flatten(-2))
-        return evenly.scatter(-1, self.place, (self._spread() * nearer).sum(-1))
+        blind, _, far = _rearmings(counts, self._delay, self._system, evenly)
+        blind, far = ((values.gather(-1, self.place)) for values in (blind - far, far / max(part, 1e-300)))
+        spread, before, off = self._spread(), None, None
+        slopes: torch.Tensor | float = 0.0
+        self._set_rearming(slopes)
+        for turn in range(rounds if self._chained else 1):
+            sources = self._earlier_bins(spread, even)
+            late = slopes if isinstance(slopes, float) else slopes[..., 0, :]
+            later = far * (1.0 - (sources[..., 0, :] * (nearer - split * late)).sum(-1))
+            change = self._pass(blind + later, self._earlier.unsqueeze(-1) * sources)
+            if turn < 2:
+                own = (self._slope + change).clamp(-_STEEPEST, _STEEPEST)
+            if turn < 2 and self._chained:
+                slopes = self._earlier_bins(own, torch.zeros_like(even))
+                self._set_rearming(slopes)
+            last, before, last_off = before, self._spread(), off
+            off, spread = before - spread, before
+            if last is not None and last_off is not None:
+                turned = off - last_off
+                ahead = (off * turned).sum(-1, keepdim=True) / turned.square().sum(-1, keepdim=True).clamp_min(1e-30)
+                spread = before - ahead.clamp(-1.0, 1.0) * (before - last)
+        return evenly.scatter(-1, self.place, (self._spread() * (nearer - split * own)).sum(-1))
 
     def _spread(self) -> torch.Tensor:
         """Share of a bin's registrations in each of its parts."""
         return self.expected / self.expected.sum(-1, keepdim=True).clamp_min(1e-300)
 
-    def _pass(self, mine: torch.Tensor, blind: torch.Tensor, earlier: torch.Tensor) -> None:
-        """Go through the parts of all bins with the registrations (..., parts) of one dead time earlier."""
-        start, long = self._from, self.place.shape[-1] * self._parts
-        near, far = (
-            self._near * earlier[..., start : start + long],
-            self._far * earlier[..., start - 1 : start - 1 + long],
-        )
-        whole = (*near.shape[:-1], -1, self._parts)
-        rearmed = (near + far).reshape(whole)
-        again = ((1.0 - self._part) * near + (2.0 - self._part) * far).reshape(whole) * self._q
-        staying, silent = rearmed - again, 1.0 - self._p
-        within = rearmed.sum(-1)
-        armed = torch.maximum(self._system.cycles - blind, (mine - within).clamp_min(0.0))
-        self.passes, means = armed + within, []
-        for k in range(self._parts):
-            means.append(armed * self._p[..., k] + again[..., k])
-            armed = armed * silent[..., k] + staying[..., k]
-        self.expected = torch.stack(means, -1)
+    def _earlier_bins(self, own: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
+        """Values (..., W, 2, m) in the two bins one dead time earlier than each: of `own` (..., W, m), or `other`."""
+        every = torch.cat([own, other.unsqueeze(-2)], -2)
+        return every.index_select(-2, self._own).unflatten(-2, (-1, 2))
+
+    def _set_rearming(self, slopes: torch.Tensor | float) -> None:
+        """Weights of earlier registrations: in what re-arms in a part, in what of it registers there, in the rest.
+
+        A part is re-armed by the last (1 - f) of one earlier part and the first f of the next. With light 1 + b (x -
+        1/2) over the part and registrations 1 + a (x - 1/2) over theirs, these shares are (1 - f, f) -/+ a f (1 - f) /
+        2, and twice the light that follows a re-arming is w (1 - a w / 6 + ...), to first order in a and b.
+        """
+        f, m = self._fine.part, self.expected.shape[-1]
+        start = (self._delay.shift + 1) * m - self._fine.shift
+        self._rearming = []
+        for k, share in enumerate((1.0 - f, f)):
+            span = slice(start - k, start - k + m)
+            a = slopes if isinstance(slopes, float) else slopes.flatten(-2)[..., span]
+            rearmed = self._weights[k] * (share + (k - 0.5) * f * (1.0 - f) * a)
+            follows = 1.0 + k - f + share * ((3.0 - 2.0 * share) * self._slope - share * a) / 6.0
+            again = follows * self._q * rearmed
+            self._rearming.append((span, rearmed, again, (rearmed - again) * self._lit))
+
+    def _pass(self, blind: torch.Tensor, earlier: torch.Tensor) -> torch.Tensor:
+        """Go through the parts of all bins with the registrations (..., W, 2, m) of one dead time earlier.
+
+        Returns the change of the armed share over each part, relative to its mean.
+        """
+        within: Any = 0.0
+        again, staying = 0.0, 0.0
+        for span, rearmed, fires, stays in self._rearming:
+            source = earlier.flatten(-2)[..., span]
+            within = within + (rearmed * source).sum(-1)
+            again, staying = again + fires * source, staying + stays * source
+        armed = torch.maximum(self._system.cycles - blind, (self._mine - within).clamp_min(0.0))
+        self.passes = armed + within
+        begun = armed.unsqueeze(-1) + torch.nn.functional.pad(staying.cumsum(-1), (1, 0))
+        start, end = self._armed * begun[..., :-1], begun[..., 1:] / self._lit
+        self.expected = again + self._p * start
+        return 2.0 * (end - start) / (end + start).clamp_min(1e-300)
 
 
 def _rearmings(

@@ -506,3 +506,21 @@ def test_a_pipe_without_unicode_gets_plain_text(tmp_path):
     )
     assert b"1 ? " in done.stdout
     assert done.stderr == b""
+
+
+@pytest.mark.full
+@pytest.mark.skipif(sys.platform != "linux", reason="needs a limit on the address space")
+@pytest.mark.parametrize("mebibytes", [300, 500, 700, 850])
+@pytest.mark.parametrize("command", ["generate room --scene-seeds 3", "simulate --scene room --no-picture"])
+def test_a_small_address_space_is_one_line(command, mebibytes, tmp_path):
+    """Threads that cannot start, here or in Zarr, are neither a traceback nor waited for without end."""
+    import resource
+
+    def limit() -> None:
+        resource.setrlimit(resource.RLIMIT_AS, (mebibytes << 20, mebibytes << 20))
+
+    line = [sys.executable, "-m", "mars_lidar", *command.split(), "--size", "32", "-o", str(tmp_path / "a.zarr")]
+    done = subprocess.run(line, capture_output=True, text=True, preexec_fn=limit, timeout=300)
+    assert "Traceback" not in done.stderr
+    assert done.returncode == 0 or done.stderr.startswith("mars-lidar: "), done.stderr
+    assert mebibytes > 300 or done.returncode != 0

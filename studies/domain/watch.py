@@ -66,9 +66,10 @@ class Watched:
                 subject = told
         except (EOFError, OSError):
             self.seconds += patience
-            if self._ended() in (-signal.SIGPROF, -signal.SIGALRM):
+            code = self._ended()
+            if code in (-signal.SIGPROF, -signal.SIGALRM):
                 return Outcome(subject, SLOW, patience, f"stopped after {patience:g} s")
-            return Outcome(subject, FAILED, 0.0, "the process ended")
+            return Outcome(subject, FAILED, 0.0, f"the process ended with code {code}")
         outcomes, seconds = told
         self.seconds += seconds
         return list(outcomes)

@@ -88,7 +88,7 @@ def test_a_wrong_dead_time_that_is_given_is_the_suspect() -> None:
 @pytest.mark.full
 @pytest.mark.parametrize("number", [2018, 2051, 2105])
 def test_a_pulse_or_a_jitter_that_is_hardly_there(number: int) -> None:
-    """Pulses of .027 and .108 ns in jitters of 8.1 and 13.9; none in .35 ns. By variances: 4.0, 3.9, 13.5 errors off."""
+    """Pulses of .027 and .108 ns in jitters of 8.1 and 13.9, none in .35; by variances 4.0, 3.9, 13.5 errors off."""
     truth, photons = random_truth(number)
     result = ml.calibrate(stream(truth, photons, number), seed=number)
     assert result.fits

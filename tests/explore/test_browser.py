@@ -171,9 +171,12 @@ def scene(state: dict[str, Any]) -> tuple[ml.Flux, ml.System]:
     return ml.Flux(state["signal"] * (maps["light"] / 4096.0), state["background"], delay), system_of(state)
 
 
+PICTURED = BASE | {"signal": 0.7, "cycles": 300, "bins": 100, "method": "peak", "seed": 5}
+
+
 @pytest.fixture(scope="module")
 def cube(page: Page) -> tuple[dict[str, Any], NDArray[np.uint32]]:
-    page.set(**BASE | {"signal": 0.7, "cycles": 300, "bins": 100, "method": "peak", "seed": 5})
+    page.set(**PICTURED)
     drawn = page.picture()
     return page.tab.evaluate("explorer.state"), drawn
 
@@ -189,7 +192,7 @@ def test_the_picture_is_python_s(page: Page, cube: tuple[dict[str, Any], NDArray
 
 def test_the_picture_by_maximum_likelihood(page: Page, cube: tuple[dict[str, Any], NDArray[np.uint32]]):
     _, drawn = cube
-    page.set(method="likelihood")
+    page.set(**PICTURED | {"method": "likelihood"})
     page.until("explorer.picture.whole")
     delay = np.array(page.tab.evaluate("Array.from(explorer.picture.delay, (x) => Number.isNaN(x) ? null : x)"), float)
     found = reconstruct(drawn, scene(page.tab.evaluate("explorer.state"))[1])
@@ -199,14 +202,12 @@ def test_the_picture_by_maximum_likelihood(page: Page, cube: tuple[dict[str, Any
     off = np.abs((delay - found.delay_ns / 100.0 + 0.5) % 1.0 - 0.5)[both] * 100.0
     assert both.sum() > 1000
     assert np.mean(off < 1e-3) > 0.995  # ns: libm differs, and with it now and then the top that a climb ends on
-    page.set(method="peak")
 
 
 def test_the_picture_by_the_photons_around(page: Page):
     """Some photons a pixel, by the same native code and weights: Python's but for the rounding of logarithms."""
     given = BASE | {"signal": 0.004, "background": 0.004, "cycles": 1000, "bins": 256, "seed": 5, "method": "image"}
     page.set(**given)
-    page.tab.wait_for_timeout(600)
     page.until("explorer.picture.whole")
     delay, half = (
         np.array(page.tab.evaluate(f"Array.from(explorer.picture.{name})"), float) for name in ("delay", "halfWidth")
@@ -222,12 +223,12 @@ def test_the_picture_by_the_photons_around(page: Page):
     error = np.abs((delay - flux.delay_ns.ravel() / 100.0 + 0.5) % 1.0 - 0.5) * 100.0
     assert np.mean(error > 3.0 * system.pulse.sigma_ns) < 0.05  # of each pixel's fullest bin: most
     assert "fullest bin" in page.tab.inner_text("#error")
-    page.set(**BASE | {"method": "peak"})
 
 
 @pytest.mark.parametrize("place", [(12, 40), (50, 3)])
 def test_a_click_shows_that_pixel(page: Page, cube: tuple[dict[str, Any], NDArray[np.uint32]], place: tuple[int, int]):
     _, drawn = cube
+    page.set(**PICTURED)
     row, column = place
     box = page.tab.locator("#depth canvas").bounding_box()
     assert box is not None
@@ -243,7 +244,7 @@ def test_a_click_shows_that_pixel(page: Page, cube: tuple[dict[str, Any], NDArra
 
 def test_keys_move_over_the_picture(page: Page, cube: tuple[dict[str, Any], NDArray[np.uint32]]):
     _, drawn = cube
-    page.set(pixel=64 * 20 + 30)
+    page.set(**PICTURED | {"pixel": 64 * 20 + 30})
     page.tab.focus("#counts canvas")
     page.tab.evaluate("explorer.figure.results = {}")
     page.tab.keyboard.press("ArrowRight")

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import errno
 import functools
 import os
 from collections.abc import Callable
 from typing import ParamSpec, TypeVar
 
 from mars_lidar._base import checks
+from mars_lidar._base.tolerances import TOL
 
 
 def available_bytes() -> int | None:
@@ -29,6 +31,32 @@ def check_memory(nbytes: int, what: str, instead: str) -> None:
         raise MemoryError(
             f"{what} need {nbytes / 2**30:.3g} GiB of memory and {available / 2**30:.3g} GiB are available; {instead}"
         )
+
+
+def check_threads(threads: int) -> None:
+    """Raise MemoryError where a limit on the address space leaves no room for so many threads.
+
+    A thread that cannot start in a library is waited for without end there.
+    """
+    try:
+        import resource
+
+        limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+        with open("/proc/self/statm") as file:
+            remaining = limit - int(file.read().split()[0]) * resource.getpagesize()
+    except (ImportError, OSError):  # not on this system
+        return
+    wanted = threads * TOL.thread_bytes
+    if limit != resource.RLIM_INFINITY and remaining < wanted:
+        raise MemoryError(
+            f"{threads} threads take {wanted / 2**20:.0f} MiB of addresses and the limit (ulimit -v) leaves "
+            f"{max(0, remaining) / 2**20:.0f} MiB: raise it"
+        )
+
+
+def no_thread(error: RuntimeError) -> bool:
+    """Whether it tells that a thread could not start, here or in the compiled module."""
+    return "start new thread" in str(error) or os.strerror(errno.EAGAIN) in str(error)
 
 
 P = ParamSpec("P")

@@ -34,6 +34,8 @@ class Tolerances:
         Of a YAML file: PyYAML reads a megabyte in 10 s.
     hash_threads
         Threads that hash a store, without Python's lock.
+    thread_bytes
+        Addresses that a thread takes: a stack of 8 MiB, and the 64 MiB that glibc reserves for what it allocates.
     image_side
         Pixels of a resampled image's side.
     counts
@@ -64,6 +66,7 @@ class Tolerances:
     yaml_bytes: int = 2**20
     yaml_nodes: int = 2**17
     hash_threads: int = 4
+    thread_bytes: int = 72 * 2**20
     image_side: int = 1 << 13
     counts: int = 2**32
     shown_values: int = 4

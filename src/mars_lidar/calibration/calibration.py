@@ -33,7 +33,6 @@ from mars_lidar.light.timestamps import Timestamps
 _SAME_TIME = 0.01  # share of records at exactly the time of the one before, that no photons are
 LEVEL = 0.01  # false-alarm probability of the verdict
 
-PARAMETERS = ("dead_time_ns", "jitter_ns", "pulse_sigma_ns")
 _FIELDS = (
     "mode",
     "afterpulse_probability",
@@ -42,7 +41,7 @@ _FIELDS = (
     "recovery_ns",
     "electronics_dead_time_ns",
 )
-GIVEN = (*PARAMETERS, *_FIELDS)
+GIVEN = ("dead_time_ns", "jitter_ns", "pulse_sigma_ns", *_FIELDS)
 
 
 @dataclass(frozen=True)
@@ -168,14 +167,6 @@ class Calibration:
     level: float = LEVEL
 
     __repr__ = brief
-
-    @property
-    def total(self) -> float:
-        """All light, photons per period."""
-        light = (
-            e.value for name, e in self.estimates.items() if name.split("_")[0] in ("signal", "background", "light")
-        )
-        return float(sum(light))
 
     @property
     def fits(self) -> bool:
@@ -391,53 +382,46 @@ def _of_detector(detector: Detector) -> tuple[dict[str, Any], dict[str, float]]:
     return fields, fixed
 
 
+@dataclass(eq=False)
 class _Run:
     """One calibration: the model, its fit, and what follows from it."""
 
-    def __init__(
-        self,
-        recording: Recording,
-        look: Look,
-        shape: Pulse | str,
-        returns: int,
-        fields: dict[str, Any],
-        fixed: dict[str, float],
-        level: float,
-        seed: int,
-    ) -> None:
-        self.recording, self.look, self.level = recording, look, level
-        self.shape, self.returns, self.fields, self.fixed = shape, returns, fields, fixed
-        self.seed = seed
-        self.fit = Fit(recording, Effort(), (seed, 0))
-        self.wave: tuple[FloatArray, FloatArray] | None = None
-        pulse = shape if isinstance(shape, Pulse) else None
-        if pulse is not None:
-            pulse.check(recording.period_ns)
-        self.flat = not recording.laser
+    recording: Recording
+    look: Look
+    shape: Pulse | str
+    returns: int
+    fields: dict[str, Any]
+    fixed: dict[str, float]
+    level: float
+    seed: int
+    wave: tuple[FloatArray, FloatArray] | None = None
+
+    def __post_init__(self) -> None:
+        recording, shape = self.recording, self.shape
+        self.fit = Fit(recording, Effort(), (self.seed, 0))
+        if isinstance(shape, Pulse):
+            shape.check(recording.period_ns)
+        model = Model(recording.clock, 0)
         if shape == "free":
             self.wave = start.free_waveform(recording, self.fit.effort.shape_bins)
             shares, errors = (part / self.wave[0].sum() for part in self.wave)
-            model = Model(recording.clock, 0, None, shares, errors, recording.exposure)
-        elif self.flat or start.brightest_window(recording) > FALSE_ALARM:
-            self.flat = True
-            model = Model(recording.clock, 0)
-        else:
-            model = Model(recording.clock, returns, pulse=pulse)
-        self.model = replace(model, fields=tuple(fields.items()), jitter_given="jitter" in fixed)
+            model = replace(model, waveform=shares, waveform_error=errors, exposure=recording.exposure)
+        elif recording.laser and start.brightest_window(recording) <= FALSE_ALARM:
+            model = replace(model, returns=self.returns, pulse=shape if isinstance(shape, Pulse) else None)
+        self.model = replace(model, fields=tuple(self.fields.items()), jitter_given="jitter" in self.fixed)
 
     def result(self) -> Calibration:
         """The fit, the effects that it takes in, and what they leave."""
         fitted = self.first()
         wrong = () if fitted.converged and fitted.p_value >= self.level else self.wrong_values(fitted)
-        included: list[tuple[Score, suspects.Named]] = []
+        included: list[suspects.Named] = []
         listed = suspects.scores(self.fit, fitted) if fitted.converged else []
         for _ in range(self.fit.effort.effects if fitted.converged and not wrong else 0):
             better = suspects.refitted(self.fit, fitted, listed)
             if better is None:
                 break
-            used = next(score for score in listed if score.effect is better[1].effect)
             fitted = better[0]
-            included.append((used, better[1]))
+            included.append(better[1])
             listed = suspects.scores(self.fit, fitted)
         drift = suspects.drift(self.fit, fitted) if fitted.converged else None
         return self.assembled(fitted, included, [] if wrong else listed, drift, wrong)
@@ -506,7 +490,7 @@ class _Run:
     def assembled(
         self,
         fitted: Fitted,
-        included: list[tuple[Score, suspects.Named]],
+        included: list[suspects.Named],
         listed: list[Score],
         drift: Drift | None,
         wrong: tuple[Suspect, ...] = (),
@@ -515,13 +499,12 @@ class _Run:
         growth = _growth(fitted, drift)
         estimates = _estimates(fitted, self.fixed, growth)
         named: list[Suspect] = list(wrong)
-        for score, refit in included:
-            name = score.effect.names[0]
+        for refit in included:
+            name = refit.effect.names[0]
             printed = "electronics_dead_time_ns" if name == "electronics_excess" else name
             at = estimates.get(printed, Estimate(np.nan, np.nan, np.nan, np.nan))
-            named.append(
-                Suspect(score.effect.words, refit.z, at.value, at.error, refit.gain, f"given {printed}", included=True)
-            )
+            words, option = refit.effect.words, f"given {printed}"
+            named.append(Suspect(words, refit.z, at.value, at.error, refit.gain, option, included=True))
         p = fitted.p_value if fitted.converged else 0.0
         if drift is not None:
             p = min(1.0, 2.0 * min(p, drift.probability))
@@ -535,10 +518,8 @@ class _Run:
         for score in listed:
             if score.z > suspects.clear(listed) and score.effect.words not in families:
                 families.add(score.effect.words)
-                option = f"given {score.effect.names[0]}"
-                named.append(
-                    Suspect(score.effect.words, score.z, score.size, score.error, np.nan, option, included=False)
-                )
+                words, option = score.effect.words, f"given {score.effect.names[0]}"
+                named.append(Suspect(words, score.z, score.size, score.error, np.nan, option, included=False))
         if p < self.level and not any(not suspect.included for suspect in named):
             worst, z = _worst_cells(fitted)
             if z > suspects.clear(listed) or not fitted.converged:
@@ -546,26 +527,17 @@ class _Run:
                 named.append(Suspect(worst, z, np.nan, np.nan, np.nan, advice, included=False))
         centre = fitted.model.bounded(fitted.theta)
         cycles = int(np.clip(self.recording.exposure, 1, TOL.cycles))
-        wave = error = None
-        if self.wave is not None:
-            scale = float(centre[0] / self.wave[0].sum())
-            wave, error = scale * self.wave[0], scale * self.wave[1]
-        if not fitted.converged:
-            estimates = {}
+        wave, error = self.wave or (None, None)
+        if wave is not None and error is not None:
+            wave, error = (float(centre[0] / wave.sum()) * part for part in (wave, error))
+        estimates = estimates if fitted.converged else {}
+        known = bool(estimates) and self.recording.laser
+        system = fitted.model.system(centre, cycles, 1024) if known else None
+        flux = fitted.model.flux(centre) if known else None
+        ordered = tuple(sorted(named, key=lambda suspect: (not suspect.included, -suspect.z)))
+        limits, look, recording = _limits(fitted, listed), self.look, self.recording
         return Calibration(
-            self.look,
-            estimates,
-            p,
-            tuple(sorted(named, key=lambda suspect: (not suspect.included, -suspect.z))),
-            _limits(fitted, listed),
-            drift,
-            fitted.model.system(centre, cycles, 1024) if estimates and self.recording.laser else None,
-            fitted.model.flux(centre) if estimates and self.recording.laser else None,
-            wave,
-            error,
-            self.recording,
-            fitted,
-            self.level,
+            look, estimates, p, ordered, limits, drift, system, flux, wave, error, recording, fitted, self.level
         )
 
 
@@ -626,14 +598,12 @@ def _estimates(fitted: Fitted, fixed: dict[str, float], growth: FloatArray) -> d
     put("jitter_ns", jitter, jitters, "jitter", note=note)
     at = k + 3
     dead, observed = drawn[:, k + 2], float(centre[k + 2])
-    dead_name = "dead_time_ns"
     for effect in model.effects:
         columns = drawn[:, at : at + len(effect.names)].copy()
         values = centre[at : at + len(effect.names)]
         if effect.names[0] == "electronics_excess":
             put("electronics_dead_time_ns", observed, dead, "dead_time_ns")
             put("dead_time_ns", observed / (1.0 + float(values[0])), dead / (1.0 + columns[:, 0]), "electronics_excess")
-            dead_name = ""
         elif effect.names[0] == "afterpulse_probability":  # in the option's units: those lost in the dead time included
             after, delay = float(values[0]), float(np.exp(values[1]))
             columns[:, 1] = np.exp(columns[:, 1])
@@ -644,8 +614,8 @@ def _estimates(fitted: Fitted, fixed: dict[str, float], growth: FloatArray) -> d
         elif not effect.onoff:
             put(effect.names[0], float(values[0]), columns[:, 0], effect.names[0])
         at += len(effect.names)
-    if dead_name:
-        put(dead_name, observed, dead, "dead_time_ns")
+    if "dead_time_ns" not in out:
+        put("dead_time_ns", observed, dead, "dead_time_ns")
     return out
 
 

@@ -60,42 +60,28 @@ def curves(
 ) -> Curves:
     """Histograms of intervals, phases and ages in `sizes` cells, of the model at `theta` too where it is given."""
     period, unit = recording.period_ns, recording.clock.unit_ns
+
+    def counted(times: list[FloatArray], edges: list[FloatArray]) -> list[FloatArray]:
+        """Counts of intervals, phases and intervals again, in the cells of each."""
+        gaps = np.concatenate([np.diff(t) for t in times])
+        phase = np.concatenate([t - np.floor(t / period) * period for t in times])
+        return [np.histogram(x, at)[0].astype(float) for x, at in zip((gaps, phase, gaps), edges, strict=True)]
+
     gaps = np.concatenate([np.diff(piece) for piece in recording.pieces])
-    top = float(np.quantile(gaps, 0.99)) * 1.05
-    edges = _edges(0.0, top, sizes[0], unit)
-    low, high = np.quantile(gaps, (0.0005, 0.5))
+    low, high, top = np.quantile(gaps, (0.0005, 0.5, 0.99))
     ages = _edges(max(low - 0.1 * (high - low), 0.0), high + (high - low), sizes[2], unit)
-    places = np.linspace(0.0, period, sizes[1] + 1)
-    phase = np.concatenate([piece - np.floor(piece / period) * period for piece in recording.pieces])
-    fitted: list[FloatArray] = []
-    residual = None
-    recorded = [np.histogram(gaps, edges)[0], np.histogram(phase, places)[0], np.histogram(gaps, ages)[0]]
+    edges = [_edges(0.0, 1.05 * top, sizes[0], unit), np.linspace(0.0, period, sizes[1] + 1), ages]
+    recorded, fitted, residual = counted(list(recording.pieces), edges), None, None
     if model is not None and theta is not None:
         total = min(_RATIO * recording.photons, Effort.batch)
         cycles = max(2, round(recording.exposure * total / recording.photons / LIGHTS))
-        streams = model.streams(np.tile(theta, (LIGHTS, 1)), cycles, seed)
         scale = recording.exposure / (cycles * LIGHTS)
-        made = np.concatenate([np.diff(t) for t in streams])
-        where = np.concatenate([t - np.floor(t / period) * period for t in streams])
-        fitted = [
-            scale * np.histogram(made, edges)[0],
-            scale * np.histogram(where, places)[0],
-            scale * np.histogram(made, ages)[0],
-        ]
-        expected = fitted[2]
-        with np.errstate(invalid="ignore", divide="ignore"):
-            residual = (recorded[2] - expected) / np.sqrt(np.maximum(expected, 1.0) * (1.0 + scale))
-        residual[expected < 3.0] = np.nan
-    return Curves(
-        edges,
-        recorded[0].astype(float),
-        fitted[0] if fitted else None,
-        places,
-        recorded[1].astype(float),
-        fitted[1] if fitted else None,
-        ages,
-        residual,
-    )
+        streams = model.streams(np.tile(theta, (LIGHTS, 1)), cycles, seed)
+        fitted = [scale * counts for counts in counted(list(streams), edges)]
+        residual = (recorded[2] - fitted[2]) / np.sqrt(np.maximum(fitted[2], 1.0) * (1.0 + scale))
+        residual[fitted[2] < 3.0] = np.nan
+    intervals, phases = (fitted[0], fitted[1]) if fitted else (None, None)
+    return Curves(edges[0], recorded[0], intervals, edges[1], recorded[1], phases, ages, residual)
 
 
 def _edges(low: float, high: float, number: int, unit: float) -> FloatArray:

@@ -199,8 +199,7 @@ class Fitted:
     jacobian: FloatArray  # (c, free)
     rest: FloatArray  # (c,) counts that the fit leaves
     fresh: FloatArray  # (streams, c) the same of fresh streams, of the recording's exposure
-    misfit: float
-    misfit_z: float
+    misfit_z: float  # standard deviations of the misfit above that of fresh streams
     p_value: float
     converged: bool
 
@@ -382,31 +381,17 @@ class Fit:
         fresh = (fresh - fresh.mean(0)) / np.sqrt(near.ratio) * np.sqrt(len(y) / (len(y) - terms.shape[1]))
         rest = project @ (recorded - near.offset)
         dead = np.flatnonzero(free == model.light + 2)
-        misfit, z, p = _misfit(rest, fresh, law, near, recorded, float(sd[dead[0]]) if dead.size else 0.0)
+        z, p = _misfit(rest, fresh, law, near, recorded, float(sd[dead[0]]) if dead.size else 0.0)
+        scatter, converged = solve @ noise @ solve.T / near.ratio, bool(size.max() < _NEAR)
         return Fitted(
-            model=model,
-            free=free,
-            theta=mean,
-            unbounded=raw,
-            covariance=cov,
-            scatter=solve @ noise @ solve.T / near.ratio,
-            batch=law,
-            offset=near.offset,
-            estimator=estimator,
-            jacobian=jacobian,
-            rest=rest,
-            fresh=fresh,
-            misfit=misfit,
-            misfit_z=z,
-            p_value=p,
-            converged=bool(size.max() < _NEAR),
+            model, free, mean, cov, raw, scatter, law, near.offset, estimator, jacobian, rest, fresh, z, p, converged
         )
 
 
 def _misfit(
     rest: FloatArray, fresh: FloatArray, law: Batch, near: Batch, recorded: FloatArray, dead_error: float
-) -> tuple[float, float, float]:
-    """Weighed square of the counts that the fit leaves, its standard deviations above fresh streams', probability.
+) -> tuple[float, float]:
+    """Standard deviations of the weighed square of the counts that the fit leaves above fresh streams', probability.
 
     The probability is that of two tests together: the weighed square of all cells, and the largest departure of the
     cumulated intervals, which sees a few missing or early intervals at the edge of the dead time.
@@ -427,7 +412,7 @@ def _misfit(
     most = float(departure[enough].max(initial=0.0))
     late = 2.0 * enough.sum() * float(ndtr(-most))
     first = _edge_probability(law.cells.gap_edges, cumulated, np.cumsum(recorded[gaps]), dead_error)
-    return mine, float((mine - drawn.mean()) / drawn.std()), min(1.0, 2.0 * min(square, late + first))
+    return float((mine - drawn.mean()) / drawn.std()), min(1.0, 2.0 * min(square, late + first))
 
 
 def _edge_probability(edges: FloatArray, expected: FloatArray, recorded: FloatArray, dead_error: float) -> float:

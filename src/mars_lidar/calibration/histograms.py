@@ -151,11 +151,9 @@ def calibrate_cube(
         estimates["pulse_sigma_ns"] = _normal(sigma, sigma * errors[1])
     estimates["background_floor"] = _of_pixel(light, "background", int(np.argmin(light.background)))
     if len(given.counts) == 1:
-        metre = 0.5 * SPEED_OF_LIGHT_M_PER_NS
-        estimates["signal"] = _of_pixel(light, "signal", 0)
-        estimates["background"] = _of_pixel(light, "background", 0)
+        estimates |= {name: _of_pixel(light, name, 0) for name in ("signal", "background")}
         estimates["delay_ns"] = _of_pixel(light, "delay", 0, final.period_ns)
-        estimates["depth_m"] = _of_pixel(light, "delay", 0, final.period_ns * metre)
+        estimates["depth_m"] = _of_pixel(light, "delay", 0, final.period_ns * 0.5 * SPEED_OF_LIGHT_M_PER_NS)
     flux = Flux(light.signal[None], np.maximum(light.background, 0.0)[None], light.delay[None] * final.period_ns)
     return CubeCalibration(
         estimates, final, p_values[np.isfinite(p_values)], response_error, np.asarray(some, np.float64), flux

@@ -71,16 +71,8 @@ def look_at(recording: Recording) -> Look:
     gaps = np.concatenate([np.diff(piece) for piece in recording.pieces])
     count = min(20, gaps.size)
     seconds = 1e-9 * recording.exposure * recording.period_ns
-    return Look(
-        recording.photons,
-        recording.exposure,
-        recording.period_ns if recording.laser else float("nan"),
-        seconds,
-        recording.clock.unit_ns,
-        recording.clock.locked,
-        recording.photons / seconds,
-        np.sort(np.partition(gaps, count - 1)[:count]),
-        np.quantile(gaps, (0.01, 0.5, 0.99)),
-        int((gaps == 0.0).sum()),
-        other_period(recording),
-    )
+    clock, n, cycles = recording.clock, recording.photons, recording.exposure
+    period = recording.period_ns if recording.laser else float("nan")
+    smallest, quantiles = np.sort(np.partition(gaps, count - 1)[:count]), np.quantile(gaps, (0.01, 0.5, 0.99))
+    same, own, unit, locked = int((gaps == 0.0).sum()), other_period(recording), clock.unit_ns, clock.locked
+    return Look(n, cycles, period, seconds, unit, locked, n / seconds, smallest, quantiles, same, own)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, cast
 
@@ -280,7 +280,3 @@ class Model:
             made.cycle, made.phase, made.offsets, sigma_ns=sigma, deviates=deviates, grid=self.clock.grid, out=times
         )
         return Streams(times, made.offsets)
-
-    def with_effect(self, effect: Effect) -> Model:
-        """This model with one effect more."""
-        return replace(self, effects=(*self.effects, effect))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -135,7 +135,7 @@ def _best(fit: Fit, fitted: Fitted, tried: list[Score], limit: float) -> tuple[F
 
 def _stepped(fit: Fit, fitted: Fitted, score: Score) -> tuple[float, _Stepped] | None:
     """Misfit and parameters with one effect more; None where a detector cannot have it beside the others."""
-    model, effect = fitted.model.with_effect(score.effect), score.effect
+    model, effect = replace(fitted.model, effects=(*fitted.model.effects, score.effect)), score.effect
     size = effect.start[0]
     moved = fitted.theta.copy()
     if not effect.onoff and score.size > 0.0:
@@ -212,11 +212,9 @@ def drift(fit: Fit, fitted: Fitted) -> Drift | None:
     estimates = np.array(values)[:, light]
     cov = fitted.scatter[np.ix_(light, light)] * len(parts)
     names = [model.names[free[k]] for k in light]
-    signals = [i for i, name in enumerate(names) if not name.startswith("delay")]
-    combine = np.zeros((1 + len(names) - len(signals), len(names)))
-    combine[0, signals] = 1.0  # all light; then each delay
-    for row, i in enumerate(i for i in range(len(names)) if i not in signals):
-        combine[1 + row, i] = 1.0
+    delays = [i for i, name in enumerate(names) if name.startswith("delay")]
+    combine = np.eye(len(names))[[0, *delays]]  # all light; then each delay
+    combine[0] = [not name.startswith("delay") for name in names]
     x = estimates @ combine.T
     sd = np.sqrt(np.diag(combine @ cov @ combine.T))
     place = np.linspace(-0.5, 0.5, len(parts))
@@ -225,12 +223,9 @@ def drift(fit: Fit, fitted: Fitted) -> Drift | None:
     p = np.array([float(chdtrc(len(parts) - 1, value)) for value in square])
     begins = np.cumsum([0.0, *(part.exposure for part in parts)])
     middle = 0.5 * (begins[1:] + begins[:-1]) * recording.period_ns * 1e-9
-    about = np.r_[
-        fitted.theta[[free[light[i]] for i in signals]].sum(),
-        fitted.theta[[free[light[i]] for i in range(len(names)) if i not in signals]],
-    ]
+    about = combine @ fitted.theta[free[light]]
     return Drift(
-        ("light", *(names[i] for i in range(len(names)) if i not in signals)),
+        ("light", *(names[i] for i in delays)),
         middle,
         x - x.mean(0) + about,
         sd,

@@ -21,6 +21,7 @@ from cyclopts import exceptions as wrong
 from mars_lidar._base.checks import did_you_mean
 from mars_lidar._base.files import WriteError, beside
 from mars_lidar._base.progress import Bar
+from mars_lidar._base.resources import no_thread
 from mars_lidar.cli.options import describe
 
 if TYPE_CHECKING:
@@ -98,6 +99,11 @@ def run(app: App, tokens: Sequence[str]) -> int:
         return Exit.FAILED
     except OSError as error:
         say(f"failed: {_file_message(error)}")
+        return Exit.FAILED
+    except RuntimeError as error:
+        if not no_thread(error):
+            raise
+        say(f"failed: {error}: give fewer threads, or more memory")
         return Exit.FAILED
     except (ValueError, TypeError, OverflowError, MemoryError) as error:
         say(_with_options(" ".join(str(error).split()), tokens) or type(error).__name__)

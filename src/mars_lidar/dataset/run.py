@@ -30,7 +30,7 @@ from mars_lidar._base.files import (
     successor,
 )
 from mars_lidar._base.progress import callback_of
-from mars_lidar._base.resources import thread_count
+from mars_lidar._base.resources import check_threads, no_thread, thread_count
 from mars_lidar._base.types import Progress
 from mars_lidar._version import __version__
 from mars_lidar.dataset import cluster
@@ -40,6 +40,7 @@ from mars_lidar.dataset.recipe import DatasetRecipe
 from mars_lidar.dataset.store import Dataset, Item, open_dataset
 from mars_lidar.dataset.write import Failed, Made, Maker, fingerprint
 from mars_lidar.io.scene_files import Problem
+from mars_lidar.io.zarr_store import check_zarr_threads
 
 _NAMED = 5  # parts that an error names
 BUFFER_BYTES = 512 * 2**20  # of all chunks that are made at the same time on one machine
@@ -382,6 +383,7 @@ def _target(out: str | Path) -> Path:
     target: Path = place_of(out)
     if target.suffix != ".zarr":
         raise ValueError(f"out must end in .zarr, got {str(target)!r}")
+    check_zarr_threads()
     return target
 
 
@@ -463,10 +465,12 @@ def _explained(store: Path, target: Path) -> Iterator[None]:
     except KeyboardInterrupt:
         raise Interrupted(f"interrupted; {_remaining(store, target)}") from None
     except RuntimeError as error:
-        if "thread" not in str(error):
+        if not no_thread(error):
             raise
         text = f"{error}: give fewer threads, or more memory; {_remaining(store, target)}"
         raise WriteError(errno.EAGAIN, text) from error
+    except MemoryError as error:
+        raise WriteError(errno.ENOMEM, f"{error or 'no memory'}; {_remaining(store, target)}") from error
     except OSError as error:
         if isinstance(error, FileNotFoundError | FileExistsError) and not store.exists():
             raise
@@ -527,6 +531,7 @@ def _here(dataset: Dataset, parts: int, threads: int | None) -> Iterator[Team]:
     waveforms = dataset.scenes.waveform_parts(dataset.recipe.systems)
     chunk = making_bytes(array.chunks, array.dtype.itemsize, waveforms)
     teams = max(1, min(team, parts, BUFFER_BYTES // chunk))
+    check_threads(team)
     stop, local = threading.Event(), threading.local()
 
     makers: list[Maker] = []
@@ -608,7 +613,7 @@ def _remaining(store: Path, target: Path) -> str:
         dataset.tidy()
         total, missing = sum(1 for _ in dataset.items()), len(dataset.missing())
         text = f"{total - missing} of {total} parts of {store} are written, marked incomplete"
-    except (OSError, ValueError, KeyError):
+    except (OSError, ValueError, KeyError, RuntimeError, MemoryError):
         text = f"{store} is left behind without counts, marked incomplete"
     if store != target:
         text += f", and {target} is what it was before"

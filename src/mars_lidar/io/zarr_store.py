@@ -9,7 +9,9 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import os
 import shutil
+import threading
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -21,6 +23,7 @@ from numpy.typing import NDArray
 from mars_lidar._base import manifest
 from mars_lidar._base.files import FileError, alone, beside, exchange, successor, telling
 from mars_lidar._base.imports import MissingLibraryError, needed
+from mars_lidar._base.resources import check_threads
 from mars_lidar.io import layout
 from mars_lidar.io.recipe import Recipe, Recording
 from mars_lidar.io.store import OnDisk, OpenedStore, Writer
@@ -69,6 +72,12 @@ def resumable_writer(path: Path, recipe: Recipe, group: Any = None) -> Iterator[
                 exchange(store, path)
 
 
+def check_zarr_threads() -> None:
+    """Raise MemoryError where Zarr could not start its event loop and the threads of Python's pool that it reads by."""
+    if not any(thread.name == "zarr_io" for thread in threading.enumerate()):
+        check_threads(1 + min(32, (os.cpu_count() or 1) + 4))
+
+
 def begun_store(path: Path) -> Path:
     """The store that a stopped run left, whose final name is `path`."""
     return beside_it if (beside_it := successor(path)).exists() else path
@@ -88,6 +97,7 @@ def create(path: Path, recipe: Recipe | Recording) -> Any:
     """The group of a new store at an empty folder; its attribute ``complete`` is false from the first byte on."""
     import zarr
 
+    check_zarr_threads()
     attrs = {"complete": False, **layout.attributes(recipe)}
     group = zarr.create_group(path, zarr_format=3, attributes=attrs)
     add(group, layout.variables(recipe))
@@ -155,6 +165,7 @@ def open_store(path: Path, check: layout.Check = layout.check_format) -> OpenedS
 
     from mars_lidar._base.sealed_store import PlainFiles, SealedStore
 
+    check_zarr_threads()
     attrs = manifest.root_document(path).get("attributes", {})
     check(path, attrs)
     identity = ""

@@ -173,7 +173,8 @@ def _findings(found: Found, methods: Places, pairs: list[dict[str, Any]], config
             off = one["lost"] - one["lost_closed"]
             yield f"{where}: {off:+.2f} dB from the closed form (within {CLOSE:g})", abs(off) <= CLOSE
         holds = abs(one["exact"] - 0.9) <= CALIBRATED
-        yield f"{where}: exact-trained 90 % intervals cover {one['exact']:.3f} (within {CALIBRATED} of 0.9)", holds
+        covered = f"{one['exact']:.3f} ± {one['exact_error']:.3f}"
+        yield f"{where}: exact-trained 90 % intervals cover {covered} (within {CALIBRATED} of 0.9)", holds
 
 
 def _csv(found: Found, methods: Places) -> list[Row]:

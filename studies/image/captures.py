@@ -45,8 +45,9 @@ def captures(folder: Path) -> Iterator[Capture]:
     """The first image of each cube in a folder, and of the public file "tower.mat"."""
     for path in sorted(folder.iterdir()):
         if path.name == "tower.mat":
-            window = {"variable": "data_processed", "unit_ns": 0.001, "window_ns": (5180.0, 5380.0)}
-            yield capture(path.stem, foreign_cube(path, TOWER, **window))
+            window = (5180.0, 5380.0)
+            cube = foreign_cube(path, TOWER, variable="data_processed", unit_ns=0.001, window_ns=window)
+            yield capture(path.stem, cube)
         elif path.suffix in SUFFIXES:
             yield capture(path.stem, load(path))
 

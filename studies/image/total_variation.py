@@ -26,7 +26,7 @@ def total_variation(cube: np.ndarray, system: System, weight: float = WEIGHT) ->
     solver = solver_of(Photons.of(cube.reshape(-1, bins), height, width), 1)
     setting = settings_of(system)[-1]
     solver.begin(setting)
-    likelihood = solver.volumes().likelihood
+    likelihood = np.asarray(solver.volumes().likelihood)
     cells = setting.cells
     cost = -np.log(likelihood.reshape(-1, cells).astype(np.float64) + 1e-12)
     place = (np.arange(cells) + 0.5) / setting.sigma

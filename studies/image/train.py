@@ -112,7 +112,7 @@ def _train_choose(torch: Any, images: list[_Prepared], plan: Plan, tell: Tell) -
     features, labels, lost, wrong = [], [], [], []
     for k, image in enumerate(images):
         volumes = image.solver.volumes()
-        mass = volumes.mass
+        mass = np.asarray(volumes.mass)
         off = np.abs(gap(volumes.place, image.truth[:, None], image.cells)) / image.sigma
         label = np.where(off.min(1) < OUTLIER_SIGMA, off.argmin(1), SIZES["peaks"])
         open_pixels = np.flatnonzero(image.valid.ravel() & (mass[:, 0] < _core.IMAGE_SETTLED))
@@ -121,7 +121,7 @@ def _train_choose(torch: Any, images: list[_Prepared], plan: Plan, tell: Tell) -
         if k % _HELD_OUT == 0 or open_pixels.size == 0:
             continue
         pixel = np.sort(rng.permutation(open_pixels)[:700])
-        features.append(image.solver.candidate_features(volumes, pixel).astype(np.float16))
+        features.append(np.asarray(image.solver.candidate_features(volumes, pixel)).astype(np.float16))
         labels.append(label[pixel])
     tell(f"image: of unsure pixels {np.mean(wrong):.1%} have a wrong first peak, {np.mean(lost):.1%} no right one")
     x = torch.from_numpy(np.concatenate(features))

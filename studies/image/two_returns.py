@@ -70,7 +70,7 @@ def _peaks(cube: np.ndarray, system: System) -> tuple[FloatArray, FloatArray]:
     setting = settings_of(system)[-1]
     solver.begin(setting)
     volumes, cells = solver.volumes(), setting.cells
-    place, mass = volumes.place, volumes.mass
+    place, mass = np.asarray(volumes.place), np.asarray(volumes.mass)
     apart = np.abs((place - place[:, :1] + 0.5 * cells) % cells - 0.5 * cells)
     others = np.where(apart > _APART * setting.sigma, mass, 0.0)
     second = others.argmax(1)

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 
+import h5py
 import numpy as np
 import pytest
+import scipy.io
 import xarray
 import yaml
 
@@ -125,3 +127,18 @@ def test_the_schema_is_that_of_what_is_read(tmp_path):
     assert json.loads((tmp_path / "scene.json").read_text()) == scene
     assert json.loads(run("schema", "system").stdout) == json_schema("system")
     assert "did you mean 'recipe'" in run("schema", "recipes").stderr
+
+
+@pytest.mark.parametrize("version", [5, 7.3])
+def test_a_mat_of_another_laboratory_is_a_depth(tmp_path, version):
+    """Not every .mat is NYUv2's."""
+    depth = np.linspace(2.0, 5.0, 48).reshape(6, 8)
+    path = tmp_path / "d.mat"
+    if version == 5:
+        scipy.io.savemat(path, {"depth": depth})
+    else:
+        with h5py.File(path, "w") as file:
+            file["depth"] = depth.T
+    np.testing.assert_allclose(read_view({"depth": str(path), "light": LIGHT}, SYSTEM).depth_m, depth)
+    done = run("generate", path, "--dry-run", "-o", tmp_path / "a.zarr", "--bins", 32)
+    assert done.exit_code == 0, done.output

@@ -10,7 +10,6 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import psutil
 from cyclopts import App
 from cyclopts.argument import Argument
 
@@ -69,6 +68,8 @@ def stopped(process: subprocess.Popen[str], how: signal.Signals) -> tuple[str, f
 
     Other work on the machine lengthens the time by a clock, and not that of a processor.
     """
+    import psutil  # wheels are tested without it
+
     before, taken = _children_s(), sum(psutil.Process(process.pid).cpu_times()[:2])
     process.send_signal(how)
     out, err = process.communicate(timeout=300.0)
@@ -77,5 +78,7 @@ def stopped(process: subprocess.Popen[str], how: signal.Signals) -> tuple[str, f
 
 def _children_s() -> float:
     """Seconds of a processor that the children that have ended took."""
+    import psutil
+
     used = psutil.Process().cpu_times()
     return used.children_user + used.children_system

@@ -126,7 +126,7 @@ def report(rows: list[dict[str, str]]) -> str:
             number=len(values),
             expected=2.0 * SUSPECT * len(values),
             listed="\n".join(listed) or "None.",
-            open=", ".join([*open_, "PractRand beyond 4 GiB (1 TB was asked for)"]),
+            open=", ".join([*open_, "PractRand beyond 8 GiB (1 TB was asked for)"]),
         )
     )
 

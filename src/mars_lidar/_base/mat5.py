@@ -129,7 +129,7 @@ def _values(content: bytes, place: int, order: str) -> tuple[bytes, int]:
 
 def _check(content: bytes, order: str, most: int) -> None:
     """Raise ValueError for an element of a type that there is not, or more than `most` of them."""
-    unpack = struct.Struct(order + "II").unpack_from
+    unpack, matrix, values = struct.Struct(order + "II").unpack_from, int(_Kind.MATRIX), _VALUES
     ends: list[int] = []  # of the matrices that contain the element
     place, end = 0, len(content)
     for _ in range(most):
@@ -139,14 +139,14 @@ def _check(content: bytes, order: str, most: int) -> None:
             place, end = end, ends.pop()
         kind, size = unpack(content, place)
         place += 8
-        if kind == _Kind.MATRIX:
+        if kind == matrix:
             if len(ends) > TOL.nested:
                 raise ValueError(f"holds cells or structures more than {TOL.nested} deep")
             ends.append(end)
             end = min(end, place + size)
-        elif kind in _VALUES:
+        elif kind in values:
             place += size + 7 & -8
-        elif not kind >> 16 or kind & 0xFFFF not in _VALUES:  # a small one has its size there, and values for a size
+        elif not kind >> 16 or kind & 0xFFFF not in values:  # a small one has its size there, and values for a size
             raise _no_type(kind)
     raise _unreadable(f"it has more than {most:,} elements: is it damaged?")
 

@@ -151,7 +151,7 @@ def _files(entry: dict[str, Any], folder: Path, problems: list[Problem]) -> Iter
     if isinstance(image, list):
         raise ValueError(f"image must be a file where path is one, got {image!r}")
     own = SceneFile(depth=path, image=None if image is None else folder / image, **options)
-    if path.suffix.lower() != ".mat" or not path.is_file():
+    if path.suffix.lower() != ".mat" or not path.is_file() or not rgbd.is_nyu(path):
         yield from _chosen([own], entry)
         return
     frames = range(rgbd.nyu_frames(path))

@@ -141,5 +141,6 @@ def cell_arrays(variables: dict[str, Any]) -> dict[str, Any]:
 
 def _is_deep(cell: Any) -> bool:
     """Whether this is a sparse matrix, or an array of numbers that is no vector."""
-    is_array = isinstance(cell, np.ndarray) and cell.dtype.kind in "iuf" and min(cell.shape, default=0) > 1
-    return is_sparse(cell) or is_array
+    if not isinstance(cell, np.ndarray):
+        return is_sparse(cell)
+    return cell.size > 1 and 1 not in cell.shape and cell.dtype.kind in "iuf"

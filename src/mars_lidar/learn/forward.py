@@ -34,6 +34,7 @@ from mars_lidar.instrument.effects import LIGHT_EFFECTS
 from mars_lidar.instrument.pulse import GaussianPulse, Pulse, SampledPulse
 from mars_lidar.instrument.system import System
 from mars_lidar.learn.needed import torch
+from mars_lidar.learn.tolerances import TOLERANCES
 from mars_lidar.statistics.phase_chain import ConvergenceError
 
 # --- Photons of each bin -------------------------------------------------------------------------------------------
@@ -191,12 +192,6 @@ def check_detector(system: System, *, light: bool = False) -> None:
 
 Rows = torch.Tensor  # (pixels, bins), double
 
-_KRYLOV, _RESTARTS = 40, 25  # dimension of the Krylov space; restarts of GMRES
-TOLERANCE = 1e-13  # residual relative to the source at which GMRES stops
-_GOOD = 1e-9  # relative residual that is accepted where rounding prevents further progress
-_ROWS = 2**15  # pixels x bins solved together on a CPU, so that the working arrays stay in the cache
-_HELD = 24  # arrays (pixels, bins) beside the Krylov space, the powers of two of the recursion among them
-
 
 def fired(light: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """p and q of photons in a bin."""
@@ -315,7 +310,7 @@ class Circle:
         back = self.delay.rearmed_transposed((1.0 - self.q) * c - self.q * z)
         return z + back + self.delay.periods * weight
 
-    def solve(self, s: Rows, tolerance: float = TOLERANCE, turned: bool = False) -> Rows:
+    def solve(self, s: Rows, tolerance: float = TOLERANCES.residual, turned: bool = False) -> Rows:
         """x of A x = s, (1), or of A' x = s."""
         if not turned:
             return gmres(self.apply, self.source(s), tolerance)
@@ -323,21 +318,21 @@ class Circle:
         return z + self._back(z)[1]  # Q' z
 
 
-def gmres(apply: Callable[[Rows], Rows], wanted: Rows, tolerance: float = TOLERANCE) -> Rows:
+def gmres(apply: Callable[[Rows], Rows], wanted: Rows, tolerance: float = TOLERANCES.residual) -> Rows:
     """x (rows, n) of apply(x) = wanted, of rows that are independent; ConvergenceError for a residual above 1e-9."""
     size = torch.linalg.vector_norm(wanted, dim=-1).clamp_min(1e-300)
     x, rest, last = torch.zeros_like(wanted), wanted, math.inf
-    for _ in range(_RESTARTS):
+    for _ in range(TOLERANCES.restarts):
         residual = float((torch.linalg.vector_norm(rest, dim=-1) / size).max())
-        if residual <= tolerance or (residual <= _GOOD and residual > 0.3 * last):  # the latter: rounding
+        rounding = residual <= TOLERANCES.accepted_residual and residual > 0.3 * last
+        if residual <= tolerance or rounding:
             return x
         last = residual
         x = x + _krylov(apply, rest, tolerance * size)
         rest = wanted - apply(x)
-    if not last <= _GOOD:
-        raise ConvergenceError(
-            f"the feedback equation has a relative residual of {last:.1e} after {_KRYLOV * _RESTARTS} steps"
-        )
+    if not last <= TOLERANCES.accepted_residual:
+        steps = TOLERANCES.krylov * TOLERANCES.restarts
+        raise ConvergenceError(f"the feedback equation has a relative residual of {last:.1e} after {steps} steps")
     return x
 
 
@@ -345,11 +340,11 @@ def _krylov(apply: Callable[[Rows], Rows], rest: Rows, enough: torch.Tensor) -> 
     """Correction of x that minimises the residual in the Krylov space of `apply` and `rest`."""
     least = torch.finfo(rest.dtype).tiny
     size = torch.linalg.vector_norm(rest, dim=-1)
-    basis = rest.new_empty((len(rest), _KRYLOV + 1, rest.shape[-1]))
+    basis = rest.new_empty((len(rest), TOLERANCES.krylov + 1, rest.shape[-1]))
     basis[:, 0] = rest / size.clamp_min(least)[:, None]
-    triangle = rest.new_zeros((len(rest), _KRYLOV, _KRYLOV))
+    triangle = rest.new_zeros((len(rest), TOLERANCES.krylov, TOLERANCES.krylov))
     target, cosines, sines = [size], list[torch.Tensor](), list[torch.Tensor]()
-    for k in range(_KRYLOV):
+    for k in range(TOLERANCES.krylov):
         fresh = apply(basis[:, k])
         known = basis[:, : k + 1]
         column = torch.bmm(known, fresh.unsqueeze(-1)).squeeze(-1)  # once: what rounding leaves, a restart takes away
@@ -440,7 +435,7 @@ def by_rows(function: Any, info: Any, in_dims: tuple[int | None, ...], given: tu
 
 
 def registered(
-    photons: Rows, source: Rows, delay: Delay, tolerance: float = TOLERANCE, known: Rows | None = None
+    photons: Rows, source: Rows, delay: Delay, tolerance: float = TOLERANCES.residual, known: Rows | None = None
 ) -> Rows:
     """h of (1), differentiable in photons and sources, (pixels, bins) in double; `known`: h, if it was found before."""
     h: Rows = _Solution.apply(photons, source, known, delay, tolerance, False)  # type: ignore[no-untyped-call]
@@ -455,15 +450,12 @@ def blocks(most: int, bins: int, *rows: torch.Tensor) -> Any:
 def _block(device: torch.device) -> int:
     """Pixels x bins solved at a time on a device: what a cache holds, or half of what a GPU has free."""
     if device.type != "cuda":
-        return _ROWS
+        return TOLERANCES.cached_values
     free, _ = torch.cuda.mem_get_info(device)
-    return max(_ROWS, free // (2 * 8 * (_KRYLOV + _HELD)))
+    return max(TOLERANCES.cached_values, free // (2 * 8 * (TOLERANCES.krylov + TOLERANCES.arrays)))
 
 
 # --- The expected histogram ----------------------------------------------------------------------------------------
-
-_FINE = 4.0  # parts per sigma of the pulse
-_BLOCK = 2**22  # pixels x bins of photons in memory together
 
 
 @checked
@@ -554,7 +546,7 @@ def _refined(system: System) -> int:
     if not isinstance(system.pulse, GaussianPulse):
         return 1
     sigma, beyond = system.pulse.sigma_ns, math.remainder(system.detector.dead_time_ns, system.period_ns)
-    fine = _FINE * (4.0 if abs(beyond) < 8.0 * sigma else 1.0)
+    fine = TOLERANCES.parts_of_width * (4.0 if abs(beyond) < 8.0 * sigma else 1.0)
     return max(1, math.ceil(fine * system.bin_ns / sigma))
 
 
@@ -567,7 +559,7 @@ class _Expected(torch.autograd.Function):
     @staticmethod
     def forward(signal: Any, background: Any, delay_ns: Any, system: System, parts: int) -> tuple[torch.Tensor, ...]:
         check_values(signal, background, delay_ns)
-        every = blocks(_BLOCK, system.bins * parts, signal, background, delay_ns)
+        every = blocks(TOLERANCES.photons, system.bins * parts, signal, background, delay_ns)
         done = [_registered(rows, system, parts) for rows in every]
         return tuple(torch.cat(blocks_of) for blocks_of in zip(*done, strict=True))
 
@@ -602,7 +594,7 @@ class _Expected(torch.autograd.Function):
 
 def _again(ctx: Any, *others: torch.Tensor) -> Iterator[tuple[Any, Any, Any]]:
     """Block by block: the histogram as a function of its light, that light, and the same rows of `others`."""
-    for rows in blocks(_BLOCK, ctx.system.bins * ctx.parts, *ctx.saved_tensors, *others):
+    for rows in blocks(TOLERANCES.photons, ctx.system.bins * ctx.parts, *ctx.saved_tensors, *others):
         light, known, rest = rows[:3], rows[3:5], rows[5:]
 
         def again(*light: torch.Tensor, known: Any = known) -> torch.Tensor:
@@ -616,7 +608,7 @@ def _registered(rows: Any, system: System, parts: int, known: Any = (None, None)
     signal, background, delay_ns = (tensor.double() for tensor in rows)
     photons = photons_in(signal, background, delay_ns, system, parts)
     delay = Delay(system.dead_time_periods, photons.shape[-1])
-    tolerance = max(TOLERANCE, 1e-2 * torch.finfo(rows[0].dtype).eps)
+    tolerance = max(TOLERANCES.residual, 1e-2 * torch.finfo(rows[0].dtype).eps)
     nothing = photons.detach()[:, :0]
     if system.dead_time_periods == 0.0:
         return _summed(photons * system.cycles, parts).to(rows[0].dtype), nothing, nothing

@@ -27,13 +27,12 @@ from mars_lidar.instrument.system import System
 from mars_lidar.learn.forward import check_detector, expected_histogram
 from mars_lidar.learn.likelihood import histogram_log_likelihood
 from mars_lidar.learn.tabulated import HistogramTable
+from mars_lidar.learn.tolerances import TOLERANCES
 from mars_lidar.light.flux import Flux
 from mars_lidar.reconstruction.histogram_record import relative_width
 from mars_lidar.reconstruction.reconstruction import reconstruct
 from mars_lidar.simulation import simulate
 from mars_lidar.table import Table
-
-_ZERO = 0.2  # photons in the exposure that an estimate of zero stands for, in a logarithm
 
 
 class LidarPhysics(Physics):  # type: ignore[misc]  # deepinv is not typed
@@ -135,7 +134,7 @@ class LidarPhysics(Physics):  # type: ignore[misc]  # deepinv is not typed
     def images(self, signal: torch.Tensor, background: torch.Tensor, delay_ns: torch.Tensor) -> torch.Tensor:
         """Images (B, 3, H, W) of light (B, H, W); of logarithms no less than 0.2 photons in the exposure."""
         if self._images == "log":
-            least = _ZERO / self.system.cycles
+            least = TOLERANCES.zero_photons / self.system.cycles
             logs = [light.clamp_min(least).log() for light in (signal, background)]
             return torch.stack([*logs, delay_ns / self._width_ns], 1)
         if self._images == "signal":

@@ -19,6 +19,7 @@ from mars_lidar.instrument.pulse import GaussianPulse
 from mars_lidar.instrument.system import System
 from mars_lidar.learn.forward import HALF, Delay, check_detector, detected, fired, inputs, photons_in, wrapped_energy
 from mars_lidar.learn.needed import torch
+from mars_lidar.learn.tolerances import TOLERANCES
 from mars_lidar.reconstruction.histogram_record import relative_width
 
 
@@ -181,16 +182,10 @@ def _passed(counts: torch.Tensor, signal: Any, background: Any, delay_ns: Any, s
     return torch.xlogy(counts, expected.clamp_min(1e-300)) + torch.xlogy(rest, silent / rest.clamp_min(1e-12))
 
 
-_PART = 0.35  # widths of the pulse in which light and registrations pass for linear
-_STEEPEST = 2.0  # slope over a part at which light, linear in it, is 0 at one end
-_DARKEST = 600.0  # photons in a bin beyond which no pixel stays armed through it; exp of more overflows
-_REACH = 5.0  # sigma of a Gaussian pulse on each side; beyond it there is 6e-7 of its light
-
-
 def _reach(system: System) -> tuple[float, float]:
     """First and last light of the pulse, ns from the delay."""
     if isinstance(system.pulse, GaussianPulse):
-        return -_REACH * system.pulse.sigma_ns, _REACH * system.pulse.sigma_ns
+        return -TOLERANCES.reach * system.pulse.sigma_ns, TOLERANCES.reach * system.pulse.sigma_ns
     return system.pulse.support_ns()
 
 
@@ -203,11 +198,11 @@ def _cut(system: System) -> tuple[int, int, bool]:
     """
     width = relative_width(system) * system.period_ns
     low, high = _reach(system)
-    parts = max(2, math.ceil(system.bin_ns / (_PART * width)))
+    parts = max(2, math.ceil(system.bin_ns / (TOLERANCES.part * width)))
     once, twice = (abs(math.remainder(k * system.detector.dead_time_ns, system.period_ns)) for k in (1, 2))
     if once < high - low:
         return parts, 5, False
-    if system.bin_ns <= _PART * width:
+    if system.bin_ns <= TOLERANCES.part * width:
         return 1, 1, False
     return parts, 2, twice < high - low + system.bin_ns
 
@@ -245,10 +240,10 @@ class _CutBins:
         cells = (self.place * m).unsqueeze(-1) + torch.arange(-1, m + 2, device=counts.device)
         energy = wrapped_energy(system, cells.to(signal.dtype) * (period / (n * m)) - delay_ns[..., None, None])
         light = signal[..., None, None] * energy.diff(dim=-1).clamp_min(0.0) + background[..., None, None] / (n * m)
-        self._slope = (0.5 * (light[..., 2:] - light[..., :-2]) / light[..., 1:-1]).clamp(-_STEEPEST, _STEEPEST)
+        self._slope = _slope(0.5 * (light[..., 2:] - light[..., :-2]) / light[..., 1:-1])
         light = light[..., 1:-1]
         self._p, self._q = fired(light)
-        since = light.cumsum(-1).clamp_max(_DARKEST)
+        since = light.cumsum(-1).clamp_max(TOLERANCES.darkest)
         self._armed, self._lit = torch.exp(light - since), torch.exp(since)
         self.expected = self._armed * self._p  # of a pixel armed at the start of the bin
         self.passes = self.expected.sum(-1)
@@ -256,7 +251,7 @@ class _CutBins:
         own = [offsets.get((k - back + turn) % n, len(offsets)) for k in offsets for turn in range(2)]
         self._chained, self._own = min(own) < len(offsets), torch.tensor(own, device=counts.device)
         earlier = (self.place.unsqueeze(-1) - back + torch.arange(2, device=counts.device)) % n
-        self._earlier = counts.gather(-1, earlier.flatten(-2)).unflatten(-1, earlier.shape[-2:])
+        self._earlier = counts.gather(-1, earlier.flatten(-2)).reshape(earlier.shape)
         self._mine = counts.gather(-1, self.place)
         shares = [_within(system, self._delay.whole + k) for k in range(2)]
         wraps = [cells[..., 1:-2] < self._fine.shift + k for k in range(2)]
@@ -275,8 +270,10 @@ class _CutBins:
         evenly = torch.full_like(counts, 1.0 - part)
         blind, _, far = _rearmings(counts, self._delay, self._system, evenly)
         blind, far = ((values.gather(-1, self.place)) for values in (blind - far, far / max(part, 1e-300)))
-        spread, before, off = self._spread(), None, None
-        slopes: torch.Tensor | float = 0.0
+        spread = self._spread()
+        before: Any = None
+        off: Any = None
+        slopes: Any = 0.0
         self._set_rearming(slopes)
         for turn in range(rounds if self._chained else 1):
             sources = self._earlier_bins(spread, even)
@@ -284,13 +281,13 @@ class _CutBins:
             later = far * (1.0 - (sources[..., 0, :] * (nearer - split * late)).sum(-1))
             change = self._pass(blind + later, self._earlier.unsqueeze(-1) * sources)
             if turn < 2:
-                own = (self._slope + change).clamp(-_STEEPEST, _STEEPEST)
+                own = _slope(self._slope + change)
             if turn < 2 and self._chained:
                 slopes = self._earlier_bins(own, torch.zeros_like(even))
                 self._set_rearming(slopes)
             last, before, last_off = before, self._spread(), off
             off, spread = before - spread, before
-            if last is not None and last_off is not None:
+            if last is not None:
                 turned = off - last_off
                 ahead = (off * turned).sum(-1, keepdim=True) / turned.square().sum(-1, keepdim=True).clamp_min(1e-30)
                 spread = before - ahead.clamp(-1.0, 1.0) * (before - last)
@@ -303,7 +300,8 @@ class _CutBins:
     def _earlier_bins(self, own: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
         """Values (..., W, 2, m) in the two bins one dead time earlier than each: of `own` (..., W, m), or `other`."""
         every = torch.cat([own, other.unsqueeze(-2)], -2)
-        return every.index_select(-2, self._own).unflatten(-2, (-1, 2))
+        picked: torch.Tensor = every.index_select(-2, self._own)
+        return picked.reshape(*own.shape[:-1], 2, own.shape[-1])
 
     def _set_rearming(self, slopes: torch.Tensor | float) -> None:
         """Weights of earlier registrations: in what re-arms in a part, in what of it registers there, in the rest.
@@ -329,7 +327,8 @@ class _CutBins:
         Returns the change of the armed share over each part, relative to its mean.
         """
         within: Any = 0.0
-        again, staying = 0.0, 0.0
+        again: Any = 0.0
+        staying: Any = 0.0
         for span, rearmed, fires, stays in self._rearming:
             source = earlier.flatten(-2)[..., span]
             within = within + (rearmed * source).sum(-1)
@@ -340,6 +339,10 @@ class _CutBins:
         start, end = self._armed * begun[..., :-1], begun[..., 1:] / self._lit
         self.expected = again + self._p * start
         return 2.0 * (end - start) / (end + start).clamp_min(1e-300)
+
+
+def _slope(value: torch.Tensor) -> torch.Tensor:
+    return value.clamp(-TOLERANCES.steepest, TOLERANCES.steepest)
 
 
 def _rearmings(

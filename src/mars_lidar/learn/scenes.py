@@ -31,12 +31,12 @@ from mars_lidar.instrument.system import System
 from mars_lidar.io.scene_files import SceneFile, scan
 from mars_lidar.learn.needed import torch
 from mars_lidar.learn.ranges import Range, SystemList, SystemRange
+from mars_lidar.learn.tolerances import TOLERANCES
 from mars_lidar.light.flux import Flux
 from mars_lidar.scene.scene import Scene
 
 # --- Ray-cast scenes that workers share ----------------------------------------------------------------------------
 
-_SLOTS = 64  # pages are taken as scenes come
 _WRITTEN = 1 << 32
 
 
@@ -53,19 +53,19 @@ class SharedScenes:
         self._map()
 
     def _map(self) -> None:
-        shape = (_SLOTS, 2, *self._size)
+        shape = (TOLERANCES.slots, 2, *self._size)
         content = 8 * int(np.prod(shape))
         self._memory: mmap.mmap | None = None
         if self._file < 0:
             return
-        os.ftruncate(self._file, content + 16 * _SLOTS)
-        self._memory = mmap.mmap(self._file, content + 16 * _SLOTS)
+        os.ftruncate(self._file, content + 16 * TOLERANCES.slots)
+        self._memory = mmap.mmap(self._file, content + 16 * TOLERANCES.slots)
         self._maps = np.frombuffer(self._memory, np.float64, content // 8).reshape(shape)
-        self._heads = np.frombuffer(self._memory, np.uint64, 2 * _SLOTS, content).reshape(_SLOTS, 2)
+        self._heads = np.frombuffer(self._memory, np.uint64, 2 * TOLERANCES.slots, content).reshape(TOLERANCES.slots, 2)
 
     def get(self, number: int) -> Scene | None:
         """A scene that some worker has cast."""
-        place = number % _SLOTS
+        place = number % TOLERANCES.slots
         if self._memory is None or int(self._heads[place, 0]) != number:
             return None
         maps = self._maps[place].copy()
@@ -75,7 +75,7 @@ class SharedScenes:
         """Let the others have it; for scenes without a background map."""
         if self._memory is None:
             return
-        maps, place = np.stack([scene.depth_m, scene.reflectivity]), number % _SLOTS
+        maps, place = np.stack([scene.depth_m, scene.reflectivity]), number % TOLERANCES.slots
         self._maps[place] = maps
         self._heads[place] = number, _checksum(number, maps)
 
@@ -98,10 +98,6 @@ def _checksum(number: int, maps: NDArray[np.float64]) -> int:
 
 
 # --- Where scenes come from ----------------------------------------------------------------------------------------
-
-POOL = 16  # ray-cast scenes in use together
-_MARGIN = 1.5  # side of a ray-cast scene relative to the crop taken from it
-_CACHED = 32  # scenes in memory, per worker
 
 
 def generator(purpose: int, seed: int, *numbers: int) -> np.random.Generator:
@@ -129,7 +125,7 @@ class SceneSource(ABC):
         number = self.number(seed, epoch, sample)
         if number not in self._kept:
             self._kept[number] = self.load(number)
-            if len(self._kept) > _CACHED:
+            if len(self._kept) > TOLERANCES.cached_scenes:
                 self._kept.popitem(last=False)
         self._kept.move_to_end(number)
         return self._kept[number]
@@ -141,21 +137,21 @@ class SceneSource(ABC):
 class RayCast(SceneSource):
     """A built-in scene under ever new seeds: each serves `reuse` samples on average, with other crops and light.
 
-    Samples of one round, `POOL` x `reuse` in a row, each take one of the `POOL` scenes of that round.
+    Samples of one round, `pool` x `reuse` in a row, each take one of the `pool` scenes of that round.
     """
 
     def __init__(self, name: str, size: tuple[int, int], reuse: int) -> None:
         super().__init__()
         self._name, self._reuse = name, reuse
-        self._size = size if reuse == 1 else (round(_MARGIN * size[0]), round(_MARGIN * size[1]))
+        self._size = size if reuse == 1 else (round(TOLERANCES.margin * size[0]), round(TOLERANCES.margin * size[1]))
         self._shared = SharedScenes(self._size) if reuse > 1 else None
 
     def number(self, seed: int, epoch: int, sample: int) -> int:
         """A seed of 64 bits."""
         if self._reuse == 1:
             return int(generator(1, seed, epoch, sample).integers(2**64, dtype=np.uint64))
-        which = int(generator(2, seed, epoch, sample).integers(POOL))
-        return _pooled(seed, epoch, sample // (POOL * self._reuse), which)
+        which = int(generator(2, seed, epoch, sample).integers(TOLERANCES.pool))
+        return _pooled(seed, epoch, sample // (TOLERANCES.pool * self._reuse), which)
 
     def load(self, number: int) -> Scene:
         """Ray-cast the scene, or copy it from another worker."""
@@ -168,7 +164,7 @@ class RayCast(SceneSource):
         return scene
 
 
-@lru_cache(maxsize=4 * POOL)
+@lru_cache(maxsize=4 * TOLERANCES.pool)
 def _pooled(seed: int, epoch: int, turn: int, which: int) -> int:
     """A seed of 64 bits for one of the scenes of a round."""
     return int(generator(1, seed, epoch, turn, which).integers(2**64, dtype=np.uint64))
@@ -288,8 +284,6 @@ def as_source(scenes: Any, size: tuple[int, int] | None, reuse: int) -> SceneSou
 
 # --- One sample ----------------------------------------------------------------------------------------------------
 
-_TRIES = 20  # places tried for a crop with a return in it
-
 
 @dataclass(frozen=True)
 class Sample:
@@ -349,7 +343,7 @@ class Recipe:
         height, width = scene.shape if self.size is None else self.size
         if height > scene.shape[0] or width > scene.shape[1]:
             raise ValueError(f"size must be at most that of every scene, got {height} × {width} and {scene!r}")
-        for _ in range(_TRIES):
+        for _ in range(TOLERANCES.crop_tries):
             y = int(random.integers(scene.shape[0] - height + 1))
             x = int(random.integers(scene.shape[1] - width + 1))
             crop = scene[_run(y, height, down), _run(x, width, right)]

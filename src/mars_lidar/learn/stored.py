@@ -27,8 +27,8 @@ from mars_lidar.dataset.arrays import MAPS, sample_parts
 from mars_lidar.dataset.store import Block, Dataset, open_dataset, read_block
 from mars_lidar.learn.needed import torch
 from mars_lidar.learn.stream import Buffers, Passes, rank_of, worker_of
+from mars_lidar.learn.tolerances import TOLERANCES
 
-_DECODED_BYTES = 256 * 2**20  # of chunks of several exposures, which are decoded whole: what a worker holds of them
 _NATIVE = {  # types that packed counts are decoded to without a copy
     torch.float32: np.float32,
     torch.int16: np.int16,
@@ -324,7 +324,7 @@ class StoredDataset(torch.utils.data.IterableDataset[dict[str, Any]]):
             if block.native:
                 packed[k] = block.packed(sample, realization)
                 continue
-            counts = block.exposure(sample, realization, shards.decoded, _DECODED_BYTES)
+            counts = block.exposure(sample, realization, shards.decoded, TOLERANCES.decoded_bytes)
             if not kind.is_floating_point and int(counts.max(initial=0)) > torch.iinfo(kind).max:
                 raise ValueError(f"dtype {kind} does not hold a count of {int(counts.max())}")
             np.copyto(rows[k], counts, casting="unsafe")

@@ -31,6 +31,7 @@ from mars_lidar.io.scene_files import SceneFile
 from mars_lidar.learn.needed import torch
 from mars_lidar.learn.ranges import LogUniform, Range, SystemRange, as_range, as_systems
 from mars_lidar.learn.scenes import Recipe, Sample, as_source, example_of
+from mars_lidar.learn.tolerances import TOLERANCES
 from mars_lidar.scene.radiometry import AMBIENTS, ATTENUATIONS
 from mars_lidar.scene.scene import Scene
 from mars_lidar.simulation import simulate
@@ -163,7 +164,6 @@ def warn_if_put_together(batched: bool) -> None:
 # --- Examples made ahead -------------------------------------------------------------------------------------------
 
 T = TypeVar("T")
-_WAIT_S = 0.1  # after which a thread that cannot hand on its item looks whether anybody still wants it
 
 
 def prefetched(items: Iterator[T], number: int) -> Iterator[T]:
@@ -178,7 +178,7 @@ def prefetched(items: Iterator[T], number: int) -> Iterator[T]:
     def hand_on(item: Any, error: BaseException | None) -> bool:
         while not closed.is_set():
             try:
-                ready.put((item, error), timeout=_WAIT_S)
+                ready.put((item, error), timeout=TOLERANCES.wait_s)
             except queue.Full:
                 continue
             return True

@@ -8,9 +8,8 @@ from typing import Any
 
 from mars_lidar.learn.forward import Delay, blocks, by_rows, check_detector, inputs, values_of, wrapped_energy
 from mars_lidar.learn.needed import torch
+from mars_lidar.learn.tolerances import TOLERANCES
 from mars_lidar.table import Table
-
-_BLOCK = 2**18  # pixels x bins evaluated together
 
 
 class HistogramTable(torch.nn.Module):
@@ -109,7 +108,7 @@ class HistogramTable(torch.nn.Module):
                     f"{name} must lie in the table's [{low:g}, {high:g}] photons per period, got {least:g} to {most:g}"
                 )
         flat = [tensor.reshape(-1).to(self.histograms.dtype) for tensor in given]
-        parts = blocks(_BLOCK, self.system.bins, *flat)
+        parts = blocks(TOLERANCES.table_values, self.system.bins, *flat)
         out = [_Again.apply(self._expected, *rows) for rows in parts]  # type: ignore[no-untyped-call]
         expected: torch.Tensor = torch.cat(out) if out else self.histograms.new_empty((0, self.system.bins))
         return expected.reshape(*given[0].shape, self.system.bins).to(given[0].dtype)

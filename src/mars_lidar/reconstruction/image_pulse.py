@@ -24,7 +24,7 @@ _SMOOTHING = 0.25  # widths of the pulse, of the Gaussian that takes the noise o
 def cell_count(system: System, blur: float = 0.0) -> int:
     """Cells a period for a pulse that is blurred by a Gaussian of standard deviation `blur`, in periods."""
     sigma = math.sqrt(relative_width(system) ** 2 + blur**2 + 1.0 / (12.0 * system.bins**2))
-    lanes = _core.IMAGE_SIZES["lanes"]
+    lanes = int(_core.IMAGE_SIZES["lanes"])
     return max(lanes, lanes * math.ceil(CELLS_PER_SIGMA / sigma / lanes))
 
 

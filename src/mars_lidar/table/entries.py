@@ -29,12 +29,11 @@ from mars_lidar.statistics.matched import trusted
 from mars_lidar.statistics.phase_chain import ConvergenceError
 from mars_lidar.statistics.renewal import holding_times
 from mars_lidar.table.axes import thinned
+from mars_lidar.table.tolerances import TOLERANCES
 
 # --- Entries by the exact recursion --------------------------------------------------------------------------------
 
 Shapes = NDArray[np.float32]
-
-_BLOCK_BYTES = 32 << 20  # float64 histograms computed together; far below the size of a table
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +89,7 @@ class Entries:
             return self.shape
         out = np.empty_like(self.shape)
         part = cycles / self.cycles
-        step = max(1, _BLOCK_BYTES // (8 * self.shape.shape[1]))
+        step = max(1, TOLERANCES.block_bytes // (8 * self.shape.shape[1]))
         for start in range(0, len(out), step):
             some = slice(start, start + step)
             # H(n) = u + n (H(N) - u) / N
@@ -126,7 +125,7 @@ def exposure_entries(
         startup=np.zeros((n, bins), np.float32) if growing else None,
     )
     window = 3 * (int(system.dead_time_periods) + 1)  # periods that the recursion runs on after settling (20)
-    step = max(64, _BLOCK_BYTES // (8 * bins))
+    step = max(64, TOLERANCES.block_bytes // (8 * bins))
     for start in range(0, n, step):
         some = slice(start, min(start + step, n))
         cells = Cells.of(signal[some], background[some], system)
@@ -188,17 +187,14 @@ class NodeLaws:
         k = int(np.searchsorted(self.row, row))
         if k == self.row.size or self.row[k] != row:
             return None
-        return Pmf(int(self.first[k]), self.pmf[self.offsets[k] : self.offsets[k + 1]], _NEGLIGIBLE)
-
-
-_NEGLIGIBLE = 1e-12  # probability that is not stored at either end of a law
+        return Pmf(int(self.first[k]), self.pmf[self.offsets[k] : self.offsets[k + 1]], TOLERANCES.negligible)
 
 
 def _trimmed(window: Pmf) -> Pmf:
     below = np.cumsum(window.p)
-    some = np.flatnonzero((below > _NEGLIGIBLE) & (below[-1] - below + window.p > _NEGLIGIBLE))
+    some = np.flatnonzero((below > TOLERANCES.negligible) & (below[-1] - below + window.p > TOLERANCES.negligible))
     low, high = (int(some[0]), int(some[-1]) + 1) if some.size else (0, window.p.size)
-    return Pmf(window.first + low, window.p[low:high], _NEGLIGIBLE)
+    return Pmf(window.first + low, window.p[low:high], TOLERANCES.negligible)
 
 
 def node_laws(
@@ -222,13 +218,6 @@ def node_laws(
 
 
 # --- Change with the delay -----------------------------------------------------------------------------------------
-
-_STEP = 0.2  # step of log S and log B; bicubic interpolation errs by less than 1e-4 sd (docs/table.md, 4)
-_PHASE_ERROR = 1e-3  # error of linear interpolation between phases, in standard deviations
-_MAX_PHASES = 192  # phases of a table
-_SAMPLE = 12  # values of each axis from which the phases are chosen
-_MAX_EDGES = 2**14  # candidate phases
-_BLOCK = 256  # cells evaluated together
 
 
 @dataclass(frozen=True, eq=False)
@@ -287,7 +276,7 @@ def start_phases(
     """
     if system.dead_time_periods == 0.0:
         return StartPhases.none()  # Poisson: no memory
-    row, column = thinned(signal, _STEP), thinned(background, _STEP)
+    row, column = thinned(signal, TOLERANCES.log_step), thinned(background, TOLERANCES.log_step)
     index = (row[:, None] * background.size + column[None, :]).reshape(-1)
     cells = Cells.of(np.repeat(signal[row], column.size), np.tile(background[column], row.size), system).resolved(1)
     own = bins[index]
@@ -319,7 +308,7 @@ def start_phases(
 
 
 def _few(size: int) -> IndexArray:
-    return np.unique(np.linspace(0, size - 1, _SAMPLE).round().astype(np.int64))
+    return np.unique(np.linspace(0, size - 1, TOLERANCES.phase_values).round().astype(np.int64))
 
 
 def _phase_grid(cells: Cells, coarsest: int) -> int:
@@ -334,7 +323,7 @@ def _blocks(grids: IndexArray) -> list[tuple[IndexArray, int]]:
     out = []
     for n in np.unique(grids):
         index = np.flatnonzero(grids == n)
-        out += [(index[k : k + _BLOCK], int(n)) for k in range(0, index.size, _BLOCK)]
+        out += [(index[k : k + TOLERANCES.cells], int(n)) for k in range(0, index.size, TOLERANCES.cells)]
     return out
 
 
@@ -370,7 +359,9 @@ def _corrections(cells: Cells, bins: int, phase: FloatArray, threads: int) -> tu
 def _choose(cells: Cells, grids: IndexArray, scale: FloatArray, sample: IndexArray, threads: int) -> FloatArray:
     """Phases between which linear interpolation is good enough for a sample of cells, the worst one first."""
     coarsest = int(grids.min())
-    stride = next(k for k in range(1, coarsest + 1) if coarsest % k == 0 and coarsest // k <= _MAX_EDGES)
+    stride = next(
+        k for k in range(1, coarsest + 1) if coarsest % k == 0 and coarsest // k <= TOLERANCES.phase_candidates
+    )
     edges = cells.edges(coarsest)[::stride]  # edges of every finer grid as well, whose bins divide these
     coarsest //= stride
     curves = []
@@ -397,7 +388,7 @@ def _choose(cells: Cells, grids: IndexArray, scale: FloatArray, sample: IndexArr
     nodes.sort()
     for begin, end in pairwise(nodes):
         settle(begin, end)
-    while error.max() > _PHASE_ERROR and len(nodes) < _MAX_PHASES:
+    while error.max() > TOLERANCES.phase_error and len(nodes) < TOLERANCES.phases:
         worst = int(error.argmax())
         place = int(np.searchsorted(nodes, worst))
         begin, end = nodes[place - 1], nodes[place]
@@ -413,12 +404,12 @@ def _replace_if_wrong(
     """Exact corrections (p, 4) of a cell whose exposure ended before start and end forgot each other.
 
     The corrections of (P7) are compared with exact ones at the few phases where they are largest, and replaced where
-    they differ by more than `_PHASE_ERROR`.
+    they differ by more than `TOLERANCES.phase_error`.
     """
     size = np.abs(correction / scale)
     checked = np.unique(np.concatenate([size.argmax(0), size[:, :2].argmin(0), [phase.size // 2]]))
     exact = _directly(cells, cell, bins, phase[checked], threads)
-    if not (np.abs(exact - correction[checked])[:, :2] / scale[:2]).max() > _PHASE_ERROR:
+    if not (np.abs(exact - correction[checked])[:, :2] / scale[:2]).max() > TOLERANCES.phase_error:
         return
     correction[:] = _directly(cells, cell, bins, phase, threads)
 
@@ -439,7 +430,6 @@ def _directly(cells: Cells, cell: int, bins: int, phase: FloatArray, threads: in
 # --- The two methods -----------------------------------------------------------------------------------------------
 
 Method = Literal["exposure", "mars"]
-_CELL_BLOCK = 32
 
 
 @dataclass(frozen=True, eq=False)
@@ -486,7 +476,7 @@ def renewal_entries(
     shape = np.full((n, system.bins), 1.0 / system.bins, dtype=np.float32)
 
     def block(start: int) -> int:
-        stop = min(start + _CELL_BLOCK, n)
+        stop = min(start + TOLERANCES.chain_cells, n)
         for k in range(start, stop):
             photons = signal[k] * energy + background[k] / bins
             if photons.any():
@@ -497,14 +487,14 @@ def renewal_entries(
         return stop - start
 
     with ThreadPoolExecutor(max(1, threads)) as pool:
-        waiting = {pool.submit(block, start) for start in range(0, n, _CELL_BLOCK)}
+        waiting = {pool.submit(block, start) for start in range(0, n, TOLERANCES.chain_cells)}
         try:
             while waiting:
                 done, waiting = wait(waiting, timeout=0.2, return_when=FIRST_EXCEPTION)
                 for future in done:
                     future.result()
                 if progress is not None:
-                    progress(n - min(n, _CELL_BLOCK * len(waiting)), n)
+                    progress(n - min(n, TOLERANCES.chain_cells * len(waiting)), n)
         except BaseException:  # Ctrl-C as well: what has not begun never does
             pool.shutdown(wait=False, cancel_futures=True)
             raise

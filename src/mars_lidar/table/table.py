@@ -37,7 +37,7 @@ from mars_lidar.statistics.law import count_law
 from mars_lidar.statistics.matched import matched_pmf
 from mars_lidar.statistics.phase_chain import ConvergenceError
 from mars_lidar.table import cache, storage
-from mars_lidar.table.axes import MAX_POINTS, PAPER_GRID, Grid, axis_values, describe, inserted, midpoints, thinned
+from mars_lidar.table.axes import PAPER_GRID, Grid, axis_values, describe, inserted, midpoints, thinned
 from mars_lidar.table.entries import (
     Entries,
     Lookup,
@@ -50,15 +50,12 @@ from mars_lidar.table.entries import (
     read_pixels,
     start_phases,
 )
-from mars_lidar.table.error import MOST_CYCLES, LawError, QuantisationError, deviations, law_variation, random_pixels
+from mars_lidar.table.error import LawError, QuantisationError, deviations, law_variation, random_pixels
+from mars_lidar.table.tolerances import TOLERANCES
 
 Interpolation = Literal["bilinear", "nearest"]
 INTERPOLATIONS, OUTSIDE = ("bilinear", "nearest"), ("error", "exact")
 _METHODS, _REARMS = ("exposure", "mars"), ("centre", "edge")
-_ERROR_SAMPLES = 128  # random pixels on which a new table is checked
-_ATTEMPTS = 4  # refinements, each with half the error of the previous one
-_LINES = 8  # values of the other axis at which an axis is examined
-_ROUNDS = 12
 
 Axes = tuple[FloatArray, FloatArray]
 Evaluate = Callable[[FloatArray, FloatArray], Entries]
@@ -185,10 +182,10 @@ class Table:
         began = time.perf_counter()
         if goal is None:
             table = _evaluated(system, axes, recipe, progress)
-            error = table.quantisation_error(samples=_ERROR_SAMPLES, threads=recipe.threads)
+            error = table.quantisation_error(samples=TOLERANCES.error_pixels, threads=recipe.threads)
         else:
             table, error = _refined(system, axes, recipe, goal, progress)
-        longest = table._long_error(_ERROR_SAMPLES, recipe.threads)
+        longest = table._long_error(TOLERANCES.error_pixels, recipe.threads)
         law = table.law_error(threads=recipe.threads).to_dict() if check_law else None
         table.provenance.update(
             key=storage.request_key(system, axes, method=method, rearm=rearm, refine=goal, tolerance=tolerance),
@@ -540,10 +537,10 @@ class Table:
 
     def _long_error(self, samples: int, threads: int | None) -> QuantisationError | None:
         """Errors at the longest exposure, 1e8 cycles; None where some entry does not serve it, or has no exact law."""
-        if self.system.cycles != MOST_CYCLES and not self.entries.serves(MOST_CYCLES).all():
+        if self.system.cycles != TOLERANCES.cycles and not self.entries.serves(TOLERANCES.cycles).all():
             return None
         try:
-            return self.quantisation_error(samples=samples, cycles=MOST_CYCLES, threads=threads)
+            return self.quantisation_error(samples=samples, cycles=TOLERANCES.cycles, threads=threads)
         except ConvergenceError:  # the law of a random pixel between the entries, which is much of a locked one
             return None
 
@@ -645,10 +642,10 @@ def _refined(
     system: System, axes: Axes, recipe: Recipe, goal: float, progress: Progress | None
 ) -> tuple[Table, QuantisationError]:
     inner = goal
-    for _ in range(_ATTEMPTS):
+    for _ in range(TOLERANCES.attempts):
         axes = _refined_axes(*axes, lambda s, b: recipe.entries(s, b, system), inner)
         table = _evaluated(system, axes, recipe, progress)
-        error = table.quantisation_error(samples=4 * _ERROR_SAMPLES, threads=recipe.threads)
+        error = table.quantisation_error(samples=4 * TOLERANCES.error_pixels, threads=recipe.threads)
         if error.largest <= goal:
             return table, error
         inner *= 0.5
@@ -678,7 +675,7 @@ def _refined_axes(
 def _lines(axis: FloatArray) -> FloatArray:
     positive = axis[axis > 0]
     span = np.log(positive[-1] / positive[0]) if positive.size else 0.0
-    some = axis[thinned(axis, max(span / (_LINES - 1), 1e-9))]
+    some = axis[thinned(axis, max(span / (TOLERANCES.lines - 1), 1e-9))]
     return some[some > 0] if positive.size else some
 
 
@@ -686,7 +683,7 @@ def _refined_axis(
     axis: FloatArray, along: Callable[[FloatArray], Entries], lines: FloatArray, goal: float
 ) -> FloatArray:
     """One axis. `along` evaluates points x lines; lines are the exact nodes of a table's second axis here."""
-    for _ in range(_ROUNDS):
+    for _ in range(TOLERANCES.rounds):
         if axis.size < 2:
             return axis
         between = midpoints(axis)
@@ -708,10 +705,11 @@ def _refined_axis(
         bad = np.maximum(law, shape).reshape(between.size, lines.size).max(1) > 0.5 * goal
         if not bad.any():
             return axis
-        if axis.size + int(bad.sum()) > MAX_POINTS:
+        if axis.size + int(bad.sum()) > TOLERANCES.points:
             break
         axis = inserted(axis, between[bad])
     raise ValueError(
-        f"refine must be an error that {MAX_POINTS} points of an axis and {_ROUNDS} rounds can meet, got {goal:g}: "
+        f"refine must be an error that {TOLERANCES.points} points of an axis and {TOLERANCES.rounds} rounds can meet, "
+        f"got {goal:g}: "
         f"{axis.size} points in [{axis[0]:g}, {axis[-1]:g}] do not meet it; choose a larger error or a smaller range"
     )

@@ -124,7 +124,9 @@ def _single(values: NDArray[Any]) -> _Cells:
 
 
 def _is_times(values: Any) -> bool:
-    return isinstance(values, np.ndarray) and values.dtype.kind in "fiu" and values.size == max((0, *values.shape))
+    if not isinstance(values, np.ndarray) or values.dtype.kind not in "fiu":
+        return False
+    return values.size in values.shape if values.size else not any(values.shape)
 
 
 def cells_of(variables: dict[str, Any]) -> dict[str, _Cells]:

@@ -1,0 +1,65 @@
+"""What the package `mars_lidar.learn` computes by: its tolerances and limits, with unit and origin."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Tolerances:
+    """Quantities that accuracy, work or memory of this package depends on."""
+
+    # forward: the cyclic solver
+    krylov: int = 40
+    """Dimension of the Krylov space of GMRES; 14 steps do in most pixels."""
+    restarts: int = 25
+    """Of GMRES, before it gives up."""
+    residual: float = 1e-13
+    """Relative to the source, at which GMRES stops: three digits above the rounding of double precision."""
+    accepted_residual: float = 1e-9
+    """Relative to the source, where rounding prevents further progress."""
+    cached_values: int = 2**15
+    """Pixels x bins solved together on a CPU: a working array of 256 KiB stays in the cache."""
+    arrays: int = 24
+    """(pixels, bins) beside the Krylov space, the powers of two of the recursion among them."""
+
+    # forward: the expected histogram
+    parts_of_width: float = 4.0
+    """Of sigma of the pulse: the docstring of `expected_histogram` states the error."""
+    photons: int = 2**22
+    """Pixels x bins in memory together: 32 MiB."""
+
+    # tabulated
+    table_values: int = 2**18
+    """Pixels x bins evaluated together: 2 MiB."""
+
+    # likelihood: bins that are cut (bias below 0.06 standard deviations: tests/learn/test_likelihood.py)
+    part: float = 0.35
+    """Widths of the pulse in which light and registrations pass for linear."""
+    steepest: float = 2.0
+    """Slope over a part, relative to the mean, at which light is 0 at one end."""
+    darkest: float = 600.0
+    """Photons in a bin beyond which no pixel stays armed through it: exp(700) overflows."""
+    reach: float = 5.0
+    """Sigma of a Gaussian pulse on each side: beyond it there is 6e-7 of its light."""
+
+    # streams
+    zero_photons: float = 0.2
+    """In the exposure, that an estimate of zero stands for in a logarithm."""
+    wait_s: float = 0.1
+    """Seconds after which a thread that cannot hand on its item looks whether anybody still wants it."""
+    decoded_bytes: int = 256 * 2**20
+    """Of chunks of several exposures, which are decoded whole: what a worker holds of them."""
+    slots: int = 64
+    """Scenes in the memory that workers share; its pages are taken as scenes come."""
+    pool: int = 16
+    """Ray-cast scenes in use together."""
+    margin: float = 1.5
+    """Side of a ray-cast scene relative to the crop taken from it."""
+    cached_scenes: int = 32
+    """In memory, of a worker."""
+    crop_tries: int = 20
+    """Places tried for a crop with a return in it."""
+
+
+TOLERANCES = Tolerances()

@@ -119,6 +119,16 @@ def test_an_effect_is_named(effect: str) -> None:
     assert NAMES[effect] in [suspect.name for suspect in result.suspects]
 
 
+@pytest.mark.nightly
+def test_twilight_that_looks_like_afterpulses_is_named_alone() -> None:
+    """Its score is that of afterpulses; the refit with them leaves a misfit."""
+    truth = replace(BASE, twilight=2.0)
+    result = ml.calibrate(stream(truth, 100_000, 332), seed=332)
+    assert [suspect.name for suspect in result.suspects] == [NAMES["twilight"]]
+    assert result.fits
+    assert abs(result.estimates["twilight_ns"].value - 2.0) < FAR * result.estimates["twilight_ns"].error
+
+
 @pytest.mark.full
 @pytest.mark.parametrize(("probability", "delay"), [(0.1, 100.0), (0.05, 30.0)])
 def test_strong_afterpulses_are_taken_in(probability: float, delay: float) -> None:

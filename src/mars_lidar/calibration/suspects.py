@@ -97,12 +97,14 @@ def refitted(fit: Fit, fitted: Fitted, listed: list[Score]) -> tuple[Fitted, Nam
     """The fit with the one effect that takes most of the misfit; None where no effect is clear.
 
     Effects are named by the refit: a slow recovery may have the score of a paralyzable detector, and one that the
-    dead time has taken up has no score at all. So where the misfit is clear, effects without a score are tried too.
+    dead time has taken up has no score at all. So where the misfit stays clear, effects without a score are tried too.
     """
     limit = clear(listed)
     best = _best(fit, fitted, [score for score in listed if score.z > limit], limit)
-    if best is None and fitted.p_value < _MISFIT:
-        best = _best(fit, fitted, [score for score in listed if score.z <= limit], limit)
+    if (fitted if best is None else best[0]).p_value < _MISFIT:
+        other = _best(fit, fitted, [score for score in listed if score.z <= limit], limit)
+        trials = [trial for trial in (best, other) if trial is not None]
+        best = min(trials, key=lambda trial: trial[0].misfit_z, default=None)
     return best
 
 

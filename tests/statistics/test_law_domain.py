@@ -19,7 +19,7 @@ from mars_lidar.statistics import exposure as exposure_module
 from mars_lidar.statistics import joint as pixel_module
 from mars_lidar.statistics.budget import LAW
 from mars_lidar.statistics.cells import Cells
-from mars_lidar.statistics.joint_grid import FoldedGrid, left_over
+from mars_lidar.statistics.joint_grid import FoldedGrid, relative_residual
 from mars_lidar.statistics.tolerances import TOL
 from tests.harness.law_map import disagreements, draw, laws
 
@@ -474,8 +474,8 @@ def test_a_warm_state_that_is_not_found_is_refused():
     a lock)."""
     system = view(0.9997565745952581, 1, 0.011089244157797067, "stationary", bins=1430)
     flux = ml.Flux(1000.0, 0.1484680065940475, 0.890211598817147 * PERIOD_NS)
-    assert left_over(np.ones(3), np.zeros(3)) == math.inf
-    assert left_over(np.zeros(3), np.zeros(3)) == 0.0
+    assert relative_residual(np.ones(3), np.zeros(3)) == math.inf
+    assert relative_residual(np.zeros(3), np.zeros(3)) == 0.0
     for law in (
         lambda: ml.registration_pdf(flux, system, "stationary"),
         lambda: mean_histogram(flux, system),

@@ -404,7 +404,7 @@ def _replace_if_wrong(
     """Exact corrections (p, 4) of a cell whose exposure ended before start and end forgot each other.
 
     The corrections of (P7) are compared with exact ones at the few phases where they are largest, and replaced where
-    they differ by more than `TOLERANCES.phase_error`.
+    they differ by more than the tolerance `phase_error`.
     """
     size = np.abs(correction / scale)
     checked = np.unique(np.concatenate([size.argmax(0), size[:, :2].argmin(0), [phase.size // 2]]))

@@ -121,10 +121,10 @@ def histogram_log_likelihood(
     Notes
     -----
     Unbiased to 0.1 of the Cramer-Rao bound's standard deviation at 1000 cycles, for bins of up to 3 widths (sigma) of
-    the pulse, S up to 10, B up to 5 and any dead time (399 random instruments against the exact mean histogram, of which one
-    has 0.104; the bias in these units grows with the square root of the cycles). Not so where fewer than about one of the
-    passes of the pulse ends without registration in an exposure that began armed: 0.3 to 0.7. Where the window of
-    bins that are cut moves by a bin, the value jumps by about 3e-7. Cost: O(bins); where
+    the pulse, S up to 10, B up to 5 and any dead time (399 random instruments against the exact mean histogram, of
+    which one has 0.104; the bias in these units grows with the square root of the cycles). Not so where fewer than
+    about one of the passes of the pulse ends without registration in an exposure that began armed: 0.3 to 0.7.
+    Where the window of bins that are cut moves by a bin, the value jumps by about 3e-7. Cost: O(bins); where
     bins are wider than a third of the pulse's width, or dead time re-arms the pixel within the pulse, the bins that the
     pulse reaches are cut into parts of a third of it (docs/learn.md has the times).
 

@@ -1,13 +1,15 @@
 // Gaussian jitter of the records: the mean histogram of registrations, convolved round the period, as
 // statistics/timing.py has it.
-import { sharpness } from "./light.js";
+import { photonsIn, sharpness, sum } from "./light.js";
 
 const PARTS_PER_SIGMA = 24, MOST_PARTS = 2 ** 16;
 
 /** Parts of the period in which registrations are wanted, and the probabilities that a record is d parts later. */
 export class Jitter {
-  constructor(native, system) {
-    const finest = 1 / (2 * Math.sqrt(Math.PI) * Math.max(sharpness(system.sigma), 1));
+  constructor(native, system, pixel) {
+    // Registrations of n photons fall within an n-th of the width of the light: as fast as its first photon comes.
+    const photons = Math.max(sum(photonsIn(native, system, pixel, 1)), 1);
+    const finest = 1 / (2 * Math.sqrt(Math.PI) * Math.max(sharpness(system.sigma), 1) * photons);
     const width = Math.hypot(finest, system.jitter), bins = system.bins;
     const split = Math.ceil(PARTS_PER_SIGMA / (Math.max(width, 1e-9) * bins));
     this.split = 2 * Math.max(1, Math.floor(Math.min(split, Math.floor(MOST_PARTS / bins)) / 2));

@@ -27,7 +27,7 @@ const stages = {
   /** The exact mean histogram, and mean and variance of the count. */
   mean() {
     const { system, pixel } = kept;
-    kept.jitter = system.jitter > 0 ? new Jitter(native, system) : null;
+    kept.jitter = system.jitter > 0 ? new Jitter(native, system, pixel) : null;
     const out = kept.jitter?.parts ?? system.bins;
     kept.law = system.mode === SYNCHRONOUS ? synchronous(native, system, pixel, out) : exposure(native, system, pixel, out);
     const { cumulants, histogram, bins } = kept.law;

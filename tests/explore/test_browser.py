@@ -56,6 +56,7 @@ STATES: dict[str, dict[str, Any]] = {
     "no dead time": {"dead": 0, "cycles": 300},
     "light effects": {"efficiency": 0.3, "dark": 1e6},
     "jitter": {"jitter": 2, "cycles": 1000, "bins": 64},
+    "jitter, bright": {"jitter": 0.3, "signal": 20, "cycles": 1000, "bins": 32},
     "bright": {"signal": 20, "background": 1, "cycles": 2000},
     "few cycles": {"cycles": 12, "bins": 32},
 }

@@ -19,13 +19,13 @@ const LINK_MS = 400; // after the last change, before the address has it: Safari
 
 async function begin() {
   const told = JSON.parse(at("cube").textContent);
-  const source = told ? new CubeSource(told) : new SceneSource();
+  const networks = async () => ({ weights: widened(await unpacked(at("weights").textContent)), card: Float64Array.from(JSON.parse(at("card").textContent)) });
+  const source = told ? new CubeSource(told) : new SceneSource(networks);
   const module = await WebAssembly.compile(await unpacked(at("native").textContent)), worker = at("worker").textContent;
   const page = { histogram: at("histogram"), law: at("law"), facts: at("facts"), notes: at("notes"), computing: at("computing") };
   const figureAlone = new URLSearchParams(location.search).has("figure"); // embedded in a page of its own prose
   document.body.classList.toggle("figure-alone", figureAlone);
   const figure = new Figure(page, new Engine(module, worker)), painter = new Engine(module, worker);
-  const networks = { weights: widened(await unpacked(at("weights").textContent)), card: Float64Array.from(JSON.parse(at("card").textContent)) };
   const pixels = source.height * source.width;
   const base = told ? { ...INITIAL, ...source.settings } : INITIAL;
   const first = fromHash(location.hash, pixels, base, source.images);
@@ -107,7 +107,7 @@ async function begin() {
     const found = lastPicture;
     const tell = (share) => { if (mine === painted) at("progress").textContent = share < 1 ? `${Math.round(100 * share)} %` : ""; };
     try {
-      await source.picture(current, painter, networks, tell, (some) => {
+      await source.picture(current, painter, tell, (some) => {
         if (mine !== painted) return;
         Object.assign(found, some);
         showPictures(found, current, range);

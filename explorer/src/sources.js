@@ -14,7 +14,9 @@ export class SceneSource {
   fixed = [];
   images = 1;
 
-  constructor() {
+  /** `networks` unpacks those of the image method, which only that method needs. */
+  constructor(networks) {
+    this.networks = networks;
     this.height = scene.height;
     this.width = scene.width;
     this.depth = Float64Array.from(wordsOf(scene.depth_mm), (mm) => mm / 1000);
@@ -30,14 +32,14 @@ export class SceneSource {
   }
 
   /** Counts and delays (periods) of all pixels, by parts to `show`. */
-  async picture(state, engine, networks, tell, show) {
+  async picture(state, engine, tell, show) {
     const delays = this.depth.map((depth) => NS_PER_M * depth), pixels = Array.from(delays, (_, p) => p);
     const second = state.second > 0 ? this.light.map((x) => state.second * x) : null;
     const light = detected(state, this.light.map((x) => state.signal * x), delays, pixels, second);
     const found = await engine.ask("picture", { system: inPeriods(state), light, seed: state.seed }, tell);
     show({ totals: found.totals, delay: found.delay, peak: found.delay });
     if (state.method === "likelihood") show(await engine.ask("likelihood", {}, tell));
-    if (state.method === "image") show(await engine.ask("image", { height: this.height, width: this.width, networks }, tell));
+    if (state.method === "image") show(await engine.ask("image", { height: this.height, width: this.width, networks: await this.networks() }, tell));
     if (state.method === "truth") show({ delay: light.delay });
   }
 
@@ -76,7 +78,7 @@ export class CubeSource {
     return { signal: state.signal, second: state.second, background: state.background, delayNs: state.delay, index: 0, stored, counts: this.shown?.counts };
   }
 
-  async picture(state, engine, networks, tell, show) {
+  async picture(state, engine, tell, show) {
     const pixels = this.height * this.width, totals = new Float64Array(pixels).fill(NaN), delay = new Float64Array(pixels).fill(NaN);
     const step = Math.max(1, Math.ceil(4096 / this.width));
     for (let first = 0; first < this.height; first += step) {

@@ -33,7 +33,7 @@ class Tolerances:
     table_values: int = 2**18
     """Pixels x bins evaluated together: 2 MiB."""
 
-    # likelihood: bins that are cut (bias below 0.06 standard deviations: tests/learn/test_likelihood.py)
+    # likelihood: bins that are cut (bias: docs/learn.md and tests/learn/test_likelihood.py)
     part: float = 0.35
     """Widths of the pulse in which light and registrations pass for linear."""
     steepest: float = 2.0

@@ -300,7 +300,7 @@ def _describe_pictures(app: Sphinx, doctree: nodes.document) -> None:
 
 
 def _wrap_pictures(app: Sphinx, doctree: nodes.document) -> None:
-    """Puts each picture of a program or a report into a box, which scrolls where the picture could not be read smaller."""
+    """Puts pictures of programs and reports into boxes that scroll where a picture could not be read smaller."""
     if app.env.docname == "index":  # made for a phone
         return
     for image in [node for node in doctree.findall() if isinstance(node, (nodes.image, imgsgnode))]:

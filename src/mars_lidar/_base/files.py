@@ -577,7 +577,7 @@ def read_column(path: Path, *, alone: bool = False) -> NDArray[np.float64]:
     columns = np.asarray(rows)
     if len(columns) > 1 and columns.shape[1] == 2:
         steps = np.diff(columns[:, 0])
-        if not 0 < steps.max() < 1.5 * steps.min():  # a line that is missing doubles a step; rounding changes it by less
+        if not 0 < steps.max() < 1.5 * steps.min():  # a missing line doubles a step, rounding changes it by less
             raise ValueError(
                 f"its first column must be times that ascend in equal steps, got steps of {steps.min():g} to "
                 f"{steps.max():g}"

@@ -83,5 +83,6 @@ def _counts_type(matrix: Any) -> np.dtype[Any]:
     if data is None or stored.kind not in "iuf" or (matrix.format == "coo" and not matrix.has_canonical_format):
         return stored
     with np.errstate(invalid="ignore"):
-        are_counts = bool(((data >= 0) & (data == np.floor(data))).all()) and float(data.sum(dtype=np.float64)) < TOL.counts
+        whole = bool(((data >= 0) & (data == np.floor(data))).all())
+        are_counts = whole and float(data.sum(dtype=np.float64)) < TOL.counts
     return np.dtype(np.uint32) if are_counts and stored.itemsize > 4 else stored

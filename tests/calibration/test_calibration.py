@@ -96,6 +96,24 @@ def test_a_pulse_or_a_jitter_that_is_hardly_there(number: int) -> None:
 
 
 @pytest.mark.full
+def test_a_dead_time_that_two_early_intervals_refuse() -> None:
+    """Eleven intervals a nanosecond at its end, of which few were recorded: the counts say .9 ns more, 7.6 errors."""
+    truth, photons = random_truth(3142)
+    result = ml.calibrate(stream(truth, photons, 3142), seed=3142)
+    assert result.fits
+    assert (np.abs(pulls(result, truth)) < 3.5).all()
+    assert result.estimates["dead_time_ns"].error < 0.3  # three times what the shortest interval alone tells
+
+
+def test_the_clock_of_a_period_that_ends_within_a_unit() -> None:
+    """A pulse about the end of the period: 1 in 86 times, of the unit that is cut, lie at the begin of the next."""
+    truth, _ = random_truth(3234)
+    look = ml.calibrate(stream(truth, 5_000, 3234), look=True).look
+    assert look.unit_ns == truth.unit
+    assert look.locked
+
+
+@pytest.mark.full
 def test_a_few_photons_of_a_fine_clock_start_at_the_pulse() -> None:
     """16,384 cells of the period, 5,289 photons: most cells are empty, so their median is no measure of the light."""
     truth, photons = random_truth(4)
@@ -237,7 +255,7 @@ def test_native_counts_are_those_of_numpy() -> None:
             assert (np.diff(t) >= 0.0).all()
             if clock.unit_ns and not clock.locked:
                 assert np.abs(t / clock.unit_ns % 1.0 - 0.5).max() < 1e-6
-        cells = Cells(model, rows[0], list(streams), 1e4)
+        cells = Cells(model, rows[0], list(streams), 1e4, 0.7)
         gaps = slice(cells.phases, cells.phases + cells.gap_edges.size + 1)
         for t, counts in zip(streams, cells.count(streams), strict=True):
             edges = np.r_[-np.inf, np.nextafter(cells.gap_edges, np.inf), np.inf]  # an interval at an edge is below it

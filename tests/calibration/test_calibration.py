@@ -10,8 +10,8 @@ import pytest
 import mars_lidar as ml
 from tests.calibration.photon_by_photon import Truth, as_timestamps, photon_by_photon
 from tests.calibration.sweep import NAMES, pulls, random_truth, with_effect
+from tests.calibration.sweep import ORDINARY as BASE
 
-BASE = Truth(signal=0.4, background=0.15, delay=30.0, sigma=0.3, dead=50.0, period=100.0, jitter=0.1, unit=0.064)
 FAR = 4.5  # stated errors: 7e-6 by chance for a normal law
 
 

@@ -309,6 +309,8 @@ def open_dataset(path: str | Path, *, allow_incomplete: bool = False, listed: bo
         Nothing there, or no dataset; one that lacks a part, or whose metadata is damaged (a ValueError).
     IncompleteFileError
         Its generation did not finish (a ValueError).
+    TypeError, ValueError
+        A path that is no text or Path, or an address that cannot be one.
     """
     with reading(place_of(path), "a dataset of mars-lidar") as source:
         dataset = Dataset(source, listed=listed)
@@ -334,6 +336,13 @@ def read_sparse(dataset: Dataset | str | Path, sample: int, realization: int = 0
     -------
     scipy.sparse.coo_array
         (H W, bins), in order of rows and columns, of the type of the histogram.
+
+    Raises
+    ------
+    FileNotFoundError, ValueError
+        No dataset, or one that is incomplete or damaged; no such sample or realization.
+    TypeError
+        An argument of another kind.
     """
     source = dataset if isinstance(dataset, Dataset) else open_dataset(dataset)
     array = source.histogram

@@ -101,6 +101,8 @@ def foreign_cube(
     ------
     FileNotFoundError, ValueError
         No such file, not readable, or not what the arguments say; the message names the file.
+    TypeError
+        An argument of another kind.
 
     See Also
     --------

@@ -10,8 +10,8 @@ import pytest
 import mars_lidar as ml
 from tests.calibration.photon_by_photon import Truth, as_timestamps, photon_by_photon
 from tests.calibration.sweep import NAMES, pulls, random_truth, with_effect
+from tests.calibration.sweep import ORDINARY as BASE
 
-BASE = Truth(signal=0.4, background=0.15, delay=30.0, sigma=0.3, dead=50.0, period=100.0, jitter=0.1, unit=0.064)
 FAR = 4.5  # stated errors: 7e-6 by chance for a normal law
 
 
@@ -93,6 +93,24 @@ def test_a_pulse_or_a_jitter_that_is_hardly_there(number: int) -> None:
     result = ml.calibrate(stream(truth, photons, number), seed=number)
     assert result.fits
     assert (np.abs(pulls(result, truth)) < 3.5).all()  # 5e-4 by chance, of 15
+
+
+@pytest.mark.full
+def test_a_dead_time_that_two_early_intervals_refuse() -> None:
+    """Eleven intervals a nanosecond at its end, of which few were recorded: the counts say .9 ns more, 7.6 errors."""
+    truth, photons = random_truth(3142)
+    result = ml.calibrate(stream(truth, photons, 3142), seed=3142)
+    assert result.fits
+    assert (np.abs(pulls(result, truth)) < 3.5).all()
+    assert result.estimates["dead_time_ns"].error < 0.3  # three times what the shortest interval alone tells
+
+
+def test_the_clock_of_a_period_that_ends_within_a_unit() -> None:
+    """A pulse about the end of the period: 1 in 86 times, of the unit that is cut, lie at the begin of the next."""
+    truth, _ = random_truth(3234)
+    look = ml.calibrate(stream(truth, 5_000, 3234), look=True).look
+    assert look.unit_ns == truth.unit
+    assert look.locked
 
 
 @pytest.mark.full
@@ -237,7 +255,7 @@ def test_native_counts_are_those_of_numpy() -> None:
             assert (np.diff(t) >= 0.0).all()
             if clock.unit_ns and not clock.locked:
                 assert np.abs(t / clock.unit_ns % 1.0 - 0.5).max() < 1e-6
-        cells = Cells(model, rows[0], list(streams), 1e4)
+        cells = Cells(model, rows[0], list(streams), 1e4, 0.7)
         gaps = slice(cells.phases, cells.phases + cells.gap_edges.size + 1)
         for t, counts in zip(streams, cells.count(streams), strict=True):
             edges = np.r_[-np.inf, np.nextafter(cells.gap_edges, np.inf), np.inf]  # an interval at an edge is below it

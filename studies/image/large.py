@@ -7,6 +7,8 @@ import sys
 import time
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
@@ -23,13 +25,24 @@ def rows(sides: tuple[int, ...], system: System, photons: float, sbr: float) -> 
     """Seconds of one processor and the memory at most, above that of the photons themselves too, for each size."""
     out: list[Row] = []
     for side in sides:
-        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as alone:
-            out.append(alone.submit(_cost, side, system, photons, sbr).result())
+        with TemporaryDirectory() as folder:
+            path = Path(folder) / "photons.npz"
+            for step in (_draw, _cost):
+                with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as alone:
+                    result = alone.submit(step, path, side, system, photons, sbr).result()
+            out.append(result)
     return out
 
 
-def _cost(side: int, system: System, photons: float, sbr: float) -> Row:
+def _draw(path: Path, side: int, system: System, photons: float, sbr: float) -> Row:
     given, delay = drawn(side, system, photons, sbr)
+    np.savez(path, first=given.first, bin=given.bin, number=given.number, delay=delay)
+    return {}
+
+
+def _cost(path: Path, side: int, system: System, photons: float, sbr: float) -> Row:
+    with np.load(path) as saved:
+        given, delay = Photons(side, side, saved["first"], saved["bin"], saved["number"]), saved["delay"]
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / _OF_RUSAGE
     began, at = time.process_time(), time.perf_counter()
     found = Image().of_photons(given, system, 1)

@@ -195,7 +195,8 @@ def _commands() -> str:
     examples = [commands.get(section.split()[2]) for section in sections]
     parts = [example.partition("\n\n") if example else None for example in (app.help_epilogue, *examples)]
     ends = [f"```text\n{part[0]}\n```\n\n{part[2]}\n\n" if part else "" for part in parts]
-    return "".join(section + end for section, end in zip((overview, *sections), ends, strict=True))
+    page = "".join(section + end for section, end in zip((overview, *sections), ends, strict=True))
+    return re.sub(r"docs/(\w+)\.md", r"[](../\1.md)", page)
 
 
 for page in (ROOT / "docs" / "api").glob("*.rst"):  # of names that have gone
@@ -222,7 +223,9 @@ def _annotations(thing: Any, section: str) -> dict[str, str]:
         return {p.name: str(p.annotation) for p in parameters if p.annotation is not p.empty}
     types = _annotations(thing, "Parameters")
     for base in reversed(getattr(thing, "__mro__", ())):
-        types |= {name: str(text) for name, text in inspect.get_annotations(base).items()}
+        types |= {
+            name: getattr(text, "__forward_arg__", str(text)) for name, text in inspect.get_annotations(base).items()
+        }
         for name, member in vars(base).items():
             getter = getattr(member, "fget", None) or getattr(member, "func", None)  # a property, also a cached one
             text = getattr(getter, "__annotations__", {}).get("return")
@@ -232,7 +235,8 @@ def _annotations(thing: Any, section: str) -> dict[str, str]:
 
 
 def _document_types(app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
-    """Puts the types of the annotations beside the names of the sections Parameters and Attributes."""
+    """Puts the types of the annotations beside the names of the sections Parameters and Attributes, and links pages."""
+    lines[:] = [re.sub(r"docs/(\w+)\.md", r":doc:`/\1`", line) for line in lines]
     types: dict[str, str] = {}
     for number, line in enumerate(lines):
         following = lines[number + 1] if number + 1 < len(lines) else ""
@@ -267,6 +271,20 @@ def _title(app: Sphinx, page: str, source: list[str]) -> None:
 def _link_copies(app: Sphinx, page: str, source: list[str]) -> None:
     source[0] = source[0].replace("](../benchmarks/results/", "](copied/benchmarks/")
     source[0] = source[0].replace("](../CONTRIBUTING.md", "](copied/project/CONTRIBUTING.md")
+    if Path(app.env.doc2path(page)).suffix == ".md":  # a page's name becomes its title
+        source[0] = re.sub(r"\[[\w/]+\.md\](\((?!https?:)[^)\s]+\.md\))", r"[]\1", source[0])
+
+
+_NOT_PROSE = re.compile(r"(```.*?```|(`+).*?\2|\$\$.*?\$\$|\$[^$\n]*\$|\]\([^)]*\))", re.DOTALL)
+_SYMBOL = re.compile(r"(?<![\w\\./])([tN]_[dre])(?![\w/])")
+
+
+def _set_symbols(app: Sphinx, page: str, source: list[str]) -> None:
+    """Symbols with an index that reports, which are text, spell out."""
+    if Path(app.env.doc2path(page)).suffix == ".md":
+        parts = _NOT_PROSE.split(source[0])  # prose, a match, its backticks, prose, ...
+        del parts[2::3]
+        source[0] = "".join(part if k % 2 else _SYMBOL.sub(r"$\1$", part) for k, part in enumerate(parts))
 
 
 def _describe_pictures(app: Sphinx, doctree: nodes.document) -> None:
@@ -279,6 +297,17 @@ def _describe_pictures(app: Sphinx, doctree: nodes.document) -> None:
         description = image.get("alt", "")
         if not description or re.match(r"(plot|lesson) \d", description):
             image["alt"] = f"{title}: picture {number}, described in the text beside it"
+
+
+def _wrap_pictures(app: Sphinx, doctree: nodes.document) -> None:
+    """Puts pictures of programs and reports into boxes that scroll where a picture could not be read smaller."""
+    if app.env.docname == "index":  # made for a phone
+        return
+    for image in [node for node in doctree.findall() if isinstance(node, (nodes.image, imgsgnode))]:
+        if isinstance(image, imgsgnode):
+            image.replace_self(nodes.container("", image.deepcopy(), classes=["picture"]))
+        elif isinstance(image.parent, nodes.paragraph) and len(image.parent) == 1:
+            image.parent["classes"].append("picture")
 
 
 def _mark_long_cells(app: Sphinx, doctree: nodes.document) -> None:
@@ -308,8 +337,10 @@ def setup(app: Sphinx) -> None:
     """Hooks of Sphinx."""
     app.connect("source-read", _link_copies)
     app.connect("source-read", _title)
+    app.connect("source-read", _set_symbols)
     app.connect("autodoc-process-docstring", _document_types, priority=400)  # before numpydoc, 500
     app.connect("doctree-read", _describe_pictures)
+    app.connect("doctree-read", _wrap_pictures)
     app.connect("doctree-read", _drop_private_bases)
     app.connect("doctree-read", _mark_long_cells)
     app.connect("build-finished", lambda app, error: FORMULAS.close())

@@ -96,5 +96,5 @@ def test_a_npy_that_claims_more_than_it_holds_is_refused(tmp_path):
     with open(tmp_path / "a.npy", "wb") as stream:
         np.lib.format.write_array_header_1_0(stream, {"descr": "<f8", "fortran_order": False, "shape": (2**40, 3, 4)})
         stream.write(bytes(1000))
-    with pytest.raises(FileError, match=r"a\.npy: .*too short for an array of shape"):
+    with pytest.raises(FileError, match=r"a\.npy: .*takes 105553116266496 bytes, and it has 1000"):
         io.read_transient(tmp_path / "a.npy", bin_ns=1.0)

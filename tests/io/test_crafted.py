@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import struct
 import time
+import warnings
+import zipfile
 from pathlib import Path
 
 import h5py
@@ -137,8 +140,45 @@ def test_numbers_above_a_column_are_no_words(tmp_path: Path):
         (tmp_path / "a.csv").write_text(text)
         with pytest.raises(ValueError, match="holds no numbers"):
             read_column(tmp_path / "a.csv")
-    (tmp_path / "a.csv").write_text("# made 2026-11-23\nt_ns, counts\n1, 2\n3, 4\n")
-    assert read_column(tmp_path / "a.csv").tolist() == [2.0, 4.0]
+    for mark in ("", "\ufeff"):  # which spreadsheets put before the text
+        (tmp_path / "a.csv").write_text(mark + "# made 2026-11-23\nt_ns, counts\n1, 2\n3, 4\n", encoding="utf-8")
+        assert read_column(tmp_path / "a.csv").tolist() == [2.0, 4.0]
+
+
+def test_the_first_line_behind_a_byte_order_mark_is_a_count(tmp_path: Path):
+    """It was taken for a line of words: the histogram lost its first bin."""
+    (tmp_path / "a.csv").write_text("\ufeff7\n2\n", encoding="utf-8")
+    assert read_column(tmp_path / "a.csv").tolist() == [7.0, 2.0]
+
+
+@pytest.mark.parametrize("times", [(0, 1, 2, 4), (3, 2, 1, 0), (1, 10, 100, 1000), (0, 0, 1, 2)])
+def test_times_beside_counts_ascend_in_equal_steps(tmp_path: Path, times):
+    """They were not looked at: a line that a recorder leaves out, for no counts, moved all later bins."""
+    path = tmp_path / "a.csv"
+    path.write_text("".join(f"{time},5\n" for time in times))
+    with pytest.raises(ValueError, match=r"a\.csv.*equal steps"):
+        io.foreign_cube(path, SYSTEM)
+    path.write_text("0.33,5\n0.67,1\n1.00,2\n1.33,4\n")  # thirds, rounded
+    assert read_column(path).tolist() == [5.0, 1.0, 2.0, 4.0]
+    with pytest.raises(ValueError, match=r"a\.csv.*one column"):
+        ml.Timestamps.load(path, unit_ns=1.0, period_ns=0.1)
+
+
+def test_an_array_that_is_shorter_than_its_file_is_refused(tmp_path: Path):
+    """A shape of fewer rows than there are was read without a word."""
+    whole = np.arange(12 * 32, dtype=np.int32).reshape(12, 32) % 5
+    np.save(tmp_path / "a.npy", whole)
+    content = (tmp_path / "a.npy").read_bytes().replace(b"(12, 32)", b"( 2, 32)")
+    (tmp_path / "b.npy").write_bytes(content)
+    with zipfile.ZipFile(tmp_path / "b.npz", "w") as archive:
+        archive.writestr("a.npy", content)
+    np.savez(tmp_path / "c.npz", a=whole)
+    with warnings.catch_warnings(), zipfile.ZipFile(tmp_path / "c.npz", "a") as archive:
+        warnings.simplefilter("ignore", UserWarning)
+        archive.writestr("a.npy", (tmp_path / "a.npy").read_bytes())
+    for name in ("b.npy", "b.npz", "c.npz"):
+        with pytest.raises(FileError, match=re.escape(name)):
+            io.foreign_cube(tmp_path / name, SYSTEM)
 
 
 def test_text_is_no_capture(tmp_path):

@@ -120,3 +120,31 @@ def test_chunks_that_no_file_can_list_are_refused(tmp_path: Path):
         data = file.create_dataset("a", (756_484, 7, 7), "f8", chunks=(1, 7, 7))
         with pytest.raises(FileError, match="756484 chunks"):
             whole(data)
+
+
+@pytest.mark.parametrize("packed", [False, True])
+@pytest.mark.parametrize(
+    ("place", "value", "reason"),
+    [
+        (9, 0x08, "lacks a part"),  # complex, without an imaginary part
+        (8, 5, "lacks a part"),  # sparse, without rows and ends
+        (4, 12, "no flags"),
+        (36, 64, "do not fill"),  # its values go on into the next cell
+        (40, 14, "no element is of type 14"),  # a matrix in the place of numbers
+        (44, 1, "a part too many"),
+    ],
+)
+def test_cells_whose_parts_are_not_those_of_their_class_are_refused(packed, place, value, reason, tmp_path: Path):
+    """The first ended the process: SciPy took the next cell for numbers."""
+    head = [6, 8, 6, 0, 5, 8, 1, 3, 1, 0, 9, 24]  # flags, (1, 3), no name, three doubles
+    cell = bytearray(struct.pack("<12I3d", *head, 1.0, 2.0, 3.0))
+    cell[place] = value
+    cells = b"".join(struct.pack("<II", 14, len(cell)) + each for each in (bytes(cell), bytes(cell)))
+    inside = struct.pack("<10I", 6, 8, 1, 0, 5, 8, 1, 2, 1 | 1 << 16, 97) + cells
+    variable = struct.pack("<II", 14, len(inside)) + inside
+    if packed:
+        variable = struct.pack("<II", 15, len(zlib.compress(variable))) + zlib.compress(variable)
+    savemat(tmp_path / "a.mat", {"b": np.zeros(1)})
+    (tmp_path / "a.mat").write_bytes((tmp_path / "a.mat").read_bytes()[:128] + variable)
+    with pytest.raises(FileError, match=rf"a\.mat.*{reason}"):
+        read_mat5(tmp_path / "a.mat")

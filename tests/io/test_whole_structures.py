@@ -98,6 +98,51 @@ def test_indices_outside_of_a_sparse_matrix_are_refused(name, where, value, tmp_
         io.load(path)
 
 
+@pytest.mark.parametrize(
+    ("part", "change"),
+    [
+        ("indices", lambda values: values + 0.5),
+        ("indices", lambda values: values.astype("S4")),
+        ("indptr", lambda values: values.astype(float)),
+        ("indptr", lambda values: np.append(values[:-1], values[-1] - 2)),
+    ],
+)
+def test_indices_of_another_type_or_to_some_of_the_values_are_refused(part, change, tmp_path):
+    """SciPy makes integers of any type, and leaves out what is beyond the last end."""
+    matrix, names = counts(), {"indices": "ir", "indptr": "jc"}
+    changed = {"indices": matrix.indices, "indptr": matrix.indptr} | {part: change(getattr(matrix, part))}
+    np.savez(tmp_path / "a.npz", format=b"csc", shape=matrix.shape, data=matrix.data, **changed)
+    with h5py.File(tmp_path / "a.mat", "w") as file:
+        group = file.create_group("spad")
+        group.attrs["MATLAB_sparse"] = np.uint64(matrix.shape[0])
+        group["data"] = matrix.data
+        for name, values in changed.items():
+            group[names[name]] = values
+    for name in ("a.npz", "a.mat"):
+        with pytest.raises(FileError, match=name):
+            foreign_cube(tmp_path / name, SYSTEM, image=(3, 4))
+
+
+@pytest.mark.parametrize("offset", [1000, -1000, 2**40])
+def test_diagonals_outside_of_a_matrix_are_refused(offset, tmp_path):
+    """Their counts were left out; 2^40 became 0."""
+    matrix = counts().todia()
+    offsets = matrix.offsets.astype(np.int64) + offset
+    np.savez(tmp_path / "a.npz", format=b"dia", shape=matrix.shape, data=matrix.data, offsets=offsets)
+    with pytest.raises(FileError, match=r"a\.npz.*diagonal"):
+        foreign_cube(tmp_path / "a.npz", SYSTEM, image=(3, 4))
+
+
+def test_sums_of_counts_do_not_wrap_around():
+    """94 counts of 2^63 became 94 zeros, and 200 + 200 in bytes 144."""
+    huge = sparse.csr_array(np.full((12, 32), 2**63, np.uint64))
+    with pytest.raises(ValueError, match="counts"):
+        io.from_histograms(huge, SYSTEM)
+    twice = sparse.coo_array((np.array([200, 200], np.uint8), ([1, 1], [2, 2])), shape=(12, 32))
+    for matrix in (twice, sparse.csr_array((twice.data, [2, 2], [0, 0, *[2] * 11]), shape=(12, 32))):
+        assert dense_counts("counts", matrix)[1, 2] == 400
+
+
 def test_rows_of_matlab_ascend(tmp_path):
     matrix = counts()
     first, second = matrix.indices[:2].copy()

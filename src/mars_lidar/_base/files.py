@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from mars_lidar._base import mat5
 from mars_lidar._base.buckets import in_bucket
-from mars_lidar._base.resources import check_memory
+from mars_lidar._base.resources import check_memory, no_thread
 from mars_lidar._base.sparse import check_sparse, is_sparse
 from mars_lidar._base.tolerances import TOL
 
@@ -302,7 +302,7 @@ def reading(path: str | Path, kind: str = "file") -> Iterator[Path]:
             type(error) is ValueError or isinstance(error, OSError)
         ):  # an OSError of a library's own, such as Pillow's
             raise FileError(text) from error
-        if isinstance(error, MemoryError):
+        if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and no_thread(error)):
             raise MemoryError(f"{source}: does not fit in memory ({text[:300]})") from error
         if not (text and isinstance(error, ValueError | TypeError | OSError)):  # such as a KeyError
             text = f"{type(error).__name__} {text}".strip()
@@ -382,13 +382,15 @@ def open_npz(path: Path, stream: Any = None, *, beside: str = "") -> Iterator[Np
     with reading(path, "an .npz"):
         with zipfile.ZipFile(stream or path) as archive:
             members = archive.infolist()
+            if len(set(archive.namelist())) < len(members):
+                raise ValueError("several of its arrays have the same name")
             check_claim(path, sum(entry.file_size for entry in members if entry.filename != f"{beside}.npy"))
             for entry in members:
                 with archive.open(entry) as member:
                     shape, dtype, _ = npy_header(member)
                     nbytes = math.prod(shape) * dtype.itemsize
-                    if nbytes > entry.file_size:
-                        raise ValueError(f"{entry.filename} cannot hold an array of shape {shape}")
+                    if member.tell() + nbytes != entry.file_size:
+                        raise ValueError(f"{entry.filename} does not hold an array of shape {shape}")
                     if entry.filename == f"{beside}.npy":
                         check_claim(path, nbytes, beside, in_parts=True)
         if stream is not None:
@@ -426,8 +428,9 @@ class NpyFile:
             self.shape, self.dtype, self._in_columns = npy_header(stream)
             self._start = stream.tell()
             self.nbytes = math.prod(self.shape) * self.dtype.itemsize
-            if self.nbytes > path.stat().st_size - self._start:
-                raise ValueError(f"it is too short for an array of shape {self.shape}")
+            content = path.stat().st_size - self._start
+            if self.nbytes != content:
+                raise ValueError(f"an array of shape {self.shape} takes {self.nbytes} bytes, and it has {content}")
 
     def __getitem__(self, rows: slice) -> NDArray[Any]:
         height, *rest = self.shape or (1,)
@@ -557,11 +560,11 @@ def _check_sparse_within(name: str, value: Any) -> None:
         check_sparse(name, value, sorted_rows=True)
 
 
-def read_column(path: Path) -> NDArray[np.float64]:
-    """The last of one or two columns of numbers in a text file, below lines of words; else a ValueError."""
+def read_column(path: Path, *, alone: bool = False) -> NDArray[np.float64]:
+    """Values of a text file below lines of words, unless `alone` beside times in equal steps; else a ValueError."""
     check_claim(path, 64 * path.stat().st_size)
     rows: list[list[float]] = []
-    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+    for line in path.read_text(encoding="utf-8-sig", errors="replace").splitlines():
         try:
             rows.append([float(part) for part in line.replace(",", " ").replace(";", " ").split()])
         except ValueError:
@@ -569,6 +572,14 @@ def read_column(path: Path) -> NDArray[np.float64]:
             if rows or like_numbers:  # lines of words are only above the numbers
                 raise ValueError(f"line {line[:40]!r} holds no numbers") from None
     rows = [row for row in rows if row]
-    if not rows or {len(row) for row in rows} not in ({1}, {2}):
-        raise ValueError("numbers as text are one column, or times and values")
-    return np.asarray(rows)[:, -1]
+    if not rows or {len(row) for row in rows} not in ({1}, {1 if alone else 2}):
+        raise ValueError("numbers as text must be one column" + ("" if alone else ", or times and values"))
+    columns = np.asarray(rows)
+    if len(columns) > 1 and columns.shape[1] == 2:
+        steps = np.diff(columns[:, 0])
+        if not 0 < steps.max() < 1.5 * steps.min():  # a missing line doubles a step, rounding changes it by less
+            raise ValueError(
+                f"its first column must be times that ascend in equal steps, got steps of {steps.min():g} to "
+                f"{steps.max():g}"
+            )
+    return columns[:, -1]

@@ -19,11 +19,18 @@ _VALUES = frozenset({1, 2, 3, 4, 5, 6, 7, 9, 12, 13, 16, 17, 18})  # numbers and
 _CLASSES = {1: "cell", 2: "struct", 3: "object", 4: "char", 5: "sparse", **dict.fromkeys(range(6, 16), "numbers")}
 
 
+_PARTS = {4: 3, 5: 5, **dict.fromkeys(range(6, 16), 3)}  # elements after the flags, by class: shape, name, values
+_HEAD = 40  # bytes of the flags, the shape and the name of an array, at least
+
+
 class _Kind(IntEnum):
     """Types of elements that contain others."""
 
     MATRIX = 14
     COMPRESSED = 15
+
+
+_MATRIX = int(_Kind.MATRIX)  # compared for each element, where an enumeration costs
 
 
 @dataclass(frozen=True)
@@ -128,27 +135,63 @@ def _values(content: bytes, place: int, order: str) -> tuple[bytes, int]:
 
 
 def _check(content: bytes, order: str, most: int) -> None:
-    """Raise ValueError for an element of a type that there is not, or more than `most` of them."""
-    unpack, matrix, values = struct.Struct(order + "II").unpack_from, int(_Kind.MATRIX), _VALUES
+    """Raise ValueError unless SciPy's reader meets, where it expects numbers, an element of numbers; `most` of arrays.
+
+    SciPy goes from element to element and does not look at the size of the matrix around them. So none may end beyond
+    the matrix that contains it, and one of numbers must have all its parts, the imaginary one where its flags say so.
+    """
+    unpack, unpack_head = struct.Struct(order + "II").unpack_from, struct.Struct(order + "10I").unpack_from
     ends: list[int] = []  # of the matrices that contain the element
     place, end = 0, len(content)
     for _ in range(most):
         while end - place < 8:
+            if place < end:
+                raise _unreadable("its elements do not fill what contains them")
             if not ends:
                 return
-            place, end = end, ends.pop()
+            end = ends.pop()
         kind, size = unpack(content, place)
         place += 8
-        if kind == matrix:
-            if len(ends) > TOL.nested:
-                raise ValueError(f"holds cells or structures more than {TOL.nested} deep")
-            ends.append(end)
-            end = min(end, place + size)
-        elif kind in values:
-            place += size + 7 & -8
-        elif not kind >> 16 or kind & 0xFFFF not in values:  # a small one has its size there, and values for a size
-            raise _no_type(kind)
+        if kind != _MATRIX:
+            place = _after(place, kind, size, end)
+        elif size:  # of an empty cell it is 0
+            inner_end = place + size
+            if inner_end > end or size < _HEAD:
+                raise _unreadable("its elements do not fill what contains them")
+            kind, size, flags, _, of_shape, axes, _, _, of_name, name = unpack_head(content, place)
+            if kind != 6 or size != 8:
+                raise _unreadable("a variable has no flags")
+            place += 16
+            parts = _PARTS.get(flags & 0xFF)
+            if parts is None:
+                if len(ends) > TOL.nested:
+                    raise ValueError(f"holds cells or structures more than {TOL.nested} deep")
+                ends.append(end)
+                end = inner_end
+                continue
+            parts += flags >> 11 & 1
+            if of_shape == 5 and axes == 8 and of_name == 1 and name == 0:  # as in most cells: (H, W), without a name
+                place, parts = place + 24, parts - 2
+            while parts:
+                if inner_end - place < 8:
+                    raise _unreadable("a variable lacks a part")
+                kind, size = unpack(content, place)
+                place = _after(place + 8, kind, size, inner_end)
+                parts -= 1
+            if place < inner_end:
+                raise _unreadable("a variable has a part too many")
     raise _unreadable(f"it has more than {most:,} elements: is it damaged?")
+
+
+def _after(place: int, kind: int, size: int, end: int) -> int:
+    """Where the next element begins after one of numbers, whose content begins at `place`."""
+    if kind in _VALUES:
+        if place + size > end:
+            raise _unreadable("its elements do not fill what contains them")
+        return place + (size + 7 & -8)
+    if not kind >> 16 or kind & 0xFFFF not in _VALUES:  # a small one has its size there, and values for a size
+        raise _no_type(kind)
+    return place
 
 
 def _no_type(kind: int) -> ValueError:

@@ -7,6 +7,7 @@ changes memory beyond the array.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -45,6 +46,23 @@ def check_sparse(name: str, matrix: Any, *, sorted_rows: bool = False) -> None:
                 raise ValueError(f"{name} is damaged: a sparse index lies outside of its shape {matrix.shape}")
 
 
+def check_stored(parts: Mapping[str, NDArray[Any]]) -> None:
+    """Raise ValueError unless the indices of a file's sparse matrix are whole numbers, to each of its values.
+
+    SciPy casts any type to integers, leaves out what is beyond the last row or column's end, and reads no diagonal that
+    lies outside of the matrix.
+    """
+    for name in {"indices", "indptr", "row", "col", "offsets"} & parts.keys():
+        if parts[name].dtype.kind not in "iu":
+            raise ValueError(f"{name} of a sparse matrix must be integers, got {parts[name].dtype}")
+    if "indptr" in parts and int(parts["indptr"][-1]) != len(parts["indices"]):
+        raise ValueError(f"a sparse matrix has {len(parts['indices'])} values and ends at {parts['indptr'][-1]}")
+    if "offsets" in parts:
+        rows, columns = map(int, parts["shape"])
+        if not all(-rows < int(offset) < columns for offset in parts["offsets"]):
+            raise ValueError(f"a diagonal of a sparse matrix lies outside of its shape ({rows}, {columns})")
+
+
 def dense_bytes(matrix: Any) -> int:
     """Memory of `dense_counts`."""
     return math.prod(map(int, matrix.shape)) * _counts_type(matrix).itemsize
@@ -57,11 +75,14 @@ def dense_counts(name: str, matrix: Any) -> NDArray[Any]:
 
 
 def _counts_type(matrix: Any) -> np.dtype[Any]:
-    """uint32 where the stored elements are counts, each of which comes once, else the type of the matrix."""
+    """uint32 where the stored elements are counts, else that of the matrix; sums of repeated integers do not wrap."""
     stored: np.dtype[Any] = np.dtype(matrix.dtype)
     data = matrix.data if matrix.format in (*_COMPRESSED, *_EXPANDED) else None
+    if stored.kind in "iu" and not getattr(matrix, "has_canonical_format", True):
+        return np.dtype(np.float64)
     if data is None or stored.kind not in "iuf" or (matrix.format == "coo" and not matrix.has_canonical_format):
         return stored
     with np.errstate(invalid="ignore"):
-        are_counts = bool(((data >= 0) & (data == np.floor(data))).all()) and float(data.sum()) < TOL.counts
+        whole = bool(((data >= 0) & (data == np.floor(data))).all())
+        are_counts = whole and float(data.sum(dtype=np.float64)) < TOL.counts
     return np.dtype(np.uint32) if are_counts and stored.itemsize > 4 else stored

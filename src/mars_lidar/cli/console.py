@@ -105,6 +105,11 @@ def run(app: App, tokens: Sequence[str]) -> int:
             raise
         say(f"failed: {error}: give fewer threads, or more memory")
         return Exit.FAILED
+    except SystemError as error:  # CPython makes it of a MemoryError in the body of a class
+        if "without setting an exception" not in str(error):
+            raise
+        say("failed: the memory or address space (ulimit -v) is exhausted")
+        return Exit.FAILED
     except (ValueError, TypeError, OverflowError, MemoryError) as error:
         say(_with_options(" ".join(str(error).split()), tokens) or type(error).__name__)
         return Exit.BAD_INPUT

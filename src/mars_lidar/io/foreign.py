@@ -16,7 +16,7 @@ from mars_lidar._base import mat5
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.files import NpyFile, check_claim, npy_header, open_npz, read_column, read_npy, reading, whole
 from mars_lidar._base.hdf5 import CELLS, open_hdf5
-from mars_lidar._base.sparse import check_sparse, dense_bytes, is_sparse
+from mars_lidar._base.sparse import check_sparse, check_stored, dense_bytes, is_sparse
 from mars_lidar.instrument.system import System
 from mars_lidar.io.cube import Cube
 from mars_lidar.io.measured import from_histograms, from_photon_times, in_order
@@ -281,6 +281,7 @@ def _npz(path: Path) -> dict[str, Any]:
             from scipy import sparse
 
             matrix = sparse.load_npz(path)
+            check_stored(archive)
             check_sparse("", matrix)
             return {"": matrix}
         return {name: archive[name] for name in archive.files if archive[name].dtype.kind in "iuf"}

@@ -13,7 +13,7 @@ import numpy as np
 from mars_lidar._base import mat5
 from mars_lidar._base.files import check_claim, open_npz, read_mat5, reading, size_on_disk, whole
 from mars_lidar._base.hdf5 import CELLS, open_hdf5
-from mars_lidar._base.sparse import check_sparse, is_sparse
+from mars_lidar._base.sparse import check_sparse, check_stored, is_sparse
 from mars_lidar.io.store import OnDisk
 
 _FEW_CELLS, _CELL_BYTES = 50_000, 8  # cells of any file; bytes of a file that each of more takes at least
@@ -110,10 +110,11 @@ def _sparse(name: str, group: Any) -> Any:
     """A sparse matrix of MATLAB 7.3: a group of columns' ends, rows and values."""
     from scipy import sparse
 
-    columns = whole(group["jc"]).astype(np.int64)
-    data, rows = (whole(group[part]) if part in group else np.zeros(0) for part in ("data", "ir"))
+    columns = whole(group["jc"])
+    data, rows = (whole(group[part]) if part in group else np.zeros(0, int) for part in ("data", "ir"))
+    check_stored({"indices": rows, "indptr": columns})
     shape = (int(group.attrs["MATLAB_sparse"]), len(columns) - 1)
-    matrix = sparse.csc_array((data, rows.astype(np.int64), columns), shape=shape)
+    matrix = sparse.csc_array((data, rows.astype(np.int64), columns.astype(np.int64)), shape=shape)
     check_sparse(name, matrix, sorted_rows=True)
     return matrix
 

@@ -78,7 +78,7 @@ def _flat(path: Path, name: str, cells: _Cells) -> tuple[NDArray[np.float64], ND
 def _times(path: Path, unit_ns: float | None, variable: str | None) -> tuple[dict[str, _Cells], str, _Cells, float]:
     """All variables, the name and the cells of the one that holds the times, and their unit, ns."""
     if path.suffix in (".csv", ".txt"):
-        variables = {"": _single(read_column(path))}
+        variables = {"": _single(read_column(path, alone=True))}
     elif path.suffix == ".mat":
         variables = cells_of(mat_arrays(path, deep=False))
     else:

@@ -22,11 +22,16 @@ nb::bytes pack(Vector<const Count> counts) {
 }
 
 template <class Count>
+void unpack_one(Vector<const uint8_t> packed, Count* out, size_t size) {
+    const Packed source(packed.data(), packed.shape(0));
+    if (source.size != size) throw std::invalid_argument("packed counts are of another size than their chunk");
+    unpack_counts(source, out);
+}
+
+template <class Count>
 void unpack(Vector<const uint8_t> packed, Vector<Count> out) {
     const nb::gil_scoped_release release;
-    const Packed source(packed.data(), packed.shape(0));
-    if (source.size != out.shape(0)) throw std::invalid_argument("packed counts are of another size than their chunk");
-    unpack_counts(source, out.data());
+    unpack_one(packed, out.data(), out.shape(0));
 }
 
 // Row k of `out` becomes what packed[k] holds.
@@ -35,15 +40,7 @@ void unpack_batch(const std::vector<Vector<const uint8_t>>& packed, Matrix<Count
     const nb::gil_scoped_release release;
     if (packed.size() != out.shape(0)) throw std::invalid_argument("out must have a row for each packed chunk");
     const size_t size = out.shape(1);
-    const auto source = [&](size_t k) {
-        Packed one(packed[k].data(), packed[k].shape(0));
-        if (one.size != size) throw std::invalid_argument("packed counts are of another size than their chunk");
-        return one;
-    };
-    size_t k = 0;
-    for (; k + 1 < packed.size(); k += 2)
-        unpack_counts(source(k), out.data() + k * size, source(k + 1), out.data() + (k + 1) * size);
-    if (k < packed.size()) unpack_counts(source(k), out.data() + k * size);
+    for (size_t k = 0; k < packed.size(); ++k) unpack_one(packed[k], out.data() + k * size, size);
 }
 
 uint64_t events_of(Vector<const uint8_t> packed) { return Packed(packed.data(), packed.shape(0)).events; }

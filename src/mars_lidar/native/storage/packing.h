@@ -94,10 +94,9 @@ class Unpacker {
         : bits_{source.data.data() + kHeader, source.data.data() + source.data.size() - kPadding}, size_(source.size) {}
 
     // Position and count - 1 of the next element that is not zero.
-    std::pair<uint64_t, uint32_t> next() {
-        const uint32_t gap = bits_.rice(gaps_.parameter());
+    MARS_INLINE std::pair<uint64_t, uint32_t> next() {
+        const auto [gap, more] = bits_.rice_pair(gaps_.parameter(), above_.parameter());
         gaps_.see(gap);
-        const uint32_t more = bits_.rice(above_.parameter());
         above_.see(more);
         const uint64_t position = next_ + gap;
         if (position >= size_) throw std::invalid_argument("packed counts run over their end");
@@ -117,7 +116,7 @@ void Packed::for_each(const Found& found) const {
 
 // One more than `more` as a Count; std::invalid_argument where an integer type does not hold it.
 template <class Count>
-Count count_of(uint32_t more) {
+MARS_INLINE Count count_of(uint32_t more) {
     const Count count = static_cast<Count>(static_cast<uint64_t>(more) + 1);
     if (std::is_integral_v<Count> && static_cast<uint64_t>(count) != static_cast<uint64_t>(more) + 1)
         throw std::invalid_argument("packed counts exceed their type");
@@ -129,30 +128,6 @@ template <class Count>
 void unpack_counts(const Packed& source, Count* out) {
     std::memset(out, 0, source.size * sizeof(Count));
     source.for_each([&](uint64_t, uint64_t position, uint32_t more) { out[position] = count_of<Count>(more); });
-}
-
-// The same of two sources at a time: each code begins where the one before it ends, so that one stream alone leaves most of
-// the processor waiting.
-template <class Count>
-void unpack_counts(const Packed& first, Count* out, const Packed& second, Count* other) {
-    std::memset(out, 0, first.size * sizeof(Count));
-    std::memset(other, 0, second.size * sizeof(Count));
-    Unpacker one(first), two(second);
-    const uint64_t both = std::min(first.events, second.events);
-    for (uint64_t k = 0; k < both; ++k) {
-        const auto [here, more] = one.next();
-        const auto [there, above] = two.next();
-        out[here] = count_of<Count>(more);
-        other[there] = count_of<Count>(above);
-    }
-    for (uint64_t k = both; k < first.events; ++k) {
-        const auto [position, more] = one.next();
-        out[position] = count_of<Count>(more);
-    }
-    for (uint64_t k = both; k < second.events; ++k) {
-        const auto [position, more] = two.next();
-        other[position] = count_of<Count>(more);
-    }
 }
 
 }  // namespace mars

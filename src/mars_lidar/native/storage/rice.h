@@ -5,6 +5,7 @@
 #include <cstddef>
 #include <cstdint>
 #include <stdexcept>
+#include <utility>
 
 #include "lanes/bits.h"
 
@@ -13,14 +14,16 @@ namespace mars {
 constexpr size_t kPadding = 8;  // bytes behind a code that a reader may look at
 
 constexpr int kEscape = 24;  // a quotient of this many zeros or more: the value follows in 32 plain bits
-inline void store64(uint8_t* to, uint64_t value) {
-    for (int k = 0; k < 8; ++k) to[k] = static_cast<uint8_t>(value >> (8 * k));
+// Little-endian numbers. Compilers make one instruction of these expressions, and of a loop only where they unroll it.
+MARS_INLINE void store64(uint8_t* to, uint64_t x) {
+    to[0] = static_cast<uint8_t>(x), to[1] = static_cast<uint8_t>(x >> 8), to[2] = static_cast<uint8_t>(x >> 16);
+    to[3] = static_cast<uint8_t>(x >> 24), to[4] = static_cast<uint8_t>(x >> 32), to[5] = static_cast<uint8_t>(x >> 40);
+    to[6] = static_cast<uint8_t>(x >> 48), to[7] = static_cast<uint8_t>(x >> 56);
 }
 
-inline uint64_t load64(const uint8_t* from) {
-    uint64_t value = 0;
-    for (int k = 0; k < 8; ++k) value |= static_cast<uint64_t>(from[k]) << (8 * k);
-    return value;
+MARS_INLINE uint64_t load64(const uint8_t* from) {
+    const auto byte = [&](int k) { return static_cast<uint64_t>(from[k]) << (8 * k); };
+    return byte(0) | byte(1) | byte(2) | byte(3) | byte(4) | byte(5) | byte(6) | byte(7);
 }
 
 // The parameter of a Rice code for numbers of about the running mean: floor(log2(mean)), 0 below a mean of 2, which is
@@ -29,8 +32,8 @@ inline uint64_t load64(const uint8_t* from) {
 template <int Memory>
 struct Adaptive {
     uint64_t sum = 0;  // mean times 2^Memory, below 2^(32 + Memory)
-    int parameter() const { return highest_bit(sum >> Memory | 1); }
-    void see(uint32_t value) { sum += value - (sum >> Memory); }
+    MARS_INLINE int parameter() const { return highest_bit(sum >> Memory | 1); }
+    MARS_INLINE void see(uint32_t value) { sum += value - (sum >> Memory); }
 };
 using Gaps = Adaptive<4>;
 using Counts = Adaptive<1>;
@@ -70,10 +73,10 @@ struct BitReader {
     const uint8_t *at, *end;  // readable to end + kPadding
     int used = 0;             // bits of *at
 
-    uint64_t peek() const {
+    MARS_INLINE uint64_t peek() const {
         return load64(at) >> used;  // 57 bits at least
     }
-    void skip(int width) {
+    MARS_INLINE void skip(int width) {
         used += width;
         at += used >> 3;
         used &= 7;
@@ -81,12 +84,32 @@ struct BitReader {
     }
     uint32_t rice(int k) {
         const uint64_t word = peek();
-        const int quotient = lowest_bit(word | uint64_t{1} << kEscape);
+        const int quotient = quotient_of(word);
         if (quotient >= kEscape) {
             skip(kEscape + 32);
             return static_cast<uint32_t>(word >> kEscape);
         }
         skip(quotient + 1 + k);
+        return value(word, quotient, k);
+    }
+    // Two codes, of parameters k and j. Nearly always one word holds both, and reading is a matter of how long each step
+    // waits for the one before it.
+    MARS_INLINE std::pair<uint32_t, uint32_t> rice_pair(int k, int j) {
+        const uint64_t word = peek();
+        const int quotient = quotient_of(word), first = quotient + 1 + k;
+        const uint64_t rest = word >> first;
+        const int another = quotient_of(rest), width = first + another + 1 + j;
+        if (quotient >= kEscape || another >= kEscape || width > 57) {
+            const uint32_t one = rice(k);
+            return {one, rice(j)};
+        }
+        skip(width);
+        return {value(word, quotient, k), value(rest, another, j)};
+    }
+
+ private:
+    static MARS_INLINE int quotient_of(uint64_t word) { return lowest_bit(word | uint64_t{1} << kEscape); }
+    static MARS_INLINE uint32_t value(uint64_t word, int quotient, int k) {
         const uint64_t rest = (word >> (quotient + 1)) & ((uint64_t{1} << k) - 1);
         return static_cast<uint32_t>(static_cast<uint64_t>(quotient) << k | rest);
     }

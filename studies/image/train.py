@@ -243,7 +243,7 @@ def _calibrated(
     for k in range(plan.calibration):
         image = _prepared(scenes.example(scenes.CALIBRATION + k, plan.seed))
         prepared.append(_weighed(torch, image, first))
-        near.append(image.solver.background_near().reshape(image.valid.shape))
+        near.append(np.asarray(image.solver.background_near()).reshape(image.valid.shape))
     with torch.no_grad():
         _, of = _weigh_loss(torch, net, prepared, 0)
     stated = (of["valid"] & (of["half"] < OUTLIER_SIGMA) & (of["doubt"] < 1.0 - LEVEL)).numpy()

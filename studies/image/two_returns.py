@@ -30,9 +30,9 @@ def rows(size: int, system: System, seed: int, photons: tuple[float, ...] = PHOT
         }
         cubes = {name: simulate(flux, system, seed=seed, threads=1)[0] for name, flux in scenes.items()}
         for method in _METHODS:
-            every = {name: reconstruct(cube, system, method, returns=2, threads=1) for name, cube in cubes.items()}
-            both = {name: _both(every[name].returns.delay_ns, wall, pane, system) for name in ("whole", "half")}
-            two = {name: every[name].returns.count > 1 for name in ("half", "none")}
+            delays = {name: _delays(cube, system, method) for name, cube in cubes.items()}
+            both = {name: _both(delays[name], wall, pane, system) for name in ("whole", "half")}
+            two = {name: np.isfinite(delays[name]).all(-1) for name in ("half", "none")}
             line = {"photons of each return": each, "method": method, "both, whole pane %": both["whole"]}
             line |= {"both, half a pane %": both["half"][:, :half], "two beside it %": two["half"][:, half:]}
             line |= {"two without a pane %": two["none"]}
@@ -40,8 +40,15 @@ def rows(size: int, system: System, seed: int, photons: tuple[float, ...] = PHOT
     return out
 
 
+def _delays(cube: np.ndarray, system: System, method: str) -> FloatArray:
+    """Of both returns (H, W, 2), ns."""
+    found = reconstruct(cube, system, method, returns=2, threads=1).returns
+    assert found is not None
+    return found.delay_ns
+
+
 def _both(delays: FloatArray, wall: FloatArray, pane: FloatArray, system: System) -> np.ndarray:
     """Whether the returns (H, W, 2) of a pixel are within 3 sigma of pane and wall, or of wall and pane."""
     period, most = system.period_ns, _core.IMAGE_OUTLIER_SIGMA * relative_width(system) * system.period_ns
     near = [np.abs((delays - each[..., None] + 0.5 * period) % period - 0.5 * period) < most for each in (wall, pane)]
-    return (near[0] & near[1][..., ::-1]).any(-1)
+    return np.asarray((near[0] & near[1][..., ::-1]).any(-1))

@@ -121,13 +121,14 @@ def test_depth_where_each_pixel_alone_has_none(method):
     "system",
     [
         replace(SYSTEM, cycles=30, detector=ml.Detector(dead_time_ns=150.0)),
+        replace(SYSTEM, cycles=30, start="stationary", detector=ml.Detector(dead_time_ns=150.0)),
         replace(SYSTEM, cycles=40, detector=ml.Detector(dead_time_ns=0.0, mode="synchronous")),
         replace(SYSTEM, detector=ml.Detector(dead_time_ns=30.0, mode="gated", gate_start_ns=20.0, gate_width_ns=50.0)),
         replace(SYSTEM, pulse=ml.SampledPulse(np.exp(-np.arange(0.0, 4.0, 0.05) / 0.6), 0.05)),
         replace(SYSTEM, bins=32),
         replace(SYSTEM, bins=65536, pulse=ml.GaussianPulse(sigma_ns=0.012)),
     ],
-    ids=["blind", "synchronous", "gated", "a measured pulse", "coarse bins", "more cells than one pass takes"],
+    ids=["blind", "blind from the start", "synchronous", "gated", "a measured pulse", "coarse bins", "more cells than one pass takes"],
 )
 def test_systems(system):
     """Delay and signal, whatever the detector hides: no more bias than a tenth of the pulse or of the signal."""

@@ -114,7 +114,8 @@ class Image(Method):
             raise ValueError(f"efficiency must be of the image's {image} pixels, got shape {self.efficiency.shape}")
         if self.returns == 1:
             return self._surface(photons, photons.number, system, threads)
-        setting, surfaces = settings_of(system)[-1], []
+        setting = settings_of(system)[-1]
+        surfaces: list[Estimates] = []
         for k in 2 * tuple(range(self.returns)):  # twice, so that the first knows of the others
             others = surfaces[:k] + surfaces[k + 1 :]
             counted, share = _outside(photons, others, setting)

@@ -63,7 +63,7 @@ def reconstruction(config: Config, bandwidth: Bandwidth) -> Section:
 def calibration(config: Config, bandwidth: Bandwidth) -> Section:
     """Calibration of one stream, per million timestamps."""
     del bandwidth
-    instrument = system(config).replace(cycles=max(20_000, 1_000 * config.cycles))
+    instrument = system(config).replace(cycles=1_000 * config.cycles)
     times = ml.simulate_timestamps(ml.Flux(0.8, 0.5, 40.0), instrument, seed=SEED, threads=1)
     cases: dict[str, Callable[[], object]] = {
         "calibrate, detector and pulse given": partial(ml.calibrate, times, instrument),

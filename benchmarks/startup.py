@@ -14,7 +14,7 @@ from benchmarks.subprocesses import run_python
 
 GOAL_IMPORT_S, GOAL_COMMAND_S, GOAL_PICTURE_S = 0.3, 3.0, 6.0
 _IMPORT = "import time; t = time.perf_counter(); import {}; print(time.perf_counter() - t)"
-_COMMAND = "import sys; from mars_lidar.cli import main; sys.exit(main())"  # what the script `mars-lidar` runs
+_COMMAND = "import sys; from mars_lidar_command import main; sys.exit(main())"  # what the script `mars-lidar` runs
 
 
 def import_time(config: Config, bandwidth: Bandwidth) -> Section:

@@ -22,7 +22,7 @@ TINY = Config(
     mode="tiny",
     side=8,
     bins=64,
-    cycles=50,
+    cycles=8,
     repeats=2,
     seconds=0.0,
     table_entries=2,
@@ -88,11 +88,11 @@ def test_goals_stand_beside_measured_values(report):
 @pytest.mark.full
 def test_command_saves_markdown_and_json(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(command, "QUICK", TINY)
-    command.main(["--quick", "--only", "exact", "--only", "paths", "--out", str(tmp_path)])
-    assert (tmp_path / "tiny-exact-paths.md").read_text() in capsys.readouterr().out
-    data = json.loads((tmp_path / "tiny-exact-paths.json").read_text())
+    command.main(["--quick", "--only", "exact", "--only", "import", "--out", str(tmp_path)])
+    assert (tmp_path / "tiny-exact-import.md").read_text() in capsys.readouterr().out
+    data = json.loads((tmp_path / "tiny-exact-import.json").read_text())
     titles = [section["title"] for section in data["sections"]]
-    assert titles == ["Exact engine, canonical cube", "Paths of the exact engine"]
+    assert titles == ["Exact engine, canonical cube", "Import"]
     assert {goal["met"] for goal in data["goals"]} <= {True, False}
 
 

@@ -17,6 +17,7 @@ import xarray
 
 import mars_lidar as ml
 from mars_lidar import _core, io
+from mars_lidar.cli import main
 from mars_lidar.cli.system_options import DEFAULT_SYSTEM
 from mars_lidar.engines.feedback import Reason
 from tests.harness.command import command_line, listen_to_ctrl_c, stopped
@@ -29,7 +30,7 @@ def run(*arguments: object):
 
 
 def command(*arguments: object) -> list[str]:
-    code = "import sys; sys.argv[0] = 'mars-lidar'; from mars_lidar.cli import main; sys.exit(main())"
+    code = "import sys; sys.argv[0] = 'mars-lidar'; from mars_lidar_command import main; sys.exit(main())"
     return [sys.executable, "-c", code, *(str(a) for a in arguments)]
 
 
@@ -403,6 +404,41 @@ def test_a_stopped_run_is_left_incomplete(tmp_path, how):
     assert "complete       NO: the simulation did not finish; at least 0 of 1 chunks" in done.output
 
 
+@pytest.mark.skipif(os.name != "posix", reason="needs POSIX signals")
+@pytest.mark.parametrize("module", ["mars_lidar", "numpy", "mars_lidar.calibration", "cyclopts"])
+def test_ctrl_c_while_python_imports_is_one_line(module):
+    code = f"""
+import os, signal, sys
+class Press:
+    def find_spec(name, path=None, target=None):
+        if name == {module!r}:
+            os.kill(os.getpid(), signal.SIGINT)
+sys.meta_path.insert(0, Press)
+from mars_lidar_command import main
+sys.exit(main())
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code, "--version"], capture_output=True, text=True, preexec_fn=listen_to_ctrl_c
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "mars-lidar: interrupted\n")
+
+
+def test_what_python_makes_of_exhausted_memory_is_one_line(monkeypatch, capsys):
+    """Seen with 800 MB of addresses while Matplotlib was imported; another SystemError keeps its traceback."""
+    for text in ("<built-in function __build_class__> returned NULL without setting an exception", "another"):
+
+        def exhausted(*_: object, text=text) -> None:
+            raise SystemError(text)
+
+        monkeypatch.setattr("mars_lidar.cli.console._refuse_empty", exhausted)
+        if text == "another":
+            with pytest.raises(SystemError, match=text):
+                main(["info"])
+        else:
+            assert main(["info"]) == 1
+            assert capsys.readouterr().err.startswith("mars-lidar: failed: the memory")
+
+
 def _wait_for(path: Path) -> None:
     end = time.monotonic() + 300.0
     while not path.exists():
@@ -499,7 +535,7 @@ def test_a_pipe_without_unicode_gets_plain_text(tmp_path):
     out = tmp_path / "a.zarr"
     assert run("simulate", "--scene", "room", *SMALL, "--no-picture", "-o", out).exit_code == 0
     done = subprocess.run(
-        [sys.executable, "-c", "import sys; from mars_lidar.cli import main; sys.exit(main())", "info", str(out)],
+        command("info", out),
         env=os.environ | {"PYTHONIOENCODING": "ascii"},
         capture_output=True,
         check=True,
@@ -524,3 +560,34 @@ def test_a_small_address_space_is_one_line(command, mebibytes, tmp_path):
     assert "Traceback" not in done.stderr
     assert done.returncode == 0 or done.stderr.startswith("mars-lidar: "), done.stderr
     assert mebibytes > 300 or done.returncode != 0
+
+
+@pytest.mark.full
+@pytest.mark.skipif(sys.platform != "linux", reason="needs a limit on the address space")
+@pytest.mark.parametrize(
+    "arguments", ["verify SET", "export SET --layout lindell -o OUT", "info CUBE", "convert CUBE OUT.h5"]
+)
+def test_reading_a_store_in_a_small_address_space_is_one_line(arguments, tmp_path):
+    """SciPy's matrix library, loaded behind the threads of Zarr, never returned, or sent the process a Ctrl-C."""
+    import resource
+
+    assert (
+        run("generate", "room", "--size", 16, "--bins", 64, "--cycles", 20, "-o", tmp_path / "set.zarr").exit_code == 0
+    )
+    assert run("simulate", "--scene", "room", *SMALL, "--no-picture", "-o", tmp_path / "cube.zarr").exit_code == 0
+    names = {"SET": "set.zarr", "CUBE": "cube.zarr", "OUT": "out", "OUT.h5": "out.h5"}
+    words = [str(tmp_path / names[word]) if word in names else word for word in arguments.split()]
+    for mebibytes in (450, 550, 650):
+
+        def limit(size: int = mebibytes << 20) -> None:
+            resource.setrlimit(resource.RLIMIT_AS, (size, size))
+
+        done = subprocess.run(command(*words), capture_output=True, text=True, preexec_fn=limit, timeout=100)
+        assert done.returncode in (0, 1, 2), done
+        assert "Traceback" not in done.stderr
+        assert done.returncode == 0 or done.stderr.startswith("mars-lidar: "), done.stderr
+        if done.returncode:
+            assert not list(tmp_path.glob("out*")), "nothing half written"
+        else:
+            for path in tmp_path.glob("out*"):
+                shutil.rmtree(path) if path.is_dir() else path.unlink()

@@ -369,8 +369,6 @@ ANCESTORS = {
     **dict.fromkeys(("FileNotFoundError", "FileExistsError", "IsADirectoryError", "NotADirectoryError"), ("OSError",)),
     **dict.fromkeys(("RecipeError", "FileError", "IncompleteFileError", "UnicodeDecodeError"), ("ValueError",)),
 }
-UNDOCUMENTED = {name for name in CALLS if name.startswith("io.")} | {"calibrate", "Cube", "to_xarray"}
-UNDOCUMENTED |= {"estimate", "open_dataset", "dataset.verify", "dataset.Light", "read_sparse", "read_view", "load_maps"}
 
 
 def accepted(call: str, argument: str, label: str) -> bool:
@@ -430,8 +428,8 @@ def test_errors_of_wrong_arguments_are_documented(here, name):
     docscrape = pytest.importorskip("numpydoc.docscrape")
     call = CALLS[name](here)[0]
     home = inspect.unwrap(call)
-    if name in UNDOCUMENTED or not (inspect.isclass(call) or "." not in home.__qualname__):
-        pytest.skip("a method, which its class describes" if name not in UNDOCUMENTED else "not yet")
+    if not (inspect.isclass(call) or "." not in home.__qualname__):
+        pytest.skip("a method, which its class describes")
     sections = docscrape.NumpyDocString(inspect.getdoc(call) or "")
     documented = {word.split(".")[-1] for entry in sections["Raises"] for word in entry.type.split(", ")}
     raised = {told.split(":")[0] for _, kind, told in outcomes(name, here) if kind == "refused"}

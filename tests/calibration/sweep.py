@@ -1,8 +1,9 @@
 """Pulls of `calibrate` over random streams of the independent simulator: ``python -m tests.calibration.sweep 0 40``.
 
-A stream a number: light, jitter, clock, period, dead time and photons are drawn from the seed of that number; with
-``--effect NAME`` the detector has that effect too. Prints a line a stream, and the spread of the pulls; with ``--keep
-FILE`` results are appended to that file, a JSON object a line, and streams that it has are not calibrated again.
+A stream a number: light, jitter, clock, period, dead time and photons are drawn from the seed of that number, or are
+those of `ORDINARY` with ``--ordinary``; with ``--effect NAME``, or ``NAME+NAME``, the detector has these effects too.
+Prints a line a stream, and the spread of the pulls; with ``--keep FILE`` results are appended to that file, a JSON
+object a line, and streams that it has are not calibrated again.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import numpy as np
 import mars_lidar as ml
 from tests.calibration.photon_by_photon import Truth, as_timestamps, photon_by_photon
 
+ORDINARY = Truth(signal=0.4, background=0.15, delay=30.0, sigma=0.3, dead=50.0, period=100.0, jitter=0.1, unit=0.064)
 EFFECTS = {
     "afterpulses": {"afterpulses": 0.03, "afterpulse_delay": 100.0},
     "twilight": {"twilight": 0.5},
@@ -75,8 +77,10 @@ def random_truth(number: int) -> tuple[Truth, int]:
 
 
 def with_effect(truth: Truth, effect: str | None) -> Truth:
-    """The pixel with one of `EFFECTS`."""
-    more = dict(EFFECTS.get(effect or "", {}))
+    """The pixel with one of `EFFECTS`, or two with a plus between them."""
+    more: dict[str, Any] = {}
+    for name in (effect or "").split("+"):
+        more |= EFFECTS.get(name, {})
     if "electronics" in more:
         more["electronics"] = more["electronics"] * truth.dead
     return replace(truth, **more)
@@ -119,7 +123,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("first", type=int)
     parser.add_argument("last", type=int)
-    parser.add_argument("--effect", choices=list(EFFECTS))
+    parser.add_argument("--effect", help=f"{', '.join(EFFECTS)}; or two, with a plus between them")
+    parser.add_argument("--ordinary", action="store_true")
     parser.add_argument("--photons", type=int)
     parser.add_argument("--keep", type=Path)
     parser.add_argument("--kept", action="store_true", help="only the streams of FILE, as the table of the docs")
@@ -128,13 +133,13 @@ def main() -> None:
     if asked.keep is not None and asked.keep.exists():
         for line in asked.keep.read_text().splitlines():
             row = json.loads(line)
-            if (row["effect"], row["asked"]) == (asked.effect, asked.photons):
+            if (row["effect"], row["asked"], row["ordinary"]) == (asked.effect, asked.photons, asked.ordinary):
                 done[row["number"]] = row
     rows = []
     for number in range(asked.first, asked.last):
         if asked.kept and number not in done:
             continue
-        row = done.get(number) or calibrated(number, asked.effect, asked.photons)
+        row = done.get(number) or calibrated(number, asked.effect, asked.photons, asked.ordinary)
         rows.append(row)
         if number not in done and asked.keep is not None:
             with asked.keep.open("a") as file:
@@ -142,10 +147,10 @@ def main() -> None:
         if not asked.kept:
             print(f"{number} {row['photons']:,} photons {row['seconds']:.1f} s p={row['p']:.2g}", end=" ")
             print(np.round(np.array(row["pulls"], float), 1), row["suspects"], flush=True)
-    print(table(rows, NAMES.get(asked.effect or "", "")))
+    print(table(rows, [NAMES[name] for name in asked.effect.split("+")] if asked.effect else []))
 
 
-def table(rows: list[dict[str, Any]], effect: str) -> str:
+def table(rows: list[dict[str, Any]], effects: list[str]) -> str:
     """Markdown: what the pulls of these streams were, and a line about verdicts and times."""
     pulled = np.array([row["pulls"] for row in rows], float)
     missed = [name for row in rows for name in row["outside"]]
@@ -157,8 +162,8 @@ def table(rows: list[dict[str, Any]], effect: str) -> str:
         ("truth outside of the 95 % interval", [f"{missed.count(name) / len(rows):.1%}" for name in PULLED]),
         ("without an estimate", [str(v) for v in np.isnan(pulled).sum(0)]),
     ]
-    named = sum(bool(effect) and effect in row["suspects"] for row in rows)
-    others = sum(any(name != effect for name in row["suspects"]) for row in rows)
+    named = [sum(name in row["suspects"] for row in rows) for name in effects]
+    others = sum(not {*row["suspects"]} <= {*effects} for row in rows)
     seconds = [row["seconds"] for row in rows]
     return "\n".join(
         [
@@ -166,15 +171,16 @@ def table(rows: list[dict[str, Any]], effect: str) -> str:
             "|---|---|---|---|---|---|",
             *(f"| {words} | {' | '.join(values)} |" for words, values in lines),
             "",
-            f"{len(rows)} streams: p below 1 % in {sum(row['p'] < 0.01 for row in rows)}, effect named in {named}, "
-            f"other suspects in {others}; {np.mean(seconds):.1f} s of a processor each, largest {max(seconds):.1f}.",
+            f"{len(rows)} streams: p below 1 % in {sum(row['p'] < 0.01 for row in rows)}, "
+            + "".join(f"{name} named in {number}, " for name, number in zip(effects, named, strict=True))
+            + f"other suspects in {others}; {np.mean(seconds):.1f} s of a processor each, largest {max(seconds):.1f}.",
         ]
     )
 
 
-def calibrated(number: int, effect: str | None, photons: int | None) -> dict[str, Any]:
+def calibrated(number: int, effect: str | None, photons: int | None, ordinary: bool) -> dict[str, Any]:
     """The pulls, p-value, suspects and time of one stream."""
-    truth, own = random_truth(number)
+    truth, own = (ORDINARY, 100_000) if ordinary else random_truth(number)
     truth = with_effect(truth, effect)
     t, cycles = photon_by_photon(truth, photons or own, number)
     began = time.process_time()
@@ -183,10 +189,12 @@ def calibrated(number: int, effect: str | None, photons: int | None) -> dict[str
         "number": number,
         "effect": effect,
         "asked": photons,
+        "ordinary": ordinary,
         "photons": t.size,
         "seconds": time.process_time() - began,
         "p": float(result.p_value),
         "pulls": [None if np.isnan(z) else float(z) for z in pulls(result, truth)],
+        "errors": [float(result.estimates[name].error) if name in result.estimates else None for name in PULLED],
         "outside": outside(result, truth),
         "suspects": [suspect.name for suspect in result.suspects],
     }

@@ -16,7 +16,7 @@ from mars_lidar._base.resources import one_blas_thread
 from mars_lidar._base.types import FloatArray
 from mars_lidar.calibration import start, suspects
 from mars_lidar.calibration.curves import Curves, Realizations, curves, realizations
-from mars_lidar.calibration.fit import Effort, Fit, Fitted, draws
+from mars_lidar.calibration.fit import Effort, Fit, Fitted, Guess, draws
 from mars_lidar.calibration.look import Look, look_at
 from mars_lidar.calibration.model import Model, all_carriers
 from mars_lidar.calibration.recording import FALSE_ALARM, LEAST_PHOTONS, Recording, recording_of, recording_of_arrivals
@@ -469,22 +469,13 @@ class _Run:
         width_known = model.returns == 0 or model.pulse is not None
         tried = []
         begin = start.starts(fit, self.recording, model, self.fixed)
-        free = np.array(
-            [
-                k
-                for k, name in enumerate(model.names)
-                if name not in self.fixed and not (width_known and name == "width")
-            ],
-            np.intp,
-        )
+        known = {*self.fixed, *(["width"] if width_known else [])}
+        free = np.array([k for k, name in enumerate(model.names) if name not in known], np.intp)
         first = float(min(self.recording.photons, fit.effort.first))
         for _, theta in begin[:2]:
-            spread = np.diag(0.5 * model.scale(theta)[free])
-            theta, root, misfit, _ = fit.steps(model, theta, spread, free, first)
-            tried.append((misfit, theta, root))
-        _, theta, root = min(tried, key=lambda trial: trial[0])
-        theta, root, _, settled = fit.steps(model, theta, root, free, float(self.recording.photons))
-        final = fit.finish(model, theta, root, free)
+            tried.append(fit.steps(Guess(model, theta, np.diag(0.5 * model.scale(theta)[free]), free), first))
+        guess, _, settled = fit.steps(min(tried, key=lambda trial: trial[1])[0], float(self.recording.photons))
+        final = fit.finish(guess)
         return replace(final, converged=final.converged and (settled or final.p_value >= self.level))
 
     def assembled(
@@ -520,11 +511,10 @@ class _Run:
                 families.add(score.effect.words)
                 words, option = score.effect.words, f"given {score.effect.names[0]}"
                 named.append(Suspect(words, score.z, score.size, score.error, np.nan, option, included=False))
-        if p < self.level and not any(not suspect.included for suspect in named):
+        if p < min(self.level, FALSE_ALARM) and not any(not suspect.included for suspect in named):
             worst, z = _worst_cells(fitted)
-            if z > suspects.clear(listed) or not fitted.converged:
-                advice = "pulse='free', or returns=2" if worst.startswith("phases") else "no option of the model"
-                named.append(Suspect(worst, z, np.nan, np.nan, np.nan, advice, included=False))
+            advice = "pulse='free', or returns=2" if worst.startswith("phases") else "no option of the model"
+            named.append(Suspect(worst, z, np.nan, np.nan, np.nan, advice, included=False))
         centre = fitted.model.bounded(fitted.theta)
         cycles = int(np.clip(self.recording.exposure, 1, TOL.cycles))
         wave, error = self.wave or (None, None)

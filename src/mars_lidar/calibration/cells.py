@@ -22,10 +22,10 @@ class Cells:
     """Counts of a stream: phases; intervals; (interval, phase at its begin, does it end in a pulse).
 
     The edges follow from streams that the model draws, never from the data: cells that follow the data would be biased.
-    Intervals are resolved down to those of which the exposure has less than one, for the edge of the dead time.
+    Intervals are resolved down to those of which the exposure has `least`, for the edge of the dead time.
     """
 
-    def __init__(self, model: Model, theta: FloatArray, pilot: list[FloatArray], photons: float) -> None:
+    def __init__(self, model: Model, theta: FloatArray, pilot: list[FloatArray], photons: float, least: float) -> None:
         period, unit = model.clock.period_ns, model.clock.unit_ns
         gaps = np.sort(np.concatenate([np.diff(t) for t in pilot]))
         phases = np.concatenate([t / period - np.floor(t / period) for t in pilot])
@@ -38,7 +38,7 @@ class Cells:
             inside |= (centre - low) % 1.0 < (high - low) % 1.0
         self.phases = edges.size + 1
         ratio = gaps.size / max(photons, 1.0)
-        fine = max(0.7, 2.0 / ratio) * 1.5 ** np.arange(60)
+        fine = max(least, 2.0 / ratio) * 1.5 ** np.arange(60)
         tail = 0.2 * 0.5 ** np.arange(1, 6)
         quantiles = np.r_[np.linspace(0.2, 0.8, 7), 1.0 - tail]
         rank = np.r_[fine[fine < 0.15 * photons], photons * quantiles] * ratio

@@ -10,6 +10,7 @@ may be shorter than the recording.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from mars_lidar._base.types import FloatArray
 from mars_lidar.calibration.cells import Cells
 from mars_lidar.calibration.model import Effect, Model
-from mars_lidar.calibration.recording import Recording
+from mars_lidar.calibration.recording import FALSE_ALARM, Recording
 
 LIGHTS = 16  # streams of one detector, in one call of the engine
 _NEAR = 3.0  # standard errors of the recording about the estimate, from which the last streams are drawn
@@ -34,9 +35,8 @@ class Effort:
     standard errors of a stream of its length. Of the last streams `longer` is the factor on their photons, so that
     they need not differ as much, `more` that on the number of those which give the weights, and `recentred` the number
     of batches at most. `widths` of the pulse in a batch: the tables of a pulse cost as much as a stream. `draws` from
-    the law of the estimate, for its bounds. `attempts` to fit a stream, each with simulated streams of its own, of
-    which the first that converges is taken; `effects` taken in, one after the other, and `refits` with an effect more
-    that fresh streams judge; `shape_bins` of a free light, at most.
+    the law of the estimate, for its bounds; `edge` photons at least, for the law of the shortest intervals. `attempts`
+    to fit a stream, each with simulated streams of its own, of XX `shape_bins` of a free light, at most.
     """
 
     settings: int = 32
@@ -61,6 +61,15 @@ class Effort:
         number = self.settings * LIGHTS
         wanted = times * max(self.stream, min(self.share * photons, self.batch) / number)
         return int(min(photons, max(wanted, 2.0 * photons / number)))
+
+
+class Guess(NamedTuple):
+    """Parameters (p,) of a model, which of them are free, and a root (free, free) of the covariance of those."""
+
+    model: Model
+    theta: FloatArray
+    root: FloatArray
+    free: NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,25 +269,23 @@ class Fit:
         """Laser periods in which the recording has this many photons."""
         return self.recording.exposure * photons / self.recording.photons
 
-    def cells(self, model: Model, theta: FloatArray, photons: float) -> Cells:
-        """Cells of a law for this many photons, by streams at `theta`."""
+    def cells(self, model: Model, theta: FloatArray, photons: float, least: float = 0.7) -> Cells:
+        """Cells of a law for this many photons, by streams at `theta`; `least` intervals in the first, expected."""
         size = self.exposure(self.effort.of(photons))
         pilot = model.streams(np.tile(theta, (LIGHTS, 1)), max(2, round(size)), self.next_seed())
-        return Cells(model, theta, [t for t in pilot if t.size > 2], photons)
+        return Cells(model, theta, [t for t in pilot if t.size > 2], photons, least)
 
     def law(
         self,
-        model: Model,
-        theta: FloatArray,
-        root: FloatArray,
-        free: NDArray[np.intp],
+        guess: Guess,
         photons: float,
         cells: Cells | None = None,
         spread: float | None = None,
         more: int = 1,
         times: float = 1.0,
     ) -> Batch:
-        """The linear law of counts about `theta` for an exposure of this many photons."""
+        """The linear law of counts about a guess for an exposure of this many photons."""
+        model, theta, root, free = guess
         cells = self.cells(model, theta, photons) if cells is None else cells
         size = self.effort.of(photons, times)
         spread = self.effort.spread if spread is None else spread
@@ -290,21 +297,14 @@ class Fit:
         made = counted(model, cells, rows, exposure, self.next_seed())
         return regression(cells, rows, theta, made, self.exposure(photons) / exposure, free)
 
-    def steps(
-        self,
-        model: Model,
-        theta: FloatArray,
-        root: FloatArray,
-        free: NDArray[np.intp],
-        photons: float,
-        first: float = 0.0,
-    ) -> tuple[FloatArray, FloatArray, float, bool]:
-        """Steps that weigh ever more photons, up to `photons`; parameters, root, misfit a cell, whether it settled."""
+    def steps(self, guess: Guess, photons: float, first: float = 0.0) -> tuple[Guess, float, bool]:
+        """Steps that weigh ever more photons, up to `photons`; misfit a cell, and whether it settled."""
+        model, theta, root, free = guess
         weighed = float(min(photons, max(first, self.effort.first)))
         total = float(self.recording.photons)
         misfit, near = np.inf, False
         for _ in range(self.effort.rounds):
-            law = self.law(model, theta, root, free, weighed)
+            law = self.law(Guess(model, theta, root, free), weighed)
             recorded = law.cells.of(self.recording) * (weighed / total)
             prior = np.asarray(np.linalg.inv(root @ root.T) / 36.0, np.float64)
             gain = law.estimator(free, prior)
@@ -329,22 +329,50 @@ class Fit:
             if near and weighed >= photons:
                 break
             weighed = grown
-        return theta, root, misfit, near and weighed >= photons
+        return Guess(model, theta, root, free), misfit, near and weighed >= photons
 
-    def finish(
-        self, model: Model, theta: FloatArray, root: FloatArray, free: NDArray[np.intp], again: bool = True
-    ) -> Fitted:
-        """The last estimate, and what fresh streams about it say of its slope, bias, scatter and misfit."""
-        photons = float(self.recording.photons)
-        effort = self.effort
+    def shortest(self, guess: Guess) -> tuple[float, float]:
+        """The dead time by the shortest interval alone, and its standard error, by streams as long as the recording.
+
+        The fit counts intervals in cells, and does not know where in its cell an interval lies.
+        """
+        model, theta, _, _ = guess
+        recorded = min(float(np.diff(piece).min()) for piece in self.recording.pieces)
+        cycles, number = max(2, round(self.recording.exposure)), 4.0 * self.effort.batch / self.recording.photons
+        drawn = [
+            float(np.diff(model.streams(theta[None], cycles, self.next_seed()).times).min(initial=np.inf))
+            for _ in range(int(np.clip(number, 4, LIGHTS)))
+        ]
+        dead = float(theta[model.light + 2]) + recorded - float(np.mean(drawn))
+        return dead, float(np.hypot(np.std(drawn, ddof=1), model.clock.unit_ns))
+
+    def finish(self, guess: Guess, again: bool = True, known: tuple[float, float] | None = None) -> Fitted:
+        """The last estimate, and what fresh streams about it say of its slope, bias, scatter and misfit.
+
+        Where the shortest interval refuses it, it is made once more with the dead time `known` by that, its mean and
+        standard deviation, and with cells that do not divide the shortest: counts of so few have no normal law.
+        """
+        model, theta, root, free = guess
+        photons, effort = float(self.recording.photons), self.effort
         closer = effort.spread / effort.more**0.5  # counts near the end of a dead time are linear over short distances
-        law = self.law(model, theta, root, free, photons, None, closer, effort.more, effort.longer)
+        prior, middle, cells = model.precision(free), model.middle(theta), None
+        if known is not None:
+            dead, error = known
+            place = int(np.flatnonzero(free == model.light + 2)[0])
+            gain = root @ root[place] / (root[place] @ root[place])
+            theta, middle, prior = theta.copy(), middle.copy(), prior.copy()
+            theta[free] += gain * (dead - theta[model.light + 2])
+            theta, middle[model.light + 2] = model.bounded(theta), dead
+            prior[place, place] = error**-2.0
+            root = _root(root @ root.T + (error**2 - root[place] @ root[place]) * np.outer(gain, gain))
+            cells = self.cells(model, theta, photons, _CUMULATED)
+        law = self.law(Guess(model, theta, root, free), photons, cells, closer, effort.more, effort.longer)
         nearby = _NEAR * (effort.of(photons, effort.longer) / photons) ** 0.5
         gain = law.estimator(free)
         recorded = law.cells.of(self.recording)
         centre, size = theta, np.zeros(len(free))
         for trial in range(effort.recentred):
-            near = self.law(model, centre, root, free, photons, law.cells, nearby, times=effort.longer)
+            near = self.law(Guess(model, centre, root, free), photons, law.cells, nearby, times=effort.longer)
             y = near.counts  # of streams near the estimate, in the recording's exposure
             moved = (near.theta - centre)[:, free]
             terms = np.c_[np.ones(len(y)), moved]
@@ -354,18 +382,18 @@ class Fit:
             rest = (y - near.offset) @ gain.T - terms @ slope
             noise = np.atleast_2d(rest.T @ rest) / (len(y) - terms.shape[1])
             away = gain @ (recorded - near.offset) - slope[0]
-            information, prior = np.linalg.inv(noise), model.precision(free)
-            place = np.r_[1.0, np.linalg.pinv(local) @ away]  # where the law is read, for its own noise there
+            information = np.linalg.inv(noise)
+            there = np.r_[1.0, np.linalg.pinv(local) @ away]  # where the law is read, for its own noise there
             for _ in range(2):
-                scale = 1.0 / (1.0 / near.ratio + place @ inverse @ place)
+                scale = 1.0 / (1.0 / near.ratio + there @ inverse @ there)
                 # the square of the slope is too large by that of its noise
                 fisher = scale * (local.T @ information @ local - len(free) * inverse[1:, 1:])
                 cov = _inverse(fisher, prior, root)
                 solve = scale * cov @ local.T @ information
-                place[1:] = solve @ away + cov @ prior @ (model.middle(centre) - centre)[free]
+                there[1:] = solve @ away + cov @ prior @ (middle - centre)[free]
             estimator = solve @ gain
             raw = centre.copy()
-            raw[free] += place[1:]
+            raw[free] += there[1:]
             mean = most_probable(model, raw, cov, free)
             size = np.abs((mean - centre)[free]) / np.sqrt(np.diag(cov))
             if trial and (size.max() < 1.0 or trial == effort.recentred - 1):
@@ -374,23 +402,38 @@ class Fit:
             centre = centre + (mean - centre) / max(1.0, float(size.max()) / _NEAR)
         sd = np.sqrt(np.diag(cov))
         if again and (np.abs((centre - theta)[free]) > _NEAR * sd).any():  # cells and weights were laid elsewhere
-            return self.finish(model, centre, _root(cov), free, again=False)
+            return self.finish(Guess(model, centre, _root(cov), free), again=False)
         jacobian = law.slope[:, free] @ local
         project = np.eye(len(recorded)) - jacobian @ estimator
         fresh = near.residual @ project.T
         fresh = (fresh - fresh.mean(0)) / np.sqrt(near.ratio) * np.sqrt(len(y) / (len(y) - terms.shape[1]))
         rest = project @ (recorded - near.offset)
-        dead = np.flatnonzero(free == model.light + 2)
-        z, p = _misfit(rest, fresh, law, near, recorded, float(sd[dead[0]]) if dead.size else 0.0)
+        z, p = _misfit(rest, fresh, law, near)
+        error = float(sd[free == model.light + 2].sum())  # 0 where it is given
+        last = Guess(model, mean, _root(cov), free)
+        shortest = self.shortest(last)
+        early = _extreme(shortest[0] - mean[model.light + 2], shortest[1], error)
+        if early < FALSE_ALARM and known is None:
+            other = self.finish(last, again=False, known=shortest) if error else None
+            if other is not None and other.converged and other.p_value > FALSE_ALARM:
+                return other
+            p = min(p, early)
         scatter, converged = solve @ noise @ solve.T / near.ratio, bool(size.max() < _NEAR)
         return Fitted(
             model, free, mean, cov, raw, scatter, law, near.offset, estimator, jacobian, rest, fresh, z, p, converged
         )
 
 
-def _misfit(
-    rest: FloatArray, fresh: FloatArray, law: Batch, near: Batch, recorded: FloatArray, dead_error: float
-) -> tuple[float, float]:
+def _extreme(off: float, scatter: float, error: float) -> float:
+    """Bound of the probability that the shortest interval is `off` its mean, which has an error of its own, by as much.
+
+    Chernoff's, of the sum of a normal law and one whose tail is exponential, as that of an extreme value at most is.
+    """
+    rate = min(np.pi / 6.0**0.5 / scatter, abs(off) / max(error, 1e-12) ** 2)
+    return min(1.0, 2.0 * float(np.exp(0.5 * (rate * error) ** 2 - rate * abs(off))))
+
+
+def _misfit(rest: FloatArray, fresh: FloatArray, law: Batch, near: Batch) -> tuple[float, float]:
     """Standard deviations of the weighed square of the counts that the fit leaves above fresh streams', probability.
 
     The probability is that of two tests together: the weighed square of all cells, and the largest departure of the
@@ -406,34 +449,8 @@ def _misfit(
     shape = drawn.mean() ** 2 / drawn.var()
     square = float(gammaincc(shape, mine * shape / drawn.mean()))
     gaps = slice(law.cells.phases, law.cells.phases + law.cells.gap_edges.size)
-    cumulated = np.cumsum(near.offset[gaps])
-    enough = cumulated > _CUMULATED
+    enough = np.cumsum(near.offset[gaps]) > _CUMULATED
     departure = np.abs(np.cumsum(rest[gaps])) / (np.cumsum(fresh[:, gaps], axis=1).std(0) * noise**0.5)
     most = float(departure[enough].max(initial=0.0))
     late = 2.0 * enough.sum() * float(ndtr(-most))
-    first = _edge_probability(law.cells.gap_edges, cumulated, np.cumsum(recorded[gaps]), dead_error)
-    return float((mine - drawn.mean()) / drawn.std()), min(1.0, 2.0 * min(square, late + first))
-
-
-def _edge_probability(edges: FloatArray, expected: FloatArray, recorded: FloatArray, dead_error: float) -> float:
-    """Probability of a cumulated number of the shortest intervals as far from Poisson's law, of any edge.
-
-    `expected` (n,) intervals below `edges` (n,). Those of another dead time are the same, later by the difference: the
-    dead time within two of its standard errors for which they are most probable is taken. No linear law is used, which
-    the begin of the intervals does not have.
-    """
-    from scipy.special import gammainc, gammaincc
-
-    few = expected <= _CUMULATED
-    number = int(few.sum())
-    if number < 2:
-        return 1.0
-    at = np.r_[2.0 * edges[0] - edges[1], edges]
-    best = 0.0
-    for shift in np.linspace(-2.0, 2.0, 21) * dead_error:
-        mean = np.maximum(np.interp(edges[few] - shift, at, np.r_[0.0, expected]), 1e-3)
-        count = recorded[few]
-        above = np.where(count > 0.0, gammainc(np.maximum(count, 1e-9), mean), 1.0)  # of so many or more
-        below = gammaincc(count + 1.0, mean)
-        best = max(best, float(np.minimum(above, below).min()))
-    return min(1.0, 2.0 * number * best)
+    return float((mine - drawn.mean()) / drawn.std()), min(1.0, 2.0 * min(square, late))

@@ -15,7 +15,7 @@ from mars_lidar._base.types import FloatArray
 from mars_lidar.light.timestamps import Timestamps
 
 _ON_GRID = 0.02  # units: largest distance from the grid of a clock, for times in float64 over an hour
-FALSE_ALARM = 0.005  # probability of a suspect of a plain recording; of another period; of a pulse; of a drift
+FALSE_ALARM = 0.003  # of a plain recording: an effect, a drift, a misfit that is named; another period; a pulse
 LEAST_PHOTONS = 300  # of a recording or a part of it: below them the counts of the cells have no normal law
 _PROBED = 2000  # times that tell the clock
 _OWN_UNITS = (2**15, 2**16)  # units of the period in our own PTU and Photon-HDF5, at most
@@ -132,9 +132,13 @@ def clock_of(t: FloatArray, stream: Timestamps) -> Clock:
     candidates = [unit] if unit > 0.0 else [period / (most // stream.bins * stream.bins) for most in _OWN_UNITS]
     for unit in candidates:
         for locked, place in ((False, probe / unit), (True, x * period / unit)):
-            angle = np.angle(np.exp(2j * np.pi * place).mean()) / (2 * np.pi)
+            first = locked & (place < 1.0)  # those of the last unit of a period may lie beyond its end
+            if first.all():
+                continue
+            angle = np.angle(np.exp(2j * np.pi * place[~first]).mean()) / (2 * np.pi)
             offset = float(angle % 1.0)
-            away = np.abs((place - offset + 0.5) % 1.0 - 0.5)
+            last = np.where(first, place + period / unit, place)
+            away = np.min([np.abs((at - offset + 0.5) % 1.0 - 0.5) for at in (place, last)], axis=0)
             if float(np.quantile(away, 0.99)) < _ON_GRID:
                 return Clock(period, unit, 0.0 if min(offset, 1.0 - offset) < _ON_GRID else offset, locked)
     return Clock(period)

@@ -87,12 +87,11 @@ def starts(fit: Fit, recording: Recording, model: Model, fixed: dict[str, float]
     low = np.sort(np.diff(t))
     n = low.size
     ranks = np.unique(np.minimum([1, 5, 20, max(30, n // 500), max(60, n // 100), max(120, n // 30)], n - 1))
-    observed = low[ranks]
-    hold = observed[-3] + 3 * (observed[-3] - observed[0]) + 2 * model.clock.unit_ns
-    hold = max(hold, fixed.get("dead_time_ns", 0.0) + 2 * model.clock.unit_ns)
+    observed, unit = low[ranks], model.clock.unit_ns
+    hold = max(4 * observed[-3] - 3 * observed[0], fixed.get("dead_time_ns", 0.0)) + 2 * unit
     if model.returns == 0:
         total = float(free_waveform(recording, 64)[0].sum())
-        first = np.array([total, max((observed[-3] - observed[0]) / 4, 0.3 * model.clock.unit_ns)])
+        first = np.array([total, max((observed[-3] - observed[0]) / 4, 0.3 * unit)])
     else:
         first = light(t, model, hold)
     trials = []

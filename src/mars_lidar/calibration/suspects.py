@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.types import FloatArray
-from mars_lidar.calibration.fit import LIGHTS, Fit, Fitted, counted
-from mars_lidar.calibration.model import Effect, Model, effects
+from mars_lidar.calibration.fit import LIGHTS, Fit, Fitted, Guess, counted
+from mars_lidar.calibration.model import Effect, effects
 from mars_lidar.calibration.recording import FALSE_ALARM, LEAST_PHOTONS, Recording
 from mars_lidar.calibration.start import with_edge
 
@@ -90,9 +90,6 @@ class Named:
     gain: float
 
 
-_Stepped = tuple[Model, FloatArray, FloatArray, NDArray[np.intp]]
-
-
 def refitted(fit: Fit, fitted: Fitted, listed: list[Score]) -> tuple[Fitted, Named] | None:
     """The fit with the one effect that takes most of the misfit; None where no effect is clear.
 
@@ -109,7 +106,7 @@ def refitted(fit: Fit, fitted: Fitted, listed: list[Score]) -> tuple[Fitted, Nam
 
 
 def _best(fit: Fit, fitted: Fitted, tried: list[Score], limit: float) -> tuple[Fitted, Named] | None:
-    trials: list[tuple[float, Score, _Stepped]] = []
+    trials: list[tuple[float, Score, Guess]] = []
     families: set[str] = set()
     for score in tried:
         if score.effect.names[0] in families:
@@ -119,8 +116,8 @@ def _best(fit: Fit, fitted: Fitted, tried: list[Score], limit: float) -> tuple[F
         if trial is not None:
             trials.append((trial[0], score, trial[1]))
     best: tuple[Fitted, Named] | None = None
-    for _, score, (model, theta, root, free) in sorted(trials, key=lambda trial: trial[0])[: fit.effort.refits]:
-        final = fit.finish(model, theta, root, free)
+    for _, score, guess in sorted(trials, key=lambda trial: trial[0])[: fit.effort.refits]:
+        final = fit.finish(guess)
         if final.converged and (best is None or final.misfit_z < best[0].misfit_z):
             best = final, Named(score.effect, score.z, fitted.misfit_z - final.misfit_z)
     if best is None:
@@ -135,7 +132,7 @@ def _best(fit: Fit, fitted: Fitted, tried: list[Score], limit: float) -> tuple[F
     return best if clear_size or fitted.p_value < _MISFIT * final.p_value else None
 
 
-def _stepped(fit: Fit, fitted: Fitted, score: Score) -> tuple[float, _Stepped] | None:
+def _stepped(fit: Fit, fitted: Fitted, score: Score) -> tuple[float, Guess] | None:
     """Misfit and parameters with one effect more; None where a detector cannot have it beside the others."""
     model, effect = replace(fitted.model, effects=(*fitted.model.effects, score.effect)), score.effect
     size = effect.start[0]
@@ -154,10 +151,10 @@ def _stepped(fit: Fit, fitted: Fitted, score: Score) -> tuple[float, _Stepped] |
         if fitted.model.light + 2 in fitted.free:  # which has taken up what it could of the effect
             gaps = np.diff(fit.recording.pieces[0][: 12 * fit.effort.first])
             theta = with_edge(fit, model, theta, np.sort(gaps))
-        theta, root, misfit, _ = fit.steps(model, theta, np.diag(spread[free]), free, photons, photons / 6.0)
+        guess, misfit, _ = fit.steps(Guess(model, theta, np.diag(spread[free]), free), photons, photons / 6.0)
     except (ValueError, np.linalg.LinAlgError):
         return None
-    return misfit, (model, theta, root, free)
+    return misfit, guess
 
 
 @dataclass(frozen=True, eq=False)

@@ -80,6 +80,13 @@ def estimate(
 
     Up to four scenes, spread over the list, are read, and up to eight chunks of them simulated and packed in memory.
     Arguments are those of `mars_lidar.generate`.
+
+    Raises
+    ------
+    FileNotFoundError, ValueError
+        A recipe that is missing or wrong, as `mars_lidar.generate` says it.
+    TypeError
+        An argument of another kind.
     """
 
     team = thread_count(threads)

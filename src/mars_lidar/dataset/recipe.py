@@ -50,6 +50,11 @@ class Light:
     """Levels of light, and the arguments of `mars_lidar.Scene.flux` that all samples share.
 
     `levels` are pairs (signal, sbr). `photons_per_unit` stands for the signal of a single rendered transient.
+
+    Raises
+    ------
+    ValueError, TypeError
+        A level, a length or a share that is out of range, or no number; one that the other settings exclude.
     """
 
     levels: tuple[tuple[float, float], ...] = ((1.0, 1.0),)

@@ -618,7 +618,7 @@ def _remaining(store: Path, target: Path) -> str:
     if store != target:
         text += f", and {target} is what it was before"
     if not in_bucket(target):
-        text += f" ({shutil.disk_usage(target.parent).free / 1e9:.3g} GB free there)"
+        text += f" ({shutil.disk_usage(target.parent).free / 1e9:,.3f} GB free there)"
     return f"{text}: continue with --resume (resume=True)"
 
 

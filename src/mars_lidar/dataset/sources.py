@@ -361,6 +361,8 @@ def read_view(scene: dict[str, Any] | str | Path, system: System, *, whole: bool
     ------
     ValueError
         ``FILE:LINE: what is wrong``, or what is wrong with the dictionary; several scenes or levels.
+    TypeError
+        An argument of another kind.
     """
     changes = {name: value for name, value in replaced.items() if value is not None and name != "light"}
     shining = {name: value for name, value in (replaced.get("light") or {}).items() if value is not None}

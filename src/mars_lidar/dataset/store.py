@@ -49,6 +49,7 @@ from mars_lidar.io.cube import Cube
 from mars_lidar.io.recipe import Recipe
 from mars_lidar.io.scene_files import Problem
 from mars_lidar.io.store import OnDisk
+from mars_lidar.io.zarr_store import check_zarr_threads
 from mars_lidar.light.transient import Transient
 from mars_lidar.scene.layers import LayeredScene
 from mars_lidar.scene.scene import Scene
@@ -79,6 +80,7 @@ class Dataset:
         if self.attrs.get("format_version") not in (FORMAT_VERSION, MORE_VERSION):
             version = self.attrs.get("format_version")
             raise ValueError(f"{path} has layout version {version}; {FORMAT_VERSION} and {MORE_VERSION} can be read")
+        check_zarr_threads()
         self.sums = manifest.require(path, listed=listed) if self.complete else None
         store: Any = zarr_store(path, read_only=self.sums is not None)
         if in_bucket(path):
@@ -307,6 +309,8 @@ def open_dataset(path: str | Path, *, allow_incomplete: bool = False, listed: bo
         Nothing there, or no dataset; one that lacks a part, or whose metadata is damaged (a ValueError).
     IncompleteFileError
         Its generation did not finish (a ValueError).
+    TypeError, ValueError
+        A path that is no text or Path, or an address that cannot be one.
     """
     with reading(place_of(path), "a dataset of mars-lidar") as source:
         dataset = Dataset(source, listed=listed)
@@ -332,6 +336,13 @@ def read_sparse(dataset: Dataset | str | Path, sample: int, realization: int = 0
     -------
     scipy.sparse.coo_array
         (H W, bins), in order of rows and columns, of the type of the histogram.
+
+    Raises
+    ------
+    FileNotFoundError, ValueError
+        No dataset, or one that is incomplete or damaged; no such sample or realization.
+    TypeError
+        An argument of another kind.
     """
     source = dataset if isinstance(dataset, Dataset) else open_dataset(dataset)
     array = source.histogram

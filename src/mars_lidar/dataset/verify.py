@@ -69,6 +69,13 @@ def verify(
         Of the choice.
     threads, progress
         As for `mars_lidar.generate`.
+
+    Raises
+    ------
+    FileNotFoundError, ValueError
+        No dataset, an incomplete one, or one whose metadata are damaged; a number out of range.
+    TypeError
+        An argument of another kind.
     """
     progress = callback_of(progress, "verifying")
     dataset = open_dataset(path)

@@ -167,6 +167,8 @@ def save_capture(path: str | Path, cube: Cube, like: str | Path, *, overwrite: b
     ------
     ValueError
         Sizes or widths that differ.
+    TypeError
+        Not a `Cube`, or a path that is no text or Path.
 
     See Also
     --------

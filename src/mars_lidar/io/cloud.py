@@ -85,6 +85,8 @@ def save_cloud(
     ------
     ValueError
         Another suffix, or maps of different shapes.
+    TypeError
+        Maps that are no numbers.
     OSError
         `path` exists and `overwrite` is false, or cannot be written.
 

@@ -160,6 +160,8 @@ def photons(
     ValueError
         The photons do not have the stored counts (another version made the cube), or the engine draws
         histograms only.
+    TypeError
+        Not a cube that `load` returned.
 
     See Also
     --------

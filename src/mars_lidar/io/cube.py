@@ -302,6 +302,8 @@ def save(
     ------
     ValueError
         Another suffix, or a cube that the format cannot hold.
+    TypeError
+        Neither a cube nor counts, or counts without a system.
     OSError
         `path` exists and `overwrite` is false, or cannot be written.
 
@@ -375,6 +377,8 @@ def load(path: str | Path, *, allow_incomplete: bool = False) -> Cube:
         The file was left by an unfinished run (a ValueError).
     FileError
         Not a cube of mars-lidar, or damaged (a ValueError that names the file); a store that lacks a part.
+    TypeError, ValueError
+        A path that is no text or Path, or an address that cannot be one.
 
     See Also
     --------

@@ -101,6 +101,8 @@ def foreign_cube(
     ------
     FileNotFoundError, ValueError
         No such file, not readable, or not what the arguments say; the message names the file.
+    TypeError
+        An argument of another kind.
 
     See Also
     --------
@@ -140,7 +142,7 @@ def read_counts(
         return ForeignCounts(source, name, None, array, "")
     order = _guessed(source, array.shape, bins) if axes is None else axes
     if is_sparse(array):
-        check_claim(source, dense_bytes(array), f"the counts of {name}".rstrip())
+        check_claim(source, dense_bytes(array), f"the counts of {name or 'its matrix'}")
     try:
         return ForeignCounts(source, name, in_order(array, order, image), None, order, told_by)
     except (ValueError, TypeError) as error:

@@ -97,7 +97,15 @@ def save_maps(path: str | Path, results: Mapping[str, Any], *, source: str = "",
 
 @checked
 def load_maps(path: str | Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-    """Variables by name, and attributes, of a file of `save_maps`. ``xarray.open_zarr`` opens a .zarr as well."""
+    """Variables by name, and attributes, of a file of `save_maps`. ``xarray.open_zarr`` opens a .zarr as well.
+
+    Raises
+    ------
+    FileNotFoundError, ValueError
+        No such file, or none of `save_maps`; a damaged one.
+    TypeError
+        A path that is no text or Path.
+    """
     source = Path(path)
     if not source.exists():
         raise FileNotFoundError(f"{source} does not exist")

@@ -291,6 +291,10 @@ def read_mat(path: str | Path) -> SpadMat:
     ------
     ValueError
         Not such a file, or damaged; the message starts with the file.
+    FileNotFoundError
+        No such file.
+    TypeError
+        A path that is no text or Path.
 
     See Also
     --------

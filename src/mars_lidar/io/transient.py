@@ -64,6 +64,8 @@ def read_transient(
     ValueError
         A file that is missing, damaged or of the wrong kind, or does not tell its bin width: the message starts
         with the file.
+    TypeError
+        An argument of another kind.
 
     See Also
     --------

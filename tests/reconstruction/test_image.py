@@ -128,7 +128,7 @@ def test_depth_where_each_pixel_alone_has_none(method):
         replace(SYSTEM, bins=32),
         replace(SYSTEM, bins=65536, pulse=ml.GaussianPulse(sigma_ns=0.012)),
     ],
-    ids=["blind", "blind from the start", "synchronous", "gated", "a measured pulse", "coarse bins", "more cells than one pass takes"],
+    ids=["blind", "blind at first", "synchronous", "gated", "measured pulse", "coarse bins", "many cells"],
 )
 def test_systems(system):
     """Delay and signal, whatever the detector hides: no more bias than a tenth of the pulse or of the signal."""

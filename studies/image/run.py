@@ -144,9 +144,8 @@ def run(request: Request) -> Facts:
     for each in captures.captures(request.captures) if request.captures is not None else ():
         for photons in settings.photons[:3]:
             request.tell(f"image: capture {each.name}, {photons:g} photons")
-            rows.extend(
-                {"part": "captures", "scene": each.name, "photons": photons} | x for x in thinned(each, photons)
-            )
+            at = {"part": "captures", "scene": each.name, "system": "measured", "photons": photons, "sbr": "-"}
+            rows.extend(at | x for x in thinned(each, photons))
     if request.captures is None:
         request.tell("image: no folder of real captures was given (--captures): left out")
     bright = replace(SYSTEM, cycles=20_000)

@@ -245,6 +245,15 @@ def test_bright_pixels_are_estimated_alone():
     assert (found.outlier < 0.01).all()
 
 
+def test_signal_at_an_edge_of_reflectivity():
+    """Of 60 and of 150 photons on one surface: not worse than of each pixel alone, though depth alone tells no edge."""
+    system = replace(SYSTEM, cycles=20_000)
+    level = np.where(np.indices((32, 32)).sum(0) % 16 < 8, 60.0, 150.0) / system.cycles
+    cube = ml.simulate(ml.Flux(level, 60.0 / system.cycles, np.full(level.shape, 40.0)), system, seed=6)[0]
+    image, alone = (ml.reconstruct(cube, system, name).signal - level for name in ("image", "maximum_likelihood"))
+    assert np.sqrt((image**2).mean()) < np.sqrt((alone**2).mean())
+
+
 def test_parts_of_an_image_give_what_the_whole_gives(monkeypatch):
     """Parts overlap; a message from beyond the overlap hardly counts."""
     delay = roof(72)

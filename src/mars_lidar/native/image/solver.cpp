@@ -551,8 +551,8 @@ ImageSolver::Window ImageSolver::agreeing(int64_t p, const float* plane) const {
     const bool own = number > kOwn;
     Window at{seen_.offset[p] / sigma, own ? 1.0f / std::sqrt(number) : 9.0f,
               number / std::max(seen_.exposure[p], 1e-3f), number};
-    Window best = at;
-    float low = -HUGE_VALF, high = HUGE_VALF;
+    Window best = at, light = at;
+    float low = -HUGE_VALF, high = HUGE_VALF, dim = -HUGE_VALF, bright = HUGE_VALF;
     bool agrees = true;
     for (int k = 0; k <= kImageWindows; ++k) {
         if (k > 0) {
@@ -563,6 +563,15 @@ ImageSolver::Window ImageSolver::agreeing(int64_t p, const float* plane) const {
         high = std::min(high, at.offset + kKappa * at.error);
         agrees = agrees && low <= high;
         if (k == 1 ? agrees || !own : agrees) best = at;
+        if (!own) continue;  // signals tell edges too, where a pixel has enough of it
+        const float error = at.signal / std::sqrt(at.light);
+        dim = std::max(dim, at.signal - kKappa * error);
+        bright = std::min(bright, at.signal + kKappa * error);
+        if (agrees && dim <= bright) light = at;
+    }
+    if (own) {
+        best.signal = light.signal;
+        best.light = light.light;
     }
     return best;
 }

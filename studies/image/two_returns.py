@@ -32,7 +32,7 @@ def rows(size: int, system: System, seed: int, photons: tuple[float, ...] = PHOT
         for method in _METHODS:
             delays = {name: _delays(cube, system, method) for name, cube in cubes.items()}
             both = {name: _both(delays[name], wall, pane, system) for name in ("whole", "half")}
-            two = {name: np.isfinite(delays[name]).all(-1) for name in ("half", "none")}
+            two = {name: np.asarray(np.isfinite(delays[name]).all(-1)) for name in ("half", "none")}
             line = {"photons of each return": each, "method": method, "both, whole pane %": both["whole"]}
             line |= {"both, half a pane %": both["half"][:, :half], "two beside it %": two["half"][:, half:]}
             line |= {"two without a pane %": two["none"]}

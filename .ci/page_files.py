@@ -95,6 +95,17 @@ def _counts(path: str) -> None:
         scipy.io.savemat(path, {"counts": counts})
 
 
+def _histogram() -> None:
+    import numpy as np
+
+    import mars_lidar as ml
+
+    pulse, detector = ml.GaussianPulse(sigma_ns=1.0), ml.Detector(dead_time_ns=50.0)
+    system = ml.System(period_ns=100.0, cycles=20_000, bins=1000, pulse=pulse, detector=detector)
+    counts = ml.simulate(ml.Flux(1.5, 1.0, 40.0), system)[0, 0, 0]
+    np.savetxt("lab.csv", np.c_[system.time_ns, counts], delimiter=",", header="time_ns,counts", comments="", fmt="%g")
+
+
 def _photon_times() -> None:
     import numpy as np
     import scipy.io
@@ -146,6 +157,7 @@ FILES: dict[str, Callable[[], None]] = {
     "room.zarr": _room,
     "face.mat": lambda: _counts("face.mat"),
     "face.npy": lambda: _counts("face.npy"),
+    "lab.csv": _histogram,
     "tcspc.mat": _photon_times,
     "recipe.yaml": _recipe,
     "spad.yaml": _command("mars-lidar init spad.yaml && sed -i 's/dead_time_ns: 75.*/dead_time_ns: 50.0/' spad.yaml"),

@@ -313,8 +313,9 @@ def _wrap_pictures(app: Sphinx, doctree: nodes.document) -> None:
 def _mark_long_cells(app: Sphinx, doctree: nodes.document) -> None:
     """Marks cells of much text, which are wider than their longest word also where the table is wider than the page."""
     for entry in doctree.findall(nodes.entry):
-        if len(entry.astext()) > 90:
-            entry["classes"].append("long")
+        length = len(entry.astext())
+        if length > 25:
+            entry["classes"].append("long" if length > 90 else "middling")
 
 
 def _drop_private_bases(app: Sphinx, doctree: nodes.document) -> None:

@@ -49,6 +49,8 @@ def within_a_bin(net, size=32):
 if __name__ == "__main__":
     network, curve = train()
     print("placed within one bin:", within_a_bin(network))
+    plt.style.use("mars_lidar.plot.mars")
+    plt.figure(figsize=(6, 2.8), layout="constrained")
     plt.plot(curve)
-    plt.gca().set(xlabel="batch (8 new cubes each)", ylabel="cross entropy of the bin", title="train_depth.py")
-    plt.savefig("train_depth.png", dpi=80, bbox_inches="tight")
+    plt.gca().set(xlabel="batch (8 new cubes each)", ylabel="cross entropy of the bin (nats)")
+    plt.savefig("train_depth.png", dpi=130)

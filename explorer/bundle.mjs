@@ -22,7 +22,7 @@ const parts = {
   STYLE: readFileSync(here("node_modules/uplot/dist/uPlot.min.css"), "utf8") + readFileSync(here("src/style.css"), "utf8"),
   NATIVE: packed(readFileSync(module)),
   WEIGHTS: packed(stored.subarray(10 + stored.readUInt16LE(8))),
-  CARD: JSON.stringify([card.interval_factor, ...signal, ...sbr, ...cells, ...side]),
+  CARD: JSON.stringify([card.interval_factor, card.interval_exponent, ...signal, ...sbr, ...cells, ...side]),
   WORKER: await bundled("worker.js"),
   MAIN: await bundled("main.js"),
 };

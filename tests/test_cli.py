@@ -560,3 +560,34 @@ def test_a_small_address_space_is_one_line(command, mebibytes, tmp_path):
     assert "Traceback" not in done.stderr
     assert done.returncode == 0 or done.stderr.startswith("mars-lidar: "), done.stderr
     assert mebibytes > 300 or done.returncode != 0
+
+
+@pytest.mark.full
+@pytest.mark.skipif(sys.platform != "linux", reason="needs a limit on the address space")
+@pytest.mark.parametrize(
+    "arguments", ["verify SET", "export SET --layout lindell -o OUT", "info CUBE", "convert CUBE OUT.h5"]
+)
+def test_reading_a_store_in_a_small_address_space_is_one_line(arguments, tmp_path):
+    """SciPy's matrix library, loaded behind the threads of Zarr, never returned, or sent the process a Ctrl-C."""
+    import resource
+
+    assert (
+        run("generate", "room", "--size", 16, "--bins", 64, "--cycles", 20, "-o", tmp_path / "set.zarr").exit_code == 0
+    )
+    assert run("simulate", "--scene", "room", *SMALL, "--no-picture", "-o", tmp_path / "cube.zarr").exit_code == 0
+    names = {"SET": "set.zarr", "CUBE": "cube.zarr", "OUT": "out", "OUT.h5": "out.h5"}
+    words = [str(tmp_path / names[word]) if word in names else word for word in arguments.split()]
+    for mebibytes in (450, 550, 650):
+
+        def limit(size: int = mebibytes << 20) -> None:
+            resource.setrlimit(resource.RLIMIT_AS, (size, size))
+
+        done = subprocess.run(command(*words), capture_output=True, text=True, preexec_fn=limit, timeout=100)
+        assert done.returncode in (0, 1, 2), done
+        assert "Traceback" not in done.stderr
+        assert done.returncode == 0 or done.stderr.startswith("mars-lidar: "), done.stderr
+        if done.returncode:
+            assert not list(tmp_path.glob("out*")), "nothing half written"
+        else:
+            for path in tmp_path.glob("out*"):
+                shutil.rmtree(path) if path.is_dir() else path.unlink()

@@ -199,6 +199,20 @@ def test_programs_print_what_their_texts_state(site: Path, folder: str):
         assert all(re.search(r"\d|True", line) for line in stated), program.name
 
 
+@pytest.mark.parametrize("size", [(1400, 900), (1100, 900), (390, 844)], ids=str)
+def test_the_figure_stays_beside_the_phrase_that_changes_it(site: Path, browser: Any, size: tuple[int, int]):
+    tab = new_tab(browser, viewport={"width": size[0], "height": size[1]})
+    tab.route("**/explorer/index.html*", lambda route: route.abort())  # the frame's place, not what it computes
+    tab.goto((site / "seven_pictures.html").as_uri(), wait_until="load")
+    for phrase in tab.locator("a[target=pixel]").all():
+        phrase.evaluate("(e) => e.scrollIntoView({ block: 'end', behavior: 'instant' })")
+        frame = tab.locator(".explorable-frame").bounding_box()
+        assert 0 <= frame["y"] <= size[1] - min(frame["height"], 500), phrase.inner_text()
+        box = phrase.bounding_box()
+        assert box["y"] >= frame["y"] + frame["height"] or box["x"] < frame["x"], phrase.inner_text()
+    tab.close()
+
+
 def test_commands_can_be_copied(site: Path):
     """Two hyphens of an option are two hyphens."""
     text = re.sub(r"<title>.*?</title>", "", (site / "copied" / "commands.html").read_text())

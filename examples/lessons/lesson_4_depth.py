@@ -47,8 +47,8 @@ print(f"{depth}; S = {estimate.signal:.2f}, B = {estimate.background:.3f}")
 
 # %%
 # The program prints ``Depth 8.9925 m, standard error 3.1 mm; S = 2.98, B = 1.001``; the truth is 8.9938 m, 3 and 1.
-# To do the same to a histogram of your own, change the line of ``counts`` and the four numbers of the system. If you
-# do not know the dead time, estimate it from the photon times: :doc:`/calibration`.
+# For a histogram of your own, see :doc:`/reconstruction`, which begins with one. If you do not know the dead time,
+# estimate it from the photon times: :doc:`/calibration`.
 #
 # A whole image
 # -------------

@@ -287,7 +287,8 @@ EMSCRIPTEN_KEEPALIVE void image_maps(const double* told, int32_t knots, const do
     ImageNetworks networks;
     networks.weights.assign(weights, weights + ImageNetworks::kChoose + ImageNetworks::kWeigh);
     networks.interval_factor = card[0];
-    std::copy(card + 1, card + 9, &networks.limits[0][0]);
+    networks.interval_exponent = card[1];
+    std::copy(card + 2, card + 10, &networks.limits[0][0]);
     constexpr double kMostCells = 4096.0;
     std::vector<std::unique_ptr<ImageSetting>> settings;
     settings.push_back(image_setting(record, record.width, 0.0));
@@ -300,7 +301,8 @@ EMSCRIPTEN_KEEPALIVE void image_maps(const double* told, int32_t knots, const do
     std::vector<const ImageSetting*> given;
     for (const auto& each : settings) given.push_back(each.get());
     std::vector<uint8_t> flags(pixels);
-    ImageSolver solver({height, width, first.data(), bin.data(), number.data()}, nullptr, 16 << 20, 1 << 14, 1);
+    ImageSolver solver({height, width, first.data(), bin.data(), number.data(), number.data()}, nullptr, 16 << 20,
+                       1 << 14, 1);
     solver.solve(given, &networks, maps, flags.data(), {});
 
     const CountRows rows{counts, CountRows::Type::kUint32, record.bins};

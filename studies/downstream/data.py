@@ -93,6 +93,8 @@ _TINY = Sizes(
 CONFIGS = {
     "small": Config(name="small", seeds=1, dead=(0.95,), lines=(0.75,)),
     "full": Config(name="full", spatial=True),
+    # rooms that no choice about the networks was made on
+    "held-out": Config(name="held-out", sizes=Sizes(name="held-out", test=(5000, 12)), arms=PAIR, dead=(), lines=()),
     "tiny": Config(
         name="tiny",
         sizes=_TINY,

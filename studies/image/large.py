@@ -7,6 +7,8 @@ import sys
 import time
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
@@ -16,21 +18,31 @@ from mars_lidar.reconstruction.photons import Photons
 from studies.common.report import Row
 
 _ROWS = 64  # drawn at a time
-_OF_RUSAGE = 2**20 if sys.platform == "darwin" else 2**10  # bytes or kilobytes, of a MB
 
 
 def rows(sides: tuple[int, ...], system: System, photons: float, sbr: float) -> list[Row]:
     """Seconds of one processor and the memory at most, above that of the photons themselves too, for each size."""
     out: list[Row] = []
     for side in sides:
-        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as alone:
-            out.append(alone.submit(_cost, side, system, photons, sbr).result())
+        with TemporaryDirectory() as folder:
+            path = Path(folder) / "photons.npz"
+            for step in (_draw, _cost):
+                with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as alone:
+                    result = alone.submit(step, path, side, system, photons, sbr).result()
+            out.append(result)
     return out
 
 
-def _cost(side: int, system: System, photons: float, sbr: float) -> Row:
+def _draw(path: Path, side: int, system: System, photons: float, sbr: float) -> Row:
     given, delay = drawn(side, system, photons, sbr)
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / _OF_RUSAGE
+    np.savez(path, first=given.first, bin=given.bin, number=given.number, delay=delay)
+    return {}
+
+
+def _cost(path: Path, side: int, system: System, photons: float, sbr: float) -> Row:
+    with np.load(path) as saved:
+        given, delay = Photons(side, side, saved["first"], saved["bin"], saved["number"]), saved["delay"]
+    before = _most_memory()
     began, at = time.process_time(), time.perf_counter()
     found = Image().of_photons(given, system, 1)
     seconds, wall = time.process_time() - began, time.perf_counter() - at
@@ -39,10 +51,19 @@ def _cost(side: int, system: System, photons: float, sbr: float) -> Row:
         "pixels": f"{side} x {side}",
         "processor s": seconds,
         "wall s": wall,
-        "memory at most, MB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / _OF_RUSAGE,
+        "memory at most, MB": _most_memory(),
         "before, MB": before,
         "off %": 100.0 * float((off > 3.0 * system.pulse.sigma_ns).mean()),  # type: ignore[attr-defined]
     }
+
+
+def _most_memory() -> float:
+    """Of this process so far, MB; on Linux by its own status, since rusage goes on from that of the parent."""
+    status = Path("/proc/self/status")
+    if status.exists():
+        (kilobytes,) = (line.split()[1] for line in status.read_text().splitlines() if line.startswith("VmHWM"))
+        return int(kilobytes) / 2**10
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
 
 
 def drawn(side: int, system: System, photons: float, sbr: float, seed: int = 7) -> tuple[Photons, np.ndarray]:

@@ -53,7 +53,7 @@ def example(number: int, seed: int) -> Example:
         pulse=_pulse(number, rng, fresh),
         detector=Detector(dead_time_ns=_between(rng, *DEAD_TIME_NS)),
     )
-    scene = _folded(rng) if fresh else _scene(number, rng, system)
+    scene = _folded(number, rng, system) if fresh else _scene(number, rng, system)
     photons, sbr = _between(rng, *SIGNAL), _between(rng, *SBR)
     flux = light(scene, system, photons, sbr, "reflectivity" if rng.random() < 0.5 else "uniform")
     if number % 4 == 0:
@@ -110,10 +110,14 @@ def _scene(number: int, rng: np.random.Generator, system: System) -> Scene:
             depth, reflectivity = depth[y : y + SIDE, x : x + SIDE], reflectivity[y : y + SIDE, x : x + SIDE]
         depth = depth * _between(rng, 0.2, 2.0)
     if number % 3:
-        width_m = float(system.depth_m(relative_width(system) * system.period_ns))
-        depth, reflectivity = busier(depth, reflectivity, width_m, rng)
+        depth, reflectivity = busier(depth, reflectivity, _width_m(system), rng)
     depth = np.clip(depth, 0.02 * np.nanmax(depth), None)
     return Scene(depth_m=depth, reflectivity=np.clip(reflectivity, 0.01, None) / max(1.0, float(reflectivity.max())))
+
+
+def _width_m(system: System) -> float:
+    """Width of the pulse, as a depth."""
+    return float(system.depth_m(relative_width(system) * system.period_ns))
 
 
 def _leaves(side: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
@@ -135,8 +139,8 @@ def _leaves(side: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray
     return depth, reflectivity
 
 
-def _folded(rng: np.random.Generator) -> Scene:
-    """Corrugated ground behind triangles: what no training image has."""
+def _folded(number: int, rng: np.random.Generator, system: System) -> Scene:
+    """Corrugated ground behind triangles, which no training image has; every third busier."""
     y, x = np.mgrid[:SIDE, :SIDE] - 0.5 * (SIDE - 1)
     angle, wave = rng.uniform(0.0, np.pi), _between(rng, 6.0, 60.0)
     along = x * np.cos(angle) + y * np.sin(angle)
@@ -154,6 +158,8 @@ def _folded(rng: np.random.Generator) -> Scene:
             inside &= (x - right) * np.cos(turn) + (y - down) * np.sin(turn) < _between(rng, 1.0, 15.0)
         depth = np.where(inside, far * rng.uniform(0.4, 0.98), depth)
         reflectivity = np.where(inside, rng.uniform(0.05, 1.0), reflectivity)
+    if number % 3 == 0:
+        depth, reflectivity = busier(depth, reflectivity, _width_m(system), rng)
     return Scene(depth_m=np.clip(depth, 0.1, None), reflectivity=np.clip(reflectivity, 0.01, 1.0))
 
 

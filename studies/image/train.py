@@ -16,10 +16,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
 
 from mars_lidar import __version__
 from mars_lidar._base.imports import needed
 from mars_lidar._base.native import _core
+from mars_lidar._base.types import FloatArray
 from mars_lidar.reconstruction.image import solver_of
 from mars_lidar.reconstruction.image_network import CARD, LIMITS, WEIGHTS, networks_of
 from mars_lidar.reconstruction.image_pulse import CELLS_PER_SIGMA, settings_of
@@ -32,7 +34,11 @@ LEVEL, OUTLIER_SIGMA = _core.IMAGE_LEVEL, _core.IMAGE_OUTLIER_SIGMA
 Floats = NDArray[np.float32]
 _REACHED = 6.0  # sigma, up to which an error counts
 _HELD_OUT = 12  # every so many-th image
-UNCALIBRATED = {"interval_factor": 1.0, "holds_for": dict.fromkeys(LIMITS, (0.0, 1e9))}  # of networks in training
+UNCALIBRATED = {
+    "interval_factor": 1.0,
+    "interval_exponent": 0.0,
+    "holds_for": dict.fromkeys(LIMITS, (0.0, 1e9)),
+}  # of networks in training
 
 
 @dataclass(frozen=True)
@@ -40,7 +46,7 @@ class Plan:
     """How much is trained, and from which seed."""
 
     images: int = 400
-    calibration: int = 48  # images, of other content and pulses, by which the intervals are calibrated
+    calibration: int = 192  # images, of other content and pulses, by which the intervals are calibrated
     choose_steps: int = 2000
     weigh_steps: int = 4000
     seed: int = 20261123
@@ -76,10 +82,10 @@ def train(out: Path, plan: Plan = FULL, tell: Tell = str) -> list[Path]:
     prepared = [_weighed(torch, image, first) for image in images]
     weigh, more = _train_weigh(torch, prepared, plan, tell)
     _round(torch, weigh)
-    factor, others = _calibrated(torch, weigh, first, plan, tell)
+    intervals, others = _calibrated(torch, weigh, first, plan, tell)
     out.mkdir(parents=True, exist_ok=True)
     np.save(out / WEIGHTS.name, np.concatenate([_flat(choose), _layers(weigh)]).astype(np.float16))
-    card = _card(plan, factor, facts | more | others, time.process_time() - began, torch.__version__)
+    card = _card(plan, intervals, facts | more | others, time.process_time() - began, torch.__version__)
     (out / CARD.name).write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
     return [out / WEIGHTS.name, out / CARD.name]
 
@@ -231,17 +237,34 @@ def _facts(of: dict[str, Any]) -> dict[str, float]:
 
 def _calibrated(
     torch: Any, net: Any, first: _core.ImageNetworks, plan: Plan, tell: Tell
-) -> tuple[float, dict[str, float]]:
-    """The factor by which intervals hold in images of content and pulses that no network was trained on."""
-    images = (_prepared(scenes.example(scenes.CALIBRATION + k, plan.seed)) for k in range(plan.calibration))
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Factor (1 + background photons about the delay)^exponent of the intervals: least quantile score in new images."""
+    prepared, near = [], []
+    for k in range(plan.calibration):
+        image = _prepared(scenes.example(scenes.CALIBRATION + k, plan.seed))
+        prepared.append(_weighed(torch, image, first))
+        near.append(np.asarray(image.solver.background_near()).reshape(image.valid.shape))
     with torch.no_grad():
-        _, of = _weigh_loss(torch, net, [_weighed(torch, image, first) for image in images], 0)
-    stated = of["valid"] & (of["half"] < OUTLIER_SIGMA) & (of["doubt"] < 1.0 - LEVEL)
-    ratio = (of["error"] / of["half"])[stated]
-    factor = float(ratio.quantile(LEVEL)) if len(ratio) else 1.0
+        _, of = _weigh_loss(torch, net, prepared, 0)
+    stated = (of["valid"] & (of["half"] < OUTLIER_SIGMA) & (of["doubt"] < 1.0 - LEVEL)).numpy()
+    ratio = np.log(np.maximum(of["error"].numpy()[stated].astype(np.float64), 1e-6) / of["half"].numpy()[stated])
+    background = np.log1p(np.stack(near)[stated].astype(np.float64))
+    exponent = _slope(background, ratio)
+    factor = float(np.exp(np.quantile(ratio - exponent * background, LEVEL)))
     facts = {name.replace("held_out", "calibration"): value for name, value in _facts(of).items()}
-    tell(f"image: calibration, factor {factor:.4f}, without it {facts}")
-    return factor, facts
+    tell(f"image: calibration, factor {factor:.4f}, exponent {exponent:.4f}, without them {facts}")
+    return {"interval_factor": factor, "interval_exponent": exponent}, facts
+
+
+def _slope(x: FloatArray, y: FloatArray) -> float:
+    """Of the straight line in x below which `LEVEL` of y lie: least quantile score, which is convex in it."""
+
+    def score(slope: float) -> float:
+        rest = y - slope * x
+        beyond = rest - np.quantile(rest, LEVEL)
+        return float(np.maximum(LEVEL * beyond, (LEVEL - 1.0) * beyond).mean())
+
+    return float(minimize_scalar(score, bounds=(-1.0, 1.0), method="bounded").x)
 
 
 def _weigh_net(torch: Any) -> Any:
@@ -318,14 +341,17 @@ def _layers(net: Any) -> np.ndarray:
     return np.ascontiguousarray(np.concatenate(parts), np.float32)
 
 
-def _card(plan: Plan, factor: float, facts: dict[str, float], seconds: float, torch: str) -> dict[str, Any]:
+def _card(
+    plan: Plan, intervals: dict[str, float], facts: dict[str, float], seconds: float, torch: str
+) -> dict[str, Any]:
     cells = [CELLS_PER_SIGMA * scenes.PERIOD_NS / sigma for sigma in scenes.SIGMA_NS]
     return {
         "what": "weights of the two networks of reconstruct(method='image')",
         "trained_on": f"{plan.images} images of {scenes.SIDE} x {scenes.SIDE} pixels: this package's scenes 'room' and "
         "'random', and clutter; two of three with relief, texture and thin things added; photons by its engine 'exact'",
-        "calibrated_on": f"{plan.calibration} images of other content, folds and triangles, and other pulses",
-        "interval_factor": factor,
+        "calibrated_on": f"{plan.calibration} images of other content, folds and triangles, and other pulses; "
+        "every third with relief, texture and thin things added",
+        **intervals,
         "ranges": {
             "signal photons a pixel, mean": scenes.SIGNAL,
             "signal to background": scenes.SBR,

@@ -1,4 +1,4 @@
-"""Two surfaces behind each pixel in dim light: peaks of the image's posterior beside ``returns=2``."""
+"""Two surfaces behind each pixel in dim light: ``returns=2`` of each pixel alone, and of the image."""
 
 from __future__ import annotations
 
@@ -7,73 +7,48 @@ import numpy as np
 from mars_lidar import Flux, Scene, System, reconstruct, simulate
 from mars_lidar._base.native import _core
 from mars_lidar._base.types import FloatArray
-from mars_lidar.reconstruction import MaximumLikelihood
-from mars_lidar.reconstruction.image import solver_of
-from mars_lidar.reconstruction.image_pulse import settings_of
-from mars_lidar.reconstruction.photons import Photons
+from mars_lidar.reconstruction.histogram_record import relative_width
 from studies.common.report import Row
 
 PHOTONS = 1.0, 2.0, 5.0, 10.0, 20.0  # of each of two returns, a pixel
-FALSE = 0.01  # share of the pixels of one surface, to which a second is given
-_APART = 5.0  # sigma between two returns at least
+_METHODS = "maximum_likelihood", "image"
 
 
 def rows(size: int, system: System, seed: int, photons: tuple[float, ...] = PHOTONS) -> list[Row]:
-    """For each light the share of the pixels whose surfaces both were found, by either way."""
-    room = Scene.example("room", size)
-    y, x = np.mgrid[:size, :size]
-    pane = 10.0 + 3.0 * x / size + 2.0 * y / size  # ns: a pane of glass in front of the room
-    behind = np.asarray(room.flux(system, signal=1.0, sbr=1.0).delay_ns)
+    """Shares of the pixels with both surfaces where there are two, and with a second return where there is one."""
+    x, half = np.arange(size), size // 2
+    pane = 10.0 + (3.0 * x + 2.0 * x[:, None]) / size  # ns: a pane of glass in front of the room
+    wall = np.asarray(Scene.example("room", size).flux(system, signal=1.0, sbr=1.0).delay_ns)
     out: list[Row] = []
     for each in photons:
-        level = each / system.cycles
-        wall = Flux(np.full((size, size), level), level, behind)
-        both = Flux.multi(wall, Flux(np.full((size, size), level), 0.0, pane))
-        one = Flux(np.full((size, size), 2.0 * level), level, behind)
-        line: dict[str, float] = {"photons of each return": each}
-        lone, pair = (simulate(flux, system, seed=seed, threads=1)[0] for flux in (one, both))
-        for name, seconds in (("pixel alone", _alone), ("posterior's peaks", _peaks)):
-            _, score = seconds(lone, system)
-            least = float(np.quantile(score, 1.0 - FALSE))
-            delays, score = seconds(pair, system)
-            near = [
-                np.abs(_gap(delays, d[..., None], system)) < _core.IMAGE_OUTLIER_SIGMA * _sigma(system)
-                for d in (behind, pane)
-            ]
-            found = (near[0] & near[1][..., ::-1]).any(-1) & (score > least)
-            line[f"{name}, both found %"] = 100.0 * float(found.mean())
-        out.append(line)
+        level = np.full((size, size), each / system.cycles)
+        of_wall = Flux(level, level, wall)
+        scenes = {
+            "whole": Flux.multi(of_wall, Flux(level, 0.0, pane)),
+            "half": Flux.multi(of_wall, Flux(np.where(x < half, level, 0.0), 0.0, pane)),
+            "none": Flux(2.0 * level, level, wall),
+        }
+        cubes = {name: simulate(flux, system, seed=seed, threads=1)[0] for name, flux in scenes.items()}
+        for method in _METHODS:
+            delays = {name: _delays(cube, system, method) for name, cube in cubes.items()}
+            both = {name: _both(delays[name], wall, pane, system) for name in ("whole", "half")}
+            two = {name: np.asarray(np.isfinite(delays[name]).all(-1)) for name in ("half", "none")}
+            line = {"photons of each return": each, "method": method, "both, whole pane %": both["whole"]}
+            line |= {"both, half a pane %": both["half"][:, :half], "two beside it %": two["half"][:, half:]}
+            line |= {"two without a pane %": two["none"]}
+            out.append({k: 100.0 * float(v.mean()) if isinstance(v, np.ndarray) else v for k, v in line.items()})
     return out
 
 
-def _sigma(system: System) -> float:
-    setting = settings_of(system)[-1]
-    return setting.sigma / setting.cells * system.period_ns
-
-
-def _gap(a: FloatArray, b: FloatArray, system: System) -> FloatArray:
-    return np.asarray((a - b + 0.5 * system.period_ns) % system.period_ns - 0.5 * system.period_ns)
-
-
-def _alone(cube: np.ndarray, system: System) -> tuple[FloatArray, FloatArray]:
-    """Delays (H, W, 2) of the two returns of each pixel alone, and minus the log of the second's false alarm."""
-    found = reconstruct(cube, system, MaximumLikelihood(false_alarm=0.2), returns=2, threads=1).returns
+def _delays(cube: np.ndarray, system: System, method: str) -> FloatArray:
+    """Of both returns (H, W, 2), ns."""
+    found = reconstruct(cube, system, method, returns=2, threads=1).returns
     assert found is not None
-    chance = np.sort(np.where(np.isfinite(found.delay_ns), found.false_alarm, 1.0), -1)[..., -1]
-    return found.delay_ns, -np.log(np.maximum(chance, 1e-300))
+    return found.delay_ns
 
 
-def _peaks(cube: np.ndarray, system: System) -> tuple[FloatArray, FloatArray]:
-    """Delays (H, W, 2) of the two largest peaks apart of each pixel's posterior, and the mass of the smaller."""
-    height, width, bins = cube.shape
-    solver = solver_of(Photons.of(cube.reshape(-1, bins), height, width), 1)
-    setting = settings_of(system)[-1]
-    solver.begin(setting)
-    volumes, cells = solver.volumes(), setting.cells
-    place, mass = np.asarray(volumes.place), np.asarray(volumes.mass)
-    apart = np.abs((place - place[:, :1] + 0.5 * cells) % cells - 0.5 * cells)
-    others = np.where(apart > _APART * setting.sigma, mass, 0.0)
-    second = others.argmax(1)
-    pixels = np.arange(len(place))
-    delays = np.stack([place[:, 0], place[pixels, second]], -1) / cells * system.period_ns
-    return delays.reshape(height, width, 2), others[pixels, second].reshape(height, width)
+def _both(delays: FloatArray, wall: FloatArray, pane: FloatArray, system: System) -> np.ndarray:
+    """Whether the returns (H, W, 2) of a pixel are within 3 sigma of pane and wall, or of wall and pane."""
+    period, most = system.period_ns, _core.IMAGE_OUTLIER_SIGMA * relative_width(system) * system.period_ns
+    near = [np.abs((delays - each[..., None] + 0.5 * period) % period - 0.5 * period) < most for each in (wall, pane)]
+    return np.asarray((near[0] & near[1][..., ::-1]).any(-1))

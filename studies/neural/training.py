@@ -14,7 +14,9 @@ from torch import Tensor
 
 from mars_lidar import System
 from mars_lidar._base import checks
+from mars_lidar.plot.style import style
 from mars_lidar.statistics.cells import require_mode
+from studies.common.draw import panels
 from studies.common.report import save_csv, save_figure
 from studies.neural.model import NeuralMap
 from studies.neural.network import PdfAutoencoder, canonical, one_thread, rolled
@@ -145,18 +147,14 @@ def _validate_on(network: PdfAutoencoder, held_out: _Tensors, step: int, seconds
 
 def save_curves(trained: Trained, stem: Path) -> list[Path]:
     """Write the validation curve as `stem`.csv and `stem`.png; returns the paths."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(6.4, 3.6), dpi=120, layout="constrained")
-    axes = figure.add_subplot()
-    steps = [p.step for p in trained.curve]
-    for name, words in (("tv_mean", "mean"), ("tv_95", "95 %"), ("tv_max", "largest")):
-        axes.plot(steps, [getattr(p, name) for p in trained.curve], label=f"total variation, {words}")
-    axes.plot(steps, [p.mean_error for p in trained.curve], ":", label="relative error of the mean count, mean")
-    axes.axhline(trained.unconditional, color="0.5", lw=1.0, ls="--", label="mean PDF, flux ignored")
-    axes.axhline(0.02, color="0.7", lw=1.0, label="0.02")
-    axes.set(yscale="log", xlabel="step", ylabel="on held-out fluxes", ylim=(1e-5, 1.0))
-    axes.legend(fontsize=7, ncols=2, frameon=False, loc="lower left")
-    axes.grid(alpha=0.3)
+    with style():
+        figure, ((axes,),) = panels(3.2, 1, 1)
+        steps = [p.step for p in trained.curve]
+        for name, words in (("tv_mean", "mean"), ("tv_95", "95 %"), ("tv_max", "largest")):
+            axes.plot(steps, [getattr(p, name) for p in trained.curve], label=f"total variation, {words}")
+        axes.plot(steps, [p.mean_error for p in trained.curve], ":", label="relative error of the mean count, mean")
+        axes.axhline(trained.unconditional, color="0.5", lw=1.0, ls="--", label="total variation, flux ignored")
+        axes.set(yscale="log", xlabel="step of the training", ylabel="error on held-out fluxes", ylim=(1e-5, 1.0))
+        axes.legend(ncols=2, loc="lower left")
     rows = [vars(point) for point in trained.curve]
     return [save_csv(stem.with_suffix(".csv"), rows), save_figure(stem.with_suffix(".png"), figure)]

@@ -1,4 +1,4 @@
-"""Study "returns": returns seen that are not there, how near two may be, and how well their errors hold."""
+"""Study "returns": detections without a return, how near two may be, and how well their errors hold."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ def run(request: Request) -> Facts:
 
 
 def false_alarms(settings: Settings) -> Iterator[Row]:
-    """Pixels of one return, and of two, in which another was seen."""
+    """Pixels of one return, and of two, in which another was detected."""
     for system, signal, sbr in ALONE[:: settings.every]:
         yield alarm(system, (signal,), signal / sbr, settings.pixels, FALSE_ALARM)
     for dead, first, second, background in PAIRS[:: settings.every]:
@@ -143,15 +143,15 @@ def histograms(
 
 
 def alarm(system: System, signals: tuple[float, ...], background: float, pixels: int, level: float) -> Row:
-    """A line: of the pixels in which all returns were seen, how many show one more."""
+    """A line: of the pixels in which all returns were detected, how many show one more."""
     random = np.random.default_rng(SEED)
     gated = system.detector.mode == "gated"
     delay = 90.0 + 15.0 * random.random(pixels) if gated else 100.0 * random.random(pixels)
     cube = histograms(system, signals, background, [delay + 20.0 * k for k in range(len(signals))], pixels)
-    found = reconstruct(cube, system, MaximumLikelihood(false_alarm=level), returns=MOST)
-    assert found.returns is not None
-    seen = found.returns.count >= len(signals)
-    more = int((found.returns.count > len(signals)).sum())
+    estimate = reconstruct(cube, system, MaximumLikelihood(false_alarm=level), returns=MOST)
+    assert estimate.returns is not None
+    detected = estimate.returns.count >= len(signals)
+    more = int((estimate.returns.count > len(signals)).sum())
     return {
         "mode": system.detector.mode,
         "start": system.start,
@@ -160,33 +160,33 @@ def alarm(system: System, signals: tuple[float, ...], background: float, pixels:
         "bin ns": system.bin_ns,
         "S": " + ".join(f"{s:g}" for s in signals),
         "B": background,
-        "pixels": int(seen.sum()),
+        "pixels": int(detected.sum()),
         "level %": 100.0 * level,
-        "extra %": 100.0 * more / max(int(seen.sum()), 1),
-        "+-": 100.0 * np.sqrt(max(more, 1)) / max(int(seen.sum()), 1),
+        "extra %": 100.0 * more / max(int(detected.sum()), 1),
+        "+-": 100.0 * np.sqrt(max(more, 1)) / max(int(detected.sum()), 1),
     }
 
 
 def pair(system: System, signals: tuple[float, float], background: float, apart: float, pixels: int) -> dict[str, Any]:
-    """A line: how often two returns so many sigma apart are both seen, and how well their errors hold then."""
+    """A line: how often two returns so many sigma apart are both detected, and how well their errors hold then."""
     delay = DELAY_NS + SIGMA_NS * np.array([0.0, apart])
     cube = histograms(system, signals, background, delay, pixels)
-    found = reconstruct(cube, system, returns=MOST).returns
-    assert found is not None
-    both = found.count == 2
+    returns = reconstruct(cube, system, returns=MOST).returns
+    assert returns is not None
+    both = returns.count == 2
     bound = returns_bound(
         Flux.multi(*(Flux(s, 0.5 * background, tau) for s, tau in zip(signals, delay, strict=True))), system
     )
     off = {
-        "depth": ((found.delay_ns[both, :2] - delay), found.delay_error_ns[both, :2], bound.delay_ns),
-        "S": ((found.signal[both, :2] - np.array(signals)), found.signal_error[both, :2], bound.signal),
+        "depth": ((returns.delay_ns[both, :2] - delay), returns.delay_error_ns[both, :2], bound.delay_ns),
+        "S": ((returns.signal[both, :2] - np.array(signals)), returns.signal_error[both, :2], bound.signal),
     }
     line: dict[str, Any] = {
         "dead time ns": system.detector.dead_time_ns,
         "S": " + ".join(f"{s:g}" for s in signals),
         "B": background,
         "separation": apart,
-        "both seen %": 100.0 * float(both.mean()),
+        "both detected %": 100.0 * float(both.mean()),
     }
     for what, (error, stated, least) in off.items():
         for words, times in COVERS.items():
@@ -200,14 +200,14 @@ def pair(system: System, signals: tuple[float, float], background: float, apart:
 
 
 def held(rows: list[dict[str, Any]]) -> list[Row]:
-    """The worst coverage of all pairs by how surely they are seen."""
+    """The worst coverage of all pairs by how surely they are detected."""
     lines: list[Row] = []
     for low, high in ((99.0, 101.0), (90.0, 99.0), (50.0, 90.0), (5.0, 50.0)):
-        mine = [row for row in rows if low <= row["both seen %"] < high]
+        mine = [row for row in rows if low <= row["both detected %"] < high]
         if not mine:
             continue
         words = f"{low:g} % and more" if high > 100 else f"{low:g} to {high:g} %"
-        line: dict[str, Any] = {"both seen": words, "cases": len(mine)}
+        line: dict[str, Any] = {"both detected": words, "cases": len(mine)}
         for what in ("depth", "S"):
             for share in COVERS:
                 line[f"{what} in {share}, least"] = min(row[f"{what} in {share}"] for row in mine)
@@ -217,15 +217,15 @@ def held(rows: list[dict[str, Any]]) -> list[Row]:
 
 
 def limit(curves: list[dict[str, Any]], cycles: int) -> Row:
-    """The separation, in sigma, at which half and nine tenths of the pairs are seen as two."""
+    """The separation, in sigma, at which half and nine tenths of the pairs are detected as two."""
     mine = [row for row in curves if row["cycles"] == cycles]
-    share = np.maximum.accumulate([row["both seen %"] for row in mine])
+    share = np.maximum.accumulate([row["both detected %"] for row in mine])
     apart = np.array([row["separation"] for row in mine])
     return {
         "cycles": cycles,
         "photons of each": 0.5 * cycles,
-        "half seen, sigma": float(np.interp(50.0, share, apart)),
-        "90 % seen, sigma": float(np.interp(90.0, share, apart)),
+        "half detected, sigma": float(np.interp(50.0, share, apart)),
+        "90 % detected, sigma": float(np.interp(90.0, share, apart)),
     }
 
 
@@ -244,18 +244,18 @@ def timings(settings: Settings) -> list[Row]:
 
 
 def _figure(curves: Sequence[Row], rows: Sequence[Row]) -> Figure:
-    """How often two returns are seen as two, over their separation; and how often their intervals hold the truth."""
+    """How often two returns are both detected, over their separation; and how often their intervals hold the truth."""
     figure, axes = panels(2.9, 1, 2)
     left, right = axes[0]
     for colour, cycles in zip(COLOURS, dict.fromkeys(row["cycles"] for row in curves), strict=False):
         mine = [row for row in curves if row["cycles"] == cycles]
         label = f"{0.5 * cycles:g} photons each"
-        left.plot(*_line(mine, "both seen %"), "o-", ms=2.5, lw=1.0, color=colour, label=label)
-    left.set(xscale="log", xlabel="separation (sigma of the pulse)", ylabel="both seen (%)")
+        left.plot(*_line(mine, "both detected %"), "o-", ms=2.5, lw=1.0, color=colour, label=label)
+    left.set(xscale="log", xlabel="separation (sigma of the pulse)", ylabel="both detected (%)")
     left.legend(frameon=False, loc="lower right")
     for what, colour in (("depth", COLOURS[0]), ("S", COLOURS[1])):
         for words, marker in (("95 %", "o"), ("68 %", "s")):
-            sure = [row for row in rows if row["both seen %"] >= 90.0]
+            sure = [row for row in rows if row["both detected %"] >= 90.0]
             label = f"{what}, intervals of {words}"
             right.plot(*_line(sure, f"{what} in {words}"), marker, ms=3, mfc="none", color=colour, label=label)
     for share in (95.0, 68.27):

@@ -15,6 +15,11 @@ from tests.calibration.sweep import ORDINARY as BASE
 FAR = 4.5  # stated errors: 7e-6 by chance for a normal law
 
 
+def nightly(*values: object) -> list[object]:
+    """Cases of the same claim that only the nightly tier runs."""
+    return [pytest.param(value, marks=pytest.mark.nightly) for value in values]
+
+
 def stream(truth: Truth, photons: int, seed: int) -> ml.Timestamps:
     t, cycles = photon_by_photon(truth, photons, seed)
     return as_timestamps(t, truth, cycles)
@@ -56,7 +61,7 @@ def test_a_plain_stream_is_calibrated_with_nothing_given() -> None:
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *nightly(1, 2)])
 def test_a_short_pulse_beside_a_jitter_of_the_clocks_unit(seed: int) -> None:
     """Where the errors of an exact likelihood without the jitter were 28 to 82 times too small."""
     truth = Truth(signal=0.3, background=0.5, delay=10.0, sigma=0.02, dead=25.0, period=32.768, jitter=0.08, unit=0.064)
@@ -66,7 +71,7 @@ def test_a_short_pulse_beside_a_jitter_of_the_clocks_unit(seed: int) -> None:
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("signal", [0.3, 1.0, 3.0])
+@pytest.mark.parametrize("signal", [1.0, *nightly(0.3, 3.0)])
 def test_a_dead_time_that_is_given_and_a_jitter_that_is_not(signal: float) -> None:
     truth = replace(BASE, signal=signal, dead=30.0, jitter=0.08, sigma=0.1)
     result = ml.calibrate(stream(truth, 20_000, 2), {"dead_time_ns": 30.0})
@@ -86,7 +91,7 @@ def test_a_wrong_dead_time_that_is_given_is_the_suspect() -> None:
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("number", [2018, 2051, 2105])
+@pytest.mark.parametrize("number", [2051, *nightly(2018, 2105)])
 def test_a_pulse_or_a_jitter_that_is_hardly_there(number: int) -> None:
     """Pulses of .027 and .108 ns in jitters of 8.1 and 13.9, none in .35; by variances 4.0, 3.9, 13.5 errors off."""
     truth, photons = random_truth(number)
@@ -129,7 +134,7 @@ def test_a_period_of_half_units_fits(seed: int) -> None:
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("effect", ["afterpulses", "twilight", "recovery", "paralyzable", "electronics"])
+@pytest.mark.parametrize("effect", ["afterpulses", "recovery", "paralyzable", "electronics", *nightly("twilight")])
 def test_an_effect_is_named(effect: str) -> None:
     """In 100,000 photons; twilight and electronics, which a fitted dead time takes up in part, in 300,000."""
     truth = with_effect(BASE, effect)

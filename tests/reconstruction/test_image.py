@@ -121,13 +121,14 @@ def test_depth_where_each_pixel_alone_has_none(method):
     "system",
     [
         replace(SYSTEM, cycles=30, detector=ml.Detector(dead_time_ns=150.0)),
+        replace(SYSTEM, cycles=30, start="stationary", detector=ml.Detector(dead_time_ns=150.0)),
         replace(SYSTEM, cycles=40, detector=ml.Detector(dead_time_ns=0.0, mode="synchronous")),
         replace(SYSTEM, detector=ml.Detector(dead_time_ns=30.0, mode="gated", gate_start_ns=20.0, gate_width_ns=50.0)),
         replace(SYSTEM, pulse=ml.SampledPulse(np.exp(-np.arange(0.0, 4.0, 0.05) / 0.6), 0.05)),
         replace(SYSTEM, bins=32),
         replace(SYSTEM, bins=65536, pulse=ml.GaussianPulse(sigma_ns=0.012)),
     ],
-    ids=["blind", "synchronous", "gated", "a measured pulse", "coarse bins", "more cells than one pass takes"],
+    ids=["blind", "blind at first", "synchronous", "gated", "measured pulse", "coarse bins", "many cells"],
 )
 def test_systems(system):
     """Delay and signal, whatever the detector hides: no more bias than a tenth of the pulse or of the signal."""
@@ -214,12 +215,43 @@ def test_exposures_added_up_are_one_longer_exposure():
     assert max(off) < 0.25 * SIGMA
 
 
+@pytest.mark.parametrize("dead_time", [75.0, 250.0])
+def test_two_surfaces(dead_time):
+    """A pane before half of a roof: both where it is, one beside it, and the signal of each, whatever they blind."""
+    system = replace(SYSTEM, cycles=300, detector=ml.Detector(dead_time_ns=dead_time))
+    delay, photons = roof(), np.full((32, 32), 4.0 / 300)
+    behind = np.where(np.arange(32) < 16, 1.0, 0.0) * photons
+    flux = ml.Flux.multi(ml.Flux(photons, photons, delay), ml.Flux(behind, 0.0, delay - 15.0))
+    cube = ml.simulate(flux, system, seed=3)[0]
+    found = ml.reconstruct(cube, system, "image", returns=2)
+    near, far = np.moveaxis(found.returns.delay_ns, -1, 0)
+    both = (np.abs(near - delay + 15.0) < 3.0 * SIGMA) & (np.abs(far - delay) < 3.0 * SIGMA)
+    assert both[:, :16].mean() > 0.8
+    assert (found.returns.count[:, 16:] > 1).mean() < 0.03
+    assert (np.abs(off_by(found, delay)) < 3.0 * SIGMA)[:, 16:].mean() > 0.97
+    assert np.nanmedian(found.returns.signal[:, :16], (0, 1)) == pytest.approx(photons[0, 0], rel=0.15)
+    assert found.background.mean() == pytest.approx(photons[0, 0], rel=0.1)
+    strongest = np.nanmax(np.where(np.isfinite(found.returns.delay_ns), found.returns.signal, -1.0), -1)
+    some = found.returns.count > 0
+    assert np.array_equal(found.signal[some], strongest[some])
+    assert np.array_equal(found.returns.count, np.isfinite(found.returns.false_alarm).sum(-1))
+
+
 def test_bright_pixels_are_estimated_alone():
     system = replace(SYSTEM, cycles=20_000)
     cube = drawn(roof(16), 500.0, system=system)
     found, alone = ml.reconstruct(cube, system, "image"), ml.reconstruct(cube, system)
     assert np.array_equal(found.delay_ns, alone.delay_ns)
     assert (found.outlier < 0.01).all()
+
+
+def test_signal_at_an_edge_of_reflectivity():
+    """Of 60 and of 150 photons on one surface: not worse than of each pixel alone, though depth alone tells no edge."""
+    system = replace(SYSTEM, cycles=20_000)
+    level = np.where(np.indices((32, 32)).sum(0) % 16 < 8, 60.0, 150.0) / system.cycles
+    cube = ml.simulate(ml.Flux(level, 60.0 / system.cycles, np.full(level.shape, 40.0)), system, seed=6)[0]
+    image, alone = (ml.reconstruct(cube, system, name).signal - level for name in ("image", "maximum_likelihood"))
+    assert np.sqrt((image**2).mean()) < np.sqrt((alone**2).mean())
 
 
 def test_parts_of_an_image_give_what_the_whole_gives(monkeypatch):
@@ -276,7 +308,7 @@ def test_any_shape(shape):
     ("change", "message"),
     [
         ({"cube": np.ones((9, 250), np.uint16)}, r"'image' needs images, a cube \(..., H, W, bins\)"),
-        ({"returns": 2}, "returns=2 needs method 'maximum_likelihood', got 'image'"),
+        ({"returns": 9}, r"returns must be an integer in \[1, 8\], got 9"),
         ({"system": replace(SYSTEM, detector=ml.Detector(dead_time_ns=5.0, mode="paralyzable"))}, "'paralyzable'"),
     ],
 )

@@ -70,7 +70,7 @@ def reconstruct(
     attenuation
         none or inverse_square: reflectivity is signal times depth squared. [default: as the cube was simulated]
     returns
-        Returns to look for in each pixel, each tested (glass, foliage). Needs maximum_likelihood. [default: 1]
+        Returns to look for in each pixel, each tested (glass, foliage); of maximum_likelihood and image. [default: 1]
     keep
         With --returns: the return whose depth is taken, strongest, nearest or farthest. [default: strongest]
     from_ns

@@ -49,6 +49,7 @@ from mars_lidar.io.cube import Cube
 from mars_lidar.io.recipe import Recipe
 from mars_lidar.io.scene_files import Problem
 from mars_lidar.io.store import OnDisk
+from mars_lidar.io.zarr_store import check_zarr_threads
 from mars_lidar.light.transient import Transient
 from mars_lidar.scene.layers import LayeredScene
 from mars_lidar.scene.scene import Scene
@@ -79,6 +80,7 @@ class Dataset:
         if self.attrs.get("format_version") not in (FORMAT_VERSION, MORE_VERSION):
             version = self.attrs.get("format_version")
             raise ValueError(f"{path} has layout version {version}; {FORMAT_VERSION} and {MORE_VERSION} can be read")
+        check_zarr_threads()
         self.sums = manifest.require(path, listed=listed) if self.complete else None
         store: Any = zarr_store(path, read_only=self.sums is not None)
         if in_bucket(path):

@@ -115,7 +115,7 @@ def sourced(name: str) -> Sourced:
 
 def table() -> str:
     """All instruments as the table of docs/detectors.md."""
-    lines = ["| name | value | | source |", "|---|---|---|---|"]
+    lines = ["| name | field | value | source |", "|---|---|---|---|"]
     for name in INSTRUMENTS:
         label = f"`{name}`"
         for field, (value, source) in sourced(name).items():

@@ -6,12 +6,13 @@ small networks choose among the posterior's peaks and weigh the planes. The step
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from statistics import NormalDist
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base import checks
 from mars_lidar._base.native import _core
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
@@ -21,11 +22,13 @@ from mars_lidar.reconstruction.image_pulse import settings_of
 from mars_lidar.reconstruction.maximum_likelihood import MaximumLikelihood
 from mars_lidar.reconstruction.method import Estimates, Flags, Method
 from mars_lidar.reconstruction.photons import Photons
+from mars_lidar.reconstruction.returns import MOST_RETURNS, RETURN_COLUMNS
 
 VOLUME_BYTES = 96 * 2**20  # of each of three volumes (rows, columns, cells): larger images are computed in parts
 BLOCK_PIXELS = 2**17  # of the second network at a time
 NORMAL_HALF_WIDTH = NormalDist().inv_cdf(0.95)  # standard errors to either side that hold 90 %
 _BRIGHT_BYTES = 64 * 2**20  # of the counts of such pixels at a time
+_NO_SURFACE = np.uint8(Flags.EMPTY | Flags.FILLED)
 _REJECTED = np.uint8(Flags.EMPTY | Flags.NO_SIGNAL | Flags.SATURATED | Flags.UNCONVERGED)
 
 
@@ -40,9 +43,14 @@ class Image(Method):
     efficiency
         (H, W) of each pixel, as a share of that of the others, 0 for pixels that see nothing; None: all alike. Signal
         and background are those of a pixel of the map's mean.
+    returns
+        Surfaces to look for behind each pixel, 1 to 8, each from the photons outside the pulses of the others. A return
+        is given where its interval is. `signal` and `delay_ns` are then those of the strongest.
 
     Raises
     ------
+    TypeError
+        Returns that are no number.
     ValueError
         An efficiency that is no such map; ``check``: a detector that this method does not hold for.
 
@@ -65,6 +73,7 @@ class Image(Method):
     """
 
     efficiency: FloatArray | None = None
+    returns: int = 1
 
     name = "image"
     modes = ("nonparalyzable", "synchronous", "gated")
@@ -73,6 +82,7 @@ class Image(Method):
     of_images = True
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "returns", checks.integer("returns", self.returns, low=1, high=MOST_RETURNS))
         if self.efficiency is None:
             return
         given = np.array(self.efficiency, np.float64)
@@ -102,12 +112,23 @@ class Image(Method):
         image = photons.height, photons.width
         if self.efficiency is not None and self.efficiency.shape != image:
             raise ValueError(f"efficiency must be of the image's {image} pixels, got shape {self.efficiency.shape}")
-        solver = solver_of(photons, threads, self.efficiency)
-        maps, flags = (
-            np.empty((_core.IMAGE_SIZES["maps"], image[0] * image[1])),
-            np.empty(image[0] * image[1], np.uint8),
-        )
+        if self.returns == 1:
+            return self._surface(photons, photons.number, system, threads)
+        setting = settings_of(system)[-1]
+        surfaces: list[Estimates] = []
+        for k in 2 * tuple(range(self.returns)):  # twice, so that the first knows of the others
+            others = surfaces[:k] + surfaces[k + 1 :]
+            counted, share = _outside(photons, others, setting)
+            surface = self._surface(photons, counted, system, threads)
+            surfaces[k : k + 1] = [replace(surface, background=surface.background / share)]
+        return _several(surfaces)
+
+    def _surface(self, photons: Photons, counted: NDArray[np.float32], system: System, threads: int) -> Estimates:
+        """One surface, from the photons that are `counted` (entries,)."""
+        pixels = photons.height * photons.width
         settings = settings_of(system)
+        solver = solver_of(photons, threads, self.efficiency, counted)
+        maps, flags = np.empty((_core.IMAGE_SIZES["maps"], pixels)), np.empty(pixels, np.uint8)
         solver.solve(settings, self._networks(), maps=maps, flags=flags)
         delay, half_width, deviation, outlier, signal, signal_error, background, number = maps
         estimates = Estimates(
@@ -120,10 +141,10 @@ class Image(Method):
             half_width=half_width,
             outlier=outlier,
         )
-        width = settings[-1].sigma / settings[-1].cells
-        _refit_bright(
-            estimates, np.flatnonzero(number > _core.IMAGE_BRIGHT), width, photons, system, self.efficiency, threads
-        )
+        if self.returns == 1:
+            width = settings[-1].sigma / settings[-1].cells
+            bright = np.flatnonzero(number > _core.IMAGE_BRIGHT)
+            _refit_bright(estimates, bright, width, photons, system, self.efficiency, threads)
         return estimates
 
     def _networks(self) -> _core.ImageNetworks | None:
@@ -136,11 +157,13 @@ class UntrainedImage(Image):
 
     Parameters
     ----------
-    efficiency
+    efficiency, returns
         As of `Image`.
 
     Raises
     ------
+    TypeError
+        Returns that are no number.
     ValueError
         An efficiency that is no such map; ``check``: a detector that this method does not hold for.
 
@@ -168,19 +191,53 @@ class UntrainedImage(Image):
         return None
 
 
-def solver_of(photons: Photons, threads: int, efficiency: FloatArray | None = None) -> _core.ImageSolver:
-    """The native solver of one image."""
+def solver_of(
+    photons: Photons,
+    threads: int,
+    efficiency: FloatArray | None = None,
+    counted: NDArray[np.float32] | None = None,
+) -> _core.ImageSolver:
+    """The native solver of one image; `counted`: of each entry, the photons that are not of another surface."""
     return _core.ImageSolver(
         height=photons.height,
         width=photons.width,
         first=photons.first,
         bin=photons.bin,
         number=photons.number,
+        counted=photons.number if counted is None else counted,
         efficiency=np.empty(0) if efficiency is None else efficiency.ravel(),
         volume_bytes=VOLUME_BYTES,
         block_pixels=BLOCK_PIXELS,
         threads=threads,
     )
+
+
+def _outside(
+    photons: Photons, surfaces: list[Estimates], setting: _core.ImageSetting
+) -> tuple[NDArray[np.float32], FloatArray]:
+    """Photons (entries,) outside the pulses of `surfaces`, and the share of the period (pixels,) that is."""
+    first, last = (end / setting.cells for end in setting.pulse)
+    counted, share = photons.number.copy(), np.ones(photons.height * photons.width)
+    for each in surfaces:
+        there = each.flags & _NO_SURFACE == 0
+        since = (photons.bin + 0.5) / setting.bins - each.delay[photons.pixel] - first
+        counted[there[photons.pixel] & (since % 1.0 < last - first)] = 0.0
+        share -= there * (last - first)
+    return counted, np.maximum(share, 1.0 / setting.cells)
+
+
+def _several(surfaces: list[Estimates]) -> Estimates:
+    """Of each pixel the surfaces that have an interval, nearest first; and the maps of the strongest of them."""
+    every = {each.name: [getattr(surface, each.name) for surface in surfaces] for each in fields(Estimates)}
+    maps = {name: np.stack(values, -1) for name, values in every.items() if values[0] is not None}
+    maps["false_alarm"] = maps["outlier"]
+    stated = np.isfinite(maps["half_width"])
+    returns = np.stack([np.where(stated, maps[name], np.nan) for name in RETURN_COLUMNS], -1)
+    order = np.argsort(returns[..., 0], -1)  # NaN last
+    strongest = np.where(stated, maps["signal"], -1.0).argmax(-1)[:, None]
+    chosen = {name: np.take_along_axis(values, strongest, -1)[:, 0] for name, values in maps.items()}
+    del chosen["false_alarm"]
+    return Estimates(**chosen, returns=np.take_along_axis(returns, order[..., None], 1))
 
 
 def _refit_bright(

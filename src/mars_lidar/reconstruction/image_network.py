@@ -35,4 +35,5 @@ def networks() -> _core.ImageNetworks:
 def networks_of(weights: NDArray[np.floating[Any]], of: dict[str, Any]) -> _core.ImageNetworks:
     """Networks of these weights, with the intervals and limits of a card."""
     limits = np.array([of["holds_for"][name] for name in LIMITS], np.float64)
-    return _core.ImageNetworks(weights.astype(np.float32), interval_factor=of["interval_factor"], limits=limits)
+    intervals = {name: of[name] for name in ("interval_factor", "interval_exponent")}
+    return _core.ImageNetworks(weights.astype(np.float32), **intervals, limits=limits)

@@ -210,7 +210,7 @@ def reconstruct(
         As in `Scene.flux`: ``"inverse_square"`` makes reflectivity proportional to S times depth squared.
     returns
         Returns to look for in each pixel, 1 to 8: panes of glass, foliage. Each is tested, and all of them are in
-        `Reconstruction.returns`. Of ``"maximum_likelihood"`` alone.
+        `Reconstruction.returns`. Of ``"maximum_likelihood"``, each pixel alone, and of ``"image"``.
     threads
         Threads to run on; default: all processors this process may use. The result does not depend on it.
     progress
@@ -275,8 +275,9 @@ def with_returns(method: Method, returns: int) -> Method:
     """The method, looking for so many returns of each pixel."""
     if checks.integer("returns", returns, low=1, high=MOST_RETURNS) == 1:
         return method
-    if not isinstance(method, MaximumLikelihood):
-        raise ValueError(f"returns={returns} needs method 'maximum_likelihood', got {method.name!r}")
+    if not isinstance(method, MaximumLikelihood | Image):
+        able = " or ".join(repr(each.name) for each in METHODS.values() if isinstance(each, MaximumLikelihood | Image))
+        raise ValueError(f"returns={returns} needs method {able}, got {method.name!r}")
     return replace(method, returns=int(returns))
 
 

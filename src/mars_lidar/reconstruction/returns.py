@@ -31,7 +31,8 @@ class Returns:
         (..., K) standard errors from the observed information; NaN where it does not bound them.
     false_alarm
         (..., K) probability that a return which is not there would have gained so much likelihood, anywhere in the
-        period (docs/theory_reconstruction.md, section 6).
+        period (docs/theory_reconstruction.md, section 6). Of method ``"image"`` the probability that the return is not
+        of this delay.
 
     See Also
     --------

@@ -205,7 +205,7 @@ class Table:
         background: Grid = PAPER_GRID["background"],
         **options: Any,
     ) -> Table:
-        """`build`, or the same table from the user's cache (docs/table.md, 7), which keeps what is built.
+        """`build`, or the same table from the user's cache (docs/lookup_table.md), which keeps what is built.
 
         Arguments, `options` included, are those of `build`. Where nothing can be written there, the table is built,
         with a warning.

@@ -141,7 +141,7 @@ void image_likelihood(const ImageSetting& s, const ImagePhotons& photons, const 
                                    static_cast<float>(s.cells) - 0.001f);
             task.photons = count;
             task.time = time.data();
-            task.weight = photons.number + e;
+            task.weight = photons.counted + e;
             task.ratio = ratio[p];
             task.armed = exposure(photons.bin + e, photons.number + e, count) ? exposure.relative() : nullptr;
             task.out = out + k * s.cells;
@@ -218,12 +218,12 @@ void image_centroids(const ImageSetting& s, const ImagePhotons& photons, const f
                          for (int64_t e = first; e < last; ++e) {
                              float u = (static_cast<float>(photons.bin[e]) + 0.5f) * step - delay[p];
                              u -= period * std::round(u / period);
-                             if (u >= pulse.near_low && u < pulse.near_high) near += photons.number[e];
+                             if (u >= pulse.near_low && u < pulse.near_high) near += photons.counted[e];
                              const float x = (u - offset - pulse.low) * static_cast<float>(pulse.phases);
                              if (!(x >= 0.0f) || !(x < static_cast<float>(pulse.count))) continue;
                              const int64_t j = static_cast<int64_t>(x);
                              const float q = ratio[p] * pulse.density[j];
-                             const double g = static_cast<double>(photons.number[e] * q / (1.0f + q));
+                             const double g = static_cast<double>(photons.counted[e] * q / (1.0f + q));
                              a += g;
                              b += g * static_cast<double>(pulse.score[j]);
                          }

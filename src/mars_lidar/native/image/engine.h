@@ -15,6 +15,8 @@ struct ImagePhotons {
     const int64_t* first;  // (pixels + 1)
     const int32_t* bin;
     const float* number;
+    const float*
+        counted;  // of them, those that are not of another surface; the others blinded the detector all the same
 };
 
 // A rectangle of the image: rows [y0, y1), columns [x0, x1).

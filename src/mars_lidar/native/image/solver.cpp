@@ -164,7 +164,7 @@ ImageSolver::ImageSolver(const ImagePhotons& photons, const double* efficiency, 
       total_(photons.height * photons.width, 0.0) {
     for (int64_t p = 0; p < pixels(); ++p)
         for (int64_t e = photons.first[p]; e < photons.first[p + 1]; ++e)
-            total_[p] += static_cast<double>(photons.number[e]);
+            total_[p] += static_cast<double>(photons.counted[e]);
 }
 
 void ImageSolver::solve(const std::vector<const ImageSetting*>& settings, const ImageNetworks* networks, double* maps,
@@ -243,7 +243,7 @@ double ImageSolver::signal_share() const {
             total[p] = total_[y * width + p];
             for (int64_t e = photons_.first[y * width + p]; e < photons_.first[y * width + p + 1]; ++e)
                 to[std::min<int64_t>(photons_.bin[e] * int64_t{slots} / bins, slots - 1)] +=
-                    static_cast<double>(photons_.number[e]);
+                    static_cast<double>(photons_.counted[e]);
             for (int s = 0; s < slots; ++s)
                 near[p * slots + s] = to[s] + 0.5 * (to[s == 0 ? slots - 1 : s - 1] + to[s == slots - 1 ? 0 : s + 1]);
         }
@@ -551,8 +551,8 @@ ImageSolver::Window ImageSolver::agreeing(int64_t p, const float* plane) const {
     const bool own = number > kOwn;
     Window at{seen_.offset[p] / sigma, own ? 1.0f / std::sqrt(number) : 9.0f,
               number / std::max(seen_.exposure[p], 1e-3f), number};
-    Window best = at;
-    float low = -HUGE_VALF, high = HUGE_VALF;
+    Window best = at, light = at;
+    float low = -HUGE_VALF, high = HUGE_VALF, dim = -HUGE_VALF, bright = HUGE_VALF;
     bool agrees = true;
     for (int k = 0; k <= kImageWindows; ++k) {
         if (k > 0) {
@@ -563,8 +563,22 @@ ImageSolver::Window ImageSolver::agreeing(int64_t p, const float* plane) const {
         high = std::min(high, at.offset + kKappa * at.error);
         agrees = agrees && low <= high;
         if (k == 1 ? agrees || !own : agrees) best = at;
+        if (!own) continue;  // signals tell edges too, where a pixel has enough of it
+        const float error = at.signal / std::sqrt(at.light);
+        dim = std::max(dim, at.signal - kKappa * error);
+        bright = std::min(bright, at.signal + kKappa * error);
+        if (agrees && dim <= bright) light = at;
+    }
+    if (own) {
+        best.signal = light.signal;
+        best.light = light.light;
     }
     return best;
+}
+
+float ImageSolver::background_near(int64_t p) const {
+    return std::max(static_cast<float>(light_.background[p]), static_cast<float>(kLeastLight)) *
+           (5.0f * static_cast<float>(setting_->sigma) / static_cast<float>(setting_->cells));
 }
 
 ImagePlaneFeatures ImageSolver::plane_features(int64_t first, int64_t last, const Watch& watch) const {
@@ -603,8 +617,7 @@ ImagePlaneFeatures ImageSolver::plane_features(int64_t first, int64_t last, cons
         add(std::log(chosen_.spread[p] / sigma));
         add(0.5f * std::log(chosen_.mass[p] + 1e-3f));
         add(0.5f * std::log(std::max(chosen_.confidence[p], 0.0f) + 1e-3f));
-        add(std::log(std::max(static_cast<float>(light_.background[p]), static_cast<float>(kLeastLight)) *
-                     (5.0f * sigma / static_cast<float>(setting_->cells))));
+        add(std::log(background_near(p)));
         add(clipped(number - std::max(of[kImageMoments + 5], static_cast<float>(kLeastLight)) *
                                  static_cast<float>(efficiency(p)),
                     -10.0f, 10.0f));
@@ -671,7 +684,9 @@ void ImageSolver::estimate(const ImageNetworks* networks, double* maps, uint8_t*
                 signal += share[k] * std::exp(static_cast<double>(f.log_signals[k * size + q]));
             offset += 0.3 * clipped(rest[3], -3.0, 3.0);
             const double doubt = 1.0 / (1.0 + std::exp(2.0 - rest[1]));
-            double half = networks->interval_factor * std::exp(clipped(rest[4], -4.0, 3.0) - 0.7);
+            double half = networks->interval_factor *
+                          std::pow(1.0 + static_cast<double>(background_near(p)), networks->interval_exponent) *
+                          std::exp(clipped(rest[4], -4.0, 3.0) - 0.7);
             if (half > kImageOutlierSigma || doubt > 1.0 - kImageLevel) half = kNone;
             put(p, offset, sigma * std::exp(clipped(rest[0], -4.0, 3.0) - 1.5), half * sigma, doubt, signal,
                 std::exp(clipped(rest[2], -4.0, 3.0) - 1.0));

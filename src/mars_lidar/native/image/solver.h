@@ -40,7 +40,8 @@ struct ImageNetworks {
     static constexpr int kWeigh = (kImagePlaneFeatures + 1) * kImageChannels +
                                   2 * (9 * kImageChannels + 1) * kImageChannels + (kImageChannels + 1) * kImageOutputs;
     std::vector<float> weights;  // kChoose + kWeigh; kChoose alone while the second is not trained
-    double interval_factor = 1.0;
+    // of the half widths: factor (1 + background photons about the delay)^exponent
+    double interval_factor = 1.0, interval_exponent = 0.0;
     double limits[4][2] = {};  // least and largest signal photons a pixel, signal to background, cells, pixels a side
 
     bool hold_for(double signal, double background, int cells, int64_t side) const;
@@ -117,6 +118,7 @@ class ImageSolver {
     int64_t pixels() const { return photons_.height * photons_.width; }
     int64_t parts() const { return static_cast<int64_t>(cuts().size()); }
     const ImageLight& light() const { return light_; }
+    float background_near(int64_t p) const;  // photons of background in 5 sigma
     const ImageChoice& chosen() const { return chosen_; }
 
  private:

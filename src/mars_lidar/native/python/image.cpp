@@ -37,7 +37,7 @@ nb::object array_of(std::vector<Number> values, std::initializer_list<size_t> sh
     return nb::cast(nb::ndarray<nb::numpy, Number>(kept->data(), shape, owner));
 }
 
-ImageNetworks* networks_of(const Floats& weights, double factor, const Matrix<const double>& limits) {
+ImageNetworks* networks_of(const Floats& weights, double factor, double exponent, const Matrix<const double>& limits) {
     const int64_t size = size_of(weights);
     if (size != ImageNetworks::kChoose && size != ImageNetworks::kChoose + ImageNetworks::kWeigh)
         throw nb::value_error("weights must be those of the first network, or of both");
@@ -45,23 +45,25 @@ ImageNetworks* networks_of(const Floats& weights, double factor, const Matrix<co
     auto out = std::make_unique<ImageNetworks>();
     out->weights.assign(weights.data(), weights.data() + size);
     out->interval_factor = factor;
+    out->interval_exponent = exponent;
     std::copy(limits.data(), limits.data() + 8, &out->limits[0][0]);
     return out.release();
 }
 
 void make(BoundImageSolver* self, int64_t height, int64_t width, Vector<const int64_t> first, Vector<const int32_t> bin,
-          Floats number, Doubles efficiency, int64_t volume_bytes, int64_t block_pixels, int threads) {
+          Floats number, Floats counted, Doubles efficiency, int64_t volume_bytes, int64_t block_pixels, int threads) {
     if (height < 1 || width < 1 || size_of(first) != height * width + 1)
         throw nb::value_error("first must be (height * width + 1)");
-    if (size_of(bin) != size_of(number) || first.data()[height * width] != size_of(bin))
-        throw nb::value_error("bin and number must have one entry for each of first");
+    if (size_of(bin) != size_of(number) || size_of(bin) != size_of(counted) ||
+        first.data()[height * width] != size_of(bin))
+        throw nb::value_error("bin, number and counted must have one entry for each of first");
     if (size_of(efficiency) != 0 && size_of(efficiency) != height * width)
         throw nb::value_error("efficiency must be empty or (height * width)");
     new (self) BoundImageSolver;
-    self->solver = std::make_unique<ImageSolver>(ImagePhotons{height, width, first.data(), bin.data(), number.data()},
-                                                 size_of(efficiency) ? efficiency.data() : nullptr, volume_bytes,
-                                                 block_pixels, threads);
-    self->arrays = nb::make_tuple(first, bin, number, efficiency);
+    self->solver = std::make_unique<ImageSolver>(
+        ImagePhotons{height, width, first.data(), bin.data(), number.data(), counted.data()},
+        size_of(efficiency) ? efficiency.data() : nullptr, volume_bytes, block_pixels, threads);
+    self->arrays = nb::make_tuple(first, bin, number, counted, efficiency);
 }
 
 // `settings`: from the widest blur to none.
@@ -169,10 +171,18 @@ void bind_image(nb::module_& module) {
         .def(nb::init<nb::object, int, int64_t, Doubles, Doubles, double>(), "recording"_a, nb::kw_only(), "cells"_a,
              "first"_a, "density"_a, "score"_a, "sigma"_a)
         .def_ro("cells", &BoundImageSetting::cells)
-        .def_ro("sigma", &BoundImageSetting::sigma);
+        .def_ro("sigma", &BoundImageSetting::sigma)
+        .def_prop_ro("bins", [](const BoundImageSetting& self) { return self.recording->bins; })
+        .def_prop_ro(
+            "pulse",
+            [](const BoundImageSetting& self) {
+                const PulseScore& of = self.score;
+                return nb::make_tuple(of.low, of.low + static_cast<float>(of.count) / static_cast<float>(of.phases));
+            },
+            "Begin and end of the pulse about its delay, cells.");
 
     nb::class_<ImageNetworks>(module, "ImageNetworks", "Weights of both networks, and where they hold.")
-        .def(nb::new_(&networks_of), "weights"_a, nb::kw_only(), "interval_factor"_a, "limits"_a)
+        .def(nb::new_(&networks_of), "weights"_a, nb::kw_only(), "interval_factor"_a, "interval_exponent"_a, "limits"_a)
         .def("hold_for", &ImageNetworks::hold_for, nb::kw_only(), "signal"_a, "background"_a, "cells"_a, "side"_a,
              "Whether they hold for mean photons a pixel, cells a period and pixels a side.");
 
@@ -184,8 +194,8 @@ void bind_image(nb::module_& module) {
 
     nb::class_<BoundImageSolver> solver(module, "ImageSolver", "Depth of one image from a few photons a pixel.");
     solver
-        .def("__init__", &make, nb::kw_only(), "height"_a, "width"_a, "first"_a, "bin"_a, "number"_a, "efficiency"_a,
-             "volume_bytes"_a, "block_pixels"_a, "threads"_a)
+        .def("__init__", &make, nb::kw_only(), "height"_a, "width"_a, "first"_a, "bin"_a, "number"_a, "counted"_a,
+             "efficiency"_a, "volume_bytes"_a, "block_pixels"_a, "threads"_a)
         .def("solve", &solve, "settings"_a, "networks"_a.none(), nb::kw_only(), "maps"_a.noconvert(),
              "flags"_a.noconvert(), "All steps: `maps` (maps, pixels) of native/image/solver.h, and `flags` (pixels).")
         .def("begin", &begin, "setting"_a, "The light, from a first round of delays.")
@@ -195,6 +205,15 @@ void bind_image(nb::module_& module) {
         .def("volumes", &volumes, "Posteriors, and the likelihoods that they come from.")
         .def("candidate_features", &candidate_features, "volumes"_a, "pixel"_a,
              "(pixels, peaks, features) that the first network reads of some pixels.")
+        .def(
+            "background_near",
+            [](const BoundImageSolver& self) {
+                std::vector<float> out(self.solver->pixels());
+                for (size_t p = 0; p < out.size(); ++p) out[p] = self.solver->background_near(static_cast<int64_t>(p));
+                const size_t pixels = out.size();
+                return array_of(std::move(out), {pixels});
+            },
+            "Photons of background about the delay (pixels).")
         .def("choose", &choose, "networks"_a.none(), "Delay, in cells, and confidence (pixels) that are chosen.")
         .def("plane_features", &plane_features,
              "(features, H, W) that the second network reads; delays and logarithms of signals that it weighs.");

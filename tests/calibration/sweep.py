@@ -127,14 +127,12 @@ def main() -> None:
     parser.add_argument("--ordinary", action="store_true")
     parser.add_argument("--photons", type=int)
     parser.add_argument("--keep", type=Path)
-    parser.add_argument("--kept", action="store_true", help="only the streams of FILE, as the table of the docs")
+    parser.add_argument("--kept", action="store_true", help="only the streams of FILE, as the tables of the docs")
     asked = parser.parse_args()
-    done: dict[int, dict[str, Any]] = {}
-    if asked.keep is not None and asked.keep.exists():
-        for line in asked.keep.read_text().splitlines():
-            row = json.loads(line)
-            if (row["effect"], row["asked"], row["ordinary"]) == (asked.effect, asked.photons, asked.ordinary):
-                done[row["number"]] = row
+    lines = asked.keep.read_text().splitlines() if asked.keep is not None and asked.keep.exists() else []
+    stored = [json.loads(line) for line in lines]
+    wanted = (asked.effect, asked.photons, asked.ordinary)
+    done = {row["number"]: row for row in stored if (row["effect"], row["asked"], row["ordinary"]) == wanted}
     rows = []
     for number in range(asked.first, asked.last):
         if asked.kept and number not in done:
@@ -148,6 +146,8 @@ def main() -> None:
             print(f"{number} {row['photons']:,} photons {row['seconds']:.1f} s p={row['p']:.2g}", end=" ")
             print(np.round(np.array(row["pulls"], float), 1), row["suspects"], flush=True)
     print(table(rows, [NAMES[name] for name in asked.effect.split("+")] if asked.effect else []))
+    if asked.kept and not asked.effect:
+        print("\n" + named(stored))
 
 
 def table(rows: list[dict[str, Any]], effects: list[str]) -> str:
@@ -176,6 +176,30 @@ def table(rows: list[dict[str, Any]], effects: list[str]) -> str:
             + f"other suspects in {others}; {np.mean(seconds):.1f} s of a processor each, largest {max(seconds):.1f}.",
         ]
     )
+
+
+def named(rows: list[dict[str, Any]]) -> str:
+    """Markdown: for each effect, or pair, of these streams, how many name all of it, and how many something else."""
+    lines = [
+        "| effect | photons | streams | named | other suspects | CPU s, mean | largest pull |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    groups: dict[tuple[str, int], list[dict[str, Any]]] = {}
+    for row in rows:
+        if row["effect"]:
+            groups.setdefault((row["effect"], row["asked"]), []).append(row)
+    for (effect, photons), group in groups.items():
+        names = {NAMES[name] for name in effect.split("+")}
+        whole = sum(names <= {*row["suspects"]} for row in group)
+        others = sum(not {*row["suspects"]} <= names for row in group)
+        # the dead time that electronics hide is an estimate only where they are named
+        pulled = [abs(z) for row in group if names <= {*row["suspects"]} for z in row["pulls"] if z is not None]
+        seconds = np.mean([row["seconds"] for row in group])
+        lines.append(
+            f"| {effect.replace('+', ' and ')} | {photons:,} | {len(group)} | {whole} | {others} | {seconds:.1f} | "
+            f"{max(pulled, default=np.nan):.1f} |"
+        )
+    return "\n".join(lines)
 
 
 def calibrated(number: int, effect: str | None, photons: int | None, ordinary: bool) -> dict[str, Any]:

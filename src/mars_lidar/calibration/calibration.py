@@ -466,14 +466,13 @@ class _Run:
     def _attempt(self) -> Fitted:
         """A fit with the streams of `fit`."""
         fit, model = self.fit, self.model
-        width_known = model.returns == 0 or model.pulse is not None
         tried = []
         begin = start.starts(fit, self.recording, model, self.fixed)
-        known = {*self.fixed, *(["width"] if width_known else [])}
+        known = {*self.fixed, *(["width"] if model.returns == 0 or model.pulse is not None else [])}
         free = np.array([k for k, name in enumerate(model.names) if name not in known], np.intp)
-        first = float(min(self.recording.photons, fit.effort.first))
         for _, theta in begin[:2]:
-            tried.append(fit.steps(Guess(model, theta, np.diag(0.5 * model.scale(theta)[free]), free), first))
+            trial = Guess(model, theta, np.diag(0.5 * model.scale(theta)[free]), free)
+            tried.append(fit.steps(trial, float(min(self.recording.photons, fit.effort.first))))
         guess, _, settled = fit.steps(min(tried, key=lambda trial: trial[1])[0], float(self.recording.photons))
         final = fit.finish(guess)
         return replace(final, converged=final.converged and (settled or final.p_value >= self.level))
@@ -549,12 +548,11 @@ def _estimates(fitted: Fitted, fixed: dict[str, float], growth: FloatArray) -> d
     scale = growth[fitted.free]
     covariance = fitted.covariance * np.outer(scale, scale)
     drawn = draws(model, fitted.unbounded, covariance, fitted.free)
-    centre = model.bounded(fitted.theta)
+    centre, names = model.bounded(fitted.theta), model.names
     if drawn is None:  # the estimate lies beyond what a detector can have
         drawn = np.tile(centre, (2000, 1))
         drawn[:, fitted.free] = np.random.default_rng(0).multivariate_normal(centre[fitted.free], covariance, 2000)
         drawn = model.bounded(drawn)
-    names = model.names
     k = model.light
     free = {names[i] for i in fitted.free}
     out: dict[str, Estimate] = {}

@@ -280,7 +280,7 @@ class Fit:
         guess: Guess,
         photons: float,
         cells: Cells | None = None,
-        spread: float | None = None,
+        spread: float = Effort.spread,
         more: int = 1,
         times: float = 1.0,
     ) -> Batch:
@@ -288,7 +288,6 @@ class Fit:
         model, theta, root, free = guess
         cells = self.cells(model, theta, photons) if cells is None else cells
         size = self.effort.of(photons, times)
-        spread = self.effort.spread if spread is None else spread
         linear = np.diag(model.scale(theta)[free] ** -2.0)
         precision = np.linalg.inv(spread**2 * photons / size * root @ root.T) + linear
         wide = _root(np.asarray(np.linalg.inv(precision), np.float64))
@@ -331,20 +330,30 @@ class Fit:
             weighed = grown
         return Guess(model, theta, root, free), misfit, near and weighed >= photons
 
-    def shortest(self, guess: Guess) -> tuple[float, float]:
-        """The dead time by the shortest interval alone, and its standard error, by streams as long as the recording.
+    def shortest(self, model: Model, theta: FloatArray) -> tuple[float, float]:
+        """Dead time by the shortest interval alone, and its standard error, by streams as long as the recording.
 
         The fit counts intervals in cells, and does not know where in its cell an interval lies.
         """
-        model, theta, _, _ = guess
         recorded = min(float(np.diff(piece).min()) for piece in self.recording.pieces)
         cycles, number = max(2, round(self.recording.exposure)), 4.0 * self.effort.batch / self.recording.photons
         drawn = [
             float(np.diff(model.streams(theta[None], cycles, self.next_seed()).times).min(initial=np.inf))
             for _ in range(int(np.clip(number, 4, LIGHTS)))
         ]
-        dead = float(theta[model.light + 2]) + recorded - float(np.mean(drawn))
-        return dead, float(np.hypot(np.std(drawn, ddof=1), model.clock.unit_ns))
+        later = recorded - float(np.mean(drawn))
+        return float(theta[model.light + 2]) + later, float(np.hypot(np.std(drawn, ddof=1), model.clock.unit_ns))
+
+    def settled(self, model: Model, theta: FloatArray) -> tuple[float, float]:
+        """That dead time by streams that have it; its error is wider where a shorter one has as long intervals."""
+        at, k = theta.copy(), model.light + 2
+        for _ in range(3):
+            (dead, error), before = self.shortest(model, at), float(at[k])
+            at[k] = dead
+        error = float(np.hypot(error, dead - before))
+        at[k] -= 3.0 * error
+        slope = (self.shortest(model, at)[0] - at[k]) / (3.0 * error)
+        return dead, error / float(np.clip(slope, 0.05, 1.0))
 
     def finish(self, guess: Guess, again: bool = True, known: tuple[float, float] | None = None) -> Fitted:
         """The last estimate, and what fresh streams about it say of its slope, bias, scatter and misfit.
@@ -408,13 +417,12 @@ class Fit:
         fresh = near.residual @ project.T
         fresh = (fresh - fresh.mean(0)) / np.sqrt(near.ratio) * np.sqrt(len(y) / (len(y) - terms.shape[1]))
         rest = project @ (recorded - near.offset)
-        z, p = _misfit(rest, fresh, law, near)
+        (z, p), (dead, scatter) = _misfit(rest, fresh, law, near), self.shortest(model, mean)
         error = float(sd[free == model.light + 2].sum())  # 0 where it is given
-        last = Guess(model, mean, _root(cov), free)
-        shortest = self.shortest(last)
-        early = _extreme(shortest[0] - mean[model.light + 2], shortest[1], error)
+        early = _extreme(dead - mean[model.light + 2], scatter, error)
         if early < FALSE_ALARM and known is None:
-            other = self.finish(last, again=False, known=shortest) if error else None
+            last = Guess(model, mean, _root(cov), free)
+            other = self.finish(last, again=False, known=self.settled(model, mean)) if error else None
             if other is not None and other.converged and other.p_value > FALSE_ALARM:
                 return other
             p = min(p, early)
@@ -451,6 +459,5 @@ def _misfit(rest: FloatArray, fresh: FloatArray, law: Batch, near: Batch) -> tup
     gaps = slice(law.cells.phases, law.cells.phases + law.cells.gap_edges.size)
     enough = np.cumsum(near.offset[gaps]) > _CUMULATED
     departure = np.abs(np.cumsum(rest[gaps])) / (np.cumsum(fresh[:, gaps], axis=1).std(0) * noise**0.5)
-    most = float(departure[enough].max(initial=0.0))
-    late = 2.0 * enough.sum() * float(ndtr(-most))
+    late = 2.0 * enough.sum() * float(ndtr(-departure[enough].max(initial=0.0)))
     return float((mine - drawn.mean()) / drawn.std()), min(1.0, 2.0 * min(square, late))

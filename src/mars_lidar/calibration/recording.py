@@ -135,8 +135,7 @@ def clock_of(t: FloatArray, stream: Timestamps) -> Clock:
             first = locked & (place < 1.0)  # those of the last unit of a period may lie beyond its end
             if first.all():
                 continue
-            angle = np.angle(np.exp(2j * np.pi * place[~first]).mean()) / (2 * np.pi)
-            offset = float(angle % 1.0)
+            offset = float(np.angle(np.exp(2j * np.pi * place[~first]).mean()) / (2 * np.pi) % 1.0)
             last = np.where(first, place + period / unit, place)
             away = np.min([np.abs((at - offset + 0.5) % 1.0 - 0.5) for at in (place, last)], axis=0)
             if float(np.quantile(away, 0.99)) < _ON_GRID:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import tempfile
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,8 @@ from mars_lidar import _core
 
 SIDE = 64
 LEVELS = (10.0, 1.0, 0.1, 0.01)  # mean signal photons per period; SBR 1
-GOAL_SHARE, GOAL_SIZE, GOAL_MEMORY_GIB, GOAL_WORKERS = 0.6, 0.2, 1.5, 1.7
+_SUMS = "the SHA-256 of its files alone"
+GOAL_SHARE, GOAL_SIZE, GOAL_MEMORY_GIB, GOAL_WORKERS, GOAL_SUMS = 0.6, 0.2, 1.5, 1.7, 0.03
 _CODECS: dict[str, Any] = {
     "blosc lz4-5 bitshuffle": Blosc("lz4", 5, Blosc.BITSHUFFLE),
     "blosc zstd-1 bitshuffle": Blosc("zstd", 1, Blosc.BITSHUFFLE),
@@ -139,6 +141,9 @@ def epochs(config: Config, bandwidth: Bandwidth) -> Section:
                 opened = StoredDataset(store, batch_size=batch)
                 cases[f"{layout}, first epoch"] = lambda s=store: sum(1 for _ in StoredDataset(s, batch_size=batch))
                 cases[f"{layout}, later epochs"] = lambda d=opened: sum(1 for _ in d)
+                cases[f"{layout}, {_SUMS}"] = lambda s=store: [
+                    sha256(file.read_bytes()).digest() for file in s.rglob("*") if file.is_file()
+                ]
                 examples = StoredDataset(store)
                 if layout == "sparse":
                     cases["sparse, examples that the loader collates"] = lambda d=examples: sum(
@@ -154,6 +159,9 @@ def epochs(config: Config, bandwidth: Bandwidth) -> Section:
             section.rows += [{"S": level, "epoch": name, "cubes per CPU s": rate} for name, rate in rates.items()]
             read, made = rates["sparse, later epochs"], rates["simulated (CubeStream)"]
             section.goals.append(Goal(f"sparse over simulated, S = {level:g}", read / made, 1.0, "", True))
+            for layout in ("sparse", "dense"):
+                share = rates[f"{layout}, first epoch"] / rates[f"{layout}, {_SUMS}"]
+                section.goals.append(Goal(f"{layout}, SHA-256 of a first epoch, S = {level:g}", share, GOAL_SUMS, ""))
             if level == 1.0:
                 section.goals.append(Goal("sparse cubes per CPU s, S = 1", read, 60.0, "", True))
     return section

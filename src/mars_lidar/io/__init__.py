@@ -5,6 +5,7 @@ Every library is imported when its format is first used.
 
 from mars_lidar._base.files import IncompleteFileError, Interrupted, WriteError
 from mars_lidar._base.imports import MissingLibraryError
+from mars_lidar.io import maps as maps
 from mars_lidar.io.capture import save_capture
 from mars_lidar.io.cloud import points, save_cloud
 from mars_lidar.io.conversion import Converted, convert, photons

@@ -311,11 +311,13 @@ def _wrap_pictures(app: Sphinx, doctree: nodes.document) -> None:
 
 
 def _mark_long_cells(app: Sphinx, doctree: nodes.document) -> None:
-    """Marks cells of much text, which are wider than their longest word also where the table is wider than the page."""
+    """Marks cells of much text, which wide tables would squeeze, and figures, which stay beside their unit."""
     for entry in doctree.findall(nodes.entry):
-        length = len(entry.astext())
-        if length > 25:
-            entry["classes"].append("long" if length > 90 else "middling")
+        text = entry.astext()
+        if len(text) > 25:
+            entry["classes"].append("long" if len(text) > 90 else "middling")
+        elif len(text) < 14 and re.search(r"\d", text):
+            entry["classes"].append("figure-cell")
 
 
 def _drop_private_bases(app: Sphinx, doctree: nodes.document) -> None:

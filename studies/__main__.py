@@ -44,7 +44,7 @@ def _parser(command: str) -> argparse.ArgumentParser:
         "size of the study 'downstream': some five minutes of one core, or some twenty "
         "(default: %(default)s); with --quick a tiny one, seconds"
     )
-    add("--config", choices=("small", "full"), default="small", help=words)
+    add("--config", choices=("small", "full", "held-out"), default="small", help=words)
     add("--seed", type=int, metavar="N", help="another sweep (studies 'domain', 'long-exposures')")
     add("--systems", type=int, metavar="N", help="systems of a sweep (studies 'domain', 'long-exposures')")
     words = "folder of RGB-D pairs, NAME_depth.png and NAME_colors.png or Middlebury folders (study 'image')"

@@ -73,6 +73,35 @@ def test_no_dead_time_is_poisson_at_any_length():
     require({"bins": float(stats.chi2.sf(z @ z, z.size))}, "feedback, no dead time")
 
 
+VARIANCES = {  # S, B, delay, t_d, sigma (ns of 100), cycles, bins, start; they were 1.15 to 8 times too large
+    "bright background": (0.0, 100.9, 86.3, 7.98, 9.7, 23_394, 24, "armed"),
+    "two bins": (0.03, 40.9, 99.9, 52.743, 0.49, 1_530, 2, "armed"),
+    "whole period, narrow pulse": (2.89, 2e-6, 53.77, 100.0, 0.063, 15_476, 64, "armed"),
+    "whole period, narrower than any bin": (2.9, 0.05, 53.77, 100.0, 0.006, 30_000, 16, "armed"),
+    "constant light, nearly three periods": (0.0, 4.08, 0.0, 299.944, 0.05, 9_975_432, 4, "stationary"),
+}
+
+
+@pytest.mark.parametrize("name", VARIANCES)
+def test_the_count_has_the_variance_of_its_law(name):
+    """4,000 exposures: 2.2 % is one standard error of the variance, 4.5 of them fail (7e-6)."""
+    signal, background, delay, dead, sigma, cycles, bins, start = VARIANCES[name]
+    system = System(
+        period_ns=100.0,
+        cycles=cycles,
+        bins=bins,
+        pulse=ml.GaussianPulse(sigma_ns=sigma),
+        detector=Detector(dead_time_ns=dead),
+        start=start,
+    )
+    flux = ml.Flux(signal, background, delay)
+    report: dict[str, float] = {}
+    cube = ml.simulate(flux, system, engine="feedback", realizations=4_000, seed=5, report=report)
+    assert report["pixels given to exact"] == 0
+    variance = float(np.ravel(ml.count_law(flux, system).variance)[0])
+    assert abs(cube.sum(-1).var(ddof=1) / variance - 1.0) < 4.5 * (2.0 / 4_000) ** 0.5
+
+
 def off(request: Case, kinds: NDArray[np.uint8]) -> float:
     """Distance of a grid's mean histogram from that of one of half its cells' width."""
     check = Check.of(task_of(request, 1, realizations=1), np.arange(1), kinds)

@@ -1,6 +1,7 @@
-"""The internal grid of the feedback engine: bins are cut until the mean histogram is that of a finer grid.
+"""The internal grid of the feedback engine: bins are cut until its law is that of a finer grid.
 
-No rule on the shape of the light: a grid is judged by what it does to the mean, native/feedback/check.h.
+No rule on the shape of the light: a grid is judged by what it does to the mean histogram and to the variance of the
+count, native/feedback/check.h.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from mars_lidar._base.native import _core
 from mars_lidar._base.types import FloatArray, IndexArray
 from mars_lidar.engines.engine import Task
 from mars_lidar.engines.tolerances import TOLERANCES
+from mars_lidar.instrument.pulse import GaussianPulse, SampledPulse
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 
@@ -63,11 +65,12 @@ class Grids:
 
         sharing = np.flatnonzero(~alone)
         corners, which = _corners_of(task.flux, pixels[sharing])
-        known = _corner_grids(task, corners, start)
+        known = _corner_grids(task, corners, _around_the_pulse(task.system, start))
         for number, corner in enumerate(corners):
             put(sharing[which == number], *known[corner])
         some = np.flatnonzero(alone)  # judged together: neighbours in background need about as many sweeps
         some = some[np.argsort(task.flux.background.reshape(-1)[pixels[some]], kind="stable")]
+        start = resolving(task.system, start, _structure(task.system, task.flux), slice(None))
         halvings, sweeps, armed = _even_halvings(task, pixels[some], start)
         for k in np.unique(halvings):
             at = halvings == k
@@ -121,37 +124,90 @@ def coarsest(system: System) -> KindArray:
     return np.full(system.bins, least_power(1, short, 0, TOLERANCES.halvings), np.uint8)
 
 
+def resolving(system: System, kinds: KindArray, structure: float, bins: IndexArray | slice) -> KindArray:
+    """A grid whose cells in some `bins` are narrow enough for the distance to a finer grid to tell anything.
+
+    Where the dead time is nearly whole periods, what registers in a cell re-arms in the same cell, and both grids are
+    wrong alike until cells are narrower than the light's `structure` (periods), or than what the dead time is off.
+    """
+    dead = system.dead_time_periods
+    widest = 0.5 * max(structure, abs(math.remainder(dead, 1.0)))
+    if dead == 0.0:
+        return kinds
+    out = kinds.copy()
+    least = least_power(1, 1.0 / max(widest * system.bins, 1e-30), 0, TOLERANCES.halvings)
+    out[bins] = np.maximum(out[bins], least.astype(np.uint8))
+    return out
+
+
 class Check(NamedTuple):
-    """What is known of a grid for some pixels (n,): see `Grids`; `parts` (n, bins) of the squared distances."""
+    """What is known of a grid for some pixels (n,): see `Grids`.
+
+    `distance` of the mean and `spread`, of the variance (0 where it is not judged); `parts` (n, bins) of their squares.
+    """
 
     distance: FloatArray
+    spread: FloatArray
     sweeps: IndexArray
     armed: FloatArray
     parts: FloatArray
 
     @classmethod
-    def of(cls, task: Task, pixels: IndexArray, kinds: KindArray, *, parts: bool = False) -> Check:
+    def of(
+        cls, task: Task, pixels: IndexArray, kinds: KindArray, *, variance: bool = True, parts: bool = False
+    ) -> Check:
         """Judge a grid; `parts` (0, bins) where they are not wanted."""
         both, sweeps = np.empty((2, pixels.size)), np.empty(pixels.size, np.int32)
-        bins = np.empty((pixels.size if parts else 0, task.system.bins))
+        spread, bins = (
+            np.empty(pixels.size if variance else 0),
+            np.empty((pixels.size if parts else 0, task.system.bins)),
+        )
         _core.feedback_check(
-            task.job, task.pulse, np.ascontiguousarray(pixels), kinds, both, sweeps, bins, task.threads
+            task.job, task.pulse, np.ascontiguousarray(pixels), kinds, both, sweeps, spread, bins, task.threads
         )
         limit = TOLERANCES.richardson
-        return cls(limit * both[0], sweeps.astype(np.int64), both[1], limit**2 * bins)
+        spread = spread if variance else np.zeros(pixels.size)
+        return cls(limit * both[0], limit * spread, sweeps.astype(np.int64), both[1], limit**2 * bins)
+
+    @property
+    def of_law(self) -> FloatArray:
+        """Both distances as one (n,)."""
+        return np.hypot(self.distance, self.spread)
+
+
+def _structure(system: System, flux: Flux | None = None) -> float:
+    """Width of the finest structure of the light, periods: of a part of a waveform, or of the pulse."""
+    if flux is not None and flux.waveform is not None:
+        return 1.0 / flux.waveform.shape[-1]
+    pulse = system.pulse
+    if isinstance(pulse, GaussianPulse):
+        return pulse.sigma_ns / system.period_ns
+    return pulse.bin_ns / system.period_ns if isinstance(pulse, SampledPulse) else 0.0
+
+
+def _around_the_pulse(system: System, kinds: KindArray) -> KindArray:
+    """A grid that resolves the pulse of a return in the middle bin."""
+    low, high = (math.floor(edge / system.bin_ns) for edge in system.pulse.support_ns())
+    lit = (system.bins // 2 + np.arange(low, min(high + 2, low + system.bins))) % system.bins
+    return resolving(system, kinds, _structure(system), lit)
 
 
 def _even_halvings(task: Task, pixels: IndexArray, start: KindArray) -> tuple[IndexArray, IndexArray, FloatArray]:
     """How often all cells of each pixel (n,) must be halved, -1 where that is too often; sweeps, fewest armed (n,)."""
     halvings, sweeps = np.zeros(pixels.size, np.int64), np.zeros(pixels.size, np.int64)
-    armed = np.zeros(pixels.size)
+    armed, unlike = np.zeros(pixels.size), np.ones(pixels.size, np.bool_)
     most = (TOLERANCES.cells // cells_of(start)).bit_length() - 1
     open_ = np.arange(pixels.size)
     while open_.size:
         rest = []
         for k in np.unique(halvings[open_]):
             at = open_[halvings[open_] == k]
-            distance, sweeps[at], armed[at], _ = Check.of(task, pixels[at], np.asarray(start + k, np.uint8))
+            distance = np.zeros(at.size)
+            for judged in np.unique(unlike[at]):  # a variance that is right on a grid is so on a finer one
+                some = unlike[at] == judged
+                check = Check.of(task, pixels[at[some]], np.asarray(start + k, np.uint8), variance=bool(judged))
+                distance[some], sweeps[at[some]], armed[at[some]] = check.of_law, check.sweeps, check.armed
+                unlike[at[some]] = check.spread > TOLERANCES.mean_distance
             far = (distance > TOLERANCES.mean_distance) & (sweeps[at] <= TOLERANCES.mean_sweeps)
             # distances fall with the square of the width; whether so many halvings do is judged in the next round
             ratio = distance[far] / TOLERANCES.mean_distance
@@ -229,7 +285,7 @@ def _refined(task: Task, corners: list[Corner], start: KindArray) -> Known:
             for k, corner in enumerate(members):
                 own = slice(k * each, (k + 1) * each)
                 settled = checks.sweeps[own] <= TOLERANCES.mean_sweeps
-                distance, parts = checks.distance[own][settled], checks.parts[own][settled]
+                distance, parts = checks.of_law[own][settled], checks.parts[own][settled]
                 fine = not settled.any() or distance.max() <= TOLERANCES.mean_distance
                 grid = CornerGrid(kinds, int(np.median(checks.sweeps[own])), float(np.median(checks.armed[own])))
                 if fine:

@@ -1,4 +1,5 @@
-// How far the mean histogram of an internal grid is from the true one, and which bins it owes that to.
+// How far the mean histogram of an internal grid and the variance of its count are from the true ones, and which bins they
+// owe that to.
 //
 // The mean w of a grid twice as fine, put into the equations of the grid itself, leaves in each of its cells a residual
 //     r_j = w_j - p_j (1 - (C_j - RA_j)) - q_j (RA_{j+1} - RA_j),
@@ -8,8 +9,21 @@
 //     D^2 = N_r / (1 + K sum w) sum_j r_j^2 / (v_j + |r_j|)
 // is the squared Mahalanobis distance of the two means: no linear function of the histogram, a bin, a window or the
 // count, has a mean further than D of its standard deviations from the finer grid's. |r_j| is there for cells of a fraction of a
-// count. Everything is second order in the width of cells: of the distance to the true mean, three quarters.
+// count.
+//
+// The mean may be right where the law is not: in constant light it is so on any grid. What a wide cell loses is at which
+// phase of it an exposure registered, and the spread of these phases from dead time to dead time is what the count's
+// variance is made of. That of a grid is
+//     Var N = sum_j y_j^2 v_j + sum over cells c of w_c Var G_c(u),   y = A'^-1 1,
+// with G_c(u) the sum of y_e (p_e - q_e) + y_{e-1} q_{e-1} over the edges e whose instant one dead time before lies in the
+// cell c after u, which is even over the cell (docs/feedback.md). Of both grids, at the mean of the finer one, it gives
+//     V = kVariance (Var N - Var N') / (Var N' + 1),  Var N' of the finer grid: a count is a whole number.
+// Everything is second order in the width of cells: of the distances to the true law, three quarters.
 #pragma once
+#include <cmath>
+#include <utility>
+#include <vector>
+
 #include "feedback/laws.h"
 #include "laws/exposure_numbers.h"
 
@@ -49,6 +63,38 @@ struct FineRates {
     }
 };
 
+// p and q of a grid whose cells are two each of a finer one.
+struct CoarseRates {
+    double *fires, *refires;  // (n, kJudged)
+
+    CoarseRates(const FineRates& fine, int32_t cells, double*& memory)
+        : fires(memory), refires(memory + static_cast<int64_t>(cells) * kJudged) {
+        memory += 2 * static_cast<int64_t>(cells) * kJudged;
+        for (int32_t j = 0; j < cells; ++j) {
+            const double *light0 = fine.photons(2 * j), *light1 = fine.photons(2 * j + 1);
+            const double *fire0 = fine.fire(2 * j), *fire1 = fine.fire(2 * j + 1);
+            double *p = fires + static_cast<int64_t>(j) * kJudged, *q = refires + static_cast<int64_t>(j) * kJudged;
+            for (int i = 0; i < kJudged; ++i) {
+                const double l = light0[i] + light1[i];
+                const double series = l * (0.5 - l * (1.0 / 6 - l * (1.0 / 24 - l * (1.0 / 120 - l * (1.0 / 720)))));
+                p[i] = fire0[i] + fire1[i] - fire0[i] * fire1[i];
+                q[i] = l < 0.02 ? series : 1.0 - p[i] / l;
+            }
+        }
+    }
+    const double* fire(int32_t j) const { return fires + static_cast<int64_t>(j) * kJudged; }
+    const double* refire(int32_t j) const { return refires + static_cast<int64_t>(j) * kJudged; }
+};
+
+// Those of the finer grid, or of the other.
+struct EitherRates {
+    const FineRates* fine;
+    const CoarseRates* coarse;
+
+    const double* fire(int32_t j) const { return fine ? fine->fire(j) : coarse->fire(j); }
+    const double* refire(int32_t j) const { return fine ? fine->refire(j) : coarse->refire(j); }
+};
+
 // The judged pixels' doubles in vectors, so that those of a cell stay in registers for the next.
 constexpr int kVectors = kJudged / kReals;
 struct Judged {
@@ -73,16 +119,13 @@ struct Residual {
     alignas(64) double square[kJudged];                             // r^2 / (v + |r|)
     alignas(64) double own[kJudged], begin[kJudged], end[kJudged];  // its parts: light in the cell, RA at either edge
 
-    // Of both grids: RA at the cell's edges. `fire`, `light` of the two finer cells.
-    MARS_NOINLINE void set(const double* __restrict__ fire0, const double* __restrict__ fire1,
-                           const double* __restrict__ light0, const double* __restrict__ light1,
+    // `re`, `then`: RA at the cell's edges; `off`, `next_off`: that of its grid less that of the finer one.
+    MARS_NOINLINE void set(const double* __restrict__ fire, const double* __restrict__ refire,
                            const double* __restrict__ from, const double* __restrict__ to,
                            const double* __restrict__ re, const double* __restrict__ then,
                            const double* __restrict__ off, const double* __restrict__ next_off) {
         for (int i = 0; i < kJudged; ++i) {
-            const double l = light0[i] + light1[i], p = fire0[i] + fire1[i] - fire0[i] * fire1[i];
-            const double series = l * (0.5 - l * (1.0 / 6 - l * (1.0 / 24 - l * (1.0 / 120 - l * (1.0 / 720)))));
-            const double q = l < 0.02 ? series : 1.0 - p / l;
+            const double p = fire[i], q = refire[i];
             const double some = 1.0 - (from[i] - re[i]), more = then[i] - re[i];
             const double armed = some > 0.0 ? some : 0.0, in = more > 0.0 ? more : 0.0;
             const double inside = to[i] - from[i] - p * some - q * more;
@@ -100,17 +143,27 @@ struct Residual {
 class GridCheck {
  public:
     explicit GridCheck(const FeedbackCheck& check)
-        : check_(check), fine_(*check.fine), memory_(check.memory), rates_(check, memory_), sums_(memory_) {}
+        : check_(check),
+          fine_(*check.fine),
+          memory_(check.memory),
+          rates_(check, memory_),
+          coarse_(rates_, check.coarse->cells, memory_),
+          sums_(memory_),
+          adjoint_(memory_ + (static_cast<int64_t>(fine_.cells) + 1) * kJudged) {}
 
     void run() {
         solve();
         judge();
+        if (check_.spread) judge_variance();
     }
 
  private:
     static constexpr int kSweeps = 200;
     static constexpr double kStill = 4e-4;  // D^2 by the last sweep's move at most
     static constexpr double kRounding = 1e-13;
+    static constexpr double kVariance =
+        2.0;  // a variance that is 2.5 % off counts as a mean that is 0.05 deviations off
+    static constexpr double kStillAdjoint = 1e-3;  // move of y, of about 1
 
     double* row(int32_t j) const { return sums_ + static_cast<int64_t>(j) * kJudged; }
 
@@ -216,8 +269,7 @@ class GridCheck {
         for (int32_t j = 0; j < grid.cells; ++j) {
             while (grid.bin_cell[bin + 1] <= j) ++bin;
             at_edge(j + 1, then, next_off);
-            residual.set(rates_.fire(2 * j), rates_.fire(2 * j + 1), rates_.photons(2 * j), rates_.photons(2 * j + 1),
-                         row(2 * j), row(2 * j + 2), re, then, off, next_off);
+            residual.set(coarse_.fire(j), coarse_.refire(j), row(2 * j), row(2 * j + 2), re, then, off, next_off);
             for (int i = 0; i < kJudged; ++i) check_.square[i] += scale[i] * residual.square[i];
             if (check_.bins) {
                 add(bin, scale, residual.own);
@@ -231,8 +283,110 @@ class GridCheck {
         }
     }
 
-    int32_t bin_of(int32_t cell) const {
-        const int32_t bin = static_cast<int32_t>(check_.coarse->place[cell] * fine_.bins + 1e-6);
+    // V, and the bins' parts of its square: by what each adds to the two variances.
+    void judge_variance() {
+        const int64_t bins = fine_.bins;
+        std::vector<double> parts(static_cast<size_t>(2 * bins * kJudged), 0.0);
+        add_variance(*check_.coarse, {nullptr, &coarse_}, 2, parts.data());
+        add_variance(fine_, {&rates_, nullptr}, 1, parts.data() + bins * kJudged);
+        for (int i = 0; i < kJudged; ++i) {
+            double some = 0.0, fine = 0.0, apart = 0.0;
+            auto of = [&](int64_t grid, int64_t b) {
+                return parts[static_cast<size_t>((grid * bins + b) * kJudged + i)];
+            };
+            for (int64_t b = 0; b < bins; ++b) {
+                some += of(0, b);
+                fine += of(1, b);
+                apart += std::fabs(of(0, b) - of(1, b));
+            }
+            const double share = 1.0 / (1.0 + fine_.whole * row(fine_.cells)[i]);
+            const double scale = check_.exposures * share * share * share;
+            const double off = kVariance * scale * (some - fine) / (scale * fine + 1.0);
+            check_.spread[i] = off;
+            for (int64_t b = 0; check_.bins && apart > 0.0 && b < bins; ++b)
+                check_.bins[b * kJudged + i] += off * off * std::fabs(of(0, b) - of(1, b)) / apart;
+        }
+    }
+
+    // Adds to each bin (bins, kJudged) what its cells contribute to the variance of the count on a grid, per exposure and at
+    // K = 0. A cell of the grid is `each` cells of the finer one, whose mean is used.
+    MARS_NOINLINE void add_variance(const FeedbackGrid& grid, const EitherRates rates, int32_t each, double* parts) {
+        const int32_t n = grid.cells;
+        const int64_t rows = (static_cast<int64_t>(fine_.cells) + 1) * kJudged;
+        double *const y = adjoint_, *old = y + rows, *fresh = old + rows;
+        if (each == 2) {
+            for (int64_t k = 0; k < static_cast<int64_t>(n) * kJudged; ++k) y[k] = 1.0;
+        } else {  // begin with those of the grid whose cells are twice as wide
+            for (int64_t j = n - 1; j > 0; --j) memcpy(y + j * kJudged, y + j / 2 * kJudged, kJudged * sizeof(double));
+        }
+        for (int i = 0; i < kJudged; ++i) old[static_cast<int64_t>(n) * kJudged + i] = 0.0;
+        for (int32_t j = n - 1; j >= 0; --j) {
+            const int64_t at = static_cast<int64_t>(j) * kJudged;
+            const double* p = rates.fire(j);
+            for (int i = 0; i < kJudged; ++i) old[at + i] = old[at + kJudged + i] + p[i] * y[at + i];
+        }
+        sources_.resize(static_cast<size_t>(3 * n));
+        for (int32_t e = 0; e < 3 * n; ++e) {
+            const int32_t turns = e / n;
+            const FeedbackEdge& edge = grid.edge[e - turns * n];
+            sources_[static_cast<size_t>(e)] = edge.early + (turns - edge.turns) * n;
+        }
+        const auto source = [at = sources_.data()](int32_t e) { return at[e]; };
+        alignas(64) double moved[kJudged];
+        for (int sweep = 0; sweep < kSweeps; ++sweep) {
+            adjoint_sweep<double, kJudged, kJudged>(grid, rates, source, old, fresh, y, moved);
+            std::swap(old, fresh);
+            double most = 0.0;
+            for (int i = 0; i < kJudged; ++i)
+                if (check_.sweeps[i] <= kSweeps && moved[i] > most) most = moved[i];
+            if (most <= kStillAdjoint) break;
+        }
+        auto value = [&](int32_t j) { return y + static_cast<int64_t>(j) * kJudged; };
+        alignas(64) double re[kJudged], then[kJudged];
+        rearmed(0, re);
+        int32_t bin = 0;
+        for (int32_t j = 0; j < n; ++j) {  // the registrations of each cell, given the past
+            while (grid.bin_cell[bin + 1] <= j) ++bin;
+            rearmed(each * (j + 1), then);
+            const double *p = rates.fire(j), *q = rates.refire(j), *from = row(each * j), *here = value(j);
+            double* const to = parts + static_cast<int64_t>(bin) * kJudged;
+            for (int i = 0; i < kJudged; ++i) {
+                const double some = 1.0 - (from[i] - re[i]), more = then[i] - re[i];
+                const double armed = some > 0.0 ? some : 0.0, in = more > 0.0 ? more : 0.0;
+                to[i] += here[i] * here[i] * (p[i] * (1.0 - p[i]) * armed + q[i] * (1.0 - q[i]) * in);
+                re[i] = then[i];
+            }
+        }
+        // where within a cell they were: edges in order, those of one cell of registration together
+        alignas(64) double sum[kJudged] = {}, square[kJudged] = {};
+        int32_t first = 1;
+        while (first < n && grid.edge[first].early == grid.edge[0].early) ++first;
+        for (int32_t k = 0; k < n; ++k) {
+            const int32_t e = first + k <= n ? first + k : first + k - n, here = e < n ? e : 0;
+            const FeedbackEdge& edge = grid.edge[e];
+            const double until = 1.0 - static_cast<double>(edge.part);
+            const double *p = rates.fire(here), *q = rates.refire(here), *q_ahead = rates.refire(e - 1);
+            const double *y_here = value(here), *y_ahead = value(e - 1);
+            for (int i = 0; i < kJudged; ++i) {
+                const double g = y_here[i] * (p[i] - q[i]) + y_ahead[i] * q_ahead[i];
+                square[i] += g * (2.0 * sum[i] + g * until);
+                sum[i] += g * until;
+            }
+            const int32_t next = e < n ? e + 1 : 1;
+            if (k + 1 < n && grid.edge[next].early == edge.early) continue;
+            const double *from = row(each * edge.early), *to = row(each * (edge.early + 1));
+            double* const part = parts + static_cast<int64_t>(bin_in(grid, edge.early)) * kJudged;
+            for (int i = 0; i < kJudged; ++i) {
+                const double spread = square[i] - sum[i] * sum[i];
+                part[i] += (to[i] - from[i]) * (spread > 0.0 ? spread : 0.0);
+                sum[i] = square[i] = 0.0;
+            }
+        }
+    }
+
+    int32_t bin_of(int32_t cell) const { return bin_in(*check_.coarse, cell); }
+    int32_t bin_in(const FeedbackGrid& grid, int32_t cell) const {
+        const int32_t bin = static_cast<int32_t>(grid.place[cell] * fine_.bins + 1e-6);
         return bin < fine_.bins ? bin : fine_.bins - 1;
     }
     void add(int32_t bin, const double* scale, const double* part) const {
@@ -244,7 +398,10 @@ class GridCheck {
     const FeedbackGrid& fine_;
     double* memory_;
     const FineRates rates_;
+    const CoarseRates coarse_;
     double* const sums_;
+    double* const adjoint_;
+    std::vector<int32_t> sources_;  // cell one dead time before each edge of three periods
 };
 
 }  // namespace

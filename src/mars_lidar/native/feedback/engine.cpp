@@ -52,7 +52,7 @@ void feedback_check(const Job& job, const PulseTable& pulse, const FeedbackCheck
         const PhotonsOf<kJudged> photons(job, energy.energy, fine.grid, pixel, lit_photons, kJudged);
         const int64_t room = feedback_check_doubles(fine.grid.cells, photons.lit_end - photons.lit_begin);
         parts.assign(call.bins ? static_cast<size_t>(bins) * kJudged : 0, 0.0);
-        double square[kJudged], armed[kJudged];
+        double square[kJudged], spread[kJudged], armed[kJudged];
         int32_t sweeps[kJudged];
         FeedbackCheck check{};
         check.coarse = &coarse.grid;
@@ -64,6 +64,7 @@ void feedback_check(const Job& job, const PulseTable& pulse, const FeedbackCheck
         check.exposures = job.cycles;
         check.memory = memory.of(room);
         check.square = square;
+        check.spread = call.spread ? spread : nullptr;
         check.sweeps = sweeps;
         check.armed = armed;
         check.bins = call.bins ? parts.data() : nullptr;
@@ -72,6 +73,7 @@ void feedback_check(const Job& job, const PulseTable& pulse, const FeedbackCheck
             call.distance[first + i] = std::sqrt(square[i]);
             call.sweeps[first + i] = sweeps[i];
             call.armed[first + i] = armed[i];
+            if (call.spread) call.spread[first + i] = std::fabs(spread[i]);
             for (int64_t b = 0; call.bins && b < bins; ++b)
                 call.bins[(first + i) * bins + b] = parts[static_cast<size_t>(b * kJudged + i)];
         }

@@ -39,6 +39,7 @@ struct FeedbackCheckCall {
     double* distance;
     int32_t* sweeps;
     double* armed;
+    double* spread;
     double* bins;
 };
 void feedback_check(const Job& job, const PulseTable& pulse, const FeedbackCheckCall& call, int threads);

@@ -111,7 +111,7 @@ inline int64_t feedback_bytes(int64_t cells, int64_t laps, int64_t lit) {
 // Pixels that are judged together: few, so that their rows of doubles stay in the second-level cache.
 constexpr int kJudged = 8;
 
-// A batch of pixels whose mean on a grid is judged by a grid of half its cells' width (feedback/check.h).
+// A batch of pixels whose law on a grid is judged by a grid of half its cells' width (feedback/check.h).
 struct FeedbackCheck {
     const FeedbackGrid *coarse, *fine;
     const double* dark_photons;  // (kKinds, kJudged) ...
@@ -120,13 +120,14 @@ struct FeedbackCheck {
     double exposures;           // N_r
     double* memory;             // `feedback_check_doubles` of scratch
     double* square;             // (kJudged): D^2
+    double* spread;             // (kJudged): V; or null: it is not wanted
     int32_t* sweeps;            // (kJudged): until the mean was settled, 201 where it was not
     double* armed;              // (kJudged): the fewest exposures armed in any cell
-    double* bins;               // (bins, kJudged): parts of D^2 that narrower cells would lessen, 0 at first; or null
+    double* bins;  // (bins, kJudged): parts of D^2 + V^2 that narrower cells would lessen, 0 at first; or null
 };
 
 inline int64_t feedback_check_doubles(int64_t cells, int64_t lit) {
-    return (2 * kKinds + 2 * lit + cells + 1) * kJudged;
+    return (2 * kKinds + 2 * lit + cells + 1 + cells + 3 * (cells + 1)) * kJudged;
 }
 
 #if !defined(__CUDACC_RTC__)

@@ -160,40 +160,42 @@ MARS_NOINLINE void place_rearmed(const FeedbackGrid& grid, const float* sums, co
 //     y_j = 1 - sum over j < i < e0 of p_i y_i + q y at e0 - 1 + sum over those e of (1 - f_e) (p_e y_e - q_e y_e +
 //           q_{e-1} y_{e-1}).
 // `old`, `fresh`: suffix sums of p y (n + 1 rows); `values`: y, replaced in place. `moved`: the largest change of y.
-MARS_NOINLINE void adjoint_sweep(const FeedbackGrid& grid, const Rates& rates, const float* __restrict__ old,
-                                 float* __restrict__ fresh, float* __restrict__ values, float* __restrict__ moved) {
+// `source(e)`: cell one dead time before edge e, which is counted on through three periods.
+template <class Number, int lanes, int stride, class AnyRates, class Source>
+MARS_NOINLINE void adjoint_sweep(const FeedbackGrid& grid, const AnyRates& rates, const Source& source,
+                                 const Number* __restrict__ old, Number* __restrict__ fresh,
+                                 Number* __restrict__ values, Number* __restrict__ moved) {
     const int32_t n = grid.cells;
-    alignas(64) float total[kTeam], sum[kTeam], y[kTeam];
-    for (int i = 0; i < kTeam; ++i) {
+    alignas(64) Number total[lanes], sum[lanes], y[lanes];
+    for (int i = 0; i < lanes; ++i) {
         total[i] = old[i];
-        sum[i] = moved[i] = 0.0f;
-        fresh[static_cast<int64_t>(n) * kRow + i] = 0.0f;
+        sum[i] = moved[i] = 0;
+        fresh[static_cast<int64_t>(n) * stride + i] = 0;
     }
-    auto row = [](auto* rows, int32_t j) { return rows + static_cast<int64_t>(j) * kRow; };
-    auto source = [&](int32_t e) {  // cell one dead time before edge e, e counted on through the periods
-        const int32_t turns = e / n;
-        const FeedbackEdge& edge = grid.edge[e - turns * n];
-        return edge.early + (turns - edge.turns) * n;
+    auto row = [](auto* rows, int32_t j) { return rows + static_cast<int64_t>(j) * stride; };
+    auto within = [n](int32_t e) {  // the period
+        while (e >= n) e -= n;
+        return e;
     };
     int32_t all = 3 * n;  // e0
     for (int32_t j = n - 1; j >= 0; --j) {
         while (source(all - 1) > j) --all;
-        const int32_t turns = all > n ? (all > 2 * n ? 2 : 1) : 0, last = (all - 1) % n;
-        const float* beyond = turns ? row(old, all - turns * n) : row(fresh, all);
-        const float *q = rates.refire(last), *y_last = row(values, last);
-        for (int i = 0; i < kTeam; ++i)
-            y[i] = 1.0f - (sum[i] - (beyond[i] - static_cast<float>(turns) * total[i])) + q[i] * y_last[i];
+        const int32_t turns = all > n ? (all > 2 * n ? 2 : 1) : 0, last = within(all - 1);
+        const Number* beyond = turns ? row(old, all - turns * n) : row(fresh, all);
+        const Number *q = rates.refire(last), *y_last = row(values, last);
+        for (int i = 0; i < lanes; ++i)
+            y[i] = 1 - (sum[i] - (beyond[i] - static_cast<Number>(turns) * total[i])) + q[i] * y_last[i];
         for (int32_t e = all - 1; source(e) == j; --e) {
-            const int32_t here = e % n, ahead = (e - 1) % n;
-            const float keep = 1.0f - grid.edge[here].part;
-            const float *p = rates.fire(here), *q_here = rates.refire(here), *q_ahead = rates.refire(ahead);
-            const float *y_here = row(values, here), *y_ahead = row(values, ahead);
-            for (int i = 0; i < kTeam; ++i) y[i] += keep * ((p[i] - q_here[i]) * y_here[i] + q_ahead[i] * y_ahead[i]);
+            const int32_t here = within(e), ahead = within(e - 1);
+            const Number keep = 1.0f - grid.edge[here].part;
+            const Number *p = rates.fire(here), *q_here = rates.refire(here), *q_ahead = rates.refire(ahead);
+            const Number *y_here = row(values, here), *y_ahead = row(values, ahead);
+            for (int i = 0; i < lanes; ++i) y[i] += keep * ((p[i] - q_here[i]) * y_here[i] + q_ahead[i] * y_ahead[i]);
         }
-        const float* p = rates.fire(j);
-        float *value = row(values, j), *after = row(fresh, j);
-        for (int i = 0; i < kTeam; ++i) {
-            const float step = y[i] > value[i] ? y[i] - value[i] : value[i] - y[i];
+        const Number* p = rates.fire(j);
+        Number *value = row(values, j), *after = row(fresh, j);
+        for (int i = 0; i < lanes; ++i) {
+            const Number step = y[i] > value[i] ? y[i] - value[i] : value[i] - y[i];
             moved[i] = step > moved[i] ? step : moved[i];
             value[i] = y[i];
             sum[i] += p[i] * y[i];
@@ -219,8 +221,13 @@ MARS_NOINLINE void count_variance(const FeedbackGrid& grid, const Rates& rates, 
             values[at] = 1.0f;
             old[at] = old[at + kRow] + rates.fire(j)[i];
         }
+    const auto source = [&](int32_t e) {
+        const int32_t turns = e / n;
+        const FeedbackEdge& edge = grid.edge[e - turns * n];
+        return edge.early + (turns - edge.turns) * n;
+    };
     for (int sweep = 1; sweep <= sweeps; ++sweep) {
-        adjoint_sweep(grid, rates, old, fresh, values, moved);
+        adjoint_sweep<float, kTeam, kRow>(grid, rates, source, old, fresh, values, moved);
         std::swap(old, fresh);
         bool some = false;
         for (int i = 0; i < kTeam; ++i) {

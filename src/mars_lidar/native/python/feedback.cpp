@@ -41,13 +41,14 @@ void histogram(const BoundJob& job, const PulseTable& pulse, Matrix<Count> out, 
 }
 
 void judge(const BoundJob& job, const PulseTable& pulse, Vector<const int64_t> pixels, Vector<const uint8_t> kinds,
-           nb::ndarray<double, nb::ndim<2>, nb::c_contig> distance_armed, Vector<int32_t> sweeps,
+           nb::ndarray<double, nb::ndim<2>, nb::c_contig> distance_armed, Vector<int32_t> sweeps, Vector<double> spread,
            nb::ndarray<double, nb::ndim<2>, nb::c_contig> bins, int threads) {
     check_pixels(job, pixels);
     if (size_of(kinds) != job.bins) throw nb::value_error("kinds must be (bins)");
     const int64_t number = size_of(pixels), wanted = static_cast<int64_t>(bins.shape(0));
     expect("distance_armed must be (2, pixels)", {2, number}, distance_armed);
     expect("sweeps must be (pixels)", {number}, sweeps);
+    expect("spread must be (pixels or 0)", {size_of(spread) == 0 ? 0 : number}, spread);
     expect("bins must be (pixels or 0, bins)", {wanted == 0 ? 0 : number, job.bins}, bins);
     double* const distance = distance_armed.data();
     const FeedbackCheckCall call{pixels.data(),
@@ -56,6 +57,7 @@ void judge(const BoundJob& job, const PulseTable& pulse, Vector<const int64_t> p
                                  distance,
                                  sweeps.data(),
                                  distance + number,
+                                 size_of(spread) == 0 ? nullptr : spread.data(),
                                  wanted == 0 ? nullptr : bins.data()};
     nb::gil_scoped_release free;
     feedback_check(job, pulse, call, threads);
@@ -79,14 +81,16 @@ void bind_feedback(nb::module_& module) {
         "else why its row is not written; 64 and more: it needs that "
         "many "
         "laps less 64.";
-    module.def("feedback_check", &judge, "job"_a, "pulse"_a, "pixels"_a, "kinds"_a, "distance_armed"_a.noconvert(),
-               "sweeps"_a.noconvert(), "bins"_a.noconvert(), "threads"_a,
-               "distance_armed (2, pixels): distance of the mean histogram on an internal grid from that of one of "
-               "half its cells' width, "
-               "in standard deviations of the linear function that shows it best, and the fewest exposures armed in "
-               "any cell; sweeps (pixels,) of the latter, 201 "
-               "where it does not settle; and what each bin's cells have to do with its square, (pixels, bins), or "
-               "(0, bins) where that is not needed.");
+    module.def(
+        "feedback_check", &judge, "job"_a, "pulse"_a, "pixels"_a, "kinds"_a, "distance_armed"_a.noconvert(),
+        "sweeps"_a.noconvert(), "spread"_a.noconvert(), "bins"_a.noconvert(), "threads"_a,
+        "distance_armed (2, pixels): distance of the mean histogram on an internal grid from that of one of "
+        "half its cells' width, "
+        "in standard deviations of the linear function that shows it best, and the fewest exposures armed in "
+        "any cell; sweeps (pixels,) of the latter, 201 "
+        "where it does not settle; spread (pixels,): twice the relative distance of the two variances of the count, or "
+        "(0,) where that is not needed; and what each bin's cells have to do with the sum of the squares, (pixels, "
+        "bins), or (0, bins).");
     define<uint16_t>(module, about);
     define<uint32_t>(module, about);
 }

@@ -110,5 +110,5 @@ print(f"At S = 20 the fullest bin is {at_20:.0f} cm too short.")
 # %%
 # The last line printed is ``At S = 20 the fullest bin is 52 cm too short.``
 #
-# Next: :doc:`lesson_2_pile_up` derives the shape of the histogram. Related: the modes of real detectors in
-# :doc:`/detectors`, and how to simulate a scene in :doc:`/start`.
+# Next: :doc:`lesson_2_pile_up` derives the shape of the histogram. Theory: :doc:`/theory_detectors`, the law of each
+# mode of detector. How-to: :doc:`/start` simulates a scene, :doc:`/detectors` describes your own detector.

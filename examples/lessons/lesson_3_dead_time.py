@@ -101,4 +101,5 @@ print(f"Counts of the ten bins around the return: their sum has {window:.2f} of 
 # An error bar from the sum of the bins' variances is too long by the inverse square root of that number.
 #
 # Next: :doc:`lesson_4_depth`. Theory: :doc:`/theory_exposure` (counts and shapes), :doc:`/joint_law` (correlations),
-# :doc:`/theory` (the Markov-renewal view of the MaRS paper).
+# :doc:`/theory` (the Markov-renewal view of the MaRS paper). How-to: :doc:`/engines` says which engine draws these
+# correlations.

@@ -76,5 +76,5 @@ print(f"Median depth error: {medians['peak']:.0f} cm by the fullest bin, {best:.
 # %%
 # The last line printed is ``Median depth error: 28 cm by the fullest bin, 1.0 cm by maximum likelihood.``
 #
-# Next: :doc:`lesson_5_certainty`. How-to: :doc:`/reconstruction`, which compares the methods and says where each
-# holds.
+# Next: :doc:`lesson_5_certainty`. Theory: :doc:`/theory_reconstruction` derives the estimates. How-to:
+# :doc:`/reconstruction` compares the methods and says where each holds.

@@ -78,5 +78,6 @@ print(f"{once:.0%} of all depths are within one standard error, {twice:.0%} with
 # %%
 # The last line printed is ``69% of all depths are within one standard error, 95% within two.``
 #
-# This was the last lesson. Next: :doc:`/howto` for recipes, :doc:`/gallery/index` for further examples,
-# :doc:`/explanation` for the derivations.
+# This was the last lesson. Theory: :doc:`/theory_reconstruction` derives the bound and the errors. How-to:
+# :doc:`/reconstruction` gives both for your own histogram. Next: :doc:`/howto` for recipes,
+# :doc:`/gallery/index` for further examples, :doc:`/explanation` for the derivations.

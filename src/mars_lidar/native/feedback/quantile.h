@@ -1,8 +1,9 @@
 // The count of a cell as a function of its mean, for one uniform number: H = max(0, ceil(alpha mu + beta)).
 //
 // The law is a binomial's of mean mu and variance s^2, that is, of p' = 1 - s^2 / mu and mu / p' trials. Below a mean
-// of 6 its quantile comes from the sums of its terms, above from the Cornish-Fisher expansion. Between sweeps mu moves
-// by a small part of s, so the quantile is followed to first order from `mean` on.
+// of 6 its quantile comes from the sums of its terms, and so does that of what does not register where fewer than 6 do
+// not; between them from the Cornish-Fisher expansion. Between sweeps mu moves by a small part of s, so the quantile is
+// followed to first order from `mean` on.
 #pragma once
 #include "feedback/kernel.h"
 #include "feedback/math.h"
@@ -116,6 +117,35 @@ MARS_INLINE bool any_few(const float* mean) {
     return any_lane([&](int first) { return load<Float>(mean + first) < kInversionBelow; });
 }
 
+// Where more than half register: how many of the trials do not, for the numbers that leave H of them. (From below, the
+// first terms would be nothing in single precision.)
+struct Missing {
+    alignas(64) float mean[kTeam], trials[kTeam];
+    Terms terms;
+
+    // How many do not on average, or so many that the expansion may be taken.
+    static MARS_INLINE float missing(float mean, float variance) {
+        return 2.0f * variance < mean ? variance / (1.0f - variance / mean) : kInversionBelow;
+    }
+    static MARS_INLINE bool likely(const float* mean, const float* variance) {
+        return any_lane([&](int first) {
+            const Float m = load<Float>(mean + first), v = load<Float>(variance + first);
+            return (v < kInversionBelow) & (2.0f * v < m);
+        });
+    }
+    MARS_NOINLINE void set(const float* __restrict__ of, const float* __restrict__ variance,
+                           const float* __restrict__ above) {
+        alignas(64) float uniform[kTeam], spread[kTeam];
+        for (int i = 0; i < kTeam; ++i) {
+            mean[i] = missing(of[i], variance[i]);
+            trials[i] = of[i] + mean[i];
+            spread[i] = mean[i] < kInversionBelow ? variance[i] : 0.5f * mean[i];
+            uniform[i] = 1.0f - above[i];
+        }
+        terms.sum(mean, spread, uniform);
+    }
+};
+
 // Whether any line is steeper than limit_slopes allows.
 MARS_INLINE bool any_steep(const float* p, const float* q, const float* alpha) {
     return any_lane([&](int first) {
@@ -173,6 +203,16 @@ MARS_INLINE void follow_quantile(const float* mean, const float* variance, const
             beta[i] = few ? k - slope * (mean[i] + up) : beta[i];
         }
     }
+    if (Missing::likely(mean, variance)) {  // as many do not register if more exposures are armed
+        Missing missing;
+        missing.set(mean, variance, uniforms.above);
+        for (int i = 0; i < kTeam; ++i) {
+            const bool nearly = missing.mean[i] < kInversionBelow;
+            const float slope = 1.0f / (p[i] > q[i] ? p[i] : q[i]);
+            alpha[i] = nearly ? slope : alpha[i];
+            beta[i] = nearly ? missing.trials[i] - missing.terms.count[i] - 0.5f - slope * mean[i] : beta[i];
+        }
+    }
     if (any_steep(p, q, alpha)) limit_slopes(p, q, mean, alpha, beta);
 }
 
@@ -187,11 +227,20 @@ MARS_INLINE void quantile(const float* mean, const float* variance, const Unifor
         const int32_t up = down + (x > static_cast<float>(down) ? 1 : 0);
         count[i] = up > 0 ? up : 0;
     }
-    if (!any_few(mean)) return;
-    Terms terms;
-    terms.sum(mean, variance, uniforms.above);
-    for (int i = 0; i < kTeam; ++i)
-        count[i] = mean[i] < kInversionBelow ? static_cast<int32_t>(terms.count[i]) : count[i];
+    if (any_few(mean)) {
+        Terms terms;
+        terms.sum(mean, variance, uniforms.above);
+        for (int i = 0; i < kTeam; ++i)
+            count[i] = mean[i] < kInversionBelow ? static_cast<int32_t>(terms.count[i]) : count[i];
+    }
+    if (Missing::likely(mean, variance)) {
+        Missing missing;
+        missing.set(mean, variance, uniforms.above);
+        for (int i = 0; i < kTeam; ++i) {
+            const int32_t some = static_cast<int32_t>(missing.trials[i] - missing.terms.count[i] + 0.5f);
+            count[i] = missing.mean[i] < kInversionBelow ? some : count[i];
+        }
+    }
 }
 
 }  // namespace MARS_LEVEL

@@ -181,7 +181,7 @@ def _structure(system: System, flux: Flux | None = None) -> float:
         return 1.0 / flux.waveform.shape[-1]
     pulse = system.pulse
     if isinstance(pulse, GaussianPulse):
-        return pulse.sigma_ns / system.period_ns
+        return float(pulse.sigma_ns / system.period_ns)
     return pulse.bin_ns / system.period_ns if isinstance(pulse, SampledPulse) else 0.0
 
 

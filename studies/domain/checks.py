@@ -131,10 +131,15 @@ def variances_of(sample: Sample, oracle: str, names: list[str], x: Numbers, vari
 
 
 def covariance_of(sample: Sample, oracle: str, name: str, x: FloatArray, y: FloatArray, known: float) -> list[Check]:
-    """Sample covariance of two windows against the known one."""
+    """Sample covariance of two windows against the known one.
+
+    Its variance has a term of second order, all that is left where every product is about the same: of counts that are
+    0 or 1 with equal chances.
+    """
     a, b = x - x.mean(), y - y.mean()
     product, n = a * b, len(a)
-    error = product.std(ddof=1) / np.sqrt(n) if n > 1 else 0.0
+    second = (a.var() * b.var() + product.mean() ** 2) / (n * (n - 1)) if n > 1 else 0.0
+    error = float(np.sqrt(product.var(ddof=1) / n + second)) if n > 1 else 0.0
     if n < 200 or error == 0.0 or (product**4).mean() > n / 50.0 * (product**2).mean() ** 2:
         return []
     size = float(np.sqrt(max(a.var() * b.var(), 1e-300)))

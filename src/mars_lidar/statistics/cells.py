@@ -498,11 +498,18 @@ class Cells:
         return 1.0 / (2.0 * math.sqrt(math.pi) * max(self._sharpness, 1.0) * photons)
 
     def first_bins(self, out_bins: int) -> int:
-        """Bins of the first grid: `usual_bins`, or more where a narrower pulse must be resolved."""
+        """Bins of the first grid: `usual_bins`, or more where a narrower pulse must be resolved.
+
+        So must the parts of a waveform where pixels re-arm in the bin of their registration: grids that do not resolve
+        them agree with each other on a mean that is 1e-4 off.
+        """
         most = max(TOL.most_first_bins, out_bins)
         if self.follow:
             return followed_bins(self, most, out_bins)
-        return _multiple(max(self.usual_bins(out_bins), needed_bins(self, most)), out_bins)
+        usual, needed = self.usual_bins(out_bins), needed_bins(self, most)
+        if self.waveform is not None and 0.0 < self.system.dead_time_periods and _apart(self) * usual < 1.0:
+            needed = min(self.waveform.shape[-1], most)
+        return _multiple(max(usual, needed), out_bins)
 
     def usual_bins(self, out_bins: int) -> int:
         """Even multiple of `out_bins` whose bins are at most sigma / 2 of pulse or gate wide, at most some 2^14."""

@@ -507,7 +507,7 @@ class Cells:
         if self.follow:
             return followed_bins(self, most, out_bins)
         usual, needed = self.usual_bins(out_bins), needed_bins(self, most)
-        if self.waveform is not None and 0.0 < self.system.dead_time_periods and _apart(self) * usual < 1.0:
+        if self.waveform is not None and self.system.dead_time_periods > 0.0 and _apart(self) * usual < 1.0:
             needed = min(self.waveform.shape[-1], most)
         return _multiple(max(usual, needed), out_bins)
 

@@ -178,7 +178,7 @@ class Check(NamedTuple):
 def _structure(system: System, flux: Flux | None = None) -> float:
     """Width of the finest structure of the light, periods: of a part of a waveform, or of the pulse."""
     if flux is not None and flux.waveform is not None:
-        return 1.0 / flux.waveform.shape[-1]
+        return float(1.0 / flux.waveform.shape[-1])
     pulse = system.pulse
     if isinstance(pulse, GaussianPulse):
         return float(pulse.sigma_ns / system.period_ns)

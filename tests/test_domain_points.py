@@ -356,3 +356,18 @@ def test_a_waveform_that_re_arms_within_its_parts() -> None:
     law = ml.count_law(flux, pixel.system)
     assert ml.mean_histogram(flux, pixel.system).sum() == pytest.approx(float(law.mean), rel=2e-6)
     assert ml.joint_law(flux, pixel.system).count_mean == pytest.approx(float(law.mean), rel=2e-6)
+
+
+def test_a_stationary_start_of_a_pixel_that_fires_like_a_clock() -> None:
+    """500 photons a dead time: the iteration did not settle. The rate of registrations is that of constant light."""
+    system = ml.System(
+        period_ns=100.0,
+        cycles=100,
+        bins=1,
+        pulse=ml.GaussianPulse(sigma_ns=1e-4),
+        detector=ml.Detector(dead_time_ns=50.0),
+        start="stationary",
+    )
+    counts = ml.simulate(ml.Flux(1.0, 1000.0, 59.8), system, seed=1, realizations=2000)
+    assert counts.mean() == pytest.approx(100 * 1001 / (1 + 1001 * 0.5), abs=0.1)
+    assert counts.std() < 1.0

@@ -109,7 +109,7 @@ class StationaryState {
             q_[j] = same ? q_[j - 1] : (photons[j] > 1e-8 ? 1.0 - p_[j] / photons[j] : 0.5 * photons[j]);
             all += photons[j];
         }
-        constexpr int kPlainTurns = 16, kTurns = 500;
+        constexpr int kPlainTurns = 16, kTurns = 80;
         const double shift = (dead_time_ - static_cast<double>(whole_)) * static_cast<double>(n);
         delay_ = static_cast<int64_t>(shift);
         spill_ = shift - static_cast<double>(delay_);
@@ -140,10 +140,7 @@ class StationaryState {
             }
             mix(steps, changes, residual, x, next);
         }
-        if (!converged_ && n <= 2048) {
-            solve_directly(x);
-            converged_ = true;
-        }
+        if (!converged_) solve_by_residuals(x);
         double sum = 0.0;
         for (double& h : x) sum += h = h > 0.0 ? h : 0.0;
         const double scale = 1.0 / (1.0 + static_cast<double>(whole_) * sum);
@@ -151,34 +148,67 @@ class StationaryState {
         for (int64_t j = 0; j < n; ++j) below_[j + 1] = below_[j] + x[j] * scale;
     }
 
-    // Gaussian elimination, for pixels so bright and so nearly periodic that no iteration gets anywhere.
-    void solve_directly(std::vector<double>& h) const {
-        const int64_t n = static_cast<int64_t>(h.size());
-        std::vector<std::vector<double>> a(n, std::vector<double>(n + 1, 0.0));
-        for (int64_t j = 0; j < n; ++j) {  // h_j + p_j W_j - q_j I_j = p_j
-            auto& row = a[j];
-            auto add = [&](int64_t back, double value) { row[((j - back) % n + n) % n] += value; };
-            add(0, 1.0);
-            for (int64_t i = 1; i <= delay_; ++i) add(i, p_[j]);
-            add(delay_ + 1, p_[j] * spill_ - q_[j] * spill_);
-            add(delay_, -q_[j] * (1.0 - spill_));
-            row[n] = p_[j];
-        }
-        for (int64_t i = 0; i < n; ++i) {
-            int64_t pivot = i;
-            for (int64_t k = i + 1; k < n; ++k)
-                if (std::fabs(a[k][i]) > std::fabs(a[pivot][i])) pivot = k;
-            std::swap(a[i], a[pivot]);
-            for (int64_t k = i + 1; k < n; ++k) {
-                const double factor = a[k][i] / a[i][i];
-                if (factor == 0.0) continue;
-                for (int64_t j = i; j <= n; ++j) a[k][j] -= factor * a[i][j];
+    // For pixels so bright and so nearly periodic that dozens of slow modes remain: the fixed point x = G x + b of a sweep
+    // by generalised minimal residuals (Saad and Schultz, SIAM J. Sci. Stat. Comput. 7, 856 (1986)), restarted.
+    void solve_by_residuals(std::vector<double>& x) {
+        constexpr int kBasis = 60, kRestarts = 40;
+        const size_t n = x.size();
+        using Vector = std::vector<double>;
+        auto dot = [n](const Vector& a, const Vector& b) {
+            double sum = 0.0;
+            for (size_t j = 0; j < n; ++j) sum += a[j] * b[j];
+            return sum;
+        };
+        Vector swept_zero(n, 0.0);
+        sweep(swept_zero);  // b
+        for (int restart = 0; restart < kRestarts; ++restart) {
+            Vector next = x;
+            sweep(next);
+            double error = 0.0, sum = 0.0;
+            for (size_t j = 0; j < n; ++j) {
+                error += std::fabs(next[j] - x[j]);
+                sum += std::fabs(next[j]);
+                next[j] -= x[j];
             }
-        }
-        for (int64_t i = n - 1; i >= 0; --i) {
-            h[i] = a[i][n];
-            for (int64_t j = i + 1; j < n; ++j) h[i] -= a[i][j] * h[j];
-            h[i] /= a[i][i];
+            converged_ = error <= 1e-8 * sum;
+            const double size = std::sqrt(dot(next, next));
+            if (converged_ || !(size > 0.0)) return;
+            std::vector<Vector> basis{std::move(next)};
+            for (double& value : basis[0]) value /= size;
+            // Hessenberg matrix, made triangular by rotations as it grows
+            double h[kBasis + 1][kBasis], cosine[kBasis], sine[kBasis], g[kBasis + 1] = {size};
+            int m = 0;
+            for (; m < kBasis && std::fabs(g[m]) > 1e-10 * size; ++m) {
+                Vector image = basis[static_cast<size_t>(m)];
+                sweep(image);
+                for (size_t j = 0; j < n; ++j) image[j] = basis[static_cast<size_t>(m)][j] - (image[j] - swept_zero[j]);
+                for (int i = 0; i <= m; ++i) {
+                    const Vector& each = basis[static_cast<size_t>(i)];
+                    h[i][m] = dot(image, each);
+                    for (size_t j = 0; j < n; ++j) image[j] -= h[i][m] * each[j];
+                }
+                h[m + 1][m] = std::sqrt(dot(image, image));
+                for (double& value : image) value /= h[m + 1][m] > 0.0 ? h[m + 1][m] : 1.0;
+                basis.push_back(std::move(image));
+                for (int i = 0; i < m; ++i) {
+                    const double above = h[i][m], below = h[i + 1][m];
+                    h[i][m] = cosine[i] * above + sine[i] * below;
+                    h[i + 1][m] = cosine[i] * below - sine[i] * above;
+                }
+                const double length = std::sqrt(h[m][m] * h[m][m] + h[m + 1][m] * h[m + 1][m]);
+                if (!(length > 0.0)) break;
+                cosine[m] = h[m][m] / length;
+                sine[m] = h[m + 1][m] / length;
+                h[m][m] = length;
+                g[m + 1] = -sine[m] * g[m];
+                g[m] *= cosine[m];
+            }
+            for (int i = m - 1; i >= 0; --i) {
+                for (int k = i + 1; k < m; ++k) g[i] -= h[i][k] * g[k];
+                g[i] /= h[i][i];
+            }
+            for (int i = 0; i < m; ++i)
+                for (size_t j = 0; j < n; ++j) x[j] += g[i] * basis[static_cast<size_t>(i)][j];
         }
     }
 

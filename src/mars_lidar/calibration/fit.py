@@ -35,10 +35,9 @@ class Effort:
     standard errors of a stream of its length. Of the last streams `longer` is the factor on their photons, so that
     they need not differ as much, `more` that on the number of those which give the weights, and `recentred` the number
     of batches at most. `widths` of the pulse in a batch: the tables of a pulse cost as much as a stream. `draws` from
-    the law of the estimate, for its bounds; `edge` photons at least, for the law of the shortest intervals. `attempts`
-    to fit a stream, each with simulated streams of its own, of which the first that converges is taken; `effects` taken
-    in, one after the other, and `refits` with an effect more that fresh streams judge; `shape_bins` of a free light, at
-    most.
+    the law of the estimate, for its bounds. `attempts` to fit a stream, each with simulated streams of its own, of
+    which the first that converges is taken; `effects` taken in, one after the other, and `refits` with an effect more
+    that fresh streams judge; `shape_bins` of a free light, at most.
     """
 
     settings: int = 32

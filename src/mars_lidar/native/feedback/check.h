@@ -326,11 +326,7 @@ class GridCheck {
             for (int i = 0; i < kJudged; ++i) old[at + i] = old[at + kJudged + i] + p[i] * y[at + i];
         }
         sources_.resize(static_cast<size_t>(3 * n));
-        for (int32_t e = 0; e < 3 * n; ++e) {
-            const int32_t turns = e / n;
-            const FeedbackEdge& edge = grid.edge[e - turns * n];
-            sources_[static_cast<size_t>(e)] = edge.early + (turns - edge.turns) * n;
-        }
+        for (int32_t e = 0; e < 3 * n; ++e) sources_[static_cast<size_t>(e)] = grid.source(e);
         const auto source = [at = sources_.data()](int32_t e) { return at[e]; };
         alignas(64) double moved[kJudged];
         for (int sweep = 0; sweep < kSweeps; ++sweep) {

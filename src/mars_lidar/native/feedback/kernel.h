@@ -52,6 +52,12 @@ struct FeedbackGrid {
     bool stationary;
 
     int32_t path() const { return cells * laps; }  // cells of all laps
+    // The cell one rest of the dead time before edge e, which is counted on through several periods.
+    int32_t source(int32_t e) const {
+        const int32_t turns = e / cells;
+        const FeedbackEdge& at = edge[e - turns * cells];
+        return at.early + (turns - at.turns) * cells;
+    }
     // Whole periods of the dead time that a sweep of one period leaves to the term K N; several laps leave them out.
     int32_t folded() const { return laps == 1 ? whole : 0; }
 };

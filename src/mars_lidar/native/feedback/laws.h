@@ -221,11 +221,7 @@ MARS_NOINLINE void count_variance(const FeedbackGrid& grid, const Rates& rates, 
             values[at] = 1.0f;
             old[at] = old[at + kRow] + rates.fire(j)[i];
         }
-    const auto source = [&](int32_t e) {
-        const int32_t turns = e / n;
-        const FeedbackEdge& edge = grid.edge[e - turns * n];
-        return edge.early + (turns - edge.turns) * n;
-    };
+    const auto source = [&grid](int32_t e) { return grid.source(e); };
     for (int sweep = 1; sweep <= sweeps; ++sweep) {
         adjoint_sweep<float, kTeam, kRow>(grid, rates, source, old, fresh, values, moved);
         std::swap(old, fresh);

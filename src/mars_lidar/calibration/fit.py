@@ -281,12 +281,13 @@ class Fit:
         guess: Guess,
         photons: float,
         cells: Cells | None = None,
-        spread: float = Effort.spread,
+        spread: float | None = None,
         more: int = 1,
         times: float = 1.0,
     ) -> Batch:
         """The linear law of counts about a guess for an exposure of this many photons."""
         model, theta, root, free = guess
+        spread = self.effort.spread if spread is None else spread
         cells = self.cells(model, theta, photons) if cells is None else cells
         size = self.effort.of(photons, times)
         linear = np.diag(model.scale(theta)[free] ** -2.0)

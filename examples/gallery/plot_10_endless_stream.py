@@ -23,7 +23,7 @@ layers = nn.Conv2d(64, 64, 1), nn.ReLU(), nn.Conv2d(64, 32, 3, padding=1), nn.Re
 manual_seed(0)  # weights before training
 net = nn.Sequential(*layers)
 optimizer = optim.AdamW(net.parameters(), 3e-3)
-for batch in CubeStream(system, size=32, batch_size=8, epoch_size=8 * 60, signal=LogUniform(0.02, 0.5), seed=1):
+for batch in CubeStream(system, size=32, batch_size=8, epoch_size=8 * 120, signal=LogUniform(0.02, 0.5), seed=1):
     optimizer.zero_grad()
     place = (batch["flux"]["delay"] / system.bin_ns).long() % 64
     nn.functional.cross_entropy(net(batch["counts"].log1p()), place).backward()

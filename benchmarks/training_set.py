@@ -30,12 +30,12 @@ def waveforms() -> str:
     """A sentence on the processor time of waveforms, and of simulating one exposure of them."""
     room, nothing = ml.Scene.example("room", SIDE), np.full((SIDE, SIDE), np.nan)
     light = np.random.default_rng(0).exponential(size=(SIDE, SIDE, SYSTEM.bins))
-    shown = {
+    kinds = {
         "rendered light": Rendered(Transient(light, SYSTEM.bin_ns), nothing, nothing),
         "fog": Surfaces(room, Fog(extinction_per_m=0.05, backscatter=0.3, nearest_m=1.0)),
     }
     texts = []
-    for name, content in shown.items():
+    for name, content in kinds.items():
         flux = content.flux(SYSTEM, Light(), 1.0, 1.0)
         whole = flux[:]
         took = in_turn(

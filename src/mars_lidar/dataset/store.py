@@ -51,8 +51,7 @@ from mars_lidar.io.scene_files import Problem
 from mars_lidar.io.store import OnDisk
 from mars_lidar.io.zarr_store import check_zarr_threads
 from mars_lidar.light.transient import Transient
-from mars_lidar.scene.layers import LayeredScene
-from mars_lidar.scene.scene import Scene
+from mars_lidar.scene.scene import LayeredScene, Scene
 
 
 @dataclass(frozen=True)

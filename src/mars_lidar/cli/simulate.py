@@ -28,8 +28,7 @@ from mars_lidar.cli.options import (
 from mars_lidar.cli.system_options import Effects, SystemOptions
 from mars_lidar.engines import ENGINES, EngineOptions
 from mars_lidar.instrument.system import System
-from mars_lidar.light.flux import Flux
-from mars_lidar.light.stored_flux import StoredFlux
+from mars_lidar.light.flux import Flux, StoredFlux
 from mars_lidar.table import Table
 
 if TYPE_CHECKING:

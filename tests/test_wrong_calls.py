@@ -220,7 +220,6 @@ CALLS: dict[str, Callable[[Path], tuple[Callable[..., Any], dict[str, Any]]]] = 
         for call in (
             statistics.electronics_moments,
             statistics.exposure_moments,
-            statistics.mars_moments,
             statistics.mean_histogram,
             statistics.photons_per_bin,
         )

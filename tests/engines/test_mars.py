@@ -14,7 +14,7 @@ from harness.check import COUNTS, SHAPE
 
 import mars_lidar as ml
 from mars_lidar.engines import MarsEngine
-from mars_lidar.engines.tolerances import TOLERANCES
+from mars_lidar.engines.tolerances import TOL
 from mars_lidar.statistics import exposure_moments
 from mars_lidar.table import Table
 
@@ -114,9 +114,9 @@ def test_batches_do_not_show(monkeypatch: pytest.MonkeyPatch):
     from mars_lidar.engines import synthesis as _synthesis
 
     whole = ml.simulate(image(), SYSTEM, engine="mars", table=table(), realizations=5)
-    small = replace(TOLERANCES, batch_exposures=4, looked_up=11)
-    monkeypatch.setattr(_synthesis, "TOLERANCES", small)
-    monkeypatch.setattr(_count_shape, "TOLERANCES", small)
+    small = replace(TOL, batch_exposures=4, looked_up=11)
+    monkeypatch.setattr(_synthesis, "TOL", small)
+    monkeypatch.setattr(_count_shape, "TOL", small)
     assert np.array_equal(whole, ml.simulate(image(), SYSTEM, engine="mars", table=table(), realizations=5))
 
 

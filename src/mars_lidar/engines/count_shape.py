@@ -12,7 +12,7 @@ from mars_lidar._base.types import FloatArray, IndexArray
 from mars_lidar.engines.engine import Engine, Task
 from mars_lidar.engines.synthesis import CountLaws, Run
 from mars_lidar.engines.table_reader import Entries, TableReader
-from mars_lidar.engines.tolerances import TOLERANCES
+from mars_lidar.engines.tolerances import TOL
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.statistics.exposure import normalised
@@ -49,7 +49,7 @@ class CountTimesShape(Engine):
             self._evaluate(run, pixels)
             return
         self.reader.warn_of_start_up(task)
-        step = TOLERANCES.looked_up
+        step = TOL.looked_up
         outside = [self._look_up(run, self.reader, pixels[k : k + step]) for k in range(0, pixels.size, step)]
         self._evaluate(run, np.concatenate(outside))
 

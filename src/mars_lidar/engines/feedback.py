@@ -20,7 +20,7 @@ from mars_lidar.engines.engine import Engine, Task, draw_pixels, stage
 from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.engines.feedback_grid import Grids, KindArray
 from mars_lidar.engines.poisson import PoissonEngine
-from mars_lidar.engines.tolerances import TOLERANCES
+from mars_lidar.engines.tolerances import TOL
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 
@@ -202,11 +202,11 @@ class Plan:
     def of(cls, task: Task, pixels: IndexArray) -> Plan:
         """For some pixels (n,) of a task."""
         reason = np.zeros(pixels.size, np.uint8)
-        if task.system.cycles < TOLERANCES.fewest_dead_times * math.ceil(task.system.dead_time_periods):
+        if task.system.cycles < TOL.fewest_dead_times * math.ceil(task.system.dead_time_periods):
             reason[:] = Reason.SHORT
             return cls(Grids.coarsest(task, pixels.size), reason)
         grids = Grids.checked(task, pixels)
-        reason[grids.sweeps > TOLERANCES.mean_sweeps] = Reason.SLOW
+        reason[grids.sweeps > TOL.mean_sweeps] = Reason.SLOW
         reason[grids.of < 0] = Reason.CELLS
         return cls(grids, reason)
 
@@ -246,7 +246,7 @@ def sweep_pixels(
     status[:, able] = draw(task, 0, able, np.ones_like(able))
     slow = able[status[0, able] >= Reason.LAPS]
     laps = status[0, slow].astype(np.int64) - Reason.LAPS
-    large = cells[slow] * laps > TOLERANCES.lap_cells
+    large = cells[slow] * laps > TOL.lap_cells
     slower = np.zeros_like(large) if worth is None else cells[slow] * laps > worth[slow]
     status[:, slow[slower]] = Reason.SLOWER
     status[:, slow[large]] = Reason.CELLS
@@ -254,12 +254,12 @@ def sweep_pixels(
     status[:, slow[far]] = draw(replace(task, progress=None), 0, slow[far], laps[far])
     of_laps = np.ones(pixels.size, np.int64)
     of_laps[slow] = laps
-    long = expected_registrations(task.flux, task.system).reshape(-1)[pixels] > TOLERANCES.try_from * cells * of_laps
+    long = expected_registrations(task.flux, task.system).reshape(-1)[pixels] > TOL.try_from * cells * of_laps
     unsettled = (status == Reason.UNSETTLED) & long
     tried = int(unsettled.sum())
-    for attempt in range(1, TOLERANCES.tries + 1):
+    for attempt in range(1, TOL.tries + 1):
         for row in np.flatnonzero(unsettled.any(1)):
-            first, seed = task.first_realization + int(row), task.seed ^ (attempt * TOLERANCES.other_numbers % 2**64)
+            first, seed = task.first_realization + int(row), task.seed ^ (attempt * TOL.other_numbers % 2**64)
             part = replace(task, realizations=1, first_realization=first, seed=seed, progress=None)
             again = np.flatnonzero(unsettled[row])
             status[row, again] = draw(part, int(row), again, of_laps[again])[0]

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from mars_lidar._base.native import _core
 from mars_lidar._base.types import FloatArray, IndexArray
 from mars_lidar.engines.engine import Task
-from mars_lidar.engines.tolerances import TOLERANCES
+from mars_lidar.engines.tolerances import TOL
 from mars_lidar.instrument.pulse import GaussianPulse, SampledPulse
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
@@ -44,14 +44,14 @@ class Grids:
     def coarsest(cls, task: Task, number: int) -> Grids:
         """The widest cells that the sweeps allow, for `number` pixels."""
         start = coarsest(task.system)
-        of = np.full(number, 0 if cells_of(start) <= TOLERANCES.cells else -1)
+        of = np.full(number, 0 if cells_of(start) <= TOL.cells else -1)
         return cls([start], of, np.zeros(number, np.int64), np.full(number, float(task.system.cycles)))
 
     @classmethod
     def checked(cls, task: Task, pixels: IndexArray) -> Grids:
         """The grids of `pixels` (n,) of a task: each depends on the pixel and the system alone."""
         grids, start = cls.coarsest(task, pixels.size), coarsest(task.system)
-        if cells_of(start) > TOLERANCES.cells:
+        if cells_of(start) > TOL.cells:
             return grids
         alone = judged_alone(task, pixels)
         numbers = {start.tobytes(): 0}
@@ -86,11 +86,11 @@ class Grids:
 
         A history is forgotten to 3e-3 within about half the sweeps that the mean takes.
         """
-        return np.where(self.armed < TOLERANCES.few_armed, np.maximum(self.sweeps // 2, 3), 1)
+        return np.where(self.armed < TOL.few_armed, np.maximum(self.sweeps // 2, 3), 1)
 
     def cells(self) -> IndexArray:
         """Cells (n,) of a period."""
-        each = np.array([cells_of(kinds) for kinds in self.kinds] + [TOLERANCES.cells + 1])
+        each = np.array([cells_of(kinds) for kinds in self.kinds] + [TOL.cells + 1])
         return np.asarray(each[self.of])
 
 
@@ -117,11 +117,11 @@ def coarsest(system: System) -> KindArray:
 
     Without the last, where that would take many cells, the sweeps count a whole period in cells, and are slower.
     """
-    short = TOLERANCES.dead_time_cells / max(system.dead_time_periods * system.bins, 1e-30)
+    short = TOL.dead_time_cells / max(system.dead_time_periods * system.bins, 1e-30)
     beyond = 1.0 / max(math.fmod(system.dead_time_periods, 1.0) * system.bins, 1e-30)
-    if system.dead_time_periods > 1.0 and beyond <= 2**TOLERANCES.cheap_halvings:
+    if system.dead_time_periods > 1.0 and beyond <= 2**TOL.cheap_halvings:
         short = max(short, beyond)
-    return np.full(system.bins, least_power(1, short, 0, TOLERANCES.halvings), np.uint8)
+    return np.full(system.bins, least_power(1, short, 0, TOL.halvings), np.uint8)
 
 
 def resolving(system: System, kinds: KindArray, structure: float, bins: IndexArray | slice) -> KindArray:
@@ -135,7 +135,7 @@ def resolving(system: System, kinds: KindArray, structure: float, bins: IndexArr
     if dead == 0.0:
         return kinds
     out = kinds.copy()
-    least = least_power(1, 1.0 / max(widest * system.bins, 1e-30), 0, TOLERANCES.halvings)
+    least = least_power(1, 1.0 / max(widest * system.bins, 1e-30), 0, TOL.halvings)
     out[bins] = np.maximum(out[bins], least.astype(np.uint8))
     return out
 
@@ -165,7 +165,7 @@ class Check(NamedTuple):
         _core.feedback_check(
             task.job, task.pulse, np.ascontiguousarray(pixels), kinds, both, sweeps, spread, bins, task.threads
         )
-        limit = TOLERANCES.richardson
+        limit = TOL.richardson
         spread = spread if variance else np.zeros(pixels.size)
         return cls(limit * both[0], limit * spread, sweeps.astype(np.int64), both[1], limit**2 * bins)
 
@@ -196,7 +196,7 @@ def _even_halvings(task: Task, pixels: IndexArray, start: KindArray) -> tuple[In
     """How often all cells of each pixel (n,) must be halved, -1 where that is too often; sweeps, fewest armed (n,)."""
     halvings, sweeps = np.zeros(pixels.size, np.int64), np.zeros(pixels.size, np.int64)
     armed, unlike = np.zeros(pixels.size), np.ones(pixels.size, np.bool_)
-    most = (TOLERANCES.cells // cells_of(start)).bit_length() - 1
+    most = (TOL.cells // cells_of(start)).bit_length() - 1
     open_ = np.arange(pixels.size)
     while open_.size:
         rest = []
@@ -207,11 +207,11 @@ def _even_halvings(task: Task, pixels: IndexArray, start: KindArray) -> tuple[In
                 some = unlike[at] == judged
                 check = Check.of(task, pixels[at[some]], np.asarray(start + k, np.uint8), variance=bool(judged))
                 distance[some], sweeps[at[some]], armed[at[some]] = check.of_law, check.sweeps, check.armed
-                unlike[at[some]] = check.spread > TOLERANCES.mean_distance
-            far = (distance > TOLERANCES.mean_distance) & (sweeps[at] <= TOLERANCES.mean_sweeps)
+                unlike[at[some]] = check.spread > TOL.mean_distance
+            far = (distance > TOL.mean_distance) & (sweeps[at] <= TOL.mean_sweeps)
             # distances fall with the square of the width; whether so many halvings do is judged in the next round
-            ratio = distance[far] / TOLERANCES.mean_distance
-            halvings[at[far]] += least_power(2, ratio, 1, TOLERANCES.halvings_at_once)
+            ratio = distance[far] / TOL.mean_distance
+            halvings[at[far]] += least_power(2, ratio, 1, TOL.halvings_at_once)
             halvings[at[far & (halvings[at] > most)]] = most + 1 if k < most else -1
             halvings[at[far & (k < most) & (halvings[at] > most)]] = most
             rest.append(at[far & (halvings[at] >= 0)])
@@ -238,9 +238,9 @@ Known = dict[Corner, CornerGrid]
 
 def _corners_of(flux: Flux, pixels: IndexArray) -> tuple[list[Corner], IndexArray]:
     """Corners, powers of the least level of signal and background that a pixel does not exceed; (n,) which is whose."""
-    dimmest, most = TOLERANCES.dimmest, 500  # as far as doubles go
+    dimmest, most = TOL.dimmest, 500  # as far as doubles go
     signal, background = (
-        least_power(TOLERANCES.light_octaves, light.reshape(-1)[pixels], low, most)
+        least_power(TOL.light_octaves, light.reshape(-1)[pixels], low, most)
         for light, low in zip((flux.signal, flux.background), dimmest, strict=True)
     )
     keys, which = np.unique(signal * 2 * most + background - dimmest[1], return_inverse=True)
@@ -264,10 +264,10 @@ def _corner_grids(task: Task, corners: list[Corner], start: KindArray) -> Known:
 
 def _refined(task: Task, corners: list[Corner], start: KindArray) -> Known:
     """Cut bins where they make the mean wrong, until it is not; corners of one grid are judged in one call."""
-    system, each = task.system, 4 * len(TOLERANCES.delays)
+    system, each = task.system, 4 * len(TOL.delays)
     powers = np.array([[(s - i, b - j) for i in (0, 1) for j in (0, 1)] for s, b in corners])
-    light = np.repeat(np.ldexp(1.0, TOLERANCES.light_octaves * powers).reshape(-1, 2), len(TOLERANCES.delays), axis=0)
-    delay = (system.bins // 2 + np.tile(TOLERANCES.delays, 4 * len(corners))) * (system.period_ns / system.bins)
+    light = np.repeat(np.ldexp(1.0, TOL.light_octaves * powers).reshape(-1, 2), len(TOL.delays), axis=0)
+    delay = (system.bins // 2 + np.tile(TOL.delays, 4 * len(corners))) * (system.period_ns / system.bins)
     flux = Flux(light[None, :, 0], light[None, :, 1], delay[None])
     judged = Task(flux, system, 1, 0, np.zeros(light.shape[0], np.uint32), 0, task.threads, None)
     done: Known = {}
@@ -284,20 +284,20 @@ def _refined(task: Task, corners: list[Corner], start: KindArray) -> Known:
             checks = Check.of(judged, pixels, kinds, parts=True)
             for k, corner in enumerate(members):
                 own = slice(k * each, (k + 1) * each)
-                settled = checks.sweeps[own] <= TOLERANCES.mean_sweeps
+                settled = checks.sweeps[own] <= TOL.mean_sweeps
                 distance, parts = checks.of_law[own][settled], checks.parts[own][settled]
-                fine = not settled.any() or distance.max() <= TOLERANCES.mean_distance
+                fine = not settled.any() or distance.max() <= TOL.mean_distance
                 grid = CornerGrid(kinds, int(np.median(checks.sweeps[own])), float(np.median(checks.armed[own])))
                 if fine:
                     before, done[corner] = corner in done, grid
                 if not settled.any() or (corner in done and (not fine or before)):
                     del grids[corner]  # the narrower grid stays
                     continue
-                widest = start if rounds <= TOLERANCES.joining_rounds else kinds
+                widest = start if rounds <= TOL.joining_rounds else kinds
                 grids[corner] = _recut(kinds, widest, distance, parts)
-                if fine and cells_of(grids[corner]) > TOLERANCES.worthwhile * cells_of(kinds):
+                if fine and cells_of(grids[corner]) > TOL.worthwhile * cells_of(kinds):
                     del grids[corner]
-                elif cells_of(grids[corner]) > TOLERANCES.cells:
+                elif cells_of(grids[corner]) > TOL.cells:
                     done[corner] = grid._replace(kinds=None)
                     del grids[corner]
     return done
@@ -312,13 +312,13 @@ def _recut(kinds: KindArray, widest: KindArray, distance: FloatArray, parts: Flo
     """
     worst = (parts * np.maximum(distance**2 / np.maximum(parts.sum(-1), 1e-300), 1.0)[:, None]).max(0)
     now = kinds.astype(np.int64)
-    cells, goal = (1 << now).astype(np.float64), (0.8 * TOLERANCES.mean_distance) ** 2
-    fine = bool(distance.max() <= TOLERANCES.mean_distance)
+    cells, goal = (1 << now).astype(np.float64), (0.8 * TOL.mean_distance) ** 2
+    fine = bool(distance.max() <= TOL.mean_distance)
     least = widest.astype(np.int64) - now
-    most = np.minimum(0 if fine else TOLERANCES.halvings_at_once, TOLERANCES.halvings - now)
+    most = np.minimum(0 if fine else TOL.halvings_at_once, TOL.halvings - now)
 
     def halvings(level: float) -> IndexArray:
-        return np.clip(least_power(5, worst / (level * cells), -TOLERANCES.halvings, TOLERANCES.halvings), least, most)
+        return np.clip(least_power(5, worst / (level * cells), -TOL.halvings, TOL.halvings), least, most)
 
     low, high = 1e-12 * goal, max(float((worst / cells).max()), goal) * 2.0**29
     for _ in range(40):
@@ -329,6 +329,6 @@ def _recut(kinds: KindArray, widest: KindArray, distance: FloatArray, parts: Flo
     if not fine and not (more > 0).any():
         more[np.argmax(worst)] = 1
     graded = np.asarray(now + more, np.int64)
-    for turn in (1, -1) * (TOLERANCES.halvings // TOLERANCES.graded + 1):
-        graded = np.maximum(graded, np.roll(graded, turn) - TOLERANCES.graded)
+    for turn in (1, -1) * (TOL.halvings // TOL.graded + 1):
+        graded = np.maximum(graded, np.roll(graded, turn) - TOL.graded)
     return graded.astype(np.uint8)

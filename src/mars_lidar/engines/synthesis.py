@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from mars_lidar._base.types import FloatArray, IndexArray, Progress
 from mars_lidar.engines.engine import Task
 from mars_lidar.engines.pixels import Alignment
-from mars_lidar.engines.tolerances import TOLERANCES
+from mars_lidar.engines.tolerances import TOL
 from mars_lidar.statistics.count_pmf import Pmf
 
 # --- Counts ----------------------------------------------------------------------------------------------------------
@@ -242,8 +242,8 @@ class Run:
     def draw(self, batch: Batch) -> None:
         """All realizations of the batch's pixels."""
         number = self.task.realizations
-        deep = min(number, TOLERANCES.batch_exposures)
-        wide = max(1, TOLERANCES.batch_exposures // deep)
+        deep = min(number, TOL.batch_exposures)
+        wide = max(1, TOL.batch_exposures // deep)
         for first in range(0, batch.pixels.size, wide):
             some = batch.part(slice(first, first + wide))
             for realization in range(0, number, deep):

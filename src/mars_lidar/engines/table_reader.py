@@ -20,7 +20,7 @@ from mars_lidar._base.types import FloatArray, IndexArray, Progress
 from mars_lidar.engines.engine import Task
 from mars_lidar.engines.pixels import Alignment, single_return
 from mars_lidar.engines.synthesis import Batch, CountLaws, Run, Tabulated
-from mars_lidar.engines.tolerances import TOLERANCES
+from mars_lidar.engines.tolerances import TOL
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
@@ -124,8 +124,8 @@ class TableReader:
         expected = system.cycles * total / (1.0 + total * system.dead_time_periods)
         within = (signal > 0.0) & (signal >= self.table.signal[0]) & (signal <= self.table.signal[-1])
         within &= (background >= self.table.background[0]) & (background <= self.table.background[-1])
-        some = np.flatnonzero(within & (expected * TOLERANCES.misplaced_share < TOLERANCES.misplaced))
-        some = some[np.argsort(-total[some], kind="stable")][: TOLERANCES.start_up_pixels]
+        some = np.flatnonzero(within & (expected * TOL.misplaced_share < TOL.misplaced))
+        some = some[np.argsort(-total[some], kind="stable")][: TOL.start_up_pixels]
         if not some.size:
             return
         error = self.table.start_up_error(
@@ -138,7 +138,7 @@ class TableReader:
         )
         worst = int(np.argmax(error))
         task.report["start_up_error"] = float(error[worst])
-        if error[worst] > TOLERANCES.misplaced_share:
+        if error[worst] > TOL.misplaced_share:
             at = some[worst]
             warnings.warn(
                 f"table places {error[worst]:.2g} of the registrations ({error[worst] * expected[at]:.2g} of "
@@ -298,7 +298,7 @@ def image_table(
     if single is None:
         return None
     signal, background = single[0], light.background.reshape(-1)
-    if len(np.unique(np.stack([*single, background], 1), axis=0)) < TOLERANCES.table_pixels:
+    if len(np.unique(np.stack([*single, background], 1), axis=0)) < TOL.table_pixels:
         return None
     options: dict[str, Any] = {"threads": threads, "progress": progress}
     return Table.cached(system, _axis("signal", signal), _axis("background", background), **options)
@@ -310,7 +310,7 @@ def _axis(name: str, photons: FloatArray) -> Any:
     if some.size == 0:
         return np.array([0.0, 1e-6])
     low, high = float(some.min()), float(some.max())
-    if high < low * (1.0 + TOLERANCES.axis_width):
-        return np.array([low * (1.0 - TOLERANCES.axis_width), high * (1.0 + TOLERANCES.axis_width)])
+    if high < low * (1.0 + TOL.axis_width):
+        return np.array([low * (1.0 - TOL.axis_width), high * (1.0 + TOL.axis_width)])
     first, last = math.floor(8 * math.log10(low)), math.ceil(8 * math.log10(high))  # eighths of a decade
     return 10.0 ** (first / 8), 10.0 ** (last / 8), max(2, 1 + (last - first) * _PER_DECADE[name] // 8)

@@ -112,4 +112,4 @@ class Tolerances:
     """Steps of progress of a call of several stages."""
 
 
-TOLERANCES = Tolerances()
+TOL = Tolerances()

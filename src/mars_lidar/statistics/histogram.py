@@ -88,10 +88,10 @@ def mean_histogram(
     return mean_histograms(cells, tolerance, threads).reshape(*cells.shape, system.bins)
 
 
-def histogram_effects(system: object) -> tuple[str, ...]:
+def histogram_effects(system: System) -> tuple[str, ...]:
     """Effects of the detector that the mean histogram treats in the mode of `system`."""
-    able = isinstance(system, System) and system.detector.mode in ELECTRONICS_MODES
-    return (*LIGHT_EFFECTS, *(("electronics_dead_time_ns",) if able else ()), *TIMING_EFFECTS)
+    slow = ("electronics_dead_time_ns",) if system.detector.mode in ELECTRONICS_MODES else ()
+    return (*LIGHT_EFFECTS, *slow, *TIMING_EFFECTS)
 
 
 def mean_histograms(cells: Cells, tolerance: float, threads: int | None) -> FloatArray:

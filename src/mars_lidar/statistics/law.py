@@ -23,7 +23,6 @@ from mars_lidar.statistics.count_pmf import Pmf, exact_windows, gaussian_window,
 from mars_lidar.statistics.electronics import record_windows
 from mars_lidar.statistics.exposure import Exposure, refined_moments
 from mars_lidar.statistics.histogram import chain_of, histogram_effects, rearm_of
-from mars_lidar.statistics.histogram import registration_pdf as registration_pdf
 from mars_lidar.statistics.renewal import holding_times
 from mars_lidar.statistics.synchronous import cumulants_of, synchronous_windows
 from mars_lidar.statistics.tolerances import LAW, TOL
@@ -176,7 +175,8 @@ def count_law(
         - ``"exact"``: finite exposure, start and end included, any dead time and every mode of the detector
           (docs/theory_exposure.md, docs/detectors.md); with electronics dead time for modes ``"nonparalyzable"`` and
           ``"gated"``, to 1e-3 (see `electronics_moments`),
-        - ``"mars"``: the Gaussian of the MaRS paper (arXiv 2512.04924), asymptotic in the exposure,
+        - ``"mars"``: the Gaussian of the MaRS paper (arXiv 2512.04924), asymptotic in the exposure: it depends neither
+          on the start nor, but for the grid, on the delay,
         - ``"renewal"``: the Gaussian of a constant-rate renewal process of equal energy, mean
           lambda t / (1 + lambda t_d) and variance lambda t / (1 + lambda t_d)^3,
         - ``"poisson"``: no dead time, the law of the arrivals (inside of the gate) for every mode.
@@ -257,7 +257,6 @@ def _gaussian_moments(method: str, cells: Cells, edge: Literal["centre", "edge"]
     """Mean and variance (cells,) of the Gaussian laws."""
     if method == "renewal":
         return renewal_moments(cells.signal + cells.background, cells.system)
-
     mean, variance = np.zeros(cells.size), np.zeros(cells.size)
     for k in range(cells.size):
         chain = chain_of(cells, k, edge)

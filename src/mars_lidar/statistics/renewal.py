@@ -1,7 +1,6 @@
-"""Markov-renewal theory of the count: holding times, their covariances, and the Gaussian count law of MaRS.
+"""Markov-renewal theory of the count: holding times of a `PhaseChain` and their covariances, in laser periods.
 
-Equation numbers refer to docs/theory.md, section 3. Inner functions work on a `PhaseChain`, in laser periods;
-`mars_moments` takes the flux and the system.
+Equation numbers refer to docs/theory.md, section 3. `count_law` of method "mars" is the Gaussian that follows (3.11).
 """
 
 from __future__ import annotations
@@ -12,15 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.display import brief
 from mars_lidar._base.types import FloatArray
-from mars_lidar.instrument.system import System
-from mars_lidar.light.flux import Flux
-from mars_lidar.statistics.cells import cell_name, default_bins, photons_per_bin, require_mode
-from mars_lidar.statistics.chain import PhaseChain, Rearm, Stationary, stationary_from
-from mars_lidar.statistics.phase_chain import cyclic_recursion
+from mars_lidar.statistics.chain import PhaseChain, Stationary, cyclic_recursion, stationary_from
 from mars_lidar.statistics.tolerances import TOL
 
 
@@ -292,71 +286,3 @@ def holding_times(chain: PhaseChain) -> HoldingTimes:
     for array in (mean, variance, value):
         array.flags.writeable = False
     return HoldingTimes(stationary, mean, variance, mu, sigma_ss2, sigma2, covariance_sum, value, defect)
-
-
-@checked
-def mars_moments(
-    flux: Flux,
-    system: System,
-    *,
-    rearm: Rearm = "centre",
-    bins: int | None = None,
-) -> tuple[FloatArray, FloatArray]:
-    """Mean and variance of the MaRS count law N ~ Normal(t / mu, t sigma^2 / mu^3), t the exposure (3.11).
-
-    The asymptotic law of a long exposure: it depends neither on the start of the exposure nor, except through the
-    grid, on the delay.
-
-    Parameters
-    ----------
-    flux, system
-        The light of pixels of shape (...), and what registers it.
-    rearm
-        ``"centre"``, or ``"edge"`` for the re-arming of Rapp's code.
-    bins
-        As `photons_per_bin`.
-
-    Returns
-    -------
-    tuple
-        mean, variance: arrays (...); 0, 0 where there is no flux.
-
-    Raises
-    ------
-    TypeError
-        No `Flux` or no `System`.
-    ValueError
-        `rearm` or `bins` out of range; a detector of another mode than ``"nonparalyzable"``, or with effects that the
-        chain does not describe.
-    ConvergenceError
-        Where a solution did not converge; the message names the cell.
-
-    See Also
-    --------
-    count_law, exposure_moments, holding_times
-
-    Examples
-    --------
-    >>> import mars_lidar as ml
-    >>> system = ml.System(
-    ...     period_ns=100.0, cycles=1000, bins=128,
-    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
-    ... )
-    >>> mean, variance = ml.statistics.mars_moments(ml.Flux(1.0, 1.0, 40.0), system)
-    >>> round(float(mean), 1), round(float(variance), 1)
-    (815.1, 127.3)
-    """
-    require_mode("mars_moments", system)
-    checks.choice("rearm", rearm, ("centre", "edge"))
-    mean, variance = np.zeros(flux.shape), np.zeros(flux.shape)
-    if bins is None and flux.waveform is None:
-        bins = default_bins(system)
-    for index in np.ndindex(flux.shape):
-        photons = photons_per_bin(flux[index], system, bins=bins)
-        if not photons.any():
-            continue
-        cell = cell_name(flux[index], system)
-        times = holding_times(PhaseChain(photons, system.dead_time_periods, rearm, cell))
-        mean[index] = system.cycles / times.mu
-        variance[index] = system.cycles * times.sigma2 / times.mu**3
-    return mean, variance

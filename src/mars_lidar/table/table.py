@@ -30,12 +30,11 @@ from mars_lidar._version import __version__
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.statistics.cells import require_mode
-from mars_lidar.statistics.chain import Rearm
+from mars_lidar.statistics.chain import ConvergenceError, Rearm
 from mars_lidar.statistics.count_pmf import Pmf, total_variation
 from mars_lidar.statistics.exposure import exposure_moments, normalised
 from mars_lidar.statistics.law import count_law
 from mars_lidar.statistics.matched import matched_pmf
-from mars_lidar.statistics.phase_chain import ConvergenceError
 from mars_lidar.table import cache, storage
 from mars_lidar.table.axes import PAPER_GRID, Grid, axis_values, describe, inserted, midpoints, thinned
 from mars_lidar.table.entries import (
@@ -51,7 +50,7 @@ from mars_lidar.table.entries import (
     start_phases,
 )
 from mars_lidar.table.error import LawError, QuantisationError, deviations, law_variation, random_pixels
-from mars_lidar.table.tolerances import TOLERANCES
+from mars_lidar.table.tolerances import TOL
 
 Interpolation = Literal["bilinear", "nearest"]
 INTERPOLATIONS, OUTSIDE = ("bilinear", "nearest"), ("error", "exact")
@@ -182,10 +181,10 @@ class Table:
         began = time.perf_counter()
         if goal is None:
             table = _evaluated(system, axes, recipe, progress)
-            error = table.quantisation_error(samples=TOLERANCES.error_pixels, threads=recipe.threads)
+            error = table.quantisation_error(samples=TOL.error_pixels, threads=recipe.threads)
         else:
             table, error = _refined(system, axes, recipe, goal, progress)
-        longest = table._long_error(TOLERANCES.error_pixels, recipe.threads)
+        longest = table._long_error(TOL.error_pixels, recipe.threads)
         law = table.law_error(threads=recipe.threads).to_dict() if check_law else None
         table.provenance.update(
             key=storage.request_key(system, axes, method=method, rearm=rearm, refine=goal, tolerance=tolerance),
@@ -537,10 +536,10 @@ class Table:
 
     def _long_error(self, samples: int, threads: int | None) -> QuantisationError | None:
         """Errors at the longest exposure, 1e8 cycles; None where some entry does not serve it, or has no exact law."""
-        if self.system.cycles != TOLERANCES.cycles and not self.entries.serves(TOLERANCES.cycles).all():
+        if self.system.cycles != TOL.cycles and not self.entries.serves(TOL.cycles).all():
             return None
         try:
-            return self.quantisation_error(samples=samples, cycles=TOLERANCES.cycles, threads=threads)
+            return self.quantisation_error(samples=samples, cycles=TOL.cycles, threads=threads)
         except ConvergenceError:  # the law of a random pixel between the entries, which is much of a locked one
             return None
 
@@ -642,10 +641,10 @@ def _refined(
     system: System, axes: Axes, recipe: Recipe, goal: float, progress: Progress | None
 ) -> tuple[Table, QuantisationError]:
     inner = goal
-    for _ in range(TOLERANCES.attempts):
+    for _ in range(TOL.attempts):
         axes = _refined_axes(*axes, lambda s, b: recipe.entries(s, b, system), inner)
         table = _evaluated(system, axes, recipe, progress)
-        error = table.quantisation_error(samples=4 * TOLERANCES.error_pixels, threads=recipe.threads)
+        error = table.quantisation_error(samples=4 * TOL.error_pixels, threads=recipe.threads)
         if error.largest <= goal:
             return table, error
         inner *= 0.5
@@ -675,7 +674,7 @@ def _refined_axes(
 def _lines(axis: FloatArray) -> FloatArray:
     positive = axis[axis > 0]
     span = np.log(positive[-1] / positive[0]) if positive.size else 0.0
-    some = axis[thinned(axis, max(span / (TOLERANCES.lines - 1), 1e-9))]
+    some = axis[thinned(axis, max(span / (TOL.lines - 1), 1e-9))]
     return some[some > 0] if positive.size else some
 
 
@@ -683,7 +682,7 @@ def _refined_axis(
     axis: FloatArray, along: Callable[[FloatArray], Entries], lines: FloatArray, goal: float
 ) -> FloatArray:
     """One axis. `along` evaluates points x lines; lines are the exact nodes of a table's second axis here."""
-    for _ in range(TOLERANCES.rounds):
+    for _ in range(TOL.rounds):
         if axis.size < 2:
             return axis
         between = midpoints(axis)
@@ -705,11 +704,11 @@ def _refined_axis(
         bad = np.maximum(law, shape).reshape(between.size, lines.size).max(1) > 0.5 * goal
         if not bad.any():
             return axis
-        if axis.size + int(bad.sum()) > TOLERANCES.points:
+        if axis.size + int(bad.sum()) > TOL.points:
             break
         axis = inserted(axis, between[bad])
     raise ValueError(
-        f"refine must be an error that {TOLERANCES.points} points of an axis and {TOLERANCES.rounds} rounds can meet, "
+        f"refine must be an error that {TOL.points} points of an axis and {TOL.rounds} rounds can meet, "
         f"got {goal:g}: "
         f"{axis.size} points in [{axis[0]:g}, {axis[-1]:g}] do not meet it; choose a larger error or a smaller range"
     )

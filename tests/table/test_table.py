@@ -263,7 +263,7 @@ def test_axes():
         ({"tolerance": 0.0}, ValueError, "tolerance must be"),
         ({"check_law": 1}, TypeError, "check_law must be"),
         ({"threads": 0}, ValueError, "threads must be"),
-        ({"progress": 3}, TypeError, "progress must be callable"),
+        ({"progress": 3}, TypeError, "progress must be a callable"),
     ],
 )
 def test_bad_requests(change, error, told):

@@ -35,7 +35,7 @@ from mars_lidar.statistics.count_pmf import Pmf, total_variation
 from mars_lidar.statistics.exposure import exposure_moments, normalised
 from mars_lidar.statistics.law import count_law
 from mars_lidar.statistics.matched import matched_pmf
-from mars_lidar.table import cache, storage
+from mars_lidar.table import storage
 from mars_lidar.table.axes import PAPER_GRID, Grid, axis_values, describe, inserted, midpoints, thinned
 from mars_lidar.table.entries import (
     Entries,
@@ -53,8 +53,6 @@ from mars_lidar.table.error import LawError, QuantisationError, deviations, law_
 from mars_lidar.table.tolerances import TOL
 
 Interpolation = Literal["bilinear", "nearest"]
-INTERPOLATIONS, OUTSIDE = ("bilinear", "nearest"), ("error", "exact")
-_METHODS, _REARMS = ("exposure", "mars"), ("centre", "edge")
 
 Axes = tuple[FloatArray, FloatArray]
 Evaluate = Callable[[FloatArray, FloatArray], Entries]
@@ -115,6 +113,7 @@ class Table:
     __repr__ = brief
 
     @classmethod
+    @checked
     def build(
         cls,
         system: System,
@@ -163,13 +162,9 @@ class Table:
         ConvergenceError
             Naming the cell that could not be evaluated.
         """
-        if not isinstance(system, System):
-            raise TypeError(f"system must be a System, got {type(system).__name__}")
         require_mode("a table", system)
         system = system.detected()  # its axes are detected photons
         axes = axis_values("signal", signal), axis_values("background", background)
-        checks.choice("method", method, _METHODS)
-        checks.choice("rearm", rearm, _REARMS)
         if rearm != "centre" and method != "mars":
             raise ValueError(f"rearm must be 'centre' for method {method!r}, which has no such choice, got {rearm!r}")
         goal = None if refine is None else checks.real("refine", refine, low=1e-5, high=0.1)
@@ -197,6 +192,7 @@ class Table:
         return table
 
     @classmethod
+    @checked
     def cached(
         cls,
         system: System,
@@ -213,7 +209,7 @@ class Table:
         if existing is None:
             table = cls.build(system.detected(), signal, background, **options)
             try:
-                cache.keep(table.save, own)
+                storage.put_into_cache(table.save, own)
             except OSError as error:
                 warnings.warn(
                     f"the table cannot be kept in {own.parent} ({reason(error)}) and will be built again the next "
@@ -225,6 +221,7 @@ class Table:
         return cls.load(existing or own, system)
 
     @classmethod
+    @checked
     def cached_path(cls, system: System, signal: Grid, background: Grid, **options: Any) -> Path:
         """File of the table in the cache; built and put there where it is not.
 
@@ -233,7 +230,7 @@ class Table:
         """
         own, existing = cls._search(system, signal, background, options)
         if existing is None:
-            cache.keep(cls.build(system.detected(), signal, background, **options).save, own)
+            storage.put_into_cache(cls.build(system.detected(), signal, background, **options).save, own)
         return existing or own
 
     @classmethod
@@ -241,8 +238,6 @@ class Table:
         cls, system: System, signal: Grid, background: Grid, options: dict[str, Any]
     ) -> tuple[Path, Path | None]:
         """Path of the table in the cache, and the existing file that can be used instead, or None."""
-        if not isinstance(system, System):
-            raise TypeError(f"system must be a System, got {type(system).__name__}")
         system = system.detected()
         chosen = {"method": "exposure", "rearm": "centre", "refine": None, "tolerance": 1e-4} | options
         unknown = set(chosen) - {"method", "rearm", "refine", "tolerance", "check_law", "threads", "progress"}
@@ -250,7 +245,7 @@ class Table:
             raise TypeError(f"the options are those of Table.build, got {sorted(unknown)[0]!r}")
         axes = axis_values("signal", signal), axis_values("background", background)
         request = {name: chosen[name] for name in ("method", "rearm", "refine", "tolerance")}
-        own, others = cache.candidates(storage.request_key(system, axes, **request), system.cycles)
+        own, others = storage.cached_candidates(storage.request_key(system, axes, **request), system.cycles)
         for path in (own, *others):
             with contextlib.suppress(OSError, ValueError):  # absent, out of reach, damaged, or of too few cycles
                 law = cls.load(path, system).provenance["law"]
@@ -289,8 +284,6 @@ class Table:
             Where the table is of another system, naming the field that differs. Another number of cycles is no
             difference where every entry holds for it.
         """
-        if system is not None and not isinstance(system, System):
-            raise TypeError(f"system must be a System, got {type(system).__name__}")
         with reading(path, "a table of mars-lidar") as source:
             header, arrays = storage.read(source)
             made_for = System.from_json(header["system"])
@@ -357,6 +350,7 @@ class Table:
         light = flux.signal, flux.background, flux.delay_ns
         return self.at(*light, cycles=cycles, interpolation=interpolation, outside=outside, threads=threads)
 
+    @checked
     def at(
         self,
         signal: ArrayLike,
@@ -372,8 +366,6 @@ class Table:
 
         Without delays, at the canonical t_r / 2; `cycles`, `interpolation`, `outside` and `threads` as there.
         """
-        checks.choice("interpolation", interpolation, INTERPOLATIONS)
-        checks.choice("outside", outside, OUTSIDE)
         periods = self._cycles(cycles)
         team = thread_count(threads)
         s, b, phase, beyond = read_pixels(
@@ -443,6 +435,7 @@ class Table:
             f"{self.entries.cycles} cycles, and {why}"
         )
 
+    @checked
     def quantisation_error(
         self,
         *,
@@ -464,7 +457,6 @@ class Table:
         threads
             Threads to run on; default: all processors that this process may use.
         """
-        checks.choice("interpolation", interpolation, INTERPOLATIONS)
         samples = checks.integer("samples", samples, low=1, high=1_000_000)
         rng = np.random.default_rng(checks.integer("seed", seed, low=0, high=2**64 - 1))
         periods = self.system.cycles if cycles is None else checks.integer("cycles", cycles, low=1, high=10**8)

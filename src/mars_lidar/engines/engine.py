@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.cached import cached_property
+from mars_lidar._base.native import _core
 from mars_lidar._base.resources import check_memory
 from mars_lidar._base.types import Progress
 from mars_lidar.engines.tolerances import TOL
@@ -28,7 +29,6 @@ from mars_lidar.light.flux import Flux
 from mars_lidar.light.timestamps import record_bins, record_times
 
 if TYPE_CHECKING:
-    from mars_lidar._base.native import _core
     from mars_lidar.table import Table
 
 IN_PARTS = (
@@ -86,8 +86,6 @@ class Task:
     @cached_property
     def job(self) -> _core.Job:
         """The native form of this task; times in laser periods."""
-        from mars_lidar._base.native import _core
-
         wave = self.flux.waveform
         detector = self.system.detector
         start, step, width = detector.gate_periods(self.system.period_ns)
@@ -238,8 +236,6 @@ class Engine(ABC):
 @lru_cache(maxsize=16)
 def _recording(detector: Detector, period_ns: float) -> _core.Recording:
     """What the electronics make of registrations; times in periods."""
-    from mars_lidar._base.native import _core
-
     given = native_fields({name: getattr(detector, name) for name in RECORDING_EFFECTS}, period_ns)
     return _core.Recording(**(_EVERYTHING | given))
 

@@ -18,6 +18,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.native import _core
 from mars_lidar._base.types import FloatArray, IndexArray, Progress
 from mars_lidar.engines.engine import Task
 from mars_lidar.engines.pixels import Alignment
@@ -79,8 +80,6 @@ class OfPixels(CountLaws):
 
     def fill(self, streams: Streams, out: IndexArray) -> None:
         """Draw counts into `out` (realizations, pixels)."""
-        from mars_lidar._base.native import _core
-
         streams.fill(getattr(_core, self.native), out, **vars(self))
 
 
@@ -136,8 +135,6 @@ class Tabulated(CountLaws):
 
     def fill(self, streams: Streams, out: IndexArray) -> None:
         """Draw counts into `out` (realizations, pixels)."""
-        from mars_lidar._base.native import _core
-
         laws = {"first": self.first, "offsets": self.offsets, "cumulative": self.cumulative}
         streams.fill(_core.tabulated_counts, out, law=self.law, **laws)
 
@@ -250,8 +247,6 @@ class Run:
                 self._draw(some, realization, min(deep, number - realization))
 
     def _draw(self, batch: Batch, first: int, number: int) -> None:
-        from mars_lidar._base.native import _core
-
         task, pixels = self.task, batch.pixels
         index = np.ascontiguousarray(task.pixel_index[pixels])
         start = task.first_realization + first

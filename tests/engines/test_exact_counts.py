@@ -162,14 +162,14 @@ def test_usual_pixels_are_drawn_as_before():
 
 
 def test_parts_batches_and_threads_do_not_show(monkeypatch: pytest.MonkeyPatch):
-    from mars_lidar.engines import count_shape as _count_shape
     from mars_lidar.engines import synthesis as _synthesis
+    from mars_lidar.engines import table_reader as _table_reader
 
     flux = doubted(pixels=160)
     whole = ml.simulate(flux, SYSTEM, engine="mars", table=table(), realizations=3, threads=2)
     small = replace(TOL, batch_exposures=4, looked_up=11)
     monkeypatch.setattr(_synthesis, "TOL", small)
-    monkeypatch.setattr(_count_shape, "TOL", small)
+    monkeypatch.setattr(_table_reader, "TOL", small)
     monkeypatch.setitem(vars(STATISTICS), "block", 3)
     assert np.array_equal(whole, ml.simulate(flux, SYSTEM, engine="mars", table=table(), realizations=3, threads=1))
     index = np.arange(flux.signal.size).reshape(1, -1)[:, 7:20]

@@ -16,8 +16,7 @@ from mars_lidar import Detector, System, _core
 from mars_lidar.engines.auto import AutoEngine
 from mars_lidar.engines.engine import Task
 from mars_lidar.engines.exact import ExactEngine
-from mars_lidar.engines.feedback import FeedbackEngine, expected_registrations
-from mars_lidar.engines.feedback_grid import Check, Grids, cells_of, least_power
+from mars_lidar.engines.feedback import Check, FeedbackEngine, Grids, cells_of, expected_registrations, least_power
 from mars_lidar.engines.tolerances import TOL
 
 # What is given to other engines

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from mars_lidar.engines.engine import Engine, Task, stage
 from mars_lidar.engines.exact import ExactEngine
-from mars_lidar.engines.feedback import FeedbackEngine, Plan, draw_rest, expected_registrations
-from mars_lidar.engines.feedback_grid import judged_alone
+from mars_lidar.engines.feedback import FeedbackEngine, Plan, draw_rest, expected_registrations, judged_alone
 from mars_lidar.engines.tolerances import TOL
 
 

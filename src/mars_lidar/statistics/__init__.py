@@ -9,7 +9,7 @@ from mars_lidar.statistics.histogram import mean_histogram, registration_pdf
 from mars_lidar.statistics.joint import JointLaw, joint_law
 from mars_lidar.statistics.law import CountLaw, count_law
 from mars_lidar.statistics.paralyzable import paralyzable_moments
-from mars_lidar.statistics.renewal import HoldingTimes, MomentMatrices, holding_times, moment_matrices
+from mars_lidar.statistics.renewal import HoldingTimes, holding_times
 from mars_lidar.statistics.spectral import HoldingTimeCovariance, holding_time_covariance
 
 __all__ = [
@@ -19,7 +19,6 @@ __all__ = [
     "HoldingTimeCovariance",
     "HoldingTimes",
     "JointLaw",
-    "MomentMatrices",
     "Moments",
     "PhaseChain",
     "Stationary",
@@ -31,7 +30,6 @@ __all__ = [
     "holding_times",
     "joint_law",
     "mean_histogram",
-    "moment_matrices",
     "paralyzable_moments",
     "photons_per_bin",
     "registration_pdf",

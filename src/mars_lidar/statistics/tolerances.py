@@ -173,8 +173,8 @@ class Tolerances:
         one of a solution.
     holding_times
         Allowed difference of a moment of the holding times by independent routes, relative to its largest term.
-    dense_bins, eigen_bins
-        Bins of dense matrices (512 MiB each), and of an eigen-decomposition, O(n^3).
+    eigen_bins
+        Bins of an eigen-decomposition, O(n^3).
     most_lags, most_modes
         Lags of a covariance, an O(n) product each; eigenvalues that the automatic rule considers.
     most_mean, matched_outside
@@ -269,7 +269,6 @@ class Tolerances:
     chain_residual: float = 1e-12
     chain_worst_residual: float = 1e-10
     holding_times: float = 1e-7
-    dense_bins: int = 8192
     eigen_bins: int = 4096
     most_lags: int = 100_000
     most_modes: int = 12

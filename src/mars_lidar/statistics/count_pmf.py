@@ -238,7 +238,7 @@ def _folded(cells: Cells, first: IndexArray, size: int, bins: int, threads: int)
 
 
 def _if_whole(pmf: FloatArray, first: int, mean: float, spread: float) -> Pmf | None:
-    """The window where it contains the law: ends below `TOL.edge`, nothing negative, sum 1, the assumed mean."""
+    """The window where it contains the law: ends below `Tolerances.edge`, nothing negative, sum 1, the assumed mean."""
     away = float(pmf @ (first + np.arange(pmf.size))) - mean
     ends = _ends(pmf, first)
     if not (ends <= TOL.edge and abs(away) <= TOL.like_mean * max(spread, 0.5) and float(pmf.min()) >= -TOL.consistent):

@@ -30,8 +30,8 @@ class Request:
 
     `truth` is the engine whose simulation the study "count-law" takes for true; `stream` a measured photon stream for
     the study "hardware"; `config` the size of "downstream"; `seed` and `systems` another sweep, and its size, of the
-    studies "domain" and "long-exposures"; `rgbd` a folder of RGB-D pairs and `captures` one of measured cubes for the
-    study "image".
+    studies "domain" and "long-exposures"; `rgbd` a folder of RGB-D pairs, `captures` one of measured cubes and
+    `drunet` a file of weights of deepinv's DRUNet for the study "image".
     """
 
     out: Path
@@ -45,6 +45,7 @@ class Request:
     systems: int | None = None
     rgbd: Path | None = None
     captures: Path | None = None
+    drunet: Path | None = None
 
 
 class OtherRunsError(ValueError):
@@ -53,13 +54,13 @@ class OtherRunsError(ValueError):
 
 def _studies() -> dict[str, tuple[str, str]]:
     """Module and words by name, of every module whose first line is ``Study "NAME": words``."""
-    found = {}
+    results = {}
     for path in sorted(Path(__file__).parent.glob("*/*.py")):
         with path.open(encoding="utf-8") as file:
             named = re.match(r'"""Study "([a-z-]+)"[:,] (.*)', file.readline())
         if named:
-            found[named[1]] = f"studies.{path.parent.name}.{path.stem}", named[2].rstrip('."')
-    return found
+            results[named[1]] = f"studies.{path.parent.name}.{path.stem}", named[2].rstrip('."')
+    return results
 
 
 STUDIES = _studies()

@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
 from mars_lidar._base.types import FloatArray
-from mars_lidar.statistics import HoldingTimeCovariance, moment_matrices
+from mars_lidar.statistics import HoldingTimeCovariance, PhaseChain
 from studies import Tell
 from studies.covariance.settings import SPECTRAL, SPECTRAL_NAME, Cell, Settings
 
 
 def dense_checks(settings: Settings, cells: list[Cell], extra: int, tell: Tell) -> list[dict[str, Any]]:
     """Some cells the paper's way: the slowest at each dead time, the worst, `extra` at random, per grid."""
-    found = [_dense_check(cell) for cell in _chosen(settings, cells, extra)]
-    tell(f"covariance: {len(found)} cells by dense matrices, re-arming at the {cells[0].rearm}")
-    return found
+    results = [_dense_check(cell) for cell in _chosen(settings, cells, extra)]
+    tell(f"covariance: {len(results)} cells by dense matrices, re-arming at the {cells[0].rearm}")
+    return results
 
 
 def _chosen(settings: Settings, cells: list[Cell], extra: int) -> Iterator[Cell]:
@@ -42,8 +43,8 @@ def _dense_check(cell: Cell) -> dict[str, Any]:
     terms = cell.terms
     dense = HoldingTimeCovariance(**{name: getattr(terms, name) for name in terms.__dataclass_fields__})
     count = SPECTRAL[1] + 1
-    reference, found = dense.eigenvalues[:count], terms.eigenvalues[:count]
-    apart = np.abs(reference[:, None] - found[None, :]).min(axis=1)
+    reference, arnoldi = dense.eigenvalues[:count], terms.eigenvalues[:count]
+    apart = np.abs(reference[:, None] - arnoldi[None, :]).min(axis=1)
     apart = apart[:-1] if np.abs(reference[-1].imag) > 0 else apart  # the last may be half of a pair
     paper = dense.spectral_sum(*SPECTRAL)
     inverse = _by_inverse(cell)
@@ -59,14 +60,36 @@ def _dense_check(cell: Cell) -> dict[str, Any]:
     }
 
 
+def moment_matrices(chain: PhaseChain) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Dense P, mean mu_ij and variance sigma_ij^2 of the holding time given the step i -> j, periods (3.1-3.3)."""
+    n = chain.bins
+    j = np.arange(n)
+    arm = (j + chain.shift) % n
+    ahead = (j[None, :] - arm[:, None]) % n
+    # M and Sigma away from the re-arming bin: a geometric number of further periods (3.1, 3.2)
+    loss, passed = chain.loss, math.exp(-chain.total)
+    mean = (chain.blind_bins + ahead) / n + passed / loss
+    variance = np.full((n, n), passed / loss**2)
+    # the re-arming bin is met once in part, then whole every period (3.3)
+    again = chain.again()
+    there = chain.refire + again
+    with np.errstate(invalid="ignore", divide="ignore"):
+        first = np.where(there > 0, again / loss / there, 0.0)
+        second = np.where(there > 0, again * (1.0 + passed) / loss**2 / there, 0.0)
+    mean[j, arm] = chain.blind_bins / n + first[arm]
+    variance[j, arm] = (second - first**2)[arm]
+    return chain.dense(), mean, variance
+
+
 def _parts(cell: Cell) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Dense P, pi, pi Q_mu - mu pi and Q_mu 1 - mu, all from matrices, in periods (3.7)."""
     chain = cell.terms.chain
     pdf = np.asarray(cell.terms.stationary_pdf)
-    q_mu = moment_matrices(chain).q_mu
+    matrix, waits, _ = moment_matrices(chain)
+    q_mu = matrix * waits
     mean = q_mu.sum(axis=1)
     mu = float(pdf @ mean)
-    return chain.dense(), pdf, pdf @ q_mu - mu * pdf, mean - mu
+    return matrix, pdf, pdf @ q_mu - mu * pdf, mean - mu
 
 
 def _by_solve(cell: Cell) -> float:
@@ -89,7 +112,7 @@ def _by_inverse(cell: Cell) -> float:
     count = SPECTRAL[1]
     if abs(values[order[count - 1]].imag) > 0 and np.count_nonzero(values[order[1:count]].imag) % 2:
         count += 1
-    kept = order[1:count]
-    weight = (row @ vectors[:, kept]) * (inverse[kept] @ value)
-    tail = np.sum(weight * values[kept] ** SPECTRAL[0] / (1.0 - values[kept]))
+    selected = order[1:count]
+    weight = (row @ vectors[:, selected]) * (inverse[selected] @ value)
+    tail = np.sum(weight * values[selected] ** SPECTRAL[0] / (1.0 - values[selected]))
     return cell.terms.cutoff_sum(SPECTRAL[0]) + float(tail.real) * cell.grid.period_ns**2

@@ -14,7 +14,7 @@ from harness.check import COUNTS, SHAPE
 
 import mars_lidar as ml
 from mars_lidar.engines import MarsEngine
-from mars_lidar.engines.tolerances import TOLERANCES
+from mars_lidar.engines.tolerances import TOL
 from mars_lidar.statistics import exposure_moments
 from mars_lidar.table import Table
 
@@ -101,8 +101,8 @@ def test_a_locked_pixel_needs_the_exact_count():
 def test_any_part_alone_on_any_threads(with_table: bool):
     flux, given = image(), table() if with_table else None
     whole = ml.simulate(flux, SYSTEM, engine="mars", table=given, realizations=3, seed=5, threads=2)
-    one = ml.simulate(flux, SYSTEM, engine="mars", table=given, realizations=3, seed=5, threads=1)
-    assert np.array_equal(whole, one)
+    single = ml.simulate(flux, SYSTEM, engine="mars", table=given, realizations=3, seed=5, threads=1)
+    assert np.array_equal(whole, single)
     index = np.arange(35).reshape(5, 7)[1:4]
     part = ml.simulate(flux[1:4], SYSTEM, engine="mars", table=given, first_realization=1, pixel_index=index, seed=5)
     assert np.array_equal(part[0], whole[1, 1:4])
@@ -110,13 +110,13 @@ def test_any_part_alone_on_any_threads(with_table: bool):
 
 
 def test_batches_do_not_show(monkeypatch: pytest.MonkeyPatch):
-    from mars_lidar.engines import count_shape as _count_shape
     from mars_lidar.engines import synthesis as _synthesis
+    from mars_lidar.engines import table_reader as _table_reader
 
     whole = ml.simulate(image(), SYSTEM, engine="mars", table=table(), realizations=5)
-    small = replace(TOLERANCES, batch_exposures=4, looked_up=11)
-    monkeypatch.setattr(_synthesis, "TOLERANCES", small)
-    monkeypatch.setattr(_count_shape, "TOLERANCES", small)
+    small = replace(TOL, batch_exposures=4, looked_up=11)
+    monkeypatch.setattr(_synthesis, "TOL", small)
+    monkeypatch.setattr(_table_reader, "TOL", small)
     assert np.array_equal(whole, ml.simulate(image(), SYSTEM, engine="mars", table=table(), realizations=5))
 
 
@@ -165,8 +165,8 @@ def test_pixels_beyond_the_table_are_an_error_unless_asked_for(engine: str):
     flux = ml.Flux(signal, background, 30.0)
     with pytest.raises(ValueError, match="table must reach every pixel, but 2 of 6 lie outside") as error:
         ml.simulate(flux, SYSTEM, engine=engine, table=table())
-    for told in ("signal 5 to 20", "(the table: 0 to 3)", "background 7.5 to 7.5", "outside='exact'"):
-        assert told in str(error.value)
+    for words in ("signal 5 to 20", "(the table: 0 to 3)", "background 7.5 to 7.5", "outside='exact'"):
+        assert words in str(error.value)
     assert ml.simulate(flux, SYSTEM, engine=engine, table=table(), outside="exact").sum(-1).min() > 0
 
 

@@ -6,7 +6,7 @@ import pytest
 from table.cases import make_system, small_table
 
 import mars_lidar as ml
-from mars_lidar.table import cache, storage
+from mars_lidar.table import storage
 from mars_lidar.table.axes import axis_values
 from tests.harness.command import command_line
 
@@ -43,7 +43,7 @@ def test_a_file_says_what_the_table_said(tmp_path, method):
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "message"),
     [
         ({"bins": 64}, "bins is 32 there and 64 here"),
         ({"period_ns": 90.0}, "period_ns is 100.0 there and 90.0 here"),
@@ -53,10 +53,10 @@ def test_a_file_says_what_the_table_said(tmp_path, method):
         ({"cycles": 2}, "cycles is 200 there and 2 here"),
     ],
 )
-def test_another_system_is_refused(tmp_path, change, told):
+def test_another_system_is_refused(tmp_path, change, message):
     table = small_table()
     table.save(tmp_path / "t.h5")
-    with pytest.raises(ValueError, match=f"is a table of another system: {told}"):
+    with pytest.raises(ValueError, match=f"is a table of another system: {message}"):
         ml.Table.load(tmp_path / "t.h5", table.system.replace(**change))
     longer = ml.Table.load(tmp_path / "t.h5", table.system.replace(cycles=900))
     assert np.array_equal(longer.at(1.0, 1.0).cumulants, table.at(1.0, 1.0, cycles=900).cumulants)
@@ -110,7 +110,7 @@ def test_the_cache_builds_once(own_cache, monkeypatch):
     longer = ml.Table.cached(system.replace(cycles=4000), **grids)
     assert np.array_equal(first.shapes(), again.shapes())
     assert longer.system.cycles == 4000
-    assert cache.files() == [file]
+    assert storage.cached_tables() == [file]
     monkeypatch.undo()
     for other in ({"tolerance": 1e-3}, {"method": "mars"}, {"background": (0.1, 2.0, 4)}):
         key = storage.request_key(
@@ -138,10 +138,10 @@ def test_a_damaged_file_in_the_cache_is_replaced(own_cache):
 def test_where_the_cache_is(tmp_path, monkeypatch):
     monkeypatch.delenv("MARS_LIDAR_CACHE", raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert cache.directory() == tmp_path / "mars-lidar"
+    assert storage.cache_folder() == tmp_path / "mars-lidar"
     monkeypatch.delenv("XDG_CACHE_HOME")
     monkeypatch.setenv("HOME", str(tmp_path / "me"))
-    assert cache.directory() == tmp_path / "me" / ".cache" / "mars-lidar"
+    assert storage.cache_folder() == tmp_path / "me" / ".cache" / "mars-lidar"
 
 
 @pytest.mark.full
@@ -149,10 +149,10 @@ def test_commands(tmp_path, own_cache):
     small = ["--signal", "0.1,5,5", "--background", "0.1,2,4", "--bins", 32, "--pulse-sigma-ns", 4, "--threads", 1]
     done = run("table", "build", *small, "-o", tmp_path / "t.h5", "--check-law")
     assert done.exit_code == 0, done.output
-    told = run("table", "info", tmp_path / "t.h5")
+    printed = run("table", "info", tmp_path / "t.h5")
     words = "0 and 5 log-spaced values in [0.1, 5]", "105 MB", "108 GB", "count law", "start phases", "exact laws"
     for word in words:
-        assert word in told.output, word
+        assert word in printed.output, word
     assert run("table", "build", *small, "-o", tmp_path / "t.h5").exit_code == 2
     assert run("table", "build", *small).exit_code == 0
     assert run("table", "build", *small, "--method", "mars").exit_code == 0

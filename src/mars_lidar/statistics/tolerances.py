@@ -1,12 +1,68 @@
-"""Accuracies, sizes of grids and sizes of blocks of the statistics of one pixel.
+"""What a statistic of one pixel may cost before it is refused; accuracies, sizes of grids and of blocks.
 
-What a statistic may cost is in `budget.py`. Every result is checked where it is computed, against a finer grid, a
-residual or known moments, so that a coarse first guess costs time and not accuracy.
+Costs are counted, not timed: what is refused does not depend on the machine. Seconds are those of one core at 3 GHz.
+Every result is checked where it is computed, against a finer grid, a residual or known moments, so that a coarse first
+guess costs time and not accuracy.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+
+
+@dataclass(frozen=True, kw_only=True)
+class Budget:
+    """Largest costs of one statistic of one pixel.
+
+    Attributes
+    ----------
+    recursion, one_pass
+        Bins x periods of the exposure recursion, on all grids together and on one of them; 80 ns each.
+    transform
+        Bins x periods x batches of eight points of the generating function of the count; 12 ns each.
+    forgetting
+        Bins x periods within which an exposure forgets its start, for the closed form of the joint law; 12 ns each.
+    run_through
+        Bins x periods of an exposure that does not forget its start: the joint law runs through it for every window.
+    record_kernel
+        Probabilities from record to record behind electronics with a dead time; 8 bytes each.
+    record_moments, record_points
+        Multiplications for the moments of the number of these records, and for the points of its law.
+    synchronous_terms, synchronous_points
+        Terms of the sums for a count law of mode synchronous, and points x counts of its transform.
+    history
+        Bytes, in each thread, of the registrations of one dead time.
+    """
+
+    recursion: float
+    one_pass: float
+    transform: float = 8e7
+    forgetting: int = 40_000_000
+    run_through: int = 2**22
+    record_kernel: int
+    record_moments: float
+    record_points: float = 2e10
+    synchronous_terms: int = 2**23
+    synchronous_points: int = 30_000_000
+    history: int = 2**30
+
+    def refusal(self, steps: float) -> str:
+        """Why `steps` bins x periods of the exposure recursion are refused, in seconds of 80 ns a step."""
+        return f"it would take about {8e-8 * steps:.2g} s, and the limit of a law is {8e-8 * self.recursion:.1g} s"
+
+
+LAW = Budget(recursion=2.6e7, one_pass=2.6e7, record_kernel=2**24, record_moments=1.2e9)
+"""Count laws, mean histograms and joint laws: about two seconds."""
+
+MOMENTS = Budget(recursion=math.inf, one_pass=4e9, record_kernel=2**27, record_moments=4e10)
+"""`exposure_moments` and `electronics_moments`: minutes, and a kernel of 1 GiB."""
+
+
+def advice(*names: str) -> str:
+    """The end of a refusal: what to use instead, one of `names` or the exact engine."""
+    simulate = "simulate it with engine 'exact'"
+    return f"use {', '.join(names)}, or {simulate}" if names else simulate
 
 
 @dataclass(frozen=True)
@@ -41,7 +97,7 @@ class Tolerances:
     knots_per_sigma, longest_pulse
         Grid points per sigma of a pulse; support of a pulse, in sigma, up to which a grid that follows it resolves it.
     warm_periods, least_warm_periods, warm_steps
-        Sweeps towards the stationary state, at most, at least, and times bins; beyond, a sparse equation gives it.
+        Sweeps towards the stationary state: most, least, and most sweeps x bins; beyond, a sparse equation gives it.
     chunk_bytes
         Energies and histograms computed together.
     near_bytes, middle_bytes
@@ -52,7 +108,7 @@ class Tolerances:
     cells_of_many, joint_cells_of_many
         Bins of the coarser grids, tried in turn: mean histogram, and joint law.
     few_windows_bins
-        Bins of a grid of the joint law beyond which fewer windows are compared: a window takes long.
+        Bins of a grid of the joint law beyond which fewer windows are compared, because each takes long.
     block
         Cells, windows or bins of a matrix product computed together.
     sampled_delays
@@ -66,8 +122,8 @@ class Tolerances:
     lanes
         Points of the circle that the native core evaluates together.
     near_transform_bytes, far_transform_bytes, far_transform, period_bins
-        History of these points beyond which a step costs `far_transform` times as much, as for a dead time below one
-        bin, and six times that; bins that take as long as the work done once a period.
+        History of these points beyond which a step costs `far_transform` times as much (so does any step where the dead
+        time is below one bin), and beyond which it costs six times that; work done once a period, in bins.
     most_tilt, most_log_growth
         Largest exponential tilt per count, and logarithm of E e^(theta N) of one period: the largest double is e^709.
     consistent, consistent_per_cycle
@@ -92,7 +148,7 @@ class Tolerances:
     blas_thread
         Multiplications of a matrix product that BLAS libraries do on one thread.
     record_block
-        Multiplications that take as long as the overhead of a block of records.
+        Overhead of a block of records, in multiplications.
     records_repeat
         As `repeats`, behind electronics.
     records
@@ -100,25 +156,25 @@ class Tolerances:
     direct_bins
         Bins up to which the stationary equations of records are solved directly.
     record_turns, record_stands
-        Power iterations for them, and their total variation per iteration, relative to 1 - contraction, at the end.
+        Most power iterations for them; total variation of the last one, relative to 1 - contraction.
     like_moments
         Allowed disagreement of a pmf of records with mean and variance, in units of the tolerance.
     rate_steps, light_steps
-        Cost of the rates of a paralyzable bin, at most, and of the light of another, in steps of the recursion.
+        Cost of a bin in steps of the recursion: of the rates of a paralyzable pixel, at most; of the light of others.
     folded_factored
         Bins of a feedback equation of the joint law that is factorised: a second.
     folded_residual, folded_change, folded_sweeps, folded_checked
-        Its relative residual; change per sweep relative to the largest value; sweeps, beyond which a factorisation is
-        faster; windows of a block whose residual is checked.
+        Relative residual of this equation; change per sweep relative to the largest value; sweeps beyond which a
+        factorisation is faster; windows of a block whose residual is checked.
     chain_sweeps, chain_krylov
         Gauss-Seidel sweeps of the phase chain before GMRES, and the dimension of the Krylov space.
     chain_change, chain_residual, chain_worst_residual
         Relative change per sweep; backward error that ends an iteration (rounding alone gives 1e-16 to 1e-14); largest
         one of a solution.
     holding_times
-        Independent routes to a moment of the holding times may differ by this much, relative to its largest term.
-    dense_bins, eigen_bins
-        Bins of dense matrices (512 MiB each), and of an eigen-decomposition, O(n^3).
+        Allowed difference of a moment of the holding times by independent routes, relative to its largest term.
+    eigen_bins
+        Bins of an eigen-decomposition, O(n^3).
     most_lags, most_modes
         Lags of a covariance, an O(n) product each; eigenvalues that the automatic rule considers.
     most_mean, matched_outside
@@ -213,7 +269,6 @@ class Tolerances:
     chain_residual: float = 1e-12
     chain_worst_residual: float = 1e-10
     holding_times: float = 1e-7
-    dense_bins: int = 8192
     eigen_bins: int = 4096
     most_lags: int = 100_000
     most_modes: int = 12

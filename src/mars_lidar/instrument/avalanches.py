@@ -36,7 +36,7 @@ class Afterpulsing:
         afterpulse probability p after a dead time, as data sheets state it, is
         ``Afterpulsing.after_dead_time(probability=p, ...)``.
     delay_ns
-        Mean of exponential delays, ns. Either this, or
+        Mean of exponential delays, ns; in place of ``delays`` and ``bin_ns``.
     delays, bin_ns
         ``(n,)`` non-negative density of the delay on samples of `bin_ns` ns from the avalanche on, constant on each.
     generations

@@ -50,7 +50,7 @@ def test_the_sequential_engine_begins_in_any_phase_of_a_slow_drift():
 
 @pytest.mark.parametrize("signal", [3.0, 160.0])
 def test_a_state_that_depends_on_the_switching_on_is_refused(signal: float):
-    """Two peaks, and a dead time that ends shortly before the peak that was registered: a bright pixel stays with it."""
+    """Two peaks, and a dead time that ends shortly before the one that was registered: a bright pixel stays with it."""
     samples = np.zeros(256)
     samples[:8] = samples[200:208] = 1.0
     system = ml.System(

@@ -53,13 +53,12 @@ export function sharpness(sigma) {
   return total / (2 * Math.sqrt(Math.PI) * sigma);
 }
 
-/** Bins of the first grid: even, a multiple of `out`, at most half a sigma of the pulse wide. */
+/** Bins of the first grid: an even multiple of `out`, at most half a sigma of the pulse wide. */
 export function firstBins(system, out) {
   let sharp = sharpness(system.sigma);
   if (system.mode === GATED) sharp = Math.max(sharp, 1 / Math.max(system.gateWidth, 1 / MOST_FIRST_BINS));
   const wanted = Math.min(Math.max(MIN_BINS, 4 * Math.sqrt(Math.PI) * sharp), MOST_FIRST_BINS);
-  const step = out % 2 === 0 ? out : 2 * out;
-  return step * Math.ceil(wanted / step);
+  return 2 * out * Math.ceil(wanted / (2 * out));
 }
 
 /** Whole periods of the dead time, whole bins of the rest, and the fraction of a bin that is left. */

@@ -592,9 +592,11 @@ class Cells:
 
 
 def _multiple(wanted: float, out_bins: int) -> int:
-    """Smallest even multiple of `out_bins` that is at least `wanted`."""
-    step = out_bins if out_bins % 2 == 0 else 2 * out_bins
-    return step * math.ceil(wanted / step)
+    """Smallest even multiple of `out_bins` that is at least `wanted`: a grid of half as many bins has their edges too.
+
+    On the edges of every second bin, two grids agreed while 74,000 of 3 million registrations were in the bin beside.
+    """
+    return 2 * out_bins * math.ceil(wanted / (2 * out_bins))
 
 
 def _unit_energies(before: FloatArray) -> FloatArray:

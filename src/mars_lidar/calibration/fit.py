@@ -9,7 +9,7 @@ may be shorter than the recording.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -50,7 +50,7 @@ class Effort:
     longer: float = 4.0
     more: int = 2
     recentred: int = 4
-    widths: int = 8
+    widths: int = 4
     draws: int = 20_000
     attempts: int = 3
     effects: int = 2
@@ -213,6 +213,11 @@ class Fitted:
     p_value: float
     converged: bool
 
+    @property
+    def guess(self) -> Guess:
+        """Where another fit may begin."""
+        return Guess(self.model, self.theta, _root(self.covariance), self.free)
+
 
 def most_probable(model: Model, theta: FloatArray, covariance: FloatArray, free: NDArray[np.intp]) -> FloatArray:
     """The most probable parameters (p,) of a normal law within what a detector can have.
@@ -261,6 +266,11 @@ class Fit:
     def __init__(self, recording: Recording, effort: Effort, seed: tuple[int, ...]) -> None:
         self.recording, self.effort = recording, effort
         self._random = np.random.default_rng(seed)
+
+    @property
+    def shorter(self) -> Fit:
+        """A fit whose last batches are as short as those of the steps, to choose between models."""
+        return Fit(self.recording, replace(self.effort, longer=1.0, more=1, recentred=2), (self.next_seed(),))
 
     def next_seed(self) -> int:
         """A seed that no batch has had."""

@@ -15,6 +15,7 @@ from mars_lidar.calibration.start import with_edge
 
 _MISFIT = 1e-3  # probability of the misfit below which effects without a clear score are refitted, and their gain in it
 _PARTS = 16  # of a recording, for drift: a trend then has 14 degrees of freedom
+_WINDOWS = (8.0, 64)  # expected counts of the shortest window for flicker, and the number of the longest at least
 
 
 @dataclass(frozen=True)
@@ -95,6 +96,7 @@ def refitted(fit: Fit, fitted: Fitted, listed: list[Score]) -> tuple[Fitted, Nam
 
     Effects are named by the refit: a slow recovery may have the score of a paralyzable detector, and one that the
     dead time has taken up has no score at all. So where the misfit stays clear, effects without a score are tried too.
+    Shorter batches judge between effects; the last ones are those of the effect that is taken in.
     """
     limit = clear(listed)
     best = _best(fit, fitted, [score for score in listed if score.z > limit], limit)
@@ -102,7 +104,10 @@ def refitted(fit: Fit, fitted: Fitted, listed: list[Score]) -> tuple[Fitted, Nam
         other = _best(fit, fitted, [score for score in listed if score.z <= limit], limit)
         trials = [trial for trial in (best, other) if trial is not None]
         best = min(trials, key=lambda trial: trial[0].misfit_z, default=None)
-    return best
+    if best is None:
+        return None
+    final = fit.finish(best[0].guess)
+    return (final, best[1]) if final.converged else best
 
 
 def _best(fit: Fit, fitted: Fitted, tried: list[Score], limit: float) -> tuple[Fitted, Named] | None:
@@ -117,7 +122,7 @@ def _best(fit: Fit, fitted: Fitted, tried: list[Score], limit: float) -> tuple[F
             trials.append((trial[0], score, trial[1]))
     best: tuple[Fitted, Named] | None = None
     for _, score, guess in sorted(trials, key=lambda trial: trial[0])[: fit.effort.refits]:
-        final = fit.finish(guess)
+        final = fit.shorter.finish(guess)
         if final.converged and (best is None or final.misfit_z < best[0].misfit_z):
             best = final, Named(score.effect, score.z, fitted.misfit_z - final.misfit_z)
     if best is None:
@@ -162,7 +167,8 @@ class Drift:
     """Parameters by parts of the recording.
 
     `times_s` (parts,) their middles; `values` (parts, p), and `errors` (p,) of each; `trend` (p,) change from begin to
-    end, in standard deviations; `p_value` (p,) of the scatter; `growth` (p,) of the stated errors for it.
+    end, in standard deviations; `p_value` (p,) of the scatter; `growth` (p,) of the stated errors for it; `flicker`
+    relative standard deviation of counts in times shorter than such a part, `flicker_z` its standard deviations.
     """
 
     names: tuple[str, ...]
@@ -173,6 +179,8 @@ class Drift:
     change: FloatArray
     p_value: FloatArray
     growth: FloatArray
+    flicker: float
+    flicker_z: float
 
     @property
     def _trend_p(self) -> FloatArray:
@@ -181,15 +189,56 @@ class Drift:
         return np.asarray(2.0 * ndtr(-np.abs(self.trend)))
 
     @property
+    def _flicker_p(self) -> float:
+        from scipy.special import ndtr
+
+        return float(ndtr(-self.flicker_z))
+
+    @property
     def probability(self) -> float:
         """Probability of a trend or a scatter as large in a constant recording, all parameters together."""
-        p = np.r_[self._trend_p, self.p_value]
+        p = np.r_[self._trend_p, self.p_value, self._flicker_p]
         return float(1.0 - (1.0 - p.min()) ** p.size)
 
     @property
     def drifts(self) -> NDArray[np.bool_]:
         """(p,) which parameters are not constant."""
-        return np.asarray(np.minimum(self._trend_p, self.p_value) < FALSE_ALARM / (2 * self.p_value.size))
+        return np.asarray(np.minimum(self._trend_p, self.p_value) < FALSE_ALARM / (2 * self.p_value.size + 1))
+
+    @property
+    def flickers(self) -> bool:
+        """Whether the light is not constant over shorter times."""
+        return self._flicker_p < FALSE_ALARM / (2 * self.p_value.size + 1)
+
+
+def _flicker(fit: Fit, fitted: Fitted) -> tuple[float, float, float]:
+    """Relative scatter of counts by flickering light, its standard deviations, and the factor on their variance.
+
+    Half the mean squared difference of counts in successive windows (Allan's variance, which a slow drift does not
+    change), over that of streams of the fit: for longer windows, beside the shortest. Afterpulses and all else that a
+    detector remembers for less than these changes all windows alike, the fluctuations of light the longer ones more.
+    """
+    from scipy.special import ndtr, ndtri
+
+    recording, size = fit.recording, min(float(fit.recording.photons), fit.effort.batch / 4.0)
+    cycles = max(2, round(fit.exposure(size)))
+    streams = fitted.model.streams(np.tile(fitted.theta, (LIGHTS, 1)), cycles, 0)
+    drawn = [Recording((t,), (cycles,), recording.clock) for t in streams]
+    counts, longest = _WINDOWS
+    rows = []
+    while not rows or counts * longest < recording.photons:
+        window = counts * recording.exposure / recording.photons
+        (variance, number, mean), *other = [x.unevenness(window) for x in (recording, *drawn)]
+        expected = max(float(np.mean([each[0] for each in other])), 1e-300)
+        noise = 3.0 / max(number, 1) + 3.0 / max(sum(each[1] for each in other), 1)  # of the ratio, even counts
+        rows.append((max(variance / expected, 1e-300), noise, max(variance - expected, 0.0) ** 0.5 / max(mean, 1e-300)))
+        counts *= 4.0
+    ratio, noise, scatter = np.array(rows).T
+    if ratio.size == 1:
+        return 0.0, -np.inf, 1.0
+    z = np.log(ratio[1:] / ratio[0]) / np.sqrt(noise[1:] + noise[0])
+    p = min(1.0, z.size * float(ndtr(-z.max())))
+    return float(scatter[1 + z.argmax()]), float(-ndtri(p)) if p > 0.0 else float(z.max()), float(ratio.max())
 
 
 def drift(fit: Fit, fitted: Fitted) -> Drift | None:
@@ -223,6 +272,9 @@ def drift(fit: Fit, fitted: Fitted) -> Drift | None:
     begins = np.cumsum([0.0, *(part.exposure for part in parts)])
     middle = 0.5 * (begins[1:] + begins[:-1]) * recording.period_ns * 1e-9
     about = combine @ fitted.theta[free[light]]
+    growth = np.sqrt(np.maximum(square / (len(parts) - 1), 1.0))
+    flicker, flicker_p, ratio = _flicker(fit, fitted)
+    growth[0] = max(growth[0], ratio**0.5)
     return Drift(
         ("light", *(names[i] for i in delays)),
         middle,
@@ -231,5 +283,7 @@ def drift(fit: Fit, fitted: Fitted) -> Drift | None:
         slope / (sd / np.sqrt(place @ place)),
         slope,
         p,
-        np.sqrt(np.maximum(square / (len(parts) - 1), 1.0)),
+        growth,
+        flicker,
+        flicker_p,
     )

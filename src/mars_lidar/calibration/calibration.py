@@ -423,8 +423,8 @@ class _Run:
             better = suspects.refitted(self.fit, fitted, listed)
             if better is None:
                 break
-            fitted = better[0]
-            included.append(better[1])
+            fitted, effect = better
+            included += [] if effect is None else [effect]
             listed = suspects.scores(self.fit, fitted)
         if included:
             drift = suspects.drift(self.fit, fitted)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.types import FloatArray
-from mars_lidar.calibration.fit import LIGHTS, Fit, Fitted, Guess, counted
+from mars_lidar.calibration.fit import LIGHTS, Fit, Fitted, Guess, counted, root_of
 from mars_lidar.calibration.model import Effect, effects
 from mars_lidar.calibration.recording import FALSE_ALARM, LEAST_PHOTONS, Recording
 from mars_lidar.calibration.start import with_edge
@@ -91,8 +91,11 @@ class Named:
     gain: float
 
 
-def refitted(fit: Fit, fitted: Fitted, listed: list[Score]) -> tuple[Fitted, Named] | None:
-    """The fit with the one effect that takes most of the misfit; None where no effect is clear.
+Refit = tuple[Fitted, Named | None]
+
+
+def refitted(fit: Fit, fitted: Fitted, listed: list[Score]) -> Refit | None:
+    """The fit with the one effect that takes most of the misfit, or a better one without; None where none is clear.
 
     Effects are named by the refit: a slow recovery may have the score of a paralyzable detector, and one that the
     dead time has taken up has no score at all. So where the misfit stays clear, effects without a score are tried too.
@@ -110,7 +113,7 @@ def refitted(fit: Fit, fitted: Fitted, listed: list[Score]) -> tuple[Fitted, Nam
     return (final, best[1]) if final.converged else best
 
 
-def _best(fit: Fit, fitted: Fitted, tried: list[Score], limit: float) -> tuple[Fitted, Named] | None:
+def _best(fit: Fit, fitted: Fitted, tried: list[Score], limit: float) -> Refit | None:
     trials: list[tuple[float, Score, Guess]] = []
     families: set[str] = set()
     for score in tried:
@@ -130,11 +133,15 @@ def _best(fit: Fit, fitted: Fitted, tried: list[Score], limit: float) -> tuple[F
     final, named = best
     if named.z > limit:  # of electronics the size may be wide: a short dead time of the detector acts as a long one
         return best
-    clear_size = (
-        not named.effect.onoff
-        and final.theta[fitted.model.size] > limit * final.covariance[(k := len(fitted.free)), k] ** 0.5
-    )
-    return best if clear_size or fitted.p_value < _MISFIT * final.p_value else None
+    own = len(fitted.free)
+    if not named.effect.onoff and final.theta[fitted.model.size] > limit * final.covariance[own, own] ** 0.5:
+        return best
+    if fitted.p_value >= _MISFIT * final.p_value:
+        return None
+    # neither score nor size: the refit may have gone where the effect is not needed either
+    start = Guess(fitted.model, final.theta[: fitted.model.size], root_of(final.covariance[:own, :own]), fitted.free)
+    plain = fit.shorter.finish(start)
+    return (plain, None) if plain.converged and plain.p_value > _MISFIT * final.p_value else best
 
 
 def _stepped(fit: Fit, fitted: Fitted, score: Score) -> tuple[float, Guess] | None:

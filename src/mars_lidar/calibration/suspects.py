@@ -15,7 +15,6 @@ from mars_lidar.calibration.start import with_edge
 
 _MISFIT = 1e-3  # probability of the misfit below which effects without a clear score are refitted, and their gain in it
 _PARTS = 16  # of a recording, for drift: a trend then has 14 degrees of freedom
-_WINDOWS = (8.0, 64)  # expected counts of the shortest window for flicker, and the number of the longest at least
 
 
 @dataclass(frozen=True)
@@ -174,8 +173,9 @@ class Drift:
     """Parameters by parts of the recording.
 
     `times_s` (parts,) their middles; `values` (parts, p), and `errors` (p,) of each; `trend` (p,) change from begin to
-    end, in standard deviations; `p_value` (p,) of the scatter; `growth` (p,) of the stated errors for it; `flicker`
-    relative standard deviation of counts in times shorter than such a part, `flicker_z` its standard deviations.
+    end, in standard deviations; `p_value` (p,) of it or of the scatter, the smaller; `growth` (p,) of the stated errors
+    by the scatter; `flicker` relative standard deviation of counts in times shorter than such a part, `flicker_z` its
+    standard deviations.
     """
 
     names: tuple[str, ...]
@@ -190,50 +190,45 @@ class Drift:
     flicker_z: float
 
     @property
-    def _trend_p(self) -> FloatArray:
-        from scipy.special import ndtr
-
-        return np.asarray(2.0 * ndtr(-np.abs(self.trend)))
-
-    @property
-    def _flicker_p(self) -> float:
-        from scipy.special import ndtr
-
-        return float(ndtr(-self.flicker_z))
-
-    @property
     def probability(self) -> float:
-        """Probability of a trend or a scatter as large in a constant recording, all parameters together."""
-        p = np.r_[self._trend_p, self.p_value, self._flicker_p]
-        return float(1.0 - (1.0 - p.min()) ** p.size)
+        """Probability of a trend, a scatter or flicker as large in a constant recording, all parameters together."""
+        p = min(float(self.p_value.min()), _above(self.flicker_z))
+        return float(1.0 - (1.0 - p) ** (2 * self.p_value.size + 1))
 
     @property
     def drifts(self) -> NDArray[np.bool_]:
         """(p,) which parameters are not constant."""
-        return np.asarray(np.minimum(self._trend_p, self.p_value) < FALSE_ALARM / (2 * self.p_value.size + 1))
+        return np.asarray(self.p_value < FALSE_ALARM / (2 * self.p_value.size + 1))
 
     @property
     def flickers(self) -> bool:
         """Whether the light is not constant over shorter times."""
-        return self._flicker_p < FALSE_ALARM / (2 * self.p_value.size + 1)
+        return _above(self.flicker_z) < FALSE_ALARM / (2 * self.p_value.size + 1)
 
 
-def _flicker(fit: Fit, fitted: Fitted) -> tuple[float, float, float]:
+def _above(z: float) -> float:
+    """Probability of a normal deviate above z."""
+    from scipy.special import ndtr
+
+    return float(ndtr(-z))
+
+
+def _flicker(fit: Fit, fitted: Fitted, counts: float = 8.0, windows: int = 64) -> tuple[float, float, float]:
     """Relative scatter of counts by flickering light, its standard deviations, and the factor on their variance.
 
     Half the mean squared difference of counts in successive windows (Allan's variance, which a slow drift does not
     change), over that of streams of the fit: for longer windows, beside the shortest. Afterpulses and all else that a
     detector remembers for less than these changes all windows alike, the fluctuations of light the longer ones more.
+    The shortest have so many `counts`, the others four times as many each, as long as there are so many `windows`.
     """
-    from scipy.special import ndtr, ndtri
+    from scipy.special import ndtri
 
     recording, size = fit.recording, min(float(fit.recording.photons), fit.effort.batch / 4.0)
     cycles = max(2, round(fit.exposure(size)))
     streams = fitted.model.streams(np.tile(fitted.theta, (LIGHTS, 1)), cycles, 0)
     drawn = [Recording((t,), (cycles,), recording.clock) for t in streams]
-    counts, longest = _WINDOWS
     rows = []
-    while not rows or counts * longest < recording.photons:
+    while not rows or counts * windows < recording.photons:
         window = counts * recording.exposure / recording.photons
         (variance, number, mean), *other = [x.unevenness(window) for x in (recording, *drawn)]
         expected = max(float(np.mean([each[0] for each in other])), 1e-300)
@@ -244,7 +239,7 @@ def _flicker(fit: Fit, fitted: Fitted) -> tuple[float, float, float]:
     if ratio.size == 1:
         return 0.0, -np.inf, 1.0
     z = np.log(ratio[1:] / ratio[0]) / np.sqrt(noise[1:] + noise[0])
-    p = min(1.0, z.size * float(ndtr(-z.max())))
+    p = min(1.0, z.size * _above(z.max()))
     return float(scatter[1 + z.argmax()]), float(-ndtri(p)) if p > 0.0 else float(z.max()), float(ratio.max())
 
 
@@ -275,22 +270,13 @@ def drift(fit: Fit, fitted: Fitted) -> Drift | None:
     place = np.linspace(-0.5, 0.5, len(parts))
     slope = place @ (x - x.mean(0)) / (place @ place)
     square = (((x - x.mean(0)) / sd) ** 2).sum(0)
-    p = np.array([float(chdtrc(len(parts) - 1, value)) for value in square])
+    trend = slope / (sd / np.sqrt(place @ place))
+    p = np.minimum([2.0 * _above(abs(z)) for z in trend], chdtrc(len(parts) - 1, square))
     begins = np.cumsum([0.0, *(part.exposure for part in parts)])
     middle = 0.5 * (begins[1:] + begins[:-1]) * recording.period_ns * 1e-9
     about = combine @ fitted.theta[free[light]]
     growth = np.sqrt(np.maximum(square / (len(parts) - 1), 1.0))
-    flicker, flicker_p, ratio = _flicker(fit, fitted)
+    flicker, flicker_z, ratio = _flicker(fit, fitted)
     growth[0] = max(growth[0], ratio**0.5)
-    return Drift(
-        ("light", *(names[i] for i in delays)),
-        middle,
-        x - x.mean(0) + about,
-        sd,
-        slope / (sd / np.sqrt(place @ place)),
-        slope,
-        p,
-        growth,
-        flicker,
-        flicker_p,
-    )
+    names = ("light", *(names[i] for i in delays))
+    return Drift(names, middle, x - x.mean(0) + about, sd, trend, slope, p, growth, flicker, flicker_z)

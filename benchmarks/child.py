@@ -61,12 +61,12 @@ def main(call: str, side: int, cycles: int, bins: int, threads: int) -> None:
     registrations = load.registrations
     CALLS[call](Workload(load.flux[:2], load.system), threads)  # code and tables
     more = {"out": load.warm().reshape(1, *load.flux.shape, -1)} if call == "cube, out=" else {}
-    (made, size), told = measured(lambda: CALLS[call](load, threads, **more))
+    (made, size), facts = measured(lambda: CALLS[call](load, threads, **more))
     fresh = 0 if more else size
     pages = np.empty(fresh, np.uint8)  # the result is still there: these are fresh too
     _, touched = measured(lambda: pages[::4096].fill(1))
-    told |= {"pages": touched["system"], "registrations": registrations, "bytes": size, "fresh": fresh}
-    print(json.dumps(told))
+    facts |= {"pages": touched["system"], "registrations": registrations, "bytes": size, "fresh": fresh}
+    print(json.dumps(facts))
     del made
 
 

@@ -63,10 +63,10 @@ def of_a_task() -> dict[str, tuple[float, float]]:
                 before, client = spent(), time.process_time()
                 _make_all(nullcontext(team), items, lambda _: None)
                 totals.append((time.process_time() - client, spent() - before))
-    (one, one_scheduled), (many, many_scheduled) = totals
+    (single, one_scheduled), (many, many_scheduled) = totals
     more = PARTS[1] - PARTS[0]
     return {
-        "client": (one / TASKS, max(0.0, many - one) / TASKS / more),
+        "client": (single / TASKS, max(0.0, many - single) / TASKS / more),
         "scheduler": (one_scheduled / TASKS, max(0.0, many_scheduled - one_scheduled) / TASKS / more),
     }
 

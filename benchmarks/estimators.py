@@ -29,7 +29,7 @@ def reconstruction(config: Config, bandwidth: Bandwidth) -> Section:
     clocked = free.replace(detector=ml.Detector(dead_time_ns=0.0, mode="synchronous"))
     delay = np.random.default_rng(SEED).uniform(0.0, free.period_ns, (1, pixels))
     cases: dict[str, Callable[[], object]] = {}
-    told: dict[str, tuple[str, str, float, float]] = {}
+    entries: dict[str, tuple[str, str, float, float]] = {}
     for instrument in (free, clocked):
         mode = instrument.detector.mode
         for signal, background in _LEVELS if instrument is free else _LEVELS[:1]:
@@ -38,11 +38,11 @@ def reconstruction(config: Config, bandwidth: Bandwidth) -> Section:
             for name in methods if signal == 1.0 else ["maximum_likelihood"]:
                 key = f"{mode} {name} {signal:g} {background:g}"
                 cases[key] = partial(ml.reconstruct, cube, instrument, name, threads=1)
-                told[key] = (mode, name, signal, background)
+                entries[key] = (mode, name, signal, background)
     times = in_turn(cases, config)
     section = Section("Reconstruction", notes=[_RECONSTRUCTION.format(pixels=pixels, threads=config.threads)])
     slowest = 0.0
-    for key, (mode, name, signal, background) in told.items():
+    for key, (mode, name, signal, background) in entries.items():
         pixel = min(times[key].cpu) / pixels
         section.rows.append(
             {
@@ -70,10 +70,10 @@ def calibration(config: Config, bandwidth: Bandwidth) -> Section:
         "calibrate, nothing given": partial(ml.calibrate, times),
         "calibrate, any shape": partial(ml.calibrate, times, pulse="free"),
     }
-    found = in_turn(cases, config)
+    result = in_turn(cases, config)
     section = Section("Calibration of a stream", notes=[f"{len(times):,} timestamps, S = 0.8, B = 0.5."])
     section.rows = [
-        {"case": name, "CPU s": min(found[name].cpu), "CPU s per 10^6": 1e6 * min(found[name].cpu) / len(times)}
+        {"case": name, "CPU s": min(result[name].cpu), "CPU s per 10^6": 1e6 * min(result[name].cpu) / len(times)}
         for name in cases
     ]
     return section

@@ -100,8 +100,8 @@ class Bandwidth:
 
     def seconds(self, size: int, *, threads: int, fresh: bool) -> float:
         """Least time to write `size` bytes."""
-        one, every = (self.fresh_one, self.fresh_all) if fresh else (self.warm_one, self.warm_all)
-        return size / (one if threads == 1 else every)
+        single, every = (self.fresh_one, self.fresh_all) if fresh else (self.warm_one, self.warm_all)
+        return size / (single if threads == 1 else every)
 
 
 def measure_bandwidth(config: Config) -> Bandwidth:

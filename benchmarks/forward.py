@@ -78,7 +78,9 @@ def _models(bins: int, config: Config) -> Cases:
     s, b, tau = _light(np.random.default_rng(0), PIXELS, system.period_ns)
     table = HistogramTable(ml.Table.build(system, (0.04, 2.1, 6), (0.04, 2.1, 6), threads=1))
     counts = torch.from_numpy(ml.simulate(ml.Flux(s[None], b[None], tau[None]), system, seed=0)[0, 0].astype(float))
-    at, double = ([torch.tensor(one, dtype=dtype) for one in (s, b, tau)] for dtype in (torch.float32, torch.float64))
+    at, double = (
+        [torch.tensor(values, dtype=dtype) for values in (s, b, tau)] for dtype in (torch.float32, torch.float64)
+    )
     armed = system.replace(start="armed")
     return {
         "mean_histogram": (lambda: ml.mean_histogram(ml.Flux(s, b, tau), system, threads=1), None),
@@ -93,7 +95,7 @@ def _models(bins: int, config: Config) -> Cases:
 def _coarse(bins: int, config: Config) -> Cases:
     """The likelihood where bins are cut, beside its plain form: by the width of a bin, and re-armed in the pulse."""
     random = np.random.default_rng(0)
-    at = [torch.from_numpy(one) for one in _light(random, _MANY, 100.0)]
+    at = [torch.from_numpy(values) for values in _light(random, _MANY, 100.0)]
     counts = torch.from_numpy(random.poisson(30.0, (_MANY, bins)).astype(float))
     cases: Cases = {}
     again, twice = ", re-armed in the pulse", ", re-armed after two dead times"
@@ -114,9 +116,9 @@ def _coarse(bins: int, config: Config) -> Cases:
 
 
 def _gradient(model: Callable[..., torch.Tensor], at: list[torch.Tensor]) -> list[torch.Tensor | None]:
-    leaves = [one.clone().requires_grad_() for one in at]
+    leaves = [values.clone().requires_grad_() for values in at]
     model(*leaves).square().sum().backward()
-    return [one.grad for one in leaves]
+    return [leaf.grad for leaf in leaves]
 
 
 _NOTE = (

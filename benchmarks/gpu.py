@@ -14,10 +14,9 @@ from typing import Any, Literal
 import numpy as np
 
 import mars_lidar as ml
-from mars_lidar import cuda
-from mars_lidar.cuda.exact import exact_histogram
-from mars_lidar.cuda.machine import Cuda, cupy_with_device
-from mars_lidar.engines import Engine, find_engine
+from mars_lidar.engines import Engine, cuda, find_engine
+from mars_lidar.engines.cuda.exact import exact_histogram
+from mars_lidar.engines.cuda.machine import Cuda, cupy_with_device
 from mars_lidar.engines.engine import Task
 from mars_lidar.simulation import _task
 from mars_lidar.table import Table

@@ -59,11 +59,11 @@ class NumpyTable:
 
     def rows(self, signal: FloatArray, background: FloatArray) -> NDArray[np.intp]:
         """Nearest entries (P,) of pixels (P,); fluxes beyond the axes take their ends."""
-        found = []
+        results = []
         for k, flux in enumerate((signal, background)):
             place = np.rint((np.log(flux) - self.low[k]) / self.step[k])
-            found.append(np.clip(place, 0, self.points[k] - 1).astype(np.intp))
-        return np.asarray(found[0] * self.points[1] + found[1], dtype=np.intp)
+            results.append(np.clip(place, 0, self.points[k] - 1).astype(np.intp))
+        return np.asarray(results[0] * self.points[1] + results[1], dtype=np.intp)
 
 
 def synthesize(table: NumpyTable, flux: Flux, out: NDArray[Any], *, seed: int, stages: dict[str, float]) -> None:
@@ -83,9 +83,9 @@ def synthesize(table: NumpyTable, flux: Flux, out: NDArray[Any], *, seed: int, s
         shapes = windows[rows, (bins - shift) % bins].astype(np.float64)
         shapes /= shapes.sum(axis=1, keepdims=True)
         aligned = time.perf_counter()
-        for one in cube:
+        for image in cube:
             counts = np.maximum(np.rint(random.normal(mean, spread)), 0.0).astype(np.int64)
-            one[start : start + _BLOCK] = random.multinomial(counts, shapes)
+            image[start : start + _BLOCK] = random.multinomial(counts, shapes)
         done = time.perf_counter()
         for name, seconds in zip(STAGES, (looked - begun, aligned - looked, done - aligned), strict=True):
             stages[name] = stages.get(name, 0.0) + seconds

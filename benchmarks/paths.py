@@ -40,13 +40,13 @@ def exact_paths(config: Config, bandwidth: Bandwidth) -> Section:
     workloads = {
         _USUAL: usual,
         _ARMED: some,
-        _STATIONARY: _seen(some, start="stationary"),
+        _STATIONARY: _changed(some, start="stationary"),
         "two returns": Workload(_returns(flux, 2), instrument),
         "four returns": Workload(_returns(flux, 4), instrument),
-        "sampled pulse, 400 samples": _seen(usual, pulse=_measured_like_pulse()),
-        "dead time of one period": _seen(usual, detector=ml.Detector(dead_time_ns=PERIOD_NS)),
-        "dead time of 10.5 periods": _seen(usual, detector=ml.Detector(dead_time_ns=10.5 * PERIOD_NS)),
-        "no dead time": _seen(usual, detector=ml.Detector(dead_time_ns=0.0)),
+        "sampled pulse, 400 samples": _changed(usual, pulse=_measured_like_pulse()),
+        "dead time of one period": _changed(usual, detector=ml.Detector(dead_time_ns=PERIOD_NS)),
+        "dead time of 10.5 periods": _changed(usual, detector=ml.Detector(dead_time_ns=10.5 * PERIOD_NS)),
+        "no dead time": _changed(usual, detector=ml.Detector(dead_time_ns=0.0)),
         f"waveform of {config.bins} samples": Workload(_waveform(usual, config.bins), instrument),
         **{name: Workload(_waveform(usual, parts, fog=True), instrument) for parts, name in fog.items()},
     }
@@ -99,7 +99,7 @@ def detector_effects(config: Config, bandwidth: Bandwidth) -> Section:
             name: getattr(preset, name) for name in ("afterpulsing", "twilight_ns")
         },
     }
-    loads = {name: _seen(ideal, detector=replace(ideal.system.detector, **more)) for name, more in detectors.items()}
+    loads = {name: _changed(ideal, detector=replace(ideal.system.detector, **more)) for name, more in detectors.items()}
     runs = {name: EngineRun(load, out=load.warm()) for name, load in loads.items()}
     times = in_turn(runs, config)
     section = Section("Effects of the detector", notes=[_EFFECTS])
@@ -135,7 +135,7 @@ def _usual(config: Config) -> Workload:
     return Workload(ml.Flux(**maps((side, side))), system(config))
 
 
-def _seen(load: Workload, **changes: Any) -> Workload:
+def _changed(load: Workload, **changes: Any) -> Workload:
     return Workload(load.flux, load.system.replace(**changes))
 
 

@@ -27,8 +27,8 @@ class Saved:
     def row(self, title: str, case: str, **more: Any) -> dict[str, Any]:
         """The one row of a section with this case."""
         wanted = {"case": case, **more}
-        (found,) = (r for r in self._sections[title] if all(r.get(k) == v for k, v in wanted.items()))
-        return found
+        (match,) = (r for r in self._sections[title] if all(r.get(k) == v for k, v in wanted.items()))
+        return match
 
     def has(self, title: str, case: str) -> bool:
         """Whether there is such a row."""
@@ -48,14 +48,14 @@ def _rows(saved: Saved) -> dict[str, str]:
     def long(engine: str) -> str:
         return ", ".join(saved.ms(_LONG, f"N_r = {10**k:,}", engine=engine) for k in range(3, 8))
 
-    one, two, avx2 = "avx512, 1 thread", "avx512, all threads", "avx2, all threads"
-    stamps, told = "timestamps (into fresh memory)", "timestamps, fresh memory"
-    if not saved.has(_PATHS, told):  # tables of versions that drew twice
-        stamps, told = "timestamps (two passes, into fresh memory)", "timestamps (two passes)"
+    single, two, avx2 = "avx512, 1 thread", "avx512, all threads", "avx2, all threads"
+    stamps, title = "timestamps (into fresh memory)", "timestamps, fresh memory"
+    if not saved.has(_PATHS, title):  # tables of versions that drew twice
+        stamps, title = "timestamps (two passes, into fresh memory)", "timestamps (two passes)"
     laws = saved.row(_LAWS, "moments and mean histogram"), saved.row(_LAWS, "count pmf")
     return {
         "`exact`, one core / two": (
-            f"{saved.ms(_EXACT, one)} ({saved.ns(_EXACT, one)} a registration) / {saved.ms(_EXACT, two)}"
+            f"{saved.ms(_EXACT, single)} ({saved.ns(_EXACT, single)} a registration) / {saved.ms(_EXACT, two)}"
         ),
         "`exact`, AVX2 only, two cores": f"{saved.ms(_EXACT, avx2)} ({saved.ns(_EXACT, avx2)})",
         "`mars` with a table, two cores, at 1e3, 1e4, 1e5, 1e6, 1e7 cycles": long("mars"),
@@ -64,7 +64,7 @@ def _rows(saved: Saved) -> dict[str, str]:
         "`poisson`, two cores": saved.ms(_EXACT, "poisson, all threads"),
         "the paper's pipeline in NumPy, one core": saved.ms(_PIPELINE, "NumPy, lookup + alignment + multinomial"),
         f"waveforms / {stamps}, one core": (
-            f"{saved.ns(_PATHS, 'waveform of 1024 samples')} / {saved.ns(_PATHS, told)}"
+            f"{saved.ns(_PATHS, 'waveform of 1024 samples')} / {saved.ns(_PATHS, title)}"
         ),
         "exact mean, variance and mean histogram of one (S, B)": f"{number(laws[0]['ms per (S, B)'])} ms",
         "exact law of the count of one (S, B)": f"{number(laws[1]['ms per (S, B)'])} ms",
@@ -91,12 +91,12 @@ def speed(saved: Saved) -> str:
 def figures(saved: Saved) -> str:
     """README's few figures."""
     rows, million = _rows(saved), "N_r = 1,000,000"
-    shown = (
+    selected = (
         "`exact`, one core / two",
         "the paper's pipeline in NumPy, one core",
         "exact law of the count of one (S, B)",
     )
-    chosen = {what: rows[what] for what in shown}
+    chosen = {what: rows[what] for what in selected}
     chosen["`auto`, two cores, at a million cycles"] = saved.ms(_LONG, million, engine="auto")
     return f"{_where(saved)}\n\n{table([{'': what, 'time': time} for what, time in chosen.items()])}\n"
 
@@ -123,15 +123,15 @@ TABLES = ("README.md", "docs/engines.md", "docs/speed.md")
 def filled(name: str) -> tuple[str, str]:
     """A document as it is, and with its tables made anew."""
     text = new = ROOT.joinpath(name).read_text(encoding="utf-8")
-    saved, found = Saved(json.loads(SAVED.read_text(encoding="utf-8"))), 0
+    saved, blocks = Saved(json.loads(SAVED.read_text(encoding="utf-8"))), 0
     for what, make in BLOCKS.items():
         made = make(saved)
         if name.startswith("docs/"):
             made = made.replace("](benchmarks/", "](../benchmarks/").replace("](#start)", "](start.md)")
         block = re.compile(rf"(<!-- {what}: [^>]*-->\n).*?(<!-- end of {what} -->)", re.DOTALL)
         new, count = block.subn(lambda m, made=made: m[1] + made + m[2], new)
-        found += count
-    if not found:
+        blocks += count
+    if not blocks:
         raise SystemExit(f"{name} has no block <!-- {', '.join(BLOCKS)}: ... -->")
     return text, new
 

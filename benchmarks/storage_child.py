@@ -25,7 +25,7 @@ REALIZATIONS = 8
 def main(what: str, level: float, scenes: int, threads: int, cycles: int, bins: int, out: Path) -> None:
     """Wall and CPU seconds, bytes on disk and at the peak, exposures and their rate."""
     system = _system(Config(mode="child", cycles=cycles, bins=bins))
-    told: list[tuple[float, int]] = []
+    marks: list[tuple[float, int]] = []
     recipe = {
         "scenes": {"path": str(out.parent / "scenes")},
         "systems": [system],
@@ -47,13 +47,13 @@ def main(what: str, level: float, scenes: int, threads: int, cycles: int, bins: 
             ml.simulate(flux, system, realizations=REALIZATIONS, seed=k, threads=threads, out=buffer)
     else:
         team = {"workers": threads} if what == "workers" else {"threads": threads}
-        ml.generate(recipe, out, progress=lambda done, total: told.append((time.perf_counter(), done)), **team)
+        ml.generate(recipe, out, progress=lambda done, total: marks.append((time.perf_counter(), done)), **team)
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     rate = exposures / wall
     if what == "workers":
-        (first, before), (last, done) = told[2], told[-1]
+        (first, before), (last, done) = marks[2], marks[-1]
         rate = exposures * (done - before) / done / (last - first)
-    size = sum(one.stat().st_size for one in out.rglob("*") if one.is_file()) if out.exists() else 0
+    size = sum(path.stat().st_size for path in out.rglob("*") if path.is_file()) if out.exists() else 0
     print(
         json.dumps(
             {"wall": wall, "cpu": cpu, "bytes": size, "peak": resident("VmHWM"), "exposures": exposures, "rate": rate}

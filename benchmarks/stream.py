@@ -47,15 +47,15 @@ def stream(config: Config, bandwidth: Bandwidth) -> Section:
         samples = [made(None).sample(k) for k in range(4 * BATCH)]
 
         def bare(samples: list[Sample] = samples) -> None:
-            for one in samples:
-                ml.simulate(one.flux, system, seed=one.seed, threads=1, out=out)
+            for drawn in samples:
+                ml.simulate(drawn.flux, system, seed=drawn.seed, threads=1, out=out)
 
         streams = {"stream, counts": iter(made(None)), "stream, float32": iter(made(torch.float32))}
         cases = {"bare engine": bare}
-        for name, one in streams.items():
+        for name, dataset in streams.items():
             for _ in range(4):  # its memory is taken, scenes are cast
-                next(one)
-            cases[name] = lambda one=one: [None for _ in itertools.islice(one, 4)]
+                next(dataset)
+            cases[name] = lambda dataset=dataset: [None for _ in itertools.islice(dataset, 4)]
         spent = {
             (name, 0): (*(min(seconds) / (4 * BATCH) for seconds in (timing.cpu, timing.wall)), 0.0)
             for name, timing in in_turn(cases, config).items()
@@ -91,12 +91,12 @@ def _numbers(processors: int) -> list[int]:
     return sorted({2**k for k in range(processors.bit_length()) if 2**k < processors} | {processors})
 
 
-def _measured(one: CubeStream, workers: int, config: Config) -> tuple[float, float, float]:
+def _measured(dataset: CubeStream, workers: int, config: Config) -> tuple[float, float, float]:
     """CPU seconds a cube of all processes, wall seconds, and this process's share: the least of several stretches.
 
     A stretch begins and ends with all workers idle, as many batches made ahead: it holds the work of what was taken.
     """
-    batches: Any = iter(DataLoader(one, batch_size=None, num_workers=workers))
+    batches: Any = iter(DataLoader(dataset, batch_size=None, num_workers=workers))
     known = [worker.pid for worker in batches._workers]
     number, began, stretches = 4 * workers, time.perf_counter(), []
     for _ in range(number):  # memory is taken, scenes are cast
@@ -111,7 +111,7 @@ def _measured(one: CubeStream, workers: int, config: Config) -> tuple[float, flo
         spent = here + sum(map(_seconds, known)) - before, time.perf_counter() - start, here
         stretches.append(tuple(seconds / (number * BATCH) for seconds in spent))
     cpu, _, received = min(stretches)
-    return cpu, min(one[1] for one in stretches), received
+    return cpu, min(stretch[1] for stretch in stretches), received
 
 
 def _idle(processes: list[int]) -> None:
@@ -129,9 +129,9 @@ def _seconds(process: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def _fields(told: Path) -> list[str]:
+def _fields(path: Path) -> list[str]:
     try:
-        return told.read_text().rpartition(")")[2].split()
+        return path.read_text().rpartition(")")[2].split()
     except OSError:  # a thread that has ended
         return []
 

@@ -20,6 +20,6 @@ def run_python(*arguments: str, folder: Path | None = None) -> str:
         [sys.executable, *arguments], env=environment, cwd=folder, capture_output=True, text=True, check=False
     )
     if done.returncode:
-        told = f"{done.stdout}{done.stderr}"
-        raise RuntimeError(f"{' '.join(arguments)} exited with {done.returncode}:\n{told}")
+        words = f"{done.stdout}{done.stderr}"
+        raise RuntimeError(f"{' '.join(arguments)} exited with {done.returncode}:\n{words}")
     return done.stdout

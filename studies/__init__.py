@@ -53,13 +53,13 @@ class OtherRunsError(ValueError):
 
 def _studies() -> dict[str, tuple[str, str]]:
     """Module and words by name, of every module whose first line is ``Study "NAME": words``."""
-    found = {}
+    results = {}
     for path in sorted(Path(__file__).parent.glob("*/*.py")):
         with path.open(encoding="utf-8") as file:
             named = re.match(r'"""Study "([a-z-]+)"[:,] (.*)', file.readline())
         if named:
-            found[named[1]] = f"studies.{path.parent.name}.{path.stem}", named[2].rstrip('."')
-    return found
+            results[named[1]] = f"studies.{path.parent.name}.{path.stem}", named[2].rstrip('."')
+    return results
 
 
 STUDIES = _studies()

@@ -15,14 +15,14 @@ from studies import STUDIES, OtherRunsError, Request, run
 
 
 def _parser(command: str) -> argparse.ArgumentParser:
-    told = "\n".join(f"  {name:<17} {words}" for name, (_, words) in STUDIES.items())
-    told += "\n\nthe network of the neural baseline:\n  neural train|info  see neural --help"
-    told += "\n\nengines side by side on a scene:\n  compare            see compare --help"
+    listed = "\n".join(f"  {name:<17} {words}" for name, (_, words) in STUDIES.items())
+    listed += "\n\nthe network of the neural baseline:\n  neural train|info  see neural --help"
+    listed += "\n\nengines side by side on a scene:\n  compare            see compare --help"
     parser = argparse.ArgumentParser(
         prog=command,
         formatter_class=argparse.RawDescriptionHelpFormatter,
         description="Run studies. Each writes NAME.md, its figures and NAME.csv into the output folder.",
-        epilog=f"studies:\n{told}\n\nexample:\n"
+        epilog=f"studies:\n{listed}\n\nexample:\n"
         f"  {command} covariance law --out docs/studies\n\n"
         "exit codes: 0 done, 1 failed, 2 bad input, 130 interrupted",
     )

@@ -28,9 +28,11 @@ class Hidden(importlib.abc.MetaPathFinder):
 
 
 def says(error: BaseException | str, extra: str) -> None:
-    told = str(error)
-    assert any(f"mars-lidar[{one}" in told for one in extra.split(",")), f"{told!r} does not name the extra {extra}"
-    assert len(told.strip().splitlines()) == 1, told
+    message = str(error)
+    assert any(f"mars-lidar[{name}" in message for name in extra.split(",")), (
+        f"{message!r} does not name the extra {extra}"
+    )
+    assert len(message.strip().splitlines()) == 1, message
 
 
 def check_names(extra: str) -> int:
@@ -40,7 +42,7 @@ def check_names(extra: str) -> int:
 
     missing = 0
     packages = [mars_lidar.__name__]
-    packages += [f"mars_lidar.{one.name}" for one in pkgutil.iter_modules(mars_lidar.__path__) if one.ispkg]
+    packages += [f"mars_lidar.{package.name}" for package in pkgutil.iter_modules(mars_lidar.__path__) if package.ispkg]
     for name in packages:
         if name.rpartition(".")[2].startswith("_"):
             continue

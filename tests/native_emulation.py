@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mars_lidar.cuda.kernels import HEADERS
+from mars_lidar.engines.cuda.kernels import HEADERS
 
 SOURCES = Path(__file__).resolve().parent / "emulation"
 BUILT = SOURCES.parents[1] / "build" / "emulation"

@@ -110,9 +110,9 @@ def test_exact_against_sequential(made: Case):
         require({"twilight pulses": two_mean_vectors(*shares)}, made.name)
 
 
-def against(found: np.ndarray, expected: float, about: str) -> None:
+def against(result: np.ndarray, expected: float, about: str) -> None:
     """The mean of independent numbers is the expected one."""
-    z = (found.mean() - expected) / (found.std(ddof=1) / np.sqrt(found.size))
+    z = (result.mean() - expected) / (result.std(ddof=1) / np.sqrt(result.size))
     require({"mean": float(2 * stats.norm.sf(abs(z)))}, about)
 
 
@@ -230,11 +230,11 @@ def test_releases_within_the_dead_time_change_no_bit(kind: str, mode: str):
     plain = system.replace(detector=ml.Detector(dead_time_ns=63.75, mode=mode, **gate))
     within = ml.Afterpulsing(probability=0.9, delays=(2.0, 0.0, 1.0), bin_ns=21.25)
     expected = ml.simulate(flux, plain, seed=3)
-    found = ml.simulate(flux, plain.replace(detector=replace(plain.detector, afterpulsing=within)), seed=3)
-    assert np.array_equal(found, expected)
+    result = ml.simulate(flux, plain.replace(detector=replace(plain.detector, afterpulsing=within)), seed=3)
+    assert np.array_equal(result, expected)
     beyond = replace(within, delays=(2.0, 0.0, 1.0, 0.5))
-    found = ml.simulate(flux, plain.replace(detector=replace(plain.detector, afterpulsing=beyond)), seed=3)
-    assert not np.array_equal(found, expected)
+    result = ml.simulate(flux, plain.replace(detector=replace(plain.detector, afterpulsing=beyond)), seed=3)
+    assert not np.array_equal(result, expected)
 
 
 ONE_WAY = [(r, c) for r in range(3) for c in range(3) if (r, c) != (1, 1)]
@@ -287,8 +287,8 @@ def test_crosstalk_bits_and_whole_images():
         start="stationary",
     )
     whole = ml.simulate(flux, system, engine="sequential", realizations=3)
-    one = ml.simulate(flux, system, engine="sequential", first_realization=1, threads=1)
-    assert np.array_equal(one[0], whole[1])
+    single = ml.simulate(flux, system, engine="sequential", first_realization=1, threads=1)
+    assert np.array_equal(single[0], whole[1])
     assert np.array_equal(
         ml.simulate_timestamps(flux, system, engine="sequential", realization=2).histogram(), whole[2]
     )
@@ -302,17 +302,17 @@ def test_crosstalk_bits_and_whole_images():
 def test_what_has_no_law_says_so(name: str):
     on: dict[str, Any] = {"afterpulsing": EXPONENTIAL, "twilight_ns": 5.0}
     system = case(1.0, 1.0, dead_time_ns=75.0, **{name: on[name]}).system
-    told = f"does not do {name}.*'exact' or 'sequential'"
+    text = f"does not do {name}.*'exact' or 'sequential'"
     for law in ("count_law", "exposure_moments", "joint_law", "mean_histogram", "registration_pdf"):
-        with pytest.raises(ValueError, match=told):
+        with pytest.raises(ValueError, match=text):
             getattr(statistics, law)(ml.Flux(1.0, 1.0, 50.0), system)
     for engine in ("mars", "renewal", "feedback", "auto"):
-        with pytest.raises(ValueError, match=f"engine '{engine}' {told}"):
+        with pytest.raises(ValueError, match=f"engine '{engine}' {text}"):
             ml.simulate(flux_of(1.0, 1.0), system, engine=engine)
 
 
 @pytest.mark.parametrize(
-    ("make", "told"),
+    ("make", "message"),
     [
         (lambda: ml.Afterpulsing(probability=1.0, delay_ns=1.0), "below 1.*got 1.0"),
         (lambda: ml.Afterpulsing(probability=0.0, delay_ns=1.0), "probability of afterpulsing must be"),
@@ -334,8 +334,8 @@ def test_what_has_no_law_says_so(name: str):
         (lambda: case(1, 1, dead_time_ns=1.0, afterpulsing=replace(EXPONENTIAL, delay_ns=1e9)), "1e6 periods"),
     ],
 )
-def test_refused(make: Any, told: str):
-    with pytest.raises((ValueError, TypeError), match=told):
+def test_refused(make: Any, message: str):
+    with pytest.raises((ValueError, TypeError), match=message):
         make()
 
 
@@ -375,7 +375,7 @@ def test_command_line(tmp_path: Path):
     assert np.array_equal(io.regenerate(cube), cube.histogram)
     with pytest.raises(ValueError, match="rows must be all 4 rows with crosstalk"):
         io.regenerate(cube, rows=slice(1, 2))
-    for options, told in (
+    for options, message in (
         (("--afterpulse-delay-ns", "3"), "belong together"),
         (("--crosstalk-kernel", "4"), "belongs to --crosstalk"),
         (("--crosstalk", "0.1"), "use 'sequential'"),
@@ -383,7 +383,7 @@ def test_command_line(tmp_path: Path):
     ):
         failed = run(*options, "-o", str(tmp_path / "not.npz"))
         assert failed.exit_code != 0
-        assert told in " ".join(failed.output.split())
+        assert message in " ".join(failed.output.split())
 
 
 @pytest.mark.parametrize("engine", ["exact", "sequential"])

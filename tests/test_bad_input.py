@@ -26,9 +26,9 @@ NAN, INF = math.nan, math.inf
 def refused(call: Callable[[], Any], kind: type[Exception], *fragments: str) -> None:
     with pytest.raises(kind) as error:
         call()
-    told = str(error.value)
+    message = str(error.value)
     for fragment in fragments:
-        assert fragment in told, f"{fragment!r} is not in {told!r}"
+        assert fragment in message, f"{fragment!r} is not in {message!r}"
 
 
 @pytest.mark.parametrize(
@@ -248,10 +248,10 @@ def test_simulate(argument: str, value: Any, kind: type[Exception], fragments: l
 def test_simulate_timestamps(argument: str, value: Any, kind: type[Exception], fragments: list[str]):
     with pytest.raises(kind) as error:
         ml.simulate_timestamps(FLUX, SYSTEM, **{argument: value})
-    told = str(error.value)
-    assert told.startswith(f"{argument} must "), told  # the caller's word for it
+    message = str(error.value)
+    assert message.startswith(f"{argument} must "), message  # the caller's word for it
     for fragment in fragments:
-        assert fragment in told
+        assert fragment in message
 
 
 @pytest.mark.parametrize("verb", [ml.simulate, ml.simulate_timestamps])
@@ -350,7 +350,7 @@ def test_maps_that_do_not_fit_together_are_refused(tmp_path):
     with np.load(tmp_path / "maps.npz") as archive:
         arrays = dict(archive)
     system = arrays["attributes"].item().replace('"system"', '"sistem"')
-    for name, value, told in (
+    for name, value, message in (
         ("depth", arrays["depth"][..., :-1], "depth must be numbers"),
         ("signal", arrays["signal"].astype(str), "signal must be numbers"),
         ("flags", None, "has no variable 'flags'"),
@@ -358,7 +358,7 @@ def test_maps_that_do_not_fit_together_are_refused(tmp_path):
     ):
         changed = {key: each for key, each in {**arrays, name: value}.items() if each is not None}
         np.savez(tmp_path / "bad.npz", **changed)
-        refused(lambda: load_maps(tmp_path / "bad.npz"), ValueError, "bad.npz", told)
+        refused(lambda: load_maps(tmp_path / "bad.npz"), ValueError, "bad.npz", message)
 
 
 def test_what_is_no_array_of_counts_is_named_by_its_type(tmp_path):
@@ -380,7 +380,7 @@ def test_a_file_of_another_kind_says_what_it_is(tmp_path):
     save_maps(tmp_path / "maps.npz", {"peak": ml.reconstruct(cube, SYSTEM, "peak")})
     ml.simulate_timestamps(FLUX, SYSTEM).save(tmp_path / "times.npz")
     ml.Table.build(SYSTEM, signal=(0.1, 1, 4), background=(0.1, 1, 4)).save(tmp_path / "table.h5")
-    for name, told in (("maps.npz", "load_maps"), ("times.npz", "Timestamps.load"), ("table.h5", "Table.load")):
-        refused(lambda name=name: io.load(tmp_path / name), ValueError, name, "not a cube", told)
+    for name, message in (("maps.npz", "load_maps"), ("times.npz", "Timestamps.load"), ("table.h5", "Table.load")):
+        refused(lambda name=name: io.load(tmp_path / name), ValueError, name, "not a cube", message)
     io.simulate_to(tmp_path / "a.zarr", FLUX, SYSTEM)
     refused(lambda: ml.Table.load(tmp_path / "a.zarr", SYSTEM), ValueError, "a.zarr is not a table")

@@ -147,8 +147,8 @@ def test_clock_is_that_of_dependent_additions(monkeypatch: pytest.MonkeyPatch):
     level = _core.levels()[-1]
     run = workload.EngineRun(load, level=level)
     timing, bandwidth = Timing((1.0,), (1.0,)), Bandwidth(1.0, 1.0, 1.0, 1.0)
-    told = rows.engine_row("a", run, timing, bandwidth)["ops floor ns/reg"]
-    assert told == pytest.approx(1e9 * operations(level).seconds(hertz))
+    text = rows.engine_row("a", run, timing, bandwidth)["ops floor ns/reg"]
+    assert text == pytest.approx(1e9 * operations(level).seconds(hertz))
     monkeypatch.setattr(_core, "addition_chain", None)
     clock.cache_clear()
     assert rows.engine_row("a", run, timing, bandwidth)["ops floor ns/reg"] is None

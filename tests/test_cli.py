@@ -68,7 +68,7 @@ def test_pixels_given_to_the_exact_engine_are_said(tmp_path, engine, light, reas
     out, small = tmp_path / "room.npz", ["--size", 4, "--bins", 64, "--seed", 3]
     done = run("simulate", "--scene", "room", *small, *light, "--engine", engine, "-o", out, "--no-picture")
     assert done.exit_code == 0, done.output
-    told = " ".join(done.output.split())
+    printed = " ".join(done.output.split())
     cube, report = io.load(out), dict[str, float]()
     ml.simulate(cube.flux, cube.system, engine=engine, seed=3, report=report)
     about = {name: number for name, number in report.items() if "exact" in name}
@@ -77,7 +77,7 @@ def test_pixels_given_to_the_exact_engine_are_said(tmp_path, engine, light, reas
         assert about[f"pixels given to exact, {reason}"] > 0
     for name, number in about.items():
         what, _, why = name.partition(", ")
-        assert f"{what}{f' ({why})' if why else ''} {number:,.0f}" in told
+        assert f"{what}{f' ({why})' if why else ''} {number:,.0f}" in printed
 
 
 @pytest.mark.parametrize("reason", [Reason.UNLIKELY, Reason.NEGATIVE])
@@ -365,8 +365,8 @@ def test_a_full_disk_is_exit_code_1(tmp_path, monkeypatch):
     monkeypatch.setattr(Writer, "write", full)
     done = run("simulate", "--scene", "room", *SMALL, "-o", tmp_path / "a.zarr")
     assert done.exit_code == 1
-    left = f"{tmp_path / 'a.zarr'} stays, marked incomplete: --resume (resume=True) continues it"
-    assert done.stderr == f"mars-lidar: failed: No space left on device; {left}\n"
+    remaining = f"{tmp_path / 'a.zarr'} stays, marked incomplete: --resume (resume=True) continues it"
+    assert done.stderr == f"mars-lidar: failed: No space left on device; {remaining}\n"
     assert "complete       NO: the simulation did not finish" in run("info", tmp_path / "a.zarr").output
     done = run("view", tmp_path / "a.zarr", "-o", tmp_path / "a.png")
     assert done.exit_code == 2
@@ -391,11 +391,11 @@ def test_a_stopped_run_is_left_incomplete(tmp_path, how):
     )
     _wait_for(out / "histogram" / "zarr.json")
     time.sleep(0.3)
-    told, seconds = stopped(process, how)
+    words, seconds = stopped(process, how)
     if how == signal.SIGINT:
         assert seconds < 2.0  # of two threads: promised within a second
         assert process.returncode == 130
-        assert f"mars-lidar: interrupted; {out} stays, marked incomplete: --resume" in told
+        assert f"mars-lidar: interrupted; {out} stays, marked incomplete: --resume" in words
     else:
         assert process.returncode == -signal.SIGKILL
     assert not (tmp_path / "a.png").exists()

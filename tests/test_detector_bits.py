@@ -88,7 +88,7 @@ def test_golden_bits_and_levels(mode: str, kind: str):
     """The committed bits, from every vector level, in histograms and timestamps."""
     flux, system = scene(mode, kind)
     cube = ml.simulate(flux, system, realizations=2, seed=2**63 + 1)
-    told = hashlib.sha256(cube.astype("<u4").tobytes()).hexdigest()[:12]
+    text = hashlib.sha256(cube.astype("<u4").tobytes()).hexdigest()[:12]
     index = np.arange(SHAPE[0] * SHAPE[1], dtype=np.uint32)
     request = Task(flux, system, 2, 0, index, 2**63 + 1, 1, None)
     expected = drawn(ExactEngine(level=_core.levels()[-1]), request)[1]
@@ -97,7 +97,7 @@ def test_golden_bits_and_levels(mode: str, kind: str):
         assert np.array_equal(out, cube.reshape(out.shape))
         for name in ("times", "cycle", "bin"):
             assert np.array_equal(getattr(records, name), getattr(expected, name))
-    assert told == GOLDEN[f"{mode} {kind}"]
+    assert text == GOLDEN[f"{mode} {kind}"]
 
 
 @pytest.mark.parametrize("engine", ["exact", "sequential"])
@@ -226,11 +226,11 @@ def test_plain_detectors_are_written_as_before():
 def test_starts_and_steps_wrap(system: ml.System):
     """A gate one period later, or moved by a period more, is the same gate."""
     flux = ml.Flux(np.ones((4, 4)), 0.5, 60.0)
-    one = ml.Detector(dead_time_ns=20.0, **GATE | {"gate_start_ns": 20.0, "gate_step_ns": 3.0})
+    instrument = ml.Detector(dead_time_ns=20.0, **GATE | {"gate_start_ns": 20.0, "gate_step_ns": 3.0})
     period = system.period_ns
     for start, step in ((20.0 + period, 3.0), (20.0 - 2 * period, 3.0), (20.0, 3.0 - period)):
-        other = replace(one, gate_start_ns=start, gate_step_ns=step)
-        a, b = (ml.simulate(flux, system.replace(detector=d), seed=1).astype(int) for d in (one, other))
+        other = replace(instrument, gate_start_ns=start, gate_step_ns=step)
+        a, b = (ml.simulate(flux, system.replace(detector=d), seed=1).astype(int) for d in (instrument, other))
         # the last bit of a gate's edge may differ, and with it a photon in a million
         assert np.abs(a - b).sum() <= 4
 
@@ -260,9 +260,9 @@ def test_command_line(tmp_path):
             dead_time_ns=75.0, mode="gated", gate_start_ns=30.0, gate_width_ns=20.0, gate_step_ns=5.0, gate_cycles=2
         )
         cube.system.save(tmp_path / "gated.yaml")
-    told = run("info", tmp_path / "a.zarr").output
-    assert "gated" in told
-    assert "20 ns from 30 ns of each period, moved by 5 ns every 2 periods" in told
+    printed = run("info", tmp_path / "a.zarr").output
+    assert "gated" in printed
+    assert "20 ns from 30 ns of each period, moved by 5 ns every 2 periods" in printed
     # a file's gate: kept with its mode, replaced in part, dropped with another mode
     file = ["--system", tmp_path / "gated.yaml"]
     for given, expected in (

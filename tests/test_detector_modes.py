@@ -93,8 +93,8 @@ def modes_of(case: Case, k: int, random: np.random.Generator) -> Case:
             extra["gate_step_ns"] = random.uniform(-0.3, 0.3) * system.period_ns * random.choice([1.0, 0.01])
             extra["gate_cycles"] = int(random.choice([1, 7]))
     pixel = Detector(dead_time_ns=system.detector.dead_time_ns, mode=mode, **extra)
-    told = f"{mode} {', moving' if 'gate_step_ns' in extra else ''}"
-    return replace(case, name=f"{told} {case.name}", system=system.replace(detector=pixel))
+    text = f"{mode} {', moving' if 'gate_step_ns' in extra else ''}"
+    return replace(case, name=f"{text} {case.name}", system=system.replace(detector=pixel))
 
 
 _RANDOM = np.random.default_rng(7)

@@ -18,7 +18,7 @@ def test_quick(tmp_path):
     assert main(["detectors", "--quick", "--out", str(tmp_path)]) == 0
     with (tmp_path / "detectors.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert [row["detector"] for row in rows] == [shown.name for shown in detectors.SHOWN]
+    assert [row["detector"] for row in rows] == [example.name for example in detectors.EXAMPLES]
     text = (tmp_path / "detectors.md").read_text()
     figures = sorted(path.name for path in tmp_path.glob("*.png"))
     assert figures == ["detectors_gated.png", "detectors_paralyzable.png", "detectors_synchronous.png"]

@@ -185,9 +185,9 @@ def test_dim_tails(signal: float) -> None:
     edges += [(-b, -a) for a, b in edges]
     pixels = max(1, round(registrations / (signal * 50_000_000)))
     drawn = pixels * 50_000_000 * signal / (1 + 0.3 * signal)
-    found = _tail_counts(ml.GaussianPulse(sigma_ns=sigma * PERIOD_NS), signal, edges, registrations)
+    result = _tail_counts(ml.GaussianPulse(sigma_ns=sigma * PERIOD_NS), signal, edges, registrations)
     outcomes = {}
-    for (low, high), events in zip(edges, found, strict=True):
+    for (low, high), events in zip(edges, result, strict=True):
         expected = drawn * abs(special.ndtr(-abs(low) / sigma) - special.ndtr(-abs(high) / sigma))
         more, fewer = stats.poisson.sf(events - 1, 1.01 * expected), stats.poisson.cdf(events, 0.99 * expected)
         outcomes[f"{low / sigma:.1f} to {high / sigma:.1f} sigma: {events} for {expected:.3g}"] = min(
@@ -216,8 +216,8 @@ def test_first_phases_lie_on_no_lattice(background: float) -> None:
     times = ml.simulate_timestamps(ml.Flux(np.zeros((100, 400)), background, 0.0), system, seed=4)
     first = times.offsets[:-1][np.diff(times.offsets) > 0]
     fine = times.times_ns[first] / PERIOD_NS * 2.0**17 % 1.0
-    seen = np.bincount((fine * 16).astype(int), minlength=16)
-    require({"even": stats.chisquare(seen).pvalue}, f"lattice of phases, B {background:g}")
+    observed = np.bincount((fine * 16).astype(int), minlength=16)
+    require({"even": stats.chisquare(observed).pvalue}, f"lattice of phases, B {background:g}")
 
 
 @pytest.mark.full
@@ -264,10 +264,10 @@ def test_laws_answer_or_say_what_to_use(name: str, prediction: str) -> None:
     }
     words = ""
     try:
-        found = np.asarray(asked[prediction]())
+        result = np.asarray(asked[prediction]())
     except (ValueError, MemoryError, ml.statistics.ConvergenceError) as error:
-        words, found = str(error), np.zeros(1)
-    assert np.isfinite(found).all()
+        words, result = str(error), np.zeros(1)
+    assert np.isfinite(result).all()
     assert not words or any(word in words for word in ("use ", "simulat", "engine", "tolerance=")), words
 
 

@@ -122,7 +122,7 @@ def test_efficiency_and_dark_counts_are_a_flux(engine: str):
 
 def by_definition(times: np.ndarray, offsets: np.ndarray, detector: Detector, first: int) -> list[int]:
     """Places of the registrations that are recorded, one after the other, as the documentation says."""
-    kept = []
+    selected = []
     for low, high in itertools.pairwise(offsets):
         last, number, in_period, period = -np.inf, 0, 0, -1
         for k in range(low, high):
@@ -136,8 +136,8 @@ def by_definition(times: np.ndarray, offsets: np.ndarray, detector: Detector, fi
             if number == (detector.max_events_per_exposure or first):
                 continue
             in_period, number = in_period + 1, number + 1
-            kept.append(k)
-    return kept
+            selected.append(k)
+    return selected
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -147,11 +147,11 @@ def test_records_are_those_of_the_definition(mode: str, wave: bool):
     for limits in ({}, {"max_events_per_period": 1, "max_events_per_exposure": 9}):
         detector = pixel({"electronics_dead_time_ns": 61.0} | limits, mode)
         plain = records_of(case_of(detector.without(*detector.effects), 400, wave))
-        found = records_of(case_of(detector, 400, wave))
-        kept = by_definition(plain.times, plain.offsets, detector, 2**31)
-        assert 0 < len(kept) < plain.times.size
-        assert np.array_equal(found.times, plain.times[kept])
-        assert np.array_equal(found.bin, plain.bin[kept])
+        result = records_of(case_of(detector, 400, wave))
+        selected = by_definition(plain.times, plain.offsets, detector, 2**31)
+        assert 0 < len(selected) < plain.times.size
+        assert np.array_equal(result.times, plain.times[selected])
+        assert np.array_equal(result.bin, plain.bin[selected])
 
 
 @pytest.mark.parametrize("engine", ["exact", "waveform", "sequential"])
@@ -219,8 +219,8 @@ def test_records_of_bright_light_in_wide_bins(effects: dict[str, Any]):
 def test_electronics_dead_time_statistics(dead: float, electronics: float, start: str, cycles: int):
     detector = pixel({"electronics_dead_time_ns": electronics}, dead=dead)
     case = case_of(detector, 20_000, start=start, cycles=cycles)
-    found = electronics_moments(ml.Flux(1.2, 0.8, 37.0), case.system)
-    law = Law(histogram=found.histogram, count_moments=(float(found.mean), float(found.variance)))
+    result = electronics_moments(ml.Flux(1.2, 0.8, 37.0), case.system)
+    law = Law(histogram=result.histogram, count_moments=(float(result.mean), float(result.variance)))
     check(ENGINES["exact"], case, law, {COUNTS, SHAPE})
 
 
@@ -228,9 +228,9 @@ def test_electronics_dead_time_in_bins_narrower_than_the_pulse():
     """Cells of the kernel are wider than these bins, which the pulse fills unevenly."""
     detector = pixel({"electronics_dead_time_ns": 130.0}, dead=45.0)
     case = case_of(detector, 20_000, cycles=120, bins=320)
-    found = electronics_moments(ml.Flux(1.2, 0.8, 37.0), case.system)
-    assert found.bins < 320
-    check(ENGINES["exact"], case, Law(histogram=found.histogram), {SHAPE})
+    result = electronics_moments(ml.Flux(1.2, 0.8, 37.0), case.system)
+    assert result.bins < 320
+    check(ENGINES["exact"], case, Law(histogram=result.histogram), {SHAPE})
 
 
 def test_electronics_dead_time_of_an_undisturbed_pixel_in_the_long_run():
@@ -238,9 +238,9 @@ def test_electronics_dead_time_of_an_undisturbed_pixel_in_the_long_run():
     means = []
     for cycles in (200, 400, 800):
         system = case_of(pixel({"electronics_dead_time_ns": 83.0}), cycles=cycles).system
-        found = electronics_moments(ml.Flux(1.2, 0.8, 0.5 * system.period_ns), system, tolerance=0.05)
-        means.append((float(found.mean), float(found.variance)))
-        assert found.histogram.sum() == pytest.approx(found.mean)
+        result = electronics_moments(ml.Flux(1.2, 0.8, 0.5 * system.period_ns), system, tolerance=0.05)
+        means.append((float(result.mean), float(result.variance)))
+        assert result.histogram.sum() == pytest.approx(result.mean)
     steps = np.diff(means, axis=0)
     assert steps[1] == pytest.approx(2.0 * steps[0], rel=1e-6)
 

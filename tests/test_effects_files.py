@@ -74,30 +74,30 @@ def test_every_effect_is_a_field_and_some_engine_does_it():
 @pytest.mark.parametrize("engine", ["mars", "feedback", "auto", "renewal", "poisson"])
 @pytest.mark.parametrize("name", EFFECTS)
 def test_engines_refuse_what_they_do_not_do(engine, name):
-    one = system(ALL.without(*(other for other in EFFECTS if other != name)))
+    instrument = system(ALL.without(*(other for other in EFFECTS if other != name)))
     flux = ml.Flux(1.0, 0.5, 40.0)
     if name in ENGINES[engine].effects:
-        assert ml.simulate(flux, one, engine=engine).sum() > 0
+        assert ml.simulate(flux, instrument, engine=engine).sum() > 0
         return
     with pytest.raises(ValueError, match=f"'{engine}' does not do {name} of the detector.*use '(exact|seq)"):
-        ml.simulate(flux, one, engine=engine)
+        ml.simulate(flux, instrument, engine=engine)
 
 
 @pytest.mark.parametrize("name", [name for name in EFFECTS if name.startswith(("elec", "max", "jit", "code"))])
 def test_statistics_refuse_what_they_do_not_know(name):
-    one = system(REAL.without(*(other for other in EFFECTS if other != name)))
+    instrument = system(REAL.without(*(other for other in EFFECTS if other != name)))
     with pytest.raises(ValueError, match=f"does not do {name} of the detector.*simulate it with engine 'exact'"):
-        ml.holding_time_covariance(ml.Flux(1.0, 0.5, 50.0), one)
+        ml.holding_time_covariance(ml.Flux(1.0, 0.5, 50.0), instrument)
     if name not in TIMING_EFFECTS:
         with pytest.raises(ValueError, match=f"joint_law.*{name}"):
-            ml.joint_law(ml.Flux(1.0, 0.5, 50.0), one)
+            ml.joint_law(ml.Flux(1.0, 0.5, 50.0), instrument)
         with pytest.raises(ValueError, match=f"exposure_moments.*{name}"):
-            ml.statistics.exposure_moments(ml.Flux(1.0, 0.5, 50.0), one)
+            ml.statistics.exposure_moments(ml.Flux(1.0, 0.5, 50.0), instrument)
         if name != "electronics_dead_time_ns":
             with pytest.raises(ValueError, match=f"count_law.*{name}"):
-                ml.count_law(ml.Flux(1.0, 0.5, 50.0), one)
+                ml.count_law(ml.Flux(1.0, 0.5, 50.0), instrument)
     with pytest.raises(ValueError, match=f"a table does not do {name}"):
-        ml.Table.build(one, [0.5, 1.0], [0.5, 1.0])
+        ml.Table.build(instrument, [0.5, 1.0], [0.5, 1.0])
 
 
 def test_electronics_dead_time_has_statistics_for_some_modes_only():
@@ -164,12 +164,12 @@ def test_dark_count_maps():
     assert hot.mean() == pytest.approx(0.03, abs=4 * np.sqrt(0.03 * 0.97 / rates.size))
     assert np.median(rates[~hot]) == pytest.approx(50.0, rel=0.02)
     assert np.log(rates[~hot]).std() == pytest.approx(0.4, rel=0.02)
-    one = system(Detector(dead_time_ns=1.0, detection_efficiency=0.25))
-    flux = ml.Flux(np.ones((200, 300)), 0.5, 10.0).with_dark_counts(rates, one)
-    assert np.allclose(flux.detected(one).background, 0.125 + rates * 1e-7, rtol=1e-12)
+    instrument = system(Detector(dead_time_ns=1.0, detection_efficiency=0.25))
+    flux = ml.Flux(np.ones((200, 300)), 0.5, 10.0).with_dark_counts(rates, instrument)
+    assert np.allclose(flux.detected(instrument).background, 0.125 + rates * 1e-7, rtol=1e-12)
     for bad in (-1.0, np.ones((2, 3)), np.nan):
         with pytest.raises(ValueError, match="rate_hz"):
-            flux.with_dark_counts(bad, one)
+            flux.with_dark_counts(bad, instrument)
 
 
 def test_dark_counts_are_in_the_gate_only():
@@ -210,22 +210,22 @@ def test_command_line(tmp_path):
         32,
     )
     scene = ("simulate", "--scene", "room", "--size", 8, "--no-picture", "-o")
-    code, told = run(*scene, tmp_path / "a.npz", *flags)
-    assert code == 0, told
+    code, output = run(*scene, tmp_path / "a.npz", *flags)
+    assert code == 0, output
     with io.load(tmp_path / "a.npz") as cube:
         detector = cube.system.detector
         cube.system.save(tmp_path / "spad.yaml")
         counts = np.asarray(cube.histogram)
     jitter = Jitter.from_fwhm(fwhm_ns=0.2, tail_ns=0.3, tail_fraction=0.2)
     assert detector == Detector(**{**vars(REAL), "jitter": jitter})
-    code, told = run(*scene, tmp_path / "b.npz", "--system", tmp_path / "spad.yaml")
-    assert code == 0, told
+    code, output = run(*scene, tmp_path / "b.npz", "--system", tmp_path / "spad.yaml")
+    assert code == 0, output
     with io.load(tmp_path / "b.npz") as cube:
         assert np.array_equal(np.asarray(cube.histogram), counts)
-    code, told = run("info", tmp_path / "a.npz", "--verify")
+    code, output = run("info", tmp_path / "a.npz", "--verify")
     assert code == 0
     for text in ("detection_efficiency 0.3", "electronics_dead_time_ns 60", "code_density of 2 values", "every count"):
-        assert text in told
+        assert text in output
 
 
 @pytest.mark.full
@@ -233,14 +233,16 @@ def test_pictures(tmp_path):
     """With what has a predicted mean, and with what has none."""
     both = ("--jitter-fwhm-ns", 2.0, "--electronics-dead-time-ns", 90), ("--max-events-per-period", 1)
     for k, flags in enumerate(both):
-        code, told = run("simulate", "--scene", "room", "--size", 8, "--bins", 64, "-o", tmp_path / f"{k}.npz", *flags)
-        assert code == 0, told
+        code, output = run(
+            "simulate", "--scene", "room", "--size", 8, "--bins", 64, "-o", tmp_path / f"{k}.npz", *flags
+        )
+        assert code == 0, output
         assert (tmp_path / f"{k}.png").exists()
 
 
 def test_the_poisson_engine_draws_detected_photons(tmp_path):
-    one = system(Detector(dead_time_ns=20.0, detection_efficiency=0.5, dark_count_hz=1e6))
-    io.simulate_to(tmp_path / "a.npz", ml.Flux(1.0, 0.5, 40.0), one, engine="poisson")
+    instrument = system(Detector(dead_time_ns=20.0, detection_efficiency=0.5, dark_count_hz=1e6))
+    io.simulate_to(tmp_path / "a.npz", ml.Flux(1.0, 0.5, 40.0), instrument, engine="poisson")
     with io.load(tmp_path / "a.npz") as cube:
         assert predicted_counts(cube, 0, 0).sum() == pytest.approx(50 * (0.75 + 0.1))
 
@@ -260,7 +262,7 @@ def test_the_poisson_engine_draws_detected_photons(tmp_path):
     ],
 )
 def test_command_line_errors(tmp_path, arguments, error):
-    code, told = run("simulate", "--scene", "room", "--size", 8, "-o", tmp_path / "x.npz", *arguments)
+    code, output = run("simulate", "--scene", "room", "--size", 8, "-o", tmp_path / "x.npz", *arguments)
     assert code == 2
-    assert error in " ".join(told.split())
+    assert error in " ".join(output.split())
     assert not (tmp_path / "x.npz").exists()

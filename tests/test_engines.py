@@ -223,8 +223,8 @@ def test_one_registration_at_most(engine: str, start: str):
         histogram = first_arrival(photons) / -np.expm1(-total) * -np.expm1(-7 * total)
     else:
         histogram = 7 * photons / (1 + 9 * total)
-    seen = histogram.sum()
-    check(ENGINES[engine], case, Law(histogram, np.array([1 - seen, seen])), CLAIMS[engine])
+    observed = histogram.sum()
+    check(ENGINES[engine], case, Law(histogram, np.array([1 - observed, observed])), CLAIMS[engine])
     assert draw(ENGINES[engine], case, 2).counts.max() <= 1
 
 

@@ -154,8 +154,8 @@ def test_tails_after_a_dead_time_of_one_period():
 @pytest.mark.parametrize("part", [1.2, 1.6, 2.5, 6.0])
 def test_armed_in_the_late_tail(signal: float, part: float):
     """Armed each period where `part` times what the engine draws afresh is left of the pulse."""
-    left = part * min(2.0**-14, 2.0**-8 / signal)
-    depth = -special.ndtri(left)
+    remaining = part * min(2.0**-14, 2.0**-8 / signal)
+    depth = -special.ndtri(remaining)
     cycles = 1_000_000 if signal == 1.0 else 300_000
     view = system(cycles=cycles, detector=ml.Detector(dead_time_ns=0.0, mode="synchronous"), bins=1000)
     law = first_arrival(signal * view.pulse.bin_energy(PERIOD - depth, PERIOD, view.bins))

@@ -56,10 +56,10 @@ def test_a_folder_without_any_image_says_so(tmp_path):
         write_depth(tmp_path / f"s{k}_depth.png")
     with pytest.warns(UserWarning, match=r"no image was found to any of 3 depth files.*s0_depth\.png"):
         scenes, _ = io.scan(tmp_path)
-    assert [one.image for one in scenes] == [None] * 3
+    assert [scene.image for scene in scenes] == [None] * 3
     Image.fromarray(np.full((8, 8), 200, np.uint8)).save(tmp_path / "s1.jpg")
     scenes, _ = io.scan(tmp_path)  # some have none, which is nothing odd
-    assert [one.image and one.image.name for one in scenes] == [None, "s1.jpg", None]
+    assert [scene.image and scene.image.name for scene in scenes] == [None, "s1.jpg", None]
 
 
 def test_whole_floats_are_integers_everywhere(tmp_path):
@@ -100,9 +100,9 @@ def test_progress_true_is_a_bar_and_a_log_gets_a_line_every_half_minute(monkeypa
     for second in range(1, 101):
         now[0] = float(second)
         bar(second, 100)
-    told = capsys.readouterr().err.splitlines()
-    assert told[0] == "mars-lidar: simulating: 5 % after 5 s, about 95 s left"  # before a long run
-    assert [int(re.search(r"(\d+) %", line)[1]) for line in told] == [5, 36, 67, 98]
+    output = capsys.readouterr().err.splitlines()
+    assert output[0] == "mars-lidar: simulating: 5 % after 5 s, about 95 s left"  # before a long run
+    assert [int(re.search(r"(\d+) %", line)[1]) for line in output] == [5, 36, 67, 98]
     brief = bars.Bar("simulating")
     for second in range(101, 106):
         now[0] = float(second)
@@ -141,12 +141,12 @@ def test_depth_is_judged_in_the_table_as_in_the_picture(tmp_path):
     flux = ml.Scene.example("room", size=12).flux(SYSTEM, signal=0.02, sbr=0.5)
     io.simulate_to(tmp_path / "a.zarr", flux, SYSTEM)
     with io.load(tmp_path / "a.zarr") as cube:
-        found = ml.reconstruct(cube)
-        assert 0.0 < found.detected.mean() < 1.0
-        drawn = depth_error_m(cube, np.where(found.detected[0], found.depth_m[0], np.nan))
-        told = errors_against(cube, found)["depth"]
-    assert told.rmse == pytest.approx(float(np.sqrt(np.nanmean(drawn**2))))
-    assert told.missing == pytest.approx(1.0 - float(found.detected.mean()))
+        estimate = ml.reconstruct(cube)
+        assert 0.0 < estimate.detected.mean() < 1.0
+        drawn = depth_error_m(cube, np.where(estimate.detected[0], estimate.depth_m[0], np.nan))
+        text = errors_against(cube, estimate)["depth"]
+    assert text.rmse == pytest.approx(float(np.sqrt(np.nanmean(drawn**2))))
+    assert text.missing == pytest.approx(1.0 - float(estimate.detected.mean()))
 
 
 def test_what_an_earlier_run_did_is_no_part_of_the_speed(monkeypatch, capsys):
@@ -210,10 +210,10 @@ LONG = SYSTEM.replace(cycles=10_000_000)
 
 def test_a_long_run_is_told_before_with_what_is_faster():
     flux = ml.Scene.example("room", size=32).flux(LONG, signal=1.0, sbr=1.0)
-    told = advice(flux, LONG)
-    assert 10.0 < told.seconds < 10_000.0
-    assert told.auto_s < told.seconds / 3
-    assert re.fullmatch(r"about .* on this machine; --engine auto: about .*, same law", str(told))
+    text = advice(flux, LONG)
+    assert 10.0 < text.seconds < 10_000.0
+    assert text.auto_s < text.seconds / 3
+    assert re.fullmatch(r"about .* on this machine; --engine auto: about .*, same law", str(text))
     assert str(advice(flux, SYSTEM)) == ""
     gated = LONG.replace(detector=ml.Detector(dead_time_ns=50.0, max_events_per_period=1))
     assert "auto" not in str(advice(flux, gated))  # which cannot do it
@@ -256,8 +256,8 @@ def test_mars_takes_a_table_over_the_range_of_an_image(tmp_path, monkeypatch):
         assert abs(cube.histogram[0, 9, 9].sum() - law[0].mean) < 6 * law[0].variance ** 0.5
     done = run(*given, "--engine", "mars", "--table", "none", "-o", tmp_path / "b.zarr")
     assert (done.exit_code, done.stderr) == (0, "")
-    found = compare(cube.flux, cube.system, ["mars"], realizations=50, repeats=1, pixels=1)
-    assert "by a table" in found.table
+    result = compare(cube.flux, cube.system, ["mars"], realizations=50, repeats=1, pixels=1)
+    assert "by a table" in result.table
     (next((tmp_path / "cache").iterdir())).unlink()
     with io.load(tmp_path / "a.zarr") as cube, pytest.raises(ValueError, match="table must be the one"):
         io.verify(cube)
@@ -269,7 +269,7 @@ def gated(**times: float) -> ml.Detector:
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "message"),
     [
         ({"pulse": ml.GaussianPulse(sigma_ns=100.0)}, r"sigma_ns=100 .* in picoseconds, give 0\.1, in ns"),
         ({"pulse": ml.GaussianPulse.from_fwhm(fwhm_ns=100.0)}, r"sigma_ns=42.* in picoseconds"),
@@ -287,8 +287,8 @@ def gated(**times: float) -> ml.Detector:
         ),
     ],
 )
-def test_a_time_in_another_unit_is_told(change, told):
-    with pytest.warns(ml.UnitWarning, match=told):
+def test_a_time_in_another_unit_is_told(change, message):
+    with pytest.warns(ml.UnitWarning, match=message):
         SYSTEM.replace(**{"period_ns": 133.0, **change})
 
 

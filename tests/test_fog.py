@@ -27,8 +27,8 @@ def test_lidar_equation(alpha: float, first: float, delay: float):
     assert (flux.background == 0.1).all()
     target = 0.5 * C * delay
     total = integrate.quad(lambda z: np.exp(-2 * alpha * z) / z**2, first, np.inf)[0]
-    seen = integrate.quad(lambda z: np.exp(-2 * alpha * z) / z**2, first, target)[0]
-    assert flux.signal == pytest.approx(0.7 * np.exp(-2 * alpha * target) + 1.3 * seen / total, rel=1e-6)
+    observed = integrate.quad(lambda z: np.exp(-2 * alpha * z) / z**2, first, target)[0]
+    assert flux.signal == pytest.approx(0.7 * np.exp(-2 * alpha * target) + 1.3 * observed / total, rel=1e-6)
     # the cloud through the pulse, point by point
     z = np.linspace(first, target, 400_001)
     density = np.exp(-2 * alpha * z) / z**2
@@ -37,7 +37,9 @@ def test_lidar_equation(alpha: float, first: float, delay: float):
     place = (tau[:, None] + 0.4 * np.random.default_rng(1).standard_normal((tau.size, 4))) % 100.0
     cloud = np.histogram(place, 50, (0.0, 100.0), weights=np.repeat(weight[:, None], 4, 1))[0] * 1.3 / total / 4
     target_energy = 0.7 * np.exp(-2 * alpha * target) * SYSTEM.pulse.bin_energy(delay, 100.0, 50)
-    assert flux.waveform.reshape(50, 20).sum(-1) == pytest.approx(cloud + target_energy, abs=5e-3 * 1.3 * seen / total)
+    assert flux.waveform.reshape(50, 20).sum(-1) == pytest.approx(
+        cloud + target_energy, abs=5e-3 * 1.3 * observed / total
+    )
 
 
 def test_limits():
@@ -74,7 +76,7 @@ def test_light_that_comes_many_periods_late():
 
 def test_bad_input():
     flux = ml.Flux(1.0, 0.0, 30.0)
-    for light, changes, told in (
+    for light, changes, message in (
         (flux, {"extinction_per_m": 0.0}, "extinction_per_m must be"),
         (flux, {"backscatter": -1.0}, "backscatter must be"),
         (flux, {"nearest_m": 0.0}, "nearest_m must be"),
@@ -82,7 +84,7 @@ def test_bad_input():
         (ml.Flux(1.0, 0.0, -3.0), {}, "delay_ns must be >= 0 in fog"),
         (ml.Flux(waveform=[1.0]), {}, "needs the delays of returns"),
     ):
-        with pytest.raises(ValueError, match=told):
+        with pytest.raises(ValueError, match=message):
             light.in_fog(SYSTEM, **({"extinction_per_m": 0.1, "backscatter": 1.0} | changes))
 
 

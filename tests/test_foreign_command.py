@@ -20,7 +20,7 @@ SYSTEM = ml.System(
 )
 DELAY = np.linspace(5.0, 35.0, 64).reshape(8, 8)
 CLOUD = ["--focal-px", "10", "--cloud"]
-TOLD = ["--bin-ps", "200", "--cycles", "4e3", "--dead-time-ns", "25", "--pulse-sigma-ns", "0.5"]
+SYSTEM_OPTIONS = ["--bin-ps", "200", "--cycles", "4e3", "--dead-time-ns", "25", "--pulse-sigma-ns", "0.5"]
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +42,7 @@ def test_reconstruct_from_a_bare_array(tmp_path: Path, counts: np.ndarray) -> No
             tmp_path / "maps.npz",
             "--axes",
             "tyx",
-            *TOLD,
+            *SYSTEM_OPTIONS,
             *CLOUD,
             tmp_path / "face.ply",
         )
@@ -50,9 +50,9 @@ def test_reconstruct_from_a_bare_array(tmp_path: Path, counts: np.ndarray) -> No
     )
     assert b"element vertex 64" in (tmp_path / "face.ply").read_bytes()
     assert b"depth_error" in (tmp_path / "face.ply").read_bytes()
-    found = ml.io.maps.load_maps(tmp_path / "maps.npz")[0]
-    error = np.asarray(found["depth"])[0, 0] - SYSTEM.depth_m(DELAY)
-    assert np.abs(error).max() < 5 * np.nanmax(found["depth_error"])
+    result = ml.io.maps.load_maps(tmp_path / "maps.npz")[0]
+    error = np.asarray(result["depth"])[0, 0] - SYSTEM.depth_m(DELAY)
+    assert np.abs(error).max() < 5 * np.nanmax(result["depth_error"])
     assert (tmp_path / "maps.png").exists()
 
 
@@ -75,30 +75,30 @@ def test_info_lists_what_is_in_a_foreign_file(
 ) -> None:
     np.savez(tmp_path / "two.npz", a=counts, b=np.zeros(3))
     assert run("info", tmp_path / "two.npz") == 0
-    told = capsys.readouterr().out
-    assert "a 8 × 8 × 200" in told
-    assert "--cycles" in told
+    output = capsys.readouterr().out
+    assert "a 8 × 8 × 200" in output
+    assert "--cycles" in output
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "message"),
     [
         ([], "give --cycles, --dead-time-ns, --pulse-sigma-ns, --bin-ps, or --system"),
-        (TOLD[:2], "give --cycles, --dead-time-ns, --pulse-sigma-ns, or --system"),
-        ([*TOLD, "--bin-ns", "0.2"], "exclude each other"),
-        ([*TOLD, "--period-ns", "40.1"], "40 and 40.2 would be"),
-        ([*TOLD, "--axes", "yx"], "axes must be made of"),
-        ([*TOLD, "--cloud", "a.ply"], "belong together"),
-        ([*TOLD, "--image", "3"], "two integers"),
-        ([*TOLD, "--start-ns", "0.3"], "0.2 or 0.4"),
-        (["--cycles", "10", *TOLD[:2], *TOLD[4:]], "cycles must be the laser periods"),
+        (SYSTEM_OPTIONS[:2], "give --cycles, --dead-time-ns, --pulse-sigma-ns, or --system"),
+        ([*SYSTEM_OPTIONS, "--bin-ns", "0.2"], "exclude each other"),
+        ([*SYSTEM_OPTIONS, "--period-ns", "40.1"], "40 and 40.2 would be"),
+        ([*SYSTEM_OPTIONS, "--axes", "yx"], "axes must be made of"),
+        ([*SYSTEM_OPTIONS, "--cloud", "a.ply"], "belong together"),
+        ([*SYSTEM_OPTIONS, "--image", "3"], "two integers"),
+        ([*SYSTEM_OPTIONS, "--start-ns", "0.3"], "0.2 or 0.4"),
+        (["--cycles", "10", *SYSTEM_OPTIONS[:2], *SYSTEM_OPTIONS[4:]], "cycles must be the laser periods"),
         (["--system", "none.yaml", "--cycles", "5"], "exclude each other"),
     ],
 )
 def test_what_is_missing_is_named(
-    tmp_path: Path, counts: np.ndarray, capsys: pytest.CaptureFixture[str], words: list[str], told: str
+    tmp_path: Path, counts: np.ndarray, capsys: pytest.CaptureFixture[str], words: list[str], message: str
 ) -> None:
     np.save(tmp_path / "face.npy", counts)
     assert run("reconstruct", tmp_path / "face.npy", "-o", tmp_path / "maps.zarr", *words) == 2
-    assert told in " ".join(capsys.readouterr().err.split())
+    assert message in " ".join(capsys.readouterr().err.split())
     assert not (tmp_path / "maps.zarr").exists()

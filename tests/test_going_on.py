@@ -67,13 +67,13 @@ def test_an_interrupted_cube_goes_on_to_the_same_bits(tmp_path, monkeypatch, in_
 
 def test_a_cube_of_something_else_is_not_gone_on_with(tmp_path):
     io.simulate_to(tmp_path / "a.zarr", flux_of(), SYSTEM)
-    for change, told in (
+    for change, message in (
         ({"seed": 1}, "begun with another seed"),
         ({"system": SYSTEM.replace(cycles=41)}, "begun with another"),
         ({"flux": flux_of(signal=2.0)}, "begun with another"),
     ):
         given = {"flux": flux_of(), "system": SYSTEM, **change}
-        with pytest.raises(ValueError, match=told):
+        with pytest.raises(ValueError, match=message):
             io.simulate_to(tmp_path / "a.zarr", **given, resume=True)
     io.simulate_to(tmp_path / "a.h5", flux_of(), SYSTEM)
     with pytest.raises(ValueError, match=r"resume is for a \.zarr"):

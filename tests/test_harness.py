@@ -149,7 +149,7 @@ class IndependentBins(Wrong):
         out[:] = np.random.default_rng(task.seed).poisson(out.mean(0), out.shape)
 
 
-def found(engine: Engine, case: Case, claims: Collection[str] = EVERYTHING) -> set[str]:
+def failures(engine: Engine, case: Case, claims: Collection[str] = EVERYTHING) -> set[str]:
     return rejected(compare(engine, case, EXACT, claims))
 
 
@@ -170,14 +170,14 @@ def found(engine: Engine, case: Case, claims: Collection[str] = EVERYTHING) -> s
     ids=lambda x: type(x).__name__ if isinstance(x, Engine) else "",
 )
 def test_wrong_engine_is_found(engine: Engine, case: Case, claims: Collection[str], expected: set[str]):
-    assert expected <= found(engine, case, claims)
+    assert expected <= failures(engine, case, claims)
 
 
 @pytest.mark.parametrize("case", [replace(MID, items=24_000), REPELLING], ids=["repulsion 10 %", "repulsion 60 %"])
 def test_faults_of_the_joint_law_are_found_there_only(case: Case):
     """Count x multinomial has the right counts and the right mean shape: only the joint law shows it."""
     expected = {"histogram variance", "window", "lag-1 covariance"}
-    assert found(CountTimesMultinomial(), case, HISTOGRAMS) == expected
+    assert failures(CountTimesMultinomial(), case, HISTOGRAMS) == expected
 
 
 @pytest.mark.parametrize(
@@ -201,11 +201,11 @@ def test_wrong_engine_is_found_by_the_closed_form(engine: Engine, case: Case, ex
 
 def test_wrong_count_law_with_the_right_moments_is_found():
     case = replace(MID, flux=flux_of(0.05, 0.02), items=20_000)
-    assert found(GaussianCounts(), case, {COUNTS}) == {"count law"}
+    assert failures(GaussianCounts(), case, {COUNTS}) == {"count law"}
 
 
 def test_dead_time_ignored_is_found():
-    assert {"count mean", "mean histogram"} <= found(ENGINES["poisson"], MID, HISTOGRAMS)
+    assert {"count mean", "mean histogram"} <= failures(ENGINES["poisson"], MID, HISTOGRAMS)
 
 
 @pytest.mark.parametrize(

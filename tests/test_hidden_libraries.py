@@ -33,9 +33,9 @@ def test_what_misses_a_library_names_its_extra(tmp_path, library, extra, names, 
         [sys.executable, HIDDEN, library, extra, tmp_path], capture_output=True, text=True, timeout=300
     )
     assert done.returncode == 0, done.stdout + done.stderr
-    told = re.search(r"(\d+) names and (\d+) commands", done.stdout)
-    assert told, done.stdout
-    assert (int(told[1]) > 0, int(told[2]) > 0) == (names, commands), done.stdout
+    words = re.search(r"(\d+) names and (\d+) commands", done.stdout)
+    assert words, done.stdout
+    assert (int(words[1]) > 0, int(words[2]) > 0) == (names, commands), done.stdout
 
 
 def test_an_exr_names_its_extra(tmp_path):

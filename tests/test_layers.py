@@ -11,7 +11,7 @@ import mars_lidar as ml
 from mars_lidar.io.rgbd import read_layers
 from mars_lidar.light.fog import Fog
 from mars_lidar.light.transient import Transient
-from mars_lidar.scene.layers import LayeredScene
+from mars_lidar.scene.scene import LayeredScene
 
 SYSTEM = ml.System(
     period_ns=100.0, cycles=50, bins=32, pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=30.0)

@@ -87,12 +87,12 @@ def test_bins_are_independent_poisson_numbers(per_bin: float, bins: int):
     size = deviation.size
     # variance of all bins; covariance of neighbours, of halves of a row, and of successive realizations
     assert z_to_p((np.sum(deviation**2) - size) / np.sqrt(realizations * np.sum(2 + 1 / m)))[()] > ALPHA
-    for left, right in (
+    for lower, right in (
         (deviation[:, 1:], deviation[:, :-1]),
         (deviation[:, : m.size // 2], deviation[:, m.size - m.size // 2 :]),
         (deviation[1:], deviation[:-1]),
     ):
-        assert z_to_p(np.sum(left * right) / np.sqrt(left.size))[()] > ALPHA
+        assert z_to_p(np.sum(lower * right) / np.sqrt(lower.size))[()] > ALPHA
     total = np.sum((cube.sum(1) - mean.sum()) ** 2) / mean.sum()
     assert 2 * min(stats.chi2.sf(total, realizations), stats.chi2.cdf(total, realizations)) > ALPHA
 

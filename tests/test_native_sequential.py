@@ -158,8 +158,8 @@ def test_without_dead_time_bins_are_poisson(name: str):
 
 def armed_survival(n: np.ndarray, rate: float, dead: float, exposure: float) -> np.ndarray:
     """P(N >= n) = P(Gamma(n, 1 / rate) <= t - (n - 1) t_d) for n >= 1."""
-    left = np.maximum(exposure - (n - 1) * dead, 0.0)
-    return np.where(n == 0, 1.0, special.gammainc(np.maximum(n, 1), rate * left))
+    remaining = np.maximum(exposure - (n - 1) * dead, 0.0)
+    return np.where(n == 0, 1.0, special.gammainc(np.maximum(n, 1), rate * remaining))
 
 
 @pytest.mark.full

@@ -47,10 +47,10 @@ def objects(tmp_path_factory) -> dict[str, object]:
 @pytest.mark.full
 def test_a_notebook_shows_text_and_a_small_picture(objects):
     without = {"several laws", "one pixel", "dark flux"}  # no map, no curve
-    for name, shown in objects.items():
-        text = shown._repr_html_()
+    for name, example in objects.items():
+        text = example._repr_html_()
         assert text.startswith("<code>"), name
-        assert type(shown).__name__.removeprefix("Drawn") in re.sub("<.*?>", "", text)[:40], name
+        assert type(example).__name__.removeprefix("Drawn") in re.sub("<.*?>", "", text)[:40], name
         assert ("data:image/png;base64," in text) == (name not in without), name
         assert len(text) < 60_000, name
 
@@ -61,10 +61,10 @@ def test_the_tutorial_runs_and_is_the_notebook(monkeypatch):
     import make_notebook
 
     try:
-        made, kept = make_notebook.notebook(), json.loads((EXAMPLES / "tutorial.ipynb").read_text())
+        made, selected = make_notebook.notebook(), json.loads((EXAMPLES / "tutorial.ipynb").read_text())
     finally:
         sys.modules.pop("make_notebook")
-    assert [one["source"] for one in made["cells"]] == [one["source"] for one in kept["cells"]]
-    shown = [output for one in made["cells"] for output in one.get("outputs", ())]
-    assert sum("text/html" in one.get("data", {}) for one in shown) >= 6
-    assert sum("image/png" in one.get("data", {}) for one in shown) == 1
+    assert [item["source"] for item in made["cells"]] == [item["source"] for item in selected["cells"]]
+    examples = [output for item in made["cells"] for output in item.get("outputs", ())]
+    assert sum("text/html" in item.get("data", {}) for item in examples) >= 6
+    assert sum("image/png" in item.get("data", {}) for item in examples) == 1

@@ -233,9 +233,9 @@ def test_an_array_of_counts_is_drawn_and_saved_with_its_system(tmp_path):
         with io.load(tmp_path / name) as back:
             assert np.array_equal(back.histogram[...], counts)
             assert np.array_equal(back.flux.signal, flux.signal)
-    told = r"cube must be a Cube, or an array of counts beside the system that recorded them .*got ndarray alone"
+    text = r"cube must be a Cube, or an array of counts beside the system that recorded them .*got ndarray alone"
     for call in (lambda: plot.pixel_histogram(counts, 0, 0), lambda: io.save(tmp_path / "c.h5", counts)):
-        with pytest.raises(TypeError, match=told):
+        with pytest.raises(TypeError, match=text):
             call()
     with pytest.raises(TypeError, match="a Cube has its own"):
         io.save(tmp_path / "c.h5", cube, SYSTEM)

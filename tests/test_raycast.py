@@ -80,10 +80,10 @@ def test_the_nearest_surface_wins_whatever_the_order():
     ball = Sphere((0.0, 0.0, 3.0), 0.5, white)
     wall = Box((0.0, 0.0, 5.0), (9.0, 9.0, 0.5), (lambda u, v: np.full_like(u, 0.25),) * 6)
     camera = Camera((0.0, 0.0, 0.0))
-    one, two = cast([ball, wall], camera, (20, 20)), cast([wall, ball], camera, (20, 20))
-    for a, b in zip(one, two, strict=True):
+    first, two = cast([ball, wall], camera, (20, 20)), cast([wall, ball], camera, (20, 20))
+    for a, b in zip(first, two, strict=True):
         np.testing.assert_array_equal(a, b)
-    assert one[0].min() == pytest.approx(2.5, abs=0.02)
+    assert first[0].min() == pytest.approx(2.5, abs=0.02)
 
 
 def test_what_is_behind_the_camera_is_not_seen():

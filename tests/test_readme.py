@@ -28,10 +28,10 @@ def test_python():
 
 def test_commands_that_the_checks_run_are_there():
     for name in ("main", "tests"):
-        found = subprocess.run(
+        result = subprocess.run(
             [sys.executable, ROOT / ".ci" / "readme_command.py", name], capture_output=True, text=True, check=True
         )
-        assert ".venv/bin/" in found.stdout
+        assert ".venv/bin/" in result.stdout
 
 
 def test_links_lead_somewhere():

@@ -66,9 +66,9 @@ def test_absolute_photon_times_in_a_window(tmp_path):
     given = [tmp_path / "tower.mat", "--unit-ns", "0.001", "--bin-ps", "1000", "--period-ns", "10000", *KNOWN]
     assert "--window-ns" in run("reconstruct", *given, "--start-ns", "5180", "-o", tmp_path / "a.npz")
     run("reconstruct", *given, "--window-ns", "5180,5300", "-o", tmp_path / "maps.npz")
-    found = depth(tmp_path / "maps.npz")
-    assert found.shape == (4, 5)
-    assert np.abs(np.median(found) - truth) < 0.1
+    result = depth(tmp_path / "maps.npz")
+    assert result.shape == (4, 5)
+    assert np.abs(np.median(result) - truth) < 0.1
     assert "--window-ns must be two numbers" in refused(
         "reconstruct", *given, "--window-ns", "5", "-o", tmp_path / "b.npz"
     )
@@ -91,9 +91,9 @@ def test_a_cell_of_sparse_matrices(tmp_path, system):
     assert "CNN[1] 200 × 12 sparse" in run("info", tmp_path / "capture.mat")
     given = ["--bin-ps", "500", *KNOWN]
     run("reconstruct", tmp_path / "capture.mat", *given, "--axes", "t(xy)", "--image", "3,4", "-o", tmp_path / "a.npz")
-    told = run("info", tmp_path / "two.mat")
-    assert "cubes[1] 3 × 4 × 200" in told
-    assert "cubes[2] 3 × 4 × 200" in told
+    output = run("info", tmp_path / "two.mat")
+    assert "cubes[1] 3 × 4 × 200" in output
+    assert "cubes[2] 3 × 4 × 200" in output
     assert "cubes[1]" in refused("reconstruct", tmp_path / "two.mat", *given, "-o", tmp_path / "b.npz")
     run("reconstruct", tmp_path / "two.mat", *given, "--variable", "cubes[2]", "-o", tmp_path / "b.npz")
     for name in "ab":
@@ -104,9 +104,9 @@ def test_info_of_a_v73_file_whose_first_element_is_no_cube(tmp_path):
     with h5py.File(tmp_path / "stream.mat", "w") as file:
         file["t_ns"] = np.arange(10.0)[:, None]
         file["note"] = np.frombuffer(b"no cube", np.uint8)
-    told = run("info", tmp_path / "stream.mat")
-    assert "t_ns" in told
-    assert "version 5" not in told
+    output = run("info", tmp_path / "stream.mat")
+    assert "t_ns" in output
+    assert "version 5" not in output
 
 
 @pytest.mark.full
@@ -150,10 +150,10 @@ def reflecting(path: Path, system: ml.System) -> np.ndarray:
 def test_an_internal_reflection_is_told_and_left_out(tmp_path, system):
     surface = reflecting(tmp_path / "cube.h5", system)
     cube = tmp_path / "cube.h5"
-    told = run("reconstruct", cube, "-o", tmp_path / "first.npz")
-    assert "of the first returns stand at" in told
-    assert "--from-ns" in told
-    assert "--returns 2 --keep farthest" in told
+    output = run("reconstruct", cube, "-o", tmp_path / "first.npz")
+    assert "of the first returns stand at" in output
+    assert "--from-ns" in output
+    assert "--returns 2 --keep farthest" in output
     assert np.median(np.abs(depth(tmp_path / "first.npz") - 0.44)) < 0.05
     for name, remedy in (("a", ["--from-ns", "6"]), ("b", ["--returns", "2", "--keep", "farthest"])):
         run("reconstruct", cube, *remedy, "-o", tmp_path / f"{name}.npz")
@@ -169,15 +169,15 @@ def test_a_plain_wall_is_no_reflection(tmp_path, system):
 @pytest.mark.full
 def test_the_false_alarm_level(tmp_path, system):
     io.simulate_to(tmp_path / "dim.h5", ml.Flux(np.full((20, 20), 0.002), 0.02, 40.0), system.replace(cycles=1500))
-    seen = {}
+    recorded = {}
     for level in ("1e-6", "0.2"):
         run("reconstruct", tmp_path / "dim.h5", "--false-alarm", level, "-o", tmp_path / f"{level}.npz")
-        seen[level] = int((load_maps(tmp_path / f"{level}.npz")[0]["flags"] & 2 == 0).sum())
-    assert seen["0.2"] > seen["1e-6"] + 20
-    told = refused(
+        recorded[level] = int((load_maps(tmp_path / f"{level}.npz")[0]["flags"] & 2 == 0).sum())
+    assert recorded["0.2"] > recorded["1e-6"] + 20
+    output = refused(
         "reconstruct", tmp_path / "dim.h5", "--method", "peak", "--false-alarm", "0.1", "-o", tmp_path / "x.npz"
     )
-    assert "--false-alarm belongs to maximum_likelihood" in told
+    assert "--false-alarm belongs to maximum_likelihood" in output
 
 
 def test_depth_of_matlab_and_the_unit_in_the_advice(tmp_path):
@@ -187,8 +187,8 @@ def test_depth_of_matlab_and_the_unit_in_the_advice(tmp_path):
     savemat(tmp_path / "one.mat", {"range_map": 1000.0 * metres})
     assert np.allclose(ml.Scene.from_rgbd(tmp_path / "one.mat", depth_unit_m=0.001).depth_m, metres)
     np.save(tmp_path / "mm.npy", 1000.0 * metres)
-    told = run("simulate", "--depth", tmp_path / "mm.npy", "-o", tmp_path / "a.npz")
-    assert "--depth-unit-m" in told
+    output = run("simulate", "--depth", tmp_path / "mm.npy", "-o", tmp_path / "a.npz")
+    assert "--depth-unit-m" in output
 
 
 def test_a_pulse_and_a_stream_as_text(tmp_path):

@@ -45,9 +45,9 @@ def test_reflectivity_is_right_behind_a_detection_efficiency(tmp_path):
     words = (*SMALL[:-1], 8, "--detection-efficiency", share, "--cycles", 3000, "--no-picture", "-o", out)
     assert run("simulate", "--scene", "room", *words).exit_code == 0
     with io.load(out) as stored:
-        found = reconstruct_stored(stored, ["maximum_likelihood"])["maximum_likelihood"].result
-        ratio = found.reflectivity[0] / stored.reflectivity
-        np.testing.assert_allclose(found.signal[0] / stored.flux.signal, share, rtol=0.15)
+        outcome = reconstruct_stored(stored, ["maximum_likelihood"])["maximum_likelihood"].result
+        ratio = outcome.reflectivity[0] / stored.reflectivity
+        np.testing.assert_allclose(outcome.signal[0] / stored.flux.signal, share, rtol=0.15)
     assert np.median(ratio) == pytest.approx(1.0, abs=0.02)
 
 
@@ -106,14 +106,14 @@ def test_maps_read_back(cube, tmp_path, suffix):
     assert (tmp_path / "maps.png").exists() == picture
     assert not picture or (tmp_path / "maps.png").stat().st_size > 10_000
     assert not list(tmp_path.glob("*.incomplete"))
-    found, attrs = load_maps(out)
-    assert list(found["method"]) == ["maximum_likelihood", "peak"]
+    result, attrs = load_maps(out)
+    assert list(result["method"]) == ["maximum_likelihood", "peak"]
     with io.load(cube) as stored:
         direct = ml.reconstruct(np.asarray(stored.histogram), stored.system)
-        assert np.array_equal(found["depth"][0], direct.depth_m, equal_nan=True)
-        assert np.array_equal(found["signal_error"][0], direct.signal_error, equal_nan=True)
+        assert np.array_equal(result["depth"][0], direct.depth_m, equal_nan=True)
+        assert np.array_equal(result["signal_error"][0], direct.signal_error, equal_nan=True)
         assert ml.System.from_json(attrs["system"]) == stored.system
-    assert np.isnan(found["signal_error"][1]).all()  # peak gives none
+    assert np.isnan(result["signal_error"][1]).all()  # peak gives none
     if suffix == ".zarr":
         opened = xarray.open_zarr(out)
         assert opened.depth.dims == ("method", "realization", "y", "x")
@@ -143,14 +143,14 @@ def test_several_returns_read_back(tmp_path, suffix):
     assert (tmp_path / "maps.png").stat().st_size > 10_000
     head, line = done.stdout.splitlines()[1:3]
     assert "2 returns %" in head
-    found, _ = load_maps(out)
-    count = found["returns"][0, 0]
-    assert found["return_depth"].shape == (1, 1, 6, 8, 3)
+    result, _ = load_maps(out)
+    count = result["returns"][0, 0]
+    assert result["return_depth"].shape == (1, 1, 6, 8, 3)
     assert (count[:, 4:] >= 2).all()
     assert (count[:, :4] >= 1).all()
     assert f"{100.0 * (count == 2).mean():.4g}" in line
-    assert np.array_equal(np.isfinite(found["return_depth"]).sum(-1)[0, 0], count)
-    near = found["return_depth"][0, 0, :, 4:, 0]
+    assert np.array_equal(np.isfinite(result["return_depth"]).sum(-1)[0, 0], count)
+    near = result["return_depth"][0, 0, :, 4:, 0]
     assert near == pytest.approx(np.full((6, 4), system.depth_m(12.0)), abs=0.05)
     points = int(next(row for row in cloud.read_bytes().split(b"\n") if row.startswith(b"element vertex")).split()[2])
     assert points == count.sum()
@@ -171,13 +171,13 @@ def test_an_image_of_a_dim_cube(tmp_path, monkeypatch):
     monkeypatch.setattr(stored_module, "_CHUNK_BYTES", 3 * 24 * 256 * 2)
     done = run("reconstruct", tmp_path / "dim.zarr", "--method", "image,peak", "-o", tmp_path / "m.zarr")
     assert done.exit_code == 0, done.output
-    found, _ = load_maps(tmp_path / "m.zarr")
+    result, _ = load_maps(tmp_path / "m.zarr")
     with io.load(tmp_path / "dim.zarr") as stored:
         direct = ml.reconstruct(stored, method="image")
     for name in ("depth", "depth_error", "depth_half_width", "outlier", "flags"):
         values = getattr(direct, {"flags": "flags", "outlier": "outlier"}.get(name, f"{name}_m"))
-        assert np.array_equal(found[name][0], values, equal_nan=True), name
-    assert np.isnan(found["outlier"][1]).all()
+        assert np.array_equal(result[name][0], values, equal_nan=True), name
+    assert np.isnan(result["outlier"][1]).all()
 
 
 def test_all_methods_and_errors_in_the_table(cube, tmp_path):
@@ -235,12 +235,12 @@ def test_parts_make_the_whole(cube, monkeypatch):
         whole = reconstruct_stored(stored, ["generalised_coates"])["generalised_coates"].result
         for module, name in ((recipes, "BLOCK_BYTES"), (stored_module, "_CHUNK_BYTES")):
             monkeypatch.setattr(module, name, 3 * 12 * 256 * 2)  # three rows at a time
-        seen = []
-        parts = reconstruct_stored(stored, ["generalised_coates"], progress=lambda *at: seen.append(at))
+        recorded = []
+        parts = reconstruct_stored(stored, ["generalised_coates"], progress=lambda *at: recorded.append(at))
     for name, values in whole.maps().items():
         assert np.array_equal(values, getattr(parts["generalised_coates"].result, name), equal_nan=True)
-    assert len(seen) == 8
-    assert seen[-1] == (288, 288)
+    assert len(recorded) == 8
+    assert recorded[-1] == (288, 288)
 
 
 def test_errors_of_a_map():
@@ -250,11 +250,11 @@ def test_errors_of_a_map():
     off = truth.copy()
     off[0, 0] = np.nan
     off[1:] += 3.0
-    found = map_error(truth, off)
-    assert found.missing == pytest.approx(1 / 256)
-    assert found.rmse == pytest.approx(3.0 * np.sqrt(240 / 255))
-    assert found.psnr == pytest.approx(20 * np.log10(30.0 / found.rmse))
-    assert found.ssim < 0.99
+    result = map_error(truth, off)
+    assert result.missing == pytest.approx(1 / 256)
+    assert result.rmse == pytest.approx(3.0 * np.sqrt(240 / 255))
+    assert result.psnr == pytest.approx(20 * np.log10(30.0 / result.rmse))
+    assert result.ssim < 0.99
 
 
 @pytest.mark.full

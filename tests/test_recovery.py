@@ -87,12 +87,12 @@ class EveryArrival(Engine):
         arrivals = arrivals[(arrivals - start) % 1.0 < width]
         dead, recovery = system.dead_time_periods, system.detector.recovery_ns / period
         asked = random.random(arrivals.size)
-        seen, ready = [], -np.inf
+        recorded, ready = [], -np.inf
         for t, u in zip(arrivals, asked, strict=True):
             if t >= ready and u >= np.exp(-(t - ready) / recovery):
-                seen.append(t)
+                recorded.append(t)
                 ready = t + dead
-        return np.array(seen)
+        return np.array(recorded)
 
 
 def pixels_of(flux: ml.Flux) -> int:
@@ -188,11 +188,13 @@ def test_waits_under_constant_light(engine: str, rate: float, dead: float, recov
     passed = rate * cumulated(np.maximum(length - dead, 0.0), recovery)
     assert sample.records is not None
     begin = sample.records.times[np.flatnonzero(np.diff(np.repeat(np.arange(sample.counts.size), sample.counts)) == 0)]
-    left = rate * cumulated(np.maximum(made.system.cycles - begin - dead, 0.0), recovery)
-    uniform = np.expm1(-passed) / np.expm1(-np.maximum(left, 1e-300))
+    remaining = rate * cumulated(np.maximum(made.system.cycles - begin - dead, 0.0), recovery)
+    uniform = np.expm1(-passed) / np.expm1(-np.maximum(remaining, 1e-300))
     assert item.size > 300
-    kept = left > 0.0
-    require({"waits": float(stats.kstest(uniform[kept], "uniform").pvalue)}, f"{engine}, {rate}, {dead}, {recovery}")
+    selected = remaining > 0.0
+    require(
+        {"waits": float(stats.kstest(uniform[selected], "uniform").pvalue)}, f"{engine}, {rate}, {dead}, {recovery}"
+    )
 
 
 def cumulated(u: Any, recovery: float) -> Any:
@@ -283,12 +285,12 @@ def test_bits_are_those_of_every_level_thread_and_part(kind: str):
 
 def test_what_has_no_law_says_so():
     system = case(1.0, 1.0, dead_time_ns=75.0, recovery_ns=5.0).system
-    told = "does not do recovery_ns of the detector, got 5.0.*'exact' or 'sequential'"
+    text = "does not do recovery_ns of the detector, got 5.0.*'exact' or 'sequential'"
     for law in ("count_law", "exposure_moments", "joint_law", "mean_histogram", "registration_pdf"):
-        with pytest.raises(ValueError, match=told):
+        with pytest.raises(ValueError, match=text):
             getattr(statistics, law)(ml.Flux(1.0, 1.0, 50.0), system)
     for engine in ("mars", "renewal", "feedback", "auto", "poisson"):
-        with pytest.raises(ValueError, match=f"engine '{engine}' {told}"):
+        with pytest.raises(ValueError, match=f"engine '{engine}' {text}"):
             ml.simulate(flux_of(1.0, 1.0), system, engine=engine)
     with pytest.raises(ValueError, match="a table does not do recovery_ns"):
         ml.Table.build(system, [0.5, 1.0], [0.5, 1.0])
@@ -302,7 +304,7 @@ def test_what_has_no_law_says_so():
 
 
 @pytest.mark.parametrize(
-    ("make", "told"),
+    ("make", "message"),
     [
         (lambda: ml.Detector(dead_time_ns=1.0, recovery_ns=-1.0), r"recovery_ns must be a finite number.*got -1"),
         (lambda: ml.Detector(dead_time_ns=1.0, recovery_ns=float("nan")), "recovery_ns must be a finite number"),
@@ -319,8 +321,8 @@ def test_what_has_no_law_says_so():
         ),
     ],
 )
-def test_refused(make: Any, told: str):
-    with pytest.raises((ValueError, TypeError), match=told):
+def test_refused(make: Any, message: str):
+    with pytest.raises((ValueError, TypeError), match=message):
         make()
 
 

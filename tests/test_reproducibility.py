@@ -93,8 +93,8 @@ def test_golden_bits(kind: str):
 def test_golden_times(kind: str):
     flux, system = image(kind)
     times = ml.simulate_timestamps(flux, system, seed=5)
-    told = hashlib.sha256(times.times_ns.astype("<f8").tobytes()).hexdigest()[:16]
-    assert told == GOLDEN[f"{kind}, times"]
+    text = hashlib.sha256(times.times_ns.astype("<f8").tobytes()).hexdigest()[:16]
+    assert text == GOLDEN[f"{kind}, times"]
 
 
 def task(kind: str, realizations: int = 3, threads: int = 1) -> Task:
@@ -139,9 +139,9 @@ def test_unknown_level_is_an_error():
 @pytest.mark.parametrize("kind", KINDS)
 def test_threads_do_not_matter(engine: str, kind: str):
     flux, system = image(kind)
-    one = ml.simulate(flux, system, engine=engine, realizations=4, seed=1, threads=1)
+    single = ml.simulate(flux, system, engine=engine, realizations=4, seed=1, threads=1)
     for threads in (2, 5, None):
-        assert np.array_equal(one, ml.simulate(flux, system, engine=engine, realizations=4, seed=1, threads=threads))
+        assert np.array_equal(single, ml.simulate(flux, system, engine=engine, realizations=4, seed=1, threads=threads))
 
 
 @pytest.mark.full

@@ -67,7 +67,7 @@ def test_repr_tells_size_depth_and_gaps():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "error", "told"),
+    ("arguments", "error", "message"),
     [
         (([1.0, 2.0], 1.0), ValueError, r"depth_m must be \(H, W\).*\(2,\)"),
         ((np.empty((0, 3)), 1.0), ValueError, "at least one pixel"),
@@ -86,8 +86,8 @@ def test_repr_tells_size_depth_and_gaps():
         (([[1.0]], 1.0, [1.0, 2.0]), ValueError, "background must have the shape"),
     ],
 )
-def test_bad_maps_are_refused(arguments, error, told):
-    with pytest.raises(error, match=told):
+def test_bad_maps_are_refused(arguments, error, message):
+    with pytest.raises(error, match=message):
         Scene(*arguments)
 
 
@@ -286,7 +286,7 @@ def test_extreme_depths_and_maps_do_not_overflow(system):
 
 
 @pytest.mark.parametrize(
-    ("changes", "error", "told"),
+    ("changes", "error", "message"),
     [
         ({"signal": 0.0}, ValueError, r"signal must be a finite number in \(0, inf\), got 0.0"),
         ({"signal": NAN}, ValueError, "signal must be"),
@@ -304,14 +304,14 @@ def test_extreme_depths_and_maps_do_not_overflow(system):
         ({"signal": 1e7}, ValueError, r"signal must lie in \[0, 1e\+06\]"),
     ],
 )
-def test_bad_arguments_are_refused(scene, system, changes, error, told):
+def test_bad_arguments_are_refused(scene, system, changes, error, message):
     arguments = {"system": system, "signal": 1.0, "sbr": 1.0, **changes}
-    with pytest.raises(error, match=told):
+    with pytest.raises(error, match=message):
         scene.flux(**arguments)
 
 
 @pytest.mark.parametrize(
-    ("scene", "told"),
+    ("scene", "message"),
     [
         (Scene([[NAN, NAN]], 1.0), "depth_m is NaN at every pixel"),
         (Scene([[1.0, 2.0]], 0.0), "reflectivity is zero at every pixel with a return: signal=1"),
@@ -319,8 +319,8 @@ def test_bad_arguments_are_refused(scene, system, changes, error, told):
         (Scene([[1.0, NAN]], 1.0, [[0.0, 1.0]]), "ambient light is zero at every pixel with a return: sbr=1"),
     ],
 )
-def test_levels_that_cannot_be_reached_are_refused(scene, system, told):
-    with pytest.raises(ValueError, match=told):
+def test_levels_that_cannot_be_reached_are_refused(scene, system, message):
+    with pytest.raises(ValueError, match=message):
         scene.flux(system, signal=1.0, sbr=1.0)
 
 

@@ -77,10 +77,10 @@ def test_flux_views_and_broadcasts(system: ml.System):
 
 
 def test_returns_without_signal_change_nothing(system: ml.System):
-    one = ml.Flux(np.full((2, 4), 0.7), 0.2, 30.0)
+    pixel = ml.Flux(np.full((2, 4), 0.7), 0.2, 30.0)
     empty = ml.Flux(np.zeros((2, 4)), 0.0, np.nan)
-    expected = ml.simulate(one, system)
-    assert np.array_equal(expected, ml.simulate(ml.Flux.multi(one, empty), system))
+    expected = ml.simulate(pixel, system)
+    assert np.array_equal(expected, ml.simulate(ml.Flux.multi(pixel, empty), system))
 
 
 # Memory
@@ -93,11 +93,11 @@ def test_request_beyond_the_memory_is_refused_before_any_work(system: ml.System)
     with pytest.raises(MemoryError) as error:
         ml.simulate(flux, huge, realizations=1000)
     assert time.process_time() - start < 0.5
-    told = str(error.value)
-    assert "(1000, 100, 100, 1048576)" in told
-    assert re.search(r"need 1\.95e\+04 GiB of memory and \S+ GiB are available", told)
-    assert "out=" in told
-    assert "pixel_index" in told
+    message = str(error.value)
+    assert "(1000, 100, 100, 1048576)" in message
+    assert re.search(r"need 1\.95e\+04 GiB of memory and \S+ GiB are available", message)
+    assert "out=" in message
+    assert "pixel_index" in message
 
 
 def test_timestamps_beyond_the_memory_are_refused(system: ml.System, monkeypatch: pytest.MonkeyPatch):
@@ -118,7 +118,7 @@ def test_available_memory_is_that_of_the_machine():
 @pytest.mark.parametrize("engine", ["exact", "sequential", "poisson"])
 def test_progress_rises_to_the_total(system: ml.System, engine: str):
     """Long enough for several reports, every 50 ms."""
-    seen: list[tuple[int, int]] = []
+    recorded: list[tuple[int, int]] = []
     flux = ml.Flux(np.full((40, 40), 2.0), 2.0, 50.0)
     realizations, bins = {"exact": (60, 64), "sequential": (12, 64), "poisson": (40, 1024)}[engine]
     ml.simulate(
@@ -127,24 +127,24 @@ def test_progress_rises_to_the_total(system: ml.System, engine: str):
         engine=engine,
         realizations=realizations,
         threads=1,
-        progress=lambda done, total: seen.append((done, total)),
+        progress=lambda done, total: recorded.append((done, total)),
     )
-    done = [d for d, _ in seen]
-    assert len({total for _, total in seen}) == 1
+    done = [d for d, _ in recorded]
+    assert len({total for _, total in recorded}) == 1
     assert done == sorted(done)
-    assert seen[-1][0] == seen[-1][1] > 0
+    assert recorded[-1][0] == recorded[-1][1] > 0
     assert min(done) >= 0
     if engine != "poisson":
-        assert len(seen) >= 3
+        assert len(recorded) >= 3
 
 
 def test_progress_of_a_short_run_is_complete(system: ml.System, flux: ml.Flux):
-    seen: list[tuple[int, int]] = []
-    ml.simulate(flux, system, progress=lambda done, total: seen.append((done, total)))
-    assert seen[-1][0] == seen[-1][1]
-    seen.clear()
-    ml.simulate_timestamps(flux, system, progress=lambda done, total: seen.append((done, total)))
-    assert seen[-1][0] == seen[-1][1]
+    recorded: list[tuple[int, int]] = []
+    ml.simulate(flux, system, progress=lambda done, total: recorded.append((done, total)))
+    assert recorded[-1][0] == recorded[-1][1]
+    recorded.clear()
+    ml.simulate_timestamps(flux, system, progress=lambda done, total: recorded.append((done, total)))
+    assert recorded[-1][0] == recorded[-1][1]
 
 
 @pytest.mark.parametrize("engine", ["exact", "sequential"])

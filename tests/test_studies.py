@@ -38,8 +38,8 @@ def quick(tmp_path_factory):
 
 @pytest.mark.full
 def test_files(quick):
-    found = {path.name for path in quick.iterdir()}
-    assert {"covariance.md", "covariance.csv", "law.md", "law.csv"} <= found
+    results = {path.name for path in quick.iterdir()}
+    assert {"covariance.md", "covariance.csv", "law.md", "law.csv"} <= results
     figures = [path for path in quick.iterdir() if path.suffix == ".png"]
     assert len(figures) == 9
     for path in figures:
@@ -73,7 +73,7 @@ def test_covariance_figures_make_sense(quick):
 def test_rules_of_the_covariance_sum():
     cells = covariance.compute(covariance.QUICK, "centre", str)
     errors = [covariance.mean_error(cells, covariance.cutoff_name(c)) for c in (0, 20, 500)]
-    assert all(one > other for one, other in pairwise(errors))
+    assert all(first > other for first, other in pairwise(errors))
     best = covariance.best_cutoff(cells)
     assert covariance.mean_error(cells, covariance.cutoff_name(best)) <= errors[1]
     for cell in cells:
@@ -130,11 +130,11 @@ def test_law_figures_make_sense(quick):
 
 def test_simulation_of_a_cell_is_keyed_by_the_seed():
     settings = law.Settings((0.5,), (0.5,), (0.5,), (20,), realizations=200, draws=10, map_cycles=20)
-    one, other = (law.flux_map(settings, str)[0] for _ in range(2))
-    np.testing.assert_array_equal(one.sample.p, other.sample.p)
-    assert one.limit == other.limit
+    first, other = (law.flux_map(settings, str)[0] for _ in range(2))
+    np.testing.assert_array_equal(first.sample.p, other.sample.p)
+    assert first.limit == other.limit
     system = settings.system(0.5, 20)
-    assert one.cumulants[0] == pytest.approx(
+    assert first.cumulants[0] == pytest.approx(
         float(count_law(ml.Flux(0.5, 0.5, 0.5 * system.period_ns), system).mean), rel=1e-9
     )
 
@@ -232,8 +232,8 @@ def test_help_lists_the_studies(capsys):
     with pytest.raises(SystemExit) as stop:
         main(["--help"])
     assert stop.value.code == 0
-    told = capsys.readouterr().out
-    assert all(name in told and words in told for name, (_, words) in STUDIES.items())
+    output = capsys.readouterr().out
+    assert all(name in output and words in output for name, (_, words) in STUDIES.items())
 
 
 def test_table():

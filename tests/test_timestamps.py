@@ -48,16 +48,16 @@ def test_pixels_are_views_in_order_of_time(system: ml.System, flux: ml.Flux):
     times = ml.simulate_timestamps(flux, system, seed=2)
     for y in range(2):
         for x in range(3):
-            one = times.pixel(y, x)
-            assert one.shape == (1, 1)
-            assert len(one) == times.counts[y, x]
-            assert np.all(np.diff(one.times_ns) >= system.detector.dead_time_ns - 1e-4)
-            assert np.shares_memory(one.cycle, times.cycle) or len(one) == 0
-            assert np.array_equal(one.histogram()[0, 0], times.histogram()[y, x])
+            single = times.pixel(y, x)
+            assert single.shape == (1, 1)
+            assert len(single) == times.counts[y, x]
+            assert np.all(np.diff(single.times_ns) >= system.detector.dead_time_ns - 1e-4)
+            assert np.shares_memory(single.cycle, times.cycle) or len(single) == 0
+            assert np.array_equal(single.histogram()[0, 0], times.histogram()[y, x])
             again = times.pixel(y, x)  # once the image has times, a pixel's are views of them
-            assert np.array_equal(one.times_ns, again.times_ns[: len(one)])
+            assert np.array_equal(single.times_ns, again.times_ns[: len(single)])
             assert times.times_ns is times.times_ns
-            assert np.shares_memory(times.pixel(y, x).times_ns, times.times_ns) or len(one) == 0
+            assert np.shares_memory(times.pixel(y, x).times_ns, times.times_ns) or len(single) == 0
     assert np.array_equal(times.pixel(-1, -1).times_ns, times.pixel(1, 2).times_ns)
     assert len(times.pixel(1, 2)) == 0  # no photons there
 
@@ -115,12 +115,12 @@ def test_one_pass_wherever_the_records_are_kept(level: str, light: str):
     engine = ExactEngine(level)
     index = np.arange(bright.size, dtype=np.uint32)
     histograms = np.zeros((2, bright.size, 16), system.histogram_dtype)
-    found = []
+    results = []
     for threads, expected in ((1, 0.0), (2, 4e5), (2, 1e5), (2, 0.0)):
         task = Task(flux, system, 2, 0, index, 1, threads, None)
-        found.append(engine.records(task, expected))
+        results.append(engine.records(task, expected))
     engine.histogram(task, histograms.reshape(-1, 16))
-    first = found[0]
+    first = results[0]
     assert np.array_equal(np.diff(first.offsets), histograms.sum(axis=2).ravel())
     assert np.array_equal(np.diff(first.offsets), engine.counts(task))
     item = np.repeat(np.arange(2 * bright.size), np.diff(first.offsets))
@@ -128,7 +128,7 @@ def test_one_pass_wherever_the_records_are_kept(level: str, light: str):
     assert not ((np.diff(first.times) < 0) & (np.diff(item) == 0)).any()
     assert first.cycle.min() >= 0
     assert first.cycle.max() < 1000
-    for other in found[1:]:
+    for other in results[1:]:
         for name in ("offsets", "times", "cycle", "bin"):
             assert np.array_equal(getattr(first, name), getattr(other, name))
 
@@ -191,9 +191,9 @@ def test_phases_lie_in_the_bins_of_the_cube(bins: int, codes: bool):
         cube = ml.simulate(flux, system, seed=7)[0]
         assert len(times) > 4000
         for x in range(3):
-            one = times.pixel(0, x)
-            assert np.array_equal(np.bincount(one.bin, minlength=bins), cube[0, x])
-            assert (np.diff(one.times_ns) >= 0.0).all()
+            single = times.pixel(0, x)
+            assert np.array_equal(np.bincount(single.bin, minlength=bins), cube[0, x])
+            assert (np.diff(single.times_ns) >= 0.0).all()
 
 
 def test_where_memory_is_scarce_they_are_counted_first(

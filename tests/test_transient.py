@@ -154,7 +154,7 @@ def test_bad_files(tmp_path, name):
 def test_bad_input(light, tmp_path):
     np.save(tmp_path / "t.npy", light)
     np.save(tmp_path / "rgb.npy", np.stack([light] * 3, axis=-1))
-    for call, told in (
+    for call, message in (
         (lambda: io.read_transient(tmp_path / "t.npy"), "does not tell the width of a time bin"),
         (lambda: io.read_transient(tmp_path / "no.npy"), "no such file"),
         (lambda: io.read_transient(tmp_path / "t.npy", bin_ns=1.0, channel=0), "channel is for"),
@@ -170,5 +170,5 @@ def test_bad_input(light, tmp_path):
         (lambda: Transient(light, 1.0).flux(SYSTEM, signal=1.0, rows=slice(0, 4, 2)), "rows must select"),
         (lambda: Transient(light, 1.0).flux(SYSTEM, signal=1.0, parts=0), "parts must be"),
     ):
-        with pytest.raises(ValueError, match=told):
+        with pytest.raises(ValueError, match=message):
             call()

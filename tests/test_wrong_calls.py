@@ -390,13 +390,13 @@ def names(error: BaseException, argument: str, value: Any) -> bool:
 @functools.cache
 def outcomes(name: str, here: Path) -> list[tuple[str, str, str]]:
     """(argument and what is wrong with it, outcome, what was told) for each wrong call of one function."""
-    found = []
+    results = []
     for argument, parameter in inspect.signature(CALLS[name](here)[0]).parameters.items():
         if parameter.kind in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL):
             continue
         for label, value in wrong(str(parameter.annotation)).items():
             call, good = CALLS[name](here)
-            where, kind, told = f"{argument}: {label}", "taken", ""
+            where, kind, text = f"{argument}: {label}", "taken", ""
             try:
                 with warnings.catch_warnings():
                     warnings.simplefilter("ignore")
@@ -404,11 +404,11 @@ def outcomes(name: str, here: Path) -> list[tuple[str, str, str]]:
             except Exception as error:
                 said = {argument, SAYS.get((name, argument), argument)}
                 kind = "refused" if any(names(error, word, value) for word in said) else "unnamed"
-                told = f"{type(error).__name__}: {error}"
+                text = f"{type(error).__name__}: {error}"
             if kind == "taken" and accepted(name, argument, label):
                 kind = "documented"
-            found.append((where, kind, told))
-    return found
+            results.append((where, kind, text))
+    return results
 
 
 @pytest.mark.full
@@ -416,9 +416,9 @@ def outcomes(name: str, here: Path) -> list[tuple[str, str, str]]:
 def test_wrong_arguments_are_refused_by_name(here, name):
     call, good = CALLS[name](here)
     call(**good)  # what is refused below is refused for the one argument
-    found = outcomes(name, here)
-    assert found
-    assert not [one for one in found if one[1] in ("taken", "unnamed")]
+    result = outcomes(name, here)
+    assert result
+    assert not [item for item in result if item[1] in ("taken", "unnamed")]
 
 
 @pytest.mark.full
@@ -432,7 +432,7 @@ def test_errors_of_wrong_arguments_are_documented(here, name):
         pytest.skip("a method, which its class describes")
     sections = docscrape.NumpyDocString(inspect.getdoc(call) or "")
     documented = {word.split(".")[-1] for entry in sections["Raises"] for word in entry.type.split(", ")}
-    raised = {told.split(":")[0] for _, kind, told in outcomes(name, here) if kind == "refused"}
+    raised = {message.split(":")[0] for _, kind, message in outcomes(name, here) if kind == "refused"}
     missing = {each for each in raised if documented.isdisjoint({each, *ANCESTORS.get(each, ())})}
     assert not missing, f"{name} raises {missing}, and documents {documented}"
 
@@ -445,10 +445,10 @@ def test_every_public_name_is_called():
 
 def test_what_is_documented_as_taken_is_taken(here):
     """An entry that nothing needs any more is removed."""
-    found = [(name, where) for name in CALLS for where, kind, _ in outcomes(name, here) if kind == "documented"]
+    results = [(name, where) for name in CALLS for where, kind, _ in outcomes(name, here) if kind == "documented"]
     for call, argument, label in ACCEPTED:
         wanted = (call, f"{argument}: {label}")
-        assert any(all(map(fnmatch.fnmatch, one, wanted)) for one in found), wanted
+        assert any(all(map(fnmatch.fnmatch, item, wanted)) for item in results), wanted
 
 
 # The command line: arguments that make each command do something small, by the files of `here`.
@@ -484,32 +484,32 @@ def options(command: str) -> Iterator[tuple[str, type]]:
             yield name, next((kind for kind in WORDS if kind in hints), str)
 
 
-def command_outcomes(command: str, here: Path, seen: set[str]) -> Iterator[tuple[str, str, str, str]]:
+def command_outcomes(command: str, here: Path, observed: set[str]) -> Iterator[tuple[str, str, str, str]]:
     """(option, word, outcome, what was told) for options that no command before had."""
     for option, kind in options(command):
-        if option in seen:
+        if option in observed:
             continue
-        seen.add(option)
+        observed.add(option)
         for word in WORDS[kind]:
             arguments = [*command.split(), *map(str, COMMANDS[command](here)), f"{option}={word}"]
             done = command_line(arguments)
-            told = " ".join(done.output.split())
+            printed = " ".join(done.output.split())
             if done.exit_code == 0:
                 given = (command, option, word)
                 took = any(all(map(fnmatch.fnmatch, given, entry)) for entry in TAKEN)
-                yield option, word, "documented" if took else "taken", told
+                yield option, word, "documented" if took else "taken", printed
             else:
                 ours = done.exit_code in (1, 2)
-                named = option in told or option[2:].replace("-", "_") in told or (word != "" and word in told)
-                yield option, word, "refused" if ours and named else "unnamed", told
+                named = option in printed or option[2:].replace("-", "_") in printed or (word != "" and word in printed)
+                yield option, word, "refused" if ours and named else "unnamed", printed
 
 
 @pytest.mark.full
 def test_wrong_options_are_refused_by_name(here):
-    seen: set[str] = set()
+    recorded: set[str] = set()
     for command, make in COMMANDS.items():
         done = command_line([*command.split(), *map(str, make(here))])
         assert done.exit_code == 0, (command, done.output)
-        found = list(command_outcomes(command, here, seen))
-        assert not [one for one in found if one[2] in ("taken", "unnamed")], command
-    assert len(seen) > 90
+        result = list(command_outcomes(command, here, recorded))
+        assert not [item for item in result if item[2] in ("taken", "unnamed")], command
+    assert len(recorded) > 90

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from mars_lidar._version import __version__
 from mars_lidar.calibration import Calibration, calibrate
 from mars_lidar.instrument.avalanches import Afterpulsing, Crosstalk
-from mars_lidar.instrument.dark_counts import dark_count_map
+from mars_lidar.instrument.detector import dark_count_map
 from mars_lidar.instrument.effects import Jitter, SampledJitter
 from mars_lidar.instrument.pulse import GaussianPulse, Pulse, SampledPulse
 from mars_lidar.instrument.system import Detector, System

@@ -17,8 +17,7 @@ from mars_lidar.engines import Engine, EngineOptions, check_detector, find_engin
 from mars_lidar.engines.engine import IN_PARTS, PhaseRecords, Records, Task
 from mars_lidar.instrument.system import System
 from mars_lidar.instrument.units import check_delays
-from mars_lidar.light.flux import Flux
-from mars_lidar.light.stored_flux import StoredFlux
+from mars_lidar.light.flux import Flux, StoredFlux
 from mars_lidar.light.timestamps import DrawnTimestamps, Timestamps
 from mars_lidar.light.tolerances import TOL
 
@@ -211,7 +210,7 @@ def simulate_timestamps(
     drawn_by = find_engine(engine)
     task = _task(flux, system, drawn_by, 1, realization, pixel_index, seed, threads, progress, first_name="realization")
     if checks.choice("device", device, ("cpu", "cuda")) == "cuda":
-        from mars_lidar import cuda
+        from mars_lidar.engines import cuda
 
         cuda.check(drawn_by, task.flux, task.system)
         records: Records | PhaseRecords = cuda.records(drawn_by, task)
@@ -229,8 +228,8 @@ def simulate_timestamps(
 
 
 def _on_cuda(engine: Engine, task: Task, shape: tuple[int, ...], out: Any) -> Any:
-    from mars_lidar import cuda
-    from mars_lidar.cuda.machine import cupy_with_device
+    from mars_lidar.engines import cuda
+    from mars_lidar.engines.cuda.machine import cupy_with_device
 
     cuda.check(engine, task.flux, task.system)
     cupy = cupy_with_device()

@@ -24,8 +24,8 @@ def panels(height: float, rows: int, columns: int, **options: Any) -> tuple[Figu
 
 def legend_below(figure: Any, axes: Iterable[Axes], columns: int, **options: Any) -> None:
     """One legend of all labels of some axes, each once, below them."""
-    shown = {label: line for ax in axes for line, label in zip(*ax.get_legend_handles_labels(), strict=True)}
-    figure.legend(shown.values(), shown.keys(), frameon=False, loc="outside lower center", ncols=columns, **options)
+    handles = {label: line for ax in axes for line, label in zip(*ax.get_legend_handles_labels(), strict=True)}
+    figure.legend(handles.values(), handles.keys(), frameon=False, loc="outside lower center", ncols=columns, **options)
 
 
 def log_edges(centres: Sequence[float]) -> NDArray[np.float64]:

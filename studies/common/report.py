@@ -44,7 +44,9 @@ def write(request: Request, name: str, study: ModuleType, facts: Mapping[str, An
     names = SimpleNamespace(**{**shared, **vars(study)})
     template = module.with_name(f"{'report' if module.stem == 'run' else module.stem}.md.jinja")
     drawn: Mapping[str, Figure] = facts.get("figures", {})
-    figures = [save_figure(request.out / f"{f'{name}_{key}' if key else name}.png", one) for key, one in drawn.items()]
+    figures = [
+        save_figure(request.out / f"{f'{name}_{key}' if key else name}.png", figure) for key, figure in drawn.items()
+    ]
     text.write_text(render(request, template, {"study": names, **facts, "figures": figures}), encoding="utf-8")
     paths = [text, *figures]
     for key, rows in {"": facts.get("rows", ()), **facts.get("tables", {})}.items():

@@ -36,9 +36,9 @@ def system_of(
 
 def settings_of(system: System, light: Mapping[str, Any], exposures: int, seed: int) -> dict[str, Any]:
     """A configuration by name: the system but for its detector, the light, and what is simulated."""
-    told = {field.name: getattr(system, field.name) for field in fields(system) if field.name != "detector"}
+    entries = {field.name: getattr(system, field.name) for field in fields(system) if field.name != "detector"}
     simulated = {"exposures": exposures, "engine": "exact", "seed": seed}
-    return told | dict(light) | simulated
+    return entries | dict(light) | simulated
 
 
 def log_points(points: int, low: float = 0.01, high: float = 10.0) -> tuple[float, ...]:

@@ -108,7 +108,7 @@ def compare(
     system = instrument.build(effects)
     view = read_scene(scene, light, system)
     with progress_bar("comparing") as progress:
-        found = run(
+        result = run(
             view.flux,
             system,
             names,
@@ -122,13 +122,13 @@ def compare(
             budget_s=budget_s,
             progress=progress,
         )
-    save_picture(comparison(found), out)
+    save_picture(comparison(result), out)
     if numbers is not None:
         with beside(numbers) as unfinished:
-            told = {"scene": view.source, **as_data(found)}
-            unfinished.write_text(json.dumps(told, indent=1, allow_nan=False) + "\n")
-    show(found)
-    rows = [("table", found.table)] if found.table else []
+            entries = {"scene": view.source, **as_data(result)}
+            unfinished.write_text(json.dumps(entries, indent=1, allow_nan=False) + "\n")
+    show(result)
+    rows = [("table", result.table)] if result.table else []
     rows += [("picture", str(out)), ("time", f"{span(time.perf_counter() - began)} in all")]
     table(rows if numbers is None else [*rows, ("numbers", str(numbers))])
 

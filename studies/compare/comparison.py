@@ -192,17 +192,17 @@ def compare(
         if isinstance(predicted, str):
             unpredicted[pixel] = predicted
         law = laws[pixel] = None if isinstance(predicted, str) else predicted
-        found: dict[str, PixelStatistics] = {}
+        results: dict[str, PixelStatistics] = {}
         reference: Sample | None = None
         for name, engine in runs.items():
             drawn = draw_pixel(flux, system, engine, (y, x), n, _stream(seed, name), team, budget / len(places))
             sample = Sample(drawn, window)
             random = np.random.default_rng([_stream(seed, name), y, x])
-            found[name] = pixel_statistics(name, pixel, sample, law, reference, random)
+            results[name] = pixel_statistics(name, pixel, sample, law, reference, random)
             if name == against:
                 reference = sample
             steps.done()
-        statistics[pixel] = found
+        statistics[pixel] = results
     order = [name for name in _names(engines, against) if name in runs]
     return Comparison(
         flux,
@@ -214,7 +214,7 @@ def compare(
         {name: scenes[name] for name in order},
         places,
         laws,
-        {pixel: {name: found[name] for name in order} for pixel, found in statistics.items()},
+        {pixel: {name: result[name] for name in order} for pixel, result in statistics.items()},
         skipped,
         unpredicted,
         table,
@@ -256,9 +256,9 @@ def _with_table(runs: dict[str, Engine], flux: Flux, system: System, team: int) 
     table = image_table(flux, system, team) if slow else None
     if table is None:
         return runs, ""
-    told = f"{table.signal.size} × {table.background.size}, found or built in {time.perf_counter() - began:.2g} s"
+    text = f"{table.signal.size} × {table.background.size}, found or built in {time.perf_counter() - began:.2g} s"
     changed = {name: find_engine(name, table=table, outside="exact") for name in slow}
-    return runs | changed, f"{' and '.join(slow)}: the whole image by a table {told}; single pixels without"
+    return runs | changed, f"{' and '.join(slow)}: the whole image by a table {text}; single pixels without"
 
 
 def _check_places(places: dict[str, tuple[int, int]], flux: Flux) -> None:

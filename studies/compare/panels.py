@@ -45,24 +45,24 @@ def draw_points(
         if known is not None and math.isfinite(known.get(pixel, math.nan)):
             ax.plot([column - 0.45, column + 0.45], [known[pixel]] * 2, color=INK, lw=0.9, ls=(0, (4, 1.5)))
         placed = {True: 0, False: 0}  # off the scale, above and below
-        for k, (engine, found) in enumerate(row.items()):
+        for k, (engine, result) in enumerate(row.items()):
             at = column + (k - 0.5 * (len(engines) - 1)) * step
             colour = colours[engine]
-            if isinstance(found, Distance):
-                if found.value > 0:
-                    ax.plot(at, found.value, "o", ms=3.5, color=colour)
-                    ax.plot([at - 0.45 * step, at + 0.45 * step], [found.floor] * 2, color=INK, lw=0.9)
-            elif low <= found.value <= high:
-                ax.errorbar(at, found.value, 2.0 * found.error, fmt="o", ms=3.5, lw=1.0, color=colour)
-            elif math.isfinite(found.value):
-                above = found.value > high
+            if isinstance(result, Distance):
+                if result.value > 0:
+                    ax.plot(at, result.value, "o", ms=3.5, color=colour)
+                    ax.plot([at - 0.45 * step, at + 0.45 * step], [result.floor] * 2, color=INK, lw=0.9)
+            elif low <= result.value <= high:
+                ax.errorbar(at, result.value, 2.0 * result.error, fmt="o", ms=3.5, lw=1.0, color=colour)
+            elif math.isfinite(result.value):
+                above = result.value > high
                 edge, within = (0.96, "top") if above else (0.04, "bottom")
                 frame = ax.get_xaxis_transform()
                 ax.plot(at, edge, "^" if above else "v", ms=4, color=colour, transform=frame)
                 away = 5 + 7 * placed[above]  # one below the other: neighbours are narrower than their numbers
                 placed[above] += 1
                 ax.annotate(
-                    f"{found.value:.2g}",
+                    f"{result.value:.2g}",
                     (at, edge),
                     (0, -away if above else away),
                     xycoords=frame,
@@ -87,10 +87,10 @@ def draw_points(
         ax.axvline(column - 0.5, color=MUTED, lw=0.3, zorder=0)
 
 
-def draw_times(ax: Axes, found: Comparison, colours: dict[str, str]) -> None:
+def draw_times(ax: Axes, result: Comparison, colours: dict[str, str]) -> None:
     """Median wall time of a cube by engine, on a log axis."""
-    names = list(found.scenes)
-    times = [1e3 * scene.median_s for scene in found.scenes.values()]
+    names = list(result.scenes)
+    times = [1e3 * scene.median_s for scene in result.scenes.values()]
     ax.barh(range(len(names)), times, color=[colours[n] for n in names], height=0.65)
     ax.set_xscale("log")
     ax.set_xlim(0.3 * min(times), 12.0 * max(times))
@@ -99,7 +99,7 @@ def draw_times(ax: Axes, found: Comparison, colours: dict[str, str]) -> None:
     ax.set_yticks(range(len(names)), names)
     ax.tick_params(axis="y", length=0)
     ax.invert_yaxis()
-    ax.set_title(f"Time of one cube (ms), threads: {found.threads}", loc="left")
+    ax.set_title(f"Time of one cube (ms), threads: {result.threads}", loc="left")
 
 
 def _range(rows: Mapping[str, Mapping[str, Estimate | Distance]], goal: float, always: str) -> tuple[float, float]:

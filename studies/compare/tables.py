@@ -22,16 +22,16 @@ _MARK = "!"
 _SMALL = 4  # numbers in an array that is written as such
 
 
-def show(found: Comparison) -> None:
+def show(result: Comparison) -> None:
     """Print all tables on standard output; what is significantly wrong is red and marked."""
     console = screen()
-    _scene_table(console, found)
-    for pixel in found.pixels:
-        _pixel_table(console, found, pixel)
+    _scene_table(console, result)
+    for pixel in result.pixels:
+        _pixel_table(console, result, pixel)
     for line in (
         "",
         f"{_MARK} deviates by more than {SIGNIFICANT:g} standard errors from what is predicted, or else from "
-        f"{found.against}.",
+        f"{result.against}.",
         "In brackets: standard error in the last digits. Window: +-3 sigma around the return.",
         "lag-1: covariance of neighbouring bins over the mean count, in 1/1000.",
         "TV: total variation of the mean histogram's shape and of the law of the count, in 1/1000;",
@@ -40,31 +40,33 @@ def show(found: Comparison) -> None:
         console.print(line, style="dim")
 
 
-def as_data(found: Any) -> Any:
+def as_data(result: Any) -> Any:
     """A comparison as JSON can hold it, its attributes by their names.
 
     NaN is None, infinity 1e308; maps, laws and histograms are left out.
     """
-    if isinstance(found, System):
-        return found.to_dict()
-    if isinstance(found, float):
-        return found if math.isfinite(found) else None if math.isnan(found) else math.copysign(1e308, found)
-    if isinstance(found, np.ndarray | np.generic):
-        return as_data(found.tolist())
-    if dataclasses.is_dataclass(found):
-        found = {field.name: getattr(found, field.name) for field in dataclasses.fields(found)}
-    if isinstance(found, dict):
-        small = {name: one for name, one in found.items() if not (isinstance(one, np.ndarray) and one.size > _SMALL)}
-        return {name: as_data(one) for name, one in small.items()}
-    return [as_data(one) for one in found] if isinstance(found, tuple | list) else found
+    if isinstance(result, System):
+        return result.to_dict()
+    if isinstance(result, float):
+        return result if math.isfinite(result) else None if math.isnan(result) else math.copysign(1e308, result)
+    if isinstance(result, np.ndarray | np.generic):
+        return as_data(result.tolist())
+    if dataclasses.is_dataclass(result):
+        result = {field.name: getattr(result, field.name) for field in dataclasses.fields(result)}
+    if isinstance(result, dict):
+        small = {
+            name: item for name, item in result.items() if not (isinstance(item, np.ndarray) and item.size > _SMALL)
+        }
+        return {name: as_data(item) for name, item in small.items()}
+    return [as_data(item) for item in result] if isinstance(result, tuple | list) else result
 
 
-def _scene_table(console: Console, found: Comparison) -> None:
-    known = int(found.expected.known.sum())
-    height, width = found.flux.shape
-    goal = f"against the exact mean of {known:,} pixels" if known > 1 else f"against {found.against}"
-    shown = grid(
-        f"Whole image, {width} × {height} pixels, {found.threads} threads; bias {goal}",
+def _scene_table(console: Console, result: Comparison) -> None:
+    known = int(result.expected.known.sum())
+    height, width = result.flux.shape
+    goal = f"against the exact mean of {known:,} pixels" if known > 1 else f"against {result.against}"
+    view = grid(
+        f"Whole image, {width} × {height} pixels, {result.threads} threads; bias {goal}",
         (
             "engine",
             "ms",
@@ -76,9 +78,9 @@ def _scene_table(console: Console, found: Comparison) -> None:
             "dispersion",
         ),
     )
-    for name, s in found.scenes.items():
+    for name, s in result.scenes.items():
         percent = Estimate(100 * s.relative_bias.value, 100 * s.relative_bias.error, s.relative_bias.z)
-        shown.add_row(
+        view.add_row(
             name,
             _number(1e3 * s.median_s),
             str(len(s.seconds)),
@@ -89,34 +91,34 @@ def _scene_table(console: Console, found: Comparison) -> None:
             cell(s.dispersion),
         )
     console.print()
-    console.print(shown)
-    for name, why in found.skipped.items():
+    console.print(view)
+    for name, why in result.skipped.items():
         console.print(f"{name} was not run: {why}")
 
 
-def _pixel_table(console: Console, found: Comparison, pixel: str) -> None:
-    y, x = found.pixels[pixel]
-    statistics, law = found.statistics[pixel], found.laws[pixel]
+def _pixel_table(console: Console, result: Comparison, pixel: str) -> None:
+    y, x = result.pixels[pixel]
+    statistics, law = result.statistics[pixel], result.laws[pixel]
     drawn = {name: s.realizations for name, s in statistics.items()}
     most = max(drawn.values())
     fewer = "".join(f", {name} {n:,}" for name, n in drawn.items() if n < most)
-    shown = grid(
-        f"{pixel} pixel (y {y}, x {x}): S = {found.flux.signal[y, x]:.3g}, "
-        f"B = {found.flux.background[y, x]:.3g}; {most:,} exposures{fewer}",
-        ("engine", "mean", "variance", "Fano", "window var", f"/ {found.against}", "lag-1", "TV shape", "TV count"),
+    view = grid(
+        f"{pixel} pixel (y {y}, x {x}): S = {result.flux.signal[y, x]:.3g}, "
+        f"B = {result.flux.background[y, x]:.3g}; {most:,} exposures{fewer}",
+        ("engine", "mean", "variance", "Fano", "window var", f"/ {result.against}", "lag-1", "TV shape", "TV count"),
     )
     if law is not None:
         known: Moments = law.counts
         exact = [f"{e.value:.6g}" for e in (known.mean, known.variance)] + [_number(known.fano.value)]
         window = "" if law.window is None else _number(float(law.window[1]))
         lag = "" if math.isnan(law.lag1) else f"{1e3 * law.lag1:.3g}"
-        shown.add_row("predicted", *(f"{words} " for words in (*exact, window, "", lag)), "", "", style="bold")
+        view.add_row("predicted", *(f"{words} " for words in (*exact, window, "", lag)), "", "", style="bold")
     for name, s in statistics.items():
         relative = cell(s.window_ratio)
-        if name == found.against and math.isfinite(s.window_ratio.value):
+        if name == result.against and math.isfinite(s.window_ratio.value):
             relative = cell(Estimate(1.0))
         lag1 = Estimate(1e3 * s.lag1.value, 1e3 * s.lag1.error, s.lag1_error.z)
-        shown.add_row(
+        view.add_row(
             name,
             cell(s.counts.mean),
             cell(s.counts.variance),
@@ -128,20 +130,20 @@ def _pixel_table(console: Console, found: Comparison, pixel: str) -> None:
             cell(s.law),
         )
     console.print()
-    console.print(shown)
-    if pixel in found.unpredicted:
-        console.print(f"{pixel} pixel has no prediction: {found.unpredicted[pixel]}")
+    console.print(view)
+    if pixel in result.unpredicted:
+        console.print(f"{pixel} pixel has no prediction: {result.unpredicted[pixel]}")
 
 
-def cell(found: Estimate | Distance) -> Text:
+def cell(result: Estimate | Distance) -> Text:
     """A value with its error, or a distance (in 1/1000) with its floor; red with a mark where it is wrong."""
     from rich.text import Text
 
-    if isinstance(found, Distance):
-        words = "–" if math.isnan(found.value) else f"{_short(1e3 * found.value)} ({_short(1e3 * found.floor)})"
+    if isinstance(result, Distance):
+        words = "–" if math.isnan(result.value) else f"{_short(1e3 * result.value)} ({_short(1e3 * result.floor)})"
     else:
-        words = with_error(found.value, found.error)
-    return Text(words + _MARK, style="bold red") if found.wrong else Text(words + " ")
+        words = with_error(result.value, result.error)
+    return Text(words + _MARK, style="bold red") if result.wrong else Text(words + " ")
 
 
 def with_error(value: float, error: float) -> str:

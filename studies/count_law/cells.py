@@ -148,7 +148,7 @@ def _system_cells(settings: Settings, grid: Grid, dead_ns: float, truth: str, nu
     # another seed: an engine must not share random numbers with the truth
     training = Training(steps=settings.steps, pairs=settings.pairs, held_out=min(500, settings.pairs))
     asked = simulators(settings.sampled, seed + (1 << 40), training)
-    predictions = {one.name: one.predict(signal, background, system) for one in asked}
+    predictions = {item.name: item.predict(signal, background, system) for item in asked}
     cumulants = count_law(Flux(signal, background, 0.5 * system.period_ns), system, "exact").cumulants
     random = np.random.default_rng([settings.seed, number])
     cells = []
@@ -167,7 +167,7 @@ def _system_cells(settings: Settings, grid: Grid, dead_ns: float, truth: str, nu
                 size,
                 _scores(settings, sample, predictions, k, random),
                 Pmf.of_counts(sample.counts[:, k]),
-                {name: one.pmfs[k] for name, one in predictions.items()},
+                {name: prediction.pmfs[k] for name, prediction in predictions.items()},
             )
         )
     return cells
@@ -177,25 +177,29 @@ def _scores(
     settings: Settings, sample: Sample, predictions: dict[str, Prediction], k: int, random: np.random.Generator
 ) -> dict[str, Score]:
     """Scores of every simulator in cell `k`."""
-    exact, size, found = predictions["mars_exact"], settings.realizations, Pmf.of_counts(sample.counts[:, k])
+    exact, size, result = predictions["mars_exact"], settings.realizations, Pmf.of_counts(sample.counts[:, k])
     noise: dict[int, FloatArray] = {}
     scores = {}
-    for name, one in predictions.items():
-        if one.sampled not in noise:
-            noise[one.sampled] = resampled_figures(exact.pmfs[k], size, one.sampled, settings.resamplings, random)
-        shape = 0.5 * float(np.abs(sample.shape[k] - one.shape[k]).sum())
+    for name, prediction in predictions.items():
+        if prediction.sampled not in noise:
+            noise[prediction.sampled] = resampled_figures(
+                exact.pmfs[k], size, prediction.sampled, settings.resamplings, random
+            )
+        shape = 0.5 * float(np.abs(sample.shape[k] - prediction.shape[k]).sum())
         # a sample has its own noise as well, as much as the truth's for the same number of exposures
-        own = float(np.sqrt(1.0 + size / one.sampled)) if one.sampled else 1.0
-        figures = law_figures(found, one.pmfs[k], float(one.mean[k]), float(one.variance[k]), size)
-        scores[name] = Score(figures, noise[one.sampled], shape, own * float(sample.shape_floor[k]), own)
+        own = float(np.sqrt(1.0 + size / prediction.sampled)) if prediction.sampled else 1.0
+        figures = law_figures(
+            result, prediction.pmfs[k], float(prediction.mean[k]), float(prediction.variance[k]), size
+        )
+        scores[name] = Score(figures, noise[prediction.sampled], shape, own * float(sample.shape_floor[k]), own)
     return scores
 
 
 def law_figures(sample: Pmf, law: Pmf, mean: float, variance: float, size: int) -> FloatArray:
     """`FIGURES` (4,) of a law with its own mean and variance, against frequencies of `size` simulated counts."""
     low, high = min(sample.first, law.first), max(sample.last, law.last)
-    found = _figures(sample.on(low, high)[None], law.on(low, high), low, mean, variance, size)
-    return np.asarray(found[0], dtype=np.float64)
+    result = _figures(sample.on(low, high)[None], law.on(low, high), low, mean, variance, size)
+    return np.asarray(result[0], dtype=np.float64)
 
 
 def resampled_figures(law: Pmf, size: int, sampled: int, number: int, random: np.random.Generator) -> FloatArray:
@@ -203,8 +207,8 @@ def resampled_figures(law: Pmf, size: int, sampled: int, number: int, random: np
 
     With `sampled` > 0 against other samples of that many counts instead: the floor of a law known by sampling.
     """
-    kept = np.flatnonzero(law.p > _NEGLIGIBLE / size)
-    first, p = law.first + int(kept[0]), law.p[kept[0] : kept[-1] + 1]
+    selected = np.flatnonzero(law.p > _NEGLIGIBLE / size)
+    first, p = law.first + int(selected[0]), law.p[selected[0] : selected[-1] + 1]
     p = p / p.sum()
     counts = first + np.arange(p.size)
     mean = float((p * counts).sum())
@@ -214,10 +218,10 @@ def resampled_figures(law: Pmf, size: int, sampled: int, number: int, random: np
         return _figures(drawn, p, first, mean, variance, size)
     others = random.multinomial(sampled, p, number) / sampled
     rows = []
-    for one, other in zip(drawn, others, strict=True):
+    for frequency, other in zip(drawn, others, strict=True):
         own = float((other * counts).sum())
         spread = float((other * (counts - own) ** 2).sum()) * sampled / (sampled - 1)
-        rows.append(_figures(one[None], other, first, own, spread, size)[0])
+        rows.append(_figures(frequency[None], other, first, own, spread, size)[0])
     return np.array(rows)
 
 
@@ -234,7 +238,7 @@ def _figures(sample: FloatArray, law: FloatArray, first: int, mean: float, varia
 def shape_sweep(settings: Settings, tell: Tell) -> dict[str, FloatArray]:
     """Total variation (dead times, cells) of each of `SHAPES` to the exposure's exact mean histogram."""
     signal, background = (g.ravel() for g in np.meshgrid(settings.sweep_flux, settings.sweep_flux, indexing="ij"))
-    found: dict[str, list[FloatArray]] = {name: [] for name in SHAPES}
+    results: dict[str, list[FloatArray]] = {name: [] for name in SHAPES}
     for dead in settings.dead_sweep:
         system = settings.system(PERIOD_NS, dead * PERIOD_NS)
         flux = centred(signal, background, system)
@@ -245,6 +249,6 @@ def shape_sweep(settings: Settings, tell: Tell) -> dict[str, FloatArray]:
             "mars_edge": registration_pdf(flux, system, "chain", rearm="edge"),
         }
         for name, shape in shapes.items():
-            found[name].append(0.5 * np.abs(shape - truth).sum(-1))
+            results[name].append(0.5 * np.abs(shape - truth).sum(-1))
     tell(f"count-law: shapes at {len(settings.dead_sweep)} dead times, {signal.size} cells each")
-    return {name: np.array(rows) for name, rows in found.items()}
+    return {name: np.array(rows) for name, rows in results.items()}

@@ -82,12 +82,12 @@ def second_look(settings: Settings, cells: list[Cell], tell: Tell) -> list[tuple
     """Cells in which the exact law looked worst, each with a fresh simulation four times as large."""
     doubtful = [c for c in cells if not c.within("exact") or c.p_value < 1.0 / len(cells)]
     larger = replace(settings, realizations=4 * settings.realizations)
-    found = []
+    results = []
     for k, cell in enumerate(doubtful):
         signal, background = np.array([cell.signal]), np.array([cell.background])
-        found.append((cell, _cells(larger, signal, background, cell.dead, cell.cycles, 10_000 + k)[0]))
+        results.append((cell, _cells(larger, signal, background, cell.dead, cell.cycles, 10_000 + k)[0]))
         tell(f"law: second look at {cell.name()}")
-    return found
+    return results
 
 
 def laws_of(flux: Flux, system: System) -> dict[str, CountLaw]:
@@ -173,7 +173,7 @@ def run(request: Request) -> Facts:
             "gaussian": law_figures.gaussian(settings, flux, exposure),
             "flux": law_figures.rows(settings, flux, "flux"),
             "exposure": law_figures.rows(settings, exposure, "exposure"),
-            "cells": law_figures.shown(_drawn_out(cells)),
+            "cells": law_figures.examples(_drawn_out(cells)),
             "floor": law_figures.floors(cells),
         },
     }

@@ -70,7 +70,7 @@ def gaussian(settings: Settings, flux: Sequence[Cell], exposure: Sequence[Cell])
     return figure
 
 
-def shown(cells: Sequence[Cell]) -> Figure:
+def examples(cells: Sequence[Cell]) -> Figure:
     """Count laws of a few cells beside the simulated frequencies."""
     figure, axes = panels(3.9, 2, len(cells) // 2)
     for ax, cell in zip(axes.flat, cells, strict=False):
@@ -109,9 +109,11 @@ def floors(cells: Sequence[Cell]) -> Figure:
     limit = np.array([cell.limit for cell in cells])
     for k, (ax, name) in enumerate(zip(axes[0], ("exact", "gaussian", "mars", "mars_edge"), strict=True)):
         ratio = np.array([cell.to_simulation[name] for cell in cells]) / floor
-        seen = floor > 1e-6
-        ax.plot(spread[seen], limit[seen] / floor[seen], ".", ms=2, color=MUTED, mew=0, label="99.9 % limit")
-        ax.plot(spread[seen], ratio[seen], "o", ms=2.2, color=COLOURS[k], mew=0, alpha=0.7)
+        selected = floor > 1e-6
+        ax.plot(
+            spread[selected], limit[selected] / floor[selected], ".", ms=2, color=MUTED, mew=0, label="99.9 % limit"
+        )
+        ax.plot(spread[selected], ratio[selected], "o", ms=2.2, color=COLOURS[k], mew=0, alpha=0.7)
         ax.axhline(1.0, color=INK, lw=0.6)
         ax.set(xscale="log", yscale="log", xlabel="sd of N", ylim=(0.2, 300))
         ax.set_title(LAWS[name], loc="left")

@@ -196,17 +196,17 @@ def _draw(settings: Settings, parts: Sequence[Part]) -> Figure:
     """Maps over S and B: columns for dead times; rows for cycles, and the Gaussian for comparison."""
     shape = len(settings.signal), len(settings.background)
     by = {(round(part.dead, 9), part.system.cycles): part for part in parts}
-    shown = [[by[round(dead, 9), cycles] for dead in settings.dead] for cycles in settings.cycles]
+    chosen = [[by[round(dead, 9), cycles] for dead in settings.dead] for cycles in settings.cycles]
     rows = {
         f"{cycles} cycles\nB": (settings.background, [part.matched.reshape(shape).T for part in here])
-        for cycles, here in zip(settings.cycles, shown, strict=True)
+        for cycles, here in zip(settings.cycles, chosen, strict=True)
     }
-    images = [part.gaussian.reshape(shape).T for part in shown[0]]
+    images = [part.gaussian.reshape(shape).T for part in chosen[0]]
     rows[f"Gaussian,\n{settings.cycles[0]} cycles\nB"] = settings.background, images
     titles, label = [f"{dead:g} $t_r$" for dead in settings.dead], "total variation to the exact law"
     height, norm = 0.5 + 0.95 * len(rows), LogNorm(_LOW, _HIGH)
     figure, axes, bar = maps(height, settings.signal, rows, titles, norm, label)
-    for ax, part in zip(axes[:-1].flat, chain(*shown), strict=True):
+    for ax, part in zip(axes[:-1].flat, chain(*chosen), strict=True):
         at = ~part.trusted
         ax.plot(part.signal[at], part.background[at], "x", ms=1.4, mew=0.4, color=COLOURS[0])
     bar.ax.axhline(AIM, color=COLOURS[0], lw=0.8)

@@ -33,20 +33,20 @@ def run(request: Request) -> Facts:
         raise ValueError("data must be the folder of the reference cases, got None")
     paths = sorted(request.data.glob("*.json"))
     draws = QUICK_DRAWS if request.quick else DRAWS
-    found: list[dict[str, Any]] = []
+    results: list[dict[str, Any]] = []
     cases = {}
     for k, path in enumerate(paths):
         cases[path.stem] = case = _read(path)
-        found += compare(path.stem, case, draws, np.random.default_rng([SEED, k]))
+        results += compare(path.stem, case, draws, np.random.default_rng([SEED, k]))
         request.tell(f"reference: {path.stem}")
     return {
         "cases": cases,
         "keys": _KEYS[:-1],
-        "found": found,
-        "exact": [c for c in found if c["law"] == "exact"],
+        "found": results,
+        "exact": [c for c in results if c["law"] == "exact"],
         "laws": LAWS,
         "draws": draws,
-        "rows": found,
+        "rows": results,
     }
 
 
@@ -68,7 +68,7 @@ def compare(name: str, case: dict[str, Any], draws: int, random: np.random.Gener
     laws = laws_of(Flux([signal], background, delay), system)
     pmfs, exact = pmfs_of(laws, 0), laws["exact"].cumulants[0]
     noise = distance.sampling_floor(pmfs["exact"], size, draws, random)
-    found = []
+    results = []
     for key, pmf in pmfs.items():
         # the Gaussian has mean and variance of the exact law
         expected, variance = (float(v) for v in laws.get(key, laws["exact"]).cumulants[0, :2])
@@ -87,8 +87,8 @@ def compare(name: str, case: dict[str, Any], draws: int, random: np.random.Gener
             "p_value": distance.g_test(pmf, sample, size),
         }
         close = max(abs(row["z_mean"]), abs(row["z_variance"])) <= _LIMIT_Z
-        found.append(row | {"good": close and row["distance"] <= row["limit"] and row["p_value"] > _LIMIT_P})
-    return found
+        results.append(row | {"good": close and row["distance"] <= row["limit"] and row["p_value"] > _LIMIT_P})
+    return results
 
 
 def _read(path: Path) -> dict[str, Any]:

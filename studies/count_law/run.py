@@ -69,7 +69,7 @@ def _row(name: str, words: str, cells: Sequence[Cell]) -> dict[str, Any]:
         "ours": name in OURS,
         "excess": figures[kl] - floor[kl],
         "allowed": max(KL_ABOVE_FLOOR, limit[kl] - floor[kl]),
-        "right": {key: float(np.mean([one[key] for one in judged])) for key in ("mean", "variance", "shape")},
+        "right": {key: float(np.mean([item[key] for item in judged])) for key in ("mean", "variance", "shape")},
     }
 
 
@@ -81,14 +81,16 @@ def run(request: Request) -> Facts:
     cells = compute(settings, request.truth, request.tell)
     sweep = shape_sweep(settings, request.tell)
     first = cells[0].scores
-    words = {one.name: one.words for one in simulators(1, 0) if one.name in first}
+    words = {simulator.name: simulator.words for simulator in simulators(1, 0) if simulator.name in first}
     by_grid = {grid.name: [cell for cell in cells if cell.grid == grid.name] for grid in settings.grids}
     return {
         "s": settings,
         "truth": request.truth,
         "kl_floor": TOL.tail,
         "sampled": [name for name in first if first[name].noise > 1.0],
-        "grids": {name: [_row(one, said, here) for one, said in words.items()] for name, here in by_grid.items()},
+        "grids": {
+            name: [_row(simulator, said, here) for simulator, said in words.items()] for name, here in by_grid.items()
+        },
         "keys": FIGURES,
         "histogram": figures.HISTOGRAM,
         "histogram_cycles": figures.HISTOGRAM_CYCLES,

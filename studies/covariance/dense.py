@@ -15,9 +15,9 @@ from studies.covariance.settings import SPECTRAL, SPECTRAL_NAME, Cell, Settings
 
 def dense_checks(settings: Settings, cells: list[Cell], extra: int, tell: Tell) -> list[dict[str, Any]]:
     """Some cells the paper's way: the slowest at each dead time, the worst, `extra` at random, per grid."""
-    found = [_dense_check(cell) for cell in _chosen(settings, cells, extra)]
-    tell(f"covariance: {len(found)} cells by dense matrices, re-arming at the {cells[0].rearm}")
-    return found
+    results = [_dense_check(cell) for cell in _chosen(settings, cells, extra)]
+    tell(f"covariance: {len(results)} cells by dense matrices, re-arming at the {cells[0].rearm}")
+    return results
 
 
 def _chosen(settings: Settings, cells: list[Cell], extra: int) -> Iterator[Cell]:
@@ -42,8 +42,8 @@ def _dense_check(cell: Cell) -> dict[str, Any]:
     terms = cell.terms
     dense = HoldingTimeCovariance(**{name: getattr(terms, name) for name in terms.__dataclass_fields__})
     count = SPECTRAL[1] + 1
-    reference, found = dense.eigenvalues[:count], terms.eigenvalues[:count]
-    apart = np.abs(reference[:, None] - found[None, :]).min(axis=1)
+    reference, arnoldi = dense.eigenvalues[:count], terms.eigenvalues[:count]
+    apart = np.abs(reference[:, None] - arnoldi[None, :]).min(axis=1)
     apart = apart[:-1] if np.abs(reference[-1].imag) > 0 else apart  # the last may be half of a pair
     paper = dense.spectral_sum(*SPECTRAL)
     inverse = _by_inverse(cell)
@@ -89,7 +89,7 @@ def _by_inverse(cell: Cell) -> float:
     count = SPECTRAL[1]
     if abs(values[order[count - 1]].imag) > 0 and np.count_nonzero(values[order[1:count]].imag) % 2:
         count += 1
-    kept = order[1:count]
-    weight = (row @ vectors[:, kept]) * (inverse[kept] @ value)
-    tail = np.sum(weight * values[kept] ** SPECTRAL[0] / (1.0 - values[kept]))
+    selected = order[1:count]
+    weight = (row @ vectors[:, selected]) * (inverse[selected] @ value)
+    tail = np.sum(weight * values[selected] ** SPECTRAL[0] / (1.0 - values[selected]))
     return cell.terms.cutoff_sum(SPECTRAL[0]) + float(tail.real) * cell.grid.period_ns**2

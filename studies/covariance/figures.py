@@ -36,11 +36,11 @@ def decay(settings: Settings) -> Figure:
         for k, dead in enumerate(settings.decay_dead):
             terms = one_cell(settings, signal, background, dead, "centre").terms
             size = terms.gamma[:_DECAY_LAGS] / terms.sigma_ss2
-            seen = np.abs(size) > _FLOOR
+            selected = np.abs(size) > _FLOOR
             colour = COLOURS[k % len(COLOURS)]
-            ax.plot(lags[seen], np.abs(size)[seen], color=colour, lw=0.9, label=f"{dead:g}")
+            ax.plot(lags[selected], np.abs(size)[selected], color=colour, lw=0.9, label=f"{dead:g}")
             for sign, face in ((1.0, colour), (-1.0, "white")):
-                chosen = seen & (np.sign(size) == sign)
+                chosen = selected & (np.sign(size) == sign)
                 ax.plot(lags[chosen], np.abs(size)[chosen], "o", ms=3.2, mfc=face, mec=colour, mew=0.8)
         ax.set(yscale="log", xlabel="lag $l$", ylim=(_FLOOR, 2.0), xlim=(0, _DECAY_LAGS + 1))
         ax.xaxis.get_major_locator().set_params(integer=True)

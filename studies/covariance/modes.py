@@ -50,13 +50,13 @@ class LeadingTerms(HoldingTimeCovariance):
     def _modes(self) -> tuple[ComplexArray, ComplexArray]:
         chain, times = self._chain, self._times
         values, right = _eigenpairs(chain.backward, chain.bins, chain.describe())
-        others, left = _eigenpairs(chain.forward, chain.bins, chain.describe())
+        others, left_vectors = _eigenpairs(chain.forward, chain.bins, chain.describe())
         partner = _partners(values, others, chain.describe())
-        left = left[:, partner]
+        left_vectors = left_vectors[:, partner]
         pdf = times.stationary.pdf
         row = weighted_waits(chain, pdf) - times.mu * pdf
-        overlap = np.sum(left * right, axis=0)  # u_k v_k without conjugation: left vectors of P itself
-        weights = (row @ right) * (left.T @ (times.mean - times.mu)) / overlap
+        overlap = np.sum(left_vectors * right, axis=0)  # u_k v_k without conjugation: left vectors of P itself
+        weights = (row @ right) * (left_vectors.T @ (times.mean - times.mu)) / overlap
         return values, weights * self._unit
 
 
@@ -85,10 +85,10 @@ def _partners(values: ComplexArray, others: ComplexArray, cell: str) -> NDArray[
     """For each eigenvalue from the right the place of the same one from the left."""
     distance = np.abs(values[:, None] - others[None, :])
     partner = np.asarray(distance.argmin(axis=1), dtype=np.intp)
-    found = distance.min(axis=1)
+    closest = distance.min(axis=1)
     # the last may be one of a pair that was cut; small ones have left the tail long before
     counted = np.flatnonzero(np.abs(values[:-1]) > _MATTERS)
-    if counted.size and found[counted].max() > _PAIRED:
-        k = int(counted[found[counted].argmax()])
-        raise ConvergenceError(f"{cell}: eigenvalue {k + 1} from left and right differ by {found[k]:.1e}")
+    if counted.size and closest[counted].max() > _PAIRED:
+        k = int(counted[closest[counted].argmax()])
+        raise ConvergenceError(f"{cell}: eigenvalue {k + 1} from left and right differ by {closest[k]:.1e}")
     return partner

@@ -15,18 +15,18 @@ from studies.detectors.settings import BACKGROUND, DELAY_NS, REACH, SIGNAL, Outc
 
 def draw_all(outcomes: Sequence[Outcome]) -> dict[str, Figure]:
     """A figure for each group of detectors, the free-running pixel in all of them."""
-    groups = dict.fromkeys(each.shown.figure for each in outcomes if each.shown.figure)
-    return {name: _group([each for each in outcomes if each.shown.figure in ("", name)]) for name in groups}
+    groups = dict.fromkeys(each.example.figure for each in outcomes if each.example.figure)
+    return {name: _group([each for each in outcomes if each.example.figure in ("", name)]) for name in groups}
 
 
-def _group(shown: Sequence[Outcome]) -> Figure:
+def _group(examples: Sequence[Outcome]) -> Figure:
     figure, axes = panels(2.5, 1, 3)
-    left, middle, right = axes[0]
-    system = shown[0].system
+    left_axes, middle, right = axes[0]
+    system = examples[0].system
     energy = SIGNAL * system.pulse.bin_energy(DELAY_NS, system.period_ns, system.bins) + BACKGROUND / system.bins
-    left.plot(system.time_ns, energy / system.bin_ns, color=INK, lw=0.6, ls=":", label="arrivals")
-    for each, colour in zip(shown, [MUTED, *COLOURS], strict=False):
-        _histogram(left, each, colour)
+    left_axes.plot(system.time_ns, energy / system.bin_ns, color=INK, lw=0.6, ls=":", label="arrivals")
+    for each, colour in zip(examples, [MUTED, *COLOURS], strict=False):
+        _histogram(left_axes, each, colour)
         number = np.bincount(each.counts) / each.counts.size
         n = np.flatnonzero(number)
         middle.plot(n, number[n], ".", ms=2.0, color=colour)
@@ -34,8 +34,8 @@ def _group(shown: Sequence[Outcome]) -> Figure:
             middle.plot(n, np.pad(each.law, (0, max(0, number.size - each.law.size)))[n], color=colour, lw=0.9)
         edges = np.linspace(0.0, REACH, each.intervals.size + 1)
         right.stairs(np.where(each.intervals > 0, each.intervals, np.nan), edges, color=colour, lw=0.8)
-    left.set(xlabel="time in the period, ns", ylabel="registrations per period and ns", yscale="log")
-    left.set_title("mean histogram")
+    left_axes.set(xlabel="time in the period, ns", ylabel="registrations per period and ns", yscale="log")
+    left_axes.set_title("mean histogram")
     middle.set(xlabel="registrations N in an exposure", ylabel="P(N)")
     middle.set_title("count law")
     right.set(xlabel="periods between registrations", ylabel="intervals per exposure", yscale="log")
@@ -48,9 +48,9 @@ def _group(shown: Sequence[Outcome]) -> Figure:
 def _histogram(ax: Axes, each: Outcome, colour: str) -> None:
     system = each.system
     scale = 1.0 / (system.cycles * system.bin_ns)
-    seen = each.histogram > 0
-    ax.plot(system.time_ns[seen][::2], each.histogram[seen][::2] * scale, ".", ms=1.6, color=colour)
-    label = each.shown.name
+    selected = each.histogram > 0
+    ax.plot(system.time_ns[selected][::2], each.histogram[selected][::2] * scale, ".", ms=1.6, color=colour)
+    label = each.example.name
     if each.expected is None:
         ax.plot([], [], color=colour, lw=0.9, label=f"{label} (simulated only)")
         return

@@ -15,7 +15,7 @@ from mars_lidar.statistics.count_pmf import Pmf
 from studies import Facts, Request
 from studies.common.distance import g_test
 from studies.common.sample import settings_of
-from studies.detectors.settings import BACKGROUND, DELAY_NS, LIGHT, REACH, SEED, SHOWN, SIGNAL, Outcome, Shown
+from studies.detectors.settings import BACKGROUND, DELAY_NS, EXAMPLES, LIGHT, REACH, SEED, SIGNAL, Example, Outcome
 
 _BINS_OF_INTERVALS = 150
 _SIMULATED_ONLY = (*AVALANCHE_EFFECTS, "max_events_per_period", "max_events_per_exposure")
@@ -27,9 +27,9 @@ def run(request: Request) -> Facts:
 
     exposures = 400 if request.quick else 40_000
     outcomes = []
-    for shown in SHOWN:
-        request.tell(f"detectors: {shown.name}")
-        outcomes.append(outcome(shown, exposures))
+    for example in EXAMPLES:
+        request.tell(f"detectors: {example.name}")
+        outcomes.append(outcome(example, exposures))
     rows = [row(each) for each in outcomes]
     return {
         "settings": settings_of(outcomes[0].system, LIGHT, exposures, SEED),
@@ -38,11 +38,11 @@ def run(request: Request) -> Facts:
     }
 
 
-def outcome(shown: Shown, exposures: int) -> Outcome:
+def outcome(example: Example, exposures: int) -> Outcome:
     """Simulate one detector, and predict what is known of it."""
     pulse = GaussianPulse(sigma_ns=1.0)
-    system = System(period_ns=100.0, cycles=500, bins=200, pulse=pulse, detector=shown.detector)
-    coupled = shown.detector.crosstalk is not None  # the exposures are then the pixels of one square image
+    system = System(period_ns=100.0, cycles=500, bins=200, pulse=pulse, detector=example.detector)
+    coupled = example.detector.crosstalk is not None  # the exposures are then the pixels of one square image
     side = round(math.sqrt(exposures))
     flux = Flux(np.full((side, side) if coupled else (1, exposures), SIGNAL), BACKGROUND, DELAY_NS)
     times = simulate_timestamps(flux, system, engine="sequential" if coupled else "exact", seed=SEED)
@@ -56,7 +56,7 @@ def outcome(shown: Shown, exposures: int) -> Outcome:
     intervals = np.histogram(apart, _BINS_OF_INTERVALS, (0.0, REACH))[0] / exposures
     expected, moments, law = _predicted(system)
     error = np.sqrt(np.maximum(second - each**2, 0.0) / exposures)
-    return Outcome(shown, system, counts, each, error, intervals, expected, moments, law)
+    return Outcome(example, system, counts, each, error, intervals, expected, moments, law)
 
 
 def _predicted(system: System) -> tuple[FloatArray | None, tuple[float, float] | None, FloatArray | None]:
@@ -73,13 +73,13 @@ def row(each: Outcome) -> dict[str, Any]:
     """One line of the table."""
     n = each.counts.size
     mean, variance = float(each.counts.mean()), float(each.counts.var(ddof=1))
-    line: dict[str, Any] = {"detector": each.shown.name, "simulated mean": mean, "simulated variance": variance}
+    line: dict[str, Any] = {"detector": each.example.name, "simulated mean": mean, "simulated variance": variance}
     if each.moments is None or each.expected is None or each.law is None:
         words = ("predicted mean", "predicted variance", "z mean", "z variance", "worst z of a bin", "p of the law")
         return line | dict.fromkeys(words, "-")
     fourth = float(np.mean((each.counts - mean) ** 4))
-    seen = each.histogram_error > 0
-    z = (each.histogram[seen] - each.expected[seen]) / each.histogram_error[seen]
+    selected = each.histogram_error > 0
+    z = (each.histogram[selected] - each.expected[selected]) / each.histogram_error[selected]
     return line | {
         "predicted mean": each.moments[0],
         "predicted variance": each.moments[1],

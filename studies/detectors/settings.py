@@ -14,11 +14,11 @@ from mars_lidar._base.types import FloatArray
 SIGNAL, BACKGROUND, DELAY_NS, DEAD_NS = 1.0, 1.0, 37.0, 45.0
 LIGHT = {"signal S": SIGNAL, "background B": BACKGROUND, "delay_ns": DELAY_NS, "dead_time_ns": DEAD_NS}
 SEED = 20
-REACH = 3.0  # periods of inter-registration times that are shown
+REACH = 3.0  # periods of inter-registration times that are drawn
 
 
 @dataclass(frozen=True)
-class Shown:
+class Example:
     """A detector, its name in figures and tables, and the figure it belongs to."""
 
     name: str
@@ -26,18 +26,18 @@ class Shown:
     detector: Detector
 
 
-def shown_as(name: str, figure: str, **changes: Any) -> Shown:
+def example_of(name: str, figure: str, **changes: Any) -> Example:
     """A detector of the common dead time but for `changes`."""
-    return Shown(name, figure, Detector(**{"dead_time_ns": DEAD_NS, **changes}))
+    return Example(name, figure, Detector(**{"dead_time_ns": DEAD_NS, **changes}))
 
 
-SHOWN = (
-    shown_as("non-paralyzable", ""),
-    shown_as("paralyzable", "paralyzable", mode="paralyzable"),
-    shown_as("synchronous, no dead time", "synchronous", dead_time_ns=0.0, mode="synchronous"),
-    shown_as("synchronous", "synchronous", mode="synchronous"),
-    shown_as("gated", "gated", mode="gated", gate_start_ns=20.0, gate_width_ns=40.0),
-    shown_as(
+EXAMPLES = (
+    example_of("non-paralyzable", ""),
+    example_of("paralyzable", "paralyzable", mode="paralyzable"),
+    example_of("synchronous, no dead time", "synchronous", dead_time_ns=0.0, mode="synchronous"),
+    example_of("synchronous", "synchronous", mode="synchronous"),
+    example_of("gated", "gated", mode="gated", gate_start_ns=20.0, gate_width_ns=40.0),
+    example_of(
         "moving gate", "gated", mode="gated", gate_start_ns=0.0, gate_width_ns=30.0, gate_step_ns=1.0, gate_cycles=5
     ),
 )
@@ -50,7 +50,7 @@ class Outcome:
     `histogram` and `intervals` are means per exposure; `counts` (exposures,). `law` (n,) is P(N = n), or None.
     """
 
-    shown: Shown
+    example: Example
     system: System
     counts: NDArray[np.int64]
     histogram: FloatArray

@@ -115,7 +115,7 @@ def mean_of(
 
 def variances_of(sample: Sample, oracle: str, names: list[str], x: Numbers, variance: FloatArray) -> list[Check]:
     """Sample variances of `x` (items, k) against known ones, by logarithm, with their error from the fourth moment."""
-    found = []
+    results = []
     n = len(x)
     for name, y, known in zip(names, np.asarray(x, float).T, variance, strict=True):
         second = y.var()
@@ -126,8 +126,8 @@ def variances_of(sample: Sample, oracle: str, names: list[str], x: Numbers, vari
             continue
         z = np.log(second * n / (n - 1) / known) / np.sqrt(error)
         p, detects = float(2.0 * stats.norm.sf(abs(z))), _reach() * math.sqrt(error)
-        found.append(Check(sample.engine, oracle, name, p, float(second / known - 1.0), detects))
-    return found
+        results.append(Check(sample.engine, oracle, name, p, float(second / known - 1.0), detects))
+    return results
 
 
 def covariance_of(sample: Sample, oracle: str, name: str, x: FloatArray, y: FloatArray, known: float) -> list[Check]:

@@ -77,8 +77,8 @@ def _constant_rate(case: Case) -> Known | None:
     if most > _MOST and cycles * rate > _MOST:
         return None
     n = np.arange(1, min(most, int(cycles * rate + 12.0 * np.sqrt(cycles * rate) + 30.0)) + 1)
-    left = cycles - (n - 1) * dead
-    reach = np.where(left > 0.0, special.gammainc(n, np.maximum(rate * left, 0.0)), 0.0)
+    remaining = cycles - (n - 1) * dead
+    reach = np.where(remaining > 0.0, special.gammainc(n, np.maximum(rate * remaining, 0.0)), 0.0)
     at_least = np.concatenate([[1.0], reach, [0.0]])
     pmf = at_least[:-1] - at_least[1:]
     mean = float(reach.sum())

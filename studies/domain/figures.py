@@ -77,11 +77,11 @@ def _modes(rows: Sequence[dict[str, Any]]) -> Figure:
     for ax, subject in zip(axes.flat, subjects, strict=False):
         for at, kind in enumerate(kinds):
             states = [row[subject] for row in rows if (row["mode"], row["start"]) == kind and row.get(subject)]
-            left = 0.0
+            start_of_bar = 0.0
             for state, ink in _INK.items():
                 share = states.count(state) / max(len(states), 1)
-                ax.barh(at, share, left=left, color=ink, height=0.8)
-                left += share
+                ax.barh(at, share, left=start_of_bar, color=ink, height=0.8)
+                start_of_bar += share
         ax.set_title(subject, fontsize=7)
         ax.set_yticks(range(len(kinds)), [f"{mode}, {start}" for mode, start in kinds], fontsize=4.5)
         ax.set_xticks([0, 0.5, 1], ["0", "50 %", "100 %"], fontsize=5)

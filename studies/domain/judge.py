@@ -124,13 +124,13 @@ class _Judge:
 
     def _engine(self, engine: str) -> list[Check]:
         """Draw, and compare with the predictions."""
-        case, one = self.case, self.case.registrations()
+        case, per_exposure = self.case, self.case.registrations()
         if engine != "exact" and engine != "sequential":
             simulate(case.flux(), case.system.replace(cycles=1), engine=engine, threads=1)  # claims it, or refuses
         # before a stationary exposure the sequential engine draws so many periods
         early = 320.0 * (case.system.dead_time_periods + 1.0) if case.system.start == "stationary" else 0.0
         arrivals = case.photons * (case.system.cycles + early)
-        events = arrivals if engine == "sequential" or case.mode == "paralyzable" else one
+        events = arrivals if engine == "sequential" or case.mode == "paralyzable" else per_exposure
         if case.mode in ("gated", "moving gate"):
             events = max(events, min(arrivals, case.system.cycles))
         seconds = events * (_NS["sequential"] if engine == "sequential" else _NS["exact"] * _LANES)
@@ -138,11 +138,11 @@ class _Judge:
             raise _Skipped(SLOW, f"an exposure takes some {seconds:.3g} s")
         items = self._items(events)
         if engine in ("feedback", "auto"):
-            items = self._handed(engine, items, one)
+            items = self._handed(engine, items, per_exposure)
         if self.windows is None:
             self.windows = Windows.of(case, self._pilot())
         sample = simulated(engine, case, items, self.seed + 1 + 1000 * ENGINES.index(engine), self.windows)
-        if sample.counts.sum() > 0 or items * one > 30:
+        if sample.counts.sum() > 0 or items * per_exposure > 30:
             self.samples[engine] = sample
         if engine in ("feedback", "auto") and sample.handed >= 1.0:
             raise _Skipped(HANDED, "report: pixels given to exact")
@@ -158,10 +158,10 @@ class _Judge:
         cube = simulate(self.case.flux(), self.case.system.replace(cycles=cycles), threads=1, seed=self.seed + 99)
         return np.asarray(cube.reshape(-1).astype(np.float64) + 1e-9)
 
-    def _handed(self, engine: str, items: int, one: float) -> int:
+    def _handed(self, engine: str, items: int, per_exposure: float) -> int:
         """Exposures to draw with an engine that may give pixels to `exact`: few of those, many of its own."""
-        cost = one * _NS["exact"] * _LANES
-        if engine == "auto" and one <= 4 * self.case.system.bins:
+        cost = per_exposure * _NS["exact"] * _LANES
+        if engine == "auto" and per_exposure <= 4 * self.case.system.bins:
             return min(items, 64)
         pixels = 1 if cost > 0.03 else 16
         report: dict[str, float] = {}
@@ -177,24 +177,24 @@ class _Judge:
         return int(np.clip(0.15 * self.budget.cells / per, 1, 0.5 * self.budget.exposures))
 
     def _against_predictions(self, sample: Sample) -> list[Check]:
-        told, found, engine = self.predicted, [], sample.engine
+        laws, results, engine = self.predicted, [], sample.engine
         slack = _SLACK.get(engine, 0.0)
         joint_claimed = engine != "mars"
         number = sample.windows[:, :1]
-        for oracle, law in (("count_law", told.law), ("closed form", told.known)):
+        for oracle, law in (("count_law", laws.law), ("closed form", laws.known)):
             if law is None or law.variance is None:
                 continue
             mean, variance = np.array([float(law.mean)]), np.array([float(law.variance)])
             allowed = (slack + TOLERANCE) * np.sqrt(variance) + (2e-6 * mean + 0.03) * (slack > 0.0)
-            found += mean_of(sample, oracle, "mean of the count", number, mean, variance, allowed)
-            found += variances_of(sample, oracle, ["variance of the count"], number, variance)
-        if told.pmf is not None and (slack == 0.0 or sample.items < 200):
-            found += against_law(sample, "pmf", *told.pmf)
-        if told.histogram is not None and self.windows is not None:
-            found += self._histogram(sample, told.histogram, slack)
-        if told.joint is not None and told.window_variance is not None and joint_claimed:
-            found += self._joint(sample, slack)
-        return found
+            results += mean_of(sample, oracle, "mean of the count", number, mean, variance, allowed)
+            results += variances_of(sample, oracle, ["variance of the count"], number, variance)
+        if laws.pmf is not None and (slack == 0.0 or sample.items < 200):
+            results += against_law(sample, "pmf", *laws.pmf)
+        if laws.histogram is not None and self.windows is not None:
+            results += self._histogram(sample, laws.histogram, slack)
+        if laws.joint is not None and laws.window_variance is not None and joint_claimed:
+            results += self._joint(sample, slack)
+        return results
 
     def _histogram(self, sample: Sample, mean: FloatArray, slack: float) -> list[Check]:
         """Cells of the mean histogram, with the joint law's variances or else those of the sample; rare windows."""
@@ -202,12 +202,12 @@ class _Judge:
         cells = np.add.reduceat(mean, self.windows.edges)
         variance = self.predicted.cell_variance
         if variance is None or sample.engine == "mars":
-            seen = sample.cells.var(0, ddof=1) if sample.items >= 50 else None
-            variance = np.maximum(seen, cells / sample.items) if seen is not None else None
-        found = []
+            scatter = sample.cells.var(0, ddof=1) if sample.items >= 50 else None
+            variance = np.maximum(scatter, cells / sample.items) if scatter is not None else None
+        results = []
         if variance is not None:
             allowed = slack * np.sqrt(variance) * np.sqrt(10.0 * (slack > 0) + 1.0) + 0.2 * TOLERANCE * cells.sum()
-            found += mean_of(sample, "mean_histogram", "mean histogram", sample.cells, cells, variance, allowed)
+            results += mean_of(sample, "mean_histogram", "mean histogram", sample.cells, cells, variance, allowed)
         for low, high in self.case.rare:
             bins = self.case.system.bins
             first, last = int(np.ceil(low * bins)), int(np.floor(high * bins))
@@ -215,24 +215,26 @@ class _Judge:
             expected = float(mean[inside].sum()) * sample.items
             if slack == 0.0 and 0 < inside.size < bins // 2 and expected < 1e5:
                 name = f"rare photons, {low:.4f} to {high:.4f}"
-                found.append(rare(sample, "mean_histogram", name, int(sample.total[inside].sum()), expected))
-        return found
+                results.append(rare(sample, "mean_histogram", name, int(sample.total[inside].sum()), expected))
+        return results
 
     def _joint(self, sample: Sample, slack: float) -> list[Check]:
-        told = self.predicted
-        assert told.window_mean is not None
-        assert told.window_variance is not None
-        sd = np.sqrt(told.window_variance)
-        allowed = 1e-3 * sd + slack * sd * 3.0 + 1e-6 * told.window_mean
+        laws = self.predicted
+        assert laws.window_mean is not None
+        assert laws.window_variance is not None
+        sd = np.sqrt(laws.window_variance)
+        allowed = 1e-3 * sd + slack * sd * 3.0 + 1e-6 * laws.window_mean
         x = sample.windows
-        found = mean_of(sample, "joint_law", "mean of the windows", x, told.window_mean, told.window_variance, allowed)
+        results = mean_of(
+            sample, "joint_law", "mean of the windows", x, laws.window_mean, laws.window_variance, allowed
+        )
         names = ["variance of the count", "variance of the window", "variance of the echo"]
         if slack == 0.0 or sample.items < 1000:
-            found += variances_of(sample, "joint_law", names, x, told.window_variance)
+            results += variances_of(sample, "joint_law", names, x, laws.window_variance)
             pulse, echo = x[:, 1].astype(np.float64), x[:, 2].astype(np.float64)
             name = "covariance at the dead time"
-            found += covariance_of(sample, "joint_law", name, pulse, echo, told.echo_covariance)
-        return found
+            results += covariance_of(sample, "joint_law", name, pulse, echo, laws.echo_covariance)
+        return results
 
     def _own(self) -> None:
         """The sweep's own simulator, where it is cheap."""

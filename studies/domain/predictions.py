@@ -69,15 +69,15 @@ class Predictions:
     def _count_law(self) -> list[Check]:
         law = count_law(self.case.flux()[0, 0], self.case.system, threads=1)
         self.law = law
-        found = [_sane("count_law", bool(np.isfinite(law.cumulants).all() and law.mean >= 0 and law.variance >= 0))]
+        results = [_sane("count_law", bool(np.isfinite(law.cumulants).all() and law.mean >= 0 and law.variance >= 0))]
         if self.known is not None:
             sd = np.sqrt(self.known.variance or 0.0) or 1.0
             size = max(sd, 1e-4 * self.known.mean, 1e-12)
-            found.append(_agree("count_law", "closed form", "mean of the count", (law.mean - self.known.mean) / size))
+            results.append(_agree("count_law", "closed form", "mean of the count", (law.mean - self.known.mean) / size))
             if self.known.variance is not None and self.known.variance > 1e-9 * max(self.known.mean, 1e-9):
                 off = law.variance / self.known.variance - 1.0
-                found.append(_agree("count_law", "closed form", "variance of the count", off))
-        return found
+                results.append(_agree("count_law", "closed form", "variance of the count", off))
+        return results
 
     def _pmf(self) -> list[Check]:
         if self.law is None:
@@ -88,49 +88,51 @@ class Predictions:
         off = support - float(self.law.mean)  # of the mean, which may be 1e8, to parts of a count
         mean = float(pmf @ off)
         variance = float(pmf @ (off - mean) ** 2)
-        found = [
+        results = [
             _sane("pmf", bool(np.isfinite(pmf).all() and pmf.min() > -1e-9)),
             _agree("pmf", "count_law", "total", pmf.sum() - 1.0),
             _agree("pmf", "count_law", "mean of the count", mean / max(sd, 1e-3)),
         ]
         if self.law.variance > 1e-6:
-            found.append(_agree("pmf", "count_law", "variance of the count", variance / float(self.law.variance) - 1.0))
+            results.append(
+                _agree("pmf", "count_law", "variance of the count", variance / float(self.law.variance) - 1.0)
+            )
         if self.known is not None and self.known.pmf is not None:
             wide = max(int(support[-1]) + 1, self.known.pmf.size)
             mine, theirs = np.zeros(wide), np.zeros(wide)
             mine[support], theirs[: self.known.pmf.size] = pmf, self.known.pmf
-            found.append(_agree("pmf", "closed form", "law of the count", 0.5 * float(np.abs(mine - theirs).sum())))
+            results.append(_agree("pmf", "closed form", "law of the count", 0.5 * float(np.abs(mine - theirs).sum())))
         if pmf.size <= _WIDEST:
             self.pmf = int(support[0]), np.maximum(pmf, 0.0)
-        return found
+        return results
 
     def _histogram(self) -> list[Check]:
         mean = np.asarray(mean_histogram(self.case.flux()[0, 0], self.case.system, threads=1))
         self.histogram = mean
         self.windows = Windows.of(self.case, mean)
         least = float(mean.min(initial=0.0))
-        found = [
+        results = [
             _sane("mean_histogram", bool(np.isfinite(mean).all() and least >= -1e-9 * max(1.0, float(mean.max()))))
         ]
         if self.law is not None:
-            found.append(_agree("mean_histogram", "count_law", "mean of the count", self._in_sd(float(mean.sum()))))
-        return found
+            results.append(_agree("mean_histogram", "count_law", "mean of the count", self._in_sd(float(mean.sum()))))
+        return results
 
     def _stationary(self) -> list[Check]:
         case = self.case
         shape = np.asarray(registration_pdf(case.flux()[0, 0], case.system, "stationary", threads=1))
-        found = [_sane("stationary shape", bool(np.isfinite(shape).all() and abs(shape.sum() - 1.0) < 1e-6))]
+        results = [_sane("stationary shape", bool(np.isfinite(shape).all() and abs(shape.sum() - 1.0) < 1e-6))]
         dead = case.system.dead_time_periods
         plain = case.mode == "nonparalyzable" and not case.system.detector.effects
         if plain and dead == round(dead) and case.photons > 0.0:
             flat = photons_per_bin(case.flux()[0, 0], case.system, bins=case.system.bins)
             off = 0.5 * float(np.abs(shape - flat / flat.sum()).sum())
-            found.append(_agree("stationary shape", "closed form", "shape", off))
+            results.append(_agree("stationary shape", "closed form", "shape", off))
         if case.system.start == "stationary" and self.histogram is not None and self.histogram.sum() > 0.0:
-            seen = self.histogram / self.histogram.sum()
-            off = 0.5 * float(np.abs(shape - seen).sum())
-            found.append(_agree("stationary shape", "mean_histogram", "shape", off))
-        return found
+            observed = self.histogram / self.histogram.sum()
+            off = 0.5 * float(np.abs(shape - observed).sum())
+            results.append(_agree("stationary shape", "mean_histogram", "shape", off))
+        return results
 
     def _joint(self) -> list[Check]:
         began = time.process_time()
@@ -145,17 +147,17 @@ class Predictions:
         if took < _QUICK_SECONDS and max(joint.grid_bins, joint.mean.size) * self.windows.edges.size <= 4_000_000:
             self.cell_variance = joint.window(self.windows.cells().astype(np.float64))[1]
         self.echo_covariance = float(joint.covariance_of(weights[1], weights[2]))
-        found = [_sane("joint_law", bool(np.isfinite(joint.mean).all() and np.isfinite(self.window_variance).all()))]
+        results = [_sane("joint_law", bool(np.isfinite(joint.mean).all() and np.isfinite(self.window_variance).all()))]
         if self.law is not None:
-            found.append(_agree("joint_law", "count_law", "mean of the count", self._in_sd(joint.count_mean)))
+            results.append(_agree("joint_law", "count_law", "mean of the count", self._in_sd(joint.count_mean)))
             variance = float(self.law.variance)
             if variance > 1e-6 * max(1.0, float(self.law.mean)):
                 off = self.window_variance[0] / variance - 1.0
-                found.append(_agree("joint_law", "count_law", "variance of the count", off))
+                results.append(_agree("joint_law", "count_law", "variance of the count", off))
         if self.histogram is not None and self.histogram.sum() > 0.0:
             off = 0.5 * float(np.abs(self.histogram - joint.mean).sum() / self.histogram.sum())
-            found.append(_agree("joint_law", "mean_histogram", "mean histogram", off))
-        return found
+            results.append(_agree("joint_law", "mean_histogram", "mean histogram", off))
+        return results
 
     def _bound(self) -> list[Check]:
         bound = cramer_rao(self.case.flux()[0, 0], self.case.system, threads=1)

@@ -40,8 +40,8 @@ def recorded(case: Case, seed: int, budget: float) -> list[Check]:
         or system.detector.mode != "gated"
         or bool((case.since_gate(t, early=2.5e-7) <= case.gate_width + 5e-7).all()),
     }
-    found = [Check("timestamps", "timestamps", name, 1.0 if fine else 0.0, 0.0) for name, fine in facts.items()]
-    return found + _lattice(case, t, owner)
+    results = [Check("timestamps", "timestamps", name, 1.0 if fine else 0.0, 0.0) for name, fine in facts.items()]
+    return results + _lattice(case, t, owner)
 
 
 def _lattice(case: Case, t: NDArray[np.float64], owner: NDArray[np.int64]) -> list[Check]:
@@ -52,13 +52,13 @@ def _lattice(case: Case, t: NDArray[np.float64], owner: NDArray[np.int64]) -> li
         return []
     fine = (t * 2.0**_LATTICE) % 1.0
     first = np.diff(owner, prepend=-1) != 0
-    found = []
+    results = []
     for name, x in (("fine phases", fine), ("fine phases of the first", fine[first])):
         # a registration at the end of a dead time keeps its distance to the one before: the first only, or dim light
         if x.size < 40 * _CELLS or (name == "fine phases" and case.photons * case.system.dead_time_periods > 0.1):
             continue
-        seen = np.bincount((x * _CELLS).astype(int), minlength=_CELLS)
+        observed = np.bincount((x * _CELLS).astype(int), minlength=_CELLS)
         expected = x.size / _CELLS
-        p = float(stats.chi2.sf(((seen - expected) ** 2 / expected).sum(), _CELLS - 1))
-        found.append(Check("timestamps", "closed form", name, p, float(np.abs(seen / expected - 1.0).max())))
-    return found
+        p = float(stats.chi2.sf(((observed - expected) ** 2 / expected).sum(), _CELLS - 1))
+        results.append(Check("timestamps", "closed form", name, p, float(np.abs(observed / expected - 1.0).max())))
+    return results

@@ -43,7 +43,7 @@ def run(request: Request) -> Facts:
         judged.append(case)
         if len(judged) % 50 == 0:
             request.tell(f"{len(judged)} of {settings.systems} systems, {time.monotonic() - began:.0f} s")
-    cases = [case_row(one) for one in judged]
+    cases = [case_row(item) for item in judged]
     failures = failure_rows(judged)
     return {
         "s": settings,
@@ -60,7 +60,7 @@ def run(request: Request) -> Facts:
         "slow": [_slow(judged, subject) for subject in LAWS],
         "drawn": _drawn(judged),
         "power": _power(judged),
-        "seconds": sum(one.seconds for one in judged),
+        "seconds": sum(item.seconds for item in judged),
         "rows": cases,
         "figures": maps(cases),
     }
@@ -79,40 +79,40 @@ def case_row(judged: Judged) -> dict[str, Any]:
 def failure_rows(judged: list[Judged]) -> list[dict[str, Any]]:
     """Every failure: the case, who, and in what."""
     return [
-        one.case.facts() | {"subject": outcome.subject, "note": outcome.note.replace("\n", " ")}
-        for one in judged
-        for outcome in one.outcomes
+        item.case.facts() | {"subject": outcome.subject, "note": outcome.note.replace("\n", " ")}
+        for item in judged
+        for outcome in item.outcomes
         if outcome.state == "failed"
     ]
 
 
 def _states(judged: Sequence[Judged], subject: str) -> list[tuple[Judged, str]]:
-    return [(one, outcome.state) for one in judged for outcome in one.outcomes if outcome.subject == subject]
+    return [(item, outcome.state) for item in judged for outcome in item.outcomes if outcome.subject == subject]
 
 
 def _range(judged: Sequence[Judged], subject: str) -> dict[str, Any]:
     """Extent of what was verified."""
-    facts = [one.case.facts() for one, state in _states(judged, subject) if state == VERIFIED]
+    facts = [item.case.facts() for item, state in _states(judged, subject) if state == VERIFIED]
     keys = {"S": "S", "B": "B", "dead": "t_d / t_r", "cycles": "cycles", "bins": "bins"}
     return {"": f"`{subject}`"} | {title: decades([float(f[key]) for f in facts]) for key, title in keys.items()}
 
 
 def _slow(judged: Sequence[Judged], subject: str) -> dict[str, Any]:
     """How often a prediction is slow: by cycles, by dead time, by photons in a dead time."""
-    asked = [(one, state) for one, state in _states(judged, subject) if state in (VERIFIED, SLOW, FAILED)]
+    asked = [(item, state) for item, state in _states(judged, subject) if state in (VERIFIED, SLOW, FAILED)]
 
     def share(some: list[str]) -> str:
         return f"{some.count(SLOW)} of {len(some)}"
 
-    load = [(one, state, one.case.photons * one.case.system.dead_time_periods) for one, state in asked]
-    seconds = [o.seconds for one in judged for o in one.outcomes if o.subject == subject and o.state == VERIFIED]
+    load = [(item, state, item.case.photons * item.case.system.dead_time_periods) for item, state in asked]
+    seconds = [o.seconds for item in judged for o in item.outcomes if o.subject == subject and o.state == VERIFIED]
     quantiles = np.quantile(seconds, (0.5, 0.99)).tolist() if seconds else []
     return {
         "": f"`{subject}`",
         "all": share([state for _, state in asked]),
-        "up to 1e4 cycles": share([state for one, state in asked if one.case.system.cycles <= 1e4]),
-        "bins up to 1024": share([state for one, state in asked if one.case.system.bins <= 1024]),
-        "S + B up to 10": share([state for one, state in asked if one.case.photons <= 10]),
+        "up to 1e4 cycles": share([state for item, state in asked if item.case.system.cycles <= 1e4]),
+        "bins up to 1024": share([state for item, state in asked if item.case.system.bins <= 1024]),
+        "S + B up to 10": share([state for item, state in asked if item.case.photons <= 10]),
         "(S + B) t_d up to 8": share([state for _, state, x in load if x <= 8]),
         "of those verified: median, 99 %": " / ".join(f"{number(float(q))} s" for q in quantiles),
     }
@@ -121,17 +121,17 @@ def _slow(judged: Sequence[Judged], subject: str) -> dict[str, Any]:
 def _drawn(judged: Sequence[Judged]) -> list[dict[str, Any]]:
     """Families of systems."""
     rows = []
-    for family in sorted({one.case.family for one in judged}):
-        some = [one for one in judged if one.case.family == family]
+    for family in sorted({item.case.family for item in judged}):
+        some = [item for item in judged if item.case.family == family]
         engines = [state for engine in ENGINES for _, state in _states(some, engine)]
         rows.append(
             {
                 "family": family,
                 "systems": len(some),
-                "comparisons": sum(one.checks for one in some),
+                "comparisons": sum(item.checks for item in some),
                 "engines verified": engines.count(VERIFIED),
                 "engines failed": engines.count(FAILED),
-                "seconds each": float(np.mean([one.seconds for one in some])),
+                "seconds each": float(np.mean([item.seconds for item in some])),
             }
         )
     return rows
@@ -140,8 +140,8 @@ def _drawn(judged: Sequence[Judged]) -> list[dict[str, Any]]:
 def _power(judged: Sequence[Judged]) -> list[dict[str, Any]]:
     """What deviation comparisons detect, by kind."""
     detects: dict[str, list[float]] = {}
-    for one in judged:
-        for check in (check for outcome in one.outcomes for check in outcome.checks if math.isfinite(check.detects)):
+    for item in judged:
+        for check in (check for outcome in item.outcomes for check in outcome.checks if math.isfinite(check.detects)):
             kind = check.what.partition(" of ")[0] if check.what.startswith(("variance", "mean of")) else check.what
             detects.setdefault(kind, []).append(check.detects)
     return [

@@ -122,8 +122,8 @@ def _registered(case: Case, first: NDArray[np.int64], time: FloatArray) -> tuple
             ready[here[fires]] = np.maximum(np.floor(t[fires]) + 1.0, np.ceil(t[fires] + dead))
         else:
             ready[here[fires]] = t[fires] + dead
-        seen = fires & (t >= 0.0) & (t < cycles)
-        who, t = here[seen], t[seen]
+        selected = fires & (t >= 0.0) & (t < cycles)
+        who, t = here[selected], t[selected]
         ok = t >= recorded[who] + electronics
         recorded[who[ok]] = t[ok] if electronics > dead else -np.inf
         who, t = who[ok], t[ok]

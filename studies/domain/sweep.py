@@ -86,19 +86,19 @@ def sweep(settings: Settings, tell: Tell, lines: Lines, workers: int = 1) -> Ite
             return Judged.of_record(case, lines.records[number])
         watched = idle.get()
         try:
-            one = judge_case(case, settings, watched, settings.seed * 1_000_003 + number)
-            lines.add(number, one.record())
-            return one
+            result = judge_case(case, settings, watched, settings.seed * 1_000_003 + number)
+            lines.add(number, result.record())
+            return result
         finally:
             idle.put(watched)
 
     with ExitStack() as stack, ThreadPoolExecutor(workers) as pool:
         for _ in range(workers):
             idle.put(stack.enter_context(Watched()))
-        for one in pool.map(judged, range(settings.systems)):
-            for subject in sorted({o.subject for o in one.outcomes if o.state == FAILED}):
-                tell(f"{one.case.name} ({one.case.family}): {subject} failed")
-            yield one
+        for result in pool.map(judged, range(settings.systems)):
+            for subject in sorted({o.subject for o in result.outcomes if o.state == FAILED}):
+                tell(f"{result.case.name} ({result.case.family}): {subject} failed")
+            yield result
 
 
 def judge_case(case: Case, settings: Settings, watched: Watched, seed: int) -> Judged:
@@ -110,16 +110,16 @@ def judge_case(case: Case, settings: Settings, watched: Watched, seed: int) -> J
     if suspects:
         again = watched.judge(case, 10_000 * seed + 5_000, settings.budget.times(AGAIN), 2.0 * watched.patience)
         level = second_level(settings.checks)
-        seen = {(c.a, c.b, c.what): c for outcome in again for c in outcome.checks}
+        recorded = {(c.a, c.b, c.what): c for outcome in again for c in outcome.checks}
         for check in suspects:
             if check.a == check.b:  # what must hold of every registration: no chance is in it
                 failing.append(check)
                 continue
-            found = seen.get((check.a, check.b, check.what))
-            if found is None:  # not made a second time: kept only where no chance is in it
+            result = recorded.get((check.a, check.b, check.what))
+            if result is None:  # not made a second time: kept only where no chance is in it
                 failing += [check] if check.p == 0.0 else []
-            elif not found.p >= level:
-                failing.append(found)
+            elif not result.p >= level:
+                failing.append(result)
     for party, checks in blamed(failing).items():
         _blame(outcomes, party, checks)
     return Judged(case, outcomes, failing, suspects, watched.seconds - before)

@@ -65,14 +65,14 @@ def blamed(failing: list[Check]) -> dict[str, list[Check]]:
 
     Of two that stand alone against each other it is the one further from first principles (`_SUSPECTS`, in order).
     """
-    left, found = list(failing), {}
-    while left:
-        times = Counter(name for check in left for name in {check.a, check.b})
-        pairs = {name: len({frozenset((c.a, c.b)) for c in left if name in (c.a, c.b)}) for name in times}
+    remaining, result = list(failing), {}
+    while remaining:
+        times = Counter(name for check in remaining for name in {check.a, check.b})
+        pairs = {name: len({frozenset((c.a, c.b)) for c in remaining if name in (c.a, c.b)}) for name in times}
         worst = min(times, key=lambda name: (-pairs[name], (*_SUSPECTS, name).index(name)))
-        found[worst] = [check for check in left if worst in (check.a, check.b)]
-        left = [check for check in left if worst not in (check.a, check.b)]
-    return found
+        result[worst] = [check for check in remaining if worst in (check.a, check.b)]
+        remaining = [check for check in remaining if worst not in (check.a, check.b)]
+    return result
 
 
 def second_level(checks: int) -> float:

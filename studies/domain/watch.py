@@ -62,15 +62,15 @@ class Watched:
         subject = "between steps"
         try:
             self.pipe.send((case, seed, budget, list(skip), patience))
-            while isinstance(told := self.pipe.recv(), str):
-                subject = told
+            while isinstance(message := self.pipe.recv(), str):
+                subject = message
         except (EOFError, OSError):
             self.seconds += patience
             code = self._ended()
             if code in (-signal.SIGPROF, -signal.SIGALRM):
                 return Outcome(subject, SLOW, patience, f"stopped after {patience:g} s")
             return Outcome(subject, FAILED, 0.0, f"the process ended with code {code}")
-        outcomes, seconds = told
+        outcomes, seconds = message
         self.seconds += seconds
         return list(outcomes)
 

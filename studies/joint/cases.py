@@ -102,7 +102,7 @@ def random_cases(
     Every third dead time lies within 0.1 of a whole number of periods, or on it.
     """
     random = np.random.default_rng(seed)
-    found = []
+    results = []
     for k in range(number):
         signal, background = 10 ** random.uniform(-2, 1), 10 ** random.uniform(-3, 1)
         dead = 10 ** random.uniform(np.log10(0.02), np.log10(4.0))
@@ -112,8 +112,8 @@ def random_cases(
         sigma, delay = 10 ** random.uniform(-2.7, -1.5), random.uniform()
         periods = int(np.exp(random.uniform(*np.log(cycles))))
         light, time = (float(signal), float(background)), (float(dead), float(delay), float(sigma))
-        found.append(Case(f"r{k:02d}", *light, *time, periods, starts[k % len(starts)]))
-    return found
+        results.append(Case(f"r{k:02d}", *light, *time, periods, starts[k % len(starts)]))
+    return results
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,15 +165,15 @@ class Law:
         weight = self._next[pairs] / (self._variance * np.roll(self._variance, -1))[pairs]
         scale = float(weight @ self._next[pairs])
         mean, spread = self._window
-        seen, all_seen = spread * size >= OFTEN, self._count * size >= OFTEN
+        varies, all_seen = spread * size >= OFTEN, self._count * size >= OFTEN
         signal, count = x.window - x.window.mean(), x.coarse.sum(1) - x.coarse.sum(1).mean()
         shift = float(x.window.mean() - mean) / np.sqrt(spread), float(x.window.std(ddof=1) / np.sqrt(spread * size))
         return {
-            "window": _mean(signal**2 / spread if seen else None),
+            "window": _mean(signal**2 / spread if varies else None),
             "bin": _mean((apart[:, often] ** 2 / variance).mean(1) if often.any() else None),
             "neighbour": _mean(product @ weight / scale if scale > 0 else None),
             "count": _mean(count**2 / self._count if all_seen else None),
-            "window mean": shift if seen else _mean(None),
+            "window mean": shift if varies else _mean(None),
         }
 
 

@@ -76,16 +76,16 @@ def random_systems(settings: Settings, tell: Tell) -> list[Outcome]:
 
     Those that the closed form refuses are not among them: they do not forget their start, and would take too long.
     """
-    found = []
+    results = []
     cases = random_cases(settings.systems, settings.seed, settings.cycles, ("armed", "stationary"))
     for k, case in enumerate(cases):
         try:
-            found.append(compare(case, settings))
+            results.append(compare(case, settings))
         except ConvergenceError:
             tell(f"joint-covariance: {case.name} refused")
         if k % 20 == 19:
             tell(f"joint-covariance: {k + 1} of {settings.systems} systems")
-    return found
+    return results
 
 
 def second_look(o: Outcome, settings: Settings) -> float | None:
@@ -170,10 +170,10 @@ def run(request: Request) -> Facts:
 def _scores(systems: Sequence[Outcome], settings: Settings) -> dict[str, FloatArray]:
     """z of each kind, one number from each system: independent of each other, unlike those of one system."""
     random = np.random.default_rng(settings.seed + 1)
-    found = {name: [o.single[name] for o in systems if name in o.single] for name in _SINGLE}
+    results = {name: [o.single[name] for o in systems if name in o.single] for name in _SINGLE}
     for kind, words in _RANDOM.items():
-        found[words] = [float(random.choice(list(z.values()))) for o in systems if (z := getattr(o, kind))]
-    return {name: np.array(z) for name, z in found.items()}
+        results[words] = [float(random.choice(list(z.values()))) for o in systems if (z := getattr(o, kind))]
+    return {name: np.array(z) for name, z in results.items()}
 
 
 def _rms(z: Sequence[float]) -> float:

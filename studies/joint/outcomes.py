@@ -54,15 +54,15 @@ class Outcome:
 def compute(settings: Settings, tell: Tell) -> list[Outcome]:
     """All engines in all cases, then in the random systems; raises MissingLibraryError without scikit-learn."""
     require_sklearn()
-    found = []
+    results = []
     for number, case in enumerate(settings.cases):
-        found += examine(case, settings, number, settings.exposures, TESTS)
+        results += examine(case, settings, number, settings.exposures, TESTS)
         tell(f"joint: {case.name}")
     for number, case in enumerate(random_cases(settings.systems, settings.seed), len(settings.cases)):
-        found += examine(case, settings, number, settings.random_exposures, TESTS[:2], random=True)
+        results += examine(case, settings, number, settings.random_exposures, TESTS[:2], random=True)
         if (number - len(settings.cases)) % 10 == 9:
             tell(f"joint: {number - len(settings.cases) + 1} of {settings.systems} random systems")
-    return found
+    return results
 
 
 def examine(
@@ -71,16 +71,16 @@ def examine(
     """One case: the exact sample first, then every engine against it."""
     seed, law, fine = (settings.seed << 16) + 100 * number, Law(case, settings.bins), near(case, settings.bins)
     truth = Sample.of(case, settings.bins, "exact", exposures, seed, fine)
-    found = [Outcome(case, random, "exact", "", law.ratios(truth), {})]
+    results = [Outcome(case, random, "exact", "", law.ratios(truth), {})]
     for k, engine in enumerate(ENGINES, 1):
         try:
             x = Sample.of(case, settings.bins, "exact" if engine == AGAIN else engine, exposures, seed + k, fine)
         except ConvergenceError:  # a law that would take too long
-            found.append(Outcome(case, random, engine, "refused", dict.fromkeys(RATIOS, (np.nan, np.nan)), {}))
+            results.append(Outcome(case, random, engine, "refused", dict.fromkeys(RATIOS, (np.nan, np.nan)), {}))
             continue
         aucs = {} if x.handed else {test: _auc(test, truth, x, number) for test in tests}
-        found.append(Outcome(case, random, engine, "exact" if x.handed else "", law.ratios(x), aucs))
-    return found
+        results.append(Outcome(case, random, engine, "exact" if x.handed else "", law.ratios(x), aucs))
+    return results
 
 
 def near(case: Case, bins: int) -> NDArray[np.intp]:

@@ -41,11 +41,11 @@ def run(request: Request) -> Facts:
 
     settings = QUICK if request.quick else FULL
 
-    def seen(o: Outcome, test: str) -> bool:
+    def significant(o: Outcome, test: str) -> bool:
         return abs(auc_score(o, test, settings)) > _SEEN
 
-    found = outcomes.compute(settings, request.tell)
-    named, drawn = ([o for o in found if o.random is kind] for kind in (False, True))
+    result = outcomes.compute(settings, request.tell)
+    named, drawn = ([o for o in result if o.random is kind] for kind in (False, True))
     return {
         "s": settings,
         "period_ns": PERIOD_NS,
@@ -55,13 +55,13 @@ def run(request: Request) -> Facts:
             for engine in ENGINES
             if (here := [(o, test) for o in named if o.engine == engine and o.aucs for test in TESTS])
         ],
-        "gone": given_to_exact(found),
-        "refused": [f"{o.engine} {o.case.name}" for o in found if o.instead == "refused"],
-        "asked": sum(o.engine == "feedback" for o in found),
+        "gone": given_to_exact(result),
+        "refused": [f"{o.engine} {o.case.name}" for o in result if o.instead == "refused"],
+        "asked": sum(o.engine == "feedback" for o in result),
         "band": [2 * classifiers.chance(n) for n in (settings.exposures, settings.random_exposures)],
         "aucs": {
             test: crossed(
-                (o.case.name, o.engine, marked(o.aucs[test], seen(o, test)) if o.aucs else o.instead)
+                (o.case.name, o.engine, marked(o.aucs[test], significant(o, test)) if o.aucs else o.instead)
                 for o in named
                 if o.engine != "exact"
             )
@@ -71,14 +71,14 @@ def run(request: Request) -> Facts:
         "random": [_random_row(drawn, engine, test, settings) for test in TESTS[:2] for engine in ENGINES],
         "spread": [_spread_row(drawn, engine) for engine in ("exact", *ENGINES)],
         "worst": _worst_rows(drawn, settings),
-        "rows": [_csv_row(o) for o in found],
-        "figures": {"": figure(settings, found)},
+        "rows": [_csv_row(o) for o in result],
+        "figures": {"": figure(settings, result)},
     }
 
 
-def given_to_exact(found: Sequence[Outcome]) -> list[str]:
+def given_to_exact(result: Sequence[Outcome]) -> list[str]:
     """Cases whose pixel the feedback engine gave to the exact one: they are not judged."""
-    return [o.case.name for o in found if o.engine == "feedback" and o.instead == "exact"]
+    return [o.case.name for o in result if o.engine == "feedback" and o.instead == "exact"]
 
 
 def _p(value: float) -> str:

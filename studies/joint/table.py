@@ -42,14 +42,14 @@ QUICK = Settings(cases=(REFERENCE[0], REFERENCE[7], SEVEN[6]), realizations=400,
 
 def compute(settings: Settings, tell: Tell) -> Scores:
     """All engines that draw any system in all cases, over the closed form."""
-    found: Scores = {}
+    results: Scores = {}
     for number, case in enumerate(settings.cases):
         seed, law = (settings.seed << 16) + 100 * number, Law(case, settings.bins)
         for k, engine in enumerate(ANY_SYSTEM):
             x = Sample.of(case, settings.bins, engine, settings.realizations, seed + k, np.zeros(0, np.intp))
-            found[case.name, engine] = law.ratios(x)
+            results[case.name, engine] = law.ratios(x)
         tell(f"joint-table: {case.name}")
-    return found
+    return results
 
 
 def beyond(pair: tuple[float, float], key: str) -> bool:
@@ -61,36 +61,36 @@ def beyond(pair: tuple[float, float], key: str) -> bool:
 def run(request: Request) -> Facts:
     """All engines in all cases."""
     settings = QUICK if request.quick else FULL
-    found = compute(settings, request.tell)
+    result = compute(settings, request.tell)
     return {
         "s": settings,
         "engines": list(ANY_SYSTEM),
         "period_ns": PERIOD_NS,
-        "findings": [_finding(engine, found) for engine in ANY_SYSTEM],
+        "findings": [_finding(engine, result) for engine in ANY_SYSTEM],
         "known": [
-            (case.name, *found[case.name, "mars"]["window"], noted)
+            (case.name, *result[case.name, "mars"]["window"], noted)
             for case, noted in zip(SEVEN, SEVEN_RATIOS, strict=True)
             if case in settings.cases
         ],
         "compared": {
-            key: crossed((*who, marked(one[key], beyond(one[key], key))) for who, one in found.items())
+            key: crossed((*who, marked(item[key], beyond(item[key], key))) for who, item in result.items())
             for key in RATIOS
         },
         "rows": [
             {"case": case, "engine": engine}
-            | {f"{key.replace(' ', '_')}{end}": one[key][k] for key in RATIOS for k, end in enumerate(("", "_error"))}
-            for (case, engine), one in found.items()
+            | {f"{key.replace(' ', '_')}{end}": item[key][k] for key in RATIOS for k, end in enumerate(("", "_error"))}
+            for (case, engine), item in result.items()
         ],
     }
 
 
-def _finding(engine: str, found: Scores) -> dict[str, object]:
-    here = {case: one for (case, name), one in found.items() if name == engine}
+def _finding(engine: str, result: Scores) -> dict[str, object]:
+    here = {case: item for (case, name), item in result.items() if name == engine}
     worst = max(here, key=lambda case: abs(here[case]["window"][0] - 1.0))
     return {
         "engine": engine,
         "cases": len(here),
-        "off": {words: sum(beyond(one[key], key) for one in here.values()) for key, words in _WORDS.items()},
+        "off": {words: sum(beyond(item[key], key) for item in here.values()) for key, words in _WORDS.items()},
         "worst": worst,
         "window": here[worst]["window"][0],
     }

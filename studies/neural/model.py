@@ -96,8 +96,8 @@ class NeuralMap:
                 some = photons[first : first + _BATCH]
                 filled = np.concatenate([some, np.repeat(some[:1], _BATCH - len(some), axis=0)])
                 flux, shift = canonical(torch.from_numpy(filled).to(torch.float32))
-                found = rolled(self.network(flux), -shift).to(torch.float64).exp().numpy()[: len(some)]
-                out[first : first + _BATCH] = found / found.sum(-1, keepdims=True)
+                result = rolled(self.network(flux), -shift).to(torch.float64).exp().numpy()[: len(some)]
+                out[first : first + _BATCH] = result / result.sum(-1, keepdims=True)
         return out
 
     def moments(self, photons: FloatArray, pdf: FloatArray, cycles: int) -> tuple[FloatArray, FloatArray]:

@@ -127,10 +127,10 @@ def _trained(system: System, training: Training) -> NeuralEngine:
 
 def _sampler(engine: str, realizations: int, seed: int) -> Predict:
     def predict(signal: FloatArray, background: FloatArray, system: System) -> Prediction:
-        found = draw(engine, signal, background, system, realizations=realizations, seed=seed)
-        mean = found.counts.mean(0, dtype=np.float64)
-        variance = found.counts.var(0, dtype=np.float64, ddof=1)
-        pmfs = [Pmf.of_counts(column) for column in found.counts.T]
-        return Prediction(mean, variance, pmfs, found.shape, realizations)
+        result = draw(engine, signal, background, system, realizations=realizations, seed=seed)
+        mean = result.counts.mean(0, dtype=np.float64)
+        variance = result.counts.var(0, dtype=np.float64, ddof=1)
+        pmfs = [Pmf.of_counts(column) for column in result.counts.T]
+        return Prediction(mean, variance, pmfs, result.shape, realizations)
 
     return predict

@@ -125,8 +125,8 @@ def train(
 
 def _errors(log_pdf: Tensor, pdf: Tensor, wait: Tensor) -> tuple[Tensor, Tensor]:
     """Total variation, and relative error of the mean holding time, (P,) each."""
-    found = log_pdf.exp()
-    return 0.5 * (found - pdf).abs().sum(-1), ((found * wait).sum(-1) - 1.0).abs()
+    result = log_pdf.exp()
+    return 0.5 * (result - pdf).abs().sum(-1), ((result * wait).sum(-1) - 1.0).abs()
 
 
 def _validate_on(network: PdfAutoencoder, held_out: _Tensors, step: int, seconds: float, loss: float) -> Point:

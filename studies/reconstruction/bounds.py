@@ -36,8 +36,8 @@ def line(system: System, signal: float, pixels: int) -> dict[str, Any]:
         for less, name in ((True, ""), (False, " of the maximum")):
             if not less and cycles != system.cycles:
                 continue
-            found = reconstruct(cube, longer, MaximumLikelihood(less_bias=less))
-            error = (found.signal - signal)[found.flags & Flags.SATURATED == 0] / least
+            estimate = reconstruct(cube, longer, MaximumLikelihood(less_bias=less))
+            error = (estimate.signal - signal)[estimate.flags & Flags.SATURATED == 0] / least
             error *= np.sqrt(cycles / system.cycles)
             out[f"error{name} / bound, {cycles} cycles"] = float(np.sqrt(np.mean(error**2)))
             out[f"bias{name} / bound, {cycles} cycles"] = float(error.mean())
@@ -67,8 +67,8 @@ def _bounds(
     second = 0.5 * (second + second.transpose(0, 2, 1)) + score[:, :, None] * score[:, None, :]
     pairs = np.triu_indices(3)
     both = np.concatenate([score, second[:, pairs[0], pairs[1]]], axis=1)
-    told = {}
+    entries = {}
     for name, statistics in (("bound, ends hidden", score), ("bound, second order", both)):
         inverse = np.linalg.inv(statistics.T @ statistics / len(statistics))
-        told[name] = float(np.sqrt(inverse[0, 0]) * scale[0] / least)
-    return told
+        entries[name] = float(np.sqrt(inverse[0, 0]) * scale[0] / least)
+    return entries

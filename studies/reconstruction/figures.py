@@ -56,22 +56,22 @@ def flux_figure(rows: Sequence[Row]) -> Figure:
     return figure
 
 
-def maps_figure(shown: Picture) -> Figure:
+def maps_figure(picture: Picture) -> Figure:
     """A bright room: true maps, and those of two methods."""
-    limits = _limits(shown.depth_m)
-    errors = {name: 1e3 * (each.depth_m - shown.depth_m) for name, each in shown.found.items()}
+    limits = _limits(picture.depth_m)
+    errors = {name: 1e3 * (each.depth_m - picture.depth_m) for name, each in picture.estimates.items()}
     reach = float(np.percentile(np.abs(errors["matched_filter"]), 98))
-    share = _limits(shown.signal)
+    share = _limits(picture.signal)
     figure, axes = panels(4.3, 2, 3)
-    for ax, name in zip(axes[0, 1:], shown.found, strict=True):
+    for ax, name in zip(axes[0, 1:], picture.estimates, strict=True):
         words = "matched filter, raw counts" if name == "matched_filter" else "maximum likelihood"
         _draw_map(ax, errors[name], "depth error (mm)", "RdBu_r", (-reach, reach), words)
-    for ax, (name, each) in zip(axes[1, 1:], shown.found.items(), strict=True):
+    for ax, (name, each) in zip(axes[1, 1:], picture.estimates.items(), strict=True):
         raw = name == "matched_filter"
         words = "signal, raw counts (own scale)" if raw else "signal, maximum likelihood"
         _draw_map(ax, each.signal, "photons per period", "gray", _limits(each.signal) if raw else share, words)
-    _draw_map(axes[0, 0], shown.depth_m, "depth (m)", "viridis", limits, "true depth")
-    _draw_map(axes[1, 0], shown.signal, "photons per period", "gray", share, "true signal")
+    _draw_map(axes[0, 0], picture.depth_m, "depth (m)", "viridis", limits, "true depth")
+    _draw_map(axes[1, 0], picture.signal, "photons per period", "gray", share, "true signal")
     for ax in axes.flat:
         ax.images[0].set_interpolation("nearest")  # a file a third as large
     return figure

@@ -246,13 +246,13 @@ def timings(settings: Settings) -> list[Row]:
 def _figure(curves: Sequence[Row], rows: Sequence[Row]) -> Figure:
     """How often two returns are both detected, over their separation; and how often their intervals hold the truth."""
     figure, axes = panels(2.9, 1, 2)
-    left, right = axes[0]
+    left_axes, right = axes[0]
     for colour, cycles in zip(COLOURS, dict.fromkeys(row["cycles"] for row in curves), strict=False):
         mine = [row for row in curves if row["cycles"] == cycles]
         label = f"{0.5 * cycles:g} photons each"
-        left.plot(*_line(mine, "both detected %"), "o-", ms=2.5, lw=1.0, color=colour, label=label)
-    left.set(xscale="log", xlabel="separation (sigma of the pulse)", ylabel="both detected (%)")
-    left.legend(frameon=False, loc="lower right")
+        left_axes.plot(*_line(mine, "both detected %"), "o-", ms=2.5, lw=1.0, color=colour, label=label)
+    left_axes.set(xscale="log", xlabel="separation (sigma of the pulse)", ylabel="both detected (%)")
+    left_axes.legend(frameon=False, loc="lower right")
     for what, colour in (("depth", COLOURS[0]), ("S", COLOURS[1])):
         for words, marker in (("95 %", "o"), ("68 %", "s")):
             sure = [row for row in rows if row["both detected %"] >= 90.0]
@@ -261,10 +261,10 @@ def _figure(curves: Sequence[Row], rows: Sequence[Row]) -> Figure:
     for share in (95.0, 68.27):
         right.axhline(share, color=INK, lw=0.7, ls="--")
     right.set(xscale="log", xlabel="separation (sigma of the pulse)", ylabel="intervals that hold the truth (%)")
-    for ax in (left, right):
+    for ax in (left_axes, right):
         ax.set_xticks([0.5, 1, 2, 5, 10, 20], ["0.5", "1", "2", "5", "10", "20"])
         ax.minorticks_off()
-    left.set_xlim(0.28, 6.5)
+    left_axes.set_xlim(0.28, 6.5)
     legend_below(figure, [right], 4, handlelength=1.2, columnspacing=1.0)
     return figure
 

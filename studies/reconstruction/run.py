@@ -42,22 +42,22 @@ def run(request: Request) -> Facts:
     request.tell("reconstruction: near the bound")
     near = lines(2 * settings.pixels)
     request.tell("reconstruction: picture")
-    shown = picture(settings)
+    example = picture(settings)
     n = len(settings.signals)  # three fluxes: dim, ordinary, bright
     chosen = {settings.signals[k] for k in ((0, 1, 2) if n < 5 else (n // 4, (5 * n) // 8, n - 2))}
     words = {"matched_filter": "the matched filter", "maximum_likelihood": "maximum likelihood"}
     return {
         "s": settings,
-        "findings": [one for mode, title in TITLE.items() if (one := _finding(rows, mode, title))],
+        "findings": [finding for mode, title in TITLE.items() if (finding := _finding(rows, mode, title))],
         "chosen": [row for row in rows if row["signal"] in chosen],
         "near": near,
         "shown": [
-            (said, 1e3 * (found.depth_m - shown.depth_m), float(np.median(found.signal / shown.signal - 1.0)))
-            for said, found in ((said, shown.found[name]) for name, said in words.items())
+            (said, 1e3 * (estimate.depth_m - example.depth_m), float(np.median(estimate.signal / example.signal - 1.0)))
+            for said, estimate in ((said, example.estimates[name]) for name, said in words.items())
         ],
         "window": window_lines(settings),
         "rows": rows,
-        "figures": {"flux": flux_figure(rows), "maps": maps_figure(shown)},
+        "figures": {"flux": flux_figure(rows), "maps": maps_figure(example)},
     }
 
 
@@ -95,12 +95,12 @@ def sweep(system: System, signal: float, pixels: int) -> list[dict[str, Any]]:
     for name, method in METHODS.items():
         if method.of_images or system.detector.mode not in method.modes:
             continue
-        found = reconstruct(cube, system, method)
-        lag = (found.delay_ns - delay + 0.5 * period) % period - 0.5 * period
+        estimate = reconstruct(cube, system, method)
+        lag = (estimate.delay_ns - delay + 0.5 * period) % period - 0.5 * period
         near = np.abs(lag) < OUTLIER_SIGMAS * system.pulse.sigma_ns  # type: ignore[attr-defined]
         off = np.asarray(system.depth_m(lag))[near]
-        bounded = found.flags & Flags.SATURATED == 0
-        error = (found.signal - signal)[bounded]
+        bounded = estimate.flags & Flags.SATURATED == 0
+        error = (estimate.signal - signal)[bounded]
         lines.append(
             {
                 "detector": system.detector.mode,
@@ -143,5 +143,5 @@ def picture(settings: Settings) -> Picture:
     scene = Scene.example("room", size=settings.size)
     flux = scene.flux(PLAIN, signal=BRIGHT, sbr=SBR)
     cube = simulate(flux, PLAIN, seed=SEED)[0]
-    found = {name: reconstruct(cube, PLAIN, name) for name in ("matched_filter", "maximum_likelihood")}
-    return Picture(scene.depth_m, flux.signal, found)
+    estimate = {name: reconstruct(cube, PLAIN, name) for name in ("matched_filter", "maximum_likelihood")}
+    return Picture(scene.depth_m, flux.signal, estimate)

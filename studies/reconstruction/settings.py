@@ -39,4 +39,4 @@ class Picture:
 
     depth_m: Any
     signal: Any
-    found: dict[str, Reconstruction]
+    estimates: dict[str, Reconstruction]

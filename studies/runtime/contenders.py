@@ -69,11 +69,11 @@ def contenders(tables: Tables) -> list[Contender]:
     def numpy(flux: Flux, system: System, realizations: int) -> Run:
         return partial(_pipeline, tables.numpy(system), flux)
 
-    found = [
+    results = [
         Contender(name, "mars, no table" if name == "mars" else name, partial(_engine, name)) for name in ANY_SYSTEM
     ]
-    found.append(Contender(TABLED, "mars, table", tabled, tabled=True))
-    return [*found, Contender(NUMPY, "MaRS pipeline in NumPy, table", numpy, tabled=True)]
+    results.append(Contender(TABLED, "mars, table", tabled, tabled=True))
+    return [*results, Contender(NUMPY, "MaRS pipeline in NumPy, table", numpy, tabled=True)]
 
 
 def _engine(engine: str | Engine, flux: Flux, system: System, realizations: int) -> Run:

@@ -63,8 +63,8 @@ def single_pixel(settings: Settings, single: Sequence[Point]) -> Figure:
     cycles, realizations = settings.teaser
     names = [p.contender for p in single]
     here = {p.contender: float(p.seconds or 0.0) for p in single}
-    shown = {f"here: {cycles} cycles x {realizations} realizations": here, "paper: another workload": PAPER_TEASER}
-    for ax, (words, seconds) in zip(axes[0], shown.items(), strict=True):
+    bars = {f"here: {cycles} cycles x {realizations} realizations": here, "paper: another workload": PAPER_TEASER}
+    for ax, (words, seconds) in zip(axes[0], bars.items(), strict=True):
         order = [name for _, name in sorted((s, name) for name, s in seconds.items())]
         at = np.arange(len(order))
         ax.barh(at, [seconds[name] for name in order], color=[_colour(name, names) for name in order], height=0.7)

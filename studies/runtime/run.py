@@ -28,15 +28,15 @@ def crossover(points: Sequence[Point], axis: str, fast: str, other: str) -> tupl
 
     Interpolated in the logarithms between the points at which both were timed.
     """
-    found = {
+    results = {
         name: {p.value: p for p in points if p.axis == axis and p.contender == name and p.seconds is not None}
         for name in (fast, other)
     }
-    shared = sorted(set(found[fast]) & set(found[other]))
+    shared = sorted(set(results[fast]) & set(results[other]))
     if not shared:
         return None, f"{fast} and {other} were not timed together along {axis}"
-    hits = [found[fast][v].registrations for v in shared]
-    ratio = [float(found[other][v].seconds or 0.0) / float(found[fast][v].seconds or 1.0) for v in shared]
+    hits = [results[fast][v].registrations for v in shared]
+    ratio = [float(results[other][v].seconds or 0.0) / float(results[fast][v].seconds or 1.0) for v in shared]
     ahead = np.array(ratio) > 1.0
     if ahead.all() or not ahead.any():
         first, second = (fast, other) if ahead.all() else (other, fast)
@@ -59,7 +59,7 @@ def run(request: Request) -> Facts:
     single = teaser(settings, request.tell)
     points = [point for axis in settings.axes for point in along(settings, axis, request.tell)]
     others = [
-        one for one in dict.fromkeys(p.contender for p in points) if one not in ("exact", "sequential", "poisson")
+        other for other in dict.fromkeys(p.contender for p in points) if other not in ("exact", "sequential", "poisson")
     ]
     axes = (("cycles", "exposure grows"), ("flux", "flux grows"))
     return {
@@ -69,7 +69,7 @@ def run(request: Request) -> Facts:
         "cubes": cubes,
         "engines": [cube for cube in cubes if cube["contender"] != NUMPY],
         "base": next(cube["seconds"] for cube in cubes if cube["contender"] == NUMPY),
-        "rules": [(words, *crossover(points, axis, "exact", one)) for one in others for axis, words in axes],
+        "rules": [(words, *crossover(points, axis, "exact", other)) for other in others for axis, words in axes],
         "pixels": next(axis.pixels for axis in settings.axes if axis.name == "cycles"),
         "axes": {axis.words: _axis_rows(points, axis.name) for axis in settings.axes},
         "single": single,

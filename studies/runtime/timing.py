@@ -115,18 +115,18 @@ def cube_stages(settings: Settings, tell: Tell) -> tuple[list[dict[str, Any]], T
 
     Least seconds, and the stages of that run. ``prepared``: seconds spent before, on a table or nothing.
     """
-    flux, seen = image(settings.side**2, settings.seed), system(settings, 1000)
-    out, found = _memory(flux, seen, 1), []
+    flux, instrument = image(settings.side**2, settings.seed), system(settings, 1000)
+    out, rows = _memory(flux, instrument, 1), []
     tables = Tables(settings.cube_table)
-    for one in contenders(tables):
+    for contender in contenders(tables):
         began = time.perf_counter()
-        run = one.prepare(flux, seen, 1)
+        run = contender.prepare(flux, instrument, 1)
         prepared = time.perf_counter() - began
-        seconds, stages = _least({one.name: run}, out, settings)[one.name]
+        seconds, stages = _least({contender.name: run}, out, settings)[contender.name]
         times = {"seconds": seconds, "stages": stages, "prepared": prepared}
-        found.append({"contender": one.name, "words": one.words} | times)
-        tell(f"runtime: cube, {one.words}: {seconds:.3g} s")
-    return found, tables.get(seen)
+        rows.append({"contender": contender.name, "words": contender.words} | times)
+        tell(f"runtime: cube, {contender.words}: {seconds:.3g} s")
+    return rows, tables.get(instrument)
 
 
 def along(settings: Settings, axis: Axis, tell: Tell) -> list[Point]:
@@ -134,17 +134,17 @@ def along(settings: Settings, axis: Axis, tell: Tell) -> list[Point]:
     points: list[Point] = []
     entrants = contenders(Tables(settings.axis_table))
     for value in axis.values:
-        flux, seen, realizations = _at(settings, axis, value)
+        flux, instrument, realizations = _at(settings, axis, value)
         # mean registrations of a pixel in one exposure, from at most 16 of them
-        hits = float(simulate(flux[:, :16], seen.replace(bins=1), seed=settings.seed).mean(dtype=np.float64))
+        hits = float(simulate(flux[:, :16], instrument.replace(bins=1), seed=settings.seed).mean(dtype=np.float64))
         runs: dict[str, Run] = {}
-        for one in entrants:
-            why = _refusal(settings, one, flux, value, points)
+        for entrant in entrants:
+            why = _refusal(settings, entrant, flux, value, points)
             if why:
-                points.append(Point(axis.name, value, one.name, None, why, hits))
+                points.append(Point(axis.name, value, entrant.name, None, why, hits))
             else:
-                runs[one.name] = one.prepare(flux, seen, realizations)
-        out = _memory(flux, seen, realizations)
+                runs[entrant.name] = entrant.prepare(flux, instrument, realizations)
+        out = _memory(flux, instrument, realizations)
         for name, (seconds, _) in _least(runs, out, settings).items():
             points.append(Point(axis.name, value, name, seconds, "", hits))
         tell(f"runtime: {axis.words} {value:.4g}: {len(runs)} contenders")
@@ -154,9 +154,12 @@ def along(settings: Settings, axis: Axis, tell: Tell) -> list[Point]:
 def teaser(settings: Settings, tell: Tell) -> list[Point]:
     """Many exposures of one pixel, S = B = 1."""
     cycles, realizations = settings.teaser
-    flux, seen = Flux([[1.0]], 1.0, 0.5 * PERIOD_NS), system(settings, cycles)
-    runs = {one.name: one.prepare(flux, seen, realizations) for one in contenders(Tables(settings.axis_table))}
-    timed = _least(runs, _memory(flux, seen, realizations), settings)
+    flux, instrument = Flux([[1.0]], 1.0, 0.5 * PERIOD_NS), system(settings, cycles)
+    runs = {
+        contender.name: contender.prepare(flux, instrument, realizations)
+        for contender in contenders(Tables(settings.axis_table))
+    }
+    timed = _least(runs, _memory(flux, instrument, realizations), settings)
     tell("runtime: teaser")
     return [Point("teaser", float(realizations), name, seconds) for name, (seconds, _) in timed.items()]
 
@@ -171,10 +174,10 @@ def _at(settings: Settings, axis: Axis, value: float) -> tuple[Flux, System, int
     return image(pixels, settings.seed, level), system(settings, cycles), realizations
 
 
-def _refusal(settings: Settings, one: Contender, flux: Flux, value: float, points: Sequence[Point]) -> str:
+def _refusal(settings: Settings, entrant: Contender, flux: Flux, value: float, points: Sequence[Point]) -> str:
     """Why a point is left out, or nothing."""
-    own = [p for p in points if p.contender == one.name]
-    if not one.takes(flux):
+    own = [p for p in points if p.contender == entrant.name]
+    if not entrant.takes(flux):
         return "flux beyond the table"
     if own and own[-1].why.startswith("predicted"):
         return own[-1].why
@@ -190,9 +193,9 @@ def _refusal(settings: Settings, one: Contender, flux: Flux, value: float, point
     return f"predicted {predicted:.3g} s" if predicted > settings.limit_s else ""
 
 
-def _memory(flux: Flux, seen: System, realizations: int) -> NDArray[Any]:
+def _memory(flux: Flux, instrument: System, realizations: int) -> NDArray[Any]:
     """Memory for a cube, written to before."""
-    out = np.empty((realizations, *flux.shape, seen.bins), seen.histogram_dtype)
+    out = np.empty((realizations, *flux.shape, instrument.bins), instrument.histogram_dtype)
     out.fill(1)
     return out
 

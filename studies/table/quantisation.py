@@ -91,8 +91,8 @@ def compute(settings: Settings, tell: Tell) -> list[Cost]:
             seconds = time.perf_counter() - began
             shapes = table.shapes()
             for interpolation in INTERPOLATIONS:
-                found = table.at(signal, background, interpolation=interpolation)
-                errors = _errors(found.rows, found.weights, found.cumulants, shapes, truth)
+                result = table.at(signal, background, interpolation=interpolation)
+                errors = _errors(result.rows, result.weights, result.cumulants, shapes, truth)
                 costs.append(Cost(dead_ns, size, interpolation, errors, seconds, shapes.nbytes / 1e6))
             tell(f"quantisation: t_d = {dead_ns:g} ns, {size[0]} x {size[1]} in {seconds:.1f} s")
     return costs
@@ -116,7 +116,7 @@ def _errors(
         "mean": np.abs(cumulants[:, 0] - mean) / np.sqrt(variance),
         "variance": np.abs(cumulants[:, 1] / variance - 1.0),
         "shape": np.array([0.5 * np.abs(m - e).sum() for m, e in zip(mixed, expected, strict=True)]),
-        "law": np.array([total_variation(one, other) for one, other in zip(*laws, strict=True)]),
+        "law": np.array([total_variation(first, other) for first, other in zip(*laws, strict=True)]),
     }
 
 

@@ -38,14 +38,16 @@ def run(request: Request) -> Facts:
     for case in _CASES[: 2 if request.quick else None]:
         rows += _measure(*case, points, delays)
         request.tell("start-up: t_d = {:g} ns, {} cycles".format(*case))
-    shown = dict.fromkeys((row["dead_time_ns"], row["cycles"]) for row in rows)
+    examples = dict.fromkeys((row["dead_time_ns"], row["cycles"]) for row in rows)
     # start-up lasts where the dead time is near the period
     close = [row["displaced"] for row in rows if 0.9 * PERIOD_NS <= row["dead_time_ns"] <= PERIOD_NS]
     return {
         "points": points,
         "delays": delays,
         "levels": list(_LEVELS),
-        "lines": [_line(case, [row for row in rows if (row["dead_time_ns"], row["cycles"]) == case]) for case in shown],
+        "lines": [
+            _line(case, [row for row in rows if (row["dead_time_ns"], row["cycles"]) == case]) for case in examples
+        ],
         "away": max(row["displaced"] for row in rows if row["dead_time_ns"] < 0.9 * PERIOD_NS),
         "near": max(close, default=None),
         "rows": rows,

@@ -36,7 +36,7 @@ SYSTEM = System(
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Seen:
+class View:
     """What a detector makes of the waveform: mean counts (bins,), predicted and simulated, and its standard error."""
 
     name: str
@@ -59,22 +59,22 @@ def run(request: Request) -> Facts:
     waveform = incident()
     flux = Flux(waveform=np.broadcast_to(waveform, (1, exposures, SYSTEM.bins)), background=BACKGROUND)
     arrivals = waveform + BACKGROUND / SYSTEM.bins  # per period
-    shown = []
+    examples = []
     for name, detector in DETECTORS.items():
         request.tell(f"transients: {name}")
         system = SYSTEM.replace(detector=detector)
         cube = simulate(flux, system, seed=SEED)[0, 0].astype(np.float64)
         expected = mean_histogram(Flux(waveform=waveform, background=BACKGROUND), system)
-        shown.append(Seen(name, expected, cube.mean(0), cube.std(0, ddof=1) / np.sqrt(exposures)))
+        examples.append(View(name, expected, cube.mean(0), cube.std(0, ddof=1) / np.sqrt(exposures)))
     light = {"glass (S, ns)": GLASS, "wall (S, ns)": WALL, **FOG, "background B": BACKGROUND, "dead_time_ns": DEAD_NS}
     return {
         "settings": settings_of(SYSTEM, light, exposures, SEED),
-        "rows": [row(each, SYSTEM.cycles * arrivals) for each in shown],
-        "figures": {"": _draw(shown, arrivals)},
+        "rows": [row(each, SYSTEM.cycles * arrivals) for each in examples],
+        "figures": {"": _draw(examples, arrivals)},
     }
 
 
-def row(each: Seen, arrivals: FloatArray) -> dict[str, Any]:
+def row(each: View, arrivals: FloatArray) -> dict[str, Any]:
     """One line of the table."""
     line: dict[str, Any] = {"detector": each.name, "registrations": float(each.simulated.sum())}
     for name, low, high in (("fog", 0.0, 37.0), ("glass", 37.0, 43.0), ("wall", 70.0, 76.0)):
@@ -85,12 +85,12 @@ def row(each: Seen, arrivals: FloatArray) -> dict[str, Any]:
     return line
 
 
-def _draw(shown: list[Seen], arrivals: FloatArray) -> Figure:
+def _draw(examples: list[View], arrivals: FloatArray) -> Figure:
     figure, axes = panels(2.8, 1, 2)
     scale = 1.0 / (SYSTEM.cycles * SYSTEM.bin_ns)
     for ax, low, high in ((axes[0, 0], 0.0, 100.0), (axes[0, 1], 66.0, 82.0)):
         ax.plot(SYSTEM.time_ns, arrivals / SYSTEM.bin_ns, color=INK, lw=0.7, ls=":", label="arrivals")
-        for each, colour in zip(shown, [MUTED, *COLOURS], strict=False):
+        for each, colour in zip(examples, [MUTED, *COLOURS], strict=False):
             simulated = np.where(each.simulated > 0, each.simulated * scale, np.nan)
             ax.plot(SYSTEM.time_ns, simulated, ".", ms=1.8, color=colour)
             ax.plot(SYSTEM.time_ns, each.expected * scale, color=colour, lw=0.8, label=each.name)

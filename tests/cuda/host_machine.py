@@ -9,7 +9,7 @@ import numpy as np
 from native_emulation import run_kernel
 from numpy.typing import NDArray
 
-from mars_lidar.cuda.kernels import Kernel
+from mars_lidar.engines.cuda.kernels import Kernel
 
 
 class Host:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 
-from mars_lidar.cuda.kernels import HEADERS, OPTIONS, Kernel, source
+from mars_lidar.engines.cuda.kernels import HEADERS, OPTIONS, Kernel, source
 
 
 class NotFound(RuntimeError):

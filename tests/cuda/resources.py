@@ -1,4 +1,4 @@
-"""What the kernels of `mars_lidar.cuda` take, from compiling them without a GPU: `python -m tests.cuda.resources`.
+"""What the CUDA kernels take, from compiling them without a GPU: `python -m tests.cuda.resources`.
 
 Writes benchmarks/results/gpu-resources.md.
 """
@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from mars_lidar import _core
-from mars_lidar.cuda.kernels import (
+from mars_lidar.engines.cuda.kernels import (
     AHEAD,
     MARS_LAWS,
     Kernel,
@@ -20,7 +20,7 @@ from mars_lidar.cuda.kernels import (
     mars_histograms,
     source,
 )
-from mars_lidar.cuda.mars import LANES
+from mars_lidar.engines.cuda.mars import LANES
 from mars_lidar.engines.pixels import pulse_frame
 from mars_lidar.instrument.detector import Detector
 from mars_lidar.instrument.pulse import GaussianPulse

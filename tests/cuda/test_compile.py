@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from mars_lidar.cuda import kernels
-from mars_lidar.cuda.kernels import (
+from mars_lidar.engines.cuda import kernels
+from mars_lidar.engines.cuda.kernels import (
     HEADERS,
     MARS_LAWS,
     Kernel,

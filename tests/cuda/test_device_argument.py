@@ -66,7 +66,7 @@ def test_the_command_line_says_what_is_missing(monkeypatch: pytest.MonkeyPatch, 
 
 def _device() -> Any:
     cupy = pytest.importorskip("cupy", reason="no CuPy: the extra cuda12 or cuda13", exc_type=ImportError)
-    from mars_lidar.cuda.machine import cupy_with_device
+    from mars_lidar.engines.cuda.machine import cupy_with_device
 
     try:
         return cupy_with_device()

@@ -11,8 +11,8 @@ from host_machine import Host
 from numpy.typing import NDArray
 
 import mars_lidar as ml
-from mars_lidar.cuda import exact
-from mars_lidar.cuda.kernels import Sink, Variant
+from mars_lidar.engines.cuda import exact
+from mars_lidar.engines.cuda.kernels import Sink, Variant
 from mars_lidar.engines.engine import Records, Task
 from mars_lidar.engines.exact import ExactEngine
 

@@ -9,7 +9,7 @@ import pytest
 from host_machine import Host
 
 import mars_lidar as ml
-from mars_lidar.cuda.feedback import feedback_histogram
+from mars_lidar.engines.cuda.feedback import feedback_histogram
 from mars_lidar.engines.engine import Task
 from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.engines.feedback import FeedbackEngine

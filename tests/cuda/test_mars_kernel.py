@@ -10,9 +10,8 @@ import pytest
 from host_machine import Host
 
 import mars_lidar as ml
-from mars_lidar import cuda
-from mars_lidar.cuda.mars import mars_histogram
-from mars_lidar.engines import MarsEngine
+from mars_lidar.engines import MarsEngine, cuda
+from mars_lidar.engines.cuda.mars import mars_histogram
 from mars_lidar.engines.engine import Task
 from mars_lidar.table import Table
 

@@ -29,4 +29,4 @@ def recipe() -> dict[str, Any]:
 
 def files(store: Path) -> dict[str, bytes]:
     """Every file of a store, by its path."""
-    return {str(one.relative_to(store)): one.read_bytes() for one in sorted(store.rglob("*")) if one.is_file()}
+    return {str(path.relative_to(store)): path.read_bytes() for path in sorted(store.rglob("*")) if path.is_file()}

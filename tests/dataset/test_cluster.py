@@ -136,9 +136,9 @@ def test_a_part_that_cannot_be_written_is_named_and_the_others_are_there(tmp_pat
     monkeypatch.setattr(write, "write_shard", write_shard)
     with pytest.raises(
         io.WriteError, match=r"1 parts could not be written in four attempts \(Stale file handle\)"
-    ) as told:
+    ) as raised:
         ml.generate(recipe, tmp_path / "two.zarr", threads=1)
-    assert bad[0].name in str(told.value)
+    assert bad[0].name in str(raised.value)
     assert len(ml.dataset.open_dataset(tmp_path / "two.zarr", allow_incomplete=True).missing()) == 1
     monkeypatch.undo()
     ml.generate(recipe, tmp_path / "two.zarr", resume=True)

@@ -61,8 +61,8 @@ def test_layers_of_a_file_are_simulated_too(tmp_path):
 
 
 def test_keys_of_one_scene_stand_for_those_of_many():
-    one = {"systems": SYSTEM, "scenes": {"example": "room", "seed": 3}}
-    assert DatasetRecipe.from_dict(one).scenes == ({"example": "room", "size": 128, "seeds": [3]},)
+    single = {"systems": SYSTEM, "scenes": {"example": "room", "seed": 3}}
+    assert DatasetRecipe.from_dict(single).scenes == ({"example": "room", "size": 128, "seeds": [3]},)
     with pytest.raises(ValueError, match="seed stands for seeds of one"):
         read_view({"example": "room", "seed": 3, "seeds": [3]}, SYSTEM)
     with pytest.raises(ValueError, match="there must be one scene: 2 are named"):
@@ -74,7 +74,7 @@ def test_keys_of_one_scene_stand_for_those_of_many():
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         ("example: room\nfogg: {}\n", r"scene\.yaml:2: .*unknown key 'fogg' \(did you mean 'fog'\?\)"),
         (
@@ -84,9 +84,9 @@ def test_keys_of_one_scene_stand_for_those_of_many():
         ("example: room\nlight:\n  signal: 1\n  atenuation: none\n", r"scene\.yaml:4: .*did you mean 'attenuation'"),
     ],
 )
-def test_a_scene_file_names_line_and_word(tmp_path, text, told):
+def test_a_scene_file_names_line_and_word(tmp_path, text, message):
     (tmp_path / "scene.yaml").write_text(text)
-    with pytest.raises(ValueError, match=told):
+    with pytest.raises(ValueError, match=message):
         read_view(tmp_path / "scene.yaml", SYSTEM)
 
 
@@ -105,7 +105,7 @@ def test_a_system_file_names_line_and_word(tmp_path, suffix):
 
 
 def properties(schema: dict, of: str) -> set[str]:
-    kinds = [one for one in schema["anyOf"] if of in one["properties"]]
+    kinds = [kind for kind in schema["anyOf"] if of in kind["properties"]]
     assert len(kinds) == 1
     return set(kinds[0]["properties"])
 

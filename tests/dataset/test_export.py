@@ -71,54 +71,54 @@ def test_lists_of_intensities(store: Path, tmp_path: Path, layout: str) -> None:
         for k, name in enumerate(images):
             scene, realization = divmod(k, 2)
             sample = 2 * scene + level - 1
-            found = loadmat(name.replace("intensity", "spad").replace(".mat", f"_p{level}.mat"))
+            contents = loadmat(name.replace("intensity", "spad").replace(".mat", f"_p{level}.mat"))
             counts = column_major(name.replace("intensity", "spad").replace(".mat", f"_p{level}.mat"))
             np.testing.assert_array_equal(counts.transpose(1, 2, 0), counts_of(store, sample, realization))
-            rates = found["rates"].reshape(1, SIDE, SIDE, -1).transpose(0, 3, 1, 2)
+            rates = contents["rates"].reshape(1, SIDE, SIDE, -1).transpose(0, 3, 1, 2)
             rates = rates / rates.sum(axis=1)[None]
             assert np.isfinite(rates).all()
-            bins = found["bin"].astype(np.float32).reshape(SIDE, SIDE) - 1
+            bins = contents["bin"].astype(np.float32).reshape(SIDE, SIDE) - 1
             assert np.abs(rates[0].argmax(axis=0) - bins).max() <= 1
             flux = opened.maps
             lit = np.asarray(flux["signal"][sample]) > 0
             delay = np.asarray(flux["delay"][sample])
             assert np.abs((bins + 0.5) * SYSTEM.bin_ns - delay)[lit].max() < 0.51 * SYSTEM.bin_ns
-            fine = found["bin_hr"].astype(np.float32).reshape(8 * SIDE, 8 * SIDE) - 1
+            fine = contents["bin_hr"].astype(np.float32).reshape(8 * SIDE, 8 * SIDE) - 1
             assert np.abs(fine - bins.repeat(8, 0).repeat(8, 1)).max() <= 0.5001
             intensity = loadmat(name)["intensity"].astype(np.float32).reshape(8 * SIDE, 8 * SIDE) / 255
             shared = np.asarray(flux["reflectivity"][sample]).repeat(8, 0).repeat(8, 1)
             known = np.isfinite(shared)
             assert np.abs(intensity - shared)[known].max() < 0.003
             signal, sbr = (value * lit.mean() for value in LEVELS[level - 1])
-            assert found["SBR"].shape == (1, 1)
-            assert found["SBR"][0, 0] == pytest.approx(sbr, rel=1e-6)
-            assert found["photons"][0, 0] == pytest.approx(signal * SYSTEM.cycles, rel=1e-6)
+            assert contents["SBR"].shape == (1, 1)
+            assert contents["SBR"][0, 0] == pytest.approx(sbr, rel=1e-6)
+            assert contents["photons"][0, 0] == pytest.approx(signal * SYSTEM.cycles, rel=1e-6)
             if layout == "deepsensorfusion":
-                drawn_anew(found, bins, lit)
+                drawn_anew(contents, bins, lit)
     if layout == "deepsensorfusion":
         assert loadmat(tmp_path / "set" / "simulated_data" / "dark_img.mat")["dark_img"].reshape(50, 64).sum() == 0
 
 
-def drawn_anew(found: dict[str, Any], bins: np.ndarray, lit: np.ndarray) -> None:
+def drawn_anew(contents: dict[str, Any], bins: np.ndarray, lit: np.ndarray) -> None:
     """The rates that this loader makes of pulse, signal and background, rolled to the bin of the return."""
     rate = np.zeros((SIDE, SIDE, BINS))
-    rate[:, :, :16] = found["pulse"].reshape(SIDE, SIDE, 16) * found["signal_ppp"][:, :, None]
-    rate += found["ambient_ppp"][:, :, None]
+    rate[:, :, :16] = contents["pulse"].reshape(SIDE, SIDE, 16) * contents["signal_ppp"][:, :, None]
+    rate += contents["ambient_ppp"][:, :, None]
     for y, x in zip(*np.nonzero(lit), strict=True):
-        rolled = np.roll(rate[y, x], int(bins[y, x]) - 6) - found["ambient_ppp"][y, x]
-        meant = found["rates"][y, x] * rolled.max()
+        rolled = np.roll(rate[y, x], int(bins[y, x]) - 6) - contents["ambient_ppp"][y, x]
+        meant = contents["rates"][y, x] * rolled.max()
         assert np.abs(rolled - meant).max() < 2e-3 * rolled.max()
-    flux = found["signal_ppp"].mean() / (BINS * found["ambient_ppp"].mean())
-    assert flux == pytest.approx(found["SBR"][0, 0], rel=1e-6)
+    flux = contents["signal_ppp"].mean() / (BINS * contents["ambient_ppp"].mean())
+    assert flux == pytest.approx(contents["SBR"][0, 0], rel=1e-6)
 
 
 def test_without_fill_a_pixel_without_return_has_bin_0(store: Path, tmp_path: Path) -> None:
     done = export(store, tmp_path / "set", layout="lindell")
-    found = loadmat(samples(done.listed)[2].replace("intensity", "spad").replace(".mat", "_p1.mat"))
-    hole = found["bin"] == 0
+    contents = loadmat(samples(done.listed)[2].replace("intensity", "spad").replace(".mat", "_p1.mat"))
+    hole = contents["bin"] == 0
     assert np.argwhere(hole).tolist() == [[2, 5], [3, 5]]
-    assert found["rates"][hole].sum() == 0
-    assert np.isnan(found["bin_hr"]).sum() == 2 * 64
+    assert contents["rates"][hole].sum() == 0
+    assert np.isnan(contents["bin_hr"]).sum() == 2 * 64
 
 
 def test_compressive_histograms(store: Path, tmp_path: Path) -> None:
@@ -128,17 +128,17 @@ def test_compressive_histograms(store: Path, tmp_path: Path) -> None:
     opened = dataset.open_dataset(store)
     for k, name in enumerate(files):
         sample, realization = divmod(k, 2)
-        found = loadmat(name)
-        rows, columns, bins = found["rates"].shape
+        contents = loadmat(name)
+        rows, columns, bins = contents["rates"].shape
         assert (rows, columns, bins) == (SIDE, SIDE, BINS)
-        assert found["bin_size"].squeeze() * 1e12 == pytest.approx(1e3 * SYSTEM.bin_ns)
+        assert contents["bin_size"].squeeze() * 1e12 == pytest.approx(1e3 * SYSTEM.bin_ns)
         counts = counts_of(store, sample, realization)
         np.testing.assert_array_equal(column_major(name).transpose(1, 2, 0), counts)
-        np.testing.assert_array_equal(found["est_range_bins_argmax"] - 1, counts.argmax(-1))
+        np.testing.assert_array_equal(contents["est_range_bins_argmax"] - 1, counts.argmax(-1))
         signal, sbr = LEVELS[sample % 2]
         lit = np.mean(np.asarray(opened.maps["signal"][sample]) > 0)
-        assert abs(int(found["mean_signal_photons"].astype(np.int32)[0, 0]) - lit * signal * SYSTEM.cycles) <= 1
-        assert abs(int(found["mean_background_photons"].astype(np.int32)[0, 0]) - signal * SYSTEM.cycles / sbr) <= 1
+        assert abs(int(contents["mean_signal_photons"].astype(np.int32)[0, 0]) - lit * signal * SYSTEM.cycles) <= 1
+        assert abs(int(contents["mean_background_photons"].astype(np.int32)[0, 0]) - signal * SYSTEM.cycles / sbr) <= 1
         assert re.search(r"_p[12]\.mat$", name)
     (psf,) = (tmp_path / "set").glob("PSF_used_for_simulation*.mat")
     pulse = loadmat(psf)["psf"].mean(axis=-1)
@@ -155,14 +155,14 @@ def test_spadnet(store: Path, tmp_path: Path) -> None:
     opened = dataset.open_dataset(store)
     for k, name in enumerate(files):
         sample, realization = divmod(k, 2)
-        found = loadmat(root / "spad_nyuv2" / name)
+        contents = loadmat(root / "spad_nyuv2" / name)
         np.testing.assert_array_equal(
             column_major(root / "spad_nyuv2" / name).transpose(1, 2, 0), counts_of(store, sample, realization)
         )
         level = int(re.search(r"nl\d+.mat", name).group()[2:-4])  # type: ignore[union-attr]
         assert level == sample % 2 + 1
         depth = np.asarray(opened.maps["depth"][sample])
-        np.testing.assert_allclose(found["depth"].reshape(SIDE, SIDE), np.nan_to_num(depth), rtol=1e-6)
+        np.testing.assert_allclose(contents["depth"].reshape(SIDE, SIDE), np.nan_to_num(depth), rtol=1e-6)
         mono = root / "mono_nyuv2" / name.replace(f"_nl{level}.mat", "").replace("spad_", "")
         truth = np.asarray(Image.open(f"{mono}_truth.png")).astype(np.float64) / 25.5
         assert np.abs(truth - np.nan_to_num(depth)).max() < 0.021
@@ -213,17 +213,17 @@ def test_webdataset_reads_its_tars(tmp_path, recipe, monkeypatch):
     assert len(names) == 5
     stored = dataset.open_dataset(tmp_path / "set.zarr")
     urls = [str(tmp_path / "tars" / name) for name in names]
-    found = set()
-    for one in webdataset.WebDataset(urls, shardshuffle=False).decode():
-        numbers = one["json"]
+    results = set()
+    for example in webdataset.WebDataset(urls, shardshuffle=False).decode():
+        numbers = example["json"]
         sample, realization = numbers["sample"], numbers["realization"]
-        assert one["__key__"] == f"{sample:07d}-{realization:05d}"
-        np.testing.assert_array_equal(one["counts.npy"], stored.histogram[sample, realization])
+        assert example["__key__"] == f"{sample:07d}-{realization:05d}"
+        np.testing.assert_array_equal(example["counts.npy"], stored.histogram[sample, realization])
         for name in ("depth", "reflectivity", "signal", "background", "delay"):
-            np.testing.assert_array_equal(one[f"{name}.npy"], stored.maps[name][sample])
+            np.testing.assert_array_equal(example[f"{name}.npy"], stored.maps[name][sample])
         assert ml.System.from_dict(numbers["system"]) in stored.recipe.systems
         assert numbers["seed"] == int(stored.seeds[sample])
-        found.add((sample, realization))
-    assert len(found) == 24
+        results.add((sample, realization))
+    assert len(results) == 24
     with pytest.raises(ValueError, match="fill belongs to"):
         export(tmp_path / "set.zarr", tmp_path / "more", layout="webdataset", fill=True)

@@ -104,13 +104,13 @@ def test_deepsensorfusion(store: Path, tmp_path: Path, monkeypatch: pytest.Monke
     dark = np.asarray(scipy.io.loadmat("simulated_data/dark_img.mat")["dark_img"]).reshape([50, 64])
     dark = np.transpose(np.tile(np.mean(dark[:, 0:64]), [64, 1]))
     (intensity,) = listed.read_text().split()
-    found = scipy.io.loadmat(
+    contents = scipy.io.loadmat(
         intensity.replace("processed", "spad").replace("intensity", "spad").replace(".mat", "_p2.mat")
     )
-    bins = found["bin"].astype(np.float32).reshape([64, 64]) - 1
-    signal, ambient = found["signal_ppp"].reshape([64, 64]), found["ambient_ppp"].reshape([64, 64]) + dark / 1024
+    bins = contents["bin"].astype(np.float32).reshape([64, 64]) - 1
+    signal, ambient = contents["signal_ppp"].reshape([64, 64]), contents["ambient_ppp"].reshape([64, 64]) + dark / 1024
     rates = np.zeros((64, 64, 1024))
-    rates[:, :, :16] = found["pulse"].reshape([64, 64, 16]) * signal[:, :, None]
+    rates[:, :, :16] = contents["pulse"].reshape([64, 64, 16]) * signal[:, :, None]
     rates += ambient[:, :, None]
     rates *= np.minimum(1, 1 / (1024 * ambient))[:, :, None]  # its optimal filtering
     for y, x in np.ndindex(64, 64):
@@ -134,25 +134,25 @@ def test_gutierrez(tmp_path: Path) -> None:
     assert pulse.sum() == pytest.approx(1.0, abs=1e-5)
     opened = open_dataset(store)
     name, _ = files
-    found = scipy.io.loadmat(name)
-    rows, columns, number = found["rates"].shape
-    assert found["bin_size"].squeeze() * 1e12 == pytest.approx(1e3 * SYSTEM.bin_ns)
-    rates = np.transpose(found["rates"].astype(np.float32)[np.newaxis], (0, 3, 1, 2))
+    contents = scipy.io.loadmat(name)
+    rows, columns, number = contents["rates"].shape
+    assert contents["bin_size"].squeeze() * 1e12 == pytest.approx(1e3 * SYSTEM.bin_ns)
+    rates = np.transpose(contents["rates"].astype(np.float32)[np.newaxis], (0, 3, 1, 2))
     rates = rates / (np.sum(rates, axis=-3, keepdims=True) + 1e-8)
     spad = dense(name, columns, rows, number)
     counts = np.asarray(opened.histogram[1, 0])
     np.testing.assert_array_equal(spad[0].transpose(1, 2, 0), counts)
-    bins = (found["bin"].astype(np.float32)[np.newaxis] - 1) / number  # its normalize_matlab_depth_bins
+    bins = (contents["bin"].astype(np.float32)[np.newaxis] - 1) / number  # its normalize_matlab_depth_bins
     depth = np.asarray(opened.maps["depth"][1])
     known = np.isfinite(depth) & (depth > 0)
     assert np.abs((bins[0] * number + 0.5) * SYSTEM.bin_ns * 0.149896229 - depth)[known].max() < 0.02
     assert np.abs(rates[0].argmax(0) - bins[0] * number)[known].max() <= 1
-    argmax = np.asarray(found["est_range_bins_argmax"]) - 1
+    argmax = np.asarray(contents["est_range_bins_argmax"]) - 1
     np.testing.assert_array_equal(argmax, counts.argmax(-1))
-    assert found["mean_signal_photons"].astype(np.int32)[0, 0] == LEVELS[1][0] * SYSTEM.cycles
-    assert found["mean_background_photons"].astype(np.int32)[0, 0] == LEVELS[1][0] / LEVELS[1][1] * SYSTEM.cycles
-    assert found["SBR"].astype(np.float32)[0, 0] == pytest.approx(LEVELS[1][1], rel=1e-5)
-    matched = np.asarray(found["est_range_bins_lmf"]) - 1  # by the programs that compare with its baselines
+    assert contents["mean_signal_photons"].astype(np.int32)[0, 0] == LEVELS[1][0] * SYSTEM.cycles
+    assert contents["mean_background_photons"].astype(np.int32)[0, 0] == LEVELS[1][0] / LEVELS[1][1] * SYSTEM.cycles
+    assert contents["SBR"].astype(np.float32)[0, 0] == pytest.approx(LEVELS[1][1], rel=1e-5)
+    matched = np.asarray(contents["est_range_bins_lmf"]) - 1  # by the programs that compare with its baselines
     assert np.mean(np.abs(matched - bins[0] * number)[known] <= 3) > 0.9
 
 
@@ -173,15 +173,17 @@ def test_sun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         if name.replace(f"_nl{level}", "") not in blacklist and level == 2:
             files.append("spad_nyuv2/" + name)
     (file,) = files
-    found = scipy.io.loadmat(file)
+    contents = scipy.io.loadmat(file)
     np.testing.assert_array_equal(dense(file, 512, 512, -1)[0].transpose(1, 2, 0), opened.histogram[1, 0])
-    depth = found["depth"].astype(np.float32).reshape([512, 512])
+    depth = contents["depth"].astype(np.float32).reshape([512, 512])
     np.testing.assert_allclose(depth, np.nan_to_num(opened.maps["depth"][1]), rtol=1e-6)
-    assert found["intensity"].astype(np.float32).reshape([1, 512, 512]).max() <= 1.0
+    assert contents["intensity"].astype(np.float32).reshape([1, 512, 512]).max() <= 1.0
     picture = file.replace("spad_nyuv2/", "").replace("_nl2.mat", "").replace("spad_", "")
     truth = np.asarray(Image.open(f"mono_nyuv2/{picture}_truth.png")).astype(np.float64) / 25.5
     assert np.asarray(Image.open(f"mono_nyuv2/{picture}_pred.png")).shape == (512, 512)
     mask = ~((truth >= 10.0) | (truth <= 0.0))
     assert np.abs(truth - depth)[mask].max() <= 0.5 / 25.5 + 1e-6
-    assert found["mean_signal_photons"].astype(np.float32)[0, 0] == pytest.approx(LEVELS[1][0] * few.cycles, rel=1e-5)
-    assert found["SBR"].astype(np.float32)[0, 0] == pytest.approx(LEVELS[1][1], rel=1e-5)
+    assert contents["mean_signal_photons"].astype(np.float32)[0, 0] == pytest.approx(
+        LEVELS[1][0] * few.cycles, rel=1e-5
+    )
+    assert contents["SBR"].astype(np.float32)[0, 0] == pytest.approx(LEVELS[1][1], rel=1e-5)

@@ -32,14 +32,14 @@ def test_every_sample_is_what_simulate_makes(tmp_path, recipe, layout):
         data = xarray.open_zarr(tmp_path / "set.zarr", chunks=None)
     assert data.attrs["complete"] is True
     assert data.histogram.dims == ("sample", "realization", "y", "x", "time")
-    systems = [ml.System.from_dict(one) for one in json.loads(data.attrs["systems"])]
+    systems = [ml.System.from_dict(settings) for settings in json.loads(data.attrs["systems"])]
     for k in range(8):
-        one = data.isel(sample=k)
-        scene = ml.Scene.example("room", (12, 10), (0, 3)[int(one.scene)])
-        system = systems[int(one.system)]
-        flux = scene.flux(system, signal=float(one.signal_level), sbr=float(one.sbr), dark_count_hz=1e5)
-        cube = ml.simulate(flux, system, realizations=3, seed=int(one.seed))
-        np.testing.assert_array_equal(one.histogram, cube)
+        stored = data.isel(sample=k)
+        scene = ml.Scene.example("room", (12, 10), (0, 3)[int(stored.scene)])
+        system = systems[int(stored.system)]
+        flux = scene.flux(system, signal=float(stored.signal_level), sbr=float(stored.sbr), dark_count_hz=1e5)
+        cube = ml.simulate(flux, system, realizations=3, seed=int(stored.seed))
+        np.testing.assert_array_equal(stored.histogram, cube)
         for name, there in (
             ("depth", scene.depth_m),
             ("reflectivity", scene.reflectivity),
@@ -47,7 +47,7 @@ def test_every_sample_is_what_simulate_makes(tmp_path, recipe, layout):
             ("background", flux.background),
             ("delay", flux.delay_ns),
         ):
-            np.testing.assert_array_equal(one[name], there.astype(np.float32))
+            np.testing.assert_array_equal(stored[name], there.astype(np.float32))
         sparse = read_sparse(tmp_path / "set.zarr", k, 2)
         np.testing.assert_array_equal(sparse.toarray().reshape(12, 10, 32), cube[2])
         assert sparse.has_canonical_format or np.all(np.diff(sparse.row * 32 + sparse.col) > 0)
@@ -107,11 +107,11 @@ def test_bad_files_are_told_and_left_out(tmp_path, recipe):
     recipe["scenes"] = [{"path": str(folder)}]
     done = ml.generate(recipe, tmp_path / "set.zarr")
     assert done.shape[0] == 2 * 4
-    assert [one.path.name[0] for one in done.problems] == ["b", "d", "e", "f", "g"]
-    told = [one.reason for one in done.problems]
-    assert "cannot be read" in told[0]
-    assert "24 × 10 pixels" in told[3]
-    assert "zero at every pixel" in told[4]
+    assert [problem.path.name[0] for problem in done.problems] == ["b", "d", "e", "f", "g"]
+    messages = [problem.reason for problem in done.problems]
+    assert "cannot be read" in messages[0]
+    assert "24 × 10 pixels" in messages[3]
+    assert "zero at every pixel" in messages[4]
     assert [Path(name).name for name in open_dataset(tmp_path / "set.zarr").scene_names()] == [
         "a_depth.png",
         "c_depth.png",
@@ -152,14 +152,14 @@ def test_damage_is_found(tmp_path, recipe):
     counts = np.asarray(stored.histogram[5, 1])
     counts[3, 4, 5] += 1
     with_zeros(zarr.open_group(tmp_path / "set.zarr", mode="r+", use_consolidated=False)["histogram"])[5, 1] = counts
-    told = verify(tmp_path / "set.zarr", chunks=None)
-    assert not told.good
-    assert "histogram/c.5.0.0.0.0 is not as it was written" in told.different[0]
-    assert "histogram/c.5.0.0.0.0 is not as it was written" in told.different[1]
+    problems = verify(tmp_path / "set.zarr", chunks=None)
+    assert not problems.good
+    assert "histogram/c.5.0.0.0.0 is not as it was written" in problems.different[0]
+    assert "histogram/c.5.0.0.0.0 is not as it was written" in problems.different[1]
     manifest.seal(tmp_path / "set.zarr", {})  # a manifest that agrees with what is there
-    told = verify(tmp_path / "set.zarr", chunks=None)
-    assert told.different[0].startswith("histogram[5:6, 1:2, ")
-    assert "differs in 1 bins" in told.different[0]
+    problems = verify(tmp_path / "set.zarr", chunks=None)
+    assert problems.different[0].startswith("histogram[5:6, 1:2, ")
+    assert "differs in 1 bins" in problems.different[0]
     shard = max((tmp_path / "set.zarr/histogram").glob("c.*"), key=lambda path: path.stat().st_size)
     content = bytearray(shard.read_bytes())
     content[30] ^= 4
@@ -180,7 +180,7 @@ def test_the_command(tmp_path):
     ran = command_line(["generate", "room", *options, "--sbr", "2", "-o", name])
     assert ran.exit_code == 0, ran.output
     assert command_line(["verify", name]).exit_code == 0
-    for bad, told in (
+    for bad, message in (
         (["room", "--crop", "x"], "--crop must be one integer"),
         (["room", "--focal-px", "3"], "belong to RGB-D"),
         ([str(tmp_path / "none")], "no such file"),
@@ -189,7 +189,7 @@ def test_the_command(tmp_path):
     ):
         ran = command_line(["generate", *bad, "-o", str(tmp_path / "b.zarr"), "--layout", "dense"])
         assert ran.exit_code == 2, ran.output
-        assert told in ran.output
+        assert message in ran.output
     assert not (tmp_path / "b.zarr").exists()
 
 
@@ -250,13 +250,13 @@ def test_crosstalk_needs_whole_images(tmp_path, recipe):
 def test_estimates_come_near(tmp_path, recipe):
     recipe["scenes"][0]["size"] = 48
     recipe["store"] = {"chunk_mib": 0.1, "shard_mib": 1}
-    told = estimate(recipe, tmp_path / "set.zarr")
+    stated = estimate(recipe, tmp_path / "set.zarr")
     ml.generate(recipe, tmp_path / "set.zarr")
-    found = sum(len(one) for name, one in files(tmp_path / "set.zarr").items() if "histogram" in name)
-    maps = told.shape[0] * 48 * 48 * 20 + told.scenes * 48 * 48 * 16
-    assert told.shape == (8, 3, 48, 48, 32)
-    assert told.bytes - maps == pytest.approx(found, rel=0.25)
-    assert told.memory_bytes < 1.5 * 2**30
+    written = sum(len(file) for name, file in files(tmp_path / "set.zarr").items() if "histogram" in name)
+    maps = stated.shape[0] * 48 * 48 * 20 + stated.scenes * 48 * 48 * 16
+    assert stated.shape == (8, 3, 48, 48, 32)
+    assert stated.bytes - maps == pytest.approx(written, rel=0.25)
+    assert stated.memory_bytes < 1.5 * 2**30
 
 
 def test_many_shards(tmp_path, recipe):
@@ -281,12 +281,12 @@ def test_many_shards(tmp_path, recipe):
 
 def test_bad_arguments(tmp_path, recipe):
     out = tmp_path / "set.zarr"
-    for options, told in (
+    for options, message in (
         ({"threads": 0}, "threads must be"),
         ({"workers": 1, "scheduler": "x"}, "give one of them"),
         ({"resume": True, "overwrite": True}, "exclude each other"),
     ):
-        with pytest.raises(ValueError, match=told):
+        with pytest.raises(ValueError, match=message):
             ml.generate(recipe, out, **options)
     with pytest.raises(ValueError, match=r"out must end in \.zarr"):
         ml.generate(recipe, tmp_path / "set.h5")

@@ -50,8 +50,8 @@ def cube(tmp_path) -> Path:
 
 @pytest.fixture
 def maps(cube) -> Path:
-    found = ml.reconstruct(np.asarray(io.load(cube).histogram), SYSTEM)
-    return save_maps(cube.with_name("maps.zarr"), {"maximum_likelihood": found})
+    estimate = ml.reconstruct(np.asarray(io.load(cube).histogram), SYSTEM)
+    return save_maps(cube.with_name("maps.zarr"), {"maximum_likelihood": estimate})
 
 
 def all_of(dataset: Path) -> None:
@@ -96,19 +96,19 @@ def test_every_flipped_bit_is_found(dataset, cube, maps, name):
         path.write_bytes(content)
         try:
             in_manifest = path.name == manifest.NAME  # a wrong sum of data that is good
-            told = ""
+            message = ""
             try:
                 READERS[name](store)
             except (FileError, FileNotFoundError) as error:
-                told = str(error)
-            noticed = str(store) in told
+                message = str(error)
+            noticed = str(store) in message
             assert noticed or in_manifest, f"a flipped bit of {path} goes unnoticed by its reader"
             if name == "set":
                 try:
-                    found = not verify(store, chunks=1).good
+                    detected = not verify(store, chunks=1).good
                 except ValueError:  # it cannot be opened
-                    found = True
-                assert found, f"verify does not find a flipped bit of {path}"
+                    detected = True
+                assert detected, f"verify does not find a flipped bit of {path}"
             assert noticed or list(manifest.damage(store))
         finally:
             path.write_bytes(path_was)
@@ -127,9 +127,9 @@ def test_changed_labels_coordinates_and_inputs_are_found_without_a_manifest_too(
     scene = dataset / "scenes/depth/c.0.0.0"
     was_there = scene.read_bytes()
     scene.write_bytes(was_there[:-1] + b"\0")
-    found = verify(dataset).different
-    assert found[0] == "scenes/depth/c.0.0.0 is not as it was written"
-    assert "cannot be read" in found[1]
+    changed = verify(dataset).different
+    assert changed[0] == "scenes/depth/c.0.0.0 is not as it was written"
+    assert "cannot be read" in changed[1]
     scene.write_bytes(was_there)
     (dataset / manifest.NAME).rename(dataset / "away")
     with pytest.raises(FileError, match=r"is damaged: its manifest\.sha256 is missing"):
@@ -143,8 +143,8 @@ def test_changed_labels_coordinates_and_inputs_are_found_without_a_manifest_too(
 
 def test_opening_says_what_it_made_sure_of(dataset, cube):
     for path in (dataset, cube):
-        told = command_line(["info", str(path)]).output
-        assert "every file of its manifest.sha256 is there" in " ".join(told.split())
+        printed = command_line(["info", str(path)]).output
+        assert "every file of its manifest.sha256 is there" in " ".join(printed.split())
     (cube / "histogram/c/0/0/0/0").unlink()
     refused = command_line(["info", str(cube)])
     assert refused.exit_code == 2

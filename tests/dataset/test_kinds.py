@@ -18,7 +18,7 @@ from dataset.test_stopped import stopped
 import mars_lidar as ml
 from mars_lidar import io
 from mars_lidar.dataset import DatasetRecipe, estimate, open_dataset, verify
-from mars_lidar.scene.layers import LayeredScene
+from mars_lidar.scene.scene import LayeredScene
 from tests.harness.command import command_line
 
 SHAPE = (12, 10)

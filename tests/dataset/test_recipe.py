@@ -60,7 +60,7 @@ def test_options_replace_values(write):
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "line", "told"),
+    ("old", "new", "line", "message"),
     [
         ("seed: 3", "seed: -3", 1, "seed must be an integer in"),
         ("seed: 3", "sead: 3", 1, "unknown key 'sead'"),
@@ -82,9 +82,9 @@ def test_options_replace_values(write):
         ("light:", "light: [", 13, "expected"),
     ],
 )
-def test_errors_point_at_the_line(write, old, new, line, told):
+def test_errors_point_at_the_line(write, old, new, line, message):
     assert old in TEXT
-    with pytest.raises(ValueError, match=rf"recipe\.yaml:{line}: .*{told}"):
+    with pytest.raises(ValueError, match=rf"recipe\.yaml:{line}: .*{message}"):
         DatasetRecipe.load(write(TEXT.replace(old, new, 1)))
 
 

@@ -132,5 +132,5 @@ def test_drawn_histograms_follow_the_aligned_shape():
     table = Table.build(system, np.array([1.9, 2.0]), np.array([0.3, 0.4]))
     cube = ml.simulate(flux, system, engine="mars", table=table, realizations=8)
     exact = exposure_moments(ml.Flux(2.0, 0.3, delay), system).histogram
-    seen = cube.reshape(-1, BINS).sum(0, dtype=np.int64)
-    require({"mean histogram": goodness(seen, exact / exact.sum() * seen.sum())}, "mars, aligned")
+    observed = cube.reshape(-1, BINS).sum(0, dtype=np.int64)
+    require({"mean histogram": goodness(observed, exact / exact.sum() * observed.sum())}, "mars, aligned")

@@ -11,8 +11,7 @@ from harness import Case, counts_against_law, require, task_of
 
 import mars_lidar as ml
 from mars_lidar.engines import MarsEngine
-from mars_lidar.engines.counts import Matched, PartlyReplaced, Streams, Tabulated
-from mars_lidar.engines.synthesis import Run
+from mars_lidar.engines.synthesis import Matched, PartlyReplaced, Run, Streams, Tabulated
 from mars_lidar.engines.table_reader import Entries
 from mars_lidar.engines.tolerances import TOLERANCES
 from mars_lidar.statistics.count_pmf import Pmf, total_variation

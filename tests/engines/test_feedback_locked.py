@@ -151,8 +151,8 @@ def test_bright_background_settles_to_its_joint_law(name: str):
     law = ml.joint_law(ml.Flux(signal, background, delay), request.system)
     size = np.sqrt(law.variance)
     value, mode = np.linalg.eigh(law.covariance() / np.outer(size, size))
-    seen = value > 1e-3 * value.max()
-    y = ((x - law.mean) / size) @ mode[:, seen] / np.sqrt(value[seen])
+    selected = value > 1e-3 * value.max()
+    y = ((x - law.mean) / size) @ mode[:, selected] / np.sqrt(value[selected])
     assert np.abs(y.mean(0)).max() < 0.05 + 5.0 / np.sqrt(len(x))
     assert np.abs(y.var(0) - 1.0).max() < 0.05 + 5.0 * np.sqrt(2.0 / len(x))
 

@@ -66,8 +66,8 @@ def test_bins_have_the_mean_and_variance_of_the_joint_law(name: str):
     flux = request.flux
     law = ml.joint_law(flux[0, 0], request.system)
     x = drawn(Sampler(), request).astype(float)
-    seen = law.mean > 0.1
-    off = (x.mean(0) - law.mean)[seen] / np.sqrt(law.variance[seen])
+    selected = law.mean > 0.1
+    off = (x.mean(0) - law.mean)[selected] / np.sqrt(law.variance[selected])
     assert np.abs(off).max() < 0.05 + 5.0 / np.sqrt(len(x))
     many = law.mean > 20.0
     spread = x[:, many].var(0) / law.variance[many] - 1.0

@@ -117,10 +117,10 @@ def test_a_bright_pulse_across_the_edge_of_a_bin_leaves_little_behind_it(signal)
         detector=Detector(dead_time_ns=20.0),
     )
     counts = ml.simulate(ml.Flux(signal, 4e-6, 50.0), system, engine="feedback", realizations=4_000, seed=4)[:, 0, 0]
-    behind, law = counts[:, 4], 25_881 * np.exp(-0.5 * signal)
+    far, law = counts[:, 4], 25_881 * np.exp(-0.5 * signal)
     light = 4e-6 * 25_881 / 8 + law  # of the background too
-    assert abs(behind.mean() - light) < (4.5 / 4_000**0.5 + 0.05) * light**0.5
-    assert behind.var() < (1.0 + 4.5 * ((2.0 + 1.0 / light) / 4_000) ** 0.5 + 0.05) * light
+    assert abs(far.mean() - light) < (4.5 / 4_000**0.5 + 0.05) * light**0.5
+    assert far.var() < (1.0 + 4.5 * ((2.0 + 1.0 / light) / 4_000) ** 0.5 + 0.05) * light
     assert abs(counts.sum(-1).mean() - 25_881.06) < 0.2
 
 
@@ -258,11 +258,11 @@ def test_level_must_run_here():
 @pytest.mark.parametrize("engine", ["feedback", "auto"])
 def test_progress_runs_once_to_its_end(engine: str):
     flux, system = mixture()
-    seen: list[float] = []
-    ml.simulate(flux, system, engine=engine, realizations=3000, progress=lambda done, of: seen.append(done / of))
-    assert len(seen) > 1  # every 50 ms, and at the end
-    assert seen[-1] == 1.0
-    assert seen == sorted(seen)
+    recorded: list[float] = []
+    ml.simulate(flux, system, engine=engine, realizations=3000, progress=lambda done, of: recorded.append(done / of))
+    assert len(recorded) > 1  # every 50 ms, and at the end
+    assert recorded[-1] == 1.0
+    assert recorded == sorted(recorded)
 
 
 # The choice

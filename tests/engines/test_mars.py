@@ -101,8 +101,8 @@ def test_a_locked_pixel_needs_the_exact_count():
 def test_any_part_alone_on_any_threads(with_table: bool):
     flux, given = image(), table() if with_table else None
     whole = ml.simulate(flux, SYSTEM, engine="mars", table=given, realizations=3, seed=5, threads=2)
-    one = ml.simulate(flux, SYSTEM, engine="mars", table=given, realizations=3, seed=5, threads=1)
-    assert np.array_equal(whole, one)
+    single = ml.simulate(flux, SYSTEM, engine="mars", table=given, realizations=3, seed=5, threads=1)
+    assert np.array_equal(whole, single)
     index = np.arange(35).reshape(5, 7)[1:4]
     part = ml.simulate(flux[1:4], SYSTEM, engine="mars", table=given, first_realization=1, pixel_index=index, seed=5)
     assert np.array_equal(part[0], whole[1, 1:4])
@@ -165,8 +165,8 @@ def test_pixels_beyond_the_table_are_an_error_unless_asked_for(engine: str):
     flux = ml.Flux(signal, background, 30.0)
     with pytest.raises(ValueError, match="table must reach every pixel, but 2 of 6 lie outside") as error:
         ml.simulate(flux, SYSTEM, engine=engine, table=table())
-    for told in ("signal 5 to 20", "(the table: 0 to 3)", "background 7.5 to 7.5", "outside='exact'"):
-        assert told in str(error.value)
+    for words in ("signal 5 to 20", "(the table: 0 to 3)", "background 7.5 to 7.5", "outside='exact'"):
+        assert words in str(error.value)
     assert ml.simulate(flux, SYSTEM, engine=engine, table=table(), outside="exact").sum(-1).min() > 0
 
 

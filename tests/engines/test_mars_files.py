@@ -99,9 +99,9 @@ def test_command_line(tmp_path, table: Table):
     with io.load(tmp_path / "a.zarr") as cube:
         assert cube.settings["interpolation"] == "nearest"
         assert io.verify(cube, table=table)
-    told = command_line(["info", str(tmp_path / "a.zarr")])
-    assert "count gaussian" in told.output
-    assert "table" in told.output
+    printed = command_line(["info", str(tmp_path / "a.zarr")])
+    assert "count gaussian" in printed.output
+    assert "table" in printed.output
     wrong = command_line([*arguments, "--dead-time-ns", "40", *more[:-1], str(tmp_path / "b.zarr")])
     assert wrong.exit_code == 2
     refused = command_line([*arguments[:-4], "--engine", "exact", *more[:2], "-o", str(tmp_path / "c.npz")])

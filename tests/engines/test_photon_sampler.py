@@ -111,8 +111,8 @@ def test_photons_follow_the_formed_shape(dead: float, signal: float, background:
     outcomes = {}
     for k, (move, shape) in enumerate(zip(MOVES, pixels.aligned(), strict=True)):
         assert not cube[:, k, shape == 0.0].any()
-        seen = cube[:, k].sum(0, dtype=np.int64)
-        outcomes[f"bins, moved {move:g}"] = goodness(seen, shape * seen.sum())
+        observed = cube[:, k].sum(0, dtype=np.int64)
+        outcomes[f"bins, moved {move:g}"] = goodness(observed, shape * observed.sum())
         turned = -int(np.floor(move)) - BINS // 2 + 15  # the frame begins here
         parts = np.add.reduceat(np.roll(cube[:, k], turned, -1), [0, 30, 90, 150], -1)
         p = np.add.reduceat(np.roll(shape, turned), [0, 30, 90, 150])

@@ -33,25 +33,25 @@ def test_count_and_shape(with_table: bool):
     n = np.arange(int(mean + 12 * np.sqrt(variance)))
     pmf = np.diff(stats.norm.cdf((n + 0.5 - mean) / np.sqrt(variance)), prepend=0.0)
     exact = exposure_moments(ml.Flux(signal, background, delay), SYSTEM).histogram
-    seen = cube.sum(0, dtype=np.int64)
+    observed = cube.sum(0, dtype=np.int64)
     require(
         {
             "count law": counts_against_law(cube.sum(1, dtype=np.int64), pmf),
-            "shape": goodness(seen, exact / exact.sum() * seen.sum()),
+            "shape": goodness(observed, exact / exact.sum() * observed.sum()),
         },
         f"renewal, table {with_table}",
     )
 
 
 def test_waveforms_and_returns_are_solved_at_their_own_delays():
-    one = ml.Flux(np.full((1, 4), 0.9), 0.2, 31.7)
-    both = ml.Flux.multi(one, ml.Flux(np.full((1, 4), 0.5), 0.0, 77.7))
+    pixel = ml.Flux(np.full((1, 4), 0.9), 0.2, 31.7)
+    both = ml.Flux.multi(pixel, ml.Flux(np.full((1, 4), 0.5), 0.0, 77.7))
     cube = ml.simulate(both, SYSTEM, engine="renewal", realizations=1000).reshape(-1, SYSTEM.bins)
     parts = SYSTEM.bins * 64
     wave = 0.9 * SYSTEM.pulse.bin_energy(31.7, 100.0, parts) + 0.5 * SYSTEM.pulse.bin_energy(77.7, 100.0, parts)
     exact = exposure_moments(ml.Flux(waveform=np.maximum(wave, 0.0), background=0.2), SYSTEM).histogram
-    seen = cube.sum(0, dtype=np.int64)
-    require({"shape": goodness(seen, exact / exact.sum() * seen.sum())}, "renewal, two returns")
+    observed = cube.sum(0, dtype=np.int64)
+    require({"shape": goodness(observed, exact / exact.sum() * observed.sum())}, "renewal, two returns")
 
 
 def test_any_part_alone():

@@ -75,10 +75,10 @@ def test_counts_of_a_bin_are_binomial(mean: float):
     cube = sample(np.full(bins, 1 / bins, np.float32), np.full((60, 4), photons), seed=3)
     law = stats.binom(photons, 1 / bins)
     low, high = int(law.ppf(1e-7)), int(law.isf(1e-7))
-    seen = np.bincount(np.clip(cube.ravel(), low, high) - low, minlength=high - low + 1)
+    observed = np.bincount(np.clip(cube.ravel(), low, high) - low, minlength=high - low + 1)
     expected = law.pmf(np.arange(low, high + 1)) * cube.size
     # bins of one exposure repel a little (1 in 1023), which makes the statistic smaller, not larger
-    require({"law": goodness(seen, expected * seen.sum() / expected.sum())}, f"bin of mean {mean}")
+    require({"law": goodness(observed, expected * observed.sum() / expected.sum())}, f"bin of mean {mean}")
 
 
 @pytest.mark.parametrize("bins", [1, 2, 7, 63, 64, 65, 200, 1000, 4096, 70_001])

@@ -25,10 +25,10 @@ def chromium() -> Iterator[Any]:
     sync_api = pytest.importorskip("playwright.sync_api", reason="needs Playwright: the extra 'browser'")
     with sync_api.sync_playwright() as playwright:
         own = Path(playwright.chromium.executable_path)
-        found = str(own) if own.exists() else next(filter(None, map(shutil.which, _NAMES)), None)
-        if found is None:
+        path = str(own) if own.exists() else next(filter(None, map(shutil.which, _NAMES)), None)
+        if path is None:
             pytest.skip("needs a Chromium: of the system, or by `playwright install chromium`")
-        browser = playwright.chromium.launch(executable_path=found, args=["--no-sandbox"], timeout=WAIT_MS)
+        browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"], timeout=WAIT_MS)
         try:
             yield browser
         finally:

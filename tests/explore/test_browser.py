@@ -97,8 +97,8 @@ def python_counts(state: dict[str, Any]) -> NDArray[Any]:
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    with chromium() as found:
-        yield found
+    with chromium() as process:
+        yield process
 
 
 @pytest.fixture(scope="module")
@@ -113,8 +113,8 @@ def test_it_needs_no_network(page: Page):
 
 
 def test_the_same_bits_in_the_browser(page: Page):
-    found = {each["name"]: each["found"] for each in page.tab.evaluate("explorer.golden()")}
-    assert found == golden_of_page()
+    results = {each["name"]: each["found"] for each in page.tab.evaluate("explorer.golden()")}
+    assert results == golden_of_page()
     page.tab.click("#check")
     page.until("document.getElementById('golden').textContent.includes('All 8 golden cubes')")
 
@@ -122,37 +122,37 @@ def test_the_same_bits_in_the_browser(page: Page):
 @pytest.mark.parametrize("name", STATES)
 def test_curves_are_python_s(page: Page, name: str):
     """Dots to the last bit; curves to rounding where both refine to the same grid, and to the tolerance where not."""
-    told = page.set(**BASE | STATES[name])
+    answer = page.set(**BASE | STATES[name])
     state = page.tab.evaluate("explorer.state")
     system, delay = system_of(state), float(state["delay"])
     light = (ml.Flux(float(state["signal"]), float(state["background"]), delay), system)
-    assert np.array_equal(told["draw"]["counts"], python_counts(state))
-    assert told["draw"]["incident"] == pytest.approx(photons_per_bin(*light, bins=system.bins), rel=1e-9, abs=1e-12)
+    assert np.array_equal(answer["draw"]["counts"], python_counts(state))
+    assert answer["draw"]["incident"] == pytest.approx(photons_per_bin(*light, bins=system.bins), rel=1e-9, abs=1e-12)
     mean = mean_histogram(*light)
-    assert np.abs(np.array(told["mean"]["mean"]) - mean).max() <= 1e-6 * mean.max()
+    assert np.abs(np.array(answer["mean"]["mean"]) - mean).max() <= 1e-6 * mean.max()
     law = count_law(*light)
-    assert told["mean"]["cumulants"] == pytest.approx([float(law.mean), float(law.variance)], rel=1e-5)
-    assert distance(law, told["law"]) <= 2e-5
+    assert answer["mean"]["cumulants"] == pytest.approx([float(law.mean), float(law.variance)], rel=1e-5)
+    assert distance(law, answer["law"]) <= 2e-5
     if state["mode"] != "nonparalyzable":
-        assert told["spread"] is None
+        assert answer["spread"] is None
     elif state["dead"] == 0:
-        assert told["spread"] == pytest.approx(np.sqrt(told["mean"]["mean"]))
+        assert answer["spread"] == pytest.approx(np.sqrt(answer["mean"]["mean"]))
     else:
-        assert told["spread"] == pytest.approx(np.sqrt(joint_law(*light).variance), rel=1e-3)
+        assert answer["spread"] == pytest.approx(np.sqrt(joint_law(*light).variance), rel=1e-3)
 
 
-def distance(law: ml.CountLaw, told: dict[str, Any]) -> float:
+def distance(law: ml.CountLaw, answer: dict[str, Any]) -> float:
     """Total variation between Python's law of the count and the page's."""
-    low = min(int(law.support[0]), told["first"])
-    both = np.zeros((2, max(int(law.support[-1]), told["first"] + len(told["p"]) - 1) - low + 1))
+    low = min(int(law.support[0]), answer["first"])
+    both = np.zeros((2, max(int(law.support[-1]), answer["first"] + len(answer["p"]) - 1) - low + 1))
     both[0, int(law.support[0]) - low :][: law.pmf.size] = law.pmf
-    both[1, told["first"] - low :][: len(told["p"])] = told["p"]
+    both[1, answer["first"] - low :][: len(answer["p"])] = answer["p"]
     return float(0.5 * np.abs(both[0] - both[1]).sum())
 
 
 def test_what_has_no_law_says_so(page: Page):
-    told = page.set(**BASE | {"afterpulses": 0.1, "cycles": 1000})
-    assert "mean" not in told
+    answer = page.set(**BASE | {"afterpulses": 0.1, "cycles": 1000})
+    assert "mean" not in answer
     assert "afterpulses" in page.tab.inner_text("#notes")
     locked = page.set(**BASE | {"dead": 100.05, "signal": 30})
     assert "mean" in locked
@@ -163,11 +163,11 @@ def scene(state: dict[str, Any]) -> tuple[ml.Flux, ml.System]:
     """The page's picture, from the same committed numbers."""
     import base64
 
-    told = json.loads((PAGE.parents[3] / "explorer" / "src" / "scene.json").read_text())
+    settings = json.loads((PAGE.parents[3] / "explorer" / "src" / "scene.json").read_text())
+    height, width = settings.pop("height"), settings.pop("width")
     maps = {
-        name: np.frombuffer(base64.b64decode(told[name]), "<u2").reshape(told["height"], told["width"]) for name in told
-        if name not in ("height", "width")
-    }  # fmt: skip
+        name: np.frombuffer(base64.b64decode(text), "<u2").reshape(height, width) for name, text in settings.items()
+    }
     delay = 2.0 / 0.299792458 * (maps["depth_mm"] / 1000.0)
     return ml.Flux(state["signal"] * (maps["light"] / 4096.0), state["background"], delay), system_of(state)
 
@@ -196,11 +196,11 @@ def test_the_picture_by_maximum_likelihood(page: Page, cube: tuple[dict[str, Any
     page.set(**PICTURED | {"method": "likelihood"})
     page.until("explorer.picture.whole")
     delay = np.array(page.tab.evaluate("Array.from(explorer.picture.delay, (x) => Number.isNaN(x) ? null : x)"), float)
-    found = reconstruct(drawn, scene(page.tab.evaluate("explorer.state"))[1])
-    seen = np.isfinite(delay)
-    assert np.mean(seen == found.detected) > 0.998
-    both = seen & found.detected
-    off = np.abs((delay - found.delay_ns / 100.0 + 0.5) % 1.0 - 0.5)[both] * 100.0
+    estimate = reconstruct(drawn, scene(page.tab.evaluate("explorer.state"))[1])
+    estimated = np.isfinite(delay)
+    assert np.mean(estimated == estimate.detected) > 0.998
+    both = estimated & estimate.detected
+    off = np.abs((delay - estimate.delay_ns / 100.0 + 0.5) % 1.0 - 0.5)[both] * 100.0
     assert both.sum() > 1000
     assert np.mean(off < 1e-3) > 0.995  # ns: libm differs, and with it now and then the top that a climb ends on
 
@@ -237,9 +237,9 @@ def test_a_click_shows_that_pixel(page: Page, cube: tuple[dict[str, Any], NDArra
     page.tab.evaluate("explorer.figure.results = {}")
     at = {"x": (column + 0.5) / 64 * box["width"], "y": (row + 0.5) / 64 * box["height"]}
     page.tab.locator("#depth canvas").click(position=at)
-    told = page.drawn()
+    answer = page.drawn()
     assert page.tab.evaluate("explorer.state.pixel") == 64 * row + column
-    assert np.array_equal(told["draw"]["counts"], drawn[64 * row + column])
+    assert np.array_equal(answer["draw"]["counts"], drawn[64 * row + column])
     assert f"Pixel ({row}, {column})" in page.tab.inner_text("#which")
 
 
@@ -278,9 +278,9 @@ def test_a_link_holds_the_state(browser: Any, page: Page):
     assert other.tab.evaluate("explorer.state") == state
     other.close()
     odd = Page(browser, PAGE.as_uri() + "#signal=abc&bins=7e9&mode=odd&pixel=99999&dead=-3&nothing=1", offline=True)
-    told = odd.tab.evaluate("explorer.state")
-    kept = {"signal": 1, "bins": 1024, "mode": "nonparalyzable", "pixel": -1, "dead": 0}
-    assert {name: told[name] for name in kept} == kept
+    answer = odd.tab.evaluate("explorer.state")
+    valid = {"signal": 1, "bins": 1024, "mode": "nonparalyzable", "pixel": -1, "dead": 0}
+    assert {name: answer[name] for name in valid} == valid
     changed = odd.tab.inner_text("#changed")
     for words in (
         'Signal S: "abc" is not a number',
@@ -305,20 +305,20 @@ def test_a_link_holds_the_state(browser: Any, page: Page):
     ids=["pixel", "synchronous", "second return", "gated", "effects"],
 )
 def test_the_python_makes_the_same_figure(page: Page, changes: dict[str, Any], monkeypatch: pytest.MonkeyPatch):
-    told = page.set(**BASE | {"cycles": 500} | changes)
+    answer = page.set(**BASE | {"cycles": 500} | changes)
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
     monkeypatch.setattr(plt, "show", lambda: None)
     names: dict[str, Any] = {}
     exec(page.tab.inner_text("#python"), names)
-    assert np.array_equal(told["draw"]["counts"], names["drawn"])
-    assert told["draw"]["incident"] == pytest.approx(names["incident"], rel=1e-9, abs=1e-12)
-    if "mean" in told:
-        assert np.abs(np.array(told["mean"]["mean"]) - names["mean"]).max() <= 1e-6 * names["mean"].max()
-        assert ("spread" in names) == (told["spread"] is not None)
-        assert told["spread"] is None or told["spread"] == pytest.approx(names["spread"], rel=1e-3)
-        assert distance(names["law"], told["law"]) <= 2e-5
+    assert np.array_equal(answer["draw"]["counts"], names["drawn"])
+    assert answer["draw"]["incident"] == pytest.approx(names["incident"], rel=1e-9, abs=1e-12)
+    if "mean" in answer:
+        assert np.abs(np.array(answer["mean"]["mean"]) - names["mean"]).max() <= 1e-6 * names["mean"].max()
+        assert ("spread" in names) == (answer["spread"] is not None)
+        assert answer["spread"] is None or answer["spread"] == pytest.approx(names["spread"], rel=1e-3)
+        assert distance(names["law"], answer["law"]) <= 2e-5
     else:
         assert "mean" not in names
     plt.close("all")
@@ -448,13 +448,13 @@ def test_curves_of_another_state_are_marked(page: Page):
 
 
 def test_it_saves_what_it_shows(page: Page):
-    told = page.set(**BASE | {"bins": 32})
+    answer = page.set(**BASE | {"bins": 32})
     rows = page.tab.evaluate("explorer.table()").splitlines()
     assert rows[1] == "time_ns,arriving_photons_mean,counts,exact_mean,standard_deviation"
     values = np.array([[float(cell) for cell in row.split(",")] for row in rows[2:]])
-    assert values[:, 2] == pytest.approx(told["draw"]["counts"])
-    assert values[:, 3] == pytest.approx(told["mean"]["mean"])
-    assert values[:, 4] == pytest.approx(told["spread"])
+    assert values[:, 2] == pytest.approx(answer["draw"]["counts"])
+    assert values[:, 3] == pytest.approx(answer["mean"]["mean"])
+    assert values[:, 4] == pytest.approx(answer["spread"])
     picture = page.tab.evaluate("explorer.png().then((blob) => [blob.type, blob.size])")
     assert picture[0] == "image/png"
     assert picture[1] > 10_000
@@ -493,29 +493,29 @@ def test_a_preset_is_taken_though_an_address_is_still_to_be_written(page: Page):
 
 
 def test_presets_show_what_their_sentences_say(page: Page):
-    told = preset(page, "More light, worse depth")
+    answer = preset(page, "More light, worse depth")
     assert "3.4 ns early, half a metre" in page.tab.inner_text("#story")
-    crest = (np.argmax(told["mean"]["mean"]) + 0.5) * 100 / 128
+    crest = (np.argmax(answer["mean"]["mean"]) + 0.5) * 100 / 128
     assert 60 - crest == pytest.approx(3.4, abs=0.05)
     dimmer = page.set(signal=0.2)
     assert (np.argmax(dimmer["mean"]["mean"]) + 0.5) * 100 / 128 == pytest.approx(60, abs=0.4)
-    told = preset(page, "The echo that is not there")
-    mean = np.array(told["mean"]["mean"])
+    answer = preset(page, "The echo that is not there")
+    mean = np.array(answer["mean"]["mean"])
     assert "35 in the bin at 71 ns, where the end of the period has 20" in page.tab.inner_text("#story")
     assert mean[int(71 * 1.28)] == pytest.approx(35, abs=0.5)
     assert mean[-1] == pytest.approx(19.5, abs=0.6)
     assert mean[int(35 * 1.28)] < 3
-    told = preset(page, "Two surfaces become one")
-    mean, time = np.array(told["mean"]["mean"]), (np.arange(128) + 0.5) * 100 / 128
+    answer = preset(page, "Two surfaces become one")
+    mean, time = np.array(answer["mean"]["mean"]), (np.arange(128) + 0.5) * 100 / 128
     assert "8000 photons some 35" in page.tab.inner_text("#story")
     assert mean[np.abs(time - 55) < 6].sum() == pytest.approx(35, abs=1)
-    told = preset(page, "A locked pixel counts like a clock")
-    assert told["mean"]["cumulants"][0] == pytest.approx(1000, abs=0.01)
-    assert told["mean"]["cumulants"][1] < 0.001
-    told = preset(page, "Dim light, honest errors")
-    error = told["estimate"]["likelihood"]["delayError"] * 100 * 0.299792458 / 2
+    answer = preset(page, "A locked pixel counts like a clock")
+    assert answer["mean"]["cumulants"][0] == pytest.approx(1000, abs=0.01)
+    assert answer["mean"]["cumulants"][1] < 0.001
+    answer = preset(page, "Dim light, honest errors")
+    error = answer["estimate"]["likelihood"]["delayError"] * 100 * 0.299792458 / 2
     assert 0.036 < error < 0.06  # of one draw: 4.0 to 5.3 cm in nine of ten, the bound is 4.5
-    assert told["state"]["signal"] * 2000 == 60
+    assert answer["state"]["signal"] * 2000 == 60
 
 
 @pytest.mark.parametrize("size", [(1400, 900), (1100, 900), (740, 360), (700, 450), (390, 844)], ids=str)

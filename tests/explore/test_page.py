@@ -27,8 +27,8 @@ def test_the_page_is_made_of_these_sources():
     listed = dict(reversed(line.split(maxsplit=1)) for line in INPUTS.read_text().splitlines())
     changed = [
         name
-        for name, told in listed.items()
-        if not (ROOT / name).is_file() or hashlib.sha256((ROOT / name).read_bytes()).hexdigest() != told
+        for name, digest in listed.items()
+        if not (ROOT / name).is_file() or hashlib.sha256((ROOT / name).read_bytes()).hexdigest() != digest
     ]
     assert not changed, f"the explorer's page is stale: run explorer/build and commit what it writes ({changed})"
     unlisted = {f"explorer/src/{path.name}" for path in SOURCES.iterdir()} - set(listed)
@@ -55,9 +55,9 @@ def golden_of_page() -> dict[str, str]:
 
 
 def test_the_page_expects_the_package_s_golden_bits():
-    told = golden_of_page()
-    assert len(told) == 8
-    assert told == {name: {**GOLDEN, **OF_MODES}[name] for name in told}
+    expected = golden_of_page()
+    assert len(expected) == 8
+    assert expected == {name: {**GOLDEN, **OF_MODES}[name] for name in expected}
 
 
 def test_golden_bits_in_node(tmp_path: Path):
@@ -77,5 +77,5 @@ def test_golden_bits_in_node(tmp_path: Path):
         console.log(JSON.stringify(await goldenBits(native)));
     """
     run = subprocess.run([node, "--input-type=module", "-e", script], capture_output=True, text=True, check=True)
-    found = {each["name"]: each["found"] for each in json.loads(run.stdout)}
-    assert found == golden_of_page()
+    results = {each["name"]: each["found"] for each in json.loads(run.stdout)}
+    assert results == golden_of_page()

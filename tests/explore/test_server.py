@@ -24,7 +24,7 @@ from explorer_page import Page, chromium
 import mars_lidar as ml
 from mars_lidar import explore, io
 from mars_lidar.explore import CubeServer, page_text
-from mars_lidar.explore.settings import settings_of
+from mars_lidar.explore.server import settings_of
 from mars_lidar.reconstruction import reconstruct
 from tests.harness.command import command_line
 

@@ -42,9 +42,11 @@ def _dataset(path: Path) -> Iterator[Any]:
 
 
 def _maps(path: Path) -> Iterator[Any]:
-    found, attrs = load_maps(path)
-    for one in (found, attrs):
-        yield from (part for name in sorted(one) if name not in (SEAL, "manifest") for part in (name, one[name]))
+    maps, attrs = load_maps(path)
+    for entries in (maps, attrs):
+        yield from (
+            part for name in sorted(entries) if name not in (SEAL, "manifest") for part in (name, entries[name])
+        )
 
 
 def _photons(path: Path) -> Iterator[Any]:
@@ -87,7 +89,7 @@ def flips(name: str, path: Path, number: int, seed: int) -> Iterator[tuple[str, 
     """(kind, whether verification of a store finds it, where), bit by bit; every file of a store has its turn first."""
     was = content(name, path)
     random = np.random.default_rng(seed)
-    every = [one for one in sorted(path.rglob("*")) if one.is_file()] if path.is_dir() else [path]
+    every = [inside for inside in sorted(path.rglob("*")) if inside.is_file()] if path.is_dir() else [path]
     for k in range(number):
         file = every[k] if k < len(every) else every[random.integers(len(every))]
         good = file.read_bytes()
@@ -118,12 +120,12 @@ if __name__ == "__main__":
     print("|---|" + "--:|" * 6)
     with tempfile.TemporaryDirectory() as folder:
         make(Path(folder))
-        for one in READERS:
-            rows = list(flips(one, Path(folder) / one, given.flips, given.seed))
+        for name in READERS:
+            rows = list(flips(name, Path(folder) / name, given.flips, given.seed))
             counts = collections.Counter(kind for kind, _, _ in rows)
-            found = sum(verified for _, verified, _ in rows)
-            store = (Path(folder) / one).is_dir()
-            cells = [len(rows), *(counts[kind] for kind in KINDS), found if store else ""]
-            print(f"| {one} | " + " | ".join(map(str, cells)) + " |", flush=True)
-            bad += counts["wrong"] + counts["unnamed"] + (len(rows) - found if store else 0)
+            detected = sum(verified for _, verified, _ in rows)
+            store = (Path(folder) / name).is_dir()
+            cells = [len(rows), *(counts[kind] for kind in KINDS), detected if store else ""]
+            print(f"| {name} | " + " | ".join(map(str, cells)) + " |", flush=True)
+            bad += counts["wrong"] + counts["unnamed"] + (len(rows) - detected if store else 0)
     raise SystemExit(1 if bad else 0)

@@ -56,7 +56,7 @@ def _stream(path: Path) -> None:
     ml.Timestamps.load(path, **given).histogram()
 
 
-def _elsewhere(path: Path) -> None:
+def _counts_of_another_file(path: Path) -> None:
     """Counts that lie in another file: never read. What is refused by its name is as it should be."""
     try:
         cube = foreign_cube(path, SYSTEM)
@@ -104,7 +104,7 @@ READERS: dict[str, Callable[[Path], Any]] = {
         ["sparse.mat", "packed.mat", "sparse73.mat", "sparse.npz", "cells.mat", "cells73.mat"],
         lambda path: foreign_cube(path, SYSTEM, variable="spad[2]" if path.name.startswith("cells") else None),
     ),
-    **dict.fromkeys(["external.h5", "virtual.h5", "linked.h5"], _elsewhere),
+    **dict.fromkeys(["external.h5", "virtual.h5", "linked.h5"], _counts_of_another_file),
     "four.mat": lambda path: foreign_cube(path, SYSTEM, variable="counts"),
     "window.mat": lambda path: foreign_cube(path, SYSTEM, unit_ns=1.0, window_ns=(200.0, 250.0)),
     "stream.csv": lambda path: ml.Timestamps.load(path, period_ns=100.0, unit_ns=1.0).histogram(),
@@ -132,11 +132,11 @@ def make(folder: Path) -> list[str]:
     times = ml.simulate_timestamps(flux, SYSTEM)
     for suffix in (".npz", ".h5", ".ptu"):
         times.save(folder / f"photons{suffix}")
-    one = np.sort(np.random.default_rng(1).random(300) * 5e4)
-    savemat(folder / "bare.mat", {"t_ns": one})
-    np.savez_compressed(folder / "bare.npz", t_ns=one)
+    stamps = np.sort(np.random.default_rng(1).random(300) * 5e4)
+    savemat(folder / "bare.mat", {"t_ns": stamps})
+    np.savez_compressed(folder / "bare.npz", t_ns=stamps)
     with h5py.File(folder / "bare73.mat", "w") as file:
-        file["a"], file["b"] = one[:100], one[100:]
+        file["a"], file["b"] = stamps[:100], stamps[100:]
         cells = file.create_dataset("t_ns", (2, 1), h5py.ref_dtype)
         cells[0, 0], cells[1, 0] = file["a"].ref, file["b"].ref
     light = np.random.default_rng(2).random((3, 4, 50))
@@ -221,22 +221,22 @@ def make(folder: Path) -> list[str]:
     for place in np.ndindex(times.shape):
         times[place] = np.sort(np.random.default_rng(6).random(30) * 300.0)
     savemat(folder / "window.mat", {"times": times})
-    np.savetxt(folder / "stream.csv", one[:100])
+    np.savetxt(folder / "stream.csv", stamps[:100])
     np.savetxt(folder / "pulse.csv", np.exp(-(np.linspace(-3, 3, 40) ** 2)))
     savemat(folder / "matlab.mat", {"depth": np.random.default_rng(3).random((6, 7)) + 1.0})
-    elsewhere = Path(tempfile.mkdtemp(prefix="fuzz"))
-    atexit.register(shutil.rmtree, elsewhere, True)
-    (elsewhere / "secret.bin").write_bytes(bytes([SECRET]) * 384)
-    with h5py.File(elsewhere / "secret.h5", "w") as file:
+    other_folder = Path(tempfile.mkdtemp(prefix="fuzz"))
+    atexit.register(shutil.rmtree, other_folder, True)
+    (other_folder / "secret.bin").write_bytes(bytes([SECRET]) * 384)
+    with h5py.File(other_folder / "secret.h5", "w") as file:
         file["counts"] = np.full((3, 4, 32), SECRET, np.uint8)
     with h5py.File(folder / "external.h5", "w") as file:
-        file.create_dataset("counts", (3, 4, 32), "u1", external=[(str(elsewhere / "secret.bin"), 0, 384)])
+        file.create_dataset("counts", (3, 4, 32), "u1", external=[(str(other_folder / "secret.bin"), 0, 384)])
     virtual = h5py.VirtualLayout((3, 4, 32), "u1")
-    virtual[:] = h5py.VirtualSource(elsewhere / "secret.h5", "counts", (3, 4, 32))
+    virtual[:] = h5py.VirtualSource(other_folder / "secret.h5", "counts", (3, 4, 32))
     with h5py.File(folder / "virtual.h5", "w") as file:
         file.create_virtual_dataset("counts", virtual)
     with h5py.File(folder / "linked.h5", "w") as file:
-        file["counts"] = h5py.ExternalLink(str(elsewhere / "secret.h5"), "/counts")
+        file["counts"] = h5py.ExternalLink(str(other_folder / "secret.h5"), "/counts")
     np.save(folder / "pulse.npy", np.exp(-(np.linspace(-3, 3, 40) ** 2)))
     try:
         import OpenEXR

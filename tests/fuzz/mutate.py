@@ -71,7 +71,7 @@ def apply(path: Path, edit: dict[str, Any]) -> None:
     """Change the file, or a file of the store, in place."""
     where = edit["where"]
     if path.is_dir():
-        store, files = path, sorted(one for one in path.rglob("*") if one.is_file())
+        store, files = path, sorted(file for file in path.rglob("*") if file.is_file())
         path = files[int(where[0] * len(files))]
         if edit["meaning"] and path.suffix == ".json":
             path.write_text(json.dumps(_other(json.loads(path.read_text()), edit)))
@@ -165,11 +165,11 @@ def _hdf5(path: Path, edit: dict[str, Any]) -> None:
 
     where = edit["where"]
     with h5py.File(path, "r+") as file:
-        found: list[str] = []
-        file.visit(found.append)
-        if not found:  # a link to another file alone
+        names: list[str] = []
+        file.visit(names.append)
+        if not names:  # a link to another file alone
             return
-        name = sorted(found)[int(where[0] * len(found))]
+        name = sorted(names)[int(where[0] * len(names))]
         attrs = file.attrs if where[5] < 0.3 else file[name].attrs
         keys = sorted(key for key in attrs if key not in ("CLASS", "NAME", "DIMENSION_LIST", "REFERENCE_LIST"))
         if where[6] < 0.4 and keys:
@@ -222,9 +222,9 @@ def _words(path: Path, edit: dict[str, Any]) -> None:
     """One word of a text replaced by another, or by an odd one."""
     text = path.read_text()
     words = list(re.finditer(r"[^\s,:\[\]{}=;]+", text))
-    one = words[int(edit["where"][0] * len(words))]
+    word = words[int(edit["where"][0] * len(words))]
     others = [edit["text"], words[int(edit["where"][1] * len(words))][0], "[" * 3000, "1" * 5000]
-    path.write_text(text[: one.start()] + others[int(edit["where"][2] ** 3 * 4)] + text[one.end() :])
+    path.write_text(text[: word.start()] + others[int(edit["where"][2] ** 3 * 4)] + text[word.end() :])
 
 
 def _reseal(store: Path) -> None:

@@ -42,9 +42,9 @@ def fuzz(
             for other in ("system.yaml", "depth.png"):
                 shutil.copy(good / other, inside / other)
         apply(inside / name, edit)
-        found = server.read(name, inside / name)
-        if name in LEAVES_OUT and found["kind"] == "refused":
-            found["kind"] = "foreign"  # one damaged file stopped a folder
-        tell(found, inside / name)
+        result = server.read(name, inside / name)
+        if name in LEAVES_OUT and result["kind"] == "refused":
+            result["kind"] = "foreign"  # one damaged file stopped a folder
+        tell(result, inside / name)
 
     once()

@@ -55,9 +55,9 @@ def _outcome(name: str, path: Path) -> dict[str, Any]:
             READERS[name](path)
         return {"kind": "read", "told": ""}
     except (ValueError, OSError, MemoryError) as error:
-        told = str(error)
-        kind = "refused" if str(path) in told or str(path.parent) in told else "unnamed"
-        return {"kind": kind, "told": f"{type(error).__name__}: {told}"}
+        message = str(error)
+        kind = "refused" if str(path) in message or str(path.parent) in message else "unnamed"
+        return {"kind": kind, "told": f"{type(error).__name__}: {message}"}
     except Exception as error:
         kind = "refused" if isinstance(error, TypeError) and str(path) in str(error) else "foreign"
         return {"kind": kind, "told": f"{type(error).__name__}: {error}"}

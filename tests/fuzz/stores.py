@@ -65,7 +65,9 @@ def opened(reader: str, store: Path) -> Callable[[], Iterator[Any]]:
         examples = StoredDataset(store, shuffle=False)
 
         def epoch() -> Iterator[Any]:
-            yield from (value for one in examples for value in (one["counts"].numpy(), one["depth"].numpy()))
+            yield from (
+                value for example in examples for value in (example["counts"].numpy(), example["depth"].numpy())
+            )
 
         return epoch
 
@@ -128,13 +130,13 @@ def attacks(folder: Path, number: int, seed: int) -> Iterator[tuple[str, str, st
         kind = ATTACKS[int(random.integers(len(ATTACKS)))]
         if not after and kind == "replace_store":
             kind = "swap"  # a whole store is another store
-        told, outcome = "", "same"
+        note, outcome = "", "same"
         try:
             read = opened(reader, store) if after else None
-            told = attack(kind, store, other, random)
-            found = [np.array(part) for part in (read or opened(reader, store))()]
-            same = len(found) == len(good) and all(
-                np.array_equal(a, b, equal_nan=True) for a, b in zip(found, good, strict=True)
+            note = attack(kind, store, other, random)
+            results = [np.array(part) for part in (read or opened(reader, store))()]
+            same = len(results) == len(good) and all(
+                np.array_equal(a, b, equal_nan=True) for a, b in zip(results, good, strict=True)
             )
             outcome, error = "same" if same else "wrong", ""
         except (FileError, FileNotFoundError) as refusal:
@@ -142,7 +144,7 @@ def attacks(folder: Path, number: int, seed: int) -> Iterator[tuple[str, str, st
             outcome = "refused" if str(store) in error else "unnamed"
         except Exception as foreign:
             outcome, error = "unnamed", f"{type(foreign).__name__}: {foreign}"
-        yield reader, f"{'after' if after else 'before'} opening: {told or kind}", outcome, error
+        yield reader, f"{'after' if after else 'before'} opening: {note or kind}", outcome, error
 
 
 if __name__ == "__main__":

@@ -41,9 +41,9 @@ def test_mutated_files_are_refused_by_name(tmp_path, good, server, name):
         pytest.skip("its library is missing")
     assert server.read(name, folder / name)["kind"] == "read"
     outcomes = []
-    fuzz(name, folder, tmp_path, server, EXAMPLES, 20261122, lambda found, _: outcomes.append(found))
+    fuzz(name, folder, tmp_path, server, EXAMPLES, 20261122, lambda result, _: outcomes.append(result))
     assert len(outcomes) >= EXAMPLES // 2
-    assert not [one for one in outcomes if one["kind"] in BAD]
+    assert not [outcome for outcome in outcomes if outcome["kind"] in BAD]
 
 
 @pytest.mark.full

@@ -99,9 +99,9 @@ def case(
         detector=Detector(**detector),
     )
     flux = waveform_flux(WAVE, background) if signal is WAVE else flux_of(signal, background, delay)
-    shown = "waveform" if signal is WAVE else f"S {signal}"
-    told = [f"{k} {v}" if isinstance(v, int | float | str) else k for k, v in sorted(detector.items())]
-    name = f"{shown}, B {background}, {start}, {', '.join(told)}"
+    light = "waveform" if signal is WAVE else f"S {signal}"
+    effects = [f"{k} {v}" if isinstance(v, int | float | str) else k for k, v in sorted(detector.items())]
+    name = f"{light}, B {background}, {start}, {', '.join(effects)}"
     return Case(name, flux, system, items or (4000 if start == "armed" else 1600))
 
 

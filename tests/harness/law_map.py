@@ -160,7 +160,7 @@ def laws(drawn: Drawn) -> dict[str, Callable[[Values], Values]]:
     def window(_: Values) -> Values:
         return {"joint variance": held["joint"].count_variance}
 
-    found = {
+    results = {
         "count_law": count,
         "pmf": pmf,
         "exposure": shape("exposure"),
@@ -168,8 +168,8 @@ def laws(drawn: Drawn) -> dict[str, Callable[[Values], Values]]:
         "mean_histogram": histogram,
     }
     if drawn.mode == "nonparalyzable" and drawn.electronics == 0.0:
-        found |= {"joint_law": joint, "window": window}
-    return found
+        results |= {"joint_law": joint, "window": window}
+    return results
 
 
 def _worker(pipe: Connection) -> None:
@@ -191,19 +191,19 @@ def _worker(pipe: Connection) -> None:
 
 def disagreements(drawn: Drawn, values: Values) -> list[str]:
     """What does not agree, in words."""
-    found = []
+    results = []
 
     def compare(a: str, expected: float, scale: float, allowed: float = SMALL) -> None:
         if a in values and not abs(values[a] - expected) <= allowed * scale + TINY:
-            found.append(f"{a} {values[a]:.9g} for {expected:.9g}")
+            results.append(f"{a} {values[a]:.9g} for {expected:.9g}")
 
     for name in values:
         if not math.isfinite(values[name]):
-            found.append(f"{name} {values[name]}")
+            results.append(f"{name} {values[name]}")
         if name.endswith("sum"):
             compare(name, 1.0, 1.0, 1e-4)
         if name.endswith("least") and values[name] < 0.0:
-            found.append(f"{name} {values[name]:.3g}")
+            results.append(f"{name} {values[name]:.3g}")
     if "mean" in values:
         mean, variance = values["mean"], values["variance"]
         spread = max(math.sqrt(max(variance, 0.0)), 1e-6 * mean, 1e-300)
@@ -225,7 +225,7 @@ def disagreements(drawn: Drawn, values: Values) -> list[str]:
                 compare("variance", known, max(known, 1e-9))
         if plain and drawn.start == "armed" and drawn.dead >= drawn.cycles:
             compare("mean", -math.expm1(-(drawn.signal + drawn.background) * drawn.cycles), scale)
-    return found
+    return results
 
 
 class _Workers:
@@ -252,10 +252,10 @@ class _Workers:
                 times[missing[0]] = (KILLED_S, "killed")
                 self.start()
                 return times, values
-            told = self.pipe.recv()
-            if told is None:
+            message = self.pipe.recv()
+            if message is None:
                 return times, values
-            name, seconds, error, some = told
+            name, seconds, error, some = message
             times[name] = (seconds, error)
             values |= some
 
@@ -275,17 +275,17 @@ def main() -> None:
         drawn = draw(seed)
         times, values = workers.run(drawn)
         bad = disagreements(drawn, values)
-        told = []
+        differences = []
         for name, (seconds, error) in times.items():
             if seconds > LIMIT_S:
                 slow[name] += 1
-                told.append(f"{name} {seconds:.1f} s")
+                differences.append(f"{name} {seconds:.1f} s")
             if error:
                 refused[f"{name} {error.split(':')[0]}"] += 1
-                told.append(f"{name}: {error}")
+                differences.append(f"{name}: {error}")
         wrong += bool(bad)
-        if told or bad:
-            print(f"{drawn}\n    " + "\n    ".join([*told, *(f"WRONG {b}" for b in bad)]), flush=True)
+        if differences or bad:
+            print(f"{drawn}\n    " + "\n    ".join([*differences, *(f"WRONG {b}" for b in bad)]), flush=True)
         lines.append(json.dumps(vars(drawn) | {"times": times, "values": values, "wrong": bad}))
     if asked.o:
         asked.o.write_text("\n".join(lines) + "\n")

@@ -24,8 +24,8 @@ class Law:
 
 def armed_survival(n: NDArray[np.int64], rate: float, dead: float, exposure: float) -> Floats:
     """P(N >= n) = P(Gamma(n, 1 / rate) <= t - (n - 1) t_d) at a constant rate, armed at the start."""
-    left = np.maximum(exposure - (n - 1) * dead, 0.0)
-    return np.where(n == 0, 1.0, special.gammainc(np.maximum(n, 1), rate * left))
+    remaining = np.maximum(exposure - (n - 1) * dead, 0.0)
+    return np.where(n == 0, 1.0, special.gammainc(np.maximum(n, 1), rate * remaining))
 
 
 def armed_count_pmf(rate: float, dead: float, exposure: float, most: int) -> Floats:

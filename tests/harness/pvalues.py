@@ -169,6 +169,6 @@ def _hotelling(difference: Floats, covariance: Floats, freedom: int) -> float:
         return 0.0
     p = int(alive.sum())
     statistic = float(np.sum(along[alive] ** 2 / value[alive]))
-    left = freedom - p + 1
-    assert left > 0, f"{freedom} degrees of freedom are too few for {p} components"
-    return float(stats.f.sf(statistic * left / (freedom * p), p, left))
+    denominator = freedom - p + 1
+    assert denominator > 0, f"{freedom} degrees of freedom are too few for {p} components"
+    return float(stats.f.sf(statistic * denominator / (freedom * p), p, denominator))

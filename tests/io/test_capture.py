@@ -79,7 +79,7 @@ def write(path: Path, layout: str) -> tuple[Path, np.ndarray]:
                 wanted = "cTbyx" if "rows" in layout else "xybTc"
             else:
                 wanted = "cTbyxYX" if "rows" in layout else "YXyxbTc"
-            file["data"] = parts.transpose([letters.index(one) for one in wanted])
+            file["data"] = parts.transpose([letters.index(letter) for letter in wanted])
             for name, points in (("camera", sensor), ("laser", laser)):
                 file[f"{name}GridPositions"] = points
                 file[f"{name}GridNormals"] = np.zeros_like(points)
@@ -170,16 +170,16 @@ def test_the_command_and_a_reconstruction(tmp_path, kind):
     """`simulate --like`: photons through a SPAD, in the bins of the render; the hidden point is where it was."""
     render, _ = write(tmp_path / "render.hdf5", f"tal {kind}")
     out = tmp_path / "capture.hdf5"
-    told = command_line(["simulate", "--like", str(render), *OPTIONS, "-o", str(out), "--no-picture"])
-    assert told.exit_code == 0, told.output
-    assert sorted(one.name for one in tmp_path.iterdir()) == ["capture.hdf5", "render.hdf5"]
+    printed = command_line(["simulate", "--like", str(render), *OPTIONS, "-o", str(out), "--no-picture"])
+    assert printed.exit_code == 0, printed.output
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["capture.hdf5", "render.hdf5"]
     axes = [np.linspace(-0.4, 0.4, 9), np.linspace(-0.4, 0.4, 9), np.linspace(0.4, 1.0, 7)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     best = points[int(np.argmax(backprojected(out, points)))]
     assert np.abs(best - HIDDEN).max() < 0.01
     cube = tmp_path / "cube.zarr"  # any other suffix is a cube with those bins
-    told = command_line(["simulate", "--like", str(render), *OPTIONS, "-o", str(cube), "--no-picture"])
-    assert told.exit_code == 0, told.output
+    printed = command_line(["simulate", "--like", str(render), *OPTIONS, "-o", str(cube), "--no-picture"])
+    assert printed.exit_code == 0, printed.output
     counts = io.load(cube).histogram[0]
     assert np.array_equal(io.read_transient(out).rows(slice(0, None)), counts)
 
@@ -193,9 +193,9 @@ def test_what_does_not_fit_is_refused(tmp_path):
         (["--period-ns", "5"], "must be a whole number of bins"),
         (["--realizations", "2"], "holds one exposure"),
     ):
-        told = command_line(["simulate", "--like", str(render), *options, "-o", out])
-        assert told.exit_code == 2, told.output
-        assert words in told.output
+        printed = command_line(["simulate", "--like", str(render), *options, "-o", out])
+        assert printed.exit_code == 2, printed.output
+        assert words in printed.output
     other = tmp_path / "other.hdf5"
     with h5py.File(other, "w") as file:
         file["values"] = np.ones((2, 3, 4))
@@ -244,8 +244,8 @@ print(int(data.H.sum()), *points[np.unravel_index(found.argmax(), found.shape)])
 def test_tal_reconstructs_what_is_written(tmp_path, layout):
     render, _ = write(tmp_path / "render.hdf5", layout)
     out = tmp_path / "capture.hdf5"
-    told = command_line(["simulate", "--like", str(render), *OPTIONS, "--no-picture", "-o", str(out)])
-    assert told.exit_code == 0, told.output
+    printed = command_line(["simulate", "--like", str(render), *OPTIONS, "--no-picture", "-o", str(out)])
+    assert printed.exit_code == 0, printed.output
     done = subprocess.run(
         [str(TAL), "-c", BY_TAL, str(out), layout.split()[0]], capture_output=True, text=True, check=False
     )

@@ -85,14 +85,14 @@ def test_the_photons_of_a_cube_are_its_counts(tmp_path):
 def test_what_cannot_be_converted_is_refused(tmp_path):
     io.simulate_to(tmp_path / "cube.npz", one_return(), SYSTEM)
     ml.simulate_timestamps(one_return(), SYSTEM).save(tmp_path / "photons.npz")
-    for source, target, told in (
+    for source, target, message in (
         ("cube.npz", "cube.csv", r"target must end in one of .*\.zarr, got .*cube\.csv"),
         ("cube.txt", "cube.h5", r"source must end in one of"),
         ("nothing.h5", "cube.h5", "does not exist"),
         ("photons.npz", "cube.zarr", r"is a photon stream, which goes into one of \.npz, \.ptu, \.h5"),
         ("cube.npz", "cube.npz", "target must not be the source"),
     ):
-        with pytest.raises((ValueError, OSError), match=told):
+        with pytest.raises((ValueError, OSError), match=message):
             io.convert(tmp_path / source, tmp_path / target)
     with pytest.raises(ValueError, match="realization is for cubes"):
         io.convert(tmp_path / "photons.npz", tmp_path / "a.npz", realization=0)
@@ -117,7 +117,7 @@ def test_the_commands(tmp_path):
     assert (done.exit_code, "photons of 6 × 5 pixels" in done.output) == (0, True)
     expected = ml.simulate(one_return(), SYSTEM, realizations=2)[1]
     assert np.array_equal(ml.Timestamps.load(tmp_path / "photons.npz").histogram(), expected)
-    for arguments, told in (
+    for arguments, message in (
         (("convert", tmp_path / "set.zarr", tmp_path / "a.mat"), "a .mat holds one exposure"),
         (("timestamps", tmp_path / "set.zarr", "-o", tmp_path / "photons.npz"), "exists already"),
         (("timestamps", tmp_path / "set.zarr", "-o", tmp_path / "a.zarr"), "must end in one of .npz"),
@@ -125,4 +125,4 @@ def test_the_commands(tmp_path):
     ):
         done = run(*arguments)
         assert done.exit_code == 2
-        assert told in done.output
+        assert message in done.output

@@ -79,8 +79,8 @@ def test_mat_has_the_keys_shapes_and_types_of_the_field(tmp_path):
     flux, path = one_return(), tmp_path / "cube.mat"
     io.simulate_to(path, flux, SYSTEM, seed=3)
     counts = ml.simulate(flux, SYSTEM, seed=3)[0]
-    found = scipy.io.loadmat(path)
-    assert {k for k in found if not k.startswith("__")} == {
+    contents = scipy.io.loadmat(path)
+    assert {k for k in contents if not k.startswith("__")} == {
         "spad",
         "rates",
         "bin",
@@ -90,24 +90,24 @@ def test_mat_has_the_keys_shapes_and_types_of_the_field(tmp_path):
         "mars_lidar",
     }
     # the load of the networks: dense, (W, H, T), then turned
-    spad = np.asarray(scipy.sparse.csc_matrix.todense(found["spad"])).reshape([1, 5, 6, -1])
+    spad = np.asarray(scipy.sparse.csc_matrix.todense(contents["spad"])).reshape([1, 5, 6, -1])
     assert np.array_equal(np.transpose(spad, (0, 3, 2, 1))[0], counts.transpose(2, 0, 1))
-    assert found["spad"].dtype == np.float64
-    assert (found["bin"].shape, found["bin"].dtype) == ((6, 5), np.uint16)
-    assert (found["bin_hr"].shape, found["bin_hr"].dtype) == ((48, 40), np.float64)
-    assert (found["rates"].shape, found["rates"].dtype) == ((6, 5, 64), np.float64)
+    assert contents["spad"].dtype == np.float64
+    assert (contents["bin"].shape, contents["bin"].dtype) == ((6, 5), np.uint16)
+    assert (contents["bin_hr"].shape, contents["bin_hr"].dtype) == ((48, 40), np.float64)
+    assert (contents["rates"].shape, contents["rates"].dtype) == ((6, 5, 64), np.float64)
     assert {name: kind for name, _, kind in scipy.io.whosmat(path)}["bin"] == "double"  # as in MATLAB
     valid = flux.signal > 0
     # a return is in the bin that its delay falls into, from 1; this pulse's largest bin is there or beside it
-    assert np.array_equal(found["bin"][valid], np.floor(flux.delay_ns[valid] / SYSTEM.bin_ns) + 1)
-    assert (np.abs(found["rates"].argmax(-1) + 1 - found["bin"])[valid] <= 0).all()
-    assert np.array_equal(found["rates"].max(-1), valid.astype(float))
-    assert found["bin"][~valid].tolist() == [0]
-    fine = found["bin_hr"][::8, ::8]
+    assert np.array_equal(contents["bin"][valid], np.floor(flux.delay_ns[valid] / SYSTEM.bin_ns) + 1)
+    assert (np.abs(contents["rates"].argmax(-1) + 1 - contents["bin"])[valid] <= 0).all()
+    assert np.array_equal(contents["rates"].max(-1), valid.astype(float))
+    assert contents["bin"][~valid].tolist() == [0]
+    fine = contents["bin_hr"][::8, ::8]
     assert np.isnan(fine[~valid]).all()
-    assert np.array_equal(np.floor(fine[valid] + 0.5), found["bin"][valid])
-    assert found["SBR"].item() == pytest.approx(flux.signal.mean() / flux.background.mean(), rel=1e-15)
-    assert found["photons"].item() == pytest.approx(60 * flux.signal.mean(), rel=1e-15)
+    assert np.array_equal(np.floor(fine[valid] + 0.5), contents["bin"][valid])
+    assert contents["SBR"].item() == pytest.approx(flux.signal.mean() / flux.background.mean(), rel=1e-15)
+    assert contents["photons"].item() == pytest.approx(60 * flux.signal.mean(), rel=1e-15)
 
 
 def test_a_mat_tells_the_light_that_the_pixel_detects(tmp_path):
@@ -116,9 +116,9 @@ def test_a_mat_tells_the_light_that_the_pixel_detects(tmp_path):
     system = SYSTEM.replace(detector=detector)
     flux = ml.Flux(np.full((2, 3), 2.0), 0.5, 20.0)
     io.simulate_to(tmp_path / "a.mat", flux, system)
-    found = scipy.io.loadmat(tmp_path / "a.mat")
-    assert found["photons"].item() == pytest.approx(system.cycles * 0.5, rel=1e-12)
-    assert found["SBR"].item() == pytest.approx(0.5 / (0.125 + 1e-3 * system.period_ns), rel=1e-12)
+    contents = scipy.io.loadmat(tmp_path / "a.mat")
+    assert contents["photons"].item() == pytest.approx(system.cycles * 0.5, rel=1e-12)
+    assert contents["SBR"].item() == pytest.approx(0.5 / (0.125 + 1e-3 * system.period_ns), rel=1e-12)
 
 
 @pytest.mark.parametrize("make", [several_returns, waveform])

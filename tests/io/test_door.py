@@ -65,20 +65,20 @@ def test_pipes_and_devices_are_refused_at_once(tmp_path, name):
     (tmp_path / "zero").mkdir()
     (tmp_path / "zero" / name).symlink_to("/dev/zero")
     for path in (tmp_path / name, tmp_path / "zero" / name):
-        told: list[BaseException] = []
+        errors: list[BaseException] = []
 
-        def read(path=path, told=told) -> None:
+        def read(path=path, errors=errors) -> None:
             try:
                 READERS[name](path)
             except Exception as error:
-                told.append(error)
+                errors.append(error)
 
         thread = threading.Thread(target=read, daemon=True)
         thread.start()
         thread.join(20)
         assert not thread.is_alive(), f"{path} was read without an end"
-        assert isinstance(told[0], ValueError)
-        assert name in str(told[0])
+        assert isinstance(errors[0], ValueError)
+        assert name in str(errors[0])
 
 
 def test_claims_are_checked_before_memory_is_asked_for(tmp_path, monkeypatch):
@@ -201,15 +201,15 @@ def folder(tmp_path):
 
 
 def test_damaged_files_in_a_folder_are_left_out_with_their_reason(tmp_path, folder):
-    found, problems = io.scan(folder)
-    assert [one.depth.name for one in found] == ["good.npz"]
-    names = sorted(one.name for one in folder.iterdir() if one.name != "good.npz")
-    assert sorted({one.path.name for one in problems}) == names
-    assert all(str(one).startswith(str(one.path)) and len(one.reason) > 20 for one in problems)
+    scenes, problems = io.scan(folder)
+    assert [scene.depth.name for scene in scenes] == ["good.npz"]
+    names = sorted(damaged.name for damaged in folder.iterdir() if damaged.name != "good.npz")
+    assert sorted({problem.path.name for problem in problems}) == names
+    assert all(str(problem).startswith(str(problem.path)) and len(problem.reason) > 20 for problem in problems)
     recipe = {"scenes": {"path": str(folder)}, "systems": [SYSTEM], "light": {"signal": [1.0]}}
     done = ml.generate(recipe, tmp_path / "s.zarr")
     assert done.shape[0] == 1
-    assert sorted({one.path.name for one in done.problems}) == names
+    assert sorted({problem.path.name for problem in done.problems}) == names
 
 
 def test_heaps_and_markers_over_which_libraries_do_not_end_are_refused(tmp_path):

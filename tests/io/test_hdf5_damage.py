@@ -23,8 +23,8 @@ SYSTEM = ml.System(
 def files(tmp_path) -> dict[str, Path]:
     flux = ml.Flux(np.linspace(0.1, 1.0, 24).reshape(4, 6), 0.1, 40.0)
     io.simulate_to(tmp_path / "cube.h5", flux, SYSTEM)
-    found = ml.reconstruct(np.asarray(io.load(tmp_path / "cube.h5").histogram), SYSTEM, "peak")
-    save_maps(tmp_path / "maps.h5", {"peak": found})
+    estimate = ml.reconstruct(np.asarray(io.load(tmp_path / "cube.h5").histogram), SYSTEM, "peak")
+    save_maps(tmp_path / "maps.h5", {"peak": estimate})
     ml.Table.build(SYSTEM, signal=(0.1, 1, 2), background=(0.1, 1, 2)).save(tmp_path / "table.h5")
     return {path.name: path for path in tmp_path.glob("*.h5")}
 
@@ -56,13 +56,13 @@ def test_a_changed_number_is_refused(files):
     with h5py.File(files["cube.h5"]) as file:
         place = file["histogram"].id.get_chunk_info(0)
         depth = file["signal"].id.get_chunk_info(0)
-    for found, read in ((place, lambda cube: cube.histogram[0]), (depth, lambda cube: cube.flux.signal)):
+    for damaged, read in ((place, lambda cube: cube.histogram[0]), (depth, lambda cube: cube.flux.signal)):
         content = bytearray(files["cube.h5"].read_bytes())
-        content[found.byte_offset + found.size // 2] ^= 4
+        content[damaged.byte_offset + damaged.size // 2] ^= 4
         files["cube.h5"].write_bytes(content)
         with pytest.raises(FileError, match=r"cube\.h5"):
             read(io.load(files["cube.h5"]))
-        content[found.byte_offset + found.size // 2] ^= 4
+        content[damaged.byte_offset + damaged.size // 2] ^= 4
         files["cube.h5"].write_bytes(content)
     with io.load(files["cube.h5"]) as cube:
         assert cube.histogram[0].sum() == cube.registrations

@@ -53,15 +53,15 @@ def test_whole_files_pass(packed: bool, tmp_path: Path):
 def test_what_was_checked_is_what_is_read(packed: bool, tmp_path: Path):
     """A file that is replaced between the check and the reading ended the process; a cut one still names itself."""
     path = written(tmp_path / "a.mat", packed=packed)
-    found = {each.name: each for each in variables(path)}
-    content = found["a"].element()
+    results = {each.name: each for each in variables(path)}
+    content = results["a"].element()
     damaged = bytearray(path.read_bytes())
     damaged[136 + 60 :] = bytes(len(damaged) - 196)
     path.write_bytes(damaged)
     assert (loadmat(BytesIO(content))["a"] == CONTENT["a"]).all()
     if packed:
         with pytest.raises((ValueError, zlib.error)):
-            found["cells"].element()
+            results["cells"].element()
 
 
 def test_a_packed_variable_with_a_wrong_checksum_is_refused(tmp_path: Path):

@@ -140,14 +140,14 @@ def test_a_window_of_the_period_is_a_gate(counts: np.ndarray) -> None:
             dead_time_ns=30.0, mode="gated", gate_start_ns=start * SYSTEM.bin_ns, gate_width_ns=bins * SYSTEM.bin_ns
         )
     )
-    seen = ml.simulate(FLUX, gated, seed=4)[0, ..., start : start + bins]
-    cube = io.from_histograms(seen, SYSTEM, start_ns=start * SYSTEM.bin_ns)
+    observed = ml.simulate(FLUX, gated, seed=4)[0, ..., start : start + bins]
+    cube = io.from_histograms(observed, SYSTEM, start_ns=start * SYSTEM.bin_ns)
     assert cube.system.to_json() == gated.to_json()
-    found = ml.reconstruct(cube.histogram[0], cube.system)
-    assert found.delay_error_ns is not None
-    assert found.signal_error is not None
-    assert (np.abs(found.delay_ns - DELAY) < 5 * found.delay_error_ns).all()
-    assert (np.abs(found.signal - FLUX.signal) < 5 * found.signal_error).all()
+    estimate = ml.reconstruct(cube.histogram[0], cube.system)
+    assert estimate.delay_error_ns is not None
+    assert estimate.signal_error is not None
+    assert (np.abs(estimate.delay_ns - DELAY) < 5 * estimate.delay_error_ns).all()
+    assert (np.abs(estimate.signal - FLUX.signal) < 5 * estimate.signal_error).all()
 
 
 def test_photon_times_of_a_clock_and_of_a_gate(counts: np.ndarray) -> None:
@@ -158,8 +158,8 @@ def test_photon_times_of_a_clock_and_of_a_gate(counts: np.ndarray) -> None:
     with pytest.warns(UserWarning, match=r"start_ns=2.1 is added .*--window-ns"):  # the gate crosses the period's end
         cube = io.from_photon_times(later, SYSTEM, start_ns=2.1)
     np.testing.assert_array_equal(np.asarray(cube.histogram)[0], np.roll(counts, 10, axis=-1))
-    one = io.from_photon_times(np.repeat(SYSTEM.time_ns, counts[0, 0]), SYSTEM)
-    np.testing.assert_array_equal(np.asarray(one.histogram)[0, 0, 0], counts[0, 0])
+    single = io.from_photon_times(np.repeat(SYSTEM.time_ns, counts[0, 0]), SYSTEM)
+    np.testing.assert_array_equal(np.asarray(single.histogram)[0, 0, 0], counts[0, 0])
 
 
 def test_exposures_and_brackets(counts: np.ndarray) -> None:
@@ -176,8 +176,8 @@ def test_the_law_is_drawn_on_measured_counts(counts: np.ndarray) -> None:
     cube = io.from_histograms(counts, SYSTEM)
     with pytest.raises(ValueError, match="measured, not simulated"):
         _ = cube.flux
-    shown = fitted(cube, 0)
-    assert np.abs(shown.flux.delay_ns - DELAY).max() < 0.2
+    curves = fitted(cube, 0)
+    assert np.abs(curves.flux.delay_ns - DELAY).max() < 0.2
     figure = ml.plot.overview(cube, pixels=[(1, 1)])
     assert "measured" in figure.texts[0].get_text()
     legends = [axes.get_legend() for axes in figure.axes if axes.get_legend() is not None]
@@ -185,7 +185,7 @@ def test_the_law_is_drawn_on_measured_counts(counts: np.ndarray) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "message"),
     [
         ({"counts": np.full((2, 2, 250), 0.5)}, "whole numbers"),
         ({"counts": np.full((2, 2, 250), -1)}, "at least 0"),
@@ -204,9 +204,9 @@ def test_the_law_is_drawn_on_measured_counts(counts: np.ndarray) -> None:
         ({"start_ns": np.inf}, "start_ns"),
     ],
 )
-def test_what_is_no_cube_is_refused(change: dict[str, object], told: str) -> None:
+def test_what_is_no_cube_is_refused(change: dict[str, object], message: str) -> None:
     arguments: dict[str, object] = {"counts": np.zeros((2, 2, 250), int), "system": SYSTEM} | change
-    with pytest.raises((ValueError, TypeError), match=told):
+    with pytest.raises((ValueError, TypeError), match=message):
         io.from_histograms(**arguments)  # type: ignore[arg-type]
 
 

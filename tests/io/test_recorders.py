@@ -91,9 +91,9 @@ def check_photons(times: ml.Timestamps, first: int, fine_ns: float) -> None:
     for k in range(3):
         if not (channel == k).any():
             continue
-        one = times.pixel(0, k + first)
-        assert np.array_equal(one.cycle, cycle[channel == k])
-        assert np.allclose(one.times_ns % PERIOD_NS, (fine[channel == k] + 0.5) * fine_ns, atol=1e-6)
+        of_pixel = times.pixel(0, k + first)
+        assert np.array_equal(of_pixel.cycle, cycle[channel == k])
+        assert np.allclose(of_pixel.times_ns % PERIOD_NS, (fine[channel == k] + 0.5) * fine_ns, atol=1e-6)
 
 
 def test_pt3(tmp_path):
@@ -101,9 +101,9 @@ def test_pt3(tmp_path):
     reader = pytest.importorskip("phconvert.pqreader", reason="phconvert (extra io) is not installed")
     pytest.importorskip("numba", reason="phconvert without numba wants two overflows")
     cycle, detector, fine, _, _ = reader.load_pt3(str(tmp_path / "a.pt3"))  # another reader finds the same
-    kept = detector != 15
-    assert np.array_equal(cycle[kept], parts(0.016)[0])
-    assert np.array_equal(fine[kept], parts(0.016)[1])
+    selected = detector != 15
+    assert np.array_equal(cycle[selected], parts(0.016)[0])
+    assert np.array_equal(fine[selected], parts(0.016)[1])
 
 
 @pytest.mark.parametrize("version", [b"1.0", b"2.0"])
@@ -136,9 +136,11 @@ def test_absolute_times(tmp_path, suffix, unit_ns):
     times = ml.Timestamps.load(path, bins=1000)
     assert times.period_ns == pytest.approx(PERIOD_NS, rel=1e-7)
     for k in (0, 2):
-        one = times.pixel(0, k + (suffix == ".pt2"))
-        assert np.array_equal(one.cycle, cycle[channel == k])
-        assert np.allclose(one.times_ns - one.cycle * times.period_ns, fine[channel == k] * 0.016, atol=2 * unit_ns)
+        of_pixel = times.pixel(0, k + (suffix == ".pt2"))
+        assert np.array_equal(of_pixel.cycle, cycle[channel == k])
+        assert np.allclose(
+            of_pixel.times_ns - of_pixel.cycle * times.period_ns, fine[channel == k] * 0.016, atol=2 * unit_ns
+        )
     bare = files.recorded(path)
     assert bare.fine is None
     assert bare.clock_ns == pytest.approx(unit_ns)
@@ -163,10 +165,10 @@ def test_t3r_has_histograms_but_no_periods(tmp_path, version):
     tags = [100, 0, 0, 0, 0, 0, 0, 20_000_000, 0, 0, 0, records.size, 3]
     path = tmp_path / "a.t3r"
     path.write_bytes(header + struct.pack("<13i", *tags) + bytes(12) + records.astype("<u4").tobytes())
-    found = files.recorded(path)
-    assert (found.clock_ns, found.period_ns) == (pytest.approx(100.0), None)
-    assert np.array_equal(found.clock, clock)
-    assert np.array_equal(found.detector, channel)
+    result = files.recorded(path)
+    assert (result.clock_ns, result.period_ns) == (pytest.approx(100.0), None)
+    assert np.array_equal(result.clock, clock)
+    assert np.array_equal(result.detector, channel)
     histograms = recorded(path).arrays
     for k in (0, 2):
         counts = np.bincount(fine[channel == k], minlength=fine.max() + 1)
@@ -242,9 +244,9 @@ def test_sdt(tmp_path):
     block = struct.pack("<BBIIHhII", 0, 0, data + 22, 0, 0x11, 0, 0, counts.nbytes)
     path = tmp_path / "a.sdt"
     path.write_bytes(header + info + setup + measured + block + counts.tobytes())
-    found = recorded(path)
-    assert found.bin_ns == pytest.approx(50.0 / 2 / 256)
-    assert np.array_equal(found.arrays["block 0"], counts)
+    result = recorded(path)
+    assert result.bin_ns == pytest.approx(50.0 / 2 / 256)
+    assert np.array_equal(result.arrays["block 0"], counts)
     system = ml.System(
         period_ns=25.0,
         cycles=1000,
@@ -270,11 +272,11 @@ def scanned(tmp_path: Path) -> tuple[Path, np.ndarray]:
 
 def test_scanned_image(tmp_path):
     path, counts = scanned(tmp_path)
-    found = recorded(path)
-    assert (found.bin_ns, found.period_ns, found.cycles) == (pytest.approx(0.5), pytest.approx(50.0), 500)
-    assert found.notes == ()
+    result = recorded(path)
+    assert (result.bin_ns, result.period_ns, result.cycles) == (pytest.approx(0.5), pytest.approx(50.0), 500)
+    assert result.notes == ()
     for k in range(2):
-        assert np.array_equal(found.arrays[f"channel {k}"], counts[:, :, :, k])
+        assert np.array_equal(result.arrays[f"channel {k}"], counts[:, :, :, k])
     system = SYSTEM.replace(bins=100, cycles=500, detector=ml.Detector(dead_time_ns=0.0))
     with pytest.raises(ValueError, match="several arrays, give variable: channel 0"):
         io.foreign_cube(path, system)
@@ -302,30 +304,30 @@ def test_a_laser_scanning_pt3(tmp_path):
     header = pico_header(3, words.size, (3, 3, 1, 2, 3, 0, columns, rows))
     path = tmp_path / "scan.pt3"
     path.write_bytes(header + words.astype("<u4").tobytes())
-    found = recorded(path)
-    assert found.cycles == dwell
-    (name,) = found.arrays
+    result = recorded(path)
+    assert result.cycles == dwell
+    (name,) = result.arrays
     assert name == "channel 0"
-    assert np.array_equal(found.arrays[name], image)
+    assert np.array_equal(result.arrays[name], image)
 
 
 def test_commands_take_them(tmp_path):
     """`info` lists channels, `calibrate` takes a channel, `reconstruct` and `convert` the histograms."""
     path = pt3(tmp_path / "a.pt3")
-    told = command_line(["info", str(path)])
-    assert told.exit_code == 0, told.output
+    printed = command_line(["info", str(path)])
+    assert printed.exit_code == 0, printed.output
     channel = parts(0.016)[2]
-    assert f"0: {int((channel == 0).sum()):,} photons" in told.output
-    assert f"2: {int((channel == 2).sum()):,} photons" in told.output
-    told = command_line(["calibrate", str(path), "--pixel", "0,2", "--look"])
-    assert told.exit_code == 0, told.output
-    assert "rate" in told.output
+    assert f"0: {int((channel == 0).sum()):,} photons" in printed.output
+    assert f"2: {int((channel == 2).sum()):,} photons" in printed.output
+    printed = command_line(["calibrate", str(path), "--pixel", "0,2", "--look"])
+    assert printed.exit_code == 0, printed.output
+    assert "rate" in printed.output
     scan, counts = scanned(tmp_path)
     known = ["--variable", "channel 0", "--dead-time-ns", "0", "--pulse-sigma-ns", "0.5"]
-    told = command_line(["reconstruct", str(scan), *known, "-o", str(tmp_path / "maps.npz")])
-    assert told.exit_code == 0, told.output
-    told = command_line(["convert", str(scan), str(tmp_path / "cube.zarr"), *known])
-    assert told.exit_code == 0, told.output
+    printed = command_line(["reconstruct", str(scan), *known, "-o", str(tmp_path / "maps.npz")])
+    assert printed.exit_code == 0, printed.output
+    printed = command_line(["convert", str(scan), str(tmp_path / "cube.zarr"), *known])
+    assert printed.exit_code == 0, printed.output
     cube = io.load(tmp_path / "cube.zarr")
     assert np.array_equal(cube.histogram[:], counts[:, :, :, 0])
     assert (cube.system.cycles, cube.system.bins, cube.system.period_ns) == (500, 100, pytest.approx(50.0))

@@ -74,12 +74,12 @@ def test_memory_and_web(store, tmp_path):
     check(in_memory(store), store)
     with served(tmp_path) as url:
         check(f"{url}/a.zarr", store)
-        told = command_line(["info", f"{url}/a.zarr"])
-        assert told.exit_code == 0, told.output
-        assert f"{url}/a.zarr (mars-lidar" in told.output
+        printed = command_line(["info", f"{url}/a.zarr"])
+        assert printed.exit_code == 0, printed.output
+        assert f"{url}/a.zarr (mars-lidar" in printed.output
         out = tmp_path / "maps.npz"
-        told = command_line(["reconstruct", f"{url}/a.zarr", "--no-picture", "-o", str(out)])
-        assert told.exit_code == 0, told.output
+        printed = command_line(["reconstruct", f"{url}/a.zarr", "--no-picture", "-o", str(out)])
+        assert printed.exit_code == 0, printed.output
         with pytest.raises(ValueError, match=r"nothing\.zarr: there is no Zarr store"):
             io.load(f"{url}/nothing.zarr")
 

@@ -63,9 +63,9 @@ def test_counts_of_an_archive_are_counts_and_add_up(tmp_path, counts):
         ("signal", lambda signal: np.array(0.0)),
         ("signal", lambda signal: signal > 0),
         ("delay", lambda delay: delay.astype(np.float32)),
-        ("attributes", lambda told: told.update(engine=0)),
-        ("attributes", lambda told: told.update(version={})),
-        ("attributes", lambda told: told.update(source=[1])),
+        ("attributes", lambda attributes: attributes.update(engine=0)),
+        ("attributes", lambda attributes: attributes.update(version={})),
+        ("attributes", lambda attributes: attributes.update(source=[1])),
     ],
 )
 def test_the_light_and_the_attributes_of_an_archive_are_what_we_write(tmp_path, name, change):
@@ -85,12 +85,12 @@ def test_the_light_and_the_attributes_of_an_archive_are_what_we_write(tmp_path, 
         ("realization", lambda numbers: numbers + 0.5),
         ("method", lambda names: np.arange(len(names))),
         ("method", lambda names: names[None]),
-        ("attributes", lambda told: told.update(level="{}")),
-        ("attributes", lambda told: told.update(level='{"maximum_likelihood": "high"}')),
-        ("attributes", lambda told: told.update(level='{"maximum_likelihood": -1}')),
-        ("attributes", lambda told: told.update(level=3)),
-        ("attributes", lambda told: told.update(source=None)),
-        ("attributes", lambda told: told.update(version=1)),
+        ("attributes", lambda attributes: attributes.update(level="{}")),
+        ("attributes", lambda attributes: attributes.update(level='{"maximum_likelihood": "high"}')),
+        ("attributes", lambda attributes: attributes.update(level='{"maximum_likelihood": -1}')),
+        ("attributes", lambda attributes: attributes.update(level=3)),
+        ("attributes", lambda attributes: attributes.update(source=None)),
+        ("attributes", lambda attributes: attributes.update(version=1)),
     ],
 )
 def test_the_labels_of_maps_are_what_we_write(tmp_path, name, change):
@@ -107,7 +107,7 @@ def test_the_labels_of_maps_are_what_we_write(tmp_path, name, change):
 def test_a_stream_has_the_system_of_its_photons(tmp_path, system):
     path = tmp_path / "photons.npz"
     ml.simulate_timestamps(one_return(), SYSTEM).save(path)
-    rewrite(path, "attributes", lambda told: told["info"].update(system=system))
+    rewrite(path, "attributes", lambda attributes: attributes["info"].update(system=system))
     with pytest.raises(FileError, match=r"photons\.npz"):
         ml.Timestamps.load(path)
 

@@ -180,8 +180,8 @@ def test_depth_unit_does_not_apply_to_middlebury(tmp_path):
 # --- bad files: the message names the file and the reason --------------------------------------------------
 
 
-def refused(told: str, *paths: Path, **options):
-    with pytest.raises(ValueError, match=told) as caught:
+def refused(message: str, *paths: Path, **options):
+    with pytest.raises(ValueError, match=message) as caught:
         Scene.from_rgbd(*paths, **options)
     return str(caught.value)
 
@@ -229,7 +229,7 @@ def test_depth_of_the_wrong_kind(tmp_path):
 
 def test_bad_archives(tmp_path):
     depth = np.ones((2, 2))
-    for name, arrays, told in (
+    for name, arrays, message in (
         ("a", {"z": depth}, "must hold an array 'depth', got z"),
         ("b", {"depth": depth, "reflectivity": depth, "image": depth}, "one of 'reflectivity' and 'image'"),
         ("c", {"depth": depth, "reflectivity": 2 * depth}, r"reflectivity must lie in \[0, 1\], got 2 to 2"),
@@ -240,15 +240,15 @@ def test_bad_archives(tmp_path):
         ("h", {"depth": depth, "image": np.ones((2, 2, 5))}, "grey or RGB"),
     ):
         np.savez(tmp_path / name, **arrays)
-        assert refused(told, tmp_path / f"{name}.npz").startswith(str(tmp_path / f"{name}.npz"))
+        assert refused(message, tmp_path / f"{name}.npz").startswith(str(tmp_path / f"{name}.npz"))
 
 
 def test_sizes_must_agree(tmp_path, millimetres):
     depth = png(tmp_path / "d.png", millimetres)
     image = png(tmp_path / "i.png", np.ones((3, 2), dtype=np.uint8))
-    told = refused("must have the size of the depth, 2 x 3", depth, image)
-    assert told.startswith(str(image))
-    assert "got 3 x 2" in told
+    output = refused("must have the size of the depth, 2 x 3", depth, image)
+    assert output.startswith(str(image))
+    assert "got 3 x 2" in output
 
 
 @pytest.mark.parametrize("option", ["depth_unit_m", "focal_px", "max_depth_m"])
@@ -308,12 +308,12 @@ def test_depths_beyond_the_largest_are_no_return(tmp_path):
     assert np.array_equal(np.isnan(layers[1].depth_m), depth + 1.0 > 5.5)
     out = tmp_path / "out.npz"
     options = ["--depth", str(path), "--max-depth-m", "5", "--cycles", "100", "--no-picture", "-o", str(out)]
-    told = command_line(["simulate", *options])
-    assert told.exit_code == 0, told.output
+    printed = command_line(["simulate", *options])
+    assert printed.exit_code == 0, printed.output
     assert np.array_equal(np.isnan(io.load(out).depth_m), depth > 5.0)
     options = ["-o", str(tmp_path / "set.zarr"), "--cycles", "100", "--max-depth-m", "5"]
-    told = command_line(["generate", str(path), *options])
-    assert told.exit_code == 0, told.output
+    printed = command_line(["generate", str(path), *options])
+    assert printed.exit_code == 0, printed.output
 
 
 @pytest.mark.parametrize("suffix", [".png", ".tif", ".npy"])

@@ -54,7 +54,7 @@ def test_pfm_by_its_bytes(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("content", "told"),
+    ("content", "message"),
     [
         (b"", "not a PFM"),
         (b"P5\n2 2\n255\nabcd", "must begin with a line Pf or PF"),
@@ -64,9 +64,9 @@ def test_pfm_by_its_bytes(tmp_path):
         (b"Pf\n2 2\n-1.0\n" + 15 * b"\0", "cut short: 15 of 16 bytes"),
     ],
 )
-def test_bad_pfm(tmp_path, content, told):
+def test_bad_pfm(tmp_path, content, message):
     (tmp_path / "d.pfm").write_bytes(content)
-    with pytest.raises(ValueError, match=rf"d\.pfm: cannot be read \(.*{told}"):
+    with pytest.raises(ValueError, match=rf"d\.pfm: cannot be read \(.*{message}"):
         read_rgbd(tmp_path / "d.pfm")
 
 
@@ -97,7 +97,7 @@ def test_exr(tmp_path):
         file.write(str(tmp_path / "image.exr"))
     with pytest.raises(ValueError, match=r"image\.exr: holds colours, not depth: its channels are B, G, R"):
         read_rgbd(tmp_path / "image.exr")
-    with openexr.File(header, {f"ViewLayer.Combined.{name}": one for name, one in colours.items()}) as file:
+    with openexr.File(header, {f"ViewLayer.Combined.{name}": colour for name, colour in colours.items()}) as file:
         file.write(str(tmp_path / "layers.exr"))
     with pytest.raises(ValueError, match=r"layers\.exr: must have a channel of depth"):
         read_rgbd(tmp_path / "layers.exr")
@@ -117,9 +117,9 @@ def test_a_render_of_blender(tmp_path, nothing):
     channels = {"ViewLayer.Depth.Z": depth, "ViewLayer.Combined.R": depth, "ViewLayer.Combined.G": depth}
     with openexr.File({"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage}, channels) as file:
         file.write(str(tmp_path / "render.exr"))
-    found = read_rgbd(tmp_path / "render.exr")[0]
-    assert np.isnan(found[0, :2]).all()
-    np.testing.assert_array_equal(found[1:], depth[1:].astype(np.float64))
+    result = read_rgbd(tmp_path / "render.exr")[0]
+    assert np.isnan(result[0, :2]).all()
+    np.testing.assert_array_equal(result[1:], depth[1:].astype(np.float64))
 
 
 def test_exr_without_the_library(tmp_path, monkeypatch):
@@ -149,12 +149,12 @@ def test_nyu_frames(tmp_path):
     scene = Scene.from_rgbd(tmp_path / "nyu.mat", index=2)
     np.testing.assert_array_equal(scene.depth_m, depth[2])
     np.testing.assert_allclose(scene.reflectivity, [[0, 0.2126, 0, 0], [0, 0, 0, 1]], atol=1e-15)
-    for options, told in (
+    for options, message in (
         ({}, "needs index, the frame from 0"),
         ({"index": 3}, r"index must be an integer in \[0, 2\], got 3"),
         ({"index": 0, "depth_unit_m": 1e-3}, "depth_unit_m does not apply to NYUv2"),
     ):
-        with pytest.raises(ValueError, match=told):
+        with pytest.raises(ValueError, match=message):
             read_rgbd(tmp_path / "nyu.mat", **options)
     np.save(tmp_path / "d.npy", np.ones((2, 2)))
     with pytest.raises(ValueError, match=r"d\.npy: has no frames, got index 0"):
@@ -229,7 +229,7 @@ def test_middlebury_2014_with_a_file_missing(tmp_path, name):
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "told"),
+    ("old", "new", "message"),
     [
         ("baseline=193.001\n", "", "must give baseline"),
         ("doffs=131.111", "doffs=", "doffs must begin with a number, got ''"),
@@ -237,8 +237,8 @@ def test_middlebury_2014_with_a_file_missing(tmp_path, name):
         ("cam0=[4000.5", "cam0=[nan", "cam0 must begin with a number > 0"),
     ],
 )
-def test_bad_calibrations(tmp_path, old, new, told):
-    with pytest.raises(ValueError, match=rf"calib\.txt: {told}"):
+def test_bad_calibrations(tmp_path, old, new, message):
+    with pytest.raises(ValueError, match=rf"calib\.txt: {message}"):
         read_rgbd(middlebury(tmp_path / "a", CALIB.replace(old, new)))
 
 
@@ -261,8 +261,8 @@ def test_a_folder_of_everything(tmp_path):
     png(tmp_path / "seq" / "depth" / "8.png", millimetres)
     np.savez(tmp_path / "own.npz", depth=np.ones((3, 3)))
     (tmp_path / "wrong.mat").write_bytes(b"MATLAB 5.0")
-    seen = []
-    scenes, problems = io.scan(tmp_path, progress=lambda done, total: seen.append((done, total)))
+    recorded = []
+    scenes, problems = io.scan(tmp_path, progress=lambda done, total: recorded.append((done, total)))
     assert [(s.depth.relative_to(tmp_path).as_posix(), s.index) for s in scenes] == [
         ("0001_depth.png", None),
         ("b_stereo", None),
@@ -277,7 +277,7 @@ def test_a_folder_of_everything(tmp_path):
     assert images == ["0001_colors.png", None, None, None, None, None, "seq/rgb/7.jpg", None]
     assert sorted(p.path.name for p in problems) == ["0002_depth.png", "wrong.mat"]
     assert all(str(p).startswith(str(p.path)) and "cannot be read" in str(p) for p in problems)
-    assert seen[-1] == (10, 10)  # a .mat may hold one depth map: it is a scene until it is read
+    assert recorded[-1] == (10, 10)  # a .mat may hold one depth map: it is a scene until it is read
     assert scenes[3].load(size=2).shape == (1, 2)
     unchecked, problems = io.scan(tmp_path, check=False)
     assert len(unchecked) == 10
@@ -307,10 +307,12 @@ def test_by_manifest(tmp_path):
     )
     scenes, problems = io.scan(tmp_path)
     assert [(s.depth.name, s.index, s.depth_unit_m) for s in scenes] == [("nyu.mat", 1, None), ("d.npy", None, 0.001)]
-    told = sorted(str(p) for p in problems)
-    assert len(told) == 4
+    problem_lines = sorted(str(p) for p in problems)
+    assert len(problem_lines) == 4
     for part, line in zip(
-        ("d.npy: depth is uint16", "manifest.csv: line 6", "manifest.csv: line 7", "no such"), told, strict=True
+        ("d.npy: depth is uint16", "manifest.csv: line 6", "manifest.csv: line 7", "no such"),
+        problem_lines,
+        strict=True,
     ):
         assert part in line
     (tmp_path / "other.csv").write_text("depth,colour\nd.npy,x.png\n")

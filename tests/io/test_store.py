@@ -93,14 +93,16 @@ def test_streaming_in_blocks_changes_no_count(tmp_path, monkeypatch, suffix, blo
     monkeypatch.setattr(recipe, "BLOCK_BYTES", block_bytes)
     monkeypatch.setattr("mars_lidar.io.zarr_store._CHUNK_BYTES", 1500)
     monkeypatch.setattr("mars_lidar.io.hdf5._CHUNK_BYTES", 1500)
-    told: list[tuple[int, int]] = []
+    reports: list[tuple[int, int]] = []
     path = tmp_path / f"cube{suffix}"
-    io.simulate_to(path, flux, SYSTEM, realizations=4, pixel_index=index, seed=3, progress=lambda *at: told.append(at))
+    io.simulate_to(
+        path, flux, SYSTEM, realizations=4, pixel_index=index, seed=3, progress=lambda *at: reports.append(at)
+    )
     with io.load(path) as cube:
         assert np.array_equal(np.asarray(cube.histogram), expected)
         assert io.verify(cube)
-    assert [done for done, _ in told] == sorted(done for done, _ in told)
-    assert told[-1] == (120, 120)
+    assert [done for done, _ in reports] == sorted(done for done, _ in reports)
+    assert reports[-1] == (120, 120)
 
 
 @pytest.mark.parametrize(
@@ -111,15 +113,15 @@ def test_blocks_cover_the_cube_in_order_and_in_whole_chunks(monkeypatch, shape, 
     monkeypatch.setattr(recipe, "BLOCK_BYTES", 40_000)
     made = io.Recipe(system=SYSTEM, flux=ml.Flux(np.ones(shape[1:]), 0.1, 5.0), realizations=shape[0])
     chunks = made.chunks(target)
-    seen = np.zeros(shape[:2], int)
+    observed = np.zeros(shape[:2], int)
     order = []
     for images, rows in made.blocks(chunks):
-        seen[images, rows] += 1
+        observed[images, rows] += 1
         order.append((images.start, rows.start))
         assert images.start % chunks[0] == 0
         assert rows.start % chunks[1] == 0
         assert images.stop - images.start == 1 or (rows.start, rows.stop) == (0, shape[1])
-    assert (seen == 1).all()
+    assert (observed == 1).all()
     assert order == sorted(order)
     assert chunks[0] == 1 or chunks[1:3] == shape[1:]
 

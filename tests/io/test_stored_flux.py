@@ -12,7 +12,7 @@ from scipy.io import savemat
 
 import mars_lidar as ml
 from mars_lidar import io
-from mars_lidar.light.stored_flux import StoredFlux
+from mars_lidar.light.flux import StoredFlux
 from mars_lidar.light.tolerances import TOL
 from tests.harness.command import command_line
 

@@ -173,10 +173,10 @@ def test_the_depth_networks_layout_is_checked(tmp_path):
     io.simulate_to(tmp_path / "cube.mat", flux, SYSTEM)
     from scipy.io import loadmat
 
-    found = {k: v for k, v in loadmat(tmp_path / "cube.mat").items() if not k.startswith("__")}
-    spad = found["spad"].tocsc()
+    contents = {k: v for k, v in loadmat(tmp_path / "cube.mat").items() if not k.startswith("__")}
+    spad = contents["spad"].tocsc()
     spad.indices[3] = 400
-    savemat(tmp_path / "bad.mat", found | {"spad": spad})
+    savemat(tmp_path / "bad.mat", contents | {"spad": spad})
     for reader in (io.load, io.read_mat):
         with pytest.raises(FileError, match=r"bad\.mat.*damaged"):
             reader(tmp_path / "bad.mat")

@@ -49,16 +49,16 @@ def test_learned_prior(deepinv):
     example = runpy.run_path(str(PATH.with_name("learned_prior.py")))
     denoiser, losses = example["train"](100, 24)
     assert losses[-1] < 0.8 * sum(losses[:10]) / 10
-    rows, shown = example["compared"](denoiser, "random", 2, 24, 12)
+    rows, pictures = example["compared"](denoiser, "random", 2, 24, 12)
     assert [len(row) for row in rows] == 7 * [6]
-    assert set(example["SHOWN"]) <= set(shown)
+    assert set(example["SHOWN"]) <= set(pictures)
     depth, reflectivity = ({row[0]: float(row[k]) for row in rows} for k in (1, 5))
     assert depth["learned prior"] < 0.5 * depth[example["ALONE"]]
     assert reflectivity["learned prior"] < reflectivity[example["ALONE"]]
-    true = shown["truth"]
+    true = pictures["truth"]
     noisy = true + 0.5 * torch.randn(true.shape, generator=torch.Generator().manual_seed(3))
-    mended = denoiser(noisy, 0.5).detach()
-    assert (mended - true).square().mean() < 0.6 * (noisy - true).square().mean()
+    denoised = denoiser(noisy, 0.5).detach()
+    assert (denoised - true).square().mean() < 0.6 * (noisy - true).square().mean()
 
 
 def test_the_data_term_of_the_learned_prior_is_the_likelihood(deepinv):
@@ -77,6 +77,6 @@ def test_the_data_term_of_the_learned_prior_is_the_likelihood(deepinv):
             y[0, :, row, column].numpy(), Flux(*light[0, :, row, column].numpy()), system
         )
         for channel, unit in enumerate(units):
-            told = -slope[channel] * unit[row, column].item()
+            predicted = -slope[channel] * unit[row, column].item()
             deviation = information[channel, channel] ** 0.5 * unit[row, column].item()
-            assert abs(gradient[channel, row, column].item() - told) < 0.02 * deviation
+            assert abs(gradient[channel, row, column].item() - predicted) < 0.02 * deviation

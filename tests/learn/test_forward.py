@@ -31,7 +31,7 @@ def system(dead_ns=42.3, pulse=PULSES[0], bins=20, start="stationary", cycles=50
 
 
 def point(*values):
-    return [torch.tensor(one, dtype=torch.float64, requires_grad=True) for one in values]
+    return [torch.tensor(value, dtype=torch.float64, requires_grad=True) for value in values]
 
 
 # at a delay of 40.0 the window of cut bins would move by a bin, where the likelihood jumps by 3e-7
@@ -43,12 +43,12 @@ AT = ([0.7, 3.0, 0.02], [0.3, 1.0, 0.01], [40.1, 97.0, 3.3])
 @pytest.mark.parametrize("pulse", PULSES, ids=["gaussian", "sampled"])
 def test_gradients(dead_ns, pulse):
     """In every direction for the photons, in random ones for what follows from them; both starts."""
-    one, at = system(dead_ns, pulse), point(*AT)
-    assert torch.autograd.gradcheck(lambda *x: bin_photons(*x, one), at)
+    instrument, at = system(dead_ns, pulse), point(*AT)
+    assert torch.autograd.gradcheck(lambda *x: bin_photons(*x, instrument), at)
     counts = torch.tensor(np.random.default_rng(0).poisson(9.0, (3, 20)))
-    assert torch.autograd.gradcheck(lambda *x: histogram_log_likelihood(counts, *x, one), at)
+    assert torch.autograd.gradcheck(lambda *x: histogram_log_likelihood(counts, *x, instrument), at)
     for start in ("stationary", "armed"):
-        begun = one.replace(start=start, cycles=4 if start == "armed" else 1)
+        begun = instrument.replace(start=start, cycles=4 if start == "armed" else 1)
 
         def mean(*x, begun=begun):
             return expected_histogram(*x, begun, refine=2)
@@ -61,12 +61,12 @@ def test_gradients(dead_ns, pulse):
 @pytest.mark.parametrize("start", ["stationary", "armed"])
 def test_transforms_of_torch_func(start):
     """Jacobians by both modes, second derivatives by three routes and by differences, each pixel by itself."""
-    one, at = system(start=start), [x.detach() for x in point(*AT)]
+    instrument, at = system(start=start), [x.detach() for x in point(*AT)]
     torch.manual_seed(0)
     weights = torch.randn(20, dtype=torch.float64)
 
     def mean(*x):
-        return expected_histogram(*x, one)
+        return expected_histogram(*x, instrument)
 
     def loss(x):
         return mean(*x) @ weights
@@ -102,15 +102,15 @@ def test_transforms_of_torch_func(start):
 
 def differentiable(name):
     """A function of (S, B, delay) by its name in `mars_lidar.learn`."""
-    one = system()
+    instrument = system()
     if name == "HistogramTable":
-        return HistogramTable(ml.Table.build(one, (0.01, 5.0, 8), (0.005, 3.0, 6), threads=1)).double()
+        return HistogramTable(ml.Table.build(instrument, (0.01, 5.0, 8), (0.005, 3.0, 6), threads=1)).double()
     if name == "histogram_log_likelihood":
         counts = torch.tensor(np.random.default_rng(0).poisson(9.0, 20))
-        return lambda *x: histogram_log_likelihood(counts, *x, one)
+        return lambda *x: histogram_log_likelihood(counts, *x, instrument)
     return {
-        "bin_photons": lambda *x: bin_photons(*x, one),
-        "expected_histogram": lambda *x: expected_histogram(*x, one),
+        "bin_photons": lambda *x: bin_photons(*x, instrument),
+        "expected_histogram": lambda *x: expected_histogram(*x, instrument),
     }[name]
 
 
@@ -120,8 +120,8 @@ def test_vmap_and_jacobians_of_every_function(name):
     alone = torch.stack([function(*(x[k] for x in at)) for k in range(3)])
     torch.testing.assert_close(torch.vmap(function)(*at), alone, rtol=1e-11, atol=1e-9)
     back, ahead = (torch.vmap(mode(function, argnums=every))(*at) for mode in (torch.func.jacrev, torch.func.jacfwd))
-    for one, other in zip(back, ahead, strict=True):
-        torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-9)
+    for first, other in zip(back, ahead, strict=True):
+        torch.testing.assert_close(first, other, rtol=1e-9, atol=1e-9)
     with pytest.raises(ValueError, match="must be >= 0"):
         torch.vmap(function)(-at[0], *at[1:])
     for half in (torch.float16, torch.bfloat16):
@@ -145,13 +145,13 @@ def test_blocks_of_another_size_are_solved_alike(monkeypatch):
     parts = expected_histogram(*at, system())
     torch.testing.assert_close(parts, whole, rtol=1e-11, atol=0)
     weights = torch.arange(20.0, dtype=torch.float64)
-    one = torch.autograd.grad((whole @ weights).sum(), at)
-    torch.testing.assert_close(torch.autograd.grad((parts @ weights).sum(), at), one, rtol=1e-9, atol=1e-9)
+    single = torch.autograd.grad((whole @ weights).sum(), at)
+    torch.testing.assert_close(torch.autograd.grad((parts @ weights).sum(), at), single, rtol=1e-9, atol=1e-9)
 
 
 def test_gradient_at_many_bins_is_that_of_the_exact_mean_histogram():
     """Differences of `mean_histogram`, which shares no code with it: central, of a step that both errors allow."""
-    one = ml.System(
+    instrument = ml.System(
         period_ns=100.0,
         cycles=1000,
         bins=512,
@@ -161,18 +161,20 @@ def test_gradient_at_many_bins_is_that_of_the_exact_mean_histogram():
     at, step = np.array([0.9, 0.4, 61.3]), np.array([1e-2, 1e-2, 1e-2])
     weights = np.cos(np.arange(512.0) / 9)
     both = at + np.concatenate([np.diag(step), -np.diag(step)])
-    exact = ml.statistics.mean_histogram(ml.Flux(both[:, 0], both[:, 1], both[:, 2]), one, tolerance=1e-6) @ weights
+    exact = (
+        ml.statistics.mean_histogram(ml.Flux(both[:, 0], both[:, 1], both[:, 2]), instrument, tolerance=1e-6) @ weights
+    )
     x = point(*at)
-    (expected_histogram(*x, one) @ torch.tensor(weights)).backward()
+    (expected_histogram(*x, instrument) @ torch.tensor(weights)).backward()
     np.testing.assert_allclose([float(v.grad) for v in x], (exact[:3] - exact[3:]) / (2 * step), rtol=2e-3)
 
 
 @pytest.mark.parametrize("pulse", PULSES, ids=["gaussian", "sampled"])
 def test_photons_are_those_of_the_pulse(pulse):
-    found = bin_photons(*point(*AT), system(pulse=pulse)).detach().numpy()
-    s, b, tau = (np.array(one) for one in AT)
+    result = bin_photons(*point(*AT), system(pulse=pulse)).detach().numpy()
+    s, b, tau = (np.array(values) for values in AT)
     expected = s[:, None] * pulse.bin_energy(tau, 100.0, 20) + b[:, None] / 20
-    np.testing.assert_allclose(found, expected, rtol=1e-12)
+    np.testing.assert_allclose(result, expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize("start", ["stationary", "armed"])
@@ -182,18 +184,18 @@ def test_expected_histogram_is_the_exact_mean(start, dead_ns):
 
     Where the dead time is whole periods also by its closed form.
     """
-    one = system(dead_ns, bins=50, start=start, cycles=1000)
+    instrument = system(dead_ns, bins=50, start=start, cycles=1000)
     s, b, tau = (np.array(x) for x in ([0.7, 3.0, 0.02, 0.0], [0.3, 1.0, 0.01, 0.2], [40.0, 97.0, 3.3, 0.0]))
-    exact = ml.statistics.mean_histogram(ml.Flux(s, b, tau), one, tolerance=1e-6)
+    exact = ml.statistics.mean_histogram(ml.Flux(s, b, tau), instrument, tolerance=1e-6)
     near = (dead_ns + 2.0) % 100.0 < 4.0 and dead_ns % 100.0 > 0.0  # one bin from 0 or a period: hard for the grid
     for refine, error in ((None, 1e-3 if near else 2e-4), (12, 2e-4 if near else 1e-5)):
-        found = expected_histogram(*point(s, b, tau), one, refine=refine).detach().numpy()
-        assert (np.abs(found - exact).sum(-1) / 2 < error * exact.sum(-1)).all()
-        np.testing.assert_allclose(found.sum(-1), exact.sum(-1), rtol=error)
+        result = expected_histogram(*point(s, b, tau), instrument, refine=refine).detach().numpy()
+        assert (np.abs(result - exact).sum(-1) / 2 < error * exact.sum(-1)).all()
+        np.testing.assert_allclose(result.sum(-1), exact.sum(-1), rtol=error)
     if dead_ns % 100.0 == 0.0 and start == "stationary":
-        flux = s[:, None] * one.pulse.bin_energy(tau, 100.0, 50) + b[:, None] / 50
+        flux = s[:, None] * instrument.pulse.bin_energy(tau, 100.0, 50) + b[:, None] / 50
         closed = 1000 * flux / (1 + dead_ns / 100.0 * (s + b)[:, None])
-        np.testing.assert_allclose(found, closed, rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(result, closed, rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.full
@@ -207,20 +209,20 @@ def test_expected_histogram_is_the_exact_mean(start, dead_ns):
 )
 def test_gradients_in_coarse_bins_are_those_of_the_exact_mean(bins, sigma, dead, light):
     """Differences of the native recursion, of fourth order; norm over the bins to 4e-3, as the docstring says."""
-    one = system(dead, bins=bins, pulse=ml.GaussianPulse(sigma_ns=sigma), cycles=1000)
+    instrument = system(dead, bins=bins, pulse=ml.GaussianPulse(sigma_ns=sigma), cycles=1000)
     steps = np.diag([1e-3 * light[0], 1e-3 * light[1], 1e-3 * sigma])
-    for step, jacobian in zip(steps, _jacobian(light, one), strict=True):
+    for step, jacobian in zip(steps, _jacobian(light, instrument), strict=True):
         moved = [
-            ml.statistics.mean_histogram(ml.Flux(*(light + k * step)), one, tolerance=1e-9).ravel()
+            ml.statistics.mean_histogram(ml.Flux(*(light + k * step)), instrument, tolerance=1e-9).ravel()
             for k in (-2, -1, 1, 2)
         ]
         exact = (moved[0] - 8.0 * moved[1] + 8.0 * moved[2] - moved[3]) / (12.0 * step.sum())
         assert np.linalg.norm(jacobian - exact) < 4e-3 * np.linalg.norm(exact)
 
 
-def _jacobian(light, one):
+def _jacobian(light, instrument):
     at = torch.tensor(light, dtype=torch.float64)
-    return torch.func.jacrev(lambda x: expected_histogram(x[0], x[1], x[2], one))(at).T.numpy()
+    return torch.func.jacrev(lambda x: expected_histogram(x[0], x[1], x[2], instrument))(at).T.numpy()
 
 
 def test_efficiency_and_dark_counts_are_those_of_the_exact_mean():
@@ -234,8 +236,8 @@ def test_efficiency_and_dark_counts_are_those_of_the_exact_mean():
     assert np.abs(mean.detach().numpy() - exact).sum(-1).max() < 2e-3 * exact.sum(-1).min()
     counts = mean.detach().round()
     likely = histogram_log_likelihood(counts, *at, dim)
-    seen = [at[0] * 0.3, at[1] * 0.3 + 0.2, at[2]]
-    assert torch.equal(likely, histogram_log_likelihood(counts, *seen, dim.detected()))
+    light = [at[0] * 0.3, at[1] * 0.3 + 0.2, at[2]]
+    assert torch.equal(likely, histogram_log_likelihood(counts, *light, dim.detected()))
     assert torch.autograd.gradcheck(lambda *x: histogram_log_likelihood(counts, *x, dim), at)
     with pytest.raises(ValueError, match=r"beyond efficiency and dark counts.* and jitter"):
         expected_histogram(*at, dim.replace(detector=ml.Detector(dead_time_ns=42.3, jitter=ml.Jitter(sigma_ns=1.0))))
@@ -243,7 +245,7 @@ def test_efficiency_and_dark_counts_are_those_of_the_exact_mean():
 
 def test_narrow_pulse_at_many_bins():
     """1024 bins, a pulse of half a bin: nothing dense would fit."""
-    one = ml.System(
+    instrument = ml.System(
         period_ns=100.0,
         cycles=1000,
         bins=1024,
@@ -251,16 +253,16 @@ def test_narrow_pulse_at_many_bins():
         detector=ml.Detector(dead_time_ns=85.0),
     )
     s, b, tau = (np.array(x) for x in ([0.5, 5.0], [1.0, 0.1], [40.03, 99.99]))
-    found = expected_histogram(*point(s, b, tau), one).detach().numpy()
-    exact = ml.statistics.mean_histogram(ml.Flux(s, b, tau), one)
-    assert (np.abs(found - exact).sum(-1) / 2 < 2e-4 * exact.sum(-1)).all()
+    result = expected_histogram(*point(s, b, tau), instrument).detach().numpy()
+    exact = ml.statistics.mean_histogram(ml.Flux(s, b, tau), instrument)
+    assert (np.abs(result - exact).sum(-1) / 2 < 2e-4 * exact.sum(-1)).all()
 
 
 @pytest.mark.parametrize("dead_ns", [42.3, 97.0, 163.1])
 def test_an_armed_start_adds_less_than_one_registration(dead_ns):
     """Two pixels that see the same photons, one warmed up, register by turns: 0 to 1 more where it began armed."""
     at = point([0.7, 3.0, 10.0, 0.0], [0.3, 1.0, 0.01, 9.0], [40.0, 97.0, 3.3, 0.0])
-    armed, warm = (expected_histogram(*at, system(dead_ns, start=one)).sum(-1) for one in ("armed", "stationary"))
+    armed, warm = (expected_histogram(*at, system(dead_ns, start=state)).sum(-1) for state in ("armed", "stationary"))
     more = (armed - warm).detach()
     assert (more > 0.0).all()
     assert (more < 1.0).all()
@@ -268,13 +270,13 @@ def test_an_armed_start_adds_less_than_one_registration(dead_ns):
 
 def test_dark_and_blinding_pixels():
     at = point([0.0, 1e-9, 1e3, 1.0], [0.0, 0.0, 1.0, 300.0], [5.0, 5.0, 40.0, 40.0])
-    one = system(bins=100, cycles=1000)
-    found = expected_histogram(*at, one)
-    found.sum().backward()
-    assert (found[0] == 0.0).all()
-    np.testing.assert_allclose(float(found[1].sum().detach()), 1e-6, rtol=1e-6)
+    instrument = system(bins=100, cycles=1000)
+    result = expected_histogram(*at, instrument)
+    result.sum().backward()
+    assert (result[0] == 0.0).all()
+    np.testing.assert_allclose(float(result[1].sum().detach()), 1e-6, rtol=1e-6)
     for k in (2, 3):
-        assert 1000 / 0.423 > float(found[k].sum().detach()) > 900
+        assert 1000 / 0.423 > float(result[k].sum().detach()) > 900
     assert all(torch.isfinite(v.grad).all() for v in at)
     assert float(at[0].grad[0]) == pytest.approx(1000.0, rel=1e-6)  # the first photon is always seen
 
@@ -287,53 +289,55 @@ def test_armed_periods_err_by_the_ends_of_the_exposure_alone(start, dead_ns):
 
     Besides, a registration or a re-arming may lie anywhere in its bin: none, in most of these fine bins.
     """
-    one = system(dead_ns, bins=2000, cycles=60, start=start)
-    times = ml.simulate_timestamps(ml.Flux(np.full((8, 1), 1.0), 0.7, 40.0), one, seed=3)
-    edges = np.arange(60 * 2000 + 1) * one.bin_ns
+    instrument = system(dead_ns, bins=2000, cycles=60, start=start)
+    times = ml.simulate_timestamps(ml.Flux(np.full((8, 1), 1.0), 0.7, 40.0), instrument, seed=3)
+    edges = np.arange(60 * 2000 + 1) * instrument.bin_ns
     for row in range(8):
         at = times.pixel(row, 0).times_ns
         # blind time before each edge; what lies before the exposure no timestamp tells: it belongs to the ends
         blind = np.clip(edges[:, None] - at, 0.0, dead_ns).sum(-1)
-        true = 60 - np.diff(blind).reshape(60, 2000).sum(0) / one.bin_ns
-        counts = torch.tensor(np.bincount((at % 100.0 / one.bin_ns).astype(int), minlength=2000), dtype=torch.float64)
-        found = armed_periods(counts, one)
-        d = int(dead_ns % 100.0 / one.bin_ns)
+        true = 60 - np.diff(blind).reshape(60, 2000).sum(0) / instrument.bin_ns
+        counts = torch.tensor(
+            np.bincount((at % 100.0 / instrument.bin_ns).astype(int), minlength=2000), dtype=torch.float64
+        )
+        result = armed_periods(counts, instrument)
+        d = int(dead_ns % 100.0 / instrument.bin_ns)
         inside = 0.5 * counts + torch.roll(counts, d, -1) + torch.roll(counts, d + 1, -1)
-        off = torch.tensor(true) - found
+        off = torch.tensor(true) - result
         assert (off.abs() <= inside + (dead_ns // 100.0 + 1) + 1e-6).all()
         assert (off >= -inside - 1e-6).all()  # the dead time after the end is taken for one within it
 
 
 def test_log_likelihood_is_the_native_one():
-    one = system(bins=2000, cycles=2000)
+    instrument = system(bins=2000, cycles=2000)
     flux = ml.Flux(0.7, 0.3, 40.0)
-    counts = ml.simulate(flux, one, seed=1)[0, 0, 0]
+    counts = ml.simulate(flux, instrument, seed=1)[0, 0, 0]
     at = point([0.7, 0.5], [0.3, 0.35], [40.0, 40.5])
-    found = histogram_log_likelihood(torch.from_numpy(counts.astype(float)), *at, one)
-    value, gradient, _ = log_likelihood(counts, ml.Flux(*(x.detach().numpy() for x in at)), one)
-    found.sum().backward()
-    np.testing.assert_allclose(float((found[0] - found[1]).detach()), value[0] - value[1], rtol=5e-3)
+    result = histogram_log_likelihood(torch.from_numpy(counts.astype(float)), *at, instrument)
+    value, gradient, _ = log_likelihood(counts, ml.Flux(*(x.detach().numpy() for x in at)), instrument)
+    result.sum().backward()
+    np.testing.assert_allclose(float((result[0] - result[1]).detach()), value[0] - value[1], rtol=5e-3)
     for k in range(3):
         np.testing.assert_allclose(at[k].grad[1], gradient[1, k], rtol=5e-3)
 
 
 def test_batches_types_and_bad_arguments():
-    one = system()
+    instrument = system()
     maps = [torch.rand(2, 3, 4) + 0.1, torch.rand(4) + 0.1, torch.tensor(30.0)]
-    found = expected_histogram(*maps, one)
-    assert found.shape == (2, 3, 4, 20)
-    assert found.dtype == torch.float32
-    alone = expected_histogram(maps[0][1, 2, 3], maps[1][3], maps[2], one)
-    torch.testing.assert_close(found[1, 2, 3], alone)
-    assert armed_periods(found, one).shape == found.shape
+    result = expected_histogram(*maps, instrument)
+    assert result.shape == (2, 3, 4, 20)
+    assert result.dtype == torch.float32
+    alone = expected_histogram(maps[0][1, 2, 3], maps[1][3], maps[2], instrument)
+    torch.testing.assert_close(result[1, 2, 3], alone)
+    assert armed_periods(result, instrument).shape == result.shape
     with pytest.raises(TypeError, match="signal must be a Tensor"):
-        expected_histogram(1.0, *maps[1:], one)
+        expected_histogram(1.0, *maps[1:], instrument)
     with pytest.raises(ValueError, match="must be >= 0"):
-        expected_histogram(-maps[0], *maps[1:], one)
+        expected_histogram(-maps[0], *maps[1:], instrument)
     with pytest.raises(ValueError, match=r"must broadcast, got shapes \(2, 3, 4\), \(5,\), \(\)"):
-        expected_histogram(maps[0], torch.rand(5), maps[2], one)
+        expected_histogram(maps[0], torch.rand(5), maps[2], instrument)
     with pytest.raises(ValueError, match="histogram must be a tensor"):
-        histogram_log_likelihood(torch.zeros(3), *maps, one)
+        histogram_log_likelihood(torch.zeros(3), *maps, instrument)
     with pytest.raises(ValueError, match="mode 'synchronous'"):
-        expected_histogram(*maps, one.replace(detector=ml.Detector(dead_time_ns=10.0, mode="synchronous")))
-    assert expected_histogram(*(torch.zeros(0, 3) for _ in range(3)), one).shape == (0, 3, 20)
+        expected_histogram(*maps, instrument.replace(detector=ml.Detector(dead_time_ns=10.0, mode="synchronous")))
+    assert expected_histogram(*(torch.zeros(0, 3) for _ in range(3)), instrument).shape == (0, 3, 20)

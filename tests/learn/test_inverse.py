@@ -52,8 +52,10 @@ def test_vjp_is_what_deepinv_asks_for(physics):
     """A and A_vjp against differences along a direction, and the same from a table."""
     from mars_lidar.learn import LidarPhysics
 
-    one, two = (torch.tensor(v, dtype=torch.float64).reshape(1, 3, 1, 1) for v in ([0.8, 0.4, 37.0], [0.3, -0.2, 0.7]))
-    x, step = one.expand(1, 3, 2, 2), 1e-5 * two
+    first, two = (
+        torch.tensor(v, dtype=torch.float64).reshape(1, 3, 1, 1) for v in ([0.8, 0.4, 37.0], [0.3, -0.2, 0.7])
+    )
+    x, step = first.expand(1, 3, 2, 2), 1e-5 * two
     v = torch.linspace(-1.0, 1.0, 16, dtype=torch.float64).reshape(1, 16, 1, 1).expand(1, 16, 2, 2)
     along = ((physics.A(x + step) - physics.A(x - step)) * v).sum() / 2
     torch.testing.assert_close((physics.A_vjp(x, v) * step).sum(), along, rtol=1e-5, atol=0)
@@ -83,7 +85,7 @@ def test_reconstruction_with_deepinv(physics):
         first = gradient.norm() if first is None else first
         x = (x - 0.05 * units * gradient).clamp_min(0.0)
     assert gradient.norm() < 0.2 * first
-    before, after = ((one - true).square().mean((0, 2, 3)) for one in (start, x))
+    before, after = ((example - true).square().mean((0, 2, 3)) for example in (start, x))
     assert (after < before).all()
 
 
@@ -113,9 +115,12 @@ def test_jvp_is_the_transpose_of_vjp(physics):
     torch.manual_seed(1)
     step, back = torch.randn_like(x), torch.randn(1, 16, 2, 2, dtype=torch.float64)
     table = ml.Table.build(SYSTEM, (0.5, 1.5, 8), (0.2, 0.8, 8), threads=1)
-    for one, close in ((physics, 1e-9), (LidarPhysics(SYSTEM, table=table), 1e-4)):  # a table's is of single precision
+    for example, close in (
+        (physics, 1e-9),
+        (LidarPhysics(SYSTEM, table=table), 1e-4),
+    ):  # a table's is of single precision
         torch.testing.assert_close(
-            (one.A_jvp(x, step) * back).sum(), (one.A_vjp(x, back) * step).sum(), rtol=close, atol=close
+            (example.A_jvp(x, step) * back).sum(), (example.A_vjp(x, back) * step).sum(), rtol=close, atol=close
         )
     moved = (physics.A(x + 1e-5 * step) - physics.A(x - 1e-5 * step)) / 2e-5
     torch.testing.assert_close(physics.A_jvp(x, step), moved, rtol=1e-5, atol=1e-5)
@@ -134,9 +139,9 @@ def test_depth_images_are_those_of_deepinv(physics):
     )
     x = torch.tensor([20.3, 900.0, 7.0]).reshape(1, 3, 1, 1).expand(1, 3, 3, 3)
     torch.testing.assert_close(ours.A(x), theirs.A(x), rtol=0.01, atol=0.5)
-    found = ours.A_dagger(ours(x).double())
+    result = ours.A_dagger(ours(x).double())
     errors = torch.tensor([0.1, 30.0, 0.4]).reshape(1, 3, 1, 1)  # standard errors, about
-    assert ((found - x).abs() < 5.0 * errors).all()
+    assert ((result - x).abs() < 5.0 * errors).all()
     with pytest.raises(ValueError, match="depth, intensity and background"):
         ours.A(x[0])
 
@@ -169,8 +174,8 @@ def test_stock_solvers_on_a_step(deepinv, name):
         "TVPrior": (lambda: TVPrior(n_it_max=20), {"stepsize": 0.02, "lambda_reg": 2.0}),
         "MedianFilter": (lambda: PnP(MedianFilter(kernel_size=3)), {"stepsize": 0.005}),
     }[name]
-    found = likelihood_descent(physics, y, prior(), max_iter=60, **options)
-    error = [(each - true).square().mean((0, 2, 3)) for each in (physics.A_dagger(y), found)]
+    result = likelihood_descent(physics, y, prior(), max_iter=60, **options)
+    error = [(each - true).square().mean((0, 2, 3)) for each in (physics.A_dagger(y), result)]
     assert (error[1] < 0.4 * error[0]).all(), error[1] / error[0]
 
 
@@ -188,12 +193,12 @@ def test_stock_solvers_on_a_built_in_room(deepinv, name):
     flux = ml.Scene.example("room", 20, 1).flux(system, signal=0.2, sbr=1.0)
     physics = LidarPhysics(system, images="log", seed=3)
     maps = (flux.signal, flux.background, flux.delay_ns)
-    true = physics.images(*(torch.from_numpy(np.broadcast_to(one, (20, 20)).copy())[None] for one in maps))
+    true = physics.images(*(torch.from_numpy(np.broadcast_to(values, (20, 20)).copy())[None] for values in maps))
     y = physics(true)
     prior, options = {
         "TVPrior": (lambda: TVPrior(n_it_max=20), {"lambda_reg": 2.0}),
         "TVDenoiser": (lambda: PnP(TVDenoiser(n_it_max=20)), {"sigma_denoiser": 0.04}),
     }[name]
-    found = likelihood_descent(physics, y, prior(), stepsize=0.02, max_iter=40, **options)
-    before, after = ((one - true).square().mean((0, 2, 3)).sqrt() for one in (physics.A_dagger(y), found))
+    result = likelihood_descent(physics, y, prior(), stepsize=0.02, max_iter=40, **options)
+    before, after = ((item - true).square().mean((0, 2, 3)).sqrt() for item in (physics.A_dagger(y), result))
     assert (after < before).all()

@@ -40,7 +40,7 @@ def path(tmp_path_factory):
 
 
 def numbers(examples) -> list[tuple[int, int]]:
-    return [(int(one["sample"]), int(one["realization"])) for one in examples]
+    return [(int(example["sample"]), int(example["realization"])) for example in examples]
 
 
 EVERY = [(sample, number) for sample in range(6) for number in range(5)]
@@ -54,13 +54,15 @@ def test_examples_are_the_exposures(path):
     assert len(dataset) == 30
     assert numbers(examples) != EVERY
     assert sorted(numbers(examples)) == EVERY
-    for one in examples:
-        assert one["counts"].shape == (32, 6, 8)
-        assert one["counts"].dtype == torch.float32
-        counts = np.asarray(stored.histogram[int(one["sample"]), int(one["realization"])])
-        np.testing.assert_array_equal(one["counts"].permute(1, 2, 0).numpy(), counts)
-        np.testing.assert_array_equal(one["signal"].numpy(), np.asarray(stored.maps["signal"][int(one["sample"])]))
-        assert one["seed"].item() == int(stored.seeds[int(one["sample"])])
+    for example in examples:
+        assert example["counts"].shape == (32, 6, 8)
+        assert example["counts"].dtype == torch.float32
+        counts = np.asarray(stored.histogram[int(example["sample"]), int(example["realization"])])
+        np.testing.assert_array_equal(example["counts"].permute(1, 2, 0).numpy(), counts)
+        np.testing.assert_array_equal(
+            example["signal"].numpy(), np.asarray(stored.maps["signal"][int(example["sample"])])
+        )
+        assert example["seed"].item() == int(stored.seeds[int(example["sample"])])
     numbered = {"sample", "realization", "scene", "system", "signal_level", "sbr", "seed"}
     assert set(examples[0]) == {"counts", "depth", "signal"} | numbered
 
@@ -80,23 +82,23 @@ def test_the_documented_loop_over_any_dataset_seed(tmp_path, seed):
     train = StoredDataset(tmp_path / "set.zarr", maps=["depth"], seed=1)
     for epoch in range(2):
         train.set_epoch(epoch)
-        told = {}
+        entries = {}
         for batch in DataLoader(train, batch_size=2):
             assert batch["counts"].shape == (2, 32, 4, 5)
-            told |= dict(zip(batch["sample"].tolist(), batch["seed"].tolist(), strict=True))
-        assert told == dict(enumerate(stored.seeds.tolist()))
+            entries |= dict(zip(batch["sample"].tolist(), batch["seed"].tolist(), strict=True))
+        assert entries == dict(enumerate(stored.seeds.tolist()))
 
 
 @pytest.mark.full
 def test_orders(path):
     first, again = (StoredDataset(path, seed=1) for _ in range(2))
-    one, two = numbers(first), numbers(first)
-    assert one != two
-    assert numbers(again) == one
+    single, two = numbers(first), numbers(first)
+    assert single != two
+    assert numbers(again) == single
     again.set_epoch(1)
     assert numbers(again) == two
     assert numbers(StoredDataset(path, shuffle=False)) == EVERY
-    assert numbers(StoredDataset(path, seed=2)) != one
+    assert numbers(StoredDataset(path, seed=2)) != single
 
 
 @pytest.mark.full
@@ -104,7 +106,7 @@ def test_orders(path):
 def test_ranks_have_equally_many_and_none_twice(path, world):
     parts = [numbers(StoredDataset(path, rank=rank, world_size=world, pool=2)) for rank in range(world)]
     assert {len(part) for part in parts} == {30 // world}
-    together = [one for part in parts for one in part]
+    together = [example for part in parts for example in part]
     assert len(set(together)) == len(together) == 30 // world * world
 
 
@@ -114,14 +116,14 @@ def test_some_samples_with_workers_of_a_loader(path):
         batches = list(DataLoader(dataset, batch_size=4, num_workers=2))
     assert batches[0]["counts"].shape == (4, 6, 8, 32)
     assert batches[0]["counts"].dtype == torch.int32
-    found = sorted((int(s), int(r)) for b in batches for s, r in zip(b["sample"], b["realization"], strict=True))
-    assert found == [one for one in EVERY if one[0] in (1, 2, 5)]
+    result = sorted((int(s), int(r)) for b in batches for s, r in zip(b["sample"], b["realization"], strict=True))
+    assert result == [example for example in EVERY if example[0] in (1, 2, 5)]
 
 
 def test_transform_and_bad_arguments(path):
-    dataset = StoredDataset(path, transform=lambda one: one["counts"].sum(0), shuffle=False)
+    dataset = StoredDataset(path, transform=lambda example: example["counts"].sum(0), shuffle=False)
     assert next(iter(dataset)).shape == (6, 8)
-    for options, error, told in (
+    for options, error, message in (
         ({"samples": [6]}, ValueError, r"samples must lie in \[0, 6\), got 6"),
         ({"samples": []}, TypeError, "samples must be a list of integers"),
         ({"maps": ["colour"]}, ValueError, "maps must be one of"),
@@ -131,7 +133,7 @@ def test_transform_and_bad_arguments(path):
         ({"dtype": "float"}, TypeError, "dtype must be a torch.dtype"),
         ({"pool": 0}, ValueError, "pool must be"),
     ):
-        with pytest.raises(error, match=told):
+        with pytest.raises(error, match=message):
             StoredDataset(path, **options)
 
 
@@ -154,15 +156,15 @@ def test_every_layout_chunk_and_type_holds_the_counts(tmp_path, layout, store, d
     ml.generate(recipe, tmp_path / "set.zarr")
     histogram = np.asarray(ml.dataset.open_dataset(tmp_path / "set.zarr").histogram)
     for axes in ("THW", "HWT"):
-        seen = 0
+        observed = 0
         for batch in StoredDataset(tmp_path / "set.zarr", batch_size=5, dtype=dtype, axes=axes):
             assert batch["counts"].dtype == dtype
             stored = histogram[batch["sample"], batch["realization"]]
             order = (0, 3, 1, 2) if axes == "THW" else (0, 1, 2, 3)
             np.testing.assert_array_equal(batch["counts"].to(torch.float64).numpy(), stored.transpose(order))
             assert batch["counts"].permute(0, 2, 3, 1).is_contiguous() == (axes == "THW")
-            seen += len(stored)
-        assert seen == 12
+            observed += len(stored)
+        assert observed == 12
 
 
 def test_a_type_that_is_too_small_is_refused(tmp_path):
@@ -207,7 +209,7 @@ def test_all_ranks_have_equally_many_batches_in_2000_random_configurations(path)
 
 
 def content(batches) -> list[list[tuple[int, int]]]:
-    return [list(zip(one["sample"].tolist(), one["realization"].tolist(), strict=True)) for one in batches]
+    return [list(zip(batch["sample"].tolist(), batch["realization"].tolist(), strict=True)) for batch in batches]
 
 
 @pytest.mark.full
@@ -293,17 +295,17 @@ def test_several_stores_as_one_dataset(path, tmp_path):
     }
     ml.generate(recipe, tmp_path / "more.zarr")
     dataset = StoredDataset([path, tmp_path / "more.zarr"], batch_size=4)
-    found = {}
+    results = {}
     for batch in dataset:
         for k, (store, sample) in enumerate(zip(batch["store"].tolist(), batch["sample"].tolist(), strict=True)):
-            found[store, sample, int(batch["realization"][k])] = batch["counts"][k].permute(1, 2, 0).numpy()
-    assert len(found) == len({key[1:] for key in found}) == 32
+            results[store, sample, int(batch["realization"][k])] = batch["counts"][k].permute(1, 2, 0).numpy()
+    assert len(results) == len({key[1:] for key in results}) == 32
     for number, (where, first) in enumerate(((path, 0), (tmp_path / "more.zarr", 6))):
         stored = np.asarray(ml.dataset.open_dataset(where).histogram)
-        for store, sample, realization in found:
+        for store, sample, realization in results:
             if store == number:
-                np.testing.assert_array_equal(found[store, sample, realization], stored[sample - first, realization])
-    assert {int(one["store"]) for one in StoredDataset([path, tmp_path / "more.zarr"], samples=[6])} == {1}
+                np.testing.assert_array_equal(results[store, sample, realization], stored[sample - first, realization])
+    assert {int(example["store"]) for example in StoredDataset([path, tmp_path / "more.zarr"], samples=[6])} == {1}
     recipe["scenes"]["size"] = [6, 9]
     ml.generate(recipe, tmp_path / "other.zarr")
     with pytest.raises(ValueError, match="must have the same images and bins"):
@@ -351,9 +353,9 @@ def test_two_ranks_train_three_epochs_on_uneven_data(path):
     printed = [rank.communicate(timeout=300)[0].splitlines() for rank in ranks]
     assert [rank.returncode for rank in ranks] == [0, 0]
     epochs = []
-    for one, other in zip(*printed, strict=True):
-        assert one[0] == other[0]
-        numbers = [json.loads(line[2:]) for line in (one, other)]
+    for first, other in zip(*printed, strict=True):
+        assert first[0] == other[0]
+        numbers = [json.loads(line[2:]) for line in (first, other)]
         assert [len(each) for each in numbers] == [12, 12]
         assert len({*numbers[0], *numbers[1]}) == 24
         epochs.append(tuple(numbers[0]))

@@ -45,8 +45,8 @@ def loader(dataset, workers, **changes) -> DataLoader:
 
 def flat(example, prefix="") -> dict[str, torch.Tensor]:
     out = {}
-    for name, one in example.items():
-        out.update(flat(one, f"{name}.") if isinstance(one, dict) else {prefix + name: one})
+    for name, value in example.items():
+        out.update(flat(value, f"{name}.") if isinstance(value, dict) else {prefix + name: value})
     return out
 
 
@@ -72,7 +72,7 @@ def test_batches_do_not_depend_on_workers(workers, settings):
     for first, second in zip(alone, together, strict=True):
         if first["counts"].is_sparse:
             assert second["counts"].is_coalesced()
-            first, second = ({**one, "counts": one["counts"].to_dense()} for one in (first, second))
+            first, second = ({**example, "counts": example["counts"].to_dense()} for example in (first, second))
         assert_same(first, second)
 
 
@@ -81,13 +81,13 @@ def test_batches_do_not_depend_on_workers(workers, settings):
 def test_single_samples_are_those_of_the_batches():
     dataset = stream(repeat=True)
     alone = list(dataset)
-    assert [int(one["index"]) for one in alone] == list(range(22))
+    assert [int(example["index"]) for example in alone] == list(range(22))
     for workers in (0, 2, 4):
-        for one in loader(dataset, workers, batch_size=None):
-            assert_same(one, alone[int(one["index"])])
+        for example in loader(dataset, workers, batch_size=None):
+            assert_same(example, alone[int(example["index"])])
     batch = next(iter(stream(batch_size=4)))
     for place in range(4):
-        assert_same({name: one[place] for name, one in flat(batch).items()}, flat(alone[place]))
+        assert_same({name: value[place] for name, value in flat(batch).items()}, flat(alone[place]))
 
 
 def test_epochs_seeds_and_threads_differ_or_not_as_they_should():
@@ -95,23 +95,23 @@ def test_epochs_seeds_and_threads_differ_or_not_as_they_should():
     assert_same(first, next(iter(stream(threads=2))))
     other = stream()
     other.set_epoch(1)
-    for one in (next(iter(other)), next(iter(stream(seed=4)))):
-        assert not torch.equal(first["counts"], one["counts"])
-        assert int(one["seed"]) != int(first["seed"])
+    for example in (next(iter(other)), next(iter(stream(seed=4)))):
+        assert not torch.equal(first["counts"], example["counts"])
+        assert int(example["seed"]) != int(first["seed"])
     assert_same(first, next(iter(other.__class__(SYSTEMS, size=6, seed=3))))  # without end: the same samples
 
 
 def indices(examples) -> list[list[int]]:
-    return [one["index"].reshape(-1).tolist() + one["seed"].reshape(-1).tolist() for one in examples]
+    return [example["index"].reshape(-1).tolist() + example["seed"].reshape(-1).tolist() for example in examples]
 
 
 def passes(dataset, number: int) -> list[list[list[int]]]:
     """What the first epochs of a stream give, each set by hand."""
-    found = []
+    results = []
     for epoch in range(number):
         dataset.set_epoch(epoch)
-        found.append(indices(dataset))
-    return found
+        results.append(indices(dataset))
+    return results
 
 
 @pytest.mark.full
@@ -120,7 +120,7 @@ def passes(dataset, number: int) -> list[list[list[int]]]:
 @pytest.mark.parametrize("workers", [0, 1, 3])
 def test_epochs_advance_by_themselves(workers, lives_on):
     wanted = passes(stream(batch_size=3), 5)
-    assert len({str(one) for one in wanted}) == 5
+    assert len({str(example) for example in wanted}) == 5
     dataset = stream(batch_size=3)
     made = loader(dataset, workers, batch_size=None, persistent_workers=lives_on and workers > 0)
     assert dataset.epoch == 0
@@ -183,9 +183,9 @@ def test_a_plain_loader_resumes_twice_with_other_numbers_of_workers(workers, the
     assert indices(third) == wanted[2 + taken :]
 
 
-@pytest.mark.parametrize(("batch_size", "told"), [(3, "stacks the batches"), (None, "worker by worker")])
-def test_a_loader_that_stacks_is_warned_of(batch_size, told):
-    with pytest.warns(UserWarning, match=told):
+@pytest.mark.parametrize(("batch_size", "message"), [(3, "stacks the batches"), (None, "worker by worker")])
+def test_a_loader_that_stacks_is_warned_of(batch_size, message):
+    with pytest.warns(UserWarning, match=message):
         next(iter(loader(stream(batch_size=batch_size), 0, batch_size=2)))
 
 
@@ -237,7 +237,11 @@ def test_workers_that_live_on_hear_of_epochs():
 @pytest.mark.parametrize("batch_size", [None, 3])
 def test_ranks_share_an_epoch(batch_size):
     parts = [
-        [int(k) for one in stream(batch_size=batch_size, rank=rank, world_size=4) for k in one["index"].reshape(-1)]
+        [
+            int(k)
+            for example in stream(batch_size=batch_size, rank=rank, world_size=4)
+            for k in example["index"].reshape(-1)
+        ]
         for rank in range(4)
     ]
     assert {len(part) for part in parts} == {5}
@@ -275,18 +279,18 @@ def test_resume(world):
 def test_cube_is_that_of_the_sample():
     """What is given is what `simulate` makes of the sample's flux, system and seed."""
     dataset = stream(axes="HWT", dtype=None)
-    for one in itertools.islice(iter(dataset), 8):
-        told = dataset.sample(int(one["index"]))
-        cube = ml.simulate(told.flux, told.system, seed=told.seed)[0]
-        np.testing.assert_array_equal(one["counts"].numpy(), cube)
-        np.testing.assert_array_equal(one["flux"]["signal"].numpy(), told.flux.signal.astype(np.float32))
-        assert int(one["seed"]) == told.seed
+    for example in itertools.islice(iter(dataset), 8):
+        stated = dataset.sample(int(example["index"]))
+        cube = ml.simulate(stated.flux, stated.system, seed=stated.seed)[0]
+        np.testing.assert_array_equal(example["counts"].numpy(), cube)
+        np.testing.assert_array_equal(example["flux"]["signal"].numpy(), stated.flux.signal.astype(np.float32))
+        assert int(example["seed"]) == stated.seed
         np.testing.assert_allclose(
-            one["flux"]["delay"], told.system.delay_ns(one["depth"].numpy().astype(float)), rtol=1e-6
+            example["flux"]["delay"], stated.system.delay_ns(example["depth"].numpy().astype(float)), rtol=1e-6
         )
-        assert float(one["system"]["cycles"]) == told.system.cycles
-        np.testing.assert_allclose(one["signal_level"], told.flux.signal.mean(), rtol=1e-6)
-        np.testing.assert_allclose(one["sbr"], told.flux.signal.mean() / told.flux.background.mean(), rtol=1e-6)
+        assert float(example["system"]["cycles"]) == stated.system.cycles
+        np.testing.assert_allclose(example["signal_level"], stated.flux.signal.mean(), rtol=1e-6)
+        np.testing.assert_allclose(example["sbr"], stated.flux.signal.mean() / stated.flux.background.mean(), rtol=1e-6)
 
 
 def test_flips_and_crops_turn_maps_and_cube_together():
@@ -294,20 +298,20 @@ def test_flips_and_crops_turn_maps_and_cube_together():
     depth = np.arange(1.0, 101.0).reshape(10, 10) * 0.14
     scene = ml.Scene(depth, 0.5 + 0.005 * np.arange(100.0).reshape(10, 10))
     bright = SYSTEM.replace(cycles=400, pulse=ml.GaussianPulse(sigma_ns=0.05), bins=1000)
-    seen = set()
-    for one in stream(bright, scene, size=(4, 5), epoch_size=40, signal=2.0, sbr=math.inf):
-        place = np.rint(one["depth"].numpy() / 0.14).astype(int) - 1
+    recorded = set()
+    for example in stream(bright, scene, size=(4, 5), epoch_size=40, signal=2.0, sbr=math.inf):
+        place = np.rint(example["depth"].numpy() / 0.14).astype(int) - 1
         rows, columns = place // 10, place % 10
         down, right = rows[1, 0] - rows[0, 0], columns[0, 1] - columns[0, 0]
         np.testing.assert_array_equal(rows, rows[:1, :1] + down * np.arange(4)[:, None] + 0 * columns)
         np.testing.assert_array_equal(columns, columns[:1, :1] + right * np.arange(5) + 0 * rows)
-        seen.add((int(down), int(right)))
-        np.testing.assert_allclose(one["reflectivity"], scene.reflectivity[rows, columns], rtol=1e-6)
-        peak = (one["counts"].argmax(0).numpy() + 0.5) * bright.bin_ns
-        np.testing.assert_allclose(peak, bright.delay_ns(one["depth"].numpy()), atol=3 * 0.05 + bright.bin_ns)
-    assert seen == {(1, 1), (1, -1), (-1, 1), (-1, -1)}
-    for one in stream(bright, scene, size=10, epoch_size=3, flips=False):
-        np.testing.assert_allclose(one["depth"], depth, rtol=1e-6)
+        recorded.add((int(down), int(right)))
+        np.testing.assert_allclose(example["reflectivity"], scene.reflectivity[rows, columns], rtol=1e-6)
+        peak = (example["counts"].argmax(0).numpy() + 0.5) * bright.bin_ns
+        np.testing.assert_allclose(peak, bright.delay_ns(example["depth"].numpy()), atol=3 * 0.05 + bright.bin_ns)
+    assert recorded == {(1, 1), (1, -1), (-1, 1), (-1, -1)}
+    for example in stream(bright, scene, size=10, epoch_size=3, flips=False):
+        np.testing.assert_allclose(example["depth"], depth, rtol=1e-6)
 
 
 def test_ranges():
@@ -316,26 +320,26 @@ def test_ranges():
         SYSTEMS, size=4, signal=LogUniform(0.1, 10), sbr=Choice([1, 2.5]), depth_scale=Uniform(0.5, 2), seed=8
     )
     samples = [dataset.sample(k) for k in range(600)]
-    systems = [one.system for one in samples]
+    systems = [example.system for example in samples]
 
     def uniform(values, low, high):
         assert min(values) >= low
         assert max(values) <= high
         assert stats.kstest(values, "uniform", (low, high - low)).pvalue > 1e-4
 
-    uniform([math.log(one.signal_level) for one in samples], math.log(0.1) - 1e-12, math.log(10) + 1e-12)
-    uniform([one.period_ns for one in systems], 80, 120)
-    uniform([math.log(one.pulse.sigma_ns) for one in systems], math.log(0.2) - 1e-12, math.log(2) + 1e-12)
-    assert {10 <= one.cycles <= 200 for one in systems} == {True}
+    uniform([math.log(example.signal_level) for example in samples], math.log(0.1) - 1e-12, math.log(10) + 1e-12)
+    uniform([example.period_ns for example in systems], 80, 120)
+    uniform([math.log(example.pulse.sigma_ns) for example in systems], math.log(0.2) - 1e-12, math.log(2) + 1e-12)
+    assert {10 <= each.cycles <= 200 for each in systems} == {True}
     for values, allowed in (
-        ([one.sbr for one in samples], {1.0, 2.5}),
-        ([one.detector.dead_time_ns for one in systems], {0.0, 20.0, 150.0}),
+        ([example.sbr for example in samples], {1.0, 2.5}),
+        ([example.detector.dead_time_ns for example in systems], {0.0, 20.0, 150.0}),
     ):
-        counts = [values.count(one) for one in sorted(allowed)]
+        counts = [values.count(value) for value in sorted(allowed)]
         assert sum(counts) == 600
         assert stats.chisquare(counts).pvalue > 1e-4
-    assert len({one.seed for one in samples}) == 600
-    lengths = {one.scene.depth_m.max() for one in samples}
+    assert len({example.seed for example in samples}) == 600
+    lengths = {example.scene.depth_m.max() for example in samples}
     assert len(lengths) > 500  # crops and scales differ
 
 
@@ -353,7 +357,7 @@ def test_given_scenes_all_come_before_any_again(tmp_path):
         np.savez(tmp_path / f"{k}.npz", depth=scene.depth_m, reflectivity=scene.reflectivity)
     orders = []
     for source in (scenes, tmp_path):
-        depths = [float(one["depth"][0, 0]) for one in stream(SYSTEM, source, size=None, epoch_size=10)]
+        depths = [float(example["depth"][0, 0]) for example in stream(SYSTEM, source, size=None, epoch_size=10)]
         assert sorted(depths[:5]) == sorted(depths[5:]) == [1, 2, 3, 4, 5]
         assert depths[:5] != depths[5:]
         orders.append(depths)
@@ -366,21 +370,21 @@ def test_arrays_are_scenes(tmp_path):
     depth, reflectivity = random.uniform(1, 9, (5, 6, 7)), random.uniform(0.1, 1, (5, 6, 7))
     np.save(tmp_path / "depth.npy", depth)
     maps = {"depth": np.load(tmp_path / "depth.npy", mmap_mode="r"), "reflectivity": torch.from_numpy(reflectivity)}
-    scenes = [ml.Scene(*one) for one in zip(depth, reflectivity, strict=True)]
+    scenes = [ml.Scene(*example) for example in zip(depth, reflectivity, strict=True)]
     for first, second in zip(stream(SYSTEM, maps, epoch_size=10), stream(SYSTEM, scenes, epoch_size=10), strict=True):
         assert_same(first, second)
-    whole = [one["depth"] for one in stream(SYSTEM, depth, size=None, flips=False, epoch_size=5)]
-    assert sorted(float(one[0, 0]) for one in whole) == sorted(depth[:, 0, 0].astype(np.float32).tolist())
+    whole = [example["depth"] for example in stream(SYSTEM, depth, size=None, flips=False, epoch_size=5)]
+    assert sorted(float(example[0, 0]) for example in whole) == sorted(depth[:, 0, 0].astype(np.float32).tolist())
     assert next(iter(stream(SYSTEM, depth[0], size=None)))["counts"].shape == (64, 6, 7)
     assert float(next(iter(stream(SYSTEM, depth)))["reflectivity"].min()) == 1.0
-    for wrong, told in (
+    for wrong, message in (
         ({"depth": depth, "reflectivity": reflectivity[:4]}, "maps of one shape"),
         ({"depths": depth}, "maps 'depth'"),
         (depth[None], r"depth map \(n, H, W\)"),
         (-depth, "depth_m must be in"),
         ((depth, reflectivity), "dictionary of arrays"),
     ):
-        with pytest.raises((ValueError, TypeError), match=told):
+        with pytest.raises((ValueError, TypeError), match=message):
             stream(SYSTEM, wrong)
 
 
@@ -391,9 +395,9 @@ def test_scenes_of_other_workers_are_whole_or_none():
     assert shared.get(3) is None
     for number, scene in scenes.items():
         shared.put(number, scene)
-        found = shared.get(number)
-        np.testing.assert_array_equal(found.depth_m, scene.depth_m)
-        np.testing.assert_array_equal(found.reflectivity, scene.reflectivity)
+        result = shared.get(number)
+        np.testing.assert_array_equal(result.depth_m, scene.depth_m)
+        np.testing.assert_array_equal(result.reflectivity, scene.reflectivity)
     assert shared.get(3) is None  # 67 took its place
     place = 67 % 64
     shared._heads[place, 0] = 3
@@ -418,8 +422,8 @@ def test_maps_of_a_dataset_are_scenes(tmp_path):
     maps = ml.dataset.open_dataset(tmp_path / "set.zarr").maps
     dataset = stream(SYSTEMS, tmp_path / "set.zarr", epoch_size=6, flips=False, size=None, repeat=True)
     alone = list(dataset)
-    depths = sorted(float(one[0, 0]) for one in maps["depth"][:])
-    assert sorted(float(one["depth"][0, 0]) for one in alone[:3]) == pytest.approx(depths, rel=1e-6)
+    depths = sorted(float(depth[0, 0]) for depth in maps["depth"][:])
+    assert sorted(float(example["depth"][0, 0]) for example in alone[:3]) == pytest.approx(depths, rel=1e-6)
     for first, second in zip(alone, loader(dataset, 2, batch_size=None), strict=True):
         assert_same(first, second)
 
@@ -430,10 +434,10 @@ def test_bad_files_are_left_out_and_told(tmp_path):
     np.savez(tmp_path / "dark.npz", depth=np.full((6, 6), np.nan))
     (tmp_path / "torn.npz").write_bytes((tmp_path / "0.npz").read_bytes()[:60])
     dataset = stream(SYSTEM, tmp_path, epoch_size=10)
-    with pytest.warns(UserWarning, match="left out of the stream") as told:
-        depths = [float(one["depth"][0, 0]) for one in dataset]
-    assert len(told) == 2  # each once
-    assert {"dark.npz" in str(one.message) for one in told} == {True, False}
+    with pytest.warns(UserWarning, match="left out of the stream") as warned:
+        depths = [float(example["depth"][0, 0]) for example in dataset]
+    assert len(warned) == 2  # each once
+    assert {"dark.npz" in str(warning.message) for warning in warned} == {True, False}
     assert set(depths) == {1.0, 2.0, 3.0}
     for k in range(3):
         (tmp_path / f"{k}.npz").unlink()
@@ -447,9 +451,12 @@ def test_crops_find_the_only_return():
     depth = np.full((50, 50), np.nan)
     depth[49, 0] = 3.0
     depth[20, 30] = 4.0
-    seen = [np.argwhere(np.isfinite(one["depth"].numpy())) for one in stream(SYSTEM, depth, epoch_size=40, flips=False)]
-    assert {len(one) for one in seen} == {1}
-    assert len({tuple(one[0]) for one in seen}) > 5
+    places = [
+        np.argwhere(np.isfinite(example["depth"].numpy()))
+        for example in stream(SYSTEM, depth, epoch_size=40, flips=False)
+    ]
+    assert {len(place) for place in places} == {1}
+    assert len({tuple(place[0]) for place in places}) > 5
     with pytest.raises(ValueError, match="a scene must have a pixel with a return"):
         next(iter(stream(SYSTEM, np.full((8, 8), np.nan))))
 
@@ -459,20 +466,20 @@ def test_ranks_of_torchrun(monkeypatch):
     for rank in range(2):
         monkeypatch.setenv("RANK", str(rank))
         monkeypatch.setenv("WORLD_SIZE", "2")
-        assert [int(one["index"]) for one in stream(epoch_size=5)] == [rank, rank + 2]
-        assert [int(one["index"]) for one in stream(epoch_size=2, rank=0, world_size=1)] == [0, 1]
+        assert [int(example["index"]) for example in stream(epoch_size=5)] == [rank, rank + 2]
+        assert [int(example["index"]) for example in stream(epoch_size=2, rank=0, world_size=1)] == [0, 1]
     monkeypatch.delenv("RANK")
     assert len(stream(epoch_size=5)) == 5
 
 
 def test_buffers_are_not_given_out_while_they_are_held():
     dataset = stream(SYSTEM, batch_size=2, epoch_size=40, repeat=True)
-    held = [one["counts"][0] for one in dataset]  # a view keeps the memory
-    copies = [one["counts"][0].clone() for one in dataset]
-    assert len({one.data_ptr() for one in held}) == len(held)
+    held = [example["counts"][0] for example in dataset]  # a view keeps the memory
+    copies = [example["counts"][0].clone() for example in dataset]
+    assert len({example.data_ptr() for example in held}) == len(held)
     for first, second in zip(held, copies, strict=True):
         assert torch.equal(first, second)
-    freed = {one["counts"].data_ptr() for one in dataset}
+    freed = {example["counts"].data_ptr() for example in dataset}
     assert len(freed) <= 6  # memory is used again
 
 
@@ -489,13 +496,13 @@ def test_what_workers_pass_on_is_not_overwritten_while_it_is_held(settings):
     As PyTorch sees them they are ordinary tensors, also where the loader stacks them, and after a transform.
     """
     dataset = stream(SYSTEM, epoch_size=40, repeat=True, **settings)
-    held = [(one["counts"][..., :3].numpy(), one) for one in loader(dataset, 2, batch_size=None)]
-    for (part, one), alone in zip(held, dataset, strict=True):
-        assert type(one["counts"]) is torch.Tensor
-        assert_same(one, alone)
+    held = [(example["counts"][..., :3].numpy(), example) for example in loader(dataset, 2, batch_size=None)]
+    for (part, example), alone in zip(held, dataset, strict=True):
+        assert type(example["counts"]) is torch.Tensor
+        assert_same(example, alone)
         assert np.array_equal(part, alone["counts"][..., :3].numpy())
-        one["counts"].zero_()  # it is the receiver's own
-    again = [one["counts"].data_ptr() for one in loader(dataset, 1, batch_size=None)]
+        example["counts"].zero_()  # it is the receiver's own
+    again = [example["counts"].data_ptr() for example in loader(dataset, 1, batch_size=None)]
     assert len(set(again)) <= 6
     changed = list(loader(stream(SYSTEM, epoch_size=4, transform=_half), 1, batch_size=None))
     for (part, rest), alone in zip(changed, stream(SYSTEM, epoch_size=4), strict=True):
@@ -512,8 +519,8 @@ def test_what_workers_pass_on_is_not_overwritten_while_it_is_held(settings):
 def test_examples_are_made_ahead_in_order_and_what_fails_is_told():
     alone = list(stream(SYSTEM, epoch_size=7, ahead=0))
     for number in (1, 3):
-        for one, other in zip(stream(SYSTEM, epoch_size=7, ahead=number), alone, strict=True):
-            assert_same(one, other)
+        for first, other in zip(stream(SYSTEM, epoch_size=7, ahead=number), alone, strict=True):
+            assert_same(first, other)
     made: list[int] = []
 
     def items():
@@ -551,7 +558,7 @@ def test_mixed_counts_and_types():
     wide = SYSTEM.replace(detector=ml.Detector(dead_time_ns=0.0))
     assert wide.histogram_dtype == np.uint32
     raw = list(stream([SYSTEM, wide], dtype=None, batch_size=4))
-    assert {one["counts"].dtype for one in raw} == {torch.uint32}
+    assert {example["counts"].dtype for example in raw} == {torch.uint32}
     for dtype in (torch.float64, torch.float16, torch.bfloat16, torch.int32):
         for first, second in zip(raw, stream([SYSTEM, wide], dtype=dtype, batch_size=4), strict=True):
             assert second["counts"].dtype == dtype
@@ -559,7 +566,7 @@ def test_mixed_counts_and_types():
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "message"),
     [
         ({"epoch_size": 0}, "epoch_size must be an integer"),
         ({"batch_size": 0}, "batch_size must be an integer"),
@@ -582,8 +589,8 @@ def test_mixed_counts_and_types():
         ({"reuse": 0}, "reuse must be an integer"),
     ],
 )
-def test_bad_arguments(changes, told):
-    with pytest.raises((ValueError, TypeError), match=told):
+def test_bad_arguments(changes, message):
+    with pytest.raises((ValueError, TypeError), match=message):
         CubeStream(**{"systems": SYSTEM, "size": 6} | changes)
 
 
@@ -607,9 +614,9 @@ def test_bad_ranges_are_told_before_any_work():
 
 @pytest.mark.parametrize("seed", range(3))
 def test_random_scenes_are_whole_and_different(seed):
-    one, again, other = (ml.Scene.example("random", 24, k) for k in (seed, seed, seed + 100))
-    np.testing.assert_array_equal(one.depth_m, again.depth_m)
-    assert not np.array_equal(one.depth_m, other.depth_m)
-    assert one.valid.all()
-    assert 0.3 < one.depth_m.min() < one.depth_m.max() < 17.5
-    assert one.reflectivity.max() > 0.02
+    first, again, other = (ml.Scene.example("random", 24, k) for k in (seed, seed, seed + 100))
+    np.testing.assert_array_equal(first.depth_m, again.depth_m)
+    assert not np.array_equal(first.depth_m, other.depth_m)
+    assert first.valid.all()
+    assert 0.3 < first.depth_m.min() < first.depth_m.max() < 17.5
+    assert first.reflectivity.max() > 0.02

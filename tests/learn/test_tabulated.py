@@ -30,7 +30,7 @@ def table() -> ml.Table:
 
 
 def point(*values, dtype=torch.float64):
-    return [torch.tensor(one, dtype=dtype, requires_grad=True) for one in values]
+    return [torch.tensor(value, dtype=dtype, requires_grad=True) for value in values]
 
 
 @pytest.mark.full
@@ -49,10 +49,10 @@ def test_it_is_the_exact_mean_histogram(sigma_ns, dead_ns, start, error):
     s = np.array([0.1, 1.0, 5.0, 5.0, 0.0, 1.0, 5.02])
     b = np.array([0.05, 1.0, 0.05, 2.0, 1.0, 0.0, 0.99])
     tau = np.array([40.03, 50.0, 99.98, 75.02, 5.0, 0.01, 20.07])
-    found = HistogramTable(table)(*point(s, b, tau, dtype=torch.float32)).detach().double().numpy()
+    result = HistogramTable(table)(*point(s, b, tau, dtype=torch.float32)).detach().double().numpy()
     exact = ml.statistics.mean_histogram(ml.Flux(s, b, tau), table.system)
-    assert (found >= 0.0).all()
-    off = np.abs(found - exact).sum(-1) / 2 / exact.sum(-1)
+    assert (result >= 0.0).all()
+    off = np.abs(result - exact).sum(-1) / 2 / exact.sum(-1)
     assert (off < error).all(), off
 
 
@@ -79,7 +79,7 @@ def test_kinks_at_the_nodes_are_as_small_as_is_said():
         others = [torch.tensor([0.999 * x], dtype=torch.float64) for x in nodes]
 
         def along(x, place=place, others=others):
-            return model(*(x if k == place else one for k, one in enumerate(others)))[0]
+            return model(*(x if k == place else other for k, other in enumerate(others)))[0]
 
         below, above = (
             torch.autograd.functional.jacobian(along, torch.tensor([nodes[place] * (1.0 + step)], dtype=torch.float64))
@@ -94,9 +94,9 @@ def test_delay_moves_it_continuously_and_keeps_the_total(table):
     near = 33.0 + bin_ns * torch.tensor([1 - 1e-9, 1.0, 1 + 1e-9], dtype=torch.float64)
     delay = torch.cat([torch.linspace(33.0, 33.5, 50).double(), near])
     level = torch.tensor(3.0).double(), torch.tensor(0.5).double()
-    one = model(*level, delay)
-    torch.testing.assert_close(one.sum(-1), one.sum(-1)[:1].expand(53), rtol=1e-12, atol=0)
-    torch.testing.assert_close(one[-3], one[-1], rtol=1e-6, atol=1e-6)
+    single = model(*level, delay)
+    torch.testing.assert_close(single.sum(-1), single.sum(-1)[:1].expand(53), rtol=1e-12, atol=0)
+    torch.testing.assert_close(single[-3], single[-1], rtol=1e-6, atol=1e-6)
     whole = model(*level, torch.tensor([33.0, 33.0 + 7 * bin_ns, 133.0]).double())
     torch.testing.assert_close(whole[1], torch.roll(whole[0], 7, -1))
     torch.testing.assert_close(whole[2], whole[0])
@@ -106,17 +106,17 @@ def test_delay_moves_it_continuously_and_keeps_the_total(table):
 def test_it_leads_back_to_the_pixel_of_an_exact_mean(table):
     """From a mean histogram that no table knows, by its gradients alone (L-BFGS), pixel by pixel of a map."""
     true = np.array([[1.0, 0.5, 61.3], [3.0, 1.5, 12.34], [0.5, 0.1, 99.9]])
-    one = table.system
-    mean = torch.from_numpy(ml.statistics.mean_histogram(ml.Flux(*true.T), one))
-    fine = HistogramTable(ml.Table.build(one, (0.2, 5.0, 24), (0.05, 2.0, 16), threads=1)).double()
+    single = table.system
+    mean = torch.from_numpy(ml.statistics.mean_histogram(ml.Flux(*true.T), single))
+    fine = HistogramTable(ml.Table.build(single, (0.2, 5.0, 24), (0.05, 2.0, 16), threads=1)).double()
     x = (torch.from_numpy(true) * torch.tensor([0.8, 1.3, 1.0]) + torch.tensor([0.0, 0.0, 0.4])).requires_grad_()
     optimizer = torch.optim.LBFGS([x], max_iter=60, line_search_fn="strong_wolfe", tolerance_change=1e-12)
 
     def loss():
         optimizer.zero_grad()
         s, b, tau = x.unbind(-1)
-        found = fine(s.clamp(0.0, 5.0), b.clamp(0.0, 2.0), tau)
-        value = (found - mean * torch.log(found.clamp_min(1e-12))).sum() / 1000
+        result = fine(s.clamp(0.0, 5.0), b.clamp(0.0, 2.0), tau)
+        value = (result - mean * torch.log(result.clamp_min(1e-12))).sum() / 1000
         value.backward()
         return value
 
@@ -129,7 +129,7 @@ def test_bad_arguments(table):
     model = HistogramTable(table)
     maps = torch.full((2, 3), 0.5), torch.tensor(0.5), torch.tensor(30.0)
     assert model(*maps).shape == (2, 3, 1024)
-    assert model(*(one.double() for one in maps)).dtype == torch.float64
+    assert model(*(values.double() for values in maps)).dtype == torch.float64
     assert model(*(torch.zeros(0) for _ in range(3))).shape == (0, 1024)
     assert "6 x 5 x 1024, 1000 cycles" in repr(model)
     with pytest.raises(ValueError, match=r"signal must lie in the table's \[0, 5.1\] .* got 6 to 6"):

@@ -21,7 +21,7 @@ SKEWED = ml.SampledPulse([0, 4, 10, 7, 4, 2.5, 1.5, 1, 0.5, 0.2], 0.7)
 PIXELS = 3000
 
 
-def found(system: ml.System, signal: float, background: float, delays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def delays_of(system: ml.System, signal: float, background: float, delays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Errors of the delay, ns, of the centroid and of the peak."""
     flux = ml.Flux(np.full((1, delays.size), signal), background, delays[None])
     cube = ml.simulate(flux, system, seed=3)[0]
@@ -36,7 +36,7 @@ def found(system: ml.System, signal: float, background: float, delays: np.ndarra
 def test_bias_and_spread(pulse):
     system = SYSTEM.replace(pulse=pulse)
     delays = np.random.default_rng(1).uniform(0.0, 100.0, PIXELS)  # also round the end of the period
-    centroid, peak = found(system, 0.005, 0.0, delays)
+    centroid, peak = delays_of(system, 0.005, 0.0, delays)
     z = centroid.mean() / (centroid.std() / np.sqrt(PIXELS))
     # bins are 1 ns: the truncated window and the finite bin leave up to 0.01 ns
     allowed = 0.01 / (centroid.std() / np.sqrt(PIXELS))
@@ -48,7 +48,7 @@ def test_bias_and_spread(pulse):
 
 
 def test_with_background_and_where_nothing_is_seen():
-    centroid, peak = found(SYSTEM, 0.005, 0.005, np.linspace(0.0, 99.9, PIXELS))
+    centroid, peak = delays_of(SYSTEM, 0.005, 0.005, np.linspace(0.0, 99.9, PIXELS))
     assert abs(centroid.mean()) < 0.03
     assert np.sqrt(np.mean(centroid**2)) < np.sqrt(np.mean(peak**2))
     empty = np.zeros((2, 100), np.uint16)

@@ -33,13 +33,13 @@ def cube(signal: float, background: float, truth: ml.System, seed: int) -> np.nd
 @pytest.mark.parametrize(("signal", "background"), [(0.6, 0.4), (0.05, 0.05), (3.0, 0.5)])
 def test_pixels_of_the_model_fit(signal: float, background: float) -> None:
     """No more p-values below 1 % of 400 than chance has at 1e-4, and half of them not far from above a half."""
-    found = ml.reconstruct(cube(signal, background, system(), 1), system(), threads=1)
-    assert found.p_value is not None
-    small = int((found.p_value < 0.01).sum())
-    assert binom.sf(small - 1, found.p_value.size, 0.01) > 1e-4
-    assert 0.3 < (found.p_value < 0.5).mean() < 0.6  # four tests together are conservative in the middle
-    assert found.misfits < 0.015
-    assert found.advice == ""
+    estimate = ml.reconstruct(cube(signal, background, system(), 1), system(), threads=1)
+    assert estimate.p_value is not None
+    small = int((estimate.p_value < 0.01).sum())
+    assert binom.sf(small - 1, estimate.p_value.size, 0.01) > 1e-4
+    assert 0.3 < (estimate.p_value < 0.5).mean() < 0.6  # four tests together are conservative in the middle
+    assert estimate.misfits < 0.015
+    assert estimate.advice == ""
 
 
 @pytest.mark.parametrize(
@@ -57,27 +57,27 @@ def test_a_wrong_dead_time_or_pulse_is_flagged_in_99_of_100(dead: float, sigma: 
     """At 5,000 photons a pixel."""
     counts = cube(0.6, 0.4, system(), 2)
     assert 4500 < counts.sum(-1).mean() < 5600
-    found = ml.reconstruct(counts, system(dead, sigma), threads=1)
-    assert (found.flags & Flags.MISFIT > 0).mean() >= 0.99
-    assert found.advice.startswith(words)
+    estimate = ml.reconstruct(counts, system(dead, sigma), threads=1)
+    assert (estimate.flags & Flags.MISFIT > 0).mean() >= 0.99
+    assert estimate.advice.startswith(words)
 
 
 def test_a_wrong_dead_time_in_dim_light_is_flagged_as_far_as_its_photons_tell_it() -> None:
     """At S = 0.1, B = 0.4 5,000 photons hold 1.6 standard deviations of 20 % less dead time: 7 % could be flagged."""
     cycles = round(5000 / (cube(0.1, 0.4, system(), 4).sum(-1).mean() / 8000))
     counts = cube(0.1, 0.4, system().replace(cycles=cycles), 4)
-    found = ml.reconstruct(counts, system(40.0).replace(cycles=cycles), threads=1)
-    assert found.longer is not None
-    told = float(found.longer.mean())  # 400 scores of unit variance
-    assert 1.4 < told < 1.8
-    flagged, most = int((found.flags & Flags.MISFIT > 0).sum()), norm.sf(norm.isf(1e-3) - told)
+    estimate = ml.reconstruct(counts, system(40.0).replace(cycles=cycles), threads=1)
+    assert estimate.longer is not None
+    mean_score = float(estimate.longer.mean())  # 400 scores of unit variance
+    assert 1.4 < mean_score < 1.8
+    flagged, most = int((estimate.flags & Flags.MISFIT > 0).sum()), norm.sf(norm.isf(1e-3) - mean_score)
     assert flagged <= 400 * most + 5.0 * (400 * most * (1.0 - most)) ** 0.5
 
 
 def test_a_dead_time_of_several_periods_and_a_dim_pixel() -> None:
     truth = system(dead=230.0)
-    found = ml.reconstruct(cube(0.8, 0.4, truth, 3), truth, threads=1)
-    assert found.misfits < 0.015
+    estimate = ml.reconstruct(cube(0.8, 0.4, truth, 3), truth, threads=1)
+    assert estimate.misfits < 0.015
     empty = ml.reconstruct(np.zeros((2, 500), np.uint16), system(), threads=1)
     assert np.isnan(empty.p_value).all()
     assert not (empty.flags & Flags.MISFIT).any()
@@ -157,15 +157,15 @@ def test_p_value_of_statistics() -> None:
 def test_short_dead_times_fit(dead: float) -> None:
     """Dead times of about a bin (0.2 ns): a bin's own registrations must not decide their score."""
     truth = system(dead=dead)
-    found = ml.reconstruct(cube(0.0, 0.3, truth, 5), truth, threads=1)
-    assert found.p_value is not None
-    small = int((found.p_value < 0.01).sum())
-    assert binom.sf(small - 1, found.p_value.size, 0.01) > 1e-4
+    estimate = ml.reconstruct(cube(0.0, 0.3, truth, 5), truth, threads=1)
+    assert estimate.p_value is not None
+    small = int((estimate.p_value < 0.01).sum())
+    assert binom.sf(small - 1, estimate.p_value.size, 0.01) > 1e-4
 
 
 def test_a_pulse_away_from_its_delay() -> None:
     """Samples that begin 20 ns after the delay: wider, it lies elsewhere."""
     pulse = ml.SampledPulse(values=[*([0.0] * 50), 1.0, 3.0, 2.0, 1.0], bin_ns=0.4, origin="first")
     truth = system().replace(pulse=pulse)
-    found = ml.reconstruct(cube(0.6, 0.4, truth, 6), truth, threads=1)
-    assert found.misfits < 0.015
+    estimate = ml.reconstruct(cube(0.6, 0.4, truth, 6), truth, threads=1)
+    assert estimate.misfits < 0.015

@@ -58,15 +58,15 @@ def test_unbiased_and_at_the_bound(name):
     system, signal, background, delay = SYSTEMS[name]
     pixels = 2000
     cube = ml.simulate(ml.Flux(np.full((1, pixels), signal), background, delay), system, seed=7)[0, 0]
-    found = ml.reconstruct(cube, system)
-    assert not (found.flags & ~np.uint8(Flags.MISFIT)).any()
+    estimate = ml.reconstruct(cube, system)
+    assert not (estimate.flags & ~np.uint8(Flags.MISFIT)).any()
     bound = ml.cramer_rao(ml.Flux(signal, background, delay), system)
-    lag = (found.delay_ns - delay + 0.5 * PERIOD) % PERIOD - 0.5 * PERIOD
+    lag = (estimate.delay_ns - delay + 0.5 * PERIOD) % PERIOD - 0.5 * PERIOD
     outcomes = {}
     for what, error, stated, least in (
-        ("signal", found.signal - signal, found.signal_error, bound.signal),
-        ("background", found.background - background, found.background_error, bound.background),
-        ("delay", lag, found.delay_error_ns, bound.delay_ns),
+        ("signal", estimate.signal - signal, estimate.signal_error, bound.signal),
+        ("background", estimate.background - background, estimate.background_error, bound.background),
+        ("delay", lag, estimate.delay_error_ns, bound.delay_ns),
     ):
         # second order, and places within a bin: 0.03 sd are allowed for
         z = max(abs(error.mean()) / least - 0.03, 0.0) * np.sqrt(pixels)
@@ -108,10 +108,10 @@ def test_the_bound_knows_efficiency_and_dark_counts():
     """It is that of the light that the pixel sees, in units of the light that falls on it."""
     share, dark_hz = 0.4, 2e6
     dim = PLAIN.replace(detector=ml.Detector(dead_time_ns=75.0, detection_efficiency=share, dark_count_hz=dark_hz))
-    seen = PLAIN.replace(detector=ml.Detector(dead_time_ns=75.0))
+    detected = PLAIN.replace(detector=ml.Detector(dead_time_ns=75.0))
     dark = 1e-9 * dark_hz * PERIOD
     bound = ml.cramer_rao(ml.Flux(2.0, 0.5, 37.0), dim)
-    same = ml.cramer_rao(ml.Flux(2.0 * share, 0.5 * share + dark, 37.0), seen)
+    same = ml.cramer_rao(ml.Flux(2.0 * share, 0.5 * share + dark, 37.0), detected)
     assert bound.signal * share == pytest.approx(float(same.signal), rel=1e-12)
     assert bound.background * share == pytest.approx(float(same.background), rel=1e-12)
     assert bound.depth_m == pytest.approx(float(same.depth_m), rel=1e-12)
@@ -192,19 +192,19 @@ def test_delay_wherever_the_pulse_is_narrow_or_wide():
     for sigma, bins in ((0.05, 500), (20.0, 200), (0.5, 64)):
         system = PLAIN.replace(pulse=ml.GaussianPulse(sigma_ns=sigma), bins=bins)
         delays = np.linspace(0.0, 99.9, 64)[None]
-        found = ml.reconstruct(ml.simulate(ml.Flux(4.0, 0.5, delays), system, seed=2)[0], system)
-        lag = (found.delay_ns - delays + 50.0) % 100.0 - 50.0
+        estimate = ml.reconstruct(ml.simulate(ml.Flux(4.0, 0.5, delays), system, seed=2)[0], system)
+        lag = (estimate.delay_ns - delays + 50.0) % 100.0 - 50.0
         # narrow pulses are lost inside of a bin: what is known of the delay is the bin
-        assert np.abs(lag).max() < max(6.0 * found.delay_error_ns[np.isfinite(found.delay_error_ns)].max(), 0.25)
+        assert np.abs(lag).max() < max(6.0 * estimate.delay_error_ns[np.isfinite(estimate.delay_error_ns)].max(), 0.25)
 
 
 def test_pixels_without_signal_are_flagged():
     flux = ml.Flux(np.zeros((1, 4000)), 0.5, 0.0)
     cube = ml.simulate(flux, PLAIN.replace(cycles=400), seed=5)[0, 0]
-    found = ml.reconstruct(cube, PLAIN.replace(cycles=400))
-    missed = int((found.flags & Flags.NO_SIGNAL == 0).sum())
+    estimate = ml.reconstruct(cube, PLAIN.replace(cycles=400))
+    missed = int((estimate.flags & Flags.NO_SIGNAL == 0).sum())
     require({"false alarms": float(stats.binom.sf(missed - 1, 4000, 0.015))}, "signal seen where there is none")
-    assert (found.signal + found.background).mean() == pytest.approx(0.5, rel=0.01)  # the pulse takes what it can
+    assert (estimate.signal + estimate.background).mean() == pytest.approx(0.5, rel=0.01)  # the pulse takes what it can
 
 
 def test_empty_saturated_and_impossible_pixels():
@@ -213,14 +213,14 @@ def test_empty_saturated_and_impossible_pixels():
     cube[1, 200] = 1
     cube[2, 300] = 100  # fired in every period
     cube[3] = 50_000  # no pixel with this dead time can
-    found = ml.reconstruct(cube, system)
+    estimate = ml.reconstruct(cube, system)
     flags = Flags
-    assert found.flags[0] == flags.EMPTY
-    assert np.isnan(found.depth_m[0])
-    assert found.signal[0] == 0.0
-    assert found.flags[2] & flags.SATURATED
-    assert found.flags[3] & flags.SATURATED
-    assert not found.detected[0]
+    assert estimate.flags[0] == flags.EMPTY
+    assert np.isnan(estimate.depth_m[0])
+    assert estimate.signal[0] == 0.0
+    assert estimate.flags[2] & flags.SATURATED
+    assert estimate.flags[3] & flags.SATURATED
+    assert not estimate.detected[0]
     for method in ("generalised_coates", "mchc", "matched_filter", "peak"):
         other = ml.reconstruct(cube, system, method)
         assert other.flags[0] & flags.EMPTY
@@ -233,13 +233,13 @@ def test_threads_and_types_do_not_matter():
     for method in METHODS.values():
         if PLAIN.detector.mode not in method.modes or method.of_images:
             continue
-        one = ml.reconstruct(cube, PLAIN, method, threads=1)
+        single = ml.reconstruct(cube, PLAIN, method, threads=1)
         for other in (
             ml.reconstruct(cube, PLAIN, method, threads=3),
             ml.reconstruct(cube.astype(np.int64), PLAIN, method),
             ml.reconstruct(cube.astype(float), PLAIN, method),
         ):
-            for name, values in one.maps().items():
+            for name, values in single.maps().items():
                 assert np.array_equal(values, getattr(other, name), equal_nan=True), (method.name, name)
 
 

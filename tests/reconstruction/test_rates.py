@@ -77,26 +77,26 @@ def test_coates_inverts_the_exact_mean(dead_ns, cycles):
     system = system_of(dead_ns, cycles=cycles, mode="synchronous")
     rate = photons(system, 1.0, 0.5, 37.0)
     mean = mean_histogram(ml.Flux(1.0, 0.5, 37.0), system)
-    found = coates_rates(mean, system)
-    assert np.abs(found / rate - 1.0).max() < (1e-9 if dead_ns == 0 else 1e-3)
+    result = coates_rates(mean, system)
+    assert np.abs(result / rate - 1.0).max() < (1e-9 if dead_ns == 0 else 1e-3)
 
 
 def test_coates_is_the_textbook_formula():
     system = system_of(0.0, bins=4, cycles=100, sigma_ns=5.0, mode="synchronous")
     h = np.array([10, 20, 0, 30])
-    found = coates_rates(h, system)
-    assert found == pytest.approx(np.log([100 / 90, 90 / 70, 1.0, 70 / 40]), abs=1e-12)
+    result = coates_rates(h, system)
+    assert result == pytest.approx(np.log([100 / 90, 90 / 70, 1.0, 70 / 40]), abs=1e-12)
     assert np.isinf(coates_rates([10, 90, 0, 0], system)[1])
 
 
 def test_a_gate_that_stays():
     system = system_of(45.0, mode="gated", gate_start_ns=80.03, gate_width_ns=40.0)
     mean = mean_histogram(ml.Flux(1.0, 1.0, 95.0), system, tolerance=1e-6)
-    found = generalised_coates_rates(mean, system)
+    result = generalised_coates_rates(mean, system)
     rate = photons(system, 1.0, 1.0, 95.0)
     inside = np.r_[402:500, 0:99]
-    assert np.abs(found[inside] / rate[inside] - 1.0).max() < 2e-3
-    assert not found[102:398].any()
+    assert np.abs(result[inside] / rate[inside] - 1.0).max() < 2e-3
+    assert not result[102:398].any()
 
 
 def test_mchc_has_the_histogram_as_its_fixed_point():
@@ -105,8 +105,8 @@ def test_mchc_has_the_histogram_as_its_fixed_point():
         system = system_of(dead_ns, cycles=10**6)
         rate = photons(system, 1.0, 1.0, 37.0)
         mean = mean_histogram(ml.Flux(1.0, 1.0, 37.0), system, tolerance=1e-6)
-        found = mchc_rates(mean, system, tolerance=1e-9)
-        assert np.abs(found - rate).sum() / rate.sum() < 1e-3
+        result = mchc_rates(mean, system, tolerance=1e-9)
+        assert np.abs(result - rate).sum() / rate.sum() < 1e-3
         known = mchc_rates(mean, system, total=2.0, tolerance=1e-9)
         assert known.sum() == pytest.approx(2.0, rel=1e-12)
         assert np.abs(known - rate).sum() / rate.sum() < 1e-3

@@ -60,23 +60,23 @@ def test_no_more_returns_than_there_are(name: str, level: float) -> None:
     pixels = 2000 if level < 0.05 else 500
     delay = np.random.default_rng(3).uniform(25.0, 65.0, pixels)
     cube = drawn(system, (signal,), background, (delay,), pixels)
-    found = ml.reconstruct(cube, system, MaximumLikelihood(false_alarm=level), returns=2)
-    seen, more = int((found.returns.count > 0).sum()), int((found.returns.count > 1).sum())
-    assert seen > 0.98 * pixels
+    estimate = ml.reconstruct(cube, system, MaximumLikelihood(false_alarm=level), returns=2)
+    first, more = int((estimate.returns.count > 0).sum()), int((estimate.returns.count > 1).sum())
+    assert first > 0.98 * pixels
     # an upper bound by its making; 1.1 of it is allowed for what a histogram hides of bright pixels
-    require({"more": float(stats.binom.sf(more - 1, seen, 1.1 * level))}, f"returns that are not there, {name}")
-    one = ml.reconstruct(cube, system)
-    alone = found.returns.count == 1
-    assert np.array_equal(found.returns.delay_ns[alone, 0], one.delay_ns[alone])
-    assert np.array_equal(found.returns.signal_error[alone, 0], one.signal_error[alone], equal_nan=True)
+    require({"more": float(stats.binom.sf(more - 1, first, 1.1 * level))}, f"returns that are not there, {name}")
+    single = ml.reconstruct(cube, system)
+    alone = estimate.returns.count == 1
+    assert np.array_equal(estimate.returns.delay_ns[alone, 0], single.delay_ns[alone])
+    assert np.array_equal(estimate.returns.signal_error[alone, 0], single.signal_error[alone], equal_nan=True)
 
 
 @pytest.mark.full
 def test_the_level_is_not_far_from_what_is_stated() -> None:
     """The bound of the level is a near one: a test that never errs would show nothing dim."""
     cube = drawn(SYSTEM, (1.0,), 1.0, (DELAY,), 2000)
-    found = ml.reconstruct(cube, SYSTEM, MaximumLikelihood(false_alarm=0.2), returns=2)
-    more = int((found.returns.count > 1).sum())
+    estimate = ml.reconstruct(cube, SYSTEM, MaximumLikelihood(false_alarm=0.2), returns=2)
+    more = int((estimate.returns.count > 1).sum())
     require({"level": float(stats.binom.cdf(more, 2000, 0.1))}, "level of the test of a second return")
 
 
@@ -99,17 +99,17 @@ def test_both_are_found_and_their_errors_hold(name: str) -> None:
     system, signals, background, apart = PAIRS[name]
     pixels, delay = 1500, DELAY + SIGMA * np.array([0.0, apart])
     cube = drawn(system, signals, background, delay, pixels, seed=5)
-    found = ml.reconstruct(cube, system, returns=3).returns
-    both = found.count == 2
+    estimate = ml.reconstruct(cube, system, returns=3).returns
+    both = estimate.count == 2
     assert both.mean() > 0.97
-    assert np.isnan(found.depth_m[both, 2]).all()
-    assert (found.false_alarm[both, :2] < 0.01).all()
+    assert np.isnan(estimate.depth_m[both, 2]).all()
+    assert (estimate.false_alarm[both, :2] < 0.01).all()
     bound = returns_bound(pixel(signals, background, delay), system)
     outcomes = {}
     count = int(both.sum())
     for what, error, stated, least in (
-        ("delay", found.delay_ns[both, :2] - delay, found.delay_error_ns[both, :2], bound.delay_ns),
-        ("signal", found.signal[both, :2] - signals, found.signal_error[both, :2], bound.signal),
+        ("delay", estimate.delay_ns[both, :2] - delay, estimate.delay_error_ns[both, :2], bound.delay_ns),
+        ("signal", estimate.signal[both, :2] - signals, estimate.signal_error[both, :2], bound.signal),
     ):
         for k in range(2):
             z = max(abs(error[:, k].mean()) / least[k] - 0.06, 0.0) * np.sqrt(count)
@@ -127,17 +127,17 @@ def test_both_are_found_and_their_errors_hold(name: str) -> None:
 def test_three_returns_and_more_than_were_asked_for() -> None:
     delays = np.array([20.0, 23.0, 60.0])
     cube = drawn(SYSTEM, (0.2, 0.4, 0.3), 0.5, delays, 300)
-    found = ml.reconstruct(cube, SYSTEM, returns=4)
-    three = found.returns.count == 3
+    estimate = ml.reconstruct(cube, SYSTEM, returns=4)
+    three = estimate.returns.count == 3
     assert three.mean() > 0.95
-    assert np.abs(found.returns.delay_ns[three, :3] - delays).max() < 0.3
+    assert np.abs(estimate.returns.delay_ns[three, :3] - delays).max() < 0.3
     # the maps are those of the strongest
-    assert np.array_equal(found.delay_ns[three], found.returns.delay_ns[three, 1])
-    assert found.depth_error_m[three] == pytest.approx(found.returns.depth_error_m[three, 1], rel=1e-12)
-    assert found.background[three].mean() == pytest.approx(0.5, rel=0.02)
+    assert np.array_equal(estimate.delay_ns[three], estimate.returns.delay_ns[three, 1])
+    assert estimate.depth_error_m[three] == pytest.approx(estimate.returns.depth_error_m[three, 1], rel=1e-12)
+    assert estimate.background[three].mean() == pytest.approx(0.5, rel=0.02)
     fewer = ml.reconstruct(cube, SYSTEM, returns=2)
     assert (fewer.flags & Flags.MORE_RETURNS > 0).mean() > 0.95
-    assert not (found.flags[three] & Flags.MORE_RETURNS).any()
+    assert not (estimate.flags[three] & Flags.MORE_RETURNS).any()
 
 
 def test_the_likelihood_is_that_of_scipy() -> None:
@@ -154,11 +154,11 @@ def test_the_likelihood_is_that_of_scipy() -> None:
 
     start = np.array([0.5, 0.5, delay[0], 0.3, delay[1]])
     best = optimize.minimize(loss, start, method="Nelder-Mead", options={"xatol": 1e-7, "fatol": 1e-9, "maxiter": 9000})
-    found = ml.reconstruct(h, system, returns=2)
-    assert found.returns.count == 2
-    mine = np.array([found.background, *np.stack([found.returns.signal, found.returns.delay_ns], -1).ravel()])
+    estimate = ml.reconstruct(h, system, returns=2)
+    assert estimate.returns.count == 2
+    mine = np.array([estimate.background, *np.stack([estimate.returns.signal, estimate.returns.delay_ns], -1).ravel()])
     # the maximum is flat: a step that gains less than 5e-7 of the logarithm is a thousandth of a standard error
-    error = np.stack([found.returns.signal_error, found.returns.delay_error_ns], -1).ravel()
+    error = np.stack([estimate.returns.signal_error, estimate.returns.delay_error_ns], -1).ravel()
     assert np.abs((mine - best.x)[1:] / error).max() < 5e-3
     assert loss(mine) - best.fun < 5e-6
 
@@ -166,17 +166,17 @@ def test_the_likelihood_is_that_of_scipy() -> None:
 def test_nothing_is_found_in_nothing() -> None:
     cube = np.zeros((3, 500), np.uint16)
     cube[1] = drawn(SYSTEM, (0.0,), 1.0, (0.0,), 1)[0]
-    found = ml.reconstruct(cube, SYSTEM, MaximumLikelihood(false_alarm=1e-6), returns=2).returns
-    assert found.count.tolist() == [0, 0, 0]
-    assert np.isnan(found.depth_m).all()
-    assert found.depth_m.shape == (3, 2)
+    estimate = ml.reconstruct(cube, SYSTEM, MaximumLikelihood(false_alarm=1e-6), returns=2).returns
+    assert estimate.count.tolist() == [0, 0, 0]
+    assert np.isnan(estimate.depth_m).all()
+    assert estimate.depth_m.shape == (3, 2)
 
 
 def test_threads_do_not_matter() -> None:
     cube = drawn(SYSTEM, (0.5, 0.5), 0.5, (DELAY, DELAY + 1.0), 200)
-    one, two = (ml.reconstruct(cube, SYSTEM, returns=3, threads=n).returns for n in (1, 2))
+    first, two = (ml.reconstruct(cube, SYSTEM, returns=3, threads=n).returns for n in (1, 2))
     for name in ("delay_ns", "signal", "delay_error_ns", "false_alarm"):
-        assert np.array_equal(getattr(one, name), getattr(two, name), equal_nan=True)
+        assert np.array_equal(getattr(first, name), getattr(two, name), equal_nan=True)
 
 
 @pytest.mark.parametrize(
@@ -193,10 +193,10 @@ def test_bad_input(change: dict, message: str) -> None:
 
 
 def test_the_bound_of_one_is_that_of_one() -> None:
-    one = ml.cramer_rao(ml.Flux(1.0, 0.5, DELAY), SYSTEM)
+    bound = ml.cramer_rao(ml.Flux(1.0, 0.5, DELAY), SYSTEM)
     same = returns_bound(ml.Flux(1.0, 0.5, DELAY), SYSTEM)
-    assert same.depth_m[0] == pytest.approx(float(one.depth_m), rel=1e-3)
-    assert same.signal[0] == pytest.approx(float(one.signal), rel=1e-3)
+    assert same.depth_m[0] == pytest.approx(float(bound.depth_m), rel=1e-3)
+    assert same.signal[0] == pytest.approx(float(bound.signal), rel=1e-3)
     far = returns_bound(pixel([0.5, 0.5], 0.5, [10.0, 60.0]), SYSTEM)
     near = returns_bound(pixel([0.5, 0.5], 0.5, [10.0, 10.5]), SYSTEM)
     assert (near.depth_m > 1.5 * far.depth_m).all()

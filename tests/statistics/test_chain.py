@@ -96,32 +96,32 @@ def test_dense_matrix_is_the_law_of_the_first_arrival():
 @pytest.mark.parametrize(("total", "dead", "rearm"), CASES)
 def test_stationary_is_the_dense_eigenvector(total, dead, rearm):
     chain = PhaseChain(bumpy(total), dead, rearm)
-    found = chain.stationary()
+    solution = chain.stationary()
     n = chain.bins
     system = np.vstack([np.eye(n) - chain.dense().T, np.ones(n)])
     dense = np.linalg.lstsq(system, np.append(np.zeros(n), 1.0), rcond=None)[0]
-    np.testing.assert_allclose(found.pdf, dense, rtol=0, atol=1e-12)
-    assert found.pdf.sum() == pytest.approx(1.0, abs=1e-14)
-    assert found.residual < 1e-11
-    assert found.error < 1e-11
+    np.testing.assert_allclose(solution.pdf, dense, rtol=0, atol=1e-12)
+    assert solution.pdf.sum() == pytest.approx(1.0, abs=1e-14)
+    assert solution.residual < 1e-11
+    assert solution.error < 1e-11
 
 
 @pytest.mark.parametrize("dead", [0.0, 0.25, 0.6371, 0.999, 3.3])
 @pytest.mark.parametrize("total", [1e-6, 1.0, 40.0])
 def test_constant_rate_is_uniform(total, dead):
     n = 64
-    found = PhaseChain(np.full(n, total / n), dead).stationary()
-    np.testing.assert_allclose(found.pdf, 1.0 / n, rtol=1e-12)
+    solution = PhaseChain(np.full(n, total / n), dead).stationary()
+    np.testing.assert_allclose(solution.pdf, 1.0 / n, rtol=1e-12)
 
 
 @pytest.mark.parametrize("dead", [0.1, 0.6375, 0.997])
 @pytest.mark.parametrize("rearm", ["centre", "edge"])
 def test_whole_periods_leave_the_stationary_distribution(dead, rearm):
-    one = pulse_chain(3.0, 0.5, dead, bins=256, rearm=rearm).stationary()
+    single = pulse_chain(3.0, 0.5, dead, bins=256, rearm=rearm).stationary()
     for whole in (1, 7, 200):
         more = pulse_chain(3.0, 0.5, dead + whole, bins=256, rearm=rearm).stationary()
-        np.testing.assert_allclose(more.pdf, one.pdf, rtol=0, atol=1e-11)
-        assert 1.0 / more.rate == pytest.approx(1.0 / one.rate + whole, rel=1e-12)
+        np.testing.assert_allclose(more.pdf, single.pdf, rtol=0, atol=1e-11)
+        assert 1.0 / more.rate == pytest.approx(1.0 / single.rate + whole, rel=1e-12)
 
 
 @pytest.mark.parametrize("whole", [0, 1, 3])
@@ -130,10 +130,10 @@ def test_dead_time_of_whole_periods_does_not_distort(whole):
     errors = []
     for n in (512, 1024, 2048):
         chain = pulse_chain(2.0, 0.3, float(whole), bins=n)
-        found = chain.stationary()
+        solution = chain.stationary()
         law = np.sinh(0.5 * chain.photons)
-        np.testing.assert_allclose(found.pdf, law / law.sum())
-        errors.append(np.abs(found.pdf - chain.photons / chain.total).sum())
+        np.testing.assert_allclose(solution.pdf, law / law.sum())
+        errors.append(np.abs(solution.pdf - chain.photons / chain.total).sum())
     assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.1)
     assert errors[1] / errors[2] == pytest.approx(4.0, rel=0.1)
 
@@ -154,30 +154,30 @@ def test_order_of_convergence_at_a_fractional_dead_time(rearm, order):
 
 @pytest.mark.parametrize("dead", [0.49, 0.97, 0.995, 0.9985, 0.9999, 1.995, 200.9985])
 def test_slow_mixing_cells_converge(dead):
-    found = pulse_chain(10.0, 0.01, dead).stationary()
-    assert found.error < 1e-11
-    assert found.residual < 1e-11
-    assert np.all(found.pdf >= 0)
+    solution = pulse_chain(10.0, 0.01, dead).stationary()
+    assert solution.error < 1e-11
+    assert solution.residual < 1e-11
+    assert np.all(solution.pdf >= 0)
 
 
 def test_both_iterations_and_the_factorisation_agree():
     """One cell in which sweeps suffice, solved by each method."""
     feedback = pulse_chain(2.0, 1.0, 0.6375, bins=512).feedback()
     for adjoint in (False, True):
-        found = feedback.solve(adjoint=adjoint)
-        assert found.method == "sweeps"
+        solution = feedback.solve(adjoint=adjoint)
+        assert solution.method == "sweeps"
         rhs = np.ones(512) if adjoint else feedback.fire
         krylov = feedback._krylov(rhs, np.zeros(512), adjoint)[0]
         direct = feedback._direct(rhs, np.zeros(512), adjoint)[0]
-        np.testing.assert_allclose(krylov, found.x, rtol=1e-10, atol=1e-12 * np.abs(found.x).max())
-        np.testing.assert_allclose(direct, found.x, rtol=1e-10, atol=1e-12 * np.abs(found.x).max())
+        np.testing.assert_allclose(krylov, solution.x, rtol=1e-10, atol=1e-12 * np.abs(solution.x).max())
+        np.testing.assert_allclose(direct, solution.x, rtol=1e-10, atol=1e-12 * np.abs(solution.x).max())
 
 
 @pytest.mark.parametrize(("background", "method"), [(30.0, "gmres"), (1e3, "lu")])
 def test_bright_background_uses_stronger_methods(background, method):
-    found = pulse_chain(1.0, background, 0.6375).stationary()
-    assert found.method == method
-    assert found.error < 1e-11
+    solution = pulse_chain(1.0, background, 0.6375).stationary()
+    assert solution.method == method
+    assert solution.error < 1e-11
 
 
 def test_a_bright_pulse_in_fine_cells():
@@ -187,10 +187,10 @@ def test_a_bright_pulse_in_fine_cells():
 @pytest.mark.parametrize(("signal", "background"), [(0.0, 2.0), (2.0, 0.0), (1e-6, 1e-6), (1e3, 1e-6)])
 def test_dark_and_empty_fluxes(signal, background):
     for dead in (0.0, 0.5, 0.6375, 1.0, 7.3):
-        found = pulse_chain(signal, background, dead).stationary()
-        assert found.pdf.sum() == pytest.approx(1.0)
-        assert np.isfinite(found.rate)
-        assert found.rate > 0
+        solution = pulse_chain(signal, background, dead).stationary()
+        assert solution.pdf.sum() == pytest.approx(1.0)
+        assert np.isfinite(solution.rate)
+        assert solution.rate > 0
 
 
 def test_grid_of_the_statistics():
@@ -243,5 +243,5 @@ def test_random_cells_converge_or_say_so():
         for _ in range(150):
             signal, background = 10.0 ** rng.uniform(-6, 2.5, 2)
             dead = rng.choice([rng.random(), 10 * rng.random(), rng.integers(1, 5) - 0.003 * rng.random()])
-            found = pulse_chain(signal, background, dead, bins=256).stationary()
-            assert found.residual < 1e-9
+            solution = pulse_chain(signal, background, dead, bins=256).stationary()
+            assert solution.residual < 1e-9

@@ -97,19 +97,19 @@ def test_cells_broadcast(mode: str):
 @pytest.mark.parametrize(("rate", "dead", "cycles"), [(1.0, 0.6, 30), (4.0, 1.3, 20), (0.2, 7.0, 30), (0.2, 7.25, 5)])
 def test_paralyzable_constant_rate(rate: float, dead: float, cycles: int):
     r, t = rate * np.exp(-rate * dead), float(cycles)
-    found = paralyzable_moments(ml.Flux(0.0, rate), view("paralyzable", dead, "stationary", cycles))
+    result = paralyzable_moments(ml.Flux(0.0, rate), view("paralyzable", dead, "stationary", cycles))
     near = min(dead, t)
-    assert float(found.mean) == pytest.approx(r * t, rel=1e-9)
-    assert float(found.variance) == pytest.approx(r * t - r**2 * (2 * t * near - near**2), rel=1e-5)
+    assert float(result.mean) == pytest.approx(r * t, rel=1e-9)
+    assert float(result.variance) == pytest.approx(r * t - r**2 * (2 * t * near - near**2), rel=1e-5)
     armed = paralyzable_moments(ml.Flux(0.0, rate), view("paralyzable", dead, "armed", cycles))
     # the first t_d sees the first arrival and nothing else
     assert float(armed.mean) == pytest.approx(-np.expm1(-rate * near) + r * (t - near), rel=1e-9)
 
 
 def test_paralyzable_without_dead_time_is_poisson():
-    found = paralyzable_moments(ml.Flux([0.0, 2.0], 0.5, 50.0), view("paralyzable", 0.0))
-    assert found.mean == pytest.approx(40 * np.array([0.5, 2.5]), rel=1e-9)
-    assert found.variance == pytest.approx(found.mean, rel=1e-9)
+    result = paralyzable_moments(ml.Flux([0.0, 2.0], 0.5, 50.0), view("paralyzable", 0.0))
+    assert result.mean == pytest.approx(40 * np.array([0.5, 2.5]), rel=1e-9)
+    assert result.variance == pytest.approx(result.mean, rel=1e-9)
 
 
 def test_paralyzable_long_exposures_grow_linearly():
@@ -145,8 +145,8 @@ def by_recursion(system: ml.System, early: float, total: float) -> np.ndarray:
         armed[: whole + 2, 0] = np.linalg.lstsq(balance, np.eye(whole + 3)[-1], rcond=None)[0]
     done = np.zeros(cycles + 2)
     for n in range(cycles):
-        for step, seen, chance in steps:
-            moved = np.roll(armed[n], seen) * chance
+        for step, observed, chance in steps:
+            moved = np.roll(armed[n], observed) * chance
             if n + step >= cycles:
                 done += moved
             else:
@@ -220,19 +220,19 @@ def test_coates_inverts_the_synchronous_histogram():
     """r_i = ln[(N_r - sum_{k<i} n_k) / (N_r - sum_{k<=i} n_k)] of the mean histogram is the flux (Coates 1968)."""
     system = view("synchronous", 0.0, cycles=500)
     n = mean_histogram(ml.Flux(2.0, 0.7, 40.0), system)
-    left = 500 - np.concatenate([[0.0], np.cumsum(n)])
+    remaining = 500 - np.concatenate([[0.0], np.cumsum(n)])
     photons = 2.0 * system.pulse.bin_energy(40.0, PERIOD_NS, 50) + 0.7 / 50
-    assert np.log(left[:-1] / left[1:]) == pytest.approx(photons, rel=1e-9)
+    assert np.log(remaining[:-1] / remaining[1:]) == pytest.approx(photons, rel=1e-9)
 
 
 def test_coates_inverts_simulated_histograms():
     system = view("synchronous", 0.0, cycles=5000)
     cube = ml.simulate(ml.Flux(np.full((1, 500), 1.0), 0.7, 40.0), system, seed=3)[0, 0].astype(float)
-    left = 5000 - np.concatenate([np.zeros((500, 1)), np.cumsum(cube, -1)], axis=1)
+    remaining = 5000 - np.concatenate([np.zeros((500, 1)), np.cumsum(cube, -1)], axis=1)
     photons = system.pulse.bin_energy(40.0, PERIOD_NS, 50) + 0.7 / 50
     # the logarithm of a binomial share is biased by (1 / n_after - 1 / n_before) / 2
-    bias = 0.5 * (1 / left[:, 1:] - 1 / left[:, :-1])
-    require({"flux": mean_vector(np.log(left[:, :-1] / left[:, 1:]) - bias, photons)}, "Coates")
+    bias = 0.5 * (1 / remaining[:, 1:] - 1 / remaining[:, :-1])
+    require({"flux": mean_vector(np.log(remaining[:, :-1] / remaining[:, 1:]) - bias, photons)}, "Coates")
 
 
 # Gated
@@ -285,10 +285,10 @@ def test_what_does_not_treat_a_mode_says_so(mode: str):
     for what, call in calls.items():
         with pytest.raises(ValueError) as error:
             call()
-        told = str(error.value)
-        assert what in told
-        assert f"got {named!r}" in told
-        assert "mean_histogram" in told or "count_law" in told
+        message = str(error.value)
+        assert what in message
+        assert f"got {named!r}" in message
+        assert "mean_histogram" in message or "count_law" in message
 
 
 def test_moving_gates_are_refused():

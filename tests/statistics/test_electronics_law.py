@@ -54,11 +54,11 @@ def test_law_at_a_constant_rate():
         reached.append(record.sum())
         record = np.fft.irfft(np.fft.rfft(record, size) * np.fft.rfft(step, size), size)[: wait.size]
     expected = -np.diff([1.0, *reached, 0.0])
-    found = pmf_of(ml.count_law(ml.Flux(0.0, rate), view(dead, electronics, cycles=cycles)))
-    assert found[: expected.size] == pytest.approx(expected[: found.size], abs=2e-3)
-    assert found.sum() == pytest.approx(1.0, abs=1e-12)
+    result = pmf_of(ml.count_law(ml.Flux(0.0, rate), view(dead, electronics, cycles=cycles)))
+    assert result[: expected.size] == pytest.approx(expected[: result.size], abs=2e-3)
+    assert result.sum() == pytest.approx(1.0, abs=1e-12)
     mean = expected @ np.arange(expected.size)
-    assert found @ np.arange(found.size) == pytest.approx(mean, abs=3e-3)
+    assert result @ np.arange(result.size) == pytest.approx(mean, abs=3e-3)
 
 
 @pytest.mark.full
@@ -100,9 +100,9 @@ def test_waveform():
 @pytest.mark.parametrize(("dead", "electronics"), [(0.7, 0.5), (0.7, 0.7), (0.0, 0.6)])
 def test_where_one_of_the_two_has_no_effect(dead: float, electronics: float):
     plain = view(max(dead, electronics), 0.0)
-    found, expected = (ml.count_law(ml.Flux(2.0, 0.3, 50.0), system) for system in (view(dead, electronics), plain))
-    assert found.cumulants == pytest.approx(expected.cumulants, rel=1e-7)
-    assert pmf_of(found) == pytest.approx(pmf_of(expected), abs=1e-12)
+    result, expected = (ml.count_law(ml.Flux(2.0, 0.3, 50.0), system) for system in (view(dead, electronics), plain))
+    assert result.cumulants == pytest.approx(expected.cumulants, rel=1e-7)
+    assert pmf_of(result) == pytest.approx(pmf_of(expected), abs=1e-12)
 
 
 @pytest.mark.full
@@ -160,8 +160,8 @@ def test_stationary_shape_of_the_sequential_engine():
     flux = flux_of(3.16, 0.12, 0.37)
     drawn = ml.simulate(flux, system, engine="sequential", realizations=50, seed=20_264).reshape(-1, 50)
     shape = ml.registration_pdf(ml.Flux(3.16, 0.12, 37.0), system, "stationary")
-    seen = drawn.sum(0).astype(float)
-    assert 0.5 * np.abs(seen / seen.sum() - shape).sum() < 3e-3
+    observed = drawn.sum(0).astype(float)
+    assert 0.5 * np.abs(observed / observed.sum() - shape).sum() < 3e-3
     # bins of an exposure are correlated: errors from the scatter between exposures
     share = drawn / drawn.sum(1, keepdims=True)
     error = share.std(0, ddof=1) / np.sqrt(len(share))

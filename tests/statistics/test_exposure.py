@@ -13,10 +13,9 @@ import mars_lidar as ml
 from mars_lidar import _core
 from mars_lidar.statistics import ConvergenceError, PhaseChain
 from mars_lidar.statistics import cells as cells_module
-from mars_lidar.statistics.budget import MOMENTS
 from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.exposure import exposure_moments, native_light, stationary_histogram
-from mars_lidar.statistics.tolerances import TOL
+from mars_lidar.statistics.tolerances import MOMENTS, TOL
 
 REFERENCE = Path(__file__).parents[3] / "shared" / "reference"
 

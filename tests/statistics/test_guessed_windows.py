@@ -21,8 +21,8 @@ SYSTEM = ml.System(
 def cells():
     signal, background = np.array([8.0, 3.0, 0.3, 0.001, 6.0]), np.array([0.02, 0.5, 3.0, 0.002, 0.2])
     some = Cells.of(signal, background, SYSTEM, delay_ns=[3.0, 50.0, 60.0, 10.0, 97.0])
-    found = refined_moments(some, 1, tolerance=1e-4, threads=1)
-    return some, found.cumulants.reshape(-1, 4), found.bins.reshape(-1)
+    result = refined_moments(some, 1, tolerance=1e-4, threads=1)
+    return some, result.cumulants.reshape(-1, 4), result.bins.reshape(-1)
 
 
 def alone(monkeypatch):
@@ -34,13 +34,13 @@ def alone(monkeypatch):
 
 def test_they_are_the_exact_ones(monkeypatch):
     some, cumulants, bins = cells()
-    asked, told = alone(monkeypatch), []
+    asked, windows = alone(monkeypatch), []
     for guess, truth in zip(
-        guessed_windows(some, cumulants, bins, 1, told.append), exact_windows(some, cumulants, bins, 1), strict=True
+        guessed_windows(some, cumulants, bins, 1, windows.append), exact_windows(some, cumulants, bins, 1), strict=True
     ):
         assert total_variation(guess, truth) < 1e-11
     assert not asked
-    assert told[-1] == some.size
+    assert windows[-1] == some.size
 
 
 @pytest.mark.parametrize(

@@ -102,7 +102,7 @@ def test_whole_periods_of_dead_time(whole: int):
 
 def systems(number: int, seed: int, **changes: object) -> list[tuple[float, float, ml.System, float]]:
     random = np.random.default_rng(seed)
-    found = []
+    results = []
     for k in range(number):
         dead = 10 ** random.uniform(-2, np.log10(4))
         if k % 4 == 0:
@@ -116,8 +116,8 @@ def systems(number: int, seed: int, **changes: object) -> list[tuple[float, floa
             start="stationary" if k % 2 else "armed",
         ).replace(**changes)
         flux = 10 ** random.uniform(-2, 1), 10 ** random.uniform(-3, 1)
-        found.append((*flux, at, random.uniform(0, PERIOD)))
-    return found
+        results.append((*flux, at, random.uniform(0, PERIOD)))
+    return results
 
 
 @pytest.mark.parametrize(("signal", "background", "at", "delay"), systems(40, seed=3))
@@ -138,8 +138,8 @@ def test_closed_form_is_the_limit_of_the_exact_recursion(signal, background, at,
     assert law.settled >= 0
     window = (np.arange(64) % 7 < 3).astype(float)
     columns = law._pixel._columns(window[None])[0]
-    found = law.covariance_of(window, np.eye(64))
-    assert np.abs(found - columns).max() < 1e-7 * np.abs(columns).max()
+    result = law.covariance_of(window, np.eye(64))
+    assert np.abs(result - columns).max() < 1e-7 * np.abs(columns).max()
 
 
 def weighted_recursion(
@@ -199,14 +199,14 @@ def test_short_exposures_by_another_recursion(signal, background, dead, cycles, 
     assert law.settled == -1
     random = np.random.default_rng(5)
     weights = np.vstack([np.ones(16), np.eye(16)[[7, 8, 15]], random.normal(size=(4, 16))])
-    found = []
+    results = []
     for n in (128, 256):
         flux = photons(signal, background, law.system, n)
         history = plain_feedback(flux, int(dead * n))[1] if start == "stationary" else None
         fine = np.repeat(weights, n // 16, axis=1)
-        found.append(np.array(weighted_recursion(flux, int(dead * n), cycles, fine, history)))
-    mean, variance = found[1] + (found[1] - found[0]) / 3.0
-    spread = np.abs(found[1] - found[0]).max(0)
+        results.append(np.array(weighted_recursion(flux, int(dead * n), cycles, fine, history)))
+    mean, variance = results[1] + (results[1] - results[0]) / 3.0
+    spread = np.abs(results[1] - results[0]).max(0)
     got = np.array(law.window(weights))
     assert np.all(np.abs(got[0] - mean) < 0.05 * spread + 1e-6)
     assert np.all(np.abs(got[1] - variance) < 0.05 * spread + 1e-6 * variance)
@@ -219,15 +219,15 @@ def test_matrix_by_dense_algebra(signal: float, background: float, dead: float):
     """The whole matrix, leading term: T diag(v) T' on plain bins, Richardson."""
     cycles = 10**8
     law = joint_law(ml.Flux(signal, background, 50.0), system(dead, cycles, bins=32, sigma=0.05, start="stationary"))
-    found = []
+    results = []
     for n in (256, 512):
         solution, _, noise = plain_feedback(photons(signal, background, law.system, n), round(dead * n))
         joined = solution.reshape(32, -1, n).sum(1)
-        found.append(cycles * (joined * noise) @ joined.T)
-    expected = found[1] + (found[1] - found[0]) / 3.0
+        results.append(cycles * (joined * noise) @ joined.T)
+    expected = results[1] + (results[1] - results[0]) / 3.0
     error = np.abs(law.covariance() - expected)
     size = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
-    assert np.all(error < 0.1 * np.abs(found[1] - found[0]) + 1e-4 * size)
+    assert np.all(error < 0.1 * np.abs(results[1] - results[0]) + 1e-4 * size)
 
 
 @pytest.mark.parametrize("name", REFERENCE_NAMES)

@@ -48,8 +48,8 @@ def test_constant_rate_pmf(total, dead, cycles):
     """P(N >= n) = P(Gamma(n, 1 / rate) <= t - (n - 1) t_d) for an armed start."""
     law = count_law(ml.Flux(0.0, total), system_of(dead, cycles=cycles), tolerance=1e-6)
     n = np.append(law.support, law.support[-1] + 1).astype(float)
-    left = np.maximum(cycles - (n - 1) * dead, 0.0)
-    at_least = np.where(n == 0, 1.0, stats.gamma.cdf(left, np.maximum(n, 1.0), scale=1 / total))
+    remaining = np.maximum(cycles - (n - 1) * dead, 0.0)
+    at_least = np.where(n == 0, 1.0, stats.gamma.cdf(remaining, np.maximum(n, 1.0), scale=1 / total))
     np.testing.assert_allclose(law.pmf, at_least[:-1] - at_least[1:], atol=2e-6)
     np.testing.assert_allclose(law.cdf, 1 - at_least[1:], atol=2e-6)
     assert law.cdf[-1] == pytest.approx(1.0, abs=1e-10)
@@ -80,10 +80,10 @@ def test_pmf_agrees_with_cumulants(signal, background, dead, cycles, start):
     assert law.outside <= 2e-12
     assert (np.diff(law.support) == 1).all()
     assert law.support[0] >= 0
-    for k, found in enumerate(moments_of(law)):
+    for k, result in enumerate(moments_of(law)):
         scale = max(abs(law.cumulants[k]), float(law.variance) ** ((k + 1) / 2), 1e-12)
         noise = 1e-13 * law.support.size ** (k + 1)  # of the transform, some 1e-15 for every count
-        assert found == pytest.approx(law.cumulants[k], abs=1e-5 * scale + noise)
+        assert result == pytest.approx(law.cumulants[k], abs=1e-5 * scale + noise)
 
 
 def test_single_cycle_is_bernoulli():
@@ -102,10 +102,10 @@ def test_batches():
     assert law.support.shape == law.pmf.shape == law.cdf.shape
     assert law.pmf.shape[:2] == (2, 3)
     for i, j in np.ndindex(2, 3):
-        one = count_law(ml.Flux(signal[i, 0], background[j], 20.0), system)
-        size = one.pmf.size
-        np.testing.assert_array_equal(law.support[i, j, :size], one.support)
-        np.testing.assert_allclose(law.pmf[i, j, :size], one.pmf, atol=1e-8)
+        pixel = count_law(ml.Flux(signal[i, 0], background[j], 20.0), system)
+        size = pixel.pmf.size
+        np.testing.assert_array_equal(law.support[i, j, :size], pixel.support)
+        np.testing.assert_allclose(law.pmf[i, j, :size], pixel.pmf, atol=1e-8)
         np.testing.assert_allclose(law.pmf[i, j, size:], 0.0)
     delays = count_law(ml.Flux(1.0, 1.0, [10.0, 90.0]), system)
     assert delays.mean.shape == (2,)
@@ -154,9 +154,9 @@ def test_renewal_is_the_constant_rate_gaussian():
     law = count_law(ml.Flux(1.0, 1.0, 50.0), system_of(0.6375), "renewal")
     assert law.mean == pytest.approx(2000 / 2.275)
     assert law.variance == pytest.approx(2000 / 2.275**3)
-    found = moments_of(law)
-    assert found[0] == pytest.approx(law.mean)
-    assert found[1] == pytest.approx(law.variance + 1 / 12, rel=1e-6)  # a Gaussian on integers
+    result = moments_of(law)
+    assert result[0] == pytest.approx(law.mean)
+    assert result[1] == pytest.approx(law.variance + 1 / 12, rel=1e-6)  # a Gaussian on integers
 
 
 def test_shapes():

@@ -17,10 +17,9 @@ from mars_lidar.statistics import ConvergenceError, exposure_moments, mean_histo
 from mars_lidar.statistics import count_pmf as pmf_module
 from mars_lidar.statistics import exposure as exposure_module
 from mars_lidar.statistics import joint as pixel_module
-from mars_lidar.statistics.budget import LAW
 from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.joint_grid import FoldedGrid, relative_residual
-from mars_lidar.statistics.tolerances import TOL
+from mars_lidar.statistics.tolerances import LAW, TOL
 from tests.harness.law_map import disagreements, draw, laws
 
 PERIOD_NS = 100.0

@@ -59,18 +59,18 @@ def test_laws_of_one_pixel_ask_for_one(name: str) -> None:
 
 def test_every_prediction_takes_flux_and_system_first() -> None:
     """By their signatures; laws of given numbers (`matched_pmf`, cumulants) and of given rates have no light."""
-    found = {}
+    results = {}
     for home in (statistics, reconstruction):
         for name in home.__all__:
             thing = getattr(home, name)
             if inspect.isfunction(thing):
-                found[name] = list(inspect.signature(thing).parameters)
-    light = {name: names for name, names in found.items() if "flux" in names}
+                results[name] = list(inspect.signature(thing).parameters)
+    light = {name: names for name, names in results.items() if "flux" in names}
     assert len(light) >= 14, sorted(light)
     for name, names in light.items():
         first = names.index("flux")
         assert names[first + 1] == "system", name
-    for name, names in found.items():
+    for name, names in results.items():
         assert not {"signal", "background", "delay_ns", "waveform"} <= set(names), name
         assert not ({"signal", "background"} <= set(names)), name
 

@@ -85,11 +85,11 @@ def test_probabilities_have_the_cumulants(name):
     window = matched_pmf([asked])[0]
     assert window.p.min() >= 0
     assert window.p.sum() == pytest.approx(1, abs=1e-12)
-    found, spread = cumulants_of(window), np.sqrt(asked[1])
+    result, spread = cumulants_of(window), np.sqrt(asked[1])
     scale = np.array([1.0, spread, spread**2, spread**3]) * spread
     # the quantile of the smooth form is a series, the others are exact
     tolerance = 2e-3 if name == "smooth" else 1e-6
-    np.testing.assert_array_less(np.abs(found - asked) / scale, tolerance)
+    np.testing.assert_array_less(np.abs(result - asked) / scale, tolerance)
 
 
 @pytest.mark.parametrize("name", FORMS)
@@ -194,17 +194,17 @@ def test_laws_on_a_few_integers_keep_mean_and_variance(atoms):
     first = random.integers(0, 5000, 2000)
     cells = np.array([cumulants_of(Pmf(int(f), q)) for f, q in zip(first, p, strict=True)])
     spread = np.sqrt(np.maximum(cells[:, 1], 1e-12))
-    found = np.array([cumulants_of(window) for window in matched_pmf(cells)])
-    assert (np.abs(found[:, 0] - cells[:, 0]) <= 0.02 * spread + 1e-6).all()
-    assert (np.abs(found[:, 1] - cells[:, 1]) <= 0.05 * cells[:, 1] + 1e-6).all()
+    result = np.array([cumulants_of(window) for window in matched_pmf(cells)])
+    assert (np.abs(result[:, 0] - cells[:, 0]) <= 0.02 * spread + 1e-6).all()
+    assert (np.abs(result[:, 1] - cells[:, 1]) <= 0.05 * cells[:, 1] + 1e-6).all()
 
 
 def test_next_to_no_step_at_the_change_of_form():
     """The laws on either side of a variance of 9 and of the other thresholds are near one another."""
     steps = []
     for variance, third, fourth in ((9.0, -3.0, 1.0), (9.0, 8.0, 7.0), (0.7, -0.1, 0.02)):
-        one, other = (matched_pmf([(40.3, variance * scale, third, fourth)])[0] for scale in (1 - 1e-9, 1 + 1e-9))
-        steps.append(total_variation(one, other))
+        first, other = (matched_pmf([(40.3, variance * scale, third, fourth)])[0] for scale in (1 - 1e-9, 1 + 1e-9))
+        steps.append(total_variation(first, other))
     assert max(steps) < 0.01
 
 

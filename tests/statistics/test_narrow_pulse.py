@@ -58,8 +58,8 @@ def by_histogram(*light: float, view: ml.System, delay_ns: float) -> Figures:
 
 
 def by_paralyzable_moments(*light: float, view: ml.System, delay_ns: float) -> Figures:
-    found = paralyzable_moments(ml.Flux(*light, delay_ns), view)
-    return float(found.mean), float(found.variance)
+    result = paralyzable_moments(ml.Flux(*light, delay_ns), view)
+    return float(result.mean), float(result.variance)
 
 
 def like_a_wide_one(law: Any, signal: float, whole: int, apart: float, sigma: float, **view: str) -> None:
@@ -68,9 +68,9 @@ def like_a_wide_one(law: Any, signal: float, whole: int, apart: float, sigma: fl
     mean, variance = law(signal, DARK, view=wide, delay_ns=50.0)
     narrow = system(whole + apart * sigma, sigma, **view)  # type: ignore[arg-type]
     for delay in (0.5, 0.5 + 2.0 * sigma, 0.3):
-        found = law(signal, DARK, view=narrow, delay_ns=delay * PERIOD_NS)
-        assert found[0] == pytest.approx(mean, abs=1e-4 * variance**0.5)
-        assert found[1] == pytest.approx(variance, rel=1e-4)
+        result = law(signal, DARK, view=narrow, delay_ns=delay * PERIOD_NS)
+        assert result[0] == pytest.approx(mean, abs=1e-4 * variance**0.5)
+        assert result[1] == pytest.approx(variance, rel=1e-4)
 
 
 @pytest.mark.full
@@ -135,11 +135,11 @@ def test_phases_of_a_table() -> None:
     cells = Cells.of(np.repeat(signal, 2), np.tile(background, 2), view)
     entries = refined_moments(cells, 1, tolerance=1e-4, threads=1)
     phases = start_phases(view, signal, background, entries.cumulants, entries.bins, threads=1)
-    told = phases.correction.reshape(4, -1, 4)[:, :, :2]
+    text = phases.correction.reshape(4, -1, 4)[:, :, :2]
     for node in range(0, phases.phase.size, 4):
         delay = (0.5 - phases.phase[node]) * PERIOD_NS
         moved = exposure_moments(ml.Flux(cells.signal, cells.background, delay), view).cumulants - entries.cumulants
-        assert told[:, node] == pytest.approx(moved[:, :2], abs=1e-3)
+        assert text[:, node] == pytest.approx(moved[:, :2], abs=1e-3)
 
 
 def test_narrow_pulses_that_nothing_re_arms_within() -> None:

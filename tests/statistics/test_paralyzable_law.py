@@ -63,11 +63,11 @@ def constant_rate_pmf(rate: float, dead: float, cycles: float, start: str) -> np
 @pytest.mark.parametrize(("rate", "dead", "cycles"), [(1.3, 0.35, 5), (0.4, 2.7, 30), (4.0, 0.9, 12), (0.8, 1.0, 9)])
 def test_pmf_at_a_constant_rate(rate: float, dead: float, cycles: int, start: str):
     expected = constant_rate_pmf(rate, dead, cycles, start)
-    found = pmf_of(ml.count_law(ml.Flux(0.0, rate), view(dead, start, cycles), tolerance=1e-7))
-    size = min(found.size, expected.size)
+    result = pmf_of(ml.count_law(ml.Flux(0.0, rate), view(dead, start, cycles), tolerance=1e-7))
+    size = min(result.size, expected.size)
     assert expected.sum() == pytest.approx(1.0, abs=1e-9)
-    assert found[:size] == pytest.approx(expected[:size], abs=1e-8)
-    assert max(expected[size:].sum(), found[size:].sum()) < 1e-8
+    assert result[:size] == pytest.approx(expected[:size], abs=1e-8)
+    assert max(expected[size:].sum(), result[size:].sum()) < 1e-8
 
 
 @pytest.mark.parametrize("case", random_cases(24, seed=77, photons=4e5, least=1000, most=3000), ids=lambda c: c.name)
@@ -92,10 +92,10 @@ def test_moments_are_the_closed_form_ones(case: Case):
 def test_the_grid_of_the_histogram_is_not_the_one_of_the_moments(bins: int):
     """However many bins the histogram has, `paralyzable_moments` keeps its tolerance."""
     system = view(0.45, cycles=500, sigma=0.01, bins=bins)
-    found = paralyzable_moments(ml.Flux(1.0, 1.0, 37.0), system)
+    result = paralyzable_moments(ml.Flux(1.0, 1.0, 37.0), system)
     known = exposure_moments(ml.Flux(1.0, 1.0, 37.0), system.replace(bins=1), tolerance=1e-7)
-    assert float(found.mean) == pytest.approx(float(known.mean), rel=1e-5)
-    assert float(found.variance) == pytest.approx(float(known.variance), rel=1e-5)
+    assert float(result.mean) == pytest.approx(float(known.mean), rel=1e-5)
+    assert float(result.variance) == pytest.approx(float(known.variance), rel=1e-5)
 
 
 @pytest.mark.parametrize("start", ["armed", "stationary"])

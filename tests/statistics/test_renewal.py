@@ -41,7 +41,7 @@ make_system = partial(system_of, bins=1024)
 def test_moment_matrices_match_the_definition(total, dead, rearm):
     """mu_ij and sigma_ij^2 against sums over the number of periods waited."""
     chain = PhaseChain(bumpy(total, n=16), dead, rearm)
-    found, n = moment_matrices(chain), chain.bins
+    result, n = moment_matrices(chain), chain.bins
     flux = np.concatenate([[0.0], np.cumsum(np.tile(chain.photons, 2))])
     periods = np.arange(int(60 / total) + 60)
     for i in range(n):
@@ -59,9 +59,9 @@ def test_moment_matrices_match_the_definition(total, dead, rearm):
                 chance[0] = -np.expm1(-(1 - chain.fraction) * chain.photons[arm])
             wait = (chain.blind_bins + k) / n + periods
             mean = np.average(wait, weights=chance)
-            assert found.mean[i, j % n] == pytest.approx(mean, rel=1e-9)
+            assert result.mean[i, j % n] == pytest.approx(mean, rel=1e-9)
             variance = np.average((wait - mean) ** 2, weights=chance)
-            assert found.variance[i, j % n] == pytest.approx(variance, rel=1e-8)
+            assert result.variance[i, j % n] == pytest.approx(variance, rel=1e-8)
             assert chain.dense()[i, j % n] == pytest.approx(chance.sum(), rel=1e-9)
 
 
@@ -223,8 +223,8 @@ def test_mars_moments_of_arrays():
     mean, variance = mars_moments(ml.Flux(signal, background, 50.0), system, bins=256)
     assert mean.shape == variance.shape == (2, 3)
     assert mean[0, 0] == variance[0, 0] == 0.0
-    one = mars_moments(ml.Flux(1.0, 0.5, 50.0), system, bins=256)
-    assert (mean[1, 1], variance[1, 1]) == (one[0], one[1])
+    pixel = mars_moments(ml.Flux(1.0, 0.5, 50.0), system, bins=256)
+    assert (mean[1, 1], variance[1, 1]) == (pixel[0], pixel[1])
     terms = holding_time_covariance(ml.Flux(1.0, 0.5, 50.0), system, bins=256)
     assert mean[1, 1] == pytest.approx(1000 * 100.0 / terms.mu)
     assert variance[1, 1] == pytest.approx(1000 * 100.0 * terms.sigma2 / terms.mu**3)

@@ -93,78 +93,78 @@ class Refusing(Engine):
 
 
 @pytest.fixture(scope="module")
-def found():
+def result():
     engines = ["exact", "sequential", "poisson", Dimmed()]
     return compare(scene(), SYSTEM, engines, realizations=3000, repeats=8, pixels=3, seed=5, **CALM)
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("engine", TRUE)
-def test_true_engines_are_not_accused(found, engine):
-    for pixel, row in found.statistics.items():
+def test_true_engines_are_not_accused(result, engine):
+    for pixel, row in result.statistics.items():
         scored = {name: e for name, e in row[engine].scored.items() if not math.isnan(e.z)}
         assert scored.keys() >= {"mean", "variance", "fano", "window_variance", "lag1_error", "shape", "law"}
-        assert ("window_ratio" in scored) == (engine != found.against)
+        assert ("window_ratio" in scored) == (engine != result.against)
         p = {name: p_value(e.z, one_sided=name in ("shape", "law")) for name, e in scored.items()}
         require(p, f"compare: {engine}, {pixel}")
-    s = found.scenes[engine]
+    s = result.scenes[engine]
     whole = {"bias": s.bias.z, "relative": s.relative_bias.z, "dispersion": s.dispersion.z}
     require({name: p_value(z) for name, z in whole.items()}, f"compare: {engine}, image")
 
 
-def test_no_dead_time_is_found_in_everything(found):
-    s = found.scenes["poisson"]
+def test_no_dead_time_is_found_in_everything(result):
+    s = result.scenes["poisson"]
     assert s.bias.wrong
     assert s.relative_bias.wrong
     assert s.dispersion.wrong
-    expected = float(found.flux.total.sum()) * SYSTEM.cycles / float(found.expected.mean.sum()) - 1.0
+    expected = float(result.flux.total.sum()) * SYSTEM.cycles / float(result.expected.mean.sum()) - 1.0
     assert s.relative_bias.value == pytest.approx(expected, abs=8 * s.relative_bias.error)
-    bright = found.statistics["bright"]["poisson"]
+    bright = result.statistics["bright"]["poisson"]
     wrong = {name for name, e in bright.scored.items() if e.wrong}
     assert wrong >= {"mean", "variance", "fano", "window_mean", "window_variance", "window_ratio", "shape", "law"}
 
 
 def test_a_wrong_joint_law_is_found_and_nothing_else():
     system, flux = SYSTEM.replace(detector=ml.Detector(dead_time_ns=10.0)), ml.Flux(np.full((2, 2), 2.0), 2.0, 20.0)
-    found = compare(flux, system, [CountTimesShape()], realizations=3000, repeats=8, pixels=1, seed=5, **CALM)
-    row = found.statistics["bright"]["count-times-shape"].scored
+    result = compare(flux, system, [CountTimesShape()], realizations=3000, repeats=8, pixels=1, seed=5, **CALM)
+    row = result.statistics["bright"]["count-times-shape"].scored
     assert {name for name, e in row.items() if e.wrong} == {"window_variance", "window_ratio", "lag1_error"}
     right = ("mean", "variance", "fano", "window_mean", "shape", "law")
     require({name: p_value(row[name].z, one_sided=name in ("shape", "law")) for name in right}, "compare: joint only")
-    assert not found.scenes["count-times-shape"].bias.wrong
+    assert not result.scenes["count-times-shape"].bias.wrong
     # the bins of the window given the count are binomial: Var = Var(N) q^2 + E(N) q (1 - q)
-    law = found.laws["bright"]
+    law = result.laws["bright"]
     window = np.abs(system.time_ns - 20.0) < 4.5
     q = float(law.histogram[window].sum() / law.histogram.sum())
     variance = law.counts.variance.value * q * q + law.counts.mean.value * q * (1 - q)
-    drawn = found.statistics["bright"]["count-times-shape"].window.variance
+    drawn = result.statistics["bright"]["count-times-shape"].window.variance
     require({"window variance": p_value((drawn.value - variance) / drawn.error)}, "compare: multinomial window")
 
 
-def test_a_small_bias_of_the_image_is_found(found):
-    dimmed, flux = found.scenes["dimmed"], found.flux
+def test_a_small_bias_of_the_image_is_found(result):
+    dimmed, flux = result.scenes["dimmed"], result.flux
     assert dimmed.relative_bias.wrong
     darker = ml.count_law(ml.Flux(0.97 * flux.signal, 0.97 * flux.background, flux.delay_ns), SYSTEM)
-    expected = float(darker.mean.sum() / found.expected.mean.sum()) - 1.0
+    expected = float(darker.mean.sum() / result.expected.mean.sum()) - 1.0
     z = (dimmed.relative_bias.value - expected) / dimmed.relative_bias.error
     require({"relative bias": p_value(z)}, "compare: a darker scene")
 
 
-def test_predictions_are_those_of_the_count_law(found):
-    law = ml.count_law(ml.Flux(found.flux.signal, found.flux.background, found.flux.delay_ns), SYSTEM)
-    assert np.allclose(found.expected.mean, law.mean, rtol=1e-6)
-    assert np.allclose(found.expected.variance, law.variance, rtol=1e-3)
-    y, x = found.pixels["dim"]
-    assert found.laws["dim"].counts.variance.value == pytest.approx(float(law.variance[y, x]), rel=1e-3)
+def test_predictions_are_those_of_the_count_law(result):
+    law = ml.count_law(ml.Flux(result.flux.signal, result.flux.background, result.flux.delay_ns), SYSTEM)
+    assert np.allclose(result.expected.mean, law.mean, rtol=1e-6)
+    assert np.allclose(result.expected.variance, law.variance, rtol=1e-3)
+    y, x = result.pixels["dim"]
+    assert result.laws["dim"].counts.variance.value == pytest.approx(float(law.variance[y, x]), rel=1e-3)
 
 
-def test_a_seed_gives_the_same_numbers_whoever_runs_beside(found):
+def test_a_seed_gives_the_same_numbers_whoever_runs_beside(result):
     alone = compare(
         scene(), SYSTEM, ["sequential"], realizations=3000, repeats=8, pixels=3, seed=5, **{**CALM, "threads": 1}
     )
     assert alone.engines == ["exact", "sequential"]
     for pixel, row in alone.statistics.items():
-        again = found.statistics[pixel]["sequential"].scored
+        again = result.statistics[pixel]["sequential"].scored
         assert {k: v.value for k, v in row["sequential"].scored.items()} == {k: v.value for k, v in again.items()}
 
 
@@ -181,12 +181,12 @@ KINDS = {
 @pytest.mark.full
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_of_flux_is_compared_and_drawn(tmp_path, kind):
-    found = compare(KINDS[kind], SYSTEM, TRUE, realizations=200, repeats=2, **CALM)
-    for row in found.statistics.values():
+    result = compare(KINDS[kind], SYSTEM, TRUE, realizations=200, repeats=2, **CALM)
+    for row in result.statistics.values():
         for engine in TRUE:
             assert not [name for name, e in row[engine].scored.items() if e.wrong]
-    assert not found.unpredicted
-    figure = comparison(found)
+    assert not result.unpredicted
+    figure = comparison(result)
     assert isinstance(figure, Figure)
     figure.savefig(tmp_path / "compare.png", dpi=40)
     assert (tmp_path / "compare.png").stat().st_size > 2000
@@ -194,45 +194,45 @@ def test_every_kind_of_flux_is_compared_and_drawn(tmp_path, kind):
 
 def test_a_large_image_is_predicted_on_a_grid():
     system = SYSTEM.replace(bins=8, cycles=20)
-    found = compare(scene(70, 66), system, ["exact"], realizations=50, repeats=1, pixels=1, **CALM)
-    assert found.expected.step == 2
-    assert found.expected.mean.shape == (35, 33)
-    assert found.expected.known.all()
-    require({"bias": p_value(found.scenes["exact"].bias.z)}, "compare: on a grid")
-    assert isinstance(comparison(found), Figure)
+    result = compare(scene(70, 66), system, ["exact"], realizations=50, repeats=1, pixels=1, **CALM)
+    assert result.expected.step == 2
+    assert result.expected.mean.shape == (35, 33)
+    assert result.expected.known.all()
+    require({"bias": p_value(result.scenes["exact"].bias.z)}, "compare: on a grid")
+    assert isinstance(comparison(result), Figure)
 
 
 def test_engines_that_cannot_are_skipped_and_told():
     for late, words in ((False, "cycles must be odd"), (True, "outside of the table")):
-        found = compare(scene(), SYSTEM, ["exact", Refusing(late)], realizations=50, repeats=1, pixels=1, **CALM)
-        assert found.engines == ["exact"]
-        assert words in found.skipped["refusing"]
+        result = compare(scene(), SYSTEM, ["exact", Refusing(late)], realizations=50, repeats=1, pixels=1, **CALM)
+        assert result.engines == ["exact"]
+        assert words in result.skipped["refusing"]
         with pytest.raises(ValueError, match=words):
             compare(scene(), SYSTEM, ["exact", Refusing(late)], against="refusing", realizations=50, repeats=1)
 
 
 def test_without_a_prediction_the_reference_engine_is_the_goal(monkeypatch, capsys):
     monkeypatch.setattr("studies.compare.comparison.pixel_law", lambda *_: "it does not settle")
-    found = compare(scene(), SYSTEM, [*TRUE, "poisson"], realizations=1000, repeats=2, pixels=2, seed=8, **CALM)
-    assert found.unpredicted == {"bright": "it does not settle", "dim": "it does not settle"}
-    for pixel, row in found.statistics.items():
+    result = compare(scene(), SYSTEM, [*TRUE, "poisson"], realizations=1000, repeats=2, pixels=2, seed=8, **CALM)
+    assert result.unpredicted == {"bright": "it does not settle", "dim": "it does not settle"}
+    for pixel, row in result.statistics.items():
         assert all(math.isnan(e.z) for e in row["exact"].scored.values())
         p = {k: p_value(e.z, one_sided=k in ("shape", "law")) for k, e in row["sequential"].scored.items()}
         require(p, f"compare: two samples, {pixel}")
         wrong = {name for name, e in row["poisson"].scored.items() if e.wrong}
         assert wrong >= {"mean", "variance", "window_ratio", "law"}
-    assert isinstance(comparison(found), Figure)
-    show(found)
+    assert isinstance(comparison(result), Figure)
+    show(result)
     assert "bright pixel has no prediction: it does not settle" in capsys.readouterr().out
 
 
 def test_less_time_means_fewer_exposures():
-    found = compare(scene(), SYSTEM, ["exact"], realizations=10**5, repeats=500, pixels=1, budget_s=1e-6)
-    assert found.statistics["bright"]["exact"].realizations == 50
-    assert len(found.scenes["exact"].seconds) == 1
-    assert not found.expected.known.any()
-    assert math.isnan(found.scenes["exact"].bias.value)
-    assert isinstance(comparison(found), Figure)
+    result = compare(scene(), SYSTEM, ["exact"], realizations=10**5, repeats=500, pixels=1, budget_s=1e-6)
+    assert result.statistics["bright"]["exact"].realizations == 50
+    assert len(result.scenes["exact"].seconds) == 1
+    assert not result.expected.known.any()
+    assert math.isnan(result.scenes["exact"].bias.value)
+    assert isinstance(comparison(result), Figure)
 
 
 def test_pixels_are_different_and_in_order():

@@ -77,8 +77,8 @@ def test_distances():
     assert wasserstein(normal, later) == pytest.approx(4.0, rel=1e-6)
     assert kl_divergence(normal, later) == pytest.approx(0.5 * (4.0 / 3.0) ** 2, rel=1e-3)
     assert kl_divergence(normal, normal) == pytest.approx(0.0, abs=1e-9)
-    certain, elsewhere = np.array([1.0, 0.0]), np.array([0.0, 1.0])
-    assert kl_divergence(certain, elsewhere) == pytest.approx(-np.log(TOL.tail))
+    certain, other_folder = np.array([1.0, 0.0]), np.array([0.0, 1.0])
+    assert kl_divergence(certain, other_folder) == pytest.approx(-np.log(TOL.tail))
     both = np.stack([normal, later])
     np.testing.assert_allclose(wasserstein(both, normal), [0.0, 4.0], atol=1e-6)
 
@@ -88,15 +88,15 @@ def test_floors_are_those_of_samples():
     law = Pmf(0, stats.poisson.pmf(np.arange(80), 20.0))
     size = 10_000
     random = np.random.default_rng(3)
-    found = cells_of.resampled_figures(law, size, 0, 2000, random)
-    assert found[:, 2].mean() == pytest.approx(np.sqrt(2 / np.pi * 20.0 / size), rel=0.06)
-    assert found[:, 3].mean() == pytest.approx(np.sqrt(2 / np.pi * (20.0 + 2 * 20.0**2) / size), rel=0.06)
+    result = cells_of.resampled_figures(law, size, 0, 2000, random)
+    assert result[:, 2].mean() == pytest.approx(np.sqrt(2 / np.pi * 20.0 / size), rel=0.06)
+    assert result[:, 3].mean() == pytest.approx(np.sqrt(2 / np.pi * (20.0 + 2 * 20.0**2) / size), rel=0.06)
     times = np.arange(1, size + 1)
     rates = np.log(times[:, None] / (size * law.p)) * times[:, None] / size
     expected = (stats.binom.pmf(times[:, None], size, law.p) * rates).sum()
-    assert found[:, 1].mean() == pytest.approx(expected, rel=0.05)
+    assert result[:, 1].mean() == pytest.approx(expected, rel=0.05)
     twice = cells_of.resampled_figures(law, size, size, 500, random)
-    assert twice[:, 2].mean() == pytest.approx(np.sqrt(2) * found[:, 2].mean(), rel=0.12)
+    assert twice[:, 2].mean() == pytest.approx(np.sqrt(2) * result[:, 2].mean(), rel=0.12)
 
 
 @pytest.mark.full
@@ -104,13 +104,13 @@ def test_sample_noise_of_the_shape():
     """The floor of the shape is the distance that a sample really has; of a Poisson pixel that is known."""
     system = count_law.QUICK.system(100.0, 0.0).replace(bins=64)
     signal, background = np.array([0.0]), np.array([1.0])
-    found = [draw("poisson", signal, background, system, realizations=200, seed=k) for k in range(30)]
-    floor = np.mean([one.shape_floor[0] for one in found])
-    apart = np.mean([0.5 * np.abs(one.shape[0] - 1 / 64).sum() for one in found])
+    results = [draw("poisson", signal, background, system, realizations=200, seed=k) for k in range(30)]
+    floor = np.mean([item.shape_floor[0] for item in results])
+    apart = np.mean([0.5 * np.abs(item.shape[0] - 1 / 64).sum() for item in results])
     assert floor == pytest.approx(apart, rel=0.1)
     assert floor == pytest.approx(0.5 * np.sqrt(2 / np.pi * 63 / (200 * system.cycles)), rel=0.1)
-    assert found[0].counts.shape == (200, 1)
-    assert abs(found[0].counts.mean() - system.cycles) < 6 * np.sqrt(system.cycles / 200)
+    assert results[0].counts.shape == (200, 1)
+    assert abs(results[0].counts.mean() - system.cycles) < 6 * np.sqrt(system.cycles / 200)
 
 
 @pytest.mark.full
@@ -119,13 +119,13 @@ def test_engine_without_a_law_is_sampled(monkeypatch):
         name = "other"
 
     monkeypatch.setitem(ENGINES, "other", Other())
-    names = [one.name for one in simulators.simulators(50, 1)]
+    names = [simulator.name for simulator in simulators.simulators(50, 1)]
     assert names[:6] == ["poisson", "renewal", "mars_centre", "mars_edge", "mars_exact", "mars_matched"]
-    other = next(one for one in simulators.simulators(50, 1) if one.name == "other")
+    other = next(simulator for simulator in simulators.simulators(50, 1) if simulator.name == "other")
     system = count_law.QUICK.system(100.0, 50.0)
-    found = other.predict(np.array([0.1, 0.2]), np.array([0.1, 0.1]), system)
-    assert found.sampled == 50
-    np.testing.assert_allclose(found.mean, [20.0, 30.0], atol=6 * np.sqrt(30.0 / 50))
+    result = other.predict(np.array([0.1, 0.2]), np.array([0.1, 0.1]), system)
+    assert result.sampled == 50
+    np.testing.assert_allclose(result.mean, [20.0, 30.0], atol=6 * np.sqrt(30.0 / 50))
     settings = replace(count_law.QUICK, grids=count_law.QUICK.grids[1:], realizations=100, sampled=50)
     scores = count_law.compute(settings, "exact", str)[0].scores["other"]
     assert scores.shape_floor > 1.5 * count_law.compute(settings, "exact", str)[0].scores["poisson"].shape_floor
@@ -134,11 +134,11 @@ def test_engine_without_a_law_is_sampled(monkeypatch):
 def test_shapes_over_dead_time():
     """A dead time of a whole period does not distort the shape; the chain is close everywhere else."""
     settings = replace(count_law.QUICK, dead_sweep=(0.5, 1.0), cycles=1000)
-    found = shape_sweep(settings, str)
-    assert found["poisson"].shape == (2, 4)
-    assert found["poisson"][0].max() > 0.1
-    assert found["poisson"][1].max() < 0.02
-    assert found["renewal"][0].max() < 0.02
+    result = shape_sweep(settings, str)
+    assert result["poisson"].shape == (2, 4)
+    assert result["poisson"][0].max() > 0.1
+    assert result["poisson"][1].max() < 0.02
+    assert result["renewal"][0].max() < 0.02
 
 
 def test_truth_by_the_exact_engine(tmp_path, capsys):
@@ -148,5 +148,5 @@ def test_truth_by_the_exact_engine(tmp_path, capsys):
     assert "invalid choice: 'poisson'" in capsys.readouterr().err
     settings = replace(count_law.QUICK, grids=count_law.QUICK.grids[1:])
     pairs = zip(*(count_law.compute(settings, truth, str) for truth in ("exact", "sequential")), strict=True)
-    z = [(one.mean - other.mean) / np.hypot(one.mean_error, other.mean_error) for one, other in pairs]
+    z = [(first.mean - other.mean) / np.hypot(first.mean_error, other.mean_error) for first, other in pairs]
     require({f"cell {k}: mean": 2 * stats.norm.sf(abs(v)) for k, v in enumerate(z)}, "truths agree")

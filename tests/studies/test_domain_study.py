@@ -202,9 +202,9 @@ def test_merging_keeps_all_and_joins_the_few() -> None:
 
 def test_errors_without_information_are_infinite() -> None:
     """Two parameters that only their sum is known of, and a third of its own."""
-    found = _variances(np.array([[1.0, 2.0, 0.0], [2.0, 4.0, 0.0], [0.0, 0.0, 0.25]]))
-    assert np.isinf(found[:2]).all()
-    assert found[2] == pytest.approx(4.0)
+    result = _variances(np.array([[1.0, 2.0, 0.0], [2.0, 4.0, 0.0], [0.0, 0.0, 0.25]]))
+    assert np.isinf(result[:2]).all()
+    assert result[2] == pytest.approx(4.0)
     regular = np.array([[2.0, 0.3, 0.1], [0.3, 1.0, 0.2], [0.1, 0.2, 3.0]])
     assert np.array_equal(_variances(regular), np.diag(np.linalg.inv(regular)))
 

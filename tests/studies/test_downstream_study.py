@@ -71,9 +71,9 @@ def test_declared_configurations():
         spans = [range(first, first + number) for first, number in (config.sizes.train, config.sizes.test)]
         assert len(set().union(*spans)) == sum(map(len, spans))  # disjoint
         assert set(config.arms) <= set(WORDS)
-        files = [one.file for one in downstream.runs(config)]
+        files = [run.file for run in downstream.runs(config)]
         assert len(set(files)) == len(files)
-    small, full = ({one.file for one in downstream.runs(CONFIGS[name])} for name in ("small", "full"))
+    small, full = ({run.file for run in downstream.runs(CONFIGS[name])} for name in ("small", "full"))
     assert small < full  # which uses what the other has trained
 
 
@@ -82,14 +82,14 @@ def test_features_are_a_window_about_the_fullest_bins_and_sums_of_the_rest():
     counts = random.poisson(0.5, (3, 256)).astype(np.uint16)
     for pixel, first in enumerate((100, 250, 3)):  # the second lies across the end of the period
         counts[pixel, (first + np.arange(BOX)) % 256] += 20
-    seen, middle = features(counts, 0.3)
+    observed, middle = features(counts, 0.3)
     sums = np.append(starts(256, 0.3), 256)
-    assert seen.shape == (3, number(256, 0.3)) == (3, len(sums) - 1 + LOGS)
+    assert observed.shape == (3, number(256, 0.3)) == (3, len(sums) - 1 + LOGS)
     np.testing.assert_allclose(middle % 256, (np.array([100, 250, 3]) + 0.5 * BOX) % 256)
     turned = counts[1, (int(middle[1]) - WINDOW // 2 + np.arange(256)) % 256]
     wanted = [turned[low:high].sum() for low, high in itertools.pairwise(sums)]
-    np.testing.assert_allclose(seen[1, :-LOGS] ** 2, wanted, rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose((seen[:, :-LOGS] ** 2).sum(1), counts.sum(1), rtol=1e-5)
+    np.testing.assert_allclose(observed[1, :-LOGS] ** 2, wanted, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose((observed[:, :-LOGS] ** 2).sum(1), counts.sum(1), rtol=1e-5)
     assert {*range(0, WINDOW, NEAR)} < set(sums.tolist())
 
 
@@ -100,7 +100,7 @@ def test_the_sums_hide_little_of_what_a_histogram_says_of_its_return():
     0.06, 0.10 and 0.01 dB of the signal's variance; coarse sums of the rest alone hid 0.6 and 0.7.
     """
     for signal, background, dead in ((3.0, 1.8, MAIN), (3.0, 3.0, 0.3), (1.5, 1.8, 0.95)):
-        best = [at(signal, background, instrument(dead), summed=one).best for one in (True, False)]
+        best = [at(signal, background, instrument(dead), summed=item).best for item in (True, False)]
         assert 20.0 * np.log10(best[0] / best[1]) < 0.5 / 3.0
 
 
@@ -130,13 +130,13 @@ def test_the_tabulated_neural_map_is_the_map():
     light = ml.Flux(np.full((1, 400), 1.3), 0.9, 41.0)
     engine = downstream_data.Data(sizes).engine("neural", MAIN)
     counts = [
-        ml.simulate(light, system, engine=one, seed=7, threads=1)[0, 0].astype(np.float64)
-        for one in (engine, NeuralEngine())
+        ml.simulate(light, system, engine=item, seed=7, threads=1)[0, 0].astype(np.float64)
+        for item in (engine, NeuralEngine())
     ]
-    tabled, direct = (one.sum(-1) for one in counts)
+    tabled, direct = (count.sum(-1) for count in counts)
     assert abs(tabled.mean() - direct.mean()) < 4.0 * np.sqrt((tabled.var() + direct.var()) / 400)
     assert tabled.var() / direct.var() == pytest.approx(1.0, abs=4.0 * np.sqrt(4.0 / 400))
-    shapes = [one.sum(0) / one.sum() for one in counts]
+    shapes = [count.sum(0) / count.sum() for count in counts]
     noise = np.sqrt(2.0 * shapes[1] / counts[1].sum())
     assert 0.5 * np.abs(shapes[0] - shapes[1]).sum() < 1.2 * 0.5 * np.sqrt(2.0 / np.pi) * noise.sum()
 
@@ -197,19 +197,19 @@ def test_the_closed_form_is_the_scatter_of_the_estimate(dead_ns):
     """The estimate that is best under count x multinomial, made here from differences of `mean_histogram`, applied to
     exposures of the exact engine: its scatter over what it claims, and how often its intervals hold; 4 standard errors.
     """
-    one, light, exposures = small_system(dead_ns), np.array([1.5, 2.0, 50.0]), 4000
-    closed = at(*light[:2].tolist(), one, summed=False)
+    single, light, exposures = small_system(dead_ns), np.array([1.5, 2.0, 50.0]), 4000
+    closed = at(*light[:2].tolist(), single, summed=False)
     step = np.array([1e-2, 1e-2, 1e-2])
     both = light + np.concatenate([np.diag(step), -np.diag(step)])
-    mean = mean_histogram(ml.Flux(*both.T), one, tolerance=1e-6)
+    mean = mean_histogram(ml.Flux(*both.T), single, tolerance=1e-6)
     moved = ((mean[:3] - mean[3:]) / (2.0 * step[:, None])).T
-    centre = mean_histogram(ml.Flux(*light), one, tolerance=1e-6).reshape(-1)
-    law = ml.joint_law(ml.Flux(*light), one)
+    centre = mean_histogram(ml.Flux(*light), single, tolerance=1e-6).reshape(-1)
+    law = ml.joint_law(ml.Flux(*light), single)
     total = centre.sum()
     mars = np.diag(centre) + np.outer(centre, centre) * (law.count_variance / total**2 - 1.0 / total)
     weights = np.linalg.solve(mars, moved)
     inverse = np.linalg.inv(moved.T @ weights)
-    counts = ml.simulate(ml.Flux([[light[0]]], *light[1:]), one, realizations=exposures, seed=5, threads=1)
+    counts = ml.simulate(ml.Flux([[light[0]]], *light[1:]), single, realizations=exposures, seed=5, threads=1)
     error = ((counts.reshape(exposures, -1) - centre) @ weights @ inverse)[:, 0]
     assert inverse[0, 0] ** 0.5 == pytest.approx(closed.claimed, rel=0.01)
     assert error.std() / closed.real == pytest.approx(1.0, abs=4.0 / np.sqrt(2.0 * exposures) + 0.01)

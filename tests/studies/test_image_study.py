@@ -67,8 +67,8 @@ def test_total_variation_denoises():
     """Least squares plus variation of one edge: both levels move by the weight over their width (Strong and Chan)."""
     image = np.zeros((8, 8))
     image[:, 4:] = 1.0
-    found = total_variation.denoised(image, 0.5, projections=1000)
-    np.testing.assert_allclose(found, np.where(image > 0.5, 1.0 - 0.5 / 4.0, 0.5 / 4.0), atol=0.01)
+    result = total_variation.denoised(image, 0.5, projections=1000)
+    np.testing.assert_allclose(result, np.where(image > 0.5, 1.0 - 0.5 / 4.0, 0.5 / 4.0), atol=0.01)
     delay = 30.0 + 0.02 * np.add.outer(np.arange(24.0), np.arange(24.0))
     system = SYSTEM.replace(cycles=1000)
     flux = ml.Flux(np.full(delay.shape, 5e-3), 5e-3, delay)

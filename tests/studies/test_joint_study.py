@@ -44,11 +44,11 @@ def test_classifiers(kind):
     x, y, z = (random.normal(size=(2000, 3)) for _ in range(3))
     y[:, 0] += 1.0
     x, y, z = (np.column_stack([a, a.sum(-1), np.full(len(a), 7.0)]) for a in (x, y, z))
-    found, error = classifiers.separate(kind, x, y, 1)
+    result, error = classifiers.separate(kind, x, y, 1)
     best = stats.norm.cdf(np.sqrt(0.5))
-    assert best - 0.05 - 4 * error < found < best + 5.2 * error
-    found, _ = classifiers.separate(kind, x, z, 1)
-    p = 2 * stats.norm.sf(abs(found - 0.5) / classifiers.chance_error(1000, 1000))
+    assert best - 0.05 - 4 * error < result < best + 5.2 * error
+    result, _ = classifiers.separate(kind, x, z, 1)
+    p = 2 * stats.norm.sf(abs(result - 0.5) / classifiers.chance_error(1000, 1000))
     require({kind: p}, "one law, two samples")
     assert classifiers.separate(kind, x[:, 4:], y[:, 4:], 1) == (0.5, 0.0)
 
@@ -60,9 +60,9 @@ def test_qda_sees_covariance():
     laws = [np.array([[1.0, c], [c, 1.0]]) for c in (0.6, -0.6)]
     x, y = (random.multivariate_normal([0, 0], law, size=4000) for law in laws)
     best, _ = classifiers.auc(*(-np.prod(random.multivariate_normal([0, 0], law, size=50_000), -1) for law in laws))
-    found, error = classifiers.separate(classifiers.QDA, x, y, 1)
-    assert abs(found - best) < 5.2 * error + 0.003
-    assert found > 0.7
+    result, error = classifiers.separate(classifiers.QDA, x, y, 1)
+    assert abs(result - best) < 5.2 * error + 0.003
+    assert result > 0.7
 
 
 def test_features():
@@ -83,11 +83,11 @@ def test_pixels_given_to_exact_are_not_judged():
     pytest.importorskip("sklearn", reason="extra 'studies'")
     settings = joint.Settings((), 60, 0, 60, bins=256)
     case = bins.Case("too short", 1.0, 1.0, 0.6375, cycles=50)
-    found = {o.engine: o for o in joint.examine(case, settings, 0, 300, joint.TESTS[:1])}
-    assert found["feedback"].instead == "exact"
-    assert not found["feedback"].aucs
-    assert found["mars"].aucs
-    assert run.given_to_exact(list(found.values())) == ["too short"]
+    results = {o.engine: o for o in joint.examine(case, settings, 0, 300, joint.TESTS[:1])}
+    assert results["feedback"].instead == "exact"
+    assert not results["feedback"].aucs
+    assert results["mars"].aucs
+    assert run.given_to_exact(list(results.values())) == ["too short"]
 
 
 @pytest.mark.full
@@ -111,9 +111,9 @@ def test_files(tmp_path):
     assert len(outcomes) == 16
     require(outcomes, "joint study")
     bright = [row for row in rows if row["case"] == bins.SEVEN[6].name]
-    seen = {row["engine"]: float(row["auc_qda"]) for row in bright if row["auc_qda"]}
-    assert seen["mars"] > 0.7, "its window variance is more than twice the exact one"
-    assert seen["renewal"] > 0.7
+    recorded = {row["engine"]: float(row["auc_qda"]) for row in bright if row["auc_qda"]}
+    assert recorded["mars"] > 0.7, "its window variance is more than twice the exact one"
+    assert recorded["renewal"] > 0.7
 
 
 def test_without_scikit_learn(tmp_path, monkeypatch, capsys):
@@ -133,9 +133,9 @@ def test_an_engine_whose_law_takes_too_long_is_not_judged(monkeypatch):
         return sampled(case, many, engine, *rest)
 
     monkeypatch.setattr(joint.Sample, "of", refuses)
-    found = joint.examine(bins.SEVEN[6], joint.Settings((), 60, 0, 60, bins=256), 0, 300, joint.TESTS[:1])
-    mars = next(o for o in found if o.engine == "mars")
+    result = joint.examine(bins.SEVEN[6], joint.Settings((), 60, 0, 60, bins=256), 0, 300, joint.TESTS[:1])
+    mars = next(o for o in result if o.engine == "mars")
     assert mars.instead == "refused"
     assert not mars.aucs
     assert np.isnan(mars.ratios["window"]).all()
-    assert all(o.aucs for o in found if o.engine not in ("exact", "mars"))
+    assert all(o.aucs for o in result if o.engine not in ("exact", "mars"))

@@ -48,12 +48,12 @@ def test_without_dead_time_bins_are_independent():
     case = Case("no dead time", 0.5, 0.5, 0.0, cycles=300)
     outcomes = {}
     for seed, engine in enumerate(("exact", "poisson")):
-        found = compared(case, engine, 4000, seed)
-        assert list(found) == list(RATIOS)
+        result = compared(case, engine, 4000, seed)
+        assert list(result) == list(RATIOS)
         for key, none in (("window", 1.0), ("bin", 1.0), ("count", 1.0), ("window mean", 0.0)):
-            value, error = found[key]
+            value, error = result[key]
             outcomes[f"{engine}: {key}"] = 2 * stats.norm.sf(abs(value - none) / error)
-            assert not joint.beyond(found[key], key)
+            assert not joint.beyond(result[key], key)
     require(outcomes, "joint table")
 
 
@@ -61,10 +61,10 @@ def test_without_dead_time_bins_are_independent():
 def test_errors_are_the_scatter_of_samples():
     """Standard errors of 60 samples of one law against the scatter of their ratios; 5 of its own errors."""
     case, law = SEVEN[6], Law(SEVEN[6], 256)
-    found = [law.ratios(Sample.of(case, 256, "exact", 500, k, NONE)) for k in range(60)]
+    results = [law.ratios(Sample.of(case, 256, "exact", 500, k, NONE)) for k in range(60)]
     outcomes = {}
     for key in RATIOS:
-        value, error = np.array([one[key] for one in found]).T
+        value, error = np.array([item[key] for item in results]).T
         z = (value - (key != "window mean")) / error
         outcomes[key] = 2 * min(stats.chi2.sf((z**2).sum(), z.size), stats.chi2.cdf((z**2).sum(), z.size))
     require(outcomes, "errors of the joint table")
@@ -75,18 +75,18 @@ def test_dead_time_is_seen():
     law = Law(REFERENCE[0], 256)
     assert law._count == pytest.approx(140.2, rel=0.05)
     assert law._window[1] == pytest.approx(273.6, rel=0.05)
-    found = compared(REFERENCE[0], "poisson", 800, 2)
-    assert found["count"][0] > 5
-    assert all(joint.beyond(found[key], key) for key in ("window", "bin", "count", "window mean"))
+    result = compared(REFERENCE[0], "poisson", 800, 2)
+    assert result["count"][0] > 5
+    assert all(joint.beyond(result[key], key) for key in ("window", "bin", "count", "window mean"))
     assert compared(SEVEN[6], "mars", 800, 3)["window"][0] == pytest.approx(1.0 / SEVEN_RATIOS[6], rel=0.3)
 
 
 def test_bins_without_neighbours():
     """Neighbours are compared only where both bins vary; a lone pulse has none."""
     case = Case("pulse alone", 1.0, 0.0, 0.1, delay=0.5 + 0.5 / COARSE, sigma=0.0005, cycles=100)
-    found = compared(case, "sequential", 400, 2)
-    assert np.isnan(found["neighbour"]).all()
-    assert not joint.beyond(found["neighbour"], "neighbour")
-    assert found["bin"][0] == pytest.approx(1.0, abs=6 * found["bin"][1])
+    result = compared(case, "sequential", 400, 2)
+    assert np.isnan(result["neighbour"]).all()
+    assert not joint.beyond(result["neighbour"], "neighbour")
+    assert result["bin"][0] == pytest.approx(1.0, abs=6 * result["bin"][1])
     near = Case("on an edge", 1.0, 0.0, 0.1, delay=0.5, sigma=0.0005, cycles=100)
     assert np.isfinite(compared(near, "exact", 400, 3)["neighbour"]).all()

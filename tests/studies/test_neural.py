@@ -46,10 +46,10 @@ def held_out() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def test_pdf_is_within_a_fiftieth_of_the_chain(held_out):
     signal, background, delay = held_out
     chain = ml.registration_pdf(ml.Flux(signal, background, delay), SYSTEM, "chain")
-    found = NEURAL.registration_pdf(ml.Flux(signal, background, delay), SYSTEM)
-    np.testing.assert_allclose(found.sum(-1), 1.0, rtol=1e-12)
-    assert (found >= 0.0).all()
-    off = variation(found, chain)
+    result = NEURAL.registration_pdf(ml.Flux(signal, background, delay), SYSTEM)
+    np.testing.assert_allclose(result.sum(-1), 1.0, rtol=1e-12)
+    assert (result >= 0.0).all()
+    off = variation(result, chain)
     assert off.max() < WITHIN
     assert off.mean() < WITHIN / 10
     # what a network that ignores its input would score, in the best of frames: each flux at the same delay
@@ -160,16 +160,16 @@ def test_training_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFi
     assert main(arguments) == 0
     assert "total variation to the chain" in capsys.readouterr().out
     assert {p.name for p in tmp_path.iterdir()} == {"net.npz", "net.csv", "net.png", "small.yaml"}
-    found = NeuralMap.load(path)
-    assert found.system.dead_time_periods == 0.3
+    result = NeuralMap.load(path)
+    assert result.system.dead_time_periods == 0.3
     # learned, not merely guessed: better than before the first step, and than the mean PDF
     rows = (tmp_path / "net.csv").read_text().splitlines()
     first, last = (float(rows[k].split(",")[3]) for k in (1, -1))
     assert last < 0.5 * first
-    assert last < 0.2 * found.record["tv_unconditional"]
+    assert last < 0.2 * result.record["tv_unconditional"]
     flux = ml.Flux(1.0, 1.0, 5.0)
     cube = ml.simulate(flux, SMALL, engine=NeuralEngine(path))
-    assert np.array_equal(cube, ml.simulate(flux, SMALL, engine=NeuralEngine(found)))
+    assert np.array_equal(cube, ml.simulate(flux, SMALL, engine=NeuralEngine(result)))
     assert main(["neural", "info", str(path)]) == 0
     assert "trained" not in capsys.readouterr().err
     assert main(arguments) == 2
@@ -187,15 +187,15 @@ def test_the_package_says_where_the_engine_went():
 @pytest.mark.full
 def test_it_is_compared_beside_the_engines_of_the_package():
     scene = ml.Scene.example("room", size=4)
-    found = compare(scene.flux(SYSTEM, signal=1.0, sbr=1.0), SYSTEM, ["exact", NEURAL], realizations=50, seed=1)
-    assert list(found.scenes) == ["exact", "neural"]
-    assert not found.skipped
+    result = compare(scene.flux(SYSTEM, signal=1.0, sbr=1.0), SYSTEM, ["exact", NEURAL], realizations=50, seed=1)
+    assert list(result.scenes) == ["exact", "neural"]
+    assert not result.skipped
 
 
 def test_training_is_repeatable():
     plan = Training(steps=3, pairs=40, held_out=10, batch=8, width=4, code=8)
-    one, two = (train(SMALL, plan).map for _ in range(2))
-    assert one.digest == two.digest != train(SMALL, Training(**{**vars(plan), "seed": 1})).map.digest
+    first, two = (train(SMALL, plan).map for _ in range(2))
+    assert first.digest == two.digest != train(SMALL, Training(**{**vars(plan), "seed": 1})).map.digest
 
 
 def test_bad_files_and_plans(tmp_path: Path):

@@ -34,11 +34,11 @@ def test_no_error_on_the_nodes(interpolation):
     table = Table.build(system, signal=(0.1, 10.0, 3), background=(0.1, 10.0, 3))
     signal, background = np.array([0.1, 1.0, 10.0]), np.array([1.0, 10.0, 0.1])
     truth = exposure_moments(Flux(signal, background, 0.5 * system.period_ns), system)
-    found = table.at(signal, background, interpolation=interpolation)
-    errors = quantisation._errors(found.rows, found.weights, found.cumulants, table.shapes(), truth)
+    result = table.at(signal, background, interpolation=interpolation)
+    errors = quantisation._errors(result.rows, result.weights, result.cumulants, table.shapes(), truth)
     assert all(errors[key].max() < 1e-5 for key in quantisation.ERRORS)
     shifted = quantisation._errors(
-        found.rows[[1, 1, 1]], found.weights, found.cumulants[[1, 1, 1]], table.shapes(), truth
+        result.rows[[1, 1, 1]], result.weights, result.cumulants[[1, 1, 1]], table.shapes(), truth
     )
     assert shifted["law"][0] > 0.5
     assert shifted["shape"][0] > 0.05

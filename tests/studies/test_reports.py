@@ -122,9 +122,9 @@ def test_filters_and_tables():
     assert report.table([]) == ""
     assert report.table([{"a": 1, "b": 0.5}]) == "| a | b |\n|---|---|\n| 1 | 0.5 |"
     values = np.array([1.0, 2.0, 4.0])
-    shown = jinja2.Environment(autoescape=False)
-    shown.filters |= report.FILTERS
-    made = shown.from_string("{{ v|each }} {{ v|mean|f('.3f') }} {{ v|median|n }} {{ v|quantile(1.0)|n }}").render(
+    examples = jinja2.Environment(autoescape=False)
+    examples.filters |= report.FILTERS
+    made = examples.from_string("{{ v|each }} {{ v|mean|f('.3f') }} {{ v|median|n }} {{ v|quantile(1.0)|n }}").render(
         v=values
     )
     assert made == "1, 2, 4 2.333 2 4"

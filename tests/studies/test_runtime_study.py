@@ -120,16 +120,16 @@ def test_points_that_would_take_too_long_are_left_out(monkeypatch):
 
     monkeypatch.setattr(timing, "contenders", lambda tables: [contenders.Contender("slow", "slow", prepare)])
     axis = timing.Axis("cycles", "cycles", (10.0, 100.0, 1000.0, 10_000.0), 2)
-    found = timing.along(timing.QUICK, axis, str)
-    assert [p.seconds is not None for p in found] == [True, True, False, False]
-    assert found[2].why == found[3].why == "predicted 6.31 s"
+    result = timing.along(timing.QUICK, axis, str)
+    assert [p.seconds is not None for p in result] == [True, True, False, False]
+    assert result[2].why == result[3].why == "predicted 6.31 s"
 
 
 def test_flux_beyond_the_table_is_left_out():
-    one = next(c for c in contenders.contenders(contenders.Tables((4, 3))) if c.name == contenders.NUMPY)
-    assert one.takes(ml.Flux(0.01, 10.0, 1.0))
-    assert not one.takes(ml.Flux(0.009, 1.0, 1.0))
-    assert not one.takes(ml.Flux(0.1, 10.1, 1.0))
+    single = next(c for c in contenders.contenders(contenders.Tables((4, 3))) if c.name == contenders.NUMPY)
+    assert single.takes(ml.Flux(0.01, 10.0, 1.0))
+    assert not single.takes(ml.Flux(0.009, 1.0, 1.0))
+    assert not single.takes(ml.Flux(0.1, 10.1, 1.0))
 
 
 @pytest.mark.full

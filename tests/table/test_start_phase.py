@@ -44,11 +44,11 @@ def test_one_sweep_gives_the_cumulants_at_every_delay(start, dead):
     signal, background = 10 ** rng.uniform(-2, 1, (2, 5))
     system = make_system(dead, cycles=4000, start=start)
     own = np.empty((5, 4))
-    found, settled = corrections(signal, background, system, cumulants=own)
+    result, settled = corrections(signal, background, system, cumulants=own)
     delay = system.period_ns * (0.5 - PHASES / GRID)
     exact = exposure_moments(ml.Flux(signal[:, None], background[:, None], delay), system, tolerance=1e-5).cumulants
     spread = np.sqrt(exact[:, :1, 1])[..., None] ** np.arange(1, 5)
-    error = (found - (exact - exact[:, :1])) / spread
+    error = (result - (exact - exact[:, :1])) / spread
     assert (settled >= 0).sum() >= 3
     assert np.abs(error[settled >= 0]).max() < 3e-4
     assert np.abs(own - exact[:, 0]).max(0) == pytest.approx(0, abs=1e-4 * np.abs(exact[:, 0]).max())
@@ -69,8 +69,8 @@ def test_what_the_correction_is_worth():
 
 
 def test_a_constant_rate_has_no_phase():
-    found, _ = corrections(0.0, [0.1, 2.0], make_system(0.37, cycles=2000))
-    assert np.abs(found).max() < 1e-9
+    result, _ = corrections(0.0, [0.1, 2.0], make_system(0.37, cycles=2000))
+    assert np.abs(result).max() < 1e-9
 
 
 def test_vector_widths_agree():
@@ -93,9 +93,9 @@ def test_interpolated_over_pixels_and_phases(start):
         for d in (delay, 0.5 * table.system.period_ns)
     )
     exact = (moved.cumulants - canonical.cumulants)[:, :2]
-    found = table.at(signal, background, delay_ns=delay).cumulants - table.at(signal, background).cumulants
+    result = table.at(signal, background, delay_ns=delay).cumulants - table.at(signal, background).cumulants
     scale = np.maximum(np.sqrt(moved.variance), 0.5)[:, None] ** np.arange(1, 3)
-    assert (np.abs(found[:, :2] - exact) / scale).max() < 2e-3
+    assert (np.abs(result[:, :2] - exact) / scale).max() < 2e-3
     effect = (np.abs(exact) / scale).max(0)
     assert effect[1] > 0.03
     assert effect[0] > 0.1 or start == "stationary"
@@ -113,10 +113,10 @@ def test_exposures_that_end_before_they_settle(dead, cycles):
     for node in (phases.phase.size // 3, phases.phase.size // 2):
         delay = system.period_ns * (0.5 - phases.phase[node])
         exact = exposure_moments(ml.Flux(s, b, delay), system).cumulants - entries.cumulants
-        told = phases.correction.reshape(phases.settled.size, -1, 4)[:, node]
+        text = phases.correction.reshape(phases.settled.size, -1, 4)[:, node]
         scale = np.maximum(np.sqrt(entries.variance), 0.5)[:, None] ** np.arange(1, 3)
         rows = np.searchsorted(signal, phases.signal)[:, None] * 3 + np.searchsorted(background, phases.background)
-        assert (np.abs(told - exact[rows.reshape(-1)])[:, :2] / scale[rows.reshape(-1)]).max() < 5e-3
+        assert (np.abs(text - exact[rows.reshape(-1)])[:, :2] / scale[rows.reshape(-1)]).max() < 5e-3
 
 
 @pytest.mark.full

@@ -43,7 +43,7 @@ def test_a_file_says_what_the_table_said(tmp_path, method):
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "message"),
     [
         ({"bins": 64}, "bins is 32 there and 64 here"),
         ({"period_ns": 90.0}, "period_ns is 100.0 there and 90.0 here"),
@@ -53,10 +53,10 @@ def test_a_file_says_what_the_table_said(tmp_path, method):
         ({"cycles": 2}, "cycles is 200 there and 2 here"),
     ],
 )
-def test_another_system_is_refused(tmp_path, change, told):
+def test_another_system_is_refused(tmp_path, change, message):
     table = small_table()
     table.save(tmp_path / "t.h5")
-    with pytest.raises(ValueError, match=f"is a table of another system: {told}"):
+    with pytest.raises(ValueError, match=f"is a table of another system: {message}"):
         ml.Table.load(tmp_path / "t.h5", table.system.replace(**change))
     longer = ml.Table.load(tmp_path / "t.h5", table.system.replace(cycles=900))
     assert np.array_equal(longer.at(1.0, 1.0).cumulants, table.at(1.0, 1.0, cycles=900).cumulants)
@@ -149,10 +149,10 @@ def test_commands(tmp_path, own_cache):
     small = ["--signal", "0.1,5,5", "--background", "0.1,2,4", "--bins", 32, "--pulse-sigma-ns", 4, "--threads", 1]
     done = run("table", "build", *small, "-o", tmp_path / "t.h5", "--check-law")
     assert done.exit_code == 0, done.output
-    told = run("table", "info", tmp_path / "t.h5")
+    printed = run("table", "info", tmp_path / "t.h5")
     words = "0 and 5 log-spaced values in [0.1, 5]", "105 MB", "108 GB", "count law", "start phases", "exact laws"
     for word in words:
-        assert word in told.output, word
+        assert word in printed.output, word
     assert run("table", "build", *small, "-o", tmp_path / "t.h5").exit_code == 2
     assert run("table", "build", *small).exit_code == 0
     assert run("table", "build", *small, "--method", "mars").exit_code == 0

@@ -10,8 +10,8 @@ from studies import Request
 
 @pytest.mark.full
 def test_the_study_writes_its_report(tmp_path):
-    told = []
-    paths = studies.run("table", Request(tmp_path, quick=True, tell=told.append))
+    messages = []
+    paths = studies.run("table", Request(tmp_path, quick=True, tell=messages.append))
     assert [path.name for path in paths] == ["table.md", "table.csv"]
     text = paths[0].read_text()
     assert "| 75 | armed | exposure | 1000 | bilinear |" in text
@@ -20,7 +20,7 @@ def test_the_study_writes_its_report(tmp_path):
     at = rows[0].index("mean max")
     bilinear, nearest = (float(row[at]) for row in rows[1:3])
     assert bilinear < 0.1 * nearest
-    assert len(told) == 1
+    assert len(messages) == 1
 
 
 def test_the_start_up_study_writes_its_report(tmp_path):

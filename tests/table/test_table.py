@@ -17,9 +17,9 @@ def total_variation(a, b):
     return 0.5 * np.abs(a - b).sum(-1)
 
 
-def mixed(table, found, cycles=None):
+def mixed(table, result, cycles=None):
     shapes = table.shapes(cycles)
-    return np.stack([w @ shapes[r] for r, w in zip(found.rows, found.weights, strict=True)])
+    return np.stack([w @ shapes[r] for r, w in zip(result.rows, result.weights, strict=True)])
 
 
 def test_entries_are_the_exact_statistics():
@@ -32,9 +32,9 @@ def test_entries_are_the_exact_statistics():
         exact = exposure_moments(
             ml.Flux(table.signal[i], table.background[j], 0.5 * table.system.period_ns), table.system, tolerance=1e-6
         )
-        found = table.at(table.signal[i], table.background[j])
-        assert found.cumulants[0] == pytest.approx(exact.cumulants, rel=1e-12)
-        row = found.rows[0, found.weights[0].argmax()]
+        result = table.at(table.signal[i], table.background[j])
+        assert result.cumulants[0] == pytest.approx(exact.cumulants, rel=1e-12)
+        row = result.rows[0, result.weights[0].argmax()]
         assert row == i * 25 + j
         own = exact.histogram / exact.mean if exact.mean > 0 else np.full(32, 1 / 32)
         assert total_variation(shapes[row], own) < 1e-6
@@ -52,8 +52,8 @@ def test_any_number_of_cycles(start, cycles):
         table.system.replace(cycles=cycles),
         tolerance=1e-6,
     )
-    found = table.at(table.signal[i], table.background[j], cycles=cycles)
-    assert found.cumulants == pytest.approx(exact.cumulants, rel=1e-6, abs=1e-6)
+    result = table.at(table.signal[i], table.background[j], cycles=cycles)
+    assert result.cumulants == pytest.approx(exact.cumulants, rel=1e-6, abs=1e-6)
     shapes = table.shapes(cycles)[i * table.background.size + j]
     lit = exact.mean > 0
     own = exact.histogram[lit] / exact.mean[lit, None]
@@ -69,16 +69,16 @@ def test_between_entries():
     exact = exposure_moments(ml.Flux(signal, background, 0.5 * table.system.period_ns), table.system, tolerance=1e-6)
     spread = np.maximum(np.sqrt(exact.variance), 0.5)
     own = exact.histogram / exact.mean[:, None]
-    found = table.at(signal, background)
+    result = table.at(signal, background)
     near = table.at(signal, background, interpolation="nearest")
-    assert np.abs(found.weights.sum(-1) - 1).max() < 1e-12
-    assert found.weights.min() >= 0
+    assert np.abs(result.weights.sum(-1) - 1).max() < 1e-12
+    assert result.weights.min() >= 0
     assert set(np.unique(near.weights)) == {0.0, 1.0}
-    off = {n: np.abs(told.cumulants - exact.cumulants)[:, 0] / spread for n, told in (("b", found), ("n", near))}
+    off = {n: np.abs(message.cumulants - exact.cumulants)[:, 0] / spread for n, message in (("b", result), ("n", near))}
     assert off["b"].max() < 0.015
     assert off["n"].max() > 20 * off["b"].max()
-    assert total_variation(mixed(table, found), own).max() < 3e-3
-    assert total_variation(mixed(table, near), own).max() > 3 * total_variation(mixed(table, found), own).max()
+    assert total_variation(mixed(table, result), own).max() < 3e-3
+    assert total_variation(mixed(table, near), own).max() > 3 * total_variation(mixed(table, result), own).max()
 
 
 def test_pixels_without_signal_background_or_both():
@@ -94,9 +94,9 @@ def test_pixels_without_signal_background_or_both():
     assert masked.cumulants[0, 0] == pytest.approx(rate * periods / (1 + x) + x**2 / 2 / (1 + x) ** 2, rel=1e-6)
     signal, background = np.array([0.003, 0.012, 0.007, 1.0]), np.array([1.0, 0.02, 0.01, 0.021])
     exact = exposure_moments(ml.Flux(signal, background, 0.5 * table.system.period_ns), table.system, tolerance=1e-6)
-    found = table.at(signal, background)
-    assert (np.abs(found.cumulants - exact.cumulants)[:, 0] / np.sqrt(exact.variance)).max() < 0.005
-    assert total_variation(mixed(table, found), exact.histogram / exact.mean[:, None]).max() < 5e-3
+    result = table.at(signal, background)
+    assert (np.abs(result.cumulants - exact.cumulants)[:, 0] / np.sqrt(exact.variance)).max() < 0.005
+    assert total_variation(mixed(table, result), exact.histogram / exact.mean[:, None]).max() < 5e-3
 
 
 def test_pixels_beyond_the_axes():
@@ -105,13 +105,13 @@ def test_pixels_beyond_the_axes():
         table.at([0.5, 11.0], 1.0)
     with pytest.raises(ValueError, match="background must lie in"):
         table.at(0.5, 6.0)
-    found = table.at([[0.5, 11.0], [2.0, 3.0]], 1.0, outside="exact")
-    assert found.outside.tolist() == [False, True, False, False]
-    assert np.isnan(found.cumulants[1]).all()
-    assert found.rows[1].tolist() == [0, 0, 0, 0]
-    assert found.weights[1].tolist() == [1, 0, 0, 0]
-    assert np.array_equal(found.cumulants[[0, 2, 3]], table.at([0.5, 2.0, 3.0], 1.0).cumulants)
-    assert not found.trusted()[1]
+    result = table.at([[0.5, 11.0], [2.0, 3.0]], 1.0, outside="exact")
+    assert result.outside.tolist() == [False, True, False, False]
+    assert np.isnan(result.cumulants[1]).all()
+    assert result.rows[1].tolist() == [0, 0, 0, 0]
+    assert result.weights[1].tolist() == [1, 0, 0, 0]
+    assert np.array_equal(result.cumulants[[0, 2, 3]], table.at([0.5, 2.0, 3.0], 1.0).cumulants)
+    assert not result.trusted()[1]
     assert table.at([11.0, 12.0], 1.0, outside="exact").outside.all()
 
 
@@ -146,10 +146,10 @@ def test_the_method_of_the_paper():
     mean, variance = mars_moments(
         ml.Flux(table.signal[i], table.background[j], 0.5 * table.system.period_ns), table.system
     )
-    found = table.at(table.signal[i], table.background[j], delay_ns=12.0)
-    assert found.cumulants[:, 0] == pytest.approx(mean, rel=1e-12)
-    assert found.cumulants[:, 1] == pytest.approx(variance, rel=1e-12)
-    assert not found.cumulants[:, 2:].any()
+    result = table.at(table.signal[i], table.background[j], delay_ns=12.0)
+    assert result.cumulants[:, 0] == pytest.approx(mean, rel=1e-12)
+    assert result.cumulants[:, 1] == pytest.approx(variance, rel=1e-12)
+    assert not result.cumulants[:, 2:].any()
     chain = ml.registration_pdf(
         ml.Flux(table.signal[i], table.background[j], 0.5 * table.system.period_ns), table.system, "chain"
     )
@@ -162,9 +162,9 @@ def test_the_method_of_the_paper():
 
 def test_no_dead_time_is_poisson():
     table = ml.Table.build(make_system(0.0), (0.1, 10, 12), (0.1, 10, 8), threads=1)
-    found = table.at(2.0, 0.3, delay_ns=17.0, cycles=3)
-    assert found.cumulants[0] == pytest.approx(3 * 2.3, rel=0.02)
-    assert np.ptp(found.cumulants[0]) < 1e-9
+    result = table.at(2.0, 0.3, delay_ns=17.0, cycles=3)
+    assert result.cumulants[0] == pytest.approx(3 * 2.3, rel=0.02)
+    assert np.ptp(result.cumulants[0]) < 1e-9
 
 
 def test_short_exposures_serve_no_others():
@@ -209,8 +209,8 @@ def test_the_error_of_long_exposures_is_measured_and_told(tmp_path):
     shorter = table.quantisation_error(samples=128, cycles=10**6)
     assert longest.mean_max == pytest.approx(10.0 * shorter.mean_max, rel=0.05)  # as the root of the exposure
     within = longest.cycles_within(0.05)
-    told = table.quantisation_error(samples=128, cycles=within)
-    assert 0.045 <= max(told.mean_max, told.delayed_mean_max) <= 0.055
+    text = table.quantisation_error(samples=128, cycles=within)
+    assert 0.045 <= max(text.mean_max, text.delayed_mean_max) <= 0.055
     assert longest.cycles_within(1e6) == 10**8
     with pytest.raises(ValueError, match="allowed must be"):
         longest.cycles_within(0.0)
@@ -247,7 +247,7 @@ def test_axes():
 
 
 @pytest.mark.parametrize(
-    ("change", "error", "told"),
+    ("change", "error", "message"),
     [
         ({"system": "laser"}, TypeError, "system must be a System"),
         ({"signal": (0.1, 1.0)}, ValueError, r"signal must be \(low, high, points\)"),
@@ -267,15 +267,15 @@ def test_axes():
         ({"progress": 3}, TypeError, "progress must be callable"),
     ],
 )
-def test_bad_requests(change, error, told):
+def test_bad_requests(change, error, message):
     given = {"system": make_system(), "signal": [1.0], "background": [1.0]} | change
-    with pytest.raises(error, match=told):
+    with pytest.raises(error, match=message):
         ml.Table.build(given.pop("system"), **given)
 
 
 def test_bad_lookups():
     table = small_table()
-    for given, error, told in (
+    for given, error, message in (
         ({"signal": -1.0}, ValueError, "signal must be photons per period >= 0"),
         ({"signal": np.nan}, ValueError, "signal must be photons per period >= 0"),
         ({"delay_ns": np.nan}, ValueError, "delay_ns must be finite"),
@@ -284,16 +284,16 @@ def test_bad_lookups():
         ({"outside": "clip"}, ValueError, "outside must be one of"),
         ({"cycles": 0}, ValueError, "cycles must be an integer"),
     ):
-        with pytest.raises(error, match=told):
+        with pytest.raises(error, match=message):
             table.at(**({"signal": 1.0, "background": 1.0} | given))
 
 
 def test_progress_and_stopping():
-    seen = []
-    ml.Table.build(make_system(cycles=50), [0.1, 1.0], [0.1, 1.0], threads=1, progress=lambda *at: seen.append(at))
-    assert seen[-1][0] == seen[-1][1] > 0
-    assert [done for done, _ in seen] == sorted(done for done, _ in seen)
-    assert len({total for _, total in seen}) == 1
+    recorded = []
+    ml.Table.build(make_system(cycles=50), [0.1, 1.0], [0.1, 1.0], threads=1, progress=lambda *at: recorded.append(at))
+    assert recorded[-1][0] == recorded[-1][1] > 0
+    assert [done for done, _ in recorded] == sorted(done for done, _ in recorded)
+    assert len({total for _, total in recorded}) == 1
 
     def stop(done, total):
         raise KeyboardInterrupt

@@ -30,7 +30,7 @@ def build(
     out: OutPath | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Build the table of a system, in a file or in the cache; a cached table is not built again.
+    """Build the table of a system, in a file or in the cache; a cached table is reused.
 
     Grid
     ----

@@ -164,7 +164,7 @@ KINDS: dict[str, Fields] = {
         "pattern": values.text("Of a folder: which files."),
         "bin_ns": values.real("Width of a time bin, ns.", low=0.0, strict_low=True),
         "start_ns": values.real("Travel time at the first bin, ns."),
-        "name": values.text("Which array of the file."),
+        "name": values.text("Name of the array in the file."),
         "channel": values.integer("Which channel of (y, x, time, channel).", low=0, high=2**31),
         "pulse": values.flag("Whether the system's pulse is still to be applied."),
         "size": _SIZE,

@@ -43,8 +43,7 @@ from mars_lidar.light.flux import Flux
 from mars_lidar.light.fog import Fog
 from mars_lidar.light.tolerances import TOL
 from mars_lidar.light.transient import Rows, Transient, parts_of
-from mars_lidar.scene.layers import LayeredScene
-from mars_lidar.scene.scene import Scene
+from mars_lidar.scene.scene import LayeredScene, Scene
 
 
 @dataclass(frozen=True)

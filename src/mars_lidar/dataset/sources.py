@@ -30,8 +30,7 @@ from mars_lidar.io.scene_files import BAD_FILE, Problem, SceneFile, scan
 from mars_lidar.io.transient import SUFFIXES, read_transient, read_truth
 from mars_lidar.light.flux import Flux
 from mars_lidar.light.fog import Fog
-from mars_lidar.scene.layers import LayeredScene
-from mars_lidar.scene.scene import Scene
+from mars_lidar.scene.scene import LayeredScene, Scene
 from mars_lidar.simulation import _check_registrations
 
 _TRIES = 20  # places tried for a crop with a return in it

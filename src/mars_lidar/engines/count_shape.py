@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.types import FloatArray, IndexArray
-from mars_lidar.engines.counts import CountLaws
 from mars_lidar.engines.engine import Engine, Task
-from mars_lidar.engines.synthesis import Run
+from mars_lidar.engines.synthesis import CountLaws, Run
 from mars_lidar.engines.table_reader import Entries, TableReader
 from mars_lidar.engines.tolerances import TOLERANCES
 from mars_lidar.instrument.system import System

@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.types import FloatArray, IndexArray, Progress
-from mars_lidar.engines.counts import CountLaws, Tabulated
 from mars_lidar.engines.engine import Task
 from mars_lidar.engines.pixels import Alignment, single_return
-from mars_lidar.engines.synthesis import Batch, Run
+from mars_lidar.engines.synthesis import Batch, CountLaws, Run, Tabulated
 from mars_lidar.engines.tolerances import TOLERANCES
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System

@@ -133,7 +133,7 @@ FIELDS: dict[str, Effect] = {
         0.0,
         lambda v: checks.real("dark_count_hz", v, low=0.0, high=TOL.rate_hz),
         "dark_count_hz: 100.0             # counts/s of every pixel",
-        help="Dark counts of every pixel, counts/s, which no efficiency reduces.",
+        help="Dark counts of every pixel, counts/s; not reduced by the efficiency.",
         default="0",
     ),
     "afterpulsing": Effect(
@@ -153,7 +153,7 @@ afterpulsing:                    # carriers in traps: each that is released is a
         lambda v: checks.real("twilight_ns", v, low=0.0),
         "twilight_ns: 2.0                 # photons so late in the dead time fire at its end",
         native=lambda v, period_ns: {"twilight": v / period_ns},
-        help="Arrivals this long before the end of the dead time fire at its end, ns.",
+        help="Arrivals up to this long before the end of the dead time trigger an avalanche at its end, ns.",
         default="0",
     ),
     "recovery_ns": Effect(
@@ -191,7 +191,7 @@ crosstalk:                       # avalanches trigger neighbours; with the seque
         lambda v: checks.integer("max_events_per_period", v, low=1, high=TOL.events),
         "max_events_per_period: 1         # the TDC records the first ones only, of a period ...",
         native=lambda v, period_ns: {"most_per_period": v},
-        help="Events recorded of a period.",
+        help="Largest number of events recorded in a period.",
         default="no limit",
     ),
     "max_events_per_exposure": Effect(
@@ -200,7 +200,7 @@ crosstalk:                       # avalanches trigger neighbours; with the seque
         lambda v: checks.integer("max_events_per_exposure", v, low=1, high=TOL.events),
         "max_events_per_exposure: 1000    # ... and of an exposure",
         native=lambda v, period_ns: {"most_per_exposure": v},
-        help="Events recorded of an exposure.",
+        help="Largest number of events recorded in an exposure.",
         default="no limit",
     ),
     "jitter": Effect(

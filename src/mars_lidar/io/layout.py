@@ -40,8 +40,7 @@ from mars_lidar._version import __version__
 from mars_lidar.instrument.system import System
 from mars_lidar.io.recipe import Recipe, Recording
 from mars_lidar.io.store import OnDisk, values
-from mars_lidar.light.flux import Flux
-from mars_lidar.light.stored_flux import StoredFlux, Waveforms
+from mars_lidar.light.flux import Flux, StoredFlux, Waveforms
 from mars_lidar.light.tolerances import TOL
 
 Check = Callable[[Path, Mapping[str, Any]], None]  # of the attributes of a file, before anything else of it is read

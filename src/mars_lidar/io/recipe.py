@@ -14,8 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from mars_lidar._base import checks
 from mars_lidar._base.display import brief
 from mars_lidar.instrument.system import System
-from mars_lidar.light.flux import Flux
-from mars_lidar.light.stored_flux import StoredFlux
+from mars_lidar.light.flux import Flux, StoredFlux
 
 BLOCK_BYTES = 64 * 2**20  # one call of the simulator: enough work for every core, little beside the output
 

@@ -39,8 +39,7 @@ from mars_lidar._base.hdf5 import open_hdf5
 from mars_lidar._base.types import FloatArray
 from mars_lidar.io import pixels
 from mars_lidar.io.named_arrays import mat_arrays
-from mars_lidar.scene.layers import LayeredScene
-from mars_lidar.scene.scene import Scene
+from mars_lidar.scene.scene import LayeredScene, Scene
 
 _DEPTH_IMAGES = (".png", ".tif", ".tiff")
 _DEPTH_FLOATS = (".pfm", ".exr")

@@ -25,8 +25,7 @@ from mars_lidar.instrument.system import System
 from mars_lidar.io import zarr_store
 from mars_lidar.io.cube import Cube, check_output, load, open_writer
 from mars_lidar.io.recipe import Recipe
-from mars_lidar.light.flux import Flux
-from mars_lidar.light.stored_flux import StoredFlux
+from mars_lidar.light.flux import Flux, StoredFlux
 from mars_lidar.simulation import simulate
 from mars_lidar.table import Table, cache
 

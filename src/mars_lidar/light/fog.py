@@ -13,8 +13,7 @@ from mars_lidar._base import checks
 from mars_lidar._base.resources import check_memory
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import SPEED_OF_LIGHT_M_PER_NS, System
-from mars_lidar.light.flux import Flux
-from mars_lidar.light.stored_flux import StoredFlux
+from mars_lidar.light.flux import Flux, StoredFlux
 from mars_lidar.light.tolerances import TOL
 from mars_lidar.light.transient import through_pulse
 

@@ -22,8 +22,7 @@ from mars_lidar._base.resources import check_memory
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.pulse import Pulse
 from mars_lidar.instrument.system import System
-from mars_lidar.light.flux import Flux
-from mars_lidar.light.stored_flux import StoredFlux
+from mars_lidar.light.flux import Flux, StoredFlux
 from mars_lidar.light.tolerances import TOL
 
 # --- Parts of rates that stay on disk ------------------------------------------------------------------------------

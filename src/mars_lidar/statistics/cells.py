@@ -33,10 +33,8 @@ from mars_lidar.instrument.detector import Mode, require_effects
 from mars_lidar.instrument.effects import LIGHT_EFFECTS
 from mars_lidar.instrument.pulse import SampledPulse
 from mars_lidar.instrument.system import System
-from mars_lidar.light.flux import Flux, check_photons
-from mars_lidar.light.stored_flux import StoredFlux
-from mars_lidar.statistics.budget import MOMENTS, advice
-from mars_lidar.statistics.tolerances import TOL
+from mars_lidar.light.flux import Flux, StoredFlux, check_photons
+from mars_lidar.statistics.tolerances import MOMENTS, TOL, advice
 
 # --- Detectors that a statistic treats -----------------------------------------------------------------------------
 # A gate that repeats every period makes a gated pixel a free-running one that detects the flux inside of the gate, so

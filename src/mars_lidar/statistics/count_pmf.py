@@ -17,11 +17,10 @@ from numpy.typing import NDArray
 
 from mars_lidar._base.native import _core
 from mars_lidar._base.types import FloatArray, IndexArray
-from mars_lidar.statistics.budget import LAW
 from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.exposure import Settled, native_light, refined_moments, warm_history
 from mars_lidar.statistics.phase_chain import ConvergenceError
-from mars_lidar.statistics.tolerances import TOL
+from mars_lidar.statistics.tolerances import LAW, TOL
 
 # --- Support of the count, and closed forms ------------------------------------------------------------------------
 

@@ -24,13 +24,12 @@ from mars_lidar.instrument.detector import Mode
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
-from mars_lidar.statistics.budget import LAW, MOMENTS, Budget, advice
 from mars_lidar.statistics.cells import Cells, photons_before
 from mars_lidar.statistics.count_pmf import Pmf, exact_windows
 from mars_lidar.statistics.exposure import Moments, refined_moments, stationary_histogram
 from mars_lidar.statistics.phase_chain import ConvergenceError
 from mars_lidar.statistics.timing import Timing, is_timed
-from mars_lidar.statistics.tolerances import TOL
+from mars_lidar.statistics.tolerances import LAW, MOMENTS, TOL, Budget, advice
 
 # --- From record to record -----------------------------------------------------------------------------------------
 

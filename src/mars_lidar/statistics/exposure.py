@@ -31,12 +31,11 @@ from mars_lidar.instrument.detector import Mode
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
-from mars_lidar.statistics.budget import MOMENTS, Budget
 from mars_lidar.statistics.cells import Cells, fine_histograms, meets_itself, photons_before
 from mars_lidar.statistics.joint_grid import FoldedGrid
 from mars_lidar.statistics.phase_chain import ConvergenceError
 from mars_lidar.statistics.timing import Timing, is_timed
-from mars_lidar.statistics.tolerances import TOL
+from mars_lidar.statistics.tolerances import MOMENTS, TOL, Budget
 
 # --- Results on one grid and their comparison ----------------------------------------------------------------------
 

@@ -14,7 +14,6 @@ from mars_lidar.instrument.detector import MODES
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
-from mars_lidar.statistics.budget import LAW
 from mars_lidar.statistics.cells import PLAIN, Cells, fine_histograms
 from mars_lidar.statistics.chain import PhaseChain
 from mars_lidar.statistics.electronics import ELECTRONICS_MODES, moments, stationary_records
@@ -22,7 +21,7 @@ from mars_lidar.statistics.exposure import normalised, refined_moments, stationa
 from mars_lidar.statistics.paralyzable import paralyzable_histograms
 from mars_lidar.statistics.synchronous import cumulants_of, first_arrivals, synchronous_windows
 from mars_lidar.statistics.timing import recorded
-from mars_lidar.statistics.tolerances import TOL
+from mars_lidar.statistics.tolerances import LAW, TOL
 
 # --- Mean histogram ------------------------------------------------------------------------------------------------
 

@@ -32,13 +32,12 @@ from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
-from mars_lidar.statistics.budget import LAW, advice
 from mars_lidar.statistics.cells import Cells, light_before, meets_itself, misplaced, one_pixel, registered_before
 from mars_lidar.statistics.exposure import recorded_light
 from mars_lidar.statistics.joint_grid import FoldedGrid
 from mars_lidar.statistics.phase_chain import ConvergenceError
 from mars_lidar.statistics.timing import Timing, is_timed
-from mars_lidar.statistics.tolerances import TOL
+from mars_lidar.statistics.tolerances import LAW, TOL, advice
 
 # --- One pixel on one grid -----------------------------------------------------------------------------------------
 

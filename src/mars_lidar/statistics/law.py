@@ -17,7 +17,6 @@ from mars_lidar.instrument.detector import MODES
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
-from mars_lidar.statistics.budget import LAW
 from mars_lidar.statistics.cells import PLAIN, Cells
 from mars_lidar.statistics.constant_light import renewal_moments
 from mars_lidar.statistics.count_pmf import Pmf, exact_windows, gaussian_window, poisson_window
@@ -27,7 +26,7 @@ from mars_lidar.statistics.histogram import chain_of, histogram_effects, rearm_o
 from mars_lidar.statistics.histogram import registration_pdf as registration_pdf
 from mars_lidar.statistics.renewal import holding_times
 from mars_lidar.statistics.synchronous import cumulants_of, synchronous_windows
-from mars_lidar.statistics.tolerances import TOL
+from mars_lidar.statistics.tolerances import LAW, TOL
 
 Method = Literal["exact", "mars", "renewal", "poisson"]
 _METHODS = get_args(Method)

@@ -13,11 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.types import FloatArray
-from mars_lidar.statistics.budget import LAW, advice
 from mars_lidar.statistics.cells import Cells, photons_before
 from mars_lidar.statistics.count_pmf import Pmf
 from mars_lidar.statistics.phase_chain import ConvergenceError
-from mars_lidar.statistics.tolerances import TOL
+from mars_lidar.statistics.tolerances import LAW, TOL, advice
 
 _INSTEAD = advice("fewer cycles")
 

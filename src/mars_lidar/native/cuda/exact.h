@@ -2,7 +2,7 @@
 // those of the processor's engine: the same source, no fused multiply-add, IEEE division.
 //
 // Threads of a warp run in step, so each waits for the longest exposure of its 32: the host hands out pixels in the
-// order of their brightness (mars_lidar/cuda/exact.py), which makes them alike.
+// order of their brightness (mars_lidar/engines/cuda/exact.py), which makes them alike.
 #pragma once
 #include "cuda/device.h"
 #include "exact/step.h"

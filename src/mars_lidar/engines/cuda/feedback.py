@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.native import _core
-from mars_lidar.cuda.kernels import feedback_histograms, overflow
-from mars_lidar.cuda.machine import Cuda
+from mars_lidar.engines.cuda.kernels import feedback_histograms, overflow
+from mars_lidar.engines.cuda.machine import Cuda
 from mars_lidar.engines.engine import Task, part_of
 from mars_lidar.engines.feedback import Group, Plan, sweep_pixels
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.imports import MissingLibraryError
-from mars_lidar.cuda.kernels import HEADERS, OPTIONS, Kernel, source
+from mars_lidar.engines.cuda.kernels import HEADERS, OPTIONS, Kernel, source
 
 _PLAIN_SHARED = 48 << 10  # bytes that a block gets without asking
 

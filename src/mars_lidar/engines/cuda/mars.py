@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 
 from mars_lidar._base.native import _core
 from mars_lidar._base.types import FloatArray, IndexArray
-from mars_lidar.cuda.kernels import MARS_LAWS, mars_histograms, overflow
-from mars_lidar.cuda.machine import Cuda
-from mars_lidar.engines.counts import Streams
+from mars_lidar.engines.cuda.kernels import MARS_LAWS, mars_histograms, overflow
+from mars_lidar.engines.cuda.machine import Cuda
 from mars_lidar.engines.engine import Task, part_of
 from mars_lidar.engines.pixels import Frame, pulse_frame, shift_of, single_return
-from mars_lidar.engines.synthesis import Run
+from mars_lidar.engines.synthesis import Run, Streams
 from mars_lidar.engines.table_reader import TableReader, exact_laws
 
 if TYPE_CHECKING:

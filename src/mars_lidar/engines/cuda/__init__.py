@@ -1,4 +1,7 @@
-"""Which engine runs on a GPU, and what it does there: the engines themselves know of no device."""
+"""Engines on a GPU: the native headers compiled for CUDA at run time.
+
+Here: which engine runs there, and what it does; the engines themselves know of no device.
+"""
 
 from __future__ import annotations
 
@@ -6,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from mars_lidar.cuda.exact import exact_histogram, exact_records
-from mars_lidar.cuda.feedback import feedback_histogram
-from mars_lidar.cuda.machine import Cuda
-from mars_lidar.cuda.mars import check_mars, mars_histogram
+from mars_lidar.engines.cuda.exact import exact_histogram, exact_records
+from mars_lidar.engines.cuda.feedback import feedback_histogram
+from mars_lidar.engines.cuda.machine import Cuda
+from mars_lidar.engines.cuda.mars import check_mars, mars_histogram
 from mars_lidar.engines.engine import Engine, PhaseRecords, Task
 from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.engines.feedback import FeedbackEngine

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.native import _core
-from mars_lidar.cuda.kernels import Sink, Variant, block_bytes
-from mars_lidar.cuda.machine import Cuda
+from mars_lidar.engines.cuda.kernels import Sink, Variant, block_bytes
+from mars_lidar.engines.cuda.machine import Cuda
 from mars_lidar.engines.engine import PhaseRecords, Task
 
 _WARP = 32

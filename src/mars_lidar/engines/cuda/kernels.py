@@ -12,7 +12,7 @@ from mars_lidar._base.native import _core
 from mars_lidar.engines.engine import Task
 from mars_lidar.instrument.detector import MODES
 
-HEADERS = Path(__file__).resolve().parent.parent / "native"
+HEADERS = Path(__file__).resolve().parents[2] / "native"
 AHEAD = 8  # registrations drawn ahead; changes speed only
 # The bits are those of the processor: no fused multiply-add, IEEE division, subnormal numbers.
 OPTIONS = (

@@ -531,7 +531,7 @@ class _Run:
         system = fitted.model.system(centre, cycles, 1024) if known else None
         flux = fitted.model.flux(centre) if known else None
         ordered = tuple(sorted(named, key=lambda suspect: (not suspect.included, -suspect.z)))
-        limits, look, recording = _limits(fitted, listed), self.look, self.recording
+        limits, look, recording = _limits(fitted, listed if p >= self.level else []), self.look, self.recording
         return Calibration(
             look, estimates, p, ordered, limits, drift, system, flux, wave, error, recording, fitted, self.level
         )

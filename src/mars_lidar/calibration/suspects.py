@@ -13,7 +13,7 @@ from mars_lidar.calibration.model import Effect, effects
 from mars_lidar.calibration.recording import FALSE_ALARM, LEAST_PHOTONS, Recording
 from mars_lidar.calibration.start import with_edge
 
-_MISFIT = 1e-3  # probability of the misfit below which effects without a clear score are refitted, and their gain in it
+_MISFIT = 1e-3  # gain in the probability of the misfit by which an effect without score and size is accepted
 _PARTS = 16  # of a recording, for drift: a trend then has 14 degrees of freedom
 
 
@@ -102,7 +102,7 @@ def refitted(fit: Fit, fitted: Fitted, listed: list[Score]) -> Refit | None:
     """
     limit = clear(listed)
     best = _best(fit, fitted, [score for score in listed if score.z > limit], limit)
-    if (fitted if best is None else best[0]).p_value < _MISFIT:
+    if (fitted if best is None else best[0]).p_value < FALSE_ALARM:
         other = _best(fit, fitted, [score for score in listed if score.z <= limit], limit)
         trials = [trial for trial in (best, other) if trial is not None]
         best = min(trials, key=lambda trial: trial[0].misfit_z, default=None)

@@ -449,7 +449,7 @@ class _Run:
             free = run.first()
             if not free.converged or free.p_value < self.level:
                 continue
-            at = _estimates(free, fixed, np.ones(free.model.size)).get(name, Estimate(np.nan, np.nan, np.nan, np.nan))
+            at = _estimates(free, np.ones(free.model.size)).get(name, Estimate(np.nan, np.nan, np.nan, np.nan))
             printed = f"{given:g}" if isinstance(given, float) else str(given)
             gain = fitted.misfit_z - free.misfit_z if fitted.converged else float("nan")
             z = abs(at.value - given) / at.error if isinstance(given, float) and at.error > 0.0 else 0.0
@@ -491,7 +491,7 @@ class _Run:
     ) -> Calibration:
         """The result of the last fit."""
         growth = _growth(fitted, drift)
-        estimates = _estimates(fitted, self.fixed, growth)
+        estimates = _estimates(fitted, growth)
         named: list[Suspect] = list(wrong)
         for refit in included:
             name = refit.effect.names[0]
@@ -549,7 +549,7 @@ def _growth(fitted: Fitted, drift: Drift | None) -> FloatArray:
     return out
 
 
-def _estimates(fitted: Fitted, fixed: dict[str, float], growth: FloatArray) -> dict[str, Estimate]:
+def _estimates(fitted: Fitted, growth: FloatArray) -> dict[str, Estimate]:
     """What is printed, written and drawn, from draws of the law of the parameters."""
     model = fitted.model
     scale = growth[fitted.free]

@@ -213,11 +213,6 @@ class Fitted:
     p_value: float
     converged: bool
 
-    @property
-    def guess(self) -> Guess:
-        """Where another fit may begin."""
-        return Guess(self.model, self.theta, root_of(self.covariance), self.free)
-
 
 def most_probable(model: Model, theta: FloatArray, covariance: FloatArray, free: NDArray[np.intp]) -> FloatArray:
     """The most probable parameters (p,) of a normal law within what a detector can have.

@@ -175,11 +175,9 @@ class Model:
         if self.gaussian and self.jitter_given:
             out[..., k] = np.maximum(out[..., k], out[..., k + 1])
         out[..., k + 2] = np.maximum(out[..., k + 2], 0.0)
-        at = k + 3
-        for effect in self.effects:
-            for low, high in zip(effect.least, effect.most, strict=True):
-                out[..., at] = np.clip(out[..., at], low, high)
-                at += 1
+        bounds = [each for effect in self.effects for each in zip(effect.least, effect.most, strict=True)]
+        for at, (low, high) in enumerate(bounds, k + 3):
+            out[..., at] = np.clip(out[..., at], low, high)
         return out
 
     def widths(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -108,7 +108,8 @@ def refitted(fit: Fit, fitted: Fitted, listed: list[Score]) -> Refit | None:
         best = min(trials, key=lambda trial: trial[0].misfit_z, default=None)
     if best is None:
         return None
-    final = fit.finish(best[0].guess)
+    last = best[0]
+    final = fit.finish(Guess(last.model, last.theta, root_of(last.covariance), last.free))
     return (final, best[1]) if final.converged else best
 
 

@@ -347,10 +347,8 @@ class Fit:
         cycles, number = max(2, round(self.recording.exposure)), 4.0 * self.effort.batch / self.recording.photons
         rows = np.resize(theta, (int(np.clip(number, 4, LIGHTS)), model.size))
         drawn = [np.diff(model.streams(row[None], cycles, self.next_seed()).times).min(initial=np.inf) for row in rows]
-        later = recorded - float(np.mean(drawn))
-        return float(rows[:, model.light + 2].mean()) + later, float(
-            np.hypot(np.std(drawn, ddof=1), model.clock.unit_ns)
-        )
+        later = np.array(drawn) - rows[:, model.light + 2]
+        return recorded - float(later.mean()), float(np.hypot(later.std(ddof=1), model.clock.unit_ns))
 
     def settled(self, model: Model, theta: FloatArray) -> tuple[float, float]:
         """That dead time by streams that have it; its error is wider where a shorter one has as long intervals."""
@@ -427,15 +425,18 @@ class Fit:
         rest = project @ (recorded - near.offset)
         (z, p), (dead, scatter) = _misfit(rest, fresh, law, near), self.shortest(model, mean)
         error = float(sd[free == model.light + 2].sum())  # 0 where it is given
-        early = _extreme(dead - mean[model.light + 2], scatter, error)
+        early, more = _extreme(dead - mean[model.light + 2], scatter, error), 0.0
         if early < FALSE_ALARM and (rows := draws(model, raw, cov, free)) is not None:
-            rows = rows[:: len(rows) // LIGHTS]  # a jitter that is not known makes the shortest interval uncertain too
-            other, total = self.shortest(model, rows[:LIGHTS])
-            whole = max(error, max(total**2 - scatter**2, 0.0) ** 0.5)
-            early = max(early, _extreme(other - rows[:LIGHTS, model.light + 2].mean(), scatter, whole))
+            # a jitter that is not known makes the shortest interval uncertain too
+            further, total = self.shortest(model, rows[:: len(rows) // LIGHTS][:LIGHTS])
+            more = max(total**2 - scatter**2, 0.0) ** 0.5
+            early = max(early, _extreme(further - mean[model.light + 2], scatter, float(np.hypot(error, more))))
         if early < FALSE_ALARM and known is None:
-            last = Guess(model, mean, root_of(cov), free)
-            other = self.finish(last, again=False, known=self.settled(model, mean)) if error else None
+            other = None
+            if error:
+                least, own = self.settled(model, mean)
+                last = Guess(model, mean, root_of(cov), free)
+                other = self.finish(last, again=False, known=(least, float(np.hypot(own, more))))
             if other is not None and other.converged and other.p_value > FALSE_ALARM:
                 return other
             p = min(p, early)

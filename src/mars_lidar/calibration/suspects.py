@@ -228,7 +228,7 @@ def _flicker(fit: Fit, fitted: Fitted, counts: float = 8.0, windows: int = 64) -
     cycles = max(2, round(fit.exposure(size)))
     streams = fitted.model.streams(np.tile(fitted.theta, (LIGHTS, 1)), cycles, 0)
     drawn = [Recording((t,), (cycles,), recording.clock) for t in streams]
-    rows = []
+    rows: list[tuple[float, float, float]] = []
     while not rows or counts * windows < recording.photons:
         window = counts * recording.exposure / recording.photons
         (variance, number, mean), *other = [x.unevenness(window) for x in (recording, *drawn)]
@@ -279,5 +279,5 @@ def drift(fit: Fit, fitted: Fitted) -> Drift | None:
     growth = np.sqrt(np.maximum(square / (len(parts) - 1), 1.0))
     flicker, flicker_z, ratio = _flicker(fit, fitted)
     growth[0] = max(growth[0], ratio**0.5)
-    names = ("light", *(names[i] for i in delays))
-    return Drift(names, middle, x - x.mean(0) + about, sd, trend, slope, p, growth, flicker, flicker_z)
+    printed = ("light", *(names[i] for i in delays))
+    return Drift(printed, middle, x - x.mean(0) + about, sd, trend, slope, p, growth, flicker, flicker_z)

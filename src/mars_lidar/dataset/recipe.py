@@ -333,8 +333,8 @@ class DatasetRecipe:
             scenes=scenes,
             systems=systems,
             light=light,
-            size=_pair(root.get("size")),
-            crop=None if not crop else _pair([crop["size"]] * 2 if isinstance(crop["size"], int) else crop["size"]),
+            size=pair(root.get("size")),
+            crop=None if not crop else pair([crop["size"]] * 2 if isinstance(crop["size"], int) else crop["size"]),
             crops=crop.get("count", 1),
             engine=engine,
             realizations=root["realizations"],
@@ -363,7 +363,7 @@ class DatasetRecipe:
 _FILE: Fields = {"file": values.text("A system of its own file.")}
 
 
-def _pair(size: Any) -> Any:
+def pair(size: Any) -> Any:
     """A size as the package has it."""
     return tuple(size) if isinstance(size, list) else size
 

@@ -32,8 +32,8 @@ from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.statistics.cells import Cells, fine_histograms, meets_itself, photons_before
+from mars_lidar.statistics.chain import ConvergenceError
 from mars_lidar.statistics.joint_grid import FoldedGrid
-from mars_lidar.statistics.phase_chain import ConvergenceError
 from mars_lidar.statistics.timing import Timing, is_timed
 from mars_lidar.statistics.tolerances import MOMENTS, TOL, Budget
 
@@ -158,13 +158,6 @@ class Moments:
         return np.sqrt(self.variance)
 
 
-def darkness(result: Exposure, which: NDArray[np.bool_], bins: int) -> None:
-    """Set the statistics of the cells `which` without light to 0."""
-    for array in (result.cumulants, result.cumulant_rates, result.histogram, result.histogram_rate, result.settled):
-        array[which] = 0
-    result.bins[which] = bins
-
-
 def blank(cells: Cells, out_bins: int) -> Exposure:
     """Uninitialised statistics of the cells."""
     n = cells.size
@@ -225,7 +218,7 @@ def normalised(histogram: FloatArray) -> FloatArray:
 
 # --- Rates of a paralyzable pixel ----------------------------------------------------------------------------------
 
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
+_SERIES_BELOW, _SERIES_TERMS = 0.25, 10  # of the exponent: the recursion loses 4 digits there, the series none
 
 
 def registration_rates(cells: Cells, bins: int) -> FloatArray:
@@ -263,16 +256,41 @@ def _moments(before: FloatArray, within: FloatArray) -> FloatArray:
 
 
 def _on_parts(before: FloatArray, within: FloatArray, parts: int) -> FloatArray:
-    """Moments 0 to 3, with rates of arrivals now and a dead time ago that are constant in each of `parts` of a bin."""
+    """Moments 0 to 3, with rates of arrivals now and a dead time ago that are constant in each of `parts` of a bin.
+
+    The rate of registrations is then exponential in a part, and is largest at one of its ends, from which on x is
+    measured: whatever it falls by in the part, a moment is a sum of terms of one sign.
+    """
     photons, rise = np.diff(before), np.diff(within)
+    peak = photons * np.exp(-np.minimum(within[:, :-1], within[:, 1:]))
+    powers = peak * _decaying_powers(np.abs(rise))
+    step = np.where(rise < 0.0, -2.0, 2.0) / parts
     out = np.zeros((before.shape[0], photons.shape[1] // parts, 4))
     for part in range(parts):
-        some, low, more = photons[:, part::parts], within[:, :-1][:, part::parts], rise[:, part::parts]
-        for node, weight in zip(0.5 * (_NODES + 1.0), 0.5 * _WEIGHTS, strict=True):
-            rate = weight * some * np.exp(-(low + node * more))
-            place = 2.0 * (part + node) / parts - 1.0
-            for order in range(4):
-                out[:, :, order] += rate * place**order
+        width, (zero, one, two, three) = step[:, part::parts], powers[:, :, part::parts]
+        start = 2.0 * part / parts - 1.0 + np.where(width < 0.0, -width, 0.0)
+        out[:, :, 0] += zero
+        out[:, :, 1] += start * zero + width * one
+        out[:, :, 2] += start * (start * zero + 2.0 * width * one) + width**2 * two
+        out[:, :, 3] += start * (start * (start * zero + 3.0 * width * one) + 3.0 * width**2 * two) + width**3 * three
+    return out
+
+
+def _decaying_powers(fall: FloatArray) -> FloatArray:
+    """Integrals of x^m exp(-fall x) over [0, 1], m = 0 .. 3, (4, ...), for fall >= 0."""
+    out = np.empty((4, *fall.shape))
+    large = np.maximum(fall, _SERIES_BELOW)
+    last = np.exp(-large)
+    out[0] = -np.expm1(-large) / large
+    for m in range(1, 4):
+        out[m] = (m * out[m - 1] - last) / large
+    small = np.minimum(fall, _SERIES_BELOW)
+    for m in range(4):
+        term, total = np.ones_like(small), np.full_like(small, 1.0 / (m + 1))
+        for j in range(1, _SERIES_TERMS):
+            term *= -small / j
+            total += term / (m + 1 + j)
+        out[m] = np.where(fall < _SERIES_BELOW, total, out[m])
     return out
 
 
@@ -452,7 +470,8 @@ def refined_moments(
     bins = cells.first_bins(out_bins)
     most = max(TOL.most_bins, 4 * out_bins, 2 * bins)
     if pending.size < cells.size:
-        darkness(result, cells.total == 0.0, bins)
+        for name, array in vars(result).items():  # cells without light register nothing
+            array[cells.total == 0.0] = bins if name == "bins" else 0
         if not pending.size:
             return shaped(result, cells.shape)
     shared = math.gcd(bins // 2, out_bins)
@@ -491,10 +510,10 @@ def _spent(done: Exposure, cells: Cells) -> FloatArray:
     """Cost (cells,) of one pass in bins x periods, with the light and the access to the history included."""
     periods = np.where(done.settled >= 0, done.settled, cells.system.cycles)
     bins = int(done.bins.max(initial=1))
-    return (periods + _before(cells.system)) * done.bins.astype(np.float64) * cells.step_cost(bins)
+    return (periods + _light_cost(cells.system)) * done.bins.astype(np.float64) * cells.step_cost(bins)
 
 
-def _before(system: System) -> float:
+def _light_cost(system: System) -> float:
     """Cost of the light of a bin, in steps of the native recursion."""
     return TOL.rate_steps if system.detector.mode == "paralyzable" else TOL.light_steps
 
@@ -527,7 +546,7 @@ def _run(
     """One pass of the recursion over all cells on one grid."""
     cells.check_history(bins)
     steps = None if budget is MOMENTS else budget.one_pass / cells.step_cost(bins)
-    periods = min(3.0 * (cells.system.dead_time_periods + 1.0), cells.system.cycles) + _before(cells.system)
+    periods = min(3.0 * (cells.system.dead_time_periods + 1.0), cells.system.cycles) + _light_cost(cells.system)
     if steps is not None and periods * bins > steps:
         raise ConvergenceError(f"exposure statistics of {cells.name(0)}: {_too_long(cells, budget)}")
     result = blank(cells, out_bins)

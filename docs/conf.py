@@ -25,8 +25,8 @@ ROOT = Path(__file__).resolve().parents[1]
 
 project = "mars-lidar"
 author = "The mars-lidar authors"
-copyright = "the mars-lidar authors, MIT licence"
 version = release = mars_lidar.__version__
+copyright = f"the mars-lidar authors, MIT licence; documentation of version {version}"
 
 extensions = [
     "myst_parser",
@@ -98,6 +98,7 @@ WITH_CONTENTS = (
 html_theme_options = {
     "show_prev_next": False,
     "secondary_sidebar_items": {pages: ["page-toc"] for pages in WITH_CONTENTS},
+    "logo": {"text": project},
     "navbar_align": "left",
     "header_links_before_dropdown": 8,
     "footer_start": ["copyright"],
@@ -190,6 +191,7 @@ def _commands() -> str:
 
     describe(app)
     text = app.generate_docs(output_format="markdown").replace("# mars-lidar\n", "# Command line\n", 1)
+    text = re.sub(r"(mars-lidar --install-completion).*(?= \[OPTIONS\])", r"\1", text)  # the program that runs is named
     overview, *sections = re.split(r"(?m)^(?=## mars-lidar [a-z])", text)
     commands = {name: app[name].help_epilogue for name in app}
     examples = [commands.get(section.split()[2]) for section in sections]

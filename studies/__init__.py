@@ -5,8 +5,9 @@ a figure in it is made from the run. Reports hold the configuration and the seed
 something depend on the machine, and they name it.
 
 A study is a folder: `run.py` computes what its report states and draws, `report.md.jinja` is the report. Some folders
-hold several studies of one subject, a module and a template of its name for each. What they share is in `common`. All run alike: `run(request)` of the module returns the facts that the template states, among them ``rows`` of
-the CSV file and ``figures`` by name; what writes them is here.
+hold several studies of one subject, a module and a template of its name for each. What they share is in `common`. All
+run alike: `run(request)` of the module returns the facts that the template states, among them ``rows`` of the CSV
+file and ``figures`` by name; what writes them is here.
 """
 
 from __future__ import annotations
@@ -29,8 +30,8 @@ class Request:
 
     `truth` is the engine whose simulation the study "count-law" takes for true; `stream` a measured photon stream for
     the study "hardware"; `config` the size of "downstream"; `seed` and `systems` another sweep, and its size, of the
-    studies "domain" and "long-exposures"; `rgbd` a folder of RGB-D pairs and `captures` one of measured cubes for the
-    study "image".
+    studies "domain" and "long-exposures"; `rgbd` a folder of RGB-D pairs, `captures` one of measured cubes and
+    `drunet` a file of weights of deepinv's DRUNet for the study "image".
     """
 
     out: Path
@@ -44,6 +45,7 @@ class Request:
     systems: int | None = None
     rgbd: Path | None = None
     captures: Path | None = None
+    drunet: Path | None = None
 
 
 class OtherRunsError(ValueError):

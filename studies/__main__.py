@@ -51,6 +51,11 @@ def _parser(command: str) -> argparse.ArgumentParser:
     add("--rgbd", type=Path, metavar="DIR", help=words)
     words = "folder of measured cubes, .zarr, .h5 or .npz, as `mars_lidar.io.save` writes them (study 'image')"
     add("--captures", type=Path, metavar="DIR", help=words)
+    words = (
+        "weights of a DRUNet of one channel, such as deepinv's drunet_deepinv_gray_finetune_26k.pth (study 'image'; "
+        "without, a small one is trained first)"
+    )
+    add("--drunet", type=Path, metavar="FILE", help=words)
     words = "instead of the study 'image', train its networks, and write weights and card into --out"
     add("--train", action="store_true", help=words)
     return parser
@@ -76,10 +81,12 @@ def main(arguments: Sequence[str] | None = None, command: str = "python -m studi
         parser.error("study 'reference' needs --data DIR, the folder of the reference cases")
     if given.data is not None and not any(given.data.glob("*.json")):
         parser.error(f"--data must be a folder with *.json cases, got {str(given.data)!r}")
-    if given.stream is not None and not given.stream.is_file():
-        parser.error(f"--stream must be a file, got {str(given.stream)!r}")
     if given.train and given.studies != ["image"]:
         parser.error(f"--train is of study 'image' alone, got {' '.join(given.studies)}")
+    for name in ("stream", "drunet"):
+        file = getattr(given, name)
+        if file is not None and not file.is_file():
+            parser.error(f"--{name} must be a file, got {str(file)!r}")
     for name in ("rgbd", "captures"):
         folder = getattr(given, name)
         if folder is not None and not folder.is_dir():

@@ -86,3 +86,25 @@ def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
 def pytest_testnodedown(node: Any, error: object) -> None:
     """Add the statistical checks of a process of pytest-xdist to the account."""
     ledger.add(getattr(node, "workeroutput", {}).get("ledger", ()))
+
+
+@pytest.fixture(scope="session")
+def deepinv():
+    """deepinv, also beside a torchvision of another build than PyTorch's (that of PyPI, beside a CPU build).
+
+    There the package's error is looked at first; then the two operators are declared that torchvision misses. deepinv
+    calls none of its compiled ones here.
+    """
+    try:
+        import deepinv
+    except ImportError as error:
+        pytest.skip(f"needs deepinv ({error})")
+    except RuntimeError:
+        import torch
+
+        with pytest.raises(ImportError, match="torchvision that was built for PyTorch"):
+            from mars_lidar.learn import LidarPhysics  # noqa: F401
+        for name in ("nms", "qnms"):
+            torch.library.define(f"torchvision::{name}", "(Tensor boxes, Tensor scores, float threshold) -> Tensor")
+        import deepinv
+    return deepinv

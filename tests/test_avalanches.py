@@ -320,7 +320,7 @@ def test_what_has_no_law_says_so(name: str):
         (lambda: ml.Afterpulsing(probability=0.1, delay_ns=1.0, bin_ns=1.0), "belong together"),
         (lambda: ml.Afterpulsing(probability=0.1, delays=(), bin_ns=1.0), "delays of afterpulsing"),
         (lambda: ml.Afterpulsing(probability=0.1, delays=(1.0, float("nan")), bin_ns=1.0), "finite and non-negative"),
-        (lambda: ml.Afterpulsing(probability=0.1, delays=(0.0,), bin_ns=1.0), "positive, finite sum"),
+        (lambda: ml.Afterpulsing(probability=0.1, delays=(0.0,), bin_ns=1.0), "positive and finite sum"),
         (lambda: ml.Afterpulsing(probability=0.1, delay_ns=1.0, generations=0), "generations must be"),
         (lambda: ml.Crosstalk(probability=1.5), "probability of crosstalk must be"),
         (lambda: ml.Crosstalk(probability=0.1, kernel="6"), "kernel of crosstalk"),

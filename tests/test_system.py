@@ -68,7 +68,7 @@ def test_start_may_be_left_out(system: ml.System):
         ({"detector": {"dead_time_ns": 5.0, "gain": 1}}, "detector has unknown key 'gain'"),
         ({"detector": 5.0}, "detector must be a mapping"),
         ({"pulse": {"kind": "square"}}, "kind 'gaussian' or 'sampled', got"),
-        ({"pulse": {"kind": "gaussian"}}, "sigma_ns or fwhm_ns"),
+        ({"pulse": {"kind": "gaussian"}}, "one of sigma_ns and fwhm_ns, got neither"),
         (
             {"pulse": {"kind": "gaussian", "sigma_ns": 1.0, "fwhm_ns": 2.0}},
             "one of sigma_ns and fwhm_ns, got both",

@@ -220,7 +220,6 @@ CALLS: dict[str, Callable[[Path], tuple[Callable[..., Any], dict[str, Any]]]] = 
         for call in (
             statistics.electronics_moments,
             statistics.exposure_moments,
-            statistics.mars_moments,
             statistics.mean_histogram,
             statistics.photons_per_bin,
         )
@@ -231,7 +230,6 @@ CALLS: dict[str, Callable[[Path], tuple[Callable[..., Any], dict[str, Any]]]] = 
     ),
     "statistics.PhaseChain": lambda _: (statistics.PhaseChain, {"photons": np.full(8, 0.1), "dead_time": 0.3}),
     "statistics.holding_times": lambda _: (statistics.holding_times, {"chain": chain()}),
-    "statistics.moment_matrices": lambda _: (statistics.moment_matrices, {"chain": chain()}),
     "statistics.constant_light_rate": lambda _: (
         statistics.constant_light_rate,
         {"rate_hz": 1e6, "detector": SYSTEM.detector},

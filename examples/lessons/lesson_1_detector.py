@@ -10,8 +10,8 @@ distance,
 A distant or dark surface returns less than a photon per pulse. A *single-photon avalanche diode* (SPAD) registers
 such light: one photon triggers an avalanche of charge, and a clock records its time. The avalanche must then be
 quenched and the diode recharged. During this *dead time* :math:`t_d`, some 20 to 100 ns, the detector registers
-nothing. It is longer than the pulse and often a large part of the time between two pulses, and it causes most of what
-is special about single-photon LiDAR.
+nothing. The dead time is longer than the pulse and often a large part of the laser period; it causes the effects that
+these lessons describe.
 
 The laser repeats the pulse thousands of times with a period :math:`t_r`, and the times since the last pulse are
 sorted into the bins of a *histogram*. Light is measured in photons per period: :math:`S` *signal* photons from the

@@ -2,11 +2,11 @@ r"""
 4 From counts back to depth
 ===========================
 
-Given are a histogram and how it was recorded: period, bins, number of periods :math:`N_r`, pulse, dead time
-:math:`t_d`. To be estimated are the depth, the signal :math:`S` and the background :math:`B`. The correction of
-:doc:`lesson_2_pile_up` carries over to a free-running detector: **count in how many periods each bin was armed.** A
-registration in bin :math:`k` makes the detector dead in the bins of the following dead time. With
-:math:`d = t_d / (\text{bin width})` and bins counted round the period
+The depth, the signal :math:`S` and the background :math:`B` are to be estimated from a histogram of known period,
+bins, number of periods :math:`N_r`, pulse and dead time :math:`t_d`. The correction of :doc:`lesson_2_pile_up` applies
+to a free-running detector, too: **count in how many periods each bin was armed.** A registration in bin :math:`k` makes
+the detector dead in the bins of the following dead time. With :math:`d = t_d / (\text{bin width})` and bins counted
+round the period
 
 .. math:: \text{armed}_j \approx N_r - \sum_{k = j - d}^{j - 1} n_k,
    \qquad \hat l_j = -\ln\Bigl(1 - \frac{n_j}{\text{armed}_j}\Bigr). \tag{1}

@@ -119,12 +119,10 @@ def simulate(
     >>> bool(cube.sum(-1).max() <= system.cycles * 100 / 75 + 1)  # at most one count a dead time
     True
     """
-    if not isinstance(report, dict | None):
-        raise TypeError(f"report must be a dictionary, got {type(report).__name__}")
     drawn_by = find_engine(engine, **options)
     task = _task(flux, system, drawn_by, realizations, first_realization, pixel_index, seed, threads, progress)
     shape = (task.realizations, *task.flux.shape, system.bins)
-    if checks.choice("device", device, ("cpu", "cuda")) == "cuda":
+    if device == "cuda":
         there: NDArray[Any] = _on_cuda(drawn_by, task, shape, out)
         if report is not None:
             report.update(task.report)
@@ -209,7 +207,7 @@ def simulate_timestamps(
     """
     drawn_by = find_engine(engine)
     task = _task(flux, system, drawn_by, 1, realization, pixel_index, seed, threads, progress, first_name="realization")
-    if checks.choice("device", device, ("cpu", "cuda")) == "cuda":
+    if device == "cuda":
         from mars_lidar.engines import cuda
 
         cuda.check(drawn_by, task.flux, task.system)
@@ -258,10 +256,6 @@ def _task(
     progress: Progress | bool | None,
     first_name: str = "first_realization",
 ) -> Task:
-    if not isinstance(flux, Flux):
-        raise TypeError(f"flux must be a Flux, got {type(flux).__name__}")
-    if not isinstance(system, System):
-        raise TypeError(f"system must be a System, got {type(system).__name__}")
     flux = flux[:] if isinstance(flux, StoredFlux) else flux.image  # whole, or a MemoryError that says so
     first = checks.integer(first_name, first_realization, low=0, high=2**32 - 1)
     number = checks.integer("realizations", realizations, low=1, high=2**32 - first)

@@ -7,6 +7,7 @@ to docs/theory.md.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -16,7 +17,7 @@ from matplotlib.figure import Figure
 
 from mars_lidar._base.types import FloatArray
 from mars_lidar.plot.style import COLOURS, INK, MUTED
-from mars_lidar.statistics import HoldingTimeCovariance, moment_matrices
+from mars_lidar.statistics import HoldingTimeCovariance, PhaseChain
 from studies import Facts, Request, Tell
 from studies.common.draw import legend_below, maps, panels
 from studies.common.report import Row, picked
@@ -82,14 +83,36 @@ def _dense_check(cell: Cell) -> dict[str, Any]:
     }
 
 
+def moment_matrices(chain: PhaseChain) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Dense P, mean mu_ij and variance sigma_ij^2 of the holding time given the step i -> j, periods (3.1-3.3)."""
+    n = chain.bins
+    j = np.arange(n)
+    arm = (j + chain.shift) % n
+    ahead = (j[None, :] - arm[:, None]) % n
+    # M and Sigma away from the re-arming bin: a geometric number of further periods (3.1, 3.2)
+    loss, passed = chain.loss, math.exp(-chain.total)
+    mean = (chain.blind_bins + ahead) / n + passed / loss
+    variance = np.full((n, n), passed / loss**2)
+    # the re-arming bin is met once in part, then whole every period (3.3)
+    again = chain.again()
+    there = chain.refire + again
+    with np.errstate(invalid="ignore", divide="ignore"):
+        first = np.where(there > 0, again / loss / there, 0.0)
+        second = np.where(there > 0, again * (1.0 + passed) / loss**2 / there, 0.0)
+    mean[j, arm] = chain.blind_bins / n + first[arm]
+    variance[j, arm] = (second - first**2)[arm]
+    return chain.dense(), mean, variance
+
+
 def _parts(cell: Cell) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Dense P, pi, pi Q_mu - mu pi and Q_mu 1 - mu, all from matrices, in periods (3.7)."""
     chain = cell.terms.chain
     pdf = np.asarray(cell.terms.stationary_pdf)
-    q_mu = moment_matrices(chain).q_mu
+    matrix, waits, _ = moment_matrices(chain)
+    q_mu = matrix * waits
     mean = q_mu.sum(axis=1)
     mu = float(pdf @ mean)
-    return chain.dense(), pdf, pdf @ q_mu - mu * pdf, mean - mu
+    return matrix, pdf, pdf @ q_mu - mu * pdf, mean - mu
 
 
 def _by_solve(cell: Cell) -> float:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import csv
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from mars_lidar import Detector, GaussianPulse, SampledPulse, Scene, System, reconstruct, simulate
+from mars_lidar._base.imports import MissingLibraryError
 from mars_lidar._base.native import _core
 from mars_lidar._base.types import FloatArray
 from mars_lidar.plot.figures import _draw_map, _limits
@@ -22,7 +24,7 @@ from mars_lidar.reconstruction.image_network import card
 from studies import Facts, Request
 from studies.common.draw import panels
 from studies.common.report import Row
-from studies.image import captures, large, total_variation, two_returns
+from studies.image import alternating, captures, drunet, large, two_returns
 from studies.image.scenes import busier, light
 
 SEED = 41
@@ -40,13 +42,26 @@ FROZEN = (20261227, 20261228, 20261229, 20261230, 20261231)
 # what reconstruct(neighbourhood=4) of version 0.2.0 made of the same cubes, judged as the others
 NEIGHBOURHOOD = Path(__file__).with_name("neighbourhood.csv")
 SHOWN = "random", 1.0, 1.0  # scene, photons and ratio of the picture
-METHODS = "maximum_likelihood", "pooled matched filter", "total variation", "image_untrained", "image"
-Results = dict[str, Reconstruction | FloatArray]  # of a method, or of "total variation" and "truth" depths in m
+# by name: what makes delays of a cube, or None for methods of the package
+Methods = dict[str, Callable[[np.ndarray, System], FloatArray] | None]
+METHODS: Methods = {
+    "maximum_likelihood": None,
+    "pooled matched filter": None,
+    "total variation": alternating.by_variation,
+    "image_untrained": None,
+    "image": None,
+}
+DRUNET = "DRUNet prior"
+AGAIN = ", further exposures"  # of method "image" alone, for the coverage: appended to the part that they are of
+Results = dict[str, Reconstruction | FloatArray]  # of a method, or of a prior and of "truth" depths in m
 
 
 @dataclass(frozen=True)
 class Settings:
-    """Side of the images, mean photons of signal of a pixel, signal to background, and sides of the other parts."""
+    """Side of the images, mean photons of signal of a pixel, signal to background, and sizes of the other parts.
+
+    `exposures` of each image, over which the coverage is averaged; `drunet`: steps and images of its training.
+    """
 
     size: int
     photons: tuple[float, ...]
@@ -54,10 +69,12 @@ class Settings:
     frozen: int
     two: int
     large: tuple[int, ...]
+    exposures: int
+    drunet: tuple[int, int]
 
 
-FULL = Settings(64, (1.0, 2.0, 5.0, 10.0), (0.03, 0.3, 1.0, 3.0), len(FROZEN), 48, (256, 2048))
-QUICK = Settings(24, (2.0,), (1.0,), 0, 16, (64,))  # no frozen scene: a quick look is a look
+FULL = Settings(64, (1.0, 2.0, 5.0, 10.0), (0.03, 0.3, 1.0, 3.0), len(FROZEN), 48, (256, 2048), 4, (1500, 300))
+QUICK = Settings(24, (2.0,), (1.0,), 0, 16, (64,), 2, (20, 8))  # no frozen scene: a quick look is a look
 
 
 def systems() -> dict[str, System]:
@@ -114,12 +131,17 @@ def run(request: Request) -> Facts:
     rows: list[Row] = []
     thin: list[Row] = []
     maps: Results = {}
+    methods, about_drunet = _methods(request, settings)
 
     def add(part: str, name: str, scene: Scene, system: System, photons: float, sbr: float, words: str) -> None:
         nonlocal maps
         request.tell(f"image: {part}, {name}, {words}, {photons:g} photons, signal to background {sbr:g}")
-        lines, results = case(scene, system, photons, sbr)
-        rows.extend({"part": part, "scene": name, "system": words, "photons": photons, "sbr": sbr} | x for x in lines)
+        at = {"scene": name, "system": words, "photons": photons, "sbr": sbr}
+        lines, results = case(scene, system, photons, sbr, methods)
+        rows.extend({"part": part} | at | x for x in lines)
+        for k in range(1, settings.exposures) if part in ("scenes", "systems", "dead time") else ():
+            (line,), _ = case(scene, system, photons, sbr, {"image": None}, SEED + k)
+            rows.append({"part": part + AGAIN} | at | line)
         if part == "scenes" and (name, photons, sbr) == (SHOWN[0], *_nearest(settings)):
             maps = results
         if name == "sticks" and sbr == _nearest(settings)[1]:
@@ -145,7 +167,7 @@ def run(request: Request) -> Facts:
         for photons in settings.photons[:3]:
             request.tell(f"image: capture {each.name}, {photons:g} photons")
             at = {"part": "captures", "scene": each.name, "system": "measured", "photons": photons, "sbr": "-"}
-            rows.extend(at | x for x in thinned(each, photons))
+            rows.extend(at | x for x in thinned(each, photons, methods))
     if request.captures is None:
         request.tell("image: no folder of real captures was given (--captures): left out")
     bright = replace(SYSTEM, cycles=20_000)
@@ -153,7 +175,8 @@ def run(request: Request) -> Facts:
     request.tell("image: two returns, large images")
     return {
         "s": settings,
-        "tv_weight": total_variation.WEIGHT,
+        "tv_weight": alternating.TV_WEIGHT,
+        "drunet": about_drunet,
         "fewest": captures.FEWEST,
         "card": card(),
         "by_light": _table(rows, "scenes", ("photons", "sbr")),
@@ -166,11 +189,28 @@ def run(request: Request) -> Facts:
         "before": _before(rows),
         "two": two_returns.rows(settings.two, SYSTEM, SEED),
         "large": large.rows(settings.large, SYSTEM, 2.0, 1.0),
-        "coverage": _coverage(rows),
+        "coverage": _coverage(rows, "scenes", ("photons", "sbr")),
+        "coverage_unseen": _coverage(rows, "systems", ("system",)),
+        "coverage_blind": _coverage(rows, "dead time", ("system",)),
         "thin": thin,
         "rows": rows,
         "figures": {"": _figure(maps, settings)},
     }
+
+
+def _methods(request: Request, settings: Settings) -> tuple[Methods, str]:
+    """The methods that are compared, with DRUNet's prior where deepinv is installed; and what its network is."""
+    steps, images = settings.drunet
+    try:
+        request.tell("image: the prior DRUNet")
+        prior = drunet.prior(request.drunet, steps, images, SEED)
+    except MissingLibraryError as error:
+        if request.drunet is not None:
+            raise
+        request.tell(f"image: {DRUNET} was skipped: {error}")
+        return METHODS, f"skipped: {error}"
+    before = dict(list(METHODS.items())[:3])
+    return before | {DRUNET: partial(alternating.by_denoiser, denoise=prior)} | METHODS, prior.weights
 
 
 def _thin(scene: Scene, system: System, photons: float, results: Results) -> dict[str, float]:
@@ -200,35 +240,37 @@ def _nearest(settings: Settings) -> tuple[float, float]:
     )
 
 
-def case(scene: Scene, system: System, photons: float, sbr: float) -> tuple[list[dict[str, Any]], Results]:
+def case(
+    scene: Scene, system: System, photons: float, sbr: float, methods: Methods, seed: int = SEED
+) -> tuple[list[dict[str, Any]], Results]:
     """A line for each method; and the reconstructions, with the truth, m, under "truth"."""
     flux = light(scene, system, photons, sbr)
-    cube = simulate(flux, system, seed=SEED, threads=1)[0]
+    cube = simulate(flux, system, seed=seed, threads=1)[0]
     truth = np.asarray(flux.delay_ns)
     signal = np.asarray(flux.signal) * system.detector.detection_efficiency
     valid = np.isfinite(truth) & (signal > 0.0)
-    lines, results = compared(cube, system, truth, signal, valid)
+    lines, results = compared(cube, system, truth, signal, valid, methods)
     return lines, {"truth": np.asarray(system.depth_m(truth))} | results
 
 
-def thinned(capture: captures.Capture, photons: float) -> list[dict[str, Any]]:
+def thinned(capture: captures.Capture, photons: float, methods: Methods) -> list[dict[str, Any]]:
     """A line for each method, of a real capture of which so many signal photons a pixel were left."""
     counts, share = capture.thinned(photons, SEED)
     signal = capture.signal * share / (capture.system.cycles * capture.system.detector.detection_efficiency)
-    return compared(counts.astype(np.uint16), capture.system, capture.delay_ns, signal, capture.valid)[0]
+    return compared(counts.astype(np.uint16), capture.system, capture.delay_ns, signal, capture.valid, methods)[0]
 
 
 def compared(
-    cube: np.ndarray, system: System, truth: FloatArray, signal: FloatArray, valid: np.ndarray
+    cube: np.ndarray, system: System, truth: FloatArray, signal: FloatArray, valid: np.ndarray, methods: Methods
 ) -> tuple[list[dict[str, Any]], Results]:
     """A line for each method, and the reconstructions, of a cube whose true delays, ns, and signals are known."""
     lines: list[dict[str, Any]] = []
     results: Results = {}
-    for method in METHODS:
+    for method, prior in methods.items():
         began = time.process_time()
         delay, width, light_found = truth, None, None
-        if method == "total variation":
-            delay = total_variation.total_variation(cube, system)
+        if prior is not None:
+            delay = prior(cube, system)
             results[method] = np.asarray(system.depth_m(delay))
         else:
             pooled = method == "pooled matched filter"
@@ -313,17 +355,21 @@ def _before(rows: Iterable[Row]) -> list[Row]:
     return out
 
 
-def _coverage(rows: Iterable[Row]) -> list[Row]:
-    """Share of the intervals of method "image" that hold, least, mean and largest over the scenes, for each light."""
-    groups: dict[tuple[float, float], list[tuple[float, float]]] = {}
+def _coverage(rows: Iterable[Row], part: str, keys: tuple[str, ...]) -> list[Row]:
+    """Share of the intervals of method "image" that hold the truth, over all exposures: images, mean and its error."""
+    groups: dict[tuple[Any, ...], dict[tuple[Any, ...], list[tuple[float, float]]]] = {}
     for row in rows:
-        if row["part"] == "scenes" and row["method"] == "image":
-            groups.setdefault((row["photons"], row["sbr"]), []).append((row["in 90 %"], row["answered %"]))
+        if row["part"] in (part, part + AGAIN) and row["method"] == "image":
+            of = groups.setdefault(tuple(row[key] for key in keys), {})
+            image = row["scene"], row["photons"], row["sbr"]
+            of.setdefault(image, []).append((row["in 90 %"], row["answered %"]))
     out: list[Row] = []
-    for (photons, sbr), values in groups.items():
-        inside, answered = np.array(values).T
-        line = {"photons": photons, "sbr": sbr, "least %": inside.min(), "mean %": inside.mean()}
-        out.append(line | {"largest %": inside.max(), "answered %": answered.mean()})
+    for at, images in groups.items():
+        inside, answered = np.moveaxis(np.array(list(images.values())), -1, 0)  # (images, exposures)
+        error = np.sqrt((inside.var(1, ddof=1) / inside.shape[1]).sum()) / len(inside)
+        line: dict[str, Any] = dict(zip(keys, at, strict=True)) | {"least %": inside.mean(1).min()}
+        line |= {"mean %": inside.mean(), "error of it %": error, "largest %": inside.mean(1).max()}
+        out.append(line | {"answered %": answered.mean()})
     return out
 
 

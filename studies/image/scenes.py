@@ -53,7 +53,7 @@ def example(number: int, seed: int) -> Example:
         pulse=_pulse(number, rng, fresh),
         detector=Detector(dead_time_ns=_between(rng, *DEAD_TIME_NS)),
     )
-    scene = _folded(number, rng, system) if fresh else _scene(number, rng, system)
+    scene = _folded(number, rng, system) if fresh else training_scene(number, rng, system)
     photons, sbr = _between(rng, *SIGNAL), _between(rng, *SBR)
     flux = light(scene, system, photons, sbr, "reflectivity" if rng.random() < 0.5 else "uniform")
     if number % 4 == 0:
@@ -96,7 +96,7 @@ def light(scene: Scene, system: System, photons: float, sbr: float, ambient: str
         return scene.flux(system, signal=photons / system.cycles, sbr=sbr, ambient=ambient)  # type: ignore[arg-type]
 
 
-def _scene(number: int, rng: np.random.Generator, system: System) -> Scene:
+def training_scene(number: int, rng: np.random.Generator, system: System) -> Scene:
     """A built-in scene, whole or a part of a larger one, or leaves; two of three made busier."""
     if number % 4 == 3:
         depth, reflectivity = _leaves(SIDE, rng)

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from mars_lidar import CountLaw, Flux, System
 from mars_lidar._base.types import FloatArray
 from mars_lidar.engines import Engine
-from mars_lidar.engines.count_shape import as_shapes
 from mars_lidar.engines.engine import Task
 from mars_lidar.engines.pixels import Alignment, groups, single_return
 from mars_lidar.engines.synthesis import Batch, RoundedGaussian, Run
+from mars_lidar.engines.table_reader import as_shapes
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.statistics import photons_per_bin
 from mars_lidar.statistics.cells import Cells

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from mars_lidar import Detector, GaussianPulse, SampledPulse, System
 from mars_lidar.engines.engine import Task
-from mars_lidar.engines.feedback import FeedbackEngine
-from mars_lidar.engines.feedback_grid import Grids, KindArray
+from mars_lidar.engines.feedback import FeedbackEngine, Grids, KindArray
 
 GIVEN = "pixels given to exact"
 SAMPLED = SampledPulse(two_lobes(), 0.1, "centroid")

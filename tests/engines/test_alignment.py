@@ -9,8 +9,8 @@ from harness.pvalues import goodness
 
 import mars_lidar as ml
 from mars_lidar import _core
-from mars_lidar.engines.count_shape import as_shapes
 from mars_lidar.engines.pixels import Alignment
+from mars_lidar.engines.table_reader import as_shapes
 from mars_lidar.statistics import exposure_moments
 from mars_lidar.table import Table
 

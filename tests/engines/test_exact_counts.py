@@ -13,9 +13,9 @@ import mars_lidar as ml
 from mars_lidar.engines import MarsEngine
 from mars_lidar.engines.synthesis import Matched, PartlyReplaced, Run, Streams, Tabulated
 from mars_lidar.engines.table_reader import Entries
-from mars_lidar.engines.tolerances import TOLERANCES
+from mars_lidar.engines.tolerances import TOL
 from mars_lidar.statistics.count_pmf import Pmf, total_variation
-from mars_lidar.statistics.tolerances import TOL
+from mars_lidar.statistics.tolerances import TOL as STATISTICS
 from mars_lidar.table import Table
 
 AIM = 0.002
@@ -162,15 +162,15 @@ def test_usual_pixels_are_drawn_as_before():
 
 
 def test_parts_batches_and_threads_do_not_show(monkeypatch: pytest.MonkeyPatch):
-    from mars_lidar.engines import count_shape as _count_shape
     from mars_lidar.engines import synthesis as _synthesis
+    from mars_lidar.engines import table_reader as _table_reader
 
     flux = doubted(pixels=160)
     whole = ml.simulate(flux, SYSTEM, engine="mars", table=table(), realizations=3, threads=2)
-    small = replace(TOLERANCES, batch_exposures=4, looked_up=11)
-    monkeypatch.setattr(_synthesis, "TOLERANCES", small)
-    monkeypatch.setattr(_count_shape, "TOLERANCES", small)
-    monkeypatch.setitem(vars(TOL), "block", 3)
+    small = replace(TOL, batch_exposures=4, looked_up=11)
+    monkeypatch.setattr(_synthesis, "TOL", small)
+    monkeypatch.setattr(_table_reader, "TOL", small)
+    monkeypatch.setitem(vars(STATISTICS), "block", 3)
     assert np.array_equal(whole, ml.simulate(flux, SYSTEM, engine="mars", table=table(), realizations=3, threads=1))
     index = np.arange(flux.signal.size).reshape(1, -1)[:, 7:20]
     part = ml.simulate(flux[:, 7:20], SYSTEM, engine="mars", table=table(), realizations=3, pixel_index=index)

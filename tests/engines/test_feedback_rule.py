@@ -16,9 +16,8 @@ from mars_lidar import Detector, System, _core
 from mars_lidar.engines.auto import AutoEngine
 from mars_lidar.engines.engine import Task
 from mars_lidar.engines.exact import ExactEngine
-from mars_lidar.engines.feedback import FeedbackEngine, expected_registrations
-from mars_lidar.engines.feedback_grid import Check, Grids, cells_of, least_power
-from mars_lidar.engines.tolerances import TOLERANCES
+from mars_lidar.engines.feedback import Check, FeedbackEngine, Grids, cells_of, expected_registrations, least_power
+from mars_lidar.engines.tolerances import TOL
 
 # What is given to other engines
 
@@ -127,7 +126,7 @@ def test_a_bright_pulse_across_the_edge_of_a_bin_leaves_little_behind_it(signal)
 def off(request: Case, kinds: NDArray[np.uint8]) -> float:
     """Distance of a grid's mean histogram from that of one of half its cells' width."""
     check = Check.of(task_of(request, 1, realizations=1), np.arange(1), kinds)
-    return float(check.distance[0]) / TOLERANCES.richardson
+    return float(check.distance[0]) / TOL.richardson
 
 
 def test_bins_are_cut_where_light_and_its_echo_are():
@@ -154,8 +153,8 @@ GRIDS = {
 @pytest.mark.parametrize("name", GRIDS)
 def test_the_mean_is_that_of_a_finer_grid_and_no_cell_is_cut_in_vain(name: str):
     kinds = kinds_of(GRIDS[name])
-    assert off(GRIDS[name], kinds) <= TOLERANCES.mean_distance
-    assert off(GRIDS[name], np.maximum(kinds, 1) - 1) > TOLERANCES.mean_distance / 4
+    assert off(GRIDS[name], kinds) <= TOL.mean_distance
+    assert off(GRIDS[name], np.maximum(kinds, 1) - 1) > TOL.mean_distance / 4
 
 
 def test_powers_are_the_least_that_are_not_below():

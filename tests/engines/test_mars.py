@@ -14,7 +14,7 @@ from harness.check import COUNTS, SHAPE
 
 import mars_lidar as ml
 from mars_lidar.engines import MarsEngine
-from mars_lidar.engines.tolerances import TOLERANCES
+from mars_lidar.engines.tolerances import TOL
 from mars_lidar.statistics import exposure_moments
 from mars_lidar.table import Table
 
@@ -110,13 +110,13 @@ def test_any_part_alone_on_any_threads(with_table: bool):
 
 
 def test_batches_do_not_show(monkeypatch: pytest.MonkeyPatch):
-    from mars_lidar.engines import count_shape as _count_shape
     from mars_lidar.engines import synthesis as _synthesis
+    from mars_lidar.engines import table_reader as _table_reader
 
     whole = ml.simulate(image(), SYSTEM, engine="mars", table=table(), realizations=5)
-    small = replace(TOLERANCES, batch_exposures=4, looked_up=11)
-    monkeypatch.setattr(_synthesis, "TOLERANCES", small)
-    monkeypatch.setattr(_count_shape, "TOLERANCES", small)
+    small = replace(TOL, batch_exposures=4, looked_up=11)
+    monkeypatch.setattr(_synthesis, "TOL", small)
+    monkeypatch.setattr(_table_reader, "TOL", small)
     assert np.array_equal(whole, ml.simulate(image(), SYSTEM, engine="mars", table=table(), realizations=5))
 
 

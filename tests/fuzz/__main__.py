@@ -19,16 +19,16 @@ from tests.fuzz.server import Server
 KINDS = ("read", "refused", *BAD)
 HEAD = f"""# Mutated files
 
-Mutations of a good file of each format, each read in a process of its own with limits of memory and time; made by
-`python -m tests.fuzz --examples N --seed S` at the commit that the row names (Python {platform.python_version()}).
-*Read*: as a file may be whose mutation changed nothing that matters, or numbers without a checksum; *refused*: by one
-error that names the file. The other columns are faults: an error without the file's name, one of a library, the end of
-the process, more than 10 s of CPU or 1 GiB, or a refusal that takes more than 3 s or 200 MiB. Most s, most MiB: CPU
-time and memory of the dearest refusal, above the process before it.
-
-| format | {" | ".join(KINDS)} | most s | most MiB | commit, date, N, S |
-|---|{"--:|" * (len(KINDS) + 2)}---|
+Each row is about mutations of a good file of one format, each read in a process of its own with limits of memory and
+time (`python -m tests.fuzz --examples N --seed S`, Python {platform.python_version()}).
+*read*: the mutation changed nothing that matters, or numbers without a checksum; *refused*: by one error that names the
+file. The other columns are faults: an error without the file's name (*unnamed*), an exception of a library (*foreign*),
+the end of the process (*crash*), more than 10 s of CPU (*hang*), more than 1 GiB, or a refusal of more than 3 s or
+200 MiB (*memory*). *most s*, *most MiB*: CPU time and memory of the costliest refusal, above those of the process
+before it.
 """
+RUN = "commit, date, N, S"
+ONE_RUN = f"All rows are of one run ({RUN}): "
 
 
 def head() -> str:
@@ -38,18 +38,25 @@ def head() -> str:
 
 
 def write(out: Path, rows: dict[str, list[str]]) -> None:
-    """Put rows into the table of a report; those of other formats stay."""
+    """Put rows into the table of a report; those of other formats stay. A column names the run unless all have one."""
     table = dict(rows)
-    for line in out.read_text(encoding="utf-8").splitlines() if out.is_file() else ():
+    lines = out.read_text(encoding="utf-8").splitlines() if out.is_file() else []
+    run = [line.removeprefix(ONE_RUN).rstrip(".") for line in lines if line.startswith(ONE_RUN)]
+    for line in lines:
         cells = [cell.strip() for cell in line.strip("| ").split("|")]
-        if cells[0] in READERS and len(cells) == len(KINDS) + 4:
-            table.setdefault(cells[0], cells[1:])
+        if cells[0] in READERS and len(cells) + len(run) == len(KINDS) + 4:
+            table.setdefault(cells[0], [*cells[1:], *run])
     table = {name: table[name] for name in READERS if name in table}
     sums = [sum(int(row[k]) for row in table.values()) for k in range(len(KINDS))]
     most = [f"{max(float(row[k]) for row in table.values()):g}" for k in (-3, -2)]
+    runs = {row[-1] for row in table.values()}
     table[f"all {sum(sums)}"] = [*map(str, sums), *most, ""]
-    lines = (f"| {name} | {' | '.join(row)} |\n" for name, row in table.items())
-    out.write_text(HEAD + "".join(lines), encoding="utf-8")
+    columns, note = [*KINDS, "most s", "most MiB", RUN], ""
+    if len(runs) == 1:
+        columns, note = columns[:-1], f"\n{ONE_RUN}{runs.pop()}.\n"
+    heading = f"| format | {' | '.join(columns)} |\n|---|{'--:|' * len(columns)}\n"
+    body = "".join(f"| {name} | {' | '.join(row[: len(columns)])} |\n" for name, row in table.items())
+    out.write_text(f"{HEAD}{note}\n{heading}{body}", encoding="utf-8")
 
 
 def main() -> int:

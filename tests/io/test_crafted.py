@@ -37,7 +37,8 @@ def test_a_chunk_of_an_incomplete_store_is_a_plain_file(tmp_path, instead):
         document = json.loads((path / name).read_text())
         change(document)
         (path / name).write_text(json.dumps(document))
-    (path / "manifest.sha256").unlink()
+    for name in ("manifest.sha256", "manifest.xxh128"):
+        (path / name).unlink()
     (tmp_path / "secret").write_bytes(bytes([PATTERN]) * 2 * 6 * 5 * 64)
     chunk = next(each for each in sorted((path / "histogram/c").rglob("*")) if each.is_file())
     chunk.unlink()

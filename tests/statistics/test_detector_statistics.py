@@ -16,7 +16,6 @@ from mars_lidar.statistics import (
     ConvergenceError,
     PhaseChain,
     exposure_moments,
-    mars_moments,
     mean_histogram,
     paralyzable_moments,
 )
@@ -275,7 +274,6 @@ def test_what_does_not_treat_a_mode_says_so(mode: str):
         "count_law of method 'renewal'": lambda: ml.count_law(ml.Flux(1.0, 1.0, 50.0), system, "renewal"),
         "registration_pdf of method 'chain'": lambda: ml.registration_pdf(ml.Flux(1.0, 1.0, 50.0), system, "chain"),
         "holding_time_covariance": lambda: ml.holding_time_covariance(ml.Flux(1.0, 1.0, 50.0), system),
-        "mars_moments": lambda: mars_moments(ml.Flux(1.0, 1.0, 50.0), system),
         "the chain of phases": lambda: PhaseChain.from_flux(ml.Flux(1.0, 1.0, 50.0), system),
     }
     if mode != "paralyzable":

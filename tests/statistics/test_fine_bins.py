@@ -12,8 +12,8 @@ import pytest
 import mars_lidar as ml
 from mars_lidar.statistics import cells, joint
 from mars_lidar.statistics.cells import Cells
+from mars_lidar.statistics.chain import ConvergenceError
 from mars_lidar.statistics.histogram import mean_histogram
-from mars_lidar.statistics.phase_chain import ConvergenceError
 from mars_lidar.statistics.tolerances import LAW, TOL
 
 BINS = 150_001  # no grid of a power of two is a multiple of it

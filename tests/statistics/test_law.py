@@ -10,8 +10,9 @@ from harness import system_of
 from scipy import stats
 
 import mars_lidar as ml
-from mars_lidar.statistics import ConvergenceError, mars_moments
-from mars_lidar.statistics.law import count_law, registration_pdf
+from mars_lidar.statistics import ConvergenceError, PhaseChain, holding_times
+from mars_lidar.statistics.histogram import registration_pdf
+from mars_lidar.statistics.law import count_law
 from mars_lidar.statistics.tolerances import TOL
 
 REFERENCE = Path(__file__).parents[3] / "shared" / "reference"
@@ -134,7 +135,11 @@ def test_mars_is_the_gaussian_of_the_paper():
     system = system_of(0.6375)
     for rearm in (None, "centre", "edge"):
         law = count_law(ml.Flux([1.0, 0.002], 0.001, 50.0), system, "mars", rearm=rearm)
-        mean, variance = mars_moments(ml.Flux([1.0, 0.002], 0.001, 50.0), system, rearm=rearm or "centre")
+        chains = [
+            PhaseChain.from_flux(ml.Flux(signal, 0.001, 50.0), system, rearm=rearm or "centre")
+            for signal in (1.0, 0.002)
+        ]
+        mean, variance = np.transpose([(1000 / t.mu, 1000 * t.sigma2 / t.mu**3) for t in map(holding_times, chains)])
         np.testing.assert_array_equal(law.mean, mean)
         np.testing.assert_array_equal(law.variance, variance)
         np.testing.assert_array_equal(law.cumulants[:, 2:], 0.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from mars_lidar.reconstruction.image_pulse import settings_of
 from mars_lidar.reconstruction.photons import Photons
 from studies.__main__ import main
 from studies.common.report import MAX_FIGURE_BYTES
-from studies.image import captures, total_variation
+from studies.image import alternating, captures
 
 SYSTEM = ml.System(
     period_ns=100.0,
@@ -35,6 +36,7 @@ def test_study(tmp_path):
     folder = str(tmp_path / "captures")
     assert main(["image", "--quick", "--captures", folder, "--out", str(tmp_path)]) == 0
     text = (tmp_path / "image.md").read_text()
+    assert ("DRUNet: skipped" in text) != ("| DRUNet prior |" in text)
     assert "Quick form" in text
     assert "| measured | 2 | image |" in text
     assert 5_000 < (tmp_path / "image.png").stat().st_size < MAX_FIGURE_BYTES
@@ -61,20 +63,85 @@ def test_a_folder_that_is_none_is_refused(capsys):
     with pytest.raises(SystemExit):
         main(["image", "--captures", "/nowhere"])
     assert "--captures must be a folder" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["image", "--drunet", "/nowhere"])
+    assert "--drunet must be a file" in capsys.readouterr().err
 
 
 def test_total_variation_denoises():
     """Least squares plus variation of one edge: both levels move by the weight over their width (Strong and Chan)."""
     image = np.zeros((8, 8))
     image[:, 4:] = 1.0
-    result = total_variation.denoised(image, 0.5, projections=1000)
+    result = alternating.total_variation(image, 0.5, projections=1000)
     np.testing.assert_allclose(result, np.where(image > 0.5, 1.0 - 0.5 / 4.0, 0.5 / 4.0), atol=0.01)
     delay = 30.0 + 0.02 * np.add.outer(np.arange(24.0), np.arange(24.0))
     system = SYSTEM.replace(cycles=1000)
     flux = ml.Flux(np.full(delay.shape, 5e-3), 5e-3, delay)
-    off = total_variation.total_variation(ml.simulate(flux, system, seed=4)[0], system) - delay
+    off = alternating.by_variation(ml.simulate(flux, system, seed=4)[0], system) - delay
     assert np.median(np.abs(off)) < 0.3
     assert (np.abs(off) > 1.8).mean() < 0.02
+
+
+def test_a_denoiser_is_a_prior():
+    """Half-quadratic splitting with a denoiser that knows the answer ends there; the noise decreases to sigma."""
+    system = SYSTEM.replace(cycles=1000)
+    delay = 30.0 + 0.02 * np.add.outer(np.arange(12.0), np.arange(12.0))
+    cube = ml.simulate(ml.Flux(np.full(delay.shape, 5e-3), 5e-3, delay), system, seed=4)[0]
+    noises = []
+
+    def mean(image, noise):
+        noises.append(noise)
+        return np.full_like(image, np.median(image))
+
+    assert np.ptp(alternating.by_denoiser(cube, system, mean)) == 0.0
+    assert abs(alternating.by_denoiser(cube, system, mean).mean() - delay.mean()) < 0.2
+    assert noises[-1] == pytest.approx(1.0)
+    assert (np.diff(noises[: len(noises) // 2]) <= 0.0).all()
+
+
+@pytest.mark.full
+def test_drunet_denoises(deepinv, tmp_path):
+    """Trained in a few steps, and read again from its file, with the sizes that are in it."""
+    import torch
+
+    from studies.image import drunet
+
+    trained = drunet.prior(None, 60, 12, 1)
+    assert "trained here" in trained.weights
+    clean = np.add.outer(np.linspace(0.0, 8.0, 32), np.linspace(0.0, 4.0, 32))
+    noisy = clean + np.random.default_rng(2).normal(size=clean.shape)
+    assert np.square(trained(noisy, 1.0) - clean).mean() < 0.7
+    torch.save(trained.net.state_dict(), tmp_path / "weights.pth")
+    read = drunet.prior(tmp_path / "weights.pth", 0, 0, 0)
+    assert "weights.pth" in read.weights
+    np.testing.assert_array_equal(read(noisy, 1.0), trained(noisy, 1.0))
+
+
+def test_without_deepinv_the_study_says_so(monkeypatch, tmp_path):
+    from studies import Request
+    from studies.image import run
+
+    monkeypatch.setitem(sys.modules, "deepinv", None)
+    monkeypatch.setitem(sys.modules, "deepinv.models", None)
+    methods, words = run._methods(Request(tmp_path), run.QUICK)
+    assert methods == run.METHODS
+    assert words.startswith("skipped: DRUNet needs deepinv")
+    with pytest.raises(ImportError):
+        run._methods(Request(tmp_path, drunet=tmp_path / "weights.pth"), run.QUICK)
+
+
+def test_coverage_of_several_exposures():
+    """Mean over images of the mean over their exposures; its error from the scatter between exposures."""
+    from studies.image import run
+
+    of = {"method": "image", "photons": 1.0, "sbr": 1.0, "answered %": 80.0}
+    rows = [{"part": "scenes", "scene": "a", "in 90 %": 90.0} | of]
+    rows += [{"part": "scenes" + run.AGAIN, "scene": "a", "in 90 %": 94.0} | of]
+    rows += [{"part": part, "scene": "b", "in 90 %": 80.0} | of for part in ("scenes", "scenes" + run.AGAIN)]
+    (line,) = run._coverage(rows, "scenes", ("photons", "sbr"))
+    assert line["mean %"] == 86.0
+    assert (line["least %"], line["largest %"]) == (80.0, 92.0)
+    assert line["error of it %"] == pytest.approx(np.sqrt(8.0 / 2.0) / 2.0)
 
 
 @pytest.mark.full

@@ -6,7 +6,7 @@ import pytest
 from table.cases import make_system, small_table
 
 import mars_lidar as ml
-from mars_lidar.table import cache, storage
+from mars_lidar.table import storage
 from mars_lidar.table.axes import axis_values
 from tests.harness.command import command_line
 
@@ -110,7 +110,7 @@ def test_the_cache_builds_once(own_cache, monkeypatch):
     longer = ml.Table.cached(system.replace(cycles=4000), **grids)
     assert np.array_equal(first.shapes(), again.shapes())
     assert longer.system.cycles == 4000
-    assert cache.files() == [file]
+    assert storage.cached_tables() == [file]
     monkeypatch.undo()
     for other in ({"tolerance": 1e-3}, {"method": "mars"}, {"background": (0.1, 2.0, 4)}):
         key = storage.request_key(
@@ -138,10 +138,10 @@ def test_a_damaged_file_in_the_cache_is_replaced(own_cache):
 def test_where_the_cache_is(tmp_path, monkeypatch):
     monkeypatch.delenv("MARS_LIDAR_CACHE", raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert cache.directory() == tmp_path / "mars-lidar"
+    assert storage.cache_folder() == tmp_path / "mars-lidar"
     monkeypatch.delenv("XDG_CACHE_HOME")
     monkeypatch.setenv("HOME", str(tmp_path / "me"))
-    assert cache.directory() == tmp_path / "me" / ".cache" / "mars-lidar"
+    assert storage.cache_folder() == tmp_path / "me" / ".cache" / "mars-lidar"
 
 
 @pytest.mark.full

@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from mars_lidar._base.types import FloatArray
+
 
 def real(name: str, value: Any, *, low: float = -math.inf, high: float = math.inf, strict_low: bool = False) -> float:
     """A finite real number in [low, high] (or (low, high] with `strict_low`), as float."""
@@ -82,14 +84,31 @@ def numbers(name: str, value: Any) -> Any:
     return value
 
 
-def known_keys(name: str, mapping: Any, allowed: tuple[str, ...]) -> dict[str, Any]:
-    """A mapping whose keys are all known; a misspelt key is an error, never ignored."""
+def weights(name: str, value: Any, *, most: int, least: int = 1, what: str = "weights") -> FloatArray:
+    """`least` to `most` numbers (n,), finite and non-negative, not all 0: `what` they are, for errors."""
+    array = np.asarray(numbers(name, unmasked(name, value)))
+    if array.ndim != 1 or not least <= array.size <= most:
+        raise ValueError(f"{name} must be {least} to {most} {what} (n,), got shape {array.shape} of {array.dtype}")
+    array = array.astype(np.float64)
+    bad = ~(np.isfinite(array) & (array >= 0.0))
+    if bad.any() or not 0.0 < array.sum() < math.inf:
+        k = int(np.argmax(bad))
+        got = f"{name}[{k}] = {array[k]}" if bad.any() else f"a sum of {array.sum()}"
+        raise ValueError(f"{name} must be finite and non-negative, with a positive and finite sum, got {got}")
+    return array
+
+
+def known_keys(name: str, mapping: Any, allowed: tuple[str, ...], needed: tuple[str, ...] = ()) -> dict[str, Any]:
+    """A mapping of known keys, `needed` ones among them; a misspelt key is an error, never ignored."""
     if not isinstance(mapping, dict):
         raise TypeError(f"{name} must be a mapping with keys {', '.join(allowed)}, got {mapping!r}")
     unknown = [key for key in mapping if key not in allowed]
     if unknown:
         meant = did_you_mean(unknown[0], allowed)
         raise ValueError(f"{name} has unknown key {unknown[0]!r}{meant}; allowed: {', '.join(allowed)}")
+    for key in needed:
+        if key not in mapping:
+            raise ValueError(f"{name} must give {key}; needed: {', '.join(needed)}")
     return mapping
 
 

@@ -196,6 +196,15 @@ def unfinished_of(target: Path) -> list[Path]:
     return [path for path in names if finished_name(path) == target]
 
 
+def check_finished(source: Path) -> None:
+    """Raise FileNotFoundError where there is no file, IncompleteFileError where a stopped run left its beginning."""
+    if source.exists():
+        return
+    if leftovers := unfinished_of(source):
+        raise IncompleteFileError(f"{source} was never finished: a stopped run left {leftovers[0]}")
+    raise FileNotFoundError(f"{source} does not exist")
+
+
 @contextlib.contextmanager
 def _held(path: Path) -> Iterator[None]:
     """Hold a lock on an unfinished file or folder; OSError where another process has it, or there are no locks."""

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import hashlib
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -74,9 +72,9 @@ class SealedStore(PlainFiles):
 
 
 class SealedValues(WrapperStore[Any]):
-    """A complete store that lies elsewhere: what is fetched whole, as chunks are, is compared with its sum."""
+    """A complete store that lies elsewhere: what is fetched whole, as chunks are, is compared with its XXH128."""
 
-    def __init__(self, store: Any, sums: Mapping[str, str] | Manifest, url: str) -> None:
+    def __init__(self, store: Any, sums: Manifest, url: str) -> None:
         super().__init__(store)
         self._sums, self._url = sums, url
 
@@ -86,11 +84,10 @@ class SealedValues(WrapperStore[Any]):
     async def get(self, key: str, prototype: Any, byte_range: Any = None) -> Any:
         """The bytes at a key, None where the store was written without it."""
         content = await self._store.get(key, prototype, byte_range)
-        wanted = self._sums.get(key) if isinstance(self._sums, Mapping) else self._sums.line(key)
-        if wanted is None:
+        if key not in self._sums:
             return content
         if content is None:
             raise FileError(f"{self._url} is damaged or was removed: {key} is missing")
-        if byte_range is None and hashlib.sha256(content.as_buffer_like()).hexdigest() != wanted:
+        if byte_range is None and not self._sums.is_good(key, content.to_bytes()):
             raise FileError(f"{self._url} is damaged or was replaced: {key} is not as it was written; open it again")
         return content

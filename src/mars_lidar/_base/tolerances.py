@@ -34,6 +34,8 @@ class Tolerances:
         Of a YAML file: PyYAML reads a megabyte in 10 s.
     hash_threads
         Threads that hash a store, without Python's lock.
+    hashed_part
+        Bytes of a file that are hashed together: they fit into a processor's second cache.
     thread_bytes
         Addresses that a thread takes: a stack of 8 MiB, and the 64 MiB that glibc reserves for what it allocates.
     image_side
@@ -65,6 +67,7 @@ class Tolerances:
     mat_head: int = 2**10
     yaml_bytes: int = 2**20
     yaml_nodes: int = 2**17
+    hashed_part: int = 256 * 2**10
     hash_threads: int = 4
     thread_bytes: int = 72 * 2**20
     image_side: int = 1 << 13

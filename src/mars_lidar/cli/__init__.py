@@ -1,6 +1,6 @@
 """The command `mars-lidar`.
 
-Exit codes: 0 done, 1 failed (disk full, a bug), 2 bad input, 3 a model that does not fit, 130 interrupted.
+Exit codes: 0 done, 1 failed (disk full, a bug), 2 bad input, 3 the model does not fit, 130 interrupted.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ A first run:
   mars-lidar view room.zarr --pixel 40,64 -o pixel.png
 
 mars-lidar COMMAND --help describes a command.
-Exit codes: 0 done, 1 failed, 2 bad input, 3 a model that does not fit, 130 interrupted."""
+Exit codes: 0 done, 1 failed, 2 bad input, 3 the model does not fit, 130 interrupted."""
 
 app = App(
     name="mars-lidar",
@@ -50,7 +50,9 @@ for _heading, _modules in _COMMANDS.items():
         _command = f"mars_lidar.cli.{_module}:{_name}_command"
         app.command(_command, name=_name, group=_group, sort_key=_place)
 app.register_install_completion_command(
-    help="Let the shell complete commands and options: bash, zsh, fish, PowerShell.", help_epilogue="", **COMMAND_LINE
+    help="Install the completion of commands and options in bash, zsh, fish or PowerShell.",
+    help_epilogue="",
+    **COMMAND_LINE,
 )
 _group = Group.create_ordered("Options")
 for _name in ("--help", "--version", "--install-completion"):

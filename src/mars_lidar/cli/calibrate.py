@@ -152,9 +152,10 @@ def calibrate(
 ) -> int | None:
     """Fit light and detector to a measured photon stream.
 
-    Each estimate has a standard error; a verdict says whether the model fits, and what is suspect where it does not.
-    Only what --given states is assumed; of a simulated stream only the photons are used. Without a laser: dead
-    time, jitter and afterpulses in constant light. Of a cube: dead time and pulse width that its pixels share.
+    Each estimate has a standard error; a verdict states whether the model fits and, if not, what may be wrong. Only
+    values passed with --given are assumed; from a simulated stream only the photons are used. Without a laser, dead
+    time, jitter and afterpulses are estimated in constant light; from a cube, the dead time and pulse width that its
+    pixels share.
 
     Arguments
     ---------
@@ -187,7 +188,7 @@ def calibrate(
 
     Notes
     -----
-    Exit code 3 where the model does not fit the stream. docs/calibration.md has the whole recipe.
+    Exit code 3: the model does not fit the stream. docs/calibration.md has the whole recipe.
     """
     from mars_lidar.io.streams.photons import NoLaserError
 

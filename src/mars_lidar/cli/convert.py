@@ -30,7 +30,7 @@ def convert(
 ) -> None:
     """Write a cube or a photon stream in another format.
 
-    What the other format cannot hold is listed.
+    Data that the other format cannot hold are listed.
 
     Arguments
     ---------
@@ -42,11 +42,11 @@ def convert(
     Options
     -------
     realization
-        Of a cube, this exposure alone, from 0; a .mat holds one.
+        Convert only this exposure of a cube, from 0; a .mat holds one.
     bins
         Histogram bins of a recorded stream. [default: its finest clock]
     clock_ps
-        Of a stream in a .ptu: least unit of its times, ps. Programs that make an image of it have a bin for each.
+        For a .ptu stream: unit of the times, ps; programs that make an image of it use one bin per unit.
         [default: the finest, 32768 to a period]
     overwrite
         Replace an existing file.
@@ -106,7 +106,7 @@ def timestamps(
 ) -> None:
     """Write the photons of a cube one by one, with their times.
 
-    The cube is simulated again. The histogram of the photons is the cube's exposure, count by count; this is checked.
+    The exposure is simulated again, and the histogram of its photons is compared with the cube's counts.
 
     Arguments
     ---------
@@ -122,7 +122,7 @@ def timestamps(
     threads
         Threads. [default: all cores]
     clock_ps
-        Of a stream in a .ptu: least unit of its times, ps. Programs that make an image of it have a bin for each.
+        For a .ptu stream: unit of the times, ps; programs that make an image of it use one bin per unit.
         [default: the finest, 32768 to a period]
     overwrite
         Replace an existing file.

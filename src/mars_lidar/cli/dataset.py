@@ -63,10 +63,10 @@ def generate(
 ) -> int | None:
     """Simulate a dataset of many scenes, systems and levels of light.
 
-    Every scene with every system, level of light and realization, into one Zarr store. With a recipe, options
+    Simulates every scene with every system, level of light and realization into one Zarr store. With a recipe, options
     replace its values. The store does not depend on threads, workers or interruptions: the same recipe gives the
-    same files, byte for byte. Files that cannot be used are left out, and listed at the end. Fog, panes, folders of
-    transients and all else that has no option stand in a recipe.
+    same files, byte for byte. Unusable files are skipped and listed at the end. Fog, panes, folders of transients
+    and everything else without an option are set in a recipe.
 
     Arguments
     ---------
@@ -138,9 +138,9 @@ def generate(
     begin
         Read the scenes and create the store without counts, which --part jobs make.
     part : K/N
-        Make part K of N of a store that --begin began, in any order.
+        Make part K of N of a store that --begin created, in any order.
     finish
-        Check that all parts are there, and mark the store complete.
+        Check that all parts exist, and mark the store complete.
     dry_run
         Print size, time and memory; write nothing.
 
@@ -318,7 +318,7 @@ def export(
     layout
         Whose loader reads it: lindell, deepsensorfusion, sun, gutierrez or webdataset.
     fill
-        Pixels without a return take depth and rates of the nearest with one.
+        Give pixels without a return the depth and rates of the nearest pixel with one.
 
     Examples
     --------

@@ -57,7 +57,7 @@ class ForeignOptions:
     unit_ns
         Unit of photon times, ns.
     window_ns : START,STOP
-        Of photon times that count from the laser pulse: those in this window alone, ns.
+        Use only the photon times since the laser pulse that lie in this window, ns.
     """
 
     system: Path | None = None

@@ -48,7 +48,7 @@ def schema(
 
     With it an editor completes and checks keys.
 
-    In the first line of the YAML file:  # yaml-language-server: $schema=recipe.json
+    Put this in the first line of the YAML file:  # yaml-language-server: $schema=recipe.json
 
     Arguments
     ---------
@@ -92,7 +92,7 @@ def init(
     Options
     -------
     out
-        Another way to give FILE.
+        The same as FILE.
     preset
         An instrument: $presets.
     overwrite

@@ -192,7 +192,7 @@ class SceneOptions:
         Image size in pixels: square for --scene; the longer side, resampled, for --depth. [default: 128 for --scene,
         the file's own for --depth]
     scene_seed
-        Arrangement of the built-in scene. [default: 0]
+        Seed of the built-in scene's arrangement. [default: 0]
     depth
         Depth: 16-bit PNG or TIFF in mm, .pfm, .exr, .npy or .npz in m, NYUv2's .mat, or a Middlebury folder.
     image
@@ -215,11 +215,11 @@ class SceneOptions:
     transient_start_ns
         Travel time at its first bin, ns. [default: as stated in the file, else 0]
     transient_name
-        Which array of the file. [default: transient]
+        Name of the array in the file. [default: transient]
     transient_channel
-        Which channel of a file (y, x, time, channel), from 0.
+        Channel of an array (y, x, time, channel), from 0.
     transient_pulse
-        Convolve with the system's pulse; --no-transient-pulse where the transient contains it already. [default: yes]
+        Convolve with the system's pulse; --no-transient-pulse if the transient already contains it. [default: yes]
     photons_per_unit
         Instead of --signal: detectable photons per period for one unit of its light.
     """

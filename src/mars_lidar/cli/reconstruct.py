@@ -49,8 +49,8 @@ def reconstruct(
 ) -> None:
     """Reconstruct depth and reflectivity from a cube.
 
-    The maps are compared with the truth where the cube has it. The counts are read in parts, so a .zarr or .h5 of
-    any size will do.
+    If the cube contains the true scene, the maps are compared with it. Counts are read in parts: a .zarr or .h5 may
+    have any size.
 
     Arguments
     ---------
@@ -70,15 +70,16 @@ def reconstruct(
     attenuation
         none or inverse_square: reflectivity is signal times depth squared. [default: as the cube was simulated]
     returns
-        Returns to look for in each pixel, each tested (glass, foliage); of maximum_likelihood and image. [default: 1]
+        Largest number of returns in a pixel (glass, foliage), each tested for significance; for maximum_likelihood and
+        image. [default: 1]
     keep
         With --returns: the return whose depth is taken, strongest, nearest or farthest. [default: strongest]
     from_ns
-        Returns nearer than this, ns after the pulse, such as an internal reflection, are modelled and left out.
+        Returns nearer than this, ns after the pulse, such as an internal reflection, are modelled but not reported.
         [default: all]
     false_alarm
-        Largest share of the pixels without signal in which noise passes for a return; of maximum_likelihood. [default:
-        0.01]
+        Largest fraction of the pixels without signal in which noise passes as a return; for maximum_likelihood.
+        [default: 0.01]
     threads
         Threads. [default: all cores]
     cloud

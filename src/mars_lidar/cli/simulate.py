@@ -59,7 +59,7 @@ def simulate(
 ) -> None:
     """Simulate the histograms of a scene: a cube and a picture of it.
 
-    The file holds all that is needed to make the cube again. xarray.open_zarr(OUT) opens a .zarr with named
+    The file contains everything needed to simulate the cube again. xarray.open_zarr(OUT) opens a .zarr with named
     dimensions and units; mars_lidar.io.load(OUT) opens any of the formats.
 
     Simulation
@@ -94,7 +94,7 @@ def simulate(
     overwrite
         Replace an existing cube and picture.
     resume
-        Continue a .zarr that was interrupted: the same command, the same bits.
+        Continue an interrupted .zarr, with the same command.
     picture
         A PNG overview beside the cube. [default: yes]
 

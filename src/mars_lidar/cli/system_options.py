@@ -42,7 +42,7 @@ class StreamEffects:
     jitter_tail_ns
         Mean of the exponential tail of the jitter, ns ...
     jitter_tail_fraction
-        ... and share of the events that are in it.
+        ... and the fraction of the events in it.
     jitter_file
         Measured jitter instead: 1-D .npy array of its density.
     jitter_bin_ns

@@ -12,8 +12,9 @@ from mars_lidar._base.progress import span
 from mars_lidar.cli.console import progress_bar, refuse_existing, table
 from mars_lidar.cli.options import COMMAND_LINE, Integer, Number, OutPath, Text, command
 from mars_lidar.cli.system_options import Effects, SystemOptions
-from mars_lidar.table import Table, cache
+from mars_lidar.table import Table
 from mars_lidar.table.error import QuantisationError
+from mars_lidar.table.storage import cache_folder, cached_tables
 
 
 def build(
@@ -30,7 +31,7 @@ def build(
     out: OutPath | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Build the table of a system, in a file or in the cache; a cached table is not built again.
+    """Build the table of a system, in a file or in the cache; a cached table is reused.
 
     Grid
     ----
@@ -96,9 +97,9 @@ def info(
     if file is not None:
         table(_rows(file))
         return
-    files = cache.files()
+    files = cached_tables()
     total = sum(path.stat().st_size for path in files)
-    rows = [("cache", f"{cache.directory()}: {len(files)} files, {total / 1e6:,.4g} MB")]
+    rows = [("cache", f"{cache_folder()}: {len(files)} files, {total / 1e6:,.4g} MB")]
     table(rows + [(f"{path.stat().st_size / 1e6:,.4g} MB", _line(path)) for path in files])
 
 
@@ -113,17 +114,17 @@ def clear(
     yes
         Do not ask.
     """
-    files = cache.files()
+    files = cached_tables()
     if not files:
-        print(f"{cache.directory()} holds no tables")
+        print(f"{cache_folder()} holds no tables")
         return
-    total = sum(path.stat().st_size for path in files)
-    question = f"remove {len(files)} files, {total / 1e6:,.4g} MB, from {cache.directory()}?"
-    if not yes and not _confirmed(question):
+    what = f"{len(files)} files, {sum(path.stat().st_size for path in files) / 1e6:,.4g} MB"
+    if not yes and not _confirmed(f"remove {what}, from {cache_folder()}?"):
         print("nothing was removed")
         return
-    count, freed = cache.clear()
-    print(f"removed {count} files, {freed / 1e6:,.4g} MB")
+    for path in files:
+        path.unlink()
+    print(f"removed {what}")
 
 
 def _confirmed(question: str) -> bool:

@@ -217,8 +217,8 @@ def explore(
 ) -> None:
     """Show pixels and their exact laws in a browser.
 
-    Sliders show what dead time does; a cube is shown pixel by pixel. The page is served on 127.0.0.1 alone, until
-    Ctrl-C; parts of the cube are read as they are looked at.
+    Sliders show the effects of dead time; any pixel of a cube can be selected. The page is served on 127.0.0.1 only,
+    until Ctrl-C; the cube is read in the parts that are displayed.
 
     Arguments
     ---------

@@ -164,7 +164,7 @@ KINDS: dict[str, Fields] = {
         "pattern": values.text("Of a folder: which files."),
         "bin_ns": values.real("Width of a time bin, ns.", low=0.0, strict_low=True),
         "start_ns": values.real("Travel time at the first bin, ns."),
-        "name": values.text("Which array of the file."),
+        "name": values.text("Name of the array in the file."),
         "channel": values.integer("Which channel of (y, x, time, channel).", low=0, high=2**31),
         "pulse": values.flag("Whether the system's pulse is still to be applied."),
         "size": _SIZE,
@@ -333,8 +333,8 @@ class DatasetRecipe:
             scenes=scenes,
             systems=systems,
             light=light,
-            size=_pair(root.get("size")),
-            crop=None if not crop else _pair([crop["size"]] * 2 if isinstance(crop["size"], int) else crop["size"]),
+            size=pair(root.get("size")),
+            crop=None if not crop else pair([crop["size"]] * 2 if isinstance(crop["size"], int) else crop["size"]),
             crops=crop.get("count", 1),
             engine=engine,
             realizations=root["realizations"],
@@ -363,7 +363,7 @@ class DatasetRecipe:
 _FILE: Fields = {"file": values.text("A system of its own file.")}
 
 
-def _pair(size: Any) -> Any:
+def pair(size: Any) -> Any:
     """A size as the package has it."""
     return tuple(size) if isinstance(size, list) else size
 

@@ -1,4 +1,4 @@
-"""Writing a shard of counts chunk by chunk (Zarr v3, sharding codec, index at the end), and digests of written files.
+"""Writing a shard of counts chunk by chunk (Zarr v3, sharding codec, index at the end), and sums of written files.
 
 zarr-python takes a whole shard at once: it copies every chunk into a fresh array before it packs it, which cost as much
 as the packing. Here a chunk is packed while it is still in the processor's cache, and a shard is never in memory.
@@ -7,7 +7,6 @@ as the packing. Here a chunk is packed while it is still in the processor's cach
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import io
 import itertools
 import secrets
@@ -21,6 +20,7 @@ from numpy.typing import NDArray
 
 from mars_lidar._base.buckets import content_of, in_bucket, put
 from mars_lidar._base.files import replacing
+from mars_lidar._base.manifest import Summing, Sums, sums_of
 from mars_lidar._base.native import _core
 
 _NOTE_S = 10.0  # between two writes of digests in an object store: what a killed worker loses is read again
@@ -68,26 +68,26 @@ def is_good(data: bytes) -> bool:
     return int(value(data[:-4])).to_bytes(4, "little") == data[-4:]
 
 
-def write_shard(path: Path, chunks: Iterator[bytes | None]) -> tuple[int, str]:
+def write_shard(path: Path, chunks: Iterator[bytes | None]) -> tuple[int, Sums]:
     """Write the chunks of a shard, in C order, None for those beyond the array; the file appears by a rename.
 
-    Returns its size and its SHA-256.
+    Returns its size and its sums.
     """
     places: list[int] = []
-    offset, digest = 0, hashlib.sha256()
+    offset, summing = 0, Summing()
     with _whole(path) as stream:
         for data in chunks:
             if data is None:
                 places += [_NONE, _NONE]
                 continue
             stream.write(data)
-            digest.update(data)
+            summing.update(data)
             places += [offset, len(data)]
             offset += len(data)
         index = with_sum(np.array(places, "<u8").tobytes())
         stream.write(index)
-        digest.update(index)
-    return offset + len(index), digest.hexdigest()
+        summing.update(index)
+    return offset + len(index), summing.sums()
 
 
 @contextlib.contextmanager
@@ -109,7 +109,7 @@ def digests_of(store: Path) -> Path:
 
 
 class DigestNotes:
-    """Notes SHA-256, size and name of each file that a writer has written: `Dataset.finish` reads none of them again.
+    """Notes sums, size and name of each file that a writer has written: `Dataset.finish` reads none of them again.
 
     Each writer has a file of its own, so that writers on many machines need not wait for each other.
     """
@@ -120,9 +120,9 @@ class DigestNotes:
         self._lines: list[str] = []
         self._written_at = time.monotonic()
 
-    def add(self, path: Path, size: int, digest: str) -> None:
+    def add(self, path: Path, size: int, sums: Sums) -> None:
         """Note a file."""
-        line = f"{digest} {size} {path.relative_to(self._store).as_posix()}\n"
+        line = f"{sums.sha256} {sums.xxh128} {size} {path.relative_to(self._store).as_posix()}\n"
         if in_bucket(self._store):  # nothing can be appended to an object
             self._lines.append(line)
             self.write(_NOTE_S)
@@ -134,7 +134,7 @@ class DigestNotes:
     def add_content(self, path: Path) -> None:
         """Note a file that has just been written, by its content."""
         content = content_of(path)
-        self.add(path, len(content), hashlib.sha256(content).hexdigest())
+        self.add(path, len(content), sums_of(content))
 
     def write(self, wait_s: float = 0.0) -> None:
         """Write the notes on an object store, unless they were written within so many seconds."""

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.yaml import Key, Lines, RecipeError, located, read_yaml
-from mars_lidar.dataset.recipe import DatasetRecipe, read_light, read_scene, refuse_for_transients
+from mars_lidar.dataset.recipe import DatasetRecipe, pair, read_light, read_scene, refuse_for_transients
 from mars_lidar.dataset.scenes import Content, Rendered, Surfaces
 from mars_lidar.dataset.values import listed_numbers
 from mars_lidar.engines import find_engine
@@ -229,7 +229,7 @@ def _examples(entry: dict[str, Any]) -> Iterator[Candidate]:
     name, size = entry["example"], entry["size"]
     for seed in listed_numbers(entry["seeds"]):
         called = f"{name}, size {size}, seed {seed}"
-        yield Candidate(called, Path(called), partial(_example, name, _side(size), seed), called)
+        yield Candidate(called, Path(called), partial(_example, name, pair(size), seed), called)
 
 
 def _example(name: str, size: Any, seed: int) -> Content:
@@ -242,15 +242,11 @@ def _sized(whole: Candidate, entry: dict[str, Any]) -> Candidate:
     if size is None:
         return whole
     name, place = (f"{text}, size {size}" for text in (whole.name, whole.place))
-    return Candidate(name, whole.path, partial(_resized, whole.load, _side(size)), place)
+    return Candidate(name, whole.path, partial(_resized, whole.load, pair(size)), place)
 
 
 def _resized(load: Callable[[], Content], size: Any) -> Content:
     return load().resize(size)
-
-
-def _side(size: Any) -> Any:
-    return tuple(size) if isinstance(size, list) else size
 
 
 def _surfaces(file: SceneFile) -> Content:

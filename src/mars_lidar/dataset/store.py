@@ -227,17 +227,17 @@ class Dataset:
         assert self.sums is not None, "incomplete stores are not read by name"
         return self.sums.read(name)
 
-    def written(self) -> dict[str, tuple[int, str]]:
-        """Size and SHA-256 of files by name, as their writers noted them."""
-        noted: dict[str, tuple[int, str]] = {}
+    def written(self) -> dict[str, tuple[int, manifest.Sums]]:
+        """Size and sums of files by name, as their writers noted them."""
+        noted: dict[str, tuple[int, manifest.Sums]] = {}
         folder = digests_of(self.path)
         if in_bucket(self.path) and not folder.exists():
             return noted
         for file in sorted(folder.glob("*.txt"), key=str):
             for line in content_of(file).decode().splitlines():
-                digest, size, name = (*line.split(" ", 2), "", "")[:3]
-                if name and size.isdecimal() and len(digest) == 64:  # the last line of a killed writer may be cut
-                    noted[name] = int(size), digest
+                sha256, xxh128, size, name = (*line.split(" ", 3), "", "", "")[:4]
+                if name and size.isdecimal():  # the last line of a killed writer may be cut
+                    noted[name] = int(size), manifest.Sums(sha256, xxh128)
         return noted
 
     def tidy(self) -> None:
@@ -256,13 +256,13 @@ class Dataset:
         noted = self.written()
         if in_bucket(self.path):
             there = sizes(self.path)
-            digests = {name: digest for name, (size, digest) in noted.items() if there.get(name) == size}
+            known = {name: sums for name, (size, sums) in noted.items() if there.get(name) == size}
             if noted:
                 remove(digests_of(self.path))
         else:
-            digests = {name: digest for name, (size, digest) in noted.items() if _has_size(self.path / name, size)}
+            known = {name: sums for name, (size, sums) in noted.items() if _has_size(self.path / name, size)}
             shutil.rmtree(digests_of(self.path), ignore_errors=True)
-        manifest.seal(self.path, {"stage": "done", "complete": True}, digests)
+        manifest.seal(self.path, {"stage": "done", "complete": True}, known)
         self.attrs = manifest.root_document(self.path)["attributes"]
 
 

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from mars_lidar.engines.engine import Engine, Task, stage
 from mars_lidar.engines.exact import ExactEngine
-from mars_lidar.engines.feedback import FeedbackEngine, Plan, draw_rest, expected_registrations
-from mars_lidar.engines.feedback_grid import judged_alone
-from mars_lidar.engines.tolerances import TOLERANCES
+from mars_lidar.engines.feedback import FeedbackEngine, Plan, draw_rest, expected_registrations, judged_alone
+from mars_lidar.engines.tolerances import TOL
 
 
 class AutoEngine(Engine):
@@ -41,18 +40,18 @@ class AutoEngine(Engine):
         """Feedback where it pays, exact for the rest."""
         registrations = expected_registrations(task.flux, task.system).reshape(-1)
         every = np.arange(registrations.size)
-        each = np.where(judged_alone(task, every), TOLERANCES.judged_even, TOLERANCES.cell_even)
+        each = np.where(judged_alone(task, every), TOL.judged_even, TOL.cell_even)
         many = registrations > each * task.system.bins
         pixels = every[many]
         plan = Plan.of(task, pixels)
         laps = plan.grids.laps()
-        each = np.where(laps > 1, TOLERANCES.lap_even * laps, TOLERANCES.cell_even)
+        each = np.where(laps > 1, TOL.lap_even * laps, TOL.cell_even)
         worth = registrations[pixels] > each * plan.grids.cells()
         many[pixels[~worth]] = False
         plan = plan.part(worth)
         share = float(many.mean())
         first, second = (replace(task, progress=stage(task.progress, *part)) for part in ((0.0, share), (share, 1.0)))
-        lap_cells = registrations[many] / TOLERANCES.lap_even
+        lap_cells = registrations[many] / TOL.lap_even
         refused = FeedbackEngine(self.level).sample(first, out, np.flatnonzero(many), plan, lap_cells)
         rest = replace(refused, pixels=np.sort(np.concatenate([np.flatnonzero(~many), refused.pixels])))
         draw_rest(ExactEngine(self.level), second, out, rest)

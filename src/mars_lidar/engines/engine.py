@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.cached import cached_property
+from mars_lidar._base.native import _core
 from mars_lidar._base.resources import check_memory
 from mars_lidar._base.types import Progress
-from mars_lidar.engines.tolerances import TOLERANCES
+from mars_lidar.engines.tolerances import TOL
 from mars_lidar.instrument.detector import MODES, Detector, Mode
 from mars_lidar.instrument.effects import (
     AVALANCHE_EFFECTS,
@@ -28,7 +29,6 @@ from mars_lidar.light.flux import Flux
 from mars_lidar.light.timestamps import record_bins, record_times
 
 if TYPE_CHECKING:
-    from mars_lidar._base.native import _core
     from mars_lidar.table import Table
 
 IN_PARTS = (
@@ -86,8 +86,6 @@ class Task:
     @cached_property
     def job(self) -> _core.Job:
         """The native form of this task; times in laser periods."""
-        from mars_lidar._base.native import _core
-
         wave = self.flux.waveform
         detector = self.system.detector
         start, step, width = detector.gate_periods(self.system.period_ns)
@@ -238,8 +236,6 @@ class Engine(ABC):
 @lru_cache(maxsize=16)
 def _recording(detector: Detector, period_ns: float) -> _core.Recording:
     """What the electronics make of registrations; times in periods."""
-    from mars_lidar._base.native import _core
-
     given = native_fields({name: getattr(detector, name) for name in RECORDING_EFFECTS}, period_ns)
     return _core.Recording(**(_EVERYTHING | given))
 
@@ -310,7 +306,7 @@ def stage(progress: Progress | None, start: float, end: float) -> Progress | Non
         return None
 
     def stage_progress(done: int, total: int) -> object:
-        return progress(round(TOLERANCES.ticks * (start + (end - start) * done / max(total, 1))), TOLERANCES.ticks)
+        return progress(round(TOL.ticks * (start + (end - start) * done / max(total, 1))), TOL.ticks)
 
     return stage_progress
 
@@ -340,8 +336,8 @@ def draw_pixels(engine: Engine, task: Task, out: NDArray[Any], pixels: NDArray[n
         return
     cube = out.reshape(task.realizations, every, task.system.bins)
     row = task.system.bins * out.itemsize
-    wide = max(1, min(pixels.size, TOLERANCES.buffer_bytes // row))
-    deep = max(1, min(task.realizations, TOLERANCES.buffer_bytes // (row * wide)))
+    wide = max(1, min(pixels.size, TOL.buffer_bytes // row))
+    deep = max(1, min(task.realizations, TOL.buffer_bytes // (row * wide)))
     steps = [(p, r) for p in range(0, pixels.size, wide) for r in range(0, task.realizations, deep)]
     for k, (first_pixel, first) in enumerate(steps):
         some = pixels[first_pixel : first_pixel + wide]
@@ -367,9 +363,9 @@ def check_start(flux: Flux, system: System) -> None:
     pulses = math.ceil(detector.twilight_ns / period) if apart < detector.twilight_ns else 0
     photons = flux.background * (detector.twilight_ns / period) + (flux.total - flux.background) * pulses
     worst = float(np.max(photons, initial=0.0))
-    if worst > TOLERANCES.twilight_photons:
+    if worst > TOL.twilight_photons:
         raise ValueError(
-            f"start must be 'armed' where more than {TOLERANCES.twilight_photons:g} photons may arrive within "
+            f"start must be 'armed' where more than {TOL.twilight_photons:g} photons may arrive within "
             f"detector.twilight_ns of the end of one dead time after another, got 'stationary' with {worst:.3g}: such "
             "a pixel ticks once in every dead time and does not settle; simulate a longer armed exposure and leave out "
             "its beginning"

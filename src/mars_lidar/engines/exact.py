@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from mars_lidar._base.native import _core
 from mars_lidar._base.resources import available_bytes, check_memory
 from mars_lidar.engines.engine import IN_PARTS, Engine, PhaseRecords, Records, Task, check_start
-from mars_lidar.engines.tolerances import TOLERANCES
+from mars_lidar.engines.tolerances import TOL
 from mars_lidar.instrument.detector import MODES
 from mars_lidar.instrument.effects import EFFECTS
 from mars_lidar.instrument.system import System
@@ -49,7 +49,7 @@ class ExactEngine(Engine):
 
     def records(self, task: Task, expected: float) -> PhaseRecords:
         """In one pass, into more room than is needed; where memory is scarce they are counted before."""
-        room = int(TOLERANCES.room * expected) + 1024
+        room = int(TOL.room * expected) + 1024
         available = available_bytes()
         if available is not None and 2 * PhaseRecords.BYTES * room > available:
             room = int(self.counts(task).sum())

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from mars_lidar._base import checks
 from mars_lidar._base.types import FloatArray, IndexArray
-from mars_lidar.engines.count_shape import CountTimesShape, as_shapes
 from mars_lidar.engines.engine import Count, Interpolation, Outside
 from mars_lidar.engines.pixels import Group, groups
 from mars_lidar.engines.synthesis import (
@@ -19,7 +18,7 @@ from mars_lidar.engines.synthesis import (
     Run,
     Tabulated,
 )
-from mars_lidar.engines.table_reader import Entries, TableReader, exact_laws, untrusted
+from mars_lidar.engines.table_reader import CountTimesShape, Entries, TableReader, as_shapes, exact_laws, untrusted
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 

@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.types import FloatArray, IndexArray
-from mars_lidar.engines.tolerances import TOLERANCES
+from mars_lidar.engines.tolerances import TOL
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.pulse import Pulse
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.statistics.cells import Cells, waveform_parts
 from mars_lidar.statistics.timing import is_timed
-from mars_lidar.statistics.tolerances import TOL
+from mars_lidar.statistics.tolerances import TOL as STATISTICS
 
 _EFFECTS = LIGHT_EFFECTS + TIMING_EFFECTS
 
@@ -52,7 +52,7 @@ def groups(flux: Flux, system: System, pixels: IndexArray, *, delays: bool = Tru
     _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
     order = np.argsort(inverse, kind="stable")
     starts = np.searchsorted(inverse[order], np.arange(first.size + 1))
-    step = int(np.clip(TOLERANCES.statistics_bytes // (8 * _doubles(flux, system)), 1, TOLERANCES.statistics_pixels))
+    step = int(np.clip(TOL.statistics_bytes // (8 * _doubles(flux, system)), 1, TOL.statistics_pixels))
     for low in range(0, first.size, step):
         high = min(low + step, first.size)
         members = order[starts[low] : starts[high]]
@@ -68,7 +68,7 @@ def _doubles(flux: Flux, system: System) -> int:
     elif single_return(flux) is None:
         parts = 4 * waveform_parts(system)
     law = 40.0 * float(np.sqrt(system.cycles * flux.total.max()))  # a count is no wider than without dead time
-    bins = TOL.most_parts if is_timed(system) else system.bins
+    bins = STATISTICS.most_parts if is_timed(system) else system.bins
     return 12 * bins + parts + int(law)
 
 
@@ -162,19 +162,19 @@ def _frame(pulse: Pulse, period_ns: float, bins: int, dead_fraction: float) -> F
     low, high = pulse.support_ns()
     t = np.linspace(low, high, 4097)
     energy = pulse.cumulative(t)
-    early = t[max(0, int(np.searchsorted(energy, TOLERANCES.pulse_outside)) - 1)]
-    late = t[min(t.size - 1, int(np.searchsorted(energy, 1.0 - TOLERANCES.pulse_outside)))]
+    early = t[max(0, int(np.searchsorted(energy, TOL.pulse_outside)) - 1)]
+    late = t[min(t.size - 1, int(np.searchsorted(energy, 1.0 - TOL.pulse_outside)))]
     width = period_ns / bins
     first = math.floor((0.5 * period_ns + early) / width)
     size = min(bins, math.floor((0.5 * period_ns + late) / width) - first + 1)
     if size == bins:
         first = 0
     deviation = _deviation(pulse, period_ns) / width  # in bins
-    parts = _power_of_two(TOLERANCES.energies_of_width / deviation, 8, max(8, min(4096, TOLERANCES.energies // size)))
+    parts = _power_of_two(TOL.energies_of_width / deviation, 8, max(8, min(4096, TOL.energies // size)))
     cells = 1
     near = min(dead_fraction, 1.0 - dead_fraction) * bins  # of the dead time to whole periods, bins
-    if deviation < TOLERANCES.narrow_bins and near < size + 1:
-        cells = _power_of_two(TOLERANCES.cells_of_width / deviation, 1, min(64, parts))
+    if deviation < TOL.narrow_bins and near < size + 1:
+        cells = _power_of_two(TOL.cells_of_width / deviation, 1, min(64, parts))
         while cells > 1 and size * cells > 8192:  # a record full of narrow features
             cells //= 2
     place = (first + np.arange(size))[None, :] + np.arange(parts + 1)[:, None] / parts

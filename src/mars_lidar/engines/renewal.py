@@ -8,11 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.types import FloatArray, IndexArray
-from mars_lidar.engines.count_shape import CountTimesShape, as_shapes
 from mars_lidar.engines.engine import Interpolation, Outside
 from mars_lidar.engines.pixels import Alignment, Group, groups, single_return
 from mars_lidar.engines.synthesis import Batch, CountLaws, RoundedGaussian, Run
-from mars_lidar.engines.table_reader import Entries, TableReader
+from mars_lidar.engines.table_reader import CountTimesShape, Entries, TableReader, as_shapes
 from mars_lidar.instrument.system import System
 
 if TYPE_CHECKING:

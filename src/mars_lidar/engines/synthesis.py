@@ -18,10 +18,11 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.native import _core
 from mars_lidar._base.types import FloatArray, IndexArray, Progress
 from mars_lidar.engines.engine import Task
 from mars_lidar.engines.pixels import Alignment
-from mars_lidar.engines.tolerances import TOLERANCES
+from mars_lidar.engines.tolerances import TOL
 from mars_lidar.statistics.count_pmf import Pmf
 
 # --- Counts ----------------------------------------------------------------------------------------------------------
@@ -79,8 +80,6 @@ class OfPixels(CountLaws):
 
     def fill(self, streams: Streams, out: IndexArray) -> None:
         """Draw counts into `out` (realizations, pixels)."""
-        from mars_lidar._base.native import _core
-
         streams.fill(getattr(_core, self.native), out, **vars(self))
 
 
@@ -136,8 +135,6 @@ class Tabulated(CountLaws):
 
     def fill(self, streams: Streams, out: IndexArray) -> None:
         """Draw counts into `out` (realizations, pixels)."""
-        from mars_lidar._base.native import _core
-
         laws = {"first": self.first, "offsets": self.offsets, "cumulative": self.cumulative}
         streams.fill(_core.tabulated_counts, out, law=self.law, **laws)
 
@@ -242,16 +239,14 @@ class Run:
     def draw(self, batch: Batch) -> None:
         """All realizations of the batch's pixels."""
         number = self.task.realizations
-        deep = min(number, TOLERANCES.batch_exposures)
-        wide = max(1, TOLERANCES.batch_exposures // deep)
+        deep = min(number, TOL.batch_exposures)
+        wide = max(1, TOL.batch_exposures // deep)
         for first in range(0, batch.pixels.size, wide):
             some = batch.part(slice(first, first + wide))
             for realization in range(0, number, deep):
                 self._draw(some, realization, min(deep, number - realization))
 
     def _draw(self, batch: Batch, first: int, number: int) -> None:
-        from mars_lidar._base.native import _core
-
         task, pixels = self.task, batch.pixels
         index = np.ascontiguousarray(task.pixel_index[pixels])
         start = task.first_realization + first

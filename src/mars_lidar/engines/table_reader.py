@@ -1,12 +1,14 @@
-"""What engines ask of a lookup table: that it fits the system, the entries of pixels, a record for a cube's file.
+"""Engines that draw pixels from a lookup table, where there is one, and the others one by one.
 
-And exact laws of the count for pixels whose four cumulants do not fix it.
+What they ask of the table: that it fits the system, the entries of pixels, a record for a cube's file; and exact laws
+of the count for pixels whose four cumulants do not fix it.
 """
 
 from __future__ import annotations
 
 import math
 import warnings
+from abc import abstractmethod
 from dataclasses import dataclass
 from hashlib import blake2b
 from typing import TYPE_CHECKING, Any, Literal
@@ -17,15 +19,16 @@ from numpy.typing import NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.types import FloatArray, IndexArray, Progress
-from mars_lidar.engines.engine import Task
+from mars_lidar.engines.engine import Engine, Task
 from mars_lidar.engines.pixels import Alignment, single_return
 from mars_lidar.engines.synthesis import Batch, CountLaws, Run, Tabulated
-from mars_lidar.engines.tolerances import TOLERANCES
+from mars_lidar.engines.tolerances import TOL
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.count_pmf import Pmf, guessed_windows
+from mars_lidar.statistics.exposure import normalised
 
 if TYPE_CHECKING:
     from mars_lidar.table import Table
@@ -124,8 +127,8 @@ class TableReader:
         expected = system.cycles * total / (1.0 + total * system.dead_time_periods)
         within = (signal > 0.0) & (signal >= self.table.signal[0]) & (signal <= self.table.signal[-1])
         within &= (background >= self.table.background[0]) & (background <= self.table.background[-1])
-        some = np.flatnonzero(within & (expected * TOLERANCES.misplaced_share < TOLERANCES.misplaced))
-        some = some[np.argsort(-total[some], kind="stable")][: TOLERANCES.start_up_pixels]
+        some = np.flatnonzero(within & (expected * TOL.misplaced_share < TOL.misplaced))
+        some = some[np.argsort(-total[some], kind="stable")][: TOL.start_up_pixels]
         if not some.size:
             return
         error = self.table.start_up_error(
@@ -138,7 +141,7 @@ class TableReader:
         )
         worst = int(np.argmax(error))
         task.report["start_up_error"] = float(error[worst])
-        if error[worst] > TOLERANCES.misplaced_share:
+        if error[worst] > TOL.misplaced_share:
             at = some[worst]
             warnings.warn(
                 f"table places {error[worst]:.2g} of the registrations ({error[worst] * expected[at]:.2g} of "
@@ -298,7 +301,7 @@ def image_table(
     if single is None:
         return None
     signal, background = single[0], light.background.reshape(-1)
-    if len(np.unique(np.stack([*single, background], 1), axis=0)) < TOLERANCES.table_pixels:
+    if len(np.unique(np.stack([*single, background], 1), axis=0)) < TOL.table_pixels:
         return None
     options: dict[str, Any] = {"threads": threads, "progress": progress}
     return Table.cached(system, _axis("signal", signal), _axis("background", background), **options)
@@ -310,7 +313,63 @@ def _axis(name: str, photons: FloatArray) -> Any:
     if some.size == 0:
         return np.array([0.0, 1e-6])
     low, high = float(some.min()), float(some.max())
-    if high < low * (1.0 + TOLERANCES.axis_width):
-        return np.array([low * (1.0 - TOLERANCES.axis_width), high * (1.0 + TOLERANCES.axis_width)])
+    if high < low * (1.0 + TOL.axis_width):
+        return np.array([low * (1.0 - TOL.axis_width), high * (1.0 + TOL.axis_width)])
     first, last = math.floor(8 * math.log10(low)), math.ceil(8 * math.log10(high))  # eighths of a decade
     return 10.0 ** (first / 8), 10.0 ** (last / 8), max(2, 1 + (last - first) * _PER_DECADE[name] // 8)
+
+
+# --- The engines -----------------------------------------------------------------------------------------------------
+
+
+class CountTimesShape(Engine):
+    """Draws N from a law of the count, and its registrations from a shape; both from a table or evaluated."""
+
+    def __init__(self, table: Table | None, interpolation: str | None, outside: str | None, level: str) -> None:
+        for name, value in (("interpolation", interpolation), ("outside", outside)):
+            if table is None and value is not None:
+                raise ValueError(f"{name} must be None without a table, got {value!r}")
+        self.reader = None if table is None else TableReader(table, interpolation, outside)
+        self.level = level
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The table, if there is one."""
+        return self.reader.settings if self.reader else {}
+
+    def check(self, flux: Flux, system: System) -> None:
+        """A table must be of the system, reach the pixels unless they may lie outside, and knows one return each."""
+        if self.reader:
+            self.reader.check(flux, system)
+
+    def histogram(self, task: Task, out: NDArray[Any]) -> None:
+        """Look up or evaluate, draw the counts, draw their places: batch by batch."""
+        run = Run(task, out, self.level)
+        pixels = np.arange(task.pixel_index.size)
+        if self.reader is None:
+            self._evaluate(run, pixels)
+            return
+        self.reader.warn_of_start_up(task)
+        step = TOL.looked_up
+        outside = [self._look_up(run, self.reader, pixels[k : k + step]) for k in range(0, pixels.size, step)]
+        self._evaluate(run, np.concatenate(outside))
+
+    def _look_up(self, run: Run, reader: TableReader, pixels: IndexArray) -> IndexArray:
+        """Draws the pixels on the grid; returns the others."""
+        with run.stage("lookup_s"):
+            entries, outside = reader.read(run.task, pixels)
+        run.draw(entries.batch(self._laws_of(run, reader, entries)))
+        return outside
+
+    @abstractmethod
+    def _laws_of(self, run: Run, reader: TableReader, entries: Entries) -> CountLaws:
+        """Laws of the counts of pixels from a table."""
+
+    @abstractmethod
+    def _evaluate(self, run: Run, pixels: IndexArray) -> None:
+        """Draws pixels without a table."""
+
+
+def as_shapes(histogram: FloatArray) -> NDArray[np.float32]:
+    """Shapes (cells, bins) of histograms (..., bins), as the sampler takes them."""
+    return np.ascontiguousarray(normalised(histogram.reshape(-1, histogram.shape[-1])).astype(np.float32))

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 class Tolerances:
     """Quantities that the choice of an engine, a grid or a warning depends on."""
 
-    # feedback: the internal grid (engines/feedback_grid.py)
+    # feedback: the internal grid (engines/feedback.py)
     mean_distance: float = 0.05
     """Standard deviations (Mahalanobis) between the mean of a grid and that of infinitely narrow cells; the study
     of long exposures detects 0.39 in a bin."""
@@ -112,4 +112,4 @@ class Tolerances:
     """Steps of progress of a call of several stages."""
 
 
-TOLERANCES = Tolerances()
+TOL = Tolerances()

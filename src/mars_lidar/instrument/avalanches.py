@@ -36,7 +36,7 @@ class Afterpulsing:
         afterpulse probability p after a dead time, as data sheets state it, is
         ``Afterpulsing.after_dead_time(probability=p, ...)``.
     delay_ns
-        Mean of exponential delays, ns. Either this, or
+        Mean of exponential delays, ns; in place of ``delays`` and ``bin_ns``.
     delays, bin_ns
         ``(n,)`` non-negative density of the delay on samples of `bin_ns` ns from the avalanche on, constant on each.
     generations
@@ -84,7 +84,10 @@ class Afterpulsing:
         if self.delay_ns is not None:
             set_field(self, "delay_ns", checks.real("delay_ns", self.delay_ns, low=0.0, strict_low=True))
         else:
-            set_field(self, "delays", _density(self.delays))
+            density = checks.weights(
+                "delays of afterpulsing", self.delays, most=TOL.samples, what="samples of a density"
+            )
+            set_field(self, "delays", tuple(density.tolist()))
             set_field(self, "bin_ns", checks.real("bin_ns", self.bin_ns, low=0.0, strict_low=True))
         if self.generations is not None:
             number = checks.integer("generations", self.generations, low=1, high=TOL.generations)
@@ -158,10 +161,7 @@ class Afterpulsing:
     def from_dict(cls, data: Any) -> Afterpulsing:
         """The afterpulsing that `to_dict` described."""
         names = ("probability", "delay_ns", "delays", "bin_ns", "generations")
-        known = checks.known_keys("afterpulsing", data, names)
-        if "probability" not in known:
-            raise ValueError("afterpulsing must give probability")
-        return cls(**known)
+        return cls(**checks.known_keys("afterpulsing", data, names, needed=names[:1]))
 
 
 @constructed_by_name
@@ -205,11 +205,8 @@ class Crosstalk:
 
     def __post_init__(self) -> None:
         set_field = object.__setattr__
-        set_field(
-            self,
-            "probability",
-            checks.real("probability of crosstalk", self.probability, low=0.0, high=1.0, strict_low=True),
-        )
+        probability = checks.real("probability of crosstalk", self.probability, low=0.0, high=1.0, strict_low=True)
+        set_field(self, "probability", probability)
         if isinstance(self.kernel, str):
             checks.choice("kernel of crosstalk", self.kernel, tuple(_KERNELS))
             return
@@ -241,26 +238,7 @@ class Crosstalk:
     @classmethod
     def from_dict(cls, data: Any) -> Crosstalk:
         """The crosstalk that `to_dict` described by `data`; ``kernel: 4`` without quotes is understood."""
-        known = dict(checks.known_keys("crosstalk", data, ("probability", "kernel")))
-        if "probability" not in known:
-            raise ValueError("crosstalk must give probability")
+        known = dict(checks.known_keys("crosstalk", data, ("probability", "kernel"), needed=("probability",)))
         if isinstance(known.get("kernel"), int):
             known["kernel"] = str(known["kernel"])
         return cls(**known)
-
-
-def _density(values: Any) -> tuple[float, ...]:
-    samples = np.asarray(values)
-    if samples.dtype.kind not in "fiu" or samples.ndim != 1 or not 1 <= samples.size <= TOL.delay_samples:
-        raise ValueError(
-            f"delays of afterpulsing must be 1 to {TOL.delay_samples} samples (n,) of a density, "
-            f"got shape {samples.shape} of {samples.dtype}"
-        )
-    samples = samples.astype(np.float64)
-    bad = ~np.isfinite(samples) | (samples < 0.0)
-    if bad.any() or not 0.0 < samples.sum() < math.inf:
-        offending = samples[bad][0] if bad.any() else samples.sum()
-        raise ValueError(
-            f"delays of afterpulsing must be finite and non-negative, of positive, finite sum, got {offending}"
-        )
-    return tuple(samples.tolist())

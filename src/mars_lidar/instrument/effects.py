@@ -7,7 +7,6 @@ docs/detectors.md; the steps that add one are in docs/architecture.md.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -73,31 +72,15 @@ class Effect:
     default: str | None = None
 
 
-def _jitter(value: Any) -> Jitter | SampledJitter:
-    if not isinstance(value, (Jitter, SampledJitter)):
-        raise TypeError(f"jitter must be a Jitter or a SampledJitter, got {value!r}")
-    return value
-
-
-def _instance(name: str, value: Any, of: type) -> Any:
+def _instance(name: str, value: Any, *of: type) -> Any:
     if not isinstance(value, of):
-        raise TypeError(f"{name} must be of type {of.__name__}, got {value!r}")
+        raise TypeError(f"{name} must be of type {' or '.join(each.__name__ for each in of)}, got {value!r}")
     return value
 
 
 def _code_density(value: Any) -> tuple[float, ...]:
-    widths = np.asarray(checks.numbers("code_density", checks.unmasked("code_density", value)))
-    if widths.dtype.kind not in "fiu" or widths.ndim != 1 or not 2 <= widths.size <= TOL.codes:
-        raise ValueError(
-            f"code_density must be 2 to {TOL.codes} relative widths of TDC codes (n,), got shape {widths.shape} "
-            f"of {widths.dtype}"
-        )
-    widths = widths.astype(np.float64)
-    bad = ~(np.isfinite(widths) & (widths >= 0.0))
-    if bad.any() or not 0.0 < widths.sum() < math.inf:
-        got = f"{widths[bad][0]:g}" if bad.any() else f"a sum of {widths.sum():g}"
-        raise ValueError(f"code_density must be finite, non-negative and not all 0, got {got}")
-    return tuple(widths.tolist())
+    what = "relative widths of TDC codes"
+    return tuple(checks.weights("code_density", value, least=2, most=TOL.codes, what=what).tolist())
 
 
 def _native_traps(traps: Afterpulsing, period_ns: float) -> dict[str, Any]:
@@ -133,7 +116,7 @@ FIELDS: dict[str, Effect] = {
         0.0,
         lambda v: checks.real("dark_count_hz", v, low=0.0, high=TOL.rate_hz),
         "dark_count_hz: 100.0             # counts/s of every pixel",
-        help="Dark counts of every pixel, counts/s, which no efficiency reduces.",
+        help="Dark counts of every pixel, counts/s; not reduced by the efficiency.",
         default="0",
     ),
     "afterpulsing": Effect(
@@ -153,7 +136,7 @@ afterpulsing:                    # carriers in traps: each that is released is a
         lambda v: checks.real("twilight_ns", v, low=0.0),
         "twilight_ns: 2.0                 # photons so late in the dead time fire at its end",
         native=lambda v, period_ns: {"twilight": v / period_ns},
-        help="Arrivals this long before the end of the dead time fire at its end, ns.",
+        help="Arrivals up to this long before the end of the dead time trigger an avalanche at its end, ns.",
         default="0",
     ),
     "recovery_ns": Effect(
@@ -191,7 +174,7 @@ crosstalk:                       # avalanches trigger neighbours; with the seque
         lambda v: checks.integer("max_events_per_period", v, low=1, high=TOL.events),
         "max_events_per_period: 1         # the TDC records the first ones only, of a period ...",
         native=lambda v, period_ns: {"most_per_period": v},
-        help="Events recorded of a period.",
+        help="Largest number of events recorded in a period.",
         default="no limit",
     ),
     "max_events_per_exposure": Effect(
@@ -200,13 +183,13 @@ crosstalk:                       # avalanches trigger neighbours; with the seque
         lambda v: checks.integer("max_events_per_exposure", v, low=1, high=TOL.events),
         "max_events_per_exposure: 1000    # ... and of an exposure",
         native=lambda v, period_ns: {"most_per_exposure": v},
-        help="Events recorded of an exposure.",
+        help="Largest number of events recorded in an exposure.",
         default="no limit",
     ),
     "jitter": Effect(
         "timing",
         None,
-        _jitter,
+        lambda v: _instance("jitter", v, Jitter, SampledJitter),
         """\
 jitter:                          # of a record; leave it out of the pulse above then
   kind: gaussian                 # or sampled, with values, bin_ns and origin as for a pulse

@@ -13,7 +13,7 @@ from mars_lidar._base import checks
 from mars_lidar._base.arguments import constructed_by_name
 from mars_lidar._base.cached import cached_property
 from mars_lidar._base.types import FloatArray
-from mars_lidar.instrument.pulse import FWHM_PER_SIGMA, SampledPulse
+from mars_lidar.instrument.pulse import FWHM_PER_SIGMA, SampledPulse, shape_from_dict
 
 
 @constructed_by_name
@@ -237,18 +237,9 @@ class SampledJitter:
 
 
 def jitter_from_dict(data: Any) -> Jitter | SampledJitter:
-    """The jitter that `to_dict` described; ``fwhm_ns`` may stand for ``sigma_ns``."""
-    kind = data.get("kind", "gaussian") if isinstance(data, dict) else None
-    if kind == "gaussian":
-        known = checks.known_keys("jitter", data, ("kind", "sigma_ns", "fwhm_ns", "tail_ns", "tail_fraction"))
-        given = {name: value for name, value in known.items() if name != "kind"}
-        if ("sigma_ns" in given) == ("fwhm_ns" in given):
-            raise ValueError(f"jitter of kind 'gaussian' must give one of sigma_ns and fwhm_ns, got {list(given)}")
-        return Jitter.from_fwhm(**given) if "fwhm_ns" in given else Jitter(**given)
-    if kind == "sampled":
-        known = checks.known_keys("jitter", data, ("kind", "values", "bin_ns", "origin"))
-        missing = [key for key in ("values", "bin_ns") if key not in known]
-        if missing:
-            raise ValueError(f"jitter of kind 'sampled' must give {missing[0]}")
-        return SampledJitter(known["values"], known["bin_ns"], known.get("origin", "peak"))
-    raise ValueError(f"jitter must be a mapping with kind 'gaussian' or 'sampled', got {data!r}")
+    """The jitter that `to_dict` described; it is Gaussian where no kind is given."""
+    named = {"kind": "gaussian", **data} if isinstance(data, dict) else data
+    jitter: Jitter | SampledJitter = shape_from_dict(
+        "jitter", named, Jitter, SampledJitter, ("tail_ns", "tail_fraction")
+    )
+    return jitter

@@ -245,15 +245,7 @@ class SampledPulse(Pulse):
     _bytes: bytes
 
     def __init__(self, values: ArrayLike, bin_ns: float, origin: str = "peak") -> None:
-        samples = np.array(checks.numbers("values", checks.unmasked("values", values)), dtype=np.float64)
-        if samples.ndim != 1 or samples.size == 0:
-            raise ValueError(f"values must be a 1-D array of at least one sample, got shape {samples.shape}")
-        bad = ~np.isfinite(samples) | (samples < 0)
-        if bad.any():
-            k = int(np.argmax(bad))
-            raise ValueError(f"values must be finite and non-negative, got values[{k}] = {samples[k]}")
-        if not samples.max() > 0 or not np.isfinite(samples.sum()):
-            raise ValueError(f"values must have a positive, finite sum, got {samples.sum()}")
+        samples = checks.weights("values", values, most=TOL.samples, what="samples")
         width = checks.real("bin_ns", bin_ns, low=0.0, strict_low=True)
         checks.choice("origin", origin, _ORIGINS)
         samples.flags.writeable = False
@@ -344,20 +336,21 @@ def _unroll(samples: NDArray[np.float64], width: float, origin: str) -> tuple[ND
 
 def pulse_from_dict(data: Any) -> Pulse:
     """The pulse that `Pulse.to_dict` described."""
+    shape: Pulse = shape_from_dict("pulse", data, GaussianPulse, SampledPulse)
+    return shape
+
+
+def shape_from_dict(name: str, data: Any, gaussian: Any, sampled: Any, more: tuple[str, ...] = ()) -> Any:
+    """A shape by its kind, `gaussian` or `sampled`, with a width by ``sigma_ns`` or ``fwhm_ns``, and `more` keys."""
     kind = data.get("kind") if isinstance(data, dict) else None
     if kind == "gaussian":
-        checks.known_keys("pulse", data, ("kind", "sigma_ns", "fwhm_ns"))
-        if "fwhm_ns" in data:
-            if "sigma_ns" in data:
-                raise ValueError("pulse must give one of sigma_ns and fwhm_ns, got both")
-            return GaussianPulse.from_fwhm(fwhm_ns=data["fwhm_ns"])
-        if "sigma_ns" not in data:
-            raise ValueError("pulse of kind 'gaussian' must give sigma_ns or fwhm_ns, got neither")
-        return GaussianPulse(sigma_ns=data["sigma_ns"])
+        known = dict(checks.known_keys(name, data, ("kind", "sigma_ns", "fwhm_ns", *more)))
+        del known["kind"]
+        if ("sigma_ns" in known) == ("fwhm_ns" in known):
+            got = "both" if "fwhm_ns" in known else "neither"
+            raise ValueError(f"{name} of kind 'gaussian' must give one of sigma_ns and fwhm_ns, got {got}")
+        return gaussian.from_fwhm(**known) if "fwhm_ns" in known else gaussian(**known)
     if kind == "sampled":
-        checks.known_keys("pulse", data, ("kind", "values", "bin_ns", "origin"))
-        missing = [key for key in ("values", "bin_ns") if key not in data]
-        if missing:
-            raise ValueError(f"pulse of kind 'sampled' must give {missing[0]}")
-        return SampledPulse(data["values"], data["bin_ns"], data.get("origin", "peak"))
-    raise ValueError(f"pulse must be a mapping with kind 'gaussian' or 'sampled', got {data!r}")
+        known = checks.known_keys(name, data, ("kind", "values", "bin_ns", "origin"), needed=("values", "bin_ns"))
+        return sampled(known["values"], known["bin_ns"], known.get("origin", "peak"))
+    raise ValueError(f"{name} must be a mapping with kind 'gaussian' or 'sampled', got {data!r}")

@@ -208,10 +208,7 @@ class System:
     def from_dict(cls, data: Any) -> System:
         """The system that `to_dict` described by `data`; unknown or missing keys are errors that name them."""
         names = tuple(field.name for field in dataclasses.fields(cls))
-        known = dict(checks.known_keys("system", data, names))
-        missing = [name for name in names if name not in known and name != "start"]
-        if missing:
-            raise ValueError(f"system must give {missing[0]}; needed: {', '.join(names[:-1])}")
+        known = dict(checks.known_keys("system", data, names, needed=names[:-1]))  # all but the start
         known["pulse"] = pulse_from_dict(known["pulse"])
         known["detector"] = Detector.from_dict(known["detector"])
         return cls(**known)

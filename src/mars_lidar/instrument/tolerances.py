@@ -11,8 +11,8 @@ class Tolerances:
 
     Attributes
     ----------
-    generations, delay_samples
-        Generations of afterpulses that a number may ask for; samples of a density of their delays (128 MiB).
+    generations, samples
+        Generations of afterpulses that a number may ask for; samples of a pulse or of a density of delays (128 MiB).
     delay_periods
         Laser periods of a mean delay of afterpulses or of a recovery: beyond it a pixel at rest and one that is not can
         no longer be distinguished in double precision.
@@ -51,7 +51,7 @@ class Tolerances:
     """
 
     generations: int = 1_000_000
-    delay_samples: int = 2**24
+    samples: int = 2**24
     delay_periods: float = 1e6
     gate_ns: float = 1e12
     gate_periods: float = 1e-5

@@ -20,10 +20,10 @@ from mars_lidar._base.files import (
     INCOMPLETE_SUFFIX,
     FileError,
     IncompleteFileError,
+    check_finished,
     check_target,
     finished_name,
     reading,
-    unfinished_of,
 )
 from mars_lidar._base.imports import late, needed
 from mars_lidar._base.resources import check_memory
@@ -406,10 +406,7 @@ def load(path: str | Path, *, allow_incomplete: bool = False) -> Cube:
     source = Path(path)
     plain = finished_name(source)
     form = format_of(plain, "path")
-    if not source.exists():
-        if leftovers := unfinished_of(source):
-            raise IncompleteFileError(f"{source} was never finished: a stopped run left {leftovers[0]}")
-        raise FileNotFoundError(f"{source} does not exist")
+    check_finished(source)
     if plain != source and plain.suffix in (".mat", ".ptu"):  # no part of them is of use
         raise IncompleteFileError(f"{source} is incomplete: a run that was stopped left it")
     try:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from mars_lidar._base import manifest
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.files import beside, check_target, reading
+from mars_lidar._base.files import beside, check_finished, check_target, reading
 from mars_lidar._base.hdf5 import ForgivingFile, seal
 from mars_lidar._version import __version__
 from mars_lidar.instrument.system import System
@@ -107,8 +107,7 @@ def load_maps(path: str | Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]
         A path that is no text or Path.
     """
     source = Path(path)
-    if not source.exists():
-        raise FileNotFoundError(f"{source} does not exist")
+    check_finished(source)
     with reading(source, "maps of mars-lidar"):
         _check_suffix("path", source)
         with contextlib.closing(format_of(source, "path").open_store(source, _check_format)) as store:

@@ -27,7 +27,8 @@ from mars_lidar.io.cube import Cube, check_output, load, open_writer
 from mars_lidar.io.recipe import Recipe
 from mars_lidar.light.flux import Flux, StoredFlux
 from mars_lidar.simulation import simulate
-from mars_lidar.table import Table, cache
+from mars_lidar.table import Table
+from mars_lidar.table.storage import cached_tables
 
 
 @dataclass(frozen=True)
@@ -344,7 +345,7 @@ def _repeatable(recipe: Recipe, table: Table | None) -> Recipe:
 
 def _from_cache(system: System, record: dict[str, Any]) -> Table | None:
     """The table of that record, where the user's cache has it."""
-    for path in cache.files():
+    for path in cached_tables():
         with contextlib.suppress(OSError, ValueError):
             table = Table.load(path, system)
             same = [table.signal.size, table.background.size] == [record["signal"][2], record["background"][2]]

@@ -7,7 +7,6 @@ from any URL that fsspec opens (``https://``, ``s3://``, ``memory://``).
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 import os
 import shutil
@@ -266,29 +265,30 @@ def open_url(url: str) -> OpenedStore:
         return OpenedStore(attrs, {name: RemoteArray(array, Path(url)) for name, array in group.arrays()})
 
 
-def _require(url: str, system: Any, root: str, stated: str | None) -> dict[str, str]:
-    """The sums of all files.
+def _require(url: str, system: Any, root: str, stated: str | None) -> manifest.Manifest:
+    """The manifest.
 
     Raises where a document or coordinate is not as it was written, or a file is missing where they can be listed.
     """
-    try:
-        lines = system.cat_file(f"{root}/{manifest.NAME}").decode()
-    except FileNotFoundError:
-        raise FileError(f"{url} is damaged: its {manifest.NAME} is missing") from None
+    lines = {}
+    for name in (manifest.NAME, manifest.CHECKS):
+        try:
+            lines[name] = manifest.lines_of(system.cat_file(f"{root}/{name}").decode())
+        except FileNotFoundError:
+            raise FileError(f"{url} is damaged: its {name} is missing") from None
     try:
         there = {str(name).rpartition(f"{root}/")[2] for name in system.find(root)}
     except Exception:  # what cannot be listed (most web servers)
         there = set()
     listed = there if manifest.NAME in there else None
 
-    def digest(name: str) -> str:
-        return hashlib.sha256(system.cat_file(f"{root}/{name}")).hexdigest()
+    def read(name: str) -> manifest.Sums:
+        return manifest.sums_of(system.cat_file(f"{root}/{name}"))
 
-    sums = manifest.lines_of(lines)
-    wrong = list(manifest.compared(sums, listed, digest, stated=stated))
+    wrong = list(manifest.compared(lines[manifest.NAME], lines[manifest.CHECKS], listed, read, stated=stated))
     if wrong:
         raise ValueError(f"is damaged: {', '.join(wrong[:3])}")
-    return sums
+    return manifest.ManifestInBucket(Path(url), lines[manifest.NAME], lines[manifest.CHECKS], {})
 
 
 @contextlib.contextmanager

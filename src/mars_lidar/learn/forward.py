@@ -35,7 +35,7 @@ from mars_lidar.instrument.pulse import GaussianPulse, Pulse, SampledPulse
 from mars_lidar.instrument.system import System
 from mars_lidar.learn.needed import torch
 from mars_lidar.learn.tolerances import TOLERANCES
-from mars_lidar.statistics.phase_chain import ConvergenceError
+from mars_lidar.statistics.chain import ConvergenceError
 
 # --- Photons of each bin -------------------------------------------------------------------------------------------
 

@@ -272,26 +272,12 @@ class Transient:
         return Flux(waveform=waveform, background=background, info=info)
 
     @checked
-    def stored_flux(
-        self,
-        system: System,
-        *,
-        signal: float | None = None,
-        photons_per_unit: float | None = None,
-        sbr: float = math.inf,
-        dark_count_hz: float = 0.0,
-        pulse: bool = True,
-        parts: int | None = None,
-    ) -> StoredFlux:
+    def stored_flux(self, system: System, **level: Any) -> StoredFlux:
         """The flux as `flux` gives it, for a transient larger than memory: rows are read when they are used.
 
-        `mars_lidar.io.simulate_to` takes it band by band. Parameters (`system`, `signal`, `photons_per_unit`, `sbr`,
-        `dark_count_hz`, `pulse`, `parts`) and errors are those of `flux`; the transient is read once at this call, for
-        its `totals`.
+        `mars_lidar.io.simulate_to` takes it band by band. `system`, the arguments of `level` (all but `rows`) and the
+        errors are those of `flux`; the transient is read once at this call, for its `totals`.
         """
-
-        level: dict[str, Any] = {"signal": signal, "photons_per_unit": photons_per_unit, "sbr": sbr}
-        level |= {"dark_count_hz": dark_count_hz, "pulse": pulse, "parts": parts}
 
         def make(rows: slice) -> Flux:
             return self.flux(system, **level, rows=rows)

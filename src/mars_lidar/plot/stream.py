@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from mars_lidar._base.types import FloatArray
 from mars_lidar.plot.style import COLOURS, DPI, INK, MUTED, style
 
 if TYPE_CHECKING:
@@ -35,9 +36,7 @@ def calibration_figure(result: Calibration, title: str = "") -> Figure:
 
 def _intervals(ax: Axes, curves: Curves, result: Calibration) -> None:
     edges = curves.interval_edges_ns
-    ax.stairs(curves.intervals, edges, color=COLOURS[0], fill=True, alpha=0.5, label="recorded")
-    if curves.fitted_intervals is not None:
-        ax.stairs(curves.fitted_intervals, edges, color=COLOURS[1], lw=0.9, label="fit")
+    _recorded(ax, edges, curves.intervals, curves.fitted_intervals)
     if "dead_time_ns" in result.estimates:
         dead = result.estimates["dead_time_ns"]
         ax.axvline(dead.value, color=MUTED, lw=0.7, label=f"dead time {dead} ns")
@@ -48,11 +47,15 @@ def _intervals(ax: Axes, curves: Curves, result: Calibration) -> None:
     ax.legend(frameon=False, loc="upper right")
 
 
+def _recorded(ax: Axes, edges: FloatArray, counts: FloatArray, fit: FloatArray | None) -> None:
+    ax.stairs(counts, edges, color=COLOURS[0], fill=True, alpha=0.5, label="recorded")
+    if fit is not None:
+        ax.stairs(fit, edges, color=COLOURS[1], lw=0.9, label="fit")
+
+
 def _phases(ax: Axes, curves: Curves, result: Calibration) -> None:
     edges = curves.phase_edges_ns
-    ax.stairs(curves.phases, edges, color=COLOURS[0], fill=True, alpha=0.5, label="recorded")
-    if curves.fitted_phases is not None:
-        ax.stairs(curves.fitted_phases, edges, color=COLOURS[1], lw=0.9, label="fit")
+    _recorded(ax, edges, curves.phases, curves.fitted_phases)
     if "signal" in result.estimates:
         signal, background = result.estimates["signal"], result.estimates["background"]
         ax.plot([], [], " ", label=f"S {signal}\nB {background}")

@@ -1,22 +1,15 @@
 """Analytic count laws and histogram shapes of one pixel: no scene, no sampling."""
 
 from mars_lidar.statistics.cells import photons_per_bin
-from mars_lidar.statistics.chain import PhaseChain, Stationary
+from mars_lidar.statistics.chain import ConvergenceError, PhaseChain, Stationary
 from mars_lidar.statistics.constant_light import constant_light_rate
 from mars_lidar.statistics.electronics import electronics_moments
 from mars_lidar.statistics.exposure import Exposure, Moments, exposure_moments
-from mars_lidar.statistics.histogram import mean_histogram
+from mars_lidar.statistics.histogram import mean_histogram, registration_pdf
 from mars_lidar.statistics.joint import JointLaw, joint_law
-from mars_lidar.statistics.law import CountLaw, count_law, registration_pdf
+from mars_lidar.statistics.law import CountLaw, count_law
 from mars_lidar.statistics.paralyzable import paralyzable_moments
-from mars_lidar.statistics.phase_chain import ConvergenceError
-from mars_lidar.statistics.renewal import (
-    HoldingTimes,
-    MomentMatrices,
-    holding_times,
-    mars_moments,
-    moment_matrices,
-)
+from mars_lidar.statistics.renewal import HoldingTimes, holding_times
 from mars_lidar.statistics.spectral import HoldingTimeCovariance, holding_time_covariance
 
 __all__ = [
@@ -26,7 +19,6 @@ __all__ = [
     "HoldingTimeCovariance",
     "HoldingTimes",
     "JointLaw",
-    "MomentMatrices",
     "Moments",
     "PhaseChain",
     "Stationary",
@@ -37,9 +29,7 @@ __all__ = [
     "holding_time_covariance",
     "holding_times",
     "joint_law",
-    "mars_moments",
     "mean_histogram",
-    "moment_matrices",
     "paralyzable_moments",
     "photons_per_bin",
     "registration_pdf",

@@ -279,8 +279,8 @@ def followed_edges(cells: Cells, parts: int, out_bins: int) -> FloatArray:
 def knots(cells: Cells, bins: int, halved: float) -> FloatArray:
     """Phases (n,) in [0, 1) at which a grid for the only cell must have edges.
 
-    The edges of the samples of a sampled pulse or waveform; 8 `halved` points per sigma on a Gaussian pulse that `bins`
-    bins do not resolve; otherwise none.
+    The edges of the samples of a sampled pulse or waveform; on a Gaussian pulse that `bins` bins do not resolve, 8
+    times `halved` points per sigma; otherwise none.
     """
     if cells.waveform is not None:
         return np.linspace(0.0, 1.0, cells.waveform.shape[-1], endpoint=False)
@@ -488,9 +488,9 @@ class Cells:
 
     @property
     def finest(self) -> float:
-        """Standard deviation, in periods, of a Gaussian as narrow as the signal; of registrations, where it is bright.
+        """Standard deviation, in periods, of a Gaussian as narrow as the registrations of the signal.
 
-        These fall as fast as the signal's first photon comes: of n photons, in an n-th of its width.
+        In dim light these are as wide as the signal; of n photons the first comes within about an n-th of its width.
         """
         photons = max(float(np.max(self.total, initial=0.0)), 1.0)
         return 1.0 / (2.0 * math.sqrt(math.pi) * max(self._sharpness, 1.0) * photons)
@@ -498,8 +498,8 @@ class Cells:
     def first_bins(self, out_bins: int) -> int:
         """Bins of the first grid: `usual_bins`, or more where a narrower pulse must be resolved.
 
-        So must the parts of a waveform where pixels re-arm in the bin of their registration: grids that do not resolve
-        them agree with each other on a mean that is 1e-4 off.
+        The parts of a waveform must be resolved where pixels re-arm in the bin of their registration: grids that do not
+        resolve them agree with each other on a mean that is 1e-4 off.
         """
         most = max(TOL.most_first_bins, out_bins)
         if self.follow:

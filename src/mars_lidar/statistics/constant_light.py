@@ -21,7 +21,7 @@ from mars_lidar.instrument.detector import Detector, require_effects
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.instrument.tolerances import TOL as INSTRUMENT
-from mars_lidar.statistics.phase_chain import ConvergenceError
+from mars_lidar.statistics.chain import ConvergenceError
 from mars_lidar.statistics.tolerances import TOL
 
 _EFFECTS = (*LIGHT_EFFECTS, "afterpulsing", "twilight_ns", "recovery_ns", *TIMING_EFFECTS)

@@ -1,8 +1,7 @@
 """Probabilities of the count of an exposure: closed forms, and the inversion of the generating function E z^N.
 
 Rigorous tail bounds give the support; the generating function is evaluated at as many points of the unit circle as the
-support has counts, and an FFT gives the probabilities. Equation numbers:
-docs/theory_exposure.md, section 8.
+support has counts, and an FFT gives the probabilities. Equation numbers: docs/theory_exposure.md, section 8.
 """
 
 from __future__ import annotations
@@ -18,8 +17,8 @@ from numpy.typing import NDArray
 from mars_lidar._base.native import _core
 from mars_lidar._base.types import FloatArray, IndexArray
 from mars_lidar.statistics.cells import Cells
+from mars_lidar.statistics.chain import ConvergenceError
 from mars_lidar.statistics.exposure import Settled, native_light, refined_moments, warm_history
-from mars_lidar.statistics.phase_chain import ConvergenceError
 from mars_lidar.statistics.tolerances import LAW, TOL
 
 # --- Support of the count, and closed forms ------------------------------------------------------------------------
@@ -112,7 +111,7 @@ class TooLongError(ConvergenceError):
 
 
 class Remaining:
-    """Steps of `Budget.transform` that the law of one cell may still take; at first a `share` of all."""
+    """Steps of `Budget.transform` that remain for the law of one cell; at the start a `share` of all."""
 
     def __init__(self, share: float = 1.0) -> None:
         self.steps = share * LAW.transform
@@ -239,7 +238,7 @@ def _folded(cells: Cells, first: IndexArray, size: int, bins: int, threads: int)
 
 
 def _if_whole(pmf: FloatArray, first: int, mean: float, spread: float) -> Pmf | None:
-    """The window if it contains the law: ends below `_EDGE`, nothing negative, sum 1, the assumed mean; else None."""
+    """The window where it contains the law: ends below `Tolerances.edge`, nothing negative, sum 1, the assumed mean."""
     away = float(pmf @ (first + np.arange(pmf.size))) - mean
     ends = _ends(pmf, first)
     if not (ends <= TOL.edge and abs(away) <= TOL.like_mean * max(spread, 0.5) and float(pmf.min()) >= -TOL.consistent):

@@ -3,8 +3,9 @@
 An avalanche is recorded iff t_e has passed since the last record; the pixel keeps detecting meanwhile, dead for t_d
 after each avalanche. Records form a Markov-renewal process whose state is the phase of a record: equations (10) to (13)
 of docs/theory_detectors.md. Its transition probabilities are the kernel (10) folded over the periods. The stationary
-law of the phases is the mean histogram of a stationary pixel (20), the case of Rapp et al., IEEE TSP 2019. Weighting
-each record with z gives the generating function of the number of records, and on the unit circle its law (19).
+law of the phases is the mean histogram of a stationary pixel (20), which Rapp et al. treat (IEEE TSP 2019). With a
+weight z for each record the same recursion gives the generating function of the number of records; its values on the
+unit circle give the law of the number (19).
 """
 
 from __future__ import annotations
@@ -25,14 +26,13 @@ from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.statistics.cells import Cells, photons_before
+from mars_lidar.statistics.chain import ConvergenceError
 from mars_lidar.statistics.count_pmf import Pmf, exact_windows
 from mars_lidar.statistics.exposure import Moments, refined_moments, stationary_histogram
-from mars_lidar.statistics.phase_chain import ConvergenceError
 from mars_lidar.statistics.timing import Timing, is_timed
 from mars_lidar.statistics.tolerances import LAW, MOMENTS, TOL, Budget, advice
 
 # --- From record to record -----------------------------------------------------------------------------------------
-
 
 Rows = NDArray[Any]  # real or complex
 
@@ -131,8 +131,8 @@ class RecordGrid:
 class RecordRun:
     """Records bin by bin through the exposure, for several weightings (rows) at once (12).
 
-    `start` (rows,) are the weights of the first record; `weigh` maps the records (rows, bins) to the weighted records
-    that the next ones follow from.
+    `start` (rows,) are the weights of the first record; `weigh` gives records (rows, bins) the weights with which they
+    enter the records that follow them.
     """
 
     def __init__(self, grid: RecordGrid, start: Rows, weigh: Callable[[Rows], Rows]) -> None:
@@ -403,7 +403,7 @@ class _Run:
             self._run(RecordGrid(cell, bins, electronics, budget))
 
     def _run(self, grid: RecordGrid) -> None:
-        """Records period by period, and the number of those before each (12), (13)."""
+        """Sums of the records and of the pairs of records, period by period (12), (13)."""
         run = RecordRun(grid, np.array([1.0, 0.0]), lambda now: np.stack([now[0], now[0] + now[1]]))
         a_period = grid.bins * (grid.shift + 64.0) + TOL.record_block * len(run.blocks)
         periods = min(self.cycles, max(100, int(grid.budget.record_moments / a_period)))

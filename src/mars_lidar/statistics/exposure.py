@@ -32,8 +32,8 @@ from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.statistics.cells import Cells, fine_histograms, meets_itself, photons_before
+from mars_lidar.statistics.chain import ConvergenceError
 from mars_lidar.statistics.joint_grid import FoldedGrid
-from mars_lidar.statistics.phase_chain import ConvergenceError
 from mars_lidar.statistics.timing import Timing, is_timed
 from mars_lidar.statistics.tolerances import MOMENTS, TOL, Budget
 
@@ -156,13 +156,6 @@ class Moments:
     def std(self) -> FloatArray:
         """Standard deviation of N (...)."""
         return np.sqrt(self.variance)
-
-
-def darkness(result: Exposure, which: NDArray[np.bool_], bins: int) -> None:
-    """Set the statistics of the cells `which` without light to 0."""
-    for array in (result.cumulants, result.cumulant_rates, result.histogram, result.histogram_rate, result.settled):
-        array[which] = 0
-    result.bins[which] = bins
 
 
 def blank(cells: Cells, out_bins: int) -> Exposure:
@@ -452,7 +445,8 @@ def refined_moments(
     bins = cells.first_bins(out_bins)
     most = max(TOL.most_bins, 4 * out_bins, 2 * bins)
     if pending.size < cells.size:
-        darkness(result, cells.total == 0.0, bins)
+        for name, array in vars(result).items():  # cells without light register nothing
+            array[cells.total == 0.0] = bins if name == "bins" else 0
         if not pending.size:
             return shaped(result, cells.shape)
     shared = math.gcd(bins // 2, out_bins)
@@ -491,10 +485,10 @@ def _spent(done: Exposure, cells: Cells) -> FloatArray:
     """Cost (cells,) of one pass in bins x periods, with the light and the access to the history included."""
     periods = np.where(done.settled >= 0, done.settled, cells.system.cycles)
     bins = int(done.bins.max(initial=1))
-    return (periods + _before(cells.system)) * done.bins.astype(np.float64) * cells.step_cost(bins)
+    return (periods + _light_cost(cells.system)) * done.bins.astype(np.float64) * cells.step_cost(bins)
 
 
-def _before(system: System) -> float:
+def _light_cost(system: System) -> float:
     """Cost of the light of a bin, in steps of the native recursion."""
     return TOL.rate_steps if system.detector.mode == "paralyzable" else TOL.light_steps
 
@@ -527,7 +521,7 @@ def _run(
     """One pass of the recursion over all cells on one grid."""
     cells.check_history(bins)
     steps = None if budget is MOMENTS else budget.one_pass / cells.step_cost(bins)
-    periods = min(3.0 * (cells.system.dead_time_periods + 1.0), cells.system.cycles) + _before(cells.system)
+    periods = min(3.0 * (cells.system.dead_time_periods + 1.0), cells.system.cycles) + _light_cost(cells.system)
     if steps is not None and periods * bins > steps:
         raise ConvergenceError(f"exposure statistics of {cells.name(0)}: {_too_long(cells, budget)}")
     result = blank(cells, out_bins)

@@ -7,7 +7,6 @@ from typing import Literal
 
 import numpy as np
 
-from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.detector import MODES
@@ -15,7 +14,7 @@ from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.statistics.cells import PLAIN, Cells, fine_histograms
-from mars_lidar.statistics.chain import PhaseChain
+from mars_lidar.statistics.chain import PhaseChain, Rearm
 from mars_lidar.statistics.electronics import ELECTRONICS_MODES, moments, stationary_records
 from mars_lidar.statistics.exposure import normalised, refined_moments, stationary_histogram
 from mars_lidar.statistics.paralyzable import paralyzable_histograms
@@ -88,10 +87,10 @@ def mean_histogram(
     return mean_histograms(cells, tolerance, threads).reshape(*cells.shape, system.bins)
 
 
-def histogram_effects(system: object) -> tuple[str, ...]:
+def histogram_effects(system: System) -> tuple[str, ...]:
     """Effects of the detector that the mean histogram treats in the mode of `system`."""
-    able = isinstance(system, System) and system.detector.mode in ELECTRONICS_MODES
-    return (*LIGHT_EFFECTS, *(("electronics_dead_time_ns",) if able else ()), *TIMING_EFFECTS)
+    slow = ("electronics_dead_time_ns",) if system.detector.mode in ELECTRONICS_MODES else ()
+    return (*LIGHT_EFFECTS, *slow, *TIMING_EFFECTS)
 
 
 def mean_histograms(cells: Cells, tolerance: float, threads: int | None) -> FloatArray:
@@ -120,8 +119,6 @@ def _registrations(cells: Cells, bins: int, tolerance: float, threads: int | Non
 
 # --- Shape ---------------------------------------------------------------------------------------------------------
 
-_SHAPES = ("exposure", "stationary", "chain")
-
 
 @checked
 def registration_pdf(
@@ -129,7 +126,7 @@ def registration_pdf(
     system: System,
     method: Literal["exposure", "stationary", "chain"] = "exposure",
     *,
-    rearm: Literal["centre", "edge"] | None = None,
+    rearm: Rearm | None = None,
     tolerance: float = 1e-4,
     threads: int | None = None,
 ) -> FloatArray:
@@ -178,7 +175,6 @@ def registration_pdf(
     >>> pdf.shape
     (128,)
     """
-    checks.choice("method", method, _SHAPES)
     edge = rearm_of(rearm, method == "chain", f"method {method!r}")
     cells = Cells.of_flux(
         flux,
@@ -201,23 +197,21 @@ def registration_pdf(
     return normalised(shape).reshape(*cells.shape, system.bins)
 
 
-def rearm_of(rearm: str | None, used: bool, by: str) -> Literal["centre", "edge"]:
-    """The checked argument `rearm`, which must be None unless the chain is `used`."""
-    if rearm is None:
-        return "centre"
-    if not used:
+def rearm_of(rearm: Rearm | None, used: bool, by: str) -> Rearm:
+    """The argument `rearm`, which must be None unless the chain is `used`."""
+    if rearm is not None and not used:
         raise ValueError(f"rearm must be None for {by}, which has no such choice, got {rearm!r}")
-    return "edge" if checks.choice("rearm", rearm, ("centre", "edge")) == "edge" else "centre"
+    return rearm or "centre"
 
 
-def chain_of(cells: Cells, k: int, edge: Literal["centre", "edge"] = "centre") -> PhaseChain | None:
+def chain_of(cells: Cells, k: int, edge: Rearm = "centre") -> PhaseChain | None:
     """The chain of one cell; None where there is no flux."""
     if cells.signal[k] + cells.background[k] == 0.0:
         return None
     return PhaseChain.from_flux(cells.flux(k), cells.system, rearm=edge)
 
 
-def _chain_shapes(cells: Cells, edge: Literal["centre", "edge"]) -> FloatArray:
+def _chain_shapes(cells: Cells, edge: Rearm) -> FloatArray:
     """Registrations per period (cells, bins), by the chain on its grid, summed into histogram bins."""
     bins = cells.system.bins
     out = np.zeros((cells.size, bins))

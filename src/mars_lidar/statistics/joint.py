@@ -33,9 +33,9 @@ from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.statistics.cells import Cells, light_before, meets_itself, misplaced, one_pixel, registered_before
+from mars_lidar.statistics.chain import ConvergenceError
 from mars_lidar.statistics.exposure import recorded_light
 from mars_lidar.statistics.joint_grid import FoldedGrid
-from mars_lidar.statistics.phase_chain import ConvergenceError
 from mars_lidar.statistics.timing import Timing, is_timed
 from mars_lidar.statistics.tolerances import LAW, TOL, advice
 
@@ -48,9 +48,10 @@ INSTEAD = advice("exposure_moments (count and mean histogram)")
 class Windows:
     """Terms of the covariances of m windows; arrays (m, ...), made by `SettledLaw.windows`.
 
-    `y`: transposed solution (m, 2 n). `noise`: half of its noise plus that of its change at the end (m, 2 n).
-    `after_end`: effect after the end of registrations before it (5.6); `spread`: the same times the second moments of
-    the registrations. `step`, `first`, `edge`, `expected`: contributions of whole periods and of the oldest bin.
+    `y`: transposed solution (m, 2 n). `noise`: covariance of the noise times half of `y`, and times the change of `y`
+    at the end of the exposure (m, 2 n). `after_end`: effect beyond the end of the registrations before it (5.6);
+    `spread`: the same times the second moments of the registrations. `step`, `first`, `edge`, `expected`: contributions
+    of whole periods and of the oldest bin.
     """
 
     y: FloatArray
@@ -175,7 +176,6 @@ class Pixel:
     """One pixel on one grid, windows on `out` bins: by the closed form, or by running through all periods."""
 
     def __init__(self, cells: Cells, bins: int, out: int) -> None:
-
         cells.check_history(bins)
         self.cells, self.out = cells, out
         self._monitored: tuple[FloatArray, FloatArray] | None = None
@@ -246,7 +246,6 @@ class Pixel:
 
     def _columns(self, weights: FloatArray) -> FloatArray:
         """(m, out) covariances of windows with every bin (6.1)-(6.4)."""
-
         grid = self.grid
         columns = np.empty(weights.shape)
         _core.joint_exposure(

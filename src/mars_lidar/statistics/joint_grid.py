@@ -18,7 +18,7 @@ from mars_lidar._base.cached import cached_property
 from mars_lidar._base.native import _core
 from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics.cells import Cells, whole_bins
-from mars_lidar.statistics.phase_chain import ConvergenceError
+from mars_lidar.statistics.chain import ConvergenceError
 from mars_lidar.statistics.tolerances import TOL
 
 if TYPE_CHECKING:
@@ -157,7 +157,7 @@ class FoldedGrid:
     direct
         Whether the equation is solved by sparse factors, because sweeps did not converge.
     unproven
-        Transposed solutions by sweeps whose residual has yet to be checked; later ones are of the same kind.
+        Number of the next transposed solutions by sweeps whose residual is checked; later ones are of the same kind.
     """
 
     whole: int
@@ -251,7 +251,7 @@ class FoldedGrid:
 
     @cached_property
     def _flat(self) -> tuple[FloatArray, float]:
-        """(2, n) and its total worth: the transposed solution for a window of ones."""
+        """The transposed solution (2, n) for a window of ones, and its total worth."""
         y = self._adjoint(np.ones((1, self.bins)), None, TOL.folded_change)[0]
         return y, float(self.worth(y).sum())
 
@@ -271,7 +271,6 @@ class FoldedGrid:
         return y
 
     def _forward(self, source: FloatArray) -> FloatArray:
-
         source = np.ascontiguousarray(source)
         if not self.direct:
             out = np.empty((self.bins, 2))
@@ -298,7 +297,6 @@ class FoldedGrid:
         return x
 
     def _adjoint(self, mass: FloatArray, moment: FloatArray | None, tolerance: float) -> FloatArray:
-
         m, n = mass.shape
         y = np.zeros((m, 2, n))
         mass = np.ascontiguousarray(mass)

@@ -55,7 +55,6 @@ def matched_pmf(cumulants: ArrayLike, *, threads: int | None = None) -> list[Pmf
         )
     start = np.concatenate([[0], np.cumsum(size)])
     flat = np.empty(int(start[-1]))
-
     _core.matched_pmf(cumulants=given, first=first, start=start, out=flat, threads=team)
     return [Pmf(int(first[k]), flat[start[k] : start[k + 1]].copy(), TOL.matched_outside) for k in range(first.size)]
 
@@ -83,7 +82,6 @@ def matched_counts(cumulants: ArrayLike, uniform: ArrayLike, *, threads: int | N
         raise ValueError(f"uniform must be of shape ({given.shape[0]}, draws), got {u.shape}")
     if not ((u > 0.0) & (u < 1.0)).all():
         raise ValueError(f"uniform must be in (0, 1), got {u[~((u > 0.0) & (u < 1.0))][0]:g}")
-
     out = np.empty(u.shape, np.int64)
     _core.matched_draw(cumulants=given, uniform=u, out=out, threads=team)
     return out

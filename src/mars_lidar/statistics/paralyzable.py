@@ -18,8 +18,8 @@ from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.statistics.cells import Cells, knots, photons_before
+from mars_lidar.statistics.chain import ConvergenceError
 from mars_lidar.statistics.exposure import Moments
-from mars_lidar.statistics.phase_chain import ConvergenceError
 from mars_lidar.statistics.tolerances import TOL
 
 
@@ -100,21 +100,17 @@ def _refined(cells: Cells, tolerance: float, *, with_variance: bool) -> Moments:
     histogram = np.empty((cells.size, system.bins))
     for k in range(cells.size):
         cell = cells.part(slice(k, k + 1))
-        n = cell.usual_bins(system.bins)
-        usual = n
-        if (
-            n // 2 < system.bins
-        ):  # every grid includes the edges of the histogram: with no further edges two grids would be equal
-            n *= 2
-        start = n
+        usual = cell.usual_bins(system.bins)
+        # every grid includes the edges of the histogram: with no further edges two grids would be equal
+        n = start = 2 * usual if usual // 2 < system.bins else usual
         coarse, before = _Grid(cell, n // 2, knots(cell, usual, 0.5), with_variance), math.inf
         while True:
             fine = _Grid(cell, n, knots(cell, usual, n / start), with_variance)
             limit = fine.mean + (fine.mean - coarse.mean) / 3.0  # the error is quadratic in the bin width
-            still = with_variance or abs(limit - before) <= max(
+            same_limit = with_variance or abs(limit - before) <= max(
                 10.0 * tolerance * min(limit, TOL.least_spread * math.sqrt(limit)), TOL.rounding * limit
             )
-            if still and _moved(coarse, fine) <= tolerance:
+            if same_limit and _moved(coarse, fine) <= tolerance:
                 break
             coarse, before, n = fine, limit, 2 * n
             if n > max(TOL.most_bins, 4 * system.bins):

@@ -1,66 +1,20 @@
-"""Markov-renewal theory of the count: holding times, their covariances, and the Gaussian count law of MaRS.
+"""Markov-renewal theory of the count: holding times of a `PhaseChain` and their covariances, in laser periods.
 
-Equation numbers refer to docs/theory.md, section 3. Inner functions work on a `PhaseChain`, in laser periods;
-`mars_moments` takes the flux and the system.
+Equation numbers refer to docs/theory.md, section 3. `count_law` of method "mars" is the Gaussian that follows (3.11).
 """
 
 from __future__ import annotations
 
-import math
 import warnings
 from dataclasses import dataclass
 
 import numpy as np
 
-from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.display import brief
 from mars_lidar._base.types import FloatArray
-from mars_lidar.instrument.system import System
-from mars_lidar.light.flux import Flux
-from mars_lidar.statistics.cells import cell_name, default_bins, photons_per_bin, require_mode
-from mars_lidar.statistics.chain import PhaseChain, Rearm, Stationary, stationary_from
-from mars_lidar.statistics.phase_chain import cyclic_recursion
+from mars_lidar.statistics.chain import PhaseChain, Stationary, cyclic_recursion, stationary_from
 from mars_lidar.statistics.tolerances import TOL
-
-
-@dataclass(frozen=True, eq=False)
-class MomentMatrices:
-    """Moments of the holding time W given the step i -> j, dense (n, n), in periods (3.1-3.3).
-
-    `mean` mu_ij and `variance` sigma_ij^2 of W; `q_mu` = P.mean, `q_mu2` = P.mean.mean and
-    `q_s2` = P.variance, element by element.
-
-    Attributes
-    ----------
-    mean, variance
-        (n, n) mean mu_ij and variance sigma_ij^2 of the holding time, laser periods and their squares.
-    q_mu, q_mu2, q_s2
-        (n, n) P.mean, P.mean.mean and P.variance, element by element, with P the transition matrix.
-
-    See Also
-    --------
-    moment_matrices, holding_times
-
-    Examples
-    --------
-    >>> import mars_lidar as ml
-    >>> system = ml.System(
-    ...     period_ns=100.0, cycles=1000, bins=128,
-    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
-    ... )
-    >>> chain = ml.statistics.PhaseChain.from_flux(ml.Flux(1.0, 1.0, 40.0), system, bins=128)
-    >>> ml.statistics.moment_matrices(chain).mean.shape
-    (128, 128)
-    """
-
-    mean: FloatArray
-    variance: FloatArray
-    q_mu: FloatArray
-    q_mu2: FloatArray
-    q_s2: FloatArray
-
-    __repr__ = brief
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,64 +71,6 @@ class HoldingTimes:
     defect: float
 
     __repr__ = brief
-
-
-@checked
-def moment_matrices(chain: PhaseChain) -> MomentMatrices:
-    """Dense moments of the holding time, for studies and tests: O(n^2) memory, n at most 8192.
-
-    Parameters
-    ----------
-    chain
-        The chain of one pixel, of n <= 8192 bins.
-
-    Returns
-    -------
-    MomentMatrices
-
-    Raises
-    ------
-    TypeError
-        No `PhaseChain`.
-    ValueError
-        A chain of more bins, whose matrices would not fit.
-
-    See Also
-    --------
-    holding_times, MomentMatrices
-
-    Examples
-    --------
-    >>> import mars_lidar as ml
-    >>> system = ml.System(
-    ...     period_ns=100.0, cycles=1000, bins=128,
-    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
-    ... )
-    >>> chain = ml.statistics.PhaseChain.from_flux(ml.Flux(1.0, 1.0, 40.0), system, bins=128)
-    >>> dense = ml.statistics.moment_matrices(chain)
-    >>> bool(abs(dense.q_mu.sum(1) - ml.statistics.holding_times(chain).mean).max() < 1e-9)
-    True
-    """
-    n = chain.bins
-    if n > TOL.dense_bins:
-        raise ValueError(f"bins must be at most {TOL.dense_bins} for dense matrices, got {n}")
-    matrix = chain.dense()
-    j = np.arange(n)
-    arm = (j + chain.shift) % n
-    ahead = (j[None, :] - arm[:, None]) % n
-    # M and Sigma away from the re-arming bin: a geometric number of further periods (3.1, 3.2)
-    loss, passed = chain.loss, math.exp(-chain.total)
-    mean = (chain.blind_bins + ahead) / n + passed / loss
-    variance = np.full((n, n), passed / loss**2)
-    # the re-arming bin is met once in part, then whole every period (3.3)
-    again = chain.again()
-    there = chain.refire + again
-    with np.errstate(invalid="ignore", divide="ignore"):
-        first = np.where(there > 0, again / loss / there, 0.0)
-        second = np.where(there > 0, again * (1.0 + passed) / loss**2 / there, 0.0)
-    mean[j, arm] = chain.blind_bins / n + first[arm]
-    variance[j, arm] = (second - first**2)[arm]
-    return MomentMatrices(mean, variance, matrix * mean, matrix * mean * mean, matrix * variance)
 
 
 def row_moments(chain: PhaseChain) -> tuple[FloatArray, FloatArray]:
@@ -292,71 +188,3 @@ def holding_times(chain: PhaseChain) -> HoldingTimes:
     for array in (mean, variance, value):
         array.flags.writeable = False
     return HoldingTimes(stationary, mean, variance, mu, sigma_ss2, sigma2, covariance_sum, value, defect)
-
-
-@checked
-def mars_moments(
-    flux: Flux,
-    system: System,
-    *,
-    rearm: Rearm = "centre",
-    bins: int | None = None,
-) -> tuple[FloatArray, FloatArray]:
-    """Mean and variance of the MaRS count law N ~ Normal(t / mu, t sigma^2 / mu^3), t the exposure (3.11).
-
-    The asymptotic law of a long exposure: it depends neither on the start of the exposure nor, except through the
-    grid, on the delay.
-
-    Parameters
-    ----------
-    flux, system
-        The light of pixels of shape (...), and what registers it.
-    rearm
-        ``"centre"``, or ``"edge"`` for the re-arming of Rapp's code.
-    bins
-        As `photons_per_bin`.
-
-    Returns
-    -------
-    tuple
-        mean, variance: arrays (...); 0, 0 where there is no flux.
-
-    Raises
-    ------
-    TypeError
-        No `Flux` or no `System`.
-    ValueError
-        `rearm` or `bins` out of range; a detector of another mode than ``"nonparalyzable"``, or with effects that the
-        chain does not describe.
-    ConvergenceError
-        Where a solution did not converge; the message names the cell.
-
-    See Also
-    --------
-    count_law, exposure_moments, holding_times
-
-    Examples
-    --------
-    >>> import mars_lidar as ml
-    >>> system = ml.System(
-    ...     period_ns=100.0, cycles=1000, bins=128,
-    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
-    ... )
-    >>> mean, variance = ml.statistics.mars_moments(ml.Flux(1.0, 1.0, 40.0), system)
-    >>> round(float(mean), 1), round(float(variance), 1)
-    (815.1, 127.3)
-    """
-    require_mode("mars_moments", system)
-    checks.choice("rearm", rearm, ("centre", "edge"))
-    mean, variance = np.zeros(flux.shape), np.zeros(flux.shape)
-    if bins is None and flux.waveform is None:
-        bins = default_bins(system)
-    for index in np.ndindex(flux.shape):
-        photons = photons_per_bin(flux[index], system, bins=bins)
-        if not photons.any():
-            continue
-        cell = cell_name(flux[index], system)
-        times = holding_times(PhaseChain(photons, system.dead_time_periods, rearm, cell))
-        mean[index] = system.cycles / times.mu
-        variance[index] = system.cycles * times.sigma2 / times.mu**3
-    return mean, variance

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics.cells import Cells, photons_before
+from mars_lidar.statistics.chain import ConvergenceError
 from mars_lidar.statistics.count_pmf import Pmf
-from mars_lidar.statistics.phase_chain import ConvergenceError
 from mars_lidar.statistics.tolerances import LAW, TOL, advice
 
 _INSTEAD = advice("fewer cycles")
@@ -145,15 +145,10 @@ class _Count:
 
     def _reach(self, most: int) -> tuple[int, int]:
         """First and last count of the support, from mean and variance of the time of a registration."""
-        lost = (
-            1.0 - self.armed_register
-        ) / self.armed_register + self.late  # periods per registration beyond its dead time
-        each = self.whole + 1.0 + lost
+        q, late = self.armed_register, self.late
+        each = self.whole + 1.0 + ((1.0 - q) / q + late)  # periods per registration
         mean = self.cycles / each
-        spread = (
-            math.sqrt(mean * ((1.0 - self.armed_register) / self.armed_register**2 + self.late * (1.0 - self.late)))
-            / each
-        )
+        spread = math.sqrt(mean * ((1.0 - q) / q**2 + late * (1.0 - late))) / each
         reach = TOL.synchronous_reach * spread + 10.0 + self.first.size / each
         return max(0, math.floor(mean - reach)), min(most, math.ceil(mean + reach))
 

@@ -97,7 +97,7 @@ class Tolerances:
     knots_per_sigma, longest_pulse
         Grid points per sigma of a pulse; support of a pulse, in sigma, up to which a grid that follows it resolves it.
     warm_periods, least_warm_periods, warm_steps
-        Sweeps towards the stationary state, at most, at least, and times bins; beyond, a sparse equation gives it.
+        Sweeps towards the stationary state: most, least, and most sweeps x bins; beyond, a sparse equation gives it.
     chunk_bytes
         Energies and histograms computed together.
     near_bytes, middle_bytes
@@ -108,7 +108,7 @@ class Tolerances:
     cells_of_many, joint_cells_of_many
         Bins of the coarser grids, tried in turn: mean histogram, and joint law.
     few_windows_bins
-        Bins of a grid of the joint law beyond which fewer windows are compared: a window takes long.
+        Bins of a grid of the joint law beyond which fewer windows are compared, because each takes long.
     block
         Cells, windows or bins of a matrix product computed together.
     sampled_delays
@@ -122,8 +122,8 @@ class Tolerances:
     lanes
         Points of the circle that the native core evaluates together.
     near_transform_bytes, far_transform_bytes, far_transform, period_bins
-        History of these points beyond which a step costs `far_transform` times as much, as for a dead time below one
-        bin, and six times that; bins that take as long as the work done once a period.
+        History of these points beyond which a step costs `far_transform` times as much (so does any step where the dead
+        time is below one bin), and beyond which it costs six times that; work done once a period, in bins.
     most_tilt, most_log_growth
         Largest exponential tilt per count, and logarithm of E e^(theta N) of one period: the largest double is e^709.
     consistent, consistent_per_cycle
@@ -148,7 +148,7 @@ class Tolerances:
     blas_thread
         Multiplications of a matrix product that BLAS libraries do on one thread.
     record_block
-        Multiplications that take as long as the overhead of a block of records.
+        Overhead of a block of records, in multiplications.
     records_repeat
         As `repeats`, behind electronics.
     records
@@ -156,25 +156,25 @@ class Tolerances:
     direct_bins
         Bins up to which the stationary equations of records are solved directly.
     record_turns, record_stands
-        Power iterations for them, and their total variation per iteration, relative to 1 - contraction, at the end.
+        Most power iterations for them; total variation of the last one, relative to 1 - contraction.
     like_moments
         Allowed disagreement of a pmf of records with mean and variance, in units of the tolerance.
     rate_steps, light_steps
-        Cost of the rates of a paralyzable bin, at most, and of the light of another, in steps of the recursion.
+        Cost of a bin in steps of the recursion: of the rates of a paralyzable pixel, at most; of the light of others.
     folded_factored
         Bins of a feedback equation of the joint law that is factorised: a second.
     folded_residual, folded_change, folded_sweeps, folded_checked
-        Its relative residual; change per sweep relative to the largest value; sweeps, beyond which a factorisation is
-        faster; windows of a block whose residual is checked.
+        Relative residual of this equation; change per sweep relative to the largest value; sweeps beyond which a
+        factorisation is faster; windows of a block whose residual is checked.
     chain_sweeps, chain_krylov
         Gauss-Seidel sweeps of the phase chain before GMRES, and the dimension of the Krylov space.
     chain_change, chain_residual, chain_worst_residual
         Relative change per sweep; backward error that ends an iteration (rounding alone gives 1e-16 to 1e-14); largest
         one of a solution.
     holding_times
-        Independent routes to a moment of the holding times may differ by this much, relative to its largest term.
-    dense_bins, eigen_bins
-        Bins of dense matrices (512 MiB each), and of an eigen-decomposition, O(n^3).
+        Allowed difference of a moment of the holding times by independent routes, relative to its largest term.
+    eigen_bins
+        Bins of an eigen-decomposition, O(n^3).
     most_lags, most_modes
         Lags of a covariance, an O(n) product each; eigenvalues that the automatic rule considers.
     most_mean, matched_outside
@@ -269,7 +269,6 @@ class Tolerances:
     chain_residual: float = 1e-12
     chain_worst_residual: float = 1e-10
     holding_times: float = 1e-7
-    dense_bins: int = 8192
     eigen_bins: int = 4096
     most_lags: int = 100_000
     most_modes: int = 12

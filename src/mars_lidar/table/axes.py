@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.types import FloatArray
-from mars_lidar.light.tolerances import TOL
-from mars_lidar.table.tolerances import TOLERANCES
+from mars_lidar.light.tolerances import TOL as LIGHT
+from mars_lidar.table.tolerances import TOL
 
 Grid = tuple[float, float, int] | ArrayLike
 
@@ -37,20 +37,22 @@ def axis_values(name: str, grid: Grid) -> FloatArray:
     if isinstance(grid, tuple):
         if len(grid) != 3:
             raise ValueError(f"{name} must be (low, high, points) or an array of values, got {grid!r}")
-        low = checks.real(f"{name}[0]", grid[0], low=0.0, high=TOL.photons, strict_low=True)
-        high = checks.real(f"{name}[1]", grid[1], low=0.0, high=TOL.photons, strict_low=True)
-        points = checks.integer(f"{name}[2]", grid[2], low=2, high=TOLERANCES.points)
+        low = checks.real(f"{name}[0]", grid[0], low=0.0, high=LIGHT.photons, strict_low=True)
+        high = checks.real(f"{name}[1]", grid[1], low=0.0, high=LIGHT.photons, strict_low=True)
+        points = checks.integer(f"{name}[2]", grid[2], low=2, high=TOL.points)
         if not high > low:
             raise ValueError(f"{name} must be (low, high, points) with high > low, got {grid!r}")
         return np.concatenate([[0.0], np.geomspace(low, high, points)])
     values = np.array(checks.numbers(name, checks.unmasked(name, grid)))
     if values.dtype.kind not in "fiu":
         raise TypeError(f"{name} must be (low, high, points) or real numbers, got dtype {values.dtype}")
-    if values.ndim != 1 or not 1 <= values.size <= TOLERANCES.points:
-        raise ValueError(f"{name} must have shape (n,) with n from 1 to {TOLERANCES.points}, got {values.shape}")
+    if values.ndim != 1 or not 1 <= values.size <= TOL.points:
+        raise ValueError(f"{name} must have shape (n,) with n from 1 to {TOL.points}, got {values.shape}")
     values = values.astype(np.float64)
-    if not ((values >= 0) & (values <= TOL.photons)).all() or not (np.diff(values) > 0).all():
-        raise ValueError(f"{name} must be strictly ascending photons per period in [0, {TOL.photons:g}], got {values}")
+    if not ((values >= 0) & (values <= LIGHT.photons)).all() or not (np.diff(values) > 0).all():
+        raise ValueError(
+            f"{name} must be strictly ascending photons per period in [0, {LIGHT.photons:g}], got {values}"
+        )
     return values
 
 

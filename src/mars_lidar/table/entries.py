@@ -22,14 +22,13 @@ from mars_lidar._base.types import FloatArray, IndexArray, Progress
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux, broadcast
 from mars_lidar.statistics.cells import Cells, cell_name, default_bins, flat
-from mars_lidar.statistics.chain import PhaseChain, Rearm
+from mars_lidar.statistics.chain import ConvergenceError, PhaseChain, Rearm
 from mars_lidar.statistics.count_pmf import Pmf, guessed_windows
 from mars_lidar.statistics.exposure import Settled, _run, blank, native_light, normalised, refined_moments
 from mars_lidar.statistics.matched import trusted
-from mars_lidar.statistics.phase_chain import ConvergenceError
 from mars_lidar.statistics.renewal import holding_times
 from mars_lidar.table.axes import thinned
-from mars_lidar.table.tolerances import TOLERANCES
+from mars_lidar.table.tolerances import TOL
 
 # --- Entries by the exact recursion --------------------------------------------------------------------------------
 
@@ -89,7 +88,7 @@ class Entries:
             return self.shape
         out = np.empty_like(self.shape)
         part = cycles / self.cycles
-        step = max(1, TOLERANCES.block_bytes // (8 * self.shape.shape[1]))
+        step = max(1, TOL.block_bytes // (8 * self.shape.shape[1]))
         for start in range(0, len(out), step):
             some = slice(start, start + step)
             # H(n) = u + n (H(N) - u) / N
@@ -125,7 +124,7 @@ def exposure_entries(
         startup=np.zeros((n, bins), np.float32) if growing else None,
     )
     window = 3 * (int(system.dead_time_periods) + 1)  # periods that the recursion runs on after settling (20)
-    step = max(64, TOLERANCES.block_bytes // (8 * bins))
+    step = max(64, TOL.block_bytes // (8 * bins))
     for start in range(0, n, step):
         some = slice(start, min(start + step, n))
         cells = Cells.of(signal[some], background[some], system)
@@ -187,14 +186,14 @@ class NodeLaws:
         k = int(np.searchsorted(self.row, row))
         if k == self.row.size or self.row[k] != row:
             return None
-        return Pmf(int(self.first[k]), self.pmf[self.offsets[k] : self.offsets[k + 1]], TOLERANCES.negligible)
+        return Pmf(int(self.first[k]), self.pmf[self.offsets[k] : self.offsets[k + 1]], TOL.negligible)
 
 
 def _trimmed(window: Pmf) -> Pmf:
     below = np.cumsum(window.p)
-    some = np.flatnonzero((below > TOLERANCES.negligible) & (below[-1] - below + window.p > TOLERANCES.negligible))
+    some = np.flatnonzero((below > TOL.negligible) & (below[-1] - below + window.p > TOL.negligible))
     low, high = (int(some[0]), int(some[-1]) + 1) if some.size else (0, window.p.size)
-    return Pmf(window.first + low, window.p[low:high], TOLERANCES.negligible)
+    return Pmf(window.first + low, window.p[low:high], TOL.negligible)
 
 
 def node_laws(
@@ -276,7 +275,7 @@ def start_phases(
     """
     if system.dead_time_periods == 0.0:
         return StartPhases.none()  # Poisson: no memory
-    row, column = thinned(signal, TOLERANCES.log_step), thinned(background, TOLERANCES.log_step)
+    row, column = thinned(signal, TOL.log_step), thinned(background, TOL.log_step)
     index = (row[:, None] * background.size + column[None, :]).reshape(-1)
     cells = Cells.of(np.repeat(signal[row], column.size), np.tile(background[column], row.size), system).resolved(1)
     own = bins[index]
@@ -308,7 +307,7 @@ def start_phases(
 
 
 def _few(size: int) -> IndexArray:
-    return np.unique(np.linspace(0, size - 1, TOLERANCES.phase_values).round().astype(np.int64))
+    return np.unique(np.linspace(0, size - 1, TOL.phase_values).round().astype(np.int64))
 
 
 def _phase_grid(cells: Cells, coarsest: int) -> int:
@@ -323,7 +322,7 @@ def _blocks(grids: IndexArray) -> list[tuple[IndexArray, int]]:
     out = []
     for n in np.unique(grids):
         index = np.flatnonzero(grids == n)
-        out += [(index[k : k + TOLERANCES.cells], int(n)) for k in range(0, index.size, TOLERANCES.cells)]
+        out += [(index[k : k + TOL.cells], int(n)) for k in range(0, index.size, TOL.cells)]
     return out
 
 
@@ -359,9 +358,7 @@ def _corrections(cells: Cells, bins: int, phase: FloatArray, threads: int) -> tu
 def _choose(cells: Cells, grids: IndexArray, scale: FloatArray, sample: IndexArray, threads: int) -> FloatArray:
     """Phases between which linear interpolation is good enough for a sample of cells, the worst one first."""
     coarsest = int(grids.min())
-    stride = next(
-        k for k in range(1, coarsest + 1) if coarsest % k == 0 and coarsest // k <= TOLERANCES.phase_candidates
-    )
+    stride = next(k for k in range(1, coarsest + 1) if coarsest % k == 0 and coarsest // k <= TOL.phase_candidates)
     edges = cells.edges(coarsest)[::stride]  # edges of every finer grid as well, whose bins divide these
     coarsest //= stride
     curves = []
@@ -388,7 +385,7 @@ def _choose(cells: Cells, grids: IndexArray, scale: FloatArray, sample: IndexArr
     nodes.sort()
     for begin, end in pairwise(nodes):
         settle(begin, end)
-    while error.max() > TOLERANCES.phase_error and len(nodes) < TOLERANCES.phases:
+    while error.max() > TOL.phase_error and len(nodes) < TOL.phases:
         worst = int(error.argmax())
         place = int(np.searchsorted(nodes, worst))
         begin, end = nodes[place - 1], nodes[place]
@@ -409,7 +406,7 @@ def _replace_if_wrong(
     size = np.abs(correction / scale)
     checked = np.unique(np.concatenate([size.argmax(0), size[:, :2].argmin(0), [phase.size // 2]]))
     exact = _directly(cells, cell, bins, phase[checked], threads)
-    if not (np.abs(exact - correction[checked])[:, :2] / scale[:2]).max() > TOLERANCES.phase_error:
+    if not (np.abs(exact - correction[checked])[:, :2] / scale[:2]).max() > TOL.phase_error:
         return
     correction[:] = _directly(cells, cell, bins, phase, threads)
 
@@ -476,7 +473,7 @@ def renewal_entries(
     shape = np.full((n, system.bins), 1.0 / system.bins, dtype=np.float32)
 
     def block(start: int) -> int:
-        stop = min(start + TOLERANCES.chain_cells, n)
+        stop = min(start + TOL.chain_cells, n)
         for k in range(start, stop):
             photons = signal[k] * energy + background[k] / bins
             if photons.any():
@@ -487,14 +484,14 @@ def renewal_entries(
         return stop - start
 
     with ThreadPoolExecutor(max(1, threads)) as pool:
-        waiting = {pool.submit(block, start) for start in range(0, n, TOLERANCES.chain_cells)}
+        waiting = {pool.submit(block, start) for start in range(0, n, TOL.chain_cells)}
         try:
             while waiting:
                 done, waiting = wait(waiting, timeout=0.2, return_when=FIRST_EXCEPTION)
                 for future in done:
                     future.result()
                 if progress is not None:
-                    progress(n - min(n, TOLERANCES.chain_cells * len(waiting)), n)
+                    progress(n - min(n, TOL.chain_cells * len(waiting)), n)
         except BaseException:  # Ctrl-C as well: what has not begun never does
             pool.shutdown(wait=False, cancel_futures=True)
             raise

@@ -11,7 +11,7 @@ import numpy as np
 
 from mars_lidar._base import checks
 from mars_lidar._base.types import FloatArray
-from mars_lidar.table.tolerances import TOLERANCES
+from mars_lidar.table.tolerances import TOL
 
 # total variation between normal laws that differ a little: 0.399 per standard deviation of the mean, 0.242 per
 # relative change of the variance
@@ -95,7 +95,7 @@ class QuantisationError:
         """
         allowed = checks.real("allowed", allowed, low=0.0, strict_low=True)
         worst = max(self.mean_max, self.delayed_mean_max, 1e-300)
-        return max(1, int(min(self.cycles * (allowed / worst) ** 2, TOLERANCES.cycles)))
+        return max(1, int(min(self.cycles * (allowed / worst) ** 2, TOL.cycles)))
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data."""
@@ -104,7 +104,7 @@ class QuantisationError:
 
 def deviations(cumulants: FloatArray, exact: FloatArray) -> FloatArray:
     """Errors (P, 4) of cumulants in powers of the standard deviation, of at least half a count."""
-    return np.abs(cumulants - exact) / np.maximum(np.sqrt(exact[:, 1:2]), TOLERANCES.least_spread) ** np.arange(1, 5)
+    return np.abs(cumulants - exact) / np.maximum(np.sqrt(exact[:, 1:2]), TOL.least_spread) ** np.arange(1, 5)
 
 
 def law_variation(error: FloatArray) -> FloatArray:

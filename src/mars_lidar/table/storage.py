@@ -1,9 +1,12 @@
-"""Tables in HDF5 files."""
+"""Tables in HDF5 files, and those in the user's cache, under the hash of their request."""
 
 from __future__ import annotations
 
 import hashlib
 import json
+import os
+import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -97,3 +100,42 @@ def compare(path: Path, made_for: System, system: System) -> None:
 def _short(value: Any) -> str:
     text = repr(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+# --- The cache -------------------------------------------------------------------------------------------------------
+
+
+def cache_folder() -> Path:
+    """Folder of the cached tables, which need not exist.
+
+    ``MARS_LIDAR_CACHE``, or ``mars-lidar`` in ``XDG_CACHE_HOME``, or in ``~/.cache``.
+    """
+    given = os.environ.get("MARS_LIDAR_CACHE")
+    if given:
+        return Path(given)
+    base = os.environ.get("XDG_CACHE_HOME")
+    root = Path(base) if base and Path(base).is_absolute() else Path.home() / ".cache"
+    return root / "mars-lidar"
+
+
+def cached_candidates(key: str, cycles: int) -> tuple[Path, list[Path]]:
+    """File of a request for `cycles`, and the existing files of the same request for other numbers of cycles."""
+    folder = cache_folder()
+    own = folder / f"{key}-{cycles}.h5"
+    others = sorted(folder.glob(f"{key}-*.h5")) if folder.is_dir() else []
+    return own, [other for other in others if other != own]
+
+
+def put_into_cache(save: Callable[..., None], own: Path) -> None:
+    """Put a table into the cache by its method `save`."""
+    own.parent.mkdir(parents=True, exist_ok=True)
+    mine = own.with_name(f"{own.stem}-{os.getpid()}.h5")  # several processes may build the same table at once
+    save(mine, overwrite=True)
+    os.replace(mine, own)
+
+
+def cached_tables() -> list[Path]:
+    """Tables in the cache, and unfinished files there."""
+    ours = re.compile(rf"[0-9a-f]{{{KEY_LENGTH}}}-.*\.h5")
+    folder = cache_folder()
+    return sorted(p for p in folder.iterdir() if p.is_file() and ours.match(p.name)) if folder.is_dir() else []

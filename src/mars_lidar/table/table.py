@@ -30,13 +30,12 @@ from mars_lidar._version import __version__
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.statistics.cells import require_mode
-from mars_lidar.statistics.chain import Rearm
+from mars_lidar.statistics.chain import ConvergenceError, Rearm
 from mars_lidar.statistics.count_pmf import Pmf, total_variation
 from mars_lidar.statistics.exposure import exposure_moments, normalised
 from mars_lidar.statistics.law import count_law
 from mars_lidar.statistics.matched import matched_pmf
-from mars_lidar.statistics.phase_chain import ConvergenceError
-from mars_lidar.table import cache, storage
+from mars_lidar.table import storage
 from mars_lidar.table.axes import PAPER_GRID, Grid, axis_values, describe, inserted, midpoints, thinned
 from mars_lidar.table.entries import (
     Entries,
@@ -51,11 +50,9 @@ from mars_lidar.table.entries import (
     start_phases,
 )
 from mars_lidar.table.error import LawError, QuantisationError, deviations, law_variation, random_pixels
-from mars_lidar.table.tolerances import TOLERANCES
+from mars_lidar.table.tolerances import TOL
 
 Interpolation = Literal["bilinear", "nearest"]
-INTERPOLATIONS, OUTSIDE = ("bilinear", "nearest"), ("error", "exact")
-_METHODS, _REARMS = ("exposure", "mars"), ("centre", "edge")
 
 Axes = tuple[FloatArray, FloatArray]
 Evaluate = Callable[[FloatArray, FloatArray], Entries]
@@ -116,6 +113,7 @@ class Table:
     __repr__ = brief
 
     @classmethod
+    @checked
     def build(
         cls,
         system: System,
@@ -164,13 +162,9 @@ class Table:
         ConvergenceError
             Naming the cell that could not be evaluated.
         """
-        if not isinstance(system, System):
-            raise TypeError(f"system must be a System, got {type(system).__name__}")
         require_mode("a table", system)
         system = system.detected()  # its axes are detected photons
         axes = axis_values("signal", signal), axis_values("background", background)
-        checks.choice("method", method, _METHODS)
-        checks.choice("rearm", rearm, _REARMS)
         if rearm != "centre" and method != "mars":
             raise ValueError(f"rearm must be 'centre' for method {method!r}, which has no such choice, got {rearm!r}")
         goal = None if refine is None else checks.real("refine", refine, low=1e-5, high=0.1)
@@ -182,10 +176,10 @@ class Table:
         began = time.perf_counter()
         if goal is None:
             table = _evaluated(system, axes, recipe, progress)
-            error = table.quantisation_error(samples=TOLERANCES.error_pixels, threads=recipe.threads)
+            error = table.quantisation_error(samples=TOL.error_pixels, threads=recipe.threads)
         else:
             table, error = _refined(system, axes, recipe, goal, progress)
-        longest = table._long_error(TOLERANCES.error_pixels, recipe.threads)
+        longest = table._long_error(TOL.error_pixels, recipe.threads)
         law = table.law_error(threads=recipe.threads).to_dict() if check_law else None
         table.provenance.update(
             key=storage.request_key(system, axes, method=method, rearm=rearm, refine=goal, tolerance=tolerance),
@@ -198,6 +192,7 @@ class Table:
         return table
 
     @classmethod
+    @checked
     def cached(
         cls,
         system: System,
@@ -214,7 +209,7 @@ class Table:
         if existing is None:
             table = cls.build(system.detected(), signal, background, **options)
             try:
-                cache.keep(table.save, own)
+                storage.put_into_cache(table.save, own)
             except OSError as error:
                 warnings.warn(
                     f"the table cannot be kept in {own.parent} ({reason(error)}) and will be built again the next "
@@ -226,6 +221,7 @@ class Table:
         return cls.load(existing or own, system)
 
     @classmethod
+    @checked
     def cached_path(cls, system: System, signal: Grid, background: Grid, **options: Any) -> Path:
         """File of the table in the cache; built and put there where it is not.
 
@@ -234,7 +230,7 @@ class Table:
         """
         own, existing = cls._search(system, signal, background, options)
         if existing is None:
-            cache.keep(cls.build(system.detected(), signal, background, **options).save, own)
+            storage.put_into_cache(cls.build(system.detected(), signal, background, **options).save, own)
         return existing or own
 
     @classmethod
@@ -242,8 +238,6 @@ class Table:
         cls, system: System, signal: Grid, background: Grid, options: dict[str, Any]
     ) -> tuple[Path, Path | None]:
         """Path of the table in the cache, and the existing file that can be used instead, or None."""
-        if not isinstance(system, System):
-            raise TypeError(f"system must be a System, got {type(system).__name__}")
         system = system.detected()
         chosen = {"method": "exposure", "rearm": "centre", "refine": None, "tolerance": 1e-4} | options
         unknown = set(chosen) - {"method", "rearm", "refine", "tolerance", "check_law", "threads", "progress"}
@@ -251,7 +245,7 @@ class Table:
             raise TypeError(f"the options are those of Table.build, got {sorted(unknown)[0]!r}")
         axes = axis_values("signal", signal), axis_values("background", background)
         request = {name: chosen[name] for name in ("method", "rearm", "refine", "tolerance")}
-        own, others = cache.candidates(storage.request_key(system, axes, **request), system.cycles)
+        own, others = storage.cached_candidates(storage.request_key(system, axes, **request), system.cycles)
         for path in (own, *others):
             with contextlib.suppress(OSError, ValueError):  # absent, out of reach, damaged, or of too few cycles
                 law = cls.load(path, system).provenance["law"]
@@ -290,8 +284,6 @@ class Table:
             Where the table is of another system, naming the field that differs. Another number of cycles is no
             difference where every entry holds for it.
         """
-        if system is not None and not isinstance(system, System):
-            raise TypeError(f"system must be a System, got {type(system).__name__}")
         with reading(path, "a table of mars-lidar") as source:
             header, arrays = storage.read(source)
             made_for = System.from_json(header["system"])
@@ -358,6 +350,7 @@ class Table:
         light = flux.signal, flux.background, flux.delay_ns
         return self.at(*light, cycles=cycles, interpolation=interpolation, outside=outside, threads=threads)
 
+    @checked
     def at(
         self,
         signal: ArrayLike,
@@ -373,8 +366,6 @@ class Table:
 
         Without delays, at the canonical t_r / 2; `cycles`, `interpolation`, `outside` and `threads` as there.
         """
-        checks.choice("interpolation", interpolation, INTERPOLATIONS)
-        checks.choice("outside", outside, OUTSIDE)
         periods = self._cycles(cycles)
         team = thread_count(threads)
         s, b, phase, beyond = read_pixels(
@@ -444,6 +435,7 @@ class Table:
             f"{self.entries.cycles} cycles, and {why}"
         )
 
+    @checked
     def quantisation_error(
         self,
         *,
@@ -465,7 +457,6 @@ class Table:
         threads
             Threads to run on; default: all processors that this process may use.
         """
-        checks.choice("interpolation", interpolation, INTERPOLATIONS)
         samples = checks.integer("samples", samples, low=1, high=1_000_000)
         rng = np.random.default_rng(checks.integer("seed", seed, low=0, high=2**64 - 1))
         periods = self.system.cycles if cycles is None else checks.integer("cycles", cycles, low=1, high=10**8)
@@ -537,10 +528,10 @@ class Table:
 
     def _long_error(self, samples: int, threads: int | None) -> QuantisationError | None:
         """Errors at the longest exposure, 1e8 cycles; None where some entry does not serve it, or has no exact law."""
-        if self.system.cycles != TOLERANCES.cycles and not self.entries.serves(TOLERANCES.cycles).all():
+        if self.system.cycles != TOL.cycles and not self.entries.serves(TOL.cycles).all():
             return None
         try:
-            return self.quantisation_error(samples=samples, cycles=TOLERANCES.cycles, threads=threads)
+            return self.quantisation_error(samples=samples, cycles=TOL.cycles, threads=threads)
         except ConvergenceError:  # the law of a random pixel between the entries, which is much of a locked one
             return None
 
@@ -642,10 +633,10 @@ def _refined(
     system: System, axes: Axes, recipe: Recipe, goal: float, progress: Progress | None
 ) -> tuple[Table, QuantisationError]:
     inner = goal
-    for _ in range(TOLERANCES.attempts):
+    for _ in range(TOL.attempts):
         axes = _refined_axes(*axes, lambda s, b: recipe.entries(s, b, system), inner)
         table = _evaluated(system, axes, recipe, progress)
-        error = table.quantisation_error(samples=4 * TOLERANCES.error_pixels, threads=recipe.threads)
+        error = table.quantisation_error(samples=4 * TOL.error_pixels, threads=recipe.threads)
         if error.largest <= goal:
             return table, error
         inner *= 0.5
@@ -675,7 +666,7 @@ def _refined_axes(
 def _lines(axis: FloatArray) -> FloatArray:
     positive = axis[axis > 0]
     span = np.log(positive[-1] / positive[0]) if positive.size else 0.0
-    some = axis[thinned(axis, max(span / (TOLERANCES.lines - 1), 1e-9))]
+    some = axis[thinned(axis, max(span / (TOL.lines - 1), 1e-9))]
     return some[some > 0] if positive.size else some
 
 
@@ -683,7 +674,7 @@ def _refined_axis(
     axis: FloatArray, along: Callable[[FloatArray], Entries], lines: FloatArray, goal: float
 ) -> FloatArray:
     """One axis. `along` evaluates points x lines; lines are the exact nodes of a table's second axis here."""
-    for _ in range(TOLERANCES.rounds):
+    for _ in range(TOL.rounds):
         if axis.size < 2:
             return axis
         between = midpoints(axis)
@@ -705,11 +696,11 @@ def _refined_axis(
         bad = np.maximum(law, shape).reshape(between.size, lines.size).max(1) > 0.5 * goal
         if not bad.any():
             return axis
-        if axis.size + int(bad.sum()) > TOLERANCES.points:
+        if axis.size + int(bad.sum()) > TOL.points:
             break
         axis = inserted(axis, between[bad])
     raise ValueError(
-        f"refine must be an error that {TOLERANCES.points} points of an axis and {TOLERANCES.rounds} rounds can meet, "
+        f"refine must be an error that {TOL.points} points of an axis and {TOL.rounds} rounds can meet, "
         f"got {goal:g}: "
         f"{axis.size} points in [{axis[0]:g}, {axis[-1]:g}] do not meet it; choose a larger error or a smaller range"
     )

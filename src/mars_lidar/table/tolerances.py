@@ -48,4 +48,4 @@ class Tolerances:
     """Values of an axis."""
 
 
-TOLERANCES = Tolerances()
+TOL = Tolerances()

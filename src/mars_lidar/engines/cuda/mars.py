@@ -132,7 +132,7 @@ class _Launches:
             if refused:
                 self.reader.table._refuse(self.cycles)
             if doubted:
-                self._mend(pixels, np.flatnonzero(machine.host(self.arrays["doubted"])))
+                self._use_exact_laws(pixels, np.flatnonzero(machine.host(self.arrays["doubted"])))
 
     def _light(self, pixels: IndexArray) -> tuple[NDArray[np.float64], ...]:
         single = single_return(self.task.flux)
@@ -140,7 +140,7 @@ class _Launches:
         background = np.ascontiguousarray(self.task.flux.background.reshape(-1)[pixels])
         return single[0][pixels], background, single[1][pixels]
 
-    def _mend(self, pixels: IndexArray, doubted: IndexArray) -> None:
+    def _use_exact_laws(self, pixels: IndexArray, doubted: IndexArray) -> None:
         """Exact laws for pixels whose cumulants do not fix them, from the table or evaluated by the processor."""
         run = Run(self.task, np.empty((0, 0)))
         entries, _ = self.reader.read(self.task, pixels[doubted])

@@ -14,11 +14,11 @@ from mars_lidar._base import checks
 from mars_lidar._base.files import (
     IncompleteFileError,
     beside,
+    check_finished,
     check_target,
     finished_name,
     open_npz,
     reading,
-    unfinished_of,
 )
 from mars_lidar.io.streams.photons import BEFORE_PTU, FORMAT, Photons, attributes, from_attributes
 from mars_lidar.light.timestamps import Timestamps
@@ -92,10 +92,7 @@ def load(
         raise ValueError(
             f"unit_ns and variable are for .mat, .npz and text: a {plain.suffix} tells both, got {str(path)!r}"
         )
-    if not source.exists():
-        if leftovers := unfinished_of(source):
-            raise IncompleteFileError(f"{source} was never finished: a stopped run left {leftovers[0]}")
-        raise FileNotFoundError(f"{source} does not exist")
+    check_finished(source)
     if plain != source:
         raise IncompleteFileError(f"{source} is incomplete: a run that was stopped left it")
     with reading(source, "a photon stream"):

@@ -193,7 +193,8 @@ def comparison(result: Comparison) -> Figure:
 
     with style():
         figure = Figure(figsize=(13.0, 6.0), dpi=DPI, layout="constrained")
-        upper, lower = figure.subfigures(2, 1)
+        halves: Any = figure.subfigures(2, 1)
+        upper, lower = halves
         _draw_maps(list(upper.subplots(1, 1 + len(result.engines), squeeze=False).flat), result)
         for ax, (quantity, title) in zip(lower.subplots(1, len(_PANELS)), _PANELS.items(), strict=True):
             _draw_points(ax, result, quantity)

@@ -7,10 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
+from benchmarks.machine import load
 from mars_lidar.plot.style import COLOURS, INK, MUTED
 from studies import Facts, Request
 from studies.common.draw import legend_below, panels
-from studies.common.report import Row, load
+from studies.common.report import Row
 from studies.common.sample import PERIOD_NS
 from studies.runtime.timing import (
     DEAD_TIME_NS,

@@ -93,14 +93,14 @@ def _models(bins: int, config: Config) -> Cases:
 
 
 def _coarse(bins: int, config: Config) -> Cases:
-    """The likelihood where bins are cut, beside its plain form: by the width of a bin, and re-armed in the pulse."""
+    """The likelihood by the width of a bin, and re-armed in the pulse."""
     random = np.random.default_rng(0)
     at = [torch.from_numpy(values) for values in _light(random, _MANY, 100.0)]
     counts = torch.from_numpy(random.poisson(30.0, (_MANY, bins)).astype(float))
     cases: Cases = {}
     again, twice = ", re-armed in the pulse", ", re-armed after two dead times"
     for sigmas, dead, words in (
-        (0.34, 50.0, " (not cut)"),
+        (0.34, 50.0, ""),
         *((wide, dead, words) for wide in (1.0, 3.0) for dead, words in ((75.0, ""), (99.0, again), (51.0, twice))),
     ):
         system = ml.System(

@@ -23,7 +23,8 @@ PARTS = {path.name for path in PACKAGE.iterdir() if (path / "__init__.py").is_fi
 
 DOTTED = re.compile(r"[A-Za-z_]\w*(?:\.[A-Za-z_]\w*)+(?=\(|$)")
 SOURCE = re.compile(r"[\w./-]+\.(?:py|h|cpp|cu|js|md|html|jinja)")
-DATA = re.compile(r"[\w./-]+\.(?:csv|h5|incomplete|jpg|json|lock|mat|npz|pdf|pfm|png|sha256|toml|txt|xxh128|yaml|zarr)")
+SUFFIXES = "csv|h5|incomplete|jpg|json|lock|mat|npz|pdf|pfm|png|pth|sha256|toml|txt|xxh128|yaml|zarr"
+DATA = re.compile(rf"[\w./-]+\.(?:{SUFFIXES})")
 
 # What names in the text's own examples are; and roots of names that are not this package's.
 EXAMPLES = {"cube": "Cube", "flux": "Flux", "stream": "CubeStream", "system": "System", "table": "Table"}

@@ -69,12 +69,30 @@ def bias(case: Case) -> np.ndarray:
     return (torch.linalg.solve(curvature, score)).numpy() / case.bound
 
 
+def cut_off(case: Case) -> bool:
+    """Whether less than one pass of the pulse is expected to end without registration, in an exposure that began armed.
+
+    Then it matters which registrations the end of the exposure cuts off, which a histogram does not say.
+    """
+    passes = float(ml.mean_histogram(ml.Flux(*case.light), case.system).sum())  # no more than registrations and these
+    return case.system.start == "armed" and passes * np.exp(-case.light[0]) < 1.0
+
+
 @pytest.mark.nightly
-@pytest.mark.parametrize("first", range(0, 200, 20))
+@pytest.mark.parametrize("first", [*range(0, 200, 20), *range(1000, 1200, 20)])
 def test_bias_of_random_systems(first):
+    """The settings were chosen with the first 200, and the last 200 were looked at afterwards."""
     for number in range(first, first + 20):
-        worst = float(np.abs(bias(drawn(number))).max())
-        assert worst < 0.1, (number, drawn(number), worst)
+        case = drawn(number)
+        if not cut_off(case):
+            worst = float(np.abs(bias(case)).max())
+            assert worst < 0.1, (number, case, worst)
+
+
+@pytest.mark.parametrize("number", [12, 74, 149, 203, 390, 1033])
+def test_bias_of_the_worst_of_600_systems(number):
+    """Bins of 2 sigma after three dead times, dead times within a cell, a nearly locked pixel, and others."""
+    assert np.abs(bias(drawn(number))).max() < 0.06
 
 
 @pytest.mark.full
@@ -119,7 +137,7 @@ def test_the_fit_of_the_page_ends_where_reconstruct_does():
 @pytest.mark.full
 @pytest.mark.parametrize(("sigma", "dead"), [(3.0, 42.3), (1.7, 42.3), (4.0, 97.0), (4.0, 0.7), (4.0, 103.0)])
 def test_gradient_in_bins_that_are_cut(sigma, dead):
-    """Of 5 ns: beside differences, to 1e-6 of the largest."""
+    """Of 5 ns: beside differences, to 1e-6 of the largest; and what is refused."""
     system = ml.System(
         period_ns=100.0,
         cycles=500,
@@ -140,3 +158,9 @@ def test_gradient_in_bins_that_are_cut(sigma, dead):
     for mode in (torch.func.grad, torch.func.jacrev, torch.func.jacfwd):
         slope = mode(value)(at)
         assert float((slope - central).abs().max()) < 1e-6 * float(central.abs().max())
+    with pytest.raises(ValueError, match="first and second derivatives only"):
+        torch.func.jacrev(torch.func.hessian(value))(at)
+    with pytest.raises(ValueError, match="forward mode within forward mode"):
+        torch.func.jacfwd(torch.func.jacfwd(value))(at)
+    with pytest.raises(ValueError, match="no derivatives with respect to the histogram"):
+        histogram_log_likelihood(counts.requires_grad_(), at[0], at[1], at[2], system)

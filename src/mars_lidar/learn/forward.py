@@ -528,7 +528,7 @@ def expected_histogram(
     (815, 167)
     """
     check_detector(system, light=True)
-    _refuse_nested_forward()
+    refuse_nested_forward("expected_histogram")
     given = alike(signal, background, delay_ns)
     given[0], given[1], system = detected(given[0], given[1], system)
     if given[0].numel() == 0:
@@ -622,13 +622,13 @@ def _registered(rows: Any, system: System, parts: int, known: Any = (None, None)
     return _summed(fine, parts).to(rows[0].dtype), settled, more
 
 
-def _refuse_nested_forward() -> None:
+def refuse_nested_forward(name: str) -> None:
     """Raise within two transforms of forward mode: through a function of one's own PyTorch then gives zeros."""
     functorch = torch._C._functorch
     levels = functorch.get_interpreter_stack() or []
     if sum(level.key() == functorch.TransformType.Jvp for level in levels) > 1:
         raise ValueError(
-            "expected_histogram cannot be differentiated by forward mode within forward mode: for second derivatives "
+            f"{name} cannot be differentiated by forward mode within forward mode: for second derivatives "
             "use torch.func.hessian, or jacrev or grad inside of jvp or jacfwd"
         )
 

@@ -34,14 +34,16 @@ class Tolerances:
     """Pixels x bins evaluated together: 2 MiB."""
 
     # likelihood: bins that are cut (bias: docs/learn.md and tests/learn/test_likelihood.py)
-    part: float = 0.35
-    """Widths of the pulse in which light and registrations pass for linear."""
-    steepest: float = 2.0
-    """Slope over a part, relative to the mean, at which light is 0 at one end."""
-    darkest: float = 600.0
-    """Photons in a bin beyond which no pixel stays armed through it: exp(700) overflows."""
+    even: float = 0.1
+    """Widths of the pulse in a bin in which light and registrations pass for even."""
+    part: float = 0.5
+    """Widths of the pulse in a cell of wider bins; half as many in the second of the two that are extrapolated."""
     reach: float = 5.0
     """Sigma of a Gaussian pulse on each side: beyond it there is 6e-7 of its light."""
+    rounds: int = 60
+    """In which registrations are distributed over cells that depend on each other."""
+    settled: float = 1e-10
+    """Change of the registrations of a cell, relative to the cycles, at which the rounds end."""
 
     # streams
     zero_photons: float = 0.2

@@ -618,8 +618,8 @@ ImagePlaneFeatures ImageSolver::plane_features(int64_t first, int64_t last, cons
         add(0.5f * std::log(chosen_.mass[p] + 1e-3f));
         add(0.5f * std::log(std::max(chosen_.confidence[p], 0.0f) + 1e-3f));
         add(std::log(background_near(p)));
-        add(clipped(number - std::max(of[kImageMoments + 5], static_cast<float>(kLeastLight)) *
-                                 static_cast<float>(efficiency(p)),
+        // photons beyond those that the smallest but one of the windows leads to expect while the pixel is armed
+        add(clipped(number - std::max(of[kImageMoments + 5], static_cast<float>(kLeastLight)) * seen_.exposure[p],
                     -10.0f, 10.0f));
         add(0.5f * std::log(clipped(1.0f - chosen_.broad[p], 1e-3f, 1.0f)));
         add(finer);

@@ -75,6 +75,7 @@ void bind_feedback(nb::module_& module);
 void bind_packing(nb::module_& module);
 void bind_corrected_rates(nb::module_& module);
 void bind_maximum_likelihood(nb::module_& module);
+void bind_coarse_likelihood(nb::module_& module);
 void bind_calibration(nb::module_& module);
 void bind_image(nb::module_& module);
 

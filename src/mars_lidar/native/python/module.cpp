@@ -24,6 +24,7 @@ NB_MODULE(_core, module) {
     mars::bind_packing(module);
     mars::bind_corrected_rates(module);
     mars::bind_maximum_likelihood(module);
+    mars::bind_coarse_likelihood(module);
     mars::bind_calibration(module);
     mars::bind_image(module);
 }

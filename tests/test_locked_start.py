@@ -48,6 +48,30 @@ def test_the_sequential_engine_begins_in_any_phase_of_a_slow_drift():
     check(ENGINES["sequential"], case, Law(histogram, pmf), {COUNTS})
 
 
+@pytest.mark.parametrize("signal", [3.0, 160.0])
+def test_a_state_that_depends_on_the_switching_on_is_refused(signal: float):
+    """Two peaks, and a dead time that ends shortly before the one that was registered: a bright pixel stays with it."""
+    samples = np.zeros(256)
+    samples[:8] = samples[200:208] = 1.0
+    system = ml.System(
+        period_ns=PERIOD_NS,
+        cycles=50,
+        bins=64,
+        pulse=ml.SampledPulse(samples, 0.1, "first"),
+        start="stationary",
+        detector=ml.Detector(dead_time_ns=4.964 * PERIOD_NS),
+    )
+    flux = ml.Flux(signal, 0.1, 7.0)
+    if signal < 10.0:  # it changes between the peaks every few registrations
+        drawn = ml.simulate(flux, system, realizations=4000, seed=5)[:, 0, 0].mean(0)
+        law = ml.mean_histogram(flux, system)
+        assert np.abs(drawn - law).max() < 5.0 * np.sqrt(law.max() / 4000)
+        return
+    with pytest.raises(RuntimeError, match=r"depends on when the detector was switched on.*start='armed'"):
+        ml.simulate(flux, system, seed=5)
+    assert ml.simulate(flux, system.replace(start="armed"), seed=5).sum() > 0
+
+
 @pytest.mark.parametrize("light", ["pulses", "waveforms"])
 def test_pixels_of_one_light_share_the_state_that_they_start_in(light: str):
     """In any order among others, with the bits that each has alone."""

@@ -1,10 +1,9 @@
-// Registrations of a paralyzable pixel on the grid of the native recursion, as statistics/paralyzable_rate.py has them
+// Registrations of a paralyzable pixel on the grid of the native recursion, as statistics/exposure.py has them
 // (docs/theory_detectors.md, (1) and (17)).
 import { PARTS, differences, edgesOf, photonsBefore } from "./light.js";
 
 const ORDERS = 4;
-const NODES = [-0.8611363115940526, -0.33998104358485626, 0.33998104358485626, 0.8611363115940526];
-const WEIGHTS = [0.34785484513745385, 0.6521451548625461, 0.6521451548625461, 0.34785484513745385];
+const SERIES_BELOW = 0.25, SERIES_TERMS = 10; // of the exponent: the recursion loses 4 digits there, the series none
 
 /** Integrals of r(t) x^m over each bin, by kinds: steady, and for an armed start the first period and the K-th. */
 export function registrationRates(native, system, pixel, bins) {
@@ -26,16 +25,30 @@ function moments(before, within, bins) {
   return fine.map((x, k) => x + (x - coarse[k]) / 3);
 }
 
+// The rate of registrations is exponential in a part, and largest at one of its ends, from which on x is measured.
 function onParts(before, within, parts, bins) {
   const photons = differences(before), rise = differences(within), out = new Float64Array(bins * ORDERS);
   for (let j = 0; j < bins; ++j)
     for (let part = 0; part < parts; ++part) {
-      const at = j * parts + part;
-      for (let k = 0; k < NODES.length; ++k) {
-        const node = 0.5 * (NODES[k] + 1), place = (2 * (part + node)) / parts - 1;
-        let rate = 0.5 * WEIGHTS[k] * photons[at] * Math.exp(-(within[at] + node * rise[at]));
-        for (let order = 0; order < ORDERS; ++order, rate *= place) out[j * ORDERS + order] += rate;
-      }
+      const at = j * parts + part, width = (rise[at] < 0 ? -2 : 2) / parts;
+      const start = (2 * part) / parts - 1 + Math.max(0, -width);
+      const peak = photons[at] * Math.exp(-Math.min(within[at], within[at + 1]));
+      const [zero, one, two, three] = decayingPowers(Math.abs(rise[at])).map((x) => peak * x);
+      out[j * ORDERS] += zero;
+      out[j * ORDERS + 1] += start * zero + width * one;
+      out[j * ORDERS + 2] += start * (start * zero + 2 * width * one) + width ** 2 * two;
+      out[j * ORDERS + 3] +=
+        start * (start * (start * zero + 3 * width * one) + 3 * width ** 2 * two) + width ** 3 * three;
     }
+  return out;
+}
+
+/** Integrals of x^m exp(-fall x) over [0, 1], m = 0 .. 3, for fall >= 0. */
+function decayingPowers(fall) {
+  const out = new Float64Array(ORDERS), last = Math.exp(-fall);
+  for (let m = 0; m < ORDERS; ++m)
+    if (fall < SERIES_BELOW)
+      for (let j = 0, term = 1; j < SERIES_TERMS; term *= -fall / ++j) out[m] += term / (m + 1 + j);
+    else out[m] = m === 0 ? -Math.expm1(-fall) / fall : (m * out[m - 1] - last) / fall;
   return out;
 }

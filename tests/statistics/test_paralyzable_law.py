@@ -88,6 +88,16 @@ def test_moments_are_the_closed_form_ones(case: Case):
     assert law.cumulants[2:] == pytest.approx([third, fourth], abs=1e-6 * max(spread, 1.0) ** 4)
 
 
+@pytest.mark.parametrize("sigma", [1e-6, 1e-5, 1e-3])
+@pytest.mark.parametrize("signal", [3.0, 30.0, 1000.0])
+def test_the_first_photon_of_a_short_pulse_is_registered(sigma: float, signal: float):
+    """However bright: a count of 1 - exp(-S) a period was 1e-13 where a pulse of 1000 photons was within a cell."""
+    system = view(0.5, "stationary", 20, sigma=sigma)
+    law = ml.count_law(ml.Flux(signal, 0.0, 25.0), system)
+    assert float(law.mean) == pytest.approx(-20.0 * np.expm1(-signal), rel=1e-9)
+    assert float(law.variance) == pytest.approx(-20.0 * np.expm1(-signal) * np.exp(-signal), rel=1e-6, abs=1e-9)
+
+
 @pytest.mark.parametrize("bins", [1, 50, 200, 1000])
 def test_the_grid_of_the_histogram_is_not_the_one_of_the_moments(bins: int):
     """However many bins the histogram has, `paralyzable_moments` keeps its tolerance."""

@@ -33,7 +33,7 @@ def test_it_is_short():
 
 
 @pytest.mark.nightly
-@pytest.mark.filterwarnings("ignore:Maximum number of epochs")  # four on purpose: `train` says why
+@pytest.mark.filterwarnings("ignore::UserWarning")  # sbi's: four epochs and a prior by its draws alone, on purpose
 def test_own_prior():
     """90 % intervals hold 88 to 92 % over the prior: beyond that 3 standard errors (false alarm 4e-3 over six ends)."""
     pytest.importorskip("sbi")

@@ -23,7 +23,7 @@ from benchmarks import (
 )
 from benchmarks.config import DEFAULT, FULL, QUICK, Config
 from benchmarks.floor import Bandwidth, measure_bandwidth
-from benchmarks.machine import Interference, describe_machine
+from benchmarks.machine import describe_machine, load
 from benchmarks.report import Report, Section
 
 RESULTS = Path(__file__).parent / "results"
@@ -37,7 +37,6 @@ SECTIONS: dict[str, Callable[[Config, Bandwidth], Section]] = {
     "effects": paths.detector_effects,
     "exposure": laws.exposure_laws,
     "reconstruction": estimators.reconstruction,
-    "calibration": estimators.calibration,
     "codecs": storage.codecs,
     "datasets": storage.datasets,
     "epochs": storage.epochs,
@@ -50,8 +49,7 @@ SECTIONS: dict[str, Callable[[Config, Bandwidth], Section]] = {
 
 def run(config: Config, names: Sequence[str] = tuple(SECTIONS), tell: Callable[[str], object] = str) -> Report:
     """Run the named sections; `tell` hears each as it is done."""
-    began, interference = time.perf_counter(), Interference()
-    machine = describe_machine(config)
+    began, machine = time.perf_counter(), describe_machine(config)
     bandwidth = measure_bandwidth(config)
     configuration = {
         "mode": config.mode,
@@ -66,8 +64,7 @@ def run(config: Config, names: Sequence[str] = tuple(SECTIONS), tell: Callable[[
         start = time.perf_counter()
         report.sections.append(SECTIONS[name](config, bandwidth))
         tell(f"{name}: {time.perf_counter() - start:.1f} s")
-    machine["meanwhile"] = interference.describe()
-    report.caution = interference.caution()
+    machine["load"] = f"{machine['load']} before, {load()} after"
     machine["run time"] = f"{time.perf_counter() - began:.0f} s"
     return report
 

@@ -1,4 +1,4 @@
-"""The estimators: reconstruction of a cube by each method and at several fluxes, calibration of a stream."""
+"""Reconstruction of a cube by each method and at several fluxes."""
 
 from __future__ import annotations
 
@@ -57,25 +57,6 @@ def reconstruction(config: Config, bandwidth: Bandwidth) -> Section:
         if name == "maximum_likelihood":
             slowest = max(slowest, CUBE_PIXELS * pixel)
     section.goals = [Goal("maximum likelihood, CPU of 128 x 128, any flux", slowest, GOAL_CUBE_S, "s")]
-    return section
-
-
-def calibration(config: Config, bandwidth: Bandwidth) -> Section:
-    """Calibration of one stream, per million timestamps."""
-    del bandwidth
-    instrument = system(config).replace(cycles=1_000 * config.cycles)
-    times = ml.simulate_timestamps(ml.Flux(0.8, 0.5, 40.0), instrument, seed=SEED, threads=1)
-    cases: dict[str, Callable[[], object]] = {
-        "calibrate, detector and pulse given": partial(ml.calibrate, times, instrument),
-        "calibrate, nothing given": partial(ml.calibrate, times),
-        "calibrate, any shape": partial(ml.calibrate, times, pulse="free"),
-    }
-    result = in_turn(cases, config)
-    section = Section("Calibration of a stream", notes=[f"{len(times):,} timestamps, S = 0.8, B = 0.5."])
-    section.rows = [
-        {"case": name, "CPU s": min(result[name].cpu), "CPU s per 10^6": 1e6 * min(result[name].cpu) / len(times)}
-        for name in cases
-    ]
     return section
 
 

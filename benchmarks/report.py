@@ -59,7 +59,6 @@ class Report:
     machine: dict[str, Any]
     configuration: dict[str, Any]
     sections: list[Section] = field(default_factory=list)
-    caution: str = ""
 
     @property
     def goals(self) -> list[Goal]:
@@ -73,8 +72,6 @@ class Report:
             table([{"": key, "value": value} for key, value in self.machine.items()]),
             "; ".join(f"{key}: {value}" for key, value in self.configuration.items()) + ".",
         ]
-        if self.caution:
-            parts.append(self.caution)
         if self.goals:
             parts += ["## Goals", table([goal.row() for goal in self.goals])]
         return "\n\n".join([*parts, *(section.markdown() for section in self.sections)]) + "\n"
@@ -84,7 +81,6 @@ class Report:
         data = {
             "machine": self.machine,
             "configuration": self.configuration,
-            "caution": self.caution,
             "goals": [asdict(goal) | {"met": goal.met} for goal in self.goals],
             "sections": [{"title": s.title, "rows": s.rows, "notes": s.notes} for s in self.sections],
         }

@@ -11,13 +11,12 @@ import matplotlib.pyplot as plt
 import numpy as np
 import torch
 from deepinv.models import DRUNet
-from deepinv.optim import PGD, DataFidelity
-from deepinv.optim.potential import Potential
+from deepinv.optim import PGD
 from deepinv.optim.prior import PnP, TVPrior
 from torch.nn.functional import avg_pool2d, pad
 
 import mars_lidar as ml
-from mars_lidar.learn import LidarPhysics, histogram_log_likelihood
+from mars_lidar.learn import LidarLikelihood, LidarPhysics
 
 PULSE_NS, PHOTONS, SBR = 1.0, 5.0, 1.0  # photons of the return: of a pixel, on average, in the whole exposure
 PULSE, DETECTOR = ml.GaussianPulse(sigma_ns=PULSE_NS), ml.Detector(dead_time_ns=75.0)
@@ -66,7 +65,9 @@ def train(steps=1500, rooms=300, batch=8):
     denoiser, losses = Denoiser(), []
     optimizer = torch.optim.AdamW(denoiser.parameters())
     rate = torch.optim.lr_scheduler.OneCycleLR(optimizer, 2.5e-3, total_steps=steps)
-    for _ in range(steps):
+    for step in range(steps):
+        if step % 100 == 0:
+            print(f"training, step {step} of {steps}", flush=True)
         top, left = torch.randint(65, (2,)).tolist()
         x = clean[torch.randint(rooms, (batch,)), :, top : top + 32, left : left + 32]
         x[:, 1] += torch.randn(batch, 1, 1)  # any background
@@ -81,20 +82,10 @@ def train(steps=1500, rooms=300, batch=8):
     return denoiser.eval(), losses
 
 
-class Likelihood(DataFidelity):
-    """Minus the log likelihood of histograms, of images; deepinv's own are of distances from the mean."""
-
-    grad = Potential.grad
-
-    def fn(self, x, y, physics):
-        """One number for each image."""
-        return -histogram_log_likelihood(y.movedim(1, -1), *light_of(x).unbind(1), physics.system).sum((1, 2))
-
-
 def solve(y, start, prior, **options):
     """Images by deepinv's proximal gradient descent."""
-    descent = PGD(data_fidelity=Likelihood(), prior=prior, **options)
-    return descent(y, LidarPhysics(SYSTEM), init=(start.clone(), start.clone())).detach()
+    descent = PGD(data_fidelity=LidarLikelihood(), prior=prior, **options)
+    return descent(y, LidarPhysics(SYSTEM, images="log"), init=(start.clone(), start.clone())).detach()
 
 
 def estimates(y, denoiser, steps=100):
@@ -122,6 +113,7 @@ def compared(denoiser, name, seed, size=SIZE, steps=100):
     true = images(light)
     rows, shown = [], {"truth": true}
     for method, found in estimates(y, denoiser, steps):
+        print(f"{name}: {method}", flush=True)
         depth = M_PER_WIDTH * (found - true)[:, 2].abs()
         far = depth > 3.0 * M_PER_WIDTH
         signal = (light_of(found) - light)[:, 0] / light[:, 0].mean()

@@ -81,7 +81,7 @@ def test_goals_stand_beside_measured_values(report):
     for goal in report.goals:
         assert np.isfinite(goal.measured)
         assert goal.what in text
-    for key in ("processor", "vector levels", "NumPy", "date", "meanwhile"):
+    for key in ("processor", "vector levels", "NumPy", "date", "load"):
         assert report.machine[key]
 
 
@@ -189,8 +189,7 @@ def test_forward_models_are_measured_with_their_gradients():
 
 @pytest.mark.full
 def test_estimators_are_timed():
-    reconstruction, calibration = command.run(TINY, ("reconstruction", "calibration")).sections
+    reconstruction = command.run(TINY, ("reconstruction",)).sections[0]
     assert {row["method"] for row in reconstruction.rows} >= {"maximum_likelihood", "mchc", "coates", "matched_filter"}
     assert all(row["us per pixel"] > 0 for row in reconstruction.rows)
     assert [goal.unit for goal in reconstruction.goals] == ["s"]
-    assert all(row["CPU s per 10^6"] > 0 for row in calibration.rows)

@@ -33,7 +33,7 @@ from scipy import special, stats
 import mars_lidar as ml
 from mars_lidar.engines import ENGINES
 from studies.domain import simulator
-from studies.domain.case import Case as Pixel
+from studies.domain.systems import Case as Pixel
 from studies.domain.systems import draw
 
 

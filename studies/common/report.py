@@ -6,7 +6,6 @@ import csv
 import datetime
 import importlib
 import math
-import os
 import platform
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -17,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from benchmarks.machine import processor
+from benchmarks.machine import load, processor
 from mars_lidar._base.imports import needed
 
 if TYPE_CHECKING:
@@ -170,11 +169,3 @@ def machine() -> str:
         f"{processor()}, {thread_count(None)} processors used, {_core.levels()[0]}, "
         f"{platform.system()} {platform.machine()}, Python {platform.python_version()}"
     )
-
-
-def load() -> str:
-    """Processes that wanted to run, mean of the last minute: what a timing may have been disturbed by."""
-    try:
-        return f"{os.getloadavg()[0]:.1f} on {os.cpu_count()} processors"
-    except OSError:
-        return "not known on this system"

@@ -29,8 +29,7 @@ from mars_lidar.cli.options import command as as_command
 from mars_lidar.cli.system_options import Effects, SystemOptions
 from mars_lidar.engines import ENGINES
 from studies.compare.comparison import compare as run
-from studies.compare.figures import comparison
-from studies.compare.tables import as_data, show
+from studies.compare.report import as_data, comparison, show
 
 
 def compare(

@@ -3,18 +3,161 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
 
 from mars_lidar import CountLaw, Flux, System, count_law, simulate
 from mars_lidar._base.types import FloatArray
+from mars_lidar.plot.style import COLOURS
 from mars_lidar.statistics.count_pmf import Pmf, gaussian_window, total_variation
 from studies import Facts, Request, Tell
 from studies.common import distance
+from studies.common.draw import legend_below, maps
 from studies.common.report import Row, picked
-from studies.count_law.settings import _PER_SKEWNESS, FEW, FULL, LAWS, MODERATE, QUICK, STILL, VISIBLE, Cell, Settings
+from studies.common.sample import PERIOD_NS, log_points, system_of
+
+LAWS = {
+    "exact": "exact",
+    "gaussian": "best Gaussian",
+    "mars": "mars, centre",
+    "mars_edge": "mars, edge",
+    "renewal": "renewal",
+    "poisson": "Poisson",
+}
+
+_ROUNDING = 1e-9  # of a law whose count is certain: its floor is 0
+FEW, STILL, VISIBLE = 10.0, 1.0, 0.01  # E N below FEW, Var N below STILL, total variation above VISIBLE
+MODERATE = 200.0  # E N from where a Poisson law is within VISIBLE of its Gaussian
+
+# E |z^3 - 3 z| / 12, z standard normal: total variation of the first Edgeworth term per unit of skewness
+_PER_SKEWNESS = (1.0 + 4.0 * float(np.exp(-1.5))) / (6.0 * float(np.sqrt(2.0 * np.pi)))
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Configuration of the study: maps over (S, B) at one exposure and over (S, exposure)."""
+
+    signal: tuple[float, ...]
+    background: tuple[float, ...]
+    dead: tuple[float, ...]  # periods
+    cycles: tuple[int, ...]
+    realizations: int
+    draws: int  # of the bootstrap
+    map_cycles: int = 1000
+    ratio: float = 10.0  # S / B along the exposure map
+    sigma_ns: float = 0.5
+    seed: int = 20263
+
+    def system(self, dead: float, cycles: int) -> System:
+        """System of a map; dead time in periods."""
+        return system_of(dead * PERIOD_NS, cycles, sigma_ns=self.sigma_ns)
+
+
+FULL = Settings(
+    signal=log_points(8),
+    background=log_points(8),
+    dead=(0.1875, 0.6375, 0.9765, 1.0, 1.97),
+    cycles=(10, 30, 100, 300, 1000, 3000, 10000),
+    realizations=50_000,
+    draws=2000,
+)
+
+QUICK = Settings(
+    signal=(0.05, 5.0),
+    background=(0.1, 2.0),
+    dead=(0.1875, 0.9765),
+    cycles=(10, 100),
+    realizations=2000,
+    draws=200,
+    map_cycles=100,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Cell:
+    """One pixel: moments of its exact law, distances of every law, the sampling floor.
+
+    `to_simulation` and `to_exact` are total variations by law; `floor` and `limit` the mean and the 99.9 %
+    quantile of the bootstrap of the exact law; `p_value` its G-test.
+    """
+
+    signal: float
+    background: float
+    dead: float
+    cycles: int
+    cumulants: FloatArray
+    to_simulation: dict[str, float]
+    to_exact: dict[str, float]
+    floor: float
+    limit: float
+    p_value: float
+    mean_score: float
+    variance_score: float
+
+    def within(self, law: str) -> bool:
+        """Whether the simulation cannot be told from this law by total variation, at this sample size."""
+        return self.to_simulation[law] <= self.limit + _ROUNDING
+
+    def name(self) -> str:
+        """The cell in words."""
+        flux = f"S = {self.signal:.3g}, B = {self.background:.3g}"
+        return f"{flux}, t_d = {self.dead:g} t_r, {self.cycles} cycles"
+
+
+_LOW, _HIGH = 3e-3, 1.0  # total variation on the colour scales
+_LOW_EXACT = 1e-3  # where there is no sampling noise
+Value = Callable[[Cell], float]
+
+
+def _row(
+    settings: Settings, cells: Sequence[Cell], kind: str, value: Value
+) -> tuple[Sequence[float], list[list[list[float]]]]:
+    """Maps of a value for each dead time: S along x; B or cycles along y, whose points come first."""
+    y = settings.background if kind == "flux" else settings.cycles
+    by = {(c.dead, c.signal, c.background if kind == "flux" else c.cycles): value(c) for c in cells}
+    return y, [[[by[dead, s, b] for s in settings.signal] for b in y] for dead in settings.dead]
+
+
+def _titles(settings: Settings) -> list[str]:
+    return [f"$t_d$ = {dead:g} $t_r$" for dead in settings.dead]
+
+
+def total_variation_maps(settings: Settings, cells: Sequence[Cell], kind: str) -> Figure:
+    """Total variation to simulation: rows for the sampling floor and each law, columns for dead times."""
+    lines: list[tuple[str, Value]] = [("sampling floor", lambda cell: cell.floor)]
+    lines += [(words, lambda cell, name=name: cell.to_simulation[name]) for name, words in LAWS.items()]  # type: ignore[misc]
+    name = "B" if kind == "flux" else "cycles"
+    images = {f"{words}\n{name}": _row(settings, cells, kind, value) for words, value in lines}
+    label = "total variation to simulation"
+    return maps(8.4, settings.signal, images, _titles(settings), LogNorm(_LOW, _HIGH), label)[0]
+
+
+def gaussian_map(settings: Settings, flux: Sequence[Cell], exposure: Sequence[Cell]) -> Figure:
+    """Where the Gaussian breaks: its distance to the exact law, without noise, and why."""
+    kinds = {"B": ("flux", flux), "cycles": ("exposure", exposure)}
+    images = {
+        name: _row(settings, cells, kind, lambda cell: cell.to_exact["gaussian"])
+        for name, (kind, cells) in kinds.items()
+    }
+    norm, label = LogNorm(_LOW_EXACT, _HIGH), "total variation,\nbest Gaussian to exact law"
+    figure, axes, _ = maps(3.3, settings.signal, images, _titles(settings), norm, label)
+    for row, (kind, cells) in zip(axes, kinds.values(), strict=True):
+        for cell in cells:
+            y = cell.background if kind == "flux" else cell.cycles
+            mark = "." if cell.cumulants[0] < 10.0 else "_" if cell.cumulants[1] < 1.0 else ""
+            if mark:
+                # dark on pale, pale on dark
+                colour = COLOURS[0] if cell.to_exact["gaussian"] < 0.05 else COLOURS[5]
+                ax = row[settings.dead.index(cell.dead)]
+                ax.plot(cell.signal, y, mark, ms=2.4, color=colour, mew=0.8)
+    for mark, words in ((".", "E N < 10"), ("_", "E N at least 10, Var N < 1")):
+        axes[0, 0].plot([], [], mark, ms=4, color=COLOURS[0], label=words)
+    legend_below(figure, axes[0, :1], 2)
+    return figure
 
 
 def flux_map(settings: Settings, tell: Tell) -> list[Cell]:
@@ -71,8 +214,6 @@ def _cells(
                 p_value=distance.g_test(laws["exact"], sample, size),
                 mean_score=distance.mean_score(mean, variance, float(counts[:, k].mean(dtype=np.float64)), size),
                 variance_score=distance.variance_score(exact.cumulants[k], sample, size),
-                laws=laws,
-                sample=sample,
             )
         )
     return cells
@@ -128,22 +269,8 @@ def _regimes(cells: Sequence[Cell]) -> dict[str, list[Cell]]:
     return {name: [c for c in cells if test(c.cumulants[0], c.cumulants[1])] for name, test in tests.items()}
 
 
-def _drawn_out(cells: Sequence[Cell]) -> list[Cell]:
-    """Cells whose laws are drawn out: the worst for the Gaussian in each regime, at different dead times."""
-    chosen: list[Cell] = []
-    # a cell with next to no counts at all is far from a Gaussian, but tells nothing
-    regimes = _regimes([c for c in cells if 0.02 < c.laws["exact"].p.max() < 0.98])
-    for regime, number in zip(regimes.values(), (2, 2, 1, 1), strict=False):
-        worst: dict[float, Cell] = {}
-        for cell in sorted(regime, key=lambda c: -c.to_exact["gaussian"]):
-            worst.setdefault(cell.dead, cell)
-        chosen += list(worst.values())[:number]
-    return chosen
-
-
 def run(request: Request) -> Facts:
     """Both maps, and a second look where the exact law looked worst."""
-    from studies.count_law import law_figures
 
     settings = QUICK if request.quick else FULL
     flux, exposure = flux_map(settings, request.tell), exposure_map(settings, request.tell)
@@ -170,11 +297,9 @@ def run(request: Request) -> Facts:
         "nan": float("nan"),
         "rows": [_csv_row("flux", c) for c in flux] + [_csv_row("exposure", c) for c in exposure],
         "figures": {
-            "gaussian": law_figures.gaussian(settings, flux, exposure),
-            "flux": law_figures.rows(settings, flux, "flux"),
-            "exposure": law_figures.rows(settings, exposure, "exposure"),
-            "cells": law_figures.examples(_drawn_out(cells)),
-            "floor": law_figures.floors(cells),
+            "gaussian": gaussian_map(settings, flux, exposure),
+            "flux": total_variation_maps(settings, flux, "flux"),
+            "exposure": total_variation_maps(settings, exposure, "exposure"),
         },
     }
 

@@ -17,8 +17,7 @@ from mars_lidar.statistics.count_pmf import Pmf, total_variation
 from studies import Facts, Request
 from studies.common import distance
 from studies.common.sample import system_of
-from studies.count_law.law import laws_of, pmfs_of
-from studies.count_law.settings import LAWS
+from studies.count_law.law import LAWS, laws_of, pmfs_of
 
 DRAWS, QUICK_DRAWS = 20_000, 500
 SEED = 20262

@@ -1,21 +1,31 @@
 """Study "covariance", T4 of the MaRS paper (arXiv 2512.04924): covariances of holding times, and truncating their sum.
 
 What each rule leaves out of gamma_1 + gamma_2 + ... in every cell of declared grids over (S, B, t_d), against
-the sum without truncation. Equation numbers refer to docs/theory.md.
+the sum without truncation; some cells by dense matrices and LAPACK, a check of the O(n) way. Equation numbers refer
+to docs/theory.md.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
 
-from studies import Facts, Request
+from mars_lidar._base.types import FloatArray
+from mars_lidar.plot.style import COLOURS, INK, MUTED
+from mars_lidar.statistics import HoldingTimeCovariance, PhaseChain
+from studies import Facts, Request, Tell
+from studies.common.draw import legend_below, maps, panels
 from studies.common.report import Row, picked
 from studies.covariance.settings import (
     CUTOFFS,
     FULL,
     QUICK,
+    SPECTRAL,
     SPECTRAL_NAME,
     TOLERANCES,
     Cell,
@@ -25,6 +35,204 @@ from studies.covariance.settings import (
     cutoff_name,
     one_cell,
 )
+
+
+def dense_checks(settings: Settings, cells: list[Cell], extra: int, tell: Tell) -> list[dict[str, Any]]:
+    """Some cells the paper's way: the slowest at each dead time, the worst, `extra` at random, per grid."""
+    results = [_dense_check(cell) for cell in _chosen(settings, cells, extra)]
+    tell(f"covariance: {len(results)} cells by dense matrices, re-arming at the {cells[0].rearm}")
+    return results
+
+
+def _chosen(settings: Settings, cells: list[Cell], extra: int) -> Iterator[Cell]:
+    random = np.random.default_rng(settings.seed)
+    for grid in settings.grids:
+        here = [cell for cell in cells if cell.grid is grid]
+        slowest = [max((c for c in here if c.dead_ns == d), key=lambda c: c.sizes[1]) for d in grid.dead_ns]
+        worst = max(here, key=lambda cell: abs(cell.relative_error(SPECTRAL_NAME)))
+        first = slowest if worst in slowest else [*slowest, worst]
+        rest = [cell for cell in here if cell not in first]
+        yield from first
+        for k in random.choice(len(rest), extra, replace=False):
+            yield rest[k]
+
+
+def _dense_check(cell: Cell) -> dict[str, Any]:
+    """One cell by the paper's way, dense matrices and LAPACK, beside the O(n) way.
+
+    Differences of sums are relative to sigma^2. ``inverse`` is what left vectors from inv(V) in place of LAPACK's
+    change of sigma^2 by the paper's rule, relative to it; ``negative`` whether it is below 0.
+    """
+    terms = cell.terms
+    dense = HoldingTimeCovariance(**{name: getattr(terms, name) for name in terms.__dataclass_fields__})
+    count = SPECTRAL[1] + 1
+    reference, arnoldi = dense.eigenvalues[:count], terms.eigenvalues[:count]
+    apart = np.abs(reference[:, None] - arnoldi[None, :]).min(axis=1)
+    apart = apart[:-1] if np.abs(reference[-1].imag) > 0 else apart  # the last may be half of a pair
+    paper = dense.spectral_sum(*SPECTRAL)
+    inverse = _by_inverse(cell)
+    sigma2 = terms.sigma2
+    return {
+        "cell": cell,
+        "eigenvalues": float(apart.max()),
+        "spectral": 2.0 * abs(paper - cell.sums[SPECTRAL_NAME]) / sigma2,
+        "exact": 2.0 * abs(_by_solve(cell) - terms.exact_sum) / sigma2,
+        "summed": 2.0 * abs(dense.cutoff_sum(3000) - terms.exact_sum) / sigma2,
+        "inverse": 2.0 * (inverse - paper) / sigma2,
+        "negative": terms.sigma_ss2 + 2.0 * inverse < 0.0,
+    }
+
+
+def moment_matrices(chain: PhaseChain) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Dense P, mean mu_ij and variance sigma_ij^2 of the holding time given the step i -> j, periods (3.1-3.3)."""
+    n = chain.bins
+    j = np.arange(n)
+    arm = (j + chain.shift) % n
+    ahead = (j[None, :] - arm[:, None]) % n
+    # M and Sigma away from the re-arming bin: a geometric number of further periods (3.1, 3.2)
+    loss, passed = chain.loss, math.exp(-chain.total)
+    mean = (chain.blind_bins + ahead) / n + passed / loss
+    variance = np.full((n, n), passed / loss**2)
+    # the re-arming bin is met once in part, then whole every period (3.3)
+    again = chain.again()
+    there = chain.refire + again
+    with np.errstate(invalid="ignore", divide="ignore"):
+        first = np.where(there > 0, again / loss / there, 0.0)
+        second = np.where(there > 0, again * (1.0 + passed) / loss**2 / there, 0.0)
+    mean[j, arm] = chain.blind_bins / n + first[arm]
+    variance[j, arm] = (second - first**2)[arm]
+    return chain.dense(), mean, variance
+
+
+def _parts(cell: Cell) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Dense P, pi, pi Q_mu - mu pi and Q_mu 1 - mu, all from matrices, in periods (3.7)."""
+    chain = cell.terms.chain
+    pdf = np.asarray(cell.terms.stationary_pdf)
+    matrix, waits, _ = moment_matrices(chain)
+    q_mu = matrix * waits
+    mean = q_mu.sum(axis=1)
+    mu = float(pdf @ mean)
+    return matrix, pdf, pdf @ q_mu - mu * pdf, mean - mu
+
+
+def _by_solve(cell: Cell) -> float:
+    """The sum without truncation by one dense solution of (I - P + 1 pi) z = Q_mu 1 - mu, ns^2."""
+    matrix, pdf, row, value = _parts(cell)
+    n = pdf.size
+    z = np.linalg.solve(np.eye(n) - matrix + pdf[None, :], value)
+    return float(row @ z) * cell.grid.period_ns**2
+
+
+def _by_inverse(cell: Cell) -> float:
+    """The paper's rule with left vectors as rows of inv(V) (4.4), ns^2; infinite where V is singular."""
+    matrix, _, row, value = _parts(cell)
+    values, vectors = np.linalg.eig(matrix)
+    order = np.argsort(-np.round(np.abs(values), 12), kind="stable")
+    try:
+        inverse = np.linalg.inv(vectors)
+    except np.linalg.LinAlgError:
+        return float("inf")
+    count = SPECTRAL[1]
+    if abs(values[order[count - 1]].imag) > 0 and np.count_nonzero(values[order[1:count]].imag) % 2:
+        count += 1
+    selected = order[1:count]
+    weight = (row @ vectors[:, selected]) * (inverse[selected] @ value)
+    tail = np.sum(weight * values[selected] ** SPECTRAL[0] / (1.0 - values[selected]))
+    return cell.terms.cutoff_sum(SPECTRAL[0]) + float(tail.real) * cell.grid.period_ns**2
+
+
+_DECAY = ((1.0, 1.0), (10.0, 0.1))  # S, B
+_DECAY_LAGS = 20
+_NOTE: dict[str, Any] = {"ha": "right", "fontsize": 7, "color": MUTED}
+_FLOOR = 1e-9  # of sigma_ss^2; below it covariances are not drawn
+
+
+def decay(settings: Settings) -> Figure:
+    """|gamma_l| / sigma_ss^2 against the lag, sign in the marker."""
+    figure, axes = panels(2.7, 1, len(_DECAY), sharey=True)
+    lags = np.arange(1, _DECAY_LAGS + 1)
+    for ax, (signal, background) in zip(axes[0], _DECAY, strict=True):
+        for k, dead in enumerate(settings.decay_dead):
+            terms = one_cell(settings, signal, background, dead, "centre").terms
+            size = terms.gamma[:_DECAY_LAGS] / terms.sigma_ss2
+            selected = np.abs(size) > _FLOOR
+            colour = COLOURS[k % len(COLOURS)]
+            ax.plot(lags[selected], np.abs(size)[selected], color=colour, lw=0.9, label=f"{dead:g}")
+            for sign, face in ((1.0, colour), (-1.0, "white")):
+                chosen = selected & (np.sign(size) == sign)
+                ax.plot(lags[chosen], np.abs(size)[chosen], "o", ms=3.2, mfc=face, mec=colour, mew=0.8)
+        ax.set(yscale="log", xlabel="lag $l$", ylim=(_FLOOR, 2.0), xlim=(0, _DECAY_LAGS + 1))
+        ax.xaxis.get_major_locator().set_params(integer=True)
+        ax.set_title(f"S = {signal:g}, B = {background:g} photons per period", loc="left")
+    axes[0, 0].set_ylabel(r"$|\gamma_l|\,/\,\sigma_{ss}^2$")
+    axes[0, -1].legend(
+        title="$t_d / t_r$", title_fontsize=7, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5)
+    )
+    axes[0, 0].annotate("filled: positive\nopen: negative", (0.97, 0.97), xycoords="axes fraction", va="top", **_NOTE)
+    return figure
+
+
+def eigenvalues(settings: Settings, cells: Sequence[Cell]) -> Figure:
+    """Magnitudes of the leading eigenvalues: every cell a point, median and largest as lines."""
+    figure, axes = panels(2.5, 1, len(settings.grids), sharey=True)
+    random = np.random.default_rng(0)
+    for ax, grid in zip(axes[0], settings.grids, strict=True):
+        size = np.array([cell.sizes[:12] for cell in cells if cell.grid is grid])
+        place = np.arange(1, size.shape[1] + 1)
+        jitter = random.uniform(-0.28, 0.28, size.shape)
+        ax.plot(place + jitter, size, ".", ms=1.6, color=COLOURS[0], alpha=0.35, mew=0, rasterized=True)
+        ax.plot(place, size.max(axis=0), color=INK, lw=0.9, marker="_", ms=8, label="largest")
+        ax.plot(place, np.median(size, axis=0), color=COLOURS[1], lw=0.9, marker="_", ms=8, label="median")
+        ax.axhline(0.7, color=MUTED, lw=0.7, ls=(0, (4, 2)))
+        ax.axvline(5.5, color=MUTED, lw=0.7, ls=(0, (1, 2)))
+        ax.set(xlabel="$k$", ylim=(0, 1.05), xlim=(0.3, size.shape[1] + 0.7))
+        ax.set_xticks(place[::2])
+        ax.set_title(f"{grid.name}, {grid.size} cells", loc="left")
+    axes[0, 0].set_ylabel(r"$|\lambda_k|$")
+    axes[0, -1].legend(frameon=False, loc="upper right")
+    axes[0, 0].annotate("0.7", (0.97, 0.7), xycoords=("axes fraction", "data"), va="bottom", **_NOTE)
+    return figure
+
+
+def truncation(settings: Settings, cells: Sequence[Cell]) -> Figure:
+    """Mean absolute error of the sum against the fixed cut-off, with the other rules as levels."""
+    figure, axes = panels(2.7, 1, len(settings.grids), sharey=True)
+    levels = [(SPECTRAL_NAME, COLOURS[1], "-")]
+    levels += [(automatic_name(t), c, "--") for t, c in zip(TOLERANCES, (COLOURS[2], COLOURS[3]), strict=True)]
+    for ax, grid in zip(axes[0], settings.grids, strict=True):
+        here = [cell for cell in cells if cell.grid is grid]
+        error = [np.mean([abs(cell.error(cutoff_name(c))) for cell in here]) for c in CUTOFFS]
+        ax.plot(CUTOFFS, error, "o-", ms=2.4, lw=0.9, color=COLOURS[0], label="first $c$ lags")
+        for name, colour, line in levels:
+            level = np.mean([abs(cell.error(name)) for cell in here])
+            ax.axhline(level, color=colour, lw=1.0, ls=line, label=name)
+        ax.set_xscale("symlog", linthresh=10, linscale=1.2)
+        ax.set_yscale("log")
+        ax.set_xticks([0, 5, 10, 20, 50, 100, 500], ["0", "5", "10", "20", "50", "", "500"])
+        ax.set(xlabel="cut-off $c$", xlim=(-0.5, 600), ylim=(1e-6, None))
+        ax.set_title(f"{grid.name}, {grid.size} cells", loc="left")
+    axes[0, 0].set_ylabel(r"mean |error| of $\sum\gamma_l$, ns$^2$")
+    legend_below(figure, axes[0, :1], 4)
+    return figure
+
+
+def error_map(settings: Settings, cells: Sequence[Cell]) -> Figure:
+    """Relative error of sigma^2 over (S, B) for three rules, at each dead time of the last grid."""
+    grid = settings.grids[-1]
+    flux, dead = grid.flux, grid.dead_ns
+    by = {(c.signal, c.background, c.dead_ns): c for c in cells if c.grid is grid}
+
+    def error(rule: str, dead_ns: float) -> list[list[float]]:
+        return [[abs(by[s, b, dead_ns].relative_error(rule)) for s in flux] for b in flux]
+
+    rules = ("cut-off 0", "cut-off 20", SPECTRAL_NAME)
+    rows = {f"{rule.replace('spectral ', '')}\nB": (flux, [error(rule, d) for d in dead]) for rule in rules}
+    titles = [f"$t_d$ = {d / grid.period_ns:g} $t_r$" for d in dead]
+    figure, axes, _ = maps(3.3, flux, rows, titles, LogNorm(1e-6, 1.0), r"|relative error of $\sigma^2$|")
+    for ax in axes[0]:
+        ax.title.set_fontsize(7)
+    return figure
+
 
 _USUAL_CUTOFFS = range(21)  # among these the best fixed one is looked for
 _HARD = (10.0, 1.0, 1.0)  # S, B, t_d / t_r
@@ -42,8 +250,6 @@ def best_cutoff(cells: Sequence[Cell]) -> int:
 
 def run(request: Request) -> Facts:
     """Both ways of re-arming on all grids, and the check by dense matrices."""
-    from studies.covariance import figures
-    from studies.covariance.dense import dense_checks
 
     settings = QUICK if request.quick else FULL
     centre = compute(settings, "centre", request.tell)
@@ -84,10 +290,10 @@ def run(request: Request) -> Facts:
         "automatic": {t: np.array([c.rules[automatic_name(t)] for c in centre]).T for t in TOLERANCES},
         "rows": [_csv_row(c) for c in (*centre, *edge)],
         "figures": {
-            "decay": figures.decay(settings),
-            "eigenvalues": figures.eigenvalues(settings, centre),
-            "truncation": figures.truncation(settings, centre),
-            "map": figures.error_map(settings, centre),
+            "decay": decay(settings),
+            "eigenvalues": eigenvalues(settings, centre),
+            "truncation": truncation(settings, centre),
+            "map": error_map(settings, centre),
         },
     }
 

@@ -10,8 +10,7 @@ from mars_lidar import Afterpulsing, Crosstalk, Detector, Flux, GaussianPulse, J
 from mars_lidar.statistics import constant_light_rate
 from studies import Facts, Request
 from studies.common.sample import settings_of
-from studies.detectors.run import outcome, row
-from studies.detectors.settings import LIGHT, SEED, example_of
+from studies.detectors.run import LIGHT, SEED, example_of, outcome, row
 
 CODES = tuple(1.0 + 0.25 * np.sin(2.0 * np.pi * k / 8.0) for k in range(8))
 EXAMPLES = (
@@ -42,7 +41,7 @@ EXAMPLES = (
 
 def run(request: Request) -> Facts:
     """Every effect, and the rate under constant light; a figure for each group of effects."""
-    from studies.detectors.figures import draw_all
+    from studies.detectors.run import draw_all
 
     exposures = 400 if request.quick else 10_000
     outcomes = []

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from studies.common.draw import WIDTH, panels
-from studies.domain.verdict import ENGINES, FAILED, HANDED, LAWS, REFUSED, SLOW, UNJUDGED, VERIFIED
+from studies.domain.judge import ENGINES, FAILED, HANDED, LAWS, REFUSED, SLOW, UNJUDGED, VERIFIED
 
 _INK = {
     VERIFIED: "#3b78b5",
@@ -20,6 +20,7 @@ _INK = {
     UNJUDGED: "#7a7a7a",
     FAILED: "#c4161c",
 }
+_DOTS = 6  # in a decade, at most: those of one state that would lie on each other are drawn once
 _LEAST = {"S": 1e-7, "B": 1e-7, "dead": 1e-4}  # where zeros are drawn
 _TITLE = {
     "S": "S (0 at the edge)",
@@ -47,12 +48,12 @@ def _map(rows: Sequence[dict[str, Any]], subjects: Sequence[str], x: str, y: str
     for ax, subject in zip(axes[0], subjects, strict=True):
         for state, ink in _INK.items():
             some = [row for row in rows if row.get(subject) == state]
-            if some:
-                at = [[max(float(row[key]), _LEAST.get(key, 1.0)) for row in some] for key in (x, y)]
-                if state == FAILED:
-                    ax.scatter(*at, s=14, marker="x", c=ink, lw=0.9, zorder=3)
-                else:
-                    ax.scatter(*at, s=2.5, marker="o", c=ink, lw=0, zorder=1 + (state == SLOW))
+            at = np.array([[max(float(row[key]), _LEAST.get(key, 1.0)) for key in (x, y)] for row in some])
+            if state == FAILED:
+                ax.scatter(*at.reshape(-1, 2).T, s=14, marker="x", c=ink, lw=0.9, zorder=3)
+            else:
+                dots = np.unique(np.round(np.log10(at.reshape(-1, 2)) * _DOTS, 0), axis=0)
+                ax.scatter(*10.0 ** (dots.T / _DOTS), s=2.5, marker="o", c=ink, lw=0, zorder=1 + (state == SLOW))
         ax.set(xscale="log", yscale="log")
         ax.set_xlabel(_TITLE[x], fontsize=7)
         ax.set_title(subject, fontsize=8)

@@ -18,7 +18,7 @@ from mars_lidar.engines.feedback import FeedbackEngine, draw_rest
 from mars_lidar.statistics import ConvergenceError
 from studies import Facts, Request
 from studies.common.kept import Lines
-from studies.domain.case import PERIOD_NS, Case
+from studies.domain.systems import PERIOD_NS, Case
 
 FAMILIES = ("gaussian", "bright", "locked", "reflection", "samples", "spike", "returns", "waveform")
 MEAN_OFF = 0.3  # standard deviations of a bin or window that its mean may be off

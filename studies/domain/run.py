@@ -15,11 +15,10 @@ from mars_lidar._base.resources import thread_count
 from studies import Facts, Request
 from studies.common.kept import Lines
 from studies.common.report import number
-from studies.domain import checks, judge, sweep, verdict, watch
+from studies.domain import checks, judge, sweep
 from studies.domain.figures import decades, maps
-from studies.domain.judge import Budget
+from studies.domain.judge import ENGINES, FAILED, LAWS, SLOW, SUBJECTS, VERIFIED, Budget
 from studies.domain.sweep import Judged, Settings
-from studies.domain.verdict import ENGINES, FAILED, LAWS, SLOW, SUBJECTS, VERIFIED
 
 SEED = 20_261_124
 FULL = Settings(3000, SEED, Budget(4e5, 4e6, 800), 100_000)
@@ -50,8 +49,8 @@ def run(request: Request) -> Facts:
         "judged": judged,
         "checks": checks,
         "judge": judge,
-        "watch": watch,
-        "second_level": verdict.second_level(settings.checks),
+        "sweep": sweep,
+        "second_level": judge.second_level(settings.checks),
         "result": {subject: Counter(state for _, state in _states(judged, subject)) for subject in SUBJECTS},
         "failures": failures,
         "tables": {"failures": failures},

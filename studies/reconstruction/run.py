@@ -3,35 +3,185 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
-from mars_lidar import Flux, Scene, System, cramer_rao, reconstruct, simulate
-from mars_lidar.reconstruction import METHODS, Flags, window_error, window_weights
+from mars_lidar import Detector, Flux, Reconstruction, Scene, System, cramer_rao, reconstruct, simulate
+from mars_lidar.plot.figures import _draw_map, _limits
+from mars_lidar.plot.style import COLOURS, INK
+from mars_lidar.reconstruction import METHODS, Flags, MaximumLikelihood, log_likelihood, window_error, window_weights
 from studies import Facts, Request
+from studies.common.draw import legend_below, panels
 from studies.common.report import Row
-from studies.reconstruction.settings import (
-    BRIGHT,
-    FULL,
-    KNOWN,
-    OUTLIER_SIGMAS,
-    PLAIN,
-    QUICK,
-    SBR,
-    SEED,
-    SYNCHRONOUS,
-    Picture,
-    Settings,
-)
+from studies.common.sample import system_of
+
+SEED = 9
+SBR = 1.0
+OUTLIER_SIGMAS = 4.0  # of the pulse: further off the pulse itself was missed
+_DEAD_NS = 75.0
+KNOWN = 10.0  # %, of S: a bound above it is not reached by any estimate (section "Near the bound")
+BRIGHT = 3.0  # mean signal photons per period of the picture
+PLAIN = system_of(_DEAD_NS, 1000)
+SYNCHRONOUS = PLAIN.replace(detector=Detector(dead_time_ns=0.0, mode="synchronous"))
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Levels of signal photons per period, pixels at each, side of the picture's image."""
+
+    signals: tuple[float, ...]
+    pixels: int
+    size: int
+
+
+FULL = Settings(tuple(float(s) for s in np.geomspace(0.003, 10.0, 15)), 1000, 48)
+QUICK = Settings((0.03, 0.3, 3.0), 100, 24)
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A bright room: true depth (H, W), m, and what two methods make of it."""
+
+    depth_m: Any
+    signal: Any
+    estimates: dict[str, Reconstruction]
+
+
+_DELAY_NS = 50.0  # both ends of the exposure matter there
+_LONG = 20_000  # cycles
+_STEP = 2e-3  # of finite differences, in standard errors
+FREE = (1.0, 1.76, 3.14, 5.6, 10.0)
+CLOCKED = (1.76, 3.14, 5.6)
+
+
+def lines(pixels: int) -> list[dict[str, Any]]:
+    """A line for each brightness: error of S over the bound, and two bounds that know more of a short exposure."""
+    return [line(PLAIN, s, pixels) for s in FREE] + [line(SYNCHRONOUS, s, pixels) for s in CLOCKED]
+
+
+def line(system: System, signal: float, pixels: int) -> dict[str, Any]:
+    """Maximum likelihood and bounds of S at one brightness, in units of the Cramer-Rao bound of known armed times."""
+    background = signal / SBR
+    flux = Flux(np.full(pixels, signal), background, _DELAY_NS)
+    bound = cramer_rao(Flux(signal, background, _DELAY_NS), system)
+    least = float(bound.signal)
+    out: dict[str, Any] = {"detector": system.detector.mode, "S": signal, "bound %": 100.0 * least / signal}
+    for cycles in (system.cycles, _LONG):
+        longer = system.replace(cycles=cycles)
+        cube = simulate(flux, longer, seed=SEED)[0, 0]
+        for less, name in ((True, ""), (False, " of the maximum")):
+            if not less and cycles != system.cycles:
+                continue
+            estimate = reconstruct(cube, longer, MaximumLikelihood(less_bias=less))
+            error = (estimate.signal - signal)[estimate.flags & Flags.SATURATED == 0] / least
+            error *= np.sqrt(cycles / system.cycles)
+            out[f"error{name} / bound, {cycles} cycles"] = float(np.sqrt(np.mean(error**2)))
+            out[f"bias{name} / bound, {cycles} cycles"] = float(error.mean())
+        if cycles == system.cycles:
+            out |= _bounds(cube, longer, (signal, background, _DELAY_NS), bound.information, least)
+    return out
+
+
+def _bounds(
+    cube: NDArray[Any],
+    system: System,
+    truth: tuple[float, float, float],
+    information: NDArray[np.float64],
+    least: float,
+) -> dict[str, float]:
+    """Bounds from the scores of simulated histograms: the first derivatives, and with the second ones.
+
+    Bhattacharyya, Sankhya 8, 1 (1946): of statistics L'/L and L''/L, an unbiased estimate of S has covariance 1 with
+    the first's derivative by S, 0 with all others.
+    """
+    scale = np.sqrt(np.diag(np.linalg.inv(information)))
+    steps = _STEP * np.concatenate([np.zeros((1, 3)), np.diag(scale), -np.diag(scale)])
+    points = np.asarray(truth) + steps
+    gradient = np.array([log_likelihood(h, Flux(*points.T), system)[1] for h in cube])  # (pixels, 7, 3)
+    score = gradient[:, 0] * scale
+    second = (gradient[:, 1:4] - gradient[:, 4:]) * scale / (2.0 * _STEP)
+    second = 0.5 * (second + second.transpose(0, 2, 1)) + score[:, :, None] * score[:, None, :]
+    pairs = np.triu_indices(3)
+    both = np.concatenate([score, second[:, pairs[0], pairs[1]]], axis=1)
+    entries = {}
+    for name, statistics in (("bound, ends hidden", score), ("bound, second order", both)):
+        inverse = np.linalg.inv(statistics.T @ statistics / len(statistics))
+        entries[name] = float(np.sqrt(inverse[0, 0]) * scale[0] / least)
+    return entries
+
+
+_ALONE = [name for name, method in METHODS.items() if not method.of_images]
+_COLOUR = dict(zip(_ALONE, (*COLOURS, INK), strict=True))
+TITLE = {"nonparalyzable": "free-running, t_d = 75 ns", "synchronous": "synchronous"}
+
+
+def flux_figure(rows: Sequence[Row]) -> Figure:
+    """RMSE and bias of depth and signal over flux: a column for each detector."""
+    quantities = (
+        ("depth RMSE mm", "depth bound mm", "depth RMSE (mm)"),
+        ("depth bias mm", None, "depth |bias| (mm)"),
+        ("signal RMSE %", "signal bound %", "signal RMSE (%)"),
+        ("signal bias %", None, "signal |bias| (%)"),
+    )
+    figure, axes = panels(5.7, 4, 2, sharex=True, sharey="row")
+    for column, detector in enumerate(TITLE):
+        mine = [row for row in rows if row["detector"] == detector]
+        for line, (name, bound, label) in enumerate(quantities):
+            ax = axes[line, column]
+            for method in dict.fromkeys(row["method"] for row in mine):
+                here = [row for row in mine if row["method"] == method]
+                x = [row["signal"] for row in here]
+                y = np.abs([row[name] for row in here])
+                ax.plot(x, y, "o-", ms=2.5, lw=1.0, color=_COLOUR[method], label=method.replace("_", " "))
+                if bound and method == "maximum_likelihood":
+                    ax.plot(x, [row[bound] for row in here], "--", lw=1.2, color=INK, label="bound", zorder=5)
+            ax.set(xscale="log", yscale="log")
+            ax.minorticks_off()
+            if column == 0:
+                ax.set_ylabel(label)
+            if line == 0:
+                ax.set_title(TITLE[detector], loc="left")
+            if line == len(quantities) - 1:
+                ax.set_xlabel("signal = background photons per period")
+    methods = dict.fromkeys(row["method"] for row in rows)
+    legend_below(figure, axes[0], len(methods) + 1, handlelength=1.2, columnspacing=1.0)
+    axes[2, 0].set_ylim(1.0, 1e3)
+    axes[3, 0].set_ylim(1e-2, 1e3)
+    axes[0, 0].set_ylim(1.0, 3e2)
+    axes[1, 0].set_ylim(1e-2, 1e2)
+    return figure
+
+
+def maps_figure(picture: Picture) -> Figure:
+    """A bright room: true maps, and those of two methods."""
+    limits = _limits(picture.depth_m)
+    errors = {name: 1e3 * (each.depth_m - picture.depth_m) for name, each in picture.estimates.items()}
+    reach = float(np.percentile(np.abs(errors["matched_filter"]), 98))
+    share = _limits(picture.signal)
+    figure, axes = panels(4.3, 2, 3)
+    for ax, name in zip(axes[0, 1:], picture.estimates, strict=True):
+        words = "matched filter, raw counts" if name == "matched_filter" else "maximum likelihood"
+        _draw_map(ax, errors[name], "depth error (mm)", "RdBu_r", (-reach, reach), words)
+    for ax, (name, each) in zip(axes[1, 1:], picture.estimates.items(), strict=True):
+        raw = name == "matched_filter"
+        words = "signal, raw counts (own scale)" if raw else "signal, maximum likelihood"
+        _draw_map(ax, each.signal, "photons per period", "gray", _limits(each.signal) if raw else share, words)
+    _draw_map(axes[0, 0], picture.depth_m, "depth (m)", "viridis", limits, "true depth")
+    _draw_map(axes[1, 0], picture.signal, "photons per period", "gray", share, "true signal")
+    for ax in axes.flat:
+        ax.images[0].set_interpolation("nearest")  # a file a third as large
+    return figure
+
 
 _BOUNDS = 17  # delays at which the bound is computed; between them its logarithm is interpolated
 
 
 def run(request: Request) -> Facts:
     """Sweeps over flux, near the bound, and a picture."""
-    from studies.reconstruction.bounds import lines
-    from studies.reconstruction.figures import TITLE, flux_figure, maps_figure
 
     settings = QUICK if request.quick else FULL
     rows = []

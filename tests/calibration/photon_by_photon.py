@@ -34,6 +34,8 @@ class Truth:
     electronics: float = 0.0
     paralyzable: bool = False
     drift: float = 0.0  # relative change of all light from the first photon to the last
+    flicker: float = 0.0  # standard deviation of the logarithm of all light, from one stretch to the next
+    flicker_periods: int = 1000  # of a stretch
     locked: bool = True  # the recorder's clock begins anew with each laser pulse
 
     @property
@@ -73,6 +75,9 @@ def clocked(t: np.ndarray, truth: Truth) -> np.ndarray:
 
 def _arrivals(truth: Truth, first: int, count: int, cycles: int, random: np.random.Generator) -> np.ndarray:
     level = 1.0 + truth.drift * (np.arange(first, first + count) / cycles - 0.5)
+    if truth.flicker:
+        stretches = np.random.default_rng(7).standard_normal(4 * cycles // truth.flicker_periods + 1)
+        level = level * np.exp(truth.flicker * stretches[np.arange(first, first + count) // truth.flicker_periods])
     signals = random.poisson(truth.signal * level)
     backgrounds = random.poisson(truth.background * level)
     number = np.arange(first, first + count)

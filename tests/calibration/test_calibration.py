@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -140,6 +141,7 @@ def test_an_effect_is_named(effect: str) -> None:
     truth = with_effect(BASE, effect)
     result = ml.calibrate(stream(truth, 300_000 if effect in ("twilight", "electronics") else 100_000, 5))
     assert NAMES[effect] in [suspect.name for suspect in result.suspects]
+    assert pickle.loads(pickle.dumps(result)).estimates == result.estimates
 
 
 @pytest.mark.nightly
@@ -173,6 +175,17 @@ def test_a_drift_is_named_and_grows_the_errors() -> None:
     assert not result.fits
     plain = ml.calibrate(stream(BASE, 60_000, 5))
     assert result.estimates["signal"].error > 1.5 * plain.estimates["signal"].error
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("periods", [130, *nightly(1300)])
+def test_flicker_is_named_and_no_afterpulses(periods: int) -> None:
+    """Light that changes by a third every 56 counts or every 560: they come in bunches, as afterpulses do."""
+    result = ml.calibrate(stream(replace(BASE, flicker=0.36, flicker_periods=periods), 20_000, 1))
+    assert "flicker of the light, counts relative" in [suspect.name for suspect in result.suspects]
+    assert not any(suspect.included for suspect in result.suspects)
+    assert not result.fits
+    assert result.estimates["background"].error > 0.03 * 0.15  # twice that of steady light
 
 
 def test_a_look_stops_before_the_fit() -> None:

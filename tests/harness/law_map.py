@@ -1,23 +1,14 @@
-"""``python -m tests.harness.law_map``: where in the declared domain laws are slow, refuse or disagree with each other.
+"""Random systems of the declared domain, the laws of each, and what must agree between them.
 
-Draws random systems over the Limits of the README, with extra weight near locks (dead times just below k periods, and
-k halves) and at the extremes; times each law of each system in a process of its own, catches what it raises, and
-compares laws that must agree: pmf with cumulants, mean histogram with the mean, the joint law with both, constant light
-with its closed form. Times are those of one thread.
+Extra weight lies near locks (dead times just below k periods, and k halves) and at the extremes. Laws that must agree:
+pmf and cumulants, mean histogram and mean, the joint law and both, constant light and its closed form.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
-import multiprocessing
-import time
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
-from multiprocessing.connection import Connection
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,8 +16,6 @@ import numpy as np
 import mars_lidar as ml
 
 PERIOD_NS = 100.0
-LIMIT_S = 2.0  # what a law may take
-KILLED_S = 40.0  # on a busy machine much more than the time of the processor
 SMALL = 1e-3  # by which laws may disagree, in standard deviations or relative
 TINY = 1e-12  # probability that is nothing
 
@@ -172,23 +161,6 @@ def laws(drawn: Drawn) -> dict[str, Callable[[Values], Values]]:
     return results
 
 
-def _worker(pipe: Connection) -> None:
-    while True:
-        drawn = pipe.recv()
-        values: Values = {}
-        for name, law in laws(drawn).items():
-            began = time.process_time()
-            try:
-                some = law(values)
-                values |= some
-                pipe.send((name, time.process_time() - began, "", some))
-            except KeyError:  # of a law that has been refused
-                continue
-            except Exception as error:
-                pipe.send((name, time.process_time() - began, f"{type(error).__name__}: {error}", {}))
-        pipe.send(None)
-
-
 def disagreements(drawn: Drawn, values: Values) -> list[str]:
     """What does not agree, in words."""
     results = []
@@ -226,72 +198,3 @@ def disagreements(drawn: Drawn, values: Values) -> list[str]:
         if plain and drawn.start == "armed" and drawn.dead >= drawn.cycles:
             compare("mean", -math.expm1(-(drawn.signal + drawn.background) * drawn.cycles), scale)
     return results
-
-
-class _Workers:
-    """A process that is started again where a law had to be killed."""
-
-    def __init__(self) -> None:
-        self.context = multiprocessing.get_context("fork")
-        self.start()
-
-    def start(self) -> None:
-        self.pipe, other = self.context.Pipe()
-        self.process = self.context.Process(target=_worker, args=(other,), daemon=True)
-        self.process.start()
-
-    def run(self, drawn: Drawn) -> tuple[dict[str, tuple[float, str]], Values]:
-        times: dict[str, tuple[float, str]] = {}
-        values: Values = {}
-        self.pipe.send(drawn)
-        while True:
-            if not self.pipe.poll(KILLED_S):
-                self.process.kill()
-                self.process.join()
-                missing = [name for name in laws(drawn) if name not in times]
-                times[missing[0]] = (KILLED_S, "killed")
-                self.start()
-                return times, values
-            message = self.pipe.recv()
-            if message is None:
-                return times, values
-            name, seconds, error, some = message
-            times[name] = (seconds, error)
-            values |= some
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--systems", type=int, default=1000)
-    parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("-o", type=Path, default=None, help="write every system as a line of JSON")
-    asked = parser.parse_args()
-    workers = _Workers()
-    slow: Counter[str] = Counter()
-    refused: Counter[str] = Counter()
-    wrong = 0
-    lines = []
-    for seed in range(asked.first, asked.first + asked.systems):
-        drawn = draw(seed)
-        times, values = workers.run(drawn)
-        bad = disagreements(drawn, values)
-        differences = []
-        for name, (seconds, error) in times.items():
-            if seconds > LIMIT_S:
-                slow[name] += 1
-                differences.append(f"{name} {seconds:.1f} s")
-            if error:
-                refused[f"{name} {error.split(':')[0]}"] += 1
-                differences.append(f"{name}: {error}")
-        wrong += bool(bad)
-        if differences or bad:
-            print(f"{drawn}\n    " + "\n    ".join([*differences, *(f"WRONG {b}" for b in bad)]), flush=True)
-        lines.append(json.dumps(vars(drawn) | {"times": times, "values": values, "wrong": bad}))
-    if asked.o:
-        asked.o.write_text("\n".join(lines) + "\n")
-    print(f"{asked.systems} systems; slower than {LIMIT_S:g} s: {dict(slow)}")
-    print(f"raised: {dict(refused)}; disagree: {wrong}")
-
-
-if __name__ == "__main__":
-    main()

@@ -33,7 +33,7 @@ def test_it_is_short():
 
 
 @pytest.mark.nightly
-@pytest.mark.filterwarnings("ignore:Maximum number of epochs")  # four on purpose: `train` says why
+@pytest.mark.filterwarnings("ignore::UserWarning")  # sbi's: four epochs and a prior by its draws alone, on purpose
 def test_own_prior():
     """90 % intervals hold 88 to 92 % over the prior: beyond that 3 standard errors (false alarm 4e-3 over six ends)."""
     pytest.importorskip("sbi")
@@ -64,14 +64,15 @@ def test_learned_prior(deepinv):
 
 def test_the_data_term_of_the_learned_prior_is_the_likelihood(deepinv):
     """The gradient that deepinv follows beside that of the native likelihood, to 2 % of its standard deviation."""
-    from mars_lidar.learn import LidarPhysics
+    from mars_lidar.learn import LidarLikelihood, LidarPhysics
     from mars_lidar.reconstruction import log_likelihood
 
     example = runpy.run_path(str(PATH.with_name("learned_prior.py")))
-    system, physics = example["SYSTEM"], LidarPhysics(example["SYSTEM"])
+    system, physics = example["SYSTEM"], LidarPhysics(example["SYSTEM"], images="log")
     light = example["scenes"]("room", 8, [0]).double()
-    y = physics(light, seed=1)
-    gradient = example["Likelihood"]().grad(example["images"](light), y, physics)[0].detach()
+    x = example["images"](light)
+    y = physics(x, seed=1)
+    gradient = LidarLikelihood().grad(x, y, physics)[0].detach()
     units = (light[0, 0], light[0, 1], torch.tensor(example["PULSE_NS"]).expand(8, 8))
     for row, column in ((0, 0), (3, 4), (7, 2), (5, 5)):
         _, slope, information = log_likelihood(

@@ -202,3 +202,24 @@ def test_stock_solvers_on_a_built_in_room(deepinv, name):
     result = likelihood_descent(physics, y, prior(), stepsize=0.02, max_iter=40, **options)
     before, after = ((item - true).square().mean((0, 2, 3)).sqrt() for item in (physics.A_dagger(y), result))
     assert (after < before).all()
+
+
+@pytest.mark.full
+def test_drunet_runs_as_it_comes(deepinv, tmp_path):
+    """Weights of one's own from a file, for deepinv's own are a download: two steps, beside the same by hand."""
+    from deepinv.models import DRUNet
+    from deepinv.optim.prior import PnP
+
+    from mars_lidar.learn import LidarLikelihood, LidarPhysics
+
+    physics, weights = LidarPhysics(SYSTEM.replace(cycles=100), images="log", seed=3), tmp_path / "weights.pt"
+    torch.manual_seed(0)
+    torch.save(DRUNet(3, 3, nc=(8, 8, 8, 8), nb=1, pretrained=None).state_dict(), weights)
+    denoiser = DRUNet(3, 3, nc=(8, 8, 8, 8), nb=1, pretrained=str(weights)).eval()
+    y = physics(physics.images(*torch.tensor([0.6, 0.32, 40.0]).reshape(3, 1, 1, 1).expand(3, 1, 16, 16)))
+    images = likelihood_descent(physics, y, PnP(denoiser), stepsize=0.005, sigma_denoiser=0.1, max_iter=2)
+    by_hand = physics.A_dagger(y)
+    for _ in range(2):
+        by_hand = denoiser(by_hand - 0.005 * LidarLikelihood().grad(by_hand, y, physics), 0.1).detach()
+    torch.testing.assert_close(images, by_hand, rtol=1e-4, atol=1e-5)
+    assert (images - physics.A_dagger(y)).abs().max() > 0.1

@@ -490,7 +490,7 @@ def test_a_warm_state_that_is_not_found_is_refused():
 def test_random_systems(first: int):
     for seed in range(first, first + 8):
         drawn, values, unhelpful = draw(seed), {}, []
-        if drawn.electronics or drawn.dead > 300.0 or drawn.bins > 4096:  # right, but slow: `tests.harness.law_map`
+        if drawn.electronics or drawn.dead > 300.0 or drawn.bins > 4096:  # right, but slow: `python -m studies domain`
             continue
         for name, law in laws(drawn).items():
             try:

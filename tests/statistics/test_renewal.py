@@ -15,7 +15,7 @@ from mars_lidar.statistics import (
     photons_per_bin,
 )
 from mars_lidar.statistics.renewal import lag_covariances, row_moments, weighted_waits
-from studies.covariance.dense import moment_matrices
+from studies.covariance.run import moment_matrices
 
 # photons per period, dead time in periods, re-arming
 CASES = [

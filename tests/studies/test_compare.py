@@ -12,10 +12,8 @@ from scipy import stats
 
 import mars_lidar as ml
 from mars_lidar.engines import ENGINES, Engine
-from studies.compare.comparison import compare
-from studies.compare.figures import comparison
-from studies.compare.pixel import telling_pixels
-from studies.compare.tables import show
+from studies.compare.comparison import compare, telling_pixels
+from studies.compare.report import comparison, show
 
 SYSTEM = ml.System(
     period_ns=100.0,

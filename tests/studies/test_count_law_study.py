@@ -38,7 +38,7 @@ def cells():
 def test_files(quick):
     text = (quick / "count_law.md").read_text()
     figures = [path for path in quick.iterdir() if path.suffix == ".png"]
-    assert len(figures) == 3
+    assert len(figures) == 2
     for path in figures:
         assert 5_000 < path.stat().st_size <= MAX_FIGURE_BYTES
         assert text.count(f"({path.name})") == 1

@@ -17,15 +17,10 @@ from studies.__main__ import main
 from studies.common.distance import neighbours
 from studies.common.report import MAX_FIGURE_BYTES
 from studies.domain import judge as judging
-from studies.domain import verdict
-from studies.domain.case import MOVING, PERIOD_NS, Case
-from studies.domain.checks import Check, two_samples
-from studies.domain.closed_forms import known
-from studies.domain.judge import Budget, judge
-from studies.domain.samples import Windows, simulated
-from studies.domain.sweep import Settings, judge_case
-from studies.domain.systems import FAMILIES, draw
-from studies.domain.watch import Watched
+from studies.domain.checks import Check, Windows, simulated, two_samples
+from studies.domain.judge import Budget, judge, known
+from studies.domain.sweep import Settings, Watched, judge_case
+from studies.domain.systems import FAMILIES, MOVING, PERIOD_NS, Case, draw
 
 
 def pixel(signal: float = 1.0, background: float = 0.5, dead: float = 0.4, cycles: int = 100, **more: object) -> Case:
@@ -70,11 +65,11 @@ def test_a_right_engine_passes_and_wrong_ones_do_not(monkeypatch: pytest.MonkeyP
     """Engine "poisson", which knows no dead time, called "exact": every kind of comparison sees it."""
     case, budget = pixel(), Budget(2e5, 1e6, 2000)
     outcomes = judge(case, 1, budget, silent)
-    assert {o.subject for o in outcomes} >= set(verdict.SUBJECTS)
+    assert {o.subject for o in outcomes} >= set(judging.SUBJECTS)
     assert {o.state for o in outcomes if o.subject != "cramer_rao"} <= {
-        verdict.VERIFIED,
-        verdict.HANDED,
-        verdict.UNJUDGED,
+        judging.VERIFIED,
+        judging.HANDED,
+        judging.UNJUDGED,
     }
     assert min(c.p for o in outcomes for c in o.checks) > 1e-4
     monkeypatch.setattr(
@@ -94,7 +89,7 @@ def test_a_right_engine_passes_and_wrong_ones_do_not(monkeypatch: pytest.MonkeyP
         ("sequential", "mean histogram"),
         ("simulator", "law of the count"),
     } <= kinds
-    assert set(verdict.blamed(wrong)) == {"exact"}
+    assert set(judging.blamed(wrong)) == {"exact"}
 
 
 def _called(sample: object, name: str) -> object:
@@ -104,32 +99,32 @@ def _called(sample: object, name: str) -> object:
 
 def test_the_second_drawing_decides() -> None:
     """Levels multiply; a chance deviation in the first drawing does not make a failure."""
-    level = verdict.second_level(100_000)
-    assert level * verdict.FIRST_LEVEL * 100_000 == pytest.approx(verdict.FAMILY_LEVEL)
+    level = judging.second_level(100_000)
+    assert level * judging.FIRST_LEVEL * 100_000 == pytest.approx(judging.FAMILY_LEVEL)
     settings = Settings(1, 1, Budget(2e4, 1e5, 100), 100)
 
     class Odd(Watched):
         def judge(self, case, seed, budget, patience=None):
             first = budget.exposures == 100
             check = Check("exact", "pmf", "law of the count", 1e-6 if first else 0.3, 0.1)
-            return [verdict.Outcome("exact", verdict.VERIFIED, checks=[check])]
+            return [judging.Outcome("exact", judging.VERIFIED, checks=[check])]
 
     judged = judge_case(pixel(), settings, Odd(), 1)
     assert judged.suspects
     assert not judged.failing
-    assert judged.outcomes[0].state == verdict.VERIFIED
+    assert judged.outcomes[0].state == judging.VERIFIED
 
 
 def test_blame_and_refusals() -> None:
     bad = [Check("feedback", b, "mean", 0.0, 1.0) for b in ("count_law", "exact", "joint_law")]
-    assert set(verdict.blamed(bad)) == {"feedback"}
-    assert set(verdict.blamed([Check("exact", "mean_histogram", "x", 0.0, 1.0)])) == {"mean_histogram"}
+    assert set(judging.blamed(bad)) == {"feedback"}
+    assert set(judging.blamed([Check("exact", "mean_histogram", "x", 0.0, 1.0)])) == {"mean_histogram"}
     law = [Check(a, "count_law", "mean", 0.0, 1.0) for a in ("exact", "sequential", "simulator")]
-    assert set(verdict.blamed(law)) == {"count_law"}
-    assert verdict.refusal(ValueError("this does not do gates; use engine 'exact'"))
-    assert not verdict.refusal(ConvergenceError("not reached"))
-    assert not verdict.refusal(OverflowError("use fewer cycles"))
-    assert not verdict.refusal(RuntimeError("use anything"))
+    assert set(judging.blamed(law)) == {"count_law"}
+    assert judging.refusal(ValueError("this does not do gates; use engine 'exact'"))
+    assert not judging.refusal(ConvergenceError("not reached"))
+    assert not judging.refusal(OverflowError("use fewer cycles"))
+    assert not judging.refusal(RuntimeError("use anything"))
 
 
 @pytest.mark.full
@@ -145,12 +140,12 @@ def test_what_hangs_is_stopped_and_what_crashes_is_told(monkeypatch: pytest.Monk
             return os._exit, (3,)
 
     with Watched(0.3) as watched:
-        [only] = [o for o in watched.judge(Ends(), 1, Budget(1e3, 1e3, 10)) if o.state == verdict.FAILED]  # type: ignore[arg-type]
+        [only] = [o for o in watched.judge(Ends(), 1, Budget(1e3, 1e3, 10)) if o.state == judging.FAILED]  # type: ignore[arg-type]
         assert only.note.startswith("the process ended with code ")
         began = time.monotonic()
         slow = pixel(50.0, 50.0, 0.9999, 10**8)
         states = {o.subject: o.state for o in watched.judge(slow, 1, Budget(1e3, 1e3, 10))}
-        assert states["exact"] == verdict.SLOW
+        assert states["exact"] == judging.SLOW
         assert time.monotonic() - began < 120.0
 
 
@@ -221,7 +216,7 @@ def test_quick_form(tmp_path, capsys) -> None:
     with (tmp_path / "domain.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 60
-    assert {row["exact"] for row in rows} <= set(verdict.STATES)
-    assert sum(row["exact"] == verdict.VERIFIED for row in rows) > 40
+    assert {row["exact"] for row in rows} <= set(judging.STATES)
+    assert sum(row["exact"] == judging.VERIFIED for row in rows) > 40
     for name in ("engines", "engines_exposure", "laws", "laws_exposure", "modes"):
         assert 0 < (tmp_path / f"domain_{name}.png").stat().st_size <= MAX_FIGURE_BYTES

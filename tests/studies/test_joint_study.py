@@ -14,8 +14,7 @@ from mars_lidar.statistics import ConvergenceError
 from studies.__main__ import main
 from studies.common.report import MAX_FIGURE_BYTES
 from studies.joint import cases as bins
-from studies.joint import classifiers, run
-from studies.joint import outcomes as joint
+from studies.joint import run as joint
 
 
 def test_auc_and_its_error():
@@ -23,20 +22,20 @@ def test_auc_and_its_error():
     random = np.random.default_rng(3)
     low, high = random.integers(0, 6, 40).astype(float), random.integers(1, 8, 30).astype(float)
     pairs = high[:, None] - low
-    assert classifiers.auc(low, high)[0] == pytest.approx(np.mean((pairs > 0) + 0.5 * (pairs == 0)))
-    assert classifiers.auc(high, low)[0] == pytest.approx(1.0 - classifiers.auc(low, high)[0])
-    shifted = [classifiers.auc(random.normal(size=300), random.normal(1.0, size=200)) for _ in range(400)]
+    assert joint.auc(low, high)[0] == pytest.approx(np.mean((pairs > 0) + 0.5 * (pairs == 0)))
+    assert joint.auc(high, low)[0] == pytest.approx(1.0 - joint.auc(low, high)[0])
+    shifted = [joint.auc(random.normal(size=300), random.normal(1.0, size=200)) for _ in range(400)]
     value, error = np.array(shifted).T
     truth = stats.norm.cdf(np.sqrt(0.5))
     z = (value - truth) / error
     require({"normal": stats.kstest(z, "norm").pvalue}, "AUC of shifted normals")
-    null = [classifiers.auc(random.normal(size=300), random.normal(size=200))[0] for _ in range(400)]
-    z = (np.array(null) - 0.5) / classifiers.chance_error(300, 200)
+    null = [joint.auc(random.normal(size=300), random.normal(size=200))[0] for _ in range(400)]
+    z = (np.array(null) - 0.5) / joint.chance_error(300, 200)
     require({"normal": stats.kstest(z, "norm").pvalue}, "AUC of one law")
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("kind", classifiers.CLASSIFIERS)
+@pytest.mark.parametrize("kind", joint.CLASSIFIERS)
 def test_classifiers(kind):
     """Of two normal laws the best AUC is known; of one law it is chance, collinear and constant features or not."""
     pytest.importorskip("sklearn", reason="extra 'studies'")
@@ -44,13 +43,13 @@ def test_classifiers(kind):
     x, y, z = (random.normal(size=(2000, 3)) for _ in range(3))
     y[:, 0] += 1.0
     x, y, z = (np.column_stack([a, a.sum(-1), np.full(len(a), 7.0)]) for a in (x, y, z))
-    result, error = classifiers.separate(kind, x, y, 1)
+    result, error = joint.separate(kind, x, y, 1)
     best = stats.norm.cdf(np.sqrt(0.5))
     assert best - 0.05 - 4 * error < result < best + 5.2 * error
-    result, _ = classifiers.separate(kind, x, z, 1)
-    p = 2 * stats.norm.sf(abs(result - 0.5) / classifiers.chance_error(1000, 1000))
+    result, _ = joint.separate(kind, x, z, 1)
+    p = 2 * stats.norm.sf(abs(result - 0.5) / joint.chance_error(1000, 1000))
     require({kind: p}, "one law, two samples")
-    assert classifiers.separate(kind, x[:, 4:], y[:, 4:], 1) == (0.5, 0.0)
+    assert joint.separate(kind, x[:, 4:], y[:, 4:], 1) == (0.5, 0.0)
 
 
 def test_qda_sees_covariance():
@@ -59,8 +58,8 @@ def test_qda_sees_covariance():
     random = np.random.default_rng(6)
     laws = [np.array([[1.0, c], [c, 1.0]]) for c in (0.6, -0.6)]
     x, y = (random.multivariate_normal([0, 0], law, size=4000) for law in laws)
-    best, _ = classifiers.auc(*(-np.prod(random.multivariate_normal([0, 0], law, size=50_000), -1) for law in laws))
-    result, error = classifiers.separate(classifiers.QDA, x, y, 1)
+    best, _ = joint.auc(*(-np.prod(random.multivariate_normal([0, 0], law, size=50_000), -1) for law in laws))
+    result, error = joint.separate(joint.QDA, x, y, 1)
     assert abs(result - best) < 5.2 * error + 0.003
     assert result > 0.7
 
@@ -87,7 +86,7 @@ def test_pixels_given_to_exact_are_not_judged():
     assert results["feedback"].instead == "exact"
     assert not results["feedback"].aucs
     assert results["mars"].aucs
-    assert run.given_to_exact(list(results.values())) == ["too short"]
+    assert joint.given_to_exact(list(results.values())) == ["too short"]
 
 
 @pytest.mark.full
@@ -101,7 +100,7 @@ def test_files(tmp_path):
         rows = list(csv.DictReader(file))
     quick = joint.QUICK
     assert len(rows) == (1 + len(joint.ENGINES)) * (len(quick.cases) + quick.systems)
-    chance = classifiers.chance_error(quick.exposures // 2, quick.exposures // 2)
+    chance = joint.chance_error(quick.exposures // 2, quick.exposures // 2)
     outcomes = {}
     for row in rows:
         if row["random"] == "0" and row["engine"] in (bins.AGAIN, "feedback"):

@@ -11,8 +11,8 @@ import mars_lidar as ml
 from benchmarks.numpy_pipeline import STAGES, NumpyTable, synthesize
 from mars_lidar.engines import ANY_SYSTEM
 from studies.__main__ import main
-from studies.runtime import contenders, timing
 from studies.runtime import run as runtime
+from studies.runtime import timing
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +26,7 @@ def test_files(tmp_path):
     with (tmp_path / "runtime.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert {row["axis"] for row in rows} == {"cycles", "flux", "realizations", "pixels", "teaser"}
-    assert {*ANY_SYSTEM, contenders.NUMPY} <= {row["contender"] for row in rows}
+    assert {*ANY_SYSTEM, timing.NUMPY} <= {row["contender"] for row in rows}
     assert all((row["seconds"] == "") == bool(row["why"]) for row in rows)
     text = (tmp_path / "runtime.md").read_text()
     assert "| 105.1 MB | 105 MB |" in text
@@ -118,7 +118,7 @@ def test_points_that_would_take_too_long_are_left_out(monkeypatch):
 
         return run
 
-    monkeypatch.setattr(timing, "contenders", lambda tables: [contenders.Contender("slow", "slow", prepare)])
+    monkeypatch.setattr(timing, "contenders", lambda tables: [timing.Contender("slow", "slow", prepare)])
     axis = timing.Axis("cycles", "cycles", (10.0, 100.0, 1000.0, 10_000.0), 2)
     result = timing.along(timing.QUICK, axis, str)
     assert [p.seconds is not None for p in result] == [True, True, False, False]
@@ -126,7 +126,7 @@ def test_points_that_would_take_too_long_are_left_out(monkeypatch):
 
 
 def test_flux_beyond_the_table_is_left_out():
-    single = next(c for c in contenders.contenders(contenders.Tables((4, 3))) if c.name == contenders.NUMPY)
+    single = next(c for c in timing.contenders(timing.Tables((4, 3))) if c.name == timing.NUMPY)
     assert single.takes(ml.Flux(0.01, 10.0, 1.0))
     assert not single.takes(ml.Flux(0.009, 1.0, 1.0))
     assert not single.takes(ml.Flux(0.1, 10.1, 1.0))
@@ -134,7 +134,7 @@ def test_flux_beyond_the_table_is_left_out():
 
 @pytest.mark.full
 def test_tables_are_shared_between_exposures(system):
-    tables = contenders.Tables((4, 3))
+    tables = timing.Tables((4, 3))
     first = tables.get(system)
     longer = system.replace(cycles=5 * system.cycles)
     assert first.serves(longer.cycles)
@@ -149,4 +149,4 @@ def test_tables_are_shared_between_exposures(system):
 
 
 def test_stages_of_a_report():
-    assert contenders.stages_of({"lookup_s": 0.5, "pixels_exact": 3.0}) == {"lookup": 0.5}
+    assert timing.stages_of({"lookup_s": 0.5, "pixels_exact": 3.0}) == {"lookup": 0.5}

@@ -82,7 +82,8 @@ class Suspect:
     included: bool
 
     def __str__(self) -> str:
-        size = "" if np.isnan(self.size) else f" {self.size:.3g} ± {self.error:.2g}"
+        size = "" if np.isnan(self.size) else f" {self.size:.3g}"
+        size += "" if np.isnan(self.error) else f" ± {self.error:.2g}"
         gain = "" if np.isnan(self.gain) else f", taking it in gains {self.gain:.1f} standard deviations of the misfit"
         state = "in the result" if self.included else f"not in the result: {self.option}"
         clear = f"{self.z:.1f} standard deviations{gain}" if self.z > 0.0 else f"no score of its own{gain}"
@@ -415,15 +416,18 @@ class _Run:
         fitted = self.first()
         wrong = () if fitted.converged and fitted.p_value >= self.level else self.wrong_values(fitted)
         included: list[suspects.Named] = []
-        listed = suspects.scores(self.fit, fitted) if fitted.converged else []
-        for _ in range(self.fit.effort.effects if fitted.converged and not wrong else 0):
+        drift = suspects.drift(self.fit, fitted) if fitted.converged else None
+        steady = fitted.converged and not (drift is not None and drift.flickers)  # or all effects look like it
+        listed = suspects.scores(self.fit, fitted) if steady else []
+        for _ in range(self.fit.effort.effects if steady and not wrong else 0):
             better = suspects.refitted(self.fit, fitted, listed)
             if better is None:
                 break
-            fitted = better[0]
-            included.append(better[1])
+            fitted, effect = better
+            included += [] if effect is None else [effect]
             listed = suspects.scores(self.fit, fitted)
-        drift = suspects.drift(self.fit, fitted) if fitted.converged else None
+        if included:
+            drift = suspects.drift(self.fit, fitted)
         return self.assembled(fitted, included, [] if wrong else listed, drift, wrong)
 
     def wrong_values(self, fitted: Fitted) -> tuple[Suspect, ...]:
@@ -445,7 +449,7 @@ class _Run:
             free = run.first()
             if not free.converged or free.p_value < self.level:
                 continue
-            at = _estimates(free, fixed, np.ones(free.model.size)).get(name, Estimate(np.nan, np.nan, np.nan, np.nan))
+            at = _estimates(free, np.ones(free.model.size)).get(name, Estimate(np.nan, np.nan, np.nan, np.nan))
             printed = f"{given:g}" if isinstance(given, float) else str(given)
             gain = fitted.misfit_z - free.misfit_z if fitted.converged else float("nan")
             z = abs(at.value - given) / at.error if isinstance(given, float) and at.error > 0.0 else 0.0
@@ -487,7 +491,7 @@ class _Run:
     ) -> Calibration:
         """The result of the last fit."""
         growth = _growth(fitted, drift)
-        estimates = _estimates(fitted, self.fixed, growth)
+        estimates = _estimates(fitted, growth)
         named: list[Suspect] = list(wrong)
         for refit in included:
             name = refit.effect.names[0]
@@ -498,12 +502,15 @@ class _Run:
         p = fitted.p_value if fitted.converged else 0.0
         if drift is not None:
             p = min(1.0, 2.0 * min(p, drift.probability))
+            option = "calibrate parts of the recording; the errors include what the parts scatter"
             for k in np.flatnonzero(drift.drifts):
                 change = drift.change[k] / (drift.values[:, k].mean() if k == 0 else 1.0)
                 words = "drift of the light, relative" if k == 0 else f"drift of {drift.names[k]}, ns"
                 error = abs(drift.change[k] / drift.trend[k]) * abs(change / drift.change[k])
-                option = "calibrate parts of the recording; the errors include what the parts scatter"
                 named.append(Suspect(words, abs(drift.trend[k]), change, error, np.nan, option, included=False))
+            if drift.flickers:
+                words = "flicker of the light, counts relative"
+                named.append(Suspect(words, drift.flicker_z, drift.flicker, np.nan, np.nan, option, included=False))
         families = {suspect.name for suspect in named}
         for score in listed:
             if score.z > suspects.clear(listed) and score.effect.words not in families:
@@ -524,7 +531,7 @@ class _Run:
         system = fitted.model.system(centre, cycles, 1024) if known else None
         flux = fitted.model.flux(centre) if known else None
         ordered = tuple(sorted(named, key=lambda suspect: (not suspect.included, -suspect.z)))
-        limits, look, recording = _limits(fitted, listed), self.look, self.recording
+        limits, look, recording = _limits(fitted, listed if p >= self.level else []), self.look, self.recording
         return Calibration(
             look, estimates, p, ordered, limits, drift, system, flux, wave, error, recording, fitted, self.level
         )
@@ -536,13 +543,13 @@ def _growth(fitted: Fitted, drift: Drift | None) -> FloatArray:
     if drift is None:
         return out
     for k, name in enumerate(drift.names):
-        if drift.drifts[k]:
+        if drift.drifts[k] or (k == 0 and drift.flickers):
             which = [i for i, own in enumerate(fitted.model.names[: fitted.model.light]) if (own == name) or k == 0]
             out[which] = np.maximum(out[which], drift.growth[k])
     return out
 
 
-def _estimates(fitted: Fitted, fixed: dict[str, float], growth: FloatArray) -> dict[str, Estimate]:
+def _estimates(fitted: Fitted, growth: FloatArray) -> dict[str, Estimate]:
     """What is printed, written and drawn, from draws of the law of the parameters."""
     model = fitted.model
     scale = growth[fitted.free]

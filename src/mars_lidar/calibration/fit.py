@@ -9,7 +9,7 @@ may be shorter than the recording.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -50,7 +50,7 @@ class Effort:
     longer: float = 4.0
     more: int = 2
     recentred: int = 4
-    widths: int = 8
+    widths: int = 4
     draws: int = 20_000
     attempts: int = 3
     effects: int = 2
@@ -136,12 +136,12 @@ def design(
     within = cov[np.ix_(lit, lit)]
     if det.size:
         between = cov[np.ix_(det, det)]
-        away = np.repeat(normal(number, det.size) @ _root(between).T, LIGHTS, 0)
+        away = np.repeat(normal(number, det.size) @ root_of(between).T, LIGHTS, 0)
         gain = cov[np.ix_(lit, det)] @ np.linalg.pinv(between, rcond=1e-10)
         rows[:, det] += away
         rows[:, lit] += away @ gain.T
         within = within - gain @ cov[np.ix_(det, lit)]
-    rows[:, lit] += normal(len(rows), lit.size) @ _root(within).T
+    rows[:, lit] += normal(len(rows), lit.size) @ root_of(within).T
     rows[:, k : k + 2] = np.abs(rows[:, k : k + 2])
     if model.split:
         rows[:, k + 1] = np.arcsin(np.abs(np.sin(rows[:, k + 1])))
@@ -158,7 +158,7 @@ def design(
     return rows
 
 
-def _root(cov: FloatArray) -> FloatArray:
+def root_of(cov: FloatArray) -> FloatArray:
     """A root of a covariance that rounding may have made indefinite."""
     scale = np.sqrt(np.maximum(np.diag(cov), 1e-300))
     values, vectors = np.linalg.eigh(cov / np.outer(scale, scale))
@@ -238,7 +238,7 @@ def most_probable(model: Model, theta: FloatArray, covariance: FloatArray, free:
 
 def draws(model: Model, theta: FloatArray, covariance: FloatArray, free: NDArray[np.intp]) -> FloatArray | None:
     """Parameters (n, p) of that law, or None where hardly any lies within the bounds."""
-    root = _root(covariance)
+    root = root_of(covariance)
     rows = np.tile(theta, (Effort.draws, 1))
     rows[:, free] += np.random.default_rng(0).standard_normal((Effort.draws, len(free))) @ root.T
     inside = (np.abs(model.bounded(rows) - rows)[:, free] <= 1e-12 * np.abs(theta[free])).all(1)
@@ -261,6 +261,11 @@ class Fit:
     def __init__(self, recording: Recording, effort: Effort, seed: tuple[int, ...]) -> None:
         self.recording, self.effort = recording, effort
         self._random = np.random.default_rng(seed)
+
+    @property
+    def shorter(self) -> Fit:
+        """A fit whose last batches are as short as those of the steps, to choose between models."""
+        return Fit(self.recording, replace(self.effort, longer=1.0, more=1, recentred=2), (self.next_seed(),))
 
     def next_seed(self) -> int:
         """A seed that no batch has had."""
@@ -292,7 +297,7 @@ class Fit:
         size = self.effort.of(photons, times)
         linear = np.diag(model.scale(theta)[free] ** -2.0)
         precision = np.linalg.inv(spread**2 * photons / size * root @ root.T) + linear
-        wide = _root(np.asarray(np.linalg.inv(precision), np.float64))
+        wide = root_of(np.asarray(np.linalg.inv(precision), np.float64))
         rows = design(model, theta, wide, free, self.next_seed(), more * self.effort.settings, self.effort.widths)
         exposure = max(2, round(self.exposure(size)))
         made = counted(model, cells, rows, exposure, self.next_seed())
@@ -326,7 +331,7 @@ class Fit:
             grown = min(photons, weighed * 6.0) if near else weighed
             cov = cov * (weighed / grown)
             cov = cov + np.diag(0.02**2 * np.diag(cov))
-            root = _root(cov)
+            root = root_of(cov)
             if near and weighed >= photons:
                 break
             weighed = grown
@@ -335,16 +340,15 @@ class Fit:
     def shortest(self, model: Model, theta: FloatArray) -> tuple[float, float]:
         """Dead time by the shortest interval alone, and its standard error, by streams as long as the recording.
 
+        They are drawn at parameters (p,), or of each of a few (n, p), which are uncertain then and scatter more.
         The fit counts intervals in cells, and does not know where in its cell an interval lies.
         """
         recorded = min(float(np.diff(piece).min()) for piece in self.recording.pieces)
         cycles, number = max(2, round(self.recording.exposure)), 4.0 * self.effort.batch / self.recording.photons
-        drawn = [
-            float(np.diff(model.streams(theta[None], cycles, self.next_seed()).times).min(initial=np.inf))
-            for _ in range(int(np.clip(number, 4, LIGHTS)))
-        ]
-        later = recorded - float(np.mean(drawn))
-        return float(theta[model.light + 2]) + later, float(np.hypot(np.std(drawn, ddof=1), model.clock.unit_ns))
+        rows = np.resize(theta, (int(np.clip(number, 4, LIGHTS)), model.size))
+        drawn = [np.diff(model.streams(row[None], cycles, self.next_seed()).times).min(initial=np.inf) for row in rows]
+        later = np.array(drawn) - rows[:, model.light + 2]
+        return recorded - float(later.mean()), float(np.hypot(later.std(ddof=1), model.clock.unit_ns))
 
     def settled(self, model: Model, theta: FloatArray) -> tuple[float, float]:
         """That dead time by streams that have it; its error is wider where a shorter one has as long intervals."""
@@ -375,7 +379,7 @@ class Fit:
             theta[free] += gain * (dead - theta[model.light + 2])
             theta, middle[model.light + 2] = model.bounded(theta), dead
             prior[place, place] = error**-2.0
-            root = _root(root @ root.T + (error**2 - root[place] @ root[place]) * np.outer(gain, gain))
+            root = root_of(root @ root.T + (error**2 - root[place] @ root[place]) * np.outer(gain, gain))
             cells = self.cells(model, theta, photons, _CUMULATED)
         law = self.law(Guess(model, theta, root, free), photons, cells, closer, effort.more, effort.longer)
         nearby = _NEAR * (effort.of(photons, effort.longer) / photons) ** 0.5
@@ -409,11 +413,11 @@ class Fit:
             size = np.abs((mean - centre)[free]) / np.sqrt(np.diag(cov))
             if trial and (size.max() < 1.0 or trial == effort.recentred - 1):
                 break
-            root = _root(cov)
+            root = root_of(cov)
             centre = centre + (mean - centre) / max(1.0, float(size.max()) / _NEAR)
         sd = np.sqrt(np.diag(cov))
         if again and (np.abs((centre - theta)[free]) > _NEAR * sd).any():  # cells and weights were laid elsewhere
-            return self.finish(Guess(model, centre, _root(cov), free), again=False)
+            return self.finish(Guess(model, centre, root_of(cov), free), again=False)
         jacobian = law.slope[:, free] @ local
         project = np.eye(len(recorded)) - jacobian @ estimator
         fresh = near.residual @ project.T
@@ -421,10 +425,18 @@ class Fit:
         rest = project @ (recorded - near.offset)
         (z, p), (dead, scatter) = _misfit(rest, fresh, law, near), self.shortest(model, mean)
         error = float(sd[free == model.light + 2].sum())  # 0 where it is given
-        early = _extreme(dead - mean[model.light + 2], scatter, error)
+        early, more = _extreme(dead - mean[model.light + 2], scatter, error), 0.0
+        if early < FALSE_ALARM and (rows := draws(model, raw, cov, free)) is not None:
+            # a jitter that is not known makes the shortest interval uncertain too
+            further, total = self.shortest(model, rows[:: len(rows) // LIGHTS][:LIGHTS])
+            more = max(total**2 - scatter**2, 0.0) ** 0.5
+            early = max(early, _extreme(further - mean[model.light + 2], scatter, float(np.hypot(error, more))))
         if early < FALSE_ALARM and known is None:
-            last = Guess(model, mean, _root(cov), free)
-            other = self.finish(last, again=False, known=self.settled(model, mean)) if error else None
+            other = None
+            if error:
+                least, own = self.settled(model, mean)
+                last = Guess(model, mean, root_of(cov), free)
+                other = self.finish(last, again=False, known=(least, float(np.hypot(own, more))))
             if other is not None and other.converged and other.p_value > FALSE_ALARM:
                 return other
             p = min(p, early)
@@ -435,12 +447,16 @@ class Fit:
 
 
 def _extreme(off: float, scatter: float, error: float) -> float:
-    """Bound of the probability that the shortest interval is `off` its mean, which has an error of its own, by as much.
+    """Probability that the shortest interval is `off` its mean, which has an error of its own, by as much.
 
-    Chernoff's, of the sum of a normal law and one whose tail is exponential, as that of an extreme value at most is.
+    It is that of the sum of a normal law and one whose tail is exponential, as that of an extreme value is at most.
     """
-    rate = min(np.pi / 6.0**0.5 / scatter, abs(off) / max(error, 1e-12) ** 2)
-    return min(1.0, 2.0 * float(np.exp(0.5 * (rate * error) ** 2 - rate * abs(off))))
+    from scipy.special import log_ndtr, ndtr
+
+    rate, sd = np.pi / 6.0**0.5 / scatter, max(error, 1e-12)
+    z = (abs(off) + 1.0 / rate) / sd  # from the begin of the exponential law, whose mean is zero
+    tail = np.exp(0.5 * (rate * sd) ** 2 - rate * sd * z + log_ndtr(z - rate * sd))
+    return min(1.0, 2.0 * float(ndtr(-z) + tail))
 
 
 def _misfit(rest: FloatArray, fresh: FloatArray, law: Batch, near: Batch) -> tuple[float, float]:

@@ -53,39 +53,43 @@ def all_carriers(after: float, delay_ns: float, dead_time_ns: float) -> float:
     return float(min(after * np.exp(min(dead_time_ns / delay_ns, 50.0)), _MOST_CARRIERS))
 
 
+def _afterpulses(fields: Fields, value: tuple[float, ...]) -> Fields:
+    after, delay = value[0], float(np.exp(value[1]))
+    carriers = all_carriers(after, delay, fields["dead_time_ns"])
+    return fields | ({"afterpulsing": Afterpulsing(probability=carriers, delay_ns=delay)} if carriers > 0 else {})
+
+
+def _electronics(fields: Fields, value: tuple[float, ...]) -> Fields:
+    observed = fields["dead_time_ns"]  # that of the electronics, over a detector that is ready earlier
+    return fields | {"electronics_dead_time_ns": observed, "dead_time_ns": observed / (1.0 + value[0])}
+
+
+def _twilight(fields: Fields, value: tuple[float, ...]) -> Fields:
+    return fields | {"twilight_ns": min(value[0], fields["dead_time_ns"])}
+
+
+def _recovery(fields: Fields, value: tuple[float, ...]) -> Fields:
+    return fields | {"recovery_ns": value[0]}
+
+
+def _paralyzable(fields: Fields, value: tuple[float, ...]) -> Fields:
+    return fields | ({"mode": "paralyzable"} if value[0] > 0.5 else {})
+
+
 def effects(dead_time_ns: float) -> tuple[Effect, ...]:
     """Effects that are looked for in a stream of a detector with this dead time."""
     dead = dead_time_ns
-
-    def afterpulses(fields: Fields, value: tuple[float, ...]) -> Fields:
-        after, delay = value[0], float(np.exp(value[1]))
-        carriers = all_carriers(after, delay, fields["dead_time_ns"])
-        return fields | ({"afterpulsing": Afterpulsing(probability=carriers, delay_ns=delay)} if carriers > 0 else {})
-
-    def electronics(fields: Fields, value: tuple[float, ...]) -> Fields:
-        observed = fields["dead_time_ns"]  # that of the electronics, over a detector that is ready earlier
-        return fields | {"electronics_dead_time_ns": observed, "dead_time_ns": observed / (1.0 + value[0])}
-
-    def twilight(fields: Fields, value: tuple[float, ...]) -> Fields:
-        return fields | {"twilight_ns": min(value[0], fields["dead_time_ns"])}
-
-    def recovery(fields: Fields, value: tuple[float, ...]) -> Fields:
-        return fields | {"recovery_ns": value[0]}
-
-    def paralyzable(fields: Fields, value: tuple[float, ...]) -> Fields:
-        return fields | ({"mode": "paralyzable"} if value[0] > 0.5 else {})
-
     after = ("afterpulse_probability", "log_afterpulse_delay")
     middle, reach = float(np.log(1.6 * dead)), float(np.log(8.0))  # mean delays from a fifth to 13 dead times
     least, most = (0.0, middle - reach), (0.5, middle + reach)
     starts = [(0.03, middle + place * reach) for place in (-0.5, 0.0, 0.5)]
     own = "electronics with a dead time of their own"
     return (
-        *(Effect(after, start, least, most, afterpulses, "afterpulses") for start in starts),
-        Effect(("twilight_ns",), (min(1.0, 0.2 * dead),), (0.0,), (dead,), twilight, "twilight pulses"),
-        Effect(("recovery_ns",), (0.03 * dead,), (0.0,), (2.0 * dead,), recovery, "slow recovery"),
-        Effect(("electronics_excess",), (0.25,), (0.0,), (19.0,), electronics, own),
-        Effect(("paralyzable",), (1.0,), (0.0,), (1.0,), paralyzable, "paralyzable detector", onoff=True),
+        *(Effect(after, start, least, most, _afterpulses, "afterpulses") for start in starts),
+        Effect(("twilight_ns",), (min(1.0, 0.2 * dead),), (0.0,), (dead,), _twilight, "twilight pulses"),
+        Effect(("recovery_ns",), (0.03 * dead,), (0.0,), (2.0 * dead,), _recovery, "slow recovery"),
+        Effect(("electronics_excess",), (0.25,), (0.0,), (19.0,), _electronics, own),
+        Effect(("paralyzable",), (1.0,), (0.0,), (1.0,), _paralyzable, "paralyzable detector", onoff=True),
     )
 
 
@@ -171,11 +175,9 @@ class Model:
         if self.gaussian and self.jitter_given:
             out[..., k] = np.maximum(out[..., k], out[..., k + 1])
         out[..., k + 2] = np.maximum(out[..., k + 2], 0.0)
-        at = k + 3
-        for effect in self.effects:
-            for low, high in zip(effect.least, effect.most, strict=True):
-                out[..., at] = np.clip(out[..., at], low, high)
-                at += 1
+        bounds = [each for effect in self.effects for each in zip(effect.least, effect.most, strict=True)]
+        for at, (low, high) in enumerate(bounds, k + 3):
+            out[..., at] = np.clip(out[..., at], low, high)
         return out
 
     def widths(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -74,6 +74,17 @@ class Recording:
         """Laser periods of all stretches."""
         return float(sum(self.cycles))
 
+    def unevenness(self, window: float) -> tuple[float, int, float]:
+        """Half the mean squared difference of counts in successive windows of so many periods, their number, mean."""
+        rows = [
+            np.bincount((piece / (window * self.period_ns)).astype(np.int64), minlength=int(cycles / window) + 1)
+            for piece, cycles in zip(self.pieces, self.cycles, strict=True)
+        ]
+        whole = [row[: int(cycles / window)] for row, cycles in zip(rows, self.cycles, strict=True)]
+        steps = np.concatenate([np.diff(row) for row in whole])
+        mean = float(np.concatenate(whole).mean()) if steps.size else 0.0
+        return (0.5 * float((steps**2.0).mean()) if steps.size else 0.0), steps.size, mean
+
     def parts(self, number: int) -> list[Recording]:
         """About `number` parts of equal exposure, in order of time."""
         size = self.exposure / number

@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.types import FloatArray
-from mars_lidar.calibration.fit import LIGHTS, Fit, Fitted, Guess, counted
+from mars_lidar.calibration.fit import LIGHTS, Fit, Fitted, Guess, counted, root_of
 from mars_lidar.calibration.model import Effect, effects
 from mars_lidar.calibration.recording import FALSE_ALARM, LEAST_PHOTONS, Recording
 from mars_lidar.calibration.start import with_edge
 
-_MISFIT = 1e-3  # probability of the misfit below which effects without a clear score are refitted, and their gain in it
+_MISFIT = 1e-3  # gain in the probability of the misfit by which an effect without score and size is accepted
 _PARTS = 16  # of a recording, for drift: a trend then has 14 degrees of freedom
 
 
@@ -90,22 +90,30 @@ class Named:
     gain: float
 
 
-def refitted(fit: Fit, fitted: Fitted, listed: list[Score]) -> tuple[Fitted, Named] | None:
-    """The fit with the one effect that takes most of the misfit; None where no effect is clear.
+Refit = tuple[Fitted, Named | None]
+
+
+def refitted(fit: Fit, fitted: Fitted, listed: list[Score]) -> Refit | None:
+    """The fit with the one effect that takes most of the misfit, or a better one without; None where none is clear.
 
     Effects are named by the refit: a slow recovery may have the score of a paralyzable detector, and one that the
     dead time has taken up has no score at all. So where the misfit stays clear, effects without a score are tried too.
+    Shorter batches judge between effects; the last ones are those of the effect that is taken in.
     """
     limit = clear(listed)
     best = _best(fit, fitted, [score for score in listed if score.z > limit], limit)
-    if (fitted if best is None else best[0]).p_value < _MISFIT:
+    if (fitted if best is None else best[0]).p_value < FALSE_ALARM:
         other = _best(fit, fitted, [score for score in listed if score.z <= limit], limit)
         trials = [trial for trial in (best, other) if trial is not None]
         best = min(trials, key=lambda trial: trial[0].misfit_z, default=None)
-    return best
+    if best is None:
+        return None
+    last = best[0]
+    final = fit.finish(Guess(last.model, last.theta, root_of(last.covariance), last.free))
+    return (final, best[1]) if final.converged else best
 
 
-def _best(fit: Fit, fitted: Fitted, tried: list[Score], limit: float) -> tuple[Fitted, Named] | None:
+def _best(fit: Fit, fitted: Fitted, tried: list[Score], limit: float) -> Refit | None:
     trials: list[tuple[float, Score, Guess]] = []
     families: set[str] = set()
     for score in tried:
@@ -117,7 +125,7 @@ def _best(fit: Fit, fitted: Fitted, tried: list[Score], limit: float) -> tuple[F
             trials.append((trial[0], score, trial[1]))
     best: tuple[Fitted, Named] | None = None
     for _, score, guess in sorted(trials, key=lambda trial: trial[0])[: fit.effort.refits]:
-        final = fit.finish(guess)
+        final = fit.shorter.finish(guess)
         if final.converged and (best is None or final.misfit_z < best[0].misfit_z):
             best = final, Named(score.effect, score.z, fitted.misfit_z - final.misfit_z)
     if best is None:
@@ -125,11 +133,15 @@ def _best(fit: Fit, fitted: Fitted, tried: list[Score], limit: float) -> tuple[F
     final, named = best
     if named.z > limit:  # of electronics the size may be wide: a short dead time of the detector acts as a long one
         return best
-    clear_size = (
-        not named.effect.onoff
-        and final.theta[fitted.model.size] > limit * final.covariance[(k := len(fitted.free)), k] ** 0.5
-    )
-    return best if clear_size or fitted.p_value < _MISFIT * final.p_value else None
+    own = len(fitted.free)
+    if not named.effect.onoff and final.theta[fitted.model.size] > limit * final.covariance[own, own] ** 0.5:
+        return best
+    if fitted.p_value >= _MISFIT * final.p_value:
+        return None
+    # neither score nor size: the refit may have gone where the effect is not needed either
+    start = Guess(fitted.model, final.theta[: fitted.model.size], root_of(final.covariance[:own, :own]), fitted.free)
+    plain = fit.shorter.finish(start)
+    return (plain, None) if plain.converged and plain.p_value > _MISFIT * final.p_value else best
 
 
 def _stepped(fit: Fit, fitted: Fitted, score: Score) -> tuple[float, Guess] | None:
@@ -162,7 +174,9 @@ class Drift:
     """Parameters by parts of the recording.
 
     `times_s` (parts,) their middles; `values` (parts, p), and `errors` (p,) of each; `trend` (p,) change from begin to
-    end, in standard deviations; `p_value` (p,) of the scatter; `growth` (p,) of the stated errors for it.
+    end, in standard deviations; `p_value` (p,) of it or of the scatter, the smaller; `growth` (p,) of the stated errors
+    by the scatter; `flicker` relative standard deviation of counts in times shorter than such a part, `flicker_z` its
+    standard deviations.
     """
 
     names: tuple[str, ...]
@@ -173,23 +187,61 @@ class Drift:
     change: FloatArray
     p_value: FloatArray
     growth: FloatArray
-
-    @property
-    def _trend_p(self) -> FloatArray:
-        from scipy.special import ndtr
-
-        return np.asarray(2.0 * ndtr(-np.abs(self.trend)))
+    flicker: float
+    flicker_z: float
 
     @property
     def probability(self) -> float:
-        """Probability of a trend or a scatter as large in a constant recording, all parameters together."""
-        p = np.r_[self._trend_p, self.p_value]
-        return float(1.0 - (1.0 - p.min()) ** p.size)
+        """Probability of a trend, a scatter or flicker as large in a constant recording, all parameters together."""
+        p = min(float(self.p_value.min()), _above(self.flicker_z))
+        return float(1.0 - (1.0 - p) ** (2 * self.p_value.size + 1))
 
     @property
     def drifts(self) -> NDArray[np.bool_]:
         """(p,) which parameters are not constant."""
-        return np.asarray(np.minimum(self._trend_p, self.p_value) < FALSE_ALARM / (2 * self.p_value.size))
+        return np.asarray(self.p_value < FALSE_ALARM / (2 * self.p_value.size + 1))
+
+    @property
+    def flickers(self) -> bool:
+        """Whether the light is not constant over shorter times."""
+        return _above(self.flicker_z) < FALSE_ALARM / (2 * self.p_value.size + 1)
+
+
+def _above(z: float) -> float:
+    """Probability of a normal deviate above z."""
+    from scipy.special import ndtr
+
+    return float(ndtr(-z))
+
+
+def _flicker(fit: Fit, fitted: Fitted, counts: float = 8.0, windows: int = 64) -> tuple[float, float, float]:
+    """Relative scatter of counts by flickering light, its standard deviations, and the factor on their variance.
+
+    Half the mean squared difference of counts in successive windows (Allan's variance, which a slow drift does not
+    change), over that of streams of the fit: for longer windows, beside the shortest. Afterpulses and all else that a
+    detector remembers for less than these changes all windows alike, the fluctuations of light the longer ones more.
+    The shortest have so many `counts`, the others four times as many each, as long as there are so many `windows`.
+    """
+    from scipy.special import ndtri
+
+    recording, size = fit.recording, min(float(fit.recording.photons), fit.effort.batch / 4.0)
+    cycles = max(2, round(fit.exposure(size)))
+    streams = fitted.model.streams(np.tile(fitted.theta, (LIGHTS, 1)), cycles, 0)
+    drawn = [Recording((t,), (cycles,), recording.clock) for t in streams]
+    rows: list[tuple[float, float, float]] = []
+    while not rows or counts * windows < recording.photons:
+        window = counts * recording.exposure / recording.photons
+        (variance, number, mean), *other = [x.unevenness(window) for x in (recording, *drawn)]
+        expected = max(float(np.mean([each[0] for each in other])), 1e-300)
+        noise = 3.0 / max(number, 1) + 3.0 / max(sum(each[1] for each in other), 1)  # of the ratio, even counts
+        rows.append((max(variance / expected, 1e-300), noise, max(variance - expected, 0.0) ** 0.5 / max(mean, 1e-300)))
+        counts *= 4.0
+    ratio, noise, scatter = np.array(rows).T
+    if ratio.size == 1:
+        return 0.0, -np.inf, 1.0
+    z = np.log(ratio[1:] / ratio[0]) / np.sqrt(noise[1:] + noise[0])
+    p = min(1.0, z.size * _above(z.max()))
+    return float(scatter[1 + z.argmax()]), float(-ndtri(p)) if p > 0.0 else float(z.max()), float(ratio.max())
 
 
 def drift(fit: Fit, fitted: Fitted) -> Drift | None:
@@ -219,17 +271,13 @@ def drift(fit: Fit, fitted: Fitted) -> Drift | None:
     place = np.linspace(-0.5, 0.5, len(parts))
     slope = place @ (x - x.mean(0)) / (place @ place)
     square = (((x - x.mean(0)) / sd) ** 2).sum(0)
-    p = np.array([float(chdtrc(len(parts) - 1, value)) for value in square])
+    trend = slope / (sd / np.sqrt(place @ place))
+    p = np.minimum([2.0 * _above(abs(z)) for z in trend], chdtrc(len(parts) - 1, square))
     begins = np.cumsum([0.0, *(part.exposure for part in parts)])
     middle = 0.5 * (begins[1:] + begins[:-1]) * recording.period_ns * 1e-9
     about = combine @ fitted.theta[free[light]]
-    return Drift(
-        ("light", *(names[i] for i in delays)),
-        middle,
-        x - x.mean(0) + about,
-        sd,
-        slope / (sd / np.sqrt(place @ place)),
-        slope,
-        p,
-        np.sqrt(np.maximum(square / (len(parts) - 1), 1.0)),
-    )
+    growth = np.sqrt(np.maximum(square / (len(parts) - 1), 1.0))
+    flicker, flicker_z, ratio = _flicker(fit, fitted)
+    growth[0] = max(growth[0], ratio**0.5)
+    printed = ("light", *(names[i] for i in delays))
+    return Drift(printed, middle, x - x.mean(0) + about, sd, trend, slope, p, growth, flicker, flicker_z)

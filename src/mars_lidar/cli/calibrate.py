@@ -309,7 +309,7 @@ def fit_rows(result: Calibration) -> list[tuple[str, str]]:
         for k, name in enumerate(drift.names):
             if drift.drifts[k]:
                 rows.append(("drift", f"{name}: errors grown {drift.growth[k]:.2f} times by the scatter of parts"))
-        if not drift.drifts.any():
+        if not drift.drifts.any() and not drift.flickers:
             rows.append(("drift", f"none in {drift.times_s.size} parts of the recording (p = {drift.probability:.2g})"))
     rows += [("suspect", str(suspect)) for suspect in result.suspects]
     return [*rows, ("verdict", result.verdict)]

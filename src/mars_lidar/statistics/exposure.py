@@ -267,12 +267,14 @@ def _on_parts(before: FloatArray, within: FloatArray, parts: int) -> FloatArray:
     step = np.where(rise < 0.0, -2.0, 2.0) / parts
     out = np.zeros((before.shape[0], photons.shape[1] // parts, 4))
     for part in range(parts):
-        width, (zero, one, two, three) = step[:, part::parts], powers[:, :, part::parts]
+        width, (constant, linear, square, cube) = step[:, part::parts], powers[:, :, part::parts]
         start = 2.0 * part / parts - 1.0 + np.where(width < 0.0, -width, 0.0)
-        out[:, :, 0] += zero
-        out[:, :, 1] += start * zero + width * one
-        out[:, :, 2] += start * (start * zero + 2.0 * width * one) + width**2 * two
-        out[:, :, 3] += start * (start * (start * zero + 3.0 * width * one) + 3.0 * width**2 * two) + width**3 * three
+        out[:, :, 0] += constant
+        out[:, :, 1] += start * constant + width * linear
+        out[:, :, 2] += start * (start * constant + 2.0 * width * linear) + width**2 * square
+        out[:, :, 3] += (
+            start * (start * (start * constant + 3.0 * width * linear) + 3.0 * width**2 * square) + width**3 * cube
+        )
     return out
 
 

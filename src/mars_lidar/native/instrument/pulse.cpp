@@ -122,8 +122,9 @@ void build_gaussian(PulseTable& table) {
             const double error = below(v) - p;
             if (std::fabs(error) <= 1e-14 * p) break;
             (error < 0 ? a : b) = v;
-            const double newton = v - error / density(v);
-            v = newton > a && newton < b ? newton : 0.5 * (a + b);
+            const double newton = v - error / density(v), middle = 0.5 * (a + b);
+            if (!(newton > a && newton < b) && (middle == a || middle == b)) return middle;  // no number between
+            v = newton > a && newton < b ? newton : middle;
         }
         return v;
     };

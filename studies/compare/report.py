@@ -1,4 +1,4 @@
-"""Tables of a comparison for a terminal of 100 columns, and the same numbers as plain data."""
+"""A comparison as tables for a terminal of 100 columns, as plain data, and as a picture."""
 
 from __future__ import annotations
 
@@ -10,9 +10,14 @@ import numpy as np
 
 from mars_lidar.cli.console import grid, screen
 from mars_lidar.instrument.system import System
+from mars_lidar.plot.figures import _draw_map
+from mars_lidar.plot.style import COLOURS, DPI, INK, MUTED, style
+from mars_lidar.plot.views import instrument
 from studies.compare.sample import SIGNIFICANT, Distance, Estimate, Moments
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
     from rich.console import Console
     from rich.text import Text
 
@@ -172,3 +177,78 @@ def _number(value: float) -> str:
     if math.isnan(value):
         return "–"
     return f"{value:,.0f}" if 999.5 <= abs(value) < 1e7 else f"{value:.3g}"
+
+
+_SCORES = 4.0  # limit of the maps of deviations, in standard errors
+_PANELS = {  # attributes of `PixelStatistics`
+    "window_ratio": "Variance of the signal window / {against}",
+    "lag1": "Covariance of neighbouring bins / mean count",
+    "shape": "Shape of the mean histogram: TV (- by chance)",
+}
+
+
+def comparison(result: Comparison) -> Figure:
+    """Maps and joint statistics of a `compare` run; dashes are predictions, bars two standard errors."""
+    from matplotlib.figure import Figure
+
+    with style():
+        figure = Figure(figsize=(13.0, 6.0), dpi=DPI, layout="constrained")
+        halves: Any = figure.subfigures(2, 1)
+        upper, lower = halves
+        _draw_maps(list(upper.subplots(1, 1 + len(result.engines), squeeze=False).flat), result)
+        for ax, (quantity, title) in zip(lower.subplots(1, len(_PANELS)), _PANELS.items(), strict=True):
+            _draw_points(ax, result, quantity)
+            ax.set_title(title.format(against=result.against), loc="left")
+        lower.axes[0].legend(loc="best", fontsize=6.0)
+        height, width = result.flux.shape
+        figure.suptitle(f"{height} x {width} pixels, {instrument(result.system)}", x=0.01, ha="left", fontsize=9.0)
+    return figure
+
+
+def _draw_maps(axes: list[Axes], result: Comparison) -> None:
+    """The expected count with the pixels, then each engine's deviation from it in standard errors of its mean."""
+    expected = result.expected
+    known, reference = bool(expected.known.any()), result.scenes[result.against].mean_counts
+    words = "Expected count" if known else result.against
+    _draw_map(axes[0], expected.mean if known else reference, "registrations", "magma", None, words)
+    for name, (y, x) in result.pixels.items():
+        scale = expected.step if known else 1
+        axes[0].plot(x / scale, y / scale, "o", ms=5, mfc="none", mec="white", mew=1.0)
+        axes[0].annotate(name, (x / scale, y / scale), (5, 0), textcoords="offset points", color="white", fontsize=6.5)
+    for ax, (engine, scene) in zip(axes[1:], result.scenes.items(), strict=True):
+        if known:
+            error = np.sqrt(np.where(expected.variance > 0, expected.variance, np.nan) / len(scene.seconds))
+            values, label = (expected.on_grid(scene.mean_counts) - expected.mean) / error, "standard errors"
+        else:
+            values, label = scene.mean_counts - reference, f"count minus {result.against}"
+        most = float(np.nanpercentile(np.abs(values), 99)) if np.isfinite(values).any() else 0.0
+        if known and most <= 2.0 * _SCORES:  # an engine that is off everywhere has a scale of its own
+            most = _SCORES
+        _draw_map(ax, values, label, "RdBu_r", (-(most or 1.0), most or 1.0))
+        ax.set_title(engine, loc="left")
+
+
+def _draw_points(ax: Axes, result: Comparison, quantity: str) -> None:
+    """A point for each engine at each pixel, with the prediction."""
+    pixels, engines = list(result.pixels), result.engines
+    for k, engine in enumerate(engines):
+        at = np.arange(len(pixels)) + 0.8 * ((k + 0.5) / len(engines) - 0.5)
+        values = [getattr(result.statistics[pixel][engine], quantity) for pixel in pixels]
+        error = [2.0 * getattr(value, "error", 0.0) for value in values]
+        colour = COLOURS[k % len(COLOURS)]
+        ax.errorbar(at, [value.value for value in values], error, fmt="o", ms=3.5, lw=1.0, color=colour, label=engine)
+        if quantity == "shape":
+            ax.plot(at, [value.floor for value in values], "_", ms=8, color=INK)
+    if quantity != "shape":
+        for k, pixel in enumerate(pixels):
+            ax.plot([k - 0.45, k + 0.45], [_predicted(result, pixel, quantity)] * 2, "--", color=MUTED, lw=0.9)
+    elif any(line > 0 for line in ax.dataLim.intervaly):
+        ax.set_yscale("log")
+    ax.set_xticks(range(len(pixels)), pixels)
+
+
+def _predicted(result: Comparison, pixel: str, quantity: str) -> float:
+    law, drawn = result.laws[pixel], result.statistics[pixel][result.against].window.variance.value
+    if law is None or quantity == "lag1":
+        return math.nan if law is None else law.lag1
+    return math.nan if law.window is None or not drawn > 0 else float(law.window[1]) / drawn

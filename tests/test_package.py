@@ -153,7 +153,8 @@ def test_wheels_and_recipe_follow_the_project():
     assert recipe["context"]["version"] == settings["project"]["version"]
     conda_names = {"matplotlib-base": "matplotlib", "python-xxhash": "xxhash"}
     run = {" ".join(conda_names.get(word, word) for word in line.split()) for line in recipe["requirements"]["run"]}
-    assert {line.replace(" ", "") for line in run} == {*settings["project"]["dependencies"], "python" + settings["project"]["requires-python"]}
+    python = "python" + settings["project"]["requires-python"]
+    assert {line.replace(" ", "") for line in run} == {*settings["project"]["dependencies"], python}
     host = {line.replace(" ", "") for line in recipe["requirements"]["host"]}
     assert set(settings["build-system"]["requires"]) <= host
 

@@ -58,9 +58,9 @@ class StationaryState {
         const std::string name = "the stationary state of pixel " + std::to_string(pixel_index);
         if (!converged_) throw std::runtime_error(name + " did not converge; use start='armed'");
         if (!unique_)
-            throw std::runtime_error(name +
-                                     " depends on when the detector was switched on: it locks to one of several "
-                                     "places of the pulse and practically never leaves it; use start='armed'");
+            throw std::invalid_argument(name +
+                                        " depends on when the detector was switched on: it locks to one of several "
+                                        "places of the pulse and practically never leaves it; use start='armed'");
     }
 
     // 1 - e^-l without libm: a series for small l, else repeated squaring of e^-(l/2^k).

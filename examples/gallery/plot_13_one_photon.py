@@ -6,7 +6,7 @@ In this room each pixel registers on average one signal and one background photo
 is estimated alone, half of the depths are missing or wrong (beyond three standard deviations of the pulse, 27 cm).
 Method ``image`` estimates all pixels together and gives 90 % intervals, except where the depth may be that of another
 surface (white in the last map). The program prints
-``Wrong depths: 55% alone, 1.8% by the image.``
+``Wrong depths: 55% alone, 1.7% by the image.``
 
 How-to: :doc:`/reconstruction`. Theory: :doc:`/theory_reconstruction`.
 """

@@ -352,6 +352,8 @@ def _corrections(cells: Cells, bins: int, phase: FloatArray, threads: int) -> tu
         )
     values = out.reshape(cells.size, phase.size, 4)
     values[:, phase == 1.0] = 0.0  # the whole period later: the same but for rounding
+    constant = cells.signal == 0.0  # nothing comes later; rounding may keep the recursion from repeating itself
+    values[constant], settled[constant] = 0.0, 1
     return values, settled
 
 

@@ -61,10 +61,11 @@ class Summing:
         return Sums(self._sha256.hexdigest(), self._xxh128.hexdigest())
 
 
-def sums_of(content: bytes) -> Sums:
-    """The sums of the content of a file."""
+def sums_of(content: bytes | Path) -> Sums:
+    """The sums of the content of a file, or of the file at a path."""
     summing = Summing()
-    summing.update(content)
+    for part in _parts(content):
+        summing.update(part)
     return summing.sums()
 
 
@@ -82,7 +83,7 @@ def seal(store: Path, attrs: dict[str, Any], known: Mapping[str, Sums] | None = 
     each = {name: known[name] for name in names if name in known} if known else {}
     others = [name for name in names if name not in each]
     with ThreadPoolExecutor(TOL.hash_threads) as pool:
-        each.update(zip(others, pool.map(lambda name: _sums(store / name), others), strict=True))
+        each.update(zip(others, pool.map(lambda name: sums_of(store / name), others), strict=True))
     checks = _lines({name: sums.xxh128 for name, sums in each.items()})
     lines = {name: sums.sha256 for name, sums in each.items()} | {CHECKS: sums_of(checks).sha256}
     document["attributes"][SUM] = _sum(lines)
@@ -183,8 +184,7 @@ class Manifest:
         """Whether the content, or that of the file at a path, has the sum of its line."""
         if name in self._checks:
             return _xxh128(content) == self._checks[name]
-        sums = sums_of(content) if isinstance(content, bytes) else _sums(content)
-        return sums.sha256 == self._sums.get(name)
+        return sums_of(content).sha256 == self._sums.get(name)
 
     def _error(self, reason: str) -> FileError:
         return FileError(
@@ -249,7 +249,7 @@ def _compared(
     def read(name: str) -> Sums:
         if not in_bucket(store) and (state := _state(store / name)) is not None:
             states[name] = state
-        return _sums(store / name)
+        return sums_of(store / name)
 
     stated = root_document(store).get("attributes", {}).get(SUM)
     wrong = compared(sums, checks, _files(store) if listed else None, read, every, stated)
@@ -328,25 +328,21 @@ def _files(store: Path) -> set[str]:
     return files
 
 
-def _sums(path: Path) -> Sums:
-    summing = Summing()
-    for part in _parts(path):
-        summing.update(part)
-    return summing.sums()
-
-
 def _xxh128(content: bytes | Path) -> str:
     checksum = xxhash.xxh3_128()
-    for part in [content] if isinstance(content, bytes) else _parts(content):
+    for part in _parts(content):
         checksum.update(part)
     return checksum.hexdigest()
 
 
-def _parts(path: Path) -> Iterator[bytes]:
-    """The content of a file, in parts that stay in the processor's cache."""
-    if in_bucket(path):
-        yield path.read_bytes()
+def _parts(content: bytes | Path) -> Iterator[bytes]:
+    """The content of a file, from a path in parts that stay in the processor's cache."""
+    if isinstance(content, bytes):
+        yield content
         return
-    with open(path, "rb", buffering=0) as stream:
+    if in_bucket(content):
+        yield content.read_bytes()
+        return
+    with open(content, "rb", buffering=0) as stream:
         while part := stream.read(TOL.hashed_part):
             yield part

@@ -33,24 +33,38 @@ class Case:
     items: int  # exposures, a multiple of the number of pixels
 
 
+def make_system(
+    dead_ns: float,
+    cycles: int = 1000,
+    bins: int = 64,
+    *,
+    sigma_ns: float = 1.0,
+    period_ns: float = PERIOD_NS,
+    start: str = "armed",
+    pulse: Pulse | None = None,
+    **detector: Any,
+) -> System:
+    """A system by its numbers; `detector` are further fields of the detector."""
+    return System(
+        period_ns=period_ns,
+        cycles=cycles,
+        bins=bins,
+        pulse=pulse or GaussianPulse(sigma_ns=sigma_ns),
+        detector=Detector(dead_time_ns=dead_ns, **detector),
+        start=start,  # type: ignore[arg-type]  # checked there
+    )
+
+
 def system_of(
     dead: float,
     cycles: int = 1000,
     bins: int = 64,
     *,
     sigma: float = 0.00375,
-    start: str = "armed",
-    pulse: Pulse | None = None,
+    **more: Any,
 ) -> System:
-    """A free-running system; times in periods of 100 ns."""
-    return System(
-        period_ns=PERIOD_NS,
-        cycles=cycles,
-        bins=bins,
-        pulse=pulse or GaussianPulse(sigma_ns=sigma * PERIOD_NS),
-        detector=Detector(dead_time_ns=dead * PERIOD_NS),
-        start=start,  # type: ignore[arg-type]  # checked there
-    )
+    """The same by its dead time and pulse in periods of 100 ns."""
+    return make_system(dead * PERIOD_NS, cycles, bins, sigma_ns=sigma * PERIOD_NS, **more)
 
 
 def shared(path: str) -> Path:
@@ -94,14 +108,8 @@ def case(
     **detector: Any,
 ) -> Case:
     """A case by the fields of its detector; the waveform `WAVE` in the place of a signal is taken for one."""
-    system = System(
-        period_ns=PERIOD_NS,
-        cycles=cycles,
-        bins=bins,
-        pulse=pulse or GaussianPulse(sigma_ns=2.0),
-        start=start,
-        detector=Detector(**detector),
-    )
+    fields = {"dead_time_ns": 0.0} | detector
+    system = make_system(fields.pop("dead_time_ns"), cycles, bins, sigma_ns=2.0, pulse=pulse, start=start, **fields)
     flux = waveform_flux(WAVE, background) if signal is WAVE else flux_of(signal, background, delay)
     light = "waveform" if signal is WAVE else f"S {signal}"
     effects = [f"{k} {v}" if isinstance(v, int | float | str) else k for k, v in sorted(detector.items())]

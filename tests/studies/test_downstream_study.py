@@ -143,7 +143,7 @@ def test_training_pixels_have_the_light_of_the_study():
     """Poisson's counts are the arrivals: S = photons x reflectivity, B of the same mean at a ratio of 1."""
     sizes = TINY.sizes
     pixels = downstream_data.Data(sizes).training("poisson", MAIN, 1.0, 3)
-    counts = (pixels.seen[..., :-LOGS] ** 2).sum(-1).mean((1, 2)) / instrument(MAIN).cycles
+    counts = (pixels.inputs[..., :-LOGS] ** 2).sum(-1).mean((1, 2)) / instrument(MAIN).cycles
     light = sizes.photons * pixels.wanted[..., 0].mean((1, 2))
     np.testing.assert_allclose(counts, 2.0 * light, rtol=0.02)
 

@@ -259,7 +259,7 @@ def test_verify_fails_where_a_count_differs(tmp_path):
     counts[0, 0, 0, 0] = 9999
     done = run("info", "--verify", tmp_path / "a.zarr")
     assert done.exit_code == 1
-    assert "NO: histogram/c/0/0/0/0 is not as it was written" in done.output
+    assert "NO: histogram/c/0/0/0/0 has changed since it was written" in done.output
     assert "made by" not in done.output
 
 
@@ -299,7 +299,7 @@ def test_view_draws_a_cube(tmp_path):
         (["--scene", "room", "--sbr", "0"], "sbr must be"),
         (["--scene", "room", "--attenuation", "fog"], "--attenuation must be one of"),
         (["--scene", "room", "--system", "nowhere.yaml"], "nowhere.yaml"),
-        (["--scene", "room", "--pulse-sigma-ns", "1", "--pulse-fwhm-ns", "1"], "the pulse is given once"),
+        (["--scene", "room", "--pulse-sigma-ns", "1", "--pulse-fwhm-ns", "1"], "give the pulse once"),
         (["--scene", "room", "--pulse-bin-ns", "1"], "belong to --pulse-file"),
         (["--scene", "room", "--pulse-file", "irf.npy"], "needs --pulse-bin-ns"),
         (["--scene", "room", "--pulse-file", "irf.csv", "--pulse-bin-ns", "1"], "irf.csv does not exist"),

@@ -149,7 +149,7 @@ def test_bad_input(light, tmp_path):
     np.save(tmp_path / "t.npy", light)
     np.save(tmp_path / "rgb.npy", np.stack([light] * 3, axis=-1))
     for call, message in (
-        (lambda: io.read_transient(tmp_path / "t.npy"), "does not tell the width of a time bin"),
+        (lambda: io.read_transient(tmp_path / "t.npy"), "does not state the width of a time bin"),
         (lambda: io.read_transient(tmp_path / "no.npy"), "no such file"),
         (lambda: io.read_transient(tmp_path / "t.npy", bin_ns=1.0, channel=0), "channel is for"),
         (lambda: io.read_transient(tmp_path / "rgb.npy", bin_ns=1.0), "has 3 channels: give channel"),

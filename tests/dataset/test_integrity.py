@@ -120,14 +120,14 @@ def test_changed_labels_coordinates_and_inputs_are_found_without_a_manifest_too(
     for name in ("sbr", "signal_level", "period_ns", "seed", "scene", "time", "y"):
         was = group[name][...]
         group[name][0] = 3
-        with pytest.raises(FileError, match=f"{name}/c/0 is not as it was written"):
+        with pytest.raises(FileError, match=f"{name}/c/0 has changed since it was written"):
             verify(dataset, chunks=1)
         group[name][...] = was
     scene = dataset / "scenes/depth/c.0.0.0"
     was_there = scene.read_bytes()
     scene.write_bytes(was_there[:-1] + b"\0")
     changed = verify(dataset).different
-    assert changed[0] == "scenes/depth/c.0.0.0 is not as it was written"
+    assert changed[0] == "scenes/depth/c.0.0.0 has changed since it was written"
     assert "cannot be read" in changed[1]
     scene.write_bytes(was_there)
     (dataset / manifest.NAME).rename(dataset / "away")

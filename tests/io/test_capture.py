@@ -183,8 +183,8 @@ def test_what_does_not_fit_is_refused(tmp_path):
     render, _ = write(tmp_path / "render.hdf5", "tal confocal")
     out = str(tmp_path / "x.hdf5")
     for options, words in (
-        (["--bins", "10"], "leave out --bins"),
-        (["--scene", "room"], "leave out --scene"),
+        (["--bins", "10"], "omit --bins"),
+        (["--scene", "room"], "omit --scene"),
         (["--period-ns", "5"], "must be a whole number of bins"),
         (["--realizations", "2"], "holds one exposure"),
     ):

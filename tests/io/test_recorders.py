@@ -178,7 +178,7 @@ def test_t3r_has_histograms_but_no_periods(tmp_path, version):
         (content.replace(version, b"7.0", 1), "no .t3r of format 5.0 or 6.0"),
         (header + struct.pack("<13i", *(-1, *tags[1:])) + content[-4 * records.size :], "its clocks are -1 ns"),
         (header + struct.pack("<13i", *tags[:12], -2) + content[-4 * records.size :], "image header -2"),
-        (header + struct.pack("<13i", *tags[:11], -5, 3) + content[-4 * records.size :], "tells of -5 records"),
+        (header + struct.pack("<13i", *tags[:11], -5, 3) + content[-4 * records.size :], "states -5 records"),
     ):
         path.write_bytes(damaged)
         with pytest.raises(ValueError, match=f"a\\.t3r.*{reason}"):
@@ -325,7 +325,7 @@ def test_cut_short_and_unknown(tmp_path):
     path = pt3(tmp_path / "a.pt3")
     whole = path.read_bytes()
     path.write_bytes(whole[:-40])
-    with pytest.raises(ValueError, match=r"a\.pt3 is cut short: its header tells of \d+ records"):
+    with pytest.raises(ValueError, match=r"a\.pt3 is cut short: its header states \d+ records"):
         ml.Timestamps.load(path)
     path.write_bytes(whole[:400])
     with pytest.raises(ValueError, match=r"a\.pt3"):

@@ -256,7 +256,7 @@ def test_the_poisson_engine_draws_detected_photons(tmp_path):
         (("--jitter-bin-ns", 1), "belongs to --jitter-file"),
         (("--jitter-file", "no.npy"), "needs --jitter-bin-ns"),
         (("--jitter-file", "no.npy", "--jitter-bin-ns", 1), "no.npy"),
-        (("--jitter-file", "no.npy", "--jitter-bin-ns", 1, "--jitter-fwhm-ns", 1), "given once"),
+        (("--jitter-file", "no.npy", "--jitter-bin-ns", 1, "--jitter-fwhm-ns", 1), "give the jitter once"),
         (("--code-density-file", "no.txt"), "no.txt does not exist"),
         (("--max-events-per-period", 1, "--engine", "feedback"), "does not do max_events_per_period"),
     ],

@@ -299,7 +299,7 @@ def test_what_has_no_law_says_so():
     both = replace(system.detector, afterpulsing=TRAPS)
     with pytest.raises(ValueError, match="constant_light_rate treats recovery_ns or afterpulsing, not both, got 5 and"):
         statistics.constant_light_rate(1e6, both)
-    with pytest.warns(UserWarning, match="no method of reconstruction knows recovery_ns"):
+    with pytest.warns(UserWarning, match="no reconstruction method models recovery_ns"):
         ml.reconstruct(np.ones((1, 1, 64), np.uint16), system)
 
 

@@ -8,20 +8,14 @@ from dataclasses import replace
 import h5py
 import numpy as np
 import pytest
-from harness import ledger
+from harness import ledger, make_system
 
 import mars_lidar as ml
 from mars_lidar import io
 from mars_lidar.light.transient import Transient
 
 C = 0.299792458
-SYSTEM = ml.System(
-    period_ns=100.0,
-    cycles=200,
-    bins=200,
-    pulse=ml.GaussianPulse(sigma_ns=0.8),
-    detector=ml.Detector(dead_time_ns=30.0),
-)
+SYSTEM = make_system(30.0, 200, 200, sigma_ns=0.8)
 
 
 @pytest.fixture
@@ -155,7 +149,7 @@ def test_bad_input(light, tmp_path):
     np.save(tmp_path / "t.npy", light)
     np.save(tmp_path / "rgb.npy", np.stack([light] * 3, axis=-1))
     for call, message in (
-        (lambda: io.read_transient(tmp_path / "t.npy"), "does not tell the width of a time bin"),
+        (lambda: io.read_transient(tmp_path / "t.npy"), "does not state the width of a time bin"),
         (lambda: io.read_transient(tmp_path / "no.npy"), "no such file"),
         (lambda: io.read_transient(tmp_path / "t.npy", bin_ns=1.0, channel=0), "channel is for"),
         (lambda: io.read_transient(tmp_path / "rgb.npy", bin_ns=1.0), "has 3 channels: give channel"),

@@ -1,7 +1,6 @@
-"""What people write: scenes, light, systems and recipes of datasets as plain data, and the JSON Schema of such files.
+"""Scenes, light, systems and recipes of datasets as plain data, and the JSON Schema of their files.
 
-`KINDS`, `LIGHT` and `ROOT` declare every key once: they are what files, command line and Python are read by, and what
-editors read.
+`KINDS`, `LIGHT` and `ROOT` declare every key once, for files, command line, Python and editors.
 """
 
 from __future__ import annotations
@@ -54,7 +53,7 @@ class Light:
     Raises
     ------
     ValueError, TypeError
-        A level, a length or a share that is out of range, or no number; one that the other settings exclude.
+        A level, length or share that is not a number, is out of range, or is excluded by other settings.
     """
 
     levels: tuple[tuple[float, float], ...] = ((1.0, 1.0),)
@@ -109,7 +108,7 @@ def read_light(data: Any, key: Key = ("light",)) -> Light:
 
 
 def refuse_for_transients(light: Light, key: Key = ("light",)) -> None:
-    """Raise where rendered light is given what only surfaces have."""
+    """Raise if rendered light has settings that apply to surfaces only."""
     if light.attenuation != "none":
         text = f"attenuation is for surfaces; transients have it in them, got {light.attenuation!r}"
         raise RecipeError((*key, "attenuation"), text)
@@ -243,7 +242,7 @@ ROOT: Fields = {
 
 @dataclass(frozen=True, kw_only=True)
 class DatasetRecipe:
-    """What a dataset is made of; docs/generate.md explains every key of the YAML form.
+    """Content of a dataset; docs/generate.md explains every key of the YAML form.
 
     Attributes
     ----------
@@ -281,7 +280,7 @@ class DatasetRecipe:
     shard_mib: float | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data from which `from_dict` makes an equal recipe: the form of the YAML file, files read in."""
+        """Plain data, as in the YAML file with its files included, from which `from_dict` makes an equal recipe."""
         light = asdict(self.light)
         light["levels"] = plain_levels(self.light)
         return {
@@ -410,7 +409,7 @@ _PLAIN = {float: "number", int: "integer", str: "string", bool: "boolean", Path:
 def json_schema(file: str = "recipe") -> dict[str, Any]:
     """JSON Schema (draft 2020-12) of a scene file, a recipe of `generate`, or a system file.
 
-    An editor that knows it completes keys and underlines what is wrong: in VS Code with the YAML extension, put
+    With it an editor completes keys and marks errors: in VS Code with the YAML extension, put
     ``# yaml-language-server: $schema=recipe.json`` in the first line of the file.
     """
     checks.choice("file", file, FILES)

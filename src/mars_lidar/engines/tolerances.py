@@ -1,4 +1,4 @@
-"""What the engines judge by: every tolerance and limit of theirs, with its unit and where it comes from."""
+"""Tolerances and limits of the engines, each with its unit and origin."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Tolerances:
-    """Quantities that the choice of an engine, a grid or a warning depends on."""
+    """Quantities that determine the choice of an engine or a grid, and warnings."""
 
     # feedback: the internal grid (engines/feedback.py)
     mean_distance: float = 0.05

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray
+from harness import make_system
 
 import mars_lidar as ml
 from mars_lidar import _core, io
@@ -151,14 +152,7 @@ def test_every_option_of_the_run_reaches_the_file(tmp_path, suffix):
     assert done.exit_code == 0, done.output
     assert not out.with_suffix(".png").exists()
     pulse = ml.SampledPulse(np.exp(-np.arange(50) / 9.0), 0.1, "centroid")
-    system = ml.System(
-        period_ns=80.0,
-        cycles=40,
-        bins=32,
-        pulse=pulse,
-        detector=ml.Detector(dead_time_ns=20.0, dark_count_hz=1e5),
-        start="stationary",
-    )
+    system = make_system(20.0, 40, 32, pulse=pulse, period_ns=80.0, start="stationary", dark_count_hz=1e5)
     flux = ml.Scene.example("room", size=10, seed=4).flux(
         system,
         signal=0.7,

@@ -26,6 +26,7 @@ from harness import (
     draw,
     first_arrival,
     flux_of,
+    make_system,
     measured_pulse,
     random_cases,
     require,
@@ -36,7 +37,7 @@ from harness import (
 )
 from scipy import stats
 
-from mars_lidar import Detector, GaussianPulse, SampledPulse, System
+from mars_lidar import Detector, GaussianPulse, SampledPulse
 from mars_lidar.engines import ANY_SYSTEM, ENGINES
 
 CLAIMS = {
@@ -55,26 +56,13 @@ RANDOM = random_cases(40, seed=2024, photons=2.5e6)
 
 
 def constant_rate(rate: float, dead: float, cycles: int, items: int, start: str = "armed") -> Case:
-    system = System(
-        period_ns=PERIOD_NS,
-        cycles=cycles,
-        bins=16,
-        pulse=GaussianPulse(sigma_ns=1.0),
-        detector=Detector(dead_time_ns=dead * PERIOD_NS),
-        start=start,
-    )
+    system = make_system(dead * PERIOD_NS, cycles, 16, start=start)
     name = f"constant rate {rate:g}, t_d {dead:g}, {cycles} cycles, {start}"
     return Case(name, flux_of(0.0, rate), system, items)
 
 
 def pulsed(signal: float, background: float, dead: float, *, items: int = 6000, **changes: object) -> Case:
-    system = System(
-        period_ns=PERIOD_NS,
-        cycles=200,
-        bins=64,
-        pulse=GaussianPulse(sigma_ns=2.0),
-        detector=Detector(dead_time_ns=dead * PERIOD_NS),
-    ).replace(**changes)
+    system = make_system(dead * PERIOD_NS, 200, 64, sigma_ns=2.0).replace(**changes)
     name = f"S {signal:g}, B {background:g}, t_d {dead:g}, {system.cycles} cycles, {system.start}"
     return Case(name, flux_of(signal, background, 0.37), system, items)
 

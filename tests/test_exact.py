@@ -12,6 +12,7 @@ from harness import (
     counts_against_law,
     flux_of,
     goodness,
+    make_system,
     require,
     two_lobes,
 )
@@ -28,8 +29,7 @@ LONGEST = TOL.cycles
 
 def system(**changes: object) -> ml.System:
     """Period 100 ns, bins of a quarter of the pulse's sigma."""
-    base = ml.System(period_ns=100.0, cycles=1000, bins=400, pulse=GAUSSIAN, detector=ml.Detector(dead_time_ns=50.0))
-    return base.replace(**changes)
+    return make_system(50.0, 1000, 400, pulse=GAUSSIAN).replace(**changes)
 
 
 def dead(periods: float) -> ml.Detector:

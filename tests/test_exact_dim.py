@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from harness import first_arrival, goodness, require
+from harness import first_arrival, goodness, make_system, require
 from numpy.typing import NDArray
 from scipy import special, stats
 
@@ -39,14 +39,7 @@ MODES: dict[str, dict[str, Any]] = {
 
 def system(**changes: Any) -> ml.System:
     """Sigma 1 ns, bins of a quarter of it."""
-    base = ml.System(
-        period_ns=PERIOD,
-        cycles=100_000_000,
-        bins=400,
-        pulse=ml.GaussianPulse(sigma_ns=1.0),
-        detector=ml.Detector(dead_time_ns=40.0),
-    )
-    return base.replace(**changes)
+    return make_system(40.0, 100_000_000, 400).replace(**changes)
 
 
 def poisson_p(number: float, mean: float) -> float:

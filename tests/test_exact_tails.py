@@ -11,6 +11,7 @@ from harness import (
     first_arrival,
     flux_of,
     goodness,
+    make_system,
     measured_pulse,
     require,
     same_law,
@@ -28,8 +29,7 @@ DELAY_NS = 50.003
 
 def system(**changes: object) -> ml.System:
     """Period 100 ns, bins of a quarter of the pulse's sigma."""
-    base = ml.System(period_ns=100.0, cycles=1000, bins=400, pulse=GAUSSIAN, detector=ml.Detector(dead_time_ns=50.0))
-    return base.replace(**changes)
+    return make_system(50.0, 1000, 400, pulse=GAUSSIAN).replace(**changes)
 
 
 def sampled_gaussian() -> ml.SampledPulse:

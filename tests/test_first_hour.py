@@ -10,6 +10,7 @@ import time
 import numpy as np
 import pytest
 import xarray
+from harness import make_system
 from PIL import Image
 
 import mars_lidar as ml
@@ -21,9 +22,7 @@ from mars_lidar.io.simulated_file import _Probe, advice
 from studies.compare.comparison import compare
 from tests.harness.command import command_line
 
-SYSTEM = ml.System(
-    period_ns=100.0, cycles=50, bins=64, pulse=ml.GaussianPulse(sigma_ns=0.5), detector=ml.Detector(dead_time_ns=50.0)
-)
+SYSTEM = make_system(50.0, 50, 64, sigma_ns=0.5)
 RECIPE = "scenes: {path: .}\nsystems: {file: spad.yaml}\nlight: {signal: 1, sbr: 1}\n"
 
 

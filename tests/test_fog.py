@@ -2,23 +2,16 @@
 
 from __future__ import annotations
 
-import csv
-
 import numpy as np
 import pytest
+from harness import make_system
 from scipy import integrate, special
 
 import mars_lidar as ml
-from studies.__main__ import main
+from tests.harness.study import quick_study
 
 C = 0.299792458
-SYSTEM = ml.System(
-    period_ns=100.0,
-    cycles=100,
-    bins=200,
-    pulse=ml.GaussianPulse(sigma_ns=0.4),
-    detector=ml.Detector(dead_time_ns=30.0),
-)
+SYSTEM = make_system(30.0, 100, 200, sigma_ns=0.4)
 
 
 @pytest.mark.parametrize(("alpha", "first", "delay"), [(0.05, 0.5, 60.0), (1.0, 2.0, 33.3), (0.02, 1.0, 140.0)])
@@ -89,8 +82,7 @@ def test_bad_input():
 
 
 def test_study(tmp_path):
-    assert main(["transients", "--quick", "--out", str(tmp_path)]) == 0
-    with (tmp_path / "transients.csv").open() as file:
-        rows = {row["detector"]: row for row in csv.DictReader(file)}
+    study = quick_study("transients", tmp_path)
+    rows = {row["detector"]: row for row in study.rows}
     assert float(rows["synchronous"]["wall"]) < 0.3 * float(rows["non-paralyzable"]["wall"])
-    assert "transients.png" in (tmp_path / "transients.md").read_text()
+    assert study.figures == ["transients.png"]

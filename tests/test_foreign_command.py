@@ -6,18 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from harness import make_system
 from scipy.io import savemat
 
 import mars_lidar as ml
 from mars_lidar.cli import main
 
-SYSTEM = ml.System(
-    period_ns=40.0,
-    cycles=4000,
-    bins=200,
-    pulse=ml.GaussianPulse(sigma_ns=0.5),
-    detector=ml.Detector(dead_time_ns=25.0),
-)
+SYSTEM = make_system(25.0, 4000, 200, sigma_ns=0.5, period_ns=40.0)
 DELAY = np.linspace(5.0, 35.0, 64).reshape(8, 8)
 CLOUD = ["--focal-px", "10", "--cloud"]
 SYSTEM_OPTIONS = ["--bin-ps", "200", "--cycles", "4e3", "--dead-time-ns", "25", "--pulse-sigma-ns", "0.5"]

@@ -6,6 +6,7 @@ import sys
 
 import numpy as np
 import pytest
+from harness import make_system
 
 import mars_lidar as ml
 from mars_lidar import io
@@ -15,9 +16,7 @@ from mars_lidar.io import zarr_store
 from mars_lidar.io.store import Writer
 from tests.harness.command import command_line
 
-SYSTEM = ml.System(
-    period_ns=100.0, cycles=40, bins=64, pulse=ml.GaussianPulse(sigma_ns=0.5), detector=ml.Detector(dead_time_ns=50.0)
-)
+SYSTEM = make_system(50.0, 40, 64, sigma_ns=0.5)
 
 
 def run(*arguments: object):

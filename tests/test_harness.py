@@ -28,6 +28,7 @@ from harness import (
     constant_rate_moments,
     flux_of,
     goodness,
+    make_system,
     mean_vector,
     rejected,
     require,
@@ -40,7 +41,7 @@ from harness.sample import draw
 from numpy.typing import NDArray
 from scipy import stats
 
-from mars_lidar import Detector, Flux, GaussianPulse, System, count_law
+from mars_lidar import Detector, Flux, GaussianPulse, count_law
 from mars_lidar.engines import ENGINES, Engine
 from mars_lidar.engines.engine import Records, Task
 
@@ -49,13 +50,7 @@ HISTOGRAMS = {COUNTS, SHAPE, JOINT}
 MID = Case(
     "mid",
     flux_of(2.0, 1.0),
-    System(
-        period_ns=PERIOD_NS,
-        cycles=100,
-        bins=64,
-        pulse=GaussianPulse(sigma_ns=1.5),
-        detector=Detector(dead_time_ns=63.75),
-    ),
+    make_system(63.75, 100, 64, sigma_ns=1.5),
     6000,
 )
 REPELLING = replace(MID, flux=flux_of(2.0, 5.0), system=MID.system.replace(detector=Detector(dead_time_ns=10.0)))
@@ -295,13 +290,7 @@ def test_a_locked_pixel_is_right_and_a_wrong_one_is_found(dead: float, differ: i
     locked = Case(
         "locked",
         flux_of(0.0, 300.0),
-        System(
-            period_ns=PERIOD_NS,
-            cycles=60,
-            bins=16,
-            pulse=GaussianPulse(sigma_ns=1.5),
-            detector=Detector(dead_time_ns=dead * PERIOD_NS),
-        ),
+        make_system(dead * PERIOD_NS, 60, 16, sigma_ns=1.5),
         2000,
     )
     exact = count_law(Flux(0.0, 300.0), locked.system)

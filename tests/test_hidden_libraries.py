@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from harness import make_system
 
 import mars_lidar as ml
 
@@ -50,12 +51,6 @@ def test_an_exr_names_its_extra(tmp_path):
 
 def test_a_labelled_cube_names_its_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "xarray", None)
-    system = ml.System(
-        period_ns=100.0,
-        cycles=10,
-        bins=8,
-        pulse=ml.GaussianPulse(sigma_ns=1.0),
-        detector=ml.Detector(dead_time_ns=50.0),
-    )
+    system = make_system(50.0, 10, 8)
     with pytest.raises(ml.io.MissingLibraryError, match=r"mars-lidar\[io\]"):
         ml.to_xarray(np.zeros((1, 1, 1, 8), np.uint16), system)

@@ -6,6 +6,7 @@ import itertools
 
 import numpy as np
 import pytest
+from harness import make_system
 
 import mars_lidar as ml
 from mars_lidar.io.rgbd import read_layers
@@ -13,9 +14,7 @@ from mars_lidar.light.fog import Fog
 from mars_lidar.light.transient import Transient
 from mars_lidar.scene.scene import LayeredScene
 
-SYSTEM = ml.System(
-    period_ns=100.0, cycles=50, bins=32, pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=30.0)
-)
+SYSTEM = make_system(30.0, 50, 32)
 
 
 def test_a_pane_hides_behind_what_is_nearer():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from harness import COUNTS, PERIOD_NS, SHAPE, Case, Law, check, flux_of
+from harness import COUNTS, PERIOD_NS, SHAPE, Case, Law, check, flux_of, make_system
 
 import mars_lidar as ml
 from mars_lidar.engines import ENGINES
@@ -18,14 +18,7 @@ GATE = {"mode": "gated", "gate_start_ns": 0.0, "gate_width_ns": PERIOD_NS}
 @pytest.mark.parametrize("dead", [0.9995, 2.0008])
 def test_a_locked_pixel_starts_as_the_statistics_say(dead: float, detector: dict[str, object]):
     """A grid that blurs each turn by a part of a bin puts 0.001 registrations too many into each period."""
-    system = ml.System(
-        period_ns=PERIOD_NS,
-        cycles=12,
-        bins=64,
-        pulse=ml.GaussianPulse(sigma_ns=0.5),
-        start="stationary",
-        detector=ml.Detector(dead_time_ns=dead * PERIOD_NS, **detector),
-    )
+    system = make_system(dead * PERIOD_NS, 12, 64, sigma_ns=0.5, start="stationary", **detector)
     law = count_law(ml.Flux(20.0, 0.05, 37.0), system)
     pmf = np.zeros(law.support[-1] + 1)
     pmf[law.support] = law.pmf
@@ -53,14 +46,7 @@ def test_a_state_that_depends_on_the_switching_on_is_refused(signal: float):
     """Two peaks, and a dead time that ends shortly before the one that was registered: a bright pixel stays with it."""
     samples = np.zeros(256)
     samples[:8] = samples[200:208] = 1.0
-    system = ml.System(
-        period_ns=PERIOD_NS,
-        cycles=50,
-        bins=64,
-        pulse=ml.SampledPulse(samples, 0.1, "first"),
-        start="stationary",
-        detector=ml.Detector(dead_time_ns=4.964 * PERIOD_NS),
-    )
+    system = make_system(4.964 * PERIOD_NS, 50, 64, pulse=ml.SampledPulse(samples, 0.1, "first"), start="stationary")
     flux = ml.Flux(signal, 0.1, 7.0)
     if signal < 10.0:  # it changes between the peaks every few registrations
         drawn = ml.simulate(flux, system, realizations=4000, seed=5)[:, 0, 0].mean(0)
@@ -81,14 +67,7 @@ def test_pixels_of_one_light_share_the_state_that_they_start_in(light: str):
     if light == "waveforms":
         shape = np.exp(-0.5 * ((np.arange(64) - 20.0) / 3.0) ** 2)
         flux = ml.Flux(waveform=signal[None, :, None] * shape / shape.sum(), background=background[None])
-    system = ml.System(
-        period_ns=100.0,
-        cycles=20,
-        bins=64,
-        pulse=ml.GaussianPulse(sigma_ns=2.0),
-        detector=ml.Detector(dead_time_ns=97.0),
-        start="stationary",
-    )
+    system = make_system(97.0, 20, 64, sigma_ns=2.0, start="stationary")
     cube = ml.simulate(flux, system, realizations=3, seed=4).reshape(3, 8, 64)
     for k in range(8):
         alone = ml.simulate(flux[:, k : k + 1], system, realizations=3, seed=4, pixel_index=[[k]])

@@ -9,14 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from harness import make_system
 
 import mars_lidar as ml
 from mars_lidar import io
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
-SYSTEM = ml.System(
-    period_ns=100.0, cycles=50, bins=64, pulse=ml.GaussianPulse(sigma_ns=0.5), detector=ml.Detector(dead_time_ns=50.0)
-)
+SYSTEM = make_system(50.0, 50, 64, sigma_ns=0.5)
 
 
 @pytest.fixture(scope="module")

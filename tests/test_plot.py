@@ -9,6 +9,7 @@ import matplotlib as mpl
 import matplotlib.style
 import numpy as np
 import pytest
+from harness import make_system
 from harness.ledger import rejected, require
 from harness.pvalues import mean_vector
 from matplotlib.figure import Figure
@@ -18,13 +19,7 @@ from mars_lidar import io, plot
 from mars_lidar.plot import views
 from mars_lidar.plot.style import COLOURS
 
-SYSTEM = ml.System(
-    period_ns=100.0,
-    cycles=300,
-    bins=128,
-    pulse=ml.GaussianPulse(sigma_ns=1.0),
-    detector=ml.Detector(dead_time_ns=30.0),
-)
+SYSTEM = make_system(30.0, 300, 128)
 
 
 def cube_of(flux: ml.Flux, system: ml.System = SYSTEM, engine: str = "exact", realizations: int = 1) -> io.Cube:
@@ -194,13 +189,7 @@ def test_no_prediction_where_it_would_take_too_long():
 
 
 def test_a_headline_names_what_is_not_plain():
-    plain = ml.System(
-        period_ns=100.0,
-        cycles=1,
-        bins=1,
-        pulse=ml.GaussianPulse(sigma_ns=1.0),
-        detector=ml.Detector(dead_time_ns=50.0),
-    )
+    plain = make_system(50.0, 1, 1)
     assert views.instrument(plain) == "1 bin of 100 ns; 1 laser period of 100 ns; dead time 50 ns"
     odd = plain.replace(
         bins=1000,

@@ -6,7 +6,7 @@ import pickle
 
 import numpy as np
 import pytest
-from harness import measured_pulse, two_lobes
+from harness import make_system, measured_pulse, two_lobes
 from scipy import integrate, stats
 
 import mars_lidar as ml
@@ -157,13 +157,7 @@ def test_empty_ends_are_left_out():
 
 def test_record_as_long_as_the_period_is_taken():
     """To rounding: 3 x 0.1 is more than 0.3."""
-    system = ml.System(
-        period_ns=0.3,
-        cycles=1,
-        bins=3,
-        pulse=ml.SampledPulse([1, 2, 3], 0.1),
-        detector=ml.Detector(dead_time_ns=0.0),
-    )
+    system = make_system(0.0, 1, 3, pulse=ml.SampledPulse([1, 2, 3], 0.1), period_ns=0.3)
     assert ml.simulate(ml.Flux(5.0, 0.0, 0.1), system, seed=1).sum() > 0
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from harness import make_system
 from scipy import sparse
 from scipy.io import savemat
 
@@ -39,13 +40,7 @@ def depth(path: Path) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def system() -> ml.System:
-    return ml.System(
-        period_ns=100.0,
-        cycles=2000,
-        bins=200,
-        pulse=ml.GaussianPulse(sigma_ns=0.5),
-        detector=ml.Detector(dead_time_ns=10),
-    )
+    return make_system(10, 2000, 200, sigma_ns=0.5)
 
 
 def tower(path: Path) -> float:
@@ -206,8 +201,7 @@ def test_the_gutierrez_layout_is_what_its_loader_reads(tmp_path):
     """`est_range_bins_lmf` of the repository's head, and mean photons that an int32 does not cut down by one."""
     recipe = {
         "scenes": {"example": "room", "size": [8, 9]},
-        "systems": [ml.System(period_ns=100.0, cycles=2000, bins=64, pulse=ml.GaussianPulse(sigma_ns=1.0),
-                              detector=ml.Detector(dead_time_ns=10.0))],
+        "systems": [make_system(10.0, 2000, 64)],
         "light": {"signal": [0.01]},
     }  # fmt: skip
     ml.generate(recipe, tmp_path / "set.zarr")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import itertools
 import re
 import sys
@@ -10,6 +9,7 @@ import sys
 import numpy as np
 import pytest
 import xarray
+from harness import make_system
 from PIL import Image
 
 import mars_lidar as ml
@@ -20,9 +20,8 @@ from mars_lidar.reconstruction import METHODS
 from mars_lidar.reconstruction import stored as stored_module
 from mars_lidar.reconstruction.quality import map_error
 from mars_lidar.reconstruction.stored import reconstruct_stored
-from studies.__main__ import main
-from studies.common.report import MAX_FIGURE_BYTES
 from tests.harness.command import command_line
+from tests.harness.study import quick_study
 
 SMALL = ("--size", 12, "--cycles", 300, "--bins", 256, "--signal", 2)
 
@@ -52,13 +51,7 @@ def test_reflectivity_is_right_behind_a_detection_efficiency(tmp_path):
 
 
 LIGHT = ml.Flux(0.3, 0.3, 40.0)
-RECORDED = ml.System(
-    period_ns=100.0,
-    cycles=20_000,
-    bins=1000,
-    pulse=ml.GaussianPulse.from_fwhm(fwhm_ns=0.3),
-    detector=ml.Detector(dead_time_ns=50.0),
-)
+RECORDED = make_system(50.0, 20_000, 1000, pulse=ml.GaussianPulse.from_fwhm(fwhm_ns=0.3))
 OPTIONS = {"--bin-ps": 100, "--cycles": 20_000, "--dead-time-ns": 50, "--pulse-fwhm-ns": 0.3}
 
 
@@ -124,13 +117,7 @@ def test_maps_read_back(cube, tmp_path, suffix):
 @pytest.mark.parametrize("suffix", [".zarr", ".h5", ".npz"])
 def test_several_returns_read_back(tmp_path, suffix):
     """A pane before a wall: table, maps with an axis of returns, and every return a point of the cloud."""
-    system = ml.System(
-        period_ns=50.0,
-        cycles=2000,
-        bins=256,
-        pulse=ml.GaussianPulse(sigma_ns=0.4),
-        detector=ml.Detector(dead_time_ns=30.0),
-    )
+    system = make_system(30.0, 2000, 256, sigma_ns=0.4, period_ns=50.0)
     pane = np.zeros((6, 8))
     pane[:, 4:] = 0.3
     io.simulate_to(
@@ -259,25 +246,17 @@ def test_errors_of_a_map():
 
 @pytest.mark.full
 def test_study(tmp_path):
-    assert main(["reconstruction", "--quick", "--out", str(tmp_path)]) == 0
-    with (tmp_path / "reconstruction.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    rows = quick_study("reconstruction", tmp_path).rows
     assert {row["method"] for row in rows} == {name for name, method in METHODS.items() if not method.of_images}
     bright = {row["method"]: row for row in rows if float(row["signal"]) == 3.0 and row["detector"] != "synchronous"}
     likely = bright["maximum_likelihood"]
     assert float(likely["depth RMSE mm"]) < 1.3 * float(likely["depth bound mm"])
     assert float(bright["matched_filter"]["depth bias mm"]) < -10 * float(likely["depth bound mm"])
-    text = (tmp_path / "reconstruction.md").read_text()
-    for figure in tmp_path.glob("*.png"):
-        assert figure.name in text
-        assert 5_000 < figure.stat().st_size <= MAX_FIGURE_BYTES
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("name", ["returns"])
-def test_study_of_returns(tmp_path, name):
-    assert main([name, "--quick", "--out", str(tmp_path)]) == 0
-    text = (tmp_path / f"{name}.md").read_text()
-    assert "Quick form" in text
-    assert 5_000 < (tmp_path / f"{name}.png").stat().st_size < MAX_FIGURE_BYTES
-    assert (tmp_path / f"{name}.csv").stat().st_size > 1000
+def test_study_of_returns(tmp_path):
+    study = quick_study("returns", tmp_path)
+    assert "Quick form" in study.text
+    assert study.figures == ["returns.png"]
+    assert len(study.rows) > 10

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from harness import make_system
 
-from mars_lidar.instrument.pulse import GaussianPulse
-from mars_lidar.instrument.system import SPEED_OF_LIGHT_M_PER_NS, Detector, System
+from mars_lidar.instrument.system import SPEED_OF_LIGHT_M_PER_NS, System
 from mars_lidar.scene.scene import Scene
 
 NAN = math.nan
@@ -17,13 +17,7 @@ NAN = math.nan
 
 @pytest.fixture
 def system() -> System:
-    return System(  # unambiguous range 14.99 m
-        period_ns=100.0,
-        cycles=100,
-        bins=64,
-        pulse=GaussianPulse(sigma_ns=1.0),
-        detector=Detector(dead_time_ns=20.0),
-    )
+    return make_system(20.0, 100)  # unambiguous range 14.99 m
 
 
 @pytest.fixture

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from harness import make_system
 
 import mars_lidar as ml
 
@@ -158,9 +159,7 @@ def test_derived_quantities(system: ml.System):
     ],
 )
 def test_most_registrations_of_a_bin(system: ml.System, dead: float, bins: int, cycles: int, most: float):
-    view = ml.System(
-        period_ns=100.0, cycles=cycles, bins=bins, pulse=system.pulse, detector=ml.Detector(dead_time_ns=dead)
-    )
+    view = make_system(dead, cycles, bins, pulse=system.pulse)
     assert view.max_bin_count == most
     assert view.histogram_dtype == (np.uint16 if most <= 65535 else np.uint32)
 
@@ -173,13 +172,7 @@ def test_type_depends_on_the_system_only(system: ml.System):
 def test_bound_on_a_bin_is_never_exceeded():
     """Blinding light: the bound is reached, not passed."""
     for dead, bins in ((30.0, 7), (12.5, 8), (0.7, 100), (250.0, 4)):
-        view = ml.System(
-            period_ns=100.0,
-            cycles=50,
-            bins=bins,
-            pulse=ml.GaussianPulse(sigma_ns=1.0),
-            detector=ml.Detector(dead_time_ns=dead),
-        )
+        view = make_system(dead, 50, bins)
         cube = ml.simulate(ml.Flux(np.zeros((4, 4)), 1e5, 0.0), view)
         assert cube.max() <= view.max_bin_count
 

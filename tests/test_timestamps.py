@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from harness import make_system
 
 import mars_lidar as ml
 from mars_lidar import _core
@@ -105,13 +106,7 @@ def test_one_pass_wherever_the_records_are_kept(level: str, light: str):
         flux = ml.Flux(bright, 0.1 * bright, random.uniform(0.0, 100.0, bright.shape))
     else:
         flux = ml.Flux(waveform=bright[..., None] * random.dirichlet(np.ones(16), bright.shape))
-    system = ml.System(
-        period_ns=100.0,
-        cycles=1000,
-        bins=16,
-        pulse=ml.GaussianPulse(sigma_ns=1.0),
-        detector=ml.Detector(dead_time_ns=10.0, jitter=Jitter(sigma_ns=5.0)),
-    )
+    system = make_system(10.0, 1000, 16, jitter=Jitter(sigma_ns=5.0))
     engine = ExactEngine(level)
     index = np.arange(bright.size, dtype=np.uint32)
     histograms = np.zeros((2, bright.size, 16), system.histogram_dtype)

@@ -8,20 +8,14 @@ from dataclasses import replace
 import h5py
 import numpy as np
 import pytest
-from harness import ledger
+from harness import ledger, make_system
 
 import mars_lidar as ml
 from mars_lidar import io
 from mars_lidar.light.transient import Transient
 
 C = 0.299792458
-SYSTEM = ml.System(
-    period_ns=100.0,
-    cycles=200,
-    bins=200,
-    pulse=ml.GaussianPulse(sigma_ns=0.8),
-    detector=ml.Detector(dead_time_ns=30.0),
-)
+SYSTEM = make_system(30.0, 200, 200, sigma_ns=0.8)
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from harness import COUNTS, SHAPE, Case, Law, check, first_arrival, require, waveform_flux
+from harness import COUNTS, SHAPE, Case, Law, check, first_arrival, make_system, require, waveform_flux
 from scipy import stats
 
 import mars_lidar as ml
@@ -15,14 +15,7 @@ from mars_lidar.engines.exact import ExactEngine
 
 
 def view(dead: float, cycles: int = 20, bins: int = 64, mode: str = "nonparalyzable", start: str = "armed"):
-    return ml.System(
-        period_ns=100.0,
-        cycles=cycles,
-        bins=bins,
-        pulse=ml.GaussianPulse(sigma_ns=1.0),
-        detector=ml.Detector(dead_time_ns=100.0 * dead, mode=mode),
-        start=start,
-    )
+    return make_system(100.0 * dead, cycles, bins, start=start, mode=mode)
 
 
 def one_part(parts: int, at: int) -> np.ndarray:

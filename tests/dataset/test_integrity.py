@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import zarr
 from dataset.conftest import files
+from harness import make_system
 
 import mars_lidar as ml
 from mars_lidar import io
@@ -23,9 +24,7 @@ from mars_lidar.io.store import OnDisk
 from tests.harness.command import command_line
 
 FLIPS = int(os.environ.get("MARS_LIDAR_FLIPS", "200"))
-SYSTEM = ml.System(
-    period_ns=100.0, cycles=50, bins=32, pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=30.0)
-)
+SYSTEM = make_system(30.0, 50, 32)
 
 
 @pytest.fixture

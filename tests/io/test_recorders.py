@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from harness import make_system
 
 import mars_lidar as ml
 from mars_lidar import io
@@ -16,14 +17,7 @@ from tests.harness.command import command_line
 
 pytest.importorskip("ptufile", reason="ptufile (extra io) is not installed")
 PERIOD_NS, CYCLES = 50.0, 5000
-SYSTEM = ml.System(
-    period_ns=PERIOD_NS,
-    cycles=CYCLES,
-    bins=1000,
-    pulse=ml.GaussianPulse(sigma_ns=0.5),
-    detector=ml.Detector(dead_time_ns=80.0),
-    start="armed",
-)
+SYSTEM = make_system(80.0, CYCLES, 1000, sigma_ns=0.5, period_ns=PERIOD_NS, start="armed")
 
 
 def simulated() -> ml.Timestamps:
@@ -247,13 +241,7 @@ def test_sdt(tmp_path):
     result = recorded(path)
     assert result.bin_ns == pytest.approx(50.0 / 2 / 256)
     assert np.array_equal(result.arrays["block 0"], counts)
-    system = ml.System(
-        period_ns=25.0,
-        cycles=1000,
-        bins=256,
-        pulse=ml.GaussianPulse(sigma_ns=0.3),
-        detector=ml.Detector(dead_time_ns=40.0),
-    )
+    system = make_system(40.0, 1000, 256, sigma_ns=0.3, period_ns=25.0)
     assert np.array_equal(io.foreign_cube(path, system).histogram[0], counts)
     path.write_bytes(path.read_bytes()[:200])
     with pytest.raises(ValueError, match=r"a\.sdt"):

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import csv
-
 import pytest
 from harness import require
 from scipy import stats
 
-from studies.__main__ import main
-from studies.common.report import MAX_FIGURE_BYTES
 from studies.joint import covariance as joint_covariance
 from studies.joint.covariance import QUICK, random_systems
+from tests.harness.study import quick_study
 
 
 @pytest.fixture(scope="module")
@@ -31,13 +28,9 @@ def test_random_systems(systems):
 @pytest.mark.full
 def test_report(systems, tmp_path, monkeypatch):
     monkeypatch.setattr(joint_covariance, "random_systems", lambda *_: systems)
-    assert main(["joint-covariance", "--quick", "--out", str(tmp_path)]) == 0
-    text = (tmp_path / "joint_covariance.md").read_text()
-    assert "Quick form" in text
-    assert "None given" in text
-    assert "![closed form and simulation](joint_covariance.png)" in text
-    assert 5_000 < (tmp_path / "joint_covariance.png").stat().st_size <= MAX_FIGURE_BYTES
-    with (tmp_path / "joint_covariance.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert len(rows) == QUICK.systems
-    assert all(float(row["movement"]) <= 1e-4 for row in rows)
+    study = quick_study("joint-covariance", tmp_path)
+    assert "Quick form" in study.text
+    assert "None given" in study.text
+    assert study.figures == ["joint_covariance.png"]
+    assert len(study.rows) == QUICK.systems
+    assert all(float(row["movement"]) <= 1e-4 for row in study.rows)

@@ -1,6 +1,5 @@
 """The studies in their quick form: they run, write what they promise, and their figures make sense."""
 
-import csv
 import json
 import math
 from itertools import pairwise
@@ -17,15 +16,11 @@ from mars_lidar.statistics.count_pmf import Pmf, gaussian_window, total_variatio
 from studies import STUDIES, Request
 from studies.__main__ import main
 from studies.common.distance import g_test, sampling_floor, variance_score
-from studies.common.report import MAX_FIGURE_BYTES, table
+from studies.common.report import table
 from studies.count_law import law
 from studies.covariance import run as covariance
 from studies.covariance import settings as modes
-
-
-def read_csv(path):
-    with path.open() as file:
-        return list(csv.DictReader(file))
+from tests.harness.study import quick_study, read_csv, written
 
 
 @pytest.fixture(scope="module")
@@ -38,14 +33,7 @@ def quick(tmp_path_factory):
 
 @pytest.mark.full
 def test_files(quick):
-    results = {path.name for path in quick.iterdir()}
-    assert {"covariance.md", "covariance.csv", "law.md", "law.csv"} <= results
-    figures = [path for path in quick.iterdir() if path.suffix == ".png"]
-    assert len(figures) == 7
-    for path in figures:
-        assert 5_000 < path.stat().st_size <= MAX_FIGURE_BYTES
-        texts = (quick / "covariance.md", quick / "law.md")
-        assert sum(path.name in text.read_text() for text in texts) == 1
+    assert sum(len(written(name, quick).figures) for name in ("covariance", "law")) == 7
 
 
 def test_covariance_figures_make_sense(quick):
@@ -196,13 +184,13 @@ def test_reference_study(tmp_path):
         "count": {str(v): int(t) for v, t in zip(values, times, strict=True)},
     }
     (data / "made.json").write_text(json.dumps(case))
-    assert main(["reference", "--quick", "--data", str(data), "--out", str(tmp_path)]) == 0
-    rows = {row["law"]: row for row in read_csv(tmp_path / "reference.csv")}
+    study = quick_study("reference", tmp_path, "--data", data)
+    rows = {row["law"]: row for row in study.rows}
     assert set(rows) == set(law.LAWS)
     assert rows["exact"]["good"] == "True"
     assert rows["poisson"]["good"] == rows["renewal"]["good"] == "False"
     assert abs(float(rows["exact"]["z_mean"])) < 5
-    assert "1 of 1 good" in (tmp_path / "reference.md").read_text()
+    assert "1 of 1 good" in study.text
     del case["tau"]
     (data / "made.json").write_text(json.dumps(case))
     with pytest.raises(ValueError, match=r"made\.json must hold .* lacks tau"):
@@ -249,8 +237,8 @@ def test_table():
 
 @pytest.mark.full
 def test_long_exposures_are_those_of_the_closed_form(tmp_path):
-    assert main(["long-exposures", "--quick", "--out", str(tmp_path)]) == 0
-    outcomes = [row["outcome"] for row in read_csv(tmp_path / "long_exposures.csv")]
+    study = quick_study("long-exposures", tmp_path)
+    outcomes = [row["outcome"] for row in study.rows]
     assert outcomes.count("right") >= 3
     assert "wrong" not in outcomes
-    assert f"{outcomes.count('right')} " in (tmp_path / "long_exposures.md").read_text()
+    assert f"{outcomes.count('right')} " in study.text

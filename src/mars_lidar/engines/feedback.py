@@ -77,11 +77,10 @@ class Grids:
             put(sharing[which == number], *known[corner])
         some = np.flatnonzero(alone)  # judged together: neighbours in background need about as many sweeps
         some = some[np.argsort(task.flux.background.reshape(-1)[pixels[some]], kind="stable")]
-        start = resolving(task.system, start, _structure(task.system, task.flux), slice(None))
-        halvings, sweeps, armed = _even_halvings(task, pixels[some], start)
+        halvings, sweeps, armed = _even_halvings(task, pixels[some])
         for k in np.unique(halvings):
             at = halvings == k
-            put(some[at], None if k < 0 else np.asarray(start + k, np.uint8), sweeps[at], armed[at])
+            put(some[at], None if k < 0 else even(task.system, k), sweeps[at], armed[at])
         return grids
 
     def part(self, some: NDArray[np.bool_]) -> Grids:
@@ -119,8 +118,18 @@ def least_power(octaves: int, ratio: FloatArray | float, low: int, high: int) ->
     return low + np.searchsorted(np.ldexp(1.0, octaves * np.arange(low, high)), ratio)
 
 
+def even(system: System, halvings: int) -> KindArray:
+    """A grid of equal cells: bins halved so many times, or joined by pairs where that is negative."""
+    return np.full(system.bins >> max(-halvings, 0), max(halvings, 0), np.uint8)
+
+
 def coarsest(system: System) -> KindArray:
-    """The widest cells (bins,): bins, a quarter of a dead time, or what it exceeds whole periods by.
+    """The widest cells (bins,), none wider than a bin, that the sweeps allow."""
+    return even(system, _sweepable(system, 0))
+
+
+def _sweepable(system: System, least: int) -> int:
+    """Halvings of all bins, `least` or more: to a quarter of a dead time, or what it exceeds whole periods by.
 
     Without the last, where that would take many cells, the sweeps count a whole period in cells, and are slower.
     """
@@ -128,24 +137,18 @@ def coarsest(system: System) -> KindArray:
     beyond = 1.0 / max(math.fmod(system.dead_time_periods, 1.0) * system.bins, 1e-30)
     if system.dead_time_periods > 1.0 and beyond <= 2**TOL.cheap_halvings:
         short = max(short, beyond)
-    return np.full(system.bins, least_power(1, short, 0, TOL.halvings), np.uint8)
+    return int(least_power(1, short, least, TOL.halvings))
 
 
-def resolving(system: System, kinds: KindArray, structure: float, bins: IndexArray | slice) -> KindArray:
-    """A grid whose cells in some `bins` are narrow enough for a meaningful comparison with a finer grid.
+def _resolving(system: System, structure: float, least: int) -> int:
+    """Halvings of a bin, `least` or more, from which a comparison with a finer grid is meaningful.
 
     Where the dead time is nearly a whole number of periods, a pixel re-arms in the cell in which it registered, and
     both grids have the same error until cells are narrower than the `structure` of the light (periods), or than the
     difference of the dead time from whole periods.
     """
-    dead = system.dead_time_periods
-    widest = 0.5 * max(structure, abs(math.remainder(dead, 1.0)))
-    if dead == 0.0:
-        return kinds
-    out = kinds.copy()
-    least = least_power(1, 1.0 / max(widest * system.bins, 1e-30), 0, TOL.halvings)
-    out[bins] = np.maximum(out[bins], least.astype(np.uint8))
-    return out
+    widest = 0.5 * max(structure, abs(math.remainder(system.dead_time_periods, 1.0)))
+    return int(least_power(1, 1.0 / max(widest * system.bins, 1e-30), least, TOL.halvings))
 
 
 class Check(NamedTuple):
@@ -164,12 +167,9 @@ class Check(NamedTuple):
     def of(
         cls, task: Task, pixels: IndexArray, kinds: KindArray, *, variance: bool = True, parts: bool = False
     ) -> Check:
-        """Judge a grid; `parts` (0, bins) where they are not wanted."""
+        """Judge a grid, `kinds` (bins,) or of joined bins; `parts` (0, bins) where they are not wanted."""
         both, sweeps = np.empty((2, pixels.size)), np.empty(pixels.size, np.int32)
-        spread, bins = (
-            np.empty(pixels.size if variance else 0),
-            np.empty((pixels.size if parts else 0, task.system.bins)),
-        )
+        spread, bins = np.empty(pixels.size if variance else 0), np.empty((pixels.size if parts else 0, kinds.size))
         _core.feedback_check(
             task.job, task.pulse, np.ascontiguousarray(pixels), kinds, both, sweeps, spread, bins, task.threads
         )
@@ -197,15 +197,25 @@ def _around_the_pulse(system: System, kinds: KindArray) -> KindArray:
     """A grid that resolves the pulse of a return in the middle bin."""
     low, high = (math.floor(edge / system.bin_ns) for edge in system.pulse.support_ns())
     lit = (system.bins // 2 + np.arange(low, min(high + 2, low + system.bins))) % system.bins
-    return resolving(system, kinds, _structure(system), lit)
+    out = kinds.copy()
+    out[lit] = np.maximum(out[lit], _resolving(system, _structure(system), 0))
+    return out
 
 
-def _even_halvings(task: Task, pixels: IndexArray, start: KindArray) -> tuple[IndexArray, IndexArray, FloatArray]:
-    """How often all cells of each pixel (n,) must be halved, -1 where that is too often; sweeps, fewest armed (n,)."""
-    halvings, sweeps = np.zeros(pixels.size, np.int64), np.zeros(pixels.size, np.int64)
+def _even_halvings(task: Task, pixels: IndexArray) -> tuple[IndexArray, IndexArray, FloatArray]:
+    """How often all bins of each pixel (n,) must be halved, -1 where that is too often; sweeps, fewest armed (n,).
+
+    Of waveforms, whose light is wider than a few bins, a grid of joined bins is judged first, as far as the sweeps
+    allow, which costs less: where it is fine enough, so are bins.
+    """
+    system, structure, waveforms = task.system, _structure(task.system, task.flux), task.flux.waveform is not None
+    joined = -min(TOL.joined, (system.bins & -system.bins).bit_length() - 1) if waveforms else 0
+    first = max(_sweepable(system, joined), _resolving(system, structure, joined))
+    halvings, sweeps = np.full(pixels.size, first), np.zeros(pixels.size, np.int64)
     armed, unlike = np.zeros(pixels.size), np.ones(pixels.size, np.bool_)
-    most = (TOL.cells // cells_of(start)).bit_length() - 1
-    open_ = np.arange(pixels.size)
+    most = (TOL.cells // system.bins).bit_length() - 1
+    able = np.full(pixels.size, first <= most)
+    open_ = np.flatnonzero(able)
     while open_.size:
         rest = []
         for k in np.unique(halvings[open_]):
@@ -213,18 +223,18 @@ def _even_halvings(task: Task, pixels: IndexArray, start: KindArray) -> tuple[In
             distance = np.zeros(at.size)
             for judged in np.unique(unlike[at]):  # a variance that is right on a grid is so on a finer one
                 some = unlike[at] == judged
-                check = Check.of(task, pixels[at[some]], np.asarray(start + k, np.uint8), variance=bool(judged))
+                check = Check.of(task, pixels[at[some]], even(system, k), variance=bool(judged))
                 distance[some], sweeps[at[some]], armed[at[some]] = check.of_law, check.sweeps, check.armed
-                unlike[at[some]] = check.spread > TOL.mean_distance
-            far = (distance > TOL.mean_distance) & (sweeps[at] <= TOL.mean_sweeps)
+                unlike[at[some]] = (check.spread > TOL.mean_distance) | (k < 0)
+            settled = sweeps[at] <= TOL.mean_sweeps
+            far = (distance > TOL.mean_distance) & settled | ~settled & (k < 0)
             # distances fall with the square of the width; whether so many halvings do is judged in the next round
-            ratio = distance[far] / TOL.mean_distance
-            halvings[at[far]] += least_power(2, ratio, 1, TOL.halvings_at_once)
-            halvings[at[far & (halvings[at] > most)]] = most + 1 if k < most else -1
-            halvings[at[far & (k < most) & (halvings[at] > most)]] = most
-            rest.append(at[far & (halvings[at] >= 0)])
+            more = k + least_power(2, distance[far] / TOL.mean_distance, 1, TOL.halvings_at_once)
+            able[at[far]] = k < most
+            halvings[at[far]] = np.minimum(more, most) if k >= 0 else 0
+            rest.append(at[far & able[at]])
         open_ = np.concatenate(rest)
-    return halvings, sweeps, armed
+    return np.where(able, np.maximum(halvings, 0), -1), sweeps, armed
 
 
 # Pixels of a single return: the same cells for all, because every lane begins half a period before its return

@@ -37,6 +37,8 @@ class Tolerances:
     """Rounds of refinement in which cells may be joined; later ones only halve, so that there is an end."""
     worthwhile: float = 0.8
     """Share of a grid's cells: one with fewer is judged too, because cost is proportional to the cells."""
+    joined: int = 2
+    """Times that bins are joined by pairs for a first look at waveforms: a quarter of the cost."""
     halvings_at_once: int = 4
     """At most: the first distances from a wide grid are not of second order."""
 

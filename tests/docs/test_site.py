@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gzip
 import html
-import itertools
 import os
 import re
 import subprocess
@@ -16,9 +15,9 @@ from urllib.parse import unquote
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "tests" / "explore"))
-from explorer_page import WAIT_MS, chromium  # noqa: E402
+from explorer_page import WAIT_MS, chromium, shortcomings  # noqa: E402
 
 fcntl = pytest.importorskip("fcntl", reason="the site is built on systems with POSIX locks")
 pytestmark = pytest.mark.full
@@ -35,46 +34,6 @@ SOURCES = (
 GENERATED = ("docs/api/", "docs/copied/", "docs/gallery/", "docs/lessons/")
 WEIGHT = 1_000_000  # bytes of a page with all it loads, pictures aside, which have a limit of their own
 PICTURES = 1_000_000
-
-# Text below the contrast of WCAG AA; each combination of elements, classes and inline styles is looked at once a page.
-CONTRAST = """() => {
-  const rgb = (text) => text.match(/[\\d.]+/g).map(Number);
-  const linear = (x) => (x <= 0.04045 ? x / 12.92 : ((x + 0.055) / 1.055) ** 2.4);
-  const light = ([r, g, b]) => 0.2126 * linear(r / 255) + 0.7152 * linear(g / 255) + 0.0722 * linear(b / 255);
-  const behind = (element) => {
-    for (let e = element; e; e = e.parentElement) {
-      const c = rgb(getComputedStyle(e).backgroundColor);
-      if (c.length < 4 || c[3] > 0.5) return c;
-    }
-    return [255, 255, 255];
-  };
-  const names = new Map();
-  const style = (e) => {  // what a rule of a style sheet can select it by: rows of tables alternate
-    if (!e) return "";
-    if (!names.has(e)) {
-      const row = e.tagName === "TR" ? [...e.parentElement.children].indexOf(e) % 2 : "";
-      names.set(e, `${style(e.parentElement)} ${e.tagName}.${e.className}[${e.getAttribute("style")}]${row}`);
-    }
-    return names.get(e);
-  };
-  const low = [], styles = new Set();
-  const walker = document.createTreeWalker(document.querySelector("main"), NodeFilter.SHOW_TEXT);
-  while (walker.nextNode()) {
-    const text = walker.currentNode.textContent.trim(), element = walker.currentNode.parentElement;
-    if (!text || styles.has(style(element))) continue;
-    const skipped = "script, style, noscript, .headerlink, .katex-mathml";
-    if (element.closest(skipped) || !element.checkVisibility()) continue;
-    const computed = getComputedStyle(element), box = element.getBoundingClientRect();
-    const colour = rgb(computed.color);
-    if (box.width < 2 || computed.visibility === "hidden" || colour[3] === 0) continue;
-    styles.add(style(element));
-    const [a, b] = [light(colour), light(behind(element))].sort((x, y) => y - x);
-    const size = parseFloat(computed.fontSize), large = size >= 24 || (size >= 18.66 && computed.fontWeight >= 700);
-    if ((a + 0.05) / (b + 0.05) < (large ? 3 : 4.5))
-      low.push(`${text.slice(0, 30)}: ${computed.color} on ${behind(element)}`);
-  }
-  return [...new Set(low)];
-}"""
 
 
 def pages_of(site: Path) -> list[str]:
@@ -113,15 +72,6 @@ def new_tab(browser: Any, **context: Any) -> Any:
     return tab
 
 
-FACTS = """() => ({
-  scroll: Math.max(...[document.documentElement, ...document.querySelectorAll(".bd-article-container")]
-    .map((e) => e.scrollWidth - e.clientWidth)),
-  levels: [...document.querySelectorAll("main h1, main h2, main h3, main h4")].map((h) => Number(h.tagName[1])),
-  undescribed: [...document.images].filter((i) => !i.alt || /(^|[ /_])(plot|sphx|_images)[ _/]|\\.png$/i.test(i.alt))
-    .map((i) => i.alt || i.src.split("/").pop()),
-})"""
-
-
 def weight(file: Path) -> int:
     """Bytes that a server sends: text compressed, as all of them do."""
     content = file.read_bytes()
@@ -129,8 +79,8 @@ def weight(file: Path) -> int:
 
 
 def test_every_page_on_a_telephone(site: Path, browser: Any):
-    """390 px wide: no sideways scroll, one first heading and no level left out, pictures described, contrast
-    of WCAG AA in light and dark, no error, below 1 MB but for pictures and the explorer, nothing from another host."""
+    """390 px wide: nothing that `shortcomings` lists, no error on the console, below 1 MB except pictures and the
+    explorer, no request to another host."""
     tab = new_tab(browser, viewport={"width": 390, "height": 844})
     said: list[str] = []
     asked: list[str] = []
@@ -143,13 +93,6 @@ def test_every_page_on_a_telephone(site: Path, browser: Any):
         said.clear()
         asked.clear()
         tab.goto((site / name).as_uri(), wait_until="load")
-        facts = tab.evaluate(FACTS)
-        low = []
-        tab.add_style_tag(content="* { transition: none !important }")
-        for scheme in ("light", "dark"):
-            tab.evaluate("(scheme) => { document.documentElement.dataset.theme = scheme }", scheme)
-            low += tab.evaluate(CONTRAST)
-        levels = facts["levels"]
         names = {
             unquote(url.removeprefix("file://").split("?")[0].split("#")[0]) for url in asked if url.startswith("file:")
         }
@@ -158,13 +101,7 @@ def test_every_page_on_a_telephone(site: Path, browser: Any):
             weights.setdefault(file, weight(file))
         pictures = sum(weights[file] for file in files if file.suffix in (".png", ".gif", ".webp"))
         rest = sum(weights[file] for file in files) - pictures
-        problems = {
-            "scroll": max(facts["scroll"], 0),
-            "headings": levels
-            if levels.count(1) != 1 or any(b > a + 1 for a, b in itertools.pairwise(levels))
-            else None,
-            "alt": facts["undescribed"],
-            "contrast": low[:5],
+        problems = shortcomings(tab) | {
             "console": list(said),
             "bytes": rest if rest >= WEIGHT else 0,
             "bytes of pictures": pictures if pictures >= PICTURES else 0,

@@ -7,11 +7,10 @@ criterion for its accuracy.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base.native import _core
 from mars_lidar._base.resources import thread_count
-from mars_lidar._base.types import FloatArray, IndexArray
+from mars_lidar._base.types import ArrayLike, FloatArray, IndexArray, NDArray
 from mars_lidar.statistics.count_pmf import Pmf
 from mars_lidar.statistics.tolerances import TOL
 

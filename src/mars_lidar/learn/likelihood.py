@@ -238,12 +238,12 @@ def _evaluated(counts: torch.Tensor, light: torch.Tensor, system: System, column
 
     out = torch.empty((len(light), columns), dtype=torch.float64)
     rows, at = (tensor.detach().cpu().contiguous().numpy() for tensor in (counts, light))
-    _core.coarse_likelihood(_record(system), rows, at, out.numpy(), threads=torch.get_num_threads())
+    _core.coarse_likelihood(_plan(system), rows, at, out.numpy(), threads=torch.get_num_threads())
     return out.to(light.device)
 
 
 @lru_cache(maxsize=16)
-def _record(system: System) -> _core.CoarseRecord:
+def _plan(system: System) -> _core.CoarsePlan:
     """What the native likelihood needs of a system; times in laser periods."""
     from mars_lidar._base.native import _core
 
@@ -258,7 +258,7 @@ def _record(system: System) -> _core.CoarseRecord:
         sampled = {"sigma": 0.0, "width": pulse.bin_ns / period, "start": pulse._start_ns / period}
         ends, knots = pulse.support_ns(), np.asarray(pulse._cumulative, np.float64)
     fine = system.bin_ns <= TOLERANCES.even * width
-    return _core.CoarseRecord(
+    return _core.CoarsePlan(
         bins=system.bins,
         cycles=system.cycles,
         cells=0 if fine else math.ceil(system.bin_ns / (TOLERANCES.part * width)),

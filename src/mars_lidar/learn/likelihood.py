@@ -143,8 +143,8 @@ def histogram_log_likelihood(
     longer than a period, and less than one pass of the pulse is expected to end without a registration. There it
     matters which registrations the end of the exposure cuts off, which a histogram does not say; S and delay may be 0.4
     off (0.2 and 0.4 in two more instruments, below 0.03 in four), and a warning says so. Where the window of bins that
-    are cut moves by a bin, the value jumps by up to 5e-3 (1e-4 mostly); the slope in the delay jumps where a sample of a pulse begins
-    at the edge of a cell.
+    are cut moves by a bin, the value jumps by up to 5e-3 (1e-4 mostly); the slope in the delay jumps where a sample of
+    a pulse begins at the edge of a cell.
     The processor computes it, with its first and second derivatives: tensors of another device are copied there and
     back. One thread of PyTorch's a share of the pixels; docs/learn.md has the times.
 
@@ -263,8 +263,8 @@ def _warn_of_the_end(counts: FloatArray, signal: FloatArray, system: System) -> 
         warnings.warn(
             f"histogram_log_likelihood: in {affected} of {len(signal)} pixels less than one pass of the pulse is "
             "expected to end without a registration, each of which blinds the pixel for more than a period: which "
-            "registrations the end of the exposure cuts off matters, and S and delay may be 0.4 of the bound's standard "
-            "deviation off",
+            "registrations the end of the exposure cuts off matters, and S and delay may be 0.4 of the bound's "
+            "standard deviation off",
             UserWarning,
             stacklevel=2,
         )

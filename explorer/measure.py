@@ -130,11 +130,10 @@ def main() -> None:
     text = f"""# The explorer's page in a browser
 
 Made by `python explorer/measure.py --write`: Chromium {version}, headless, {cores} processor cores on which {load:.0f}
-other processes were running, the page of {PAGE.stat().st_size:,} bytes from a file. A slider moves the dead time at
-10,000 laser periods, the pictures of all pixels left alone, which are drawn when it has rested; times are to the next
-frame, and those of a later stage hold the earlier ones. Where other
-processes share the cores, times by the clock are longer than the browser's work: the last column is the processor time
-that all of its threads took for the change, from the event to that frame.
+other processes were running, the page of {PAGE.stat().st_size:,} bytes from a file. A slider changes the dead time at
+10,000 laser periods, without the images of all pixels, which are drawn when it rests. Times are from the event to the
+next frame; those of a later stage include the earlier stages. Where other processes share the cores, wall-clock times
+exceed the work of the browser: the last column is the processor time of all its threads from the event to that frame.
 
 {chr(10).join(lines)}
 """

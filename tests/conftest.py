@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 
-from mars_lidar import Detector, Flux, GaussianPulse, System
+from mars_lidar import Flux, System
 
 pytest.register_assert_rewrite("harness")
 
-from harness import ledger  # noqa: E402  (after the line above, so that its assertions explain themselves)
+from harness import ledger, make_system  # noqa: E402  (after the line above, so that its assertions explain themselves)
 
 
 @pytest.fixture(autouse=True, scope="session")
@@ -25,13 +25,7 @@ def tables_of_this_run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Non
 @pytest.fixture
 def system() -> System:
     """The system of the MaRS paper, shortened."""
-    return System(
-        period_ns=1e3 / 7.5,
-        cycles=200,
-        bins=64,
-        pulse=GaussianPulse(sigma_ns=0.5),
-        detector=Detector(dead_time_ns=85.0),
-    )
+    return make_system(85.0, 200, 64, sigma_ns=0.5, period_ns=1e3 / 7.5)
 
 
 @pytest.fixture

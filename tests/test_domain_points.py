@@ -24,6 +24,7 @@ from harness import (
     check,
     counts_against_law,
     flux_of,
+    make_system,
     require,
     waveform_flux,
 )
@@ -38,14 +39,7 @@ from studies.domain.systems import draw
 
 
 def _system(dead: float, sigma: float, bins: int, cycles: int, start: str = "armed") -> ml.System:
-    return ml.System(
-        period_ns=PERIOD_NS,
-        cycles=cycles,
-        bins=bins,
-        pulse=ml.GaussianPulse(sigma_ns=sigma * PERIOD_NS),
-        detector=ml.Detector(dead_time_ns=dead * PERIOD_NS),
-        start=start,
-    )
+    return make_system(dead * PERIOD_NS, cycles, bins, sigma_ns=sigma * PERIOD_NS, start=start)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -150,13 +144,7 @@ def test_waveforms(name: str, engine: str) -> None:
 
 def test_a_scene_of_long_locked_pixels() -> None:
     """The issue's own: 200 pixels of 20 and 2 photons, a million cycles; none may hold 0 or 2^31 counts."""
-    system = ml.System(
-        period_ns=1e3 / 7.5,
-        cycles=1_000_000,
-        bins=1024,
-        pulse=ml.GaussianPulse(sigma_ns=0.5),
-        detector=ml.Detector(dead_time_ns=0.97e3 / 7.5),
-    )
+    system = make_system(0.97e3 / 7.5, 1_000_000, 1024, sigma_ns=0.5, period_ns=1e3 / 7.5)
     cube = ml.simulate(ml.Flux(np.full((1, 200), 20.0), 2.0, 60.0), system, engine="auto", seed=1)
     counts = cube.sum(-1, dtype=np.int64)
     assert counts.min() >= 999_997
@@ -165,9 +153,7 @@ def test_a_scene_of_long_locked_pixels() -> None:
 
 def _tail_counts(pulse: ml.Pulse, signal: float, edges: list[tuple[float, float]], registrations: float) -> list[int]:
     """Registrations of the exact engine at these distances (periods) from the delay: dim light, by timestamps."""
-    system = ml.System(
-        period_ns=PERIOD_NS, cycles=50_000_000, bins=64, pulse=pulse, detector=ml.Detector(dead_time_ns=0.3 * PERIOD_NS)
-    )
+    system = make_system(0.3 * PERIOD_NS, 50_000_000, 64, pulse=pulse)
     pixels = max(1, round(registrations / (signal * system.cycles)))
     flux = ml.Flux(np.full((1, pixels), signal), 0.0, 0.5 * PERIOD_NS)
     times = ml.simulate_timestamps(flux, system, seed=3)
@@ -360,14 +346,7 @@ def test_a_waveform_that_re_arms_within_its_parts() -> None:
 
 def test_a_stationary_start_of_a_pixel_that_fires_like_a_clock() -> None:
     """500 photons a dead time: the iteration did not settle. The rate of registrations is that of constant light."""
-    system = ml.System(
-        period_ns=100.0,
-        cycles=100,
-        bins=1,
-        pulse=ml.GaussianPulse(sigma_ns=1e-4),
-        detector=ml.Detector(dead_time_ns=50.0),
-        start="stationary",
-    )
+    system = make_system(50.0, 100, 1, sigma_ns=1e-4, start="stationary")
     counts = ml.simulate(ml.Flux(1.0, 1000.0, 59.8), system, seed=1, realizations=2000)
     assert counts.mean() == pytest.approx(100 * 1001 / (1 + 1001 * 0.5), abs=0.1)
     assert counts.std() < 1.0
@@ -375,14 +354,7 @@ def test_a_stationary_start_of_a_pixel_that_fires_like_a_clock() -> None:
 
 def test_a_stationary_start_that_is_nearly_locked_to_a_very_bright_pulse() -> None:
     """The bins' means are those of the law; in 256 bins 56.2 and 6.6 were drawn for 58.7 and 4.0. 4.5 errors: 7e-6."""
-    system = ml.System(
-        period_ns=100.0,
-        cycles=251,
-        bins=700,
-        pulse=ml.GaussianPulse(sigma_ns=0.194),
-        detector=ml.Detector(dead_time_ns=399.9915),
-        start="stationary",
-    )
+    system = make_system(399.9915, 251, 700, sigma_ns=0.194, start="stationary")
     flux = ml.Flux(611.75, 0.0376, 0.0)
     counts = ml.simulate(flux, system, seed=3, realizations=4000).reshape(4000, -1)[:, -4:-2]
     law = ml.mean_histogram(flux, system)[-4:-2]
@@ -413,13 +385,7 @@ def test_bright_registrations_beside_an_edge_of_a_bin():
     peaks |= {41: 1, 42: 1, 44: 1, 48: 1, 50: 3, 51: 21, 52: 15, 54: 4, 59: 1, 60: 1, 63: 1, 64: 4, 66: 3, 72: 3, 73: 1}
     samples = np.zeros(74)
     samples[list(peaks)] = list(peaks.values())
-    system = ml.System(
-        period_ns=100.0,
-        cycles=2000,
-        bins=32,
-        pulse=ml.SampledPulse(samples, 0.0711274, "first"),
-        detector=ml.Detector(dead_time_ns=1.8587403),
-    )
+    system = make_system(1.8587403, 2000, 32, pulse=ml.SampledPulse(samples, 0.0711274, "first"))
     flux = ml.Flux(387.593, 0.0, 5.2111)
     law = ml.joint_law(flux, system)
     drawn = ml.simulate(flux, system, realizations=400, seed=3).reshape(400, -1)

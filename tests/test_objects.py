@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from harness import make_system
 
 import mars_lidar as ml
 from mars_lidar import io, statistics
@@ -14,9 +15,7 @@ from mars_lidar._base.display import brief
 from mars_lidar.engines import MarsEngine
 from mars_lidar.reconstruction import HistogramBound
 
-SYSTEM = ml.System(
-    period_ns=100.0, cycles=200, bins=64, pulse=ml.GaussianPulse(sigma_ns=0.5), detector=ml.Detector(dead_time_ns=40.0)
-)
+SYSTEM = make_system(40.0, 200, 64, sigma_ns=0.5)
 LONG = SYSTEM.replace(cycles=50_000)
 LINE = 800  # characters: a few lines of a notebook
 

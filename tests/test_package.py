@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from harness import make_system
 
 import mars_lidar as ml
 from mars_lidar.engines import EngineOptions
@@ -94,9 +95,7 @@ def test_every_option_of_an_engine_is_documented_where_it_is_given():
     for name in EngineOptions.__annotations__:
         assert f"`{name}`" in text
         assert f"\n{name}\n" in inspect.getdoc(EngineOptions)
-    system = ml.System(
-        period_ns=10.0, cycles=1, bins=8, pulse=ml.GaussianPulse(sigma_ns=0.5), detector=ml.Detector(dead_time_ns=1.0)
-    )
+    system = make_system(1.0, 1, 8, sigma_ns=0.5, period_ns=10.0)
     with pytest.raises(TypeError, match="'tabel' is no argument of this function, nor an option of an engine"):
         ml.simulate(ml.Flux(1.0, 1.0, 5.0), system, engine="mars", tabel=None)  # type: ignore[call-arg]
 

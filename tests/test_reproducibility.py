@@ -6,6 +6,7 @@ import hashlib
 
 import numpy as np
 import pytest
+from harness import make_system
 from numpy.typing import NDArray
 
 import mars_lidar as ml
@@ -25,13 +26,7 @@ def image(kind: str) -> tuple[ml.Flux, ml.System]:
     signal = np.where((x + y) % 5 == 0, 0.0, 0.01 * 2.0 ** ((3 * x + 7 * y) % 13))
     background = np.where((2 * x + y) % 7 == 0, 0.0, 0.02 * 3.0 ** ((x + 5 * y) % 6))
     delay = 9.7 * x - 31.3 * y
-    system = ml.System(
-        period_ns=100.0,
-        cycles=120,
-        bins=50,
-        pulse=ml.GaussianPulse(sigma_ns=0.75),
-        detector=ml.Detector(dead_time_ns=63.75),
-    )
+    system = make_system(63.75, 120, 50, sigma_ns=0.75)
     flux = ml.Flux(signal, background, delay)
     if kind == "sampled":
         system = system.replace(pulse=ml.SampledPulse(LOBES, 0.9))

@@ -20,6 +20,7 @@ from typing import Any, get_args
 import h5py
 import numpy as np
 import pytest
+from harness import make_system
 
 import mars_lidar as ml
 from mars_lidar import io, plot, reconstruction, statistics
@@ -27,9 +28,7 @@ from mars_lidar.dataset import DatasetRecipe, Light, estimate, export, open_data
 from mars_lidar.io.maps import load_maps, save_maps
 from tests.harness.command import command_line, options_of
 
-SYSTEM = ml.System(
-    period_ns=100.0, cycles=20, bins=16, pulse=ml.GaussianPulse(sigma_ns=2.0), detector=ml.Detector(dead_time_ns=30.0)
-)
+SYSTEM = make_system(30.0, 20, 16, sigma_ns=2.0)
 System = type(SYSTEM)
 FLUX = ml.Flux(np.full((2, 3), 0.5), 0.1, 40.0)
 PIXEL = ml.Flux(0.5, 0.1, 40.0)

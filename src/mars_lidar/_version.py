@@ -4,7 +4,7 @@ __version__ = "0.3.0"
 
 
 def other_version(made_by: object) -> str:
-    """What is added where counts differ: empty, or, in brackets after a space, that another version made them."""
+    """Suffix of a message on differing counts: empty, or a note that another version simulated them."""
     if made_by in (None, "", __version__):
         return ""
     versions = f"made by mars-lidar {made_by}, this is {__version__}"

@@ -1,4 +1,4 @@
-"""The verb: check, estimate, dispatch."""
+"""`simulate` and `simulate_timestamps`: checks of arguments, and the call of an engine."""
 
 from __future__ import annotations
 
@@ -41,26 +41,26 @@ def simulate(
     report: dict[str, float] | None = None,
     **options: Unpack[EngineOptions],
 ) -> NDArray[Any]:
-    """Histogram cubes of an image.
+    """Simulate histogram cubes of an image.
 
     Parameters
     ----------
     flux
-        The light, (H, W); one pixel is an image of 1 x 1, N pixels are one row.
+        The light, (H, W); one pixel is an image of 1 x 1, N pixels are a row.
     system
         Laser, detector and histogram.
     engine
         ``"exact"`` (default), ``"feedback"`` (whole histograms, at a cost independent of the exposure),
-        ``"auto"`` (the faster of these two, pixel by pixel), ``"sequential"`` (slow, independent gold standard),
+        ``"auto"`` (the faster of these two, pixel by pixel), ``"sequential"`` (slow, independent reference),
         ``"mars"`` (count law x shape), ``"renewal"`` and ``"poisson"`` (baselines), or an `Engine`
-        of your own settings.
+        with other settings.
     realizations
         Independent exposures of the whole image.
     first_realization
-        Number of the first one: ``realizations=2, first_realization=4`` are numbers 4 and 5 of a larger run.
+        Number of the first realization: ``realizations=2, first_realization=4`` gives numbers 4 and 5 of a larger run.
     pixel_index
-        (H * W,) or (H, W) integers in [0, 2**32): the place of each pixel in a larger image, row-major. Any
-        part of a cube can so be made alone, with the same bits. Default: 0 .. H * W - 1.
+        (H * W,) or (H, W) integers in [0, 2**32): the place of each pixel in a larger image, row-major. With
+        it any part of a cube can be simulated alone, with the same bits. Default: 0 .. H * W - 1.
     seed
         Integer in [0, 2**64).
     threads
@@ -72,35 +72,36 @@ def simulate(
         ``torch.from_dlpack`` takes without a copy.
     out
         C-contiguous array or memory map (realizations, H, W, bins) of ``system.histogram_dtype`` to fill, such as the
-        cube of a call before: fresh memory costs a fifth more time, in which the system clears its pages; with
+        cube of an earlier call: new memory takes a fifth more time, because the system clears its pages; with
         ``device="cuda"`` a CuPy array.
     progress
         Called as ``progress(done, total)`` a few times a second; an exception from it stops the run. True: a bar, or
-        a line every 30 s where there is no terminal.
+        a line every 30 s without a terminal.
     report
-        A dictionary that takes what the engine has to tell beside the counts, numbers by name.
+        A dictionary into which the engine writes its report, numbers by name.
     **options
-        Of the engines ``"mars"`` and ``"renewal"`` (`mars_lidar.engines.EngineOptions`): `table`, a `mars_lidar.Table`;
-        `count`, the law of the count: ``"exact"`` (default), ``"matched"`` (to four cumulants) or ``"gaussian"`` (the
-        paper's), for ``"mars"``; and for a table `interpolation`, ``"bilinear"`` (default) or ``"nearest"`` (the
-        paper's), and `outside`, of pixels beyond its range: ``"error"`` (default), or ``"exact"``, some ms each.
+        Options of the engines ``"mars"`` and ``"renewal"`` (`mars_lidar.engines.EngineOptions`): `table`, a
+        `mars_lidar.Table`; `count`, the law of the count: ``"exact"`` (default), ``"matched"`` (to four cumulants) or
+        ``"gaussian"`` (the paper's), for ``"mars"``; and for a table `interpolation`, ``"bilinear"`` (default) or
+        ``"nearest"`` (the paper's), and `outside`, for pixels beyond its range: ``"error"`` (default), or ``"exact"``,
+        some ms each.
 
     Returns
     -------
     NDArray
-        (realizations, H, W, bins), uint16, or uint32 where a bin could exceed 65535 (`out` if given); of CuPy
+        (realizations, H, W, bins), uint16, or uint32 if a bin could exceed 65535 (`out` if given); a CuPy array
         with ``device="cuda"``.
 
     Raises
     ------
     ValueError
-        An argument out of its range, or a detector, start or light that the engine does not do; nothing was drawn.
+        An argument out of range, or a detector, start or light that the engine does not support; nothing was drawn.
     TypeError
         An argument of another type, or an unknown keyword.
     MemoryError
-        The cube, or what the engine needs beside it, does not fit in the memory that is free.
+        The cube, or the working memory of the engine, does not fit in the available memory.
     ConvergenceError
-        (`mars_lidar.statistics`) A count law of ``engine="mars"`` does not converge; the text names the pixel.
+        (`mars_lidar.statistics`) A count law of ``engine="mars"`` does not converge; the message names the pixel.
 
     See Also
     --------
@@ -152,14 +153,14 @@ def simulate_timestamps(
     device: Literal["cpu", "cuda"] = "cpu",
     progress: Progress | bool | None = None,
 ) -> Timestamps:
-    """Registration times of an image in one realization.
+    """Simulate the registration times of an image in one realization.
 
     The histogram of the result equals ``simulate(..., first_realization=realization)[0]`` of the same seed exactly.
 
     Parameters
     ----------
     flux, system
-        The light (H, W), photons per period, and what registers it.
+        The light (H, W), photons per period, and the system.
     engine
         ``"exact"`` (default) or ``"sequential"``, or an `Engine`.
     realization
@@ -171,24 +172,24 @@ def simulate_timestamps(
     threads
         Threads to run on; default: all processors this process may use. The result does not depend on it.
     device
-        ``"cpu"`` (default) or ``"cuda"``; the result is in the processor's memory on every device.
+        ``"cpu"`` (default) or ``"cuda"``; the result is in host memory for either.
     progress
         As for `simulate`.
 
     Returns
     -------
     Timestamps
-        Packed times (ns), cycles and bins of all pixels: of `exact` 8 bytes a registration, times and bins when asked
-        for.
+        Packed times (ns), cycles and bins of all pixels; with `exact` 8 bytes a registration, times and bins on first
+        use.
 
     Raises
     ------
     TypeError
         An argument of another type, or an unknown keyword.
     ValueError
-        As `simulate`; also for an engine that draws histograms only.
+        As for `simulate`; also for an engine that draws histograms only.
     MemoryError
-        The expected registrations do not fit in the memory that is free.
+        The expected registrations do not fit in the available memory.
 
     See Also
     --------

@@ -1,4 +1,4 @@
-"""The script `mars-lidar`: outside of the package, so that Ctrl-C while the package is imported ends it in one line."""
+"""The script `mars-lidar`: outside the package, so that Ctrl-C during the import of the package prints one line."""
 
 import sys
 

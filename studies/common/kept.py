@@ -32,7 +32,7 @@ def fixed(folder: Path, config: Mapping[str, Any]) -> None:
     _save_whole(path, record)
 
 
-def kept(path: Path, make: Callable[[], Any], tell: Tell) -> Any:
+def once(path: Path, make: Callable[[], Any], tell: Tell) -> Any:
     """What the JSON file `path` holds, made and written first where it is not there."""
     if not path.exists():
         _save_whole(path, json.dumps(make()) + "\n")

@@ -121,8 +121,8 @@ def room(number: int, sizes: Sizes) -> Scene:
 
 def test_scene(number: int, sizes: Sizes) -> Scene:
     """A part of a room."""
-    top, left = _random(sizes, number, 1).integers(0, sizes.render - sizes.size + 1, 2)
-    return room(number, sizes)[top : top + sizes.size, left : left + sizes.size]
+    row, column = _random(sizes, number, 1).integers(0, sizes.render - sizes.size + 1, 2)
+    return room(number, sizes)[row : row + sizes.size, column : column + sizes.size]
 
 
 def level(scene: Scene, sizes: Sizes) -> float:
@@ -142,7 +142,7 @@ class Pixels:
     window does not hold it.
     """
 
-    seen: NDArray[np.float32]
+    inputs: NDArray[np.float32]
     middle: FloatArray
     wanted: NDArray[np.float32]
     dead: float  # time, in periods
@@ -151,14 +151,14 @@ class Pixels:
     def empty(cls, system: System, *shape: int) -> Pixels:
         """Memory for images of `shape` (N, H, W)."""
         dead = system.dead_time_periods
-        seen = np.empty((*shape, number(system.bins, dead)), np.float32)
-        return cls(seen, np.empty(shape), np.empty((*shape, 2), np.float32), dead)
+        inputs = np.empty((*shape, number(system.bins, dead)), np.float32)
+        return cls(inputs, np.empty(shape), np.empty((*shape, 2), np.float32), dead)
 
     def put(self, k: int, counts: NDArray[Any], reflectivity: Any, delay: Any) -> None:
         """Image k: histograms (H, W, bins), and maps of reflectivity and of the delay in bins."""
         bins = counts.shape[-1]
-        seen, middle = features(counts.reshape(-1, bins), self.dead)
-        self.seen[k], self.middle[k] = seen.reshape(self.seen[k].shape), middle.reshape(self.middle[k].shape)
+        inputs, middle = features(counts.reshape(-1, bins), self.dead)
+        self.inputs[k], self.middle[k] = inputs.reshape(self.inputs[k].shape), middle.reshape(self.middle[k].shape)
         away = (np.asarray(delay) - self.middle[k] + 0.5 * bins) % bins - 0.5 * bins
         self.wanted[k, ..., 0] = reflectivity
         self.wanted[k, ..., 1] = np.where(np.abs(away) < 0.5 * WINDOW, away, np.nan)

@@ -38,20 +38,20 @@ class Network(nn.Module):
 
         self.blocks = nn.ModuleList(block() for _ in range(0 if kind == "pixel" else 2))
         self.head = nn.Sequential(nn.SiLU(), nn.Linear(width, 2 * OUTPUTS))
-        self.seen_mean, self.seen_scale = nn.Buffer(torch.zeros(features)), nn.Buffer(torch.ones(features))
+        self.inputs_mean, self.inputs_scale = nn.Buffer(torch.zeros(features)), nn.Buffer(torch.ones(features))
         self.wanted_mean, self.wanted_scale = nn.Buffer(torch.zeros(OUTPUTS)), nn.Buffer(torch.ones(OUTPUTS))
 
     def standardise(self, pixels: Pixels) -> None:
         """Take the scales of features and outputs from training data."""
-        for name, values in (("seen", pixels.seen), ("wanted", pixels.wanted)):
+        for name, values in (("inputs", pixels.inputs), ("wanted", pixels.wanted)):
             flat = values.reshape(-1, values.shape[-1])
             getattr(self, f"{name}_mean").copy_(torch.from_numpy(np.nanmean(flat, 0, dtype=np.float64)))
             scale = torch.from_numpy(np.nanstd(flat, 0, dtype=np.float64))
             getattr(self, f"{name}_scale").copy_(scale.clamp_min(1e-3))
 
-    def forward(self, seen: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
         """Means and log-variances in the units of what is wanted."""
-        x = self.inner(self.stem((seen - self.seen_mean) / self.seen_scale))
+        x = self.inner(self.stem((inputs - self.inputs_mean) / self.inputs_scale))
         for block in self.blocks:
             x = x + block(x.movedim(-1, 1)).movedim(1, -1)
         mean, log_variance = self.head(x).chunk(2, -1)
@@ -62,15 +62,15 @@ class Network(nn.Module):
 def trained(kind: str, pixels: Pixels, *, steps: int, batch: int, seed: int) -> Network:
     """A network; `batch` images a step, or as many pixels of any images for the pixel network."""
     torch.manual_seed(seed)
-    network = Network(kind, pixels.seen.shape[-1])
+    network = Network(kind, pixels.inputs.shape[-1])
     network.standardise(pixels)
     optimizer = Steps(network, steps, _RATES[kind])
-    seen, wanted = torch.from_numpy(pixels.seen), torch.from_numpy(pixels.wanted)
+    inputs, wanted = torch.from_numpy(pixels.inputs), torch.from_numpy(pixels.wanted)
     if kind == "pixel":
-        batch *= seen.shape[1] * seen.shape[2]
-        seen, wanted = (values.reshape(-1, values.shape[-1]) for values in (seen, wanted))
-    for index in _turns(len(seen), batch, steps, seed):
-        mean, log_variance = network(seen[index])
+        batch *= inputs.shape[1] * inputs.shape[2]
+        inputs, wanted = (values.reshape(-1, values.shape[-1]) for values in (inputs, wanted))
+    for index in _turns(len(inputs), batch, steps, seed):
+        mean, log_variance = network(inputs[index])
         aim = wanted[index]
         known = torch.isfinite(aim)
         loss = torch.where(known, likelihood(mean, log_variance, torch.where(known, aim, mean.detach())), 0.0)
@@ -91,8 +91,8 @@ def _turns(number: int, batch: int, steps: int, seed: int) -> Iterator[Tensor]:
 def predicted(network: Network, pixels: Pixels) -> tuple[FloatArray, FloatArray]:
     """Means and standard deviations (N, H, W, OUTPUTS); the delay is from bin 0."""
     with torch.inference_mode():
-        parts = [network(torch.from_numpy(image[None])) for image in pixels.seen]
-    mean = torch.cat([one for one, _ in parts]).double().numpy()
-    deviation = torch.exp(0.5 * torch.cat([one for _, one in parts])).double().numpy()
+        parts = [network(torch.from_numpy(image[None])) for image in pixels.inputs]
+    mean = torch.cat([value for value, _ in parts]).double().numpy()
+    deviation = torch.exp(0.5 * torch.cat([value for _, value in parts])).double().numpy()
     mean[..., 1] += pixels.middle
     return mean, deviation

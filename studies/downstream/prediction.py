@@ -53,11 +53,11 @@ def at(signal: float, background: float, system: System, *, summed: bool = True)
     if summed:
         sums = _sums(system)
         exact, mars, moved = sums @ exact @ sums.T, sums @ mars @ sums.T, sums @ moved
-    weights = {name: np.linalg.solve(one, moved) for name, one in (("mars", mars), ("exact", exact))}
+    weights = {name: np.linalg.solve(slopes, moved) for name, slopes in (("mars", mars), ("exact", exact))}
     inverse = np.linalg.inv(moved.T @ weights["mars"])
     real = inverse @ weights["mars"].T @ exact @ weights["mars"] @ inverse
     best = np.linalg.inv(moved.T @ weights["exact"])
-    claimed, error, least = (float(np.sqrt(one[0, 0])) for one in (inverse, real, best))
+    claimed, error, least = (float(np.sqrt(covariance[0, 0])) for covariance in (inverse, real, best))
     return Predicted(signal, background, claimed, error, least)
 
 
@@ -72,7 +72,7 @@ def _jacobian(signal: float, background: float, system: System) -> FloatArray:
     """Derivatives (bins, 3) of the mean histogram in S, B and the delay in ns."""
     size = _STEP * np.array([signal, background, 1.0])
     light = np.array([signal, background, 0.5 * system.period_ns]) + np.concatenate([np.diag(size), -np.diag(size)])
-    s, b, tau = (torch.from_numpy(np.ascontiguousarray(one)) for one in light.T)
+    s, b, tau = (torch.from_numpy(np.ascontiguousarray(values)) for values in light.T)
     mean = expected_histogram(s, b, tau, system).numpy()
     return np.asarray((mean[:3] - mean[3:]).T / (2.0 * size))
 
@@ -87,7 +87,7 @@ def of_scenes(fluxes: Sequence[Flux], system: System, lights: int) -> dict[str, 
     )
     order = np.argsort(signal, kind="stable")
     some = order[((np.arange(lights) + 0.5) * len(order) / lights).astype(int)]
-    found = [at(max(float(signal[k]), _LEAST), float(background[k]), system) for k in some]
-    real, best = (float(np.mean([getattr(one, name) ** 2 for one in found])) for name in ("real", "best"))
-    covered = float(np.mean([one.coverage(0.9) for one in found]))
+    predictions = [at(max(float(signal[k]), _LEAST), float(background[k]), system) for k in some]
+    real, best = (float(np.mean([getattr(p, name) ** 2 for p in predictions])) for name in ("real", "best"))
+    covered = float(np.mean([p.coverage(0.9) for p in predictions]))
     return {"lost": 10.0 * float(np.log10(real / best)), "covered": covered}

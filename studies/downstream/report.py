@@ -43,30 +43,30 @@ ASSUMED = (
     "read here as the first pair is",
 )
 
-Found = Mapping[Run, Any]
+Results = Mapping[Run, Any]
 Places = Mapping[tuple[float, float], Any]
 
 
-def facts(config: Config, found: Found, methods: Places, lines: Places) -> Facts:
+def facts(config: Config, results: Results, methods: Places, lines: Places) -> Facts:
     """What the report states of the results by run, and the figure."""
-    pairs = [_pair(found, kind, place, lines) for kind, place in _paired(found)]
+    pairs = [_pair(results, kind, place, lines) for kind, place in _paired(results)]
     return {
         "c": config,
         "data": data,
         "system": instrument(MAIN),
-        "minutes": sum(result["seconds"] for result in found.values()) / 60.0,
-        "table_rows": [row for sbr in config.sbr for row in _rows(found, methods[MAIN, sbr], sbr)],
+        "minutes": sum(result["seconds"] for result in results.values()) / 60.0,
+        "table_rows": [row for sbr in config.sbr for row in _rows(results, methods[MAIN, sbr], sbr)],
         "pairs": pairs,
-        "findings": list(_findings(found, methods, pairs, config)),
-        "rows": _csv(found, methods),
-        "figures": {"": picture(found, lines, config)},
+        "findings": list(_findings(results, methods, pairs, config)),
+        "rows": _csv(results, methods),
+        "figures": {"": picture(results, lines, config)},
     }
 
 
-def of(found: Found, kind: str, arm: str, dead: float, sbr: float, where: str, measure: str) -> FloatArray:
+def of(results: Results, kind: str, arm: str, dead: float, sbr: float, where: str, measure: str) -> FloatArray:
     """One measure (seeds, scenes); no rows where there is no such network."""
-    runs = [one for one in found if (one.kind, one.arm, one.dead, one.sbr) == (kind, arm, dead, sbr)]
-    return np.array([found[one][where][measure] for one in runs])
+    runs = [run for run in results if (run.kind, run.arm, run.dead, run.sbr) == (kind, arm, dead, sbr)]
+    return np.array([results[run][where][measure] for run in runs])
 
 
 def scatter(values: FloatArray) -> float:
@@ -83,12 +83,12 @@ def rms(square: FloatArray) -> float:
     return float(np.sqrt(square.mean()))
 
 
-def _rows(found: Found, methods: Mapping[str, Any], sbr: float) -> list[Row]:
+def _rows(results: Results, methods: Mapping[str, Any], sbr: float) -> list[Row]:
     rows: list[Row] = []
     for kind, words in KINDS.items():
         for arm, name in WORDS.items():
             psnr, square, covered, depth_covered, ssim = (
-                {where: of(found, kind, arm, MAIN, sbr, where, key) for where in ("own", "gold")}
+                {where: of(results, kind, arm, MAIN, sbr, where, key) for where in ("own", "gold")}
                 for key in ("psnr", "depth_square", "covered", "depth_covered", "ssim")
             )
             if not psnr["gold"].size:
@@ -122,20 +122,20 @@ def _rows(found: Found, methods: Mapping[str, Any], sbr: float) -> list[Row]:
     return rows
 
 
-def _paired(found: Found) -> list[tuple[str, tuple[float, float]]]:
+def _paired(results: Results) -> list[tuple[str, tuple[float, float]]]:
     """Kinds and places (dead time, ratio) where both of the pair were trained, by equally many seeds."""
-    places = sorted({(one.kind, (one.dead, one.sbr)) for one in found})
+    places = sorted({(run.kind, (run.dead, run.sbr)) for run in results})
 
     def number(kind: str, place: tuple[float, float], arm: str) -> int:
-        return len(of(found, kind, arm, *place, "gold", "psnr"))
+        return len(of(results, kind, arm, *place, "gold", "psnr"))
 
-    return [one for one in places if number(*one, PAIR[0]) == number(*one, PAIR[1]) > 0]
+    return [at for at in places if number(*at, PAIR[0]) == number(*at, PAIR[1]) > 0]
 
 
-def _pair(found: Found, kind: str, place: tuple[float, float], lines: Places) -> dict[str, Any]:
+def _pair(results: Results, kind: str, place: tuple[float, float], lines: Places) -> dict[str, Any]:
     """Exact less MaRS on gold-standard data, scene by scene and seed by seed, beside the closed form."""
-    exact, mars = (of(found, kind, arm, *place, "gold", "psnr") for arm in PAIR)
-    sure, covered = (of(found, kind, arm, *place, "gold", "covered") for arm in PAIR)
+    exact, mars = (of(results, kind, arm, *place, "gold", "psnr") for arm in PAIR)
+    sure, covered = (of(results, kind, arm, *place, "gold", "covered") for arm in PAIR)
     return {
         "kind": kind,
         "dead": place[0],
@@ -152,32 +152,32 @@ def _pair(found: Found, kind: str, place: tuple[float, float], lines: Places) ->
     }
 
 
-def _findings(found: Found, methods: Places, pairs: list[dict[str, Any]], config: Config) -> Any:
+def _findings(results: Results, methods: Places, pairs: list[dict[str, Any]], config: Config) -> Any:
     """What was expected, and whether it came so."""
     for sbr in config.sbr:
         own = methods[MAIN, sbr]
-        gold = of(found, "pixel", "exact", MAIN, sbr, "gold", "psnr").mean()
+        gold = of(results, "pixel", "exact", MAIN, sbr, "gold", "psnr").mean()
         short = float(np.mean(own["Cramer-Rao bound"]["psnr"]) - gold)
         yield f"SBR {sbr:g}: exact-trained, {short:.2f} dB from the bound (at most {FROM_BOUND})", short <= FROM_BOUND
-        depth = rms(of(found, "pixel", "exact", MAIN, sbr, "gold", "depth_square"))
+        depth = rms(of(results, "pixel", "exact", MAIN, sbr, "gold", "depth_square"))
         times = depth / rms(np.array(own["maximum likelihood"]["depth_square"]))
         yield (
             f"SBR {sbr:g}: its depth, {times:.2f} times maximum likelihood's RMSE (at most {OF_BEST})",
             times <= OF_BEST,
         )
-    for one in pairs:
-        where = f"{KINDS[one['kind']]}, t_d = {one['dead']:g} t_r, SBR {one['sbr']:g}"
-        if (one["kind"], one["dead"], one["sbr"]) == ("pixel", MAIN, 1.0):
-            yield f"{where}: {one['lost']:.2f} dB lost (at least {LEAST})", one["lost"] >= LEAST
-        if one["kind"] == "pixel":
-            off = one["lost"] - one["lost_closed"]
+    for pair in pairs:
+        where = f"{KINDS[pair['kind']]}, t_d = {pair['dead']:g} t_r, SBR {pair['sbr']:g}"
+        if (pair["kind"], pair["dead"], pair["sbr"]) == ("pixel", MAIN, 1.0):
+            yield f"{where}: {pair['lost']:.2f} dB lost (at least {LEAST})", pair["lost"] >= LEAST
+        if pair["kind"] == "pixel":
+            off = pair["lost"] - pair["lost_closed"]
             yield f"{where}: {off:+.2f} dB from the closed form (within {CLOSE:g})", abs(off) <= CLOSE
-        holds = abs(one["exact"] - 0.9) <= CALIBRATED
-        covered = f"{one['exact']:.3f} ± {one['exact_error']:.3f}"
+        holds = abs(pair["exact"] - 0.9) <= CALIBRATED
+        covered = f"{pair['exact']:.3f} ± {pair['exact_error']:.3f}"
         yield f"{where}: exact-trained 90 % intervals cover {covered} (within {CALIBRATED} of 0.9)", holds
 
 
-def _csv(found: Found, methods: Places) -> list[Row]:
+def _csv(results: Results, methods: Places) -> list[Row]:
     rows: list[Row] = []
     columns = ("psnr", "ssim", "depth_square", "covered", "depth_covered")
 
@@ -186,8 +186,8 @@ def _csv(found: Found, methods: Places) -> list[Row]:
             measures = {name: judged[name][scene] if name in judged else "" for name in columns}
             rows.append(about | {"scene": scene} | measures)
 
-    for one, result in found.items():
-        about = {"estimate": one.kind, "trained": one.arm, "dead": one.dead, "sbr": one.sbr, "seed": one.seed}
+    for run, result in results.items():
+        about = {"estimate": run.kind, "trained": run.arm, "dead": run.dead, "sbr": run.sbr, "seed": run.seed}
         for where in ("own", "gold"):
             add(about | {"tested": where}, result[where])
     for (dead, sbr), named in methods.items():
@@ -197,28 +197,28 @@ def _csv(found: Found, methods: Places) -> list[Row]:
     return rows
 
 
-def picture(found: Found, lines: Places, config: Config) -> Figure:
+def picture(results: Results, lines: Places, config: Config) -> Figure:
     """dB lost and coverage over the dead time: networks as dots, the closed form as lines."""
-    figure, ((left, right),) = panels(3.2, 1, 2)
+    figure, ((lost, claimed),) = panels(3.2, 1, 2)
     looks = dict(zip(config.sbr, COLOURS, strict=False))
     for sbr, colour in looks.items():
         law = sorted((dead, row) for (dead, ratio), row in lines.items() if ratio == sbr)
-        dead = [one for one, _ in law]
-        left.plot(dead, [row["lost"] for _, row in law], color=colour, label=f"closed form, SBR {sbr:g}")
-        right.plot(dead, [row["covered"] for _, row in law], color=colour, label=f"closed form, SBR {sbr:g}")
-    for kind, place in _paired(found):
-        one, colour = _pair(found, kind, place, lines), looks[place[1]]
+        dead = [at for at, _ in law]
+        lost.plot(dead, [row["lost"] for _, row in law], color=colour, label=f"closed form, SBR {sbr:g}")
+        claimed.plot(dead, [row["covered"] for _, row in law], color=colour, label=f"closed form, SBR {sbr:g}")
+    for kind, place in _paired(results):
+        pair, colour = _pair(results, kind, place, lines), looks[place[1]]
         dot: dict[str, Any] = {"fmt": "o" if kind == "pixel" else "s", "color": colour, "capsize": 2, "ms": 4}
         label = f"{KINDS[kind]}s, SBR {place[1]:g}"
-        left.errorbar(place[0], one["lost"], one["lost_error"], label=label, **dot)
-        right.errorbar(place[0], one["mars"], one["mars_error"], label=label, **dot)
+        lost.errorbar(place[0], pair["lost"], pair["lost_error"], label=label, **dot)
+        claimed.errorbar(place[0], pair["mars"], pair["mars_error"], label=label, **dot)
         sure = dot | {"mfc": "white"}
-        right.errorbar(
-            place[0], one["exact"], one["exact_error"], label="trained on exact", **(sure | {"color": "0.4"})
+        claimed.errorbar(
+            place[0], pair["exact"], pair["exact_error"], label="trained on exact", **(sure | {"color": "0.4"})
         )
-    left.axhline(0.0, color="0.7", lw=0.8, zorder=0)
-    right.axhline(0.9, color="0.7", lw=0.8, zorder=0)
-    left.set(xlabel="$t_d / t_r$", ylabel="reflectivity lost by training on MaRS, dB")
-    right.set(xlabel="$t_d / t_r$", ylabel="share of 90 % intervals that hold the truth")
-    legend_below(figure, (left, right), 3)
+    lost.axhline(0.0, color="0.7", lw=0.8, zorder=0)
+    claimed.axhline(0.9, color="0.7", lw=0.8, zorder=0)
+    lost.set(xlabel="$t_d / t_r$", ylabel="reflectivity lost by training on MaRS, dB")
+    claimed.set(xlabel="$t_d / t_r$", ylabel="share of 90 % intervals that hold the truth")
+    legend_below(figure, (lost, claimed), 3)
     return figure

@@ -20,7 +20,7 @@ from mars_lidar import Flux, System, cramer_rao, reconstruct
 from mars_lidar._base.imports import needed
 from mars_lidar._base.types import FloatArray
 from studies import Facts, Request
-from studies.common.kept import chosen, fixed, kept
+from studies.common.kept import chosen, fixed, once
 from studies.downstream.data import CONFIGS, MAIN, Data, instrument, truths
 from studies.downstream.networks import predicted, trained
 from studies.downstream.prediction import of_scenes
@@ -44,35 +44,35 @@ def run(request: Request) -> Facts:
     folder = request.out / f"downstream-{config.sizes.name}"
     fixed(folder, asdict(config.sizes))
     data, every = Data(config.sizes), list(runs(config))
-    tell(f"downstream: {sum(not (folder / one.file).exists() for one in every)} of {len(every)} networks to train")
-    found = {one: kept(folder / one.file, partial(train_and_test, one, data), tell) for one in every}
+    tell(f"downstream: {sum(not (folder / job.file).exists() for job in every)} of {len(every)} networks to train")
+    results = {job: once(folder / job.file, partial(train_and_test, job, data), tell) for job in every}
     places = [(MAIN, sbr) for sbr in config.sbr]
     bounds = {
-        (dead, sbr): kept(folder / f"methods-dead{dead:g}-sbr{sbr:g}.json", partial(methods, data, dead, sbr), tell)
+        (dead, sbr): once(folder / f"methods-dead{dead:g}-sbr{sbr:g}.json", partial(methods, data, dead, sbr), tell)
         for dead, sbr in places
     }
     lines = {
-        (dead, sbr): kept(folder / f"law-dead{dead:g}-sbr{sbr:g}.json", partial(_law, data, dead, sbr), tell)
+        (dead, sbr): once(folder / f"law-dead{dead:g}-sbr{sbr:g}.json", partial(_law, data, dead, sbr), tell)
         for sbr in config.sbr
         for dead in sorted({*config.lines, MAIN, *(config.dead if sbr == 1.0 else ())})
     }
-    return {"study": report} | report.facts(config, found, bounds, lines)
+    return {"study": report} | report.facts(config, results, bounds, lines)
 
 
 def _law(data: Data, dead: float, sbr: float) -> dict[str, float]:
     return of_scenes(data.fluxes(dead, sbr), instrument(dead), data.sizes.lights)
 
 
-def train_and_test(one: Run, data: Data) -> dict[str, Any]:
+def train_and_test(job: Run, data: Data) -> dict[str, Any]:
     """A network on fresh pixels of its simulator, and what it says of the test scenes."""
     began, sizes = time.process_time(), data.sizes
-    pixels = data.training(one.arm, one.dead, one.sbr, one.seed)
-    which = int(one.kind == "spatial")
-    network = trained(one.kind, pixels, steps=sizes.steps[which], batch=sizes.batch[which], seed=one.seed)
-    result: dict[str, Any] = {"run": asdict(one), "seconds": time.process_time() - began}
+    pixels = data.training(job.arm, job.dead, job.sbr, job.seed)
+    which = int(job.kind == "spatial")
+    network = trained(job.kind, pixels, steps=sizes.steps[which], batch=sizes.batch[which], seed=job.seed)
+    result: dict[str, Any] = {"run": asdict(job), "seconds": time.process_time() - began}
     for where in ("own", "gold"):
-        tested = data.tested(one.arm, one.dead, one.sbr, gold=where == "gold")
-        result[where] = judged(*predicted(network, tested), data, instrument(one.dead))
+        tested = data.tested(job.arm, job.dead, job.sbr, gold=where == "gold")
+        result[where] = judged(*predicted(network, tested), data, instrument(job.dead))
     return result
 
 

@@ -37,11 +37,11 @@ def dynamic_range(cases: Sequence[Case]) -> Figure:
     return figure
 
 
-def _draw_counts(ax: Axes, found: Realizations, name: str) -> None:
-    measured, law = found.measured, found.predicted
+def _draw_counts(ax: Axes, drawn: Realizations, name: str) -> None:
+    measured, law = drawn.measured, drawn.predicted
     edges = measured.first - 0.5 + np.arange(measured.p.size + 1)
     ax.stairs(measured.p, edges, color=COLOURS[0], fill=True, alpha=0.45, label="recorded")
     ax.plot(law.first + np.arange(law.p.size), law.p, color=COLOURS[1], lw=1.0, label="model")
     ax.set(xlabel="registrations of a realization", ylabel="probability")
-    ax.set_title(f"{name}: TV {found.total_variation:.3g}, floor {found.total_variation_floor[0]:.3g}", loc="left")
+    ax.set_title(f"{name}: TV {drawn.total_variation:.3g}, floor {drawn.total_variation_floor[0]:.3g}", loc="left")
     ax.legend(frameon=False)

@@ -79,8 +79,8 @@ def _train(torch: Any, net: Any, steps: int, images: int, seed: int) -> None:
     optimiser = torch.optim.AdamW(net.parameters())
     rate = torch.optim.lr_scheduler.OneCycleLR(optimiser, 2e-3, total_steps=steps)
     for _ in range(steps):
-        top, left = rng.integers(0, scenes.SIDE - _SIDE + 1, 2)
-        x = clean[rng.integers(0, images, _BATCH), None, top : top + _SIDE, left : left + _SIDE]
+        row, column = rng.integers(0, scenes.SIDE - _SIDE + 1, 2)
+        x = clean[rng.integers(0, images, _BATCH), None, row : row + _SIDE, column : column + _SIDE]
         noise = torch.from_numpy(np.geomspace(_LEAST_NOISE, MOST_NOISE, 1001)[rng.integers(0, 1001, _BATCH)]).float()
         given = x + noise[:, None, None, None] * torch.randn(x.shape)
         loss = ((net(given, noise) - x).abs().mean((1, 2, 3)) / noise).mean()

@@ -44,9 +44,9 @@ def _cost(path: Path, side: int, system: System, photons: float, sbr: float) -> 
         given, delay = Photons(side, side, saved["first"], saved["bin"], saved["number"]), saved["delay"]
     before = _most_memory()
     began, at = time.process_time(), time.perf_counter()
-    found = Image().of_photons(given, system, 1)
+    estimate = Image().of_photons(given, system, 1)
     seconds, wall = time.process_time() - began, time.perf_counter() - at
-    off = np.abs((found.delay - delay + 0.5) % 1.0 - 0.5) * system.period_ns
+    off = np.abs((estimate.delay - delay + 0.5) % 1.0 - 0.5) * system.period_ns
     return {
         "pixels": f"{side} x {side}",
         "processor s": seconds,

@@ -41,7 +41,7 @@ SYSTEM = System(
 FROZEN = (20261227, 20261228, 20261229, 20261230, 20261231)
 # what reconstruct(neighbourhood=4) of version 0.2.0 made of the same cubes, judged as the others
 NEIGHBOURHOOD = Path(__file__).with_name("neighbourhood.csv")
-SHOWN = "random", 1.0, 1.0  # scene, photons and ratio of the picture
+PICTURED = "random", 1.0, 1.0  # scene, photons and ratio of the picture
 # by name: what makes delays of a cube, or None for methods of the package
 Methods = dict[str, Callable[[np.ndarray, System], FloatArray] | None]
 METHODS: Methods = {
@@ -113,21 +113,21 @@ def scenes(size: int) -> dict[str, Scene]:
 
 def rgbd(folder: Path, size: int) -> dict[str, Scene]:
     """The RGB-D pairs of a folder, NAME_depth.png beside NAME_colors.png, at this size."""
-    found = {}
+    pairs = {}
     for path in sorted(folder.glob("*_depth.png")):
         name = path.name.removesuffix("_depth.png")
-        found[name] = Scene.from_rgbd(path, path.with_name(f"{name}_colors.png"), size=size)
+        pairs[name] = Scene.from_rgbd(path, path.with_name(f"{name}_colors.png"), size=size)
     for path in sorted(folder.glob("middlebury_*")):
-        found[path.name] = Scene.from_rgbd(path, size=size)
-    return found
+        pairs[path.name] = Scene.from_rgbd(path, size=size)
+    return pairs
 
 
 def run(request: Request) -> Facts:
     """Every scene, system and brightness by every method."""
     settings = QUICK if request.quick else FULL
-    shown = scenes(settings.size)
+    every = scenes(settings.size)
     if request.rgbd is not None:
-        shown |= rgbd(request.rgbd, settings.size)
+        every |= rgbd(request.rgbd, settings.size)
     rows: list[Row] = []
     thin: list[Row] = []
     maps: Results = {}
@@ -142,23 +142,23 @@ def run(request: Request) -> Facts:
         for k in range(1, settings.exposures) if part in ("scenes", "systems", "dead time") else ():
             (line,), _ = case(scene, system, photons, sbr, {"image": None}, SEED + k)
             rows.append({"part": part + AGAIN} | at | line)
-        if part == "scenes" and (name, photons, sbr) == (SHOWN[0], *_nearest(settings)):
+        if part == "scenes" and (name, photons, sbr) == (PICTURED[0], *_nearest(settings)):
             maps = results
         if name == "sticks" and sbr == _nearest(settings)[1]:
             thin.append(_thin(scene, system, photons, results))
 
-    for name, scene in shown.items():
+    for name, scene in every.items():
         for photons in settings.photons:
             for sbr in settings.sbr:
                 add("scenes", name, scene, SYSTEM, photons, sbr, "100 ns")
     for words, system in systems().items():
         for name in ("room", "random"):
             for photons in settings.photons[:3:2] or settings.photons:
-                add("systems", name, shown[name], system, photons, 1.0, words)
+                add("systems", name, every[name], system, photons, 1.0, words)
     for dead_time in (0.0, 50.0, 100.0, 200.0):
         system = replace(SYSTEM, cycles=50, detector=Detector(dead_time_ns=dead_time))
         for name in ("room", "random"):
-            add("dead time", name, shown[name], system, 5.0, 1.0, f"50 cycles, {dead_time:g} ns")
+            add("dead time", name, every[name], system, 5.0, 1.0, f"50 cycles, {dead_time:g} ns")
     for seed in FROZEN[: settings.frozen]:
         frozen = Scene.example("random", settings.size, seed=seed)
         for photons in settings.photons[:3]:
@@ -171,7 +171,7 @@ def run(request: Request) -> Facts:
     if request.captures is None:
         request.tell("image: no folder of real captures was given (--captures): left out")
     bright = replace(SYSTEM, cycles=20_000)
-    add("bright", "room", shown["room"], bright, 500.0, 1.0, "20,000 cycles")
+    add("bright", "room", every["room"], bright, 500.0, 1.0, "20,000 cycles")
     request.tell("image: two returns, large images")
     return {
         "s": settings,
@@ -223,20 +223,20 @@ def _thin(scene: Scene, system: System, photons: float, results: Results) -> dic
             off[name] = ~(np.abs(each.depth_m - scene.depth_m) < most)
     single = results["maximum_likelihood"]
     assert isinstance(single, Reconstruction)
-    seen = sticks & single.detected & ~off["maximum_likelihood"]
+    alone = sticks & single.detected & ~off["maximum_likelihood"]
     line = {"photons": photons}
     line |= {f"{name}, off %": 100.0 * float(x[sticks].mean()) for name, x in off.items()}
     return line | {
-        "seen alone %": 100.0 * float(seen.sum() / sticks.sum()),
-        "of these off, image %": 100.0 * float(off["image"][seen].mean()) if seen.any() else float("nan"),
+        "seen alone %": 100.0 * float(alone.sum() / sticks.sum()),
+        "of these off, image %": 100.0 * float(off["image"][alone].mean()) if alone.any() else float("nan"),
     }
 
 
 def _nearest(settings: Settings) -> tuple[float, float]:
     """Photons and ratio of the picture that these settings hold."""
     return (
-        min(settings.photons, key=lambda x: abs(np.log(x / SHOWN[1]))),
-        min(settings.sbr, key=lambda x: abs(np.log(x / SHOWN[2]))),
+        min(settings.photons, key=lambda x: abs(np.log(x / PICTURED[1]))),
+        min(settings.sbr, key=lambda x: abs(np.log(x / PICTURED[2]))),
     )
 
 
@@ -274,13 +274,13 @@ def compared(
             results[method] = np.asarray(system.depth_m(delay))
         else:
             pooled = method == "pooled matched filter"
-            found = reconstruct(
+            estimate = reconstruct(
                 *((_pooled(cube), system, "matched_filter") if pooled else (cube, system, method)), threads=1
             )
-            delay, width, results[method] = found.delay_ns, found.delay_half_width_ns, found
-            if width is None and found.delay_error_ns is not None:
-                width = 1.645 * found.delay_error_ns
-            light_found = found.signal / (POOLED**2 if pooled else 1)
+            delay, width, results[method] = estimate.delay_ns, estimate.delay_half_width_ns, estimate
+            if width is None and estimate.delay_error_ns is not None:
+                width = 1.645 * estimate.delay_error_ns
+            light_found = estimate.signal / (POOLED**2 if pooled else 1)
         seconds = time.process_time() - began
         judgement = judged(delay, width, light_found, system, truth, signal, valid)
         lines.append({"method": method} | judgement | {"s": seconds})

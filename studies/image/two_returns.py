@@ -42,9 +42,9 @@ def rows(size: int, system: System, seed: int, photons: tuple[float, ...] = PHOT
 
 def _delays(cube: np.ndarray, system: System, method: str) -> FloatArray:
     """Of both returns (H, W, 2), ns."""
-    found = reconstruct(cube, system, method, returns=2, threads=1).returns
-    assert found is not None
-    return found.delay_ns
+    returns = reconstruct(cube, system, method, returns=2, threads=1).returns
+    assert returns is not None
+    return returns.delay_ns
 
 
 def _both(delays: FloatArray, wall: FloatArray, pane: FloatArray, system: System) -> np.ndarray:

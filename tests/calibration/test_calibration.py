@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from harness import make_system
 
 import mars_lidar as ml
 from tests.calibration.photon_by_photon import Truth, as_timestamps, photon_by_photon
@@ -32,14 +33,7 @@ def test_the_simulator_has_the_law_of_one_dead_time() -> None:
 
     truth = replace(BASE, jitter=0.0, unit=0.0)
     t, _ = photon_by_photon(truth, 40_000, 3)
-    system = ml.System(
-        period_ns=100.0,
-        cycles=1,
-        bins=50,
-        pulse=ml.GaussianPulse(sigma_ns=0.3),
-        detector=ml.Detector(dead_time_ns=50.0),
-        start="stationary",
-    )
+    system = make_system(50.0, 1, 50, sigma_ns=0.3, start="stationary")
     law = ml.registration_pdf(ml.Flux(0.4, 0.15, 30.0), system, "stationary")
     counts = np.bincount((t % 100.0 / 2.0).astype(int), minlength=50)
     expected = law / law.sum() * t.size

@@ -8,14 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from harness import make_system
 
 import mars_lidar as ml
 from tests.harness.command import command_line
 
 FLUX = ml.Flux(np.full((2, 3), 2.0), 0.5, np.linspace(10.0, 80.0, 6).reshape(2, 3))
-SYSTEM = ml.System(
-    period_ns=100.0, cycles=500, bins=64, pulse=ml.GaussianPulse(sigma_ns=0.5), detector=ml.Detector(dead_time_ns=63.75)
-)
+SYSTEM = make_system(63.75, 500, 64, sigma_ns=0.5)
 
 
 def test_unknown_device():
@@ -30,13 +29,7 @@ def test_engines_without_a_kernel_name_what_works(engine: str):
 
 
 def test_effects_and_waveforms_are_refused():
-    jittery = ml.System(
-        period_ns=100.0,
-        cycles=500,
-        bins=64,
-        pulse=ml.GaussianPulse(sigma_ns=0.5),
-        detector=ml.Detector(dead_time_ns=63.75, jitter=ml.Jitter(sigma_ns=0.1)),
-    )
+    jittery = make_system(63.75, 500, 64, sigma_ns=0.5, jitter=ml.Jitter(sigma_ns=0.1))
     with pytest.raises(ValueError, match=r"'cuda' does not do jitter.*use device 'cpu'"):
         ml.simulate(FLUX, jittery, device="cuda")
     wave = ml.Flux(waveform=np.full((1, 1, 8), 0.1), background=0.1)
@@ -79,14 +72,7 @@ def _device() -> Any:
 @pytest.mark.parametrize("start", ["armed", "stationary"])
 def test_bits_on_a_gpu(mode: str, start: str):
     cupy = _device()
-    system = ml.System(
-        period_ns=100.0,
-        cycles=2000,
-        bins=1024,
-        pulse=ml.GaussianPulse(sigma_ns=0.5),
-        start=start,
-        detector=ml.Detector(dead_time_ns=63.75, mode=mode),
-    )
+    system = make_system(63.75, 2000, 1024, sigma_ns=0.5, start=start, mode=mode)
     there = ml.simulate(FLUX, system, realizations=50, seed=3, device="cuda")
     assert isinstance(there, cupy.ndarray)
     np.testing.assert_array_equal(there.get(), ml.simulate(FLUX, system, realizations=50, seed=3))

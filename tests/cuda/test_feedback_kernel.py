@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from harness import make_system
 from host_machine import Host
 
 import mars_lidar as ml
@@ -14,13 +15,7 @@ from mars_lidar.engines.engine import Task
 from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.engines.feedback import FeedbackEngine
 
-BASE = ml.System(
-    period_ns=100.0,
-    cycles=3000,
-    bins=128,
-    pulse=ml.GaussianPulse(sigma_ns=1.0),
-    detector=ml.Detector(dead_time_ns=63.75),
-)
+BASE = make_system(63.75, 3000, 128)
 SAMPLED = ml.SampledPulse(np.array([0.1, 0.7, 1.0, 0.4, 0.3, 0.1]), bin_ns=0.9)
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from harness import make_system
 from host_machine import Host
 
 import mars_lidar as ml
@@ -15,13 +16,7 @@ from mars_lidar.engines.cuda.mars import mars_histogram
 from mars_lidar.engines.engine import Task
 from mars_lidar.table import Table
 
-BASE = ml.System(
-    period_ns=100.0,
-    cycles=300,
-    bins=128,
-    pulse=ml.GaussianPulse(sigma_ns=1.0),
-    detector=ml.Detector(dead_time_ns=63.75),
-)
+BASE = make_system(63.75, 300, 128)
 SYSTEMS: dict[str, ml.System] = {
     "plain": BASE,  # the table keeps laws of its doubted entries
     "whole": BASE.replace(detector=ml.Detector(dead_time_ns=101.0)),  # the frame is cut into cells

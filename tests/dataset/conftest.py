@@ -6,12 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from harness import make_system
 
-from mars_lidar import Detector, GaussianPulse, System
-
-SYSTEM = System(
-    period_ns=100.0, cycles=50, bins=32, pulse=GaussianPulse(sigma_ns=1.0), detector=Detector(dead_time_ns=30.0)
-)
+SYSTEM = make_system(30.0, 50, 32)
 
 
 @pytest.fixture

@@ -10,6 +10,7 @@ import pytest
 import scipy.io
 import xarray
 import yaml
+from harness import make_system
 
 import mars_lidar as ml
 from mars_lidar import io
@@ -17,9 +18,7 @@ from mars_lidar.dataset import DatasetRecipe, json_schema, read_view
 from mars_lidar.dataset.recipe import KINDS
 from tests.harness.command import command_line
 
-SYSTEM = ml.System(
-    period_ns=100.0, cycles=30, bins=32, pulse=ml.GaussianPulse(sigma_ns=0.5), detector=ml.Detector(dead_time_ns=50.0)
-)
+SYSTEM = make_system(50.0, 30, 32, sigma_ns=0.5)
 FOG = {"extinction_per_m": 0.1, "backscatter": 0.3}
 PANE = {"depth_m": 1.5, "reflectivity": 0.2, "transmission": 0.8}
 LIGHT = {"signal": 0.7, "sbr": 2.0}

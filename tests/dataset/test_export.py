@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from harness import make_system
 from PIL import Image
 from scipy import sparse
 from scipy.io import loadmat
@@ -17,13 +18,7 @@ from mars_lidar import dataset
 from mars_lidar.cli import main
 from mars_lidar.dataset.network_files import LAYOUTS, export
 
-SYSTEM = ml.System(
-    period_ns=100.0,
-    cycles=300,
-    bins=1024,
-    pulse=ml.GaussianPulse(sigma_ns=0.1),
-    detector=ml.Detector(dead_time_ns=30.0),
-)
+SYSTEM = make_system(30.0, 300, 1024, sigma_ns=0.1)
 SIDE, BINS = 8, 1024
 LEVELS = [[0.5, 2.0], [2.0, 0.5]]
 

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 import scipy.io
 import scipy.sparse
+from harness import make_system
 from PIL import Image
 
 import mars_lidar as ml
@@ -24,13 +25,7 @@ from mars_lidar.dataset import open_dataset
 from mars_lidar.dataset.network_files import export
 
 pytestmark = pytest.mark.full
-SYSTEM = ml.System(
-    period_ns=81.92,
-    cycles=2000,
-    bins=1024,
-    pulse=ml.GaussianPulse(sigma_ns=0.12),
-    detector=ml.Detector(dead_time_ns=20.0),
-)
+SYSTEM = make_system(20.0, 2000, 1024, sigma_ns=0.12, period_ns=81.92)
 LEVELS = [[0.005, 1.0], [0.02, 4.0]]  # signal per period, SBR
 
 

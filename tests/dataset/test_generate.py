@@ -154,8 +154,8 @@ def test_damage_is_found(tmp_path, recipe):
     with_zeros(zarr.open_group(tmp_path / "set.zarr", mode="r+", use_consolidated=False)["histogram"])[5, 1] = counts
     problems = verify(tmp_path / "set.zarr", chunks=None)
     assert not problems.good
-    assert "histogram/c.5.0.0.0.0 is not as it was written" in problems.different[0]
-    assert "histogram/c.5.0.0.0.0 is not as it was written" in problems.different[1]
+    assert "histogram/c.5.0.0.0.0 has changed since it was written" in problems.different[0]
+    assert "histogram/c.5.0.0.0.0 has changed since it was written" in problems.different[1]
     manifest.seal(tmp_path / "set.zarr", {})  # a manifest that agrees with what is there
     problems = verify(tmp_path / "set.zarr", chunks=None)
     assert problems.different[0].startswith("histogram[5:6, 1:2, ")

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import zarr
 from dataset.conftest import files
+from harness import make_system
 
 import mars_lidar as ml
 from mars_lidar import io
@@ -23,9 +24,7 @@ from mars_lidar.io.store import OnDisk
 from tests.harness.command import command_line
 
 FLIPS = int(os.environ.get("MARS_LIDAR_FLIPS", "200"))
-SYSTEM = ml.System(
-    period_ns=100.0, cycles=50, bins=32, pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=30.0)
-)
+SYSTEM = make_system(30.0, 50, 32)
 
 
 @pytest.fixture
@@ -121,14 +120,14 @@ def test_changed_labels_coordinates_and_inputs_are_found_without_a_manifest_too(
     for name in ("sbr", "signal_level", "period_ns", "seed", "scene", "time", "y"):
         was = group[name][...]
         group[name][0] = 3
-        with pytest.raises(FileError, match=f"{name}/c/0 is not as it was written"):
+        with pytest.raises(FileError, match=f"{name}/c/0 has changed since it was written"):
             verify(dataset, chunks=1)
         group[name][...] = was
     scene = dataset / "scenes/depth/c.0.0.0"
     was_there = scene.read_bytes()
     scene.write_bytes(was_there[:-1] + b"\0")
     changed = verify(dataset).different
-    assert changed[0] == "scenes/depth/c.0.0.0 is not as it was written"
+    assert changed[0] == "scenes/depth/c.0.0.0 has changed since it was written"
     assert "cannot be read" in changed[1]
     scene.write_bytes(was_there)
     (dataset / manifest.NAME).rename(dataset / "away")

@@ -118,7 +118,7 @@ def test_damage_is_an_error(recipe, bucket):
     content[10] ^= 1
     opened = open_dataset(f"{bucket}/set.zarr")
     system.pipe_file(name, bytes(content))
-    with pytest.raises(FileError, match="is not as it was written"):
+    with pytest.raises(FileError, match="has changed since it was written"):
         opened.read(name.partition("set.zarr/")[2])
     system.rm(name)
     with pytest.raises(FileError, match="is missing"):

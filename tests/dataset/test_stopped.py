@@ -181,7 +181,7 @@ def test_what_is_taken_away_while_it_is_made_is_missed(tmp_path, recipe, what):
             else:
                 (out / what).unlink(missing_ok=True)
 
-    with pytest.raises(OSError, match=r"taken away|has no zarr\.json|No such file|does not exist"):
+    with pytest.raises(OSError, match=r"removed while|has no zarr\.json|No such file|does not exist"):
         ml.generate(recipe, out, progress=progress, threads=1)
     with pytest.raises((ValueError, FileNotFoundError)):
         open_dataset(out)

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from harness import PERIOD_NS, Case, flux_of, task_of, two_lobes
+from harness import PERIOD_NS, Case, flux_of, make_system, task_of, two_lobes
 from numpy.typing import NDArray
 
-from mars_lidar import Detector, GaussianPulse, SampledPulse, System
+from mars_lidar import SampledPulse
 from mars_lidar.engines.engine import Task
 from mars_lidar.engines.feedback import FeedbackEngine, Grids, KindArray
 
@@ -35,13 +35,7 @@ def case(
     items: int = 4000,
     **changes: Any,
 ) -> Case:
-    system = System(
-        period_ns=PERIOD_NS,
-        cycles=cycles,
-        bins=128,
-        pulse=GaussianPulse(sigma_ns=sigma * PERIOD_NS),
-        detector=Detector(dead_time_ns=dead * PERIOD_NS),
-    ).replace(**changes)
+    system = make_system(dead * PERIOD_NS, cycles, 128, sigma_ns=sigma * PERIOD_NS).replace(**changes)
     name = f"S {signal:g}, B {background:g}, t_d {dead:g}, {cycles} cycles, {system.start}"
     return Case(name, flux_of(signal, background, delay), system, items)
 

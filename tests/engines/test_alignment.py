@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from harness import require, two_lobes
+from harness import make_system, require, two_lobes
 from harness.pvalues import goodness
 
 import mars_lidar as ml
@@ -21,14 +21,9 @@ MOVES = np.array([0.0, 3.25, -20.5, 7.8, 127.6])  # bins
 
 
 def system_of(sigma_bins: float, dead: float, **changes: object) -> ml.System:
-    return ml.System(
-        period_ns=PERIOD_NS,
-        cycles=1000,
-        bins=BINS,
-        pulse=ml.GaussianPulse(sigma_ns=sigma_bins * BIN_NS),
-        detector=ml.Detector(dead_time_ns=dead * PERIOD_NS),
-        start="stationary",
-    ).replace(**changes)
+    return make_system(dead * PERIOD_NS, 1000, BINS, sigma_ns=sigma_bins * BIN_NS, start="stationary").replace(
+        **changes
+    )
 
 
 def moved(system: ml.System, signal: float, background: float, moves: np.ndarray, level: str = "") -> np.ndarray:

@@ -7,7 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from harness import Case, counts_against_law, require, task_of
+from harness import Case, counts_against_law, make_system, require, task_of
 
 import mars_lidar as ml
 from mars_lidar.engines import MarsEngine
@@ -19,13 +19,7 @@ from mars_lidar.statistics.tolerances import TOL as STATISTICS
 from mars_lidar.table import Table
 
 AIM = 0.002
-SYSTEM = ml.System(
-    period_ns=100.0,
-    cycles=150,
-    bins=64,
-    pulse=ml.GaussianPulse(sigma_ns=1.0),
-    detector=ml.Detector(dead_time_ns=63.75),
-)
+SYSTEM = make_system(63.75, 150, 64)
 
 
 @cache

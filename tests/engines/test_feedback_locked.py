@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from feedback_cases import GIVEN, Sampler, case, drawn, kinds_of
-from harness import COUNTS, JOINT, SHAPE, Case, check, require, task_of, waveform_flux
+from harness import COUNTS, JOINT, SHAPE, Case, check, make_system, require, task_of, waveform_flux
 from scipy import stats
 
 import mars_lidar as ml
@@ -61,13 +61,7 @@ def test_shadow_of_a_bright_pulse():
     require(p, "feedback, shadow of a bright pulse")
 
 
-SYSTEM = ml.System(
-    period_ns=PERIOD_NS,
-    cycles=1_000_000,
-    bins=1024,
-    pulse=ml.GaussianPulse(sigma_ns=0.5),
-    detector=ml.Detector(dead_time_ns=0.97 * PERIOD_NS),
-)
+SYSTEM = make_system(0.97 * PERIOD_NS, 1_000_000, 1024, sigma_ns=0.5, period_ns=PERIOD_NS)
 
 
 def test_a_million_cycles_with_a_count_that_cannot_vary():

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from feedback_cases import Sampler, case, drawn
-from harness import PERIOD_NS, Case
+from harness import PERIOD_NS, Case, make_system
 from scipy import stats
 
 import mars_lidar as ml
@@ -83,13 +83,7 @@ def test_dead_times_next_to_whole_periods(engine: str):
     for k in range(12):
         apart = float(10.0 ** random.uniform(-9.0, -2.0)) * (1 if k % 3 else -1)
         whole, bins = 1 + k % 3, int(2 ** random.integers(1, 13))
-        system = ml.System(
-            period_ns=100.0,
-            cycles=8000 if bins > 600 else int(random.integers(8000, 60_000)),
-            bins=bins,
-            pulse=ml.GaussianPulse(sigma_ns=1.0),
-            detector=ml.Detector(dead_time_ns=100.0 * (whole + apart)),
-        )
+        system = make_system(100.0 * (whole + apart), 8000 if bins > 600 else int(random.integers(8000, 60_000)), bins)
         signal, background = np.exp(random.uniform([[[-2.0]], [[-4.0]]], [[[1.5]], [[1.0]]], (2, 1, 3)))
         flux = ml.Flux(signal, background, random.uniform(0.0, 100.0, (1, 3)))
         counts = ml.simulate(flux, system, engine=engine, seed=k).sum(-1)
@@ -98,13 +92,7 @@ def test_dead_times_next_to_whole_periods(engine: str):
 
 
 def test_the_system_of_the_report():
-    system = ml.System(
-        period_ns=100.0,
-        cycles=30_000,
-        bins=64,
-        pulse=ml.GaussianPulse(sigma_ns=1.0),
-        detector=ml.Detector(dead_time_ns=100.0),
-    )
+    system = make_system(100.0, 30_000, 64)
     flux = ml.Flux(np.full((1, 400), 3.0), 0.3, 70.0)
     x, y = (ml.simulate(flux, system, engine=engine, seed=2)[0, 0].astype(float) for engine in ("feedback", "exact"))
     error = np.sqrt((x.var(0) + y.var(0)) / 400 + 1e-9)

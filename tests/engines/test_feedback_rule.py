@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from feedback_cases import GIVEN, SAMPLED, Sampler, case, drawn, kinds_of
-from harness import PERIOD_NS, Case, flux_of, require, task_of, two_lobes, waveform_flux
+from harness import PERIOD_NS, Case, flux_of, make_system, require, task_of, two_lobes, waveform_flux
 from numpy.typing import NDArray
 from scipy import stats
 
@@ -85,14 +85,7 @@ VARIANCES = {  # S, B, delay, t_d, sigma (ns of 100), cycles, bins, start; they 
 def test_the_count_has_the_variance_of_its_law(name):
     """4,000 exposures: 2.2 % is one standard error of the variance, 4.5 of them fail (7e-6)."""
     signal, background, delay, dead, sigma, cycles, bins, start = VARIANCES[name]
-    system = System(
-        period_ns=100.0,
-        cycles=cycles,
-        bins=bins,
-        pulse=ml.GaussianPulse(sigma_ns=sigma),
-        detector=Detector(dead_time_ns=dead),
-        start=start,
-    )
+    system = make_system(dead, cycles, bins, sigma_ns=sigma, start=start)
     flux = ml.Flux(signal, background, delay)
     report: dict[str, float] = {}
     cube = ml.simulate(flux, system, engine="feedback", realizations=4_000, seed=5, report=report)
@@ -108,13 +101,7 @@ def test_a_bright_pulse_across_the_edge_of_a_bin_leaves_little_behind_it(signal)
     4,000 exposures; the mean and the variance may be 4.5 standard errors (7e-6) and 0.05 of the law's deviation off.
     Up to 12 of 25,881 too many were there (S = 50), or a fifth too few (16).
     """
-    system = System(
-        period_ns=100.0,
-        cycles=25_881,
-        bins=8,
-        pulse=ml.GaussianPulse(sigma_ns=0.0288),
-        detector=Detector(dead_time_ns=20.0),
-    )
+    system = make_system(20.0, 25_881, 8, sigma_ns=0.0288)
     counts = ml.simulate(ml.Flux(signal, 4e-6, 50.0), system, engine="feedback", realizations=4_000, seed=4)[:, 0, 0]
     far, law = counts[:, 4], 25_881 * np.exp(-0.5 * signal)
     light = 4e-6 * 25_881 / 8 + law  # of the background too

@@ -1,4 +1,4 @@
-"""The engine "mars": tables, count laws, settings; its statistics without a table are in tests/test_engines.py."""
+"""The engine "mars": tables, count laws, settings. Its statistics without a table: test_engines.py."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from harness import Law, check, counts_against_law, require
+from harness import Law, check, counts_against_law, make_system, require
 from harness.cases import Case
 from harness.check import COUNTS, SHAPE
 
@@ -18,13 +18,7 @@ from mars_lidar.engines.tolerances import TOL
 from mars_lidar.statistics import exposure_moments
 from mars_lidar.table import Table
 
-SYSTEM = ml.System(
-    period_ns=100.0,
-    cycles=300,
-    bins=128,
-    pulse=ml.GaussianPulse(sigma_ns=1.0),
-    detector=ml.Detector(dead_time_ns=63.75),
-)
+SYSTEM = make_system(63.75, 300, 128)
 
 
 @cache
@@ -260,14 +254,7 @@ def test_bad_input(call, kind, fragments):
 
 
 def ticking(cycles: int, start: str = "armed") -> ml.System:
-    return ml.System(
-        period_ns=100.0,
-        cycles=cycles,
-        bins=128,
-        pulse=ml.GaussianPulse(sigma_ns=1.0),
-        detector=ml.Detector(dead_time_ns=87.331),
-        start=start,
-    )
+    return make_system(87.331, cycles, 128, start=start)
 
 
 @pytest.mark.parametrize(

@@ -4,19 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from harness import make_system
 
 import mars_lidar as ml
 from mars_lidar import io
 from mars_lidar.table import Table
 from tests.harness.command import command_line
 
-SYSTEM = ml.System(
-    period_ns=100.0,
-    cycles=60,
-    bins=64,
-    pulse=ml.GaussianPulse(sigma_ns=1.0),
-    detector=ml.Detector(dead_time_ns=30.0),
-)
+SYSTEM = make_system(30.0, 60, 64)
 FLUX = ml.Flux(np.linspace(0.2, 1.9, 30).reshape(6, 5), 0.4, np.linspace(0.0, 99.0, 30).reshape(6, 5))
 
 

@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from harness import goodness, require
+from harness import goodness, make_system, require
 from harness.pvalues import bonferroni, variance_score
 from scipy import stats
 
@@ -23,14 +23,7 @@ SIGNALS, BACKGROUNDS = (0.2, 1.3), (0.05, 0.6)
 
 @cache
 def shapes_of(dead: float, signals: tuple[float, ...], backgrounds: tuple[float, ...]) -> tuple[ml.System, np.ndarray]:
-    system = ml.System(
-        period_ns=PERIOD_NS,
-        cycles=1000,
-        bins=BINS,
-        pulse=ml.GaussianPulse(sigma_ns=0.9),
-        detector=ml.Detector(dead_time_ns=dead * PERIOD_NS),
-        start="stationary",
-    )
+    system = make_system(dead * PERIOD_NS, 1000, BINS, sigma_ns=0.9, start="stationary")
     s, b = np.meshgrid(signals, backgrounds, indexing="ij")
     return system, as_shapes(exposure_moments(ml.Flux(s.ravel(), b.ravel(), 50.0), system).histogram)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from harness import counts_against_law, require
+from harness import counts_against_law, make_system, require
 from harness.pvalues import goodness
 from scipy import stats
 
@@ -12,14 +12,7 @@ import mars_lidar as ml
 from mars_lidar.statistics import exposure_moments
 from mars_lidar.table import Table
 
-SYSTEM = ml.System(
-    period_ns=100.0,
-    cycles=400,
-    bins=128,
-    pulse=ml.GaussianPulse(sigma_ns=1.5),
-    detector=ml.Detector(dead_time_ns=63.75),
-    start="stationary",
-)
+SYSTEM = make_system(63.75, 400, 128, sigma_ns=1.5, start="stationary")
 
 
 @pytest.mark.parametrize("with_table", [True, False])

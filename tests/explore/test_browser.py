@@ -11,7 +11,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 import pytest
-from explorer_page import PAGE, Page, chromium
+from explorer_page import PAGE, Page, chromium, shortcomings
 from numpy.typing import NDArray
 from test_page import golden_of_page
 
@@ -325,12 +325,13 @@ def test_the_python_makes_the_same_figure(page: Page, changes: dict[str, Any], m
 
 
 def test_dark_and_small(browser: Any):
-    """Another colour scheme, and a telephone: everything is there, and nothing sticks out."""
+    """A telephone, in light and dark: nothing that `shortcomings` lists, and a page of less than 1 MB."""
     small = Page(browser, PAGE.as_uri(), offline=True, color_scheme="dark", viewport={"width": 360, "height": 740})
-    width = small.tab.evaluate("[document.documentElement.scrollWidth, document.documentElement.clientWidth]")
-    assert width[0] == width[1]
     colour = small.tab.evaluate("getComputedStyle(document.body).backgroundColor")
     assert max(int(part) for part in colour.strip("rgb()").split(",")) < 64
+    problems = shortcomings(small.tab)
+    assert not any(problems.values()), problems
+    assert PAGE.stat().st_size < 1_000_000
     small.close()
 
 

@@ -20,6 +20,7 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 from explorer_page import Page, chromium
+from harness import make_system
 
 import mars_lidar as ml
 from mars_lidar import explore, io
@@ -199,7 +200,7 @@ def test_a_port_in_use_is_named(server: CubeServer):
 
 def test_what_the_sliders_cannot_tell():
     pulse = ml.GaussianPulse(sigma_ns=1.0)
-    system = ml.System(period_ns=100.0, cycles=10, bins=20, pulse=pulse, detector=ml.Detector(dead_time_ns=5.0))
+    system = make_system(5.0, 10, 20, pulse=pulse)
     told, reason = settings_of(system)
     assert (told["sigma"], told["dead"], told["mode"], reason) == (1.0, 5.0, "nonparalyzable", "")
     moving = ml.Detector(dead_time_ns=5.0, mode="gated", gate_start_ns=1.0, gate_width_ns=9.0, gate_step_ns=2.0)

@@ -19,13 +19,13 @@ from tests.fuzz.server import Server
 KINDS = ("read", "refused", *BAD)
 HEAD = f"""# Mutated files
 
-Each row is about mutations of a good file of one format, each read in a process of its own with limits of memory and
-time (`python -m tests.fuzz --examples N --seed S`, Python {platform.python_version()}).
-*read*: the mutation changed nothing that matters, or numbers without a checksum; *refused*: by one error that names the
-file. The other columns are faults: an error without the file's name (*unnamed*), an exception of a library (*foreign*),
-the end of the process (*crash*), more than 10 s of CPU (*hang*), more than 1 GiB, or a refusal of more than 3 s or
-200 MiB (*memory*). *most s*, *most MiB*: CPU time and memory of the costliest refusal, above those of the process
-before it.
+Each row gives the outcomes of reading mutations of a valid file of one format, each in a separate process with limits
+on memory and time (`python -m tests.fuzz --examples N --seed S`, Python {platform.python_version()}).
+*read*: the mutation had no effect on the content, or changed numbers without a checksum; *refused*: one error that
+names the file. The other columns are faults: an error without the file's name (*unnamed*), an exception of a library
+(*foreign*), a crash of the process (*crash*), more than 10 s of CPU time (*hang*), more than 1 GiB, or a refusal that
+takes more than 3 s or 200 MiB (*memory*). *most s*, *most MiB*: CPU time and memory of the costliest refusal, in
+addition to those of the process before it.
 """
 RUN = "commit, date, N, S"
 ONE_RUN = f"All rows are of one run ({RUN}): "

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.cases import PERIOD_NS, Case, flux_of, shared
-from mars_lidar import Detector, GaussianPulse, System
+from harness.cases import Case, flux_of, shared, system_of
 
 REFERENCE_NAMES = (
     "s01_mid",
@@ -74,13 +73,7 @@ class Reference:
 
     def case(self, photons: float = 3e7, most: int = 20_000) -> Case:
         """The same, to be drawn until about so many photons have arrived."""
-        system = System(
-            period_ns=PERIOD_NS,
-            cycles=self.cycles,
-            bins=self.mean.size,
-            pulse=GaussianPulse(sigma_ns=self.sigma * PERIOD_NS),
-            detector=Detector(dead_time_ns=self.dead * PERIOD_NS),
-        )
+        system = system_of(self.dead, self.cycles, self.mean.size, sigma=self.sigma)
         items = int(min(most, photons / ((self.signal + self.background) * self.cycles)))
         return Case(self.name, flux_of(self.signal, self.background, self.delay), system, items // 4 * 4)
 

@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+from harness import make_system
 
 import mars_lidar as ml
 
 SUFFIXES = (".zarr", ".h5", ".npz")
 
-SYSTEM = ml.System(
-    period_ns=100.0,
-    cycles=60,
-    bins=64,
-    pulse=ml.GaussianPulse(sigma_ns=1.0),
-    detector=ml.Detector(dead_time_ns=30.0),
-)
+SYSTEM = make_system(30.0, 60, 64)
 
 
 def one_return(height: int = 6, width: int = 5) -> ml.Flux:

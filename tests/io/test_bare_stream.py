@@ -74,8 +74,8 @@ def test_errors_name_file_and_cure(tmp_path):
     for arguments, words in (
         ({"period_ns": 100.0}, "several arrays that could be times: a, b; give variable"),
         ({"period_ns": 100.0, "variable": "c"}, "variable must be one of a, b"),
-        ({"period_ns": 100.0, "variable": "a"}, "nothing tells the unit of 'a': give unit_ns"),
-        ({"unit_ns": 1.0, "variable": "a"}, "does not tell the laser period: give period_ns"),
+        ({"period_ns": 100.0, "variable": "a"}, "the unit of 'a' is not stated: give unit_ns"),
+        ({"unit_ns": 1.0, "variable": "a"}, "does not state the laser period: give period_ns"),
         ({"unit_ns": 1.0, "variable": "b", "period_ns": 100.0}, "lie within one laser period"),
         ({"unit_ns": 0.0, "variable": "b", "period_ns": 100.0}, "unit_ns must be"),
         ({"unit_ns": 1e9, "variable": "a", "period_ns": 0.01}, r"2\^31 laser periods"),

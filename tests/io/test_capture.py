@@ -9,6 +9,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from harness import make_system
 
 import mars_lidar as ml
 from mars_lidar import io
@@ -120,13 +121,7 @@ def test_a_capture_goes_there_and_back(tmp_path, layout):
     path, image = write(tmp_path / "a.hdf5", layout)
     width = read_capture(path).bin_ns
     assert width is not None
-    system = ml.System(
-        period_ns=(BINS + 10) * width,
-        cycles=2000,
-        bins=BINS + 10,
-        pulse=ml.GaussianPulse(sigma_ns=0.02),
-        detector=ml.Detector(dead_time_ns=20.0),
-    )
+    system = make_system(20.0, 2000, BINS + 10, sigma_ns=0.02, period_ns=(BINS + 10) * width)
     light = io.read_transient(path, start_ns=0.0)
     cube_file = tmp_path / "cube.zarr"
     io.simulate_to(cube_file, light.flux(system, signal=0.02, sbr=10.0), system, seed=3)
@@ -188,8 +183,8 @@ def test_what_does_not_fit_is_refused(tmp_path):
     render, _ = write(tmp_path / "render.hdf5", "tal confocal")
     out = str(tmp_path / "x.hdf5")
     for options, words in (
-        (["--bins", "10"], "leave out --bins"),
-        (["--scene", "room"], "leave out --scene"),
+        (["--bins", "10"], "omit --bins"),
+        (["--scene", "room"], "omit --scene"),
         (["--period-ns", "5"], "must be a whole number of bins"),
         (["--realizations", "2"], "holds one exposure"),
     ):
@@ -205,13 +200,7 @@ def test_what_does_not_fit_is_refused(tmp_path):
         file["data"], file["deltaT"] = np.ones((2, 3, 4)), 0.01
     with pytest.raises(ValueError, match=r"other\.hdf5: data must have 5 axes"):
         read_capture(other)
-    system = ml.System(
-        period_ns=10.0,
-        cycles=100,
-        bins=10,
-        pulse=ml.GaussianPulse(sigma_ns=0.1),
-        detector=ml.Detector(dead_time_ns=1.0),
-    )
+    system = make_system(1.0, 100, 10, sigma_ns=0.1, period_ns=10.0)
     io.simulate_to(tmp_path / "small.npz", ml.Flux([[0.1]], 0.0, 2.0), system)
     cube = io.load(tmp_path / "small.npz")
     with pytest.raises(ValueError, match="cube must be one exposure of 5 x 4 x 200"):

@@ -13,6 +13,7 @@ import zlib
 import h5py
 import numpy as np
 import pytest
+from harness import make_system
 from PIL import Image
 
 import mars_lidar as ml
@@ -21,9 +22,7 @@ from mars_lidar._base.files import LIMIT, FileError, reading
 from mars_lidar.dataset import DatasetRecipe
 from mars_lidar.io.maps import load_maps
 
-SYSTEM = ml.System(
-    period_ns=100.0, cycles=50, bins=32, pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=30.0)
-)
+SYSTEM = make_system(30.0, 50, 32)
 READERS = {
     "cube.h5": io.load,
     "cube.npz": io.load,

@@ -8,6 +8,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from harness import make_system
 from PIL import Image
 from scipy import sparse
 from scipy.io import savemat
@@ -17,13 +18,7 @@ from mars_lidar import io
 from mars_lidar.io.foreign import read_counts
 from mars_lidar.plot.views import fitted
 
-SYSTEM = ml.System(
-    period_ns=50.0,
-    cycles=2000,
-    bins=250,
-    pulse=ml.GaussianPulse(sigma_ns=0.4),
-    detector=ml.Detector(dead_time_ns=30.0),
-)
+SYSTEM = make_system(30.0, 2000, 250, sigma_ns=0.4, period_ns=50.0)
 DELAY = np.linspace(8.0, 40.0, 12).reshape(3, 4)
 FLUX = ml.Flux(np.linspace(0.2, 2.0, 12).reshape(3, 4), 0.3, DELAY)
 

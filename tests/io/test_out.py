@@ -7,13 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray
+from harness import make_system
 
 import mars_lidar as ml
 from mars_lidar import io
 
-SYSTEM = ml.System(
-    period_ns=50.0, cycles=200, bins=64, pulse=ml.GaussianPulse(sigma_ns=0.5), detector=ml.Detector(dead_time_ns=30.0)
-)
+SYSTEM = make_system(30.0, 200, 64, sigma_ns=0.5, period_ns=50.0)
 
 
 def read_ply(path: Path) -> tuple[list[str], np.ndarray]:

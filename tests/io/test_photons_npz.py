@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from harness import make_system
 
 import mars_lidar as ml
 from mars_lidar._base.files import FileError
 
-SYSTEM = ml.System(
-    period_ns=100.0, cycles=50, bins=32, pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=30.0)
-)
+SYSTEM = make_system(30.0, 50, 32)
 
 
 def test_bins_belong_to_their_times(tmp_path):

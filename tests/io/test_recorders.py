@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from harness import make_system
 
 import mars_lidar as ml
 from mars_lidar import io
@@ -16,14 +17,7 @@ from tests.harness.command import command_line
 
 pytest.importorskip("ptufile", reason="ptufile (extra io) is not installed")
 PERIOD_NS, CYCLES = 50.0, 5000
-SYSTEM = ml.System(
-    period_ns=PERIOD_NS,
-    cycles=CYCLES,
-    bins=1000,
-    pulse=ml.GaussianPulse(sigma_ns=0.5),
-    detector=ml.Detector(dead_time_ns=80.0),
-    start="armed",
-)
+SYSTEM = make_system(80.0, CYCLES, 1000, sigma_ns=0.5, period_ns=PERIOD_NS, start="armed")
 
 
 def simulated() -> ml.Timestamps:
@@ -184,7 +178,7 @@ def test_t3r_has_histograms_but_no_periods(tmp_path, version):
         (content.replace(version, b"7.0", 1), "no .t3r of format 5.0 or 6.0"),
         (header + struct.pack("<13i", *(-1, *tags[1:])) + content[-4 * records.size :], "its clocks are -1 ns"),
         (header + struct.pack("<13i", *tags[:12], -2) + content[-4 * records.size :], "image header -2"),
-        (header + struct.pack("<13i", *tags[:11], -5, 3) + content[-4 * records.size :], "tells of -5 records"),
+        (header + struct.pack("<13i", *tags[:11], -5, 3) + content[-4 * records.size :], "states -5 records"),
     ):
         path.write_bytes(damaged)
         with pytest.raises(ValueError, match=f"a\\.t3r.*{reason}"):
@@ -247,13 +241,7 @@ def test_sdt(tmp_path):
     result = recorded(path)
     assert result.bin_ns == pytest.approx(50.0 / 2 / 256)
     assert np.array_equal(result.arrays["block 0"], counts)
-    system = ml.System(
-        period_ns=25.0,
-        cycles=1000,
-        bins=256,
-        pulse=ml.GaussianPulse(sigma_ns=0.3),
-        detector=ml.Detector(dead_time_ns=40.0),
-    )
+    system = make_system(40.0, 1000, 256, sigma_ns=0.3, period_ns=25.0)
     assert np.array_equal(io.foreign_cube(path, system).histogram[0], counts)
     path.write_bytes(path.read_bytes()[:200])
     with pytest.raises(ValueError, match=r"a\.sdt"):
@@ -337,7 +325,7 @@ def test_cut_short_and_unknown(tmp_path):
     path = pt3(tmp_path / "a.pt3")
     whole = path.read_bytes()
     path.write_bytes(whole[:-40])
-    with pytest.raises(ValueError, match=r"a\.pt3 is cut short: its header tells of \d+ records"):
+    with pytest.raises(ValueError, match=r"a\.pt3 is cut short: its header states \d+ records"):
         ml.Timestamps.load(path)
     path.write_bytes(whole[:400])
     with pytest.raises(ValueError, match=r"a\.pt3"):

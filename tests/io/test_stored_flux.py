@@ -8,6 +8,7 @@ import sys
 import h5py
 import numpy as np
 import pytest
+from harness import make_system
 from scipy.io import savemat
 
 import mars_lidar as ml
@@ -16,13 +17,7 @@ from mars_lidar.light.flux import StoredFlux
 from mars_lidar.light.tolerances import TOL
 from tests.harness.command import command_line
 
-SYSTEM = ml.System(
-    period_ns=100.0,
-    cycles=200,
-    bins=200,
-    pulse=ml.GaussianPulse(sigma_ns=0.8),
-    detector=ml.Detector(dead_time_ns=30.0),
-)
+SYSTEM = make_system(30.0, 200, 200, sigma_ns=0.8)
 
 
 @pytest.fixture

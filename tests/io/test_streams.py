@@ -252,7 +252,7 @@ def test_wrong_kinds_are_told_apart(tmp_path):
         io.load(tmp_path / "photons.npz")
     with pytest.raises(ValueError, match=r"must end in one of \.npz, \.ptu, \.h5"):
         photons().save(tmp_path / "photons.csv")
-    with pytest.raises(ValueError, match="are for the streams of others"):
+    with pytest.raises(ValueError, match="are for streams of other programs"):
         ml.Timestamps.load(tmp_path / "photons.npz", bins=10)
     with pytest.raises(FileExistsError):
         photons().save(tmp_path / "photons.npz")

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from harness import make_system
 
 import mars_lidar as ml
 from mars_lidar import io
@@ -17,9 +18,7 @@ from mars_lidar._base.files import INCOMPLETE_SUFFIX, beside, finished_name, ope
 from mars_lidar.dataset.run import _alone
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="links")
-SYSTEM = ml.System(
-    period_ns=50.0, cycles=40, bins=16, pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=10.0)
-)
+SYSTEM = make_system(10.0, 40, 16, period_ns=50.0)
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".h5", ".mat", ".ptu"])

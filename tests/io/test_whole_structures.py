@@ -12,6 +12,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from harness import make_system
 from scipy import sparse
 from scipy.io import savemat
 
@@ -21,9 +22,7 @@ from mars_lidar._base.files import FileError
 from mars_lidar._base.sparse import check_sparse, dense_counts
 from mars_lidar.io.foreign import foreign_cube
 
-SYSTEM = ml.System(
-    period_ns=100.0, cycles=5000, bins=32, pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=30.0)
-)
+SYSTEM = make_system(30.0, 5000, 32)
 
 
 def counts() -> sparse.csc_matrix:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from harness import make_system
 
 import mars_lidar as ml
 from mars_lidar.learn import (
@@ -25,9 +26,7 @@ PULSES = (ml.GaussianPulse(sigma_ns=3.0), ml.SampledPulse([1, 4, 9, 7, 3, 1, 0.5
 
 
 def system(dead_ns=42.3, pulse=PULSES[0], bins=20, start="stationary", cycles=500) -> ml.System:
-    return ml.System(
-        period_ns=100.0, cycles=cycles, bins=bins, pulse=pulse, detector=ml.Detector(dead_time_ns=dead_ns), start=start
-    )
+    return make_system(dead_ns, cycles, bins, pulse=pulse, start=start)
 
 
 def point(*values):
@@ -151,13 +150,7 @@ def test_blocks_of_another_size_are_solved_alike(monkeypatch):
 
 def test_gradient_at_many_bins_is_that_of_the_exact_mean_histogram():
     """Differences of `mean_histogram`, which shares no code with it: central, of a step that both errors allow."""
-    instrument = ml.System(
-        period_ns=100.0,
-        cycles=1000,
-        bins=512,
-        pulse=ml.GaussianPulse(sigma_ns=0.8),
-        detector=ml.Detector(dead_time_ns=64.0),
-    )
+    instrument = make_system(64.0, 1000, 512, sigma_ns=0.8)
     at, step = np.array([0.9, 0.4, 61.3]), np.array([1e-2, 1e-2, 1e-2])
     weights = np.cos(np.arange(512.0) / 9)
     both = at + np.concatenate([np.diag(step), -np.diag(step)])
@@ -245,13 +238,7 @@ def test_efficiency_and_dark_counts_are_those_of_the_exact_mean():
 
 def test_narrow_pulse_at_many_bins():
     """1024 bins, a pulse of half a bin: nothing dense would fit."""
-    instrument = ml.System(
-        period_ns=100.0,
-        cycles=1000,
-        bins=1024,
-        pulse=ml.GaussianPulse(sigma_ns=0.05),
-        detector=ml.Detector(dead_time_ns=85.0),
-    )
+    instrument = make_system(85.0, 1000, 1024, sigma_ns=0.05)
     s, b, tau = (np.array(x) for x in ([0.5, 5.0], [1.0, 0.1], [40.03, 99.99]))
     result = expected_histogram(*point(s, b, tau), instrument).detach().numpy()
     exact = ml.statistics.mean_histogram(ml.Flux(s, b, tau), instrument)

@@ -7,18 +7,12 @@ import sys
 import numpy as np
 import pytest
 import torch
+from harness import make_system
 
 import mars_lidar as ml
 
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated")  # torch's own forward mode calls it
-SYSTEM = ml.System(
-    period_ns=100.0,
-    cycles=300,
-    bins=16,
-    pulse=ml.GaussianPulse(sigma_ns=4.0),
-    detector=ml.Detector(dead_time_ns=40.0),
-    start="stationary",
-)
+SYSTEM = make_system(40.0, 300, 16, sigma_ns=4.0, start="stationary")
 
 
 @pytest.fixture

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from harness import make_system
 
 import mars_lidar as ml
 from mars_lidar._base.native import _core
@@ -45,14 +46,7 @@ def drawn(number: int) -> Case:
         abs(100.0 * random.integers(0, 3) + 3.0 * sigma * random.normal()),
         np.exp(random.uniform(np.log(0.01), np.log(100.0))),
     )[number % 4]
-    system = ml.System(
-        period_ns=100.0,
-        cycles=1000,
-        bins=bins,
-        pulse=ml.GaussianPulse(sigma_ns=sigma),
-        detector=ml.Detector(dead_time_ns=dead),
-        start="stationary" if random.random() < 0.5 else "armed",
-    )
+    system = make_system(dead, 1000, bins, sigma_ns=sigma, start="stationary" if random.random() < 0.5 else "armed")
     signal, background = (np.exp(random.uniform(*np.log(ends))) for ends in ((0.1, 10.0), (0.05, 5.0)))
     return Case(system, (float(signal), float(background), float(random.uniform(0.0, 100.0))))
 
@@ -140,13 +134,7 @@ def test_bias_of_the_worst_of_600_systems(number):
 def test_bias_of_simulated_exposures(bins, sigma, dead, light):
     """Mean of 2,000 one-step estimates from the truth; 0.1 and 4 standard errors (false alarm 2e-4 a case)."""
     exposures = 2000
-    system = ml.System(
-        period_ns=100.0,
-        cycles=1000,
-        bins=bins,
-        pulse=ml.GaussianPulse(sigma_ns=sigma),
-        detector=ml.Detector(dead_time_ns=dead),
-    )
+    system = make_system(dead, 1000, bins, sigma_ns=sigma)
     cube = ml.simulate(ml.Flux([[light[0]]], *light[1:]), system, realizations=exposures, seed=2, threads=1)
     counts = torch.from_numpy(cube.reshape(exposures, bins).astype(float))
     at = torch.tensor([light] * exposures, dtype=torch.float64, requires_grad=True)
@@ -170,13 +158,7 @@ def test_the_fit_of_the_page_ends_where_reconstruct_does():
 @pytest.mark.parametrize(("sigma", "dead"), [(3.0, 42.3), (1.7, 42.3), (4.0, 97.0), (4.0, 0.7), (4.0, 103.0)])
 def test_gradient_in_bins_that_are_cut(sigma, dead):
     """Of 5 ns: beside differences, to 1e-6 of the largest; and what is refused."""
-    system = ml.System(
-        period_ns=100.0,
-        cycles=500,
-        bins=20,
-        pulse=ml.GaussianPulse(sigma_ns=sigma),
-        detector=ml.Detector(dead_time_ns=dead),
-    )
+    system = make_system(dead, 500, 20, sigma_ns=sigma)
     counts = torch.from_numpy(ml.simulate(ml.Flux([[2.0]], 0.5, 40.0), system, seed=1).reshape(-1).astype(float))
     at = torch.tensor([1.8, 0.6, 40.7], dtype=torch.float64)
 

@@ -11,6 +11,7 @@ import sys
 import numpy as np
 import pytest
 import torch
+from harness import make_system
 from torch.utils.data import DataLoader
 
 import mars_lidar as ml
@@ -18,9 +19,7 @@ from mars_lidar import io
 from mars_lidar.learn import StoredDataset
 from mars_lidar.learn.stored import Exposures
 
-SYSTEM = ml.System(
-    period_ns=100.0, cycles=50, bins=32, pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=30.0)
-)
+SYSTEM = make_system(30.0, 50, 32)
 
 
 @pytest.fixture(scope="module")

@@ -13,6 +13,7 @@ import warnings
 import numpy as np
 import pytest
 import torch
+from harness import make_system
 from scipy import stats
 from torch.utils.data import DataLoader
 
@@ -21,9 +22,7 @@ from mars_lidar.learn import Choice, CubeStream, LogUniform, SystemRange, Unifor
 from mars_lidar.learn.scenes import SharedScenes
 from mars_lidar.learn.stream import prefetched
 
-SYSTEM = ml.System(
-    period_ns=100.0, cycles=60, bins=64, pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=30.0)
-)
+SYSTEM = make_system(30.0, 60, 64)
 SYSTEMS = SystemRange(
     base=SYSTEM,
     cycles=LogUniform(10, 200),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from harness import make_system
 
 import mars_lidar as ml
 from mars_lidar.learn import HistogramTable
@@ -13,14 +14,7 @@ AXES = np.array([0.0, 0.1, 0.98, 1.02, 4.9, 5.1]), np.array([0.0, 0.05, 0.98, 1.
 
 
 def build(sigma_ns=0.5, dead_ns=64.0, start="stationary", bins=1024) -> ml.Table:
-    system = ml.System(
-        period_ns=100.0,
-        cycles=1000,
-        bins=bins,
-        pulse=ml.GaussianPulse(sigma_ns=sigma_ns),
-        detector=ml.Detector(dead_time_ns=dead_ns),
-        start=start,
-    )
+    system = make_system(dead_ns, 1000, bins, sigma_ns=sigma_ns, start=start)
     return ml.Table.build(system, *AXES, threads=1)
 
 

@@ -4,19 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from harness import require
+from harness import make_system, require
 from scipy import stats
 
 import mars_lidar as ml
 from mars_lidar.reconstruction import METHODS
 
-SYSTEM = ml.System(
-    period_ns=100.0,
-    cycles=40_000,
-    bins=100,
-    pulse=ml.GaussianPulse(sigma_ns=1.5),
-    detector=ml.Detector(dead_time_ns=20.0),
-)
+SYSTEM = make_system(20.0, 40_000, 100, sigma_ns=1.5)
 SKEWED = ml.SampledPulse([0, 4, 10, 7, 4, 2.5, 1.5, 1, 0.5, 0.2], 0.7)
 PIXELS = 3000
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from harness import make_system
 from scipy.stats import binom, chi2, norm
 
 import mars_lidar as ml
@@ -16,13 +17,7 @@ PIXELS = (20, 20)
 
 
 def system(dead: float = 50.0, sigma: float = 0.3, bins: int = 500) -> ml.System:
-    return ml.System(
-        period_ns=100.0,
-        cycles=8000,
-        bins=bins,
-        pulse=ml.GaussianPulse(sigma_ns=sigma),
-        detector=ml.Detector(dead_time_ns=dead),
-    )
+    return make_system(dead, 8000, bins, sigma_ns=sigma)
 
 
 def cube(signal: float, background: float, truth: ml.System, seed: int) -> np.ndarray:
@@ -101,14 +96,7 @@ def armed_time(counts: np.ndarray, truth: ml.System, dead_ns: float) -> np.ndarr
 @pytest.mark.parametrize("dead", [10.0, 50.0, 130.0])
 def test_statistics_are_those_of_their_definition(dead: float) -> None:
     """Chi-square of cells, and scores by weighted least squares: p-values to 2 %, scores to 0.05."""
-    truth = ml.System(
-        period_ns=100.0,
-        cycles=8000,
-        bins=250,
-        pulse=ml.GaussianPulse(sigma_ns=1.0),
-        detector=ml.Detector(dead_time_ns=dead),
-        start="stationary",
-    )
+    truth = make_system(dead, 8000, 250, start="stationary")
     delay = np.array([[20.0, 45.5, 70.3, 99.8]])
     counts = ml.simulate(ml.Flux(np.full_like(delay, 0.6), 0.4, delay), truth, seed=4)[0]
     fit = MaximumLikelihood().estimate(checked(counts, truth, 1)[0])

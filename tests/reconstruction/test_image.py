@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from harness import require
+from harness import make_system, require
 from scipy import stats
 
 import mars_lidar as ml
@@ -18,13 +18,7 @@ from mars_lidar.reconstruction.image_pulse import settings_of
 from mars_lidar.reconstruction.photons import Photons
 
 SIGMA = 0.6
-SYSTEM = ml.System(
-    period_ns=100.0,
-    cycles=1000,
-    bins=250,
-    pulse=ml.GaussianPulse(sigma_ns=SIGMA),
-    detector=ml.Detector(dead_time_ns=75.0),
-)
+SYSTEM = make_system(75.0, 1000, 250, sigma_ns=SIGMA)
 BOTH = "image", "image_untrained"
 
 

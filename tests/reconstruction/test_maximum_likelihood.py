@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 import pytest
-from harness import require
+from harness import make_system, require
 from scipy import stats
 
 import mars_lidar as ml
@@ -16,13 +16,7 @@ from mars_lidar.reconstruction import METHODS, Flags, MaximumLikelihood, log_lik
 from mars_lidar.reconstruction.histogram_record import recording_of
 
 PERIOD = 100.0
-PLAIN = ml.System(
-    period_ns=PERIOD,
-    cycles=4000,
-    bins=500,
-    pulse=ml.GaussianPulse(sigma_ns=0.5),
-    detector=ml.Detector(dead_time_ns=75.3),
-)
+PLAIN = make_system(75.3, 4000, 500, sigma_ns=0.5)
 
 
 def with_dead(dead_ns: float, **more) -> ml.System:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from harness import make_system
 
 import mars_lidar as ml
 from mars_lidar.reconstruction import coates_rates, generalised_coates_rates, mchc_rates
@@ -12,16 +13,8 @@ from mars_lidar.statistics import mean_histogram
 PERIOD = 100.0
 
 
-def system_of(dead_ns: float, *, bins: int = 500, cycles: int = 1000, sigma_ns: float = 1.0, **more) -> ml.System:
-    detector = {k: more.pop(k) for k in list(more) if k.startswith("gate") or k == "mode"}
-    return ml.System(
-        period_ns=PERIOD,
-        cycles=cycles,
-        bins=bins,
-        pulse=ml.GaussianPulse(sigma_ns=sigma_ns),
-        detector=ml.Detector(dead_time_ns=dead_ns, **detector),
-        **more,
-    )
+def system_of(dead_ns: float, *, bins: int = 500, **more) -> ml.System:
+    return make_system(dead_ns, bins=bins, period_ns=PERIOD, **more)
 
 
 def photons(system: ml.System, signal: float, background: float, delay_ns: float) -> np.ndarray:
@@ -126,13 +119,7 @@ def test_one_cycle_of_an_armed_pixel():
     ids=["electronics", "jitter", "limit"],
 )
 def test_what_no_method_knows_of_the_detector_is_told(effect):
-    plain = ml.System(
-        period_ns=100.0,
-        cycles=100,
-        bins=100,
-        pulse=ml.GaussianPulse(sigma_ns=1.0),
-        detector=ml.Detector(dead_time_ns=50.0, detection_efficiency=0.5),
-    )
+    plain = make_system(50.0, 100, 100, detection_efficiency=0.5)
     cube = ml.simulate(ml.Flux(1.0, 0.5, 37.0), plain)
     ml.reconstruct(cube, plain)  # no word of an efficiency
     odd = plain.replace(detector=ml.Detector(dead_time_ns=50.0, **effect))

@@ -4,19 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from harness import require
+from harness import make_system, require
 from scipy import optimize, stats
 
 import mars_lidar as ml
 from mars_lidar.reconstruction import Flags, MaximumLikelihood, returns_bound
 
-SYSTEM = ml.System(
-    period_ns=100.0,
-    cycles=4000,
-    bins=500,
-    pulse=ml.GaussianPulse(sigma_ns=0.5),
-    detector=ml.Detector(dead_time_ns=75.3),
-)
+SYSTEM = make_system(75.3, 4000, 500, sigma_ns=0.5)
 SIGMA, DELAY = 0.5, 37.013
 GATED = {"mode": "gated", "gate_start_ns": 20.03, "gate_width_ns": 50.0}
 

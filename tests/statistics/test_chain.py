@@ -4,6 +4,7 @@ import warnings
 
 import numpy as np
 import pytest
+from harness import system_of
 
 import mars_lidar as ml
 from mars_lidar.statistics import ConvergenceError, PhaseChain, photons_per_bin
@@ -32,18 +33,10 @@ def bumpy(total, n=96, seed=3):
     return photons * (total / photons.sum())
 
 
-def make_system(dead_periods, sigma=0.00375, bins=1024, period_ns=100.0):
-    return ml.System(
-        period_ns=period_ns,
-        cycles=1000,
-        bins=bins,
-        pulse=ml.GaussianPulse(sigma_ns=sigma * period_ns),
-        detector=ml.Detector(dead_time_ns=dead_periods * period_ns),
-    )
-
-
 def pulse_chain(signal, background, dead_periods, bins=1024, rearm="centre"):
-    return PhaseChain.from_flux(ml.Flux(signal, background, 50.0), make_system(dead_periods), bins=bins, rearm=rearm)
+    return PhaseChain.from_flux(
+        ml.Flux(signal, background, 50.0), system_of(dead_periods, bins=1024), bins=bins, rearm=rearm
+    )
 
 
 def dense_by_rapp(chain):
@@ -140,7 +133,7 @@ def test_dead_time_of_whole_periods_does_not_distort(whole):
 
 @pytest.mark.parametrize(("rearm", "order"), [("centre", 2), ("edge", 1)])
 def test_order_of_convergence_at_a_fractional_dead_time(rearm, order):
-    system = make_system(0.6371, sigma=0.02)
+    system = system_of(0.6371, bins=1024, sigma=0.02)
 
     def shape(n):
         chain = PhaseChain.from_flux(ml.Flux(4.0, 0.5, 50.0), system, bins=n, rearm=rearm)
@@ -194,7 +187,7 @@ def test_dark_and_empty_fluxes(signal, background):
 
 
 def test_grid_of_the_statistics():
-    system = make_system(0.6, bins=100)
+    system = system_of(0.6, bins=100)
     photons = photons_per_bin(ml.Flux(2.0, 0.5, 50.0), system)
     assert photons.size % 100 == 0
     assert photons.size >= 512
@@ -210,7 +203,7 @@ def test_grid_of_the_statistics():
 
 
 def test_bad_input_is_named():
-    system = make_system(0.6)
+    system = system_of(0.6, bins=1024)
     with pytest.raises(ValueError, match="photons must not all be 0"):
         PhaseChain.from_flux(ml.Flux(0.0, 0.0), system)
     with pytest.raises(ValueError, match=r"photons\[1\] = -1"):
@@ -233,7 +226,9 @@ def test_bad_input_is_named():
 
 def test_a_grid_that_cannot_hold_the_flux_is_refused_by_name():
     with pytest.raises(ConvergenceError, match=r"S = 1000, B = 0.5 .* t_d = 0 periods.*more bins"):
-        PhaseChain.from_flux(ml.Flux(1e3, 0.5, 50.0), make_system(0.0, sigma=1e-4), bins=33, rearm="edge").stationary()
+        PhaseChain.from_flux(
+            ml.Flux(1e3, 0.5, 50.0), system_of(0.0, bins=1024, sigma=1e-4), bins=33, rearm="edge"
+        ).stationary()
 
 
 def test_random_cells_converge_or_say_so():

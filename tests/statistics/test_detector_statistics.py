@@ -6,7 +6,20 @@ from typing import Any
 
 import numpy as np
 import pytest
-from harness import COUNTS, PERIOD_NS, SHAPE, Case, Law, check, first_arrival, flux_of, mean_vector, require, two_lobes
+from harness import (
+    COUNTS,
+    PERIOD_NS,
+    SHAPE,
+    Case,
+    Law,
+    check,
+    first_arrival,
+    flux_of,
+    make_system,
+    mean_vector,
+    require,
+    two_lobes,
+)
 from harness import waveform_flux as flux_of_waveform
 from scipy import stats
 
@@ -30,14 +43,7 @@ def view(mode: str, dead: float, start: str = "armed", cycles: int = 40, **chang
     if mode in GATES:
         opens, width = GATES[mode]
         mode, extra = "gated", {"gate_start_ns": opens * PERIOD_NS, "gate_width_ns": width * PERIOD_NS}
-    return ml.System(
-        period_ns=PERIOD_NS,
-        cycles=cycles,
-        bins=50,
-        pulse=ml.GaussianPulse(sigma_ns=2.0),
-        detector=ml.Detector(dead_time_ns=dead * PERIOD_NS, mode=mode, **extra),
-        start=start,
-    ).replace(**changes)
+    return make_system(dead * PERIOD_NS, cycles, 50, sigma_ns=2.0, start=start, mode=mode, **extra).replace(**changes)
 
 
 def law_of(case: Case, flux: ml.Flux) -> Law:

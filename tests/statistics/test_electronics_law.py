@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from harness import COUNTS, PERIOD_NS, SHAPE, Case, Law, check, flux_of, two_lobes, waveform_flux
+from harness import COUNTS, PERIOD_NS, SHAPE, Case, Law, check, flux_of, make_system, two_lobes, waveform_flux
 
 import mars_lidar as ml
 from mars_lidar.engines import ENGINES
@@ -14,15 +14,14 @@ from mars_lidar.statistics import electronics_moments, mean_histogram
 
 
 def view(dead: float, electronics: float, start: str = "armed", cycles: int = 40, **detector: Any) -> ml.System:
-    return ml.System(
-        period_ns=PERIOD_NS,
-        cycles=cycles,
-        bins=50,
-        pulse=ml.GaussianPulse(sigma_ns=3.0),
+    return make_system(
+        dead * PERIOD_NS,
+        cycles,
+        50,
+        sigma_ns=3.0,
         start=start,
-        detector=ml.Detector(
-            dead_time_ns=dead * PERIOD_NS, electronics_dead_time_ns=electronics * PERIOD_NS, **detector
-        ),
+        electronics_dead_time_ns=electronics * PERIOD_NS,
+        **detector,
     )
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from harness import make_system
 
 import mars_lidar as ml
 from mars_lidar.statistics import cells, joint
@@ -21,14 +22,7 @@ BINS = 150_001  # no grid of a power of two is a multiple of it
 
 def view(dead: float, cycles: int, sigma: float, *, bins: int = BINS, start: Any = "armed") -> ml.System:
     """A system of period 100 ns, its dead time and pulse in periods."""
-    return ml.System(
-        period_ns=100.0,
-        bins=bins,
-        cycles=cycles,
-        pulse=ml.GaussianPulse(sigma_ns=100.0 * sigma),
-        detector=ml.Detector(dead_time_ns=100.0 * dead),
-        start=start,
-    )
+    return make_system(100.0 * dead, cycles, bins, sigma_ns=100.0 * sigma, start=start)
 
 
 def spikes() -> np.ndarray:

@@ -2,20 +2,14 @@
 
 import numpy as np
 import pytest
+from harness import make_system
 
-import mars_lidar as ml
 from mars_lidar.statistics import count_pmf as _pmf
 from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.count_pmf import exact_windows, guessed_windows, total_variation
 from mars_lidar.statistics.exposure import refined_moments
 
-SYSTEM = ml.System(
-    period_ns=100.0,
-    cycles=120,
-    bins=32,
-    pulse=ml.GaussianPulse(sigma_ns=1.0),
-    detector=ml.Detector(dead_time_ns=63.75),
-)
+SYSTEM = make_system(63.75, 120, 32)
 
 
 def cells():

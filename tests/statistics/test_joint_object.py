@@ -108,5 +108,7 @@ def test_bad_input(law: ml.JointLaw):
         law.covariance_of(np.ones((2, 50)), np.ones((3, 50)))
     with pytest.raises(ValueError, match=r"lag must be an integer in \[-50, 50\], got 51"):
         law.lag(51)
-    with pytest.raises(ConvergenceError, match=r"S = 20, B = 0 .* t_d = 1\.5 .* does not forget its start .* 300000"):
+    with pytest.raises(
+        ConvergenceError, match=r"S = 20, B = 0 .* t_d = 1\.5 .* start-up transient does not end .* 300000"
+    ):
         joint_law(ml.Flux(20.0, 0.0, 50.0), system(1.5, cycles=300_000))  # locked to every second pulse

@@ -8,19 +8,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from harness import make_system
 from scipy import stats
 
 import mars_lidar as ml
 from mars_lidar import reconstruction, statistics
 from tests.harness.ledger import require
 
-SYSTEM = ml.System(
-    period_ns=100.0,
-    cycles=200,
-    bins=32,
-    pulse=ml.GaussianPulse(sigma_ns=2.0),
-    detector=ml.Detector(dead_time_ns=60.0),
-)
+SYSTEM = make_system(60.0, 200, 32, sigma_ns=2.0)
 IMAGE = ml.Flux(np.array([[0.5, 2.0, 0.0], [1.0, 0.1, 3.0]]), 0.3, np.array([[20.0, 40.0, np.nan], [60.0, 80.0, 10.0]]))
 PIXEL = IMAGE[0, 1]
 OF_PIXELS: dict[str, Callable[[ml.Flux], Any]] = {

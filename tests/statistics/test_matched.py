@@ -1,18 +1,15 @@
 """The count law from four cumulants: close to the exact law, true to the request, drawn as it is listed."""
 
-import csv
-
 import numpy as np
 import pytest
-from harness import goodness, require
+from harness import goodness, make_system, require
 from scipy import stats
 
 import mars_lidar as ml
 from mars_lidar.statistics.count_pmf import Pmf, gaussian_window, total_variation
 from mars_lidar.statistics.matched import matched_counts, matched_pmf, trusted
-from studies.__main__ import main
-from studies.common.report import MAX_FIGURE_BYTES
 from studies.count_law.matched import QUICK
+from tests.harness.study import quick_study
 
 PERIOD_NS = 1e3 / 7.5
 AIM = 0.002
@@ -36,14 +33,7 @@ def cumulants_of(window):
 
 
 def exact(dead, cycles, signal, background, start="armed"):
-    system = ml.System(
-        period_ns=PERIOD_NS,
-        cycles=cycles,
-        bins=64,
-        pulse=ml.GaussianPulse(sigma_ns=0.5),
-        detector=ml.Detector(dead_time_ns=dead * PERIOD_NS),
-        start=start,
-    )
+    system = make_system(dead * PERIOD_NS, cycles, 64, sigma_ns=0.5, period_ns=PERIOD_NS, start=start)
     return ml.count_law(ml.Flux(signal, background, 0.5 * PERIOD_NS), system)
 
 
@@ -232,14 +222,11 @@ def test_bad_uniform():
 
 @pytest.mark.full
 def test_study(tmp_path):
-    assert main(["matched", "--quick", "--out", str(tmp_path)]) == 0
-    with (tmp_path / "matched.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    study = quick_study("matched", tmp_path)
+    rows = study.rows
     cells = len(QUICK.signal) * len(QUICK.background)
     maps = len(QUICK.dead) * len(QUICK.cycles) + len(QUICK.stationary)
     assert 0 < len(rows) < maps * cells + QUICK.systems * QUICK.pixels
     assert all(row["trusted"] == "False" or AIM / 4 < float(row["tv_exact_matched"]) <= AIM for row in rows)
-    text = (tmp_path / "matched.md").read_text()
-    assert "matched_map.png" in text
-    assert f"| grid, armed | {len(QUICK.dead) * len(QUICK.cycles) * cells} |" in text
-    assert 5_000 < (tmp_path / "matched_map.png").stat().st_size <= MAX_FIGURE_BYTES
+    assert f"| grid, armed | {len(QUICK.dead) * len(QUICK.cycles) * cells} |" in study.text
+    assert study.figures == ["matched_map.png"]

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from harness import require
+from harness import require, system_of
 from harness.pvalues import variance_score
 from scipy import stats
 
@@ -31,14 +31,7 @@ def system(
     dead: float, sigma: float, cycles: int = 50, start: str = "armed", mode: str = "nonparalyzable"
 ) -> ml.System:
     """Times in periods."""
-    return ml.System(
-        period_ns=PERIOD_NS,
-        cycles=cycles,
-        bins=2,
-        pulse=ml.GaussianPulse(sigma_ns=sigma * PERIOD_NS),
-        detector=ml.Detector(dead_time_ns=dead * PERIOD_NS, mode=mode),  # type: ignore[arg-type]
-        start=start,  # type: ignore[arg-type]
-    )
+    return system_of(dead, cycles, 2, sigma=sigma, start=start, mode=mode)
 
 
 def by_count_law(*light: float, view: ml.System, delay_ns: float) -> Figures:

@@ -6,7 +6,19 @@ from math import comb, factorial
 
 import numpy as np
 import pytest
-from harness import COUNTS, PERIOD_NS, SHAPE, Case, Law, check, flux_of, random_cases, two_lobes, waveform_flux
+from harness import (
+    COUNTS,
+    PERIOD_NS,
+    SHAPE,
+    Case,
+    Law,
+    check,
+    flux_of,
+    make_system,
+    random_cases,
+    two_lobes,
+    waveform_flux,
+)
 from scipy.integrate import quad
 
 import mars_lidar as ml
@@ -15,14 +27,7 @@ from mars_lidar.statistics import exposure_moments, paralyzable_moments
 
 
 def view(dead: float, start: str = "armed", cycles: int = 40, *, sigma: float = 0.02, bins: int = 50) -> ml.System:
-    return ml.System(
-        period_ns=PERIOD_NS,
-        cycles=cycles,
-        bins=bins,
-        pulse=ml.GaussianPulse(sigma_ns=sigma * PERIOD_NS),
-        detector=ml.Detector(dead_time_ns=dead * PERIOD_NS, mode="paralyzable"),
-        start=start,
-    )
+    return make_system(dead * PERIOD_NS, cycles, bins, sigma_ns=sigma * PERIOD_NS, start=start, mode="paralyzable")
 
 
 def pmf_of(law: ml.CountLaw) -> np.ndarray:

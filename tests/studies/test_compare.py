@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from harness import make_system
 from harness.ledger import require
 from matplotlib.figure import Figure
 from scipy import stats
@@ -15,13 +16,7 @@ from mars_lidar.engines import ENGINES, Engine
 from studies.compare.comparison import compare, telling_pixels
 from studies.compare.report import comparison, show
 
-SYSTEM = ml.System(
-    period_ns=100.0,
-    cycles=200,
-    bins=100,
-    pulse=ml.GaussianPulse(sigma_ns=1.5),
-    detector=ml.Detector(dead_time_ns=63.0),
-)
+SYSTEM = make_system(63.0, 200, 100, sigma_ns=1.5)
 CALM = {"threads": 2, "budget_s": 600.0}  # as many exposures on a busy machine
 TRUE = ("exact", "sequential")  # engines that claim everything
 

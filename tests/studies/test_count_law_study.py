@@ -1,6 +1,5 @@
 """The study of count laws: its distances, its floors, what it calls right, and its quick form."""
 
-import csv
 from dataclasses import replace
 
 import numpy as np
@@ -14,18 +13,18 @@ from mars_lidar.statistics.count_pmf import Pmf, kl_divergence
 from mars_lidar.statistics.tolerances import TOL
 from studies.__main__ import main
 from studies.common.distance import wasserstein
-from studies.common.report import MAX_FIGURE_BYTES
 from studies.common.sample import draw
 from studies.count_law import cells as cells_of
 from studies.count_law import run as count_law
 from studies.count_law.run import shape_sweep
 from studies.neural import simulators
+from tests.harness.study import quick_study, written
 
 
 @pytest.fixture(scope="module")
 def quick(tmp_path_factory):
     out = tmp_path_factory.mktemp("count_law")
-    assert main(["count-law", "--quick", "--out", str(out)]) == 0
+    quick_study("count-law", out)
     return out
 
 
@@ -36,16 +35,10 @@ def cells():
 
 @pytest.mark.full
 def test_files(quick):
-    text = (quick / "count_law.md").read_text()
-    figures = [path for path in quick.iterdir() if path.suffix == ".png"]
-    assert len(figures) == 2
-    for path in figures:
-        assert 5_000 < path.stat().st_size <= MAX_FIGURE_BYTES
-        assert text.count(f"({path.name})") == 1
-    with (quick / "count_law.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert len(rows) == sum(grid.size for grid in count_law.QUICK.grids)
-    assert "engine `sequential`" in text
+    study = written("count-law", quick)
+    assert len(study.figures) == 2
+    assert len(study.rows) == sum(grid.size for grid in count_law.QUICK.grids)
+    assert "engine `sequential`" in study.text
 
 
 @pytest.mark.full

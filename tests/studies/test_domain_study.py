@@ -2,35 +2,28 @@
 
 from __future__ import annotations
 
-import csv
 import time
 
 import numpy as np
 import pytest
+from harness import make_system
 from scipy import stats
 
 import mars_lidar as ml
 from mars_lidar.instrument.effects import EFFECTS
 from mars_lidar.reconstruction.histogram_bound import _variances
 from mars_lidar.statistics import ConvergenceError
-from studies.__main__ import main
 from studies.common.distance import neighbours
-from studies.common.report import MAX_FIGURE_BYTES
 from studies.domain import judge as judging
 from studies.domain.checks import Check, Windows, simulated, two_samples
 from studies.domain.judge import Budget, judge, known
 from studies.domain.sweep import Settings, Watched, judge_case
 from studies.domain.systems import FAMILIES, MOVING, PERIOD_NS, Case, draw
+from tests.harness.study import quick_study
 
 
 def pixel(signal: float = 1.0, background: float = 0.5, dead: float = 0.4, cycles: int = 100, **more: object) -> Case:
-    system = ml.System(
-        period_ns=PERIOD_NS,
-        cycles=cycles,
-        bins=32,
-        pulse=ml.GaussianPulse(sigma_ns=1.0),
-        detector=ml.Detector(dead_time_ns=dead * PERIOD_NS, **more),
-    )
+    system = make_system(dead * PERIOD_NS, cycles, 32, **more)
     return Case("by hand/0", "any", system, (signal,), (0.3,), background)
 
 
@@ -207,16 +200,12 @@ def test_errors_without_information_are_infinite() -> None:
 @pytest.mark.full
 def test_quick_form(tmp_path, capsys) -> None:
     """Sixty systems with fixed seeds: no failure, a report, its data and its maps."""
-    assert main(["domain", "--quick", "--out", str(tmp_path)]) == 0
+    study = quick_study("domain", tmp_path)
     capsys.readouterr()
     failures = tmp_path / "domain_failures.csv"
     assert not failures.exists(), failures.read_text()
-    text = (tmp_path / "domain.md").read_text()
-    assert "**No failure**" in text
-    with (tmp_path / "domain.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert len(rows) == 60
-    assert {row["exact"] for row in rows} <= set(judging.STATES)
-    assert sum(row["exact"] == judging.VERIFIED for row in rows) > 40
-    for name in ("engines", "engines_exposure", "laws", "laws_exposure", "modes"):
-        assert 0 < (tmp_path / f"domain_{name}.png").stat().st_size <= MAX_FIGURE_BYTES
+    assert "**No failure**" in study.text
+    assert len(study.rows) == 60
+    assert {row["exact"] for row in study.rows} <= set(judging.STATES)
+    assert sum(row["exact"] == judging.VERIFIED for row in study.rows) > 40
+    assert len(study.figures) == 5

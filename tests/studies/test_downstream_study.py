@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import itertools
 import json
 from dataclasses import replace
@@ -10,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from harness import make_system
 
 import mars_lidar as ml
 from mars_lidar.statistics import mean_histogram
 from studies import Request
-from studies.__main__ import main
 from studies.common.kept import fixed
 from studies.common.windows import BOX, LOGS, NEAR, WINDOW, features, number, starts
 from studies.downstream import data as downstream_data
@@ -24,6 +23,7 @@ from studies.downstream.networks import predicted, trained
 from studies.downstream.prediction import at
 from studies.downstream.report import scatter
 from studies.neural import NeuralEngine
+from tests.harness.study import quick_study
 
 TINY = CONFIGS["tiny"]
 
@@ -45,17 +45,15 @@ def test_the_study_goes_on_where_it_was_stopped(tmp_path: Path, monkeypatch: pyt
         downstream.run(Request(tmp_path, quick=True, tell=stop))
     result = tmp_path / "downstream-tiny" / "pixel-exact-dead0.5625-sbr1-0.json"
     made = result.stat().st_mtime_ns
-    assert main(["downstream", "--quick", "--out", str(tmp_path)]) == 0
+    study = quick_study("downstream", tmp_path)
     assert result.stat().st_mtime_ns == made
     assert "3 of 3 networks" in messages[0]
-    text = (tmp_path / "downstream.md").read_text()
+    text, rows = study.text, study.rows
     assert "33.68 / 0.061" in text
     assert "36.49" not in text  # the paper's row of another ratio
     assert "not for citing" in text
     assert "_Cramer-Rao bound_" in text
-    assert (tmp_path / "downstream.png").stat().st_size > 5000
-    with (tmp_path / "downstream.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    assert study.figures == ["downstream.png"]
     scenes = small.sizes.test[1]
     assert len(rows) == scenes * (3 * 2 + 4)
     judged = json.loads(result.read_text())["gold"]
@@ -145,7 +143,7 @@ def test_training_pixels_have_the_light_of_the_study():
     """Poisson's counts are the arrivals: S = photons x reflectivity, B of the same mean at a ratio of 1."""
     sizes = TINY.sizes
     pixels = downstream_data.Data(sizes).training("poisson", MAIN, 1.0, 3)
-    counts = (pixels.seen[..., :-LOGS] ** 2).sum(-1).mean((1, 2)) / instrument(MAIN).cycles
+    counts = (pixels.inputs[..., :-LOGS] ** 2).sum(-1).mean((1, 2)) / instrument(MAIN).cycles
     light = sizes.photons * pixels.wanted[..., 0].mean((1, 2))
     np.testing.assert_allclose(counts, 2.0 * light, rtol=0.02)
 
@@ -174,14 +172,7 @@ def test_errors_are_those_of_scenes_and_seeds():
 
 
 def small_system(dead_ns: float) -> ml.System:
-    return ml.System(
-        period_ns=100.0,
-        cycles=1000,
-        bins=256,
-        pulse=ml.GaussianPulse(sigma_ns=2.0),
-        detector=ml.Detector(dead_time_ns=dead_ns),
-        start="stationary",
-    )
+    return make_system(dead_ns, 1000, 256, sigma_ns=2.0, start="stationary")
 
 
 @pytest.mark.full

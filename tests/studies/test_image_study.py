@@ -7,6 +7,7 @@ import sys
 
 import numpy as np
 import pytest
+from harness import make_system
 
 import mars_lidar as ml
 from mars_lidar import io
@@ -16,16 +17,10 @@ from mars_lidar.reconstruction.image_network import CARD, WEIGHTS, networks_of
 from mars_lidar.reconstruction.image_pulse import settings_of
 from mars_lidar.reconstruction.photons import Photons
 from studies.__main__ import main
-from studies.common.report import MAX_FIGURE_BYTES
 from studies.image import alternating, captures
+from tests.harness.study import quick_study
 
-SYSTEM = ml.System(
-    period_ns=100.0,
-    cycles=20_000,
-    bins=250,
-    pulse=ml.GaussianPulse(sigma_ns=0.6),
-    detector=ml.Detector(dead_time_ns=20.0),
-)
+SYSTEM = make_system(20.0, 20_000, 250, sigma_ns=0.6)
 
 
 @pytest.mark.full
@@ -33,14 +28,13 @@ def test_study(tmp_path):
     room = ml.Scene.example("room", 24).flux(SYSTEM, signal=100.0 / SYSTEM.cycles, sbr=1.0)
     (tmp_path / "captures").mkdir()
     io.save(tmp_path / "captures" / "measured.npz", io.from_histograms(ml.simulate(room, SYSTEM, seed=1)[0], SYSTEM))
-    folder = str(tmp_path / "captures")
-    assert main(["image", "--quick", "--captures", folder, "--out", str(tmp_path)]) == 0
-    text = (tmp_path / "image.md").read_text()
+    study = quick_study("image", tmp_path, "--captures", tmp_path / "captures")
+    text = study.text
     assert ("DRUNet: skipped" in text) != ("| DRUNet prior |" in text)
     assert "Quick form" in text
     assert "| measured | 2 | image |" in text
-    assert 5_000 < (tmp_path / "image.png").stat().st_size < MAX_FIGURE_BYTES
-    assert (tmp_path / "image.csv").stat().st_size > 1000
+    assert study.figures == ["image.png"]
+    assert len(study.rows) > 10
 
 
 def test_a_capture_is_thinned_to_so_many_photons(tmp_path):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import sys
 
 import numpy as np
@@ -12,9 +11,9 @@ from scipy import stats
 
 from mars_lidar.statistics import ConvergenceError
 from studies.__main__ import main
-from studies.common.report import MAX_FIGURE_BYTES
 from studies.joint import cases as bins
 from studies.joint import run as joint
+from tests.harness.study import quick_study
 
 
 def test_auc_and_its_error():
@@ -92,12 +91,10 @@ def test_pixels_given_to_exact_are_not_judged():
 @pytest.mark.full
 def test_files(tmp_path):
     pytest.importorskip("sklearn", reason="extra 'studies'")
-    assert main(["joint", "--quick", "--out", str(tmp_path)]) == 0
-    text = (tmp_path / "joint.md").read_text()
-    assert "Quick form" in text
-    assert 5_000 < (tmp_path / "joint.png").stat().st_size <= MAX_FIGURE_BYTES
-    with (tmp_path / "joint.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    study = quick_study("joint", tmp_path)
+    rows = study.rows
+    assert "Quick form" in study.text
+    assert study.figures == ["joint.png"]
     quick = joint.QUICK
     assert len(rows) == (1 + len(joint.ENGINES)) * (len(quick.cases) + quick.systems)
     chance = joint.chance_error(quick.exposures // 2, quick.exposures // 2)

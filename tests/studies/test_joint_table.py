@@ -1,16 +1,14 @@
 """The joint table: what samples are compared with, against independent bins and known figures, and its quick form."""
 
-import csv
-
 import numpy as np
 import pytest
 from harness.ledger import require
 from scipy import stats
 
 from mars_lidar.engines import ANY_SYSTEM
-from studies.__main__ import main
 from studies.joint import table as joint
 from studies.joint.cases import COARSE, RATIOS, REFERENCE, SEVEN, SEVEN_RATIOS, Case, Law, Sample
+from tests.harness.study import quick_study
 
 NONE = np.zeros(0, np.intp)
 
@@ -21,13 +19,10 @@ def compared(case, engine, exposures, seed):
 
 
 def test_files(tmp_path):
-    assert main(["joint-table", "--quick", "--out", str(tmp_path)]) == 0
-    with (tmp_path / "joint_table.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert len(rows) == len(joint.QUICK.cases) * len(ANY_SYSTEM)
-    assert {row["engine"] for row in rows} == set(ANY_SYSTEM)
-    text = (tmp_path / "joint_table.md").read_text()
-    assert all(f"| {case.name} |" in text for case in joint.QUICK.cases)
+    study = quick_study("joint-table", tmp_path)
+    assert len(study.rows) == len(joint.QUICK.cases) * len(ANY_SYSTEM)
+    assert {row["engine"] for row in study.rows} == set(ANY_SYSTEM)
+    assert all(f"| {case.name} |" in study.text for case in joint.QUICK.cases)
 
 
 def test_cases_are_the_declared_ones():

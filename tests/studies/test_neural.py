@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from harness import mean_vector, require
+from harness import make_system, mean_vector, require
 
 import mars_lidar as ml
 from mars_lidar.engines import find_engine
@@ -18,17 +18,9 @@ from studies.neural import FluxRange, NeuralEngine, NeuralMap, Training, train
 from studies.neural.pairs import Pairs
 
 WITHIN = 0.02  # total variation
-SYSTEM = ml.System(
-    period_ns=1e3 / 7.5,
-    cycles=1000,
-    bins=1024,
-    pulse=ml.GaussianPulse(sigma_ns=0.5),
-    detector=ml.Detector(dead_time_ns=75.0),
-)
+SYSTEM = make_system(75.0, 1000, 1024, sigma_ns=0.5, period_ns=1e3 / 7.5)
 NEURAL = NeuralEngine()
-SMALL = ml.System(
-    period_ns=100.0, cycles=50, bins=128, pulse=ml.GaussianPulse(sigma_ns=2.0), detector=ml.Detector(dead_time_ns=30.0)
-)
+SMALL = make_system(30.0, 50, 128, sigma_ns=2.0)
 
 
 def variation(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -1,31 +1,25 @@
 """The study of quantisation: errors vanish on the nodes, shrink with the grid, and less for the nearest entry."""
 
-import csv
-
 import numpy as np
 import pytest
 
 from mars_lidar import Flux
 from mars_lidar.statistics import exposure_moments
 from mars_lidar.table import Table
-from studies.__main__ import main
 from studies.table import quantisation
+from tests.harness.study import quick_study
 
 
 @pytest.mark.full
 def test_files(tmp_path):
-    assert main(["quantisation", "--quick", "--out", str(tmp_path)]) == 0
-    with (tmp_path / "quantisation.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    study = quick_study("quantisation", tmp_path)
     settings = quantisation.QUICK
-    assert len(rows) == len(settings.sizes) * len(settings.dead_ns) * len(quantisation.INTERPOLATIONS)
+    assert len(study.rows) == len(settings.sizes) * len(settings.dead_ns) * len(quantisation.INTERPOLATIONS)
     for key in quantisation.ERRORS:
-        error = {(row["signal_points"], row["lookup"]): float(row[f"{key}_mean"]) for row in rows}
+        error = {(row["signal_points"], row["lookup"]): float(row[f"{key}_mean"]) for row in study.rows}
         assert error["16", "bilinear"] < error["16", "nearest"] < error["4", "nearest"]
         assert error["16", "bilinear"] < error["4", "bilinear"]
-    text = (tmp_path / "quantisation.md").read_text()
-    assert "quantisation.png" in text
-    assert (tmp_path / "quantisation.png").stat().st_size > 5_000
+    assert study.figures == ["quantisation.png"]
 
 
 @pytest.mark.parametrize("interpolation", quantisation.INTERPOLATIONS)

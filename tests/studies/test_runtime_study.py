@@ -1,7 +1,5 @@
 """The paper's pipeline in NumPy, and the runtime study: no time is asserted, only what is done with times."""
 
-import csv
-
 import numpy as np
 import pytest
 from harness.ledger import require
@@ -10,9 +8,9 @@ from scipy import stats
 import mars_lidar as ml
 from benchmarks.numpy_pipeline import STAGES, NumpyTable, synthesize
 from mars_lidar.engines import ANY_SYSTEM
-from studies.__main__ import main
 from studies.runtime import run as runtime
 from studies.runtime import timing
+from tests.harness.study import quick_study
 
 
 @pytest.fixture(scope="module")
@@ -22,17 +20,15 @@ def system():
 
 @pytest.mark.full
 def test_files(tmp_path):
-    assert main(["runtime", "--quick", "--out", str(tmp_path)]) == 0
-    with (tmp_path / "runtime.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    study = quick_study("runtime", tmp_path)
+    rows, text = study.rows, study.text
     assert {row["axis"] for row in rows} == {"cycles", "flux", "realizations", "pixels", "teaser"}
     assert {*ANY_SYSTEM, timing.NUMPY} <= {row["contender"] for row in rows}
     assert all((row["seconds"] == "") == bool(row["why"]) for row in rows)
-    text = (tmp_path / "runtime.md").read_text()
     assert "| 105.1 MB | 105 MB |" in text
     assert "40.83" in text
     assert "`Table` of this run, 5 x 4 entries" in text  # flux 0 is a node of either axis
-    assert {path.name for path in tmp_path.glob("*.png")} == {"runtime_axes.png", "runtime_teaser.png"}
+    assert study.figures == ["runtime_axes.png", "runtime_teaser.png"]
 
 
 def test_pipeline_draws_the_law_of_its_table(system):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from harness.ledger import require
 from scipy.stats import norm
-from table.cases import make_system, small_table
+from table.cases import small_table, table_system
 
 import mars_lidar as ml
 from mars_lidar import _core
@@ -42,7 +42,7 @@ def corrections(signal, background, system, *, level="", cumulants=None):
 def test_one_sweep_gives_the_cumulants_at_every_delay(start, dead):
     rng = np.random.default_rng(5)
     signal, background = 10 ** rng.uniform(-2, 1, (2, 5))
-    system = make_system(dead, cycles=4000, start=start)
+    system = table_system(dead, cycles=4000, start=start)
     own = np.empty((5, 4))
     result, settled = corrections(signal, background, system, cumulants=own)
     delay = system.period_ns * (0.5 - PHASES / GRID)
@@ -56,7 +56,7 @@ def test_one_sweep_gives_the_cumulants_at_every_delay(start, dead):
 
 def test_what_the_correction_is_worth():
     """The oracle of the test above would notice if there were none; and t_d = t_r needs none."""
-    system = make_system(0.6, cycles=500)
+    system = table_system(0.6, cycles=500)
     effect, _ = corrections(10.0, 0.05, system)
     law = exposure_moments(ml.Flux(10.0, 0.05, 0.5 * system.period_ns), system)
     assert np.ptp(effect[0, :, 0]) > 0.3
@@ -69,12 +69,12 @@ def test_what_the_correction_is_worth():
 
 
 def test_a_constant_rate_has_no_phase():
-    result, _ = corrections(0.0, [0.1, 2.0], make_system(0.37, cycles=2000))
+    result, _ = corrections(0.0, [0.1, 2.0], table_system(0.37, cycles=2000))
     assert np.abs(result).max() < 1e-9
 
 
 def test_vector_widths_agree():
-    system = make_system(0.6, cycles=300)
+    system = table_system(0.6, cycles=300)
     signal, background = [0.1, 1.0, 9.0], [1.0, 0.2, 0.05]
     first, _ = corrections(signal, background, system, level=_core.levels()[-1])
     for level in _core.levels():
@@ -104,7 +104,7 @@ def test_interpolated_over_pixels_and_phases(start):
 @pytest.mark.parametrize(("dead", "cycles"), [(0.6, 4), (2.53, 60)])
 def test_exposures_that_end_before_they_settle(dead, cycles):
     """Start and end of such an exposure know each other: cells where that matters are run phase by phase."""
-    system = make_system(dead, cycles=cycles)
+    system = table_system(dead, cycles=cycles)
     signal, background = np.array([0.0, 0.1, 3.0, 10.0]), np.array([0.01, 0.1, 1.0])
     s, b = np.repeat(signal, 3), np.tile(background, 4)
     entries = exposure_moments(ml.Flux(s, b, 0.5 * system.period_ns), system)

@@ -3,7 +3,7 @@
 import h5py
 import numpy as np
 import pytest
-from table.cases import make_system, small_table
+from table.cases import small_table, table_system
 
 import mars_lidar as ml
 from mars_lidar.table import storage
@@ -101,7 +101,7 @@ def test_files_that_are_not_tables(tmp_path, monkeypatch):
 
 
 def test_the_cache_builds_once(own_cache, monkeypatch):
-    system = make_system(cycles=300)
+    system = table_system(cycles=300)
     grids = {"signal": (0.1, 5.0, 6), "background": (0.1, 2.0, 5)}
     first = ml.Table.cached(system, **grids, threads=1)
     (file,) = own_cache.iterdir()
@@ -127,7 +127,7 @@ def test_the_cache_builds_once(own_cache, monkeypatch):
 
 
 def test_a_damaged_file_in_the_cache_is_replaced(own_cache):
-    system = make_system(cycles=300)
+    system = table_system(cycles=300)
     ml.Table.cached(system, [0.5, 1.0], [0.2, 0.4], threads=1)
     (file,) = own_cache.iterdir()
     file.write_bytes(file.read_bytes()[:3000])

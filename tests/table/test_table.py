@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from table.cases import make_system, small_table
+from harness import system_of
+from table.cases import small_table, table_system
 
 import mars_lidar as ml
 from mars_lidar.statistics import exposure_moments
@@ -160,14 +161,14 @@ def test_the_method_of_the_paper():
 
 
 def test_no_dead_time_is_poisson():
-    table = ml.Table.build(make_system(0.0), (0.1, 10, 12), (0.1, 10, 8), threads=1)
+    table = ml.Table.build(table_system(0.0), (0.1, 10, 12), (0.1, 10, 8), threads=1)
     result = table.at(2.0, 0.3, delay_ns=17.0, cycles=3)
     assert result.cumulants[0] == pytest.approx(3 * 2.3, rel=0.02)
     assert np.ptp(result.cumulants[0]) < 1e-9
 
 
 def test_short_exposures_serve_no_others():
-    system = make_system(0.6, cycles=3)
+    system = table_system(0.6, cycles=3)
     table = ml.Table.build(system, [0.0, 1.0, 10.0], [0.0, 0.1, 1.0], threads=1)
     assert not table.serves(4)
     assert table.at(1.0, 0.1).cumulants[0] == pytest.approx(
@@ -222,7 +223,7 @@ def test_the_error_of_long_exposures_is_measured_and_told(tmp_path):
 
 
 def test_axes_refined_until_the_error_is_met():
-    system = make_system(0.6, bins=16, sigma=0.04)
+    system = system_of(0.6, 200, 16, sigma=0.04)
     coarse = ml.Table.build(system, (1.0, 9.0, 4), (0.01, 0.3, 4), threads=2)
     fine = ml.Table.build(system, (1.0, 9.0, 4), (0.01, 0.3, 4), refine=5e-3, threads=2)
     assert coarse.quantisation_error(samples=200, seed=9).largest > 2e-2
@@ -267,7 +268,7 @@ def test_axes():
     ],
 )
 def test_bad_requests(change, error, message):
-    given = {"system": make_system(), "signal": [1.0], "background": [1.0]} | change
+    given = {"system": table_system(), "signal": [1.0], "background": [1.0]} | change
     with pytest.raises(error, match=message):
         ml.Table.build(given.pop("system"), **given)
 
@@ -289,7 +290,7 @@ def test_bad_lookups():
 
 def test_progress_and_stopping():
     recorded = []
-    ml.Table.build(make_system(cycles=50), [0.1, 1.0], [0.1, 1.0], threads=1, progress=lambda *at: recorded.append(at))
+    ml.Table.build(table_system(cycles=50), [0.1, 1.0], [0.1, 1.0], threads=1, progress=lambda *at: recorded.append(at))
     assert recorded[-1][0] == recorded[-1][1] > 0
     assert [done for done, _ in recorded] == sorted(done for done, _ in recorded)
     assert len({total for _, total in recorded}) == 1
@@ -299,4 +300,4 @@ def test_progress_and_stopping():
 
     for method in ("exposure", "mars"):
         with pytest.raises(KeyboardInterrupt):
-            ml.Table.build(make_system(), (0.1, 5, 8), (0.1, 5, 8), method=method, threads=1, progress=stop)
+            ml.Table.build(table_system(), (0.1, 5, 8), (0.1, 5, 8), method=method, threads=1, progress=stop)

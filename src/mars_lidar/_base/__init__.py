@@ -1,1 +1,1 @@
-"""What every part of the package uses: checks of arguments, memory, optional libraries, short texts."""
+"""Shared utilities: argument checks, memory, optional libraries, short texts."""

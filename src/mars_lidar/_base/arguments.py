@@ -1,9 +1,9 @@
-"""Arguments checked by the annotations of the function that they are given to, in one wording.
+"""Arguments are checked against the annotations of the function, with uniform messages.
 
-A caller may hand in None, a list of rows of different lengths, or a cube where a system is wanted; without a check
-something deep inside would fail in words of its own. An annotation is the one declaration of what an argument is:
-`checked` evaluates it when the function is first called and refuses, by its name, a value that it does not allow.
-Numbers have checks in the functions, which know their ranges (`checks`).
+A caller may pass None, a list of rows of different lengths, or a cube where a system is expected; without a check, an
+unrelated error would be raised deep inside. The annotation is the single declaration of an argument's type: `checked`
+evaluates it at the first call of the function and refuses, by name, an argument whose value it does not allow.
+Ranges of numbers are checked in the functions (`checks`).
 """
 
 from __future__ import annotations
@@ -71,11 +71,11 @@ class _Names(Mapping[str, Any]):
 
 
 def checked(function: Callable[P, R], masks: bool = False) -> Callable[P, R]:
-    """Refuse, by their names, arguments that are not what their annotations say.
+    """Refuse, by name, arguments whose values their annotations do not allow.
 
-    Texts, choices, paths, arrays, mappings, sequences, functions, classes and unions of them are compared; numbers and
-    what else an annotation may be are for the function to judge. Arrays must hold real numbers, and nothing that is
-    masked, but where `masks` mean something. A sequence is compared as such, not in what it holds.
+    Texts, choices, paths, arrays, mappings, sequences, functions, classes and unions of them are checked; numbers and
+    all other annotations are left to the function. Arrays must contain real numbers and no masked elements, except
+    where `masks` are meaningful. Of a sequence only the type is checked, not its elements.
     """
     signature = inspect.signature(function)
     rules: dict[str, tuple[Any, ...]] = {}
@@ -94,7 +94,7 @@ def checked(function: Callable[P, R], masks: bool = False) -> Callable[P, R]:
 
 
 def explained(function: Callable[P, R]) -> Callable[P, R]:
-    """Explain a call that Python refuses, as `checked` does, and leave the values of arguments to the function."""
+    """Explain a call that Python refuses, as `checked` does, without checking the values of arguments."""
     signature = inspect.signature(function)
 
     @functools.wraps(function)
@@ -145,7 +145,7 @@ def _bound(name: str, signature: inspect.Signature, args: tuple[Any, ...], kwarg
 
 
 def checked_with_masks(function: Callable[P, R]) -> Callable[P, R]:
-    """As `checked`, for a function to which masked elements mean something."""
+    """As `checked`, for a function that accepts masked elements."""
     return checked(function, masks=True)
 
 

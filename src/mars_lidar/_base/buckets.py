@@ -1,4 +1,4 @@
-"""Stores in object stores: paths of universal_pathlib, which have the methods of `Path`, and what files have beside.
+"""Object stores: paths of universal_pathlib, with the methods of `Path`, and functions in place of those of files.
 
 An object appears whole under its name or not at all. There are no renames, no locks, and no folders.
 """
@@ -15,7 +15,7 @@ _URL = re.compile(r"^((?:[A-Za-z][\w+.-]*::)*[A-Za-z][\w+.-]+):/+(.*)$")  # a dr
 
 
 def url_of(path: str | Path) -> str | None:
-    """The URL that a text is, also after `Path` has taken its second slash; None for a file."""
+    """The URL in a text, also after `Path` has removed its second slash; None for a file."""
     match = _URL.match(str(path))
     if match is None:
         return None
@@ -37,7 +37,7 @@ def in_bucket(path: Any) -> bool:
 
 
 def zarr_store(path: Any, *, read_only: bool = False) -> Any:
-    """What Zarr opens: the path itself, or its store for a URL."""
+    """The argument that Zarr opens: the path itself, or its store for a URL."""
     if not in_bucket(path):
         return path
     from zarr.storage import FsspecStore
@@ -51,7 +51,7 @@ def put(path: Any, content: bytes) -> None:
 
 
 def content_of(path: Any) -> bytes:
-    """The bytes of a file or an object; of an object as it is now, whatever an earlier listing of its folder says."""
+    """The bytes of a file or an object; an object is fetched again even if its folder was listed before."""
     if in_bucket(path):
         path.fs.invalidate_cache(path.path)
     content: bytes = path.read_bytes()
@@ -59,7 +59,7 @@ def content_of(path: Any) -> bytes:
 
 
 def sizes(folder: Any) -> dict[str, int]:
-    """Bytes of all objects below a path, by their names from there on; the object store is asked anew."""
+    """Sizes in bytes of all objects below a path, by their relative names; the object store is queried again."""
     folder.fs.invalidate_cache()
     prefix = folder.path.rstrip("/") + "/"
     listed = folder.fs.find(folder.path, detail=True)

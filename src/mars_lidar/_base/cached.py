@@ -1,7 +1,7 @@
-"""The cached property of functools as it is from Python 3.12 on, without the lock of 3.11.
+"""The cached property of functools of Python 3.12, without the lock of 3.11.
 
-That lock belongs to the class. A process that is forked while another thread holds it, as the workers of a loader are
-while a stream is simulated in the background, would wait for it for ever.
+The lock of 3.11 is shared by all instances of the class. A process that is forked while another thread holds it, such
+as a loader worker while a stream is simulated in the background, would wait for it forever.
 """
 
 from __future__ import annotations

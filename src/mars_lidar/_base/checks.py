@@ -38,7 +38,7 @@ def integer(name: str, value: Any, *, low: int, high: int) -> int:
 
 
 def whole(value: Any) -> Any:
-    """A float that is a whole number as int, anything else as it is: people write 1e6, in Python, YAML and a shell."""
+    """A float with an integer value as int, anything else unchanged: users write 1e6 in Python, YAML and a shell."""
     is_whole = isinstance(value, Real) and not isinstance(value, Integral) and math.isfinite(value)
     return int(value) if is_whole and float(value).is_integer() else value
 
@@ -52,14 +52,14 @@ def choice(name: str, value: Any, allowed: tuple[str, ...]) -> str:
 
 
 def unmasked(name: str, value: Any) -> Any:
-    """The value, unless elements of it are masked: an array made of it would take what the mask hides."""
+    """The value; ValueError if elements are masked, because an array made of it would contain the hidden elements."""
     if np.ma.is_masked(value):
         raise ValueError(f"{name} must have no masked elements, got {np.ma.getmaskarray(value).sum()}: fill them first")
     return value
 
 
 def even_rows(name: str, value: Any) -> Any:
-    """The value, unless it is a list of rows that no array can be made of."""
+    """The value; ValueError for a list of rows of different lengths."""
     if isinstance(value, list | tuple):
         try:
             np.shape(value)
@@ -69,7 +69,7 @@ def even_rows(name: str, value: Any) -> Any:
 
 
 def numbers(name: str, value: Any) -> Any:
-    """The value, unless an array made of it would hold anything but real numbers."""
+    """The value; ValueError if an array made of it would contain anything but real numbers."""
     even_rows(name, value)
     dtype = getattr(value, "dtype", None)
     if not isinstance(dtype, np.dtype):
@@ -99,7 +99,7 @@ def weights(name: str, value: Any, *, most: int, least: int = 1, what: str = "we
 
 
 def known_keys(name: str, mapping: Any, allowed: tuple[str, ...], needed: tuple[str, ...] = ()) -> dict[str, Any]:
-    """A mapping of known keys, `needed` ones among them; a misspelt key is an error, never ignored."""
+    """A mapping whose keys are known and include the `needed` ones; a misspelt key is an error, never ignored."""
     if not isinstance(mapping, dict):
         raise TypeError(f"{name} must be a mapping with keys {', '.join(allowed)}, got {mapping!r}")
     unknown = [key for key in mapping if key not in allowed]

@@ -1,8 +1,8 @@
-"""The door that every file is read through, and files that are whole or not there.
+"""Reading files with errors that name the file, and writing files that are complete or absent.
 
-Reading: `reading` turns whatever a library makes of a damaged file into one error that names the file, and
-`check_claim` refuses what a header claims before memory is asked for. Writing: a file is written beside its target
-and renamed at the end, so that what is half written never looks complete, whatever stops the process.
+Reading: `reading` turns any exception that a library raises for a damaged file into one error that names the file, and
+`check_claim` refuses sizes that a header states before memory is allocated. Writing: a file is written beside its
+target and renamed at the end, so that an interrupted write never leaves a file that looks complete.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ _UNFINISHED = re.compile(r"(\.[0-9a-f]{8})?\.incomplete$")
 
 
 class FileError(ValueError):
-    """A file that cannot be read: damaged, cut short, of another kind, or no file at all; its text names the file."""
+    """A file that cannot be read: damaged, truncated, of another format, or not a file. The message names it."""
 
 
 class IncompleteFileError(FileError):
-    """The file was left by a simulation that did not finish.
+    """The file was written by a simulation that did not finish.
 
     See Also
     --------
@@ -55,7 +55,7 @@ class IncompleteFileError(FileError):
 
 
 class WriteError(OSError):
-    """The file could not be written (a full disk, say); its text says what is left on disk.
+    """The file could not be written, for example because the disk is full. The message states what remains on the disk.
 
     See Also
     --------
@@ -64,7 +64,7 @@ class WriteError(OSError):
 
 
 class Interrupted(KeyboardInterrupt):
-    """Ctrl-C while a file was written; its text says what is left on disk.
+    """Ctrl-C while a file was written. The message states what remains on the disk.
 
     See Also
     --------
@@ -74,7 +74,7 @@ class Interrupted(KeyboardInterrupt):
 
 @contextlib.contextmanager
 def telling(clean_up: Callable[[], str]) -> Iterator[None]:
-    """On an error while writing, run `clean_up` and put its text into `WriteError` or `Interrupted`."""
+    """On an error while writing, run `clean_up` and raise `WriteError` or `Interrupted` with the returned text."""
     try:
         yield
     except OSError as error:
@@ -88,9 +88,9 @@ def telling(clean_up: Callable[[], str]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def beside(target: Path, *, folder: bool = False) -> Iterator[Path]:
-    """A new file (or `folder`) beside `target` to write to: renamed to it at the end, at once, or else removed.
+    """A new file (or `folder`) beside `target` to write to: at the end it is renamed to `target`, on an error removed.
 
-    A store or file at `target` is replaced. What a killed run left there is removed.
+    A store or file at `target` is replaced. Temporary files of a killed run are removed.
     """
     _remove_leftovers(target)
     path = _created(target, folder)
@@ -113,7 +113,7 @@ def beside(target: Path, *, folder: bool = False) -> Iterator[Path]:
 
 
 def write_text(target: Path, text: str) -> None:
-    """Write a file of text, whole or not at all; one at `target` is replaced."""
+    """Write a text file, completely or not at all; an existing `target` is replaced."""
     with beside(target) as unfinished:
         unfinished.write_text(text, encoding="utf-8")
 
@@ -127,7 +127,7 @@ def _remove_leftovers(target: Path) -> None:
 
 @contextlib.contextmanager
 def replacing(target: Path) -> Iterator[BinaryIO]:
-    """A stream whose content replaces `target` at the end; what stops the writing removes it."""
+    """A stream whose content replaces `target` at the end; on an exception it is removed."""
     path = _created(target, folder=False)
     try:
         with open(path, "r+b") as stream:
@@ -139,9 +139,9 @@ def replacing(target: Path) -> Iterator[BinaryIO]:
 
 
 def exchange(path: Path, target: Path) -> None:
-    """Put the folder `path` in the place of `target`, if there is one, and remove that.
+    """Rename the folder `path` to `target` and remove the previous `target`, if any.
 
-    Who reads `target` reads the old one or the new one, never a mixture under one name.
+    A reader of `target` reads either the old or the new folder, never a mixture.
     """
     _remove_leftovers(target)
     if not target.exists() and not target.is_symlink():
@@ -154,7 +154,7 @@ def exchange(path: Path, target: Path) -> None:
 
 
 def successor(target: Path) -> Path:
-    """Where a store is made that can be resumed and will replace `target`: readers keep that until it is complete."""
+    """Path of a resumable store that will replace `target` once it is complete."""
     path = target.with_name(f"{target.stem}{INCOMPLETE_SUFFIX}{target.suffix}")
     if path.is_symlink():
         raise FileExistsError(f"{path} is a link to another folder, which is not written to: remove it")
@@ -175,7 +175,7 @@ def alone(folder: Path) -> Iterator[None]:
 
 
 def open_own(path: Path) -> BinaryIO:
-    """A file to write to at a name that others know, such as that of a lock: a link of this name is not followed."""
+    """Open a file for writing at a predictable name, such as that of a lock; a link of this name is not followed."""
     try:
         number = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
     except OSError as error:
@@ -186,18 +186,18 @@ def open_own(path: Path) -> BinaryIO:
 
 
 def finished_name(path: Path) -> Path:
-    """The path that a file will have which a run left unfinished at `path`; `path` itself for others."""
+    """The final path of the unfinished file at `path`; `path` itself for other files."""
     return path.with_name(_UNFINISHED.sub("", path.name))
 
 
 def unfinished_of(target: Path) -> list[Path]:
-    """What stopped runs left beside `target`."""
+    """Unfinished files of stopped runs beside `target`."""
     names = sorted(target.parent.glob(f"{glob.escape(target.name)}*{INCOMPLETE_SUFFIX}"))
     return [path for path in names if finished_name(path) == target]
 
 
 def check_finished(source: Path) -> None:
-    """Raise FileNotFoundError where there is no file, IncompleteFileError where a stopped run left its beginning."""
+    """Raise FileNotFoundError for a missing file, IncompleteFileError for the unfinished file of a stopped run."""
     if source.exists():
         return
     if leftovers := unfinished_of(source):
@@ -250,7 +250,7 @@ def _remove(path: Path) -> None:
 
 
 def reason(error: OSError) -> str:
-    """Why, in the words of the operating system, which HDF5 buries under its own."""
+    """The reason as the operating system states it, without the text that HDF5 adds."""
     return os.strerror(error.errno) if error.errno else str(error)
 
 
@@ -283,16 +283,16 @@ def check_target(path: Path, *, folder: bool, overwrite: bool) -> None:
 
 @contextlib.contextmanager
 def reading(path: str | Path, kind: str = "file") -> Iterator[Path]:
-    """Whatever goes wrong inside names the file; `kind` says in words what it should be.
+    """Context manager: any error inside is raised again with the file's name; `kind` describes the expected format.
 
     Raises
     ------
     FileNotFoundError, PermissionError
-        As the operating system says it.
+        As raised by the operating system.
     MemoryError
         The file does not fit in memory.
     FileError
-        Anything else: a pipe or a device, which would never end; a damaged file, whatever its library raised.
+        Any other error: a pipe or a device, which may never end; a damaged file, whatever its library raised.
     """
     source: Any = path  # of an object store, as it is
     if not in_bucket(path):
@@ -331,7 +331,7 @@ def _is_ours(error: BaseException) -> bool:
 
 
 def check_source(path: Path) -> None:
-    """Raise unless `path` is a file or a folder: pipes and devices would be read without an end."""
+    """Raise unless `path` is a file or a folder: reading a pipe or a device may never end."""
     try:
         mode = path.stat().st_mode
     except FileNotFoundError:
@@ -339,11 +339,11 @@ def check_source(path: Path) -> None:
     except (OSError, ValueError) as error:  # a name that is too long, a circle of links, a null byte
         raise FileError(f"{path}: cannot be opened ({error})") from error
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
-        raise FileError(f"{path} is no file but a pipe, socket or device")
+        raise FileError(f"{path} is not a file but a pipe, socket or device")
 
 
 def is_plain_file(path: Path) -> bool | None:
-    """Whether this is a file, and no link to one; None where there is nothing."""
+    """Whether `path` is a file and not a link; None if nothing exists there."""
     try:
         return stat.S_ISREG(path.lstat().st_mode)
     except (FileNotFoundError, NotADirectoryError):
@@ -351,9 +351,9 @@ def is_plain_file(path: Path) -> bool | None:
 
 
 def check_claim(path: Path, nbytes: float, what: str = "its arrays", *, in_parts: bool = False) -> None:
-    """Raise where a file claims more than its size makes likely, or, unless it is read in parts, than there is memory.
+    """Raise if the stated size of a file's content is implausible for the file, or exceeds memory unless read in parts.
 
-    Nothing that was ever recorded is smaller by 512 times when it is packed; a bomb, or a damaged header, is.
+    No recording compresses by a factor of 512; a decompression bomb or a damaged header states such a factor.
     """
     given = os.environ.get(LIMIT)
     if in_bucket(path):
@@ -386,7 +386,7 @@ def _packed_limit(size: int, in_parts: bool) -> int:
 def open_npz(path: Path, stream: Any = None, *, beside: str = "") -> Iterator[NpzFile]:
     """An .npz, or a `stream` of one inside of the file, whose arrays are as large as their headers claim.
 
-    All of them must fit in memory, but for the one called `beside`.
+    All of them must fit in memory, except the array named `beside`.
     """
     with reading(path, "an .npz"):
         with zipfile.ZipFile(stream or path) as archive:
@@ -409,7 +409,7 @@ def open_npz(path: Path, stream: Any = None, *, beside: str = "") -> Iterator[Np
 
 
 def npy_header(stream: Any) -> tuple[tuple[int, ...], np.dtype[Any], bool]:
-    """Shape and type of an open .npy, and whether its first axis varies fastest, as in Fortran."""
+    """Shape and type of an open .npy, and whether it is in Fortran order."""
     version = np.lib.format.read_magic(stream)
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape, in_columns, dtype = read(stream)
@@ -426,9 +426,9 @@ def read_npy(path: Path) -> NDArray[Any]:
 
 
 class NpyFile:
-    """The array of a .npy, whose rows are read when they are sliced.
+    """The array of a .npy; rows are read when it is sliced.
 
-    It is not mapped: a file that is cut short while it is mapped ends the process that touches it (SIGBUS).
+    It is not memory-mapped, because truncating a mapped file kills the process that reads it (SIGBUS).
     """
 
     def __init__(self, path: Path) -> None:
@@ -473,9 +473,9 @@ class NpyFile:
 
 
 class UnchangedFile:
-    """A file that is opened again and again: it must be the one that it was at first.
+    """A file that is opened repeatedly and must not change.
 
-    What is compared is device, inode, size and the time of the last change, which the file system keeps to some ms.
+    Device, inode, size and modification time, which the file system resolves to some ms, are compared.
     """
 
     def __init__(self, path: Path) -> None:
@@ -484,7 +484,7 @@ class UnchangedFile:
 
     @contextlib.contextmanager
     def unchanged(self) -> Iterator[Path]:
-        """The path; FileError where the file is another one before or after what is done with it."""
+        """Context manager with the path; FileError if the file has changed before or after its use."""
         self._check()
         yield self.path
         self._check()
@@ -531,7 +531,7 @@ def whole(data: Any) -> NDArray[Any]:
 
 
 def size_on_disk(path: Path) -> int:
-    """Bytes of a file, or of all files of a folder."""
+    """Size in bytes of a file, or of all files in a folder."""
     parts = path.rglob("*") if path.is_dir() else (path,)
     return sum(part.stat().st_size for part in parts if part.is_file())
 
@@ -570,7 +570,7 @@ def _check_sparse_within(name: str, value: Any) -> None:
 
 
 def read_column(path: Path, *, alone: bool = False) -> NDArray[np.float64]:
-    """Values of a text file below lines of words, unless `alone` beside times in equal steps; else a ValueError."""
+    """Values of a text file below its header; unless `alone`, in a column beside equidistant times; else ValueError."""
     check_claim(path, 64 * path.stat().st_size)
     rows: list[list[float]] = []
     for line in path.read_text(encoding="utf-8-sig", errors="replace").splitlines():

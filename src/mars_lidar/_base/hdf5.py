@@ -1,9 +1,9 @@
-"""HDF5 files that survive a full disk, and in which no damage goes unnoticed.
+"""HDF5 files with checksums, whose writing raises an error when the disk is full.
 
-A full disk is an error for the caller, not the end of the process. Every chunk that we write carries the checksum of
-HDF5's Fletcher-32 filter, and every header and index that of HDF5 1.10, which its library looks at whenever it reads
-them. What these do not reach, texts of attributes and data sets that have no chunks, `seal` adds up in one SHA-256 that
-`require` compares on opening. Files without the sum, of earlier versions and of others, open as they are.
+A full disk raises an error and does not crash the process. Every chunk has the checksum of HDF5's Fletcher-32 filter,
+and every header and index that of HDF5 1.10; the HDF5 library verifies both whenever it reads them. Attributes of text
+and data sets without chunks are covered by one SHA-256, which `seal` writes and `require` compares on opening. Files
+without it, of earlier versions and of other programs, are opened without this check.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ _SCALES = {"CLASS", "NAME", "DIMENSION_LIST", "REFERENCE_LIST", "DIMENSION_LABEL
 
 
 class ForgivingFile(io.FileIO):
-    """A file that keeps the first error of writing to itself, for `check` to raise.
+    """A file that stores the first error of writing, which `check` raises.
 
-    The HDF5 library cannot live with a disk that fills up: it holds on to what it could not write, fails to
-    close the file, and crashes when the process ends.
+    When the disk is full, the HDF5 library keeps the data that it could not write, fails to close the file, and
+    crashes at the end of the process.
     """
 
     def __init__(self, path: Path) -> None:
@@ -58,12 +58,12 @@ class ForgivingFile(io.FileIO):
         self.check()
 
     def check(self) -> None:
-        """Raise the first error there was."""
+        """Raise the first error, if any."""
         if self._error is not None:
             raise self._error
 
     def write(self, data: Any) -> int:
-        """Write all of `data`, or nothing more once something failed."""
+        """Write `data`; after a first error write nothing."""
         rest = memoryview(data).cast("B")
         size = rest.nbytes
         while rest.nbytes and self._error is None:
@@ -105,8 +105,8 @@ def open_hdf5(path: Path, kind: str = "an HDF5 file") -> Iterator[h5py.File]:
 def check_links(file: h5py.File, path: Path) -> None:
     """Raise FileError for a link to another file, and for data sets whose values lie in one.
 
-    A file of a stranger would else be read as counts, whatever it is. What the cells of MATLAB refer to is checked
-    when it is read (`mars_lidar._base.files.check_data`).
+    Otherwise any readable file of this machine could be read as counts. References in MATLAB cells are checked
+    when they are read (`mars_lidar._base.files.check_data`).
     """
     import h5py
 
@@ -131,7 +131,7 @@ def _links(file: h5py.File) -> list[tuple[str, int]]:
 
 
 def check_heaps(path: Path) -> None:
-    """Raise ValueError for a damaged heap of texts in an HDF5 file, over which the library would loop without an end.
+    """Raise ValueError for a damaged heap of texts in an HDF5 file, which would make the library loop forever.
 
     A collection is a signature, its size, and objects of (index, ..., size); the step over an object of index 0, free
     space, is its size (HDF5 File Format Specification 3.0, III.E). Looked for in the first 64 MiB.
@@ -164,12 +164,12 @@ def with_checksums(shape: tuple[int, ...], dtype: Any) -> dict[str, Any]:
 
 
 def seal(file: h5py.File) -> None:
-    """Add the sum over all that the checksums of chunks do not reach; nothing may change afterwards."""
+    """Write the SHA-256 of all content without chunk checksums; the file must not change afterwards."""
     file.attrs[SEAL] = _sum(file, lambda data: np.asarray(data[...]))
 
 
 def require(file: h5py.File, path: Path) -> None:
-    """Raise FileError where a file that is sealed is not as it was written."""
+    """Raise FileError if a sealed file has changed since it was written."""
     if SEAL not in file.attrs:
         return
     try:
@@ -178,7 +178,7 @@ def require(file: h5py.File, path: Path) -> None:
         with reading(path, "HDF5"):
             raise error
     if not same:
-        raise FileError(f"{path} is damaged: its attributes or variables are not as they were written")
+        raise FileError(f"{path} is damaged: its attributes or variables have changed since they were written")
 
 
 def _sum(file: h5py.File, read: Callable[[Any], NDArray[Any]]) -> str:

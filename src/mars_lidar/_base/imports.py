@@ -1,8 +1,8 @@
-"""Modules that are imported when they are needed: of optional libraries, and of higher layers.
+"""Late imports: of optional libraries, and of modules of higher layers.
 
-`Timestamps.save`, `Timestamps.load` and `Scene.from_rgbd` belong to classes that know of no file format, `Flux.in_fog`
-and `Flux.from_transient` to one that knows of no model of light, `Cube.plot` to one that draws nothing. These are the
-only places where a module calls one above it: docs/architecture.md lists them, tests/test_package.py counts them.
+`Timestamps.save`, `Timestamps.load` and `Scene.from_rgbd` call file formats, `Flux.in_fog` and `Flux.from_transient`
+models of light, and `Cube.plot` the figures, all of which lie in higher layers than these classes. These are the only
+calls into a higher layer: docs/architecture.md lists them, tests/test_package.py counts them.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ def late(name: str) -> Any:
 
 
 def names_of(package: str, homes: dict[str, str]) -> Callable[[str], Any]:
-    """The ``__getattr__`` of a package: names by the modules of it that have them, each loaded when it is asked for.
+    """The ``__getattr__`` of a package that imports the module of a name at its first use.
 
-    All names of a module are put into the package at once, for one of them may be called like the module.
+    All names of a module enter the package together, because one of them may have the name of the module.
     """
 
     def get(name: str) -> Any:
@@ -39,7 +39,7 @@ def names_of(package: str, homes: dict[str, str]) -> Callable[[str], Any]:
 
 
 class MissingLibraryError(ImportError, ValueError):
-    """What was asked for needs a library that is not installed.
+    """A function needs an optional library that is not installed. The message names the extra that installs it.
 
     See Also
     --------
@@ -48,7 +48,7 @@ class MissingLibraryError(ImportError, ValueError):
 
 
 def needed(module: str, what: str, extra: str = "io") -> Any:
-    """The module, or an error that says how to install it, by which extra; `what` names the format."""
+    """The module, or an error that names the extra which installs it; `what` is the format that needs it."""
     try:
         return importlib.import_module(module)
     except ImportError as error:

@@ -1,13 +1,13 @@
-"""What a Zarr store consists of: ``manifest.sha256``, a line of ``sha256sum`` for every file of it.
+"""Checksums of a Zarr store: ``manifest.sha256`` has a line of ``sha256sum`` for each of its files.
 
-With it no chunk can be missing, which Zarr would read as zeros, and no label be another one. On opening, `require`
-compares metadata, coordinates and names, and the sum over the manifest itself, which the root document has. The
-`Manifest` that it returns stays in memory: the first time that a chunk file is read, its XXH128 is compared with the
-line of its name in ``manifest.xxh128``, and again whenever the file is another one than before. So what was opened is
-what is read, or an error. (SHA-256 took up to 9 % of an epoch of training. CRC-32C would be blind: it is the same for
-all data of one length that end in their own CRC-32C, as chunks do.)
-`damage` looks at every byte, as ``sha256sum -c manifest.sha256`` does. The manifest appears by a rename before the root
-document of the store does, which says "complete": what was stopped between the two is incomplete.
+It reveals missing chunks, which Zarr reads as zeros, and changed labels. On opening, `require` compares metadata,
+coordinates and names, and the checksum of the manifest itself, which is in the root document. The `Manifest` that it
+returns stays in memory: when a chunk file is first read, its XXH128 is compared with the line of its name in
+``manifest.xxh128``, and again whenever the file has changed since. A store that changes after opening thus raises an
+error. (SHA-256 took up to 9 % of an epoch of training. CRC-32C would detect nothing: it is equal for all data of one
+length that end in their own CRC-32C, as chunks do.)
+`damage` reads every byte, as ``sha256sum -c manifest.sha256`` does. The manifest is renamed into place before the root
+document that marks the store complete: a run that stops between the two leaves an incomplete store.
 """
 
 from __future__ import annotations
@@ -46,13 +46,13 @@ class Sums(NamedTuple):
 
 
 class Summing:
-    """`Sums` of bytes that come in pieces."""
+    """`Sums` of bytes that arrive in pieces."""
 
     def __init__(self) -> None:
         self._sha256, self._xxh128 = hashlib.sha256(), xxhash.xxh3_128()
 
     def update(self, data: bytes) -> None:
-        """Take in the next bytes."""
+        """Add the next bytes."""
         self._sha256.update(data)
         self._xxh128.update(data)
 
@@ -70,7 +70,7 @@ def sums_of(content: bytes | Path) -> Sums:
 
 
 def seal(store: Path, attrs: dict[str, Any], known: Mapping[str, Sums] | None = None) -> None:
-    """Put these attributes into the root document, with a manifest of everything as it is then.
+    """Write these attributes into the root document, together with the manifest of all files.
 
     Files whose sums are `known` are not read again.
     """
@@ -78,7 +78,7 @@ def seal(store: Path, attrs: dict[str, Any], known: Mapping[str, Sums] | None = 
     document["attributes"].update(attrs | {"manifest": NAME})
     for name in document.get("consolidated_metadata", {}).get("metadata", {}):
         if not (store / name / _ROOT).is_file():
-            raise FileNotFoundError(f"{store / name / _ROOT} was taken away while the store was written")
+            raise FileNotFoundError(f"{store / name / _ROOT} was removed while the store was written")
     names = sorted(_files(store) - {_ROOT, NAME, CHECKS})
     each = {name: known[name] for name in names if name in known} if known else {}
     others = [name for name in names if name not in each]
@@ -116,7 +116,7 @@ class Manifest:
     Attributes
     ----------
     identity
-        Sum over all lines: two stores of the same identity are the same in every byte.
+        Checksum of all lines: two stores with the same identity are identical byte for byte.
     """
 
     def __init__(
@@ -134,14 +134,14 @@ class Manifest:
         return iter(self._sums)
 
     def is_known(self, name: str) -> bool:
-        """Whether the file is the one that was compared before: one look at its directory entry."""
+        """Whether the file is unchanged since it was last compared, by its directory entry."""
         state = self._known.get(name)
         return state is not None and state == _state(self._store / name)
 
     def check(self, name: str) -> None:
-        """Raise FileError unless the file is there as it was when the store was sealed; without a line, unless absent.
+        """Raise FileError unless the file is as it was when the store was sealed; a file without a line must be absent.
 
-        A file is read once: later calls compare what the file system says of it.
+        The content is compared once; later calls compare the directory entry.
         """
         if name not in self._sums:
             if _state(self._store / name) is not None:
@@ -163,7 +163,7 @@ class Manifest:
             except FileNotFoundError:
                 raise self._error(f"{name} is missing") from None
             if not good or _state(path) != before:
-                raise self._error(f"{name} is not as it was written")
+                raise self._error(f"{name} has changed since it was written")
             self._known[name] = before
 
     def read(self, name: str) -> bytes:
@@ -174,7 +174,7 @@ class Manifest:
             raise self._error(f"{name} is missing")
         content = path.read_bytes()
         if self._known.get(name) != before and not self.is_good(name, content):
-            raise self._error(f"{name} is not as it was written")
+            raise self._error(f"{name} has changed since it was written")
         if _state(path) != before:
             raise self._error(f"{name} was replaced while it was read")
         self._known[name] = before
@@ -196,7 +196,7 @@ class ManifestInBucket(Manifest):
     """The sums of a store in an object store: an object that is read is compared each time."""
 
     def is_known(self, name: str) -> bool:
-        """Never: nothing tells that an object is still the same but its content."""
+        """Never: only the content of an object shows whether it has changed."""
         return False
 
     def check(self, name: str) -> None:
@@ -211,19 +211,19 @@ class ManifestInBucket(Manifest):
         except FileNotFoundError:
             raise self._error(f"{name} is missing") from None
         if not self.is_good(name, content):
-            raise self._error(f"{name} is not as it was written")
+            raise self._error(f"{name} has changed since it was written")
         return content
 
 
 def description(store: Path) -> str:
-    """For people: what opening a store has made sure of."""
+    """A sentence on what was verified when the store was opened."""
     return f"every file of its {NAME} is there"
 
 
 def require(store: Path, *, listed: bool = True) -> Manifest:
-    """The manifest; FileError where a file of a store is missing, or a document of it is not as it was written.
+    """The manifest; FileError where a file of a store is missing, or a document of it has changed since it was written.
 
-    Names are compared only where they are `listed`: a file that is missing is else noticed when it is read.
+    Names are compared only if `listed`; otherwise a missing file is noticed when it is read.
     """
     sums, checks, documents, wrong = _compared(store, every=False, listed=listed)
     if wrong:
@@ -277,10 +277,10 @@ def compared(
     every: bool = False,
     stated: str | None = None,
 ) -> Iterator[str]:
-    """A sentence for each file that has not the SHA-256 and XXH128 of its lines.
+    """A sentence for each file whose SHA-256 or XXH128 differs from its line.
 
-    Compared are those of the files that are `there`, None where they cannot be listed. `stated` is the sum over the
-    lines that the root document has.
+    `there` are the existing files, None where they cannot be listed. `stated` is the checksum of all lines in the root
+    document.
     """
     if stated != _sum(sums):
         yield f"its {NAME} is not that of its {_ROOT}"
@@ -293,7 +293,7 @@ def compared(
     with ThreadPoolExecutor(TOL.hash_threads) as pool:
         for name, now in zip(names, pool.map(read, names), strict=True):
             if now != Sums(sums[name], checks.get(name, now.xxh128)):
-                yield f"{name} is not as it was written"
+                yield f"{name} has changed since it was written"
 
 
 def _lines(sums: Mapping[str, str]) -> bytes:

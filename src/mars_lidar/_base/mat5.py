@@ -1,7 +1,7 @@
-"""The elements of a MATLAB file of version 5, checked before a library follows them blindly.
+"""The elements of a MATLAB file of version 5 are checked before SciPy reads them.
 
-SciPy takes the type of an element as an index into a table and does not look whether it is in it: a damaged one ends
-the process. Layout: MathWorks, MAT-File Format, chapter 1.
+SciPy uses the type of an element as an index into a table without a bounds check: a damaged type crashes the process.
+Layout: MathWorks, MAT-File Format, chapter 1.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _MATRIX = int(_Kind.MATRIX)  # compared for each element, where an enumeration c
 
 @dataclass(frozen=True)
 class Variable:
-    """A variable: its head, and where the rest is."""
+    """A variable: its header, and the position of its data."""
 
     name: str
     kind: str  # "numbers", "sparse", "cell", "struct", ...
@@ -46,10 +46,10 @@ class Variable:
     _order: str = "<"
 
     def element(self) -> bytes:
-        """A file with this variable alone, unpacked; of version 4 the whole file.
+        """A decompressed file with this variable alone; of version 4 the whole file.
 
-        ValueError for an element of a type that there is not, also within cells. What is returned is what was checked,
-        whatever becomes of the file.
+        ValueError for an element of unknown type, also within cells. The returned bytes are those that were checked,
+        even if the file changes meanwhile.
         """
         kind, start, size = self._place
         if not start:
@@ -73,7 +73,7 @@ class Variable:
 
 
 def variables(path: Path) -> list[Variable]:
-    """Heads of all variables of a file of version 5 or 4, of which only the first bytes are unpacked."""
+    """Headers of all variables of a file of version 5 or 4; only their first bytes are decompressed."""
     with open(path, "rb") as stream:
         header = stream.read(TOL.mat_header)
     if len(header) >= 4 and 0 in header[:4]:  # version 4, which has no elements

@@ -11,7 +11,7 @@ from mars_lidar._base.types import Progress
 
 
 def callback_of(progress: Any, label: str) -> Progress | None:
-    """The callback that an argument `progress` means: a function, True for a `Bar`, None or False for nothing."""
+    """The callback of an argument `progress`: a function, True for a `Bar`, None or False for none."""
     if progress is None or progress is False:
         return None
     if progress is True:
@@ -37,7 +37,7 @@ def of_part(progress: Progress | None, first: int, last: int, total: int) -> Pro
 
 
 class Bar:
-    """A callback (done, total) that says on standard error how far a run is, and how long it will still take."""
+    """A callback (done, total) that prints the progress and the remaining time on standard error."""
 
     def __init__(self, label: str) -> None:
         self._label = label
@@ -65,7 +65,7 @@ class Bar:
             print(f"mars-lidar: {self._text(done, total, spent)}", file=sys.stderr, flush=True)
 
     def close(self) -> None:
-        """Leave the terminal as it was."""
+        """Clear the line on the terminal."""
         if self._width:
             sys.stderr.write("\r" + " " * self._width + "\r")
             sys.stderr.flush()
@@ -82,7 +82,7 @@ class Bar:
 
 
 def span(seconds: float) -> str:
-    """A time in words: two or three digits, and the unit that suits."""
+    """A duration as text: two or three digits and a suitable unit."""
     if seconds < 120:
         return f"{seconds:.0f} s" if seconds >= 10 else f"{seconds:.2g} s"
     return f"{seconds / 60:.3g} minutes" if seconds < 7200 else f"{seconds / 3600:.3g} hours"

@@ -1,4 +1,4 @@
-"""Memory and threads: what a computation may take of the machine."""
+"""Memory and threads available to a computation."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mars_lidar._base.tolerances import TOL
 
 
 def available_bytes() -> int | None:
-    """Memory that could be allocated now without swapping; None where the system does not tell."""
+    """Memory that can be allocated without swapping; None where the system does not report it."""
     try:
         with open("/proc/meminfo") as lines:
             for line in lines:
@@ -25,7 +25,7 @@ def available_bytes() -> int | None:
 
 
 def check_memory(nbytes: int, what: str, instead: str) -> None:
-    """Raise MemoryError where `nbytes` is more than there is, saying what to do `instead`."""
+    """Raise MemoryError if `nbytes` exceed the available memory; the message states what to do `instead`."""
     available = available_bytes()
     if available is not None and nbytes > available:
         raise MemoryError(
@@ -34,9 +34,9 @@ def check_memory(nbytes: int, what: str, instead: str) -> None:
 
 
 def check_threads(threads: int) -> None:
-    """Raise MemoryError where a limit on the address space leaves no room for so many threads.
+    """Raise MemoryError if a limit on the address space leaves no room for so many threads.
 
-    A thread that cannot start in a library is waited for without end there.
+    Libraries wait forever for a thread that cannot start.
     """
     try:
         import resource
@@ -55,7 +55,7 @@ def check_threads(threads: int) -> None:
 
 
 def no_thread(error: RuntimeError) -> bool:
-    """Whether it tells that a thread could not start, here or in the compiled module."""
+    """Whether the exception states that a thread could not start, in Python or in the compiled module."""
     return "start new thread" in str(error) or os.strerror(errno.EAGAIN) in str(error)
 
 
@@ -77,7 +77,7 @@ def one_blas_thread(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def thread_count(threads: int | None) -> int:
-    """Threads asked for, or all processors that this process may use."""
+    """The requested number of threads, or the number of processors that this process may use."""
     if threads is not None:
         return checks.integer("threads", threads, low=1, high=1024)
     try:

@@ -1,4 +1,4 @@
-"""Stores of Zarr whose files are compared with their manifest when they are read."""
+"""Zarr stores whose files are compared with their manifest when they are read."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ if TYPE_CHECKING:
 
 
 class PlainFiles(LocalStore):
-    """A store of plain files: for a link, a pipe or a device in the place of a file it raises FileError.
+    """A store of plain files: a link, a pipe or a device in place of a file raises FileError.
 
-    A link in a store of a stranger would be read as counts, whatever it points to; a pipe would never end.
+    The target of a link in an untrusted store would be read as counts, and reading a pipe may never end.
     """
 
     async def get(self, key: str, prototype: Any = None, byte_range: Any = None) -> Any:
@@ -42,7 +42,7 @@ class PlainFiles(LocalStore):
 class SealedStore(PlainFiles):
     """A complete store as it was opened: a file that is missing, empty, changed or exchanged raises FileError.
 
-    The look comes after the read, so that a file that is replaced meanwhile is found as well.
+    The comparison follows the read, so that a file that is replaced meanwhile is detected.
     """
 
     def __init__(self, root: Path, sums: Manifest) -> None:
@@ -72,7 +72,7 @@ class SealedStore(PlainFiles):
 
 
 class SealedValues(WrapperStore[Any]):
-    """A complete store that lies elsewhere: what is fetched whole, as chunks are, is compared with its XXH128."""
+    """A complete store in an object store: objects that are fetched whole, such as chunks, are compared by XXH128."""
 
     def __init__(self, store: Any, sums: Manifest, url: str) -> None:
         super().__init__(store)
@@ -89,5 +89,7 @@ class SealedValues(WrapperStore[Any]):
         if content is None:
             raise FileError(f"{self._url} is damaged or was removed: {key} is missing")
         if byte_range is None and not self._sums.is_good(key, content.to_bytes()):
-            raise FileError(f"{self._url} is damaged or was replaced: {key} is not as it was written; open it again")
+            raise FileError(
+                f"{self._url} is damaged or was replaced: {key} has changed since it was written; open it again"
+            )
         return content

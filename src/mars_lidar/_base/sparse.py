@@ -1,7 +1,7 @@
 """Sparse matrices of files and callers: their indices are checked before compiled code follows them.
 
-SciPy writes through the indices of a matrix without a look at them: one that is out of range ends the process, or
-changes memory beyond the array.
+SciPy uses the indices of a matrix without a bounds check: one out of range crashes the process or overwrites memory
+beyond the array.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def is_sparse(value: Any) -> bool:
 def check_sparse(name: str, matrix: Any, *, sorted_rows: bool = False) -> None:
     """Raise ValueError unless all indices of `matrix` lie inside of it, and its parts have equal sizes.
 
-    `sorted_rows`: each index comes once and they ascend, as MATLAB keeps them.
+    `sorted_rows`: indices are unique and ascending, as in MATLAB files.
     """
     name = name or "the matrix"
     if matrix.ndim != 2 or min(matrix.shape) < 0:
@@ -49,8 +49,8 @@ def check_sparse(name: str, matrix: Any, *, sorted_rows: bool = False) -> None:
 def check_stored(parts: Mapping[str, NDArray[Any]]) -> None:
     """Raise ValueError unless the indices of a file's sparse matrix are whole numbers, to each of its values.
 
-    SciPy casts any type to integers, leaves out what is beyond the last row or column's end, and reads no diagonal that
-    lies outside of the matrix.
+    SciPy casts any type to integers, drops values beyond the last row or column pointer, and ignores diagonals outside
+    the matrix.
     """
     for name in {"indices", "indptr", "row", "col", "offsets"} & parts.keys():
         if parts[name].dtype.kind not in "iu":

@@ -1,4 +1,4 @@
-"""Limits of what files may claim, and sizes of what is read, shown and printed at once."""
+"""Limits on the sizes that files may state, and sizes of blocks that are read and of texts that are shown."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Tolerances:
-    """Numbers of the base that are no arguments.
+    """Constants of the base that are not arguments.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Types that the whole package uses."""
+"""Types used in the whole package."""
 
 from __future__ import annotations
 

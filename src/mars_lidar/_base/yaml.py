@@ -1,7 +1,7 @@
-"""YAML 1.2 with the line of every key, so that an error can point at it.
+"""YAML 1.2 with the line number of every key, for error messages.
 
 Scalars follow the core schema of YAML 1.2: 1e-3 is a number, 1:30 and 2026-11-23 are texts, 010 is ten, and only true
-and false are truth values. PyYAML, which reads the structure, follows YAML 1.1: a text, 90, a date and eight.
+and false are booleans. PyYAML, which parses the structure, follows YAML 1.1, where these are a text, 90, a date and 8.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ def read_yaml(path: Path) -> tuple[Any, Lines]:
 
 @contextlib.contextmanager
 def located(path: Path, lines: Lines, overridden: Callable[[Key], bool] = lambda key: False) -> Iterator[None]:
-    """Turn what is wrong with the data of a file into ``FILE:LINE: what``; no line for keys that are `overridden`."""
+    """Raise errors in the data of a file as ``FILE:LINE: message``, without a line for keys that are `overridden`."""
     try:
         yield
     except (ValueError, TypeError) as error:
@@ -118,7 +118,7 @@ def located(path: Path, lines: Lines, overridden: Callable[[Key], bool] = lambda
 
 
 def line_of(key: Key, message: str, lines: Lines) -> int | None:
-    """Line of a key, or of what stands nearest above it; a key below it that `message` names comes first."""
+    """Line of a key, of a key below it that `message` names, or else of the nearest parent."""
     unknown = re.search(r"unknown key '(.*?)'", message)
     words = [unknown[1]] if unknown else re.findall(r"\w+", message)
     for word in words:

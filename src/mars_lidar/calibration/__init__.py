@@ -1,4 +1,4 @@
-"""Calibration: what a recorded stream of photons says about its light and its detector, and whether a model fits it."""
+"""Calibration: light and detector estimated from a recorded photon stream, with a test of the model."""
 
 from mars_lidar.calibration.calibration import Calibration, Estimate, Limit, Suspect, calibrate
 from mars_lidar.calibration.histograms import CubeCalibration, calibrate_cube

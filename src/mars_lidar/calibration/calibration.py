@@ -1,4 +1,4 @@
-"""The verb `calibrate`: a recorded stream to its light, its detector, a verdict, and what may be wrong."""
+"""`calibrate`: estimates of light and detector from a recorded photon stream, a test of fit, and suspected effects."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from mars_lidar.instrument.tolerances import TOL
 from mars_lidar.light.flux import Flux
 from mars_lidar.light.timestamps import Timestamps
 
-_SAME_TIME = 0.01  # share of records at exactly the time of the one before, that no photons are
+_SAME_TIME = 0.01  # share of records at exactly the time of the preceding one, that no photons are
 LEVEL = 0.01  # false-alarm probability of the verdict
 
 _FIELDS = (
@@ -46,9 +46,9 @@ GIVEN = ("dead_time_ns", "jitter_ns", "pulse_sigma_ns", *_FIELDS)
 
 @dataclass(frozen=True)
 class Estimate:
-    """A parameter: its value, standard error, and 95 % interval; the error is 0 where the value was given.
+    """A parameter: its value, standard error, and 95 % interval; the error of a given value is 0.
 
-    `note` says what its numbers cannot: that it was given, not detected, or not identified.
+    `note` states whether it was given, not detected, or not identified.
     """
 
     value: float
@@ -67,10 +67,11 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Suspect:
-    """What the stream shows beyond the plain model.
+    """An effect or deviation in the stream beyond the plain model.
 
-    `z` standard deviations of its score, `size` with `error` in the units of its option, `gain` of the misfit when it
-    is taken in (standard deviations of the misfit), `option` that gives it, `included` whether the result has it.
+    `z`: score in standard deviations; `size` and `error`: in the units of its option; `gain`: decrease of the misfit
+    when the effect is included, in standard deviations of the misfit; `option`: the argument that sets it; `included`:
+    whether the result includes it.
     """
 
     name: str
@@ -92,7 +93,7 @@ class Suspect:
 
 @dataclass(frozen=True)
 class Limit:
-    """An effect that was not detected: 95 % upper limit in units of `name`, and what it would shift at that size."""
+    """An effect that was not detected: 95 % upper limit in units of `name`, and its effect on estimates."""
 
     name: str
     words: str
@@ -102,30 +103,30 @@ class Limit:
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """A recorded stream's light and detector, made by `calibrate`.
+    """Light and detector of a recorded stream, the result of `calibrate`.
 
     Attributes
     ----------
     look
-        What the file holds, before any model.
+        Content of the recording, before any model.
     estimates
         By name: ``signal``, ``background`` (photons per period), ``delay_ns``, ``width_ns`` (sigma of the recorded
         pulse, jitter included), ``pulse_sigma_ns``, ``jitter_ns`` (sigma), ``dead_time_ns``, and those of the effects
         in the result, in the units of `Detector`. With several returns ``signal_1``, ``delay_ns_1``, ...
     p_value
-        Probability of a misfit as large if the model holds, drift included; NaN with ``look=True``.
+        Probability of a misfit at least this large if the model holds, drift included; NaN with ``look=True``.
     suspects
-        What the stream shows beyond the plain model, the clearest first.
+        Effects and deviations beyond the plain model, the most significant first.
     limits
         Effects that were not detected, each with its upper limit.
     drift
         Light and delay by parts of the recording, or None for a short one.
     system, flux
-        The instrument and the light of these estimates, to simulate with; None with ``look=True``.
+        Instrument and light of these estimates, for `simulate`; None with ``look=True``.
     waveform, waveform_error
-        Light (bins,) in photons per period and bin, of a free shape; else None.
+        Light (bins,) in photons per period and bin, with ``pulse="free"``; else None.
     recording, fitted
-        The recorded times and the fit, as `curves` and `realizations` read them; no fit with ``look=True``.
+        The recorded times and the fit, the inputs of `curves` and `realizations`; no fit with ``look=True``.
     level
         False-alarm probability of the verdict.
 
@@ -176,7 +177,7 @@ class Calibration:
 
     @property
     def problems(self) -> tuple[str, ...]:
-        """What is wrong with the recording or the model, a sentence each."""
+        """Problems of the recording or the model, one sentence each."""
         return (*self.look.problems, *(str(suspect) for suspect in self.suspects if not suspect.included))
 
     @property
@@ -194,13 +195,13 @@ class Calibration:
         return f"p = {self.p_value:.2g}: {model} does not fit"
 
     def curves(self, seed: int = 0) -> Curves:
-        """Histograms of the recording, and of the fit by streams of `seed`, for a picture."""
+        """Histograms of the recording and of streams that the fitted model draws with `seed`, for a figure."""
         model = None if self.fitted is None else self.fitted.model
         theta = None if model is None or self.fitted is None else model.bounded(self.fitted.theta)
         return curves(self.recording, model, theta, seed, (200, 256, 60))
 
     def realizations(self, cycles: int, *, simulated: int = 4000, seed: int = 0) -> Realizations:
-        """Law of the count in pieces of `cycles` periods beside that of `simulated` pieces drawn with `seed` (T6).
+        """Distribution of the count in pieces of `cycles` periods, and of `simulated` pieces drawn with `seed` (T6).
 
         Raises
         ------
@@ -235,51 +236,51 @@ def calibrate(
     level: float = LEVEL,
     seed: int = 0,
 ) -> Calibration:
-    """Light and detector of the stream of one free-running pixel, with errors, a verdict, and suspects.
+    """Estimate light and detector from the photon stream of one free-running pixel, with errors and a test of fit.
 
-    Counts of the stream by phase, interval and both are compared with those of streams that the exact engine draws, and
-    the stated errors are the scatter of that very estimate over such streams (docs/calibration.md). Effects of the
-    detector that the counts show are taken in one after the other, by the refit that fits best.
+    Counts of the stream by phase, by interval and by both are compared with those of streams that the exact engine
+    simulates, and the stated errors are the scatter of the same estimate over such streams (docs/calibration.md).
+    Detector effects that the counts reveal are included one after the other, each time the one whose refit fits best.
 
     Parameters
     ----------
     times
         The stream of one pixel (`Timestamps.load`, `Timestamps.pixel`), or a sequence of recordings of that pixel; or
-        (n,) times in ns of a recording without a laser, in constant light. Nothing but times, period and clock is used.
+        (n,) times in ns of a recording without a laser, in constant light. Only times, period and clock are used.
     given
-        What is known, and is not fitted: a mapping of ``dead_time_ns``, ``jitter_ns`` (sigma), ``pulse_sigma_ns`` (of
+        Known values, which are not fitted: a mapping of ``dead_time_ns``, ``jitter_ns`` (sigma), ``pulse_sigma_ns`` (of
         the light, without the jitter) and fields of `Detector` (``afterpulse_probability`` with
         ``afterpulse_delay_ns``, ``twilight_ns``, ``recovery_ns``, ``electronics_dead_time_ns``, ``mode``); a
-        `Detector`; or a `System`, whose pulse is then known too.
+        `Detector`; or a `System`, whose pulse is then also known.
     pulse
-        A `Pulse` of known shape, without the jitter; ``"gaussian"``, of unknown width; or ``"free"``: any light, bin by
-        bin.
+        A `Pulse` of known shape, without the jitter; ``"gaussian"``, of unknown width; or ``"free"``: light of any
+        shape, estimated bin by bin.
     returns
         Number of returns, 1 to 4.
     look
-        Stop before the fit: what the file holds.
+        Describe the recording and stop before the fit.
     pooled
         All pixels of `times` are recordings of one and the same pixel.
     unit_ns
-        Unit of the clock of an array of times, ns; 0: real numbers.
+        Clock unit of an array of times, ns; 0: real numbers.
     level
         False-alarm probability of the verdict.
     seed
-        Of the simulated streams; the result depends on it within its errors.
+        Seed of the simulated streams; estimates for different seeds differ within their errors.
 
     Returns
     -------
     Calibration
-        Estimates with errors, verdict, suspects, limits, drift, and the system and flux to simulate with.
+        Estimates with errors, test of fit, suspects, limits, drift, and the system and flux for a simulation.
 
     Raises
     ------
     TypeError
-        `times` that are neither `Timestamps` nor numbers, a `pulse` that is none, switches other than True or False.
+        `times` are neither `Timestamps` nor numbers, `pulse` is not a pulse, or a switch is not True or False.
     ValueError
-        Several pixels without `pooled`, fewer than 300 registrations, records that are no photons, recordings of
-        different periods; a detector that is not free-running or has effects that one pixel does not show; the pulse
-        given twice, or afterpulses with a probability and no delay.
+        Several pixels without `pooled`, fewer than 300 registrations, records that are not photons, recordings with
+        different periods; a detector that is not free-running or has effects that one pixel cannot reveal; a pulse
+        that is given twice, or an afterpulse probability without a delay.
 
     See Also
     --------
@@ -351,7 +352,7 @@ def _known(
     if "pulse_sigma_ns" in known:
         sigma = checks.real("pulse_sigma_ns", known.pop("pulse_sigma_ns"), low=0.0, strict_low=True)
         if pulse != "gaussian":
-            raise ValueError("the pulse is given once: choose pulse or pulse_sigma_ns")
+            raise ValueError("give the pulse once: pulse or pulse_sigma_ns")
         pulse = GaussianPulse(sigma_ns=sigma)
     if "dead_time_ns" in known:
         fixed["dead_time_ns"] = checks.real("dead_time_ns", known.pop("dead_time_ns"), low=0.0)

@@ -1,4 +1,4 @@
-"""A stream as counts in cells: phases, intervals, and a table of both, laid where streams of the model differ."""
+"""Counts of a stream in cells of phase, of interval, and of both; cells are set by simulated streams of the model."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ _CLASSES = 12  # parts of the period in the table, beside the stretches of brigh
 class Cells:
     """Counts of a stream: phases; intervals; (interval, phase at its begin, does it end in a pulse).
 
-    The edges follow from streams that the model draws, never from the data: cells that follow the data would be biased.
-    Intervals are resolved down to those of which the exposure has `least`, for the edge of the dead time.
+    The edges are set by simulated streams, never by the data, which would bias the counts. The shortest intervals are
+    resolved down to `least` counts in the exposure, to locate the end of the dead time.
     """
 
     def __init__(self, model: Model, theta: FloatArray, pilot: list[FloatArray], photons: float, least: float) -> None:

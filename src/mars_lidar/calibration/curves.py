@@ -1,4 +1,4 @@
-"""Histograms of a calibrated recording beside those of its model: what a picture draws, and the law of the count."""
+"""Histograms of a calibrated recording and of its model, and the distribution of the count."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Curves:
 
 @dataclass(frozen=True, eq=False)
 class Realizations:
-    """Law of the count in pieces of the recording beside the model's (T6 of the MaRS paper).
+    """Distribution of the count in pieces of the recording, and that of the model (T6 of the MaRS paper).
 
     `counts` (realizations,); `measured` and `predicted` frequencies; distances with what samples of this size from the
     predicted law have: mean and 99 % quantile of the total variation, mean of the Kullback-Leibler divergence in nats.

@@ -1,4 +1,4 @@
-"""What all pixels of a histogram cube share: dead time, pulse width or a free response, background floor.
+"""Parameters common to all pixels of a histogram cube: dead time, pulse width or a free response, background floor.
 
 Registrations h_j of a bin are expected to be e_j = l_j D_j, the light times the passes for which the pixel was armed,
 and differ from it by a martingale of variance e_j. So sum_j h_j log e_j - e_j is a quasi-likelihood (Wedderburn,
@@ -32,22 +32,22 @@ _DECREASE = 1e-2  # of the log likelihood, to which it is climbed
 
 @dataclass(frozen=True, eq=False)
 class CubeCalibration:
-    """What the pixels of a cube share, made by `calibrate_cube`.
+    """Parameters common to the pixels of a cube, the result of `calibrate_cube`.
 
     Attributes
     ----------
     estimates
         ``dead_time_ns``, ``pulse_sigma_ns`` (of a Gaussian, jitter included), and ``background_floor``, photons per
-        period of the darkest fitted pixel, which none of them is below. Of a single pixel ``signal``, ``background``,
-        ``delay_ns`` and ``depth_m`` too.
+        period of the darkest fitted pixel. For a single pixel also ``signal``, ``background``, ``delay_ns`` and
+        ``depth_m``.
     system
-        The system given, with these; with ``pulse="free"`` its pulse is a `SampledPulse` in samples of a bin.
+        The given system with these values; with ``pulse="free"`` its pulse is a `SampledPulse` with one sample per bin.
     response_error
         Standard errors of the samples of that pulse, in units of its `values`; else None.
     counts, flux
         The fitted pixels, the brightest first: histograms (pixels, bins), and their light, an image of one row.
     p_values
-        (pixels,) of the fitted pixels: probability of a histogram as far from its own law.
+        (pixels,) for each fitted pixel the probability of a histogram at least as far from its law.
     """
 
     estimates: dict[str, Estimate]
@@ -74,22 +74,22 @@ class CubeCalibration:
 def calibrate_cube(
     cube: ArrayLike, system: System, *, pulse: Literal["gaussian", "free"] = "gaussian", pixels: int = 32
 ) -> CubeCalibration:
-    """Dead time and pulse that all pixels of a cube (..., bins) share, with errors.
+    """Estimate the dead time and pulse common to all pixels of a cube (..., bins), with errors.
 
-    Depth and an offset of the histograms from the laser pulse are one unknown, so that no offset is estimated.
+    An offset of the histograms from the laser pulse cannot be distinguished from depth and is not estimated.
 
     Parameters
     ----------
     cube
         (..., bins) counts.
     system
-        How they were recorded, with a free-running detector: its dead time and the width of its pulse are where the
-        search begins, and are replaced by estimates.
+        The recording system, with a free-running detector. Its dead time and pulse width are starting values of the
+        fit.
     pulse
-        ``"gaussian"``, of unknown width; or ``"free"``: a response in samples of a bin, over ten standard deviations of
-        the Gaussian that fits best on either side, whose centroid is the delay of a pixel.
+        ``"gaussian"``, of unknown width; or ``"free"``: a response with one sample per bin, over ten standard
+        deviations of the best Gaussian on either side, whose centroid is the delay of a pixel.
     pixels
-        Pixels that are fitted, at most: the brightest.
+        Largest number of fitted pixels; the brightest are taken.
 
     Raises
     ------

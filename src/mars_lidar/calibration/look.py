@@ -1,4 +1,4 @@
-"""What a recording holds before any model: clock, period, rate, intervals, and what is odd about them."""
+"""Description of a recording before any model: clock, period, rate, intervals, and anomalies."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ class Look:
     registrations, cycles, period_ns, seconds
         Sizes; the period is NaN without a laser.
     unit_ns, locked
-        Unit of the clock, 0 for real numbers, and whether it begins anew with each laser pulse.
+        Clock unit, 0 for real numbers, and whether the clock restarts with each laser pulse.
     rate_per_s, per_period
         Registrations per second and per laser period.
     smallest_ns, quantiles_ns
         Smallest intervals (up to 20), and those at 1, 50 and 99 %.
     same_time
-        Records at exactly the time of the one before.
+        Number of records with exactly the time of the preceding record.
     own_period_ns
-        Period that the photons repeat with where it is not the laser's, or None.
+        Period of the photons if it differs from that of the laser, else None.
     """
 
     registrations: int
@@ -53,15 +53,15 @@ class Look:
 
     @property
     def problems(self) -> tuple[str, ...]:
-        """What no stream of photons of this laser has."""
+        """Anomalies that no photon stream of this laser shows, one sentence each."""
         out = []
         if self.own_period_ns is not None:
             given = "no laser was recorded" if np.isnan(self.period_ns) else f"not every {self.period_ns:.7g} ns"
             out.append(f"the photons repeat every {self.own_period_ns:.6g} ns, {given}: give that period")
         if self.same_time:
             out.append(
-                f"{self.same_time:,} records at exactly the time of the one before: several detectors in one channel, "
-                "records that are no photons, or a clock coarser than the dead time"
+                f"{self.same_time:,} records at exactly the time of the preceding one: several detectors in one "
+                "channel, records that are not photons, or a clock coarser than the dead time"
             )
         return tuple(out)
 

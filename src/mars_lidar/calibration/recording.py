@@ -165,7 +165,7 @@ def recording_of_arrivals(times_ns: ArrayLike, unit_ns: float) -> Recording:
     t = t - np.floor(t[0] / unit_ns) * unit_ns if unit_ns else t - t[0]
     period = float(t[-1] - t[0]) / (t.size - 1)
     if not period > 0.0:
-        raise ValueError("times must be of photons one after the other, got one time alone")
+        raise ValueError("times must contain different times, got one value only")
     clock = Clock(period)
     if unit_ns:
         place = t[:: max(1, t.size // _PROBED)] / unit_ns

@@ -1,4 +1,4 @@
-"""`mars-lidar calibrate`: from a measured photon stream to its light, its detector and a verdict."""
+"""`mars-lidar calibrate`: light and detector from a measured photon stream, with a test of fit."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ class StreamOptions:
 
 @options
 class KnownOptions:
-    """What is known of pulse and detector, and the shape of the light.
+    """Known properties of pulse and detector, and the shape of the light.
 
     System
     ------
@@ -109,7 +109,7 @@ class KnownOptions:
         """The argument `given` of `calibrate`."""
         if self.system is not None:
             if self.given:
-                raise ValueError("the detector is given once: choose --system or --given")
+                raise ValueError("give the detector once: --system or --given")
             return System.load(self.system)
         values: dict[str, Any] = {}
         for text in self.given or ():
@@ -130,7 +130,7 @@ class KnownOptions:
         """The argument `pulse` of `calibrate`."""
         pulse = self.pulse.build()
         if self.free and pulse is not None:
-            raise ValueError("the light has one shape: choose --free or a pulse")
+            raise ValueError("give the shape of the light once: --free or a pulse")
         return "free" if self.free else pulse or "gaussian"
 
 
@@ -198,7 +198,7 @@ def calibrate(
         if out.suffix not in (".yaml", ".yml", ".json"):
             raise ValueError(f"--out must end in .yaml, .yml or .json, got {str(out)!r}")
         if look or (known.free and not cube):
-            raise ValueError("--out needs a fitted pulse: leave out --free and --look, or --out")
+            raise ValueError("--out needs a fitted pulse: omit --free and --look, or --out")
         refuse_existing(out, overwrite)
     if cycles is not None:
         checks.integer("--cycles", cycles, low=1, high=TOL.cycles)
@@ -271,7 +271,7 @@ def _cube(path: Path, known: KnownOptions, out: Path | None, picture: Path | Non
 
 
 def look_rows(result: Calibration) -> list[tuple[str, str]]:
-    """Clock, laser, rate, intervals, and what is odd about them."""
+    """Clock, laser, rate, intervals, and anomalies."""
     look = result.look
     clock = f", clock unit {1e3 * look.unit_ns:.5g} ps" if look.unit_ns else ""
     if look.unit_ns and look.locked:

@@ -52,7 +52,7 @@ class Exit(IntEnum):
 
 
 def say(message: str) -> None:
-    """One line on standard error."""
+    """Print one line on standard error."""
     print(f"mars-lidar: {message}", file=sys.stderr)
 
 
@@ -60,9 +60,9 @@ def say(message: str) -> None:
 
 
 def run(app: App, tokens: Sequence[str]) -> int:
-    """Run a command line; the exit code, after one line on standard error where it is not 0.
+    """Run a command line and return the exit code; a failure prints one line on standard error.
 
-    What is unforeseen keeps its traceback: it is a bug, and the report of it needs all of it.
+    An unexpected exception keeps its traceback, because it is a bug and a report needs the traceback.
     """
     try:
         with warnings.catch_warnings():
@@ -144,7 +144,7 @@ def _refuse_empty(tokens: Sequence[str]) -> None:
 
 
 def usage_message(error: wrong.CycloptsError, program: str) -> str:
-    """What is wrong with a command line, in the words of its options, and the page that helps."""
+    """Error message of a command line in terms of its options, and the page that helps."""
     commands = " ".join((program, *(error.command_chain or ())))
     return f"{_usage_message(error, commands)} ({commands} --help)"
 
@@ -216,7 +216,7 @@ def _show_warning(printed: set[str], message: Warning | str, category: type[Warn
 
 @contextlib.contextmanager
 def progress_bar(label: str) -> Iterator[Bar]:
-    """A callback (done, total) that draws how far a run is, and is removed at its end."""
+    """A callback (done, total) that draws a progress bar and removes it at the end."""
     bar = Bar(label)
     try:
         yield bar
@@ -239,7 +239,7 @@ def check_new(out: Path | None, overwrite: bool) -> None:
 
 
 def refuse_existing(out: Path | None, overwrite: bool, ways: str = "--overwrite or another name") -> None:
-    """Raise where a file would be replaced unasked."""
+    """Raise if a file would be replaced without --overwrite."""
     if out is not None and out.exists() and not overwrite:
         raise FileExistsError(f"{out} exists already; give {ways}")
 
@@ -252,7 +252,7 @@ def save_picture(figure: Figure, out: Path) -> None:
 
 
 def table(content: Mapping[str, str] | Sequence[tuple[str, str]]) -> None:
-    """Two columns on standard output: a label, and text that is never cut; plain where it is piped."""
+    """Print two columns on standard output, a label and a text that is never truncated; plain text in a pipe."""
     rows = content.items() if isinstance(content, Mapping) else content
     if not sys.stdout.isatty():
         for label, text in rows:
@@ -270,7 +270,7 @@ def table(content: Mapping[str, str] | Sequence[tuple[str, str]]) -> None:
 
 
 def screen() -> Console:
-    """Standard output; without a terminal no line below 250 columns is folded."""
+    """Standard output; without a terminal, lines below 250 columns are not wrapped."""
     from rich.console import Console
 
     return Console(highlight=False) if sys.stdout.isatty() else Console(highlight=False, width=250)

@@ -338,7 +338,7 @@ def export(
 
 
 def dataset_rows(path: Path) -> list[tuple[str, str]] | None:
-    """What `mars-lidar info` tells of a dataset; None for anything else."""
+    """Rows that `mars-lidar info` prints for a dataset; None for anything else."""
     from mars_lidar.dataset.store import is_dataset, open_dataset
 
     if not is_dataset(path):
@@ -399,7 +399,7 @@ def _tell_problems(problems: tuple[Problem, ...]) -> None:
 
 
 def tell_estimate(expected: Estimate) -> int | None:
-    """What `--dry-run` expects; exit code 2 where the disk is too small."""
+    """Print the estimate of `--dry-run`; exit code 2 if the disk is too small."""
     shards = f"{expected.shards:,} shard{'s' * (expected.shards > 1)}"
     rows = [
         ("dataset", _shape(expected.shape)),
@@ -426,7 +426,7 @@ def _dimensions(shape: tuple[int, ...]) -> str:
 
 
 def files(number: int) -> str:
-    """How many files, in words."""
+    """A number of files as text."""
     return f"{number:,} file{'s' * (number > 1)}" if number else "nothing"
 
 

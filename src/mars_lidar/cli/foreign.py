@@ -24,7 +24,7 @@ _NEEDED = "--system, or --bin-ps (or --period-ns), --cycles, --dead-time-ns (or 
 
 @options
 class ForeignOptions:
-    """What a file of another program does not tell of its histograms; nothing is needed for one of mars-lidar.
+    """Properties of histograms that files of other programs do not contain; not needed for files of mars-lidar.
 
     System
     ------
@@ -80,7 +80,7 @@ class ForeignOptions:
         return [f.name for f in fields(self) if getattr(self, f.name) not in (None, 0.0, PulseOptions())]
 
     def of_histograms(self, path: Path) -> bool:
-        """Whether `path` is taken for histograms: by its suffix, or by options that neither cubes nor streams have."""
+        """Whether `path` is read as histograms: by its suffix, or by options that apply to histograms only."""
         if path.suffix.lower() in (".npy", ".csv", ".txt", ".tif", ".tiff", ".sdt"):
             return True
         names = ("system", "cycles", "bin_ns", "bin_ps", "dead_time_ns", "axes", "image")
@@ -98,11 +98,11 @@ class ForeignOptions:
                 if not is_foreign(path, error):
                     raise
                 raise ValueError(
-                    f"{path} is not a cube written by mars-lidar; for one of others give {_NEEDED}"
+                    f"{path} is not a cube written by mars-lidar; for a file of another program give {_NEEDED}"
                 ) from error
         if path.suffix in SUFFIXES and path.suffix not in FOREIGN_SUFFIXES:
             options = ", ".join(f"--{name.replace('_', '-')}" for name in self._given)
-            raise ValueError(f"{path} describes its histograms completely: leave out {options}")
+            raise ValueError(f"{path} describes its histograms completely: omit {options}")
         base = self._file()
         contents = read_counts(
             path,
@@ -151,7 +151,7 @@ class ForeignOptions:
             if not given
         ]
         if missing or pulse is None or self.cycles is None:
-            raise ValueError(f"{path} does not tell how it was recorded: give {', '.join(missing)}, or --system")
+            raise ValueError(f"{path} does not state how it was recorded: give {', '.join(missing)}, or --system")
         period, bins = self._clock(path, length)
         detector = Detector(dead_time_ns=0.0) if self.detector is None else Detector.preset(self.detector)
         if self.dead_time_ns is not None:
@@ -189,7 +189,7 @@ def is_foreign(path: Path, error: ValueError) -> bool:
 
 
 def foreign_rows(path: Path) -> list[tuple[str, str]]:
-    """What `mars-lidar info` tells of a file of another program."""
+    """Rows that `mars-lidar info` prints for a file of another program."""
     from mars_lidar.io.foreign import listed
     from mars_lidar.io.streams.recorders import RECORDER_SUFFIXES
 

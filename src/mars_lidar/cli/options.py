@@ -1,4 +1,4 @@
-"""Options that several commands take: how one is declared, and those of scene and light.
+"""Options of several commands: their declaration, and those of scene and light.
 
 An option is a field of a class, or a keyword of a command, with its type; its help stands in the docstring of these.
 """
@@ -89,7 +89,7 @@ def _sections(target: Any) -> dict[str, str]:
 
 
 def documented(target: Any) -> Any:
-    """Give the options of a class or function the words of its docstring.
+    """Take the help texts of the options of a class or function from its docstring.
 
     A section of the docstring is a panel of the help ("Arguments" and "Options" are those of the command line itself).
     An entry is a name, its metavariable or {choices}, and its help, which may end in [default: words]; `$presets`
@@ -116,7 +116,7 @@ def documented(target: Any) -> Any:
 
 @dataclass_transform(frozen_default=True, kw_only_default=True)
 def options(cls: type[T]) -> type[T]:
-    """A class of options: a command with a parameter of it has all of them, under their own names."""
+    """A class of options: a command with a parameter of this class has all its options, under their own names."""
     return Parameter(name="*")(dataclass(frozen=True, kw_only=True)(documented(cls)))
 
 
@@ -132,7 +132,7 @@ COMMAND_LINE: dict[str, Any] = {
 
 
 def describe(command: App) -> None:
-    """Make docstrings the help of a command or of all in a group, without line ends: the screen's width folds them."""
+    """Take the help of a command, or of all commands in a group, from docstrings, without their line breaks."""
     if command.default_command is None:
         for name in command:
             if not name.startswith("-"):
@@ -168,7 +168,7 @@ def _examples(sections: dict[str, str]) -> str:
 def two(
     option: str, text: str, form: str = "integers Y,X (row, column)", kind: Callable[[str], N] = int
 ) -> tuple[N, N]:
-    """The value of an option of two numbers, such as the pixel (y, x) of ``--pixel Y,X``."""
+    """The value of an option with two numbers, such as the pixel (y, x) of ``--pixel Y,X``."""
     try:
         first, second = (kind(part) for part in text.split(","))
     except ValueError:

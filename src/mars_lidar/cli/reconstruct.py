@@ -260,7 +260,7 @@ def _show(cube: Cube, timed: dict[str, Timed]) -> None:
     for name, each in timed.items():
         if advice := each.result.advice:
             share = f"{100.0 * each.result.misfits:.3g} % of the pixels do not fit (0.1 % do so by chance)"
-            say(f"warning: {name}: {share}; would fit better: {advice}; mars-lidar calibrate CUBE finds the value")
+            say(f"warning: {name}: {share}; a better fit: {advice}; mars-lidar calibrate CUBE finds the value")
 
 
 def _show_pixel(results: dict[str, Reconstruction]) -> None:

@@ -140,7 +140,7 @@ def simulate(
         target = out
         if capture is not None and out.suffix.lower() in CAPTURE_SUFFIXES:
             if resume or out.suffix != out.suffix.lower():
-                raise ValueError("a capture is written when all is simulated: leave out --resume")
+                raise ValueError("a capture is written after the whole simulation: omit --resume")
             folder = after.enter_context(tempfile.TemporaryDirectory(prefix=".mars-lidar-", dir=out.parent))
             target = Path(folder) / "cube.zarr"
         view = read_scene(scene, light, system, in_parts=True)
@@ -193,7 +193,7 @@ def capture_scene(
     conflicts = [name for name in names if getattr(scene, name) is not None] + ["bins"] * (changes.bins is not None)
     if conflicts:
         conflict = conflicts[0].replace("_", "-")
-        raise ValueError(f"--like takes light and time bins from {like}: leave out --{conflict}")
+        raise ValueError(f"--like takes light and time bins from {like}: omit --{conflict}")
     capture = read_capture(like)
     width, bins = float(capture.bin_ns or 0.0), capture.image[2]
     if changes.period_ns is not None:
@@ -210,7 +210,7 @@ def capture_scene(
 def say_time(
     flux: Flux, system: System, engine: str, realizations: int, threads: int | None, options: EngineOptions
 ) -> None:
-    """Say how long a long run will take, and what is faster."""
+    """Print the expected time of a long run and a faster alternative."""
     from mars_lidar.io.simulated_file import advice
 
     text = str(advice(flux, system, engine, realizations=realizations, threads=threads, options=options))

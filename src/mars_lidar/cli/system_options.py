@@ -21,7 +21,7 @@ from mars_lidar.instrument.system import Detector, System
 
 @options
 class LightEffects:
-    """What changes the light that a pixel counts; None: as in the file."""
+    """Effects on the light that a pixel counts; None: as in the file."""
 
     detection_efficiency: Number | None = None
     dark_count_hz: Number | None = None
@@ -29,7 +29,7 @@ class LightEffects:
 
 @options
 class StreamEffects:
-    """Effects of the detector that the stream of one pixel shows; None: as in the file.
+    """Detector effects that the stream of one pixel reveals; None: as in the file.
 
     Effects of the detector (off by default)
     ----------------------------------------
@@ -88,7 +88,7 @@ class StreamEffects:
             checks.real("--jitter-fwhm-ns", self.jitter_fwhm_ns, low=0.0, strict_low=True)
         if self.jitter_file is not None:
             if gaussian:
-                raise ValueError("the jitter is given once: choose --jitter-file or --jitter-fwhm-ns and its tail")
+                raise ValueError("give the jitter once: --jitter-file or --jitter-fwhm-ns and its tail")
             if self.jitter_bin_ns is None:
                 raise ValueError(f"--jitter-file {self.jitter_file} needs --jitter-bin-ns, its samples' width in ns")
             values = read_array("--jitter-file", self.jitter_file)
@@ -170,7 +170,7 @@ class PulseOptions:
     pulse_origin: Text | None = None
 
     def build(self) -> Pulse | None:
-        """The pulse that is meant, or None where none is given."""
+        """The pulse of these options, or None if none is given."""
         one_of = (
             ("--pulse-sigma-ns", self.pulse_sigma_ns),
             ("--pulse-fwhm-ns", self.pulse_fwhm_ns),
@@ -178,7 +178,7 @@ class PulseOptions:
         )
         given = [name for name, value in one_of if value is not None]
         if len(given) > 1:
-            raise ValueError(f"the pulse is given once: choose one of {' and '.join(given)}")
+            raise ValueError(f"give the pulse once: one of {' and '.join(given)}")
         if self.pulse_file is None and (self.pulse_bin_ns is not None or self.pulse_origin is not None):
             raise ValueError("--pulse-bin-ns and --pulse-origin belong to --pulse-file, which is not given")
         if self.pulse_sigma_ns is not None:
@@ -269,7 +269,7 @@ class SystemChanges:
     start: Text | None = None
 
     def of(self, file: Path | None, effects: Effects | None = None) -> System:
-        """The system of a file, or the default one, so changed."""
+        """The system of a file, or the default, with these changes."""
         base = DEFAULT_SYSTEM if file is None else System.load(file)
         if self.detector is not None:
             base = base.replace(detector=Detector.preset(self.detector))
@@ -297,12 +297,12 @@ class SystemOptions:
     changes: SystemChanges = SystemChanges()
 
     def build(self, effects: Effects | None = None) -> System:
-        """The system that is meant."""
+        """The system of these options."""
         return self.changes.of(self.system, effects)
 
 
 def with_changes(base: Detector, given: dict[str, Any]) -> Detector:
-    """`base` with what is given in place of its values; a gate of the file goes with its mode."""
+    """`base` with the given values in place of its own; the gate of a file is dropped with its mode."""
     known = base.to_dict()
     if given.get("mode", base.mode) != base.mode:
         known = {name: value for name, value in known.items() if name != "mode" and not name.startswith("gate_")}

@@ -1,4 +1,4 @@
-"""`mars-lidar info`, `view` and `explore`: a file in words, as a picture, and in a browser."""
+"""`mars-lidar info`, `view` and `explore`: describe a file, draw it, and explore it in a browser."""
 
 from __future__ import annotations
 
@@ -87,8 +87,7 @@ def view(
     """Draw depth, reflectivity, counts and a few histograms.
 
     Beside the true depth stands that of the fullest bin. Each histogram stands beside the incident rate, scaled to
-    the same total: the difference is pile-up. A measured cube is shown with the light that maximum likelihood finds
-    in it.
+    the same total: the difference is pile-up. A measured cube is shown with its maximum-likelihood light.
 
     Arguments
     ---------

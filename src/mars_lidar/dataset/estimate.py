@@ -1,4 +1,4 @@
-"""Before the work: how large a dataset will be, how long it takes, how much memory; from a few parts made in memory."""
+"""Estimates of the size, time and memory of a dataset before it is generated, from a few parts made in memory."""
 
 from __future__ import annotations
 
@@ -32,18 +32,18 @@ _BASE_BYTES = 220 * 2**20  # of the interpreter with NumPy, SciPy and Zarr
 
 @dataclass(frozen=True)
 class Estimate:
-    """What `estimate` expects.
+    """Expected size, time and memory of a dataset, the result of `estimate`.
 
     Attributes
     ----------
     scenes
-        Scenes, or crops, if none that was not looked at is bad.
+        Number of scenes, or crops, if all files that were not read are usable.
     shape
         (samples, realizations, H, W, bins) of the histogram.
     dense_bytes, bytes
-        Of the counts as they are, and on disk with maps and scenes.
+        Size of the dense counts, and of the store on disk with maps and scenes.
     free_bytes
-        On the disk of the target; None without a target.
+        Free space on the disk of the target; None without a target.
     seconds
         Wall clock on `threads` processors of this machine.
     threads
@@ -51,9 +51,9 @@ class Estimate:
     memory_bytes
         At most, at any time.
     shards, chunk
-        Number of files of the histogram, and the shape of what is read at once.
+        Number of files of the histogram, and the shape of a chunk, which is read at once.
     problems
-        Bad files among those that were looked at.
+        Unusable files among those that were read.
     """
 
     scenes: int
@@ -76,15 +76,15 @@ def estimate(
     *,
     threads: int | None = None,
 ) -> Estimate:
-    """Size, time and memory of a dataset, without writing anything.
+    """Estimate size, time and memory of a dataset without writing anything.
 
-    Up to four scenes, spread over the list, are read, and up to eight chunks of them simulated and packed in memory.
+    Up to four scenes, spread over the list, are read, and up to eight of their chunks simulated and encoded in memory.
     Arguments are those of `mars_lidar.generate`.
 
     Raises
     ------
     FileNotFoundError, ValueError
-        A recipe that is missing or wrong, as `mars_lidar.generate` says it.
+        A missing or invalid recipe, as for `mars_lidar.generate`.
     TypeError
         An argument of another kind.
     """
@@ -126,7 +126,7 @@ def estimate(
 
 
 def quick_advice(recipe: DatasetRecipe | dict[str, Any] | str | Path, threads: int | None = None) -> Advice:
-    """How long `generate` will take about, from one scene: quick also where a chunk takes minutes."""
+    """Approximate time of `generate`, from one scene; fast even where a chunk takes minutes."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # generate itself tells them
         plan, listed, _, looked, each_s = _looked_at(recipe, 1)

@@ -97,7 +97,7 @@ LAYOUTS = {
 
 @dataclass(frozen=True)
 class Exported:
-    """What `export` did: how many files of exposures it wrote, the list of them, and what to know of them."""
+    """Result of `export`: the number of files it wrote, their list, and notes."""
 
     files: int
     listed: Path
@@ -113,31 +113,31 @@ def export(
     fill: bool = False,
     progress: Progress | bool | None = None,
 ) -> Exported:
-    """Write every exposure of a dataset as a file that a network's loader reads.
+    """Write every exposure of a dataset as a file for the loader of a published network.
 
     Parameters
     ----------
     dataset
-        What `mars_lidar.generate` wrote, or its path.
+        A dataset of `mars_lidar.generate`, or its path.
     out
-        A folder that is not there yet, or is empty. The loader's list in it, ``list.txt``, holds a file a line. It
-        appears when all is written; what stops the writing leaves nothing under its name.
+        A new or empty folder. Its ``list.txt``, the list that the loader reads, has one file per line. The folder
+        appears when all files are written; an interruption leaves nothing under its name.
     layout
         One of `LAYOUTS`; or ``"webdataset"``: tar files ``shard-000000.tar``, ... of about 256 MiB for WebDataset, in
         which an exposure is ``SAMPLE-REALIZATION`` with an array of counts (H, W, bins), a ``.npy`` for each map, and
         ``json``, its numbers and its system.
     fill
         Give pixels without a return the depth, bin and rates of the nearest pixel with one. Otherwise their bin is 0,
-        and loaders that divide rates by their sum make NaN of them.
+        and loaders that divide rates by their sum turn them into NaN.
     progress
         Called as ``progress(done, total)`` after each exposure; True: a bar.
 
     Raises
     ------
     ValueError, TypeError
-        An unknown layout, or what it cannot hold; nothing was written.
+        An unknown layout, or data that it cannot contain; nothing was written.
     OSError
-        `out` has something in it, or cannot be written.
+        `out` is not empty or cannot be written.
     """
     report = callback_of(progress, "exporting")
     source = dataset if isinstance(dataset, Dataset) else open_dataset(dataset)

@@ -1,7 +1,6 @@
-"""What people write: scenes, light, systems and recipes of datasets as plain data, and the JSON Schema of such files.
+"""Scenes, light, systems and recipes of datasets as plain data, and the JSON Schema of their files.
 
-`KINDS`, `LIGHT` and `ROOT` declare every key once: they are what files, command line and Python are read by, and what
-editors read.
+`KINDS`, `LIGHT` and `ROOT` declare every key once, for files, command line, Python and editors.
 """
 
 from __future__ import annotations
@@ -54,7 +53,7 @@ class Light:
     Raises
     ------
     ValueError, TypeError
-        A level, a length or a share that is out of range, or no number; one that the other settings exclude.
+        A level, length or share that is not a number, is out of range, or is excluded by other settings.
     """
 
     levels: tuple[tuple[float, float], ...] = ((1.0, 1.0),)
@@ -109,9 +108,9 @@ def read_light(data: Any, key: Key = ("light",)) -> Light:
 
 
 def refuse_for_transients(light: Light, key: Key = ("light",)) -> None:
-    """Raise where rendered light is given what only surfaces have."""
+    """Raise if rendered light has settings that apply to surfaces only."""
     if light.attenuation != "none":
-        text = f"attenuation is for surfaces; transients have it in them, got {light.attenuation!r}"
+        text = f"attenuation is for surfaces and is already included in transients, got {light.attenuation!r}"
         raise RecipeError((*key, "attenuation"), text)
     if light.ambient not in (None, "uniform"):
         raise RecipeError((*key, "ambient"), f"ambient must be uniform with transients, got {light.ambient!r}")
@@ -124,20 +123,28 @@ def plain_levels(light: Light) -> list[list[Any]]:
 
 FOG: Fields = {
     "extinction_per_m": values.real("Extinction coefficient, 1/m: 3.91 / visibility.", low=0.0, strict_low=True),
-    "backscatter": values.real("Photons per period that fog without a target sends back, per unit of signal.", low=0.0),
-    "nearest_m": values.real("Depth from which on the laser is seen, m.", low=0.0, strict_low=True).or_else(1.0),
+    "backscatter": values.real(
+        "Photons per period backscattered by fog without a target, per unit of signal.", low=0.0
+    ),
+    "nearest_m": values.real("Depth from which laser and field of view overlap, m.", low=0.0, strict_low=True).or_else(
+        1.0
+    ),
 }
 PANE: Fields = {
     "depth_m": values.real("Depth of the pane, m.", low=0.0, strict_low=True),
     "reflectivity": values.real("Reflectivity of the pane.", low=0.0, high=1.0),
-    "transmission": values.real("What passes it, there and back.", low=0.0, high=1.0, strict_low=True).or_else(1.0),
+    "transmission": values.real(
+        "Fraction of the light that passes it there and back.", low=0.0, high=1.0, strict_low=True
+    ).or_else(1.0),
 }
 _SIZE = values.size("Resample: the longer side, or [height, width].")
 _BEFORE: Fields = {
     "fog": values.several(
-        values.mapping("Fog before the surfaces; several are a scene each.", FOG, ("extinction_per_m", "backscatter"))
+        values.mapping(
+            "Fog in front of the surfaces; a list makes a scene of each.", FOG, ("extinction_per_m", "backscatter")
+        )
     ),
-    "pane": values.mapping("A pane before the surfaces.", PANE, ("depth_m", "reflectivity")),
+    "pane": values.mapping("A pane in front of the surfaces.", PANE, ("depth_m", "reflectivity")),
 }
 _IMAGE = {"anyOf": [{"type": "string"}, {"type": "array", "items": {"type": "string"}, "minItems": 1, "maxItems": 2}]}
 KINDS: dict[str, Fields] = {
@@ -149,33 +156,33 @@ KINDS: dict[str, Fields] = {
     },
     "path": {
         "path": values.text("Depth: a file, or a folder of scenes."),
-        "pattern": values.text("Of a folder: which depth files, such as **/*_depth.png."),
-        "image": values.other("The image to a file; to a pattern, a text of it and what stands in its place.", _IMAGE),
-        "manifest": values.text("Of a folder: a CSV with a column depth."),
+        "pattern": values.text("For a folder: the depth files, such as **/*_depth.png."),
+        "image": values.other("The image of a file; with pattern, a text of it and its replacement.", _IMAGE),
+        "manifest": values.text("For a folder: a CSV with a column depth."),
         "depth_unit_m": values.real("Metres per stored unit of depth.", low=0.0, strict_low=True),
-        "focal_px": values.real("Focal length, pixels: depth becomes range.", low=0.0, strict_low=True),
-        "max_depth_m": values.real("Depths beyond this, m, are no return.", low=0.0, strict_low=True),
-        "frames": values.numbers("Of NYUv2: which frames.", "frames"),
+        "focal_px": values.real("Focal length, pixels: converts depth to range.", low=0.0, strict_low=True),
+        "max_depth_m": values.real("Depths beyond this, m, are treated as no return.", low=0.0, strict_low=True),
+        "frames": values.numbers("For NYUv2: the frames.", "frames"),
         "size": _SIZE,
         **_BEFORE,
     },
     "transient": {
         "transient": values.text("Rendered light (y, x, time): a file, or a folder of them."),
-        "pattern": values.text("Of a folder: which files."),
+        "pattern": values.text("For a folder: the files."),
         "bin_ns": values.real("Width of a time bin, ns.", low=0.0, strict_low=True),
         "start_ns": values.real("Travel time at the first bin, ns."),
         "name": values.text("Name of the array in the file."),
-        "channel": values.integer("Which channel of (y, x, time, channel).", low=0, high=2**31),
-        "pulse": values.flag("Whether the system's pulse is still to be applied."),
+        "channel": values.integer("Channel of (y, x, time, channel).", low=0, high=2**31),
+        "pulse": values.flag("Whether to convolve with the system's pulse."),
         "size": _SIZE,
     },
 }
 SINGLE: dict[str, Fields] = {
     "path": {
         "depth": values.text("Depth: a file, or a Middlebury folder; the same as path."),
-        "index": values.integer("Of NYUv2: which frame; the same as frames of one.", low=0, high=2**31),
+        "index": values.integer("For NYUv2: the frame; the same as frames with one entry.", low=0, high=2**31),
     },
-    "example": {"seed": values.integer("Seed; the same as seeds of one.", low=0, high=2**64 - 1)},
+    "example": {"seed": values.integer("Seed; the same as seeds with one entry.", low=0, high=2**64 - 1)},
     "transient": {},
 }
 _STANDS_FOR = {"depth": "path", "index": "frames", "seed": "seeds"}
@@ -199,7 +206,7 @@ def read_scene(key: Key, entry: Any) -> dict[str, Any]:
         got = " and ".join(kinds) or "none of them"
         raise RecipeError(key, f"{name} must give one of example, depth (or path) and transient, got {got}")
     if entry[kinds[0]] is None:
-        raise RecipeError((*key, kinds[0]), f"{kinds[0]} must have a value, got nothing behind it")
+        raise RecipeError((*key, kinds[0]), f"{kinds[0]} must have a value, got none")
     kind = _STANDS_FOR.get(kinds[0], kinds[0])
     given = values.read_mapping(key, entry, {**SINGLE[kind], **KINDS[kind]}, name=name)
     for each, many in _STANDS_FOR.items():
@@ -220,8 +227,10 @@ def read_scene(key: Key, entry: Any) -> dict[str, Any]:
 LAYOUTS = ("sparse", "dense")
 STORE: Fields = {
     "layout": values.choice("dense: any Zarr library reads it; sparse: smaller.", LAYOUTS).or_else("dense"),
-    "chunk_mib": values.real("What is read at once, MiB of dense counts.", low=0.001, high=512.0).or_else(8.0),
-    "shard_mib": values.real("A file, MiB of dense counts.", low=0.001, high=1024.0),
+    "chunk_mib": values.real(
+        "Size of a chunk, which is read at once, MiB of dense counts.", low=0.001, high=512.0
+    ).or_else(8.0),
+    "shard_mib": values.real("Size of a file, MiB of dense counts.", low=0.001, high=1024.0),
 }
 _CROP: Fields = {
     "size": values.size("Side, or [height, width]."),
@@ -229,21 +238,21 @@ _CROP: Fields = {
 }
 ROOT: Fields = {
     "seed": values.integer("Seed of the dataset.", low=0, high=2**64 - 1).or_else(0),
-    "scenes": values.other("Where scenes come from.", {}),
+    "scenes": values.other("Sources of the scenes.", {}),
     "size": values.size("Resample every scene: the longer side, or [height, width]."),
     "crop": values.mapping("Parts at random places.", _CROP, ("size",)),
     "systems": values.other("Lasers, detectors and histograms.", {}),
     "light": values.other("Levels of light.", {}),
     "engine": values.other("As for simulate.", {"type": "string"}).or_else("exact"),
     "realizations": values.integer("Exposures of each sample.", low=1, high=2**31).or_else(1),
-    "store": values.mapping("How the counts lie on disk.", STORE),
+    "store": values.mapping("Layout of the counts on disk.", STORE),
 }
 """The keys of a recipe; `json_schema` puts in what scenes, systems and light are."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class DatasetRecipe:
-    """What a dataset is made of; docs/generate.md explains every key of the YAML form.
+    """Content of a dataset; docs/generate.md explains every key of the YAML form.
 
     Attributes
     ----------
@@ -281,7 +290,7 @@ class DatasetRecipe:
     shard_mib: float | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data from which `from_dict` makes an equal recipe: the form of the YAML file, files read in."""
+        """Plain data, as in the YAML file with its files included, from which `from_dict` makes an equal recipe."""
         light = asdict(self.light)
         light["levels"] = plain_levels(self.light)
         return {
@@ -410,7 +419,7 @@ _PLAIN = {float: "number", int: "integer", str: "string", bool: "boolean", Path:
 def json_schema(file: str = "recipe") -> dict[str, Any]:
     """JSON Schema (draft 2020-12) of a scene file, a recipe of `generate`, or a system file.
 
-    An editor that knows it completes keys and underlines what is wrong: in VS Code with the YAML extension, put
+    With it an editor completes keys and marks errors: in VS Code with the YAML extension, put
     ``# yaml-language-server: $schema=recipe.json`` in the first line of the file.
     """
     checks.choice("file", file, FILES)

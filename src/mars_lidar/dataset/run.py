@@ -1,4 +1,4 @@
-"""The verb `generate`: from a recipe to a dataset on disk, on one machine or on many, in one go or in several."""
+"""`generate`: from a recipe to a dataset on disk, on one machine or on many, in one run or in several."""
 
 from __future__ import annotations
 
@@ -57,11 +57,11 @@ class Generated:
     shape
         (samples, realizations, H, W, bins) of its histogram.
     problems
-        Files that were left out, and why.
+        Files that were skipped, each with the reason.
     parts, parts_before
-        Parts that were made now, and that were there already.
+        Number of parts made in this run, and number that existed before.
     simulate_s, write_s
-        Seconds spent simulating, and packing and writing, all threads added.
+        Seconds spent on simulation, and on encoding and writing, summed over threads.
     seconds
         Wall clock.
 
@@ -120,10 +120,10 @@ def generate(
     out
         The store, ``NAME.zarr``.
     resume
-        Continue what was interrupted; of a complete store nothing is made. The recipe must be the same.
+        Continue an interrupted run with the same recipe; a complete store is left unchanged.
     overwrite
-        Replace an existing store: by one that is made beside it, ``NAME.incomplete.zarr``, and takes its place when it
-        is complete. Who reads the old one gets an error then, never a mixture of both.
+        Replace an existing store. The new one is written beside it, as ``NAME.incomplete.zarr``, and takes its place
+        when complete; open readers of the old store then get an error, never a mixture of both.
     threads
         Threads of this process; default: all processors it may use. With `workers`: of each worker, default 1.
     workers
@@ -131,7 +131,7 @@ def generate(
     scheduler
         Address of a running dask scheduler, whose workers see `out` under the same path.
     progress
-        Called with (parts done, in all); True: a bar, or a line every 30 s where there is no terminal.
+        Called with (parts done, all parts); True: a bar, or a line every 30 s without a terminal.
 
     Raises
     ------
@@ -142,7 +142,7 @@ def generate(
     FileExistsError
         `out` exists, and neither `resume` nor `overwrite` is given.
     mars_lidar.io.WriteError, mars_lidar.io.Interrupted
-        Stopped half way (a full disk, Ctrl-C); the text says how to go on.
+        Interrupted (a full disk, Ctrl-C); the message states how to continue.
 
     See Also
     --------
@@ -193,9 +193,9 @@ def begin(
     workers: int | None = None,
     scheduler: str | None = None,
 ) -> Generated:
-    """Begin a dataset whose parts other processes make: read its scenes, and lay out its arrays.
+    """Begin a dataset whose parts other processes make: read its scenes and create its arrays.
 
-    After it `make_part` runs anywhere, in any order and at the same time, such as in the jobs of an array; then
+    Afterwards `make_part` runs in any process, in any order and concurrently, such as in the jobs of a job array; then
     `finish`. The store is that of `generate`, byte for byte.
 
     Parameters
@@ -249,7 +249,7 @@ def make_part(
     threads: int | None = None,
     progress: Progress | bool | None = None,
 ) -> Generated:
-    """Make the K-th of N parts of a dataset that `begin` began; what is there already is not made again.
+    """Make the K-th of N parts of a dataset that `begin` created; existing files are not made again.
 
     Parameters
     ----------
@@ -269,7 +269,7 @@ def make_part(
     TypeError
         Arguments of another kind.
     ValueError
-        A part that is not K of N; a store that `begin` did not begin, or whose version or bits are others.
+        An invalid part (K, N); a store that `begin` did not create, or that another version or other bits began.
     FileNotFoundError
         No store.
 
@@ -311,9 +311,9 @@ def make_part(
 
 @checked
 def finish(out: str | Path) -> Generated:
-    """Mark a dataset complete whose parts were all made by `make_part`.
+    """Mark a dataset complete after `make_part` has made all its parts.
 
-    Only files whose writer noted no digest are read again.
+    Only files for which the writer stored no checksum are read again.
 
     Parameters
     ----------
@@ -327,7 +327,7 @@ def finish(out: str | Path) -> Generated:
     Raises
     ------
     TypeError
-        A path that is none.
+        `out` is not a path.
     ValueError
         A part is missing.
     FileNotFoundError

@@ -1,4 +1,4 @@
-"""What a sample shows (surfaces, in clear air or in fog, or rendered light), and where a store has it.
+"""Scenes of a dataset (surfaces in clear air or in fog, or rendered light), and their arrays in a store.
 
 The group ``scenes`` is written scene by scene, and read again when a sample needs one::
 
@@ -109,7 +109,7 @@ class Surfaces:
 
 @dataclass(frozen=True)
 class Rendered:
-    """Rendered light; depth and reflectivity are NaN where nobody tells them."""
+    """Rendered light; depth and reflectivity are NaN where unknown."""
 
     transient: Transient
     depth_m: FloatArray

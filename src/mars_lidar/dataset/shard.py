@@ -1,7 +1,7 @@
-"""Writing a shard of counts chunk by chunk (Zarr v3, sharding codec, index at the end), and sums of written files.
+"""Writing a shard of counts chunk by chunk (Zarr v3, sharding codec, index at the end), and checksums of written files.
 
-zarr-python takes a whole shard at once: it copies every chunk into a fresh array before it packs it, which cost as much
-as the packing. Here a chunk is packed while it is still in the processor's cache, and a shard is never in memory.
+zarr-python writes a whole shard at once and copies every chunk into a new array before it encodes it, which takes as
+long as the encoding. Here a chunk is encoded while it is in the processor's cache, and a shard is never in memory.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def chunks_of(region: Region, chunk: tuple[int, ...], shard: tuple[int, ...]) ->
 
 
 def packer(layout: str, dtype: np.dtype[Any]) -> Callable[[NDArray[Any]], bytes]:
-    """From a chunk to its bytes: what the codecs of `mars_lidar.dataset.arrays.packing` do."""
+    """The function from a chunk to its bytes, equivalent to the codecs of `mars_lidar.dataset.arrays.packing`."""
     if layout == "sparse":
         pack: Callable[[NDArray[Any]], bytes] = _core.pack_counts
     else:
@@ -55,23 +55,23 @@ def packer(layout: str, dtype: np.dtype[Any]) -> Callable[[NDArray[Any]], bytes]
 
 
 def with_sum(data: bytes) -> bytes:
-    """With a CRC-32C at the end, as Zarr's codec has it."""
+    """The bytes followed by their CRC-32C, as in Zarr's codec."""
     from google_crc32c import value
 
     return data + int(value(data)).to_bytes(4, "little")
 
 
 def is_good(data: bytes) -> bool:
-    """Whether the sum at the end is that of the rest."""
+    """Whether the CRC-32C at the end is that of the preceding bytes."""
     from google_crc32c import value
 
     return int(value(data[:-4])).to_bytes(4, "little") == data[-4:]
 
 
 def write_shard(path: Path, chunks: Iterator[bytes | None]) -> tuple[int, Sums]:
-    """Write the chunks of a shard, in C order, None for those beyond the array; the file appears by a rename.
+    """Write the chunks of a shard, in C order, None for those beyond the array; the file is renamed into place.
 
-    Returns its size and its sums.
+    Returns its size and checksums.
     """
     places: list[int] = []
     offset, summing = 0, Summing()
@@ -104,12 +104,12 @@ def _whole(path: Path) -> Iterator[BinaryIO]:
 
 
 def digests_of(store: Path) -> Path:
-    """Folder of the notes of an incomplete store: Zarr looks at all else in a group, but not in an array."""
+    """Folder of the writers' checksums in an incomplete store, within an array, where Zarr ignores other files."""
     return store / "histogram" / "digests"
 
 
 class DigestNotes:
-    """Notes sums, size and name of each file that a writer has written: `Dataset.finish` reads none of them again.
+    """Stores checksum, size and name of each written file, so that `Dataset.finish` need not read the file again.
 
     Each writer has a file of its own, so that writers on many machines need not wait for each other.
     """
@@ -137,7 +137,7 @@ class DigestNotes:
         self.add(path, len(content), sums_of(content))
 
     def write(self, wait_s: float = 0.0) -> None:
-        """Write the notes on an object store, unless they were written within so many seconds."""
+        """Write the notes to an object store, unless they were written within so many seconds."""
         if self._lines and time.monotonic() - self._written_at >= wait_s:
             put(self._file, "".join(self._lines).encode())
             self._written_at = time.monotonic()

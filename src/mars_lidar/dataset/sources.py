@@ -1,6 +1,6 @@
-"""From the scenes of a recipe to scenes one by one: read, resized, cropped, named; bad ones are listed and omitted.
+"""Scenes of a recipe one by one: read, resized, cropped and named; unusable ones are listed and omitted.
 
-A `View` is one scene with its light, which `simulate` takes.
+A `View` is one scene with its light, the input of `simulate`.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _LIGHT = ("bin_ns", "start_ns", "name", "channel")  # keys that tell how a file 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A scene that has not been read yet; its name goes into the seeds of its samples, `place` into its crops."""
+    """A scene before it is read; its name enters the seeds of its samples, `place` those of its crops."""
 
     name: str
     path: Path
@@ -48,9 +48,9 @@ class Candidate:
 
 
 def candidates(entries: Sequence[dict[str, Any]], folder: Path) -> tuple[list[Candidate], list[Problem]]:
-    """All scenes that the entries of a recipe name, in its order, and entries of manifests that are no scenes.
+    """All scenes that the entries of a recipe name, in its order, and entries of manifests that are not scenes.
 
-    A source that does not exist, or holds no scene at all, is a ValueError.
+    ValueError for a source that does not exist or contains no scene.
     """
     listed: list[Candidate] = []
     problems: list[Problem] = []
@@ -70,7 +70,7 @@ def candidates(entries: Sequence[dict[str, Any]], folder: Path) -> tuple[list[Ca
             name += "" if file.index is None else f", frame {file.index}"
             listed += _behind_all(_sized(Candidate(name, file.depth, partial(_surfaces, file), name), entry), entry)
         if len(listed) == before and not problems:
-            raise ValueError(f"{folder / entry['path']}: no scene found; docs/formats.md tells what is one")
+            raise ValueError(f"{folder / entry['path']}: no scene found; docs/formats.md lists the recognised files")
     names = [each.name for each in listed]
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
@@ -81,7 +81,7 @@ def candidates(entries: Sequence[dict[str, Any]], folder: Path) -> tuple[list[Ca
 def scenes(
     candidate: Candidate, recipe: DatasetRecipe, shape: tuple[int, int] | None
 ) -> Iterator[tuple[str, Content] | Problem]:
-    """What a candidate gives: itself or its crops by name, checked against all levels and systems; or what is wrong.
+    """The scene of a candidate, or its crops, by name, checked against all levels and systems; or the problem.
 
     `shape` is that of the dataset, None while it is not known.
     """
@@ -114,15 +114,15 @@ def scenes(
 def several(
     some: Sequence[Candidate], recipe: DatasetRecipe, shape: tuple[int, int] | None
 ) -> list[list[tuple[str, Content] | Problem]]:
-    """What each of several candidates gives; runs on workers."""
+    """The same for several candidates; runs on workers."""
     return [list(scenes(candidate, recipe, shape)) for candidate in some]
 
 
 def seed_of(recipe: DatasetRecipe, scene: str, system: str, signal: float, sbr: float) -> int:
-    """The seed of a sample: of all that tells it from others, and of nothing else.
+    """The seed of a sample, a hash of the properties that identify it.
 
-    A sample keeps its seed whatever other scenes, systems and levels a recipe has. 64 bits of BLAKE2b: among a
-    million samples two have the same one with a probability of 3e-8.
+    It does not depend on the other scenes, systems and levels of a recipe. 64 bits of BLAKE2b: two of a million
+    samples have the same seed with a probability of 3e-8.
     """
     text = json.dumps([recipe.seed, scene, system, repr(signal), repr(sbr)])
     return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "little")
@@ -327,7 +327,7 @@ _PATHS = ("depth", "path", "image", "manifest", "transient")
 
 @dataclass(frozen=True)
 class View:
-    """Flux, true depth (m) and reflectivity of one scene, None where unknown, and what it is in words."""
+    """Flux, true depth (m) and reflectivity of one scene, None where unknown, and its description."""
 
     flux: Flux
     depth_m: NDArray[Any] | None
@@ -337,25 +337,25 @@ class View:
 
 @checked
 def read_view(scene: dict[str, Any] | str | Path, system: System, *, whole: bool = True, **replaced: Any) -> View:
-    """The one scene that a description means, lit under `system`.
+    """Read the scene of a description, with its light for `system`.
 
     Parameters
     ----------
     scene
-        A YAML file, or its content: an entry of a recipe's `scenes` that means one scene, such as ``{"example":
+        A YAML file, or its content: an entry of a recipe's `scenes` for one scene, such as ``{"example":
         "room", "fog": {"extinction_per_m": 0.1, "backscatter": 0.3}}``, ``{"depth": "depth.png", "image": "rgb.jpg"}``
         or ``{"transient": "render.hdf5"}``, and beside it ``light``, as in a recipe, of one level (docs/formats.md).
     system
         Laser, detector and histogram.
     whole
-        False: a transient's waveforms are made in bands of rows, as they are used (`StoredFlux`).
+        False: waveforms of a transient are computed in bands of rows, on use (`StoredFlux`).
     **replaced
-        Keys that take other values, those of `light` in a dictionary; None: as in the description.
+        Values that replace those of the description, the keys of `light` in a dictionary; None: as in the description.
 
     Raises
     ------
     ValueError
-        ``FILE:LINE: what is wrong``, or what is wrong with the dictionary; several scenes or levels.
+        Invalid content, as ``FILE:LINE: message`` for a file; several scenes or levels.
     TypeError
         An argument of another kind.
     """

@@ -1,4 +1,4 @@
-"""The Zarr store of a dataset: its arrays, which of its parts are there, and when it is whole.
+"""The Zarr store of a dataset: its arrays, its existing parts, and its completion.
 
 ::
 
@@ -7,8 +7,8 @@
     scene, system, signal_level, sbr, seed, ...     (sample)
     scenes/     what the samples are made of, as it was read: see `mars_lidar.dataset.scenes`
 
-The store alone is enough to make any part of it, so that workers and `verify` need no source files. Every part is a
-file of its own that appears by a rename: what is there is whole, and what is missing is known from the names.
+The store contains everything needed to make any of its parts, so that workers and `verify` need no source files. Every
+part is a file that is renamed into place: an existing part is complete, and names show which parts are missing.
 """
 
 from __future__ import annotations
@@ -98,12 +98,12 @@ class Dataset:
 
     @property
     def planned(self) -> bool:
-        """Whether all scenes are in, so that the parts of the store are known."""
+        """Whether all scenes are stored, so that the parts of the store are known."""
         return self.attrs.get("stage") != "scenes"
 
     @property
     def complete(self) -> bool:
-        """Whether all parts are there."""
+        """Whether all parts exist."""
         return self.attrs.get("complete") is True
 
     @cached_property
@@ -123,17 +123,17 @@ class Dataset:
 
     @cached_property
     def problems(self) -> list[Problem]:
-        """What was left out, and why."""
+        """Skipped files, each with the reason."""
         return [Problem(Path(path), reason) for path, reason in self.attrs.get("problems", [])]
 
     def scene(self, number: int) -> Scene | LayeredScene | Transient:
-        """A scene as it was read: of rendered light the transient, which stays on disk."""
+        """A scene as it was read; the transient of rendered light stays on disk."""
         content = self.scenes.read(number)
         return content.transient if isinstance(content, Rendered) else content.scene
 
     @cached_property
     def scenes(self) -> SceneReader:
-        """All that samples show."""
+        """All scenes."""
         with reading(self.path, "scenes of a dataset"):
             return SceneReader(self.group["scenes"], self.path)
 
@@ -142,7 +142,7 @@ class Dataset:
             return OnDisk(with_zeros(self.group[name]), self.path)
 
     def cube(self, sample: int) -> Cube:
-        """One sample as a cube (realizations, H, W, bins), with the light behind it."""
+        """One sample as a cube (realizations, H, W, bins), with its light."""
         number = checks.integer("sample", sample, low=0, high=len(self.seeds) - 1)
         scene, which, signal, sbr = sample_parts(self.recipe, number)
         system, content = self.recipe.systems[which], self.scenes.read(scene)
@@ -178,7 +178,7 @@ class Dataset:
         return [self.path / name / array.metadata.encode_chunk_key(item.shard) for name, array in arrays.items()]
 
     def missing(self, items: Iterable[Item] | None = None) -> list[Item]:
-        """Those of some parts, or of all, that are not there, or whose files were cut short."""
+        """Those of some parts, or of all, that are missing or whose files are truncated."""
         if in_bucket(self.path):  # objects are whole or not there
             there = sizes(self.path)
             return [
@@ -202,7 +202,7 @@ class Dataset:
         return [item for item in (self.items() if items is None else items) if not whole(item)]
 
     def gone(self) -> list[Path]:
-        """Files that are not there."""
+        """Missing files."""
         if in_bucket(self.path):
             return [file for item in self.missing() for file in self.files(item)]
         return [file for item in self.items() for file in self.files(item) if not file.is_file()]
@@ -214,11 +214,11 @@ class Dataset:
 
     @property
     def identity(self) -> str:
-        """Sum over the manifest of a complete store: two of the same identity are the same in every byte."""
+        """Checksum of the manifest of a complete store: stores with the same identity are identical byte for byte."""
         return "" if self.sums is None else self.sums.identity
 
     def check(self, file: Path) -> None:
-        """Raise FileError where a file of a complete store is not as it was when it was opened."""
+        """Raise FileError if a file of a complete store has changed since it was opened."""
         if self.sums is not None:
             self.sums.check(file.relative_to(self.path).as_posix())
 
@@ -228,7 +228,7 @@ class Dataset:
         return self.sums.read(name)
 
     def written(self) -> dict[str, tuple[int, manifest.Sums]]:
-        """Size and sums of files by name, as their writers noted them."""
+        """Size and checksums of files by name, as their writers stored them."""
         noted: dict[str, tuple[int, manifest.Sums]] = {}
         folder = digests_of(self.path)
         if in_bucket(self.path) and not folder.exists():
@@ -241,7 +241,7 @@ class Dataset:
         return noted
 
     def tidy(self) -> None:
-        """Remove what a writer that was killed left behind: files that were not renamed yet."""
+        """Remove the temporary files of killed writers."""
         for name in () if in_bucket(self.path) else ("", "histogram", *MAPS):
             for pattern in ("*.partial", f"*{INCOMPLETE_SUFFIX}"):  # of Zarr, and of ours
                 for leftover in (self.path / name).rglob(pattern) if name else self.path.glob(pattern):
@@ -250,7 +250,7 @@ class Dataset:
     def finish(self) -> None:
         """Mark the store complete, with one replacement of its root document, after its manifest."""
         if gone := self.gone():
-            raise FileNotFoundError(f"{gone[0]} was taken away while the others were made, the first of {len(gone)}")
+            raise FileNotFoundError(f"{gone[0]} was removed while the others were made, the first of {len(gone)}")
         if "consolidated_metadata" not in manifest.root_document(self.path):  # stopped just before it
             mark(self.group, {})
         noted = self.written()
@@ -297,19 +297,19 @@ def open_dataset(path: str | Path, *, allow_incomplete: bool = False, listed: bo
     path
         Its folder, or a URL of an object store (extra ``remote``).
     allow_incomplete
-        Open it also where its generation did not finish.
+        Open it even if its generation did not finish.
     listed
-        Compare the names of all files with the manifest, which lists the folder. False: a file that is missing is
+        Compare the names of all files with the manifest, which needs a listing of the folder. False: a missing file is
         noticed only when it is read.
 
     Raises
     ------
     FileNotFoundError, FileError
-        Nothing there, or no dataset; one that lacks a part, or whose metadata is damaged (a ValueError).
+        No dataset at `path`, or one with a missing part or damaged metadata (a ValueError).
     IncompleteFileError
         Its generation did not finish (a ValueError).
     TypeError, ValueError
-        A path that is no text or Path, or an address that cannot be one.
+        `path` is neither text nor Path, or is not a valid address.
     """
     with reading(place_of(path), "a dataset of mars-lidar") as source:
         dataset = Dataset(source, listed=listed)
@@ -339,7 +339,7 @@ def read_sparse(dataset: Dataset | str | Path, sample: int, realization: int = 0
     Raises
     ------
     FileNotFoundError, ValueError
-        No dataset, or one that is incomplete or damaged; no such sample or realization.
+        A missing, incomplete or damaged dataset; a sample or realization out of range.
     TypeError
         An argument of another kind.
     """

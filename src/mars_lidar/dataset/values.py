@@ -1,4 +1,4 @@
-"""Keys of descriptions that people write: each is declared once, with its check, its text and its JSON Schema."""
+"""Keys of recipes and scene files: each is declared once, with its check, description and JSON Schema."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mars_lidar._base.yaml import Key, RecipeError
 
 @dataclass(frozen=True)
 class Field:
-    """A value of a description: `read` checks it and makes it what the package uses; `schema` is for editors."""
+    """A value of a description: `read` checks and converts it; `schema` is for editors."""
 
     read: Callable[[Key, Any], Any]
     schema: dict[str, Any]
@@ -68,7 +68,7 @@ def choice(about: str, allowed: tuple[str, ...]) -> Field:
 
 
 def text(about: str) -> Field:
-    """A text that is not empty."""
+    """A non-empty text."""
     return _field(about, _kind(str, "a text"), type="string", minLength=1)
 
 
@@ -152,7 +152,7 @@ def several(item: Field) -> Field:
 
 
 def other(about: str, schema: dict[str, Any]) -> Field:
-    """A value that is read elsewhere."""
+    """A value that another function reads."""
     return _field(about, lambda key, value: value, **schema)
 
 
@@ -188,7 +188,7 @@ def key_name(key: Key) -> str:
 
 
 def number(value: Any) -> Any:
-    """YAML takes inf for a text."""
+    """A number, also from the text inf, which YAML does not convert."""
     if isinstance(value, str):
         try:
             return float(value)
@@ -198,7 +198,7 @@ def number(value: Any) -> Any:
 
 
 def checked(key: Key, call: Any, *arguments: Any) -> Any:
-    """The result of a call whose complaint is about `key`."""
+    """The result of a call; its errors are raised for `key`."""
     try:
         return call(*arguments)
     except RecipeError:

@@ -1,4 +1,4 @@
-"""Whether a dataset is what its recipe makes: chunks drawn at random are made again and compared."""
+"""Verification of a dataset: random chunks are simulated again and compared."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from mars_lidar.dataset.write import Maker
 
 @dataclass(frozen=True)
 class Verified:
-    """What `verify` found.
+    """Result of `verify`.
 
     Attributes
     ----------
     chunks, of
-        Chunks that were made again, and all there are.
+        Number of chunks that were simulated again, and number of all chunks.
     different
-        A sentence for each chunk that is not what it was made as.
+        A sentence for each chunk that differs.
     """
 
     chunks: int
@@ -40,7 +40,7 @@ class Verified:
 
     @property
     def good(self) -> bool:
-        """Whether every chunk is the same."""
+        """Whether all chunks are equal."""
         return not self.different
 
 
@@ -53,27 +53,27 @@ def verify(
     threads: int | None = None,
     progress: Progress | bool | None = None,
 ) -> Verified:
-    """Make random chunks of a dataset again, with the maps of their samples, and compare every number.
+    """Simulate random chunks of a dataset again, with the maps of their samples, and compare every number.
 
-    The store's own scenes and recipe are used: files of the source are not needed. Every byte of the store is compared
-    with its manifest, and every coordinate and label with the recipe. Stores of earlier versions have no manifest:
-    their scenes and the rest of their metadata cannot be checked.
+    The scenes and the recipe in the store are used, so that source files are not needed. Every byte of the store is
+    compared with its manifest, and every coordinate and label with the recipe. Stores of earlier versions have no
+    manifest: their scenes and the rest of their metadata cannot be checked.
 
     Parameters
     ----------
     path
         A complete dataset.
     chunks
-        How many; None: all of them.
+        Number of chunks; None: all.
     seed
-        Of the choice.
+    Seed of the choice.
     threads, progress
         As for `mars_lidar.generate`.
 
     Raises
     ------
     FileNotFoundError, ValueError
-        No dataset, an incomplete one, or one whose metadata are damaged; a number out of range.
+        A missing or incomplete dataset, or one with damaged metadata; a number out of range.
     TypeError
         An argument of another kind.
     """

@@ -1,4 +1,4 @@
-"""Making one part of a dataset: simulate, pack, write. A part depends on the store's scenes and on nothing else."""
+"""Making one part of a dataset: simulate, encode, write. A part depends on the scenes of the store only."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Stopped(Exception):
 
 @dataclass(frozen=True)
 class Made:
-    """What making a part took."""
+    """Time spent on a part."""
 
     simulate_s: float
     write_s: float
@@ -58,7 +58,7 @@ TRANSIENT = frozenset(getattr(errno, name) for name in _TRANSIENT_NAMES if hasat
 
 
 class Maker:
-    """Makes parts of one dataset; of use to one thread at a time. Keeps a buffer of one chunk."""
+    """Makes parts of one dataset, in one thread at a time, with a buffer of one chunk."""
 
     def __init__(self, dataset: Dataset, threads: int = 1, stop: threading.Event | None = None) -> None:
         self.dataset = dataset
@@ -72,7 +72,7 @@ class Maker:
         self.notes = DigestNotes(dataset.path)
 
     def attempt(self, item: Item, pauses_s: Sequence[float] = (0.2, 1.0, 5.0)) -> Made | Failed:
-        """`make`, again after each pause where the file system fails for a moment; other errors are raised."""
+        """`make`, repeated after pauses if the file system fails temporarily; other errors are raised."""
         for pause in (*pauses_s, None):
             try:
                 return self.make(item)
@@ -146,7 +146,7 @@ class Maker:
         return {name: np.stack(values).astype(np.float32) for name, values in stacks}
 
     def counts(self, region: tuple[slice, ...]) -> NDArray[Any]:
-        """Counts of a region (samples, realizations, rows, columns, all bins); good until the next call."""
+        """Counts of a region (samples, realizations, rows, columns, all bins); valid until the next call."""
         samples, realizations, rows, columns, _ = region
         recipe = self.dataset.recipe
         dtype, width = self.dataset.histogram.dtype, self.dataset.histogram.shape[3]
@@ -205,7 +205,7 @@ class Maker:
 
 
 def fingerprint() -> str:
-    """Hash of a small exact cube: the same wherever the package draws the same bits."""
+    """Hash of a small cube of engine exact: equal on all machines on which the package draws the same bits."""
     system = System(
         period_ns=100.0,
         cycles=50,

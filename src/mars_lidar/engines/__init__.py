@@ -1,4 +1,4 @@
-"""Engines: one file each, under the names that `simulate` takes."""
+"""Engines, one file each, by the names of the argument `engine` of `simulate`."""
 
 from mars_lidar.engines.engine import Engine, EngineOptions
 from mars_lidar.engines.mars import MarsEngine

@@ -1,4 +1,4 @@
-"""The auto engine: exact where registrations are few, feedback where they are many."""
+"""The auto engine: exact for pixels of few registrations, feedback for pixels of many."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from mars_lidar.engines.tolerances import TOL
 class AutoEngine(Engine):
     """Exact or feedback, whichever is faster for each pixel.
 
-    Feedback costs the same whatever the exposure, exact the same for every registration. What both will cost is
-    predicted from the pixel and the system only, so that any part of an image has the bits of the whole: feedback takes
-    a pixel of more than 4 expected registrations for every internal cell (`Grids.cells`), 6 for those of all laps where
-    it needs several (`Grids.laps`), and 8 for every bin where the pixel's cells are judged for it alone (waveforms,
-    several returns). The rest, and what feedback refuses, goes to exact.
+    The cost of feedback does not depend on the exposure; that of exact is proportional to the registrations. Both costs
+    are predicted from the pixel and the system only, so that any part of an image has the bits of the whole. Feedback
+    draws a pixel of more than 4 expected registrations per internal cell (`Grids.cells`), 6 per cell of all laps where
+    several are needed (`Grids.laps`), and 8 per bin where the cells are chosen for the pixel alone (waveforms, several
+    returns). All other pixels, and those that feedback refuses, are drawn by exact.
 
-    That holds for images. A call with few pixels costs up to some milliseconds more than exact, and the first one with
-    a system, whose cells are then judged, some ten (docs/engines.md).
+    This holds for images. A call with few pixels takes up to some milliseconds more than exact, and the first call with
+    a system, for which the cells are then chosen, some ten (docs/engines.md).
 
     Reports ``pixels drawn by exact`` and ``pixels drawn by feedback``, and what feedback reports. Draws histograms
-    only: of its pixels' registrations the feedback engine knows the bins, not the times.
+    only, because the feedback engine draws no registration times.
     """
 
     name = "auto"
@@ -37,7 +37,7 @@ class AutoEngine(Engine):
         self.level = level
 
     def histogram(self, task: Task, out: NDArray[Any]) -> None:
-        """Feedback where it pays, exact for the rest."""
+        """Feedback where it is faster, exact otherwise."""
         registrations = expected_registrations(task.flux, task.system).reshape(-1)
         every = np.arange(registrations.size)
         each = np.where(judged_alone(task, every), TOL.judged_even, TOL.cell_even)

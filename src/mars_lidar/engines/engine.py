@@ -1,4 +1,4 @@
-"""What an engine is: the contract, written once; options of engines; pixels of one task drawn by several of them."""
+"""The interface of engines; their options; tasks whose pixels are drawn by several engines."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ IN_PARTS = (
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """One checked request: which pixels of which realizations of which flux, seen by which system.
+    """One checked request: pixels and realizations of a flux under a system.
 
-    `flux` and `system` become those of detected photons (`Flux.detected`, `System.detected`), so that no engine needs
-    to know of efficiencies and dark counts.
+    `flux` and `system` are converted to detected photons (`Flux.detected`, `System.detected`), so that engines need not
+    handle efficiencies and dark counts.
 
     `pixel_index` (H * W,) uint32 names the random stream of each pixel, so that any part of an image can be
-    made alone with the bits that it has in the whole. `report` is where an engine writes what it has to tell
-    beside the counts: numbers by name, such as seconds of its stages or pixels that it gave to another engine.
+    simulated alone with the same bits. An engine writes additional results into `report`: numbers by name, such as
+    seconds of its stages or the number of pixels that it passed to another engine.
     """
 
     flux: Flux
@@ -75,7 +75,7 @@ class Task:
         return native_pulse(self.system.pulse, self.system.period_ns)
 
     def pixel_arrays(self) -> dict[str, Any]:
-        """What kernels read of the pixels, by name: light and delays (in periods) of the returns, (returns, pixels)."""
+        """Inputs of the kernels by name: light and delays (in periods) of the returns, (returns, pixels)."""
         return {
             "signal": np.ascontiguousarray(self.flux.returns_signal.reshape(-1, self.pixel_index.size)),
             "delay": self.flux.delay_periods(self.system.period_ns),
@@ -130,18 +130,18 @@ class Records:
 
     @classmethod
     def allocate(cls, counts: NDArray[np.int64]) -> Records:
-        """Room for `counts` (items,) registrations each; MemoryError where there is not that much memory."""
+        """Allocate `counts` (items,) registrations for each item; MemoryError if memory is insufficient."""
         offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
         return cls.reserve(offsets, int(offsets[-1]))
 
     @classmethod
     def reserve(cls, offsets: NDArray[np.int64], room: int) -> Records:
-        """Room for `room` registrations, wherever items begin; MemoryError where there is not that much memory."""
+        """Allocate `room` registrations, with the items not yet placed; MemoryError if memory is insufficient."""
         check_memory(room * cls.BYTES, f"timestamps of shape ({room},)", IN_PARTS)
         return cls(offsets, np.empty(room), np.empty(room, np.int32), np.empty(room, np.int32))
 
     def sort(self) -> None:
-        """Put the registrations of each item in order of time, which jitter may have changed."""
+        """Sort the registrations of each item by time, since jitter may change their order."""
         item = np.repeat(np.arange(self.offsets.size - 1), np.diff(self.offsets))
         if not ((np.diff(self.times) < 0.0) & (np.diff(item) == 0)).any():
             return
@@ -176,10 +176,10 @@ class PhaseRecords:
 
 
 class Engine(ABC):
-    """A way to draw histograms. Engines never see files or scenes.
+    """Interface of the simulation engines, which draw histograms and registrations from a `Task`.
 
-    Sampling is reproducible: it depends on the flux, the system, the seed, and on the pixel index and number
-    of the realization, never on threads, chunks, or what else is simulated in the same call.
+    Sampling is reproducible: it depends on the flux, the system, the seed, the pixel index and the number of the
+    realization, never on threads, chunks, or other pixels of the same call.
 
     See Also
     --------
@@ -205,11 +205,11 @@ class Engine(ABC):
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What a cube depends on beside system, flux and seed: plain data for the file of a cube."""
+        """Settings on which a cube depends besides system, flux and seed, as plain data for the file of a cube."""
         return {}
 
     def check(self, flux: Flux, system: System) -> None:  # noqa: B027  (most engines take everything)
-        """Raise ValueError, naming the field, for what of `flux` and `system` this engine cannot do."""
+        """Raise ValueError, naming the field, if this engine cannot simulate `flux` under `system`."""
 
     @abstractmethod
     def histogram(self, task: Task, out: NDArray[Any]) -> None:
@@ -220,9 +220,9 @@ class Engine(ABC):
         raise ValueError(f"engine {self.name!r} draws histograms only, not single registrations; use 'exact'")
 
     def records(self, task: Task, expected: float) -> Records | PhaseRecords:
-        """Every registration of `task`, with the draws of `histogram`; `expected`: about how many there will be.
+        """Every registration of `task`, with the draws of `histogram`; `expected`: their approximate number.
 
-        Here in two passes, `counts` and `timestamps`.
+        The default implementation takes two passes, `counts` and `timestamps`.
         """
         records = Records.allocate(self.counts(task))
         self.timestamps(task, records)
@@ -269,7 +269,7 @@ class EngineOptions(TypedDict, total=False):
     interpolation
         For a table: ``"bilinear"`` (default) or ``"nearest"`` (the paper's).
     outside
-        For a table, of pixels beyond its range: ``"error"`` (default), or ``"exact"``, some ms each.
+        For pixels beyond the range of a table: ``"error"`` (default), or ``"exact"``, which takes some ms a pixel.
 
     See Also
     --------
@@ -293,7 +293,7 @@ NAMES = tuple(EngineOptions.__annotations__)
 
 
 def given(options: EngineOptions) -> dict[str, Any]:
-    """The options that are not None; TypeError for a name that is none of them."""
+    """The options that are not None; TypeError for an unknown name."""
     for name in options:
         if name not in NAMES:
             raise TypeError(f"{name!r} is no argument of this function, nor an option of an engine: {', '.join(NAMES)}")
@@ -314,7 +314,7 @@ def stage(progress: Progress | None, start: float, end: float) -> Progress | Non
 def part_of(
     task: Task, pixels: NDArray[np.int64], first: int, realizations: int, progress: Progress | None = None
 ) -> Task:
-    """Some pixels (n,) of a task in some of its realizations, `first` the first: each has the bits of the whole."""
+    """A task with some of the pixels (n,) and realizations (from `first` on) of another, with the same bits."""
     return replace(
         task,
         flux=task.flux.pixels(pixels),
@@ -350,10 +350,10 @@ def draw_pixels(engine: Engine, task: Task, out: NDArray[Any], pixels: NDArray[n
 
 
 def check_start(flux: Flux, system: System) -> None:
-    """Raise ValueError for a stationary start that twilight pulses keep from settling before the exposure.
+    """Raise ValueError for a stationary start that twilight pulses prevent from settling before the exposure.
 
-    Ticks follow each other on background, or where the same pulses lie in the twilight of the next dead time too: where
-    that is a whole number of periods but for less than the twilight.
+    Twilight pulses follow each other on background, or where the same laser pulses also lie in the twilight time of the
+    next dead time: where the dead time differs from whole periods by less than the twilight time.
     """
     period, detector = system.period_ns, system.detector
     if system.start != "stationary" or detector.twilight_ns == 0.0:

@@ -18,7 +18,7 @@ from mars_lidar.light.flux import Flux
 
 
 class ExactEngine(Engine):
-    """Exact sampling without rejection, cost O(registrations) however bright the scene.
+    """Exact sampling without rejection, at a cost of O(registrations) for any brightness.
 
     After re-arming at u the next registration is ``C^-1(C(u) + E)``, with C the integrated flux and E ~ Exp(1).
     The same seed gives the same cube, bit for bit, on any machine: a random stream per item, no libm, no
@@ -34,7 +34,7 @@ class ExactEngine(Engine):
         self.level = level
 
     def check(self, flux: Flux, system: System) -> None:
-        """Refuse stationary starts that twilight pulses keep from settling."""
+        """Refuse stationary starts that twilight pulses prevent from settling."""
         check_start(flux, system)
 
     def histogram(self, task: Task, out: NDArray[Any]) -> None:
@@ -42,13 +42,13 @@ class ExactEngine(Engine):
         _core.exact_histogram(task.job, task.pulse, out, task.threads, task.progress, self.level)
 
     def counts(self, task: Task) -> NDArray[np.int64]:
-        """Registrations alone, of which nothing is kept."""
+        """The number of registrations, without storing them."""
         out = np.empty(task.items, np.int64)
         _core.exact_counts(task.job, task.pulse, out, task.threads, None, self.level)
         return out
 
     def records(self, task: Task, expected: float) -> PhaseRecords:
-        """In one pass, into more room than is needed; where memory is scarce they are counted before."""
+        """In one pass, into more memory than needed; if memory is scarce, registrations are counted first."""
         room = int(TOL.room * expected) + 1024
         available = available_bytes()
         if available is not None and 2 * PhaseRecords.BYTES * room > available:
@@ -68,7 +68,7 @@ class ExactEngine(Engine):
         return PhaseRecords(offsets, cycle, phase, task.system.bins)
 
     def timestamps(self, task: Task, records: Records) -> None:
-        """The same as `records`, into memory that is there."""
+        """The same as `records`, into allocated memory."""
         drawn = self.records(task, float(records.times.size))
         for to, array in ((records.times, drawn.times), (records.cycle, drawn.cycle), (records.bin, drawn.bin)):
             to[:] = array

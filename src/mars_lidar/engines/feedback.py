@@ -1,8 +1,8 @@
-"""The feedback engine: the whole integer histogram at once, at a cost that does not grow with the exposure.
+"""The feedback engine: draws a whole histogram at once, at a cost independent of the exposure.
 
-Which exposures it draws, on which internal grid, and which are drawn exactly instead. The bins of the grid are cut
-until its law is that of a finer grid. No rule on the shape of the light: a grid is judged by what it does to the mean
-histogram and to the variance of the count, native/feedback/check.h.
+This module chooses the pixels that it draws, their internal grids, and the pixels that are drawn exactly instead. The
+bins of a grid are divided until its law agrees with that of a finer grid, by the mean histogram and the variance of the
+count (native/feedback/check.h); no rule on the shape of the light is used.
 """
 
 from __future__ import annotations
@@ -77,11 +77,10 @@ class Grids:
             put(sharing[which == number], *known[corner])
         some = np.flatnonzero(alone)  # judged together: neighbours in background need about as many sweeps
         some = some[np.argsort(task.flux.background.reshape(-1)[pixels[some]], kind="stable")]
-        start = resolving(task.system, start, _structure(task.system, task.flux), slice(None))
-        halvings, sweeps, armed = _even_halvings(task, pixels[some], start)
+        halvings, sweeps, armed = _even_halvings(task, pixels[some])
         for k in np.unique(halvings):
             at = halvings == k
-            put(some[at], None if k < 0 else np.asarray(start + k, np.uint8), sweeps[at], armed[at])
+            put(some[at], None if k < 0 else even(task.system, k), sweeps[at], armed[at])
         return grids
 
     def part(self, some: NDArray[np.bool_]) -> Grids:
@@ -89,9 +88,9 @@ class Grids:
         return Grids(self.kinds, self.of[some], self.sweeps[some], self.armed[some])
 
     def laps(self) -> IndexArray:
-        """Periods of a piece (n,) of the exposure as far as `armed` tells; the kernel decides (native/feedback/laps.h).
+        """Periods of a piece (n,) of the exposure, estimated from `armed`; the kernel decides (native/feedback/laps.h).
 
-        A history is forgotten to 3e-3 within about half the sweeps that the mean takes.
+        The memory of a history decays to 3e-3 within about half the sweeps that the mean takes.
         """
         return np.where(self.armed < TOL.few_armed, np.maximum(self.sweeps // 2, 3), 1)
 
@@ -119,8 +118,18 @@ def least_power(octaves: int, ratio: FloatArray | float, low: int, high: int) ->
     return low + np.searchsorted(np.ldexp(1.0, octaves * np.arange(low, high)), ratio)
 
 
+def even(system: System, halvings: int) -> KindArray:
+    """A grid of equal cells: bins halved so many times, or joined by pairs where that is negative."""
+    return np.full(system.bins >> max(-halvings, 0), max(halvings, 0), np.uint8)
+
+
 def coarsest(system: System) -> KindArray:
-    """The widest cells (bins,): bins, a quarter of a dead time, or what it exceeds whole periods by.
+    """The widest cells (bins,), none wider than a bin, that the sweeps allow."""
+    return even(system, _sweepable(system, 0))
+
+
+def _sweepable(system: System, least: int) -> int:
+    """Halvings of all bins, `least` or more: to a quarter of a dead time, or what it exceeds whole periods by.
 
     Without the last, where that would take many cells, the sweeps count a whole period in cells, and are slower.
     """
@@ -128,27 +137,22 @@ def coarsest(system: System) -> KindArray:
     beyond = 1.0 / max(math.fmod(system.dead_time_periods, 1.0) * system.bins, 1e-30)
     if system.dead_time_periods > 1.0 and beyond <= 2**TOL.cheap_halvings:
         short = max(short, beyond)
-    return np.full(system.bins, least_power(1, short, 0, TOL.halvings), np.uint8)
+    return int(least_power(1, short, least, TOL.halvings))
 
 
-def resolving(system: System, kinds: KindArray, structure: float, bins: IndexArray | slice) -> KindArray:
-    """A grid whose cells in some `bins` are narrow enough for the distance to a finer grid to tell anything.
+def _resolving(system: System, structure: float, least: int) -> int:
+    """Halvings of a bin, `least` or more, from which a comparison with a finer grid is meaningful.
 
-    Where the dead time is nearly whole periods, what registers in a cell re-arms in the same cell, and both grids are
-    wrong alike until cells are narrower than the light's `structure` (periods), or than what the dead time is off.
+    Where the dead time is nearly a whole number of periods, a pixel re-arms in the cell in which it registered, and
+    both grids have the same error until cells are narrower than the `structure` of the light (periods), or than the
+    difference of the dead time from whole periods.
     """
-    dead = system.dead_time_periods
-    widest = 0.5 * max(structure, abs(math.remainder(dead, 1.0)))
-    if dead == 0.0:
-        return kinds
-    out = kinds.copy()
-    least = least_power(1, 1.0 / max(widest * system.bins, 1e-30), 0, TOL.halvings)
-    out[bins] = np.maximum(out[bins], least.astype(np.uint8))
-    return out
+    widest = 0.5 * max(structure, abs(math.remainder(system.dead_time_periods, 1.0)))
+    return int(least_power(1, 1.0 / max(widest * system.bins, 1e-30), least, TOL.halvings))
 
 
 class Check(NamedTuple):
-    """What is known of a grid for some pixels (n,): see `Grids`.
+    """Properties of a grid for some pixels (n,): see `Grids`.
 
     `distance` of the mean and `spread`, of the variance (0 where it is not judged); `parts` (n, bins) of their squares.
     """
@@ -163,12 +167,9 @@ class Check(NamedTuple):
     def of(
         cls, task: Task, pixels: IndexArray, kinds: KindArray, *, variance: bool = True, parts: bool = False
     ) -> Check:
-        """Judge a grid; `parts` (0, bins) where they are not wanted."""
+        """Judge a grid, `kinds` (bins,) or of joined bins; `parts` (0, bins) where they are not wanted."""
         both, sweeps = np.empty((2, pixels.size)), np.empty(pixels.size, np.int32)
-        spread, bins = (
-            np.empty(pixels.size if variance else 0),
-            np.empty((pixels.size if parts else 0, task.system.bins)),
-        )
+        spread, bins = np.empty(pixels.size if variance else 0), np.empty((pixels.size if parts else 0, kinds.size))
         _core.feedback_check(
             task.job, task.pulse, np.ascontiguousarray(pixels), kinds, both, sweeps, spread, bins, task.threads
         )
@@ -196,15 +197,25 @@ def _around_the_pulse(system: System, kinds: KindArray) -> KindArray:
     """A grid that resolves the pulse of a return in the middle bin."""
     low, high = (math.floor(edge / system.bin_ns) for edge in system.pulse.support_ns())
     lit = (system.bins // 2 + np.arange(low, min(high + 2, low + system.bins))) % system.bins
-    return resolving(system, kinds, _structure(system), lit)
+    out = kinds.copy()
+    out[lit] = np.maximum(out[lit], _resolving(system, _structure(system), 0))
+    return out
 
 
-def _even_halvings(task: Task, pixels: IndexArray, start: KindArray) -> tuple[IndexArray, IndexArray, FloatArray]:
-    """How often all cells of each pixel (n,) must be halved, -1 where that is too often; sweeps, fewest armed (n,)."""
-    halvings, sweeps = np.zeros(pixels.size, np.int64), np.zeros(pixels.size, np.int64)
+def _even_halvings(task: Task, pixels: IndexArray) -> tuple[IndexArray, IndexArray, FloatArray]:
+    """How often all bins of each pixel (n,) must be halved, -1 where that is too often; sweeps, fewest armed (n,).
+
+    Of waveforms, whose light is wider than a few bins, a grid of joined bins is judged first, as far as the sweeps
+    allow, which costs less: where it is fine enough, so are bins.
+    """
+    system, structure, waveforms = task.system, _structure(task.system, task.flux), task.flux.waveform is not None
+    joined = -min(TOL.joined, (system.bins & -system.bins).bit_length() - 1) if waveforms else 0
+    first = max(_sweepable(system, joined), _resolving(system, structure, joined))
+    halvings, sweeps = np.full(pixels.size, first), np.zeros(pixels.size, np.int64)
     armed, unlike = np.zeros(pixels.size), np.ones(pixels.size, np.bool_)
-    most = (TOL.cells // cells_of(start)).bit_length() - 1
-    open_ = np.arange(pixels.size)
+    most = (TOL.cells // system.bins).bit_length() - 1
+    able = np.full(pixels.size, first <= most)
+    open_ = np.flatnonzero(able)
     while open_.size:
         rest = []
         for k in np.unique(halvings[open_]):
@@ -212,18 +223,18 @@ def _even_halvings(task: Task, pixels: IndexArray, start: KindArray) -> tuple[In
             distance = np.zeros(at.size)
             for judged in np.unique(unlike[at]):  # a variance that is right on a grid is so on a finer one
                 some = unlike[at] == judged
-                check = Check.of(task, pixels[at[some]], np.asarray(start + k, np.uint8), variance=bool(judged))
+                check = Check.of(task, pixels[at[some]], even(system, k), variance=bool(judged))
                 distance[some], sweeps[at[some]], armed[at[some]] = check.of_law, check.sweeps, check.armed
-                unlike[at[some]] = check.spread > TOL.mean_distance
-            far = (distance > TOL.mean_distance) & (sweeps[at] <= TOL.mean_sweeps)
+                unlike[at[some]] = (check.spread > TOL.mean_distance) | (k < 0)
+            settled = sweeps[at] <= TOL.mean_sweeps
+            far = (distance > TOL.mean_distance) & settled | ~settled & (k < 0)
             # distances fall with the square of the width; whether so many halvings do is judged in the next round
-            ratio = distance[far] / TOL.mean_distance
-            halvings[at[far]] += least_power(2, ratio, 1, TOL.halvings_at_once)
-            halvings[at[far & (halvings[at] > most)]] = most + 1 if k < most else -1
-            halvings[at[far & (k < most) & (halvings[at] > most)]] = most
-            rest.append(at[far & (halvings[at] >= 0)])
+            more = k + least_power(2, distance[far] / TOL.mean_distance, 1, TOL.halvings_at_once)
+            able[at[far]] = k < most
+            halvings[at[far]] = np.minimum(more, most) if k >= 0 else 0
+            rest.append(at[far & able[at]])
         open_ = np.concatenate(rest)
-    return halvings, sweeps, armed
+    return np.where(able, np.maximum(halvings, 0), -1), sweeps, armed
 
 
 # Pixels of a single return: the same cells for all, because every lane begins half a period before its return
@@ -345,34 +356,34 @@ def _recut(kinds: KindArray, widest: KindArray, distance: FloatArray, parts: Flo
 
 
 class FeedbackEngine(Engine):
-    """Cyclic feedback: an integer histogram that agrees with itself round the laser period.
+    """Cyclic feedback: an integer histogram that is consistent with itself around the laser period.
 
-    The pixel is armed iff nothing was registered within the last dead time. Folded over the exposure, the counts
-    of a bin are binomial given those of the preceding dead time; this engine finds the histogram that satisfies
-    all these laws at once for one uniform number per bin. Its mean and covariance are those of
-    ``H = lambda (N_r + e - G H) + M``; the law is right bin by bin and jointly (docs/feedback.md).
-    The cost is that of some sweeps over the bins, whatever the number of cycles.
+    The pixel is armed if and only if no photon was registered within the last dead time. Folded over the exposure, the
+    counts of a bin are binomial given those of the preceding dead time; this engine finds the histogram that satisfies
+    all these laws at once for one uniform number per bin. Its mean and covariance are those of ``H = lambda (N_r + e -
+    G H) + M``; the law of each bin and the joint law are correct (docs/feedback.md). The cost is that of some sweeps
+    over the bins, for any number of cycles.
 
-    Pixels whose sweeps would not forget their past within a period, or whose count hardly varies (locked ones, of a
-    bright pulse or background), are cut into pieces of several periods that go through their bins together, with
-    numbers of their own in each; the whole periods of a dead time are left out of the pieces.
+    Pixels whose sweeps depend on more than one period, or whose count hardly varies (locked pixels, a bright pulse or
+    background), are divided into pieces of several periods, each with random numbers of its own, which are swept
+    together; the whole periods of a dead time are omitted from the pieces.
 
-    The internal grid is judged by its own mean: bins are cut until no linear function of the histogram is off by more
+    The internal grid is judged by its mean: bins are divided until no linear function of the histogram is off by more
     than a twentieth of its standard deviation.
 
-    Pixels that it cannot do are given to the exact engine, by a rule on the pixel and the system alone: exposures
-    below 100 dead times, sweeps that contract too slowly (some 15 or more background photons per dead time), locked
-    pixels below 1e4 periods, more than 65,536 internal cells.
-    Every drawn exposure is checked before it is written: its history must agree with itself, arm no negative number
-    of exposures, and have a count that its law allows; else that exposure is drawn by the exact engine. Without dead
+    Some pixels are drawn by the exact engine instead, by a rule on the pixel and the system alone: exposures below 100
+    dead times, sweeps that contract too slowly (some 15 or more background photons per dead time), locked pixels below
+    1e4 periods, and pixels with more than 65,536 internal cells.
+    Every drawn exposure is checked before it is written: its history must be consistent, without negative armed
+    numbers, and its count must be possible under its law; otherwise the exact engine draws that exposure. Without dead
     time the bins are independent Poisson numbers.
 
     The same seed gives the same bits whatever the threads, chunks, parts of the image and vector width. `level`
     forces one of ``_core.levels()``.
 
-    Reports ``pixels given to exact`` and ``exposures drawn again by exact``, and each of them by reason where there
-    are any, such as ``pixels given to exact, slow sweeps``; and where there are any, ``exposures drawn again by
-    feedback``, with other numbers of the same law.
+    Reports ``pixels given to exact`` and ``exposures drawn again by exact``, and, if there are any, each of them by
+    reason, such as ``pixels given to exact, slow sweeps``, and ``exposures drawn again by feedback``, with other random
+    numbers of the same law.
     """
 
     name = "feedback"
@@ -397,7 +408,7 @@ class FeedbackEngine(Engine):
         plan: Plan | None = None,
         worth: NDArray[np.float64] | None = None,
     ) -> Rest:
-        """Fill the rows of `pixels` (n,) and return those that this engine cannot do, whose rows are not filled.
+        """Fill the rows of `pixels` (n,) and return those that this engine cannot draw, whose rows are not filled.
 
         `plan` of these pixels; `worth` (n,): cells of all laps beyond which another engine is quicker for a pixel.
         """
@@ -432,7 +443,7 @@ StatusArray = NDArray[np.uint8]
 
 
 class Reason(IntEnum):
-    """What became of an exposure: `FeedbackStatus` of native/feedback/kernel.h, and reasons known before."""
+    """Outcome of an exposure: `FeedbackStatus` of native/feedback/kernel.h, and reasons known before the draw."""
 
     DRAWN = 0
     SLOW = 1
@@ -447,7 +458,7 @@ class Reason(IntEnum):
 
     @property
     def words(self) -> str:
-        """As a report names it."""
+        """The name in a report."""
         return _WORDS[self]
 
 
@@ -480,7 +491,7 @@ The number is the task's first realization in the output.
 
 @dataclass(frozen=True, eq=False)
 class Rest:
-    """What is to be drawn exactly: whole pixels (n,), and single exposures of others, (m,) realization and pixel."""
+    """Exposures to be drawn exactly: whole pixels (n,), and single exposures of others, (m,) realization and pixel."""
 
     pixels: IndexArray
     realization: IndexArray
@@ -500,7 +511,7 @@ class Rest:
         return cls(np.sort(pixels[all_of_it]), realization, pixels[column])
 
     def blocks(self, realizations: int) -> Iterator[tuple[int, int, IndexArray]]:
-        """What is to be drawn as first realization of the call, number of them, and pixels."""
+        """The same as blocks: first realization of the call, number of realizations, and pixels."""
         if self.pixels.size:
             yield 0, realizations, self.pixels
         for number in np.unique(self.realization):
@@ -509,9 +520,9 @@ class Rest:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """What is known of pixels (n,) before their sweeps.
+    """Properties of pixels (n,) before their sweeps.
 
-    `reason` why sweeps are not even tried, or DRAWN.
+    `reason`: why sweeps are not tried, or DRAWN.
     """
 
     grids: Grids

@@ -1,4 +1,4 @@
-"""The engine of the MaRS paper: a count from its law, its registrations from the shape of the mean histogram."""
+"""The engine of the MaRS paper: a count from its law, registrations from the shape of the mean histogram."""
 
 from __future__ import annotations
 
@@ -32,39 +32,40 @@ _COUNTS = ("exact", "matched", "gaussian")
 class MarsEngine(CountTimesShape):
     """Whole histograms from two statistics of a pixel: N from the count law, Multinomial(N, pi) from the shape pi.
 
-    arXiv 2512.04924, with the finite exposure's exact statistics in place of the stationary chain's. The law of the
-    count and the mean histogram are right; *the joint law of the bins is not*, because successive registrations
-    repel each other: the variance of a window of bins is off by factors such as 0.28 and 9.7.
+    The method of arXiv 2512.04924, with the exact statistics of the finite exposure in place of those of the stationary
+    chain. The law of the count and the mean histogram are exact; *the joint law of the bins is not*, because
+    registrations are at least a dead time apart: the variance of a window of bins is off by factors such as 0.28 and
+    9.7.
 
     Parameters
     ----------
     table
         `mars_lidar.Table` of this system (any number of cycles): cumulants and shapes are interpolated in (S, B),
         the shape is moved to the pixel's delay to a fraction of a bin. None: every distinct (S, B, delay), or waveform,
-        is evaluated by itself, exactly, which takes from a millisecond to some ten of them each.
+        is evaluated exactly, which takes from one to some ten milliseconds each.
     count
         ``"exact"``: the exact law. With a table it is the discrete law of the table's four cumulants where these fix
         it to a total variation of 0.002 (`Lookup.trusted`), and evaluated for every other distinct pixel, which takes
         some tenths of a millisecond each (ten for dead times beyond a period).
         ``"matched"``: the law of four cumulants everywhere, off by at most some 0.02 in pixels locked to the laser.
         ``"gaussian"``: the paper's, a rounded normal number of the right mean and variance, at least 0. Rounding
-        adds 1/12 to the variance of a wide law and has no rule for a narrow one: it spoils pixels that are locked
-        to the laser, whose variances go down to 0.04.
+        adds 1/12 to the variance of a wide law; it is wrong for pixels that are locked to the laser, whose variances
+        go down to 0.04.
     interpolation
         For a table: ``"bilinear"`` in (log S, log B), the default, or ``"nearest"`` grid point, the paper's.
     outside
-        For a table, of pixels beyond its grid: ``"error"``, the default, or ``"exact"``, to evaluate them as without
-        a table, and count them in the report. Pixels without a return (S = 0) are no error: where the grid has no
-        S = 0 they are evaluated.
+        For pixels beyond the grid of a table: ``"error"``, the default, or ``"exact"``, to evaluate them as without
+        a table, and count them in the report. Pixels without a return (S = 0) never raise an error: where the grid has
+        no S = 0 they are evaluated.
     level
         Forces one of ``_core.levels()`` (vector widths); it changes speed only.
 
     Raises
     ------
     TypeError
-        A table that is none.
+        `table` is not a `Table`.
     ValueError
-        An unknown `count`, `interpolation`, `outside` or `level`; those of a table without one.
+        An unknown `count`, `interpolation`, `outside` or `level`; options of a table without a table.
 
     See Also
     --------
@@ -72,9 +73,10 @@ class MarsEngine(CountTimesShape):
 
     Notes
     -----
-    Seconds of the stages go to the report: ``lookup_s``, ``evaluation_s``, ``counts_s``, ``sampling_s`` (alignment
-    included), and ``pixels_evaluated``, those that no table was used for. With a table, ``pixels_exact_count`` had
-    their count's law evaluated beside it, by ``laws_evaluated`` distinct evaluations.
+    The report has the seconds of the stages, ``lookup_s``, ``evaluation_s``, ``counts_s`` and ``sampling_s`` (alignment
+    included), and ``pixels_evaluated``, the number of pixels evaluated without a table. With a table,
+    ``pixels_exact_count`` is the number of pixels whose count law was evaluated, by ``laws_evaluated`` distinct
+    evaluations.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""The pixels of a flux: one return each or waveforms, which are alike, and how shapes are moved to their delays."""
+"""The pixels of a flux (one return each, or waveforms), equal pixels, and the shift of shapes to their delays."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Group:
 
 
 def groups(flux: Flux, system: System, pixels: IndexArray, *, delays: bool = True) -> Iterator[Group]:
-    """The distinct ones among some pixels, in batches of moderate memory.
+    """The distinct pixels among some pixels, in batches of moderate memory.
 
     Without `delays` pixels of one return are distinct by (S, B) alone, and the cells have the canonical delay.
     """
@@ -144,7 +144,7 @@ class Alignment:
 
 
 def shift_of(delay_ns: FloatArray, period_ns: float) -> FloatArray:
-    """By how much delays (pixels,) are behind the canonical one: periods in [0, 1)."""
+    """Difference of delays (pixels,) from the canonical delay, in periods in [0, 1)."""
     shift = np.nan_to_num(delay_ns / period_ns) - 0.5
     shift -= np.floor(shift)
     shift[shift >= 1.0] = 0.0

@@ -1,4 +1,4 @@
-"""The Poisson engine: what most of the literature trains on; no dead time."""
+"""The Poisson engine, without dead time, as used for training in most of the literature."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ class PoissonEngine(Engine):
     """Independent Poisson counts of mean N_r l_j in every bin: the law of the *arrivals*.
 
     The baseline "Poisson" of the MaRS paper (arXiv 2512.04924): N ~ Poisson(Lambda N_r), shape lambda / Lambda.
-    It ignores when the detector registers, in every mode: its dead time and, if it is synchronous, that it sees one
-    photon a period. Only a gate is not ignored, since arrivals outside of it do not exist; it must not move.
+    It ignores the dead time in every mode, and the limit of one registration per period of a synchronous detector. A
+    fixed gate is applied, because arrivals outside it do not exist; a moving gate is refused.
     Reproducible on one processor family.
     """
 
@@ -27,7 +27,7 @@ class PoissonEngine(Engine):
     modes = MODES
 
     def check(self, flux: Flux, system: System) -> None:
-        """A gate that moves is an error."""
+        """Refuse a moving gate."""
         if system.detector.gate_moves:
             raise ValueError(
                 "engine 'poisson' needs a gate that repeats every period, got "
@@ -35,5 +35,5 @@ class PoissonEngine(Engine):
             )
 
     def histogram(self, task: Task, out: NDArray[Any]) -> None:
-        """Every bin on its own."""
+        """Independent Poisson counts in every bin."""
         _core.poisson_histogram(task.job, task.pulse, out, task.threads, task.progress)

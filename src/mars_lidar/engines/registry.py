@@ -1,4 +1,4 @@
-"""The engines by name: which there are, and which of them to use where one cannot."""
+"""The engines by name, and the alternatives where an engine does not apply."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ ANY_SYSTEM = tuple(name for name, engine in ENGINES.items() if engine.any_system
 
 
 def check_detector(engine: Engine, system: System) -> None:
-    """Raise ValueError, naming the engines to use, where `engine` does not do the detector's mode or effects."""
+    """Raise ValueError, naming alternatives, if `engine` does not support the detector's mode or effects."""
     if system.cycles > TOL.cycles:
         raise ValueError(f"cycles must be an integer in [1, {TOL.cycles}] to be simulated, got {system.cycles}")
     mode = system.detector.mode
@@ -59,7 +59,7 @@ def find_engine(engine: str | Engine, **options: Unpack[EngineOptions]) -> Engin
     engine
         A name, as for `mars_lidar.simulate`, such as ``"exact"``, ``"auto"`` or ``"mars"``; or an `Engine`.
     options
-        `EngineOptions`; those that are None have the engine's defaults.
+        `EngineOptions`; None: the default of the engine.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""The renewal baseline of the MaRS paper: the chain's shape, and the count law of light spread over the period."""
+"""The renewal baseline of the MaRS paper: the shape of the chain, and the count law of a constant rate."""
 
 from __future__ import annotations
 
@@ -23,25 +23,25 @@ class RenewalEngine(CountTimesShape):
 
     The baseline "Renewal" of the MaRS paper (arXiv 2512.04924): mean t lambda / (1 + lambda t_d) and variance
     t lambda / (1 + lambda t_d)^3 with lambda = (S + B) / t_r, rounded to integers and at least 0; pi the stationary
-    distribution of the Markov chain of phases (arXiv 2509.20500). Mean and variance are wrong where a pulse
-    matters; the shape is right for an exposure that is long, or starts warmed up.
+    distribution of the Markov chain of phases (arXiv 2509.20500). Mean and variance are wrong for
+    pulsed light; the shape is right for an exposure that is long or has a stationary start.
 
     Parameters
     ----------
     table
-        `mars_lidar.Table` of this system: its shapes (of either method) in place of the chain's, and see
-        `MarsEngine`. None: the chain is solved for every distinct (S, B), some milliseconds each.
+        `mars_lidar.Table` of this system, whose shapes (of either method) replace those of the chain, see
+        `MarsEngine`. None: the chain is solved for every distinct (S, B), which takes some milliseconds each.
     interpolation, outside
-        As for `MarsEngine`; pixels beyond the grid get their own chain.
+        As for `MarsEngine`; for pixels beyond the grid the chain is solved.
     level
         Forces one of ``_core.levels()`` (vector widths); it changes speed only.
 
     Raises
     ------
     TypeError
-        A table that is none.
+        `table` is not a `Table`.
     ValueError
-        An unknown `interpolation`, `outside` or `level`; those of a table without one.
+        An unknown `interpolation`, `outside` or `level`; options of a table without a table.
 
     See Also
     --------

@@ -1,4 +1,4 @@
-"""The sequential engine: the gold standard, and the oracle of the exact engine."""
+"""The sequential engine: photon-by-photon simulation, the independent reference of the exact engine."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ class SequentialEngine(Engine):
     effects = EFFECTS
 
     def check(self, flux: Flux, system: System) -> None:
-        """Refuse stationary starts that twilight pulses keep from settling."""
+        """Refuse stationary starts that twilight pulses prevent from settling."""
         check_start(flux, system)
 
     def histogram(self, task: Task, out: NDArray[Any]) -> None:
-        """Every arrival that finds the pixel armed."""
+        """Every arrival at an armed pixel."""
         _core.sequential_histogram(task.job, task.pulse, out, task.threads, task.progress)
 
     def counts(self, task: Task) -> NDArray[np.int64]:

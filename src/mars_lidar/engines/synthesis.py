@@ -1,9 +1,9 @@
 """Count law x shape: laws of the counts, and the stage that the engines "mars" and "renewal" share.
 
-One word of a pixel's own random stream makes one count, whatever the law.
+One word of a pixel's random stream gives one count, for any law.
 
-A batch holds what is known of some pixels: laws of their counts, and their shapes as mixtures of rows. The native
-sampler draws Multinomial(N, shape) for each exposure; nothing depends on how pixels are batched.
+A batch contains the count laws of some pixels, and their shapes as mixtures of rows. The native sampler draws
+Multinomial(N, shape) for each exposure; the result does not depend on the batches.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from mars_lidar.statistics.count_pmf import Pmf
 
 @dataclass(frozen=True, eq=False)
 class Streams:
-    """Whose counts are drawn: pixels (P,) of `realizations` realizations from number `first` on."""
+    """Random streams of pixels (P,) in `realizations` realizations from number `first` on."""
 
     pixel_index: NDArray[np.uint32]
     realizations: int
@@ -172,7 +172,7 @@ class Batch:
 
     `pixels` (P,) their places in the image; `shapes` (rows, bins) float32, each summing to 1, of which pixel p mixes
     `rows` (P, 4) by `weights` (P, 4); `alignment` None where the rows are at the pixels' own delays. `guides`
-    (rows, 64) float32, at first zeros, takes what the sampler finds out about rows of canonical delay, for later use.
+    (rows, 64) float32, at first zeros, caches results of the sampler for rows of canonical delay.
     """
 
     pixels: IndexArray
@@ -211,7 +211,7 @@ class Batch:
 
 
 class Run:
-    """One task under way: draws batches into `out` (items, bins), keeps time, and reports the progress."""
+    """One running task: draws batches into `out` (items, bins), measures times, and reports the progress."""
 
     def __init__(self, task: Task, out: NDArray[Any], level: str = "") -> None:
         self.task, self.out, self.level = task, out, level
@@ -232,7 +232,7 @@ class Run:
 
     @property
     def waiting(self) -> Progress | None:
-        """For work before the sampling of a batch: keeps the caller in touch, at the same place."""
+        """Progress callback during work before the sampling of a batch, with unchanged progress."""
         tell = self.task.progress
         return None if tell is None else lambda done, total: tell(self._done, self.task.items)
 

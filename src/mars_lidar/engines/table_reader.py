@@ -1,7 +1,7 @@
-"""Engines that draw pixels from a lookup table, where there is one, and the others one by one.
+"""Engines that draw pixels from a lookup table, if given, and evaluate the others.
 
-What they ask of the table: that it fits the system, the entries of pixels, a record for a cube's file; and exact laws
-of the count for pixels whose four cumulants do not fix it.
+This module checks that the table fits the system, reads the entries of pixels, makes a record for the file of a cube,
+and evaluates exact count laws for pixels whose four cumulants do not determine the law.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ _OUTSIDE = ("error", "exact")
 
 @dataclass(frozen=True, eq=False)
 class Entries:
-    """What a table says of some pixels (P,) of the image, in the order of its grid.
+    """Table entries of some pixels (P,) of the image, in the order of the grid.
 
-    Neighbours on the grid follow each other, so that their rows are still in the processor's cache.
+    Neighbours on the grid are adjacent, so that their rows stay in the processor's cache.
     """
 
     pixels: IndexArray
@@ -61,7 +61,7 @@ class Entries:
 
 
 class TableReader:
-    """A table as an engine reads it: which, how between its grid points, and whether pixels may lie beyond them."""
+    """A table as read by an engine: the table, its interpolation, and the treatment of pixels beyond its grid."""
 
     def __init__(self, table: Table, interpolation: str | None, outside: str | None) -> None:
         if not (callable(getattr(table, "lookup", None)) and callable(getattr(table, "shapes", None))):
@@ -74,11 +74,11 @@ class TableReader:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What a cube depends on: interpolation, and which table."""
+        """Settings on which a cube depends: interpolation and table."""
         return {"interpolation": self.interpolation, "table": table_record(self.table)}
 
     def check(self, flux: Flux, system: System) -> None:
-        """The table is of this system but for the number of cycles, and every pixel has one return, on its grid."""
+        """Check that the table is of this system (for any cycles) and every pixel has one return within its grid."""
         ours, theirs = system.detected().to_dict(), self.table.system.to_dict()
         for name in ours:
             if name != "cycles" and ours[name] != theirs[name]:
@@ -113,10 +113,10 @@ class TableReader:
             )
 
     def warn_of_start_up(self, task: Task) -> None:
-        """Warn, before anything is drawn, where a short armed exposure has its start-up in the wrong place.
+        """Warn, before drawing, if the table misplaces the start-up of a short armed exposure.
 
-        A start-up misplaces at most some registrations, so that only short exposures are evaluated, and of them some of
-        the brightest pixels. The report says by how much: ``start_up_error``.
+        At most some registrations are misplaced, so that only short exposures are evaluated, at some of the brightest
+        pixels. The report has the error, ``start_up_error``.
         """
         system, single = task.system, single_return(task.flux)
         assert single is not None  # see check
@@ -202,9 +202,9 @@ def _shapes(table: Table, cycles: int) -> tuple[NDArray[np.float32], NDArray[np.
 
 
 def table_record(table: Table) -> dict[str, Any]:
-    """Names a table in the file of a cube: hash of its content, cycles, method and grid.
+    """Identifies a table in the file of a cube: hash of its content, cycles, method and grid.
 
-    The hash is of what a cube depends on: axes, shapes, and cumulants at the nodes.
+    The hash covers axes, shapes, and cumulants at the nodes, on which a cube depends.
     """
     signal, background = (np.ascontiguousarray(axis, dtype=np.float64) for axis in (table.signal, table.background))
     nodes = table.at(np.repeat(signal, background.size), np.tile(background, signal.size), interpolation="nearest")
@@ -230,7 +230,7 @@ def untrusted(run: Run, reader: TableReader, entries: Entries) -> IndexArray:
 
 
 def exact_laws(run: Run, reader: TableReader, entries: Entries, at: IndexArray) -> Tabulated:
-    """Laws of the pixels `at`, each distinct one evaluated once; those that the table keeps are taken from it."""
+    """Laws of the pixels `at`, each distinct law evaluated once, or taken from the table if stored there."""
     keys = _keys(run, reader, entries, at)
     _, first, law = np.unique(keys, axis=0, return_index=True, return_inverse=True)
     windows = _table_laws(run, reader, entries, at[first], keys[first])
@@ -283,11 +283,11 @@ _PER_DECADE = {"signal": 58, "background": 16}  # 4 % apart: the mean count is t
 def image_table(
     flux: Flux, system: System, threads: int | None = None, progress: Progress | None = None
 ) -> Table | None:
-    """A table that reaches the pixels of `flux` for `mars` and `renewal`, from the cache or built and put there.
+    """A table that covers the pixels of `flux` for `mars` and `renewal`, from the cache, or built and cached.
 
-    None where there is none to be had or nothing to be gained: waveforms, several returns in a pixel, a detector
-    without one, fewer than `Tolerances.table_pixels` distinct pixels. What lies beyond it (S = 0 or B = 0) is
-    evaluated: give ``outside="exact"``.
+    None if a table is impossible or of no use: waveforms, several returns in a pixel, a detector without tables, fewer
+    than `Tolerances.table_pixels` distinct pixels. Pixels beyond it (S = 0 or B = 0) are evaluated with
+    ``outside="exact"``.
     """
     from mars_lidar.statistics.cells import require_mode
     from mars_lidar.table import Table
@@ -323,7 +323,7 @@ def _axis(name: str, photons: FloatArray) -> Any:
 
 
 class CountTimesShape(Engine):
-    """Draws N from a law of the count, and its registrations from a shape; both from a table or evaluated."""
+    """Draws N from a count law and its registrations from a shape, both from a table or evaluated."""
 
     def __init__(self, table: Table | None, interpolation: str | None, outside: str | None, level: str) -> None:
         for name, value in (("interpolation", interpolation), ("outside", outside)):
@@ -338,7 +338,7 @@ class CountTimesShape(Engine):
         return self.reader.settings if self.reader else {}
 
     def check(self, flux: Flux, system: System) -> None:
-        """A table must be of the system, reach the pixels unless they may lie outside, and knows one return each."""
+        """Check that the table is of the system and covers the pixels unless they may lie outside; one return each."""
         if self.reader:
             self.reader.check(flux, system)
 

@@ -1,4 +1,4 @@
-"""What the engines judge by: every tolerance and limit of theirs, with its unit and where it comes from."""
+"""Tolerances and limits of the engines, each with its unit and origin."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Tolerances:
-    """Quantities that the choice of an engine, a grid or a warning depends on."""
+    """Quantities that determine the choice of an engine or a grid, and warnings."""
 
     # feedback: the internal grid (engines/feedback.py)
     mean_distance: float = 0.05
@@ -37,6 +37,8 @@ class Tolerances:
     """Rounds of refinement in which cells may be joined; later ones only halve, so that there is an end."""
     worthwhile: float = 0.8
     """Share of a grid's cells: one with fewer is judged too, because cost is proportional to the cells."""
+    joined: int = 2
+    """Times that bins are joined by pairs for a first look at waveforms: a quarter of the cost."""
     halvings_at_once: int = 4
     """At most: the first distances from a wide grid are not of second order."""
 

@@ -1,7 +1,7 @@
-"""The explorer: a page that draws pixels and their exact laws in a browser, and a server that shows it own cubes.
+"""The explorer: a page that shows pixels and their exact laws in a browser, and a server for cubes of the user.
 
-`page.html` holds everything the page needs, the native sources compiled to WebAssembly with it; `explorer/build` in a
-checkout makes it (docs/explorer.md).
+`page.html` is self-contained, with the native sources compiled to WebAssembly; `explorer/build` in a checkout makes it
+(docs/explorer.md).
 """
 
 from mars_lidar.explore.server import CubeServer, page_text

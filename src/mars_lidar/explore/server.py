@@ -1,7 +1,7 @@
-"""The explorer's page with a cube of the user's own, served to this machine only.
+"""The explorer's page with a cube of the user, served to this machine only.
 
-It listens on the loopback address; every path begins with a random word, and a request for another host's name, as a
-page elsewhere would send it after naming this machine its own, is refused.
+The server listens on the loopback address; every path begins with a random word, and requests with another host name
+are refused (DNS rebinding).
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _MAX_CONNECTIONS = 32  # at a time, each a thread: a browser opens six to a host
 
 
 def page_text() -> str:
-    """The page; FileNotFoundError, in one line, where this installation came without it."""
+    """The page; FileNotFoundError if this installation does not contain it."""
     page = files("mars_lidar.explore").joinpath("page.html")
     if not page.is_file():
         raise FileNotFoundError("this installation has no page for the explorer: explorer/build in a checkout makes it")
@@ -47,16 +47,16 @@ def page_text() -> str:
 
 
 class CubeServer:
-    """Serves the page, and the pixels of `cube` (None: the page's own picture) as they are clicked.
+    """Serves the page, and pixels of `cube` (None: the built-in image of the page) on a click.
 
     Parameters
     ----------
     cube
-        An open cube; its counts are read in the parts that are asked for.
+        An open cube; its counts are read in the requested parts.
     name
-        The file's name, which the page shows and its Python reads.
+        The name of the file, for the page and its Python snippet.
     port
-        0: one that is free.
+        Port on the loopback address; 0: a free one.
     """
 
     def __init__(self, cube: Cube | None = None, name: str = "", *, port: int = 0) -> None:
@@ -78,7 +78,7 @@ class CubeServer:
         self.url = f"http://{self.hosts[0]}{self._word}/"
 
     def serve(self) -> None:
-        """Answer until the process is interrupted, or `stop` is called by another thread."""
+        """Answer requests until the process is interrupted or another thread calls `stop`."""
         self._server.serve_forever()
 
     def stop(self) -> None:
@@ -86,11 +86,11 @@ class CubeServer:
         self._server.shutdown()
 
     def close(self) -> None:
-        """Give the port back."""
+        """Release the port."""
         self._server.server_close()
 
     def answer(self, target: str) -> tuple[str, bytes]:
-        """Type and content of what `target`, path and query, asks for; KeyError where that is nothing."""
+        """Type and content for `target` (path and query); KeyError for an unknown path."""
         asked = urlsplit(target)
         if not secrets.compare_digest(asked.path[: len(self._word)].encode(), self._word.encode()):
             raise KeyError(target)
@@ -137,7 +137,7 @@ class CubeServer:
         totals = counts.sum(-1, dtype=np.float64)
         if given["method"] == "truth":
             if cube.measured or cube.flux.waveform is not None:
-                raise ValueError("the file does not tell the true depth")
+                raise ValueError("the file does not contain the true depth")
             delay = cube.flux.returns_delay_ns.reshape(-1, height, width)[0, first : first + rows]
         else:
             method = _METHODS[given["method"]]
@@ -247,7 +247,7 @@ _SUPPORTED = (*LIGHT_EFFECTS, "afterpulsing", "twilight_ns", "electronics_dead_t
 
 
 def settings_of(system: System) -> tuple[dict[str, Any], str]:
-    """What the page's sliders are set to for a system, and why it has no exact law there, or nothing."""
+    """The settings of the page for a system, and the reason if it has no exact law there."""
     detector = system.detector
     settings: dict[str, Any] = {
         "period": system.period_ns,
@@ -283,7 +283,7 @@ def settings_of(system: System) -> tuple[dict[str, Any], str]:
 
 
 def truth_of(cube: Cube) -> str:
-    """Why the light of a cube cannot be told by one return over uniform background, or nothing."""
+    """The reason if the light of a cube is not one return over uniform background, else empty."""
     if cube.measured:
         return ""
     if cube.flux.waveform is not None or len(cube.flux.returns_signal) > 1:

@@ -1,1 +1,1 @@
-"""The instrument: laser pulse, detector with its effects, histogram, and the system that they make."""
+"""The instrument: laser pulse, detector with its effects, histogram, and the system of all of them."""

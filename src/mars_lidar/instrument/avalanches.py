@@ -22,18 +22,18 @@ _KERNELS = {
 @constructed_by_name
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Afterpulsing:
-    """Carriers that an avalanche leaves in traps and that are released later: each is an arrival like a photon.
+    """Afterpulsing: carriers that an avalanche leaves in traps; each, when released, acts like an arriving photon.
 
     Every avalanche leaves a Poisson number of them (Straka et al., J. Lightwave Technol. 38, 4765 (2020), arXiv
-    2001.10036), with independent delays counted from the avalanche. One that is released during the dead time is
-    lost; one that finds it armed triggers an avalanche, which leaves carriers again.
+    2001.10036), with independent delays from the avalanche. A carrier that is released during the dead time is
+    lost; one that is released while the pixel is armed triggers an avalanche, which leaves carriers again.
 
     Parameters
     ----------
     probability
-        Mean number of carriers per avalanche, in (0, 1), those included that will be lost in the dead time. With
-        exponential delays the share e^(-t_d / delay) of them outlives the dead time of its own avalanche: an
-        afterpulse probability p after a dead time, as data sheets state it, is
+        Mean number of carriers per avalanche, in (0, 1), including those that are lost in the dead time. With
+        exponential delays a share e^(-t_d / delay) of them outlives the dead time of the avalanche: an
+        afterpulse probability p after a dead time, as stated in data sheets, is
         ``Afterpulsing.after_dead_time(probability=p, ...)``.
     delay_ns
         Mean of exponential delays, ns; in place of ``delays`` and ``bin_ns``.
@@ -46,7 +46,7 @@ class Afterpulsing:
     Raises
     ------
     TypeError
-        A probability or delay that is no number.
+        A probability or delay is not a number.
     ValueError
         A probability outside (0, 1), a delay that is not positive, or both `delay_ns` and `delays`.
 
@@ -106,7 +106,7 @@ class Afterpulsing:
     ) -> Afterpulsing:
         """Exponential delays with `probability` afterpulses per avalanche after its dead time.
 
-        `delay_ns` is their mean, `dead_time_ns` that of the detector, `generations` as here.
+        `delay_ns` is the mean delay, `dead_time_ns` that of the detector, `generations` as for `Afterpulsing`.
         """
         after_dead = checks.real("probability", probability, low=0.0, high=1.0, strict_low=True)
         delay = checks.real("delay_ns", delay_ns, low=0.0, strict_low=True)
@@ -140,7 +140,7 @@ class Afterpulsing:
         return np.asarray(below / below[-1] if below[-1] > 0 else below)
 
     def check(self, period_ns: float) -> None:
-        """Raise ValueError for delays that are out of all proportion to the laser period `period_ns`."""
+        """Raise ValueError for delays too short or too long for the laser period `period_ns`."""
         most = TOL.delay_periods * period_ns
         if self.mean_delay_ns > most:
             raise ValueError(
@@ -169,23 +169,23 @@ class Afterpulsing:
 class Crosstalk:
     """Optical crosstalk: an avalanche triggers neighbouring pixels at the same time, where they are armed.
 
-    Each neighbour is triggered independently of the others; the avalanches so triggered trigger their neighbours, and
-    so on. Pixels at the border of the image have fewer neighbours. Since the pixels of an image influence each other,
-    it is simulated as a whole.
+    Each neighbour is triggered independently of the others; these avalanches trigger their own neighbours, and so on.
+    Pixels at the border of the image have fewer neighbours. Since the pixels influence each other, the image is
+    simulated as a whole.
 
     Parameters
     ----------
     probability
-        Mean number of neighbours that an avalanche triggers where all are armed, in (0, 1]: the sum over the
-        neighbours of the probability for each.
+        Mean number of neighbours that an avalanche triggers if all are armed, in (0, 1]: the sum of the probabilities
+        of the neighbours.
     kernel
-        ``"4"`` (the pixels above, below, left and right), ``"8"`` (the diagonal ones too), all alike; or relative
-        weights (3, 3) of the neighbours, that of the pixel itself in the middle 0.
+        ``"4"`` (the pixels above, below, left and right) or ``"8"`` (also the diagonal ones), with equal probabilities;
+        or relative weights (3, 3) of the neighbours, 0 in the middle.
 
     Raises
     ------
     TypeError
-        A probability that is no number; a kernel of another kind.
+        A probability that is not a number; a kernel of another type.
     ValueError
         A probability outside (0, 1], or weights that are not (3, 3), finite, non-negative and 0 in the middle.
 
@@ -237,7 +237,7 @@ class Crosstalk:
 
     @classmethod
     def from_dict(cls, data: Any) -> Crosstalk:
-        """The crosstalk that `to_dict` described by `data`; ``kernel: 4`` without quotes is understood."""
+        """The crosstalk that `to_dict` described by `data`; ``kernel: 4`` without quotes is accepted."""
         known = dict(checks.known_keys("crosstalk", data, ("probability", "kernel"), needed=("probability",)))
         if isinstance(known.get("kernel"), int):
             known["kernel"] = str(known["kernel"])

@@ -1,4 +1,4 @@
-"""The detector pixel: dead time, when an arrival is registered, gate, effects. Definitions: docs/detectors.md."""
+"""The detector pixel: dead time, mode, gate, effects. Definitions: docs/detectors.md."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ class Detector:
         laser period or many periods.
     mode
         - ``"nonparalyzable"``: free-running; photons that arrive during the dead time have no effect,
-        - ``"paralyzable"``: free running; every arrival, registered or not, begins the dead time anew, so that
-          an arrival is registered iff none came within the dead time before it,
-        - ``"synchronous"``: armed at the start of each laser period, registers the first photon and nothing
-          more until the next; a dead time that is not over at the start of a period costs that whole period,
-        - ``"gated"``: photons outside of the gate do not exist; inside, as ``"nonparalyzable"``. Where the gate
+        - ``"paralyzable"``: free-running; every arrival, registered or not, restarts the dead time, so that
+          an arrival is registered if and only if none came within the dead time before it,
+        - ``"synchronous"``: armed at the start of each laser period, registers the first photon of the period
+          only; a dead time that extends beyond the start of a period makes the pixel dead for that whole period,
+        - ``"gated"``: only photons within the gate count; inside, as ``"nonparalyzable"``. If the gate
           opens during the dead time, the pixel is armed when its dead time ends.
     gate_start_ns, gate_width_ns
         The gate is open on [start, start + width) of each period; one that reaches beyond the end of the period
@@ -54,8 +54,7 @@ class Detector:
     gate_step_ns
         The start advances by this much (modulo the period, either sign) ...
     gate_cycles
-        ... every so many periods, for a gate that is moved during the exposure. Default: 0 and 1, a gate that
-        stays.
+        ... every so many periods, for a gate that moves during the exposure. Default: 0 and 1, a fixed gate.
 
     detection_efficiency
         Probability, fill factor included, that a photon of the `Flux` triggers an avalanche; in (0, 1]. 1: the flux
@@ -64,32 +63,33 @@ class Detector:
         Rate of avalanches without a photon, counts/s: uniform in time, in the gate of a gated pixel only. Rates pixel
         by pixel: `Flux.with_dark_counts`.
     afterpulsing
-        `Afterpulsing`: carriers that an avalanche leaves in traps and that trigger others when they are released.
+        `Afterpulsing`: carriers that an avalanche leaves in traps and that trigger further avalanches when released.
     twilight_ns
         Arrivals within this time before the end of a dead time, ns, are not lost: the pixel fires at its end (a
         twilight pulse). At most the dead time; mode ``"nonparalyzable"`` only.
     recovery_ns
         Time constant r, ns, with which the sensitivity returns after a dead time t_d (Krause and Walenta, *Exponential-
         recovery model for free-running SPADs with capacity-induced dead-time imperfections*, arXiv 2507.10361, 2025):
-        what arrives at t after a registration at T triggers an avalanche with the probability
-        ``1 - exp(-(t - T - t_d) / r)``, in addition to `detection_efficiency`, each arrival for itself; photons,
-        dark counts, afterpulses and crosstalk alike. One that does not is lost, and changes nothing. Twilight pulses
-        fire all the same. A pixel without a registration before, as at an armed start, is fully sensitive. At most 1e6
-        laser periods; modes ``"nonparalyzable"`` and ``"gated"`` (it recovers whether the gate is open or not).
+        an arrival at t after a registration at T triggers an avalanche with the probability
+        ``1 - exp(-(t - T - t_d) / r)``, in addition to `detection_efficiency`, independently for each photon, dark
+        count, afterpulse and crosstalk event; otherwise it is lost. Twilight pulses are not affected. A pixel without
+        a previous registration, as at an armed start, is fully sensitive. At most 1e6 laser periods; modes
+        ``"nonparalyzable"`` and ``"gated"`` (recovery continues while the gate is closed).
     crosstalk
         `Crosstalk`: avalanches trigger neighbouring pixels. The pixels of an image then depend on each other.
     electronics_dead_time_ns
-        An avalanche is recorded only where none was within this time before it, t_e, ns, beside the dead time of the
-        pixel itself; without effect unless longer. The electronics are ready at the start of an exposure.
+        An avalanche is recorded only if no other occurred within this time t_e before it, ns, in addition to the dead
+        time of the pixel; without effect unless longer. The electronics are ready at the start of an exposure.
     max_events_per_period, max_events_per_exposure
-        The electronics record no more events than this of a laser period, and of an exposure: the first ones.
+        Largest number of events that the electronics record in a laser period, and in an exposure; later events are
+        lost.
     jitter
-        `Jitter` or `SampledJitter`: what a record's time is off from that of its avalanche. It decides nothing: dead
-        times, gate, limits and exposure go by the avalanche.
+        `Jitter` or `SampledJitter`: difference between the recorded time and that of the avalanche. Dead time, gate,
+        limits and exposure are determined by the time of the avalanche.
     code_density
         Non-linearity of the time-to-digital converter: relative widths (n,) of n neighbouring codes, as a code-density
-        test finds them. n divides the number of bins, and the pattern repeats (the taps of a delay line in each cycle
-        of the clock); n = bins gives every bin its own.
+        test measures them. n divides the number of bins, and the pattern repeats (the taps of a delay line in each
+        cycle of the clock); n = bins gives every bin its own.
 
     Raises
     ------
@@ -168,7 +168,7 @@ class Detector:
 
     @classmethod
     def preset(cls, name: str) -> Detector:
-        """A detector as published, by its `name` in `mars_lidar.instrument.presets.PRESETS` (docs/detectors.md).
+        """A published detector, by its `name` in `mars_lidar.instrument.presets.PRESETS` (docs/detectors.md).
 
         `dataclasses.replace` changes fields. Efficiencies stay at 1, because they depend on the wavelength.
         """
@@ -207,7 +207,7 @@ class Detector:
 
     @property
     def effects(self) -> tuple[str, ...]:
-        """Names of the effects that are on and change anything, in the order in which they act."""
+        """Names of the effects that are on and have an effect, in the order in which they act."""
         on = [name for name, field in effects.FIELDS.items() if getattr(self, name) != field.off]
         if self.electronics_dead_time_ns <= self.dead_time_ns:  # registrations are that far apart in every mode
             on = [name for name in on if name != "electronics_dead_time_ns"]
@@ -219,7 +219,7 @@ class Detector:
 
     @property
     def gate_moves(self) -> bool:
-        """Whether the gate is moved during the exposure."""
+        """Whether the gate moves during the exposure."""
         return bool(self.gate_step_ns)
 
     def gate_periods(self, period_ns: float) -> tuple[float, float, float]:
@@ -230,7 +230,7 @@ class Detector:
         return start % 1.0, step % 1.0, min(self.gate_width_ns / period_ns, 1.0)
 
     def check(self, period_ns: float, bins: int, start: str) -> None:
-        """Raise ValueError, naming the field, for what makes no sense at this `period_ns`, `bins` and `start`."""
+        """Raise ValueError, naming the field, for values that are invalid at this `period_ns`, `bins` and `start`."""
         if self.jitter is not None:
             self.jitter.check(period_ns)
         if self.afterpulsing is not None:
@@ -281,7 +281,7 @@ class Detector:
 
 
 def require_effects(what: str, detector: Detector, able: tuple[str, ...], instead: Callable[[str], str]) -> None:
-    """Raise ValueError, naming the first effect that is on and not in `able`, and what `instead` says of it."""
+    """Raise ValueError, naming the first effect that is on and not in `able`, with the alternative from `instead`."""
     for name in detector.effects:
         if name not in able:
             value = repr(getattr(detector, name))
@@ -314,14 +314,14 @@ def dark_count_map(
     hot_fraction
         Probability that a pixel is hot, in [0, 1].
     hot_factor
-        Median of the hot pixels over that of the others; their logarithms spread alike.
+        Ratio of the median of the hot pixels to that of the others; their logarithms have the same spread.
     seed
         Integer in [0, 2**64).
 
     Raises
     ------
     TypeError
-        A rate, factor or shape that is no number.
+        A rate, factor or shape is not a number.
     ValueError
         A shape that is not (H, W), or a number out of its range.
 

@@ -1,8 +1,8 @@
 """Effects of a pixel and its electronics beside dead time and mode: the optional fields of `Detector`.
 
 Every effect is declared here once: its check, its form in files, its option, its native fields. All are off by default,
-and then the bits are those of the ideal pixel. The order in which they act, and what each of them is taken to be, is in
-docs/detectors.md; the steps that add one are in docs/architecture.md.
+and then the bits are those of the ideal pixel. docs/detectors.md defines each effect and the order in which they act;
+docs/architecture.md lists the steps to add one.
 """
 
 from __future__ import annotations
@@ -41,16 +41,16 @@ Kind = Literal["light", "avalanche", "recording", "timing"]
 
 @dataclass(frozen=True)
 class Effect:
-    """All that is declared of a field of `Detector` that is an effect.
+    """Declaration of a field of `Detector` that is an effect.
 
     kind
-        What it changes. ``"light"``: the flux only (`Flux.detected`), which every engine and statistic takes.
+        What it changes. ``"light"``: the flux only (`Flux.detected`), supported by every engine and statistic.
         ``"avalanche"``: further arrivals that an avalanche causes in the same pixel or in its neighbours.
         ``"recording"``: which registrations of a pixel are recorded; ``"timing"``: at what time, but not how many.
     off
-        The value that switches it off: the bits of the ideal pixel.
+        The value that switches it off, with the bits of the ideal pixel.
     checked
-        The value as it is kept; TypeError or ValueError, naming the field, for one that makes no sense.
+        The converted value; TypeError or ValueError, naming the field, for an invalid one.
     example
         Its lines in the commented file of ``mars-lidar init``.
     read
@@ -59,7 +59,7 @@ class Effect:
         The fields of the native job (avalanche) or of its recording (recording, timing) for a value and the laser
         period, ns; times in periods. None for light.
     help, default
-        Of the option of the command line that has its name; None: it has options of its own (cli/system_options.py).
+        Of its command-line option of the same name; None: it has separate options (cli/system_options.py).
     """
 
     kind: Kind

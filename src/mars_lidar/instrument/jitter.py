@@ -1,4 +1,4 @@
-"""Timing jitter: by how much a record is later than its avalanche."""
+"""Timing jitter: the delay of a recorded time after its avalanche."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from mars_lidar.instrument.pulse import FWHM_PER_SIGMA, SampledPulse, shape_from
 @constructed_by_name
 @dataclass(frozen=True, kw_only=True)
 class Jitter:
-    """Timing jitter: a record is later than its avalanche by a Gaussian number, some by an exponential one on top.
+    """Timing jitter: Gaussian difference of a recorded time from its avalanche, plus an exponential delay for a share.
 
     Parameters
     ----------
@@ -28,12 +28,12 @@ class Jitter:
     tail_ns
         Mean of the exponential delay of carriers that diffuse into the multiplication region, ns.
     tail_fraction
-        Share of the avalanches that have it, in [0, 1].
+        Share of the avalanches with this exponential delay, in [0, 1].
 
     Raises
     ------
     TypeError
-        A width or fraction that is no number.
+        A width or fraction is not a number.
     ValueError
         `sigma_ns` is not positive, or one of `tail_ns` and `tail_fraction` is 0 without the other.
 
@@ -82,7 +82,7 @@ class Jitter:
 
     @property
     def finest_ns(self) -> float:
-        """Standard deviation of its narrowest feature, ns: a tail widens it, and smooths nothing."""
+        """Standard deviation of its narrowest feature, ns, that of the Gaussian: a tail does not smooth it."""
         return self.sigma_ns
 
     def reach_ns(self) -> tuple[float, float]:
@@ -120,7 +120,7 @@ class Jitter:
         return np.asarray(np.where(x > -5.0, near, np.exp(exponent) * ndtr(z - ratio)), dtype=np.float64)
 
     def check(self, period_ns: float) -> None:
-        """Sigma from 1e-6 to 1/20 of `period_ns`: 8.5 sigma lie within half a period. The tail's mean up to it."""
+        """Check sigma, 1e-6 to 1/20 of `period_ns` (8.5 sigma within half a period), and the tail's mean."""
         if not 1e-6 * period_ns <= self.sigma_ns <= 0.05 * period_ns:
             raise ValueError(
                 f"sigma_ns of a jitter must lie in [{1e-6 * period_ns:g}, {0.05 * period_ns:g}] ns "
@@ -138,7 +138,7 @@ class Jitter:
 @constructed_by_name
 @dataclass(frozen=True)
 class SampledJitter:
-    """A measured jitter: the density of the delay of a record after its avalanche, constant on samples.
+    """A measured jitter: density of the delay of a recorded time after its avalanche, constant on samples.
 
     Parameters
     ----------
@@ -152,7 +152,7 @@ class SampledJitter:
     Raises
     ------
     TypeError
-        Values or times that are no numbers.
+        Values or times that are not numbers.
     ValueError
         Samples that are not 1-D, finite and non-negative, or sum to 0.
 

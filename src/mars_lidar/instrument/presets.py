@@ -1,7 +1,7 @@
-"""Detectors and instruments by name: parameters as published, each with its source (docs/detectors.md).
+"""Detectors and instruments by name: published parameters, each with its source (docs/detectors.md).
 
-A value of an instrument is a pair (value, source). Where no data sheet was at hand the source begins with "assumption":
-check it before you rely on it. The table in docs/detectors.md is `table` of this.
+A value of an instrument is a pair (value, source). The source of a value without a data sheet begins with "assumption";
+check such values before use. The table in docs/detectors.md is `table` of this.
 """
 
 from __future__ import annotations

@@ -49,7 +49,7 @@ class Pulse(ABC):
 
     @abstractmethod
     def check(self, period_ns: float) -> None:
-        """Raise ValueError where this pulse cannot be used at the laser period `period_ns`."""
+        """Raise ValueError if this pulse cannot be used at the laser period `period_ns`."""
 
     @abstractmethod
     def to_dict(self) -> dict[str, Any]:
@@ -66,9 +66,9 @@ class Pulse(ABC):
         return as_html(self, {"pulse (1/ns) over the time after the delay (ns)": (edges[1:], density)})
 
     def wrapped_cumulative(self, t_ns: ArrayLike, period_ns: float) -> NDArray[np.float64]:
-        """Energy until `t_ns` of the pulse train of period `period_ns`, from a fixed origin: grows by 1 a period.
+        """Energy of the pulse train of period `period_ns` from a fixed origin to `t_ns`; increases by 1 each period.
 
-        Differences of it are exact energies of an interval, wrap-around included.
+        Its differences are exact energies of intervals, wrap-around included.
         """
         t = np.asarray(t_ns, dtype=np.float64)
         flat, total = t.reshape(-1), np.empty(t.size)
@@ -126,9 +126,9 @@ class GaussianPulse(Pulse):
     Raises
     ------
     TypeError
-        A width that is no number.
+        A width that is not a number.
     ValueError
-        `sigma_ns` is not positive and finite; `System` asks for 1e-6 to 1 period.
+        `sigma_ns` is not positive and finite; `System` requires 1e-6 to 1 period.
 
     See Also
     --------
@@ -180,7 +180,7 @@ class GaussianPulse(Pulse):
         return total
 
     def check(self, period_ns: float) -> None:
-        """Sigma between 1e-6 and 1 times `period_ns`: narrower is a delta to the sampler, wider is flat."""
+        """Sigma between 1e-6 and 1 times `period_ns`: narrower is a delta function to the sampler, wider is flat."""
         if not 1e-6 * period_ns <= self.sigma_ns <= period_ns:
             raise ValueError(
                 f"sigma_ns must lie in [{1e-6 * period_ns:g}, {period_ns:g}] ns (1e-6 to 1 period), "
@@ -212,16 +212,17 @@ class SampledPulse(Pulse):
         - ``"centroid"``: the circular mean of the record,
         - ``"first"``: the start of sample 0.
 
-        For ``"peak"`` and ``"centroid"`` the record is cyclic and is cut opposite the origin, so a response
-        whose rising edge was stored at the end of the array is put together again. For ``"first"`` it is
-        taken as it stands.
+        For ``"peak"`` and ``"centroid"`` the record is cyclic and is cut opposite the origin, so that a response
+        whose rising edge is stored at the end of the array is rejoined. For ``"first"`` it is
+        used as given.
 
     Raises
     ------
     TypeError
-        Values or times that are no numbers.
+        Values or times that are not numbers.
     ValueError
-        Samples that are not 1-D, finite and non-negative, or sum to 0; `System` asks that the record fits in a period.
+        Samples that are not 1-D, finite and non-negative, or sum to 0; `System` requires that the record fits in a
+        period.
 
     See Also
     --------
@@ -283,7 +284,7 @@ class SampledPulse(Pulse):
         return f"SampledPulse({self.values.size} samples, bin_ns={self.bin_ns:g}, origin={self.origin!r})"
 
     def support_ns(self) -> tuple[float, float]:
-        """The record's extent around the origin, samples without energy at either end left out."""
+        """Extent of the record around the origin, without samples of zero energy at either end."""
         inside = np.flatnonzero(np.diff(self._cumulative) > 0)
         return (
             self._start_ns + float(inside[0]) * self.bin_ns,

@@ -1,4 +1,4 @@
-"""The instrument: laser, detector and histogram, as one frozen object that goes along with every result."""
+"""The instrument: laser, detector and histogram, as one frozen object that accompanies every result."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ class System:
     period_ns
         Laser period t_r, ns.
     cycles
-        Laser periods per exposure N_r, at most 1e8 to be simulated; the exposure lasts ``cycles * period_ns``.
+        Laser periods per exposure N_r, at most 1e8 in a simulation; the exposure lasts ``cycles * period_ns``.
     bins
         Histogram bins over one period n_b.
     pulse
-        Shape of the returned pulse, detector response included; without it where the detector has a jitter.
+        Shape of the returned pulse, including the detector response unless the detector has a jitter.
     detector
-        Dead time, mode and gate of the pixel, and what else it does.
+        Dead time, mode, gate and effects of the pixel.
     start
         State of the pixel at the start of the exposure: ``"armed"`` (ready at t = 0) or ``"stationary"``
         (warmed up). The two differ by up to half a count in the mean.
@@ -53,14 +53,14 @@ class System:
     ------
     ValueError
         A number out of its range, a pulse that does not fit in the period, a dead time above 2^20 periods, or settings
-        that no detector combines; the text names the setting.
+        that exclude each other; the message names the setting.
     TypeError
-        A pulse or detector of another type, a number that is none, or an unknown keyword.
+        A pulse or detector of another type, a value that is not a number, or an unknown keyword.
 
     Warns
     -----
     UnitWarning
-        A time that is possible, and likely meant in ps or s: a dead time of 75,000 ns, a pulse of 100 ns.
+        A possible time that was probably meant in ps or s: a dead time of 75,000 ns, a pulse of 100 ns.
 
     See Also
     --------
@@ -142,7 +142,7 @@ class System:
         return self.detector.electronics_dead_time_ns / self.period_ns
 
     def detected(self) -> System:
-        """This system for a flux of detected photons, `Flux.detected`: efficiency and dark counts are in that flux."""
+        """This system for a flux of detected photons, `Flux.detected`, which includes efficiency and dark counts."""
         bare = self.detector.without(*LIGHT_EFFECTS)
         return self if bare == self.detector else self.replace(detector=bare)
 
@@ -168,11 +168,11 @@ class System:
 
     @property
     def max_bin_count(self) -> float:
-        """Most registrations that one bin can hold: inf for a dead time of 0.
+        """Largest possible count of one bin; inf for a dead time of 0.
 
-        A bin is open for one bin width per period, which fits floor(width / t_d) + 1 registrations, and an
-        exposure fits floor(exposure / t_d) + 1 in all; only the latter where records are moved into the bin. A
-        synchronous pixel registers once in max(1, ceil(t_d / t_r)) periods.
+        One bin width per period allows floor(width / t_d) + 1 registrations, and an exposure floor(exposure / t_d) + 1;
+        only the latter limit holds where jitter moves records into the bin. A synchronous pixel registers once in
+        max(1, ceil(t_d / t_r)) periods.
         """
         dead = self.detector.dead_time_ns
         if self.detector.mode == "synchronous":
@@ -186,7 +186,7 @@ class System:
 
     @property
     def histogram_dtype(self) -> np.dtype[Any]:
-        """uint16, or uint32 where a bin could exceed 65535; a function of the system alone."""
+        """uint16, or uint32 if a bin could exceed 65535; a function of the system alone."""
         return np.dtype(np.uint16 if self.max_bin_count <= np.iinfo(np.uint16).max else np.uint32)
 
     def replace(self, **changes: Any) -> System:
@@ -194,7 +194,7 @@ class System:
         return dataclasses.replace(self, **changes)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data, JSON and YAML ready, from which `System.from_dict` makes an equal system."""
+        """Plain data for JSON and YAML, from which `System.from_dict` makes an equal system."""
         return {
             "period_ns": self.period_ns,
             "cycles": self.cycles,
@@ -217,8 +217,8 @@ class System:
     def preset(cls, name: str) -> System:
         """An instrument by its `name` in `mars_lidar.instrument.presets.INSTRUMENTS`, with its laser and time bins.
 
-        Where each value is from, or that it is an assumption, stands in docs/detectors.md and in the file that
-        ``mars-lidar init --preset NAME`` writes. ValueError for one that is a detector alone (`Detector.preset`).
+        The source of each value, or that it is an assumption, is stated in docs/detectors.md and in the file that
+        ``mars-lidar init --preset NAME`` writes. ValueError for a preset of a detector alone (`Detector.preset`).
         """
         fields = sourced(name)
         if "period_ns" not in fields:
@@ -228,7 +228,7 @@ class System:
         return cls(period_ns=period, cycles=cycles, bins=bins, pulse=pulse, detector=Detector.preset(name))
 
     def to_json(self) -> str:
-        """One line of JSON; floats are written so that they read back to the same bits."""
+        """One line of JSON; floats are read back with the same bits."""
         return json.dumps(self.to_dict())
 
     @classmethod
@@ -257,7 +257,7 @@ class System:
     @classmethod
     @checked
     def load(cls, path: str | Path) -> System:
-        """Read the file `path` that `save` wrote; an error names the file, the line and the key."""
+        """Read the file `path` that `save` wrote; errors name the file, the line and the key."""
         source = Path(path)
         if source.suffix not in (".json", ".yaml", ".yml"):
             raise ValueError(f"path must end in .json, .yaml or .yml, got {str(path)!r}")

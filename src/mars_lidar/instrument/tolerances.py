@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Tolerances:
-    """Numbers of the instrument that are no arguments.
+    """Constants of the instrument that are not arguments.
 
     Attributes
     ----------

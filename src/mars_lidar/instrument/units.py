@@ -11,7 +11,7 @@ from mars_lidar.instrument.tolerances import TOL
 
 
 class UnitWarning(UserWarning):
-    """A possible value that is likely meant in another unit.
+    """A value that is possible but was probably given in another unit.
 
     See Also
     --------
@@ -35,14 +35,14 @@ _PULSE, _DEAD, _GATE = (41.0, 0.31, 2e4), (25_000.0, 25.0, 1e6), (0.0, 25.0, 1e6
 
 
 def period_hint(period_ns: float) -> str:
-    """Hint at the period that was likely meant, or an empty text."""
+    """Hint at the period that was probably meant, or an empty text."""
     if period_ns < 1e-3:  # 1 ps
         return f"period_ns={period_ns:g} is {period_ns:g} ns: {1e9 * period_ns:.4g} ns, if it was given in seconds"
     return ""
 
 
 def check_units(period: float, pulse: Pulse, detector: Detector) -> None:
-    """Warn of times that are 1000 or 1e9 times what is usual."""
+    """Warn of times that are 1000 or 1e9 times the usual values."""
     if hint := period_hint(period):
         _warn(hint)
     times = [

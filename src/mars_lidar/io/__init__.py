@@ -1,4 +1,4 @@
-"""Files: histogram cubes with everything that is needed to make them again.
+"""Files: histogram cubes with everything needed to simulate them again.
 
 Every library is imported when its format is first used.
 """

@@ -1,8 +1,8 @@
-"""HDF5 captures of light around corners: tal and mitransient, and the Zaragoza NLOS data set. Read, and written back.
+"""Reading and writing HDF5 captures of non-line-of-sight imaging: tal, mitransient, and the Zaragoza NLOS data set.
 
 tal (github.com/diegoroyo/tal, ``tal/io``): ``H`` with the time first and ``H_format``; ``delta_t``, ``t_start``. The
 Zaragoza data set (graphics.unizar.es/nlos_dataset): ``data`` with colours and bounces, ``deltaT``, ``t0``, in the order
-of MATLAB or of HDF5, told apart as tal does. Times are metres of optical path, time = path / c.
+of MATLAB or of HDF5, distinguished as in tal. Times are metres of optical path, time = path / c.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _BAND_BYTES = 64 * 2**20
 
 @dataclass(frozen=True)
 class Capture:
-    """Where the light of a capture is, and how it becomes an image."""
+    """Location of the light in a capture, and its axes as an image."""
 
     file: UnchangedFile
     name: str  # of its data set
@@ -46,7 +46,7 @@ class Capture:
 
     @property
     def rows(self) -> str:
-        """Axes of the image's rows: the laser's points where there are several, else y of the sensor's."""
+        """Axes of the image's rows: the laser points if there are several, else y of the sensor points."""
         several = math.prod(self._size.get(axis, 1) for axis in "XYl") > 1
         return "".join(axis for axis in ("XYl" if several else "y") if axis in self.axes)
 
@@ -115,7 +115,7 @@ class Capture:
 
 
 def capture_in(opened: UnchangedFile, file: Any) -> Capture | None:
-    """The capture in an open HDF5 file, or None where it is none."""
+    """The capture in an open HDF5 file, or None for other files."""
     if "H" in file and "H_format" in file:
         name, axes = "H", _tal_axes(file)
     elif "data" in file and "deltaT" in file:
@@ -132,7 +132,7 @@ def capture_in(opened: UnchangedFile, file: Any) -> Capture | None:
 
 
 def read_capture(path: str | Path) -> Capture:
-    """The capture in a file; ValueError where it is none, or does not tell its time bins."""
+    """The capture in a file; ValueError for other files, or if its time bins are not stated."""
     source = Path(path)
     if source.suffix.lower() not in CAPTURE_SUFFIXES:
         raise ValueError(f"{source}: a capture must be one of {', '.join(CAPTURE_SUFFIXES)}")
@@ -142,33 +142,34 @@ def read_capture(path: str | Path) -> Capture:
         if capture is None:
             raise ValueError(f"{source}: no capture of tal ('H', 'H_format') or Zaragoza's ('data', 'deltaT')")
     if capture.bin_ns is None or not capture.bin_ns > 0.0:
-        raise ValueError(f"{source}: does not tell the width of a time bin ({_TIMES[capture.name][0]})")
+        raise ValueError(f"{source}: does not state the width of a time bin ({_TIMES[capture.name][0]})")
     return capture
 
 
 @checked
 def save_capture(path: str | Path, cube: Cube, like: str | Path, *, overwrite: bool = False) -> None:
-    """Write the counts of a cube as a capture with the layout of another one, for the programs that read that.
+    """Write the counts of a cube as a capture with the layout of another capture.
 
     Parameters
     ----------
     path
         The new ``.hdf5``.
     cube
-        Of one exposure, of the image of `like` and at least as many bins, of the same width; later bins are left out.
+        A cube of one exposure with the image size and bin width of `like` and at least as many bins; later bins are
+        dropped.
     like
-        A capture of tal, mitransient, or the Zaragoza data set: everything but the light is copied from it, grids of
-        laser and sensor, ``t_start``, ``scene_info``. Of colours and bounces the first one holds the counts. The recipe
-        is in the attribute ``mars_lidar`` of the file, which those programs pass over.
+        A capture of tal, mitransient, or the Zaragoza data set: everything but the light is copied from it: grids of
+        laser and sensor, ``t_start``, ``scene_info``. The counts are written to the first colour and bounce, and the
+        recipe to the attribute ``mars_lidar`` of the file, which other programs ignore.
     overwrite
         Replace an existing file.
 
     Raises
     ------
     ValueError
-        Sizes or widths that differ.
+        Sizes or bin widths that differ.
     TypeError
-        Not a `Cube`, or a path that is no text or Path.
+        Not a `Cube`, or a path that is neither text nor Path.
 
     See Also
     --------

@@ -22,14 +22,14 @@ def points(depth_m: ArrayLike, focal_px: float) -> FloatArray:
     Parameters
     ----------
     depth_m
-        Range along the ray, as `mars_lidar.Scene` and `mars_lidar.Reconstruction` have it.
+        Range along the ray, as in `mars_lidar.Scene` and `mars_lidar.Reconstruction`.
     focal_px
         Focal length in pixels of this image; its centre is the principal point.
 
     Raises
     ------
     ValueError, TypeError
-        Ranges that are no (H, W) or (H, W, K) real numbers, or a focal length that is not positive.
+        Ranges that are not real numbers (H, W) or (H, W, K), or a focal length that is not positive.
 
     See Also
     --------
@@ -66,14 +66,14 @@ def save_cloud(
     error_m: ArrayLike | None = None,
     overwrite: bool = False,
 ) -> int:
-    """Write a ``.ply`` (binary, little endian) of the pixels with a depth; returns how many points it has.
+    """Write the pixels with a depth as a ``.ply`` (binary, little endian); returns the number of points.
 
     Parameters
     ----------
     path
         The file.
     depth_m, focal_px
-        As for `points`, also (H, W, K) of several returns a pixel; those of depth NaN or inf are left out.
+        As for `points`, also (H, W, K) for several returns a pixel; points with depth NaN or inf are omitted.
     intensity
         (H, W), or as the depth, property of the points, such as reflectivity or signal.
     error_m
@@ -86,7 +86,7 @@ def save_cloud(
     ValueError
         Another suffix, or maps of different shapes.
     TypeError
-        Maps that are no numbers.
+        Maps that are not numbers.
     OSError
         `path` exists and `overwrite` is false, or cannot be written.
 

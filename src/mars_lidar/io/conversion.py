@@ -1,4 +1,4 @@
-"""From one file format to another, and from a stored cube to its photons; what does not survive is told."""
+"""Conversion between file formats, and of a stored cube to its photons, with a list of data that are lost."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from mars_lidar.simulation import simulate_timestamps
 
 @dataclass(frozen=True)
 class Converted:
-    """What `convert` did.
+    """Result of `convert`.
 
     Attributes
     ----------
     path
         The new file.
     content
-        What is in it, in words.
+        Description of its content.
     lost
-        What the source has and the new file has not, a sentence each.
+        Data of the source that the new file does not contain, one sentence each.
 
     See Also
     --------
@@ -68,7 +68,7 @@ def convert(
     clock_ps: float | None = None,
     overwrite: bool = False,
 ) -> Converted:
-    """Write a cube or a photon stream in the format that the target's suffix names.
+    """Write a cube or a photon stream in the format given by the suffix of the target.
 
     Cubes: ``.zarr .h5 .hdf5 .npz .mat .ptu``; their counts and recipe are kept in all of them. Streams:
     ``.npz .ptu .h5 .hdf5`` (the last two as Photon-HDF5); times are kept to the resolution of the format. A
@@ -79,18 +79,18 @@ def convert(
     source, target
         The two files.
     realization
-        Of a cube: this exposure alone, counted from 0 in the file. A ``.mat`` holds no more than one.
+        For a cube: only this exposure, counted from 0 in the file. A ``.mat`` contains one exposure.
     period_ns, bins
-        Of a recorded stream: see `mars_lidar.Timestamps.load`.
+        For a recorded stream: see `mars_lidar.Timestamps.load`.
     clock_ps
-        Of a stream that becomes a ``.ptu``: see `mars_lidar.Timestamps.save`.
+        For a stream written as ``.ptu``: see `mars_lidar.Timestamps.save`.
     overwrite
         Replace an existing target.
 
     Raises
     ------
     ValueError, TypeError
-        Files of the wrong kind, damaged, incomplete, or beyond what the target's format can hold.
+        Files of another kind, damaged or incomplete files, or data that the target's format cannot contain.
     OSError
         The target exists and `overwrite` is false, or cannot be written.
 
@@ -144,7 +144,7 @@ def photons(
     Parameters
     ----------
     cube
-        What `load` returned.
+        A cube that `load` returned.
     realization
         Which exposure, counted from 0 in the file.
     threads, progress
@@ -153,7 +153,7 @@ def photons(
     Returns
     -------
     Timestamps
-        Their histogram is the stored exposure, count by count.
+        Their histogram equals the stored exposure.
 
     Raises
     ------
@@ -234,7 +234,7 @@ def _stream(times: Timestamps, old: Path, new: Path, overwrite: bool, clock_ps: 
 
 
 def resolution_ns(path: Path, times: Timestamps, clock_ps: float | None = None) -> float:
-    """Unit of the times that the format of `path` stores, ns; 0 for .npz, which holds them as they are."""
+    """Unit of the times in the format of `path`, ns; 0 for .npz, which stores them unchanged."""
     if path.suffix == ".npz":
         return 0.0
     if path.suffix == ".ptu":

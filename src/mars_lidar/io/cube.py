@@ -1,4 +1,4 @@
-"""A histogram cube with all that explains it: put on disk and read back, and as xarray has it."""
+"""A histogram cube with its system and light: written, read, and as an xarray data set."""
 
 from __future__ import annotations
 
@@ -50,21 +50,21 @@ SUFFIXES = tuple(_MODULES)
 
 @dataclass(frozen=True, eq=False, init=False)
 class Cube:
-    """A histogram cube: counts, the system that recorded them, and the light where it is known.
+    """A histogram cube: counts, the system that recorded them, and the light, if known.
 
-    What `io.load`, `io.foreign_cube` and `io.from_histograms` give, and `reconstruct`, `plot` and `io.save` take.
+    Returned by `io.load`, `io.foreign_cube` and `io.from_histograms`; input of `reconstruct`, `plot` and `io.save`.
 
     Parameters
     ----------
     counts
-        (realizations, H, W, bins) whole numbers, as `simulate` returns them; of one exposure, of a row of pixels and of
-        one pixel the leading axes may be left out.
+        (realizations, H, W, bins) whole numbers, as `simulate` returns them; leading axes of length 1 may be omitted
+        (one exposure, one row of pixels, one pixel).
     system
         Laser, detector and histogram.
     flux
-        The light of the pixels, where it is known.
+        The light of the pixels, if known.
     depth_m, reflectivity
-        Maps (H, W) of the scene, beside a flux; depth is c tau / 2 by default.
+        Maps (H, W) of the scene, together with a flux; default depth: c tau / 2.
 
     Attributes
     ----------
@@ -74,20 +74,21 @@ class Cube:
     recipe
         Arguments of the simulation, or the `Recording` of measured counts, which have no flux, engine and seed.
     complete
-        False for what an unfinished run left (see `load`).
+        False for the file of an unfinished run (see `load`).
     registrations
-        Total counts; None where they were never added up.
+        Total counts; None if they were not counted.
     version
         Version of mars-lidar that wrote the file.
     path
         The file, or None for a cube in memory or at a `url`.
     url
-        Where a cube that is read from elsewhere lies; "" for others.
+        Address of a remote cube; "" for others.
 
     Raises
     ------
     ValueError, TypeError
-        Counts, light or maps of shapes that do not fit the system or each other; counts that are no whole numbers >= 0.
+        Shapes of counts, light or maps that do not fit the system or each other; counts that are not whole numbers >=
+        0.
 
     See Also
     --------
@@ -145,7 +146,7 @@ class Cube:
 
     @classmethod
     def of(cls, histogram: CountArray, recipe: Recipe | Recording, **known: Any) -> Cube:
-        """A cube by what made or recorded it; `known` are further attributes."""
+        """A cube with the recipe that made it or the recording; `known` are further attributes."""
         if tuple(histogram.shape) != recipe.shape:
             raise ValueError(
                 f"histogram must have the shape {recipe.shape} of its recipe "
@@ -180,11 +181,9 @@ class Cube:
         return isinstance(self.recipe, Recording)
 
     def simulation(self, what: str = "this") -> Recipe:
-        """The recipe of a simulated cube; ValueError for a measured one, which `what` needs it for."""
+        """The recipe of a simulated cube; ValueError, naming `what` needs it, for a measured one."""
         if isinstance(self.recipe, Recording):
-            raise ValueError(
-                f"{self.path or 'the cube'} was measured, not simulated, and {what} needs the light behind it"
-            )
+            raise ValueError(f"{self.path or 'the cube'} was measured, not simulated, and {what} needs its light")
         return self.recipe
 
     @property
@@ -194,7 +193,7 @@ class Cube:
 
     @property
     def engine(self) -> str:
-        """Name of the engine; "measured" where there is none."""
+        """Name of the engine; "measured" for measured counts."""
         return self.recipe.engine
 
     @property
@@ -209,12 +208,12 @@ class Cube:
 
     @property
     def depth_m(self) -> NDArray[np.float64]:
-        """True depth (H, W), m; NaN where there is no return, or where it is not known."""
+        """True depth (H, W), m; NaN without a return, or if unknown."""
         return self.recipe.depth_m
 
     @property
     def reflectivity(self) -> NDArray[np.float64] | None:
-        """Reflectivity (H, W), or None where no scene is behind the flux."""
+        """Reflectivity (H, W), or None if the flux was not made from a scene."""
         return self.recipe.reflectivity
 
     @property
@@ -261,7 +260,7 @@ def _whole_numbers(counts: ArrayLike, system: System) -> NDArray[Any]:
 
 
 def as_cube(cube: Cube | ArrayLike, system: System | None, flux: Flux | None = None) -> Cube:
-    """The cube, or one of an array of counts and the system that recorded them."""
+    """The cube, or a new cube of an array of counts and the system that recorded them."""
     if isinstance(cube, Cube):
         if system is not None or flux is not None:
             raise TypeError("system and flux stand beside an array of counts: a Cube has its own")
@@ -285,7 +284,7 @@ def save(
 ) -> None:
     """Write a cube to a ``.zarr``, ``.h5``, ``.hdf5``, ``.npz``, ``.mat`` or ``.ptu``.
 
-    Of an array of counts with the `system` that recorded them, and its light where it is known, it makes a cube.
+    An array of counts is written as a cube with the `system` that recorded them and, if known, its light.
 
     Parameters
     ----------
@@ -294,14 +293,14 @@ def save(
     cube
         A `Cube`, or counts as `mars_lidar.simulate` returns them.
     system, flux
-        Beside counts: what recorded them, and the light where it is known.
+        With counts: the system that recorded them, and the light, if known.
     overwrite
         Replace an existing file.
 
     Raises
     ------
     ValueError
-        Another suffix, or a cube that the format cannot hold.
+        Another suffix, or a cube that the format cannot contain.
     TypeError
         Neither a cube nor counts, or counts without a system.
     OSError
@@ -365,20 +364,20 @@ def load(path: str | Path, *, allow_incomplete: bool = False) -> Cube:
     ----------
     path
         ``.zarr``, ``.h5``, ``.hdf5``, ``.npz``, ``.mat`` or ``.ptu`` written by mars-lidar; or the URL of a ``.zarr``
-        (``https://``, ``s3://``, ...: extra ``remote``), of which what is indexed is fetched.
+        (``https://``, ``s3://``, ...: extra ``remote``), which is fetched in parts when indexed.
     allow_incomplete
-        Open what an unfinished run left; parts that were not written read as zeros.
+        Open the file of an unfinished run; missing parts are read as zeros.
 
     Raises
     ------
     FileNotFoundError
         No such file.
     IncompleteFileError
-        The file was left by an unfinished run (a ValueError).
+        The file of an unfinished run (a ValueError).
     FileError
         Not a cube of mars-lidar, or damaged (a ValueError that names the file); a store that lacks a part.
     TypeError, ValueError
-        A path that is no text or Path, or an address that cannot be one.
+        A path that is neither text nor Path, or an invalid address.
 
     See Also
     --------
@@ -408,13 +407,13 @@ def load(path: str | Path, *, allow_incomplete: bool = False) -> Cube:
     form = format_of(plain, "path")
     check_finished(source)
     if plain != source and plain.suffix in (".mat", ".ptu"):  # no part of them is of use
-        raise IncompleteFileError(f"{source} is incomplete: a run that was stopped left it")
+        raise IncompleteFileError(f"{source} is incomplete: a stopped run left it")
     try:
         with reading(source, "a cube of mars-lidar"):
             return _opened(form.open_store(source), source, allow_incomplete)
     except FileError as error:
         if source.name.endswith(INCOMPLETE_SUFFIX) and not isinstance(error, IncompleteFileError):
-            raise IncompleteFileError(f"{source} is incomplete: a run that was stopped left it") from error
+            raise IncompleteFileError(f"{source} is incomplete: a stopped run left it") from error
         raise
 
 
@@ -426,7 +425,7 @@ def _opened(store: OpenedStore, source: Path, allow_incomplete: bool, url: str =
             raise IncompleteFileError(f"{url or source} is incomplete: its simulation did not finish{progress}")
         histogram = store.arrays.get("histogram")
         if histogram is None:
-            raise ValueError(f"{url or source} has no variable 'histogram': its writing stopped at the very start")
+            raise ValueError(f"{url or source} has no variable 'histogram': its writing stopped before the first count")
         recipe = layout.recipe_from(store.attrs, store.arrays, int(histogram.shape[0]))
         if tuple(histogram.shape) != recipe.shape or histogram.dtype != recipe.dtype:
             raise ValueError(
@@ -452,7 +451,7 @@ def _opened(store: OpenedStore, source: Path, allow_incomplete: bool, url: str =
 
 
 def check_output(path: str | Path, recipe: Recipe | Recording, *, overwrite: bool = False) -> None:
-    """Raise what writing the cube there would raise, without touching anything."""
+    """Raise the errors of writing the cube there, without writing."""
     target = Path(path)
     form = format_of(target, "out")
     check_target(target, folder=target.suffix == ".zarr", overwrite=overwrite)
@@ -461,12 +460,14 @@ def check_output(path: str | Path, recipe: Recipe | Recording, *, overwrite: boo
         check_memory(recipe.nbytes, what, "a .zarr or .h5 is read in parts")
     if target.suffix in (".mat", ".ptu"):  # formats with limits of their own
         if isinstance(recipe, Recording):
-            raise ValueError(f"a {target.suffix} keeps the light behind a cube, unknown of measured counts; use .h5")
+            raise ValueError(
+                f"a {target.suffix} stores the light of a cube, which is unknown for measured counts; use .h5"
+            )
         form.check(recipe)
 
 
 def open_writer(path: str | Path, recipe: Recipe | Recording) -> AbstractContextManager[Writer]:
-    """A writer for the format that the suffix names, where `check_output` finds nothing wrong."""
+    """A writer for the format of the suffix, after `check_output`."""
     opened: AbstractContextManager[Writer] = format_of(Path(path), "out").open_writer(Path(path), recipe)
     return opened
 
@@ -490,7 +491,7 @@ def to_xarray(
     depth_m: ArrayLike | None = None,
     reflectivity: ArrayLike | None = None,
 ) -> xarray.Dataset:
-    """Counts with named dimensions, coordinates and units, as ``xarray.open_zarr`` gives them of our stores.
+    """Counts with named dimensions, coordinates and units, as ``xarray.open_zarr`` returns them for our stores.
 
     Parameters
     ----------
@@ -498,21 +499,21 @@ def to_xarray(
         A `mars_lidar.io.Cube`, or counts of `mars_lidar.simulate`: (realizations, H, W, bins), or fewer dimensions as
         `mars_lidar.io.from_histograms` takes them.
     system
-        How they were recorded; of a `Cube` its own.
+        The system that recorded them; not for a `Cube`, which contains it.
     flux
-        The light behind counts, if it is known, (H, W).
+        The light of counts, if known, (H, W).
     depth_m, reflectivity
-        Maps (H, W) of the scene, beside a flux; depth is c tau / 2 by default.
+        Maps (H, W) of the scene, together with a flux; default depth: c tau / 2.
 
     Returns
     -------
     xarray.Dataset
-        ``histogram`` (realization, y, x, time), and what is known of the light.
+        ``histogram`` (realization, y, x, time), and the light, if known.
 
     Raises
     ------
     TypeError
-        Counts without the system that recorded them, or a cube beside a system of its own.
+        Counts without the system that recorded them, or a cube together with a system.
     ValueError
         Shapes that do not fit.
     MissingLibraryError

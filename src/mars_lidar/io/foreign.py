@@ -1,4 +1,4 @@
-"""Histograms and photon times in the files of others: NumPy, MATLAB, HDF5, TIFF, text, photon counters."""
+"""Histograms and photon times in files of other programs: NumPy, MATLAB, HDF5, TIFF, text, photon counters."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ FOREIGN_SUFFIXES = (".npy", ".npz", ".mat", ".h5", ".hdf5", ".tif", ".tiff", ".c
 
 @dataclass(frozen=True, eq=False)
 class ForeignCounts:
-    """What `read_counts` found."""
+    """Result of `read_counts`."""
 
     path: Path
     name: str  # of the array in the file; "" where the format has no names
@@ -87,11 +87,11 @@ def foreign_cube(
         cells of photon times), ``.h5``, ``.hdf5``, ``.tif`` (a page for each time bin), ``.csv`` or ``.txt`` (one
         histogram: a column of counts, or times and counts).
     system, axes, image, start_ns
-        As for `mars_lidar.io.from_histograms`. Default of `axes`: time is the dimension that is as long as the system
-        has bins where there is one such, else the last; of a TIFF the pages. A dimension of pixels goes through columns
-        in MATLAB's files, else through rows.
+        As for `mars_lidar.io.from_histograms`. Default of `axes`: time is the only dimension whose length is the
+        number of bins of the system, else the last; in a TIFF the pages. A dimension of pixels is ordered by columns in
+        files of MATLAB, else by rows.
     variable
-        Name of the array, of a file that has several; ``name[3]`` is the third of a MATLAB cell of arrays.
+        Name of the array in a file with several; ``name[3]`` is the third array of a MATLAB cell.
     unit_ns
         Unit of photon times, ns.
     window_ns
@@ -100,7 +100,7 @@ def foreign_cube(
     Raises
     ------
     FileNotFoundError, ValueError
-        No such file, not readable, or not what the arguments say; the message names the file.
+        A file that is missing, unreadable, or does not match the arguments; the message names it.
     TypeError
         An argument of another kind.
 
@@ -134,7 +134,7 @@ def read_counts(
     image: tuple[int, int] | None = None,
     bins: int | None = None,
 ) -> ForeignCounts:
-    """The array of a file, in order; `bins` is the length by which time is told from the image, if that is known."""
+    """The array of a file, its axes in order; `bins`, if known, identifies the time axis by its length."""
     source = Path(path)
     told_by = recorded(source) if source.suffix.lower() in RECORDER_SUFFIXES else None
     name, array = _chosen(source, arrays(source) if told_by is None else told_by.arrays, variable)
@@ -152,7 +152,7 @@ def read_counts(
 def arrays(path: Path) -> dict[str, Any]:
     """Every array of a file that could be histograms or photon times, by name: dense, sparse, or cells of times."""
     if path.suffix.lower() not in FOREIGN_SUFFIXES:
-        raise ValueError(f"{path}: histograms of others are read from {', '.join(FOREIGN_SUFFIXES)}")
+        raise ValueError(f"{path}: histograms of other programs are read from {', '.join(FOREIGN_SUFFIXES)}")
     with reading(path, "arrays of histograms"):
         if path.suffix.lower() in RECORDER_SUFFIXES:
             return dict(recorded(path).arrays)
@@ -164,7 +164,7 @@ _MOST_LISTED = 64  # cells of a variable that are opened to say what is in them
 
 
 def listed(path: Path) -> dict[str, str]:
-    """What a file holds, by name, in words; of .mat, .npz and HDF5 without reading the values."""
+    """Descriptions of the arrays in a file by name; for .mat, .npz and HDF5 without reading the values."""
     import h5py
 
     suffix = path.suffix.lower()
@@ -258,7 +258,7 @@ def _guessed(path: Path, shape: tuple[int, ...], bins: int | None) -> str:
     pixels = "(xy)" if kind == ".mat" else "(yx)"
     image = {1: [], 2: [pixels], 3: ["y", "x"], 4: ["n", "y", "x"]}.get(len(shape))
     if image is None:
-        raise ValueError(f"{path}: an array of shape {shape} is no cube of histograms")
+        raise ValueError(f"{path}: an array of shape {shape} is not a cube of histograms")
     fitting = [k for k, size in enumerate(shape) if size == bins]
     place = fitting[0] if len(fitting) == 1 else len(shape) - 1
     axes = "".join([*image[:place], "t", *image[place:]])

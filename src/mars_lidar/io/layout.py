@@ -1,4 +1,4 @@
-"""The layout that every format shares: variables with dimensions and units, and the attributes.
+"""The layout common to all formats: variables with dimensions and units, and attributes.
 
 Version 1 of the layout:
 
@@ -19,9 +19,9 @@ pixel_index         y, x                         where the cube is a part of a l
 ==================  ===========================  =====================================================
 
 Attributes: ``format``, ``format_version``, ``complete``, ``system`` (JSON), ``engine``, ``engine_settings``
-(JSON: what the counts depend on beside, such as the hash and grid of a table), ``seed``,
-``first_realization``, ``flux`` (JSON: what made the flux), ``source``, ``version`` (of this package) and,
-once complete, ``registrations``. Measured counts have ``engine`` "measured", and nothing that belongs to a flux.
+(JSON: further settings that determine the counts, such as the hash and grid of a table), ``seed``,
+``first_realization``, ``flux`` (JSON: origin of the flux), ``source``, ``version`` (of this package) and,
+once complete, ``registrations``. Measured counts have ``engine`` "measured", and no variables of a flux.
 """
 
 from __future__ import annotations
@@ -147,9 +147,9 @@ def attributes(recipe: Recipe | Recording) -> dict[str, str | int]:
 
 
 def recipe_from(attrs: Mapping[str, Any], arrays: Mapping[str, Any], realizations: int) -> Recipe | Recording:
-    """The recipe or the recording that `variables` and `attributes` wrote, of the variables of a file by name.
+    """The recipe or recording from the variables of a file by name and its attributes.
 
-    Waveforms larger than TOL.band_bytes stay on disk, where they are there.
+    Waveforms larger than TOL.band_bytes stay on disk.
     """
 
     def read(name: str) -> NDArray[Any]:

@@ -1,9 +1,9 @@
-"""Files of reconstructed maps: .zarr, .h5 or .npz with named dimensions, units and what they were made of.
+"""Files of reconstructed maps: .zarr, .h5 or .npz with named dimensions, units and their source.
 
-Variables (method, realization, y, x): ``depth``, ``reflectivity``, ``signal``, ``background``, ``delay``, errors of the
-methods that give them (NaN for the others), ``significance`` and ``flags``; of the methods for images half widths of
-90 % intervals and ``outlier``. Where several returns were looked for:
-``returns`` (their number), and of each (method, realization, y, x, return) ``return_depth``, ``return_signal``,
+Variables (method, realization, y, x): ``depth``, ``reflectivity``, ``signal``, ``background``, ``delay``, standard
+errors (NaN for methods without them), ``significance`` and ``flags``; for image methods half widths of 90 % intervals
+and ``outlier``. With several returns:
+``returns`` (their number), and for each (method, realization, y, x, return) ``return_depth``, ``return_signal``,
 ``return_delay``, their errors, and ``return_false_alarm``, nearest first, NaN beyond the last. Attributes: ``format`` =
 "mars-lidar maps", ``format_version``, ``system`` (JSON), ``level``, ``source`` (the cube), ``version``.
 """
@@ -69,7 +69,7 @@ def check_maps_output(path: str | Path, *, overwrite: bool = False) -> None:
 
 @checked
 def save_maps(path: str | Path, results: Mapping[str, Any], *, source: str = "", overwrite: bool = False) -> Path:
-    """Write each `mars_lidar.Reconstruction` (realizations, H, W) of a cube by method; whole or not at all."""
+    """Write each `mars_lidar.Reconstruction` (realizations, H, W) of a cube by method, completely or not at all."""
     target = Path(path)
     check_maps_output(target, overwrite=overwrite)
     variables, attrs = _contents(results, source)
@@ -102,9 +102,9 @@ def load_maps(path: str | Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]
     Raises
     ------
     FileNotFoundError, ValueError
-        No such file, or none of `save_maps`; a damaged one.
+        A file that is missing, damaged, or not written by `save_maps`.
     TypeError
-        A path that is no text or Path.
+        A path that is neither text nor Path.
     """
     source = Path(path)
     check_finished(source)

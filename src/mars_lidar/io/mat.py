@@ -1,4 +1,4 @@
-"""MATLAB v5 ``.mat``, the layout that depth networks of the field load: one exposure, counts sparse.
+"""MATLAB v5 ``.mat`` in the layout that published depth networks load: one exposure, counts sparse.
 
 ==========  ==================  =============================================================================
 variable    shape               holds
@@ -13,8 +13,8 @@ photons     (1, 1)              mean expected signal photons of a pixel in the e
 mars_lidar  (1, 1) struct       ours: ``attributes`` (JSON) and the maps of `mars_lidar.io.layout`
 ==========  ==================  =============================================================================
 
-All numbers are of MATLAB's class double; ``bin`` is stored as small integers, as MATLAB does with whole numbers, and
-so `scipy.io.loadmat` returns it as uint16. ``rates`` is zero where there is no return.
+All numbers are of MATLAB's class double. ``bin`` is stored as small integers, as MATLAB stores whole numbers, so that
+`scipy.io.loadmat` returns it as uint16. ``rates`` is zero without a return.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ _COMPRESSED, _DOUBLE_CLASS, _HEADER_BYTES = 15, 6, 128  # MAT-File Level 5: elem
 
 
 def check(recipe: Recipe) -> None:
-    """Raise ValueError for what the format cannot hold, before any work."""
+    """Raise ValueError, before any work, for data that the format cannot contain."""
     realizations, height, width, bins = recipe.shape
     if realizations != 1:
         raise ValueError(
@@ -67,7 +67,7 @@ def check(recipe: Recipe) -> None:
 
 @contextlib.contextmanager
 def open_writer(path: Path, recipe: Recipe, bin_hr: NDArray[np.float64] | None = None) -> Iterator[Writer]:
-    """Writes a cube, whose counts it keeps sparse until the end."""
+    """Writes a cube; its counts stay sparse in memory until the end."""
     from scipy import sparse
 
     check(recipe)
@@ -189,7 +189,7 @@ def open_store(path: Path) -> OpenedStore:
     if "mars_lidar" not in {head.name for head in mat5.variables(path)}:
         raise ValueError(
             f"{path} is not a cube written by mars-lidar (no variable 'mars_lidar'); "
-            f"mars_lidar.io.read_mat reads such files of others"
+            f"mars_lidar.io.read_mat reads such files of other programs"
         )
     variables = read_variables(path)
     ours = variables["mars_lidar"][0, 0]
@@ -218,7 +218,7 @@ def open_store(path: Path) -> OpenedStore:
 
 
 def read_variables(path: Path) -> dict[str, Any]:
-    """All variables of a v5 file; FileError where it is none or is damaged."""
+    """All variables of a v5 file; FileError for other or damaged files."""
     if _is_hdf5(path):
         raise FileError(f"{path} is a MATLAB v7.3 file (HDF5), and a v5 .mat is needed: save it with -v7")
     return read_mat5(path)
@@ -233,14 +233,14 @@ def _is_hdf5(path: Path) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class SpadMat:
-    """What such a file holds.
+    """Content of such a file.
 
     Attributes
     ----------
     histogram
         (H, W, bins) uint16 or uint32, counts.
     rates
-        (H, W, bins), signal before dead time; of a unit of its own.
+        (H, W, bins), signal before dead time, in arbitrary units.
     bin
         (H, W), bin of the return, from 1.
     bin_hr
@@ -290,11 +290,11 @@ def read_mat(path: str | Path) -> SpadMat:
     Raises
     ------
     ValueError
-        Not such a file, or damaged; the message starts with the file.
+        A file of another kind, or a damaged one; the message starts with the file.
     FileNotFoundError
         No such file.
     TypeError
-        A path that is no text or Path.
+        A path that is neither text nor Path.
 
     See Also
     --------
@@ -375,7 +375,7 @@ def save_mat(
     Raises
     ------
     ValueError, TypeError
-        A bad argument, or a cube that the format cannot hold.
+        An invalid argument, or a cube that the format cannot contain.
     OSError
         `path` exists and `overwrite` is false, or cannot be written.
 

@@ -1,4 +1,4 @@
-"""Histograms and photon times of other programs as cubes: the arrays are in memory, `foreign_cube` reads files."""
+"""Cubes from histograms and photon times of other programs in memory; `foreign_cube` reads files."""
 
 from __future__ import annotations
 
@@ -34,27 +34,27 @@ def from_histograms(
     start_ns: float = 0.0,
     source: str = "",
 ) -> Cube:
-    """A cube of measured histograms, for `mars_lidar.reconstruct`, `io.save` and all that takes cubes.
+    """A cube of measured histograms, for `mars_lidar.reconstruct`, `io.save` and all other functions of cubes.
 
     Parameters
     ----------
     counts
-        Counts (H, W, T), or as `axes` says; a SciPy sparse matrix of (pixels, T) as well. Whole numbers >= 0, also as
+        Counts (H, W, T), or in the order `axes`; or a SciPy sparse matrix (pixels, T). Whole numbers >= 0, also as
         floats.
     system
-        How they were recorded; `cycles` is the number of laser periods that a histogram was accumulated over, `bins`
-        the number of bins of a whole period. Where T is smaller, the histograms are a window of the period: the
-        detector becomes one that is gated to it, and bins outside are empty.
+        The system that recorded them; `cycles` is the number of laser periods of each histogram, `bins` the number of
+        bins of a whole period. If T is smaller, the histograms are a window of the period: the detector of the cube is
+        gated to it, and bins outside are empty.
     axes
-        What the dimensions are, in order: n exposures, y rows, x columns, t time, and in brackets a dimension of pixels
-        that goes through rows, ``(yx)``, or columns, ``(xy)``, as MATLAB's does. Default by the number of dimensions:
-        ``t``, ``(yx)t``, ``yxt``, ``nyxt``.
+        The dimensions in order: n exposures, y rows, x columns, t time; in brackets one dimension of all pixels,
+        ordered by rows, ``(yx)``, or by columns, ``(xy)``, as in MATLAB. Default, by the number of dimensions: ``t``,
+        ``(yx)t``, ``yxt``, ``nyxt``.
     image
         (H, W) of the pixels in brackets. Default: (1, pixels).
     start_ns
         Time from the laser pulse to the start of the first bin, ns: a whole number of bins.
     source
-        Free text: where the counts came from.
+        Free text: origin of the counts.
 
     Returns
     -------
@@ -64,7 +64,7 @@ def from_histograms(
     Raises
     ------
     ValueError, TypeError
-        Shapes that do not fit, counts that are no counts or more than the system can register; nothing was done.
+        Shapes that do not fit, values that are not counts, or counts above those that the system can register.
 
     See Also
     --------
@@ -111,29 +111,30 @@ def from_photon_times(
     window_ns: tuple[float, float] | None = None,
     source: str = "",
 ) -> Cube:
-    """A cube of the photon times of each pixel, as MATLAB's cell arrays hold them.
+    """A cube from the photon times of each pixel, as in cell arrays of MATLAB.
 
     Parameters
     ----------
     cells
-        (H, W) of arrays of times since the laser pulse, or one array for one pixel. Absolute times, which go on over
-        laser periods, are folded.
+        (H, W) of arrays of times since the laser pulse, or one array for one pixel. Absolute times over many laser
+        periods are folded.
     system
-        How they were recorded, see `from_histograms`.
+        The system that recorded them, see `from_histograms`.
     unit_ns
-        Unit of the times, ns. Times that are all whole numbers are units of a clock and become the middle of theirs.
+        Unit of the times, ns. If all times are whole numbers, they are clock units and are moved to the middle of the
+        unit.
     start_ns
-        Time from the laser pulse to time 0, ns: of a gate that the times count from.
+        Time from the laser pulse to time 0, ns, such as the start of a gate from which times are counted.
     window_ns
-        (start, stop): photons within this time of the laser pulse alone, whole numbers of bins; the cube is a window.
-        For times that count from the pulse, of a recording with a gate, or to leave out an internal reflection.
+        (start, stop): use only photons in this interval after the laser pulse, whole numbers of bins; the cube is a
+        window. For recordings with a gate whose times count from the pulse, or to exclude an internal reflection.
     source
-        Free text: where the times came from.
+        Free text: origin of the times.
 
     Raises
     ------
     ValueError, TypeError
-        Times that are no numbers >= 0, or shapes that do not fit; no photon in the window.
+        Times that are not numbers >= 0, shapes that do not fit, or no photon in the window.
 
     See Also
     --------
@@ -249,7 +250,7 @@ def in_order(counts: Any, axes: str | None, image: tuple[int, int] | None) -> ND
 
 
 def windowed(system: System, bins: int, first: int) -> System:
-    """The system of histograms of `bins` bins from bin `first` on: gated to them where they are not the period."""
+    """The system of histograms of `bins` bins from bin `first` on, gated to them unless they cover the period."""
     if bins > system.bins:
         raise ValueError(f"the system has {system.bins} bins in a period, and the histograms have {bins}")
     if bins == system.bins or system.detector.mode == "gated":

@@ -1,4 +1,4 @@
-"""Arrays of numbers in .npz, .mat (v5, v7.3) and HDF5 files of others, by name."""
+"""Arrays of numbers in .npz, .mat (v5, v7.3) and HDF5 files of other programs, by name."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def open_arrays(path: Path) -> Iterator[NamedArrays]:
 def mat_arrays(path: Path, names: list[str] | None = None, *, deep: bool = True) -> dict[str, Any]:
     """Variables of a .mat: arrays in MATLAB's order, sparse matrices, and cells (H, W) as arrays of arrays.
 
-    `names`: of version 5, these variables only. `deep`: those within structures of a v7.3 file as well.
+    `names`: read only these variables, of version 5. `deep`: include those within structures of a v7.3 file.
     """
     import h5py
 
@@ -132,7 +132,7 @@ def _cell(name: str, part: Any) -> Any:
 
 
 def cell_arrays(variables: dict[str, Any]) -> dict[str, Any]:
-    """Arrays in cells of a .mat that are no photon times, by names such as ``spad[2]``, the second, as in MATLAB."""
+    """Arrays in cells of a .mat that are not photon times, by names such as ``spad[2]`` (the second, as in MATLAB)."""
     out: dict[str, Any] = {}
     for name, values in variables.items():
         if isinstance(values, np.ndarray) and values.dtype == object:

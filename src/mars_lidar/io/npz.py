@@ -1,7 +1,7 @@
-"""NumPy's .npz: `numpy.load` opens it anywhere, but reads a variable whole.
+"""NumPy's .npz: `numpy.load` opens it anywhere, but reads whole variables.
 
 Each variable is a member; ``attributes`` is a JSON string that also gives every variable's dimensions and
-units. The counts are streamed into the archive, so writing needs no memory for the cube.
+units. The counts are streamed into the archive, so that writing does not need the cube in memory.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def open_writer(path: Path, recipe: Recipe | Recording) -> Iterator[Writer]:
 
 
 def archive(path: Path) -> zipfile.ZipFile:
-    """A new one, packed quickly."""
+    """A new archive with fast compression."""
     return zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=_LEVEL)
 
 
@@ -57,7 +57,7 @@ def add_array(to: zipfile.ZipFile, name: str, array: NDArray[Any]) -> None:
 
 
 def add(to: zipfile.ZipFile, variables: Iterable[layout.Variable]) -> dict[str, Any]:
-    """Write variables; returns what the attribute ``variables`` tells of them."""
+    """Write variables; returns the content of the attribute ``variables``."""
     labels = {}
     for v in variables:
         add_array(to, v.name, np.asarray(v.data))

@@ -78,9 +78,9 @@ def read_pfm(path: Path) -> NDArray[np.float32]:
 
 
 def read_exr(path: Path) -> NDArray[Any]:
-    """The depth (H, W): the channel Z, else that of a layer (``*.Depth.Z``), Y, the only one, or grey written as RGB.
+    """The depth (H, W): channel Z, else that of a layer (``*.Depth.Z``), Y, the only channel, or grey stored as RGB.
 
-    A ValueError begins with the file: several channels of which none is depth, colours, or no EXR that can be read.
+    ValueError, starting with the file, for several channels without a depth, for colours, and for unreadable files.
     """
     openexr = needed("OpenEXR", f"{path}: depth in .exr")
     check_source(path)
@@ -118,7 +118,7 @@ def _depth_channel(path: Path, channels: dict[str, NDArray[Any]]) -> NDArray[Any
 
 
 def reflectivity(path: Path, stored: NDArray[Any]) -> FloatArray:
-    """Reflectivity (H, W) of what an image file or a .npy holds: floats in two dimensions are linear."""
+    """Reflectivity (H, W) from the content of an image file or a .npy: floats in two dimensions are linear."""
     if path.suffix.lower() == ".npy" and stored.ndim == 2 and stored.dtype.kind == "f":
         return linear(path, stored)
     return luminance(path, stored)
@@ -160,7 +160,7 @@ def floats(path: Path, name: str, stored: NDArray[Any]) -> FloatArray:
 
 
 def known(path: Path, depth: FloatArray) -> FloatArray:
-    """The depth, unless no pixel has one."""
+    """The depth; ValueError if no pixel has one."""
     if np.isnan(depth).all():
         raise FileError(f"{path}: no pixel has a depth")
     return depth

@@ -1,4 +1,4 @@
-"""What is behind a cube: all that makes a simulated one again, bit for bit, or how a measured one was recorded."""
+"""Origin of a cube: the recipe that reproduces a simulated cube bit for bit, or the recording of a measured one."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class _Blocks:
 
     @property
     def light_bytes(self) -> int:
-        """Size of incident light that stays on disk until a part of it is simulated."""
+        """Size of incident light that stays on disk until its part is simulated."""
         return 0
 
     @property
@@ -89,23 +89,23 @@ class _Blocks:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Recording(_Blocks):
-    """How a measured cube was recorded; the light that fell on the detector is not known.
+    """Recording of a measured cube, whose light is unknown.
 
     Parameters
     ----------
     system
         Laser, detector and histogram: `cycles` laser periods in each exposure.
     pixels
-        (H, W) of the image.
+        Image size (H, W).
     realizations
-        Exposures of it.
+        Number of exposures.
     source
-        Free text: where the counts came from.
+        Free text: origin of the counts.
 
     Raises
     ------
     ValueError, TypeError
-        A size or a number of realizations below 1, or no `System`.
+        A size or a number of realizations below 1, or `system` is not a `System`.
 
     See Also
     --------
@@ -151,7 +151,7 @@ class Recording(_Blocks):
 
     @property
     def depth_m(self) -> NDArray[np.float64]:
-        """NaN everywhere (H, W): it is not known."""
+        """Unknown: NaN (H, W)."""
         return np.full(self.pixels, np.nan)
 
     def replace(self, **changes: Any) -> Recording:
@@ -162,25 +162,25 @@ class Recording(_Blocks):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Recipe(_Blocks):
-    """All arguments of one `mars_lidar.simulate`, and the maps that explain its cube.
+    """All arguments of one call of `mars_lidar.simulate`, and the maps of the scene.
 
     Parameters
     ----------
     system, flux, engine, seed, realizations, first_realization, pixel_index
-        As `mars_lidar.simulate` takes them; `pixel_index` is (H * W,) or None for the row-major numbering
+        As for `mars_lidar.simulate`; `pixel_index` is (H * W,) or None for the row-major numbering
         of the flux.
     depth_m
         (H, W), m. By default the depth c tau / 2 of the flux's strongest return.
     reflectivity
-        (H, W) or None where no scene is behind the flux.
+        (H, W), or None if the flux was not made from a scene.
     source
-        Free text: where the scene came from.
+        Free text: origin of the scene.
     options
-        Arguments of `mars_lidar.simulate` that the engine takes beside: table, count, interpolation,
+        Further arguments of `mars_lidar.simulate` for the engine: table, count, interpolation,
         outside.
     settings
-        What the cube depends on beside system, flux and seed, as plain data: `Engine.settings`. It is what a file
-        keeps of the options.
+        Settings on which the cube depends besides system, flux and seed, as plain data: `Engine.settings`. A file
+        stores them in place of the options.
 
     Raises
     ------
@@ -267,11 +267,11 @@ class Recipe(_Blocks):
 
     @property
     def light_bytes(self) -> int:
-        """Size of incident light that stays on disk until a part of it is simulated."""
+        """Size of incident light that stays on disk until its part is simulated."""
         return self.flux.waveform_bytes if isinstance(self.flux, StoredFlux) else 0
 
     def part(self, realizations: slice, rows: slice) -> dict[str, Any]:
-        """Arguments with which `mars_lidar.simulate` makes this part alone, the same bits as in the whole.
+        """Arguments for `mars_lidar.simulate` of this part alone, with the same bits as in the whole.
 
         Both slices, `realizations` and `rows`, count from the start of this cube and have explicit ends.
         """

@@ -10,9 +10,9 @@ Middlebury has a folder for each stereo scene (vision.middlebury.edu/stereo/data
 
 2005 and 2006, ``disp1.png``, ``view1.png``, ``dmin.txt``: depth is ``f b / (d + d_min)``, f = 3740 px and b =
 160 mm at full size. The stored d is in pixels of the *full* size at full, half and third size alike (the data
-set's page has it divided by 2 or 3 to get pixels of the image at hand), and so is d_min: no scale enters. (On
-half-size "Art" this makes the paper cup 72 mm wide and the depth 1.4 to 2.2 m; d_min in half-size pixels would
-make it 48 mm.) d = 0 is unknown.
+set's page divides it by 2 or 3 for pixels of the reduced image), and so is d_min, so that no scale is needed. (On
+half-size "Art" the paper cup is then 72 mm wide and the depth 1.4 to 2.2 m; with d_min in half-size pixels it would
+be 48 mm wide.) d = 0 is unknown.
 
 2014 and 2021, ``disp0.pfm``, ``im0.png``, ``calib.txt``: depth is ``f b / (d + doffs)`` with f from the matrix
 ``cam0`` in pixels, ``baseline`` b in mm, and ``doffs`` the distance in x of the two principal points; d = inf is
@@ -57,8 +57,8 @@ def read_rgbd(
 ) -> tuple[FloatArray, FloatArray, FloatArray | None]:
     """Depth in m (NaN = no return), reflectivity in [0, 1], and the background map or None; (H, W) each.
 
-    Depth, by the kind of `depth_path`; 0, NaN and inf in a file mean "no return", and so do 65504 and 1e10 in files of
-    floats, which renderers write where a ray meets nothing:
+    Depth, by the kind of `depth_path`; 0, NaN and inf in a file mean "no return", as do 65504 and 1e10 in files of
+    floats, which renderers write for rays without a surface:
 
     - 16-bit PNG or TIFF, one channel: integers of `depth_unit_m` each, by default 0.001 (millimetres; other
       data sets use 1/5000 or 1/256).
@@ -72,18 +72,18 @@ def read_rgbd(
     - a folder of Middlebury 2005 or 2006 with ``disp1.png``, ``view1.png`` and ``dmin.txt``, or of 2014 or
       2021 with ``disp0.pfm``, ``im0.png`` and ``calib.txt``.
 
-    Reflectivity, from `image_path`, else from what comes with the depth, else 1 everywhere (only relative
-    values matter to a flux):
+    Reflectivity, from `image_path`, else from the file of the depth, else 1 everywhere (only relative
+    values affect a flux):
 
     - an image of 8 or 16 bits: sRGB decoded (IEC 61966-2-1), linear luminance
-      Y = 0.2126 R + 0.7152 G + 0.0722 B; alpha is ignored. It stands in for the reflectivity at the laser's
+      Y = 0.2126 R + 0.7152 G + 0.0722 B; alpha is ignored. It approximates the reflectivity at the laser's
       wavelength, shading included.
     - ``.npy``: (H, W) floats in [0, 1] are the reflectivity itself, linear; integers, and (H, W, 3), are an
       image.
 
     `focal_px` (pixels of the depth file, principal point at the centre) turns depth perpendicular to the
     image plane into range along the ray, ``r = z sqrt(1 + (x^2 + y^2) / f^2)``; without it depth is taken as
-    range. Depths of the file beyond `max_depth_m` are no return.
+    range. Depths beyond `max_depth_m` are treated as no return.
 
     Raises
     ------
@@ -213,7 +213,7 @@ def _depth(path: Path, stored: NDArray[Any], unit: float | None) -> FloatArray:
 
 
 def within(path: Path, depth: FloatArray, most_m: float | None) -> FloatArray:
-    """Depths up to `most_m`, m; those beyond are no return."""
+    """Depths up to `most_m`, m; greater depths become NaN, no return."""
     return depth if most_m is None else pixels.known(path, np.where(depth <= most_m, depth, np.nan))
 
 
@@ -352,7 +352,7 @@ def read_layers(
 ) -> LayeredScene:
     """The scene in an ``.npz`` whose ``depth`` and ``reflectivity`` are (layers, H, W).
 
-    ``background`` is (H, W), where there is one; without ``reflectivity`` it is 1 everywhere. Units and what means "no
+    ``background``, if present, is (H, W); without ``reflectivity`` it is 1 everywhere. Units and values for "no
     return": `mars_lidar.Scene.from_rgbd`.
 
     Raises

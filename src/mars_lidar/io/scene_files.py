@@ -1,4 +1,4 @@
-"""All the scenes in a folder: a manifest, a pattern, or the layouts that data sets have; bad files are told."""
+"""All scenes in a folder: by a manifest, a pattern, or the layouts of data sets; unusable files are listed."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _IMAGE_WORDS = ("rgb", "colors", "color", "colours", "colour", "image", "images"
 
 @dataclass(frozen=True, kw_only=True)
 class SceneFile:
-    """Where a scene is; `load` reads it. The arguments are those of `mars_lidar.Scene.from_rgbd`.
+    """Location of a scene; `load` reads it. The arguments are those of `mars_lidar.Scene.from_rgbd`.
 
     Parameters
     ----------
@@ -37,13 +37,13 @@ class SceneFile:
     image
         Image whose luminance is the reflectivity; None: the reflectivity is 1.
     index
-        Frame of a file that has several.
+        Frame of a file with several.
     depth_unit_m
         Metres per stored unit.
     focal_px
         Focal length, pixels: turns depth along the axis into range along the ray.
     max_depth_m
-        Depths beyond this are no return, m.
+        Depths beyond this are treated as no return, m.
 
     Raises
     ------
@@ -81,14 +81,14 @@ class SceneFile:
 
 @dataclass(frozen=True)
 class Problem:
-    """A file that cannot be used, and why.
+    """A file that cannot be used, and the reason.
 
     Attributes
     ----------
     path
         The file.
     reason
-        What is wrong with it, a sentence.
+        The reason, one sentence.
 
     See Also
     --------
@@ -129,11 +129,11 @@ def scan(
 ) -> tuple[list[SceneFile], list[Problem]]:
     """Find the scenes in a folder and in the folders below it.
 
-    What is a scene, in this order:
+    Scenes are recognised in this order:
 
-    - `manifest`, or a ``manifest.csv`` in the folder: a CSV with a header; columns ``depth``, and where needed
+    - `manifest`, or a ``manifest.csv`` in the folder: a CSV with a header; columns ``depth``, and optionally
       ``image``, ``index``, ``depth_unit_m``, ``focal_px``, ``max_depth_m``; paths are relative to the manifest. Empty
-      means "not given".
+      fields are not given.
     - `pattern`: every depth file or folder that it matches (``"**/*_depth.png"``); its image is the file whose
       path, relative to `folder`, has the second text of `image` in place of the first
       (``("_depth.png", "_colors.png")``).
@@ -141,25 +141,25 @@ def scan(
       files; and depth images or ``.npy`` whose name ends in ``depth`` (``0001_depth.png``) or that lie in a
       folder ``depth``. The image is the file of the same name (.png, .jpg, .webp, ...) without ``depth``, or with
       ``rgb``, ``color``, ``colors``, ``image`` or ``img`` in place of it, in the name or in the folder's; without one,
-      reflectivity is 1, and a folder without any image is told by a warning.
+      reflectivity is 1; a folder without any image raises a warning.
 
     Parameters
     ----------
     folder
-        Where to look.
+        Folder to search.
     pattern, image, manifest
-        What is a scene there, as above.
+        Rules for scenes, as above.
     depth_unit_m, focal_px, max_depth_m
-        As for `mars_lidar.Scene.from_rgbd`, for all scenes; a manifest's own values come first.
+        As for `mars_lidar.Scene.from_rgbd`, for all scenes; values of a manifest take precedence.
     check
-        Read every scene once, so that damaged files are found now and not in the middle of a long run.
+        Read every scene once, so that damaged files are reported now and not during a long run.
     progress
         Called as ``progress(done, total)``; True: a bar.
 
     Returns
     -------
     scenes, problems
-        `SceneFile` in the order of their paths, and what was left out, with the reason.
+        `SceneFile` in the order of their paths, and the omitted files with the reasons.
 
     Raises
     ------

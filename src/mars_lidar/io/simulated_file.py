@@ -1,4 +1,4 @@
-"""Simulate straight into a file, and make a cube again; before that, how long it will take."""
+"""Simulation into a file, repetition of a cube, and an estimate of the time in advance."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from mars_lidar.table.storage import cached_tables
 
 @dataclass(frozen=True)
 class Written:
-    """What `simulate_to` did.
+    """Result of `simulate_to`.
 
     Attributes
     ----------
@@ -42,9 +42,9 @@ class Written:
     registrations
         Total counts of the cube.
     simulate_s, write_s
-        Seconds spent in the engine and on the file.
+        Seconds spent in the engine and on writing.
     report
-        What the engine had to tell beside the counts, numbers by name, added up.
+        Report of the engine, numbers by name, summed over blocks.
 
     See Also
     --------
@@ -99,39 +99,39 @@ def simulate_to(
 ) -> Written:
     """Simulate a cube into a ``.zarr``, ``.h5``, ``.hdf5`` or ``.npz`` of any size.
 
-    Blocks of at most about 64 MiB are simulated and written one after the other, so the cube never needs
-    to fit in memory; its counts are those of one `mars_lidar.simulate`, bit for bit.
+    Blocks of at most about 64 MiB are simulated and written one after the other, so that the cube need not fit
+    in memory; its counts are those of one call of `mars_lidar.simulate`, bit for bit.
 
     Parameters
     ----------
     path
         The file; its suffix chooses the format.
     flux, system, engine, realizations, first_realization, pixel_index, seed, threads, device
-        As for `mars_lidar.simulate`; blocks from a GPU are copied from there, and the file does not tell.
+        As for `mars_lidar.simulate`; blocks are copied from a GPU, and the file does not depend on the device.
     **options
-        As for `mars_lidar.simulate`; the file keeps the name of the engine, its settings, and a hash of the table.
+        As for `mars_lidar.simulate`; the file stores the name of the engine, its settings, and a hash of the table.
     depth_m, reflectivity
-        Maps (H, W) of the scene to store beside the counts; depth is c tau / 2 by default.
+        Maps (H, W) of the scene to store with the counts; default depth: c tau / 2.
     source
-        Free text: where the scene came from.
+        Free text: origin of the scene.
     overwrite
-        Replace an existing file, which stays as it is until the new one is complete.
+        Replace an existing file, which remains unchanged until the new one is complete.
     resume
-        Continue a ``.zarr`` that was left incomplete, to the same bits; of a complete one nothing is made. Everything
-        else must be as it was.
+        Continue an incomplete ``.zarr``, to the same bits; a complete one is left unchanged. All other arguments must
+        be the same.
     progress
-        Called with (pixel exposures done, in all); True: a bar, or a line every 30 s where there is no terminal.
+        Called with (pixel exposures done, all of them); True: a bar, or a line every 30 s without a terminal.
 
     Raises
     ------
     ValueError, TypeError
-        A bad argument; nothing was written.
+        An invalid argument; nothing was written.
     FileExistsError
         `path` exists and `overwrite` is false.
     MemoryError
-        An ``.npz`` that could not be read back in this machine's memory.
+        An ``.npz`` that is too large for the memory of this machine.
     WriteError, Interrupted
-        Stopped half way. A Zarr store is left marked incomplete; the other formats leave nothing.
+        Interrupted. A Zarr store remains, marked incomplete; files of other formats are removed.
 
     See Also
     --------
@@ -214,11 +214,11 @@ def regenerate(
     cube
         What `load` returned, or its recipe.
     realizations, rows
-        Part to make: slices of step 1 that count from the start of the cube.
+        Part to simulate: slices of step 1 from the start of the cube.
     threads
         As for `mars_lidar.simulate`.
     table
-        The table that the cube was made with, if there was one; another one is refused.
+        The table of the cube, if it was made with one; any other table is refused.
 
     Returns
     -------
@@ -228,7 +228,7 @@ def regenerate(
     Raises
     ------
     ValueError, TypeError
-        A part outside of the cube, another table than the cube's, or a measured cube, which has no recipe.
+        A part outside the cube, a table other than the cube's, or a measured cube, which has no recipe.
 
     See Also
     --------
@@ -264,26 +264,26 @@ def regenerate(
 def verify(
     cube: Cube, *, threads: int | None = None, progress: Progress | bool | None = None, table: Table | None = None
 ) -> bool:
-    """Whether simulating again gives the stored counts, bit for bit; one block in memory at a time.
+    """Whether a repeated simulation gives the stored counts, bit for bit; one block is in memory at a time.
 
-    A cube that was made with a table needs that `table`; another one is refused. Of a Zarr store every byte is compared
-    with its manifest as well.
+    A cube that was made with a table needs that `table`; any other table is refused. Every byte of a Zarr store is also
+    compared with its manifest.
 
     Parameters
     ----------
     cube
-        What `load` returned.
+        A cube that `load` returned.
     threads
         As for `mars_lidar.simulate`.
     progress
         Called as ``progress(done, total)``; True: a bar.
     table
-        The table that the cube was made with, if there was one.
+        The table of the cube, if it was made with one.
 
     Raises
     ------
     ValueError, TypeError
-        A measured or incomplete cube, or another table than the cube's.
+        A measured or incomplete cube, or a table other than the cube's.
 
     See Also
     --------
@@ -398,7 +398,7 @@ _BY_PHOTON = ("exact", "sequential", "poisson")
 
 @dataclass(frozen=True)
 class Advice:
-    """Seconds that a run will take about, and those with engine `auto`, NaN where it does not draw the same law."""
+    """Approximate seconds of a run, and of the same run with engine `auto`, NaN if that draws another law."""
 
     seconds: float
     auto_s: float = math.nan
@@ -422,9 +422,9 @@ def advice(
     threads: int | None = None,
     options: EngineOptions | None = None,
 ) -> Advice:
-    """How long `mars_lidar.simulate` will take, measured on pixels spread over the image, a few tenths of a second.
+    """Approximate time of `mars_lidar.simulate`, measured in some tenths of a second on pixels spread over the image.
 
-    Nothing is drawn, and the answer is 0, where a run is short whatever the engine.
+    0, without a measurement, for runs that are short with any engine.
     """
     drawn_by = find_engine(engine, **(options or {}))
     if isinstance(flux, StoredFlux) or system.detector.crosstalk is not None:  # not to be had in single pixels

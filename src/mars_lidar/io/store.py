@@ -1,7 +1,7 @@
-"""What the formats have in common: a writer, and an opened file.
+"""Interface of the file formats: a writer, and an opened file.
 
-A format is one module with two functions, `open_writer`, a context that gives a `Writer`, and `open_store`. The rule
-for all of them: what is half written never looks complete, whatever stops the process.
+A format is one module with two functions, `open_writer`, a context that gives a `Writer`, and `open_store`. A file
+of any format is marked complete only at the end, so that an interrupted write is recognised.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from mars_lidar.light.transient import RateArray
 
 
 class CountArray(RateArray, Protocol):
-    """Counts (realizations, H, W, bins) in memory or on disk; indexing reads only what is asked for."""
+    """Counts (realizations, H, W, bins) in memory or on disk; indexing reads only the requested part."""
 
     @property
     def dtype(self) -> Any:
@@ -31,9 +31,9 @@ class CountArray(RateArray, Protocol):
 
 
 class LazyCounts:
-    """Counts of a file that can only be read whole: shape and type at once, the counts on first use.
+    """Counts of a file that can only be read as a whole: shape and type at once, the counts on first use.
 
-    `read` returns them all; a MemoryError before any work where they do not fit.
+    `read` returns them all; MemoryError, before any work, if they do not fit.
     """
 
     def __init__(self, shape: tuple[int, ...], dtype: Any, read: Callable[[], NDArray[Any]]) -> None:
@@ -44,7 +44,7 @@ class LazyCounts:
 
 
 class OnDisk:
-    """An array of a file, of h5py, Zarr or our own: what goes wrong when it is read names the file."""
+    """An array of a file, by h5py, Zarr or this package, whose read errors name the file."""
 
     def __init__(self, array: Any, path: Path) -> None:
         self._array, self._path = array, path
@@ -70,7 +70,7 @@ class OnDisk:
         return int(self._array.shape[0])
 
     def whole(self) -> NDArray[Any]:
-        """All values, if they are no more than a file of this size can hold."""
+        """All values; FileError if a file of this size cannot contain so many."""
         array: NDArray[Any] = self._read(lambda: whole(self._array))
         return array
 
@@ -94,7 +94,7 @@ def values(array: Any) -> NDArray[Any]:
 
 @dataclass(frozen=True, eq=False)
 class OpenedStore:
-    """A file as its format module reads it."""
+    """An opened file, as read by the module of its format."""
 
     attrs: Mapping[str, Any]
     arrays: Mapping[str, Any]  # variables by name; on disk until they are indexed, where the format allows it
@@ -112,7 +112,7 @@ class OpenedStore:
 class Writer:
     """Takes the counts of one cube, block by block, in the order of `Recipe.blocks`.
 
-    A format's ``open_writer(path, recipe)`` is a context that gives one: the file is complete where it ends well.
+    It is the context of a format's ``open_writer(path, recipe)``; the file is complete when the context ends normally.
     """
 
     chunks: tuple[int, int, int, int]

@@ -1,4 +1,4 @@
-"""Transients on disk, with depth and reflectivity beside them: NumPy, HDF5, MATLAB, captures of tal and mitransient."""
+"""Transients on disk, optionally with depth and reflectivity: NumPy, HDF5, MATLAB, captures of tal and mitransient."""
 
 from __future__ import annotations
 
@@ -36,33 +36,33 @@ def read_transient(
     """Open a transient image; its values stay on disk (.npy, .h5) until rows of them are needed.
 
     - ``.npy``: (H, W, T), or (H, W, T, C) with `channel`, as mitransient's ``numpy.save`` of its result gives.
-    - ``.npz``: the array `name` (default ``transient``, or the only one); ``bin_ns``, ``start_ns`` where it has them.
+    - ``.npz``: the array `name` (default ``transient``, or the only one); ``bin_ns``, ``start_ns`` if present.
     - ``.h5``, ``.hdf5``: the data set `name` (default ``transient``), with attributes ``bin_ns`` and
-      ``start_ns`` where it has them.
+      ``start_ns`` if present.
     - ``.mat``: the variable `name` (default ``transient``, or ``rect_data`` or ``meas`` of confocal scans), (H, W, T),
-      with ``bin_ns`` and ``start_ns`` where it holds them. Version 7.3 stays on disk, older ones are read whole.
+      with ``bin_ns`` and ``start_ns`` if present. Version 7.3 stays on disk, older versions are read as a whole.
     - ``.h5``, ``.hdf5`` with ``H`` and ``H_format``, captures of tal and mitransient, or with ``data`` and ``deltaT``,
       of the Zaragoza data set, whose colours and bounces are added up (`mars_lidar.io.capture`). Times are metres of
-      optical path (time = path / c). Pixel (y, x) is that of the sensor's grid, of a confocal or single capture; of an
-      exhaustive one each laser point is a row of the image and each sensor point a column. Whether the ways from the
-      laser and to the camera are in it, ``t_accounts_first_and_last_bounces`` tells; the times are taken as they are.
+      optical path (time = path / c). In confocal and single captures pixel (y, x) is that of the sensor grid; in
+      exhaustive captures each laser point is a row of the image and each sensor point a column. Times are used as
+      stored; ``t_accounts_first_and_last_bounces`` states whether they include the paths from laser and to camera.
 
     Parameters
     ----------
     path
         The file.
     bin_ns, start_ns
-        Width of a bin and travel time at the start of bin 0, ns; where given they take the place of the
-        file's. A ``.npy`` tells neither: `bin_ns` is needed, `start_ns` is 0.
+        Width of a bin and travel time at the start of bin 0, ns, in place of those of the file. A ``.npy`` contains
+        neither: `bin_ns` is required, the default of `start_ns` is 0.
     name
-        Which array of an ``.npz``, ``.h5`` or ``.mat``.
+        Name of the array in an ``.npz``, ``.h5`` or ``.mat``.
     channel
-        Which of the C channels of a 4-D array (colours of a renderer).
+        Index of a channel of a 4-D array (colours of a renderer).
 
     Raises
     ------
     ValueError
-        A file that is missing, damaged or of the wrong kind, or does not tell its bin width: the message starts
+        A file that is missing, damaged, of another kind, or without a bin width: the message starts
         with the file.
     TypeError
         An argument of another kind.
@@ -107,7 +107,7 @@ def _read(
         raise ValueError(f"{source}: a transient must be one of {', '.join(SUFFIXES)}")
     width = stated.get("bin_ns") if bin_ns is None else bin_ns
     if width is None:
-        raise ValueError(f"{source}: does not tell the width of a time bin: give bin_ns")
+        raise ValueError(f"{source}: does not state the width of a time bin: give bin_ns")
     start = stated.get("start_ns", 0.0) if start_ns is None else start_ns
     if len(light.shape) == 4:
         if channel is None or not 0 <= channel < light.shape[3]:
@@ -155,7 +155,7 @@ def _capture(path: Path) -> Capture | None:
 
 
 def read_truth(path: str | Path, shape: tuple[int, int]) -> dict[str, FloatArray]:
-    """Depth and reflectivity beside a transient of `shape` (H, W), float64, those that are there.
+    """Depth and reflectivity stored with a transient of `shape` (H, W), float64, if present.
 
     Arrays ``depth`` (m; 0, NaN and inf mean "no return", which becomes NaN) and ``reflectivity`` ([0, 1]), (H, W), of
     ``.npz``, ``.h5``, ``.hdf5`` and ``.mat`` (turned, as the transient is). A ValueError begins with the file.

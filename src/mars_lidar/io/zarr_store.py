@@ -1,6 +1,6 @@
 """Zarr v3: the format for cubes of any size; chunks are written as they are simulated.
 
-``xarray.open_zarr(path)`` opens a store with its dimensions, coordinates and units. Stores that lie elsewhere are read
+``xarray.open_zarr(path)`` opens a store with its dimensions, coordinates and units. Remote stores are read
 from any URL that fsspec opens (``https://``, ``s3://``, ``memory://``).
 """
 
@@ -32,7 +32,7 @@ _CHUNK_BYTES = 4 * 2**20
 
 @contextlib.contextmanager
 def open_writer(path: Path, recipe: Recipe | Recording) -> Iterator[Writer]:
-    """Writes a store that is whole or not there; one at `path` stays until the new one takes its place."""
+    """Writes a store completely or not at all; an existing store at `path` remains until the new one replaces it."""
     with beside(path, folder=True) as unfinished:
         writer = _writer(create(unfinished, recipe))
         yield writer
@@ -41,7 +41,7 @@ def open_writer(path: Path, recipe: Recipe | Recording) -> Iterator[Writer]:
 
 @contextlib.contextmanager
 def resumable_writer(path: Path, recipe: Recipe, group: Any = None) -> Iterator[Writer]:
-    """As `open_writer`; a store that is stopped stays, its attribute ``complete`` false. `group`: of `unfinished`.
+    """As `open_writer`; an interrupted store remains, its attribute ``complete`` false. `group`: that of `unfinished`.
 
     Where there is a store at `path`, the new one is made at `mars_lidar._base.files.successor`.
     """
@@ -78,7 +78,7 @@ def check_zarr_threads() -> None:
 
 
 def begun_store(path: Path) -> Path:
-    """The store that a stopped run left, whose final name is `path`."""
+    """The store of a stopped run, whose final name is `path`."""
     return beside_it if (beside_it := successor(path)).exists() else path
 
 
@@ -133,7 +133,7 @@ def _begun(path: Path, histogram: Any, blocks: Sequence[tuple[slice, slice]]) ->
 
 
 def unfinished(path: Path, recipe: Recipe) -> Any:
-    """The group of a store that was left incomplete, by this recipe and version; None for a complete one."""
+    """The group of an incomplete store of this recipe and version; None for a complete store."""
     import zarr
 
     target, path = path, begun_store(path)
@@ -201,7 +201,7 @@ def add(group: Any, variables: Iterable[layout.Variable]) -> None:
 
 
 def consolidated(group: Any) -> Any:
-    """The group with a copy of all metadata in its root document, for quick opening."""
+    """The group with a copy of all metadata in its root document, for fast opening."""
     import zarr
 
     with warnings.catch_warnings():  # that other Zarr libraries may ignore the copy
@@ -210,7 +210,7 @@ def consolidated(group: Any) -> Any:
 
 
 def blosc(dtype: np.dtype[Any], name: Any, level: int, shuffle: Any) -> Any:
-    """Blosc for elements of this type, and a CRC-32C of what it makes.
+    """Blosc for elements of this type, followed by a CRC-32C.
 
     Measured on a room of 128 x 128 x 1024 uint16 counts (61 % zeros, 34 MB, 2 cores; write, read, size):
     zstd-1 bitshuffle 0.11 s, 0.03 s, 3.6 MB; lz4 bitshuffle 0.15 s, 0.04 s, 4.6 MB; zstd-1 byte shuffle
@@ -231,20 +231,20 @@ def _map_chunks(data: Any) -> tuple[int, ...]:
 
 
 class RemoteArray(OnDisk):
-    """An array of a store at a URL: what goes wrong when it is read names the URL."""
+    """An array of a store at a URL, whose read errors name the URL."""
 
     def _naming(self) -> contextlib.AbstractContextManager[Any]:
         return _naming(str(self._path))
 
     def whole(self) -> NDArray[Any]:
-        """All values, if there is memory for them."""
+        """All values; MemoryError if they do not fit."""
         return np.asarray(self)
 
 
 def open_url(url: str) -> OpenedStore:
     """Open a store for reading; its documents and coordinates are compared with its manifest, and its names if listed.
 
-    Every error names the URL; MissingLibraryError where fsspec, or what it needs for this kind of URL, is missing.
+    Every error names the URL; MissingLibraryError if fsspec, or its library for this kind of URL, is missing.
     """
     if not url.rstrip("/").endswith(".zarr"):
         raise FileError(f"{url}: only a .zarr is opened from a URL; fetch other files first")
@@ -268,7 +268,7 @@ def open_url(url: str) -> OpenedStore:
 def _require(url: str, system: Any, root: str, stated: str | None) -> manifest.Manifest:
     """The manifest.
 
-    Raises where a document or coordinate is not as it was written, or a file is missing where they can be listed.
+    Raises where a document or coordinate has changed since it was written, or a listed file is missing.
     """
     lines = {}
     for name in (manifest.NAME, manifest.CHECKS):

@@ -2,8 +2,8 @@
 
 Registrations round the laser period under dead time: a linear equation in each pixel, solved at a cost of O(bins).
 
-With l photons in a bin, p = 1 - e^-l is the chance that an armed pixel fires in it, q = 1 - p / l that of one which is
-re-armed in it (uniformly). G counts the registrations of the preceding dead time, L moves them by it, and
+With l photons in a bin, p = 1 - e^-l is the probability that an armed pixel registers in it, q = 1 - p / l that of a
+pixel re-armed in it (uniformly). G counts the registrations of the preceding dead time, L shifts them by it, and
 
     A h = s,     A = 1 + diag(p) G - diag(q) L                                                          (1)
 
@@ -13,8 +13,8 @@ c = G h grows from bin to bin by h - L h, so that with (1) it obeys a recursion 
     c_{j+1} = e^-l_j c_j + s_j - (1 - q_j) (L h)_j,     in short c = C [s - (1 - q) L h],                (2)
     h = T L h + (s - p C s),     T x = q x + p C [(1 - q) x].                                            (3)
 
-T L is the chain of the phases of successive registrations (arXiv 2512.04924), without a matrix. How many there are (3)
-leaves open: the pixel is blind for t_d after each, so that mean(c) = t_d sum(h). Hence
+T L is the chain of the phases of successive registrations (arXiv 2512.04924), without a matrix. (3) does not determine
+their number; since the pixel is blind for t_d after each, mean(c) = t_d sum(h). Hence
 
     B h = Q s,     B h = h - T L h + v (t_d sum(h) + mean C [(1 - q) L h]),     Q s = s - p C s + v mean(C s)   (4)
 
@@ -53,7 +53,7 @@ def bin_photons(
     system
         Laser, detector and histogram.
     refine
-        Parts that each bin is cut into.
+        Number of parts of each bin.
 
     Returns
     -------
@@ -63,7 +63,7 @@ def bin_photons(
     Raises
     ------
     TypeError
-        Light that is no floating tensor, or of half precision; no `System`.
+        Light that is not a floating tensor, or of half precision; `system` is not a `System`.
     ValueError
         Negative photons, a delay that is not finite, shapes that do not broadcast, `refine` out of range.
 
@@ -90,7 +90,7 @@ def bin_photons(
 def photons_in(
     signal: torch.Tensor, background: torch.Tensor, delay_ns: torch.Tensor, system: System, refine: int
 ) -> torch.Tensor:
-    """`bin_photons` of what has been checked, also where `torch.vmap` does not let values be looked at."""
+    """`bin_photons` of checked arguments, also within `torch.vmap`, where values cannot be read."""
     bins = system.bins * refine
     edges = torch.arange(bins + 1, dtype=signal.dtype, device=signal.device) * (system.period_ns / bins)
     time = edges - torch.remainder(delay_ns, system.period_ns).unsqueeze(-1)
@@ -99,7 +99,7 @@ def photons_in(
 
 
 def wrapped_energy(system: System, time: torch.Tensor) -> torch.Tensor:
-    """Energy of the periodic pulse train up to a time (ns) after the delay; grows by 1 a period."""
+    """Energy of the periodic pulse train up to a time (ns) after the delay; increases by 1 each period."""
     period = system.period_ns
     whole = torch.round(time.detach() / period)
     rest = time - whole * period  # within half a period of the nearest pulse
@@ -131,7 +131,7 @@ def inputs(*given: torch.Tensor) -> list[torch.Tensor]:
 
 
 def values_of(tensor: torch.Tensor) -> torch.Tensor:
-    """Numbers of a tensor, without the wrappers of `torch.func`, which keep them from being checked."""
+    """Values of a tensor without the wrappers of `torch.func`, which prevent checks."""
     functorch = torch._C._functorch
     while functorch.is_functorch_wrapped_tensor(tensor):
         tensor = functorch.get_unwrapped(tensor)
@@ -175,7 +175,7 @@ def detected(
 
 
 def check_detector(system: System, *, light: bool = False) -> None:
-    """Raise where the differentiable model does not describe it; `light`: efficiency and dark counts are welcome."""
+    """Raise if the differentiable model does not describe the detector; `light`: allow efficiency and dark counts."""
     if not isinstance(system, System):
         raise TypeError(f"system must be a System, got {type(system).__name__}")
     detector = system.detector
@@ -210,7 +210,7 @@ def slopes(light: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 class Delay:
-    """A dead time of K + (d + f) / n periods on n bins: what re-arms where, and who is blind."""
+    """A dead time of K + (d + f) / n periods on n bins: the bins of re-arming and the blind bins."""
 
     def __init__(self, dead: float, bins: int) -> None:
         self.periods, self.bins = dead, bins
@@ -437,7 +437,7 @@ def by_rows(function: Any, info: Any, in_dims: tuple[int | None, ...], given: tu
 def registered(
     photons: Rows, source: Rows, delay: Delay, tolerance: float = TOLERANCES.residual, known: Rows | None = None
 ) -> Rows:
-    """h of (1), differentiable in photons and sources, (pixels, bins) in double; `known`: h, if it was found before."""
+    """h of (1), differentiable in photons and sources, (pixels, bins) in double; `known`: h, if already computed."""
     h: Rows = _Solution.apply(photons, source, known, delay, tolerance, False)  # type: ignore[no-untyped-call]
     return h
 
@@ -469,15 +469,15 @@ def expected_histogram(
 ) -> torch.Tensor:
     """Expected registrations in each bin (..., bins) under dead time; differentiable in all three arguments.
 
-    Any number of times, and under `torch.func`: ``vmap``, ``grad``, ``vjp``, ``jacrev``, ``jvp``, ``jacfwd``,
-    ``hessian``.
+    Derivatives of any order exist, also under `torch.func`: ``vmap``, ``grad``, ``vjp``, ``jacrev``, ``jvp``,
+    ``jacfwd``, ``hessian``.
 
     Solves ``h = p (N_r + e - G h) + q (L h - b)`` round the circle of a period: G counts the registrations of the
-    preceding dead time, L those of one dead time ago; e and b are what the dead time that outlasts the exposure
-    adds where it began armed (docs/joint_law.md, 3.2 and 4.6). Derivatives are those of the solution, by solutions
-    of the same equation or of the transposed one, not of the steps that led there. Exact, up to the grid, where the
-    exposure forgets its start before its end; `mars_lidar.mean_histogram` needs no such condition. The
-    error of the grid falls with the square of `refine`: at the default a total variation below 4e-4, and 1e-3
+    preceding dead time, L those of one dead time ago; e and b account for
+    the dead time that extends beyond the end of an exposure with an armed start (docs/joint_law.md, 3.2 and 4.6).
+    Derivatives are solutions of the same or of the transposed equation. The result is exact, up to the grid, if the
+    start-up transient ends before the exposure does; `mars_lidar.mean_histogram` needs no such condition. The
+    error of the grid decreases with the square of `refine`: at the default a total variation below 4e-4, and 1e-3
     where the dead time is within 8 sigma of 0 or of whole periods (bins of up to 3 sigma); derivatives are within 4e-3
     of those of the exact mean (norm over the bins; median 1e-4).
 
@@ -488,8 +488,8 @@ def expected_histogram(
     system
         Non-paralyzable, without gate, or effects beyond detection efficiency and dark counts.
     refine
-        Parts that each bin is cut into for the solution; None: four to a sigma of the pulse, 16 where the dead
-        time is within 8 sigma of 0 or of whole periods (1 for a measured pulse).
+        Number of parts of each bin for the solution; None: four to a sigma of the pulse, 16 if the dead time is within
+        8 sigma of 0 or of whole periods (1 for a measured pulse).
 
     Returns
     -------
@@ -499,10 +499,10 @@ def expected_histogram(
     Raises
     ------
     TypeError, ValueError
-        Bad arguments; a detector that this form does not describe; forward mode within forward mode, of which PyTorch
-        drops a part without a word: take ``jacfwd(jacrev(f))``, which is ``hessian(f)``.
+        Invalid arguments; a detector that the model does not describe; forward mode within forward mode, of which
+        PyTorch silently drops a part: use ``jacfwd(jacrev(f))``, which is ``hessian(f)``.
     ConvergenceError
-        Where the equation is not solved to 1e-9.
+        The equation is not solved to 1e-9.
 
     See Also
     --------
@@ -510,8 +510,8 @@ def expected_histogram(
 
     Notes
     -----
-    O(bins) a pixel, in double precision, on the CPU or a GPU (`mars_lidar.learn.forward`). At less cost and to
-    the accuracy of a table: `HistogramTable`.
+    O(bins) a pixel, in double precision, on the CPU or a GPU (`mars_lidar.learn.forward`). `HistogramTable` is faster,
+    with the accuracy of a table.
 
     Examples
     --------
@@ -623,7 +623,7 @@ def _registered(rows: Any, system: System, parts: int, known: Any = (None, None)
 
 
 def refuse_nested_forward(name: str) -> None:
-    """Raise within two transforms of forward mode: through a function of one's own PyTorch then gives zeros."""
+    """Raise within two transforms of forward mode, where PyTorch returns zeros for custom functions."""
     functorch = torch._C._functorch
     levels = functorch.get_interpreter_stack() or []
     if sum(level.key() == functorch.TransformType.Jvp for level in levels) > 1:

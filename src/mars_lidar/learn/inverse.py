@@ -1,4 +1,4 @@
-"""A single-photon LiDAR as a physics operator of deepinv (https://deepinv.github.io), for its inverse problems."""
+"""A single-photon LiDAR as a physics operator of deepinv (https://deepinv.github.io)."""
 
 from __future__ import annotations
 
@@ -36,28 +36,28 @@ from mars_lidar.table import Table
 
 
 class LidarPhysics(Physics):  # type: ignore[misc]  # deepinv is not typed
-    """Histograms (B, bins, H, W) of images (B, 3, H, W), whose channels `images` names.
+    """Operator from images (B, 3, H, W), with channels given by `images`, to histograms (B, bins, H, W).
 
     ``A(x)`` is the expected histogram, ``A_vjp`` and ``A_jvp`` the products with its Jacobian, ``A_dagger(y)`` the
-    estimate of each pixel by itself; ``custom_init=LidarPhysics.custom_init`` starts an algorithm of deepinv from it.
-    ``physics(x)`` is a measured histogram: drawn by the engine, for the noise of histograms under dead time is no
+    estimate of each pixel alone; ``custom_init=LidarPhysics.custom_init`` starts an algorithm of deepinv from it.
+    ``physics(x)`` is a histogram drawn by the engine, because the noise of histograms under dead time is not a
     function of their mean. The first call draws with `seed`, the next with ``seed + 1``, and so on; ``physics(x,
-    seed=s)`` draws with s. Photons must stay >= 0: project onto that between steps.
+    seed=s)`` draws with s. Photons must stay >= 0: project them between steps.
 
     Parameters
     ----------
     system
         As for `mars_lidar.learn.expected_histogram`.
     table
-        A `mars_lidar.Table` of it: ``A`` is then a `mars_lidar.learn.HistogramTable`, some 30 times as fast.
+        A `mars_lidar.Table` of `system`: ``A`` is then a `mars_lidar.learn.HistogramTable`, some 30 times as fast.
     images
         ``"log"``: logarithms of signal and background, photons per period, and the delay over the width of the pulse
-        (sigma of a Gaussian): any numbers are light, and errors are about 1 / sqrt(photons) in all three, as the
-        priors, denoisers and steps of deepinv's algorithms want it.
+        (sigma of a Gaussian): any real numbers are valid, and errors are about 1 / sqrt(photons) in all
+        three, as the priors, denoisers and step sizes of deepinv's algorithms assume.
         ``"signal"``: signal and background, photons per period, and the delay, ns. ``"depth"``: those of deepinv's own
         ``SinglePhotonLidar``: depth in bins, an integer in the middle of a bin; intensity, photons of the return in the
         exposure; background, photons of a bin in the exposure. Without dead time both operators have the same mean.
-        In these two photons must stay >= 0, which a stock algorithm does not see to.
+        With these two, photons must stay >= 0, which stock algorithms do not ensure.
     engine
         As for `mars_lidar.simulate`.
     seed
@@ -115,9 +115,9 @@ class LidarPhysics(Physics):  # type: ignore[misc]  # deepinv is not typed
         return {"est": (start, start.clone())}
 
     def A_dagger(self, y: torch.Tensor, x_init: torch.Tensor | None = None, **kwargs: Any) -> torch.Tensor:
-        """Maximum likelihood of every pixel by itself (B, 3, H, W), by `mars_lidar.reconstruct`; `x_init` is not used.
+        """Maximum likelihood of every pixel alone (B, 3, H, W), by `mars_lidar.reconstruct`; `x_init` is not used.
 
-        Where a pixel shows no return its signal is 0 and its delay half a period.
+        For a pixel without a detected return the signal is 0 and the delay half a period.
         """
         cubes = y.detach().cpu().double().permute(0, 2, 3, 1).contiguous().numpy()
         estimate = reconstruct(cubes, self.system, threads=self._threads)
@@ -146,7 +146,7 @@ class LidarPhysics(Physics):  # type: ignore[misc]  # deepinv is not typed
     def forward(self, x: torch.Tensor, seed: int | None = None, **kwargs: Any) -> torch.Tensor:
         """Measured histograms, in the type of `x`; no gradient passes through them.
 
-        `seed`: of this draw alone; None: the next one of the operator's own.
+        `seed`: of this draw only; None: the next seed of the operator.
         """
         own = seed is None
         number = self._seed if seed is None else checks.integer("seed", seed, low=0, high=2**63 - 1)
@@ -183,7 +183,7 @@ class LidarPhysics(Physics):  # type: ignore[misc]  # deepinv is not typed
 
 
 class LidarLikelihood(DataFidelity):  # type: ignore[misc]
-    """Minus the log likelihood of histograms under dead time, `mars_lidar.learn.histogram_log_likelihood`.
+    """Negative log likelihood of histograms under dead time, `mars_lidar.learn.histogram_log_likelihood`.
 
     The data term of an algorithm of deepinv with a `LidarPhysics` of any images; with ``images="log"`` steps need no
     projection.

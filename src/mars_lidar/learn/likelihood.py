@@ -1,4 +1,4 @@
-"""The likelihood of a histogram under dead time, from the histogram's own registrations: nothing is solved (PyTorch).
+"""The likelihood of a histogram under dead time, from its registrations, without solving a law (PyTorch).
 
 Native code computes it with its first and second derivatives (native/reconstruct/coarse_likelihood.h).
 """
@@ -37,16 +37,16 @@ if TYPE_CHECKING:
 def armed_periods(histogram: torch.Tensor, system: System) -> torch.Tensor:
     """Periods in which the pixel was armed in each bin, estimated from its histogram.
 
-    ``N_r`` less the registrations whose dead time covers the bin (Gupta et al., ICCV 2019); a registration in the bin
-    and a re-arming count half. What the dead time covers after the end of the exposure is taken for its beginning,
-    where the pixel was armed (or blind from before): D is at most t_d / t_r + 1 periods off, whatever the exposure.
+    ``N_r`` minus the registrations whose dead time covers the bin (Gupta et al., ICCV 2019); a registration or a
+    re-arming in the bin counts half. Dead time beyond the end of the exposure is counted at its start, where the pixel
+    was armed (or blind from before): the error of D is at most t_d / t_r + 1 periods, for any exposure.
 
     Parameters
     ----------
     histogram
         (..., bins) counts.
     system
-        How they were recorded: non-paralyzable, without gate.
+        The system that recorded them: non-paralyzable, without gate.
 
     Returns
     -------
@@ -56,9 +56,9 @@ def armed_periods(histogram: torch.Tensor, system: System) -> torch.Tensor:
     Raises
     ------
     TypeError
-        Counts that are no tensor; no `System`.
+        Counts that are not a tensor; `system` is not a `System`.
     ValueError
-        Another number of bins; a detector that this form does not describe.
+        Another number of bins; a detector that the model does not describe.
 
     See Also
     --------
@@ -95,17 +95,17 @@ def histogram_log_likelihood(
     delay_ns: torch.Tensor,
     system: System,
 ) -> torch.Tensor:
-    """Log likelihood (...) of histograms (..., bins), up to a constant; its negative is a loss that needs no truth.
+    """Log likelihood (...) of histograms (..., bins), up to a constant; its negative is a self-supervised loss.
 
     ``sum_j h_j log m_j + (P_j - h_j) log((P_j - m_j) / (P_j - h_j))``: of the P_j passes in which the pixel was armed
     at the start of bin j or re-armed in it, m_j are expected to register. P_j comes from the registrations one dead
     time earlier, so that no law is solved: O(bins). Registrations in the bins that the pulse reaches, and in those
-    where they re-arm the pixel, are distributed over cells of their bin as the light and the dead time have them.
+    where they re-arm the pixel, are distributed over cells of their bin according to light and dead time.
 
     Parameters
     ----------
     histogram
-        Counts, integers or of single or double precision; a constant: it has no derivative.
+        Counts, integers or of single or double precision; a constant without derivative.
     signal, background, delay_ns
         As for `bin_photons`; background must be > 0.
     system
@@ -119,11 +119,11 @@ def histogram_log_likelihood(
     Raises
     ------
     TypeError
-        Counts or light that are no tensors of a suitable type; no `System`.
+        Counts or light that are not tensors of a suitable type; `system` is not a `System`.
     ValueError
-        Negative photons; another number of bins; a detector that this form does not describe; counts that require a
+        Negative photons; another number of bins; a detector that the model does not describe; counts that require a
         gradient; third derivatives, and forward mode within forward mode (``jacfwd(jacrev(f))`` is ``hessian(f)``). The
-        values of counts are not checked: negative ones give numbers without a meaning.
+        values of counts are not checked: negative counts give meaningless numbers.
 
     Warns
     -----
@@ -137,16 +137,15 @@ def histogram_log_likelihood(
     Notes
     -----
     Unbiased to 0.1 of the Cramer-Rao bound's standard deviation at 1000 cycles, for bins of up to 3 widths (sigma) of
-    the pulse, S up to 10, B up to 5 and any dead time: at most 0.03 over the 399 random instruments that its settings
-    were chosen with, 0.05 over 198 others, against the exact mean histogram (the bias in these units grows with the
-    square root of the cycles). Not so where all of the following hold: the exposure began armed, the dead time is
-    longer than a period, and less than one pass of the pulse is expected to end without a registration. There it
-    matters which registrations the end of the exposure cuts off, which a histogram does not say; S and delay may be 0.4
-    off (0.2 and 0.4 in two more instruments, below 0.03 in four), and a warning says so. Where the window of bins that
-    are cut moves by a bin, the value jumps by up to 5e-3 (1e-4 mostly); the slope in the delay jumps where a sample of
-    a pulse begins at the edge of a cell.
-    The processor computes it, with its first and second derivatives: tensors of another device are copied there and
-    back. One thread of PyTorch's a share of the pixels; docs/learn.md has the times.
+    the pulse, S up to 10, B up to 5 and any dead time: at most 0.03 over the 399 random instruments with which its
+    settings were chosen, 0.05 over 198 others, against the exact mean histogram (the bias in these units grows with the
+    square root of the cycles). The bias of S and of the delay is larger (0.2 and 0.4 in two further instruments) where
+    three conditions hold: an armed start, a dead time longer than a period, and less than one pass of the pulse that is
+    expected to end without registration. The registrations that the end of the exposure cuts off then matter, and a
+    histogram does not contain them; a warning says so. The value jumps by up to 5e-3 (1e-4 mostly) where the window of
+    divided bins moves by a bin; the slope in the delay jumps where a sample of a pulse begins at the edge of a cell.
+    The processor computes it with its first and second derivatives; tensors of other devices are copied there and back.
+    Pixels are shared among PyTorch's threads; docs/learn.md has the times.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""PyTorch, which every part of `mars_lidar.learn` but the ranges needs, or an error that says how to install it."""
+"""Import of PyTorch, or an error that states how to install it; all of `mars_lidar.learn` but the ranges needs it."""
 
 from __future__ import annotations
 

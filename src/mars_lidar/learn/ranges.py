@@ -1,4 +1,4 @@
-"""From what the settings of a sample are drawn: numbers, and instruments."""
+"""Distributions of the settings of a sample: numbers and instruments."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from mars_lidar.instrument.system import System
 
 @dataclass(frozen=True)
 class Uniform:
-    """Any number in [low, high], all equally likely.
+    """Uniform distribution on [low, high].
 
     Parameters
     ----------
     low, high
-        Ends of the range, in the unit of what is drawn.
+        Ends of the range, in the unit of the quantity.
 
     Raises
     ------
     TypeError
-        An end that is no number.
+        An end that is not a number.
     ValueError
         An end that is not finite, or `low` above `high`.
 
@@ -58,7 +58,7 @@ class Uniform:
             raise ValueError(f"low must be at most high, got {self.low:g} and {self.high:g}")
 
     def draw(self, random: np.random.Generator) -> float:
-        """One number, by the generator `random`."""
+        """One number, drawn by the generator `random`."""
         return float(random.uniform(self.low, self.high))
 
     @property
@@ -69,17 +69,17 @@ class Uniform:
 
 @dataclass(frozen=True)
 class LogUniform(Uniform):
-    """A positive number in [low, high] whose logarithm is uniform: every factor of two is equally likely.
+    """Log-uniform distribution on [low, high]: the logarithm is uniform.
 
     Parameters
     ----------
     low, high
-        Ends of the range, > 0, in the unit of what is drawn.
+        Ends of the range, > 0, in the unit of the quantity.
 
     Raises
     ------
     TypeError
-        An end that is no number.
+        An end that is not a number.
     ValueError
         An end that is not finite and > 0, or `low` above `high`.
 
@@ -98,7 +98,7 @@ class LogUniform(Uniform):
     _positive: ClassVar[bool] = True
 
     def draw(self, random: np.random.Generator) -> float:
-        """One number, by the generator `random`."""
+        """One number, drawn by the generator `random`."""
         drawn = math.exp(random.uniform(math.log(self.low), math.log(self.high)))
         return min(max(drawn, self.low), self.high)  # the rounding of exp stays inside
 
@@ -110,12 +110,12 @@ class Choice:
     Parameters
     ----------
     values
-        The numbers, at least one, in the unit of what is drawn.
+        The numbers, at least one, in the unit of the quantity.
 
     Raises
     ------
     TypeError
-        No list of numbers, or an empty one.
+        Not a list of numbers, or an empty list.
     ValueError
         A number that is NaN.
 
@@ -153,7 +153,7 @@ _DRAWN = ("cycles", "period_ns", "dead_time_ns", "sigma_ns")
 
 
 def as_range(name: str, value: float | Range, *, low: float = 0.0, infinite: bool = False) -> Range:
-    """A range, or a number as a range of one; everything in it is above `low`."""
+    """A range, or a number as a range of one value; all values must be above `low`."""
     if isinstance(value, list | tuple | str | bytes | bool) or value is None:
         raise TypeError(f"{name} must be a number, Uniform, LogUniform or Choice, got {value!r}")
     given = value if isinstance(value, Uniform | Choice) else Choice((_number(name, value),))
@@ -166,27 +166,27 @@ def as_range(name: str, value: float | Range, *, low: float = 0.0, infinite: boo
 
 @dataclass(frozen=True, kw_only=True)
 class SystemRange:
-    """Instruments like `base`, with what is given here drawn anew: a number, or a range of them.
+    """Distribution of instruments: those of `base`, with the given fields drawn from ranges or set to numbers.
 
-    Everything is drawn independently. The number of bins is that of `base`, so that cubes can be stacked.
+    All fields are drawn independently. The number of bins is that of `base`, so that cubes can be stacked.
 
     Parameters
     ----------
     base
-        What all have in common.
+        The instrument whose other fields are used.
     cycles
-        Laser periods per exposure, rounded to whole ones.
+        Laser periods per exposure, rounded to integers.
     period_ns, dead_time_ns
         Laser period and dead time, ns. The dead time may be 0.
     sigma_ns
-        Width of the pulse, ns; it is then a `mars_lidar.GaussianPulse`.
+        Width of the pulse, ns; the pulse is then a `mars_lidar.GaussianPulse`.
 
     Raises
     ------
     TypeError
-        A base that is no `System`; a setting that is neither a number nor a range.
+        A base that is not a `System`; a field that is neither a number nor a range.
     ValueError
-        A setting that makes no instrument: all ends of the ranges are tried in all combinations.
+        An invalid instrument at some combination of the ends of the ranges; all combinations are checked.
 
     See Also
     --------
@@ -224,7 +224,7 @@ class SystemRange:
         self.corners()
 
     def draw(self, random: np.random.Generator) -> System:
-        """One instrument, by the generator `random`."""
+        """One instrument, drawn by the generator `random`."""
         return self._system({name: given.draw(random) for name, given in self._ranges().items()})
 
     def corners(self) -> list[System]:

@@ -1,8 +1,7 @@
-"""Scenes of a stream of training examples, and the sample that is made of each.
+"""Scenes of a stream of training examples, and the samples made from them.
 
-A scene is ray-cast without end, read from files, or taken from arrays; the workers of a loader share the scenes that
-one of them has cast. A sample is a function of numbers alone: which scene, turned how, in what light, seen by what
-system.
+Scenes are ray-cast without end, read from files, or taken from arrays; the workers of a loader share ray-cast scenes.
+A sample is a function of numbers alone, which determine scene, flip, light and system.
 """
 
 from __future__ import annotations
@@ -41,10 +40,10 @@ _WRITTEN = 1 << 32
 
 
 class SharedScenes:
-    """Scenes by number, in anonymous memory (memfd) of a process and of those that it starts.
+    """Scenes by number, in anonymous memory (memfd) shared by a process and its children.
 
-    There is no lock: a checksum of number and content tells a reader whether what it copied is whole, and what it
-    wanted. If not, it casts the scene itself, and gets the same. Outside Linux nothing is shared.
+    There is no lock: a checksum of number and content shows a reader whether its copy is complete and of the requested
+    scene. If not, the reader casts the scene itself, with the same result. Outside Linux nothing is shared.
     """
 
     def __init__(self, size: tuple[int, int]) -> None:
@@ -72,7 +71,7 @@ class SharedScenes:
         return Scene(*maps) if int(self._heads[place, 1]) == _checksum(number, maps) else None
 
     def put(self, number: int, scene: Scene) -> None:
-        """Let the others have it; for scenes without a background map."""
+        """Share a scene with other workers; for scenes without a background map."""
         if self._memory is None:
             return
         maps, place = np.stack([scene.depth_m, scene.reflectivity]), number % TOLERANCES.slots
@@ -101,7 +100,7 @@ def _checksum(number: int, maps: NDArray[np.float64]) -> int:
 
 
 def generator(purpose: int, seed: int, *numbers: int) -> np.random.Generator:
-    """A random stream of its own for every purpose, seed, and numbers (each below 2**64)."""
+    """A separate random stream for every purpose, seed, and numbers (each below 2**64)."""
     words = [half for number in (purpose, seed, *numbers) for half in (number & 0xFFFFFFFF, number >> 32)]
     return np.random.default_rng(np.random.SeedSequence(words))
 
@@ -135,7 +134,7 @@ class SceneSource(ABC):
 
 
 class RayCast(SceneSource):
-    """A built-in scene under ever new seeds: each serves `reuse` samples on average, with other crops and light.
+    """A built-in scene with a new seed for every `reuse` samples on average, which differ in crop and light.
 
     Samples of one round, `pool` x `reuse` in a row, each take one of the `pool` scenes of that round.
     """
@@ -198,7 +197,7 @@ class Given(SceneSource):
         return int(self._order[1][place])
 
     def load(self, number: int) -> Scene:
-        """Read it, where it is a file; instead of one that cannot be read, the next that can."""
+        """Read the scene, if it is a file; for an unreadable file the next readable one."""
         for place in range(number, number + len(self._scenes)):
             entry = self._scenes[place % len(self._scenes)]
             if isinstance(entry, Scene):
@@ -217,7 +216,7 @@ class Given(SceneSource):
 
 
 class Arrays(Given):
-    """Maps (n, H, W) of n scenes, or (H, W) of one; a scene is taken out of them when it is needed."""
+    """Maps (n, H, W) of n scenes, or (H, W) of one; a scene is read from them on use."""
 
     def __init__(self, maps: Mapping[str, Any]) -> None:
         SceneSource.__init__(self)
@@ -242,7 +241,7 @@ class Arrays(Given):
         return self._number
 
     def load(self, number: int) -> Scene:
-        """One of the maps each; without reflectivity everything is white."""
+        """One scene of the maps; the default reflectivity is 1."""
         arrays = {name: np.asarray(maps[number]) for name, maps in self._maps.items()}
         return Scene(arrays["depth"], arrays.get("reflectivity", 1.0), arrays.get("background"))
 
@@ -262,7 +261,7 @@ def as_source(scenes: Any, size: tuple[int, int] | None, reuse: int) -> SceneSou
             stored = open_dataset(scenes)
             if any("transient" in entry for entry in stored.recipe.scenes):
                 raise ValueError(
-                    f"{scenes}: holds rendered transients, which have no surfaces to light anew; "
+                    f"{scenes}: holds rendered transients, which have no surfaces for new light; "
                     "StoredDataset gives their cubes"
                 )
             maps = stored.maps
@@ -287,7 +286,7 @@ def as_source(scenes: Any, size: tuple[int, int] | None, reuse: int) -> SceneSou
 
 @dataclass(frozen=True)
 class Sample:
-    """All that a cube is simulated from."""
+    """All inputs of the simulation of a cube."""
 
     index: int
     scene: Scene
@@ -313,7 +312,7 @@ class Recipe:
     seed: int
 
     def sample(self, epoch: int, index: int) -> Sample:
-        """Sample `index` of an epoch. What is drawn for one purpose does not depend on the settings of another."""
+        """Sample `index` of an epoch. Draws for one purpose do not depend on the settings of another."""
         drawn = self.systems.corners() if isinstance(self.systems, SystemList) else ()
         system = drawn[0] if len(drawn) == 1 else self.systems.draw(generator(4, self.seed, epoch, index))
         level, sbr, stretch = self._light(epoch, index)

@@ -1,9 +1,9 @@
 """Training examples from datasets that `mars_lidar.generate` wrote: each exposure once an epoch, each shard read once.
 
-The order of an epoch is a list of exposures. Shards are shuffled, and the exposures of `pool` shards that follow each
-other are shuffled again. Each rank takes an equal, contiguous part of the list and cuts it into batches, so a batch
-does not depend on the number of workers. Of the batches of a rank each worker takes a contiguous section, so a shard
-is read by one worker; the loader asks its workers in turn, so the batches arrive in the order `_turns`.
+The order of an epoch is a list of exposures. Shards are shuffled, and the exposures of each `pool` successive shards
+are shuffled again. Each rank takes an equal, contiguous part of the list and divides it into batches, so that batches
+do not depend on the number of workers. Each worker takes a contiguous section of the batches of a rank, so that a shard
+is read by one worker; the loader asks its workers in turn, so that batches arrive in the order `_turns`.
 """
 
 from __future__ import annotations
@@ -42,53 +42,53 @@ _STORED = {np.dtype(np.uint16): torch.uint16, np.dtype(np.uint32): torch.uint32}
 class StoredDataset(torch.utils.data.IterableDataset[dict[str, Any]]):
     """The exposures of stored datasets, as batches or examples for a `torch.utils.data.DataLoader`.
 
-    Give `batch_size` here and ``batch_size=None`` to the loader: then packed counts are decoded into the batch itself,
-    and a batch holds the same exposures whatever the number of workers. A loader that collates single examples works as
-    well, at the cost of a copy.
+    Give `batch_size` here and ``batch_size=None`` to the loader: counts are then decoded into the batch itself, and a
+    batch contains the same exposures for any number of workers. A loader that collates single examples also works, at
+    the cost of a copy.
 
-    All ranks of a distributed run give equally many batches, whatever their number, that of workers and the batch size.
-    Where the number of ranks does not divide the exposures, those that remain at the end of the epoch's order are left
-    out, other ones each epoch, or the first ones of the order are repeated (`uneven`).
+    All ranks of a distributed run give the same number of batches, for any number of ranks and workers and any batch
+    size. If the number of ranks does not divide the exposures, those at the end of the epoch's order are omitted
+    (different ones each epoch), or the first ones of the order are repeated (`uneven`).
 
     A batch is a dictionary: ``counts`` (B, bins, H, W), the chosen maps (B, H, W) as float32, and for each of its
     exposures ``sample``, ``realization``, ``scene``, ``system``, ``signal_level``, ``sbr``; and ``seed``, torch.uint64,
-    as seeds go up to 2^64. Of several stores ``store`` is the number of the one that holds the exposure. An example has
+    because seeds reach 2^64. With several stores, ``store`` is the number of the store of the exposure. An example has
     the same entries without the leading axis.
 
     Parameters
     ----------
     path
-        The dataset, complete; a folder, or a URL such as ``s3://bucket/set.zarr`` (extra ``remote``). Or several, whose
-        images and bins agree: their exposures follow each other, and samples are counted through.
+        The dataset, complete; a folder, or a URL such as ``s3://bucket/set.zarr`` (extra ``remote``). Or several
+        with equal images and bins: their exposures are concatenated, and samples are numbered consecutively.
     samples
-        Numbers of the samples to use (a split by scenes, say); default: all.
+        Numbers of the samples to use, such as a split by scenes; default: all.
     batch_size
         Exposures in a batch; the last batch of an epoch may be smaller. None: single examples.
     shuffle
         False: in the order of the store.
     pool
-        Shards whose exposures are mixed; a worker holds them packed.
+        Number of shards whose exposures are mixed; a worker keeps them encoded in memory.
     seed
-        Of the order.
+        Seed of the order.
     maps
-        Maps that go along: depth, reflectivity, signal, background, delay.
+        Maps in each batch: depth, reflectivity, signal, background, delay.
     axes
-        ``"THW"``: time first, as networks take it; a view of ``"HWT"``, the order in which counts are stored (torch's
-        channels-last memory format), so without a copy.
+        ``"THW"``: time first, as for networks; a view, without a copy, of ``"HWT"``, the order in which counts are
+        stored (torch's channels-last memory format).
     dtype
-        Of the counts; default float32.
+        Type of the counts; default float32.
     uneven
         ``"drop"`` or ``"repeat"`` the exposures that cannot be shared equally among the ranks.
     transform
-        Called on each batch (or example); what it returns is given out.
+        Called on each batch (or example), which its result replaces.
     rank, world_size
-        Of a distributed run; default: those of torch.distributed where it is initialised, else of the environment
-        (RANK and WORLD_SIZE, as torchrun sets them), else 0 of 1.
+        Of a distributed run; default: those of torch.distributed if initialised, else of the environment
+        (RANK and WORLD_SIZE, as set by torchrun), else 0 of 1.
 
     Raises
     ------
     ValueError, TypeError
-        A bad argument; a dataset that is incomplete or none; stores that do not go together; fewer exposures than ranks
+        An invalid argument; a missing or incomplete dataset; stores that do not match; fewer exposures than ranks
         with ``uneven="drop"``.
 
     See Also
@@ -187,7 +187,7 @@ class StoredDataset(torch.utils.data.IterableDataset[dict[str, Any]]):
         return self._passes.first[0] + max(self._passes.begun - 1, 0)
 
     def set_epoch(self, epoch: int) -> None:
-        """Choose the order of the next pass: `epoch`, as with `DistributedSampler`; without it the next one."""
+        """Select the `epoch` of the next pass, as with `DistributedSampler`; default: the next epoch."""
         self._begin_at(checks.integer("epoch", epoch, low=0, high=2**62), 0, 0)
 
     def _begin_at(self, epoch: int, start: int, workers: int) -> None:
@@ -196,15 +196,15 @@ class StoredDataset(torch.utils.data.IterableDataset[dict[str, Any]]):
         self._given, self._joined = 0, None
 
     def state_dict(self, batches: int | None = None) -> dict[str, int]:
-        """Position in the pass, for `load_state_dict`; only with `batch_size` where a loader has workers.
+        """Position in the pass, for `load_state_dict`; with workers of a loader, only with `batch_size`.
 
-        torchdata's ``StatefulDataLoader`` asks for it in each of its workers.
+        torchdata's ``StatefulDataLoader`` calls it in each of its workers.
 
         Parameters
         ----------
         batches
-            Batches taken from a plain loader with workers since the pass began, or since it was resumed: workers run
-            ahead, so only the caller knows that number. None: counted here, without workers.
+            Batches taken from a plain loader with workers since the pass began or was resumed, a number that only the
+            caller knows, because workers run ahead. None: counted here, without workers.
 
         Raises
         ------
@@ -226,9 +226,9 @@ class StoredDataset(torch.utils.data.IterableDataset[dict[str, Any]]):
         return {"seed": self._seed, "epoch": self.epoch, "start": min(start + given, len(self)), "workers": first}
 
     def load_state_dict(self, state: Mapping[str, int]) -> None:
-        """Go on where `state_dict` gave `state`, with any number of workers; the other settings must be the same.
+        """Continue from `state`, the result of `state_dict`, with the same settings but any number of workers.
 
-        A pass that was at its end then gives nothing more, and the next one is the next epoch.
+        A pass that was at its end is then empty, and the next pass is the next epoch.
         """
         if state["seed"] != self._seed:
             raise ValueError(f"the state is of a dataset with seed {state['seed']}, this one has {self._seed}")
@@ -438,7 +438,7 @@ def _first(batch: dict[str, Any]) -> dict[str, Any]:
 
 
 def share_of_rank(order: NDArray[np.int64], rank: int, world: int, uneven: str) -> NDArray[np.int64]:
-    """Equal contiguous parts of the order: what remains is dropped, or the first exposures are repeated at the end."""
+    """Equal contiguous parts of the order: the remainder is dropped, or the first exposures are repeated at the end."""
     each = _each(order.size, world, uneven)
     return np.resize(order, each * world)[rank * each : (rank + 1) * each] if order.size else order
 

@@ -1,10 +1,10 @@
-"""Training examples simulated as they are needed: no two alike, and the same whoever makes them.
+"""Training examples simulated on demand: no two are equal, and they do not depend on workers.
 
-Passes. A loader hands copies of its dataset to workers, and tells nobody when a pass begins: each worker calls ``iter``
-once a pass, the parent never does. So passes are counted in memory that all copies share. Every worker has a place
-there, in which it alone writes, one number at a time: how many passes it has begun, and the seed that a loader gives to
-all workers of one pass. A worker that finds this seed in another's place joins that pass; one that finds it nowhere, or
-in its own place (workers that live on keep theirs), begins the next.
+Passes: a loader gives copies of its dataset to workers and does not announce the begin of a pass; each worker calls
+``iter`` once a pass, the parent never does. Passes are therefore counted in memory shared by all copies. Each worker
+writes two numbers into its own entry: the number of passes it has begun, and the seed that a loader gives to all
+workers of one pass. A worker that finds this seed in another entry joins that pass; if the seed is in no entry, or in
+its own (persistent workers keep theirs), it begins the next pass.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from mars_lidar.simulation import simulate
 
 
 def rank_of(rank: int | None, world_size: int | None) -> tuple[int, int]:
-    """Rank and number of ranks: as given; of torch.distributed where it runs; of the environment; 0 of 1."""
+    """Rank and number of ranks: as given, else of torch.distributed, else of the environment, else 0 of 1."""
     if (rank is None) != (world_size is None):
         raise ValueError("rank and world_size go together, got one of them")
     if rank is None or world_size is None:
@@ -57,7 +57,7 @@ def rank_of(rank: int | None, world_size: int | None) -> tuple[int, int]:
 
 
 def worker_of() -> tuple[int, int, bool]:
-    """Number of this worker and of all workers of a DataLoader, and whether this is one; else 0 of 1."""
+    """Number of this worker, number of workers, and whether this process is a worker of a DataLoader; else 0 of 1."""
     info = torch.utils.data.get_worker_info()
     return (0, 1, False) if info is None else (info.id, info.num_workers, True)
 
@@ -79,18 +79,18 @@ class Passes:
         self._shared.share_memory_()  # type: ignore[no-untyped-call]
 
     def begin_at(self, epoch: int, start: int) -> None:
-        """The next pass is the first: of this epoch, from this sample on."""
+        """Make the next pass the first, of this epoch and from this sample on."""
         self._shared[3:] = 0
         self._shared[2] = 0
         self._shared[1], self._shared[0] = start, epoch
 
     def join(self, epoch: int, start: int) -> None:
-        """In a worker: go on with a pass of an epoch. All workers of the pass write the same here, in any order."""
+        """In a worker: continue a pass of an epoch. All workers of the pass write the same values, in any order."""
         self._shared[1], self._shared[0] = start, epoch
         self._shared[3:] = (1 << _SEED_BITS) | _mark()
 
     def begin(self, worker: int) -> tuple[int, int]:
-        """Begin a pass, or join the one that other workers have begun: passes before it, and its first sample."""
+        """Begin a pass, or join that of other workers; returns the number of earlier passes and its first sample."""
         if worker >= _WORKERS:
             raise ValueError(f"a loader may have at most {_WORKERS} workers, got worker {worker}")
         mark, marks = _mark(), self._shared[3:].tolist()
@@ -105,7 +105,7 @@ class Passes:
         return number - 1, int(self._shared[1]) if number == 1 else 0
 
     def end(self) -> None:
-        """The pass has given all that it has."""
+        """Mark the pass as finished."""
         self._shared[2] = 1
 
     @property
@@ -120,7 +120,7 @@ class Passes:
 
     @property
     def start(self) -> int:
-        """First sample of the pass that is going on, or of the next one."""
+        """First sample of the current pass, or of the next one."""
         return int(self._shared[1]) if self.begun == 0 or (self.begun == 1 and not self._shared[2]) else 0
 
     @property
@@ -141,9 +141,9 @@ def _mark() -> int:
 
 
 def warn_if_put_together(batched: bool) -> None:
-    """In ``__iter__``: warn where it was called by a loader that stacks what the stream gives.
+    """In ``__iter__``: warn if the caller is a loader that stacks the examples of the stream.
 
-    No interface tells a dataset so; the loader's fetcher has it in a variable.
+    No interface provides this; it is read from a variable of the loader's fetcher.
     """
     caller = sys._getframe(2)
     if not caller.f_locals.get("auto_collation", False) or "torch" not in caller.f_code.co_filename:
@@ -167,10 +167,10 @@ T = TypeVar("T")
 
 
 def prefetched(items: Iterator[T], number: int) -> Iterator[T]:
-    """The items of an iterator, in order, up to `number` of them made before they are asked for.
+    """The items of an iterator, in order, with up to `number` of them computed ahead.
 
-    What the iterator raises is raised here, in its place. The thread ends with the last item, or after the one it is
-    making when this iterator is closed.
+    Exceptions of the iterator are raised here, in their place. The thread ends with the last item, or after the current
+    item when this iterator is closed.
     """
     ready: queue.Queue[tuple[Any, BaseException | None]] = queue.Queue(number)
     closed = threading.Event()
@@ -216,7 +216,7 @@ _UNSIGNED = {np.dtype(np.uint16): torch.uint16, np.dtype(np.uint32): torch.uint3
 
 
 class CubeMaker:
-    """Makes the cubes of a batch; `systems` are the extremes of what will be asked for."""
+    """Simulates the cubes of a batch; `systems` are the extremes of the systems that will be used."""
 
     def __init__(
         self, engine: Engine, systems: Sequence[System], device: Any, layout: str, axes: str, dtype: Any
@@ -309,10 +309,10 @@ def _sparse(counts: NDArray[Any]) -> torch.Tensor:
 
 
 class Buffers:
-    """Memory of tensors that nobody holds any more, given out again: fresh pages cost as much as simulating dim light.
+    """Reuses the memory of released tensors, because new pages cost as much time as the simulation of dim light.
 
-    A tensor made from a NumPy array holds a reference to it, and so do all its views through their storage: an array
-    with no reference but the one here is free.
+    A tensor made from a NumPy array keeps a reference to it, as do all its views through their storage: an array
+    without further references is free.
     """
 
     _KEPT = 4
@@ -349,40 +349,40 @@ _LAST = 2**62
 
 
 class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
-    """Cubes and their ground truth for a `torch.utils.data.DataLoader`, simulated as they are asked for.
+    """Cubes and their ground truth for a `torch.utils.data.DataLoader`, simulated on demand.
 
-    Sample k of an epoch is a function of (`seed`, epoch, k) and of the settings here, never of workers, ranks,
-    threads or what came before. Ranks and workers take batches in turn; none is made twice. Give `batch_size` here
-    and ``batch_size=None`` to the loader: then the batches are the same, in the same order, for any number of
-    workers, and are simulated in place instead of copied together.
+    Sample k of an epoch is a function of (`seed`, epoch, k) and of the settings here, independent of workers, ranks,
+    threads and earlier samples. Ranks and workers take batches in turn; none is made twice. Give `batch_size` here
+    and ``batch_size=None`` to the loader: the batches are then the same, in the same order, for any number of
+    workers, and are simulated in place without a copy.
 
     An example is a dictionary, with a leading axis where `batch_size` is given: ``counts`` (T, H, W); ``depth`` (m,
     NaN without a return) and ``reflectivity`` (H, W); ``flux``, a dictionary of ``signal``, ``background`` (photons
     per period) and ``delay`` (ns) (H, W); ``system``, a dictionary of ``period_ns``, ``cycles``, ``dead_time_ns``,
-    ``sigma_ns``; ``signal_level``, ``sbr``, ``index``, ``seed``. Maps and settings are float32. `sample` gives the
-    Scene, Flux and System themselves.
+    ``sigma_ns``; ``signal_level``, ``sbr``, ``index``, ``seed``. Maps and settings are float32. `sample` returns the
+    Scene, Flux and System.
 
     Parameters
     ----------
     systems
-        A System, several (one is drawn for each sample), or a `SystemRange`.
+        A System, a list of them (one is drawn for each sample), or a `SystemRange`.
     scenes
-        ``"random"`` (default) or ``"room"``: built-in scenes without end. A folder of RGB-D data, whatever
-        `mars_lidar.io.scan` finds in it; a dataset of `mars_lidar.generate`, for its maps; Scenes and
+        ``"random"`` (default) or ``"room"``: built-in scenes without end. A folder of RGB-D data, as
+        `mars_lidar.io.scan` reads it; a dataset of `mars_lidar.generate`, for its maps; Scenes and
         `mars_lidar.io.SceneFile` objects; or arrays: depths (n, H, W) in m, or a dictionary of ``depth``,
-        ``reflectivity``, ``background`` (NumPy, PyTorch, or what gives one when it is indexed: memory maps, Zarr). In
-        random order, each once before any comes again. A file that cannot be read, or without any return, is told by a
-        warning, and the next one taken.
+        ``reflectivity``, ``background`` (NumPy, PyTorch, or arrays that return these when indexed: memory maps, Zarr).
+        In random order; all are used before any is used again. A file that is unreadable or without any return raises a
+        warning and is replaced by the next.
     size
-        (H, W), or one number for a square: random crops of that size. None: 64 for built-in scenes, else scenes as
-        they are.
+        (H, W), or one number for a square: random crops of that size. None: 64 for built-in scenes, else whole
+        scenes.
     epoch_size
         Samples in an epoch; None (default): without end.
     batch_size
-        Samples stacked into one example; None (default): one, without that axis.
+        Samples stacked into one example; None (default): a single sample without this axis.
     signal, sbr
-        Mean signal photons per period over the image, and signal-to-background ratio, as `mars_lidar.Scene.flux`
-        has them: a number or a range. Default: log-uniform in [0.01, 1] and in [0.1, 10].
+        Mean signal photons per period over the image, and signal-to-background ratio, as for `mars_lidar.Scene.flux`:
+        a number or a range. Default: log-uniform in [0.01, 1] and in [0.1, 10].
     depth_scale
         Factor on the depth: a number or a range.
     flips
@@ -392,37 +392,36 @@ class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
     engine
         Name or `Engine`, as for `mars_lidar.simulate`.
     device
-        ``"cpu"``, or ``"cuda"`` to simulate on the GPU and leave the cubes there (in the process of the loader:
+        ``"cpu"``, or ``"cuda"`` for simulation on the GPU, where the cubes remain (in the process of the loader:
         ``num_workers=0``).
     layout
         ``"dense"``, or ``"sparse"``: coalesced COO tensors.
     axes
-        ``"THW"``: time first, as a view of ``"HWT"`` (torch's channels-last memory format), so without a copy.
+        ``"THW"``: time first, a view of ``"HWT"`` without a copy (torch's channels-last memory format).
     dtype
-        Of the counts; None: those as they are simulated (uint16 or uint32; int32 for sparse ones).
+        Type of the counts; None: as simulated (uint16 or uint32; int32 for sparse ones).
     reuse
-        Samples for which a built-in scene serves, on average: other crops, flips, light and instruments.
+        Mean number of samples from one built-in scene, with different crops, flips, light and instruments.
     seed
         Integer in [0, 2**63).
     threads
-        Of one process; default: the processors shared out among the loader's workers.
+        Threads of one process; default: the number of processors over the number of the loader's workers.
     ahead
-        Examples that a background thread simulates while the last one is in use, without workers and on the CPU;
-        0: none. Another process would cost a copy of every cube, this costs none.
+        Number of examples that a background thread simulates in advance, without workers and on the CPU; 0: none.
+        Unlike a worker process, the thread needs no copy of the cubes.
     repeat
-        False: every pass is the next epoch, as a training wants it. True: every pass is the same one, as a validation
-        does.
+        False: every pass is the next epoch, for training. True: every pass is the same epoch, for validation.
     transform
-        Called on each example; what it returns is given out.
+        Called on each example, which its result replaces.
     rank, world_size
-        Of a distributed run; default: those of torch.distributed where it is initialised, else of the environment
-        (RANK and WORLD_SIZE, as torchrun sets them), else 0 of 1. All ranks give equally many samples of an epoch, so
-        that up to ``world_size - 1`` are left out.
+        Of a distributed run; default: those of torch.distributed if initialised, else of the environment
+        (RANK and WORLD_SIZE, as set by torchrun), else 0 of 1. All ranks give the same number of samples of an
+        epoch, so that up to ``world_size - 1`` are omitted.
 
     Raises
     ------
     ValueError, TypeError
-        A bad argument, or settings that make no instrument at an end of their range.
+        An invalid argument, or an invalid instrument at an end of the ranges.
 
     See Also
     --------
@@ -509,11 +508,11 @@ class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
         return f"CubeStream({given}, seed={self._recipe.seed}, epoch {self.epoch})"
 
     def set_epoch(self, epoch: int, start: int = 0) -> None:
-        """Choose the `epoch` of the next pass and its first sample `start`, before which an earlier run stopped.
+        """Select the `epoch` of the next pass and its first sample `start`, where an earlier run stopped.
 
-        Without it the first pass is epoch 0 and each gives the next one; with ``repeat=True`` all give the same. After
-        n batches a loader has given samples up to ``n * batch_size * world_size``; from there the batches of the rest
-        are those of a run that did not stop.
+        Without this call the first pass is epoch 0, and each pass is the next epoch; with ``repeat=True`` all are the
+        same. After n batches a loader has returned samples up to ``n * batch_size * world_size``; a pass that starts
+        there has the remaining batches of an uninterrupted run.
         """
         number = checks.integer("epoch", epoch, low=0, high=_LAST)
         self._passes.begin_at(number, checks.integer("start", start, low=0, high=self._end))
@@ -528,13 +527,13 @@ class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
     def state_dict(self, batches: int | None = None) -> dict[str, int]:
         """Position in the pass, for `load_state_dict`.
 
-        torchdata's ``StatefulDataLoader`` asks for it in each of its workers, and resumes exactly with any number of
-        them. The parent of a plain loader's workers does not know how far the pass has gone: they run ahead.
+        torchdata's ``StatefulDataLoader`` calls it in each of its workers, and resumes exactly with any number of them.
+        The parent of a plain loader's workers does not know the position in the pass, because they run ahead.
 
         Parameters
         ----------
         batches
-            Examples taken from a plain loader with workers since the pass began: only the caller knows that number.
+            Examples taken from a plain loader with workers since the pass began, a number that only the caller knows.
             None: counted here, without workers.
 
         Raises
@@ -558,9 +557,9 @@ class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
         return state | {"start": min(start, self._end)}
 
     def load_state_dict(self, state: dict[str, int]) -> None:
-        """Go on where `state_dict` gave `state`; the settings must be the same.
+        """Continue from `state`, the result of `state_dict`, with the same settings.
 
-        A pass that was at its end then gives nothing more, and the one after it is the next epoch.
+        A pass that was at its end is then empty, and the next pass is the next epoch.
         """
         if state["seed"] != self._recipe.seed:
             raise ValueError(f"the state is of a stream with seed {state['seed']}, this one has {self._recipe.seed}")

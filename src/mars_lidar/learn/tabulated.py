@@ -15,31 +15,31 @@ from mars_lidar.table import Table
 class HistogramTable(torch.nn.Module):
     """Expected histograms (..., bins) of signal, background and delay (...), from a `mars_lidar.Table`.
 
-    Between the table's nodes the mean histogram is bilinear in S and B, as `Table.lookup` has it (docs/table.md, L1),
-    and continuous at them; its derivatives in S and B are those of the chords of a cell, and have kinks at the
-    nodes: with the spacing of the paper's table they jump there by less than 5 % in S and 15 % in B of what they
-    are. Those in the delay jump by less than 0.1 %. It is differentiable once; where smooth or second derivatives
-    are needed, use `mars_lidar.learn.expected_histogram`. The canonical shape is then moved to the delay by a
-    fraction of a bin: registrations before the cut follow from the photons before it, of which the pulse tells
-    exactly, and from the armed fraction at the bin's edges, which the table itself tells of the last dead time; in
-    between it falls by the bin's own photons. So a pulse narrower than a bin stays narrow, no bin is negative and
-    the total is kept. In total variation the shift errs by less than 1e-3, also of pulses of a quarter of a bin,
-    unless the dead time is shorter than the pulse (2e-2 at S = 10, t_d = 3 sigma).
+    Between the table's nodes the mean histogram is bilinear in S and B, as in `Table.lookup` (docs/table.md, L1), and
+    continuous at the nodes. Its derivatives in S and B are those of the chords of a cell and jump at the nodes: with
+    the spacing of the paper's table by less than 5 % in S and 15 % in B. Derivatives in the delay jump by less than 0.1
+    %. It is differentiable once; for smooth or second derivatives use `mars_lidar.learn.expected_histogram`. The
+    canonical shape is shifted to the delay by a fraction of a bin: the registrations before the cut follow from the
+    photons before it, given exactly by the pulse, and from the armed fraction, which at the edges of the bin follows
+    from the registrations of the last dead time in the table and in between decreases by the photons of the bin. A
+    pulse narrower than a bin thus stays narrow, no bin is negative, and the total is preserved. The error of the shift
+    in total variation is below 1e-3, also for pulses of a quarter of a bin, unless the dead time is shorter than the
+    pulse (2e-2 at S = 10, t_d = 3 sigma).
 
-    What the table leaves out is left out: the start-up part of an armed exposure stays at the canonical delay
-    (docs/table.md, 4). `mars_lidar.learn.expected_histogram` evaluates each pixel by itself instead.
+    As in the table, the start-up part of an armed exposure stays at the canonical delay (docs/table.md, 4).
+    `mars_lidar.learn.expected_histogram` evaluates each pixel instead.
 
     Parameters
     ----------
     table
-        Of a non-paralyzable detector without gate or effects.
+        A table of a non-paralyzable detector without gate or effects.
     cycles
         Laser periods of the exposure; None: the table's.
 
     Raises
     ------
     TypeError, ValueError
-        No table; one that does not hold for `cycles`; another detector. `forward`: pixels outside of the table.
+        Not a table; a table that is not valid for `cycles`; another detector. `forward`: pixels outside the table.
 
     See Also
     --------
@@ -47,8 +47,8 @@ class HistogramTable(torch.nn.Module):
 
     Notes
     -----
-    A module: ``.to("cuda")`` moves the table, ``.double()`` evaluates in double precision (float32 otherwise). It holds
-    ``4 x nodes x bins`` bytes of histograms; a gradient needs some tens of MB besides.
+    A module: ``.to("cuda")`` moves the table, ``.double()`` evaluates in double precision (float32 otherwise). Its
+    histograms take ``4 x nodes x bins`` bytes; a gradient needs some tens of MB in addition.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""What the package `mars_lidar.learn` computes by: its tolerances and limits, with unit and origin."""
+"""Tolerances and limits of the package `mars_lidar.learn`, each with its unit and origin."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Tolerances:
-    """Quantities that accuracy, work or memory of this package depends on."""
+    """Quantities that determine accuracy, work or memory of this package."""
 
     # forward: the cyclic solver
     krylov: int = 40

@@ -1,1 +1,1 @@
-"""Light at the detector: photon rates of every pixel, and the photons that were registered."""
+"""Light at the detector: photon rates of every pixel, and registered photons."""

@@ -1,4 +1,4 @@
-"""Photon flux at the pixels: what arrives at the detector, per laser period (`Flux`)."""
+"""Photon flux at the pixels: expected photons per laser period (`Flux`)."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def light_map(name: str, value: ArrayLike, *, photons: bool = True) -> FloatArra
 
 
 def check_photons(name: str, array: FloatArray) -> None:
-    """Raise ValueError, naming the first one, for numbers that are no photons per period."""
+    """Raise ValueError, naming the first one, for invalid numbers of photons per period."""
     if not (array.min() >= 0 and array.max() <= TOL.photons):  # NaN is neither
         bad = ~((array >= 0) & (array <= TOL.photons))
         where = tuple(int(k) for k in np.argwhere(bad)[0])
@@ -50,7 +50,7 @@ def check_photons(name: str, array: FloatArray) -> None:
 
 
 def common_shape(names: Sequence[str], shapes: Sequence[tuple[int, ...]]) -> tuple[int, ...]:
-    """The shape that all broadcast to."""
+    """The common shape to which all broadcast."""
     try:
         return np.broadcast_shapes(*shapes)
     except ValueError:
@@ -80,7 +80,7 @@ def waveform_maps(waveform: ArrayLike, background: ArrayLike) -> tuple[FloatArra
 
 
 def frozen(array: FloatArray) -> FloatArray:
-    """A contiguous copy that nobody writes to."""
+    """A contiguous read-only copy."""
     copy = np.array(array, dtype=np.float64, order="C")
     copy.flags.writeable = False
     return copy
@@ -92,34 +92,34 @@ def frozen(array: FloatArray) -> FloatArray:
 @constructed_by_name
 @dataclass(frozen=True, eq=False, init=False)
 class Flux:
-    """The light: expected photons on the pixels per laser period, of one pixel, of a row of pixels or of an image.
+    """The light: expected photons per laser period at one pixel, a row of pixels or an image.
 
-    What `simulate` draws from and every prediction is of: ``count_law(flux, system)``. The arrival rate at a pixel is
+    Argument of `simulate` and of every prediction, such as ``count_law(flux, system)``. The arrival rate at a pixel is
     periodic, ``lambda(t) = S s(t - tau) + B / t_r`` with the pulse s of the `System`, or any non-negative waveform.
-    Photons are those that the pixel can detect; of a detector with a `Detector.detection_efficiency` below 1, those on
-    the pixel, of which it detects that share.
+    Photons are detectable photons; with a `Detector.detection_efficiency` below 1 they are the photons on the pixel, of
+    which it detects that share.
 
     Parameters
     ----------
     signal
         Signal photons per period S. Scalars are one pixel, (N,) a row of pixels, (H, W) an image; all arguments
-        broadcast. (R, H, W) is an image of R returns in each pixel, 1 to 16, whose delays are then (R, H, W) too;
-        `Flux.multi` puts returns of several fluxes side by side.
+        broadcast. (R, H, W) is an image with R returns in each pixel, 1 to 16, whose delays are then also (R, H, W);
+        `Flux.multi` combines the returns of several fluxes.
     background
         Background photons per period B, uniform in time.
     delay_ns
-        Delay tau of the return, ns. Up to a second either way (1e9 ns): it wraps into the laser period. NaN, for "no
+        Delay tau of the return, ns, between -1e9 and 1e9 (one second); it wraps into the laser period. NaN, for "no
         return", is allowed where the signal is 0.
     waveform
         Instead of `signal` and `delay_ns`: photons per period in each of T equal parts of the period
         (..., T), as they reach the detector (the pulse of the system is *not* applied), constant inside
-        each part. T is free: it need not be the number of histogram bins.
+        each part. T may differ from the number of histogram bins.
 
     Attributes
     ----------
     shape
-        () of one pixel, (N,) or (H, W). Predictions have these axes first; `simulate` makes an image of every flux, of
-        1 x 1 or 1 x N pixels (`image`).
+        () for one pixel, (N,) or (H, W). Results of predictions begin with these axes; `simulate` treats every flux as
+        an image, of 1 x 1 or 1 x N pixels (`image`).
     signal, background, delay_ns
         (...) of that shape, read-only. With several returns `signal` is their sum and `delay_ns` that of the strongest;
         with a waveform `signal` is its sum and `delay_ns` is NaN.
@@ -128,15 +128,15 @@ class Flux:
     waveform
         (..., T) or None.
     info
-        What made this flux, for the record (scene radiometry puts its achieved means here).
+        Origin of this flux, such as the levels that scene radiometry achieved.
 
     Raises
     ------
     TypeError
-        Light that is no array of real numbers.
+        Light that is not an array of real numbers.
     ValueError
         Negative or infinite photons, delays that are not finite where there is signal, shapes that do not broadcast,
-        more than 16 returns, or a waveform beside signal or delay.
+        more than 16 returns, or a waveform together with signal or delay.
 
     See Also
     --------
@@ -193,10 +193,10 @@ class Flux:
 
     @classmethod
     def multi(cls, *fluxes: Flux, info: dict[str, Any] | None = None) -> Flux:
-        """The sum of several fluxes: their returns side by side, their backgrounds added.
+        """The sum of several fluxes: all their returns, and the sum of their backgrounds.
 
-        For a pane of glass in front of a wall, say. Waveforms of equal length add up; a waveform cannot be
-        mixed with returns, because the pulse that shapes those belongs to the `System`.
+        For example, a pane of glass in front of a wall. Waveforms of equal length are added; a waveform cannot be
+        combined with returns, because their pulse belongs to the `System`.
         """
         if not fluxes or not all(isinstance(f, Flux) for f in fluxes):
             raise TypeError(f"multi takes one or more Flux objects, got {fluxes!r}")
@@ -230,11 +230,11 @@ class Flux:
 
     @checked
     def detected(self, system: System) -> Flux:
-        """The photons that avalanches follow: times `Detector.detection_efficiency`, plus `Detector.dark_count_hz`.
+        """The flux of avalanches: photons times `Detector.detection_efficiency`, plus `Detector.dark_count_hz`.
 
-        Poisson photons that are each detected with a probability are Poisson photons of the thinned rate, and dark
-        counts are background: what a pixel registers of this flux is exactly what one without these two effects
-        (`System.detected`) registers of the flux returned. This flux itself where neither is on.
+        Poisson photons, each detected with the same probability, are Poisson photons of the thinned rate, and dark
+        counts are background: registrations under this flux have exactly the law of those of a pixel without these two
+        effects (`System.detected`) under the returned flux. Returns this flux if both effects are off.
         """
         share, dark = system.detector.detection_efficiency, system.detector.dark_count_hz * (system.period_ns * 1e-9)
         if share == 1.0 and dark == 0.0:
@@ -242,17 +242,17 @@ class Flux:
         return self._scaled(share, dark)
 
     def delay_periods(self, period_ns: float) -> FloatArray:
-        """Delays of the returns (K, pixels) in periods of `period_ns`, in [0, 1); 0 where there is no return."""
+        """Delays of the returns (K, pixels) in periods of `period_ns`, in [0, 1); 0 without a return."""
         pixels = self.background.size
         delay = np.ascontiguousarray(self.returns_delay_ns.reshape(-1, pixels)) / period_ns
         return np.nan_to_num(delay - np.floor(delay), nan=0.0)
 
     @checked
     def with_dark_counts(self, rate_hz: ArrayLike, system: System) -> Flux:
-        """This flux with dark counts at `rate_hz`, counts/s: scalar or of the pixels, such as `dark_count_map` draws.
+        """This flux with dark counts at `rate_hz`, counts/s: a number, or a map such as that of `dark_count_map`.
 
-        They are background that the detection efficiency of the system does not reduce (hence divided by it here, for
-        `detected` multiplies), uniform in time; a gated pixel has them in its gate only.
+        Dark counts are background, uniform in time, that the detection efficiency of the system does not reduce (they
+        are divided by it here, because `detected` multiplies by it); a gated pixel has them within its gate only.
         """
         rate = light_map("rate_hz", rate_hz, photons=False)
         if not (rate >= 0.0).all():
@@ -279,7 +279,7 @@ class Flux:
         nearest_m: float = 1.0,
         parts: int | None = None,
     ) -> Flux:
-        """These returns through homogeneous fog, as a waveform: attenuated, and behind the fog's own light.
+        """These returns through homogeneous fog, as a waveform: attenuated, with the backscatter of the fog.
 
         With alpha the extinction and z = c tau / 2, by the lidar equation for single scattering (U. Wandinger,
         "Introduction to lidar", in C. Weitkamp, ed., Lidar, Springer 2005), through the pulse of the system::
@@ -287,14 +287,14 @@ class Flux:
             S_k -> S_k exp(-2 alpha z_k)
             fog:   backscatter * g(z),   g(z) ~ exp(-2 alpha z) / z^2   from z_0 to the pixel's farthest return
 
-        g integrates to 1 from z_0 to infinity; a pixel without a return sees all of it.
+        g integrates to 1 from z_0 to infinity; a pixel without a return receives all of it.
 
         Parameters
         ----------
         extinction_per_m
             Extinction coefficient alpha, 1/m; 3.91 / (visibility in m), by Koschmieder's law.
         backscatter
-            Photons per period that fog without a target sends back.
+            Photons per period backscattered by fog without a target.
         nearest_m
             Depth z_0 from which on laser and field of view overlap, m, > 0.
         parts
@@ -350,7 +350,7 @@ class Flux:
         return part
 
     def pixels(self, numbers: IndexArray) -> Flux:
-        """Some pixels (N,) by their `numbers`, which count row by row."""
+        """Some pixels (N,) by their `numbers` in row-major order."""
         number, every = len(self.returns_signal), self.background.size
         signal, delay = (a.reshape(number, every)[:, numbers] for a in (self.returns_signal, self.returns_delay_ns))
         wave = None if self.waveform is None else self.waveform.reshape(every, -1)[numbers]
@@ -417,8 +417,8 @@ def made(
 class StoredFlux(Flux):
     """A `Flux` of waveforms too large for memory; ``flux[rows]`` is an ordinary `Flux`.
 
-    `mars_lidar.io.simulate_to` takes it band by band; `mars_lidar.simulate` makes it whole first. `waveform` has a
-    `shape` and gives rows when it is indexed.
+    `mars_lidar.io.simulate_to` reads it band by band; `mars_lidar.simulate` reads it as a whole. `waveform` has a
+    `shape` and returns rows when indexed.
 
     Parameters
     ----------
@@ -427,7 +427,7 @@ class StoredFlux(Flux):
     parts
         T, parts of the period.
     rows
-        Makes the flux of some rows, a slice with explicit ends and step 1.
+        Function that makes the flux of some rows, a slice with explicit ends and step 1.
     info
         As for `Flux`.
     """
@@ -492,7 +492,7 @@ class StoredFlux(Flux):
 
 
 class Waveforms:
-    """(H, W, T) photons per period and part, made by rows when indexed."""
+    """(H, W, T) photons per period and part, computed by rows when indexed."""
 
     dtype = np.dtype(np.float64)
     ndim = 3
@@ -522,7 +522,7 @@ class Waveforms:
         return np.asarray(self[0 : self.shape[0]], dtype=dtype)
 
     def bands(self) -> Iterator[slice]:
-        """Rows that are made together; together the image."""
+        """Bands of rows that are computed together and cover the image."""
         step = max(1, TOL.band_bytes * self.shape[0] // max(self.nbytes, 1))
         for first in range(0, self.shape[0], step):
             yield slice(first, min(first + step, self.shape[0]))

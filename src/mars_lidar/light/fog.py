@@ -1,4 +1,4 @@
-"""Returns seen through homogeneous fog: attenuated, and behind its own backscatter."""
+"""Returns through homogeneous fog: attenuated, with its backscatter."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from mars_lidar.light.transient import through_pulse
 
 @dataclass(frozen=True, kw_only=True)
 class Fog:
-    """Homogeneous fog before a scene, whatever the level of light.
+    """Homogeneous fog in front of a scene, for any level of light.
 
     Attributes
     ----------
     extinction_per_m
         Extinction coefficient alpha, 1/m; 3.91 / (visibility in m), by Koschmieder's law.
     backscatter
-        Photons that fog without a target sends back, for one photon of the mean signal in clear air: both are
-        proportional to the power of the laser.
+        Photons backscattered by fog without a target, per photon of the mean signal in clear air: both are proportional
+        to the power of the laser.
     nearest_m
         Depth from which on laser and field of view overlap, m.
     """
@@ -42,7 +42,7 @@ class Fog:
             object.__setattr__(self, name, checks.real(name, getattr(self, name), low=0.0, strict_low=above))
 
     def before(self, flux: Flux, system: System, signal: float) -> StoredFlux:
-        """Returns of the mean `signal` seen through this fog: `Flux.in_fog`, made row by row as it is used."""
+        """Returns of the mean `signal` through this fog: `Flux.in_fog`, computed row by row on use."""
         parts = TOL.parts_per_bin * system.bins
         photons = self.backscatter * signal
         step = max(1, TOL.work_bytes // (8 * flux.shape[1] * parts))

@@ -1,4 +1,4 @@
-"""Registration times of an image, packed ragged."""
+"""Registration times of an image, packed pixel after pixel."""
 
 from __future__ import annotations
 
@@ -42,10 +42,10 @@ class Timestamps:
     period_ns, cycles
         Laser period, ns, and laser periods of the exposure.
     dtype
-        Of a histogram of them, uint16 or uint32.
+        Type of their histogram, uint16 or uint32.
     info
-        Where they come from: ``system`` (as `System.to_dict` gives it), ``engine``, ``seed``, ``realization``,
-        ``source``, ``unit_ns`` (resolution of the clock that recorded them), as far as they are known.
+        Origin, as far as known: ``system`` (as `System.to_dict` returns it), ``engine``, ``seed``, ``realization``,
+        ``source``, ``unit_ns`` (resolution of the recording clock).
 
     See Also
     --------
@@ -108,7 +108,7 @@ class Timestamps:
 
     @property
     def system(self) -> System | None:
-        """Laser, detector and histogram, or None where they are not known (a measured stream)."""
+        """Laser, detector and histogram, or None if unknown (a measured stream)."""
         stored = self.info.get("system")
         return None if stored is None else System.from_dict(stored)
 
@@ -122,15 +122,15 @@ class Timestamps:
         Parameters
         ----------
         path, overwrite
-            The file, and whether to replace one that exists.
+            The file, and whether to replace an existing one.
         clock_ps
-            Of a ``.ptu``: least unit of its times; None: as fine as its records can. Programs that make an image of
-            the file have a bin for each unit of the period.
+            For a ``.ptu``: smallest unit of its times; None: the finest that its records allow. Programs that make an
+            image of the file use one bin per unit.
 
         Raises
         ------
         ValueError
-            Another suffix, or a stream that the format cannot hold.
+            Another suffix, or a stream that the format cannot contain.
         OSError
             `path` exists and `overwrite` is false, or cannot be written.
         """
@@ -147,25 +147,25 @@ class Timestamps:
         unit_ns: float | None = None,
         variable: str | None = None,
     ) -> Timestamps:
-        """Read what `save` wrote, or a photon stream that others recorded: PTU (T2, T3), Photon-HDF5, .mat, .npz.
+        """Read a file of `save`, or a photon stream of another program: PTU (T2, T3), Photon-HDF5, .mat, .npz.
 
         Parameters
         ----------
         path
-            ``.npz``, ``.ptu``, ``.h5``, ``.hdf5`` or ``.mat``. In PTU and Photon-HDF5 of others a pixel is a
-            detector (channel), and the image is (1, detectors); in ``.mat`` and ``.npz`` an array of absolute times
-            is one pixel, and a cell array (.mat) an image of them.
+            ``.npz``, ``.ptu``, ``.h5``, ``.hdf5`` or ``.mat``. In PTU and Photon-HDF5 of other programs a pixel
+            is a detector (channel), and the image is (1, detectors); in ``.mat`` and ``.npz`` an array of absolute
+            times is one pixel, and a cell array (.mat) an image.
         period_ns
-            Laser period, for files of others that do not tell (T2), or tell a rounded one.
+            Laser period, for files of other programs that do not contain it (T2) or contain a rounded one.
         bins
-            Histogram bins, for files of others; None: their own, one per unit of their fine clock.
+            Histogram bins, for files of other programs; None: one per unit of their fine clock.
         unit_ns, variable
-            For ``.mat`` and ``.npz`` of others: unit of the times in ns, and the variable that holds them.
+            For ``.mat`` and ``.npz`` of other programs: unit of the times in ns, and the variable that contains them.
 
         Raises
         ------
         ValueError
-            A file of the wrong kind, damaged or incomplete: the message names it.
+            A file of another kind, damaged or incomplete: the message names it.
         """
         load = late("io.streams.files:load")
         loaded: Timestamps = load(path, period_ns=period_ns, bins=bins, unit_ns=unit_ns, variable=variable)
@@ -216,9 +216,9 @@ class Timestamps:
 
 
 class DrawnTimestamps(Timestamps):
-    """Timestamps that an engine drew: 8 bytes each until times or bins are asked for, which are then kept.
+    """Timestamps that an engine drew: 8 bytes each; times and bins are computed and cached on first use.
 
-    Made by `of`, without the checks of `Timestamps`: no user gave the numbers.
+    Made by `of`, without the checks of `Timestamps`, because the numbers are not user input.
     """
 
     phase: NDArray[np.float32]  # (n,) part of the laser period, in [0, 1]
@@ -262,7 +262,7 @@ class DrawnTimestamps(Timestamps):
         return record_bins(self.phase, self.bins)
 
     def pixel(self, y: int, x: int) -> Timestamps:
-        """The registrations of one pixel, as views; their times and bins are the image's where it has them."""
+        """The registrations of one pixel, as views; their times and bins are views of the image's, if computed."""
         if "phase" not in vars(self):  # changed by dataclasses.replace
             return super().pixel(y, x)
         k = self._place(y, x)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Tolerances:
-    """Numbers of the light that are no arguments.
+    """Constants of the light that are not arguments.
 
     Attributes
     ----------

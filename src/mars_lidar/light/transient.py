@@ -1,7 +1,8 @@
 """Rendered transients: light against time at each pixel, as the detector's input.
 
-A transient path tracer gives what a delta pulse sends back. `Transient.flux` puts it on the laser period, gives it the
-pulse of the system, and scales it to photons. Rates (H, W, T) may stay on disk: rows are read as needed.
+A transient path tracer renders the response to a delta pulse. `Transient.flux` folds it with the laser period,
+convolves it with the pulse of the system, and scales it to photons. Rates (H, W, T) may stay on disk: rows are read as
+needed.
 """
 
 from __future__ import annotations
@@ -88,21 +89,21 @@ class Transient:
     Parameters
     ----------
     values
-        (H, W, T), >= 0, in any linear unit (radiance per bin): an array, a memory map, or anything with `shape`
-        that gives rows when it is sliced. It is read in bands of rows, never whole.
+        (H, W, T), >= 0, in any linear unit (radiance per bin): an array, a memory map, or any object with
+        `shape` that returns rows when sliced. It is read in bands of rows, never as a whole.
     bin_ns
         Width of a time bin, ns of travel time (for a bin of d metres of optical path, d / c).
     start_ns
         Travel time at the start of bin 0, ns.
     source
-        Where it comes from, for the record.
+        Free text: its origin.
     totals
-        (H, W), sums over all bins, where they are known already: else the values are read once for them.
+        (H, W), sums over all bins, if known; otherwise the values are read once to compute them.
 
     Raises
     ------
     ValueError, TypeError
-        Values of another shape, negative or no numbers; a width that is not positive.
+        Values of another shape, negative or not numbers; a width that is not positive.
 
     See Also
     --------
@@ -168,14 +169,14 @@ class Transient:
         return np.concatenate([self.rows(some).sum(-1) for some in self.bands()])
 
     def bands(self, band_bytes: int = TOL.band_bytes) -> Iterator[slice]:
-        """Rows that take at most about `band_bytes` as float64 each, at least one; together the image."""
+        """Bands of at least one row and about `band_bytes` as float64, which cover the image."""
         height, width, bins = self.values.shape
         step = max(1, band_bytes // (8 * width * bins))
         for first in range(0, height, step):
             yield slice(first, min(first + step, height))
 
     def pixel_index(self, rows: slice) -> NDArray[np.int64]:
-        """What `mars_lidar.simulate` needs as `pixel_index`, so that some rows have the photons of the whole."""
+        """`pixel_index` for `mars_lidar.simulate`, so that some rows have the photons of the whole image."""
         first, last, _ = rows.indices(self.shape[0])
         width = self.shape[1]
         return np.arange(first * width, last * width, dtype=np.int64)
@@ -200,12 +201,12 @@ class Transient:
             S = signal * L / mean_V(L)      or      S = photons_per_unit * L
             B = mean_V(S) / sbr  +  dark_count_hz * t_r / detection_efficiency
 
-        Time is folded with the laser period: light that arrives after its end comes in the next one.
+        Time is folded with the laser period: light after the end of a period arrives in the next one.
 
         Parameters
         ----------
         system
-            Gives the laser period and the pulse.
+            The system with the laser period and the pulse.
         signal
             Mean detectable signal photons per laser period over the pixels with light, > 0.
         photons_per_unit
@@ -213,21 +214,21 @@ class Transient:
         sbr
             Mean signal over ambient photons, uniform over the image; inf: no ambient light.
         dark_count_hz
-            Dark counts of a pixel, counts/s, besides those of the detector (`Detector.dark_count_hz`): what is counted,
-            whatever the detection efficiency.
+            Dark counts of a pixel, counts/s, in addition to those of the detector (`Detector.dark_count_hz`); not
+            reduced by the detection efficiency.
         pulse
-            Convolve with the system's pulse (for what a delta pulse sends back). False: the pulse and the
-            detector's response are in the transient already.
+            Convolve with the system's pulse (for the response to a delta pulse). False: the transient already contains
+            the pulse and the detector's response.
         parts
             Parts of the waveform in a period. Default: as fine as the transient and the histogram. A transient
-            whose bins fit the period a whole number of times is taken over unchanged.
+            with a whole number of bins per period is used unchanged.
         rows
-            Rows of the image, of step 1; the levels are those of the whole image whatever the rows.
+            Rows of the image, of step 1; levels always refer to the whole image.
 
         Raises
         ------
         ValueError, TypeError
-            A bad argument; light that is negative or not finite; no light anywhere.
+            An invalid argument; light that is negative or not finite; no light in any pixel.
         """
         if (signal is None) == (photons_per_unit is None):
             raise ValueError("the level is one of signal and photons_per_unit, got neither or both")
@@ -273,9 +274,9 @@ class Transient:
 
     @checked
     def stored_flux(self, system: System, **level: Any) -> StoredFlux:
-        """The flux as `flux` gives it, for a transient larger than memory: rows are read when they are used.
+        """The flux of `flux`, for a transient larger than memory: rows are read on use.
 
-        `mars_lidar.io.simulate_to` takes it band by band. `system`, the arguments of `level` (all but `rows`) and the
+        `mars_lidar.io.simulate_to` reads it band by band. `system`, the arguments of `level` (all but `rows`) and the
         errors are those of `flux`; the transient is read once at this call, for its `totals`.
         """
 
@@ -328,7 +329,7 @@ class Transient:
 
 
 def parts_of(transient: Transient, system: System) -> int:
-    """Parts of a waveform as fine as the transient and the histogram; ValueError where its bins are absurd."""
+    """Number of parts of a waveform as fine as the transient and the histogram; ValueError for unreasonable bins."""
     parts = system.period_ns / transient.bin_ns * (1 - 1e-12)
     periods = (transient.values.shape[2] * transient.bin_ns + abs(transient.start_ns)) / system.period_ns
     if parts > TOL.parts or periods > TOL.periods:
@@ -341,7 +342,7 @@ def parts_of(transient: Transient, system: System) -> int:
 
 
 def through_pulse(light: FloatArray, system: System) -> FloatArray:
-    """Light in equal parts of the period (..., T), even inside each, after the system's pulse; its energy is kept."""
+    """Light in equal parts of the period (..., T), constant in each, convolved with the system's pulse."""
     number = light.shape[-1]
     total = light.sum(-1, keepdims=True)
     spread = np.fft.irfft(np.fft.rfft(light) * _spectrum(system.pulse, system.period_ns, number), n=number)

@@ -1,7 +1,7 @@
-"""Pictures of histogram cubes, for screens and papers.
+"""Figures of histogram cubes, for screens and papers.
 
 Every figure is a `matplotlib.figure.Figure` and changes no global state of matplotlib: no window opens, no
-backend is selected, and figures can be made in any thread. ``figure.savefig(path)`` writes one.
+backend is selected, and figures can be made in any thread. ``figure.savefig(path)`` writes a figure.
 """
 
 from mars_lidar.plot.figures import map_image, overview, pixel_histogram

@@ -40,21 +40,21 @@ def overview(
 ) -> Figure:
     """Depth, reflectivity, total counts, peak-bin depth, and the histograms of a few pixels.
 
-    For a measured cube the maximum likelihood estimate replaces the true light.
+    For a measured cube the maximum-likelihood estimate replaces the true light.
 
     Parameters
     ----------
     cube
-        A cube in memory or on disk, of which only one realization is read, in bands of rows; or counts as `simulate`
+        A cube in memory or on disk, of which one realization is read in bands of rows; or counts as `simulate`
         returns them.
     system, flux
-        Beside an array of counts: how they were recorded, and the light where it is known.
+        For an array of counts: the system that recorded them, and the light, if known.
     realization
-        Which one, counted from the start of the cube.
+        Number of the realization, from the start of the cube.
     pixels
         (y, x) of the pixels whose histograms are drawn, 1 to 6; default `example_pixels`.
     title
-        Headline; by default a line on the system.
+        Title; by default a line about the system.
 
     Returns
     -------
@@ -64,9 +64,9 @@ def overview(
     Raises
     ------
     TypeError
-        No cube, or no array of counts with its system; pixels that are no pairs.
+        Neither a cube nor an array of counts with its system; pixels that are not pairs.
     ValueError
-        `realization` or a pixel outside of the cube; other than 1 to 6 pixels.
+        `realization` or a pixel outside the cube; other than 1 to 6 pixels.
 
     See Also
     --------
@@ -144,9 +144,9 @@ def pixel_histogram(
     y, x
         Row and column of the pixel, from 0.
     system, flux
-        Beside an array of counts: how they were recorded, and the light where it is known.
+        For an array of counts: the system that recorded them, and the light, if known.
     realization
-        Which exposure, counted from the start of the cube.
+        Number of the exposure, from the start of the cube.
 
     Returns
     -------
@@ -155,9 +155,9 @@ def pixel_histogram(
     Raises
     ------
     TypeError
-        No cube, or no array of counts with its system.
+        Neither a cube nor an array of counts with its system.
     ValueError
-        A pixel or a realization outside of the cube.
+        A pixel or a realization outside the cube.
 
     See Also
     --------
@@ -208,9 +208,9 @@ def map_image(values: NDArray[Any], label: str, *, cmap: str = "viridis") -> Fig
     Raises
     ------
     TypeError
-        Values that are no array of numbers.
+        Values that are not an array of numbers.
     ValueError
-        Values that are no map (H, W), or a colour map that matplotlib does not have.
+        Values that are not a map (H, W), or an unknown colour map.
 
     See Also
     --------

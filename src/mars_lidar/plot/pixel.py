@@ -27,8 +27,7 @@ def draw_pixel(
 ) -> None:
     """Draw counts, the predicted mean histogram, the incident rate scaled to the same total, and the true delays.
 
-    The incident rate is what the histogram would look like without dead time: what lies between it and the
-    prediction is pile-up.
+    The incident rate has the shape of a histogram without dead time; its difference from the prediction is pile-up.
     """
     y, x = pixel
     system, flux = cube.system, cube.flux
@@ -89,7 +88,7 @@ def draw_pixel(
 
 
 def quiet_corner(rate: NDArray[np.float64]) -> str:
-    """Where a legend hides least of a histogram of this rate."""
+    """The corner in which a legend covers least of a histogram of this rate."""
     left, middle, right = (float(part.max(initial=0.0)) for part in np.array_split(rate, 3))
     places = {"upper right": right, "upper left": left, "upper center": middle}
     return min(places, key=lambda name: places[name])

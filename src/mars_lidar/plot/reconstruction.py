@@ -1,4 +1,4 @@
-"""The picture of a reconstruction: truth above, and a row of depth, its error, and reflectivity for each method."""
+"""The figure of a reconstruction: the truth above, and a row of depth, its error, and reflectivity for each method."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ _MAP_INCHES = 2.35
 
 
 def reconstruction(cube: Cube, results: Mapping[str, Reconstruction], *, realization: int = 0) -> Figure:
-    """Depth, error of depth and reflectivity of each method; errors only where the truth is known.
+    """Depth, error of depth and reflectivity of each method; errors only if the truth is known.
 
-    Of a single pixel its histogram, beside the true light, or that fitted to a measured one.
+    For a single pixel its histogram, with the true light, or the fitted light of a measured one.
 
     Parameters
     ----------
     cube
-        The cube, whose maps are the truth where it has a scene.
+        The cube, whose maps are the truth if it has a scene.
     results
         Reconstructions (realizations, H, W) by name of the method.
     realization
-        Which one, counted from the start of the cube.
+        Number of the realization, from the start of the cube.
     """
     depth = cube.depth_m
     if depth.shape == (1, 1):

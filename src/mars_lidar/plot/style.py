@@ -1,4 +1,4 @@
-"""The style sheet of all pictures (mars.mplstyle beside this file), and colours that are set by name."""
+"""The style sheet of all figures (mars.mplstyle beside this file), and named colours."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ MISSING = "#c8c8c8"  # pixels without a value
 
 
 def style() -> Any:
-    """Context in which figures are built; the user's own settings are back after it."""
+    """Context in which figures are made; the user's settings are restored afterwards."""
     import matplotlib as mpl
 
     return mpl.rc_context(mpl.rc_params_from_file(SHEET, use_default_template=False))

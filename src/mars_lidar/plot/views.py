@@ -29,29 +29,29 @@ def count_maps(
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Total counts, and the depth at the fullest bin.
 
-    The depth is that of the bin's centre, with the distance between the pulse's peak and its origin taken
-    off; modulo the unambiguous range. The first of several equal bins is taken.
+    The depth is that of the bin's centre minus the distance between the pulse's peak and its origin, modulo the
+    unambiguous range. Of several equal bins the first is used.
 
     Parameters
     ----------
     cube
         A cube in memory or on disk, read in bands of rows; or counts as `simulate` returns them.
     realization
-        Which exposure, counted from the start of the cube.
+        Number of the exposure, from the start of the cube.
     system
-        Beside an array of counts: how they were recorded.
+        For an array of counts: the system that recorded them.
 
     Returns
     -------
     tuple
-        Counts (H, W), and depth (H, W) in m: NaN where nothing was counted.
+        Counts (H, W), and depth (H, W) in m: NaN without counts.
 
     Raises
     ------
     TypeError
-        No cube, or no array of counts with its system.
+        Neither a cube nor an array of counts with its system.
     ValueError
-        A realization outside of the cube.
+        A realization outside the cube.
 
     See Also
     --------
@@ -87,10 +87,10 @@ def count_maps(
 
 @checked
 def example_pixels(flux: Flux, depth_m: NDArray[np.float64]) -> dict[str, tuple[int, int]]:
-    """A bright, a dim and an edge pixel: ``{"bright": (y, x), ...}``, as many as there are.
+    """A bright, a dim and an edge pixel, if present: ``{"bright": (y, x), ...}``.
 
     Bright and dim are the 98th and the 5th percentile of the signal among pixels with a return; the edge is
-    the steepest step in depth. The rim of the image is left out, where recorded images have their artefacts.
+    the steepest step in depth. The rim of the image, where recorded images have artefacts, is excluded.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def example_pixels(flux: Flux, depth_m: NDArray[np.float64]) -> dict[str, tuple[
     Raises
     ------
     TypeError
-        No `Flux`, or a depth that is no array of numbers.
+        Not a `Flux`, or a depth that is not an array of numbers.
     ValueError
         A depth of another shape than the flux.
 
@@ -146,7 +146,7 @@ def example_pixels(flux: Flux, depth_m: NDArray[np.float64]) -> dict[str, tuple[
 
 
 def by_signal(flux: Flux) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
-    """(H, W) pixels that do not belong to the rim of the image, and those with a return among them, flat, by signal."""
+    """(H, W) pixels without the rim of the image, and those with a return among them, flat, sorted by signal."""
     inside = np.zeros(flux.shape, bool)
     rim = [n // 16 for n in flux.shape]
     inside[rim[0] : flux.shape[0] - rim[0], rim[1] : flux.shape[1] - rim[1]] = True
@@ -155,7 +155,7 @@ def by_signal(flux: Flux) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
 
 
 def with_pixels(named: dict[str, tuple[int, int]], flat: dict[str, np.int64], flux: Flux) -> dict[str, tuple[int, int]]:
-    """Those `named` and those that `flat` names beside them, as (y, x)."""
+    """The pixels `named` and those of `flat`, as (y, x)."""
     for name, k in flat.items():
         pixel = (int(k) // flux.shape[1], int(k) % flux.shape[1])
         if pixel not in named.values():
@@ -164,7 +164,7 @@ def with_pixels(named: dict[str, tuple[int, int]], flat: dict[str, np.int64], fl
 
 
 def instrument(system: System) -> str:
-    """A system in the words of a headline: bins, exposure, dead time, and what is not plain of the detector."""
+    """A system as a title: bins, exposure, dead time, and mode and effects of the detector."""
     detector, width = system.detector, system.bin_ns
     bins = f"{system.bins:,} bin{'s' if system.bins > 1 else ''} of "
     bins += f"{width:.4g} ns" if width >= 1.0 else f"{1e3 * width:.4g} ps"
@@ -183,7 +183,7 @@ def incident_rate(flux: Flux, system: System, y: int, x: int) -> NDArray[np.floa
     Parameters
     ----------
     flux, system
-        The light of the image (H, W), photons per period, and what registers it.
+        The light of the image (H, W), photons per period, and the system.
     y, x
         Row and column of the pixel, from 0.
 
@@ -195,9 +195,9 @@ def incident_rate(flux: Flux, system: System, y: int, x: int) -> NDArray[np.floa
     Raises
     ------
     TypeError
-        No `Flux` or no `System`.
+        Not a `Flux` or not a `System`.
     ValueError
-        A pixel outside of the image.
+        A pixel outside the image.
 
     See Also
     --------
@@ -220,10 +220,10 @@ def incident_rate(flux: Flux, system: System, y: int, x: int) -> NDArray[np.floa
 
 
 def predicted_counts(cube: Cube, y: int, x: int) -> NDArray[np.float64] | None:
-    """Mean histogram (bins,) of pixel (y, x) over many exposures, by the exact finite-exposure statistics.
+    """Expected histogram (bins,) of pixel (y, x), by the exact finite-exposure statistics.
 
-    None where that takes too long for a picture, does not converge, or is not known: behind a gate that moves, with
-    limits on events. The engine "poisson" has no dead time: its mean is the detected rate, inside of the gate.
+    None if it takes too long for a figure, does not converge, or is unknown (a moving gate, limits on events). The
+    engine "poisson" has no dead time: its mean is the detected rate within the gate.
     """
     system, flux = cube.system, cube.flux
     effects = system.detector.effects
@@ -253,21 +253,21 @@ def depth_error_m(
     Parameters
     ----------
     cube
-        A cube whose true depth is known, or fitted; or counts as `simulate` returns them.
+        A cube with known or fitted true depth; or counts as `simulate` returns them.
     estimate_m
-        (H, W) depth, m; NaN where there is none.
+        (H, W) depth, m; NaN without an estimate.
     system, flux
-        Beside an array of counts: how they were recorded, and the light, whose delays are the truth.
+        For an array of counts: the system that recorded them, and the light, whose delays are the truth.
 
     Returns
     -------
     NDArray
-        (H, W) difference, m; NaN where either is missing.
+        (H, W) difference, m; NaN if either is missing.
 
     Raises
     ------
     TypeError
-        No cube, or no array of counts with its system; estimates that are no array of numbers.
+        Neither a cube nor an array of counts with its system; estimates that are not an array of numbers.
     ValueError
         Estimates of another shape than the image.
 
@@ -304,10 +304,10 @@ def _peak_offset_ns(system: System) -> float:
 
 
 def fitted(cube: Cube, realization: int) -> Cube:
-    """One exposure of a measured cube with the flux that maximum likelihood finds in it; a simulated one as it is.
+    """One exposure of a measured cube with its maximum-likelihood flux; a simulated cube unchanged.
 
-    The flux is that of detectable photons, so the system is `System.detected`. Depth is NaN where there is no return.
-    Detectors that maximum likelihood does not hold for are fitted by the first of the other methods that does.
+    The flux is that of detectable photons, so that the system is `System.detected`. Depth is NaN without a return. For
+    detectors to which maximum likelihood does not apply, the first applicable method is used.
     """
     if not cube.measured:
         return cube

@@ -1,11 +1,11 @@
-"""The centre of mass of the counts round the fullest bin: depth finer than a bin without a model of the noise.
+"""The centre of mass of the counts around the fullest bin: sub-bin depth without a noise model.
 
-With b the counts that the background leaves in each bin and w the bins of the pulse's core round the peak at t_0::
+With b the background counts of each bin and w the bins of the pulse's core around the peak at t_0::
 
     tau = t_0 + sum_w (h_j - b) (t_j - t_0) / sum_w (h_j - b) - m                                                    (1)
 
-m is the centre of mass of the pulse over the same core, relative to its delay. Of a Gaussian pulse of N signal photons
-without background its standard deviation is that of the mean, sigma / sqrt(N).
+m is the centre of mass of the pulse over the same core, relative to its delay. For a Gaussian pulse of N signal photons
+without background the standard deviation of tau is that of a mean, sigma / sqrt(N).
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ _BLOCK = 2**22  # counts gathered at a time
 
 @dataclass(frozen=True)
 class Centroid(Peak):
-    """Delay at the centre of mass (1) of the counts round the fullest bin, less those of the background."""
+    """Delay at the centre of mass (1) of the background-subtracted counts around the fullest bin."""
 
     name = "centroid"
 
     def estimate(self, histograms: Histograms) -> Estimates:
-        """Delay, and signal and background of the window round the peak."""
+        """Delay, and signal and background of the window around the peak."""
         estimates = super().estimate(histograms)
         delay = estimates.delay.copy()
         rows = max(1, _BLOCK // (2 * _reach(histograms.system) + 1))

@@ -1,7 +1,7 @@
-"""Coates' correction: each bin's registrations over the periods in which the pixel was armed there.
+"""Coates' correction: registrations of each bin over the periods in which the pixel was armed in it.
 
-Coates, J. Phys. E 1, 878 (1968), exact for detectors that the laser clock arms. Generalised to free-running ones by
-Gupta, Ingle, Gupta, Asynchronous single-photon 3D imaging, ICCV 2019; here for bins of any brightness, dead times of
+Coates, J. Phys. E 1, 878 (1968), exact for synchronous detectors. Generalised to free-running detectors by Gupta,
+Ingle, Gupta, Asynchronous single-photon 3D imaging, ICCV 2019; extended here to bins of any brightness, dead times of
 any length, and both ends of the exposure (docs/reconstruction.md).
 """
 
@@ -31,7 +31,7 @@ class Coates(RateMethod):
     Raises
     ------
     ValueError
-        A filter that is none; ``check``: a detector of another mode.
+        An unknown filter; ``check``: a detector of another mode.
 
     See Also
     --------
@@ -65,21 +65,22 @@ def coates_rates(cube: ArrayLike, system: System, *, threads: int | None = None)
     cube
         (..., bins) counts.
     system
-        How they were recorded: mode ``"synchronous"``.
+        The system that recorded them, of mode ``"synchronous"``.
     threads
         Threads to run on; default: all processors that this process may use.
 
     Returns
     -------
     NDArray
-        (..., bins) photons per period; infinite in bins that registered in every remaining armed period.
+        (..., bins) photons per period; infinite in bins with a registration in every remaining armed period.
 
     Raises
     ------
     TypeError
-        Counts that are no array of numbers, or no `System`.
+        Counts that are not an array of numbers, or not a `System`.
     ValueError
-        Counts that are no whole numbers >= 0, or more than the periods; another mode; effects that this does not undo.
+        Counts that are not whole numbers >= 0, or more than the periods; another mode; effects that cannot be
+        corrected.
 
     See Also
     --------
@@ -103,9 +104,9 @@ def coates_rates(cube: ArrayLike, system: System, *, threads: int | None = None)
 
 @dataclass(frozen=True)
 class GeneralisedCoates(RateMethod):
-    """Rates with which every bin registers as often as it did, given when the histogram says the pixel was armed (R8).
+    """Rates whose expected registrations equal those of the bins, with the armed time of the histogram (R8).
 
-    `filter` on the rates: as `MatchedFilter`.
+    `filter` on the rates: as for `MatchedFilter`.
 
     Parameters
     ----------
@@ -115,7 +116,7 @@ class GeneralisedCoates(RateMethod):
     Raises
     ------
     ValueError
-        A filter that is none; ``check``: a detector of another mode.
+        An unknown filter; ``check``: a detector of another mode.
 
     See Also
     --------
@@ -143,29 +144,29 @@ class GeneralisedCoates(RateMethod):
 def generalised_coates_rates(cube: ArrayLike, system: System, *, threads: int | None = None) -> FloatArray:
     """Photons per period in each bin from histograms of a free-running detector.
 
-    Whatever the waveform: no pulse is assumed. The variance of a bin's rate l is about l^2 / h, h its registrations,
-    and bins are independent of each other.
+    No pulse shape is assumed. The variance of a bin's rate l is about l^2 / h, with h its registrations, and bins are
+    independent.
 
     Parameters
     ----------
     cube
         (..., bins) counts.
     system
-        How they were recorded.
+        The system that recorded them.
     threads
         Threads to run on; default: all processors that this process may use.
 
     Returns
     -------
     NDArray
-        (..., bins) photons per period; infinite in bins that registered whenever they could.
+        (..., bins) photons per period; infinite in bins with a registration in every armed period.
 
     Raises
     ------
     TypeError
-        Counts that are no array of numbers, or no `System`.
+        Counts that are not an array of numbers, or not a `System`.
     ValueError
-        Counts that are no whole numbers >= 0, or more than the periods allow; a detector that this does not hold for.
+        Counts that are not whole numbers >= 0, or more than the periods allow; a detector to which this does not apply.
 
     See Also
     --------

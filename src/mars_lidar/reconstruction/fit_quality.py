@@ -1,4 +1,4 @@
-"""Goodness of fit of reconstructed pixels: does each histogram agree with the law of its own estimate?
+"""Goodness of fit of reconstructed pixels: agreement of each histogram with the law of its estimate.
 
 `native/reconstruct/fit_quality.h` computes the statistics of each pixel: docs/theory_reconstruction.md, section 8.
 """
@@ -24,9 +24,9 @@ _WIDTH = 1.1  # ... and of the pulse whose score is computed
 
 
 def tested_recordings(system: System) -> list[_core.HistogramRecord]:
-    """The changes whose scores are computed, longer, shorter, wider; none where armed passes do not follow.
+    """The changes for which scores are computed (longer, shorter, wider); none if armed passes do not follow.
 
-    They do where the detector is free-running, without a gate, and exposed for much longer than its dead time.
+    They follow for a free-running detector without a gate in an exposure much longer than its dead time.
     """
     if system.detector.mode != "nonparalyzable" or system.cycles <= 4.0 * max(1.0, system.dead_time_periods):
         return []
@@ -39,10 +39,10 @@ def tested_recordings(system: System) -> list[_core.HistogramRecord]:
 
 @dataclass(frozen=True, eq=False)
 class Quality:
-    """Four tests of each pixel (pixels,) and their common p-value; NaN where there are too few photons.
+    """Four tests of each pixel (pixels,) and their combined p-value; NaN for too few photons.
 
     `chi2` of pooled cells with `freedom` degrees; `longer`, `shorter` and `wider` in standard deviations: positive
-    where a longer or a shorter dead time, a wider pulse would fit better.
+    if a longer dead time, a shorter dead time or a wider pulse fits better.
     """
 
     chi2: FloatArray

@@ -1,4 +1,4 @@
-"""How well depth and flux can be known: the Cramer-Rao bound, and the errors of linear window estimates."""
+"""Bounds on the accuracy of depth and flux: the Cramer-Rao bound, and the errors of linear window estimates."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ class HistogramBound:
     Attributes
     ----------
     information
-        (..., 3, 3) Fisher information of (S, B, delay in ns); of several returns (2 K + 1, 2 K + 1) of (all S, B, all
+        (..., 3, 3) Fisher information of (S, B, delay in ns); for several returns (2 K + 1, 2 K + 1) of (all S, B, all
         delays).
     signal, background, delay_ns, depth_m
-        (...) least standard deviations of unbiased estimates; inf where nothing is known of them. Of several returns
-        (K,), but for the background.
+        (...) smallest standard deviations of unbiased estimates; inf without information. For several returns
+        (K,), except the background.
 
     See Also
     --------
@@ -64,22 +64,22 @@ class HistogramBound:
 
 @checked
 def cramer_rao(flux: Flux, system: System, *, threads: int | None = None) -> HistogramBound:
-    """Least standard deviations of S, B and depth from a histogram, whatever the method.
+    """Smallest standard errors of S, B and depth that any unbiased estimate from a histogram can have.
 
     The information of registrations at the rate l_j in the armed time of bin j is that of a Poisson process,
-    ``I = sum_j E[D_j] (dl_j)(dl_j)' / l_j``, with E[D_j] = E[h_j] / l_j the mean armed time; a bin that hides the times
-    inside of it keeps the fraction (x / sinh x)^2 of that, x = l_j / 2 (R18). The armed time is taken as known: the
-    information that the ends of the exposure hide is not subtracted (docs/theory_reconstruction.md, section 3).
+    ``I = sum_j E[D_j] (dl_j)(dl_j)' / l_j``, with E[D_j] = E[h_j] / l_j the mean armed time; a bin, which does
+    not resolve times within it, has the fraction (x / sinh x)^2 of it, x = l_j / 2 (R18). The armed time is assumed
+    known: information lost at the ends of the exposure is not subtracted (docs/theory_reconstruction.md, section 3).
 
     Parameters
     ----------
     flux
         One return and background > 0 in each pixel (...).
     system
-        Detectors of mode nonparalyzable, synchronous, or gated with a gate that stays, without effects beyond detection
+        Detectors of mode nonparalyzable, synchronous, or gated with a fixed gate, without effects beyond detection
         efficiency and dark counts.
     threads
-        As `exposure_moments`.
+        As for `exposure_moments`.
 
     Returns
     -------
@@ -89,11 +89,11 @@ def cramer_rao(flux: Flux, system: System, *, threads: int | None = None) -> His
     Raises
     ------
     TypeError
-        No `Flux` or no `System`.
+        Not a `Flux` or not a `System`.
     ValueError
-        Several returns, no background, or a detector that this bound does not hold for.
+        Several returns, no background, or a detector to which this bound does not apply.
     ConvergenceError
-        Naming the cell, where the mean histogram was not reached.
+        The mean histogram did not converge; the message names the pixel.
 
     See Also
     --------
@@ -134,9 +134,9 @@ def cramer_rao(flux: Flux, system: System, *, threads: int | None = None) -> His
 
 @checked
 def returns_bound(flux: Flux, system: System, *, threads: int | None = None) -> HistogramBound:
-    """Least standard deviations of every return of one pixel that has several, each with an unknown S and delay.
+    """Smallest standard errors of all returns of one pixel, each with unknown S and delay.
 
-    As `cramer_rao`, for the K returns of a pixel (`Flux.multi`): those that overlap are known less well than alone.
+    As `cramer_rao`, for the K returns of a pixel (`Flux.multi`); overlapping returns have larger errors.
 
     Parameters
     ----------
@@ -155,9 +155,9 @@ def returns_bound(flux: Flux, system: System, *, threads: int | None = None) -> 
     Raises
     ------
     TypeError
-        No `Flux` or no `System`.
+        Not a `Flux` or not a `System`.
     ValueError
-        Several pixels, no background, or a detector that this bound does not hold for.
+        Several pixels, no background, or a detector to which this bound does not apply.
 
     See Also
     --------
@@ -224,15 +224,15 @@ def _information(
 def window_error(weights: ArrayLike, flux: Flux, system: System) -> tuple[FloatArray, FloatArray]:
     """Mean and standard deviation of linear estimates ``weights @ h`` under dead time.
 
-    Exact, by `joint_law`: bins of one histogram are not independent, so the Poisson error of a window is wrong
-    (docs/joint_law.md). For the estimates of signal that `MatchedFilter` and `Peak` take from windows, say.
+    Exact, by `joint_law`: bins of one histogram are not independent, so that the Poisson error of a window is wrong
+    (docs/joint_law.md). Applies, for example, to the signal estimates of `MatchedFilter` and `Peak`.
 
     Parameters
     ----------
     weights
         (..., bins) real numbers.
     flux, system
-        The light of one pixel, photons per period, and what registers it.
+        The light of one pixel, photons per period, and the system.
 
     Returns
     -------
@@ -242,7 +242,7 @@ def window_error(weights: ArrayLike, flux: Flux, system: System) -> tuple[FloatA
     Raises
     ------
     TypeError
-        No `Flux` or no `System`; weights that are no array of numbers.
+        Not a `Flux` or not a `System`; weights that are not an array of numbers.
     ValueError
         Weights of another number of bins; several pixels.
     ConvergenceError
@@ -272,12 +272,12 @@ def window_error(weights: ArrayLike, flux: Flux, system: System) -> tuple[FloatA
 
 @checked
 def window_weights(system: System, delay_ns: float) -> FloatArray:
-    """Weights with which ``weights @ h`` is the signal that a window around a delay gives (R16).
+    """Weights for which ``weights @ h`` is the signal estimate from a window around a delay (R16).
 
     Parameters
     ----------
     system
-        How the histogram was recorded.
+        The system that recorded the histogram.
     delay_ns
         Centre of the window, ns.
 
@@ -289,9 +289,9 @@ def window_weights(system: System, delay_ns: float) -> FloatArray:
     Raises
     ------
     TypeError
-        No `System`, or a delay that is no number.
+        Not a `System`, or a delay that is not a number.
     ValueError
-        A delay that is not finite; a pulse that leaves too little of the period free.
+        A delay that is not finite; a pulse too wide for a background window in the period.
 
     See Also
     --------

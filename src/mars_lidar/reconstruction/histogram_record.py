@@ -1,4 +1,4 @@
-"""What the native estimators need to know of a system: dead time on the histogram's bins, pulse, gate."""
+"""Inputs of the native estimators from a system: dead time on the histogram's bins, pulse, gate."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ _OUTSIDE_CORE = 0.0015  # of the energy on either side of the window in which th
 
 @lru_cache(maxsize=16)
 def recording_of(system: System, *, longer: float = 1.0, wider: float = 1.0) -> _core.HistogramRecord:
-    """The native form of a system whose gate, if any, does not move; times in laser periods.
+    """The native form of a system without a moving gate; times in laser periods.
 
-    With a dead time `longer` times as long, and a pulse `wider` times as wide.
+    Its dead time is multiplied by `longer`, the width of its pulse by `wider`.
     """
     from mars_lidar._base.native import _core
     from mars_lidar.statistics.cells import whole_bins
@@ -65,7 +65,7 @@ def pulse_width(sharpness: float) -> float:
 
 
 def check_window(what: str, system: System) -> None:
-    """Raise ValueError where the window of the signal leaves no bins for the background."""
+    """Raise ValueError if the window of the signal leaves no bins for the background."""
     low, high = core_ns(system)
     most = 0.75 * system.detector.gate_periods(system.period_ns)[2] * system.period_ns
     if high - low > most:
@@ -82,7 +82,7 @@ def relative_width(system: System) -> float:
 
 
 def core_ns(system: System) -> tuple[float, float]:
-    """The part of the pulse, around the delay, in which a signal is counted: all but 0.15 % of it on either side."""
+    """The interval around the delay in which signal is counted: all but 0.15 % of the pulse on either side."""
     low, high = system.pulse.support_ns()
     x = np.linspace(low, high, _CELLS_PER_PERIOD + 1)
     ends = np.interp([_OUTSIDE_CORE, 1.0 - _OUTSIDE_CORE], system.pulse.cumulative(x), x)

@@ -1,4 +1,4 @@
-"""Histograms as estimators take them: checked, flat, in a type that the native core reads."""
+"""Histograms for the estimators: checked, flat, in a type of the native core."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Histograms:
-    """What a method works on: `counts` (pixels, bins) of uint16, uint32 or float64, and how they were recorded.
+    """Input of a method: `counts` (pixels, bins) of uint16, uint32 or float64, and the system that recorded them.
 
     `image`: the shape (..., H, W) that the pixels had.
     """

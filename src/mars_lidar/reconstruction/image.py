@@ -1,7 +1,8 @@
 """Depth and signal of an image from a few photons a pixel: docs/theory_reconstruction.md, section 7.
 
-The posterior of each pixel on the two comb trees of the image, then planes through the photons about it; trained, two
-small networks choose among the posterior's peaks and weigh the planes. The steps are in native/image/solver.h.
+The posterior of each pixel is computed on the two comb trees of the image; then planes are fitted to the photons around
+it. In the trained method two small networks choose among the peaks of the posterior and weight the planes. The steps
+are in native/image/solver.h.
 """
 
 from __future__ import annotations
@@ -34,25 +35,25 @@ _REJECTED = np.uint8(Flags.EMPTY | Flags.NO_SIGNAL | Flags.SATURATED | Flags.UNC
 
 @dataclass(frozen=True, eq=False)
 class Image(Method):
-    """Depth and signal of every pixel from its photons and those of the image around it, trained where that holds.
+    """Depth and signal of every pixel from its photons and those of its neighbours, by networks where they apply.
 
-    Intervals hold the delay with probability 0.9; none is given where an outlier is likelier than 0.1.
+    Intervals contain the delay with probability 0.9; none is given if the probability of an outlier exceeds 0.1.
 
     Parameters
     ----------
     efficiency
-        (H, W) of each pixel, as a share of that of the others, 0 for pixels that see nothing; None: all alike. Signal
-        and background are those of a pixel of the map's mean.
+        (H, W) relative detection efficiency of each pixel, 0 for dead pixels; None: equal. Signal and background are
+        those of a pixel with the mean efficiency.
     returns
-        Surfaces to look for behind each pixel, 1 to 8, each from the photons outside the pulses of the others. A return
-        is given where its interval is. `signal` and `delay_ns` are then those of the strongest.
+        Largest number of returns in a pixel, 1 to 8, each estimated from the photons outside the pulses of the others.
+        A return is given if its interval is. `signal` and `delay_ns` are then those of the strongest.
 
     Raises
     ------
     TypeError
-        Returns that are no number.
+        `returns` is not a number.
     ValueError
-        An efficiency that is no such map; ``check``: a detector that this method does not hold for.
+        An invalid efficiency; ``check``: a detector to which this method does not apply.
 
     See Also
     --------
@@ -108,7 +109,7 @@ class Image(Method):
         return Estimates.joined(estimates)
 
     def of_photons(self, photons: Photons, system: System, threads: int) -> Estimates:
-        """Estimates of one image from its `photons` (times by pixel), recorded by `system`, on so many `threads`."""
+        """Estimates of one image from its `photons` (times by pixel), recorded by `system`, on `threads` threads."""
         image = photons.height, photons.width
         if self.efficiency is not None and self.efficiency.shape != image:
             raise ValueError(f"efficiency must be of the image's {image} pixels, got shape {self.efficiency.shape}")
@@ -153,19 +154,19 @@ class Image(Method):
 
 @dataclass(frozen=True, eq=False)
 class UntrainedImage(Image):
-    """As `Image`, with nothing trained: the largest peak of the posterior, and the largest window that agrees.
+    """As `Image`, without networks: the largest peak of the posterior, and the largest consistent window.
 
     Parameters
     ----------
     efficiency, returns
-        As of `Image`.
+        As for `Image`.
 
     Raises
     ------
     TypeError
-        Returns that are no number.
+        `returns` is not a number.
     ValueError
-        An efficiency that is no such map; ``check``: a detector that this method does not hold for.
+        An invalid efficiency; ``check``: a detector to which this method does not apply.
 
     See Also
     --------
@@ -197,7 +198,7 @@ def solver_of(
     efficiency: FloatArray | None = None,
     counted: NDArray[np.float32] | None = None,
 ) -> _core.ImageSolver:
-    """The native solver of one image; `counted`: of each entry, the photons that are not of another surface."""
+    """The native solver of one image; `counted`: photons of each entry that are not attributed to another surface."""
     return _core.ImageSolver(
         height=photons.height,
         width=photons.width,

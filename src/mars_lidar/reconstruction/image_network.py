@@ -1,6 +1,6 @@
-"""The trained part of depth from a few photons a pixel: weights of two small networks, and where they hold.
+"""Networks for depth from a few photons a pixel: their weights and range of validity.
 
-Weights and card lie beside this file; ``python -m studies image --train`` makes both again.
+Weights and card lie beside this file; ``python -m studies image --train`` makes both.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ LIMITS = "signal", "sbr", "cells", "side"  # of the card: mean photons of signal
 
 
 def card() -> dict[str, Any]:
-    """What the networks were trained on, and the ranges in which they hold."""
+    """Training data of the networks, and the ranges in which they are valid."""
     out: dict[str, Any] = json.loads(CARD.read_text(encoding="utf-8"))
     return out
 

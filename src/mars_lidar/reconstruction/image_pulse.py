@@ -22,7 +22,7 @@ _SMOOTHING = 0.25  # widths of the pulse, of the Gaussian that takes the noise o
 
 
 def cell_count(system: System, blur: float = 0.0) -> int:
-    """Cells a period for a pulse that is blurred by a Gaussian of standard deviation `blur`, in periods."""
+    """Cells per period for a pulse that is blurred by a Gaussian of standard deviation `blur`, in periods."""
     sigma = math.sqrt(relative_width(system) ** 2 + blur**2 + 1.0 / (12.0 * system.bins**2))
     lanes = int(_core.IMAGE_SIZES["lanes"])
     return max(lanes, lanes * math.ceil(CELLS_PER_SIGMA / sigma / lanes))
@@ -30,7 +30,7 @@ def cell_count(system: System, blur: float = 0.0) -> int:
 
 @lru_cache(maxsize=16)
 def settings_of(system: System) -> list[_core.ImageSetting]:
-    """The cells of a system: of the pulse as it is, preceded by those of the pulse blurred to `_MOST_CELLS` or less."""
+    """The cells of a system: those of the pulse, preceded by those of the pulse blurred to `_MOST_CELLS` or less."""
     blurs = []
     if cell_count(system) > _MOST_CELLS:
         blur = CELLS_PER_SIGMA / (_MOST_CELLS - 16)

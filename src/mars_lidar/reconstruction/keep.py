@@ -1,4 +1,4 @@
-"""Which of several returns of a pixel becomes its depth, and whether most first returns are one reflection."""
+"""Selection of one of several returns as the depth of a pixel, and detection of an internal reflection."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ _EXCESS = 5.0  # standard deviations by which a later return rises above the med
 def keep_return(
     result: Reconstruction, keep: str = "strongest", from_ns: float = 0.0, attenuation: str = "none"
 ) -> Reconstruction:
-    """The maps (...) of one return of each pixel, of those not nearer than `from_ns` after the laser pulse.
+    """The maps (...) of one return of each pixel, among the returns at least `from_ns` after the laser pulse.
 
-    `found` was looked for with ``returns=2`` or more: an internal reflection is then a return of its own, whose counts
-    and dead time the likelihood accounts for, and is left out here. Pixels without a return there are flagged.
-    `attenuation` is that of the reconstruction; its level stays.
+    `found` is a reconstruction with ``returns=2`` or more: an internal reflection is then a separate return, whose
+    counts and dead time the likelihood includes, and is omitted here. Pixels without another return are flagged.
+    `attenuation` is that of the reconstruction; its level is unchanged.
     """
     checks.choice("keep", keep, KEEP)
     first = checks.real("from_ns", from_ns, low=0.0, high=result.system.period_ns)
@@ -57,7 +57,7 @@ def keep_return(
 
 
 def common_delay(result: Reconstruction) -> tuple[float, float] | None:
-    """(share of the pixels, delay in ns) where more than half of the first returns stand in the same few bins."""
+    """(share of the pixels, delay in ns) if more than half of the first returns lie in the same few bins."""
     every = result.returns
     first = result.delay_ns if every is None else np.where(every.count > 0, every.delay_ns[..., 0], np.nan)
     delays = first[result.detected & np.isfinite(first)]
@@ -73,7 +73,7 @@ def common_delay(result: Reconstruction) -> tuple[float, float] | None:
 
 
 def has_later_light(counts: NDArray[Any], result: Reconstruction, delay_ns: float) -> bool:
-    """Whether the counts of all pixels together (bins,) show light elsewhere than at a delay and its pulse."""
+    """Whether the summed counts of all pixels (bins,) show light outside the pulse at a delay."""
     system = result.system
     low, high = system.pulse.support_ns()
     since = (system.time_ns - delay_ns) % system.period_ns

@@ -1,4 +1,4 @@
-"""The matched filter on the histogram as it is, and its largest bin: right where dead time plays no part."""
+"""The matched filter and the largest bin of the uncorrected histogram, valid if dead time is negligible."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from mars_lidar.reconstruction.method import FILTERS, Estimates, Filter, Method,
 
 @dataclass(frozen=True)
 class MatchedFilter(Method):
-    """Delay where the histogram, taken as it is, correlates best with the pulse.
+    """Delay at which the uncorrected histogram correlates best with the pulse.
 
     Parameters
     ----------
@@ -22,7 +22,7 @@ class MatchedFilter(Method):
     Raises
     ------
     ValueError
-        A filter that is none.
+        An unknown filter.
 
     See Also
     --------
@@ -57,7 +57,7 @@ class MatchedFilter(Method):
 
 @dataclass(frozen=True)
 class Peak(Method):
-    """Delay at the centre of the largest bin, the first of several equal ones, less the offset of the pulse's peak.
+    """Delay at the centre of the largest bin (the first of equal ones), minus the offset of the pulse's peak.
 
     See Also
     --------

@@ -21,19 +21,19 @@ from mars_lidar.reconstruction.returns import MOST_RETURNS, RETURN_COLUMNS
 
 @dataclass(frozen=True)
 class MaximumLikelihood(Method):
-    """S, B and delay that make the histogram most likely, given when it says the pixel was armed (R9, R10).
+    """Maximum-likelihood S, B and delay, given the armed time estimated from the histogram (R9, R10).
 
     Parameters
     ----------
     starts
-        The likelihood is climbed from this many delays, the best of a grid over the period, in [1, 8].
+        Number of starting delays of the maximisation, the best of a grid over the period, in [1, 8].
     false_alarm
         False-alarm probability: the approximate fraction of pixels without signal that are not flagged. A signal is
-        detected where twice its gain in log likelihood exceeds the level that background reaches anywhere in the
-        period with this probability.
+        detected if twice its gain in log likelihood exceeds the level that background reaches anywhere in the period
+        with this probability.
     less_bias
         Subtract the first-order bias of the maximum (Cox and Snell, J. R. Stat. Soc. B 30, 248, 1968; R19): some
-        tenths of a standard error in bright pixels of short exposures, whose errors it makes smaller too.
+        tenths of a standard error in bright pixels of short exposures, where this also reduces the errors.
     returns
         Largest number of returns for each pixel, in [1, 8]. Returns are added as long as twice the gain of the log
         likelihood exceeds what noise reaches anywhere in the period with probability `false_alarm` (R23 of
@@ -42,9 +42,9 @@ class MaximumLikelihood(Method):
     Raises
     ------
     TypeError
-        Settings that are no numbers.
+        Settings that are not numbers.
     ValueError
-        Settings out of range; ``check``: a detector that this method does not hold for.
+        Settings out of range; ``check``: a detector to which this method does not apply.
 
     See Also
     --------
@@ -79,10 +79,9 @@ class MaximumLikelihood(Method):
         checks.real("false_alarm", self.false_alarm, low=1e-12, high=0.5)
 
     def least_gain(self, system: System) -> float:
-        """Twice the gain of the log likelihood above which a signal of `system` counts as detected.
+        """Twice the gain in log likelihood above which a signal of `system` counts as detected.
 
-        At one delay it is the square of a normal number where that is positive; a period holds about 1 / sigma
-        delays that are independent.
+        At one delay it is the square of a positive normal number; a period has about 1 / sigma independent delays.
         """
         places = max(1.0, min(system.bins, 1.0 / relative_width(system)))
         return float(NormalDist().inv_cdf(1.0 - self.false_alarm / places) ** 2)
@@ -162,7 +161,7 @@ def log_likelihood(histogram: ArrayLike, flux: Flux, system: System) -> tuple[Fl
     flux
         Hypotheses (...) of the light: one return and background > 0 each.
     system
-        How they were recorded.
+        The system that recorded them.
 
     Returns
     -------
@@ -172,9 +171,9 @@ def log_likelihood(histogram: ArrayLike, flux: Flux, system: System) -> tuple[Fl
     Raises
     ------
     TypeError
-        No `Flux` or no `System`; counts that are no array of numbers.
+        Not a `Flux` or not a `System`; counts that are not an array of numbers.
     ValueError
-        Counts of another number of bins; hypotheses without background; a detector that this does not hold for.
+        Counts with another number of bins; hypotheses without background; a detector to which this does not apply.
 
     See Also
     --------

@@ -17,22 +17,22 @@ from mars_lidar.reconstruction.method import _CHAIN, RateMethod
 class ChainCorrection(RateMethod):
     """Rates whose Markov chain of phases has the histogram f as its stationary distribution.
 
-    ``l <- f; repeat s = (f P(l)) / l, l <- f / s``, scaled to the total flux (R14, R15). The paper takes the total from
-    the times between registrations, which a histogram does not have; here it is that of `GeneralisedCoates` (the
-    number of registrations alone hardly tells it of a bright pixel). Phases are taken as stationary: the start and
-    the end of the exposure are neglected.
+    ``l <- f; repeat s = (f P(l)) / l, l <- f / s``, scaled to the total flux (R14, R15). The paper estimates the total
+    from the times between registrations, which a histogram does not contain; here it is that of `GeneralisedCoates`
+    (the number of registrations alone hardly determines it for bright pixels). Phases are assumed stationary: the
+    start and the end of the exposure are neglected.
 
     Parameters
     ----------
     filter
-        On the rates: as `MatchedFilter`.
+        On the rates: as for `MatchedFilter`.
     iterations, tolerance
-        Stops when the rates move by less than `tolerance` of their sum, or after so many iterations.
+        Iteration stops when the rates change by less than `tolerance` of their sum, or after so many iterations.
 
     Raises
     ------
     ValueError
-        A filter, a number of iterations or a tolerance that is none; ``check``: a detector of another mode than
+        An invalid filter, number of iterations or tolerance; ``check``: a detector of another mode than
         ``"nonparalyzable"``, or a dead time below one bin.
 
     See Also
@@ -67,7 +67,7 @@ class ChainCorrection(RateMethod):
         checks.real("tolerance", self.tolerance, low=0.0, high=0.1, strict_low=True)
 
     def check(self, system: System) -> None:
-        """As any method does for a `system`; and the dead time is at least one bin."""
+        """As for any method; the dead time of `system` must be at least one bin."""
         super().check(system)
         if system.detector.dead_time_ns < system.bin_ns:
             raise ValueError(
@@ -77,7 +77,7 @@ class ChainCorrection(RateMethod):
 
     @property
     def settings(self) -> dict[str, float]:
-        """Steps and the movement at which they end."""
+        """Number of iterations, and the tolerance."""
         return {"steps": self.iterations, "tolerance": self.tolerance}
 
 
@@ -91,17 +91,17 @@ def mchc_rates(
     tolerance: float = 1e-5,
     threads: int | None = None,
 ) -> FloatArray:
-    """Photons per period in each bin behind histograms, by `ChainCorrection`.
+    """Photons per period in each bin from histograms, by `ChainCorrection`.
 
     Parameters
     ----------
     cube
         (..., bins) counts.
     system
-        How they were recorded.
+        The system that recorded them.
     total
-        Photons per period in all, a scalar or (...), where they are known, from the times between registrations
-        for instance; None: the sum of `generalised_coates_rates`.
+        Total photons per period, a scalar or (...), if known, for example from the times between registrations; None:
+        the sum of `generalised_coates_rates`.
     iterations, tolerance
         As for `ChainCorrection`.
     threads
@@ -115,10 +115,10 @@ def mchc_rates(
     Raises
     ------
     TypeError
-        Counts that are no array of numbers, or no `System`.
+        Counts that are not an array of numbers, or not a `System`.
     ValueError
-        Counts that are no whole numbers >= 0 or of another number of bins; arguments out of range; a detector that the
-        method does not hold for.
+        Counts that are not whole numbers >= 0 or have another number of bins; arguments out of range; a detector to
+        which the method does not apply.
 
     See Also
     --------

@@ -1,4 +1,4 @@
-"""What a reconstruction method is: the contract, written once; the leaves stay silent."""
+"""Interface of the reconstruction methods."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ _LOCATORS = {"peak": 0, "linear": 1, "log": 2}
 
 
 class Flags(IntFlag):
-    """Statements on a pixel, as bits; 0 where there are none.
+    """Flags of a pixel, as bits; 0 for none.
 
     ``EMPTY``: no counts. ``NO_SIGNAL``: no return beyond what background reaches. ``SATURATED``: S or B has no upper
-    bound. ``UNCONVERGED``: the iteration stopped early. ``MORE_RETURNS``: more returns than were asked for. ``FILLED``:
-    from the pixels around. ``MISFIT``: the test of fit rejects the estimate.
+    bound. ``UNCONVERGED``: the iteration stopped early. ``MORE_RETURNS``: more returns than requested. ``FILLED``:
+    filled from neighbouring pixels. ``MISFIT``: the test of fit rejects the estimate.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ class Flags(IntFlag):
 
 @dataclass(frozen=True, eq=False)
 class Estimates:
-    """What a method found, each (pixels,); None for what it does not give.
+    """Results of a method, each (pixels,); None for quantities that it does not estimate.
 
     Delay in periods, the rest in photons per period.
     """
@@ -91,13 +91,13 @@ class Estimates:
 
     @staticmethod
     def joined(parts: Sequence[Estimates]) -> Estimates:
-        """Those of several sets of pixels, one after the other."""
+        """Concatenation over several sets of pixels."""
         values = {each.name: [getattr(part, each.name) for part in parts] for each in fields(Estimates)}
         return Estimates(**{name: np.concatenate(v) for name, v in values.items() if v[0] is not None})
 
 
 class Method(ABC):
-    """A way from histograms to depth and signal.
+    """A method that estimates depth and signal from histograms.
 
     See Also
     --------
@@ -117,7 +117,7 @@ class Method(ABC):
     of_images: ClassVar[bool] = False  # each pixel's estimate depends on those around it: cubes (..., H, W, bins)
 
     def check(self, system: System) -> None:
-        """Raise ValueError, naming mode and method, for a `system` that this method does not hold for."""
+        """Raise ValueError, naming mode and method, for a `system` to which this method does not apply."""
         mode = system.detector.mode
         if mode not in self.modes:
             able = " or ".join(repr(each.name) for each in _known() if mode in each.modes)
@@ -136,7 +136,7 @@ class Method(ABC):
 
     @abstractmethod
     def estimate(self, histograms: Histograms) -> Estimates:
-        """Estimates of every pixel of `histograms`, whose system is one that `check` let pass."""
+        """Estimates of every pixel of `histograms`, whose system `check` accepts."""
 
 
 def _known(kind: Any = None) -> Iterator[type[Method]]:
@@ -148,12 +148,12 @@ def _known(kind: Any = None) -> Iterator[type[Method]]:
 
 
 def tell_effects(system: System) -> None:
-    """Warn of what the detector does and no method knows: a histogram shows it, and the estimates take it for light."""
+    """Warn of detector effects that no method models, so that their counts are attributed to light."""
     beyond = [name for name in system.detector.effects if name not in LIGHT_EFFECTS]
     if beyond:
         warnings.warn(
-            f"no method of reconstruction knows {', '.join(beyond)} of the detector: estimates are biased by it, which "
-            "their standard errors do not tell",
+            f"no reconstruction method models {', '.join(beyond)} of the detector: estimates are biased by it, "
+            "and standard errors do not include this bias",
             UserWarning,
             stacklevel=3,
         )
@@ -161,9 +161,9 @@ def tell_effects(system: System) -> None:
 
 @dataclass(frozen=True)
 class RateMethod(Method):
-    """A method that corrects the rates, finds the delay by a filter on them, and signal and background by its window.
+    """A method that corrects the rates, then estimates the delay by a filter and signal and background by its window.
 
-    `filter` on the rates: as `MatchedFilter`.
+    `filter` on the rates: as for `MatchedFilter`.
     """
 
     filter: Filter = "log"
@@ -175,7 +175,7 @@ class RateMethod(Method):
 
     @property
     def settings(self) -> dict[str, float]:
-        """Of the correction, as the native core names them."""
+        """Settings of the correction, by their names in the native core."""
         return {"steps": 0, "tolerance": 0.0}
 
     def estimate(self, histograms: Histograms) -> Estimates:
@@ -183,7 +183,7 @@ class RateMethod(Method):
         return window_estimates(histograms, self.filter, self.correction, **self.settings)
 
     def rates(self, cube: ArrayLike, system: System, threads: int | None, total: ArrayLike | None = None) -> FloatArray:
-        """Photons per period in each bin (..., bins) behind the histograms (..., bins); `total` (...) of each."""
+        """Photons per period in each bin (..., bins) from the histograms (..., bins); `total` (...) of each."""
         from mars_lidar._base.native import _core
 
         given, shape = checked(cube, system, threads)

@@ -1,4 +1,4 @@
-"""The registrations of an image, sparse: what depth from a few photons a pixel is computed from."""
+"""The registrations of an image, sparse: the input of the image methods."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Photons:
     Attributes
     ----------
     height, width
-        Of the image.
+        Size of the image.
     first
         (pixels + 1) int64.
     bin
@@ -34,7 +34,7 @@ class Photons:
 
     @staticmethod
     def of(counts: NDArray[np.generic], height: int, width: int) -> Photons:
-        """Those of counts (height * width, bins)."""
+        """From counts (height * width, bins)."""
         bins = counts.shape[-1]
         step = max(1, _ROWS_BYTES // (bins * counts.itemsize))
         entries, parts = np.zeros(len(counts), np.int64), []

@@ -31,7 +31,7 @@ class MapError:
         Structural similarity (Wang et al., 2004), mean over pixels; NaN for images of less than 7 pixels a side, and
         where scikit-image is not installed.
     missing
-        Share of pixels without an estimate; SSIM takes them as the median of the others.
+        Share of pixels without an estimate; for SSIM they are set to the median of the others.
     """
 
     rmse: float
@@ -91,8 +91,8 @@ def _mean_ssim(truth: FloatArray, images: FloatArray, known: BoolArray, span: fl
 def errors_against(cube: Cube, result: Reconstruction) -> dict[str, MapError]:
     """Errors of depth, in m modulo the unambiguous range, and of reflectivity or else signal, of a known scene.
 
-    Depth is judged where a return was seen, as in the picture of `mars_lidar.plot.reconstruction`: elsewhere the
-    estimate is a guess anywhere in the period, and counts as missing.
+    Depth is compared where a return was detected, as in the figure of `mars_lidar.plot.reconstruction`: elsewhere the
+    estimate is arbitrary, and counts as missing.
     """
     out: dict[str, MapError] = {}
     if cube.measured:

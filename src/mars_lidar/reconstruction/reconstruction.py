@@ -1,4 +1,4 @@
-"""The verb: histogram cube to depth and reflectivity."""
+"""`reconstruct`: from a histogram cube to depth and reflectivity."""
 
 from __future__ import annotations
 
@@ -44,41 +44,41 @@ METHODS: dict[str, Method] = {
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Reconstruction:
-    """What was found in a cube (..., bins): maps of shape (...), usually (H, W) or (realizations, H, W).
+    """Maps reconstructed from a cube (..., bins), of shape (...), usually (H, W) or (realizations, H, W).
 
     Attributes
     ----------
     method
         Name of the method.
     system
-        How the cube was recorded.
+        The system that recorded the cube.
     delay_ns, depth_m
-        Delay tau in [0, period), ns, and depth c tau / 2, m; NaN where there is no estimate.
+        Delay tau in [0, period), ns, and depth c tau / 2, m; NaN without an estimate.
     signal, background
-        S and B, detectable photons per laser period: a detection efficiency and dark counts are in them. B is that of
-        the whole period, also behind a gate.
+        S and B, detectable photons per laser period, including detection efficiency and dark counts. B is that of the
+        whole period, also with a gate.
     reflectivity
-        S over `level`, times depth^2 where the light falls off with it.
+        S over `level`, times depth^2 with ``attenuation="inverse_square"``.
     level
-        Signal photons per period of a surface of reflectivity 1 (at 1 m where the light falls off).
+        Signal photons per period of a surface of reflectivity 1 (at 1 m with inverse-square attenuation).
     delay_error_ns, depth_error_m, signal_error, background_error
-        Standard errors, or None where the method gives none; NaN where an estimate lies on its bound.
+        Standard errors, or None for methods without them; NaN for an estimate on its bound.
     significance
-        Root of twice the gain in log likelihood by the signal, in standard deviations about; or None.
+        Square root of twice the gain in log likelihood by the signal, approximately in standard deviations; or None.
     flags
         (...) uint8, `Flags`.
     p_value
-        Probability of a histogram as far from the estimate's law; NaN for too few photons, None where the method has
-        no law.
+        Probability of a histogram at least as far from the law of the estimate; NaN for too few photons, None for
+        methods without a law.
     longer, shorter, wider
-        Scores of a longer and of a shorter dead time and of a wider pulse, standard deviations; see `advice`.
+        Scores of a longer dead time, a shorter dead time and a wider pulse, in standard deviations; see `advice`.
     returns
-        Every return of each pixel, where several were asked for; then the maps above are those of the strongest.
+        All returns of each pixel, if several were requested; the maps above are then those of the strongest.
     delay_half_width_ns, depth_half_width_m
-        Half width of the 90 % interval of delay and depth, of methods ``"image"`` and ``"image_untrained"``; NaN where
-        an outlier is too likely for one.
+        Half width of the 90 % interval of delay and depth, for methods ``"image"`` and ``"image_untrained"``; NaN if
+        the probability of an outlier is too large.
     outlier
-        (...) probability that the depth is that of another surface, of the same methods.
+        (...) probability that the depth is that of another surface, for the same methods.
 
     See Also
     --------
@@ -130,19 +130,19 @@ class Reconstruction:
 
     @property
     def detected(self) -> NDArray[np.bool_]:
-        """(...) whether a return was detected: a depth, and a signal above the background."""
+        """(...) whether a return was detected: an estimated depth, and a signal above the background."""
         return _detected(self.depth_m, self.flags)
 
     @property
     def misfits(self) -> float:
-        """Share of the pixels with a p-value that the estimate does not fit; NaN without p-values."""
+        """Share of the pixels with a p-value whose estimate the test of fit rejects; NaN without p-values."""
         if self.p_value is None or not np.isfinite(self.p_value).any():
             return float("nan")
         return float((self.p_value[np.isfinite(self.p_value)] < FALSE_ALARM).mean())
 
     @property
     def advice(self) -> str:
-        """What would fit more of the pixels, in words; empty where the share of misfits is that of false alarms."""
+        """Advice on settings that would fit more pixels; empty if the share of misfits is that of false alarms."""
         tested = 0 if self.p_value is None else int(np.isfinite(self.p_value).sum())
         if tested == 0 or self.misfits * tested <= FALSE_ALARM * tested + 4.0 * (FALSE_ALARM * tested) ** 0.5 + 1.0:
             return ""
@@ -170,7 +170,7 @@ class Recorded(Protocol):
 
     @property
     def system(self) -> System:
-        """How they were recorded."""
+        """The system that recorded them."""
 
     @property
     def histogram(self) -> Any:
@@ -195,22 +195,23 @@ def reconstruct(
     ----------
     cube
         (..., bins) counts, whole numbers of any type, e.g. (realizations, H, W, bins) of `simulate`.
-        Or a cube of `mars_lidar.io.load`, which carries its system.
+        Or a cube of `mars_lidar.io.load`, which contains its system.
     system
-        How they were recorded. Flux is periodic, with the system's pulse. None: the system that the cube carries.
+        The system that recorded them. Flux is periodic, with the system's pulse. None: the system that the cube
+        carries.
     method
         A name in `mars_lidar.reconstruction.METHODS` (default ``"maximum_likelihood"``; docs/reconstruction.md says
-        what each assumes), or a `Method` of your own settings. Each refuses detectors that it does not hold for.
-        ``"image"``, for images (..., H, W, bins) of 1 to 20 photons a pixel, takes the pixels around into account.
+        what each assumes), or a `Method` with other settings. Each refuses detectors to which it does not apply.
+        ``"image"``, for images (..., H, W, bins) of 1 to 20 photons a pixel, also uses neighbouring pixels.
     level
         Detectable signal photons per period of a surface of reflectivity 1 (at 1 m, with
         ``attenuation="inverse_square"``).
-        None: so that the mean reflectivity of the pixels with a return is 1, which makes it relative.
+        None: relative reflectivity, with mean 1 over the pixels with a return.
     attenuation
         As in `Scene.flux`: ``"inverse_square"`` makes reflectivity proportional to S times depth squared.
     returns
-        Returns to look for in each pixel, 1 to 8: panes of glass, foliage. Each is tested, and all of them are in
-        `Reconstruction.returns`. Of ``"maximum_likelihood"``, each pixel alone, and of ``"image"``.
+        Largest number of returns in a pixel, 1 to 8 (panes of glass, foliage). Each is tested, and all are in
+        `Reconstruction.returns`. For ``"maximum_likelihood"``, which treats each pixel alone, and ``"image"``.
     threads
         Threads to run on; default: all processors this process may use. The result does not depend on it.
     progress
@@ -224,10 +225,10 @@ def reconstruct(
     Raises
     ------
     TypeError
-        Counts that are no array of numbers, or without a system; an argument of another kind.
+        Counts that are not an array of numbers, or without a system; an argument of another type.
     ValueError
-        Counts that are no whole numbers >= 0, or of another number of bins than the system; an unknown method, or one
-        that does not hold for the detector; a level or a number of returns out of range.
+        Counts that are not whole numbers >= 0, or with another number of bins than the system; an unknown method, or
+        one that does not apply to the detector; a level or a number of returns out of range.
 
     See Also
     --------
@@ -265,14 +266,14 @@ def reconstruct(
 
 
 def find_method(method: str | Method) -> Method:
-    """The method of that name, of default settings, or the method itself."""
+    """The method of that name with default settings, or the given method."""
     if isinstance(method, Method):
         return method
     return METHODS[checks.choice("method", method, tuple(METHODS))]
 
 
 def with_returns(method: Method, returns: int) -> Method:
-    """The method, looking for so many returns of each pixel."""
+    """The method for up to so many returns of each pixel."""
     if checks.integer("returns", returns, low=1, high=MOST_RETURNS) == 1:
         return method
     if not isinstance(method, MaximumLikelihood | Image):

@@ -1,4 +1,4 @@
-"""Several returns of a pixel: what was found of each."""
+"""Several returns of a pixel: estimates of each."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ RETURN_COLUMNS = ("delay", "signal", "delay_error", "signal_error", "false_alarm
 
 @dataclass(frozen=True, eq=False)
 class Returns:
-    """The returns of each pixel of a reconstruction (...), nearest first, NaN beyond those that there are.
+    """The returns of each pixel of a reconstruction (...), nearest first, NaN beyond the last.
 
     Attributes
     ----------
     count
-        (...) uint8, returns that were found, 0 to K.
+        (...) uint8, number of detected returns, 0 to K.
     delay_ns, depth_m
         (..., K) delay in [0, period), ns, and depth, m.
     signal
         (..., K) S, detectable photons per laser period.
     delay_error_ns, depth_error_m, signal_error
-        (..., K) standard errors from the observed information; NaN where it does not bound them.
+        (..., K) standard errors from the observed information; NaN if it does not determine them.
     false_alarm
-        (..., K) probability that a return which is not there would have gained so much likelihood, anywhere in the
-        period (docs/theory_reconstruction.md, section 6). Of method ``"image"`` the probability that the return is not
-        of this delay.
+        (..., K) probability that noise would gain as much likelihood anywhere in the period without a return
+        (docs/theory_reconstruction.md, section 6). For method ``"image"`` the probability that the return has another
+        delay.
 
     See Also
     --------
@@ -64,7 +64,7 @@ class Returns:
 
 
 def returns_of(values: FloatArray | None, system: System, shape: tuple[int, ...]) -> Returns | None:
-    """Those (..., K) of the estimates (pixels, K, columns) of a method; None where it looks for one only."""
+    """The returns (..., K) from the estimates (pixels, K, columns) of a method; None for a single return."""
     if values is None:
         return None
     columns = values.reshape(*shape, *values.shape[1:])

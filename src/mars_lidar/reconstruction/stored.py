@@ -1,4 +1,4 @@
-"""Reconstruction of a stored cube, part by part: its counts never need to fit in memory."""
+"""Reconstruction of a stored cube in parts: its counts need not fit in memory."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _CHUNK_BYTES = 4 * 2**20
 
 @dataclass(frozen=True, eq=False)
 class Timed:
-    """A reconstruction (realizations, H, W) and the seconds that it took, reading left out."""
+    """A reconstruction (realizations, H, W) and its time in seconds, without reading."""
 
     result: Reconstruction
     seconds: float
@@ -48,16 +48,16 @@ def reconstruct_stored(
     Parameters
     ----------
     cube
-        The cube. Without `level`, its own: that with which a known scene's reflectivity became its signal.
+        The cube. Without `level`, the level with which the signal was computed from the reflectivity of its scene.
     methods
-        Names or methods of different names.
+        Names, or methods with different names.
     level, attenuation, returns, threads, progress
-        As `mars_lidar.reconstruct`; attenuation None: that with which the flux was made, if it says so.
+        As for `mars_lidar.reconstruct`; attenuation None: that of the flux, if recorded.
 
     Returns
     -------
     dict
-        By name of the method.
+        Results by name of the method.
     """
     progress = callback_of(progress, "reconstructing")
     system, recipe = cube.system, cube.recipe
@@ -125,7 +125,7 @@ def reconstruct_stored(
 
 
 def true_level(cube: Cube, attenuation: str) -> float | None:
-    """Detectable signal of a surface of reflectivity 1 in the scene behind a cube; None where there is no scene."""
+    """Detectable signal of a surface of reflectivity 1 in the scene of a cube; None without a scene."""
     if cube.reflectivity is None:
         return None
     light = cube.reflectivity * (cube.depth_m**-2.0 if attenuation == "inverse_square" else 1.0)

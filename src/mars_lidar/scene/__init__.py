@@ -1,4 +1,4 @@
-"""Scenes: surfaces, layers and built-in rooms, and the photons that they return."""
+"""Scenes: surfaces, layers and built-in rooms, and their returned photons."""
 
 from mars_lidar.scene.scene import LayeredScene, Scene
 

@@ -6,8 +6,8 @@ over five rays where neighbouring pixels differ and one ray elsewhere. World axe
 A surface is a function ``albedo(u, v)`` of two coordinates on a face, in metres (on a sphere: longitude and latitude in
 radians).
 
-"random" is another room with other things and another view for every seed, and cheap, because networks are trained on
-thousands of them; "room" has the finer textures.
+"random" is a different room, with other objects and another view, for every seed; it is fast to render, because
+networks are trained on thousands of them. "room" has finer textures.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def _turn(a: FloatArray, b: FloatArray, degrees: float) -> tuple[FloatArray, Flo
 
 @dataclass(frozen=True)
 class Box:
-    """A box turned by `yaw_deg` about the vertical, seen from outside, or from `inside` (a room).
+    """A box rotated by `yaw_deg` about the vertical, viewed from outside, or from `inside` (a room).
 
     `faces` are the textures of -x, +x, -y, +y, -z, +z. Texture coordinates are (z, y) on x faces, (x, z) on y
     faces and (x, y) on z faces, from the centre of the box.

@@ -37,14 +37,14 @@ class Scene:
     Parameters
     ----------
     depth_m
-        Range along the ray of each pixel (H, W), m: what time of flight measures, delay = 2 z / c. Positive,
-        or NaN for "no return". Masked entries of a masked array are "no return" too.
+        Range z along the ray of each pixel (H, W), m, with the delay 2 z / c. Positive, or NaN for "no return". Masked
+        entries of a masked array are also "no return".
     reflectivity
-        Fraction of the laser light that comes back, relative, in [0, 1]: (H, W), or one number for all. It
-        includes everything but distance: albedo, incidence (Lambert's cosine), and transmission.
+        Relative fraction of the laser light that returns, in [0, 1]: (H, W), or one number for all pixels. It includes
+        all factors but distance: albedo, incidence (Lambert's cosine), and transmission.
     background
-        Relative ambient light reaching each pixel (H, W), >= 0, in any unit; `flux` scales it. None: the
-        ambient light is chosen there.
+        Relative ambient light at each pixel (H, W), >= 0, in any unit; `flux` scales it. None: see the argument
+        `ambient` of `flux`.
 
     Attributes
     ----------
@@ -56,9 +56,10 @@ class Scene:
     Raises
     ------
     ValueError
-        Maps of different shapes, a depth that is not positive, a reflectivity outside [0, 1]; the text names the pixel.
+        Maps of different shapes, a depth that is not positive, a reflectivity outside [0, 1]; the message names the
+        pixel.
     TypeError
-        A map that holds no real numbers.
+        A map without real numbers.
 
     See Also
     --------
@@ -135,13 +136,13 @@ class Scene:
     def resize(self, size: int | tuple[int, int]) -> Scene:
         """The scene at another size.
 
-        Depth takes the nearest pixel, so it is never blended across an edge and NaN stays NaN; reflectivity
-        and background take the mean over the area of the new pixel.
+        Depth is that of the nearest pixel, so that it is never averaged across an edge and NaN remains NaN;
+        reflectivity and background are means over the area of the new pixel.
 
         Parameters
         ----------
         size
-            (H, W), or the longer side: the other one then keeps the aspect ratio.
+            (H, W), or the longer side, with the aspect ratio preserved.
         """
         height, width = new_size(size, self.shape)
         rows, columns = nearest(self.shape[0], height), nearest(self.shape[1], width)
@@ -180,27 +181,27 @@ class Scene:
         Parameters
         ----------
         system
-            Gives the laser period t_r.
+            The system with the laser period t_r.
         signal
-            Mean signal photons per laser period over the valid pixels, > 0, as they reach the detector: engines apply
-            its `detection_efficiency` (`Flux.detected`).
+            Mean signal photons per laser period at the detector over the valid pixels, > 0; engines apply its
+            `detection_efficiency` (`Flux.detected`).
         sbr
             Mean signal over mean *ambient* photons, both over the valid pixels and per laser period, in
-            (0, inf]; inf is no ambient light. Dark counts are not part of it: they come on top.
+            (0, inf]; inf: no ambient light. Dark counts are not included in the ratio and are added.
         attenuation
             g(z): ``"none"`` (distance already in the reflectivity, or compensated) or ``"inverse_square"``.
         ambient
             a: ``"uniform"``, ``"reflectivity"`` (sunlight or lamps scattered by the same surface; radiance
-            does not fall with distance) or ``"map"`` (the scene's background map). None: the map where there
-            is one, else uniform.
+            does not decrease with distance) or ``"map"`` (the scene's background map). None: the map if the scene has
+            one, else uniform.
         dark_count_hz
-            Dark counts of a pixel, counts/s, the same in all, besides those of the detector (`Detector.dark_count_hz`):
-            what is counted, whatever the detection efficiency.
+            Dark counts of every pixel, counts/s, in addition to those of the detector (`Detector.dark_count_hz`); not
+            reduced by the detection efficiency.
 
         Returns
         -------
         Flux
-            Its `info` holds the parameters, the achieved means and counts of pixels, as plain JSON types;
+            Its `info` contains the parameters, the achieved means and numbers of pixels, as plain JSON types;
             an infinite ratio is None.
 
         Warns
@@ -211,7 +212,7 @@ class Scene:
         Raises
         ------
         TypeError, ValueError
-            An argument of the wrong kind or out of range; no valid pixel; a level or ratio that cannot be
+            An argument of another type or out of range; no valid pixel; a level or ratio that cannot be
             reached because reflectivity or ambient light is zero at every valid pixel.
         """
         maps = self.depth_m[None], self.reflectivity[None], self.background
@@ -219,7 +220,7 @@ class Scene:
 
     @staticmethod
     def example_names() -> tuple[str, ...]:
-        """Names that `example` knows."""
+        """Names of the built-in scenes of `example`."""
         return _EXAMPLES
 
     @classmethod
@@ -227,7 +228,7 @@ class Scene:
         """A built-in scene, ray-cast by this package: no files needed, exact depth, any size.
 
         ``"room"``: walls, floor, a door to a passage, boxes, spheres, a table, a test chart; 2.4 to 8.7 m.
-        ``"random"``: a room of its own for every seed, boxes and spheres in it, and its own view; up to 17 m.
+        ``"random"``: a different room with boxes and spheres, and a different view, for every seed; up to 17 m.
         Depth is the range along the ray of the pixel's centre; reflectivity is albedo times the cosine of
         incidence (Lambert, laser at the camera).
 
@@ -264,7 +265,7 @@ class Scene:
         index: int | None = None,
         max_depth_m: float | None = None,
     ) -> Scene:
-        """A scene from a depth file and an image; what is read, and how: `mars_lidar.io.rgbd.read_rgbd`.
+        """A scene from a depth file and an image; formats: `mars_lidar.io.rgbd.read_rgbd`.
 
         Parameters
         ----------
@@ -272,24 +273,24 @@ class Scene:
             16-bit PNG (or TIFF), ``.pfm``, ``.exr``, ``.npy``, ``.npz``, NYUv2's labelled ``.mat``, or the
             folder of a Middlebury scene.
         image_path
-            Image whose linear luminance stands for the reflectivity; None: what the depth file or folder
-            brings along, else 1 everywhere.
+            Image whose linear luminance is used as the reflectivity; None: that of the depth file or folder, else 1
+            everywhere.
         size
-            As in `resize`; None keeps the size of the files.
+            As for `resize`; None: the size of the files.
         depth_unit_m
             Metres per stored unit of depth; None: 0.001 (mm) for 16-bit images, 1 (m) for arrays.
         focal_px
-            Focal length in pixels of the depth file: turns depth perpendicular to the image plane, which
-            RGB-D cameras give, into range along the ray. None: the depth is taken as it is.
+            Focal length in pixels of the depth file: converts depth perpendicular to the image plane, as
+            measured by RGB-D cameras, to range along the ray. None: the depth is used unchanged.
         index
             Frame of a NYUv2 ``.mat``, from 0; None for everything else.
         max_depth_m
-            Depths of the file beyond this, m, are no return (a sky, a wall behind everything); None: none.
+            Depths beyond this, m, are treated as no return (sky, a far wall); None: no limit.
 
         Raises
         ------
         ValueError
-            A file that is missing, damaged or of the wrong kind: the message names it and says why.
+            A file that is missing, damaged or of another kind: the message names it and the reason.
         """
         if size is not None:  # refuse a bad size before reading anything
             cls(np.ones((1, 1)), 1.0).resize(size)
@@ -336,9 +337,9 @@ class LayeredScene:
     Parameters
     ----------
     layers
-        Scenes of one shape, up to 16, in any order; NaN in the depth of one: it has no surface there. Reflectivities
-        share one scale and include what the surfaces before them let through. The first is the one whose depth and
-        reflectivity count as the scene's, and its background map is taken for the ambient light.
+        Scenes of one shape, up to 16, in any order; NaN in the depth of a layer: no surface. Reflectivities have a
+        common scale and include the transmission of nearer surfaces. Depth and reflectivity of the scene are those of
+        the first layer, whose background map is the ambient light.
 
     Attributes
     ----------
@@ -365,14 +366,14 @@ class LayeredScene:
         Parameters
         ----------
         scene
-            Without the pane.
+            The scene without the pane.
         depth_m
-            Range of the pane along every ray, m. Where the first layer is nearer the pane is hidden.
+            Range of the pane along every ray, m. The pane is hidden where the first layer is nearer.
         reflectivity
-            Of the pane, on the scale of the scene's, in [0, 1].
+            Reflectivity of the pane, on the scale of the scene, in [0, 1].
         transmission
-            Share of the light that passes it on the way there and back, in (0, 1]: a factor on the reflectivity of
-            everything farther away.
+            Fraction of the light that passes the pane there and back, in (0, 1]: a factor on the reflectivity of all
+            surfaces farther away.
         """
         depth = checks.real("depth_m", depth_m, low=0.0, strict_low=True)
         share = checks.real("reflectivity", reflectivity, low=0.0, high=1.0)
@@ -418,8 +419,8 @@ class LayeredScene:
 
             S_k = signal * w_k / mean_V(sum_k w_k)
 
-        so that all returns of a pixel together have the mean `signal`. Ambient ``"reflectivity"`` is the sum of the
-        reflectivities of the surfaces in a pixel; in a pixel without any it is the largest reflectivity of all
+        so that the sum of all returns of a pixel has the mean `signal`. Ambient ``"reflectivity"`` is the sum of the
+        reflectivities of the surfaces in a pixel; in a pixel without a surface it is the largest reflectivity of all
         layers.
         """
         depth, share = (

@@ -109,9 +109,9 @@ def photons_per_bin(flux: Flux, system: System, *, bins: int | None = None) -> F
     Raises
     ------
     TypeError
-        No `Flux` or no `System`.
+        Not a `Flux` or not a `System`.
     ValueError
-        `bins` that are no whole number >= 1; light that does not fit the system.
+        `bins` that are not a whole number >= 1; light that does not fit the system.
 
     See Also
     --------

@@ -3,14 +3,14 @@
 Equation numbers refer to docs/theory.md. Times are in laser periods, fluxes in photons per bin and period.
 
 The state is the bin (of n) of the last registration. P is never formed as a matrix: products with it are
-first-order recursions round the circle (2.4, 2.5), and its stationary distribution solves the *feedback*
+first-order recursions around the period (2.4, 2.5), and its stationary distribution solves the *feedback*
 equation (2.8), which the slow modes of the chain do not enter,
 
     A x = p,    A = I + diag(p) G - diag(p') S.
 
 G sums the s bins before a bin, S shifts by s bins, s the dead time in bins without whole periods. The equation
 x (I - P) = 0 of the chain is singular, with many further small singular values where the chain mixes slowly; A is
-well conditioned. Gauss-Seidel sweeps round the circle converge fast unless some ten background photons fall into one
+well conditioned. Gauss-Seidel sweeps around the period converge fast unless some ten background photons fall into one
 dead time; then a Krylov method follows and, where it fails too, a sparse factorisation.
 """
 
@@ -80,7 +80,7 @@ class Feedback:
         Raises
         ------
         ConvergenceError
-            Where no method reached a backward error of 1e-10.
+            No method reached a backward error of 1e-10.
         """
         n = self.fire.size
         rhs = np.ones(n) if adjoint else self.fire
@@ -244,7 +244,7 @@ class Stationary:
     sweeps
         Gauss-Seidel sweeps and Krylov steps spent; 0 where no iteration was needed.
     method
-        ``"sweeps"``, ``"gmres"`` or ``"lu"``: what converged.
+        ``"sweeps"``, ``"gmres"`` or ``"lu"``: the method that converged.
 
     See Also
     --------
@@ -306,7 +306,7 @@ class PhaseChain:
     Raises
     ------
     TypeError
-        Photons that are no array of real numbers.
+        Photons that are not an array of real numbers.
     ValueError
         Photons that are negative, not finite or all 0; a dead time below 0; an unknown `rearm`.
 
@@ -462,7 +462,7 @@ class PhaseChain:
         Raises
         ------
         ConvergenceError
-            Where no method reached a residual of 1e-9; the message names the cell.
+            No method reached a residual of 1e-9; the message names the cell.
         """
         return stationary_from(self, self.solve(adjoint=False))
 

@@ -39,7 +39,7 @@ def constant_light_rate(rate_hz: float, detector: Detector) -> float:
     Parameters
     ----------
     rate_hz
-        Photons per second at the pixel, before its detection efficiency; dark counts come on top.
+        Photons per second at the pixel, before its detection efficiency; dark counts are added.
     detector
         Of mode ``"nonparalyzable"``, without crosstalk or a longer dead time of the electronics, and afterpulses of all
         generations, not together with `recovery_ns`.
@@ -52,7 +52,7 @@ def constant_light_rate(rate_hz: float, detector: Detector) -> float:
     Raises
     ------
     TypeError
-        A rate that is no number; no `Detector`.
+        A rate that is not a number; not a `Detector`.
     ValueError
         A negative rate, or a detector whose mean rate is not known (see `detector`).
 

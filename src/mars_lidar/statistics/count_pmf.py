@@ -158,7 +158,7 @@ def characteristic(
     if lost.any():
         raise TooLongError(
             f"count law of {cells.name(int(np.argmax(lost)))}: the state of the pixel does not repeat within "
-            f"{steps:.1g} bins x periods, too many to run the exposure to its end at {z_re.shape[1]} points; mean, "
+            f"{steps:.1g} bins x periods, too many to compute the exposure to its end at {z_re.shape[1]} points; mean, "
             f"variance and two more cumulants are known; for the law {cells.instead}"
         )
     taken = np.where(settled >= 0, settled, cells.system.cycles).mean(-1).max()

@@ -1,11 +1,11 @@
 """Free-running pixels behind electronics with a dead time of their own: count law, mean histogram, stationary shape.
 
-An avalanche is recorded iff t_e has passed since the last record; the pixel keeps detecting meanwhile, dead for t_d
-after each avalanche. Records form a Markov-renewal process whose state is the phase of a record: equations (10) to (13)
-of docs/theory_detectors.md. Its transition probabilities are the kernel (10) folded over the periods. The stationary
-law of the phases is the mean histogram of a stationary pixel (20), which Rapp et al. treat (IEEE TSP 2019). With a
-weight z for each record the same recursion gives the generating function of the number of records; its values on the
-unit circle give the law of the number (19).
+An avalanche is recorded if and only if t_e has passed since the last record; meanwhile the pixel continues to detect,
+dead for t_d after each avalanche. Records form a Markov-renewal process whose state is the phase of a record: equations
+(10) to (13) of docs/theory_detectors.md. Its transition probabilities are the kernel (10) folded over the periods. The
+stationary law of the phases is the mean histogram of a stationary pixel (20), which Rapp et al. treat (IEEE TSP 2019).
+With a weight z for each record the same recursion gives the generating function of the number of records; its values on
+the unit circle give the law of the number (19).
 """
 
 from __future__ import annotations
@@ -230,12 +230,12 @@ def electronics_moments(
 ) -> Moments:
     """Mean and variance of the number of records, and their mean histogram, with `Detector.electronics_dead_time_ns`.
 
-    For modes ``"nonparalyzable"`` and ``"gated"`` (a gate that stays), both starts.
+    For modes ``"nonparalyzable"`` and ``"gated"`` (a fixed gate), both starts.
 
     Parameters
     ----------
     flux, system
-        The light of pixels of shape (...), and what registers it.
+        The light of pixels of shape (...), and the system.
     tolerance
         The grid is refined until doubling it moves mean and variance, or their limits for fine grids, by less than
         this in standard deviations of N (or relative to themselves, if that is larger), and the shape by less in
@@ -249,12 +249,12 @@ def electronics_moments(
     Raises
     ------
     TypeError
-        No `Flux` or no `System`.
+        Not a `Flux` or not a `System`.
     ValueError
         For arguments out of range, another mode, other effects.
     ConvergenceError
-        Naming the cell, where the grid that would be needed does not fit in 1 GiB, or the exposure is too long to be
-        run through before its state repeats.
+        The required grid does not fit in 1 GiB, or the exposure is too long to be computed before its state repeats;
+        the message names the cell.
 
     See Also
     --------
@@ -484,8 +484,8 @@ def _phases(grid: RecordGrid) -> FloatArray:
         if moved <= TOL.record_stands * forgotten:
             return law
     raise ConvergenceError(
-        f"stationary shape of {grid.cell.name(0)} behind electronics with a dead time: {n} phases do not settle; use "
-        "method 'exposure', or simulate it with engine 'exact'"
+        f"stationary shape of {grid.cell.name(0)} behind electronics with a dead time: {n} phases do not converge; "
+        "use method 'exposure', or simulate it with engine 'exact'"
     )
 
 

@@ -386,7 +386,7 @@ def exposure_moments(
     Parameters
     ----------
     flux, system
-        The light of pixels of shape (...), and what registers it.
+        The light of pixels of shape (...), and the system.
     tolerance
         The statistics grid is refined until `Exposure.movement` is below this, in [1e-9, 0.1].
     threads
@@ -402,13 +402,13 @@ def exposure_moments(
     Raises
     ------
     TypeError
-        No `Flux` or no `System`.
+        Not a `Flux` or not a `System`.
     ValueError
         A tolerance out of range; a detector of mode ``"synchronous"``, with a moving gate, or with effects that this
         law does not describe.
     ConvergenceError
-        Naming the cell, where no grid up to 2^20 bins meets the tolerance, or where the state has not
-        repeated after some 10^5 to 10^7 periods of an exposure that is longer still.
+        No grid up to 2^20 bins meets the tolerance, or the state has not repeated after some 10^5 to 10^7 periods of a
+        longer exposure; the message names the cell.
 
     See Also
     --------

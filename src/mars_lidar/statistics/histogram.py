@@ -41,7 +41,7 @@ def mean_histogram(
     Parameters
     ----------
     flux, system
-        The light of pixels of shape (...), photons per period, and what registers it; a gate must not move.
+        The light of pixels of shape (...), photons per period, and the system; a gate must be fixed.
     tolerance
         The grid is refined until the result moves by less than this, in [1e-9, 0.1] (`Exposure.movement`).
     threads
@@ -55,11 +55,11 @@ def mean_histogram(
     Raises
     ------
     TypeError
-        No `Flux` or no `System`.
+        Not a `Flux` or not a `System`.
     ValueError
         A tolerance out of range, a moving gate, or effects whose mean is not known (afterpulses, crosstalk).
     ConvergenceError
-        Naming the cell, where no grid meets the tolerance or the exposure is too long to be run through.
+        No grid meets the tolerance, or the exposure is too long to be computed; the message names the cell.
 
     See Also
     --------
@@ -154,11 +154,11 @@ def registration_pdf(
     Raises
     ------
     TypeError
-        No `Flux` or no `System`.
+        Not a `Flux` or not a `System`.
     ValueError
         An unknown `method`, `rearm` without ``"chain"``, or a detector that the method does not describe.
     ConvergenceError
-        Naming the cell, where no grid meets the tolerance.
+        No grid meets the tolerance; the message names the cell.
 
     See Also
     --------
@@ -200,7 +200,7 @@ def registration_pdf(
 def rearm_of(rearm: Rearm | None, used: bool, by: str) -> Rearm:
     """The argument `rearm`, which must be None unless the chain is `used`."""
     if rearm is not None and not used:
-        raise ValueError(f"rearm must be None for {by}, which has no such choice, got {rearm!r}")
+        raise ValueError(f"rearm must be None for {by}, which has no such option, got {rearm!r}")
     return rearm or "centre"
 
 

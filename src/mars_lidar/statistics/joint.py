@@ -1,9 +1,10 @@
 """The covariance of a histogram in closed form: means, variances and covariances of any bins and windows.
 
-A pixel is armed iff nothing registered in the last dead time, so that registrations feed back linearly on later ones,
-driven by noise without memory. Folded over the periods this is one linear equation round the circle; its solution for
-the weights of a window gives the variance of the window. For an exposure that forgets its start, a closed form includes
-the exact terms of both ends (section 5). Derivation and equation numbers: docs/joint_law.md.
+A pixel is armed if and only if no photon was registered in the last dead time, so that registrations feed back linearly
+on later ones, driven by memoryless noise. Folded over the periods this is one linear equation around the period; its
+solution for the weights of a window gives the variance of the window. If the start-up transient ends within the
+exposure, a closed form includes the exact terms of both ends (section 5). Derivation and equation numbers:
+docs/joint_law.md.
 
 With jitter or uneven codes, a registration is recorded in a random bin, independently of all others given its time. A
 weight w of the bin then has the mean v = E w for its registration and, by the law of total variance, with the mean m of
@@ -65,7 +66,7 @@ class Windows:
 
 
 class SettledLaw:
-    """Mean and covariance of windows of the histogram of an exposure that forgets its start before its end."""
+    """Mean and covariance of windows of the histogram of an exposure whose start-up transient ends before its end."""
 
     def __init__(self, grid: FoldedGrid) -> None:
         n, d, whole = grid.bins, grid.shift, grid.whole
@@ -202,8 +203,8 @@ class Pixel:
         if self.law is None:
             if self.settled == -2 or bins * (grid.cycles + grid.whole) > LAW.run_through:
                 raise ConvergenceError(
-                    f"joint law of {cells.name(0)}: the pixel does not forget its start before the exposure ends, "
-                    f"and {bins} bins x {grid.cycles} periods are too many to run through; {INSTEAD}"
+                    f"joint law of {cells.name(0)}: the start-up transient does not end within the exposure, "
+                    f"and {bins} bins x {grid.cycles} periods are too many to compute; {INSTEAD}"
                 )
             fine = grid.cycles * grid.state[0] if grid.warm else total
         else:
@@ -409,12 +410,12 @@ def joint_law(
     Raises
     ------
     TypeError
-        No `Flux` or no `System`.
+        Not a `Flux` or not a `System`.
     ValueError
         Several pixels, a tolerance out of range, or a detector that this law does not describe.
     ConvergenceError
-        Naming the pixel, where no grid up to 2^17 bins meets the tolerance, or where the exposure does not
-        forget its start and is too long to be run through bin by bin (more than 2^22 bins x periods).
+        No grid up to 2^17 bins meets the tolerance, or the start-up transient does not end within the exposure, which
+        is too long to be computed bin by bin (more than 2^22 bins x periods); the message names the pixel.
 
     See Also
     --------
@@ -422,9 +423,9 @@ def joint_law(
 
     Notes
     -----
-    The result includes the terms of the start and of the end of the exposure; nothing is assumed stationary. Where
-    the exposure is too short to forget its start (`settled` is -1) every window is run through all periods, which
-    is exact too but costs O(bins x cycles) a window instead of O(bins).
+    The result includes the terms of the start and of the end of the exposure; nothing is assumed stationary. If the
+    start-up transient does not end within the exposure (`settled` is -1), every window is computed through all periods,
+    which is also exact but costs O(bins x cycles) a window instead of O(bins).
 
     Examples
     --------
@@ -499,7 +500,7 @@ def _refined(cells: Cells, out: int, tolerance: float) -> tuple[JointLaw, Pixel]
         bins *= 2
         if bins > max(TOL.many_bins, 4 * out):
             raise ConvergenceError(
-                f"joint law of {cells.name(0)}: with {bins // 2} bins per period it still moves by {moved:.2g} "
+                f"joint law of {cells.name(0)}: with {bins // 2} bins per period it still changes by {moved:.2g} "
                 f"(tolerance {tolerance:g}); {instead}"
             )
         coarse = fine
@@ -523,8 +524,8 @@ class JointLaw:
     grid_bins
         Bins per period of the final grid, which need not be those of the histogram.
     settled
-        Periods after which the start is forgotten; -1 where the exposure is shorter than that, and is run through
-        for every window.
+        Periods after which the start-up transient has ended; -1 if the exposure is shorter, and is computed through all
+        periods for every window.
 
     See Also
     --------
@@ -556,7 +557,7 @@ class JointLaw:
 
     @property
     def sweeps(self) -> int:
-        """Sweeps round the circle of the slowest solution so far; 200 where it was then factorised."""
+        """Sweeps around the period of the slowest solution so far; 200 if it was then factorised."""
         return 0 if self._pixel is None else self._pixel.grid.sweeps
 
     @property
@@ -620,7 +621,7 @@ class JointLaw:
         return np.concatenate([self._pixel.covariances(x, y) for x, y in parts]).reshape(shape)[()]
 
     def lag(self, lag: int = 1) -> FloatArray:
-        """Covariances (bins,) of bin j with bin j + `lag`, round the period; at 0 variances. May raise MemoryError."""
+        """Covariances (bins,) of bin j with bin j + `lag`, cyclic; variances for lag 0. May raise MemoryError."""
         n = self.mean.size
         lag = checks.integer("lag", lag, low=-n, high=n)
         if self._pixel is None:
@@ -645,7 +646,7 @@ class JointLaw:
         Raises
         ------
         MemoryError
-            Where it would not fit in memory; `window` and `lag` need little.
+            The matrix does not fit in memory; `window` and `lag` need little.
         """
         n = self.mean.size
         if self._pixel is None:

@@ -31,9 +31,9 @@ Method = Literal["exact", "mars", "renewal", "poisson"]
 
 
 class CountLaw:
-    """Law of the number N of registrations in an exposure, for cells of shape (...); made by `count_law`.
+    """Law of the number N of registrations in an exposure, for pixels of shape (...); returned by `count_law`.
 
-    `support`, `pmf` and `cdf` are computed when they are first asked for.
+    `support`, `pmf` and `cdf` are computed on first use.
 
     Attributes
     ----------
@@ -44,7 +44,7 @@ class CountLaw:
     cumulants
         (..., 4) mean, variance, third and fourth cumulant of N.
     windows
-        Function that gives the probabilities of the cells, called when they are first asked for.
+        Function that returns the probabilities of the cells, called on first use.
     exposure
         The `Exposure` of an exact law (its histogram has a single bin), else None.
 
@@ -125,7 +125,7 @@ class CountLaw:
 
     @cached_property
     def outside(self) -> FloatArray:
-        """Bound (...) on the probability outside of `support`, and so on the aliasing of an exact pmf."""
+        """Bound (...) on the probability outside `support`, and thus on the aliasing of an exact pmf."""
         return np.array([window.outside for window in self._windows]).reshape(self._shape)
 
     @property
@@ -169,16 +169,16 @@ def count_law(
     flux
         The light of pixels of shape (...); with an armed start the law depends on the delay.
     system
-        Laser, detector and histogram (whose bins do not matter here).
+        Laser, detector and histogram (the bins have no influence).
     method
         - ``"exact"``: finite exposure, start and end included, any dead time and every mode of the detector
           (docs/theory_exposure.md, docs/detectors.md); with electronics dead time for modes ``"nonparalyzable"`` and
           ``"gated"``, to 1e-3 (see `electronics_moments`),
         - ``"mars"``: the Gaussian of the MaRS paper (arXiv 2512.04924), asymptotic in the exposure: it depends neither
-          on the start nor, but for the grid, on the delay,
+          on the start nor, except through the grid, on the delay,
         - ``"renewal"``: the Gaussian of a constant-rate renewal process of equal energy, mean
           lambda t / (1 + lambda t_d) and variance lambda t / (1 + lambda t_d)^3,
-        - ``"poisson"``: no dead time, the law of the arrivals (inside of the gate) for every mode.
+        - ``"poisson"``: no dead time, the law of the arrivals (within the gate) for every mode.
     rearm
         ``"centre"`` (default) or ``"edge"`` of the bin, for ``"mars"`` only: where its chain re-arms.
     tolerance
@@ -194,11 +194,11 @@ def count_law(
     Raises
     ------
     TypeError
-        No `Flux` or no `System`.
+        Not a `Flux` or not a `System`.
     ValueError
         An unknown `method`, a tolerance out of range, or a detector that the method does not describe.
     ConvergenceError
-        Naming the cell, where no grid meets the tolerance, or where the exposure is too long to be run through.
+        No grid meets the tolerance, or the exposure is too long to be computed; the message names the cell.
 
     See Also
     --------

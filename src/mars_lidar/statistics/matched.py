@@ -1,4 +1,4 @@
-"""Count laws matched to four given cumulants, for tables that store no more of the exact law.
+"""Count laws matched to four given cumulants, for tables that store only these cumulants of the exact law.
 
 The law is defined in native/laws/matched_law.h, from which the engines draw. This module gives its probabilities and a
 criterion for its accuracy.
@@ -23,7 +23,7 @@ def matched_pmf(cumulants: ArrayLike, *, threads: int | None = None) -> list[Pmf
     ----------
     cumulants
         (cells, 4) mean in [0, 1e15], variance >= 0, third and fourth cumulant. Cumulants that no count
-        can have (a variance below that of an integer of this mean, say) give a nearby law.
+        can have (such as a variance below that of an integer of this mean) give a nearby law.
     threads
         Threads to run on; default: all processors that this process may use.
 

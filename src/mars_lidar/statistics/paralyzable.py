@@ -1,8 +1,8 @@
 """Mean, variance and mean histogram of a paralyzable pixel, in closed form.
 
-An arrival is registered iff no other came within the dead time before it. The rate of registrations is therefore
-r(t) = lambda(t) exp(-(C(t) - C(t - t_d))), with the integrated flux C, and registrations further apart than the dead
-time are independent. Equation numbers: docs/theory_detectors.md.
+An arrival is registered if and only if no other came within the dead time before it. The rate of registrations is
+therefore r(t) = lambda(t) exp(-(C(t) - C(t - t_d))), with the integrated flux C, and registrations further apart than
+the dead time are independent. Equation numbers: docs/theory_detectors.md.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def paralyzable_moments(
     Parameters
     ----------
     flux, system
-        The light of pixels of shape (...), and what registers it.
+        The light of pixels of shape (...), and the system.
     tolerance
         The grid is refined until doubling it moves mean and variance by less than this, relative to
         themselves, and the shape by less in total variation; in [1e-9, 0.1].
@@ -48,11 +48,11 @@ def paralyzable_moments(
     Raises
     ------
     TypeError
-        No `Flux` or no `System`.
+        Not a `Flux` or not a `System`.
     ValueError
         For arguments out of range, another mode, or a dead time of more than 20,000 periods.
     ConvergenceError
-        Naming the cell, where no grid up to 2^20 bins meets the tolerance.
+        No grid up to 2^20 bins meets the tolerance; the message names the cell.
 
     See Also
     --------
@@ -115,7 +115,7 @@ def _refined(cells: Cells, tolerance: float, *, with_variance: bool) -> Moments:
             coarse, before, n = fine, limit, 2 * n
             if n > max(TOL.most_bins, 4 * system.bins):
                 raise ConvergenceError(
-                    f"paralyzable statistics of {cells.name(k)}: with {n // 2} bins per period they still move by "
+                    f"paralyzable statistics of {cells.name(k)}: with {n // 2} bins per period they still change by "
                     f"more than {tolerance:g}; use a larger tolerance, or simulate it with engine 'exact'"
                 )
         mean[k], variance[k], histogram[k], bins[k] = fine.mean, fine.variance, fine.histogram, n

@@ -40,7 +40,7 @@ class HoldingTimes:
     relative_value
         (n,) the solution z of (I - P + 1 pi) z = Q_mu 1 - mu.
     defect
-        Largest relative disagreement among independent routes to the same figures: mu from pi and from the
+        Largest relative disagreement among independent computations of the same quantities: mu from pi and from the
         feedback equation, the residual of the equation for z, sigma2 and sigma_ss2 + 2 covariance_sum.
 
     See Also
@@ -124,14 +124,14 @@ def holding_times(chain: PhaseChain) -> HoldingTimes:
     Raises
     ------
     TypeError
-        No `PhaseChain`.
+        Not a `PhaseChain`.
     ConvergenceError
-        Where a solution did not converge.
+        A solution did not converge.
 
     Warns
     -----
     RuntimeWarning
-        Where independent routes to one figure disagree by more than 1e-7; the message names the cell.
+        Independent computations of one quantity disagree by more than 1e-7; the message names the cell.
 
     See Also
     --------
@@ -180,7 +180,7 @@ def holding_times(chain: PhaseChain) -> HoldingTimes:
     )
     if not defect <= TOL.holding_times:
         warnings.warn(
-            f"holding times at {chain.describe()}: independent routes agree to {defect:.1e} only "
+            f"holding times at {chain.describe()}: independent computations agree to {defect:.1e} only "
             f"(mu = {mu:g}, sigma2 = {sigma2:g} periods)",
             RuntimeWarning,
             stacklevel=2,

@@ -47,7 +47,7 @@ class HoldingTimeCovariance:
     sigma2
         sigma_ss2 + 2 exact_sum, computed as a sum of squares: never negative.
     defect
-        Relative disagreement of independent routes to mu, exact_sum and sigma2 (see `HoldingTimes`).
+        Relative disagreement of independent computations of mu, exact_sum and sigma2 (see `HoldingTimes`).
 
     See Also
     --------
@@ -196,16 +196,16 @@ def holding_time_covariance(
     rearm
         ``"centre"``, or ``"edge"`` for the re-arming of Rapp's code.
     bins
-        As `photons_per_bin`; the delay only shifts the phases on the grid.
+        As for `photons_per_bin`; the delay only shifts the phases on the grid.
 
     Raises
     ------
     TypeError
-        No `Flux` or no `System`.
+        Not a `Flux` or not a `System`.
     ValueError
-        For arguments out of range, and for a flux of 0: without registrations there are no holding times.
+        Arguments out of range, or a flux of 0, which has no registrations and thus no holding times.
     ConvergenceError
-        Where a solution did not converge; the message names the cell.
+        A solution did not converge; the message names the cell.
 
     See Also
     --------

@@ -1,6 +1,6 @@
-"""What a statistic of one pixel may cost before it is refused; accuracies, sizes of grids and of blocks.
+"""Largest costs of the statistics of one pixel, accuracies, and sizes of grids and blocks.
 
-Costs are counted, not timed: what is refused does not depend on the machine. Seconds are those of one core at 3 GHz.
+Costs are counted, not timed, so that refusals do not depend on the machine. Seconds are those of one core at 3 GHz.
 Every result is checked where it is computed, against a finer grid, a residual or known moments, so that a coarse first
 guess costs time and not accuracy.
 """
@@ -60,14 +60,14 @@ MOMENTS = Budget(recursion=math.inf, one_pass=4e9, record_kernel=2**27, record_m
 
 
 def advice(*names: str) -> str:
-    """The end of a refusal: what to use instead, one of `names` or the exact engine."""
+    """End of a refusal: the alternatives, one of `names` or the exact engine."""
     simulate = "simulate it with engine 'exact'"
     return f"use {', '.join(names)}, or {simulate}" if names else simulate
 
 
 @dataclass(frozen=True)
 class Tolerances:
-    """Numbers of the statistics that are no arguments.
+    """Constants of the statistics that are not arguments.
 
     Attributes
     ----------

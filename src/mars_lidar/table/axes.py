@@ -1,4 +1,4 @@
-"""Axes of a table: photons per period, ascending; how they are given, thinned and refined."""
+"""Axes of a table (photons per period, ascending): their specification, thinning and refinement."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ def axis_values(name: str, grid: Grid) -> FloatArray:
     Parameters
     ----------
     name
-        Of the argument, for errors.
+        Name of the argument, for errors.
     grid
         A tuple ``(low, high, points)``: 0, and `points` values from low to high, equally spaced in the logarithm.
-        Or an array of values, ascending, taken as it is.
+        Or an array of ascending values, used unchanged.
 
     Returns
     -------

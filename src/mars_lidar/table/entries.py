@@ -1,7 +1,7 @@
 """Entries of a table for each (S, B): their evaluation and their interpolation for pixels (docs/table.md).
 
-Of each entry: cumulants and shape of the count at the canonical delay t_r / 2 (`Entries`), the exact law of the count
-where four cumulants do not fix it (`NodeLaws`), and for an armed start the change of the cumulants with the delay
+Each entry has cumulants and shape at the canonical delay t_r / 2 (`Entries`), the exact law of the count if four
+cumulants do not determine it (`NodeLaws`), and for an armed start the change of the cumulants with the delay
 (`StartPhases`). A `Recipe` evaluates entries, by the exact recursion or by the method of the MaRS paper.
 """
 
@@ -44,16 +44,16 @@ class Entries:
     cycles
         N, the exposure that `cumulants` and `shape` describe.
     cumulants, rates
-        (n, 4) of the count, and what one more period adds; NaN where that is not known.
+        (n, 4) of the count, and their increments per further period; NaN if unknown.
     enough
-        (n,) periods from which on the linear continuation holds; -1: for N alone.
+        (n,) periods from which the linear continuation is valid; -1: for N only.
     bins
-        (n,) bins per period of the statistics grid that was needed.
+        (n,) bins per period of the statistics grid.
     shape
         (n, bins) float32 mean histogram of N periods, normalised; uniform where nothing is registered.
     startup
         (n, bins) float32 part of the mean histogram that does not grow with the exposure, in registrations; None
-        where there is none.
+        without such a part.
     """
 
     cycles: int
@@ -65,7 +65,7 @@ class Entries:
     startup: Shapes | None
 
     def serves(self, cycles: int) -> NDArray[np.bool_]:
-        """Which entries (n,) hold for exposures of `cycles` periods."""
+        """Which entries (n,) are valid for exposures of `cycles` periods."""
         if cycles == self.cycles:
             return np.ones(self.enough.size, dtype=bool)
         return (self.enough >= 0) & (self.enough <= cycles)
@@ -81,7 +81,7 @@ class Entries:
     def shapes_at(self, cycles: int) -> Shapes:
         """Normalised mean histograms (n, bins) for `cycles` periods; NaN for entries that do not serve them.
 
-        The array itself where it holds already what is asked for.
+        Returns the stored array if it is for these cycles.
         """
         serves = self.serves(cycles)
         if cycles == self.cycles or (self.startup is None and serves.all()):
@@ -182,7 +182,7 @@ class NodeLaws:
         return cls.of(np.empty(0, np.int64), [])
 
     def window(self, row: int) -> Pmf | None:
-        """Law of an entry; None where its cumulants are enough."""
+        """Law of an entry; None if its cumulants suffice."""
         k = int(np.searchsorted(self.row, row))
         if k == self.row.size or self.row[k] != row:
             return None
@@ -228,11 +228,11 @@ class StartPhases:
     signal, background
         (mS,), (mB,) photons per period: some of the table's axes.
     phase
-        (p,) ascending from 0 to 1, in periods: where a canonical exposure begins; t_r / 2 - tau of a pixel.
+        (p,) ascending from 0 to 1, in periods: start of a canonical exposure; t_r / 2 - tau of a pixel.
     correction
         (mS * mB, p * 4) float32, added to the cumulants at the canonical delay; 0 at the phases 0 and 1.
     settled
-        (mS * mB,) whether it holds for any long exposure; else for the table's own cycles only.
+        (mS * mB,) whether it is valid for any long exposure, or for the table's cycles only.
     """
 
     signal: FloatArray
@@ -248,7 +248,7 @@ class StartPhases:
         return cls(nothing, nothing, nothing, np.empty((0, 0), np.float32), np.empty(0, dtype=bool))
 
     def correction_at(self, own_cycles: bool) -> NDArray[np.float32]:
-        """The corrections for the table's own cycles, or for others: NaN where they do not hold then."""
+        """The corrections for `cycles`; NaN where they are not valid."""
         if own_cycles or self.settled.all():
             return self.correction
         return np.where(self.settled[:, None], self.correction, np.float32(np.nan))
@@ -269,7 +269,7 @@ def start_phases(
     Parameters
     ----------
     cumulants, bins
-        (nS * nB, 4) and (nS * nB,): of the entries, which say how large an error matters and which grid to use.
+        (nS * nB, 4) and (nS * nB,) of the entries, which determine the tolerable error and the grid.
     progress
         Called as ``progress(done, total)``.
     """
@@ -348,7 +348,7 @@ def _corrections(cells: Cells, bins: int, phase: FloatArray, threads: int) -> tu
         k = int(np.argmax(settled == Settled.UNSETTLED))
         raise ConvergenceError(
             f"start-phase correction of {cells.name(k)}: the state of the pixel does not repeat from period to "
-            "period for so long that the exposure cannot be run to its end"
+            "period, and the exposure is too long to be computed to its end"
         )
     values = out.reshape(cells.size, phase.size, 4)
     values[:, phase == 1.0] = 0.0  # the whole period later: the same but for rounding
@@ -464,10 +464,9 @@ def renewal_entries(
 ) -> Entries:
     """Entries (n,) of N ~ Normal(t / mu, t sigma^2 / mu^3) and of the chain's stationary shape (arXiv 2512.04924).
 
-    The sum of the covariances of the holding times is not truncated: it is what the paper's L lags and p
-    eigenpairs approximate (docs/theory.md, 3.10). Asymptotic in the exposure, so linear in it from 1 period on;
-    the start of the exposure, and with it the delay, is unknown to this law. Third and fourth cumulants are those
-    of a Gaussian, 0.
+    The sum of the covariances of the holding times, which the paper approximates by L lags and p eigenpairs, is not
+    truncated (docs/theory.md, 3.10). The law is asymptotic in the exposure, thus linear in it from 1 period on, and
+    independent of the start of the exposure and of the delay. Third and fourth cumulants are those of a Gaussian, 0.
     """
     n, bins = signal.size, default_bins(system)
     energy = np.maximum(system.pulse.bin_energy(0.5 * system.period_ns, system.period_ns, bins), 0.0)
@@ -521,10 +520,10 @@ class Lookup:
         (P, 4) rows of `Table.shapes` and their weights, >= 0 with sum 1: the pixel's shape at the canonical delay
         is their mixture. A pixel `outside` has row 0 with weight 1.
     cumulants
-        (P, 4) mean, variance, third and fourth cumulant of the pixel's count, at its own delay and the exposure
-        asked for; NaN for a pixel `outside`.
+        (P, 4) mean, variance, third and fourth cumulant of the pixel's count, at its delay and the requested
+        exposure; NaN for a pixel `outside`.
     outside
-        (P,) pixels that the table does not reach, to be evaluated by the caller.
+        (P,) pixels beyond the table, to be evaluated by the caller.
 
     See Also
     --------
@@ -551,10 +550,10 @@ class Lookup:
     outside: NDArray[np.bool_]
 
     def trusted(self) -> NDArray[np.bool_]:
-        """Pixels (P,) whose four cumulants fix the law of the count to about 0.002 in total variation.
+        """Pixels (P,) whose four cumulants determine the law of the count to about 0.002 in total variation.
 
-        See `statistics.matched.trusted`; elsewhere (few photons, saturation, mode locking) an exact law may be worth
-        its cost. False `outside`.
+        See `statistics.matched.trusted`; elsewhere (few photons, saturation, mode locking) use an exact law. False
+        for pixels `outside`.
         """
         good = np.zeros(self.outside.size, dtype=bool)
         inside = ~self.outside
@@ -573,8 +572,8 @@ def read_pixels(
 ) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
     """The arguments of `Table.lookup`, checked, (P,): signal, background, phase, and what lies beyond the axes.
 
-    The phase, in [0, 1) periods, is by how much the return comes before the canonical delay, half a period; 0 where
-    there is no return.
+    The phase, in [0, 1) periods, is the canonical delay, half a period, minus the delay of the return; 0 without a
+    return.
     """
     delay_ns = 0.5 * period_ns if delay_ns is None else delay_ns
     given = [np.asarray(values, dtype=np.float64) for values in (signal, background, delay_ns)]

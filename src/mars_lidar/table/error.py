@@ -1,4 +1,4 @@
-"""Errors of a table on random pixels between its nodes: what is measured, and in which units."""
+"""Errors of a table on random pixels between its nodes, and their units."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ _TV_MEAN, _TV_VARIANCE = 1.0 / math.sqrt(2.0 * math.pi), 1.0 / math.sqrt(2.0 * m
 class QuantisationError:
     """Errors of a table on random pixels between its nodes.
 
-    Errors of the cumulants are in units of powers of the standard deviation, at least 1/2 count. Those called
-    `delayed` are at random delays, where an armed start gives another law; the others at the canonical t_r / 2.
+    Errors of the cumulants are in units of powers of the standard deviation, at least 1/2 count. Errors
+    `delayed` are at random delays, where an armed start has another law; the others at the canonical delay t_r / 2.
     All hold for exposures of `cycles` periods: an error of the mean count per period grows with the exposure, the
     standard deviation with its root, so that errors of the mean in standard deviations grow as the root of the
     exposure. Those of the variance and of the shape do not grow.
@@ -31,13 +31,13 @@ class QuantisationError:
     Attributes
     ----------
     interpolation, samples, cycles
-        What was measured, on how many pixels, for exposures of how many periods.
+        Interpolation, number of pixels, and periods of the exposures.
     mean_rms, mean_max, variance_rms, variance_max, third_max, fourth_max
         Of the cumulants.
     shape_mean, shape_max
         Total variation between the mixture of shapes and the pixel's own.
     delayed_mean_max, delayed_variance_max, delayed_shape_max
-        The same at random delays. The shape is shifted by whole bins, so that nothing but the table errs.
+        The same at random delays. Shapes are shifted by whole bins, so that only errors of the table count.
     law_max
         Largest of 0.399 ``|error of the mean|`` + 0.242 ``|error of the variance|``: the total variation between two
         normal laws, to first order; delays included.
@@ -83,15 +83,14 @@ class QuantisationError:
 
     @property
     def largest(self) -> float:
-        """Total variation that the table may be off by: the larger of `law_max` and `shape_max`."""
+        """Largest error of the table in total variation: the larger of `law_max` and `shape_max`."""
         return max(self.law_max, self.shape_max)
 
     def cycles_within(self, allowed: float = 0.05) -> int:
         """Periods up to which the mean is within `allowed` standard deviations, from 1 to 1e8.
 
-        From the error measured at `cycles`, by its growth with the root of the exposure: most exact where measured at
-        1e8 cycles, since a standard deviation below half a count, for which short exposures are excused, is excused
-        no longer.
+        Extrapolated from the error at `cycles` with the square root of the exposure. It is most accurate for errors
+        measured at 1e8 cycles, where the lower limit of half a count on the standard deviation no longer matters.
         """
         allowed = checks.real("allowed", allowed, low=0.0, strict_low=True)
         worst = max(self.mean_max, self.delayed_mean_max, 1e-300)
@@ -129,7 +128,7 @@ def random_pixels(rng: np.random.Generator, axis: FloatArray, samples: int, belo
 class LawError:
     """Total variation between count laws at random pixels: that with the table's four cumulants, and the exact one.
 
-    Interpolation, start-phase correction and the law itself (`statistics.matched.matched_pmf`) err together here.
+    It includes the errors of interpolation, start-phase correction and the law (`statistics.matched.matched_pmf`).
 
     Attributes
     ----------

@@ -34,7 +34,7 @@ def request_key(
     refine: float | None,
     tolerance: float,
 ) -> str:
-    """Hash of all that decides a table but its cycles, which many tables do not depend on."""
+    """Hash of all settings of a table except its cycles, on which many tables do not depend."""
     instrument = system.to_dict()
     del instrument["cycles"]
     request = {
@@ -52,7 +52,7 @@ def request_key(
 
 
 def write(path: Path, header: dict[str, Any], arrays: dict[str, NDArray[Any]], overwrite: bool) -> None:
-    """Write attributes and arrays to a new HDF5 file, which appears under its name when it is complete."""
+    """Write attributes and arrays to a new HDF5 file, renamed to its final name when complete."""
     if path.suffix not in _SUFFIXES:
         raise ValueError(f"path must end in .h5 or .hdf5, got {str(path)!r}")
     check_target(path, folder=False, overwrite=overwrite)
@@ -65,7 +65,7 @@ def write(path: Path, header: dict[str, Any], arrays: dict[str, NDArray[Any]], o
 
 
 def read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-    """Attributes and arrays, which nobody can write to."""
+    """Attributes and read-only arrays."""
     if path.is_dir():
         raise ValueError(f"{path} is not a table of mars-lidar")
     with open_hdf5(path) as file:
@@ -85,7 +85,7 @@ def _own(array: Any) -> NDArray[Any]:
 
 
 def compare(path: Path, made_for: System, system: System) -> None:
-    """Refuse another system, naming the field that differs."""
+    """Raise ValueError for a different system, naming the field that differs."""
     theirs, ours = made_for.to_dict(), system.to_dict()
     for name in ours:
         if name == "cycles" or theirs[name] == ours[name]:
@@ -106,7 +106,7 @@ def _short(value: Any) -> str:
 
 
 def cache_folder() -> Path:
-    """Folder of the cached tables, which need not exist.
+    """Folder of the cached tables, which may not exist yet.
 
     ``MARS_LIDAR_CACHE``, or ``mars-lidar`` in ``XDG_CACHE_HOME``, or in ``~/.cache``.
     """

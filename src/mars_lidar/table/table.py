@@ -1,8 +1,8 @@
-"""The lookup table over (S, B) at a canonical delay: built once for a system, it answers for any pixel.
+"""The lookup table over (S, B) at a canonical delay: built once for a system, valid for any pixel.
 
-The paper's table (arXiv 2512.04924): 256 x 100 entries on [0.01, 10]^2; delay invariance replaces a third axis. Here
-with the exact law of the finite exposure, its dependence on the delay, any number of cycles, and interpolation. What
-is stored, and the errors, are described in docs/table.md.
+The paper's table (arXiv 2512.04924): 256 x 100 entries on [0.01, 10]^2; delay invariance replaces a third axis. This
+table has the exact law of the finite exposure, its dependence on the delay, any number of cycles, and interpolation.
+docs/table.md describes its content and errors.
 """
 
 from __future__ import annotations
@@ -65,21 +65,21 @@ class Table:
     Attributes
     ----------
     system
-        Laser, detector and histogram; its `cycles` are those of ``cycles=None``.
+        Laser, detector and histogram; its `cycles` are the default of the methods.
     method
         ``"exposure"`` or ``"mars"``.
     signal, background
         (nS,), (nB,) axes, photons per period, ascending. The first may be 0: pixels without a return.
     rearm
-        Of the chain, for ``"mars"``.
+        Re-arming of the chain, for ``"mars"``.
     tolerance
-        Of the exposure statistics.
+        Tolerance of the exposure statistics.
     provenance
-        How the table came to be: version, request, axes in words, seconds, and the error measured at the end.
+        Origin of the table: version, request, description of the axes, seconds, and the measured error.
     entries, start_phases
-        Cumulants and shapes of every entry, and what the delay adds to the cumulants (docs/table.md, 1 and 3).
+        Cumulants and shapes of every entry, and the change of the cumulants with the delay (docs/table.md, 1 and 3).
     laws
-        Exact laws of the count at those entries whose four cumulants do not fix it (`statistics.matched.trusted`).
+        Exact count laws of the entries whose four cumulants do not determine them (`statistics.matched.trusted`).
 
     See Also
     --------
@@ -128,28 +128,27 @@ class Table:
         threads: int | None = None,
         progress: Progress | bool | None = None,
     ) -> Table:
-        """Evaluate every entry.
+        """Build a table: evaluate every entry.
 
         Parameters
         ----------
         system
-            Laser, detector and histogram. Its detection efficiency and dark counts are left out (`System.detected`).
+            Laser, detector and histogram. Its detection efficiency and dark counts are ignored (`System.detected`).
         signal, background
             Axes, detected photons per period (`Flux.detected`): ``(low, high, points)`` for 0 and `points` log-spaced
-            values, or an array of values taken as it is. Between 0 and the next value everything is interpolated
-            linearly.
+            values, or an array of values. Between 0 and the next value interpolation is linear.
         method
             ``"exposure"``: exact statistics of the finite exposure. ``"mars"``: the paper's, Markov chain and
             Gaussian of the Markov-renewal law, asymptotic in the exposure.
         rearm
             ``"centre"`` or ``"edge"`` of the bin, for ``"mars"``.
         refine
-            Error in total variation, in [1e-5, 0.1]: points are inserted until the table meets it between its
-            nodes (`QuantisationError.largest`). None: the axes as they are.
+            Error in total variation, in [1e-5, 0.1]: points are inserted until the error between nodes is below it
+            (`QuantisationError.largest`). None: the given axes.
         tolerance
             Of each entry, for ``"exposure"``: see `exposure_moments`.
         check_law
-            Compare the counts drawn from the table with exact laws as well (`law_error`), and keep the result.
+            Also compare the count laws of the table with exact laws (`law_error`), and store the result.
         threads
             Threads to run on; default: all processors that this process may use.
         progress
@@ -158,15 +157,15 @@ class Table:
         Raises
         ------
         ValueError, TypeError
-            Naming the argument, before any work; or where `refine` cannot be met.
+            An invalid argument, before any work; `refine` cannot be met.
         ConvergenceError
-            Naming the cell that could not be evaluated.
+            An entry could not be evaluated; the message names it.
         """
         require_mode("a table", system)
         system = system.detected()  # its axes are detected photons
         axes = axis_values("signal", signal), axis_values("background", background)
         if rearm != "centre" and method != "mars":
-            raise ValueError(f"rearm must be 'centre' for method {method!r}, which has no such choice, got {rearm!r}")
+            raise ValueError(f"rearm must be 'centre' for method {method!r}, which has no such option, got {rearm!r}")
         goal = None if refine is None else checks.real("refine", refine, low=1e-5, high=0.1)
         tolerance = checks.real("tolerance", tolerance, low=1e-9, high=0.1)
         if not isinstance(check_law, bool):
@@ -200,10 +199,10 @@ class Table:
         background: Grid = PAPER_GRID["background"],
         **options: Any,
     ) -> Table:
-        """`build`, or the same table from the user's cache (docs/lookup_table.md), which keeps what is built.
+        """The table of `build` from the user's cache (docs/lookup_table.md), built and stored there if missing.
 
-        Arguments, `options` included, are those of `build`. Where nothing can be written there, the table is built,
-        with a warning.
+        Arguments, `options` included, are those of `build`. If the cache cannot be written, the table is built with a
+        warning.
         """
         own, existing = cls._search(system, signal, background, options)
         if existing is None:
@@ -223,10 +222,10 @@ class Table:
     @classmethod
     @checked
     def cached_path(cls, system: System, signal: Grid, background: Grid, **options: Any) -> Path:
-        """File of the table in the cache; built and put there where it is not.
+        """File of the table in the cache, built and stored there if missing.
 
-        Arguments, `options` included, are those of `build`. A table made for another number of cycles is taken where
-        every entry of it holds for those of `system`.
+        Arguments, `options` included, are those of `build`. A table for another number of cycles is used if all its
+        entries are valid for those of `system`.
         """
         own, existing = cls._search(system, signal, background, options)
         if existing is None:
@@ -255,9 +254,9 @@ class Table:
 
     @checked
     def save(self, path: str | Path, *, overwrite: bool = False) -> None:
-        """Write to an HDF5 file `path` (.h5, .hdf5), which appears under its name when it is complete.
+        """Write to an HDF5 file `path` (.h5, .hdf5), renamed to its final name when complete.
 
-        An existing file is an error but with `overwrite`.
+        An existing file is an error unless `overwrite` is true.
         """
         made_for = self.system.replace(cycles=self.entries.cycles)
         header = {
@@ -276,13 +275,13 @@ class Table:
     @classmethod
     @checked
     def load(cls, path: str | Path, system: System | None = None) -> Table:
-        """The table of the file `path`, for `system` (None: for the one it was made for).
+        """Read the table in the file `path`, for `system` (None: the system of the table).
 
         Raises
         ------
         ValueError
-            Where the table is of another system, naming the field that differs. Another number of cycles is no
-            difference where every entry holds for it.
+            The table is of another system; the message names the field that differs. Another number of cycles is
+            accepted if all entries are valid for it.
         """
         with reading(path, "a table of mars-lidar") as source:
             header, arrays = storage.read(source)
@@ -340,10 +339,10 @@ class Table:
         Raises
         ------
         TypeError
-            Naming `flux`, where it is no `Flux`.
+            `flux` is not a `Flux`.
         ValueError
-            Naming the range that lies outside of the table; the entry that does not hold for `cycles`; or the flux,
-            where it has a waveform or several returns.
+            Pixels outside the table (the message names the range), entries that are not valid for `cycles`, or a flux
+            with a waveform or several returns.
         """
         if flux.waveform is not None or len(flux.returns_signal) != 1:
             raise ValueError("flux must have one return a pixel: a table has none for waveforms or several returns")
@@ -395,16 +394,15 @@ class Table:
     def shapes(self, cycles: int | None = None) -> NDArray[np.float32]:
         """Normalised mean histograms at the canonical delay t_r / 2 (nS * nB, bins), float32, read-only.
 
-        Row iS * nB + iB belongs to ``signal[iS], background[iB]``. Mapped from the file where it holds what is
-        asked for; computed at each call for other cycles than those that the table was made for. Rows that do not
-        hold for `cycles` are NaN; `lookup` refuses to name them.
+        Row iS * nB + iB belongs to ``signal[iS], background[iB]``. Computed at each call for cycles other than the
+        table's. Rows that are not valid for `cycles` are NaN; `lookup` refuses them.
         """
         shapes = self.entries.shapes_at(self._cycles(cycles)).view()
         shapes.flags.writeable = False
         return shapes
 
     def serves(self, cycles: int) -> bool:
-        """Whether every entry holds for exposures of `cycles` periods."""
+        """Whether every entry is valid for exposures of `cycles` periods."""
         periods = self._cycles(cycles)
         own = periods == self.entries.cycles
         return own or bool(self.entries.serves(periods).all() and self.start_phases.settled.all())
@@ -498,7 +496,7 @@ class Table:
     def law_error(
         self, *, samples: int = 50, seed: int = 0, cycles: int | None = None, threads: int | None = None
     ) -> LawError:
-        """Total variation, on random pixels, between the count law that the table leads to and the exact one.
+        """Total variation, on random pixels, between the count law of the table and the exact law.
 
         Some 10 to 20 ms a pixel. `samples`, `seed`, `cycles` and `threads` as for `quantisation_error`.
         """
@@ -545,10 +543,10 @@ class Table:
         interpolation: Interpolation = "bilinear",
         threads: int | None = None,
     ) -> FloatArray:
-        """Share (P,) of the registrations that the shape places wrongly because it is that of the canonical delay.
+        """Share (P,) of the registrations that the table misplaces because the shape is that of the canonical delay.
 
-        Total variation between the table's shape, moved to the delay `delay_ns` (P,) by whole bins, and the exact one
-        there, less the same at the canonical delay. Each pixel is evaluated twice by itself. `interpolation` and
+        Total variation between the table's shape, shifted to the delay `delay_ns` (P,) by whole bins, and the exact
+        shape, minus the same at the canonical delay. Each pixel is evaluated twice. `interpolation` and
         `cycles` are those of `lookup`, `threads` those of `quantisation_error`.
         """
         periods = self._cycles(cycles)

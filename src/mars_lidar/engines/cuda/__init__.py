@@ -1,6 +1,6 @@
 """Engines on a GPU: the native headers compiled for CUDA at run time.
 
-Here: which engine runs there, and what it does; the engines themselves know of no device.
+This module selects the engines; the engines of the processor are independent of it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ ABLE: tuple[type[Engine], ...] = (ExactEngine, FeedbackEngine, MarsEngine)
 
 
 def check(engine: Engine, flux: Flux, system: System) -> None:
-    """Raise ValueError, naming what to use, for what `engine` cannot do on a GPU."""
+    """Raise ValueError, naming the alternative, for tasks that `engine` cannot do on a GPU."""
     match engine:
         case ExactEngine():
             _check_exact(engine, flux, system)
@@ -54,7 +54,7 @@ def check(engine: Engine, flux: Flux, system: System) -> None:
 def histogram(engine: Engine, task: Task, out: Any) -> None:
     """Fill `out` (items, bins), a C-contiguous CuPy array, with the bits of the processor.
 
-    On CuPy's current device and stream, for a task that `check` took.
+    Runs on CuPy's current device and stream, for a task that `check` accepts.
     """
     match engine:
         case ExactEngine():  # one exposure a thread
@@ -69,7 +69,7 @@ def histogram(engine: Engine, task: Task, out: Any) -> None:
 
 
 def records(engine: Engine, task: Task) -> PhaseRecords:
-    """Registrations of a task that `check` took, in the processor's memory; ValueError where an engine draws none."""
+    """Registrations of a task that `check` accepts, in host memory; ValueError for an engine without timestamps."""
     if not isinstance(engine, ExactEngine):
         raise ValueError(f"engine {engine.name!r} draws histograms only, not timestamps; use 'exact'")
     return exact_records(task, Cuda())

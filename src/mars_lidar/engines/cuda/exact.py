@@ -1,4 +1,4 @@
-"""The exact engine on a GPU: what the processor prepares, and the launches."""
+"""The exact engine on a GPU: preparation on the processor, and the launches."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ _LEAST_WARPS = 3  # of histograms that must fit into a multiprocessor, else they
 def exact_histogram(task: Task, out: Any, machine: Cuda, *, in_block: bool | None = None) -> None:
     """Fill `out` (items, bins), a C-contiguous array of the machine, with the bits of the processor.
 
-    `in_block` says where histograms are counted: in the memory of a block (True), in the device's (False), or
-    wherever they fit (None).
+    `in_block`: histograms are counted in the shared memory of a block (True), in device memory (False), or wherever
+    they fit (None).
     """
     out.fill(0)
     if in_block is None:
@@ -33,7 +33,7 @@ def exact_histogram(task: Task, out: Any, machine: Cuda, *, in_block: bool | Non
 
 
 def exact_records(task: Task, machine: Cuda) -> PhaseRecords:
-    """Timestamps: counted, then drawn again with a place to go; the records are copied to the processor."""
+    """Timestamps: registrations are counted, then drawn again into allocated memory, and copied to the host."""
     arrays = _arrays(task, machine)
     counts = machine.empty((task.items,), np.int64)
     _run(task, Sink.COUNTS, {"out": counts}, arrays, machine)

@@ -1,4 +1,4 @@
-"""The engine "feedback" on a GPU: what the processor prepares, and the launches."""
+"""The engine "feedback" on a GPU: preparation on the processor, and the launches."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ Draw = Callable[[Task, Any], None]
 def feedback_histogram(task: Task, out: Any, machine: Cuda, draw_exactly: Draw, *, warps: int | None = None) -> None:
     """Fill `out` (items, bins), a C-contiguous array of the machine, with the bits of the processor.
 
-    What the sweeps are not tried on, what they refuse, and single exposures that do not settle are drawn by
-    ``draw_exactly(task, out)``.
+    Pixels on which the sweeps are not tried or which they refuse, and single exposures that do not settle, are drawn
+    by ``draw_exactly(task, out)``.
     """
     arrays = _arrays(task, machine)
 

@@ -1,4 +1,4 @@
-"""The source of the kernels, how they are compiled, and which of them a task takes."""
+"""The source of the kernels, their compilation, and the choice of the kernel of a task."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ OPTIONS = (
 
 @cache
 def source(header: str) -> str:
-    """What is compiled. It tells the headers' contents, by which CuPy names what it has compiled before."""
+    """The source that is compiled. It contains a hash of the headers, by which CuPy caches compiled kernels."""
     contents = blake2b(digest_size=16)
     for file in sorted(HEADERS.rglob("*.h")):
         contents.update(file.read_bytes())
@@ -36,7 +36,7 @@ def source(header: str) -> str:
 
 @dataclass(frozen=True)
 class Kernel:
-    """One kernel: the header of `native` that has it, and its name in C++."""
+    """One kernel: its header in `native`, and its name in C++."""
 
     header: str
     expression: str
@@ -79,7 +79,7 @@ class Variant:
 
     @classmethod
     def of(cls, task: Task, sink: Sink) -> Variant:
-        """What a task needs."""
+        """The variant for a task."""
         return cls(
             mode=MODES.index(task.system.detector.mode),
             gaussian=_core.device_tables(task.pulse)["inverse"].size > 0,
@@ -90,13 +90,13 @@ class Variant:
 
     @property
     def kernel(self) -> Kernel:
-        """As it is compiled."""
+        """The kernel of this variant."""
         flags = ", ".join(str(flag).lower() for flag in (self.gaussian, self.whole, self.single))
         return Kernel("cuda/exact.h", f"mars::exact_items<{self.mode}, {flags}, {int(self.sink)}, {self.ahead}>")
 
 
 def overflow(itemsize: int) -> OverflowError:
-    """What the engines raise where a bin exceeds its type."""
+    """The error of the engines for a bin that exceeds its type."""
     most = 2 ** (8 * itemsize) - 1
     return OverflowError(
         f"a histogram bin exceeds {most} counts: use fewer cycles, less flux"

@@ -1,4 +1,4 @@
-"""Where kernels run: CuPy's current device. Tests put the processor in its place (tests/cuda/host_machine.py)."""
+"""The device that runs the kernels: CuPy's current device; in tests the processor (tests/cuda/host_machine.py)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class NoDeviceError(RuntimeError, ValueError):
 
 
 def cupy_with_device() -> Any:
-    """CuPy, where it can compute; ImportError or RuntimeError that says what is missing."""
+    """CuPy with a usable device; ImportError or RuntimeError that names the missing part."""
     try:
         import cupy
     except ImportError as error:
@@ -38,7 +38,7 @@ def cupy_with_device() -> Any:
 class Cuda:
     """Arrays and launches, in the order of one stream: CuPy's current device and stream.
 
-    `shared_bytes` of memory can a block have; `key` names the device.
+    `shared_bytes`: shared memory available to a block; `key` identifies the device.
     """
 
     def __init__(self) -> None:
@@ -48,19 +48,19 @@ class Cuda:
         self.shared_bytes = int(self._device.attributes["MaxSharedMemoryPerBlockOptin"])
 
     def array(self, host: NDArray[Any]) -> Any:
-        """A copy there."""
+        """A copy on the device."""
         return self._cupy.asarray(host)
 
     def zeros(self, shape: tuple[int, ...], dtype: Any) -> Any:
-        """An array there."""
+        """An array of zeros on the device."""
         return self._cupy.zeros(shape, dtype)
 
     def empty(self, shape: tuple[int, ...], dtype: Any) -> Any:
-        """Room for an array of anything."""
+        """An uninitialised array on the device."""
         return self._cupy.empty(shape, dtype)
 
     def host(self, array: Any) -> NDArray[Any]:
-        """A copy here, when everything queued before is done."""
+        """A copy in host memory, after all queued work."""
         copy: NDArray[Any] = array.get()
         return copy
 
@@ -89,7 +89,7 @@ class Cuda:
 
 @lru_cache(maxsize=64)
 def compiled(kernel: Kernel, device: int) -> Any:
-    """A kernel for a device; CuPy keeps what it has compiled in files."""
+    """A compiled kernel for a device; CuPy caches it in files."""
     import cupy
 
     module = cupy.RawModule(

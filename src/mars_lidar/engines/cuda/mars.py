@@ -1,4 +1,4 @@
-"""The engine "mars" on a GPU: what the processor prepares, and the launches."""
+"""The engine "mars" on a GPU: preparation on the processor, and the launches."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _tables: WeakKeyDictionary[Table, dict[Any, TableThere]] = WeakKeyDictionary()
 
 
 def check_mars(task_flux_most: float, cycles: int, dead_time_periods: float) -> None:
-    """Raise ValueError for exposures that the kernel's numbers do not hold."""
+    """Raise ValueError for exposures beyond the range of the kernel's integers."""
     most = cycles * min(task_flux_most, 1.0 / dead_time_periods if dead_time_periods > 0.0 else np.inf)
     if most > 0.9 * _MOST_COUNTS:
         raise ValueError(

@@ -1,1 +1,1 @@
-"""Streams of photons on disk: our own files, Photon-HDF5, PicoQuant PTU, and bare arrays."""
+"""Photon streams on disk: files of mars-lidar, Photon-HDF5, PicoQuant PTU, and bare arrays."""

@@ -1,7 +1,7 @@
-"""Absolute times of photons in files without a header: MATLAB ``.mat`` (v5, v7.3), ``.npz`` of others, and text.
+"""Absolute photon times in files without a header: MATLAB ``.mat`` (v5, v7.3), ``.npz`` of other programs, and text.
 
-A vector holds the times of one pixel; a cell array (H, W) those of an image, empty cells and scalars included.
-Times count from a laser pulse, in a unit that the caller gives (or the end of a name tells: ``_ns``, ``_ps``).
+A vector contains the times of one pixel; a cell array (H, W) those of an image, empty cells and scalars included.
+Times count from a laser pulse, in a unit that the caller or the end of a name gives (``_ns``, ``_ps``).
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def read(
     if period_ns is None:
         period_ns = _period(variables, unit)
     if period_ns is None:
-        raise NoLaserError(f"{path} does not tell the laser period: give period_ns")
+        raise NoLaserError(f"{path} does not state the laser period: give period_ns")
     raw, pixel, clocked = _flat(path, name, cells)
     # a whole number of units is known to a unit: its middle
     times_ns = (raw + 0.5 * clocked) * unit
@@ -56,7 +56,7 @@ def read(
 
 
 def photons(path: Path, unit_ns: float | None, variable: str | None) -> Photons:
-    """The absolute times alone, each cell a channel; of a clock where they are whole numbers."""
+    """The absolute times alone, each cell a channel; clock units if they are whole numbers."""
     _, name, cells, unit = _times(path, unit_ns, variable)
     raw, channel, clocked = _flat(path, name, cells)
     tick = unit if clocked else _FINEST_NS
@@ -89,7 +89,7 @@ def _times(path: Path, unit_ns: float | None, variable: str | None) -> tuple[dic
     if unit is None:
         unit = next((ns for ending, ns in _SUFFIX_NS.items() if name.endswith(ending)), None)
     if unit is None:
-        raise ValueError(f"{path}: nothing tells the unit of {name!r}: give unit_ns (1 if its times are in ns)")
+        raise ValueError(f"{path}: the unit of {name!r} is not stated: give unit_ns (1 if its times are in ns)")
     return variables, name, cells, unit
 
 

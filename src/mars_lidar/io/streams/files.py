@@ -1,4 +1,4 @@
-"""Photon streams on disk: which format, the rules for the place to write to, and NumPy's .npz."""
+"""Photon streams on disk: choice of the format, checks of the output path, and NumPy's .npz."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def save(path: str | Path, times: Timestamps, *, overwrite: bool = False, clock_
 
 
 def check_output(path: str | Path, *, overwrite: bool = False, clock_ps: float | None = None) -> None:
-    """Raise what `save` would raise because of the place or the suffix, without touching anything."""
+    """Raise the errors that `save` raises for the path or the suffix, without writing."""
     if clock_ps is not None:
         checks.real("clock_ps", clock_ps, low=0.0, strict_low=True)
         if Path(path).suffix != ".ptu":
@@ -94,7 +94,7 @@ def load(
         )
     check_finished(source)
     if plain != source:
-        raise IncompleteFileError(f"{source} is incomplete: a run that was stopped left it")
+        raise IncompleteFileError(f"{source} is incomplete: a stopped run left it")
     with reading(source, "a photon stream"):
         if bare:
             return _read_bare(source, period_ns, bins, unit_ns, variable)
@@ -106,7 +106,7 @@ def load(
 
 
 def recorded(path: Path, *, unit_ns: float | None = None, variable: str | None = None) -> Photons:
-    """The photons of another program's file as its recorder counted them; `Timestamps.load` has the arguments."""
+    """The photons of another program's file in units of its recorder; arguments as for `Timestamps.load`."""
     module = _module(path)
     with reading(path, "a photon stream"):
         photons: Photons = module.photons(path, *((unit_ns, variable) if path.suffix in _BARE else ()))
@@ -123,13 +123,14 @@ def _read_bare(
         return times
     if not (period_ns is None and bins is None and unit_ns is None and variable is None):
         raise ValueError(
-            f"{source} tells all of itself: period_ns, bins, unit_ns and variable are for the streams of others"
+            f"{source} describes its stream completely: period_ns, bins, unit_ns and variable are for "
+            "streams of other programs"
         )
     return _read_npz(source, attrs)
 
 
 def is_stream(path: Path) -> bool:
-    """Whether the file at `path` is a photon stream, not a cube or something else; ValueError if damaged."""
+    """Whether the file at `path` is a photon stream; ValueError if damaged."""
     with reading(path, "cube or photon stream"):
         if path.suffix == ".npz":
             return _npz_attributes(path).get("format") == FORMAT

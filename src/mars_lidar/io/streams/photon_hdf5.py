@@ -1,6 +1,6 @@
 """Photon-HDF5 0.5 (photon-hdf5.github.io), photon streams: timestamps, detectors = pixels, nanotimes.
 
-All pixels look at the same time: ``timestamps`` counts laser periods from the start of the exposure (unit in
+All pixels record simultaneously: ``timestamps`` counts laser periods from the start of the exposure (unit in
 s), ``detectors`` is the pixel y W + x, ``nanotimes`` the time since the laser pulse in units of
 ``bin width / m``, m as large as 16 bits allow (32 for more than 65536 bins): the bin is kept exactly, the
 time to half a unit. Photons are in order of time. phconvert writes and validates the file; h5py reads it.
@@ -34,12 +34,12 @@ _FULL = 2**20  # bytes free on a disk that is taken for full
 
 
 def check_library() -> None:
-    """Raise where the library that writes the format is missing."""
+    """Raise if the library that writes the format is missing."""
     needed("phconvert.hdf5", "Photon-HDF5")
 
 
 def write(path: Path, times: Timestamps) -> None:
-    """Write a stream; the caller renames the file when it is whole."""
+    """Write a stream; the caller renames the complete file."""
     library = needed("phconvert.hdf5", "Photon-HDF5")
     fine = units_per_bin(times.bins)
     kind = np.uint16 if times.bins * fine <= 2**16 else np.uint32
@@ -106,7 +106,7 @@ def write(path: Path, times: Timestamps) -> None:
 
 
 def read(path: Path, period_ns: float | None, bins: int | None) -> Timestamps:
-    """Read a stream; `period_ns` and `bins` are for files of others."""
+    """Read a stream; `period_ns` and `bins` are for files of other programs."""
     with _opened(path) as file:
         photons = _photons(path, file)
         own = file.get(f"user/{_GROUP}/{_ATTRIBUTES}")
@@ -114,14 +114,14 @@ def read(path: Path, period_ns: float | None, bins: int | None) -> Timestamps:
     if not attrs or photons.fine is None:
         return photons.timestamps(period_ns, bins)
     if period_ns is not None or bins is not None:
-        raise ValueError(f"{path} tells its period and bins: period_ns and bins are for the streams of others")
+        raise ValueError(f"{path} states its period and bins: period_ns and bins are for streams of other programs")
     order = np.argsort(photons.detector, kind="stable")
     since, fine = photons.fine[order].astype(np.int64), units_per_bin(int(attrs["bins"]))
     return of_fine_times(attrs, photons.clock[order], since, fine, photons.detector)
 
 
 def photons(path: Path) -> Photons:
-    """The photons of a file of others, of one spot."""
+    """The photons of one spot in a file of another program."""
     with _opened(path) as file:
         return _photons(path, file)
 

@@ -1,6 +1,6 @@
-"""Photons as a recorder of another program counted them: units of its clocks, before anything is known of the laser.
+"""Photons in the clock units of a recorder, before the laser period is known.
 
-Beside them what every file of photons tells, and the timestamps of a measured stream.
+Also the attributes common to files of photons, and the timestamps of a measured stream.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ _SYNC = _SyncTolerances()
 
 
 class NoLaserError(FileError):
-    """The file does not tell which laser period its photons came in."""
+    """The file does not state the laser periods of its photons."""
 
 
 @dataclass(frozen=True, eq=False)
 class Photons:
-    """What every format of a stream is mapped onto."""
+    """The common representation of all stream formats."""
 
     clock: NDArray[Any]  # (n,) whole units of `clock_ns` since the start of the recording
     clock_ns: float
@@ -52,7 +52,7 @@ class Photons:
     period_ns: float | None = None  # of the laser, where the file tells it
 
     def timestamps(self, period_ns: float | None = None, bins: int | None = None) -> Timestamps:
-        """A pixel for each channel, in one row; `period_ns` where the file does not tell it."""
+        """A pixel for each channel, in one row; `period_ns` if the file does not state it."""
         if self.fine is not None:
             return self._counted(self.fine, self.period_ns if period_ns is None else period_ns, bins)
         if period_ns is None:
@@ -75,7 +75,7 @@ class Photons:
     def _counted(self, fine: NDArray[Any], period_ns: float | None, bins: int | None) -> Timestamps:
         if period_ns is None:
             raise NoLaserError(
-                f"{self.source} does not tell the laser period: its clock of {self.clock_ns:g} ns runs free; "
+                f"{self.source} does not state the laser period: its clock of {self.clock_ns:g} ns runs free; "
                 "mars-lidar reconstruct takes its histograms, mars-lidar calibrate its dead time"
             )
         if abs(self.clock_ns / period_ns - 1.0) > _SYNC.period:
@@ -105,7 +105,7 @@ class Photons:
 
 
 def attributes(times: Timestamps) -> dict[str, Any]:
-    """What a file tells beside the photons, as JSON knows it."""
+    """Attributes of a file besides the photons, as JSON data."""
     return {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
@@ -184,7 +184,7 @@ def measured(
     """Timestamps of a recorded stream: laser period and fine time of each photon, and its detector.
 
     `fine` counts units of `unit_ns` since the laser pulse. Without `bins`, a bin is one unit, and the last
-    one may be cut by the end of the period. `clock_ns` is the resolution of the clock, where it is not `unit_ns`.
+    one may be cut by the end of the period. `clock_ns` is the resolution of the clock, if it differs from `unit_ns`.
     """
     pixels = int(detector.max()) + 1 if detector.size else 1
     phase = (np.asarray(fine, np.float64) + 0.5) * unit_ns  # the middle of what the clock tells apart

@@ -1,22 +1,22 @@
 """PTU of PicoQuant and the formats before it: header, cubes and photon streams.
 
-A PTU file is a list of tags (name, type, value) and then 32-bit records. Readers skip tags that they do not
-know, so two of our own carry what the format has no place for: ``MarsLidar_Attributes`` (JSON) and
+A PTU file is a list of tags (name, type, value) and then 32-bit records. Readers skip unknown tags, so that
+two additional tags contain the data without a place in the format: ``MarsLidar_Attributes`` (JSON) and
 ``MarsLidar_Variables`` (an .npz as binary blob).
 
-Cubes: a T3 image that labs' programs open; realizations are its frames. The format holds photons, not counts:
-`ptufile.PtuWriter` puts those of a pixel one laser period after the other, so that any reader that makes an image of
-the file gets the cube back. *When* in the exposure a photon came is not in it.
+Cubes: a T3 image that programs of laboratories open; realizations are its frames. The format contains photons, not
+counts: `ptufile.PtuWriter` writes the photons of a pixel in successive laser periods, so that any reader that makes an
+image of the file returns the cube. The times of photons within the exposure are not stored.
 
-Photon streams: generic T3 records with the real times of a raster scan. Written: one detector looks at the pixels one
-after the other, each for one exposure, so pixel k spans laser periods ``k * cycles`` to ``(k + 1) * cycles`` and line
-markers stand at both ends of each image row. Any reader that makes images (`ptufile.imread`) gets the cube; one that
-makes streams gets the photons. The fine time is in units of ``bin width / m``, m as large as the 15 bits of a record
+Photon streams: generic T3 records with the real times of a raster scan. Written: one detector records the pixels one
+after the other, each for one exposure, so that pixel k spans laser periods ``k * cycles`` to ``(k + 1) * cycles``, with
+line markers at both ends of each image row. A reader of images (`ptufile.imread`) returns the cube, a reader of streams
+the photons. The fine time is in units of ``bin width / m``, m as large as the 15 bits of a record
 allow: the bin is kept exactly, the time to half a unit. Read: these files, and T3 and T2 streams of others, where a
 pixel is a detector.
 
 ``.pt2`` and ``.pt3`` (PicoHarp 300), ``.ht2`` and ``.ht3`` (HydraHarp 400) become a PTU in memory: their records are
-those of a PTU; only the header is another one, of fixed places (PicoQuant, "Time Tagged File Format Demos",
+those of a PTU; only the header differs, with fixed positions (PicoQuant, "Time Tagged File Format Demos",
 github.com/PicoQuant; tsbischof/libpicoquant).
 """
 
@@ -63,8 +63,7 @@ def new_file(
 ) -> Any:
     """A `ptufile.PtuWriter` of generic T3 records, with our tags, for images of shape (H, W, bins).
 
-    `cycles` are the laser periods of a pixel; the time that all records span is asked for by phconvert and PicoQuant's
-    own software.
+    `cycles` are the laser periods of a pixel; phconvert and PicoQuant's software need the time that all records span.
     """
     ptufile = needed("ptufile", "a .ptu")
     packed = BytesIO()
@@ -98,7 +97,7 @@ def new_file(
 
 
 def header_attributes(tags: Mapping[str, Any]) -> dict[str, Any]:
-    """The attributes in the tags `found`; empty where another program wrote the file."""
+    """The attributes in the tags `found`; empty for files of other programs."""
     text = tags.get(_ATTRIBUTES)
     if not isinstance(text, str):
         return {}
@@ -116,7 +115,7 @@ def header_variables(path: Path, tags: Mapping[str, Any]) -> dict[str, NDArray[A
 
 
 def open_ptu(path: Path, trimdims: str = "") -> Any:
-    """A `ptufile.PtuFile`, also of the formats before PTU; ValueError where it is none, damaged, or never finished."""
+    """A `ptufile.PtuFile`, also of the formats before PTU; ValueError for other, damaged or unfinished files."""
     ptufile = needed("ptufile", f"a {path.suffix}")
     if path.suffix in BEFORE_PTU:
         with reading(path, f"a {path.suffix}"):
@@ -135,7 +134,7 @@ def open_ptu(path: Path, trimdims: str = "") -> Any:
     stored, stated = (path.stat().st_size - ptu.record_offset) // 4, ptu.tags.get("TTResult_NumberOfRecords", 0)
     if stated > stored:
         ptu.close()
-        raise ValueError(f"{path} is cut short: its header tells of {stated} records, {stored} are there")
+        raise ValueError(f"{path} is cut short: its header states {stated} records, {stored} are there")
     return ptu
 
 
@@ -169,11 +168,9 @@ def as_ptu(path: Path) -> BytesIO:
     words = struct.unpack_from(f"<{image}i", raw, end) if image >= 0 and begin <= len(raw) else ()
     number = tags["TTResult_NumberOfRecords"]
     if len(words) != image or not 0 <= number <= (len(raw) - begin) // 4:
-        raise ValueError(f"{path} is cut short: its header tells of {number} records")
+        raise ValueError(f"{path} is cut short: its header states {number} records")
     if number == 0 and len(raw) > begin:
-        raise ValueError(
-            f"{path} was not finished: its header tells of no records, and {(len(raw) - begin) // 4} follow"
-        )
+        raise ValueError(f"{path} was not finished: its header states no records, and {(len(raw) - begin) // 4} follow")
     if len(words) >= 8 and words[:2] == (3, _LSM):
         tags |= {"Measurement_SubMode": 3, "ImgHdr_Dimensions": 3, "ImgHdr_Ident": _LSM}
         tags |= dict(zip(_IMAGE, words[2:8], strict=True))
@@ -228,7 +225,7 @@ _MAX_PIXEL_PERIODS = 2**31  # ptufile counts the periods of a pixel in 32 bits
 
 
 def check(recipe: Recipe) -> None:
-    """Raise ValueError for what the format cannot hold, before any work."""
+    """Raise ValueError, before any work, for data that the format cannot contain."""
     needed("ptufile", "a .ptu")
     if recipe.system.bins > MAX_BINS:
         raise ValueError(f"bins must be at most {MAX_BINS} in a .ptu, got {recipe.system.bins}; use .h5")
@@ -238,7 +235,7 @@ def check(recipe: Recipe) -> None:
 
 @contextlib.contextmanager
 def open_writer(path: Path, recipe: Recipe) -> Iterator[Writer]:
-    """Writes a cube image by image; the number of records comes into the header at the end."""
+    """Writes a cube image by image; the number of records is written into the header at the end."""
     check(recipe)
     _, height, width, bins = recipe.shape
     size = height * width * bins * recipe.dtype.itemsize
@@ -321,15 +318,15 @@ _LINE_START, _LINE_STOP, _FRAME = 1, 2, 4  # marker bits, as the header of ptufi
 
 
 def check_library() -> None:
-    """Raise where the library that writes the format is missing."""
+    """Raise if the library that writes the format is missing."""
     needed("ptufile", "a .ptu")
 
 
 def write(path: Path, times: Timestamps, clock_ps: float | None = None) -> None:
-    """Write a stream; the caller renames the file when it is whole.
+    """Write a stream; the caller renames the complete file.
 
-    `clock_ps`: least unit of the fine time. Programs that make images of the file have a bin for each of its codes:
-    at the finest one, 32768 a period, an image of 128 x 128 pixels takes 1 GB there.
+    `clock_ps`: smallest unit of the fine time. Programs that make images of the file use one bin per unit: at the
+    finest unit, 32768 a period, an image of 128 x 128 pixels takes 1 GB.
     """
     if times.bins > MAX_BINS:
         raise ValueError(f"bins must be at most {MAX_BINS} in a .ptu, got {times.bins}; use .h5 or .npz")
@@ -359,7 +356,7 @@ def write(path: Path, times: Timestamps, clock_ps: float | None = None) -> None:
 
 
 def read(path: Path, period_ns: float | None, bins: int | None) -> Timestamps:
-    """Read a stream; `period_ns` and `bins` are for files of others."""
+    """Read a stream; `period_ns` and `bins` are for files of other programs."""
     with open_ptu(path) as ptu:
         attrs = header_attributes(ptu.tags)
         if attrs.get("kind") == CUBE:
@@ -369,7 +366,7 @@ def read(path: Path, period_ns: float | None, bins: int | None) -> Timestamps:
                 f"{path} is an image of another program: mars_lidar.io.foreign_cube and mars-lidar reconstruct read it"
             )
         if attrs and (period_ns is not None or bins is not None):
-            raise ValueError(f"{path} tells its period and bins: period_ns and bins are for the streams of others")
+            raise ValueError(f"{path} states its period and bins: period_ns and bins are for streams of other programs")
         if not attrs:
             return _photons(ptu, path).timestamps(period_ns, bins)
         decoded = ptu.decode_records()
@@ -388,7 +385,7 @@ def read(path: Path, period_ns: float | None, bins: int | None) -> Timestamps:
 
 
 def photons(path: Path) -> Photons:
-    """The photons of a file: T3, or T2, absolute times; markers are passed over."""
+    """The photons of a file: T3, or T2, absolute times; markers are skipped."""
     with open_ptu(path) as ptu:
         return _photons(ptu, path)
 
@@ -404,18 +401,18 @@ def _photons(ptu: Any, path: Path) -> Photons:
         return Photons(records["time"][photon], clock_ns, channel[photon], str(path))
     records = records[photon]
     if not clock_ns > 0.0:
-        raise ValueError(f"{path} tells no sync rate, so that its laser period is not known")
+        raise ValueError(f"{path} states no sync rate, so that its laser period is unknown")
     return Photons(records["time"], clock_ns, records["channel"], str(path), records["dtime"], fine_ns, clock_ns)
 
 
 def units_per_bin(bins: int, period_ns: float = 0.0, clock_ps: float | None = None) -> int:
-    """Units of the fine time in a histogram bin: as many as a record has room for, or of at least `clock_ps` each."""
+    """Units of the fine time in a histogram bin: as many as fit in a record, or units of at least `clock_ps`."""
     most = MAX_BINS // bins
     return most if clock_ps is None else min(most, max(1, int(1e3 * period_ns / bins / clock_ps * (1 + 1e-9))))
 
 
 def is_stream(path: Path) -> bool:
-    """Whether the file holds a stream: ours, or of others but no image."""
+    """Whether the file contains a stream: of mars-lidar, or of another program and not an image."""
     with open_ptu(path) as ptu:
         attrs = header_attributes(ptu.tags)
         return attrs.get("kind") == STREAM if attrs else not ptu.is_image

@@ -1,4 +1,4 @@
-"""Files of photon counters: histograms (.ptu and its like, .t3r, .spc, .sdt), and photons of .t3r and .spc."""
+"""Files of photon counters: histograms (.ptu and related formats, .t3r, .spc, .sdt), and photons of .t3r and .spc."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ RECORDER_SUFFIXES = (*_PICOQUANT, ".t3r", ".spc", ".sdt")
 
 @dataclass(frozen=True, eq=False)
 class Recorded:
-    """Histograms of a recorder, and what it tells of them."""
+    """Histograms of a recorder, and its description of them."""
 
     arrays: dict[str, NDArray[Any]]  # by name: (frames, y, x, t), (y, x, t) or (t,) counts
     bin_ns: float | None = None  # width of a bin
@@ -116,7 +116,7 @@ def _time_harp(path: Path) -> Photons:
     if not (math.isfinite(fine_ns) and fine_ns > 0.0 and clock_ns > 0 and more >= 0):
         raise ValueError(f"{path} is damaged: its clocks are {clock_ns} ns and {fine_ns:g} ns, image header {more}")
     if not 0 <= number <= (len(content) - begin) // 4:
-        raise ValueError(f"{path} is cut short: its header tells of {number} records")
+        raise ValueError(f"{path} is cut short: its header states {number} records")
     records = np.frombuffer(content, "<u4", number, begin)
     data, valid = (records >> 16) & 0xFFF, (records >> 30) & 1 == 1
     wraps = np.cumsum(~valid & (data & _OVERFLOW > 0), dtype=np.int64)
@@ -153,7 +153,7 @@ def _becker_hickl(path: Path) -> Photons:
     bins = int(data.get("tcspc_num_bins", 4096))
     fine_ns = 1e9 * float(setup.get("SP_TAC_R", 0.0)) / float(setup.get("SP_TAC_G", 1) or 1) / bins
     if not fine_ns > 0.0:
-        raise ValueError(f"{settings} does not tell the time range, SP_TAC_R")
+        raise ValueError(f"{settings} does not state the time range, SP_TAC_R")
     return Photons(
         np.asarray(data["timestamps"][photon], np.int64),
         clock_ns,

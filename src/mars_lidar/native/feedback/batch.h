@@ -60,7 +60,10 @@ class Batch : private BatchPixels {
 
     // Everything random of one draw: the quantiles of all cells, and the state at the ends of the exposure.
     void draw_numbers(int32_t draw) {
+        responds_ = false;
         for (int i = 0; i < kTeam; ++i) {
+            slow_[i] = drawing_[i] && grid_.laps == 1 && (grid_.folded() > 0 || rate_[i] > kLinearFrom) ? 1 : 0;
+            responds_ = responds_ || slow_[i] != 0;
             const uint32_t realization = batch_.realization[i] + static_cast<uint32_t>(draw) * batch_.realization_step;
             const Pair<uint32_t> key = stream_key(batch_.seed ^ kDomain, realization, batch_.pixel_index[i]);
             key0_[i] = key.first;
@@ -81,8 +84,11 @@ class Batch : private BatchPixels {
                     dither[i] = static_cast<uint16_t>(other[i] >> 16);
                     split[i] = static_cast<uint16_t>(other[i] & 0xffffu);
                 }
+                float *const alpha = work_.alpha + row(t), *const beta = work_.beta + row(t);
                 follow_quantile(law.mean, law.variance, work_.rates.fire(j), work_.rates.refire(j), grid_.laps > 1,
-                                uniforms, work_.alpha + row(t), work_.beta + row(t));
+                                uniforms, alpha, beta);
+                for (int i = 0; responds_ && i < kTeam; ++i)  // what the quantile adds to the mean, rounding included
+                    work_.noise[row(j) + i] = (alpha[i] - 1.0f) * law.mean[i] + beta[i] + 0.5f;
             }
         }
         place_rearmed(grid_, work_.sums, scale_, work_.split);
@@ -117,18 +123,14 @@ class Batch : private BatchPixels {
     // The first history: the mean, and the linear response to this draw's noise where sweeps contract slowly.
     void start_history() {
         alignas(64) float armed[kTeam], change[kTeam];
-        alignas(64) int32_t slow[kTeam], active[kTeam];
-        int32_t some = 0;
+        alignas(64) int32_t active[kTeam];
         for (int i = 0; i < kTeam; ++i) {
             number_[i] = pieces_[i] * share_[i] * total_[i];
-            slow[i] = active[i] =
-                drawing_[i] && grid_.laps == 1 && (grid_.folded() > 0 || rate_[i] > kLinearFrom) ? 1 : 0;
-            some |= active[i];
+            active[i] = slow_[i];
         }
         float *old = work_.spare_sums, *fresh = work_.more_sums;
-        const bool respond = some != 0;
-        if (respond) {
-            set_noise();
+        if (responds_) {
+            int32_t some = 1;
             double moved_by[kTeam] = {}, step_before[kTeam] = {}, damping[kTeam];  // N less its mean
             for (int i = 0; i < kTeam; ++i) damping[i] = 1.0;
             for (int64_t k = 0; k < row(n_ + 1); ++k) old[k] = 0.0f;
@@ -148,19 +150,8 @@ class Batch : private BatchPixels {
             }
             for (int i = 0; i < kTeam; ++i) number_[i] += moved_by[i];
         }
-        round_sums(grid_, work_.sums, scale_, respond ? old : nullptr, slow, work_.history[0]);
+        round_sums(grid_, work_.sums, scale_, responds_ ? old : nullptr, slow_, work_.history[0]);
         set_blind();
-    }
-
-    // What the quantiles add to their means, rounding included on average.
-    void set_noise() {
-        MeanLaw law(grid_, work_.rates, work_.sums, scale_);
-        for (int32_t j = 0; j < n_; ++j) {
-            law.next(j);
-            const float *alpha = work_.alpha + row(j), *beta = work_.beta + row(j);
-            float* noise = work_.noise + row(j);
-            for (int i = 0; i < kTeam; ++i) noise[i] = (alpha[i] - 1.0f) * law.mean[i] + beta[i] + 0.5f;
-        }
     }
 
     // A step of N. By 1 / (1 + K sum w) it is right for a history that has settled; where sweeps settle slowly, the total
@@ -263,6 +254,8 @@ class Batch : private BatchPixels {
     Exposure exposure_;
     alignas(64) uint32_t key0_[kTeam], key1_[kTeam];
     alignas(64) int32_t negative_[kTeam];
+    alignas(64) int32_t slow_[kTeam];  // 1: the lane begins with the linear response to its noise
+    bool responds_;                    // some of them do
     bool drawing_[kTeam];
     bool overdrawn_[kTeam];  // fewer than no exposures armed in the last sweep
     int32_t spare_[kTeam];   // whole periods blind beyond the end, less those at the start

@@ -74,6 +74,7 @@ struct CoarseRates {
             const double *light0 = fine.photons(2 * j), *light1 = fine.photons(2 * j + 1);
             const double *fire0 = fine.fire(2 * j), *fire1 = fine.fire(2 * j + 1);
             double *p = fires + static_cast<int64_t>(j) * kJudged, *q = refires + static_cast<int64_t>(j) * kJudged;
+            MARS_VECTORS
             for (int i = 0; i < kJudged; ++i) {
                 const double l = light0[i] + light1[i];
                 const double series = l * (0.5 - l * (1.0 / 6 - l * (1.0 / 24 - l * (1.0 / 120 - l * (1.0 / 720)))));
@@ -124,6 +125,7 @@ struct Residual {
                            const double* __restrict__ from, const double* __restrict__ to,
                            const double* __restrict__ re, const double* __restrict__ then,
                            const double* __restrict__ off, const double* __restrict__ next_off) {
+        MARS_VECTORS
         for (int i = 0; i < kJudged; ++i) {
             const double p = fire[i], q = refire[i];
             const double some = 1.0 - (from[i] - re[i]), more = then[i] - re[i];
@@ -171,6 +173,7 @@ class GridCheck {
     void rearmed(int32_t e, double* out) const {
         const FeedbackEdge& edge = fine_.edge[e];
         const double *late = row(edge.late), *early = row(edge.early), *total = row(fine_.cells);
+        MARS_VECTORS
         for (int i = 0; i < kJudged; ++i) out[i] = late[i] - edge.part * (late[i] - early[i]) - edge.turns * total[i];
     }
 
@@ -256,9 +259,11 @@ class GridCheck {
             rearmed(2 * e, exact);
             const FeedbackEdge& edge = grid.edge[e];
             const double *late = row(2 * edge.late), *early = row(2 * edge.early);
+            MARS_VECTORS
             for (int i = 0; i < kJudged; ++i)
                 difference[i] = late[i] - edge.part * (late[i] - early[i]) - edge.turns * total[i] - exact[i];
         };
+        MARS_VECTORS
         for (int i = 0; i < kJudged; ++i) {
             scale[i] = check_.exposures / (1.0 + fine_.whole * total[i]);
             check_.square[i] = 0.0;
@@ -276,6 +281,7 @@ class GridCheck {
                 add(bin_of(grid.edge[j].early), scale, residual.begin);
                 add(bin_of(grid.edge[j + 1].early), scale, residual.end);
             }
+            MARS_VECTORS
             for (int i = 0; i < kJudged; ++i) {
                 re[i] = then[i];
                 off[i] = next_off[i];
@@ -319,18 +325,17 @@ class GridCheck {
         } else {  // begin with those of the grid whose cells are twice as wide
             for (int64_t j = n - 1; j > 0; --j) memcpy(y + j * kJudged, y + j / 2 * kJudged, kJudged * sizeof(double));
         }
+        MARS_VECTORS
         for (int i = 0; i < kJudged; ++i) old[static_cast<int64_t>(n) * kJudged + i] = 0.0;
         for (int32_t j = n - 1; j >= 0; --j) {
             const int64_t at = static_cast<int64_t>(j) * kJudged;
             const double* p = rates.fire(j);
+            MARS_VECTORS
             for (int i = 0; i < kJudged; ++i) old[at + i] = old[at + kJudged + i] + p[i] * y[at + i];
         }
-        sources_.resize(static_cast<size_t>(3 * n));
-        for (int32_t e = 0; e < 3 * n; ++e) sources_[static_cast<size_t>(e)] = grid.source(e);
-        const auto source = [at = sources_.data()](int32_t e) { return at[e]; };
         alignas(64) double moved[kJudged];
         for (int sweep = 0; sweep < kSweeps; ++sweep) {
-            adjoint_sweep<double, kJudged, kJudged>(grid, rates, source, old, fresh, y, moved);
+            adjoint_sweep<double, kJudged, kJudged>(grid, rates, old, fresh, y, moved);
             std::swap(old, fresh);
             double most = 0.0;
             for (int i = 0; i < kJudged; ++i)
@@ -346,6 +351,7 @@ class GridCheck {
             rearmed(each * (j + 1), then);
             const double *p = rates.fire(j), *q = rates.refire(j), *from = row(each * j), *here = value(j);
             double* const to = parts + static_cast<int64_t>(bin) * kJudged;
+            MARS_VECTORS
             for (int i = 0; i < kJudged; ++i) {
                 const double some = 1.0 - (from[i] - re[i]), more = then[i] - re[i];
                 const double armed = some > 0.0 ? some : 0.0, in = more > 0.0 ? more : 0.0;
@@ -363,6 +369,7 @@ class GridCheck {
             const double until = 1.0 - static_cast<double>(edge.part);
             const double *p = rates.fire(here), *q = rates.refire(here), *q_ahead = rates.refire(e - 1);
             const double *y_here = value(here), *y_ahead = value(e - 1);
+            MARS_VECTORS
             for (int i = 0; i < kJudged; ++i) {
                 const double g = y_here[i] * (p[i] - q[i]) + y_ahead[i] * q_ahead[i];
                 square[i] += g * (2.0 * sum[i] + g * until);
@@ -372,6 +379,7 @@ class GridCheck {
             if (k + 1 < n && grid.edge[next].early == edge.early) continue;
             const double *from = row(each * edge.early), *to = row(each * (edge.early + 1));
             double* const part = parts + static_cast<int64_t>(bin_in(grid, edge.early)) * kJudged;
+            MARS_VECTORS
             for (int i = 0; i < kJudged; ++i) {
                 const double spread = square[i] - sum[i] * sum[i];
                 part[i] += (to[i] - from[i]) * (spread > 0.0 ? spread : 0.0);
@@ -387,6 +395,7 @@ class GridCheck {
     }
     void add(int32_t bin, const double* scale, const double* part) const {
         double* const to = check_.bins + static_cast<int64_t>(bin) * kJudged;
+        MARS_VECTORS
         for (int i = 0; i < kJudged; ++i) to[i] += scale[i] * part[i];
     }
 
@@ -397,7 +406,6 @@ class GridCheck {
     const CoarseRates coarse_;
     double* const sums_;
     double* const adjoint_;
-    std::vector<int32_t> sources_;  // cell one dead time before each edge of three periods
 };
 
 }  // namespace

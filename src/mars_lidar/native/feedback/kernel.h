@@ -52,9 +52,9 @@ struct FeedbackGrid {
     bool stationary;
 
     int32_t path() const { return cells * laps; }  // cells of all laps
-    // The cell one rest of the dead time before edge e, which is counted on through several periods.
+    // The cell one rest of the dead time before edge e, which is counted on through three periods.
     int32_t source(int32_t e) const {
-        const int32_t turns = e / cells;
+        const int32_t turns = (e >= cells ? 1 : 0) + (e >= 2 * cells ? 1 : 0);
         const FeedbackEdge& at = edge[e - turns * cells];
         return at.early + (turns - at.turns) * cells;
     }

@@ -5,6 +5,13 @@
 #include "base/standard.h"
 #include "feedback/sweeps.h"
 
+// Before loops over few lanes: GCC would write them out one by one first, and not see vectors any more.
+#if defined(__GNUC__) && !defined(__CUDACC__)
+#define MARS_VECTORS _Pragma("GCC unroll 1")
+#else
+#define MARS_VECTORS
+#endif
+
 namespace mars {
 inline namespace MARS_LEVEL {
 
@@ -16,6 +23,7 @@ MARS_INLINE double floor_of(double x) {
 // A row of p = 1 - e^-l and q = 1 - p / l: Taylor series at l / 64, then six times 1 - e^-2x = p (2 - p).
 template <class Real, int lanes = kTeam>
 MARS_NOINLINE void set_rates(const double* photons, Real* fire, Real* refire) {
+    MARS_VECTORS
     for (int i = 0; i < lanes; ++i) {
         const double l = photons[i] < 40.0 ? photons[i] : 40.0, x = l * 0x1p-6;
         double p = 1.0;
@@ -159,14 +167,14 @@ MARS_NOINLINE void place_rearmed(const FeedbackGrid& grid, const float* sums, co
 // edge e that lies in it one dead time on, and
 //     y_j = 1 - sum over j < i < e0 of p_i y_i + q y at e0 - 1 + sum over those e of (1 - f_e) (p_e y_e - q_e y_e +
 //           q_{e-1} y_{e-1}).
-// `old`, `fresh`: suffix sums of p y (n + 1 rows); `values`: y, replaced in place. `moved`: the largest change of y.
-// `source(e)`: cell one dead time before edge e, which is counted on through three periods.
-template <class Number, int lanes, int stride, class AnyRates, class Source>
-MARS_NOINLINE void adjoint_sweep(const FeedbackGrid& grid, const AnyRates& rates, const Source& source,
-                                 const Number* __restrict__ old, Number* __restrict__ fresh,
-                                 Number* __restrict__ values, Number* __restrict__ moved) {
+// `old`, `fresh`: suffix sums S of p y (n + 1 rows); `values`: y, replaced in place. `moved`: the largest change of y.
+// With y = rest - S, S' = (1 - p) S + p rest: a cell waits for the one after for a multiplication and an addition only.
+template <class Number, int lanes, int stride, class AnyRates>
+MARS_NOINLINE void adjoint_sweep(const FeedbackGrid& grid, const AnyRates& rates, const Number* __restrict__ old,
+                                 Number* __restrict__ fresh, Number* __restrict__ values, Number* __restrict__ moved) {
     const int32_t n = grid.cells;
-    alignas(64) Number total[lanes], sum[lanes], y[lanes];
+    alignas(64) Number total[lanes], sum[lanes], rest[lanes];
+    MARS_VECTORS
     for (int i = 0; i < lanes; ++i) {
         total[i] = old[i];
         sum[i] = moved[i] = 0;
@@ -179,26 +187,30 @@ MARS_NOINLINE void adjoint_sweep(const FeedbackGrid& grid, const AnyRates& rates
     };
     int32_t all = 3 * n;  // e0
     for (int32_t j = n - 1; j >= 0; --j) {
-        while (source(all - 1) > j) --all;
+        while (grid.source(all - 1) > j) --all;
         const int32_t turns = all > n ? (all > 2 * n ? 2 : 1) : 0, last = within(all - 1);
         const Number* beyond = turns ? row(old, all - turns * n) : row(fresh, all);
         const Number *q = rates.refire(last), *y_last = row(values, last);
+        MARS_VECTORS
         for (int i = 0; i < lanes; ++i)
-            y[i] = 1 - (sum[i] - (beyond[i] - static_cast<Number>(turns) * total[i])) + q[i] * y_last[i];
-        for (int32_t e = all - 1; source(e) == j; --e) {
+            rest[i] = 1 + (beyond[i] - static_cast<Number>(turns) * total[i]) + q[i] * y_last[i];
+        for (int32_t e = all - 1; grid.source(e) == j; --e) {
             const int32_t here = within(e), ahead = within(e - 1);
             const Number keep = 1.0f - grid.edge[here].part;
             const Number *p = rates.fire(here), *q_here = rates.refire(here), *q_ahead = rates.refire(ahead);
             const Number *y_here = row(values, here), *y_ahead = row(values, ahead);
-            for (int i = 0; i < lanes; ++i) y[i] += keep * ((p[i] - q_here[i]) * y_here[i] + q_ahead[i] * y_ahead[i]);
+            MARS_VECTORS
+            for (int i = 0; i < lanes; ++i)
+                rest[i] += keep * ((p[i] - q_here[i]) * y_here[i] + q_ahead[i] * y_ahead[i]);
         }
         const Number* p = rates.fire(j);
         Number *value = row(values, j), *after = row(fresh, j);
+        MARS_VECTORS
         for (int i = 0; i < lanes; ++i) {
-            const Number step = y[i] > value[i] ? y[i] - value[i] : value[i] - y[i];
+            const Number y = rest[i] - sum[i], step = y > value[i] ? y - value[i] : value[i] - y;
             moved[i] = step > moved[i] ? step : moved[i];
-            value[i] = y[i];
-            sum[i] += p[i] * y[i];
+            value[i] = y;
+            sum[i] = (1 - p[i]) * sum[i] + p[i] * rest[i];
             after[i] = sum[i];
         }
     }
@@ -215,27 +227,33 @@ MARS_NOINLINE void count_variance(const FeedbackGrid& grid, const Rates& rates, 
         old[static_cast<int64_t>(n) * kRow + i] = 0.0f;
         result[i] = 0.0;
     }
-    for (int32_t j = n - 1; j >= 0; --j)
+    for (int32_t j = n - 1; j >= 0; --j) {
+        const float* p = rates.fire(j);
         for (int i = 0; i < kTeam; ++i) {
             const int64_t at = static_cast<int64_t>(j) * kRow + i;
             values[at] = 1.0f;
-            old[at] = old[at + kRow] + rates.fire(j)[i];
+            old[at] = old[at + kRow] + p[i];
         }
-    const auto source = [&grid](int32_t e) { return grid.source(e); };
+    }
     for (int sweep = 1; sweep <= sweeps; ++sweep) {
-        adjoint_sweep<float, kTeam, kRow>(grid, rates, source, old, fresh, values, moved);
+        adjoint_sweep<float, kTeam, kRow>(grid, rates, old, fresh, values, moved);
         std::swap(old, fresh);
-        bool some = false;
+        bool some = false, now = false;
+        alignas(64) int64_t ends[kTeam];  // 1: this sweep is the lane's last
         for (int i = 0; i < kTeam; ++i) {
-            if (done[i]) continue;
-            done[i] = !(moved[i] > 1e-3f) || sweep == sweeps;
+            const bool last = !done[i] && (!(moved[i] > 1e-3f) || sweep == sweeps);
+            ends[i] = last ? 1 : 0;
+            done[i] = done[i] || last;
+            now = now || last;
             some = some || !done[i];
-            for (int32_t j = 0; done[i] && j < n; ++j) {
+        }
+        for (int32_t j = 0; now && j < n; ++j)
+            for (int i = 0; i < kTeam; ++i) {
                 const int64_t at = static_cast<int64_t>(j) * kRow + i;
                 const double y = static_cast<double>(values[at]);
-                result[i] += y * y * static_cast<double>(variance[at]);
+                const double part = y * y * static_cast<double>(variance[at]);
+                result[i] += ends[i] ? part : 0.0;
             }
-        }
         if (!some) break;
     }
 }

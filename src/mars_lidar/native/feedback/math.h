@@ -93,5 +93,44 @@ MARS_INLINE float normal_size(float tail) {
     return (centre ? over : far_over) / (centre ? under : far_under);
 }
 
+// In lanes: the integers that numbers of 16 bits in memory are, the lesser and the larger of two, and the least integer that
+// is not below x.
+#if MARS_LANES > 1
+MARS_INLINE Int shorts(const uint16_t* from) {
+    typedef uint16_t HardShort __attribute__((vector_size(2 * kHardwareLanes)));
+    HardShort low, high;
+    memcpy(&low, from, sizeof low);
+    memcpy(&high, from + kHardwareLanes, sizeof high);
+    return {__builtin_convertvector(low, HardInt), __builtin_convertvector(high, HardInt)};
+}
+MARS_INLINE HardInt smaller(HardInt a, HardInt b) { return a < b ? a : b; }
+MARS_INLINE HardInt larger(HardInt a, HardInt b) { return a > b ? a : b; }
+MARS_INLINE Int smaller(Int a, Int b) { return {smaller(a.low, b.low), smaller(a.high, b.high)}; }
+MARS_INLINE Int larger(Int a, Int b) { return {larger(a.low, b.low), larger(a.high, b.high)}; }
+#else
+MARS_INLINE Int shorts(const uint16_t* from) { return *from; }
+MARS_INLINE Int smaller(Int a, Int b) { return a < b ? a : b; }
+MARS_INLINE Int larger(Int a, Int b) { return a > b ? a : b; }
+#endif
+MARS_INLINE Float smaller(Float a, Float b) { return minimum(a, b); }
+MARS_INLINE Float larger(Float a, Float b) { return maximum(a, b); }
+
+#if defined(MARS_LEVEL_avx512)
+MARS_INLINE Int rounded_up(Float x) {
+    constexpr int up = _MM_FROUND_TO_POS_INF | _MM_FROUND_NO_EXC;
+    return {(HardInt)_mm512_cvt_roundps_epi32((__m512)x.low, up),
+            (HardInt)_mm512_cvt_roundps_epi32((__m512)x.high, up)};
+}
+#elif defined(MARS_LEVEL_avx2)
+MARS_INLINE Int rounded_up(Float x) {
+    return truncate({(HardFloat)_mm256_ceil_ps((__m256)x.low), (HardFloat)_mm256_ceil_ps((__m256)x.high)});
+}
+#else
+MARS_INLINE Int rounded_up(Float x) {
+    const Int down = truncate(x);
+    return plus_if(down, x > to_float(down));
+}
+#endif
+
 }  // namespace MARS_LEVEL
 }  // namespace mars

@@ -126,15 +126,16 @@ class BatchPixels {
         bool some = false;
         for (int i = 0; i < kTeam; ++i) some = some || variance_matters(i);
         double variance[kTeam];
-        if (some) {
-            MeanLaw law(grid_, work_.rates, work_.sums, scale_);
-            for (int32_t j = 0; j < n_; ++j) {
-                law.next(j);
-                for (int i = 0; i < kTeam; ++i) work_.noise[row(j) + i] = law.variance[i];
-            }
+        for (int i = 0; i < kTeam; ++i) fewest_[i] = static_cast<float>(pieces_[i]);
+        MeanLaw law(grid_, work_.rates, work_.sums, scale_);
+        for (int32_t j = 0; j < n_; ++j) {
+            law.next(j);
+            for (int i = 0; i < kTeam; ++i) fewest_[i] = lesser(law.armed[i], fewest_[i]);
+            for (int i = 0; some && i < kTeam; ++i) work_.noise[row(j) + i] = law.variance[i];
+        }
+        if (some)
             count_variance(grid_, work_.rates, work_.noise, work_.spare_sums, work_.more_sums, work_.alpha, kMeanSweeps,
                            variance);
-        }
         for (int i = 0; i < kTeam; ++i) {
             mean_[i] = cycles() * share_[i] * total_[i];
             const double narrower = shortened() ? 1.0 : share_[i] * share_[i];
@@ -165,16 +166,10 @@ class BatchPixels {
     // Lanes for which one lap is not enough, or not this number, are refused with the number that is. Also how many
     // sweeps a lane goes through at least.
     void choose_laps() {
-        alignas(64) float ghosts[kTeam], armed[kTeam];  // the fewest exposures armed in any cell
-        for (int i = 0; i < kTeam; ++i) armed[i] = static_cast<float>(pieces_[i]);
-        MeanLaw law(grid_, work_.rates, work_.sums, scale_);
-        for (int32_t j = 0; j < n_; ++j) {
-            law.next(j);
-            for (int i = 0; i < kTeam; ++i) armed[i] = lesser(law.armed[i], armed[i]);
-        }
+        alignas(64) float ghosts[kTeam];
         bool some = grid_.laps > 1;
         for (int i = 0; i < kTeam; ++i) {
-            some = some || armed[i] < kFewestArmed || rate_[i] > kLinearFrom;
+            some = some || fewest_[i] < kFewestArmed || rate_[i] > kLinearFrom;
             float once = rate_[i];
             for (int32_t k = 1; k < grid_.laps; ++k) once *= rate_[i];
             // until what rounding did to the first history is forgotten to 3 %
@@ -186,7 +181,7 @@ class BatchPixels {
             for (int i = 0; i < kTeam; ++i) {
                 const float count = kModes * rate_[i];
                 const bool slow = rate_[i] > kSlowFromPeriods && count > kGhostsOfDeviation * deviation_[i];
-                const bool few = armed[i] < kFewestArmed;
+                const bool few = fewest_[i] < kFewestArmed;
                 if (grid_.laps == 1 && (few || slow) && refused_[i] == FeedbackStatus::kDrawn) ask_for_laps(i);
             }
             return;
@@ -195,7 +190,7 @@ class BatchPixels {
         for (int i = 0; i < kTeam; ++i) {
             if (refused_[i] != FeedbackStatus::kDrawn) continue;
             if (grid_.laps == 1) {
-                const bool few = armed[i] < kFewestArmed;
+                const bool few = fewest_[i] < kFewestArmed;
                 const bool many = rate_[i] > kLinearFrom && ghosts[i] > kGhostsOfDeviation * deviation_[i];
                 if (!few && !many) continue;
             }
@@ -222,19 +217,20 @@ class BatchPixels {
     const FeedbackGrid& grid_;
     const int32_t n_;
     Workspace work_;
-    FeedbackStatus refused_[kTeam];   // all draws of a lane
-    bool needs_laps_[kTeam];          // whatever its ghosts
-    alignas(64) float rate_[kTeam];   // contraction of a sweep
-    alignas(64) float scale_[kTeam];  // M / (1 + K sum w): exposures for each unit of w
-    int32_t forgotten_[kTeam];        // sweep by which the mean has forgotten its start
-    int32_t least_[kTeam];            // integer sweeps, at least
-    int32_t pieces_[kTeam];           // of the exposure: N_r with one lap
-    double total_[kTeam];             // sum w
-    double share_[kTeam];             // 1 / (1 + K sum w)
-    double mean_[kTeam];              // of the count of the exposure, or of its pieces
-    double deviation_[kTeam];         // its standard deviation, or a bound
-    int32_t allowed_[kTeam];          // by how much a count may differ
-    float still_[kTeam];              // a move of the history that ends a lane's sweeps
+    FeedbackStatus refused_[kTeam];    // all draws of a lane
+    bool needs_laps_[kTeam];           // whatever its ghosts
+    alignas(64) float rate_[kTeam];    // contraction of a sweep
+    alignas(64) float scale_[kTeam];   // M / (1 + K sum w): exposures for each unit of w
+    int32_t forgotten_[kTeam];         // sweep by which the mean has forgotten its start
+    int32_t least_[kTeam];             // integer sweeps, at least
+    alignas(64) float fewest_[kTeam];  // exposures armed in any cell
+    int32_t pieces_[kTeam];            // of the exposure: N_r with one lap
+    double total_[kTeam];              // sum w
+    double share_[kTeam];              // 1 / (1 + K sum w)
+    double mean_[kTeam];               // of the count of the exposure, or of its pieces
+    double deviation_[kTeam];          // its standard deviation, or a bound
+    int32_t allowed_[kTeam];           // by how much a count may differ
+    float still_[kTeam];               // a move of the history that ends a lane's sweeps
 };
 
 }  // namespace

@@ -64,29 +64,35 @@ MARS_INLINE float rearmed_before(const History<float>::Rows& back, float part, i
     return back.late[i] - back.gone[i] - part * (back.late[i] - back.early[i]);
 }
 
-// The largest move of the prefix sums that the next period sees, relative to the move of their total.
-template <class Number>
-struct Moves {
-    alignas(64) Number most[kTeam], least[kTeam];
+// Sums in lanes: differences of counts are right modulo 2^32.
+constexpr int kParts = kTeam / kLanes;  // vectors of a row
+MARS_INLINE Float apart(Float a, Float b) { return a - b; }
+MARS_INLINE Int apart(UInt a, UInt b) { return as_int(a - b); }
+MARS_INLINE Int apart(Int a, Int b) { return as_int(as_uint(a) - as_uint(b)); }
 
+// The largest move of the prefix sums that the next period sees, relative to the move of their total.
+template <class Sum>
+struct Moves {
+    using Move = decltype(apart(Sum{}, Sum{}));
+    Move most[kParts], least[kParts];
+
+    template <class Number>
     explicit Moves(Number bound) {
-        for (int i = 0; i < kTeam; ++i) {
-            most[i] = -bound;
-            least[i] = bound;
+        for (int k = 0; k < kParts; ++k) {
+            most[k] = splat(-bound);
+            least[k] = splat(bound);
         }
     }
-    MARS_INLINE void see(const Number* sums, const Number* before) {
-        for (int i = 0; i < kTeam; ++i) {
-            const Number moved = minus(sums[i], before[i]);
-            most[i] = moved > most[i] ? moved : most[i];
-            least[i] = moved < least[i] ? moved : least[i];
-        }
+    MARS_INLINE void see(int k, Sum sums, Sum before) {
+        const Move moved = apart(sums, before);
+        most[k] = larger(moved, most[k]);
+        least[k] = smaller(moved, least[k]);
     }
-    MARS_INLINE void largest(const Number* sums, const Number* totals, Number* change) const {
-        for (int i = 0; i < kTeam; ++i) {
-            const Number total = minus(sums[i], totals[i]);
-            const Number up = minus(most[i], total), down = minus(total, least[i]);
-            change[i] = up > down ? up : down;
+    template <class Number>
+    MARS_INLINE void largest(const Sum* sums, const Number* totals, Number* change) const {
+        for (int k = 0; k < kParts; ++k) {
+            const Move total = apart(sums[k], load<Sum>(totals + k * kLanes));
+            store(change + k * kLanes, larger(apart(most[k], total), apart(total, least[k])));
         }
     }
 };
@@ -101,27 +107,36 @@ MARS_NOINLINE void real_sweep(const FeedbackGrid& grid, const Rates& rates, cons
                               float* __restrict__ fresh, float* __restrict__ change) {
     const int32_t n = grid.cells;
     const History<float> history(old, fresh, n);
-    alignas(64) float c[kTeam], re[kTeam];
-    Moves<float> moves(1e30f);
-    for (int i = 0; i < kTeam; ++i) {
-        fresh[i] = c[i] = 0.0f;
-        re[i] = rearmed_before(history.at(grid.edge[0]), grid.edge[0].part, i);
+    auto rearmed_by = [&](int32_t e, int at) {
+        const auto back = history.at(grid.edge[e]);
+        const Float late = load<Float>(back.late + at), early = load<Float>(back.early + at);
+        return late - load<Float>(back.gone + at) - grid.edge[e].part * (late - early);
+    };
+    Float c[kParts], re[kParts], all[kParts];
+    Mask on[kParts];
+    Moves<Float> moves(1e30f);
+    for (int k = 0; k < kParts; ++k) {
+        const int at = k * kLanes;
+        c[k] = splat(0.0f);
+        store(fresh + at, c[k]);
+        re[k] = rearmed_by(0, at);
+        all[k] = load<Float>(armed + at);
+        on[k] = load<Int>(active + at) > 0;
     }
     for (int32_t j = 0; j < n; ++j) {
-        const float *p = rates.fire(j), *q = rates.refire(j), part = grid.edge[j + 1].part;
-        const auto back = history.at(grid.edge[j + 1]);
+        const float *p = rates.fire(j), *q = rates.refire(j);
         const int64_t row = static_cast<int64_t>(j) * kRow;
-        const float* before = old + row + kRow;
-        float* after = fresh + row + kRow;
-        for (int i = 0; i < kTeam; ++i) {
-            const float next = rearmed_before(back, part, i);
-            float h = p[i] * (armed[i] - (c[i] - re[i])) + q[i] * (next - re[i]);
-            if constexpr (response) h = alpha[row + i] * h + noise[row + i];
-            re[i] = next;
-            c[i] = active[i] ? c[i] + h : before[i];
-            after[i] = c[i];
+        const bool seen = j + 1 >= grid.watch;
+        for (int k = 0; k < kParts; ++k) {
+            const int at = k * kLanes;
+            const Float next = rearmed_by(j + 1, at), before = load<Float>(old + row + kRow + at);
+            Float h = load<Float>(p + at) * (all[k] - (c[k] - re[k])) + load<Float>(q + at) * (next - re[k]);
+            if constexpr (response) h = load<Float>(alpha + row + at) * h + load<Float>(noise + row + at);
+            re[k] = next;
+            c[k] = select(on[k], c[k] + h, before);
+            store(fresh + row + kRow + at, c[k]);
+            if (seen) moves.see(k, c[k], before);
         }
-        if (j + 1 >= grid.watch) moves.see(c, before);
     }
     moves.largest(c, history.less[1], change);
 }
@@ -157,20 +172,26 @@ MARS_INLINE void draw_words(const uint32_t* key0, const uint32_t* key1, int32_t 
 
 // Replaces the counts of the lanes in `mask` by their quantiles at the exposures armed now.
 MARS_NOINLINE void take_exactly(const Quantiles& quantiles, int32_t j, uint32_t mask, const float* p, const float* q,
-                                const int32_t* armed, const int32_t* rearmed, int32_t* count) {
+                                const Int* armed, const Int* rearmed, Int* count) {
     alignas(64) uint32_t words[kTeam], other[kTeam];
     alignas(64) float mean[kTeam], variance[kTeam];
-    alignas(64) int32_t exact[kTeam];
+    alignas(64) int32_t exact[kTeam], now[kTeam], more[kTeam], followed[kTeam];
+    for (int k = 0; k < kParts; ++k) {
+        store(now + k * kLanes, armed[k]);
+        store(more + k * kLanes, rearmed[k]);
+        store(followed + k * kLanes, count[k]);
+    }
     Uniforms uniforms;
     draw_words(quantiles.key0, quantiles.key1, j, words, other);
     uniforms.set(words);
     for (int i = 0; i < kTeam; ++i) {
-        const float a = static_cast<float>(armed[i]), b = static_cast<float>(rearmed[i]);
+        const float a = static_cast<float>(now[i]), b = static_cast<float>(more[i]);
         mean[i] = p[i] * a + q[i] * b;
         variance[i] = p[i] * (1.0f - p[i]) * a + q[i] * (1.0f - q[i]) * b;
     }
     quantile(mean, variance, uniforms, exact);
-    for (int i = 0; i < kTeam; ++i) count[i] = mask >> i & 1u ? exact[i] : count[i];
+    for (int i = 0; i < kTeam; ++i) followed[i] = mask >> i & 1u ? exact[i] : followed[i];
+    for (int k = 0; k < kParts; ++k) count[k] = load<Int>(followed + k * kLanes);
 }
 
 constexpr float kLargest = 2147483520.0f;  // the largest float that an integer holds
@@ -189,86 +210,90 @@ MARS_NOINLINE void integer_sweep(const FeedbackGrid& grid, const Rates& rates, c
                                  int32_t* __restrict__ change, int32_t* __restrict__ negative) {
     const int32_t path = grid.path();
     const History<int32_t> history(old, fresh, path);
-    alignas(64) int32_t c[kTeam], re[kTeam], mark[kTeam];
-    alignas(64) int32_t phase[kTeam];  // cells after the beginning of the exposure
-    alignas(64) int32_t armed[kTeam], rearmed[kTeam], count[kTeam];
-    Moves<int32_t> moves(INT32_MAX / 2);
+    alignas(64) int32_t sums[kTeam], marks[kTeam];
+    UInt c[kParts], re[kParts], mark[kParts];
+    Int phase[kParts];  // cells after the beginning of the exposure
+    Mask on[kParts];
+    Moves<UInt> moves(INT32_MAX / 2);
     // One lot for each cell in which the re-armed were registered: whatever the edges, their order is kept.
-    auto rearmed_by = [](const History<int32_t>::Rows& back, uint16_t split, uint16_t lot, int i) {
-        const float part = static_cast<float>(split) * 0x1p-16f;
-        const float late = part * static_cast<float>(minus(back.late[i], back.early[i]));
-        const int32_t whole = static_cast<int32_t>(late + static_cast<float>(lot) * 0x1p-16f);
-        return minus(minus(back.late[i], back.gone[i]), whole);
+    auto rearmed_by = [&](int32_t e, int at) {
+        const FeedbackEdge& edge = grid.lap_edge[e];
+        const auto back = history.at(edge);
+        const UInt late = load<UInt>(back.late + at);
+        const Float share = to_float(shorts(quantiles.split + static_cast<int64_t>(e) * kRow + at));
+        const Float lot = to_float(shorts(quantiles.dither + static_cast<int64_t>(edge.early) * kRow + at));
+        const Float after = share * to_float(apart(late, load<UInt>(back.early + at)));
+        return late - load<UInt>(back.gone + at) - as_uint(truncate((after + lot) * 0x1p-16f));
     };
-    auto lots = [&](const FeedbackEdge& edge) { return quantiles.dither + static_cast<int64_t>(edge.early) * kRow; };
     for (int i = 0; i < kTeam; ++i) {
-        fresh[i] = c[i] = negative[i] = 0;
-        phase[i] = path - 1 - exposure.edge[i];
-        re[i] = rearmed_by(history.at(grid.lap_edge[0]), quantiles.split[i], lots(grid.lap_edge[0])[i], i);
         const int32_t before = old[static_cast<int64_t>(exposure.edge[i]) * kRow + i];
-        mark[i] = minus(minus(before, history.less[1][i]), exposure.rank[i]);
+        marks[i] = minus(minus(before, history.less[1][i]), exposure.rank[i]);
+        negative[i] = 0;
+    }
+    for (int k = 0; k < kParts; ++k) {
+        const int at = k * kLanes;
+        c[k] = splat(0u);
+        store(fresh + at, c[k]);
+        re[k] = rearmed_by(0, at);
+        mark[k] = load<UInt>(marks + at);
+        phase[k] = splat(path - 1) - load<Int>(exposure.edge + at);
+        on[k] = load<Int>(exposure.active + at) < 0;
     }
     int32_t until = 0;  // no lane's exposure begins before
     for (int32_t lap = 0, t = 0; lap < grid.laps; ++lap)
         for (int32_t j = 0; j < grid.cells; ++j, ++t) {
             if (!periods && t == until) {
                 until = path;
+                for (int k = 0; k < kParts; ++k) store(sums + k * kLanes, c[k]);
                 for (int i = 0; i < kTeam; ++i) {
-                    mark[i] = t == exposure.edge[i] ? minus(c[i], exposure.rank[i]) : mark[i];
+                    marks[i] = t == exposure.edge[i] ? minus(sums[i], exposure.rank[i]) : marks[i];
                     if (exposure.edge[i] > t && exposure.edge[i] < until) until = exposure.edge[i];
                 }
+                for (int k = 0; k < kParts; ++k) mark[k] = load<UInt>(marks + k * kLanes);
             }
-            const FeedbackEdge& edge = grid.lap_edge[t + 1];
             const float *p = rates.fire(j), *q = rates.refire(j);
-            const auto back = history.at(edge);
             const int64_t row = static_cast<int64_t>(t) * kRow;
             const float *alpha = quantiles.alpha + row, *beta = quantiles.beta + row;
-            const uint16_t *const lot = lots(edge), *const split = quantiles.split + row + kRow;
-            const int32_t* before = old + row + kRow;
-            int32_t* after = fresh + row + kRow;
             const double golden = 0.61803398874989485 * j;  // evenly over the cells and over [0, 1)
             const float turn = static_cast<float>(golden - static_cast<double>(static_cast<int64_t>(golden)));
-            auto quantise = [&](int i) {
-                const int32_t next = rearmed_by(back, split[i], lot[i], i);
-                int32_t extra = 0, in = minus(next, re[i]);
+            Int armed[kParts], rearmed[kParts], count[kParts];
+            for (int k = 0; k < kParts; ++k) {
+                const int at = k * kLanes;
+                const UInt next = rearmed_by(t + 1, at);
+                Int left = as_int(load<UInt>(exposure.armed + at) + (re[k] - c[k])), in = apart(next, re[k]);
                 if constexpr (warm) {
-                    phase[i] = phase[i] + 1 == path ? 0 : phase[i] + 1;
-                    extra -= phase[i] < exposure.start[i] ? 1 : 0;
+                    const Int later = phase[k] + 1;
+                    phase[k] = select(later == path, splat(0), later);
+                    left = minus_if(left, phase[k] < load<Int>(exposure.start + at));
                 }
                 if constexpr (periods) {
-                    extra += (phase[i] < exposure.end[i] ? 1 : 0) - (exposure.part[i] > turn ? 1 : 0);
+                    left = plus_if(left, phase[k] < load<Int>(exposure.end + at));
+                    left = minus_if(left, load<Float>(exposure.part + at) > turn);
                 } else {
-                    const int32_t out = minus(re[i], mark[i]) < 0 ? 1 : 0;
-                    extra += out;
-                    in += (minus(next, mark[i]) < 0 ? 1 : 0) - out;
+                    const Mask out = apart(re[k], mark[k]) < 0;
+                    left = plus_if(left, out);
+                    in = minus_if(plus_if(in, apart(next, mark[k]) < 0), out);
                 }
-                const int32_t left = plus(exposure.armed[i] + extra, minus(re[i], c[i]));
-                if constexpr (warm) negative[i] |= left;
-                armed[i] = left > 0 ? left : 0;
-                rearmed[i] = in > 0 ? in : 0;
-                re[i] = next;
-                const float mean = p[i] * static_cast<float>(armed[i]) + q[i] * static_cast<float>(rearmed[i]);
-                const float followed = alpha[i] * mean + beta[i], x = followed < kLargest ? followed : kLargest;
-                const int32_t down = static_cast<int32_t>(x), up = down + (x > static_cast<float>(down) ? 1 : 0);
-                count[i] = up > 0 ? up : 0;
-            };
-            auto add = [&](int i) {
-                const int32_t there = armed[i] + rearmed[i], kept = before[i];
-                const int32_t moved = plus(c[i], count[i] < there ? count[i] : there);
-                c[i] = kept ^ ((moved ^ kept) & exposure.active[i]);
-                after[i] = c[i];
-            };
-            if (const uint32_t anew = quantiles.exact[static_cast<int64_t>(t) * kTeams]) {
-                for (int i = 0; i < kTeam; ++i) quantise(i);
-                take_exactly(quantiles, t, anew, p, q, armed, rearmed, count);
-                for (int i = 0; i < kTeam; ++i) add(i);
-            } else {
-                for (int i = 0; i < kTeam; ++i) {
-                    quantise(i);
-                    add(i);
-                }
+                if constexpr (warm) store(negative + at, load<UInt>(negative + at) | as_uint(left));
+                armed[k] = larger(left, splat(0));
+                rearmed[k] = larger(in, splat(0));
+                re[k] = next;
+                const Float mean =
+                    load<Float>(p + at) * to_float(armed[k]) + load<Float>(q + at) * to_float(rearmed[k]);
+                const Float followed = load<Float>(alpha + at) * mean + load<Float>(beta + at);
+                count[k] = larger(rounded_up(minimum(followed, splat(kLargest))), splat(0));
             }
-            if (t + 1 >= grid.lap_watch) moves.see(c, before);
+            if (const uint32_t anew = quantiles.exact[static_cast<int64_t>(t) * kTeams]; seldom(anew != 0u))
+                take_exactly(quantiles, t, anew, p, q, armed, rearmed, count);
+            const bool seen = t + 1 >= grid.lap_watch;
+            for (int k = 0; k < kParts; ++k) {
+                const int64_t at = row + kRow + k * kLanes;
+                const UInt before = load<UInt>(old + at);
+                const UInt after = c[k] + as_uint(smaller(count[k], armed[k] + rearmed[k]));
+                c[k] = as_uint(select(on[k], as_int(after), as_int(before)));
+                store(fresh + at, c[k]);
+                if (seen) moves.see(k, c[k], before);
+            }
         }
     moves.largest(c, history.less[1], change);
 }

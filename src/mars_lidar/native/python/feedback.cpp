@@ -44,12 +44,14 @@ void judge(const BoundJob& job, const PulseTable& pulse, Vector<const int64_t> p
            nb::ndarray<double, nb::ndim<2>, nb::c_contig> distance_armed, Vector<int32_t> sweeps, Vector<double> spread,
            nb::ndarray<double, nb::ndim<2>, nb::c_contig> bins, int threads) {
     check_pixels(job, pixels);
-    if (size_of(kinds) != job.bins) throw nb::value_error("kinds must be (bins)");
     const int64_t number = size_of(pixels), wanted = static_cast<int64_t>(bins.shape(0));
+    if (size_of(kinds) < 1 || job.bins % size_of(kinds) != 0) throw nb::value_error("kinds must divide the bins");
+    Job judged = job;
+    judged.bins = static_cast<int32_t>(size_of(kinds));
     expect("distance_armed must be (2, pixels)", {2, number}, distance_armed);
     expect("sweeps must be (pixels)", {number}, sweeps);
     expect("spread must be (pixels or 0)", {size_of(spread) == 0 ? 0 : number}, spread);
-    expect("bins must be (pixels or 0, bins)", {wanted == 0 ? 0 : number, job.bins}, bins);
+    expect("bins must be (pixels or 0, bins)", {wanted == 0 ? 0 : number, judged.bins}, bins);
     double* const distance = distance_armed.data();
     const FeedbackCheckCall call{pixels.data(),
                                  number,
@@ -60,7 +62,7 @@ void judge(const BoundJob& job, const PulseTable& pulse, Vector<const int64_t> p
                                  size_of(spread) == 0 ? nullptr : spread.data(),
                                  wanted == 0 ? nullptr : bins.data()};
     nb::gil_scoped_release free;
-    feedback_check(job, pulse, call, threads);
+    feedback_check(judged, pulse, call, threads);
 }
 
 template <class Count>
@@ -84,7 +86,8 @@ void bind_feedback(nb::module_& module) {
     module.def(
         "feedback_check", &judge, "job"_a, "pulse"_a, "pixels"_a, "kinds"_a, "distance_armed"_a.noconvert(),
         "sweeps"_a.noconvert(), "spread"_a.noconvert(), "bins"_a.noconvert(), "threads"_a,
-        "distance_armed (2, pixels): distance of the mean histogram on an internal grid from that of one of "
+        "Judges an internal grid, kinds of all bins or of equally many joined ones. "
+        "distance_armed (2, pixels): distance of the mean histogram on it from that on one of "
         "half its cells' width, "
         "in standard deviations of the linear function that shows it best, and the fewest exposures armed in "
         "any cell; sweeps (pixels,) of the latter, 201 "

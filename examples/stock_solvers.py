@@ -69,11 +69,11 @@ def errors(file, seed=1):
     """Root mean squared errors of every method on a room: log signal, log background, delay in widths of the pulse."""
     true = scenes("room", [seed]).float()
     y = PHYSICS(true)
-    found = {"maximum likelihood, each pixel alone": PHYSICS.A_dagger(y)}
+    estimates = {"maximum likelihood, each pixel alone": PHYSICS.A_dagger(y)}
     for name, algorithm in solvers(file):
         print(name, flush=True)
-        found[name] = algorithm(y, PHYSICS).detach()
-    return {name: (images - true).square().mean((0, 2, 3)).sqrt().tolist() for name, images in found.items()}
+        estimates[name] = algorithm(y, PHYSICS).detach()
+    return {name: (images - true).square().mean((0, 2, 3)).sqrt().tolist() for name, images in estimates.items()}
 
 
 if __name__ == "__main__":

@@ -11,11 +11,10 @@ from dataclasses import dataclass, fields, replace
 from statistics import NormalDist
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.native import _core
-from mars_lidar._base.types import FloatArray
+from mars_lidar._base.types import FloatArray, NDArray
 from mars_lidar.instrument.system import System
 from mars_lidar.reconstruction.histograms import Histograms
 from mars_lidar.reconstruction.image_network import networks

@@ -260,3 +260,22 @@ def test_time_that_may_be_first_is_told(tmp_path: Path, shape: tuple[int, ...], 
         warnings.simplefilter("error")
         read_counts(tmp_path / "a.npy", axes="yxt")
         read_counts(tmp_path / "a.npy", bins=shape[0] if warned else shape[-1])
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e3, 1e-9])
+def test_times_beside_the_counts_are_those_of_the_bins(tmp_path, unit):
+    """They were not looked at: a histogram that began 20 ns late was 3 m too near."""
+    system = make_system(50.0, 1000, 100, sigma_ns=1.0)
+    path, times = tmp_path / "lab.csv", np.arange(100.0)
+
+    def write(part, first=0.0):
+        np.savetxt(path, np.c_[(times[part] + first) * unit, np.ones(times[part].size)], delimiter=",")
+        return path
+
+    for first in (0.0, 0.5):  # edges of bins, and their middles
+        assert ml.io.foreign_cube(write(slice(None), first), system).shape == (1, 1, 1, 100)
+    with pytest.raises(ValueError, match=r"begin at 20 ns: give the laser period and start_ns"):
+        ml.io.foreign_cube(write(slice(20, 90)), system)
+    assert ml.io.foreign_cube(write(slice(20, 90)), system, start_ns=20.0).histogram[0, 0, 0, 20:90].sum() == 70
+    with pytest.raises(ValueError, match=r"which is no bin of 0\.5 ns"):
+        ml.io.foreign_cube(write(slice(None)), system.replace(bins=200))

@@ -571,6 +571,11 @@ def _check_sparse_within(name: str, value: Any) -> None:
 
 def read_column(path: Path, *, alone: bool = False) -> NDArray[np.float64]:
     """Values of a text file below its header; unless `alone`, in a column beside equidistant times; else ValueError."""
+    return read_times(path, alone=alone)[1]
+
+
+def read_times(path: Path, *, alone: bool = False) -> tuple[NDArray[np.float64] | None, NDArray[np.float64]]:
+    """The times of `read_column`, in the unit of the file, where there are any; and the values."""
     check_claim(path, 64 * path.stat().st_size)
     rows: list[list[float]] = []
     for line in path.read_text(encoding="utf-8-sig", errors="replace").splitlines():
@@ -591,4 +596,4 @@ def read_column(path: Path, *, alone: bool = False) -> NDArray[np.float64]:
                 f"its first column must be times that ascend in equal steps, got steps of {steps.min():g} to "
                 f"{steps.max():g}"
             )
-    return columns[:, -1]
+    return columns[:, 0] if columns.shape[1] == 2 else None, columns[:, -1]

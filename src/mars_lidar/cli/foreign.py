@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 from cyclopts import Parameter
 
+from mars_lidar.cli.console import say
 from mars_lidar.cli.options import Integer, Number, Text, options, two
 from mars_lidar.cli.system_options import PulseOptions
 from mars_lidar.instrument.presets import PRESETS
@@ -116,7 +117,15 @@ class ForeignOptions:
         between, form = self.window_ns, "numbers START,STOP in ns"
         window = None if between is None else two("--window-ns", between, form, float)
         system = base or whole._system(path, length)
-        return contents.cube(system, start_ns=self.start_ns, unit_ns=self.unit_ns, window_ns=window)
+        cube = contents.cube(system, start_ns=self.start_ns, unit_ns=self.unit_ns, window_ns=window)
+        if cube.system.detector.mode == "gated" and system.detector.mode != "gated":
+            gate = cube.system.detector.gate_width_ns
+            say(
+                f"warning: {path}: {gate:.6g} of the {system.period_ns:.6g} ns of a period are taken for the gate of a "
+                "detector that is off outside; a free-running detector is also blind after light there, which makes S and "
+                "B too low: give its whole period"
+            )
+        return cube
 
     def _completed(self, recorder: Recorded, length: int | None) -> ForeignOptions:
         """With what the recorder tells, where no option does: the period is as many of its bins as fill it best."""

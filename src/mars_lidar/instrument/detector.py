@@ -78,7 +78,7 @@ class Detector:
     crosstalk
         `Crosstalk`: avalanches trigger neighbouring pixels. The pixels of an image then depend on each other.
     electronics_dead_time_ns
-        An avalanche is recorded only if no other occurred within this time t_e before it, ns, in addition to the dead
+        An avalanche is recorded only if none was recorded within this time t_e before it, ns, in addition to the dead
         time of the pixel; without effect unless longer. The electronics are ready at the start of an exposure.
     max_events_per_period, max_events_per_exposure
         Largest number of events that the electronics record in a laser period, and in an exposure; later events are

@@ -14,7 +14,17 @@ from numpy.typing import NDArray
 
 from mars_lidar._base import mat5
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.files import NpyFile, check_claim, npy_header, open_npz, read_column, read_npy, reading, whole
+from mars_lidar._base.files import (
+    NpyFile,
+    check_claim,
+    npy_header,
+    open_npz,
+    read_column,
+    read_npy,
+    read_times,
+    reading,
+    whole,
+)
 from mars_lidar._base.hdf5 import CELLS, open_hdf5
 from mars_lidar._base.sparse import check_sparse, check_stored, dense_bytes, is_sparse
 from mars_lidar.instrument.system import System
@@ -38,6 +48,7 @@ class ForeignCounts:
     cells: NDArray[Any] | None  # (H, W) of arrays of photon times, or None
     axes: str  # what the array's dimensions were taken for
     recorder: Recorded | None = None  # what a photon counter's file tells of its histograms
+    times: NDArray[np.float64] | None = None  # of the bins of a .csv or .txt, in a unit that it does not state
 
     def cube(
         self,
@@ -55,6 +66,8 @@ class ForeignCounts:
                     raise ValueError("unit_ns is for photon times, and this array holds histograms")
                 if window_ns is not None:
                     raise ValueError("window_ns is for photon times, and this array holds histograms")
+                if self.times is not None and self.times.size > 1:
+                    _check_times(self.times, system.bin_ns, start_ns)
                 return from_histograms(self.counts, system, start_ns=start_ns, source=source)
             if unit_ns is None:
                 raise ValueError(f"{self.name} holds photon times of an unknown unit: give unit_ns (1 for ns)")
@@ -144,9 +157,31 @@ def read_counts(
     if is_sparse(array):
         check_claim(source, dense_bytes(array), f"the counts of {name or 'its matrix'}")
     try:
-        return ForeignCounts(source, name, in_order(array, order, image), None, order, told_by)
+        text = source.suffix.lower() in (".csv", ".txt")
+        times = read_times(source)[0] if text else None
+        return ForeignCounts(source, name, in_order(array, order, image), None, order, told_by, times)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{source}: {name or 'the array'}: {error}") from error
+
+
+_UNITS = {"s": 1e9, "us": 1e3, "ns": 1.0, "ps": 1e-3}
+
+
+def _check_times(times: NDArray[np.float64], bin_ns: float, start_ns: float) -> None:
+    """Raise ValueError where the times beside the counts contradict the bins of the system or where they begin."""
+    step = float(times[-1] - times[0]) / (times.size - 1)
+    fits = [scale for scale in _UNITS.values() if abs(step * scale / bin_ns - 1.0) < 1e-3]
+    if not fits:
+        raise ValueError(
+            f"its times ascend by {step:g}, which is no bin of {bin_ns:g} ns in {', '.join(_UNITS)}: mend the width of "
+            "the bins or the period"
+        )
+    begin = float(times[0]) * fits[0]
+    if start_ns == 0.0 and not -0.01 < begin / bin_ns < 0.99:  # the first bin's edge or its middle
+        raise ValueError(
+            f"its times begin at {begin:g} ns: give the laser period and start_ns (--period-ns, --start-ns) where the "
+            "histogram begins that late after the laser pulse, or the counts alone where its first bin is at the pulse"
+        )
 
 
 def arrays(path: Path) -> dict[str, Any]:

@@ -11,8 +11,8 @@ what it needs (parts separated by semicolons):
     <!-- run: as scene.yaml; by mars-lidar simulate --scene scene.yaml -o a.zarr -->   a file, and what reads it
     <!-- not run: why -->
 
-Commands after ``<!-- command: NAME -->`` are those that `.ci/run` itself runs. tests/test_pages.py holds that nothing
-else is left out.
+Commands after ``<!-- command: NAME -->`` are those that `.ci/run` itself runs. tests/docs/test_pages.py holds that
+nothing else is left out.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The engine "mars": tables, count laws, settings; its statistics without a table are in tests/test_engines.py."""
+"""The engine "mars": tables, count laws, settings. Its statistics without a table: test_engines.py."""
 
 from __future__ import annotations
 

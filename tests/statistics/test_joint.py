@@ -2,7 +2,7 @@
 
 Oracles: constant rate; t_d = 0 and whole periods; the count law's recursion (`exposure_moments`: another
 expansion); a weighted delay recursion and a dense matrix, both on plain bins, written here; ten cases of an
-independent simulator. Engines are compared with it in tests/test_engines.py.
+independent simulator. Engines are compared with it in tests/engines/test_engines.py.
 """
 
 from __future__ import annotations

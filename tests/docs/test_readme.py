@@ -12,7 +12,7 @@ import pytest
 
 from benchmarks import readme
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 README = ROOT.joinpath("README.md").read_text()
 
 

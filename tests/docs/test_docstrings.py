@@ -23,7 +23,7 @@ import mars_lidar as ml
 numpydoc = pytest.importorskip("numpydoc.docscrape")
 
 FLAGS = doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS
-REFERENCE = Path(__file__).resolve().parents[1] / "docs" / "reference.md"
+REFERENCE = Path(__file__).resolve().parents[2] / "docs" / "reference.md"
 WITH_TORCH = find_spec("torch") is not None
 PACKAGES = ("", "io", "plot", "reconstruction", "statistics", *(["learn"] if WITH_TORCH else []))
 WITHOUT_EXAMPLE = {"io.save_capture"}  # it wants a capture that another program made: tests/io/test_capture.py

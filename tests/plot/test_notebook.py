@@ -14,7 +14,7 @@ from harness import make_system
 import mars_lidar as ml
 from mars_lidar import io
 
-EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 SYSTEM = make_system(50.0, 50, 64, sigma_ns=0.5)
 
 

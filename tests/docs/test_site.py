@@ -15,7 +15,7 @@ from urllib.parse import unquote
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "tests" / "explore"))
 from explorer_page import WAIT_MS, chromium, shortcomings  # noqa: E402
 

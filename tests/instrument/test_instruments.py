@@ -10,7 +10,7 @@ import mars_lidar as ml
 from mars_lidar.instrument.presets import ASSUMED, INSTRUMENTS, PRESETS, sourced, table
 from tests.harness.command import command_line
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_the_documentation_is_the_declaration():

@@ -13,7 +13,7 @@ from harness import make_system
 
 import mars_lidar as ml
 
-HIDDEN = Path(__file__).with_name("hidden_library.py")
+HIDDEN = Path(__file__).parents[1] / "hidden_library.py"
 # library, extra, and whether public names and commands are to miss it
 LIBRARIES = [
     ("torch", "learn", True, False),

@@ -11,6 +11,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
+from scipy import stats
+
 from harness import (
     COUNTS,
     EVERYTHING,
@@ -38,9 +41,6 @@ from harness import (
 )
 from harness.pvalues import merge, variance_score
 from harness.sample import draw
-from numpy.typing import NDArray
-from scipy import stats
-
 from mars_lidar import Detector, Flux, GaussianPulse, count_law
 from mars_lidar.engines import ENGINES, Engine
 from mars_lidar.engines.engine import Records, Task

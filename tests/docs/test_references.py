@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "src" / "mars_lidar"
 PARTS = {path.name for path in PACKAGE.iterdir() if (path / "__init__.py").is_file()} | {
     path.stem for path in PACKAGE.glob("*.py")

@@ -18,7 +18,7 @@ from scipy import integrate, special, stats
 from mars_lidar import _core
 
 ALPHA = 5e-8
-REFERENCE = Path(__file__).parents[2] / "shared" / "reference"
+REFERENCE = Path(__file__).parents[3] / "shared" / "reference"
 CASES = sorted(path.stem for path in REFERENCE.glob("*.json"))
 IMAGE = Case(signal=[0.0, 0.3, 2.0, 30.0], background=[0.2, 0.0, 1.0, 10.0], delay=[0.1, -3.4, 0.999, 7.5])
 SAMPLES = np.array([0.0, 1.0, 5.0, 9.0, 4.0, 0.0, 0.0, 2.0, 1.0])

@@ -94,9 +94,8 @@ def _models(bins: int, config: Config) -> Cases:
 
 def _coarse(bins: int, config: Config) -> Cases:
     """The likelihood by the width of a bin, and re-armed in the pulse."""
-    random = np.random.default_rng(0)
-    at = [torch.from_numpy(values) for values in _light(random, _MANY, 100.0)]
-    counts = torch.from_numpy(random.poisson(30.0, (_MANY, bins)).astype(float))
+    light = _light(np.random.default_rng(0), _MANY, 100.0)
+    at = [torch.from_numpy(values) for values in light]
     cases: Cases = {}
     again, twice = ", re-armed in the pulse", ", re-armed after two dead times"
     for sigmas, dead, words in (
@@ -110,6 +109,8 @@ def _coarse(bins: int, config: Config) -> Cases:
             pulse=ml.GaussianPulse(sigma_ns=100.0 / bins / sigmas),
             detector=ml.Detector(dead_time_ns=dead),
         )
+        flux = ml.Flux(*(values[None] for values in light))
+        counts = torch.from_numpy(ml.simulate(flux, system, seed=0, threads=1)[0, 0].astype(float))
         name = f"histogram_log_likelihood, bins of {sigmas:g} sigma{words}"
         cases[name] = partial(histogram_log_likelihood, counts, system=system), at
     return cases

@@ -6,13 +6,12 @@ import math
 from typing import Any, Literal, Unpack
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.progress import callback_of
 from mars_lidar._base.resources import check_memory, thread_count
-from mars_lidar._base.types import FloatArray, Progress
+from mars_lidar._base.types import ArrayLike, FloatArray, NDArray, Progress
 from mars_lidar.engines import Engine, EngineOptions, check_detector, find_engine
 from mars_lidar.engines.engine import IN_PARTS, PhaseRecords, Records, Task
 from mars_lidar.instrument.system import System

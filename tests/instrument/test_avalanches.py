@@ -9,27 +9,24 @@ from typing import Any
 import numpy as np
 import pytest
 from harness import (
-    EVERYTHING,
     GATE,
-    INTERVALS,
     PERIOD_NS,
     WAVE,
     Case,
     case,
-    check,
     draw,
-    flux_of,
+    make_system,
     require,
     two_lobes,
     two_mean_vectors,
 )
+from instrument.effect_checks import exact_against_sequential, exact_bits_do_not_depend, has_no_law, mean_is
 from scipy import stats
 from test_reproducibility import image
 
 import mars_lidar as ml
-from mars_lidar import _core, io, statistics
+from mars_lidar import io
 from mars_lidar.engines import ENGINES
-from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.statistics import constant_light_rate
 from tests.harness.command import command_line
 
@@ -98,22 +95,14 @@ CASES = [
 @pytest.mark.full
 @pytest.mark.parametrize("made", CASES, ids=lambda made: made.name)
 def test_exact_against_sequential(made: Case):
-    """The intervals of twilight pulses are all t_d, which the exact engine's phases resolve to 6e-8 of a period."""
-    twilight = made.system.detector.twilight_ns > 0.0
-    check(ENGINES["exact"], made, ENGINES["sequential"], EVERYTHING - ({INTERVALS} if twilight else set()))
-    if twilight:
+    exact_against_sequential(made)
+    if made.system.detector.twilight_ns > 0.0:
         shares = []
         for k, engine in enumerate(BOTH):
             item, length = draw(ENGINES[engine], made, 7 + k, times=True).intervals()
             pulses = np.abs(length - made.system.dead_time_periods) < 1e-5
             shares.append(np.bincount(item[pulses], minlength=made.items).astype(float))
         require({"twilight pulses": two_mean_vectors(*shares)}, made.name)
-
-
-def against(result: np.ndarray, expected: float, about: str) -> None:
-    """The mean of independent numbers is the expected one."""
-    z = (result.mean() - expected) / (result.std(ddof=1) / np.sqrt(result.size))
-    require({"mean": float(2 * stats.norm.sf(abs(z)))}, about)
 
 
 @pytest.mark.full
@@ -135,11 +124,11 @@ def test_without_a_dead_time_it_is_a_hawkes_process(engine: str):
     k = np.fft.fftfreq(32 * fine, 1 / (32 * fine))
     photons = 2.0 * made.system.pulse.bin_energy(37.0, PERIOD_NS, 32 * fine) + 0.5 / (32 * fine)
     rate = np.fft.ifft(np.fft.fft(photons) / (1 - p / (1 + 2j * np.pi * k * tau))).real
-    against(sample.counts.astype(float), 20 * 2.5 / (1 - p), f"{engine}: counts")
+    mean_is(sample.counts, 20 * 2.5 / (1 - p), f"{engine}: counts")
     part = sample.cube.reshape(-1, 8, 4).sum(-1)
     expected = 20 * rate.reshape(8, -1).sum(1)
     for j in range(8):
-        against(part[:, j].astype(float), expected[j], f"{engine}: bin {j}")
+        mean_is(part[:, j].astype(float), expected[j], f"{engine}: bin {j}")
     # armed at the start: the mean relaxes from lambda to lambda / (1 - p) at the rate (1 - p) / tau
     armed = case(
         0.0,
@@ -153,7 +142,7 @@ def test_without_a_dead_time_it_is_a_hawkes_process(engine: str):
     )
     decay = (1 - p) / tau
     mean = 2.0 / (1 - p) * (2 - p * -np.expm1(-decay * 2) / decay)
-    against(draw(ENGINES[engine], armed, 4).counts.astype(float), mean, f"{engine}: armed")
+    mean_is(draw(ENGINES[engine], armed, 4).counts, mean, f"{engine}: armed")
 
 
 @pytest.mark.parametrize("engine", BOTH)
@@ -163,7 +152,7 @@ def test_rate_under_constant_light(engine: str, probability: float, twilight: fl
     traps = ml.Afterpulsing(probability=probability, delay_ns=30.0) if probability else None
     made = case(0.0, 3.0, "stationary", dead_time_ns=24.0, afterpulsing=traps, twilight_ns=twilight, cycles=300)
     rate = constant_light_rate(3.0e9 / PERIOD_NS, made.system.detector)
-    against(draw(ENGINES[engine], made, 5).counts.astype(float), rate * 1e-9 * made.system.exposure_ns, engine)
+    mean_is(draw(ENGINES[engine], made, 5).counts, rate * 1e-9 * made.system.exposure_ns, engine)
 
 
 def test_constant_light_rate_of_sampled_and_exponential_delays():
@@ -198,16 +187,7 @@ def test_bits_are_those_of_every_level_thread_and_part(kind: str):
     flux, system = image(kind)
     detector = replace(system.detector, afterpulsing=ml.Afterpulsing(probability=0.3, delay_ns=50.0), twilight_ns=2.0)
     system = system.replace(detector=detector)
-    whole = ml.simulate(flux, system, seed=9, realizations=2)
-    for level in _core.levels():
-        assert np.array_equal(ml.simulate(flux, system, engine=ExactEngine(level), seed=9, realizations=2), whole)
-    assert np.array_equal(ml.simulate(flux, system, seed=9, realizations=2, threads=1), whole)
-    rows = slice(1, 2)
-    index = np.arange(flux.shape[1], 2 * flux.shape[1])
-    again = ml.simulate(flux[rows], system, seed=9, first_realization=1, pixel_index=index)
-    assert np.array_equal(again[0], whole[1, rows])
-    times = ml.simulate_timestamps(flux, system, seed=9, realization=1)
-    assert np.array_equal(times.histogram(), whole[1])
+    exact_bits_do_not_depend(flux, system)
 
 
 @pytest.mark.parametrize("kind", ["gaussian", "waveform"])
@@ -244,8 +224,7 @@ def line(shape: tuple[int, int], lit: tuple[int, int], **crosstalk: Any) -> tupl
     """An image in which one pixel is lit."""
     signal = np.zeros(shape)
     signal[lit] = 1.5
-    detector = ml.Detector(dead_time_ns=45.0, crosstalk=ml.Crosstalk(**crosstalk))
-    system = ml.System(period_ns=PERIOD_NS, cycles=40, bins=50, pulse=ml.GaussianPulse(sigma_ns=2.0), detector=detector)
+    system = make_system(45.0, 40, 50, sigma_ns=2.0, crosstalk=ml.Crosstalk(**crosstalk))
     return ml.Flux(signal, 0.0, 37.0), system
 
 
@@ -266,7 +245,7 @@ def test_crosstalk_thins():
     flux, system = line((1, 2), (0, 0), probability=0.6, kernel=[[0, 0, 0], [1, 0, 1], [0, 0, 0]])
     cube = ml.simulate(flux, system, engine="sequential", realizations=4000, seed=2)
     lit, dark = cube.sum(-1)[:, 0].T.astype(float)
-    against(dark - 0.3 * lit, 0.0, "thinned")
+    mean_is(dark - 0.3 * lit, 0.0, "thinned")
     require({"variance": float(stats.chi2.sf(np.sum((dark - 0.3 * lit) ** 2 / (0.21 * lit)), 4000))}, "thinned")
     plain = system.replace(detector=system.detector.without("crosstalk"))
     alone = ml.simulate(flux, plain, engine="sequential", realizations=4000, seed=3).sum(-1)[:, 0, 0].astype(float)
@@ -277,15 +256,8 @@ def test_crosstalk_thins():
 def test_crosstalk_bits_and_whole_images():
     random = np.random.default_rng(5)
     flux = ml.Flux(random.uniform(0, 2, (9, 7)), random.uniform(0, 1, (9, 7)), 37.0)
-    detector = ml.Detector(dead_time_ns=45.0, crosstalk=ml.Crosstalk(probability=0.2), afterpulsing=SAMPLED)
-    system = ml.System(
-        period_ns=PERIOD_NS,
-        cycles=30,
-        bins=50,
-        pulse=ml.GaussianPulse(sigma_ns=2.0),
-        detector=detector,
-        start="stationary",
-    )
+    effects = {"crosstalk": ml.Crosstalk(probability=0.2), "afterpulsing": SAMPLED}
+    system = make_system(45.0, 30, 50, sigma_ns=2.0, start="stationary", **effects)
     whole = ml.simulate(flux, system, engine="sequential", realizations=3)
     single = ml.simulate(flux, system, engine="sequential", first_realization=1, threads=1)
     assert np.array_equal(single[0], whole[1])
@@ -303,12 +275,7 @@ def test_what_has_no_law_says_so(name: str):
     on: dict[str, Any] = {"afterpulsing": EXPONENTIAL, "twilight_ns": 5.0}
     system = case(1.0, 1.0, dead_time_ns=75.0, **{name: on[name]}).system
     text = f"does not do {name}.*'exact' or 'sequential'"
-    for law in ("count_law", "exposure_moments", "joint_law", "mean_histogram", "registration_pdf"):
-        with pytest.raises(ValueError, match=text):
-            getattr(statistics, law)(ml.Flux(1.0, 1.0, 50.0), system)
-    for engine in ("mars", "renewal", "feedback", "auto"):
-        with pytest.raises(ValueError, match=f"engine '{engine}' {text}"):
-            ml.simulate(flux_of(1.0, 1.0), system, engine=engine)
+    has_no_law(system, text)
 
 
 @pytest.mark.parametrize(
@@ -395,15 +362,7 @@ def test_ticking_pixels_have_no_stationary_start(
     engine: str, signal: float, background: float, dead: float, twilight: float
 ):
     """The mean count of the first periods was up to 4 % off in `exact`, and drifted in `sequential`."""
-    detector = ml.Detector(dead_time_ns=dead, twilight_ns=twilight)
-    system = ml.System(
-        period_ns=100.0,
-        cycles=100,
-        bins=50,
-        pulse=ml.GaussianPulse(sigma_ns=0.22),
-        detector=detector,
-        start="stationary",
-    )
+    system = make_system(dead, 100, 50, sigma_ns=0.22, start="stationary", twilight_ns=twilight)
     flux = ml.Flux(signal, background, 99.99)
     with pytest.raises(ValueError, match=r"start must be 'armed' where more than 5 photons .* got 'stationary' with"):
         ml.simulate(flux, system, engine=engine)

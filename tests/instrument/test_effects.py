@@ -24,13 +24,13 @@ from harness import (
     task_of,
     waveform_flux,
 )
+from instrument.effect_checks import exact_bits_do_not_depend
 from scipy import stats
 
 import mars_lidar as ml
-from mars_lidar import Detector, GaussianPulse, Jitter, SampledJitter, System, _core
+from mars_lidar import Detector, GaussianPulse, Jitter, SampledJitter, System
 from mars_lidar.engines import ENGINES
 from mars_lidar.engines.engine import Records
-from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.statistics import electronics_moments, mean_histogram
 
 TAIL = Jitter(sigma_ns=1.0, tail_ns=6.0, tail_fraction=0.3)
@@ -279,13 +279,7 @@ def test_bits_do_not_depend_on_level_threads_and_parts(name: str, mode: str, wav
     if wave:
         flux = ml.Flux(waveform=random.exponential(0.05, (5, 40, 64)), background=flux.background)
     system = case_of(pixel(EACH[name], mode)).system
-    whole = ml.simulate(flux, system, seed=9, threads=1)
-    for level in _core.levels()[1:]:
-        assert np.array_equal(whole, ml.simulate(flux, system, seed=9, threads=2, engine=ExactEngine(level))), level
-    part = ml.simulate(flux[3:], system, seed=9, pixel_index=np.arange(120, 200), threads=2)
-    assert np.array_equal(whole[:, 3:], part)
-    stamps = ml.simulate_timestamps(flux, system, seed=9)
-    assert np.array_equal(stamps.histogram(), whole[0])
+    exact_bits_do_not_depend(flux, system)
 
 
 def test_off_is_the_ideal_pixel():

@@ -11,26 +11,24 @@ import pytest
 from harness import (
     EVERYTHING,
     GATE,
-    INTERVALS,
     PERIOD_NS,
     WAVE,
     Case,
     case,
     check,
     draw,
-    flux_of,
     require,
     two_lobes,
     waveform_flux,
 )
+from instrument.effect_checks import exact_against_sequential, exact_bits_do_not_depend, has_no_law, mean_is
 from scipy import integrate, stats
 from test_reproducibility import image
 
 import mars_lidar as ml
-from mars_lidar import _core, statistics
+from mars_lidar import statistics
 from mars_lidar.engines import ENGINES
 from mars_lidar.engines.engine import Engine, Records, Task
-from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.instrument.effects import EFFECTS
 
 BOTH = ["exact", "sequential"]
@@ -158,9 +156,7 @@ TOGETHER = [
 @pytest.mark.full
 @pytest.mark.parametrize("made", TOGETHER, ids=lambda made: made.name)
 def test_exact_against_sequential(made: Case):
-    """Intervals of twilight pulses are all t_d, which the exact engine's phases resolve to 6e-8 of a period."""
-    twilight = made.system.detector.twilight_ns > 0.0
-    check(ENGINES["exact"], made, ENGINES["sequential"], EVERYTHING - ({INTERVALS} if twilight else set()))
+    exact_against_sequential(made)
 
 
 @pytest.mark.full
@@ -222,8 +218,7 @@ def test_mean_rate_of_the_engines(engine: str):
     made = case(0.0, 6.0, "stationary", dead_time_ns=24.0, recovery_ns=35.0, twilight_ns=4.0, cycles=300, items=1600)
     expected = statistics.constant_light_rate(6e9 / PERIOD_NS, made.system.detector) * 1e-9 * made.system.exposure_ns
     counts = draw(ENGINES[engine], made, 5).counts
-    z = (counts.mean() - expected) / (counts.std(ddof=1) / np.sqrt(counts.size))
-    require({"mean": float(2 * stats.norm.sf(abs(z)))}, engine)
+    mean_is(counts, expected, engine)
 
 
 def test_a_rested_pixel_is_fully_sensitive():
@@ -261,8 +256,7 @@ def test_a_short_recovery_has_the_law_of_none(engine: str):
     check(ENGINES[engine], short, ENGINES["exact"], EVERYTHING)
     law = statistics.mean_histogram(ml.Flux(20.0, 10.0, 37.0), none.system)
     sample = draw(ENGINES[engine], short, 9)
-    z = (sample.counts.mean() - law.sum()) / (sample.counts.std(ddof=1) / np.sqrt(sample.counts.size))
-    require({"mean": float(2 * stats.norm.sf(abs(z)))}, engine)
+    mean_is(sample.counts, law.sum(), engine)
 
 
 @pytest.mark.parametrize(
@@ -271,27 +265,13 @@ def test_a_short_recovery_has_the_law_of_none(engine: str):
 def test_bits_are_those_of_every_level_thread_and_part(kind: str):
     flux, system = image(kind)
     system = system.replace(detector=replace(system.detector, recovery_ns=25.0))
-    whole = ml.simulate(flux, system, seed=9, realizations=2)
-    for level in _core.levels():
-        assert np.array_equal(ml.simulate(flux, system, engine=ExactEngine(level), seed=9, realizations=2), whole)
-    assert np.array_equal(ml.simulate(flux, system, seed=9, realizations=2, threads=1), whole)
-    rows = slice(1, 2)
-    index = np.arange(flux.shape[1], 2 * flux.shape[1])
-    again = ml.simulate(flux[rows], system, seed=9, first_realization=1, pixel_index=index)
-    assert np.array_equal(again[0], whole[1, rows])
-    times = ml.simulate_timestamps(flux, system, seed=9, realization=1)
-    assert np.array_equal(times.histogram(), whole[1])
+    exact_bits_do_not_depend(flux, system)
 
 
 def test_what_has_no_law_says_so():
     system = case(1.0, 1.0, dead_time_ns=75.0, recovery_ns=5.0).system
     text = "does not do recovery_ns of the detector, got 5.0.*'exact' or 'sequential'"
-    for law in ("count_law", "exposure_moments", "joint_law", "mean_histogram", "registration_pdf"):
-        with pytest.raises(ValueError, match=text):
-            getattr(statistics, law)(ml.Flux(1.0, 1.0, 50.0), system)
-    for engine in ("mars", "renewal", "feedback", "auto", "poisson"):
-        with pytest.raises(ValueError, match=f"engine '{engine}' {text}"):
-            ml.simulate(flux_of(1.0, 1.0), system, engine=engine)
+    has_no_law(system, text)
     with pytest.raises(ValueError, match="a table does not do recovery_ns"):
         ml.Table.build(system, [0.5, 1.0], [0.5, 1.0])
     with pytest.raises(ValueError, match="cramer_rao does not do recovery_ns"):

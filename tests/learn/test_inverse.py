@@ -174,31 +174,6 @@ def test_stock_solvers_on_a_step(deepinv, name):
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("name", ["TVPrior", "TVDenoiser"])
-def test_stock_solvers_on_a_built_in_room(deepinv, name):
-    """On a dim cube: log light and depth nearer to the truth than by each pixel alone."""
-    from deepinv.models import TVDenoiser
-    from deepinv.optim.prior import PnP, TVPrior
-
-    from mars_lidar.learn import LidarPhysics
-
-    pulse, detector = ml.GaussianPulse(sigma_ns=1.5), ml.Detector(dead_time_ns=75.0)
-    system = ml.System(period_ns=128.0, cycles=200, bins=256, pulse=pulse, detector=detector)
-    flux = ml.Scene.example("room", 20, 1).flux(system, signal=0.2, sbr=1.0)
-    physics = LidarPhysics(system, images="log", seed=3)
-    maps = (flux.signal, flux.background, flux.delay_ns)
-    true = physics.images(*(torch.from_numpy(np.broadcast_to(values, (20, 20)).copy())[None] for values in maps))
-    y = physics(true)
-    prior, options = {
-        "TVPrior": (lambda: TVPrior(n_it_max=20), {"lambda_reg": 2.0}),
-        "TVDenoiser": (lambda: PnP(TVDenoiser(n_it_max=20)), {"sigma_denoiser": 0.04}),
-    }[name]
-    result = likelihood_descent(physics, y, prior(), stepsize=0.02, max_iter=40, **options)
-    before, after = ((item - true).square().mean((0, 2, 3)).sqrt() for item in (physics.A_dagger(y), result))
-    assert (after < before).all()
-
-
-@pytest.mark.full
 def test_drunet_runs_as_it_comes(deepinv, tmp_path):
     """Weights of one's own from a file, for deepinv's own are a download: two steps, beside the same by hand."""
     from deepinv.models import DRUNet

@@ -198,3 +198,16 @@ def test_the_bound_of_one_is_that_of_one() -> None:
         ml.cramer_rao(pixel([0.5, 0.5], 0.5, [10.0, 60.0]), SYSTEM)
     with pytest.raises(ValueError, match="flux must have returns with delays, and background > 0"):
         returns_bound(pixel([1.0, 2.0], 0.0, [10.0, 20.0]), SYSTEM)
+
+
+@pytest.mark.parametrize(
+    ("signals", "background", "dead"), [((5.0, 3.0), 0.3, 230.0), ((1.0, 1.0), 0.03, 50.0), ((1.0, 1.0), 1.0, 50.0)]
+)
+def test_all_returns_reported_are_no_more_returns(signals: tuple[float, float], background: float, dead: float) -> None:
+    """The flag is the outcome of the test of one return more: 1 % of 300 pixels, exceeded at 1e-4."""
+    delay = np.random.default_rng(8).uniform(5.0, 55.0, 300)
+    counts = drawn(with_dead(dead, 3000), signals, background, (delay, delay + 15.0), 300, seed=8)
+    estimate = ml.reconstruct(counts, with_dead(dead, 3000), returns=2)
+    assert (estimate.returns.count == 2).all()
+    flagged = int((estimate.flags & Flags.MORE_RETURNS > 0).sum())
+    assert stats.binom.sf(flagged - 1, 300, 0.01) > 1e-4

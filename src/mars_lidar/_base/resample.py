@@ -5,11 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.tolerances import TOL
-from mars_lidar._base.types import FloatArray
+from mars_lidar._base.types import FloatArray, NDArray
 
 
 def image_size(size: Any) -> tuple[int, int]:

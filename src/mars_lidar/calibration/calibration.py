@@ -7,13 +7,12 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.display import brief, measured
 from mars_lidar._base.resources import one_blas_thread
-from mars_lidar._base.types import FloatArray
+from mars_lidar._base.types import ArrayLike, FloatArray
 from mars_lidar.calibration import start, suspects
 from mars_lidar.calibration.curves import Curves, Realizations, curves, realizations
 from mars_lidar.calibration.fit import Effort, Fit, Fitted, Guess, draws

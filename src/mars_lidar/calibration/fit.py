@@ -13,9 +13,8 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mars_lidar._base.types import FloatArray
+from mars_lidar._base.types import FloatArray, NDArray
 from mars_lidar.calibration.cells import Cells
 from mars_lidar.calibration.model import Effect, Model
 from mars_lidar.calibration.recording import FALSE_ALARM, Recording

@@ -12,11 +12,10 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
 from mars_lidar._base.display import brief
-from mars_lidar._base.types import FloatArray
+from mars_lidar._base.types import ArrayLike, FloatArray
 from mars_lidar.calibration.calibration import Estimate
 from mars_lidar.instrument.pulse import GaussianPulse, SampledPulse
 from mars_lidar.instrument.system import SPEED_OF_LIGHT_M_PER_NS, System

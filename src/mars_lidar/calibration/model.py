@@ -9,10 +9,9 @@ from itertools import pairwise
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mars_lidar._base.native import _core
-from mars_lidar._base.types import FloatArray
+from mars_lidar._base.types import FloatArray, NDArray
 from mars_lidar.calibration.recording import Clock
 from mars_lidar.instrument.avalanches import Afterpulsing
 from mars_lidar.instrument.detector import Detector

@@ -8,10 +8,9 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
-from mars_lidar._base.types import FloatArray
+from mars_lidar._base.types import ArrayLike, FloatArray
 from mars_lidar.light.timestamps import Timestamps
 
 _ON_GRID = 0.02  # units: largest distance from the grid of a clock, for times in float64 over an hour

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mars_lidar._base.types import FloatArray
+from mars_lidar._base.types import FloatArray, NDArray
 from mars_lidar.calibration.fit import LIGHTS, Fit, Fitted, Guess, counted, root_of
 from mars_lidar.calibration.model import Effect, effects
 from mars_lidar.calibration.recording import FALSE_ALARM, LEAST_PHOTONS, Recording

@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
@@ -29,7 +28,7 @@ from mars_lidar._base.cached import cached_property
 from mars_lidar._base.files import beside
 from mars_lidar._base.progress import callback_of
 from mars_lidar._base.resources import check_memory
-from mars_lidar._base.types import FloatArray, Progress
+from mars_lidar._base.types import FloatArray, NDArray, Progress
 from mars_lidar.dataset.arrays import MAPS, sample_parts
 from mars_lidar.dataset.store import Dataset, open_dataset, read_sparse
 from mars_lidar.dataset.write import Maker

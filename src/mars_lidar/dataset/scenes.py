@@ -25,13 +25,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mars_lidar._base.buckets import in_bucket
 from mars_lidar._base.cached import cached_property
 from mars_lidar._base.files import reading
 from mars_lidar._base.resample import area_mean, nearest, new_size, window
-from mars_lidar._base.types import FloatArray
+from mars_lidar._base.types import FloatArray, NDArray
 from mars_lidar.dataset.arrays import FLAT_KEYS, create_maps, fitting, grid
 from mars_lidar.dataset.recipe import Light
 from mars_lidar.dataset.shard import DigestNotes

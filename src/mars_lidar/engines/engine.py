@@ -9,12 +9,11 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypedDict
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mars_lidar._base.cached import cached_property
 from mars_lidar._base.native import _core
 from mars_lidar._base.resources import check_memory
-from mars_lidar._base.types import Progress
+from mars_lidar._base.types import NDArray, Progress
 from mars_lidar.engines.tolerances import TOL
 from mars_lidar.instrument.detector import MODES, Detector, Mode
 from mars_lidar.instrument.effects import (

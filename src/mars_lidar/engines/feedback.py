@@ -15,10 +15,9 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mars_lidar._base.native import _core
-from mars_lidar._base.types import FloatArray, IndexArray
+from mars_lidar._base.types import FloatArray, IndexArray, NDArray
 from mars_lidar.engines.engine import Engine, Task, draw_pixels, stage
 from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.engines.poisson import PoissonEngine

@@ -9,9 +9,8 @@ from functools import lru_cache
 from hashlib import blake2b
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mars_lidar._base.types import FloatArray, IndexArray
+from mars_lidar._base.types import FloatArray, IndexArray, NDArray
 from mars_lidar.engines.tolerances import TOL
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.pulse import Pulse

@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mars_lidar._base.types import FloatArray, IndexArray
+from mars_lidar._base.types import FloatArray, IndexArray, NDArray
 from mars_lidar.engines.engine import Interpolation, Outside
 from mars_lidar.engines.pixels import Alignment, Group, groups, single_return
 from mars_lidar.engines.synthesis import Batch, CountLaws, RoundedGaussian, Run

@@ -16,10 +16,9 @@ from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mars_lidar._base.native import _core
-from mars_lidar._base.types import FloatArray, IndexArray, Progress
+from mars_lidar._base.types import FloatArray, IndexArray, NDArray, Progress
 from mars_lidar.engines.engine import Task
 from mars_lidar.engines.pixels import Alignment
 from mars_lidar.engines.tolerances import TOL

@@ -15,10 +15,9 @@ from typing import TYPE_CHECKING, Any, Literal
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mars_lidar._base import checks
-from mars_lidar._base.types import FloatArray, IndexArray, Progress
+from mars_lidar._base.types import FloatArray, IndexArray, NDArray, Progress
 from mars_lidar.engines.engine import Engine, Task
 from mars_lidar.engines.pixels import Alignment, single_return
 from mars_lidar.engines.synthesis import Batch, CountLaws, Run, Tabulated

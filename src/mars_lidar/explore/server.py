@@ -17,9 +17,8 @@ from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mars_lidar._base.types import FloatArray
+from mars_lidar._base.types import FloatArray, NDArray
 from mars_lidar.instrument.effects import LIGHT_EFFECTS
 from mars_lidar.instrument.pulse import GaussianPulse
 from mars_lidar.instrument.system import System

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import constructed_by_name
 from mars_lidar._base.cached import cached_property
-from mars_lidar._base.types import FloatArray
+from mars_lidar._base.types import ArrayLike, FloatArray
 from mars_lidar.instrument.pulse import FWHM_PER_SIGMA, SampledPulse, shape_from_dict
 
 

@@ -5,12 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.files import beside, check_target
-from mars_lidar._base.types import FloatArray
+from mars_lidar._base.types import ArrayLike, FloatArray
 
 
 @checked

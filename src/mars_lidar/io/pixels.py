@@ -15,11 +15,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mars_lidar._base.files import FileError, check_claim, check_source, read_npy, reading
 from mars_lidar._base.imports import needed
-from mars_lidar._base.types import FloatArray
+from mars_lidar._base.types import FloatArray, NDArray
 
 if TYPE_CHECKING:
     from PIL.Image import Image

@@ -31,12 +31,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.files import FileError, check_claim, npy_header, open_npz, reading
 from mars_lidar._base.hdf5 import open_hdf5
-from mars_lidar._base.types import FloatArray
+from mars_lidar._base.types import FloatArray, NDArray
 from mars_lidar.io import pixels
 from mars_lidar.io.named_arrays import mat_arrays
 from mars_lidar.scene.scene import LayeredScene, Scene

@@ -10,13 +10,12 @@ from pathlib import Path
 from typing import Any, Literal, Unpack
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import manifest
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.progress import callback_of, of_part, span
 from mars_lidar._base.tolerances import TOL
-from mars_lidar._base.types import Progress
+from mars_lidar._base.types import ArrayLike, NDArray, Progress
 from mars_lidar.engines import ENGINES, Engine, EngineOptions, check_detector, find_engine
 from mars_lidar.engines.engine import given
 from mars_lidar.engines.feedback import expected_registrations

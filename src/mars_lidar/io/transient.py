@@ -6,12 +6,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.files import NpyFile, UnchangedFile, check_data, reading
 from mars_lidar._base.hdf5 import open_hdf5
-from mars_lidar._base.types import FloatArray
+from mars_lidar._base.types import FloatArray, NDArray
 from mars_lidar.io.capture import CAPTURE_SUFFIXES, Capture, capture_in
 from mars_lidar.io.named_arrays import NamedArrays, open_arrays
 from mars_lidar.io.store import OnDisk, values

@@ -21,10 +21,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mars_lidar._base import checks
-from mars_lidar._base.types import FloatArray
+from mars_lidar._base.types import FloatArray, NDArray
 from mars_lidar.instrument.pulse import GaussianPulse, Pulse
 from mars_lidar.instrument.system import System
 from mars_lidar.io.scene_files import SceneFile, scan

@@ -7,14 +7,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked, checked_with_masks, constructed_by_name
 from mars_lidar._base.display import as_html
 from mars_lidar._base.imports import late
 from mars_lidar._base.resources import check_memory
-from mars_lidar._base.types import FloatArray, IndexArray
+from mars_lidar._base.types import ArrayLike, FloatArray, IndexArray, NDArray
 from mars_lidar.instrument.system import System
 from mars_lidar.light.tolerances import TOL
 

@@ -7,11 +7,10 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.resources import check_memory
-from mars_lidar._base.types import FloatArray
+from mars_lidar._base.types import FloatArray, NDArray
 from mars_lidar.instrument.system import SPEED_OF_LIGHT_M_PER_NS, System
 from mars_lidar.light.flux import Flux, StoredFlux
 from mars_lidar.light.tolerances import TOL

@@ -13,14 +13,13 @@ from functools import lru_cache
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.cached import cached_property
 from mars_lidar._base.resample import area_mean, new_size, window
 from mars_lidar._base.resources import check_memory
-from mars_lidar._base.types import FloatArray
+from mars_lidar._base.types import ArrayLike, FloatArray, NDArray
 from mars_lidar.instrument.pulse import Pulse
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux, StoredFlux

@@ -9,10 +9,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from numpy.typing import ArrayLike
-
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.types import FloatArray
+from mars_lidar._base.types import ArrayLike, FloatArray
 from mars_lidar.instrument.system import System
 from mars_lidar.reconstruction.method import RateMethod
 

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -12,7 +13,7 @@ import numpy as np
 
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
-from mars_lidar.reconstruction.histogram_record import recording_of
+from mars_lidar.reconstruction.histogram_record import recording_of, relative_width
 
 if TYPE_CHECKING:
     from mars_lidar._base.native import _core
@@ -20,7 +21,8 @@ if TYPE_CHECKING:
 FALSE_ALARM = 1e-3  # of `Flags.MISFIT`, a pixel
 COLUMNS = 5  # of the native statistics of a pixel
 _DEAD_TIME = 1.2  # factor of the dead times, longer and shorter, ...
-_WIDTH = 1.1  # ... and of the pulse whose score is computed
+_WIDTH = 1.1  # ... and of the pulse whose score is computed, ...
+_BIN = 0.5  # ... which has the width of so much of a bin in addition: less cannot be seen
 
 
 def tested_recordings(system: System) -> list[_core.HistogramRecord]:
@@ -33,7 +35,7 @@ def tested_recordings(system: System) -> list[_core.HistogramRecord]:
     return [
         recording_of(system, longer=_DEAD_TIME),
         recording_of(system, longer=1.0 / _DEAD_TIME),
-        recording_of(system, wider=_WIDTH),
+        recording_of(system, wider=math.hypot(_WIDTH, _BIN / (system.bins * relative_width(system)))),
     ]
 
 

@@ -6,12 +6,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.progress import callback_of
 from mars_lidar._base.resources import thread_count
-from mars_lidar._base.types import Progress
+from mars_lidar._base.types import ArrayLike, NDArray, Progress
 from mars_lidar.instrument.system import System
 from mars_lidar.reconstruction.histogram_record import recording_of
 

@@ -7,10 +7,9 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mars_lidar._base.native import _core
-from mars_lidar._base.types import FloatArray
+from mars_lidar._base.types import FloatArray, NDArray
 from mars_lidar.instrument.pulse import GaussianPulse
 from mars_lidar.instrument.system import System
 from mars_lidar.reconstruction.histogram_record import recording_of, relative_width

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 from statistics import NormalDist
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import arguments, checks
-from mars_lidar._base.types import FloatArray
+from mars_lidar._base.types import ArrayLike, FloatArray, NDArray
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.reconstruction.fit_quality import COLUMNS, FALSE_ALARM, quality_of, tested_recordings

@@ -10,10 +10,9 @@ from enum import IntFlag
 from typing import Any, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
-from mars_lidar._base.types import FloatArray
+from mars_lidar._base.types import ArrayLike, FloatArray, NDArray
 from mars_lidar.instrument.detector import Mode
 from mars_lidar.instrument.effects import LIGHT_EFFECTS
 from mars_lidar.instrument.system import System

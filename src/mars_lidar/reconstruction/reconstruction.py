@@ -6,12 +6,11 @@ from dataclasses import dataclass, fields, replace
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import explained
 from mars_lidar._base.display import as_html, brief
-from mars_lidar._base.types import FloatArray, Progress
+from mars_lidar._base.types import ArrayLike, FloatArray, NDArray, Progress
 from mars_lidar.instrument.system import System
 from mars_lidar.reconstruction.centroid import Centroid
 from mars_lidar.reconstruction.coates import Coates, GeneralisedCoates

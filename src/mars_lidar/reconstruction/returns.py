@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mars_lidar._base.display import brief
-from mars_lidar._base.types import FloatArray
+from mars_lidar._base.types import FloatArray, NDArray
 from mars_lidar.instrument.system import System
 
 MOST_RETURNS = 8

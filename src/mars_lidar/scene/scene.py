@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked, checked_with_masks, constructed_by_name
@@ -20,7 +19,7 @@ from mars_lidar._base.display import as_html
 from mars_lidar._base.files import reading
 from mars_lidar._base.imports import late
 from mars_lidar._base.resample import area_mean, image_size, nearest, new_size, window
-from mars_lidar._base.types import FloatArray
+from mars_lidar._base.types import ArrayLike, FloatArray, NDArray
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.light.tolerances import TOL

@@ -22,13 +22,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.native import _core
 from mars_lidar._base.resources import check_memory
-from mars_lidar._base.types import FloatArray, IndexArray
+from mars_lidar._base.types import ArrayLike, FloatArray, IndexArray, NDArray
 from mars_lidar.instrument.detector import Mode, require_effects
 from mars_lidar.instrument.effects import LIGHT_EFFECTS
 from mars_lidar.instrument.pulse import SampledPulse

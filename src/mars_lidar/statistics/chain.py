@@ -22,12 +22,11 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
 from mars_lidar._base.display import brief
 from mars_lidar._base.native import _core
-from mars_lidar._base.types import FloatArray
+from mars_lidar._base.types import ArrayLike, FloatArray
 from mars_lidar.instrument.system import System
 from mars_lidar.instrument.tolerances import TOL as INSTRUMENT
 from mars_lidar.light.flux import Flux

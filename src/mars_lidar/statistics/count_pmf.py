@@ -12,10 +12,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mars_lidar._base.native import _core
-from mars_lidar._base.types import FloatArray, IndexArray
+from mars_lidar._base.types import FloatArray, IndexArray, NDArray
 from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.chain import ConvergenceError
 from mars_lidar.statistics.exposure import Settled, native_light, refined_moments, warm_history

@@ -19,14 +19,13 @@ from enum import IntEnum
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.display import brief
 from mars_lidar._base.native import _core
 from mars_lidar._base.resources import thread_count
-from mars_lidar._base.types import FloatArray, IndexArray, Progress
+from mars_lidar._base.types import FloatArray, IndexArray, NDArray, Progress
 from mars_lidar.instrument.detector import Mode
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System

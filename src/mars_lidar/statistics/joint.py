@@ -21,7 +21,6 @@ from copy import copy
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
@@ -29,7 +28,7 @@ from mars_lidar._base.cached import cached_property
 from mars_lidar._base.display import as_html, brief
 from mars_lidar._base.native import _core
 from mars_lidar._base.resources import check_memory
-from mars_lidar._base.types import FloatArray
+from mars_lidar._base.types import ArrayLike, FloatArray
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux

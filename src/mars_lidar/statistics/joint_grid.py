@@ -12,11 +12,10 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base.cached import cached_property
 from mars_lidar._base.native import _core
-from mars_lidar._base.types import FloatArray
+from mars_lidar._base.types import ArrayLike, FloatArray, NDArray
 from mars_lidar.statistics.cells import Cells, whole_bins
 from mars_lidar.statistics.chain import ConvergenceError
 from mars_lidar.statistics.tolerances import TOL

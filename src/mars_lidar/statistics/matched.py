@@ -7,11 +7,10 @@ criterion for its accuracy.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base.native import _core
 from mars_lidar._base.resources import thread_count
-from mars_lidar._base.types import FloatArray, IndexArray
+from mars_lidar._base.types import ArrayLike, FloatArray, IndexArray, NDArray
 from mars_lidar.statistics.count_pmf import Pmf
 from mars_lidar.statistics.tolerances import TOL
 
@@ -57,34 +56,6 @@ def matched_pmf(cumulants: ArrayLike, *, threads: int | None = None) -> list[Pmf
     flat = np.empty(int(start[-1]))
     _core.matched_pmf(cumulants=given, first=first, start=start, out=flat, threads=team)
     return [Pmf(int(first[k]), flat[start[k] : start[k + 1]].copy(), TOL.matched_outside) for k in range(first.size)]
-
-
-def matched_counts(cumulants: ArrayLike, uniform: ArrayLike, *, threads: int | None = None) -> IndexArray:
-    """Counts drawn by inversion from the laws of `matched_pmf`, bit for bit as the engines draw them.
-
-    Parameters
-    ----------
-    cumulants
-        (cells, 4), as `matched_pmf`.
-    uniform
-        (cells, draws) numbers in (0, 1).
-    threads
-        As `matched_pmf`.
-
-    Returns
-    -------
-    NDArray
-        (cells, draws) int64, non-decreasing in `uniform`.
-    """
-    given, team = _checked(cumulants), thread_count(threads)
-    u = np.ascontiguousarray(uniform, dtype=np.float64)
-    if u.ndim != 2 or u.shape[0] != given.shape[0]:
-        raise ValueError(f"uniform must be of shape ({given.shape[0]}, draws), got {u.shape}")
-    if not ((u > 0.0) & (u < 1.0)).all():
-        raise ValueError(f"uniform must be in (0, 1), got {u[~((u > 0.0) & (u < 1.0))][0]:g}")
-    out = np.empty(u.shape, np.int64)
-    _core.matched_draw(cumulants=given, uniform=u, out=out, threads=team)
-    return out
 
 
 def trusted(cumulants: ArrayLike, *, threads: int | None = None) -> NDArray[np.bool_]:

@@ -10,9 +10,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mars_lidar._base.types import FloatArray
+from mars_lidar._base.types import FloatArray, NDArray
 from mars_lidar.statistics.cells import Cells, photons_before
 from mars_lidar.statistics.chain import ConvergenceError
 from mars_lidar.statistics.count_pmf import Pmf

@@ -12,10 +12,9 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mars_lidar._base.cached import cached_property
-from mars_lidar._base.types import FloatArray
+from mars_lidar._base.types import FloatArray, NDArray
 from mars_lidar.instrument.effects import TIMING_EFFECTS, code_edges
 from mars_lidar.instrument.system import System
 from mars_lidar.statistics.cells import Cells

@@ -14,11 +14,10 @@ from itertools import pairwise
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base.native import _core
 from mars_lidar._base.progress import of_part
-from mars_lidar._base.types import FloatArray, IndexArray, Progress
+from mars_lidar._base.types import ArrayLike, FloatArray, IndexArray, NDArray, Progress
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux, broadcast
 from mars_lidar.statistics.cells import Cells, cell_name, default_bins, flat

@@ -11,11 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mars_lidar._base.files import beside, check_target, whole
 from mars_lidar._base.hdf5 import ForgivingFile, open_hdf5, seal
-from mars_lidar._base.types import FloatArray
+from mars_lidar._base.types import FloatArray, NDArray
 from mars_lidar._version import __version__
 from mars_lidar.instrument.system import System
 

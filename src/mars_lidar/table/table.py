@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
@@ -25,7 +24,7 @@ from mars_lidar._base.display import brief
 from mars_lidar._base.files import reading, reason
 from mars_lidar._base.progress import callback_of, of_part
 from mars_lidar._base.resources import check_memory, thread_count
-from mars_lidar._base.types import FloatArray, Progress
+from mars_lidar._base.types import ArrayLike, FloatArray, NDArray, Progress
 from mars_lidar._version import __version__
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux

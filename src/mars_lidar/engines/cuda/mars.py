@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mars_lidar._base.native import _core
-from mars_lidar._base.types import FloatArray, IndexArray
+from mars_lidar._base.types import FloatArray, IndexArray, NDArray
 from mars_lidar.engines.cuda.kernels import MARS_LAWS, mars_histograms, overflow
 from mars_lidar.engines.cuda.machine import Cuda
 from mars_lidar.engines.engine import Task, part_of

@@ -333,14 +333,18 @@ class GridCheck {
             MARS_VECTORS
             for (int i = 0; i < kJudged; ++i) old[at + i] = old[at + kJudged + i] + p[i] * y[at + i];
         }
-        alignas(64) double moved[kJudged];
+        alignas(64) double moved[kJudged], before[kJudged] = {};
         for (int sweep = 0; sweep < kSweeps; ++sweep) {
             adjoint_sweep<double, kJudged, kJudged>(grid, rates, old, fresh, y, moved);
             std::swap(old, fresh);
-            double most = 0.0;
-            for (int i = 0; i < kJudged; ++i)
-                if (check_.sweeps[i] <= kSweeps && moved[i] > most) most = moved[i];
-            if (most <= kStillAdjoint) break;
+            bool still = true;
+            for (int i = 0; i < kJudged; ++i) {  // a move, and all that would follow it at the rate of the last two
+                const double step = moved[i], ahead = before[i] - step;
+                still = still && (check_.sweeps[i] > kSweeps ||
+                                  (step <= kStillAdjoint && (sweep == 0 || step * step <= kStillAdjoint * ahead)));
+                before[i] = step;
+            }
+            if (still) break;
         }
         auto value = [&](int32_t j) { return y + static_cast<int64_t>(j) * kJudged; };
         alignas(64) double re[kJudged], then[kJudged];

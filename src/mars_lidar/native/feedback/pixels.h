@@ -8,8 +8,6 @@ namespace mars {
 inline namespace MARS_LEVEL {
 namespace {
 
-// Most sweeps of the mean and of the adjoint, and of integers in one lap.
-constexpr int kMeanSweeps = 240, kIntegerSweeps = 120;
 constexpr double kSettled = 0.04;    // a move of the history that ends a lane, in standard deviations of the count
 constexpr double kMeanError = 8e-6;  // of the mean per period, or of a count: float32 sums, and the last sweep's change
 constexpr float kSlowest =
@@ -170,11 +168,10 @@ class BatchPixels {
         bool some = grid_.laps > 1;
         for (int i = 0; i < kTeam; ++i) {
             some = some || fewest_[i] < kFewestArmed || rate_[i] > kLinearFrom;
-            float once = rate_[i];
-            for (int32_t k = 1; k < grid_.laps; ++k) once *= rate_[i];
-            // until what rounding did to the first history is forgotten to 3 %
+            // until what rounding did to the first history is forgotten to 3 %, as several laps do in one sweep
             least_[i] = 1;
-            for (float left = once; left > 0.03f && least_[i] < kIntegerSweeps / 2; left *= once) ++least_[i];
+            if (grid_.laps > 1) continue;
+            for (float left = rate_[i]; left > 0.03f && least_[i] < kIntegerSweeps / 2; left *= rate_[i]) ++least_[i];
         }
         if (!some) return;
         if (grid_.whole > 0) {

@@ -35,12 +35,9 @@ struct ArmedPasses {
         arm(r);
     }
 
-    // Of the same histogram, recorded otherwise.
-    void set(const HistogramRecord& r, const ArmedPasses& other) {
-        count = other.count;
-        before = other.before;
-        total = other.total;
-        arm(r);
+    // Of a histogram that need not be whole.
+    void set(const HistogramRecord& r, const std::vector<double>& histogram) {
+        set(r, {histogram.data(), CountRows::Type::kDouble, r.bins}, 0);
     }
 
  private:

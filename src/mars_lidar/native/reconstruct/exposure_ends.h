@@ -13,7 +13,7 @@ namespace mars {
 
 class ExposureEnds {
  public:
-    static constexpr int kMost = 5;       // possible numbers of passes
+    static constexpr int kMost = 33;      // possible numbers of passes, or of groups of them that follow each other
     static constexpr double kFew = 50.0;  // passes at the pulse, for each that is uncertain, above which it is nothing
 
     // For a pulse around `delay`; empty (`count` 0) where the numbers do not matter, or are too many.
@@ -29,16 +29,18 @@ class ExposureEnds {
         first = ((first % r.bins) + r.bins) % r.bins;
         const double turn = delay - std::floor(delay);
         const int64_t at = std::min(static_cast<int64_t>(turn * n), r.bins - 1);
-        double one[kMost + 1];
-        const int most = numbers(r, passes, at, one);
+        double one[kMost];
+        int64_t together;
+        const int most = numbers(r, passes, at, r.stationary ? kMost / 2 : kMost - 1, one, &together);
         const int possible = r.stationary ? 2 * most + 1 : most + 1;
-        if (most == 0 || possible > kMost) return;
+        if (most == 0) return;
+        const double group = static_cast<double>(together);
         double fewest = HUGE_VAL;
         for (int64_t k = 0; k < length; ++k) {
             const int64_t j = (first + k) % r.bins;
             fewest = std::min(fewest, passes.raw[j] + passes.rearmed[j]);
         }
-        if (fewest > kFew * most) return;
+        if (fewest > kFew * most * group) return;
         // before a stationary exposure as after it, independent of each other: the difference counts
         double chance[kMost] = {}, mean = 0.0;
         if (r.stationary) {
@@ -48,13 +50,14 @@ class ExposureEnds {
             std::copy(one, one + possible, chance);
             for (int c = 0; c < possible; ++c) mean += c * chance[c];
         }
-        const double lowest = r.stationary ? -most : 0.0, slack = r.fraction > 0.0 ? 1.0 : 0.5;
+        const double lowest = r.stationary ? -most : 0.0, slack = (r.fraction > 0.0 ? 1.0 : 0.5) + 0.5 * (group - 1.0);
         for (int c = 0; c < possible; ++c) {
-            const double move = lowest + c - mean;
+            const double move = (lowest + c - mean) * group;
             if (!(chance[c] > 0.0) || !can_be(r, passes, move, slack)) continue;
             shift[count] = move;
             log_chance[count++] = std::log(chance[c]);
         }
+        everywhere = r.whole > 0;
         if (count > 0) set_choices(r, passes);
     }
 
@@ -71,42 +74,45 @@ class ExposureEnds {
     const double* choices(int64_t k) const { return choices_.data() + k * kMost; }
 
     int count = 0;
+    bool everywhere = false;       // whether the other bins share the passes: dead times above a period
     double low = 0.0, high = 0.0;  // what is covered, from within its first bin to within its last, in periods
     std::array<double, kMost> shift{}, log_chance{};
 
  private:
-    // Chances of 0, 1 .. passes of bin `at` after the exposure that a registration within it blinds; returns the most.
-    // Of the last t_d at most one registration is left; the pass i periods after the end is blind with the chance that
-    // it fell into the last t_d - i - at / n periods.
-    static int numbers(const HistogramRecord& r, const ArmedPasses& passes, int64_t at, double* chance) {
+    // Chances of 0, 1 .. passes of bin `at` after the exposure that a registration within it blinds, or of groups of so many
+    // `together`, at most `limit` after the first; returns the last. Of the last t_d at most one registration is left; the
+    // pass i periods after the end is blind with the chance that it fell into the last t_d - i - at / n periods.
+    static int numbers(const HistogramRecord& r, const ArmedPasses& passes, int64_t at, int limit, double* chance,
+                       int64_t* together) {
         const int64_t n = r.bins;
-        double reached[kMost + 1];
-        int most = 0;
-        const double periods = static_cast<double>(r.cycles);
-        if (r.synchronous) {
-            if (r.whole >= kMost) return kMost;
-            const double edge = static_cast<double>(n - r.shift) - r.fraction;
-            const bool late = r.shift > 0 || r.fraction > 0.0;
-            for (int64_t i = 0; i < r.whole + (late ? 1 : 0); ++i) {
-                double sum = passes.total * static_cast<double>(std::max<int64_t>(r.whole - i, 0));
-                for (int64_t j = static_cast<int64_t>(edge); late && j < n; ++j)
-                    sum += passes.count[j] * std::clamp(static_cast<double>(j + 1) - edge, 0.0, 1.0);
-                reached[most++] = std::min(sum / periods, 1.0);
-            }
-        } else {
-            for (int64_t i = 0; i <= r.whole + 1; ++i) {
+        const double periods = static_cast<double>(r.cycles), edge = static_cast<double>(n - r.shift) - r.fraction;
+        const bool late = r.shift > 0 || r.fraction > 0.0;
+        double last = 0.0;  // registrations of the part of the period after which one more is lost
+        for (int64_t j = static_cast<int64_t>(edge); r.synchronous && late && j < n; ++j)
+            last += passes.count[j] * std::clamp(static_cast<double>(j + 1) - edge, 0.0, 1.0);
+        const auto more_than = [&](int64_t i) {
+            double sum;
+            if (r.synchronous) {
+                sum =
+                    passes.total * static_cast<double>(std::max<int64_t>(r.whole - i, 0)) + (i <= r.whole ? last : 0.0);
+            } else {
                 const int64_t length = (r.whole - i) * n + r.shift - at;  // of that part, in bins, and `fraction`
-                if (length < 0) break;
-                if (most == kMost) return kMost;
+                if (length < 0) return 0.0;
                 const int64_t rest = n - length % n;  // the last of its bins that is whole begins here
-                double sum = passes.total * static_cast<double>(length / n) + passes.total - passes.before[rest];
+                sum = passes.total * static_cast<double>(length / n) + passes.total - passes.before[rest];
                 sum += r.fraction * passes.count[rest - 1];
-                reached[most++] = std::min(sum / periods, 1.0);
             }
+            return std::min(sum / periods, 1.0);
+        };
+        int64_t most = r.whole + 2;
+        while (most > 0 && !(more_than(most - 1) > 0.0)) --most;
+        *together = most / (limit + 1) + 1;
+        const int groups = static_cast<int>(most / *together);
+        for (int c = 0; c <= groups; ++c) {
+            const double above = c == 0 ? 1.0 : more_than(c * *together - 1);
+            chance[c] = std::max(above - (c == groups ? 0.0 : more_than((c + 1) * *together - 1)), 0.0);
         }
-        for (int c = 0; c <= most; ++c)
-            chance[c] = std::max((c == 0 ? 1.0 : reached[c - 1]) - (c == most ? 0.0 : reached[c]), 0.0);
-        return most;
+        return groups;
     }
 
     // No bin registers more often than it was passed.

@@ -1,10 +1,11 @@
 // Goodness of fit of a pixel: does its histogram agree with the law of its own estimate?
 // docs/theory_reconstruction.md, section 8.
 //
-// Given the registrations before, those of a bin are the light there times its armed time. What a histogram has beyond
-// that, h - l t, is a martingale (Andersen, Borgan, Gill, Keiding, Statistical models based on counting processes, 1993),
-// uncorrelated from bin to bin, of variance E h. So a chi-square of bins pooled to cells needs no covariance, and the
-// score of a change of dead time or pulse is a weighted sum over bins.
+// Given the registrations before, those of a bin are a binomial number of its armed passes, of mean m (R7). What a
+// histogram has beyond that, h - m, is a martingale (Andersen, Borgan, Gill, Keiding, Statistical models based on counting
+// processes, 1993), uncorrelated from bin to bin. So a chi-square of bins pooled to cells needs no covariance, and the
+// score of a change of dead time or pulse is a weighted sum over bins. The weights are those of the expected histogram:
+// the observed one would be correlated with what it is weighted by.
 #pragma once
 #include <algorithm>
 #include <array>
@@ -50,15 +51,17 @@ class FitQuality {
     explicit FitQuality(const QualityJob& job)
         : job_(job),
           bins_(job.recording.bins),
+          typical_(bins_),
           other_(bins_),
-          time_(bins_),
-          other_time_(bins_),
-          rate_(bins_),
+          mean_(bins_),
+          variance_(bins_),
+          slope_(bins_),
+          fired_(bins_),
           weight_(bins_),
           residual_(bins_),
           change_(bins_),
           share_(bins_),
-          slope_(bins_),
+          moved_(bins_),
           wider_(bins_),
           reached_(bins_) {}
 
@@ -69,61 +72,89 @@ class FitQuality {
         out[1] = 0.0;
         if (!std::isfinite(background)) return;
         const bool lit = signal > 0.0 && std::isfinite(delay);
-        const double total = expect(passes, signal, background, delay);
-        const int cells = static_cast<int>(std::min(total / kExpected, static_cast<double>(kCells)));
+        expect(passes, signal, background, delay);
+        double total = 0.0;
+        for (const double v : variance_) total += v;
+        const int cells = static_cast<int>(std::min(total / kVariance, static_cast<double>(kCells)));
         if (cells < kLeastCells) return;
+        const double hidden = hidden_passes(passes.total);
+        double armed = 0.0;
+        for (const double a : passes.armed) armed += a;
+        if (hidden > kMostHidden * kMostHidden * armed * armed / static_cast<double>(bins_ * bins_)) return;
         int used;
-        out[0] = chi_square(passes.count, total, cells, &used);
+        out[0] = chi_square(passes.count, total, cells, hidden, &used);
         out[1] = used - (lit ? 3 : 1);
-        set_tangent(passes, lit);
+        for (int64_t j = 0; j < bins_; ++j) residual_[j] = passes.count[j] - mean_[j];
+        typical_.set(job_.recording, mean_);
+        set_law(typical_);
+        set_tangent(lit, hidden);
         if (tests_dead_time()) {
-            out[2] = dead_time_score(passes, job_.longer);
-            out[3] = dead_time_score(passes, job_.shorter);
+            out[2] = dead_time_score(job_.longer);
+            out[3] = dead_time_score(job_.shorter);
         }
         if (lit) out[4] = width_score();
     }
 
-    // Registrations that are expected in each bin (bins); returns their sum.
-    double expect(const ArmedPasses& passes, double signal, double background, double delay) {
-        std::fill(rate_.begin(), rate_.end(), background / static_cast<double>(bins_));
-        for (const int64_t j : pulse_) share_[j] = slope_[j] = wider_[j] = reached_[j] = 0;
+    // Registrations that are expected in each bin (bins), given those before.
+    void expect(const ArmedPasses& passes, double signal, double background, double delay) {
+        for (const int64_t j : pulse_) share_[j] = moved_[j] = wider_[j] = reached_[j] = 0;
         pulse_.clear();
-        if (signal > 0.0 && std::isfinite(delay)) set_pulse(signal, delay);
-        set_time(passes, job_.recording, time_);
-        return sums_of<1>(bins_, [&](int64_t j) {
-            change_[j] = rate_[j] * time_[j];
-            return std::array<double, 1>{change_[j]};
-        })[0];
+        signal_ = signal > 0.0 && std::isfinite(delay) ? signal : 0.0;
+        flat_ = background / static_cast<double>(bins_);
+        if (signal_ > 0.0) set_pulse(delay);
+        set_law(passes);
     }
-    const std::vector<double>& expected() const { return change_; }
+    const std::vector<double>& expected() const { return mean_; }
 
  private:
     static constexpr int kCells = 64;               // of a pixel, at most
     static constexpr int kLeastCells = 6;           // of which three are taken up by the estimates
-    static constexpr double kExpected = 8.0;        // registrations of a cell, at least, for the law of chi-square
+    static constexpr double kVariance = 8.0;        // of a cell, registrations, at least: for the law of chi-square
     static constexpr double kLeastVariance = 1e-9;  // of a bin that was never armed
     static constexpr double kRidge = 1e-9;          // of the scaled normal equations, where two estimates say the same
+    // Of a change's variance, what the estimates leave at least: less is rounding, and says nothing of the change.
+    static constexpr double kLeft = 1e-6;
+    // Of the armed passes, what the ends of the exposure hide at most (standard deviation): the tests are linear in it.
+    static constexpr double kMostHidden = 0.5;
 
     // Whether both change what is blind by registrations of other bins alone: the score of what a bin's own number
     // decides has a mean.
     bool tests_dead_time() const { return !job_.recording.below_bin() && !job_.shorter.below_bin(); }
 
-    void set_time(const ArmedPasses& passes, const HistogramRecord& recording, std::vector<double>& time) const {
-        if (recording.below_bin()) {
-            time = passes.armed;
+    // Photons per period in bin j.
+    double light(int64_t j) const { return flat_ * job_.recording.share(j) + signal_ * share_[j]; }
+
+    // Mean of each bin's registrations, their variance and the mean's derivative by the bin's photons.
+    void set_law(const ArmedPasses& passes) {
+        const double *armed = passes.armed.data(), *rearmed = passes.rearmed.data();
+        double *mean = mean_.data(), *variance = variance_.data(), *slope = slope_.data(), *fired = fired_.data();
+        if (job_.recording.below_bin()) {
+            for (int64_t j = 0; j < bins_; ++j) {
+                slope[j] = armed[j];
+                mean[j] = variance[j] = light(j) * armed[j];
+            }
             return;
         }
-        const double *armed = passes.armed.data(), *rearmed = passes.rearmed.data(), *count = passes.count.data();
-        double* __restrict const to = time.data();
-        for (int64_t j = 0; j < bins_; ++j) {
-            const double here = armed[j] + 0.5 * (rearmed[j] - count[j]);
-            to[j] = here > 0.0 ? here : 0.0;
+        const auto set = [=](int64_t j, const Pass& pass) {
+            const Expected e(pass, armed[j], rearmed[j]);
+            const double all = armed[j] + rearmed[j];
+            mean[j] = e.mean;
+            slope[j] = e.slope;
+            fired[j] = pass.fired;
+            variance[j] = all > 0.0 ? e.mean * e.silent / all : 0.0;
+        };
+        const Pass flat(flat_, true);
+        for (int64_t j = 0; j < bins_; ++j) set(j, flat);
+        if (job_.recording.gated()) {
+            for (int64_t j = 0; j < bins_; ++j) set(j, Pass(light(j), true));
+        } else {
+            for (const int64_t j : pulse_) set(j, Pass(light(j), true));
         }
     }
 
     // Bins that the pulse or the wider one reaches, with its energy, its slope by the delay, and what the wider one has
     // more.
-    void set_pulse(double signal, double delay) {
+    void set_pulse(double delay) {
         const auto reach = [&](int64_t j) {
             if (!reached_[j]) pulse_.push_back(j);
             reached_[j] = true;
@@ -138,69 +169,93 @@ class FitQuality {
         for_pulse_bins(job_.recording, delay, pulse.low, pulse.low + pulse.span(),
                        [&](int64_t, int64_t j, double s, double ds) {
                            reach(j);
-                           rate_[j] += signal * s;
                            share_[j] = s;
-                           slope_[j] = ds;
+                           moved_[j] = signal_ * ds;
                        });
-        for (const int64_t j : pulse_) wider_[j] -= share_[j];
+        for (const int64_t j : pulse_) wider_[j] = signal_ * (wider_[j] - share_[j]);
     }
 
-    // Pearson's, over cells of about equal expectation.
-    double chi_square(const std::vector<double>& count, double total, int cells, int* used) const {
-        double h[kCells] = {}, e[kCells] = {}, below = 0.0, sum = 0.0;
+    // Pearson's, over cells of about equal variance, whose excesses share the hidden passes.
+    double chi_square(const std::vector<double>& count, double total, int cells, double hidden, int* used) const {
+        double h[kCells] = {}, v[kCells] = {}, f[kCells] = {}, below = 0.0, sum = 0.0;
         const double scale = static_cast<double>(cells) / total;
-        const double *registered = count.data(), *expected = change_.data();
+        const double *registered = count.data(), *expected = mean_.data(), *variance = variance_.data();
+        const double* fired = fired_.data();
         for (int64_t j = 0; j < bins_;) {
-            const int cell = std::min(static_cast<int>((below + 0.5 * expected[j]) * scale), cells - 1);
-            double here = 0.0, mean = 0.0;
+            const int cell = std::min(static_cast<int>((below + 0.5 * variance[j]) * scale), cells - 1);
+            double excess = 0.0, spread = 0.0, passes = 0.0;
             do {
-                here += registered[j];
-                mean += expected[j];
-                below += expected[j++];
-            } while (j < bins_ && (below + 0.5 * expected[j]) * scale < static_cast<double>(cell + 1));
-            h[cell] += here;
-            e[cell] += mean;
+                excess += registered[j] - expected[j];
+                spread += variance[j];
+                passes += fired[j];
+                below += variance[j++];
+            } while (j < bins_ && (below + 0.5 * variance[j]) * scale < static_cast<double>(cell + 1));
+            h[cell] += excess;
+            v[cell] += spread;
+            f[cell] += passes;
         }
+        double along = 0.0, own = hidden > 0.0 ? 1.0 / hidden : HUGE_VAL;
         *used = 0;
         for (int c = 0; c < cells; ++c) {
-            if (e[c] > 0.0) {
-                sum += (h[c] - e[c]) * (h[c] - e[c]) / e[c];
+            if (v[c] > 0.0) {
+                sum += h[c] * h[c] / v[c];
+                along += f[c] * h[c] / v[c];
+                own += f[c] * f[c] / v[c];
                 ++*used;
             } else if (h[c] > 0.0) {
                 sum = HUGE_VAL;
             }
         }
-        return sum;
+        return sum - along * along / own;
     }
 
-    // Normal equations of the estimates, and what their directions have of the residuals.
-    void set_tangent(const ArmedPasses& passes, bool lit) {
+    // Variance of the passes that the last registration blinds after the exposure (and from a stationary start one before
+    // it), which the histogram does not say: uniform up to the dead time, and rounded to whole passes by the phase.
+    double hidden_passes(double total) const {
+        const HistogramRecord& r = job_.recording;
+        if (r.below_bin()) return 0.0;
+        const double n = static_cast<double>(r.bins),
+                     dead = static_cast<double>(r.whole) + (static_cast<double>(r.shift) + r.fraction) / n;
+        const double chance = std::min(1.0, total * dead / static_cast<double>(r.cycles));
+        const double one = chance * (dead * dead / 3.0 - 0.25 * chance * dead * dead + 0.25);
+        return r.stationary ? 2.0 * one : one;
+    }
+
+    // Normal equations of the estimates and of the passes that the ends hide, which are of the known variance `hidden`, and
+    // what their directions have of the residuals.
+    void set_tangent(bool lit, double hidden) {
         free_[0] = free_[2] = lit;
-        const double *count = passes.count.data(), *expected = change_.data(), *time = time_.data();
+        free_[1] = true;
+        free_[3] = hidden > 0.0;
+        const double *variance = variance_.data(), *slope = slope_.data(), *fired = fired_.data();
         double *weight = weight_.data(), *residual = residual_.data();
-        const auto [flat, along] = sums_of<2>(bins_, [=](int64_t j) {
-            const double t = time[j];
-            weight[j] = 1.0 / std::max(expected[j], kLeastVariance);
-            residual[j] = (count[j] - expected[j]) * weight[j];
-            return std::array<double, 2>{t * t * weight[j], t * residual[j]};
+        const auto [flat, along, both, passes, missed] = sums_of<5>(bins_, [=](int64_t j) {
+            const double g = slope[j], p = fired[j], w = 1.0 / std::max(variance[j], kLeastVariance);
+            weight[j] = w;
+            residual[j] *= w;
+            return std::array<double, 5>{g * g * w, g * residual[j], g * p * w, p * p * w, p * residual[j]};
         });
-        double normal[3][3] = {}, taken[3] = {0.0, along, 0.0};
+        double normal[4][4] = {}, taken[4] = {0.0, along, 0.0, missed};
         normal[1][1] = flat;
+        normal[3][1] = both;
+        normal[3][3] = free_[3] ? passes + 1.0 / hidden : 0.0;
         for (const int64_t j : pulse_) {
-            const double t = time_[j], s = share_[j] * t, ds = slope_[j] * t, w = weight_[j];
+            const double g = slope_[j], s = share_[j] * g, ds = moved_[j] * g, p = fired_[j], w = weight_[j];
             normal[0][0] += s * s * w;
-            normal[1][0] += s * t * w;
+            normal[1][0] += s * g * w;
             normal[2][0] += s * ds * w;
-            normal[2][1] += ds * t * w;
+            normal[2][1] += ds * g * w;
             normal[2][2] += ds * ds * w;
+            normal[3][0] += p * s * w;
+            normal[3][2] += p * ds * w;
             taken[0] += s * residual_[j];
             taken[2] += ds * residual_[j];
         }
-        for (int a = 0; a < 3; ++a) {
+        for (int a = 0; a < 4; ++a) {
             free_[a] = free_[a] && normal[a][a] > 0.0;
             scale_[a] = free_[a] ? 1.0 / std::sqrt(normal[a][a]) : 0.0;
         }
-        for (int a = 0; a < 3; ++a) {
+        for (int a = 0; a < 4; ++a) {
             taken_[a] = taken[a] * scale_[a];
             for (int b = 0; b <= a; ++b)
                 normal_[a][b] = normal_[b][a] = normal[a][b] * scale_[a] * scale_[b] + (a == b ? kRidge : 0.0);
@@ -208,45 +263,54 @@ class FitQuality {
     }
 
     // Rao's score of a change of the expectation, what the estimates would take up left out: from the change's products
-    // with the estimates' directions, itself and the residuals.
+    // with the estimates' directions, itself and the residuals. NaN where the estimates take up all of it.
     double score(const double* own, double variance, double sum) const {
-        double scaled[3], along[3];
-        for (int a = 0; a < 3; ++a) scaled[a] = own[a] * scale_[a];
-        if (!solve<3>(normal_, scaled, free_, along)) return NAN;
-        for (int a = 0; a < 3; ++a) {
+        double scaled[4], along[4];
+        const double least = kLeft * variance;
+        for (int a = 0; a < 4; ++a) scaled[a] = own[a] * scale_[a];
+        if (!solve<4>(normal_, scaled, free_, along)) return NAN;
+        for (int a = 0; a < 4; ++a) {
             variance -= along[a] * scaled[a];
             sum -= along[a] * taken_[a];
         }
-        return sum / std::sqrt(std::max(variance, 1e-300));
+        return variance > least ? sum / std::sqrt(variance) : NAN;
     }
 
-    // Of a histogram with another dead time.
-    double dead_time_score(const ArmedPasses& passes, const HistogramRecord& recording) {
-        other_.set(recording, passes);
-        set_time(other_, recording, other_time_);
-        const double *rate = rate_.data(), *time = time_.data(), *other = other_time_.data(), *weight = weight_.data();
-        const double* residual = residual_.data();
+    // Of a histogram with another dead time: the passes of the expected histogram change, and the mean by what a pass gives.
+    double dead_time_score(const HistogramRecord& recording) {
+        other_.set(recording, mean_);
+        const double *armed = typical_.raw.data(), *rearmed = typical_.rearmed.data(), *slope = slope_.data();
+        const double *armed2 = other_.raw.data(), *rearmed2 = other_.rearmed.data();
+        const double *weight = weight_.data(), *residual = residual_.data(), *fired = fired_.data();
         double* change = change_.data();
-        const auto [along, variance, sum] = sums_of<3>(bins_, [=](int64_t j) {
-            const double d = rate[j] * (other[j] - time[j]), dw = d * weight[j];
-            change[j] = dw;
-            return std::array<double, 3>{time[j] * dw, d * dw, d * residual[j]};
-        });
-        double own[3] = {0.0, along, 0.0};
+        const Pass flat(flat_, true);
+        for (int64_t j = 0; j < bins_; ++j)
+            change[j] = (armed2[j] - armed[j]) * flat.fired + (rearmed2[j] - rearmed[j]) * flat.q;
         for (const int64_t j : pulse_) {
-            own[0] += share_[j] * time_[j] * change_[j];
-            own[2] += slope_[j] * time_[j] * change_[j];
+            const Pass pass(light(j), true);
+            change[j] = (armed2[j] - armed[j]) * pass.fired + (rearmed2[j] - rearmed[j]) * pass.q;
+        }
+        const auto [along, variance, sum, passes] = sums_of<4>(bins_, [=](int64_t j) {
+            const double d = change[j], dw = d * weight[j];
+            change[j] = dw;
+            return std::array<double, 4>{slope[j] * dw, d * dw, d * residual[j], fired[j] * dw};
+        });
+        double own[4] = {0.0, along, 0.0, passes};
+        for (const int64_t j : pulse_) {
+            own[0] += share_[j] * slope_[j] * change_[j];
+            own[2] += moved_[j] * slope_[j] * change_[j];
         }
         return score(own, variance, sum);
     }
 
     double width_score() const {
-        double own[3] = {}, variance = 0.0, sum = 0.0;
+        double own[4] = {}, variance = 0.0, sum = 0.0;
         for (const int64_t j : pulse_) {
-            const double d = wider_[j] * time_[j], dw = d * weight_[j];
-            own[0] += share_[j] * time_[j] * dw;
-            own[1] += time_[j] * dw;
-            own[2] += slope_[j] * time_[j] * dw;
+            const double g = slope_[j], d = wider_[j] * g, dw = d * weight_[j];
+            own[0] += share_[j] * g * dw;
+            own[1] += g * dw;
+            own[2] += moved_[j] * g * dw;
+            own[3] += fired_[j] * dw;
             variance += d * dw;
             sum += d * residual_[j];
         }
@@ -255,14 +319,16 @@ class FitQuality {
 
     const QualityJob job_;
     const int64_t bins_;
-    ArmedPasses other_;
-    std::vector<double> time_, other_time_, rate_;    // armed time and photons per period of each bin
-    std::vector<double> weight_, residual_, change_;  // 1 / variance, weighted h - l t, and what is tested
-    std::vector<double> share_, slope_, wider_;       // of the pulse; 0 but in the bins of `pulse_`
+    ArmedPasses typical_, other_;                     // of the expected histogram, as it was recorded and otherwise
+    double signal_ = 0.0, flat_ = 0.0;                // photons per period: S, and those of background in a bin
+    std::vector<double> mean_, variance_, slope_;     // of each bin's registrations; the slope by the bin's photons
+    std::vector<double> fired_;                       // chance that an armed pass registers in the bin
+    std::vector<double> weight_, residual_, change_;  // 1 / variance, weighted h - m, and what is tested
+    std::vector<double> share_, moved_, wider_;       // of the pulse: s, change with delay, width; 0 but in `pulse_`
     std::vector<int64_t> pulse_;
     std::vector<uint8_t> reached_;  // (bins) whether in `pulse_`
-    bool free_[3] = {true, true, true};
-    double normal_[3][3] = {}, scale_[3] = {}, taken_[3] = {};
+    bool free_[4] = {};             // S, B, delay, passes that the ends hide
+    double normal_[4][4] = {}, scale_[4] = {}, taken_[4] = {};
 };
 
 }  // namespace mars

@@ -159,7 +159,7 @@ class Maximizer {
         if (job_.less_bias && *flag == 0) correct(pixel, least, best);
         for (int k = 0; k < 3; ++k) out[k] = best.at[k];
         if (best.at[0] == 0.0) out[2] = NAN;
-        errors(best, out + 3);
+        errors(pixel, least, best, out + 3);
     }
 
     // Of the last histogram.
@@ -186,8 +186,9 @@ class Maximizer {
         fit.likelihood = there;
     }
 
-    // Standard errors: roots of the diagonal of the inverse information; NaN for what lies on its bound.
-    static void errors(const Fit& fit, double* out) {
+    // Standard errors: roots of the diagonal of the inverse information; NaN for what lies on its bound. Where that is B,
+    // the others move with what it may be above: its likelihood there, the others at their maximum, is a truncated normal.
+    void errors(const PixelLikelihood& pixel, double least, const Fit& fit, double* out) const {
         double known[3][3];
         known_information(fit.likelihood, fit.free, known);
         for (int k = 0; k < 3; ++k) {
@@ -195,6 +196,27 @@ class Maximizer {
             unit[k] = 1.0;
             if (fit.free[k] && solve<3>(known, unit, fit.free, column)) out[k] = std::sqrt(column[k]);
         }
+        if (fit.free[1] || !fit.free[0] || fit.at[1] > 2.0 * least) return;
+        const double step = 1e3 * least;  // one registration
+        const Likelihood there = pixel(fit.at[0], fit.at[1] + step, fit.at[2], ends_);
+        double change[3], move[3];  // of the slopes, and of the maxima of the others, by B
+        for (int k = 0; k < 3; ++k) change[k] = (there.gradient[k] - fit.likelihood.gradient[k]) / step;
+        if (!solve<3>(known, change, fit.free, move)) return;
+        double curvature = -change[1];
+        for (int k = 0; k < 3; ++k) curvature -= move[k] * change[k];
+        const double square = truncated_square(fit.likelihood.gradient[1], curvature);
+        for (int k = 0; k < 3; ++k) out[k] = std::sqrt(out[k] * out[k] + move[k] * move[k] * square);
+    }
+
+    // E x^2 of a density exp(slope x - curvature x^2 / 2) of x >= 0, slope < 0.
+    static double truncated_square(double slope, double curvature) {
+        if (!(curvature > 1e-3 * slope * slope)) return 2.0 / (slope * slope);
+        const double spread = 1.0 / std::sqrt(curvature), mean = slope / curvature, from = -mean / spread;
+        constexpr double kRootHalf = 0.70710678118654752,
+                         kDensity = 0.39894228040143268;  // 1 / sqrt(2), 1 / sqrt(2 pi)
+        const double beyond = 0.5 * std::erfc(from * kRootHalf);
+        const double mills = std::exp(-0.5 * from * from) * kDensity / beyond;
+        return mean * mean + spread * spread + mean * spread * mills;
     }
 
     const HistogramRecord& r_;

@@ -2,6 +2,7 @@
 // docs/theory_reconstruction.md, section 3. O(bins that the pulse reaches) per evaluation: the rest of the period enters by sums.
 #pragma once
 #include <cmath>
+#include <vector>
 
 #include "reconstruct/background_series.h"
 #include "reconstruct/bin_term.h"
@@ -37,6 +38,7 @@ class PixelLikelihood {
             const double share = r_.share(j);
             if (share <= 0.0) continue;
             count_ += passes_.count[j];
+            shares_of_bins_ += share;
             time_ += share * passes_.time(r_, j);
             if (r_.gated()) shares_ += passes_.count[j] * std::log(share);
         }
@@ -59,7 +61,8 @@ class PixelLikelihood {
     // With `ends`, mixed over what they leave of the bins that these cover. `whole`: bin by bin round the period.
     Likelihood operator()(double signal, double background, double delay, const ExposureEnds& ends,
                           bool whole = false) const {
-        Likelihood out, each[ExposureEnds::kMost];
+        Likelihood out;
+        std::vector<Likelihood> each(ends.count);
         const double flat = background / static_cast<double>(r_.bins);
         whole = whole || whole_ || (series_ && flat > 2.0 * BackgroundSeries::kMost);
         double low = r_.pulse.low, high = low + (whole ? 1.0 : r_.pulse.span());
@@ -68,7 +71,7 @@ class PixelLikelihood {
             high = std::max(high, ends.high - delay);
         }
         int64_t first = 0, seen = 0;
-        double count = count_, time = time_, shares = shares_;
+        double count = count_, time = time_, shares = shares_, bins = shares_of_bins_;
         for_pulse_bins(r_, delay, low, high, [&](int64_t i, int64_t j, double s, double ds) {
             if (i == 0) first = j;
             seen = i + 1;
@@ -77,6 +80,7 @@ class PixelLikelihood {
             const double h = passes_.count[j];
             count -= h;
             time -= share * passes_.time(r_, j);
+            bins -= share;
             if (r_.gated()) shares -= h * std::log(share);
             const double l = signal * s + flat * share;
             const double dl[3] = {s, share / static_cast<double>(r_.bins), signal * ds};
@@ -114,7 +118,15 @@ class PixelLikelihood {
             out.value += count * std::log(flat) + shares + sum;
             out.add(count / flat + slope, -curve, dl);
         }
-        if (ends.count > 0) mix(out, each, ends);
+        if (ends.count > 0) {
+            // a pass more in each bin outside, which registers as those that are counted
+            for (int c = 0; c < ends.count && ends.everywhere && !whole && time > 0.0; ++c) {
+                const double moved = ends.shift[c] * std::max(bins, 0.0);
+                each[c].value += std::max(count, 0.0) * std::log(std::max(1.0 + moved / time, 1e-9)) - flat * moved;
+                each[c].gradient[1] -= moved / static_cast<double>(r_.bins);
+            }
+            mix(out, each.data(), ends);
+        }
         return out;
     }
 
@@ -147,7 +159,7 @@ class PixelLikelihood {
 
     const HistogramRecord& r_;
     const ArmedPasses& passes_;
-    double count_ = 0.0, time_ = 0.0, shares_ = 0.0;
+    double count_ = 0.0, time_ = 0.0, shares_ = 0.0, shares_of_bins_ = 0.0;
     const BackgroundSeries* series_ = nullptr;
     bool whole_ = false;
 };

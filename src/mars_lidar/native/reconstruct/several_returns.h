@@ -45,7 +45,9 @@ class SeveralReturns {
             const double least = search_.least_gain(job_.false_alarm);
             if (hints_.empty() || hints_[0].gain < kTold * least) break;
             if (best.count == job_.most) {
-                if (hints_[0].gain > least) *flag |= kMoreReturns;
+                ReturnsPoint more;
+                if (best.count == kMostReturns ? hints_[0].gain > least : further(best, least, more))
+                    *flag |= kMoreReturns;
                 break;
             }
             ReturnsPoint next;

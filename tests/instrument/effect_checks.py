@@ -1,0 +1,49 @@
+"""What every effect of the detector is tested for: bits, means, and refusals where no law knows it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from harness import Case, check, flux_of, require
+from harness.check import EVERYTHING, INTERVALS
+from scipy import stats
+
+import mars_lidar as ml
+from mars_lidar import _core, statistics
+from mars_lidar.engines import ENGINES
+from mars_lidar.engines.exact import ExactEngine
+
+
+def exact_against_sequential(made: Case) -> None:
+    """Intervals of twilight pulses are all t_d, which the exact engine's phases resolve to 6e-8 of a period."""
+    twilight = made.system.detector.twilight_ns > 0.0
+    check(ENGINES["exact"], made, ENGINES["sequential"], EVERYTHING - ({INTERVALS} if twilight else set()))
+
+
+def mean_is(result: np.ndarray, expected: float, about: str) -> None:
+    """The mean of independent numbers is the expected one."""
+    z = (result.mean() - expected) / (result.std(ddof=1) / np.sqrt(result.size))
+    require({"mean": float(2 * stats.norm.sf(abs(z)))}, about)
+
+
+def exact_bits_do_not_depend(flux: ml.Flux, system: ml.System) -> None:
+    """On vector level, threads, and the part of the image; histograms are those of the timestamps."""
+    whole = ml.simulate(flux, system, seed=9, realizations=2)
+    for level in _core.levels():
+        assert np.array_equal(ml.simulate(flux, system, engine=ExactEngine(level), seed=9, realizations=2), whole)
+    assert np.array_equal(ml.simulate(flux, system, seed=9, realizations=2, threads=1), whole)
+    index = np.arange(flux.shape[1], 2 * flux.shape[1])
+    again = ml.simulate(flux[1:2], system, seed=9, first_realization=1, pixel_index=index)
+    assert np.array_equal(again[0], whole[1, 1:2])
+    times = ml.simulate_timestamps(flux, system, seed=9, realization=1)
+    assert np.array_equal(times.histogram(), whole[1])
+
+
+def has_no_law(system: ml.System, text: str) -> None:
+    """Every prediction, and every engine that draws from one, refuses it with `text`."""
+    for law in ("count_law", "exposure_moments", "joint_law", "mean_histogram", "registration_pdf"):
+        with pytest.raises(ValueError, match=text):
+            getattr(statistics, law)(ml.Flux(1.0, 1.0, 50.0), system)
+    for engine in ("mars", "renewal", "feedback", "auto", "poisson"):
+        with pytest.raises(ValueError, match=f"engine '{engine}' {text}"):
+            ml.simulate(flux_of(1.0, 1.0), system, engine=engine)

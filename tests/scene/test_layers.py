@@ -58,7 +58,7 @@ def test_bad_layers(tmp_path):
     for layers, message in (([], "1 to 16"), ([item] * 17, "1 to 16"), ([item, ml.Scene([[1.0]], 1.0)], "one shape")):
         with pytest.raises(ValueError, match=message):
             LayeredScene(layers)
-    for arguments, message in (
+    for arguments, name in (
         ((0.0, 0.1), "depth_m"),
         ((1.0, 2.0), "reflectivity"),
         ((1.0, 0.1, 0.0), "transmission"),

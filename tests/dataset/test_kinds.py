@@ -212,7 +212,7 @@ def test_training(tmp_path, of_transients):
 
 
 @pytest.mark.parametrize(
-    ("scene", "told"),
+    ("scene", "message"),
     [
         (
             {"transient": "x.npz", "path": "y"},

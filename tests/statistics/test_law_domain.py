@@ -348,7 +348,7 @@ def test_counts_far_from_zero_are_unwrapped_at_once():
 
 @pytest.mark.parametrize("law", [ml.count_law, ml.registration_pdf, mean_histogram, exposure_moments, ml.joint_law])
 @pytest.mark.parametrize(
-    ("change", "error", "told"),
+    ("change", "error", "message"),
     [
         ({"signal": math.nan}, ValueError, "signal must lie in"),
         ({"signal": -1e-9}, ValueError, "signal must lie in"),

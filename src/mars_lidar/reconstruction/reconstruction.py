@@ -248,7 +248,7 @@ def reconstruct(
     if isinstance(cube, Recorded):
         system, cube = cube.system if system is None else system, np.asarray(cube.histogram)
     if system is None:
-        raise TypeError("system must be given for an array of counts (a cube of mars_lidar.io.load carries its own)")
+        raise TypeError("system must be given for an array of counts (a cube of mars_lidar.io.load contains its own)")
     used = with_returns(find_method(method), returns)
     checks.choice("attenuation", attenuation, ATTENUATIONS)
     if level is not None:

@@ -196,8 +196,8 @@ def reconstruct(
         (..., bins) counts, whole numbers of any type, e.g. (realizations, H, W, bins) of `simulate`.
         Or a cube of `mars_lidar.io.load`, which contains its system.
     system
-        The system that recorded them. Flux is periodic, with the system's pulse. None: the system that the cube
-        carries.
+        The system that recorded them. Flux is periodic, with the system's pulse. None: the system of the
+        cube.
     method
         A name in `mars_lidar.reconstruction.METHODS` (default ``"maximum_likelihood"``; docs/reconstruction.md says
         what each assumes), or a `Method` with other settings. Each refuses detectors to which it does not apply.

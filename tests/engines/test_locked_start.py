@@ -53,8 +53,9 @@ def test_a_state_that_depends_on_the_switching_on_is_refused(signal: float):
         law = ml.mean_histogram(flux, system)
         assert np.abs(drawn - law).max() < 5.0 * np.sqrt(law.max() / 4000)
         return
-    with pytest.raises(ValueError, match=r"depends on when the detector was switched on.*start='armed'"):
-        ml.simulate(flux, system, seed=5)
+    for engine in ("exact", "sequential"):
+        with pytest.raises(ValueError, match=r"depends on when the detector was switched on.*start='armed'"):
+            ml.simulate(flux, system, engine=engine, seed=5)
     assert ml.simulate(flux, system.replace(start="armed"), seed=5).sum() > 0
 
 

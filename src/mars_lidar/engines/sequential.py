@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -33,10 +35,12 @@ class SequentialEngine(Engine):
 
     def histogram(self, task: Task, out: NDArray[Any]) -> None:
         """Every arrival at an armed pixel."""
+        _check_unique_start(task)
         _core.sequential_histogram(task.job, task.pulse, out, task.threads, task.progress)
 
     def counts(self, task: Task) -> NDArray[np.int64]:
         """The first of the two passes for timestamps."""
+        _check_unique_start(task)
         out = np.empty(task.items, np.int64)
         _core.sequential_counts(task.job, task.pulse, out, task.threads, None)
         return out
@@ -47,3 +51,13 @@ class SequentialEngine(Engine):
         _core.sequential_timestamps(task.job, task.pulse, *where, task.threads, task.progress)
         if task.system.detector.jitter is not None:
             records.sort()
+
+
+def _check_unique_start(task: Task) -> None:
+    """Refuse pixels whose stationary state depends on when the detector was switched on, as the exact engine does."""
+    detector = task.system.detector
+    if task.system.start != "stationary" or detector.mode != "nonparalyzable" or detector.crosstalk is not None:
+        return
+    brief = replace(task, system=task.system.replace(cycles=1), realizations=1)
+    with suppress(RuntimeError):  # a state that the exact engine cannot compute
+        _core.exact_counts(brief.job, brief.pulse, np.empty(brief.items, np.int64), task.threads, None, "")

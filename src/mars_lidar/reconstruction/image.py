@@ -27,6 +27,9 @@ from mars_lidar.reconstruction.returns import MOST_RETURNS, RETURN_COLUMNS
 VOLUME_BYTES = 96 * 2**20  # of each of three volumes (rows, columns, cells): larger images are computed in parts
 BLOCK_PIXELS = 2**17  # of the second network at a time
 NORMAL_HALF_WIDTH = NormalDist().inv_cdf(0.95)  # standard errors to either side that hold 90 %
+_SELF_BLIND = (
+    1.0  # signal photons a period, above which a pulse hides so much of itself that its armed time says little
+)
 _BRIGHT_BYTES = 64 * 2**20  # of the counts of such pixels at a time
 _NO_SURFACE = np.uint8(Flags.EMPTY | Flags.FILLED)
 _REJECTED = np.uint8(Flags.EMPTY | Flags.NO_SIGNAL | Flags.SATURATED | Flags.UNCONVERGED)
@@ -143,7 +146,9 @@ class Image(Method):
         )
         if self.returns == 1:
             width = settings[-1].sigma / settings[-1].cells
-            bright = np.flatnonzero(number > _core.IMAGE_BRIGHT)
+            self_blind = signal > _SELF_BLIND
+            bright = np.flatnonzero((number > _core.IMAGE_BRIGHT) | self_blind)
+            signal_error[self_blind] = np.nan  # unless their own likelihood says it
             _refit_bright(estimates, bright, width, photons, system, self.efficiency, threads)
         return estimates
 
@@ -249,7 +254,7 @@ def _refit_bright(
     efficiency: FloatArray | None,
     threads: int,
 ) -> None:
-    """Maximum likelihood of the brightest pixels, each alone, where its delay is within 3 widths of the image's."""
+    """Maximum likelihood of bright pixels, each alone, where its delay is within 3 widths of the image's."""
     step = max(1, _BRIGHT_BYTES // (4 * system.bins))
     for begin in range(0, len(pixels), step):
         part = pixels[begin : begin + step]

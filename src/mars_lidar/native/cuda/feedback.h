@@ -1,5 +1,5 @@
 // The engine "feedback" on a GPU: a stream of exposures of one pixel for each thread, with the sweeps of the
-// processor's batches (feedback/batch.h) at one lane. The rows of a warp's threads lie side by side in memory, as those
+// processor's batches (feedback/integer_draws.h) at one lane. The rows of a warp's threads lie side by side in memory, as those
 // of a batch.
 //
 // Sweeps differ in number, and a warp waits for its slowest: the host hands out pixels in the order of their
@@ -7,7 +7,7 @@
 #pragma once
 #define MARS_FEEDBACK_TEAM 1
 #include "cuda/device_team.h"
-#include "feedback/batch.h"
+#include "feedback/integer_draws.h"
 #include "feedback/photons.h"
 
 namespace mars {

@@ -1,7 +1,7 @@
-// The feedback engine at one vector level: a batch of lanes (feedback/batch.h), each of which draws exposures of a
+// The feedback engine at one vector level: a batch of lanes (feedback/integer_draws.h), each of which draws exposures of a
 // pixel of its own.
-#include "feedback/batch.h"
 #include "feedback/check.h"
+#include "feedback/integer_draws.h"
 
 namespace mars {
 

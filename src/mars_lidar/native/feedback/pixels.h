@@ -8,8 +8,6 @@ namespace mars {
 inline namespace MARS_LEVEL {
 namespace {
 
-// Most sweeps of the mean and of the adjoint, and of integers in one lap.
-constexpr int kMeanSweeps = 240, kIntegerSweeps = 120;
 constexpr double kSettled = 0.04;    // a move of the history that ends a lane, in standard deviations of the count
 constexpr double kMeanError = 8e-6;  // of the mean per period, or of a count: float32 sums, and the last sweep's change
 constexpr float kSlowest =

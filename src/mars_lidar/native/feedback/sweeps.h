@@ -10,6 +10,10 @@
 namespace mars {
 inline namespace MARS_LEVEL {
 
+// Most sweeps of the mean and of the adjoint; of the linear response to one draw's noise, which only gives the integers a
+// start; of integers in one lap, and in several: a draw that has not settled by then is refused.
+constexpr int kMeanSweeps = 240, kLinearSweeps = 60, kIntegerSweeps = 120, kLapSweeps = 40;
+
 // p and q of all cells and lanes: one row for each kind of cell without signal.
 struct Rates {
     const uint8_t* kind;

@@ -209,9 +209,12 @@ void image_centroids(const ImageSetting& s, const ImagePhotons& photons, const f
                  for (int64_t p = begin; p < end && !stop; ++p) {
                      const int64_t first = photons.first[p], last = photons.first[p + 1];
                      const bool blind = exposure(photons.bin + first, photons.number + first, last - first);
-                     const int at = std::min(static_cast<int>(delay[p]), s.cells - 1);
-                     const double lag = exposure.lag(at);
                      float offset = 0.0f, near = 0.0f, number = 0.0f;
+                     const auto cell = [&] {  // of the delay, where a bright pulse blinds its own end
+                         float place = delay[p] + offset;
+                         place -= period * std::floor(place / period);
+                         return std::min(static_cast<int>(place), s.cells - 1);
+                     };
                      for (int k = 0; k < steps; ++k) {
                          double a = 0.0, b = 0.0;
                          near = 0.0f;
@@ -228,13 +231,13 @@ void image_centroids(const ImageSetting& s, const ImagePhotons& photons, const f
                              b += g * static_cast<double>(pulse.score[j]);
                          }
                          number = static_cast<float>(a);
-                         if (a > 1e-6) offset += static_cast<float>(b / a - lag);
+                         if (a > 1e-6) offset += static_cast<float>(b / a - exposure.lag(cell()));
                          if (a < kOwnPhotons) break;  // its centroid would run after its own photons
                      }
                      float* const to = out + p * kImageColumns;
                      to[0] = number;
                      to[1] = offset;
-                     to[2] = static_cast<float>(exposure.background()) * (blind ? exposure.relative()[at] : 1.0f);
+                     to[2] = static_cast<float>(exposure.background()) * (blind ? exposure.relative()[cell()] : 1.0f);
                      to[3] = static_cast<float>(exposure.background());
                      to[4] = near;
                  }

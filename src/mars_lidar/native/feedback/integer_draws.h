@@ -16,9 +16,6 @@ namespace {
 constexpr uint64_t kDomain = 0x466565646261636bu;  // "Feedback": not another engine's numbers at one seed
 constexpr uint32_t kEndEvent = 0xffffffffu;        // the counter, not a cell, of the state at the ends of the exposure
 
-// Most sweeps of the linear response to one draw's noise, which only gives the integers a start, and of integers in laps:
-// a draw that has not settled by then is refused.
-constexpr int kLinearSweeps = 60, kLapSweeps = 40;
 // Quantiles are taken anew where fewer exposures are armed, and more counts expected, or firing more likely.
 constexpr float kFewArmed = 32.0f, kFewCounts = 0.03f, kLikely = 0.02f;
 

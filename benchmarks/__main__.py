@@ -45,6 +45,7 @@ SECTIONS: dict[str, Callable[[Config, Bandwidth], Section]] = {
     "import": startup.import_time,
     "cli": startup.command_line,
 }
+QUICK_SECTIONS = ("exact", "user", "long", "exposure", "reconstruction", "import")  # some 40 s of a processor
 
 
 def run(config: Config, names: Sequence[str] = tuple(SECTIONS), tell: Callable[[str], object] = str) -> Report:
@@ -79,7 +80,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         prog="python -m benchmarks", description="Time mars_lidar and print and save a table."
     )
     size = parser.add_mutually_exclusive_group()
-    size.add_argument("--quick", action="store_true", help="under a minute")
+    size.add_argument("--quick", action="store_true", help="under a minute: without effects, files, learning")
     size.add_argument("--full", action="store_true", help="many turns, tables unscaled: for the record")
     parser.add_argument(
         "--only",
@@ -93,7 +94,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     chosen = parser.parse_args(arguments)
     config = QUICK if chosen.quick else FULL if chosen.full else DEFAULT
-    report = run(config, chosen.only or tuple(SECTIONS), _tell)
+    report = run(config, chosen.only or (QUICK_SECTIONS if chosen.quick else tuple(SECTIONS)), _tell)
     print(report.markdown())
     stem = "-".join([config.mode, *(chosen.only or ())])
     for path in report.save(chosen.out, stem):

@@ -30,13 +30,13 @@ def _parser(command: str) -> argparse.ArgumentParser:
     add("studies", nargs="+", choices=list(STUDIES), metavar="STUDY", help="one or more of the list below")
     out = Path("study-results")
     add("--out", type=Path, default=out, metavar="DIR", help="folder to write into, made if missing (%(default)s)")
-    add("--quick", action="store_true", help="small grids, few realizations: seconds, not for citing")
+    add("--quick", action="store_true", help="small grids, few realizations: a preview in seconds, not for citation")
     words = "folder of the reference cases, *.json (studies 'reference', 'joint-covariance')"
     add("--data", type=Path, metavar="DIR", help=words)
     words = "measured photon stream: a .mat with times in units of 64 ps (study 'hardware')"
     add("--stream", type=Path, metavar="FILE", help=words)
     words = (
-        "engine taken for true (study 'count-law'): 'sequential' shares nothing with the laws, 'exact' is several "
+        "reference engine (study 'count-law'): 'sequential' shares no code with the laws, 'exact' is several "
         "times faster (default: %(default)s)"
     )
     add("--truth", choices=("sequential", "exact"), default="sequential", help=words)
@@ -45,8 +45,8 @@ def _parser(command: str) -> argparse.ArgumentParser:
         "(default: %(default)s); with --quick a tiny one, seconds"
     )
     add("--config", choices=("small", "full", "held-out"), default="small", help=words)
-    add("--seed", type=int, metavar="N", help="another sweep (studies 'domain', 'long-exposures')")
-    add("--systems", type=int, metavar="N", help="systems of a sweep (studies 'domain', 'long-exposures')")
+    add("--seed", type=int, metavar="N", help="seed of the random systems (studies 'domain', 'long-exposures')")
+    add("--systems", type=int, metavar="N", help="number of random systems (studies 'domain', 'long-exposures')")
     words = "folder of RGB-D pairs, NAME_depth.png and NAME_colors.png or Middlebury folders (study 'image')"
     add("--rgbd", type=Path, metavar="DIR", help=words)
     words = "folder of measured cubes, .zarr, .h5 or .npz, as `mars_lidar.io.save` writes them (study 'image')"
@@ -56,7 +56,7 @@ def _parser(command: str) -> argparse.ArgumentParser:
         "without, a small one is trained first)"
     )
     add("--drunet", type=Path, metavar="FILE", help=words)
-    words = "instead of the study 'image', train its networks, and write weights and card into --out"
+    words = "train the networks of the study 'image' instead, and write weights and card into --out"
     add("--train", action="store_true", help=words)
     return parser
 

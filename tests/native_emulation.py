@@ -32,8 +32,8 @@ def compiler() -> list[str]:
     if asked := os.environ.get("CXX"):
         return shlex.split(asked)
     for name in ("c++", "g++", "clang++"):
-        if found := shutil.which(name):
-            return [found]
+        if estimate := shutil.which(name):
+            return [estimate]
     pytest.skip("no C++ compiler (c++, g++, clang++, or $CXX) to build the emulation of a GPU with")
 
 

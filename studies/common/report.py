@@ -70,7 +70,7 @@ def render(request: Request, template: Path, facts: Mapping[str, Any]) -> str:
     environment.filters |= FILTERS
     environment.globals |= {
         "quick": request.quick,
-        "for_looking": "_Quick form: a look, not for citing._" if request.quick else "",
+        "for_looking": "_Quick run: a preview, not for citation._" if request.quick else "",
         "flag": " --quick" if request.quick else "",
         "versions": versions(),
         "machine": machine,

@@ -1,4 +1,4 @@
-"""Study "matched": the law with four matched cumulants, its total variation to the exact law of the count."""
+"""Study "matched": total variation between the law with four matched cumulants and the exact law."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Study "domain": every engine and prediction on random systems, drawn, judged and reported."""
+"""Study "domain": every engine and prediction, verified on random systems."""
 
 from __future__ import annotations
 

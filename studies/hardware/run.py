@@ -1,4 +1,4 @@
-"""Study "hardware", T6 of the MaRS paper: streams calibrated, their verdicts, the paper's own figures beside them."""
+"""Study "hardware", T6 of the MaRS paper: calibrated streams, their tests of fit, compared with the paper."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Study "image": depth and signal of images from 1 to 10 photons a pixel, and how well the intervals hold."""
+"""Study "image": depth and signal of images from 1 to 10 photons a pixel, and the coverage of the intervals."""
 
 from __future__ import annotations
 

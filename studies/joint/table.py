@@ -1,4 +1,4 @@
-"""Study "joint-table": joint statistics of the histogram's bins, for every engine, over the closed form.
+"""Study "joint-table": joint statistics of the histogram's bins for every engine, relative to the closed form.
 
 The count and the mean histogram do not tell a joint law: given N the bins are not multinomial. Reported are the
 variance of the count in a signal window, the variance of single bins, and the covariance of neighbours.

@@ -1,4 +1,4 @@
-"""Study "returns": detections without a return, how near two may be, and how well their errors hold."""
+"""Study "returns": false returns, the resolution of two returns, and the coverage of their errors."""
 
 from __future__ import annotations
 

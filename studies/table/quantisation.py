@@ -1,4 +1,4 @@
-"""Study "quantisation": what the lookup of a table costs: nearest and interpolated, over the number of its points."""
+"""Study "quantisation": errors of a table lookup, nearest and interpolated, over the number of entries."""
 
 from __future__ import annotations
 

@@ -17,12 +17,12 @@ def test_dead_time_and_pulse_are_found_from_wrong_ones(dead: float, sigma: float
     random = np.random.default_rng(3)
     light = random.uniform(0.2, 0.8, (8, 8)), random.uniform(0.1, 0.6, (8, 8)), random.uniform(0.0, 100.0, (8, 8))
     counts = ml.simulate(ml.Flux(*light), system(bins=1000), seed=5)[0]
-    found = calibrate_cube(counts, system(dead, sigma, bins=1000))
+    outcome = calibrate_cube(counts, system(dead, sigma, bins=1000))
     for name, true in (("dead_time_ns", 50.0), ("pulse_sigma_ns", 0.3)):
-        estimate = found.estimates[name]
+        estimate = outcome.estimates[name]
         assert abs(estimate.value - true) < 4.5 * estimate.error
         assert estimate.error < 0.01 * true
-    assert found.fits
+    assert outcome.fits
 
 
 def test_too_few_photons_are_refused() -> None:

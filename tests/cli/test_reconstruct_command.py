@@ -257,6 +257,6 @@ def test_study(tmp_path):
 @pytest.mark.full
 def test_study_of_returns(tmp_path):
     study = quick_study("returns", tmp_path)
-    assert "Quick form" in study.text
+    assert "Quick run" in study.text
     assert study.figures == ["returns.png"]
     assert len(study.rows) > 10

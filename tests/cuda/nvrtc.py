@@ -52,11 +52,11 @@ def library() -> ctypes.CDLL:
 def compiled(kernels: list[Kernel], architecture: str) -> dict[Kernel, Resources]:
     """Compile to machine code for one architecture, such as ``sm_90``; RuntimeError with the log where that fails."""
     headers = dict.fromkeys(kernel.header for kernel in kernels)
-    found: dict[Kernel, Resources] = {}
+    estimate: dict[Kernel, Resources] = {}
     for header in headers:
         some = {kernel.expression: kernel for kernel in kernels if kernel.header == header}
-        found |= {some[name]: used for name, used in compiled_code(source(header), list(some), architecture).items()}
-    return found
+        estimate |= {some[name]: used for name, used in compiled_code(source(header), list(some), architecture).items()}
+    return estimate
 
 
 def compiled_code(code: str, expressions: list[str], architecture: str) -> dict[str, Resources]:
@@ -72,13 +72,13 @@ def compiled_code(code: str, expressions: list[str], architecture: str) -> dict[
         log = _text(nvrtc, program, "ProgramLog").decode()
         _check(result, log)
         cubin = _text(nvrtc, program, "CUBIN")
-        found = {}
+        estimate = {}
         for expression in expressions:
             name = ctypes.c_char_p()
             _check(nvrtc.nvrtcGetLoweredName(program, expression.encode(), ctypes.byref(name)), log)
             assert name.value is not None
-            found[expression] = _resources(log, cubin, name.value.decode())
-        return found
+            estimate[expression] = _resources(log, cubin, name.value.decode())
+        return estimate
     finally:
         nvrtc.nvrtcDestroyProgram(ctypes.byref(program))
 
@@ -101,10 +101,10 @@ def _resources(log: str, cubin: bytes, kernel: str) -> Resources:
     said = log.split(f"Compiling entry function '{kernel}'", 1)[1].split("Compiling entry function", 1)[0]
 
     def number(pattern: str) -> int:
-        found = re.search(pattern, said)
-        if found is None:
+        estimate = re.search(pattern, said)
+        if estimate is None:
             raise RuntimeError(f"ptxas did not tell {pattern!r}: {said}")
-        return int(found[1])
+        return int(estimate[1])
 
     return Resources(
         registers=number(r"Used (\d+) registers"),

@@ -94,10 +94,10 @@ def main() -> None:
     ]
     slope = 0.0
     for architecture in ARCHITECTURES:
-        found = compiled([variant.kernel for variant in [*variants, shorter]], architecture)
-        lines += [row(architecture, variant, found[variant.kernel]) for variant in variants]
-        slope = (found[plain.kernel].instructions - found[shorter.kernel].instructions) / (AHEAD - shorter.ahead)
-        registers = found[plain.kernel].registers
+        result = compiled([variant.kernel for variant in [*variants, shorter]], architecture)
+        lines += [row(architecture, variant, result[variant.kernel]) for variant in variants]
+        slope = (result[plain.kernel].instructions - result[shorter.kernel].instructions) / (AHEAD - shorter.ahead)
+        registers = result[plain.kernel].registers
         found_others = compiled(others, architecture)
         more += [other_row(architecture, kernel, used) for kernel, used in found_others.items()]
     lines += more
@@ -157,14 +157,14 @@ def mars_steps() -> dict[str, Resources]:
     return compiled_code(source(MARS_LAWS.header) + STEPS, names, "sm_90")
 
 
-def mars_estimate(found: dict[Kernel, Resources]) -> list[str]:
+def mars_estimate(result: dict[Kernel, Resources]) -> list[str]:
     """The same for mars at 1e5 cycles: rounds of Poisson numbers in all bins."""
     steps = mars_steps()
     nothing = steps["mars::nothing"].instructions
     each = (steps["mars::two_poisson"].instructions - nothing) / 2.0 + steps["mars::form"].instructions - nothing
     issue = ISSUE_PER_S * 32 / (each * BINS * PIXELS)
     written = PIXELS * BINS * 4
-    block, used = mars_block(), found[mars_histograms(True)]
+    block, used = mars_block(), result[mars_histograms(True)]
     blocks = min(SHARED_BYTES // (block + RESERVED_BYTES), REGISTERS // (LANES * used.registers), MOST_THREADS // LANES)
     return [
         f"## Bounds for an NVIDIA H200: `mars` with a table, 128 x 128 pixels, {BINS} bins of uint32, N_r = 1e5",
@@ -179,7 +179,7 @@ def mars_estimate(found: dict[Kernel, Resources]) -> list[str]:
     ]
 
 
-def feedback_estimate(found: dict[Kernel, Resources]) -> list[str]:
+def feedback_estimate(result: dict[Kernel, Resources]) -> list[str]:
     """The same for feedback: its sweeps read and write memory."""
     cells, sweeps = BINS, 8
     mean, integer = 4 * 4.0, 4 * 7.0 + 2.0  # bytes of a cell, read and written: sums, rates; history, quantiles, dither
@@ -191,7 +191,7 @@ def feedback_estimate(found: dict[Kernel, Resources]) -> list[str]:
         f"- Memory: where a pixel needs {sweeps} sweeps of the mean and {sweeps} of integers, these on {cells} cells "
         f"move {moved / 1e9:.1f} GB a cube: {MEMORY_BYTES_PER_S / moved:.0f} cubes/s. Fewer sweeps where the "
         "background is dim, more cells where the pulse is narrow or the exposure long.",
-        f"- Work area: {work / 1e6:.2f} MB a warp, {found[feedback_histograms(False)].registers} registers a thread. "
+        f"- Work area: {work / 1e6:.2f} MB a warp, {result[feedback_histograms(False)].registers} registers a thread. "
         "The 50 MB of the second-level cache hold those of a few dozen warps, so that sweeps go to memory.",
     ]
 

@@ -36,9 +36,9 @@ SINKS = [Variant(0, True, False, False, sink) for sink in Sink if sink not in (S
 @pytest.mark.full
 @pytest.mark.parametrize(("architecture", "variants"), [("sm_80", BRIGHT[:2]), ("sm_90", [*BRIGHT, *OTHERS, *SINKS])])
 def test_compiles_without_spills(architecture: str, variants: list[Variant]):
-    found = compiled([variant.kernel for variant in variants], architecture)
+    result = compiled([variant.kernel for variant in variants], architecture)
     for variant in variants:
-        used = found[variant.kernel]
+        used = result[variant.kernel]
         assert used.spill_stores == used.spill_loads == 0, variant
         assert used.registers <= 168, variant  # 3 warps on each of a multiprocessor's 4 schedulers
         assert used.instructions > 500, variant
@@ -64,10 +64,8 @@ def test_the_other_engines_compile_without_spills(architecture: str, kernels: li
 @pytest.mark.full
 def test_the_steps_of_the_estimate_compile():
     """What `tests.cuda.resources` counts the instructions of, alone."""
-    found = mars_steps()
-    assert (
-        found["mars::two_poisson"].instructions > found["mars::form"].instructions > found["mars::nothing"].instructions
-    )
+    step = mars_steps()
+    assert step["mars::two_poisson"].instructions > step["mars::form"].instructions > step["mars::nothing"].instructions
 
 
 def test_the_source_names_the_headers_of_every_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

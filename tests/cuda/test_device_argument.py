@@ -90,9 +90,9 @@ def test_bits_of_other_engines_on_a_gpu(engine: str, cycles: int, dead_ns: float
     options: dict[str, Any] = {}
     if engine == "mars":
         options["table"] = ml.Table.build(system, (0.05, 3.0, 9), (0.05, 3.0, 9))
-    told = ml.simulate(FLUX, system, engine=engine, realizations=20, seed=3, device="cuda", **options)
+    on_device = ml.simulate(FLUX, system, engine=engine, realizations=20, seed=3, device="cuda", **options)
     np.testing.assert_array_equal(
-        told.get(), ml.simulate(FLUX, system, engine=engine, realizations=20, seed=3, **options)
+        on_device.get(), ml.simulate(FLUX, system, engine=engine, realizations=20, seed=3, **options)
     )
 
 

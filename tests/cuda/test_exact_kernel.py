@@ -122,9 +122,9 @@ def test_timestamps_are_those_of_the_engine(mode: str, start: str):
     done: list[int] = []
     asked = replace(task(MODES[mode], "gaussian", start, 2, bins=64), progress=lambda n, _: done.append(n))
     engine = ExactEngine()
-    told = exact.exact_records(asked, Host())
+    records = exact.exact_records(asked, Host())
     wanted = Records.allocate(engine.counts(asked))
     engine.timestamps(replace(asked, progress=None), wanted)
     for name in ("offsets", "times", "cycle", "bin"):
-        np.testing.assert_array_equal(getattr(told, name), getattr(wanted, name))
+        np.testing.assert_array_equal(getattr(records, name), getattr(wanted, name))
     assert done == [60, asked.items] * 2  # counted, then drawn

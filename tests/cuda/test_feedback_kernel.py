@@ -40,14 +40,14 @@ def waveform() -> ml.Flux:
 def both(flux: ml.Flux, system: ml.System, realizations: int = 3, warps: int = 2) -> dict[str, Any]:
     """Cubes of the processor and of the kernel, and how many pixels were given to the exact engine."""
     index = np.arange(1000, 1000 + flux.background.size, dtype=np.uint32)
-    one, two = (Task(flux, system, realizations, 7, index, 2**40 + 9, 1, None) for _ in range(2))
-    wanted = np.empty((one.items, system.bins), system.histogram_dtype)
-    FeedbackEngine().histogram(one, wanted)
-    told, machine = np.full_like(wanted, 7), Host()
-    feedback_histogram(two, told, machine, ExactEngine().histogram, warps=warps)
-    assert two.report == one.report
+    asked, two = (Task(flux, system, realizations, 7, index, 2**40 + 9, 1, None) for _ in range(2))
+    wanted = np.empty((asked.items, system.bins), system.histogram_dtype)
+    FeedbackEngine().histogram(asked, wanted)
+    drawn, machine = np.full_like(wanted, 7), Host()
+    feedback_histogram(two, drawn, machine, ExactEngine().histogram, warps=warps)
+    assert two.report == asked.report
     assert machine.launched
-    return {"wanted": wanted, "told": told, "rest": one.report["pixels given to exact"]}
+    return {"wanted": wanted, "drawn": drawn, "rest": asked.report["pixels given to exact"]}
 
 
 @pytest.mark.full
@@ -57,20 +57,20 @@ def both(flux: ml.Flux, system: ml.System, realizations: int = 3, warps: int = 2
 def test_histograms_are_those_of_the_engine(pulse: ml.Pulse, dead_ns: float, start: Any):
     system = BASE.replace(pulse=pulse, detector=ml.Detector(dead_time_ns=dead_ns), start=start)
     flux = image()
-    found = both(flux, system)
-    assert found["wanted"].sum() > 10_000
-    np.testing.assert_array_equal(found["told"], found["wanted"])
+    result = both(flux, system)
+    assert result["wanted"].sum() > 10_000
+    np.testing.assert_array_equal(result["drawn"], result["wanted"])
 
 
 @pytest.mark.parametrize("flux", [several(), waveform()], ids=["returns", "waveform"])
 def test_other_light(flux: ml.Flux):
-    found = both(flux, BASE)
-    np.testing.assert_array_equal(found["told"], found["wanted"])
+    result = both(flux, BASE)
+    np.testing.assert_array_equal(result["drawn"], result["wanted"])
 
 
 def test_pixels_that_do_not_settle_are_refused():
-    found = both(image(), BASE)
-    assert 0 < found["rest"] < 36
+    result = both(image(), BASE)
+    assert 0 < result["rest"] < 36
 
 
 @pytest.mark.parametrize("warps", [1, 50])
@@ -79,10 +79,10 @@ def test_long_exposures_and_any_number_of_warps(warps: int):
     system = BASE.replace(cycles=2_000_000)
     light = image((1, 12))
     flux = ml.Flux(np.minimum(light.signal, 2.0), np.minimum(light.background, 1.0), light.delay_ns)
-    found = both(flux, system, realizations=5, warps=warps)
-    assert found["rest"] == 0
-    assert found["wanted"].dtype == np.uint32
-    np.testing.assert_array_equal(found["told"], found["wanted"])
+    result = both(flux, system, realizations=5, warps=warps)
+    assert result["rest"] == 0
+    assert result["wanted"].dtype == np.uint32
+    np.testing.assert_array_equal(result["drawn"], result["wanted"])
 
 
 def test_what_the_kernel_does_not_do_is_refused():

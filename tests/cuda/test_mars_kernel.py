@@ -48,12 +48,12 @@ def both(
     """Cubes of the processor and of the kernels, and the report of the latter."""
     index = np.arange(1000, 1000 + flux.background.size, dtype=np.uint32)
     cuda.check(engine, flux.detected(system), system.detected())
-    one, two = (Task(flux, system, realizations, 7, index, 2**40 + 9, 1, None) for _ in range(2))
-    wanted = np.empty((one.items, system.bins), system.histogram_dtype)
-    engine.histogram(one, wanted)
-    told = np.full_like(wanted, 7)
-    mars_histogram(engine, two, told, machine or Host())
-    return {"wanted": wanted, "told": told, "report": two.report}
+    asked, two = (Task(flux, system, realizations, 7, index, 2**40 + 9, 1, None) for _ in range(2))
+    wanted = np.empty((asked.items, system.bins), system.histogram_dtype)
+    engine.histogram(asked, wanted)
+    drawn = np.full_like(wanted, 7)
+    mars_histogram(engine, two, drawn, machine or Host())
+    return {"wanted": wanted, "drawn": drawn, "report": two.report}
 
 
 @pytest.mark.full
@@ -62,9 +62,9 @@ def both(
 def test_histograms_are_those_of_the_engine(name: str, count: Any):
     system = SYSTEMS[name]
     low = 0.2 if name == "lossy" else 0.06
-    found = both(MarsEngine(table(name), count=count), image(low), system)
-    assert found["wanted"].sum() > 1000
-    np.testing.assert_array_equal(found["told"], found["wanted"])
+    result = both(MarsEngine(table(name), count=count), image(low), system)
+    assert result["wanted"].sum() > 1000
+    np.testing.assert_array_equal(result["drawn"], result["wanted"])
 
 
 def test_other_cycles_nearest_entries_and_both_ways_to_draw():
@@ -72,8 +72,8 @@ def test_other_cycles_nearest_entries_and_both_ways_to_draw():
     for cycles in (2000, 20_000, 100_000):
         for interpolation in ("bilinear", "nearest"):
             engine = MarsEngine(table("long"), interpolation=interpolation)  # type: ignore[arg-type]
-            found = both(engine, image(), SYSTEMS["long"].replace(cycles=cycles))
-            np.testing.assert_array_equal(found["told"], found["wanted"])
+            result = both(engine, image(), SYSTEMS["long"].replace(cycles=cycles))
+            np.testing.assert_array_equal(result["drawn"], result["wanted"])
 
 
 @pytest.mark.full
@@ -87,25 +87,25 @@ def test_doubted_counts_are_evaluated():
     background = np.append(rng.uniform(0.02, 0.5, 20), np.full(signals.size, 0.1))  # the last: entries of the table
     delay = np.append(rng.uniform(0.0, 100.0, 20), np.full(signals.size, 50.0))
     flux = ml.Flux(signal[None], background[None], delay[None])
-    found = both(engine, flux, locked, realizations=50)
-    assert 5 < found["report"]["pixels_exact_count"] < signal.size
-    assert found["report"]["laws_evaluated"] > 0
-    np.testing.assert_array_equal(found["told"], found["wanted"])
+    result = both(engine, flux, locked, realizations=50)
+    assert 5 < result["report"]["pixels_exact_count"] < signal.size
+    assert result["report"]["laws_evaluated"] > 0
+    np.testing.assert_array_equal(result["drawn"], result["wanted"])
 
 
 def test_pixels_beyond_the_table_are_drawn_by_the_processor():
     flux = image(0.02, 4.0)
-    found = both(MarsEngine(table("plain"), outside="exact"), flux, SYSTEMS["plain"])
-    assert 0 < found["report"]["pixels_evaluated"] < flux.background.size
-    np.testing.assert_array_equal(found["told"], found["wanted"])
+    result = both(MarsEngine(table("plain"), outside="exact"), flux, SYSTEMS["plain"])
+    assert 0 < result["report"]["pixels_evaluated"] < flux.background.size
+    np.testing.assert_array_equal(result["drawn"], result["wanted"])
 
 
 @pytest.mark.parametrize("blocks", [1, 40])
 def test_neither_blocks_nor_memory_nor_threads_show(blocks: int):
     """Work areas in the device's memory; few blocks and many."""
     machine = Host(shared_bytes=1024, resident_blocks=blocks)
-    found = both(MarsEngine(table("plain")), image(), SYSTEMS["plain"], realizations=5, machine=machine)
-    np.testing.assert_array_equal(found["told"], found["wanted"])
+    result = both(MarsEngine(table("plain")), image(), SYSTEMS["plain"], realizations=5, machine=machine)
+    np.testing.assert_array_equal(result["drawn"], result["wanted"])
 
 
 def test_what_the_kernel_cannot_hold_is_refused():

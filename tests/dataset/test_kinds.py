@@ -62,7 +62,7 @@ def of_transients(recipe, renders) -> dict[str, Any]:
 def test_transients(tmp_path, of_transients, renders):
     done = ml.generate(of_transients, tmp_path / "set.zarr")
     assert done.shape == (12, 3, *SHAPE, 32)
-    assert [one.path.name for one in done.problems] == ["d.npz", "e.h5"]
+    assert [item.path.name for item in done.problems] == ["d.npz", "e.h5"]
     assert "must be finite and >= 0" in done.problems[0].reason
     stored = open_dataset(tmp_path / "set.zarr")
     assert [Path(name).name for name in stored.scene_names()] == ["a.npz", "b.h5", "c.mat"]
@@ -70,19 +70,19 @@ def test_transients(tmp_path, of_transients, renders):
         (renders / name).rename(tmp_path / name)
     data = xarray.open_zarr(tmp_path / "set.zarr", chunks=None)
     for k in range(12):
-        one = data.isel(sample=k)
-        file = tmp_path / ("a.npz", "b.h5", "c.mat")[int(one.scene)]
-        system = stored.recipe.systems[int(one.system)]
-        level = {"signal": float(one.signal_level), "sbr": float(one.sbr), "dark_count_hz": 1e5}
+        item = data.isel(sample=k)
+        file = tmp_path / ("a.npz", "b.h5", "c.mat")[int(item.scene)]
+        system = stored.recipe.systems[int(item.system)]
+        level = {"signal": float(item.signal_level), "sbr": float(item.sbr), "dark_count_hz": 1e5}
         flux = io.read_transient(file).flux(system, **level)
-        np.testing.assert_array_equal(one.histogram, ml.simulate(flux, system, realizations=3, seed=int(one.seed)))
-        np.testing.assert_allclose(one.signal, flux.signal, rtol=1e-6)
-        np.testing.assert_array_equal(one.background, flux.background.astype(np.float32))
-        assert np.isnan(one.depth[0, 0])
-        assert np.isnan(one.depth).all() == (file.suffix == ".h5")
-        assert np.isnan(one.reflectivity).all() == (file.suffix != ".npz")
-        delay = system.delay_ns(stored.scenes.read(int(one.scene)).depth_m)
-        np.testing.assert_array_equal(one.delay, delay.astype(np.float32))
+        np.testing.assert_array_equal(item.histogram, ml.simulate(flux, system, realizations=3, seed=int(item.seed)))
+        np.testing.assert_allclose(item.signal, flux.signal, rtol=1e-6)
+        np.testing.assert_array_equal(item.background, flux.background.astype(np.float32))
+        assert np.isnan(item.depth[0, 0])
+        assert np.isnan(item.depth).all() == (file.suffix == ".h5")
+        assert np.isnan(item.reflectivity).all() == (file.suffix != ".npz")
+        delay = system.delay_ns(stored.scenes.read(int(item.scene)).depth_m)
+        np.testing.assert_array_equal(item.delay, delay.astype(np.float32))
     assert verify(tmp_path / "set.zarr", chunks=None).good
     assert stored.attrs["format_version"] == 2
     np.testing.assert_array_equal(stored.scene(1).rows(slice(2, 5)), light(1, 90)[2:5])
@@ -141,10 +141,10 @@ def test_layers_of_a_file(tmp_path, recipe):
     stored = open_dataset(tmp_path / "set.zarr")
     assert isinstance(stored.scene(1), ml.Scene)
     read = stored.scene(0)
-    np.testing.assert_array_equal([one.depth_m for one in read.layers], depth)
+    np.testing.assert_array_equal([item.depth_m for item in read.layers], depth)
     total = np.where(np.isnan(depth), 0.0, share)
     delay = SYSTEM.delay_ns(np.nan_to_num(depth))
-    fluxes = [ml.Flux(one / total.sum(0).mean(), 0.0, tau) for one, tau in zip(total, delay, strict=True)]
+    fluxes = [ml.Flux(item / total.sum(0).mean(), 0.0, tau) for item, tau in zip(total, delay, strict=True)]
     flux = ml.Flux.multi(*fluxes, ml.Flux(0.0, 1e5 * 100e-9))  # signal 1
     made = read.flux(SYSTEM, signal=1.0, sbr=np.inf, dark_count_hz=1e5)
     np.testing.assert_allclose(made.returns_signal, flux.returns_signal[:3], rtol=1e-12)
@@ -181,13 +181,13 @@ def test_a_run_that_was_killed_goes_on(tmp_path, of_transients, how):
 @pytest.mark.full
 def test_estimates(tmp_path, of_transients):
     of_transients["store"] = {"chunk_mib": 1, "shard_mib": 4}
-    told = estimate(of_transients, tmp_path / "set.zarr")
+    planned = estimate(of_transients, tmp_path / "set.zarr")
     ml.generate(of_transients, tmp_path / "set.zarr")
-    assert told.shape == (20, 3, *SHAPE, 32)  # bad files are found when they are read
-    assert len(told.problems) == 2
-    found = sum(len(one) for name, one in files(tmp_path / "set.zarr").items() if name.startswith("histogram/c"))
-    scenes = sum(len(one) for name, one in files(tmp_path / "set.zarr").items() if name.startswith("scenes"))
-    assert told.bytes > (found + scenes) * 0.9
+    assert planned.shape == (20, 3, *SHAPE, 32)  # bad files are found when they are read
+    assert len(planned.problems) == 2
+    histograms = sum(len(item) for name, item in files(tmp_path / "set.zarr").items() if name.startswith("histogram/c"))
+    scenes = sum(len(item) for name, item in files(tmp_path / "set.zarr").items() if name.startswith("scenes"))
+    assert planned.bytes > (histograms + scenes) * 0.9
 
 
 @pytest.mark.full
@@ -199,11 +199,11 @@ def test_training(tmp_path, of_transients):
     stored = open_dataset(tmp_path / "set.zarr")
     examples = list(StoredDataset(tmp_path / "set.zarr", maps=["depth", "signal"], samples=range(4)))
     assert len(examples) == 12
-    for one in examples:
-        assert one["counts"].dtype == torch.float32
-        counts = np.asarray(stored.histogram[one["sample"], one["realization"]])
-        np.testing.assert_array_equal(one["counts"].permute(1, 2, 0).numpy(), counts)
-        assert torch.isnan(one["depth"][0, 0])
+    for item in examples:
+        assert item["counts"].dtype == torch.float32
+        counts = np.asarray(stored.histogram[item["sample"], item["realization"]])
+        np.testing.assert_array_equal(item["counts"].permute(1, 2, 0).numpy(), counts)
+        assert torch.isnan(item["depth"][0, 0])
     with pytest.raises(ValueError, match="rendered transients, which have no surfaces"):
         CubeStream(SYSTEM, tmp_path / "set.zarr")
     of_transients["scenes"] = [{"example": "room", "size": list(SHAPE), "fog": FOGS[0]}]
@@ -212,7 +212,7 @@ def test_training(tmp_path, of_transients):
 
 
 @pytest.mark.parametrize(
-    ("scene", "told"),
+    ("scene", "message"),
     [
         (
             {"transient": "x.npz", "path": "y"},
@@ -228,14 +228,14 @@ def test_training(tmp_path, of_transients):
         ({"example": "room", "pane": PANE | {"transmission": 2}}, "pane.transmission must be"),
     ],
 )
-def test_bad_entries(recipe, scene, told):
-    with pytest.raises(ValueError, match=told):
+def test_bad_entries(recipe, scene, message):
+    with pytest.raises(ValueError, match=message):
         DatasetRecipe.from_dict(recipe | {"scenes": [scene]})
 
 
 def test_bad_transients(tmp_path, of_transients, renders):
     out = tmp_path / "set.zarr"
-    for changes, told in (
+    for changes, message in (
         ({"light": {"attenuation": "inverse_square"}}, "attenuation is for surfaces"),
         ({"light": {"ambient": "map"}}, "ambient must be uniform"),
         ({"scenes": {"transient": str(tmp_path / "none.npz")}}, "no such file or folder"),
@@ -244,7 +244,7 @@ def test_bad_transients(tmp_path, of_transients, renders):
         ({"scenes": {"transient": str(renders / "a.npz"), "name": "x"}}, r"none of the scenes can be used:\s+.*no arr"),
         ({"engine": "neural"}, "engine 'neural' is no longer in the package"),
     ):
-        with pytest.raises(ValueError, match=told):
+        with pytest.raises(ValueError, match=message):
             ml.generate(of_transients | changes, out)
     np.savez(renders / "a.npz", transient=light(0, 40), bin_ns=3.0, depth=np.ones((3, 3)))
     with pytest.raises(ValueError, match="depth must be real numbers"):

@@ -104,7 +104,7 @@ def test_a_shard_that_was_cut_short_is_made_again(tmp_path, recipe, whole):
 @pytest.mark.skipif(os.name != "posix", reason="needs a limit on the size of files")
 def test_a_full_disk_is_told_and_the_run_goes_on_afterwards(tmp_path, recipe, whole):
     out = tmp_path / "set.zarr"
-    limit = max(len(one) for name, one in whole.items() if name.startswith("histogram/c")) - 20
+    limit = max(len(item) for name, item in whole.items() if name.startswith("histogram/c")) - 20
     ran = stopped(recipe, out, "disk", limit)
     assert ran.returncode == 0, ran.stderr
     assert ran.stdout.startswith("WriteError File too large; "), ran.stdout
@@ -313,7 +313,7 @@ def test_seeds_do_not_depend_on_how_a_path_is_spelled(tmp_path, monkeypatch):
     _folder_of_scenes(tmp_path / "data", 2)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "below").mkdir()
-    found = set()
+    result = set()
     for folder, spelled in (
         *((Path(), each) for each in ("data", "./data", "data/", "below/../data", str(tmp_path / "data"))),
         (tmp_path, "data"),
@@ -321,11 +321,11 @@ def test_seeds_do_not_depend_on_how_a_path_is_spelled(tmp_path, monkeypatch):
     ):
         with pytest.warns(UserWarning, match="no image was found"):
             listed, _ = candidates([{"path": spelled}], folder)
-        found.add(tuple(each.name for each in listed))
-    assert found == {("data/000_depth.npy", "data/001_depth.npy")}
+        result.add(tuple(each.name for each in listed))
+    assert result == {("data/000_depth.npy", "data/001_depth.npy")}
     for folder, spelled in ((Path(), "./data/000_depth.npy"), (tmp_path / "below", "../data/000_depth.npy")):
-        (one,), _ = candidates([{"path": spelled}], folder)
-        assert one.name == "000_depth.npy"
+        (item,), _ = candidates([{"path": spelled}], folder)
+        assert item.name == "000_depth.npy"
     _folder_of_scenes(tmp_path / "below" / "data", 2)
     with pytest.warns(UserWarning, match="no image was found"):
         listed, _ = candidates([{"path": "data"}, {"path": "below/data"}], Path())

@@ -44,8 +44,8 @@ def laws_of(flux: ml.Flux, system: ml.System, **options: str) -> tuple[PartlyRep
     """What the engine draws the counts of these pixels from, the table's entries of them, and its report."""
     engine = MarsEngine(table(system.start), **options)
     task = task_of(Case("pixels", flux, system, flux.signal.size), 1)
-    entries, left = engine.reader.read(task, np.arange(flux.signal.size))
-    assert left.size == 0
+    entries, remaining = engine.reader.read(task, np.arange(flux.signal.size))
+    assert remaining.size == 0
     laws = engine._laws_of(Run(task, np.empty(0)), engine.reader, entries)
     assert isinstance(laws, PartlyReplaced)
     return laws, entries, task.report
@@ -76,20 +76,20 @@ def test_between_the_entries_the_law_is_exact(start: str, cycles: int):
 def test_the_four_cumulants_would_not_do():
     """What the exact laws are for: at some of these pixels the law of the cumulants is beyond the aim."""
     lut, flux = table(), doubted()
-    found = lut.lookup(flux)
+    result = lut.lookup(flux)
     from mars_lidar.statistics.matched import matched_pmf
 
-    off = [total_variation(law, exact(flux, SYSTEM, k)) for k, law in enumerate(matched_pmf(found.cumulants)[:80])]
+    off = [total_variation(law, exact(flux, SYSTEM, k)) for k, law in enumerate(matched_pmf(result.cumulants)[:80])]
     assert max(off) > AIM
 
 
 @pytest.mark.parametrize("start", ["armed", "stationary"])
 def test_at_the_entries_the_table_keeps_the_law(start: str):
     lut, system = table(start), SYSTEM.replace(start=start)
-    found = lut.at(np.repeat(lut.signal, lut.background.size), np.tile(lut.background, lut.signal.size))
+    result = lut.at(np.repeat(lut.signal, lut.background.size), np.tile(lut.background, lut.signal.size))
     from mars_lidar.statistics.matched import matched_pmf
 
-    sure = found.trusted()
+    sure = result.trusted()
     assert np.array_equal(np.flatnonzero(~sure), lut.laws.row)
     assert lut.laws.row.size > 3
     flux = doubted(start=start, node=True)
@@ -99,7 +99,7 @@ def test_at_the_entries_the_table_keeps_the_law(start: str):
         pixel = int(entries.pixels[laws.at[k]])
         # evaluated on another grid: that of 64 bins in the table, that of a single bin here
         assert total_variation(window(laws, k), exact(flux, system, pixel)) < 1e-6
-    matched = matched_pmf(found.cumulants)
+    matched = matched_pmf(result.cumulants)
     for row in np.flatnonzero(sure)[::16]:
         law = ml.count_law(
             ml.Flux(lut.signal[row // lut.background.size], lut.background[row % lut.background.size], 50.0), system
@@ -127,11 +127,11 @@ def test_the_nearest_entry_gives_its_own_law():
 
 def test_counts_follow_the_exact_law():
     flux = doubted()
-    one = ml.Flux(np.full((1, 8), flux.signal[0, 0]), flux.background[0, 0], flux.delay_ns[0, 0])
+    item = ml.Flux(np.full((1, 8), flux.signal[0, 0]), flux.background[0, 0], flux.delay_ns[0, 0])
     report: dict[str, float] = {}
-    cube = ml.simulate(one, SYSTEM, engine="mars", table=table(), realizations=4000, report=report)
+    cube = ml.simulate(item, SYSTEM, engine="mars", table=table(), realizations=4000, report=report)
     assert (report["pixels_exact_count"], report["laws_evaluated"]) == (8, 1)  # alike: evaluated once
-    law = exact(one, SYSTEM, 0)
+    law = exact(item, SYSTEM, 0)
     pmf = np.zeros(law.first + law.p.size)
     pmf[law.first :] = law.p
     require({"count law": counts_against_law(cube.sum(-1).ravel(), pmf)}, "doubted pixel from a table")

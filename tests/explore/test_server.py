@@ -79,12 +79,12 @@ def test_a_pixel_and_its_light(server: CubeServer, stored: Path):
     with io.load(stored) as cube:
         for image, row, column in ((0, 2, 5), (1, 8, 13), (0, 3, 4)):
             status, content, _ = got(server, f"/pixel?image={image}&row={row}&column={column}")
-            told = json.loads(content)
+            state = json.loads(content)
             assert status == 200
-            assert told["counts"] == np.asarray(cube.histogram[image, row, column]).tolist()
+            assert state["counts"] == np.asarray(cube.histogram[image, row, column]).tolist()
             dark = (row, column) == (3, 4)
             expected = {"signal": 0.0 if dark else 0.2 + 0.1 * row, "background": 0.1}
-            assert told["light"] == expected | {"delay": 0.0 if dark else 20.0 + 3.0 * column + row}
+            assert state["light"] == expected | {"delay": 0.0 if dark else 20.0 + 3.0 * column + row}
 
 
 @pytest.mark.parametrize("method", ["truth", "peak", "likelihood", "image"])
@@ -201,8 +201,8 @@ def test_a_port_in_use_is_named(server: CubeServer):
 def test_what_the_sliders_cannot_tell():
     pulse = ml.GaussianPulse(sigma_ns=1.0)
     system = make_system(5.0, 10, 20, pulse=pulse)
-    told, reason = settings_of(system)
-    assert (told["sigma"], told["dead"], told["mode"], reason) == (1.0, 5.0, "nonparalyzable", "")
+    state, reason = settings_of(system)
+    assert (state["sigma"], state["dead"], state["mode"], reason) == (1.0, 5.0, "nonparalyzable", "")
     moving = ml.Detector(dead_time_ns=5.0, mode="gated", gate_start_ns=1.0, gate_width_ns=9.0, gate_step_ns=2.0)
     limited = ml.Detector(dead_time_ns=5.0, max_events_per_period=1, jitter=ml.Jitter(sigma_ns=0.5))
     measured = ml.SampledPulse([1.0, 3.0, 2.0], 1.0)
@@ -234,12 +234,12 @@ def test_ctrl_c_ends_it(stored: Path):
     command = [sys.executable, "-c", code, "explore", str(stored), "--no-browser"]
     run = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, bufsize=1)
     assert run.stdout is not None
-    told = ""
-    while "Ctrl-C" not in told:
+    message = ""
+    while "Ctrl-C" not in message:
         line = run.stdout.readline()
         assert line, run.communicate()
-        told += line
-    address = re.search(r"http://127\.0\.0\.1:\d+/\S+", told)
+        message += line
+    address = re.search(r"http://127\.0\.0\.1:\d+/\S+", message)
     assert address is not None
     where = urlsplit(address[0])
     line_to_it = http.client.HTTPConnection(where.netloc, timeout=60)
@@ -255,8 +255,8 @@ def test_the_page_with_a_cube(server: CubeServer, stored: Path):
     with chromium() as browser, io.load(stored) as cube:
         page = Page(browser, server.url)
         row, column = SHAPE[0] // 2, SHAPE[1] // 2
-        told = page.drawn()
-        assert told["draw"]["counts"] == np.asarray(cube.histogram[0, row, column]).tolist()
+        state = page.drawn()
+        assert state["draw"]["counts"] == np.asarray(cube.histogram[0, row, column]).tolist()
         assert "room <1>.zarr" in page.tab.inner_text("#title-cube")
         page.until("explorer.picture.whole")
         box = page.tab.locator("#counts canvas").bounding_box()
@@ -264,15 +264,15 @@ def test_the_page_with_a_cube(server: CubeServer, stored: Path):
         page.tab.evaluate("explorer.figure.results = {}")
         at = {"x": 2.5 / SHAPE[1] * box["width"], "y": 6.5 / SHAPE[0] * box["height"]}
         page.tab.locator("#counts canvas").click(position=at)
-        told = page.drawn()
-        assert told["draw"]["counts"] == np.asarray(cube.histogram[0, 6, 2]).tolist()
+        state = page.drawn()
+        assert state["draw"]["counts"] == np.asarray(cube.histogram[0, 6, 2]).tolist()
         state = page.tab.evaluate("explorer.state")
         assert (state["signal"], state["delay"], state["start"]) == (pytest.approx(0.8), 32.0, "stationary")
         mean = ml.statistics.mean_histogram(ml.Flux(0.8, 0.1, 32.0), cube.system)
-        assert np.abs(np.array(told["mean"]["mean"]) - mean).max() <= 1e-6 * mean.max()
+        assert np.abs(np.array(state["mean"]["mean"]) - mean).max() <= 1e-6 * mean.max()
         names: dict[str, Any] = {}
         exec(page.tab.inner_text("#python").replace("plt.show()", "plt.close('all')"), names)
-        assert np.array_equal(names["drawn"], told["draw"]["counts"])
+        assert np.array_equal(names["drawn"], state["draw"]["counts"])
         assert names["mean"] == pytest.approx(mean)
         page.tab.fill("#image", "1")
         page.tab.evaluate("explorer.figure.results = {}")

@@ -65,14 +65,14 @@ def test_effects_of_a_detector(transient, tmp_path):
     system = SYSTEM.replace(detector=detector)
     stored, whole = transient.stored_flux(system, signal=1.0, sbr=2.0), transient.flux(system, signal=1.0, sbr=2.0)
     rate = np.linspace(0.0, 1e6, 15).reshape(5, 3)
-    for one, other in (
+    for item, other in (
         (stored.detected(system), whole.detected(system)),
         (stored.with_dark_counts(rate, system), whole.with_dark_counts(rate, system)),
     ):
-        assert isinstance(one, StoredFlux)
-        assert np.array_equal(one.background, other.background)
-        assert np.array_equal(np.asarray(one.waveform), other.waveform)
-        assert np.array_equal(one[1:4:2].background, other[1:4:2].background)
+        assert isinstance(item, StoredFlux)
+        assert np.array_equal(item.background, other.background)
+        assert np.array_equal(np.asarray(item.waveform), other.waveform)
+        assert np.array_equal(item[1:4:2].background, other[1:4:2].background)
     io.simulate_to(tmp_path / "cube.h5", stored, system, seed=3)
     with io.load(tmp_path / "cube.h5") as cube:
         assert np.array_equal(np.asarray(cube.histogram), ml.simulate(whole, system, seed=3))
@@ -107,9 +107,9 @@ def test_the_command_goes_from_a_file_to_a_cube_and_a_picture(transient, tmp_pat
     with io.load(out) as cube:
         flux = transient.flux(cube.system, signal=0.5, sbr=4.0, pulse=False)
         assert np.array_equal(np.asarray(cube.histogram), ml.simulate(flux, cube.system))
-    told = command_line(["info", str(out)]).output
+    message = command_line(["info", str(out)]).output
     for word in ("waveform of 200 parts", "t.npy", "pulse_convolved False"):
-        assert word in told
+        assert word in message
     twice = "light must give one of signal and photons_per_unit, got both"
     for more, error in (
         (["--overwrite"], "give bin_ns"),
@@ -130,9 +130,9 @@ def test_matlab_files(transient, tmp_path):
         file["transient"] = values.transpose(2, 1, 0)
         file["bin_ns"], file["start_ns"] = [[0.5]], [[3.0]]
     for name in ("old.mat", "new.mat"):
-        found = io.read_transient(tmp_path / name)
-        assert (found.shape, found.bin_ns, found.start_ns) == ((5, 3), 0.5, 3.0)
-        assert np.array_equal(np.asarray(found.values[1:3]), values[1:3])
+        result = io.read_transient(tmp_path / name)
+        assert (result.shape, result.bin_ns, result.start_ns) == ((5, 3), 0.5, 3.0)
+        assert np.array_equal(np.asarray(result.values[1:3]), values[1:3])
         with pytest.raises(ValueError, match=rf"{name}: .*no array 'light'.*transient"):
             io.read_transient(tmp_path / name, name="light")
 

@@ -27,9 +27,9 @@ def drawn(delay: np.ndarray, photons: float, sbr: float = 1.0, system: ml.System
     return ml.simulate(ml.Flux(np.full(delay.shape, level), level / sbr, delay), system, seed=seed)[0]
 
 
-def off_by(found: ml.Reconstruction, delay: np.ndarray) -> np.ndarray:
-    period = found.system.period_ns
-    return (found.delay_ns - delay + 0.5 * period) % period - 0.5 * period
+def off_by(result: ml.Reconstruction, delay: np.ndarray) -> np.ndarray:
+    period = result.system.period_ns
+    return (result.delay_ns - delay + 0.5 * period) % period - 0.5 * period
 
 
 def roof(side: int = 32) -> np.ndarray:
@@ -96,19 +96,19 @@ def test_likelihood_of_a_pixel():
 def test_depth_where_each_pixel_alone_has_none(method):
     delay = roof()
     cube = drawn(delay, 2.0)
-    found, alone = ml.reconstruct(cube, SYSTEM, method), ml.reconstruct(cube, SYSTEM)
-    off = np.abs(off_by(found, delay))
+    result, alone = ml.reconstruct(cube, SYSTEM, method), ml.reconstruct(cube, SYSTEM)
+    off = np.abs(off_by(result, delay))
     assert (off > 3.0 * SIGMA).mean() < 0.02 < 0.3 < (~(np.abs(off_by(alone, delay)) < 3.0 * SIGMA)).mean()
     assert np.median(off) < 0.25 * SIGMA
-    stated = np.isfinite(found.delay_half_width_ns)
+    stated = np.isfinite(result.delay_half_width_ns)
     assert stated.mean() > 0.85
     # pixels share photons: nine of them count as one
-    inside, count = (off <= found.delay_half_width_ns)[stated].mean(), int(stated.sum() / 9)
+    inside, count = (off <= result.delay_half_width_ns)[stated].mean(), int(stated.sum() / 9)
     require({"coverage": float(stats.binom.cdf(np.floor(inside * count), count, 0.9))}, f"intervals of {method}")
-    assert found.signal.mean() == pytest.approx(2.0 / SYSTEM.cycles, rel=0.1)
-    assert found.background.mean() == pytest.approx(2.0 / SYSTEM.cycles, rel=0.1)
-    assert found.outlier.min() >= 0.0
-    assert found.outlier.max() <= 1.0
+    assert result.signal.mean() == pytest.approx(2.0 / SYSTEM.cycles, rel=0.1)
+    assert result.background.mean() == pytest.approx(2.0 / SYSTEM.cycles, rel=0.1)
+    assert result.outlier.min() >= 0.0
+    assert result.outlier.max() <= 1.0
 
 
 @pytest.mark.parametrize(
@@ -128,19 +128,19 @@ def test_systems(system):
     """Delay and signal, whatever the detector hides: no more bias than a tenth of the pulse or of the signal."""
     # within a bin nothing tells where: the slopes cross some
     delay = 30.0 + (2.0 if system.bins < 64 else 0.02) * (roof() - 30.0)
-    found = ml.reconstruct(drawn(delay, 5.0, system=system), system, "image")
+    result = ml.reconstruct(drawn(delay, 5.0, system=system), system, "image")
     width = max(getattr(system.pulse, "sigma_ns", SIGMA), 0.3 * system.bin_ns)
-    off = off_by(found, delay)
+    off = off_by(result, delay)
     assert (np.abs(off) > 3.0 * width).mean() < 0.03
     near = np.abs(off) < 3.0 * width
     assert abs(off[near].mean()) < 0.1 * width
-    assert found.signal.mean() == pytest.approx(5.0 / system.cycles, rel=0.1)
+    assert result.signal.mean() == pytest.approx(5.0 / system.cycles, rel=0.1)
 
 
 def test_over_the_end_of_the_period():
     delay = roof() + 50.0 + 15.0
-    found = ml.reconstruct(drawn(delay, 3.0), SYSTEM, "image")
-    assert (np.abs(off_by(found, delay)) > 3.0 * SIGMA).mean() < 0.02
+    result = ml.reconstruct(drawn(delay, 3.0), SYSTEM, "image")
+    assert (np.abs(off_by(result, delay)) > 3.0 * SIGMA).mean() < 0.02
 
 
 def test_hot_and_missing_pixels():
@@ -150,14 +150,14 @@ def test_hot_and_missing_pixels():
     level = 10.0 / SYSTEM.cycles
     flux = ml.Flux(np.full(delay.shape, level), level * np.where(hot, 50.0, 1.0), delay)
     cube = np.where(missing[..., None], 0, ml.simulate(flux, SYSTEM, seed=2)[0])
-    found = ml.reconstruct(cube, SYSTEM, "image")
-    assert (found.flags[missing] & Flags.FILLED > 0).all()
-    assert np.isnan(found.delay_half_width_ns[missing]).all()
-    assert not found.detected[missing].any()
-    off = np.abs(off_by(found, delay))
+    result = ml.reconstruct(cube, SYSTEM, "image")
+    assert (result.flags[missing] & Flags.FILLED > 0).all()
+    assert np.isnan(result.delay_half_width_ns[missing]).all()
+    assert not result.detected[missing].any()
+    off = np.abs(off_by(result, delay))
     assert np.median(off[hot]) < SIGMA
     assert (off[~hot & ~missing] > 3.0 * SIGMA).mean() < 0.01
-    assert np.median(found.background[hot]) > 20.0 * level
+    assert np.median(result.background[hot]) > 20.0 * level
 
 
 def test_efficiency_of_each_pixel():
@@ -169,14 +169,14 @@ def test_efficiency_of_each_pixel():
     level = 4.0 / SYSTEM.cycles
     cube = ml.simulate(ml.Flux(level * share, level * share, delay), SYSTEM, seed=3)[0]
     for method in (Image, UntrainedImage):
-        found = ml.reconstruct(cube, SYSTEM, method(efficiency=5.0 * share))
+        result = ml.reconstruct(cube, SYSTEM, method(efficiency=5.0 * share))
         sees = share > 0.0
-        assert (found.flags[~sees] & Flags.FILLED > 0).all()
-        assert found.signal[sees].mean() == pytest.approx(level, rel=0.05)
-        assert found.background[sees].mean() == pytest.approx(level, rel=0.05)
-        assert (np.abs(off_by(found, delay)) > 3.0 * SIGMA).mean() < 0.01
+        assert (result.flags[~sees] & Flags.FILLED > 0).all()
+        assert result.signal[sees].mean() == pytest.approx(level, rel=0.05)
+        assert result.background[sees].mean() == pytest.approx(level, rel=0.05)
+        assert (np.abs(off_by(result, delay)) > 3.0 * SIGMA).mean() < 0.01
         not_told = ml.reconstruct(cube, SYSTEM, method())
-        error, other = (float(np.sqrt(((x.signal - level)[sees] ** 2).mean())) for x in (found, not_told))
+        error, other = (float(np.sqrt(((x.signal - level)[sees] ** 2).mean())) for x in (result, not_told))
         assert error < 0.5 * other
 
 
@@ -203,9 +203,9 @@ def test_exposures_added_up_are_one_longer_exposure():
     flux = ml.Flux(np.full(delay.shape, 1e-3), 1e-3, delay)
     off = []
     for cube in (both, ml.simulate(flux, longer, seed=1)[0]):
-        found = ml.reconstruct(cube, longer, "image")
-        assert found.signal.mean() == pytest.approx(1e-3, rel=0.1)
-        off.append(np.median(np.abs(off_by(found, delay))))
+        result = ml.reconstruct(cube, longer, "image")
+        assert result.signal.mean() == pytest.approx(1e-3, rel=0.1)
+        off.append(np.median(np.abs(off_by(result, delay))))
     assert max(off) < 0.25 * SIGMA
 
 
@@ -231,29 +231,29 @@ def test_two_surfaces(dead_time):
     """A pane before half of a roof: both where it is, one beside it, and the signal of each, whatever they blind."""
     system = replace(SYSTEM, cycles=300, detector=ml.Detector(dead_time_ns=dead_time))
     delay, photons = roof(), np.full((32, 32), 4.0 / 300)
-    behind = np.where(np.arange(32) < 16, 1.0, 0.0) * photons
-    flux = ml.Flux.multi(ml.Flux(photons, photons, delay), ml.Flux(behind, 0.0, delay - 15.0))
+    hidden = np.where(np.arange(32) < 16, 1.0, 0.0) * photons
+    flux = ml.Flux.multi(ml.Flux(photons, photons, delay), ml.Flux(hidden, 0.0, delay - 15.0))
     cube = ml.simulate(flux, system, seed=3)[0]
-    found = ml.reconstruct(cube, system, "image", returns=2)
-    near, far = np.moveaxis(found.returns.delay_ns, -1, 0)
+    result = ml.reconstruct(cube, system, "image", returns=2)
+    near, far = np.moveaxis(result.returns.delay_ns, -1, 0)
     both = (np.abs(near - delay + 15.0) < 3.0 * SIGMA) & (np.abs(far - delay) < 3.0 * SIGMA)
     assert both[:, :16].mean() > 0.8
-    assert (found.returns.count[:, 16:] > 1).mean() < 0.03
-    assert (np.abs(off_by(found, delay)) < 3.0 * SIGMA)[:, 16:].mean() > 0.97
-    assert np.nanmedian(found.returns.signal[:, :16], (0, 1)) == pytest.approx(photons[0, 0], rel=0.15)
-    assert found.background.mean() == pytest.approx(photons[0, 0], rel=0.1)
-    strongest = np.nanmax(np.where(np.isfinite(found.returns.delay_ns), found.returns.signal, -1.0), -1)
-    some = found.returns.count > 0
-    assert np.array_equal(found.signal[some], strongest[some])
-    assert np.array_equal(found.returns.count, np.isfinite(found.returns.false_alarm).sum(-1))
+    assert (result.returns.count[:, 16:] > 1).mean() < 0.03
+    assert (np.abs(off_by(result, delay)) < 3.0 * SIGMA)[:, 16:].mean() > 0.97
+    assert np.nanmedian(result.returns.signal[:, :16], (0, 1)) == pytest.approx(photons[0, 0], rel=0.15)
+    assert result.background.mean() == pytest.approx(photons[0, 0], rel=0.1)
+    strongest = np.nanmax(np.where(np.isfinite(result.returns.delay_ns), result.returns.signal, -1.0), -1)
+    some = result.returns.count > 0
+    assert np.array_equal(result.signal[some], strongest[some])
+    assert np.array_equal(result.returns.count, np.isfinite(result.returns.false_alarm).sum(-1))
 
 
 def test_bright_pixels_are_estimated_alone():
     system = replace(SYSTEM, cycles=20_000)
     cube = drawn(roof(16), 500.0, system=system)
-    found, alone = ml.reconstruct(cube, system, "image"), ml.reconstruct(cube, system)
-    assert np.array_equal(found.delay_ns, alone.delay_ns)
-    assert (found.outlier < 0.01).all()
+    result, alone = ml.reconstruct(cube, system, "image"), ml.reconstruct(cube, system)
+    assert np.array_equal(result.delay_ns, alone.delay_ns)
+    assert (result.outlier < 0.01).all()
 
 
 def test_signal_at_an_edge_of_reflectivity():
@@ -292,8 +292,8 @@ def test_blocks_and_threads_do_not_matter(monkeypatch):
         with monkeypatch.context() as patch:
             patch.setattr(image_module, "BLOCK_PIXELS", 24 * 5)
             for k in range(2):
-                one = ml.reconstruct(cube[k].astype(np.int64), SYSTEM, method, threads=1)
-                for name, values in one.maps().items():
+                item = ml.reconstruct(cube[k].astype(np.int64), SYSTEM, method, threads=1)
+                for name, values in item.maps().items():
                     if name != "reflectivity":  # over the mean of its own image
                         assert np.array_equal(getattr(both, name)[k], values, equal_nan=True), (method, name)
 
@@ -304,15 +304,15 @@ def test_nothing_there():
     assert np.isnan(empty.depth_m).all()
     assert (empty.signal == 0.0).all()
     dark = ml.simulate(ml.Flux(np.zeros((32, 32)), 0.005, 0.0), SYSTEM, seed=4)[0]
-    found = ml.reconstruct(dark, SYSTEM, "image_untrained")
-    assert np.median(found.outlier) > 0.3
-    assert np.isfinite(found.delay_half_width_ns).mean() < 0.05
+    result = ml.reconstruct(dark, SYSTEM, "image_untrained")
+    assert np.median(result.outlier) > 0.3
+    assert np.isfinite(result.delay_half_width_ns).mean() < 0.05
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 40), (40, 1), (3, 2)])
 def test_any_shape(shape):
-    found = ml.reconstruct(drawn(np.full(shape, 50.0), 8.0), SYSTEM, "image")
-    assert np.median(np.abs(found.delay_ns - 50.0)) < SIGMA
+    result = ml.reconstruct(drawn(np.full(shape, 50.0), 8.0), SYSTEM, "image")
+    assert np.median(np.abs(result.delay_ns - 50.0)) < SIGMA
 
 
 @pytest.mark.parametrize(

@@ -19,19 +19,19 @@ SYSTEM = make_system(30.0, 50, 32)
 
 def test_a_pane_hides_behind_what_is_nearer():
     scene = ml.Scene([[1.0, 4.0, np.nan]], 0.5, [[1.0, 2.0, 3.0]])
-    seen = LayeredScene.behind_pane(scene, 2.0, 0.1, 0.8)
-    np.testing.assert_array_equal(seen.layers[1].depth_m, [[np.nan, 2.0, 2.0]])
-    np.testing.assert_allclose(seen.reflectivity, [[0.5, 0.4, 0.4]])
-    assert seen.valid.all()
-    flux = seen.flux(SYSTEM, signal=2.0, sbr=4.0)
+    visible = LayeredScene.behind_pane(scene, 2.0, 0.1, 0.8)
+    np.testing.assert_array_equal(visible.layers[1].depth_m, [[np.nan, 2.0, 2.0]])
+    np.testing.assert_allclose(visible.reflectivity, [[0.5, 0.4, 0.4]])
+    assert visible.valid.all()
+    flux = visible.flux(SYSTEM, signal=2.0, sbr=4.0)
     assert flux.returns_signal.shape == (2, 1, 3)
     assert flux.signal.mean() == pytest.approx(2.0)
     np.testing.assert_allclose(flux.returns_signal[:, 0, 1] / flux.signal[0, 0], [0.8, 0.2])
     np.testing.assert_allclose(flux.background, 0.5 * np.array([[0.5, 1.0, 1.5]]))  # the map of the first layer
-    near = seen.flux(SYSTEM, signal=2.0, sbr=4.0, attenuation="inverse_square", ambient="reflectivity")
+    near = visible.flux(SYSTEM, signal=2.0, sbr=4.0, attenuation="inverse_square", ambient="reflectivity")
     np.testing.assert_allclose(near.returns_signal[:, 0, 1] / near.signal[0, 0], [0.4 / 16 / 0.5, 0.1 / 4 / 0.5])
     np.testing.assert_allclose(near.background / near.background[0, 0], [[1.0, 1.0, 0.2]])  # the last: the pane alone
-    twice = LayeredScene.behind_pane(seen, 1.5, 0.2)
+    twice = LayeredScene.behind_pane(visible, 1.5, 0.2)
     assert len(twice.layers) == 3
     assert twice[:, 1:].shape == (1, 2)
     assert twice.resize((2, 6)).shape == (2, 6)
@@ -42,28 +42,32 @@ def test_ambient_light_of_layers_in_any_order():
     nan, rng = np.nan, np.random.default_rng(5)
     depths = [[[1.0, nan, nan, 3.0, nan]], [[2.0, 2.0, nan, nan, nan]], [[4.0, nan, 4.0, nan, nan]]]
     layers = [ml.Scene(depth, rng.uniform(0.1, 0.9, (1, 5))) for depth in depths]
-    share = [one.reflectivity[0] for one in layers]
+    share = [item.reflectivity[0] for item in layers]
     sums = [share[0][0] + share[1][0] + share[2][0], share[1][1], share[2][2], share[0][3], max(s[4] for s in share)]
     for order in itertools.permutations(range(3)):
         flux = LayeredScene([layers[k] for k in order]).flux(SYSTEM, signal=2.0, sbr=4.0, ambient="reflectivity")
         np.testing.assert_allclose(flux.background[0] / flux.background[0, 1], np.array(sums) / sums[1], rtol=1e-12)
         assert flux.background[0, :4].mean() == pytest.approx(0.5)  # over the pixels with a return
     alone = layers[0].flux(SYSTEM, signal=2.0, sbr=4.0, ambient="reflectivity")
-    one = LayeredScene(layers[:1]).flux(SYSTEM, signal=2.0, sbr=4.0, ambient="reflectivity")
-    np.testing.assert_array_equal(alone.background, one.background)
+    item = LayeredScene(layers[:1]).flux(SYSTEM, signal=2.0, sbr=4.0, ambient="reflectivity")
+    np.testing.assert_array_equal(alone.background, item.background)
 
 
 def test_bad_layers(tmp_path):
-    one = ml.Scene(np.ones((2, 2)), 1.0)
-    for layers, told in (([], "1 to 16"), ([one] * 17, "1 to 16"), ([one, ml.Scene([[1.0]], 1.0)], "one shape")):
-        with pytest.raises(ValueError, match=told):
+    item = ml.Scene(np.ones((2, 2)), 1.0)
+    for layers, message in (([], "1 to 16"), ([item] * 17, "1 to 16"), ([item, ml.Scene([[1.0]], 1.0)], "one shape")):
+        with pytest.raises(ValueError, match=message):
             LayeredScene(layers)
-    for arguments, told in (((0.0, 0.1), "depth_m"), ((1.0, 2.0), "reflectivity"), ((1.0, 0.1, 0.0), "transmission")):
-        with pytest.raises(ValueError, match=f"{told} must be"):
-            LayeredScene.behind_pane(one, *arguments)
+    for arguments, name in (
+        ((0.0, 0.1), "depth_m"),
+        ((1.0, 2.0), "reflectivity"),
+        ((1.0, 0.1, 0.0), "transmission"),
+    ):
+        with pytest.raises(ValueError, match=f"{name} must be"):
+            LayeredScene.behind_pane(item, *arguments)
     path = tmp_path / "s.npz"
     depth = np.ones((2, 3, 4))
-    for arrays, told in (
+    for arrays, message in (
         ({"depth": depth[0]}, r"must be an \.npz with a depth of \(layers, H, W\)"),
         ({"depth": depth, "image": depth}, "give reflectivity, not image"),
         ({"depth": depth, "reflectivity": depth[0]}, "reflectivity must have the shape of depth"),
@@ -74,7 +78,7 @@ def test_bad_layers(tmp_path):
         ({"depth": np.ones((17, 3, 4))}, "layers must be 1 to 16"),
     ):
         np.savez(path, **arrays)
-        with pytest.raises(ValueError, match=told):
+        with pytest.raises(ValueError, match=message):
             read_layers(path)
     np.savez(path, depth=(1000 * depth).astype(np.uint16))
     np.testing.assert_array_equal(read_layers(path, depth_unit_m=0.001).layers[1].depth_m, depth[1])

@@ -54,14 +54,14 @@ def test_mean_histogram(name: str, monkeypatch: pytest.MonkeyPatch):
     """Every bin as on a grid of its own, and the tolerance in total variation."""
     flux, system = flux_of(name), PIXELS[name][2]
     for method in ("exposure", "stationary"):
-        found = ml.registration_pdf(flux, system, method)
+        result = ml.registration_pdf(flux, system, method)
         with monkeypatch.context() as patch:
             patch.setitem(vars(TOL), "many_bins", 2**20)
             longer = replace(LAW, recursion=1e9, one_pass=1e9)  # a reference may take its time
             patch.setattr("mars_lidar.statistics.histogram.LAW", longer)
             known = ml.registration_pdf(flux, system, method)
-        assert 0.5 * np.abs(found - known).sum() < 1e-6
-        assert np.abs(found - known).max() < 1e-4 * known.max()
+        assert 0.5 * np.abs(result - known).sum() < 1e-6
+        assert np.abs(result - known).max() < 1e-4 * known.max()
 
 
 @pytest.mark.full

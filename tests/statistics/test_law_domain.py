@@ -154,11 +154,11 @@ def test_wide_laws_from_few_points(
     used = []
     true_narrow = pmf_module._narrow
 
-    def told(*arguments: Any) -> Any:
+    def recorded(*arguments: Any) -> Any:
         used.append(true_narrow(*arguments))
         return used[-1]
 
-    monkeypatch.setattr(pmf_module, "_narrow", told)
+    monkeypatch.setattr(pmf_module, "_narrow", recorded)
     law = ml.count_law(ml.Flux(signal, background, 50.0), system)
     assert law.pmf.size > 256
     assert used[0] is not None
@@ -182,8 +182,8 @@ def test_the_law_of_a_hundred_million_periods():
     assert 0.5 * np.abs(law.pmf - normal).sum() < 1e-3
 
 
-@pytest.mark.parametrize(("lattice", "seen"), [(1, True), (2, False), (3, False)])
-def test_laws_on_a_lattice_take_all_points(monkeypatch: pytest.MonkeyPatch, lattice: int, seen: bool):
+@pytest.mark.parametrize(("lattice", "converges"), [(1, True), (2, False), (3, False)])
+def test_laws_on_a_lattice_take_all_points(monkeypatch: pytest.MonkeyPatch, lattice: int, converges: bool):
     """Counts that come in pairs have a second peak of the transform at -1, as narrow as the first."""
     system = view(0.5, 10_000)
 
@@ -195,8 +195,8 @@ def test_laws_on_a_lattice_take_all_points(monkeypatch: pytest.MonkeyPatch, latt
     monkeypatch.setattr(pmf_module, "characteristic", transform)
     variance = 0.3 * 10_000 * lattice**2
     size = 2 * math.ceil(8 * math.sqrt(variance))
-    found = pmf_module._narrow(Cells.of(1.0, 1.0, system), size, 128, 1, variance, pmf_module.Remaining())
-    assert (found is not None) == seen
+    result = pmf_module._narrow(Cells.of(1.0, 1.0, system), size, 128, 1, variance, pmf_module.Remaining())
+    assert (result is not None) == converges
 
 
 @pytest.mark.parametrize(
@@ -261,12 +261,12 @@ def test_work_of_refused_laws(
     done: list[float] = []
     run = exposure_module._run
 
-    def told(cells: Cells, bins: int, *arguments: Any) -> Any:
-        found = run(cells, bins, *arguments)
-        done.append(float(bins) * (10.0 + min(cycles, max(int(found.settled[0]), 1))))
-        return found
+    def recorded(cells: Cells, bins: int, *arguments: Any) -> Any:
+        result = run(cells, bins, *arguments)
+        done.append(float(bins) * (10.0 + min(cycles, max(int(result.settled[0]), 1))))
+        return result
 
-    monkeypatch.setattr(exposure_module, "_run", told)
+    monkeypatch.setattr(exposure_module, "_run", recorded)
     with pytest.raises(ConvergenceError, match="the limit of a law"):
         ml.count_law(ml.Flux(signal, 0.0, 50.0), view(dead, cycles, sigma, start))
     assert sum(done) <= LAW.recursion
@@ -304,9 +304,9 @@ def test_joint_law_known_to_settle(monkeypatch: pytest.MonkeyPatch):
 )
 def test_refusals_say_what_to_use(signal: float, background: float, dead: float, cycles: int, sigma: float, start: str):
     system = view(dead, cycles, sigma, start)
-    told = r"; use .*joint_law.*simulate it with engine 'exact'"
+    message = r"; use .*joint_law.*simulate it with engine 'exact'"
     for law in (ml.count_law, mean_histogram, ml.registration_pdf):
-        with pytest.raises((ConvergenceError, MemoryError), match=told):
+        with pytest.raises((ConvergenceError, MemoryError), match=message):
             law(ml.Flux(signal, background, 50.0), system)
 
 
@@ -348,7 +348,7 @@ def test_counts_far_from_zero_are_unwrapped_at_once():
 
 @pytest.mark.parametrize("law", [ml.count_law, ml.registration_pdf, mean_histogram, exposure_moments, ml.joint_law])
 @pytest.mark.parametrize(
-    ("change", "error", "told"),
+    ("change", "error", "message"),
     [
         ({"signal": math.nan}, ValueError, "signal must lie in"),
         ({"signal": -1e-9}, ValueError, "signal must lie in"),
@@ -367,11 +367,11 @@ def test_counts_far_from_zero_are_unwrapped_at_once():
         ({"system": None}, TypeError, "system must be a System"),
     ],
 )
-def test_bad_input(law: Any, change: dict[str, Any], error: type[Exception], told: str):
+def test_bad_input(law: Any, change: dict[str, Any], error: type[Exception], message: str):
     given: dict[str, Any] = {"system": view(0.6)} | change
     light = {"signal": 1.0, "background": 0.1, "delay_ns": 50.0} if "waveform" not in given else {}
     light |= {name: given.pop(name) for name in ("signal", "background", "delay_ns", "waveform") if name in given}
-    with pytest.raises(error, match=told):
+    with pytest.raises(error, match=message):
         law(ml.Flux(**light), given.pop("system"), **given)
 
 

@@ -51,7 +51,7 @@ def test_the_study_goes_on_where_it_was_stopped(tmp_path: Path, monkeypatch: pyt
     text, rows = study.text, study.rows
     assert "33.68 / 0.061" in text
     assert "36.49" not in text  # the paper's row of another ratio
-    assert "not for citing" in text
+    assert "not for citation" in text
     assert "_Cramer-Rao bound_" in text
     assert study.figures == ["downstream.png"]
     scenes = small.sizes.test[1]

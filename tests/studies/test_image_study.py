@@ -31,7 +31,7 @@ def test_study(tmp_path):
     study = quick_study("image", tmp_path, "--captures", tmp_path / "captures")
     text = study.text
     assert ("DRUNet: skipped" in text) != ("| DRUNet prior |" in text)
-    assert "Quick form" in text
+    assert "Quick run" in text
     assert "| measured | 2 | image |" in text
     assert study.figures == ["image.png"]
     assert len(study.rows) > 10

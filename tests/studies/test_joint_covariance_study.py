@@ -29,7 +29,7 @@ def test_random_systems(systems):
 def test_report(systems, tmp_path, monkeypatch):
     monkeypatch.setattr(joint_covariance, "random_systems", lambda *_: systems)
     study = quick_study("joint-covariance", tmp_path)
-    assert "Quick form" in study.text
+    assert "Quick run" in study.text
     assert "None given" in study.text
     assert study.figures == ["joint_covariance.png"]
     assert len(study.rows) == QUICK.systems

@@ -93,7 +93,7 @@ def test_files(tmp_path):
     pytest.importorskip("sklearn", reason="extra 'studies'")
     study = quick_study("joint", tmp_path)
     rows = study.rows
-    assert "Quick form" in study.text
+    assert "Quick run" in study.text
     assert study.figures == ["joint.png"]
     quick = joint.QUICK
     assert len(rows) == (1 + len(joint.ENGINES)) * (len(quick.cases) + quick.systems)

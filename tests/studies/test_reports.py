@@ -97,7 +97,7 @@ def test_a_template_is_filled_strictly(tmp_path: Path):
         report.render(request, template, {"values": [1.0]})
     facts = {"values": [1.0, 2.345], "rest": "end"}
     text = report.render(request, template, facts)
-    assert text == "# A\n\n_Quick form: a look, not for citing._\n\n- 1.00\n- 2.35\n\nend\n"
+    assert text == "# A\n\n_Quick run: a preview, not for citation._\n\n- 1.00\n- 2.35\n\nend\n"
     assert "Quick" not in report.render(Request(tmp_path), template, facts)
 
 

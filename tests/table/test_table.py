@@ -146,10 +146,10 @@ def test_the_method_of_the_paper():
     i, j = np.array([3, 20, 32]), np.array([2, 11, 24])
     light = ml.Flux(table.signal[i], table.background[j], 0.5 * table.system.period_ns)
     law = ml.count_law(light, table.system, "mars")
-    found = table.at(table.signal[i], table.background[j], delay_ns=12.0)
-    assert found.cumulants[:, 0] == pytest.approx(law.mean, rel=1e-12)
-    assert found.cumulants[:, 1] == pytest.approx(law.variance, rel=1e-12)
-    assert not found.cumulants[:, 2:].any()
+    estimate = table.at(table.signal[i], table.background[j], delay_ns=12.0)
+    assert estimate.cumulants[:, 0] == pytest.approx(law.mean, rel=1e-12)
+    assert estimate.cumulants[:, 1] == pytest.approx(law.variance, rel=1e-12)
+    assert not estimate.cumulants[:, 2:].any()
     chain = ml.registration_pdf(
         ml.Flux(table.signal[i], table.background[j], 0.5 * table.system.period_ns), table.system, "chain"
     )

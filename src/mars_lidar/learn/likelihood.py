@@ -138,7 +138,7 @@ def histogram_log_likelihood(
     -----
     Unbiased to 0.1 of the Cramer-Rao bound's standard deviation at 1000 cycles, for bins of up to 3 widths (sigma) of
     the pulse, S up to 10, B up to 5 and any dead time: at most 0.03 over the 399 random instruments with which its
-    settings were chosen, 0.05 over 198 others, against the exact mean histogram (the bias in these units grows with the
+    settings were chosen, 0.05 over 398 others, against the exact mean histogram (the bias in these units grows with the
     square root of the cycles). The bias of S and of the delay is larger (0.2 and 0.4 in two further instruments) where
     three conditions hold: an armed start, a dead time longer than a period, and less than one pass of the pulse that is
     expected to end without registration. The registrations that the end of the exposure cuts off then matter, and a

@@ -196,8 +196,8 @@ def reconstruct(
         (..., bins) counts, whole numbers of any type, e.g. (realizations, H, W, bins) of `simulate`.
         Or a cube of `mars_lidar.io.load`, which contains its system.
     system
-        The system that recorded them. Flux is periodic, with the system's pulse. None: the system that the cube
-        carries.
+        The system that recorded them. Flux is periodic, with the system's pulse. None: the system of the
+        cube.
     method
         A name in `mars_lidar.reconstruction.METHODS` (default ``"maximum_likelihood"``; docs/reconstruction.md says
         what each assumes), or a `Method` with other settings. Each refuses detectors to which it does not apply.
@@ -248,7 +248,7 @@ def reconstruct(
     if isinstance(cube, Recorded):
         system, cube = cube.system if system is None else system, np.asarray(cube.histogram)
     if system is None:
-        raise TypeError("system must be given for an array of counts (a cube of mars_lidar.io.load carries its own)")
+        raise TypeError("system must be given for an array of counts (a cube of mars_lidar.io.load contains its own)")
     used = with_returns(find_method(method), returns)
     checks.choice("attenuation", attenuation, ATTENUATIONS)
     if level is not None:

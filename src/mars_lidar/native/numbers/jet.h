@@ -151,7 +151,7 @@ Jet<T> larger(const Jet<T>& x, const Jet<T>& y) {
     return choose(number(x) < number(y), y, x);
 }
 
-MARS_INLINE bool any(const RealMask& which) {
+MARS_INLINE bool any_of(const RealMask& which) {
     const Real marked = which ? splat(1.0) : splat(0.0);
     bool some = false;
     for (int k = 0; k < kReals; ++k) some = some || lane(marked, k) > 0.0;

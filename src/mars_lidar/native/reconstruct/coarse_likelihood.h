@@ -240,7 +240,7 @@ class CoarseLikelihood {
             for (const int64_t k : plan_.order) {
                 const RealMask again =
                     round == 0 ? all_pixels : moved(source_[k].bin) | moved(cyclic(source_[k].bin + 1));
-                const bool some = any(again);
+                const bool some = any_of(again);
                 moved_[k] = some ? again & (pass(k, again) > settled) : again;
                 moving = moving || some;
             }

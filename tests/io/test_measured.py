@@ -122,7 +122,7 @@ def test_saved_and_loaded_it_stays_a_measured_cube(tmp_path: Path, counts: np.nd
 
 def test_formats_that_keep_the_light_refuse_measured_counts(tmp_path: Path, counts: np.ndarray) -> None:
     cube = io.from_histograms(counts, SYSTEM)
-    with pytest.raises(ValueError, match=r"a \.mat keeps the light"):
+    with pytest.raises(ValueError, match=r"a \.mat stores the light"):
         io.save(tmp_path / "lab.mat", cube)
     assert not list(tmp_path.iterdir())
 

@@ -122,8 +122,8 @@ class ForeignOptions:
             gate = cube.system.detector.gate_width_ns
             say(
                 f"warning: {path}: {gate:.6g} of the {system.period_ns:.6g} ns of a period are taken for the gate of a "
-                "detector that is off outside; a free-running detector is also blind after light there, which makes S and "
-                "B too low: give its whole period"
+                "detector that is off outside; a free-running detector is also blind after light there, which makes S "
+                "and B too low: give its whole period"
             )
         return cube
 

@@ -54,6 +54,7 @@ def recording_of(system: System, *, longer: float = 1.0, wider: float = 1.0) -> 
         width=pulse_width(sharpness),
         core_low=core[0] / system.period_ns,
         core_high=core[1] / system.period_ns,
+        sample=system.pulse.bin_ns / system.period_ns * wider if isinstance(system.pulse, SampledPulse) else 0.0,
         open_low=open_low,
         open_high=open_high,
     )

@@ -66,7 +66,7 @@ void bind_corrected_rates(nb::module_& module) {
             "__init__",
             [](HistogramRecord* self, int64_t bins, int64_t cycles, int64_t whole, int64_t shift, double fraction,
                bool stationary, bool synchronous, double pulse_low, double pulse_cell, Vector<const double> energy,
-               Vector<const double> slope, double peak, double width, double core_low, double core_high,
+               Vector<const double> slope, double peak, double width, double core_low, double core_high, double sample,
                Vector<const double> open_low, Vector<const double> open_high) {
                 const size_t parts = open_low.shape(0);
                 if (energy.shape(0) < 2 || slope.shape(0) != energy.shape(0))
@@ -77,12 +77,12 @@ void bind_corrected_rates(nb::module_& module) {
                     throw nb::value_error("bins, cycles, whole or shift out of range");
                 const PulseCurve curve{pulse_low, pulse_cell, values_of(energy), values_of(slope)};
                 const std::vector<double> low = values_of(open_low), high = values_of(open_high);
-                new (self) HistogramRecord{bins, cycles, whole,    shift,     fraction, stationary, synchronous,
-                                           peak, width,  core_low, core_high, curve,    low,        high};
+                new (self) HistogramRecord{bins,  cycles,   whole,     shift,  fraction, stationary, synchronous, peak,
+                                           width, core_low, core_high, sample, curve,    low,        high};
             },
             nb::kw_only(), "bins"_a, "cycles"_a, "whole"_a, "shift"_a, "fraction"_a, "stationary"_a, "synchronous"_a,
             "pulse_low"_a, "pulse_cell"_a, "energy"_a, "slope"_a, "peak"_a, "width"_a, "core_low"_a, "core_high"_a,
-            "open_low"_a, "open_high"_a);
+            "sample"_a, "open_low"_a, "open_high"_a);
     module.def("corrected_rates", &rates, "recording"_a, "histogram"_a.noconvert(), nb::kw_only(), "correction"_a,
                "steps"_a, "tolerance"_a, "total"_a.none(), "out"_a.noconvert(), "flags"_a.noconvert(), "threads"_a,
                "Photons per period of each bin: out (pixels, bins).");

@@ -46,6 +46,7 @@ struct HistogramRecord {
     double peak = 0.0;                       // of the pulse, relative to the delay
     double width = 0.0;                      // of the pulse: 1 / integral of s^2, over 2 sqrt(pi): sigma of a Gaussian
     double core_low = 0.0, core_high = 0.0;  // the part of the pulse that is counted as its window
+    double sample = 0.0;                     // width of a sample over which the light is constant; 0 of smooth pulses
     PulseCurve pulse;
     std::vector<double> low, high;  // (bins) the open part of each bin, in periods; empty without a gate
 

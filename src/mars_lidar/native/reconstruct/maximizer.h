@@ -22,6 +22,11 @@ struct ReconstructionJob {
 constexpr int kMostSteps = 80;        // of a climb; most end within ten
 constexpr double kGain = 5e-7;        // of the log likelihood that a further step promises: 1e-3 of a standard error
 constexpr double kMostPhotons = 1e4;  // per period: a bound on S and on B
+constexpr int kMostTurns = 20;        // of the search around a maximum of a likelihood with kinks; most end after two
+constexpr double kStarts = 4.0;       // of it, in a bin or a standard error
+constexpr double kReach = 4.0;        // of it, standard errors
+constexpr double kPart = 0.4;         // step of the profile of the delay, in standard errors where it stands
+constexpr double kFallen = 1e-4;      // of the likelihood of the maximum: nothing
 constexpr int kMaximumColumns = 8;    // of the output: see Maximizer
 
 // What is known where the likelihood stands, without what the ends of the exposure hide, if that is positive definite.
@@ -106,6 +111,12 @@ inline Fit climb(const PixelLikelihood& pixel, const double* start, bool with_si
     return fit;
 }
 
+// The likelihood of the delay, S and B at their maximum for each, as a distribution: its weight and, times that, the mean
+// squares of how far S, B and delay are from the best; and the variances of S and B at one delay.
+struct Profile {
+    double weight = 0.0, square[3] = {}, alone[2] = {};
+};
+
 // One histogram after another, with the memory that they share.
 class Maximizer {
  public:
@@ -146,6 +157,11 @@ class Maximizer {
             best = fit;
             terrain.best = fit.likelihood.value;
         }
+        Profile profile;
+        if (r_.sample > 0.0 && best.at[0] > 0.0) {
+            look_around(pixel, terrain, best);
+            profile = profile_of(pixel, terrain, best);
+        }
         terrain.best = -HUGE_VAL;
         const double dark[3] = {0.0, flat, best.at[2]};
         ends_.set(r_, passes_, best.at[2]);
@@ -160,12 +176,100 @@ class Maximizer {
         for (int k = 0; k < 3; ++k) out[k] = best.at[k];
         if (best.at[0] == 0.0) out[2] = NAN;
         errors(pixel, least, best, out + 3);
+        if (!(profile.weight > 0.0)) return;
+        if (best.free[2]) out[5] = std::sqrt(profile.square[2] / profile.weight);
+        for (int k = 0; k < 2 && best.free[0] && best.free[1]; ++k)
+            out[3 + k] = std::sqrt(profile.alone[k] + profile.square[k] / profile.weight);
     }
 
     // Of the last histogram.
     const ArmedPasses& passes() const { return passes_; }
 
  private:
+    // Light of a sampled pulse is constant over a sample, so that the slope of the likelihood jumps at delays at which an
+    // edge of a bin meets one of a sample: between any two may be a maximum. Climbs from either side of the best, until
+    // none within some standard errors and as far as these edges recur is better.
+    void look_around(const PixelLikelihood& pixel, Terrain& terrain, Fit& best) {
+        const double bin = 1.0 / static_cast<double>(r_.bins), recurs = bin + r_.sample;
+        for (int turn = 0; turn < kMostTurns; ++turn) {
+            const double centre[3] = {best.at[0], best.at[1], best.at[2]};
+            ends_.set(r_, passes_, centre[2]);
+            best = climb(pixel, centre, true, {terrain.least, terrain.farthest, -HUGE_VAL, &ends_});
+            terrain.best = best.likelihood.value;
+            const double before = terrain.best, error = error_of_delay(best);
+            const double step = std::min(std::max(bin, error), recurs) / kStarts;
+            const int steps = static_cast<int>((recurs + kReach * std::min(error, r_.width)) / step) + 1;
+            for (int k = -steps; k <= steps; ++k) {
+                const double at[3] = {centre[0], centre[1], centre[2] + k * step};
+                const Fit fit = climb(pixel, at, true, terrain);
+                if (!(fit.likelihood.value > terrain.best)) continue;
+                best = fit;
+                terrain.best = fit.likelihood.value;
+            }
+            if (!(terrain.best > before + kGain)) {
+                best.converged = true;  // a climb may creep along a kink
+                return;
+            }
+        }
+    }
+
+    static double error_of_delay(const Fit& fit) {
+        double known[3][3], column[3];
+        const double unit[3] = {0.0, 0.0, 1.0};
+        known_information(fit.likelihood, fit.free, known);
+        return fit.free[2] && solve<3>(known, unit, fit.free, column) ? std::sqrt(column[2]) : 0.0;
+    }
+
+    // Outwards from the best until the likelihood has fallen for good; by the trapezoidal rule.
+    Profile profile_of(const PixelLikelihood& pixel, const Terrain& terrain, const Fit& best) {
+        Profile out;
+        const double bin = 1.0 / static_cast<double>(r_.bins), recurs = bin + r_.sample;
+        const double most = std::max(bin, error_of_delay(best)) / kStarts;
+        bool free[3] = {best.free[0], best.free[1], false};
+        double known[3][3], spread[3][3];
+        known_information(best.likelihood, free, known);
+        if (!best.free[2] || !inverse<3>(known, free, spread)) return out;
+        for (int k = 0; k < 2; ++k) out.alone[k] = spread[k][k];
+        for (const double side : {-1.0, 1.0}) {
+            Fit at = best;
+            double weight = 1.0, fallen = 0.0, step = most;
+            while (std::fabs(at.at[2] - best.at[2]) < 0.5 && fallen < recurs) {
+                const double curvature = at.likelihood.information[2][2];
+                step = std::min(most, 1.5 * step);
+                if (curvature > 0.0) step = std::min(step, kPart / std::sqrt(curvature));
+                step = std::max(step, 1e-3 * most);
+                Fit next = at;
+                next.at[2] += side * step;
+                settle(pixel, terrain.least, free, next);
+                const double its = std::exp(std::min(next.likelihood.value - best.likelihood.value, 1.0));
+                out.weight += 0.5 * step * (weight + its);
+                for (int k = 0; k < 3; ++k) {
+                    const double here = at.at[k] - best.at[k], there = next.at[k] - best.at[k];
+                    out.square[k] += 0.5 * step * (weight * here * here + its * there * there);
+                }
+                fallen = its < kFallen ? fallen + step : 0.0;
+                weight = its;
+                at = next;
+            }
+        }
+        return out;
+    }
+
+    // One step of scoring of S and B where the delay is.
+    void settle(const PixelLikelihood& pixel, double least, const bool* free, Fit& fit) const {
+        double known[3][3], move[3];
+        fit.likelihood = pixel(fit.at[0], fit.at[1], fit.at[2], ends_);
+        known_information(fit.likelihood, free, known);
+        if (!solve<3>(known, fit.likelihood.gradient, free, move)) return;
+        const double s = std::clamp(fit.at[0] + move[0], 0.0, kMostPhotons);
+        const double b = std::clamp(fit.at[1] + move[1], std::max(least, 0.05 * fit.at[1]), kMostPhotons);
+        const Likelihood there = pixel(s, b, fit.at[2], ends_);
+        if (!(there.value > fit.likelihood.value)) return;
+        fit.at[0] = s;
+        fit.at[1] = b;
+        fit.likelihood = there;
+    }
+
     // Takes off the first-order bias of the maximum, at most a standard error of it, and of S never more than S.
     void correct(const PixelLikelihood& pixel, double least, Fit& fit) {
         double known[3][3], spread[3][3], bias[3];
@@ -179,6 +283,7 @@ class Maximizer {
             const double most = std::sqrt(spread[k][k]);
             next[k] = fit.at[k] - std::clamp(bias[k], -most, most);
         }
+        if (r_.sample > 0.0) next[2] = fit.at[2];  // no second derivative at a kink
         if (bias[0] > 0.0) next[0] = fit.at[0] / (1.0 + bias[0] / fit.at[0]);
         next[1] = std::max(next[1], least);
         const Likelihood there = pixel(next[0], next[1], next[2], ends_);

@@ -70,9 +70,9 @@ def cramer_rao(flux: Flux, system: System, *, threads: int | None = None) -> His
     not resolve times within it, has the fraction (x / sinh x)^2 of it, x = l_j / 2 (R18). The armed time is assumed
     known: information lost at the ends of the exposure is not subtracted (docs/theory_reconstruction.md, section 3).
 
-    It cannot be reached for a `SampledPulse` with an edge that is sharp within a bin: the light of the edge's bin has a kink
-    in the delay, and the bound, the curvature at one delay, depends on where in the bin the edge lies. With a decay over 20
-    bins, its edge at the edge of a bin, it was half of the error of the best estimate.
+    It cannot be reached for a `SampledPulse` with an edge that is sharp within a bin: the light of the edge's bin has a
+    kink in the delay, and the bound, the curvature at one delay, depends on where in the bin the edge lies. With a
+    decay over 20 bins, its edge at the edge of a bin, it was half of the error of the best estimate.
 
     Parameters
     ----------

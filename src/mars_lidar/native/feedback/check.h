@@ -334,17 +334,20 @@ class GridCheck {
             for (int i = 0; i < kJudged; ++i) old[at + i] = old[at + kJudged + i] + p[i] * y[at + i];
         }
         alignas(64) double moved[kJudged], before[kJudged] = {};
-        for (int sweep = 0; sweep < kSweeps; ++sweep) {
-            adjoint_sweep<double, kJudged, kJudged>(grid, rates, old, fresh, y, moved);
+        alignas(64) int64_t active[kJudged];
+        for (int i = 0; i < kJudged; ++i) active[i] = check_.sweeps[i] <= kSweeps ? 1 : 0;
+        bool some = true;
+        for (int sweep = 0; some && sweep < kSweeps; ++sweep) {
+            adjoint_sweep<double, kJudged, kJudged>(grid, rates, active, old, fresh, y, moved);
             std::swap(old, fresh);
-            bool still = true;
-            for (int i = 0; i < kJudged; ++i) {  // a move, and all that would follow it at the rate of the last two
+            some = false;
+            for (int i = 0; i < kJudged;
+                 ++i) {  // until a move, and all that would follow it at the rate of the last two
                 const double step = moved[i], ahead = before[i] - step;
-                still = still && (check_.sweeps[i] > kSweeps ||
-                                  (step <= kStillAdjoint && (sweep == 0 || step * step <= kStillAdjoint * ahead)));
+                if (step <= kStillAdjoint && (sweep == 0 || step * step <= kStillAdjoint * ahead)) active[i] = 0;
+                some = some || active[i];
                 before[i] = step;
             }
-            if (still) break;
         }
         auto value = [&](int32_t j) { return y + static_cast<int64_t>(j) * kJudged; };
         alignas(64) double re[kJudged], then[kJudged];

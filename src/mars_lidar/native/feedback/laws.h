@@ -167,11 +167,13 @@ MARS_NOINLINE void place_rearmed(const FeedbackGrid& grid, const float* sums, co
 // edge e that lies in it one dead time on, and
 //     y_j = 1 - sum over j < i < e0 of p_i y_i + q y at e0 - 1 + sum over those e of (1 - f_e) (p_e y_e - q_e y_e +
 //           q_{e-1} y_{e-1}).
-// `old`, `fresh`: suffix sums S of p y (n + 1 rows); `values`: y, replaced in place. `moved`: the largest change of y.
+// `old`, `fresh`: suffix sums S of p y (n + 1 rows); `values`: y, replaced in place of lanes that are `active`. `moved`: the
+// largest change of y.
 // With y = rest - S, S' = (1 - p) S + p rest: a cell waits for the one after for a multiplication and an addition only.
-template <class Number, int lanes, int stride, class AnyRates>
-MARS_NOINLINE void adjoint_sweep(const FeedbackGrid& grid, const AnyRates& rates, const Number* __restrict__ old,
-                                 Number* __restrict__ fresh, Number* __restrict__ values, Number* __restrict__ moved) {
+template <class Number, int lanes, int stride, class AnyRates, class Flag>
+MARS_NOINLINE void adjoint_sweep(const FeedbackGrid& grid, const AnyRates& rates, const Flag* __restrict__ active,
+                                 const Number* __restrict__ old, Number* __restrict__ fresh,
+                                 Number* __restrict__ values, Number* __restrict__ moved) {
     const int32_t n = grid.cells;
     alignas(64) Number total[lanes], sum[lanes], rest[lanes];
     MARS_VECTORS
@@ -209,7 +211,7 @@ MARS_NOINLINE void adjoint_sweep(const FeedbackGrid& grid, const AnyRates& rates
         for (int i = 0; i < lanes; ++i) {
             const Number y = rest[i] - sum[i], step = y > value[i] ? y - value[i] : value[i] - y;
             moved[i] = step > moved[i] ? step : moved[i];
-            value[i] = y;
+            value[i] = active[i] ? y : value[i];
             sum[i] = (1 - p[i]) * sum[i] + p[i] * rest[i];
             after[i] = sum[i];
         }
@@ -222,10 +224,11 @@ MARS_NOINLINE void count_variance(const FeedbackGrid& grid, const Rates& rates, 
                                   float* fresh, float* values, int sweeps, double* result) {
     const int32_t n = grid.cells;
     alignas(64) float moved[kTeam];
-    bool done[kTeam] = {};
+    alignas(64) int32_t active[kTeam];
     for (int i = 0; i < kTeam; ++i) {
         old[static_cast<int64_t>(n) * kRow + i] = 0.0f;
         result[i] = 0.0;
+        active[i] = 1;
     }
     for (int32_t j = n - 1; j >= 0; --j) {
         const float* p = rates.fire(j);
@@ -235,27 +238,22 @@ MARS_NOINLINE void count_variance(const FeedbackGrid& grid, const Rates& rates, 
             old[at] = old[at + kRow] + p[i];
         }
     }
-    for (int sweep = 1; sweep <= sweeps; ++sweep) {
-        adjoint_sweep<float, kTeam, kRow>(grid, rates, old, fresh, values, moved);
+    bool some = true;
+    for (int sweep = 1; some && sweep <= sweeps; ++sweep) {
+        adjoint_sweep<float, kTeam, kRow>(grid, rates, active, old, fresh, values, moved);
         std::swap(old, fresh);
-        bool some = false, now = false;
-        alignas(64) int64_t ends[kTeam];  // 1: this sweep is the lane's last
+        some = false;
         for (int i = 0; i < kTeam; ++i) {
-            const bool last = !done[i] && (!(moved[i] > 1e-3f) || sweep == sweeps);
-            ends[i] = last ? 1 : 0;
-            done[i] = done[i] || last;
-            now = now || last;
-            some = some || !done[i];
+            if (!(moved[i] > 1e-3f)) active[i] = 0;
+            some = some || active[i];
         }
-        for (int32_t j = 0; now && j < n; ++j)
-            for (int i = 0; i < kTeam; ++i) {
-                const int64_t at = static_cast<int64_t>(j) * kRow + i;
-                const double y = static_cast<double>(values[at]);
-                const double part = y * y * static_cast<double>(variance[at]);
-                result[i] += ends[i] ? part : 0.0;
-            }
-        if (!some) break;
     }
+    for (int32_t j = 0; j < n; ++j)
+        for (int i = 0; i < kTeam; ++i) {
+            const int64_t at = static_cast<int64_t>(j) * kRow + i;
+            const double y = static_cast<double>(values[at]);
+            result[i] += y * y * static_cast<double>(variance[at]);
+        }
 }
 
 // Blind time rho at a period's edge in the stationary state: returns its whole periods, and in `cells` how many cells

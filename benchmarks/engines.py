@@ -42,5 +42,6 @@ _LIMITS = (
     "Against revision 726fa7b, 15 turns on 2 cores of an AMD EPYC with little else running (2026-11-26), `exact` "
     "takes 0.81 of the processor time (AVX-512), 0.77 (AVX2) and 0.86 (vectors of 128 bits), 0.82 and 0.84 in dim and "
     "very dim light; an earlier measurement was 0.77, 0.74, 0.72, 0.75 and 0.69 on another such machine. 0.75 and "
-    "0.70 were aimed at and are not reached: unchecked additions, prefetches and longer logarithms gained nothing. Fresh memory costs what the system needs to clear its pages."
+    "0.70 were aimed at and are not reached: unchecked additions, prefetches and longer logarithms gained nothing. "
+    "Fresh memory costs what the system needs to clear its pages."
 )

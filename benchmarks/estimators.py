@@ -64,7 +64,7 @@ _RECONSTRUCTION = (
     "{pixels} pixels of the canonical system, delays all over the period, one thread; least of the turns, scaled to a "
     "128 x 128 cube (the work divides among threads by pixels; here {threads} processors). In turn with 726fa7b "
     "(2 cores of an AMD EPYC, other work beside, 2026-11-26), maximum likelihood takes 73 us a pixel for 109 at S = B "
-    "= 1, 171 for 199 at S = B = 10, and two returns 540 for 1,300; 50 and 300 were aimed at and are not reached: three "
+    "= 1, 171 for 199 at S = B = 10, and two returns 540 for 1,300; 50 and 300 were aimed at and not reached: three "
     "fifths are the bins of the climbs, with a logarithm and an exponential each, a quarter is the search over all "
     "delays, an eighth the test of the fit."
 )

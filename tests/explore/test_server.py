@@ -266,8 +266,8 @@ def test_the_page_with_a_cube(server: CubeServer, stored: Path):
         page.tab.locator("#counts canvas").click(position=at)
         state = page.drawn()
         assert state["draw"]["counts"] == np.asarray(cube.histogram[0, 6, 2]).tolist()
-        state = page.tab.evaluate("explorer.state")
-        assert (state["signal"], state["delay"], state["start"]) == (pytest.approx(0.8), 32.0, "stationary")
+        inputs = page.tab.evaluate("explorer.state")
+        assert (inputs["signal"], inputs["delay"], inputs["start"]) == (pytest.approx(0.8), 32.0, "stationary")
         mean = ml.statistics.mean_histogram(ml.Flux(0.8, 0.1, 32.0), cube.system)
         assert np.abs(np.array(state["mean"]["mean"]) - mean).max() <= 1e-6 * mean.max()
         names: dict[str, Any] = {}

@@ -139,6 +139,9 @@ def foreign_cube(
     return contents.cube(system, start_ns=start_ns, unit_ns=unit_ns, window_ns=window_ns)
 
 
+_TEXT = (".csv", ".txt")
+
+
 def read_counts(
     path: str | Path,
     *,
@@ -150,15 +153,22 @@ def read_counts(
     """The array of a file, its axes in order; `bins`, if known, identifies the time axis by its length."""
     source = Path(path)
     told_by = recorded(source) if source.suffix.lower() in RECORDER_SUFFIXES else None
-    name, array = _chosen(source, arrays(source) if told_by is None else told_by.arrays, variable)
+    times = None
+    if told_by is not None:
+        by_name = told_by.arrays
+    elif source.suffix.lower() in _TEXT:
+        with reading(source, "arrays of histograms"):
+            times, column = read_times(source)
+        by_name = {"": column}
+    else:
+        by_name = arrays(source)
+    name, array = _chosen(source, by_name, variable)
     if isinstance(array, np.ndarray) and array.dtype == object:
         return ForeignCounts(source, name, None, array, "")
     order = _guessed(source, array.shape, bins) if axes is None else axes
     if is_sparse(array):
         check_claim(source, dense_bytes(array), f"the counts of {name or 'its matrix'}")
     try:
-        text = source.suffix.lower() in (".csv", ".txt")
-        times = read_times(source)[0] if text else None
         return ForeignCounts(source, name, in_order(array, order, image), None, order, told_by, times)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{source}: {name or 'the array'}: {error}") from error

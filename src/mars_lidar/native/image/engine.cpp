@@ -40,8 +40,7 @@ class DelayExposure {
     bool operator()(const int32_t* bin, const float* number, int64_t count) {
         double total = 0.0;
         for (int64_t e = 0; e < count; ++e) total += static_cast<double>(number[e]);
-        const double whole = static_cast<double>(r_.whole) + (r_.synchronous ? 0.5 : 0.0);
-        const double dead = whole + (static_cast<double>(r_.shift) + r_.fraction) / static_cast<double>(r_.bins);
+        const double dead = r_.dead() + (r_.synchronous ? 0.5 : 0.0);
         own_ = total * dead > kMostBlind * static_cast<double>(r_.cycles);
         if (own_) set(bin, number, count);
         return own_ || !flat_;

@@ -16,7 +16,7 @@ class ExposureEnds {
     static constexpr int kMost = 33;      // possible numbers of passes, or of groups of them that follow each other
     static constexpr double kFew = 50.0;  // passes at the pulse, for each that is uncertain, above which it is nothing
 
-    // For a pulse around `delay`; empty (`count` 0) where the numbers do not matter, or are too many.
+    // For a pulse around `delay`; empty (`count` 0) where the numbers do not matter.
     void set(const HistogramRecord& r, const ArmedPasses& passes, double delay) {
         count = 0;
         if (r.below_bin()) return;

@@ -214,8 +214,7 @@ class FitQuality {
     double hidden_passes(double total) const {
         const HistogramRecord& r = job_.recording;
         if (r.below_bin()) return 0.0;
-        const double n = static_cast<double>(r.bins),
-                     dead = static_cast<double>(r.whole) + (static_cast<double>(r.shift) + r.fraction) / n;
+        const double dead = r.dead();
         const double chance = std::min(1.0, total * dead / static_cast<double>(r.cycles));
         const double one = chance * (dead * dead / 3.0 - 0.25 * chance * dead * dead + 0.25);
         return r.stationary ? 2.0 * one : one;

@@ -53,6 +53,10 @@ struct HistogramRecord {
     // Dead times below one bin: several registrations a period fit into a bin.
     bool below_bin() const { return !synchronous && whole == 0 && shift == 0; }
     bool gated() const { return !low.empty(); }
+    // Dead time in periods.
+    double dead() const {
+        return static_cast<double>(whole) + (static_cast<double>(shift) + fraction) / static_cast<double>(bins);
+    }
     // The open part of bin j.
     double share(int64_t j) const { return gated() ? (high[j] - low[j]) * static_cast<double>(bins) : 1.0; }
 };

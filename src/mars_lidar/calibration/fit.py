@@ -336,35 +336,46 @@ class Fit:
             weighed = grown
         return Guess(model, theta, root, free), misfit, near and weighed >= photons
 
+    def _shortest(self, model: Model, rows: FloatArray) -> FloatArray:
+        """The shortest interval (n,) of a stream as long as the recording, for each row of parameters (n, p)."""
+        cycles = max(2, round(self.recording.exposure))
+        streams = [model.streams(row[None], cycles, self.next_seed()).times for row in rows]
+        return np.array([np.diff(times).min(initial=np.inf) for times in streams])
+
     def shortest(self, model: Model, theta: FloatArray) -> tuple[float, float]:
         """Dead time by the shortest interval alone, and its standard error, by streams as long as the recording.
 
         They are drawn at parameters (p,), or of each of a few (n, p), which are uncertain then and scatter more.
         The fit counts intervals in cells, and does not know where in its cell an interval lies.
         """
-        recorded = min(float(np.diff(piece).min()) for piece in self.recording.pieces)
-        cycles, number = max(2, round(self.recording.exposure)), 4.0 * self.effort.batch / self.recording.photons
+        number = 4.0 * self.effort.batch / self.recording.photons
         rows = np.resize(theta, (int(np.clip(number, 4, LIGHTS)), model.size))
-        drawn = [np.diff(model.streams(row[None], cycles, self.next_seed()).times).min(initial=np.inf) for row in rows]
-        later = np.array(drawn) - rows[:, model.light + 2]
-        return recorded - float(later.mean()), float(np.hypot(later.std(ddof=1), model.clock.unit_ns))
+        later = self._shortest(model, rows) - rows[:, model.light + 2]
+        return self.recording.shortest - float(later.mean()), float(np.hypot(later.std(ddof=1), model.clock.unit_ns))
 
     def settled(self, model: Model, theta: FloatArray) -> tuple[float, float]:
-        """That dead time by streams that have it; its error is wider where a shorter one has as long intervals."""
-        at, k = theta.copy(), model.light + 2
-        for _ in range(3):
-            (dead, error), before = self.shortest(model, at), float(at[k])
-            at[k] = dead
-        error = float(np.hypot(error, dead - before))
-        at[k] -= 3.0 * error
-        slope = (self.shortest(model, at)[0] - at[k]) / (3.0 * error)
-        return dead, error / float(np.clip(slope, 0.05, 1.0))
+        """Mean and standard deviation of the dead times whose streams have the recording's shortest interval.
+
+        Of equally probable dead times a quarter is selected, that with the nearest ones, as long as these are close.
+        """
+        recorded, k = self.recording.shortest, model.light + 2
+        low, high, rows = 0.0, float(model.latest(theta)), np.tile(theta, (4 * LIGHTS, 1))
+        for _ in range(self.effort.rounds):
+            rows[:, k] = np.linspace(low, high, len(rows))
+            near = np.abs(self._shortest(model, rows) - recorded)
+            dead = rows[np.argsort(near)[: len(rows) // 4], k]
+            pad = (high - low) / len(dead)
+            if dead.max() - dead.min() + 2.0 * pad > 0.5 * (high - low):
+                break
+            low, high = max(float(dead.min()) - pad, 0.0), float(dead.max()) + pad
+        return float(dead.mean()), float(np.hypot(dead.std(ddof=1), model.clock.unit_ns))
 
     def finish(self, guess: Guess, again: bool = True, known: tuple[float, float] | None = None) -> Fitted:
         """The last estimate, and what fresh streams about it say of its slope, bias, scatter and misfit.
 
-        Where the shortest interval refuses it, it is made once more with the dead time `known` by that, its mean and
-        standard deviation, and with cells that do not divide the shortest: counts of so few have no normal law.
+        Where the shortest interval refuses it, or counts hardly change with the dead time on one side of the estimate,
+        it is made once more with the dead time `known` by that interval, its mean and standard deviation, and with
+        cells that do not divide the shortest: counts of so few have no normal law.
         """
         model, theta, root, free = guess
         photons, effort = float(self.recording.photons), self.effort
@@ -430,7 +441,9 @@ class Fit:
             further, total = self.shortest(model, rows[:: len(rows) // LIGHTS][:LIGHTS])
             more = max(total**2 - scatter**2, 0.0) ** 0.5
             early = max(early, _extreme(further - mean[model.light + 2], scatter, float(np.hypot(error, more))))
-        if early < FALSE_ALARM and known is None:
+        estimates, which = solve @ gain @ (y - near.offset).T, free == model.light + 2
+        uneven = bool(error) and known is None and _uneven(estimates, moved, which)
+        if known is None and (early < FALSE_ALARM or uneven):
             other = None
             if error:
                 least, own = self.settled(model, mean)
@@ -438,11 +451,26 @@ class Fit:
                 other = self.finish(last, again=False, known=(least, float(np.hypot(own, more))))
             if other is not None and other.converged and other.p_value > FALSE_ALARM:
                 return other
-            p = min(p, early)
-        scatter, converged = solve @ noise @ solve.T / near.ratio, bool(size.max() < _NEAR)
+            p = min(p, early) if early < FALSE_ALARM else p
+        scatter, converged = solve @ noise @ solve.T / near.ratio, bool(size.max() < _NEAR) and not uneven
         return Fitted(
             model, free, mean, cov, raw, scatter, law, near.offset, estimator, jacobian, rest, fresh, z, p, converged
         )
+
+
+def _uneven(estimates: FloatArray, moved: FloatArray, which: NDArray[np.bool_]) -> bool:
+    """Whether estimates (free, streams) follow the parameter `which` on one side much less than on the other.
+
+    A normal law about the centre holds on neither side then: of dead times between two pulses, no interval tells.
+    """
+    x = moved[:, which]
+    terms = np.c_[np.ones(len(moved)), moved, np.abs(x)]
+    inverse = np.linalg.pinv(terms.T @ terms)
+    y = estimates[which][0]
+    slope = inverse @ terms.T @ y
+    error = float((y - terms @ slope).std() * inverse[-1, -1] ** 0.5)
+    along, kink = float(slope[1:-1][which][0]), abs(float(slope[-1]))
+    return along - kink + _NEAR * error < (along + kink) / _NEAR
 
 
 def _extreme(off: float, scatter: float, error: float) -> float:

@@ -25,6 +25,7 @@ from mars_lidar.simulation import simulate_timestamps
 _NARROWEST = 2e-6  # periods: the narrowest pulse that the engines draw
 _WIDEST = 0.3  # sigma of a recorded pulse, periods: a wider one is hardly told from background
 _WIDEST_JITTER = 0.05  # periods: the widest that `Jitter` takes
+_REACH = 5.5  # standard deviations of a difference of jitters, beyond which one of ten million intervals lies
 _MOST_CARRIERS = 0.95  # of an avalanche
 Fields = dict[str, Any]
 
@@ -114,7 +115,8 @@ class Model:
     (shares of the light in equal parts of the period, jitter not included) there is no return, and the background is
     all light. `waveform_error` are the standard errors of these shares by a recording of `exposure` periods: simulated
     streams have light that differs so much from the waveform, more in shorter ones as their counts do.
-    With a `pulse` its shape is known, before any jitter, and `width` means nothing.
+    With a `pulse` its shape is known, before any jitter, and `width` means nothing. `shortest` interval of the
+    recording, ns, where the dead time is not given: it has no longer one, jitter and clock aside.
     """
 
     clock: Clock
@@ -126,6 +128,7 @@ class Model:
     effects: tuple[Effect, ...] = ()
     fields: tuple[tuple[str, Any], ...] = ()  # of the detector, as given
     jitter_given: bool = False
+    shortest: float = np.inf
 
     @property
     def gaussian(self) -> bool:
@@ -173,7 +176,7 @@ class Model:
         out[..., k + 1] = np.clip(out[..., k + 1], 0.0, most)
         if self.gaussian and self.jitter_given:
             out[..., k] = np.maximum(out[..., k], out[..., k + 1])
-        out[..., k + 2] = np.maximum(out[..., k + 2], 0.0)
+        out[..., k + 2] = np.clip(out[..., k + 2], 0.0, self.latest(out))
         bounds = [each for effect in self.effects for each in zip(effect.least, effect.most, strict=True)]
         for at, (low, high) in enumerate(bounds, k + 3):
             out[..., at] = np.clip(out[..., at], low, high)
@@ -185,6 +188,13 @@ class Model:
         if self.split:
             return width * np.cos(jitter), width * np.sin(jitter)
         return np.sqrt(np.maximum(width**2 - jitter**2, 0.0)), jitter
+
+    def latest(self, theta: FloatArray) -> FloatArray:
+        """The longest dead time (...), ns, with which the shortest interval has a probability, of parameters (..., p).
+
+        It is shorter than the dead time by the difference of two jitters and of two rounded times at most.
+        """
+        return np.asarray(self.shortest + self.clock.unit_ns + _REACH * 2.0**0.5 * self.widths(theta)[1])
 
     def scale(self, theta: FloatArray) -> FloatArray:
         """Changes (p,) of parameters over which counts are about linear functions of them, as a batch varies them."""

@@ -192,9 +192,12 @@ class Model:
     def latest(self, theta: FloatArray) -> FloatArray:
         """The longest dead time (...), ns, with which the shortest interval has a probability, of parameters (..., p).
 
-        It is shorter than the dead time by the difference of two jitters and of two rounded times at most.
+        It is shorter than the dead time by the difference of two jitters and of two rounded times at most. A jitter
+        that is an unknown part of the recorded width counts as all of it.
         """
-        return np.asarray(self.shortest + self.clock.unit_ns + _REACH * 2.0**0.5 * self.widths(theta)[1])
+        return np.asarray(
+            self.shortest + self.clock.unit_ns + _REACH * 2.0**0.5 * theta[..., self.light + 1 - self.split]
+        )
 
     def scale(self, theta: FloatArray) -> FloatArray:
         """Changes (p,) of parameters over which counts are about linear functions of them, as a batch varies them."""

@@ -264,7 +264,8 @@ class Fit:
     @property
     def shorter(self) -> Fit:
         """A fit whose last batches are as short as those of the steps, to choose between models."""
-        return Fit(self.recording, replace(self.effort, longer=1.0, more=1, recentred=2), (self.next_seed(),))
+        effort = replace(self.effort, longer=1.0, more=1, recentred=2)
+        return Fit(self.recording, effort, (self.next_seed(),))
 
     def next_seed(self) -> int:
         """A seed that no batch has had."""
@@ -337,10 +338,10 @@ class Fit:
         return Guess(model, theta, root, free), misfit, near and weighed >= photons
 
     def _shortest(self, model: Model, rows: FloatArray) -> FloatArray:
-        """The shortest interval (n,) of a stream as long as the recording, for each row of parameters (n, p)."""
+        """The shortest interval (n,) of streams as long as the recording, at parameters (n, p) or (detectors, m, p)."""
         cycles = max(2, round(self.recording.exposure))
-        streams = [model.streams(row[None], cycles, self.next_seed()).times for row in rows]
-        return np.array([np.diff(times).min(initial=np.inf) for times in streams])
+        drawn = [model.streams(row, cycles, self.next_seed()) for row in rows]
+        return np.array([np.diff(times).min(initial=np.inf) for streams in drawn for times in streams])
 
     def shortest(self, model: Model, theta: FloatArray) -> tuple[float, float]:
         """Dead time by the shortest interval alone, and its standard error, by streams as long as the recording.
@@ -359,13 +360,12 @@ class Fit:
         Of equally probable dead times a quarter is selected, that with the nearest ones, as long as these are close.
         """
         recorded, k = self.recording.shortest, model.light + 2
-        low, high, rows = 0.0, float(model.latest(theta)), np.tile(theta, (4 * LIGHTS, 1))
+        low, high, rows = 0.0, float(model.latest(theta)), np.tile(theta, (LIGHTS, 4, 1))
         for _ in range(self.effort.rounds):
-            rows[:, k] = np.linspace(low, high, len(rows))
+            rows[..., k] = np.linspace(low, high, LIGHTS)[:, None]
             near = np.abs(self._shortest(model, rows) - recorded)
-            dead = rows[np.argsort(near)[: len(rows) // 4], k]
-            pad = (high - low) / len(dead)
-            if dead.max() - dead.min() + 2.0 * pad > 0.5 * (high - low):
+            dead, pad = rows[..., k].ravel()[np.argsort(near)[:LIGHTS]], (high - low) / LIGHTS
+            if np.ptp(dead) + 2.0 * pad > 0.5 * (high - low):
                 break
             low, high = max(float(dead.min()) - pad, 0.0), float(dead.max()) + pad
         return float(dead.mean()), float(np.hypot(dead.std(ddof=1), model.clock.unit_ns))
@@ -425,9 +425,17 @@ class Fit:
                 break
             root = root_of(cov)
             centre = centre + (mean - centre) / max(1.0, float(size.max()) / _NEAR)
+        if any(model.names[index].startswith("log_") for index in free):
+            counted, observed = (y - near.offset) @ gain.T, gain @ (recorded - near.offset)
+            raw, cov = _curved(model, free, raw, cov, centre, moved, counted, observed, near.ratio)
+            mean = most_probable(model, raw, cov, free)
         sd = np.sqrt(np.diag(cov))
         if again and (np.abs((centre - theta)[free]) > _NEAR * sd).any():  # cells and weights were laid elsewhere
             return self.finish(Guess(model, centre, root_of(cov), free), again=False)
+        if known is not None:  # counts do not change with the dead time as a linear law has it
+            mean[model.light + 2] = raw[model.light + 2] = dead
+            cov[place], cov[:, place], cov[place, place] = 0.0, 0.0, error**2
+            mean = model.bounded(mean)
         jacobian = law.slope[:, free] @ local
         project = np.eye(len(recorded)) - jacobian @ estimator
         fresh = near.residual @ project.T
@@ -471,6 +479,45 @@ def _uneven(estimates: FloatArray, moved: FloatArray, which: NDArray[np.bool_]) 
     error = float((y - terms @ slope).std() * inverse[-1, -1] ** 0.5)
     along, kink = float(slope[1:-1][which][0]), abs(float(slope[-1]))
     return along - kink + _NEAR * error < (along + kink) / _NEAR
+
+
+def _curved(
+    model: Model,
+    free: NDArray[np.intp],
+    raw: FloatArray,
+    cov: FloatArray,
+    centre: FloatArray,
+    moved: FloatArray,
+    counted: FloatArray,
+    observed: FloatArray,
+    ratio: float,
+) -> tuple[FloatArray, FloatArray]:
+    """Mean (p,) and covariance (free, free) of parameters of which the last one, a logarithm, acts by its square too.
+
+    Estimates `counted` (streams, free) of streams at parameters `moved` from the centre are a law with the squares of
+    the logarithm and its products with the size; draws of the linear law are weighed by it, where `observed` was.
+    """
+    rows = draws(model, raw, 2.25 * cov, free)
+    if rows is None:
+        return raw, cov
+    at = (rows - centre)[:, free]
+
+    def terms(x: FloatArray) -> FloatArray:
+        return np.c_[np.ones(len(x)), x, x[:, -1:] * x[:, -2:]]
+
+    law, own = terms(moved), terms(at)
+    inverse = np.linalg.pinv(law.T @ law)
+    slope = inverse @ law.T @ counted
+    rest = counted - law @ slope
+    scale = (len(law) - law.shape[1]) / (1.0 / ratio + np.einsum("ki,ij,kj->k", own, inverse, own))
+    off, out = observed - own @ slope, (rows - raw)[:, free]
+    log = np.einsum("ki,ij,kj->k", out, np.linalg.inv(2.25 * cov), out) + len(free) * np.log(scale)
+    log -= scale * np.einsum("ki,ij,kj->k", off, np.linalg.inv(rest.T @ rest), off)
+    weight = np.exp(0.5 * (log - log.max()))
+    mean = np.average(at, axis=0, weights=weight)
+    theta = centre.copy()
+    theta[free] += mean
+    return theta, np.atleast_2d(np.cov(at.T, aweights=weight))
 
 
 def _extreme(off: float, scatter: float, error: float) -> float:

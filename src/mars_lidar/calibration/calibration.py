@@ -409,9 +409,7 @@ class _Run:
             model = replace(model, waveform=shares, waveform_error=errors, exposure=recording.exposure)
         elif recording.laser and start.brightest_window(recording) <= FALSE_ALARM:
             model = replace(model, returns=self.returns, pulse=shape if isinstance(shape, Pulse) else None)
-        shortest = np.inf if "dead_time_ns" in self.fixed else recording.shortest
-        known = {"fields": tuple(self.fields.items()), "jitter_given": "jitter" in self.fixed, "shortest": shortest}
-        self.model = replace(model, **known)
+        self.model = replace(model, fields=tuple(self.fields.items()), jitter_given="jitter" in self.fixed)
 
     def result(self) -> Calibration:
         """The fit, the effects that it takes in, and what they leave."""

@@ -306,6 +306,7 @@ class Fit:
     def steps(self, guess: Guess, photons: float, first: float = 0.0) -> tuple[Guess, float, bool]:
         """Steps that weigh ever more photons, up to `photons`; misfit a cell, and whether it settled."""
         model, theta, root, free = guess
+        model = replace(model, shortest=np.inf)  # a bound would move what is correlated with the dead time first
         weighed = float(min(photons, max(first, self.effort.first)))
         total = float(self.recording.photons)
         misfit, near = np.inf, False
@@ -378,6 +379,9 @@ class Fit:
         cells that do not divide the shortest: counts of so few have no normal law.
         """
         model, theta, root, free = guess
+        timed = model.light + 2 in free
+        bounded = replace(model, shortest=self.recording.shortest if timed else np.inf)
+        model = replace(model, shortest=np.inf)
         photons, effort = float(self.recording.photons), self.effort
         closer = effort.spread / effort.more**0.5  # counts near the end of a dead time are linear over short distances
         prior, middle, cells = model.precision(free), model.middle(theta), None
@@ -419,7 +423,7 @@ class Fit:
             estimator = solve @ gain
             raw = centre.copy()
             raw[free] += there[1:]
-            mean = most_probable(model, raw, cov, free)
+            mean = most_probable(bounded, raw, cov, free)
             size = np.abs((mean - centre)[free]) / np.sqrt(np.diag(cov))
             if trial and (size.max() < 1.0 or trial == effort.recentred - 1):
                 break
@@ -427,15 +431,15 @@ class Fit:
             centre = centre + (mean - centre) / max(1.0, float(size.max()) / _NEAR)
         if any(model.names[index].startswith("log_") for index in free):
             counted, observed = (y - near.offset) @ gain.T, gain @ (recorded - near.offset)
-            raw, cov = _curved(model, free, raw, cov, centre, moved, counted, observed, near.ratio)
-            mean = most_probable(model, raw, cov, free)
+            raw, cov = _curved(bounded, free, raw, cov, centre, moved, counted, observed, near.ratio)
+            mean = most_probable(bounded, raw, cov, free)
         sd = np.sqrt(np.diag(cov))
         if again and (np.abs((centre - theta)[free]) > _NEAR * sd).any():  # cells and weights were laid elsewhere
             return self.finish(Guess(model, centre, root_of(cov), free), again=False)
         if known is not None:  # counts do not change with the dead time as a linear law has it
             mean[model.light + 2] = raw[model.light + 2] = dead
             cov[place], cov[:, place], cov[place, place] = 0.0, 0.0, error**2
-            mean = model.bounded(mean)
+            mean = bounded.bounded(mean)
         jacobian = law.slope[:, free] @ local
         project = np.eye(len(recorded)) - jacobian @ estimator
         fresh = near.residual @ project.T
@@ -444,7 +448,7 @@ class Fit:
         (z, p), (dead, scatter) = _misfit(rest, fresh, law, near), self.shortest(model, mean)
         error = float(sd[free == model.light + 2].sum())  # 0 where it is given
         early, more = _extreme(dead - mean[model.light + 2], scatter, error), 0.0
-        if early < FALSE_ALARM and (rows := draws(model, raw, cov, free)) is not None:
+        if early < FALSE_ALARM and (rows := draws(bounded, raw, cov, free)) is not None:
             # a jitter that is not known makes the shortest interval uncertain too
             further, total = self.shortest(model, rows[:: len(rows) // LIGHTS][:LIGHTS])
             more = max(total**2 - scatter**2, 0.0) ** 0.5
@@ -454,7 +458,7 @@ class Fit:
         if known is None and (early < FALSE_ALARM or uneven):
             other = None
             if error:
-                least, own = self.settled(model, mean)
+                least, own = self.settled(bounded, mean)
                 last = Guess(model, mean, root_of(cov), free)
                 other = self.finish(last, again=False, known=(least, float(np.hypot(own, more))))
             if other is not None and other.converged and other.p_value > FALSE_ALARM:
@@ -462,7 +466,7 @@ class Fit:
             p = min(p, early) if early < FALSE_ALARM else p
         scatter, converged = solve @ noise @ solve.T / near.ratio, bool(size.max() < _NEAR) and not uneven
         return Fitted(
-            model, free, mean, cov, raw, scatter, law, near.offset, estimator, jacobian, rest, fresh, z, p, converged
+            bounded, free, mean, cov, raw, scatter, law, near.offset, estimator, jacobian, rest, fresh, z, p, converged
         )
 
 

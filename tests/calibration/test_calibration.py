@@ -105,6 +105,17 @@ def test_a_dead_time_that_two_early_intervals_refuse() -> None:
     assert result.estimates["dead_time_ns"].error < 0.3  # three times what the shortest interval alone tells
 
 
+@pytest.mark.full
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_dead_time_that_ends_in_a_gap_without_light(seed: int) -> None:
+    # hardly any light arrives between two pulses: the dead time may end anywhere there
+    truth = Truth(signal=1.2, background=0.02, delay=10.0, sigma=2.0, dead=75.0, period=50.0, unit=0.064)
+    stream_of_few = stream(truth, 500, seed)
+    dead = ml.calibrate(stream_of_few, pulse="free").estimates["dead_time_ns"]
+    assert abs(dead.value - truth.dead) < 4.0 * dead.error
+    assert dead.low <= truth.dead <= dead.high <= np.diff(stream_of_few.times_ns).min() + 8.0  # jitter of up to 1 ns
+
+
 def test_the_clock_of_a_period_that_ends_within_a_unit() -> None:
     """A pulse about the end of the period: 1 in 86 times, of the unit that is cut, lie at the begin of the next."""
     truth, _ = random_truth(3234)

@@ -18,6 +18,7 @@ from mars_lidar._base.types import FloatArray, NDArray
 from mars_lidar.calibration.cells import Cells
 from mars_lidar.calibration.model import Effect, Model
 from mars_lidar.calibration.recording import FALSE_ALARM, Recording
+from mars_lidar.calibration.shortest import Shortest, shortest_law
 
 LIGHTS = 16  # streams of one detector, in one call of the engine
 _NEAR = 3.0  # standard errors of the recording about the estimate, from which the last streams are drawn
@@ -211,6 +212,7 @@ class Fitted:
     misfit_z: float  # standard deviations of the misfit above that of fresh streams
     p_value: float
     converged: bool
+    by_shortest: tuple[float, float, float] | None  # the dead time and its interval, where no count tells it
 
 
 def most_probable(model: Model, theta: FloatArray, covariance: FloatArray, free: NDArray[np.intp]) -> FloatArray:
@@ -235,13 +237,15 @@ def most_probable(model: Model, theta: FloatArray, covariance: FloatArray, free:
     return model.bounded(theta)
 
 
-def draws(model: Model, theta: FloatArray, covariance: FloatArray, free: NDArray[np.intp]) -> FloatArray | None:
-    """Parameters (n, p) of that law, or None where hardly any lies within the bounds."""
+def draws(model: Model, theta: FloatArray, covariance: FloatArray, free: NDArray[np.intp]) -> FloatArray:
+    """Parameters (n, p) of that law; where hardly any lies within the bounds, of one about what is most probable."""
     root = root_of(covariance)
     rows = np.tile(theta, (Effort.draws, 1))
     rows[:, free] += np.random.default_rng(0).standard_normal((Effort.draws, len(free))) @ root.T
     inside = (np.abs(model.bounded(rows) - rows)[:, free] <= 1e-12 * np.abs(theta[free])).all(1)
-    return rows[inside] if inside.sum() >= 200 else None
+    if inside.sum() >= 200:
+        return rows[inside]
+    return model.bounded(rows + most_probable(model, theta, covariance, free) - theta)
 
 
 def _inverse(fisher: FloatArray, prior: FloatArray, root: FloatArray) -> FloatArray:
@@ -275,11 +279,11 @@ class Fit:
         """Laser periods in which the recording has this many photons."""
         return self.recording.exposure * photons / self.recording.photons
 
-    def cells(self, model: Model, theta: FloatArray, photons: float, least: float = 0.7) -> Cells:
-        """Cells of a law for this many photons, by streams at `theta`; `least` intervals in the first, expected."""
+    def cells(self, model: Model, theta: FloatArray, photons: float) -> Cells:
+        """Cells of a law for this many photons, by streams at `theta`."""
         size = self.exposure(self.effort.of(photons))
         pilot = model.streams(np.tile(theta, (LIGHTS, 1)), max(2, round(size)), self.next_seed())
-        return Cells(model, theta, [t for t in pilot if t.size > 2], photons, least)
+        return Cells(model, theta, [t for t in pilot if t.size > 2], photons)
 
     def law(
         self,
@@ -306,7 +310,6 @@ class Fit:
     def steps(self, guess: Guess, photons: float, first: float = 0.0) -> tuple[Guess, float, bool]:
         """Steps that weigh ever more photons, up to `photons`; misfit a cell, and whether it settled."""
         model, theta, root, free = guess
-        model = replace(model, shortest=np.inf)  # a bound would move what is correlated with the dead time first
         weighed = float(min(photons, max(first, self.effort.first)))
         total = float(self.recording.photons)
         misfit, near = np.inf, False
@@ -338,64 +341,32 @@ class Fit:
             weighed = grown
         return Guess(model, theta, root, free), misfit, near and weighed >= photons
 
-    def _shortest(self, model: Model, rows: FloatArray) -> FloatArray:
-        """The shortest interval (n,) of streams as long as the recording, at parameters (n, p) or (detectors, m, p)."""
-        cycles = max(2, round(self.recording.exposure))
-        drawn = [model.streams(row, cycles, self.next_seed()) for row in rows]
-        return np.array([np.diff(times).min(initial=np.inf) for streams in drawn for times in streams])
+    def shortest(self, model: Model, rows: FloatArray) -> tuple[float, Shortest] | None:
+        """How probable the shortest interval is by rows (n, p) of parameters, and its law; None beside other effects.
 
-    def shortest(self, model: Model, theta: FloatArray) -> tuple[float, float]:
-        """Dead time by the shortest interval alone, and its standard error, by streams as long as the recording.
-
-        They are drawn at parameters (p,), or of each of a few (n, p), which are uncertain then and scatter more.
         The fit counts intervals in cells, and does not know where in its cell an interval lies.
         """
-        number = 4.0 * self.effort.batch / self.recording.photons
-        rows = np.resize(theta, (int(np.clip(number, 4, LIGHTS)), model.size))
-        later = self._shortest(model, rows) - rows[:, model.light + 2]
-        return self.recording.shortest - float(later.mean()), float(np.hypot(later.std(ddof=1), model.clock.unit_ns))
+        if model.effects or model.fields:
+            return None
+        k, size = model.light + 2, self.effort.of(float(self.recording.photons))
+        parts = np.array_split(rows[np.argsort(rows[:, k - 1])], 2 * LIGHTS)  # of about the same jitter each
+        middles = np.array([part[len(part) // 2] for part in parts])
+        cycles = max(2, round(self.exposure(size)))
+        law = shortest_law(self.recording, model, middles, cycles, self.next_seed())
+        return law.p_value([part[:, k] for part in parts]), law
 
-    def settled(self, model: Model, theta: FloatArray) -> tuple[float, float]:
-        """Mean and standard deviation of the dead times whose streams have the recording's shortest interval.
-
-        Of equally probable dead times a quarter is selected, that with the nearest ones, as long as these are close.
-        """
-        recorded, k = self.recording.shortest, model.light + 2
-        low, high, rows = 0.0, float(model.latest(theta)), np.tile(theta, (LIGHTS, 4, 1))
-        for _ in range(self.effort.rounds):
-            rows[..., k] = np.linspace(low, high, LIGHTS)[:, None]
-            near = np.abs(self._shortest(model, rows) - recorded)
-            dead, pad = rows[..., k].ravel()[np.argsort(near)[:LIGHTS]], (high - low) / LIGHTS
-            if np.ptp(dead) + 2.0 * pad > 0.5 * (high - low):
-                break
-            low, high = max(float(dead.min()) - pad, 0.0), float(dead.max()) + pad
-        return float(dead.mean()), float(np.hypot(dead.std(ddof=1), model.clock.unit_ns))
-
-    def finish(self, guess: Guess, again: bool = True, known: tuple[float, float] | None = None) -> Fitted:
+    def finish(self, guess: Guess, again: bool = True, known: bool = False) -> Fitted:
         """The last estimate, and what fresh streams about it say of its slope, bias, scatter and misfit.
 
-        Where the shortest interval refuses it, or counts hardly change with the dead time on one side of the estimate,
-        it is made once more with the dead time `known` by that interval, its mean and standard deviation, and with
-        cells that do not divide the shortest: counts of so few have no normal law.
+        The dead time is `known` by the shortest interval alone where that lies outside of the 95 % interval of the
+        counts, or says more than they do, or where counts hardly change with the dead time on one side of the estimate.
+        Then the others are fitted once more; what one interval says does not show beside the scatter of all counts.
         """
         model, theta, root, free = guess
-        timed = model.light + 2 in free
-        bounded = replace(model, shortest=self.recording.shortest if timed else np.inf)
-        model = replace(model, shortest=np.inf)
         photons, effort = float(self.recording.photons), self.effort
         closer = effort.spread / effort.more**0.5  # counts near the end of a dead time are linear over short distances
-        prior, middle, cells = model.precision(free), model.middle(theta), None
-        if known is not None:
-            dead, error = known
-            place = int(np.flatnonzero(free == model.light + 2)[0])
-            gain = root @ root[place] / (root[place] @ root[place])
-            theta, middle, prior = theta.copy(), middle.copy(), prior.copy()
-            theta[free] += gain * (dead - theta[model.light + 2])
-            theta, middle[model.light + 2] = model.bounded(theta), dead
-            prior[place, place] = error**-2.0
-            root = root_of(root @ root.T + (error**2 - root[place] @ root[place]) * np.outer(gain, gain))
-            cells = self.cells(model, theta, photons, _CUMULATED)
-        law = self.law(Guess(model, theta, root, free), photons, cells, closer, effort.more, effort.longer)
+        prior, middle = model.precision(free), model.middle(theta)
+        law = self.law(Guess(model, theta, root, free), photons, None, closer, effort.more, effort.longer)
         nearby = _NEAR * (effort.of(photons, effort.longer) / photons) ** 0.5
         gain = law.estimator(free)
         recorded = law.cells.of(self.recording)
@@ -423,7 +394,7 @@ class Fit:
             estimator = solve @ gain
             raw = centre.copy()
             raw[free] += there[1:]
-            mean = most_probable(bounded, raw, cov, free)
+            mean = most_probable(model, raw, cov, free)
             size = np.abs((mean - centre)[free]) / np.sqrt(np.diag(cov))
             if trial and (size.max() < 1.0 or trial == effort.recentred - 1):
                 break
@@ -431,42 +402,51 @@ class Fit:
             centre = centre + (mean - centre) / max(1.0, float(size.max()) / _NEAR)
         if any(model.names[index].startswith("log_") for index in free):
             counted, observed = (y - near.offset) @ gain.T, gain @ (recorded - near.offset)
-            raw, cov = _curved(bounded, free, raw, cov, centre, moved, counted, observed, near.ratio)
-            mean = most_probable(bounded, raw, cov, free)
+            raw, cov = _curved(model, free, raw, cov, centre, moved, counted, observed, near.ratio)
+            mean = most_probable(model, raw, cov, free)
         sd = np.sqrt(np.diag(cov))
         if again and (np.abs((centre - theta)[free]) > _NEAR * sd).any():  # cells and weights were laid elsewhere
-            return self.finish(Guess(model, centre, root_of(cov), free), again=False)
-        if known is not None:  # counts do not change with the dead time as a linear law has it
-            mean[model.light + 2] = raw[model.light + 2] = dead
-            cov[place], cov[:, place], cov[place, place] = 0.0, 0.0, error**2
-            mean = bounded.bounded(mean)
+            return self.finish(Guess(model, centre, root_of(cov), free), False, known)
         jacobian = law.slope[:, free] @ local
         project = np.eye(len(recorded)) - jacobian @ estimator
         fresh = near.residual @ project.T
         fresh = (fresh - fresh.mean(0)) / np.sqrt(near.ratio) * np.sqrt(len(y) / (len(y) - terms.shape[1]))
         rest = project @ (recorded - near.offset)
-        (z, p), (dead, scatter) = _misfit(rest, fresh, law, near), self.shortest(model, mean)
-        error = float(sd[free == model.light + 2].sum())  # 0 where it is given
-        early, more = _extreme(dead - mean[model.light + 2], scatter, error), 0.0
-        if early < FALSE_ALARM and (rows := draws(bounded, raw, cov, free)) is not None:
-            # a jitter that is not known makes the shortest interval uncertain too
-            further, total = self.shortest(model, rows[:: len(rows) // LIGHTS][:LIGHTS])
-            more = max(total**2 - scatter**2, 0.0) ** 0.5
-            early = max(early, _extreme(further - mean[model.light + 2], scatter, float(np.hypot(error, more))))
-        estimates, which = solve @ gain @ (y - near.offset).T, free == model.light + 2
-        uneven = bool(error) and known is None and _uneven(estimates, moved, which)
-        if known is None and (early < FALSE_ALARM or uneven):
-            other = None
-            if error:
-                least, own = self.settled(bounded, mean)
-                last = Guess(model, mean, root_of(cov), free)
-                other = self.finish(last, again=False, known=(least, float(np.hypot(own, more))))
-            if other is not None and other.converged and other.p_value > FALSE_ALARM:
-                return other
-            p = min(p, early) if early < FALSE_ALARM else p
+        (z, p), timed = _misfit(rest, fresh, law, near), free == model.light + 2
+        uneven = timed.any() and _uneven(solve @ gain @ (y - near.offset).T, moved, timed)
+        judged, interval = self.shortest(model, draws(model, raw, cov, free)), None
+        if judged is not None:
+            early, shortest = judged
+            dead = shortest.dead_time()
+            if timed.any() and (early < 0.05 or uneven or sd[timed][0] > dead[2] - dead[1]):
+                at = mean.copy()
+                at[model.light + 2] = dead[0]
+                own = Guess(model, at, root_of(cov[np.ix_(~timed, ~timed)]), free[~timed])
+                other = self.finish(self.steps(own, photons, photons / 6.0)[0], known=True)
+                if other.converged and other.p_value > FALSE_ALARM:
+                    return other
+            if known:
+                interval, mean[model.light + 2] = dead, dead[0]
+            elif early < FALSE_ALARM:
+                p = min(p, early)
         scatter, converged = solve @ noise @ solve.T / near.ratio, bool(size.max() < _NEAR) and not uneven
         return Fitted(
-            bounded, free, mean, cov, raw, scatter, law, near.offset, estimator, jacobian, rest, fresh, z, p, converged
+            model,
+            free,
+            mean,
+            cov,
+            raw,
+            scatter,
+            law,
+            near.offset,
+            estimator,
+            jacobian,
+            rest,
+            fresh,
+            z,
+            p,
+            converged,
+            interval,
         )
 
 
@@ -502,12 +482,10 @@ def _curved(
     the logarithm and its products with the size; draws of the linear law are weighed by it, where `observed` was.
     """
     rows = draws(model, raw, 2.25 * cov, free)
-    if rows is None:
-        return raw, cov
     at = (rows - centre)[:, free]
 
     def terms(x: FloatArray) -> FloatArray:
-        return np.c_[np.ones(len(x)), x, x[:, -1:] * x[:, -2:]]
+        return np.asarray(np.c_[np.ones(len(x)), x, x[:, -1:] * x[:, -2:]])
 
     law, own = terms(moved), terms(at)
     inverse = np.linalg.pinv(law.T @ law)
@@ -522,19 +500,6 @@ def _curved(
     theta = centre.copy()
     theta[free] += mean
     return theta, np.atleast_2d(np.cov(at.T, aweights=weight))
-
-
-def _extreme(off: float, scatter: float, error: float) -> float:
-    """Probability that the shortest interval is `off` its mean, which has an error of its own, by as much.
-
-    It is that of the sum of a normal law and one whose tail is exponential, as that of an extreme value is at most.
-    """
-    from scipy.special import log_ndtr, ndtr
-
-    rate, sd = np.pi / 6.0**0.5 / scatter, max(error, 1e-12)
-    z = (abs(off) + 1.0 / rate) / sd  # from the begin of the exponential law, whose mean is zero
-    tail = np.exp(0.5 * (rate * sd) ** 2 - rate * sd * z + log_ndtr(z - rate * sd))
-    return min(1.0, 2.0 * float(ndtr(-z) + tail))
 
 
 def _misfit(rest: FloatArray, fresh: FloatArray, law: Batch, near: Batch) -> tuple[float, float]:

@@ -25,7 +25,6 @@ from mars_lidar.simulation import simulate_timestamps
 _NARROWEST = 2e-6  # periods: the narrowest pulse that the engines draw
 _WIDEST = 0.3  # sigma of a recorded pulse, periods: a wider one is hardly told from background
 _WIDEST_JITTER = 0.05  # periods: the widest that `Jitter` takes
-_REACH = 5.5  # standard deviations of a difference of jitters, beyond which one of ten million intervals lies
 _MOST_CARRIERS = 0.95  # of an avalanche
 Fields = dict[str, Any]
 
@@ -115,8 +114,7 @@ class Model:
     (shares of the light in equal parts of the period, jitter not included) there is no return, and the background is
     all light. `waveform_error` are the standard errors of these shares by a recording of `exposure` periods: simulated
     streams have light that differs so much from the waveform, more in shorter ones as their counts do.
-    With a `pulse` its shape is known, before any jitter, and `width` means nothing. `shortest` interval of the
-    recording, ns, where the dead time is not given: it has no longer one, jitter and clock aside.
+    With a `pulse` its shape is known, before any jitter, and `width` means nothing.
     """
 
     clock: Clock
@@ -128,7 +126,6 @@ class Model:
     effects: tuple[Effect, ...] = ()
     fields: tuple[tuple[str, Any], ...] = ()  # of the detector, as given
     jitter_given: bool = False
-    shortest: float = np.inf
 
     @property
     def gaussian(self) -> bool:
@@ -176,7 +173,7 @@ class Model:
         out[..., k + 1] = np.clip(out[..., k + 1], 0.0, most)
         if self.gaussian and self.jitter_given:
             out[..., k] = np.maximum(out[..., k], out[..., k + 1])
-        out[..., k + 2] = np.clip(out[..., k + 2], 0.0, self.latest(out))
+        out[..., k + 2] = np.maximum(out[..., k + 2], 0.0)
         bounds = [each for effect in self.effects for each in zip(effect.least, effect.most, strict=True)]
         for at, (low, high) in enumerate(bounds, k + 3):
             out[..., at] = np.clip(out[..., at], low, high)
@@ -188,16 +185,6 @@ class Model:
         if self.split:
             return width * np.cos(jitter), width * np.sin(jitter)
         return np.sqrt(np.maximum(width**2 - jitter**2, 0.0)), jitter
-
-    def latest(self, theta: FloatArray) -> FloatArray:
-        """The longest dead time (...), ns, with which the shortest interval has a probability, of parameters (..., p).
-
-        It is shorter than the dead time by the difference of two jitters and of two rounded times at most. A jitter
-        that is an unknown part of the recorded width counts as all of it.
-        """
-        return np.asarray(
-            self.shortest + self.clock.unit_ns + _REACH * 2.0**0.5 * theta[..., self.light + 1 - self.split]
-        )
 
     def scale(self, theta: FloatArray) -> FloatArray:
         """Changes (p,) of parameters over which counts are about linear functions of them, as a batch varies them."""
@@ -245,7 +232,8 @@ class Model:
         least = _NARROWEST * self.clock.period_ns
         if jitter and sd > least:
             fields["jitter"] = Jitter(sigma_ns=sd)
-        pulse = self.pulse or GaussianPulse(sigma_ns=float(f"{max(sigma, least):.9g}"))
+        sigma = max(sigma, least) if self.returns else _WIDEST * self.clock.period_ns  # no light has that pulse
+        pulse = self.pulse or GaussianPulse(sigma_ns=float(f"{sigma:.9g}"))
         return System(
             period_ns=self.clock.period_ns, cycles=cycles, bins=bins, pulse=pulse, detector=Detector(**fields)
         )
@@ -263,7 +251,7 @@ class Model:
         delay = np.stack([rows[None, :, 2 + 2 * r] % period for r in range(self.returns)])
         return Flux(signal, back, delay) if self.returns > 1 else Flux(signal[0], back, delay[0])
 
-    def _varied(self, flux: Flux, cycles: int, seed: int) -> Flux:
+    def varied(self, flux: Flux, cycles: int, seed: int) -> Flux:
         """The light with shapes that are as uncertain as the waveform; the same where that is known."""
         if self.waveform is None or self.waveform_error is None or flux.waveform is None:
             return flux
@@ -273,7 +261,9 @@ class Model:
         shape = np.random.default_rng(seed).gamma(self.waveform / scale, size=flux.waveform.shape) * scale
         return Flux(waveform=light * shape / shape.sum(-1, keepdims=True))
 
-    def streams(self, rows: FloatArray, cycles: int, seed: int, extra: tuple[Effect, ...] = ()) -> Streams:
+    def streams(
+        self, rows: FloatArray, cycles: int, seed: int, extra: tuple[Effect, ...] = (), jitter: bool = True
+    ) -> Streams:
         """Recorded times of a stream for each row of (rows, p); the detector is that of the first row, but its jitter.
 
         The jitter of a recorded time is drawn here, a normal deviate each, so that it may differ from row to row and
@@ -283,9 +273,9 @@ class Model:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a trial value may look like one in another unit
             system = self.system(rows[0], cycles, extra=extra, jitter=False)
-            flux = self._varied(self.flux(rows), cycles, seed)
+            flux = self.varied(self.flux(rows), cycles, seed)
             made = cast(DrawnTimestamps, simulate_timestamps(flux, system, seed=seed, threads=1))
-        sigma = self.widths(rows)[1].copy()
+        sigma = self.widths(rows)[1] * jitter
         sigma[sigma <= _NARROWEST * self.clock.period_ns] = 0.0
         number = made.phase.size if sigma.any() else 0
         deviates = np.random.default_rng(seed).standard_normal(number, dtype=np.float32)

@@ -230,7 +230,8 @@ def systematic_error(flux: Flux, system: System) -> tuple[FloatArray, FloatArray
     -------
     tuple
         Error and standard error, each (..., 3), of S, B and the delay in ns. The error is that of one step of Fisher
-        scoring: accurate as long as the estimates are near the truth.
+        scoring: accurate as long as the estimates are near the truth. It is 0, and the standard error infinite, for the
+        delay of a pulse that lies within one bin.
 
     Raises
     ------
@@ -272,11 +273,15 @@ def systematic_error(flux: Flux, system: System) -> tuple[FloatArray, FloatArray
         _core.histogram_log_likelihood(
             recording, np.ascontiguousarray(histogram), at[row : row + 1], out[row : row + 1]
         )
-    inverse = np.linalg.inv(out[:, 4:].reshape(-1, 3, 3))
-    unit = np.array([1.0, 1.0, system.period_ns])
-    shape = (*flux.signal.shape, 3)
-    bias = np.einsum("kij,kj->ki", inverse, out[:, 1:4]) * unit
-    return bias.reshape(shape), (np.sqrt(np.einsum("kii->ki", inverse)) * unit).reshape(shape)
+    gradient, information = out[:, 1:4], out[:, 4:].reshape(-1, 3, 3)
+    anywhere = information[:, 2, 2] <= 0.0  # within its bin
+    information[anywhere, 2], information[anywhere, :, 2], information[anywhere, 2, 2] = 0.0, 0.0, 1.0
+    inverse = np.linalg.inv(information)
+    error = np.sqrt(np.einsum("kii->ki", inverse))
+    gradient[anywhere, 2], error[anywhere, 2] = 0.0, np.inf
+    unit, shape = np.array([1.0, 1.0, system.period_ns]), (*flux.signal.shape, 3)
+    bias = np.einsum("kij,kj->ki", inverse, gradient)
+    return (bias * unit).reshape(shape), (error * unit).reshape(shape)
 
 
 def tell_systematic_error(method: Method, system: System, estimates: Estimates) -> None:

@@ -278,8 +278,8 @@ GAUSSIAN = np.exp(-0.5 * (np.arange(-19.5, 20.0) / 2.5) ** 2)  # sigma of 2.5 sa
     ],
 )
 def test_intervals_hold_where_bins_are_wider_than_the_pulse(pulse, bins, signal, background, cycles):
-    """Of 512 intervals of 95 % at least 90 % hold (false alarm 1e-6), delays are closer than the middle of any bin would
-    be, and no estimate of S is that of another bin."""
+    """Of 512 intervals of 95 % at least 90 % hold (false alarm 1e-6), delays are closer than the middle of any bin
+    would be, and no estimate of S is that of another bin."""
     system = PLAIN.replace(pulse=pulse, bins=bins, cycles=cycles)
     delay = np.random.default_rng(6).uniform(30.0, 60.0, (8, 64))
     estimate = ml.reconstruct(ml.simulate(ml.Flux(signal, background, delay), system, seed=9)[0], system)

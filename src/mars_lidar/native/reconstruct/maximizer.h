@@ -29,7 +29,7 @@ constexpr double kPart = 0.4;         // step of the profile of the delay, in st
 constexpr double kFallen = 1e-4;      // of the likelihood of the maximum: nothing
 constexpr double kUniform = 0.28867513459481287;  // standard deviation of the uniform law on a unit interval
 constexpr double kRootTwoPi = 2.5066282746310002;
-constexpr int kMaximumColumns = 8;    // of the output: see Maximizer
+constexpr int kMaximumColumns = 8;  // of the output: see Maximizer
 
 // What is known where the likelihood stands, without what the ends of the exposure hide, if that is positive definite.
 inline void known_information(const Likelihood& likelihood, const bool* free, double known[3][3]) {
@@ -52,7 +52,7 @@ struct Fit {
 struct Terrain {
     double least;     // of B
     double farthest;  // a step of the delay may go
-    bool narrow;      // the pulse is narrower than half a bin, within which the likelihood hardly changes with the delay
+    bool narrow;  // the pulse is narrower than half a bin, within which the likelihood hardly changes with the delay
     double best = -HUGE_VAL;
     const ExposureEnds* ends = nullptr;
 };

@@ -238,11 +238,9 @@ def _folded(cells: Cells, first: IndexArray, size: int, bins: int, threads: int)
 
 def _if_whole(pmf: FloatArray, first: int, mean: float, spread: float) -> Pmf | None:
     """The window where it contains the law: ends below `Tolerances.edge`, nothing negative, sum 1, the assumed mean."""
-    away = float(pmf @ (first + np.arange(pmf.size))) - mean
-    ends = _ends(pmf, first)
-    if not (ends <= TOL.edge and abs(away) <= TOL.like_mean * max(spread, 0.5) and float(pmf.min()) >= -TOL.consistent):
-        return None
-    if not abs(float(pmf.sum()) - 1.0) <= TOL.consistent:
+    moved = float(pmf @ (first + np.arange(pmf.size))) - mean
+    inside = _ends(pmf, first) <= TOL.edge and abs(moved) <= TOL.guess_mean * max(spread, 0.5)
+    if not (inside and float(pmf.min()) >= -TOL.consistent and abs(float(pmf.sum()) - 1.0) <= TOL.consistent):
         return None
     return Pmf(first, np.maximum(pmf, 0.0), pmf.size * TOL.edge)
 

@@ -430,7 +430,9 @@ def joint_law(
     --------
     count_law, simulate
 
-    Notes ----- The result includes the terms of the start and of the end of the exposure; nothing is assumed
+    Notes
+    -----
+    The result includes the terms of the start and of the end of the exposure; nothing is assumed
     stationary. If the start-up transient does not end within the exposure (`settled` is -1), the recursion steps
     through all periods for every window, which is also exact but costs O(bins x cycles) a window instead of O(bins).
 

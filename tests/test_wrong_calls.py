@@ -441,6 +441,7 @@ def test_every_public_name_is_called():
     assert public - called == RESULTS - called
 
 
+@pytest.mark.full
 def test_what_is_documented_as_taken_is_taken(here):
     """An entry that nothing needs any more is removed."""
     results = [(name, where) for name in CALLS for where, kind, _ in outcomes(name, here) if kind == "documented"]

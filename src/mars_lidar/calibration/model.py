@@ -270,6 +270,8 @@ class Model:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a trial value may look like one in another unit
             system = self.system(rows[0], cycles, extra=extra, jitter=False)
+            if self.waveform is not None:  # which leaves the pulse without light: no table for each width
+                system = system.replace(pulse=GaussianPulse(sigma_ns=self.clock.period_ns))
             flux = self._varied(self.flux(rows), cycles, seed)
             made = cast(DrawnTimestamps, simulate_timestamps(flux, system, seed=seed, threads=1))
         sigma = self.widths(rows)[1].copy()

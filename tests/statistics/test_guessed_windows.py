@@ -20,9 +20,9 @@ def cells():
 
 
 def alone(monkeypatch):
-    """How many cells went the long way."""
-    asked = []
-    monkeypatch.setattr(_pmf, "_alone", lambda cell, threads, way=_pmf._alone: asked.append(1) or way(cell, threads))
+    """Cells whose law is computed by their own cumulants."""
+    asked, compute = [], _pmf._by_own_cumulants
+    monkeypatch.setattr(_pmf, "_by_own_cumulants", lambda cell, threads: asked.append(1) or compute(cell, threads))
     return asked
 
 

@@ -406,7 +406,7 @@ class _Shards:
         self._reader.shutdown(cancel_futures=True)
 
     def take(self, number: int) -> Block:
-        """A block, which is forgotten after its last use."""
+        """A block, which is released after its last use."""
         if number not in self._begun:
             self._begun.add(number)
             while number not in self._submitted or len(self._submitted) < len(self._begun & self._uses.keys()) + 1:

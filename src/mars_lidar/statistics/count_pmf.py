@@ -25,7 +25,7 @@ from mars_lidar.statistics.tolerances import LAW, TOL
 
 @dataclass(frozen=True, eq=False)
 class Pmf:
-    """Probabilities `p` (w,) of the counts `first`, `first` + 1, ...; at most `outside` lies elsewhere.
+    """Probabilities `p` (w,) of the counts `first`, `first` + 1, ...; that of all others is at most `outside`.
 
     For simulated counts `p` holds their frequencies.
     """
@@ -50,7 +50,7 @@ class Pmf:
 
     @property
     def last(self) -> int:
-        """The largest count with an entry."""
+        """The last count of `p`."""
         return self.first + self.p.size - 1
 
 
@@ -106,11 +106,11 @@ def gaussian_window(mean: float, variance: float) -> Pmf:
 
 
 class TooLongError(ConvergenceError):
-    """The state did not repeat within the budget of a law."""
+    """The state of the pixel did not repeat within the budget of a law."""
 
 
 class Remaining:
-    """Steps of `Budget.transform` that remain for the law of one cell; at the start a `share` of all."""
+    """Steps of `Budget.transform` that remain for the law of one cell; initially the `share` of all."""
 
     def __init__(self, share: float = 1.0) -> None:
         self.steps = share * LAW.transform
@@ -141,22 +141,22 @@ def characteristic(
         "settled": settled,
     }
     for part in cells.chunks(bins, 1):
-        mine: dict[str, Any] = points | {name: x[part] for name, x in points.items() if np.ndim(x)}
+        arguments: dict[str, Any] = points | {name: x[part] for name, x in points.items() if np.ndim(x)}
         light = native_light(cells.part(part), bins)
-        _core.exposure_characteristic(grid=grid, light=light, **mine, threads=threads)
-    cold = np.flatnonzero((settled == Settled.NOT_WARM).any(-1))
-    if cold.size:
+        _core.exposure_characteristic(grid=grid, light=light, **arguments, threads=threads)
+    not_warm = np.flatnonzero((settled == Settled.NOT_WARM).any(-1))
+    if not_warm.size:
         again: dict[str, Any] = points | {
-            name: np.ascontiguousarray(x[cold]) for name, x in points.items() if np.ndim(x)
+            name: np.ascontiguousarray(x[not_warm]) for name, x in points.items() if np.ndim(x)
         }
-        light = native_light(cells.part(cold), bins, warm_history(cells, cold, bins))
+        light = native_light(cells.part(not_warm), bins, warm_history(cells, not_warm, bins))
         _core.exposure_characteristic(grid=grid, light=light, **again, threads=threads)
         for name, array in (("re", re), ("im", im), ("settled", settled)):
-            array[cold] = again[name]
-    lost = (settled == Settled.UNSETTLED).any(-1)
-    if lost.any():
+            array[not_warm] = again[name]
+    unsettled = (settled == Settled.UNSETTLED).any(-1)
+    if unsettled.any():
         raise TooLongError(
-            f"count law of {cells.name(int(np.argmax(lost)))}: the state of the pixel does not repeat within "
+            f"count law of {cells.name(int(np.argmax(unsettled)))}: the state of the pixel does not repeat within "
             f"{steps:.1g} bins x periods, too many to compute the exposure to its end at {z_re.shape[1]} points; mean, "
             f"variance and two more cumulants are known; for the law {cells.instead}"
         )
@@ -199,9 +199,9 @@ def guessed_windows(
 ) -> list[Pmf]:
     """Exact pmf of each cell, given approximate cumulants (cells, 4), for example from a table.
 
-    The approximate cumulants give the support. Where the result shows that the support is too small, `exact_windows`
-    with the exact cumulants replaces it. For narrow laws this is several times faster than `exact_windows`. `waiting`
-    is called with the number of cells done.
+    The support is that of the approximate cumulants. Where the result shows that it is too small, the law is computed
+    by `exact_windows` with exact cumulants. For narrow laws this is several times faster than `exact_windows`.
+    `waiting` is called with the number of cells computed so far.
     """
     cells = cells.resolved(1)
     spread = np.sqrt(np.maximum(cumulants[:, 1], 0.0))
@@ -218,9 +218,9 @@ def guessed_windows(
             pmf = _folded(cells.part(block), first[block], int(width), int(n), threads) if guessed else None
             for k, cell in enumerate(block):
                 candidate = (
-                    None if pmf is None else _if_whole(pmf[k], int(first[cell]), cumulants[cell, 0], spread[cell])
+                    None if pmf is None else _if_complete(pmf[k], int(first[cell]), cumulants[cell, 0], spread[cell])
                 )
-                windows[cell] = candidate or _alone(cells.part(block[k : k + 1]), threads)
+                windows[cell] = candidate or _by_own_cumulants(cells.part(block[k : k + 1]), threads)
             done += block.size
             if waiting is not None:
                 waiting(done)
@@ -236,25 +236,23 @@ def _folded(cells: Cells, first: IndexArray, size: int, bins: int, threads: int)
     return np.take_along_axis(folded, (first[:, None] + np.arange(size)) % size, axis=-1)
 
 
-def _if_whole(pmf: FloatArray, first: int, mean: float, spread: float) -> Pmf | None:
-    """The window where it contains the law: ends below `Tolerances.edge`, nothing negative, sum 1, the assumed mean."""
-    away = float(pmf @ (first + np.arange(pmf.size))) - mean
-    ends = _ends(pmf, first)
-    if not (ends <= TOL.edge and abs(away) <= TOL.like_mean * max(spread, 0.5) and float(pmf.min()) >= -TOL.consistent):
-        return None
-    if not abs(float(pmf.sum()) - 1.0) <= TOL.consistent:
+def _if_complete(pmf: FloatArray, first: int, mean: float, spread: float) -> Pmf | None:
+    """The pmf if its counts include the law: small at both ends, not negative, with sum 1 and the assumed mean."""
+    moved = float(pmf @ (first + np.arange(pmf.size))) - mean
+    inside = _ends(pmf, first) <= TOL.edge and abs(moved) <= TOL.guess_mean * max(spread, 0.5)
+    if not (inside and float(pmf.min()) >= -TOL.consistent and abs(float(pmf.sum()) - 1.0) <= TOL.consistent):
         return None
     return Pmf(first, np.maximum(pmf, 0.0), pmf.size * TOL.edge)
 
 
 def _ends(pmf: FloatArray, first: int, most: float = math.inf) -> float:
-    """Larger probability of the first and last count of a window, ignoring an end at which the counts end."""
+    """Larger probability of the first and the last count, except of count 0 and of `most`, the largest possible one."""
     low = abs(float(pmf[0])) if first > 0 else 0.0
     return max(low, abs(float(pmf[-1])) if first + pmf.size - 1 < most else 0.0)
 
 
-def _alone(cell: Cells, threads: int) -> Pmf:
-    """Exact pmf of one cell with its own cumulants."""
+def _by_own_cumulants(cell: Cells, threads: int) -> Pmf:
+    """Exact pmf of one cell, computed with its exact cumulants."""
     own = refined_moments(cell, 1, tolerance=1e-4, threads=threads)
     return exact_windows(cell, own.cumulants.reshape(-1, 4), own.bins.reshape(-1), threads)[0]
 
@@ -270,7 +268,7 @@ def _supports(
         TOL.most_log_growth / (1.0 + 1.0 / dead),
         np.log1p(TOL.most_log_growth / np.maximum(cells.total, 1e-300)),
     )
-    # the tilts are scaled down to the limit; where large counts are rare, small tilts give the best bounds
+    # if necessary the tilts are reduced to this limit; where large counts are rare, small tilts give the best bounds
     unit = np.minimum(1.0 / np.maximum(spread, 1e-300), np.minimum(growth, TOL.most_tilt) / _TILTS[-1])
     tilt = _TILTS * unit[:, None]
     tilt = np.concatenate([tilt, -tilt], axis=1)
@@ -329,11 +327,11 @@ def _window(cell: Cells, first: int, last: int, outside: float, bins: int, threa
 def _narrow(
     cell: Cells, size: int, bins: int, threads: int, variance: float, remaining: Remaining
 ) -> NDArray[np.complex128] | None:
-    """Conjugate of E z^N at the points (size // 2 + 1,) of the circle, evaluated where it is not 0; None if unproven.
+    """Conjugate of E z^N at (size // 2 + 1,) points of the circle, evaluated only near z = 1; None if not justified.
 
-    The transform of a wide law is a narrow peak at z = 1, below rounding beyond some 9 of its standard deviations,
-    unless the counts lie on a lattice (all even, say), which gives further peaks of the same width. These also occur in
-    the transform of a much shorter exposure, where they are wide enough to be found on few points (27).
+    The transform of a wide law is a narrow peak at z = 1; beyond about 9 of its standard deviations it is below
+    rounding. If the counts lie on a lattice (all even, say), there are further peaks of the same width. They also occur
+    in the transform of a much shorter exposure, where they are so wide that few points detect them (27).
     """
     cycles = cell.system.cycles
     shorter = max(1, math.ceil(TOL.short_variance * cycles / max(variance, 1e-300)))
@@ -357,15 +355,15 @@ def _narrow(
     between = np.geomspace(angle[min(end, angle.size - 1)], max(begin, angle[min(end, angle.size - 1)]), 16)
     re, im = characteristic(cell, np.cos(between)[None], np.sin(between)[None], bins, threads, remaining)
     beyond = np.linspace(begin, np.pi, 2 + math.ceil((np.pi - begin) * spread / 0.3))
-    brief = replace(cell, system=cell.system.replace(cycles=shorter))
-    short_re, short_im = characteristic(brief, np.cos(beyond)[None], np.sin(beyond)[None], bins, threads, remaining)
+    short = replace(cell, system=cell.system.replace(cycles=shorter))
+    short_re, short_im = characteristic(short, np.cos(beyond)[None], np.sin(beyond)[None], bins, threads, remaining)
     highest = float(np.hypot(short_re, short_im).max())
     faint = float(np.hypot(re, im).max()) <= 10.0 * TOL.faint
     return value if faint and highest ** (cycles / shorter) <= 1e-3 * TOL.faint else None
 
 
 def _check(cells: Cells, cell: int, window: Pmf, cumulants: FloatArray) -> None:
-    """Check sum, sign, mean and variance of the pmf against the cumulants; then clip and normalise it in place."""
+    """Compare sum, sign, mean and variance of the pmf with the cumulants; then clip and normalise it in place."""
     pmf: NDArray[np.float64] = window.p
     offset = window.first + np.arange(pmf.size) - cumulants[0]
     spread = max(math.sqrt(cumulants[1]), 1e-3)
@@ -378,7 +376,7 @@ def _check(cells: Cells, cell: int, window: Pmf, cumulants: FloatArray) -> None:
         )
     total, mean = float(pmf.sum()), float((pmf * offset).sum())
     variance, least = float((pmf * offset**2).sum()), float(pmf.min())
-    # errors of rounding and extrapolation are absolute in probability; for a locked count they may exceed its variance
+    # rounding and extrapolation cause absolute errors of probability, which may exceed the variance of a locked count
     rounding, unit = TOL.consistent_per_cycle * cells.system.cycles, max(spread, 1.0)
     error = max(
         abs(total - 1.0) / (TOL.consistent + rounding),

@@ -474,13 +474,13 @@ def _phases(grid: RecordGrid) -> FloatArray:
         return np.asarray(direct / direct.sum())
     law: FloatArray = np.full(n, 1.0 / n)
     moved = math.inf
-    for _ in range(TOL.record_turns):
+    for _ in range(TOL.record_iterations):
         following = np.asarray(law @ matrix, dtype=np.float64)
         following /= following.sum()
         before, moved = moved, 0.5 * float(np.abs(following - law).sum())
         law = following
-        forgotten = 1.0 - min(moved / before, 1.0) if before > 0.0 else 1.0
-        if moved <= TOL.record_stands * forgotten:
+        gap = 1.0 - min(moved / before, 1.0) if before > 0.0 else 1.0
+        if moved <= TOL.record_change * gap:
             return law
     raise ConvergenceError(
         f"stationary shape of {grid.cell.name(0)} behind electronics with a dead time: {n} phases do not converge; "
@@ -549,11 +549,11 @@ def _window(cell: Cells, electronics_ns: float, tolerance: float) -> Pmf:
         abs(float(pmf @ offset**2) - variance) / max(variance, 1e-6),
         -float(pmf.min()),
     )
-    if not error <= TOL.like_moments * tolerance:
+    if not error <= TOL.record_mismatch * tolerance:
         raise ConvergenceError(
             f"count law of {cell.name(0)}, t_e = {electronics:g} periods: its pmf on {first} .. {last} disagrees with "
-            f"mean and variance by {error:.2g} (allowed {TOL.like_moments * tolerance:.2g}); electronics_moments has "
-            "those"
+            f"mean and variance by {error:.2g} (allowed {TOL.record_mismatch * tolerance:.2g}); electronics_moments "
+            "gives mean and variance"
         )
     pmf = np.maximum(pmf, 0.0)
     outside = TOL.record_edge * ((first > 0) + (last < most)) * pmf.size

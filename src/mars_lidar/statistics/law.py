@@ -44,7 +44,7 @@ class CountLaw:
     cumulants
         (..., 4) mean, variance, third and fourth cumulant of N.
     windows
-        Function that returns the probabilities of the cells, called on first use.
+        Function that returns the probabilities of each cell, called on first use.
     exposure
         The `Exposure` of an exact law (its histogram has a single bin), else None.
 
@@ -102,13 +102,13 @@ class CountLaw:
 
     @cached_property
     def support(self) -> IndexArray:
-        """Counts (..., w) to which `pmf` and `cdf` refer, consecutive; each cell has its own first count."""
+        """Consecutive counts (..., w) to which `pmf` and `cdf` refer; each cell has its own first count."""
         first = np.array([window.first for window in self._windows]).reshape(self._shape)
         return np.asarray(first[..., None] + np.arange(self._width), dtype=np.int64)
 
     @cached_property
     def pmf(self) -> FloatArray:
-        """P(N = n) (..., w) for n in `support`; no more than `outside` lies elsewhere.
+        """P(N = n) (..., w) for n in `support`; the probability of other counts is at most `outside`.
 
         For the Gaussian laws ("mars", "renewal") the normal density integrated from n - 1/2 to n + 1/2; P(0) includes
         the probability below 0.
@@ -137,7 +137,7 @@ class CountLaw:
         return max(window.p.size for window in self._windows)
 
     def __getstate__(self) -> dict[str, Any]:
-        """The law with its probabilities evaluated: the function that evaluates them cannot be pickled."""
+        """The law with its probabilities, because the function that evaluates them cannot be pickled."""
         windows = self._windows
         return {name: value for name, value in self.__dict__.items() if name != "_evaluate"} | {"_windows": windows}
 
@@ -174,7 +174,7 @@ def count_law(
         - ``"exact"``: finite exposure, start and end included, any dead time and every mode of the detector
           (docs/theory_exposure.md, docs/detectors.md); with electronics dead time for modes ``"nonparalyzable"`` and
           ``"gated"``, to 1e-3 (see `electronics_moments`),
-        - ``"mars"``: the Gaussian of the MaRS paper (arXiv 2512.04924), asymptotic in the exposure: it depends neither
+        - ``"mars"``: the Gaussian of the MaRS paper (arXiv 2512.04924), the limit of long exposures: it depends neither
           on the start nor, except through the grid, on the delay,
         - ``"renewal"``: the Gaussian of a constant-rate renewal process of equal energy, mean
           lambda t / (1 + lambda t_d) and variance lambda t / (1 + lambda t_d)^3,
@@ -184,7 +184,7 @@ def count_law(
     tolerance
         For ``"exact"``: see `exposure_moments`.
     threads
-        Threads to run on; default: all processors that this process may use.
+        Number of threads; default: all processors that this process may use.
 
     Returns
     -------

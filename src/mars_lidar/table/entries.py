@@ -399,7 +399,7 @@ def _choose(cells: Cells, grids: IndexArray, scale: FloatArray, sample: IndexArr
 def _replace_if_wrong(
     cells: Cells, cell: int, bins: int, phase: FloatArray, scale: FloatArray, correction: FloatArray, threads: int
 ) -> None:
-    """Exact corrections (p, 4) of a cell whose exposure ended before start and end forgot each other.
+    """Exact corrections (p, 4) of a cell whose exposure ended before its start-up transient had decayed.
 
     The corrections of (P7) are compared with exact ones at the few phases where they are largest, and replaced where
     they differ by more than the tolerance `phase_error`.

@@ -48,7 +48,8 @@ class Estimate:
     """A parameter: its value, standard error, and 95 % interval; the error of a given value is 0.
 
     `note` states whether it was given, not detected, or not identified. The error of a dead time that follows from the
-    shortest interval alone is NaN: its law is not normal, and the interval is stated.
+    shortest interval alone is NaN: its law is not normal, and the interval is stated. In a model that does not fit all
+    errors and intervals are NaN.
     """
 
     value: float
@@ -60,9 +61,8 @@ class Estimate:
     def __str__(self) -> str:
         if self.error == 0.0:
             return f"{self.value:.6g} ({self.note or 'given'})"
-        if self.note:
-            return f"{self.value:.4g} (95 %: {self.low:.3g} to {self.high:.3g}), {self.note}"
-        return measured(self.value, self.error) if np.isfinite(self.error) else f"{self.value:.6f} ± {self.error}"
+        interval = "" if np.isnan(self.low) else f" (95 %: {self.low:.3g} to {self.high:.3g})"
+        return f"{self.value:.4g}{interval}, {self.note}" if self.note else measured(self.value, self.error)
 
 
 @dataclass(frozen=True)
@@ -565,6 +565,9 @@ def _estimates(fitted: Fitted, growth: FloatArray) -> dict[str, Estimate]:
         if not free & set(needs):
             out[name] = Estimate(value, 0.0, value, value, "given")
             return
+        if fitted.p_value < FALSE_ALARM:
+            out[name] = Estimate(value, np.nan, np.nan, np.nan, "of a model that does not fit: no error holds")
+            return
         low, high = np.quantile(sample, (0.025, 0.975))
         out[name] = Estimate(value, float(((sample - value) ** 2).mean() ** 0.5), float(low), float(high), note)
 
@@ -606,7 +609,7 @@ def _estimates(fitted: Fitted, growth: FloatArray) -> dict[str, Estimate]:
         elif not effect.onoff:
             put(effect.names[0], float(values[0]), columns[:, 0], effect.names[0])
         at += len(effect.names)
-    if fitted.by_shortest is not None:
+    if fitted.by_shortest is not None and fitted.p_value >= FALSE_ALARM:
         value, low, high = fitted.by_shortest
         out["dead_time_ns"] = Estimate(value, np.nan, low, high, "by the shortest interval alone")
     elif "dead_time_ns" not in out:

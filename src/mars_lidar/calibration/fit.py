@@ -16,7 +16,7 @@ import numpy as np
 
 from mars_lidar._base.types import FloatArray, NDArray
 from mars_lidar.calibration.cells import Cells
-from mars_lidar.calibration.model import Effect, Model
+from mars_lidar.calibration.model import Model
 from mars_lidar.calibration.recording import FALSE_ALARM, Recording
 from mars_lidar.calibration.shortest import Shortest, shortest_law
 
@@ -103,13 +103,11 @@ class Batch:
         return np.asarray(inverse @ jacobian.T @ self.weight)
 
 
-def counted(
-    model: Model, cells: Cells, rows: FloatArray, exposure: float, seed: int, extra: tuple[Effect, ...] = ()
-) -> FloatArray:
+def counted(model: Model, cells: Cells, rows: FloatArray, exposure: float, seed: int) -> FloatArray:
     """Counts (rows, c) of simulated streams, one for each row of parameters; `LIGHTS` rows share a detector."""
     cycles = max(2, round(exposure))
     return np.concatenate(
-        [cells.count(model.streams(rows[k : k + LIGHTS], cycles, seed + k, extra)) for k in range(0, len(rows), LIGHTS)]
+        [cells.count(model.streams(rows[k : k + LIGHTS], cycles, seed + k)) for k in range(0, len(rows), LIGHTS)]
     )
 
 
@@ -408,10 +406,14 @@ class Fit:
         if again and (np.abs((centre - theta)[free]) > _NEAR * sd).any():  # cells and weights were laid elsewhere
             return self.finish(Guess(model, centre, root_of(cov), free), False, known)
         jacobian = law.slope[:, free] @ local
+        # what is at its bound takes up no counts that would move it beyond
+        held = ((model.bounded(mean + 1e-6 * (raw - mean)) == mean) & (raw != mean))[free]
+        estimator = estimator - cov[:, held] @ np.linalg.pinv(cov[np.ix_(held, held)]) @ estimator[held]
+        left = recorded - near.offset - jacobian[:, held] @ (mean - centre)[free[held]]
         project = np.eye(len(recorded)) - jacobian @ estimator
         fresh = near.residual @ project.T
         fresh = (fresh - fresh.mean(0)) / np.sqrt(near.ratio) * np.sqrt(len(y) / (len(y) - terms.shape[1]))
-        rest = project @ (recorded - near.offset)
+        rest = project @ left
         (z, p), timed = _misfit(rest, fresh, law, near), free == model.light + 2
         uneven = timed.any() and _uneven(solve @ gain @ (y - near.offset).T, moved, timed)
         judged, interval = self.shortest(model, draws(model, raw, cov, free)), None

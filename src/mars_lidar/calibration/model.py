@@ -215,10 +215,8 @@ class Model:
         known = self.split & (free == self.light + 1)
         return np.asarray(np.diag(known * (2.0 / np.pi) ** 2))
 
-    def system(
-        self, theta: FloatArray, cycles: int, bins: int = 16, extra: tuple[Effect, ...] = (), jitter: bool = True
-    ) -> System:
-        """The instrument of parameters (p,), with further effects at their starting values, with or without jitter."""
+    def system(self, theta: FloatArray, cycles: int, bins: int = 16, jitter: bool = True) -> System:
+        """The instrument of parameters (p,), with or without jitter."""
         k = self.light
         theta = self.bounded(theta)
         sigma, sd = map(float, self.widths(theta))
@@ -227,8 +225,6 @@ class Model:
         for effect in self.effects:
             fields = effect.apply(fields, tuple(map(float, theta[at : at + len(effect.names)])))
             at += len(effect.names)
-        for effect in extra:
-            fields = effect.apply(fields, effect.start)
         least = _NARROWEST * self.clock.period_ns
         if jitter and sd > least:
             fields["jitter"] = Jitter(sigma_ns=sd)
@@ -261,9 +257,7 @@ class Model:
         shape = np.random.default_rng(seed).gamma(self.waveform / scale, size=flux.waveform.shape) * scale
         return Flux(waveform=light * shape / shape.sum(-1, keepdims=True))
 
-    def streams(
-        self, rows: FloatArray, cycles: int, seed: int, extra: tuple[Effect, ...] = (), jitter: bool = True
-    ) -> Streams:
+    def streams(self, rows: FloatArray, cycles: int, seed: int, jitter: bool = True) -> Streams:
         """Recorded times of a stream for each row of (rows, p); the detector is that of the first row, but its jitter.
 
         The jitter of a recorded time is drawn here, a normal deviate each, so that it may differ from row to row and
@@ -272,7 +266,7 @@ class Model:
         rows = self.bounded(np.atleast_2d(rows))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a trial value may look like one in another unit
-            system = self.system(rows[0], cycles, extra=extra, jitter=False)
+            system = self.system(rows[0], cycles, jitter=False)
             flux = self.varied(self.flux(rows), cycles, seed)
             made = cast(DrawnTimestamps, simulate_timestamps(flux, system, seed=seed, threads=1))
         sigma = self.widths(rows)[1] * jitter

@@ -380,7 +380,7 @@ class Fit:
             rest = (y - near.offset) @ gain.T - terms @ slope
             noise = np.atleast_2d(rest.T @ rest) / (len(y) - terms.shape[1])
             away = gain @ (recorded - near.offset) - slope[0]
-            information = np.linalg.inv(noise)
+            information = np.linalg.pinv(noise)
             there = np.r_[1.0, np.linalg.pinv(local) @ away]  # where the law is read, for its own noise there
             for _ in range(2):
                 scale = 1.0 / (1.0 / near.ratio + there @ inverse @ there)
@@ -407,13 +407,13 @@ class Fit:
             return self.finish(Guess(model, centre, root_of(cov), free), False, known)
         jacobian = law.slope[:, free] @ local
         # what is at its bound takes up no counts that would move it beyond
-        held = ((model.bounded(mean + 1e-6 * (raw - mean)) == mean) & (raw != mean))[free]
-        estimator = estimator - cov[:, held] @ np.linalg.pinv(cov[np.ix_(held, held)]) @ estimator[held]
-        left = recorded - near.offset - jacobian[:, held] @ (mean - centre)[free[held]]
+        at_bound = ((model.bounded(mean + 1e-6 * (raw - mean)) == mean) & (raw != mean))[free]
+        estimator = estimator - cov[:, at_bound] @ np.linalg.pinv(cov[np.ix_(at_bound, at_bound)]) @ estimator[at_bound]
+        unmoved = recorded - near.offset - jacobian[:, at_bound] @ (mean - centre)[free[at_bound]]
         project = np.eye(len(recorded)) - jacobian @ estimator
         fresh = near.residual @ project.T
         fresh = (fresh - fresh.mean(0)) / np.sqrt(near.ratio) * np.sqrt(len(y) / (len(y) - terms.shape[1]))
-        rest = project @ left
+        rest = project @ unmoved
         (z, p), timed = _misfit(rest, fresh, law, near), free == model.light + 2
         uneven = timed.any() and _uneven(solve @ gain @ (y - near.offset).T, moved, timed)
         judged, interval = self.shortest(model, draws(model, raw, cov, free)), None

@@ -23,7 +23,7 @@ from mars_lidar.light.timestamps import DrawnTimestamps
 from mars_lidar.simulation import simulate_timestamps
 
 _NARROWEST = 2e-6  # periods: the narrowest pulse that the engines draw
-_WIDEST = 0.3  # sigma of a recorded pulse, periods: a wider one is hardly told from background
+_WIDEST = 0.3  # sigma of a recorded pulse, periods: a wider one is hardly distinguished from background
 _WIDEST_JITTER = 0.05  # periods: the widest that `Jitter` takes
 _MOST_CARRIERS = 0.95  # of an avalanche
 Fields = dict[str, Any]
@@ -76,7 +76,7 @@ def _paralyzable(fields: Fields, value: tuple[float, ...]) -> Fields:
 
 
 def effects(dead_time_ns: float) -> tuple[Effect, ...]:
-    """Effects that are looked for in a stream of a detector with this dead time."""
+    """Effects that are tested in the stream of a detector with this dead time."""
     dead = dead_time_ns
     after = ("afterpulse_probability", "log_afterpulse_delay")
     middle, reach = float(np.log(1.6 * dead)), float(np.log(8.0))  # mean delays from a fifth to 13 dead times
@@ -107,14 +107,14 @@ class Streams:
 class Model:
     """Parameters, in this order: background, (signal, delay) of each return, width, jitter, dead time, effects.
 
-    Photons a period, and ns. `width` is the standard deviation of the recorded pulse, jitter included, and the jitter
-    an angle, in radians: that of the point whose coordinates are the standard deviations of pulse and jitter, at the
-    distance `width`. Counts are smooth in both where one of the two vanishes; in variances they are not. Where the
-    jitter is given (`jitter_given`) or the pulse is no Gaussian of unknown width, it is in ns. With a `waveform`
-    (shares of the light in equal parts of the period, jitter not included) there is no return, and the background is
-    all light. `waveform_error` are the standard errors of these shares by a recording of `exposure` periods: simulated
-    streams have light that differs so much from the waveform, more in shorter ones as their counts do.
-    With a `pulse` its shape is known, before any jitter, and `width` means nothing.
+    The light is in photons per period, times in ns. `width` is the standard deviation of the recorded pulse, jitter
+    included, and the jitter an angle, in radians, whose sine and cosine times `width` are the standard deviations of
+    jitter and pulse. Counts are smooth functions of both where one of the two vanishes; of variances they are not.
+    Where the jitter is given (`jitter_given`) or the pulse is no Gaussian of unknown width, it is in ns. With a
+    `waveform` (shares of the light in equal parts of the period, before jitter) there is no return, and the background
+    is all light. `waveform_error` are the standard errors of these shares by a recording of `exposure` periods:
+    simulated streams have light that scatters about the waveform by so much, and more in shorter streams, as their
+    counts do. With a `pulse` its shape is known, before any jitter, and `width` is not used.
     """
 
     clock: Clock
@@ -248,7 +248,7 @@ class Model:
         return Flux(signal, back, delay) if self.returns > 1 else Flux(signal[0], back, delay[0])
 
     def varied(self, flux: Flux, cycles: int, seed: int) -> Flux:
-        """The light with shapes that are as uncertain as the waveform; the same where that is known."""
+        """The light, its shape drawn from the uncertainty of the waveform; unchanged where that is known."""
         if self.waveform is None or self.waveform_error is None or flux.waveform is None:
             return flux
         light = flux.waveform.sum(-1, keepdims=True)

@@ -1,4 +1,4 @@
-"""Where the fit begins: light with the dead time taken off, and a dead time for each of several jitters."""
+"""Starting values of the fit: light without the dead time, and a dead time for each of several jitters."""
 
 from __future__ import annotations
 

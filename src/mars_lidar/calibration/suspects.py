@@ -20,12 +20,12 @@ _PARTS = 16  # of a recording, for drift: a trend then has 14 degrees of freedom
 
 @dataclass(frozen=True)
 class Score:
-    """An effect's size by the residual counts: its value and standard deviation, and what a unit of it shifts."""
+    """An effect's size by the residual counts, its standard deviation, and how a unit of it shifts the parameters."""
 
     effect: Effect
     size: float
     error: float
-    shift: FloatArray  # (free,) of the parameters, for an effect of size 1 that nobody knows of
+    shift: FloatArray  # (free,) of the estimates, by an effect of size 1 that the model does not have
 
     @property
     def z(self) -> float:
@@ -39,7 +39,7 @@ class Score:
 
 
 def _counts(fit: Fit, fitted: Fitted, model: Model, theta: FloatArray) -> tuple[FloatArray, float]:
-    """Expected counts in the cells of a fit, of another model, and their variance over their own number."""
+    """Counts that a model expects in the cells of a fit, and the ratio of their variance to them."""
     photons = float(fit.recording.photons)
     simulated = min(fit.effort.share * photons, max(fit.effort.batch, photons))
     exposure = max(2, round(fit.exposure(simulated / LIGHTS)))

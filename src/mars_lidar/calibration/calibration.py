@@ -559,13 +559,14 @@ def _estimates(fitted: Fitted, growth: FloatArray) -> dict[str, Estimate]:
     centre, names = model.bounded(fitted.theta), model.names
     k = model.light
     free = {names[i] for i in fitted.free}
+    withheld = fitted.p_value < FALSE_ALARM and growth.max() == 1.0  # the scatter of the parts includes a misfit
     out: dict[str, Estimate] = {}
 
     def put(name: str, value: float, sample: FloatArray, *needs: str, note: str = "") -> None:
         if not free & set(needs):
             out[name] = Estimate(value, 0.0, value, value, "given")
             return
-        if fitted.p_value < FALSE_ALARM:
+        if withheld:
             out[name] = Estimate(value, np.nan, np.nan, np.nan, "of a model that does not fit: no error holds")
             return
         low, high = np.quantile(sample, (0.025, 0.975))
@@ -609,7 +610,7 @@ def _estimates(fitted: Fitted, growth: FloatArray) -> dict[str, Estimate]:
         elif not effect.onoff:
             put(effect.names[0], float(values[0]), columns[:, 0], effect.names[0])
         at += len(effect.names)
-    if fitted.by_shortest is not None and fitted.p_value >= FALSE_ALARM:
+    if fitted.by_shortest is not None and not withheld:
         value, low, high = fitted.by_shortest
         out["dead_time_ns"] = Estimate(value, np.nan, low, high, "by the shortest interval alone")
     elif "dead_time_ns" not in out:

@@ -36,6 +36,7 @@ def test_files(quick):
     assert sum(len(written(name, quick).figures) for name in ("covariance", "law")) == 7
 
 
+@pytest.mark.full
 def test_covariance_figures_make_sense(quick):
     rows = read_csv(quick / "covariance.csv")
     assert len(rows) == 2 * sum(grid.size for grid in covariance.QUICK.grids)
@@ -94,6 +95,7 @@ def test_modes_without_convergence_name_the_cell(monkeypatch):
         leading.spectral_sum()
 
 
+@pytest.mark.full
 def test_law_figures_make_sense(quick):
     rows = read_csv(quick / "law.csv")
     settings = law.QUICK

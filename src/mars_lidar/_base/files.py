@@ -73,7 +73,7 @@ class Interrupted(KeyboardInterrupt):
 
 
 @contextlib.contextmanager
-def telling(clean_up: Callable[[], str]) -> Iterator[None]:
+def explained(clean_up: Callable[[], str]) -> Iterator[None]:
     """On an error while writing, run `clean_up` and raise `WriteError` or `Interrupted` with the returned text."""
     try:
         yield
@@ -100,7 +100,7 @@ def beside(target: Path, *, folder: bool = False) -> Iterator[Path]:
         _remove(path)
         return f"{target} is what it was before" if target.exists() else f"nothing was left at {target}"
 
-    with telling(removed), contextlib.ExitStack() as lock:
+    with explained(removed), contextlib.ExitStack() as lock:
         with contextlib.suppress(OSError):  # a file system without locks: leftovers are then nobody's to remove
             lock.enter_context(_held(path))
         yield path

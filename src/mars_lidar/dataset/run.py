@@ -302,9 +302,9 @@ def make_part(
         if dataset.attrs.get("bits") != fingerprint():
             raise ValueError(f"this machine draws other counts than that on which {store} was begun")
         with _explained(store, target):
-            mine = _share(list(dataset.items()), which, of)
-            todo = dataset.missing(mine)
-            totals = _Totals(len(mine) - len(todo), len(mine), callback_of(progress, "generating"))
+            share = _share(list(dataset.items()), which, of)
+            todo = dataset.missing(share)
+            totals = _Totals(len(share) - len(todo), len(share), callback_of(progress, "generating"))
             _make(dataset, _here(dataset, len(todo), threads), todo, totals)
     return totals.generated(target, dataset, time.perf_counter() - began)
 

@@ -242,8 +242,8 @@ def exact_laws(run: Run, reader: TableReader, entries: Entries, at: IndexArray) 
         )
         own = reader.table.entries.bins[entries.rows[chosen]]
         bins = np.where(entries.weights[chosen] > 0.0, own, 0).max(-1)  # the finest grid that a corner needed
-        tell = run.waiting
-        waiting = None if tell is None else lambda done: tell(done, missing.size)
+        report = run.waiting
+        waiting = None if report is None else lambda done: report(done, missing.size)
         evaluated = guessed_windows(cells, entries.cumulants[chosen], bins, run.task.threads, waiting)
         for k, window in zip(missing, evaluated, strict=True):
             windows[k] = window

@@ -152,10 +152,10 @@ def read_counts(
 ) -> ForeignCounts:
     """The array of a file, its axes in order; `bins`, if known, identifies the time axis by its length."""
     source = Path(path)
-    told_by = recorded(source) if source.suffix.lower() in RECORDER_SUFFIXES else None
+    recording = recorded(source) if source.suffix.lower() in RECORDER_SUFFIXES else None
     times = None
-    if told_by is not None:
-        by_name = told_by.arrays
+    if recording is not None:
+        by_name = recording.arrays
     elif source.suffix.lower() in _TEXT:
         with reading(source, "arrays of histograms"):
             times, column = read_times(source)
@@ -169,7 +169,7 @@ def read_counts(
     if is_sparse(array):
         check_claim(source, dense_bytes(array), f"the counts of {name or 'its matrix'}")
     try:
-        return ForeignCounts(source, name, in_order(array, order, image), None, order, told_by, times)
+        return ForeignCounts(source, name, in_order(array, order, image), None, order, recording, times)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{source}: {name or 'the array'}: {error}") from error
 

@@ -150,7 +150,7 @@ def simulate_to(
     True
     """
     progress = callback_of(progress, "simulating")
-    drawn_by = find_engine(engine, **options)
+    chosen = find_engine(engine, **options)
     recipe = Recipe(
         system=system,
         flux=flux,
@@ -163,20 +163,20 @@ def simulate_to(
         reflectivity=reflectivity,  # type: ignore[arg-type]
         source=source,
         options=given(options),
-        settings=drawn_by.settings,
+        settings=chosen.settings,
     )
     target = Path(path)
     if resume and overwrite:
         raise ValueError("resume and overwrite exclude each other")
-    going_on = resume and zarr_store.begun_store(target).exists()
-    if not going_on:
+    resumed = resume and zarr_store.begun_store(target).exists()
+    if not resumed:
         check_output(target, recipe, overwrite=overwrite)
     elif target.suffix != ".zarr":
         raise ValueError(f"resume is for a .zarr, the only format that an interruption leaves, got {str(target)!r}")
-    drawn_by.check(flux, system)  # every pixel, before the blocks one by one
+    chosen.check(flux, system)  # every pixel, before the blocks one by one
     _try_brightest_pixel(recipe, threads, device)
-    begun = zarr_store.unfinished(target, recipe) if going_on else None
-    if going_on and begun is None:
+    begun = zarr_store.unfinished(target, recipe) if resumed else None
+    if resumed and begun is None:
         return Written(target, int(load(target).registrations or 0), 0.0, 0.0, {})
     simulate_s = write_s = 0.0
     report: dict[str, float] = {}
@@ -186,8 +186,8 @@ def simulate_to(
         for images, rows in list(recipe.blocks(writer.chunks))[writer.begun :]:
             began = time.perf_counter()
             of_block: dict[str, float] = {}
-            tell = _of_the_whole(progress, recipe, images, rows)
-            block = _simulate(recipe, images, rows, threads=threads, progress=tell, report=of_block, device=device)
+            of_whole = _progress_of_block(progress, recipe, images, rows)
+            block = _simulate(recipe, images, rows, threads=threads, progress=of_whole, report=of_block, device=device)
             ended = time.perf_counter()
             writer.write(images, rows, block)
             simulate_s += ended - began
@@ -307,8 +307,8 @@ def verify(
     if cube.path is not None and cube.path.suffix == ".zarr" and manifest.damage(cube.path):
         return False
     for images, rows in recipe.blocks(recipe.chunks(4 * 2**20)):
-        tell = _of_the_whole(progress, recipe, images, rows)
-        again = _simulate(recipe, images, rows, threads=threads, progress=tell)
+        of_whole = _progress_of_block(progress, recipe, images, rows)
+        again = _simulate(recipe, images, rows, threads=threads, progress=of_whole)
         if not np.array_equal(again, np.asarray(cube.histogram[images, rows])):
             return False
     return True
@@ -371,7 +371,7 @@ def _try_brightest_pixel(recipe: Recipe, threads: int | None, device: Literal["c
     _simulate(pixel, slice(0, 1), slice(0, 1), threads=threads, device=device)
 
 
-def _of_the_whole(progress: Progress | None, recipe: Recipe, images: slice, rows: slice) -> Progress | None:
+def _progress_of_block(progress: Progress | None, recipe: Recipe, images: slice, rows: slice) -> Progress | None:
     """A callback for one block that tells `progress` how far the whole cube is, in pixel exposures."""
     count, height, width, _ = recipe.shape
     before = images.start * height * width + rows.start * width
@@ -425,17 +425,17 @@ def advice(
 
     0, without a measurement, for runs that are short with any engine.
     """
-    drawn_by = find_engine(engine, **(options or {}))
+    chosen = find_engine(engine, **(options or {}))
     if isinstance(flux, StoredFlux) or system.detector.crosstalk is not None:  # not to be had in single pixels
         return Advice(0.0)
     events = realizations * float(expected_registrations(flux, system).sum())
-    if drawn_by.name in ("sequential", "poisson"):
+    if chosen.name in ("sequential", "poisson"):
         events = realizations * float(flux.total.sum()) * system.cycles
-    by_pixel = "table" in drawn_by.options and getattr(drawn_by, "reader", None) is None
+    by_pixel = "table" in chosen.options and getattr(chosen, "reader", None) is None
     if events * _PROBE.event_s < 1.0 and not by_pixel:
         return Advice(0.0)
-    seconds = realizations * _measured(flux, system, drawn_by, threads)
-    if seconds < TOL.long_s or drawn_by.name != "exact":
+    seconds = realizations * _measured(flux, system, chosen, threads)
+    if seconds < TOL.long_s or chosen.name != "exact":
         return Advice(seconds)
     auto = ENGINES["auto"]
     try:

@@ -284,7 +284,7 @@ def systematic_error(flux: Flux, system: System) -> tuple[FloatArray, FloatArray
     return (bias * unit).reshape(shape), (error * unit).reshape(shape)
 
 
-def tell_systematic_error(method: Method, system: System, estimates: Estimates) -> None:
+def warn_of_bias(method: Method, system: System, estimates: Estimates) -> None:
     """Warn if one of three estimates has a systematic error above half a standard error.
 
     They are those of the most precise signal, the most precise delay and the median signal.

@@ -118,9 +118,9 @@ def _removed(path: Path) -> str:
 
 
 def _begun(path: Path, histogram: Any, blocks: Sequence[tuple[slice, slice]]) -> tuple[int, int]:
-    """How many of `blocks` are written, in their order, and the registrations in them.
+    """Number of the `blocks` that are written, and the registrations in them.
 
-    The last one with anything in it may be half there, and does not count; chunks without counts are no files.
+    The last block that has a file may be incomplete and is not counted; chunks without counts have no file.
     """
     folder, chunks = path / "histogram" / "c", histogram.chunks
     last = 0
@@ -293,7 +293,7 @@ def _require(url: str, system: Any, root: str, stated: str | None) -> manifest.M
 
 @contextlib.contextmanager
 def _naming(url: str) -> Iterator[None]:
-    """What goes wrong inside names the URL."""
+    """Context manager: errors raised inside name the URL."""
     try:
         yield
     except (MissingLibraryError, MemoryError):

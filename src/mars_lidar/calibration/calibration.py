@@ -47,7 +47,8 @@ GIVEN = ("dead_time_ns", "jitter_ns", "pulse_sigma_ns", *_FIELDS)
 class Estimate:
     """A parameter: its value, standard error, and 95 % interval; the error of a given value is 0.
 
-    `note` states whether it was given, not detected, or not identified.
+    `note` states whether it was given, not detected, or not identified. The error of a dead time that follows from the
+    shortest interval alone is NaN: its law is not normal, and the interval is stated.
     """
 
     value: float
@@ -556,10 +557,6 @@ def _estimates(fitted: Fitted, growth: FloatArray) -> dict[str, Estimate]:
     covariance = fitted.covariance * np.outer(scale, scale)
     drawn = draws(model, fitted.unbounded, covariance, fitted.free)
     centre, names = model.bounded(fitted.theta), model.names
-    if drawn is None:  # the estimate lies beyond what a detector can have
-        drawn = np.tile(centre, (2000, 1))
-        drawn[:, fitted.free] = np.random.default_rng(0).multivariate_normal(centre[fitted.free], covariance, 2000)
-        drawn = model.bounded(drawn)
     k = model.light
     free = {names[i] for i in fitted.free}
     out: dict[str, Estimate] = {}
@@ -609,7 +606,10 @@ def _estimates(fitted: Fitted, growth: FloatArray) -> dict[str, Estimate]:
         elif not effect.onoff:
             put(effect.names[0], float(values[0]), columns[:, 0], effect.names[0])
         at += len(effect.names)
-    if "dead_time_ns" not in out:
+    if fitted.by_shortest is not None:
+        value, low, high = fitted.by_shortest
+        out["dead_time_ns"] = Estimate(value, np.nan, low, high, "by the shortest interval alone")
+    elif "dead_time_ns" not in out:
         put("dead_time_ns", observed, dead, "dead_time_ns")
     return out
 

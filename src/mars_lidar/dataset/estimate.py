@@ -22,9 +22,9 @@ from mars_lidar.dataset.run import BUFFER_BYTES, making_bytes, read_recipe
 from mars_lidar.dataset.scenes import Content, Rendered
 from mars_lidar.dataset.shard import packer
 from mars_lidar.dataset.sources import Candidate, candidates, scenes
+from mars_lidar.engines.simulation import simulate
 from mars_lidar.io.scene_files import Problem
 from mars_lidar.io.simulated_file import Advice, advice
-from mars_lidar.simulation import simulate
 
 _SCENES, _PROBES = 4, 8
 _BASE_BYTES = 220 * 2**20  # of the interpreter with NumPy, SciPy and Zarr

@@ -19,13 +19,13 @@ from mars_lidar._base.types import ArrayLike, NDArray, Progress
 from mars_lidar.engines import ENGINES, Engine, EngineOptions, check_detector, find_engine
 from mars_lidar.engines.engine import given
 from mars_lidar.engines.feedback import expected_registrations
+from mars_lidar.engines.simulation import simulate
 from mars_lidar.engines.table_reader import table_record
 from mars_lidar.instrument.system import System
 from mars_lidar.io import zarr_store
 from mars_lidar.io.cube import Cube, check_output, load, open_writer
 from mars_lidar.io.recipe import Recipe
 from mars_lidar.light.flux import Flux, StoredFlux
-from mars_lidar.simulation import simulate
 from mars_lidar.table import Table
 from mars_lidar.table.storage import cached_tables
 

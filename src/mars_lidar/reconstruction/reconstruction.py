@@ -18,7 +18,7 @@ from mars_lidar.reconstruction.fit_quality import FALSE_ALARM
 from mars_lidar.reconstruction.histograms import checked
 from mars_lidar.reconstruction.image import Image, UntrainedImage
 from mars_lidar.reconstruction.matched_filter import MatchedFilter, Peak
-from mars_lidar.reconstruction.maximum_likelihood import MaximumLikelihood
+from mars_lidar.reconstruction.maximum_likelihood import MaximumLikelihood, tell_systematic_error
 from mars_lidar.reconstruction.mchc import ChainCorrection
 from mars_lidar.reconstruction.method import Estimates, Flags, Method, tell_effects
 from mars_lidar.reconstruction.returns import MOST_RETURNS, Returns, returns_of
@@ -261,7 +261,9 @@ def reconstruct(
         )
     used.check(system)
     tell_effects(system)
-    return assembled(used.name, system, used.estimate(given), shape, level, attenuation)
+    estimates = used.estimate(given)
+    tell_systematic_error(used, system, estimates)
+    return assembled(used.name, system, estimates, shape, level, attenuation)
 
 
 def find_method(method: str | Method) -> Method:

@@ -15,6 +15,7 @@ from mars_lidar._base.resources import thread_count
 from mars_lidar._base.types import Progress
 from mars_lidar.reconstruction.histograms import checked
 from mars_lidar.reconstruction.image import Image
+from mars_lidar.reconstruction.maximum_likelihood import tell_systematic_error
 from mars_lidar.reconstruction.method import Estimates, Method, tell_effects
 from mars_lidar.reconstruction.photons import Photons
 from mars_lidar.reconstruction.reconstruction import Reconstruction, assembled, find_method, with_returns
@@ -118,6 +119,7 @@ def reconstruct_stored(
         estimates = Estimates(
             **{name: values.reshape(-1, *values.shape[3:]) for name, values in buffers[method.name].items()}
         )
+        tell_systematic_error(method, system, estimates)
         results[method.name] = Timed(
             assembled(method.name, system, estimates, shape, scale, attenuation), seconds[method.name]
         )

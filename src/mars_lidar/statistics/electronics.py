@@ -312,14 +312,15 @@ def without_electronics(cells: Cells) -> tuple[Cells, float]:
     """Cells without electronics, and the dead time of the electronics in ns; 0 where a single dead time is equivalent.
 
     A single dead time, the longer one, is equivalent where the dead time of the pixel is 0 or is the longer one. The
-    returned cells then have that dead time.
+    returned cells then have that dead time. Behind a pixel without a dead time they begin armed, as electronics do.
     """
     detector = cells.system.detector
     slower = max(detector.dead_time_ns, detector.electronics_dead_time_ns)
     bare = detector.without("electronics_dead_time_ns")
     if detector.dead_time_ns == 0.0 or slower == detector.dead_time_ns:
         bare, slower = replace(bare, dead_time_ns=slower), 0.0
-    return replace(cells, system=cells.system.replace(detector=bare)), slower
+    start = "armed" if detector.dead_time_ns == 0.0 else cells.system.start
+    return replace(cells, system=cells.system.replace(detector=bare, start=start)), slower
 
 
 def coarsest_grid(cell: Cells) -> int:

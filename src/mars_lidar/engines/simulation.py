@@ -12,8 +12,8 @@ from mars_lidar._base.arguments import checked
 from mars_lidar._base.progress import callback_of
 from mars_lidar._base.resources import check_memory, thread_count
 from mars_lidar._base.types import ArrayLike, FloatArray, NDArray, Progress
-from mars_lidar.engines import Engine, EngineOptions, check_detector, find_engine
-from mars_lidar.engines.engine import IN_PARTS, PhaseRecords, Records, Task
+from mars_lidar.engines.engine import IN_PARTS, Engine, EngineOptions, PhaseRecords, Records, Task
+from mars_lidar.engines.registry import check_detector, find_engine
 from mars_lidar.instrument.system import System
 from mars_lidar.instrument.units import check_delays
 from mars_lidar.light.flux import Flux, StoredFlux
@@ -266,7 +266,7 @@ def _task(
         raise ValueError(
             f"flux must have at most {TOL.returns} returns, got {len(flux.returns_signal)}; use a waveform"
         )
-    _check_registrations(flux.detected(system), system)
+    check_registrations(flux.detected(system), system)
     lit = flux.returns_delay_ns[flux.returns_signal > 0.0]
     if lit.size:
         check_delays(float(np.median(lit)), system.period_ns)
@@ -295,7 +295,8 @@ def _pixel_index(pixel_index: ArrayLike | None, shape: tuple[int, ...]) -> NDArr
     return np.ascontiguousarray(index.reshape(-1).astype(np.uint32))
 
 
-def _check_registrations(flux: Flux, system: System) -> None:
+def check_registrations(flux: Flux, system: System) -> None:
+    """Raise ValueError where a pixel is expected to have more registrations than its random stream can draw."""
     expected = _expected_arrivals(flux, system)
     most, what = float(expected.max()), "registrations"
     if system.detector.mode == "paralyzable":  # each arrival is drawn, seen or not

@@ -89,11 +89,11 @@ class Surfaces:
         return 0 if self.fog is None else TOL.parts_per_bin * system.bins
 
     def flux(
-        self, system: System, light: Light, signal: float, sbr: float, dark: float | None = None, *, tell: bool = False
+        self, system: System, light: Light, signal: float, sbr: float, dark: float | None = None, *, warn: bool = False
     ) -> Flux:
-        """Photons; pixels without return or beyond the range are no matter for every sample, unless to `tell` them."""
+        """Photons; only with `warn`, warnings of pixels without a return or beyond the unambiguous range are shown."""
         with warnings.catch_warnings():
-            if not tell:
+            if not warn:
                 warnings.simplefilter("ignore", UserWarning)
             clear = self.scene.flux(
                 system,
@@ -144,7 +144,7 @@ class Rendered:
         return parts_of(self.transient, system)
 
     def flux(
-        self, system: System, light: Light, signal: float, sbr: float, dark: float | None = None, *, tell: bool = False
+        self, system: System, light: Light, signal: float, sbr: float, dark: float | None = None, *, warn: bool = False
     ) -> Flux:
         """Photons, made row by row as they are used."""
         return self.transient.stored_flux(

@@ -232,8 +232,8 @@ class Run:
     @property
     def waiting(self) -> Progress | None:
         """Progress callback during work before the sampling of a batch, with unchanged progress."""
-        tell = self.task.progress
-        return None if tell is None else lambda done, total: tell(self._done, self.task.items)
+        report = self.task.progress
+        return None if report is None else lambda done, total: report(self._done, self.task.items)
 
     def draw(self, batch: Batch) -> None:
         """All realizations of the batch's pixels."""
@@ -283,7 +283,7 @@ class Run:
         self._done += counts.size
 
     def _sampling(self, size: int) -> Progress | None:
-        tell, before, items = self.task.progress, self._done, self.task.items
-        if tell is None:
+        report, before, items = self.task.progress, self._done, self.task.items
+        if report is None:
             return None
-        return lambda done, total: tell(before + size * done // max(total, 1), items)
+        return lambda done, total: report(before + size * done // max(total, 1), items)

@@ -91,7 +91,7 @@ class TableReader:
             self._check_range(single[0], flux.background.reshape(-1))
 
     def _check_range(self, signal: FloatArray, background: FloatArray) -> None:
-        """Every pixel lies on the grid, or has no return, of which nothing but its background has to be known."""
+        """Raise ValueError unless every pixel is within the grid; of pixels without a return, the background."""
         beyond, ranges = np.zeros(signal.size, dtype=bool), []
         for name, photons, axis in (
             ("signal", signal, self.table.signal),
@@ -186,8 +186,8 @@ class TableReader:
         return entries, pixels[look.outside]
 
 
-# A table computes its shapes for other cycles than it was built for at each call, which takes longer than a cube: those
-# of the last cycles asked for stay as long as the table lives, and with them what the sampler finds out about them.
+# For cycles other than its own a table computes its shapes at each call, which takes longer than a cube. The last
+# shapes are therefore cached for the lifetime of the table, together with the sampler's guides to them.
 _last_shapes: WeakKeyDictionary[Table, tuple[int, NDArray[np.float32], NDArray[np.float32]]] = WeakKeyDictionary()
 
 
@@ -242,8 +242,8 @@ def exact_laws(run: Run, reader: TableReader, entries: Entries, at: IndexArray) 
         )
         own = reader.table.entries.bins[entries.rows[chosen]]
         bins = np.where(entries.weights[chosen] > 0.0, own, 0).max(-1)  # the finest grid that a corner needed
-        tell = run.waiting
-        waiting = None if tell is None else lambda done: tell(done, missing.size)
+        report = run.waiting
+        waiting = None if report is None else lambda done: report(done, missing.size)
         evaluated = guessed_windows(cells, entries.cumulants[chosen], bins, run.task.threads, waiting)
         for k, window in zip(missing, evaluated, strict=True):
             windows[k] = window
@@ -265,7 +265,7 @@ def _keys(run: Run, reader: TableReader, entries: Entries, at: IndexArray) -> Fl
 def _table_laws(
     run: Run, reader: TableReader, entries: Entries, pixels: IndexArray, keys: FloatArray
 ) -> list[Pmf | None]:
-    """Laws that the table keeps: of its entries, for its own number of cycles, at its delay."""
+    """Laws stored in the table, which are those of its entries at its own delay and number of cycles."""
     table = reader.table
     if run.task.system.cycles != table.entries.cycles:
         return [None] * pixels.size

@@ -548,6 +548,10 @@ class Lookup:
     cumulants: FloatArray
     outside: NDArray[np.bool_]
 
+    def mixture(self, shapes: Shapes) -> FloatArray:
+        """Shapes (P, bins) of the pixels at the canonical delay, from those of the table (`Table.shapes`)."""
+        return np.stack([w @ shapes[r] for r, w in zip(self.rows, self.weights, strict=True)])
+
     def trusted(self) -> NDArray[np.bool_]:
         """Pixels (P,) whose four cumulants determine the law of the count to about 0.002 in total variation.
 

@@ -26,7 +26,7 @@ from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.statistics.cells import Cells, photons_before
 from mars_lidar.statistics.chain import ConvergenceError
-from mars_lidar.statistics.count_pmf import Pmf, exact_windows
+from mars_lidar.statistics.count_pmf import Pmf, exact_pmfs
 from mars_lidar.statistics.exposure import Moments, refined_moments, stationary_histogram
 from mars_lidar.statistics.timing import Timing, is_timed
 from mars_lidar.statistics.tolerances import LAW, MOMENTS, TOL, Budget, advice
@@ -516,16 +516,16 @@ def _transitions(grid: RecordGrid) -> FloatArray:
 ComplexArray = NDArray[np.complex128]
 
 
-def record_windows(cells: Cells, tolerance: float, threads: int) -> list[Pmf]:
+def record_pmfs(cells: Cells, tolerance: float, threads: int) -> list[Pmf]:
     """Pmf of the number of records of each cell; the tolerance is that of `electronics_moments`."""
     bare, slower = without_electronics(cells)
     if slower == 0.0:
         exposure = refined_moments(bare, 1, tolerance=min(tolerance, 1e-4), threads=threads)
-        return exact_windows(bare, exposure.cumulants.reshape(-1, 4), exposure.bins.reshape(-1), threads)
-    return [_window(bare.part(slice(k, k + 1)), slower, tolerance) for k in range(cells.size)]
+        return exact_pmfs(bare, exposure.cumulants.reshape(-1, 4), exposure.bins.reshape(-1), threads)
+    return [_law(bare.part(slice(k, k + 1)), slower, tolerance) for k in range(cells.size)]
 
 
-def _window(cell: Cells, electronics_ns: float, tolerance: float) -> Pmf:
+def _law(cell: Cells, electronics_ns: float, tolerance: float) -> Pmf:
     if float(cell.total[0]) == 0.0:
         return Pmf(0, np.ones(1), 0.0)
     mean, variance, _, bins = refined(cell, electronics_ns, tolerance, LAW)

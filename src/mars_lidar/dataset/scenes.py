@@ -3,7 +3,7 @@
 The group ``scenes`` is written scene by scene, and read again when a sample needs one::
 
     depth, reflectivity, background  (scene, y, x)         as they were read; of the first layer
-    name                             (scene)               text; (scene, letter) in UTF-8 before 0.3
+    name                             (scene)               text
     kind                             (scene, letter)       JSON: what is more than one surface in clear air
     layer_depth, layer_reflectivity  (scene, layer, y, x)  the other layers
     transient                        (scene, y, x, bin)    rendered light
@@ -374,8 +374,7 @@ class SceneReader:
     def names(self) -> list[str]:
         """Names of all scenes."""
         with reading(self._path, "scenes of a dataset"):
-            stored = self._group["name"]
-            return _texts(stored) if stored.ndim > 1 else [str(each) for each in stored[...]]  # of a version before
+            return [str(each) for each in self._group["name"][...]]
 
     @cached_property
     def _kinds(self) -> list[str]:

@@ -571,10 +571,11 @@ class Table:
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Delays (P,), `shift` bins after the canonical one, the exact cumulants there, and errors (P,) of `mixed`."""
         system = self.system.replace(cycles=cycles)
-        delay = 0.5 * system.period_ns + shift * system.bin_ns
+        delay = np.asarray(0.5 * system.period_ns + shift * system.bin_ns, dtype=np.float64)
         exact = exposure_moments(Flux(signal, background, delay), system, tolerance=self.tolerance, threads=threads)
         moved = np.stack([np.roll(row, k) for row, k in zip(mixed, shift, strict=True)])
-        return delay, exact.cumulants, 0.5 * np.abs(moved - normalised(exact.histogram).reshape(moved.shape)).sum(-1)
+        error = 0.5 * np.abs(moved - normalised(exact.histogram).reshape(moved.shape)).sum(-1)
+        return delay, exact.cumulants, np.asarray(error, dtype=np.float64)
 
 
 def _evaluated(system: System, axes: Axes, recipe: Recipe, progress: Progress | None) -> Table:

@@ -588,18 +588,27 @@ def _run(
 # --- The mean histogram of a stationary pixel ----------------------------------------------------------------------
 
 
-def stationary_histogram(cells: Cells, out_bins: int, *, tolerance: float, threads: int | None) -> FloatArray:
-    """Registrations per period and bin (cells, out_bins) of a stationary pixel (18)."""
+def stationary_histogram(
+    cells: Cells, out_bins: int, *, tolerance: float, threads: int | None, periods: int = 0
+) -> FloatArray:
+    """Registrations per period and bin (cells, out_bins) of a stationary pixel (18).
+
+    From a grid to the next the shape moves by less than `tolerance`, and so does the mean count of an exposure of
+    `periods`, in standard deviations of a Poisson count.
+    """
     tolerance = checks.real("tolerance", tolerance, low=1e-9, high=0.1)
     team = thread_count(threads)
     if cells.system.dead_time_periods == 0.0:  # the light itself
         return recorded_light(cells, out_bins)
     return fine_histograms(
-        cells, out_bins, tolerance, lambda some, bins: _refined(some, bins, tolerance=tolerance, team=team)
+        cells,
+        out_bins,
+        tolerance,
+        lambda some, bins: _refined(some, bins, tolerance=tolerance, team=team, periods=periods),
     )
 
 
-def _refined(cells: Cells, out_bins: int, *, tolerance: float, team: int) -> FloatArray:
+def _refined(cells: Cells, out_bins: int, *, tolerance: float, team: int, periods: int) -> FloatArray:
     """`stationary_histogram` on grids whose bins divide those of the histogram."""
     cells = cells.resolved(out_bins)
     asked, out_bins = out_bins, compared_bins(cells, out_bins)
@@ -613,7 +622,8 @@ def _refined(cells: Cells, out_bins: int, *, tolerance: float, team: int) -> Flo
         fine = _stationary(cells.part(pending), bins, out_bins, team)
         joined = fine.reshape(*coarse.shape, -1).sum(-1)
         total = np.maximum(fine.sum(-1), np.finfo(float).tiny)
-        moved = np.abs(joined - coarse).sum(-1) / total
+        counts = np.abs(fine.sum(-1) - coarse.sum(-1)) * (math.sqrt(periods) / np.sqrt(total))
+        moved = np.maximum(np.abs(joined - coarse).sum(-1) / total, counts)
         good = (moved <= tolerance) & (fine.min(-1) >= -1e-12 * total)
         result[pending[good]] = np.maximum(fine[good], 0.0)
         pending, coarse = pending[~good], fine[~good]

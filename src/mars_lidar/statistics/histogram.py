@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import Literal
 
@@ -111,13 +110,9 @@ def _registrations(cells: Cells, bins: int, tolerance: float, threads: int | Non
     if mode == "paralyzable":
         return paralyzable_histograms(cells, tolerance)
     if cells.system.start == "stationary" and cells.system.dead_time_periods > 0.0:
-        # every period has the same mean, so that refusals depend on the state alone; the mean count is judged in
-        # standard deviations of a Poisson count
-        most = cells.system.cycles * float(
-            np.minimum(cells.total, 1.0 / cells.system.dead_time_periods).max(initial=0.0)
-        )
-        finer = max(tolerance / max(math.sqrt(most), 1.0), 1e-9)
-        return cells.system.cycles * stationary_histogram(cells, bins, tolerance=finer, threads=threads)
+        # every period has the same mean, so that refusals depend on the state alone
+        cycles = cells.system.cycles
+        return cycles * stationary_histogram(cells, bins, tolerance=tolerance, threads=threads, periods=cycles)
 
     def compute(some: Cells, bins: int) -> FloatArray:
         exposure = refined_moments(some, bins, tolerance=tolerance, threads=threads, budget=LAW)

@@ -58,7 +58,8 @@ class _Count:
         self.name, self.cycles, self.whole = name, cells.system.cycles, whole
         self.armed_register = -math.expm1(-total)  # q
         after = math.exp(-early) * -math.expm1(-max(total - early, 0.0))
-        self.late = min(after / self.armed_register, 1.0) if self.armed_register > 0.0 else 0.0
+        late = min(after / self.armed_register, 1.0) if self.armed_register > 0.0 else 0.0
+        self.late = late if late * self.cycles > TOL.synchronous_tail else 0.0  # less likely than what is cut off
         self.first = self._first(cells.system.start == "stationary")
 
     def _first(self, stationary: bool) -> FloatArray:

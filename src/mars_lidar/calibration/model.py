@@ -13,6 +13,7 @@ import numpy as np
 from mars_lidar._base.native import _core
 from mars_lidar._base.types import FloatArray, NDArray
 from mars_lidar.calibration.recording import Clock
+from mars_lidar.engines.simulation import simulate_timestamps
 from mars_lidar.instrument.avalanches import Afterpulsing
 from mars_lidar.instrument.detector import Detector
 from mars_lidar.instrument.effects import Jitter
@@ -20,7 +21,6 @@ from mars_lidar.instrument.pulse import GaussianPulse, Pulse
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.light.timestamps import DrawnTimestamps
-from mars_lidar.simulation import simulate_timestamps
 
 _NARROWEST = 2e-6  # periods: the narrowest pulse that the engines draw
 _WIDEST = 0.3  # sigma of a recorded pulse, periods: a wider one is hardly distinguished from background

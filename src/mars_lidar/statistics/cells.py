@@ -332,6 +332,9 @@ class Cells:
         Phase of the return in [0, 1), periods.
     waveform, row
         Waveforms (rows, T) of unit sum, and the row of each cell; `waveform` is None for a pulse.
+    returns
+        (2, returns, rows) fraction of the light and phase of each return, where the waveforms are sampled from several;
+        None otherwise. The light before an edge is theirs, not that of the samples.
     follow
         0 for equal bins; otherwise the number of histogram bins, each a whole number of grid bins, on a grid that is
         finer on the pulse.
@@ -344,6 +347,7 @@ class Cells:
     delay: FloatArray
     waveform: FloatArray | None
     row: IndexArray
+    returns: FloatArray | None = None
     follow: int = 0
 
     @property
@@ -415,7 +419,9 @@ class Cells:
             lit = np.flatnonzero(signal > 0)
             waveform[lit] += signal[lit, None] * system.pulse.bin_energy(delay_ns[lit], system.period_ns, parts)
         waveform = np.maximum(waveform, 0.0).reshape(*flux.shape, parts)
-        return cls.of(None, flux.background, system, waveform=waveform, **named)
+        phases = np.nan_to_num(delays / system.period_ns)
+        returns = np.stack([signals / np.maximum(signals.sum(0), np.finfo(float).tiny), phases - np.floor(phases)])
+        return replace(cls.of(None, flux.background, system, waveform=waveform, **named), returns=returns)
 
     @property
     def native_flux(self) -> tuple[FloatArray, FloatArray]:
@@ -448,7 +454,7 @@ class Cells:
         """The selected cells, flat."""
         signal, row = self.signal[index], self.row[index]
         light = signal, self.background[index], self.delay[index]
-        return Cells(self.system, signal.shape, *light, self.waveform, row, self.follow)
+        return Cells(self.system, signal.shape, *light, self.waveform, row, self.returns, self.follow)
 
     def resolved(self, out_bins: int) -> Cells:
         """These cells, with bins that follow the pulse where resolving it takes too many equal bins."""
@@ -577,9 +583,14 @@ class Cells:
         if self.system.detector.mode == "gated":
             before = photons_before(self, np.arange(parts + 1) / parts)
             return _unit_energies(before), np.arange(self.size, dtype=np.int32)
+        pulse, period = self.system.pulse, self.system.period_ns
         if self.waveform is None:
             delays, rows = np.unique(self.delay, return_inverse=True)
-            energy = self.system.pulse.bin_energy(delays * self.system.period_ns, self.system.period_ns, parts)
+            energy = pulse.bin_energy(delays * period, period, parts)
+        elif self.returns is not None:
+            used, rows = np.unique(self.row, return_inverse=True)
+            fractions, delays = self.returns[:, :, used]
+            energy = np.einsum("rk,rkn->kn", fractions, pulse.bin_energy(delays * period, period, parts))
         else:
             used, rows = np.unique(self.row, return_inverse=True)
             samples = self.waveform.shape[-1]
@@ -625,11 +636,15 @@ def photons_before(cells: Cells, edges: FloatArray) -> FloatArray:
 
 
 def _photons_before(cells: Cells, edges: FloatArray) -> FloatArray:
+    pulse, period, at = cells.system.pulse, cells.system.period_ns, np.concatenate([[0.0], edges])
     if cells.waveform is None:
-        period = cells.system.period_ns
-        at = np.concatenate([[0.0], edges])
-        energy = cells.system.pulse.wrapped_cumulative((at - cells.delay[:, None]) * period, period)
+        energy = pulse.wrapped_cumulative((at - cells.delay[:, None]) * period, period)
         energy = energy[:, 1:] - energy[:, :1]
+    elif cells.returns is not None:
+        energy = np.zeros((cells.size, edges.size))
+        for fraction, delay in zip(*cells.returns[:, :, cells.row], strict=True):
+            before = pulse.wrapped_cumulative((at - delay[:, None]) * period, period)
+            energy += fraction[:, None] * (before[:, 1:] - before[:, :1])
     else:
         knots = np.linspace(0.0, 1.0, cells.waveform.shape[-1] + 1)
         rows, used = np.unique(cells.row, return_inverse=True)
@@ -683,11 +698,10 @@ def misplaced(before: FloatArray, edges: FloatArray, light: FloatArray) -> float
     """
     from scipy.interpolate import PchipInterpolator
 
-    cells = before.size - 1
-    smooth = PchipInterpolator(np.arange(cells + 1) / cells, before)(edges)
-    wrong = 0.5 * np.abs(np.diff(smooth) - np.diff(light))
-    first = np.searchsorted(edges[:-1], np.arange(cells) / cells)
-    return float((np.add.reduceat(wrong, first) / np.maximum(np.diff(before), 1.0)).max())
+    grid = np.arange(before.size) / (before.size - 1)
+    wrong = 0.5 * np.abs(np.diff(PchipInterpolator(grid, before)(edges)) - np.diff(light))
+    inside = np.bincount(np.searchsorted(grid, edges[:-1], "right") - 1, wrong, before.size - 1)
+    return float((inside / np.maximum(np.diff(before), 1.0)).max())
 
 
 def registered_before(before: FloatArray, counts: FloatArray, light: FloatArray) -> FloatArray:

@@ -1,8 +1,8 @@
 """Exact statistics of a synchronous pixel: armed at the start of each period, first photon only (Coates 1968).
 
 Every armed period registers with probability q = 1 - e^-Lambda, at a phase with the law of the first arrival,
-independently of all others. A registration occupies 1 + K periods, or 2 + K where it comes after 1 - f, with t_d =
-K + f. The count is thus a renewal process of whole periods: docs/theory_detectors.md, equations (4) to (7).
+independently of all others. A registration occupies 1 + K periods, or 2 + K if its phase is later than 1 - f, where
+t_d = K + f. The count is thus a renewal process of whole periods: docs/theory_detectors.md, equations (4) to (7).
 """
 
 from __future__ import annotations
@@ -27,50 +27,50 @@ def first_arrivals(cells: Cells) -> FloatArray:
     return np.asarray(np.exp(-before[:, :-1]) * -np.expm1(-np.maximum(np.diff(before), 0.0)), dtype=np.float64)
 
 
-def synchronous_windows(cells: Cells) -> list[Pmf]:
+def synchronous_pmfs(cells: Cells) -> list[Pmf]:
     """Exact pmf of the count of each cell."""
     dead = cells.system.dead_time_periods
     whole = math.floor(dead)
     reach = photons_before(cells, np.array([1.0 - (dead - whole), 1.0]))
     return [
-        _Count(cells, cells.name(k), whole, float(early), float(total)).window()
-        for k, (early, total) in enumerate(reach)
+        _Count(cells, cells.name(k), whole, float(early), float(total)).law() for k, (early, total) in enumerate(reach)
     ]
 
 
-def cumulants_of(window: Pmf) -> FloatArray:
+def cumulants_of(law: Pmf) -> FloatArray:
     """Mean, variance, third and fourth cumulant (4,) of a pmf."""
-    n = window.first + np.arange(window.p.size)
-    mean = float(window.p @ n)
-    m2, m3, m4 = (float(window.p @ (n - mean) ** k) for k in (2, 3, 4))
+    n = law.first + np.arange(law.p.size)
+    mean = float(law.p @ n)
+    m2, m3, m4 = (float(law.p @ (n - mean) ** k) for k in (2, 3, 4))
     return np.array([mean, m2, m3, m4 - 3.0 * m2**2])
 
 
 def _log1p(u: NDArray[np.complex128]) -> NDArray[np.complex128]:
-    """log(1 + u), real part accurate relative to itself: it is multiplied by 1e8 registrations."""
+    """log(1 + u) with a small relative error of the real part, which is multiplied by up to 1e8 registrations."""
     real = 0.5 * np.log1p(2.0 * u.real + u.real**2 + u.imag**2)
     return np.asarray(real + 1j * np.arctan2(u.imag, 1.0 + u.real))
 
 
 class _Count:
-    """The count of one pixel; of its `total` photons per period `early` arrive before the phase 1 - f."""
+    """The count of one pixel with `total` photons per period, of which `early` arrive before the phase 1 - f."""
 
     def __init__(self, cells: Cells, name: str, whole: int, early: float, total: float) -> None:
         self.name, self.cycles, self.whole = name, cells.system.cycles, whole
-        self.armed_register = -math.expm1(-total)  # q
+        self.q = -math.expm1(-total)  # probability that an armed period registers
         after = math.exp(-early) * -math.expm1(-max(total - early, 0.0))
-        self.late = min(after / self.armed_register, 1.0) if self.armed_register > 0.0 else 0.0
+        late = min(after / self.q, 1.0) if self.q > 0.0 else 0.0
+        self.late = late if late * self.cycles > TOL.synchronous_tail else 0.0  # less likely than what is cut off
         self.first = self._first(cells.system.start == "stationary")
 
     def _first(self, stationary: bool) -> FloatArray:
         """Probabilities (r,) that the first armed period is 0, 1, ...; of a stationary pixel by (7)."""
         if not stationary:
             return np.ones(1)
-        longer = np.full(min(self.whole, self.cycles) + 2, self.armed_register)  # P(M > r)
+        longer = np.full(min(self.whole, self.cycles) + 2, self.q)  # P(M > r)
         longer[0] = 1.0
         if self.whole < self.cycles:
-            longer[-1] = self.armed_register * self.late
-        return np.asarray(longer / (1.0 + self.armed_register * (self.whole + self.late)), dtype=np.float64)
+            longer[-1] = self.q * self.late
+        return np.asarray(longer / (1.0 + self.q * (self.whole + self.late)), dtype=np.float64)
 
     def at_least(self, counts: FloatArray) -> FloatArray:
         """P(N >= counts) (n,) (6)."""
@@ -100,12 +100,12 @@ class _Count:
 
         def waited(empty_periods: FloatArray, more: float = 0.0) -> FloatArray:
             """P(at most `empty_periods` empty periods before registration k + `more`)."""
-            chance = betainc(wanted + more, np.maximum(empty_periods, 0.0) + 1.0, self.armed_register)
+            chance = betainc(wanted + more, np.maximum(empty_periods, 0.0) + 1.0, self.q)
             return np.asarray(np.where(empty_periods >= 0.0, chance, 0.0), dtype=np.float64)
 
         def summed(empty_periods: FloatArray) -> FloatArray:
             """Sum of `waited` from 0 to `empty_periods`."""
-            mean = wanted * (1.0 - self.armed_register) / self.armed_register
+            mean = wanted * (1.0 - self.q) / self.q
             return np.asarray(
                 np.maximum((empty_periods + 1.0) * waited(empty_periods) - mean * waited(empty_periods - 1.0, 1.0), 0.0)
             )
@@ -119,9 +119,9 @@ class _Count:
         total = (probability * weight).sum(-1)
         return np.asarray(np.where(counts <= 0.0, 1.0, np.minimum(total, 1.0)), dtype=np.float64)
 
-    def window(self) -> Pmf:
+    def law(self) -> Pmf:
         most = math.ceil(self.cycles / (self.whole + 1))
-        if self.armed_register == 0.0:
+        if self.q == 0.0:
             return Pmf(0, np.ones(1), 0.0)
         low, high = self._reach(most)
         terms = (high - low) * TOL.synchronous_sums * self._spread(float(most))
@@ -144,7 +144,7 @@ class _Count:
 
     def _reach(self, most: int) -> tuple[int, int]:
         """First and last count of the support, from mean and variance of the time of a registration."""
-        q, late = self.armed_register, self.late
+        q, late = self.q, self.late
         each = self.whole + 1.0 + ((1.0 - q) / q + late)  # periods per registration
         mean = self.cycles / each
         spread = math.sqrt(mean * ((1.0 - q) / q**2 + late * (1.0 - late))) / each
@@ -153,7 +153,7 @@ class _Count:
 
     def _transformed(self, counts: FloatArray) -> FloatArray:
         """P(N >= counts) (n,) by the transform of the periods that k registrations lose, (21)."""
-        k, q, late, n = counts, self.armed_register, self.late, self.first.size
+        k, q, late, n = counts, self.q, self.late, self.first.size
         room = self.cycles - 1.0 - (k - 1.0) * (self.whole + 1.0)  # periods that may be lost
         spread = math.sqrt(float(k.max()) * ((1.0 - q) / q**2 + late * (1.0 - late)))
         away = float(np.abs(room - k * (1.0 - q) / q - (k - 1.0) * late).max())

@@ -56,6 +56,15 @@ def test_a_plain_stream_is_calibrated_with_nothing_given() -> None:
 
 
 @pytest.mark.full
+def test_the_interval_of_a_jitter_that_is_not_there_begins_at_none() -> None:
+    """Equal tails of its law left out both 0 and the estimate, of 10 in 12 streams."""
+    truth = replace(BASE, jitter=0.0)
+    jitter = ml.calibrate(stream(truth, 15_000, 4), seed=4).estimates["jitter_ns"]
+    assert jitter.note == "not detected"
+    assert 0.0 == jitter.low <= jitter.value <= jitter.high < 1.0
+
+
+@pytest.mark.full
 @pytest.mark.parametrize("seed", [0, *nightly(1, 2)])
 def test_a_short_pulse_beside_a_jitter_of_the_clocks_unit(seed: int) -> None:
     """Where the errors of an exact likelihood without the jitter were 28 to 82 times too small."""

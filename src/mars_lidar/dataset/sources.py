@@ -406,7 +406,7 @@ def _view(data: Any, system: System, whole: bool) -> View:
         raise RecipeError((), f"there must be one scene: {problem}")
     content = listed[0].load()
     (signal, sbr), maps = light.levels[0], (content.depth_m, content.reflectivity)
-    flux = content.flux(system, light, signal, sbr, tell=True)
+    flux = content.flux(system, light, signal, sbr, warn=True)
     depth, share = (None if np.isnan(values).all() else values for values in maps)
     kind = next(name for name in ("example", "depth", "path", "transient") if name in given)
     image = f", image {entry['image']}" if "image" in entry else ""

@@ -25,7 +25,7 @@ from mars_lidar.instrument.pulse import GaussianPulse
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 
-_KEPT = 4  # scenes and fluxes that a maker remembers: neighbours in the order of parts share them
+_KEPT = 4  # cached scenes and fluxes: consecutive parts use the same ones
 
 
 class Stopped(Exception):

@@ -256,7 +256,7 @@ def systematic_error(flux: Flux, system: System) -> tuple[FloatArray, FloatArray
     ... )
     >>> bias, error = ml.reconstruction.systematic_error(ml.Flux(2.0, 2.0, 43.4), system)
     >>> (bias / error).round(1).tolist()  # bins of 2 ns, in which the detector re-arms while the pulse passes
-    [4.8, 0.1, -3.3]
+    [4.9, 0.1, -3.2]
     """
     from mars_lidar._base.native import _core
     from mars_lidar.statistics import mean_histogram
@@ -284,7 +284,7 @@ def systematic_error(flux: Flux, system: System) -> tuple[FloatArray, FloatArray
     return (bias * unit).reshape(shape), (error * unit).reshape(shape)
 
 
-def tell_systematic_error(method: Method, system: System, estimates: Estimates) -> None:
+def warn_of_bias(method: Method, system: System, estimates: Estimates) -> None:
     """Warn if one of three estimates has a systematic error above half a standard error.
 
     They are those of the most precise signal, the most precise delay and the median signal.

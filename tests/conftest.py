@@ -76,7 +76,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def pytest_collection_finish() -> None:
-    """Modules and tests stay to the end: `gc.collect`, which benchmarks call before each turn, need not look at them."""
+    """Modules and tests stay to the end: `gc.collect`, which benchmarks call before each turn, may pass over them."""
     gc.freeze()
 
 

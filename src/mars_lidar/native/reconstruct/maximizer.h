@@ -56,7 +56,7 @@ struct Terrain {
 
 // Fisher scoring with Levenberg's damping: a step is taken if the likelihood does not fall. S >= 0 and B >= least. A
 // climb is given up where several times the gain that its next step promises would not make it the best.
-inline Fit climb(const PixelLikelihood& pixel, const double* start, bool with_signal, const Terrain& terrain) {
+inline Fit climb(PixelLikelihood& pixel, const double* start, bool with_signal, const Terrain& terrain) {
     const double least = terrain.least, farthest = terrain.farthest;
     Fit fit;
     std::copy(start, start + 3, fit.at);
@@ -121,13 +121,14 @@ struct Profile {
 class Maximizer {
  public:
     Maximizer(const HistogramRecord& recording, const ReconstructionJob& job)
-        : r_(recording), job_(job), passes_(recording.bins), search_(recording) {}
+        : r_(recording), job_(job), passes_(recording.bins), likelihood_(recording), search_(recording) {}
 
     // Signal, background, delay, their standard errors, twice the gain of the log likelihood by the signal, and its
     // value.
     void operator()(const CountRows& histograms, int64_t row, double* out, uint8_t* flag) {
         passes_.set(r_, histograms, row);
-        PixelLikelihood pixel(r_, passes_);
+        PixelLikelihood& pixel = likelihood_;
+        pixel.set(passes_);
         for (int k = 0; k < kMaximumColumns; ++k) out[k] = NAN;
         *flag = 0;
         if (!(pixel.count() > 0.0) || !(pixel.time() > 0.0)) {
@@ -147,7 +148,7 @@ class Maximizer {
         Terrain terrain{least, farthest, -HUGE_VAL, &ends_};
         double brightest = flat;
         for (int k = 0; k < found; ++k) brightest = std::max(brightest, starts[k].background);
-        pixel.expect(brightest, series_);
+        pixel.expect(brightest);
         for (int k = 0; k < found; ++k) {
             const double at[3] = {std::min(starts[k].signal, kMostPhotons),
                                   std::clamp(starts[k].background, least, kMostPhotons), starts[k].delay};
@@ -189,7 +190,7 @@ class Maximizer {
     // Light of a sampled pulse is constant over a sample, so that the slope of the likelihood jumps at delays at which an
     // edge of a bin meets one of a sample: between any two may be a maximum. Climbs from either side of the best, until
     // none within some standard errors and as far as these edges recur is better.
-    void look_around(const PixelLikelihood& pixel, Terrain& terrain, Fit& best) {
+    void look_around(PixelLikelihood& pixel, Terrain& terrain, Fit& best) {
         const double bin = 1.0 / static_cast<double>(r_.bins), recurs = bin + r_.sample;
         for (int turn = 0; turn < kMostTurns; ++turn) {
             const double centre[3] = {best.at[0], best.at[1], best.at[2]};
@@ -221,7 +222,7 @@ class Maximizer {
     }
 
     // Outwards from the best until the likelihood has fallen for good; by the trapezoidal rule.
-    Profile profile_of(const PixelLikelihood& pixel, const Terrain& terrain, const Fit& best) {
+    Profile profile_of(PixelLikelihood& pixel, const Terrain& terrain, const Fit& best) {
         Profile out;
         const double bin = 1.0 / static_cast<double>(r_.bins), recurs = bin + r_.sample;
         const double most = std::max(bin, error_of_delay(best)) / kStarts;
@@ -256,7 +257,7 @@ class Maximizer {
     }
 
     // One step of scoring of S and B where the delay is.
-    void settle(const PixelLikelihood& pixel, double least, const bool* free, Fit& fit) const {
+    void settle(PixelLikelihood& pixel, double least, const bool* free, Fit& fit) const {
         double known[3][3], move[3];
         fit.likelihood = pixel(fit.at[0], fit.at[1], fit.at[2], ends_);
         known_information(fit.likelihood, free, known);
@@ -271,7 +272,7 @@ class Maximizer {
     }
 
     // Takes off the first-order bias of the maximum, at most a standard error of it, and of S never more than S.
-    void correct(const PixelLikelihood& pixel, double least, Fit& fit) {
+    void correct(PixelLikelihood& pixel, double least, Fit& fit) {
         double known[3][3], spread[3][3], bias[3];
         if (!fit.free[0] || !fit.free[1] || !fit.free[2]) return;
         known_information(fit.likelihood, fit.free, known);
@@ -293,7 +294,7 @@ class Maximizer {
 
     // Standard errors: roots of the diagonal of the inverse information; NaN for what lies on its bound. Where that is B,
     // the others move with what it may be above: its likelihood there, the others at their maximum, is a truncated normal.
-    void errors(const PixelLikelihood& pixel, double least, const Fit& fit, double* out) const {
+    void errors(PixelLikelihood& pixel, double least, const Fit& fit, double* out) const {
         double known[3][3];
         known_information(fit.likelihood, fit.free, known);
         for (int k = 0; k < 3; ++k) {
@@ -327,9 +328,9 @@ class Maximizer {
     const HistogramRecord& r_;
     const ReconstructionJob& job_;
     ArmedPasses passes_;
+    PixelLikelihood likelihood_;
     DelaySearch search_;
     ExposureEnds ends_;
-    BackgroundSeries series_;
     LikelihoodBias bias_;
 };
 }  // namespace mars

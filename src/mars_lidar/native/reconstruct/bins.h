@@ -26,7 +26,8 @@ struct PulseBins {
         bins = std::min(r.bins, std::max<int64_t>(end - from, 1));
         first = from % r.bins;
         if (first < 0) first += r.bins;
-        const int64_t length = padded_length(bins), apart = r.gated() ? length : 1, points = padded_length(bins + apart);
+        const int64_t length = padded_length(bins), apart = r.gated() ? length : 1,
+                      points = padded_length(bins + apart);
         energy.resize(points + kBinsTogether);
         slope.resize(points + kBinsTogether);
         if (r.gated()) {

@@ -77,13 +77,15 @@ MARS_INLINE Term passed_term(const Real& h, const Real& armed, const Real& rearm
     const Passes pass(l);
     const Real all = armed + rearmed, time = armed + 0.5 * rearmed, silent_passes = larger(all - h, zero);
     const RealMask open = time > 1e-12;
-    const Real passes = choose(open, all, one), armed_time = choose(open, time, one), inverse = 1.0 / (passes * armed_time);
+    const Real passes = choose(open, all, one), armed_time = choose(open, time, one),
+               inverse = 1.0 / (passes * armed_time);
     const Real share = inverse * armed_time, unit = by_time ? inverse * passes : share;
     const Real mean = larger(armed * pass.fired + rearmed * pass.q, splat(kLeast));
     const Real slope = armed * pass.quiet + rearmed * pass.dq;
     const Real silent = larger(armed * pass.quiet + rearmed * pass.none, splat(kLeast));
     const Real both = 1.0 / (mean * silent), fires = both * silent, stays = both * mean;
-    const Real value = h * natural_log(mean * unit) + silent_passes * natural_log(larger(silent * share, splat(kLeast)));
+    const Real value =
+        h * natural_log(mean * unit) + silent_passes * natural_log(larger(silent * share, splat(kLeast)));
     return {choose(open, value, zero), choose(open, slope * (h * fires - silent_passes * stays), zero),
             choose(open, all * ((slope * fires) * (slope * stays)), zero)};
 }
@@ -152,7 +154,8 @@ void MARS_JOIN(pulse_energy_, MARS_LEVEL)(const EnergyBlock& of) {
     for (int64_t i = 0; i < of.points; i += kReals) {
         const Real u = reals(of.energy + i) - curve.low, whole = whole_below(u) - kMagic, x = (u - whole) * inverse;
         const RealMask within = x < last;
-        const Real inside = larger(choose(within, x, splat(0.0)), splat(0.0)), shifted = whole_below(inside), knot = shifted - kMagic;
+        const Real inside = larger(choose(within, x, splat(0.0)), splat(0.0)), shifted = whole_below(inside),
+                   knot = shifted - kMagic;
         Real low{}, high{}, left{}, right{};
         uint64_t cells[kReals];
         memcpy(cells, &shifted, sizeof cells);
@@ -207,10 +210,12 @@ TangentSums MARS_JOIN(bin_tangent_, MARS_LEVEL)(const TangentBlock& of) {
     Real sum[5][kParts] = {};
     for_bins(of.bins, [&](int64_t i, int p) {
         const Real g = reals(of.slope + i), fired = reals(of.fired + i);
-        const Real weight = 1.0 / larger(reals(of.variance + i), splat(of.least)), residual = reals(of.residual + i) * weight;
+        const Real weight = 1.0 / larger(reals(of.variance + i), splat(of.least)),
+                   residual = reals(of.residual + i) * weight;
         put(of.weight + i, weight);
         put(of.residual + i, residual);
-        const Real each[5] = {g * g * weight, g * residual, g * fired * weight, fired * fired * weight, fired * residual};
+        const Real each[5] = {g * g * weight, g * residual, g * fired * weight, fired * fired * weight,
+                              fired * residual};
         for (int k = 0; k < 5; ++k) sum[k][p] = sum[k][p] + each[k];
     });
     return {total(sum[0]), total(sum[1]), total(sum[2]), total(sum[3]), total(sum[4])};

@@ -32,8 +32,8 @@ struct TermsBlock {
     const double *energy, *slope, *share;
     int64_t bins;
     double signal, flat;
-    bool poisson;  // dead times below one bin: a bin may register again
-    bool by_time;  // the expected registrations are told in armed time, not in passes
+    bool poisson;          // dead times below one bin: a bin may register again
+    bool by_time;          // the expected registrations are told in armed time, not in passes
     double *score, *info;  // (bins) or null: derivative by the photons of a bin, and Fisher's information on them
 };
 

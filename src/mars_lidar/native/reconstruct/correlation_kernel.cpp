@@ -52,7 +52,8 @@ int MARS_JOIN(hills_, MARS_LEVEL)(const Hills& of) {
     float least = -HUGE_VALF;  // above which a place is one of the best
     for (int64_t first = 0; first < of.points; first += kLanes) {
         const Float here = load<Float>(gain + first);
-        const Mask hill = (here >= load<Float>(gain + first - 1)) & (here > load<Float>(gain + first + 1)) & (here > least);
+        const Mask hill =
+            (here >= load<Float>(gain + first - 1)) & (here > load<Float>(gain + first + 1)) & (here > least);
         if (of.points > 2 && !any(hill)) continue;
         for (int64_t g = first; g < first + kLanes && g < of.points; ++g) {
             const float its = gain[g];

@@ -63,8 +63,8 @@ class DelaySearch {
         for (int64_t i = 0; i < taps; ++i) gain_[i] = static_cast<float>(std::log1p(signal * energy_[i] / back));
         correlate(counts, gain_.data(), score_);
         std::array<int64_t, kMost> at{};
-        int found = hills_({score_.data(), score2_.data(), static_cast<float>(signal), work, points_, std::min(most, kMost),
-                            at.data()});
+        int found = hills_({score_.data(), score2_.data(), static_cast<float>(signal), work, points_,
+                            std::min(most, kMost), at.data()});
         if (found == 0) at[found++] = best;
         for (int k = 0; k < found; ++k)
             out[k] = {signal, back * static_cast<double>(n),
@@ -100,8 +100,7 @@ class DelaySearch {
 
     const HistogramRecord& r_;
     void (*correlate_)(const Correlation&) = kernel_at<const Correlation&>("", MARS_KERNELS(correlate_));
-    int64_t (*strongest_)(const WeakPulses&) =
-        kernel_at<const WeakPulses&, int64_t>("", MARS_KERNELS(strongest_));
+    int64_t (*strongest_)(const WeakPulses&) = kernel_at<const WeakPulses&, int64_t>("", MARS_KERNELS(strongest_));
     int (*hills_)(const Hills&) = kernel_at<const Hills&, int>("", MARS_KERNELS(hills_));
     int64_t first_ = 0, step_ = 1, points_ = 1, shift_ = 0;
     int64_t length_ = 1;  // of a row

@@ -82,8 +82,8 @@ class ExposureEnds {
     BinSums terms(int c, double signal, double flat, const PulseBins& pulse) const {
         const int64_t padded = static_cast<int64_t>(run_.count.size());
         return bins_kernels().terms({run_.count.data(), armed_.data() + c * padded, run_.rearmed.data(), nullptr,
-                                     pulse.energy.data(), pulse.slope.data(), run_.shares(), padded, signal, flat, false,
-                                     false, nullptr, nullptr});
+                                     pulse.energy.data(), pulse.slope.data(), run_.shares(), padded, signal, flat,
+                                     false, false, nullptr, nullptr});
     }
 
     int count = 0;

@@ -44,9 +44,8 @@ class FitQuality {
         if (!std::isfinite(background)) return;
         const bool lit = signal > 0.0 && std::isfinite(delay);
         expect(passes, signal, background, delay);
-        const auto [total, armed] = sums_of<2>(bins_, [&](int64_t j) {
-            return std::array<double, 2>{variance_[j], passes.armed[j]};
-        });
+        const auto [total, armed] =
+            sums_of<2>(bins_, [&](int64_t j) { return std::array<double, 2>{variance_[j], passes.armed[j]}; });
         const int cells = static_cast<int>(std::min(total / kVariance, static_cast<double>(kCells)));
         if (cells < kLeastCells) return;
         const double hidden = hidden_passes(passes.total);

@@ -20,8 +20,8 @@ class LikelihoodBias {
         for (int64_t k = 0, j = pulse_.first; k < pulse_.bins; ++k) {
             const int64_t next = j + 1 < r.bins ? j + 1 : 0;
             const double flat = r.share(j) / n, s = pulse_.energy[k], ds = pulse_.slope[k];
-            const double curve = bend * (k < later_.bins ? later_.slope[k] : 0.0) -
-                                 bend * (k < earlier_.bins ? earlier_.slope[k] : 0.0);
+            const double curve =
+                bend * (k < later_.bins ? later_.slope[k] : 0.0) - bend * (k < earlier_.bins ? earlier_.slope[k] : 0.0);
             const Bin bin{at[0] * s + at[1] * flat, {s, flat, at[0] * ds}, ds, curve};
             const double h = passes.count[j], b = passes.rearmed[j];
             if (k == 0 || r.below_bin()) armed = passes.armed[j];

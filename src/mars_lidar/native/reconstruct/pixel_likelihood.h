@@ -64,7 +64,8 @@ class PixelLikelihood {
     double time() const { return all_.time; }    // their armed time, bins x periods
 
     // With `ends`, mixed over what they leave of the bins that these cover. `whole`: bin by bin round the period.
-    Likelihood operator()(double signal, double background, double delay, const ExposureEnds& ends, bool whole = false) {
+    Likelihood operator()(double signal, double background, double delay, const ExposureEnds& ends,
+                          bool whole = false) {
         Likelihood out;
         const double n = static_cast<double>(r_.bins), flat = background / n, scale[3] = {1.0, 1.0 / n, signal};
         whole = whole || whole_ || (expanded_ && flat > 2.0 * BackgroundSeries::kMost);

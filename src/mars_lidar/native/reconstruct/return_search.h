@@ -127,7 +127,8 @@ class ReturnSearch {
         if (!of) return correlate_({rows, from, length_of_rows(), taps - lead, points_, step_, out});
         std::fill_n(out, padded(), 0.0);
         for (int64_t g = 0; g < points_; g += kCorrelatedTogether) {
-            const int64_t points = std::min(kCorrelatedTogether, points_ - g), ahead = (of->first - start(g) + 2 * n) % n;
+            const int64_t points = std::min(kCorrelatedTogether, points_ - g),
+                          ahead = (of->first - start(g) + 2 * n) % n;
             if (ahead < (points - 1) * step_ + taps || (n - ahead) % n < of->bins)
                 correlate_({rows + g, from, length_of_rows(), taps - lead, points, step_, out + g});
         }

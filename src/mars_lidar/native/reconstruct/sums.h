@@ -20,13 +20,12 @@ std::array<double, number> sums_of(int64_t n, const Of& of) {
     double part[number][side] = {};
     std::array<double, number> out{};
     int64_t j = 0;
-    for (; j + side <= n; j += side)
+    for (; j + side <= n; j += side) MARS_SIDE_BY_SIDE
+    for (int64_t k = 0; k < side; ++k) {
+        const std::array<double, number> each = of(j + k);
         MARS_SIDE_BY_SIDE
-        for (int64_t k = 0; k < side; ++k) {
-            const std::array<double, number> each = of(j + k);
-            MARS_SIDE_BY_SIDE
-            for (size_t i = 0; i < number; ++i) part[i][k] += each[i];
-        }
+        for (size_t i = 0; i < number; ++i) part[i][k] += each[i];
+    }
     for (; j < n; ++j) {
         const std::array<double, number> each = of(j);
         for (size_t i = 0; i < number; ++i) part[i][0] += each[i];

@@ -9,6 +9,7 @@ what it needs (parts separated by semicolons):
 
     <!-- run: with depth.png, rgbd/; extra io; 10_000 -> 16 -->   files (FILES makes them), extras, smaller numbers
     <!-- run: as scene.yaml; by mars-lidar simulate --scene scene.yaml -o a.zarr -->   a file, and what reads it
+    <!-- run: core only -->   not again where the page's other blocks have their extras
     <!-- not run: why -->
 
 Commands after ``<!-- command: NAME -->`` are those that `.ci/run` itself runs. tests/docs/test_pages.py holds that
@@ -117,7 +118,8 @@ def chosen(page: Path, environment: str) -> list[Block]:
     """What is to be run of a page in an environment."""
     found = [b for b in blocks(page.read_text(encoding="utf-8")) if b.language not in SHOWN and b.mark != "command"]
     if environment == "extras":
-        return found if any(block.extras for block in found) else []
+        again = [block for block in found if not any(block._parts("core only"))]
+        return again if any(block.extras for block in found) else []
     return [block for block in found if not block.extras]
 
 

@@ -18,7 +18,7 @@ from mars_lidar.engines import Engine, cuda, find_engine
 from mars_lidar.engines.cuda.exact import exact_histogram
 from mars_lidar.engines.cuda.machine import Cuda, cupy_with_device
 from mars_lidar.engines.engine import Task
-from mars_lidar.simulation import _task
+from mars_lidar.engines.simulation import _task
 from mars_lidar.table import Table
 
 RESULTS = Path(__file__).parent / "results"

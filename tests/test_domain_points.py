@@ -345,10 +345,14 @@ def test_a_waveform_that_re_arms_within_its_parts() -> None:
 
 
 def test_a_stationary_start_of_a_pixel_that_fires_like_a_clock() -> None:
-    """500 photons a dead time: the iteration did not settle. The rate of registrations is that of constant light."""
+    """500 photons a dead time: the iteration did not settle. The rate of registrations is that of constant light.
+
+    64 exposures: 4.5 standard errors (7e-6) are 0.27; all exposures of a pixel that began armed count 200, 0.4 more.
+    """
     system = make_system(50.0, 100, 1, sigma_ns=1e-4, start="stationary")
-    counts = ml.simulate(ml.Flux(1.0, 1000.0, 59.8), system, seed=1, realizations=2000)
-    assert counts.mean() == pytest.approx(100 * 1001 / (1 + 1001 * 0.5), abs=0.1)
+    counts = ml.simulate(ml.Flux(1.0, 1000.0, 59.8), system, seed=1, realizations=64)
+    assert counts.mean() == pytest.approx(100 * 1001 / (1 + 1001 * 0.5), abs=0.27)
+    assert counts.std() > 0.2
     assert counts.std() < 1.0
 
 

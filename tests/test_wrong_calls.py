@@ -250,6 +250,7 @@ CALLS: dict[str, Callable[[Path], tuple[Callable[..., Any], dict[str, Any]]]] = 
         reconstruction.returns_bound,
         {"flux": ml.Flux.multi(PIXEL, ml.Flux(0.2, 0.0, 60.0)), "system": SYSTEM},
     ),
+    "reconstruct.systematic_error": lambda _: (reconstruction.systematic_error, {"flux": PIXEL, "system": SYSTEM}),
     "reconstruct.window_weights": lambda _: (reconstruction.window_weights, {"system": SYSTEM, "delay_ns": 40.0}),
     "reconstruct.window_error": lambda _: (
         reconstruction.window_error,
@@ -440,6 +441,7 @@ def test_every_public_name_is_called():
     assert public - called == RESULTS - called
 
 
+@pytest.mark.full
 def test_what_is_documented_as_taken_is_taken(here):
     """An entry that nothing needs any more is removed."""
     results = [(name, where) for name in CALLS for where, kind, _ in outcomes(name, here) if kind == "documented"]

@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING
 
 from mars_lidar._version import __version__
 from mars_lidar.calibration import Calibration, calibrate
+from mars_lidar.engines.simulation import simulate, simulate_timestamps
 from mars_lidar.instrument.avalanches import Afterpulsing, Crosstalk
 from mars_lidar.instrument.detector import dark_count_map
 from mars_lidar.instrument.effects import Jitter, SampledJitter
@@ -14,7 +15,6 @@ from mars_lidar.light.flux import Flux
 from mars_lidar.light.timestamps import Timestamps
 from mars_lidar.reconstruction import Reconstruction, cramer_rao, reconstruct
 from mars_lidar.scene.scene import Scene
-from mars_lidar.simulation import simulate, simulate_timestamps
 from mars_lidar.statistics import (
     CountLaw,
     JointLaw,

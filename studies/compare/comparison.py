@@ -22,11 +22,11 @@ from mars_lidar._base.progress import callback_of
 from mars_lidar._base.resources import check_memory, thread_count
 from mars_lidar._base.types import FloatArray, Progress
 from mars_lidar.engines import ENGINES, Engine, find_engine
+from mars_lidar.engines.simulation import simulate
 from mars_lidar.engines.table_reader import image_table
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.plot.views import by_signal, example_pixels, incident_rate, with_pixels
-from mars_lidar.simulation import simulate
 from mars_lidar.statistics import ConvergenceError, count_law, exposure_moments, joint_law, mean_histogram
 from mars_lidar.statistics.count_pmf import Pmf
 from studies.compare.sample import Distance, Estimate, Moments, Sample, law_distance, ratio, score, shape_distance

@@ -24,7 +24,7 @@ ABLE = {
 
 
 def warm_up(case: Case) -> float:
-    """Periods before the exposure that a stationary start needs, and a random part of them: the pixel must forget."""
+    """Periods simulated before the exposure for a stationary start, so that the start-up transient decays."""
     if case.system.start == "armed" or case.system.dead_time_periods == 0.0:
         return 0.0
     return 150.0 * (case.system.dead_time_periods + 1.0)

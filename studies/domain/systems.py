@@ -69,7 +69,7 @@ class Case:
 
     @property
     def gate_width(self) -> float:
-        """How long the gate is open in a period."""
+        """Time for which the gate is open in a period, in periods."""
         return (self.system.detector.gate_width_ns or 0.0) / PERIOD_NS
 
     def registrations(self) -> float:
@@ -80,15 +80,15 @@ class Case:
         return n * rate / (1.0 + rate * dead) + min(1.0, n * rate)
 
     def flux(self, pixels: int = 1) -> Flux:
-        """`pixels` alike pixels in a row."""
+        """A row of `pixels` equal pixels."""
         row = np.ones((1, pixels))
         if self.waveform is not None:
             alike = np.broadcast_to(self.waveform, (1, pixels, self.waveform.size))
             return Flux(waveform=alike, background=self.background)
-        parts = [Flux(s * row, 0.0, d * PERIOD_NS) for s, d in zip(self.signal, self.delay, strict=True)]
-        if len(parts) == 1:
-            return Flux(self.signal[0] * row, self.background, self.delay[0] * PERIOD_NS)
-        return Flux.multi(*parts, Flux(0.0 * row, self.background, 0.0))
+        backgrounds = [self.background, *[0.0] * (len(self.signal) - 1)]
+        parts = zip(self.signal, backgrounds, self.delay, strict=True)
+        returns = [Flux(s * row, b, d * PERIOD_NS) for s, b, d in parts]
+        return Flux.multi(*returns) if len(returns) > 1 else returns[0]
 
     @property
     def predictable(self) -> bool:

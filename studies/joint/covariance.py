@@ -119,7 +119,7 @@ class Outcome:
 def random_systems(settings: Settings, tell: Tell) -> list[Outcome]:
     """Random systems, a third of them with dead times near whole periods, against the exact engine.
 
-    Those that the closed form refuses are not among them: they do not forget their start, and would take too long.
+    Those that the closed form refuses are left out: their start-up transients outlast the exposure, and take too long.
     """
     results = []
     cases = random_cases(settings.systems, settings.seed, settings.cycles, ("armed", "stationary"))

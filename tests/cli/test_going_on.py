@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import sys
+from importlib import import_module
 
 import numpy as np
 import pytest
@@ -135,7 +135,7 @@ def test_the_clock_of_a_ptu_is_as_fine_as_asked(tmp_path, clock_ps, codes):
 
 def test_the_command_tells_of_large_images(tmp_path, monkeypatch):
     pytest.importorskip("ptufile")
-    monkeypatch.setattr(sys.modules["mars_lidar.cli.convert"], "_LARGE_IMAGE", 1e6)
+    monkeypatch.setattr(import_module("mars_lidar.cli.convert"), "_LARGE_IMAGE", 1e6)
     io.simulate_to(tmp_path / "a.zarr", flux_of(), SYSTEM)
     done = run("timestamps", tmp_path / "a.zarr", "-o", tmp_path / "a.ptu")
     assert (done.exit_code, "--clock-ps a smaller one" in done.stdout) == (0, True), done.output

@@ -14,7 +14,7 @@ from harness import make_system
 import mars_lidar as ml
 
 HIDDEN = Path(__file__).parents[1] / "hidden_library.py"
-# library, extra, and whether public names and commands are to miss it
+# library, extra, and whether public names and commands are to miss it; each by itself by night
 LIBRARIES = [
     ("torch", "learn", True, False),
     ("skimage", "estimate", False, True),
@@ -28,7 +28,10 @@ LIBRARIES = [
 
 
 @pytest.mark.full
-@pytest.mark.parametrize(("library", "extra", "names", "commands"), LIBRARIES)
+@pytest.mark.parametrize(
+    ("library", "extra", "names", "commands"),
+    [LIBRARIES[0], LIBRARIES[-1], *(pytest.param(*each, marks=pytest.mark.nightly) for each in LIBRARIES[1:-1])],
+)
 def test_what_misses_a_library_names_its_extra(tmp_path, library, extra, names, commands):
     done = subprocess.run(
         [sys.executable, HIDDEN, library, extra, tmp_path], capture_output=True, text=True, timeout=300

@@ -16,6 +16,8 @@ from mars_lidar.engines.cuda.kernels import Sink, Variant
 from mars_lidar.engines.engine import Records, Task
 from mars_lidar.engines.exact import ExactEngine
 
+pytestmark = pytest.mark.full  # a compiler builds the emulation
+
 MODES: dict[str, dict[str, Any]] = {
     "nonparalyzable": {},
     "whole": {"dead_time_ns": 100.0},
@@ -78,7 +80,6 @@ STARTS = [
 ]
 
 
-@pytest.mark.full
 @pytest.mark.parametrize(("pulse", "returns"), [("gaussian", 1), ("gaussian", 4), ("sampled", 1), ("sampled", 3)])
 @pytest.mark.parametrize(("mode", "start"), STARTS)
 def test_histograms_are_those_of_the_engine(mode: str, pulse: str, returns: int, start: str):

@@ -15,6 +15,8 @@ from mars_lidar.engines.engine import Task
 from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.engines.feedback import FeedbackEngine
 
+pytestmark = pytest.mark.full  # a compiler builds the emulation
+
 BASE = make_system(63.75, 3000, 128)
 SAMPLED = ml.SampledPulse(np.array([0.1, 0.7, 1.0, 0.4, 0.3, 0.1]), bin_ns=0.9)
 
@@ -50,7 +52,6 @@ def both(flux: ml.Flux, system: ml.System, realizations: int = 3, warps: int = 2
     return {"wanted": wanted, "drawn": drawn, "rest": asked.report["pixels given to exact"]}
 
 
-@pytest.mark.full
 @pytest.mark.parametrize("start", ["armed", "stationary"])
 @pytest.mark.parametrize("dead_ns", [63.75, 163.75, 0.9])
 @pytest.mark.parametrize("pulse", [BASE.pulse, SAMPLED], ids=["gaussian", "sampled"])

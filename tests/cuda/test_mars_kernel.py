@@ -16,6 +16,8 @@ from mars_lidar.engines.cuda.mars import mars_histogram
 from mars_lidar.engines.engine import Task
 from mars_lidar.table import Table
 
+pytestmark = pytest.mark.full  # a compiler builds the emulation
+
 BASE = make_system(63.75, 300, 128)
 SYSTEMS: dict[str, ml.System] = {
     "plain": BASE,  # the table keeps laws of its doubted entries
@@ -56,7 +58,6 @@ def both(
     return {"wanted": wanted, "drawn": drawn, "report": two.report}
 
 
-@pytest.mark.full
 @pytest.mark.parametrize("count", ["exact", "matched", "gaussian"])
 @pytest.mark.parametrize("name", list(SYSTEMS))
 def test_histograms_are_those_of_the_engine(name: str, count: Any):
@@ -76,7 +77,6 @@ def test_other_cycles_nearest_entries_and_both_ways_to_draw():
             np.testing.assert_array_equal(result["drawn"], result["wanted"])
 
 
-@pytest.mark.full
 def test_doubted_counts_are_evaluated():
     """Between entries, at other delays, and from the table's own laws."""
     locked = BASE.replace(detector=ml.Detector(dead_time_ns=163.75))

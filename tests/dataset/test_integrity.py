@@ -23,7 +23,7 @@ from mars_lidar.io.maps import load_maps, save_maps
 from mars_lidar.io.store import OnDisk
 from tests.harness.command import command_line
 
-FLIPS = int(os.environ.get("MARS_LIDAR_FLIPS", "200"))
+FLIPS = int(os.environ.get("MARS_LIDAR_FLIPS", "100"))
 SYSTEM = make_system(30.0, 50, 32)
 
 

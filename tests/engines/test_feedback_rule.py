@@ -81,7 +81,10 @@ VARIANCES = {  # S, B, delay, t_d, sigma (ns of 100), cycles, bins, start; they 
 }
 
 
-@pytest.mark.parametrize("name", VARIANCES)
+LONG = "whole period, narrower than any bin"
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.full] * (name == LONG)) for name in VARIANCES])
 def test_the_count_has_the_variance_of_its_law(name):
     """4,000 exposures: 2.2 % is one standard error of the variance, 4.5 of them fail (7e-6)."""
     signal, background, delay, dead, sigma, cycles, bins, start = VARIANCES[name]
@@ -278,3 +281,14 @@ def test_auto_draws_no_timestamps():
     flux, system = mixture(50)
     with pytest.raises(ValueError, match="draws histograms only"):
         ml.simulate_timestamps(flux, system, engine=AutoEngine())
+
+
+@pytest.mark.parametrize("engine", ["feedback", "auto"])
+@pytest.mark.parametrize("bins", [1, 2, 3, 4096])
+@pytest.mark.parametrize("dead_ns", [0.0, 1e-9, 1e-3, 0.5])
+def test_no_dead_time_is_too_short_for_few_bins(dead_ns: float, bins: int, engine: str):
+    """Cells that would have to be narrower than the kernels can make them are left to exact."""
+    system = make_system(dead_ns, 7568, bins, sigma_ns=4.0)
+    exact = ml.simulate(ml.Flux(18.5, 0.6, [[30.0] * 40]), system, seed=3).sum(-1).mean()
+    drawn = ml.simulate(ml.Flux(18.5, 0.6, [[30.0] * 40]), system, seed=4, engine=engine).sum(-1).mean()
+    assert abs(drawn - exact) < 6.0 * np.sqrt(2.0 * exact / 40)

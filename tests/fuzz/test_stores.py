@@ -12,7 +12,7 @@ from tests.fuzz.stores import READERS, attacks, make
 @pytest.mark.parametrize("seed", [3, pytest.param(20261123, marks=pytest.mark.full)])
 def test_attacked_stores_are_refused_or_the_same(tmp_path, seed):
     make(tmp_path)
-    number = 2 * len(READERS) if seed == 3 else 16 * len(READERS)
+    number = 2 * len(READERS) if seed == 3 else 8 * len(READERS)
     outcomes = list(attacks(tmp_path, number, seed))
     assert len(outcomes) == number
     assert [row for row in outcomes if row[2] not in ("refused", "same")] == []

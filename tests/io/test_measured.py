@@ -277,5 +277,5 @@ def test_times_beside_the_counts_are_those_of_the_bins(tmp_path, unit):
     with pytest.raises(ValueError, match=r"begin at 20 ns: give the laser period and start_ns"):
         ml.io.foreign_cube(write(slice(20, 90)), system)
     assert ml.io.foreign_cube(write(slice(20, 90)), system, start_ns=20.0).histogram[0, 0, 0, 20:90].sum() == 70
-    with pytest.raises(ValueError, match=r"which is no bin of 0\.5 ns"):
+    with pytest.raises(ValueError, match=r"which is not the bin width of 0\.5 ns"):
         ml.io.foreign_cube(write(slice(None)), system.replace(bins=200))

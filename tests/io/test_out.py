@@ -71,7 +71,7 @@ def test_labelled_arrays_that_do_not_fit_are_refused() -> None:
         ml.to_xarray(array, SYSTEM, ml.Flux(1.0, 1.0, 1.0))
     with pytest.raises(ValueError, match="must be"):
         ml.to_xarray(array[..., :60], SYSTEM)
-    with pytest.raises(TypeError, match="beside a flux"):
+    with pytest.raises(TypeError, match="need a flux"):
         ml.to_xarray(array, SYSTEM, depth_m=np.ones((2, 3)))
     with pytest.raises(TypeError, match="has its own"):
         ml.to_xarray(io.from_histograms(array, SYSTEM), SYSTEM)

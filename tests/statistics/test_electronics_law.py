@@ -104,6 +104,18 @@ def test_where_one_of_the_two_has_no_effect(dead: float, electronics: float):
     assert pmf_of(result) == pytest.approx(pmf_of(expected), abs=1e-12)
 
 
+@pytest.mark.parametrize("mode", ["nonparalyzable", "gated"])
+@pytest.mark.parametrize("electronics", [0.9, 2.5])
+def test_electronics_behind_no_dead_time_begin_ready_for_either_start(electronics: float, mode: str):
+    gate = {"gate_start_ns": 0.2 * PERIOD_NS, "gate_width_ns": 0.6 * PERIOD_NS} if mode == "gated" else {}
+    system = view(0.0, electronics, "stationary", cycles=5, mode=mode, **gate)
+    light = ml.Flux(2.0, 0.3, 0.5 * PERIOD_NS)
+    law = ml.count_law(light, system)
+    assert mean_histogram(light, system).sum() == pytest.approx(float(law.mean), rel=1e-6)
+    case = Case("no dead time", flux_of(2.0, 0.3, 0.5), system, 4000)
+    check(ENGINES["exact"], case, Law(None, pmf_of(law)), {COUNTS})
+
+
 @pytest.mark.full
 def test_long_exposures_and_cells():
     a, b, c = (ml.count_law(ml.Flux(2.0, 0.3, 50.0), view(0.4, 1.3, cycles=n)) for n in (400, 401, 1_000_000))

@@ -45,7 +45,7 @@ def test_constant_rate(rate: float, dead: float, cycles: int, start: str):
 @pytest.mark.full
 @pytest.mark.parametrize("dead", [0.97, 0.999])
 def test_a_resonance_just_below_the_period_settles_in_any_long_exposure(dead: float):
-    """One pulse blinds until just before the next: locked, but forgotten within a hundred periods; a million here."""
+    """One pulse blinds until just before the next: locked, with a transient of a hundred periods, here of a million."""
     at = system(dead, cycles=1_000_000, sigma=0.00375)
     law = joint_law(ml.Flux(10.0, 0.01, 50.0), at)
     assert 0 <= law.settled < 200

@@ -279,7 +279,7 @@ def test_joint_law_known_to_settle(monkeypatch: pytest.MonkeyPatch):
     """Given up after some 50 of 300 periods, the fall of the distance so far tells when it is within the tolerance."""
     system = view(2.04, 10**7)
     law = ml.joint_law(ml.Flux(4.0, 0.1, 50.0), system)
-    monkeypatch.setattr(pixel_module, "LAW", replace(LAW, forgetting=100_000))
+    monkeypatch.setattr(pixel_module, "LAW", replace(LAW, transient=100_000))
     early = ml.joint_law(ml.Flux(4.0, 0.1, 50.0), system)
     assert early.settled == pytest.approx(law.settled, rel=0.1)
     assert early.settled != law.settled

@@ -20,7 +20,7 @@ def total_variation(a, b):
 
 def mixed(table, result, cycles=None):
     shapes = table.shapes(cycles)
-    return np.stack([w @ shapes[r] for r, w in zip(result.rows, result.weights, strict=True)])
+    return result.mixture(shapes)
 
 
 def test_entries_are_the_exact_statistics():

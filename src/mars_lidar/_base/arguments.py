@@ -238,7 +238,7 @@ def _words(members: tuple[Any, ...]) -> str:
     plain: dict[Any, str] = {_Array: "an array of real numbers", float: "a number", int: "an integer", bool: "a bool"}
     plain |= {Path: "a path", dict: "a mapping", slice: "a slice", collections.abc.Callable: "a callable"}
     sequence = (tuple, list, collections.abc.Sequence, collections.abc.Iterable)
-    said: list[str] = []
+    words: list[str] = []
     for member in members:
         origin = typing.get_origin(member) or member
         if origin is type(None) or (origin is str and Path in members):
@@ -251,9 +251,9 @@ def _words(members: tuple[Any, ...]) -> str:
             word = "a sequence"
         else:
             word = plain.get(origin) or f"{'an' if origin.__name__[0] in 'AEIO' else 'a'} {origin.__name__}"
-        if word not in said:
-            said.append(word)
-    return " or ".join(said)
+        if word not in words:
+            words.append(word)
+    return " or ".join(words)
 
 
 def _described(value: Any) -> str:

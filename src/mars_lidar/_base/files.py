@@ -73,7 +73,7 @@ class Interrupted(KeyboardInterrupt):
 
 
 @contextlib.contextmanager
-def telling(clean_up: Callable[[], str]) -> Iterator[None]:
+def explained(clean_up: Callable[[], str]) -> Iterator[None]:
     """On an error while writing, run `clean_up` and raise `WriteError` or `Interrupted` with the returned text."""
     try:
         yield
@@ -100,11 +100,11 @@ def beside(target: Path, *, folder: bool = False) -> Iterator[Path]:
         _remove(path)
         return f"{target} is what it was before" if target.exists() else f"nothing was left at {target}"
 
-    with telling(removed), contextlib.ExitStack() as lock:
-        with contextlib.suppress(OSError):  # a file system without locks: leftovers are then nobody's to remove
+    with explained(removed), contextlib.ExitStack() as lock:
+        with contextlib.suppress(OSError):  # a file system without locks, on which leftovers are not removed
             lock.enter_context(_held(path))
         yield path
-        if not os.path.samestat(os.lstat(path), created):  # in a shared folder, perhaps by a link
+        if not os.path.samestat(os.lstat(path), created):  # by another program in a shared folder, perhaps by a link
             raise FileExistsError(f"{path} was replaced by another program while it was being written")
         if folder:
             exchange(path, target)
@@ -119,7 +119,7 @@ def write_text(target: Path, text: str) -> None:
 
 
 def _remove_leftovers(target: Path) -> None:
-    """Remove what killed runs left beside `target`: a run that is alive holds a lock."""
+    """Remove the files of killed runs beside `target`, which, unlike those of active runs, are not locked."""
     for leftover in unfinished_of(target):
         with contextlib.suppress(OSError), _held(leftover):
             _remove(leftover)
@@ -228,7 +228,7 @@ def _held(path: Path) -> Iterator[None]:
 
 
 def _created(target: Path, folder: bool) -> Path:
-    """A new empty file or folder beside `target`, of a name that nobody can know before; never a link."""
+    """A new empty file or folder beside `target`, with an unpredictable name; never a link."""
     path = _unused(target)
     if folder:
         os.mkdir(path)
@@ -274,7 +274,7 @@ def check_target(path: Path, *, folder: bool, overwrite: bool) -> None:
         return
     if not overwrite:
         raise FileExistsError(f"{path} exists already; choose another name or give --overwrite (overwrite=True)")
-    # never delete what a slip of the keyboard named: only a store is replaced by a store, a file by a file
+    # a mistyped name must not delete anything: only a store is replaced by a store, and a file by a file
     if folder and not ((path / "zarr.json").is_file() or (path.is_dir() and not any(path.iterdir()))):
         raise FileExistsError(f"{path} exists and is not a Zarr store; it will not be overwritten")
     if not folder and not path.is_file():
@@ -300,7 +300,7 @@ def reading(path: str | Path, kind: str = "file") -> Iterator[Path]:
         check_source(source)
     try:
         yield source
-    except (FileError, ImportError):  # of a door inside of this one; `MissingLibraryError`, which says what to install
+    except (FileError, ImportError):  # of a nested `reading`; `MissingLibraryError`, which names the library to install
         raise
     except Exception as error:
         text = " ".join(str(error).split())
@@ -321,7 +321,7 @@ def reading(path: str | Path, kind: str = "file") -> Iterator[Path]:
 
 
 def _is_ours(error: BaseException) -> bool:
-    """Whether this package raised it: its own words need no comment."""
+    """Whether this package raised it, so that its message needs no addition."""
     if not isinstance(error, ValueError | TypeError):
         return False
     last = error.__traceback__

@@ -47,7 +47,9 @@ GIVEN = ("dead_time_ns", "jitter_ns", "pulse_sigma_ns", *_FIELDS)
 class Estimate:
     """A parameter: its value, standard error, and 95 % interval; the error of a given value is 0.
 
-    `note` states whether it was given, not detected, or not identified.
+    `note` states whether it was given, not detected, or not identified; the interval of a jitter that was not detected
+    begins at 0. The error of a dead time that follows from the shortest interval alone is NaN: its law is not normal,
+    and the interval is stated.
     """
 
     value: float
@@ -556,19 +558,15 @@ def _estimates(fitted: Fitted, growth: FloatArray) -> dict[str, Estimate]:
     covariance = fitted.covariance * np.outer(scale, scale)
     drawn = draws(model, fitted.unbounded, covariance, fitted.free)
     centre, names = model.bounded(fitted.theta), model.names
-    if drawn is None:  # the estimate lies beyond what a detector can have
-        drawn = np.tile(centre, (2000, 1))
-        drawn[:, fitted.free] = np.random.default_rng(0).multivariate_normal(centre[fitted.free], covariance, 2000)
-        drawn = model.bounded(drawn)
     k = model.light
     free = {names[i] for i in fitted.free}
     out: dict[str, Estimate] = {}
 
-    def put(name: str, value: float, sample: FloatArray, *needs: str, note: str = "") -> None:
+    def put(name: str, value: float, sample: FloatArray, *needs: str, note: str = "", limit: bool = False) -> None:
         if not free & set(needs):
             out[name] = Estimate(value, 0.0, value, value, "given")
             return
-        low, high = np.quantile(sample, (0.025, 0.975))
+        low, high = (0.0, np.quantile(sample, 0.95)) if limit else np.quantile(sample, (0.025, 0.975))
         out[name] = Estimate(value, float(((sample - value) ** 2).mean() ** 0.5), float(low), float(high), note)
 
     light = names[0] if model.returns else "light"  # all of it
@@ -590,7 +588,7 @@ def _estimates(fitted: Fitted, growth: FloatArray) -> dict[str, Estimate]:
         put("width_ns", float(centre[k]), drawn[:, k], "width")
         shared = note if note.startswith("not identified") else ""
         put("pulse_sigma_ns", pulse, pulses, "width", note=shared)
-    put("jitter_ns", jitter, jitters, "jitter", note=note)
+    put("jitter_ns", jitter, jitters, "jitter", note=note, limit=bool(note))  # equal tails would leave out none at all
     at = k + 3
     dead, observed = drawn[:, k + 2], float(centre[k + 2])
     for effect in model.effects:
@@ -609,7 +607,10 @@ def _estimates(fitted: Fitted, growth: FloatArray) -> dict[str, Estimate]:
         elif not effect.onoff:
             put(effect.names[0], float(values[0]), columns[:, 0], effect.names[0])
         at += len(effect.names)
-    if "dead_time_ns" not in out:
+    if fitted.by_shortest is not None:
+        value, low, high = fitted.by_shortest
+        out["dead_time_ns"] = Estimate(value, np.nan, low, high, "by the shortest interval alone")
+    elif "dead_time_ns" not in out:
         put("dead_time_ns", observed, dead, "dead_time_ns")
     return out
 

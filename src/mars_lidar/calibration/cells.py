@@ -22,10 +22,10 @@ class Cells:
     """Counts of a stream: phases; intervals; (interval, phase at its begin, does it end in a pulse).
 
     The edges are set by simulated streams, never by the data, which would bias the counts. The shortest intervals are
-    resolved down to `least` counts in the exposure, to locate the end of the dead time.
+    resolved down to 0.7 counts in the exposure, to locate the end of the dead time.
     """
 
-    def __init__(self, model: Model, theta: FloatArray, pilot: list[FloatArray], photons: float, least: float) -> None:
+    def __init__(self, model: Model, theta: FloatArray, pilot: list[FloatArray], photons: float) -> None:
         period, unit = model.clock.period_ns, model.clock.unit_ns
         gaps = np.sort(np.concatenate([np.diff(t) for t in pilot]))
         phases = np.concatenate([t / period - np.floor(t / period) for t in pilot])
@@ -38,7 +38,7 @@ class Cells:
             inside |= (centre - low) % 1.0 < (high - low) % 1.0
         self.phases = edges.size + 1
         ratio = gaps.size / max(photons, 1.0)
-        fine = max(least, 2.0 / ratio) * 1.5 ** np.arange(60)
+        fine = max(0.7, 2.0 / ratio) * 1.5 ** np.arange(60)
         tail = 0.2 * 0.5 ** np.arange(1, 6)
         quantiles = np.r_[np.linspace(0.2, 0.8, 7), 1.0 - tail]
         rank = np.r_[fine[fine < 0.15 * photons], photons * quantiles] * ratio

@@ -18,6 +18,7 @@ from mars_lidar._base.types import FloatArray, NDArray
 from mars_lidar.calibration.cells import Cells
 from mars_lidar.calibration.model import Effect, Model
 from mars_lidar.calibration.recording import FALSE_ALARM, Recording
+from mars_lidar.calibration.shortest import Shortest, shortest_law
 
 LIGHTS = 16  # streams of one detector, in one call of the engine
 _NEAR = 3.0  # standard errors of the recording about the estimate, from which the last streams are drawn
@@ -211,6 +212,7 @@ class Fitted:
     misfit_z: float  # standard deviations of the misfit above that of fresh streams
     p_value: float
     converged: bool
+    by_shortest: tuple[float, float, float] | None  # the dead time and its interval, where no count tells it
 
 
 def most_probable(model: Model, theta: FloatArray, covariance: FloatArray, free: NDArray[np.intp]) -> FloatArray:
@@ -235,13 +237,15 @@ def most_probable(model: Model, theta: FloatArray, covariance: FloatArray, free:
     return model.bounded(theta)
 
 
-def draws(model: Model, theta: FloatArray, covariance: FloatArray, free: NDArray[np.intp]) -> FloatArray | None:
-    """Parameters (n, p) of that law, or None where hardly any lies within the bounds."""
+def draws(model: Model, theta: FloatArray, covariance: FloatArray, free: NDArray[np.intp]) -> FloatArray:
+    """Parameters (n, p) of that law; where hardly any lies within the bounds, of one about what is most probable."""
     root = root_of(covariance)
     rows = np.tile(theta, (Effort.draws, 1))
     rows[:, free] += np.random.default_rng(0).standard_normal((Effort.draws, len(free))) @ root.T
     inside = (np.abs(model.bounded(rows) - rows)[:, free] <= 1e-12 * np.abs(theta[free])).all(1)
-    return rows[inside] if inside.sum() >= 200 else None
+    if inside.sum() >= 200:
+        return rows[inside]
+    return model.bounded(rows + most_probable(model, theta, covariance, free) - theta)
 
 
 def _inverse(fisher: FloatArray, prior: FloatArray, root: FloatArray) -> FloatArray:
@@ -264,7 +268,8 @@ class Fit:
     @property
     def shorter(self) -> Fit:
         """A fit whose last batches are as short as those of the steps, to choose between models."""
-        return Fit(self.recording, replace(self.effort, longer=1.0, more=1, recentred=2), (self.next_seed(),))
+        effort = replace(self.effort, longer=1.0, more=1, recentred=2)
+        return Fit(self.recording, effort, (self.next_seed(),))
 
     def next_seed(self) -> int:
         """A seed that no batch has had."""
@@ -274,11 +279,11 @@ class Fit:
         """Laser periods in which the recording has this many photons."""
         return self.recording.exposure * photons / self.recording.photons
 
-    def cells(self, model: Model, theta: FloatArray, photons: float, least: float = 0.7) -> Cells:
-        """Cells of a law for this many photons, by streams at `theta`; `least` intervals in the first, expected."""
+    def cells(self, model: Model, theta: FloatArray, photons: float) -> Cells:
+        """Cells of a law for this many photons, by streams at `theta`."""
         size = self.exposure(self.effort.of(photons))
         pilot = model.streams(np.tile(theta, (LIGHTS, 1)), max(2, round(size)), self.next_seed())
-        return Cells(model, theta, [t for t in pilot if t.size > 2], photons, least)
+        return Cells(model, theta, [t for t in pilot if t.size > 2], photons)
 
     def law(
         self,
@@ -336,51 +341,32 @@ class Fit:
             weighed = grown
         return Guess(model, theta, root, free), misfit, near and weighed >= photons
 
-    def shortest(self, model: Model, theta: FloatArray) -> tuple[float, float]:
-        """Dead time by the shortest interval alone, and its standard error, by streams as long as the recording.
+    def shortest(self, model: Model, rows: FloatArray) -> tuple[float, Shortest] | None:
+        """How probable the shortest interval is by rows (n, p) of parameters, and its law; None beside other effects.
 
-        They are drawn at parameters (p,), or of each of a few (n, p), which are uncertain then and scatter more.
         The fit counts intervals in cells, and does not know where in its cell an interval lies.
         """
-        recorded = min(float(np.diff(piece).min()) for piece in self.recording.pieces)
-        cycles, number = max(2, round(self.recording.exposure)), 4.0 * self.effort.batch / self.recording.photons
-        rows = np.resize(theta, (int(np.clip(number, 4, LIGHTS)), model.size))
-        drawn = [np.diff(model.streams(row[None], cycles, self.next_seed()).times).min(initial=np.inf) for row in rows]
-        later = np.array(drawn) - rows[:, model.light + 2]
-        return recorded - float(later.mean()), float(np.hypot(later.std(ddof=1), model.clock.unit_ns))
+        if model.effects or model.fields:
+            return None
+        k, size = model.light + 2, self.effort.of(float(self.recording.photons))
+        parts = np.array_split(rows[np.argsort(rows[:, k - 1])], 2 * LIGHTS)  # of about the same jitter each
+        middles = np.array([part[len(part) // 2] for part in parts])
+        cycles = max(2, round(self.exposure(size)))
+        law = shortest_law(self.recording, model, middles, cycles, self.next_seed())
+        return law.p_value([part[:, k] for part in parts]), law
 
-    def settled(self, model: Model, theta: FloatArray) -> tuple[float, float]:
-        """That dead time by streams that have it; its error is wider where a shorter one has as long intervals."""
-        at, k = theta.copy(), model.light + 2
-        for _ in range(3):
-            (dead, error), before = self.shortest(model, at), float(at[k])
-            at[k] = dead
-        error = float(np.hypot(error, dead - before))
-        at[k] -= 3.0 * error
-        slope = (self.shortest(model, at)[0] - at[k]) / (3.0 * error)
-        return dead, error / float(np.clip(slope, 0.05, 1.0))
-
-    def finish(self, guess: Guess, again: bool = True, known: tuple[float, float] | None = None) -> Fitted:
+    def finish(self, guess: Guess, again: bool = True, known: bool = False) -> Fitted:
         """The last estimate, and what fresh streams about it say of its slope, bias, scatter and misfit.
 
-        Where the shortest interval refuses it, it is made once more with the dead time `known` by that, its mean and
-        standard deviation, and with cells that do not divide the shortest: counts of so few have no normal law.
+        The dead time is `known` by the shortest interval alone where that lies outside of the 95 % interval of the
+        counts, or says more than they do, or where counts hardly change with the dead time on one side of the estimate.
+        Then the others are fitted once more; what one interval says does not show beside the scatter of all counts.
         """
         model, theta, root, free = guess
         photons, effort = float(self.recording.photons), self.effort
         closer = effort.spread / effort.more**0.5  # counts near the end of a dead time are linear over short distances
-        prior, middle, cells = model.precision(free), model.middle(theta), None
-        if known is not None:
-            dead, error = known
-            place = int(np.flatnonzero(free == model.light + 2)[0])
-            gain = root @ root[place] / (root[place] @ root[place])
-            theta, middle, prior = theta.copy(), middle.copy(), prior.copy()
-            theta[free] += gain * (dead - theta[model.light + 2])
-            theta, middle[model.light + 2] = model.bounded(theta), dead
-            prior[place, place] = error**-2.0
-            root = root_of(root @ root.T + (error**2 - root[place] @ root[place]) * np.outer(gain, gain))
-            cells = self.cells(model, theta, photons, _CUMULATED)
-        law = self.law(Guess(model, theta, root, free), photons, cells, closer, effort.more, effort.longer)
+        prior, middle = model.precision(free), model.middle(theta)
+        law = self.law(Guess(model, theta, root, free), photons, None, closer, effort.more, effort.longer)
         nearby = _NEAR * (effort.of(photons, effort.longer) / photons) ** 0.5
         gain = law.estimator(free)
         recorded = law.cells.of(self.recording)
@@ -414,48 +400,106 @@ class Fit:
                 break
             root = root_of(cov)
             centre = centre + (mean - centre) / max(1.0, float(size.max()) / _NEAR)
+        if any(model.names[index].startswith("log_") for index in free):
+            counted, observed = (y - near.offset) @ gain.T, gain @ (recorded - near.offset)
+            raw, cov = _curved(model, free, raw, cov, centre, moved, counted, observed, near.ratio)
+            mean = most_probable(model, raw, cov, free)
         sd = np.sqrt(np.diag(cov))
         if again and (np.abs((centre - theta)[free]) > _NEAR * sd).any():  # cells and weights were laid elsewhere
-            return self.finish(Guess(model, centre, root_of(cov), free), again=False)
+            return self.finish(Guess(model, centre, root_of(cov), free), False, known)
         jacobian = law.slope[:, free] @ local
         project = np.eye(len(recorded)) - jacobian @ estimator
         fresh = near.residual @ project.T
         fresh = (fresh - fresh.mean(0)) / np.sqrt(near.ratio) * np.sqrt(len(y) / (len(y) - terms.shape[1]))
         rest = project @ (recorded - near.offset)
-        (z, p), (dead, scatter) = _misfit(rest, fresh, law, near), self.shortest(model, mean)
-        error = float(sd[free == model.light + 2].sum())  # 0 where it is given
-        early, more = _extreme(dead - mean[model.light + 2], scatter, error), 0.0
-        if early < FALSE_ALARM and (rows := draws(model, raw, cov, free)) is not None:
-            # a jitter that is not known makes the shortest interval uncertain too
-            further, total = self.shortest(model, rows[:: len(rows) // LIGHTS][:LIGHTS])
-            more = max(total**2 - scatter**2, 0.0) ** 0.5
-            early = max(early, _extreme(further - mean[model.light + 2], scatter, float(np.hypot(error, more))))
-        if early < FALSE_ALARM and known is None:
-            other = None
-            if error:
-                least, own = self.settled(model, mean)
-                last = Guess(model, mean, root_of(cov), free)
-                other = self.finish(last, again=False, known=(least, float(np.hypot(own, more))))
-            if other is not None and other.converged and other.p_value > FALSE_ALARM:
-                return other
-            p = min(p, early)
-        scatter, converged = solve @ noise @ solve.T / near.ratio, bool(size.max() < _NEAR)
+        (z, p), timed = _misfit(rest, fresh, law, near), free == model.light + 2
+        uneven = timed.any() and _uneven(solve @ gain @ (y - near.offset).T, moved, timed)
+        judged, interval = self.shortest(model, draws(model, raw, cov, free)), None
+        if judged is not None:
+            early, shortest = judged
+            dead = shortest.dead_time()
+            if timed.any() and (early < 0.05 or uneven or sd[timed][0] > dead[2] - dead[1]):
+                at = mean.copy()
+                at[model.light + 2] = dead[0]
+                own = Guess(model, at, root_of(cov[np.ix_(~timed, ~timed)]), free[~timed])
+                other = self.finish(self.steps(own, photons, photons / 6.0)[0], known=True)
+                if other.converged and other.p_value > FALSE_ALARM:
+                    return other
+            if known:
+                interval, mean[model.light + 2] = dead, dead[0]
+            elif early < FALSE_ALARM:
+                p = min(p, early)
+        scatter, converged = solve @ noise @ solve.T / near.ratio, bool(size.max() < _NEAR) and not uneven
         return Fitted(
-            model, free, mean, cov, raw, scatter, law, near.offset, estimator, jacobian, rest, fresh, z, p, converged
+            model,
+            free,
+            mean,
+            cov,
+            raw,
+            scatter,
+            law,
+            near.offset,
+            estimator,
+            jacobian,
+            rest,
+            fresh,
+            z,
+            p,
+            converged,
+            interval,
         )
 
 
-def _extreme(off: float, scatter: float, error: float) -> float:
-    """Probability that the shortest interval is `off` its mean, which has an error of its own, by as much.
+def _uneven(estimates: FloatArray, moved: FloatArray, which: NDArray[np.bool_]) -> bool:
+    """Whether estimates (free, streams) follow the parameter `which` on one side much less than on the other.
 
-    It is that of the sum of a normal law and one whose tail is exponential, as that of an extreme value is at most.
+    A normal law about the centre holds on neither side then: of dead times between two pulses, no interval tells.
     """
-    from scipy.special import log_ndtr, ndtr
+    x = moved[:, which]
+    terms = np.c_[np.ones(len(moved)), moved, np.abs(x)]
+    inverse = np.linalg.pinv(terms.T @ terms)
+    y = estimates[which][0]
+    slope = inverse @ terms.T @ y
+    error = float((y - terms @ slope).std() * inverse[-1, -1] ** 0.5)
+    along, kink = float(slope[1:-1][which][0]), abs(float(slope[-1]))
+    return along - kink + _NEAR * error < (along + kink) / _NEAR
 
-    rate, sd = np.pi / 6.0**0.5 / scatter, max(error, 1e-12)
-    z = (abs(off) + 1.0 / rate) / sd  # from the begin of the exponential law, whose mean is zero
-    tail = np.exp(0.5 * (rate * sd) ** 2 - rate * sd * z + log_ndtr(z - rate * sd))
-    return min(1.0, 2.0 * float(ndtr(-z) + tail))
+
+def _curved(
+    model: Model,
+    free: NDArray[np.intp],
+    raw: FloatArray,
+    cov: FloatArray,
+    centre: FloatArray,
+    moved: FloatArray,
+    counted: FloatArray,
+    observed: FloatArray,
+    ratio: float,
+) -> tuple[FloatArray, FloatArray]:
+    """Mean (p,) and covariance (free, free) of parameters of which the last one, a logarithm, acts by its square too.
+
+    Estimates `counted` (streams, free) of streams at parameters `moved` from the centre are a law with the squares of
+    the logarithm and its products with the size; draws of the linear law are weighed by it, where `observed` was.
+    """
+    rows = draws(model, raw, 2.25 * cov, free)
+    at = (rows - centre)[:, free]
+
+    def terms(x: FloatArray) -> FloatArray:
+        return np.asarray(np.c_[np.ones(len(x)), x, x[:, -1:] * x[:, -2:]])
+
+    law, own = terms(moved), terms(at)
+    inverse = np.linalg.pinv(law.T @ law)
+    slope = inverse @ law.T @ counted
+    rest = counted - law @ slope
+    scale = (len(law) - law.shape[1]) / (1.0 / ratio + np.einsum("ki,ij,kj->k", own, inverse, own))
+    off, out = observed - own @ slope, (rows - raw)[:, free]
+    log = np.einsum("ki,ij,kj->k", out, np.linalg.inv(2.25 * cov), out) + len(free) * np.log(scale)
+    log -= scale * np.einsum("ki,ij,kj->k", off, np.linalg.inv(rest.T @ rest), off)
+    weight = np.exp(0.5 * (log - log.max()))
+    mean = np.average(at, axis=0, weights=weight)
+    theta = centre.copy()
+    theta[free] += mean
+    return theta, np.atleast_2d(np.cov(at.T, aweights=weight))
 
 
 def _misfit(rest: FloatArray, fresh: FloatArray, law: Batch, near: Batch) -> tuple[float, float]:

@@ -13,6 +13,7 @@ import numpy as np
 from mars_lidar._base.native import _core
 from mars_lidar._base.types import FloatArray, NDArray
 from mars_lidar.calibration.recording import Clock
+from mars_lidar.engines.simulation import simulate_timestamps
 from mars_lidar.instrument.avalanches import Afterpulsing
 from mars_lidar.instrument.detector import Detector
 from mars_lidar.instrument.effects import Jitter
@@ -20,7 +21,6 @@ from mars_lidar.instrument.pulse import GaussianPulse, Pulse
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.light.timestamps import DrawnTimestamps
-from mars_lidar.simulation import simulate_timestamps
 
 _NARROWEST = 2e-6  # periods: the narrowest pulse that the engines draw
 _WIDEST = 0.3  # sigma of a recorded pulse, periods: a wider one is hardly told from background
@@ -232,7 +232,8 @@ class Model:
         least = _NARROWEST * self.clock.period_ns
         if jitter and sd > least:
             fields["jitter"] = Jitter(sigma_ns=sd)
-        pulse = self.pulse or GaussianPulse(sigma_ns=float(f"{max(sigma, least):.9g}"))
+        sigma = max(sigma, least) if self.returns else _WIDEST * self.clock.period_ns  # no light has that pulse
+        pulse = self.pulse or GaussianPulse(sigma_ns=float(f"{sigma:.9g}"))
         return System(
             period_ns=self.clock.period_ns, cycles=cycles, bins=bins, pulse=pulse, detector=Detector(**fields)
         )
@@ -250,7 +251,7 @@ class Model:
         delay = np.stack([rows[None, :, 2 + 2 * r] % period for r in range(self.returns)])
         return Flux(signal, back, delay) if self.returns > 1 else Flux(signal[0], back, delay[0])
 
-    def _varied(self, flux: Flux, cycles: int, seed: int) -> Flux:
+    def varied(self, flux: Flux, cycles: int, seed: int) -> Flux:
         """The light with shapes that are as uncertain as the waveform; the same where that is known."""
         if self.waveform is None or self.waveform_error is None or flux.waveform is None:
             return flux
@@ -260,7 +261,9 @@ class Model:
         shape = np.random.default_rng(seed).gamma(self.waveform / scale, size=flux.waveform.shape) * scale
         return Flux(waveform=light * shape / shape.sum(-1, keepdims=True))
 
-    def streams(self, rows: FloatArray, cycles: int, seed: int, extra: tuple[Effect, ...] = ()) -> Streams:
+    def streams(
+        self, rows: FloatArray, cycles: int, seed: int, extra: tuple[Effect, ...] = (), jitter: bool = True
+    ) -> Streams:
         """Recorded times of a stream for each row of (rows, p); the detector is that of the first row, but its jitter.
 
         The jitter of a recorded time is drawn here, a normal deviate each, so that it may differ from row to row and
@@ -270,9 +273,9 @@ class Model:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a trial value may look like one in another unit
             system = self.system(rows[0], cycles, extra=extra, jitter=False)
-            flux = self._varied(self.flux(rows), cycles, seed)
+            flux = self.varied(self.flux(rows), cycles, seed)
             made = cast(DrawnTimestamps, simulate_timestamps(flux, system, seed=seed, threads=1))
-        sigma = self.widths(rows)[1].copy()
+        sigma = self.widths(rows)[1] * jitter
         sigma[sigma <= _NARROWEST * self.clock.period_ns] = 0.0
         number = made.phase.size if sigma.any() else 0
         deviates = np.random.default_rng(seed).standard_normal(number, dtype=np.float32)

@@ -10,6 +10,7 @@ from itertools import pairwise
 import numpy as np
 
 from mars_lidar._base import checks
+from mars_lidar._base.cached import cached_property
 from mars_lidar._base.types import ArrayLike, FloatArray
 from mars_lidar.light.timestamps import Timestamps
 
@@ -72,6 +73,11 @@ class Recording:
     def exposure(self) -> float:
         """Laser periods of all stretches."""
         return float(sum(self.cycles))
+
+    @cached_property
+    def shortest(self) -> float:
+        """The shortest interval, ns."""
+        return min(float(np.diff(piece).min()) for piece in self.pieces)
 
     def unevenness(self, window: float) -> tuple[float, int, float]:
         """Half the mean squared difference of counts in successive windows of so many periods, their number, mean."""

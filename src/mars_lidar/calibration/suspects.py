@@ -132,15 +132,16 @@ def _best(fit: Fit, fitted: Fitted, tried: list[Score], limit: float) -> Refit |
     final, named = best
     if named.z > limit:  # of electronics the size may be wide: a short dead time of the detector acts as a long one
         return best
-    own = len(fitted.free)
-    if not named.effect.onoff and final.theta[fitted.model.size] > limit * final.covariance[own, own] ** 0.5:
+    plain = final.free < fitted.model.size
+    size = final.theta[fitted.model.size]
+    if not named.effect.onoff and size > limit * final.covariance[~plain][:, ~plain][0, 0] ** 0.5:
         return best
     if fitted.p_value >= _MISFIT * final.p_value:
         return None
     # neither score nor size: the refit may have gone where the effect is not needed either
-    start = Guess(fitted.model, final.theta[: fitted.model.size], root_of(final.covariance[:own, :own]), fitted.free)
-    plain = fit.shorter.finish(start)
-    return (plain, None) if plain.converged and plain.p_value > _MISFIT * final.p_value else best
+    root = root_of(final.covariance[np.ix_(plain, plain)])
+    other = fit.shorter.finish(Guess(fitted.model, final.theta[: fitted.model.size], root, final.free[plain]))
+    return (other, None) if other.converged and other.p_value > _MISFIT * final.p_value else best
 
 
 def _stepped(fit: Fit, fitted: Fitted, score: Score) -> tuple[float, Guess] | None:
@@ -156,10 +157,11 @@ def _stepped(fit: Fit, fitted: Fitted, score: Score) -> tuple[float, Guess] | No
     own = np.sqrt(np.diag(fitted.covariance))
     spread[fitted.free] = np.minimum(spread[fitted.free], np.maximum(8.0 * own, 1e-12))
     more = [] if effect.onoff else range(fitted.model.size, model.size)
-    free = np.r_[fitted.free, np.array(more, np.intp)].astype(np.intp)
+    timed = [] if fitted.by_shortest is None else [fitted.model.light + 2]
+    free = np.r_[np.union1d(fitted.free, timed), more].astype(np.intp)
     photons = float(fit.recording.photons)
     try:
-        if fitted.model.light + 2 in fitted.free:  # which has taken up what it could of the effect
+        if fitted.model.light + 2 in free:  # which has taken up what it could of the effect
             gaps = np.diff(fit.recording.pieces[0][: 12 * fit.effort.first])
             theta = with_edge(fit, model, theta, np.sort(gaps))
         guess, misfit, _ = fit.steps(Guess(model, theta, np.diag(spread[free]), free), photons, photons / 6.0)

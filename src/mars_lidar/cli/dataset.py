@@ -166,10 +166,10 @@ def generate(
         raise ValueError("--part and --finish go on with the store: no SOURCE, --resume or --overwrite")
     if part is not None:
         with progress_bar("generating") as progress:
-            tell(dataset.make_part(out, _part(part), threads=threads, progress=progress))
+            print_result(dataset.make_part(out, _part(part), threads=threads, progress=progress))
         return None
     if finish:
-        tell(dataset.finish(out))
+        print_result(dataset.finish(out))
         return None
     of_systems = bool(system) or changes != SystemChanges() or effects != Effects()
     replaced = {
@@ -192,16 +192,16 @@ def generate(
     if (dry_run or begin) and recipe is None:
         raise ValueError(f"--{'dry-run' if dry_run else 'begin'} needs a SOURCE")
     if dry_run and recipe is not None:
-        return tell_estimate(dataset.estimate(recipe, out, threads=threads))
+        return print_estimate(dataset.estimate(recipe, out, threads=threads))
     where: dict[str, Any] = {"resume": resume, "overwrite": overwrite, "workers": workers, "scheduler": scheduler}
     if begin and recipe is not None:
-        tell(dataset.begin(recipe, out, **where))
+        print_result(dataset.begin(recipe, out, **where))
         return None
     here = workers is None and scheduler is None and not (resume and out.exists())
     if here and recipe is not None and (advice := str(dataset.quick_advice(recipe, threads))):
         say(advice)
     with progress_bar("generating") as progress:
-        tell(dataset.generate(recipe, out, threads=threads, progress=progress, **where))
+        print_result(dataset.generate(recipe, out, threads=threads, progress=progress, **where))
     return None
 
 
@@ -374,7 +374,7 @@ def dataset_rows(path: Path) -> list[tuple[str, str]] | None:
     ]
 
 
-def tell(done: Generated) -> None:
+def print_result(done: Generated) -> None:
     """What `generate` did."""
     exposures = math.prod(done.shape[:4])
     busy = done.simulate_s + done.write_s
@@ -390,15 +390,15 @@ def tell(done: Generated) -> None:
             "left out": files(len(done.problems)),
         }
     )
-    _tell_problems(done.problems)
+    _print_problems(done.problems)
 
 
-def _tell_problems(problems: tuple[Problem, ...]) -> None:
+def _print_problems(problems: tuple[Problem, ...]) -> None:
     for problem in problems:
         say(f"left out: {problem}")
 
 
-def tell_estimate(expected: Estimate) -> int | None:
+def print_estimate(expected: Estimate) -> int | None:
     """Print the estimate of `--dry-run`; exit code 2 if the disk is too small."""
     shards = f"{expected.shards:,} shard{'s' * (expected.shards > 1)}"
     rows = [
@@ -413,7 +413,7 @@ def tell_estimate(expected: Estimate) -> int | None:
     if expected.free_bytes is not None:
         rows.append(("disk", f"{_bytes(expected.free_bytes)} free{': NOT ENOUGH' if short else ''}"))
     table(rows)
-    _tell_problems(expected.problems)
+    _print_problems(expected.problems)
     return Exit.BAD_INPUT if short else None
 
 

@@ -141,7 +141,7 @@ def reconstruct(
             chosen = keep or "strongest", from_ns or 0.0, attenuation or own
             timed = {name: replace(each, result=keep_return(each.result, *chosen)) for name, each in timed.items()}
         else:
-            _tell_reflection(stored, timed)
+            _warn_of_reflection(stored, timed)
         results = {name: each.result for name, each in timed.items()}
         _show(stored, timed)  # first: a disk that is full takes nothing from what is known
         save_maps(out, results, source=str(cube), overwrite=overwrite)
@@ -175,7 +175,7 @@ def _with_false_alarm(names: list[str], false_alarm: float | None) -> list[str |
     return [MaximumLikelihood(false_alarm=share) if name == "maximum_likelihood" else name for name in names]
 
 
-def _tell_reflection(cube: Cube, timed: dict[str, Timed]) -> None:
+def _warn_of_reflection(cube: Cube, timed: dict[str, Timed]) -> None:
     """A warning where most first returns stand in the same few bins and there is light beyond."""
     first = next(iter(timed.values())).result
     common = common_delay(first)

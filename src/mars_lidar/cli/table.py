@@ -210,8 +210,8 @@ def _laws(stored: Table) -> str:
     if stored.method == "mars":
         return "none: the paper's count is a Gaussian"
     if not number:
-        return "none kept: four cumulants fix the law of every entry, or the file is of an older format"
-    return f"{number:,} of {entries:,} entries keep the law of their count, {stored.laws.pmf.nbytes / 1e6:,.3g} MB"
+        return "none: four cumulants determine the law of every entry"
+    return f"{number:,} of {entries:,} entries have the law of their count, {stored.laws.pmf.nbytes / 1e6:,.3g} MB"
 
 
 def _line(path: Path) -> str:

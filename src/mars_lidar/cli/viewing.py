@@ -170,12 +170,12 @@ def _rows(cube: Cube) -> dict[str, str]:
     if recipe.source:
         rows["source" if cube.measured else "scene"] = recipe.source
     place = cube.url or str(cube.path)
-    mine = f"mars_lidar.io.load({place!r})"
+    call = f"mars_lidar.io.load({place!r})"
     if not cube.complete:
-        mine = f"{mine[:-1]}, allow_incomplete=True)"
+        call = f"{call[:-1]}, allow_incomplete=True)"
     elif place.endswith(".zarr"):
-        mine += f"  or  xarray.open_zarr({place!r})"
-    rows["open with"] = mine
+        call += f"  or  xarray.open_zarr({place!r})"
+    rows["open with"] = call
     return rows
 
 

@@ -13,7 +13,7 @@ from mars_lidar.io.zarr_store import blosc, consolidated
 
 FORMAT = "mars-lidar dataset"
 FORMAT_VERSION = 1  # of datasets whose scenes are one surface each, in clear air
-MORE_VERSION = 2  # of others, which an older mars-lidar must not take for such
+MORE_VERSION = 2  # of other datasets, which older versions of mars-lidar must not read
 DIMS = ("sample", "realization", "y", "x", "time")
 PHOTONS = "photons per laser period"
 MAPS = {

@@ -22,9 +22,9 @@ from mars_lidar.dataset.run import BUFFER_BYTES, making_bytes, read_recipe
 from mars_lidar.dataset.scenes import Content, Rendered
 from mars_lidar.dataset.shard import packer
 from mars_lidar.dataset.sources import Candidate, candidates, scenes
+from mars_lidar.engines.simulation import simulate
 from mars_lidar.io.scene_files import Problem
 from mars_lidar.io.simulated_file import Advice, advice
-from mars_lidar.simulation import simulate
 
 _SCENES, _PROBES = 4, 8
 _BASE_BYTES = 220 * 2**20  # of the interpreter with NumPy, SciPy and Zarr
@@ -93,20 +93,20 @@ def estimate(
     parent = None if out is None or url_of(out) is not None else Path(out).absolute().parent
     if parent is not None and not parent.is_dir():
         raise FileNotFoundError(f"out must lie in an existing folder, got {str(out)!r}")
-    plan, listed, problems, looked, each_s = _looked_at(recipe)
-    if not looked:
+    plan, listed, problems, contents, each_s = _read_some(recipe)
+    if not contents:
         raise ValueError(
             "none of the scenes looked at can be used:\n" + "\n".join(f"  {each}" for each in problems[:5])
         )
     number = len(listed) * (plan.crops if plan.crop else 1)
     total = count_samples(plan, number)
-    image = looked[0].shape
+    image = contents[0].shape
     shape, dtype, chunk, shard = histogram_blocks(plan, total, image)
-    seconds, ratio = _probe(plan, looked, chunk, shard[1], dtype)
+    seconds, ratio = _probe(plan, contents, chunk, shard[1], dtype)
     dense = math.prod(shape) * dtype.itemsize
     pixels = math.prod(image)
-    maps = 4 * len(MAPS) * pixels * total + sum(map(_scene_bytes, looked)) // len(looked) * number
-    parts = max(each.waveform_parts(system) for each in looked for system in plan.systems)
+    maps = 4 * len(MAPS) * pixels * total + sum(map(_scene_bytes, contents)) // len(contents) * number
+    parts = max(each.waveform_parts(system) for each in contents for system in plan.systems)
     block = making_bytes(chunk, dtype.itemsize, parts)
     shards = math.prod(grid(shape, shard))
     teams = max(1, min(team, shards, BUFFER_BYTES // block))
@@ -129,15 +129,15 @@ def quick_advice(recipe: DatasetRecipe | dict[str, Any] | str | Path, threads: i
     """Approximate time of `generate`, from one scene; fast even where a chunk takes minutes."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # generate itself tells them
-        plan, listed, _, looked, each_s = _looked_at(recipe, 1)
-        if not looked:
+        plan, listed, _, contents, each_s = _read_some(recipe, 1)
+        if not contents:
             return Advice(0.0)
         total = count_samples(plan, len(listed) * (plan.crops if plan.crop else 1))
         chosen = sorted({round(k) for k in np.linspace(0, count_samples(plan, 1) - 1, 3)})
         times = []
         for sample in chosen:
             _, system, signal, sbr = sample_parts(plan, sample)
-            flux = looked[0].flux(plan.systems[system], plan.light, signal, sbr)
+            flux = contents[0].flux(plan.systems[system], plan.light, signal, sbr)
             made = plan.realizations * total
             times.append(advice(flux, plan.systems[system], plan.engine, realizations=made, threads=threads))
     reading = each_s * len(listed)
@@ -146,7 +146,7 @@ def quick_advice(recipe: DatasetRecipe | dict[str, Any] | str | Path, threads: i
     )
 
 
-def _looked_at(
+def _read_some(
     recipe: Any, most: int = _SCENES
 ) -> tuple[DatasetRecipe, list[Candidate], list[Problem], list[Content], float]:
     """The recipe, its scenes, what is bad, some scenes of one size, and the seconds that reading one took."""
@@ -172,22 +172,22 @@ def _scene_bytes(content: Content) -> int:
 
 
 def _probe(
-    plan: DatasetRecipe, looked: list[Content], chunk: tuple[int, ...], shard: int, dtype: np.dtype[Any]
+    plan: DatasetRecipe, contents: list[Content], chunk: tuple[int, ...], shard: int, dtype: np.dtype[Any]
 ) -> tuple[float, float]:
     """Seconds of one thread per exposure of a pixel, and bytes on disk over dense bytes.
 
     `shard` exposures of a sample are made one after the other.
     """
     random = np.random.default_rng(0)
-    every = count_samples(plan, len(looked))
+    every = count_samples(plan, len(contents))
     rows, columns = chunk[2], chunk[3]
     seconds, packed, dense, exposures = 0.0, 0, 0, 0
     pack = packer(plan.layout, dtype)
     together = min(shard, plan.realizations)  # exposures that share a flux
     for k, sample in enumerate(random.choice(every, min(every, _PROBES), replace=False)):
         scene, system, signal, sbr = sample_parts(plan, int(sample))
-        flux = looked[scene].flux(plan.systems[system], plan.light, signal, sbr)
-        y, x = (int(random.integers(n - m + 1)) for n, m in zip(looked[0].shape, (rows, columns), strict=True))
+        flux = contents[scene].flux(plan.systems[system], plan.light, signal, sbr)
+        y, x = (int(random.integers(n - m + 1)) for n, m in zip(contents[0].shape, (rows, columns), strict=True))
         began = time.perf_counter()
         part = flux[y : y + rows, x : x + columns]
         seconds += (time.perf_counter() - began) / together

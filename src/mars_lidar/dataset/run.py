@@ -302,9 +302,9 @@ def make_part(
         if dataset.attrs.get("bits") != fingerprint():
             raise ValueError(f"this machine draws other counts than that on which {store} was begun")
         with _explained(store, target):
-            mine = _share(list(dataset.items()), which, of)
-            todo = dataset.missing(mine)
-            totals = _Totals(len(mine) - len(todo), len(mine), callback_of(progress, "generating"))
+            share = _share(list(dataset.items()), which, of)
+            todo = dataset.missing(share)
+            totals = _Totals(len(share) - len(todo), len(share), callback_of(progress, "generating"))
             _make(dataset, _here(dataset, len(todo), threads), todo, totals)
     return totals.generated(target, dataset, time.perf_counter() - began)
 
@@ -388,7 +388,7 @@ def _target(out: str | Path) -> Path:
 
 
 def _crew(workers: int | None, scheduler: str | None) -> AbstractContextManager[Crew | None]:
-    """Workers that are not there before they are needed; ValueError where there cannot be any."""
+    """Workers, which start when they are needed; ValueError where they cannot start."""
     if workers is not None and scheduler is not None:
         raise ValueError("workers start a cluster and scheduler joins one: give one of them")
     if workers is None and scheduler is None:
@@ -405,19 +405,19 @@ def _begun(
     overwrite: bool,
     workers: AbstractContextManager[Crew | None],
 ) -> Iterator[tuple[Path, Dataset, Crew | None]]:
-    """The store that is written, the dataset in it, its scenes read, and who reads and makes it.
+    """Context manager: the store to be written, its dataset with all scenes, and the workers.
 
-    No other process writes the store meanwhile, and errors say what is on the disk.
+    No other process can write the store meanwhile, and errors state what remains on the disk.
     """
     if resume and overwrite:
         raise ValueError("resume and overwrite exclude each other")
     wanted, folder = read_recipe(recipe)
     if not (in_bucket(target) and resume):
         check_target(target, folder=True, overwrite=overwrite or resume)
-    with _alone(target):  # what is there is looked at under the lock: before, another run may have finished it
+    with _alone(target):  # the store is examined under the lock, because another run may just have finished it
         beside = target if in_bucket(target) else successor(target)
         if overwrite and beside.exists():
-            shutil.rmtree(beside)  # of a stopped run that is started again
+            shutil.rmtree(beside)  # of a stopped run that is repeated
         replacing = overwrite and target.exists()  # by a store that is made beside it, or one that was begun so
         store = beside if replacing or (resume and beside.exists()) else target
         there = store.exists() and resume
@@ -450,7 +450,7 @@ def _opened(target: Path) -> tuple[Path, Dataset]:
 
 
 def _in_place(store: Path, target: Path, dataset: Dataset) -> Dataset:
-    """The complete dataset under the name that it was asked for."""
+    """The complete dataset under its final name."""
     if store == target:
         return dataset
     exchange(store, target)
@@ -459,7 +459,7 @@ def _in_place(store: Path, target: Path, dataset: Dataset) -> Dataset:
 
 @contextlib.contextmanager
 def _explained(store: Path, target: Path) -> Iterator[None]:
-    """Errors of the file system, of threads, and Ctrl-C say what is on the disk."""
+    """Context manager: errors of the file system and of threads, and Ctrl-C, state what remains on the disk."""
     try:
         yield
     except KeyboardInterrupt:
@@ -487,13 +487,13 @@ def read_recipe(recipe: DatasetRecipe | dict[str, Any] | str | Path | None) -> t
 
 
 class _Totals:
-    """Adds up what the parts took, and tells how many are there."""
+    """Adds up the times of the parts and reports the progress."""
 
     def __init__(self, done: int, total: int, progress: Progress | None) -> None:
         self._done, self._total, self._progress = done, total, progress
         self._before = done
         if progress is not None:
-            progress(done, total)  # what an earlier run has done, before this one begins
+            progress(done, total)  # the parts of an earlier run
         self.simulate_s = self.write_s = 0.0
 
     def add(self, made: Made) -> None:
@@ -511,7 +511,7 @@ class _Totals:
 
 
 def _make(dataset: Dataset, team: AbstractContextManager[Team], todo: Sequence[Item], totals: _Totals) -> None:
-    """Make parts that are not there."""
+    """Make the missing parts."""
     for item in todo:
         for damaged in dataset.files(item):  # else Zarr would read it before it is replaced
             damaged.unlink(missing_ok=True)
@@ -546,7 +546,7 @@ def _here(dataset: Dataset, parts: int, threads: int | None) -> Iterator[Team]:
         try:
             yield Team(pool, make, lambda: teams)
         except BaseException:
-            stop.set()  # the simulator looks at it every 50 ms, and the pool waits for all threads
+            stop.set()  # the simulator checks it every 50 ms, and the pool waits for all threads
             raise
         for maker in makers:
             maker.notes.write()
@@ -605,7 +605,7 @@ def _check_same(target: Path, dataset: Dataset, wanted: DatasetRecipe | None) ->
 
 
 def _remaining(store: Path, target: Path) -> str:
-    """What is on the disk, for the text of an error."""
+    """Description of what is on the disk, for an error."""
     try:
         dataset = Dataset(store)
         if not dataset.planned:
@@ -624,9 +624,9 @@ def _remaining(store: Path, target: Path) -> str:
 
 @contextlib.contextmanager
 def _alone(target: Path, *, shared: bool = False) -> Iterator[None]:
-    """Hold a lock beside the store while it is written; a lock of a process that was killed holds nobody up.
+    """Context manager: a lock beside the store while it is written; that of a killed process does not block others.
 
-    Processes that make parts of it (`shared`) hold it together.
+    Processes that make parts of the store share it (`shared`).
     """
     if in_bucket(target):  # an object store has no locks
         yield
@@ -646,11 +646,11 @@ def _alone(target: Path, *, shared: bool = False) -> Iterator[None]:
             except OSError:  # a file system without locks
                 pass
             if not (lock.exists() and os.path.samestat(lock.stat(), os.fstat(held.fileno()))):
-                continue  # its owner left, and took the name away, between our opening and our locking
+                continue  # its owner removed the file after it was opened here
             try:
                 yield
             finally:
-                with contextlib.suppress(OSError):  # the last of those that share it takes it away
+                with contextlib.suppress(OSError):  # the last process that shares the lock removes it
                     if shared:
                         fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
                     lock.unlink(missing_ok=True)

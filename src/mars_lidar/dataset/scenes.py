@@ -3,7 +3,7 @@
 The group ``scenes`` is written scene by scene, and read again when a sample needs one::
 
     depth, reflectivity, background  (scene, y, x)         as they were read; of the first layer
-    name                             (scene)               text; (scene, letter) in UTF-8 before 0.3
+    name                             (scene)               text
     kind                             (scene, letter)       JSON: what is more than one surface in clear air
     layer_depth, layer_reflectivity  (scene, layer, y, x)  the other layers
     transient                        (scene, y, x, bin)    rendered light
@@ -89,11 +89,11 @@ class Surfaces:
         return 0 if self.fog is None else TOL.parts_per_bin * system.bins
 
     def flux(
-        self, system: System, light: Light, signal: float, sbr: float, dark: float | None = None, *, tell: bool = False
+        self, system: System, light: Light, signal: float, sbr: float, dark: float | None = None, *, warn: bool = False
     ) -> Flux:
-        """Photons; pixels without return or beyond the range are no matter for every sample, unless to `tell` them."""
+        """Photons; only with `warn`, warnings of pixels without a return or beyond the unambiguous range are shown."""
         with warnings.catch_warnings():
-            if not tell:
+            if not warn:
                 warnings.simplefilter("ignore", UserWarning)
             clear = self.scene.flux(
                 system,
@@ -144,7 +144,7 @@ class Rendered:
         return parts_of(self.transient, system)
 
     def flux(
-        self, system: System, light: Light, signal: float, sbr: float, dark: float | None = None, *, tell: bool = False
+        self, system: System, light: Light, signal: float, sbr: float, dark: float | None = None, *, warn: bool = False
     ) -> Flux:
         """Photons, made row by row as they are used."""
         return self.transient.stored_flux(
@@ -374,8 +374,7 @@ class SceneReader:
     def names(self) -> list[str]:
         """Names of all scenes."""
         with reading(self._path, "scenes of a dataset"):
-            stored = self._group["name"]
-            return _texts(stored) if stored.ndim > 1 else [str(each) for each in stored[...]]  # of a version before
+            return [str(each) for each in self._group["name"][...]]
 
     @cached_property
     def _kinds(self) -> list[str]:

@@ -24,6 +24,7 @@ from mars_lidar.dataset.recipe import DatasetRecipe, pair, read_light, read_scen
 from mars_lidar.dataset.scenes import Content, Rendered, Surfaces
 from mars_lidar.dataset.values import listed_numbers
 from mars_lidar.engines import find_engine
+from mars_lidar.engines.simulation import check_registrations
 from mars_lidar.instrument.system import System
 from mars_lidar.io import rgbd
 from mars_lidar.io.scene_files import BAD_FILE, Problem, SceneFile, scan
@@ -31,7 +32,6 @@ from mars_lidar.io.transient import SUFFIXES, read_transient, read_truth
 from mars_lidar.light.flux import Flux
 from mars_lidar.light.fog import Fog
 from mars_lidar.scene.scene import LayeredScene, Scene
-from mars_lidar.simulation import _check_registrations
 
 _TRIES = 20  # places tried for a crop with a return in it
 _LIGHT = ("bin_ns", "start_ns", "name", "channel")  # keys that tell how a file of rendered light is read
@@ -310,7 +310,7 @@ def _check_levels(scene: Content, recipe: DatasetRecipe) -> None:
             if (y, x) not in pixels:
                 pixels[y, x] = unit[y, x]
             brightest = _at_level(pixels[y, x], signal, signal / sbr, dark)
-            _check_registrations(brightest, system)
+            check_registrations(brightest, system)
             engine.check(brightest, system)
 
 
@@ -406,7 +406,7 @@ def _view(data: Any, system: System, whole: bool) -> View:
         raise RecipeError((), f"there must be one scene: {problem}")
     content = listed[0].load()
     (signal, sbr), maps = light.levels[0], (content.depth_m, content.reflectivity)
-    flux = content.flux(system, light, signal, sbr, tell=True)
+    flux = content.flux(system, light, signal, sbr, warn=True)
     depth, share = (None if np.isnan(values).all() else values for values in maps)
     kind = next(name for name in ("example", "depth", "path", "transient") if name in given)
     image = f", image {entry['image']}" if "image" in entry else ""

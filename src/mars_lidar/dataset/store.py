@@ -201,7 +201,7 @@ class Dataset:
 
         return [item for item in (self.items() if items is None else items) if not whole(item)]
 
-    def gone(self) -> list[Path]:
+    def missing_files(self) -> list[Path]:
         """Missing files."""
         if in_bucket(self.path):
             return [file for item in self.missing() for file in self.files(item)]
@@ -249,8 +249,8 @@ class Dataset:
 
     def finish(self) -> None:
         """Mark the store complete, with one replacement of its root document, after its manifest."""
-        if gone := self.gone():
-            raise FileNotFoundError(f"{gone[0]} was removed while the others were made, the first of {len(gone)}")
+        if lost := self.missing_files():
+            raise FileNotFoundError(f"{lost[0]} was removed while the others were made, the first of {len(lost)}")
         if "consolidated_metadata" not in manifest.root_document(self.path):  # stopped just before it
             mark(self.group, {})
         noted = self.written()
@@ -359,8 +359,10 @@ def read_sparse(dataset: Dataset | str | Path, sample: int, realization: int = 0
     for y, x in np.ndindex(grid((height, width), (rows, columns))):
         position, count = events(_packed(source, (sample // chunk[0], realization // chunk[1], y, x, 0)))
         first, second, row, column, time = np.unravel_index(position, chunk)
-        mine = (first == sample % chunk[0]) & (second == realization % chunk[1])
-        parts.append(((y * rows + row[mine]) * width + x * columns + column[mine], time[mine], count[mine]))
+        selected = (first == sample % chunk[0]) & (second == realization % chunk[1])
+        parts.append(
+            ((y * rows + row[selected]) * width + x * columns + column[selected], time[selected], count[selected])
+        )
     row, column, count = (np.concatenate(column) for column in zip(*parts, strict=True))
     if columns < width:
         order = np.lexsort((column, row))

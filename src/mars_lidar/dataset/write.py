@@ -19,13 +19,13 @@ from mars_lidar.dataset.arrays import MAPS, sample_parts, with_zeros
 from mars_lidar.dataset.scenes import Content
 from mars_lidar.dataset.shard import DigestNotes, chunks_of, packer, write_shard
 from mars_lidar.dataset.store import Dataset, Item
+from mars_lidar.engines.simulation import simulate
 from mars_lidar.instrument.detector import Detector
 from mars_lidar.instrument.pulse import GaussianPulse
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
-from mars_lidar.simulation import simulate
 
-_KEPT = 4  # scenes and fluxes that a maker remembers: neighbours in the order of parts share them
+_KEPT = 4  # cached scenes and fluxes: consecutive parts use the same ones
 
 
 class Stopped(Exception):

@@ -1,4 +1,4 @@
-"""Engines, one file each, by the names of the argument `engine` of `simulate`."""
+"""`simulate`, and the engines by the names of its argument `engine`, one file each."""
 
 from mars_lidar.engines.engine import Engine, EngineOptions
 from mars_lidar.engines.mars import MarsEngine

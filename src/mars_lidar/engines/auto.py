@@ -43,12 +43,14 @@ class AutoEngine(Engine):
         each = np.where(judged_alone(task, every), TOL.judged_even, TOL.cell_even)
         many = registrations > each * task.system.bins
         pixels = every[many]
-        plan = Plan.of(task, pixels)
-        laps = plan.grids.laps()
-        each = np.where(laps > 1, TOL.lap_even * laps, TOL.cell_even)
-        worth = registrations[pixels] > each * plan.grids.cells()
-        many[pixels[~worth]] = False
-        plan = plan.part(worth)
+        plan = None
+        if task.system.dead_time_periods > 0.0:  # without, bins are Poisson numbers and need no grid
+            plan = Plan.of(task, pixels)
+            laps = plan.grids.laps()
+            each = np.where(laps > 1, TOL.lap_even * laps, TOL.cell_even)
+            worth = registrations[pixels] > each * plan.grids.cells()
+            many[pixels[~worth]] = False
+            plan = plan.part(worth)
         share = float(many.mean())
         first, second = (replace(task, progress=stage(task.progress, *part)) for part in ((0.0, share), (share, 1.0)))
         lap_cells = registrations[many] / TOL.lap_even

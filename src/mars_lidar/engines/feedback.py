@@ -50,14 +50,14 @@ class Grids:
     def coarsest(cls, task: Task, number: int) -> Grids:
         """The widest cells that the sweeps allow, for `number` pixels."""
         start = coarsest(task.system)
-        of = np.full(number, 0 if cells_of(start) <= TOL.cells else -1)
+        of = np.full(number, 0 if drawable(start) else -1)
         return cls([start], of, np.zeros(number, np.int64), np.full(number, float(task.system.cycles)))
 
     @classmethod
     def checked(cls, task: Task, pixels: IndexArray) -> Grids:
         """The grids of `pixels` (n,) of a task: each depends on the pixel and the system alone."""
         grids, start = cls.coarsest(task, pixels.size), coarsest(task.system)
-        if cells_of(start) > TOL.cells:
+        if not drawable(start):
             return grids
         alone = judged_alone(task, pixels)
         numbers = {start.tobytes(): 0}
@@ -112,6 +112,11 @@ def cells_of(kinds: KindArray) -> int:
     return int((1 << kinds.astype(np.int64)).sum())
 
 
+def drawable(kinds: KindArray) -> bool:
+    """Whether the kernels have room for the cells of a grid, and for those of a finer one."""
+    return int(kinds.max()) <= TOL.halvings and cells_of(kinds) <= TOL.cells
+
+
 def least_power(octaves: int, ratio: FloatArray | float, low: int, high: int) -> IndexArray:
     """The least k of `low` to `high` for which 2^(octaves k) is not below `ratio`, or `high`: without libm's log2."""
     return low + np.searchsorted(np.ldexp(1.0, octaves * np.arange(low, high)), ratio)
@@ -130,13 +135,15 @@ def coarsest(system: System) -> KindArray:
 def _sweepable(system: System, least: int) -> int:
     """Halvings of all bins, `least` or more: to a quarter of a dead time, or what it exceeds whole periods by.
 
+    One more than possible where the dead time is shorter than that.
+
     Without the last, where that would take many cells, the sweeps count a whole period in cells, and are slower.
     """
     short = TOL.dead_time_cells / max(system.dead_time_periods * system.bins, 1e-30)
     beyond = 1.0 / max(math.fmod(system.dead_time_periods, 1.0) * system.bins, 1e-30)
     if system.dead_time_periods > 1.0 and beyond <= 2**TOL.cheap_halvings:
         short = max(short, beyond)
-    return int(least_power(1, short, least, TOL.halvings))
+    return int(least_power(1, short, least, TOL.halvings + 1))
 
 
 def _resolving(system: System, structure: float, least: int) -> int:
@@ -212,7 +219,7 @@ def _even_halvings(task: Task, pixels: IndexArray) -> tuple[IndexArray, IndexArr
     first = max(_sweepable(system, joined), _resolving(system, structure, joined))
     halvings, sweeps = np.full(pixels.size, first), np.zeros(pixels.size, np.int64)
     armed, unlike = np.zeros(pixels.size), np.ones(pixels.size, np.bool_)
-    most = (TOL.cells // system.bins).bit_length() - 1
+    most = min((TOL.cells // system.bins).bit_length() - 1, TOL.halvings)
     able = np.full(pixels.size, first <= most)
     open_ = np.flatnonzero(able)
     while open_.size:
@@ -314,7 +321,7 @@ def _refined(task: Task, corners: list[Corner], start: KindArray) -> Known:
                 grids[corner] = _recut(kinds, widest, distance, parts)
                 if fine and cells_of(grids[corner]) > TOL.worthwhile * cells_of(kinds):
                     del grids[corner]
-                elif cells_of(grids[corner]) > TOL.cells:
+                elif not drawable(grids[corner]):
                     done[corner] = grid._replace(kinds=None)
                     del grids[corner]
     return done

@@ -117,12 +117,12 @@ class Tabulated(CountLaws):
     law: IndexArray
 
     @classmethod
-    def of(cls, windows: Sequence[Pmf], law: IndexArray) -> Tabulated:
+    def of(cls, pmfs: Sequence[Pmf], law: IndexArray) -> Tabulated:
         """From the probabilities of each law."""
-        sizes = [window.p.size for window in windows]
-        sums = [np.cumsum(window.p) for window in windows]
+        sizes = [each.p.size for each in pmfs]
+        sums = [np.cumsum(each.p) for each in pmfs]
         return cls(
-            np.array([window.first for window in windows], np.int64),
+            np.array([each.first for each in pmfs], np.int64),
             np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64),
             np.concatenate([s / s[-1] for s in sums]),
             law,
@@ -232,8 +232,8 @@ class Run:
     @property
     def waiting(self) -> Progress | None:
         """Progress callback during work before the sampling of a batch, with unchanged progress."""
-        tell = self.task.progress
-        return None if tell is None else lambda done, total: tell(self._done, self.task.items)
+        report = self.task.progress
+        return None if report is None else lambda done, total: report(self._done, self.task.items)
 
     def draw(self, batch: Batch) -> None:
         """All realizations of the batch's pixels."""
@@ -283,7 +283,7 @@ class Run:
         self._done += counts.size
 
     def _sampling(self, size: int) -> Progress | None:
-        tell, before, items = self.task.progress, self._done, self.task.items
-        if tell is None:
+        report, before, items = self.task.progress, self._done, self.task.items
+        if report is None:
             return None
-        return lambda done, total: tell(before + size * done // max(total, 1), items)
+        return lambda done, total: report(before + size * done // max(total, 1), items)

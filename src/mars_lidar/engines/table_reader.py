@@ -26,7 +26,7 @@ from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.statistics.cells import Cells
-from mars_lidar.statistics.count_pmf import Pmf, guessed_windows
+from mars_lidar.statistics.count_pmf import Pmf, guessed_pmfs
 from mars_lidar.statistics.exposure import normalised
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ class TableReader:
             self._check_range(single[0], flux.background.reshape(-1))
 
     def _check_range(self, signal: FloatArray, background: FloatArray) -> None:
-        """Every pixel lies on the grid, or has no return, of which nothing but its background has to be known."""
+        """Raise ValueError unless every pixel is within the grid; of pixels without a return, the background."""
         beyond, ranges = np.zeros(signal.size, dtype=bool), []
         for name, photons, axis in (
             ("signal", signal, self.table.signal),
@@ -186,8 +186,8 @@ class TableReader:
         return entries, pixels[look.outside]
 
 
-# A table computes its shapes for other cycles than it was built for at each call, which takes longer than a cube: those
-# of the last cycles asked for stay as long as the table lives, and with them what the sampler finds out about them.
+# For cycles other than its own a table computes its shapes at each call, which takes longer than a cube. The last
+# shapes are therefore cached for the lifetime of the table, together with the sampler's guides to them.
 _last_shapes: WeakKeyDictionary[Table, tuple[int, NDArray[np.float32], NDArray[np.float32]]] = WeakKeyDictionary()
 
 
@@ -232,8 +232,8 @@ def exact_laws(run: Run, reader: TableReader, entries: Entries, at: IndexArray) 
     """Laws of the pixels `at`, each distinct law evaluated once, or taken from the table if stored there."""
     keys = _keys(run, reader, entries, at)
     _, first, law = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-    windows = _table_laws(run, reader, entries, at[first], keys[first])
-    missing = np.array([k for k, window in enumerate(windows) if window is None], np.int64)
+    laws = _table_laws(run, reader, entries, at[first], keys[first])
+    missing = np.array([k for k, each in enumerate(laws) if each is None], np.int64)
     if missing.size:
         signal, background, phase = keys[first[missing]].T
         system, chosen = run.task.system, at[first[missing]]
@@ -242,13 +242,13 @@ def exact_laws(run: Run, reader: TableReader, entries: Entries, at: IndexArray) 
         )
         own = reader.table.entries.bins[entries.rows[chosen]]
         bins = np.where(entries.weights[chosen] > 0.0, own, 0).max(-1)  # the finest grid that a corner needed
-        tell = run.waiting
-        waiting = None if tell is None else lambda done: tell(done, missing.size)
-        evaluated = guessed_windows(cells, entries.cumulants[chosen], bins, run.task.threads, waiting)
-        for k, window in zip(missing, evaluated, strict=True):
-            windows[k] = window
+        report = run.waiting
+        waiting = None if report is None else lambda done: report(done, missing.size)
+        evaluated = guessed_pmfs(cells, entries.cumulants[chosen], bins, run.task.threads, waiting)
+        for k, each in zip(missing, evaluated, strict=True):
+            laws[k] = each
     run.count("laws_evaluated", missing.size)
-    return Tabulated.of([window for window in windows if window is not None], law.reshape(-1).astype(np.int64))
+    return Tabulated.of([each for each in laws if each is not None], law.reshape(-1).astype(np.int64))
 
 
 def _keys(run: Run, reader: TableReader, entries: Entries, at: IndexArray) -> FloatArray:
@@ -265,7 +265,7 @@ def _keys(run: Run, reader: TableReader, entries: Entries, at: IndexArray) -> Fl
 def _table_laws(
     run: Run, reader: TableReader, entries: Entries, pixels: IndexArray, keys: FloatArray
 ) -> list[Pmf | None]:
-    """Laws that the table keeps: of its entries, for its own number of cycles, at its delay."""
+    """Laws stored in the table, which are those of its entries at its own delay and number of cycles."""
     table = reader.table
     if run.task.system.cycles != table.entries.cycles:
         return [None] * pixels.size
@@ -273,7 +273,7 @@ def _table_laws(
     rows = entries.rows[pixels, heaviest]
     signal, background = table.signal[rows // table.background.size], table.background[rows % table.background.size]
     same = (keys[:, 0] == signal) & (keys[:, 1] == background) & (keys[:, 2] == 0.5)
-    return [table.laws.window(int(row)) if its_own else None for row, its_own in zip(rows, same, strict=True)]
+    return [table.laws.law(int(row)) if its_own else None for row, its_own in zip(rows, same, strict=True)]
 
 
 _PER_DECADE = {"signal": 58, "background": 16}  # 4 % apart: the mean count is then within some 0.002 deviations

@@ -90,13 +90,13 @@ class CubeServer:
 
     def answer(self, target: str) -> tuple[str, bytes]:
         """Type and content for `target` (path and query); KeyError for an unknown path."""
-        asked = urlsplit(target)
-        if not secrets.compare_digest(asked.path[: len(self._word)].encode(), self._word.encode()):
+        request = urlsplit(target)
+        if not secrets.compare_digest(request.path[: len(self._word)].encode(), self._word.encode()):
             raise KeyError(target)
-        what = asked.path[len(self._word) :]
+        what = request.path[len(self._word) :]
         if what == "/":
             return "text/html; charset=utf-8", self._page
-        given = {name: values[-1] for name, values in parse_qs(asked.query).items()}
+        given = {name: values[-1] for name, values in parse_qs(request.query).items()}
         if self.cube is None:
             raise KeyError(target)
         with self._lock, warnings.catch_warnings():

@@ -11,11 +11,11 @@ from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.types import Progress
 from mars_lidar._version import __version__
+from mars_lidar.engines.simulation import simulate_timestamps
 from mars_lidar.io.cube import SUFFIXES, Cube, load, one_exposure, save
 from mars_lidar.io.streams import photon_hdf5, ptu
 from mars_lidar.io.streams.files import STREAM_SUFFIXES, is_stream
 from mars_lidar.light.timestamps import Timestamps
-from mars_lidar.simulation import simulate_timestamps
 
 
 @dataclass(frozen=True)

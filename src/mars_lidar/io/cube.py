@@ -135,7 +135,7 @@ class Cube:
         recipe: Recipe | Recording
         if flux is None:
             if depth_m is not None or reflectivity is not None:
-                raise TypeError("depth_m and reflectivity stand beside a flux, which is not given")
+                raise TypeError("depth_m and reflectivity need a flux, which is not given")
             recipe = Recording(system=system, pixels=(height, width), realizations=realizations)
         else:
             if flux.image.shape != (height, width):
@@ -263,7 +263,7 @@ def as_cube(cube: Cube | ArrayLike, system: System | None, flux: Flux | None = N
     """The cube, or a new cube of an array of counts and the system that recorded them."""
     if isinstance(cube, Cube):
         if system is not None or flux is not None:
-            raise TypeError("system and flux stand beside an array of counts: a Cube has its own")
+            raise TypeError("system and flux are for an array of counts: a Cube has its own")
         return cube
     if system is None:
         raise TypeError(
@@ -348,7 +348,7 @@ def one_exposure(cube: Cube, realization: int) -> Cube:
 
 
 def _load_again(path: str | Path, allow_incomplete: bool, identity: str) -> Cube:
-    """The cube of another process, whose file must be the same."""
+    """Open the file of a pickled cube; FileError if it was replaced in the meantime."""
     cube = load(path, allow_incomplete=allow_incomplete)
     if cube._identity != identity:
         cube.close()
@@ -406,7 +406,7 @@ def load(path: str | Path, *, allow_incomplete: bool = False) -> Cube:
     plain = finished_name(source)
     form = format_of(plain, "path")
     check_finished(source)
-    if plain != source and plain.suffix in (".mat", ".ptu"):  # no part of them is of use
+    if plain != source and plain.suffix in (".mat", ".ptu"):  # formats of which a part cannot be read
         raise IncompleteFileError(f"{source} is incomplete: a stopped run left it")
     try:
         with reading(source, "a cube of mars-lidar"):
@@ -548,6 +548,6 @@ def to_xarray(
         entry = (variable.dims, np.asarray(variable.data), variable.labels)
         (coordinates if variable.dims == (variable.name,) else variables)[variable.name] = entry
     attributes: dict[str, Any] = {**layout.attributes(cube.recipe), "complete": True}
-    if unnamed:  # nobody says how an array was made
+    if unnamed:  # how an array was made is not known
         attributes = {name: value for name, value in attributes.items() if name not in _OF_A_RUN}
     return xarray.Dataset(variables, coordinates, attributes)  # type: ignore[no-any-return]

@@ -46,8 +46,8 @@ class ForeignCounts:
     name: str  # of the array in the file; "" where the format has no names
     counts: NDArray[Any] | None  # (exposures, H, W, T), or None where the file holds photon times
     cells: NDArray[Any] | None  # (H, W) of arrays of photon times, or None
-    axes: str  # what the array's dimensions were taken for
-    recorder: Recorded | None = None  # what a photon counter's file tells of its histograms
+    axes: str  # meaning of the dimensions of the array
+    recorder: Recorded | None = None  # settings of the histograms in a file of a photon counter
     times: NDArray[np.float64] | None = None  # of the bins of a .csv or .txt, in a unit that it does not state
 
     def cube(
@@ -152,10 +152,10 @@ def read_counts(
 ) -> ForeignCounts:
     """The array of a file, its axes in order; `bins`, if known, identifies the time axis by its length."""
     source = Path(path)
-    told_by = recorded(source) if source.suffix.lower() in RECORDER_SUFFIXES else None
+    recording = recorded(source) if source.suffix.lower() in RECORDER_SUFFIXES else None
     times = None
-    if told_by is not None:
-        by_name = told_by.arrays
+    if recording is not None:
+        by_name = recording.arrays
     elif source.suffix.lower() in _TEXT:
         with reading(source, "arrays of histograms"):
             times, column = read_times(source)
@@ -169,7 +169,7 @@ def read_counts(
     if is_sparse(array):
         check_claim(source, dense_bytes(array), f"the counts of {name or 'its matrix'}")
     try:
-        return ForeignCounts(source, name, in_order(array, order, image), None, order, told_by, times)
+        return ForeignCounts(source, name, in_order(array, order, image), None, order, recording, times)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{source}: {name or 'the array'}: {error}") from error
 
@@ -178,13 +178,13 @@ _UNITS = {"s": 1e9, "us": 1e3, "ns": 1.0, "ps": 1e-3}
 
 
 def _check_times(times: NDArray[np.float64], bin_ns: float, start_ns: float) -> None:
-    """Raise ValueError where the times beside the counts contradict the bins of the system or where they begin."""
+    """Raise ValueError where the times beside the counts contradict the bins of the system or `start_ns`."""
     step = float(times[-1] - times[0]) / (times.size - 1)
     fits = [scale for scale in _UNITS.values() if abs(step * scale / bin_ns - 1.0) < 1e-3]
     if not fits:
         raise ValueError(
-            f"its times ascend by {step:g}, which is no bin of {bin_ns:g} ns in {', '.join(_UNITS)}: mend the width of "
-            "the bins or the period"
+            f"its times ascend by {step:g}, which is not the bin width of {bin_ns:g} ns in {', '.join(_UNITS)}: "
+            "correct the number of bins or the period"
         )
     begin = float(times[0]) * fits[0]
     if start_ns == 0.0 and not -0.01 < begin / bin_ns < 0.99:  # the first bin's edge or its middle
@@ -205,7 +205,7 @@ def arrays(path: Path) -> dict[str, Any]:
     return {name: array for name, array in by_name.items() if len(array.shape)}
 
 
-_MOST_LISTED = 64  # cells of a variable that are opened to say what is in them
+_MOST_LISTED = 64  # most cells of a variable that are opened to describe their contents
 
 
 def listed(path: Path) -> dict[str, str]:
@@ -318,7 +318,7 @@ def _guessed(path: Path, shape: tuple[int, ...], bins: int | None) -> str:
 
 
 def _uneven(height: int, width: int) -> float:
-    """How many times an image is longer than it is wide, or wider than long."""
+    """Aspect ratio of an image, at least 1."""
     return max(height, width) / max(min(height, width), 1)
 
 

@@ -126,7 +126,7 @@ def _check_suffix(name: str, path: Path) -> None:
 def _check_format(path: Path, attrs: Mapping[str, Any]) -> None:
     if attrs.get("format") != FORMAT:
         raise ValueError(f"{path} is not a file of maps of mars-lidar (no attribute format = {FORMAT!r})")
-    if attrs.get("complete", True) is not True:  # maps are written whole: nothing of ours says otherwise
+    if attrs.get("complete", True) is not True:  # mars-lidar writes maps as a whole
         raise ValueError(f"{path} is damaged: its attribute complete is {attrs['complete']!r}")
 
 

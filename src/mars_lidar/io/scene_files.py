@@ -206,7 +206,7 @@ def scan(
         listed = _recognised(root, problems)
     candidates = list(listed)
     if manifest is None:
-        _tell_images(root, candidates)
+        _warn_without_images(root, candidates)
         for k, scene in enumerate(candidates):
             own_unit = scene.depth.is_dir() or scene.depth.suffix.lower() == ".mat"  # these are in metres
             unit = None if own_unit else depth_unit_m
@@ -326,7 +326,7 @@ def _partner(path: Path) -> Path | None:
     return None
 
 
-def _tell_images(root: Path, scenes: list[SceneFile]) -> None:
+def _warn_without_images(root: Path, scenes: list[SceneFile]) -> None:
     """Warn where no scene of a folder has an image: reflectivity is then the same everywhere, which few want."""
     alone = [scene for scene in scenes if scene.image is None and scene.depth.suffix.lower() in _DEPTH]
     if alone and len(alone) == len(scenes):

@@ -19,13 +19,13 @@ from mars_lidar._base.types import ArrayLike, NDArray, Progress
 from mars_lidar.engines import ENGINES, Engine, EngineOptions, check_detector, find_engine
 from mars_lidar.engines.engine import given
 from mars_lidar.engines.feedback import expected_registrations
+from mars_lidar.engines.simulation import simulate
 from mars_lidar.engines.table_reader import table_record
 from mars_lidar.instrument.system import System
 from mars_lidar.io import zarr_store
 from mars_lidar.io.cube import Cube, check_output, load, open_writer
 from mars_lidar.io.recipe import Recipe
 from mars_lidar.light.flux import Flux, StoredFlux
-from mars_lidar.simulation import simulate
 from mars_lidar.table import Table
 from mars_lidar.table.storage import cached_tables
 
@@ -150,7 +150,7 @@ def simulate_to(
     True
     """
     progress = callback_of(progress, "simulating")
-    drawn_by = find_engine(engine, **options)
+    chosen = find_engine(engine, **options)
     recipe = Recipe(
         system=system,
         flux=flux,
@@ -163,20 +163,20 @@ def simulate_to(
         reflectivity=reflectivity,  # type: ignore[arg-type]
         source=source,
         options=given(options),
-        settings=drawn_by.settings,
+        settings=chosen.settings,
     )
     target = Path(path)
     if resume and overwrite:
         raise ValueError("resume and overwrite exclude each other")
-    going_on = resume and zarr_store.begun_store(target).exists()
-    if not going_on:
+    resumed = resume and zarr_store.begun_store(target).exists()
+    if not resumed:
         check_output(target, recipe, overwrite=overwrite)
     elif target.suffix != ".zarr":
         raise ValueError(f"resume is for a .zarr, the only format that an interruption leaves, got {str(target)!r}")
-    drawn_by.check(flux, system)  # every pixel, before the blocks one by one
+    chosen.check(flux, system)  # all pixels, before the first block is simulated
     _try_brightest_pixel(recipe, threads, device)
-    begun = zarr_store.unfinished(target, recipe) if going_on else None
-    if going_on and begun is None:
+    begun = zarr_store.unfinished(target, recipe) if resumed else None
+    if resumed and begun is None:
         return Written(target, int(load(target).registrations or 0), 0.0, 0.0, {})
     simulate_s = write_s = 0.0
     report: dict[str, float] = {}
@@ -186,8 +186,8 @@ def simulate_to(
         for images, rows in list(recipe.blocks(writer.chunks))[writer.begun :]:
             began = time.perf_counter()
             of_block: dict[str, float] = {}
-            tell = _of_the_whole(progress, recipe, images, rows)
-            block = _simulate(recipe, images, rows, threads=threads, progress=tell, report=of_block, device=device)
+            of_whole = _progress_of_block(progress, recipe, images, rows)
+            block = _simulate(recipe, images, rows, threads=threads, progress=of_whole, report=of_block, device=device)
             ended = time.perf_counter()
             writer.write(images, rows, block)
             simulate_s += ended - began
@@ -307,8 +307,8 @@ def verify(
     if cube.path is not None and cube.path.suffix == ".zarr" and manifest.damage(cube.path):
         return False
     for images, rows in recipe.blocks(recipe.chunks(4 * 2**20)):
-        tell = _of_the_whole(progress, recipe, images, rows)
-        again = _simulate(recipe, images, rows, threads=threads, progress=tell)
+        of_whole = _progress_of_block(progress, recipe, images, rows)
+        again = _simulate(recipe, images, rows, threads=threads, progress=of_whole)
         if not np.array_equal(again, np.asarray(cube.histogram[images, rows])):
             return False
     return True
@@ -359,7 +359,7 @@ def _grid(record: dict[str, Any]) -> str:
 
 
 def _try_brightest_pixel(recipe: Recipe, threads: int | None, device: Literal["cpu", "cuda"]) -> None:
-    """Let the simulator check its arguments before anything on disk is touched."""
+    """Simulate one pixel, so that invalid arguments are refused before anything is written."""
     y, x = (int(k) for k in np.unravel_index(np.argmax(recipe.flux.total), recipe.flux.shape))
     pixel = recipe.replace(
         flux=recipe.flux[y, x],
@@ -371,8 +371,8 @@ def _try_brightest_pixel(recipe: Recipe, threads: int | None, device: Literal["c
     _simulate(pixel, slice(0, 1), slice(0, 1), threads=threads, device=device)
 
 
-def _of_the_whole(progress: Progress | None, recipe: Recipe, images: slice, rows: slice) -> Progress | None:
-    """A callback for one block that tells `progress` how far the whole cube is, in pixel exposures."""
+def _progress_of_block(progress: Progress | None, recipe: Recipe, images: slice, rows: slice) -> Progress | None:
+    """A callback for one block that reports the progress of the whole cube, in pixel exposures."""
     count, height, width, _ = recipe.shape
     before = images.start * height * width + rows.start * width
     size = (images.stop - images.start) * (rows.stop - rows.start) * width
@@ -381,14 +381,14 @@ def _of_the_whole(progress: Progress | None, recipe: Recipe, images: slice, rows
 
 @dataclass(frozen=True)
 class _Probe:
-    """How a run is timed beforehand. The seconds decide how exact the advice is, and nothing else."""
+    """Settings of the measurement of time before a run. They affect the accuracy of the advice, and nothing else."""
 
-    event_s: float = 1e-7  # by the slowest engine: where all events of a run take less than a second, nothing is drawn
-    least_s: float = 0.1  # drawn at least, or the whole image; in two steps ...
-    first_s: float = 1.0  # ... unless the first takes longer
+    event_s: float = 1e-7  # per event of the slowest engine: runs of less than a second by it are not measured
+    least_s: float = 0.1  # shortest measurement, in two steps, or of the whole image ...
+    first_s: float = 1.0  # ... or in one step, if that takes longer than this
     pixels: int = 16  # of the first step
-    cycles: int = 20_000  # of engines that draw photon by photon: their time is proportional to the exposure
-    worth: float = 3.0  # times faster that another engine must be to be mentioned
+    cycles: int = 20_000  # for engines that draw photon by photon, whose time is proportional to the exposure
+    worth: float = 3.0  # ratio of times from which a faster engine is mentioned
 
 
 _PROBE = _Probe()
@@ -425,17 +425,17 @@ def advice(
 
     0, without a measurement, for runs that are short with any engine.
     """
-    drawn_by = find_engine(engine, **(options or {}))
-    if isinstance(flux, StoredFlux) or system.detector.crosstalk is not None:  # not to be had in single pixels
+    chosen = find_engine(engine, **(options or {}))
+    if isinstance(flux, StoredFlux) or system.detector.crosstalk is not None:  # cannot be measured on single pixels
         return Advice(0.0)
     events = realizations * float(expected_registrations(flux, system).sum())
-    if drawn_by.name in ("sequential", "poisson"):
+    if chosen.name in ("sequential", "poisson"):
         events = realizations * float(flux.total.sum()) * system.cycles
-    by_pixel = "table" in drawn_by.options and getattr(drawn_by, "reader", None) is None
+    by_pixel = "table" in chosen.options and getattr(chosen, "reader", None) is None
     if events * _PROBE.event_s < 1.0 and not by_pixel:
         return Advice(0.0)
-    seconds = realizations * _measured(flux, system, drawn_by, threads)
-    if seconds < TOL.long_s or drawn_by.name != "exact":
+    seconds = realizations * _measured(flux, system, chosen, threads)
+    if seconds < TOL.long_s or chosen.name != "exact":
         return Advice(seconds)
     auto = ENGINES["auto"]
     try:
@@ -447,7 +447,7 @@ def advice(
 
 
 def _measured(flux: Flux, system: System, engine: Engine, threads: int | None) -> float:
-    """Seconds for one image: some of its pixels, more of them until it takes long enough to be measured."""
+    """Seconds for one image, from some of its pixels: as many as take long enough to be measured."""
     share = 1.0
     if engine.name in _BY_PHOTON and system.cycles > _PROBE.cycles:
         share = system.cycles / _PROBE.cycles
@@ -462,7 +462,7 @@ def _measured(flux: Flux, system: System, engine: Engine, threads: int | None) -
         simulate(some, system, engine=engine, threads=threads)
         drawn, spent = number, time.perf_counter() - began
         if step == 1 or spent > _PROBE.first_s or (before[0] and spent > _PROBE.least_s):
-            # what the number of pixels does not change, such as a plan, is paid once
+            # costs that do not depend on the number of pixels, such as that of a plan, occur once
             each = (spent - before[1]) / (drawn - before[0]) if drawn > before[0] else spent / drawn
             return share * (spent + max(0.0, each) * (pixels - drawn))
         step = max(1, step // 2)

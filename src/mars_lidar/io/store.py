@@ -50,7 +50,7 @@ class OnDisk:
         self._array, self._path = array, path
 
     def __getattr__(self, name: str) -> Any:
-        if name.startswith("__"):  # of protocols that it has not
+        if name.startswith("__"):  # a protocol that the array does not support
             raise AttributeError(name)
         return getattr(self._array, name)
 
@@ -77,7 +77,7 @@ class OnDisk:
     def _read(self, read: Callable[[], Any]) -> Any:
         try:
             return read()
-        except (IndexError, TypeError, FileError):  # of the key; one that names the file
+        except (IndexError, TypeError, FileError):  # an error of the key, or one that names the file
             raise
         except Exception as error:
             with self._naming():
@@ -98,9 +98,9 @@ class OpenedStore:
 
     attrs: Mapping[str, Any]
     arrays: Mapping[str, Any]  # variables by name; on disk until they are indexed, where the format allows it
-    progress: str = ""  # how far an incomplete file got, for people; empty where that is not known
+    progress: str = ""  # progress of an incomplete file in words; empty where it is not known
     close: Callable[[], None] = lambda: None
-    identity: str = ""  # of the content, where the format has a sum over it
+    identity: str = ""  # checksum of the content, in formats that have one
 
     @property
     def complete(self) -> bool:
@@ -117,7 +117,7 @@ class Writer:
 
     chunks: tuple[int, int, int, int]
     put: Callable[[slice, slice, NDArray[Any]], None]
-    begun: int = 0  # blocks that are there already, of a store that is continued
+    begun: int = 0  # blocks of a resumed store that an earlier run has written
     registrations: int = 0
 
     def write(self, realizations: slice, rows: slice, block: NDArray[Any]) -> None:

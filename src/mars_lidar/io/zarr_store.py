@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base import manifest
-from mars_lidar._base.files import FileError, alone, beside, exchange, successor, telling
+from mars_lidar._base.files import FileError, alone, beside, exchange, explained, successor
 from mars_lidar._base.imports import MissingLibraryError, needed
 from mars_lidar._base.resources import check_threads
 from mars_lidar.io import layout
@@ -56,11 +56,11 @@ def resumable_writer(path: Path, recipe: Recipe, group: Any = None) -> Iterator[
         return f"{store} stays, marked incomplete{before}: --resume (resume=True) continues it"
 
     with contextlib.ExitStack() as lock:
-        with telling(lambda: _removed(store)) if new else contextlib.nullcontext():  # no counts are lost
+        with explained(lambda: _removed(store)) if new else contextlib.nullcontext():  # no counts are lost
             store.mkdir(exist_ok=not new)
             lock.enter_context(alone(store))
             group = create(store, recipe) if new else group
-        with telling(remaining):
+        with explained(remaining):
             writer = _writer(group)
             if not new:
                 histogram = group["histogram"]
@@ -118,9 +118,9 @@ def _removed(path: Path) -> str:
 
 
 def _begun(path: Path, histogram: Any, blocks: Sequence[tuple[slice, slice]]) -> tuple[int, int]:
-    """How many of `blocks` are written, in their order, and the registrations in them.
+    """Number of the `blocks` that are written, and the registrations in them.
 
-    The last one with anything in it may be half there, and does not count; chunks without counts are no files.
+    The last block that has a file may be incomplete and is not counted; chunks without counts have no file.
     """
     folder, chunks = path / "histogram" / "c", histogram.chunks
     last = 0
@@ -293,7 +293,7 @@ def _require(url: str, system: Any, root: str, stated: str | None) -> manifest.M
 
 @contextlib.contextmanager
 def _naming(url: str) -> Iterator[None]:
-    """What goes wrong inside names the URL."""
+    """Context manager: errors raised inside name the URL."""
     try:
         yield
     except (MissingLibraryError, MemoryError):

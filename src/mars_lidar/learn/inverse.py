@@ -23,6 +23,7 @@ except RuntimeError as _error:  # of torchvision, where its operators are not th
 
 from mars_lidar._base import checks
 from mars_lidar.engines import Engine, find_engine
+from mars_lidar.engines.simulation import simulate
 from mars_lidar.instrument.system import System
 from mars_lidar.learn.forward import check_detector, expected_histogram
 from mars_lidar.learn.likelihood import histogram_log_likelihood
@@ -31,7 +32,6 @@ from mars_lidar.learn.tolerances import TOLERANCES
 from mars_lidar.light.flux import Flux
 from mars_lidar.reconstruction.histogram_record import relative_width
 from mars_lidar.reconstruction.reconstruction import reconstruct
-from mars_lidar.simulation import simulate
 from mars_lidar.table import Table
 
 

@@ -268,9 +268,9 @@ class StoredDataset(torch.utils.data.IterableDataset[dict[str, Any]]):
     def _plan(self, epoch: int, start: int, first: int, worker: int, workers: int) -> list[NDArray[np.int64]]:
         """Exposures of each batch that a worker gives after `start` batches of an epoch that `first` workers began."""
         order = self._exposures.order(self._shuffle, self._pool, self._seed, epoch)
-        mine, size = share_of_rank(order, self._rank, self._world, self._uneven), self._batch or 1
+        share, size = share_of_rank(order, self._rank, self._world, self._uneven), self._batch or 1
         turns = _turns(len(self), first if self._shuffle else 1)[start:][worker::workers]
-        return [mine[k * size : (k + 1) * size] for k in turns.tolist()]
+        return [share[k * size : (k + 1) * size] for k in turns.tolist()]
 
     def _batches(self, groups: list[NDArray[np.int64]]) -> Iterator[Any]:
         """The batches of these exposures; shards are read ahead of their use, each once."""
@@ -406,7 +406,7 @@ class _Shards:
         self._reader.shutdown(cancel_futures=True)
 
     def take(self, number: int) -> Block:
-        """A block, which is forgotten after its last use."""
+        """A block, which is released after its last use."""
         if number not in self._begun:
             self._begun.add(number)
             while number not in self._submitted or len(self._submitted) < len(self._begun & self._uses.keys()) + 1:

@@ -26,6 +26,7 @@ from mars_lidar._base import checks
 from mars_lidar._base.resample import image_size
 from mars_lidar._base.resources import check_memory, thread_count
 from mars_lidar.engines import Engine, check_detector, find_engine
+from mars_lidar.engines.simulation import simulate
 from mars_lidar.instrument.system import System
 from mars_lidar.io.scene_files import SceneFile
 from mars_lidar.learn.needed import torch
@@ -34,7 +35,6 @@ from mars_lidar.learn.scenes import Recipe, Sample, as_source, example_of
 from mars_lidar.learn.tolerances import TOLERANCES
 from mars_lidar.scene.radiometry import AMBIENTS, ATTENUATIONS
 from mars_lidar.scene.scene import Scene
-from mars_lidar.simulation import simulate
 
 # --- Ranks and workers ---------------------------------------------------------------------------------------------
 

@@ -18,13 +18,13 @@ class HistogramTable(torch.nn.Module):
     Between the table's nodes the mean histogram is bilinear in S and B, as in `Table.lookup` (docs/table.md, L1), and
     continuous at the nodes. Its derivatives in S and B are those of the chords of a cell and jump at the nodes: with
     the spacing of the paper's table by less than 5 % in S and 15 % in B. Derivatives in the delay jump by less than 0.1
-    %. It is differentiable once; for smooth or second derivatives use `mars_lidar.learn.expected_histogram`. The
-    canonical shape is shifted to the delay by a fraction of a bin: the registrations before the cut follow from the
-    photons before it, given exactly by the pulse, and from the armed fraction, which at the edges of the bin follows
-    from the registrations of the last dead time in the table and in between decreases by the photons of the bin. A
-    pulse narrower than a bin thus stays narrow, no bin is negative, and the total is preserved. The error of the shift
-    in total variation is below 1e-3, also for pulses of a quarter of a bin, unless the dead time is shorter than the
-    pulse (2e-2 at S = 10, t_d = 3 sigma).
+    %. Second derivatives are those of this piecewise function, linear in S and in B but for the shift; for smooth
+    derivatives use `mars_lidar.learn.expected_histogram`. The canonical shape is shifted to the delay by a fraction of
+    a bin: the registrations before the cut follow from the photons before it, given exactly by the pulse, and from the
+    armed fraction, which at the edges of the bin follows from the registrations of the last dead time in the table and
+    in between decreases by the photons of the bin. A pulse narrower than a bin thus stays narrow, no bin is negative,
+    and the total is preserved. The error of the shift in total variation is below 1e-3, also for pulses of a quarter of
+    a bin, unless the dead time is shorter than the pulse (2e-2 at S = 10, t_d = 3 sigma).
 
     As in the table, the start-up part of an armed exposure stays at the canonical delay (docs/table.md, 4).
     `mars_lidar.learn.expected_histogram` evaluates each pixel instead.

@@ -10,7 +10,7 @@ from mars_lidar.reconstruction.histogram_bound import (
 )
 from mars_lidar.reconstruction.image import Image, UntrainedImage
 from mars_lidar.reconstruction.matched_filter import MatchedFilter, Peak
-from mars_lidar.reconstruction.maximum_likelihood import MaximumLikelihood, log_likelihood
+from mars_lidar.reconstruction.maximum_likelihood import MaximumLikelihood, log_likelihood, systematic_error
 from mars_lidar.reconstruction.mchc import ChainCorrection, mchc_rates
 from mars_lidar.reconstruction.method import Flags, Method
 from mars_lidar.reconstruction.reconstruction import METHODS, Reconstruction, reconstruct
@@ -38,6 +38,7 @@ __all__ = [
     "mchc_rates",
     "reconstruct",
     "returns_bound",
+    "systematic_error",
     "window_error",
     "window_weights",
 ]

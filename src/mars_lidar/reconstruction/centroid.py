@@ -60,9 +60,9 @@ def _centred(given: Histograms, background: FloatArray, delay: FloatArray, first
     total = counts.sum(-1)
     # from the delay to the middle of each bin, in bins
     place = (middle + 0.5 - delay * bins)[:, None] + around
-    stands_out = known & (total > 0.0)
-    moved = np.where(stands_out, (counts * place).sum(-1) / np.where(stands_out, total, 1.0), 0.0)
-    moved = np.where(np.abs(moved) <= reach, moved - np.where(stands_out, _pulse_centre(system, reach), 0.0), 0.0)
+    significant = known & (total > 0.0)
+    moved = np.where(significant, (counts * place).sum(-1) / np.where(significant, total, 1.0), 0.0)
+    moved = np.where(np.abs(moved) <= reach, moved - np.where(significant, _pulse_centre(system, reach), 0.0), 0.0)
     return np.asarray((delay + moved / bins) % 1.0)
 
 

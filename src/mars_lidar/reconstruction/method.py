@@ -146,7 +146,7 @@ def _known(kind: Any = None) -> Iterator[type[Method]]:
         yield from _known(each)
 
 
-def tell_effects(system: System) -> None:
+def warn_of_effects(system: System) -> None:
     """Warn of detector effects that no method models, so that their counts are attributed to light."""
     beyond = [name for name in system.detector.effects if name not in LIGHT_EFFECTS]
     if beyond:

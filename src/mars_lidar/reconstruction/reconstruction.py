@@ -18,9 +18,9 @@ from mars_lidar.reconstruction.fit_quality import FALSE_ALARM
 from mars_lidar.reconstruction.histograms import checked
 from mars_lidar.reconstruction.image import Image, UntrainedImage
 from mars_lidar.reconstruction.matched_filter import MatchedFilter, Peak
-from mars_lidar.reconstruction.maximum_likelihood import MaximumLikelihood
+from mars_lidar.reconstruction.maximum_likelihood import MaximumLikelihood, warn_of_bias
 from mars_lidar.reconstruction.mchc import ChainCorrection
-from mars_lidar.reconstruction.method import Estimates, Flags, Method, tell_effects
+from mars_lidar.reconstruction.method import Estimates, Flags, Method, warn_of_effects
 from mars_lidar.reconstruction.returns import MOST_RETURNS, Returns, returns_of
 
 ATTENUATIONS = ("none", "inverse_square")
@@ -260,8 +260,10 @@ def reconstruct(
             f"cube must hold whole counts, got {part}: add exposures up, and tell it by cycles of the system"
         )
     used.check(system)
-    tell_effects(system)
-    return assembled(used.name, system, used.estimate(given), shape, level, attenuation)
+    warn_of_effects(system)
+    estimates = used.estimate(given)
+    warn_of_bias(used, system, estimates)
+    return assembled(used.name, system, estimates, shape, level, attenuation)
 
 
 def find_method(method: str | Method) -> Method:

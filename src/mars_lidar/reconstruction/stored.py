@@ -15,7 +15,8 @@ from mars_lidar._base.resources import thread_count
 from mars_lidar._base.types import Progress
 from mars_lidar.reconstruction.histograms import checked
 from mars_lidar.reconstruction.image import Image
-from mars_lidar.reconstruction.method import Estimates, Method, tell_effects
+from mars_lidar.reconstruction.maximum_likelihood import warn_of_bias
+from mars_lidar.reconstruction.method import Estimates, Method, warn_of_effects
 from mars_lidar.reconstruction.photons import Photons
 from mars_lidar.reconstruction.reconstruction import Reconstruction, assembled, find_method, with_returns
 
@@ -64,7 +65,7 @@ def reconstruct_stored(
     used = [with_returns(find_method(method), returns) for method in methods]
     for method in used:
         method.check(system)
-    tell_effects(system)
+    warn_of_effects(system)
     if attenuation is None:
         attenuation = "none" if cube.measured else str(cube.flux.info.get("attenuation", "none"))
     scale = true_level(cube, attenuation) if level is None else checks.real("level", level, low=0.0, strict_low=True)
@@ -118,6 +119,7 @@ def reconstruct_stored(
         estimates = Estimates(
             **{name: values.reshape(-1, *values.shape[3:]) for name, values in buffers[method.name].items()}
         )
+        warn_of_bias(method, system, estimates)
         results[method.name] = Timed(
             assembled(method.name, system, estimates, shape, scale, attenuation), seconds[method.name]
         )

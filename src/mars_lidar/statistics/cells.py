@@ -8,10 +8,10 @@ dead time is a whole number of periods, within the length of the pulse, pixels b
 next, and the grid must resolve it. Refinement from one grid to the next does not detect this: a pulse much narrower
 than a bin looks the same on both.
 
-Many bins. The rate of registrations is the light times the probability of being armed, which is as smooth as the light.
-On a grid that resolves the light, the registrations up to a time are interpolated as a function of the photons up to
-that time, which are exact for any bin. Two checks bound the error: the photons that a smooth curve through the grid
-would misplace within a bin of the grid, and the agreement with a grid of twice the bin width.
+Many bins. The rate of registrations is the product of the light and the armed probability, which is as smooth as the
+light. On a grid that resolves the light, the registrations up to a time are interpolated as a function of the photons
+up to that time, which are exact for any bin. Two checks bound the error: the photons that a smooth curve through the
+grid would misplace within a bin of the grid, and the agreement with a grid of twice the bin width.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ from mars_lidar.light.flux import Flux, StoredFlux, check_photons
 from mars_lidar.statistics.tolerances import MOMENTS, TOL, advice
 
 # --- Detectors that a statistic treats -----------------------------------------------------------------------------
-# A gate that repeats every period makes a gated pixel a free-running one that detects the flux inside of the gate, so
-# that the exposure recursion holds for it with that flux: docs/theory_detectors.md.
+# With a gate that repeats every period, a gated pixel is a free-running one that receives only the flux inside of the
+# gate; the exposure recursion holds for it with that flux: docs/theory_detectors.md.
 
 PLAIN: tuple[Mode, ...] = ("nonparalyzable",)
 _INSTEAD = {
@@ -52,7 +52,7 @@ def require_mode(
     what: str, system: System, modes: tuple[Mode, ...] = PLAIN, effects: tuple[str, ...] = LIGHT_EFFECTS
 ) -> None:
     """Raise ValueError, with an alternative, where `what` does not treat the mode or an effect of the detector."""
-    require_effects(what, system.detector, effects, _simulated)
+    require_effects(what, system.detector, effects, _engine_advice)
     mode = system.detector.mode
     if mode not in modes:
         allowed = " and ".join(map(repr, modes))
@@ -66,9 +66,9 @@ def require_mode(
         )
 
 
-def _simulated(effect: str) -> str:
-    able = "'sequential'" if effect == "crosstalk" else "'exact' or 'sequential'"
-    return f"; simulate it with engine {able}"
+def _engine_advice(effect: str) -> str:
+    engines = "'sequential'" if effect == "crosstalk" else "'exact' or 'sequential'"
+    return f"; simulate it with engine {engines}"
 
 
 def open_parts(system: System) -> tuple[tuple[float, float], ...]:
@@ -153,7 +153,7 @@ def one_pixel(flux: Flux) -> Flux:
 
 
 def default_bins(system: System) -> int:
-    """Bins of the statistics grid when none are asked for: a multiple of `System.bins`, pulse resolved."""
+    """Default number of bins of the statistics grid: a multiple of `System.bins` that resolves the pulse."""
     wanted = max(TOL.unrefined_bins, TOL.chain_bins_per_width * _peak(system))
     return min(system.bins * math.ceil(wanted / system.bins), max(system.bins, TOL.most_bins))
 
@@ -174,7 +174,7 @@ def _bins_for_waveform(samples: int, bins: int) -> int:
 def whole_bins(dead: float, bins: int) -> tuple[int, int, float]:
     """A dead time in periods as whole periods, whole bins of the rest, and the remaining fraction of a bin."""
     whole = math.floor(dead)
-    position = (dead - whole) * bins  # whole periods are split off first, or they would cost digits of the fraction
+    position = (dead - whole) * bins  # without the whole periods, which would cost digits of the fraction
     shift = math.floor(position)
     fraction = position - shift
     if fraction < 1e-9:
@@ -191,7 +191,7 @@ def cell_name(flux: Flux, system: System) -> str:
 
 
 def waveform_parts(system: System) -> int:
-    """Parts of a waveform of several returns: at least 8192, 50 in a standard deviation of the pulse."""
+    """Samples of a waveform of several returns: at least 8192, and 50 per standard deviation of the pulse."""
     wanted = max(2**13, min(2**18, 20.0 * _peak(system)))
     return system.bins * max(1, math.ceil(wanted / system.bins))
 
@@ -202,10 +202,10 @@ def waveform_parts(system: System) -> int:
 def needed_bins(cells: Cells, coarsest: int) -> int:
     """Number of equal bins that resolves the pulse; 0 where `coarsest` equal bins suffice.
 
-    The bin is one standard deviation of the pulse, or a third of the time between the end of a pulse and the
+    A bin is then one standard deviation of the pulse wide, or a third of the time between the end of a pulse and the
     re-arming of the pixels that it blinded.
     """
-    return _bins_of_pulse(cells) if _meets_itself(cells, coarsest, TOL.detected_bins) else 0
+    return _bins_of_pulse(cells) if _rearms_within_pulse(cells, coarsest, TOL.detected_bins) else 0
 
 
 def followed_bins(cells: Cells, coarsest: int, out_bins: int) -> int:
@@ -214,7 +214,7 @@ def followed_bins(cells: Cells, coarsest: int, out_bins: int) -> int:
     Bins may be uneven only where the dead time is a whole number of periods: a pixel then re-arms in the bin of its
     registration. They are used where `coarsest` equal bins do not resolve the pulse.
     """
-    if not _is_whole(cells) or not _meets_itself(cells, coarsest, TOL.resolved_bins):
+    if not _is_whole(cells) or not _rearms_within_pulse(cells, coarsest, TOL.resolved_bins):
         return 0
     sigma, length = _extent(cells)
     blocks = _blocks(out_bins)
@@ -222,36 +222,37 @@ def followed_bins(cells: Cells, coarsest: int, out_bins: int) -> int:
     return bins if length <= TOL.longest_pulse * sigma and bins < _bins_of_pulse(cells) else 0
 
 
-def meets_itself(cells: Cells) -> bool:
+def rearms_within_pulse(cells: Cells) -> bool:
     """Whether pixels re-arm within the next pulse and resolving it takes more than 2^15 equal bins."""
-    return not _is_whole(cells) and _meets_itself(cells, TOL.most_even_bins, TOL.resolved_bins)
+    return not _is_whole(cells) and _rearms_within_pulse(cells, TOL.most_even_bins, TOL.resolved_bins)
 
 
-def _meets_itself(cells: Cells, coarsest: int, resolved: float) -> bool:
+def _rearms_within_pulse(cells: Cells, coarsest: int, resolved: float) -> bool:
     """Whether sigma is below `resolved` of `coarsest` equal bins and pixels re-arm within the pulse."""
     dead = cells.system.dead_time_periods
     if cells.waveform is not None or dead == 0.0 or not (cells.signal > 0.0).any():
         return False
     sigma, length = _extent(cells)
-    return sigma * coarsest < resolved and _apart(cells) < length + 3.0 / coarsest
+    return sigma * coarsest < resolved and _off_whole_periods(cells) < length + 3.0 / coarsest
 
 
 def _bins_of_pulse(cells: Cells) -> int:
     """Number of equal bins that resolves the pulse (`needed_bins`)."""
     sigma, length = _extent(cells)
-    return math.ceil(1.0 / max(sigma, (_apart(cells) - length) / 3.0))
+    return math.ceil(1.0 / max(sigma, (_off_whole_periods(cells) - length) / 3.0))
 
 
-def _apart(cells: Cells) -> float:
+def _off_whole_periods(cells: Cells) -> float:
     """Distance of the dead time from the nearest whole number of periods, in periods."""
     dead = cells.system.dead_time_periods
     return abs(dead - round(dead))
 
 
 def followed_edges(cells: Cells, parts: int, out_bins: int) -> FloatArray:
-    """Edges (cells, parts + 1) in [0, 1] of a grid that puts half of its parts on the pulse, in each block it overlaps.
+    """Edges (cells, parts + 1) in [0, 1] of a grid that divides the period into blocks of equally many parts.
 
-    A block is a bin of the histogram, or an equal part of it; its edges and its number of parts are fixed.
+    A block is a bin of the histogram, or an equal part of it. Where the pulse overlaps a block, half of the parts of
+    the block lie on the pulse.
     """
     blocks = _blocks(out_bins)
     each = parts // blocks
@@ -301,7 +302,7 @@ def _blocks(out_bins: int) -> int:
 
 def _is_whole(cells: Cells) -> bool:
     """Whether the dead time is a whole number of periods."""
-    return _apart(cells) <= TOL.rounding * max(1.0, cells.system.dead_time_periods)
+    return _off_whole_periods(cells) <= TOL.rounding * max(1.0, cells.system.dead_time_periods)
 
 
 def _extent(cells: Cells) -> tuple[float, float]:
@@ -331,6 +332,9 @@ class Cells:
         Phase of the return in [0, 1), periods.
     waveform, row
         Waveforms (rows, T) of unit sum, and the row of each cell; `waveform` is None for a pulse.
+    returns
+        (2, returns, rows) fraction of the light and phase of each return, where the waveforms are sampled from several;
+        None otherwise. The light before an edge is theirs, not that of the samples.
     follow
         0 for equal bins; otherwise the number of histogram bins, each a whole number of grid bins, on a grid that is
         finer on the pulse.
@@ -343,6 +347,7 @@ class Cells:
     delay: FloatArray
     waveform: FloatArray | None
     row: IndexArray
+    returns: FloatArray | None = None
     follow: int = 0
 
     @property
@@ -414,7 +419,9 @@ class Cells:
             lit = np.flatnonzero(signal > 0)
             waveform[lit] += signal[lit, None] * system.pulse.bin_energy(delay_ns[lit], system.period_ns, parts)
         waveform = np.maximum(waveform, 0.0).reshape(*flux.shape, parts)
-        return cls.of(None, flux.background, system, waveform=waveform, **named)
+        phases = np.nan_to_num(delays / system.period_ns)
+        returns = np.stack([signals / np.maximum(signals.sum(0), np.finfo(float).tiny), phases - np.floor(phases)])
+        return replace(cls.of(None, flux.background, system, waveform=waveform, **named), returns=returns)
 
     @property
     def native_flux(self) -> tuple[FloatArray, FloatArray]:
@@ -447,7 +454,7 @@ class Cells:
         """The selected cells, flat."""
         signal, row = self.signal[index], self.row[index]
         light = signal, self.background[index], self.delay[index]
-        return Cells(self.system, signal.shape, *light, self.waveform, row, self.follow)
+        return Cells(self.system, signal.shape, *light, self.waveform, row, self.returns, self.follow)
 
     def resolved(self, out_bins: int) -> Cells:
         """These cells, with bins that follow the pulse where resolving it takes too many equal bins."""
@@ -467,12 +474,12 @@ class Cells:
 
     @property
     def instead(self) -> str:
-        """Advice for the error of a refused exact law."""
+        """Advice for the error message of a refused exact law: the alternatives to it."""
         return self.alternatives()
 
     def alternatives(self, *names: str) -> str:
-        """Advice for an error: use one of `names`, or `instead`."""
-        if self.system.detector.mode == "nonparalyzable" and not meets_itself(self):
+        """As `instead`, with further alternatives `names`."""
+        if self.system.detector.mode == "nonparalyzable" and not rearms_within_pulse(self):
             names = (*names, "joint_law (mean, variance and mean histogram)", "method 'mars' (a Gaussian)")
         return advice(*names)
 
@@ -489,7 +496,7 @@ class Cells:
     def finest(self) -> float:
         """Standard deviation, in periods, of a Gaussian as narrow as the registrations of the signal.
 
-        In dim light these are as wide as the signal; of n photons the first comes within about an n-th of its width.
+        In dim light they are as wide as the signal; the first of n photons arrives within about an n-th of this width.
         """
         photons = max(float(np.max(self.total, initial=0.0)), 1.0)
         return 1.0 / (2.0 * math.sqrt(math.pi) * max(self._sharpness, 1.0) * photons)
@@ -497,14 +504,14 @@ class Cells:
     def first_bins(self, out_bins: int) -> int:
         """Bins of the first grid: `usual_bins`, or more where a narrower pulse must be resolved.
 
-        The parts of a waveform must be resolved where pixels re-arm in the bin of their registration: grids that do not
-        resolve them agree with each other on a mean that is 1e-4 off.
+        Where pixels re-arm in the bin of their registration, the samples of a waveform must be resolved: coarser grids
+        agree with each other on a mean with a relative error of 1e-4.
         """
         most = max(TOL.most_first_bins, out_bins)
         if self.follow:
             return followed_bins(self, most, out_bins)
         usual, needed = self.usual_bins(out_bins), needed_bins(self, most)
-        if self.waveform is not None and self.system.dead_time_periods > 0.0 and _apart(self) * usual < 1.0:
+        if self.waveform is not None and self.system.dead_time_periods > 0.0 and _off_whole_periods(self) * usual < 1.0:
             needed = min(self.waveform.shape[-1], most)
         return _multiple(max(usual, needed), out_bins)
 
@@ -540,10 +547,10 @@ class Cells:
         )
 
     def chunks(self, bins: int, out_bins: int) -> Iterator[slice]:
-        """Slices of the cells whose energies and histograms take about 64 MiB together."""
+        """Slices of the cells; the energies and histograms of a slice take about 64 MiB."""
         per_cell = 8 * (4 * bins + 2 * out_bins)
         least = 64
-        if self.system.detector.mode == "paralyzable":  # kinds x moments of the rate, and what they are made of
+        if self.system.detector.mode == "paralyzable":  # kinds x moments of the rate, and arrays to compute them
             per_cell, least = 8 * (40 * bins + 2 * out_bins), 1
         elif self.waveform is None and np.unique(self.delay).size == 1 and not self._all_in_shapes:
             per_cell = 16 * out_bins + 128
@@ -552,9 +559,9 @@ class Cells:
             yield slice(start, min(start + step, self.size))
 
     def step_cost(self, bins: int) -> float:
-        """Cost of one bin and period relative to a history of one dead time that fits in the cache (1, 2 or 6)."""
-        remembered = self.grid(bins, 1).bytes
-        return 1.0 if remembered <= TOL.near_bytes else 2.0 if remembered <= TOL.middle_bytes else 6.0
+        """Cost of one bin and period (1, 2 or 6), relative to that of a pixel whose history fits in the cache."""
+        history_bytes = self.grid(bins, 1).bytes
+        return 1.0 if history_bytes <= TOL.near_bytes else 2.0 if history_bytes <= TOL.middle_bytes else 6.0
 
     def check_history(self, bins: int) -> None:
         """Raise MemoryError where the registrations of one dead time do not fit in memory."""
@@ -562,7 +569,7 @@ class Cells:
         if needed > MOMENTS.history:
             raise MemoryError(
                 f"exposure statistics of {self.name(0)}: {bins} bins per period need "
-                f"{needed / 2**30:.3g} GiB to remember one dead time, at most "
+                f"{needed / 2**30:.3g} GiB for the registrations of one dead time, at most "
                 f"{MOMENTS.history / 2**30:g} GiB are allowed; {self.instead}"
             )
 
@@ -576,9 +583,14 @@ class Cells:
         if self.system.detector.mode == "gated":
             before = photons_before(self, np.arange(parts + 1) / parts)
             return _unit_energies(before), np.arange(self.size, dtype=np.int32)
+        pulse, period = self.system.pulse, self.system.period_ns
         if self.waveform is None:
             delays, rows = np.unique(self.delay, return_inverse=True)
-            energy = self.system.pulse.bin_energy(delays * self.system.period_ns, self.system.period_ns, parts)
+            energy = pulse.bin_energy(delays * period, period, parts)
+        elif self.returns is not None:
+            used, rows = np.unique(self.row, return_inverse=True)
+            fractions, delays = self.returns[:, :, used]
+            energy = np.einsum("rk,rkn->kn", fractions, pulse.bin_energy(delays * period, period, parts))
         else:
             used, rows = np.unique(self.row, return_inverse=True)
             samples = self.waveform.shape[-1]
@@ -591,9 +603,10 @@ class Cells:
 
 
 def _multiple(wanted: float, out_bins: int) -> int:
-    """Smallest even multiple of `out_bins` that is at least `wanted`: a grid of half as many bins has their edges too.
+    """Smallest even multiple of `out_bins` that is at least `wanted`, whose half has their edges too.
 
-    On the edges of every second bin, two grids agreed while 74,000 of 3 million registrations were in the bin beside.
+    Two grids that share only every second edge of the histogram can agree although registrations are assigned to the
+    neighbouring bin: 74,000 of 3 million in one system.
     """
     return 2 * out_bins * math.ceil(wanted / (2 * out_bins))
 
@@ -623,17 +636,21 @@ def photons_before(cells: Cells, edges: FloatArray) -> FloatArray:
 
 
 def _photons_before(cells: Cells, edges: FloatArray) -> FloatArray:
+    pulse, period, at = cells.system.pulse, cells.system.period_ns, np.concatenate([[0.0], edges])
     if cells.waveform is None:
-        period = cells.system.period_ns
-        at = np.concatenate([[0.0], edges])
-        energy = cells.system.pulse.wrapped_cumulative((at - cells.delay[:, None]) * period, period)
+        energy = pulse.wrapped_cumulative((at - cells.delay[:, None]) * period, period)
         energy = energy[:, 1:] - energy[:, :1]
+    elif cells.returns is not None:
+        energy = np.zeros((cells.size, edges.size))
+        for fraction, delay in zip(*cells.returns[:, :, cells.row], strict=True):
+            before = pulse.wrapped_cumulative((at - delay[:, None]) * period, period)
+            energy += fraction[:, None] * (before[:, 1:] - before[:, :1])
     else:
         knots = np.linspace(0.0, 1.0, cells.waveform.shape[-1] + 1)
         rows, used = np.unique(cells.row, return_inverse=True)
         below = [np.concatenate([[0.0], np.cumsum(cells.waveform[row])]) for row in rows]
         energy = np.stack([np.interp(edges, knots, b) for b in below])[used.reshape(-1)]
-    total = energy  # in place: of grids of a million edges fresh memory costs more than arithmetic
+    total = energy  # in place: for a million edges, allocating memory takes longer than the arithmetic
     total *= cells.signal[:, None]
     total += cells.background[:, None] * edges
     return np.maximum(total, 0.0, out=total)
@@ -654,11 +671,11 @@ def fine_histograms(
 def _fine(cell: Cells, bins: int, tolerance: float, compute: Callable[[Cells, int], FloatArray]) -> FloatArray:
     edges = np.arange(bins + 1) / bins
     light = light_before(cell, edges)
-    for few in TOL.cells_of_many:
-        before = light_before(cell, np.arange(few + 1) / few)
+    for coarse_bins in TOL.cells_of_many:
+        before = light_before(cell, np.arange(coarse_bins + 1) / coarse_bins)
         if before[-1] == 0.0 or misplaced(before, edges, light) > 2.0 * tolerance:
             continue
-        counts = compute(cell, few)[0]
+        counts = compute(cell, coarse_bins)[0]
         fine = np.diff(registered_before(before, counts, light))
         coarse = np.diff(registered_before(before[::2], counts.reshape(-1, 2).sum(-1), light))
         if float(np.abs(fine - coarse).sum()) <= 2.0 * tolerance * float(counts.sum()):

@@ -4,14 +4,14 @@ Equation numbers refer to docs/theory.md. Times are in laser periods, fluxes in 
 
 The state is the bin (of n) of the last registration. P is never formed as a matrix: products with it are
 first-order recursions around the period (2.4, 2.5), and its stationary distribution solves the *feedback*
-equation (2.8), which the slow modes of the chain do not enter,
+equation (2.8), which does not contain the slow modes of the chain,
 
     A x = p,    A = I + diag(p) G - diag(p') S.
 
 G sums the s bins before a bin, S shifts by s bins, s the dead time in bins without whole periods. The equation
 x (I - P) = 0 of the chain is singular, with many further small singular values where the chain mixes slowly; A is
-well conditioned. Gauss-Seidel sweeps around the period converge fast unless some ten background photons fall into one
-dead time; then a Krylov method follows and, where it fails too, a sparse factorisation.
+well conditioned. Gauss-Seidel sweeps around the period converge fast unless about ten background photons fall into one
+dead time. Then GMRES is used and, if it does not converge either, a sparse factorisation.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 
 class ConvergenceError(ArithmeticError):
-    """A computation did not reach its accuracy; the message names the cell and the figure reached.
+    """A computation did not reach its accuracy; the message names the pixel and the accuracy that was reached.
 
     See Also
     --------
@@ -83,7 +83,7 @@ class Feedback:
         """
         n = self.fire.size
         rhs = np.ones(n) if adjoint else self.fire
-        if self.shift == 0:  # A is diagonal: re-armed in the bin of the registration
+        if self.shift == 0:  # A is diagonal: the pixel re-arms in the bin of its registration
             with np.errstate(over="ignore", divide="ignore"):
                 x = rhs / self.rekeep
             if not np.isfinite(x).all():
@@ -124,7 +124,7 @@ class Feedback:
         return rhs - x - window + shifted
 
     def _residual(self, rhs: FloatArray, x: FloatArray, adjoint: bool) -> float:
-        """Componentwise backward error of x, which unlike a norm weighs bins of little flux equally."""
+        """Componentwise backward error of x; unlike a norm it gives bins of little flux the same weight."""
         window, shifted = self._terms(np.abs(x), adjoint)
         size = np.abs(x) + window + shifted + np.abs(rhs)
         defect = np.abs(self._defect(rhs, x, adjoint))
@@ -132,36 +132,38 @@ class Feedback:
             return float(np.max(np.where(defect == 0.0, 0.0, defect / size)))
 
     def _krylov(self, rhs: FloatArray, x: FloatArray, adjoint: bool) -> tuple[FloatArray, int]:
-        """GMRES on the fixed point of one sweep, from `x`; each step removes one slow mode."""
+        """GMRES for the fixed point of a sweep, starting at `x`; each step removes one slow mode."""
         from scipy.sparse.linalg import LinearOperator, gmres
 
         n = x.size
-        nothing = np.zeros(n)
+        zero = np.zeros(n)
         steps = 0
 
-        def moved(b: FloatArray, v: FloatArray) -> FloatArray:
+        def swept(b: FloatArray, v: FloatArray) -> FloatArray:
             nonlocal steps
             steps += 1
             out = np.array(v, dtype=np.float64).reshape(n)
             self._sweep(b, out, adjoint, 1)
             return out
 
-        operator = LinearOperator((n, n), matvec=lambda v: v - moved(nothing, v), dtype=np.float64)
+        operator = LinearOperator((n, n), matvec=lambda v: v - swept(zero, v), dtype=np.float64)
         for _ in range(2):  # the second round removes the rounding error of the first
-            rest = moved(self._defect(rhs, x, adjoint), nothing)
+            rest = swept(self._defect(rhs, x, adjoint), zero)
             goal = 1e-16 * float(np.linalg.norm(x))
             if not float(np.linalg.norm(rest)) > goal:
                 break
-            step, short = gmres(operator, rest, rtol=1e-13, atol=goal, restart=min(n, TOL.chain_krylov), maxiter=1)
+            step, unconverged = gmres(
+                operator, rest, rtol=1e-13, atol=goal, restart=min(n, TOL.chain_krylov), maxiter=1
+            )
             x = x + step
-            if short:  # many slow modes: the factorisation is cheaper than another round
+            if unconverged:  # many slow modes: the factorisation is cheaper than another round
                 break
         return x, steps
 
     def _direct(self, rhs: FloatArray, x: FloatArray, adjoint: bool) -> tuple[FloatArray, float]:
-        """Sparse LU on the prefix sums C of x (2.10): four entries a row, the fill of a planar grid.
+        """Sparse LU for the prefix sums C of x (2.10): four entries a row, with the fill-in of a planar grid.
 
-        Differences of C lose digits, which iterative refinement of the equation for x restores.
+        Differences of C lose digits; iterative refinement of the equation for x restores them.
         """
         from scipy.sparse.linalg import splu
 
@@ -211,8 +213,8 @@ class Feedback:
 def cyclic_recursion(keep: FloatArray, source: FloatArray, loss: float, *, backward: bool = False) -> FloatArray:
     """Solution (n,) of v[j+1] = keep[j] v[j] + source[j] round the circle, or backward from v[j+1] to v[j].
 
-    `loss` is 1 - prod(keep), an argument so that it is accurate where the product is nearly 1. For non-negative
-    input the result is accurate relative to itself: no term is subtracted.
+    `loss` is 1 - prod(keep); the caller computes it accurately where the product is nearly 1. For non-negative input
+    the relative error of the result is of rounding, because no term is subtracted.
     """
     out = np.empty(keep.size)
     _core.cyclic_recursion(keep, np.ascontiguousarray(source, dtype=np.float64), loss, backward, out)
@@ -237,7 +239,7 @@ class Stationary:
     rate
         Registrations per period (2.9); 1 / rate is the mean holding time in periods.
     residual
-        ``sum |pdf P - pdf|``, by an O(n) product; a weak test where the chain mixes slowly.
+        ``sum |pdf P - pdf|``, by an O(n) product; it is insensitive to errors in modes that decay slowly.
     error
         Componentwise backward error of the feedback equation (2.8), which does not depend on the mixing.
     sweeps
@@ -358,7 +360,7 @@ class PhaseChain:
         checks.choice("rearm", self.rearm, _REARMS)
         photons.flags.writeable = False
         n = photons.size
-        # whole periods are split off first, so that t_d = 200.9 periods does not lose digits of its fraction (2.2)
+        # without the whole periods, whose digits the fraction of t_d = 200.9 periods would lose (2.2)
         whole = math.floor(dead)
         position = (dead - whole) * n + (0.5 if self.rearm == "centre" else 0.0)
         shift = math.floor(position)
@@ -410,11 +412,11 @@ class PhaseChain:
         return self.whole_periods * self.bins + self.shift
 
     def rearmed(self, mass: FloatArray) -> FloatArray:
-        """Mass (n,) that re-arms in each bin when `mass` (n,) was registered: the cyclic row shift."""
+        """Mass (n,) that re-arms in each bin after `mass` (n,) was registered: a cyclic shift."""
         return np.roll(mass, self.shift)
 
     def armed(self, mass: FloatArray) -> FloatArray:
-        """Mass armed at the *start* of each bin (n,), when `mass` (n,) is registered in each bin (2.4)."""
+        """Mass (n,) armed at the *start* of each bin after `mass` (n,) was registered in each bin (2.4)."""
         return cyclic_recursion(self.keep, self.rekeep * self.rearmed(mass), self.loss)
 
     def forward(self, x: ArrayLike) -> FloatArray:
@@ -433,13 +435,13 @@ class PhaseChain:
         return np.roll(values, -self.shift)
 
     def dense(self) -> FloatArray:
-        """The transition matrix P (n, n), rows sum to 1: that of first arrivals, each row shifted round (2.3)."""
+        """The transition matrix P (n, n), whose rows sum to 1: that of first arrivals with shifted rows (2.3)."""
         n = self.bins
         order = (np.arange(n)[:, None] + np.arange(n)) % n  # bins in the order of their times after arming in bin a
-        met = self.photons[order]
-        met[:, 0] *= 1.0 - self.fraction
+        passed = self.photons[order]
+        passed[:, 0] *= 1.0 - self.fraction
         before = np.zeros((n, n))
-        np.cumsum(met[:, :-1], axis=1, out=before[:, 1:])
+        np.cumsum(passed[:, :-1], axis=1, out=before[:, 1:])
         first = np.exp(-before) * -np.expm1(-self.photons[order]) / self.loss
         first[:, 0] = self.refire + self.again()
         base = np.empty((n, n))
@@ -482,7 +484,7 @@ def stationary_from(chain: PhaseChain, solution: Solution) -> Stationary:
     """Stationary distribution from the solution w of the feedback equation (2.9)."""
     weight = np.maximum(solution.x, 0.0)
     pdf = weight / weight.sum()
-    # The rounding error of the solution is absolute; one step of the chain, which only adds, makes it relative.
+    # The rounding error of the solution is absolute; a step of the chain, a sum of positive terms, makes it relative.
     pdf = chain.forward(pdf)
     pdf /= pdf.sum()
     residual = float(np.abs(chain.forward(pdf) - pdf).sum())

@@ -40,8 +40,8 @@ def constant_light_rate(rate_hz: float, detector: Detector) -> float:
     rate_hz
         Photons per second at the pixel, before its detection efficiency; dark counts are added.
     detector
-        Of mode ``"nonparalyzable"``, without crosstalk or a longer dead time of the electronics, and afterpulses of all
-        generations, not together with `recovery_ns`.
+        A detector of mode ``"nonparalyzable"`` without crosstalk and without a longer dead time of the electronics. It
+        may have `recovery_ns` or afterpulses of all generations, but not both.
 
     Returns
     -------
@@ -101,7 +101,7 @@ def renewal_moments(photons: FloatArray, system: System) -> tuple[FloatArray, Fl
 
 
 def _wait(rate: float, recovery: float) -> float:
-    """Mean wait of an armed pixel, ns: of hazard rate (1 - e^(-u / recovery))."""
+    """Mean waiting time of an armed pixel, ns, with the hazard rate `rate` (1 - e^(-u / recovery))."""
     from scipy.special import hyp1f1
 
     a = rate * recovery
@@ -110,24 +110,24 @@ def _wait(rate: float, recovery: float) -> float:
 
 
 def _exponential(rate: float, dead: float, twilight: float, p: float, delay: float) -> float:
-    """Mean interval, ns; the release rate after every avalanche is level / delay e^(-u / delay)."""
+    """Mean interval, ns, for the release rate level / delay e^(-u / delay) of carriers after every avalanche."""
     from scipy.integrate import quad
 
-    scale = min(delay, 1.0 / rate)  # of the integrands
+    scale = min(delay, 1.0 / rate)  # ns: width of the integrands
     level, interval = p, math.inf
     for _ in range(TOL.constant_light_rounds):
         released = level * math.exp(-dead / delay)
         again = -math.expm1(-rate * twilight - released * math.expm1(twilight / delay))
 
-        def armed(s: float, released: float = released) -> float:  # P(no avalanche up to s after the recovery)
+        def survival(s: float, released: float = released) -> float:  # P(no avalanche until s after re-arming)
             return math.exp(-rate * s + released * math.expm1(-s / delay))
 
-        def soon(x: float, released: float = released) -> float:  # the part of `armed` that depends on the releases
+        def by_release(x: float, released: float = released) -> float:  # part of `survival` that depends on releases
             return scale * math.exp(-rate * x * scale - released) * math.expm1(released * math.exp(-x * scale / delay))
 
-        # E e^(-s / delay) of the next avalanche, by parts
-        mean = math.exp(-released) / rate + quad(soon, 0.0, 60.0, epsabs=0.0, limit=400)[0]
-        part = quad(lambda x: armed(x * scale) * math.exp(-x * scale / delay) * scale, 0.0, 60.0, limit=400)[0]
+        # E e^(-s / delay) for the time s of the next avalanche, integrated by parts
+        mean = math.exp(-released) / rate + quad(by_release, 0.0, 60.0, epsabs=0.0, limit=400)[0]
+        part = quad(lambda x: survival(x * scale) * math.exp(-x * scale / delay) * scale, 0.0, 60.0, limit=400)[0]
         decay = again + (1.0 - again) * (1.0 - part / delay)
         level, last, interval = p / (1.0 - math.exp(-dead / delay) * decay), interval, dead + (1.0 - again) * mean
         if abs(interval - last) <= TOL.rounding * interval:
@@ -136,7 +136,7 @@ def _exponential(rate: float, dead: float, twilight: float, p: float, delay: flo
 
 
 def _sampled(rate: float, dead: float, twilight: float, density: NDArray[np.float64], cell: float) -> float:
-    """Mean interval, ns; `density` (n,): trapped carriers of one avalanche by release time, in cells of `cell` ns."""
+    """Mean interval, ns; `density` (n,): carriers trapped by one avalanche, by release time in cells of `cell` ns."""
     from scipy.signal import fftconvolve
 
     n, edges = density.size, np.arange(density.size + 1, dtype=np.float64) * cell
@@ -155,7 +155,7 @@ def _sampled(rate: float, dead: float, twilight: float, density: NDArray[np.floa
         armed = np.exp(-np.concatenate([[0.0], np.cumsum(hazard)]))
         fires = -np.diff(armed)
         mean = float(np.sum(fires / hazard) * cell + armed[-1] / rate)
-        # carriers at dead + s + u are released u after an avalanche `s` after the recovery; s at the cell centre
+        # release at dead + s + u is u after an avalanche at s after re-arming; s is at the centre of its cell
         later = between(edges + (dead + 0.5 * cell))
         trapped = fftconvolve(later, fires[::-1])[n - 1 :]
         carriers = density + (1.0 - again) * np.maximum(trapped, 0.0) + again * free

@@ -25,7 +25,7 @@ from mars_lidar.statistics.tolerances import LAW, TOL
 
 @dataclass(frozen=True, eq=False)
 class Pmf:
-    """Probabilities `p` (w,) of the counts `first`, `first` + 1, ...; at most `outside` lies elsewhere.
+    """Probabilities `p` (w,) of the counts `first`, `first` + 1, ...; that of all others is at most `outside`.
 
     For simulated counts `p` holds their frequencies.
     """
@@ -50,7 +50,7 @@ class Pmf:
 
     @property
     def last(self) -> int:
-        """The largest count with an entry."""
+        """The last count of `p`."""
         return self.first + self.p.size - 1
 
 
@@ -69,7 +69,7 @@ def kl_divergence(sample: FloatArray, law: FloatArray) -> FloatArray:
     return np.asarray((sample * (log_sample - log_law)).sum(-1), dtype=np.float64)
 
 
-def poisson_window(mean: float) -> Pmf:
+def poisson_pmf(mean: float) -> Pmf:
     """Poisson law, exact without dead time; the support follows from Bernstein's bounds of the two tails."""
     from scipy.special import gammaln, xlogy
 
@@ -80,7 +80,7 @@ def poisson_window(mean: float) -> Pmf:
     return Pmf(low, np.exp(xlogy(counts, mean) - mean - gammaln(counts + 1.0)), TOL.tail * (1 + (low > 0)))
 
 
-def gaussian_window(mean: float, variance: float) -> Pmf:
+def gaussian_pmf(mean: float, variance: float) -> Pmf:
     """Normal law on the integers: P(n) = Phi((n + 1/2 - mean) / sd) - Phi((n - 1/2 - mean) / sd).
 
     P(0) includes the probability below 0.
@@ -106,11 +106,11 @@ def gaussian_window(mean: float, variance: float) -> Pmf:
 
 
 class TooLongError(ConvergenceError):
-    """The state did not repeat within the budget of a law."""
+    """The state of the pixel did not repeat within the budget of a law."""
 
 
 class Remaining:
-    """Steps of `Budget.transform` that remain for the law of one cell; at the start a `share` of all."""
+    """Steps of `Budget.transform` that remain for the law of one cell; initially the `share` of all."""
 
     def __init__(self, share: float = 1.0) -> None:
         self.steps = share * LAW.transform
@@ -141,22 +141,22 @@ def characteristic(
         "settled": settled,
     }
     for part in cells.chunks(bins, 1):
-        mine: dict[str, Any] = points | {name: x[part] for name, x in points.items() if np.ndim(x)}
+        arguments: dict[str, Any] = points | {name: x[part] for name, x in points.items() if np.ndim(x)}
         light = native_light(cells.part(part), bins)
-        _core.exposure_characteristic(grid=grid, light=light, **mine, threads=threads)
-    cold = np.flatnonzero((settled == Settled.NOT_WARM).any(-1))
-    if cold.size:
+        _core.exposure_characteristic(grid=grid, light=light, **arguments, threads=threads)
+    not_warm = np.flatnonzero((settled == Settled.NOT_WARM).any(-1))
+    if not_warm.size:
         again: dict[str, Any] = points | {
-            name: np.ascontiguousarray(x[cold]) for name, x in points.items() if np.ndim(x)
+            name: np.ascontiguousarray(x[not_warm]) for name, x in points.items() if np.ndim(x)
         }
-        light = native_light(cells.part(cold), bins, warm_history(cells, cold, bins))
+        light = native_light(cells.part(not_warm), bins, warm_history(cells, not_warm, bins))
         _core.exposure_characteristic(grid=grid, light=light, **again, threads=threads)
         for name, array in (("re", re), ("im", im), ("settled", settled)):
-            array[cold] = again[name]
-    lost = (settled == Settled.UNSETTLED).any(-1)
-    if lost.any():
+            array[not_warm] = again[name]
+    unsettled = (settled == Settled.UNSETTLED).any(-1)
+    if unsettled.any():
         raise TooLongError(
-            f"count law of {cells.name(int(np.argmax(lost)))}: the state of the pixel does not repeat within "
+            f"count law of {cells.name(int(np.argmax(unsettled)))}: the state of the pixel does not repeat within "
             f"{steps:.1g} bins x periods, too many to compute the exposure to its end at {z_re.shape[1]} points; mean, "
             f"variance and two more cumulants are known; for the law {cells.instead}"
         )
@@ -170,13 +170,13 @@ def characteristic(
 _TILTS = np.array([1.0, 2.0, 3.5, 5.0, 6.5, 8.0, 11.0, 15.0])  # exponential tilts in units of 1 / standard deviation
 
 
-def exact_windows(cells: Cells, cumulants: FloatArray, bins: IndexArray, threads: int) -> list[Pmf]:
+def exact_pmfs(cells: Cells, cumulants: FloatArray, bins: IndexArray, threads: int) -> list[Pmf]:
     """Exact pmf of each cell, on the grid of `bins` (cells,) on which its `cumulants` (cells, 4) converged."""
     if cells.system.dead_time_periods == 0.0:
-        return [poisson_window(float(mean)) for mean in cumulants[:, 0]]
+        return [poisson_pmf(float(mean)) for mean in cumulants[:, 0]]
     cells = cells.resolved(1)
     dark = cells.total == 0.0
-    windows: list[Pmf | None] = [Pmf(0, np.ones(1), 0.0) if nothing else None for nothing in dark]
+    laws: list[Pmf | None] = [Pmf(0, np.ones(1), 0.0) if nothing else None for nothing in dark]
     for n in np.unique(bins[~dark]):
         index = np.flatnonzero((bins == n) & ~dark)
         cells.check_history(int(n))
@@ -188,27 +188,27 @@ def exact_windows(cells: Cells, cumulants: FloatArray, bins: IndexArray, threads
             for k, cell in enumerate(block):
                 single = cells.part(block[k : k + 1])
                 spread = float(cumulants[cell, 1])
-                window = _window(single, int(lows[k]), int(highs[k]), float(outside[k]), int(n), threads, spread)
-                _check(cells, int(cell), window, cumulants[cell])
-                windows[cell] = window
-    return [window for window in windows if window is not None]
+                law = _on_support(single, int(lows[k]), int(highs[k]), float(outside[k]), int(n), threads, spread)
+                _check(cells, int(cell), law, cumulants[cell])
+                laws[cell] = law
+    return [law for law in laws if law is not None]
 
 
-def guessed_windows(
+def guessed_pmfs(
     cells: Cells, cumulants: FloatArray, bins: IndexArray, threads: int, waiting: Callable[[int], object] | None = None
 ) -> list[Pmf]:
     """Exact pmf of each cell, given approximate cumulants (cells, 4), for example from a table.
 
-    The approximate cumulants give the support. Where the result shows that the support is too small, `exact_windows`
-    with the exact cumulants replaces it. For narrow laws this is several times faster than `exact_windows`. `waiting`
-    is called with the number of cells done.
+    The support is that of the approximate cumulants. Where the result shows that it is too small, the law is computed
+    by `exact_pmfs` with exact cumulants. For narrow laws this is several times faster than `exact_pmfs`.
+    `waiting` is called with the number of cells computed so far.
     """
     cells = cells.resolved(1)
     spread = np.sqrt(np.maximum(cumulants[:, 1], 0.0))
     half = np.ceil(TOL.guess_spreads * spread + TOL.guess_counts)
     size = (8.0 * np.ceil((2.0 * half + 1.0) / 8.0)).astype(np.int64)
     first = np.maximum(np.floor(cumulants[:, 0]) - half, 0.0).astype(np.int64)
-    windows: list[Pmf | None] = [None] * cells.size
+    laws: list[Pmf | None] = [None] * cells.size
     done = 0
     for n, width in np.unique(np.stack([bins, size], -1), axis=0):
         index = np.flatnonzero((bins == n) & (size == width))
@@ -218,13 +218,13 @@ def guessed_windows(
             pmf = _folded(cells.part(block), first[block], int(width), int(n), threads) if guessed else None
             for k, cell in enumerate(block):
                 candidate = (
-                    None if pmf is None else _if_whole(pmf[k], int(first[cell]), cumulants[cell, 0], spread[cell])
+                    None if pmf is None else _if_complete(pmf[k], int(first[cell]), cumulants[cell, 0], spread[cell])
                 )
-                windows[cell] = candidate or _alone(cells.part(block[k : k + 1]), threads)
+                laws[cell] = candidate or _by_own_cumulants(cells.part(block[k : k + 1]), threads)
             done += block.size
             if waiting is not None:
                 waiting(done)
-    return [window for window in windows if window is not None]
+    return [law for law in laws if law is not None]
 
 
 def _folded(cells: Cells, first: IndexArray, size: int, bins: int, threads: int) -> FloatArray:
@@ -236,27 +236,25 @@ def _folded(cells: Cells, first: IndexArray, size: int, bins: int, threads: int)
     return np.take_along_axis(folded, (first[:, None] + np.arange(size)) % size, axis=-1)
 
 
-def _if_whole(pmf: FloatArray, first: int, mean: float, spread: float) -> Pmf | None:
-    """The window where it contains the law: ends below `Tolerances.edge`, nothing negative, sum 1, the assumed mean."""
-    away = float(pmf @ (first + np.arange(pmf.size))) - mean
-    ends = _ends(pmf, first)
-    if not (ends <= TOL.edge and abs(away) <= TOL.like_mean * max(spread, 0.5) and float(pmf.min()) >= -TOL.consistent):
-        return None
-    if not abs(float(pmf.sum()) - 1.0) <= TOL.consistent:
+def _if_complete(pmf: FloatArray, first: int, mean: float, spread: float) -> Pmf | None:
+    """The pmf if its counts include the law: small at both ends, not negative, with sum 1 and the assumed mean."""
+    moved = float(pmf @ (first + np.arange(pmf.size))) - mean
+    inside = _ends(pmf, first) <= TOL.edge and abs(moved) <= TOL.guess_mean * max(spread, 0.5)
+    if not (inside and float(pmf.min()) >= -TOL.consistent and abs(float(pmf.sum()) - 1.0) <= TOL.consistent):
         return None
     return Pmf(first, np.maximum(pmf, 0.0), pmf.size * TOL.edge)
 
 
 def _ends(pmf: FloatArray, first: int, most: float = math.inf) -> float:
-    """Larger probability of the first and last count of a window, ignoring an end at which the counts end."""
+    """Larger probability of the first and the last count, except of count 0 and of `most`, the largest possible one."""
     low = abs(float(pmf[0])) if first > 0 else 0.0
     return max(low, abs(float(pmf[-1])) if first + pmf.size - 1 < most else 0.0)
 
 
-def _alone(cell: Cells, threads: int) -> Pmf:
-    """Exact pmf of one cell with its own cumulants."""
+def _by_own_cumulants(cell: Cells, threads: int) -> Pmf:
+    """Exact pmf of one cell, computed with its exact cumulants."""
     own = refined_moments(cell, 1, tolerance=1e-4, threads=threads)
-    return exact_windows(cell, own.cumulants.reshape(-1, 4), own.bins.reshape(-1), threads)[0]
+    return exact_pmfs(cell, own.cumulants.reshape(-1, 4), own.bins.reshape(-1), threads)[0]
 
 
 def _supports(
@@ -270,7 +268,7 @@ def _supports(
         TOL.most_log_growth / (1.0 + 1.0 / dead),
         np.log1p(TOL.most_log_growth / np.maximum(cells.total, 1e-300)),
     )
-    # the tilts are scaled down to the limit; where large counts are rare, small tilts give the best bounds
+    # if necessary the tilts are reduced to this limit; where large counts are rare, small tilts give the best bounds
     unit = np.minimum(1.0 / np.maximum(spread, 1e-300), np.minimum(growth, TOL.most_tilt) / _TILTS[-1])
     tilt = _TILTS * unit[:, None]
     tilt = np.concatenate([tilt, -tilt], axis=1)
@@ -310,7 +308,7 @@ def _guessed_supports(cells: Cells, cumulants: FloatArray) -> tuple[IndexArray, 
     return first.astype(np.int64), last.astype(np.int64), (last - first) * TOL.edge
 
 
-def _window(cell: Cells, first: int, last: int, outside: float, bins: int, threads: int, variance: float) -> Pmf:
+def _on_support(cell: Cells, first: int, last: int, outside: float, bins: int, threads: int, variance: float) -> Pmf:
     """Exact pmf of one cell on the counts `first` to `last`."""
     from scipy.fft import irfft  # of lengths with a large prime factor twice as fast as NumPy's
 
@@ -329,11 +327,11 @@ def _window(cell: Cells, first: int, last: int, outside: float, bins: int, threa
 def _narrow(
     cell: Cells, size: int, bins: int, threads: int, variance: float, remaining: Remaining
 ) -> NDArray[np.complex128] | None:
-    """Conjugate of E z^N at the points (size // 2 + 1,) of the circle, evaluated where it is not 0; None if unproven.
+    """Conjugate of E z^N at (size // 2 + 1,) points of the circle, evaluated only near z = 1; None if not justified.
 
-    The transform of a wide law is a narrow peak at z = 1, below rounding beyond some 9 of its standard deviations,
-    unless the counts lie on a lattice (all even, say), which gives further peaks of the same width. These also occur in
-    the transform of a much shorter exposure, where they are wide enough to be found on few points (27).
+    The transform of a wide law is a narrow peak at z = 1; beyond about 9 of its standard deviations it is below
+    rounding. If the counts lie on a lattice (all even, say), there are further peaks of the same width. They also occur
+    in the transform of a much shorter exposure, where they are so wide that few points detect them (27).
     """
     cycles = cell.system.cycles
     shorter = max(1, math.ceil(TOL.short_variance * cycles / max(variance, 1e-300)))
@@ -357,28 +355,28 @@ def _narrow(
     between = np.geomspace(angle[min(end, angle.size - 1)], max(begin, angle[min(end, angle.size - 1)]), 16)
     re, im = characteristic(cell, np.cos(between)[None], np.sin(between)[None], bins, threads, remaining)
     beyond = np.linspace(begin, np.pi, 2 + math.ceil((np.pi - begin) * spread / 0.3))
-    brief = replace(cell, system=cell.system.replace(cycles=shorter))
-    short_re, short_im = characteristic(brief, np.cos(beyond)[None], np.sin(beyond)[None], bins, threads, remaining)
+    short = replace(cell, system=cell.system.replace(cycles=shorter))
+    short_re, short_im = characteristic(short, np.cos(beyond)[None], np.sin(beyond)[None], bins, threads, remaining)
     highest = float(np.hypot(short_re, short_im).max())
     faint = float(np.hypot(re, im).max()) <= 10.0 * TOL.faint
     return value if faint and highest ** (cycles / shorter) <= 1e-3 * TOL.faint else None
 
 
-def _check(cells: Cells, cell: int, window: Pmf, cumulants: FloatArray) -> None:
-    """Check sum, sign, mean and variance of the pmf against the cumulants; then clip and normalise it in place."""
-    pmf: NDArray[np.float64] = window.p
-    offset = window.first + np.arange(pmf.size) - cumulants[0]
+def _check(cells: Cells, cell: int, law: Pmf, cumulants: FloatArray) -> None:
+    """Compare sum, sign, mean and variance of the pmf with the cumulants; then clip and normalise it in place."""
+    pmf: NDArray[np.float64] = law.p
+    offset = law.first + np.arange(pmf.size) - cumulants[0]
     spread = max(math.sqrt(cumulants[1]), 1e-3)
     edge = TOL.edge + TOL.consistent_per_cycle * cells.system.cycles
-    if window.outside > TOL.tail * 4.0 and _ends(pmf, window.first, _most(cells)) > edge:  # a guessed support
+    if law.outside > TOL.tail * 4.0 and _ends(pmf, law.first, _most(cells)) > edge:  # a guessed support
         raise ConvergenceError(
-            f"count law of {cells.name(cell)}: it extends beyond {window.first} .. {window.first + pmf.size - 1}, "
+            f"count law of {cells.name(cell)}: it extends beyond {law.first} .. {law.first + pmf.size - 1}, "
             f"the support expected from mean and variance; mean, variance and cumulants are known; for the law "
             f"{cells.instead}"
         )
     total, mean = float(pmf.sum()), float((pmf * offset).sum())
     variance, least = float((pmf * offset**2).sum()), float(pmf.min())
-    # errors of rounding and extrapolation are absolute in probability; for a locked count they may exceed its variance
+    # rounding and extrapolation cause absolute errors of probability, which may exceed the variance of a locked count
     rounding, unit = TOL.consistent_per_cycle * cells.system.cycles, max(spread, 1.0)
     error = max(
         abs(total - 1.0) / (TOL.consistent + rounding),
@@ -388,7 +386,7 @@ def _check(cells: Cells, cell: int, window: Pmf, cumulants: FloatArray) -> None:
     )
     if not error <= 1.0:
         raise ConvergenceError(
-            f"count law of {cells.name(cell)}: its pmf on {window.first} .. {window.first + pmf.size - 1} "
+            f"count law of {cells.name(cell)}: its pmf on {law.first} .. {law.first + pmf.size - 1} "
             f"disagrees with the cumulants {error:.2g} times as much as is allowed: sum - 1 = "
             f"{total - 1.0:.2g}, mean off by {mean:.2g}, variance {variance:.6g} for {cumulants[1]:.6g}, "
             f"least {least:.2g}; mean, variance and cumulants are known; for the law {cells.instead}"

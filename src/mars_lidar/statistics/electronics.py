@@ -26,7 +26,7 @@ from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.statistics.cells import Cells, photons_before
 from mars_lidar.statistics.chain import ConvergenceError
-from mars_lidar.statistics.count_pmf import Pmf, exact_windows
+from mars_lidar.statistics.count_pmf import Pmf, exact_pmfs
 from mars_lidar.statistics.exposure import Moments, refined_moments, stationary_histogram
 from mars_lidar.statistics.timing import Timing, is_timed
 from mars_lidar.statistics.tolerances import LAW, MOMENTS, TOL, Budget, advice
@@ -312,14 +312,15 @@ def without_electronics(cells: Cells) -> tuple[Cells, float]:
     """Cells without electronics, and the dead time of the electronics in ns; 0 where a single dead time is equivalent.
 
     A single dead time, the longer one, is equivalent where the dead time of the pixel is 0 or is the longer one. The
-    returned cells then have that dead time.
+    returned cells then have that dead time. Behind a pixel without a dead time they begin armed, as electronics do.
     """
     detector = cells.system.detector
     slower = max(detector.dead_time_ns, detector.electronics_dead_time_ns)
     bare = detector.without("electronics_dead_time_ns")
     if detector.dead_time_ns == 0.0 or slower == detector.dead_time_ns:
         bare, slower = replace(bare, dead_time_ns=slower), 0.0
-    return replace(cells, system=cells.system.replace(detector=bare)), slower
+    start = "armed" if detector.dead_time_ns == 0.0 else cells.system.start
+    return replace(cells, system=cells.system.replace(detector=bare, start=start)), slower
 
 
 def coarsest_grid(cell: Cells) -> int:
@@ -474,13 +475,13 @@ def _phases(grid: RecordGrid) -> FloatArray:
         return np.asarray(direct / direct.sum())
     law: FloatArray = np.full(n, 1.0 / n)
     moved = math.inf
-    for _ in range(TOL.record_turns):
+    for _ in range(TOL.record_iterations):
         following = np.asarray(law @ matrix, dtype=np.float64)
         following /= following.sum()
         before, moved = moved, 0.5 * float(np.abs(following - law).sum())
         law = following
-        forgotten = 1.0 - min(moved / before, 1.0) if before > 0.0 else 1.0
-        if moved <= TOL.record_stands * forgotten:
+        gap = 1.0 - min(moved / before, 1.0) if before > 0.0 else 1.0
+        if moved <= TOL.record_change * gap:
             return law
     raise ConvergenceError(
         f"stationary shape of {grid.cell.name(0)} behind electronics with a dead time: {n} phases do not converge; "
@@ -515,16 +516,16 @@ def _transitions(grid: RecordGrid) -> FloatArray:
 ComplexArray = NDArray[np.complex128]
 
 
-def record_windows(cells: Cells, tolerance: float, threads: int) -> list[Pmf]:
+def record_pmfs(cells: Cells, tolerance: float, threads: int) -> list[Pmf]:
     """Pmf of the number of records of each cell; the tolerance is that of `electronics_moments`."""
     bare, slower = without_electronics(cells)
     if slower == 0.0:
         exposure = refined_moments(bare, 1, tolerance=min(tolerance, 1e-4), threads=threads)
-        return exact_windows(bare, exposure.cumulants.reshape(-1, 4), exposure.bins.reshape(-1), threads)
-    return [_window(bare.part(slice(k, k + 1)), slower, tolerance) for k in range(cells.size)]
+        return exact_pmfs(bare, exposure.cumulants.reshape(-1, 4), exposure.bins.reshape(-1), threads)
+    return [_law(bare.part(slice(k, k + 1)), slower, tolerance) for k in range(cells.size)]
 
 
-def _window(cell: Cells, electronics_ns: float, tolerance: float) -> Pmf:
+def _law(cell: Cells, electronics_ns: float, tolerance: float) -> Pmf:
     if float(cell.total[0]) == 0.0:
         return Pmf(0, np.ones(1), 0.0)
     mean, variance, _, bins = refined(cell, electronics_ns, tolerance, LAW)
@@ -549,11 +550,11 @@ def _window(cell: Cells, electronics_ns: float, tolerance: float) -> Pmf:
         abs(float(pmf @ offset**2) - variance) / max(variance, 1e-6),
         -float(pmf.min()),
     )
-    if not error <= TOL.like_moments * tolerance:
+    if not error <= TOL.record_mismatch * tolerance:
         raise ConvergenceError(
             f"count law of {cell.name(0)}, t_e = {electronics:g} periods: its pmf on {first} .. {last} disagrees with "
-            f"mean and variance by {error:.2g} (allowed {TOL.like_moments * tolerance:.2g}); electronics_moments has "
-            "those"
+            f"mean and variance by {error:.2g} (allowed {TOL.record_mismatch * tolerance:.2g}); electronics_moments "
+            "gives mean and variance"
         )
     pmf = np.maximum(pmf, 0.0)
     outside = TOL.record_edge * ((first > 0) + (last < most)) * pmf.size

@@ -1,10 +1,10 @@
 """Exact statistics of a finite exposure: cumulants of the count and the mean histogram, by the delay recursion.
 
-The result includes the start, the end and the mixing of the exposure; nothing is assumed stationary or Gaussian, or
-truncated. Derivation and equation numbers: docs/theory_exposure.md; of paralyzable pixels: docs/theory_detectors.md,
-equations (1) and (17). `refined_moments` refines the grid until two grids agree.
+The result includes the start-up transient and the end of the exposure; nothing is assumed stationary or Gaussian, and
+nothing is truncated. Derivation and equation numbers: docs/theory_exposure.md; of paralyzable pixels:
+docs/theory_detectors.md, equations (1) and (17). `refined_moments` refines the grid until two grids agree.
 
-Without a dead time every photon is registered, and every bin is Poisson.
+Without a dead time every photon is registered, and the count of every bin is Poisson.
 
 With `System.start` ``"stationary"`` the exposure begins in the fixed point of the recursion. Where many background
 photons fall into a dead time, registrations are nearly periodic and the recursion takes thousands of periods to
@@ -30,7 +30,7 @@ from mars_lidar.instrument.detector import Mode
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
-from mars_lidar.statistics.cells import Cells, fine_histograms, meets_itself, photons_before
+from mars_lidar.statistics.cells import Cells, fine_histograms, photons_before, rearms_within_pulse
 from mars_lidar.statistics.chain import ConvergenceError
 from mars_lidar.statistics.joint_grid import FoldedGrid
 from mars_lidar.statistics.timing import Timing, is_timed
@@ -40,11 +40,11 @@ from mars_lidar.statistics.tolerances import MOMENTS, TOL, Budget
 
 
 class Settled(IntEnum):
-    """`Exposure.settled` where it is no number of periods, as native/laws/exposure_kernel.h."""
+    """Values of `Exposure.settled` that are not a number of periods; as in native/laws/exposure_kernel.h."""
 
     RAN_TO_END = -1
-    UNSETTLED = -2  # not within the allowed periods: no result
-    NOT_WARM = -3  # the sweeps did not reach the stationary state to start from: no result
+    UNSETTLED = -2  # the state did not repeat within the allowed periods: no result
+    NOT_WARM = -3  # the iteration did not reach the stationary state of the start: no result
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,14 +176,14 @@ def movement(coarse: Exposure, fine: Exposure) -> FloatArray:
     mean, spread = np.abs(fine.cumulants[:, 0]), np.sqrt(np.maximum(fine.cumulants[:, 1], 0.0))
     floor = 1e-10 * mean + np.finfo(float).tiny  # rounding: the variance of a locked pixel may be 0
     change = np.abs(fine.cumulants - coarse.cumulants)
-    worst = change[:, 0] / np.maximum(np.minimum(mean, spread), floor)
+    largest = change[:, 0] / np.maximum(np.minimum(mean, spread), floor)
     for k in range(1, 4):
         scale = np.maximum(np.abs(fine.cumulants[:, k]), spread ** (k + 1))
-        worst = np.maximum(worst, change[:, k] / np.maximum(scale, floor))
+        largest = np.maximum(largest, change[:, k] / np.maximum(scale, floor))
     joined = fine.histogram.reshape(*coarse.histogram.shape, -1).sum(-1)
     shape = 0.5 * np.abs(joined - coarse.histogram).sum(-1) / np.maximum(mean, np.finfo(float).tiny)
-    below = fine.histogram.min(-1) < -1e-12 * mean
-    return np.asarray(np.where(below, np.inf, np.maximum(worst, shape)), dtype=np.float64)
+    negative = fine.histogram.min(-1) < -1e-12 * mean
+    return np.asarray(np.where(negative, np.inf, np.maximum(largest, shape)), dtype=np.float64)
 
 
 def take(some: Exposure, which: NDArray[np.bool_]) -> Exposure:
@@ -217,7 +217,7 @@ def normalised(histogram: FloatArray) -> FloatArray:
 
 # --- Rates of a paralyzable pixel ----------------------------------------------------------------------------------
 
-_SERIES_BELOW, _SERIES_TERMS = 0.25, 10  # of the exponent: the recursion loses 4 digits there, the series none
+_SERIES_BELOW, _SERIES_TERMS = 0.25, 10  # below this exponent the recursion loses 4 digits, the series none
 
 
 def registration_rates(cells: Cells, bins: int) -> FloatArray:
@@ -255,10 +255,10 @@ def _moments(before: FloatArray, within: FloatArray) -> FloatArray:
 
 
 def _on_parts(before: FloatArray, within: FloatArray, parts: int) -> FloatArray:
-    """Moments 0 to 3, with rates of arrivals now and a dead time ago that are constant in each of `parts` of a bin.
+    """Moments 0 to 3, for arrival rates, now and a dead time ago, that are constant in each of the `parts` of a bin.
 
-    The rate of registrations is then exponential in a part, and is largest at one of its ends, from which on x is
-    measured: whatever it falls by in the part, a moment is a sum of terms of one sign.
+    The rate of registrations is then an exponential in each part. With x measured from the end of the part at which the
+    rate is largest, each moment is a sum of terms of one sign, however steep the exponential is.
     """
     photons, rise = np.diff(before), np.diff(within)
     peak = photons * np.exp(-np.minimum(within[:, :-1], within[:, 1:]))
@@ -299,7 +299,7 @@ def _decaying_powers(fall: FloatArray) -> FloatArray:
 
 
 def native_light(cells: Cells, bins: int, history: FloatArray | None = None) -> _core.ExposureLight:
-    """Input of the native recursion: photons of the parts of bins or, for paralyzable pixels, rates of registrations.
+    """Input of the native recursion: photons in the parts of the bins or, for paralyzable pixels, registration rates.
 
     `history` (cells, 2 bins + 2): the stationary state, where known, of `warm_history`.
     """
@@ -314,7 +314,7 @@ def native_light(cells: Cells, bins: int, history: FloatArray | None = None) -> 
 
 
 def recorded_light(cells: Cells, out_bins: int) -> FloatArray:
-    """Photons (cells, out_bins) of a period, all of which are registered where there is no dead time."""
+    """Photons (cells, out_bins) of a period; without a dead time, the expected registrations."""
     parts, step = int(_core.EXPOSURE_PARTS), _poisson_bins(out_bins)
     rate = np.empty((cells.size, out_bins))
     for part in cells.chunks(step, out_bins):
@@ -347,8 +347,8 @@ def without_dead_time(cells: Cells, out_bins: int) -> Exposure:
 def warm_history(cells: Cells, which: IndexArray, bins: int) -> FloatArray:
     """Stationary states (n, 2 bins + 2) of the cells `which`, in the order of the native core.
 
-    Mass and first moment of the registrations of one period in each bin, the probability of being armed at its start,
-    and the registrations of the last d + f bins.
+    For each bin the mass and first moment of the registrations of one period; then the probability of being armed at
+    the start of the period, and the registrations of its last d + f bins.
     """
     out = np.empty((which.size, 2 * bins + 2))
     for row, k in zip(out, which, strict=True):
@@ -459,7 +459,7 @@ def refined_moments(
 ) -> Exposure:
     """`exposure_moments` of checked cells, histogram in `out_bins` bins; each cell is refined separately.
 
-    ConvergenceError where a cell would take more than its `budget` of the recursion.
+    Raises ConvergenceError where the recursion would exceed the `budget` of a cell.
     """
     tolerance = checks.real("tolerance", tolerance, low=1e-9, high=0.1)
     team = thread_count(threads)
@@ -479,7 +479,7 @@ def refined_moments(
     coarse = _run(cells.part(pending), bins // 2, shared, team, progress, budget)
     last = spent = _spent(coarse, cells)
     while True:
-        _affordable(cells, pending, spent + 2.0 * last, budget)
+        _check_budget(cells, pending, spent + 2.0 * last, budget)
         fine = _run(cells.part(pending), bins, out_bins, team, progress, budget)
         last = _spent(fine, cells)
         spent = spent + last
@@ -508,24 +508,24 @@ def refined_moments(
 
 
 def _spent(done: Exposure, cells: Cells) -> FloatArray:
-    """Cost (cells,) of one pass in bins x periods, with the light and the access to the history included."""
+    """Cost (cells,) of one pass in bins x periods, including the light and the memory access to the history."""
     periods = np.where(done.settled >= 0, done.settled, cells.system.cycles)
     bins = int(done.bins.max(initial=1))
     return (periods + _light_cost(cells.system)) * done.bins.astype(np.float64) * cells.step_cost(bins)
 
 
 def _light_cost(system: System) -> float:
-    """Cost of the light of a bin, in steps of the native recursion."""
+    """Cost of computing the light of a bin, in steps of the native recursion."""
     return TOL.rate_steps if system.detector.mode == "paralyzable" else TOL.light_steps
 
 
-def _affordable(cells: Cells, pending: IndexArray, after: FloatArray, budget: Budget) -> None:
-    """Raise ConvergenceError for a cell whose next pass would exceed the budget."""
-    beyond = after > budget.recursion
-    if beyond.any():
-        k_pending = int(np.argmax(beyond))
+def _check_budget(cells: Cells, pending: IndexArray, cost: FloatArray, budget: Budget) -> None:
+    """Raise ConvergenceError where the next pass of a cell would exceed the budget."""
+    excessive = cost > budget.recursion
+    if excessive.any():
+        k_pending = int(np.argmax(excessive))
         k = int(pending[k_pending])
-        why = budget.refusal(float(after[k_pending]))
+        why = budget.refusal(float(cost[k_pending]))
         raise ConvergenceError(f"exposure statistics of {cells.name(k)}: {why}; {_instead(cells, budget)}")
 
 
@@ -537,7 +537,7 @@ def _too_long(cells: Cells, budget: Budget) -> str:
 
 
 def _instead(cells: Cells, budget: Budget) -> str:
-    slower = budget is not MOMENTS and not meets_itself(cells)
+    slower = budget is not MOMENTS and not rearms_within_pulse(cells)
     return cells.alternatives("exposure_moments, which may take some minutes") if slower else cells.instead
 
 
@@ -563,9 +563,9 @@ def _run(
             _core.exposure_moments(grid=grid, light=light, **again, threads=threads, progress=progress)
             for name, array in into.items():
                 array[cold] = again[name]
-    lost = result.settled == Settled.UNSETTLED
-    if lost.any():
-        k = int(np.argmax(lost))
+    unsettled = result.settled == Settled.UNSETTLED
+    if unsettled.any():
+        k = int(np.argmax(unsettled))
         raise ConvergenceError(f"exposure statistics of {cells.name(k)}: {_too_long(cells, budget)}")
     result.bins[:] = bins
     return result

@@ -18,7 +18,7 @@ from mars_lidar.statistics.chain import PhaseChain, Rearm
 from mars_lidar.statistics.electronics import ELECTRONICS_MODES, moments, stationary_records
 from mars_lidar.statistics.exposure import normalised, refined_moments, stationary_histogram
 from mars_lidar.statistics.paralyzable import paralyzable_histograms
-from mars_lidar.statistics.synchronous import cumulants_of, first_arrivals, synchronous_windows
+from mars_lidar.statistics.synchronous import cumulants_of, first_arrivals, synchronous_pmfs
 from mars_lidar.statistics.timing import recorded
 from mars_lidar.statistics.tolerances import LAW, TOL
 
@@ -105,7 +105,7 @@ def _registrations(cells: Cells, bins: int, tolerance: float, threads: int | Non
     if mode == "synchronous":
         armed = first_arrivals(cells)
         registered = np.maximum(armed.sum(-1), np.finfo(float).tiny)
-        mean = np.array([cumulants_of(window)[0] for window in synchronous_windows(cells)])
+        mean = np.array([cumulants_of(law)[0] for law in synchronous_pmfs(cells)])
         return np.asarray(armed * (mean / registered)[:, None], dtype=np.float64)
     if mode == "paralyzable":
         return paralyzable_histograms(cells, tolerance)

@@ -1,14 +1,14 @@
 """The covariance of a histogram in closed form: means, variances and covariances of any bins and windows.
 
-A pixel is armed if and only if no photon was registered in the last dead time, so that registrations feed back linearly
-on later ones, driven by memoryless noise. Folded over the periods this is one linear equation around the period; its
-solution for the weights of a window gives the variance of the window. If the start-up transient ends within the
-exposure, a closed form includes the exact terms of both ends (section 5). Derivation and equation numbers:
+A pixel is armed if and only if no photon was registered in the last dead time. Registrations therefore obey a linear
+feedback equation that is driven by white noise. Folded over the periods it is one linear equation around the period;
+its solution for the weights of a window gives the variance of the window. If the start-up transient ends within the
+exposure, the result is a closed form with the exact terms of both ends (section 5). Derivation and equation numbers:
 docs/joint_law.md.
 
-With jitter or uneven codes, a registration is recorded in a random bin, independently of all others given its time. A
-weight w of the bin then has the mean v = E w for its registration and, by the law of total variance, with the mean m of
-the registrations in each cell,
+With jitter or uneven codes, a registration is recorded in a random bin that, given its time, is independent of all
+other registrations. Let v be the expected weight w of this bin, and m the mean registrations in each cell. By the law
+of total covariance,
 
     Cov(a H, b H) = Cov(v_a H', v_b H') + sum m (E[a b] - v_a v_b).
 """
@@ -32,7 +32,14 @@ from mars_lidar._base.types import ArrayLike, FloatArray
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
-from mars_lidar.statistics.cells import Cells, light_before, meets_itself, misplaced, one_pixel, registered_before
+from mars_lidar.statistics.cells import (
+    Cells,
+    light_before,
+    misplaced,
+    one_pixel,
+    rearms_within_pulse,
+    registered_before,
+)
 from mars_lidar.statistics.chain import ConvergenceError
 from mars_lidar.statistics.exposure import recorded_light
 from mars_lidar.statistics.joint_grid import FoldedGrid
@@ -41,7 +48,7 @@ from mars_lidar.statistics.tolerances import LAW, TOL, advice
 
 # --- One pixel on one grid -----------------------------------------------------------------------------------------
 
-INSTEAD = advice("exposure_moments (count and mean histogram)")
+_ADVICE = advice("exposure_moments (count and mean histogram)")
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +79,7 @@ class SettledLaw:
         self.grid = grid
         x = grid.state
         j = np.arange(n)
-        self._often = whole + (j >= n - d)  # number of periods whose bin j can blind the pixel at the end
+        self._blinding = whole + (j >= n - d)  # number of periods whose bin j is within a dead time of the end
         self._sum1 = 0.5 * whole * (whole + 1)
         self._sum2 = whole * (whole + 1) * (2 * whole + 1) / 6.0
         self._old = n - d - 1
@@ -107,18 +114,18 @@ class SettledLaw:
         # effect after the end of a registration before it (5.6), without whole periods
         worth = np.stack([weights - y[:, 0] + below - (grid.whole + 1) * step[:, None], -y[:, 1]], 1)
         edge = self._edge(y, armed)
-        source = self._often * worth
+        source = self._blinding * worth
         source[:, 0] += self._sum1 * step[:, None]
         source[:, :, self._old] += edge
         change = grid.adjoint(source[:, 0], source[:, 1], tolerance=1e-7)  # a term that does not grow with N_r
         x = grid.state
         first = (worth * x).sum((1, 2))
-        expected = (self._often * worth * x).sum((1, 2)) + self._sum1 * step * x[0].sum() + edge @ x[:, self._old]
+        expected = (self._blinding * worth * x).sum((1, 2)) + self._sum1 * step * x[0].sum() + edge @ x[:, self._old]
         return Windows(
             y=y.reshape(-1, 2 * n),
             noise=(_product(0.5 * self._total, y) + _product(self._noise, change)).reshape(-1, 2 * n),
             after_end=worth.reshape(-1, 2 * n),
-            spread=(self._often * _product(_spread(x), worth)).reshape(-1, 2 * n),
+            spread=(self._blinding * _product(_spread(x), worth)).reshape(-1, 2 * n),
             step=step,
             first=first,
             edge=edge,
@@ -191,19 +198,19 @@ class Pixel:
                     fraction=grid.fraction,
                     cycles=grid.cycles,
                     state=self.state,
-                    tolerance=TOL.forgotten,
-                    max_steps=LAW.forgetting,
+                    tolerance=TOL.transient,
+                    max_steps=LAW.transient,
                     total=total,
                 )
             )
             self.law = SettledLaw(grid) if self.settled >= 0 else None
         except ConvergenceError as error:
-            raise ConvergenceError(f"joint law of {cells.name(0)}: {error}; {INSTEAD}") from None
+            raise ConvergenceError(f"joint law of {cells.name(0)}: {error}; {_ADVICE}") from None
         if self.law is None:
-            if self.settled == -2 or bins * (grid.cycles + grid.whole) > LAW.run_through:
+            if self.settled == -2 or bins * (grid.cycles + grid.whole) > LAW.joint_steps:
                 raise ConvergenceError(
                     f"joint law of {cells.name(0)}: the start-up transient does not end within the exposure, "
-                    f"and {bins} bins x {grid.cycles} periods are too many to compute; {INSTEAD}"
+                    f"and {bins} bins x {grid.cycles} periods are too many to compute; {_ADVICE}"
                 )
             fine = grid.cycles * grid.state[0] if grid.warm else total
         else:
@@ -242,7 +249,7 @@ class Pixel:
         try:
             return self.law.windows(np.repeat(weights, self.grid.bins // self.out, axis=-1))
         except ConvergenceError as error:
-            raise ConvergenceError(f"joint law of {self.cells.name(0)}: {error}; {INSTEAD}") from None
+            raise ConvergenceError(f"joint law of {self.cells.name(0)}: {error}; {_ADVICE}") from None
 
     def _columns(self, weights: FloatArray) -> FloatArray:
         """(m, out) covariances of windows with every bin (6.1)-(6.4)."""
@@ -267,7 +274,7 @@ def movement(coarse: Pixel, fine: Pixel) -> float:
     mean = fine.mean.reshape(n, -1).sum(-1)
     total = max(float(mean.sum()), np.finfo(float).tiny)
     shape = 0.5 * float(np.abs(mean - coarse.mean).sum()) / total
-    few = fine.law is None or max(fine.grid.bins, fine.out) > TOL.few_windows_bins  # a window takes long
+    few = fine.law is None or max(fine.grid.bins, fine.out) > TOL.few_windows_bins  # each window takes long
     weights = _monitors(mean, fine.cells.system.dead_time_periods, few)
     means = weights @ mean
     before, after = coarse.monitored(weights), fine.monitored(np.repeat(weights, fine.out // n, axis=-1))
@@ -281,7 +288,10 @@ def movement(coarse: Pixel, fine: Pixel) -> float:
 
 
 def _monitors(mean: FloatArray, dead: float, few: bool) -> FloatArray:
-    """(m, n) windows compared between grids: all, halves, the brightest bin, its echo a dead time later, neighbours."""
+    """Windows (m, n) whose variances two grids are compared by.
+
+    They are the whole period, its halves, the brightest bin, the bin one dead time later, and some neighbours of both.
+    """
     n = mean.size
     j = np.arange(n)
     windows = [np.ones(n)]
@@ -301,7 +311,7 @@ def _monitors(mean: FloatArray, dead: float, few: bool) -> FloatArray:
 
 
 class RecordedPixel(Pixel):
-    """A `Pixel` whose registrations, of mean `mass` (cells,) on its grid, are recorded in other bins."""
+    """A `Pixel` whose registrations are recorded in other bins; `mass` (cells,) is their mean on its grid."""
 
     def __init__(self, pixel: Pixel, mass: FloatArray) -> None:
         self.pixel, self._mass = pixel, mass
@@ -327,24 +337,24 @@ class RecordedPixel(Pixel):
 class FinePixel(RecordedPixel):
     """A `Pixel` on coarse cells of the period, with a histogram of `out` finer bins that need not divide them.
 
-    Given the cells of all registrations, their places within the cells are independent, with the density of the mean
-    histogram. The pair density is thus constant within a pair of cells; the comparison with cells twice as wide bounds
-    the error.
+    Given the cells of all registrations, their times within the cells are taken as independent, with the density of the
+    mean histogram. The pair correlation is thus constant within a pair of cells; the comparison with cells twice as
+    wide bounds the error.
     """
 
     def __init__(self, pixel: Pixel, out: int) -> None:
         from scipy.sparse import csr_array
 
-        cells, few = pixel.cells, pixel.out
-        edges = np.union1d(np.arange(out + 1) / out, np.arange(few + 1) / few)
-        before = light_before(cells, np.arange(few + 1) / few)
+        cells, coarse_bins = pixel.cells, pixel.out
+        edges = np.union1d(np.arange(out + 1) / out, np.arange(coarse_bins + 1) / coarse_bins)
+        before = light_before(cells, np.arange(coarse_bins + 1) / coarse_bins)
         light = light_before(cells, edges)
         pieces = np.maximum(np.diff(registered_before(before, pixel.mean, light)), 0.0)
         middle = 0.5 * (edges[1:] + edges[:-1])
         of_bin = np.minimum((middle * out).astype(np.int64), out - 1)
-        first_of_cell = np.searchsorted(edges, np.arange(few + 1) / few)
+        first_of_cell = np.searchsorted(edges, np.arange(coarse_bins + 1) / coarse_bins)
         super().__init__(pixel, np.maximum(np.add.reduceat(pieces, first_of_cell[:-1]), np.finfo(float).tiny))
-        self._parts = csr_array((pieces, of_bin, first_of_cell), shape=(few, out))
+        self._parts = csr_array((pieces, of_bin, first_of_cell), shape=(coarse_bins, out))
         self.out, self.mean = out, np.bincount(of_bin, pieces, minlength=out).astype(np.float64)
 
     def wider(self) -> FinePixel:
@@ -354,7 +364,7 @@ class FinePixel(RecordedPixel):
         return FinePixel(pixel, self.out)
 
     def matrix(self) -> FloatArray:
-        """Raises MemoryError: more than 2^17 bins have too many covariances."""
+        """Raise MemoryError: the covariances of more than 2^17 bins do not fit in memory."""
         raise MemoryError(f"covariances of {self.out} bins with each other; use window() or covariance_of()")
 
     def _mean_weight(self, weights: FloatArray) -> FloatArray:
@@ -362,7 +372,7 @@ class FinePixel(RecordedPixel):
 
 
 class TimedPixel(RecordedPixel):
-    """A pixel on fine parts of the period, with mean (parts,), recorded with the jitter and code widths of `timing`."""
+    """A pixel whose registrations, of mean (parts,), are recorded with the jitter and code widths of `timing`."""
 
     def __init__(self, pixel: Pixel, mean: FloatArray, timing: Timing) -> None:
         super().__init__(pixel, mean)
@@ -422,9 +432,9 @@ def joint_law(
 
     Notes
     -----
-    The result includes the terms of the start and of the end of the exposure; nothing is assumed stationary. If the
-    start-up transient does not end within the exposure (`settled` is -1), every window is computed through all periods,
-    which is also exact but costs O(bins x cycles) a window instead of O(bins).
+    The result includes the terms of the start and of the end of the exposure; nothing is assumed
+    stationary. If the start-up transient does not end within the exposure (`settled` is -1), the recursion steps
+    through all periods for every window, which is also exact but costs O(bins x cycles) a window instead of O(bins).
 
     Examples
     --------
@@ -465,24 +475,24 @@ def _law(cells: Cells, tolerance: float) -> JointLaw:
         return law
     edges = np.arange(out + 1) / out
     light = light_before(cells, edges)
-    for few in TOL.joint_cells_of_many:
-        if misplaced(light_before(cells, np.arange(few + 1) / few), edges, light) > 2.0 * tolerance:
+    for coarse_bins in TOL.joint_cells_of_many:
+        if misplaced(light_before(cells, np.arange(coarse_bins + 1) / coarse_bins), edges, light) > 2.0 * tolerance:
             continue
-        law, pixel = _refined(cells, few, tolerance)
+        law, pixel = _refined(cells, coarse_bins, tolerance)
         fine = FinePixel(pixel, out)
         moved = max(law.movement, movement(fine.wider(), fine))
         if moved <= tolerance:
             return replace(law, mean=fine.mean, movement=moved, _pixel=fine)
     raise ConvergenceError(
         f"joint law of {cells.name(0)}: {TOL.joint_cells_of_many[-1]} cells of the period do not resolve the light in "
-        f"{out} bins; use fewer bins, {INSTEAD.removeprefix('use ')}"
+        f"{out} bins; use fewer bins, {_ADVICE.removeprefix('use ')}"
     )
 
 
 def _refined(cells: Cells, out: int, tolerance: float) -> tuple[JointLaw, Pixel]:
     """The law in `out` bins, refined on grids whose bins divide them."""
     system = cells.system
-    instead = cells.instead if meets_itself(cells) else INSTEAD
+    instead = cells.instead if rearms_within_pulse(cells) else _ADVICE
     cells = cells.resolved(out)
     bins = cells.first_bins(out)
     if bins > max(TOL.many_bins, 4 * out):
@@ -523,8 +533,8 @@ class JointLaw:
     grid_bins
         Bins per period of the final grid, which need not be those of the histogram.
     settled
-        Periods after which the start-up transient has ended; -1 if the exposure is shorter, and is computed through all
-        periods for every window.
+        Periods after which the start-up transient has ended; -1 if the exposure is shorter, in which case the recursion
+        steps through all its periods for every window.
 
     See Also
     --------
@@ -556,12 +566,12 @@ class JointLaw:
 
     @property
     def sweeps(self) -> int:
-        """Sweeps around the period of the slowest solution so far; 200 if it was then factorised."""
+        """Sweeps around the period that the slowest solution so far took; 200 if a factorisation replaced them."""
         return 0 if self._pixel is None else self._pixel.grid.sweeps
 
     @property
     def residual(self) -> float:
-        """Largest relative residual of the checked solutions: the mean, the first windows, all factorised ones."""
+        """Largest relative residual of the solutions for the mean and the first windows, and of all factorised ones."""
         return 0.0 if self._pixel is None else self._pixel.grid.residual
 
     @property
@@ -590,7 +600,7 @@ class JointLaw:
         Parameters
         ----------
         weights
-            (..., bins) any real numbers: 0 and 1 for a window, anything for a linear statistic.
+            (..., bins) real numbers: 0 and 1 select a window, other weights define a linear statistic.
 
         Returns
         -------
@@ -640,7 +650,7 @@ class JointLaw:
         return np.maximum(covariances, 0.0) if lag % n == 0 else covariances
 
     def covariance(self) -> FloatArray:
-        """(bins, bins) covariance matrix, in O(bins^3) simple steps: a fraction of a second for 1024 bins.
+        """(bins, bins) covariance matrix, in O(bins^3) operations: a fraction of a second for 1024 bins.
 
         Raises
         ------

@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 def factorised(grid: FoldedGrid) -> Callable[..., FloatArray]:
     """Solver of (5.4) by sparse factors, with the sliding sums of alpha as further unknowns: few entries in every row.
 
-    The first sliding sum runs over many bins, and its full row would fill the factors. It is held at 0 in them and
-    restored by a rank-one update, which is well conditioned where the state of the pixel is nearly certain: after the
-    brightest light. Other places are tried where the residual is too large.
+    The first sliding sum extends over many bins; its full row would make the factors dense. The factors are computed
+    with this sum set to 0, and a rank-one update restores it. The update is well conditioned where the state of the
+    pixel is nearly certain, which is after the brightest light; if the residual is too large, the sum begins elsewhere.
     """
     if grid.bins > TOL.folded_factored:
         raise ConvergenceError(
@@ -60,7 +60,7 @@ def factorised(grid: FoldedGrid) -> Callable[..., FloatArray]:
 
 
 def _factors_at(grid: FoldedGrid, place: int) -> Callable[..., FloatArray]:
-    """Solver with the sliding sum before bin `place` held at 0 and restored by a rank-one update."""
+    """Solver whose factors have the sliding sum before bin `place` set to 0, which a rank-one update restores."""
     from scipy.sparse.linalg import splu
 
     n, d = grid.bins, grid.shift
@@ -74,27 +74,27 @@ def _factors_at(grid: FoldedGrid, place: int) -> Callable[..., FloatArray]:
     except RuntimeError as error:  # SuperLU raises it for an exactly singular matrix
         raise ConvergenceError(f"the feedback equation is singular: {error}") from None
 
-    def bare(right: FloatArray, trans: str) -> FloatArray:
+    def solve_factors(right: FloatArray, trans: str) -> FloatArray:
         out, ordered = np.empty_like(right), np.ascontiguousarray(right[order])
         out[order] = factors.solve(ordered, trans=trans)
         return out
 
-    held = np.zeros(3 * n)
-    held[2 * n] = 1.0
-    change = {"N": (bare(held, "N"), row), "T": (bare(row, "T"), held)}
+    unit = np.zeros(3 * n)
+    unit[2 * n] = 1.0
+    update = {"N": (solve_factors(unit, "N"), row), "T": (solve_factors(row, "T"), unit)}
 
-    def whole(right: FloatArray, trans: str = "N") -> FloatArray:
-        three = right.reshape(3, n, -1)
-        out = bare(np.roll(three, -place, axis=1).reshape(3 * n, -1), trans)
-        step, weight = change[trans]
+    def solve(right: FloatArray, trans: str = "N") -> FloatArray:
+        by_unknown = right.reshape(3, n, -1)
+        out = solve_factors(np.roll(by_unknown, -place, axis=1).reshape(3 * n, -1), trans)
+        step, weight = update[trans]
         out -= step[:, None] * (weight @ out / (1.0 + weight @ step))
         return np.asarray(np.roll(out.reshape(3, n, -1), place, axis=1).reshape(right.shape))
 
-    return whole
+    return solve
 
 
 def _matrix(grid: FoldedGrid) -> csc_matrix:
-    """The equations (3 n, 3 n) without row 2 n, the sum over the window before the first bin."""
+    """Matrix (3 n, 3 n) of the equations without row 2 n, that of the sliding sum before the first bin."""
     from scipy.sparse import csc_matrix
 
     pa, p0, p1, qa, q0, q1 = grid.response
@@ -129,7 +129,7 @@ def _matrix(grid: FoldedGrid) -> csc_matrix:
 
 
 def relative_residual(rest: FloatArray, x: FloatArray) -> float:
-    """Largest residual `rest` over the largest value of the solution `x`; infinite for a residual of x = 0."""
+    """Ratio of the largest residual `rest` to the largest value of the solution `x`; infinite if only x is 0."""
     size, largest = float(np.abs(x).max()), float(np.abs(rest).max())
     return largest / size if size > 0.0 else math.inf if largest != 0.0 else 0.0
 
@@ -150,13 +150,13 @@ class FoldedGrid:
     cycles, warm
         Periods of the exposure; whether it starts in the stationary state.
     sweeps
-        Sweeps of the slowest solution so far.
+        Sweeps that the slowest solution so far took.
     residual
         Largest relative residual among the solutions that were checked.
     direct
-        Whether the equation is solved by sparse factors, because sweeps did not converge.
-    unproven
-        Number of the next transposed solutions by sweeps whose residual is checked; later ones are of the same kind.
+        Whether sparse factors solve the equation, because the sweeps did not converge.
+    unchecked
+        Number of further transposed solutions by sweeps whose residuals are to be checked; later ones converge alike.
     """
 
     whole: int
@@ -168,7 +168,7 @@ class FoldedGrid:
     sweeps: int = 0
     residual: float = 0.0
     direct: bool = False
-    unproven: int = 2
+    unchecked: int = 2
 
     @classmethod
     def of(cls, cells: Cells, bins: int) -> FoldedGrid:
@@ -199,13 +199,13 @@ class FoldedGrid:
         return np.array(near), np.array(far)
 
     def rearmed(self, x: FloatArray, near: ArrayLike = 1.0, far: ArrayLike = 1.0) -> FloatArray:
-        """Re-arming (2, n) caused by registrations `x` (2, n), with weights for its `near` and `far` bin."""
+        """Re-arming (2, n) after registrations `x` (2, n), with weights of the `near` and the `far` of its two bins."""
         a, b = self.maps
-        stays, goes_on = a @ np.roll(x, self.shift, -1), b @ np.roll(x, self.shift + 1, -1)
-        return np.asarray(np.asarray(near) * stays + np.asarray(far) * goes_on, dtype=np.float64)
+        in_near, in_far = a @ np.roll(x, self.shift, -1), b @ np.roll(x, self.shift + 1, -1)
+        return np.asarray(np.asarray(near) * in_near + np.asarray(far) * in_far, dtype=np.float64)
 
     def blind(self, x: FloatArray) -> FloatArray:
-        """(n,) registrations that keep the pixel blind at the start of each bin, whole periods included (4.3)."""
+        """(n,) registrations within the dead time before the start of each bin, whole periods included (4.3)."""
         mass, n, d = x[0], self.bins, self.shift
         below = np.concatenate([[0.0], np.cumsum(np.concatenate([mass, mass]))])
         j = np.arange(n)
@@ -292,7 +292,7 @@ class FoldedGrid:
             for _ in range(2):  # iterative refinement: the second round removes the rounding error of the first
                 right = np.concatenate([(source - self.apply(x)).reshape(-1), np.zeros(self.bins)])
                 x = x + self._factors(right, trans="T")[: 2 * self.bins].reshape(2, -1)
-        self._judge(source - self.apply(x), x)
+        self._check_residual(source - self.apply(x), x)
         return x
 
     def _adjoint(self, mass: FloatArray, moment: FloatArray | None, tolerance: float) -> FloatArray:
@@ -319,14 +319,14 @@ class FoldedGrid:
             y[:, 0], y[:, 1] = first, second
             self.direct = not (error <= tolerance).all()
             self.sweeps = max(self.sweeps, int(done.max()))
-            if self.unproven > 0 and moment is None and not self.direct:
+            if self.unchecked > 0 and moment is None and not self.direct:
                 some = np.linspace(0, m - 1, min(m, TOL.folded_checked)).astype(np.int64)
                 rest = -self._apply_transposed(y[some])
                 rest[:, 0] += mass[some]
-                self.unproven -= 1
+                self.unchecked -= 1
                 self.direct = not relative_residual(rest, y[some]) <= TOL.folded_residual
                 if not self.direct:
-                    self._judge(rest, y[some])
+                    self._check_residual(rest, y[some])
         if self.direct:
             source = np.zeros((m, 2, n))
             source[:, 0] = mass
@@ -337,10 +337,10 @@ class FoldedGrid:
                 rest = source - self._apply_transposed(y)
                 step = self._factors(np.concatenate([rest.reshape(m, -1), np.zeros((m, n))], -1).T)
                 y = y + step[: 2 * n].T.reshape(m, 2, n)
-            self._judge(source - self._apply_transposed(y), y)
+            self._check_residual(source - self._apply_transposed(y), y)
         return y
 
-    def _judge(self, rest: FloatArray, x: FloatArray) -> None:
+    def _check_residual(self, rest: FloatArray, x: FloatArray) -> None:
         error = relative_residual(rest, x)
         self.residual = max(self.residual, error)
         if not error <= TOL.folded_residual:

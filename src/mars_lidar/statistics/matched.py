@@ -21,8 +21,8 @@ def matched_pmf(cumulants: ArrayLike, *, threads: int | None = None) -> list[Pmf
     Parameters
     ----------
     cumulants
-        (cells, 4) mean in [0, 1e15], variance >= 0, third and fourth cumulant. Cumulants that no count
-        can have (such as a variance below that of an integer of this mean) give a nearby law.
+        (cells, 4) mean in [0, 1e15], variance >= 0, third and fourth cumulant. Cumulants that no integer variable
+        can have (such as a smaller variance than its mean permits) give a law with similar ones.
     threads
         Threads to run on; default: all processors that this process may use.
 
@@ -38,11 +38,11 @@ def matched_pmf(cumulants: ArrayLike, *, threads: int | None = None) -> list[Pmf
 
     Notes
     -----
-    Three forms. A variance of 9 or more, or a smooth law: the quantile is that of E. A. Cornish and R. A.
-    Fisher (1938) to the fourth cumulant, rounded, with Sheppard's corrections. Few photons, mode locking,
-    saturation: an integer, plus a Panjer count, less a Poisson one (or the mirror image), times a polynomial.
-    The least variance that an integer can have: two integers. `trusted` gives where the
-    result is close to the exact law.
+    There are three forms. (1) For a variance of 9 or more, or a smooth law, quantiles are those of E. A. Cornish and
+    R. A. Fisher (1938) to the fourth cumulant, rounded, with Sheppard's corrections. (2) For few photons, mode locking
+    and saturation the law is that of an integer plus a Panjer variable minus a Poisson variable (or the mirror image),
+    times a polynomial. (3) For the smallest variance that an integer can have it consists of two integers. `trusted`
+    states where the result is close to the exact law.
     """
     given, team = _checked(cumulants), thread_count(threads)
     first, last, _ = _support(given, team)

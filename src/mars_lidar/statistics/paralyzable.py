@@ -1,8 +1,8 @@
 """Mean, variance and mean histogram of a paralyzable pixel, in closed form.
 
-An arrival is registered if and only if no other came within the dead time before it. The rate of registrations is
-therefore r(t) = lambda(t) exp(-(C(t) - C(t - t_d))), with the integrated flux C, and registrations further apart than
-the dead time are independent. Equation numbers: docs/theory_detectors.md.
+An arrival is registered if and only if there is no other arrival within the dead time before it. The rate of
+registrations is therefore r(t) = lambda(t) exp(-(C(t) - C(t - t_d))), with the integrated flux C, and registrations
+further apart than the dead time are independent. Equation numbers: docs/theory_detectors.md.
 """
 
 from __future__ import annotations
@@ -87,8 +87,8 @@ def paralyzable_moments(
 def paralyzable_histograms(cells: Cells, tolerance: float) -> FloatArray:
     """Mean histograms (cells, bins) of checked cells, any dead time.
 
-    They sum to the mean count within 10 x `tolerance` standard deviations, down to 1e-3 of a Poisson count's, or 1e-12
-    of itself.
+    Their sums differ from the mean count by at most 10 x `tolerance` standard deviations (not less than 1e-3 of those
+    of a Poisson count), or 1e-12 of the mean.
     """
     return _refined(cells, tolerance, with_variance=False).histogram.reshape(cells.size, -1)
 
@@ -101,7 +101,7 @@ def _refined(cells: Cells, tolerance: float, *, with_variance: bool) -> Moments:
     for k in range(cells.size):
         cell = cells.part(slice(k, k + 1))
         usual = cell.usual_bins(system.bins)
-        # every grid includes the edges of the histogram: with no further edges two grids would be equal
+        # every grid includes the edges of the histogram; without further edges two grids would be equal
         n = start = 2 * usual if usual // 2 < system.bins else usual
         coarse, before = _Grid(cell, n // 2, knots(cell, usual, 0.5), with_variance), math.inf
         while True:
@@ -128,9 +128,9 @@ def _refined(cells: Cells, tolerance: float, *, with_variance: bool) -> Moments:
 
 
 class _Grid:
-    """One pixel on a grid of the period, with edges where the dead time of a start at 0, or of a step, ends.
+    """One pixel on a grid with edges at `steps` (n,), phases of discontinuities, and one dead time after them.
 
-    `steps` (n,) are phases at which the light steps: between them, and a dead time after them, it is smooth.
+    Between these edges the rate of registrations is smooth. A further edge is the end of the first dead time.
     """
 
     def __init__(self, cell: Cells, bins: int, steps: FloatArray, with_variance: bool) -> None:
@@ -184,7 +184,7 @@ class _Grid:
         return total
 
     def _registered(self, period: int, phase: FloatArray) -> FloatArray:
-        """R(t): registrations expected in [0, t), t = period + phase, 0 before the exposure."""
+        """R(t): expected registrations in [0, t), t = period + phase; 0 before the exposure."""
         mean = float(self.below[-1])
         steady = period * mean + np.interp(phase, self.edges, self.below)
         if not self.armed:
@@ -198,7 +198,7 @@ class _Grid:
         return np.where(early, -np.expm1(-lit), -math.expm1(-reached) + steady - at_end)
 
     def _pairs(self) -> float:
-        """Integral of r(t) [R(t) - R(t - t_d)]: the missing pairs closer than the dead time (3)."""
+        """Integral of r(t) [R(t) - R(t - t_d)]: the pairs closer than the dead time, which do not occur (3)."""
         total, first = 0.0, 0
         if self.armed:  # up to t_d, where R(t - t_d) = 0, it is R^2 / 2
             end = min(self.whole, self.cycles)

@@ -77,7 +77,7 @@ def row_moments(chain: PhaseChain) -> tuple[FloatArray, FloatArray]:
     """Mean and variance (n,), (n,) of the holding time after a registration in each bin, O(n) (3.4)."""
     n, keep, fire = chain.bins, chain.keep, chain.fire
     refire, rekeep = chain.refire, chain.rekeep
-    # in bins, armed at the start of a bin: fire at once, or pass one bin and go on
+    # in bins, for a pixel armed at the start of a bin: it fires there, or passes it
     wait = cyclic_recursion(keep, keep, chain.loss, backward=True)
     passing = 1.0 + np.roll(wait, -1)
     spread = cyclic_recursion(keep, keep * fire * passing**2, chain.loss, backward=True)
@@ -87,10 +87,10 @@ def row_moments(chain: PhaseChain) -> tuple[FloatArray, FloatArray]:
 
 
 def weighted_waits(chain: PhaseChain, distribution: FloatArray) -> FloatArray:
-    """The row vector x Q_mu (n,): waits of `distribution` x (n,) by the bin that ends them, O(n) (3.6)."""
+    """The row vector x Q_mu (n,): holding times from `distribution` x (n,), by the bin that ends them, O(n) (3.6)."""
     arming = chain.rekeep * chain.rearmed(distribution)
     mass = cyclic_recursion(chain.keep, arming, chain.loss)
-    # mass times bins since re-arming: every bin passed adds one
+    # mass times the bins since re-arming, which increase by one for every bin passed
     since = cyclic_recursion(chain.keep, chain.keep * mass + arming, chain.loss)
     ended = mass * chain.fire + chain.refire * chain.rearmed(distribution)
     return (chain.blind_bins * ended + chain.fire * since) / chain.bins
@@ -104,7 +104,7 @@ def lag_covariances(chain: PhaseChain, times: HoldingTimes, lags: int) -> FloatA
     for k in range(lags):
         out[k] = row @ value
         value = chain.backward(value)
-        value -= times.stationary.pdf @ value  # rounding would reintroduce the mean
+        value -= times.stationary.pdf @ value  # remove the mean that rounding reintroduces
     return out
 
 
@@ -155,14 +155,14 @@ def holding_times(chain: PhaseChain) -> HoldingTimes:
     mean, variance = row_moments(chain)
     mu = float(pdf @ mean)
 
-    # (3.8): u is the value of firing in a bin less that of passing it, scaled so that one period closes
+    # (3.8): u is the value of firing in a bin minus that of passing it, scaled so that it is periodic
     jump = dual.x * (-float(n) / float(chain.fire @ dual.x))
-    # (3.9): a martingale; what it gains in each bin has variance keep fire u^2
+    # (3.9): a martingale, whose increment in each bin has the variance keep fire u^2
     chance = chain.armed(pdf) * chain.fire * chain.keep
     chance += chain.rearmed(pdf) * chain.refire * chain.rekeep
     sigma2 = float(np.sum(chance * jump**2)) / n**2
 
-    # z from u: V falls by 1 + p u a bin (3.10)
+    # z from u: V decreases by 1 + p u per bin (3.10)
     steps = 1.0 + chain.fire * jump
     value = (jump - np.cumsum(steps)) / n
     value -= pdf @ value
@@ -175,12 +175,12 @@ def holding_times(chain: PhaseChain) -> HoldingTimes:
     defect = max(
         abs(mu * stationary.rate - 1.0),
         float(np.abs(rest).max()) / (mu + float(np.abs(value).max())),
-        # below 1e-13 mu^2 the variances of one step are rounding, and cancel to it
+        # variances below 1e-13 mu^2 are rounding errors
         abs(sigma_ss2 + 2.0 * covariance_sum - sigma2) / (max(sigma_ss2, sigma2) + 1e-6 * mu**2),
     )
     if not defect <= TOL.holding_times:
         warnings.warn(
-            f"holding times at {chain.describe()}: independent computations agree to {defect:.1e} only "
+            f"holding times at {chain.describe()}: independent computations agree only to {defect:.1e} "
             f"(mu = {mu:g}, sigma2 = {sigma2:g} periods)",
             RuntimeWarning,
             stacklevel=2,

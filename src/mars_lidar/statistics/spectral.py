@@ -28,7 +28,7 @@ ComplexArray = NDArray[np.complex128]
 
 @dataclass(frozen=True, eq=False)
 class HoldingTimeCovariance:
-    """Lag covariances of the holding times of one pixel, and their sum by every rule.
+    """Lag covariances of the holding times of one pixel, and their sum by several rules.
 
     Times in ns, covariances in ns^2. `spectral_sum`, `automatic_sum` and `eigenvalues` decompose the dense
     transition matrix on first use, O(n^3), once per object.
@@ -98,8 +98,7 @@ class HoldingTimeCovariance:
     def spectral_sum(self, lags: int = 6, modes: int = 5) -> float:
         """gamma_1 .. gamma_lags exactly, the tail from the leading `modes` eigenvalues, 1 included (4.2).
 
-        A conjugate pair is never split: one more mode is taken where `modes` would. The paper's rule is
-        L = 6, p = 5.
+        Where `modes` would split a conjugate pair, one more mode is taken. The paper's rule is L = 6, p = 5.
         """
         lags = checks.integer("lags", lags, low=0, high=TOL.most_lags)
         modes = checks.integer("modes", modes, low=1, high=self._chain.bins)
@@ -112,9 +111,9 @@ class HoldingTimeCovariance:
     def automatic_rule(self, tolerance: float = 1e-3) -> tuple[int, int]:
         """The cheapest (lags, modes) whose neglected modes stay below `tolerance` x sigma_ss2 (4.3).
 
-        The neglected part is bounded through the gap: ``|gamma_l| <= sigma_ss2``, and modes beyond the p-th fall
-        at least like ``|lambda_(p+1)|^l``. The bound is rigorous for a normal P; P is not, so the first lags, in
-        which non-normality shows, are summed exactly: at least six.
+        The neglected part is bounded by the spectral gap: ``|gamma_l| <= sigma_ss2``, and modes beyond the p-th decay
+        at least as ``|lambda_(p+1)|^l``. The bound is rigorous for a normal matrix. P is not normal, which affects the
+        first lags; at least six of them are therefore summed exactly.
         """
         tolerance = checks.real("tolerance", tolerance, low=0.0, high=1.0, strict_low=True)
         size = np.abs(self.eigenvalues)
@@ -160,7 +159,7 @@ class HoldingTimeCovariance:
                 f"bins must be at most {TOL.eigen_bins} for an eigen-decomposition, got {self._chain.bins}; "
                 f"exact_sum and cutoff_sum need none"
             )
-        # Left eigenvectors from inv(V) have given negative variances: P is strongly non-normal (4.4)
+        # not the left eigenvectors of inv(V), with which variances were negative: P is far from normal (4.4)
         decomposition: Any = eig(self._chain.dense(), left=True, right=True)
         values, left_vectors, right_vectors = decomposition
         order = np.argsort(-np.round(np.abs(values), 12), kind="stable")  # keeps conjugates adjacent
@@ -182,7 +181,7 @@ def holding_time_covariance(
     rearm: Rearm = "centre",
     bins: int | None = None,
 ) -> HoldingTimeCovariance:
-    """Covariances of the times between registrations, and their sum by every rule.
+    """Covariances of the times between registrations, and their sum by several rules.
 
     Parameters
     ----------

@@ -27,22 +27,21 @@ def first_arrivals(cells: Cells) -> FloatArray:
     return np.asarray(np.exp(-before[:, :-1]) * -np.expm1(-np.maximum(np.diff(before), 0.0)), dtype=np.float64)
 
 
-def synchronous_windows(cells: Cells) -> list[Pmf]:
+def synchronous_pmfs(cells: Cells) -> list[Pmf]:
     """Exact pmf of the count of each cell."""
     dead = cells.system.dead_time_periods
     whole = math.floor(dead)
     reach = photons_before(cells, np.array([1.0 - (dead - whole), 1.0]))
     return [
-        _Count(cells, cells.name(k), whole, float(early), float(total)).window()
-        for k, (early, total) in enumerate(reach)
+        _Count(cells, cells.name(k), whole, float(early), float(total)).law() for k, (early, total) in enumerate(reach)
     ]
 
 
-def cumulants_of(window: Pmf) -> FloatArray:
+def cumulants_of(law: Pmf) -> FloatArray:
     """Mean, variance, third and fourth cumulant (4,) of a pmf."""
-    n = window.first + np.arange(window.p.size)
-    mean = float(window.p @ n)
-    m2, m3, m4 = (float(window.p @ (n - mean) ** k) for k in (2, 3, 4))
+    n = law.first + np.arange(law.p.size)
+    mean = float(law.p @ n)
+    m2, m3, m4 = (float(law.p @ (n - mean) ** k) for k in (2, 3, 4))
     return np.array([mean, m2, m3, m4 - 3.0 * m2**2])
 
 
@@ -119,7 +118,7 @@ class _Count:
         total = (probability * weight).sum(-1)
         return np.asarray(np.where(counts <= 0.0, 1.0, np.minimum(total, 1.0)), dtype=np.float64)
 
-    def window(self) -> Pmf:
+    def law(self) -> Pmf:
         most = math.ceil(self.cycles / (self.whole + 1))
         if self.armed_register == 0.0:
             return Pmf(0, np.ones(1), 0.0)

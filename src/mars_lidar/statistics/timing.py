@@ -1,8 +1,8 @@
 """Jitter and code widths as a linear map from the mean histogram of registrations to that of records.
 
 Neither effect changes which avalanches are recorded (docs/detectors.md), and the jitters of records are independent.
-The mean histogram of the records is that of the registrations, convolved round the period with the density of the
-jitter and integrated between the edges of the codes; the count law does not change.
+The mean histogram of the records is that of the registrations after a circular convolution with the density of the
+jitter, integrated between the edges of the codes. The count law is the same.
 """
 
 from __future__ import annotations
@@ -51,12 +51,12 @@ class Timing:
 
     @cached_property
     def untimed(self) -> System:
-        """The system without these effects, its bins the parts."""
+        """The system without these effects, with the parts of the period as its bins."""
         return self.system.replace(bins=self.parts, detector=self.system.detector.without(*TIMING_EFFECTS))
 
     @cached_property
     def _jitter(self) -> NDArray[np.complex128] | None:
-        """Transform of the probabilities that a record is d parts after its avalanche, both uniform in their part."""
+        """Transform of P(a record is d parts after its avalanche), for times that are uniform within their parts."""
         jitter = self.system.detector.jitter
         if jitter is None:
             return None
@@ -93,7 +93,7 @@ class Timing:
         """Mean weight (..., parts) of the record of a registration in each part, for weights (..., bins)."""
         whole, rest = self._split
         whole, rest = whole[1:-1], rest[1:-1, None]
-        step = np.diff(weights.reshape(-1, weights.shape[-1]), axis=-1).T  # beyond each edge
+        step = np.diff(weights.reshape(-1, weights.shape[-1]), axis=-1).T  # at each edge
         beyond = np.zeros((self.parts + 2, step.shape[1]))
         np.add.at(beyond, whole, step * (1.0 - rest))  # several edges may lie in one part
         np.add.at(beyond, whole + 1, step * rest)

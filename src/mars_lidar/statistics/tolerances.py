@@ -21,10 +21,11 @@ class Budget:
         Bins x periods of the exposure recursion, on all grids together and on one of them; 80 ns each.
     transform
         Bins x periods x batches of eight points of the generating function of the count; 12 ns each.
-    forgetting
-        Bins x periods within which an exposure forgets its start, for the closed form of the joint law; 12 ns each.
-    run_through
-        Bins x periods of an exposure that does not forget its start: the joint law runs through it for every window.
+    transient
+        Bins x periods of the start-up transient, after which the closed form of the joint law holds; 12 ns each.
+    joint_steps
+        Bins x periods of an exposure that ends within its start-up transient, through which the joint law steps once
+        for every window.
     record_kernel
         Probabilities from record to record behind electronics with a dead time; 8 bytes each.
     record_moments, record_points
@@ -38,8 +39,8 @@ class Budget:
     recursion: float
     one_pass: float
     transform: float = 8e7
-    forgetting: int = 40_000_000
-    run_through: int = 2**22
+    transient: int = 40_000_000
+    joint_steps: int = 2**22
     record_kernel: int
     record_moments: float
     record_points: float = 2e10
@@ -72,15 +73,15 @@ class Tolerances:
     Attributes
     ----------
     rounding
-        Relative size of what counts as rounding: eps times the some thousand terms of a sum.
+        Relative difference that is attributed to rounding: eps times some thousand terms of a sum.
     repeats
         Relative change of the state of a pixel per period at which it repeats, (20) of docs/theory_exposure.md.
-    forgotten
-        Total variation from the stationary state at which the joint law takes the start as forgotten.
+    transient
+        Total variation from the stationary state at which the start-up transient ends for the joint law.
     most_bins, most_even_bins
         Bins per period of any statistics grid (8 MiB an array), and of equal bins where others follow the pulse.
     first_bins, most_first_bins
-        Bins per period of the coarsest and finest first grid; refinement goes beyond.
+        Bins per period of the coarsest and finest first grid; refinement may exceed the latter.
     unrefined_bins
         Least bins of grids that are not refined, of the phase chain and without a dead time, and of the first grid that
         follows the pulse: with fewer the discretisation of the chain is visible in the variance of the count.
@@ -97,11 +98,13 @@ class Tolerances:
     knots_per_sigma, longest_pulse
         Grid points per sigma of a pulse; support of a pulse, in sigma, up to which a grid that follows it resolves it.
     warm_periods, least_warm_periods, warm_steps
-        Sweeps towards the stationary state: most, least, and most sweeps x bins; beyond, a sparse equation gives it.
+        Periods that an iteration towards the stationary state may take: at most, at least, and at most as periods x
+        bins. Where it takes more, a sparse equation gives the state.
     chunk_bytes
         Energies and histograms computed together.
     near_bytes, middle_bytes
-        History of one dead time up to which a step takes 15 to 60 ns, and up to 100 ns; beyond, 100 to 350 ns.
+        Size of the history of one dead time up to which a step of the recursion takes 15 to 60 ns, and up to which it
+        takes at most 100 ns; with a longer history it takes 100 to 350 ns.
     many_bins
         Bins of a histogram beyond which it is interpolated from a coarser grid, and of the largest grid of the joint
         law (a second or two) for histograms of fewer.
@@ -112,41 +115,42 @@ class Tolerances:
     block
         Cells, windows or bins of a matrix product computed together.
     sampled_delays
-        Cells of sampled afterpulse delays: 32 MiB an array.
+        Most cells of sampled afterpulse delays: 32 MiB an array.
     constant_light_rounds
-        Iterations for the mean rate under constant light; a divergence is refused.
+        Most iterations for the mean rate under constant light.
     tail
         Bound on the probability outside the support of a count law, at either end.
     most_counts
-        Counts of a listed law: 128 MiB.
+        Most counts of a listed law: 128 MiB.
     lanes
         Points of the circle that the native core evaluates together.
     near_transform_bytes, far_transform_bytes, far_transform, period_bins
-        History of these points beyond which a step costs `far_transform` times as much (so does any step where the dead
-        time is below one bin), and beyond which it costs six times that; work done once a period, in bins.
+        Size of the history of these points above which a step costs `far_transform` times as much (as does any step
+        where the dead time is below one bin), and above which it costs six times that; cost of the work that is done
+        once a period, in bins.
     most_tilt, most_log_growth
         Largest exponential tilt per count, and logarithm of E e^(theta N) of one period: the largest double is e^709.
     consistent, consistent_per_cycle
         Allowed disagreement of a pmf with its cumulants, in standard deviations, and for rounding per extrapolated
         cycle.
     support_share, support_spreads
-        Share of `Budget.transform` for bounds of the support; beyond, its half width is so many standard deviations
-        plus one count.
+        Share of `Budget.transform` for bounds of the support; if it does not suffice, half of the width of the support
+        in standard deviations, plus one count.
     guess_spreads, guess_counts, widest_guess
         Half width of a window guessed from mean and variance: standard deviations and further counts; most counts.
     edge, record_edge
         Largest probability at the ends of a window that contains a law, and a law of records.
-    like_mean
-        Allowed difference from the assumed mean of a guessed law, in standard deviations.
+    guess_mean
+        Allowed difference of the mean of a law from the assumed one, in standard deviations.
     all_points
         Counts up to which a law is evaluated on all points of the circle.
     faint, record_faint
-        Modulus of a transform that counts as 0, and of one of records.
+        Modulus below which the transform of a count law is taken as 0, and that of a law of records.
     short_variance, least_shorter
-        Variance of the count of the shorter exposure in which further peaks of the transform are looked for, and least
-        ratio of the exposures for which that is faster, (27) of docs/theory_exposure.md.
+        Variance of the count of the shorter exposure whose transform is searched for further peaks, and least ratio of
+        the exposures for which that is faster, (27) of docs/theory_exposure.md.
     blas_thread
-        Multiplications of a matrix product that BLAS libraries do on one thread.
+        Multiplications of a matrix product up to which BLAS libraries use one thread.
     record_block
         Overhead of a block of records, in multiplications.
     records_repeat
@@ -154,35 +158,36 @@ class Tolerances:
     records
         Least tolerance of statistics behind electronics with a dead time, the accuracy that is stated for them.
     direct_bins
-        Bins up to which the stationary equations of records are solved directly.
-    record_turns, record_stands
-        Most power iterations for them; total variation of the last one, relative to 1 - contraction.
-    like_moments
+        Bins up to which the equations for the stationary law of records are solved directly.
+    record_iterations, record_change
+        Most power iterations for larger ones; change of the last one in total variation, relative to 1 - contraction.
+    record_mismatch
         Allowed disagreement of a pmf of records with mean and variance, in units of the tolerance.
     rate_steps, light_steps
         Cost of a bin in steps of the recursion: of the rates of a paralyzable pixel, at most; of the light of others.
     folded_factored
-        Bins of a feedback equation of the joint law that is factorised: a second.
+        Bins up to which a feedback equation of the joint law is factorised, in a second.
     folded_residual, folded_change, folded_sweeps, folded_checked
         Relative residual of this equation; change per sweep relative to the largest value; sweeps beyond which a
         factorisation is faster; windows of a block whose residual is checked.
     chain_sweeps, chain_krylov
         Gauss-Seidel sweeps of the phase chain before GMRES, and the dimension of the Krylov space.
     chain_change, chain_residual, chain_worst_residual
-        Relative change per sweep; backward error that ends an iteration (rounding alone gives 1e-16 to 1e-14); largest
-        one of a solution.
+        Relative change per sweep and backward error that end an iteration (rounding alone gives errors of 1e-16 to
+        1e-14); largest backward error of a solution.
     holding_times
         Allowed difference of a moment of the holding times by independent routes, relative to its largest term.
     eigen_bins
-        Bins of an eigen-decomposition, O(n^3).
+        Most bins of an eigendecomposition, O(n^3).
     most_lags, most_modes
-        Lags of a covariance, an O(n) product each; eigenvalues that the automatic rule considers.
+        Most lags of a covariance, an O(n) product each; most eigenvalues that the automatic rule considers.
     most_mean, matched_outside
-        Mean of a matched law (doubles hold integers up to 9e15); normal probability beyond 8 standard deviations.
+        Largest mean of a matched law (doubles hold integers up to 9e15); probability outside its support, that of a
+        normal law beyond 8 standard deviations.
     least_spread
         Smallest standard deviation of a count relative to Poisson: that of the best locked pixels.
     paralyzable_periods
-        Whole periods of a paralyzable dead time; the variance sums over each.
+        Most periods of a paralyzable dead time; the variance is a sum over them.
     synchronous_tail, synchronous_loose_tail
         Probability outside the support of a synchronous law, at either end, by its sums and by its transform.
     synchronous_late, synchronous_reach
@@ -197,7 +202,7 @@ class Tolerances:
 
     rounding: float = 1e-12
     repeats: float = 1e-12
-    forgotten: float = 1e-9
+    transient: float = 1e-9
     most_bins: int = 2**20
     most_even_bins: int = 2**15
     first_bins: int = 128
@@ -242,7 +247,7 @@ class Tolerances:
     widest_guess: int = 1024
     edge: float = 1e-10
     record_edge: float = 1e-9
-    like_mean: float = 0.02
+    guess_mean: float = 0.02
     all_points: int = 256
     faint: float = 1e-15
     record_faint: float = 1e-17
@@ -253,9 +258,9 @@ class Tolerances:
     records_repeat: float = 1e-11
     records: float = 1e-3
     direct_bins: int = 2048
-    record_turns: int = 2000
-    record_stands: float = 1e-9
-    like_moments: float = 3.0
+    record_iterations: int = 2000
+    record_change: float = 1e-9
+    record_mismatch: float = 3.0
     rate_steps: float = 120.0
     light_steps: float = 10.0
     folded_factored: int = 2**14

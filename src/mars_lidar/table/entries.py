@@ -22,14 +22,14 @@ from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux, broadcast
 from mars_lidar.statistics.cells import Cells, cell_name, default_bins, flat
 from mars_lidar.statistics.chain import ConvergenceError, PhaseChain, Rearm
-from mars_lidar.statistics.count_pmf import Pmf, guessed_windows
+from mars_lidar.statistics.count_pmf import Pmf, guessed_pmfs
 from mars_lidar.statistics.exposure import Settled, _run, blank, native_light, normalised, refined_moments
 from mars_lidar.statistics.matched import trusted
 from mars_lidar.statistics.renewal import holding_times
 from mars_lidar.table.axes import thinned
 from mars_lidar.table.tolerances import TOL
 
-# --- Entries by the exact recursion --------------------------------------------------------------------------------
+# --- Entries -------------------------------------------------------------------------------------------------------
 
 Shapes = NDArray[np.float32]
 
@@ -101,45 +101,6 @@ class Entries:
         return out
 
 
-def exposure_entries(
-    signal: FloatArray,
-    background: FloatArray,
-    system: System,
-    *,
-    tolerance: float,
-    threads: int,
-    progress: Progress | None,
-) -> Entries:
-    """Entries (n,) by the exact recursion, `statistics.exposure_moments`, in blocks of moderate memory."""
-    n, bins = signal.size, system.bins
-    growing = system.start == "armed" and system.dead_time_periods > 0.0
-    entries = Entries(
-        cycles=system.cycles,
-        cumulants=np.empty((n, 4)),
-        rates=np.empty((n, 4)),
-        enough=np.empty(n, np.int64),
-        bins=np.empty(n, np.int64),
-        shape=np.empty((n, bins), np.float32),
-        startup=np.zeros((n, bins), np.float32) if growing else None,
-    )
-    window = 3 * (int(system.dead_time_periods) + 1)  # periods that the recursion runs on after settling (20)
-    step = max(64, TOL.block_bytes // (8 * bins))
-    for start in range(0, n, step):
-        some = slice(start, min(start + step, n))
-        cells = Cells.of(signal[some], background[some], system)
-        part = refined_moments(
-            cells, bins, tolerance=tolerance, threads=threads, progress=of_part(progress, start, some.stop, n)
-        )
-        entries.cumulants[some], entries.rates[some] = part.cumulants, part.cumulant_rates
-        entries.enough[some] = np.where(part.settled < 0, -1, np.maximum(part.settled - window, 1))
-        entries.bins[some] = part.bins
-        entries.shape[some] = normalised(part.histogram)
-        if entries.startup is not None:
-            rest = part.histogram - system.cycles * part.histogram_rate
-            entries.startup[some] = np.where(np.isnan(rest), 0.0, rest)
-    return entries
-
-
 # --- Exact laws of some entries ------------------------------------------------------------------------------------
 
 
@@ -165,14 +126,14 @@ class NodeLaws:
     pmf: FloatArray
 
     @classmethod
-    def of(cls, row: IndexArray, windows: Sequence[Pmf]) -> NodeLaws:
-        """From one window for each row."""
-        trimmed = [_trimmed(window) for window in windows]
+    def of(cls, row: IndexArray, laws: Sequence[Pmf]) -> NodeLaws:
+        """From one law for each row."""
+        trimmed = [_trimmed(law) for law in laws]
         return cls(
             np.asarray(row, dtype=np.int64),
-            np.array([window.first for window in trimmed], np.int64),
-            np.concatenate([[0], np.cumsum([window.p.size for window in trimmed])]).astype(np.int64),
-            np.concatenate([np.empty(0), *(window.p for window in trimmed)]),
+            np.array([law.first for law in trimmed], np.int64),
+            np.concatenate([[0], np.cumsum([law.p.size for law in trimmed])]).astype(np.int64),
+            np.concatenate([np.empty(0), *(law.p for law in trimmed)]),
         )
 
     @classmethod
@@ -180,7 +141,7 @@ class NodeLaws:
         """Laws of no entry."""
         return cls.of(np.empty(0, np.int64), [])
 
-    def window(self, row: int) -> Pmf | None:
+    def law(self, row: int) -> Pmf | None:
         """Law of an entry; None if its cumulants suffice."""
         k = int(np.searchsorted(self.row, row))
         if k == self.row.size or self.row[k] != row:
@@ -188,11 +149,11 @@ class NodeLaws:
         return Pmf(int(self.first[k]), self.pmf[self.offsets[k] : self.offsets[k + 1]], TOL.negligible)
 
 
-def _trimmed(window: Pmf) -> Pmf:
-    below = np.cumsum(window.p)
-    some = np.flatnonzero((below > TOL.negligible) & (below[-1] - below + window.p > TOL.negligible))
-    low, high = (int(some[0]), int(some[-1]) + 1) if some.size else (0, window.p.size)
-    return Pmf(window.first + low, window.p[low:high], TOL.negligible)
+def _trimmed(law: Pmf) -> Pmf:
+    below = np.cumsum(law.p)
+    some = np.flatnonzero((below > TOL.negligible) & (below[-1] - below + law.p > TOL.negligible))
+    low, high = (int(some[0]), int(some[-1]) + 1) if some.size else (0, law.p.size)
+    return Pmf(law.first + low, law.p[low:high], TOL.negligible)
 
 
 def node_laws(
@@ -212,7 +173,7 @@ def node_laws(
         return NodeLaws.none()
     cells = Cells.of(signal[row // background.size], background[row % background.size], system)
     waiting = None if progress is None else lambda done: progress(done, row.size)
-    return NodeLaws.of(row, guessed_windows(cells, entries.cumulants[row], entries.bins[row], threads, waiting))
+    return NodeLaws.of(row, guessed_pmfs(cells, entries.cumulants[row], entries.bins[row], threads, waiting))
 
 
 # --- Change with the delay -----------------------------------------------------------------------------------------
@@ -399,7 +360,7 @@ def _choose(cells: Cells, grids: IndexArray, scale: FloatArray, sample: IndexArr
 def _replace_if_wrong(
     cells: Cells, cell: int, bins: int, phase: FloatArray, scale: FloatArray, correction: FloatArray, threads: int
 ) -> None:
-    """Exact corrections (p, 4) of a cell whose exposure ended before start and end forgot each other.
+    """Exact corrections (p, 4) of a cell whose exposure ended before its start-up transient had decayed.
 
     The corrections of (P7) are compared with exact ones at the few phases where they are largest, and replaced where
     they differ by more than the tolerance `phase_error`.
@@ -443,67 +404,86 @@ class Recipe:
         self, signal: FloatArray, background: FloatArray, system: System, progress: Progress | None = None
     ) -> Entries:
         """Entries of cells (n,)."""
-        if self.method == "mars":
-            return renewal_entries(
-                signal, background, system, rearm=self.rearm, threads=self.threads, progress=progress
-            )
-        return exposure_entries(
-            signal, background, system, tolerance=self.tolerance, threads=self.threads, progress=progress
+        compute = self._by_chain if self.method == "mars" else self._by_recursion
+        return compute(signal, background, system, progress)
+
+    def _by_recursion(
+        self, signal: FloatArray, background: FloatArray, system: System, progress: Progress | None
+    ) -> Entries:
+        """Entries (n,) by the exact recursion, `statistics.exposure_moments`, in blocks of moderate memory."""
+        n, bins = signal.size, system.bins
+        growing = system.start == "armed" and system.dead_time_periods > 0.0
+        entries = Entries(
+            cycles=system.cycles,
+            cumulants=np.empty((n, 4)),
+            rates=np.empty((n, 4)),
+            enough=np.empty(n, np.int64),
+            bins=np.empty(n, np.int64),
+            shape=np.empty((n, bins), np.float32),
+            startup=np.zeros((n, bins), np.float32) if growing else None,
         )
+        window = 3 * (int(system.dead_time_periods) + 1)  # periods of the recursion after settling (20)
+        step = max(64, TOL.block_bytes // (8 * bins))
+        for start in range(0, n, step):
+            some = slice(start, min(start + step, n))
+            cells = Cells.of(signal[some], background[some], system)
+            done = of_part(progress, start, some.stop, n)
+            part = refined_moments(cells, bins, tolerance=self.tolerance, threads=self.threads, progress=done)
+            entries.cumulants[some], entries.rates[some] = part.cumulants, part.cumulant_rates
+            entries.enough[some] = np.where(part.settled < 0, -1, np.maximum(part.settled - window, 1))
+            entries.bins[some] = part.bins
+            entries.shape[some] = normalised(part.histogram)
+            if entries.startup is not None:
+                rest = part.histogram - system.cycles * part.histogram_rate
+                entries.startup[some] = np.where(np.isnan(rest), 0.0, rest)
+        return entries
 
+    def _by_chain(
+        self, signal: FloatArray, background: FloatArray, system: System, progress: Progress | None
+    ) -> Entries:
+        """Entries (n,) with N ~ Normal(t / mu, t sigma^2 / mu^3) and the stationary shape of the chain.
 
-def renewal_entries(
-    signal: FloatArray,
-    background: FloatArray,
-    system: System,
-    *,
-    rearm: Rearm,
-    threads: int,
-    progress: Progress | None,
-) -> Entries:
-    """Entries (n,) of N ~ Normal(t / mu, t sigma^2 / mu^3) and of the chain's stationary shape (arXiv 2512.04924).
+        The sum of the covariances of the holding times, which the MaRS paper (arXiv 2512.04924) approximates by L lags
+        and p eigenpairs, is not truncated (docs/theory.md, 3.10). The law is that of long exposures: linear in the
+        exposure from 1 period on, and independent of its start and of the delay. The third and fourth cumulant are 0.
+        """
+        n, bins = signal.size, default_bins(system)
+        energy = np.maximum(system.pulse.bin_energy(0.5 * system.period_ns, system.period_ns, bins), 0.0)
+        rates = np.zeros((n, 4))
+        shape = np.full((n, system.bins), 1.0 / system.bins, dtype=np.float32)
 
-    The sum of the covariances of the holding times, which the paper approximates by L lags and p eigenpairs, is not
-    truncated (docs/theory.md, 3.10). The law is asymptotic in the exposure, thus linear in it from 1 period on, and
-    independent of the start of the exposure and of the delay. Third and fourth cumulants are those of a Gaussian, 0.
-    """
-    n, bins = signal.size, default_bins(system)
-    energy = np.maximum(system.pulse.bin_energy(0.5 * system.period_ns, system.period_ns, bins), 0.0)
-    rates = np.zeros((n, 4))
-    shape = np.full((n, system.bins), 1.0 / system.bins, dtype=np.float32)
+        def block(start: int) -> int:
+            stop = min(start + TOL.chain_cells, n)
+            for k in range(start, stop):
+                photons = signal[k] * energy + background[k] / bins
+                if photons.any():
+                    name = cell_name(Flux(signal[k], background[k], 0.5 * system.period_ns), system)
+                    times = holding_times(PhaseChain(photons, system.dead_time_periods, self.rearm, name))
+                    rates[k, :2] = 1.0 / times.mu, times.sigma2 / times.mu**3
+                    shape[k] = times.stationary.pdf.reshape(system.bins, -1).sum(-1)
+            return stop - start
 
-    def block(start: int) -> int:
-        stop = min(start + TOL.chain_cells, n)
-        for k in range(start, stop):
-            photons = signal[k] * energy + background[k] / bins
-            if photons.any():
-                name = cell_name(Flux(signal[k], background[k], 0.5 * system.period_ns), system)
-                times = holding_times(PhaseChain(photons, system.dead_time_periods, rearm, name))
-                rates[k, :2] = 1.0 / times.mu, times.sigma2 / times.mu**3
-                shape[k] = times.stationary.pdf.reshape(system.bins, -1).sum(-1)
-        return stop - start
-
-    with ThreadPoolExecutor(max(1, threads)) as pool:
-        waiting = {pool.submit(block, start) for start in range(0, n, TOL.chain_cells)}
-        try:
-            while waiting:
-                done, waiting = wait(waiting, timeout=0.2, return_when=FIRST_EXCEPTION)
-                for future in done:
-                    future.result()
-                if progress is not None:
-                    progress(n - min(n, TOL.chain_cells * len(waiting)), n)
-        except BaseException:  # Ctrl-C as well: what has not begun never does
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
-    return Entries(
-        cycles=system.cycles,
-        cumulants=system.cycles * rates,
-        rates=rates,
-        enough=np.ones(n, np.int64),
-        bins=np.full(n, bins, np.int64),
-        shape=shape,
-        startup=None,
-    )
+        with ThreadPoolExecutor(max(1, self.threads)) as pool:
+            waiting = {pool.submit(block, start) for start in range(0, n, TOL.chain_cells)}
+            try:
+                while waiting:
+                    done, waiting = wait(waiting, timeout=0.2, return_when=FIRST_EXCEPTION)
+                    for future in done:
+                        future.result()
+                    if progress is not None:
+                        progress(n - min(n, TOL.chain_cells * len(waiting)), n)
+            except BaseException:  # Ctrl-C as well: what has not begun never does
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
+        return Entries(
+            cycles=system.cycles,
+            cumulants=system.cycles * rates,
+            rates=rates,
+            enough=np.ones(n, np.int64),
+            bins=np.full(n, bins, np.int64),
+            shape=shape,
+            startup=None,
+        )
 
 
 # --- Lookup --------------------------------------------------------------------------------------------------------
@@ -547,6 +527,10 @@ class Lookup:
     weights: FloatArray
     cumulants: FloatArray
     outside: NDArray[np.bool_]
+
+    def mixture(self, shapes: Shapes) -> FloatArray:
+        """Shapes (P, bins) of the pixels at the canonical delay, from those of the table (`Table.shapes`)."""
+        return np.stack([w @ shapes[r] for r, w in zip(self.rows, self.weights, strict=True)])
 
     def trusted(self) -> NDArray[np.bool_]:
         """Pixels (P,) whose four cumulants determine the law of the count to about 0.002 in total variation.

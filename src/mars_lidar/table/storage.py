@@ -128,9 +128,9 @@ def cached_candidates(key: str, cycles: int) -> tuple[Path, list[Path]]:
 def put_into_cache(save: Callable[..., None], own: Path) -> None:
     """Put a table into the cache by its method `save`."""
     own.parent.mkdir(parents=True, exist_ok=True)
-    mine = own.with_name(f"{own.stem}-{os.getpid()}.h5")  # several processes may build the same table at once
-    save(mine, overwrite=True)
-    os.replace(mine, own)
+    partial = own.with_name(f"{own.stem}-{os.getpid()}.h5")  # several processes may build the same table at once
+    save(partial, overwrite=True)
+    os.replace(partial, own)
 
 
 def cached_tables() -> list[Path]:

@@ -24,7 +24,7 @@ from mars_lidar._base.display import brief
 from mars_lidar._base.files import reading, reason
 from mars_lidar._base.progress import callback_of, of_part
 from mars_lidar._base.resources import check_memory, thread_count
-from mars_lidar._base.types import ArrayLike, FloatArray, NDArray, Progress
+from mars_lidar._base.types import ArrayLike, FloatArray, IndexArray, NDArray, Progress
 from mars_lidar._version import __version__
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
@@ -177,7 +177,7 @@ class Table:
             error = table.quantisation_error(samples=TOL.error_pixels, threads=recipe.threads)
         else:
             table, error = _refined(system, axes, recipe, goal, progress)
-        longest = table._long_error(TOL.error_pixels, recipe.threads)
+        longest = table._long_error(recipe.threads)
         law = table.law_error(threads=recipe.threads).to_dict() if check_law else None
         table.provenance.update(
             key=storage.request_key(system, axes, method=method, rearm=rearm, refine=goal, tolerance=tolerance),
@@ -463,15 +463,19 @@ class Table:
         recipe = Recipe(self.method, self.rearm, self.tolerance, thread_count(threads))
         exact = recipe.entries(signal, background, system)
         looked_up = self.at(signal, background, cycles=periods, interpolation=interpolation)
-        shapes = self.shapes(periods)
-        mixed = np.stack([w @ shapes[r] for r, w in zip(looked_up.rows, looked_up.weights, strict=True)])
+        mixed = looked_up.mixture(self.shapes(periods))
         error = deviations(looked_up.cumulants, exact.cumulants)
         shape = 0.5 * np.abs(mixed - exact.shape).sum(-1)
         delayed, delayed_shape = error, shape
         if self.method == "exposure":
-            delayed, delayed_shape = self._delayed(interpolation, rng, signal, background, mixed, periods, threads)
-        law = np.maximum(law_variation(error), law_variation(delayed))
-        worst = int(np.argmax(np.maximum(law, shape)))
+            shift = rng.integers(0, system.bins, samples)
+            delay, cumulants, delayed_shape = self._against_exact(
+                signal, background, shift, mixed, periods, recipe.threads
+            )
+            law = self.at(signal, background, delay, cycles=periods, interpolation=interpolation)
+            delayed = deviations(law.cumulants, cumulants)
+        variation = np.maximum(law_variation(error), law_variation(delayed))
+        worst = int(np.argmax(np.maximum(variation, shape)))
         return QuantisationError(
             interpolation=interpolation,
             samples=samples,
@@ -487,24 +491,22 @@ class Table:
             delayed_mean_max=float(delayed[:, 0].max()),
             delayed_variance_max=float(delayed[:, 1].max()),
             delayed_shape_max=float(delayed_shape.max()),
-            law_max=float(law.max()),
+            law_max=float(variation.max()),
             worst_signal=float(signal[worst]),
             worst_background=float(background[worst]),
         )
 
-    def law_error(
-        self, *, samples: int = 50, seed: int = 0, cycles: int | None = None, threads: int | None = None
-    ) -> LawError:
+    def law_error(self, *, samples: int = 50, seed: int = 0, threads: int | None = None) -> LawError:
         """Total variation, on random pixels, between the count law of the table and the exact law.
 
-        Some 10 to 20 ms a pixel. `samples`, `seed`, `cycles` and `threads` as for `quantisation_error`.
+        Some 10 to 20 ms a pixel. `samples`, `seed` and `threads` as for `quantisation_error`.
         """
         samples = checks.integer("samples", samples, low=1, high=100_000)
         rng = np.random.default_rng(checks.integer("seed", seed, low=0, high=2**64 - 1))
-        system = self.system if cycles is None else self.system.replace(cycles=cycles)
+        system = self.system
         signal, background = (random_pixels(rng, axis, samples, True) for axis in (self.signal, self.background))
         delay = rng.uniform(0.0, system.period_ns, samples)
-        law = self.at(signal, background, delay, cycles=system.cycles)
+        law = self.at(signal, background, delay)
         exact = count_law(Flux(signal, background, delay), system, tolerance=self.tolerance, threads=threads)
         matched = matched_pmf(law.cumulants, threads=threads)
         off = np.array([total_variation(w, Pmf(int(exact.support[k, 0]), exact.pmf[k])) for k, w in enumerate(matched)])
@@ -523,12 +525,12 @@ class Table:
             worst_delay_ns=float(delay[worst]),
         )
 
-    def _long_error(self, samples: int, threads: int | None) -> QuantisationError | None:
+    def _long_error(self, threads: int) -> QuantisationError | None:
         """Errors at the longest exposure, 1e8 cycles; None where some entry does not serve it, or has no exact law."""
         if self.system.cycles != TOL.cycles and not self.entries.serves(TOL.cycles).all():
             return None
         try:
-            return self.quantisation_error(samples=samples, cycles=TOL.cycles, threads=threads)
+            return self.quantisation_error(samples=TOL.error_pixels, cycles=TOL.cycles, threads=threads)
         except ConvergenceError:  # the law of a random pixel between the entries, which is much of a locked one
             return None
 
@@ -549,38 +551,31 @@ class Table:
         `cycles` are those of `lookup`, `threads` those of `quantisation_error`.
         """
         periods = self._cycles(cycles)
-        system = self.system.replace(cycles=periods)
         entries = self.at(signal, background, cycles=periods, interpolation=interpolation)
-        shapes = self.shapes(periods)
-        mixed = np.stack([w @ shapes[r] for r, w in zip(entries.rows, entries.weights, strict=True)])
-        half = 0.5 * system.period_ns
-        shift = np.rint((np.asarray(delay_ns) - half) / system.bin_ns).astype(np.int64) % system.bins
-        errors = []
-        for turns in (shift, np.zeros_like(shift)):
-            flux = Flux(signal, background, half + turns * system.bin_ns)
-            exact = exposure_moments(flux, system, tolerance=self.tolerance, threads=threads)
-            turned = np.stack([np.roll(row, k) for row, k in zip(mixed, turns, strict=True)])
-            errors.append(0.5 * np.abs(turned - normalised(exact.histogram).reshape(turned.shape)).sum(-1))
-        return np.asarray(np.maximum(errors[0] - errors[1], 0.0))
+        mixed, system = entries.mixture(self.shapes(periods)), self.system
+        shift = np.rint((np.asarray(delay_ns) - 0.5 * system.period_ns) / system.bin_ns).astype(np.int64) % system.bins
+        delayed, canonical = (
+            self._against_exact(signal, background, bins, mixed, periods, threads)[-1]
+            for bins in (shift, np.zeros_like(shift))
+        )
+        return np.maximum(delayed - canonical, 0.0)
 
-    def _delayed(
+    def _against_exact(
         self,
-        interpolation: Interpolation,
-        rng: np.random.Generator,
         signal: FloatArray,
         background: FloatArray,
+        shift: IndexArray,
         mixed: FloatArray,
         cycles: int,
         threads: int | None,
-    ) -> tuple[FloatArray, FloatArray]:
-        """Errors (P, 4) and (P,) of cumulants and shape at random delays, whole bins from the canonical one."""
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Delays (P,), `shift` bins after the canonical one, the exact cumulants there, and errors (P,) of `mixed`."""
         system = self.system.replace(cycles=cycles)
-        shift = rng.integers(0, system.bins, signal.size)
-        delay = 0.5 * system.period_ns + shift * system.bin_ns
+        delay = np.asarray(0.5 * system.period_ns + shift * system.bin_ns, dtype=np.float64)
         exact = exposure_moments(Flux(signal, background, delay), system, tolerance=self.tolerance, threads=threads)
-        law = self.at(signal, background, delay, cycles=cycles, interpolation=interpolation)
-        turned = np.stack([np.roll(row, k) for row, k in zip(mixed, shift, strict=True)])
-        return deviations(law.cumulants, exact.cumulants), 0.5 * np.abs(turned - normalised(exact.histogram)).sum(-1)
+        moved = np.stack([np.roll(row, k) for row, k in zip(mixed, shift, strict=True)])
+        error = 0.5 * np.abs(moved - normalised(exact.histogram).reshape(moved.shape)).sum(-1)
+        return delay, exact.cumulants, np.asarray(error, dtype=np.float64)
 
 
 def _evaluated(system: System, axes: Axes, recipe: Recipe, progress: Progress | None) -> Table:

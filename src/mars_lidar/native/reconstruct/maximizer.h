@@ -29,7 +29,9 @@ constexpr double kSteps = 4.0;        // of the profile of the delay, in a bin o
 constexpr double kPart = 0.4;         // of it, at most, in standard errors where it stands
 constexpr int kDepth = 3;             // halvings of a step of it in which a kink is looked for
 constexpr double kFallen = 1e-4;      // of the likelihood of the maximum: nothing
-constexpr int kMaximumColumns = 8;    // of the output: see Maximizer
+constexpr double kUniform = 0.28867513459481287;  // standard deviation of the uniform law on a unit interval
+constexpr double kRootTwoPi = 2.5066282746310002;
+constexpr int kMaximumColumns = 8;  // of the output: see Maximizer
 
 // What is known where the likelihood stands, without what the ends of the exposure hide, if that is positive definite.
 inline void known_information(const Likelihood& likelihood, const bool* free, double known[3][3]) {
@@ -52,6 +54,7 @@ struct Fit {
 struct Terrain {
     double least;     // of B
     double farthest;  // a step of the delay may go
+    bool narrow;  // the pulse is narrower than half a bin, within which the likelihood hardly changes with the delay
     double best = -HUGE_VAL;
     const ExposureEnds* ends = nullptr;
 };
@@ -88,7 +91,9 @@ inline Fit climb(PixelLikelihood& pixel, const double* start, bool with_signal, 
             double damped[3][3], next[3];
             for (int a = 0; a < 3; ++a)
                 for (int b = 0; b < 3; ++b) damped[a][b] = known[a][b] * (a == b ? 1.0 + damping : 1.0);
-            if (!solve<3>(damped, now.gradient, fit.free, move)) continue;
+            // far inside a bin a step of the delay overshoots, and damping it would stop S and B: they move alone once
+            const bool part[3] = {fit.free[0], fit.free[1], fit.free[2] && !(terrain.narrow && trial == 1)};
+            if (!solve<3>(damped, now.gradient, part, move)) continue;
             next[0] = std::clamp(fit.at[0] + move[0], 0.0, kMostPhotons);
             next[1] = std::clamp(fit.at[1] + move[1], std::max(least, 0.05 * fit.at[1]), kMostPhotons);
             next[2] = fit.at[2] + std::clamp(move[2], -farthest, farthest);
@@ -153,7 +158,8 @@ class Maximizer {
         Start starts[DelaySearch::kMost];
         const int found = search_(passes_, pixel, job_.starts, starts);
         Fit best;
-        Terrain terrain{least, farthest, -HUGE_VAL, &ends_};
+        const bool narrow = r_.width * n < 0.5;
+        Terrain terrain{least, farthest, narrow, -HUGE_VAL, &ends_};
         double brightest = flat;
         for (int k = 0; k < found; ++k) brightest = std::max(brightest, starts[k].background);
         pixel.expect(brightest);
@@ -167,8 +173,11 @@ class Maximizer {
             terrain.best = fit.likelihood.value;
         }
         Profile profile;
-        if (r_.sample > 0.0 && best.at[0] > 0.0) {
-            profile = look_around(pixel, terrain, best);
+        bool within = false;
+        if (best.at[0] > 0.0) {
+            if (r_.sample > 0.0) profile = look_around(pixel, terrain, best);
+            within = narrow && within_bin(pixel, terrain, best);
+            if (r_.sample > 0.0 && narrow) profile = within ? Profile() : profile_of(pixel, terrain, best);
         }
         terrain.best = -HUGE_VAL;
         const double dark[3] = {0.0, flat, best.at[2]};
@@ -180,10 +189,11 @@ class Maximizer {
         if (best.at[0] == 0.0 || gain < job_.least_gain) *flag |= kNoSignal;
         out[6] = gain;
         out[7] = best.likelihood.value;
-        if (job_.less_bias && *flag == 0) correct(pixel, least, best);
+        if (job_.less_bias && *flag == 0 && !narrow) correct(pixel, least, best);
         for (int k = 0; k < 3; ++k) out[k] = best.at[k];
         if (best.at[0] == 0.0) out[2] = NAN;
         errors(pixel, least, best, out + 3);
+        if (within) out[5] = kUniform / n;
         if (!(profile.weight > 0.0)) return;
         if (best.free[2]) out[5] = std::sqrt(profile.square[2] / profile.weight);
         for (int k = 0; k < 2 && best.free[0] && best.free[1]; ++k)
@@ -194,6 +204,43 @@ class Maximizer {
     const ArmedPasses& passes() const { return passes_; }
 
  private:
+    // Of a pulse narrower than half a bin. Both bins at an edge have signal only near it: climbs from the edges of the bin.
+    // Whether the delay is then anywhere within a bin, uniformly: where the likelihood of delays in its middle, in which it
+    // hardly changes, times the bin is more than the likelihood of the maximum times its width. The best is the middle then.
+    bool within_bin(PixelLikelihood& pixel, Terrain& terrain, Fit& best) {
+        const double n = static_cast<double>(r_.bins), first = std::floor((best.at[2] + r_.peak) * n);
+        for (const double edge : {first, first + 1.0}) {
+            const double at[3] = {best.at[0], best.at[1], edge / n - r_.peak};
+            ends_.set(r_, passes_, at[2]);
+            const Fit fit = climb(pixel, at, true, terrain);
+            if (!(fit.likelihood.value > terrain.best)) continue;
+            best = fit;
+            terrain.best = fit.likelihood.value;
+        }
+        const double place = (best.at[2] + r_.peak) * n, bin = std::floor(place);
+        const auto error_of = [&](const Fit& fit) {  // in bins, if the delay is determined within its bin; else 0
+            const double error = n * error_of_delay(fit);
+            return error < kUniform ? error : 0.0;
+        };
+        Fit middle = best;
+        const double error = error_of(best);
+        double mass = error > 0.0 ? best.likelihood.value + std::log(kRootTwoPi * error) : -HUGE_VAL;
+        bool within = false;
+        for (const double there : {bin, place - bin < 0.5 ? bin - 1.0 : bin + 1.0}) {
+            Fit fit = best;
+            fit.at[2] = (there + 0.5) / n - r_.peak;
+            const bool free[3] = {true, true, false};
+            for (int step = 0; step < 3; ++step) settle(pixel, terrain.least, free, fit);
+            fit.free[2] = fit.likelihood.information[2][2] > 0.0;
+            if (error_of(fit) > 0.0 || !(fit.likelihood.value > mass)) continue;
+            mass = fit.likelihood.value;
+            middle = fit;
+            within = true;
+        }
+        best = middle;
+        return within;
+    }
+
     // Light of a sampled pulse is constant over a sample, so that the slope of the likelihood jumps at delays at which an
     // edge of a bin meets one of a sample: between any two may be a maximum. Where its profile around the best may rise
     // above it, climbs begin, until none is better; returns the profile.
@@ -202,7 +249,7 @@ class Maximizer {
         for (int turn = 0; turn < kMostTurns; ++turn) {
             const double centre[3] = {best.at[0], best.at[1], best.at[2]};
             ends_.set(r_, passes_, centre[2]);
-            best = climb(pixel, centre, true, {terrain.least, terrain.farthest, -HUGE_VAL, &ends_});
+            best = climb(pixel, centre, true, {terrain.least, terrain.farthest, terrain.narrow, -HUGE_VAL, &ends_});
             const double before = terrain.best = best.likelihood.value;
             out = profile_of(pixel, terrain, best);
             for (const auto& at : higher_) {

@@ -12,8 +12,8 @@ from mars_lidar._base.arguments import checked
 from mars_lidar._base.progress import callback_of
 from mars_lidar._base.resources import check_memory, thread_count
 from mars_lidar._base.types import ArrayLike, FloatArray, NDArray, Progress
-from mars_lidar.engines import Engine, EngineOptions, check_detector, find_engine
-from mars_lidar.engines.engine import IN_PARTS, PhaseRecords, Records, Task
+from mars_lidar.engines.engine import IN_PARTS, Engine, EngineOptions, PhaseRecords, Records, Task
+from mars_lidar.engines.registry import check_detector, find_engine
 from mars_lidar.instrument.system import System
 from mars_lidar.instrument.units import check_delays
 from mars_lidar.light.flux import Flux, StoredFlux
@@ -119,11 +119,11 @@ def simulate(
     >>> bool(cube.sum(-1).max() <= system.cycles * 100 / 75 + 1)  # at most one count a dead time
     True
     """
-    drawn_by = find_engine(engine, **options)
-    task = _task(flux, system, drawn_by, realizations, first_realization, pixel_index, seed, threads, progress)
+    chosen = find_engine(engine, **options)
+    task = _task(flux, system, chosen, realizations, first_realization, pixel_index, seed, threads, progress)
     shape = (task.realizations, *task.flux.shape, system.bins)
     if device == "cuda":
-        there: NDArray[Any] = _on_cuda(drawn_by, task, shape, out)
+        there: NDArray[Any] = _on_cuda(chosen, task, shape, out)
         if report is not None:
             report.update(task.report)
         return there
@@ -132,7 +132,7 @@ def simulate(
         out = np.empty(shape, system.histogram_dtype)
     else:
         _check_out(out, shape, system.histogram_dtype)
-    drawn_by.histogram(task, out.reshape(task.items, system.bins))
+    chosen.histogram(task, out.reshape(task.items, system.bins))
     if report is not None:
         report.update(task.report)
     cube: NDArray[Any] = out
@@ -205,19 +205,19 @@ def simulate_timestamps(
     >>> times.histogram().shape
     (1, 1, 128)
     """
-    drawn_by = find_engine(engine)
-    task = _task(flux, system, drawn_by, 1, realization, pixel_index, seed, threads, progress, first_name="realization")
+    chosen = find_engine(engine)
+    task = _task(flux, system, chosen, 1, realization, pixel_index, seed, threads, progress, first_name="realization")
     if device == "cuda":
         from mars_lidar.engines import cuda
 
-        cuda.check(drawn_by, task.flux, task.system)
-        records: Records | PhaseRecords = cuda.records(drawn_by, task)
+        cuda.check(chosen, task.flux, task.system)
+        records: Records | PhaseRecords = cuda.records(chosen, task)
     else:
         detected = task.flux.detected(system)
         expected = float((_share_registered(detected, system) * _expected_arrivals(detected, system)).sum())
         _check_memory((math.ceil(0.5 * expected),), PhaseRecords.BYTES, "timestamps")  # before any work
-        records = drawn_by.records(task, expected)
-    info = {"system": system.to_dict(), "engine": drawn_by.name, "seed": int(seed), "realization": int(realization)}
+        records = chosen.records(task, expected)
+    info = {"system": system.to_dict(), "engine": chosen.name, "seed": int(seed), "realization": int(realization)}
     height, width = task.flux.shape
     what = ((height, width), system.bins, system.histogram_dtype, system.period_ns, system.cycles, info)
     if isinstance(records, PhaseRecords):
@@ -247,7 +247,7 @@ def _on_cuda(engine: Engine, task: Task, shape: tuple[int, ...], out: Any) -> An
 def _task(
     flux: Flux,
     system: System,
-    drawn_by: Engine,
+    chosen: Engine,
     realizations: int,
     first_realization: int,
     pixel_index: ArrayLike | None,
@@ -266,12 +266,12 @@ def _task(
         raise ValueError(
             f"flux must have at most {TOL.returns} returns, got {len(flux.returns_signal)}; use a waveform"
         )
-    _check_registrations(flux.detected(system), system)
+    check_registrations(flux.detected(system), system)
     lit = flux.returns_delay_ns[flux.returns_signal > 0.0]
     if lit.size:
         check_delays(float(np.median(lit)), system.period_ns)
-    check_detector(drawn_by, system)
-    drawn_by.check(flux, system)
+    check_detector(chosen, system)
+    chosen.check(flux, system)
     index = _pixel_index(pixel_index, flux.shape)
     if system.detector.crosstalk is not None and not np.array_equal(index, np.arange(index.size)):
         raise ValueError(
@@ -295,7 +295,8 @@ def _pixel_index(pixel_index: ArrayLike | None, shape: tuple[int, ...]) -> NDArr
     return np.ascontiguousarray(index.reshape(-1).astype(np.uint32))
 
 
-def _check_registrations(flux: Flux, system: System) -> None:
+def check_registrations(flux: Flux, system: System) -> None:
+    """Raise ValueError where a pixel is expected to have more registrations than its random stream can draw."""
     expected = _expected_arrivals(flux, system)
     most, what = float(expected.max()), "registrations"
     if system.detector.mode == "paralyzable":  # each arrival is drawn, seen or not

@@ -6,7 +6,7 @@ from harness import make_system
 
 from mars_lidar.statistics import count_pmf as _pmf
 from mars_lidar.statistics.cells import Cells
-from mars_lidar.statistics.count_pmf import exact_windows, guessed_windows, total_variation
+from mars_lidar.statistics.count_pmf import exact_pmfs, guessed_pmfs, total_variation
 from mars_lidar.statistics.exposure import refined_moments
 
 SYSTEM = make_system(63.75, 120, 32)
@@ -20,9 +20,9 @@ def cells():
 
 
 def alone(monkeypatch):
-    """How many cells went the long way."""
-    asked = []
-    monkeypatch.setattr(_pmf, "_alone", lambda cell, threads, way=_pmf._alone: asked.append(1) or way(cell, threads))
+    """Cells whose law is computed by their own cumulants."""
+    asked, compute = [], _pmf._by_own_cumulants
+    monkeypatch.setattr(_pmf, "_by_own_cumulants", lambda cell, threads: asked.append(1) or compute(cell, threads))
     return asked
 
 
@@ -30,7 +30,7 @@ def test_they_are_the_exact_ones(monkeypatch):
     some, cumulants, bins = cells()
     asked, windows = alone(monkeypatch), []
     for guess, truth in zip(
-        guessed_windows(some, cumulants, bins, 1, windows.append), exact_windows(some, cumulants, bins, 1), strict=True
+        guessed_pmfs(some, cumulants, bins, 1, windows.append), exact_pmfs(some, cumulants, bins, 1), strict=True
     ):
         assert total_variation(guess, truth) < 1e-11
     assert not asked
@@ -51,7 +51,7 @@ def test_a_wrong_guess_is_noticed(monkeypatch, wrong):
     wide = np.array([1, 2, 4])  # counts of some spread: the others are all but certain
     some, cumulants, bins = some.part(wide), cumulants[wide], bins[wide]
     asked = alone(monkeypatch)
-    guesses = guessed_windows(some, np.asarray(wrong(cumulants)), bins, 1)
-    for guess, truth in zip(guesses, exact_windows(some, cumulants, bins, 1), strict=True):
+    guesses = guessed_pmfs(some, np.asarray(wrong(cumulants)), bins, 1)
+    for guess, truth in zip(guesses, exact_pmfs(some, cumulants, bins, 1), strict=True):
         assert total_variation(guess, truth) < 1e-6
     assert asked

@@ -1,0 +1,84 @@
+"""What the shortest interval of a recording says of the dead time, whatever light there is to end one.
+
+A registration at phase p is followed, at age a, by light of the rate r(p + a). Of all registrations
+
+    H(x; t_d) = sum over p of the integral over a > t_d of r(p + a) K(x - a)
+
+recorded intervals up to x are expected, K(x - a) the probability that jitter and clock bring one of age a there. Early
+intervals are few of many: none is recorded with the probability exp(-H).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mars_lidar._base.types import FloatArray
+from mars_lidar.calibration.model import Model
+from mars_lidar.calibration.recording import Clock, Recording
+from mars_lidar.statistics.cells import photons_per_bin
+
+
+@dataclass(frozen=True, eq=False)
+class Shortest:
+    """Probabilities (laws, m) of dead times (m,): a shortest interval of at least the recorded one, or of more."""
+
+    dead: FloatArray
+    least: FloatArray
+    more: FloatArray
+
+    def p_value(self, dead: list[FloatArray]) -> float:
+        """Probability of a shortest interval as far off as the recorded one, by the dead times (n,) of each law."""
+        least, more = (
+            np.mean([np.interp(own, self.dead, row).mean() for own, row in zip(dead, rows, strict=True)])
+            for rows in (self.least, self.more)
+        )
+        return float(min(1.0, 2.0 * min(least, 1.0 - more)))
+
+    def dead_time(self) -> tuple[float, float, float]:
+        """Median and 95 % interval of the dead time by the shortest interval, of equally probable ones before it."""
+        likely = (self.least - self.more).mean(0)
+        share = np.r_[0.0, np.cumsum(0.5 * (likely[1:] + likely[:-1]) * np.diff(self.dead))]
+        low, middle, high = np.interp(np.array([0.025, 0.5, 0.975]) * share[-1], share, self.dead)
+        return float(middle), float(low), float(high)
+
+
+def shortest_law(
+    recording: Recording, model: Model, rows: FloatArray, cycles: int, seed: int, bins: int = 2**14, nodes: int = 2000
+) -> Shortest:
+    """The law of the shortest interval for each of (laws, p) parameters, of all dead times.
+
+    Phases of registrations are those of streams of so many `cycles`. The light has so many `bins` a period; the dead
+    times are closest next to the shortest interval.
+    """
+    from scipy.special import ndtr
+
+    period, clock, x = model.clock.period_ns, model.clock, recording.shortest
+    middle = np.tile(rows[len(rows) // 2], (len(rows), 1))
+    drawn = replace(model, clock=Clock(period)).streams(middle, cycles, seed, jitter=False).times
+    phases = np.bincount((drawn / period * bins).astype(np.int64) % bins, minlength=bins) / drawn.size
+    flux = model.varied(model.flux(rows), round(recording.exposure), seed)
+    systems = [model.system(row, 2, jitter=False) for row in rows]
+    light = np.array([photons_per_bin(flux[:, k : k + 1], s, bins=bins)[0, 0] for k, s in enumerate(systems)])
+    rate = np.fft.irfft(np.conj(np.fft.rfft(phases)) * np.fft.rfft(light), bins) * (recording.photons * bins / period)
+    sd = np.maximum(2.0**0.5 * model.widths(rows)[1], 1e-6)  # ns, of an interval
+    unit = max(clock.unit_ns, 1e-6)
+    early, late = np.linspace(-1.0, 0.0, nodes) ** 3 * x, np.linspace(0.0, 1.0, nodes)[1:] ** 3
+    age = x + np.r_[early, late * (6.0 * sd.max() + unit)]
+
+    def none_up_to(end: float) -> FloatArray:
+        """Probability (laws, m) that no interval is recorded up to `end`."""
+        z = (end - age + np.array([unit, 0.0])[:, None, None]) / sd[:, None]
+        above = z * ndtr(z) + np.exp(-0.5 * z**2) / (2.0 * np.pi) ** 0.5  # integral of the normal law
+        recorded = (above[0] - above[1]) * sd[:, None] / unit
+        place = age / period * bins
+        cell = place.astype(np.int64)
+        part = place - cell
+        at = rate[:, cell % bins] * (1.0 - part) + rate[:, (cell + 1) % bins] * part
+        density = np.maximum(at, 0.0) * recorded
+        steps = 0.5 * (density[:, 1:] + density[:, :-1]) * np.diff(age)
+        expected = np.c_[np.cumsum(steps[:, ::-1], axis=1)[:, ::-1], np.zeros(len(rows))]
+        return np.asarray(np.exp(-expected))
+
+    return Shortest(age, none_up_to(x - unit), none_up_to(x))

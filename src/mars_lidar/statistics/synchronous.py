@@ -1,8 +1,8 @@
 """Exact statistics of a synchronous pixel: armed at the start of each period, first photon only (Coates 1968).
 
 Every armed period registers with probability q = 1 - e^-Lambda, at a phase with the law of the first arrival,
-independently of all others. A registration occupies 1 + K periods, or 2 + K where it comes after 1 - f, with t_d =
-K + f. The count is thus a renewal process of whole periods: docs/theory_detectors.md, equations (4) to (7).
+independently of all others. A registration occupies 1 + K periods, or 2 + K if its phase is later than 1 - f, where
+t_d = K + f. The count is thus a renewal process of whole periods: docs/theory_detectors.md, equations (4) to (7).
 """
 
 from __future__ import annotations
@@ -46,19 +46,20 @@ def cumulants_of(law: Pmf) -> FloatArray:
 
 
 def _log1p(u: NDArray[np.complex128]) -> NDArray[np.complex128]:
-    """log(1 + u), real part accurate relative to itself: it is multiplied by 1e8 registrations."""
+    """log(1 + u) with a small relative error of the real part, which is multiplied by up to 1e8 registrations."""
     real = 0.5 * np.log1p(2.0 * u.real + u.real**2 + u.imag**2)
     return np.asarray(real + 1j * np.arctan2(u.imag, 1.0 + u.real))
 
 
 class _Count:
-    """The count of one pixel; of its `total` photons per period `early` arrive before the phase 1 - f."""
+    """The count of one pixel with `total` photons per period, of which `early` arrive before the phase 1 - f."""
 
     def __init__(self, cells: Cells, name: str, whole: int, early: float, total: float) -> None:
         self.name, self.cycles, self.whole = name, cells.system.cycles, whole
         self.armed_register = -math.expm1(-total)  # q
         after = math.exp(-early) * -math.expm1(-max(total - early, 0.0))
-        self.late = min(after / self.armed_register, 1.0) if self.armed_register > 0.0 else 0.0
+        late = min(after / self.armed_register, 1.0) if self.armed_register > 0.0 else 0.0
+        self.late = late if late * self.cycles > TOL.synchronous_tail else 0.0  # less likely than what is cut off
         self.first = self._first(cells.system.start == "stationary")
 
     def _first(self, stationary: bool) -> FloatArray:

@@ -147,3 +147,28 @@ def test_jitter_behind_an_edge_of_a_gate(light: str):
         mean = ml.mean_histogram(flux, jittered)
         assert np.abs(mean - expected).sum() < 2e-4 * expected.sum()
         assert (np.abs(mean - expected) < 0.05 * np.sqrt(expected / 100) + 1e-9).all()  # of 1000 cycles
+
+
+@pytest.mark.parametrize("jitter_ns", [0.0, 0.12, 2.0])
+@pytest.mark.parametrize("light", ["waveform", "samples", "pulse"])
+def test_codes_divide_light_in_steps(light: str, jitter_ns: float):
+    """Registrations in 8000 bins, of which codes take what lies before their edges; bins were up to 42 % off."""
+    density = tuple(np.random.default_rng(1).uniform(0.3, 2.0, 5))
+    wave = np.random.default_rng(1).random(64) ** 3
+    flux = ml.Flux(waveform=wave / wave.sum(), background=0.3) if light == "waveform" else ml.Flux(0.7, 0.3, 31.3)
+    samples = ml.SampledPulse(np.random.default_rng(1).random(7) ** 2, bin_ns=1.7, origin="first")
+    pulse = {"pulse": samples} if light == "samples" else {}
+    fine = ml.mean_histogram(flux, make_system(30.0, 20, 8000).replace(**pulse), tolerance=1e-6)
+    if jitter_ns:
+        fine = np.fft.irfft(np.fft.rfft(fine) * np.exp(-2.0 * (np.pi * np.arange(4001) * jitter_ns / 100.0) ** 2), 8000)
+    edges = (5.0 * np.arange(40)[:, None] + 5.0 * np.r_[0.0, np.cumsum(density)[:-1]] / sum(density)).ravel()
+    before = np.interp(np.append(edges, 200.0) * 40.0, np.arange(8001), np.append(0.0, np.cumsum(fine)))
+    system = make_system(
+        30.0, 20, 200, code_density=density, **({"jitter": ml.Jitter(sigma_ns=jitter_ns)} if jitter_ns else {})
+    )
+    mean = ml.mean_histogram(flux, system.replace(**pulse))
+    expected = np.diff(before)
+    assert np.abs(mean - expected).sum() < 4e-4 * expected.sum()
+    assert (np.abs(mean - expected) < 0.02 * np.sqrt(expected / 50)).all()  # of 1000 cycles
+    law = ml.joint_law(flux, system.replace(**pulse))
+    np.testing.assert_allclose(law.mean, mean, rtol=2e-3)

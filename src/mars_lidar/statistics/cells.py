@@ -506,6 +506,12 @@ class Cells:
         photons = max(float(np.max(self.total, initial=0.0)), 1.0)
         return 1.0 / (2.0 * math.sqrt(math.pi) * max(self._sharpness, 1.0) * photons)
 
+    @property
+    def abrupt(self) -> bool:
+        """Whether registrations begin or end abruptly: with a gate, a synchronous period, or light in samples."""
+        sampled = isinstance(self.system.pulse, SampledPulse) if self.waveform is None else self.returns is None
+        return sampled or self.system.detector.mode in ("gated", "synchronous")
+
     def first_bins(self, out_bins: int) -> int:
         """Bins of the first grid: `usual_bins`, or more where a narrower pulse must be resolved.
 

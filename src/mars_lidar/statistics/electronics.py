@@ -285,7 +285,7 @@ def moments(cells: Cells, tolerance: float, budget: Budget = MOMENTS) -> Moments
     """`electronics_moments` of checked cells."""
     tolerance = checks.real("tolerance", tolerance, low=1e-6, high=0.1)
     out = cells.system
-    timing = Timing(out, cells.finest) if is_timed(out) else None
+    timing = Timing(cells) if is_timed(out) else None
     if timing is not None:
         cells = replace(cells, system=timing.untimed)
     bins = cells.system.bins

@@ -15,7 +15,7 @@ from benchmarks.workload import PERIOD_NS, system
 from mars_lidar import Flux
 from mars_lidar.statistics.cells import Cells, photons_per_bin
 from mars_lidar.statistics.chain import PhaseChain
-from mars_lidar.statistics.count_pmf import guessed_windows
+from mars_lidar.statistics.count_pmf import guessed_pmfs
 from mars_lidar.statistics.exposure import exposure_moments, refined_moments
 from mars_lidar.statistics.law import count_law
 
@@ -50,7 +50,7 @@ def exposure_laws(config: Config, bandwidth: Bandwidth) -> Section:
         "count pmf of a bright pixel, cumulants from a table": (
             narrow.size,
             1,
-            lambda: guessed_windows(narrow, known.cumulants, known.bins, 1),
+            lambda: guessed_pmfs(narrow, known.cumulants, known.bins, 1),
         ),
         f"stationary distribution, {_FINE} bins": (
             1,

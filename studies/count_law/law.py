@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from mars_lidar import CountLaw, Flux, System, count_law, simulate
 from mars_lidar._base.types import FloatArray
 from mars_lidar.plot.style import COLOURS
-from mars_lidar.statistics.count_pmf import Pmf, gaussian_window, total_variation
+from mars_lidar.statistics.count_pmf import Pmf, gaussian_pmf, total_variation
 from studies import Facts, Request, Tell
 from studies.common import distance
 from studies.common.draw import legend_below, maps
@@ -250,7 +250,7 @@ def pmf_of(law: CountLaw, k: int) -> Pmf:
 
 def gaussian_of(exact: CountLaw, k: int) -> Pmf:
     """The Gaussian with mean and variance of one cell of the exact law."""
-    return gaussian_window(float(exact.mean[k]), float(exact.variance[k]))
+    return gaussian_pmf(float(exact.mean[k]), float(exact.variance[k]))
 
 
 def _regimes(cells: Sequence[Cell]) -> dict[str, list[Cell]]:

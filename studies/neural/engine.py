@@ -19,7 +19,7 @@ from mars_lidar.engines.table_reader import as_shapes
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.statistics import photons_per_bin
 from mars_lidar.statistics.cells import Cells
-from mars_lidar.statistics.count_pmf import gaussian_window
+from mars_lidar.statistics.count_pmf import gaussian_pmf
 from studies.neural.model import NeuralMap
 
 
@@ -100,7 +100,7 @@ class NeuralEngine(Engine):
         cumulants = np.zeros((*cells.shape, 4))
         cumulants[..., 0], cumulants[..., 1] = mean.reshape(cells.shape), variance.reshape(cells.shape)
         moments = list(zip(mean, variance, strict=True))
-        return CountLaw(system, self.name, cumulants, lambda: [gaussian_window(float(m), float(v)) for m, v in moments])
+        return CountLaw(system, self.name, cumulants, lambda: [gaussian_pmf(float(m), float(v)) for m, v in moments])
 
     def _moments(self, cells: Cells) -> tuple[FloatArray, FloatArray, FloatArray]:
         """PDFs (cells, bins), means and variances (cells,): uniform, 0 and 0 where there is no light."""

@@ -7,7 +7,7 @@ from scipy import stats
 
 import mars_lidar as ml
 from mars_lidar import _core
-from mars_lidar.statistics.count_pmf import Pmf, gaussian_window, total_variation
+from mars_lidar.statistics.count_pmf import Pmf, gaussian_pmf, total_variation
 from mars_lidar.statistics.matched import matched_pmf, trusted
 from studies.count_law.matched import QUICK
 from tests.harness.study import quick_study
@@ -72,7 +72,7 @@ def test_close_to_the_exact_law():
 
 def test_unlike_a_gaussian():
     law = exact(0.6375, 1000, np.array([0.001, 9.0]), np.array([0.002, 0.01]))
-    best = [gaussian_window(*k[:2]) for k in law.cumulants]
+    best = [gaussian_pmf(*k[:2]) for k in law.cumulants]
     away = [total_variation(g, Pmf(int(law.support[k, 0]), law.pmf[k])) for k, g in enumerate(best)]
     assert min(away) > 10 * AIM
     assert distances(law).max() < AIM

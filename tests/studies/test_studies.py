@@ -12,7 +12,7 @@ import mars_lidar as ml
 import studies
 from mars_lidar.statistics import ConvergenceError, count_law
 from mars_lidar.statistics.chain import PhaseChain
-from mars_lidar.statistics.count_pmf import Pmf, gaussian_window, total_variation
+from mars_lidar.statistics.count_pmf import Pmf, gaussian_pmf, total_variation
 from studies import STUDIES, Request
 from studies.__main__ import main
 from studies.common.distance import g_test, sampling_floor, variance_score
@@ -142,7 +142,7 @@ def test_total_variation():
     assert total_variation(a, Pmf(100, np.array([1.0]))) == pytest.approx(1.0)
     assert Pmf.of_counts(np.array([5, 7, 7, 7], np.uint16)).p.tolist() == [0.25, 0.0, 0.75]
     assert a.on(4, 6).tolist() == [0.5, 0.0, 0.0]
-    assert gaussian_window(10.3, 4.0).p.sum() == pytest.approx(1.0)
+    assert gaussian_pmf(10.3, 4.0).p.sum() == pytest.approx(1.0)
 
 
 def test_sampling_floor_and_g_test():

@@ -121,15 +121,15 @@ class MarsEngine(CountTimesShape):
             run.draw(batch)
 
     def _evaluated(self, run: Run, group: Group) -> Batch:
-        from mars_lidar.statistics.count_pmf import exact_windows
+        from mars_lidar.statistics.count_pmf import exact_pmfs
         from mars_lidar.statistics.exposure import recorded_moments
 
         task = run.task
         exposure = recorded_moments(group.cells, tolerance=1e-4, threads=task.threads, progress=run.waiting)
         cumulants = exposure.cumulants.reshape(-1, 4)
         if self.count == "exact" and task.system.dead_time_periods > 0.0:
-            windows = exact_windows(group.cells, cumulants, exposure.bins.reshape(-1), task.threads)
-            laws: CountLaws = Tabulated.of(windows, group.cell)
+            pmfs = exact_pmfs(group.cells, cumulants, exposure.bins.reshape(-1), task.threads)
+            laws: CountLaws = Tabulated.of(pmfs, group.cell)
         else:
             laws = self._laws(task.system, cumulants[group.cell])
         return Batch.unmixed(group.pixels, as_shapes(exposure.histogram), group.cell, laws)

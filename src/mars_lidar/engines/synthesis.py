@@ -117,12 +117,12 @@ class Tabulated(CountLaws):
     law: IndexArray
 
     @classmethod
-    def of(cls, windows: Sequence[Pmf], law: IndexArray) -> Tabulated:
+    def of(cls, pmfs: Sequence[Pmf], law: IndexArray) -> Tabulated:
         """From the probabilities of each law."""
-        sizes = [window.p.size for window in windows]
-        sums = [np.cumsum(window.p) for window in windows]
+        sizes = [each.p.size for each in pmfs]
+        sums = [np.cumsum(each.p) for each in pmfs]
         return cls(
-            np.array([window.first for window in windows], np.int64),
+            np.array([each.first for each in pmfs], np.int64),
             np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64),
             np.concatenate([s / s[-1] for s in sums]),
             law,

@@ -26,7 +26,7 @@ from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.statistics.cells import Cells
-from mars_lidar.statistics.count_pmf import Pmf, guessed_windows
+from mars_lidar.statistics.count_pmf import Pmf, guessed_pmfs
 from mars_lidar.statistics.exposure import normalised
 
 if TYPE_CHECKING:
@@ -232,8 +232,8 @@ def exact_laws(run: Run, reader: TableReader, entries: Entries, at: IndexArray) 
     """Laws of the pixels `at`, each distinct law evaluated once, or taken from the table if stored there."""
     keys = _keys(run, reader, entries, at)
     _, first, law = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-    windows = _table_laws(run, reader, entries, at[first], keys[first])
-    missing = np.array([k for k, window in enumerate(windows) if window is None], np.int64)
+    laws = _table_laws(run, reader, entries, at[first], keys[first])
+    missing = np.array([k for k, each in enumerate(laws) if each is None], np.int64)
     if missing.size:
         signal, background, phase = keys[first[missing]].T
         system, chosen = run.task.system, at[first[missing]]
@@ -244,11 +244,11 @@ def exact_laws(run: Run, reader: TableReader, entries: Entries, at: IndexArray) 
         bins = np.where(entries.weights[chosen] > 0.0, own, 0).max(-1)  # the finest grid that a corner needed
         report = run.waiting
         waiting = None if report is None else lambda done: report(done, missing.size)
-        evaluated = guessed_windows(cells, entries.cumulants[chosen], bins, run.task.threads, waiting)
-        for k, window in zip(missing, evaluated, strict=True):
-            windows[k] = window
+        evaluated = guessed_pmfs(cells, entries.cumulants[chosen], bins, run.task.threads, waiting)
+        for k, each in zip(missing, evaluated, strict=True):
+            laws[k] = each
     run.count("laws_evaluated", missing.size)
-    return Tabulated.of([window for window in windows if window is not None], law.reshape(-1).astype(np.int64))
+    return Tabulated.of([each for each in laws if each is not None], law.reshape(-1).astype(np.int64))
 
 
 def _keys(run: Run, reader: TableReader, entries: Entries, at: IndexArray) -> FloatArray:
@@ -273,7 +273,7 @@ def _table_laws(
     rows = entries.rows[pixels, heaviest]
     signal, background = table.signal[rows // table.background.size], table.background[rows % table.background.size]
     same = (keys[:, 0] == signal) & (keys[:, 1] == background) & (keys[:, 2] == 0.5)
-    return [table.laws.window(int(row)) if its_own else None for row, its_own in zip(rows, same, strict=True)]
+    return [table.laws.law(int(row)) if its_own else None for row, its_own in zip(rows, same, strict=True)]
 
 
 _PER_DECADE = {"signal": 58, "background": 16}  # 4 % apart: the mean count is then within some 0.002 deviations

@@ -709,11 +709,10 @@ def misplaced(before: FloatArray, edges: FloatArray, light: FloatArray) -> float
     """
     from scipy.interpolate import PchipInterpolator
 
-    cells = before.size - 1
-    smooth = PchipInterpolator(np.arange(cells + 1) / cells, before)(edges)
-    wrong = 0.5 * np.abs(np.diff(smooth) - np.diff(light))
-    first = np.searchsorted(edges[:-1], np.arange(cells) / cells)
-    return float((np.add.reduceat(wrong, first) / np.maximum(np.diff(before), 1.0)).max())
+    grid = np.arange(before.size) / (before.size - 1)
+    wrong = 0.5 * np.abs(np.diff(PchipInterpolator(grid, before)(edges)) - np.diff(light))
+    inside = np.bincount(np.searchsorted(grid, edges[:-1], "right") - 1, wrong, before.size - 1)
+    return float((inside / np.maximum(np.diff(before), 1.0)).max())
 
 
 def registered_before(before: FloatArray, counts: FloatArray, light: FloatArray) -> FloatArray:

@@ -69,7 +69,7 @@ def kl_divergence(sample: FloatArray, law: FloatArray) -> FloatArray:
     return np.asarray((sample * (log_sample - log_law)).sum(-1), dtype=np.float64)
 
 
-def poisson_window(mean: float) -> Pmf:
+def poisson_pmf(mean: float) -> Pmf:
     """Poisson law, exact without dead time; the support follows from Bernstein's bounds of the two tails."""
     from scipy.special import gammaln, xlogy
 
@@ -80,7 +80,7 @@ def poisson_window(mean: float) -> Pmf:
     return Pmf(low, np.exp(xlogy(counts, mean) - mean - gammaln(counts + 1.0)), TOL.tail * (1 + (low > 0)))
 
 
-def gaussian_window(mean: float, variance: float) -> Pmf:
+def gaussian_pmf(mean: float, variance: float) -> Pmf:
     """Normal law on the integers: P(n) = Phi((n + 1/2 - mean) / sd) - Phi((n - 1/2 - mean) / sd).
 
     P(0) includes the probability below 0.
@@ -170,13 +170,13 @@ def characteristic(
 _TILTS = np.array([1.0, 2.0, 3.5, 5.0, 6.5, 8.0, 11.0, 15.0])  # exponential tilts in units of 1 / standard deviation
 
 
-def exact_windows(cells: Cells, cumulants: FloatArray, bins: IndexArray, threads: int) -> list[Pmf]:
+def exact_pmfs(cells: Cells, cumulants: FloatArray, bins: IndexArray, threads: int) -> list[Pmf]:
     """Exact pmf of each cell, on the grid of `bins` (cells,) on which its `cumulants` (cells, 4) converged."""
     if cells.system.dead_time_periods == 0.0:
-        return [poisson_window(float(mean)) for mean in cumulants[:, 0]]
+        return [poisson_pmf(float(mean)) for mean in cumulants[:, 0]]
     cells = cells.resolved(1)
     dark = cells.total == 0.0
-    windows: list[Pmf | None] = [Pmf(0, np.ones(1), 0.0) if nothing else None for nothing in dark]
+    laws: list[Pmf | None] = [Pmf(0, np.ones(1), 0.0) if nothing else None for nothing in dark]
     for n in np.unique(bins[~dark]):
         index = np.flatnonzero((bins == n) & ~dark)
         cells.check_history(int(n))
@@ -188,19 +188,19 @@ def exact_windows(cells: Cells, cumulants: FloatArray, bins: IndexArray, threads
             for k, cell in enumerate(block):
                 single = cells.part(block[k : k + 1])
                 spread = float(cumulants[cell, 1])
-                window = _window(single, int(lows[k]), int(highs[k]), float(outside[k]), int(n), threads, spread)
-                _check(cells, int(cell), window, cumulants[cell])
-                windows[cell] = window
-    return [window for window in windows if window is not None]
+                law = _on_support(single, int(lows[k]), int(highs[k]), float(outside[k]), int(n), threads, spread)
+                _check(cells, int(cell), law, cumulants[cell])
+                laws[cell] = law
+    return [law for law in laws if law is not None]
 
 
-def guessed_windows(
+def guessed_pmfs(
     cells: Cells, cumulants: FloatArray, bins: IndexArray, threads: int, waiting: Callable[[int], object] | None = None
 ) -> list[Pmf]:
     """Exact pmf of each cell, given approximate cumulants (cells, 4), for example from a table.
 
     The support is that of the approximate cumulants. Where the result shows that it is too small, the law is computed
-    by `exact_windows` with exact cumulants. For narrow laws this is several times faster than `exact_windows`.
+    by `exact_pmfs` with exact cumulants. For narrow laws this is several times faster than `exact_pmfs`.
     `waiting` is called with the number of cells computed so far.
     """
     cells = cells.resolved(1)
@@ -208,7 +208,7 @@ def guessed_windows(
     half = np.ceil(TOL.guess_spreads * spread + TOL.guess_counts)
     size = (8.0 * np.ceil((2.0 * half + 1.0) / 8.0)).astype(np.int64)
     first = np.maximum(np.floor(cumulants[:, 0]) - half, 0.0).astype(np.int64)
-    windows: list[Pmf | None] = [None] * cells.size
+    laws: list[Pmf | None] = [None] * cells.size
     done = 0
     for n, width in np.unique(np.stack([bins, size], -1), axis=0):
         index = np.flatnonzero((bins == n) & (size == width))
@@ -220,11 +220,11 @@ def guessed_windows(
                 candidate = (
                     None if pmf is None else _if_complete(pmf[k], int(first[cell]), cumulants[cell, 0], spread[cell])
                 )
-                windows[cell] = candidate or _by_own_cumulants(cells.part(block[k : k + 1]), threads)
+                laws[cell] = candidate or _by_own_cumulants(cells.part(block[k : k + 1]), threads)
             done += block.size
             if waiting is not None:
                 waiting(done)
-    return [window for window in windows if window is not None]
+    return [law for law in laws if law is not None]
 
 
 def _folded(cells: Cells, first: IndexArray, size: int, bins: int, threads: int) -> FloatArray:
@@ -254,7 +254,7 @@ def _ends(pmf: FloatArray, first: int, most: float = math.inf) -> float:
 def _by_own_cumulants(cell: Cells, threads: int) -> Pmf:
     """Exact pmf of one cell, computed with its exact cumulants."""
     own = refined_moments(cell, 1, tolerance=1e-4, threads=threads)
-    return exact_windows(cell, own.cumulants.reshape(-1, 4), own.bins.reshape(-1), threads)[0]
+    return exact_pmfs(cell, own.cumulants.reshape(-1, 4), own.bins.reshape(-1), threads)[0]
 
 
 def _supports(
@@ -308,7 +308,7 @@ def _guessed_supports(cells: Cells, cumulants: FloatArray) -> tuple[IndexArray, 
     return first.astype(np.int64), last.astype(np.int64), (last - first) * TOL.edge
 
 
-def _window(cell: Cells, first: int, last: int, outside: float, bins: int, threads: int, variance: float) -> Pmf:
+def _on_support(cell: Cells, first: int, last: int, outside: float, bins: int, threads: int, variance: float) -> Pmf:
     """Exact pmf of one cell on the counts `first` to `last`."""
     from scipy.fft import irfft  # of lengths with a large prime factor twice as fast as NumPy's
 
@@ -362,15 +362,15 @@ def _narrow(
     return value if faint and highest ** (cycles / shorter) <= 1e-3 * TOL.faint else None
 
 
-def _check(cells: Cells, cell: int, window: Pmf, cumulants: FloatArray) -> None:
+def _check(cells: Cells, cell: int, law: Pmf, cumulants: FloatArray) -> None:
     """Compare sum, sign, mean and variance of the pmf with the cumulants; then clip and normalise it in place."""
-    pmf: NDArray[np.float64] = window.p
-    offset = window.first + np.arange(pmf.size) - cumulants[0]
+    pmf: NDArray[np.float64] = law.p
+    offset = law.first + np.arange(pmf.size) - cumulants[0]
     spread = max(math.sqrt(cumulants[1]), 1e-3)
     edge = TOL.edge + TOL.consistent_per_cycle * cells.system.cycles
-    if window.outside > TOL.tail * 4.0 and _ends(pmf, window.first, _most(cells)) > edge:  # a guessed support
+    if law.outside > TOL.tail * 4.0 and _ends(pmf, law.first, _most(cells)) > edge:  # a guessed support
         raise ConvergenceError(
-            f"count law of {cells.name(cell)}: it extends beyond {window.first} .. {window.first + pmf.size - 1}, "
+            f"count law of {cells.name(cell)}: it extends beyond {law.first} .. {law.first + pmf.size - 1}, "
             f"the support expected from mean and variance; mean, variance and cumulants are known; for the law "
             f"{cells.instead}"
         )
@@ -386,7 +386,7 @@ def _check(cells: Cells, cell: int, window: Pmf, cumulants: FloatArray) -> None:
     )
     if not error <= 1.0:
         raise ConvergenceError(
-            f"count law of {cells.name(cell)}: its pmf on {window.first} .. {window.first + pmf.size - 1} "
+            f"count law of {cells.name(cell)}: its pmf on {law.first} .. {law.first + pmf.size - 1} "
             f"disagrees with the cumulants {error:.2g} times as much as is allowed: sum - 1 = "
             f"{total - 1.0:.2g}, mean off by {mean:.2g}, variance {variance:.6g} for {cumulants[1]:.6g}, "
             f"least {least:.2g}; mean, variance and cumulants are known; for the law {cells.instead}"

@@ -24,9 +24,9 @@ from mars_lidar.instrument.detector import Mode
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
-from mars_lidar.statistics.cells import Cells, photons_before
+from mars_lidar.statistics.cells import Cells, light_before, misplaced, photons_before, registered_before
 from mars_lidar.statistics.chain import ConvergenceError
-from mars_lidar.statistics.count_pmf import Pmf, exact_windows
+from mars_lidar.statistics.count_pmf import Pmf, exact_pmfs
 from mars_lidar.statistics.exposure import Moments, refined_moments, stationary_histogram
 from mars_lidar.statistics.timing import Timing, is_timed
 from mars_lidar.statistics.tolerances import LAW, MOMENTS, TOL, Budget, advice
@@ -288,20 +288,20 @@ def moments(cells: Cells, tolerance: float, budget: Budget = MOMENTS) -> Moments
     timing = Timing(cells) if is_timed(out) else None
     if timing is not None:
         cells = replace(cells, system=timing.untimed)
+    record = timing.forward if timing is not None else np.asarray
     bins = cells.system.bins
     mean, variance, grid = np.empty(cells.size), np.empty(cells.size), np.empty(cells.size, np.int64)
-    histogram = np.empty((cells.size, bins))
+    histogram = np.empty((cells.size, out.bins))
     bare, slower = without_electronics(cells)
     if slower == 0.0:
         exposure = refined_moments(bare, bins, tolerance=min(tolerance, 1e-4), threads=None)
         flat = exposure.cumulants.reshape(-1, exposure.cumulants.shape[-1])
-        mean, variance, histogram = flat[:, 0], flat[:, 1], exposure.histogram.reshape(-1, bins)
+        mean, variance, histogram = flat[:, 0], flat[:, 1], record(exposure.histogram.reshape(-1, bins))
         grid = exposure.bins.reshape(-1)
     else:
         for k in range(cells.size):
-            mean[k], variance[k], histogram[k], grid[k] = refined(bare.part(slice(k, k + 1)), slower, tolerance, budget)
-    if timing is not None:
-        histogram = timing.forward(histogram)
+            cell = bare.part(slice(k, k + 1))
+            mean[k], variance[k], histogram[k], grid[k] = refined(cell, slower, bins, tolerance, budget, record)
     shape = cells.shape
     return Moments(
         mean.reshape(shape), variance.reshape(shape), histogram.reshape(*shape, out.bins), grid.reshape(shape)
@@ -323,21 +323,36 @@ def without_electronics(cells: Cells) -> tuple[Cells, float]:
     return replace(cells, system=cells.system.replace(detector=bare, start=start)), slower
 
 
-def coarsest_grid(cell: Cells) -> int:
-    """Bins of the first grid: a power of two, so that grids nest; the dead time spans at least two bins."""
-    bins = 1 << round(math.log2(cell.first_bins(2)))
+def coarsest_grid(cell: Cells, out: int) -> int:
+    """Bins of the first grid, about `Cells.first_bins`: `out` bins doubled or halved, or else a power of two.
+
+    Grids are doubled, so that they nest; the dead time spans at least two bins.
+    """
+    wanted = cell.first_bins(2)
+    bins = out * 2.0 ** round(math.log2(wanted / out))
+    bins = int(bins) if bins.is_integer() and bins >= 2 else 1 << round(math.log2(wanted))
     while bins * cell.system.dead_time_periods < 2.0:
         bins *= 2
     return bins
 
 
+Record = Callable[[FloatArray], FloatArray]  # from registrations to records: jitter and code widths
+
+
 def refined(
-    cell: Cells, electronics_ns: float, tolerance: float, budget: Budget = MOMENTS
+    cell: Cells,
+    electronics_ns: float,
+    out: int,
+    tolerance: float,
+    budget: Budget = MOMENTS,
+    record: Record = np.asarray,
 ) -> tuple[float, float, FloatArray, int]:
-    """Mean, variance, mean histogram and bins of the final grid, for one cell of `without_electronics`."""
-    system = cell.system
-    out, electronics = system.bins, electronics_ns / system.period_ns
-    bins = coarsest_grid(cell)
+    """Mean, variance, recorded mean histogram and bins of the final grid, for one cell of `without_electronics`.
+
+    `record` maps histograms of `out` bins to the recorded ones.
+    """
+    electronics = electronics_ns / cell.system.period_ns
+    bins = coarsest_grid(cell, out)
     coarse, before = _Run(cell, bins, electronics, budget), None
     remaining = budget.record_moments - coarse.spent
     while True:
@@ -359,37 +374,51 @@ def refined(
                 max(fine.variance, 1e-6 * fine.mean, np.finfo(float).tiny),
             ]
         )
-        shape = 0.5 * float(np.abs(fine.rate.reshape(-1, 2).sum(-1) - coarse.rate).sum()) / max(fine.mean, 1e-300)
         moved = float(np.max(3.0 * np.abs(limit - [fine.mean, fine.variance]) / scale))
         if before is not None:  # long exposures: the limit converges long before the grids agree
             moved = min(moved, float(np.max(np.abs(limit - before) / scale)))
-        if max(moved, shape) <= tolerance:
-            mean, variance = float(limit[0]), max(float(limit[1]), 0.0)
-            histogram = rebinned(cell, fine.rate, coarse.rate, out)
-            return mean, variance, histogram * (mean / fine.mean if fine.mean > 0.0 else 1.0), bins
+        if moved <= tolerance:
+            histogram = rebinned(cell, fine.rate, coarse.rate, out, tolerance, record)
+            if histogram is not None:
+                mean, variance = float(limit[0]), max(float(limit[1]), 0.0)
+                return mean, variance, histogram * (mean / fine.mean if fine.mean > 0.0 else 1.0), bins
         coarse, before = fine, limit
 
 
-def rebinned(cell: Cells, fine: FloatArray, coarse: FloatArray, out: int) -> FloatArray:
-    """Records in `out` bins, from those on a grid and on one of half as many bins.
+def rebinned(
+    cell: Cells, fine: FloatArray, coarse: FloatArray, out: int, tolerance: float, record: Record
+) -> FloatArray | None:
+    """Recorded histogram of `out` bins, from a grid and one of half as many bins; None where they do not agree.
 
-    Times of re-arming are spread over a bin, which makes the error quadratic in the bin width; a third of the change
-    from the coarse grid is added to each pair of bins (Richardson). Within a bin records are proportional to the
-    photons, with a constant armed probability.
+    The two may differ by `tolerance` in total variation, in the bins of either and of the histogram. Times of re-arming
+    are spread over a bin, which makes the error quadratic in the bin width; a third of the change from the coarse grid
+    is added to each pair of bins (Richardson). Where the histogram's edges are not on the grid, records are
+    interpolated as a function of the photons. A pulse within a bin of both grids then looks the same on both: unless
+    its light is `misplaced` by less than the tolerance, records that are spread evenly over a bin must agree as well.
     """
     pairs = fine.reshape(-1, 2)
     total = pairs.sum(-1)
+    number = max(float(total.sum()), np.finfo(float).tiny)
+
+    def apart(a: FloatArray, b: FloatArray) -> bool:
+        return float(np.abs(a - b).sum()) > 2.0 * tolerance * number
+
+    if apart(total, coarse):
+        return None
     better = np.maximum(total + (total - coarse) / 3.0, 0.0)
-    better *= total.sum() / max(float(better.sum()), 1e-300)
+    better *= number / max(float(better.sum()), 1e-300)
     rate = (pairs * (better / np.where(total > 0.0, total, 1.0))[:, None]).reshape(-1)
-    edges, wanted = np.arange(rate.size + 1) / rate.size, np.arange(out + 1) / out
-    below = np.concatenate([[0.0], np.cumsum(rate)])
-    place = np.minimum((wanted * rate.size).astype(np.int64), rate.size - 1)
-    energy, at = photons_before(cell, edges)[0], photons_before(cell, wanted)[0]
-    inside = energy[place + 1] - energy[place]
-    even = wanted * rate.size - place
-    share = np.where(inside > 1e-12, (at - energy[place]) / np.maximum(inside, 1e-12), even)
-    return np.diff(below[place] + np.clip(share, 0.0, 1.0) * rate[place])
+    if rate.size % out == 0:
+        return record(rate.reshape(out, -1).sum(-1))
+    wanted, grid = np.arange(out + 1) / out, np.arange(rate.size + 1) / rate.size
+    light, before = light_before(cell, wanted), light_before(cell, grid)
+    histogram = record(np.diff(registered_before(before, rate, light)))
+    if apart(histogram, record(np.diff(registered_before(before[::2], coarse, light)))):
+        return None
+    even = np.interp(wanted, grid, np.concatenate([[0.0], np.cumsum(rate)]))
+    if misplaced(before, wanted, light) > 2.0 * tolerance and apart(histogram, record(np.diff(even))):
+        return None
+    return histogram
 
 
 class _Run:
@@ -435,30 +464,36 @@ class _Run:
 # --- Stationary shape ----------------------------------------------------------------------------------------------
 
 
-def stationary_records(cells: Cells, out: int, *, tolerance: float, threads: int | None) -> FloatArray:
-    """Mean histograms (cells, out), of sum 1, of the records of stationary pixels; 0 where there is no flux.
+def stationary_records(cells: Cells, *, tolerance: float, threads: int | None) -> FloatArray:
+    """Mean histograms (cells, bins), of sum 1, of the records of stationary pixels; 0 where there is no flux.
 
     The grid is refined until doubling it moves the shape by less than `tolerance`, at least 1e-3, in total variation.
     """
     tolerance = max(checks.real("tolerance", tolerance, low=1e-9, high=0.1), TOL.records)
+    timing = Timing(cells.system, cells.finest) if is_timed(cells.system) else None
+    if timing is not None:
+        cells = replace(cells, system=timing.untimed)
+    record, out = timing.forward if timing is not None else np.asarray, cells.system.bins
     bare, slower = without_electronics(cells)
     if slower == 0.0:
-        return stationary_histogram(bare, out, tolerance=tolerance, threads=threads)
+        return record(stationary_histogram(bare, out, tolerance=tolerance, threads=threads))
     alone = replace(bare, system=bare.system.replace(start="armed"))  # the stationary law does not depend on the start
-    return np.stack([_shape(alone.part(slice(k, k + 1)), slower, out, tolerance) for k in range(cells.size)])
+    parts = (alone.part(slice(k, k + 1)) for k in range(cells.size))
+    return np.stack([_shape(cell, slower, out, tolerance, record) for cell in parts])
 
 
-def _shape(cell: Cells, electronics_ns: float, out: int, tolerance: float) -> FloatArray:
+def _shape(cell: Cells, electronics_ns: float, out: int, tolerance: float, record: Record) -> FloatArray:
     if float(cell.total[0]) == 0.0:
-        return np.zeros(out)
+        return record(np.zeros(out))
     electronics = electronics_ns / cell.system.period_ns
-    bins = coarsest_grid(cell)
+    bins = coarsest_grid(cell, out)
     coarse = _phases(RecordGrid(cell, bins, electronics, LAW))
     while True:
         bins *= 2
         fine = _phases(RecordGrid(cell, bins, electronics, LAW))
-        if 0.5 * float(np.abs(fine.reshape(-1, 2).sum(-1) - coarse).sum()) <= tolerance:
-            return rebinned(cell, fine, coarse, out)
+        shape = rebinned(cell, fine, coarse, out, tolerance, record)
+        if shape is not None:
+            return shape
         coarse = fine
 
 
@@ -516,19 +551,19 @@ def _transitions(grid: RecordGrid) -> FloatArray:
 ComplexArray = NDArray[np.complex128]
 
 
-def record_windows(cells: Cells, tolerance: float, threads: int) -> list[Pmf]:
+def record_pmfs(cells: Cells, tolerance: float, threads: int) -> list[Pmf]:
     """Pmf of the number of records of each cell; the tolerance is that of `electronics_moments`."""
     bare, slower = without_electronics(cells)
     if slower == 0.0:
         exposure = refined_moments(bare, 1, tolerance=min(tolerance, 1e-4), threads=threads)
-        return exact_windows(bare, exposure.cumulants.reshape(-1, 4), exposure.bins.reshape(-1), threads)
-    return [_window(bare.part(slice(k, k + 1)), slower, tolerance) for k in range(cells.size)]
+        return exact_pmfs(bare, exposure.cumulants.reshape(-1, 4), exposure.bins.reshape(-1), threads)
+    return [_law(bare.part(slice(k, k + 1)), slower, tolerance) for k in range(cells.size)]
 
 
-def _window(cell: Cells, electronics_ns: float, tolerance: float) -> Pmf:
+def _law(cell: Cells, electronics_ns: float, tolerance: float) -> Pmf:
     if float(cell.total[0]) == 0.0:
         return Pmf(0, np.ones(1), 0.0)
-    mean, variance, _, bins = refined(cell, electronics_ns, tolerance, LAW)
+    mean, variance, _, bins = refined(cell, electronics_ns, 1, tolerance, LAW)
     electronics = electronics_ns / cell.system.period_ns
     grids = [RecordGrid(cell, n, electronics, LAW) for n in (bins, bins // 2)]
     most = math.floor(cell.system.cycles / electronics) + 1

@@ -202,8 +202,13 @@ def put(
     result.movement[at] = moved[good]
 
 
-def shaped(flat: Exposure, shape: tuple[int, ...]) -> Exposure:
-    """Statistics reshaped from (cells,) to `shape`."""
+def shaped(flat: Exposure, shape: tuple[int, ...], out_bins: int) -> Exposure:
+    """Statistics reshaped from (cells,) to `shape`, their histograms summed into `out_bins` bins."""
+
+    def summed(histogram: FloatArray) -> FloatArray:
+        return np.asarray(histogram.reshape(len(histogram), out_bins, -1).sum(-1))
+
+    flat = replace(flat, histogram=summed(flat.histogram), histogram_rate=summed(flat.histogram_rate))
     return Exposure(**{name: array.reshape((*shape, *array.shape[1:])) for name, array in vars(flat).items()})
 
 
@@ -338,7 +343,7 @@ def without_dead_time(cells: Cells, out_bins: int) -> Exposure:
     result.cumulants[:] = cells.system.cycles * result.cumulant_rates
     result.histogram[:] = cells.system.cycles * result.histogram_rate
     result.settled[:], result.bins[:] = 0, _poisson_bins(out_bins)
-    return shaped(result, cells.shape)
+    return shaped(result, cells.shape, out_bins)
 
 
 # --- The stationary start by the feedback equation -----------------------------------------------------------------
@@ -466,6 +471,7 @@ def refined_moments(
     if cells.system.dead_time_periods == 0.0:
         return without_dead_time(cells, out_bins)
     cells = cells.resolved(out_bins)
+    asked, out_bins = out_bins, compared_bins(cells, out_bins)
     result = blank(cells, out_bins)
     pending = np.flatnonzero(cells.total > 0.0)
     bins = cells.first_bins(out_bins)
@@ -474,7 +480,7 @@ def refined_moments(
         for name, array in vars(result).items():  # cells without light register nothing
             array[cells.total == 0.0] = bins if name == "bins" else 0
         if not pending.size:
-            return shaped(result, cells.shape)
+            return shaped(result, cells.shape, asked)
     shared = math.gcd(bins // 2, out_bins)
     coarse = _run(cells.part(pending), bins // 2, shared, team, progress, budget)
     last = spent = _spent(coarse, cells)
@@ -504,7 +510,15 @@ def refined_moments(
             f"exposure statistics of {cells.name(k)}: variance {result.cumulants[k, 1]:.3g} < 0; {cells.instead}"
         )
     np.maximum(result.cumulants[:, 1], 0.0, out=result.cumulants[:, 1])  # rounding of a locked pixel
-    return shaped(result, cells.shape)
+    return shaped(result, cells.shape, asked)
+
+
+def compared_bins(cells: Cells, out_bins: int) -> int:
+    """Bins of the histogram in which grids are compared: a multiple of `out_bins`.
+
+    Grids may have the same mean by chance while their errors are 50 times as large; not the same shape as well.
+    """
+    return out_bins if cells.follow else out_bins * math.ceil(TOL.compared_bins / out_bins)
 
 
 def _spent(done: Exposure, cells: Cells) -> FloatArray:
@@ -574,20 +588,30 @@ def _run(
 # --- The mean histogram of a stationary pixel ----------------------------------------------------------------------
 
 
-def stationary_histogram(cells: Cells, out_bins: int, *, tolerance: float, threads: int | None) -> FloatArray:
-    """Registrations per period and bin (cells, out_bins) of a stationary pixel (18)."""
+def stationary_histogram(
+    cells: Cells, out_bins: int, *, tolerance: float, threads: int | None, periods: int = 0
+) -> FloatArray:
+    """Registrations per period and bin (cells, out_bins) of a stationary pixel (18).
+
+    From a grid to the next the shape moves by less than `tolerance`, and so does the mean count of an exposure of
+    `periods`, in standard deviations of a Poisson count.
+    """
     tolerance = checks.real("tolerance", tolerance, low=1e-9, high=0.1)
     team = thread_count(threads)
     if cells.system.dead_time_periods == 0.0:  # the light itself
         return recorded_light(cells, out_bins)
     return fine_histograms(
-        cells, out_bins, tolerance, lambda some, bins: _refined(some, bins, tolerance=tolerance, team=team)
+        cells,
+        out_bins,
+        tolerance,
+        lambda some, bins: _refined(some, bins, tolerance=tolerance, team=team, periods=periods),
     )
 
 
-def _refined(cells: Cells, out_bins: int, *, tolerance: float, team: int) -> FloatArray:
+def _refined(cells: Cells, out_bins: int, *, tolerance: float, team: int, periods: int) -> FloatArray:
     """`stationary_histogram` on grids whose bins divide those of the histogram."""
     cells = cells.resolved(out_bins)
+    asked, out_bins = out_bins, compared_bins(cells, out_bins)
     result = np.empty((cells.size, out_bins))
     pending = np.arange(cells.size)
     bins = cells.first_bins(out_bins)
@@ -598,7 +622,8 @@ def _refined(cells: Cells, out_bins: int, *, tolerance: float, team: int) -> Flo
         fine = _stationary(cells.part(pending), bins, out_bins, team)
         joined = fine.reshape(*coarse.shape, -1).sum(-1)
         total = np.maximum(fine.sum(-1), np.finfo(float).tiny)
-        moved = np.abs(joined - coarse).sum(-1) / total
+        counts = np.abs(fine.sum(-1) - coarse.sum(-1)) * (math.sqrt(periods) / np.sqrt(total))
+        moved = np.maximum(np.abs(joined - coarse).sum(-1) / total, counts)
         good = (moved <= tolerance) & (fine.min(-1) >= -1e-12 * total)
         result[pending[good]] = np.maximum(fine[good], 0.0)
         pending, coarse = pending[~good], fine[~good]
@@ -608,7 +633,7 @@ def _refined(cells: Cells, out_bins: int, *, tolerance: float, team: int) -> Flo
                 f"stationary histogram of {cells.name(int(pending[0]))}: with {bins // 2} bins per period it "
                 f"still moves by {moved[~good][0]:.2g} (tolerance {tolerance:g}); {cells.instead}"
             )
-    return result
+    return np.asarray(result.reshape(cells.size, asked, -1).sum(-1))
 
 
 def _stationary(cells: Cells, bins: int, out_bins: int, threads: int) -> FloatArray:

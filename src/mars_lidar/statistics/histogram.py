@@ -18,7 +18,7 @@ from mars_lidar.statistics.chain import PhaseChain, Rearm
 from mars_lidar.statistics.electronics import ELECTRONICS_MODES, moments, stationary_records
 from mars_lidar.statistics.exposure import normalised, refined_moments, stationary_histogram
 from mars_lidar.statistics.paralyzable import paralyzable_histograms
-from mars_lidar.statistics.synchronous import cumulants_of, first_arrivals, synchronous_windows
+from mars_lidar.statistics.synchronous import cumulants_of, first_arrivals, synchronous_pmfs
 from mars_lidar.statistics.timing import recorded
 from mars_lidar.statistics.tolerances import LAW, TOL
 
@@ -95,20 +95,24 @@ def histogram_effects(system: System) -> tuple[str, ...]:
 
 def mean_histograms(cells: Cells, tolerance: float, threads: int | None) -> FloatArray:
     """`mean_histogram` of checked cells: (cells, bins)."""
+    if "electronics_dead_time_ns" in cells.system.detector.effects:
+        return moments(cells, max(tolerance, TOL.records), LAW).histogram.reshape(cells.size, cells.system.bins)
     return recorded(cells, lambda some, parts: _registrations(some, parts, tolerance, threads))
 
 
 def _registrations(cells: Cells, bins: int, tolerance: float, threads: int | None) -> FloatArray:
     mode = cells.system.detector.mode
-    if "electronics_dead_time_ns" in cells.system.detector.effects:
-        return moments(cells, max(tolerance, TOL.records), LAW).histogram.reshape(cells.size, bins)
     if mode == "synchronous":
         armed = first_arrivals(cells)
         registered = np.maximum(armed.sum(-1), np.finfo(float).tiny)
-        mean = np.array([cumulants_of(window)[0] for window in synchronous_windows(cells)])
+        mean = np.array([cumulants_of(law)[0] for law in synchronous_pmfs(cells)])
         return np.asarray(armed * (mean / registered)[:, None], dtype=np.float64)
     if mode == "paralyzable":
         return paralyzable_histograms(cells, tolerance)
+    if cells.system.start == "stationary" and cells.system.dead_time_periods > 0.0:
+        # every period has the same mean, so that refusals depend on the state alone
+        cycles = cells.system.cycles
+        return cycles * stationary_histogram(cells, bins, tolerance=tolerance, threads=threads, periods=cycles)
 
     def compute(some: Cells, bins: int) -> FloatArray:
         exposure = refined_moments(some, bins, tolerance=tolerance, threads=threads, budget=LAW)
@@ -190,10 +194,12 @@ def registration_pdf(
     elif system.detector.mode == "paralyzable":
         warm = replace(cells, system=system.replace(start="stationary"))
         shape = mean_histograms(warm, tolerance, threads)
+    elif "electronics_dead_time_ns" in system.detector.effects:
+        shape = stationary_records(cells, tolerance=tolerance, threads=threads)
     else:
-        slow = "electronics_dead_time_ns" in system.detector.effects
-        compute = stationary_records if slow else stationary_histogram
-        shape = recorded(cells, lambda some, parts: compute(some, parts, tolerance=tolerance, threads=threads))
+        shape = recorded(
+            cells, lambda some, parts: stationary_histogram(some, parts, tolerance=tolerance, threads=threads)
+        )
     return normalised(shape).reshape(*cells.shape, system.bins)
 
 

@@ -19,12 +19,12 @@ from mars_lidar.light.flux import Flux
 from mars_lidar.statistics.cells import PLAIN, Cells
 from mars_lidar.statistics.chain import Rearm
 from mars_lidar.statistics.constant_light import renewal_moments
-from mars_lidar.statistics.count_pmf import Pmf, exact_windows, gaussian_window, poisson_window
-from mars_lidar.statistics.electronics import record_windows
+from mars_lidar.statistics.count_pmf import Pmf, exact_pmfs, gaussian_pmf, poisson_pmf
+from mars_lidar.statistics.electronics import record_pmfs
 from mars_lidar.statistics.exposure import Exposure, refined_moments
 from mars_lidar.statistics.histogram import chain_of, histogram_effects, rearm_of
 from mars_lidar.statistics.renewal import holding_times
-from mars_lidar.statistics.synchronous import cumulants_of, synchronous_windows
+from mars_lidar.statistics.synchronous import cumulants_of, synchronous_pmfs
 from mars_lidar.statistics.tolerances import LAW, TOL
 
 Method = Literal["exact", "mars", "renewal", "poisson"]
@@ -43,7 +43,7 @@ class CountLaw:
         Method of `count_law`.
     cumulants
         (..., 4) mean, variance, third and fourth cumulant of N.
-    windows
+    evaluate
         Function that returns the probabilities of each cell, called on first use.
     exposure
         The `Exposure` of an exact law (its histogram has a single bin), else None.
@@ -72,14 +72,14 @@ class CountLaw:
         system: System,
         method: str,
         cumulants: FloatArray,
-        windows: Callable[[], list[Pmf]],
+        evaluate: Callable[[], list[Pmf]],
         exposure: Exposure | None = None,
     ) -> None:
         self.system = system
         self.method = method
         self.cumulants = cumulants
         self.exposure = exposure
-        self._evaluate = windows
+        self._evaluate = evaluate
 
     @property
     def mean(self) -> FloatArray:
@@ -97,13 +97,13 @@ class CountLaw:
         return np.sqrt(self.variance)
 
     @cached_property
-    def _windows(self) -> list[Pmf]:
+    def _laws(self) -> list[Pmf]:
         return self._evaluate()
 
     @cached_property
     def support(self) -> IndexArray:
         """Consecutive counts (..., w) to which `pmf` and `cdf` refer; each cell has its own first count."""
-        first = np.array([window.first for window in self._windows]).reshape(self._shape)
+        first = np.array([law.first for law in self._laws]).reshape(self._shape)
         return np.asarray(first[..., None] + np.arange(self._width), dtype=np.int64)
 
     @cached_property
@@ -113,9 +113,9 @@ class CountLaw:
         For the Gaussian laws ("mars", "renewal") the normal density integrated from n - 1/2 to n + 1/2; P(0) includes
         the probability below 0.
         """
-        out = np.zeros((len(self._windows), self._width))
-        for row, window in zip(out, self._windows, strict=True):
-            row[: window.p.size] = window.p
+        out = np.zeros((len(self._laws), self._width))
+        for row, law in zip(out, self._laws, strict=True):
+            row[: law.p.size] = law.p
         return out.reshape(*self._shape, self._width)
 
     @cached_property
@@ -126,7 +126,7 @@ class CountLaw:
     @cached_property
     def outside(self) -> FloatArray:
         """Bound (...) on the probability outside `support`, and thus on the aliasing of an exact pmf."""
-        return np.array([window.outside for window in self._windows]).reshape(self._shape)
+        return np.array([law.outside for law in self._laws]).reshape(self._shape)
 
     @property
     def _shape(self) -> tuple[int, ...]:
@@ -134,12 +134,12 @@ class CountLaw:
 
     @cached_property
     def _width(self) -> int:
-        return max(window.p.size for window in self._windows)
+        return max(law.p.size for law in self._laws)
 
     def __getstate__(self) -> dict[str, Any]:
         """The law with its probabilities, because the function that evaluates them cannot be pickled."""
-        windows = self._windows
-        return {name: value for name, value in self.__dict__.items() if name != "_evaluate"} | {"_windows": windows}
+        laws = self._laws
+        return {name: value for name, value in self.__dict__.items() if name != "_evaluate"} | {"_laws": laws}
 
     def _repr_html_(self) -> str:
         if self.cumulants.ndim == 1:
@@ -229,17 +229,17 @@ def count_law(
     team = thread_count(threads)
     slow = "electronics_dead_time_ns" in cells.system.detector.effects
     if method == "exact" and (slow or system.detector.mode == "synchronous"):
-        windows = record_windows(cells, max(tolerance, TOL.records), team) if slow else synchronous_windows(cells)
-        recorded_cumulants = np.array([cumulants_of(window) for window in windows]).reshape(*cells.shape, 4)
-        return CountLaw(system, method, recorded_cumulants, lambda: windows)
+        laws = record_pmfs(cells, max(tolerance, TOL.records), team) if slow else synchronous_pmfs(cells)
+        recorded_cumulants = np.array([cumulants_of(law) for law in laws]).reshape(*cells.shape, 4)
+        return CountLaw(system, method, recorded_cumulants, lambda: laws)
     if method == "exact":
         exposure = refined_moments(cells, 1, tolerance=tolerance, threads=team, budget=LAW)
         flat, bins = exposure.cumulants.reshape(-1, 4), exposure.bins.reshape(-1)
-        return CountLaw(system, method, exposure.cumulants, lambda: exact_windows(cells, flat, bins, team), exposure)
+        return CountLaw(system, method, exposure.cumulants, lambda: exact_pmfs(cells, flat, bins, team), exposure)
     if method == "poisson":
         means = system.cycles * cells.total
         cumulants = np.repeat(means[:, None], 4, axis=1).reshape(*cells.shape, 4)
-        return CountLaw(system, method, cumulants, lambda: [poisson_window(float(m)) for m in means])
+        return CountLaw(system, method, cumulants, lambda: [poisson_pmf(float(m)) for m in means])
     mean, variance = _gaussian_moments(method, cells, edge)
     cumulants = np.zeros((*cells.shape, 4))
     cumulants[..., 0], cumulants[..., 1] = mean.reshape(cells.shape), variance.reshape(cells.shape)
@@ -247,7 +247,7 @@ def count_law(
         system,
         method,
         cumulants,
-        lambda: [gaussian_window(float(m), float(v)) for m, v in zip(mean, variance, strict=True)],
+        lambda: [gaussian_pmf(float(m), float(v)) for m, v in zip(mean, variance, strict=True)],
     )
 
 

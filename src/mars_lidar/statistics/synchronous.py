@@ -1,8 +1,8 @@
 """Exact statistics of a synchronous pixel: armed at the start of each period, first photon only (Coates 1968).
 
 Every armed period registers with probability q = 1 - e^-Lambda, at a phase with the law of the first arrival,
-independently of all others. A registration occupies 1 + K periods, or 2 + K where it comes after 1 - f, with t_d =
-K + f. The count is thus a renewal process of whole periods: docs/theory_detectors.md, equations (4) to (7).
+independently of all others. A registration occupies 1 + K periods, or 2 + K if its phase is later than 1 - f, where
+t_d = K + f. The count is thus a renewal process of whole periods: docs/theory_detectors.md, equations (4) to (7).
 """
 
 from __future__ import annotations
@@ -27,39 +27,39 @@ def first_arrivals(cells: Cells) -> FloatArray:
     return np.asarray(np.exp(-before[:, :-1]) * -np.expm1(-np.maximum(np.diff(before), 0.0)), dtype=np.float64)
 
 
-def synchronous_windows(cells: Cells) -> list[Pmf]:
+def synchronous_pmfs(cells: Cells) -> list[Pmf]:
     """Exact pmf of the count of each cell."""
     dead = cells.system.dead_time_periods
     whole = math.floor(dead)
     reach = photons_before(cells, np.array([1.0 - (dead - whole), 1.0]))
     return [
-        _Count(cells, cells.name(k), whole, float(early), float(total)).window()
-        for k, (early, total) in enumerate(reach)
+        _Count(cells, cells.name(k), whole, float(early), float(total)).law() for k, (early, total) in enumerate(reach)
     ]
 
 
-def cumulants_of(window: Pmf) -> FloatArray:
+def cumulants_of(law: Pmf) -> FloatArray:
     """Mean, variance, third and fourth cumulant (4,) of a pmf."""
-    n = window.first + np.arange(window.p.size)
-    mean = float(window.p @ n)
-    m2, m3, m4 = (float(window.p @ (n - mean) ** k) for k in (2, 3, 4))
+    n = law.first + np.arange(law.p.size)
+    mean = float(law.p @ n)
+    m2, m3, m4 = (float(law.p @ (n - mean) ** k) for k in (2, 3, 4))
     return np.array([mean, m2, m3, m4 - 3.0 * m2**2])
 
 
 def _log1p(u: NDArray[np.complex128]) -> NDArray[np.complex128]:
-    """log(1 + u), real part accurate relative to itself: it is multiplied by 1e8 registrations."""
+    """log(1 + u) with a small relative error of the real part, which is multiplied by up to 1e8 registrations."""
     real = 0.5 * np.log1p(2.0 * u.real + u.real**2 + u.imag**2)
     return np.asarray(real + 1j * np.arctan2(u.imag, 1.0 + u.real))
 
 
 class _Count:
-    """The count of one pixel; of its `total` photons per period `early` arrive before the phase 1 - f."""
+    """The count of one pixel with `total` photons per period, of which `early` arrive before the phase 1 - f."""
 
     def __init__(self, cells: Cells, name: str, whole: int, early: float, total: float) -> None:
         self.name, self.cycles, self.whole = name, cells.system.cycles, whole
         self.armed_register = -math.expm1(-total)  # q
         after = math.exp(-early) * -math.expm1(-max(total - early, 0.0))
-        self.late = min(after / self.armed_register, 1.0) if self.armed_register > 0.0 else 0.0
+        late = min(after / self.armed_register, 1.0) if self.armed_register > 0.0 else 0.0
+        self.late = late if late * self.cycles > TOL.synchronous_tail else 0.0  # less likely than what is cut off
         self.first = self._first(cells.system.start == "stationary")
 
     def _first(self, stationary: bool) -> FloatArray:
@@ -119,7 +119,7 @@ class _Count:
         total = (probability * weight).sum(-1)
         return np.asarray(np.where(counts <= 0.0, 1.0, np.minimum(total, 1.0)), dtype=np.float64)
 
-    def window(self) -> Pmf:
+    def law(self) -> Pmf:
         most = math.ceil(self.cycles / (self.whole + 1))
         if self.armed_register == 0.0:
             return Pmf(0, np.ones(1), 0.0)

@@ -82,6 +82,8 @@ class Tolerances:
         Bins per period of any statistics grid (8 MiB an array), and of equal bins where others follow the pulse.
     first_bins, most_first_bins
         Bins per period of the coarsest and finest first grid; refinement may exceed the latter.
+    compared_bins
+        Fewest bins of the histogram in which grids are compared, whatever is asked: as cheap as one.
     unrefined_bins
         Least bins of grids that are not refined, of the phase chain and without a dead time, and of the first grid that
         follows the pulse: with fewer the discretisation of the chain is visible in the variance of the count.
@@ -207,6 +209,7 @@ class Tolerances:
     most_even_bins: int = 2**15
     first_bins: int = 128
     most_first_bins: int = 2**14
+    compared_bins: int = 32
     unrefined_bins: int = 512
     chain_bins_per_width: float = 7.5
     pulse_samples: int = 2**12

@@ -22,7 +22,7 @@ from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux, broadcast
 from mars_lidar.statistics.cells import Cells, cell_name, default_bins, flat
 from mars_lidar.statistics.chain import ConvergenceError, PhaseChain, Rearm
-from mars_lidar.statistics.count_pmf import Pmf, guessed_windows
+from mars_lidar.statistics.count_pmf import Pmf, guessed_pmfs
 from mars_lidar.statistics.exposure import Settled, _run, blank, native_light, normalised, refined_moments
 from mars_lidar.statistics.matched import trusted
 from mars_lidar.statistics.renewal import holding_times
@@ -126,14 +126,14 @@ class NodeLaws:
     pmf: FloatArray
 
     @classmethod
-    def of(cls, row: IndexArray, windows: Sequence[Pmf]) -> NodeLaws:
-        """From one window for each row."""
-        trimmed = [_trimmed(window) for window in windows]
+    def of(cls, row: IndexArray, laws: Sequence[Pmf]) -> NodeLaws:
+        """From one law for each row."""
+        trimmed = [_trimmed(law) for law in laws]
         return cls(
             np.asarray(row, dtype=np.int64),
-            np.array([window.first for window in trimmed], np.int64),
-            np.concatenate([[0], np.cumsum([window.p.size for window in trimmed])]).astype(np.int64),
-            np.concatenate([np.empty(0), *(window.p for window in trimmed)]),
+            np.array([law.first for law in trimmed], np.int64),
+            np.concatenate([[0], np.cumsum([law.p.size for law in trimmed])]).astype(np.int64),
+            np.concatenate([np.empty(0), *(law.p for law in trimmed)]),
         )
 
     @classmethod
@@ -141,7 +141,7 @@ class NodeLaws:
         """Laws of no entry."""
         return cls.of(np.empty(0, np.int64), [])
 
-    def window(self, row: int) -> Pmf | None:
+    def law(self, row: int) -> Pmf | None:
         """Law of an entry; None if its cumulants suffice."""
         k = int(np.searchsorted(self.row, row))
         if k == self.row.size or self.row[k] != row:
@@ -149,11 +149,11 @@ class NodeLaws:
         return Pmf(int(self.first[k]), self.pmf[self.offsets[k] : self.offsets[k + 1]], TOL.negligible)
 
 
-def _trimmed(window: Pmf) -> Pmf:
-    below = np.cumsum(window.p)
-    some = np.flatnonzero((below > TOL.negligible) & (below[-1] - below + window.p > TOL.negligible))
-    low, high = (int(some[0]), int(some[-1]) + 1) if some.size else (0, window.p.size)
-    return Pmf(window.first + low, window.p[low:high], TOL.negligible)
+def _trimmed(law: Pmf) -> Pmf:
+    below = np.cumsum(law.p)
+    some = np.flatnonzero((below > TOL.negligible) & (below[-1] - below + law.p > TOL.negligible))
+    low, high = (int(some[0]), int(some[-1]) + 1) if some.size else (0, law.p.size)
+    return Pmf(law.first + low, law.p[low:high], TOL.negligible)
 
 
 def node_laws(
@@ -173,7 +173,7 @@ def node_laws(
         return NodeLaws.none()
     cells = Cells.of(signal[row // background.size], background[row % background.size], system)
     waiting = None if progress is None else lambda done: progress(done, row.size)
-    return NodeLaws.of(row, guessed_windows(cells, entries.cumulants[row], entries.bins[row], threads, waiting))
+    return NodeLaws.of(row, guessed_pmfs(cells, entries.cumulants[row], entries.bins[row], threads, waiting))
 
 
 # --- Change with the delay -----------------------------------------------------------------------------------------

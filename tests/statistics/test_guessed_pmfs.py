@@ -6,7 +6,7 @@ from harness import make_system
 
 from mars_lidar.statistics import count_pmf as _pmf
 from mars_lidar.statistics.cells import Cells
-from mars_lidar.statistics.count_pmf import exact_windows, guessed_windows, total_variation
+from mars_lidar.statistics.count_pmf import exact_pmfs, guessed_pmfs, total_variation
 from mars_lidar.statistics.exposure import refined_moments
 
 SYSTEM = make_system(63.75, 120, 32)
@@ -30,7 +30,7 @@ def test_they_are_the_exact_ones(monkeypatch):
     some, cumulants, bins = cells()
     asked, windows = alone(monkeypatch), []
     for guess, truth in zip(
-        guessed_windows(some, cumulants, bins, 1, windows.append), exact_windows(some, cumulants, bins, 1), strict=True
+        guessed_pmfs(some, cumulants, bins, 1, windows.append), exact_pmfs(some, cumulants, bins, 1), strict=True
     ):
         assert total_variation(guess, truth) < 1e-11
     assert not asked
@@ -51,7 +51,7 @@ def test_a_wrong_guess_is_noticed(monkeypatch, wrong):
     wide = np.array([1, 2, 4])  # counts of some spread: the others are all but certain
     some, cumulants, bins = some.part(wide), cumulants[wide], bins[wide]
     asked = alone(monkeypatch)
-    guesses = guessed_windows(some, np.asarray(wrong(cumulants)), bins, 1)
-    for guess, truth in zip(guesses, exact_windows(some, cumulants, bins, 1), strict=True):
+    guesses = guessed_pmfs(some, np.asarray(wrong(cumulants)), bins, 1)
+    for guess, truth in zip(guesses, exact_pmfs(some, cumulants, bins, 1), strict=True):
         assert total_variation(guess, truth) < 1e-6
     assert asked

@@ -82,19 +82,21 @@ class Timing:
         starts = (np.arange(0, bins, codes)[:, None] + edges[:-1]).reshape(-1)
         return np.append(starts, bins) * split
 
-    def forward(self, histogram: FloatArray) -> FloatArray:
-        """Records (..., bins) of registrations (..., parts)."""
+    def forward(self, histogram: FloatArray, cell: int | None = None) -> FloatArray:
+        """Records (..., bins) of registrations (..., parts), of all cells or of one."""
         if self._jitter is not None:
             spectrum = np.fft.rfft(histogram, axis=-1) * self._jitter
             histogram = np.maximum(np.fft.irfft(spectrum, self.parts, axis=-1), 0.0)
         rows = histogram.reshape(-1, self.parts)
         before = np.concatenate([np.zeros((len(rows), 1)), np.cumsum(rows, axis=-1)], axis=-1)
         whole, rest = self._split
+        if cell is not None and len(rest) > 1:
+            rest = rest[cell]
         at = before[:, whole] + rest * rows[:, np.minimum(whole, self.parts - 1)]
         return np.asarray(np.diff(at, axis=-1).reshape(*histogram.shape[:-1], -1), dtype=np.float64)
 
     def backward(self, weights: FloatArray) -> FloatArray:
-        """Mean weight (..., parts) of the record of a registration of the only cell in each part; weights (..., bins)."""
+        """Mean weight (..., parts) of registrations of the only cell in a part, for weights (..., bins) of records."""
         whole, rest = self._split
         whole, rest = whole[1:-1], rest[0, 1:-1, None]
         step = np.diff(weights.reshape(-1, weights.shape[-1]), axis=-1).T  # at each edge
@@ -108,7 +110,10 @@ class Timing:
 
     @cached_property
     def _split(self) -> tuple[NDArray[np.int64], FloatArray]:
-        """The part (bins + 1,) in which each edge lies, and the fraction (cells or 1, bins + 1) of it before the edge."""
+        """The part (bins + 1,) of each edge, and what fraction (cells or 1, bins + 1) of that part is before the edge.
+
+        It is a fraction of the photons without jitter, of the time otherwise.
+        """
         whole = np.minimum(np.floor(self._edges), self.parts).astype(np.int64)
         rest = (self._edges - whole)[None]
         if self._jitter is not None or not rest.any():

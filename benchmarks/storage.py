@@ -97,20 +97,20 @@ def datasets(config: Config, bandwidth: Bandwidth) -> Section:
         alone = _child(config, "engine", level, scenes, threads)
         shares = {}
         for layout in ("sparse", "dense"):
-            found = _child(config, layout, level, scenes, threads)
-            shares[layout] = alone["cpu"] / found["cpu"]
-            section.rows.append(_dataset_row(f"{layout}, {threads} threads", level, found, alone))
+            measured = _child(config, layout, level, scenes, threads)
+            shares[layout] = alone["cpu"] / measured["cpu"]
+            section.rows.append(_dataset_row(f"{layout}, {threads} threads", level, measured, alone))
             if level == 1.0 and layout == "sparse":
                 section.goals += [
                     Goal("generate, share of the engine's speed (CPU)", shares[layout], GOAL_SHARE, "", True),
-                    Goal("generate, peak memory", found["peak"] / 2**30, GOAL_MEMORY_GIB, "GiB"),
+                    Goal("generate, peak memory", measured["peak"] / 2**30, GOAL_MEMORY_GIB, "GiB"),
                 ]
         section.rows.append(_dataset_row(f"engine alone, {threads} threads", level, alone, alone))
     rates = {}
     for workers in (1, 2):
-        found = _child(config, "workers", 1.0, scenes, workers)
-        rates[workers] = found["rate"]
-        section.rows.append(_dataset_row(f"sparse, {workers} worker{'s' * (workers > 1)}", 1.0, found, None))
+        measured = _child(config, "workers", 1.0, scenes, workers)
+        rates[workers] = measured["rate"]
+        section.rows.append(_dataset_row(f"sparse, {workers} worker{'s' * (workers > 1)}", 1.0, measured, None))
     section.goals.append(Goal("2 workers over 1, rate", rates[2] / rates[1], GOAL_WORKERS, "", True))
     return section
 
@@ -172,18 +172,18 @@ def _check(store: Path) -> None:
         files.check(name)
 
 
-def _dataset_row(case: str, level: float, found: dict[str, float], alone: dict[str, float] | None) -> Row:
+def _dataset_row(case: str, level: float, measured: dict[str, float], alone: dict[str, float] | None) -> Row:
     return {
         "case": case,
         "S": level,
-        "pixel exposures": int(found["exposures"]),
-        "s": found["wall"],
-        "CPU s": found["cpu"] if alone else None,
-        "of engine speed, CPU": alone["cpu"] / found["cpu"] if alone else None,
-        "of engine speed, wall": alone["wall"] / found["wall"] if alone else None,
-        "exposures per s": found["rate"],
-        "MB on disk": found["bytes"] / 1e6,
-        "peak MiB": found["peak"] / 2**20,
+        "pixel exposures": int(measured["exposures"]),
+        "s": measured["wall"],
+        "CPU s": measured["cpu"] if alone else None,
+        "of engine speed, CPU": alone["cpu"] / measured["cpu"] if alone else None,
+        "of engine speed, wall": alone["wall"] / measured["wall"] if alone else None,
+        "exposures per s": measured["rate"],
+        "MB on disk": measured["bytes"] / 1e6,
+        "peak MiB": measured["peak"] / 2**20,
     }
 
 
@@ -200,9 +200,9 @@ def _system(config: Config) -> ml.System:
 def _child(config: Config, what: str, level: float, scenes: int, threads: int) -> dict[str, float]:
     with tempfile.TemporaryDirectory(dir=os.environ.get("MARS_BENCH_TMP")) as folder:
         arguments = [what, level, scenes, threads, config.cycles, config.bins, Path(folder) / "set.zarr"]
-        told = run_python("-m", "benchmarks.storage_child", *map(str, arguments))
-    found: dict[str, float] = json.loads(told.splitlines()[-1])
-    return found
+        output = run_python("-m", "benchmarks.storage_child", *map(str, arguments))
+    measured: dict[str, float] = json.loads(output.splitlines()[-1])
+    return measured
 
 
 _CODEC_NOTE = (

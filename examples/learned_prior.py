@@ -23,7 +23,7 @@ PULSE, DETECTOR = ml.GaussianPulse(sigma_ns=PULSE_NS), ml.Detector(dead_time_ns=
 SYSTEM = ml.System(period_ns=128.0, cycles=1000, bins=128, pulse=PULSE, detector=DETECTOR)
 M_PER_WIDTH = 0.5 * 0.299792458 * PULSE_NS
 ALONE, AROUND, SMOOTH = "a pixel alone, maximum likelihood", "method `image`", "total variation, weight "
-SHOWN = ("truth", ALONE, AROUND, SMOOTH + "2", "learned prior")
+PICTURED = ("truth", ALONE, AROUND, SMOOTH + "2", "learned prior")
 SIZE = 96  # of the scenes that are reconstructed
 FLOOR = 0.2 / SYSTEM.cycles  # photons per period that an estimate of zero stands for, in a logarithm
 
@@ -68,8 +68,8 @@ def train(steps=1500, rooms=300, batch=8):
     for step in range(steps):
         if step % 100 == 0:
             print(f"training, step {step} of {steps}", flush=True)
-        top, left = torch.randint(65, (2,)).tolist()
-        x = clean[torch.randint(rooms, (batch,)), :, top : top + 32, left : left + 32]
+        row, column = torch.randint(65, (2,)).tolist()
+        x = clean[torch.randint(rooms, (batch,)), :, row : row + 32, column : column + 32]
         x[:, 1] += torch.randn(batch, 1, 1)  # any background
         sigma = torch.exp(torch.empty(batch, 1, 1, 1).uniform_(np.log(0.1), np.log(0.7)))
         loss = ((denoiser(x + sigma * torch.randn_like(x), sigma[:, 0, 0, 0]) - x).abs() / sigma).mean()
@@ -93,7 +93,7 @@ def estimates(y, denoiser, steps=100):
     cubes, start = y.movedim(1, -1).double().contiguous().numpy(), None
     for name, method in ((ALONE, "maximum_likelihood"), (AROUND, "image")):
         parts = [ml.reconstruct(cube, SYSTEM, method) for cube in cubes]
-        maps = [np.stack([one.signal, one.background, one.delay_ns]) for one in parts]
+        maps = [np.stack([part.signal, part.background, part.delay_ns]) for part in parts]
         start = images(torch.from_numpy(np.stack(maps)).float())
         yield name, start
     for weight in (1.0, 2.0, 4.0):
@@ -111,19 +111,19 @@ def compared(denoiser, name, seed, size=SIZE, steps=100):
     light = scenes(name, size, [seed])
     y = LidarPhysics(SYSTEM)(light, seed=3)
     true = images(light)
-    rows, shown = [], {"truth": true}
-    for method, found in estimates(y, denoiser, steps):
+    rows, maps = [], {"truth": true}
+    for method, estimate in estimates(y, denoiser, steps):
         print(f"{name}: {method}", flush=True)
-        depth = M_PER_WIDTH * (found - true)[:, 2].abs()
+        depth = M_PER_WIDTH * (estimate - true)[:, 2].abs()
         far = depth > 3.0 * M_PER_WIDTH
-        signal = (light_of(found) - light)[:, 0] / light[:, 0].mean()
+        signal = (light_of(estimate) - light)[:, 0] / light[:, 0].mean()
         rows.append((method, _rms(depth), _rms(depth[~far]), depth.median(), 100.0 * far.float().mean(), _rms(signal)))
-        shown[method] = found
+        maps[method] = estimate
     signal, background, delay_ns = light[0].double().numpy()
     bound = ml.cramer_rao(ml.Flux(signal, background, delay_ns), SYSTEM)
-    least = [_rms(torch.from_numpy(one)) for one in (bound.depth_m, bound.signal / signal.mean())]
+    least = [_rms(torch.from_numpy(error)) for error in (bound.depth_m, bound.signal / signal.mean())]
     rows.append(("Cramer-Rao bound of a pixel alone", least[0], "-", "-", "-", least[1]))
-    return rows, shown
+    return rows, maps
 
 
 def _rms(errors):
@@ -154,19 +154,19 @@ def write(folder):
     text = HEAD.format(spent=time.process_time() - began, size=SIZE)
     figure, axes = plt.subplots(2, 5, figsize=(13, 5.4), layout="constrained")
     for row, (name, seed, law) in zip(axes, (("room", 1, "another"), ("random", 2, "their own")), strict=True):
-        rows, shown = compared(denoiser, name, seed)
+        rows, maps = compared(denoiser, name, seed)
         text += f'## `"{name}"`, not among the scenes of the training, of {law} law\n\n'
         text += "| method | depth rms | rms, near | median | off, % | reflectivity rms |\n|---|---|---|---|---|---|\n"
         for method, *numbers in rows:
-            cells = [one if isinstance(one, str) else f"{float(one):.3g}" for one in numbers]
+            cells = [number if isinstance(number, str) else f"{float(number):.3g}" for number in numbers]
             text += f"| {method} | {' | '.join(cells)} |\n"
         learned = next(row for row in rows if row[0] == "learned prior")
         best = [min(row[k] for row in rows if row[0].startswith(SMOOTH)) for k in range(1, 6)]
         shares = [f"{float(a / b):.2f}" for a, b in zip(learned[1:], best, strict=True)]
         text += f"\nLearned prior over the best weight of total variation, by column: {', '.join(shares)}.\n\n"
-        far = M_PER_WIDTH * shown["truth"][0, 2].max().item()
-        for axis, method in zip(row, SHOWN, strict=True):
-            picture = axis.imshow(M_PER_WIDTH * shown[method][0, 2], vmin=0.0, vmax=far)
+        far = M_PER_WIDTH * maps["truth"][0, 2].max().item()
+        for axis, method in zip(row, PICTURED, strict=True):
+            picture = axis.imshow(M_PER_WIDTH * maps[method][0, 2], vmin=0.0, vmax=far)
             axis.set(title=method, xticks=[], yticks=[])
         figure.colorbar(picture, ax=row, label="depth (m)")
     Path(folder).mkdir(parents=True, exist_ok=True)

@@ -16,15 +16,15 @@ HERE = Path(__file__).parent
 
 def cells(text: str) -> list[tuple[str, str]]:
     """Kind and source of each cell, between lines that begin with ``# %%``."""
-    found = []
+    cells_of_text = []
     for part in re.split(r"^# %%", text, flags=re.MULTILINE)[1:]:
         head, _, body = part.partition("\n")
         if "markdown" in head:
             lines = body.strip().splitlines()
-            found.append(("markdown", "\n".join(line.removeprefix("#").removeprefix(" ") for line in lines)))
+            cells_of_text.append(("markdown", "\n".join(line.removeprefix("#").removeprefix(" ") for line in lines)))
         else:
-            found.append(("code", body.strip()))
-    return found
+            cells_of_text.append(("code", body.strip()))
+    return cells_of_text
 
 
 def run(source: str, space: dict[str, Any]) -> list[dict[str, Any]]:

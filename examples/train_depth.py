@@ -42,8 +42,8 @@ def within_a_bin(net, size=32):
     """Share of the pixels of unseen scenes that are placed at most one bin off, beside the matched filter's."""
     counts, place = next(cubes(2, 1, size))
     matched = ml.reconstruct(counts.movedim(1, -1).numpy(), SYSTEM, "matched_filter").delay_ns / SYSTEM.bin_ns
-    found = {"network": net(counts.log1p()).argmax(1) + 0.5, "matched filter": torch.from_numpy(matched)}
-    return {name: ((one - place + 32) % 64 - 32).abs().le(1).double().mean().item() for name, one in found.items()}
+    bins = {"network": net(counts.log1p()).argmax(1) + 0.5, "matched filter": torch.from_numpy(matched)}
+    return {name: ((bin - place + 32) % 64 - 32).abs().le(1).double().mean().item() for name, bin in bins.items()}
 
 
 if __name__ == "__main__":

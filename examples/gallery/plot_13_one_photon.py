@@ -23,9 +23,9 @@ cube = ml.simulate(room.flux(system, signal=1 / system.cycles, sbr=1.0), system)
 alone, image = ml.reconstruct(cube, system), ml.reconstruct(cube, system, method="image")
 
 fig, axes = plt.subplots(2, 2, figsize=(7.4, 4.6), layout="constrained")
-shown = {"truth": room.depth_m, "each pixel alone": alone.depth_m, "image": image.depth_m}
+maps = {"truth": room.depth_m, "each pixel alone": alone.depth_m, "image": image.depth_m}
 shares = {}
-for ax, (title, depth) in zip(axes.flat, shown.items(), strict=False):
+for ax, (title, depth) in zip(axes.flat, maps.items(), strict=False):
     picture = ax.imshow(depth, vmin=2.0, vmax=9.0)
     off = ~(np.abs(depth - room.depth_m) < 0.27)  # three standard deviations of the pulse
     shares[title] = off.mean()

@@ -124,9 +124,9 @@ def test_simulate_makes_an_image_of_every_flux() -> None:
 def test_two_returns_half_a_period_apart_are_one_of_half_the_period(dead_ns: float):
     """Where pixels re-arm within a pulse, samples of 50 in a standard deviation had an error of 6e-4 of the mean."""
     two = make_system(dead_ns, 40, 50, sigma_ns=0.1)
-    one = two.replace(period_ns=50.0, cycles=80, bins=25)
+    halved = two.replace(period_ns=50.0, cycles=80, bins=25)
     a = ml.statistics.exposure_moments(ml.Flux.multi(*(ml.Flux(3.0, 0.1, d) for d in (8.0, 58.0))), two, tolerance=1e-6)
-    b = ml.statistics.exposure_moments(ml.Flux(3.0, 0.1, 8.0), one, tolerance=1e-6)
+    b = ml.statistics.exposure_moments(ml.Flux(3.0, 0.1, 8.0), halved, tolerance=1e-6)
     assert float(a.mean) == pytest.approx(float(b.mean), rel=3e-6)
     assert float(a.variance) == pytest.approx(float(b.variance), rel=3e-5)
     np.testing.assert_allclose(a.histogram[:25] + a.histogram[25:], b.histogram, atol=1e-5 * float(b.mean))

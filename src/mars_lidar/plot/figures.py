@@ -103,12 +103,12 @@ def overview(
             rows, columns, first = 2, 2, 2.0 * (each + _BAR_INCHES)
         figure = Figure(figsize=(width, height), dpi=DPI)
         below, above = 0.46 / height, 1.0 - 0.62 / height
-        left, right = 0.012, (first - _BAR_INCHES) / width + 0.012
+        right = (first - _BAR_INCHES) / width + 0.012
         bottom = above - (rows * image + (rows - 1) * _GAP_INCHES) / height
         maps = figure.add_gridspec(
             rows,
             columns,
-            left=left,
+            left=0.012,
             right=min(right, 1.0 - _BAR_INCHES / width),
             bottom=bottom,
             top=above,
@@ -302,14 +302,10 @@ def _draw_pixels(
     realization: int,
     pixels: _Pixels,
 ) -> None:
-    left, right, bottom, top = box
     grid = figure.add_gridspec(
         len(pixels),
         2,
-        left=left,
-        right=right,
-        bottom=bottom,
-        top=top,
+        **dict(zip(("left", "right", "bottom", "top"), box, strict=True)),
         wspace=0.14,
         hspace=0.42,
         width_ratios=(2.4, 1.0),

@@ -89,8 +89,8 @@ def draw_pixel(
 
 def quiet_corner(rate: NDArray[np.float64]) -> str:
     """The corner in which a legend covers least of a histogram of this rate."""
-    left, middle, right = (float(part.max(initial=0.0)) for part in np.array_split(rate, 3))
-    places = {"upper right": right, "upper left": left, "upper center": middle}
+    early, middle, late = (float(part.max(initial=0.0)) for part in np.array_split(rate, 3))
+    places = {"upper right": late, "upper left": early, "upper center": middle}
     return min(places, key=lambda name: places[name])
 
 

@@ -333,8 +333,8 @@ class Cells:
     waveform, row
         Waveforms (rows, T) of unit sum, and the row of each cell; `waveform` is None for a pulse.
     returns
-        (2, returns, rows) fraction of the light and phase of each return, where the waveforms are sampled from several;
-        None otherwise. The light before an edge is theirs, not that of the samples.
+        (2, returns, rows) fraction of the light and phase of each of several returns, from which the photons before an
+        edge are computed; the waveforms are then samples of their sum. None otherwise.
     follow
         0 for equal bins; otherwise the number of histogram bins, each a whole number of grid bins, on a grid that is
         finer on the pulse.

@@ -516,7 +516,7 @@ def refined_moments(
 def compared_bins(cells: Cells, out_bins: int) -> int:
     """Bins of the histogram in which grids are compared: a multiple of `out_bins`.
 
-    Grids may have the same mean by chance while their errors are 50 times as large; not the same shape as well.
+    Two grids may agree by chance in the mean although both errors are 50 times as large; they then differ in shape.
     """
     return out_bins if cells.follow else out_bins * math.ceil(TOL.compared_bins / out_bins)
 

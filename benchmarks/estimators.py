@@ -62,9 +62,9 @@ def reconstruction(config: Config, bandwidth: Bandwidth) -> Section:
 
 _RECONSTRUCTION = (
     "{pixels} pixels of the canonical system, delays all over the period, one thread; least of the turns, scaled to a "
-    "128 x 128 cube (the work divides among threads by pixels; here {threads} processors). In turn with 726fa7b "
-    "(2 cores of an AMD EPYC, other work beside, 2026-11-26), maximum likelihood takes 73 us a pixel for 109 at S = B "
-    "= 1, 171 for 199 at S = B = 10, and two returns 540 for 1,300; 50 and 300 were aimed at and not reached: three "
-    "fifths are the bins of the climbs, with a logarithm and an exponential each, a quarter is the search over all "
-    "delays, an eighth the test of the fit."
+    "128 x 128 cube (the work divides among threads by pixels; here {threads} processors). In turn with the revision "
+    "before (2 cores of an AMD EPYC with AVX-512, other work beside, 2026-11-27), maximum likelihood takes 43 us a "
+    "pixel for 100 at S = B = 1, 78 for 205 at S = B = 10; up to two returns 220 for 335 where there is one, and 455 "
+    "for 940 where there are two (S = 1 and 0.5, B = 1). 300 was aimed at for two and is not reached: two fifths are "
+    "the searches for a further return over all delays, the rest the climbs from each start and the errors."
 )

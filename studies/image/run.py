@@ -74,7 +74,7 @@ class Settings:
 
 
 FULL = Settings(64, (1.0, 2.0, 5.0, 10.0), (0.03, 0.3, 1.0, 3.0), len(FROZEN), 48, (256, 2048), 4, (1500, 300))
-QUICK = Settings(24, (2.0,), (1.0,), 0, 16, (64,), 2, (20, 8))  # no frozen scene: a quick look is a look
+QUICK = Settings(16, (2.0,), (1.0,), 0, 16, (64,), 2, (20, 8))  # no frozen scene: a quick look is a look
 
 
 def systems() -> dict[str, System]:

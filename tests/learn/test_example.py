@@ -52,7 +52,7 @@ def test_learned_prior(deepinv):
     assert losses[-1] < 0.8 * sum(losses[:10]) / 10
     rows, pictures = example["compared"](denoiser, "random", 2, 24, 12)
     assert [len(row) for row in rows] == 7 * [6]
-    assert set(example["SHOWN"]) <= set(pictures)
+    assert set(example["PICTURED"]) <= set(pictures)
     depth, reflectivity = ({row[0]: float(row[k]) for row in rows} for k in (1, 5))
     assert depth["learned prior"] < 0.5 * depth[example["ALONE"]]
     assert reflectivity["learned prior"] < reflectivity[example["ALONE"]]

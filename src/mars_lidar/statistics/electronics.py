@@ -1,11 +1,11 @@
 """Free-running pixels behind electronics with a dead time of their own: count law, mean histogram, stationary shape.
 
-An avalanche is recorded if and only if t_e has passed since the last record; meanwhile the pixel continues to detect,
-dead for t_d after each avalanche. Records form a Markov-renewal process whose state is the phase of a record: equations
-(10) to (13) of docs/theory_detectors.md. Its transition probabilities are the kernel (10) folded over the periods. The
-stationary law of the phases is the mean histogram of a stationary pixel (20), which Rapp et al. treat (IEEE TSP 2019).
-With a weight z for each record the same recursion gives the generating function of the number of records; its values on
-the unit circle give the law of the number (19).
+An avalanche is recorded if and only if t_e has passed since the last record. During t_e the pixel continues to detect,
+with its own dead time t_d after each avalanche. Records form a Markov-renewal process whose state is the phase of a
+record: equations (10) to (13) of docs/theory_detectors.md. Its transition probabilities are the kernel (10) folded over
+the periods. The stationary law of the phases is the mean histogram of a stationary pixel (20), which Rapp et al. treat
+(IEEE TSP 2019). With a weight z for each record the same recursion gives the generating function of the number of
+records; its values on the unit circle give the law of the number (19).
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -75,10 +76,10 @@ class RecordGrid:
         self.first, self.first_armed = self._first()
 
     def _advance(self, armed: FloatArray, rearmed: FloatArray, photons: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Armed probability at the end of a bin and avalanches in it, re-armed evenly over it (9)."""
+        """Armed probability at the end of a bin, and avalanches in it, if pixels re-arm uniformly over the bin (9)."""
         keep = np.exp(-photons)
-        lasting = np.where(photons > 1e-12, -np.expm1(-photons) / np.maximum(photons, 1e-300), 1.0)
-        after = armed * keep + rearmed * lasting
+        mean_survival = np.where(photons > 1e-12, -np.expm1(-photons) / np.maximum(photons, 1e-300), 1.0)
+        after = armed * keep + rearmed * mean_survival
         return after, armed + rearmed - after
 
     def _kernel(self) -> tuple[FloatArray, FloatArray]:
@@ -130,14 +131,14 @@ class RecordGrid:
 class RecordRun:
     """Records bin by bin through the exposure, for several weightings (rows) at once (12).
 
-    `start` (rows,) are the weights of the first record; `weigh` gives records (rows, bins) the weights with which they
-    enter the records that follow them.
+    `start` (rows,) are the weights of the first record; `weigh` maps records (rows, bins) to their weights in later
+    records.
     """
 
     def __init__(self, grid: RecordGrid, start: Rows, weigh: Callable[[Rows], Rows]) -> None:
         self.grid, self.start, self.weigh = grid, start, weigh
         n, off, steps = grid.bins, grid.off, grid.steps
-        # shorter than t_e, so that no record in a block follows from another in it
+        # shorter than t_e, so that no record of a block depends on another of the same block
         size = max(1, min(TOL.block, off, n))
         self.blocks = [_Block(grid, at, min(at + size, n)) for at in range(0, n, size)]
         self.reach = steps + 1
@@ -162,7 +163,7 @@ class RecordRun:
             entry = grid.first.size - begun - at
             if 0 <= entry < end - at:
                 rearmed[:, entry] += self.start * grid.first_armed
-            armed = self.armed[:, None] * block.lasting + product(rearmed, block.kept)
+            armed = self.armed[:, None] * block.survival + product(rearmed, block.between)
             now = product(source[:, at + 1 : end + reach - grid.off], block.kernel) + armed * block.fired
             if begun + at < grid.first.size:
                 first = grid.first[begun + at : begun + end]
@@ -175,15 +176,15 @@ class RecordRun:
 
 
 class _Block:
-    """Transition of a block of bins: from earlier records and armed pixels to records in the block."""
+    """Transition probabilities from earlier records and armed pixels to records in a block of bins."""
 
     def __init__(self, grid: RecordGrid, at: int, end: int) -> None:
         self.at, self.end = at, end
         n, off, steps = grid.bins, grid.off, grid.steps
         before = np.concatenate([[0.0], np.cumsum(grid.photons[at:end])])
         self.fired = -np.expm1(-grid.photons[at:end])
-        self.lasting = np.exp(-before[:-1])  # survival of a pixel armed at the start, up to each bin
-        self.kept = np.triu(np.exp(np.minimum(before[:-1, None] - before[None, :-1], 0.0)))  # from bin to bin
+        self.survival = np.exp(-before[:-1])  # survival of a pixel armed at the start, up to each bin
+        self.between = np.triu(np.exp(np.minimum(before[:-1, None] - before[None, :-1], 0.0)))  # from bin to bin
         bins = np.arange(at, end)
         self.late = grid.late[(bins - steps - 1) % n]
         sources = np.arange(at - steps, end - off)
@@ -197,7 +198,7 @@ def product(x: Rows, matrix: FloatArray) -> Rows:
     """Product of a real or complex `x` with a real matrix, in pieces of one thread each.
 
     On a busy machine the threads of BLAS libraries wait for each other a hundred times longer than products of this
-    size take. A complex product is two real ones.
+    size take. A complex product is computed as two real ones.
     """
     if np.iscomplexobj(x):
         parts = product(np.concatenate([x.real, x.imag]), matrix)
@@ -285,7 +286,7 @@ def moments(cells: Cells, tolerance: float, budget: Budget = MOMENTS) -> Moments
     """`electronics_moments` of checked cells."""
     tolerance = checks.real("tolerance", tolerance, low=1e-6, high=0.1)
     out = cells.system
-    timing = Timing(out, cells.finest) if is_timed(out) else None
+    timing = Timing(cells) if is_timed(out) else None
     if timing is not None:
         cells = replace(cells, system=timing.untimed)
     record = timing.forward if timing is not None else np.asarray
@@ -301,7 +302,8 @@ def moments(cells: Cells, tolerance: float, budget: Budget = MOMENTS) -> Moments
     else:
         for k in range(cells.size):
             cell = bare.part(slice(k, k + 1))
-            mean[k], variance[k], histogram[k], grid[k] = refined(cell, slower, bins, tolerance, budget, record)
+            own = record if timing is None else partial(timing.forward, cell=k)
+            mean[k], variance[k], histogram[k], grid[k] = refined(cell, slower, bins, tolerance, budget, own)
     shape = cells.shape
     return Moments(
         mean.reshape(shape), variance.reshape(shape), histogram.reshape(*shape, out.bins), grid.reshape(shape)
@@ -470,7 +472,7 @@ def stationary_records(cells: Cells, *, tolerance: float, threads: int | None) -
     The grid is refined until doubling it moves the shape by less than `tolerance`, at least 1e-3, in total variation.
     """
     tolerance = max(checks.real("tolerance", tolerance, low=1e-9, high=0.1), TOL.records)
-    timing = Timing(cells.system, cells.finest) if is_timed(cells.system) else None
+    timing = Timing(cells) if is_timed(cells.system) else None
     if timing is not None:
         cells = replace(cells, system=timing.untimed)
     record, out = timing.forward if timing is not None else np.asarray, cells.system.bins
@@ -478,8 +480,11 @@ def stationary_records(cells: Cells, *, tolerance: float, threads: int | None) -
     if slower == 0.0:
         return record(stationary_histogram(bare, out, tolerance=tolerance, threads=threads))
     alone = replace(bare, system=bare.system.replace(start="armed"))  # the stationary law does not depend on the start
-    parts = (alone.part(slice(k, k + 1)) for k in range(cells.size))
-    return np.stack([_shape(cell, slower, out, tolerance, record) for cell in parts])
+    shapes = []
+    for k in range(cells.size):
+        own = record if timing is None else partial(timing.forward, cell=k)
+        shapes.append(_shape(alone.part(slice(k, k + 1)), slower, out, tolerance, own))
+    return np.stack(shapes)
 
 
 def _shape(cell: Cells, electronics_ns: float, out: int, tolerance: float, record: Record) -> FloatArray:
@@ -511,10 +516,10 @@ def _phases(grid: RecordGrid) -> FloatArray:
     law: FloatArray = np.full(n, 1.0 / n)
     moved = math.inf
     for _ in range(TOL.record_iterations):
-        following = np.asarray(law @ matrix, dtype=np.float64)
-        following /= following.sum()
-        before, moved = moved, 0.5 * float(np.abs(following - law).sum())
-        law = following
+        iterate = np.asarray(law @ matrix, dtype=np.float64)
+        iterate /= iterate.sum()
+        before, moved = moved, 0.5 * float(np.abs(iterate - law).sum())
+        law = iterate
         gap = 1.0 - min(moved / before, 1.0) if before > 0.0 else 1.0
         if moved <= TOL.record_change * gap:
             return law

@@ -56,9 +56,9 @@ class _Count:
 
     def __init__(self, cells: Cells, name: str, whole: int, early: float, total: float) -> None:
         self.name, self.cycles, self.whole = name, cells.system.cycles, whole
-        self.armed_register = -math.expm1(-total)  # q
+        self.q = -math.expm1(-total)  # probability that an armed period registers
         after = math.exp(-early) * -math.expm1(-max(total - early, 0.0))
-        late = min(after / self.armed_register, 1.0) if self.armed_register > 0.0 else 0.0
+        late = min(after / self.q, 1.0) if self.q > 0.0 else 0.0
         self.late = late if late * self.cycles > TOL.synchronous_tail else 0.0  # less likely than what is cut off
         self.first = self._first(cells.system.start == "stationary")
 
@@ -66,11 +66,11 @@ class _Count:
         """Probabilities (r,) that the first armed period is 0, 1, ...; of a stationary pixel by (7)."""
         if not stationary:
             return np.ones(1)
-        longer = np.full(min(self.whole, self.cycles) + 2, self.armed_register)  # P(M > r)
+        longer = np.full(min(self.whole, self.cycles) + 2, self.q)  # P(M > r)
         longer[0] = 1.0
         if self.whole < self.cycles:
-            longer[-1] = self.armed_register * self.late
-        return np.asarray(longer / (1.0 + self.armed_register * (self.whole + self.late)), dtype=np.float64)
+            longer[-1] = self.q * self.late
+        return np.asarray(longer / (1.0 + self.q * (self.whole + self.late)), dtype=np.float64)
 
     def at_least(self, counts: FloatArray) -> FloatArray:
         """P(N >= counts) (n,) (6)."""
@@ -100,12 +100,12 @@ class _Count:
 
         def waited(empty_periods: FloatArray, more: float = 0.0) -> FloatArray:
             """P(at most `empty_periods` empty periods before registration k + `more`)."""
-            chance = betainc(wanted + more, np.maximum(empty_periods, 0.0) + 1.0, self.armed_register)
+            chance = betainc(wanted + more, np.maximum(empty_periods, 0.0) + 1.0, self.q)
             return np.asarray(np.where(empty_periods >= 0.0, chance, 0.0), dtype=np.float64)
 
         def summed(empty_periods: FloatArray) -> FloatArray:
             """Sum of `waited` from 0 to `empty_periods`."""
-            mean = wanted * (1.0 - self.armed_register) / self.armed_register
+            mean = wanted * (1.0 - self.q) / self.q
             return np.asarray(
                 np.maximum((empty_periods + 1.0) * waited(empty_periods) - mean * waited(empty_periods - 1.0, 1.0), 0.0)
             )
@@ -121,7 +121,7 @@ class _Count:
 
     def law(self) -> Pmf:
         most = math.ceil(self.cycles / (self.whole + 1))
-        if self.armed_register == 0.0:
+        if self.q == 0.0:
             return Pmf(0, np.ones(1), 0.0)
         low, high = self._reach(most)
         terms = (high - low) * TOL.synchronous_sums * self._spread(float(most))
@@ -144,7 +144,7 @@ class _Count:
 
     def _reach(self, most: int) -> tuple[int, int]:
         """First and last count of the support, from mean and variance of the time of a registration."""
-        q, late = self.armed_register, self.late
+        q, late = self.q, self.late
         each = self.whole + 1.0 + ((1.0 - q) / q + late)  # periods per registration
         mean = self.cycles / each
         spread = math.sqrt(mean * ((1.0 - q) / q**2 + late * (1.0 - late))) / each
@@ -153,7 +153,7 @@ class _Count:
 
     def _transformed(self, counts: FloatArray) -> FloatArray:
         """P(N >= counts) (n,) by the transform of the periods that k registrations lose, (21)."""
-        k, q, late, n = counts, self.armed_register, self.late, self.first.size
+        k, q, late, n = counts, self.q, self.late, self.first.size
         room = self.cycles - 1.0 - (k - 1.0) * (self.whole + 1.0)  # periods that may be lost
         spread = math.sqrt(float(k.max()) * ((1.0 - q) / q**2 + late * (1.0 - late)))
         away = float(np.abs(room - k * (1.0 - q) / q - (k - 1.0) * late).max())

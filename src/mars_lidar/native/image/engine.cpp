@@ -79,7 +79,7 @@ class DelayExposure {
         passes_.set(r_, {row_.data(), CountRows::Type::kDouble, r_.bins}, 0);
         below_[0] = 0.0;
         for (int64_t j = 0; j < r_.bins; ++j)
-            below_[j + 1] = below_[j] + passes_.time(r_, j) * r_.share(j) / static_cast<double>(r_.cycles);
+            below_[j + 1] = below_[j] + passes_.time[j] * r_.share(j) / static_cast<double>(r_.cycles);
         const auto until = [&](double x) {  // exposure up to x bins
             const int64_t j = std::min<int64_t>(static_cast<int64_t>(x), r_.bins - 1);
             return below_[j] + (x - static_cast<double>(j)) * (below_[j + 1] - below_[j]);

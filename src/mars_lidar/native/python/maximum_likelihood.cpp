@@ -78,7 +78,7 @@ void expected_registrations(const HistogramRecord& recording, Histograms histogr
         const double* at = light.data() + 3 * p;
         passes.set(recording, counts, p);
         quality.expect(passes, at[0], at[1], at[2]);
-        std::copy(quality.expected().begin(), quality.expected().end(), out.data() + p * recording.bins);
+        std::copy_n(quality.expected().begin(), recording.bins, out.data() + p * recording.bins);
     }
 }
 
@@ -89,13 +89,13 @@ void log_likelihood(const HistogramRecord& recording, Vector<const double> histo
         throw nb::value_error("histogram must be (bins), at (points, 3), out (points, 13)");
     ArmedPasses passes(recording.bins);
     passes.set(recording, {histogram.data(), CountRows::Type::kDouble, recording.bins}, 0);
-    PixelLikelihood pixel(recording, passes);
+    PixelLikelihood pixel(recording);
+    pixel.set(passes);
     ExposureEnds ends;
-    BackgroundSeries series;
     for (size_t k = 0; k < at.shape(0); ++k) {
         const double* x = at.data() + 3 * k;
         ends.set(recording, passes, x[2]);
-        pixel.expect(x[1], series);
+        pixel.expect(x[1]);
         const Likelihood found = pixel(x[0], x[1], x[2], ends, whole);
         double* to = out.data() + 13 * k;
         *to++ = found.value;

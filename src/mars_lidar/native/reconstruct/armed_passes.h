@@ -6,6 +6,7 @@
 #include <cstdint>
 #include <vector>
 
+#include "reconstruct/bins_kernels.h"
 #include "reconstruct/count_rows.h"
 #include "reconstruct/histogram_record.h"
 
@@ -15,16 +16,18 @@ namespace mars {
 // periods in which it became so inside of it, at a place taken as uniform. For dead times below one bin `armed` is
 // the armed time of the bin instead, in periods, and `rearmed` is 0. `raw` is `armed` before it is kept within bounds.
 struct ArmedPasses {
-    std::vector<double> count, before, armed, rearmed, raw;  // (bins), before (bins + 1)
+    std::vector<double> count, before, armed, rearmed, raw;  // (padded_length(bins)), before (bins + 1)
+    // Armed time of each bin, in periods, where the registrations of the bin came in its middle (R5).
+    std::vector<double> time;
     double total = 0.0;
 
-    explicit ArmedPasses(int64_t bins) : count(bins), before(bins + 1), armed(bins), rearmed(bins), raw(bins) {}
-
-    // Armed time of bin j, in periods, where the registrations of the bin came in its middle (R5).
-    double time(const HistogramRecord& r, int64_t j) const {
-        if (r.below_bin()) return armed[j];
-        return std::max(armed[j] + 0.5 * rearmed[j] - 0.5 * count[j], 0.0);
-    }
+    explicit ArmedPasses(int64_t bins)
+        : count(padded_length(bins)),
+          before(bins + 1),
+          armed(count.size()),
+          rearmed(count.size()),
+          raw(count.size()),
+          time(count.size()) {}
 
     void set(const HistogramRecord& r, const CountRows& histograms, int64_t pixel) {
         const int64_t n = r.bins;
@@ -33,6 +36,11 @@ struct ArmedPasses {
         for (int64_t j = 0; j < n; ++j) before[j + 1] = before[j] + count[j];
         total = before[n];
         arm(r);
+        if (r.below_bin())
+            std::copy(armed.begin(), armed.end(), time.begin());
+        else
+            for (size_t j = 0; j < time.size(); ++j)
+                time[j] = std::max(armed[j] + 0.5 * rearmed[j] - 0.5 * count[j], 0.0);
     }
 
     // Of a histogram that need not be whole.
@@ -40,7 +48,7 @@ struct ArmedPasses {
         set(r, {histogram.data(), CountRows::Type::kDouble, r.bins}, 0);
     }
 
- private:
+    // Of the histogram that was set, with another dead time.
     void arm(const HistogramRecord& r) {
         if (r.synchronous)
             set_synchronous(r);
@@ -50,6 +58,7 @@ struct ArmedPasses {
             set_free(r);
     }
 
+ private:
     // Share of the registrations whose effect `p` period edges later still lies within the exposure (R3). From a
     // stationary start those before the exposure make up for the rest.
     static double within(const HistogramRecord& r, int64_t p) {
@@ -77,23 +86,12 @@ struct ArmedPasses {
         // Bins from `low` to `high`, for which the registration one dead time ago lies `ago` bins before, `wraps` periods
         // earlier in phase; `further`: and the bin before that in the period before.
         auto arm_bins = [&](int64_t low, int64_t high, int64_t ago, int wraps, bool further) {
-            const int64_t earlier = ago + 1 - (further ? n : 0);
             const bool inside = turns[wraps] == 0.0;
             const double weight = edge[wraps], weight2 = edge[wraps + (further ? 1 : 0)];
-            const double w = inside ? 1.0 : weight, all = inside ? 0.0 : (whole[wraps] + weight) * total;
-            const double early_weight = early * weight, late_weight = late * weight2, f_weight = f * weight2;
-            const double *h = count.data(), *upto = before.data();
-            double* __restrict const again = rearmed.data(), * __restrict const left = raw.data();
-            double* __restrict const to = armed.data();
-            for (int64_t j = low; j < high; ++j) {
-                // (R1): registrations of the preceding whole bins of the dead time
-                const double last = h[j - earlier], blind = upto[j] + all - w * upto[j - ago] + f_weight * last;
-                const double inside_bin = early_weight * h[j - ago] + late_weight * last, passed = periods - blind;
-                again[j] = inside_bin;
-                left[j] = passed;
-                const double least = h[j] - inside_bin, most = passed > least ? passed : least;
-                to[j] = most > 0.0 ? most : 0.0;  // std::max branches
-            }
+            bins_kernels().arm({count.data() + low, before.data() + low, armed.data() + low, rearmed.data() + low,
+                                raw.data() + low, high - low, ago, ago + 1 - (further ? n : 0), periods,
+                                inside ? 0.0 : (whole[wraps] + weight) * total, inside ? 1.0 : weight, early * weight,
+                                late * weight2, f * weight2});
         };
         arm_bins(0, r.shift, r.shift - n, 1, false);
         arm_bins(r.shift, r.shift + 1, r.shift, 0, true);

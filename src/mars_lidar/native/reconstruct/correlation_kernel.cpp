@@ -1,6 +1,7 @@
 // Correlation of a histogram with a short template, points side by side in the lanes.
 #include "reconstruct/correlation_kernel.h"
 
+#include <cmath>
 #include <cstring>
 
 #include "lanes/doubles.h"
@@ -21,6 +22,52 @@ void MARS_JOIN(correlate_, MARS_LEVEL)(const Correlation& of) {
         store(of.out + g, first);
         store(of.out + g + kLanes, second);
     }
+}
+
+int64_t MARS_JOIN(strongest_, MARS_LEVEL)(const WeakPulses& of) {
+    Float top = splat(-HUGE_VALF);
+    for (int64_t g = 0; g < of.points; g += kLanes) {
+        const Float expected = load<Float>(of.expected + g) * of.flat;
+        const Float ratio = (load<Float>(of.score + g) - expected) / square_root(maximum(expected, splat(1e-6f)));
+        store(of.ratio + g, ratio);
+        if (g + kLanes <= of.points) top = maximum(ratio, top);
+    }
+    float best = -HUGE_VALF;
+    for (int64_t g = of.points / kLanes * kLanes; g < of.points; ++g) best = of.ratio[g] > best ? of.ratio[g] : best;
+    float each[kLanes];
+    store(each, top);
+    for (const float x : each) best = x > best ? x : best;
+    for (int64_t g = 0; g < of.points; ++g)
+        if (of.ratio[g] == best) return g;
+    return 0;
+}
+
+int MARS_JOIN(hills_, MARS_LEVEL)(const Hills& of) {
+    float* const gain = of.gain;
+    for (int64_t g = 0; g < of.points; g += kLanes)
+        store(gain + g, load<Float>(of.score + g) - load<Float>(of.expected + g) * of.signal);
+    gain[-1] = gain[of.points - 1];
+    gain[of.points] = gain[0];
+    int number = 0;
+    float least = -HUGE_VALF;  // above which a place is one of the best
+    for (int64_t first = 0; first < of.points; first += kLanes) {
+        const Float here = load<Float>(gain + first);
+        const Mask hill =
+            (here >= load<Float>(gain + first - 1)) & (here > load<Float>(gain + first + 1)) & (here > least);
+        if (of.points > 2 && !any(hill)) continue;
+        for (int64_t g = first; g < first + kLanes && g < of.points; ++g) {
+            const float its = gain[g];
+            if (of.points > 2 && (its < gain[g - 1] || its <= gain[g + 1])) continue;
+            int place = number < of.most ? number++ : of.most;
+            while (place > 0 && gain[of.places[place - 1]] < its) {
+                if (place < of.most) of.places[place] = of.places[place - 1];
+                --place;
+            }
+            if (place < of.most) of.places[place] = g;
+            if (number == of.most) least = gain[of.places[of.most - 1]];
+        }
+    }
+    return number;
 }
 
 void MARS_JOIN(correlate_finely_, MARS_LEVEL)(const FineCorrelation& of) {

@@ -21,6 +21,27 @@ struct CorrelationOf {
 using Correlation = CorrelationOf<float>;
 using FineCorrelation = CorrelationOf<double>;
 
+// Weak pulses over a flat rate (R11): the place at which `score`, less `flat` times `expected`, is most standard deviations
+// above it. `ratio` is work space, as long as the others.
+struct WeakPulses {
+    const float *score, *expected;
+    float flat, *ratio;
+    int64_t points;
+};
+
+// Gains by a pulse of `signal` at each delay (R12), `score` less `signal` times `expected`; their local maxima round the
+// period, at most `most` of them, the best first, to `places`. `gain` has room for a whole vector before the first and
+// after the last.
+struct Hills {
+    const float *score, *expected;
+    float signal, *gain;
+    int64_t points;
+    int most;
+    int64_t* places;
+};
+
+MARS_DECLARE_KERNEL(int64_t, strongest_, const WeakPulses& of)
+MARS_DECLARE_KERNEL(int, hills_, const Hills& of)
 MARS_DECLARE_KERNEL(void, correlate_, const Correlation& of)
 MARS_DECLARE_KERNEL(void, correlate_finely_, const FineCorrelation& of)
 

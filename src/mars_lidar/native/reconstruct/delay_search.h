@@ -31,7 +31,7 @@ class DelaySearch {
         gain_.resize(energy_.size());
         score_.resize(whole);
         score2_.resize(whole);
-        z_.resize(points_);
+        work_.resize(whole + 2 * kCorrelatedTogether);
     }
 
     // Up to `most` starting values, the best first.
@@ -43,11 +43,8 @@ class DelaySearch {
         const float* const counts = in_rows(count_, shift_, step_, length_, count_rows_);
         correlate(counts, energy_.data(), score_);
         correlate(in_rows(time_, shift_, step_, length_, time_rows_), energy_.data(), score2_);
-        for (int64_t g = 0; g < points_; ++g) {
-            const double expected = flat * score2_[g];
-            z_[g] = (score_[g] - expected) / std::sqrt(std::max(expected, 1e-6));
-        }
-        const int64_t best = std::max_element(z_.begin(), z_.end()) - z_.begin();
+        float* const work = work_.data() + kCorrelatedTogether;
+        const int64_t best = strongest_({score_.data(), score2_.data(), static_cast<float>(flat), work, points_});
         // What lies inside and outside of that pulse gives S and B.
         const int64_t from = best * step_ + first_;
         double inside = 0.0, time = 0.0, weighted = 0.0;
@@ -65,21 +62,9 @@ class DelaySearch {
         // Gain of the likelihood for that S and B at every delay (R12).
         for (int64_t i = 0; i < taps; ++i) gain_[i] = static_cast<float>(std::log1p(signal * energy_[i] / back));
         correlate(counts, gain_.data(), score_);
-        for (int64_t g = 0; g < points_; ++g) score_[g] -= static_cast<float>(signal) * score2_[g];
-        int found = 0;
         std::array<int64_t, kMost> at{};
-        most = std::min(most, kMost);
-        for (int64_t g = 0; g < points_; ++g) {
-            const float here = score_[g];
-            const int64_t last = g == 0 ? points_ - 1 : g - 1, next = g + 1 == points_ ? 0 : g + 1;
-            if (points_ > 2 && (here < score_[last] || here <= score_[next])) continue;
-            int place = found < most ? found++ : most;
-            while (place > 0 && score_[at[place - 1]] < here) {
-                if (place < most) at[place] = at[place - 1];
-                --place;
-            }
-            if (place < most) at[place] = g;
-        }
+        int found = hills_({score_.data(), score2_.data(), static_cast<float>(signal), work, points_,
+                            std::min(most, kMost), at.data()});
         if (found == 0) at[found++] = best;
         for (int k = 0; k < found; ++k)
             out[k] = {signal, back * static_cast<double>(n),
@@ -101,7 +86,7 @@ class DelaySearch {
         for (int64_t j = 0; j < n; ++j) {
             const double share = r_.share(j);
             count_[j] = share > 0.0 ? static_cast<float>(passes.count[j]) : 0.0f;
-            time_[j] = static_cast<float>(share * passes.time(r_, j));
+            time_[j] = static_cast<float>(share * passes.time[j]);
         }
         for (int64_t from = n; from < end; from += n) {
             std::copy_n(count_.begin(), std::min(n, end - from), count_.begin() + from);
@@ -115,10 +100,11 @@ class DelaySearch {
 
     const HistogramRecord& r_;
     void (*correlate_)(const Correlation&) = kernel_at<const Correlation&>("", MARS_KERNELS(correlate_));
+    int64_t (*strongest_)(const WeakPulses&) = kernel_at<const WeakPulses&, int64_t>("", MARS_KERNELS(strongest_));
+    int (*hills_)(const Hills&) = kernel_at<const Hills&, int>("", MARS_KERNELS(hills_));
     int64_t first_ = 0, step_ = 1, points_ = 1, shift_ = 0;
     int64_t length_ = 1;  // of a row
-    std::vector<float> energy_, gain_, score_, score2_, count_, time_, count_rows_, time_rows_;
-    std::vector<double> z_;
+    std::vector<float> energy_, gain_, score_, score2_, count_, time_, count_rows_, time_rows_, work_;
 };
 
 }  // namespace mars

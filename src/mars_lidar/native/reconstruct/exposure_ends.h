@@ -7,7 +7,7 @@
 #include <cmath>
 #include <vector>
 
-#include "reconstruct/armed_passes.h"
+#include "reconstruct/bins.h"
 
 namespace mars {
 
@@ -61,21 +61,36 @@ class ExposureEnds {
         if (count > 0) set_choices(r, passes);
     }
 
-    // Whether bin j is one of those that `set` covers, and which.
-    bool covers(int64_t j, int64_t bins, int64_t* k) const {
-        *k = j - first + (j < first ? bins : 0);
-        return *k < length;
+    // Whether all bins of this run are covered.
+    bool covers(const HistogramRecord& r, const PulseBins& pulse) const {
+        const int64_t ahead = pulse.first - first + (pulse.first < first ? r.bins : 0);
+        return length == r.bins || ahead + pulse.bins <= length;
+    }
+    // Leaves them out of a run of bins.
+    void leave_out(const HistogramRecord& r, const PulseBins& pulse, BinRun& run) const {
+        for (int64_t i = 0, k = pulse.first - first + (pulse.first < first ? r.bins : 0); i < pulse.bins; ++i) {
+            if (k < length) run.leave_out(i);
+            if (++k == r.bins) k = 0;
+        }
     }
 
-    static double armed(const ArmedPasses& passes, int64_t j, double move) {
-        return std::max({passes.raw[j] + move, passes.count[j] - passes.rearmed[j], 0.0});
+    // The bins that are covered with a pulse at `delay`.
+    void illuminate(const HistogramRecord& r, double delay, PulseBins& pulse) const {
+        pulse.set(r, delay, low - delay, high - delay);
     }
-
-    const double* choices(int64_t k) const { return choices_.data() + k * kMost; }
+    // Their likelihood with the passes of choice c.
+    BinSums terms(int c, double signal, double flat, const PulseBins& pulse) const {
+        const int64_t padded = static_cast<int64_t>(run_.count.size());
+        return bins_kernels().terms({run_.count.data(), armed_.data() + c * padded, run_.rearmed.data(), nullptr,
+                                     pulse.energy.data(), pulse.slope.data(), run_.shares(), padded, signal, flat,
+                                     false, false, nullptr, nullptr});
+    }
 
     int count = 0;
     bool everywhere = false;       // whether the other bins share the passes: dead times above a period
     double low = 0.0, high = 0.0;  // what is covered, from within its first bin to within its last, in periods
+    // by which the passes of a bin differ from their mean, and the logarithm of its chance, with that of the ways in which
+    // the registrations can be spread over the passes
     std::array<double, kMost> shift{}, log_chance{};
 
  private:
@@ -124,17 +139,22 @@ class ExposureEnds {
         return true;
     }
 
-    // The ways in which a bin's registrations can be spread over its passes, log C(passes, h), less those of the mean.
+    // Passes of each bin, and the ways in which its registrations can be spread over them, log C(passes, h), less those of
+    // the mean.
     void set_choices(const HistogramRecord& r, const ArmedPasses& passes) {
-        choices_.assign(static_cast<size_t>(length) * kMost, 0.0);
+        run_.set(r, passes, first, length);
+        const int64_t padded = static_cast<int64_t>(run_.count.size());
+        armed_.assign(static_cast<size_t>(count * padded), 0.0);
         for (int64_t k = 0; k < length; ++k) {
             const int64_t j = (first + k) % r.bins;
-            const double h = passes.count[j], b = passes.rearmed[j];
-            if (!(h > 0.0)) continue;
-            const double mean =
-                log_choices(passes.armed[j] + b, h) + h * std::log((passes.armed[j] + 0.5 * b) / (passes.armed[j] + b));
-            for (int c = 0; c < count; ++c)
-                choices_[k * kMost + c] = log_choices(armed(passes, j, shift[c]) + b, h) - mean;
+            const double h = run_.count[k], b = run_.rearmed[k], mean = run_.armed[k], least = std::max(h - b, 0.0);
+            if (!(r.share(j) > 0.0)) continue;
+            const double ways = h > 0.0 ? log_choices(mean + b, h) + h * std::log((mean + 0.5 * b) / (mean + b)) : 0.0;
+            for (int c = 0; c < count; ++c) {
+                const double armed = std::max(passes.raw[j] + shift[c], least);
+                armed_[c * padded + k] = armed;
+                if (h > 0.0) log_chance[c] += log_choices(armed + b, h) - ways;
+            }
         }
     }
 
@@ -158,7 +178,8 @@ class ExposureEnds {
     }
 
     int64_t first = 0, length = 0;
-    std::vector<double> choices_;  // (length, kMost)
+    BinRun run_;                 // the bins that are covered
+    std::vector<double> armed_;  // (count, those bins)
 };
 
 }  // namespace mars

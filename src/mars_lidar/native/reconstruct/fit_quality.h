@@ -13,8 +13,9 @@
 #include <cstdint>
 #include <vector>
 
-#include "reconstruct/armed_passes.h"
+#include "reconstruct/bins.h"
 #include "reconstruct/solve.h"
+#include "reconstruct/sums.h"
 
 namespace mars {
 
@@ -26,44 +27,14 @@ struct QualityJob {
     const HistogramRecord &recording, &longer, &shorter, &wider;
 };
 
-// Sums of of(j), an array of `number`, over j < n: four sums side by side, which need not wait for each other.
-template <size_t number, class Of>
-std::array<double, number> sums_of(int64_t n, const Of& of) {
-    constexpr int64_t side = 4;
-    double part[number][side] = {};
-    std::array<double, number> out;
-    int64_t j = 0;
-    for (; j + side <= n; j += side)
-        for (int64_t k = 0; k < side; ++k) {
-            const std::array<double, number> each = of(j + k);
-            for (size_t i = 0; i < number; ++i) part[i][k] += each[i];
-        }
-    for (; j < n; ++j) {
-        const std::array<double, number> each = of(j);
-        for (size_t i = 0; i < number; ++i) part[i][0] += each[i];
-    }
-    for (size_t i = 0; i < number; ++i) out[i] = (part[i][0] + part[i][1]) + (part[i][2] + part[i][3]);
-    return out;
-}
-
 class FitQuality {
  public:
     explicit FitQuality(const QualityJob& job)
-        : job_(job),
-          bins_(job.recording.bins),
-          typical_(bins_),
-          other_(bins_),
-          mean_(bins_),
-          variance_(bins_),
-          slope_(bins_),
-          fired_(bins_),
-          weight_(bins_),
-          residual_(bins_),
-          change_(bins_),
-          share_(bins_),
-          moved_(bins_),
-          wider_(bins_),
-          reached_(bins_) {}
+        : job_(job), bins_(job.recording.bins), typical_(bins_), reached_(bins_) {
+        for (std::vector<double>* each : {&light_, &mean_, &variance_, &slope_, &fired_, &late_, &weight_, &residual_,
+                                          &change_, &share_, &moved_, &wider_, &raw_, &rearmed_})
+            each->resize(padded_length(bins_));
+    }
 
     // Of S, B (photons per period) and a delay in periods, NaN without a return. What too few photons tell is NaN; scores
     // in standard deviations, positive where the change would fit better.
@@ -73,13 +44,11 @@ class FitQuality {
         if (!std::isfinite(background)) return;
         const bool lit = signal > 0.0 && std::isfinite(delay);
         expect(passes, signal, background, delay);
-        double total = 0.0;
-        for (const double v : variance_) total += v;
+        const auto [total, armed] =
+            sums_of<2>(bins_, [&](int64_t j) { return std::array<double, 2>{variance_[j], passes.armed[j]}; });
         const int cells = static_cast<int>(std::min(total / kVariance, static_cast<double>(kCells)));
         if (cells < kLeastCells) return;
         const double hidden = hidden_passes(passes.total);
-        double armed = 0.0;
-        for (const double a : passes.armed) armed += a;
         if (hidden > kMostHidden * kMostHidden * armed * armed / static_cast<double>(bins_ * bins_)) return;
         int used;
         out[0] = chi_square(passes.count, total, cells, hidden, &used);
@@ -89,6 +58,8 @@ class FitQuality {
         set_law(typical_);
         set_tangent(lit, hidden);
         if (tests_dead_time()) {
+            raw_.swap(typical_.raw);
+            rearmed_.swap(typical_.rearmed);
             out[2] = dead_time_score(job_.longer);
             out[3] = dead_time_score(job_.shorter);
         }
@@ -102,6 +73,9 @@ class FitQuality {
         signal_ = signal > 0.0 && std::isfinite(delay) ? signal : 0.0;
         flat_ = background / static_cast<double>(bins_);
         if (signal_ > 0.0) set_pulse(delay);
+        std::fill_n(light_.begin(), bins_, flat_);
+        for (int64_t j = 0; j < bins_ && job_.recording.gated(); ++j) light_[j] *= job_.recording.share(j);
+        for (const int64_t j : pulse_) light_[j] += signal_ * share_[j];
         set_law(passes);
     }
     const std::vector<double>& expected() const { return mean_; }
@@ -121,57 +95,42 @@ class FitQuality {
     // decides has a mean.
     bool tests_dead_time() const { return !job_.recording.below_bin() && !job_.shorter.below_bin(); }
 
-    // Photons per period in bin j.
-    double light(int64_t j) const { return flat_ * job_.recording.share(j) + signal_ * share_[j]; }
-
-    // Mean of each bin's registrations, their variance and the mean's derivative by the bin's photons.
     void set_law(const ArmedPasses& passes) {
-        const double *armed = passes.armed.data(), *rearmed = passes.rearmed.data();
-        double *mean = mean_.data(), *variance = variance_.data(), *slope = slope_.data(), *fired = fired_.data();
-        if (job_.recording.below_bin()) {
-            for (int64_t j = 0; j < bins_; ++j) {
-                slope[j] = armed[j];
-                mean[j] = variance[j] = light(j) * armed[j];
-            }
-            return;
-        }
-        const auto set = [=](int64_t j, const Pass& pass) {
-            const Expected e(pass, armed[j], rearmed[j]);
-            const double all = armed[j] + rearmed[j];
-            mean[j] = e.mean;
-            slope[j] = e.slope;
-            fired[j] = pass.fired;
-            variance[j] = all > 0.0 ? e.mean * e.silent / all : 0.0;
+        const auto set = [&](const double* light, int64_t from, int64_t bins) {
+            bins_kernels().law({passes.armed.data() + from, passes.rearmed.data() + from, light, flat_, bins,
+                                job_.recording.below_bin(), mean_.data() + from, slope_.data() + from,
+                                variance_.data() + from, fired_.data() + from, late_.data() + from});
         };
-        const Pass flat(flat_, true);
-        for (int64_t j = 0; j < bins_; ++j) set(j, flat);
-        if (job_.recording.gated()) {
-            for (int64_t j = 0; j < bins_; ++j) set(j, Pass(light(j), true));
-        } else {
-            for (const int64_t j : pulse_) set(j, Pass(light(j), true));
-        }
+        const auto set_lit = [&](int64_t from, int64_t end) {
+            from = from / kBinsTogether * kBinsTogether;
+            set(light_.data() + from, from, padded_length(end - from));
+        };
+        if (job_.recording.gated()) return set_lit(0, bins_);
+        set(nullptr, 0, static_cast<int64_t>(light_.size()));
+        if (!(signal_ > 0.0)) return;
+        const int64_t first = pulse_bins_.first, end = first + pulse_bins_.bins;
+        set_lit(first, std::min(end, bins_));
+        if (end > bins_) set_lit(0, end - bins_);
     }
 
     // Bins that the pulse or the wider one reaches, with its energy, its slope by the delay, and what the wider one has
     // more.
     void set_pulse(double delay) {
-        const auto reach = [&](int64_t j) {
-            if (!reached_[j]) pulse_.push_back(j);
-            reached_[j] = true;
+        const auto reach = [&](const HistogramRecord& r, const auto& set) {
+            pulse_bins_.set(r, delay);
+            for (int64_t k = 0, j = pulse_bins_.first; k < pulse_bins_.bins; ++k) {
+                if (!reached_[j]) pulse_.push_back(j);
+                reached_[j] = true;
+                set(k, j);
+                if (++j == bins_) j = 0;
+            }
         };
-        const HistogramRecord& wide = job_.wider;
-        for_pulse_bins(wide, delay, wide.pulse.low, wide.pulse.low + wide.pulse.span(),
-                       [&](int64_t, int64_t j, double s, double) {
-                           reach(j);
-                           wider_[j] = s;
-                       });
-        const PulseCurve& pulse = job_.recording.pulse;
-        for_pulse_bins(job_.recording, delay, pulse.low, pulse.low + pulse.span(),
-                       [&](int64_t, int64_t j, double s, double ds) {
-                           reach(j);
-                           share_[j] = s;
-                           moved_[j] = signal_ * ds;
-                       });
+        const PulseBins& pulse = pulse_bins_;
+        reach(job_.wider, [&](int64_t k, int64_t j) { wider_[j] = pulse.energy[k]; });
+        reach(job_.recording, [&](int64_t k, int64_t j) {
+            share_[j] = pulse.energy[k];
+            moved_[j] = signal_ * pulse.slope[k];
+        });
         for (const int64_t j : pulse_) wider_[j] = signal_ * (wider_[j] - share_[j]);
     }
 
@@ -226,14 +185,9 @@ class FitQuality {
         free_[0] = free_[2] = lit;
         free_[1] = true;
         free_[3] = hidden > 0.0;
-        const double *variance = variance_.data(), *slope = slope_.data(), *fired = fired_.data();
-        double *weight = weight_.data(), *residual = residual_.data();
-        const auto [flat, along, both, passes, missed] = sums_of<5>(bins_, [=](int64_t j) {
-            const double g = slope[j], p = fired[j], w = 1.0 / std::max(variance[j], kLeastVariance);
-            weight[j] = w;
-            residual[j] *= w;
-            return std::array<double, 5>{g * g * w, g * residual[j], g * p * w, p * p * w, p * residual[j]};
-        });
+        const auto [flat, along, both, passes, missed] =
+            bins_kernels().tangent({slope_.data(), fired_.data(), variance_.data(), weight_.data(), residual_.data(),
+                                    static_cast<int64_t>(slope_.size()), kLeastVariance});
         double normal[4][4] = {}, taken[4] = {0.0, along, 0.0, missed};
         normal[1][1] = flat;
         normal[3][1] = both;
@@ -277,23 +231,10 @@ class FitQuality {
 
     // Of a histogram with another dead time: the passes of the expected histogram change, and the mean by what a pass gives.
     double dead_time_score(const HistogramRecord& recording) {
-        other_.set(recording, mean_);
-        const double *armed = typical_.raw.data(), *rearmed = typical_.rearmed.data(), *slope = slope_.data();
-        const double *armed2 = other_.raw.data(), *rearmed2 = other_.rearmed.data();
-        const double *weight = weight_.data(), *residual = residual_.data(), *fired = fired_.data();
-        double* change = change_.data();
-        const Pass flat(flat_, true);
-        for (int64_t j = 0; j < bins_; ++j)
-            change[j] = (armed2[j] - armed[j]) * flat.fired + (rearmed2[j] - rearmed[j]) * flat.q;
-        for (const int64_t j : pulse_) {
-            const Pass pass(light(j), true);
-            change[j] = (armed2[j] - armed[j]) * pass.fired + (rearmed2[j] - rearmed[j]) * pass.q;
-        }
-        const auto [along, variance, sum, passes] = sums_of<4>(bins_, [=](int64_t j) {
-            const double d = change[j], dw = d * weight[j];
-            change[j] = dw;
-            return std::array<double, 4>{slope[j] * dw, d * dw, d * residual[j], fired[j] * dw};
-        });
+        typical_.arm(recording);
+        const auto [along, variance, sum, passes] = bins_kernels().change(
+            {raw_.data(), rearmed_.data(), typical_.raw.data(), typical_.rearmed.data(), fired_.data(), late_.data(),
+             slope_.data(), weight_.data(), residual_.data(), change_.data(), static_cast<int64_t>(change_.size())});
         double own[4] = {0.0, along, 0.0, passes};
         for (const int64_t j : pulse_) {
             own[0] += share_[j] * slope_[j] * change_[j];
@@ -318,12 +259,15 @@ class FitQuality {
 
     const QualityJob job_;
     const int64_t bins_;
-    ArmedPasses typical_, other_;                     // of the expected histogram, as it was recorded and otherwise
+    ArmedPasses typical_;                             // of the expected histogram, as it was recorded and otherwise
+    std::vector<double> raw_, rearmed_;               // passes of the expected histogram as it was recorded
     double signal_ = 0.0, flat_ = 0.0;                // photons per period: S, and those of background in a bin
     std::vector<double> mean_, variance_, slope_;     // of each bin's registrations; the slope by the bin's photons
-    std::vector<double> fired_;                       // chance that an armed pass registers in the bin
+    std::vector<double> light_;                       // photons of each bin
+    std::vector<double> fired_, late_;                // chances that an armed and a re-armed pass register in the bin
     std::vector<double> weight_, residual_, change_;  // 1 / variance, weighted h - m, and what is tested
     std::vector<double> share_, moved_, wider_;       // of the pulse: s, change with delay, width; 0 but in `pulse_`
+    PulseBins pulse_bins_;
     std::vector<int64_t> pulse_;
     std::vector<uint8_t> reached_;  // (bins) whether in `pulse_`
     bool free_[4] = {};             // S, B, delay, passes that the ends hide

@@ -8,6 +8,12 @@
 
 namespace mars {
 
+// Bins that kernels take side by side at every level, so that their sums have the same bits on all of them. What they read
+// is of a multiple of it in length, with zeros at the end.
+constexpr int64_t kBinsTogether = 8;
+
+constexpr int64_t padded_length(int64_t bins) { return (bins + kBinsTogether - 1) / kBinsTogether * kBinsTogether; }
+
 // Energy of the periodic pulse train and its density, by cubic Hermite interpolation between equal knots. A pulse is
 // seldom evaluated at the same place twice, so the likelihood would otherwise spend its time in erf and exp.
 struct PulseCurve {

@@ -3,9 +3,8 @@
 #pragma once
 #include <algorithm>
 #include <cmath>
-#include <vector>
 
-#include "reconstruct/armed_passes.h"
+#include "reconstruct/bins.h"
 
 namespace mars {
 
@@ -17,21 +16,25 @@ class LikelihoodBias {
         set_bins(r, at);
         double weight[3] = {};             // sum over the bins of (R19), for each parameter
         double armed = 0.0, drop[3] = {};  // expected passes that are still armed, and their derivatives (R20)
-        for (size_t k = 0; k < bins_.size(); ++k) {
-            const Bin& bin = bins_[k];
-            const double h = passes.count[bin.j], b = passes.rearmed[bin.j];
-            if (k == 0) armed = passes.armed[bin.j];
-            if (bin.l > 0.0) add(r, bin, b, armed, drop, inverse, weight);
-            if (k + 1 == bins_.size() || r.below_bin()) {
-                if (k + 1 < bins_.size()) armed = passes.armed[bins_[k + 1].j];
-                continue;
-            }
-            // what was re-armed within the bin is as it was; what registers is what is expected
+        const double n = static_cast<double>(r.bins), bend = at[0] / (0.2 * r.width);
+        for (int64_t k = 0, j = pulse_.first; k < pulse_.bins; ++k) {
+            const int64_t next = j + 1 < r.bins ? j + 1 : 0;
+            const double flat = r.share(j) / n, s = pulse_.energy[k], ds = pulse_.slope[k];
+            const double curve =
+                bend * (k < later_.bins ? later_.slope[k] : 0.0) - bend * (k < earlier_.bins ? earlier_.slope[k] : 0.0);
+            const Bin bin{at[0] * s + at[1] * flat, {s, flat, at[0] * ds}, ds, curve};
+            const double h = passes.count[j], b = passes.rearmed[j];
+            if (k == 0 || r.below_bin()) armed = passes.armed[j];
             const Pass pass(bin.l, b != 0.0);
-            const Expected expected(pass, armed, b);
-            const double arrived = passes.raw[bins_[k + 1].j] - passes.raw[bin.j] + h;
-            for (int a = 0; a < 3; ++a) drop[a] = drop[a] * pass.quiet - expected.slope * bin.dl[a];
-            armed = std::max(armed - expected.mean + arrived, 0.0);
+            if (bin.l > 0.0) add(r, bin, pass, b, armed, drop, inverse, weight);
+            if (!r.below_bin() && k + 1 < pulse_.bins) {
+                // what was re-armed within the bin is as it was; what registers is what is expected
+                const Expected expected(pass, armed, b);
+                const double arrived = passes.raw[next] - passes.raw[j] + h;
+                for (int a = 0; a < 3; ++a) drop[a] = drop[a] * pass.quiet - expected.slope * bin.dl[a];
+                armed = std::max(armed - expected.mean + arrived, 0.0);
+            }
+            j = next;
         }
         for (int a = 0; a < 3; ++a) {
             bias[a] = 0.0;
@@ -40,34 +43,25 @@ class LikelihoodBias {
     }
 
  private:
+    // Photons of a bin, first derivatives, that by S and delay, that by delay twice.
     struct Bin {
-        int64_t j;
-        double l, dl[3], cross,
-            curve;  // photons of the bin, first derivatives, that by S and delay, that by delay twice
+        double l, dl[3], cross, curve;
     };
 
     // The bins of the pulse; second derivatives are differences, over a part of the pulse that smooths what is sampled.
     void set_bins(const HistogramRecord& r, const double* at) {
-        const double n = static_cast<double>(r.bins), signal = at[0], delay = at[2], step = 0.1 * r.width;
+        const double n = static_cast<double>(r.bins), delay = at[2], step = 0.1 * r.width;
         const double first = std::floor((delay + r.pulse.low - step) * n);
         const double last = std::ceil((delay + r.pulse.low + r.pulse.span() + step) * n);
         const double low = (first + 0.5) / n, high = (last - 0.5) / n;  // always the same bins
-        bins_.clear();
-        for_pulse_bins(r, delay, low - delay, high - delay, [&](int64_t, int64_t j, double s, double ds) {
-            const double flat = r.share(j) / n;
-            bins_.push_back({j, signal * s + at[1] * flat, {s, flat, signal * ds}, ds, 0.0});
-        });
-        for (const double side : {-1.0, 1.0}) {
-            const double there = delay + side * step;
-            for_pulse_bins(r, there, low - there, high - there, [&](int64_t k, int64_t, double, double ds) {
-                if (k < static_cast<int64_t>(bins_.size())) bins_[k].curve += side * signal * ds / (2.0 * step);
-            });
-        }
+        pulse_.set(r, delay, low - delay, high - delay);
+        earlier_.set(r, delay - step, low - delay + step, high - delay + step);
+        later_.set(r, delay + step, low - delay - step, high - delay - step);
     }
 
     // (R19) of one bin.
-    static void add(const HistogramRecord& r, const Bin& bin, double rearmed, double armed, const double* drop,
-                    const double inverse[3][3], double* weight) {
+    static void add(const HistogramRecord& r, const Bin& bin, const Pass& pass, double rearmed, double armed,
+                    const double* drop, const double inverse[3][3], double* weight) {
         double spread = 0.0, along = 0.0;  // dl' J dl, and drop' J dl
         for (int a = 0; a < 3; ++a)
             for (int c = 0; c < 3; ++c) {
@@ -80,13 +74,13 @@ class LikelihoodBias {
             per_pass = 1.0 / bin.l;
             v = 0.5 * armed * bend;
         } else {
-            per_pass = std::exp(-bin.l) / -std::expm1(-bin.l);
+            per_pass = pass.quiet / pass.fired;
             v = 0.5 * (armed + 0.5 * rearmed) * (bend - spread) + along;
         }
         for (int a = 0; a < 3; ++a) weight[a] += per_pass * v * bin.dl[a];
     }
 
-    std::vector<Bin> bins_;
+    PulseBins pulse_, earlier_, later_;  // at the delay and a step before and after it
 };
 
 }  // namespace mars

@@ -3,8 +3,10 @@
 // from several delays, compares with no signal at all, and takes off the first-order bias where that is asked for.
 #pragma once
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <cstdint>
+#include <vector>
 
 #include "reconstruct/delay_search.h"
 #include "reconstruct/likelihood_bias.h"
@@ -23,9 +25,9 @@ constexpr int kMostSteps = 80;        // of a climb; most end within ten
 constexpr double kGain = 5e-7;        // of the log likelihood that a further step promises: 1e-3 of a standard error
 constexpr double kMostPhotons = 1e4;  // per period: a bound on S and on B
 constexpr int kMostTurns = 20;        // of the search around a maximum of a likelihood with kinks; most end after two
-constexpr double kStarts = 4.0;       // of it, in a bin or a standard error
-constexpr double kReach = 4.0;        // of it, standard errors
-constexpr double kPart = 0.4;         // step of the profile of the delay, in standard errors where it stands
+constexpr double kSteps = 4.0;        // of the profile of the delay, in a bin or a standard error
+constexpr double kPart = 0.4;         // of it, at most, in standard errors where it stands
+constexpr int kDepth = 3;             // halvings of a step of it in which a kink is looked for
 constexpr double kFallen = 1e-4;      // of the likelihood of the maximum: nothing
 constexpr double kUniform = 0.28867513459481287;  // standard deviation of the uniform law on a unit interval
 constexpr double kRootTwoPi = 2.5066282746310002;
@@ -59,12 +61,13 @@ struct Terrain {
 
 // Fisher scoring with Levenberg's damping: a step is taken if the likelihood does not fall. S >= 0 and B >= least. A
 // climb is given up where several times the gain that its next step promises would not make it the best.
-inline Fit climb(const PixelLikelihood& pixel, const double* start, bool with_signal, const Terrain& terrain) {
+inline Fit climb(PixelLikelihood& pixel, const double* start, bool with_signal, const Terrain& terrain) {
     const double least = terrain.least, farthest = terrain.farthest;
     Fit fit;
     std::copy(start, start + 3, fit.at);
     fit.likelihood = pixel(fit.at[0], fit.at[1], fit.at[2], *terrain.ends);
     double damping = 1e-3;
+    int idle = 0;  // steps that rose by less than `kGain`, as along a kink
     for (int step = 0; step < kMostSteps; ++step) {
         const Likelihood& now = fit.likelihood;
         fit.free[0] = with_signal && (fit.at[0] > 0.0 || now.gradient[0] > 0.0) &&
@@ -102,10 +105,15 @@ inline Fit climb(const PixelLikelihood& pixel, const double* start, bool with_si
                     after += there.gradient[k] * (next[k] - fit.at[k]);
                 }
                 if (after < -0.5 * before) damping = std::max(damping, 8.0);  // far over the top: shorter from here
+                idle = there.value < now.value + kGain ? idle + 1 : 0;
                 std::copy(next, next + 3, fit.at);
                 fit.likelihood = there;
                 better = true;
             }
+        }
+        if (idle == 2) {
+            fit.converged = true;
+            return fit;
         }
         if (!better) {  // no further digit to be had
             fit.converged = damping > 1e3;
@@ -126,13 +134,14 @@ struct Profile {
 class Maximizer {
  public:
     Maximizer(const HistogramRecord& recording, const ReconstructionJob& job)
-        : r_(recording), job_(job), passes_(recording.bins), search_(recording) {}
+        : r_(recording), job_(job), passes_(recording.bins), likelihood_(recording), search_(recording) {}
 
     // Signal, background, delay, their standard errors, twice the gain of the log likelihood by the signal, and its
     // value.
     void operator()(const CountRows& histograms, int64_t row, double* out, uint8_t* flag) {
         passes_.set(r_, histograms, row);
-        PixelLikelihood pixel(r_, passes_);
+        PixelLikelihood& pixel = likelihood_;
+        pixel.set(passes_);
         for (int k = 0; k < kMaximumColumns; ++k) out[k] = NAN;
         *flag = 0;
         if (!(pixel.count() > 0.0) || !(pixel.time() > 0.0)) {
@@ -153,7 +162,7 @@ class Maximizer {
         Terrain terrain{least, farthest, narrow, -HUGE_VAL, &ends_};
         double brightest = flat;
         for (int k = 0; k < found; ++k) brightest = std::max(brightest, starts[k].background);
-        pixel.expect(brightest, series_);
+        pixel.expect(brightest);
         for (int k = 0; k < found; ++k) {
             const double at[3] = {std::min(starts[k].signal, kMostPhotons),
                                   std::clamp(starts[k].background, least, kMostPhotons), starts[k].delay};
@@ -166,9 +175,9 @@ class Maximizer {
         Profile profile;
         bool within = false;
         if (best.at[0] > 0.0) {
-            if (r_.sample > 0.0) look_around(pixel, terrain, best);
+            if (r_.sample > 0.0) profile = look_around(pixel, terrain, best);
             within = narrow && within_bin(pixel, terrain, best);
-            if (r_.sample > 0.0 && !within) profile = profile_of(pixel, terrain, best);
+            if (r_.sample > 0.0 && narrow) profile = within ? Profile() : profile_of(pixel, terrain, best);
         }
         terrain.best = -HUGE_VAL;
         const double dark[3] = {0.0, flat, best.at[2]};
@@ -198,7 +207,7 @@ class Maximizer {
     // Of a pulse narrower than half a bin. Both bins at an edge have signal only near it: climbs from the edges of the bin.
     // Whether the delay is then anywhere within a bin, uniformly: where the likelihood of delays in its middle, in which it
     // hardly changes, times the bin is more than the likelihood of the maximum times its width. The best is the middle then.
-    bool within_bin(const PixelLikelihood& pixel, Terrain& terrain, Fit& best) {
+    bool within_bin(PixelLikelihood& pixel, Terrain& terrain, Fit& best) {
         const double n = static_cast<double>(r_.bins), first = std::floor((best.at[2] + r_.peak) * n);
         for (const double edge : {first, first + 1.0}) {
             const double at[3] = {best.at[0], best.at[1], edge / n - r_.peak};
@@ -233,30 +242,46 @@ class Maximizer {
     }
 
     // Light of a sampled pulse is constant over a sample, so that the slope of the likelihood jumps at delays at which an
-    // edge of a bin meets one of a sample: between any two may be a maximum. Climbs from either side of the best, until
-    // none within some standard errors and as far as these edges recur is better.
-    void look_around(const PixelLikelihood& pixel, Terrain& terrain, Fit& best) {
-        const double bin = 1.0 / static_cast<double>(r_.bins), recurs = bin + r_.sample;
+    // edge of a bin meets one of a sample: between any two may be a maximum. Where its profile around the best may rise
+    // above it, climbs begin, until none is better; returns the profile.
+    Profile look_around(PixelLikelihood& pixel, Terrain& terrain, Fit& best) {
+        Profile out;
         for (int turn = 0; turn < kMostTurns; ++turn) {
             const double centre[3] = {best.at[0], best.at[1], best.at[2]};
             ends_.set(r_, passes_, centre[2]);
             best = climb(pixel, centre, true, {terrain.least, terrain.farthest, terrain.narrow, -HUGE_VAL, &ends_});
-            terrain.best = best.likelihood.value;
-            const double before = terrain.best, error = error_of_delay(best);
-            const double step = std::min(std::max(bin, error), recurs) / kStarts;
-            const int steps = static_cast<int>((recurs + kReach * std::min(error, r_.width)) / step) + 1;
-            for (int k = -steps; k <= steps; ++k) {
-                const double at[3] = {centre[0], centre[1], centre[2] + k * step};
-                const Fit fit = climb(pixel, at, true, terrain);
+            const double before = terrain.best = best.likelihood.value;
+            out = profile_of(pixel, terrain, best);
+            for (const auto& at : higher_) {
+                const Fit fit = climb(pixel, at.data(), true, terrain);
                 if (!(fit.likelihood.value > terrain.best)) continue;
                 best = fit;
                 terrain.best = fit.likelihood.value;
             }
-            if (!(terrain.best > before + kGain)) {
-                best.converged = true;  // a climb may creep along a kink
-                return;
-            }
+            if (!(terrain.best > before + kGain)) break;
         }
+        best.converged = true;  // a climb may creep along a kink
+        return out;
+    }
+
+    // Where between two points of the profile it is above `top`, or may be: where its tangents at both meet. A kink is
+    // there itself, which one more point tells.
+    void look_between(PixelLikelihood& pixel, const Terrain& terrain, const bool* free, const Fit& from, const Fit& to,
+                      double top, int depth) {
+        const double step = to.at[2] - from.at[2], rise = from.likelihood.gradient[2], fall = to.likelihood.gradient[2];
+        const double low = from.likelihood.value, high = to.likelihood.value;
+        const Fit& end = low > high ? from : to;
+        if (end.likelihood.value > top) return higher_.push_back({end.at[0], end.at[1], end.at[2]});
+        if (!(rise * step > 0.0 && fall * step < 0.0)) return;
+        const double x = (high - low - fall * step) / (rise - fall);
+        if (!(low + rise * x > top)) return;
+        Fit middle = end;
+        middle.at[2] = from.at[2] + x;
+        settle(pixel, terrain.least, free, middle);
+        if (depth == 0 || middle.likelihood.value > top)
+            return higher_.push_back({middle.at[0], middle.at[1], middle.at[2]});
+        look_between(pixel, terrain, free, from, middle, top, depth - 1);
+        look_between(pixel, terrain, free, middle, to, top, depth - 1);
     }
 
     static double error_of_delay(const Fit& fit) {
@@ -267,27 +292,31 @@ class Maximizer {
     }
 
     // Outwards from the best until the likelihood has fallen for good; by the trapezoidal rule.
-    Profile profile_of(const PixelLikelihood& pixel, const Terrain& terrain, const Fit& best) {
+    Profile profile_of(PixelLikelihood& pixel, const Terrain& terrain, const Fit& best) {
         Profile out;
         const double bin = 1.0 / static_cast<double>(r_.bins), recurs = bin + r_.sample;
-        const double most = std::max(bin, error_of_delay(best)) / kStarts;
+        const double most = std::max(bin, error_of_delay(best)) / kSteps;
         bool free[3] = {best.free[0], best.free[1], false};
         double known[3][3], spread[3][3];
         known_information(best.likelihood, free, known);
+        higher_.clear();
         if (!best.free[2] || !inverse<3>(known, free, spread)) return out;
         for (int k = 0; k < 2; ++k) out.alone[k] = spread[k][k];
         for (const double side : {-1.0, 1.0}) {
             Fit at = best;
             double weight = 1.0, fallen = 0.0, step = most;
             while (std::fabs(at.at[2] - best.at[2]) < 0.5 && fallen < recurs) {
-                const double curvature = at.likelihood.information[2][2];
                 step = std::min(most, 1.5 * step);
-                if (curvature > 0.0) step = std::min(step, kPart / std::sqrt(curvature));
-                step = std::max(step, 1e-3 * most);
+                if (fallen == 0.0) step = std::min(step, part_of(at, most));
                 Fit next = at;
                 next.at[2] += side * step;
                 settle(pixel, terrain.least, free, next);
                 const double its = std::exp(std::min(next.likelihood.value - best.likelihood.value, 1.0));
+                if (fallen > 0.0 && its > kFallen && step > part_of(next, most)) {  // it rises again: finer
+                    step *= 0.25;
+                    continue;
+                }
+                look_between(pixel, terrain, free, at, next, best.likelihood.value + kGain, kDepth);
                 out.weight += 0.5 * step * (weight + its);
                 for (int k = 0; k < 3; ++k) {
                     const double here = at.at[k] - best.at[k], there = next.at[k] - best.at[k];
@@ -301,8 +330,14 @@ class Maximizer {
         return out;
     }
 
+    // The step of the profile where it stands, of `most`.
+    static double part_of(const Fit& fit, double most) {
+        const double curvature = fit.likelihood.information[2][2];
+        return std::clamp(curvature > 0.0 ? kPart / std::sqrt(curvature) : most, 1e-3 * most, most);
+    }
+
     // One step of scoring of S and B where the delay is.
-    void settle(const PixelLikelihood& pixel, double least, const bool* free, Fit& fit) const {
+    void settle(PixelLikelihood& pixel, double least, const bool* free, Fit& fit) const {
         double known[3][3], move[3];
         fit.likelihood = pixel(fit.at[0], fit.at[1], fit.at[2], ends_);
         known_information(fit.likelihood, free, known);
@@ -317,11 +352,12 @@ class Maximizer {
     }
 
     // Takes off the first-order bias of the maximum, at most a standard error of it, and of S never more than S.
-    void correct(const PixelLikelihood& pixel, double least, Fit& fit) {
+    void correct(PixelLikelihood& pixel, double least, Fit& fit) {
         double known[3][3], spread[3][3], bias[3];
         if (!fit.free[0] || !fit.free[1] || !fit.free[2]) return;
         known_information(fit.likelihood, fit.free, known);
-        if (!inverse<3>(known, fit.free, spread)) return;
+        const bool free[3] = {true, true, r_.sample == 0.0};  // the second derivative by the delay has kinks
+        if (!inverse<3>(known, free, spread)) return;
         bias_(r_, passes_, fit.at, spread, bias);
         double next[3];
         for (int k = 0; k < 3; ++k) {
@@ -329,7 +365,6 @@ class Maximizer {
             const double most = std::sqrt(spread[k][k]);
             next[k] = fit.at[k] - std::clamp(bias[k], -most, most);
         }
-        if (r_.sample > 0.0) next[2] = fit.at[2];  // no second derivative at a kink
         if (bias[0] > 0.0) next[0] = fit.at[0] / (1.0 + bias[0] / fit.at[0]);
         next[1] = std::max(next[1], least);
         const Likelihood there = pixel(next[0], next[1], next[2], ends_);
@@ -339,7 +374,7 @@ class Maximizer {
 
     // Standard errors: roots of the diagonal of the inverse information; NaN for what lies on its bound. Where that is B,
     // the others move with what it may be above: its likelihood there, the others at their maximum, is a truncated normal.
-    void errors(const PixelLikelihood& pixel, double least, const Fit& fit, double* out) const {
+    void errors(PixelLikelihood& pixel, double least, const Fit& fit, double* out) const {
         double known[3][3];
         known_information(fit.likelihood, fit.free, known);
         for (int k = 0; k < 3; ++k) {
@@ -373,9 +408,10 @@ class Maximizer {
     const HistogramRecord& r_;
     const ReconstructionJob& job_;
     ArmedPasses passes_;
+    PixelLikelihood likelihood_;
     DelaySearch search_;
     ExposureEnds ends_;
-    BackgroundSeries series_;
     LikelihoodBias bias_;
+    std::vector<std::array<double, 3>> higher_;  // where a climb may end above the best
 };
 }  // namespace mars

@@ -5,7 +5,6 @@
 #include <vector>
 
 #include "reconstruct/background_series.h"
-#include "reconstruct/bin_term.h"
 #include "reconstruct/exposure_ends.h"
 
 namespace mars {
@@ -17,96 +16,82 @@ struct Likelihood {
     double information[3][3] = {};  // Fisher's, at the passes that were
     double hidden[3][3] = {};       // what of it is lost because the ends of the exposure are not known
 
+    // A term of the background alone.
     void add(double score, double info, const double* dl) {
         for (int a = 0; a < 3; ++a) {
             gradient[a] += score * dl[a];
             for (int b = 0; b <= a; ++b) information[a][b] = information[b][a] += info * dl[a] * dl[b];
         }
     }
+
+    void add(const BinSums& sums, const double* scale) {
+        value += sums.value;
+        for (int a = 0, k = 0; a < 3; ++a) {
+            gradient[a] += scale[a] * sums.score[a];
+            for (int b = 0; b <= a; ++b, ++k)
+                information[a][b] = information[b][a] += scale[a] * scale[b] * sums.info[k];
+        }
+    }
 };
 
-// One pixel's likelihood. Bins that the pulse reaches are added up one by one, each as a binomial law of the passes in
-// which the pixel was armed; those of background alone enter by their sums (R10).
+// The likelihood of one histogram after another. Bins that the pulse reaches are added up one by one, each as a binomial
+// law of the passes in which the pixel was armed; those of background alone enter by their sums (R10).
 class PixelLikelihood {
  public:
     // Where a bin of background alone holds more than this many photons, their sum does not suffice (it neglects
     // l^2 / 12): a series takes its place, and beyond the reach of that all bins are treated as those of the pulse are.
     static constexpr double kDim = 0.005;
 
-    PixelLikelihood(const HistogramRecord& recording, const ArmedPasses& passes) : r_(recording), passes_(passes) {
-        for (int64_t j = 0; j < r_.bins; ++j) {
-            const double share = r_.share(j);
-            if (share <= 0.0) continue;
-            count_ += passes_.count[j];
-            shares_of_bins_ += share;
-            time_ += share * passes_.time(r_, j);
-            if (r_.gated()) shares_ += passes_.count[j] * std::log(share);
-        }
+    explicit PixelLikelihood(const HistogramRecord& recording) : r_(recording) {}
+
+    void set(const ArmedPasses& passes) {
+        passes_ = &passes;
+        all_ = sums(0, r_.bins);
+        whole_ = expanded_ = false;
     }
 
     // To be told before the first evaluation: a background that is not above 1 or 2 times this, per period.
-    void expect(double background, BackgroundSeries& series) {
+    void expect(double background) {
         const double flat = background / static_cast<double>(r_.bins);
         whole_ = flat > BackgroundSeries::kMost;
-        series_ = nullptr;
-        if (flat > kDim && !whole_) {
-            series.set(r_, passes_);
-            series_ = &series;
-        }
+        expanded_ = flat > kDim && !whole_;
+        if (!expanded_) return;
+        run_.set(r_, *passes_, 0, r_.bins);
+        series_.set(r_, run_);
     }
 
-    double count() const { return count_; }  // registrations of the open bins
-    double time() const { return time_; }    // their armed time, bins x periods
+    double count() const { return all_.count; }  // registrations of the open bins
+    double time() const { return all_.time; }    // their armed time, bins x periods
 
     // With `ends`, mixed over what they leave of the bins that these cover. `whole`: bin by bin round the period.
     Likelihood operator()(double signal, double background, double delay, const ExposureEnds& ends,
-                          bool whole = false) const {
+                          bool whole = false) {
         Likelihood out;
-        std::vector<Likelihood> each(ends.count);
-        const double flat = background / static_cast<double>(r_.bins);
-        whole = whole || whole_ || (series_ && flat > 2.0 * BackgroundSeries::kMost);
+        const double n = static_cast<double>(r_.bins), flat = background / n, scale[3] = {1.0, 1.0 / n, signal};
+        whole = whole || whole_ || (expanded_ && flat > 2.0 * BackgroundSeries::kMost);
         double low = r_.pulse.low, high = low + (whole ? 1.0 : r_.pulse.span());
         if (ends.count > 0 && !whole) {  // always the same bins, or the mixture would jump where the pulse leaves one
             low = std::min(low, ends.low - delay);
             high = std::max(high, ends.high - delay);
         }
-        int64_t first = 0, seen = 0;
-        double count = count_, time = time_, shares = shares_, bins = shares_of_bins_;
-        for_pulse_bins(r_, delay, low, high, [&](int64_t i, int64_t j, double s, double ds) {
-            if (i == 0) first = j;
-            seen = i + 1;
-            const double share = r_.share(j);
-            if (share <= 0.0) return;
-            const double h = passes_.count[j];
-            count -= h;
-            time -= share * passes_.time(r_, j);
-            bins -= share;
-            if (r_.gated()) shares -= h * std::log(share);
-            const double l = signal * s + flat * share;
-            const double dl[3] = {s, share / static_cast<double>(r_.bins), signal * ds};
-            int64_t k;
-            if (ends.count == 0 || !ends.covers(j, r_.bins, &k)) {
-                add(out, bin_term(r_, h, passes_.armed[j], passes_.rearmed[j], l), dl);
-                return;
-            }
-            const Pass pass(l, passes_.rearmed[j] != 0.0);
-            const double* choices = ends.choices(k);
-            for (int c = 0; c < ends.count; ++c) {
-                const double armed = ExposureEnds::armed(passes_, j, ends.shift[c]),
-                             quiet = armed + passes_.rearmed[j] - h;
-                if (!(armed + passes_.rearmed[j] > 1e-9)) continue;
-                const Expected e(pass, armed, passes_.rearmed[j]);
-                const double share_of_pass = 1.0 / (armed + passes_.rearmed[j]);
-                add(each[c], passed_term(h, quiet, e, share_of_pass, share_of_pass), dl);
-                each[c].value += choices[c];
-            }
-        });
+        pulse_.set(r_, delay, low, high);
+        const OpenSums pulsed = sums(pulse_.first, pulse_.bins);
+        const double count = std::max(all_.count - pulsed.count, 0.0), time = all_.time - pulsed.time;
+        const double shares = all_.log_shares - pulsed.log_shares, bins = all_.bins - pulsed.bins;
+        if (ends.count == 0 || !ends.covers(r_, pulse_)) {
+            run_.set(r_, *passes_, pulse_.first, pulse_.bins);
+            if (ends.count > 0) ends.leave_out(r_, pulse_, run_);
+            out.add(bins_kernels().terms({run_.count.data(), run_.armed.data(), run_.rearmed.data(), nullptr,
+                                          pulse_.energy.data(), pulse_.slope.data(), run_.shares(),
+                                          static_cast<int64_t>(run_.count.size()), signal, flat, r_.below_bin(), true,
+                                          nullptr, nullptr}),
+                    scale);
+        }
         if (!whole && time > 0.0) {  // (R10)
-            const double dl[3] = {0.0, 1.0 / static_cast<double>(r_.bins), 0.0};
-            count = std::max(count, 0.0);
+            const double dl[3] = {0.0, 1.0 / n, 0.0};
             double sum = -flat * time, slope = -time, curve = -time / flat;
-            if (series_) {
-                const BackgroundSeries::Terms terms = series_->without(first, seen);
+            if (expanded_) {
+                const BackgroundSeries::Terms terms = series_.without(pulse_.first, pulse_.bins);
                 sum = slope = curve = 0.0;
                 for (int k = BackgroundSeries::kOrder; k > 0; --k) {
                     curve = curve * flat + k * (k - 1) * terms[k - 1];
@@ -119,21 +104,28 @@ class PixelLikelihood {
             out.add(count / flat + slope, -curve, dl);
         }
         if (ends.count > 0) {
-            // a pass more in each bin outside, which registers as those that are counted
-            for (int c = 0; c < ends.count && ends.everywhere && !whole && time > 0.0; ++c) {
+            ends.illuminate(r_, delay, pulse_);
+            each_.assign(ends.count, {});
+            for (int c = 0; c < ends.count; ++c) {
+                each_[c].add(ends.terms(c, signal, flat, pulse_), scale);
+                if (!ends.everywhere || whole || !(time > 0.0)) continue;
+                // a pass more in each bin outside, which registers as those that are counted
                 const double moved = ends.shift[c] * std::max(bins, 0.0);
-                each[c].value += std::max(count, 0.0) * std::log(std::max(1.0 + moved / time, 1e-9)) - flat * moved;
-                each[c].gradient[1] -= moved / static_cast<double>(r_.bins);
+                each_[c].value += count * std::log(std::max(1.0 + moved / time, 1e-9)) - flat * moved;
+                each_[c].gradient[1] -= moved / n;
             }
-            mix(out, each.data(), ends);
+            mix(out, each_.data(), ends);
         }
         return out;
     }
 
  private:
-    static void add(Likelihood& out, const BinTerm& term, const double* dl) {
-        out.value += term.value;
-        out.add(term.score, term.info, dl);
+    // Of `bins` bins from `first` on round the period.
+    OpenSums sums(int64_t first, int64_t bins) const {
+        const int64_t straight = std::min(bins, r_.bins - first);
+        OpenSums out = open_sums(r_, *passes_, first, straight);
+        if (straight < bins) out.add(open_sums(r_, *passes_, 0, bins - straight));
+        return out;
     }
 
     // Adds the mixture of `each` (R9a): gradient and information are means over what is likely.
@@ -158,10 +150,13 @@ class PixelLikelihood {
     }
 
     const HistogramRecord& r_;
-    const ArmedPasses& passes_;
-    double count_ = 0.0, time_ = 0.0, shares_ = 0.0, shares_of_bins_ = 0.0;
-    const BackgroundSeries* series_ = nullptr;
-    bool whole_ = false;
+    const ArmedPasses* passes_ = nullptr;
+    OpenSums all_;
+    PulseBins pulse_;
+    BinRun run_;
+    std::vector<Likelihood> each_;
+    BackgroundSeries series_;
+    bool whole_ = false, expanded_ = false;  // every bin as those of the pulse; background alone by the series
 };
 
 }  // namespace mars

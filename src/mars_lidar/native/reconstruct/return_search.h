@@ -31,6 +31,7 @@ class ReturnSearch {
         points_ = (r_.bins + step_ - 1) / step_;  // the last step may be a shorter one
         place_.resize(points_ + 1);
         for (int64_t g = 0; g <= points_; ++g) place_[g] = std::min(g * step_, r_.bins);
+        for (std::vector<double>* each : {&score_at_, &variance_, &beside_}) each->resize(padded());
         for (const double s : energy_) squared_.push_back(s * s);
         shifted_.assign(energy_.size(), 0.0);
         for (size_t i = static_cast<size_t>(step_); i < energy_.size(); ++i)
@@ -44,33 +45,34 @@ class ReturnSearch {
         bool free[kUnknowns] = {};
         for (int a = 0; a < unknowns; ++a) free[a] = point.information[a][a] > 0.0;
         double spread[kUnknowns][kUnknowns];
-        if (!inverse<kUnknowns>(point.information, free, spread)) return false;
+        if (!inverse<kUnknowns>(point.information, free, spread, unknowns)) return false;
         extend(score_, [&](int64_t j) { return likelihood.score()[j]; });
         extend(info_, [&](int64_t j) { return likelihood.info()[j] * r_.share(j); });
-        nuisance_.resize(unknowns);
+        along_.resize(unknowns * padded());
+        left_.assign(unknowns * padded(), 0.0);
+        correlate(energy_, score_, score_at_.data());
+        correlate(squared_, info_, variance_.data());
+        correlate(shifted_, info_, beside_.data());
         for (int a = 0; a < unknowns; ++a) {
             const int k = (a - 1) / 2;
             const double* by = a == 0 ? nullptr : a % 2 == 1 ? likelihood.energy(k) : likelihood.slope(k);
             const double scale = a == 0 ? 1.0 / static_cast<double>(r_.bins) : a % 2 == 1 ? 1.0 : point.at[a - 1];
-            extend(nuisance_[a], [&](int64_t j) { return scale * (by ? by[j] : r_.share(j)) * likelihood.info()[j]; });
+            extend(nuisance_, [&](int64_t j) { return scale * (by ? by[j] : r_.share(j)) * likelihood.info()[j]; });
+            correlate(energy_, nuisance_, &along_[a * padded()], a == 0 ? nullptr : &likelihood.pulse(k));
         }
-        along_.resize(points_ * kUnknowns);
-        left_.assign(points_ * kUnknowns, 0.0);
-        correlate(energy_, score_, score_at_);
-        correlate(squared_, info_, variance_);
-        correlate(shifted_, info_, beside_);
+        known_.assign(points_, 0.0);
         for (int a = 0; a < unknowns; ++a) {
-            correlate(energy_, nuisance_[a], one_along_);
-            for (int64_t g = 0; g < points_; ++g) along_[g * kUnknowns + a] = one_along_[g];
+            const double* along = &along_[a * padded()];
+            double *left = &left_[a * padded()], *known = known_.data();
+            for (int b = 0; b < unknowns; ++b) {
+                const double *other = &along_[b * padded()], its = spread[a][b];
+                for (int64_t g = 0; g < points_; ++g) left[g] += its * other[g];
+            }
+            for (int64_t g = 0; g < points_; ++g) known[g] += left[g] * along[g];
         }
         for (int64_t g = 0; g < points_; ++g) {
-            double *along = &along_[g * kUnknowns], *left = &left_[g * kUnknowns], known = 0.0;
-            for (int a = 0; a < unknowns; ++a) {
-                for (int b = 0; b < unknowns; ++b) left[a] += spread[a][b] * along[b];
-                known += left[a] * along[a];
-            }
-            const double all = variance_[g];
-            variance_[g] = all - known > kResolved * all ? all - known : 0.0;
+            const double rest = variance_[g] - known_[g];
+            variance_[g] = rest > kResolved * variance_[g] ? rest : 0.0;
         }
         measure(unknowns);
         collect(hints);
@@ -97,6 +99,7 @@ class ReturnSearch {
     static constexpr double kPi = 3.14159265358979323846;
     // share of the score's variance that is left at a delay, below which a return there is one of those that there are
     static constexpr double kResolved = 1e-7;
+    static constexpr double kRounding = 0x1p-53;  // of doubles
 
     int64_t start(int64_t g) const { return shift() + place_[g]; }
     int64_t shift() const { return ((first_ % r_.bins) + r_.bins) % r_.bins; }
@@ -111,13 +114,26 @@ class ReturnSearch {
             std::copy_n(out.begin(), std::min(n, end - from), out.begin() + from);
     }
 
-    // out[g] = sum over i of weights[i] values[start(g) + i].
-    void correlate(const std::vector<double>& weights, const std::vector<double>& values, std::vector<double>& out) {
-        const int64_t taps = static_cast<int64_t>(weights.size());
-        out.resize(correlated_points(points_));
-        const double* const rows = in_rows(values, shift(), step_, length_of_rows(), rows_);
-        correlate_({rows, weights.data(), length_of_rows(), taps, points_, step_, out.data()});
+    // out[g] = sum over i of weights[i] values[start(g) + i], the values 0 outside of the bins `of`, where those are given.
+    void correlate(const std::vector<double>& weights, const std::vector<double>& values, double* out,
+                   const PulseBins* of = nullptr) {
+        const int64_t n = r_.bins;
+        int64_t taps = static_cast<int64_t>(weights.size()), lead = 0;  // those that are lost in rounding left out
+        const double least = kRounding * *std::max_element(weights.begin(), weights.end());
+        while (taps > 1 && weights[taps - 1] < least) --taps;
+        while (lead + step_ < taps && weights[lead + step_ - 1] < least) lead += step_;
+        const double* const rows = in_rows(values, shift(), step_, length_of_rows(), rows_) + lead / step_;
+        const double* const from = weights.data() + lead;
+        if (!of) return correlate_({rows, from, length_of_rows(), taps - lead, points_, step_, out});
+        std::fill_n(out, padded(), 0.0);
+        for (int64_t g = 0; g < points_; g += kCorrelatedTogether) {
+            const int64_t points = std::min(kCorrelatedTogether, points_ - g),
+                          ahead = (of->first - start(g) + 2 * n) % n;
+            if (ahead < (points - 1) * step_ + taps || (n - ahead) % n < of->bins)
+                correlate_({rows + g, from, length_of_rows(), taps - lead, points, step_, out + g});
+        }
     }
+    int64_t padded() const { return correlated_points(points_); }
     int64_t length_of_rows() const { return correlated_length(points_, static_cast<int64_t>(energy_.size()), step_); }
 
     // The angle of a cosine. Neighbouring directions differ little: a series there, to 1e-9.
@@ -139,7 +155,7 @@ class ReturnSearch {
                 const int64_t from = start(g);
                 for (int64_t i = apart; i < taps; ++i) both += energy_[i] * energy_[i - apart] * info_[from + i];
             }
-            for (int a = 0; a < unknowns; ++a) both -= along_[g * kUnknowns + a] * left_[h * kUnknowns + a];
+            for (int a = 0; a < unknowns; ++a) both -= along_[a * padded() + g] * left_[a * padded() + h];
             return angle_of(both / std::sqrt(variance_[g] * variance_[h]));
         };
         for (int64_t g = 0; g < points_; ++g) {
@@ -174,8 +190,7 @@ class ReturnSearch {
     double length_ = 0.0;
     std::vector<int64_t> place_;             // (points + 1) bins
     std::vector<double> squared_, shifted_;  // of the energy: its square, and times itself a step before
-    std::vector<double> energy_, score_, info_, score_at_, variance_, beside_, along_, left_, one_along_, rows_;
-    std::vector<std::vector<double>> nuisance_;
+    std::vector<double> energy_, score_, info_, score_at_, variance_, beside_, along_, left_, known_, nuisance_, rows_;
 };
 
 }  // namespace mars

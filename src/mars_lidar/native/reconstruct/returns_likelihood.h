@@ -6,8 +6,7 @@
 #include <cstdint>
 #include <vector>
 
-#include "reconstruct/bin_term.h"
-#include "reconstruct/histogram_record.h"
+#include "reconstruct/bins.h"
 
 namespace mars {
 
@@ -33,151 +32,163 @@ class ReturnsLikelihood {
 
     explicit ReturnsLikelihood(const HistogramRecord& recording)
         : r_(recording),
-          rate_(recording.bins),
-          score_(recording.bins),
-          info_(recording.bins),
-          seen_(recording.bins),
-          energy_(kMostReturns * recording.bins),
-          slope_(kMostReturns * recording.bins) {}
+          length_(padded_length(recording.bins)),
+          light_(length_),
+          score_(length_),
+          info_(length_),
+          energy_(kMostReturns * length_),
+          slope_(kMostReturns * length_),
+          reached_(length_ / kBinsTogether) {}
 
     // The histogram; to be called before anything else.
     void set(const ArmedPasses& passes) {
         passes_ = &passes;
-        count_ = time_ = shares_ = 0.0;
-        for (int64_t j = 0; j < r_.bins; ++j) {
-            const double share = r_.share(j);
-            if (share <= 0.0) continue;
-            count_ += passes.count[j];
-            time_ += share * passes.time(r_, j);
-            if (r_.gated()) shares_ += passes.count[j] * std::log(share);
-        }
+        run_.set(r_, passes, 0, r_.bins);
+        all_ = open_sums(r_, passes, 0, r_.bins);
     }
 
     // Value, gradient and information at `point.at`.
-    void operator()(ReturnsPoint& point) { evaluate<true>(point, false); }
+    void operator()(ReturnsPoint& point) { evaluate(point, false); }
 
-    // Gradient and information, every bin singly, and `score` and `info` of all of them; the value stays.
-    void scores(ReturnsPoint& point) { evaluate<false>(point, true); }
+    // Gradient and information, every bin singly, with `score` and `info` of all of them; the value stays.
+    void scores(ReturnsPoint& point) {
+        const double value = point.value;
+        evaluate(point, true);
+        point.value = value;
+    }
 
     // Of the last evaluation: derivatives of the logarithm of the likelihood by the photons of each bin (bins), the
     // information on them, and energy and slope (bins) of a return's pulse.
     const std::vector<double>& score() const { return score_; }
     const std::vector<double>& info() const { return info_; }
-    const double* energy(int k) const { return energy_.data() + k * r_.bins; }
-    const double* slope(int k) const { return slope_.data() + k * r_.bins; }
+    const double* energy(int k) const { return energy_.data() + k * length_; }
+    const double* slope(int k) const { return slope_.data() + k * length_; }
+    const PulseBins& pulse(int k) const { return pulse_[k]; }
+    // Calls each(first, bins) for the bins that a return's pulse reaches, within the period.
+    template <class Each>
+    void for_bins(int k, const Each& each) const {
+        const PulseBins& pulse = pulse_[k];
+        const int64_t straight = std::min(pulse.bins, r_.bins - pulse.first);
+        each(pulse.first, straight);
+        if (straight < pulse.bins) each(int64_t{0}, pulse.bins - straight);
+    }
 
-    double time() const { return time_; }  // armed time of the open bins, bins x periods
+    double time() const { return all_.time; }    // armed time of the open bins, bins x periods
+    double count() const { return all_.count; }  // their registrations
 
  private:
-    template <bool valued>
     void evaluate(ReturnsPoint& point, bool whole) {
         const int64_t n = r_.bins;
         const double* x = point.at;
-        const double flat = x[0] / static_cast<double>(n);
+        const double flat = x[0] / static_cast<double>(n), step = 1.0 / static_cast<double>(n);
         whole = whole || flat > kDim;
-        reach(point);
-        if (valued) point.value = 0.0;
+        illuminate(point, flat, whole);
+        point.value = 0.0;
         std::fill(point.gradient, point.gradient + kUnknowns, 0.0);
         for (auto& row : point.information) std::fill(row, row + kUnknowns, 0.0);
-        double count = count_, time = time_, shares = shares_;
-        const double step = 1.0 / static_cast<double>(n);
-        const Pass alone(flat, true);  // of a bin without a pulse
-        auto each = [&](int64_t j) {
-            const double share = r_.share(j);
-            score_[j] = info_[j] = 0.0;
-            if (share <= 0.0) return;
-            const double h = passes_->count[j], armed = passes_->armed[j], rearmed = passes_->rearmed[j];
-            const BinTerm term = share == 1.0 && rate_[j] == 0.0
-                                     ? bin_term<valued>(r_, h, armed, rearmed, flat, alone)
-                                     : bin_term<valued>(r_, h, armed, rearmed, rate_[j] + flat * share);
-            score_[j] = term.score;
-            info_[j] = term.info;
-            if (valued) point.value += term.value;
-            point.gradient[0] += term.score * share * step;
-            point.information[0][0] += term.info * share * step * share * step;
-            count -= passes_->count[j];
-            time -= share * passes_->time(r_, j);
-            if (r_.gated()) shares -= passes_->count[j] * std::log(share);
-        };
-        if (whole)
-            for (int64_t j = 0; j < n; ++j) each(j);
-        else
-            for (const int64_t j : reached_) each(j);
+        OpenSums single;  // of the bins that are taken one by one, in whole vectors
+        for (int64_t block = 0, blocks = static_cast<int64_t>(reached_.size()); block < blocks;) {
+            if (!reached_[block]) {
+                ++block;
+                continue;
+            }
+            const int64_t from = block * kBinsTogether;
+            while (block < blocks && reached_[block]) ++block;
+            const int64_t bins = block * kBinsTogether - from;
+            point.value += bins_kernels()
+                               .terms({run_.count.data() + from, run_.armed.data() + from, run_.rearmed.data() + from,
+                                       light_.data() + from, nullptr, nullptr, nullptr, bins, 0.0, 0.0, r_.below_bin(),
+                                       true, score_.data() + from, info_.data() + from})
+                               .value;
+            const int64_t open = std::min(from + bins, n) - from;
+            const auto sum = sums_of<2>(open, [&](int64_t k) {
+                const double share = r_.share(from + k), score = score_[from + k] * share;
+                return std::array<double, 2>{score, info_[from + k] * share * share};
+            });
+            point.gradient[0] += sum[0] * step;
+            point.information[0][0] += sum[1] * step * step;
+            single.add(open_sums(r_, *passes_, from, open));
+        }
+        const double time = all_.time - single.time, count = std::max(all_.count - single.count, 0.0);
         if (!whole && time > 0.0) {
-            count = std::max(count, 0.0);
-            if (valued) point.value += count * std::log(flat) + shares - flat * time;
+            point.value += count * std::log(flat) + all_.log_shares - single.log_shares - flat * time;
             point.gradient[0] += (count / flat - time) * step;
             point.information[0][0] += time / flat * step * step;
         }
         for (int a = 0; a < point.count; ++a) {
-            const double signal = x[2 * a + 1];
-            const double *s = energy(a), *ds = slope(a);
-            double g[2] = {}, back[2] = {};
-            for (const int64_t j : of_[a]) {
-                g[0] += score_[j] * s[j];
-                g[1] += score_[j] * ds[j];
-                back[0] += info_[j] * s[j] * r_.share(j);
-                back[1] += info_[j] * ds[j] * r_.share(j);
-            }
+            const double *s = energy(a), *ds = slope(a), scale[2] = {1.0, x[2 * a + 1]};
             const int at = 2 * a + 1;
-            const double scale[2] = {1.0, signal};
-            for (int k = 0; k < 2; ++k) {
-                point.gradient[at + k] = scale[k] * g[k];
-                point.information[0][at + k] = point.information[at + k][0] = scale[k] * back[k] * step;
-            }
-            for (int b = 0; b <= a; ++b) {
-                const double other = x[2 * b + 1];
-                const double *t = energy(b), *dt = slope(b);
-                double sum[2][2] = {};
-                for (const int64_t j : of_[a]) {  // what the other does not reach is 0
-                    sum[0][0] += info_[j] * s[j] * t[j];
-                    sum[0][1] += info_[j] * s[j] * dt[j];
-                    sum[1][0] += info_[j] * ds[j] * t[j];
-                    sum[1][1] += info_[j] * ds[j] * dt[j];
+            for_bins(a, [&](int64_t from, int64_t bins) {
+                const auto sum = sums_of<4>(bins, [&](int64_t k) {
+                    const int64_t j = from + k;
+                    const double back = info_[j] * r_.share(j);
+                    return std::array<double, 4>{score_[j] * s[j], score_[j] * ds[j], back * s[j], back * ds[j]};
+                });
+                for (int k = 0; k < 2; ++k) {
+                    point.gradient[at + k] += scale[k] * sum[k];
+                    point.information[0][at + k] += scale[k] * sum[2 + k] * step;
                 }
-                const double scale_b[2] = {1.0, other};
-                for (int k = 0; k < 2; ++k)
-                    for (int m = 0; m < 2; ++m)
-                        point.information[at + k][2 * b + 1 + m] = point.information[2 * b + 1 + m][at + k] =
-                            scale[k] * scale_b[m] * sum[k][m];
-            }
+                for (int b = 0; b <= a; ++b) {  // what the other does not reach is 0
+                    const double *t = energy(b), *dt = slope(b), scale_b[2] = {1.0, x[2 * b + 1]};
+                    const auto both = sums_of<4>(bins, [&](int64_t k) {
+                        const int64_t j = from + k;
+                        const double is = info_[j] * s[j], ids = info_[j] * ds[j];
+                        return std::array<double, 4>{is * t[j], is * dt[j], ids * t[j], ids * dt[j]};
+                    });
+                    for (int k = 0; k < 2; ++k)
+                        for (int m = 0; m < 2; ++m)
+                            point.information[at + k][2 * b + 1 + m] += scale[k] * scale_b[m] * both[2 * k + m];
+                }
+            });
         }
+        for (int a = 0; a < point.unknowns(); ++a)
+            for (int b = 0; b < a; ++b)
+                if (b == 0)
+                    point.information[a][0] = point.information[0][a];
+                else
+                    point.information[b][a] = point.information[a][b];
     }
 
-    // Rates, energies and slopes of the bins that the pulses reach.
-    void reach(const ReturnsPoint& point) {
-        for (const int64_t j : reached_) {
-            rate_[j] = 0.0;
-            seen_[j] = 0;
-        }
-        reached_.clear();
+    // Light of the bins that are taken one by one, and energies and slopes of the returns.
+    void illuminate(const ReturnsPoint& point, double flat, bool whole) {
+        std::fill(reached_.begin(), reached_.end(), whole);
         for (int k = 0; k < kMostReturns; ++k) {
-            for (const int64_t j : of_[k]) energy_[k * r_.bins + j] = slope_[k * r_.bins + j] = 0.0;
-            of_[k].clear();
+            for_bins(k, [&](int64_t from, int64_t bins) {  // of the last evaluation
+                std::fill_n(energy_.begin() + k * length_ + from, bins, 0.0);
+                std::fill_n(slope_.begin() + k * length_ + from, bins, 0.0);
+            });
+            pulse_[k].bins = 0;
+            if (k >= point.count) continue;
+            pulse_[k].set(r_, point.at[2 * k + 2]);
+            const double *s = pulse_[k].energy.data(), *ds = pulse_[k].slope.data();
+            for_bins(k, [&](int64_t from, int64_t bins) {
+                std::copy_n(s, bins, energy_.begin() + k * length_ + from);
+                std::copy_n(ds, bins, slope_.begin() + k * length_ + from);
+                s += bins;
+                ds += bins;
+                const int64_t end = (from + bins + kBinsTogether - 1) / kBinsTogether;
+                for (int64_t block = from / kBinsTogether; bins > 0 && block < end; ++block) reached_[block] = 1;
+            });
         }
+        std::fill(light_.begin(), light_.end(), flat);
+        for (int64_t j = 0; j < r_.bins && r_.gated(); ++j) light_[j] *= r_.share(j);
         for (int k = 0; k < point.count; ++k) {
-            const double signal = point.at[2 * k + 1], delay = point.at[2 * k + 2];
-            for_pulse_bins(r_, delay, r_.pulse.low, r_.pulse.low + r_.pulse.span(),
-                           [&](int64_t, int64_t j, double s, double ds) {
-                               if (!seen_[j]) {
-                                   seen_[j] = 1;
-                                   reached_.push_back(j);
-                               }
-                               of_[k].push_back(j);
-                               energy_[k * r_.bins + j] = s;
-                               slope_[k * r_.bins + j] = ds;
-                               rate_[j] += signal * s;
-                           });
+            const double *s = energy(k), signal = point.at[2 * k + 1];
+            for_bins(k, [&](int64_t from, int64_t bins) {
+                for (int64_t j = from; j < from + bins; ++j) light_[j] += signal * s[j];
+            });
         }
     }
 
     const HistogramRecord& r_;
+    const int64_t length_;  // of arrays of bins
     const ArmedPasses* passes_ = nullptr;
-    double count_ = 0.0, time_ = 0.0, shares_ = 0.0;
-    std::vector<double> rate_, score_, info_;
-    std::vector<uint8_t> seen_;
-    std::vector<double> energy_, slope_;  // (returns, bins)
-    std::vector<int64_t> reached_, of_[kMostReturns];
+    OpenSums all_;
+    BinRun run_;  // the whole period
+    std::vector<double> light_, score_, info_;
+    std::vector<double> energy_, slope_;  // (returns, bins), 0 beyond the pulse
+    PulseBins pulse_[kMostReturns];
+    std::vector<uint8_t> reached_;  // (bins / kBinsTogether) whether they are taken one by one
 };
 
 }  // namespace mars

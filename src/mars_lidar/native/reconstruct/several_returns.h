@@ -77,15 +77,9 @@ class SeveralReturns {
     double first_chance(double gain) {
         // of the first return: over a background, by the same count of places
         ReturnsPoint none;
-        none.at[0] = std::max(flat(), least_);
+        none.at[0] = std::max(static_cast<double>(r_.bins) * likelihood_.count() / likelihood_.time(), least_);
         likelihood_.scores(none);
         return search_(none, likelihood_, hints_) ? search_.chance(gain) : NAN;
-    }
-
-    double flat() const {
-        double count = 0.0;
-        for (int64_t j = 0; j < r_.bins; ++j) count += r_.share(j) > 0.0 ? passes_.count[j] : 0.0;
-        return static_cast<double>(r_.bins) * count / likelihood_.time();
     }
 
     // The best climb from one return more that gains so much, twice the logarithm; false where none does.
@@ -139,11 +133,11 @@ class SeveralReturns {
             double move[kUnknowns];
             set_free(point, free);
             if (held >= 0) free[held] = false;
-            if (solve<kUnknowns>(point.information, point.gradient, free, move)) {
+            if (solve<kUnknowns>(point.information, point.gradient, free, move, unknowns)) {
                 double gain = 0.0;
                 for (int a = 0; a < unknowns; ++a) gain += 0.5 * move[a] * point.gradient[a];
                 if (gain < kGain) return true;
-                if (step >= 3 && point.value + 4.0 * gain + 1.0 < bar) return false;
+                if (step >= 1 && point.value + 4.0 * gain + 1.0 < bar) return false;
             }
             bool better = false;
             for (int trial = 0; trial < 40 && !better; ++trial, damping *= 8.0) {
@@ -152,7 +146,7 @@ class SeveralReturns {
                     std::copy(point.information[a], point.information[a] + unknowns, next.information[a]);
                     next.information[a][a] *= 1.0 + damping;
                 }
-                if (!solve<kUnknowns>(next.information, point.gradient, free, move)) continue;
+                if (!solve<kUnknowns>(next.information, point.gradient, free, move, unknowns)) continue;
                 next.count = point.count;
                 next.at[0] = std::clamp(point.at[0] + move[0], std::max(least_, 0.05 * point.at[0]), kMostPhotons);
                 for (int k = 0; k < point.count; ++k) {
@@ -232,7 +226,7 @@ class SeveralReturns {
         }
         for (int a = 0; a < unknowns; ++a)
             for (int b = 0; b < a; ++b) observed[a][b] = observed[b][a] = 0.5 * (observed[a][b] + observed[b][a]);
-        if (!inverse<kUnknowns>(observed, free, spread)) return;
+        if (!inverse<kUnknowns>(observed, free, spread, unknowns)) return;
         for (int a = 0; a < unknowns; ++a) {
             const double error = std::sqrt(spread[a][a]);
             if (!free[a] || !(error > 0.0)) continue;

@@ -1,14 +1,17 @@
 // Symmetric positive definite equations of a few unknowns, some of which are held.
 #pragma once
+#include <algorithm>
 #include <cmath>
 
 namespace mars {
 
-// Solves A x = b, A symmetric N x N and positive definite where `free`; x = 0 elsewhere. False where it is singular.
+// Solves A x = b, A symmetric n x n and positive definite where `free`; x = 0 elsewhere. False where it is singular.
 template <int N>
-inline bool solve(const double (*a)[N], const double* b, const bool* free, double* x) {
-    double l[N][N] = {}, y[N] = {};
-    for (int i = 0; i < N; ++i) {
+inline bool solve(const double (*a)[N], const double* b, const bool* free, double* x, int n = N) {
+    double l[N][N], y[N];
+    for (int i = 0; i < n; ++i) {
+        std::fill(l[i], l[i] + n, 0.0);
+        y[i] = 0.0;
         if (!free[i]) continue;
         for (int j = 0; j <= i; ++j) {
             if (!free[j]) continue;
@@ -25,11 +28,11 @@ inline bool solve(const double (*a)[N], const double* b, const bool* free, doubl
         for (int k = 0; k < i; ++k) y[i] -= l[i][k] * y[k];
         y[i] /= l[i][i];
     }
-    for (int i = N - 1; i >= 0; --i) {
+    for (int i = n - 1; i >= 0; --i) {
         x[i] = 0.0;
         if (!free[i]) continue;
         double sum = y[i];
-        for (int k = i + 1; k < N; ++k) sum -= l[k][i] * x[k];
+        for (int k = i + 1; k < n; ++k) sum -= l[k][i] * x[k];
         x[i] = sum / l[i][i];
     }
     return true;
@@ -37,11 +40,11 @@ inline bool solve(const double (*a)[N], const double* b, const bool* free, doubl
 
 // Inverse of A where `free`, 0 elsewhere; false where it is singular.
 template <int N>
-inline bool inverse(const double (*a)[N], const bool* free, double (*out)[N]) {
-    for (int k = 0; k < N; ++k) {
+inline bool inverse(const double (*a)[N], const bool* free, double (*out)[N], int n = N) {
+    for (int k = 0; k < n; ++k) {
         double unit[N] = {};
         if (free[k]) unit[k] = 1.0;
-        if (!solve<N>(a, unit, free, out[k])) return false;
+        if (!solve<N>(a, unit, free, out[k], n)) return false;
     }
     return true;
 }

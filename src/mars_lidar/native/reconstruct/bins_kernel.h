@@ -1,0 +1,97 @@
+// The bins of one histogram side by side in the lanes: energies of a pulse in them, their likelihood, and the law of their
+// registrations. Kernels for maximum likelihood (reconstruct/bins.h calls them).
+#pragma once
+#include <cstdint>
+
+#include "lanes/levels.h"
+#include "reconstruct/histogram_record.h"
+
+namespace mars {
+
+// Passes of bins (R1) that a registration blinds whose own bin lies `ago` or, for a part of a bin, `ago` and `ago` + 1
+// before in the histogram (`earlier` places instead of `ago` + 1 where the period wraps between them): see
+// ArmedPasses::set_free. Pointers are to the first of these bins.
+struct ArmBlock {
+    const double *count, *before;
+    double *armed, *rearmed, *raw;
+    int64_t bins, ago, earlier;
+    double periods, blind, weight, early, late, part;
+};
+
+// Energy of a pulse in `bins` bins, and its derivative with respect to the delay. `energy` and `density` (points) are the
+// work space, `energy` the times of edges since the delay to begin with: bin k lies between points k and k + `apart`.
+struct EnergyBlock {
+    const PulseCurve& curve;
+    int64_t points, bins, apart;
+    double *energy, *density;
+};
+
+// (R9) of bins of `light` photons, or where that is null of signal x energy + flat x share, share 1 where null.
+struct TermsBlock {
+    const double *count, *armed, *rearmed, *light;
+    const double *energy, *slope, *share;
+    int64_t bins;
+    double signal, flat;
+    bool poisson;          // dead times below one bin: a bin may register again
+    bool by_time;          // the expected registrations are told in armed time, not in passes
+    double *score, *info;  // (bins) or null: derivative by the photons of a bin, and Fisher's information on them
+};
+
+// The logarithm of the likelihood; and its derivatives by S, flat and delay / S, with Fisher's information: of (S, S),
+// (flat, S), (flat, flat), (delay, S), (delay, flat), (delay, delay). They are sums of the terms with `energy`.
+struct BinSums {
+    double value = 0.0, score[3] = {}, info[6] = {};
+};
+
+// Mean of the registrations of each bin of `light` photons, of `flat` where that is null, its slope by them, variance, and
+// the chances that an armed and a re-armed pass register (R7).
+struct LawBlock {
+    const double *armed, *rearmed, *light;
+    double flat;
+    int64_t bins;
+    bool poisson;
+    double *mean, *slope, *variance, *fired, *late;
+};
+
+// A series in the photons per bin of background alone (R10): terms (kSeriesTerms, bins).
+constexpr int kSeriesTerms = 6;
+struct SeriesBlock {
+    const double *count, *armed, *rearmed, *share;
+    int64_t bins;
+    bool poisson;
+    double* terms;
+};
+
+// Of a test of fit: the weight of each bin, 1 / variance (at least `least`), and its weighted residual. Sums over the bins
+// of the weighted products of the mean's slope and itself, `fired` (of an armed pass) and itself, both, and each with the
+// residual.
+struct TangentBlock {
+    const double *slope, *fired, *variance;
+    double *weight, *residual;
+    int64_t bins;
+    double least;
+};
+struct TangentSums {
+    double flat, along, both, passes, missed;
+};
+
+// What another dead time changes in the mean of each bin, weighted: from passes `raw` and `rearmed`, and those of the other.
+// Sums of its products with the mean's slope, itself, the residual and `fired`.
+struct ChangeBlock {
+    const double *raw, *rearmed, *other_raw, *other_rearmed, *fired, *late, *slope, *weight, *residual;
+    double* change;
+    int64_t bins;
+};
+struct ChangeSums {
+    double along, variance, residual, passes;
+};
+
+MARS_DECLARE_KERNEL(TangentSums, bin_tangent_, const TangentBlock& block)
+MARS_DECLARE_KERNEL(ChangeSums, bin_change_, const ChangeBlock& block)
+MARS_DECLARE_KERNEL(void, arm_bins_, const ArmBlock& block)
+MARS_DECLARE_KERNEL(void, pulse_energy_, const EnergyBlock& block)
+MARS_DECLARE_KERNEL(BinSums, bin_terms_, const TermsBlock& block)
+MARS_DECLARE_KERNEL(void, bin_law_, const LawBlock& block)
+MARS_DECLARE_KERNEL(void, background_series_, const SeriesBlock& block)
+
+}  // namespace mars

@@ -445,7 +445,7 @@ def recorded_moments(
     """`exposure_moments` of checked cells; the histogram includes jitter and code widths."""
     if not is_timed(cells.system):
         return refined_moments(cells, cells.system.bins, tolerance=tolerance, threads=threads, progress=progress)
-    timing = Timing(cells.system, cells.finest)
+    timing = Timing(cells)
     untimed = replace(cells, system=timing.untimed)
     exposure = refined_moments(untimed, timing.parts, tolerance=tolerance, threads=threads, progress=progress)
     return replace(

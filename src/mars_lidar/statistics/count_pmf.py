@@ -363,7 +363,7 @@ def _narrow(
 
 
 def _check(cells: Cells, cell: int, law: Pmf, cumulants: FloatArray) -> None:
-    """Compare sum, sign, mean and variance of the pmf with the cumulants; then drop what is rounding and normalise it in place."""
+    """Compare sum, sign, mean and variance of the pmf with the cumulants; remove rounding and normalise it in place."""
     pmf: NDArray[np.float64] = law.p
     offset = law.first + np.arange(pmf.size) - cumulants[0]
     spread = max(math.sqrt(cumulants[1]), 1e-3)

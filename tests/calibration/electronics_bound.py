@@ -9,8 +9,6 @@ and less the noise of the simulation, grows with the photons and is the square o
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from mars_lidar.calibration.model import Effect, Model, effects
@@ -22,10 +20,10 @@ GAPS = np.r_[59.5, 60.2, 61, 63, 66, 70:121:5, 130:161:10, 180, 200, 230, 260, 3
 PHASES = np.r_[0:26:5, 28, 29.3, 29.7, 30.0, 30.3, 30.7, 32, 35:101:5]
 
 
-def counts(at: np.ndarray, seed: int, extra: tuple[Effect, ...] = ()) -> tuple[np.ndarray, int]:
+def counts(at: np.ndarray, seed: int, *more: Effect) -> tuple[np.ndarray, int]:
     """Fine cells of 3.2 million periods, and their photons."""
-    model = Model(Clock(100.0, 0.064, 0.5, locked=True), 1)
-    streams = list(model.streams(np.tile(at, (16, 1)), 200_000, seed, extra))
+    model = Model(Clock(100.0, 0.064, 0.5, locked=True), 1, effects=more)
+    streams = list(model.streams(np.tile(at, (16, 1)), 200_000, seed))
     tables = [np.histogram2d(np.diff(t), t[:-1] % 100.0, [GAPS, PHASES])[0] for t in streams]
     return np.sum(tables, axis=0).ravel(), sum(t.size for t in streams)
 
@@ -33,7 +31,7 @@ def counts(at: np.ndarray, seed: int, extra: tuple[Effect, ...] = ()) -> tuple[n
 def main() -> None:
     """The command."""
     electronics = next(effect for effect in effects(60.0) if effect.names[0] == "electronics_excess")
-    with_them, photons = counts(AT, 1, (replace(electronics, start=(0.2,)),))
+    with_them, photons = counts(np.r_[AT, 0.2], 1, electronics)
     without, _ = counts(AT, 2)
     slopes = []
     for k, step in enumerate(STEPS):

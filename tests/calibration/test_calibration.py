@@ -92,6 +92,9 @@ def test_a_wrong_dead_time_that_is_given_is_the_suspect() -> None:
     suspect = result.suspects[0]
     assert suspect.name.startswith("given dead_time_ns = 40")
     assert abs(suspect.size - 50.0) < FAR * suspect.error
+    stated = result.estimates["signal"]
+    assert np.isnan([stated.error, stated.low, stated.high]).all()
+    assert str(stated).endswith("of a model that does not fit: no error holds")
 
 
 @pytest.mark.full

@@ -49,7 +49,7 @@ class Estimate:
 
     `note` states whether it was given, not detected, or not identified; the interval of a jitter that was not detected
     begins at 0. The error of a dead time that follows from the shortest interval alone is NaN: its law is not normal,
-    and the interval is stated.
+    and the interval is stated. In a model that does not fit all errors and intervals are NaN.
     """
 
     value: float
@@ -61,9 +61,8 @@ class Estimate:
     def __str__(self) -> str:
         if self.error == 0.0:
             return f"{self.value:.6g} ({self.note or 'given'})"
-        if self.note:
-            return f"{self.value:.4g} (95 %: {self.low:.3g} to {self.high:.3g}), {self.note}"
-        return measured(self.value, self.error) if np.isfinite(self.error) else f"{self.value:.6f} ± {self.error}"
+        interval = "" if np.isnan(self.low) else f" (95 %: {self.low:.3g} to {self.high:.3g})"
+        return f"{self.value:.4g}{interval}, {self.note}" if self.note else measured(self.value, self.error)
 
 
 @dataclass(frozen=True)
@@ -560,11 +559,15 @@ def _estimates(fitted: Fitted, growth: FloatArray) -> dict[str, Estimate]:
     centre, names = model.bounded(fitted.theta), model.names
     k = model.light
     free = {names[i] for i in fitted.free}
+    withheld = fitted.p_value < FALSE_ALARM and growth.max() == 1.0  # the scatter of the parts includes a misfit
     out: dict[str, Estimate] = {}
 
     def put(name: str, value: float, sample: FloatArray, *needs: str, note: str = "", limit: bool = False) -> None:
         if not free & set(needs):
             out[name] = Estimate(value, 0.0, value, value, "given")
+            return
+        if withheld:
+            out[name] = Estimate(value, np.nan, np.nan, np.nan, "of a model that does not fit: no error holds")
             return
         low, high = (0.0, np.quantile(sample, 0.95)) if limit else np.quantile(sample, (0.025, 0.975))
         out[name] = Estimate(value, float(((sample - value) ** 2).mean() ** 0.5), float(low), float(high), note)
@@ -607,7 +610,7 @@ def _estimates(fitted: Fitted, growth: FloatArray) -> dict[str, Estimate]:
         elif not effect.onoff:
             put(effect.names[0], float(values[0]), columns[:, 0], effect.names[0])
         at += len(effect.names)
-    if fitted.by_shortest is not None:
+    if fitted.by_shortest is not None and not withheld:
         value, low, high = fitted.by_shortest
         out["dead_time_ns"] = Estimate(value, np.nan, low, high, "by the shortest interval alone")
     elif "dead_time_ns" not in out:

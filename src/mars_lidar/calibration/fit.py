@@ -16,7 +16,7 @@ import numpy as np
 
 from mars_lidar._base.types import FloatArray, NDArray
 from mars_lidar.calibration.cells import Cells
-from mars_lidar.calibration.model import Effect, Model
+from mars_lidar.calibration.model import Model
 from mars_lidar.calibration.recording import FALSE_ALARM, Recording
 from mars_lidar.calibration.shortest import Shortest, shortest_law
 
@@ -27,14 +27,14 @@ _CUMULATED = 100.0  # intervals expected up to an edge, for a normal law of thei
 
 @dataclass(frozen=True)
 class Effort:
-    """Photons of simulated streams, and how many of these: it is traded for time and for the noise of the errors.
+    """Numbers of simulated streams and of their photons: more take longer, and make the errors less noisy.
 
     `settings` detectors of a batch, of `LIGHTS` streams each; `stream` least photons of each, `batch` photons of a
-    batch at most and `share` of the recording's photons that a batch has at least, below that bound; `first` photons
-    of the recording that the first steps weigh, `rounds` steps at most. `spread` of a batch about its centre, in
-    standard errors of a stream of its length. Of the last streams `longer` is the factor on their photons, so that
-    they need not differ as much, `more` that on the number of those which give the weights, and `recentred` the number
-    of batches at most. `widths` of the pulse in a batch: the tables of a pulse cost as much as a stream. `draws` from
+    batch at most and `share` of the recording's photons that a batch has at least, below that bound; `first` photons of
+    the recording that the first steps weigh, `rounds` steps at most. `spread` of a batch about its centre, in standard
+    errors of a stream of its length. The last streams have `longer` times as many photons, so that their parameters
+    need not differ as much; those which give the weights are `more` times as many; of their batches there are
+    `recentred` at most. `widths` of the pulse in a batch: the table of a pulse takes as long as a stream. `draws` from
     the law of the estimate, for its bounds. `attempts` to fit a stream, each with simulated streams of its own, of
     which the first that converges is taken; `effects` taken in, one after the other, and `refits` with an effect more
     that fresh streams judge; `shape_bins` of a free light, at most.
@@ -89,7 +89,7 @@ class Batch:
 
     @property
     def common(self) -> NDArray[np.bool_]:
-        """(c,) cells that are not too rare to have a normal law in streams this short."""
+        """(c,) cells with enough counts for a normal law in streams this short."""
         return np.asarray(self.offset > 2.0 * max(1.0, self.ratio / 4.0))
 
     def estimator(self, free: NDArray[np.intp], prior: FloatArray | None = None) -> FloatArray:
@@ -103,13 +103,11 @@ class Batch:
         return np.asarray(inverse @ jacobian.T @ self.weight)
 
 
-def counted(
-    model: Model, cells: Cells, rows: FloatArray, exposure: float, seed: int, extra: tuple[Effect, ...] = ()
-) -> FloatArray:
+def counted(model: Model, cells: Cells, rows: FloatArray, exposure: float, seed: int) -> FloatArray:
     """Counts (rows, c) of simulated streams, one for each row of parameters; `LIGHTS` rows share a detector."""
     cycles = max(2, round(exposure))
     return np.concatenate(
-        [cells.count(model.streams(rows[k : k + LIGHTS], cycles, seed + k, extra)) for k in range(0, len(rows), LIGHTS)]
+        [cells.count(model.streams(rows[k : k + LIGHTS], cycles, seed + k)) for k in range(0, len(rows), LIGHTS)]
     )
 
 
@@ -118,7 +116,8 @@ def design(
 ) -> FloatArray:
     """Parameters (streams, p), normal of covariance root root' about the centre; `LIGHTS` rows share a detector.
 
-    Pulses are of `widths` widths, each the mean of those that it takes the place of; the jitter makes up for it.
+    Pulses have `widths` different widths, each the mean of a group of those drawn; the jitter makes up for the
+    difference.
     """
     random = np.random.default_rng(seed)
     k = model.light
@@ -159,7 +158,7 @@ def design(
 
 
 def root_of(cov: FloatArray) -> FloatArray:
-    """A root of a covariance that rounding may have made indefinite."""
+    """A square root of a covariance, which rounding may have made indefinite."""
     scale = np.sqrt(np.maximum(np.diag(cov), 1e-300))
     values, vectors = np.linalg.eigh(cov / np.outer(scale, scale))
     return np.asarray(scale[:, None] * vectors * np.sqrt(np.maximum(values, 1e-9)))
@@ -195,12 +194,12 @@ def regression(
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """A fit that fresh streams have judged: most probable parameters (p,), covariance of the free ones, misfit."""
+    """A fit, tested by new streams: most probable parameters (p,), covariance of the free ones, misfit."""
 
     model: Model
     free: NDArray[np.intp]
     theta: FloatArray
-    covariance: FloatArray  # before these bounds
+    covariance: FloatArray  # of the law before the bounds
     unbounded: FloatArray  # (p,) before the bounds of what a detector can have
     scatter: FloatArray  # (free, free) that of the estimator for the recording's exposure, simulations aside
     batch: Batch  # cells and weights
@@ -251,7 +250,7 @@ def draws(model: Model, theta: FloatArray, covariance: FloatArray, free: NDArray
 def _inverse(fisher: FloatArray, prior: FloatArray, root: FloatArray) -> FloatArray:
     """Covariance of an information and a prior precision; noise may have made the information indefinite.
 
-    It is that of streams from within `_NEAR` standard errors root, and errors beyond them are not claimed.
+    The streams are from within `_NEAR` standard errors, and no larger error is stated.
     """
     values, vectors = np.linalg.eigh(root.T @ fisher @ root)
     whole = (vectors * np.maximum(values, _NEAR**-2.0)) @ vectors.T + root.T @ prior @ root
@@ -382,7 +381,7 @@ class Fit:
             rest = (y - near.offset) @ gain.T - terms @ slope
             noise = np.atleast_2d(rest.T @ rest) / (len(y) - terms.shape[1])
             away = gain @ (recorded - near.offset) - slope[0]
-            information = np.linalg.inv(noise)
+            information = np.linalg.pinv(noise)
             there = np.r_[1.0, np.linalg.pinv(local) @ away]  # where the law is read, for its own noise there
             for _ in range(2):
                 scale = 1.0 / (1.0 / near.ratio + there @ inverse @ there)
@@ -408,17 +407,21 @@ class Fit:
         if again and (np.abs((centre - theta)[free]) > _NEAR * sd).any():  # cells and weights were laid elsewhere
             return self.finish(Guess(model, centre, root_of(cov), free), False, known)
         jacobian = law.slope[:, free] @ local
+        # what is at its bound takes up no counts that would move it beyond
+        at_bound = ((model.bounded(mean + 1e-6 * (raw - mean)) == mean) & (raw != mean))[free]
+        estimator = estimator - cov[:, at_bound] @ np.linalg.pinv(cov[np.ix_(at_bound, at_bound)]) @ estimator[at_bound]
+        unmoved = recorded - near.offset - jacobian[:, at_bound] @ (mean - centre)[free[at_bound]]
         project = np.eye(len(recorded)) - jacobian @ estimator
         fresh = near.residual @ project.T
         fresh = (fresh - fresh.mean(0)) / np.sqrt(near.ratio) * np.sqrt(len(y) / (len(y) - terms.shape[1]))
-        rest = project @ (recorded - near.offset)
+        rest = project @ unmoved
         (z, p), timed = _misfit(rest, fresh, law, near), free == model.light + 2
         uneven = timed.any() and _uneven(solve @ gain @ (y - near.offset).T, moved, timed)
         judged, interval = self.shortest(model, draws(model, raw, cov, free)), None
         if judged is not None:
             early, shortest = judged
             dead = shortest.dead_time()
-            if timed.any() and (early < 0.05 or uneven or sd[timed][0] > dead[2] - dead[1]):
+            if timed.any() and (early < 0.05 or uneven or 1.96 * sd[timed][0] > dead[2] - dead[1]):
                 at = mean.copy()
                 at[model.light + 2] = dead[0]
                 own = Guess(model, at, root_of(cov[np.ix_(~timed, ~timed)]), free[~timed])

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from mars_lidar._base.display import brief
 from mars_lidar._base.types import FloatArray
-from mars_lidar.calibration.periodicity import other_period
-from mars_lidar.calibration.recording import Recording
+from mars_lidar.calibration.recording import FALSE_ALARM, Recording
+
+_CELLS = 2**20  # of the time axis: all of it where the stream is shorter
+_PER_PERIOD = 32  # cells of the given period: lines up to 16 times its frequency
+_SLOWEST = 0.3  # of the laser's frequency
+_STRONG = 40.0  # times the power of light without a period: one of 2^20 lines by chance at e^-40
+_CLEAR = 4.0  # times as strong as the line at the given period
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,3 +82,62 @@ def look_at(recording: Recording) -> Look:
     smallest, quantiles = np.sort(np.partition(gaps, count - 1)[:count]), np.quantile(gaps, (0.01, 0.5, 0.99))
     same, own, unit, locked = int((gaps == 0.0).sum()), other_period(recording), clock.unit_ns, clock.locked
     return Look(n, cycles, period, seconds, unit, locked, n / seconds, smallest, quantiles, same, own)
+
+
+def other_period(recording: Recording) -> float | None:
+    """The period, ns, that the photons repeat with where it is not that of the recording; None where it is, or none is.
+
+    Periodogram of the first times: photons of a constant light have a power of their number in each line, those of a
+    pulsed one of their number squared at the laser's frequency and its multiples. The lowest strong line is taken.
+    A dead time in bright light is nearly a period of its own, but a broad one: a line must stand out from its
+    neighbours. The units of a clock are spread, or they would be a period too.
+    """
+    times = max(recording.pieces, key=lambda piece: piece.size)
+    cell = recording.period_ns / _PER_PERIOD
+    times = times[: np.searchsorted(times, times[0] + _CELLS * cell)] - times[0]
+    if times.size < 100:
+        return None
+    if unit := recording.clock.unit_ns:
+        spread = np.random.default_rng(0).random(times.size) - 0.5
+        times = np.maximum(times + unit * spread, 0.0)
+    place = np.floor(times / cell).astype(np.int64)
+    length = int(2 ** np.ceil(np.log2(place.max() + 1)))
+    power = np.abs(np.fft.rfft(np.bincount(place, minlength=length))) ** 2 / times.size
+    given = length / _PER_PERIOD  # the line of the given period
+    low = int(np.ceil(_SLOWEST * given))
+    if low < 3 or power.size < low + 2:
+        return None
+    at_given = _strongest(power, given)
+    strong = np.flatnonzero(power[low:] > max(_STRONG, _CLEAR * at_given, 0.25 * float(power[low:].max()))) + low
+    first = next((int(line) for line in strong if power[line] > _STRONG * _neighbours(power, int(line))), None)
+    if first is None:
+        return None
+    first += int(np.argmax(power[first : first + 3]))
+    if abs(first - given) < 1.5 or _is_harmonic(power, first, given):
+        return None
+    around = power[first - 1 : first + 2]
+    return float(length * cell / (first + (around[2] - around[0]) / around.sum()))
+
+
+def _is_harmonic(power: FloatArray, line: int, given: float) -> bool:
+    """Whether a line is a multiple of the given frequency, of which there are others: a dead time may weaken those."""
+    from scipy.stats import gamma
+
+    number = round(line / given)
+    if number < 2 or abs(line - number * given) > 1.5:
+        return False
+    lower = [_strongest(power, k * given) / _neighbours(power, round(k * given)) for k in range(1, number)]
+    # the strongest of three lines each
+    return bool(gamma.sf(sum(lower), number - 1) * 3.0 ** (number - 1) < FALSE_ALARM)
+
+
+def _strongest(power: FloatArray, line: float) -> float:
+    near = round(line)
+    return float(power[max(near - 1, 0) : near + 2].max())
+
+
+def _neighbours(power: FloatArray, line: int) -> float:
+    """Mean power of a line without a period, by the median of those around it but the nearest."""
+    reach = 2 * _PER_PERIOD
+    around = np.concatenate([power[max(line - reach, 1) : line - 3], power[line + 4 : line + reach + 1]])
+    return max(float(np.median(around)) / math.log(2.0), 1.0)

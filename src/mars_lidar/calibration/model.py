@@ -23,7 +23,7 @@ from mars_lidar.light.flux import Flux
 from mars_lidar.light.timestamps import DrawnTimestamps
 
 _NARROWEST = 2e-6  # periods: the narrowest pulse that the engines draw
-_WIDEST = 0.3  # sigma of a recorded pulse, periods: a wider one is hardly told from background
+_WIDEST = 0.3  # sigma of a recorded pulse, periods: a wider one is hardly distinguished from background
 _WIDEST_JITTER = 0.05  # periods: the widest that `Jitter` takes
 _MOST_CARRIERS = 0.95  # of an avalanche
 Fields = dict[str, Any]
@@ -76,7 +76,7 @@ def _paralyzable(fields: Fields, value: tuple[float, ...]) -> Fields:
 
 
 def effects(dead_time_ns: float) -> tuple[Effect, ...]:
-    """Effects that are looked for in a stream of a detector with this dead time."""
+    """Effects that are tested in the stream of a detector with this dead time."""
     dead = dead_time_ns
     after = ("afterpulse_probability", "log_afterpulse_delay")
     middle, reach = float(np.log(1.6 * dead)), float(np.log(8.0))  # mean delays from a fifth to 13 dead times
@@ -107,14 +107,14 @@ class Streams:
 class Model:
     """Parameters, in this order: background, (signal, delay) of each return, width, jitter, dead time, effects.
 
-    Photons a period, and ns. `width` is the standard deviation of the recorded pulse, jitter included, and the jitter
-    an angle, in radians: that of the point whose coordinates are the standard deviations of pulse and jitter, at the
-    distance `width`. Counts are smooth in both where one of the two vanishes; in variances they are not. Where the
-    jitter is given (`jitter_given`) or the pulse is no Gaussian of unknown width, it is in ns. With a `waveform`
-    (shares of the light in equal parts of the period, jitter not included) there is no return, and the background is
-    all light. `waveform_error` are the standard errors of these shares by a recording of `exposure` periods: simulated
-    streams have light that differs so much from the waveform, more in shorter ones as their counts do.
-    With a `pulse` its shape is known, before any jitter, and `width` means nothing.
+    The light is in photons per period, times in ns. `width` is the standard deviation of the recorded pulse, jitter
+    included, and the jitter an angle, in radians, whose sine and cosine times `width` are the standard deviations of
+    jitter and pulse. Counts are smooth functions of both where one of the two vanishes; of variances they are not.
+    Where the jitter is given (`jitter_given`) or the pulse is no Gaussian of unknown width, it is in ns. With a
+    `waveform` (shares of the light in equal parts of the period, before jitter) there is no return, and the background
+    is all light. `waveform_error` are the standard errors of these shares by a recording of `exposure` periods:
+    simulated streams have light that scatters about the waveform by so much, and more in shorter streams, as their
+    counts do. With a `pulse` its shape is known, before any jitter, and `width` is not used.
     """
 
     clock: Clock
@@ -215,10 +215,8 @@ class Model:
         known = self.split & (free == self.light + 1)
         return np.asarray(np.diag(known * (2.0 / np.pi) ** 2))
 
-    def system(
-        self, theta: FloatArray, cycles: int, bins: int = 16, extra: tuple[Effect, ...] = (), jitter: bool = True
-    ) -> System:
-        """The instrument of parameters (p,), with further effects at their starting values, with or without jitter."""
+    def system(self, theta: FloatArray, cycles: int, bins: int = 16, jitter: bool = True) -> System:
+        """The instrument of parameters (p,), with or without jitter."""
         k = self.light
         theta = self.bounded(theta)
         sigma, sd = map(float, self.widths(theta))
@@ -227,8 +225,6 @@ class Model:
         for effect in self.effects:
             fields = effect.apply(fields, tuple(map(float, theta[at : at + len(effect.names)])))
             at += len(effect.names)
-        for effect in extra:
-            fields = effect.apply(fields, effect.start)
         least = _NARROWEST * self.clock.period_ns
         if jitter and sd > least:
             fields["jitter"] = Jitter(sigma_ns=sd)
@@ -252,7 +248,7 @@ class Model:
         return Flux(signal, back, delay) if self.returns > 1 else Flux(signal[0], back, delay[0])
 
     def varied(self, flux: Flux, cycles: int, seed: int) -> Flux:
-        """The light with shapes that are as uncertain as the waveform; the same where that is known."""
+        """The light, its shape drawn from the uncertainty of the waveform; unchanged where that is known."""
         if self.waveform is None or self.waveform_error is None or flux.waveform is None:
             return flux
         light = flux.waveform.sum(-1, keepdims=True)
@@ -261,9 +257,7 @@ class Model:
         shape = np.random.default_rng(seed).gamma(self.waveform / scale, size=flux.waveform.shape) * scale
         return Flux(waveform=light * shape / shape.sum(-1, keepdims=True))
 
-    def streams(
-        self, rows: FloatArray, cycles: int, seed: int, extra: tuple[Effect, ...] = (), jitter: bool = True
-    ) -> Streams:
+    def streams(self, rows: FloatArray, cycles: int, seed: int, jitter: bool = True) -> Streams:
         """Recorded times of a stream for each row of (rows, p); the detector is that of the first row, but its jitter.
 
         The jitter of a recorded time is drawn here, a normal deviate each, so that it may differ from row to row and
@@ -272,7 +266,7 @@ class Model:
         rows = self.bounded(np.atleast_2d(rows))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a trial value may look like one in another unit
-            system = self.system(rows[0], cycles, extra=extra, jitter=False)
+            system = self.system(rows[0], cycles, jitter=False)
             flux = self.varied(self.flux(rows), cycles, seed)
             made = cast(DrawnTimestamps, simulate_timestamps(flux, system, seed=seed, threads=1))
         sigma = self.widths(rows)[1] * jitter

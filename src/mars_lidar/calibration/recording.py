@@ -17,7 +17,6 @@ from mars_lidar.light.timestamps import Timestamps
 _ON_GRID = 0.02  # units: largest distance from the grid of a clock, for times in float64 over an hour
 FALSE_ALARM = 0.003  # of a plain recording: an effect, a drift, a misfit that is named; another period; a pulse
 LEAST_PHOTONS = 300  # of a recording or a part of it: below them the counts of the cells have no normal law
-_PROBED = 2000  # times that tell the clock
 _OWN_UNITS = (2**15, 2**16)  # units of the period in our own PTU and Photon-HDF5, at most
 
 
@@ -135,13 +134,13 @@ def recording_of(times: Timestamps | Sequence[Timestamps], *, pooled: bool = Fal
     return Recording(tuple(pieces), tuple(cycles), clock_of(pieces[0], first))
 
 
-def clock_of(t: FloatArray, stream: Timestamps) -> Clock:
+def clock_of(t: FloatArray, stream: Timestamps, probed: int = 2000) -> Clock:
     """The clock of times (n,), by the unit that the file gives: where their grid lies, and what it is locked to.
 
-    Times that lie on no grid of that unit are real numbers.
+    Times that lie on no grid of that unit are real numbers. So many are `probed`.
     """
     period = stream.period_ns
-    probe = t[:: max(1, t.size // _PROBED)]
+    probe = t[:: max(1, t.size // probed)]
     x = probe / period
     x -= np.floor(x)
     unit = float(stream.info.get("unit_ns", 0.0))
@@ -159,8 +158,11 @@ def clock_of(t: FloatArray, stream: Timestamps) -> Clock:
     return Clock(period)
 
 
-def recording_of_arrivals(times_ns: ArrayLike, unit_ns: float) -> Recording:
-    """A recording without a laser: its period is the mean interval, a unit of time alone."""
+def recording_of_arrivals(times_ns: ArrayLike, unit_ns: float, probed: int = 2000) -> Recording:
+    """A recording without a laser: its period is the mean interval, a unit of time alone.
+
+    Of the times so many are `probed` for the offset of the clock.
+    """
     t = np.asarray(checks.numbers("times", times_ns))
     if t.dtype.kind not in "fiu":
         raise TypeError(f"times must be Timestamps, a sequence of them, or numbers (n,), got {type(times_ns).__name__}")
@@ -173,7 +175,7 @@ def recording_of_arrivals(times_ns: ArrayLike, unit_ns: float) -> Recording:
         raise ValueError("times must contain different times, got one value only")
     clock = Clock(period)
     if unit_ns:
-        place = t[:: max(1, t.size // _PROBED)] / unit_ns
+        place = t[:: max(1, t.size // probed)] / unit_ns
         offset = float(np.angle(np.exp(2j * np.pi * place).mean()) / (2 * np.pi) % 1.0)
         clock = Clock(period, unit_ns, 0.0 if min(offset, 1.0 - offset) < _ON_GRID else offset)
     return Recording((t,), (float(t[-1]) / period,), clock, laser=False)

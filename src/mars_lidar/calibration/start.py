@@ -1,4 +1,4 @@
-"""Where the fit begins: light with the dead time taken off, and a dead time for each of several jitters."""
+"""Starting values of the fit: light without the dead time, and a dead time for each of several jitters."""
 
 from __future__ import annotations
 
@@ -138,8 +138,9 @@ def with_edge(fit: Fit, model: Model, theta: FloatArray, low: FloatArray) -> Flo
 
 def safe_hold(recording: Recording) -> float:
     """Time after a registration, ns, from which on the pixel is armed: past the edge of the intervals."""
-    gaps = np.sort(np.concatenate([np.diff(piece) for piece in recording.pieces]))
-    low, edge = gaps[min(1, gaps.size - 1)], gaps[max(30, gaps.size // 500) % gaps.size]
+    gaps = np.concatenate([np.diff(piece) for piece in recording.pieces])
+    first, late = min(1, gaps.size - 1), max(30, gaps.size // 500) % gaps.size
+    low, edge = np.partition(gaps, (first, late))[[first, late]]
     return float(edge + 3.0 * (edge - low) + 2.0 * recording.clock.unit_ns)
 
 

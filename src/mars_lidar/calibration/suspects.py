@@ -2,28 +2,30 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mars_lidar._base.types import FloatArray, NDArray
 from mars_lidar.calibration.fit import LIGHTS, Fit, Fitted, Guess, counted, root_of
-from mars_lidar.calibration.model import Effect, effects
+from mars_lidar.calibration.model import Effect, Model, effects
 from mars_lidar.calibration.recording import FALSE_ALARM, LEAST_PHOTONS, Recording
 from mars_lidar.calibration.start import with_edge
 
-_MISFIT = 1e-3  # gain in the probability of the misfit by which an effect without score and size is accepted
+_MISFIT = 1e-3  # a fit whose misfit is so many times less probable than that of another is a bad one
+_TRIED = 0.1  # false alarms of a score or a misfit from which on effects are tried: the refit decides
 _PARTS = 16  # of a recording, for drift: a trend then has 14 degrees of freedom
 
 
 @dataclass(frozen=True)
 class Score:
-    """An effect's size by the residual counts: its value and standard deviation, and what a unit of it shifts."""
+    """An effect's size by the residual counts, its standard deviation, and how a unit of it shifts the parameters."""
 
     effect: Effect
     size: float
     error: float
-    shift: FloatArray  # (free,) of the parameters, for an effect of size 1 that nobody knows of
+    shift: FloatArray  # (free,) of the estimates, by an effect of size 1 that the model does not have
 
     @property
     def z(self) -> float:
@@ -36,48 +38,52 @@ class Score:
         return max(self.size, 0.0) + 1.645 * self.error
 
 
-def scores(fit: Fit, fitted: Fitted) -> list[Score]:
-    """The score of each effect that the model does not have, the clearest first."""
-    model, law = fitted.model, fitted.batch
-    have = {name for effect in model.effects for name in effect.names} | {name for name, _ in model.fields}
-    have |= {"afterpulse_probability"} if "afterpulsing" in have else set()
-    have |= {"electronics_excess"} if "electronics_dead_time_ns" in have else set()
-    have |= {"paralyzable"} if "mode" in have else set()
-    centre = model.bounded(fitted.theta)
+def _counts(fit: Fit, fitted: Fitted, model: Model, theta: FloatArray) -> tuple[FloatArray, float]:
+    """Counts that a model expects in the cells of a fit, and the ratio of their variance to them."""
     photons = float(fit.recording.photons)
     simulated = min(fit.effort.share * photons, max(fit.effort.batch, photons))
     exposure = max(2, round(fit.exposure(simulated / LIGHTS)))
     ratio = fit.exposure(photons) / exposure
-    rows = np.tile(centre, (LIGHTS, 1))
-    plain = counted(model, law.cells, rows, exposure, fit.next_seed()).mean(0) * ratio
-    listed = []
-    used = law.common
-    dead = float(centre[model.light + 2])
+    rows = np.tile(model.bounded(theta), (LIGHTS, 1))
+    return counted(model, fitted.batch.cells, rows, exposure, fit.next_seed()).mean(0) * ratio, ratio / LIGHTS
+
+
+def _score(fit: Fit, fitted: Fitted, plain: FloatArray, model: Model, theta: FloatArray, effect: Effect) -> Score:
+    """Size of an effect along the counts of a model that has it at `theta`, less those that the fit can take up."""
+    (made, share), size = _counts(fit, fitted, model, theta), theta[fitted.model.size]
+    change, noise, used = made - plain, (np.maximum(plain, 0.5) + np.maximum(made, 0.5)) * share, fitted.batch.common
+    change = change * np.maximum(0.0, 1.0 - 2.0 * noise / np.maximum(change**2, 1e-300)) / max(float(size), 1e-9)
+    shift = fitted.estimator @ change
+    way = change - fitted.jacobian @ shift
+    along = np.zeros_like(way)
+    along[used] = fitted.batch.weight[np.ix_(used, used)] @ way[used]
+    along /= max(float(way @ along), 1e-300)
+    spread = float((fitted.fresh @ along).std()) * (1.0 + 2.0 * share) ** 0.5
+    return Score(effect, float(fitted.rest @ along), spread, shift)
+
+
+def scores(fit: Fit, fitted: Fitted) -> list[Score]:
+    """The score of each effect that the model does not have, the clearest first."""
+    model = fitted.model
+    have = {name for effect in model.effects for name in effect.names} | {name for name, _ in model.fields}
+    have |= {"afterpulse_probability"} if "afterpulsing" in have else set()
+    have |= {"electronics_excess"} if "electronics_dead_time_ns" in have else set()
+    have |= {"paralyzable"} if "mode" in have else set()
+    centre, listed = model.bounded(fitted.theta), []
+    dead, plain = float(centre[model.light + 2]), _counts(fit, fitted, model, centre)[0]
     for effect in effects(dead) if dead > 0.0 else ():
-        if effect.names[0] in have:
-            continue
-        try:
-            made = counted(model, law.cells, rows, exposure, fit.next_seed(), (effect,)).mean(0) * ratio
-        except ValueError:  # a detector cannot have both
-            continue
-        change = made - plain
-        noise = (np.maximum(plain, 0.5) + np.maximum(made, 0.5)) * ratio / LIGHTS
-        change = change * np.maximum(0.0, 1.0 - 2.0 * noise / np.maximum(change**2, 1e-300)) / effect.start[0]
-        shift = fitted.estimator @ change
-        way = change - fitted.jacobian @ shift
-        along = np.zeros_like(way)
-        along[used] = law.weight[np.ix_(used, used)] @ way[used]
-        along /= max(float(way @ along), 1e-300)
-        spread = float((fitted.fresh @ along).std()) * (1.0 + 2.0 * ratio / LIGHTS) ** 0.5
-        listed.append(Score(effect, float(fitted.rest @ along), spread, shift))
+        if effect.names[0] not in have:
+            wider = replace(model, effects=(*model.effects, effect))
+            with suppress(ValueError):  # a detector cannot have both
+                listed.append(_score(fit, fitted, plain, wider, np.r_[centre, effect.start], effect))
     return sorted(listed, key=lambda score: -score.z)
 
 
-def clear(listed: list[Score]) -> float:
-    """Standard deviations of a score that one of these effects has by chance with a probability of `FALSE_ALARM`."""
+def clear(listed: list[Score], alarm: float = FALSE_ALARM) -> float:
+    """Standard deviations of a score that one of these effects has by chance with this probability."""
     from scipy.special import ndtri
 
-    return float(-ndtri(FALSE_ALARM / max(len(listed), 1)))
+    return float(-ndtri(alarm / max(len(listed), 1)))
 
 
 @dataclass(frozen=True)
@@ -89,59 +95,37 @@ class Named:
     gain: float
 
 
-Refit = tuple[Fitted, Named | None]
-
-
-def refitted(fit: Fit, fitted: Fitted, listed: list[Score]) -> Refit | None:
-    """The fit with the one effect that takes most of the misfit, or a better one without; None where none is clear.
+def refitted(fit: Fit, fitted: Fitted, listed: list[Score]) -> tuple[Fitted, Named | None] | None:
+    """The fit with the one effect that explains most, or a better one without; None where none is clear.
 
     Effects are named by the refit: a slow recovery may have the score of a paralyzable detector, and one that the
-    dead time has taken up has no score at all. So where the misfit stays clear, effects without a score are tried too.
-    Shorter batches judge between effects; the last ones are those of the effect that is taken in.
+    dead time has taken up has no score at all, but one along the counts of the refit. So all are tried where the misfit
+    is suspicious. Shorter batches judge between effects; the last ones are those of the effect that is taken in.
     """
-    limit = clear(listed)
-    best = _best(fit, fitted, [score for score in listed if score.z > limit], limit)
-    if (fitted if best is None else best[0]).p_value < FALSE_ALARM:
-        other = _best(fit, fitted, [score for score in listed if score.z <= limit], limit)
-        trials = [trial for trial in (best, other) if trial is not None]
-        best = min(trials, key=lambda trial: trial[0].misfit_z, default=None)
+    limit = clear(listed, _TRIED)
+    tried = {score.effect.names[0]: score for score in reversed(listed) if score.z > limit or fitted.p_value < _TRIED}
+    stepped = [(score, *trial) for score in tried.values() if (trial := _stepped(fit, fitted, score)) is not None]
+    plain, best, most = _counts(fit, fitted, fitted.model, fitted.theta)[0], None, clear(listed)
+    for score, _, guess in sorted(stepped, key=lambda trial: trial[1])[: fit.effort.refits]:
+        final, size = fit.shorter.finish(guess), fitted.model.size
+        along = _score(fit, fitted, plain, final.model, final.theta, score.effect)
+        error = final.covariance[np.ix_(final.free == size, final.free == size)].sum() ** 0.5  # 0 where it has no size
+        z = max(score.z, along.z, final.theta[size] / error if error else 0.0)
+        better = z > most or final.p_value * _MISFIT > fitted.p_value
+        if final.converged and better and (best is None or final.misfit_z < best[0].misfit_z):
+            best = final, score.effect, z
     if best is None:
         return None
-    last = best[0]
-    final = fit.finish(Guess(last.model, last.theta, root_of(last.covariance), last.free))
-    return (final, best[1]) if final.converged else best
-
-
-def _best(fit: Fit, fitted: Fitted, tried: list[Score], limit: float) -> Refit | None:
-    trials: list[tuple[float, Score, Guess]] = []
-    families: set[str] = set()
-    for score in tried:
-        if score.effect.names[0] in families:
-            continue
-        families.add(score.effect.names[0])
-        trial = _stepped(fit, fitted, score)
-        if trial is not None:
-            trials.append((trial[0], score, trial[1]))
-    best: tuple[Fitted, Named] | None = None
-    for _, score, guess in sorted(trials, key=lambda trial: trial[0])[: fit.effort.refits]:
-        final = fit.shorter.finish(guess)
-        if final.converged and (best is None or final.misfit_z < best[0].misfit_z):
-            best = final, Named(score.effect, score.z, fitted.misfit_z - final.misfit_z)
-    if best is None:
-        return None
-    final, named = best
-    if named.z > limit:  # of electronics the size may be wide: a short dead time of the detector acts as a long one
-        return best
-    plain = final.free < fitted.model.size
-    size = final.theta[fitted.model.size]
-    if not named.effect.onoff and size > limit * final.covariance[~plain][:, ~plain][0, 0] ** 0.5:
-        return best
-    if fitted.p_value >= _MISFIT * final.p_value:
-        return None
-    # neither score nor size: the refit may have gone where the effect is not needed either
-    root = root_of(final.covariance[np.ix_(plain, plain)])
-    other = fit.shorter.finish(Guess(fitted.model, final.theta[: fitted.model.size], root, final.free[plain]))
-    return (other, None) if other.converged and other.p_value > _MISFIT * final.p_value else best
+    final, effect, z = best
+    if fitted.p_value < _MISFIT:  # the first fit may have been a bad one
+        known = final.free < fitted.model.size
+        root = root_of(final.covariance[np.ix_(known, known)])
+        other = fit.shorter.finish(Guess(fitted.model, final.theta[: fitted.model.size], root, final.free[known]))
+        if other.converged and other.p_value * _MISFIT > fitted.p_value:
+            return other, None
+    last = fit.finish(Guess(final.model, final.theta, root_of(final.covariance), final.free))
+    final = last if last.converged else final
+    return final, Named(effect, z, fitted.misfit_z - final.misfit_z)
 
 
 def _stepped(fit: Fit, fitted: Fitted, score: Score) -> tuple[float, Guess] | None:

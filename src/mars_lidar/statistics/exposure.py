@@ -445,7 +445,7 @@ def recorded_moments(
     """`exposure_moments` of checked cells; the histogram includes jitter and code widths."""
     if not is_timed(cells.system):
         return refined_moments(cells, cells.system.bins, tolerance=tolerance, threads=threads, progress=progress)
-    timing = Timing(cells.system, cells.finest)
+    timing = Timing(cells)
     untimed = replace(cells, system=timing.untimed)
     exposure = refined_moments(untimed, timing.parts, tolerance=tolerance, threads=threads, progress=progress)
     return replace(
@@ -516,7 +516,7 @@ def refined_moments(
 def compared_bins(cells: Cells, out_bins: int) -> int:
     """Bins of the histogram in which grids are compared: a multiple of `out_bins`.
 
-    Grids may have the same mean by chance while their errors are 50 times as large; not the same shape as well.
+    Two grids may agree by chance in the mean although both errors are 50 times as large; they then differ in shape.
     """
     return out_bins if cells.follow else out_bins * math.ceil(TOL.compared_bins / out_bins)
 

@@ -458,7 +458,7 @@ def joint_law(
     )
     if not is_timed(system):
         return replace(_law(cells, tolerance), system=system)
-    timing = Timing(cells.system, cells.finest)
+    timing = Timing(cells)
     law = _law(replace(cells, system=timing.untimed), tolerance)
     pixel = None if law._pixel is None else TimedPixel(law._pixel, law.mean, timing)
     return replace(law, system=system, mean=timing.forward(law.mean), _pixel=pixel)

@@ -83,7 +83,7 @@ class Tolerances:
     first_bins, most_first_bins
         Bins per period of the coarsest and finest first grid; refinement may exceed the latter.
     compared_bins
-        Fewest bins of the histogram in which grids are compared, whatever is asked: as cheap as one.
+        Fewest bins of the histogram in which grids are compared, at the cost of a single bin.
     unrefined_bins
         Least bins of grids that are not refined, of the phase chain and without a dead time, and of the first grid that
         follows the pulse: with fewer the discretisation of the chain is visible in the variance of the count.

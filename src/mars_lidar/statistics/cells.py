@@ -443,6 +443,14 @@ class Cells:
         """Photons per period (cells,), inside the gate if there is one."""
         return np.asarray(sum(self.native_flux), dtype=np.float64)
 
+    @property
+    def jumps(self) -> bool:
+        """Whether the light is constant in samples, whose edges lie anywhere in the bins of a grid.
+
+        Errors are then of second order and irregular, so that a grid may agree with the next by chance.
+        """
+        return self.waveform is not None or isinstance(self.system.pulse, SampledPulse)
+
     def flux(self, index: int) -> Flux:
         """The light of one cell."""
         if self.waveform is not None:

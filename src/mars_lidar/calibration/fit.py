@@ -416,8 +416,8 @@ class Fit:
         fresh = (fresh - fresh.mean(0)) / np.sqrt(near.ratio) * np.sqrt(len(y) / (len(y) - terms.shape[1]))
         rest = project @ unmoved
         (z, p), timed = _misfit(rest, fresh, law, near), free == model.light + 2
-        uneven = timed.any() and _uneven(solve @ gain @ (y - near.offset).T, moved, timed)
         judged, interval = self.shortest(model, draws(model, raw, cov, free)), None
+        uneven = judged is not None and timed.any() and _uneven(solve @ gain @ (y - near.offset).T, moved, timed)
         if judged is not None:
             early, shortest = judged
             dead = shortest.dead_time()

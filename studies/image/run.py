@@ -356,7 +356,10 @@ def _before(rows: Iterable[Row]) -> list[Row]:
 
 
 def _coverage(rows: Iterable[Row], part: str, keys: tuple[str, ...]) -> list[Row]:
-    """Share of the intervals of method "image" that hold the truth, over all exposures: images, mean and its error."""
+    """Share of the intervals of method "image" that hold the truth, over all exposures: images, mean and its errors.
+
+    Of these for the same images from the scatter between exposures, for other scenes from that between images.
+    """
     groups: dict[tuple[Any, ...], dict[tuple[Any, ...], list[tuple[float, float]]]] = {}
     for row in rows:
         if row["part"] in (part, part + AGAIN) and row["method"] == "image":
@@ -366,9 +369,13 @@ def _coverage(rows: Iterable[Row], part: str, keys: tuple[str, ...]) -> list[Row
     out: list[Row] = []
     for at, images in groups.items():
         inside, answered = np.moveaxis(np.array(list(images.values())), -1, 0)  # (images, exposures)
+        of_image = inside.mean(1)
         error = np.sqrt((inside.var(1, ddof=1) / inside.shape[1]).sum()) / len(inside)
-        line: dict[str, Any] = dict(zip(keys, at, strict=True)) | {"least %": inside.mean(1).min()}
-        line |= {"mean %": inside.mean(), "error of it %": error, "largest %": inside.mean(1).max()}
+        line: dict[str, Any] = dict(zip(keys, at, strict=True)) | {"least %": of_image.min(), "mean %": of_image.mean()}
+        line |= {"error of it %": error}
+        if part == "scenes":
+            line |= {"for other scenes %": of_image.std(ddof=1) / np.sqrt(len(inside))}
+        line |= {"largest %": of_image.max()}
         out.append(line | {"answered %": answered.mean()})
     return out
 

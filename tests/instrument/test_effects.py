@@ -227,9 +227,9 @@ def test_electronics_dead_time_statistics(dead: float, electronics: float, start
 def test_electronics_dead_time_in_bins_narrower_than_the_pulse():
     """Cells of the kernel are wider than these bins, which the pulse fills unevenly."""
     detector = pixel({"electronics_dead_time_ns": 130.0}, dead=45.0)
-    case = case_of(detector, 20_000, cycles=120, bins=320)
+    case = case_of(detector, 20_000, cycles=120, bins=1280)
     result = electronics_moments(ml.Flux(1.2, 0.8, 37.0), case.system)
-    assert result.bins < 320
+    assert result.bins < 1280
     check(ENGINES["exact"], case, Law(histogram=result.histogram), {SHAPE})
 
 

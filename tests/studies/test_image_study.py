@@ -126,7 +126,7 @@ def test_without_deepinv_the_study_says_so(monkeypatch, tmp_path):
 
 
 def test_coverage_of_several_exposures():
-    """Mean over images of the mean over their exposures; its error from the scatter between exposures."""
+    """Mean over images of the mean over their exposures; its errors from the scatter of exposures and of images."""
     from studies.image import run
 
     of = {"method": "image", "photons": 1.0, "sbr": 1.0, "answered %": 80.0}
@@ -137,6 +137,7 @@ def test_coverage_of_several_exposures():
     assert line["mean %"] == 86.0
     assert (line["least %"], line["largest %"]) == (80.0, 92.0)
     assert line["error of it %"] == pytest.approx(np.sqrt(8.0 / 2.0) / 2.0)
+    assert line["for other scenes %"] == pytest.approx(6.0)  # of 92 and 80
 
 
 @pytest.mark.full

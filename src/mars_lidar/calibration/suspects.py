@@ -106,7 +106,7 @@ def refitted(fit: Fit, fitted: Fitted, listed: list[Score]) -> tuple[Fitted, Nam
     tried = {score.effect.names[0]: score for score in reversed(listed) if score.z > limit or fitted.p_value < _TRIED}
     stepped = [(score, *trial) for score in tried.values() if (trial := _stepped(fit, fitted, score)) is not None]
     plain, best, most = _counts(fit, fitted, fitted.model, fitted.theta)[0], None, clear(listed)
-    for score, _, guess in sorted(stepped, key=lambda trial: trial[1])[: fit.effort.refits]:
+    for score, _, guess in sorted(stepped, key=lambda trial: (trial[0].z <= most, trial[1]))[: fit.effort.refits]:
         final, size = fit.shorter.finish(guess), fitted.model.size
         along = _score(fit, fitted, plain, final.model, final.theta, score.effect)
         error = final.covariance[np.ix_(final.free == size, final.free == size)].sum() ** 0.5  # 0 where it has no size
@@ -121,7 +121,7 @@ def refitted(fit: Fit, fitted: Fitted, listed: list[Score]) -> tuple[Fitted, Nam
         known = final.free < fitted.model.size
         root = root_of(final.covariance[np.ix_(known, known)])
         other = fit.shorter.finish(Guess(fitted.model, final.theta[: fitted.model.size], root, final.free[known]))
-        if other.converged and other.p_value * _MISFIT > fitted.p_value:
+        if other.converged and other.p_value > max(FALSE_ALARM, fitted.p_value / _MISFIT):
             return other, None
     last = fit.finish(Guess(final.model, final.theta, root_of(final.covariance), final.free))
     final = last if last.converged else final

@@ -20,7 +20,7 @@ class AutoEngine(Engine):
     The cost of feedback does not depend on the exposure; that of exact is proportional to the registrations. Both costs
     are predicted from the pixel and the system only, so that any part of an image has the bits of the whole. Feedback
     draws a pixel of more than 4 expected registrations per internal cell (`Grids.cells`), 6 per cell of all laps where
-    several are needed (`Grids.laps`), and 8 per bin where the cells are chosen for the pixel alone (waveforms, several
+    several are needed (`Grids.laps`), and 12 per bin where the cells are chosen for the pixel alone (waveforms, several
     returns). All other pixels, and those that feedback refuses, are drawn by exact.
 
     This holds for images. A call with few pixels takes up to some milliseconds more than exact, and the first call with

@@ -65,9 +65,9 @@ class Tolerances:
     registration, even at 2.2 to 4.8; docs/results/runtime.md: 3.8."""
     lap_even: float = 6.0
     """... a cell of each lap: 20 to 25 ns (S = 20, B = 0.01 to 3, dead times of 0.64 and 0.97 periods)."""
-    judged_even: float = 8.0
-    """... a bin whose cells are judged and drawn for one pixel: waveforms 29 + 4.3 ns for each sweep of the mean, at
-    5.4 ns a registration, two returns 15 + 5.9 ns at 10 (26 random systems, 256 pixels each)."""
+    judged_even: float = 12.0
+    """... a bin whose cells are judged and drawn for one pixel: even at 17 (waveforms) and 10 (two returns), medians of
+    8 random systems each of 256 pixels and 128 to 1024 bins, processor time on the same core."""
 
     # mars and renewal: alignment of shapes (engines/pixels.py)
     pulse_outside: float = 1e-6

@@ -87,7 +87,9 @@ def cramer_rao(flux: Flux, system: System, *, threads: int | None = None) -> His
     Returns
     -------
     HistogramBound
-        Standard deviations (...), and the information.
+        Standard deviations (...), and the information: of S and B of `flux`, which are photons on the pixel.
+        `mars_lidar.reconstruct` estimates detectable photons; their standard deviations are those times
+        `Detector.detection_efficiency`.
 
     Raises
     ------

@@ -45,7 +45,7 @@ class Image(Method):
     ----------
     efficiency
         (H, W) relative detection efficiency of each pixel, 0 for dead pixels; None: equal. Signal and background are
-        those of a pixel with the mean efficiency.
+        those of a pixel with the mean efficiency of the pixels that are not dead.
     returns
         Largest number of returns in a pixel, 1 to 8, each estimated from the photons outside the pulses of the others.
         A return is given if its interval is. `signal` and `delay_ns` are then those of the strongest.

@@ -443,6 +443,14 @@ class Cells:
         """Photons per period (cells,), inside the gate if there is one."""
         return np.asarray(sum(self.native_flux), dtype=np.float64)
 
+    @property
+    def jumps(self) -> bool:
+        """Whether the light is constant in samples, whose edges lie anywhere in the bins of a grid.
+
+        Errors are then of second order and irregular, so that a grid may agree with the next by chance.
+        """
+        return self.waveform is not None or isinstance(self.system.pulse, SampledPulse)
+
     def flux(self, index: int) -> Flux:
         """The light of one cell."""
         if self.waveform is not None:
@@ -497,9 +505,20 @@ class Cells:
         """Standard deviation, in periods, of a Gaussian as narrow as the registrations of the signal.
 
         In dim light they are as wide as the signal; the first of n photons arrives within about an n-th of this width.
+        0 where they begin or end abruptly: at the edges of a gate, of a synchronous period and of a waveform's samples.
         """
+        if self.system.detector.mode in ("gated", "synchronous") or (
+            self.waveform is not None and self.returns is None
+        ):
+            return 0.0
         photons = max(float(np.max(self.total, initial=0.0)), 1.0)
         return 1.0 / (2.0 * math.sqrt(math.pi) * max(self._sharpness, 1.0) * photons)
+
+    @property
+    def abrupt(self) -> bool:
+        """Whether registrations begin or end abruptly: with a gate, a synchronous period, or light in samples."""
+        sampled = isinstance(self.system.pulse, SampledPulse) if self.waveform is None else self.returns is None
+        return sampled or self.system.detector.mode in ("gated", "synchronous")
 
     def first_bins(self, out_bins: int) -> int:
         """Bins of the first grid: `usual_bins`, or more where a narrower pulse must be resolved.

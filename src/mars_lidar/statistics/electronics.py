@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -285,7 +286,7 @@ def moments(cells: Cells, tolerance: float, budget: Budget = MOMENTS) -> Moments
     """`electronics_moments` of checked cells."""
     tolerance = checks.real("tolerance", tolerance, low=1e-6, high=0.1)
     out = cells.system
-    timing = Timing(out, cells.finest) if is_timed(out) else None
+    timing = Timing(cells) if is_timed(out) else None
     if timing is not None:
         cells = replace(cells, system=timing.untimed)
     record = timing.forward if timing is not None else np.asarray
@@ -301,7 +302,8 @@ def moments(cells: Cells, tolerance: float, budget: Budget = MOMENTS) -> Moments
     else:
         for k in range(cells.size):
             cell = bare.part(slice(k, k + 1))
-            mean[k], variance[k], histogram[k], grid[k] = refined(cell, slower, bins, tolerance, budget, record)
+            own = record if timing is None else partial(timing.forward, cell=k)
+            mean[k], variance[k], histogram[k], grid[k] = refined(cell, slower, bins, tolerance, budget, own)
     shape = cells.shape
     return Moments(
         mean.reshape(shape), variance.reshape(shape), histogram.reshape(*shape, out.bins), grid.reshape(shape)
@@ -470,7 +472,7 @@ def stationary_records(cells: Cells, *, tolerance: float, threads: int | None) -
     The grid is refined until doubling it moves the shape by less than `tolerance`, at least 1e-3, in total variation.
     """
     tolerance = max(checks.real("tolerance", tolerance, low=1e-9, high=0.1), TOL.records)
-    timing = Timing(cells.system, cells.finest) if is_timed(cells.system) else None
+    timing = Timing(cells) if is_timed(cells.system) else None
     if timing is not None:
         cells = replace(cells, system=timing.untimed)
     record, out = timing.forward if timing is not None else np.asarray, cells.system.bins
@@ -478,8 +480,11 @@ def stationary_records(cells: Cells, *, tolerance: float, threads: int | None) -
     if slower == 0.0:
         return record(stationary_histogram(bare, out, tolerance=tolerance, threads=threads))
     alone = replace(bare, system=bare.system.replace(start="armed"))  # the stationary law does not depend on the start
-    parts = (alone.part(slice(k, k + 1)) for k in range(cells.size))
-    return np.stack([_shape(cell, slower, out, tolerance, record) for cell in parts])
+    shapes = []
+    for k in range(cells.size):
+        own = record if timing is None else partial(timing.forward, cell=k)
+        shapes.append(_shape(alone.part(slice(k, k + 1)), slower, out, tolerance, own))
+    return np.stack(shapes)
 
 
 def _shape(cell: Cells, electronics_ns: float, out: int, tolerance: float, record: Record) -> FloatArray:

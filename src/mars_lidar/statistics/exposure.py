@@ -445,7 +445,7 @@ def recorded_moments(
     """`exposure_moments` of checked cells; the histogram includes jitter and code widths."""
     if not is_timed(cells.system):
         return refined_moments(cells, cells.system.bins, tolerance=tolerance, threads=threads, progress=progress)
-    timing = Timing(cells.system, cells.finest)
+    timing = Timing(cells)
     untimed = replace(cells, system=timing.untimed)
     exposure = refined_moments(untimed, timing.parts, tolerance=tolerance, threads=threads, progress=progress)
     return replace(
@@ -484,16 +484,22 @@ def refined_moments(
     shared = math.gcd(bins // 2, out_bins)
     coarse = _run(cells.part(pending), bins // 2, shared, team, progress, budget)
     last = spent = _spent(coarse, cells)
+    before = None
+    if cells.jumps:
+        before = _run(cells.part(pending), bins // 4, math.gcd(bins // 4, out_bins), team, progress, budget)
     while True:
         _check_budget(cells, pending, spent + 2.0 * last, budget)
         fine = _run(cells.part(pending), bins, out_bins, team, progress, budget)
         last = _spent(fine, cells)
         spent = spent + last
         moved = movement(coarse, fine)
+        if before is not None:
+            moved = np.maximum(moved, movement(before, fine) / TOL.two_halvings)
         good = moved <= tolerance
         put(result, pending[good], fine, good, bins, moved)
         if good.all():
             break
+        before = take(coarse, ~good) if cells.jumps else None
         pending, coarse = pending[~good], take(fine, ~good)
         last, spent = last[~good], spent[~good]
         bins *= 2
@@ -618,14 +624,16 @@ def _refined(cells: Cells, out_bins: int, *, tolerance: float, team: int, period
     most = max(TOL.most_bins, out_bins)
     shared = math.gcd(bins // 2, out_bins)
     coarse = _stationary(cells, bins // 2, shared, team)
+    before = _stationary(cells, bins // 4, math.gcd(bins // 4, out_bins), team) if cells.jumps else None
     while pending.size:
         fine = _stationary(cells.part(pending), bins, out_bins, team)
-        joined = fine.reshape(*coarse.shape, -1).sum(-1)
-        total = np.maximum(fine.sum(-1), np.finfo(float).tiny)
-        counts = np.abs(fine.sum(-1) - coarse.sum(-1)) * (math.sqrt(periods) / np.sqrt(total))
-        moved = np.maximum(np.abs(joined - coarse).sum(-1) / total, counts)
+        moved = _moved(coarse, fine, periods)
+        if before is not None:
+            moved = np.maximum(moved, _moved(before, fine, periods) / TOL.two_halvings)
+        total = fine.sum(-1)
         good = (moved <= tolerance) & (fine.min(-1) >= -1e-12 * total)
         result[pending[good]] = np.maximum(fine[good], 0.0)
+        before = coarse[~good] if cells.jumps else None
         pending, coarse = pending[~good], fine[~good]
         bins *= 2
         if pending.size and bins > most:
@@ -634,6 +642,14 @@ def _refined(cells: Cells, out_bins: int, *, tolerance: float, team: int, period
                 f"still moves by {moved[~good][0]:.2g} (tolerance {tolerance:g}); {cells.instead}"
             )
     return np.asarray(result.reshape(cells.size, asked, -1).sum(-1))
+
+
+def _moved(coarse: FloatArray, fine: FloatArray, periods: int) -> FloatArray:
+    """Movement (cells,) of stationary histograms, and of the mean count of `periods`: see `stationary_histogram`."""
+    total = np.maximum(fine.sum(-1), np.finfo(float).tiny)
+    shape = np.abs(fine.reshape(*coarse.shape, -1).sum(-1) - coarse).sum(-1) / total
+    counts = np.abs(fine.sum(-1) - coarse.sum(-1)) * (math.sqrt(periods) / np.sqrt(total))
+    return np.asarray(np.maximum(shape, counts), dtype=np.float64)
 
 
 def _stationary(cells: Cells, bins: int, out_bins: int, threads: int) -> FloatArray:

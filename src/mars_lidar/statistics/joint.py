@@ -458,7 +458,7 @@ def joint_law(
     )
     if not is_timed(system):
         return replace(_law(cells, tolerance), system=system)
-    timing = Timing(cells.system, cells.finest)
+    timing = Timing(cells)
     law = _law(replace(cells, system=timing.untimed), tolerance)
     pixel = None if law._pixel is None else TimedPixel(law._pixel, law.mean, timing)
     return replace(law, system=system, mean=timing.forward(law.mean), _pixel=pixel)
@@ -501,9 +501,12 @@ def _refined(cells: Cells, out: int, tolerance: float) -> tuple[JointLaw, Pixel]
             f"pixels re-arm a dead time later; {instead}"
         )
     coarse = Pixel(cells, bins // 2, math.gcd(bins // 2, out))
+    before = Pixel(cells, bins // 4, math.gcd(bins // 4, out)) if cells.jumps else None
     while True:
         fine = Pixel(cells, bins, out)
         moved = movement(coarse, fine)
+        if before is not None:
+            moved = max(moved, movement(before, fine) / TOL.two_halvings)
         if moved <= tolerance:
             return JointLaw(system, fine.mean, moved, bins, fine.settled, _pixel=fine), fine
         bins *= 2
@@ -512,7 +515,7 @@ def _refined(cells: Cells, out: int, tolerance: float) -> tuple[JointLaw, Pixel]
                 f"joint law of {cells.name(0)}: with {bins // 2} bins per period it still changes by {moved:.2g} "
                 f"(tolerance {tolerance:g}); {instead}"
             )
-        coarse = fine
+        before, coarse = coarse if cells.jumps else None, fine
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,7 @@ from mars_lidar._base.cached import cached_property
 from mars_lidar._base.types import FloatArray, NDArray
 from mars_lidar.instrument.effects import TIMING_EFFECTS, code_edges
 from mars_lidar.instrument.system import System
-from mars_lidar.statistics.cells import Cells
+from mars_lidar.statistics.cells import Cells, photons_before
 from mars_lidar.statistics.tolerances import TOL
 
 
@@ -31,20 +31,23 @@ def recorded(cells: Cells, compute: Callable[[Cells, int], FloatArray]) -> Float
     system = cells.system
     if not is_timed(system):
         return compute(cells, system.bins)
-    timing = Timing(system, cells.finest)
+    timing = Timing(cells)
     return timing.forward(compute(replace(cells, system=timing.untimed), timing.parts))
 
 
 class Timing:
-    """The map from registrations in equal parts of the period to records in the bins of the histogram.
+    """The map from registrations in equal parts of the period to records in the bins of the histogram, for some cells.
 
-    `finest` is the standard deviation, in periods, of the narrowest feature of the registrations (`Cells.finest`).
+    With jitter, times are uniform within their parts, which are narrow compared with it. Without, an edge of a code
+    divides the registrations of a part as it divides the photons.
     """
 
-    def __init__(self, system: System, finest: float) -> None:
-        self.system = system
-        jitter = system.detector.jitter
-        width = math.hypot(finest, 0.0 if jitter is None else jitter.finest_ns / system.period_ns)
+    def __init__(self, cells: Cells) -> None:
+        self.system, self._cells = cells.system, cells
+        system, jitter = cells.system, cells.system.detector.jitter
+        width = cells.finest if jitter is None else jitter.finest_ns / system.period_ns
+        if jitter is not None and not cells.abrupt:
+            width = math.hypot(cells.finest, width)
         split = math.ceil(TOL.parts_per_sigma / (max(width, 1e-9) * system.bins))
         split = 2 * max(1, min(split, TOL.most_parts // system.bins) // 2)
         self.parts = system.bins * split
@@ -79,20 +82,23 @@ class Timing:
         starts = (np.arange(0, bins, codes)[:, None] + edges[:-1]).reshape(-1)
         return np.append(starts, bins) * split
 
-    def forward(self, histogram: FloatArray) -> FloatArray:
-        """Records (..., bins) of registrations (..., parts)."""
+    def forward(self, histogram: FloatArray, cell: int | None = None) -> FloatArray:
+        """Records (..., bins) of registrations (..., parts), of all cells or of one."""
         if self._jitter is not None:
             spectrum = np.fft.rfft(histogram, axis=-1) * self._jitter
             histogram = np.maximum(np.fft.irfft(spectrum, self.parts, axis=-1), 0.0)
-        before = np.concatenate([np.zeros((*histogram.shape[:-1], 1)), np.cumsum(histogram, axis=-1)], axis=-1)
+        rows = histogram.reshape(-1, self.parts)
+        before = np.concatenate([np.zeros((len(rows), 1)), np.cumsum(rows, axis=-1)], axis=-1)
         whole, rest = self._split
-        at = before[..., whole] + rest * histogram[..., np.minimum(whole, self.parts - 1)]
-        return np.asarray(np.diff(at, axis=-1), dtype=np.float64)
+        if cell is not None and len(rest) > 1:
+            rest = rest[cell]
+        at = before[:, whole] + rest * rows[:, np.minimum(whole, self.parts - 1)]
+        return np.asarray(np.diff(at, axis=-1).reshape(*histogram.shape[:-1], -1), dtype=np.float64)
 
     def backward(self, weights: FloatArray) -> FloatArray:
-        """Mean weight (..., parts) of the record of a registration in each part, for weights (..., bins)."""
+        """Mean weight (..., parts) of registrations of the only cell in a part, for weights (..., bins) of records."""
         whole, rest = self._split
-        whole, rest = whole[1:-1], rest[1:-1, None]
+        whole, rest = whole[1:-1], rest[0, 1:-1, None]
         step = np.diff(weights.reshape(-1, weights.shape[-1]), axis=-1).T  # at each edge
         beyond = np.zeros((self.parts + 2, step.shape[1]))
         np.add.at(beyond, whole, step * (1.0 - rest))  # several edges may lie in one part
@@ -104,5 +110,15 @@ class Timing:
 
     @cached_property
     def _split(self) -> tuple[NDArray[np.int64], FloatArray]:
+        """The part (bins + 1,) of each edge, and what fraction (cells or 1, bins + 1) of that part is before the edge.
+
+        It is a fraction of the photons without jitter, of the time otherwise.
+        """
         whole = np.minimum(np.floor(self._edges), self.parts).astype(np.int64)
-        return whole, self._edges - whole
+        rest = (self._edges - whole)[None]
+        if self._jitter is not None or not rest.any():
+            return whole, rest
+        ends = np.concatenate([whole, np.minimum(whole + 1, self.parts), self._edges]) / self.parts
+        low, high, at = np.split(photons_before(self._cells, ends), 3, axis=1)
+        lit = high > low
+        return whole, np.where(lit, (at - low) / np.where(lit, high - low, 1.0), rest)

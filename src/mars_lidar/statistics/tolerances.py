@@ -84,6 +84,8 @@ class Tolerances:
         Bins per period of the coarsest and finest first grid; refinement may exceed the latter.
     compared_bins
         Fewest bins of the histogram in which grids are compared, at the cost of a single bin.
+    two_halvings
+        Movement over two halvings of the bins relative to that over the last, for errors of second order: 15/3.
     unrefined_bins
         Least bins of grids that are not refined, of the phase chain and without a dead time, and of the first grid that
         follows the pulse: with fewer the discretisation of the chain is visible in the variance of the count.
@@ -210,6 +212,7 @@ class Tolerances:
     first_bins: int = 128
     most_first_bins: int = 2**14
     compared_bins: int = 32
+    two_halvings: float = 5.0
     unrefined_bins: int = 512
     chain_bins_per_width: float = 7.5
     pulse_samples: int = 2**12

@@ -40,6 +40,7 @@ class SeveralReturns {
         bool settled = climb(best, -HUGE_VAL);
         chance_[0] = first_chance(one[6]);
         while (settled) {
+            if (r_.sample > 0.0 && best.count > 1) look_around(best);
             likelihood_.scores(best);
             if (!search_(best, likelihood_, hints_)) break;
             const double least = search_.least_gain(job_.false_alarm);
@@ -65,7 +66,7 @@ class SeveralReturns {
     }
 
  private:
-    static constexpr int kSteps = 200;
+    static constexpr int kMostSteps = 200;
     // Share of the gain that the squared score tells of at least; what tells of less is not tried.
     static constexpr double kTold = 0.7;
     // Twice the fall of the logarithm a standard error from the best: 1 of a parabola, to within the first of these. Below
@@ -124,10 +125,10 @@ class SeveralReturns {
     // Fisher scoring with Levenberg's damping, as `climb` of one return; given up where it would not reach `bar`. One
     // unknown may be held.
     bool climb(ReturnsPoint& point, double bar, int held = -1) {
-        const double farthest = std::max(r_.width, 0.5 / static_cast<double>(r_.bins));
         likelihood_(point);
         double damping = 1e-3;
-        for (int step = 0; step < kSteps; ++step) {
+        int idle = 0;  // steps that rose by less than `kGain`, as along a kink
+        for (int step = 0; step < kMostSteps; ++step) {
             const int unknowns = point.unknowns();
             bool free[kUnknowns] = {};
             double move[kUnknowns];
@@ -147,13 +148,7 @@ class SeveralReturns {
                     next.information[a][a] *= 1.0 + damping;
                 }
                 if (!solve<kUnknowns>(next.information, point.gradient, free, move, unknowns)) continue;
-                next.count = point.count;
-                next.at[0] = std::clamp(point.at[0] + move[0], std::max(least_, 0.05 * point.at[0]), kMostPhotons);
-                for (int k = 0; k < point.count; ++k) {
-                    const int a = 2 * k + 1;
-                    next.at[a] = std::clamp(point.at[a] + move[a], 0.0, kMostPhotons);
-                    next.at[a + 1] = point.at[a + 1] + std::clamp(move[a + 1], -farthest, farthest);
-                }
+                move_by(move, point, next);
                 likelihood_(next);
                 if (!(next.value >= point.value)) continue;
                 double before = 0.0, after = 0.0;
@@ -162,13 +157,118 @@ class SeveralReturns {
                     after += next.gradient[a] * (next.at[a] - point.at[a]);
                 }
                 if (after < -0.5 * before) damping = std::max(damping, 8.0);
+                idle = next.value < point.value + kGain ? idle + 1 : 0;
                 point = next;
                 better = true;
             }
+            if (idle == 2) return true;
             if (!better) return damping > 1e3;
             damping = std::max(damping / 64.0, 1e-9);
         }
         return false;
+    }
+
+    // A step from a point, within bounds.
+    void move_by(const double* move, const ReturnsPoint& from, ReturnsPoint& to) const {
+        const double farthest = std::max(r_.width, 0.5 / static_cast<double>(r_.bins));
+        to.count = from.count;
+        to.at[0] = std::clamp(from.at[0] + move[0], std::max(least_, 0.05 * from.at[0]), kMostPhotons);
+        for (int k = 0; k < from.count; ++k) {
+            const int a = 2 * k + 1;
+            to.at[a] = std::clamp(from.at[a] + move[a], 0.0, kMostPhotons);
+            to.at[a + 1] = from.at[a + 1] + std::clamp(move[a + 1], -farthest, farthest);
+        }
+    }
+
+    // As `Maximizer::look_around`, along the delay of each return in turn.
+    void look_around(ReturnsPoint& best) {
+        for (int turn = 0; turn < kMostTurns; ++turn) {
+            climb(best, -HUGE_VAL);
+            ReturnsPoint top = best;
+            for (int k = 0; k < best.count; ++k) {
+                higher_.clear();
+                set_profile(best, k);
+                for (ReturnsPoint& at : higher_) {
+                    climb(at, top.value);
+                    if (at.value > top.value) top = at;
+                }
+            }
+            if (!(top.value > best.value + kGain)) return;
+            best = top;
+        }
+    }
+
+    // The likelihood of the delay of return k, the other unknowns at their maximum for each: outwards from the best until it
+    // has fallen for good, by the trapezoidal rule. Where it may rise above the best is noted in `higher_`.
+    void set_profile(const ReturnsPoint& best, int k) {
+        const int a = 2 * k + 2, unknowns = best.unknowns();
+        const double bin = 1.0 / static_cast<double>(r_.bins), recurs = bin + r_.sample, most = bin / kSteps;
+        double *square = squares_[k], &total = weights_[k] = 0.0;
+        std::fill(square, square + kUnknowns, 0.0);
+        const auto part_of = [&](const ReturnsPoint& at) {
+            const double curvature = at.information[a][a];
+            return std::clamp(curvature > 0.0 ? kPart / std::sqrt(curvature) : most, 1e-3 * most, most);
+        };
+        for (const double side : {-1.0, 1.0}) {
+            ReturnsPoint at = best;
+            double weight = 1.0, fallen = 0.0, step = most;
+            while (std::fabs(at.at[a] - best.at[a]) < 0.5 && fallen < recurs) {
+                step = std::min(most, 1.5 * step);
+                if (fallen == 0.0) step = std::min(step, part_of(at));
+                ReturnsPoint next = at;
+                next.at[a] += side * step;
+                settle(next, a);
+                const double its = std::exp(std::min(next.value - best.value, 1.0));
+                if (fallen > 0.0 && its > kFallen && step > part_of(next)) {  // it rises again: finer
+                    step *= 0.25;
+                    continue;
+                }
+                const double rise = side * at.gradient[a], fall = side * next.gradient[a];
+                const double meet =
+                    rise > 0.0 && fall < 0.0 ? (next.value - at.value - fall * step) / (rise - fall) : 0.0;
+                if (std::max(next.value, at.value + rise * meet) > best.value + kGain) {
+                    higher_.push_back(next);
+                    if (meet > 0.0) higher_.back().at[a] = at.at[a] + side * meet;
+                }
+                total += 0.5 * step * (weight + its);
+                for (int b = 0; b < unknowns; ++b) {
+                    const double here = at.at[b] - best.at[b], there = next.at[b] - best.at[b];
+                    square[b] += 0.5 * step * (weight * here * here + its * there * there);
+                }
+                fallen = its < kFallen ? fallen + step : 0.0;
+                weight = its;
+                at = next;
+            }
+        }
+    }
+
+    // One step of scoring of all unknowns but one.
+    void settle(ReturnsPoint& point, int held) {
+        bool free[kUnknowns] = {};
+        double move[kUnknowns];
+        likelihood_(point);
+        set_free(point, free);
+        free[held] = false;
+        if (!solve<kUnknowns>(point.information, point.gradient, free, move, point.unknowns())) return;
+        ReturnsPoint next;
+        move_by(move, point, next);
+        likelihood_(next);
+        if (next.value > point.value) point = next;
+    }
+
+    // Of sampled pulses: that of a delay is the root of its mean square by its profile; the others move with the delays
+    // beside their errors where these are held.
+    void profile_errors(const ReturnsPoint& best, const bool* free, double* out) {
+        bool held[kUnknowns];
+        double spread[kUnknowns][kUnknowns];
+        for (int a = 0; a < kUnknowns; ++a) held[a] = free[a] && (a == 0 || a % 2 == 1);
+        if (!inverse<kUnknowns>(best.information, held, spread, best.unknowns())) return;
+        for (int a = 0; a < best.unknowns(); ++a) {
+            double square = held[a] ? spread[a][a] : 0.0;
+            for (int k = 0; k < best.count; ++k)
+                if (held[a] || a == 2 * k + 2) square += squares_[k][a] / weights_[k];
+            if (free[a] && square > 0.0) out[a] = std::sqrt(square);
+        }
     }
 
     void set_free(const ReturnsPoint& point, bool* free) const {
@@ -212,6 +312,7 @@ class SeveralReturns {
         double observed[kUnknowns][kUnknowns] = {}, spread[kUnknowns][kUnknowns];
         std::fill(out, out + kUnknowns, NAN);
         set_free(best, free);
+        if (r_.sample > 0.0) return profile_errors(best, free, out);
         for (int a = 0; a < unknowns; ++a) {
             if (!free[a]) continue;
             const double step = 0.02 / std::sqrt(best.information[a][a]);
@@ -259,7 +360,10 @@ class SeveralReturns {
     ReturnsLikelihood likelihood_;
     ReturnSearch search_;
     std::vector<Hint> hints_;
+    std::vector<ReturnsPoint> higher_;  // where a climb may end above the best
     double least_ = 0.0, chance_[kMostReturns] = {};
+    // Of the profile of each delay: its weight and, times that, the mean squares of how far the unknowns are from the best.
+    double weights_[kMostReturns] = {}, squares_[kMostReturns][kUnknowns] = {};
 };
 
 }  // namespace mars

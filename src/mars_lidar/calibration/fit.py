@@ -416,8 +416,8 @@ class Fit:
         fresh = (fresh - fresh.mean(0)) / np.sqrt(near.ratio) * np.sqrt(len(y) / (len(y) - terms.shape[1]))
         rest = project @ unmoved
         (z, p), timed = _misfit(rest, fresh, law, near), free == model.light + 2
-        uneven = timed.any() and _uneven(solve @ gain @ (y - near.offset).T, moved, timed)
         judged, interval = self.shortest(model, draws(model, raw, cov, free)), None
+        uneven = judged is not None and timed.any() and _uneven(solve @ gain @ (y - near.offset).T, moved, timed)
         if judged is not None:
             early, shortest = judged
             dead = shortest.dead_time()
@@ -499,6 +499,10 @@ def _curved(
     log = np.einsum("ki,ij,kj->k", out, np.linalg.inv(2.25 * cov), out) + len(free) * np.log(scale)
     log -= scale * np.einsum("ki,ij,kj->k", off, np.linalg.inv(rest.T @ rest), off)
     weight = np.exp(0.5 * (log - log.max()))
+    if (
+        not weight.sum() ** 2 > 200.0 * (weight**2).sum()
+    ):  # as few draws as `draws` takes for none: the linear law holds
+        return raw, cov
     mean = np.average(at, axis=0, weights=weight)
     theta = centre.copy()
     theta[free] += mean

@@ -391,5 +391,7 @@ def _check(cells: Cells, cell: int, law: Pmf, cumulants: FloatArray) -> None:
             f"{total - 1.0:.2g}, mean off by {mean:.2g}, variance {variance:.6g} for {cumulants[1]:.6g}, "
             f"least {least:.2g}; mean, variance and cumulants are known; for the law {cells.instead}"
         )
-    pmf[pmf <= -least] = 0.0  # rounding: of a locked count's variance 1e-9 in each of 30 counts is a few percent
+    pmf[pmf <= max(min(-least, rounding), 0.0)] = (
+        0.0  # of a locked count's variance 1e-9 in each of 30 is a few percent
+    )
     pmf /= pmf.sum()

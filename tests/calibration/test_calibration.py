@@ -94,7 +94,7 @@ def test_a_wrong_dead_time_that_is_given_is_the_suspect() -> None:
     assert abs(suspect.size - 50.0) < FAR * suspect.error
     stated = result.estimates["signal"]
     assert np.isnan([stated.error, stated.low, stated.high]).all()
-    assert str(stated).endswith("of a model that does not fit: no error holds")
+    assert str(stated).endswith("of a model that does not fit: no error is stated")
 
 
 @pytest.mark.full

@@ -29,7 +29,7 @@ from mars_lidar.instrument.tolerances import TOL
 from mars_lidar.light.flux import Flux
 from mars_lidar.light.timestamps import Timestamps
 
-_SAME_TIME = 0.01  # share of records at exactly the time of the preceding one, that no photons are
+_SAME_TIME = 0.01  # fraction of records at exactly the time of the preceding one, above which they are not photons
 LEVEL = 0.01  # false-alarm probability of the verdict
 
 _FIELDS = (
@@ -413,12 +413,12 @@ class _Run:
         self.model = replace(model, fields=tuple(self.fields.items()), jitter_given="jitter" in self.fixed)
 
     def result(self) -> Calibration:
-        """The fit, the effects that it takes in, and what they leave."""
+        """The fit, the effects that it includes, and the suspects that remain."""
         fitted = self.first()
         wrong = () if fitted.converged and fitted.p_value >= self.level else self.wrong_values(fitted)
         included: list[suspects.Named] = []
         drift = suspects.drift(self.fit, fitted) if fitted.converged else None
-        steady = fitted.converged and not (drift is not None and drift.flickers)  # or all effects look like it
+        steady = fitted.converged and not (drift is not None and drift.flickers)  # flicker looks like every effect
         listed = suspects.scores(self.fit, fitted) if steady else []
         for _ in range(self.fit.effort.effects if steady and not wrong else 0):
             better = suspects.refitted(self.fit, fitted, listed)
@@ -432,7 +432,7 @@ class _Run:
         return self.assembled(fitted, included, [] if wrong else listed, drift, wrong)
 
     def wrong_values(self, fitted: Fitted) -> tuple[Suspect, ...]:
-        """Given values without which the stream fits, each with the estimate that takes its place."""
+        """Given values that the stream contradicts (without one of them it fits), and the estimate of each."""
         out = []
         without: list[tuple[str, Any, Pulse | str, dict[str, Any], dict[str, float]]] = []
         for name, value in self.fixed.items():
@@ -460,7 +460,7 @@ class _Run:
         return tuple(out)
 
     def first(self) -> Fitted:
-        """The fit of the plain model, from the better of two starts; with other streams where it did not converge."""
+        """The plain model from the better of two starts, repeated with other simulated streams until it converges."""
         for attempt in range(self.fit.effort.attempts):
             self.fit = Fit(self.recording, Effort(), (self.seed, attempt))
             fitted = self._attempt()
@@ -469,7 +469,7 @@ class _Run:
         return fitted
 
     def _attempt(self) -> Fitted:
-        """A fit with the streams of `fit`."""
+        """A fit with the simulated streams of `fit`."""
         fit, model = self.fit, self.model
         tried = []
         begin = start.starts(fit, self.recording, model, self.fixed)
@@ -503,7 +503,7 @@ class _Run:
         p = fitted.p_value if fitted.converged else 0.0
         if drift is not None:
             p = min(1.0, 2.0 * min(p, drift.probability))
-            option = "calibrate parts of the recording; the errors include what the parts scatter"
+            option = "calibrate parts of the recording; the errors include the scatter of the parts"
             for k in np.flatnonzero(drift.drifts):
                 change = drift.change[k] / (drift.values[:, k].mean() if k == 0 else 1.0)
                 words = "drift of the light, relative" if k == 0 else f"drift of {drift.names[k]}, ns"
@@ -539,7 +539,7 @@ class _Run:
 
 
 def _growth(fitted: Fitted, drift: Drift | None) -> FloatArray:
-    """Factor (p,) on the errors of the light, by the scatter of parts of the recording, where they drift."""
+    """Factor (p,) on the errors of the light where parts of the recording scatter more than their errors."""
     out = np.ones(fitted.model.size)
     if drift is None:
         return out
@@ -551,7 +551,7 @@ def _growth(fitted: Fitted, drift: Drift | None) -> FloatArray:
 
 
 def _estimates(fitted: Fitted, growth: FloatArray) -> dict[str, Estimate]:
-    """What is printed, written and drawn, from draws of the law of the parameters."""
+    """The estimates that are printed, written and drawn: moments and quantiles of draws of the parameters."""
     model = fitted.model
     scale = growth[fitted.free]
     covariance = fitted.covariance * np.outer(scale, scale)
@@ -567,7 +567,7 @@ def _estimates(fitted: Fitted, growth: FloatArray) -> dict[str, Estimate]:
             out[name] = Estimate(value, 0.0, value, value, "given")
             return
         if withheld:
-            out[name] = Estimate(value, np.nan, np.nan, np.nan, "of a model that does not fit: no error holds")
+            out[name] = Estimate(value, np.nan, np.nan, np.nan, "of a model that does not fit: no error is stated")
             return
         low, high = (0.0, np.quantile(sample, 0.95)) if limit else np.quantile(sample, (0.025, 0.975))
         out[name] = Estimate(value, float(((sample - value) ** 2).mean() ** 0.5), float(low), float(high), note)
@@ -591,7 +591,7 @@ def _estimates(fitted: Fitted, growth: FloatArray) -> dict[str, Estimate]:
         put("width_ns", float(centre[k]), drawn[:, k], "width")
         shared = note if note.startswith("not identified") else ""
         put("pulse_sigma_ns", pulse, pulses, "width", note=shared)
-    put("jitter_ns", jitter, jitters, "jitter", note=note, limit=bool(note))  # equal tails would leave out none at all
+    put("jitter_ns", jitter, jitters, "jitter", note=note, limit=bool(note))  # equal tails would exclude zero
     at = k + 3
     dead, observed = drawn[:, k + 2], float(centre[k + 2])
     for effect in model.effects:
@@ -600,7 +600,7 @@ def _estimates(fitted: Fitted, growth: FloatArray) -> dict[str, Estimate]:
         if effect.names[0] == "electronics_excess":
             put("electronics_dead_time_ns", observed, dead, "dead_time_ns")
             put("dead_time_ns", observed / (1.0 + float(values[0])), dead / (1.0 + columns[:, 0]), "electronics_excess")
-        elif effect.names[0] == "afterpulse_probability":  # in the option's units: those lost in the dead time included
+        elif effect.names[0] == "afterpulse_probability":  # in the option's units, with those that the dead time hides
             after, delay = float(values[0]), float(np.exp(values[1]))
             columns[:, 1] = np.exp(columns[:, 1])
             carriers = np.array([all_carriers(*each) for each in np.c_[columns, dead]])
@@ -619,7 +619,7 @@ def _estimates(fitted: Fitted, growth: FloatArray) -> dict[str, Estimate]:
 
 
 def _limits(fitted: Fitted, listed: list[Score]) -> tuple[Limit, ...]:
-    """Upper limits of effects that were not detected, of each the weakest delay or kind."""
+    """Upper limits of effects that were not detected, for each effect the largest over its delays or kinds."""
     best: dict[str, Limit] = {}
     names = [fitted.model.names[k] for k in fitted.free]
     errors = np.sqrt(np.diag(fitted.covariance))
@@ -639,7 +639,7 @@ def _limits(fitted: Fitted, listed: list[Score]) -> tuple[Limit, ...]:
 
 
 def _worst_cells(fitted: Fitted) -> tuple[str, float]:
-    """The group of cells that fits worst, in words, and its standard deviations."""
+    """The group of cells that fits worst, in words, and by how many standard deviations."""
     cells = fitted.batch.cells
     middle = cells.phases + cells.gap_edges.size + 1
     groups = {

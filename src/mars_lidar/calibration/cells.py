@@ -1,4 +1,4 @@
-"""Counts of a stream in cells of phase, of interval, and of both; cells are set by simulated streams of the model."""
+"""Counts of a stream in cells of phase, of interval, and of both; simulated streams of the model place the cells."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Cells:
         quantiles = np.r_[np.linspace(0.2, 0.8, 7), 1.0 - tail]
         rank = np.r_[fine[fine < 0.15 * photons], photons * quantiles] * ratio
         place = gaps[np.minimum(rank.astype(int), gaps.size - 1)]
-        early = (np.arange(1, 7) / 7) ** 3  # quantiles of the intervals that divide the table, more of them short
+        early = (np.arange(1, 7) / 7) ** 3  # quantiles of the intervals that divide the table, closer for short ones
         ages = self._between(gaps[(early * gaps.size).astype(int)], unit)
         self.gap_edges = np.union1d(self._between(place, unit), ages)
         self.gap_edges = self.gap_edges[self.gap_edges > 0.0]

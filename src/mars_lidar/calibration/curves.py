@@ -33,8 +33,8 @@ class Curves:
 class Realizations:
     """Distribution of the count in pieces of the recording, and that of the model (T6 of the MaRS paper).
 
-    `counts` (realizations,); `measured` and `predicted` frequencies; distances with what samples of this size from the
-    predicted law have: mean and 99 % quantile of the total variation, mean of the Kullback-Leibler divergence in nats.
+    `counts` (realizations,); `measured` and `predicted` frequencies; their distances, and those of samples of this size
+    from the predicted law: mean and 99 % quantile of the total variation, mean Kullback-Leibler divergence in nats.
     """
 
     cycles: int
@@ -58,7 +58,7 @@ class Realizations:
 def curves(
     recording: Recording, model: Model | None, theta: FloatArray | None, seed: int, sizes: tuple[int, int, int]
 ) -> Curves:
-    """Histograms of intervals, phases and ages in `sizes` cells, of the model at `theta` too where it is given."""
+    """Histograms of intervals, phases and ages in `sizes` cells, and those of the model at `theta` if it is given."""
     period, unit = recording.period_ns, recording.clock.unit_ns
 
     def counted(times: list[FloatArray], edges: list[FloatArray]) -> list[FloatArray]:

@@ -29,15 +29,30 @@ _CUMULATED = 100.0  # intervals expected up to an edge, for a normal law of thei
 class Effort:
     """Numbers of simulated streams and of their photons: more take longer, and make the errors less noisy.
 
-    `settings` detectors of a batch, of `LIGHTS` streams each; `stream` least photons of each, `batch` photons of a
-    batch at most and `share` of the recording's photons that a batch has at least, below that bound; `first` photons of
-    the recording that the first steps weigh, `rounds` steps at most. `spread` of a batch about its centre, in standard
-    errors of a stream of its length. The last streams have `longer` times as many photons, so that their parameters
-    need not differ as much; those which give the weights are `more` times as many; of their batches there are
-    `recentred` at most. `widths` of the pulse in a batch: the table of a pulse takes as long as a stream. `draws` from
-    the law of the estimate, for its bounds. `attempts` to fit a stream, each with simulated streams of its own, of
-    which the first that converges is taken; `effects` taken in, one after the other, and `refits` with an effect more
-    that fresh streams judge; `shape_bins` of a free light, at most.
+    Attributes
+    ----------
+    settings
+        Detectors of a batch, each with `LIGHTS` streams.
+    stream, batch, share
+        Fewest photons of a stream, most photons of a batch, and photons of a batch relative to those of the recording.
+    first, rounds
+        Photons of the recording that the first steps weigh; most steps.
+    spread
+        Standard deviation of the parameters of a batch, in standard errors of a stream of its length.
+    longer, more, recentred
+        The last streams have `longer` times as many photons, so that their parameters differ less; the batch that
+        gives the weights has `more` times as many streams; it is recentred at most `recentred` times.
+    widths
+        Different pulse widths in a batch, because the table of a pulse takes as long as a stream.
+    draws
+        Draws from the law of the estimate, for intervals within the bounds of the parameters.
+    attempts
+        Attempts to fit a recording, each with other simulated streams; the first that converges is used.
+    effects, refits
+        Effects that are included at most, one after the other, and refits with a further effect that fresh streams
+        judge.
+    shape_bins
+        Most bins of free light.
     """
 
     settings: int = 32
@@ -200,8 +215,10 @@ class Fitted:
     free: NDArray[np.intp]
     theta: FloatArray
     covariance: FloatArray  # of the law before the bounds
-    unbounded: FloatArray  # (p,) before the bounds of what a detector can have
-    scatter: FloatArray  # (free, free) that of the estimator for the recording's exposure, simulations aside
+    unbounded: FloatArray  # (p,) before the bounds of the model
+    scatter: (
+        FloatArray  # (free, free) of the estimator for the recording's exposure, without the noise of the simulations
+    )
     batch: Batch  # cells and weights
     offset: FloatArray  # (c,) expected counts at the centre of the last streams
     estimator: FloatArray  # (free, c): parameters less that centre, by counts less their offset
@@ -211,11 +228,11 @@ class Fitted:
     misfit_z: float  # standard deviations of the misfit above that of fresh streams
     p_value: float
     converged: bool
-    by_shortest: tuple[float, float, float] | None  # the dead time and its interval, where no count tells it
+    by_shortest: tuple[float, float, float] | None  # the dead time and its interval, if the counts do not determine it
 
 
 def most_probable(model: Model, theta: FloatArray, covariance: FloatArray, free: NDArray[np.intp]) -> FloatArray:
-    """The most probable parameters (p,) of a normal law within what a detector can have.
+    """The most probable parameters (p,) of a normal law within the bounds of the model.
 
     One parameter after the other, the one farthest beyond its bound first, is set to that bound, and the others to
     their mean given that value.
@@ -237,7 +254,7 @@ def most_probable(model: Model, theta: FloatArray, covariance: FloatArray, free:
 
 
 def draws(model: Model, theta: FloatArray, covariance: FloatArray, free: NDArray[np.intp]) -> FloatArray:
-    """Parameters (n, p) of that law; where hardly any lies within the bounds, of one about what is most probable."""
+    """Draws (n, p) of that law within the bounds; if hardly any lies there, about the most probable parameters."""
     root = root_of(covariance)
     rows = np.tile(theta, (Effort.draws, 1))
     rows[:, free] += np.random.default_rng(0).standard_normal((Effort.draws, len(free))) @ root.T
@@ -248,9 +265,9 @@ def draws(model: Model, theta: FloatArray, covariance: FloatArray, free: NDArray
 
 
 def _inverse(fisher: FloatArray, prior: FloatArray, root: FloatArray) -> FloatArray:
-    """Covariance of an information and a prior precision; noise may have made the information indefinite.
+    """Covariance from an information, which noise may have made indefinite, and a prior precision.
 
-    The streams are from within `_NEAR` standard errors, and no larger error is stated.
+    The streams lie within `_NEAR` standard errors of the estimate, and no larger error is stated.
     """
     values, vectors = np.linalg.eigh(root.T @ fisher @ root)
     whole = (vectors * np.maximum(values, _NEAR**-2.0)) @ vectors.T + root.T @ prior @ root
@@ -307,7 +324,7 @@ class Fit:
         return regression(cells, rows, theta, made, self.exposure(photons) / exposure, free)
 
     def steps(self, guess: Guess, photons: float, first: float = 0.0) -> tuple[Guess, float, bool]:
-        """Steps that weigh ever more photons, up to `photons`; misfit a cell, and whether it settled."""
+        """Steps that weigh more and more photons, up to `photons`; misfit per cell, and whether the steps converged."""
         model, theta, root, free = guess
         weighed = float(min(photons, max(first, self.effort.first)))
         total = float(self.recording.photons)
@@ -341,9 +358,9 @@ class Fit:
         return Guess(model, theta, root, free), misfit, near and weighed >= photons
 
     def shortest(self, model: Model, rows: FloatArray) -> tuple[float, Shortest] | None:
-        """How probable the shortest interval is by rows (n, p) of parameters, and its law; None beside other effects.
+        """Probability of the shortest interval for draws (n, p) of the parameters, and its law; None with effects.
 
-        The fit counts intervals in cells, and does not know where in its cell an interval lies.
+        The fit counts intervals in cells, without their places within a cell, so that it does not use this interval.
         """
         if model.effects or model.fields:
             return None
@@ -355,15 +372,17 @@ class Fit:
         return law.p_value([part[:, k] for part in parts]), law
 
     def finish(self, guess: Guess, again: bool = True, known: bool = False) -> Fitted:
-        """The last estimate, and what fresh streams about it say of its slope, bias, scatter and misfit.
+        """The last estimate, with the slope, bias, scatter and misfit that fresh streams around it show.
 
-        The dead time is `known` by the shortest interval alone where that lies outside of the 95 % interval of the
-        counts, or says more than they do, or where counts hardly change with the dead time on one side of the estimate.
-        Then the others are fitted once more; what one interval says does not show beside the scatter of all counts.
+        The dead time follows from the shortest interval alone (`known`) if that contradicts the 95 % interval of the
+        counts, or is more precise, or if the counts hardly change with the dead time on one side of the estimate. The
+        other parameters are then fitted once more at that dead time.
         """
         model, theta, root, free = guess
         photons, effort = float(self.recording.photons), self.effort
-        closer = effort.spread / effort.more**0.5  # counts near the end of a dead time are linear over short distances
+        closer = (
+            effort.spread / effort.more**0.5
+        )  # counts near the end of a dead time are linear over short distances only
         prior, middle = model.precision(free), model.middle(theta)
         law = self.law(Guess(model, theta, root, free), photons, None, closer, effort.more, effort.longer)
         nearby = _NEAR * (effort.of(photons, effort.longer) / photons) ** 0.5
@@ -382,7 +401,7 @@ class Fit:
             noise = np.atleast_2d(rest.T @ rest) / (len(y) - terms.shape[1])
             away = gain @ (recorded - near.offset) - slope[0]
             information = np.linalg.pinv(noise)
-            there = np.r_[1.0, np.linalg.pinv(local) @ away]  # where the law is read, for its own noise there
+            there = np.r_[1.0, np.linalg.pinv(local) @ away]  # the place at which the law is used, and its noise there
             for _ in range(2):
                 scale = 1.0 / (1.0 / near.ratio + there @ inverse @ there)
                 # the square of the slope is too large by that of its noise
@@ -407,7 +426,7 @@ class Fit:
         if again and (np.abs((centre - theta)[free]) > _NEAR * sd).any():  # cells and weights were laid elsewhere
             return self.finish(Guess(model, centre, root_of(cov), free), False, known)
         jacobian = law.slope[:, free] @ local
-        # what is at its bound takes up no counts that would move it beyond
+        # a parameter at its bound does not absorb counts that would move it beyond
         at_bound = ((model.bounded(mean + 1e-6 * (raw - mean)) == mean) & (raw != mean))[free]
         estimator = estimator - cov[:, at_bound] @ np.linalg.pinv(cov[np.ix_(at_bound, at_bound)]) @ estimator[at_bound]
         unmoved = recorded - near.offset - jacobian[:, at_bound] @ (mean - centre)[free[at_bound]]
@@ -456,7 +475,7 @@ class Fit:
 def _uneven(estimates: FloatArray, moved: FloatArray, which: NDArray[np.bool_]) -> bool:
     """Whether estimates (free, streams) follow the parameter `which` on one side much less than on the other.
 
-    A normal law about the centre holds on neither side then: of dead times between two pulses, no interval tells.
+    A normal law about the centre then holds on neither side: dead times that end between two pulses change no interval.
     """
     x = moved[:, which]
     terms = np.c_[np.ones(len(moved)), moved, np.abs(x)]
@@ -479,10 +498,11 @@ def _curved(
     observed: FloatArray,
     ratio: float,
 ) -> tuple[FloatArray, FloatArray]:
-    """Mean (p,) and covariance (free, free) of parameters of which the last one, a logarithm, acts by its square too.
+    """Mean (p,) and covariance (free, free) of parameters whose last one, a logarithm, also acts by its square.
 
-    Estimates `counted` (streams, free) of streams at parameters `moved` from the centre are a law with the squares of
-    the logarithm and its products with the size; draws of the linear law are weighed by it, where `observed` was.
+    The estimates `counted` (streams, free) of streams at parameters `moved` from the centre are fitted by a law with
+    the square of the logarithm and its product with the size. Draws of the linear law are weighted by the likelihood of
+    the `observed` estimates under it.
     """
     rows = draws(model, raw, 2.25 * cov, free)
     at = (rows - centre)[:, free]
@@ -499,9 +519,7 @@ def _curved(
     log = np.einsum("ki,ij,kj->k", out, np.linalg.inv(2.25 * cov), out) + len(free) * np.log(scale)
     log -= scale * np.einsum("ki,ij,kj->k", off, np.linalg.inv(rest.T @ rest), off)
     weight = np.exp(0.5 * (log - log.max()))
-    if (
-        not weight.sum() ** 2 > 200.0 * (weight**2).sum()
-    ):  # as few draws as `draws` takes for none: the linear law holds
+    if not weight.sum() ** 2 > 200.0 * (weight**2).sum():  # too few effective draws: the linear law is kept
         return raw, cov
     mean = np.average(at, axis=0, weights=weight)
     theta = centre.copy()
@@ -510,10 +528,10 @@ def _curved(
 
 
 def _misfit(rest: FloatArray, fresh: FloatArray, law: Batch, near: Batch) -> tuple[float, float]:
-    """Standard deviations of the weighed square of the counts that the fit leaves above fresh streams', probability.
+    """Weighted square of the residual counts, in standard deviations above that of fresh streams; its probability.
 
-    The probability is that of two tests together: the weighed square of all cells, and the largest departure of the
-    cumulated intervals, which sees a few missing or early intervals at the edge of the dead time.
+    The probability is that of two tests together: the weighted square of all cells, and the largest residual of the
+    cumulated intervals, which is sensitive to a few missing or early intervals at the end of the dead time.
     """
     from scipy.special import gammaincc, ndtr
 
@@ -521,11 +539,11 @@ def _misfit(rest: FloatArray, fresh: FloatArray, law: Batch, near: Batch) -> tup
     noise = 1.0 + near.ratio / len(near.counts)
     weight = law.weight[np.ix_(used, used)]
     drawn = np.einsum("ki,ij,kj->k", fresh[:, used], weight, fresh[:, used])
-    mine = float(rest[used] @ weight @ rest[used]) / noise
+    recorded = float(rest[used] @ weight @ rest[used]) / noise
     shape = drawn.mean() ** 2 / drawn.var()
-    square = float(gammaincc(shape, mine * shape / drawn.mean()))
+    square = float(gammaincc(shape, recorded * shape / drawn.mean()))
     gaps = slice(law.cells.phases, law.cells.phases + law.cells.gap_edges.size)
     enough = np.cumsum(near.offset[gaps]) > _CUMULATED
     departure = np.abs(np.cumsum(rest[gaps])) / (np.cumsum(fresh[:, gaps], axis=1).std(0) * noise**0.5)
     late = 2.0 * enough.sum() * float(ndtr(-departure[enough].max(initial=0.0)))
-    return float((mine - drawn.mean()) / drawn.std()), min(1.0, 2.0 * min(square, late))
+    return float((recorded - drawn.mean()) / drawn.std()), min(1.0, 2.0 * min(square, late))

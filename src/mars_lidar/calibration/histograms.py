@@ -26,7 +26,7 @@ from mars_lidar.reconstruction.maximum_likelihood import MaximumLikelihood
 from mars_lidar.reconstruction.method import Estimates
 
 _GRID = 13  # dead times of the first search, over a period
-_DECREASE = 1e-2  # of the log likelihood, to which it is climbed
+_DECREASE = 1e-2  # of the log likelihood, at which the maximisation ends
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,8 +171,8 @@ def _with_response(
     """The system with the most likely response in `reach` bins on either side, and the standard errors of its samples.
 
     A bin j of pixel k expects D_kj (B_k / bins + S_k sum_m a_kjm r_m), with r the response, a the share of its sample
-    m that falls into the bin at the pixel's delay, and D the armed passes: maximized by expectation and maximization
-    (Shepp and Vardi, IEEE Trans. Med. Imaging 1, 113, 1982), then the light of each pixel again.
+    m that falls into the bin at the pixel's delay, and D the armed passes. The likelihood is maximised by expectation
+    and maximisation (Shepp and Vardi, IEEE Trans. Med. Imaging 1, 113, 1982), in turn with the light of each pixel.
     """
     from scipy.sparse import csr_matrix
 
@@ -207,7 +207,7 @@ def _with_response(
 
 
 def _armed_passes(counts: FloatArray, system: System) -> FloatArray:
-    """Armed passes (pixels, bins) of each bin: what a light of one photon a bin would record."""
+    """Armed passes (pixels, bins) of each bin: the registrations for light of one photon per bin."""
     from mars_lidar._base.native import _core
 
     bins = counts.shape[1]
@@ -237,7 +237,7 @@ def _normal(value: float, error: float) -> Estimate:
 
 
 def _half_width(loss: Callable[[FloatArray], float], at: FloatArray, k: int, least: float) -> float:
-    """Distance at which the loss is a half above its least, the mean of both sides: one standard error."""
+    """Distance at which the loss is 1/2 above its minimum, the mean of both sides: one standard error."""
     sides = []
     for sign in (-1.0, 1.0):
         step = 1e-4 * max(abs(at[k]), 1.0)

@@ -85,12 +85,12 @@ def look_at(recording: Recording) -> Look:
 
 
 def other_period(recording: Recording) -> float | None:
-    """The period, ns, that the photons repeat with where it is not that of the recording; None where it is, or none is.
+    """The period of the photons, ns, if they have one other than that of the recording; else None.
 
-    Periodogram of the first times: photons of a constant light have a power of their number in each line, those of a
-    pulsed one of their number squared at the laser's frequency and its multiples. The lowest strong line is taken.
-    A dead time in bright light is nearly a period of its own, but a broad one: a line must stand out from its
-    neighbours. The units of a clock are spread, or they would be a period too.
+    Periodogram of the first times: in constant light the power of a line is the number of photons, in pulsed light the
+    square of that number at the laser's frequency and its multiples. The lowest strong line is taken. A dead time in
+    bright light makes broad lines, so that a line must exceed its neighbours. Times are spread over the unit of the
+    clock, which would be a period as well.
     """
     times = max(recording.pieces, key=lambda piece: piece.size)
     cell = recording.period_ns / _PER_PERIOD
@@ -120,7 +120,7 @@ def other_period(recording: Recording) -> float | None:
 
 
 def _is_harmonic(power: FloatArray, line: int, given: float) -> bool:
-    """Whether a line is a multiple of the given frequency, of which there are others: a dead time may weaken those."""
+    """Whether a line is a multiple of the given frequency whose lower multiples exist, weakened by a dead time."""
     from scipy.stats import gamma
 
     number = round(line / given)
@@ -137,7 +137,7 @@ def _strongest(power: FloatArray, line: float) -> float:
 
 
 def _neighbours(power: FloatArray, line: int) -> float:
-    """Mean power of a line without a period, by the median of those around it but the nearest."""
+    """Mean power of a line without a period, from the median of the lines around it except the nearest."""
     reach = 2 * _PER_PERIOD
     around = np.concatenate([power[max(line - reach, 1) : line - 3], power[line + 4 : line + reach + 1]])
     return max(float(np.median(around)) / math.log(2.0), 1.0)

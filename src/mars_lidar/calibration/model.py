@@ -31,11 +31,11 @@ Fields = dict[str, Any]
 
 @dataclass(frozen=True)
 class Effect:
-    """What a detector may do beside dead time and jitter.
+    """A property of a detector beside dead time and jitter.
 
-    `names` of its parameters, the first its size, the others logarithms; `start` values that a test for it tries;
-    `least` and `most` the bounds; `apply` makes the fields of a `Detector` with it; `words` for a table; `onoff` where
-    it has no size.
+    `names` of its parameters, of which the first is its size and the others are logarithms; `start`: their values in
+    the test for it; `least` and `most`: their bounds; `apply` adds it to the fields of a `Detector`; `words` for a
+    table; `onoff`: it has no size.
     """
 
     names: tuple[str, ...]
@@ -48,7 +48,7 @@ class Effect:
 
 
 def all_carriers(after: float, delay_ns: float, dead_time_ns: float) -> float:
-    """Carriers of an avalanche of which `after` outlive its dead time; fewer than one, as `Afterpulsing` has it."""
+    """Carriers of an avalanche, of which `after` outlive the dead time; fewer than one, as `Afterpulsing` requires."""
     return float(min(after * np.exp(min(dead_time_ns / delay_ns, 50.0)), _MOST_CARRIERS))
 
 
@@ -59,7 +59,7 @@ def _afterpulses(fields: Fields, value: tuple[float, ...]) -> Fields:
 
 
 def _electronics(fields: Fields, value: tuple[float, ...]) -> Fields:
-    observed = fields["dead_time_ns"]  # that of the electronics, over a detector that is ready earlier
+    observed = fields["dead_time_ns"]  # the dead time of the electronics, behind a detector that is ready earlier
     return fields | {"electronics_dead_time_ns": observed, "dead_time_ns": observed / (1.0 + value[0])}
 
 
@@ -158,7 +158,7 @@ class Model:
         return self.light + 3 + sum(len(effect.names) for effect in self.effects)
 
     def bounded(self, theta: FloatArray) -> FloatArray:
-        """Parameters (..., p) within what a detector can have."""
+        """Parameters (..., p) within their bounds."""
         out = np.array(theta, float)
         k = self.light
         out[..., 0] = np.maximum(out[..., 0], 1e-7)
@@ -187,7 +187,7 @@ class Model:
         return np.sqrt(np.maximum(width**2 - jitter**2, 0.0)), jitter
 
     def scale(self, theta: FloatArray) -> FloatArray:
-        """Changes (p,) of parameters over which counts are about linear functions of them, as a batch varies them."""
+        """Changes (p,) of the parameters over which the counts are about linear, for the spread of a batch."""
         k, unit = self.light, self.clock.unit_ns
         width = float(np.hypot(theta[k], unit / 12**0.5))
         out = np.zeros(self.size)
@@ -211,7 +211,7 @@ class Model:
         return out
 
     def precision(self, free: NDArray[np.intp]) -> FloatArray:
-        """Prior precision (free, free): an angle that no data tell has the standard deviation of its whole range."""
+        """Prior precision (free, free): that of an angle anywhere in its range; the other parameters have no prior."""
         known = self.split & (free == self.light + 1)
         return np.asarray(np.diag(known * (2.0 / np.pi) ** 2))
 
@@ -228,7 +228,9 @@ class Model:
         least = _NARROWEST * self.clock.period_ns
         if jitter and sd > least:
             fields["jitter"] = Jitter(sigma_ns=sd)
-        sigma = max(sigma, least) if self.returns else _WIDEST * self.clock.period_ns  # no light has that pulse
+        sigma = (
+            max(sigma, least) if self.returns else _WIDEST * self.clock.period_ns
+        )  # without a return the pulse has no light
         pulse = self.pulse or GaussianPulse(sigma_ns=float(f"{sigma:.9g}"))
         return System(
             period_ns=self.clock.period_ns, cycles=cycles, bins=bins, pulse=pulse, detector=Detector(**fields)
@@ -253,15 +255,15 @@ class Model:
             return flux
         light = flux.waveform.sum(-1, keepdims=True)
         variance = self.waveform_error**2 * (self.exposure / cycles)
-        scale = variance / self.waveform  # of gamma laws, which have no negative light
+        scale = variance / self.waveform  # of gamma laws, so that no light is negative
         shape = np.random.default_rng(seed).gamma(self.waveform / scale, size=flux.waveform.shape) * scale
         return Flux(waveform=light * shape / shape.sum(-1, keepdims=True))
 
     def streams(self, rows: FloatArray, cycles: int, seed: int, jitter: bool = True) -> Streams:
-        """Recorded times of a stream for each row of (rows, p); the detector is that of the first row, but its jitter.
+        """Recorded times of a stream for each row of (rows, p); all have the detector of the first row but its jitter.
 
-        The jitter of a recorded time is drawn here, a normal deviate each, so that it may differ from row to row and
-        no table of its shape is built for each value.
+        The jitter is added here, a normal deviate for each time, so that it may differ from row to row and no table is
+        built for each value.
         """
         rows = self.bounded(np.atleast_2d(rows))
         with warnings.catch_warnings():

@@ -1,4 +1,4 @@
-"""A recording of one pixel: its times, its clock, what it holds before any model."""
+"""A recording of one pixel: times, clock, and statistics that need no model."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from mars_lidar._base.types import ArrayLike, FloatArray
 from mars_lidar.light.timestamps import Timestamps
 
 _ON_GRID = 0.02  # units: largest distance from the grid of a clock, for times in float64 over an hour
-FALSE_ALARM = 0.003  # of a plain recording: an effect, a drift, a misfit that is named; another period; a pulse
-LEAST_PHOTONS = 300  # of a recording or a part of it: below them the counts of the cells have no normal law
+FALSE_ALARM = 0.003  # probability that an effect, drift, misfit, other period or pulse is named where there is none
+LEAST_PHOTONS = 300  # of a recording or a part of it: with fewer, the counts of the cells do not have a normal law
 _OWN_UNITS = (2**15, 2**16)  # units of the period in our own PTU and Photon-HDF5, at most
 
 
 @dataclass(frozen=True)
 class Clock:
-    """What a recorder writes for a time: the nearest point of a grid.
+    """The grid of a recorder, whose nearest point it writes for a time.
 
     `unit_ns` its spacing, 0 for real numbers; `offset` where its points lie, in units; `locked` whether the grid
     begins anew with each laser pulse (T3), or runs through (T2).
@@ -79,7 +79,7 @@ class Recording:
         return min(float(np.diff(piece).min()) for piece in self.pieces)
 
     def unevenness(self, window: float) -> tuple[float, int, float]:
-        """Half the mean squared difference of counts in successive windows of so many periods, their number, mean."""
+        """Allan variance of the count in windows of `window` periods, the number of differences, and the mean count."""
         rows = [
             np.bincount((piece / (window * self.period_ns)).astype(np.int64), minlength=int(cycles / window) + 1)
             for piece, cycles in zip(self.pieces, self.cycles, strict=True)
@@ -137,7 +137,7 @@ def recording_of(times: Timestamps | Sequence[Timestamps], *, pooled: bool = Fal
 def clock_of(t: FloatArray, stream: Timestamps, probed: int = 2000) -> Clock:
     """The clock of times (n,), by the unit that the file gives: where their grid lies, and what it is locked to.
 
-    Times that lie on no grid of that unit are real numbers. So many are `probed`.
+    Times that lie on no grid of that unit are real numbers; `probed` of them are examined.
     """
     period = stream.period_ns
     probe = t[:: max(1, t.size // probed)]
@@ -161,7 +161,7 @@ def clock_of(t: FloatArray, stream: Timestamps, probed: int = 2000) -> Clock:
 def recording_of_arrivals(times_ns: ArrayLike, unit_ns: float, probed: int = 2000) -> Recording:
     """A recording without a laser: its period is the mean interval, a unit of time alone.
 
-    Of the times so many are `probed` for the offset of the clock.
+    The offset of the clock follows from `probed` of the times.
     """
     t = np.asarray(checks.numbers("times", times_ns))
     if t.dtype.kind not in "fiu":

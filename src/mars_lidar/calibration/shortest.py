@@ -1,11 +1,12 @@
-"""What the shortest interval of a recording says of the dead time, whatever light there is to end one.
+"""Law of the dead time given the shortest interval of a recording, for light of any shape.
 
-A registration at phase p is followed, at age a, by light of the rate r(p + a). Of all registrations
+A registration at phase p is followed, at age a, by light of the rate r(p + a). The expected number of recorded
+intervals up to x is
 
-    H(x; t_d) = sum over p of the integral over a > t_d of r(p + a) K(x - a)
+    H(x; t_d) = sum over all registrations p of the integral over a > t_d of r(p + a) K(x - a),
 
-recorded intervals up to x are expected, K(x - a) the probability that jitter and clock bring one of age a there. Early
-intervals are few of many: none is recorded with the probability exp(-H).
+where K(x - a) is the probability that jitter and clock record an interval a as at most x. Such intervals are rare, so
+that their number is a Poisson number: none is recorded with the probability exp(-H).
 """
 
 from __future__ import annotations
@@ -22,14 +23,14 @@ from mars_lidar.statistics.cells import photons_per_bin
 
 @dataclass(frozen=True, eq=False)
 class Shortest:
-    """Probabilities (laws, m) of dead times (m,): a shortest interval of at least the recorded one, or of more."""
+    """Probabilities (laws, m) of a shortest interval of at `least` the recorded one, or `more`, for dead times (m,)."""
 
     dead: FloatArray
     least: FloatArray
     more: FloatArray
 
     def p_value(self, dead: list[FloatArray]) -> float:
-        """Probability of a shortest interval as far off as the recorded one, by the dead times (n,) of each law."""
+        """Two-sided p-value of the recorded shortest interval, given draws (n,) of the dead time for each law."""
         least, more = (
             np.mean([np.interp(own, self.dead, row).mean() for own, row in zip(dead, rows, strict=True)])
             for rows in (self.least, self.more)
@@ -37,7 +38,7 @@ class Shortest:
         return float(min(1.0, 2.0 * min(least, 1.0 - more)))
 
     def dead_time(self) -> tuple[float, float, float]:
-        """Median and 95 % interval of the dead time by the shortest interval, of equally probable ones before it."""
+        """Median and 95 % interval of the dead time given the shortest interval, for a flat prior."""
         likely = (self.least - self.more).mean(0)
         share = np.r_[0.0, np.cumsum(0.5 * (likely[1:] + likely[:-1]) * np.diff(self.dead))]
         low, middle, high = np.interp(np.array([0.025, 0.5, 0.975]) * share[-1], share, self.dead)

@@ -14,9 +14,9 @@ _WINDOWS = 64  # of the period, for the median light
 
 
 def free_light(t: FloatArray, period: float, hold: float, bins: int) -> tuple[FloatArray, FloatArray]:
-    """Registrations and passes while armed (bins,) over the period, from `hold` after each registration on.
+    """Registrations and armed passes (bins,) over the period, from `hold` after each registration on.
 
-    Their ratio is the light, photons a period in each bin, whatever its shape and whatever the dead time.
+    Their ratio is the light in photons per period and bin, for any shape and any dead time below `hold`.
     """
     a = np.floor((t[:-1] + hold) * (bins / period)).astype(np.int64)
     b = np.floor(t[1:] * (bins / period)).astype(np.int64)
@@ -78,7 +78,7 @@ def light(t: FloatArray, model: Model, hold: float) -> FloatArray:
 
 
 def starts(fit: Fit, recording: Recording, model: Model, fixed: dict[str, float]) -> list[tuple[float, FloatArray]]:
-    """(misfit, parameters), the best first: for jitters from none to all of the recorded width."""
+    """(misfit, parameters), the best first, for jitters from zero to the whole recorded width."""
     names = model.names
     k = model.light
     photons = min(recording.photons, fit.effort.first)
@@ -122,7 +122,7 @@ def starts(fit: Fit, recording: Recording, model: Model, fixed: dict[str, float]
 
 
 def with_edge(fit: Fit, model: Model, theta: FloatArray, low: FloatArray) -> FloatArray:
-    """Parameters with the dead time at which simulated streams have the smallest intervals of `low` (n,), sorted."""
+    """Parameters with a dead time at which simulated streams have the smallest intervals of `low` (n,), sorted."""
     n, k = low.size, model.light
     ranks = np.unique(np.minimum([1, 5, 20, max(30, n // 500), max(60, n // 100), max(120, n // 30)], n - 1))
     observed = low[ranks]
@@ -137,7 +137,7 @@ def with_edge(fit: Fit, model: Model, theta: FloatArray, low: FloatArray) -> Flo
 
 
 def safe_hold(recording: Recording) -> float:
-    """Time after a registration, ns, from which on the pixel is armed: past the edge of the intervals."""
+    """Time after a registration, ns, at which the pixel is certainly armed: beyond the shortest intervals."""
     gaps = np.concatenate([np.diff(piece) for piece in recording.pieces])
     first, late = min(1, gaps.size - 1), max(30, gaps.size // 500) % gaps.size
     low, edge = np.partition(gaps, (first, late))[[first, late]]
@@ -145,7 +145,7 @@ def safe_hold(recording: Recording) -> float:
 
 
 def free_waveform(recording: Recording, most: int) -> tuple[FloatArray, FloatArray]:
-    """Light (bins,) in photons per period and bin, and its standard errors, dead time removed, whatever its shape."""
+    """Light (bins,) of any shape in photons per period and bin, without dead time, and its standard errors."""
     period, unit = recording.period_ns, recording.clock.unit_ns
     units = round(period / unit) if unit else 0
     bins = most
@@ -162,7 +162,7 @@ def free_waveform(recording: Recording, most: int) -> tuple[FloatArray, FloatArr
 
 
 def brightest_window(recording: Recording) -> float:
-    """Probability that light without a pulse has a window as bright above the median, of all windows."""
+    """Probability that constant light has a window as bright above the median, all windows together."""
     from scipy.special import ndtr
 
     rate, error = free_waveform(recording, 512)

@@ -1,4 +1,4 @@
-"""What a recording shows beyond its model: effects of the detector, by a score and then by a refit; drift, by parts."""
+"""Deviations of a recording from its model: detector effects, by a score and then a refit; drift, by parts."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from mars_lidar.calibration.model import Effect, Model, effects
 from mars_lidar.calibration.recording import FALSE_ALARM, LEAST_PHOTONS, Recording
 from mars_lidar.calibration.start import with_edge
 
-_MISFIT = 1e-3  # a fit whose misfit is so many times less probable than that of another is a bad one
-_TRIED = 0.1  # false alarms of a score or a misfit from which on effects are tried: the refit decides
+_MISFIT = 1e-3  # a fit is bad if its p-value is below this fraction of another's
+_TRIED = 0.1  # false-alarm probability of a score or a misfit at which effects are tried; the refit decides
 _PARTS = 16  # of a recording, for drift: a trend then has 14 degrees of freedom
 
 
 @dataclass(frozen=True)
 class Score:
-    """An effect's size by the residual counts, its standard deviation, and how a unit of it shifts the parameters."""
+    """Size of an effect from the residual counts, its standard deviation, and the shift of the parameters."""
 
     effect: Effect
     size: float
@@ -29,7 +29,7 @@ class Score:
 
     @property
     def z(self) -> float:
-        """Standard deviations above none; no effect has a negative size."""
+        """Standard deviations above zero; no effect has a negative size."""
         return self.size / self.error
 
     @property
@@ -49,7 +49,7 @@ def _counts(fit: Fit, fitted: Fitted, model: Model, theta: FloatArray) -> tuple[
 
 
 def _score(fit: Fit, fitted: Fitted, plain: FloatArray, model: Model, theta: FloatArray, effect: Effect) -> Score:
-    """Size of an effect along the counts of a model that has it at `theta`, less those that the fit can take up."""
+    """Size of an effect along its change of the counts at `theta`, without the part that the fit absorbs."""
     (made, share), size = _counts(fit, fitted, model, theta), theta[fitted.model.size]
     change, noise, used = made - plain, (np.maximum(plain, 0.5) + np.maximum(made, 0.5)) * share, fitted.batch.common
     change = change * np.maximum(0.0, 1.0 - 2.0 * noise / np.maximum(change**2, 1e-300)) / max(float(size), 1e-9)
@@ -63,7 +63,7 @@ def _score(fit: Fit, fitted: Fitted, plain: FloatArray, model: Model, theta: Flo
 
 
 def scores(fit: Fit, fitted: Fitted) -> list[Score]:
-    """The score of each effect that the model does not have, the clearest first."""
+    """The score of each effect that the model does not include, the most significant first."""
     model = fitted.model
     have = {name for effect in model.effects for name in effect.names} | {name for name, _ in model.fields}
     have |= {"afterpulse_probability"} if "afterpulsing" in have else set()
@@ -80,7 +80,7 @@ def scores(fit: Fit, fitted: Fitted) -> list[Score]:
 
 
 def clear(listed: list[Score], alarm: float = FALSE_ALARM) -> float:
-    """Standard deviations of a score that one of these effects has by chance with this probability."""
+    """Score that the largest of these effects exceeds by chance with probability `alarm`."""
     from scipy.special import ndtri
 
     return float(-ndtri(alarm / max(len(listed), 1)))
@@ -88,7 +88,7 @@ def clear(listed: list[Score], alarm: float = FALSE_ALARM) -> float:
 
 @dataclass(frozen=True)
 class Named:
-    """An effect that a refit took in: z of its score before, and the gain of the misfit in standard deviations."""
+    """An effect that a refit included: its score before, and the decrease of the misfit in standard deviations."""
 
     effect: Effect
     z: float
@@ -96,11 +96,11 @@ class Named:
 
 
 def refitted(fit: Fit, fitted: Fitted, listed: list[Score]) -> tuple[Fitted, Named | None] | None:
-    """The fit with the one effect that explains most, or a better one without; None where none is clear.
+    """The fit with the effect that explains most, or a better fit without any; None if no effect is significant.
 
-    Effects are named by the refit: a slow recovery may have the score of a paralyzable detector, and one that the
-    dead time has taken up has no score at all, but one along the counts of the refit. So all are tried where the misfit
-    is suspicious. Shorter batches judge between effects; the last ones are those of the effect that is taken in.
+    The refit decides which effect it is: a slow recovery may have the score of a paralyzable detector, and an effect
+    that the dead time has absorbed has a score only along the counts of the refit. All effects are therefore tried if
+    the misfit is suspicious. Short batches choose between effects; the chosen one is fitted with full batches.
     """
     limit = clear(listed, _TRIED)
     tried = {score.effect.names[0]: score for score in reversed(listed) if score.z > limit or fitted.p_value < _TRIED}
@@ -129,7 +129,7 @@ def refitted(fit: Fit, fitted: Fitted, listed: list[Score]) -> tuple[Fitted, Nam
 
 
 def _stepped(fit: Fit, fitted: Fitted, score: Score) -> tuple[float, Guess] | None:
-    """Misfit and parameters with one effect more; None where a detector cannot have it beside the others."""
+    """Misfit and parameters with a further effect; None if a detector cannot have it together with the others."""
     model, effect = replace(fitted.model, effects=(*fitted.model.effects, score.effect)), score.effect
     size = effect.start[0]
     moved = fitted.theta.copy()
@@ -145,7 +145,7 @@ def _stepped(fit: Fit, fitted: Fitted, score: Score) -> tuple[float, Guess] | No
     free = np.r_[np.union1d(fitted.free, timed), more].astype(np.intp)
     photons = float(fit.recording.photons)
     try:
-        if fitted.model.light + 2 in free:  # which has taken up what it could of the effect
+        if fitted.model.light + 2 in free:  # the dead time has absorbed part of the effect
             gaps = np.diff(fit.recording.pieces[0][: 12 * fit.effort.first])
             theta = with_edge(fit, model, theta, np.sort(gaps))
         guess, misfit, _ = fit.steps(Guess(model, theta, np.diag(spread[free]), free), photons, photons / 6.0)
@@ -203,9 +203,9 @@ def _flicker(fit: Fit, fitted: Fitted, counts: float = 8.0, windows: int = 64) -
     """Relative scatter of counts by flickering light, its standard deviations, and the factor on their variance.
 
     Half the mean squared difference of counts in successive windows (Allan's variance, which a slow drift does not
-    change), over that of streams of the fit: for longer windows, beside the shortest. Afterpulses and all else that a
-    detector remembers for less than these changes all windows alike, the fluctuations of light the longer ones more.
-    The shortest have so many `counts`, the others four times as many each, as long as there are so many `windows`.
+    change), over that of streams of the fit: for longer windows, relative to the shortest. Afterpulses and other
+    correlations shorter than the windows change all of them alike, fluctuations of the light the longer ones more. The
+    shortest windows have `counts` counts, each further size four times as many, as long as `windows` remain.
     """
     from scipy.special import ndtri
 

@@ -188,6 +188,7 @@ def test_forward_models_are_measured_with_their_gradients():
 
 
 @pytest.mark.full
+@pytest.mark.filterwarnings("ignore:the bins of:UserWarning")  # of a tiny configuration
 def test_estimators_are_timed():
     reconstruction = command.run(TINY, ("reconstruction",)).sections[0]
     assert {row["method"] for row in reconstruction.rows} >= {"maximum_likelihood", "mchc", "coates", "matched_filter"}

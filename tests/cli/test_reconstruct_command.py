@@ -245,6 +245,7 @@ def test_errors_of_a_map():
 
 
 @pytest.mark.full
+@pytest.mark.filterwarnings("ignore:the bins of:UserWarning")  # half a standard error, of bins that the study states
 def test_study(tmp_path):
     rows = quick_study("reconstruction", tmp_path).rows
     assert {row["method"] for row in rows} == {name for name, method in METHODS.items() if not method.of_images}

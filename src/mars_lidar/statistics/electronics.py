@@ -289,7 +289,6 @@ def moments(cells: Cells, tolerance: float, budget: Budget = MOMENTS) -> Moments
     timing = Timing(cells) if is_timed(out) else None
     if timing is not None:
         cells = replace(cells, system=timing.untimed)
-    record = timing.forward if timing is not None else np.asarray
     bins = cells.system.bins
     mean, variance, grid = np.empty(cells.size), np.empty(cells.size), np.empty(cells.size, np.int64)
     histogram = np.empty((cells.size, out.bins))
@@ -297,13 +296,13 @@ def moments(cells: Cells, tolerance: float, budget: Budget = MOMENTS) -> Moments
     if slower == 0.0:
         exposure = refined_moments(bare, bins, tolerance=min(tolerance, 1e-4), threads=None)
         flat = exposure.cumulants.reshape(-1, exposure.cumulants.shape[-1])
-        mean, variance, histogram = flat[:, 0], flat[:, 1], record(exposure.histogram.reshape(-1, bins))
+        mean, variance, histogram = flat[:, 0], flat[:, 1], _record(timing)(exposure.histogram.reshape(-1, bins))
         grid = exposure.bins.reshape(-1)
     else:
         for k in range(cells.size):
             cell = bare.part(slice(k, k + 1))
-            own = record if timing is None else partial(timing.forward, cell=k)
-            mean[k], variance[k], histogram[k], grid[k] = refined(cell, slower, bins, tolerance, budget, own)
+            record = _record(timing, k)
+            mean[k], variance[k], histogram[k], grid[k] = refined(cell, slower, bins, tolerance, budget, record)
     shape = cells.shape
     return Moments(
         mean.reshape(shape), variance.reshape(shape), histogram.reshape(*shape, out.bins), grid.reshape(shape)
@@ -339,6 +338,11 @@ def coarsest_grid(cell: Cells, out: int) -> int:
 
 
 Record = Callable[[FloatArray], FloatArray]  # from registrations to records: jitter and code widths
+
+
+def _record(timing: Timing | None, cell: int | None = None) -> Record:
+    """The map to records, of all cells or of one."""
+    return np.asarray if timing is None else partial(timing.forward, cell=cell)
 
 
 def refined(
@@ -475,16 +479,13 @@ def stationary_records(cells: Cells, *, tolerance: float, threads: int | None) -
     timing = Timing(cells) if is_timed(cells.system) else None
     if timing is not None:
         cells = replace(cells, system=timing.untimed)
-    record, out = timing.forward if timing is not None else np.asarray, cells.system.bins
+    out = cells.system.bins
     bare, slower = without_electronics(cells)
     if slower == 0.0:
-        return record(stationary_histogram(bare, out, tolerance=tolerance, threads=threads))
+        return _record(timing)(stationary_histogram(bare, out, tolerance=tolerance, threads=threads))
     alone = replace(bare, system=bare.system.replace(start="armed"))  # the stationary law does not depend on the start
-    shapes = []
-    for k in range(cells.size):
-        own = record if timing is None else partial(timing.forward, cell=k)
-        shapes.append(_shape(alone.part(slice(k, k + 1)), slower, out, tolerance, own))
-    return np.stack(shapes)
+    parts = ((alone.part(slice(k, k + 1)), _record(timing, k)) for k in range(cells.size))
+    return np.stack([_shape(cell, slower, out, tolerance, record) for cell, record in parts])
 
 
 def _shape(cell: Cells, electronics_ns: float, out: int, tolerance: float, record: Record) -> FloatArray:

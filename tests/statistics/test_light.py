@@ -150,14 +150,16 @@ def test_jitter_behind_an_edge_of_a_gate(light: str):
 
 
 @pytest.mark.parametrize("jitter_ns", [0.0, 0.12, 2.0])
-@pytest.mark.parametrize("light", ["waveform", "samples", "pulse"])
+@pytest.mark.parametrize("light", ["waveform", "samples", "returns of samples", "pulse"])
 def test_codes_divide_light_in_steps(light: str, jitter_ns: float):
     """Registrations in 8000 bins, of which codes take what lies before their edges; bins were up to 42 % off."""
     density = tuple(np.random.default_rng(1).uniform(0.3, 2.0, 5))
     wave = np.random.default_rng(1).random(64) ** 3
     flux = ml.Flux(waveform=wave / wave.sum(), background=0.3) if light == "waveform" else ml.Flux(0.7, 0.3, 31.3)
     samples = ml.SampledPulse(np.random.default_rng(1).random(7) ** 2, bin_ns=1.7, origin="first")
-    pulse = {"pulse": samples} if light == "samples" else {}
+    if light == "returns of samples":
+        flux = ml.Flux.multi(ml.Flux(0.4, 0.3, 31.3), ml.Flux(0.3, 0.0, 70.9))
+    pulse = {"pulse": samples} if "samples" in light else {}
     fine = ml.mean_histogram(flux, make_system(30.0, 20, 8000).replace(**pulse), tolerance=1e-6)
     if jitter_ns:
         fine = np.fft.irfft(np.fft.rfft(fine) * np.exp(-2.0 * (np.pi * np.arange(4001) * jitter_ns / 100.0) ** 2), 8000)

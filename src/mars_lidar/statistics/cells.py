@@ -505,20 +505,13 @@ class Cells:
         """Standard deviation, in periods, of a Gaussian as narrow as the registrations of the signal.
 
         In dim light they are as wide as the signal; the first of n photons arrives within about an n-th of this width.
-        0 where they begin or end abruptly: at the edges of a gate, of a synchronous period and of a waveform's samples.
+        0 where they begin or end abruptly: with a gate, a synchronous period, or light in samples.
         """
-        if self.system.detector.mode in ("gated", "synchronous") or (
-            self.waveform is not None and self.returns is None
-        ):
+        smooth = self.returns is not None and not isinstance(self.system.pulse, SampledPulse)
+        if (self.jumps and not smooth) or self.system.detector.mode in ("gated", "synchronous"):
             return 0.0
         photons = max(float(np.max(self.total, initial=0.0)), 1.0)
         return 1.0 / (2.0 * math.sqrt(math.pi) * max(self._sharpness, 1.0) * photons)
-
-    @property
-    def abrupt(self) -> bool:
-        """Whether registrations begin or end abruptly: with a gate, a synchronous period, or light in samples."""
-        sampled = isinstance(self.system.pulse, SampledPulse) if self.waveform is None else self.returns is None
-        return sampled or self.system.detector.mode in ("gated", "synchronous")
 
     def first_bins(self, out_bins: int) -> int:
         """Bins of the first grid: `usual_bins`, or more where a narrower pulse must be resolved.

@@ -45,9 +45,7 @@ class Timing:
     def __init__(self, cells: Cells) -> None:
         self.system, self._cells = cells.system, cells
         system, jitter = cells.system, cells.system.detector.jitter
-        width = cells.finest if jitter is None else jitter.finest_ns / system.period_ns
-        if jitter is not None and not cells.abrupt:
-            width = math.hypot(cells.finest, width)
+        width = math.hypot(cells.finest, 0.0 if jitter is None else jitter.finest_ns / system.period_ns)
         split = math.ceil(TOL.parts_per_sigma / (max(width, 1e-9) * system.bins))
         split = 2 * max(1, min(split, TOL.most_parts // system.bins) // 2)
         self.parts = system.bins * split

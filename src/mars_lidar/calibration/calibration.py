@@ -12,14 +12,14 @@ from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.display import brief, measured
 from mars_lidar._base.resources import one_blas_thread
-from mars_lidar._base.types import ArrayLike, FloatArray
+from mars_lidar._base.types import ArrayLike, FloatArray, NDArray
 from mars_lidar.calibration import start, suspects
 from mars_lidar.calibration.curves import Curves, Realizations, curves, realizations
 from mars_lidar.calibration.fit import Effort, Fit, Fitted, Guess, draws
 from mars_lidar.calibration.look import Look, look_at
 from mars_lidar.calibration.model import Model, all_carriers
 from mars_lidar.calibration.recording import FALSE_ALARM, LEAST_PHOTONS, Recording, recording_of, recording_of_arrivals
-from mars_lidar.calibration.suspects import Drift, Score
+from mars_lidar.calibration.suspects import Drift, Named, Score
 from mars_lidar.instrument.avalanches import Afterpulsing
 from mars_lidar.instrument.detector import Detector
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, Jitter
@@ -416,20 +416,13 @@ class _Run:
         """The fit, the effects that it includes, and the suspects that remain."""
         fitted = self.first()
         wrong = () if fitted.converged and fitted.p_value >= self.level else self.wrong_values(fitted)
-        included: list[suspects.Named] = []
+        included: list[Named] = []
         drift = suspects.drift(self.fit, fitted) if fitted.converged else None
-        steady = fitted.converged and not (drift is not None and drift.flickers)  # flicker looks like every effect
-        listed = suspects.scores(self.fit, fitted) if steady else []
-        for _ in range(self.fit.effort.effects if steady and not wrong else 0):
-            better = suspects.refitted(self.fit, fitted, listed)
-            if better is None:
-                break
-            fitted, effect = better
-            included += [] if effect is None else [effect]
-            listed = suspects.scores(self.fit, fitted)
-        if included:
-            drift = suspects.drift(self.fit, fitted)
-        return self.assembled(fitted, included, [] if wrong else listed, drift, wrong)
+        listed: list[Score] = []
+        if fitted.converged and not wrong and not (drift is not None and drift.flickers):  # which looks like effects
+            fitted, included, listed = suspects.search(self.fit, fitted)
+            drift = suspects.drift(self.fit, fitted) if included else drift
+        return self.assembled(fitted, included, listed, drift, wrong)
 
     def wrong_values(self, fitted: Fitted) -> tuple[Suspect, ...]:
         """Given values that the stream contradicts (without one of them it fits), and the estimate of each."""
@@ -485,7 +478,7 @@ class _Run:
     def assembled(
         self,
         fitted: Fitted,
-        included: list[suspects.Named],
+        included: list[Named],
         listed: list[Score],
         drift: Drift | None,
         wrong: tuple[Suspect, ...] = (),
@@ -560,6 +553,7 @@ def _estimates(fitted: Fitted, growth: FloatArray) -> dict[str, Estimate]:
     k = model.light
     free = {names[i] for i in fitted.free}
     withheld = fitted.p_value < FALSE_ALARM and growth.max() == 1.0  # the scatter of the parts includes a misfit
+    extremes = _at_bounds(fitted, covariance, drawn) if model.split and "jitter" in free else []
     out: dict[str, Estimate] = {}
 
     def put(name: str, value: float, sample: FloatArray, *needs: str, note: str = "", limit: bool = False) -> None:
@@ -569,7 +563,9 @@ def _estimates(fitted: Fitted, growth: FloatArray) -> dict[str, Estimate]:
         if withheld:
             out[name] = Estimate(value, np.nan, np.nan, np.nan, "of a model that does not fit: no error is stated")
             return
-        low, high = (0.0, np.quantile(sample, 0.95)) if limit else np.quantile(sample, (0.025, 0.975))
+        parts = [sample, *(sample[rows] for rows in extremes)]  # the true angle may be a bound
+        ends = [np.quantile(part, (0.025, 0.975)) for part in parts]
+        low, high = (0.0, np.quantile(sample, 0.95)) if limit else (np.min(ends), np.max(ends))
         out[name] = Estimate(value, float(((sample - value) ** 2).mean() ** 0.5), float(low), float(high), note)
 
     light = names[0] if model.returns else "light"  # all of it
@@ -616,6 +612,15 @@ def _estimates(fitted: Fitted, growth: FloatArray) -> dict[str, Estimate]:
     elif "dead_time_ns" not in out:
         put("dead_time_ns", observed, dead, "dead_time_ns")
     return out
+
+
+def _at_bounds(fitted: Fitted, covariance: FloatArray, drawn: FloatArray) -> list[NDArray[np.intp]]:
+    """Draws next to each bound of the angle that its 95 % interval holds: a twentieth of all."""
+    k, order = fitted.model.light + 1, np.argsort(drawn[:, fitted.model.light + 1])
+    reach = 1.96 * float(np.sqrt(np.diag(covariance))[list(fitted.free).index(k)])
+    most = float(fitted.model.bounded(np.where(np.arange(drawn.shape[1]) == k, np.pi, fitted.theta))[k])
+    count, angle = len(order) // 20, float(fitted.unbounded[k])
+    return [part for part, end in ((order[:count], 0.0), (order[-count:], most)) if abs(angle - end) < reach]
 
 
 def _limits(fitted: Fitted, listed: list[Score]) -> tuple[Limit, ...]:

@@ -216,9 +216,7 @@ class Fitted:
     theta: FloatArray
     covariance: FloatArray  # of the law before the bounds
     unbounded: FloatArray  # (p,) before the bounds of the model
-    scatter: (
-        FloatArray  # (free, free) of the estimator for the recording's exposure, without the noise of the simulations
-    )
+    scatter: FloatArray  # (free, free) of the estimator for the recording, without the noise of the simulations
     batch: Batch  # cells and weights
     offset: FloatArray  # (c,) expected counts at the centre of the last streams
     estimator: FloatArray  # (free, c): parameters less that centre, by counts less their offset
@@ -283,8 +281,10 @@ class Fit:
 
     @property
     def shorter(self) -> Fit:
-        """A fit whose last batches are as short as those of the steps, to choose between models."""
-        effort = replace(self.effort, longer=1.0, more=1, recentred=2)
+        """A fit with half the streams, all as short as those of the steps, to choose between models."""
+        effort = self.effort
+        half = {"settings": effort.settings // 2, "widths": effort.widths // 2, "share": effort.share / 2.0}
+        effort = replace(effort, longer=1.0, more=1, recentred=2, **half)
         return Fit(self.recording, effort, (self.next_seed(),))
 
     def next_seed(self) -> int:
@@ -371,8 +371,10 @@ class Fit:
         law = shortest_law(self.recording, model, middles, cycles, self.next_seed())
         return law.p_value([part[:, k] for part in parts]), law
 
-    def finish(self, guess: Guess, again: bool = True, known: bool = False) -> Fitted:
+    def finish(self, guess: Guess, again: bool = True, known: bool = False, finished: bool = False) -> Fitted:
         """The last estimate, with the slope, bias, scatter and misfit that fresh streams around it show.
+
+        A guess that is already the result of `finish` has the covariance with which the last streams are drawn.
 
         The dead time follows from the shortest interval alone (`known`) if that contradicts the 95 % interval of the
         counts, or is more precise, or if the counts hardly change with the dead time on one side of the estimate. The
@@ -380,9 +382,7 @@ class Fit:
         """
         model, theta, root, free = guess
         photons, effort = float(self.recording.photons), self.effort
-        closer = (
-            effort.spread / effort.more**0.5
-        )  # counts near the end of a dead time are linear over short distances only
+        closer = effort.spread / effort.more**0.5  # counts near the end of a dead time are linear over short distances
         prior, middle = model.precision(free), model.middle(theta)
         law = self.law(Guess(model, theta, root, free), photons, None, closer, effort.more, effort.longer)
         nearby = _NEAR * (effort.of(photons, effort.longer) / photons) ** 0.5
@@ -414,13 +414,12 @@ class Fit:
             raw[free] += there[1:]
             mean = most_probable(model, raw, cov, free)
             size = np.abs((mean - centre)[free]) / np.sqrt(np.diag(cov))
-            if trial and (size.max() < 1.0 or trial == effort.recentred - 1):
+            if (trial or finished) and (size.max() < 1.0 or trial == effort.recentred - 1):
                 break
             root = root_of(cov)
             centre = centre + (mean - centre) / max(1.0, float(size.max()) / _NEAR)
         if any(model.names[index].startswith("log_") for index in free):
-            counted, observed = (y - near.offset) @ gain.T, gain @ (recorded - near.offset)
-            raw, cov = _curved(model, free, raw, cov, centre, moved, counted, observed, near.ratio)
+            raw, cov = _curved(model, free, raw, cov, near, gain, recorded)
             mean = most_probable(model, raw, cov, free)
         sd = np.sqrt(np.diag(cov))
         if again and (np.abs((centre - theta)[free]) > _NEAR * sd).any():  # cells and weights were laid elsewhere
@@ -440,7 +439,7 @@ class Fit:
         if judged is not None:
             early, shortest = judged
             dead = shortest.dead_time()
-            if timed.any() and (early < 0.05 or uneven or 1.96 * sd[timed][0] > dead[2] - dead[1]):
+            if timed.any() and (early < 0.05 or uneven or shortest.decides(mean[free[timed]][0], sd[timed][0])):
                 at = mean.copy()
                 at[model.light + 2] = dead[0]
                 own = Guess(model, at, root_of(cov[np.ix_(~timed, ~timed)]), free[~timed])
@@ -452,24 +451,8 @@ class Fit:
             elif early < FALSE_ALARM:
                 p = min(p, early)
         scatter, converged = solve @ noise @ solve.T / near.ratio, bool(size.max() < _NEAR) and not uneven
-        return Fitted(
-            model,
-            free,
-            mean,
-            cov,
-            raw,
-            scatter,
-            law,
-            near.offset,
-            estimator,
-            jacobian,
-            rest,
-            fresh,
-            z,
-            p,
-            converged,
-            interval,
-        )
+        law_of_counts = law, near.offset, estimator, jacobian, rest, fresh
+        return Fitted(model, free, mean, cov, raw, scatter, *law_of_counts, z, p, converged, interval)
 
 
 def _uneven(estimates: FloatArray, moved: FloatArray, which: NDArray[np.bool_]) -> bool:
@@ -492,37 +475,35 @@ def _curved(
     free: NDArray[np.intp],
     raw: FloatArray,
     cov: FloatArray,
-    centre: FloatArray,
-    moved: FloatArray,
-    counted: FloatArray,
-    observed: FloatArray,
-    ratio: float,
+    near: Batch,
+    gain: FloatArray,
+    own: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
     """Mean (p,) and covariance (free, free) of parameters whose last one, a logarithm, also acts by its square.
 
-    The estimates `counted` (streams, free) of streams at parameters `moved` from the centre are fitted by a law with
-    the square of the logarithm and its product with the size. Draws of the linear law are weighted by the likelihood of
-    the `observed` estimates under it.
+    The estimates by `gain` of the streams `near` the centre are fitted by a law with the square of the logarithm and
+    its product with the size. Draws of the linear law are weighted by the likelihood of the estimates by the counts
+    `own` (c,) under it.
     """
     rows = draws(model, raw, 2.25 * cov, free)
-    at = (rows - centre)[:, free]
+    at, counted = (rows - near.centre)[:, free], (near.counts - near.offset) @ gain.T
 
     def terms(x: FloatArray) -> FloatArray:
         return np.asarray(np.c_[np.ones(len(x)), x, x[:, -1:] * x[:, -2:]])
 
-    law, own = terms(moved), terms(at)
+    law, there = terms((near.theta - near.centre)[:, free]), terms(at)
     inverse = np.linalg.pinv(law.T @ law)
     slope = inverse @ law.T @ counted
     rest = counted - law @ slope
-    scale = (len(law) - law.shape[1]) / (1.0 / ratio + np.einsum("ki,ij,kj->k", own, inverse, own))
-    off, out = observed - own @ slope, (rows - raw)[:, free]
+    scale = (len(law) - law.shape[1]) / (1.0 / near.ratio + np.einsum("ki,ij,kj->k", there, inverse, there))
+    off, out = gain @ (own - near.offset) - there @ slope, (rows - raw)[:, free]
     log = np.einsum("ki,ij,kj->k", out, np.linalg.inv(2.25 * cov), out) + len(free) * np.log(scale)
     log -= scale * np.einsum("ki,ij,kj->k", off, np.linalg.inv(rest.T @ rest), off)
     weight = np.exp(0.5 * (log - log.max()))
     if not weight.sum() ** 2 > 200.0 * (weight**2).sum():  # too few effective draws: the linear law is kept
         return raw, cov
     mean = np.average(at, axis=0, weights=weight)
-    theta = centre.copy()
+    theta = near.centre.copy()
     theta[free] += mean
     return theta, np.atleast_2d(np.cov(at.T, aweights=weight))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
@@ -32,15 +33,8 @@ from mars_lidar.light.timestamps import Timestamps
 _SAME_TIME = 0.01  # fraction of records at exactly the time of the preceding one, above which they are not photons
 LEVEL = 0.01  # false-alarm probability of the verdict
 
-_FIELDS = (
-    "mode",
-    "afterpulse_probability",
-    "afterpulse_delay_ns",
-    "twilight_ns",
-    "recovery_ns",
-    "electronics_dead_time_ns",
-)
-GIVEN = ("dead_time_ns", "jitter_ns", "pulse_sigma_ns", *_FIELDS)
+_TIMES = ("dead_time_ns", "jitter_ns", "pulse_sigma_ns", "twilight_ns", "recovery_ns", "electronics_dead_time_ns")
+GIVEN = (*_TIMES, "mode", "afterpulse_probability", "afterpulse_delay_ns")
 
 
 @dataclass(frozen=True)
@@ -130,11 +124,6 @@ class Calibration:
     level
         False-alarm probability of the verdict.
 
-    Raises
-    ------
-    AttributeError
-        A name that is neither an attribute nor an estimate; the name of an estimate gives its value.
-
     See Also
     --------
     calibrate
@@ -214,12 +203,6 @@ class Calibration:
         drawn = checks.integer("simulated", simulated, low=200, high=10**7)
         model = self.fitted.model
         return realizations(self.recording, model, model.bounded(self.fitted.theta), number, drawn, seed)
-
-    def __getattr__(self, name: str) -> float:
-        estimates: dict[str, Estimate] = object.__getattribute__(self, "estimates")
-        if name in estimates:
-            return estimates[name].value
-        raise AttributeError(f"{type(self).__name__} has no attribute {name!r}; estimates: {', '.join(estimates)}")
 
 
 @checked
@@ -427,18 +410,12 @@ class _Run:
     def wrong_values(self, fitted: Fitted) -> tuple[Suspect, ...]:
         """Given values that the stream contradicts (without one of them it fits), and the estimate of each."""
         out = []
-        without: list[tuple[str, Any, Pulse | str, dict[str, Any], dict[str, float]]] = []
-        for name, value in self.fixed.items():
-            free_of_it = {key: own for key, own in self.fixed.items() if key != name}
-            printed = "jitter_ns" if name == "jitter" else name
-            without.append((printed, value, self.shape, self.fields, free_of_it))
-        for name, whole in self.fields.items():
-            rest = {key: own for key, own in self.fields.items() if key != name}
-            without.append((name, whole, self.shape, rest, self.fixed))
-        if isinstance(self.shape, Pulse):
-            known: Any = self.shape.sigma_ns if isinstance(self.shape, GaussianPulse) else self.shape
-            without.append(("pulse_sigma_ns", known, "gaussian", self.fields, self.fixed))
-        for name, given, shape, fields, fixed in without:
+        pulse = {"pulse_sigma_ns": self.shape.sigma_ns if isinstance(self.shape, GaussianPulse) else self.shape}
+        known: dict[str, Any] = {**self.fixed, **self.fields, **(pulse if isinstance(self.shape, Pulse) else {})}
+        for own, given in known.items():
+            fields, fixed = ({k: v for k, v in part.items() if k != own} for part in (self.fields, self.fixed))
+            shape = "gaussian" if own == "pulse_sigma_ns" else self.shape
+            name = "jitter_ns" if own == "jitter" else own
             run = _Run(self.recording, self.look, shape, self.returns, fields, fixed, self.level, self.seed)
             free = run.first()
             if not free.converged or free.p_value < self.level:
@@ -481,7 +458,7 @@ class _Run:
         included: list[Named],
         listed: list[Score],
         drift: Drift | None,
-        wrong: tuple[Suspect, ...] = (),
+        wrong: tuple[Suspect, ...],
     ) -> Calibration:
         """The result of the last fit."""
         growth = _growth(fitted, drift)
@@ -633,11 +610,8 @@ def _limits(fitted: Fitted, listed: list[Score]) -> tuple[Limit, ...]:
         if score.z > suspects.clear(listed) or score.effect.onoff:
             continue
         size = min(score.limit, score.effect.most[0])
-        shifts = {
-            own: float(shift * size)
-            for own, shift, error in zip(names, score.shift, errors, strict=True)
-            if abs(shift * size) > error
-        }
+        moves = zip(names, score.shift * size, errors, strict=True)
+        shifts = {own: float(move) for own, move, error in moves if abs(move) > error}
         if name not in best or size > best[name].limit:
             best[name] = Limit(name, score.effect.words, size, shifts)
     return tuple(best.values())
@@ -647,14 +621,13 @@ def _worst_cells(fitted: Fitted) -> tuple[str, float]:
     """The group of cells that fits worst, in words, and by how many standard deviations."""
     cells = fitted.batch.cells
     middle = cells.phases + cells.gap_edges.size + 1
-    groups = {
-        "phases: shape of the light": slice(0, cells.phases),
-        "intervals": slice(cells.phases, middle),
-        "intervals by phase": slice(middle, None),
-    }
+    names, ends = (
+        ("phases: shape of the light", "intervals", "intervals by phase"),
+        (0, cells.phases, middle, cells.size),
+    )
     worst, most = "", -np.inf
-    for words, part in groups.items():
-        used = np.flatnonzero(fitted.offset[part] > 5.0) + (part.start or 0)
+    for words, (first, end) in zip(names, pairwise(ends), strict=True):
+        used = np.flatnonzero(fitted.offset[first:end] > 5.0) + first
         scale = fitted.fresh[:, used].std(0)
         drawn = ((fitted.fresh[:, used] / scale) ** 2).sum(1)
         z = (float(((fitted.rest[used] / scale) ** 2).sum()) - drawn.mean()) / drawn.std()

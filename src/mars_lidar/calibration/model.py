@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, cast
@@ -34,45 +34,35 @@ class Effect:
     """A property of a detector beside dead time and jitter.
 
     `names` of its parameters, of which the first is its size and the others are logarithms; `start`: their values in
-    the test for it; `least` and `most`: their bounds; `apply` adds it to the fields of a `Detector`; `words` for a
-    table; `onoff`: it has no size.
+    the test for it; `least` and `most`: their bounds; `words` for a table; `onoff`: it has no size.
     """
 
     names: tuple[str, ...]
     start: tuple[float, ...]
     least: tuple[float, ...]
     most: tuple[float, ...]
-    apply: Callable[[Fields, tuple[float, ...]], Fields]
     words: str
     onoff: bool = False
+
+    def of(self, fields: Fields, value: tuple[float, ...]) -> Fields:
+        """Fields of a `Detector` with the effect."""
+        name, size, dead = self.names[0], value[0], fields["dead_time_ns"]
+        if name == "electronics_excess":  # the observed dead time is theirs, behind a detector that is ready earlier
+            return fields | {"electronics_dead_time_ns": dead, "dead_time_ns": dead / (1.0 + size)}
+        if name == "afterpulse_probability":
+            delay = float(np.exp(value[1]))
+            carriers = all_carriers(size, delay, dead)
+            return fields | (
+                {"afterpulsing": Afterpulsing(probability=carriers, delay_ns=delay)} if carriers > 0 else {}
+            )
+        if name == "paralyzable":
+            return fields | ({"mode": "paralyzable"} if size > 0.5 else {})
+        return fields | {name: min(size, dead) if name == "twilight_ns" else size}
 
 
 def all_carriers(after: float, delay_ns: float, dead_time_ns: float) -> float:
     """Carriers of an avalanche, of which `after` outlive the dead time; fewer than one, as `Afterpulsing` requires."""
     return float(min(after * np.exp(min(dead_time_ns / delay_ns, 50.0)), _MOST_CARRIERS))
-
-
-def _afterpulses(fields: Fields, value: tuple[float, ...]) -> Fields:
-    after, delay = value[0], float(np.exp(value[1]))
-    carriers = all_carriers(after, delay, fields["dead_time_ns"])
-    return fields | ({"afterpulsing": Afterpulsing(probability=carriers, delay_ns=delay)} if carriers > 0 else {})
-
-
-def _electronics(fields: Fields, value: tuple[float, ...]) -> Fields:
-    observed = fields["dead_time_ns"]  # the dead time of the electronics, behind a detector that is ready earlier
-    return fields | {"electronics_dead_time_ns": observed, "dead_time_ns": observed / (1.0 + value[0])}
-
-
-def _twilight(fields: Fields, value: tuple[float, ...]) -> Fields:
-    return fields | {"twilight_ns": min(value[0], fields["dead_time_ns"])}
-
-
-def _recovery(fields: Fields, value: tuple[float, ...]) -> Fields:
-    return fields | {"recovery_ns": value[0]}
-
-
-def _paralyzable(fields: Fields, value: tuple[float, ...]) -> Fields:
-    return fields | ({"mode": "paralyzable"} if value[0] > 0.5 else {})
 
 
 def effects(dead_time_ns: float) -> tuple[Effect, ...]:
@@ -84,11 +74,11 @@ def effects(dead_time_ns: float) -> tuple[Effect, ...]:
     starts = [(0.03, middle + place * reach) for place in (-0.5, 0.0, 0.5)]
     own = "electronics with a dead time of their own"
     return (
-        *(Effect(after, start, least, most, _afterpulses, "afterpulses") for start in starts),
-        Effect(("twilight_ns",), (min(1.0, 0.2 * dead),), (0.0,), (dead,), _twilight, "twilight pulses"),
-        Effect(("recovery_ns",), (0.03 * dead,), (0.0,), (2.0 * dead,), _recovery, "slow recovery"),
-        Effect(("electronics_excess",), (0.25,), (0.0,), (19.0,), _electronics, own),
-        Effect(("paralyzable",), (1.0,), (0.0,), (1.0,), _paralyzable, "paralyzable detector", onoff=True),
+        *(Effect(after, start, least, most, "afterpulses") for start in starts),
+        Effect(("twilight_ns",), (min(1.0, 0.2 * dead),), (0.0,), (dead,), "twilight pulses"),
+        Effect(("recovery_ns",), (0.03 * dead,), (0.0,), (2.0 * dead,), "slow recovery"),
+        Effect(("electronics_excess",), (0.25,), (0.0,), (19.0,), own),
+        Effect(("paralyzable",), (1.0,), (0.0,), (1.0,), "paralyzable detector", onoff=True),
     )
 
 
@@ -223,7 +213,7 @@ class Model:
         fields: Fields = dict(self.fields) | {"dead_time_ns": float(theta[k + 2])}
         at = k + 3
         for effect in self.effects:
-            fields = effect.apply(fields, tuple(map(float, theta[at : at + len(effect.names)])))
+            fields = effect.of(fields, tuple(map(float, theta[at : at + len(effect.names)])))
             at += len(effect.names)
         least = _NARROWEST * self.clock.period_ns
         if jitter and sd > least:
@@ -275,8 +265,9 @@ class Model:
         sigma[sigma <= _NARROWEST * self.clock.period_ns] = 0.0
         number = made.phase.size if sigma.any() else 0
         deviates = np.random.default_rng(seed).standard_normal(number, dtype=np.float32)
-        times = np.empty(made.phase.size)
+        times, clock = np.empty(made.phase.size), self.clock
+        grid = clock.period_ns, clock.unit_ns, clock.offset, clock.locked
         _core.recorded_times(
-            made.cycle, made.phase, made.offsets, sigma_ns=sigma, deviates=deviates, grid=self.clock.grid, out=times
+            made.cycle, made.phase, made.offsets, sigma_ns=sigma, deviates=deviates, grid=grid, out=times
         )
         return Streams(times, made.offsets)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mars_lidar._base.types import FloatArray
+from mars_lidar._base.types import FloatArray, NDArray
 from mars_lidar.calibration.fit import LIGHTS, Fit
 from mars_lidar.calibration.model import Model
 from mars_lidar.calibration.recording import Recording
@@ -79,15 +79,12 @@ def light(t: FloatArray, model: Model, hold: float) -> FloatArray:
 
 def starts(fit: Fit, recording: Recording, model: Model, fixed: dict[str, float]) -> list[tuple[float, FloatArray]]:
     """(misfit, parameters), the best first, for jitters from zero to the whole recorded width."""
-    names = model.names
-    k = model.light
+    names, k = model.names, model.light
     photons = min(recording.photons, fit.effort.first)
-    t = recording.pieces[0]
-    t = t[: 12 * photons]
+    t = recording.pieces[0][: 12 * photons]
     low = np.sort(np.diff(t))
     n = low.size
-    ranks = np.unique(np.minimum([1, 5, 20, max(30, n // 500), max(60, n // 100), max(120, n // 30)], n - 1))
-    observed, unit = low[ranks], model.clock.unit_ns
+    observed, unit = low[_ranks(n)], model.clock.unit_ns
     hold = max(4 * observed[-3] - 3 * observed[0], fixed.get("dead_time_ns", 0.0)) + 2 * unit
     if model.returns == 0:
         total = float(free_waveform(recording, 64)[0].sum())
@@ -121,10 +118,14 @@ def starts(fit: Fit, recording: Recording, model: Model, fixed: dict[str, float]
     return sorted(trials, key=lambda pair: pair[0])
 
 
+def _ranks(n: int) -> NDArray[np.intp]:
+    """Those of n sorted intervals that are compared at the end of the dead time."""
+    return np.unique(np.minimum([1, 5, 20, max(30, n // 500), max(60, n // 100), max(120, n // 30)], n - 1))
+
+
 def with_edge(fit: Fit, model: Model, theta: FloatArray, low: FloatArray) -> FloatArray:
     """Parameters with a dead time at which simulated streams have the smallest intervals of `low` (n,), sorted."""
-    n, k = low.size, model.light
-    ranks = np.unique(np.minimum([1, 5, 20, max(30, n // 500), max(60, n // 100), max(120, n // 30)], n - 1))
+    n, k, ranks = low.size, model.light, _ranks(low.size)
     observed = low[ranks]
     cycles = max(2, round(fit.exposure(min(fit.recording.photons, fit.effort.first))))
     for _ in range(4):

@@ -65,10 +65,14 @@ def _score(fit: Fit, fitted: Fitted, plain: FloatArray, model: Model, theta: Flo
 def scores(fit: Fit, fitted: Fitted, plain: FloatArray) -> list[Score]:
     """The score of each effect beyond the `plain` counts of the model, the most significant first."""
     model = fitted.model
-    have = {name for effect in model.effects for name in effect.names} | {name for name, _ in model.fields}
-    have |= {"afterpulse_probability"} if "afterpulsing" in have else set()
-    have |= {"electronics_excess"} if "electronics_dead_time_ns" in have else set()
-    have |= {"paralyzable"} if "mode" in have else set()
+    of = {
+        "afterpulsing": "afterpulse_probability",
+        "electronics_dead_time_ns": "electronics_excess",
+        "mode": "paralyzable",
+    }
+    have = {name for effect in model.effects for name in effect.names} | {
+        of.get(name, name) for name, _ in model.fields
+    }
     centre, listed = model.bounded(fitted.theta), []
     dead = float(centre[model.light + 2])
     for effect in effects(dead) if dead > 0.0 else ():

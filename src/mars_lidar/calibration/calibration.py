@@ -165,11 +165,6 @@ class Calibration:
         return bool(self.p_value >= self.level)
 
     @property
-    def problems(self) -> tuple[str, ...]:
-        """Problems of the recording or the model, one sentence each."""
-        return (*self.look.problems, *(str(suspect) for suspect in self.suspects if not suspect.included))
-
-    @property
     def verdict(self) -> str:
         """In one sentence."""
         if self.fitted is None:
@@ -609,7 +604,7 @@ def _limits(fitted: Fitted, listed: list[Score]) -> tuple[Limit, ...]:
         name = score.effect.names[0]
         if score.z > suspects.clear(listed) or score.effect.onoff:
             continue
-        size = min(score.limit, score.effect.most[0])
+        size = min(max(score.size, 0.0) + 1.645 * score.error, score.effect.most[0])
         moves = zip(names, score.shift * size, errors, strict=True)
         shifts = {own: float(move) for own, move, error in moves if abs(move) > error}
         if name not in best or size > best[name].limit:

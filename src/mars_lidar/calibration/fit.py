@@ -108,6 +108,12 @@ class Batch:
         """(c,) cells with enough counts for a normal law in streams this short."""
         return np.asarray(self.offset > 2.0 * max(1.0, self.ratio / 4.0))
 
+    def one_count(self, model: Model, free: Index) -> FloatArray:
+        """Variance (free, free) of the light by one registration more or less, where none of a kind may be recorded."""
+        rise = np.maximum(self.slope[: self.cells.phases, free], 0.0).sum(0)
+        amount = (free == 0) | ((free < model.light) & (free % 2 == 1))
+        return np.diag(amount / np.maximum(rise, 1.0 / model.scale(self.centre)[free]) ** 2)
+
     def estimator(self, free: Index, prior: FloatArray | None = None) -> FloatArray:
         """G (free, c), with an optional prior precision (free, free)."""
         jacobian = self.slope[:, free]
@@ -138,9 +144,7 @@ def design(
     random, k = np.random.default_rng(seed), model.light
     varied = (free < k) | ((free == k + 1) & (not model.split))  # within a call of the engine
     order = np.argsort(varied, kind="stable")
-    lower = np.linalg.qr(
-        root[order].T, mode="r"
-    ).T  # a triangular root: those of the detector do not depend on the rest
+    lower = np.asarray(np.linalg.qr(root[order].T, mode="r")).T  # so that detectors do not depend on the light
 
     def normal(rows: int, columns: int) -> FloatArray:
         """Deviates (rows, columns) without correlation, of variance 1."""
@@ -175,7 +179,7 @@ def root_of(cov: FloatArray) -> FloatArray:
 
 def least_squares(terms: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Coefficients, residuals, and inverse of the normal matrix, of values (n, ...) on terms (n, t)."""
-    inverse = np.linalg.pinv(terms.T @ terms)
+    inverse = np.asarray(np.linalg.pinv(terms.T @ terms), np.float64)
     slope = inverse @ terms.T @ y
     return slope, y - terms @ slope, inverse
 
@@ -282,8 +286,8 @@ class Fit:
     def shorter(self) -> Fit:
         """A fit with half the streams, all as short as those of the steps, to choose between models."""
         effort = self.effort
-        half = {"settings": effort.settings // 2, "widths": effort.widths // 2, "share": effort.share / 2.0}
-        effort = replace(effort, longer=1.0, more=1, recentred=2, **half)
+        effort = replace(effort, longer=1.0, more=1, recentred=2, share=effort.share / 2.0)
+        effort = replace(effort, settings=effort.settings // 2, widths=effort.widths // 2)
         return Fit(self.recording, effort, (self.next_seed(),))
 
     def next_seed(self) -> int:
@@ -301,19 +305,13 @@ class Fit:
         return Cells(model, theta, [t for t in pilot if t.size > 2], photons)
 
     def law(
-        self,
-        guess: Guess,
-        photons: float,
-        cells: Cells | None = None,
-        spread: float | None = None,
-        more: int = 1,
-        times: float = 1.0,
+        self, guess: Guess, photons: float, cells: Cells | None = None, spread: float | None = None, more: int = 1
     ) -> Batch:
-        """The linear law of counts about a guess for an exposure of this many photons."""
+        """The linear law of counts about a guess for so many photons; with a given spread, of longer streams."""
         model, theta, root, free = guess
+        size = self.effort.of(photons, 1.0 if spread is None else self.effort.longer)
         spread = self.effort.spread if spread is None else spread
         cells = self.cells(model, theta, photons) if cells is None else cells
-        size = self.effort.of(photons, times)
         linear = np.diag(model.scale(theta)[free] ** -2.0)
         precision = np.linalg.inv(spread**2 * photons / size * root @ root.T) + linear
         wide = root_of(np.asarray(np.linalg.inv(precision), np.float64))
@@ -335,7 +333,7 @@ class Fit:
             gain = law.estimator(free, prior)
             step = gain @ (recorded - law.offset)
             scatter = law.residual @ gain.T
-            cov = scatter.T @ scatter / (len(scatter) - len(free) - 1) / law.ratio
+            cov = scatter.T @ scatter / (len(scatter) - len(free) - 1) / law.ratio + law.one_count(model, free)
             full = law.slope[:, free].T @ law.weight @ law.slope[:, free] + prior
             inverse = np.linalg.inv(full)
             cov = cov + inverse @ prior @ inverse
@@ -349,8 +347,7 @@ class Fit:
             near = size < (0.6 if weighed >= photons else 1.5)
             grown = min(photons, weighed * 6.0) if near else weighed
             cov = cov * (weighed / grown)
-            cov = cov + np.diag(0.02**2 * np.diag(cov))
-            root = root_of(cov)
+            root = root_of(cov + np.diag(0.02**2 * np.diag(cov)))
             if near and weighed >= photons:
                 break
             weighed = grown
@@ -382,14 +379,14 @@ class Fit:
         model, theta, root, free = guess
         photons, effort = float(self.recording.photons), self.effort
         closer = effort.spread / effort.more**0.5  # counts near the end of a dead time are linear over short distances
-        prior, middle = model.precision(free), model.middle(theta)
-        law = self.law(Guess(model, theta, root, free), photons, None, closer, effort.more, effort.longer)
+        prior, middle = model.prior(theta, free)
+        law = self.law(Guess(model, theta, root, free), photons, None, closer, effort.more)
         nearby = _NEAR * (effort.of(photons, effort.longer) / photons) ** 0.5
         gain = law.estimator(free)
         recorded = law.cells.of(self.recording)
         centre, size = theta, np.zeros(len(free))
         for trial in range(effort.recentred):
-            near = self.law(Guess(model, centre, root, free), photons, law.cells, nearby, times=effort.longer)
+            near = self.law(Guess(model, centre, root, free), photons, law.cells, nearby)
             y = near.counts  # of streams near the estimate, in the recording's exposure
             moved = (near.theta - centre)[:, free]
             terms = np.c_[np.ones(len(y)), moved]
@@ -407,6 +404,7 @@ class Fit:
                 solve = scale * cov @ local.T @ information
                 there[1:] = solve @ away + cov @ prior @ (middle - centre)[free]
             estimator = solve @ gain
+            cov = cov + near.one_count(model, free)
             raw = centre.copy()
             raw[free] += there[1:]
             mean = most_probable(model, raw, cov, free)

@@ -181,7 +181,7 @@ class Model:
         k, unit = self.light, self.clock.unit_ns
         width = float(np.hypot(theta[k], unit / 12**0.5))
         out = np.zeros(self.size)
-        out[0] = 0.3 * theta[0]
+        out[0] = max(0.3 * theta[0], 0.02 * float(theta[1:k:2].sum()))
         out[1:k:2] = 0.2 * theta[1:k:2] + 0.04 * theta[0]
         out[2:k:2] = 0.6 * width
         out[k] = 0.3 * width
@@ -194,16 +194,10 @@ class Model:
             at += len(effect.start)
         return out
 
-    def middle(self, theta: FloatArray) -> FloatArray:
-        """Parameters (p,) with an unknown angle in the middle of its range, where its prior is centred."""
-        out = theta.copy()
-        out[self.light + 1] = np.pi / 4.0 if self.split else theta[self.light + 1]
-        return out
-
-    def precision(self, free: NDArray[np.intp]) -> FloatArray:
-        """Prior precision (free, free): that of an angle anywhere in its range; the other parameters have no prior."""
-        known = self.split & (free == self.light + 1)
-        return np.asarray(np.diag(known * (2.0 / np.pi) ** 2))
+    def prior(self, theta: FloatArray, free: NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
+        """Prior precision (free, free), and parameters (p,) at its centre: of an angle anywhere in its range alone."""
+        angle = self.split & (np.arange(self.size) == self.light + 1)
+        return np.diag(angle[free] * (2.0 / np.pi) ** 2), np.where(angle, np.pi / 4.0, theta)
 
     def system(self, theta: FloatArray, cycles: int, bins: int = 16, jitter: bool = True) -> System:
         """The instrument of parameters (p,), with or without jitter."""

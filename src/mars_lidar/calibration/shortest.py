@@ -115,6 +115,6 @@ def shortest_law(
         at = rate[:, cell % bins] * (1.0 - part) + rate[:, (cell + 1) % bins] * part
         density = np.maximum(at, 0.0) * share
         steps = 0.5 * (density[:, 1:] + density[:, :-1]) * np.diff(age)
-        return np.c_[np.cumsum(steps[:, ::-1], axis=1)[:, ::-1], np.zeros(len(rows))]
+        return np.asarray(np.c_[np.cumsum(steps[:, ::-1], axis=1)[:, ::-1], np.zeros(len(rows))])
 
     return Shortest(age, np.sort(np.concatenate(near)), up_to, unit, reach)

@@ -131,6 +131,8 @@ def with_edge(fit: Fit, model: Model, theta: FloatArray, low: FloatArray) -> Flo
     for _ in range(4):
         streams = model.streams(np.tile(theta, (4, 1)), cycles, fit.next_seed())
         made = np.sort(np.concatenate([np.diff(x) for x in streams]))
+        if not made.size:
+            break
         here = made[np.minimum((ranks / n * made.size).astype(int), made.size - 1)]
         theta = theta.copy()
         theta[k + 2] = max(theta[k + 2] + float((observed - here)[1:-1].mean()), 0.05 * observed[0])

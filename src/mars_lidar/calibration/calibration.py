@@ -180,9 +180,7 @@ class Calibration:
 
     def curves(self, seed: int = 0) -> Curves:
         """Histograms of the recording and of streams that the fitted model draws with `seed`, for a figure."""
-        model = None if self.fitted is None else self.fitted.model
-        theta = None if model is None or self.fitted is None else model.bounded(self.fitted.theta)
-        return curves(self.recording, model, theta, seed, (200, 256, 60))
+        return curves(self.recording, self.fitted, seed, (200, 256, 60))
 
     def realizations(self, cycles: int, *, simulated: int = 4000, seed: int = 0) -> Realizations:
         """Distribution of the count in pieces of `cycles` periods, and of `simulated` pieces drawn with `seed` (T6).
@@ -196,8 +194,7 @@ class Calibration:
             raise ValueError("realizations need a fit and a laser period: calibrate without look=True")
         number = checks.integer("cycles", cycles, low=1, high=TOL.cycles)
         drawn = checks.integer("simulated", simulated, low=200, high=10**7)
-        model = self.fitted.model
-        return realizations(self.recording, model, model.bounded(self.fitted.theta), number, drawn, seed)
+        return realizations(self.recording, self.fitted, number, drawn, seed)
 
 
 @checked

@@ -135,10 +135,8 @@ class Model:
     @property
     def names(self) -> tuple[str, ...]:
         """Names of all parameters."""
-        several = self.returns > 1
-        light = [
-            f"{name}{f'_{k + 1}' if several else ''}" for k in range(self.returns) for name in ("signal", "delay_ns")
-        ]
+        places = [f"_{k + 1}" for k in range(self.returns)] if self.returns > 1 else [""] * self.returns
+        light = [f"{name}{place}" for place in places for name in ("signal", "delay_ns")]
         more = [name for effect in self.effects for name in effect.names]
         return ("background", *light, "width", "jitter", "dead_time_ns", *more)
 
@@ -152,8 +150,7 @@ class Model:
         out = np.array(theta, float)
         k = self.light
         out[..., 0] = np.maximum(out[..., 0], 1e-7)
-        for r in range(self.returns):
-            out[..., 1 + 2 * r] = np.maximum(out[..., 1 + 2 * r], 0.0)
+        out[..., 1:k:2] = np.maximum(out[..., 1:k:2], 0.0)
         period = self.clock.period_ns
         out[..., k] = np.clip(out[..., k], _NARROWEST * period, _WIDEST * period)
         if self.split:
@@ -228,9 +225,8 @@ class Model:
         back = rows[None, :, 0]
         if self.returns == 0:
             return Flux(np.zeros_like(back), back, np.zeros_like(back))
-        period = self.clock.period_ns
-        signal = np.stack([rows[None, :, 1 + 2 * r] for r in range(self.returns)])
-        delay = np.stack([rows[None, :, 2 + 2 * r] % period for r in range(self.returns)])
+        signal, delay = (rows[:, first : self.light : 2].T[:, None] for first in (1, 2))
+        delay = delay % self.clock.period_ns
         return Flux(signal, back, delay) if self.returns > 1 else Flux(signal[0], back, delay[0])
 
     def varied(self, flux: Flux, cycles: int, seed: int) -> Flux:

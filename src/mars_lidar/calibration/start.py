@@ -101,11 +101,6 @@ def starts(fit: Fit, recording: Recording, model: Model, fixed: dict[str, float]
         theta[k + 1] = fixed.get("jitter", angle if model.split else np.sin(angle) * theta[k])
         jitter = float(model.widths(theta)[1])
         theta[k + 2] = fixed.get("dead_time_ns", max(observed[0], 0.05 * observed[-1]) + 2 * jitter)
-        at = k + 3
-        for effect in model.effects:
-            for name, value in zip(effect.names, effect.start, strict=True):
-                theta[at] = fixed.get(name, value)
-                at += 1
         if "dead_time_ns" not in fixed:
             theta = with_edge(fit, model, theta, low)
         cells = fit.cells(model, theta, photons)

@@ -248,19 +248,15 @@ def drift(fit: Fit, fitted: Fitted) -> Drift | None:
     """Light and delay of parts of the recording, by the estimator of the whole; None for a short recording."""
     from scipy.special import chdtrc
 
-    recording: Recording = fit.recording
+    recording = fit.recording
     number = int(min(_PARTS, recording.photons // LEAST_PHOTONS))
     if number < 4:
         return None
     parts = [part for part in recording.parts(number) if part.photons > 20]
-    model, law = fitted.model, fitted.batch
-    free = fitted.free
+    model, cells, free = fitted.model, fitted.batch.cells, fitted.free
     light = [k for k, index in enumerate(free) if index < model.light]
-    values = []
-    for part in parts:
-        y = law.cells.of(part) * (recording.exposure / part.exposure)
-        values.append(fitted.estimator @ (y - fitted.offset))
-    estimates = np.array(values)[:, light]
+    counts = np.array([cells.of(part) * (recording.exposure / part.exposure) for part in parts])
+    estimates = (counts - fitted.offset) @ fitted.estimator[light].T
     cov = fitted.scatter[np.ix_(light, light)] * len(parts)
     names = [model.names[free[k]] for k in light]
     delays = [i for i, name in enumerate(names) if name.startswith("delay")]

@@ -160,7 +160,7 @@ def test_a_dead_time_that_ends_in_a_gap_without_light(seed: int) -> None:
 
 @pytest.mark.full
 def test_background_of_which_no_photon_may_be_recorded() -> None:
-    """Armed for 0.8 ns between dead time and pulse, 1.8 background photons are expected: with none, B was 0 ± 0.0006."""
+    """Armed for 0.8 ns before a pulse: 1.8 background photons are expected, and without any B was 0 ± 0.0006."""
     truth, _ = random_truth(8600)
     background = ml.calibrate(stream(truth, 600, 8600), seed=8600).estimates["background"]
     assert background.low <= truth.background <= background.high

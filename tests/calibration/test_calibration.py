@@ -149,13 +149,18 @@ def test_the_law_of_the_shortest_interval(jitter: float) -> None:
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("seed", [1, 2, 3, *nightly(*range(4, 12))])
-def test_a_dead_time_that_ends_in_a_gap_without_light(seed: int) -> None:
-    """Hardly any light arrives between two pulses, where the dead time may end: its interval says so."""
-    recorded = stream(GAP, 500, seed)
-    dead = ml.calibrate(recorded, pulse="free").estimates["dead_time_ns"]
-    assert dead.low <= GAP.dead <= dead.high
-    assert dead.value <= np.diff(recorded.times_ns).min() + 8.0  # jitter of up to 1 ns
+@pytest.mark.parametrize("first", [0, *nightly(6, 12, 18)])
+def test_a_dead_time_that_ends_in_a_gap_without_light(first: int) -> None:
+    """Hardly any light arrives between two pulses, where the dead time may end: its 95 % interval holds it."""
+    from scipy.stats import binom
+
+    held = 0
+    for seed in range(first, first + 6):
+        recorded = stream(GAP, 500, seed)
+        dead = ml.calibrate(recorded, pulse="free").estimates["dead_time_ns"]
+        held += dead.low <= GAP.dead <= dead.high
+        assert dead.value <= np.diff(recorded.times_ns).min() + 8.0  # jitter of up to 1 ns
+    assert binom.cdf(held, 6, 0.95) > 1e-3
 
 
 @pytest.mark.full

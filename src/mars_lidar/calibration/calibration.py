@@ -521,7 +521,9 @@ def _estimates(fitted: Fitted, growth: FloatArray) -> dict[str, Estimate]:
     centre, names = model.bounded(fitted.theta), model.names
     k = model.light
     free = {names[i] for i in fitted.free}
-    withheld = fitted.p_value < FALSE_ALARM and growth.max() == 1.0  # the scatter of the parts includes a misfit
+    # the scatter of the parts includes a misfit
+    withheld = {name for name, factor in zip(names, growth, strict=True) if factor == 1.0}
+    withheld = withheld if fitted.p_value < FALSE_ALARM else set()
     extremes = _at_bounds(fitted, covariance, drawn) if model.split and "jitter" in free else []
     out: dict[str, Estimate] = {}
 
@@ -529,7 +531,7 @@ def _estimates(fitted: Fitted, growth: FloatArray) -> dict[str, Estimate]:
         if not free & set(needs):
             out[name] = Estimate(value, 0.0, value, value, "given")
             return
-        if withheld:
+        if withheld & set(needs):
             out[name] = Estimate(value, np.nan, np.nan, np.nan, "of a model that does not fit: no error is stated")
             return
         parts = [sample, *(sample[rows] for rows in extremes)]  # the true angle may be a bound
@@ -575,7 +577,7 @@ def _estimates(fitted: Fitted, growth: FloatArray) -> dict[str, Estimate]:
         elif not effect.onoff:
             put(effect.names[0], float(values[0]), columns[:, 0], effect.names[0])
         at += len(effect.names)
-    if fitted.by_shortest is not None and not withheld:
+    if fitted.by_shortest is not None and "dead_time_ns" not in withheld:
         value, low, high = fitted.by_shortest
         out["dead_time_ns"] = Estimate(value, np.nan, low, high, "by the shortest interval alone")
     elif "dead_time_ns" not in out:

@@ -284,10 +284,8 @@ class Fit:
 
     @property
     def shorter(self) -> Fit:
-        """A fit with half the streams, all as short as those of the steps, to choose between models."""
-        effort = self.effort
-        effort = replace(effort, longer=1.0, more=1, recentred=2, share=effort.share / 2.0)
-        effort = replace(effort, settings=effort.settings // 2, widths=effort.widths // 2)
+        """A fit whose last batches are as short as those of the steps, to choose between models."""
+        effort = replace(self.effort, longer=1.0, more=1, recentred=2)
         return Fit(self.recording, effort, (self.next_seed(),))
 
     def next_seed(self) -> int:

@@ -521,9 +521,8 @@ def _estimates(fitted: Fitted, growth: FloatArray) -> dict[str, Estimate]:
     centre, names = model.bounded(fitted.theta), model.names
     k = model.light
     free = {names[i] for i in fitted.free}
-    # the scatter of the parts includes a misfit
-    withheld = {name for name, factor in zip(names, growth, strict=True) if factor == 1.0}
-    withheld = withheld if fitted.p_value < FALSE_ALARM else set()
+    grown = dict(zip(names, growth > 1.0, strict=True))  # the scatter of the parts includes a misfit
+    withheld = {name for name in names if fitted.p_value < FALSE_ALARM and not grown[name]}
     extremes = _at_bounds(fitted, covariance, drawn) if model.split and "jitter" in free else []
     out: dict[str, Estimate] = {}
 

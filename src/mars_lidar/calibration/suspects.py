@@ -125,13 +125,9 @@ def refitted(fit: Fit, fitted: Fitted, plain: FloatArray, listed: list[Score]) -
         along = _score(fit, fitted, plain, final.model, final.theta, score.effect)
         error = final.covariance[np.ix_(final.free == size, final.free == size)].sum() ** 0.5  # 0 where it has no size
         z = max(score.z, along.z, final.theta[size] / error if error else 0.0)
-        better = z > most or (final.p_value * _MISFIT > fitted.p_value and (z > limit or not error))
-        if (
-            final.converged
-            and better
-            and final.theta[size] > 0.0
-            and (best is None or final.misfit_z < best[0].misfit_z)
-        ):
+        clearly = z > most or (final.p_value * _MISFIT > fitted.p_value and (z > limit or not error))
+        better = best is None or final.misfit_z < best[0].misfit_z
+        if final.converged and final.theta[size] > 0.0 and clearly and better:
             best = final, score.effect, z
     if best is None:
         return None

@@ -131,11 +131,7 @@ class Records:
     def allocate(cls, counts: NDArray[np.int64]) -> Records:
         """Allocate `counts` (items,) registrations for each item; MemoryError if memory is insufficient."""
         offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-        return cls.reserve(offsets, int(offsets[-1]))
-
-    @classmethod
-    def reserve(cls, offsets: NDArray[np.int64], room: int) -> Records:
-        """Allocate `room` registrations, with the items not yet placed; MemoryError if memory is insufficient."""
+        room = int(offsets[-1])
         check_memory(room * cls.BYTES, f"timestamps of shape ({room},)", IN_PARTS)
         return cls(offsets, np.empty(room), np.empty(room, np.int32), np.empty(room, np.int32))
 
@@ -214,21 +210,8 @@ class Engine(ABC):
     def histogram(self, task: Task, out: NDArray[Any]) -> None:
         """Fill `out` (items, bins), C-contiguous, of the histogram dtype of the system of `task`."""
 
-    def counts(self, task: Task) -> NDArray[np.int64]:
-        """Registrations of each exposure (items,) of `task`, with the draws of `histogram`."""
-        raise ValueError(f"engine {self.name!r} draws histograms only, not single registrations; use 'exact'")
-
     def records(self, task: Task, expected: float) -> Records | PhaseRecords:
-        """Every registration of `task`, with the draws of `histogram`; `expected`: their approximate number.
-
-        The default implementation takes two passes, `counts` and `timestamps`.
-        """
-        records = Records.allocate(self.counts(task))
-        self.timestamps(task, records)
-        return records
-
-    def timestamps(self, task: Task, records: Records) -> None:
-        """Fill `records`, allocated from `counts`, with the draws of `histogram` for `task`."""
+        """Every registration of `task`, with the draws of `histogram`; `expected`: their approximate number."""
         raise ValueError(f"engine {self.name!r} draws histograms only, not timestamps; use 'exact'")
 
 

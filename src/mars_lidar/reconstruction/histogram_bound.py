@@ -118,8 +118,6 @@ def cramer_rao(flux: Flux, system: System, *, threads: int | None = None) -> His
     from mars_lidar.reconstruction.maximum_likelihood import MaximumLikelihood
     from mars_lidar.statistics import mean_histogram
 
-    if not isinstance(system, System):
-        raise TypeError(f"system must be a System, got {type(system).__name__}")
     MaximumLikelihood().check(system)
     require_effects("cramer_rao", system.detector, LIGHT_EFFECTS, _simulate_instead)
     if len(flux.returns_signal) != 1:

@@ -12,6 +12,7 @@ import numpy as np
 
 from mars_lidar._base.cached import cached_property
 from mars_lidar._base.native import _core
+from mars_lidar._base.progress import of_part
 from mars_lidar._base.resources import check_memory
 from mars_lidar._base.types import NDArray, Progress
 from mars_lidar.engines.tolerances import TOL
@@ -284,13 +285,7 @@ def given(options: EngineOptions) -> dict[str, Any]:
 
 def stage(progress: Progress | None, start: float, end: float) -> Progress | None:
     """A progress callback for one of several calls: from `start` to `end` of the whole."""
-    if progress is None:
-        return None
-
-    def stage_progress(done: int, total: int) -> object:
-        return progress(round(TOL.ticks * (start + (end - start) * done / max(total, 1))), TOL.ticks)
-
-    return stage_progress
+    return of_part(progress, round(TOL.ticks * start), round(TOL.ticks * end), TOL.ticks)
 
 
 def part_of(

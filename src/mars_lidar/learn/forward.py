@@ -28,13 +28,12 @@ import math
 from collections.abc import Callable, Iterator
 from typing import Any
 
-import torch
-
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
 from mars_lidar.instrument.effects import LIGHT_EFFECTS
 from mars_lidar.instrument.pulse import GaussianPulse, Pulse, SampledPulse
 from mars_lidar.instrument.system import System
+from mars_lidar.learn.needed import torch
 from mars_lidar.learn.tolerances import TOLERANCES
 from mars_lidar.statistics.chain import ConvergenceError
 

@@ -11,7 +11,6 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.types import FloatArray
@@ -26,6 +25,7 @@ from mars_lidar.learn.forward import (
     inputs,
     refuse_nested_forward,
 )
+from mars_lidar.learn.needed import torch
 from mars_lidar.learn.tolerances import TOLERANCES
 from mars_lidar.reconstruction.histogram_record import relative_width
 

@@ -21,13 +21,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from mars_lidar._base import checks
 from mars_lidar._base.types import FloatArray, NDArray
 from mars_lidar.instrument.pulse import GaussianPulse, Pulse
 from mars_lidar.instrument.system import System
 from mars_lidar.io.scene_files import SceneFile, scan
+from mars_lidar.learn.needed import torch
 from mars_lidar.learn.ranges import Range, SystemList, SystemRange
 from mars_lidar.learn.tolerances import TOLERANCES
 from mars_lidar.light.flux import Flux

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from mars_lidar._base import checks
@@ -26,6 +25,7 @@ from mars_lidar._base.native import _core
 from mars_lidar._base.resources import check_memory
 from mars_lidar.dataset.arrays import MAPS, sample_parts
 from mars_lidar.dataset.store import Block, Dataset, open_dataset, read_block
+from mars_lidar.learn.needed import torch
 from mars_lidar.learn.stream import Buffers, Passes, rank_of, worker_of
 from mars_lidar.learn.tolerances import TOLERANCES
 

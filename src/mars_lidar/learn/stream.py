@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from mars_lidar._base import checks
@@ -30,6 +29,7 @@ from mars_lidar.engines import Engine, check_detector, find_engine
 from mars_lidar.engines.simulation import simulate
 from mars_lidar.instrument.system import System
 from mars_lidar.io.scene_files import SceneFile
+from mars_lidar.learn.needed import torch
 from mars_lidar.learn.ranges import LogUniform, Range, SystemRange, as_range, as_systems
 from mars_lidar.learn.scenes import Recipe, Sample, as_source, example_of
 from mars_lidar.learn.tolerances import TOLERANCES

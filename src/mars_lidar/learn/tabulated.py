@@ -6,9 +6,8 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-import torch
-
 from mars_lidar.learn.forward import Delay, blocks, by_rows, check_detector, inputs, values_of, wrapped_energy
+from mars_lidar.learn.needed import torch
 from mars_lidar.learn.tolerances import TOLERANCES
 from mars_lidar.table import Table
 

@@ -3,8 +3,6 @@
 An object appears whole under its name or not at all. There are no renames, no locks, and no folders.
 """
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any

@@ -10,8 +10,6 @@ length that end in their own CRC-32C, as chunks do.)
 document that marks the store complete: a run that stops between the two leaves an incomplete store.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

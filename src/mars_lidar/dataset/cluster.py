@@ -6,8 +6,6 @@ follows the workers that are there, so that a cluster may grow and shrink. A par
 given to another one: its files appear by a rename, so half a part does not exist.
 """
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import math

@@ -1,7 +1,5 @@
 """Making one part of a dataset: simulate, encode, write. A part depends on the scenes of the store only."""
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import threading

@@ -1,7 +1,5 @@
 """The exact engine: only registered photons are drawn, each by inversion of the integrated flux."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The engines by name, and the alternatives where an engine does not apply."""
 
-from __future__ import annotations
-
 from typing import Unpack
 
 from mars_lidar._base import checks

@@ -1,7 +1,5 @@
 """The sequential engine: photon-by-photon simulation, the independent reference of the exact engine."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 from dataclasses import replace
 from typing import Any

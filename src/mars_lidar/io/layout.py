@@ -24,8 +24,6 @@ Attributes: ``format``, ``format_version``, ``complete``, ``system`` (JSON), ``e
 once complete, ``registrations``. Measured counts have ``engine`` "measured", and no variables of a flux.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable, Iterator, Mapping

@@ -1,7 +1,5 @@
 """Arrays of numbers in .npz, .mat (v5, v7.3) and HDF5 files of other programs, by name."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ A format is one module with two functions, `open_writer`, a context that gives a
 of any format is marked complete only at the end, so that an interrupted write is recognised.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

@@ -4,8 +4,6 @@
 from any URL that fsspec opens (``https://``, ``s3://``, ``memory://``).
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

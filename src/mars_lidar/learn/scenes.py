@@ -4,8 +4,6 @@ Scenes are ray-cast without end, read from files, or taken from arrays; the work
 A sample is a function of numbers alone, which determine scene, flip, light and system.
 """
 
-from __future__ import annotations
-
 import math
 import mmap
 import os

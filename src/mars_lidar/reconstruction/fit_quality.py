@@ -3,8 +3,6 @@
 `native/reconstruct/fit_quality.h` computes the statistics of each pixel: docs/theory_reconstruction.md, section 8.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Inputs of the native estimators from a system: dead time on the histogram's bins, pulse, gate."""
 
-from __future__ import annotations
-
 import math
 from functools import lru_cache
 

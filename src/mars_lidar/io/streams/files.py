@@ -1,7 +1,5 @@
 """Photon streams on disk: choice of the format, checks of the output path, and NumPy's .npz."""
 
-from __future__ import annotations
-
 import importlib
 import json
 import math

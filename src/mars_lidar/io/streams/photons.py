@@ -3,8 +3,6 @@
 Also the attributes common to files of photons, and the timestamps of a measured stream.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -20,8 +20,6 @@ those of a PTU; only the header differs, with fixed positions (PicoQuant, "Time 
 github.com/PicoQuant; tsbischof/libpicoquant).
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import math

@@ -1,7 +1,5 @@
 """Files of photon counters: histograms (.ptu and related formats, .t3r, .spc, .sdt), and photons of .t3r and .spc."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from pathlib import Path

@@ -109,7 +109,7 @@ class Task:
         )
 
     def _avalanches(self) -> dict[str, Any]:
-        """What avalanches leave behind, as the native job takes it; only what is on."""
+        """Arguments of the native job for the effects of avalanches that are switched on."""
         detector = self.system.detector
         fields = native_fields({name: getattr(detector, name) for name in AVALANCHE_EFFECTS}, self.system.period_ns)
         if detector.crosstalk is not None:

@@ -58,7 +58,7 @@ def mat_arrays(path: Path, names: list[str] | None = None, *, deep: bool = True)
 
 
 def _plain(variables: dict[str, Any]) -> dict[str, Any]:
-    """Without what SciPy tells of the file."""
+    """Without SciPy's entries on the file itself."""
     return {name: array for name, array in variables.items() if not name.startswith("__")}
 
 

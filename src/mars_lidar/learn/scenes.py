@@ -232,7 +232,7 @@ class Arrays(Given):
         self._maps = {name: array if len(shape) == 3 else array[None] for name, array in given.items()}
         self._number = shape[0] if len(shape) == 3 else 1
         self._order = None
-        self.load(0)  # what is wrong with all of them is told at once
+        self.load(0)  # errors that all of them share are raised now
 
     def __len__(self) -> int:
         return self._number
@@ -316,7 +316,9 @@ class Recipe:
         scene = self._placed(self.source.scene(self.seed, epoch, index), epoch, index)
         if stretch != 1.0:
             scene = Scene(scene.depth_m * stretch, scene.reflectivity, scene.background)
-        with warnings.catch_warnings():  # pixels without return or beyond the range: told by the maps, not every time
+        with (
+            warnings.catch_warnings()
+        ):  # pixels without return or beyond the range: they are NaN in the maps of the example
             warnings.simplefilter("ignore", UserWarning)
             flux = scene.flux(system, signal=level, sbr=sbr, **self.lit)
         seed = int(generator(6, self.seed, epoch, index).integers(2**63))

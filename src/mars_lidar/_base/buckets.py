@@ -1,4 +1,4 @@
-"""Object stores: paths of universal_pathlib, with the methods of `Path`, and operations that differ from those on files.
+"""Object stores: paths of universal_pathlib, with the methods of `Path`, and what differs from operations on files.
 
 An object appears whole under its name or not at all. There are no renames, no locks, and no folders.
 """

@@ -1,6 +1,7 @@
 """Datasets: from scenes to a training set on disk, and back."""
 
-from mars_lidar.dataset.estimate import Estimate, estimate, quick_advice
+from mars_lidar.dataset.estimate import Estimate, estimate
+from mars_lidar.dataset.estimate import quick_advice as quick_advice
 from mars_lidar.dataset.network_files import Exported, export
 from mars_lidar.dataset.recipe import DatasetRecipe, Light, json_schema
 from mars_lidar.dataset.run import Generated, begin, finish, generate, make_part
@@ -25,7 +26,6 @@ __all__ = [
     "json_schema",
     "make_part",
     "open_dataset",
-    "quick_advice",
     "read_sparse",
     "read_view",
     "verify",

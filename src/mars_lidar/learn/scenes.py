@@ -316,9 +316,7 @@ class Recipe:
         scene = self._placed(self.source.scene(self.seed, epoch, index), epoch, index)
         if stretch != 1.0:
             scene = Scene(scene.depth_m * stretch, scene.reflectivity, scene.background)
-        with (
-            warnings.catch_warnings()
-        ):  # pixels without return or beyond the range: they are NaN in the maps of the example
+        with warnings.catch_warnings():  # pixels without return or beyond the range: NaN in the maps
             warnings.simplefilter("ignore", UserWarning)
             flux = scene.flux(system, signal=level, sbr=sbr, **self.lit)
         seed = int(generator(6, self.seed, epoch, index).integers(2**63))

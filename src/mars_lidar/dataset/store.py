@@ -73,8 +73,8 @@ class Dataset:
             )
         check_zarr_threads()
         self.sums = manifest.require(path, listed=listed) if self.complete else None
-        store, mode = store_at(path, self.sums, read_only=self.complete), "r" if self.complete else "r+"
-        self.group: Any = zarr.open_group(store, mode=mode, use_consolidated=False)
+        store = store_at(path, self.sums, read_only=self.complete)
+        self.group: Any = zarr.open_group(store, mode="r" if self.complete else "r+", use_consolidated=False)
         self.recipe = DatasetRecipe.from_dict(json.loads(self.attrs["recipe"]))
 
     def __repr__(self) -> str:

@@ -64,5 +64,5 @@ def quality_of(statistics: FloatArray) -> Quality:
     each = np.stack([gammaincc(0.5 * np.maximum(freedom, 1.0), 0.5 * chi2), *scores])
     tests = (~np.isnan(each)).sum(0)
     least = np.where(np.isnan(each), np.inf, each).min(0)
-    p_value = np.where(np.isnan(chi2), np.nan, np.minimum(1.0, np.maximum(tests, 1) * least))
+    p_value = np.where(np.isnan(chi2), np.nan, -np.expm1(tests * np.log1p(-np.minimum(least, 1.0 - 2.0**-53))))
     return Quality(chi2, freedom, longer, shorter, wider, p_value)

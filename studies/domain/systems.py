@@ -90,11 +90,6 @@ class Case:
         returns = [Flux(s * row, b, d * PERIOD_NS) for s, b, d in parts]
         return Flux.multi(*returns) if len(returns) > 1 else returns[0]
 
-    @property
-    def predictable(self) -> bool:
-        """Whether the predictions are compared: for one return, or a waveform."""
-        return self.waveform is not None or len(self.signal) == 1
-
     def facts(self) -> dict[str, Any]:
         """One row of the data: what the maps are drawn over."""
         system = self.system
@@ -117,8 +112,8 @@ class Case:
 
 
 FluxRange = (1e-6, 1e3)
-FAMILIES = ("any", "locked", "dim", "waveform", "mode", "effects", "tails", "long", "ends")
-_SHARES = (0.22, 0.20, 0.11, 0.14, 0.12, 0.11, 0.03, 0.03, 0.04)
+FAMILIES = ("any", "electronics", "locked", "dim", "waveform", "mode", "effects", "tails", "long", "ends")
+_SHARES = (0.15, 0.11, 0.16, 0.11, 0.14, 0.12, 0.11, 0.03, 0.03, 0.04)
 Start = Literal["armed", "stationary"]
 
 
@@ -152,11 +147,14 @@ class _Draw:
         cycles = self._cycles(signal + background)
         wide = self.chance(0.04 if self.family == "locked" else 0.12)
         bins = round(self.log(2, 2**20)) if wide else 2 ** int(self.random.integers(1, 13))
+        if self.family == "electronics" and self.chance(0.5):
+            bins = round(self.log(2, 5000))
         if self.family == "ends":
             bins = int(self.random.choice([1, 2, 2, 2**20]))
         if self.family == "tails":
             bins = 2 ** int(np.ceil(np.log2(6.0 / self._width(pulse))))
-        wave, kind = self._waveform(signal) if self.family == "waveform" else (None, "")
+        waves = self.family == "waveform" or (self.family == "electronics" and self.chance(0.15))
+        wave, kind = self._waveform(signal) if waves else (None, "")
         signals, delays = self._returns(signal)
         start: Start = "stationary" if self.chance(0.33) and mode != MOVING and self.family != "tails" else "armed"
         detector = self._detector(mode, dead, bins)
@@ -181,7 +179,8 @@ class _Draw:
         return signal * (not self.chance(0.1)), background * (not self.chance(0.1))
 
     def _mode(self) -> str:
-        if self.family == "mode" or (self.family in ("waveform", "effects", "dim", "ends") and self.chance(0.35)):
+        others = {"mode": 1.0, "electronics": 0.15} | dict.fromkeys(("waveform", "effects", "dim", "ends"), 0.35)
+        if self.family == "mode" or (self.family in others and self.chance(others[self.family])):
             return str(self.random.choice(["paralyzable", "synchronous", "gated", MOVING]))
         return "nonparalyzable"
 
@@ -269,7 +268,7 @@ class _Draw:
 
     def _returns(self, signal: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
         first = float(self.random.choice([self.random.random(), self.random.random(), 0.0, 0.999]))
-        if self.family in ("any", "mode", "effects") and self.chance(0.25):
+        if self.family in ("any", "electronics", "mode", "effects") and self.chance(0.25):
             number = int(self.random.choice([2, 3, 16]))
             share = self.random.dirichlet(np.full(number, 0.7))
             near = self.random.random(number) * self.random.choice([0.05, 1.0])
@@ -311,6 +310,12 @@ class _Draw:
             fields["mode"] = mode
         if self.family == "effects":
             fields |= self._effects(mode, dead, bins)
+        if self.family == "electronics":
+            fields["electronics_dead_time_ns"] = (dead + self.log(1e-2, 3.0)) * PERIOD_NS
+            beside = {"detection_efficiency": self.log(0.1, 1.0), "jitter": self._jitter()}
+            if bins % 4 == 0:
+                beside["code_density"] = tuple(self.random.uniform(0.5, 1.5, 4).tolist())
+            fields |= {name: value for name, value in beside.items() if self.chance(0.2)}
         return Detector(**fields)
 
     def _jitter(self) -> Jitter:

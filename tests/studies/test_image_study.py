@@ -23,7 +23,7 @@ from tests.harness.study import quick_study
 SYSTEM = make_system(20.0, 20_000, 250, sigma_ns=0.6)
 
 
-@pytest.mark.full
+@pytest.mark.full(seconds=14)
 def test_study(tmp_path):
     room = ml.Scene.example("room", 24).flux(SYSTEM, signal=100.0 / SYSTEM.cycles, sbr=1.0)
     (tmp_path / "captures").mkdir()
@@ -140,7 +140,7 @@ def test_coverage_of_several_exposures():
     assert line["for other scenes %"] == pytest.approx(6.0)  # of 92 and 80
 
 
-@pytest.mark.full
+@pytest.mark.full(seconds=18)
 def test_training_twice_gives_the_same_bits(tmp_path, monkeypatch):
     pytest.importorskip("torch")
     from studies.image import train

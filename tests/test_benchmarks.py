@@ -190,4 +190,4 @@ def test_estimators_are_timed():
     reconstruction = command.run(TINY, ("reconstruction",)).sections[0]
     assert {row["method"] for row in reconstruction.rows} >= {"maximum_likelihood", "mchc", "coates", "matched_filter"}
     assert all(row["us per pixel"] > 0 for row in reconstruction.rows)
-    assert [goal.unit for goal in reconstruction.goals] == ["s"]
+    assert [goal.unit for goal in reconstruction.goals] == ["s", "us", "us"]

@@ -124,6 +124,14 @@ def draw(seed: int, number: int, family: str | None = None) -> Case:
     return _Draw(random, chosen).case(f"{seed}/{number}")
 
 
+LONG = ("gaussian", "bright", "locked", "reflection", "samples", "spike", "returns", "waveform")
+
+
+def draw_long(seed: int, number: int) -> Case:
+    """System `number` of the study of long exposures: kinds for which `feedback` had errors in earlier versions."""
+    return _Draw(np.random.default_rng([seed, number]), LONG[number % len(LONG)]).long(f"{seed}/{number}")
+
+
 class _Draw:
     """One system, from its own random numbers."""
 
@@ -341,3 +349,56 @@ class _Draw:
             possible["twilight_ns"] = float(self.random.uniform(0.01, 0.2)) * min(dead, 1.0) * PERIOD_NS
         names = self.random.choice(sorted(possible), size=int(self.random.integers(1, 4)), replace=False)
         return {str(name): possible[str(name)] for name in names}
+
+    def long(self, name: str) -> Case:
+        """A free-running pixel without effects that is exposed for long."""
+        random = self.random
+        signal, background = self.log(0.05, 10.0), self.log(0.01, 10.0)
+        dead = int(random.integers(0, 4)) + float(random.uniform(0.02, 1.0))
+        pulse: Pulse = GaussianPulse(sigma_ns=self.log(1e-3, 0.02) * PERIOD_NS)
+        wave = None
+        if self.family == "bright":
+            signal, background = self.log(10.0, 100.0), self.log(0.005, 1.0)
+        elif self.family == "locked":
+            signal, background = self.log(3.0, 100.0), self.log(0.03, 12.0)
+            dead = float(random.uniform(0.7, 0.999)) if self.chance(0.7) else dead
+        if self.family in ("reflection", "samples", "spike"):
+            signal, length = self.log(0.3, 60.0), self.log(0.02, 0.6)
+            pulse = self._long_pulse(length)
+            if self.chance(0.6):  # armed again within the record, some periods later
+                dead = int(random.integers(0, 4)) + max(length * float(random.uniform(0.05, 1.0)), 0.01)
+        elif self.chance(0.25):  # next to whole periods
+            dead = max(1, int(random.integers(1, 4))) + float(random.choice([-1.0, 1.0])) * self.log(1e-5, 0.05)
+        delay = float(random.random())
+        signals: tuple[float, ...] = (signal,)
+        delays: tuple[float, ...] = (delay,)
+        if self.family == "returns":
+            signals = tuple((signal * random.dirichlet(np.ones(2))).tolist())
+            delays = (delay, (delay + float(random.uniform(0.0, 0.3))) % 1.0)
+        if self.family == "waveform":
+            t = (np.arange(1024) + 0.5) / 1024
+            shape = 0.2 + 5.0 * np.exp(-0.5 * (((t - delay + 0.5) % 1.0 - 0.5) / self.log(0.003, 0.05)) ** 2)
+            wave = shape * (signal / shape.sum())
+        system = System(
+            period_ns=PERIOD_NS,
+            cycles=int(self.log(3e4, 1e8)),
+            bins=int(random.choice([64, 100, 256, 1024])),
+            pulse=pulse,
+            detector=Detector(dead_time_ns=dead * PERIOD_NS),
+            start="stationary" if self.chance(0.33) else "armed",
+        )
+        return Case(name, self.family, system, signals, delays, background, wave, self.family)
+
+    def _long_pulse(self, length: float) -> SampledPulse:
+        """A measured pulse `length` periods long."""
+        samples = round(self.log(10, 5000))
+        t = (np.arange(samples) + 0.5) / samples
+        if self.family == "reflection":
+            width, share, later = self.random.uniform((0.01, 0.05, 0.3), (0.06, 0.8, 0.75))
+            values = np.exp(-0.5 * ((t - 0.15) / width) ** 2) + share * np.exp(-0.5 * ((t - 0.15 - later) / width) ** 2)
+        elif self.family == "spike":
+            values = np.ones(samples)
+            values[int(self.random.integers(samples))] += samples * self.log(0.01, 0.5)
+        else:
+            values = self.random.uniform(size=samples) ** 5
+        return SampledPulse(values, length * PERIOD_NS / samples, "first")

@@ -513,7 +513,7 @@ def command_outcomes(command: str, here: Path, observed: set[str]) -> Iterator[t
                 yield option, word, "refused" if ours and named else "unnamed", printed
 
 
-@pytest.mark.full
+@pytest.mark.full(seconds=20)
 def test_wrong_options_are_refused_by_name(here):
     recorded: set[str] = set()
     for command, make in COMMANDS.items():

@@ -14,7 +14,6 @@ from benchmarks import (
     exposures,
     forward,
     laws,
-    numpy_mars,
     paths,
     startup,
     storage,
@@ -31,7 +30,6 @@ RESULTS = Path(__file__).parent / "results"
 SECTIONS: dict[str, Callable[[Config, Bandwidth], Section]] = {
     "exact": engines.exact_levels,
     "user": user.first_calls,
-    "pipeline": numpy_mars.pipeline,
     "long": exposures.long_exposures,
     "paths": paths.exact_paths,
     "effects": paths.detector_effects,
@@ -40,6 +38,7 @@ SECTIONS: dict[str, Callable[[Config, Bandwidth], Section]] = {
     "codecs": storage.codecs,
     "datasets": storage.datasets,
     "epochs": storage.epochs,
+    "waveforms": storage.waveforms,
     "stream": stream.stream,
     "forward": forward.forward,
     "import": startup.import_time,

@@ -28,7 +28,7 @@ def exact_levels(config: Config, bandwidth: Bandwidth) -> Section:
     times = in_turn(runs, config)
     reference = times["fresh memory"]
     section = Section("Exact engine, canonical cube", notes=[EXPLANATION, _LIMITS])
-    section.rows = [engine_row(name, run, times[name], bandwidth, reference) for name, run in runs.items()]
+    section.rows = [engine_row(name, run, times[name], bandwidth, reference=reference) for name, run in runs.items()]
     for level in [name for name in _core.levels() if name in ("avx512", "avx2")]:
         for name in (f"{level}, 1 thread", f"{level}, all threads"):
             spent = 1e9 * times[name].cpu_median / workload.registrations

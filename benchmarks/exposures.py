@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.config import Config
 from benchmarks.floor import Bandwidth
 from benchmarks.report import Goal, Section
-from benchmarks.rows import timing_row
+from benchmarks.rows import engine_row
 from benchmarks.timing import in_turn
-from benchmarks.workload import Workload, canonical, system
+from benchmarks.workload import EngineRun, canonical, system
 from mars_lidar.engines import ENGINES, Engine, MarsEngine
 from mars_lidar.table import Table
 
@@ -41,31 +39,18 @@ def long_exposures(config: Config, bandwidth: Bandwidth) -> Section:
     for cycles in exposures:
         workload = canonical(config, cycles=cycles)
         out = workload.warm()
-        names = [n for n in engines if n != "exact" or workload.photons * cycles * workload.pixels < _MOST_EXACT]
-        times = in_turn({n: _Run(engines[n], workload, config.threads, out) for n in names}, each)
+        runs = {
+            name: EngineRun(workload, engine, threads=config.threads, out=out)
+            for name, engine in engines.items()
+            if name != "exact" or workload.photons * cycles * workload.pixels < _MOST_EXACT
+        }
+        times = in_turn(runs, each)
         registrations = int(out.sum(dtype=np.int64))  # of whichever ran last: all agree to a part in a thousand
-        for name in names:
-            row = timing_row(
-                f"N_r = {cycles:,}",
-                workload,
-                times[name],
-                bandwidth,
-                engine=name,
-                threads=config.threads,
-                reference=times["feedback"],
-                registrations=registrations,
-            )
-            section.rows.append(row)
+        more = {"reference": times["feedback"], "registrations": registrations}
+        section.rows += [
+            engine_row(f"N_r = {cycles:,}", run, times[name], bandwidth, **more) for name, run in runs.items()
+        ]
         for name, wanted in (("feedback", GOAL_FEEDBACK_S), ("mars", GOAL_MARS_S)):
             what = f"{name}, whole cube, {cycles:,} cycles, all threads"
             section.goals.append(Goal(what, 1e3 * times[name].median, 1e3 * wanted, "ms"))
     return section
-
-
-class _Run:
-    def __init__(self, engine: Engine, workload: Workload, threads: int, out: NDArray[Any]) -> None:
-        self.engine, self.workload, self.threads, self.out = engine, workload, threads, out
-
-    def __call__(self) -> NDArray[Any]:
-        self.engine.histogram(self.workload.task(self.threads), self.out)
-        return self.out

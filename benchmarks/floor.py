@@ -72,19 +72,16 @@ ADDITIONS = 16  # of a round of `_core.addition_chain`
 
 
 @lru_cache(maxsize=1)
-def clock(rounds: int = 400_000, turns: int = 30) -> float | None:
-    """Hertz at which one busy core runs, by a chain of dependent additions, a cycle each; None where there is no chain.
+def clock(rounds: int = 400_000, turns: int = 30) -> float:
+    """Hertz at which one busy core runs, by a chain of dependent additions, a cycle each.
 
     The least time of many turns: what interrupts a turn only makes it longer. Processors run faster than the clock
     that their description tells, which therefore gives no least time.
     """
-    chain = getattr(_core, "addition_chain", None)
-    if chain is None:
-        return None
     seconds = []
     for _ in range(turns):
         began = time.perf_counter()
-        chain(rounds)
+        _core.addition_chain(rounds)
         seconds.append(time.perf_counter() - began)
     return ADDITIONS * rounds / min(seconds)
 

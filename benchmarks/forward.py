@@ -15,6 +15,7 @@ from benchmarks.config import Config
 from benchmarks.floor import Bandwidth
 from benchmarks.report import Section
 from benchmarks.timing import in_turn
+from benchmarks.workload import system as canonical_system
 from mars_lidar.learn import HistogramTable, expected_histogram, histogram_log_likelihood
 
 PIXELS = 64
@@ -67,14 +68,7 @@ def _light(random: np.random.Generator, pixels: int, period_ns: float) -> list[N
 
 
 def _models(bins: int, config: Config) -> Cases:
-    system = ml.System(
-        period_ns=1e3 / 7.5,
-        cycles=config.cycles,
-        bins=bins,
-        pulse=ml.GaussianPulse(sigma_ns=0.5),
-        detector=ml.Detector(dead_time_ns=75.0),
-        start="stationary",
-    )
+    system = canonical_system(config, dead_time_ns=75.0, bins=bins, start="stationary")
     s, b, tau = _light(np.random.default_rng(0), PIXELS, system.period_ns)
     table = HistogramTable(ml.Table.build(system, (0.04, 2.1, 6), (0.04, 2.1, 6), threads=1))
     counts = torch.from_numpy(ml.simulate(ml.Flux(s[None], b[None], tau[None]), system, seed=0)[0, 0].astype(float))

@@ -6,18 +6,18 @@ Needs a CUDA device and CuPy. Writes benchmarks/results/gpu.md and gpu.json.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
 import mars_lidar as ml
-from mars_lidar.engines import Engine, cuda, find_engine
+from benchmarks.report import Section
+from mars_lidar.engines import cuda, find_engine
 from mars_lidar.engines.cuda.exact import exact_histogram
 from mars_lidar.engines.cuda.machine import Cuda, cupy_with_device
-from mars_lidar.engines.engine import Task
 from mars_lidar.engines.simulation import _task
 from mars_lidar.table import Table
 
@@ -87,45 +87,30 @@ BATCHES = [(1, 1), (32, 1), (1, 32)]
 def main() -> None:
     cupy = cupy_with_device()
     name = cupy.cuda.runtime.getDeviceProperties(cupy.cuda.Device().id)["name"].decode()
-    rows = [
+    section = Section(f"The engines on a GPU: {name}", notes=[_NOTE])
+    section.rows = [
         measure(cupy, case, scenes, realizations, way)
         for case in CASES
         for scenes, realizations in BATCHES
         for way in case.ways
     ]
-    lines = [
-        "# The engines on a GPU",
-        "",
-        f"{name}; {SIDE} x {SIDE} pixels, {BINS} bins; medians of {REPEATS} calls into an array already there, "
-        "launches and preparation on the processor counted. Bits compared with the processor's in every case.",
-        "",
-        "| engine | case | scenes | realizations | counted in | ms a cube | cubes/s | registrations/s "
-        "| share of memory bandwidth |",
-        "|---|---|--:|--:|---|--:|--:|--:|--:|",
-    ]
-    for r in rows:
-        lines.append(
-            f"| {r['engine']} | {r['case']} | {r['scenes']} | {r['realizations']} | {r['counted']} | {r['ms']:.3f} "
-            f"| {1e3 / r['ms']:.0f} | {r['registrations'] / r['ms'] * 1e3:.3g} | {r['bandwidth']:.1%} |"
-        )
-    lines += [
-        "",
-        f"Goal: {GOAL_CUBES_PER_S} cubes/s of 1000 registrations a pixel by `exact`, and at N_r = 1e5 by `mars`. The "
-        "share of memory bandwidth is that of the histograms alone: `exact` sets them to zero and writes them, the "
-        "others write them.",
-    ]
-    RESULTS.joinpath("gpu.json").write_text(json.dumps({"device": name, "rows": rows}, indent=1) + "\n")
-    RESULTS.joinpath("gpu.md").write_text("\n".join(lines) + "\n")
-    print("\n".join(lines))
+    text = section.markdown() + "\n"
+    RESULTS.joinpath("gpu.json").write_text(json.dumps({"device": name, "rows": section.rows}, indent=1) + "\n")
+    RESULTS.joinpath("gpu.md").write_text(text.removeprefix("#"))
+    print(text)
 
 
 def measure(cupy: Any, case: Case, scenes: int, realizations: int, in_block: bool | None) -> dict[str, Any]:
-    system, engine = case.system, _engine(case)
+    system = case.system
+    options = {"table": Table.cached(system, GRID, GRID), "count": case.count} if case.engine == "mars" else {}
+    engine = find_engine(case.engine, **options)
     flux = case.flux(scenes)
     task = _task(flux, system, engine, realizations, 0, None, 1, None, None)
     cuda.check(engine, task.flux, task.system)
     out = cupy.empty((task.items, BINS), system.histogram_dtype)
-    draw = _drawing(engine, task, out, in_block)
+    draw = partial(cuda.histogram, engine, task, out)
+    if in_block is not None:
+        draw = partial(exact_histogram, task, out, Cuda(), in_block=in_block)
     draw()  # compiles
     cubes, size = scenes * realizations, SIDE * SIDE
     first = out[:size].get().reshape(1, SIDE, SIDE, BINS)
@@ -145,24 +130,20 @@ def measure(cupy: Any, case: Case, scenes: int, realizations: int, in_block: boo
         "case": case.name,
         "scenes": scenes,
         "realizations": realizations,
-        "counted": "" if in_block is None else "block" if in_block else "device",
-        "ms": ms,
-        "registrations": float(first.sum()),
-        "bandwidth": passes * first.nbytes / (ms * 1e-3) / MEMORY_BYTES_PER_S,
+        "counted in": {None: None, True: "block", False: "device"}[in_block],
+        "ms a cube": ms,
+        "cubes/s": 1e3 / ms,
+        "registrations/s": 1e3 * float(first.sum()) / ms,
+        "share of memory bandwidth": passes * first.nbytes / (ms * 1e-3) / MEMORY_BYTES_PER_S,
     }
 
 
-def _engine(case: Case) -> Engine:
-    if case.engine != "mars":
-        return find_engine(case.engine)
-    return find_engine("mars", table=Table.cached(case.system, GRID, GRID), count=case.count)
-
-
-def _drawing(engine: Engine, task: Task, out: Any, in_block: bool | None) -> Callable[[], None]:
-    if in_block is not None:
-        return lambda: exact_histogram(task, out, Cuda(), in_block=in_block)
-    return lambda: cuda.histogram(engine, task, out)
-
+_NOTE = (
+    f"{SIDE} x {SIDE} pixels, {BINS} bins; medians of {REPEATS} calls into an array already there, launches and "
+    "preparation on the processor counted. Bits compared with the processor's in every case. Goal: "
+    f"{GOAL_CUBES_PER_S} cubes/s of 1000 registrations a pixel by `exact`, and at N_r = 1e5 by `mars`. The share of "
+    "memory bandwidth is that of the histograms: `exact` sets them to zero and writes them, the others write them."
+)
 
 if __name__ == "__main__":
     main()

@@ -1,4 +1,4 @@
-"""The analytic half: laws of the count, shapes and the stationary distribution."""
+"""The analytic half: laws of the count and shapes."""
 
 from __future__ import annotations
 
@@ -11,17 +11,13 @@ from benchmarks.config import Config
 from benchmarks.floor import Bandwidth
 from benchmarks.report import Goal, Row, Section
 from benchmarks.timing import Timing, in_turn
-from benchmarks.workload import PERIOD_NS, system
+from benchmarks.workload import system
 from mars_lidar import Flux
-from mars_lidar.statistics.cells import Cells, photons_per_bin
-from mars_lidar.statistics.chain import PhaseChain
-from mars_lidar.statistics.count_pmf import guessed_pmfs
-from mars_lidar.statistics.exposure import exposure_moments, refined_moments
+from mars_lidar.statistics.exposure import exposure_moments
 from mars_lidar.statistics.law import count_law
 
 GOAL_MOMENTS_MS, GOAL_PMF_MS, GOAL_TABLE_S = 3.0, 20.0, 30.0
 TABLE = (256, 100)  # of the paper: S x B, log-spaced on [0.01, 10]
-_FINE = 16_384  # bins of the stationary distribution
 
 
 def exposure_laws(config: Config, bandwidth: Bandwidth) -> Section:
@@ -35,28 +31,9 @@ def exposure_laws(config: Config, bandwidth: Bandwidth) -> Section:
     def pmf() -> object:
         return count_law(flux, instrument, method="exact", threads=1).pmf
 
-    narrow = Cells.of(10.0 ** random.uniform(0.3, 1.0, 64), 10.0 ** random.uniform(-2.0, 0.0, 64), instrument)
-    known = refined_moments(narrow, 1, tolerance=1e-4, threads=1)
-
-    photons = photons_per_bin(Flux(1.0, 0.5, 0.5 * PERIOD_NS), instrument, bins=_FINE)
-
     cases: dict[str, tuple[int, int, Callable[[], object]]] = {
-        "moments and mean histogram": (
-            signal.size,
-            1,
-            lambda: exposure_moments(flux, instrument, threads=1),
-        ),
+        "moments and mean histogram": (signal.size, 1, lambda: exposure_moments(flux, instrument, threads=1)),
         "count pmf": (signal.size, 1, pmf),
-        "count pmf of a bright pixel, cumulants from a table": (
-            narrow.size,
-            1,
-            lambda: guessed_pmfs(narrow, known.cumulants, known.bins, 1),
-        ),
-        f"stationary distribution, {_FINE} bins": (
-            1,
-            1,
-            lambda: PhaseChain(photons, instrument.dead_time_periods).stationary(),
-        ),
         "table entries, moments and shapes": (
             grid.shape[1],
             every,
@@ -66,18 +43,13 @@ def exposure_laws(config: Config, bandwidth: Bandwidth) -> Section:
     times = in_turn({name: case for name, (_, _, case) in cases.items()}, config)
     section = Section("Laws of a finite exposure", notes=[_EXPOSURE_NOTE])
     section.rows = [_row(name, threads, cells, times[name]) for name, (cells, threads, _) in cases.items()]
-    cell_ms = {row["case"]: row["ms per (S, B)"] for row in section.rows}
-    whole = 1e-3 * cell_ms["table entries, moments and shapes"] * TABLE[0] * TABLE[1]
+    moments, pmf_ms, entry_ms = (row["ms per (S, B)"] for row in section.rows)
+    whole_s = 1e-3 * entry_ms * TABLE[0] * TABLE[1]
     scaled = "" if grid.shape[1] == TABLE[0] * TABLE[1] else f", scaled from {grid.shape[1]}"
     section.goals = [
-        Goal(
-            "exact moments and mean histogram, per (S, B), 1 thread",
-            cell_ms["moments and mean histogram"],
-            GOAL_MOMENTS_MS,
-            "ms",
-        ),
-        Goal("exact count pmf, per (S, B), 1 thread", cell_ms["count pmf"], GOAL_PMF_MS, "ms"),
-        Goal(f"25,600 table entries, {every} threads{scaled}", whole, GOAL_TABLE_S, "s"),
+        Goal("exact moments and mean histogram, per (S, B), 1 thread", moments, GOAL_MOMENTS_MS, "ms"),
+        Goal("exact count pmf, per (S, B), 1 thread", pmf_ms, GOAL_PMF_MS, "ms"),
+        Goal(f"25,600 table entries, {every} threads{scaled}", whole_s, GOAL_TABLE_S, "s"),
     ]
     return section
 

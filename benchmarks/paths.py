@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -16,14 +15,13 @@ from benchmarks.report import Goal, Section
 from benchmarks.rows import engine_row, timing_row
 from benchmarks.timing import in_turn
 from benchmarks.workload import PERIOD_NS, EngineRun, Workload, maps, system
-from mars_lidar import _core
 from mars_lidar.engines.engine import PhaseRecords
 
 GOAL_JITTER, GOAL_AFTERPULSING, GOAL_WAVEFORM = 1.3, 2.0, 2.0
 SHARES = (0.02, 0.2)  # carriers of an avalanche
 DELAY_NS = 60.0  # of their release, mean
-_USUAL, _ARMED, _STATIONARY = "armed, one return (reference)", "few rows, armed", "few rows, stationary start"
-_FRESH, _WARM = "timestamps, fresh memory", "timestamps, warm memory"
+_USUAL = "armed, one return (reference)"
+_TIMESTAMPS = "timestamps, fresh memory"
 _IDEAL, _JITTER, _AFTERPULSING = (
     "ideal pixel (reference)",
     "jitter, Gaussian",
@@ -35,12 +33,10 @@ def exact_paths(config: Config, bandwidth: Bandwidth) -> Section:
     """Starts, returns, pulses, dead times, waveforms and timestamps; half the canonical image's side."""
     usual = _usual(config)
     flux, instrument = usual.flux, usual.system
-    some = Workload(flux[: max(1, config.side // 32)], instrument)
     fog = {parts: f"three returns in fog, {parts} parts" for parts in (config.bins // 4, config.bins, 4 * config.bins)}
     workloads = {
         _USUAL: usual,
-        _ARMED: some,
-        _STATIONARY: _changed(some, start="stationary"),
+        "stationary start": _changed(usual, start="stationary"),
         "two returns": Workload(_returns(flux, 2), instrument),
         "four returns": Workload(_returns(flux, 4), instrument),
         "sampled pulse, 400 samples": _changed(usual, pulse=_measured_like_pulse()),
@@ -51,21 +47,14 @@ def exact_paths(config: Config, bandwidth: Bandwidth) -> Section:
         **{name: Workload(_waveform(usual, parts, fog=True), instrument) for parts, name in fog.items()},
     }
     runs = {name: EngineRun(load, out=load.warm()) for name, load in workloads.items()}
-    cases: dict[str, Callable[[], object]] = {
-        **runs,
-        _FRESH: lambda: ml.simulate_timestamps(flux, instrument, threads=1),
-        _WARM: _timestamps(usual),
-    }
+    cases = {**runs, _TIMESTAMPS: lambda: ml.simulate_timestamps(flux, instrument, threads=1)}
     times = in_turn(cases, config)
     reference = times[_USUAL]
     section = Section("Paths of the exact engine", notes=[_NOTE])
-    section.rows = [engine_row(name, run, times[name], bandwidth, reference) for name, run in runs.items()]
-    size = PhaseRecords.BYTES * usual.registrations
-    for name in (_FRESH, _WARM):
-        more: dict[str, Any] = {"fresh": name == _FRESH, "reference": reference, "output_bytes": size}
-        section.rows.append(timing_row(name, usual, times[name], bandwidth, engine="exact", **more))
-    start_s = (times[_STATIONARY].cpu_median - times[_ARMED].cpu_median) / some.pixels
-    section.notes.append(f"A stationary start costs {1e6 * start_s:.1f} µs of CPU time a pixel.")
+    section.rows = [engine_row(name, run, times[name], bandwidth, reference=reference) for name, run in runs.items()]
+    more: dict[str, Any] = {"fresh": True, "output_bytes": PhaseRecords.BYTES * usual.registrations}
+    stamps = timing_row(_TIMESTAMPS, usual, times[_TIMESTAMPS], bandwidth, engine="exact", reference=reference, **more)
+    section.rows.append(stamps)
     for name in list(fog.values())[:2]:
         cost = times[name].cpu_median / reference.cpu_median * usual.registrations / workloads[name].registrations
         section.goals.append(
@@ -103,7 +92,9 @@ def detector_effects(config: Config, bandwidth: Bandwidth) -> Section:
     runs = {name: EngineRun(load, out=load.warm()) for name, load in loads.items()}
     times = in_turn(runs, config)
     section = Section("Effects of the detector", notes=[_EFFECTS])
-    section.rows = [engine_row(name, run, times[name], bandwidth, times[_IDEAL]) for name, run in runs.items()]
+    section.rows = [
+        engine_row(name, run, times[name], bandwidth, reference=times[_IDEAL]) for name, run in runs.items()
+    ]
     for row in section.rows:  # the work is that of the registrations, recorded or not
         row["registrations"] = ideal.registrations
         row["ns/reg/core"] = 1e9 * times[row["case"]].cpu_median / ideal.registrations
@@ -137,18 +128,6 @@ def _usual(config: Config) -> Workload:
 
 def _changed(load: Workload, **changes: Any) -> Workload:
     return Workload(load.flux, load.system.replace(**changes))
-
-
-def _timestamps(load: Workload) -> Callable[[], object]:
-    """The engine's own work, into memory that has been written to."""
-    arrays = np.ones(load.registrations, np.int32), np.ones(load.registrations, np.float32)
-    offsets = np.empty(load.pixels + 1, np.int64)
-
-    def run() -> object:
-        task = load.task(threads=1)
-        return _core.exact_records(task.job, task.pulse, offsets, *arrays, 1, None, "")
-
-    return run
 
 
 def _returns(flux: ml.Flux, number: int) -> ml.Flux:

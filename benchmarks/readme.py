@@ -12,8 +12,9 @@ from benchmarks.report import number, table
 
 ROOT = Path(__file__).resolve().parents[1]
 SAVED = RESULTS / "default.json"
+_NUMPY = "the paper's pipeline in NumPy, one core ([runtime](docs/results/runtime.md))"
 
-_EXACT, _PIPELINE, _LONG = "Exact engine, canonical cube", "The paper's pipeline in NumPy", "One cube over the exposure"
+_EXACT, _LONG = "Exact engine, canonical cube", "One cube over the exposure"
 _PATHS, _LAWS, _CLI = "Paths of the exact engine", "Laws of a finite exposure", "Command line, prompt to prompt"
 
 
@@ -24,24 +25,34 @@ class Saved:
         self.machine: dict[str, Any] = data["machine"]
         self._sections: dict[str, list[dict[str, Any]]] = {s["title"]: s["rows"] for s in data["sections"]}
 
+    def section(self, title: str) -> list[dict[str, Any]]:
+        """All its rows."""
+        return self._sections[title]
+
     def row(self, title: str, case: str, **more: Any) -> dict[str, Any]:
         """The one row of a section with this case."""
         wanted = {"case": case, **more}
         (match,) = (r for r in self._sections[title] if all(r.get(k) == v for k, v in wanted.items()))
         return match
 
-    def has(self, title: str, case: str) -> bool:
-        """Whether there is such a row."""
-        return any(row.get("case") == case for row in self._sections[title])
-
     def ms(self, title: str, case: str, **more: Any) -> str:
         """Its median wall time."""
-        value = self.row(title, case, **more)["ms"]
-        return f"{number(value)} ms" if value < 1000 else f"{number(value / 1000)} s"
+        return _time(self.row(title, case, **more)["ms"])
 
     def ns(self, title: str, case: str, **more: Any) -> str:
         """Its processor time per registration."""
         return f"{self.row(title, case, **more)['ns/reg/core']:.1f} ns"
+
+
+def _time(ms: float) -> str:
+    return f"{number(ms)} ms" if ms < 1000 else f"{number(ms / 1000)} s"
+
+
+def _numpy_pipeline() -> str:
+    """The same cube by the paper's pipeline, from the page of the study "runtime"."""
+    text = ROOT.joinpath("docs/results/runtime.md").read_text(encoding="utf-8")
+    (seconds,) = re.findall(r"^\| MaRS pipeline in NumPy, table \| ([\d.]+) \|", text, re.MULTILINE)
+    return _time(1e3 * float(seconds))
 
 
 def _rows(saved: Saved) -> dict[str, str]:
@@ -49,9 +60,6 @@ def _rows(saved: Saved) -> dict[str, str]:
         return ", ".join(saved.ms(_LONG, f"N_r = {10**k:,}", engine=engine) for k in range(3, 8))
 
     single, two, avx2 = "avx512, 1 thread", "avx512, all threads", "avx2, all threads"
-    stamps, title = "timestamps (into fresh memory)", "timestamps, fresh memory"
-    if not saved.has(_PATHS, title):  # tables of versions that drew twice
-        stamps, title = "timestamps (two passes, into fresh memory)", "timestamps (two passes)"
     laws = saved.row(_LAWS, "moments and mean histogram"), saved.row(_LAWS, "count pmf")
     return {
         "`exact`, one core / two": (
@@ -62,9 +70,9 @@ def _rows(saved: Saved) -> dict[str, str]:
         "`feedback`, two cores, at the same exposures": long("feedback"),
         "`sequential`, two cores": saved.ms(_EXACT, "sequential, all threads"),
         "`poisson`, two cores": saved.ms(_EXACT, "poisson, all threads"),
-        "the paper's pipeline in NumPy, one core": saved.ms(_PIPELINE, "NumPy, lookup + alignment + multinomial"),
-        f"waveforms / {stamps}, one core": (
-            f"{saved.ns(_PATHS, 'waveform of 1024 samples')} / {saved.ns(_PATHS, title)}"
+        _NUMPY: _numpy_pipeline(),
+        "waveforms / timestamps (into fresh memory), one core": (
+            f"{saved.ns(_PATHS, 'waveform of 1024 samples')} / {saved.ns(_PATHS, 'timestamps, fresh memory')}"
         ),
         "exact mean, variance and mean histogram of one (S, B)": f"{number(laws[0]['ms per (S, B)'])} ms",
         "exact law of the count of one (S, B)": f"{number(laws[1]['ms per (S, B)'])} ms",
@@ -93,7 +101,7 @@ def figures(saved: Saved) -> str:
     rows, million = _rows(saved), "N_r = 1,000,000"
     selected = (
         "`exact`, one core / two",
-        "the paper's pipeline in NumPy, one core",
+        _NUMPY,
         "exact law of the count of one (S, B)",
     )
     chosen = {what: rows[what] for what in selected}
@@ -106,6 +114,16 @@ def exposures(saved: Saved) -> str:
     return table([_exposure(saved, 10**k) for k in range(3, 8)]) + "\n"
 
 
+def epochs(saved: Saved) -> str:
+    """The table of docs/generate.md: epochs of a store."""
+    rows: dict[str, dict[str, str]] = {}
+    for row in saved.section("Epochs over a store, one process"):
+        name = row["epoch"]
+        columns = rows.setdefault(name, {"cubes of 64 × 64 × 1024 a CPU-second": name})
+        columns[f"S = {row['S']:g}"] = f"{row['cubes per CPU s']:.0f}"
+    return f"{table(list(rows.values()))}\n\n{saved.machine['processor']}, {saved.machine['date'].split()[0]}.\n"
+
+
 def _exposure(saved: Saved, cycles: int) -> dict[str, str]:
     row = {"laser cycles": f"{cycles:,}"}
     for engine in ("exact", "feedback", "auto", "mars"):
@@ -116,8 +134,8 @@ def _exposure(saved: Saved, cycles: int) -> dict[str, str]:
     return row
 
 
-BLOCKS = {"speed": speed, "figures": figures, "exposures": exposures}
-TABLES = ("README.md", "docs/engines.md", "docs/speed.md")
+BLOCKS = {"speed": speed, "figures": figures, "exposures": exposures, "epochs": epochs}
+TABLES = ("README.md", "docs/engines.md", "docs/generate.md", "docs/speed.md")
 
 
 def filled(name: str) -> tuple[str, str]:
@@ -127,7 +145,11 @@ def filled(name: str) -> tuple[str, str]:
     for what, make in BLOCKS.items():
         made = make(saved)
         if name.startswith("docs/"):
-            made = made.replace("](benchmarks/", "](../benchmarks/").replace("](#start)", "](start.md)")
+            made = (
+                made.replace("](benchmarks/", "](../benchmarks/")
+                .replace("](docs/", "](")
+                .replace("](#start)", "](start.md)")
+            )
         block = re.compile(rf"(<!-- {what}: [^>]*-->\n).*?(<!-- end of {what} -->)", re.DOTALL)
         new, count = block.subn(lambda m, made=made: m[1] + made + m[2], new)
         blocks += count

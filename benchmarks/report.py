@@ -95,6 +95,15 @@ class Report:
         return paths
 
 
+def write_block(page: Path, command: str, made: str) -> None:
+    """Write a block of a page of docs, between the comments that name its command and its end."""
+    before, begin, rest = page.read_text(encoding="utf-8").partition(f"<!-- {command} -->")
+    _, end, after = rest.partition("<!-- end -->")
+    if not end:
+        raise SystemExit(f"{page} has no block <!-- {command} -->")
+    page.write_text(f"{before}{begin}\n\n{made}\n\n{end}{after}", encoding="utf-8")
+
+
 def table(rows: list[Row]) -> str:
     """Markdown, columns aligned for the reader of the plain text."""
     if not rows:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from benchmarks.floor import Bandwidth, clock, operations
 from benchmarks.report import Row
 from benchmarks.timing import Timing
@@ -27,7 +29,6 @@ def timing_row(
     size = workload.output_bytes if output_bytes is None else output_bytes
     floor = bandwidth.seconds(size, threads=threads, fresh=fresh)
     least = operations(level) if level else None
-    hertz = clock()
     return {
         "case": case,
         "engine": engine,
@@ -45,24 +46,15 @@ def timing_row(
         "MiB written": size / 2**20,
         "write floor ms": 1e3 * floor,
         "ops/reg least": None if least is None else least.total,
-        "ops floor ns/reg": None if least is None or hertz is None else 1e9 * least.seconds(hertz),
+        "ops floor ns/reg": None if least is None else 1e9 * least.seconds(clock()),
         "turns": len(timing.wall),
     }
 
 
-def engine_row(case: str, run: EngineRun, timing: Timing, bandwidth: Bandwidth, reference: Timing | None = None) -> Row:
-    """The row of a run of an engine."""
-    return timing_row(
-        case,
-        run.workload,
-        timing,
-        bandwidth,
-        engine=run.engine,
-        level=run.level,
-        threads=run.threads,
-        fresh=run.out is None,
-        reference=reference,
-    )
+def engine_row(case: str, run: EngineRun, timing: Timing, bandwidth: Bandwidth, **more: Any) -> Row:
+    """The row of a run of an engine; `more` as of `timing_row`."""
+    facts: dict[str, Any] = {"engine": run.name, "level": run.level, "threads": run.threads, "fresh": run.out is None}
+    return timing_row(case, run.workload, timing, bandwidth, **facts, **more)
 
 
 EXPLANATION = (

@@ -5,6 +5,8 @@ from __future__ import annotations
 import statistics
 import tempfile
 import time
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 
 from benchmarks.config import Config
@@ -20,17 +22,15 @@ _COMMAND = "import sys; from mars_lidar_command import main; sys.exit(main())"  
 def import_time(config: Config, bandwidth: Bandwidth) -> Section:
     """``import mars_lidar``, with NumPy alone in turn."""
     del bandwidth
-    packages = ("numpy", "mars_lidar")
-    for package in packages:  # byte code and file caches
-        run_python("-c", _IMPORT.format(package))
-    seconds: dict[str, list[float]] = {package: [] for package in packages}
-    for _ in range(config.starts):
-        for package in packages:
-            seconds[package].append(float(run_python("-c", _IMPORT.format(package))))
+    runs = {
+        f"import {package}": lambda package=package: float(run_python("-c", _IMPORT.format(package)))
+        for package in ("numpy", "mars_lidar")
+    }
+    for run in runs.values():  # byte code and file caches
+        run()
     section = Section("Import")
-    section.rows = [_row(f"import {package}", seconds[package]) for package in packages]
-    median = statistics.median(seconds["mars_lidar"])
-    section.goals.append(Goal("import mars_lidar, median", median, GOAL_IMPORT_S, "s"))
+    section.rows = _in_turn(runs, config.starts)
+    section.goals.append(Goal("import mars_lidar, median", section.rows[1]["s median"], GOAL_IMPORT_S, "s"))
     return section
 
 
@@ -39,23 +39,19 @@ def command_line(config: Config, bandwidth: Bandwidth) -> Section:
     del bandwidth
     usual = ["simulate", "--scene", "room", "--size", str(config.side)]
     usual += ["--cycles", str(config.cycles), "--bins", str(config.bins), "-o", "x.zarr", "--overwrite"]
-    commands = {
-        "without picture": [*usual, "--no-picture"],
-        "with picture": usual,
-        "--version": ["--version"],
-    }
-    seconds: dict[str, list[float]] = {name: [] for name in commands}
-    with tempfile.TemporaryDirectory() as folder:
-        if config.commands > 1:  # fill caches, that of fonts among them
-            _prompt_to_prompt(usual, Path(folder))
-        for _ in range(config.commands):
-            for name, arguments in commands.items():
-                seconds[name].append(_prompt_to_prompt(arguments, Path(folder)))
     section = Section("Command line, prompt to prompt", notes=["`mars-lidar " + " ".join(usual) + "`"])
-    section.rows = [_row(name, seconds[name]) for name in commands]
-    for name, wanted in (("without picture", GOAL_COMMAND_S), ("with picture", GOAL_PICTURE_S)):
-        what = f"mars-lidar simulate --scene room, {name}"
-        section.goals.append(Goal(what, statistics.median(seconds[name]), wanted, "s"))
+    with tempfile.TemporaryDirectory() as folder:
+        runs = {
+            "without picture": partial(_prompt_to_prompt, [*usual, "--no-picture"], Path(folder)),
+            "with picture": partial(_prompt_to_prompt, usual, Path(folder)),
+            "--version": partial(_prompt_to_prompt, ["--version"], Path(folder)),
+        }
+        if config.commands > 1:  # fill caches, that of fonts among them
+            runs["with picture"]()
+        section.rows = _in_turn(runs, config.commands)
+    for row, wanted in zip(section.rows, (GOAL_COMMAND_S, GOAL_PICTURE_S), strict=False):
+        what = f"mars-lidar simulate --scene room, {row['case']}"
+        section.goals.append(Goal(what, row["s median"], wanted, "s"))
     return section
 
 
@@ -65,11 +61,11 @@ def _prompt_to_prompt(arguments: list[str], folder: Path) -> float:
     return time.perf_counter() - began
 
 
-def _row(case: str, seconds: list[float]) -> Row:
-    return {
-        "case": case,
-        "s median": statistics.median(seconds),
-        "s best": min(seconds),
-        "s worst": max(seconds),
-        "runs": len(seconds),
-    }
+def _in_turn(runs: Mapping[str, Callable[[], float]], turns: int) -> list[Row]:
+    seconds = [{case: run() for case, run in runs.items()} for _ in range(turns)]
+    rows = []
+    for case in runs:
+        of = [turn[case] for turn in seconds]
+        median = statistics.median(of)
+        rows.append({"case": case, "s median": median, "s best": min(of), "s worst": max(of), "runs": turns})
+    return rows

@@ -5,11 +5,14 @@ from __future__ import annotations
 import json
 import os
 import tempfile
+from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numcodecs import Blosc, Zstd
+from numpy.typing import NDArray
 
 import mars_lidar as ml
 from benchmarks.config import Config
@@ -17,30 +20,35 @@ from benchmarks.floor import Bandwidth
 from benchmarks.report import Goal, Row, Section
 from benchmarks.subprocesses import run_python
 from benchmarks.timing import in_turn
+from benchmarks.workload import system
 from mars_lidar import _core
 from mars_lidar._base import manifest
+from mars_lidar.dataset import Light
+from mars_lidar.dataset.scenes import Rendered, Surfaces
+from mars_lidar.light.fog import Fog
+from mars_lidar.light.transient import Transient
 
-SIDE = 64
+SIDE, DEAD_TIME_NS = 64, 75.0
 LEVELS = (10.0, 1.0, 0.1, 0.01)  # mean signal photons per period; SBR 1
 _SUMS = "the checks of its files alone"
 GOAL_SHARE, GOAL_SIZE, GOAL_MEMORY_GIB, GOAL_WORKERS, GOAL_SUMS = 0.6, 0.2, 1.5, 1.7, 0.03
-_CODECS: dict[str, Any] = {
-    "blosc lz4-5 bitshuffle": Blosc("lz4", 5, Blosc.BITSHUFFLE),
-    "blosc zstd-1 bitshuffle": Blosc("zstd", 1, Blosc.BITSHUFFLE),
-    "zstd-3": Zstd(3),
+
+
+def _sparse_decoded(packed: bytes, size: int) -> NDArray[np.uint16]:
+    out = np.empty(size, np.uint16)
+    _core.unpack_counts(np.frombuffer(packed, np.uint8), out)
+    return out
+
+
+Codec = tuple[Callable[[Any], Any], Callable[[Any, int], Any]]  # of counts: packed, and unpacked to so many
+_CODECS: dict[str, Codec] = {"sparse": (_core.pack_counts, _sparse_decoded)} | {
+    name: (codec.encode, lambda packed, size, codec=codec: codec.decode(packed))
+    for name, codec in (
+        ("blosc lz4-5 bitshuffle", Blosc("lz4", 5, Blosc.BITSHUFFLE)),
+        ("blosc zstd-1 bitshuffle", Blosc("zstd", 1, Blosc.BITSHUFFLE)),
+        ("zstd-3", Zstd(3)),
+    )
 }
-
-
-class _Packed:
-    """The codec of the sparse layout."""
-
-    def encode(self, counts: Any) -> bytes:
-        return _core.pack_counts(counts)
-
-    def decode(self, packed: bytes, size: int) -> Any:
-        out = np.empty(size, np.uint16)
-        _core.unpack_counts(np.frombuffer(packed, np.uint8), out)
-        return out
 
 
 def codecs(config: Config, bandwidth: Bandwidth) -> Section:
@@ -49,35 +57,35 @@ def codecs(config: Config, bandwidth: Bandwidth) -> Section:
     from numcodecs import blosc
 
     blosc.use_threads = False
-    section, mine = Section("Codecs of counts, one thread", notes=[_CODEC_NOTE]), _Packed()
+    section = Section("Codecs of counts, one thread", notes=[_CODEC_NOTE])
     for level in LEVELS:
-        system = _system(config)
-        flux = ml.Scene.example("room", size=SIDE).flux(system, signal=level, sbr=1.0)
-        out = np.empty((1, *flux.shape, system.bins), np.uint16)
+        instrument = system(config, dead_time_ns=DEAD_TIME_NS)
+        flux = ml.Scene.example("room", size=SIDE).flux(instrument, signal=level, sbr=1.0)
+        out = np.empty((1, *flux.shape, instrument.bins), np.uint16)
         counts = out.reshape(-1)
-        ml.simulate(flux, system, seed=0, threads=1, out=out)
-        packed = {name: codec.encode(counts) for name, codec in _CODECS.items()}
-        packed_here = mine.encode(counts)
-        cases = {"engine": lambda f=flux, s=system, o=out: ml.simulate(f, s, seed=0, threads=1, out=o)}
-        for name, codec in _CODECS.items():
-            cases[f"pack {name}"] = lambda c=codec, x=counts: c.encode(x)
-            cases[f"unpack {name}"] = lambda c=codec, x=packed[name]: c.decode(x)
-        cases["pack sparse"] = lambda x=counts: mine.encode(x)
-        cases["unpack sparse"] = lambda x=packed_here, n=counts.size: mine.decode(x, n)
+        ml.simulate(flux, instrument, seed=0, threads=1, out=out)
+        packed = {name: pack(counts) for name, (pack, _) in _CODECS.items()}
+        cases: dict[str, Callable[[], object]] = {
+            "engine": partial(ml.simulate, flux, instrument, seed=0, threads=1, out=out)
+        }
+        for name, (pack, unpack) in _CODECS.items():
+            cases[f"pack {name}"] = partial(pack, counts)
+            cases[f"unpack {name}"] = partial(unpack, packed[name], counts.size)
         timings = in_turn(cases, config)
         engine = min(timings["engine"].cpu)
-        for name, size in [("sparse", len(packed_here)), *((name, len(data)) for name, data in packed.items())]:
-            pack, unpack = (min(timings[f"{what} {name}"].cpu) for what in ("pack", "unpack"))
+        for name in _CODECS:
+            packing, unpacking = (min(timings[f"{what} {name}"].cpu) for what in ("pack", "unpack"))
+            size = len(packed[name])
             row: Row = {
                 "S": level,
                 "bins not zero": f"{100 * np.count_nonzero(counts) / counts.size:.1f} %",
                 "codec": name,
                 "engine ms": 1e3 * engine,
-                "pack ms": 1e3 * pack,
-                "unpack ms": 1e3 * unpack,
+                "pack ms": 1e3 * packing,
+                "unpack ms": 1e3 * unpacking,
                 "bytes per pixel": size / SIDE**2,
                 "of dense": size / counts.nbytes,
-                "of engine speed": engine / (engine + pack),
+                "of engine speed": engine / (engine + packing),
             }
             section.rows.append(row)
             if name == "sparse" and level == 1.0:
@@ -124,7 +132,7 @@ def epochs(config: Config, bandwidth: Bandwidth) -> Section:
 
     torch.set_num_threads(1)
     section = Section("Epochs over a store, one process", notes=[_EPOCH_NOTE])
-    scenes, batch = max(2, config.side // 8), 4
+    scenes, batch, instrument = max(2, config.side // 8), 4, system(config, dead_time_ns=DEAD_TIME_NS)
     for level in (1.0, 0.1):
         with tempfile.TemporaryDirectory(dir=os.environ.get("MARS_BENCH_TMP")) as folder:
             cases: dict[str, Any] = {}
@@ -132,26 +140,24 @@ def epochs(config: Config, bandwidth: Bandwidth) -> Section:
                 store = Path(folder) / f"{layout}.zarr"
                 recipe = {
                     "scenes": {"example": "room", "size": [SIDE, SIDE], "seeds": {"count": scenes}},
-                    "systems": [_system(config)],
+                    "systems": [instrument],
                     "light": {"signal": [level]},
                     "realizations": 4,
                     "store": {"layout": layout},
                 }
                 ml.generate(recipe, store)
                 opened = StoredDataset(store, batch_size=batch)
-                cases[f"{layout}, first epoch"] = lambda s=store: sum(1 for _ in StoredDataset(s, batch_size=batch))
-                cases[f"{layout}, later epochs"] = lambda d=opened: sum(1 for _ in d)
-                cases[f"{layout}, {_SUMS}"] = lambda s=store: _check(s)
-                examples = StoredDataset(store)
+                cases[f"{layout}, first epoch"] = lambda s=store: _iterated(StoredDataset(s, batch_size=batch))
+                cases[f"{layout}, later epochs"] = partial(_iterated, opened)
+                cases[f"{layout}, {_SUMS}"] = partial(_check, store)
                 if layout == "sparse":
-                    cases["sparse, examples that the loader collates"] = lambda d=examples: sum(
-                        1 for _ in torch.utils.data.DataLoader(d, batch_size=batch)
-                    )
+                    loader = torch.utils.data.DataLoader(StoredDataset(store), batch_size=batch)
+                    cases["sparse, examples that the loader collates"] = partial(_iterated, loader)
             stream = CubeStream(
-                _system(config), "room", size=SIDE, epoch_size=4 * scenes, batch_size=batch, signal=level, sbr=1.0,
+                instrument, "room", size=SIDE, epoch_size=4 * scenes, batch_size=batch, signal=level, sbr=1.0,
                 threads=1, ahead=0,
             )  # fmt: skip
-            cases["simulated (CubeStream)"] = lambda stream=stream: sum(1 for _ in stream)
+            cases["simulated (CubeStream)"] = partial(_iterated, stream)
             timings = in_turn(cases, config)
             rates = {name: 4 * scenes / min(timings[name].cpu) for name in cases}
             section.rows += [{"S": level, "epoch": name, "cubes per CPU s": rate} for name, rate in rates.items()]
@@ -163,6 +169,31 @@ def epochs(config: Config, bandwidth: Bandwidth) -> Section:
             if level == 1.0:
                 section.goals.append(Goal("sparse cubes per CPU s, S = 1", read, 60.0, "", True))
     return section
+
+
+def waveforms(config: Config, bandwidth: Bandwidth) -> Section:
+    """One thread: waveforms of rendered light and of fog made from their scenes, and an exposure drawn from them."""
+    del bandwidth
+    instrument = system(config, dead_time_ns=DEAD_TIME_NS)
+    room, nothing = ml.Scene.example("room", SIDE), np.full((SIDE, SIDE), np.nan)
+    light = np.random.default_rng(0).exponential(size=(SIDE, SIDE, instrument.bins))
+    kinds = {
+        "rendered light": Rendered(Transient(light, instrument.bin_ns), nothing, nothing),
+        "fog": Surfaces(room, Fog(extinction_per_m=0.05, backscatter=0.3, nearest_m=1.0)),
+    }
+    section = Section(f"Waveforms of {SIDE} × {SIDE} pixels")
+    for name, content in kinds.items():
+        flux = content.flux(instrument, Light(), 1.0, 1.0)
+        draw = partial(ml.simulate, flux[:], instrument, seed=0, threads=1)
+        spent = in_turn({"made": partial(flux.__getitem__, slice(None)), "drawn": draw}, config)
+        seconds = {f"{what}, CPU s": min(timing.cpu) for what, timing in spent.items()}
+        section.rows.append({"light": name, "parts": content.waveform_parts(instrument)} | seconds)
+    return section
+
+
+def _iterated(batches: Iterable[Any]) -> None:
+    for _ in batches:
+        pass
 
 
 def _check(store: Path) -> None:
@@ -185,16 +216,6 @@ def _dataset_row(case: str, level: float, measured: dict[str, float], alone: dic
         "MB on disk": measured["bytes"] / 1e6,
         "peak MiB": measured["peak"] / 2**20,
     }
-
-
-def _system(config: Config) -> ml.System:
-    return ml.System(
-        period_ns=1e3 / 7.5,
-        cycles=config.cycles,
-        bins=config.bins,
-        pulse=ml.GaussianPulse(sigma_ns=0.5),
-        detector=ml.Detector(dead_time_ns=75.0),
-    )
 
 
 def _child(config: Config, what: str, level: float, scenes: int, threads: int) -> dict[str, float]:

@@ -17,14 +17,15 @@ import mars_lidar as ml
 import mars_lidar.dataset.ingest
 from benchmarks.child import resident
 from benchmarks.config import Config
-from benchmarks.storage import SIDE, _system
+from benchmarks.storage import DEAD_TIME_NS, SIDE
+from benchmarks.workload import system as canonical_system
 
 REALIZATIONS = 8
 
 
 def main(what: str, level: float, scenes: int, threads: int, cycles: int, bins: int, out: Path) -> None:
     """Wall and CPU seconds, bytes on disk and at the peak, exposures and their rate."""
-    system = _system(Config(mode="child", cycles=cycles, bins=bins))
+    system = canonical_system(Config(mode="child", cycles=cycles, bins=bins), dead_time_ns=DEAD_TIME_NS)
     marks: list[tuple[float, int]] = []
     recipe = {
         "scenes": {"path": str(out.parent / "scenes")},

@@ -17,6 +17,7 @@ from benchmarks.config import Config
 from benchmarks.floor import Bandwidth
 from benchmarks.report import Goal, Section
 from benchmarks.timing import in_turn
+from benchmarks.workload import system as canonical_system
 from mars_lidar.learn import CubeStream
 from mars_lidar.learn.scenes import Sample
 
@@ -27,13 +28,7 @@ LEVELS = (1.0, 0.1)
 def stream(config: Config, bandwidth: Bandwidth) -> Section:
     """One thread in this process, then workers of a loader with a thread each."""
     side = max(4, config.side // 2)
-    system = ml.System(
-        period_ns=1e3 / 7.5,
-        cycles=config.cycles,
-        bins=config.bins,
-        pulse=ml.GaussianPulse(sigma_ns=0.5),
-        detector=ml.Detector(dead_time_ns=75.0),
-    )
+    system = canonical_system(config, dead_time_ns=75.0)
     section = Section("Stream of training cubes", notes=[_NOTE.format(side=side, bins=config.bins)])
     out = np.empty((1, side, side, system.bins), system.histogram_dtype)
     floor = bandwidth.seconds(out.nbytes, threads=1, fresh=False)

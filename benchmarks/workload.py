@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 import mars_lidar as ml
 from benchmarks.config import Config
-from mars_lidar.engines import ENGINES
+from mars_lidar.engines import ENGINES, Engine
 from mars_lidar.engines.engine import Task
 from mars_lidar.engines.exact import ExactEngine
 
@@ -79,29 +79,36 @@ class Workload:
 
 @dataclass(frozen=True, eq=False)
 class EngineRun:
-    """One timed run: an engine, at a vector level where it has them, into `out`, or fresh memory if None."""
+    """One timed run: an engine (by name, or itself), at a vector level if told, into `out`, or fresh memory if None."""
 
     workload: Workload
-    engine: str = "exact"
+    engine: str | Engine = "exact"
     level: str = ""
     threads: int = 1
     out: NDArray[Any] | None = None
 
+    @property
+    def name(self) -> str:
+        """Of the engine."""
+        return self.engine if isinstance(self.engine, str) else self.engine.name
+
     def __call__(self) -> NDArray[Any]:
-        engine = ExactEngine(self.level) if self.engine == "exact" else ENGINES[self.engine]
+        engine = self.engine
+        if isinstance(engine, str):
+            engine = ExactEngine(self.level) if engine == "exact" else ENGINES[engine]
         out = self.workload.empty() if self.out is None else self.out
         engine.histogram(self.workload.task(self.threads), out)
         return out
 
 
-def system(config: Config, **changes: Any) -> ml.System:
-    """The canonical system, with some fields changed."""
+def system(config: Config, *, dead_time_ns: float = DEAD_TIME_NS, **changes: Any) -> ml.System:
+    """The canonical system, with another dead time and some fields changed."""
     return ml.System(
         period_ns=PERIOD_NS,
         cycles=config.cycles,
         bins=config.bins,
         pulse=ml.GaussianPulse(sigma_ns=SIGMA_NS),
-        detector=ml.Detector(dead_time_ns=DEAD_TIME_NS),
+        detector=ml.Detector(dead_time_ns=dead_time_ns),
     ).replace(**changes)
 
 

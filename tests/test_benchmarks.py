@@ -69,12 +69,14 @@ def test_every_section_has_a_whole_table(report):
             assert set(section.rows[0]) == TIMING_COLUMNS
 
 
+@pytest.mark.full
 def test_every_level_is_in_the_first_table(report):
     rows = report.sections[0].rows
     assert {row["level"] for row in rows if row["engine"] == "exact"} == set(_core.levels())
     assert "sequential" in {row["engine"] for row in rows}
 
 
+@pytest.mark.full
 def test_goals_stand_beside_measured_values(report):
     text = report.markdown()
     assert len(report.goals) >= 8
@@ -137,11 +139,10 @@ def test_ratios_are_taken_within_a_turn():
     assert Timing((2.0, 8.0, 4.0), (1.0, 1.0, 1.0)).ratio(Timing((1.0, 2.0, 4.0), (1.0, 1.0, 1.0))) == 2.0
 
 
-def test_clock_is_that_of_dependent_additions(monkeypatch: pytest.MonkeyPatch):
+def test_clock_is_that_of_dependent_additions():
     """No compiler has taken the chain apart, and the floor is of that clock, not of the processor's description."""
     assert _core.addition_chain(1000) == 16_000
     hertz = clock()
-    assert hertz is not None
     assert 3e8 < hertz < 1e10
     load = workload.canonical(TINY)
     level = _core.levels()[-1]
@@ -149,10 +150,6 @@ def test_clock_is_that_of_dependent_additions(monkeypatch: pytest.MonkeyPatch):
     timing, bandwidth = Timing((1.0,), (1.0,)), Bandwidth(1.0, 1.0, 1.0, 1.0)
     text = rows.engine_row("a", run, timing, bandwidth)["ops floor ns/reg"]
     assert text == pytest.approx(1e9 * operations(level).seconds(hertz))
-    monkeypatch.setattr(_core, "addition_chain", None)
-    clock.cache_clear()
-    assert rows.engine_row("a", run, timing, bandwidth)["ops floor ns/reg"] is None
-    clock.cache_clear()
 
 
 def test_wider_levels_need_fewer_operations():
@@ -193,4 +190,4 @@ def test_estimators_are_timed():
     reconstruction = command.run(TINY, ("reconstruction",)).sections[0]
     assert {row["method"] for row in reconstruction.rows} >= {"maximum_likelihood", "mchc", "coates", "matched_filter"}
     assert all(row["us per pixel"] > 0 for row in reconstruction.rows)
-    assert [goal.unit for goal in reconstruction.goals] == ["s"]
+    assert [goal.unit for goal in reconstruction.goals] == ["s", "us", "us"]

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.numpy_pipeline import NumpyTable, synthesize
 from mars_lidar import Flux, System, Table, simulate
 from mars_lidar.engines import ANY_SYSTEM, Engine, MarsEngine
 from studies import Tell
 from studies.common.sample import PERIOD_NS, system_of
+from studies.runtime.numpy_pipeline import NumpyTable, synthesize
 
 Run = Callable[[int, NDArray[Any]], dict[str, float]]  # seed, memory for the cube -> seconds of stages
 TABLE_RANGE = (0.01, 10.0)  # photons per period, of both axes of the tables

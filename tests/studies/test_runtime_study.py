@@ -6,10 +6,10 @@ from harness.ledger import require
 from scipy import stats
 
 import mars_lidar as ml
-from benchmarks.numpy_pipeline import STAGES, NumpyTable, synthesize
 from mars_lidar.engines import ANY_SYSTEM
 from studies.runtime import run as runtime
 from studies.runtime import timing
+from studies.runtime.numpy_pipeline import STAGES, NumpyTable, synthesize
 from tests.harness.study import quick_study
 
 

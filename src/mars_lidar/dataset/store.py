@@ -27,21 +27,11 @@ from numpy.typing import NDArray
 
 from mars_lidar._base import checks, manifest
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.buckets import content_of, in_bucket, place_of, remove, sizes, zarr_store
+from mars_lidar._base.buckets import content_of, in_bucket, place_of, remove, sizes
 from mars_lidar._base.cached import cached_property
 from mars_lidar._base.files import INCOMPLETE_SUFFIX, FileError, IncompleteFileError, reading
 from mars_lidar._base.native import _core
-from mars_lidar.dataset.arrays import (
-    FORMAT,
-    FORMAT_VERSION,
-    MAPS,
-    MORE_VERSION,
-    block,
-    grid,
-    mark,
-    sample_parts,
-    with_zeros,
-)
+from mars_lidar.dataset import arrays
 from mars_lidar.dataset.recipe import DatasetRecipe
 from mars_lidar.dataset.scenes import Rendered, SceneReader
 from mars_lidar.dataset.shard import digests_of, is_good
@@ -69,24 +59,22 @@ class Dataset:
     def __init__(self, path: Path, *, listed: bool = True) -> None:
         import zarr
 
-        from mars_lidar._base.sealed_store import PlainFiles, SealedStore, SealedValues
+        from mars_lidar._base.sealed_store import store_at
         from mars_lidar.dataset import codec  # noqa: F401  (registers it)
 
         self.path = path
         self.attrs: dict[str, Any] = manifest.root_document(path).get("attributes", {})
-        if self.attrs.get("format") != FORMAT:
-            raise ValueError(f"{path} is not a dataset written by mars-lidar (no attribute format = {FORMAT!r})")
-        if self.attrs.get("format_version") not in (FORMAT_VERSION, MORE_VERSION):
+        if self.attrs.get("format") != arrays.FORMAT:
+            raise ValueError(f"{path} is not a dataset written by mars-lidar (no attribute format = {arrays.FORMAT!r})")
+        if self.attrs.get("format_version") not in (arrays.FORMAT_VERSION, arrays.MORE_VERSION):
             version = self.attrs.get("format_version")
-            raise ValueError(f"{path} has layout version {version}; {FORMAT_VERSION} and {MORE_VERSION} can be read")
+            raise ValueError(
+                f"{path} has layout version {version}; {arrays.FORMAT_VERSION} and {arrays.MORE_VERSION} can be read"
+            )
         check_zarr_threads()
         self.sums = manifest.require(path, listed=listed) if self.complete else None
-        store: Any = zarr_store(path, read_only=self.sums is not None)
-        if in_bucket(path):
-            store = store if self.sums is None else SealedValues(store, self.sums, str(path))
-        else:
-            store = PlainFiles(path) if self.sums is None else SealedStore(path, self.sums)
-        self.group: Any = zarr.open_group(store, mode="r+" if self.sums is None else "r", use_consolidated=False)
+        store = store_at(path, self.sums, read_only=self.complete)
+        self.group: Any = zarr.open_group(store, mode="r" if self.complete else "r+", use_consolidated=False)
         self.recipe = DatasetRecipe.from_dict(json.loads(self.attrs["recipe"]))
 
     def __repr__(self) -> str:
@@ -114,7 +102,7 @@ class Dataset:
     @cached_property
     def maps(self) -> dict[str, Any]:
         """The arrays (sample, y, x)."""
-        return {name: self._array(name) for name in MAPS}
+        return {name: self._array(name) for name in arrays.MAPS}
 
     @cached_property
     def seeds(self) -> NDArray[np.uint64]:
@@ -139,12 +127,12 @@ class Dataset:
 
     def _array(self, name: str) -> OnDisk:
         with reading(self.path, "a dataset of mars-lidar"):
-            return OnDisk(with_zeros(self.group[name]), self.path)
+            return OnDisk(arrays.with_zeros(self.group[name]), self.path)
 
     def cube(self, sample: int) -> Cube:
         """One sample as a cube (realizations, H, W, bins), with its light."""
         number = checks.integer("sample", sample, low=0, high=len(self.seeds) - 1)
-        scene, which, signal, sbr = sample_parts(self.recipe, number)
+        scene, which, signal, sbr = arrays.sample_parts(self.recipe, number)
         system, content = self.recipe.systems[which], self.scenes.read(scene)
         known = ~np.isnan(content.reflectivity)
         recipe = Recipe(
@@ -169,13 +157,13 @@ class Dataset:
         yield from self._grid("histogram", self.histogram)
 
     def _grid(self, kind: str, array: Any) -> Iterator[Item]:
-        for place in np.ndindex(grid(array.shape, array.shards)):
-            yield Item(kind, place, block(place, array.shards, array.shape))
+        for place in np.ndindex(arrays.grid(array.shape, array.shards)):
+            yield Item(kind, place, arrays.block(place, array.shards, array.shape))
 
     def files(self, item: Item) -> list[Path]:
         """The files of a part."""
-        arrays = {"histogram": self.histogram} if item.kind == "histogram" else self.maps
-        return [self.path / name / array.metadata.encode_chunk_key(item.shard) for name, array in arrays.items()]
+        every = {"histogram": self.histogram} if item.kind == "histogram" else self.maps
+        return [self.path / name / array.metadata.encode_chunk_key(item.shard) for name, array in every.items()]
 
     def missing(self, items: Iterable[Item] | None = None) -> list[Item]:
         """Those of some parts, or of all, that are missing or whose files are truncated."""
@@ -217,11 +205,6 @@ class Dataset:
         """Checksum of the manifest of a complete store: stores with the same identity are identical byte for byte."""
         return "" if self.sums is None else self.sums.identity
 
-    def check(self, file: Path) -> None:
-        """Raise FileError if a file of a complete store has changed since it was opened."""
-        if self.sums is not None:
-            self.sums.check(file.relative_to(self.path).as_posix())
-
     def read(self, name: str) -> bytes:
         """The content of a file of a complete store, as it was when the store was sealed."""
         assert self.sums is not None, "incomplete stores are not read by name"
@@ -242,7 +225,7 @@ class Dataset:
 
     def tidy(self) -> None:
         """Remove the temporary files of killed writers."""
-        for name in () if in_bucket(self.path) else ("", "histogram", *MAPS):
+        for name in () if in_bucket(self.path) else ("", "histogram", *arrays.MAPS):
             for pattern in ("*.partial", f"*{INCOMPLETE_SUFFIX}"):  # of Zarr, and of ours
                 for leftover in (self.path / name).rglob(pattern) if name else self.path.glob(pattern):
                     leftover.unlink(missing_ok=True)
@@ -252,7 +235,7 @@ class Dataset:
         if lost := self.missing_files():
             raise FileNotFoundError(f"{lost[0]} was removed while the others were made, the first of {len(lost)}")
         if "consolidated_metadata" not in manifest.root_document(self.path):  # stopped just before it
-            mark(self.group, {})
+            arrays.mark(self.group, {})
         noted = self.written()
         if in_bucket(self.path):
             there = sizes(self.path)
@@ -283,7 +266,7 @@ def _whole(file: Path, chunks: int) -> bool:
 def is_dataset(path: str | Path) -> bool:
     """Whether a folder is a dataset, complete or not."""
     try:
-        return bool(manifest.root_document(Path(path)).get("attributes", {}).get("format") == FORMAT)
+        return bool(manifest.root_document(Path(path)).get("attributes", {}).get("format") == arrays.FORMAT)
     except (OSError, ValueError, MemoryError):
         return False
 
@@ -348,26 +331,14 @@ def read_sparse(dataset: Dataset | str | Path, sample: int, realization: int = 0
     number, realizations, height, width, bins = array.shape
     sample = checks.integer("sample", sample, low=0, high=number - 1)
     realization = checks.integer("realization", realization, low=0, high=realizations - 1)
-    if source.recipe.layout == "dense":
-        counts = np.asarray(array[sample, realization]).reshape(height * width, bins)
-        row, column = np.nonzero(counts)
-        return scipy.sparse.coo_array((counts[row, column], (row, column)), shape=counts.shape)
-    from mars_lidar.dataset.codec import events
-
-    _, _, rows, columns, _ = chunk = array.chunks
     parts = []
-    for y, x in np.ndindex(grid((height, width), (rows, columns))):
-        position, count = events(_packed(source, (sample // chunk[0], realization // chunk[1], y, x, 0)))
-        first, second, row, column, time = np.unravel_index(position, chunk)
-        selected = (first == sample % chunk[0]) & (second == realization % chunk[1])
-        parts.append(
-            ((y * rows + row[selected]) * width + x * columns + column[selected], time[selected], count[selected])
-        )
-    row, column, count = (np.concatenate(column) for column in zip(*parts, strict=True))
-    if columns < width:
-        order = np.lexsort((column, row))
-        row, column, count = row[order], column[order], count[order]
-    return scipy.sparse.coo_array((count.astype(array.dtype), (row, column)), shape=(height * width, bins))
+    with reading(source.path, "a dataset of mars-lidar"):
+        for top in range(0, height, array.chunks[2]):
+            counts = np.asarray(array[sample, realization, top : top + array.chunks[2]]).reshape(-1)
+            place = np.flatnonzero(counts)
+            parts.append((place + top * width * bins, counts[place]))
+    place, count = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return scipy.sparse.coo_array((count, np.divmod(place, bins)), shape=(height * width, bins))
 
 
 class Block:
@@ -418,7 +389,7 @@ class Block:
         rows, columns = self._chunk[2:4]
         out = np.empty((height, width, bins), self._dtype)
         key = (self._path, sample // self._chunk[0], realization // self._chunk[1])
-        for y, x in np.ndindex(grid((height, width), (rows, columns))):
+        for y, x in np.ndindex(arrays.grid((height, width), (rows, columns))):
             counts = decoded.get((*key, y, x))
             if counts is None:
                 counts = self._decode(self.packed(sample, realization, y, x))
@@ -447,7 +418,7 @@ def read_block(dataset: Dataset, place: tuple[int, int], maps: Sequence[str]) ->
     with reading(dataset.path, "a dataset of mars-lidar"):
         files = {
             (y, x): dataset.read("histogram/" + array.metadata.encode_chunk_key((*place, y, x, 0)))
-            for y, x in np.ndindex(grid(array.shape[2:4], array.shards[2:4]))
+            for y, x in np.ndindex(arrays.grid(array.shape[2:4], array.shards[2:4]))
         }
         some = slice(place[0] * array.shards[0], (place[0] + 1) * array.shards[0])
         return Block(dataset, place, files, {name: np.asarray(dataset.maps[name][some]) for name in maps})
@@ -458,28 +429,3 @@ def _index(tail: bytes, path: Path) -> NDArray[np.uint64]:
     if not is_good(tail):
         raise FileError(f"{path}: the index of a shard is damaged (its checksum differs)")
     return np.frombuffer(tail[:-4], "<u8").reshape(-1, 2)
-
-
-def _packed(dataset: Dataset, place: tuple[int, ...]) -> NDArray[np.uint8]:
-    """The bytes of one packed chunk of the histogram: one read of the shard's index, one of the chunk.
-
-    Zarr v3, sharding codec: the file ends in the index, offset and length of each chunk in C order, and its checksum.
-    """
-    array: Any = dataset.histogram
-    each = tuple(shard // chunk for shard, chunk in zip(array.shards, array.chunks, strict=True))
-    shard = tuple(p // n for p, n in zip(place, each, strict=True))
-    inside = int(np.ravel_multi_index(tuple(p % n for p, n in zip(place, each, strict=True)), each))
-    path = dataset.path / "histogram" / array.metadata.encode_chunk_key(shard)
-    with reading(dataset.path, "a dataset of mars-lidar"):
-        dataset.check(path)
-        with open(path, "rb") as stream:
-            stream.seek(16 * (inside - math.prod(each)) - 4, 2)
-            offset, length = (int(n) for n in np.frombuffer(stream.read(16), "<u8"))
-            if offset + length > path.stat().st_size:
-                raise ValueError(f"{path}: chunk {inside} is damaged (it lies beyond the end)")
-            stream.seek(offset)
-            packed = stream.read(length)
-        dataset.check(path)  # it may have been replaced meanwhile
-        if len(packed) != length or not is_good(packed):
-            raise ValueError(f"{path}: chunk {inside} is damaged (its checksum differs)")
-    return np.frombuffer(packed, np.uint8)[:-4]

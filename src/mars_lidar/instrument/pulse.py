@@ -212,9 +212,9 @@ class SampledPulse(Pulse):
         - ``"centroid"``: the circular mean of the record,
         - ``"first"``: the start of sample 0.
 
-        For ``"peak"`` and ``"centroid"`` the record is cyclic and is cut opposite the origin, so that a response
-        whose rising edge is stored at the end of the array is rejoined. For ``"first"`` it is
-        used as given.
+        For ``"peak"`` and ``"centroid"``, a response that begins at the end of the array and continues at its start is
+        rejoined: the record is cut where the smaller of the two samples beside the cut is less, at its ends or
+        opposite the origin. For ``"first"`` it is used as given.
 
     Raises
     ------
@@ -329,10 +329,11 @@ def _unroll(samples: NDArray[np.float64], width: float, origin: str) -> tuple[ND
             raise ValueError("origin='centroid' is not defined for values without a circular mean: a flat record")
         centre = float(np.angle(resultant)) / (2.0 * np.pi) * n % n
         centre = round(centre * 2.0**20) / 2.0**20  # the last bits of exp and angle differ between machines
-    first = math.ceil(centre - 0.5 * n - 1e-9)
+    opposite = math.ceil(centre - 0.5 * n - 1e-9)
+    first = min((0, opposite), key=lambda cut: min(samples[cut - 1], samples[cut]))
     rolled = np.roll(samples, -first)
     rolled.flags.writeable = False
-    return rolled, (first - centre) * width
+    return rolled, -((centre - first) % n) * width
 
 
 def pulse_from_dict(data: Any) -> Pulse:

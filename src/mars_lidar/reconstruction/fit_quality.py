@@ -3,20 +3,15 @@
 `native/reconstruct/fit_quality.h` computes the statistics of each pixel: docs/theory_reconstruction.md, section 8.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from mars_lidar._base.native import _core
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
 from mars_lidar.reconstruction.histogram_record import recording_of, relative_width
-
-if TYPE_CHECKING:
-    from mars_lidar._base.native import _core
 
 FALSE_ALARM = 1e-3  # of `Flags.MISFIT`, a pixel
 COLUMNS = 5  # of the native statistics of a pixel
@@ -64,5 +59,5 @@ def quality_of(statistics: FloatArray) -> Quality:
     each = np.stack([gammaincc(0.5 * np.maximum(freedom, 1.0), 0.5 * chi2), *scores])
     tests = (~np.isnan(each)).sum(0)
     least = np.where(np.isnan(each), np.inf, each).min(0)
-    p_value = np.where(np.isnan(chi2), np.nan, np.minimum(1.0, np.maximum(tests, 1) * least))
+    p_value = np.where(np.isnan(chi2), np.nan, -np.expm1(tests * np.log1p(-np.minimum(least, 1.0 - 2.0**-53))))
     return Quality(chi2, freedom, longer, shorter, wider, p_value)

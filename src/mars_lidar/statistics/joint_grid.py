@@ -44,13 +44,15 @@ def factorised(grid: FoldedGrid) -> Callable[..., FloatArray]:
     after_peak = (peak + int(np.argmax(dim))) % grid.bins
     best, least = None, np.inf
     for place in dict.fromkeys((after_peak, 0, peak, (peak + grid.bins // 2) % grid.bins)):
-        solve = _factors_at(grid, place)
         source = grid.response[[0, 3]]
         x = np.zeros_like(source)
-        for _ in range(2):
-            rest = np.concatenate([(source - grid.apply(x)).reshape(-1), np.zeros(grid.bins)])
-            x = x + solve(rest, trans="T")[: 2 * grid.bins].reshape(2, -1)
-        error = relative_residual(source - grid.apply(x), x)
+        with np.errstate(all="ignore"):  # factors of a nearly singular matrix are judged by the residual
+            solve = _factors_at(grid, place)
+            for _ in range(2):
+                rest = np.concatenate([(source - grid.apply(x)).reshape(-1), np.zeros(grid.bins)])
+                x = x + solve(rest, trans="T")[: 2 * grid.bins].reshape(2, -1)
+            error = relative_residual(source - grid.apply(x), x)
+        error = math.inf if math.isnan(error) else error
         if best is None or error < least:
             best, least = solve, error
         if least <= 0.1 * TOL.folded_residual:

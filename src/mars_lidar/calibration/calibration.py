@@ -546,13 +546,10 @@ def _estimates(fitted: Fitted, growth: FloatArray) -> dict[str, Estimate]:
         put(names[i], float(centre[i] % period if wrapped else centre[i]), drawn[:, i], names[i])
     pulses, jitters = model.widths(drawn)
     pulse, jitter = map(float, model.widths(centre))
-    note = ""
-    if "jitter" in free:
-        sd = float(np.sqrt(np.diag(covariance))[list(fitted.free).index(k + 1)])
-        if fitted.unbounded[k + 1] < 2.0 * sd:
-            note = "not detected"
-        if note and model.split and np.quantile(jitters, 0.975) > 0.985 * centre[k]:
-            note = "not identified: any share of the recorded width"
+    errors = dict(zip(fitted.free.tolist(), np.sqrt(np.diag(covariance)), strict=True))
+    note = "not detected" if "jitter" in free and fitted.unbounded[k + 1] < 2.0 * errors[k + 1] else ""
+    if note and model.split and np.quantile(jitters, 0.975) > 0.985 * centre[k]:
+        note = "not identified: any share of the recorded width"
     if model.gaussian:
         put("width_ns", float(centre[k]), drawn[:, k], "width")
         shared = note if note.startswith("not identified") else ""

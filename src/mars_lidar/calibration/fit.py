@@ -494,6 +494,7 @@ def _misfit(rest: FloatArray, fresh: FloatArray, law: Batch, near: Batch) -> tup
     square = float(gammaincc(shape, recorded * shape / drawn.mean()))
     gaps = slice(law.cells.phases, law.cells.phases + law.cells.gap_edges.size)
     enough = np.cumsum(near.offset[gaps]) > _CUMULATED
-    departure = np.abs(np.cumsum(rest[gaps])) / (np.cumsum(fresh[:, gaps], axis=1).std(0) * noise**0.5)
-    late = 2.0 * enough.sum() * float(ndtr(-departure[enough].max(initial=0.0)))
+    scatter = np.cumsum(fresh[:, gaps], axis=1).std(0)[enough] * noise**0.5
+    departure = np.abs(np.cumsum(rest[gaps])[enough]) / scatter
+    late = 2.0 * enough.sum() * float(ndtr(-departure.max(initial=0.0)))
     return float((recorded - drawn.mean()) / drawn.std()), min(1.0, 2.0 * min(square, late))

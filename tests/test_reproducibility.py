@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 import mars_lidar as ml
 from mars_lidar import _core
 from mars_lidar.engines import ANY_SYSTEM
-from mars_lidar.engines.engine import Records, Task
+from mars_lidar.engines.engine import PhaseRecords, Task
 from mars_lidar.engines.exact import ExactEngine
 
 SHAPE = (6, 11)  # not a multiple of any number of lanes
@@ -98,12 +98,10 @@ def task(kind: str, realizations: int = 3, threads: int = 1) -> Task:
     return Task(flux, system, realizations, 0, index, 77, threads, None)
 
 
-def drawn(engine: ExactEngine, request: Task) -> tuple[NDArray[np.uint32], Records]:
+def drawn(engine: ExactEngine, request: Task) -> tuple[NDArray[np.uint32], PhaseRecords]:
     out = np.full((request.items, request.system.bins), 9, request.system.histogram_dtype)
     engine.histogram(request, out)
-    records = Records.allocate(engine.counts(request))
-    engine.timestamps(request, records)
-    return out, records
+    return out, engine.records(request, 0.0)
 
 
 def test_there_are_levels_to_compare():

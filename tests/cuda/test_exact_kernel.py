@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 import mars_lidar as ml
 from mars_lidar.engines.cuda import exact
 from mars_lidar.engines.cuda.kernels import Sink, Variant
-from mars_lidar.engines.engine import Records, Task
+from mars_lidar.engines.engine import Task
 from mars_lidar.engines.exact import ExactEngine
 
 pytestmark = pytest.mark.full  # a compiler builds the emulation
@@ -122,10 +122,8 @@ def test_histograms_that_fit_no_block_are_counted_in_the_memory_of_the_device():
 def test_timestamps_are_those_of_the_engine(mode: str, start: str):
     done: list[int] = []
     asked = replace(task(MODES[mode], "gaussian", start, 2, bins=64), progress=lambda n, _: done.append(n))
-    engine = ExactEngine()
     records = exact.exact_records(asked, Host())
-    wanted = Records.allocate(engine.counts(asked))
-    engine.timestamps(replace(asked, progress=None), wanted)
+    wanted = ExactEngine().records(replace(asked, progress=None), 0.0)
     for name in ("offsets", "times", "cycle", "bin"):
         np.testing.assert_array_equal(getattr(records, name), getattr(wanted, name))
     assert done == [60, asked.items] * 2  # counted, then drawn

@@ -242,7 +242,7 @@ def test_bad_transients(tmp_path, of_transients, renders):
         ({"scenes": {"transient": str(renders), "pattern": "*.png"}}, "no transient found"),
         ({"scenes": {"transient": str(renders / "a.npz"), "pattern": "*"}}, "pattern belongs to a folder"),
         ({"scenes": {"transient": str(renders / "a.npz"), "name": "x"}}, r"none of the scenes can be used:\s+.*no arr"),
-        ({"engine": "neural"}, "engine 'neural' is no longer in the package"),
+        ({"engine": "neural"}, "engine must be one of"),
     ):
         with pytest.raises(ValueError, match=message):
             ml.generate(of_transients | changes, out)

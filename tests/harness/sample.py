@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness.cases import Case
-from mars_lidar.engines.engine import Engine, Records, Task
+from mars_lidar.engines.engine import Engine, PhaseRecords, Records, Task
 from mars_lidar.instrument.system import System
 
 
@@ -18,7 +18,7 @@ class Sample:
     """Independent exposures of one pixel: histograms (items, bins), and the registrations if asked for."""
 
     cube: NDArray[np.int64]
-    records: Records | None = None
+    records: Records | PhaseRecords | None = None
 
     @cached_property
     def counts(self) -> NDArray[np.int64]:
@@ -56,10 +56,8 @@ def draw(engine: Engine, case: Case, seed: int, *, times: bool = False) -> Sampl
         out = np.empty((task.items, bins), case.system.histogram_dtype)
         engine.histogram(task, out)
         return Sample(out.astype(np.int64))
-    counts = engine.counts(task)
-    records = Records.allocate(counts)
-    engine.timestamps(task, records)
-    item = np.repeat(np.arange(task.items), counts)
+    records = engine.records(task, 0.0)
+    item = np.repeat(np.arange(task.items), np.diff(records.offsets))
     cube = np.bincount(item * bins + records.bin, minlength=task.items * bins).reshape(task.items, bins)
     some = task_of(case, seed, realizations=min(16, task.realizations))
     out = np.empty((some.items, bins), case.system.histogram_dtype)

@@ -43,7 +43,7 @@ from harness.pvalues import merge, variance_score
 from harness.sample import draw
 from mars_lidar import Detector, Flux, GaussianPulse, count_law
 from mars_lidar.engines import ENGINES, Engine
-from mars_lidar.engines.engine import Records, Task
+from mars_lidar.engines.engine import PhaseRecords, Records, Task
 
 EXACT = ENGINES["exact"]
 HISTOGRAMS = {COUNTS, SHAPE, JOINT}
@@ -68,11 +68,8 @@ class Wrong(Engine):
     def histogram(self, task: Task, out: NDArray[Any]) -> None:
         EXACT.histogram(self.mistake(task), out)
 
-    def counts(self, task: Task) -> NDArray[np.int64]:
-        return EXACT.counts(self.mistake(task))
-
-    def timestamps(self, task: Task, records: Records) -> None:
-        EXACT.timestamps(self.mistake(task), records)
+    def records(self, task: Task, expected: float) -> Records | PhaseRecords:
+        return EXACT.records(self.mistake(task), expected)
 
 
 class DeadTimeOff(Wrong):

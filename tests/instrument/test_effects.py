@@ -30,7 +30,7 @@ from scipy import stats
 import mars_lidar as ml
 from mars_lidar import Detector, GaussianPulse, Jitter, SampledJitter, System
 from mars_lidar.engines import ENGINES
-from mars_lidar.engines.engine import Records
+from mars_lidar.engines.engine import PhaseRecords, Records
 from mars_lidar.statistics import electronics_moments, mean_histogram
 
 TAIL = Jitter(sigma_ns=1.0, tail_ns=6.0, tail_fraction=0.3)
@@ -77,11 +77,8 @@ def case_of(detector: Detector, items: int = 3000, wave: bool = False, **changes
     return Case(f"{', '.join(detector.effects)}, {detector.mode}, {kind}, {system.start}", flux, system, items)
 
 
-def records_of(case: Case, engine: str = "exact", seed: int = 3) -> Records:
-    task = task_of(case, seed)
-    records = Records.allocate(ENGINES[engine].counts(task))
-    ENGINES[engine].timestamps(task, records)
-    return records
+def records_of(case: Case, engine: str = "exact", seed: int = 3) -> Records | PhaseRecords:
+    return ENGINES[engine].records(task_of(case, seed), 0.0)
 
 
 CASES = [(name, "nonparalyzable", k % 2 == 1) for k, name in enumerate(EACH)]

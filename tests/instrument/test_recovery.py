@@ -51,16 +51,12 @@ class EveryArrival(Engine):
         place = np.minimum((time % 1.0 * task.system.bins).astype(np.int64), task.system.bins - 1)
         out[:] = np.bincount(item * out.shape[1] + place, minlength=out.size).reshape(out.shape)
 
-    def counts(self, task: Task) -> Any:
-        """Registrations of each exposure."""
-        return np.bincount(self._registered(task)[0], minlength=task.items)
-
-    def timestamps(self, task: Task, records: Records) -> None:
+    def records(self, task: Task, expected: float) -> Records:
         """In order of the items."""
-        _, time = self._registered(task)
-        records.times[:] = time
-        records.cycle[:] = np.floor(time)
-        records.bin[:] = np.minimum((time % 1.0 * task.system.bins).astype(np.int64), task.system.bins - 1)
+        item, time = self._registered(task)
+        offsets = np.concatenate([[0], np.cumsum(np.bincount(item, minlength=task.items))])
+        place = np.minimum((time % 1.0 * task.system.bins).astype(np.int32), task.system.bins - 1)
+        return Records(offsets, time, np.floor(time).astype(np.int32), place)
 
     def _registered(self, task: Task) -> tuple[Any, Any]:
         pixels = task.pixel_index.size

@@ -12,7 +12,6 @@ from harness import make_system
 import mars_lidar as ml
 from mars_lidar.learn import (
     HistogramTable,
-    armed_periods,
     bin_photons,
     expected_histogram,
     forward,
@@ -132,9 +131,8 @@ def test_vmap_and_jacobians_of_every_function(name):
 def test_counts_of_half_precision_are_refused(half):
     """Above 256 they are not whole numbers any more."""
     counts, at = torch.ones(20, dtype=half), [x.detach() for x in point(*AT)]
-    for call in (lambda: armed_periods(counts, system()), lambda: histogram_log_likelihood(counts, *at, system())):
-        with pytest.raises(TypeError, match="histogram must be of integers, or of single or double"):
-            call()
+    with pytest.raises(TypeError, match="histogram must be of integers, or of single or double"):
+        histogram_log_likelihood(counts, *at, system())
 
 
 def test_blocks_of_another_size_are_solved_alike(monkeypatch):
@@ -268,33 +266,6 @@ def test_dark_and_blinding_pixels():
     assert float(at[0].grad[0]) == pytest.approx(1000.0, rel=1e-6)  # the first photon is always seen
 
 
-@pytest.mark.full
-@pytest.mark.parametrize("start", ["armed", "stationary"])
-@pytest.mark.parametrize("dead_ns", [42.3, 163.1, 1000.0])
-def test_armed_periods_err_by_the_ends_of_the_exposure_alone(start, dead_ns):
-    """Against the armed time of every bin, known from timestamps: at most t_d / t_r + 1 periods off.
-
-    Besides, a registration or a re-arming may lie anywhere in its bin: none, in most of these fine bins.
-    """
-    instrument = system(dead_ns, bins=2000, cycles=60, start=start)
-    times = ml.simulate_timestamps(ml.Flux(np.full((8, 1), 1.0), 0.7, 40.0), instrument, seed=3)
-    edges = np.arange(60 * 2000 + 1) * instrument.bin_ns
-    for row in range(8):
-        at = times.pixel(row, 0).times_ns
-        # blind time before each edge; what lies before the exposure no timestamp tells: it belongs to the ends
-        blind = np.clip(edges[:, None] - at, 0.0, dead_ns).sum(-1)
-        true = 60 - np.diff(blind).reshape(60, 2000).sum(0) / instrument.bin_ns
-        counts = torch.tensor(
-            np.bincount((at % 100.0 / instrument.bin_ns).astype(int), minlength=2000), dtype=torch.float64
-        )
-        result = armed_periods(counts, instrument)
-        d = int(dead_ns % 100.0 / instrument.bin_ns)
-        inside = 0.5 * counts + torch.roll(counts, d, -1) + torch.roll(counts, d + 1, -1)
-        off = torch.tensor(true) - result
-        assert (off.abs() <= inside + (dead_ns // 100.0 + 1) + 1e-6).all()
-        assert (off >= -inside - 1e-6).all()  # the dead time after the end is taken for one within it
-
-
 def test_log_likelihood_is_the_native_one():
     instrument = system(bins=2000, cycles=2000)
     flux = ml.Flux(0.7, 0.3, 40.0)
@@ -316,7 +287,6 @@ def test_batches_types_and_bad_arguments():
     assert result.dtype == torch.float32
     alone = expected_histogram(maps[0][1, 2, 3], maps[1][3], maps[2], instrument)
     torch.testing.assert_close(result[1, 2, 3], alone)
-    assert armed_periods(result, instrument).shape == result.shape
     with pytest.raises(TypeError, match="signal must be a Tensor"):
         expected_histogram(1.0, *maps[1:], instrument)
     with pytest.raises(ValueError, match="must be >= 0"):

@@ -13,7 +13,7 @@ from harness import make_system
 
 import mars_lidar as ml
 from mars_lidar import _core
-from mars_lidar.engines.engine import Records, Task
+from mars_lidar.engines.engine import Task
 from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.instrument.jitter import Jitter
 from mars_lidar.light.timestamps import DrawnTimestamps
@@ -139,14 +139,9 @@ def test_more_registrations_of_a_pixel_than_a_segment_holds():
     assert np.array_equal(times.histogram(), ml.simulate(flux, system, seed=2)[0])
 
 
-def test_records_into_memory_that_is_there(system: ml.System, flux: ml.Flux):
+def test_records_need_memory_of_their_size(system: ml.System, flux: ml.Flux):
     task = Task(flux, system, 1, 0, np.arange(6, dtype=np.uint32), 1, 1, None)
-    engine = ExactEngine()
-    records = Records.allocate(engine.counts(task))
-    engine.timestamps(task, records)
-    drawn = engine.records(task, 0.0)
-    assert np.array_equal(records.times, drawn.times)
-    assert np.array_equal(records.bin, drawn.bin)
+    drawn = ExactEngine().records(task, 0.0)
     with pytest.raises(ValueError, match="one length"):
         _core.exact_records(task.job, task.pulse, drawn.offsets, drawn.cycle, drawn.phase[1:], 1, None, "")
     with pytest.raises(ValueError, match="items \\+ 1"):

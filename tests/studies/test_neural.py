@@ -10,7 +10,6 @@ import pytest
 from harness import make_system, mean_vector, require
 
 import mars_lidar as ml
-from mars_lidar.engines import find_engine
 from mars_lidar.statistics import PhaseChain, holding_times
 from studies.__main__ import main
 from studies.compare.comparison import compare
@@ -168,12 +167,6 @@ def test_training_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFi
     assert "exists already" in capsys.readouterr().err
     assert main(["neural", "info", str(system)]) == 2
     assert path.exists()
-
-
-def test_the_package_says_where_the_engine_went():
-    for call in (lambda: find_engine("neural"), lambda: ml.simulate(ml.Flux(1.0, 1.0, 5.0), SYSTEM, engine="neural")):
-        with pytest.raises(ValueError, match=r"studies\.neural\.NeuralEngine\(\).*docs/neural\.md"):
-            call()
 
 
 @pytest.mark.full

@@ -1,15 +1,13 @@
-"""Object stores: paths of universal_pathlib, with the methods of `Path`, and functions in place of those of files.
+"""Object stores: paths of universal_pathlib, with the methods of `Path`, and what differs from operations on files.
 
 An object appears whole under its name or not at all. There are no renames, no locks, and no folders.
 """
-
-from __future__ import annotations
 
 import re
 from pathlib import Path
 from typing import Any
 
-from mars_lidar._base.imports import needed
+from mars_lidar._base.imports import MissingLibraryError, needed
 
 _URL = re.compile(r"^((?:[A-Za-z][\w+.-]*::)*[A-Za-z][\w+.-]+):/+(.*)$")  # a drive, C:\, is none
 
@@ -28,7 +26,14 @@ def place_of(path: Any) -> Any:
     if in_bucket(path):
         return path
     url = url_of(path)
-    return Path(path) if url is None else needed("upath", url, "remote").UPath(url)
+    if url is None:
+        return Path(path)
+    place = needed("upath", url, "remote").UPath(url)
+    try:
+        place.fs  # noqa: B018  (imports the library for this kind of URL)
+    except ImportError as error:
+        raise MissingLibraryError(f"{url}: {error}") from error
+    return place
 
 
 def in_bucket(path: Any) -> bool:
@@ -63,7 +68,7 @@ def sizes(folder: Any) -> dict[str, int]:
     folder.fs.invalidate_cache()
     prefix = folder.path.rstrip("/") + "/"
     listed = folder.fs.find(folder.path, detail=True)
-    return {str(name).partition(prefix)[2] or str(name): int(entry["size"]) for name, entry in listed.items()}
+    return {str(name).partition(prefix)[2] or str(name): int(entry["size"] or 0) for name, entry in listed.items()}
 
 
 def remove(folder: Any) -> None:

@@ -4,8 +4,6 @@ The lock of 3.11 is shared by all instances of the class. A process that is fork
 as a loader worker while a stream is simulated in the background, would wait for it forever.
 """
 
-from __future__ import annotations
-
 import functools
 import sys
 from typing import TYPE_CHECKING, Any

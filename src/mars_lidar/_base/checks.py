@@ -1,7 +1,5 @@
 """Argument checks: every message names the argument, the value given and what is allowed."""
 
-from __future__ import annotations
-
 import difflib
 import math
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Public objects on a screen: a short `repr`, and in notebooks HTML with small pictures of maps and curves."""
 
-from __future__ import annotations
-
 import base64
 import dataclasses
 import html

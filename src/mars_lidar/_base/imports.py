@@ -5,8 +5,6 @@ models of light, and `Cube.plot` the figures, all of which lie in higher layers 
 calls into a higher layer: docs/architecture.md lists them, tests/test_package.py counts them.
 """
 
-from __future__ import annotations
-
 import importlib
 import sys
 from collections.abc import Callable

@@ -10,8 +10,6 @@ length that end in their own CRC-32C, as chunks do.)
 document that marks the store complete: a run that stops between the two leaves an incomplete store.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os
@@ -252,7 +250,7 @@ def _compared(
         return sums_of(store / name)
 
     stated = root_document(store).get("attributes", {}).get(SUM)
-    wrong = compared(sums, checks, _files(store) if listed else None, read, every, stated)
+    wrong = _differences(sums, checks, _listed(store) if listed else None, read, every, stated)
     return sums, checks, states, list(wrong)
 
 
@@ -261,21 +259,17 @@ def _read_lines(path: Path) -> dict[str, str]:
         return {}
     with reading(path, "lines of a manifest"):
         check_claim(path, 4 * path.stat().st_size)
-        return lines_of(path.read_text("utf-8"))
+        lines = (line.partition("  ") for line in path.read_text("utf-8").splitlines())
+        return {name: digest for digest, _, name in lines}
 
 
-def lines_of(text: str) -> dict[str, str]:
-    """The sums of a manifest by the name of the file."""
-    return {name: digest for digest, _, name in (line.partition("  ") for line in text.splitlines())}
-
-
-def compared(
+def _differences(
     sums: Mapping[str, str],
     checks: Mapping[str, str],
     there: set[str] | None,
     read: Callable[[str], Sums],
-    every: bool = False,
-    stated: str | None = None,
+    every: bool,
+    stated: str | None,
 ) -> Iterator[str]:
     """A sentence for each file whose SHA-256 or XXH128 differs from its line.
 
@@ -326,6 +320,17 @@ def _files(store: Path) -> set[str]:
         prefix = "" if inside == "." else inside.replace(os.sep, "/") + "/"
         files |= {prefix + name for name in names if os.path.isfile(os.path.join(folder, name))}
     return files
+
+
+def _listed(store: Path) -> set[str] | None:
+    """Relative paths of all files; None where they cannot be listed, as on most web servers."""
+    try:
+        names = _files(store)
+    except Exception:
+        if not in_bucket(store):
+            raise
+        return None
+    return names if NAME in names else None
 
 
 def _xxh128(content: bytes | Path) -> str:

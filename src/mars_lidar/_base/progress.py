@@ -1,7 +1,5 @@
 """Progress of a long run: a line that is rewritten on a terminal, a line every half minute in a log."""
 
-from __future__ import annotations
-
 import sys
 import time
 from typing import Any

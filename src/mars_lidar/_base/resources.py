@@ -1,7 +1,5 @@
 """Memory and threads available to a computation."""
 
-from __future__ import annotations
-
 import errno
 import functools
 import os

@@ -8,10 +8,19 @@ from typing import TYPE_CHECKING, Any
 
 from zarr.storage import LocalStore, WrapperStore
 
+from mars_lidar._base.buckets import in_bucket, zarr_store
 from mars_lidar._base.files import FileError, is_plain_file
 
 if TYPE_CHECKING:
     from mars_lidar._base.manifest import Manifest
+
+
+def store_at(path: Any, sums: Manifest | None, *, read_only: bool = True) -> Any:
+    """What Zarr opens at a path: plain files or objects; those of a complete store are compared with its `sums`."""
+    if in_bucket(path):
+        store = zarr_store(path, read_only=read_only)
+        return store if sums is None else SealedObjects(store, sums, str(path))
+    return PlainFiles(path, read_only=read_only) if sums is None else SealedStore(path, sums)
 
 
 class PlainFiles(LocalStore):
@@ -71,15 +80,15 @@ class SealedStore(PlainFiles):
         return content
 
 
-class SealedValues(WrapperStore[Any]):
+class SealedObjects(WrapperStore[Any]):
     """A complete store in an object store: objects that are fetched whole, such as chunks, are compared by XXH128."""
 
     def __init__(self, store: Any, sums: Manifest, url: str) -> None:
         super().__init__(store)
         self._sums, self._url = sums, url
 
-    def _with_store(self, store: Any) -> SealedValues:
-        return SealedValues(store, self._sums, self._url)
+    def _with_store(self, store: Any) -> SealedObjects:
+        return SealedObjects(store, self._sums, self._url)
 
     async def get(self, key: str, prototype: Any, byte_range: Any = None) -> Any:
         """The bytes at a key, None where the store was written without it."""

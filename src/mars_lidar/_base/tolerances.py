@@ -1,7 +1,5 @@
 """Limits on the sizes that files may state, and sizes of blocks that are read and of texts that are shown."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

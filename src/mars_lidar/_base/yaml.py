@@ -4,8 +4,6 @@ Scalars follow the core schema of YAML 1.2: 1e-3 is a number, 1:30 and 2026-11-2
 and false are booleans. PyYAML, which parses the structure, follows YAML 1.1, where these are a text, 90, a date and 8.
 """
 
-from __future__ import annotations
-
 import contextlib
 import re
 from collections.abc import Callable, Iterator

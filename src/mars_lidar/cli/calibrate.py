@@ -1,7 +1,5 @@
 """`mars-lidar calibrate`: light and detector from a measured photon stream, with a test of fit."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, Literal
 

@@ -128,7 +128,7 @@ class ForeignOptions:
         return cube
 
     def _completed(self, recorder: Recorded, length: int | None) -> ForeignOptions:
-        """With what the recorder tells, where no option does: the period is as many of its bins as fill it best."""
+        """With the recorder's values where no option is given; the period is rounded to a whole number of its bins."""
         width = recorder.bin_ns if self.bin_ns is None and self.bin_ps is None else None
         if width is None:
             return self if self.cycles is not None else replace(self, cycles=recorder.cycles)

@@ -1,7 +1,5 @@
 """`mars-lidar init`: a commented system file to start from."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -12,19 +12,9 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from mars_lidar._base.progress import span
+from mars_lidar.cli import options
 from mars_lidar.cli.console import progress_bar, refuse_existing, save_picture, say
 from mars_lidar.cli.console import table as print_table
-from mars_lidar.cli.options import (
-    SCENE_KINDS,
-    Integer,
-    LightOptions,
-    OutPath,
-    SceneOptions,
-    Switch,
-    Text,
-    command,
-    read_scene,
-)
 from mars_lidar.cli.system_options import Effects, SystemOptions
 from mars_lidar.engines import ENGINES, EngineOptions
 from mars_lidar.instrument.system import System
@@ -38,24 +28,24 @@ if TYPE_CHECKING:
 
 def simulate(
     *,
-    scene: SceneOptions = SceneOptions(),
+    scene: options.SceneOptions = options.SceneOptions(),
     instrument: SystemOptions = SystemOptions(),
     effects: Effects = Effects(),
-    light: LightOptions = LightOptions(),
-    engine: Annotated[Text, Parameter(choices=tuple(ENGINES))] = "exact",
+    light: options.LightOptions = options.LightOptions(),
+    engine: Annotated[options.Text, Parameter(choices=tuple(ENGINES))] = "exact",
     table: Path | None = None,
-    count: Text | None = None,
-    interpolation: Text | None = None,
-    table_outside: Text | None = None,
-    realizations: Integer = 1,
-    seed: Integer = 0,
-    threads: Integer | None = None,
-    device: Text = "cpu",
-    out: OutPath,
+    count: options.Text | None = None,
+    interpolation: options.Text | None = None,
+    table_outside: options.Text | None = None,
+    realizations: options.Integer = 1,
+    seed: options.Integer = 0,
+    threads: options.Integer | None = None,
+    device: options.Text = "cpu",
+    out: options.OutPath,
     overwrite: bool = False,
     resume: bool = False,
     like: Path | None = None,
-    picture: Switch = True,
+    picture: options.Switch = True,
 ) -> None:
     """Simulate the histograms of a scene: a cube and a picture of it.
 
@@ -143,7 +133,7 @@ def simulate(
                 raise ValueError("a capture is written after the whole simulation: omit --resume")
             folder = after.enter_context(tempfile.TemporaryDirectory(prefix=".mars-lidar-", dir=out.parent))
             target = Path(folder) / "cube.zarr"
-        view = read_scene(scene, light, system, in_parts=True)
+        view = options.read_scene(scene, light, system, in_parts=True)
         lookup, table_outside = _table(table, system, engine, view.flux, table_outside, threads)
         chosen: EngineOptions = {
             "table": lookup,
@@ -180,8 +170,8 @@ def simulate(
 
 
 def capture_scene(
-    like: Path, instrument: SystemOptions, system: System, scene: SceneOptions
-) -> tuple[Capture, System, SceneOptions]:
+    like: Path, instrument: SystemOptions, system: System, scene: options.SceneOptions
+) -> tuple[Capture, System, options.SceneOptions]:
     """A capture, `system` with its time bins, and its light from time 0 on as the scene.
 
     The period is that of the capture's bins, or --period-ns, of a whole number of them; bin 0 is the capture's bin 0.
@@ -189,7 +179,7 @@ def capture_scene(
     from mars_lidar.io.capture import read_capture
 
     changes = instrument.changes
-    names = (*SCENE_KINDS, "transient_bin_ns", "transient_start_ns")
+    names = (*options.SCENE_KINDS, "transient_bin_ns", "transient_start_ns")
     conflicts = [name for name in names if getattr(scene, name) is not None] + ["bins"] * (changes.bins is not None)
     if conflicts:
         conflict = conflicts[0].replace("_", "-")
@@ -208,12 +198,12 @@ def capture_scene(
 
 
 def say_time(
-    flux: Flux, system: System, engine: str, realizations: int, threads: int | None, options: EngineOptions
+    flux: Flux, system: System, engine: str, realizations: int, threads: int | None, chosen: EngineOptions
 ) -> None:
     """Print the expected time of a long run and a faster alternative."""
     from mars_lidar.io.simulated_file import advice
 
-    text = str(advice(flux, system, engine, realizations=realizations, threads=threads, options=options))
+    text = str(advice(flux, system, engine, realizations=realizations, threads=threads, options=chosen))
     if text:
         say(text)
 
@@ -288,4 +278,4 @@ def each_ns(number: float) -> str:
     return f"{number:.3g} ns" if number < 999.5 else f"{number / 1e3:.3g} µs"
 
 
-simulate_command = command(simulate)
+simulate_command = options.command(simulate)

@@ -1,7 +1,5 @@
 """The system of a command line: a file, single options, or a file with some values replaced by options."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Any
 

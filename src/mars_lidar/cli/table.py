@@ -1,7 +1,5 @@
 """`mars-lidar table`: build the lookup table of a system, describe a file or the cache, clear the cache."""
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 from typing import Annotated, Any

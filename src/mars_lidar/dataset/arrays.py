@@ -1,7 +1,5 @@
 """The samples of a dataset and its arrays: numbering, names, units, chunks, shards and codecs."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any

@@ -6,8 +6,6 @@ follows the workers that are there, so that a cluster may grow and shrink. A par
 given to another one: its files appear by a rename, so half a part does not exist.
 """
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import math
@@ -96,7 +94,7 @@ def crew(workers: int | None, scheduler: str | None) -> Iterator[Crew]:
     """`workers` processes of this machine, or the workers of the `scheduler` at that address."""
     distributed = needed(*_LIBRARY)
     with contextlib.ExitStack() as after:
-        after.enter_context(_silent())  # what goes wrong is told once, by us
+        after.enter_context(_silent())  # errors are reported once, by this package
         if scheduler is not None:
             client = after.enter_context(_client(distributed, scheduler))
         else:  # one part at a time in a worker: its memory is that of a chunk
@@ -143,7 +141,7 @@ class _Workers:
 
 @dataclass(frozen=True)
 class Run:
-    """What a worker is told once: the store, a name for the run, its threads, and what its package must be."""
+    """Sent to a worker once: path of the store, name of the run, threads, and the required version and bits."""
 
     path: str
     name: str

@@ -128,7 +128,7 @@ def estimate(
 def quick_advice(recipe: DatasetRecipe | dict[str, Any] | str | Path, threads: int | None = None) -> Advice:
     """Approximate time of `generate`, from one scene; fast even where a chunk takes minutes."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # generate itself tells them
+        warnings.simplefilter("ignore")  # `generate` issues them
         plan, listed, _, contents, each_s = _read_some(recipe, 1)
         if not contents:
             return Advice(0.0)

@@ -15,19 +15,7 @@ import numpy as np
 
 from mars_lidar._base.buckets import in_bucket, remove, zarr_store
 from mars_lidar._version import __version__
-from mars_lidar.dataset.arrays import (
-    FORMAT,
-    FORMAT_VERSION,
-    MAPS,
-    MORE_VERSION,
-    PHOTONS,
-    count_samples,
-    create_histogram,
-    create_maps,
-    histogram_blocks,
-    mark,
-    sample_parts,
-)
+from mars_lidar.dataset import arrays
 from mars_lidar.dataset.cluster import Crew
 from mars_lidar.dataset.recipe import DatasetRecipe
 from mars_lidar.dataset.scenes import Content, SceneWriter
@@ -68,7 +56,7 @@ def create(path: Path, recipe: DatasetRecipe, folder: Path, crew: Crew | None = 
             continue
         name, scene = result
         if writer is None:  # nothing on the disk is touched before there is something to put on it
-            histogram_blocks(recipe, count_samples(recipe, most), scene.shape)
+            arrays.histogram_blocks(recipe, arrays.count_samples(recipe, most), scene.shape)
             writer = SceneWriter(begin(path, recipe), most, path, source)
         writer.problems = [[str(each.path), each.reason] for each in problems]
         writer.add(name, scene, (place[0], place[1] + 1))
@@ -120,8 +108,8 @@ def begin(path: Path, recipe: DatasetRecipe) -> Any:
     attrs = {
         "complete": False,
         "stage": "scenes",
-        "format": FORMAT,
-        "format_version": FORMAT_VERSION,
+        "format": arrays.FORMAT,
+        "format_version": arrays.FORMAT_VERSION,
         "version": __version__,
         "bits": fingerprint(),
         "recipe": recipe.to_json(),
@@ -134,22 +122,22 @@ def lay_out(group: Any, recipe: DatasetRecipe, writer: SceneWriter, problems: li
     names, shape = writer.names, writer.shape
     assert shape is not None
     add(group, coordinates(recipe, names, shape))
-    number = count_samples(recipe, len(names))
-    for name, (text, unit) in MAPS.items():
-        create_maps(group, name, (number, *shape), np.dtype(np.float32), ("sample", "y", "x"), text, unit)
-    create_histogram(group, recipe, number, shape)
+    number = arrays.count_samples(recipe, len(names))
+    for name, (text, unit) in arrays.MAPS.items():
+        arrays.create_maps(group, name, (number, *shape), np.dtype(np.float32), ("sample", "y", "x"), text, unit)
+    arrays.create_histogram(group, recipe, number, shape)
     plain = [[str(result.path), result.reason] for result in problems]
     systems = [result.to_dict() for result in recipe.systems]
     attrs: dict[str, Any] = {"stage": "counts", "systems": json.dumps(systems), "problems": plain}
     if not writer.plain:
-        attrs["format_version"] = MORE_VERSION
-    mark(group, attrs)
+        attrs["format_version"] = arrays.MORE_VERSION
+    arrays.mark(group, attrs)
 
 
 def coordinates(recipe: DatasetRecipe, names: list[str], shape: tuple[int, int]) -> list[Variable]:
     """Every small array, of scenes of these names and shape (H, W)."""
-    number = count_samples(recipe, len(names))
-    parts = [sample_parts(recipe, k) for k in range(number)]
+    number = arrays.count_samples(recipe, len(names))
+    parts = [arrays.sample_parts(recipe, k) for k in range(number)]
     texts = [result.to_json() for result in recipe.systems]
     seeds = [seed_of(recipe, names[scene], texts[system], s, b) for scene, system, s, b in parts]
     scene, system, signal, sbr = (np.array(column) for column in zip(*parts, strict=True))
@@ -164,7 +152,7 @@ def coordinates(recipe: DatasetRecipe, names: list[str], shape: tuple[int, int])
         Variable("scene", of_sample, scene.astype(np.int32), "1", "number of the scene in the group scenes"),
         Variable("scene_name", of_sample, scene_name, "", "name of the scene"),
         Variable("system", of_sample, system.astype(np.int32), "1", "number of the system in the attribute systems"),
-        Variable("signal_level", of_sample, signal, PHOTONS, "mean signal over the pixels with a return"),
+        Variable("signal_level", of_sample, signal, arrays.PHOTONS, "mean signal over the pixels with a return"),
         Variable("sbr", of_sample, sbr, "1", "mean signal / mean ambient photons"),
         Variable("period_ns", of_sample, periods[system], "ns", "laser period"),
         Variable("seed", of_sample, np.array(seeds, np.uint64), "1", "seed of the sample"),

@@ -17,18 +17,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mars_lidar._base import checks
+from mars_lidar._base import checks, files
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.buckets import in_bucket, place_of
-from mars_lidar._base.files import (
-    IncompleteFileError,
-    Interrupted,
-    WriteError,
-    check_target,
-    exchange,
-    open_own,
-    successor,
-)
 from mars_lidar._base.progress import callback_of
 from mars_lidar._base.resources import check_threads, no_thread, thread_count
 from mars_lidar._base.types import Progress
@@ -361,7 +352,7 @@ def finish(out: str | Path) -> Generated:
                 dataset.tidy()
                 if missing := dataset.missing():
                     total = sum(1 for _ in dataset.items())
-                    raise IncompleteFileError(
+                    raise files.IncompleteFileError(
                         f"{len(missing)} of {total} shards of {store} are missing, the first "
                         f"{dataset.files(missing[0])[0]}: run the --part jobs that did not end well again"
                     )
@@ -413,9 +404,9 @@ def _begun(
         raise ValueError("resume and overwrite exclude each other")
     wanted, folder = read_recipe(recipe)
     if not (in_bucket(target) and resume):
-        check_target(target, folder=True, overwrite=overwrite or resume)
+        files.check_target(target, folder=True, overwrite=overwrite or resume)
     with _alone(target):  # the store is examined under the lock, because another run may just have finished it
-        beside = target if in_bucket(target) else successor(target)
+        beside = target if in_bucket(target) else files.successor(target)
         if overwrite and beside.exists():
             shutil.rmtree(beside)  # of a stopped run that is repeated
         replacing = overwrite and target.exists()  # by a store that is made beside it, or one that was begun so
@@ -427,7 +418,7 @@ def _begun(
         elif wanted is None:
             raise ValueError(f"{target} does not exist: there is nothing to resume, and no recipe is given")
         if not (in_bucket(target) and there):
-            check_target(target, folder=True, overwrite=overwrite or there)
+            files.check_target(target, folder=True, overwrite=overwrite or there)
         begun = there and dataset.planned
         if not begun and wanted is None:
             raise ValueError(f"{target} was stopped before its scenes were in: give the recipe again to resume")
@@ -441,11 +432,11 @@ def _begun(
 
 def _opened(target: Path) -> tuple[Path, Dataset]:
     """The store that `begin` began, made by this version."""
-    store = target if in_bucket(target) or not successor(target).exists() else successor(target)
+    store = target if in_bucket(target) or not files.successor(target).exists() else files.successor(target)
     dataset = open_dataset(str(store), allow_incomplete=True)
     _check_same(store, dataset, None)
     if not dataset.planned:
-        raise IncompleteFileError(f"{store} was stopped before its scenes were in: --begin --resume goes on")
+        raise files.IncompleteFileError(f"{store} was stopped before its scenes were in: --begin --resume goes on")
     return store, dataset
 
 
@@ -453,7 +444,7 @@ def _in_place(store: Path, target: Path, dataset: Dataset) -> Dataset:
     """The complete dataset under its final name."""
     if store == target:
         return dataset
-    exchange(store, target)
+    files.exchange(store, target)
     return open_dataset(str(target))
 
 
@@ -463,18 +454,18 @@ def _explained(store: Path, target: Path) -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
-        raise Interrupted(f"interrupted; {_remaining(store, target)}") from None
+        raise files.Interrupted(f"interrupted; {_remaining(store, target)}") from None
     except RuntimeError as error:
         if not no_thread(error):
             raise
         text = f"{error}: give fewer threads, or more memory; {_remaining(store, target)}"
-        raise WriteError(errno.EAGAIN, text) from error
+        raise files.WriteError(errno.EAGAIN, text) from error
     except MemoryError as error:
-        raise WriteError(errno.ENOMEM, f"{error or 'no memory'}; {_remaining(store, target)}") from error
+        raise files.WriteError(errno.ENOMEM, f"{error or 'no memory'}; {_remaining(store, target)}") from error
     except OSError as error:
         if isinstance(error, FileNotFoundError | FileExistsError) and not store.exists():
             raise
-        raise WriteError(error.errno, f"{error.strerror or error}; {_remaining(store, target)}") from error
+        raise files.WriteError(error.errno, f"{error.strerror or error}; {_remaining(store, target)}") from error
 
 
 def read_recipe(recipe: DatasetRecipe | dict[str, Any] | str | Path | None) -> tuple[DatasetRecipe | None, Path]:
@@ -576,7 +567,7 @@ def _make_all(team: AbstractContextManager[Team], todo: Sequence[Item], add: Cal
     if failed:
         names = ", ".join(sorted(each.name for each in failed)[:_NAMED])
         more = f" and {len(failed) - _NAMED} more" if len(failed) > _NAMED else ""
-        raise WriteError(
+        raise files.WriteError(
             failed[0].number,
             f"{len(failed)} parts could not be written in four attempts ({failed[0].reason}): {names}{more}",
         )
@@ -633,7 +624,7 @@ def _alone(target: Path, *, shared: bool = False) -> Iterator[None]:
         return
     lock = target.with_name(target.name + ".lock")
     while True:
-        with open_own(lock) as held:
+        with files.open_own(lock) as held:
             try:
                 import fcntl
             except ImportError:  # Windows

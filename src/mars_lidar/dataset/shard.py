@@ -4,8 +4,6 @@ zarr-python writes a whole shard at once and copies every chunk into a new array
 long as the encoding. Here a chunk is encoded while it is in the processor's cache, and a shard is never in memory.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import itertools

@@ -34,7 +34,7 @@ from mars_lidar.light.fog import Fog
 from mars_lidar.scene.scene import LayeredScene, Scene
 
 _TRIES = 20  # places tried for a crop with a return in it
-_LIGHT = ("bin_ns", "start_ns", "name", "channel")  # keys that tell how a file of rendered light is read
+_LIGHT = ("bin_ns", "start_ns", "name", "channel")  # arguments of `read_transient`
 
 
 @dataclass(frozen=True)
@@ -201,7 +201,7 @@ def _root(entry: dict[str, Any], folder: Path) -> Path:
 
 
 def _root_names(entries: Sequence[dict[str, Any]], folder: Path) -> dict[Path, str]:
-    """Name of each file or folder of a recipe: the last parts of its path, as few as tell them all apart.
+    """Name of each file or folder of a recipe: the last parts of its path, as few as are needed for different names.
 
     So names, which go into seeds, do not depend on how a path is spelled or where the data lie. The folder of the
     recipe itself, which it calls ``.``, has the empty name.

@@ -27,21 +27,11 @@ from numpy.typing import NDArray
 
 from mars_lidar._base import checks, manifest
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.buckets import content_of, in_bucket, place_of, remove, sizes, zarr_store
+from mars_lidar._base.buckets import content_of, in_bucket, place_of, remove, sizes
 from mars_lidar._base.cached import cached_property
 from mars_lidar._base.files import INCOMPLETE_SUFFIX, FileError, IncompleteFileError, reading
 from mars_lidar._base.native import _core
-from mars_lidar.dataset.arrays import (
-    FORMAT,
-    FORMAT_VERSION,
-    MAPS,
-    MORE_VERSION,
-    block,
-    grid,
-    mark,
-    sample_parts,
-    with_zeros,
-)
+from mars_lidar.dataset import arrays
 from mars_lidar.dataset.recipe import DatasetRecipe
 from mars_lidar.dataset.scenes import Rendered, SceneReader
 from mars_lidar.dataset.shard import digests_of, is_good
@@ -69,24 +59,22 @@ class Dataset:
     def __init__(self, path: Path, *, listed: bool = True) -> None:
         import zarr
 
-        from mars_lidar._base.sealed_store import PlainFiles, SealedStore, SealedValues
+        from mars_lidar._base.sealed_store import store_at
         from mars_lidar.dataset import codec  # noqa: F401  (registers it)
 
         self.path = path
         self.attrs: dict[str, Any] = manifest.root_document(path).get("attributes", {})
-        if self.attrs.get("format") != FORMAT:
-            raise ValueError(f"{path} is not a dataset written by mars-lidar (no attribute format = {FORMAT!r})")
-        if self.attrs.get("format_version") not in (FORMAT_VERSION, MORE_VERSION):
+        if self.attrs.get("format") != arrays.FORMAT:
+            raise ValueError(f"{path} is not a dataset written by mars-lidar (no attribute format = {arrays.FORMAT!r})")
+        if self.attrs.get("format_version") not in (arrays.FORMAT_VERSION, arrays.MORE_VERSION):
             version = self.attrs.get("format_version")
-            raise ValueError(f"{path} has layout version {version}; {FORMAT_VERSION} and {MORE_VERSION} can be read")
+            raise ValueError(
+                f"{path} has layout version {version}; {arrays.FORMAT_VERSION} and {arrays.MORE_VERSION} can be read"
+            )
         check_zarr_threads()
         self.sums = manifest.require(path, listed=listed) if self.complete else None
-        store: Any = zarr_store(path, read_only=self.sums is not None)
-        if in_bucket(path):
-            store = store if self.sums is None else SealedValues(store, self.sums, str(path))
-        else:
-            store = PlainFiles(path) if self.sums is None else SealedStore(path, self.sums)
-        self.group: Any = zarr.open_group(store, mode="r+" if self.sums is None else "r", use_consolidated=False)
+        store, mode = store_at(path, self.sums, read_only=self.complete), "r" if self.complete else "r+"
+        self.group: Any = zarr.open_group(store, mode=mode, use_consolidated=False)
         self.recipe = DatasetRecipe.from_dict(json.loads(self.attrs["recipe"]))
 
     def __repr__(self) -> str:
@@ -114,7 +102,7 @@ class Dataset:
     @cached_property
     def maps(self) -> dict[str, Any]:
         """The arrays (sample, y, x)."""
-        return {name: self._array(name) for name in MAPS}
+        return {name: self._array(name) for name in arrays.MAPS}
 
     @cached_property
     def seeds(self) -> NDArray[np.uint64]:
@@ -139,12 +127,12 @@ class Dataset:
 
     def _array(self, name: str) -> OnDisk:
         with reading(self.path, "a dataset of mars-lidar"):
-            return OnDisk(with_zeros(self.group[name]), self.path)
+            return OnDisk(arrays.with_zeros(self.group[name]), self.path)
 
     def cube(self, sample: int) -> Cube:
         """One sample as a cube (realizations, H, W, bins), with its light."""
         number = checks.integer("sample", sample, low=0, high=len(self.seeds) - 1)
-        scene, which, signal, sbr = sample_parts(self.recipe, number)
+        scene, which, signal, sbr = arrays.sample_parts(self.recipe, number)
         system, content = self.recipe.systems[which], self.scenes.read(scene)
         known = ~np.isnan(content.reflectivity)
         recipe = Recipe(
@@ -169,13 +157,13 @@ class Dataset:
         yield from self._grid("histogram", self.histogram)
 
     def _grid(self, kind: str, array: Any) -> Iterator[Item]:
-        for place in np.ndindex(grid(array.shape, array.shards)):
-            yield Item(kind, place, block(place, array.shards, array.shape))
+        for place in np.ndindex(arrays.grid(array.shape, array.shards)):
+            yield Item(kind, place, arrays.block(place, array.shards, array.shape))
 
     def files(self, item: Item) -> list[Path]:
         """The files of a part."""
-        arrays = {"histogram": self.histogram} if item.kind == "histogram" else self.maps
-        return [self.path / name / array.metadata.encode_chunk_key(item.shard) for name, array in arrays.items()]
+        every = {"histogram": self.histogram} if item.kind == "histogram" else self.maps
+        return [self.path / name / array.metadata.encode_chunk_key(item.shard) for name, array in every.items()]
 
     def missing(self, items: Iterable[Item] | None = None) -> list[Item]:
         """Those of some parts, or of all, that are missing or whose files are truncated."""
@@ -242,7 +230,7 @@ class Dataset:
 
     def tidy(self) -> None:
         """Remove the temporary files of killed writers."""
-        for name in () if in_bucket(self.path) else ("", "histogram", *MAPS):
+        for name in () if in_bucket(self.path) else ("", "histogram", *arrays.MAPS):
             for pattern in ("*.partial", f"*{INCOMPLETE_SUFFIX}"):  # of Zarr, and of ours
                 for leftover in (self.path / name).rglob(pattern) if name else self.path.glob(pattern):
                     leftover.unlink(missing_ok=True)
@@ -252,7 +240,7 @@ class Dataset:
         if lost := self.missing_files():
             raise FileNotFoundError(f"{lost[0]} was removed while the others were made, the first of {len(lost)}")
         if "consolidated_metadata" not in manifest.root_document(self.path):  # stopped just before it
-            mark(self.group, {})
+            arrays.mark(self.group, {})
         noted = self.written()
         if in_bucket(self.path):
             there = sizes(self.path)
@@ -283,7 +271,7 @@ def _whole(file: Path, chunks: int) -> bool:
 def is_dataset(path: str | Path) -> bool:
     """Whether a folder is a dataset, complete or not."""
     try:
-        return bool(manifest.root_document(Path(path)).get("attributes", {}).get("format") == FORMAT)
+        return bool(manifest.root_document(Path(path)).get("attributes", {}).get("format") == arrays.FORMAT)
     except (OSError, ValueError, MemoryError):
         return False
 
@@ -356,7 +344,7 @@ def read_sparse(dataset: Dataset | str | Path, sample: int, realization: int = 0
 
     _, _, rows, columns, _ = chunk = array.chunks
     parts = []
-    for y, x in np.ndindex(grid((height, width), (rows, columns))):
+    for y, x in np.ndindex(arrays.grid((height, width), (rows, columns))):
         position, count = events(_packed(source, (sample // chunk[0], realization // chunk[1], y, x, 0)))
         first, second, row, column, time = np.unravel_index(position, chunk)
         selected = (first == sample % chunk[0]) & (second == realization % chunk[1])
@@ -418,7 +406,7 @@ class Block:
         rows, columns = self._chunk[2:4]
         out = np.empty((height, width, bins), self._dtype)
         key = (self._path, sample // self._chunk[0], realization // self._chunk[1])
-        for y, x in np.ndindex(grid((height, width), (rows, columns))):
+        for y, x in np.ndindex(arrays.grid((height, width), (rows, columns))):
             counts = decoded.get((*key, y, x))
             if counts is None:
                 counts = self._decode(self.packed(sample, realization, y, x))
@@ -447,7 +435,7 @@ def read_block(dataset: Dataset, place: tuple[int, int], maps: Sequence[str]) ->
     with reading(dataset.path, "a dataset of mars-lidar"):
         files = {
             (y, x): dataset.read("histogram/" + array.metadata.encode_chunk_key((*place, y, x, 0)))
-            for y, x in np.ndindex(grid(array.shape[2:4], array.shards[2:4]))
+            for y, x in np.ndindex(arrays.grid(array.shape[2:4], array.shards[2:4]))
         }
         some = slice(place[0] * array.shards[0], (place[0] + 1) * array.shards[0])
         return Block(dataset, place, files, {name: np.asarray(dataset.maps[name][some]) for name in maps})

@@ -102,8 +102,6 @@ def verify(
 def _labels(dataset: Dataset) -> Iterator[str]:
     """What is wrong with the coordinates and labels of a dataset: all of them follow from its recipe and scenes."""
     for v in coordinates(dataset.recipe, dataset.scene_names(), dataset.histogram.shape[2:4]):
-        if v.name == "scene_name" and v.name not in dataset.group:  # of version 0.1
-            continue
         array = dataset.group[v.name]
         try:
             if not np.array_equal(array[...], v.data):

@@ -1,7 +1,5 @@
 """Making one part of a dataset: simulate, encode, write. A part depends on the scenes of the store only."""
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import threading
@@ -181,7 +179,7 @@ class Maker:
         return self.dataset.recipe.systems[sample_parts(self.dataset.recipe, sample)[1]]
 
     def _part(self, sample: int, rows: slice, columns: slice) -> Flux:
-        """Part of the flux; the last one is kept: of waveforms it takes longer to make than to simulate."""
+        """Part of the flux; the last one is cached, because making waveforms takes longer than simulating them."""
         key = (sample, rows.start, rows.stop, columns.start, columns.stop)
         if self._last is None or self._last[0] != key:
             self._last = None  # its memory first

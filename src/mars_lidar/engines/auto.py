@@ -1,7 +1,5 @@
 """The auto engine: exact for pixels of few registrations, feedback for pixels of many."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

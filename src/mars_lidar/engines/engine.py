@@ -12,6 +12,7 @@ import numpy as np
 
 from mars_lidar._base.cached import cached_property
 from mars_lidar._base.native import _core
+from mars_lidar._base.progress import of_part
 from mars_lidar._base.resources import check_memory
 from mars_lidar._base.types import NDArray, Progress
 from mars_lidar.engines.tolerances import TOL
@@ -108,7 +109,7 @@ class Task:
         )
 
     def _avalanches(self) -> dict[str, Any]:
-        """What avalanches leave behind, as the native job takes it; only what is on."""
+        """Arguments of the native job for the effects of avalanches that are switched on."""
         detector = self.system.detector
         fields = native_fields({name: getattr(detector, name) for name in AVALANCHE_EFFECTS}, self.system.period_ns)
         if detector.crosstalk is not None:
@@ -131,11 +132,7 @@ class Records:
     def allocate(cls, counts: NDArray[np.int64]) -> Records:
         """Allocate `counts` (items,) registrations for each item; MemoryError if memory is insufficient."""
         offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-        return cls.reserve(offsets, int(offsets[-1]))
-
-    @classmethod
-    def reserve(cls, offsets: NDArray[np.int64], room: int) -> Records:
-        """Allocate `room` registrations, with the items not yet placed; MemoryError if memory is insufficient."""
+        room = int(offsets[-1])
         check_memory(room * cls.BYTES, f"timestamps of shape ({room},)", IN_PARTS)
         return cls(offsets, np.empty(room), np.empty(room, np.int32), np.empty(room, np.int32))
 
@@ -214,21 +211,8 @@ class Engine(ABC):
     def histogram(self, task: Task, out: NDArray[Any]) -> None:
         """Fill `out` (items, bins), C-contiguous, of the histogram dtype of the system of `task`."""
 
-    def counts(self, task: Task) -> NDArray[np.int64]:
-        """Registrations of each exposure (items,) of `task`, with the draws of `histogram`."""
-        raise ValueError(f"engine {self.name!r} draws histograms only, not single registrations; use 'exact'")
-
     def records(self, task: Task, expected: float) -> Records | PhaseRecords:
-        """Every registration of `task`, with the draws of `histogram`; `expected`: their approximate number.
-
-        The default implementation takes two passes, `counts` and `timestamps`.
-        """
-        records = Records.allocate(self.counts(task))
-        self.timestamps(task, records)
-        return records
-
-    def timestamps(self, task: Task, records: Records) -> None:
-        """Fill `records`, allocated from `counts`, with the draws of `histogram` for `task`."""
+        """Every registration of `task`, with the draws of `histogram`; `expected`: their approximate number."""
         raise ValueError(f"engine {self.name!r} draws histograms only, not timestamps; use 'exact'")
 
 
@@ -301,13 +285,7 @@ def given(options: EngineOptions) -> dict[str, Any]:
 
 def stage(progress: Progress | None, start: float, end: float) -> Progress | None:
     """A progress callback for one of several calls: from `start` to `end` of the whole."""
-    if progress is None:
-        return None
-
-    def stage_progress(done: int, total: int) -> object:
-        return progress(round(TOL.ticks * (start + (end - start) * done / max(total, 1))), TOL.ticks)
-
-    return stage_progress
+    return of_part(progress, round(TOL.ticks * start), round(TOL.ticks * end), TOL.ticks)
 
 
 def part_of(

@@ -1,7 +1,5 @@
 """The exact engine: only registered photons are drawn, each by inversion of the integrated flux."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -9,7 +7,7 @@ from numpy.typing import NDArray
 
 from mars_lidar._base.native import _core
 from mars_lidar._base.resources import available_bytes, check_memory
-from mars_lidar.engines.engine import IN_PARTS, Engine, PhaseRecords, Records, Task, check_start
+from mars_lidar.engines.engine import IN_PARTS, Engine, PhaseRecords, Task, check_start
 from mars_lidar.engines.tolerances import TOL
 from mars_lidar.instrument.detector import MODES
 from mars_lidar.instrument.effects import EFFECTS
@@ -66,9 +64,3 @@ class ExactEngine(Engine):
         if task.system.detector.jitter is not None:
             _core.sort_records(offsets, cycle, phase, task.threads)
         return PhaseRecords(offsets, cycle, phase, task.system.bins)
-
-    def timestamps(self, task: Task, records: Records) -> None:
-        """The same as `records`, into allocated memory."""
-        drawn = self.records(task, float(records.times.size))
-        for to, array in ((records.times, drawn.times), (records.cycle, drawn.cycle), (records.bin, drawn.bin)):
-            to[:] = array

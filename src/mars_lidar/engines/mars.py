@@ -6,18 +6,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from mars_lidar._base import checks
 from mars_lidar._base.types import FloatArray, IndexArray
+from mars_lidar.engines import synthesis
 from mars_lidar.engines.engine import Count, Interpolation, Outside
 from mars_lidar.engines.pixels import Group, groups
-from mars_lidar.engines.synthesis import (
-    Batch,
-    CountLaws,
-    Matched,
-    PartlyReplaced,
-    Poisson,
-    RoundedGaussian,
-    Run,
-    Tabulated,
-)
 from mars_lidar.engines.table_reader import CountTimesShape, Entries, TableReader, as_shapes, exact_laws, untrusted
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
@@ -112,7 +103,7 @@ class MarsEngine(CountTimesShape):
         """Count law, and the table if there is one."""
         return {"count": self.count} | super().settings
 
-    def _evaluate(self, run: Run, pixels: IndexArray) -> None:
+    def _evaluate(self, run: synthesis.Run, pixels: IndexArray) -> None:
         """The exact statistics of each distinct pixel, at its own delay."""
         run.count("pixels_evaluated", pixels.size)
         for group in groups(run.task.flux, run.task.system, pixels):
@@ -120,7 +111,7 @@ class MarsEngine(CountTimesShape):
                 batch = self._evaluated(run, group)
             run.draw(batch)
 
-    def _evaluated(self, run: Run, group: Group) -> Batch:
+    def _evaluated(self, run: synthesis.Run, group: Group) -> synthesis.Batch:
         from mars_lidar.statistics.count_pmf import exact_pmfs
         from mars_lidar.statistics.exposure import recorded_moments
 
@@ -129,12 +120,12 @@ class MarsEngine(CountTimesShape):
         cumulants = exposure.cumulants.reshape(-1, 4)
         if self.count == "exact" and task.system.dead_time_periods > 0.0:
             pmfs = exact_pmfs(group.cells, cumulants, exposure.bins.reshape(-1), task.threads)
-            laws: CountLaws = Tabulated.of(pmfs, group.cell)
+            laws: synthesis.CountLaws = synthesis.Tabulated.of(pmfs, group.cell)
         else:
             laws = self._laws(task.system, cumulants[group.cell])
-        return Batch.unmixed(group.pixels, as_shapes(exposure.histogram), group.cell, laws)
+        return synthesis.Batch.unmixed(group.pixels, as_shapes(exposure.histogram), group.cell, laws)
 
-    def _laws_of(self, run: Run, reader: TableReader, entries: Entries) -> CountLaws:
+    def _laws_of(self, run: synthesis.Run, reader: TableReader, entries: Entries) -> synthesis.CountLaws:
         laws = self._laws(run.task.system, entries.cumulants)
         if self.count != "exact":
             return laws
@@ -144,10 +135,10 @@ class MarsEngine(CountTimesShape):
         if not at.size:
             return laws
         with run.stage("evaluation_s"):
-            return PartlyReplaced(laws, at, exact_laws(run, reader, entries, at))
+            return synthesis.PartlyReplaced(laws, at, exact_laws(run, reader, entries, at))
 
-    def _laws(self, system: System, cumulants: FloatArray) -> CountLaws:
+    def _laws(self, system: System, cumulants: FloatArray) -> synthesis.CountLaws:
         """Laws from cumulants (pixels, 4)."""
         if self.count == "gaussian":
-            return RoundedGaussian(cumulants[:, 0], cumulants[:, 1])
-        return Poisson(cumulants[:, 0]) if system.dead_time_periods == 0.0 else Matched(cumulants)
+            return synthesis.RoundedGaussian(cumulants[:, 0], cumulants[:, 1])
+        return synthesis.Poisson(cumulants[:, 0]) if system.dead_time_periods == 0.0 else synthesis.Matched(cumulants)

@@ -1,7 +1,5 @@
 """The Poisson engine, without dead time, as used for training in most of the literature."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """The engines by name, and the alternatives where an engine does not apply."""
 
-from __future__ import annotations
-
 from typing import Unpack
 
 from mars_lidar._base import checks
@@ -88,11 +86,6 @@ def find_engine(engine: str | Engine, **options: Unpack[EngineOptions]) -> Engin
             name = next(iter(chosen))
             raise TypeError(f"{name} must be None where engine is an Engine, which has its own, got {chosen[name]!r}")
         return engine
-    if engine == "neural":
-        raise ValueError(
-            "engine 'neural' is no longer in the package: from a checkout, give studies.neural.NeuralEngine(), "
-            "which simulate takes as engine (docs/neural.md)"
-        )
     default = ENGINES[checks.choice("engine", engine, tuple(ENGINES))]
     for name in chosen:
         if name not in default.options:

@@ -1,7 +1,5 @@
 """The sequential engine: photon-by-photon simulation, the independent reference of the exact engine."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 from dataclasses import replace
 from typing import Any
@@ -38,19 +36,17 @@ class SequentialEngine(Engine):
         _check_unique_start(task)
         _core.sequential_histogram(task.job, task.pulse, out, task.threads, task.progress)
 
-    def counts(self, task: Task) -> NDArray[np.int64]:
-        """The first of the two passes for timestamps."""
+    def records(self, task: Task, expected: float) -> Records:
+        """In two passes of the same draws: the first counts the registrations."""
         _check_unique_start(task)
-        out = np.empty(task.items, np.int64)
-        _core.sequential_counts(task.job, task.pulse, out, task.threads, None)
-        return out
-
-    def timestamps(self, task: Task, records: Records) -> None:
-        """The second pass: the same draws again."""
+        counts = np.empty(task.items, np.int64)
+        _core.sequential_counts(task.job, task.pulse, counts, task.threads, None)
+        records = Records.allocate(counts)
         where = (records.offsets, records.times, records.cycle, records.bin)
         _core.sequential_timestamps(task.job, task.pulse, *where, task.threads, task.progress)
         if task.system.detector.jitter is not None:
             records.sort()
+        return records
 
 
 def _check_unique_start(task: Task) -> None:

@@ -299,7 +299,7 @@ def check_registrations(flux: Flux, system: System) -> None:
     """Raise ValueError where a pixel is expected to have more registrations than its random stream can draw."""
     expected = _expected_arrivals(flux, system)
     most, what = float(expected.max()), "registrations"
-    if system.detector.mode == "paralyzable":  # each arrival is drawn, seen or not
+    if system.detector.mode == "paralyzable":  # each arrival is drawn, registered or not
         what = "arrivals of mode 'paralyzable'"
     elif system.detector.recovery_ns > 0.0:
         what = "arrivals after a dead time, those during recovery_ns included"

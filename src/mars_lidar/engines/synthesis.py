@@ -18,6 +18,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from mars_lidar._base.native import _core
+from mars_lidar._base.progress import of_part
 from mars_lidar._base.types import FloatArray, IndexArray, NDArray, Progress
 from mars_lidar.engines.engine import Task
 from mars_lidar.engines.pixels import Alignment
@@ -279,11 +280,6 @@ class Run:
                 if batch.guides is not None:
                     job.guide(guides=batch.guides, threads=task.threads)
             out = self.out[first * image : (first + number) * image]
-            _core.shape_histogram(job, counts, out, task.threads, self.level, self._sampling(counts.size))
+            progress = of_part(task.progress, self._done, self._done + counts.size, task.items)
+            _core.shape_histogram(job, counts, out, task.threads, self.level, progress)
         self._done += counts.size
-
-    def _sampling(self, size: int) -> Progress | None:
-        report, before, items = self.task.progress, self._done, self.task.items
-        if report is None:
-            return None
-        return lambda done, total: report(before + size * done // max(total, 1), items)

@@ -1,7 +1,5 @@
 """Tolerances and limits of the engines, each with its unit and origin."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

@@ -4,8 +4,6 @@ The server listens on the loopback address; every path begins with a random word
 are refused (DNS rebinding).
 """
 
-from __future__ import annotations
-
 import json
 import secrets
 import threading

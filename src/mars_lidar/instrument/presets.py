@@ -4,8 +4,6 @@ A value of an instrument is a pair (value, source). The source of a value withou
 check such values before use. The table in docs/detectors.md is `table` of this.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from typing import Any

@@ -1,7 +1,5 @@
 """Limits of the values that describe an instrument, and accuracies of its pulses."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

@@ -1,7 +1,5 @@
 """Warnings for times that are likely given in ps or s instead of ns."""
 
-from __future__ import annotations
-
 import math
 import warnings
 

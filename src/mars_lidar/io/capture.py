@@ -41,7 +41,7 @@ class Capture:
     name: str  # of its data set
     axes: str  # a letter for each
     shape: tuple[int, ...]
-    bin_ns: float | None  # width of a time bin; None where the file does not tell
+    bin_ns: float | None  # width of a time bin; None if not stated in the file
     start_ns: float | None  # travel time at the first one
 
     @property

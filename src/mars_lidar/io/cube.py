@@ -12,26 +12,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mars_lidar._base import checks
+from mars_lidar._base import checks, files
 from mars_lidar._base.arguments import checked, checked_with_masks
-from mars_lidar._base.buckets import url_of
+from mars_lidar._base.buckets import in_bucket, place_of, url_of
 from mars_lidar._base.display import as_html, brief
-from mars_lidar._base.files import (
-    INCOMPLETE_SUFFIX,
-    FileError,
-    IncompleteFileError,
-    check_finished,
-    check_target,
-    finished_name,
-    reading,
-)
 from mars_lidar._base.imports import late, needed
 from mars_lidar._base.resources import check_memory
 from mars_lidar.instrument.system import System
 from mars_lidar.io import layout
 from mars_lidar.io.recipe import Recipe, Recording
 from mars_lidar.io.store import CountArray, OpenedStore, Writer
-from mars_lidar.io.zarr_store import open_url
 from mars_lidar.light.flux import Flux
 
 if TYPE_CHECKING:
@@ -352,7 +342,7 @@ def _load_again(path: str | Path, allow_incomplete: bool, identity: str) -> Cube
     cube = load(path, allow_incomplete=allow_incomplete)
     if cube._identity != identity:
         cube.close()
-        raise FileError(f"{path} was replaced after it was opened: open it again")
+        raise files.FileError(f"{path} was replaced after it was opened: open it again")
     return cube
 
 
@@ -399,30 +389,30 @@ def load(path: str | Path, *, allow_incomplete: bool = False) -> Cube:
     ...     stored.shape
     (1, 1, 2, 128)
     """
-    url = url_of(path)
-    if url is not None:
-        return _opened(open_url(url), Path(url), allow_incomplete, url)
-    source = Path(path)
-    plain = finished_name(source)
+    source = place_of(path)
+    plain = files.finished_name(source)
+    if in_bucket(source) and plain.suffix != ".zarr":
+        raise files.FileError(f"{source}: only a .zarr is opened from a URL; fetch other files first")
     form = format_of(plain, "path")
-    check_finished(source)
+    if not in_bucket(source):
+        files.check_finished(source)
     if plain != source and plain.suffix in (".mat", ".ptu"):  # formats of which a part cannot be read
-        raise IncompleteFileError(f"{source} is incomplete: a stopped run left it")
+        raise files.IncompleteFileError(f"{source} is incomplete: a stopped run left it")
     try:
-        with reading(source, "a cube of mars-lidar"):
-            return _opened(form.open_store(source), source, allow_incomplete)
-    except FileError as error:
-        if source.name.endswith(INCOMPLETE_SUFFIX) and not isinstance(error, IncompleteFileError):
-            raise IncompleteFileError(f"{source} is incomplete: a stopped run left it") from error
+        with files.reading(source, "a cube of mars-lidar"):
+            return _opened(form.open_store(source), source, allow_incomplete, url_of(path) or "")
+    except files.FileError as error:
+        if source.name.endswith(files.INCOMPLETE_SUFFIX) and not isinstance(error, files.IncompleteFileError):
+            raise files.IncompleteFileError(f"{source} is incomplete: a stopped run left it") from error
         raise
 
 
 def _opened(store: OpenedStore, source: Path, allow_incomplete: bool, url: str = "") -> Cube:
     try:
-        complete = store.complete and not source.name.endswith(INCOMPLETE_SUFFIX)
+        complete = store.complete and not source.name.endswith(files.INCOMPLETE_SUFFIX)
         if not (complete or allow_incomplete):
             progress = f" ({store.progress})" if store.progress else ""
-            raise IncompleteFileError(f"{url or source} is incomplete: its simulation did not finish{progress}")
+            raise files.IncompleteFileError(f"{url or source} is incomplete: its simulation did not finish{progress}")
         histogram = store.arrays.get("histogram")
         if histogram is None:
             raise ValueError(f"{url or source} has no variable 'histogram': its writing stopped before the first count")
@@ -454,7 +444,7 @@ def check_output(path: str | Path, recipe: Recipe | Recording, *, overwrite: boo
     """Raise the errors of writing the cube there, without writing."""
     target = Path(path)
     form = format_of(target, "out")
-    check_target(target, folder=target.suffix == ".zarr", overwrite=overwrite)
+    files.check_target(target, folder=target.suffix == ".zarr", overwrite=overwrite)
     if target.suffix == ".npz":  # it could be written, but never read back here
         what = f"the counts of {target}, which NumPy reads whole,"
         check_memory(recipe.nbytes, what, "a .zarr or .h5 is read in parts")
@@ -483,14 +473,7 @@ _OF_A_RUN = ("engine", "engine_settings", "seed", "first_realization", "source")
 
 
 @checked_with_masks
-def to_xarray(
-    cube: Cube | ArrayLike,
-    system: System | None = None,
-    flux: Flux | None = None,
-    *,
-    depth_m: ArrayLike | None = None,
-    reflectivity: ArrayLike | None = None,
-) -> xarray.Dataset:
+def to_xarray(cube: Cube | ArrayLike, system: System | None = None, flux: Flux | None = None) -> xarray.Dataset:
     """Counts with named dimensions, coordinates and units, as ``xarray.open_zarr`` returns them for our stores.
 
     Parameters
@@ -502,8 +485,6 @@ def to_xarray(
         The system that recorded them; not for a `Cube`, which contains it.
     flux
         The light of counts, if known, (H, W).
-    depth_m, reflectivity
-        Maps (H, W) of the scene, together with a flux; default depth: c tau / 2.
 
     Returns
     -------
@@ -534,20 +515,13 @@ def to_xarray(
     FrozenMappingWarningOnValuesAccess({'realization': 1, 'y': 1, 'x': 2, 'time': 128})
     """
     xarray = needed("xarray", "a labelled cube")
-    unnamed = not isinstance(cube, Cube)
-    if isinstance(cube, Cube):
-        if (system, flux, depth_m, reflectivity) != (None, None, None, None):
-            raise TypeError("system, flux, depth_m and reflectivity are for arrays: a Cube has its own")
-    else:
-        if not isinstance(system, System):
-            raise TypeError(f"system must be a System beside an array of counts, got {type(system).__name__}")
-        cube = Cube(cube, system, flux, depth_m=depth_m, reflectivity=reflectivity)
+    cube = as_cube(cube, system, flux)
     variables: dict[str, Any] = {"histogram": (layout.DIMS, np.asarray(cube.histogram), dict(layout.HISTOGRAM_LABELS))}
     coordinates: dict[str, Any] = {}
     for variable in layout.variables(cube.recipe):
         entry = (variable.dims, np.asarray(variable.data), variable.labels)
         (coordinates if variable.dims == (variable.name,) else variables)[variable.name] = entry
     attributes: dict[str, Any] = {**layout.attributes(cube.recipe), "complete": True}
-    if unnamed:  # how an array was made is not known
+    if not cube.version:  # how an array was made is not known
         attributes = {name: value for name, value in attributes.items() if name not in _OF_A_RUN}
     return xarray.Dataset(variables, coordinates, attributes)  # type: ignore[no-any-return]

@@ -12,19 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar._base import mat5
+from mars_lidar._base import files, mat5
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.files import (
-    NpyFile,
-    check_claim,
-    npy_header,
-    open_npz,
-    read_column,
-    read_npy,
-    read_times,
-    reading,
-    whole,
-)
 from mars_lidar._base.hdf5 import CELLS, open_hdf5
 from mars_lidar._base.sparse import check_sparse, check_stored, dense_bytes, is_sparse
 from mars_lidar.instrument.system import System
@@ -157,8 +146,8 @@ def read_counts(
     if recording is not None:
         by_name = recording.arrays
     elif source.suffix.lower() in _TEXT:
-        with reading(source, "arrays of histograms"):
-            times, column = read_times(source)
+        with files.reading(source, "arrays of histograms"):
+            times, column = files.read_times(source)
         by_name = {"": column}
     else:
         by_name = arrays(source)
@@ -167,7 +156,7 @@ def read_counts(
         return ForeignCounts(source, name, None, array, "")
     order = _guessed(source, array.shape, bins) if axes is None else axes
     if is_sparse(array):
-        check_claim(source, dense_bytes(array), f"the counts of {name or 'its matrix'}")
+        files.check_claim(source, dense_bytes(array), f"the counts of {name or 'its matrix'}")
     try:
         return ForeignCounts(source, name, in_order(array, order, image), None, order, recording, times)
     except (ValueError, TypeError) as error:
@@ -198,7 +187,7 @@ def arrays(path: Path) -> dict[str, Any]:
     """Every array of a file that could be histograms or photon times, by name: dense, sparse, or cells of times."""
     if path.suffix.lower() not in FOREIGN_SUFFIXES:
         raise ValueError(f"{path}: histograms of other programs are read from {', '.join(FOREIGN_SUFFIXES)}")
-    with reading(path, "arrays of histograms"):
+    with files.reading(path, "arrays of histograms"):
         if path.suffix.lower() in RECORDER_SUFFIXES:
             return dict(recorded(path).arrays)
         by_name: dict[str, Any] = _READERS[path.suffix.lower()](path)
@@ -213,19 +202,19 @@ def listed(path: Path) -> dict[str, str]:
     import h5py
 
     suffix = path.suffix.lower()
-    with reading(path, "arrays of histograms"):
+    with files.reading(path, "arrays of histograms"):
         if suffix == ".mat" and not h5py.is_hdf5(path):
             return _listed_mat(path)
         if suffix in (".mat", ".h5", ".hdf5"):
             return _listed_hdf5(path, suffix == ".mat")
         if suffix == ".npz":
             with zipfile.ZipFile(path) as archive:
-                heads = {name.removesuffix(".npy"): npy_header(archive.open(name)) for name in archive.namelist()}
+                heads = {name.removesuffix(".npy"): files.npy_header(archive.open(name)) for name in archive.namelist()}
             if {"format", "shape", "data"} <= heads.keys():
                 return {"": f"sparse, {heads['data'][0][0]} values {heads['data'][1]}"}
             return {name: _in_words(shape, dtype) for name, (shape, dtype, _) in heads.items() if shape}
         if suffix == ".npy":
-            head = NpyFile(path)
+            head = files.NpyFile(path)
             return {"": _in_words(head.shape, head.dtype)}
     return {name: _in_words(array.shape, array.dtype) for name, array in arrays(path).items()}
 
@@ -267,7 +256,7 @@ def _listed_hdf5(path: Path, of_matlab: bool) -> dict[str, str]:
                 words[name] = _in_words((int(item.attrs["MATLAB_sparse"]), item["jc"].size - 1), "sparse")
             elif isinstance(item, h5py.Dataset) and item.dtype == h5py.ref_dtype:
                 shape = tuple(item.shape[::-1])
-                cells = enumerate((item.file[each] for each in np.ravel(whole(item)[:_MOST_LISTED])), start=1)
+                cells = enumerate((item.file[each] for each in np.ravel(files.whole(item)[:_MOST_LISTED])), start=1)
                 deep = {
                     f"{name}[{k}]": _in_words(tuple(part.shape[::-1]), part.dtype)
                     for k, part in cells
@@ -323,7 +312,7 @@ def _uneven(height: int, width: int) -> float:
 
 
 def _npz(path: Path) -> dict[str, Any]:
-    with open_npz(path) as archive:
+    with files.open_npz(path) as archive:
         if {"format", "shape", "data"} <= set(archive.files):
             from scipy import sparse
 
@@ -352,16 +341,16 @@ def _tiff(path: Path) -> dict[str, Any]:
     with Image.open(path) as image:
         pixel = np.array(Image.new(image.mode, (1, 1))).nbytes
         claimed = sum(pixel * math.prod(page.size) for page in ImageSequence.Iterator(image))
-        check_claim(path, claimed, "its pages")
+        files.check_claim(path, claimed, "its pages")
         return {"": np.stack([decoded(page) for page in ImageSequence.Iterator(image)])}
 
 
 def _table(path: Path) -> dict[str, Any]:
-    return {"": read_column(path)}
+    return {"": files.read_column(path)}
 
 
 _READERS = {
-    ".npy": lambda path: {"": read_npy(path)},
+    ".npy": lambda path: {"": files.read_npy(path)},
     ".npz": _npz,
     ".mat": _mat,
     ".h5": hdf5_arrays,

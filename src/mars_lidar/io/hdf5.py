@@ -1,7 +1,5 @@
 """HDF5: one file for h5py, MATLAB (`h5read`) and netCDF readers, with dimension scales attached."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path

@@ -9,7 +9,7 @@ histogram           realization, y, x, time      registrations, uint16 or uint32
 time                time                         bin centres, ns
 realization, y, x   themselves                   realization number of the random streams; pixel
 depth               y, x                         m
-reflectivity        y, x                         where a scene is behind the flux
+reflectivity        y, x                         where the flux was made from a scene
 signal, background  y, x                         detectable photons per laser period
 delay               y, x                         ns; the strongest return
 returns_signal,     return, y, x                 where there are several returns
@@ -23,8 +23,6 @@ Attributes: ``format``, ``format_version``, ``complete``, ``system`` (JSON), ``e
 ``first_realization``, ``flux`` (JSON: origin of the flux), ``source``, ``version`` (of this package) and,
 once complete, ``registrations``. Measured counts have ``engine`` "measured", and no variables of a flux.
 """
-
-from __future__ import annotations
 
 import json
 import math

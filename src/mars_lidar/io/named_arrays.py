@@ -1,7 +1,5 @@
 """Arrays of numbers in .npz, .mat (v5, v7.3) and HDF5 files of other programs, by name."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -60,7 +58,7 @@ def mat_arrays(path: Path, names: list[str] | None = None, *, deep: bool = True)
 
 
 def _plain(variables: dict[str, Any]) -> dict[str, Any]:
-    """Without what SciPy tells of the file."""
+    """Without SciPy's entries on the file itself."""
     return {name: array for name, array in variables.items() if not name.startswith("__")}
 
 

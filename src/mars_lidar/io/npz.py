@@ -4,8 +4,6 @@ Each variable is a member; ``attributes`` is a JSON string that also gives every
 units. The counts are streamed into the archive, so that writing does not need the cube in memory.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import math

@@ -21,8 +21,6 @@ unknown (D. Scharstein et al., GCPR 2014).
 Depth is perpendicular to the image plane in all of them.
 """
 
-from __future__ import annotations
-
 import math
 import zipfile
 from collections.abc import Iterator

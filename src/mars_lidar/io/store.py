@@ -4,9 +4,6 @@ A format is one module with two functions, `open_writer`, a context that gives a
 of any format is marked complete only at the end, so that an interrupted write is recognised.
 """
 
-from __future__ import annotations
-
-import contextlib
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -17,6 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.buckets import in_bucket
 from mars_lidar._base.files import FileError, reading, whole
 from mars_lidar._base.resources import check_memory
 from mars_lidar.light.transient import RateArray
@@ -71,7 +69,7 @@ class OnDisk:
 
     def whole(self) -> NDArray[Any]:
         """All values; FileError if a file of this size cannot contain so many."""
-        array: NDArray[Any] = self._read(lambda: whole(self._array))
+        array: NDArray[Any] = np.asarray(self) if in_bucket(self._path) else self._read(lambda: whole(self._array))
         return array
 
     def _read(self, read: Callable[[], Any]) -> Any:
@@ -80,11 +78,8 @@ class OnDisk:
         except (IndexError, TypeError, FileError):  # an error of the key, or one that names the file
             raise
         except Exception as error:
-            with self._naming():
+            with reading(self._path, "an array"):
                 raise error
-
-    def _naming(self) -> contextlib.AbstractContextManager[Any]:
-        return reading(self._path, "an array")
 
 
 def values(array: Any) -> NDArray[Any]:

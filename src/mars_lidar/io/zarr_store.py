@@ -4,8 +4,6 @@
 from any URL that fsspec opens (``https://``, ``s3://``, ``memory://``).
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os
@@ -17,11 +15,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mars_lidar._base import manifest
-from mars_lidar._base.files import FileError, alone, beside, exchange, explained, successor
-from mars_lidar._base.imports import MissingLibraryError, needed
+from mars_lidar._base.files import alone, beside, exchange, explained, successor
 from mars_lidar._base.resources import check_threads
 from mars_lidar.io import layout
 from mars_lidar.io.recipe import Recipe, Recording
@@ -159,26 +155,21 @@ def unfinished(path: Path, recipe: Recipe) -> Any:
 
 
 def open_store(path: Path, check: layout.Check = layout.check_format) -> OpenedStore:
-    """Open a store for reading; chunks are read when the histogram is indexed."""
+    """Open a store for reading, also one at a URL; chunks are read when the histogram is indexed."""
     import zarr
 
-    from mars_lidar._base.sealed_store import PlainFiles, SealedStore
+    from mars_lidar._base.sealed_store import store_at
 
     check_zarr_threads()
     attrs = manifest.root_document(path).get("attributes", {})
     check(path, attrs)
-    identity = ""
-    if attrs.get("complete") is False:
-        group: Any = zarr.open_group(PlainFiles(path, read_only=True), mode="r")
-    else:
-        sums = manifest.require(path)
-        identity = sums.identity
-        group = zarr.open_group(SealedStore(path, sums), mode="r")
+    sums = None if attrs.get("complete") is False else manifest.require(path)
+    group: Any = zarr.open_group(store_at(path, sums), mode="r")
     arrays = {name: OnDisk(array, path) for name, array in group.arrays()}
     progress = ""
-    if attrs.get("complete") is False and (histogram := arrays.get("histogram")) is not None:
+    if sums is None and (histogram := arrays.get("histogram")) is not None:
         progress = f"at least {histogram.nchunks_initialized} of {histogram.nchunks} chunks are written"
-    return OpenedStore(attrs, arrays, progress, identity=identity)
+    return OpenedStore(attrs, arrays, progress, identity="" if sums is None else sums.identity)
 
 
 def add(group: Any, variables: Iterable[layout.Variable]) -> None:
@@ -228,80 +219,3 @@ def _map_chunks(data: Any) -> tuple[int, ...]:
         return tuple(data.shape)
     rows = max(1, _CHUNK_BYTES * data.shape[0] // data.nbytes)
     return (rows, *data.shape[1:])
-
-
-class RemoteArray(OnDisk):
-    """An array of a store at a URL, whose read errors name the URL."""
-
-    def _naming(self) -> contextlib.AbstractContextManager[Any]:
-        return _naming(str(self._path))
-
-    def whole(self) -> NDArray[Any]:
-        """All values; MemoryError if they do not fit."""
-        return np.asarray(self)
-
-
-def open_url(url: str) -> OpenedStore:
-    """Open a store for reading; its documents and coordinates are compared with its manifest, and its names if listed.
-
-    Every error names the URL; MissingLibraryError if fsspec, or its library for this kind of URL, is missing.
-    """
-    if not url.rstrip("/").endswith(".zarr"):
-        raise FileError(f"{url}: only a .zarr is opened from a URL; fetch other files first")
-    core = needed("fsspec.core", url, "remote")
-    import zarr
-    from zarr.storage import FsspecStore
-
-    with _naming(url):
-        system, root = core.url_to_fs(url)
-        attrs = json.loads(system.cat_file(f"{root}/zarr.json")).get("attributes", {})
-        layout.check_format(Path(url), attrs)
-        store: Any = FsspecStore.from_url(url, read_only=True)
-        if attrs.get("complete") is not False:
-            from mars_lidar._base.sealed_store import SealedValues
-
-            store = SealedValues(store, _require(url, system, root, attrs.get(manifest.SUM)), url)
-        group: Any = zarr.open_group(store, mode="r")
-        return OpenedStore(attrs, {name: RemoteArray(array, Path(url)) for name, array in group.arrays()})
-
-
-def _require(url: str, system: Any, root: str, stated: str | None) -> manifest.Manifest:
-    """The manifest.
-
-    Raises where a document or coordinate has changed since it was written, or a listed file is missing.
-    """
-    lines = {}
-    for name in (manifest.NAME, manifest.CHECKS):
-        try:
-            lines[name] = manifest.lines_of(system.cat_file(f"{root}/{name}").decode())
-        except FileNotFoundError:
-            raise FileError(f"{url} is damaged: its {name} is missing") from None
-    try:
-        there = {str(name).rpartition(f"{root}/")[2] for name in system.find(root)}
-    except Exception:  # what cannot be listed (most web servers)
-        there = set()
-    listed = there if manifest.NAME in there else None
-
-    def read(name: str) -> manifest.Sums:
-        return manifest.sums_of(system.cat_file(f"{root}/{name}"))
-
-    wrong = list(manifest.compared(lines[manifest.NAME], lines[manifest.CHECKS], listed, read, stated=stated))
-    if wrong:
-        raise ValueError(f"is damaged: {', '.join(wrong[:3])}")
-    return manifest.ManifestInBucket(Path(url), lines[manifest.NAME], lines[manifest.CHECKS], {})
-
-
-@contextlib.contextmanager
-def _naming(url: str) -> Iterator[None]:
-    """Context manager: errors raised inside name the URL."""
-    try:
-        yield
-    except (MissingLibraryError, MemoryError):
-        raise
-    except Exception as error:
-        text = " ".join(str(error).split()) or type(error).__name__
-        if isinstance(error, ImportError):
-            raise MissingLibraryError(f"{url}: {text}") from error
-        if isinstance(error, FileNotFoundError | KeyError):
-            raise FileError(f"{url}: there is no Zarr store ({text[:200]})") from error
-        raise FileError(text if url in text else f"{url}: {text[:400]}") from error

@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from mars_lidar.learn.forward import expected_histogram as expected_histogram
     from mars_lidar.learn.inverse import LidarLikelihood as LidarLikelihood
     from mars_lidar.learn.inverse import LidarPhysics as LidarPhysics
-    from mars_lidar.learn.likelihood import armed_periods as armed_periods
     from mars_lidar.learn.likelihood import histogram_log_likelihood as histogram_log_likelihood
     from mars_lidar.learn.ranges import Choice as Choice
     from mars_lidar.learn.ranges import LogUniform as LogUniform
@@ -34,7 +33,6 @@ _HOMES = {
     "StoredDataset": "stored",
     "SystemRange": "ranges",
     "Uniform": "ranges",
-    "armed_periods": "likelihood",
     "bin_photons": "forward",
     "expected_histogram": "forward",
     "histogram_log_likelihood": "likelihood",

@@ -553,7 +553,7 @@ def _refined(system: System) -> int:
 class _Expected(torch.autograd.Function):
     """Registrations (pixels, bins) of signal, background and delay (pixels,), and the solutions that lead to them.
 
-    Of the way there nothing else is kept: derivatives go it again, block by block, with the solutions known.
+    No other intermediate result is stored: derivatives are computed again, block by block, from the known solutions.
     """
 
     @staticmethod

@@ -8,17 +8,17 @@ from __future__ import annotations
 import math
 import warnings
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from mars_lidar._base.arguments import checked
+from mars_lidar._base.native import _core
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.pulse import GaussianPulse, SampledPulse
 from mars_lidar.instrument.system import System
 from mars_lidar.learn.forward import (
     HALF,
-    Delay,
     by_rows,
     check_detector,
     detected,
@@ -28,63 +28,6 @@ from mars_lidar.learn.forward import (
 from mars_lidar.learn.needed import torch
 from mars_lidar.learn.tolerances import TOLERANCES
 from mars_lidar.reconstruction.histogram_record import relative_width
-
-if TYPE_CHECKING:
-    from mars_lidar._base.native import _core
-
-
-@checked
-def armed_periods(histogram: torch.Tensor, system: System) -> torch.Tensor:
-    """Periods in which the pixel was armed in each bin, estimated from its histogram.
-
-    ``N_r`` minus the registrations whose dead time covers the bin (Gupta et al., ICCV 2019); a registration or a
-    re-arming in the bin counts half. Dead time beyond the end of the exposure is counted at its start, where the pixel
-    was armed (or blind from before): the error of D is at most t_d / t_r + 1 periods, for any exposure.
-
-    Parameters
-    ----------
-    histogram
-        (..., bins) counts.
-    system
-        The system that recorded them: non-paralyzable, without gate.
-
-    Returns
-    -------
-    torch.Tensor
-        (..., bins) periods D.
-
-    Raises
-    ------
-    TypeError
-        Counts that are not a tensor; `system` is not a `System`.
-    ValueError
-        Another number of bins; a detector that the model does not describe.
-
-    See Also
-    --------
-    histogram_log_likelihood, mars_lidar.reconstruction.generalised_coates_rates
-
-    Examples
-    --------
-    >>> import mars_lidar as ml
-    >>> system = ml.System(
-    ...     period_ns=100.0, cycles=1000, bins=128,
-    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
-    ... )
-    >>> import torch
-    >>> counts = torch.from_numpy(ml.simulate(ml.Flux(1.0, 1.0, 40.0), system, seed=0)[0, 0, 0].astype("float64"))
-    >>> armed = ml.learn.armed_periods(counts, system)
-    >>> tuple(armed.shape), bool((armed < 1000).all())
-    ((128,), True)
-    """
-    check_detector(system, light=True)
-    histogram = _counts(histogram, system)
-    counts = histogram if histogram.is_floating_point() else histogram.to(torch.float64)
-    if system.dead_time_periods == 0.0:
-        return torch.full_like(counts, float(system.cycles))
-    delay = Delay(system.dead_time_periods, system.bins)
-    covered = delay.blind(counts) + 0.5 * (counts - delay.rearmed(counts))
-    return (system.cycles - covered).clamp_min(0.0)
 
 
 @checked
@@ -132,7 +75,7 @@ def histogram_log_likelihood(
 
     See Also
     --------
-    expected_histogram, armed_periods, mars_lidar.reconstruction.log_likelihood
+    expected_histogram, mars_lidar.reconstruction.log_likelihood
 
     Notes
     -----
@@ -242,8 +185,6 @@ def _along(counts: torch.Tensor, light: torch.Tensor, system: System, moved: tor
 
 def _evaluated(counts: torch.Tensor, light: torch.Tensor, system: System, columns: int) -> torch.Tensor:
     """Value and derivatives (pixels, columns), by the processor."""
-    from mars_lidar._base.native import _core
-
     out = torch.empty((len(light), columns), dtype=torch.float64)
     rows, at = (tensor.detach().cpu().contiguous().numpy() for tensor in (counts, light))
     _core.coarse_likelihood(_plan(system), rows, at, out.numpy(), threads=torch.get_num_threads())
@@ -272,8 +213,6 @@ def _warn_of_the_end(counts: FloatArray, signal: FloatArray, system: System) -> 
 @lru_cache(maxsize=16)
 def _plan(system: System) -> _core.CoarsePlan:
     """What the native likelihood needs of a system; times in laser periods."""
-    from mars_lidar._base.native import _core
-
     pulse, period = system.pulse, system.period_ns
     width = relative_width(system) * period
     if isinstance(pulse, GaussianPulse):

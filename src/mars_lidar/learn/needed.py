@@ -1,7 +1,5 @@
 """Import of PyTorch, or an error that states how to install it; all of `mars_lidar.learn` but the ranges needs it."""
 
-from __future__ import annotations
-
 from mars_lidar._base.imports import MissingLibraryError
 
 try:

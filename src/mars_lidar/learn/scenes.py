@@ -4,8 +4,6 @@ Scenes are ray-cast without end, read from files, or taken from arrays; the work
 A sample is a function of numbers alone, which determine scene, flip, light and system.
 """
 
-from __future__ import annotations
-
 import math
 import mmap
 import os
@@ -234,7 +232,7 @@ class Arrays(Given):
         self._maps = {name: array if len(shape) == 3 else array[None] for name, array in given.items()}
         self._number = shape[0] if len(shape) == 3 else 1
         self._order = None
-        self.load(0)  # what is wrong with all of them is told at once
+        self.load(0)  # errors that all of them share are raised now
 
     def __len__(self) -> int:
         return self._number
@@ -318,7 +316,7 @@ class Recipe:
         scene = self._placed(self.source.scene(self.seed, epoch, index), epoch, index)
         if stretch != 1.0:
             scene = Scene(scene.depth_m * stretch, scene.reflectivity, scene.background)
-        with warnings.catch_warnings():  # pixels without return or beyond the range: told by the maps, not every time
+        with warnings.catch_warnings():  # pixels without return or beyond the range: NaN in the maps
             warnings.simplefilter("ignore", UserWarning)
             flux = scene.flux(system, signal=level, sbr=sbr, **self.lit)
         seed = int(generator(6, self.seed, epoch, index).integers(2**63))

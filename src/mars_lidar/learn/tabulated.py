@@ -168,7 +168,7 @@ class HistogramTable(torch.nn.Module):
 
 
 class _Again(torch.autograd.Function):
-    """A function whose gradient evaluates it again: else twenty maps as large as the result would be kept for it."""
+    """A function whose gradient evaluates it again, so that twenty maps of the size of the result are not stored."""
 
     @staticmethod
     def forward(function: Callable[..., torch.Tensor], *given: torch.Tensor) -> torch.Tensor:

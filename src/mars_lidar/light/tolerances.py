@@ -1,7 +1,5 @@
 """Limits of the light of an image, and of how finely its waveforms are computed."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

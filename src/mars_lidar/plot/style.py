@@ -1,7 +1,5 @@
 """The style sheet of all figures (mars.mplstyle beside this file), and named colours."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

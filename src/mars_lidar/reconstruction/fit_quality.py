@@ -3,20 +3,15 @@
 `native/reconstruct/fit_quality.h` computes the statistics of each pixel: docs/theory_reconstruction.md, section 8.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from mars_lidar._base.native import _core
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
 from mars_lidar.reconstruction.histogram_record import recording_of, relative_width
-
-if TYPE_CHECKING:
-    from mars_lidar._base.native import _core
 
 FALSE_ALARM = 1e-3  # of `Flags.MISFIT`, a pixel
 COLUMNS = 5  # of the native statistics of a pixel

@@ -15,6 +15,9 @@ from mars_lidar.instrument.effects import LIGHT_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.reconstruction.histogram_record import core_ns, open_bins, relative_width
+from mars_lidar.statistics.cells import one_pixel
+from mars_lidar.statistics.histogram import mean_histogram
+from mars_lidar.statistics.joint import joint_law
 
 _SINGULAR = 1e-11  # of the largest eigenvalue, all of size 1 to 3: rounding of the sums over the bins is 1e-15 of it
 _WAVEFORM_PARTS = 8  # of a bin, in which the light of several returns is taken as even
@@ -116,10 +119,7 @@ def cramer_rao(flux: Flux, system: System, *, threads: int | None = None) -> His
     8.2
     """
     from mars_lidar.reconstruction.maximum_likelihood import MaximumLikelihood
-    from mars_lidar.statistics import mean_histogram
 
-    if not isinstance(system, System):
-        raise TypeError(f"system must be a System, got {type(system).__name__}")
     MaximumLikelihood().check(system)
     require_effects("cramer_rao", system.detector, LIGHT_EFFECTS, _simulate_instead)
     if len(flux.returns_signal) != 1:
@@ -181,8 +181,6 @@ def returns_bound(flux: Flux, system: System, *, threads: int | None = None) -> 
     array([ 9., 21.])
     """
     from mars_lidar.reconstruction.maximum_likelihood import MaximumLikelihood
-    from mars_lidar.statistics import mean_histogram
-    from mars_lidar.statistics.cells import one_pixel
 
     MaximumLikelihood().check(system)
     require_effects("returns_bound", system.detector, LIGHT_EFFECTS, _simulate_instead)
@@ -269,8 +267,6 @@ def window_error(weights: ArrayLike, flux: Flux, system: System) -> tuple[FloatA
     >>> round(float(mean), 3), round(float(error), 3)  # of S = 0.1: dead time is not corrected
     (0.089, 0.009)
     """
-    from mars_lidar.statistics import joint_law
-
     mean, variance = joint_law(flux, system).window(weights)
     return mean, np.sqrt(variance)
 

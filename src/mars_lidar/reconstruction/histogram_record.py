@@ -1,20 +1,14 @@
 """Inputs of the native estimators from a system: dead time on the histogram's bins, pulse, gate."""
 
-from __future__ import annotations
-
 import math
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from mars_lidar._base.native import _core
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.pulse import GaussianPulse, Pulse, SampledPulse
 from mars_lidar.instrument.system import System
-
-if TYPE_CHECKING:
-    from mars_lidar._base.native import _core
-
 
 _CELLS_PER_SIGMA = 32  # Hermite interpolation: energies to 3e-9
 _CELLS_PER_PERIOD = 4096  # of a Gaussian that is wider than the period
@@ -28,7 +22,6 @@ def recording_of(system: System, *, longer: float = 1.0, wider: float = 1.0) -> 
 
     Its dead time is multiplied by `longer`, the width of its pulse by `wider`.
     """
-    from mars_lidar._base.native import _core
     from mars_lidar.statistics.cells import whole_bins
 
     # a wider pulse has in a period the form that this has in a shorter one

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from mars_lidar._base import checks
+from mars_lidar._base.native import _core
 from mars_lidar._base.progress import callback_of
 from mars_lidar._base.resources import thread_count
 from mars_lidar._base.types import ArrayLike, NDArray, Progress
 from mars_lidar.instrument.system import System
 from mars_lidar.reconstruction.histogram_record import recording_of
-
-if TYPE_CHECKING:
-    from mars_lidar._base.native import _core
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,8 +3,6 @@
 Weights and card lie beside this file; ``python -m studies image --train`` makes both.
 """
 
-from __future__ import annotations
-
 import json
 from functools import lru_cache
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The pulse on the cells of delay in which an image is reconstructed: docs/theory_reconstruction.md, section 7."""
 
-from __future__ import annotations
-
 import math
 from functools import lru_cache
 from typing import Any

@@ -9,6 +9,7 @@ from statistics import NormalDist
 import numpy as np
 
 from mars_lidar._base import arguments, checks
+from mars_lidar._base.native import _core
 from mars_lidar._base.types import ArrayLike, FloatArray, NDArray
 from mars_lidar.instrument.effects import LIGHT_EFFECTS
 from mars_lidar.instrument.system import System
@@ -91,8 +92,6 @@ class MaximumLikelihood(Method):
 
     def estimate(self, histograms: Histograms) -> Estimates:
         """Estimates, standard errors, significance of the signal, and test of fit, of each of the `histograms`."""
-        from mars_lidar._base.native import _core
-
         pixels = len(histograms.counts)
         out = np.empty((pixels, 8))
         flags = np.empty(pixels, np.uint8)
@@ -134,8 +133,6 @@ class MaximumLikelihood(Method):
 
     def _several(self, histograms: Histograms, out: FloatArray, flags: NDArray[np.uint8]) -> FloatArray:
         """Further returns of what was found: (pixels, returns, 5), and what the strongest of them changes."""
-        from mars_lidar._base.native import _core
-
         pixels = len(histograms.counts)
         returns = np.empty((pixels, self.returns * len(RETURN_COLUMNS)))
         _core.several_returns(
@@ -194,8 +191,6 @@ def log_likelihood(histogram: ArrayLike, flux: Flux, system: System) -> tuple[Fl
     >>> bool(value[1] > value[0]), gradient.shape, information.shape
     (True, (2, 3), (2, 3, 3))
     """
-    from mars_lidar._base.native import _core
-
     if np.shape(histogram) != (system.bins,):
         raise ValueError(f"histogram must be ({system.bins},), of one pixel, got shape {np.shape(histogram)}")
     given, _ = checked(histogram, system, 1)
@@ -258,7 +253,6 @@ def systematic_error(flux: Flux, system: System) -> tuple[FloatArray, FloatArray
     >>> (bias / error).round(1).tolist()  # bins of 2 ns, in which the detector re-arms while the pulse passes
     [4.9, 0.1, -3.2]
     """
-    from mars_lidar._base.native import _core
     from mars_lidar.statistics import mean_histogram
 
     MaximumLikelihood().check(system)

@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from mars_lidar._base import checks
+from mars_lidar._base.native import _core
 from mars_lidar._base.types import ArrayLike, FloatArray, NDArray
 from mars_lidar.instrument.detector import Mode
 from mars_lidar.instrument.effects import LIGHT_EFFECTS
@@ -183,8 +184,6 @@ class RateMethod(Method):
 
     def rates(self, cube: ArrayLike, system: System, threads: int | None, total: ArrayLike | None = None) -> FloatArray:
         """Photons per period in each bin (..., bins) from the histograms (..., bins); `total` (...) of each."""
-        from mars_lidar._base.native import _core
-
         given, shape = checked(cube, system, threads)
         self.check(system)
         flat = None
@@ -214,8 +213,6 @@ def window_estimates(
     given: Histograms, locator: str, correction: int = _NONE, *, steps: float = 0, tolerance: float = 0.0
 ) -> Estimates:
     """Delay by a filter or the peak, signal and background by the window around it, of corrected rates."""
-    from mars_lidar._base.native import _core
-
     out, flags = np.empty((len(given.counts), 5)), np.empty(len(given.counts), np.uint8)
     _core.window_estimates(
         given.recording,

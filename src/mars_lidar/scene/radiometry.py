@@ -1,7 +1,5 @@
 """From surfaces to photons: signal level, attenuation, ambient light, dark counts. Formulas: `Scene.flux`."""
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Callable

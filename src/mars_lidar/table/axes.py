@@ -1,7 +1,5 @@
 """Axes of a table (photons per period, ascending): their specification, thinning and refinement."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """Errors of a table on random pixels between its nodes, and their units."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Tables in HDF5 files, and those in the user's cache, under the hash of their request."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

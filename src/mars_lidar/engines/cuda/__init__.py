@@ -3,8 +3,6 @@
 This module selects the engines; the engines of the processor are independent of it.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

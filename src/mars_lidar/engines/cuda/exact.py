@@ -1,7 +1,5 @@
 """The exact engine on a GPU: preparation on the processor, and the launches."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The engine "feedback" on a GPU: preparation on the processor, and the launches."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any

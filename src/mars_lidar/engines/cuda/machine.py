@@ -1,7 +1,5 @@
 """The device that runs the kernels: CuPy's current device; in tests the processor (tests/cuda/host_machine.py)."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 from typing import Any
 

@@ -4,8 +4,6 @@ A vector contains the times of one pixel; a cell array (H, W) those of an image,
 Times count from a laser pulse, in a unit that the caller or the end of a name gives (``_ns``, ``_ps``).
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Photon streams on disk: choice of the format, checks of the output path, and NumPy's .npz."""
 
-from __future__ import annotations
-
 import importlib
 import json
 import math
@@ -10,16 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mars_lidar._base import checks
-from mars_lidar._base.files import (
-    IncompleteFileError,
-    beside,
-    check_finished,
-    check_target,
-    finished_name,
-    open_npz,
-    reading,
-)
+from mars_lidar._base import checks, files
 from mars_lidar.io.streams.photons import BEFORE_PTU, FORMAT, Photons, attributes, from_attributes
 from mars_lidar.light.timestamps import Timestamps
 
@@ -53,7 +42,7 @@ def save(path: str | Path, times: Timestamps, *, overwrite: bool = False, clock_
         )
     check_output(target, overwrite=overwrite, clock_ps=clock_ps)
     more = {} if clock_ps is None else {"clock_ps": clock_ps}
-    with beside(target) as unfinished:
+    with files.beside(target) as unfinished:
         write(unfinished, times, **more)
 
 
@@ -66,7 +55,7 @@ def check_output(path: str | Path, *, overwrite: bool = False, clock_ps: float |
     module = _module(Path(path), STREAM_SUFFIXES)
     if Path(path).suffix != ".npz":
         module.check_library()
-    check_target(Path(path), folder=False, overwrite=overwrite)
+    files.check_target(Path(path), folder=False, overwrite=overwrite)
 
 
 def load(
@@ -85,17 +74,17 @@ def load(
     if unit_ns is not None:
         unit_ns = checks.real("unit_ns", unit_ns, low=0.0, strict_low=True)
     source = Path(path)
-    plain = finished_name(source)
+    plain = files.finished_name(source)
     module = _module(plain)
     bare = plain.suffix in _BARE
     if not bare and (unit_ns is not None or variable is not None):
         raise ValueError(
             f"unit_ns and variable are for .mat, .npz and text: a {plain.suffix} tells both, got {str(path)!r}"
         )
-    check_finished(source)
+    files.check_finished(source)
     if plain != source:
-        raise IncompleteFileError(f"{source} is incomplete: a stopped run left it")
-    with reading(source, "a photon stream"):
+        raise files.IncompleteFileError(f"{source} is incomplete: a stopped run left it")
+    with files.reading(source, "a photon stream"):
         if bare:
             return _read_bare(source, period_ns, bins, unit_ns, variable)
         if plain.suffix in STREAM_SUFFIXES:
@@ -108,7 +97,7 @@ def load(
 def recorded(path: Path, *, unit_ns: float | None = None, variable: str | None = None) -> Photons:
     """The photons of another program's file in units of its recorder; arguments as for `Timestamps.load`."""
     module = _module(path)
-    with reading(path, "a photon stream"):
+    with files.reading(path, "a photon stream"):
         photons: Photons = module.photons(path, *((unit_ns, variable) if path.suffix in _BARE else ()))
         return photons
 
@@ -131,7 +120,7 @@ def _read_bare(
 
 def is_stream(path: Path) -> bool:
     """Whether the file at `path` is a photon stream; ValueError if damaged."""
-    with reading(path, "cube or photon stream"):
+    with files.reading(path, "cube or photon stream"):
         if path.suffix == ".npz":
             return _npz_attributes(path).get("format") == FORMAT
         return path.suffix in STREAM_SUFFIXES and bool(_module(path).is_stream(path))
@@ -154,14 +143,14 @@ def _write_npz(path: Path, times: Timestamps) -> None:
 
 
 def _npz_attributes(path: Path) -> dict[str, Any]:
-    with open_npz(path) as archive:
+    with files.open_npz(path) as archive:
         return dict(json.loads(archive["attributes"].item())) if "attributes" in archive.files else {}
 
 
 def _read_npz(path: Path, attrs: dict[str, Any]) -> Timestamps:
     if attrs["format"] != FORMAT:
         raise ValueError(f"{path} is not a file of timestamps written by mars-lidar (no format = {FORMAT!r})")
-    with open_npz(path) as archive:
+    with files.open_npz(path) as archive:
         content = {name: archive[name] for name in ("offsets", "times_ns", "cycle", "bin")}
     for name, values in content.items():
         if values.ndim != 1 or values.dtype.kind not in ("f" if name == "times_ns" else "iu"):

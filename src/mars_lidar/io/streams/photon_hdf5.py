@@ -6,8 +6,6 @@ s), ``detectors`` is the pixel y W + x, ``nanotimes`` the time since the laser p
 time to half a unit. Photons are in order of time. phconvert writes and validates the file; h5py reads it.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import json

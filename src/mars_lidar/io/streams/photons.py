@@ -3,8 +3,6 @@
 Also the attributes common to files of photons, and the timestamps of a measured stream.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -49,7 +47,7 @@ class Photons:
     source: str  # the file
     fine: NDArray[Any] | None = None  # (n,) whole units of `fine_ns` since the laser pulse; None without a laser
     fine_ns: float = 0.0
-    period_ns: float | None = None  # of the laser, where the file tells it
+    period_ns: float | None = None  # of the laser, if stated in the file
 
     def timestamps(self, period_ns: float | None = None, bins: int | None = None) -> Timestamps:
         """A pixel for each channel, in one row; `period_ns` if the file does not state it."""
@@ -187,7 +185,7 @@ def measured(
     one may be cut by the end of the period. `clock_ns` is the resolution of the clock, if it differs from `unit_ns`.
     """
     pixels = int(detector.max()) + 1 if detector.size else 1
-    phase = (np.asarray(fine, np.float64) + 0.5) * unit_ns  # the middle of what the clock tells apart
+    phase = (np.asarray(fine, np.float64) + 0.5) * unit_ns  # the middle of a unit of the clock
     late = np.floor(phase / period_ns).astype(np.int64)  # a stop after the next laser pulse
     cycle = np.asarray(cycle, np.int64) + late
     phase = phase - late * period_ns

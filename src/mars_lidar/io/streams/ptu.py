@@ -20,8 +20,6 @@ those of a PTU; only the header differs, with fixed positions (PicoQuant, "Time 
 github.com/PicoQuant; tsbischof/libpicoquant).
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import math
@@ -97,7 +95,7 @@ def new_file(
 
 
 def header_attributes(tags: Mapping[str, Any]) -> dict[str, Any]:
-    """The attributes in the tags `found`; empty for files of other programs."""
+    """The attributes in the tags of a file; empty for files of other programs."""
     text = tags.get(_ATTRIBUTES)
     if not isinstance(text, str):
         return {}
@@ -106,7 +104,7 @@ def header_attributes(tags: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def header_variables(path: Path, tags: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
-    """The arrays in the tags `found` of a file."""
+    """The arrays in the tags of a file."""
     blob = tags.get(_VARIABLES, b"")
     if not blob:
         return {}
@@ -139,7 +137,7 @@ def open_ptu(path: Path, trimdims: str = "") -> Any:
 
 
 def set_integer(file: Any, end: int, tag: bytes, value: int) -> None:
-    """Set the value of an integer tag in the header, which ends at byte `end`; the file's place is kept."""
+    """Set the value of an integer tag in the header, which ends at byte `end`; the position in the file is restored."""
     here = file.tell()
     file.seek(0)
     place = file.read(end).find(tag.ljust(32, b"\0"))
@@ -444,7 +442,7 @@ def _marker(bits: int) -> np.uint32:
 def _with_overflows(
     period: NDArray[np.int64], records: NDArray[np.uint32], last: np.int64
 ) -> tuple[NDArray[np.uint32], np.int64]:
-    """Records with overflow records between them: each tells of up to 1023 times 1024 periods."""
+    """Records with overflow records between them: each stands for up to 1023 times 1024 periods."""
     wraps = period // _WRAP
     steps = np.diff(wraps, prepend=last)
     extra = -(-steps // (_WRAP - 1))

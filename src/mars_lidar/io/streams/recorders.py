@@ -1,7 +1,5 @@
 """Files of photon counters: histograms (.ptu and related formats, .t3r, .spc, .sdt), and photons of .t3r and .spc."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -126,7 +124,7 @@ def _time_harp(path: Path) -> Photons:
 
 
 _SYNC = 1  # SP_MST_CLK: the macro clock is the laser's sync; 0: one of its own, others: the sync divided
-_MARKER_WRAP = 0xD  # a marker that tells of an overflow as well: phconvert 0.10 takes its bits for a number of them
+_MARKER_WRAP = 0xD  # a marker with an overflow: phconvert 0.10 reads its bits as the number of overflows
 
 
 def _becker_hickl(path: Path) -> Photons:

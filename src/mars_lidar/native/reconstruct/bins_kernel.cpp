@@ -184,6 +184,22 @@ BinSums MARS_JOIN(bin_terms_, MARS_LEVEL)(const TermsBlock& of) {
     return of.poisson ? terms_of<true>(of) : terms_of<false>(of);
 }
 
+void MARS_JOIN(bin_products_, MARS_LEVEL)(const ProductsBlock& of) {
+    double* product = of.products;
+    const auto row = [&](int a, int64_t i) { return of.rows[a] ? reals(of.rows[a] + i) : splat(1.0); };
+    for (int a = 0; a < of.number; ++a) {
+        Real sum[kParts] = {};
+        for_bins(of.bins, [&](int64_t i, int p) { sum[p] = sum[p] + reals(of.score + i) * row(a, i); });
+        of.sums[a] = total(sum);
+        for (int b = 0; b <= a; ++b) {
+            Real both[kParts] = {};
+            for_bins(of.bins,
+                     [&](int64_t i, int p) { both[p] = both[p] + reals(of.info + i) * row(a, i) * row(b, i); });
+            *product++ = total(both);
+        }
+    }
+}
+
 void MARS_JOIN(bin_law_, MARS_LEVEL)(const LawBlock& of) {
     const Passes alike(splat(of.flat));
     for (int64_t i = 0; i < of.bins; i += kReals) {

@@ -43,6 +43,16 @@ struct BinSums {
     double value = 0.0, score[3] = {}, info[6] = {};
 };
 
+// Of `number` rows (bins), of which one that is null is 1: the sum of each times `score`, and of the product of each two times
+// `info`, as the lower triangle of a matrix.
+struct ProductsBlock {
+    const double *score, *info;
+    const double* const* rows;
+    int number;
+    int64_t bins;
+    double *sums, *products;
+};
+
 // Mean of the registrations of each bin of `light` photons, of `flat` where that is null, its slope by them, variance, and
 // the chances that an armed and a re-armed pass register (R7).
 struct LawBlock {
@@ -91,6 +101,7 @@ MARS_DECLARE_KERNEL(ChangeSums, bin_change_, const ChangeBlock& block)
 MARS_DECLARE_KERNEL(void, arm_bins_, const ArmBlock& block)
 MARS_DECLARE_KERNEL(void, pulse_energy_, const EnergyBlock& block)
 MARS_DECLARE_KERNEL(BinSums, bin_terms_, const TermsBlock& block)
+MARS_DECLARE_KERNEL(void, bin_products_, const ProductsBlock& block)
 MARS_DECLARE_KERNEL(void, bin_law_, const LawBlock& block)
 MARS_DECLARE_KERNEL(void, background_series_, const SeriesBlock& block)
 

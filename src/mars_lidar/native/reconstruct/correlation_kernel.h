@@ -1,5 +1,5 @@
-// Correlation of a histogram with a short template, for the starts of maximum likelihood (reconstruct/delay_search.h) and the
-// scores of further returns (reconstruct/return_search.h).
+// Correlation of a histogram with a short template and what follows for each delay, for the starts of maximum likelihood
+// (reconstruct/delay_search.h) and the scores of further returns (reconstruct/return_search.h).
 #pragma once
 #include <cstdint>
 
@@ -40,6 +40,22 @@ struct Hills {
     int64_t* places;
 };
 
+// The score of a weak return at each of `points` delays, free of `unknowns` whose covariance is `spread` (R21), and the angles
+// between its directions (R22). `along` (unknowns, length): products of its direction with theirs; `beside`: with that of
+// the next delay. `variance` is the score's, afterwards what of it is left, 0 where that is not more than its part
+// `resolved`.
+struct FreeScores {
+    const double *score, *along, *spread, *beside;
+    double resolved;
+    int unknowns;
+    int64_t points, length;
+    double* variance;
+    double* left;   // (unknowns, length): spread x along
+    double* gain;   // the squared score over its variance; 0 of a negative score
+    double* angle;  // to the next delay's direction (points - 1), -1 where it is too large for a series
+};
+
+MARS_DECLARE_KERNEL(void, free_scores_, const FreeScores& of)
 MARS_DECLARE_KERNEL(int64_t, strongest_, const WeakPulses& of)
 MARS_DECLARE_KERNEL(int, hills_, const Hills& of)
 MARS_DECLARE_KERNEL(void, correlate_, const Correlation& of)

@@ -31,7 +31,7 @@ class ReturnSearch {
         points_ = (r_.bins + step_ - 1) / step_;  // the last step may be a shorter one
         place_.resize(points_ + 1);
         for (int64_t g = 0; g <= points_; ++g) place_[g] = std::min(g * step_, r_.bins);
-        for (std::vector<double>* each : {&score_at_, &variance_, &beside_}) each->resize(padded());
+        for (std::vector<double>* each : {&score_at_, &variance_, &beside_, &gain_, &angle_}) each->resize(padded());
         for (const double s : energy_) squared_.push_back(s * s);
         shifted_.assign(energy_.size(), 0.0);
         for (size_t i = static_cast<size_t>(step_); i < energy_.size(); ++i)
@@ -44,36 +44,40 @@ class ReturnSearch {
         const int unknowns = point.unknowns();
         bool free[kUnknowns] = {};
         for (int a = 0; a < unknowns; ++a) free[a] = point.information[a][a] > 0.0;
-        double spread[kUnknowns][kUnknowns];
-        if (!inverse<kUnknowns>(point.information, free, spread, unknowns)) return false;
-        extend(score_, [&](int64_t j) { return likelihood.score()[j]; });
-        extend(info_, [&](int64_t j) { return likelihood.info()[j] * r_.share(j); });
+        double whole[kUnknowns][kUnknowns], spread[kUnknowns * kUnknowns];
+        if (!inverse<kUnknowns>(point.information, free, whole, unknowns)) return false;
+        for (int a = 0; a < unknowns; ++a) std::copy_n(whole[a], unknowns, spread + a * unknowns);
+        extend(likelihood.score(), 1, score_);
+        extend(likelihood.info(), 2, info_);
         along_.resize(unknowns * padded());
-        left_.assign(unknowns * padded(), 0.0);
+        left_.resize(unknowns * padded());
         correlate(energy_, score_, score_at_.data());
         correlate(squared_, info_, variance_.data());
         correlate(shifted_, info_, beside_.data());
-        for (int a = 0; a < unknowns; ++a) {
+        correlate(energy_, info_, along_.data());
+        for (int64_t g = 0; g < padded(); ++g) along_[g] /= static_cast<double>(r_.bins);
+        nuisance_.assign(info_.size(), 0.0);
+        for (int a = 1; a < unknowns; ++a) {
             const int k = (a - 1) / 2;
-            const double* by = a == 0 ? nullptr : a % 2 == 1 ? likelihood.energy(k) : likelihood.slope(k);
-            const double scale = a == 0 ? 1.0 / static_cast<double>(r_.bins) : a % 2 == 1 ? 1.0 : point.at[a - 1];
-            extend(nuisance_, [&](int64_t j) { return scale * (by ? by[j] : r_.share(j)) * likelihood.info()[j]; });
-            correlate(energy_, nuisance_, &along_[a * padded()], a == 0 ? nullptr : &likelihood.pulse(k));
+            const double *by = a % 2 == 1 ? likelihood.energy(k) : likelihood.slope(k),
+                         *info = likelihood.info().data();
+            const double scale = a % 2 == 1 ? 1.0 : point.at[a - 1];
+            const auto fill = [&](double factor) {
+                likelihood.for_bins(k, [&](int64_t from, int64_t bins) {
+                    for (int64_t j = from; j < from + bins; ++j) {
+                        const int64_t i = j < shift() ? j - shift() + r_.bins : j - shift();
+                        const double its = factor * by[j] * info[j] * r_.share(j);
+                        for (int64_t to = i; to < static_cast<int64_t>(nuisance_.size()); to += r_.bins)
+                            nuisance_[to] = its;
+                    }
+                });
+            };
+            fill(scale);
+            correlate(energy_, nuisance_, &along_[a * padded()], &likelihood.pulse(k));
+            fill(0.0);
         }
-        known_.assign(points_, 0.0);
-        for (int a = 0; a < unknowns; ++a) {
-            const double* along = &along_[a * padded()];
-            double *left = &left_[a * padded()], *known = known_.data();
-            for (int b = 0; b < unknowns; ++b) {
-                const double *other = &along_[b * padded()], its = spread[a][b];
-                for (int64_t g = 0; g < points_; ++g) left[g] += its * other[g];
-            }
-            for (int64_t g = 0; g < points_; ++g) known[g] += left[g] * along[g];
-        }
-        for (int64_t g = 0; g < points_; ++g) {
-            const double rest = variance_[g] - known_[g];
-            variance_[g] = rest > kResolved * variance_[g] ? rest : 0.0;
-        }
+        free_scores_({score_at_.data(), along_.data(), spread, beside_.data(), kResolved, unknowns, points_, padded(),
+                      variance_.data(), left_.data(), gain_.data(), angle_.data()});
         measure(unknowns);
         collect(hints);
         return true;
@@ -104,12 +108,15 @@ class ReturnSearch {
     int64_t start(int64_t g) const { return shift() + place_[g]; }
     int64_t shift() const { return ((first_ % r_.bins) + r_.bins) % r_.bins; }
 
-    template <class Of>
-    void extend(std::vector<double>& out, const Of& of) const {
+    // The values of the bins, times their open shares to a power, from `shift` on round the period.
+    void extend(const std::vector<double>& values, int power, std::vector<double>& out) const {
         const int64_t n = r_.bins, taps = static_cast<int64_t>(energy_.size());
-        const int64_t end = std::max(2 * n + taps, shift() + length_of_rows());
+        const int64_t end = std::max(n + taps, length_of_rows());
         out.resize(end);
-        for (int64_t j = 0; j < n; ++j) out[j] = of(j) * r_.share(j);
+        std::copy_n(values.begin() + shift(), n - shift(), out.begin());
+        std::copy_n(values.begin(), shift(), out.begin() + n - shift());
+        for (int64_t i = 0; i < n && r_.gated(); ++i)
+            for (int k = 0; k < power; ++k) out[i] *= r_.share((shift() + i) % n);
         for (int64_t from = n; from < end; from += n)
             std::copy_n(out.begin(), std::min(n, end - from), out.begin() + from);
     }
@@ -122,7 +129,7 @@ class ReturnSearch {
         const double least = kRounding * *std::max_element(weights.begin(), weights.end());
         while (taps > 1 && weights[taps - 1] < least) --taps;
         while (lead + step_ < taps && weights[lead + step_ - 1] < least) lead += step_;
-        const double* const rows = in_rows(values, shift(), step_, length_of_rows(), rows_) + lead / step_;
+        const double* const rows = in_rows(values, 0, step_, length_of_rows(), rows_) + lead / step_;
         const double* const from = weights.data() + lead;
         if (!of) return correlate_({rows, from, length_of_rows(), taps - lead, points_, step_, out});
         std::fill_n(out, padded(), 0.0);
@@ -136,61 +143,53 @@ class ReturnSearch {
     int64_t padded() const { return correlated_points(points_); }
     int64_t length_of_rows() const { return correlated_length(points_, static_cast<int64_t>(energy_.size()), step_); }
 
-    // The angle of a cosine. Neighbouring directions differ little: a series there, to 1e-9.
-    static double angle_of(double cosine) {
-        const double u = 1.0 - cosine;
-        if (!(u > 0.0 && u < 0.05)) return std::acos(std::clamp(cosine, -1.0, 1.0));
-        return std::sqrt(2.0 * u) * (1.0 + u * (1.0 / 12 + u * (3.0 / 160 + u * (5.0 / 896 + u * 35.0 / 18432))));
-    }
-
     // The sum of the angles between the directions of neighbouring delays that are left.
     void measure(int unknowns) {
         const int64_t taps = static_cast<int64_t>(energy_.size());
-        length_ = 0.0;
-        int64_t last = -1, first = -1;
-        auto angle = [&](int64_t g, int64_t h, int64_t apart) {
-            double both = beside_[g];
-            if (apart != step_) {
-                both = 0.0;
-                const int64_t from = start(g);
-                for (int64_t i = apart; i < taps; ++i) both += energy_[i] * energy_[i - apart] * info_[from + i];
-            }
+        const auto turn = [&](int64_t g, int64_t h, int64_t apart) {
+            double both = h == g + 1 ? beside_[g] : 0.0;
+            for (int64_t i = apart; i < taps && h != g + 1; ++i)
+                both += energy_[i] * energy_[i - apart] * info_[place_[g] + i];
             for (int a = 0; a < unknowns; ++a) both -= along_[a * padded() + g] * left_[a * padded() + h];
-            return angle_of(both / std::sqrt(variance_[g] * variance_[h]));
+            return std::acos(std::clamp(both / std::sqrt(variance_[g] * variance_[h]), -1.0, 1.0));
         };
-        for (int64_t g = 0; g < points_; ++g) {
-            if (!(variance_[g] > 0.0)) continue;
-            if (last >= 0)
-                length_ += angle(last, g, place_[g] - place_[last]);
-            else
-                first = g;
-            last = g;
+        angle_[points_ - 1] = -1.0;
+        length_ = sums_of<1>(points_, [&](int64_t g) { return std::array<double, 1>{std::max(angle_[g], 0.0)}; })[0];
+        int64_t first = 0;
+        while (first < points_ && !(variance_[first] > 0.0)) ++first;
+        for (int64_t g = first; g < points_; ++g) {
+            if (angle_[g] >= 0.0 || !(variance_[g] > 0.0)) continue;
+            int64_t next = g + 1;
+            while (next < points_ && !(variance_[next] > 0.0)) ++next;
+            if (next < points_)
+                length_ += turn(g, next, place_[next] - place_[g]);
+            else if (g > first)
+                length_ += turn(g, first, r_.bins - place_[g] + place_[first]);
         }
-        if (last > first) length_ += angle(last, first, r_.bins - place_[last] + place_[first]);
     }
 
     void collect(std::vector<Hint>& hints) const {
         hints.clear();
         for (int64_t g = 0; g < points_; ++g) {
-            const double here = gain(g);
-            if (!(here > 0.0) || here < gain((g + points_ - 1) % points_) || here <= gain((g + 1) % points_)) continue;
+            const double here = gain_[g];
+            if (!(here > 0.0) || here < gain_[g > 0 ? g - 1 : points_ - 1] ||
+                here <= gain_[g + 1 < points_ ? g + 1 : 0])
+                continue;
             const double delay = (static_cast<double>(place_[g]) + 0.5) / static_cast<double>(r_.bins);
             hints.push_back({score_at_[g] / variance_[g], delay, here});
         }
         std::sort(hints.begin(), hints.end(), [](const Hint& a, const Hint& b) { return a.gain > b.gain; });
     }
 
-    double gain(int64_t g) const {
-        return variance_[g] > 0.0 && score_at_[g] > 0.0 ? score_at_[g] * score_at_[g] / variance_[g] : 0.0;
-    }
-
     const HistogramRecord& r_;
     void (*correlate_)(const FineCorrelation&) = kernel_at<const FineCorrelation&>("", MARS_KERNELS(correlate_finely_));
+    void (*free_scores_)(const FreeScores&) = kernel_at<const FreeScores&>("", MARS_KERNELS(free_scores_));
     int64_t first_ = 0, step_ = 1, points_ = 1;
     double length_ = 0.0;
     std::vector<int64_t> place_;             // (points + 1) bins
     std::vector<double> squared_, shifted_;  // of the energy: its square, and times itself a step before
-    std::vector<double> energy_, score_, info_, score_at_, variance_, beside_, along_, left_, known_, nuisance_, rows_;
+    std::vector<double> energy_, score_, info_, score_at_, variance_, beside_, along_, left_, gain_, angle_, nuisance_,
+        rows_;
 };
 
 }  // namespace mars

@@ -82,100 +82,91 @@ class ReturnsLikelihood {
         const double* x = point.at;
         const double flat = x[0] / static_cast<double>(n), step = 1.0 / static_cast<double>(n);
         whole = whole || flat > kDim;
-        illuminate(point, flat, whole);
+        place(point);
         point.value = 0.0;
-        std::fill(point.gradient, point.gradient + kUnknowns, 0.0);
-        for (auto& row : point.information) std::fill(row, row + kUnknowns, 0.0);
+        std::fill(point.gradient, point.gradient + point.unknowns(), 0.0);
+        for (int a = 0; a < point.unknowns(); ++a)
+            std::fill(point.information[a], point.information[a] + point.unknowns(), 0.0);
         OpenSums single;  // of the bins that are taken one by one, in whole vectors
         for (int64_t block = 0, blocks = static_cast<int64_t>(reached_.size()); block < blocks;) {
-            if (!reached_[block]) {
-                ++block;
-                continue;
-            }
             const int64_t from = block * kBinsTogether;
-            while (block < blocks && reached_[block]) ++block;
-            const int64_t bins = block * kBinsTogether - from;
-            point.value += bins_kernels()
-                               .terms({run_.count.data() + from, run_.armed.data() + from, run_.rearmed.data() + from,
-                                       light_.data() + from, nullptr, nullptr, nullptr, bins, 0.0, 0.0, r_.below_bin(),
-                                       true, score_.data() + from, info_.data() + from})
-                               .value;
-            const int64_t open = std::min(from + bins, n) - from;
-            const auto sum = sums_of<2>(open, [&](int64_t k) {
-                const double share = r_.share(from + k), score = score_[from + k] * share;
-                return std::array<double, 2>{score, info_[from + k] * share * share};
-            });
-            point.gradient[0] += sum[0] * step;
-            point.information[0][0] += sum[1] * step * step;
-            single.add(open_sums(r_, *passes_, from, open));
+            const uint8_t by = reached_[block];
+            while (block < blocks && reached_[block] == by) ++block;
+            if (!by && !whole) continue;
+            const int64_t bins = block * kBinsTogether - from, open = std::min(from + bins, n) - from;
+            add_run(point, by, flat, from, bins);
+            if (!whole) single.add(open_sums(r_, *passes_, from, open));
         }
-        const double time = all_.time - single.time, count = std::max(all_.count - single.count, 0.0);
-        if (!whole && time > 0.0) {
+        if (!whole && all_.time > single.time) {
+            const double time = all_.time - single.time, count = std::max(all_.count - single.count, 0.0);
             point.value += count * std::log(flat) + all_.log_shares - single.log_shares - flat * time;
             point.gradient[0] += (count / flat - time) * step;
             point.information[0][0] += time / flat * step * step;
         }
-        for (int a = 0; a < point.count; ++a) {
-            const double *s = energy(a), *ds = slope(a), scale[2] = {1.0, x[2 * a + 1]};
-            const int at = 2 * a + 1;
-            for_bins(a, [&](int64_t from, int64_t bins) {
-                const auto sum = sums_of<4>(bins, [&](int64_t k) {
-                    const int64_t j = from + k;
-                    const double back = info_[j] * r_.share(j);
-                    return std::array<double, 4>{score_[j] * s[j], score_[j] * ds[j], back * s[j], back * ds[j]};
-                });
-                for (int k = 0; k < 2; ++k) {
-                    point.gradient[at + k] += scale[k] * sum[k];
-                    point.information[0][at + k] += scale[k] * sum[2 + k] * step;
-                }
-                for (int b = 0; b <= a; ++b) {  // what the other does not reach is 0
-                    const double *t = energy(b), *dt = slope(b), scale_b[2] = {1.0, x[2 * b + 1]};
-                    const auto both = sums_of<4>(bins, [&](int64_t k) {
-                        const int64_t j = from + k;
-                        const double is = info_[j] * s[j], ids = info_[j] * ds[j];
-                        return std::array<double, 4>{is * t[j], is * dt[j], ids * t[j], ids * dt[j]};
-                    });
-                    for (int k = 0; k < 2; ++k)
-                        for (int m = 0; m < 2; ++m)
-                            point.information[at + k][2 * b + 1 + m] += scale[k] * scale_b[m] * both[2 * k + m];
-                }
-            });
-        }
         for (int a = 0; a < point.unknowns(); ++a)
-            for (int b = 0; b < a; ++b)
-                if (b == 0)
-                    point.information[a][0] = point.information[0][a];
-                else
-                    point.information[b][a] = point.information[a][b];
+            for (int b = 0; b < a; ++b) point.information[b][a] = point.information[a][b];
     }
 
-    // Light of the bins that are taken one by one, and energies and slopes of the returns.
-    void illuminate(const ReturnsPoint& point, double flat, bool whole) {
-        std::fill(reached_.begin(), reached_.end(), whole);
+    // Bins that the same returns reach, one bit of `by` for each.
+    void add_run(ReturnsPoint& point, uint8_t by, double flat, int64_t from, int64_t bins) {
+        const double *x = point.at, *share = run_.shares();
+        const double* rows[kUnknowns];
+        double scale[kUnknowns], sums[kUnknowns], products[kUnknowns * (kUnknowns + 1) / 2];
+        int unknown[kUnknowns], number = 1;
+        rows[0] = share ? share + from : nullptr;
+        unknown[0] = 0;
+        scale[0] = 1.0 / static_cast<double>(r_.bins);
+        double* light = light_.data() + from;
+        for (int64_t j = 0; j < bins; ++j) light[j] = share ? flat * share[from + j] : flat;
+        for (int k = 0; k < point.count; ++k) {
+            if (!(by >> k & 1)) continue;
+            const double* s = energy(k) + from;
+            for (int64_t j = 0; j < bins; ++j) light[j] += x[2 * k + 1] * s[j];
+            rows[number] = s;
+            rows[number + 1] = slope(k) + from;
+            for (int m = 0; m < 2; ++m, ++number) {
+                unknown[number] = 2 * k + 1 + m;
+                scale[number] = m == 0 ? 1.0 : x[2 * k + 1];
+            }
+        }
+        point.value += bins_kernels()
+                           .terms({run_.count.data() + from, run_.armed.data() + from, run_.rearmed.data() + from,
+                                   light, nullptr, nullptr, nullptr, bins, 0.0, 0.0, r_.below_bin(), true,
+                                   score_.data() + from, info_.data() + from})
+                           .value;
+        bins_kernels().products({score_.data() + from, info_.data() + from, rows, number, bins, sums, products});
+        const double* product = products;
+        for (int a = 0; a < number; ++a) {
+            point.gradient[unknown[a]] += scale[a] * sums[a];
+            for (int b = 0; b <= a; ++b) point.information[unknown[a]][unknown[b]] += scale[a] * scale[b] * *product++;
+        }
+    }
+
+    // Energies and slopes of the returns, and the bins that they reach.
+    void place(const ReturnsPoint& point) {
+        std::fill(reached_.begin(), reached_.end(), uint8_t{0});
         for (int k = 0; k < kMostReturns; ++k) {
-            for_bins(k, [&](int64_t from, int64_t bins) {  // of the last evaluation
-                std::fill_n(energy_.begin() + k * length_ + from, bins, 0.0);
-                std::fill_n(slope_.begin() + k * length_ + from, bins, 0.0);
-            });
-            pulse_[k].bins = 0;
-            if (k >= point.count) continue;
-            pulse_[k].set(r_, point.at[2 * k + 2]);
+            const bool here = k < point.count;
+            if (pulse_[k].bins > 0 && !(here && placed_[k] == point.at[2 * k + 2])) {
+                for_bins(k, [&](int64_t from, int64_t bins) {  // of the last evaluation
+                    std::fill_n(energy_.begin() + k * length_ + from, bins, 0.0);
+                    std::fill_n(slope_.begin() + k * length_ + from, bins, 0.0);
+                });
+                pulse_[k].bins = 0;
+            }
+            if (!here) continue;
+            const bool same = pulse_[k].bins > 0;
+            if (!same) pulse_[k].set(r_, placed_[k] = point.at[2 * k + 2]);
             const double *s = pulse_[k].energy.data(), *ds = pulse_[k].slope.data();
             for_bins(k, [&](int64_t from, int64_t bins) {
+                const int64_t end = (from + bins + kBinsTogether - 1) / kBinsTogether;
+                for (int64_t block = from / kBinsTogether; bins > 0 && block < end; ++block)
+                    reached_[block] |= static_cast<uint8_t>(1u << k);
+                if (same) return;
                 std::copy_n(s, bins, energy_.begin() + k * length_ + from);
                 std::copy_n(ds, bins, slope_.begin() + k * length_ + from);
                 s += bins;
                 ds += bins;
-                const int64_t end = (from + bins + kBinsTogether - 1) / kBinsTogether;
-                for (int64_t block = from / kBinsTogether; bins > 0 && block < end; ++block) reached_[block] = 1;
-            });
-        }
-        std::fill(light_.begin(), light_.end(), flat);
-        for (int64_t j = 0; j < r_.bins && r_.gated(); ++j) light_[j] *= r_.share(j);
-        for (int k = 0; k < point.count; ++k) {
-            const double *s = energy(k), signal = point.at[2 * k + 1];
-            for_bins(k, [&](int64_t from, int64_t bins) {
-                for (int64_t j = from; j < from + bins; ++j) light_[j] += signal * s[j];
             });
         }
     }
@@ -188,7 +179,8 @@ class ReturnsLikelihood {
     std::vector<double> light_, score_, info_;
     std::vector<double> energy_, slope_;  // (returns, bins), 0 beyond the pulse
     PulseBins pulse_[kMostReturns];
-    std::vector<uint8_t> reached_;  // (bins / kBinsTogether) whether they are taken one by one
+    double placed_[kMostReturns] = {};  // its delay
+    std::vector<uint8_t> reached_;      // (bins / kBinsTogether) by which returns, one bit for each
 };
 
 }  // namespace mars

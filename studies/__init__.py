@@ -30,8 +30,8 @@ class Request:
 
     `truth` is the engine whose simulation the study "count-law" takes for true; `stream` a measured photon stream for
     the study "hardware"; `config` the size of "downstream"; `seed` and `systems` another sweep, and its size, of the
-    studies "domain" and "long-exposures"; `rgbd` a folder of RGB-D pairs, `captures` one of measured cubes and
-    `drunet` a file of weights of deepinv's DRUNet for the study "image".
+    studies "domain" and "long-exposures", `seed` also other scenes for the coverage in the study "image"; `rgbd` a
+    folder of RGB-D pairs, `captures` one of measured cubes and `drunet` a file of weights of deepinv's DRUNet for it.
     """
 
     out: Path

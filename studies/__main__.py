@@ -45,7 +45,8 @@ def _parser(command: str) -> argparse.ArgumentParser:
         "(default: %(default)s); with --quick a tiny one, seconds"
     )
     add("--config", choices=("small", "full", "held-out"), default="small", help=words)
-    add("--seed", type=int, metavar="N", help="seed of the random systems (studies 'domain', 'long-exposures')")
+    words = "seed of the random systems (studies 'domain', 'long-exposures'), or of scenes for coverage (study 'image')"
+    add("--seed", type=int, metavar="N", help=words)
     add("--systems", type=int, metavar="N", help="number of random systems (studies 'domain', 'long-exposures')")
     words = "folder of RGB-D pairs, NAME_depth.png and NAME_colors.png or Middlebury folders (study 'image')"
     add("--rgbd", type=Path, metavar="DIR", help=words)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar import Detector, GaussianPulse, JointLaw, Pulse, SampledPulse, System, joint_law, simulate
+from mars_lidar import JointLaw, joint_law, simulate
 from mars_lidar._base.types import FloatArray
 from mars_lidar.engines.engine import Task
 from mars_lidar.engines.exact import ExactEngine
@@ -18,9 +18,8 @@ from mars_lidar.engines.feedback import FeedbackEngine, draw_rest
 from mars_lidar.statistics import ConvergenceError
 from studies import Facts, Request
 from studies.common.kept import Lines
-from studies.domain.systems import PERIOD_NS, Case
+from studies.domain.systems import LONG, PERIOD_NS, Case, draw_long
 
-FAMILIES = ("gaussian", "bright", "locked", "reflection", "samples", "spike", "returns", "waveform")
 MEAN_OFF = 0.3  # standard deviations of a bin or window that its mean may be off
 VARIANCE_OFF = 0.05  # of the variance of a bin or window, or of the mean over the bins near the pulse
 SIGMAS = 5.0  # standard errors that the sample's own noise may add
@@ -56,67 +55,6 @@ class _Sampled(FeedbackEngine):
         draw_rest(ExactEngine(), task, out, replace(rest, pixels=rest.pixels[:0]))
 
 
-def draw(seed: int, number: int) -> Case:
-    """System `number` of a sweep."""
-    random = np.random.default_rng([seed, number])
-    family = FAMILIES[number % len(FAMILIES)]
-
-    def log(low: float, high: float) -> float:
-        return float(np.exp(random.uniform(np.log(low), np.log(high))))
-
-    signal, background = log(0.05, 10.0), log(0.01, 10.0)
-    dead = int(random.integers(0, 4)) + float(random.uniform(0.02, 1.0))
-    pulse: Pulse = GaussianPulse(sigma_ns=log(1e-3, 0.02) * PERIOD_NS)
-    wave = None
-    if family == "bright":
-        signal, background = log(10.0, 100.0), log(0.005, 1.0)
-    elif family == "locked":
-        signal, background = log(3.0, 100.0), log(0.03, 12.0)
-        dead = float(random.uniform(0.7, 0.999)) if random.random() < 0.7 else dead
-    if family in ("reflection", "samples", "spike"):
-        signal, length = log(0.3, 60.0), log(0.02, 0.6)
-        pulse = _sampled(family, random, length)
-        if random.random() < 0.6:  # armed again within the record, some periods later
-            dead = int(random.integers(0, 4)) + max(length * float(random.uniform(0.05, 1.0)), 0.01)
-    elif random.random() < 0.25:  # next to whole periods
-        dead = max(1, int(random.integers(1, 4))) + float(random.choice([-1.0, 1.0])) * log(1e-5, 0.05)
-    delay = float(random.random())
-    signals: tuple[float, ...] = (signal,)
-    delays: tuple[float, ...] = (delay,)
-    if family == "returns":
-        signals = tuple((signal * random.dirichlet(np.ones(2))).tolist())
-        delays = (delay, (delay + float(random.uniform(0.0, 0.3))) % 1.0)
-    if family == "waveform":
-        t = (np.arange(1024) + 0.5) / 1024
-        shape = 0.2 + 5.0 * np.exp(-0.5 * (((t - delay + 0.5) % 1.0 - 0.5) / log(0.003, 0.05)) ** 2)
-        wave = shape * (signal / shape.sum())
-    system = System(
-        period_ns=PERIOD_NS,
-        cycles=int(log(3e4, 1e8)),
-        bins=int(random.choice([64, 100, 256, 1024])),
-        pulse=pulse,
-        detector=Detector(dead_time_ns=dead * PERIOD_NS),
-        start="stationary" if random.random() < 0.33 else "armed",
-    )
-    return Case(f"{seed}/{number}", family, system, signals, delays, background, wave, family)
-
-
-def _sampled(family: str, random: np.random.Generator, length: float) -> SampledPulse:
-    """A measured pulse `length` periods long."""
-    samples = round(float(np.exp(random.uniform(np.log(10), np.log(5000)))))
-    t = (np.arange(samples) + 0.5) / samples
-    if family == "reflection":
-        width, share = float(random.uniform(0.01, 0.06)), float(random.uniform(0.05, 0.8))
-        later = float(random.uniform(0.3, 0.75))
-        values = np.exp(-0.5 * ((t - 0.15) / width) ** 2) + share * np.exp(-0.5 * ((t - 0.15 - later) / width) ** 2)
-    elif family == "spike":
-        values = np.ones(samples)
-        values[int(random.integers(samples))] += samples * float(np.exp(random.uniform(np.log(0.01), np.log(0.5))))
-    else:
-        values = random.uniform(size=samples) ** 5
-    return SampledPulse(values, length * PERIOD_NS / samples, "first")
-
-
 def run(request: Request) -> Facts:
     """Random systems, compared one by one until so many were drawn by the engine and have a law."""
     settings = QUICK if request.quick else FULL
@@ -126,7 +64,7 @@ def run(request: Request) -> Facts:
     number = judged = 0
     while judged < settings.systems:
         if number not in lines.records:
-            lines.add(number, compare(draw(settings.seed, number), settings.items, number))
+            lines.add(number, compare(draw_long(settings.seed, number), settings.items, number))
             request.tell(f"{judged + 1} of {settings.systems}: {lines.records[number]}")
         judged += lines.records[number]["outcome"] in ("right", "wrong")
         number += 1
@@ -135,7 +73,7 @@ def run(request: Request) -> Facts:
     bias = Lines(request.out / "long_exposures_redrawn.jsonl", config)
     for k in often:
         if k not in bias.records:
-            bias.add(k, redrawn(draw(settings.seed, k), settings.items, k))
+            bias.add(k, redrawn(draw_long(settings.seed, k), settings.items, k))
             request.tell(f"redrawn: {bias.records[k]}")
     rows = [row for row in every if row["outcome"] in ("right", "wrong")]
     return {
@@ -143,7 +81,7 @@ def run(request: Request) -> Facts:
         "config": asdict(settings),
         "every": every,
         "outcomes": Counter(row["outcome"] for row in every),
-        "families": [_family(every, family) for family in FAMILIES],
+        "families": [_family(every, family) for family in LONG],
         "wrong": [row for row in rows if row["outcome"] == "wrong"],
         "drawn": rows,
         "seconds": sum(row["seconds"] for row in every),

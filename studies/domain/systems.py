@@ -90,11 +90,6 @@ class Case:
         returns = [Flux(s * row, b, d * PERIOD_NS) for s, b, d in parts]
         return Flux.multi(*returns) if len(returns) > 1 else returns[0]
 
-    @property
-    def predictable(self) -> bool:
-        """Whether the predictions are compared: for one return, or a waveform."""
-        return self.waveform is not None or len(self.signal) == 1
-
     def facts(self) -> dict[str, Any]:
         """One row of the data: what the maps are drawn over."""
         system = self.system
@@ -117,8 +112,8 @@ class Case:
 
 
 FluxRange = (1e-6, 1e3)
-FAMILIES = ("any", "locked", "dim", "waveform", "mode", "effects", "tails", "long", "ends")
-_SHARES = (0.22, 0.20, 0.11, 0.14, 0.12, 0.11, 0.03, 0.03, 0.04)
+FAMILIES = ("any", "electronics", "locked", "dim", "waveform", "mode", "effects", "tails", "long", "ends")
+_SHARES = (0.15, 0.11, 0.16, 0.11, 0.14, 0.12, 0.11, 0.03, 0.03, 0.04)
 Start = Literal["armed", "stationary"]
 
 
@@ -127,6 +122,14 @@ def draw(seed: int, number: int, family: str | None = None) -> Case:
     random = np.random.default_rng([seed, number])
     chosen = family or str(random.choice(FAMILIES, p=_SHARES))
     return _Draw(random, chosen).case(f"{seed}/{number}")
+
+
+LONG = ("gaussian", "bright", "locked", "reflection", "samples", "spike", "returns", "waveform")
+
+
+def draw_long(seed: int, number: int) -> Case:
+    """System `number` of the study of long exposures: kinds for which `feedback` had errors in earlier versions."""
+    return _Draw(np.random.default_rng([seed, number]), LONG[number % len(LONG)]).long(f"{seed}/{number}")
 
 
 class _Draw:
@@ -152,11 +155,14 @@ class _Draw:
         cycles = self._cycles(signal + background)
         wide = self.chance(0.04 if self.family == "locked" else 0.12)
         bins = round(self.log(2, 2**20)) if wide else 2 ** int(self.random.integers(1, 13))
+        if self.family == "electronics" and self.chance(0.5):
+            bins = round(self.log(2, 5000))
         if self.family == "ends":
             bins = int(self.random.choice([1, 2, 2, 2**20]))
         if self.family == "tails":
             bins = 2 ** int(np.ceil(np.log2(6.0 / self._width(pulse))))
-        wave, kind = self._waveform(signal) if self.family == "waveform" else (None, "")
+        waves = self.family == "waveform" or (self.family == "electronics" and self.chance(0.15))
+        wave, kind = self._waveform(signal) if waves else (None, "")
         signals, delays = self._returns(signal)
         start: Start = "stationary" if self.chance(0.33) and mode != MOVING and self.family != "tails" else "armed"
         detector = self._detector(mode, dead, bins)
@@ -181,7 +187,8 @@ class _Draw:
         return signal * (not self.chance(0.1)), background * (not self.chance(0.1))
 
     def _mode(self) -> str:
-        if self.family == "mode" or (self.family in ("waveform", "effects", "dim", "ends") and self.chance(0.35)):
+        others = {"mode": 1.0, "electronics": 0.15} | dict.fromkeys(("waveform", "effects", "dim", "ends"), 0.35)
+        if self.family == "mode" or (self.family in others and self.chance(others[self.family])):
             return str(self.random.choice(["paralyzable", "synchronous", "gated", MOVING]))
         return "nonparalyzable"
 
@@ -269,7 +276,7 @@ class _Draw:
 
     def _returns(self, signal: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
         first = float(self.random.choice([self.random.random(), self.random.random(), 0.0, 0.999]))
-        if self.family in ("any", "mode", "effects") and self.chance(0.25):
+        if self.family in ("any", "electronics", "mode", "effects") and self.chance(0.25):
             number = int(self.random.choice([2, 3, 16]))
             share = self.random.dirichlet(np.full(number, 0.7))
             near = self.random.random(number) * self.random.choice([0.05, 1.0])
@@ -311,6 +318,12 @@ class _Draw:
             fields["mode"] = mode
         if self.family == "effects":
             fields |= self._effects(mode, dead, bins)
+        if self.family == "electronics":
+            fields["electronics_dead_time_ns"] = (dead + self.log(1e-2, 3.0)) * PERIOD_NS
+            beside = {"detection_efficiency": self.log(0.1, 1.0), "jitter": self._jitter()}
+            if bins % 4 == 0:
+                beside["code_density"] = tuple(self.random.uniform(0.5, 1.5, 4).tolist())
+            fields |= {name: value for name, value in beside.items() if self.chance(0.2)}
         return Detector(**fields)
 
     def _jitter(self) -> Jitter:
@@ -336,3 +349,56 @@ class _Draw:
             possible["twilight_ns"] = float(self.random.uniform(0.01, 0.2)) * min(dead, 1.0) * PERIOD_NS
         names = self.random.choice(sorted(possible), size=int(self.random.integers(1, 4)), replace=False)
         return {str(name): possible[str(name)] for name in names}
+
+    def long(self, name: str) -> Case:
+        """A free-running pixel without effects that is exposed for long."""
+        random = self.random
+        signal, background = self.log(0.05, 10.0), self.log(0.01, 10.0)
+        dead = int(random.integers(0, 4)) + float(random.uniform(0.02, 1.0))
+        pulse: Pulse = GaussianPulse(sigma_ns=self.log(1e-3, 0.02) * PERIOD_NS)
+        wave = None
+        if self.family == "bright":
+            signal, background = self.log(10.0, 100.0), self.log(0.005, 1.0)
+        elif self.family == "locked":
+            signal, background = self.log(3.0, 100.0), self.log(0.03, 12.0)
+            dead = float(random.uniform(0.7, 0.999)) if self.chance(0.7) else dead
+        if self.family in ("reflection", "samples", "spike"):
+            signal, length = self.log(0.3, 60.0), self.log(0.02, 0.6)
+            pulse = self._long_pulse(length)
+            if self.chance(0.6):  # armed again within the record, some periods later
+                dead = int(random.integers(0, 4)) + max(length * float(random.uniform(0.05, 1.0)), 0.01)
+        elif self.chance(0.25):  # next to whole periods
+            dead = max(1, int(random.integers(1, 4))) + float(random.choice([-1.0, 1.0])) * self.log(1e-5, 0.05)
+        delay = float(random.random())
+        signals: tuple[float, ...] = (signal,)
+        delays: tuple[float, ...] = (delay,)
+        if self.family == "returns":
+            signals = tuple((signal * random.dirichlet(np.ones(2))).tolist())
+            delays = (delay, (delay + float(random.uniform(0.0, 0.3))) % 1.0)
+        if self.family == "waveform":
+            t = (np.arange(1024) + 0.5) / 1024
+            shape = 0.2 + 5.0 * np.exp(-0.5 * (((t - delay + 0.5) % 1.0 - 0.5) / self.log(0.003, 0.05)) ** 2)
+            wave = shape * (signal / shape.sum())
+        system = System(
+            period_ns=PERIOD_NS,
+            cycles=int(self.log(3e4, 1e8)),
+            bins=int(random.choice([64, 100, 256, 1024])),
+            pulse=pulse,
+            detector=Detector(dead_time_ns=dead * PERIOD_NS),
+            start="stationary" if self.chance(0.33) else "armed",
+        )
+        return Case(name, self.family, system, signals, delays, background, wave, self.family)
+
+    def _long_pulse(self, length: float) -> SampledPulse:
+        """A measured pulse `length` periods long."""
+        samples = round(self.log(10, 5000))
+        t = (np.arange(samples) + 0.5) / samples
+        if self.family == "reflection":
+            width, share, later = self.random.uniform((0.01, 0.05, 0.3), (0.06, 0.8, 0.75))
+            values = np.exp(-0.5 * ((t - 0.15) / width) ** 2) + share * np.exp(-0.5 * ((t - 0.15 - later) / width) ** 2)
+        elif self.family == "spike":
+            values = np.ones(samples)
+            values[int(self.random.integers(samples))] += samples * self.log(0.01, 0.5)
+        else:
+            values = self.random.uniform(size=samples) ** 5
+        return SampledPulse(values, length * PERIOD_NS / samples, "first")

@@ -5,15 +5,17 @@ from __future__ import annotations
 import resource
 import sys
 import time
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 
 from mars_lidar import System
-from mars_lidar.reconstruction import Image
+from mars_lidar.reconstruction import Image, UntrainedImage
 from mars_lidar.reconstruction.photons import Photons
 from studies.common.report import Row
 
@@ -21,16 +23,21 @@ _ROWS = 64  # drawn at a time
 
 
 def rows(sides: tuple[int, ...], system: System, photons: float, sbr: float) -> list[Row]:
-    """Seconds of one processor and the memory at most, above that of the photons themselves too, for each size."""
+    """Seconds of one processor and the memory at most, and before, for each size; without networks for the first."""
     out: list[Row] = []
     for side in sides:
         with TemporaryDirectory() as folder:
             path = Path(folder) / "photons.npz"
-            for step in (_draw, _cost):
-                with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as alone:
-                    result = alone.submit(step, path, side, system, photons, sbr).result()
-            out.append(result)
+            _alone(_draw, path, side, system, photons, sbr)
+            for method in (Image(), UntrainedImage()) if side == sides[0] else (Image(),):
+                out.append(_alone(_cost, path, side, system, method))
     return out
+
+
+def _alone(step: Callable[..., Row], *arguments: Any) -> Row:
+    """The result of a step in a process of its own."""
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as alone:
+        return alone.submit(step, *arguments).result()
 
 
 def _draw(path: Path, side: int, system: System, photons: float, sbr: float) -> Row:
@@ -39,16 +46,17 @@ def _draw(path: Path, side: int, system: System, photons: float, sbr: float) -> 
     return {}
 
 
-def _cost(path: Path, side: int, system: System, photons: float, sbr: float) -> Row:
+def _cost(path: Path, side: int, system: System, method: Image) -> Row:
     with np.load(path) as saved:
         given, delay = Photons(side, side, saved["first"], saved["bin"], saved["number"]), saved["delay"]
     before = _most_memory()
     began, at = time.process_time(), time.perf_counter()
-    estimate = Image().of_photons(given, system, 1)
+    estimate = method.of_photons(given, system, 1)
     seconds, wall = time.process_time() - began, time.perf_counter() - at
     off = np.abs((estimate.delay - delay + 0.5) % 1.0 - 0.5) * system.period_ns
     return {
         "pixels": f"{side} x {side}",
+        "method": method.name,
         "processor s": seconds,
         "wall s": wall,
         "memory at most, MB": _most_memory(),

@@ -52,7 +52,11 @@ METHODS: Methods = {
     "image": None,
 }
 DRUNET = "DRUNet prior"
-AGAIN = ", further exposures"  # of method "image" alone, for the coverage: appended to the part that they are of
+# scenes for the coverage alone, as many of each kind, which were drawn for the first time after it was settled how they
+# are drawn, how many, and what is reported of them
+FURTHER_SEED = 20261127
+FURTHER = ", further scenes"  # appended to the part that they belong to
+LEAST, MOST = 87.0, 93.0  # per cent: the coverage aimed at in every cell
 Results = dict[str, Reconstruction | FloatArray]  # of a method, or of a prior and of "truth" depths in m
 
 
@@ -60,7 +64,8 @@ Results = dict[str, Reconstruction | FloatArray]  # of a method, or of a prior a
 class Settings:
     """Side of the images, mean photons of signal of a pixel, signal to background, and sizes of the other parts.
 
-    `exposures` of each image, over which the coverage is averaged; `drunet`: steps and images of its training.
+    `further`: scenes of each kind for the coverage in the table's cells, and in other systems; `drunet`: steps and
+    images of its training.
     """
 
     size: int
@@ -69,12 +74,12 @@ class Settings:
     frozen: int
     two: int
     large: tuple[int, ...]
-    exposures: int
+    further: tuple[int, int]
     drunet: tuple[int, int]
 
 
-FULL = Settings(64, (1.0, 2.0, 5.0, 10.0), (0.03, 0.3, 1.0, 3.0), len(FROZEN), 48, (256, 2048), 4, (1500, 300))
-QUICK = Settings(16, (2.0,), (1.0,), 0, 16, (64,), 2, (20, 8))  # no frozen scene: a quick look is a look
+FULL = Settings(64, (1.0, 2.0, 5.0, 10.0), (0.03, 0.3, 1.0, 3.0), len(FROZEN), 48, (256, 2048), (12, 4), (1500, 300))
+QUICK = Settings(16, (2.0,), (1.0,), 0, 16, (64,), (2, 2), (20, 8))  # no frozen scene: a quick look is a look
 
 
 def systems() -> dict[str, System]:
@@ -93,32 +98,76 @@ def systems() -> dict[str, System]:
     }
 
 
+def often_dead() -> dict[str, System]:
+    """Dead times of 0 to 2 periods in an exposure of 50."""
+    times = (0.0, 50.0, 100.0, 200.0)
+    return {f"50 cycles, {t:g} ns": replace(SYSTEM, cycles=50, detector=Detector(dead_time_ns=t)) for t in times}
+
+
 def scenes(size: int) -> dict[str, Scene]:
     """Simulated scenes: the built-in ones, rough ground, and sticks of 1 to 2 pixels before a wall."""
-    rng = np.random.default_rng(SEED)
-    y, x = np.mgrid[:size, :size]
-    ground = 4.0 + 3.0 * y / size
-    rough, grass = busier(ground, np.full((size, size), 0.5), 0.09, rng)
-    sticks, bright = np.full((size, size), 7.0), np.full((size, size), 0.4)
-    for k in range(size // 8):
-        stick = (x - 8 * k - 3 - y // 6 >= 0) & (x - 8 * k - 3 - y // 6 < 1 + k % 2)
-        sticks, bright = np.where(stick, 4.0, sticks), np.where(stick, 0.8, bright)
     return {
         "room": Scene.example("room", size),
         "random": Scene.example("random", size, seed=901),
-        "rough ground": Scene(depth_m=rough, reflectivity=np.clip(grass, 0.02, 1.0)),
-        "sticks": Scene(depth_m=sticks, reflectivity=bright),
+        "rough ground": _ground(size, np.random.default_rng(SEED)),
+        "sticks": _sticks(size, 3, 6, 4.0),
     }
 
 
-def rgbd(folder: Path, size: int) -> dict[str, Scene]:
-    """The RGB-D pairs of a folder, NAME_depth.png beside NAME_colors.png, at this size."""
+def further_scenes(size: int, pairs: dict[str, Scene], each: int, seed: int) -> dict[str, Scene]:
+    """By kind and number, `each` other scenes of the kinds of `scenes`, and as many parts of the `pairs`."""
+    out = {}
+    for place, kind in enumerate([*scenes(size), *pairs]):
+        for k in range(each):
+            rng = np.random.default_rng([seed, place, k])
+            if kind in pairs:
+                scene = _part(pairs[kind], size, rng)
+            elif kind == "rough ground":
+                scene = _ground(size, rng)
+            elif kind == "sticks":
+                scene = _sticks(size, int(rng.integers(8)), int(rng.integers(3, 13)), 7.0 - rng.uniform(0.5, 5.0))
+            else:
+                scene = Scene.example(kind, size, seed=int(rng.integers(2**62)))
+            out[f"{kind} {k}"] = scene
+    return out
+
+
+def _ground(size: int, rng: np.random.Generator) -> Scene:
+    """Sloping ground with relief, texture and thin things in front."""
+    slope = 4.0 + 3.0 * np.mgrid[:size, :size][0] / size
+    rough, grass = busier(slope, np.full((size, size), 0.5), 0.09, rng)
+    return Scene(depth_m=rough, reflectivity=np.clip(grass, 0.02, 1.0))
+
+
+def _sticks(size: int, first: int, rise: int, depth_m: float) -> Scene:
+    """Sticks of 1 and 2 pixels, 8 pixels apart, that lean by a pixel every `rise` rows, before a wall at 7 m."""
+    y, x = np.mgrid[:size, :size]
+    depth, bright = np.full((size, size), 7.0), np.full((size, size), 0.4)
+    for k in range(size // 8):
+        across = x - 8 * k - first - y // rise
+        stick = (across >= 0) & (across < 1 + k % 2)
+        depth, bright = np.where(stick, depth_m, depth), np.where(stick, 0.8, bright)
+    return Scene(depth_m=depth, reflectivity=bright)
+
+
+def _part(pair: Scene, size: int, rng: np.random.Generator) -> Scene:
+    """Half to all of the sides of a scene, at random, mirrored or not."""
+    share = rng.uniform(0.5, 1.0)
+    sides = [round(share * side) for side in pair.shape]
+    top, left = (int(rng.integers(whole - side + 1)) for whole, side in zip(pair.shape, sides, strict=True))
+    part = pair[top : top + sides[0], left : left + sides[1]].resize(size)
+    step = int(rng.choice((-1, 1)))
+    return Scene(depth_m=part.depth_m[:, ::step], reflectivity=part.reflectivity[:, ::step])
+
+
+def rgbd(folder: Path) -> dict[str, Scene]:
+    """The RGB-D pairs of a folder, NAME_depth.png beside NAME_colors.png, and Middlebury folders."""
     pairs = {}
     for path in sorted(folder.glob("*_depth.png")):
         name = path.name.removesuffix("_depth.png")
-        pairs[name] = Scene.from_rgbd(path, path.with_name(f"{name}_colors.png"), size=size)
+        pairs[name] = Scene.from_rgbd(path, path.with_name(f"{name}_colors.png"))
     for path in sorted(folder.glob("middlebury_*")):
-        pairs[path.name] = Scene.from_rgbd(path, size=size)
+        pairs[path.name] = Scene.from_rgbd(path)
     return pairs
 
 
@@ -126,8 +175,8 @@ def run(request: Request) -> Facts:
     """Every scene, system and brightness by every method."""
     settings = QUICK if request.quick else FULL
     every = scenes(settings.size)
-    if request.rgbd is not None:
-        every |= rgbd(request.rgbd, settings.size)
+    pairs = {} if request.rgbd is None else rgbd(request.rgbd)
+    every |= {name: pair.resize(settings.size) for name, pair in pairs.items()}
     rows: list[Row] = []
     thin: list[Row] = []
     maps: Results = {}
@@ -139,9 +188,6 @@ def run(request: Request) -> Facts:
         at = {"scene": name, "system": words, "photons": photons, "sbr": sbr}
         lines, results = case(scene, system, photons, sbr, methods)
         rows.extend({"part": part} | at | x for x in lines)
-        for k in range(1, settings.exposures) if part in ("scenes", "systems", "dead time") else ():
-            (line,), _ = case(scene, system, photons, sbr, {"image": None}, SEED + k)
-            rows.append({"part": part + AGAIN} | at | line)
         if part == "scenes" and (name, photons, sbr) == (PICTURED[0], *_nearest(settings)):
             maps = results
         if name == "sticks" and sbr == _nearest(settings)[1]:
@@ -153,12 +199,11 @@ def run(request: Request) -> Facts:
                 add("scenes", name, scene, SYSTEM, photons, sbr, "100 ns")
     for words, system in systems().items():
         for name in ("room", "random"):
-            for photons in settings.photons[:3:2] or settings.photons:
+            for photons in _two(settings):
                 add("systems", name, every[name], system, photons, 1.0, words)
-    for dead_time in (0.0, 50.0, 100.0, 200.0):
-        system = replace(SYSTEM, cycles=50, detector=Detector(dead_time_ns=dead_time))
+    for words, system in often_dead().items():
         for name in ("room", "random"):
-            add("dead time", name, every[name], system, 5.0, 1.0, f"50 cycles, {dead_time:g} ns")
+            add("dead time", name, every[name], system, 5.0, 1.0, words)
     for seed in FROZEN[: settings.frozen]:
         frozen = Scene.example("random", settings.size, seed=seed)
         for photons in settings.photons[:3]:
@@ -172,6 +217,8 @@ def run(request: Request) -> Facts:
         request.tell("image: no folder of real captures was given (--captures): left out")
     bright = replace(SYSTEM, cycles=20_000)
     add("bright", "room", every["room"], bright, 500.0, 1.0, "20,000 cycles")
+    rows.extend(further_rows(request, settings, pairs))
+    cells = coverage(rows, "scenes", ("photons", "sbr"))
     request.tell("image: two returns, large images")
     return {
         "s": settings,
@@ -189,13 +236,44 @@ def run(request: Request) -> Facts:
         "before": _before(rows),
         "two": two_returns.rows(settings.two, SYSTEM, SEED),
         "large": large.rows(settings.large, SYSTEM, 2.0, 1.0),
-        "coverage": _coverage(rows, "scenes", ("photons", "sbr")),
-        "coverage_unseen": _coverage(rows, "systems", ("system",)),
-        "coverage_blind": _coverage(rows, "dead time", ("system",)),
+        "further_seed": further_seed(request),
+        "coverage": cells,
+        "unsure": [x for x in cells if LEAST <= x["mean %"] <= MOST and not _surely_inside(x)],
+        "coverage_by_kind": coverage(rows, "scenes", ("kind",)),
+        "coverage_unseen": coverage(rows, "systems", ("system",)),
+        "coverage_blind": coverage(rows, "dead time", ("system",)),
         "thin": thin,
         "rows": rows,
         "figures": {"": _figure(maps, settings)},
     }
+
+
+def further_seed(request: Request) -> int:
+    """Of the further scenes: that of the request, or `FURTHER_SEED`."""
+    return FURTHER_SEED if request.seed is None else request.seed
+
+
+def further_rows(request: Request, settings: Settings, pairs: dict[str, Scene]) -> list[Row]:
+    """The method, with and without networks, in one exposure of each further scene, in each cell and other system."""
+    methods: Methods = {"image_untrained": None, "image": None}
+    cells = [(SYSTEM, "100 ns", photons, sbr) for photons in settings.photons for sbr in settings.sbr]
+    others = [(system, words, photons, 1.0) for words, system in systems().items() for photons in _two(settings)]
+    dead = [(system, words, 5.0, 1.0) for words, system in often_dead().items()]
+    out: list[Row] = []
+    seed, (most, fewer) = further_seed(request), settings.further
+    for part, at, each in ("scenes", cells, most), ("systems", others, fewer), ("dead time", dead, fewer):
+        alike = further_scenes(settings.size, pairs, each, seed)
+        for system, words, photons, sbr in at:
+            request.tell(f"image: {part}{FURTHER}, {words}, {photons:g} photons, signal to background {sbr:g}")
+            for number, (name, scene) in enumerate(alike.items()):
+                line = {"part": part + FURTHER, "scene": name, "system": words, "photons": photons, "sbr": sbr}
+                out.extend(line | x for x in case(scene, system, photons, sbr, methods, seed + number)[0])
+    return out
+
+
+def _two(settings: Settings) -> tuple[float, ...]:
+    """Photons of the systems outside the training set."""
+    return settings.photons[:3:2] or settings.photons
 
 
 def _methods(request: Request, settings: Settings) -> tuple[Methods, str]:
@@ -355,29 +433,40 @@ def _before(rows: Iterable[Row]) -> list[Row]:
     return out
 
 
-def _coverage(rows: Iterable[Row], part: str, keys: tuple[str, ...]) -> list[Row]:
-    """Share of the intervals of method "image" that hold the truth, over all exposures: images, mean and its errors.
+def coverage(rows: Iterable[Row], part: str, keys: tuple[str, ...]) -> list[Row]:
+    """Share of the intervals of method "image" that contain the truth in the further scenes: all kinds weigh the same.
 
-    Of these for the same images from the scatter between exposures, for other scenes from that between images.
+    Its standard error for other scenes of these kinds is from the scatter between the scenes of a kind.
     """
-    groups: dict[tuple[Any, ...], dict[tuple[Any, ...], list[tuple[float, float]]]] = {}
+    groups: dict[tuple[Any, ...], dict[str, dict[str, dict[str, list[tuple[float, float]]]]]] = {}
     for row in rows:
-        if row["part"] in (part, part + AGAIN) and row["method"] == "image":
-            of = groups.setdefault(tuple(row[key] for key in keys), {})
-            image = row["scene"], row["photons"], row["sbr"]
-            of.setdefault(image, []).append((row["in 90 %"], row["answered %"]))
+        if row["part"] == part + FURTHER:
+            kind = row["scene"].rsplit(" ", 1)[0]
+            at = tuple(kind if key == "kind" else row[key] for key in keys)
+            of_kind = groups.setdefault(at, {}).setdefault(row["method"], {}).setdefault(kind, {})
+            of_kind.setdefault(row["scene"], []).append((row["in 90 %"], row["answered %"]))
     out: list[Row] = []
-    for at, images in groups.items():
-        inside, answered = np.moveaxis(np.array(list(images.values())), -1, 0)  # (images, exposures)
-        of_image = inside.mean(1)
-        error = np.sqrt((inside.var(1, ddof=1) / inside.shape[1]).sum()) / len(inside)
-        line: dict[str, Any] = dict(zip(keys, at, strict=True)) | {"least %": of_image.min(), "mean %": of_image.mean()}
-        line |= {"error of it %": error}
-        if part == "scenes":
-            line |= {"for other scenes %": of_image.std(ddof=1) / np.sqrt(len(inside))}
-        line |= {"largest %": of_image.max()}
-        out.append(line | {"answered %": answered.mean()})
+    for at, methods in groups.items():
+        of_scenes = {  # (scenes, 2): coverage and share answered, of each kind
+            method: [np.array([np.mean(x, 0) for x in of_kind.values()]) for of_kind in kinds.values()]
+            for method, kinds in methods.items()
+        }
+        inside = [x[:, 0] for x in of_scenes["image"]]
+        means = [float(x.mean()) for x in inside]
+        variance = sum(x.var(ddof=1) / len(x) for x in inside) / len(inside) ** 2
+        line: dict[str, Any] = dict(zip(keys, at, strict=True)) | {"scenes": sum(map(len, inside))}
+        line |= {"mean %": float(np.mean(means)), "error %": float(np.sqrt(variance))}
+        line |= {"lowest kind %": min(means), "highest kind %": max(means)} if "kind" not in keys else {}
+        line |= {"lowest scene %": float(np.concatenate(inside).min())}
+        line |= {"highest scene %": float(np.concatenate(inside).max())}
+        line |= {"answered %": float(np.mean([x[:, 1].mean() for x in of_scenes["image"]]))}
+        out.append(line | {"untrained, mean %": float(np.mean([x[:, 0].mean() for x in of_scenes["image_untrained"]]))})
     return out
+
+
+def _surely_inside(line: Row) -> bool:
+    """Whether two standard errors lie between the mean and the ends of the range."""
+    return bool(LEAST + 2.0 * line["error %"] <= line["mean %"] <= MOST - 2.0 * line["error %"])
 
 
 def _table(rows: Iterable[Row], part: str, keys: tuple[str, ...]) -> list[Row]:

@@ -34,6 +34,9 @@ LEVEL, OUTLIER_SIGMA = _core.IMAGE_LEVEL, _core.IMAGE_OUTLIER_SIGMA
 Floats = NDArray[np.float32]
 _REACHED = 6.0  # sigma, up to which an error counts
 _HELD_OUT = 12  # every so many-th image
+# of the pulse: the sampled pulses have 1.9 to 9.8, nine of ten of them more than 2.5. Of flatter ones, from a rectangle
+# to a raised cosine, 48 to 85 % of the intervals contain the truth (3 photons, ratio 1), of 2.6 and 2.8 88 to 92 %
+KURTOSIS = 2.5, 1e6
 UNCALIBRATED = {
     "interval_factor": 1.0,
     "interval_exponent": 0.0,
@@ -368,6 +371,7 @@ def _card(
             "sbr": [scenes.SBR[0] / 1.5, scenes.SBR[1] * 1.5],
             "cells": [0.5 * min(cells), 2.0 * max(cells)],
             "side": [17, 1000000],
+            "kurtosis": KURTOSIS,
         },
         "limits": "one surface a pixel",
         "command": "python -m studies image --train --out src/mars_lidar/reconstruction",

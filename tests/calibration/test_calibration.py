@@ -146,7 +146,7 @@ def test_the_law_of_the_shortest_interval(jitter: float) -> None:
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("seed", [1, 2, 3, *nightly(*range(4, 12))])
+@pytest.mark.parametrize("seed", [1, *nightly(*range(2, 12))])
 def test_a_dead_time_that_ends_in_a_gap_without_light(seed: int) -> None:
     """Hardly any light arrives between two pulses, where the dead time may end: its interval says so."""
     recorded = stream(GAP, 500, seed)
@@ -172,7 +172,7 @@ def test_a_few_photons_of_a_fine_clock_start_at_the_pulse() -> None:
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("seed", [2, 3])
+@pytest.mark.parametrize("seed", [2, *nightly(3)])
 def test_a_period_of_half_units_fits(seed: int) -> None:
     """100 ns are 1562.5 units: intervals over a laser pulse end in the middle of a unit, where cell edges were."""
     assert ml.calibrate(stream(BASE, 60_000, seed), seed=seed).p_value > 1e-3
@@ -199,7 +199,7 @@ def test_twilight_that_looks_like_afterpulses_is_named_alone() -> None:
 
 
 @pytest.mark.full
-@pytest.mark.parametrize(("probability", "delay"), [(0.1, 100.0), (0.05, 30.0)])
+@pytest.mark.parametrize(("probability", "delay"), [(0.1, 100.0), pytest.param(0.05, 30.0, marks=pytest.mark.nightly)])
 def test_strong_afterpulses_are_taken_in(probability: float, delay: float) -> None:
     """Those after the dead time, their mean delay, and the light beside them."""
     truth = replace(BASE, afterpulses=probability, afterpulse_delay=delay)

@@ -255,7 +255,7 @@ def test_mars_takes_a_table_over_the_range_of_an_image(tmp_path, monkeypatch):
         assert abs(cube.histogram[0, 9, 9].sum() - law[0].mean) < 6 * law[0].variance ** 0.5
     done = run(*given, "--engine", "mars", "--table", "none", "-o", tmp_path / "b.zarr")
     assert (done.exit_code, done.stderr) == (0, "")
-    result = compare(cube.flux, cube.system, ["mars"], realizations=50, repeats=1, pixels=1)
+    result = compare(cube.flux, cube.system, ["mars"], realizations=50, repeats=1)
     assert "by a table" in result.table
     (next((tmp_path / "cache").iterdir())).unlink()
     with io.load(tmp_path / "a.zarr") as cube, pytest.raises(ValueError, match="table must be the one"):

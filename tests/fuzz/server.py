@@ -20,11 +20,11 @@ ADDRESS_BYTES = 6 * 2**30
 
 
 class Server:
-    """A process that has imported everything, and is copied for every file."""
+    """A process that has imported everything, and is copied for every file; limits of a file in CPU seconds."""
 
-    def __init__(self) -> None:
+    def __init__(self, read_s: int = READ_S, refusal_s: float = REFUSAL_S) -> None:
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "tests.fuzz.server"],
+            [sys.executable, "-m", "tests.fuzz.server", str(read_s), str(refusal_s)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
@@ -69,14 +69,14 @@ def _resident_kib() -> int:
     return pages * resource.getpagesize() // 1024
 
 
-def _in_child(name: str, path: Path) -> dict[str, Any]:
+def _in_child(name: str, path: Path, read_s: int, refusal_s: float) -> dict[str, Any]:
     reading, writing = os.pipe()
     before = _resident_kib()  # now: the largest so far is inherited from who started this process
     child = os.fork()
     if child == 0:
         resource.setrlimit(resource.RLIMIT_AS, (ADDRESS_BYTES, ADDRESS_BYTES))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-        resource.setrlimit(resource.RLIMIT_CPU, (READ_S, READ_S))  # SIGKILL then
+        resource.setrlimit(resource.RLIMIT_CPU, (read_s, read_s + 1))  # SIGXCPU then
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, 1)
         os.dup2(nowhere, 2)
@@ -96,7 +96,7 @@ def _in_child(name: str, path: Path) -> dict[str, Any]:
     _, status, used = os.wait4(child, 0)
     seconds, mib = used.ru_utime + used.ru_stime, max(0, used.ru_maxrss - before) / 1024
     outcome: dict[str, Any]
-    if not content and (waited or seconds > 0.9 * READ_S):
+    if not content and (waited or os.waitstatus_to_exitcode(status) == -signal.SIGXCPU):
         outcome = {"kind": "hang", "told": f"no answer in {seconds:.0f} CPU s"}
     elif not content:
         outcome = {"kind": "crash", "told": f"status {status}"}
@@ -105,7 +105,7 @@ def _in_child(name: str, path: Path) -> dict[str, Any]:
             outcome = json.loads(content)
         except ValueError:  # a long text that was cut
             outcome = {"kind": "refused", "told": content.decode(errors="replace")}
-    if outcome["kind"] == "refused" and seconds > REFUSAL_S:
+    if outcome["kind"] == "refused" and seconds > refusal_s:
         outcome = {"kind": "hang", "told": f"{seconds:.1f} CPU s; {outcome['told']}"}
     elif (outcome["kind"] == "refused" and mib > REFUSAL_BYTES / 2**20) or 1024 * used.ru_maxrss > READ_BYTES:
         outcome = {"kind": "memory", "told": f"{mib:.0f} MiB; {outcome['told']}"}
@@ -121,6 +121,7 @@ if __name__ == "__main__":
 
     import tests.fuzz.formats  # noqa: F401
 
+    _limits = int(sys.argv[1]), float(sys.argv[2])
     for _line in sys.stdin:
         _name, _path = json.loads(_line)
-        print(json.dumps(_in_child(_name, Path(_path))), flush=True)
+        print(json.dumps(_in_child(_name, Path(_path), *_limits)), flush=True)

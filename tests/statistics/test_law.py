@@ -237,9 +237,12 @@ def test_a_pmf_that_contradicts_its_cumulants_is_refused(monkeypatch):
 
 @pytest.mark.full
 def test_random_systems_against_the_exact_engine():
-    """240 systems; the whole test fails by chance once in some ten thousand times."""
+    """120 systems; the whole test fails by chance once in some ten thousand times.
+
+    In 98 of 100 runs it detects a mean that is 7 standard errors off in one system, or 0.7 in all of them.
+    """
     scores, p_values = [], []
-    for number, case in enumerate(random_cases(240, 20261, photons=4e5)):
+    for number, case in enumerate(random_cases(120, 20261, photons=4e5)):
         law = count_law(case.flux[0, 0], case.system, threads=1)
         cube = ml.simulate(case.flux, case.system, realizations=500, seed=number, threads=1)
         counts = cube.sum(-1, dtype=np.int64).ravel()
@@ -250,7 +253,7 @@ def test_random_systems_against_the_exact_engine():
         spread = law.cumulants[3] + 2 * law.variance**2
         scores.append((((counts - law.mean) ** 2).mean() - law.variance) / math.sqrt(spread / counts.size))
         p_values.append(g_test(counts, law))
-    assert len(p_values) > 150
+    assert len(p_values) > 75
     assert np.abs(scores[::2]).max() < 4.9
     assert np.abs(scores[1::2]).max() < 7  # the square's own tails are heavier
     assert min(p_values) > 1e-7

@@ -22,23 +22,32 @@ from tests.harness.study import quick_study, written
 
 
 @pytest.fixture(scope="module")
-def quick(tmp_path_factory):
-    out = tmp_path_factory.mktemp("count_law")
-    quick_study("count-law", out)
-    return out
+def study(tmp_path_factory):
+    """Output folder of the study in its quick form, and the cells that it computed."""
+    out, computed = tmp_path_factory.mktemp("count_law"), []
+    compute = count_law.compute
+
+    def recorded(*arguments):
+        computed.append(compute(*arguments))
+        return computed[-1]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(count_law, "compute", recorded)
+        quick_study("count-law", out)
+    return out, *computed
 
 
 @pytest.fixture(scope="module")
-def cells():
-    return count_law.compute(count_law.QUICK, "sequential", str)
+def cells(study):
+    return study[1]
 
 
 @pytest.mark.full
-def test_files(quick):
-    study = written("count-law", quick)
-    assert len(study.figures) == 2
-    assert len(study.rows) == sum(grid.size for grid in count_law.QUICK.grids)
-    assert "engine `sequential`" in study.text
+def test_files(study):
+    result = written("count-law", study[0])
+    assert len(result.figures) == 2
+    assert len(result.rows) == sum(grid.size for grid in count_law.QUICK.grids)
+    assert "engine `sequential`" in result.text
 
 
 @pytest.mark.full

@@ -125,19 +125,43 @@ def test_without_deepinv_the_study_says_so(monkeypatch, tmp_path):
         run._methods(Request(tmp_path, drunet=tmp_path / "weights.pth"), run.QUICK)
 
 
-def test_coverage_of_several_exposures():
-    """Mean over images of the mean over their exposures; its errors from the scatter of exposures and of images."""
+def test_coverage_over_further_scenes():
+    """Kinds weigh the same; the error is from the scatter between the scenes of a kind, each a mean over its rows."""
     from studies.image import run
 
-    of = {"method": "image", "photons": 1.0, "sbr": 1.0, "answered %": 80.0}
-    rows = [{"part": "scenes", "scene": "a", "in 90 %": 90.0} | of]
-    rows += [{"part": "scenes" + run.AGAIN, "scene": "a", "in 90 %": 94.0} | of]
-    rows += [{"part": part, "scene": "b", "in 90 %": 80.0} | of for part in ("scenes", "scenes" + run.AGAIN)]
-    (line,) = run._coverage(rows, "scenes", ("photons", "sbr"))
-    assert line["mean %"] == 86.0
-    assert (line["least %"], line["largest %"]) == (80.0, 92.0)
-    assert line["error of it %"] == pytest.approx(np.sqrt(8.0 / 2.0) / 2.0)
-    assert line["for other scenes %"] == pytest.approx(6.0)  # of 92 and 80
+    shares = {"wall 0": (90.0, 94.0), "wall 1": (80.0,), "old wall 0": (70.0,), "old wall 1": (70.0,)}
+    shares |= {"old wall 2": (70.0,)}
+    rows = [
+        {"part": "scenes" + run.FURTHER, "scene": scene, "method": method, "photons": 1.0, "answered %": 80.0}
+        | {"in 90 %": share + 5.0 * (method == "image_untrained")}
+        for scene, of_scene in shares.items()
+        for share in of_scene
+        for method in ("image_untrained", "image")
+    ]
+    (line,) = run.coverage(rows, "scenes", ("photons",))
+    assert line["scenes"] == 5
+    assert line["mean %"] == 78.0  # of 86 and 70
+    assert line["untrained, mean %"] == 83.0
+    assert line["error %"] == pytest.approx(np.sqrt(72.0 / 2.0) / 2.0)
+    assert (line["lowest kind %"], line["highest kind %"]) == (70.0, 86.0)
+    assert (line["lowest scene %"], line["highest scene %"]) == (70.0, 92.0)
+    assert not run._surely_inside(line)
+    assert [x["mean %"] for x in run.coverage(rows, "scenes", ("kind",))] == [86.0, 70.0]
+
+
+def test_further_scenes_are_others_of_the_same_kinds():
+    from studies.image import run
+
+    pair = ml.Scene(np.arange(1.0, 1201.0).reshape(30, 40), np.full((30, 40), 0.5))
+    old, further = run.scenes(32), run.further_scenes(32, {"pair": pair}, 2, seed=1)
+    again = run.further_scenes(32, {"pair": pair}, 1, seed=1)
+    assert [name.rsplit(" ", 1)[0] for name in further] == [kind for kind in (*old, "pair") for _ in range(2)]
+    for kind in (*old, "pair"):
+        first, second = further[f"{kind} 0"], further[f"{kind} 1"]
+        assert not np.array_equal(first.depth_m, second.depth_m)
+        assert not np.array_equal(first.depth_m, old.get(kind, pair).depth_m)
+        np.testing.assert_array_equal(again[f"{kind} 0"].depth_m, first.depth_m)
+        assert first.shape == ((24, 32) if kind == "pair" else (32, 32))
 
 
 @pytest.mark.full

@@ -17,8 +17,8 @@ from mars_lidar._base.native import _core
 from mars_lidar._base.types import FloatArray, NDArray
 from mars_lidar.instrument.system import System
 from mars_lidar.reconstruction.histograms import Histograms
-from mars_lidar.reconstruction.image_network import networks
-from mars_lidar.reconstruction.image_pulse import settings_of
+from mars_lidar.reconstruction.image_network import networks, trained_for
+from mars_lidar.reconstruction.image_pulse import centroid_error, settings_of
 from mars_lidar.reconstruction.maximum_likelihood import MaximumLikelihood
 from mars_lidar.reconstruction.method import Estimates, Flags, Method
 from mars_lidar.reconstruction.photons import Photons
@@ -132,8 +132,10 @@ class Image(Method):
         settings = settings_of(system)
         solver = solver_of(photons, threads, self.efficiency, counted)
         maps, flags = np.empty((_core.IMAGE_SIZES["maps"], pixels)), np.empty(pixels, np.uint8)
-        solver.solve(settings, self._networks(), maps=maps, flags=flags)
+        solver.solve(settings, self._networks(system), maps=maps, flags=flags)
         delay, half_width, deviation, outlier, signal, signal_error, background, number = maps
+        of_bins, largest = centroid_error(system)
+        deviation, half_width = np.hypot(deviation, of_bins), np.hypot(half_width, largest)
         estimates = Estimates(
             signal=signal,
             background=background,
@@ -152,8 +154,8 @@ class Image(Method):
             _refit_bright(estimates, bright, width, photons, system, self.efficiency, threads)
         return estimates
 
-    def _networks(self) -> _core.ImageNetworks | None:
-        return networks()
+    def _networks(self, system: System) -> _core.ImageNetworks | None:
+        return networks() if trained_for(system.pulse) else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,7 +194,7 @@ class UntrainedImage(Image):
 
     name = "image_untrained"
 
-    def _networks(self) -> _core.ImageNetworks | None:
+    def _networks(self, system: System) -> _core.ImageNetworks | None:
         return None
 
 

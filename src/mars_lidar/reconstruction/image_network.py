@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.native import _core
+from mars_lidar.instrument.pulse import Pulse
+from mars_lidar.reconstruction.image_pulse import kurtosis
 
 WEIGHTS = Path(__file__).with_name("image_weights.npy")
 CARD = Path(__file__).with_name("image_card.json")
@@ -28,6 +30,12 @@ def card() -> dict[str, Any]:
 def networks() -> _core.ImageNetworks:
     """The networks of the package."""
     return networks_of(np.load(WEIGHTS), card())
+
+
+def trained_for(pulse: Pulse) -> bool:
+    """Whether the networks were trained on pulses of such a shape; of flatter ones their intervals are too narrow."""
+    low, high = card()["holds_for"]["kurtosis"]
+    return bool(low <= kurtosis(pulse) <= high)
 
 
 def networks_of(weights: NDArray[np.floating[Any]], of: dict[str, Any]) -> _core.ImageNetworks:

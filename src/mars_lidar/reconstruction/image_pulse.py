@@ -8,7 +8,7 @@ import numpy as np
 
 from mars_lidar._base.native import _core
 from mars_lidar._base.types import FloatArray, NDArray
-from mars_lidar.instrument.pulse import GaussianPulse
+from mars_lidar.instrument.pulse import GaussianPulse, Pulse
 from mars_lidar.instrument.system import System
 from mars_lidar.reconstruction.histogram_record import recording_of, relative_width
 
@@ -16,6 +16,8 @@ CELLS_PER_SIGMA = 1.5
 _MOST_CELLS = 4096  # a period, of the sum-product: narrower pulses are first blurred to it
 _LEAST_DENSITY = 1e-4  # of the pulse, relative to its largest, to which its slope is taken
 _SMOOTHING = 0.25  # widths of the pulse, of the Gaussian that takes the noise off the slope of a measured one
+_PLACES = 128  # of a pulse within a bin, over which the error of its centroid is taken
+_CURVE = 4096  # parts of a pulse for its moments
 
 
 def cell_count(system: System, blur: float = 0.0) -> int:
@@ -35,6 +37,38 @@ def settings_of(system: System) -> list[_core.ImageSetting]:
             blurs.append(blur)
             blur *= 0.5
     return [_setting(system, blur) for blur in (*blurs, 0.0)]
+
+
+@lru_cache(maxsize=16)
+def centroid_error(system: System) -> tuple[float, float]:
+    """By how much bins move the centroid of a surface's photons, over all places of the surface within a bin.
+
+    Root mean square, and what 90 % do not exceed, in periods. All photons share this error: more do not reduce it.
+    """
+    if not _within_bin(system):
+        return 0.0, 0.0  # of a Gaussian 0.2 % of a bin at most
+    low, high = (end / system.period_ns * system.bins for end in system.pulse.support_ns())
+    place = (np.arange(_PLACES) + 0.5) / _PLACES
+    edges = np.arange(math.floor(low), math.ceil(high) + 2)
+    energy = np.diff(system.pulse.cumulative((edges - place[:, None]) * system.period_ns / system.bins))
+    error = energy @ (edges[:-1] + 0.5) - place
+    error -= error.mean()
+    largest = float(np.quantile(np.abs(error), _core.IMAGE_LEVEL))
+    return float(error.std()) / system.bins, largest / system.bins
+
+
+@lru_cache(maxsize=16)
+def kurtosis(pulse: Pulse) -> float:
+    """Fourth central moment over the square of the second: 3 for a Gaussian, 1.8 for a rectangle."""
+    edges = np.linspace(*pulse.support_ns(), _CURVE + 1)
+    energy, x = np.diff(pulse.cumulative(edges)), 0.5 * (edges[:-1] + edges[1:])
+    x = x - float(energy @ x) / energy.sum()
+    return float(energy @ x**4 * energy.sum() / (energy @ x**2) ** 2)
+
+
+def _within_bin(system: System) -> bool:
+    """Whether the bins are so wide that the shape of the pulse is lost."""
+    return 1.0 / system.bins > 2.0 * relative_width(system)
 
 
 def _setting(system: System, blur: float) -> _core.ImageSetting:
@@ -81,7 +115,7 @@ def _score(system: System, blur: float, x: NDArray[Any], density: FloatArray) ->
     """
     width, bin_width = relative_width(system), 1.0 / system.bins
     plain = math.sqrt(width**2 + blur**2 + bin_width**2 / 12.0)
-    if isinstance(system.pulse, GaussianPulse) or bin_width > 2.0 * width or blur > width:
+    if isinstance(system.pulse, GaussianPulse) or _within_bin(system) or blur > width:
         weight = density / density.sum()
         return x - float((weight * x).sum()), plain
     from scipy.ndimage import gaussian_filter1d

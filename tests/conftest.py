@@ -67,12 +67,13 @@ def pytest_xdist_auto_num_workers() -> int:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Deselect the tests of the tiers above the one that `--tier` names."""
+    """Deselect the tests of the tiers above the one that `--tier` names; those that take long begin first."""
     above = TIERS[TIERS.index(config.getoption("--tier")) + 1 :]
     deselected = [item for item in items if any(item.get_closest_marker(tier) for tier in above)]
     if deselected:
         config.hook.pytest_deselected(items=deselected)
         items[:] = [item for item in items if item not in set(deselected)]
+    items.sort(key=lambda item: -max((mark.kwargs.get("seconds", 0) for mark in item.iter_markers("full")), default=0))
 
 
 def pytest_collection_finish() -> None:

@@ -151,11 +151,7 @@ def test_rules_hold_for_every_registration(mode: str, kind: str):
         ({"mode": "gated"}, ValueError, ["'gated'", "gate_start_ns"]),
         ({"mode": "gated", "gate_start_ns": 1.0}, ValueError, ["'gated'", "gate_width_ns"]),
         (GATE | {"gate_width_ns": 0.0}, ValueError, ["gate_width_ns", "(0, inf)", "got 0.0"]),
-        (GATE | {"gate_width_ns": "5"}, TypeError, ["gate_width_ns", "number", "got '5'"]),
-        (GATE | {"gate_start_ns": np.nan}, ValueError, ["gate_start_ns", "finite", "got nan"]),
-        (GATE | {"gate_step_ns": np.inf}, ValueError, ["gate_step_ns", "finite", "got inf"]),
         (MOVING | {"gate_cycles": 0}, ValueError, ["gate_cycles", "[1, ", "got 0"]),
-        (MOVING | {"gate_cycles": 2.5}, TypeError, ["gate_cycles", "integer", "got 2.5"]),
         (GATE | {"gate_cycles": 5}, ValueError, ["gate_cycles", "gate_step_ns", "gate_cycles=5"]),
     ],
 )

@@ -54,7 +54,7 @@ def test_compiles_without_spills(architecture: str, variants: list[Variant]):
             assert used.stack_bytes == 0, variant
 
 
-@pytest.mark.full
+@pytest.mark.full(seconds=15)
 @pytest.mark.parametrize(
     ("architecture", "kernels"),
     [

@@ -55,7 +55,7 @@ def test_a_killed_worker_loses_nothing(tmp_path, recipe, cluster):
     assert files(tmp_path / "one.zarr") == files(tmp_path / "two.zarr")
 
 
-@pytest.mark.full
+@pytest.mark.full(seconds=17)
 def test_a_cluster_that_starts_with_no_worker_fills(tmp_path, recipe):
     """Adaptive clusters start workers by the length of the queue; three parts in flight reached two of eight."""
     recipe |= {"realizations": 300}  # more work than the first worker does while the second starts

@@ -56,6 +56,7 @@ def objects(url: str) -> dict[str, bytes]:
     return {name.removeprefix(root + "/"): system.cat_file(name) for name in system.find(root)}
 
 
+@pytest.mark.full(seconds=17)
 def test_the_objects_are_the_files_of_a_folder(tmp_path, recipe, bucket):
     recipe |= {"realizations": 2}
     ml.generate(recipe, tmp_path / "one.zarr")

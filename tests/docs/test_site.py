@@ -78,6 +78,7 @@ def weight(file: Path) -> int:
     return len(gzip.compress(content)) if file.suffix in (".html", ".css", ".js", ".svg") else len(content)
 
 
+@pytest.mark.full(seconds=55)
 @pytest.mark.parametrize("step", [12, pytest.param(1, marks=pytest.mark.nightly)])
 def test_every_page_on_a_telephone(site: Path, browser: Any, step: int):
     """390 px wide: nothing that `shortcomings` lists, no error on the console, below 1 MB except pictures and the

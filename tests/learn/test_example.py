@@ -62,7 +62,7 @@ def test_learned_prior(deepinv):
     assert (denoised - true).square().mean() < 0.6 * (noisy - true).square().mean()
 
 
-@pytest.mark.full
+@pytest.mark.full(seconds=20)
 def test_stock_solvers_improve_on_each_pixel_alone(deepinv, tmp_path):
     """Three solvers of deepinv on a dim cube, DRUNet with weights trained here: all three images are nearer."""
     example = runpy.run_path(str(PATH.with_name("stock_solvers.py")))

@@ -124,8 +124,6 @@ def test_the_bound_knows_efficiency_and_dark_counts():
     ("change", "words"),
     [
         ({"background": 0.0}, "background must be > 0, got 0.0"),
-        ({"signal": -1.0}, "signal must lie in .* got -1.0"),
-        ({"delay_ns": math.nan}, "delay_ns must be finite.* got NaN"),
     ],
 )
 def test_bad_arguments_of_the_bound_are_named(change, words):
@@ -456,13 +454,8 @@ def test_window_error_is_that_of_the_raw_estimate():
     ("change", "message"),
     [
         ({"method": "coates"}, "'coates' is not for detectors of mode 'nonparalyzable'"),
-        ({"method": "best"}, "method must be one of"),
         ({"cube": np.zeros((3, 7), np.uint16)}, r"cube must be \(..., 500\)"),
-        ({"cube": np.full((1, 500), np.nan)}, "finite counts"),
-        ({"cube": np.full((1, 500), -1)}, "counts >= 0"),
         ({"level": 0.0}, "level must be"),
-        ({"attenuation": "cubic"}, "attenuation must be one of"),
-        ({"threads": 0}, "threads must be"),
         ({"system": with_dead(75.0, mode="paralyzable")}, "not for detectors of mode 'paralyzable'"),
         (
             {"system": with_dead(45.0, mode="gated", gate_start_ns=0.0, gate_width_ns=9.0, gate_step_ns=1.0)},

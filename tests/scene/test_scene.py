@@ -67,16 +67,10 @@ def test_repr_tells_size_depth_and_gaps():
         ((np.empty((0, 3)), 1.0), ValueError, "at least one pixel"),
         (([[0.0]], 1.0), ValueError, r"depth_m must be in \(0, 1e\+09\] m.*got 0.0 at pixel \(0, 0\)"),
         (([[1.0, -2.0]], 1.0), ValueError, r"got -2.0 at pixel \(0, 1\)"),
-        (([[math.inf]], 1.0), ValueError, "depth_m.*got inf"),
-        (([["a"]], 1.0), TypeError, "depth_m must be real numbers"),
-        (([[True]], 1.0), TypeError, "depth_m must be real numbers"),
-        (([[1j]], 1.0), TypeError, "depth_m must be real numbers"),
         (([[1.0]], 1.5), ValueError, r"reflectivity must be in \[0, 1\], got 1.5"),
         (([[1.0]], [[-0.1]]), ValueError, r"reflectivity must be in \[0, 1\], got -0.1"),
-        (([[1.0]], NAN), ValueError, r"reflectivity must be in \[0, 1\], got nan"),
         (([[1.0, 2.0]], [[1.0]]), ValueError, r"reflectivity must have the shape of depth_m, \(1, 2\)"),
         (([[1.0]], 1.0, -1.0), ValueError, "background must be finite and >= 0, got -1.0"),
-        (([[1.0]], 1.0, math.inf), ValueError, "background must be finite"),
         (([[1.0]], 1.0, [1.0, 2.0]), ValueError, "background must have the shape"),
     ],
 )
@@ -138,25 +132,6 @@ def test_resize_to_the_same_size_changes_nothing(scene):
 
 def test_resize_of_white_stays_white():
     assert (Scene(np.ones((997, 3)), 1.0).resize((101, 7)).reflectivity == 1.0).all()
-
-
-@pytest.mark.parametrize(
-    ("size", "error"),
-    [
-        (0, ValueError),
-        (-3, ValueError),
-        (2.5, TypeError),
-        ((3, 0), ValueError),
-        ((1, 2, 3), ValueError),
-        ("12", TypeError),
-        (True, TypeError),
-    ],
-)
-def test_bad_sizes_are_refused(size, error):
-    with pytest.raises(error, match="size must be"):
-        Scene([[1.0]], 1.0).resize(size)
-    with pytest.raises(error, match="size must be"):
-        Scene.example(size=size)
 
 
 # --- radiometry --------------------------------------------------------------------------------------------
@@ -283,18 +258,10 @@ def test_extreme_depths_and_maps_do_not_overflow(system):
     ("changes", "error", "message"),
     [
         ({"signal": 0.0}, ValueError, r"signal must be a finite number in \(0, inf\), got 0.0"),
-        ({"signal": NAN}, ValueError, "signal must be"),
-        ({"signal": "1"}, TypeError, "signal must be"),
         ({"sbr": 0.0}, ValueError, r"sbr must be a number in \(0, inf\].*got 0.0"),
-        ({"sbr": -1.0}, ValueError, "sbr must be"),
-        ({"sbr": NAN}, ValueError, "sbr must be"),
-        ({"sbr": None}, TypeError, "sbr must be"),
-        ({"sbr": True}, TypeError, "sbr must be"),
         ({"attenuation": "1/z2"}, ValueError, "attenuation must be one of 'none', 'inverse_square', got"),
         ({"ambient": "dark"}, ValueError, "ambient must be one of 'uniform', 'reflectivity', 'map', got"),
         ({"ambient": "map"}, ValueError, "ambient='map' needs a scene with a background map"),
-        ({"dark_count_hz": -1.0}, ValueError, "dark_count_hz must be"),
-        ({"system": None}, TypeError, "system must be a System, got None"),
         ({"signal": 1e7}, ValueError, r"signal must lie in \[0, 1e\+06\]"),
     ],
 )
@@ -327,9 +294,3 @@ def test_example_names_and_the_error_that_lists_them():
         assert Scene.example(name, size=4).shape == (4, 4)
     with pytest.raises(ValueError, match="name must be one of 'room', 'random', got 'kitchen'"):
         Scene.example("kitchen")
-
-
-@pytest.mark.parametrize(("seed", "error"), [(-1, ValueError), (1.5, TypeError), (None, TypeError)])
-def test_bad_example_seeds_are_refused(seed, error):
-    with pytest.raises(error, match="seed must be"):
-        Scene.example(seed=seed)

@@ -210,18 +210,8 @@ def test_bad_input_is_named():
         PhaseChain(np.array([1.0, -1.0]), 0.5)
     with pytest.raises(ValueError, match="photons must be"):
         PhaseChain(np.ones((2, 2)), 0.5)
-    with pytest.raises(ValueError, match="dead_time must be"):
-        PhaseChain(np.ones(4), -0.5)
-    with pytest.raises(ValueError, match="rearm must be one of 'centre', 'edge', got 'middle'"):
-        PhaseChain(np.ones(4), 0.5, "middle")
     with pytest.raises(ValueError, match=r"x must be \(4,\), got shape \(3,\)"):
         PhaseChain(np.ones(4), 0.5).forward(np.ones(3))
-    with pytest.raises(ValueError, match="signal must lie"):
-        photons_per_bin(ml.Flux(-1.0, 0.0, 50.0), system)
-    with pytest.raises(ValueError, match="background must lie"):
-        photons_per_bin(ml.Flux(1.0, float("nan"), 50.0), system)
-    with pytest.raises(ValueError, match="bins must be an integer"):
-        photons_per_bin(ml.Flux(1.0, 1.0, 50.0), system, bins=0)
 
 
 def test_a_grid_that_cannot_hold_the_flux_is_refused_by_name():

@@ -248,21 +248,6 @@ def test_convergence_errors_name_the_cell(monkeypatch):
         exposure_moments(ml.Flux(10.0, 0.01, 50.0), slow)
 
 
-@pytest.mark.parametrize(
-    ("change", "error", "message"),
-    [
-        ({"flux": 1.0}, TypeError, "flux must be a Flux, got 1.0 float"),
-        ({"system": 3}, TypeError, "system must be a System, got 3 int"),
-        ({"tolerance": 0.0}, ValueError, r"tolerance must be .*\[1e-09, 0.1\].*0"),
-        ({"threads": 0}, ValueError, r"threads must be an integer in \[1, 1024\], got 0"),
-    ],
-)
-def test_bad_input(change, error, message):
-    given = {"flux": ml.Flux(1.0, 1.0, 50.0), "system": system_of(0.6)} | change
-    with pytest.raises(error, match=message):
-        exposure_moments(**given)
-
-
 def test_history_that_cannot_fit_is_refused():
     with pytest.raises(MemoryError, match=r"t_d = 900000 periods.*GiB"):
         exposure_moments(ml.Flux(1.0, 1.0, 50.0), system_of(900_000.0, cycles=10**6))

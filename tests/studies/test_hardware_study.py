@@ -12,7 +12,7 @@ from studies.__main__ import main
 from tests.harness.study import quick_study
 
 
-@pytest.mark.full
+@pytest.mark.full(seconds=16)
 def test_quick(tmp_path):
     study = quick_study("hardware", tmp_path)
     assert study.figures == ["hardware_pixels.png", "hardware_range.png"]

@@ -23,7 +23,7 @@ from tests.harness.study import quick_study
 SYSTEM = make_system(20.0, 20_000, 250, sigma_ns=0.6)
 
 
-@pytest.mark.full
+@pytest.mark.full(seconds=14)
 def test_study(tmp_path):
     room = ml.Scene.example("room", 24).flux(SYSTEM, signal=100.0 / SYSTEM.cycles, sbr=1.0)
     (tmp_path / "captures").mkdir()
@@ -164,7 +164,7 @@ def test_further_scenes_are_others_of_the_same_kinds():
         assert first.shape == ((24, 32) if kind == "pair" else (32, 32))
 
 
-@pytest.mark.full
+@pytest.mark.full(seconds=18)
 def test_training_twice_gives_the_same_bits(tmp_path, monkeypatch):
     pytest.importorskip("torch")
     from studies.image import train

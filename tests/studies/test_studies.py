@@ -1,7 +1,6 @@
 """The studies in their quick form: they run, write what they promise, and their figures make sense."""
 
 import json
-import math
 from itertools import pairwise
 
 import numpy as np
@@ -16,7 +15,6 @@ from mars_lidar.statistics.count_pmf import Pmf, gaussian_pmf, total_variation
 from studies import STUDIES, Request
 from studies.__main__ import main
 from studies.common.distance import g_test, sampling_floor, variance_score
-from studies.common.report import table
 from studies.count_law import law
 from studies.covariance import run as covariance
 from studies.covariance import settings as modes
@@ -224,17 +222,6 @@ def test_help_lists_the_studies(capsys):
     assert stop.value.code == 0
     output = capsys.readouterr().out
     assert all(name in output and words in output for name, (_, words) in STUDIES.items())
-
-
-def test_table():
-    assert table([{"a": 1.23456, "b": "x"}, {"a": 123456.0, "b": 2}]).splitlines() == [
-        "| a | b |",
-        "|---|---|",
-        "| 1.235 | x |",
-        "| 123456 | 2 |",
-    ]
-    assert table([]) == ""
-    assert math.isclose(law._PER_SKEWNESS, 0.1258, abs_tol=1e-4)
 
 
 @pytest.mark.full

@@ -249,22 +249,16 @@ def test_axes():
 @pytest.mark.parametrize(
     ("change", "error", "message"),
     [
-        ({"system": "laser"}, TypeError, "system must be a System"),
         ({"signal": (0.1, 1.0)}, ValueError, r"signal must be \(low, high, points\)"),
         ({"signal": (0.0, 1.0, 5)}, ValueError, r"signal\[0\] must be a finite number in \(0"),
         ({"signal": (2.0, 1.0, 5)}, ValueError, "high > low"),
         ({"signal": (0.1, 1.0, 1)}, ValueError, r"signal\[2\] must be an integer in \[2, 4096\]"),
         ({"background": [1.0, 0.5]}, ValueError, "background must be strictly ascending"),
         ({"background": [-1.0, 0.5]}, ValueError, "background must be strictly ascending"),
-        ({"background": ["a"]}, TypeError, "background must be (.* )?real numbers"),
         ({"background": [[1.0]]}, ValueError, r"background must have shape \(n,\)"),
-        ({"method": "exact"}, ValueError, "method must be one of"),
         ({"rearm": "edge"}, ValueError, "rearm must be 'centre' for method 'exposure'"),
         ({"refine": 0.5}, ValueError, "refine must be"),
         ({"tolerance": 0.0}, ValueError, "tolerance must be"),
-        ({"check_law": 1}, TypeError, "check_law must be"),
-        ({"threads": 0}, ValueError, "threads must be"),
-        ({"progress": 3}, TypeError, "progress must be a callable"),
     ],
 )
 def test_bad_requests(change, error, message):

@@ -64,7 +64,7 @@ class PoissonSampler {
  private:
     // `word` gives the random bits of a step; steps are asked for in order.
     template <class Word>
-    int64_t number(const Word& word) {
+    MARS_INLINE int64_t number(const Word& word) {
         return mean_ < kInversionBelow ? invert(word(0)) : transform(word);
     }
 

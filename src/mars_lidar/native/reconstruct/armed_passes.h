@@ -9,6 +9,7 @@
 #include "reconstruct/bins_kernels.h"
 #include "reconstruct/count_rows.h"
 #include "reconstruct/histogram_record.h"
+#include "reconstruct/sums.h"
 
 namespace mars {
 
@@ -29,12 +30,17 @@ struct ArmedPasses {
           raw(count.size()),
           time(count.size()) {}
 
+    // `count` and `total` alone.
+    void set_counts(const HistogramRecord& r, const CountRows& histograms, int64_t pixel) {
+        histograms.copy(pixel, count.data());
+        total = sums_of<1>(r.bins, [&](int64_t j) { return std::array<double, 1>{count[j]}; })[0];
+    }
+
     void set(const HistogramRecord& r, const CountRows& histograms, int64_t pixel) {
         const int64_t n = r.bins;
-        histograms.copy(pixel, count.data());
+        set_counts(r, histograms, pixel);
         before[0] = 0.0;
         for (int64_t j = 0; j < n; ++j) before[j + 1] = before[j] + count[j];
-        total = before[n];
         arm(r);
         if (r.below_bin())
             std::copy(armed.begin(), armed.end(), time.begin());

@@ -35,7 +35,11 @@ class Corrector {
 
     // `finite`: no rate is infinite.
     uint8_t operator()(const CountRows& histograms, int64_t pixel, bool finite) {
-        passes_.set(r_, histograms, pixel);
+        const bool plain = settings_.correction == Correction::kNone;
+        if (plain)
+            passes_.set_counts(r_, histograms, pixel);
+        else
+            passes_.set(r_, histograms, pixel);
         rate.resize(r_.bins);
         variance.assign(r_.bins, 0.0);
         std::fill(rate.begin(), rate.end(), 0.0);
@@ -46,12 +50,9 @@ class Corrector {
             if (total > 0.0 && !chain_(passes_, total, rate)) flag |= kUnconverged;
             return flag;
         }
-        for (int64_t j = 0; j < r_.bins; ++j) {
+        for (int64_t j = 0; j < r_.bins && plain; ++j) rate[j] = passes_.count[j] / static_cast<double>(r_.cycles);
+        for (int64_t j = 0; j < r_.bins && !plain; ++j) {
             const double h = passes_.count[j];
-            if (settings_.correction == Correction::kNone) {
-                rate[j] = h / static_cast<double>(r_.cycles);
-                continue;
-            }
             rate[j] = finite_rate(j, &flag);
             if (!finite && (flag & kSaturated) && !std::isfinite(corrected_rate(r_, passes_, j, h))) rate[j] = HUGE_VAL;
             variance[j] = h > 0.0 ? rate[j] * rate[j] / h : 0.0;  // (R13)

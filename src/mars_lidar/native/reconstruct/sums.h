@@ -1,5 +1,6 @@
-// Sums over bins.
+// Sums over bins, and the largest.
 #pragma once
+#include <algorithm>
 #include <array>
 #include <cstddef>
 #include <cstdint>
@@ -33,6 +34,18 @@ std::array<double, number> sums_of(int64_t n, const Of& of) {
     for (size_t i = 0; i < number; ++i)
         for (int64_t k = 0; k < side; ++k) out[i] += part[i][k];
     return out;
+}
+
+// The largest of n numbers, by eight maxima side by side.
+inline double largest_of(const double* x, int64_t n) {
+    constexpr int64_t side = 8;
+    double part[side];
+    for (double& each : part) each = x[0];
+    int64_t j = 0;
+    for (; j + side <= n; j += side) MARS_SIDE_BY_SIDE
+    for (int64_t k = 0; k < side; ++k) part[k] = part[k] < x[j + k] ? x[j + k] : part[k];
+    for (; j < n; ++j) part[0] = std::max(part[0], x[j]);
+    return *std::max_element(part, part + side);
 }
 
 }  // namespace mars

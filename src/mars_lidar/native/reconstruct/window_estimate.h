@@ -30,6 +30,7 @@ class WindowEstimate {
         step_ = pulse.step;
         energy_ = std::move(pulse.energy);
         weight_.resize(energy_.size());
+        for (int64_t j = 0; j < r_.bins; ++j) share_.push_back(r_.share(j));
     }
 
     // `rate` (bins) photons per period; `variance` (bins) of them, or null.
@@ -38,7 +39,7 @@ class WindowEstimate {
         WindowResult out;
         double delay;
         if (locator_ == Locator::kPeak) {
-            const int64_t top = std::max_element(rate, rate + r_.bins) - rate;
+            const int64_t top = std::find(rate, rate + r_.bins, largest_of(rate, r_.bins)) - rate;
             delay = (static_cast<double>(top) + 0.5) / n - r_.peak;
         } else {
             delay = refine(rate, search(rate, energy_), [](double s, double) { return s; });
@@ -112,7 +113,6 @@ class WindowEstimate {
     // Background from outside of the window, signal from inside of it less that background (R16).
     WindowResult window(const double* rate, const double* variance, double delay) const {
         double inside = 0.0, shares = 0.0, energy = 0.0, noise = 0.0;
-        double all = 0.0, all_shares = 0.0, all_noise = 0.0;
         for_pulse_bins(r_, delay, r_.core_low, r_.core_high, [&](int64_t, int64_t j, double s, double) {
             if (r_.share(j) <= 0.0) return;
             inside += rate[j];
@@ -120,12 +120,10 @@ class WindowEstimate {
             energy += s;
             if (variance) noise += variance[j];
         });
-        for (int64_t j = 0; j < r_.bins; ++j) {
-            if (r_.share(j) <= 0.0) continue;
-            all += rate[j];
-            all_shares += r_.share(j);
-            if (variance) all_noise += variance[j];
-        }
+        const double *share = share_.data(), *noises = variance ? variance : rate;  // of no use without a variance
+        const auto [all, all_shares, all_noise] = sums_of<3>(r_.bins, [=](int64_t j) {
+            return std::array<double, 3>{share[j] > 0.0 ? rate[j] : 0.0, share[j], share[j] > 0.0 ? noises[j] : 0.0};
+        });
         WindowResult out;
         out.delay = delay;
         const double n = static_cast<double>(r_.bins), outside = all_shares - shares;
@@ -144,7 +142,7 @@ class WindowEstimate {
     const HistogramRecord& r_;
     Locator locator_;
     int64_t first_ = 0, step_ = 1;
-    std::vector<double> energy_, weight_, round_;
+    std::vector<double> energy_, weight_, round_, share_;
 };
 
 }  // namespace mars

@@ -111,7 +111,7 @@ class ItemOutput {
         if (to.sink == Sink::kHistogram32) std::fill_n(row<uint32_t>(), bins_, uint32_t{0});
     }
 
-    void operator()(int64_t cycle, double phase) {
+    MARS_INLINE void operator()(int64_t cycle, double phase) {
         switch (to_.sink) {
             case Sink::kCounts:
                 break;

@@ -30,9 +30,9 @@ constexpr double kPart = 0.4;         // of it, at most, in standard errors wher
 constexpr int kDepth = 3;             // halvings of a step of it in which a kink is looked for
 constexpr double kFallen = 1e-4;      // of the likelihood of the maximum: nothing
 constexpr double kUniform = 0.28867513459481287;  // standard deviation of the uniform law on a unit interval
-constexpr double kDrop = 2.0;      // of the logarithm of a likelihood at two standard errors
-constexpr double kNearDrop = 0.2;  // of it, at which a standard error is right to 5 %
-constexpr int kTrials = 12;        // for the place where it has fallen so far
+constexpr double kDrop = 2.0;                     // of the logarithm of a likelihood at two standard errors
+constexpr double kNearDrop = 0.2;                 // of it, at which a standard error is right to 5 %
+constexpr int kTrials = 12;                       // for the place where it has fallen so far
 constexpr double kRootTwoPi = 2.5066282746310002;
 constexpr int kMaximumColumns = 8;  // of the output: see Maximizer
 
@@ -65,7 +65,8 @@ struct Terrain {
 // Fisher scoring with Levenberg's damping: a step is taken if the likelihood does not fall. S >= 0 and B >= least. A
 // climb is given up where several times the gain that its next step promises would not make it the best.
 // `fixed`: a parameter that does not move.
-inline Fit climb(PixelLikelihood& pixel, const double* start, bool with_signal, const Terrain& terrain, int fixed = -1) {
+inline Fit climb(PixelLikelihood& pixel, const double* start, bool with_signal, const Terrain& terrain,
+                 int fixed = -1) {
     const double least = terrain.least, farthest = terrain.farthest;
     Fit fit;
     std::copy(start, start + 3, fit.at);

@@ -3,7 +3,6 @@
 from typing import TYPE_CHECKING
 
 from mars_lidar._version import __version__
-from mars_lidar.calibration import Calibration, calibrate
 from mars_lidar.engines.simulation import simulate, simulate_timestamps
 from mars_lidar.instrument.avalanches import Afterpulsing, Crosstalk
 from mars_lidar.instrument.detector import dark_count_map
@@ -70,6 +69,8 @@ if TYPE_CHECKING:
     from mars_lidar import io as io
     from mars_lidar import learn as learn
     from mars_lidar import plot as plot
+    from mars_lidar.calibration import Calibration as Calibration
+    from mars_lidar.calibration import calibrate as calibrate
     from mars_lidar.dataset import Generated as Generated
     from mars_lidar.dataset import generate as generate
     from mars_lidar.io import Cube as Cube
@@ -78,7 +79,14 @@ else:
     from importlib import import_module
 
     _LATER = ("dataset", "io", "learn", "plot")  # with what they import, only where they are used: `ml.io.load`
-    _HOMES = {"Cube": "io", "Generated": "dataset", "generate": "dataset", "to_xarray": "io"}
+    _HOMES = {
+        "Calibration": "calibration",
+        "Cube": "io",
+        "Generated": "dataset",
+        "calibrate": "calibration",
+        "generate": "dataset",
+        "to_xarray": "io",
+    }
 
     def __getattr__(name: str) -> object:
         if name in _LATER:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mars_lidar import _core
-from mars_lidar.dataset.codec import SparseCodec, events
+from mars_lidar.dataset.codec import SparseCodec
 
 
 def plain_decoder(packed: bytes) -> np.ndarray:
@@ -66,9 +66,6 @@ def test_packed_counts_come_back(name):
     out = np.full_like(counts, 7)
     _core.unpack_counts(packed, out)
     np.testing.assert_array_equal(out, counts)
-    position, count = events(packed)
-    np.testing.assert_array_equal(position, np.flatnonzero(counts))
-    np.testing.assert_array_equal(count, counts[position])
     np.testing.assert_array_equal(plain_decoder(packed.tobytes()), counts)
 
 

@@ -58,12 +58,4 @@ class SparseCodec(ArrayBytesCodec):
         return chunk_spec.prototype.nd_buffer.from_numpy_array(out)
 
 
-def events(packed: NDArray[np.uint8]) -> tuple[NDArray[np.int64], NDArray[np.uint32]]:
-    """Flat position and count of the elements of a packed chunk that are not zero; nothing dense is made."""
-    number = _core.packed_events(packed)
-    position, count = np.empty(number, np.int64), np.empty(number, np.uint32)
-    _core.unpack_events(packed, position, count)
-    return position, count
-
-
 register_codec(NAME, SparseCodec)

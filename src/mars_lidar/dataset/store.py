@@ -73,8 +73,8 @@ class Dataset:
             )
         check_zarr_threads()
         self.sums = manifest.require(path, listed=listed) if self.complete else None
-        store, mode = store_at(path, self.sums, read_only=self.complete), "r" if self.complete else "r+"
-        self.group: Any = zarr.open_group(store, mode=mode, use_consolidated=False)
+        store = store_at(path, self.sums, read_only=self.complete)
+        self.group: Any = zarr.open_group(store, mode="r" if self.complete else "r+", use_consolidated=False)
         self.recipe = DatasetRecipe.from_dict(json.loads(self.attrs["recipe"]))
 
     def __repr__(self) -> str:
@@ -205,11 +205,6 @@ class Dataset:
         """Checksum of the manifest of a complete store: stores with the same identity are identical byte for byte."""
         return "" if self.sums is None else self.sums.identity
 
-    def check(self, file: Path) -> None:
-        """Raise FileError if a file of a complete store has changed since it was opened."""
-        if self.sums is not None:
-            self.sums.check(file.relative_to(self.path).as_posix())
-
     def read(self, name: str) -> bytes:
         """The content of a file of a complete store, as it was when the store was sealed."""
         assert self.sums is not None, "incomplete stores are not read by name"
@@ -336,26 +331,14 @@ def read_sparse(dataset: Dataset | str | Path, sample: int, realization: int = 0
     number, realizations, height, width, bins = array.shape
     sample = checks.integer("sample", sample, low=0, high=number - 1)
     realization = checks.integer("realization", realization, low=0, high=realizations - 1)
-    if source.recipe.layout == "dense":
-        counts = np.asarray(array[sample, realization]).reshape(height * width, bins)
-        row, column = np.nonzero(counts)
-        return scipy.sparse.coo_array((counts[row, column], (row, column)), shape=counts.shape)
-    from mars_lidar.dataset.codec import events
-
-    _, _, rows, columns, _ = chunk = array.chunks
     parts = []
-    for y, x in np.ndindex(arrays.grid((height, width), (rows, columns))):
-        position, count = events(_packed(source, (sample // chunk[0], realization // chunk[1], y, x, 0)))
-        first, second, row, column, time = np.unravel_index(position, chunk)
-        selected = (first == sample % chunk[0]) & (second == realization % chunk[1])
-        parts.append(
-            ((y * rows + row[selected]) * width + x * columns + column[selected], time[selected], count[selected])
-        )
-    row, column, count = (np.concatenate(column) for column in zip(*parts, strict=True))
-    if columns < width:
-        order = np.lexsort((column, row))
-        row, column, count = row[order], column[order], count[order]
-    return scipy.sparse.coo_array((count.astype(array.dtype), (row, column)), shape=(height * width, bins))
+    with reading(source.path, "a dataset of mars-lidar"):
+        for top in range(0, height, array.chunks[2]):
+            counts = np.asarray(array[sample, realization, top : top + array.chunks[2]]).reshape(-1)
+            place = np.flatnonzero(counts)
+            parts.append((place + top * width * bins, counts[place]))
+    place, count = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return scipy.sparse.coo_array((count, np.divmod(place, bins)), shape=(height * width, bins))
 
 
 class Block:
@@ -446,28 +429,3 @@ def _index(tail: bytes, path: Path) -> NDArray[np.uint64]:
     if not is_good(tail):
         raise FileError(f"{path}: the index of a shard is damaged (its checksum differs)")
     return np.frombuffer(tail[:-4], "<u8").reshape(-1, 2)
-
-
-def _packed(dataset: Dataset, place: tuple[int, ...]) -> NDArray[np.uint8]:
-    """The bytes of one packed chunk of the histogram: one read of the shard's index, one of the chunk.
-
-    Zarr v3, sharding codec: the file ends in the index, offset and length of each chunk in C order, and its checksum.
-    """
-    array: Any = dataset.histogram
-    each = tuple(shard // chunk for shard, chunk in zip(array.shards, array.chunks, strict=True))
-    shard = tuple(p // n for p, n in zip(place, each, strict=True))
-    inside = int(np.ravel_multi_index(tuple(p % n for p, n in zip(place, each, strict=True)), each))
-    path = dataset.path / "histogram" / array.metadata.encode_chunk_key(shard)
-    with reading(dataset.path, "a dataset of mars-lidar"):
-        dataset.check(path)
-        with open(path, "rb") as stream:
-            stream.seek(16 * (inside - math.prod(each)) - 4, 2)
-            offset, length = (int(n) for n in np.frombuffer(stream.read(16), "<u8"))
-            if offset + length > path.stat().st_size:
-                raise ValueError(f"{path}: chunk {inside} is damaged (it lies beyond the end)")
-            stream.seek(offset)
-            packed = stream.read(length)
-        dataset.check(path)  # it may have been replaced meanwhile
-        if len(packed) != length or not is_good(packed):
-            raise ValueError(f"{path}: chunk {inside} is damaged (its checksum differs)")
-    return np.frombuffer(packed, np.uint8)[:-4]

@@ -56,8 +56,7 @@ def verify(
     """Simulate random chunks of a dataset again, with the maps of their samples, and compare every number.
 
     The scenes and the recipe in the store are used, so that source files are not needed. Every byte of the store is
-    compared with its manifest, and every coordinate and label with the recipe. Stores of earlier versions have no
-    manifest: their scenes and the rest of their metadata cannot be checked.
+    compared with its manifest, and every coordinate and label with the recipe.
 
     Parameters
     ----------
@@ -66,7 +65,7 @@ def verify(
     chunks
         Number of chunks; None: all.
     seed
-    Seed of the choice.
+        Seed of the choice.
     threads, progress
         As for `mars_lidar.generate`.
 

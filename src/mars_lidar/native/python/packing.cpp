@@ -43,21 +43,6 @@ void unpack_batch(const std::vector<Vector<const uint8_t>>& packed, Matrix<Count
     for (size_t k = 0; k < packed.size(); ++k) unpack_one(packed[k], out.data() + k * size, size);
 }
 
-uint64_t events_of(Vector<const uint8_t> packed) { return Packed(packed.data(), packed.shape(0)).events; }
-
-void unpack_events(Vector<const uint8_t> packed, Vector<int64_t> position, Vector<uint32_t> count) {
-    const nb::gil_scoped_release release;
-    const Packed source(packed.data(), packed.shape(0));
-    if (position.shape(0) != source.events || count.shape(0) != source.events)
-        throw std::invalid_argument("position and count must have one element per event");
-    int64_t* const where = position.data();
-    uint32_t* const number = count.data();
-    source.for_each([&](uint64_t k, uint64_t at, uint32_t more) {
-        where[k] = static_cast<int64_t>(at);
-        number[k] = more + 1;
-    });
-}
-
 }  // namespace
 
 void bind_packing(nb::module_& module) {
@@ -73,9 +58,6 @@ void bind_packing(nb::module_& module) {
     module.def("unpack_batch", &unpack_batch<int16_t>, "packed"_a, "out"_a.noconvert());
     module.def("unpack_batch", &unpack_batch<int32_t>, "packed"_a, "out"_a.noconvert());
     module.def("unpack_batch", &unpack_batch<float>, "packed"_a, "out"_a.noconvert());
-    module.def("packed_events", &events_of, "packed"_a, "Elements that are not zero.");
-    module.def("unpack_events", &unpack_events, "packed"_a, "position"_a.noconvert(), "count"_a.noconvert(),
-               "Fill position and count (events,) of the elements that are not zero.");
 }
 
 }  // namespace mars

@@ -209,34 +209,6 @@ def test_vector_levels_agree(level):
     np.testing.assert_allclose(on_grid(1.3, 0.6, system, 256, level=level)[0], narrowest, rtol=1e-11)
 
 
-def test_batch_equals_single():
-    system = system_of(0.6375, bins=7)
-    signal, background = np.array([[0.0], [0.3], [8.0]]), np.array([0.0, 0.01, 2.0])
-    batch = exposure_moments(ml.Flux(signal, background, 20.0), system, threads=2)
-    assert batch.cumulants.shape == (3, 3, 4)
-    assert batch.histogram.shape == (3, 3, 7)
-    for i, j in np.ndindex(3, 3):
-        single = exposure_moments(ml.Flux(signal[i, 0], background[j], 20.0), system, threads=1)
-        if single.bins == batch.bins[i, j]:
-            np.testing.assert_allclose(batch.cumulants[i, j], single.cumulants, rtol=1e-9, atol=1e-12)
-            np.testing.assert_allclose(batch.histogram[i, j], single.histogram, rtol=1e-9, atol=1e-12)
-    assert (batch.cumulants[0, 0] == 0).all()
-    assert (batch.histogram >= 0).all()
-    np.testing.assert_allclose(batch.histogram.sum(-1), batch.mean, rtol=1e-10)
-    assert (batch.movement <= 1e-4).all()
-
-
-def test_waveforms():
-    system = system_of(0.6375, bins=32, sigma=0.01)
-    sampled = 2.0 * system.pulse.bin_energy(40.0, 100.0, 4096)
-    by_pulse = exposure_moments(ml.Flux(2.0, 0.3, 40.0), system)
-    by_waveform = exposure_moments(ml.Flux(waveform=np.stack([sampled, 0.5 * sampled]), background=0.3), system)
-    np.testing.assert_allclose(by_waveform.cumulants[0], by_pulse.cumulants, rtol=1e-5)
-    np.testing.assert_allclose(by_waveform.histogram[0], by_pulse.histogram, rtol=1e-4, atol=1e-6)
-    flat = exposure_moments(ml.Flux(waveform=np.full(10, 0.15), background=0.5), system)
-    np.testing.assert_allclose(flat.cumulants, exposure_moments(ml.Flux(0.0, 2.0), system).cumulants, rtol=1e-6)
-
-
 def test_convergence_errors_name_the_cell(monkeypatch):
     monkeypatch.setitem(vars(TOL), "most_bins", 256)
     with pytest.raises(ConvergenceError, match=r"S = 200, B = 1 .* still move"):

@@ -182,20 +182,6 @@ def test_shapes():
     assert 0.5 * np.abs(short - shapes["stationary"][0]).sum() > 0.02
 
 
-def test_waveforms_and_methods():
-    system = system_of(0.6375, sigma=0.01)
-    wave = 2.0 * system.pulse.bin_energy(40.0, 100.0, 2048)
-    for method in ("exact", "mars", "renewal", "poisson"):
-        by_wave = count_law(ml.Flux(waveform=wave, background=0.3), system, method)
-        by_pulse = count_law(ml.Flux(2.0, 0.3, 40.0), system, method)
-        np.testing.assert_allclose(by_wave.mean, by_pulse.mean, rtol=1e-5)
-        np.testing.assert_allclose(by_wave.variance, by_pulse.variance, rtol=1e-4)
-    for method in ("exposure", "stationary", "chain"):
-        by_wave = registration_pdf(ml.Flux(waveform=wave, background=0.3), system, method)
-        by_pulse = registration_pdf(ml.Flux(2.0, 0.3, 40.0), system, method)
-        assert 0.5 * np.abs(by_wave - by_pulse).sum() < 1e-3
-
-
 @pytest.mark.parametrize(
     ("call", "error", "message"),
     [

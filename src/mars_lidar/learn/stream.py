@@ -11,13 +11,13 @@ from __future__ import annotations
 
 import math
 import os
-import queue
 import sys
-import threading
 import warnings
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +32,6 @@ from mars_lidar.io.scene_files import SceneFile
 from mars_lidar.learn.needed import torch
 from mars_lidar.learn.ranges import LogUniform, Range, SystemRange, as_range, as_systems
 from mars_lidar.learn.scenes import Recipe, Sample, as_source, example_of
-from mars_lidar.learn.tolerances import TOLERANCES
 from mars_lidar.scene.radiometry import AMBIENTS, ATTENUATIONS
 from mars_lidar.scene.scene import Scene
 
@@ -167,47 +166,20 @@ T = TypeVar("T")
 
 
 def prefetched(items: Iterator[T], number: int) -> Iterator[T]:
-    """The items of an iterator, in order, with up to `number` of them computed ahead.
+    """The items of an iterator, in order, with up to `number` of them computed ahead by a thread.
 
-    Exceptions of the iterator are raised here, in their place. The thread ends with the last item, or after the current
-    item when this iterator is closed.
+    Exceptions of the iterator are raised here, in their place. When this iterator is closed, the thread ends after the
+    item that it computes.
     """
-    ready: queue.Queue[tuple[Any, BaseException | None]] = queue.Queue(number)
-    closed = threading.Event()
-
-    def hand_on(item: Any, error: BaseException | None) -> bool:
-        while not closed.is_set():
-            try:
-                ready.put((item, error), timeout=TOLERANCES.wait_s)
-            except queue.Full:
-                continue
-            return True
-        return False
-
-    def make() -> None:
-        try:
-            for item in items:
-                if not hand_on(item, None):
-                    return
-        except BaseException as error:
-            hand_on(None, error)
-        else:
-            hand_on(None, StopIteration())
-
-    thread = threading.Thread(target=make, name="mars_lidar.learn", daemon=True)
-    thread.start()
+    pool, end = ThreadPoolExecutor(1, "mars_lidar.learn"), cast(T, object())
     try:
-        while True:
-            item, error = ready.get()
-            if isinstance(error, StopIteration):
-                return
-            if error is not None:
-                raise error
+        coming = deque(pool.submit(next, items, end) for _ in range(number))
+        while (item := coming.popleft().result()) is not end:
+            coming.append(pool.submit(next, items, end))
             yield item
-            del item
+            del item  # so that its memory can be used again
     finally:
-        closed.set()
-        thread.join()
+        pool.shutdown(cancel_futures=True)
 
 
 # --- Counts as tensors ---------------------------------------------------------------------------------------------

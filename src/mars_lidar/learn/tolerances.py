@@ -46,8 +46,6 @@ class Tolerances:
     # streams
     zero_photons: float = 0.2
     """In the exposure, that an estimate of zero stands for in a logarithm."""
-    wait_s: float = 0.1
-    """Seconds after which a thread that cannot hand on its item looks whether anybody still wants it."""
     decoded_bytes: int = 256 * 2**20
     """Of chunks of several exposures, which are decoded whole: what a worker holds of them."""
     slots: int = 64

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from native_jobs import Case, chi_square, gaussian_energy, z_to_p
-from scipy import integrate, special, stats
+from scipy import stats
 
 from mars_lidar import _core
 
@@ -50,27 +50,6 @@ def packed_histogram(case: Case, offsets: np.ndarray, bins: np.ndarray) -> np.nd
 
 
 @pytest.mark.parametrize("stationary", [False, True])
-@pytest.mark.parametrize("dead_time", [0.0, 0.6375, 3.2])
-def test_bits_depend_on_the_stream_alone(stationary: bool, dead_time: float):
-    case = IMAGE.change(realizations=5, seed=2**64 - 3, dead_time=dead_time, stationary=stationary)
-    whole = case.histogram("sequential")
-    assert np.array_equal(whole, case.histogram("sequential", threads=2))
-    assert np.array_equal(whole, case.histogram("sequential", threads=2, dtype=np.uint16))
-    assert np.array_equal(whole.sum(1), counts(case, threads=2))
-    part = case.change(
-        signal=IMAGE.signal[2:],
-        background=IMAGE.background[2:],
-        delay=IMAGE.delay[2:],
-        pixel_index=[2, 3],
-        realizations=2,
-        first_realization=3,
-    )
-    assert np.array_equal(whole.reshape(5, 4, -1)[3:, 2:].reshape(4, -1), part.histogram("sequential"))
-    assert not np.array_equal(whole, case.change(seed=4).histogram("sequential"))
-    assert len({row.tobytes() for row in whole[::4]}) == 5  # of pixel 0; a pulse of two bins may well repeat
-
-
-@pytest.mark.parametrize("stationary", [False, True])
 @pytest.mark.parametrize("dead_time", [0.0, 0.3, 0.6375, 1.0, 40.3])
 def test_timestamps_are_the_histogram_and_keep_the_dead_time(stationary: bool, dead_time: float):
     case = IMAGE.change(realizations=3, dead_time=dead_time, stationary=stationary, cycles=1500, bins=100)
@@ -84,9 +63,10 @@ def test_timestamps_are_the_histogram_and_keep_the_dead_time(stationary: bool, d
     assert np.diff(times)[same_item].min() >= dead_time - 1e-9
 
 
-def test_nothing_arrives():
-    assert not Case(signal=0.0, background=0.0, delay=np.nan).histogram("sequential").any()
-    assert not Case(waveform=np.zeros(7), background=0.0, stationary=True).histogram("sequential").any()
+@pytest.mark.parametrize("engine", ["sequential", "poisson"])
+def test_nothing_arrives(engine: str):
+    assert not Case(signal=0.0, background=0.0, delay=np.nan).histogram(engine).any()
+    assert not Case(waveform=np.zeros(7), background=0.0, stationary=True).histogram(engine).any()
 
 
 def test_a_full_bin_and_wrong_arrays_are_errors():
@@ -119,8 +99,12 @@ def test_stops_inside_a_long_pixel():
     assert time.process_time() - begun < 2.0
 
 
-@pytest.mark.parametrize("name", ["gaussian", "wrapped", "wide", "returns", "sampled", "waveform", "narrow"])
-def test_without_dead_time_bins_are_poisson(name: str):
+KINDS = ["gaussian", "wrapped", "wide", "returns", "sampled", "waveform", "fine waveform", "narrow"]
+
+
+@pytest.mark.parametrize("engine", ["sequential", "poisson"])
+@pytest.mark.parametrize("name", KINDS)
+def test_without_dead_time_bins_are_poisson(name: str, engine: str):
     """Phases of every kind of flux against SciPy, and that counts vary as Poisson numbers do."""
     case = Case(signal=2.0, background=0.5, dead_time=0.0, realizations=400, bins=96, seed=5)
     energy = {
@@ -138,81 +122,23 @@ def test_without_dead_time_bins_are_poisson(name: str):
         knots = np.concatenate([[0.0], np.cumsum(SAMPLES[1:])]) / SAMPLES.sum()
         at = -0.3 + 0.11 * np.arange(9)
         energy[name] = 2.0 * np.diff(sum(np.interp(edges - 0.1 + k, at, knots) for k in (-1, 0, 1)))
-    elif name == "waveform":
-        case = case.change(waveform=SAMPLES / 11.0)
-        cumulative = np.concatenate([[0.0], np.cumsum(SAMPLES)]) / 11.0
-        energy[name] = np.diff(np.interp(np.arange(97) / 96, np.arange(10) / 9, cumulative))
+    elif name.endswith("waveform"):
+        parts = SAMPLES if name == "waveform" else np.random.default_rng(0).exponential(size=1001)
+        case = case.change(waveform=2.0 * parts / parts.sum())
+        cumulative = np.concatenate([[0.0], np.cumsum(parts)]) / parts.sum()
+        energy[name] = 2.0 * np.diff(np.interp(np.arange(97) / 96, np.arange(parts.size + 1) / parts.size, cumulative))
     else:
         special_cases = {"wrapped": (0.002, 0.00375), "wide": (0.3, 0.2), "narrow": (0.505, 1e-6)}
         delay, sigma = special_cases.get(name, (0.5, 0.00375))
         case = case.change(delay=delay, pulse=_core.PulseTable.gaussian(sigma))
     mean = 1000 * (energy[name] + 0.5 / 96)
-    cube = case.histogram("sequential", threads=2)
+    cube = case.histogram(engine, threads=2)
     assert chi_square(cube.sum(0), 400 * mean) > ALPHA
     total = cube.sum(1)
     dispersion = np.sum((total - mean.sum()) ** 2) / mean.sum()
     assert 2 * min(stats.chi2.sf(dispersion, 400), stats.chi2.cdf(dispersion, 400)) > ALPHA
     chi = np.sum((cube - mean) ** 2 / mean, axis=0)  # variance of each bin: 400 independent Poisson numbers
     assert z_to_p((chi - 400) / np.sqrt(800 + 400 / mean)).min() > ALPHA
-
-
-def armed_survival(n: np.ndarray, rate: float, dead: float, exposure: float) -> np.ndarray:
-    """P(N >= n) = P(Gamma(n, 1 / rate) <= t - (n - 1) t_d) for n >= 1."""
-    remaining = np.maximum(exposure - (n - 1) * dead, 0.0)
-    return np.where(n == 0, 1.0, special.gammainc(np.maximum(n, 1), rate * remaining))
-
-
-@pytest.mark.full
-@pytest.mark.parametrize("stationary", [False, True])
-@pytest.mark.parametrize(
-    ("rate", "dead", "cycles"), [(1.0, 0.6375, 100), (6.0, 2.3, 40), (0.05, 0.1, 200), (20.0, 7.9, 100)]
-)
-def test_count_law_of_a_constant_rate(rate: float, dead: float, cycles: int, stationary: bool):
-    realizations = 20000 if rate < 2.0 else 5000
-    case = Case(
-        signal=0.0,
-        background=rate,
-        dead_time=dead,
-        cycles=cycles,
-        realizations=realizations,
-        seed=11,
-        stationary=stationary,
-    )
-    number = counts(case, threads=2)
-    n = np.arange(number.max() + 40)
-    survival = armed_survival(n, rate, dead, cycles)
-    if stationary:  # blind for a time uniform on (0, t_d), with probability x / (1 + x)
-        x = rate * dead
-        blind = [
-            integrate.quad_vec(lambda r: armed_survival(n, rate, dead, cycles - r), a, a + dead / 8)[0]
-            for a in np.arange(8) * dead / 8
-        ]
-        survival = (survival + x * np.sum(blind, axis=0) / dead) / (1 + x)
-    pmf = survival - np.append(survival[1:], 0.0)
-    assert chi_square(np.bincount(number, minlength=n.size), realizations * pmf) > ALPHA
-
-
-@pytest.mark.parametrize(("signal", "periods"), [(1.0, 1), (5.0, 3), (8.0, 50)])
-def test_whole_periods_of_dead_time_leave_the_shape(signal: float, periods: int):
-    """r = lambda / (1 + k Lambda), from the first period on: a stationary start has to be stationary."""
-    case = Case(
-        signal=signal,
-        background=0.2,
-        dead_time=float(periods),
-        cycles=4 * periods + 3,
-        bins=32,
-        realizations=6000 // periods,
-        seed=3,
-        stationary=True,
-        delay=0.4,
-    )
-    photons = signal * gaussian_energy(0.4, 0.00375, 32) + 0.2 / 32
-    mean = case.cycles * photons / (1 + periods * photons.sum())
-    cube = case.histogram("sequential", threads=2)
-    merged = [cube[:, part].sum(1) for part in (slice(0, 12), slice(12, 13), slice(13, 32), slice(0, 32))]
-    exact = [mean[:12].sum(), mean[12], mean[13:].sum(), mean.sum()]
-    for values, value in zip(merged, exact, strict=True):
-        assert z_to_p((values.mean() - value) / (values.std() / np.sqrt(values.size)))[()] > ALPHA
 
 
 def test_dim_pixels_over_the_longest_exposure_have_no_lattice():

@@ -45,12 +45,3 @@ def test_waveforms_and_returns_are_solved_at_their_own_delays():
     exact = exposure_moments(ml.Flux(waveform=np.maximum(wave, 0.0), background=0.2), SYSTEM).histogram
     observed = cube.sum(0, dtype=np.int64)
     require({"shape": goodness(observed, exact / exact.sum() * observed.sum())}, "renewal, two returns")
-
-
-def test_any_part_alone():
-    rng = np.random.default_rng(3)
-    flux = ml.Flux(rng.choice([0.0, 0.5, 2.0], (4, 5)), rng.choice([0.0, 0.4], (4, 5)), rng.uniform(0, 100, (4, 5)))
-    whole = ml.simulate(flux, SYSTEM, engine="renewal", realizations=2, seed=4, threads=2)
-    part = ml.simulate(flux[2:], SYSTEM, engine="renewal", realizations=2, seed=4, pixel_index=np.arange(10, 20))
-    assert np.array_equal(whole[:, 2:], part)
-    assert not whole[:, flux.total == 0].any()

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import importlib.util
+
 import numpy as np
+import pytest
 from harness import make_system
 
 import mars_lidar as ml
 
 SUFFIXES = (".zarr", ".h5", ".npz")
+PTU = pytest.param(
+    ".ptu",
+    marks=pytest.mark.skipif(importlib.util.find_spec("ptufile") is None, reason="ptufile (extra io) is not installed"),
+)
 
 SYSTEM = make_system(30.0, 60, 64)
 
@@ -19,3 +26,11 @@ def one_return(height: int = 6, width: int = 5) -> ml.Flux:
     s[1, 2], tau[1, 2] = 0.0, np.nan  # no return
     info = {"made": "by hand", "sbr": np.float64(2.5)}
     return ml.Flux(s, rng.uniform(0.0, 1.0, (height, width)), tau, info=info)
+
+
+def several_returns() -> ml.Flux:
+    return ml.Flux.multi(one_return(), ml.Flux(0.3, 0.1, 70.0), ml.Flux(0.1, 0.0, 99.9))
+
+
+def waveform() -> ml.Flux:
+    return ml.Flux(waveform=np.random.default_rng(2).uniform(0.0, 0.05, (6, 5, 40)), background=0.2)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import importlib.util
 import sys
 from pathlib import Path
 
@@ -11,65 +9,14 @@ import numpy as np
 import pytest
 import scipy.io
 import scipy.sparse
-from store_cases import SYSTEM, one_return
+from store_cases import PTU, SYSTEM, one_return, several_returns, waveform
 
 import mars_lidar as ml
 from mars_lidar import io
 from mars_lidar._base.imports import MissingLibraryError
-from mars_lidar.io import mat, recipe
 from mars_lidar.plot.views import incident_rate
 
 FIELD_MAT = Path(__file__).resolve().parents[2].parent / "shared/data/rgbd/nyuv2_home_office_spad_0161_p1.mat"
-PTU = pytest.param(
-    ".ptu",
-    marks=pytest.mark.skipif(importlib.util.find_spec("ptufile") is None, reason="ptufile (extra io) is not installed"),
-)
-
-
-def several_returns() -> ml.Flux:
-    return ml.Flux.multi(one_return(), ml.Flux(0.3, 0.1, 70.0), ml.Flux(0.1, 0.0, 99.9))
-
-
-def waveform() -> ml.Flux:
-    return ml.Flux(waveform=np.random.default_rng(2).uniform(0.0, 0.05, (6, 5, 40)), background=0.2)
-
-
-@pytest.fixture
-def small_blocks(monkeypatch):
-    """Blocks of two rows, so that a writer sees an image in parts."""
-    monkeypatch.setattr(recipe, "BLOCK_BYTES", 2 * 5 * 64 * 2)
-    monkeypatch.setattr(mat, "BLOCK_BYTES", 2 * 5 * 64 * 2)
-
-
-@pytest.mark.parametrize("suffix", [".mat", PTU])
-@pytest.mark.parametrize("make", [one_return, several_returns, waveform])
-def test_a_file_holds_the_cube_and_makes_it_again(tmp_path, small_blocks, suffix, make):
-    flux = make()
-    path = tmp_path / f"cube{suffix}"
-    number = 1 if suffix == ".mat" else 3
-    values = np.exp(-np.arange(30) / 7.0)
-    system = SYSTEM.replace(pulse=ml.SampledPulse(values, 0.37, "centroid"), start="stationary")
-    arguments = {"realizations": number, "first_realization": 2, "seed": 2**64 - 1}
-    share = np.linspace(0.0, 1.0, 30).reshape(6, 5)
-    maps = {"depth_m": np.full((6, 5), 3.7), "reflectivity": share, "source": "a test"}
-    written = io.simulate_to(path, flux, system, **arguments, **maps)
-    expected = ml.simulate(flux, system, **arguments)
-    with io.load(path) as cube:
-        assert np.array_equal(np.asarray(cube.histogram), expected)
-        assert np.array_equal(np.asarray(cube.histogram[0, 2:4, 3]), expected[0, 2:4, 3])
-        assert cube.histogram.dtype == expected.dtype == np.asarray(cube.histogram).dtype
-        assert cube.registrations == written.registrations == expected.sum()
-        assert (cube.system, cube.engine, cube.seed, cube.version) == (system, "exact", 2**64 - 1, ml.__version__)
-        assert cube.recipe.first_realization == 2
-        assert (cube.recipe.source, cube.flux.info) == ("a test", flux.info and {"made": "by hand", "sbr": 2.5})
-        assert np.array_equal(cube.reflectivity, share)
-        assert np.array_equal(cube.depth_m, maps["depth_m"])
-        for name in ("signal", "background", "delay_ns", "returns_signal", "returns_delay_ns"):
-            assert np.array_equal(getattr(cube.flux, name), getattr(flux, name), equal_nan=True)
-        if flux.waveform is not None:
-            assert np.array_equal(cube.flux.waveform, flux.waveform)
-        assert io.verify(cube)
-    assert [p.name for p in tmp_path.iterdir()] == [path.name]
 
 
 # --- .mat, as depth networks load it -----------------------------------------------------------------------
@@ -268,28 +215,3 @@ def test_damaged_files_are_named(tmp_path, suffix):
     path.unlink()
     with pytest.raises(FileNotFoundError, match="does not exist"):
         io.load(path)
-
-
-@pytest.mark.parametrize("suffix", [".mat", PTU])
-def test_an_interrupted_file_leaves_what_was_there(tmp_path, small_blocks, suffix):
-    path = tmp_path / f"cube{suffix}"
-
-    def stop(done: int, total: int) -> None:
-        if done >= 10:
-            raise KeyboardInterrupt
-
-    with pytest.raises(io.Interrupted, match="nothing was left at"):
-        io.simulate_to(path, one_return(), SYSTEM, progress=stop)
-    assert list(tmp_path.iterdir()) == []
-    io.simulate_to(path, one_return(), SYSTEM, seed=5)
-    with pytest.raises(io.Interrupted, match="is what it was before"):
-        io.simulate_to(path, one_return(), SYSTEM, progress=stop, overwrite=True)
-    with io.load(path) as cube:
-        assert cube.seed == 5
-    # what a killed process leaves
-    path.rename(tmp_path / f"cube{suffix}.incomplete")
-    with contextlib.suppress(FileNotFoundError):
-        path.unlink()
-    for name in (path, tmp_path / f"cube{suffix}.incomplete"):
-        with pytest.raises(io.IncompleteFileError, match=r"never finished|is incomplete"):
-            io.load(name, allow_incomplete=name != path)

@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray
-from store_cases import SUFFIXES, SYSTEM, one_return
+from store_cases import PTU, SUFFIXES, SYSTEM, one_return
 
 import mars_lidar as ml
 from mars_lidar import io
 from mars_lidar._base.files import alone
-from mars_lidar.io import recipe
+from mars_lidar.io import mat, recipe
 from mars_lidar.io.cube import one_exposure
 from mars_lidar.io.maps import save_maps
 
@@ -87,18 +87,25 @@ def test_a_zarr_is_not_made_through_a_link(tmp_path):
     assert not list((tmp_path / "other").iterdir())
 
 
-@pytest.mark.parametrize("suffix", [".h5", ".npz"])
-def test_an_interrupted_file_leaves_what_was_there(tmp_path, small_blocks, suffix):
-    path = tmp_path / f"cube{suffix}"
+@pytest.mark.parametrize("suffix", [".h5", ".npz", ".mat", PTU])
+def test_an_interrupted_file_leaves_what_was_there(tmp_path, monkeypatch, suffix):
+    for module in (recipe, mat):
+        monkeypatch.setattr(module, "BLOCK_BYTES", 2 * 5 * 64 * 2)
+    path, half = tmp_path / f"cube{suffix}", {"progress": _interrupt_after(10)}
     with pytest.raises(io.Interrupted, match="nothing was left at"):
-        io.simulate_to(path, one_return(), SYSTEM, realizations=4, progress=_interrupt_after(90))
+        io.simulate_to(path, one_return(), SYSTEM, **half)
     assert list(tmp_path.iterdir()) == []
     io.simulate_to(path, one_return(), SYSTEM, seed=5)
     with pytest.raises(io.Interrupted, match="is what it was before"):
-        io.simulate_to(path, one_return(), SYSTEM, realizations=4, progress=_interrupt_after(90), overwrite=True)
+        io.simulate_to(path, one_return(), SYSTEM, overwrite=True, **half)
     assert list(tmp_path.iterdir()) == [path]
     with io.load(path) as cube:
         assert cube.seed == 5
+    # what a killed process leaves
+    path.rename(tmp_path / f"cube{suffix}.incomplete")
+    for name in (path, tmp_path / f"cube{suffix}.incomplete"):
+        with pytest.raises(io.IncompleteFileError, match=r"never finished|is incomplete"):
+            io.load(name)
 
 
 _SCRIPT = """

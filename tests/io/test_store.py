@@ -10,70 +10,47 @@ import numpy as np
 import pytest
 import xarray
 import zarr
-from store_cases import SUFFIXES, SYSTEM, one_return
+from store_cases import PTU, SUFFIXES, SYSTEM, one_return, several_returns, waveform
 
 import mars_lidar as ml
 from mars_lidar import io
 from mars_lidar._base import resources as memory
-from mars_lidar.io import recipe
+from mars_lidar.io import mat, recipe
 
 
-def several_returns() -> ml.Flux:
-    first = one_return()
-    return ml.Flux.multi(first, ml.Flux(0.3, 0.1, 70.0), ml.Flux(0.1, 0.0, 99.9))
-
-
-def waveform() -> ml.Flux:
-    return ml.Flux(waveform=np.random.default_rng(2).uniform(0.0, 0.05, (6, 5, 40)), background=0.2)
-
-
-def same_flux(a: ml.Flux, b: ml.Flux) -> bool:
-    names = ("signal", "background", "delay_ns", "returns_signal", "returns_delay_ns")
-    pairs = [(getattr(a, name), getattr(b, name)) for name in names]
-    if (a.waveform is None) != (b.waveform is None):
-        return False
-    if a.waveform is not None and b.waveform is not None:
-        pairs.append((a.waveform, b.waveform))
-    return all(np.array_equal(x, y, equal_nan=True) for x, y in pairs)
-
-
-@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("suffix", [*SUFFIXES, ".mat", PTU])
 @pytest.mark.parametrize("make", [one_return, several_returns, waveform])
-def test_a_file_holds_the_cube_and_makes_it_again(tmp_path, suffix, make):
-    flux = make()
-    path = tmp_path / f"cube{suffix}"
-    arguments = {"engine": "exact", "realizations": 3, "first_realization": 2, "seed": 2**64 - 1}
-    written = io.simulate_to(path, flux, SYSTEM, **arguments)
-    expected = ml.simulate(flux, SYSTEM, **arguments)
-    with io.load(path) as cube:
-        assert np.array_equal(np.asarray(cube.histogram), expected)
-        assert np.array_equal(np.asarray(cube.histogram[1, 2:4, 3]), expected[1, 2:4, 3])
-        assert cube.histogram.dtype == expected.dtype
-        assert cube.registrations == written.registrations == expected.sum()
-        assert cube.complete
-        assert (cube.system, cube.engine, cube.seed) == (SYSTEM, "exact", 2**64 - 1)
-        assert cube.version == ml.__version__
-        assert cube.recipe.first_realization == 2
-        assert same_flux(cube.flux, flux)
-        assert io.verify(cube)
-        part = io.regenerate(cube, realizations=slice(1, 2), rows=slice(2, 5))
-        assert np.array_equal(part, expected[1:2, 2:5])
-
-
-@pytest.mark.parametrize("suffix", SUFFIXES)
-def test_a_measured_pulse_and_the_maps_come_back(tmp_path, suffix):
+def test_a_file_holds_the_cube_and_makes_it_again(tmp_path, monkeypatch, suffix, make):
+    """Light, a measured pulse, maps and counts; blocks of two rows, so that a writer sees an image in parts."""
+    for module in (recipe, mat):
+        monkeypatch.setattr(module, "BLOCK_BYTES", 2 * 5 * 64 * 2)
+    flux, path, number = make(), tmp_path / f"cube{suffix}", 1 if suffix == ".mat" else 3
     values = np.exp(-np.arange(30) / 7.0) * (1 + np.sin(np.arange(30)))
     system = SYSTEM.replace(pulse=ml.SampledPulse(values, 0.37, "centroid"), start="stationary")
-    flux = one_return()
-    depth, reflectivity = np.full(flux.shape, 3.7), np.linspace(0.0, 1.0, 30).reshape(6, 5)
-    path = tmp_path / f"cube{suffix}"
-    io.simulate_to(path, flux, system, depth_m=depth, reflectivity=reflectivity, source="a test")
+    arguments = {"engine": "exact", "realizations": number, "first_realization": 2, "seed": 2**64 - 1}
+    share = np.linspace(0.0, 1.0, 30).reshape(6, 5)
+    maps = {"depth_m": np.full((6, 5), 3.7), "reflectivity": share, "source": "a test"}
+    written = io.simulate_to(path, flux, system, **arguments, **maps)
+    expected = ml.simulate(flux, system, **arguments)
     with io.load(path) as cube:
-        assert cube.system == system
-        assert np.array_equal(cube.depth_m, depth)
-        assert np.array_equal(cube.reflectivity, reflectivity)
-        assert (cube.recipe.source, cube.flux.info) == ("a test", {"made": "by hand", "sbr": 2.5})
+        assert np.array_equal(np.asarray(cube.histogram), expected)
+        assert np.array_equal(np.asarray(cube.histogram[number - 1, 2:4, 3]), expected[number - 1, 2:4, 3])
+        assert cube.histogram.dtype == expected.dtype == np.asarray(cube.histogram).dtype
+        assert cube.registrations == written.registrations == expected.sum()
+        assert cube.complete
+        assert (cube.system, cube.engine, cube.seed, cube.version) == (system, "exact", 2**64 - 1, ml.__version__)
+        assert (cube.recipe.first_realization, cube.recipe.source) == (2, "a test")
+        assert cube.flux.info == (flux.info and {"made": "by hand", "sbr": 2.5})
+        assert np.array_equal(cube.reflectivity, share)
+        assert np.array_equal(cube.depth_m, maps["depth_m"])
+        for name in ("signal", "background", "delay_ns", "returns_signal", "returns_delay_ns"):
+            assert np.array_equal(getattr(cube.flux, name), getattr(flux, name), equal_nan=True)
+        assert (cube.flux.waveform is None) == (flux.waveform is None)
+        assert flux.waveform is None or np.array_equal(cube.flux.waveform, flux.waveform)
         assert io.verify(cube)
+        part = io.regenerate(cube, realizations=slice(number - 1, number), rows=slice(2, 5))
+        assert np.array_equal(part, expected[number - 1 : number, 2:5])
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)

@@ -82,20 +82,6 @@ def test_waveforms(mode: str):
     check(ENGINES["exact"], case, law, {COUNTS, SHAPE})
 
 
-@pytest.mark.parametrize("mode", ["paralyzable", "synchronous", "gate"])
-def test_cells_broadcast(mode: str):
-    system, signal, background = view(mode, 0.7), np.array([0.0, 0.3, 2.0]), np.array([[0.1], [0.0]])
-    delay = np.array([10.0, 33.0, 99.0])
-    together = mean_histogram(ml.Flux(signal, background, delay), system)
-    assert together.shape == (2, 3, 50)
-    for i in range(2):
-        for k in range(3):
-            alone = mean_histogram(ml.Flux(signal[k], background[i, 0], delay[k]), system)
-            assert together[i, k] == pytest.approx(alone, rel=1e-3, abs=1e-7)
-    assert together[1, 0].sum() == 0.0
-    assert np.isfinite(ml.registration_pdf(ml.Flux(signal, background, delay), system)).all()
-
-
 # Paralyzable
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from harness import system_of
+from harness import constant_rate_moments, system_of
 
 import mars_lidar as ml
 from mars_lidar import _core
@@ -52,18 +52,6 @@ def on_grid(signal, background, system, n, *, level="", settle=True, delay_ns=No
     return cumulants[0], int(settled[0])
 
 
-def constant_rate(total, dead, cycles, start):
-    """Mean and variance of a constant-rate pixel in a long exposure."""
-    x = total * dead
-    mean, variance = total * cycles / (1 + x), total * cycles / (1 + x) ** 3
-    if start == "stationary":
-        return mean, variance + x**2 * (6 + 4 * x + x**2) / (6 * (1 + x) ** 4)
-    return (
-        mean + x**2 / (2 * (1 + x) ** 2),
-        variance + x**2 * (18 + 4 * x + x**2) / (12 * (1 + x) ** 4),
-    )
-
-
 @pytest.mark.parametrize("start", ["armed", "stationary"])
 @pytest.mark.parametrize(
     ("total", "dead", "cycles"),
@@ -82,7 +70,7 @@ def constant_rate(total, dead, cycles, start):
 )
 def test_constant_rate(total, dead, cycles, start):
     result = exposure_moments(ml.Flux(0.0, total), system_of(dead, cycles=cycles, start=start), tolerance=1e-6)
-    mean, variance = constant_rate(total, dead, cycles, start)
+    mean, variance = constant_rate_moments(total, dead, cycles, stationary=start == "stationary")
     assert result.mean == pytest.approx(mean, rel=1e-9)
     assert result.variance == pytest.approx(variance, rel=1e-6)
     np.testing.assert_allclose(result.histogram, mean / 64, rtol=5e-3 if start == "armed" else 1e-9)
@@ -207,34 +195,6 @@ def test_vector_levels_agree(level):
     if level not in _core.levels():
         pytest.skip(f"this processor does not run {level}")
     np.testing.assert_allclose(on_grid(1.3, 0.6, system, 256, level=level)[0], narrowest, rtol=1e-11)
-
-
-def test_batch_equals_single():
-    system = system_of(0.6375, bins=7)
-    signal, background = np.array([[0.0], [0.3], [8.0]]), np.array([0.0, 0.01, 2.0])
-    batch = exposure_moments(ml.Flux(signal, background, 20.0), system, threads=2)
-    assert batch.cumulants.shape == (3, 3, 4)
-    assert batch.histogram.shape == (3, 3, 7)
-    for i, j in np.ndindex(3, 3):
-        single = exposure_moments(ml.Flux(signal[i, 0], background[j], 20.0), system, threads=1)
-        if single.bins == batch.bins[i, j]:
-            np.testing.assert_allclose(batch.cumulants[i, j], single.cumulants, rtol=1e-9, atol=1e-12)
-            np.testing.assert_allclose(batch.histogram[i, j], single.histogram, rtol=1e-9, atol=1e-12)
-    assert (batch.cumulants[0, 0] == 0).all()
-    assert (batch.histogram >= 0).all()
-    np.testing.assert_allclose(batch.histogram.sum(-1), batch.mean, rtol=1e-10)
-    assert (batch.movement <= 1e-4).all()
-
-
-def test_waveforms():
-    system = system_of(0.6375, bins=32, sigma=0.01)
-    sampled = 2.0 * system.pulse.bin_energy(40.0, 100.0, 4096)
-    by_pulse = exposure_moments(ml.Flux(2.0, 0.3, 40.0), system)
-    by_waveform = exposure_moments(ml.Flux(waveform=np.stack([sampled, 0.5 * sampled]), background=0.3), system)
-    np.testing.assert_allclose(by_waveform.cumulants[0], by_pulse.cumulants, rtol=1e-5)
-    np.testing.assert_allclose(by_waveform.histogram[0], by_pulse.histogram, rtol=1e-4, atol=1e-6)
-    flat = exposure_moments(ml.Flux(waveform=np.full(10, 0.15), background=0.5), system)
-    np.testing.assert_allclose(flat.cumulants, exposure_moments(ml.Flux(0.0, 2.0), system).cumulants, rtol=1e-6)
 
 
 def test_convergence_errors_name_the_cell(monkeypatch):

@@ -50,21 +50,6 @@ def test_short_exposures_have_the_same_interface():
     assert law.variance == pytest.approx(np.diag(matrix), rel=1e-9)
 
 
-def test_waveforms_and_measured_pulses():
-    """One flux given in three ways."""
-    shape = np.exp(-0.5 * ((np.arange(200) - 90) / 12.0) ** 2)
-    shape /= shape.sum()
-    sampled = system(0.7).replace(pulse=ml.SampledPulse(shape, PERIOD / 200, origin="first"))
-    laws = [
-        joint_law(ml.Flux(2.0, 0.5, 0.0), sampled, tolerance=1e-4),
-        joint_law(ml.Flux(waveform=2.0 * shape, background=0.5), sampled, tolerance=1e-4),
-        joint_law(ml.Flux(waveform=2.0 * shape + 0.5 / 200), sampled, tolerance=1e-4),
-    ]
-    for law in laws[1:]:
-        assert law.mean == pytest.approx(laws[0].mean, rel=1e-9)
-        assert law.variance == pytest.approx(laws[0].variance, rel=1e-9)
-
-
 @pytest.mark.full
 @pytest.mark.parametrize(
     ("signal", "background", "dead"), [(1.0, 30.0, 0.6375), (0.0, 300.0, 0.9), (2.0, 100.0, 1.45), (1000.0, 0.1, 0.3)]

@@ -18,6 +18,11 @@ from tests.harness.ledger import require
 SYSTEM = make_system(60.0, 200, 32, sigma_ns=2.0)
 IMAGE = ml.Flux(np.array([[0.5, 2.0, 0.0], [1.0, 0.1, 3.0]]), 0.3, np.array([[20.0, 40.0, np.nan], [60.0, 80.0, 10.0]]))
 PIXEL = IMAGE[0, 1]
+OTHERS = {
+    "paralyzable": make_system(70.0, 40, 32, sigma_ns=2.0, mode="paralyzable"),
+    "synchronous": make_system(70.0, 40, 32, sigma_ns=2.0, mode="synchronous"),
+    "gated": make_system(70.0, 40, 32, sigma_ns=2.0, mode="gated", gate_start_ns=30.3, gate_width_ns=61.0),
+}
 OF_PIXELS: dict[str, Callable[[ml.Flux], Any]] = {
     "count_law": lambda flux: ml.count_law(flux, SYSTEM).cumulants,
     "mars": lambda flux: ml.count_law(flux, SYSTEM, "mars").mean,
@@ -25,9 +30,15 @@ OF_PIXELS: dict[str, Callable[[ml.Flux], Any]] = {
     "poisson": lambda flux: ml.count_law(flux, SYSTEM, "poisson").mean,
     "mean_histogram": lambda flux: statistics.mean_histogram(flux, SYSTEM),
     "registration_pdf": lambda flux: ml.registration_pdf(flux, SYSTEM),
+    "stationary": lambda flux: ml.registration_pdf(flux, SYSTEM, "stationary"),
     "chain": lambda flux: ml.registration_pdf(flux, SYSTEM, "chain"),
     "exposure_moments": lambda flux: statistics.exposure_moments(flux, SYSTEM).histogram,
-    "photons_per_bin": lambda flux: statistics.photons_per_bin(flux, SYSTEM),
+    "photons_per_bin": lambda flux: statistics.photons_per_bin(flux, SYSTEM, bins=256),
+    **{mode: lambda flux, system=system: statistics.mean_histogram(flux, system) for mode, system in OTHERS.items()},
+}
+OF_ONE: dict[str, Callable[[ml.Flux], Any]] = {
+    "joint_law": lambda flux: ml.joint_law(flux, SYSTEM).variance,
+    "holding_time_covariance": lambda flux: ml.holding_time_covariance(flux, SYSTEM).sigma2,
 }
 
 
@@ -41,6 +52,16 @@ def test_axes_are_those_of_the_flux(name: str) -> None:
     assert np.shape(row) == (3, *rest)
     np.testing.assert_allclose(image[0], row, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(row[1], pixel, rtol=1e-9, atol=1e-12)
+    broadcast = of(ml.Flux(np.array([[0.0], [2.0]]), np.array([0.3, 0.1, 0.0]), 40.0))
+    np.testing.assert_allclose(broadcast[1, 0], pixel, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", OF_PIXELS | OF_ONE)
+def test_a_waveform_of_a_return_is_the_return(name: str) -> None:
+    of = (OF_PIXELS | OF_ONE)[name]
+    wave = 2.0 * SYSTEM.pulse.bin_energy(40.0, 100.0, 2048)
+    by_wave, by_return = of(ml.Flux(waveform=wave, background=0.3)), of(ml.Flux(2.0, 0.3, 40.0))
+    np.testing.assert_allclose(by_wave, by_return, rtol=2e-4, atol=1e-5 * np.max(np.abs(by_return)))
 
 
 @pytest.mark.parametrize("name", ["joint_law", "holding_time_covariance"])

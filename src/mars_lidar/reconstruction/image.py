@@ -8,16 +8,22 @@ are in native/image/solver.h.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from functools import lru_cache
 from statistics import NormalDist
+from typing import ClassVar
 
 import numpy as np
 
 from mars_lidar._base import checks
 from mars_lidar._base.native import _core
 from mars_lidar._base.types import FloatArray, NDArray
+from mars_lidar.engines.simulation import simulate
+from mars_lidar.instrument.pulse import SampledPulse
 from mars_lidar.instrument.system import System
+from mars_lidar.light.flux import Flux
+from mars_lidar.reconstruction.histogram_record import relative_width
 from mars_lidar.reconstruction.histograms import Histograms
-from mars_lidar.reconstruction.image_network import networks, trained_for
+from mars_lidar.reconstruction.image_network import card, networks, trained_for
 from mars_lidar.reconstruction.image_pulse import centroid_error, settings_of
 from mars_lidar.reconstruction.maximum_likelihood import MaximumLikelihood
 from mars_lidar.reconstruction.method import Estimates, Flags, Method
@@ -31,6 +37,9 @@ _SELF_BLIND = (
     1.0  # signal photons a period, above which a pulse hides so much of itself that its armed time says little
 )
 _BRIGHT_BYTES = 64 * 2**20  # of the counts of such pixels at a time
+_PLANE, _PLANES = 32, 4  # pixels a side of a simulated plane, and their number
+_SLOPES = 0.06, 0.03  # widths of the pulse from row to row and from column to column
+_PLACES = 16  # parts of the period, in one of which a plane's delay begins
 _NO_SURFACE = np.uint8(Flags.EMPTY | Flags.FILLED)
 _REJECTED = np.uint8(Flags.EMPTY | Flags.NO_SIGNAL | Flags.SATURATED | Flags.UNCONVERGED)
 
@@ -77,6 +86,9 @@ class Image(Method):
 
     efficiency: FloatArray | None = None
     returns: int = 1
+    checked: ClassVar[bool] = (
+        True  # whether a simulated plane tells if the networks' intervals hold for a measured pulse
+    )
 
     name = "image"
     modes = ("nonparalyzable", "synchronous", "gated")
@@ -132,7 +144,10 @@ class Image(Method):
         settings = settings_of(system)
         solver = solver_of(photons, threads, self.efficiency, counted)
         maps, flags = np.empty((_core.IMAGE_SIZES["maps"], pixels)), np.empty(pixels, np.uint8)
-        solver.solve(settings, self._networks(system), maps=maps, flags=flags)
+        trained = self._networks(system)
+        solver.solve(settings, trained, maps=maps, flags=flags)
+        if trained is not None and self.checked and not _hold_for(system, maps):
+            solver.solve(settings, None, maps=maps, flags=flags)
         delay, half_width, deviation, outlier, signal, signal_error, background, number = maps
         of_bins, largest = centroid_error(system)
         deviation, half_width = np.hypot(deviation, of_bins), np.hypot(half_width, largest)
@@ -196,6 +211,45 @@ class UntrainedImage(Image):
 
     def _networks(self, system: System) -> _core.ImageNetworks | None:
         return None
+
+
+class _Unchecked(Image):
+    """By which planes are estimated that tell whether intervals hold."""
+
+    checked = False
+
+
+def _hold_for(system: System, maps: FloatArray) -> bool:
+    """Whether the networks' intervals hold for this pulse, in light like that of an image's `maps`."""
+    if not isinstance(system.pulse, SampledPulse):
+        return True
+    delay, _, _, _, signal, _, background, _ = maps
+    low, high = card()["holds_for"]["signal"]
+    if not low <= signal.mean() * system.cycles <= high:  # none are used
+        return True
+    middle = np.angle(np.exp(2j * np.pi * delay[np.isfinite(delay)]).sum()) / (2.0 * np.pi)
+    octaves = np.log2(np.maximum([signal.mean(), background.mean()], 1e-12)).round()
+    return _plane_holds(system, float(octaves[0]), float(octaves[1]), int(np.round(middle * _PLACES)) % _PLACES)
+
+
+@lru_cache(maxsize=64)
+def _plane_holds(system: System, signal_octave: float, background_octave: float, place: int) -> bool:
+    """Whether 90 % of the networks' intervals hold in simulated planes, the easiest of surfaces, at such a delay."""
+    across = np.arange(_PLANE)
+    step = relative_width(system) * system.period_ns
+    delay = system.period_ns * place / _PLACES + step * (_SLOPES[0] * across[:, None] + _SLOPES[1] * across)
+    flux = Flux(np.full(delay.shape, 2.0**signal_octave), 2.0**background_octave, delay)
+    held = []
+    for seed in range(_PLANES):
+        counts = simulate(flux, system, seed=seed)[0]
+        photons = Photons.of(counts.reshape(-1, system.bins), _PLANE, _PLANE)
+        estimates = _Unchecked().of_photons(photons, system, 1)
+        assert estimates.half_width is not None
+        stated = np.isfinite(estimates.half_width)
+        off = (estimates.delay - delay.ravel() / system.period_ns + 0.5) % 1.0 - 0.5
+        held.append((np.abs(off) <= estimates.half_width)[stated])
+    every = np.concatenate(held)
+    return bool(every.size == 0 or every.mean() >= 0.9)
 
 
 def solver_of(

@@ -128,7 +128,7 @@ void image_likelihood(const ImageSetting& s, const ImagePhotons& photons, const 
     const int64_t across = part.x1 - part.x0;
     const float step = static_cast<float>(s.cells) / static_cast<float>(s.recording->bins);
     run_rows(part.pixels(), kPixels, threads, watch, [&](int64_t begin, int64_t end, const std::atomic<bool>& stop) {
-        std::vector<float> time, scratch(kImageFactors * (s.cells + s.pulse.span));
+        std::vector<float> time, scratch(2 * kImageFactors * (s.cells + s.pulse.span));
         DelayExposure exposure(s);
         ImagePixel task{&s.pulse, s.cells, 0, nullptr, nullptr, 0.0f, nullptr, s.least, scratch.data(), nullptr};
         for (int64_t k = begin; k < end && !stop; ++k) {

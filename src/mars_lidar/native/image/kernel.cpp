@@ -51,10 +51,14 @@ inline float fast_exp(float x) {
     return q * q * power;
 }
 
-// (1 + ratio armed)^-photons over its largest value, whose log is - photons nearest.
-inline float dimmed(float armed, float ratio, float nearest, float photons) {
-    const float x = photons * (nearest - fast_log(1.0f + ratio * armed));
-    return fast_exp(x < 0.0f ? x : 0.0f);
+// Takes the power of two out of a normal x > 0.
+inline float take_power(float& x) {
+    int32_t bits;
+    std::memcpy(&bits, &x, 4);
+    const int32_t power = (bits >> 23) - 127;
+    bits = (bits & 0x007fffff) | 0x3f800000;
+    std::memcpy(&x, &bits, 4);
+    return static_cast<float>(power);
 }
 
 // Copies (cells) into padded + kPad and wraps both sides.
@@ -98,12 +102,15 @@ void MARS_JOIN(image_likelihood_, MARS_LEVEL)(const ImagePixel& p) {
     const int n = p.cells, span = pulse.span, length = n + span;
     double count = 0.0, shift[kImageFactors];
     for (int64_t e = 0; e < p.photons; ++e) count += static_cast<double>(p.weight[e]);
+    bool wide = p.armed != nullptr;  // whether the likelihood leaves the range of floats: then by logarithms
     for (int m = 0; m < kImageFactors; ++m) {
-        float* const work = p.scratch + static_cast<int64_t>(m) * length;
+        float* const work = p.scratch + static_cast<int64_t>(2 * m) * length;
+        float* const power = work + length;  // of two, which were taken out of `work`
         for (int i = 0; i < length; ++i) work[i] = 1.0f;
+        for (int i = 0; i < length; ++i) power[i] = 0.0f;
         const float strength = p.ratio * kFactor[m];
         const double step = std::log1p(static_cast<double>(strength * pulse.top));
-        double level = 0.0, taken = 0.0;  // log of a bound on `work`; log of what was divided out of it
+        double level = 0.0;  // log of a bound on `work`
         for (int64_t e = 0; e < p.photons; ++e) {
             const int cell = static_cast<int>(p.time[e]);
             const float within = p.time[e] - static_cast<float>(cell);
@@ -111,15 +118,13 @@ void MARS_JOIN(image_likelihood_, MARS_LEVEL)(const ImagePixel& p) {
                 pulse.density + static_cast<int64_t>(within * static_cast<float>(pulse.phases)) * span;
             float* const w = work + cell;
             for (float left = p.weight[e]; left > 0.0f;) {
-                float now = std::floor(static_cast<float>(40.0 / step));
+                float now = std::floor(static_cast<float>(30.0 / step));
                 now = now < 1.0f ? 1.0f : now;
                 now = now < left ? now : left;
-                if (level + step * static_cast<double>(now) > 80.0) {
-                    float top = 0.0f;
-                    for (int i = 0; i < length; ++i) top = work[i] > top ? work[i] : top;
-                    for (int i = 0; i < length; ++i) work[i] /= top;
-                    taken += std::log(static_cast<double>(top));
-                    level = 0.0;
+                if (level + step * static_cast<double>(now) > 40.0) {  // so that two of them are in range as well
+                    for (int i = 0; i < length; ++i) power[i] += take_power(work[i]);
+                    wide = true;
+                    level = 0.7;
                 }
                 for (int times = static_cast<int>(now); times > 0; --times)
                     for (int k = 0; k < span; ++k) w[k] *= 1.0f + strength * q[k];
@@ -129,42 +134,43 @@ void MARS_JOIN(image_likelihood_, MARS_LEVEL)(const ImagePixel& p) {
         }
         // work[x] is of cell x + first, modulo the period
         for (int x = 0; x < span; ++x) work[x] *= work[x + n];
-        shift[m] = std::log(static_cast<double>(kShare[m])) + taken;
+        for (int x = 0; x < span; ++x) power[x] += power[x + n];
+        shift[m] = std::log(static_cast<double>(kShare[m]));
         if (!p.armed) shift[m] -= count * std::log1p(static_cast<double>(strength));
-    }
-    const auto at = [&](int i) {
-        const int x = (i - pulse.first) % n;
-        return x < 0 ? x + n : x;
-    };
-    float nearest[kImageFactors] = {};  // log of what a photon's chance is divided by, at its smallest
-    const float photons_ = static_cast<float>(count);
-    if (p.armed) {
-        for (int m = 0; m < kImageFactors; ++m) {
-            float least = HUGE_VALF;
-            for (int i = 0; i < n; ++i)
-                if (p.armed[i] >= p.least && p.armed[i] < least) least = p.armed[i];
-            nearest[m] = fast_log(1.0f + p.ratio * kFactor[m] * least);
-            shift[m] -= count * static_cast<double>(nearest[m]);
-        }
     }
     double highest = -HUGE_VAL;
     for (int m = 0; m < kImageFactors; ++m) highest = shift[m] > highest ? shift[m] : highest;
     for (int i = 0; i < n; ++i) p.out[i] = 0.0f;
-    const int turn = at(0);  // of `work` is cell 0
-    for (int m = 0; m < kImageFactors; ++m) {
-        const float share = static_cast<float>(std::exp(shift[m] - highest));
-        const float* const work = p.scratch + static_cast<int64_t>(m) * length;
-        for (int i = 0; i < n - turn; ++i) {
-            const float w = work[i + turn] * share;
-            p.out[i] += p.armed ? w * dimmed(p.armed[i], p.ratio * kFactor[m], nearest[m], photons_) : w;
-        }
-        for (int i = n - turn; i < n; ++i) {
-            const float w = work[i + turn - n] * share;
-            p.out[i] += p.armed ? w * dimmed(p.armed[i], p.ratio * kFactor[m], nearest[m], photons_) : w;
-        }
+    const int turn = ((-pulse.first) % n + n) % n;  // of `work` is cell 0
+    float largest = -HUGE_VALF;
+    for (int m = 0; m < kImageFactors && wide; ++m) {  // times (1 + ratio armed)^-photons
+        float* const work = p.scratch + static_cast<int64_t>(2 * m) * length;
+        const float photons = static_cast<float>(count), ratio = p.ratio * kFactor[m];
+        const float base = static_cast<float>(shift[m] - highest);
+        const auto exponents = [&](int from, int to, int cells) {
+            float* const w = work + from;
+            const float* const power = work + length + from;
+            for (int i = 0; i < cells; ++i) w[i] = base + fast_log(w[i]) + 0.69314718f * power[i];
+            const float* const armed = p.armed + to;
+            for (int i = 0; i < cells && p.armed; ++i)
+                w[i] = armed[i] < p.least ? -HUGE_VALF : w[i] - photons * fast_log(1.0f + ratio * armed[i]);
+            for (int i = 0; i < cells; ++i) largest = w[i] > largest ? w[i] : largest;
+        };
+        exponents(turn, 0, n - turn);
+        exponents(0, n - turn, turn);
     }
-    if (p.armed)
-        for (int i = 0; i < n; ++i) p.out[i] = p.armed[i] < p.least ? 0.0f : p.out[i];
+    for (int m = 0; m < kImageFactors && (!wide || largest > -HUGE_VALF); ++m) {
+        const float share = static_cast<float>(std::exp(shift[m] - highest));
+        const float* const work = p.scratch + static_cast<int64_t>(2 * m) * length;
+        const auto put = [&](const float* w, float* out, int cells) {
+            if (wide)
+                for (int i = 0; i < cells; ++i) out[i] += fast_exp(w[i] - largest);
+            else
+                for (int i = 0; i < cells; ++i) out[i] += w[i] * share;
+        };
+        put(work + turn, p.out, n - turn);
+        put(work, p.out + n - turn, turn);
+    }
     float top = 0.0f;  // first by the largest: the mean of very bright pixels overflows
     for (int i = 0; i < n; ++i) top = p.out[i] > top ? p.out[i] : top;
     top = top > 0.0f ? top : 1.0f;

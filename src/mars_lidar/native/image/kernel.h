@@ -21,7 +21,7 @@ struct ImagePulse {
     const float* density;
 };
 
-// Likelihood (cells) of the delay of one pixel, of mean 1. Scratch: 3 (cells + span).
+// Likelihood (cells) of the delay of one pixel, of mean 1. Scratch: 6 (cells + span).
 struct ImagePixel {
     const ImagePulse* pulse;
     int cells;

@@ -661,9 +661,11 @@ void ImageSolver::estimate(const ImageNetworks* networks, double* maps, uint8_t*
                 // the window's error knows nothing of what is rough within it; half the posterior's spread does
                 const double scale = kScale * std::hypot(static_cast<double>(at.error) * sigma,
                                                          0.5 * static_cast<double>(chosen_.spread[p]));
+                // a window says nothing of how signal varies within it: its signal agrees with the pixel's own
+                const double own = static_cast<double>(seen_.number[p]);
                 put(p, static_cast<double>(at.offset), scale, laplace_half(scale, doubt), doubt,
                     std::max(static_cast<double>(at.signal), kLeastLight),
-                    std::sqrt(0.5 / std::max(static_cast<double>(at.light), 0.5)));
+                    own > static_cast<double>(kOwn) ? std::sqrt(0.5 / own) : kNone);
             }
             return;
         }

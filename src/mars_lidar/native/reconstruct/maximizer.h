@@ -30,6 +30,9 @@ constexpr double kPart = 0.4;         // of it, at most, in standard errors wher
 constexpr int kDepth = 3;             // halvings of a step of it in which a kink is looked for
 constexpr double kFallen = 1e-4;      // of the likelihood of the maximum: nothing
 constexpr double kUniform = 0.28867513459481287;  // standard deviation of the uniform law on a unit interval
+constexpr double kDrop = 2.0;                     // of the logarithm of a likelihood at two standard errors
+constexpr double kNearDrop = 0.2;                 // of it, at which a standard error is right to 5 %
+constexpr int kTrials = 12;                       // for the place where it has fallen so far
 constexpr double kRootTwoPi = 2.5066282746310002;
 constexpr int kMaximumColumns = 8;  // of the output: see Maximizer
 
@@ -61,7 +64,9 @@ struct Terrain {
 
 // Fisher scoring with Levenberg's damping: a step is taken if the likelihood does not fall. S >= 0 and B >= least. A
 // climb is given up where several times the gain that its next step promises would not make it the best.
-inline Fit climb(PixelLikelihood& pixel, const double* start, bool with_signal, const Terrain& terrain) {
+// `fixed`: a parameter that does not move.
+inline Fit climb(PixelLikelihood& pixel, const double* start, bool with_signal, const Terrain& terrain,
+                 int fixed = -1) {
     const double least = terrain.least, farthest = terrain.farthest;
     Fit fit;
     std::copy(start, start + 3, fit.at);
@@ -75,6 +80,7 @@ inline Fit climb(PixelLikelihood& pixel, const double* start, bool with_signal, 
         fit.free[1] =
             (fit.at[1] > least || now.gradient[1] > 0.0) && (fit.at[1] < kMostPhotons || now.gradient[1] < 0.0);
         fit.free[2] = with_signal && fit.at[0] > 0.0 && now.information[2][2] > 0.0;
+        if (fixed >= 0) fit.free[fixed] = false;
         double move[3], known[3][3];
         known_information(now, fit.free, known);
         if (solve<3>(known, now.gradient, fit.free, move)) {
@@ -189,10 +195,18 @@ class Maximizer {
         if (best.at[0] == 0.0 || gain < job_.least_gain) *flag |= kNoSignal;
         out[6] = gain;
         out[7] = best.likelihood.value;
-        if (job_.less_bias && *flag == 0 && !narrow) correct(pixel, least, best);
+        errors(pixel, least, best, out + 3);
+        const bool few = ends_.count > 0 && !narrow && best.at[0] > 0.0;  // passes: the likelihood is no parabola
+        if (few) profiled_errors(pixel, terrain, best, out + 3);
+        double bias[3];
+        if (job_.less_bias && *flag == 0 && !narrow && bias_of(best, bias)) {
+            if (few)
+                for (int k = 0; k < 3; ++k) out[3 + k] = std::hypot(out[3 + k], bias[k]);
+            correct(pixel, least, bias, best);
+            if (!few) errors(pixel, least, best, out + 3);
+        }
         for (int k = 0; k < 3; ++k) out[k] = best.at[k];
         if (best.at[0] == 0.0) out[2] = NAN;
-        errors(pixel, least, best, out + 3);
         if (within) out[5] = kUniform / n;
         if (!(profile.weight > 0.0)) return;
         if (best.free[2]) out[5] = std::sqrt(profile.square[2] / profile.weight);
@@ -351,25 +365,28 @@ class Maximizer {
         fit.likelihood = there;
     }
 
-    // Takes off the first-order bias of the maximum, at most a standard error of it, and of S never more than S.
-    void correct(PixelLikelihood& pixel, double least, Fit& fit) {
-        double known[3][3], spread[3][3], bias[3];
-        if (!fit.free[0] || !fit.free[1] || !fit.free[2]) return;
+    // First-order bias of the maximum, of each parameter at most a standard error; false where it is not known.
+    bool bias_of(const Fit& fit, double* bias) {
+        double known[3][3], spread[3][3];
+        if (!fit.free[0] || !fit.free[1] || !fit.free[2]) return false;
         known_information(fit.likelihood, fit.free, known);
         const bool free[3] = {true, true, r_.sample == 0.0};  // the second derivative by the delay has kinks
-        if (!inverse<3>(known, free, spread)) return;
+        if (!inverse<3>(known, free, spread)) return false;
         bias_(r_, passes_, fit.at, spread, bias);
-        double next[3];
         for (int k = 0; k < 3; ++k) {
-            if (!std::isfinite(bias[k])) return;
+            if (!std::isfinite(bias[k])) return false;
             const double most = std::sqrt(spread[k][k]);
-            next[k] = fit.at[k] - std::clamp(bias[k], -most, most);
+            bias[k] = std::clamp(bias[k], -most, most);
         }
-        if (bias[0] > 0.0) next[0] = fit.at[0] / (1.0 + bias[0] / fit.at[0]);
-        next[1] = std::max(next[1], least);
-        const Likelihood there = pixel(next[0], next[1], next[2], ends_);
-        std::copy(next, next + 3, fit.at);
-        fit.likelihood = there;
+        return true;
+    }
+
+    // Takes off a bias, of S never more than S.
+    void correct(PixelLikelihood& pixel, double least, const double* bias, Fit& fit) {
+        fit.at[0] = bias[0] > 0.0 ? fit.at[0] / (1.0 + bias[0] / fit.at[0]) : fit.at[0] - bias[0];
+        fit.at[1] = std::max(fit.at[1] - bias[1], least);
+        fit.at[2] -= bias[2];
+        fit.likelihood = pixel(fit.at[0], fit.at[1], fit.at[2], ends_);
     }
 
     // Standard errors: roots of the diagonal of the inverse information; NaN for what lies on its bound. Where that is B,
@@ -392,6 +409,34 @@ class Maximizer {
         for (int k = 0; k < 3; ++k) curvature -= move[k] * change[k];
         const double square = truncated_square(fit.likelihood.gradient[1], curvature);
         for (int k = 0; k < 3; ++k) out[k] = std::sqrt(out[k] * out[k] + move[k] * move[k] * square);
+    }
+
+    // Half the distances at which the profile of the likelihood, the other parameters at their maximum, is `kDrop` below
+    // the maximum: of two sides the wider. NaN where it never falls so far above the estimate: there is no upper limit.
+    void profiled_errors(PixelLikelihood& pixel, Terrain terrain, const Fit& best, double* out) const {
+        terrain.best = -HUGE_VAL;
+        const double most[3] = {kMostPhotons - best.at[0], kMostPhotons - best.at[1], 0.5};
+        const double room[3] = {best.at[0], best.at[1] - terrain.least, 0.5};
+        for (int k = 0; k < 3; ++k) {
+            if (!best.free[k] || !(out[k] > 0.0)) continue;
+            double widest = 0.0;
+            for (const double side : {-1.0, 1.0}) {
+                const double limit = side > 0.0 ? most[k] : room[k];
+                double away = std::min(2.0 * out[k], limit), drop = 0.0;
+                for (int trial = 0; trial < kTrials; ++trial) {
+                    double at[3] = {best.at[0], best.at[1], best.at[2]};
+                    at[k] += side * away;
+                    drop = best.likelihood.value - climb(pixel, at, true, terrain, k).likelihood.value;
+                    if (std::fabs(drop - kDrop) < kNearDrop || (away == limit && drop < kDrop)) break;
+                    away = std::min(away * std::sqrt(std::clamp(kDrop / drop, 0.25, 16.0)), limit);
+                }
+                if (drop > kDrop - kNearDrop)
+                    widest = std::max(widest, 0.5 * away);
+                else if (side > 0.0)
+                    widest = HUGE_VAL;
+            }
+            out[k] = widest < HUGE_VAL ? std::max(widest, out[k]) : NAN;
+        }
     }
 
     // E x^2 of a density exp(slope x - curvature x^2 / 2) of x >= 0, slope < 0.

@@ -19,7 +19,7 @@ from mars_lidar.calibration.fit import Effort, Fit, Fitted, Guess, draws
 from mars_lidar.calibration.look import Look, look_at
 from mars_lidar.calibration.model import Model, all_carriers
 from mars_lidar.calibration.recording import FALSE_ALARM, LEAST_PHOTONS, Recording, recording_of, recording_of_arrivals
-from mars_lidar.calibration.suspects import Drift, Score
+from mars_lidar.calibration.suspects import Bound, Drift, Score
 from mars_lidar.instrument.avalanches import Afterpulsing
 from mars_lidar.instrument.detector import Detector
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, Jitter
@@ -532,7 +532,8 @@ class _Run:
         system = fitted.model.system(centre, cycles, 1024) if known else None
         flux = fitted.model.flux(centre) if known else None
         ordered = tuple(sorted(named, key=lambda suspect: (not suspect.included, -suspect.z)))
-        limits, look, recording = _limits(fitted, listed if p >= self.level else []), self.look, self.recording
+        bounds = suspects.at_limits(self.fit, fitted, listed) if p >= self.level else []
+        limits, look, recording = _limits(fitted, bounds), self.look, self.recording
         return Calibration(
             look, estimates, p, ordered, limits, drift, system, flux, wave, error, recording, fitted, self.level
         )
@@ -618,23 +619,19 @@ def _estimates(fitted: Fitted, growth: FloatArray) -> dict[str, Estimate]:
     return out
 
 
-def _limits(fitted: Fitted, listed: list[Score]) -> tuple[Limit, ...]:
+def _limits(fitted: Fitted, bounds: list[Bound]) -> tuple[Limit, ...]:
     """Upper limits of effects that were not detected, for each effect the largest over its delays or kinds."""
     best: dict[str, Limit] = {}
     names = [fitted.model.names[k] for k in fitted.free]
     errors = np.sqrt(np.diag(fitted.covariance))
-    for score in listed:
-        name = score.effect.names[0]
-        if score.z > suspects.clear(listed) or score.effect.onoff:
-            continue
-        size = min(score.limit, score.effect.most[0])
+    for bound in bounds:
         shifts = {
-            own: float(shift * size)
-            for own, shift, error in zip(names, score.shift, errors, strict=True)
-            if abs(shift * size) > error
+            own: float(shift)
+            for own, shift, error in zip(names, bound.shift, errors, strict=True)
+            if abs(shift) > error
         }
-        if name not in best or size > best[name].limit:
-            best[name] = Limit(name, score.effect.words, size, shifts)
+        name = bound.effect.names[0]
+        best[name] = Limit(name, bound.effect.words, bound.limit, shifts)
     return tuple(best.values())
 
 

@@ -174,12 +174,6 @@ class Transient:
         for first in range(0, height, step):
             yield slice(first, min(first + step, height))
 
-    def pixel_index(self, rows: slice) -> NDArray[np.int64]:
-        """`pixel_index` for `mars_lidar.simulate`, so that some rows have the photons of the whole image."""
-        first, last, _ = rows.indices(self.shape[0])
-        width = self.shape[1]
-        return np.arange(first * width, last * width, dtype=np.int64)
-
     @checked
     def flux(
         self,

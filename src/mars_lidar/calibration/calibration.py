@@ -20,7 +20,7 @@ from mars_lidar.calibration.fit import Effort, Fit, Fitted, Guess, draws
 from mars_lidar.calibration.look import Look, look_at
 from mars_lidar.calibration.model import Model, all_carriers
 from mars_lidar.calibration.recording import FALSE_ALARM, LEAST_PHOTONS, Recording, recording_of, recording_of_arrivals
-from mars_lidar.calibration.suspects import Drift, Named, Score
+from mars_lidar.calibration.suspects import Bound, Drift, Named, Score
 from mars_lidar.instrument.avalanches import Afterpulsing
 from mars_lidar.instrument.detector import Detector
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, Jitter
@@ -494,7 +494,8 @@ class _Run:
         system = fitted.model.system(centre, cycles, 1024) if known else None
         flux = fitted.model.flux(centre) if known else None
         ordered = tuple(sorted(named, key=lambda suspect: (not suspect.included, -suspect.z)))
-        limits, look, recording = _limits(fitted, listed if p >= self.level else []), self.look, self.recording
+        bounds = suspects.at_limits(self.fit, fitted, listed) if p >= self.level else []
+        limits, look, recording = _limits(fitted, bounds), self.look, self.recording
         return Calibration(
             look, estimates, p, ordered, limits, drift, system, flux, wave, error, recording, fitted, self.level
         )
@@ -590,21 +591,16 @@ def _at_bounds(fitted: Fitted, covariance: FloatArray, drawn: FloatArray) -> lis
     return [part for part, end in ((order[:count], 0.0), (order[-count:], most)) if abs(angle - end) < reach]
 
 
-def _limits(fitted: Fitted, listed: list[Score]) -> tuple[Limit, ...]:
-    """Upper limits of effects that were not detected, for each effect the largest over its delays or kinds."""
-    best: dict[str, Limit] = {}
+def _limits(fitted: Fitted, bounds: list[Bound]) -> tuple[Limit, ...]:
+    """Upper limits of effects that were not detected, with the shifts that exceed the stated errors."""
     names = [fitted.model.names[k] for k in fitted.free]
     errors = np.sqrt(np.diag(fitted.covariance))
-    for score in listed:
-        name = score.effect.names[0]
-        if score.z > suspects.clear(listed) or score.effect.onoff:
-            continue
-        size = min(max(score.size, 0.0) + 1.645 * score.error, score.effect.most[0])
-        moves = zip(names, score.shift * size, errors, strict=True)
-        shifts = {own: float(move) for own, move, error in moves if abs(move) > error}
-        if name not in best or size > best[name].limit:
-            best[name] = Limit(name, score.effect.words, size, shifts)
-    return tuple(best.values())
+    limits = []
+    for bound in bounds:
+        moves = zip(names, bound.shift, errors, strict=True)
+        shifts = {name: float(move) for name, move, error in moves if abs(move) > error}
+        limits.append(Limit(bound.effect.names[0], bound.effect.words, bound.limit, shifts))
+    return tuple(limits)
 
 
 def _worst_cells(fitted: Fitted) -> tuple[str, float]:

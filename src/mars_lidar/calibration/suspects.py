@@ -78,6 +78,38 @@ def scores(fit: Fit, fitted: Fitted, plain: FloatArray) -> list[Score]:
     return sorted(listed, key=lambda score: -score.z)
 
 
+@dataclass(frozen=True)
+class Bound:
+    """Upper limit of an effect that is not significant (95 %), and by how much it would move the estimates (free,)."""
+
+    effect: Effect
+    limit: float
+    shift: FloatArray
+
+
+def at_limits(fit: Fit, fitted: Fitted, listed: list[Score]) -> list[Bound]:
+    """Limits of effects that are not significant, by refits that include them.
+
+    A score does not tell them: a dead time or background that has absorbed an effect leaves hardly any residual, and
+    that is not linear in the size. Of afterpulses, the delay of the refit is that of the recording.
+    """
+    model, most, shorter, out = fitted.model, clear(listed), fit.shorter, []
+    quiet = [score for score in listed if score.z <= most and not score.effect.onoff]
+    longest = {score.effect.names[0]: score for score in sorted(quiet, key=lambda score: score.effect.start[-1])}
+    for score in longest.values():
+        trial = _stepped(shorter, fitted, score)
+        final = None if trial is None else shorter.finish(trial[1])
+        if final is None or not final.converged or model.size not in final.free:
+            continue
+        at, rest = np.flatnonzero(final.free == model.size)[0], np.searchsorted(final.free, fitted.free)
+        size, variance = float(final.theta[model.size]), float(final.covariance[at, at])
+        limit = min(size + 1.645 * variance**0.5, score.effect.most[0])
+        slope = final.covariance[rest, at] / max(variance, 1e-300)
+        moved = final.theta[fitted.free] + slope * (limit - size)
+        out.append(Bound(score.effect, limit, fitted.theta[fitted.free] - moved))
+    return out
+
+
 def clear(listed: list[Score], alarm: float = FALSE_ALARM) -> float:
     """Score that the largest of these effects exceeds by chance with probability `alarm`."""
     from scipy.special import ndtri

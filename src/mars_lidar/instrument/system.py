@@ -209,7 +209,7 @@ class System:
         closed = self.closed_bins
         outside = int(counts[..., closed].sum()) if closed.any() else 0
         if outside:
-            start, width = self.detector.gate_start_ns, self.detector.gate_width_ns
+            start, _, width = (self.period_ns * share for share in self.detector.gate_periods(self.period_ns))
             raise ValueError(
                 f"{outside:,} of {int(counts.sum()):,} counts lie in bins that the gate, open from {start:g} to "
                 f"{start + width:g} ns, never opens: correct gate_start_ns and gate_width_ns, or set these bins to 0"

@@ -484,8 +484,9 @@ def expected_histogram(
     Accuracy for S up to 10 and B up to 5 photons per period at the default of `refine`, with whose square the error of
     the grid falls: a total variation below 4e-4, and 1e-3 for a Gaussian pulse with a dead time within 8 sigma of 0 or
     of whole periods (bins of up to 3 sigma); derivatives are within 4e-3 of those of the exact mean (norm over the
-    bins; median 1e-4). docs/learn.md names two regions where derivatives are less accurate: measured pulses narrower
-    than a bin that re-arm within a bin or two, and locked pixels with hardly any background in long armed exposures.
+    bins; median 1e-4). docs/learn.md names two regions where derivatives are less accurate: that in the delay with
+    measured pulses narrower than a bin, and that in B with hardly any background in long armed
+    exposures of locked pixels.
 
     Parameters
     ----------
@@ -559,6 +560,7 @@ def _refined(system: System) -> int:
         width = pulse.bin_ns / float(np.diff(pulse._cumulative).max())  # of a box with the same peak
         extent, least = len(pulse.values) * pulse.bin_ns, TOLERANCES.parts_of_period / system.bins
     else:
+        assert isinstance(pulse, GaussianPulse)
         width, extent = pulse.sigma_ns, 8.0 * pulse.sigma_ns
     beyond = math.remainder(system.detector.dead_time_ns, system.period_ns)
     finer = 4.0 if abs(beyond) < extent else 1.0
@@ -660,7 +662,7 @@ def _followed(photons: Rows, delay: Delay, cycles: int) -> Rows:
     n = photons.shape[-1]
     dead = min(delay.whole * n + delay.shift, n * cycles)
     lengths = [min(max(dead, 1), n - begin) for begin in range(0, n, max(dead, 1))]
-    blocks_of = [part.split(lengths, -1) for part in (photons, *fired(photons))]
+    blocks_of = [torch.split(part, lengths, -1) for part in (photons, *fired(photons))]
     lit = [(light, p, q, _decays(light)) for light, p, q in zip(*blocks_of, strict=True)]
     armed, past = torch.ones_like(photons[:, :1]), torch.zeros_like(photons[:, :1]).expand(-1, dead + 1)
     total, before = torch.zeros_like(photons), torch.zeros_like(photons)
@@ -689,7 +691,8 @@ def _followed(photons: Rows, delay: Delay, cycles: int) -> Rows:
 
 def _decays(light: Rows) -> list[tuple[int, Rows]]:
     """Probabilities of no photon in 1, 2, 4, .. bins in front of the edges of a block's bins."""
-    edges, decays, step = torch.nn.functional.pad(light.cumsum(-1), (1, 0)), [], 1
+    edges, step = torch.nn.functional.pad(light.cumsum(-1), (1, 0)), 1
+    decays: list[tuple[int, Rows]] = []
     while step <= light.shape[-1]:
         decays.append((step, torch.exp(edges[:, :-step] - edges[:, step:])))
         step *= 2

@@ -431,7 +431,7 @@ class Fit:
         if judged is not None:
             early, shortest = judged
             dead = shortest.dead_time()
-            if timed.any() and (early < 0.05 or shortest.decides(mean[free[timed]][0], sd[timed][0])):
+            if timed.any() and (early < 0.05 or shortest.decides(sd[timed][0])):
                 at = mean.copy()
                 at[model.light + 2] = dead[0]
                 own = Guess(model, at, root_of(cov[np.ix_(~timed, ~timed)]), free[~timed])

@@ -40,7 +40,7 @@ class Settings:
     seed: int
 
 
-FULL, QUICK = Settings(300, 3000, 20_261_124), Settings(6, 1000, 20_261_124)
+FULL, QUICK = Settings(300, 3000, 20_261_124), Settings(10, 1000, 20_261_124)
 
 
 class _Sampled(FeedbackEngine):

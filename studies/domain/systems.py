@@ -187,7 +187,7 @@ class _Draw:
         return signal * (not self.chance(0.1)), background * (not self.chance(0.1))
 
     def _mode(self) -> str:
-        others = {"mode": 1.0, "electronics": 0.15} | dict.fromkeys(("waveform", "effects", "dim", "ends"), 0.35)
+        others = {"electronics": 0.15} | dict.fromkeys(("waveform", "effects", "dim", "ends"), 0.35)
         if self.family == "mode" or (self.family in others and self.chance(others[self.family])):
             return str(self.random.choice(["paralyzable", "synchronous", "gated", MOVING]))
         return "nonparalyzable"

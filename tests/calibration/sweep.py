@@ -12,6 +12,7 @@ import argparse
 import json
 import time
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -147,7 +148,7 @@ def main() -> None:
             print(np.round(np.array(row["pulls"], float), 1), row["suspects"], flush=True)
     print(table(rows, [NAMES[name] for name in asked.effect.split("+")] if asked.effect else []))
     if asked.kept and not asked.effect:
-        print("\n" + named(stored))
+        print("\n" + by_photons(rows) + "\n\n" + named(stored))
 
 
 def table(rows: list[dict[str, Any]], effects: list[str]) -> str:
@@ -176,6 +177,18 @@ def table(rows: list[dict[str, Any]], effects: list[str]) -> str:
             + f"other suspects in {others}; {np.mean(seconds):.1f} s of a processor each, largest {max(seconds):.1f}.",
         ]
     )
+
+
+def by_photons(rows: list[dict[str, Any]]) -> str:
+    """Markdown: standard deviations of the pulls of streams of so many photons, and the largest."""
+    lines = ["| photons | streams | B | S | delay | width | dead time | largest |", "|---|---|---|---|---|---|---|---|"]
+    for low, high in pairwise((0, 8_000, 15_000, 30_000, 60_000, 10**9)):
+        group = np.array([row["pulls"] for row in rows if low <= row["photons"] < high], float)
+        if len(group) > 1:
+            spread = " | ".join(f"{value:.2f}" for value in np.nanstd(group, axis=0))
+            below = f"to {high:,}" if high < 10**9 else f"from {low:,}"
+            lines.append(f"| {below} | {len(group)} | {spread} | {np.nanmax(np.abs(group)):.1f} |")
+    return "\n".join(lines)
 
 
 def named(rows: list[dict[str, Any]]) -> str:

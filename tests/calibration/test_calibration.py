@@ -60,7 +60,7 @@ def test_the_interval_of_a_jitter_that_is_not_there_begins_at_none() -> None:
     """Equal tails of its law left out both 0 and the estimate, of 10 in 12 streams."""
     truth = replace(BASE, jitter=0.0)
     jitter = ml.calibrate(stream(truth, 15_000, 4), seed=4).estimates["jitter_ns"]
-    assert jitter.note == "not detected"
+    assert jitter.note.startswith("not ")  # detected, or identified: by chance
     assert 0.0 == jitter.low <= jitter.value <= jitter.high < 1.0
 
 
@@ -135,24 +135,41 @@ def test_the_law_of_the_shortest_interval(jitter: float) -> None:
     truth = replace(GAP, jitter=jitter, background=0.05)
     model = Model(Clock(50.0, 0.064, 0.5, locked=True), 1, jitter_given=True)
     row = np.array([[0.05, 1.2, 10.0, truth.width, jitter, 75.0]])
-    below, held = [], 0
+    below, held, narrower = [], 0, []
     for seed in range(60):
         law = shortest_law(recording_of(stream(truth, 300, seed)), model, row, 20_000, seed)
-        below.append(np.interp(75.0, law.dead, 0.5 * (law.least + law.more)[0]))
+        below.append(np.interp(75.0, law.dead, 0.5 * sum(law.none)[0]))
         _, low, high = law.dead_time()
         held += low <= 75.0 <= high
+        narrower.append(law.narrowest() / (high - low))
+    # without jitter no interval but the shortest depends on the dead time; with it all near its end do
+    assert 0.9 < min(narrower) <= max(narrower) < 1.1 if jitter == 0.0 else np.mean(narrower) < 1.0
     assert kstest(below, "uniform").pvalue > 1e-3
     assert binom.cdf(held, 60, 0.95) > 1e-3
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("seed", [1, *nightly(*range(2, 12))])
-def test_a_dead_time_that_ends_in_a_gap_without_light(seed: int) -> None:
-    """Hardly any light arrives between two pulses, where the dead time may end: its interval says so."""
-    recorded = stream(GAP, 500, seed)
-    dead = ml.calibrate(recorded, pulse="free").estimates["dead_time_ns"]
-    assert dead.low <= GAP.dead <= dead.high
-    assert dead.value <= np.diff(recorded.times_ns).min() + 8.0  # jitter of up to 1 ns
+@pytest.mark.parametrize("first", [0, *nightly(6, 12, 18)])
+def test_a_dead_time_that_ends_in_a_gap_without_light(first: int) -> None:
+    """Hardly any light arrives between two pulses, where the dead time may end: its 95 % interval holds it."""
+    from scipy.stats import binom
+
+    held = 0
+    for seed in range(first, first + 6):
+        recorded = stream(GAP, 500, seed)
+        dead = ml.calibrate(recorded, pulse="free").estimates["dead_time_ns"]
+        held += dead.low <= GAP.dead <= dead.high
+        assert dead.value <= np.diff(recorded.times_ns).min() + 8.0  # jitter of up to 1 ns
+    assert binom.cdf(held, 6, 0.95) > 1e-3
+
+
+@pytest.mark.full
+def test_background_of_which_no_photon_may_be_recorded() -> None:
+    """Armed for 0.8 ns before a pulse: 1.8 background photons are expected, and without any B was 0 ± 0.0006."""
+    truth, _ = random_truth(8600)
+    background = ml.calibrate(stream(truth, 600, 8600), seed=8600).estimates["background"]
+    assert background.low <= truth.background <= background.high
+    assert 0.01 < background.error < 0.2
 
 
 def test_the_clock_of_a_period_that_ends_within_a_unit() -> None:

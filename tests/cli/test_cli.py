@@ -103,52 +103,13 @@ def test_exposures_that_a_check_refuses_are_said(tmp_path, monkeypatch, reason):
 def test_every_option_of_the_run_reaches_the_file(tmp_path, suffix):
     np.save(tmp_path / "irf.npy", np.exp(-np.arange(50) / 9.0))
     out = tmp_path / f"cube{suffix}"
-    done = run(
-        "simulate",
-        "--scene",
-        "room",
-        "--size",
-        10,
-        "--scene-seed",
-        4,
-        "--period-ns",
-        80,
-        "--dead-time-ns",
-        20,
-        "--cycles",
-        40,
-        "--bins",
-        32,
-        "--pulse-file",
-        tmp_path / "irf.npy",
-        "--pulse-bin-ns",
-        0.1,
-        "--pulse-origin",
-        "centroid",
-        "--start",
-        "stationary",
-        "--signal",
-        0.7,
-        "--sbr",
-        2.5,
-        "--attenuation",
-        "inverse_square",
-        "--ambient",
-        "reflectivity",
-        "--dark-count-hz",
-        1e5,
-        "--engine",
-        "sequential",
-        "--realizations",
-        3,
-        "--seed",
-        8,
-        "--threads",
-        1,
-        "--no-picture",
-        "-o",
-        out,
+    options = (
+        "--scene room --size 10 --scene-seed 4 --period-ns 80 --dead-time-ns 20 --cycles 40 --bins 32 "
+        "--pulse-bin-ns 0.1 --pulse-origin centroid --start stationary --signal 0.7 --sbr 2.5 "
+        "--attenuation inverse_square --ambient reflectivity --dark-count-hz 1e5 "
+        "--engine sequential --realizations 3 --seed 8 --threads 1 --no-picture"
     )
+    done = run("simulate", *options.split(), "--pulse-file", tmp_path / "irf.npy", "-o", out)
     assert done.exit_code == 0, done.output
     assert not out.with_suffix(".png").exists()
     pulse = ml.SampledPulse(np.exp(-np.arange(50) / 9.0), 0.1, "centroid")
@@ -194,19 +155,8 @@ def test_a_system_file_and_options_on_top_of_it(tmp_path):
     assert ml.System.load(tmp_path / "spad.yaml") == DEFAULT_SYSTEM
     text = (tmp_path / "spad.yaml").read_text().replace("dead_time_ns: 75.0", "dead_time_ns: 33.0")
     (tmp_path / "spad.yaml").write_text(text)
-    done = run(
-        "simulate",
-        "--scene",
-        "room",
-        *SMALL,
-        "--system",
-        tmp_path / "spad.yaml",
-        "--pulse-fwhm-ns",
-        2,
-        "--no-picture",
-        "-o",
-        tmp_path / "a.zarr",
-    )
+    files = ["--system", tmp_path / "spad.yaml", "-o", tmp_path / "a.zarr"]
+    done = run("simulate", "--scene", "room", *SMALL, "--pulse-fwhm-ns", 2, "--no-picture", *files)
     assert done.exit_code == 0, done.output
     with io.load(tmp_path / "a.zarr") as cube:
         assert cube.system.detector.dead_time_ns == 33.0
@@ -292,19 +242,14 @@ def test_view_draws_a_cube(tmp_path):
         (["--scene", "moon"], "--scene must be one of 'room', 'random', got 'moon'"),
         (["--scene", "room", "--image", "a.png"], "--image belongs to --depth"),
         (["--depth", "nowhere.png"], "nowhere.png"),
-        (["--scene", "room", "--engine", "quick"], "--engine must be one of"),
-        (["--scene", "room", "--bins", "0"], "bins must be an integer in [1, "),
-        (["--scene", "room", "--start", "cold"], "--start must be one of 'armed', 'stationary', got 'cold'"),
         (["--scene", "room", "--dead-time-ns", "-1"], "--dead-time-ns must be"),
         (["--scene", "room", "--sbr", "0"], "sbr must be"),
-        (["--scene", "room", "--attenuation", "fog"], "--attenuation must be one of"),
         (["--scene", "room", "--system", "nowhere.yaml"], "nowhere.yaml"),
         (["--scene", "room", "--pulse-sigma-ns", "1", "--pulse-fwhm-ns", "1"], "give the pulse once"),
         (["--scene", "room", "--pulse-bin-ns", "1"], "belong to --pulse-file"),
         (["--scene", "room", "--pulse-file", "irf.npy"], "needs --pulse-bin-ns"),
         (["--scene", "room", "--pulse-file", "irf.csv", "--pulse-bin-ns", "1"], "irf.csv does not exist"),
         (["--scene", "room", "--seed", "-1"], "--seed must be an integer in [0, "),
-        (["--scene", "room", "--realizations", "0"], "realizations must be an integer in [1, "),
         (["--scene", "room", "--out", "cube.csv"], "out must end in one of .zarr, .h5, .hdf5, .npz"),
         (["--scene", "room", "--out", "nowhere/cube.h5"], "out must lie in an existing folder"),
     ],

@@ -195,34 +195,11 @@ def test_the_command(tmp_path):
 
 def test_the_command_takes_every_option_of_a_system(tmp_path):
     name = str(tmp_path / "set.zarr")
-    ran = command_line(
-        [
-            "generate",
-            "room",
-            "--size",
-            "8",
-            "--cycles",
-            "20",
-            "--bins",
-            "16",
-            "--mode",
-            "gated",
-            "--gate-start-ns",
-            "20",
-            "--gate-width-ns",
-            "50",
-            "--pulse-fwhm-ns",
-            "2",
-            "--jitter-fwhm-ns",
-            "0.5",
-            "--attenuation",
-            "inverse_square",
-            "--ambient",
-            "reflectivity",
-            "-o",
-            name,
-        ],
+    options = (
+        "--size 8 --cycles 20 --bins 16 --mode gated --gate-start-ns 20 --gate-width-ns 50 --pulse-fwhm-ns 2 "
+        "--jitter-fwhm-ns 0.5 --attenuation inverse_square --ambient reflectivity"
     )
+    ran = command_line(["generate", "room", *options.split(), "-o", name])
     assert ran.exit_code == 0, ran.output
     stored = open_dataset(name)
     (system,) = stored.recipe.systems

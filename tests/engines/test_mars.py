@@ -194,60 +194,31 @@ def test_memory_is_the_output_and_a_bounded_work_area():
 
 
 @pytest.mark.parametrize(
-    ("call", "kind", "fragments"),
+    ("options", "kind", "message"),
     [
-        (lambda f: ml.simulate(f, SYSTEM, engine="mars", count="normal"), ValueError, ["count", "'normal'"]),
-        (
-            lambda f: ml.simulate(f, SYSTEM, engine="mars", table=table(), interpolation="cubic"),
-            ValueError,
-            ["interpolation", "'cubic'"],
-        ),
-        (
-            lambda f: ml.simulate(f, SYSTEM, engine="mars", interpolation="nearest"),
-            ValueError,
-            ["interpolation", "without a table"],
-        ),
-        (
-            lambda f: ml.simulate(f, SYSTEM, engine="mars", table=table(), outside="clip"),
-            ValueError,
-            ["outside", "'clip'", "'error'"],
-        ),
-        (
-            lambda f: ml.simulate(f, SYSTEM, engine="mars", outside="exact"),
-            ValueError,
-            ["outside", "without a table"],
-        ),
-        (lambda f: ml.simulate(f, SYSTEM, engine="exact", table=table()), TypeError, ["table", "'exact'"]),
-        (lambda f: ml.simulate(f, SYSTEM, engine="renewal", count="exact"), TypeError, ["count", "'renewal'"]),
-        (
-            lambda f: ml.simulate(f, SYSTEM, engine=MarsEngine(), count="exact"),
-            TypeError,
-            ["count", "engine is an Engine"],
-        ),
-        (lambda f: ml.simulate(f, SYSTEM, engine="mars", table="room.h5"), TypeError, ["table", "room.h5"]),
-        (
-            lambda f: ml.simulate(f, SYSTEM.replace(bins=64), engine="mars", table=table()),
-            ValueError,
-            ["table", "bins", "64", "128"],
-        ),
-        (
-            lambda f: ml.simulate(ml.Flux.multi(f, f), SYSTEM, engine="mars", table=table()),
-            ValueError,
-            ["one return", "several returns"],
-        ),
-        (
-            lambda f: ml.simulate(ml.Flux(waveform=np.ones(8)), SYSTEM, engine="mars", table=table()),
-            ValueError,
-            ["one return", "a waveform"],
-        ),
-        (lambda f: ml.simulate_timestamps(f, SYSTEM, engine="mars"), ValueError, ["'mars'", "histograms only"]),
+        ({"interpolation": "nearest"}, ValueError, "interpolation.*without a table"),
+        ({"outside": "exact"}, ValueError, "outside.*without a table"),
+        ({"count": "normal"}, ValueError, "count.*'normal'"),
+        ({"table": table, "interpolation": "cubic"}, ValueError, "interpolation.*'cubic'"),
+        ({"table": table, "outside": "clip"}, ValueError, "outside.*'error'.*'clip'"),
+        ({"table": "room.h5"}, TypeError, "table.*room.h5"),
+        ({"table": table, "engine": "exact"}, TypeError, "table.*'exact'"),
+        ({"count": "exact", "engine": "renewal"}, TypeError, "count.*'renewal'"),
+        ({"count": "exact", "engine": MarsEngine()}, TypeError, "count.*engine is an Engine"),
+        ({"table": table, "system": SYSTEM.replace(bins=64)}, ValueError, "table.*bins.*(64.*128|128.*64)"),
+        ({"table": table, "flux": ml.Flux.multi(*[ml.Flux(1.0, 0.5, 30.0)] * 2)}, ValueError, "several returns"),
+        ({"table": table, "flux": ml.Flux(waveform=np.ones(8))}, ValueError, "one return.*a waveform"),
     ],
 )
-def test_bad_input(call, kind, fragments):
-    with pytest.raises(kind) as error:
-        call(image())
-    for fragment in fragments:
-        assert fragment in str(error.value)
+def test_bad_input(options, kind, message):
+    made = {name: value() if value is table else value for name, value in options.items()}
+    with pytest.raises(kind, match=message):
+        ml.simulate(**{"flux": image(), "system": SYSTEM, "engine": "mars"} | made)
+
+
+def test_there_are_no_times():
+    with pytest.raises(ValueError, match=r"'mars'.*histograms only"):
+        ml.simulate_timestamps(image(), SYSTEM, engine="mars")
 
 
 # Start-up of short armed exposures, which a table turns with the pulse

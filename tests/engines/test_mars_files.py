@@ -70,22 +70,8 @@ def test_reports_add_up_over_blocks(tmp_path, table: Table, monkeypatch: pytest.
 def test_command_line(tmp_path, table: Table):
     table.save(tmp_path / "table.h5")
     SYSTEM.save(tmp_path / "spad.yaml")
-    arguments = [
-        "simulate",
-        "--scene",
-        "room",
-        "--size",
-        "8",
-        "--signal",
-        "0.5",
-        "--system",
-        str(tmp_path / "spad.yaml"),
-        "--no-picture",
-        "--engine",
-        "mars",
-        "--count",
-        "gaussian",
-    ]
+    options = "--scene room --size 8 --signal 0.5 --no-picture --engine mars --count gaussian"
+    arguments = ["simulate", *options.split(), "--system", str(tmp_path / "spad.yaml")]
     more = ["--table", str(tmp_path / "table.h5"), "--interpolation", "nearest", "-o", str(tmp_path / "a.zarr")]
     done = command_line([*arguments, *more])
     assert done.exit_code == 0, done.output

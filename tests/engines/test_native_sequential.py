@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from native_jobs import Case, chi_square, gaussian_energy, z_to_p
-from scipy import integrate, special, stats
+from scipy import stats
 
 from mars_lidar import _core
 
@@ -139,65 +139,6 @@ def test_without_dead_time_bins_are_poisson(name: str, engine: str):
     assert 2 * min(stats.chi2.sf(dispersion, 400), stats.chi2.cdf(dispersion, 400)) > ALPHA
     chi = np.sum((cube - mean) ** 2 / mean, axis=0)  # variance of each bin: 400 independent Poisson numbers
     assert z_to_p((chi - 400) / np.sqrt(800 + 400 / mean)).min() > ALPHA
-
-
-def armed_survival(n: np.ndarray, rate: float, dead: float, exposure: float) -> np.ndarray:
-    """P(N >= n) = P(Gamma(n, 1 / rate) <= t - (n - 1) t_d) for n >= 1."""
-    remaining = np.maximum(exposure - (n - 1) * dead, 0.0)
-    return np.where(n == 0, 1.0, special.gammainc(np.maximum(n, 1), rate * remaining))
-
-
-@pytest.mark.full
-@pytest.mark.parametrize("stationary", [False, True])
-@pytest.mark.parametrize(
-    ("rate", "dead", "cycles"), [(1.0, 0.6375, 100), (6.0, 2.3, 40), (0.05, 0.1, 200), (20.0, 7.9, 100)]
-)
-def test_count_law_of_a_constant_rate(rate: float, dead: float, cycles: int, stationary: bool):
-    realizations = 20000 if rate < 2.0 else 5000
-    case = Case(
-        signal=0.0,
-        background=rate,
-        dead_time=dead,
-        cycles=cycles,
-        realizations=realizations,
-        seed=11,
-        stationary=stationary,
-    )
-    number = counts(case, threads=2)
-    n = np.arange(number.max() + 40)
-    survival = armed_survival(n, rate, dead, cycles)
-    if stationary:  # blind for a time uniform on (0, t_d), with probability x / (1 + x)
-        x = rate * dead
-        blind = [
-            integrate.quad_vec(lambda r: armed_survival(n, rate, dead, cycles - r), a, a + dead / 8)[0]
-            for a in np.arange(8) * dead / 8
-        ]
-        survival = (survival + x * np.sum(blind, axis=0) / dead) / (1 + x)
-    pmf = survival - np.append(survival[1:], 0.0)
-    assert chi_square(np.bincount(number, minlength=n.size), realizations * pmf) > ALPHA
-
-
-@pytest.mark.parametrize(("signal", "periods"), [(1.0, 1), (5.0, 3), (8.0, 50)])
-def test_whole_periods_of_dead_time_leave_the_shape(signal: float, periods: int):
-    """r = lambda / (1 + k Lambda), from the first period on: a stationary start has to be stationary."""
-    case = Case(
-        signal=signal,
-        background=0.2,
-        dead_time=float(periods),
-        cycles=4 * periods + 3,
-        bins=32,
-        realizations=6000 // periods,
-        seed=3,
-        stationary=True,
-        delay=0.4,
-    )
-    photons = signal * gaussian_energy(0.4, 0.00375, 32) + 0.2 / 32
-    mean = case.cycles * photons / (1 + periods * photons.sum())
-    cube = case.histogram("sequential", threads=2)
-    merged = [cube[:, part].sum(1) for part in (slice(0, 12), slice(12, 13), slice(13, 32), slice(0, 32))]
-    exact = [mean[:12].sum(), mean[12], mean[13:].sum(), mean.sum()]
-    for values, value in zip(merged, exact, strict=True):
-        assert z_to_p((values.mean() - value) / (values.std() / np.sqrt(values.size)))[()] > ALPHA
 
 
 def test_dim_pixels_over_the_longest_exposure_have_no_lattice():

@@ -130,8 +130,10 @@ def measured_pulse(name: str, span_ns: float, origin: str = "peak") -> SampledPu
     return SampledPulse(values, span_ns / values.size, origin)
 
 
-def random_cases(number: int, seed: int, photons: float = 6e6, least: int = 2000, most: int = 12_000) -> list[Case]:
-    """Free-running systems of the study "domain" over the range that the engines must cover.
+def random_cases(
+    number: int, seed: int, photons: float = 6e6, least: int = 2000, most: int = 12_000, family: str | None = None
+) -> list[Case]:
+    """Free-running systems of the study "domain", or those of its family "mode", over what the engines must cover.
 
     `photons` bounds the arrivals to draw for each, `least` and `most` the exposures. With 2000 exposures on
     either side a mean that is off by 0.24 of its standard deviation, or a variance that is off by 34 %, is
@@ -139,14 +141,16 @@ def random_cases(number: int, seed: int, photons: float = 6e6, least: int = 2000
     """
     from studies.domain import systems  # the source archive has none, and golden bits are tested in it
 
-    drawn = filter(_covered, (systems.draw(seed, k) for k in itertools.count()))
+    drawn = filter(_covered, (systems.draw(seed, k, family) for k in itertools.count()))
+    if family is None:
+        drawn = (case for case in drawn if case.mode == "nonparalyzable")
     return [_bounded(case, photons, least, most) for case in itertools.islice(drawn, number)]
 
 
 def _covered(case: systems.Case) -> bool:
-    """Free-running and without effects, with registrations, and no more than a test can draw."""
+    """Without effects, with registrations, and no more than a test can draw."""
     system = case.system
-    plain = case.mode == "nonparalyzable" and not system.detector.effects and len(case.signal) < 16
+    plain = not system.detector.effects and len(case.signal) < 16
     return plain and 1e-2 < case.photons < 60.0 and system.dead_time_periods < 11.0 and system.bins <= 4096
 
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
-from harness import Case, check, flux_of, require
+from harness import Case, check, require
 from harness.check import EVERYTHING, INTERVALS
 from scipy import stats
 
 import mars_lidar as ml
-from mars_lidar import _core, statistics
+from mars_lidar import _core
 from mars_lidar.engines import ENGINES
 from mars_lidar.engines.exact import ExactEngine
 
@@ -37,13 +36,3 @@ def exact_bits_do_not_depend(flux: ml.Flux, system: ml.System) -> None:
     assert np.array_equal(again[0], whole[1, 1:2])
     times = ml.simulate_timestamps(flux, system, seed=9, realization=1)
     assert np.array_equal(times.histogram(), whole[1])
-
-
-def has_no_law(system: ml.System, text: str) -> None:
-    """Every prediction, and every engine that draws from one, refuses it with `text`."""
-    for law in ("count_law", "exposure_moments", "joint_law", "mean_histogram", "registration_pdf"):
-        with pytest.raises(ValueError, match=text):
-            getattr(statistics, law)(ml.Flux(1.0, 1.0, 50.0), system)
-    for engine in ("mars", "renewal", "feedback", "auto", "poisson"):
-        with pytest.raises(ValueError, match=f"engine '{engine}' {text}"):
-            ml.simulate(flux_of(1.0, 1.0), system, engine=engine)

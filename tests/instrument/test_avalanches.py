@@ -20,7 +20,7 @@ from harness import (
     two_lobes,
     two_mean_vectors,
 )
-from instrument.effect_checks import exact_against_sequential, exact_bits_do_not_depend, has_no_law, mean_is
+from instrument.effect_checks import exact_against_sequential, exact_bits_do_not_depend, mean_is
 from scipy import stats
 from test_reproducibility import image
 
@@ -268,14 +268,6 @@ def test_crosstalk_bits_and_whole_images():
         ml.simulate(flux[2:4], system, engine="sequential", pixel_index=np.arange(14, 28))
     with pytest.raises(ValueError, match=r"engine 'exact' does not do crosstalk.*use 'sequential'"):
         ml.simulate(flux, system)
-
-
-@pytest.mark.parametrize("name", ["afterpulsing", "twilight_ns"])
-def test_what_has_no_law_says_so(name: str):
-    on: dict[str, Any] = {"afterpulsing": EXPONENTIAL, "twilight_ns": 5.0}
-    system = case(1.0, 1.0, dead_time_ns=75.0, **{name: on[name]}).system
-    text = f"does not do {name}.*'exact' or 'sequential'"
-    has_no_law(system, text)
 
 
 @pytest.mark.parametrize(

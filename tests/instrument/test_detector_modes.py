@@ -81,29 +81,10 @@ def gated_photons(case: Case) -> np.ndarray:
     return energy.reshape(system.bins, fine).sum(1)
 
 
-def modes_of(case: Case, k: int, random: np.random.Generator) -> Case:
-    """A random case with a detector of another mode; every other gate moves where it may."""
-    system = case.system
-    mode = ("paralyzable", "synchronous", "gated", "gated")[k % 4]
-    extra: dict[str, float] = {}
-    if mode == "gated":
-        width = (1.0, random.uniform(0, 1), 10 ** random.uniform(-3, -1))[int(random.integers(3))]
-        extra = {"gate_start_ns": random.uniform(0, system.period_ns), "gate_width_ns": width * system.period_ns}
-        if system.start == "armed" and k % 8 < 4:
-            extra["gate_step_ns"] = random.uniform(-0.3, 0.3) * system.period_ns * random.choice([1.0, 0.01])
-            extra["gate_cycles"] = int(random.choice([1, 7]))
-    pixel = Detector(dead_time_ns=system.detector.dead_time_ns, mode=mode, **extra)
-    text = f"{mode} {', moving' if 'gate_step_ns' in extra else ''}"
-    return replace(case, name=f"{text} {case.name}", system=system.replace(detector=pixel))
-
-
-_RANDOM = np.random.default_rng(7)
-_CASES = random_cases(32, seed=31, photons=8e5, least=1000, most=4000)
-RANDOM = [modes_of(case, k, _RANDOM) for k, case in enumerate(_CASES)]
-
-
 @pytest.mark.full
-@pytest.mark.parametrize("case", RANDOM, ids=lambda case: case.name)
+@pytest.mark.parametrize(
+    "case", random_cases(32, seed=31, photons=8e5, least=1000, most=4000, family="mode"), ids=lambda case: case.name
+)
 def test_random_system(case: Case):
     check(ENGINES["exact"], case, ENGINES["sequential"], EVERYTHING)
 

@@ -279,3 +279,48 @@ def test_times_beside_the_counts_are_those_of_the_bins(tmp_path, unit):
     assert ml.io.foreign_cube(write(slice(20, 90)), system, start_ns=20.0).histogram[0, 0, 0, 20:90].sum() == 70
     with pytest.raises(ValueError, match=r"which is not the bin width of 0\.5 ns"):
         ml.io.foreign_cube(write(slice(None)), system.replace(bins=200))
+
+
+def test_counts_that_the_detector_cannot_register_are_refused():
+    """More than the dead time allows in all, and counts in bins that the gate never opens."""
+    plain = ml.System(
+        period_ns=100.0,
+        cycles=1000,
+        bins=50,
+        pulse=ml.GaussianPulse(sigma_ns=1.0),
+        detector=ml.Detector(dead_time_ns=75.0),
+    )
+    with pytest.raises(ValueError, match=r"a pixel holds 1,500 counts.*at most 1,334"):
+        ml.io.from_histograms(np.full((1, 50), 30), plain)
+    matched = ml.reconstruct(np.full((1, 50), 30), plain, method="matched_filter")
+    assert (matched.flags & ml.reconstruction.Flags.SATURATED).all()
+
+    gated = plain.replace(detector=ml.Detector(dead_time_ns=75.0, mode="gated", gate_start_ns=85.0, gate_width_ns=45.0))
+    assert np.flatnonzero(~gated.closed_bins).tolist() == [*range(15), *range(42, 50)]
+    counts = np.zeros((1, 50), int)
+    counts[0, [3, 14, 42, 49]] = 5  # bins at both edges are open in part
+    assert ml.io.from_histograms(counts, gated).registrations == 20
+    counts[0, 20] = 2
+    for take in (ml.io.from_histograms, ml.reconstruct):
+        with pytest.raises(ValueError, match=r"2 of 22 counts lie in bins that the gate, open from 85 to 130 ns"):
+            take(counts, gated)
+
+
+@pytest.mark.parametrize(
+    ("shape", "readings", "axes", "image"),
+    [
+        ((64, 3, 64), "'tyx' or 'yxt'", "tyx", None),
+        ((64, 64), r"'t\(yx\)' or '\(yx\)t'", "t(yx)", (8, 8)),
+    ],
+)
+def test_two_dimensions_that_could_be_time_need_axes(tmp_path, shape, readings, axes, image):
+    system = make_system(30.0, 50, 64)
+    np.save(tmp_path / "counts.npy", np.ones(shape, np.uint16))
+    with pytest.raises(ValueError, match=rf"2 dimensions of 64 bins: give axes \(--axes\), {readings}"):
+        ml.io.foreign_cube(tmp_path / "counts.npy", system)
+    assert ml.io.foreign_cube(tmp_path / "counts.npy", system, axes=axes, image=image).shape[-1] == 64
+
+
+def test_time_behind_an_image_as_wide_needs_none(tmp_path):
+    np.save(tmp_path / "counts.npy", np.ones((10, 64, 64), np.uint16))
+    assert ml.io.foreign_cube(tmp_path / "counts.npy", make_system(30.0, 50, 64)).shape == (1, 10, 64, 64)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from harness import make_system
-from scipy.stats import binom, chi2, norm
+from scipy.stats import binom, chi2, norm, poisson
 
 import mars_lidar as ml
 from mars_lidar.reconstruction import Flags
-from mars_lidar.reconstruction.fit_quality import quality_of
+from mars_lidar.reconstruction.fit_quality import law_above, quality_of
 from mars_lidar.reconstruction.histograms import checked
 from mars_lidar.reconstruction.maximum_likelihood import MaximumLikelihood
 
@@ -125,25 +125,37 @@ def test_statistics_are_those_of_their_definition(dead: float) -> None:
         fired = -np.expm1(-light)
         cells = min(64, int(variance.sum() / 8.0))
         cell = ((np.cumsum(variance) - 0.5 * variance) / variance.sum() * cells).astype(int)
-        excess, spread = np.bincount(cell, h - expected), np.bincount(cell, variance)
-        used = spread > 0.0
-        passes = np.bincount(cell, fired)[used]
-        square = excess[used] @ np.linalg.solve(np.diag(spread[used]) + hidden * np.outer(passes, passes), excess[used])
+        pooled = (cell == np.unique(cell)[:, None]).astype(float)
+        together = np.linalg.inv(
+            pooled @ np.diag(variance) @ pooled.T + hidden * np.outer(pooled @ fired, pooled @ fired)
+        )
+        form = pooled.T @ together @ pooled
+        square = (h - expected) @ form @ (h - expected)
         typical = armed_passes(expected, truth, dead)
         mean, variance = law(light, *typical)
-        white = np.linalg.inv(np.linalg.cholesky(np.diag(variance) + hidden * np.outer(fired, fired)))
+        covariance = np.diag(variance) + hidden * np.outer(fired, fired)
+        white = np.linalg.inv(np.linalg.cholesky(covariance))
         slope = (law(light * 1.001, *typical)[0] - mean) / (0.001 * light)
-        residual = white @ (h - expected)
         delay_slope = fit.signal[k] * (share(at + step) - share(at - step)) / step
         tangent = np.stack([share(at), np.ones(truth.bins), delay_slope]) * slope @ white.T
 
         changes = [law(light, *armed_passes(expected, truth, x * dead))[0] - mean for x in (1.2, 1.0 / 1.2)]
         wider_factor = np.hypot(1.1, 0.5 * truth.bin_ns / truth.pulse.sigma_ns)
         changes.append(fit.signal[k] * (share(at, wider_factor) - share(at)) * slope)
-        free = [white @ x - tangent.T @ np.linalg.lstsq(tangent.T, white @ x, rcond=None)[0] for x in changes]
-        longer, shorter, wider = (float(x @ residual / np.linalg.norm(x)) for x in free)
+        beyond = np.eye(truth.bins) - tangent.T @ np.linalg.pinv(tangent.T)  # what the estimates do not take up
+        free = [beyond @ white @ x for x in changes]
+        longer, shorter, wider = (float(x @ white @ (h - expected) / np.linalg.norm(x)) for x in free)
         assert (fit.longer[k], fit.shorter[k], fit.wider[k]) == pytest.approx((longer, shorter, wider), abs=0.05)
-        p = [chi2.sf(square, used.sum() - 3), norm.sf(longer), norm.sf(shorter), 2.0 * norm.sf(abs(wider))]
+        quiet = variance / mean
+        third, fourth = variance * (2.0 * quiet - 1.0), variance * (1.0 - 6.0 * quiet * (1.0 - quiet))
+        left = np.linalg.solve(white, beyond @ white)
+        form = left.T @ form @ left
+        average = np.trace(form @ covariance)
+        spread = 2.0 * np.trace(form @ covariance @ form @ covariance) + np.diag(form) ** 2 @ fourth
+        p = [chi2.sf(2.0 * average / spread * square, 2.0 * average**2 / spread)]
+        for score, x, sides in ((longer, free[0], (1.0,)), (shorter, free[1], (1.0,)), (wider, free[2], (1.0, -1.0))):
+            skewness = (x @ white / np.linalg.norm(x)) ** 3 @ third
+            p.append(len(sides) * min(float(law_above(np.array(s * score), np.array(s * skewness))) for s in sides))
         assert fit.p_value[k] == pytest.approx(1.0 - (1.0 - min(p)) ** 4, rel=0.05)
 
 
@@ -171,10 +183,47 @@ def test_long_dead_times_and_bright_pulses_are_no_misfits(
 def test_p_value_of_statistics() -> None:
     """Of the smallest of the tests that there are; none without photons."""
     nan = np.nan
-    table = np.array([[60.0, 50.0, nan, nan, nan], [60.0, 50.0, 3.5, -1.0, 0.1], [nan, 0.0, nan, nan, nan]])
+    table = np.array(
+        [
+            [60.0, 50.0, nan, nan, nan, nan, nan, nan],
+            [60.0, 50.0, 3.5, -1.0, 0.1, 0.0, 0.0, 0.0],
+            [nan, 0.0, nan, nan, nan, nan, nan, nan],
+        ]
+    )
     p = quality_of(table).p_value
     assert p[:2] == pytest.approx([chi2.sf(60.0, 50), 1.0 - (1.0 - norm.sf(3.5)) ** 4])
     assert np.isnan(p[2])
+
+
+@pytest.mark.parametrize("photons", [0.002, 0.05, 0.5, 5.0, 200.0, 1e5])
+def test_the_law_of_a_score_is_that_of_few_registrations(photons: float) -> None:
+    """Of a Poisson number: chance of a larger one, and half of that of itself; from below no less than its law."""
+    deviation = photons**0.5
+    number = np.floor(photons + deviation * np.linspace(-5.0, 8.0, 40))
+    number = np.unique(number[number >= 0.0])
+    score, skewness = (number - photons) / deviation, np.full(number.size, 1.0 / deviation)
+    exact = poisson.sf(number, photons) + 0.5 * poisson.pmf(number, photons)
+    assert law_above(score, skewness) == pytest.approx(exact, rel=1e-6)
+    below = poisson.cdf(number, photons) - 0.5 * poisson.pmf(number, photons)
+    rare = below < 0.02
+    assert (law_above(-score, -skewness)[rare] >= 0.99 * below[rare]).all()
+
+
+@pytest.mark.parametrize(
+    ("signal", "background", "cycles", "dead"),
+    [(1.72, 0.045, 92, 7.7), (1.72, 0.045, 300, 7.7), (1.72, 0.045, 92, 75.0), (0.5, 0.01, 300, 30.0)],
+)
+def test_short_exposures_of_dim_background_fit(signal: float, background: float, cycles: int, dead: float) -> None:
+    """79 to 258 registrations, of which few or none decide a score: 1 to 3 % had p < 0.001 by the normal law."""
+    truth = make_system(dead, cycles, 171, period_ns=133.3, sigma_ns=0.88, start="stationary")
+    delay = np.random.default_rng(1).uniform(0.0, 133.3, (1, 2000))
+    counts = ml.simulate(ml.Flux(np.full_like(delay, signal), background, delay), truth, seed=1, threads=1)[0]
+    p = ml.reconstruct(counts, truth, threads=1).p_value
+    assert p is not None
+    p = p[np.isfinite(p)]
+    assert p.size > 900
+    for level in (0.05, 0.01, 0.001):
+        assert binom.sf((p < level).sum() - 1, p.size, level) > 1e-4
 
 
 @pytest.mark.parametrize("dead", [0.0, 0.1, 0.22, 0.5])

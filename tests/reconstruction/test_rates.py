@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from harness import make_system
+from scipy.stats import binom
 
 import mars_lidar as ml
 from mars_lidar.reconstruction import coates_rates, generalised_coates_rates, mchc_rates
@@ -72,6 +73,50 @@ def test_coates_inverts_the_exact_mean(dead_ns, cycles):
     mean = mean_histogram(ml.Flux(1.0, 0.5, 37.0), system)
     result = coates_rates(mean, system)
     assert np.abs(result / rate - 1.0).max() < (1e-9 if dead_ns == 0 else 1e-3)
+
+
+@pytest.mark.parametrize(
+    ("method", "signal", "background", "cycles", "least"),
+    [
+        ("coates", 0.5, 0.5, 500, 0.95),
+        ("coates", 3.0, 0.5, 500, 0.95),  # 15 passes reach the period's end
+        ("coates", 4.0, 0.4, 300, 0.90),  # 3.7 pass: a third of the errors were those of a period without photons
+        ("coates", 1.0, 5.0, 3000, 0.95),
+        ("generalised_coates", 3.0, 0.5, 300, 0.95),
+    ],
+)
+def test_errors_of_windows_hold_where_few_passes_are_armed(method, signal, background, cycles, least):
+    """Of 1000 pixels `least` of the 95 % intervals of S and B contain them, as far as chance (1e-4) allows."""
+    mode, dead = ("synchronous", 0.0) if method == "coates" else ("nonparalyzable", 80.0)
+    system = system_of(dead, bins=200, cycles=cycles, sigma_ns=1.0, mode=mode, start="armed")
+    delay = 32.0 + np.random.default_rng(1).uniform(-0.25, 0.25, (1, 1000))
+    counts = ml.simulate(ml.Flux(np.full_like(delay, signal), background, delay), system, seed=1, threads=1)[0]
+    maps = ml.reconstruct(counts, system, method, threads=1)
+    usual = maps.flags == 0
+    assert usual.mean() > 0.9
+    for value, error, truth in (
+        (maps.signal, maps.signal_error, signal),
+        (maps.background, maps.background_error, background),
+    ):
+        within = np.abs(value - truth)[usual] < 1.96 * error[usual]
+        assert binom.cdf(within.sum(), within.size, least) > 1e-4
+        assert (np.abs(value - truth)[usual] < 5.0 * error[usual]).mean() > 0.998
+
+
+def test_no_error_of_a_background_without_registrations():
+    """And the bins in which no pass was armed say nothing of the light."""
+    system = system_of(0.0, bins=100, cycles=50, sigma_ns=1.0, mode="synchronous")
+    counts = np.zeros(100)
+    counts[40] = 20
+    maps = ml.reconstruct(counts, system, "coates")
+    assert maps.background == 0.0
+    assert np.isnan(maps.background_error)
+    assert maps.signal_error > 0.0
+    counts[:] = [1, *[0] * 38, 8, 40, *[0] * 59]  # from bin 41 on one pass, then none
+    counts[60] = 1
+    maps = ml.reconstruct(counts, system, "coates")
+    before = -np.log1p(-1 / 50) / 62 * 100  # B of bins 0 to 60, at least
+    assert float(maps.background) > before
 
 
 def test_coates_is_the_textbook_formula():

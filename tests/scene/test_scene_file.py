@@ -71,17 +71,8 @@ def test_a_scene_file_of_a_transient_is_its_options(transient):
         "light: {photons_per_unit: 2e-2, sbr: 4}\n"
     )
     out = transient / "a.npz"
-    options = [
-        "--transient",
-        transient / "t.npy",
-        "--transient-bin-ns",
-        0.5,
-        "--transient-start-ns",
-        1,
-        "--transient-channel",
-        1,
-        "--no-transient-pulse",
-    ]
+    times = "--transient-bin-ns 0.5 --transient-start-ns 1 --transient-channel 1 --no-transient-pulse"
+    options = ["--transient", transient / "t.npy", *times.split()]
     by_options, source = simulated(out, *options, "--photons-per-unit", 0.02, "--sbr", 4)
     by_file, same = simulated(out, "--scene", transient / "scene.yaml")
     assert np.array_equal(by_file, by_options)

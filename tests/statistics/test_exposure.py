@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from harness import system_of
+from harness import constant_rate_moments, system_of
 
 import mars_lidar as ml
 from mars_lidar import _core
@@ -52,18 +52,6 @@ def on_grid(signal, background, system, n, *, level="", settle=True, delay_ns=No
     return cumulants[0], int(settled[0])
 
 
-def constant_rate(total, dead, cycles, start):
-    """Mean and variance of a constant-rate pixel in a long exposure."""
-    x = total * dead
-    mean, variance = total * cycles / (1 + x), total * cycles / (1 + x) ** 3
-    if start == "stationary":
-        return mean, variance + x**2 * (6 + 4 * x + x**2) / (6 * (1 + x) ** 4)
-    return (
-        mean + x**2 / (2 * (1 + x) ** 2),
-        variance + x**2 * (18 + 4 * x + x**2) / (12 * (1 + x) ** 4),
-    )
-
-
 @pytest.mark.parametrize("start", ["armed", "stationary"])
 @pytest.mark.parametrize(
     ("total", "dead", "cycles"),
@@ -82,7 +70,7 @@ def constant_rate(total, dead, cycles, start):
 )
 def test_constant_rate(total, dead, cycles, start):
     result = exposure_moments(ml.Flux(0.0, total), system_of(dead, cycles=cycles, start=start), tolerance=1e-6)
-    mean, variance = constant_rate(total, dead, cycles, start)
+    mean, variance = constant_rate_moments(total, dead, cycles, stationary=start == "stationary")
     assert result.mean == pytest.approx(mean, rel=1e-9)
     assert result.variance == pytest.approx(variance, rel=1e-6)
     np.testing.assert_allclose(result.histogram, mean / 64, rtol=5e-3 if start == "armed" else 1e-9)

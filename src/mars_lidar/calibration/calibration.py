@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
@@ -12,14 +13,14 @@ from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.display import brief, measured
 from mars_lidar._base.resources import one_blas_thread
-from mars_lidar._base.types import ArrayLike, FloatArray
+from mars_lidar._base.types import ArrayLike, FloatArray, NDArray
 from mars_lidar.calibration import start, suspects
 from mars_lidar.calibration.curves import Curves, Realizations, curves, realizations
 from mars_lidar.calibration.fit import Effort, Fit, Fitted, Guess, draws
 from mars_lidar.calibration.look import Look, look_at
 from mars_lidar.calibration.model import Model, all_carriers
 from mars_lidar.calibration.recording import FALSE_ALARM, LEAST_PHOTONS, Recording, recording_of, recording_of_arrivals
-from mars_lidar.calibration.suspects import Drift, Score
+from mars_lidar.calibration.suspects import Bound, Drift, Named, Score
 from mars_lidar.instrument.avalanches import Afterpulsing
 from mars_lidar.instrument.detector import Detector
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, Jitter
@@ -32,15 +33,8 @@ from mars_lidar.light.timestamps import Timestamps
 _SAME_TIME = 0.01  # fraction of records at exactly the time of the preceding one, above which they are not photons
 LEVEL = 0.01  # false-alarm probability of the verdict
 
-_FIELDS = (
-    "mode",
-    "afterpulse_probability",
-    "afterpulse_delay_ns",
-    "twilight_ns",
-    "recovery_ns",
-    "electronics_dead_time_ns",
-)
-GIVEN = ("dead_time_ns", "jitter_ns", "pulse_sigma_ns", *_FIELDS)
+_TIMES = ("dead_time_ns", "jitter_ns", "pulse_sigma_ns", "twilight_ns", "recovery_ns", "electronics_dead_time_ns")
+GIVEN = (*_TIMES, "mode", "afterpulse_probability", "afterpulse_delay_ns")
 
 
 @dataclass(frozen=True)
@@ -130,11 +124,6 @@ class Calibration:
     level
         False-alarm probability of the verdict.
 
-    Raises
-    ------
-    AttributeError
-        A name that is neither an attribute nor an estimate; the name of an estimate gives its value.
-
     See Also
     --------
     calibrate
@@ -176,11 +165,6 @@ class Calibration:
         return bool(self.p_value >= self.level)
 
     @property
-    def problems(self) -> tuple[str, ...]:
-        """Problems of the recording or the model, one sentence each."""
-        return (*self.look.problems, *(str(suspect) for suspect in self.suspects if not suspect.included))
-
-    @property
     def verdict(self) -> str:
         """In one sentence."""
         if self.fitted is None:
@@ -196,9 +180,7 @@ class Calibration:
 
     def curves(self, seed: int = 0) -> Curves:
         """Histograms of the recording and of streams that the fitted model draws with `seed`, for a figure."""
-        model = None if self.fitted is None else self.fitted.model
-        theta = None if model is None or self.fitted is None else model.bounded(self.fitted.theta)
-        return curves(self.recording, model, theta, seed, (200, 256, 60))
+        return curves(self.recording, self.fitted, seed, (200, 256, 60))
 
     def realizations(self, cycles: int, *, simulated: int = 4000, seed: int = 0) -> Realizations:
         """Distribution of the count in pieces of `cycles` periods, and of `simulated` pieces drawn with `seed` (T6).
@@ -212,14 +194,7 @@ class Calibration:
             raise ValueError("realizations need a fit and a laser period: calibrate without look=True")
         number = checks.integer("cycles", cycles, low=1, high=TOL.cycles)
         drawn = checks.integer("simulated", simulated, low=200, high=10**7)
-        model = self.fitted.model
-        return realizations(self.recording, model, model.bounded(self.fitted.theta), number, drawn, seed)
-
-    def __getattr__(self, name: str) -> float:
-        estimates: dict[str, Estimate] = object.__getattribute__(self, "estimates")
-        if name in estimates:
-            return estimates[name].value
-        raise AttributeError(f"{type(self).__name__} has no attribute {name!r}; estimates: {', '.join(estimates)}")
+        return realizations(self.recording, self.fitted, number, drawn, seed)
 
 
 @checked
@@ -416,36 +391,23 @@ class _Run:
         """The fit, the effects that it includes, and the suspects that remain."""
         fitted = self.first()
         wrong = () if fitted.converged and fitted.p_value >= self.level else self.wrong_values(fitted)
-        included: list[suspects.Named] = []
+        included: list[Named] = []
         drift = suspects.drift(self.fit, fitted) if fitted.converged else None
-        steady = fitted.converged and not (drift is not None and drift.flickers)  # flicker looks like every effect
-        listed = suspects.scores(self.fit, fitted) if steady else []
-        for _ in range(self.fit.effort.effects if steady and not wrong else 0):
-            better = suspects.refitted(self.fit, fitted, listed)
-            if better is None:
-                break
-            fitted, effect = better
-            included += [] if effect is None else [effect]
-            listed = suspects.scores(self.fit, fitted)
-        if included:
-            drift = suspects.drift(self.fit, fitted)
-        return self.assembled(fitted, included, [] if wrong else listed, drift, wrong)
+        listed: list[Score] = []
+        if fitted.converged and not wrong and not (drift is not None and drift.flickers):  # which looks like effects
+            fitted, included, listed = suspects.search(self.fit, fitted)
+            drift = suspects.drift(self.fit, fitted) if included else drift
+        return self.assembled(fitted, included, listed, drift, wrong)
 
     def wrong_values(self, fitted: Fitted) -> tuple[Suspect, ...]:
         """Given values that the stream contradicts (without one of them it fits), and the estimate of each."""
         out = []
-        without: list[tuple[str, Any, Pulse | str, dict[str, Any], dict[str, float]]] = []
-        for name, value in self.fixed.items():
-            free_of_it = {key: own for key, own in self.fixed.items() if key != name}
-            printed = "jitter_ns" if name == "jitter" else name
-            without.append((printed, value, self.shape, self.fields, free_of_it))
-        for name, whole in self.fields.items():
-            rest = {key: own for key, own in self.fields.items() if key != name}
-            without.append((name, whole, self.shape, rest, self.fixed))
-        if isinstance(self.shape, Pulse):
-            known: Any = self.shape.sigma_ns if isinstance(self.shape, GaussianPulse) else self.shape
-            without.append(("pulse_sigma_ns", known, "gaussian", self.fields, self.fixed))
-        for name, given, shape, fields, fixed in without:
+        pulse = {"pulse_sigma_ns": self.shape.sigma_ns if isinstance(self.shape, GaussianPulse) else self.shape}
+        known: dict[str, Any] = {**self.fixed, **self.fields, **(pulse if isinstance(self.shape, Pulse) else {})}
+        for own, given in known.items():
+            fields, fixed = ({k: v for k, v in part.items() if k != own} for part in (self.fields, self.fixed))
+            shape = "gaussian" if own == "pulse_sigma_ns" else self.shape
+            name = "jitter_ns" if own == "jitter" else own
             run = _Run(self.recording, self.look, shape, self.returns, fields, fixed, self.level, self.seed)
             free = run.first()
             if not free.converged or free.p_value < self.level:
@@ -485,10 +447,10 @@ class _Run:
     def assembled(
         self,
         fitted: Fitted,
-        included: list[suspects.Named],
+        included: list[Named],
         listed: list[Score],
         drift: Drift | None,
-        wrong: tuple[Suspect, ...] = (),
+        wrong: tuple[Suspect, ...],
     ) -> Calibration:
         """The result of the last fit."""
         growth = _growth(fitted, drift)
@@ -532,7 +494,8 @@ class _Run:
         system = fitted.model.system(centre, cycles, 1024) if known else None
         flux = fitted.model.flux(centre) if known else None
         ordered = tuple(sorted(named, key=lambda suspect: (not suspect.included, -suspect.z)))
-        limits, look, recording = _limits(fitted, listed if p >= self.level else []), self.look, self.recording
+        bounds = suspects.at_limits(self.fit, fitted, listed) if p >= self.level else []
+        limits, look, recording = _limits(fitted, bounds), self.look, self.recording
         return Calibration(
             look, estimates, p, ordered, limits, drift, system, flux, wave, error, recording, fitted, self.level
         )
@@ -559,17 +522,21 @@ def _estimates(fitted: Fitted, growth: FloatArray) -> dict[str, Estimate]:
     centre, names = model.bounded(fitted.theta), model.names
     k = model.light
     free = {names[i] for i in fitted.free}
-    withheld = fitted.p_value < FALSE_ALARM and growth.max() == 1.0  # the scatter of the parts includes a misfit
+    grown = dict(zip(names, growth > 1.0, strict=True))  # the scatter of the parts includes a misfit
+    withheld = {name for name in names if fitted.p_value < FALSE_ALARM and not grown[name]}
+    extremes = _at_bounds(fitted, covariance, drawn) if model.split and "jitter" in free else []
     out: dict[str, Estimate] = {}
 
     def put(name: str, value: float, sample: FloatArray, *needs: str, note: str = "", limit: bool = False) -> None:
         if not free & set(needs):
             out[name] = Estimate(value, 0.0, value, value, "given")
             return
-        if withheld:
+        if withheld & set(needs):
             out[name] = Estimate(value, np.nan, np.nan, np.nan, "of a model that does not fit: no error is stated")
             return
-        low, high = (0.0, np.quantile(sample, 0.95)) if limit else np.quantile(sample, (0.025, 0.975))
+        parts = [sample, *(sample[rows] for rows in extremes)]  # the true angle may be a bound
+        ends = [np.quantile(part, (0.025, 0.975)) for part in parts]
+        low, high = (0.0, np.quantile(sample, 0.95)) if limit else (np.min(ends), np.max(ends))
         out[name] = Estimate(value, float(((sample - value) ** 2).mean() ** 0.5), float(low), float(high), note)
 
     light = names[0] if model.returns else "light"  # all of it
@@ -580,13 +547,10 @@ def _estimates(fitted: Fitted, growth: FloatArray) -> dict[str, Estimate]:
         put(names[i], float(centre[i] % period if wrapped else centre[i]), drawn[:, i], names[i])
     pulses, jitters = model.widths(drawn)
     pulse, jitter = map(float, model.widths(centre))
-    note = ""
-    if "jitter" in free:
-        sd = float(np.sqrt(np.diag(covariance))[list(fitted.free).index(k + 1)])
-        if fitted.unbounded[k + 1] < 2.0 * sd:
-            note = "not detected"
-        if note and model.split and np.quantile(jitters, 0.975) > 0.985 * centre[k]:
-            note = "not identified: any share of the recorded width"
+    errors = dict(zip(fitted.free.tolist(), np.sqrt(np.diag(covariance)), strict=True))
+    note = "not detected" if "jitter" in free and fitted.unbounded[k + 1] < 2.0 * errors[k + 1] else ""
+    if note and model.split and np.quantile(jitters, 0.975) > 0.985 * centre[k]:
+        note = "not identified: any share of the recorded width"
     if model.gaussian:
         put("width_ns", float(centre[k]), drawn[:, k], "width")
         shared = note if note.startswith("not identified") else ""
@@ -610,7 +574,7 @@ def _estimates(fitted: Fitted, growth: FloatArray) -> dict[str, Estimate]:
         elif not effect.onoff:
             put(effect.names[0], float(values[0]), columns[:, 0], effect.names[0])
         at += len(effect.names)
-    if fitted.by_shortest is not None and not withheld:
+    if fitted.by_shortest is not None and "dead_time_ns" not in withheld:
         value, low, high = fitted.by_shortest
         out["dead_time_ns"] = Estimate(value, np.nan, low, high, "by the shortest interval alone")
     elif "dead_time_ns" not in out:
@@ -618,38 +582,38 @@ def _estimates(fitted: Fitted, growth: FloatArray) -> dict[str, Estimate]:
     return out
 
 
-def _limits(fitted: Fitted, listed: list[Score]) -> tuple[Limit, ...]:
-    """Upper limits of effects that were not detected, for each effect the largest over its delays or kinds."""
-    best: dict[str, Limit] = {}
+def _at_bounds(fitted: Fitted, covariance: FloatArray, drawn: FloatArray) -> list[NDArray[np.intp]]:
+    """Draws next to each bound of the angle that its 95 % interval holds: a twentieth of all."""
+    k, order = fitted.model.light + 1, np.argsort(drawn[:, fitted.model.light + 1])
+    reach = 1.96 * float(np.sqrt(np.diag(covariance))[list(fitted.free).index(k)])
+    most = float(fitted.model.bounded(np.where(np.arange(drawn.shape[1]) == k, np.pi, fitted.theta))[k])
+    count, angle = len(order) // 20, float(fitted.unbounded[k])
+    return [part for part, end in ((order[:count], 0.0), (order[-count:], most)) if abs(angle - end) < reach]
+
+
+def _limits(fitted: Fitted, bounds: list[Bound]) -> tuple[Limit, ...]:
+    """Upper limits of effects that were not detected, with the shifts that exceed the stated errors."""
     names = [fitted.model.names[k] for k in fitted.free]
     errors = np.sqrt(np.diag(fitted.covariance))
-    for score in listed:
-        name = score.effect.names[0]
-        if score.z > suspects.clear(listed) or score.effect.onoff:
-            continue
-        size = min(score.limit, score.effect.most[0])
-        shifts = {
-            own: float(shift * size)
-            for own, shift, error in zip(names, score.shift, errors, strict=True)
-            if abs(shift * size) > error
-        }
-        if name not in best or size > best[name].limit:
-            best[name] = Limit(name, score.effect.words, size, shifts)
-    return tuple(best.values())
+    limits = []
+    for bound in bounds:
+        moves = zip(names, bound.shift, errors, strict=True)
+        shifts = {name: float(move) for name, move, error in moves if abs(move) > error}
+        limits.append(Limit(bound.effect.names[0], bound.effect.words, bound.limit, shifts))
+    return tuple(limits)
 
 
 def _worst_cells(fitted: Fitted) -> tuple[str, float]:
     """The group of cells that fits worst, in words, and by how many standard deviations."""
     cells = fitted.batch.cells
     middle = cells.phases + cells.gap_edges.size + 1
-    groups = {
-        "phases: shape of the light": slice(0, cells.phases),
-        "intervals": slice(cells.phases, middle),
-        "intervals by phase": slice(middle, None),
-    }
+    names, ends = (
+        ("phases: shape of the light", "intervals", "intervals by phase"),
+        (0, cells.phases, middle, cells.size),
+    )
     worst, most = "", -np.inf
-    for words, part in groups.items():
-        used = np.flatnonzero(fitted.offset[part] > 5.0) + (part.start or 0)
+    for words, (first, end) in zip(names, pairwise(ends), strict=True):
+        used = np.flatnonzero(fitted.offset[first:end] > 5.0) + first
         scale = fitted.fresh[:, used].std(0)
         drawn = ((fitted.fresh[:, used] / scale) ** 2).sum(1)
         z = (float(((fitted.rest[used] / scale) ** 2).sum()) - drawn.mean()) / drawn.std()

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mars_lidar._base.types import FloatArray
-from mars_lidar.calibration.fit import LIGHTS, Effort
-from mars_lidar.calibration.model import Model
+from mars_lidar.calibration.fit import LIGHTS, Effort, Fitted
 from mars_lidar.calibration.recording import Recording
 from mars_lidar.statistics.count_pmf import Pmf, kl_divergence, total_variation
 
@@ -55,10 +54,8 @@ class Realizations:
         )
 
 
-def curves(
-    recording: Recording, model: Model | None, theta: FloatArray | None, seed: int, sizes: tuple[int, int, int]
-) -> Curves:
-    """Histograms of intervals, phases and ages in `sizes` cells, and those of the model at `theta` if it is given."""
+def curves(recording: Recording, fit: Fitted | None, seed: int, sizes: tuple[int, int, int]) -> Curves:
+    """Histograms of intervals, phases and ages in `sizes` cells, and those of the model, if it is fitted."""
     period, unit = recording.period_ns, recording.clock.unit_ns
 
     def counted(times: list[FloatArray], edges: list[FloatArray]) -> list[FloatArray]:
@@ -72,11 +69,11 @@ def curves(
     ages = _edges(max(low - 0.1 * (high - low), 0.0), high + (high - low), sizes[2], unit)
     edges = [_edges(0.0, 1.05 * top, sizes[0], unit), np.linspace(0.0, period, sizes[1] + 1), ages]
     recorded, fitted, residual = counted(list(recording.pieces), edges), None, None
-    if model is not None and theta is not None:
+    if fit is not None:
         total = min(_RATIO * recording.photons, Effort.batch)
         cycles = max(2, round(recording.exposure * total / recording.photons / LIGHTS))
         scale = recording.exposure / (cycles * LIGHTS)
-        streams = model.streams(np.tile(theta, (LIGHTS, 1)), cycles, seed)
+        streams = fit.model.streams(np.tile(fit.theta, (LIGHTS, 1)), cycles, seed)
         fitted = [scale * counts for counts in counted(list(streams), edges)]
         residual = (recorded[2] - fitted[2]) / np.sqrt(np.maximum(fitted[2], 1.0) * (1.0 + scale))
         residual[fitted[2] < 3.0] = np.nan
@@ -94,7 +91,7 @@ def _edges(low: float, high: float, number: int, unit: float) -> FloatArray:
 
 
 def realizations(
-    recording: Recording, model: Model, theta: FloatArray, cycles: int, simulated: int, seed: int, resampled: int = 400
+    recording: Recording, fit: Fitted, cycles: int, simulated: int, seed: int, resampled: int = 400
 ) -> Realizations:
     """Counts in pieces of `cycles` periods, against `simulated` pieces of the model's streams; `resampled` floors."""
     length = cycles * recording.period_ns
@@ -112,7 +109,7 @@ def realizations(
             f"{cycles:,}: {counts.size}"
         )
     each = -(-simulated // LIGHTS) + 1
-    streams = model.streams(np.tile(theta, (LIGHTS, 1)), each * cycles, seed)
+    streams = fit.model.streams(np.tile(fit.theta, (LIGHTS, 1)), each * cycles, seed)
     drawn = np.concatenate([cut(t, each * length)[1:] for t in streams])  # the first begins with an armed pixel
     low, high = int(min(counts.min(), drawn.min())), int(max(counts.max(), drawn.max()))
     measured, predicted = Pmf.of_counts(counts), Pmf.of_counts(drawn)

@@ -10,7 +10,7 @@ may be shorter than the recording.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from mars_lidar.calibration.model import Model
 from mars_lidar.calibration.recording import FALSE_ALARM, Recording
 from mars_lidar.calibration.shortest import Shortest, shortest_law
 
+Index: TypeAlias = NDArray[np.intp]
 LIGHTS = 16  # streams of one detector, in one call of the engine
 _NEAR = 3.0  # standard errors of the recording about the estimate, from which the last streams are drawn
 _CUMULATED = 100.0  # intervals expected up to an edge, for a normal law of their number
@@ -85,7 +86,7 @@ class Guess(NamedTuple):
     model: Model
     theta: FloatArray
     root: FloatArray
-    free: NDArray[np.intp]
+    free: Index
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +108,13 @@ class Batch:
         """(c,) cells with enough counts for a normal law in streams this short."""
         return np.asarray(self.offset > 2.0 * max(1.0, self.ratio / 4.0))
 
-    def estimator(self, free: NDArray[np.intp], prior: FloatArray | None = None) -> FloatArray:
+    def one_count(self, model: Model, free: Index) -> FloatArray:
+        """Variance (free, free) of the light by one registration more or less, where none of a kind may be recorded."""
+        rise = np.maximum(self.slope[: self.cells.phases, free], 0.0).sum(0)
+        amount = (free == 0) | ((free < model.light) & (free % 2 == 1))
+        return np.diag(amount / np.maximum(rise, 1.0 / model.scale(self.centre)[free]) ** 2)
+
+    def estimator(self, free: Index, prior: FloatArray | None = None) -> FloatArray:
         """G (free, c), with an optional prior precision (free, free)."""
         jacobian = self.slope[:, free]
         information = jacobian.T @ self.weight @ jacobian
@@ -127,19 +134,17 @@ def counted(model: Model, cells: Cells, rows: FloatArray, exposure: float, seed:
 
 
 def design(
-    model: Model, centre: FloatArray, root: FloatArray, free: NDArray[np.intp], seed: int, number: int, widths: int
+    model: Model, centre: FloatArray, root: FloatArray, free: Index, seed: int, number: int, widths: int
 ) -> FloatArray:
     """Parameters (streams, p), normal of covariance root root' about the centre; `LIGHTS` rows share a detector.
 
     Pulses have `widths` different widths, each the mean of a group of those drawn; the jitter makes up for the
     difference.
     """
-    random = np.random.default_rng(seed)
-    k = model.light
-    cov = np.zeros((model.size, model.size))
-    cov[np.ix_(free, free)] = root @ root.T
-    det = free[(free >= k) & ((free != k + 1) | model.split)]
-    lit = np.setdiff1d(free, det)
+    random, k = np.random.default_rng(seed), model.light
+    varied = (free < k) | ((free == k + 1) & (not model.split))  # within a call of the engine
+    order = np.argsort(varied, kind="stable")
+    lower = np.asarray(np.linalg.qr(root[order].T, mode="r")).T  # so that detectors do not depend on the light
 
     def normal(rows: int, columns: int) -> FloatArray:
         """Deviates (rows, columns) without correlation, of variance 1."""
@@ -147,15 +152,8 @@ def design(
         return np.asarray(np.linalg.qr(z - z.mean(0))[0] * rows**0.5)
 
     rows = np.tile(centre, (number * LIGHTS, 1))
-    within = cov[np.ix_(lit, lit)]
-    if det.size:
-        between = cov[np.ix_(det, det)]
-        away = np.repeat(normal(number, det.size) @ root_of(between).T, LIGHTS, 0)
-        gain = cov[np.ix_(lit, det)] @ np.linalg.pinv(between, rcond=1e-10)
-        rows[:, det] += away
-        rows[:, lit] += away @ gain.T
-        within = within - gain @ cov[np.ix_(det, lit)]
-    rows[:, lit] += normal(len(rows), lit.size) @ root_of(within).T
+    detectors = np.repeat(normal(number, int((~varied).sum())), LIGHTS, 0)
+    rows[:, free[order]] += np.c_[detectors, normal(len(rows), int(varied.sum()))] @ lower.T
     rows[:, k : k + 2] = np.abs(rows[:, k : k + 2])
     if model.split:
         rows[:, k + 1] = np.arcsin(np.abs(np.sin(rows[:, k + 1])))
@@ -179,17 +177,22 @@ def root_of(cov: FloatArray) -> FloatArray:
     return np.asarray(scale[:, None] * vectors * np.sqrt(np.maximum(values, 1e-9)))
 
 
+def least_squares(terms: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Coefficients, residuals, and inverse of the normal matrix, of values (n, ...) on terms (n, t)."""
+    inverse = np.asarray(np.linalg.pinv(terms.T @ terms), np.float64)
+    slope = inverse @ terms.T @ y
+    return slope, y - terms @ slope, inverse
+
+
 def regression(
-    cells: Cells, theta: FloatArray, centre: FloatArray, counts: FloatArray, ratio: float, free: NDArray[np.intp]
+    cells: Cells, theta: FloatArray, centre: FloatArray, counts: FloatArray, ratio: float, free: Index
 ) -> Batch:
     """The linear law of counts (streams, c), in units of an exposure `ratio` times as long as theirs."""
     y = counts * ratio
     x = (theta - centre)[:, free]
     scale = np.maximum(np.abs(x).max(0), 1e-300)
     terms = np.c_[np.ones(len(x)), x / scale]
-    inverse = np.linalg.pinv(terms.T @ terms)
-    fitted = inverse @ terms.T @ y
-    residual = y - terms @ fitted
+    fitted, residual, inverse = least_squares(terms, y)
     freedom = len(y) - terms.shape[1]
     # a cell that few streams reach has a variance of its own count at least, as Poisson's
     variance = (residual**2).sum(0) / freedom / ratio
@@ -212,13 +215,11 @@ class Fitted:
     """A fit, tested by new streams: most probable parameters (p,), covariance of the free ones, misfit."""
 
     model: Model
-    free: NDArray[np.intp]
+    free: Index
     theta: FloatArray
     covariance: FloatArray  # of the law before the bounds
     unbounded: FloatArray  # (p,) before the bounds of the model
-    scatter: (
-        FloatArray  # (free, free) of the estimator for the recording's exposure, without the noise of the simulations
-    )
+    scatter: FloatArray  # (free, free) of the estimator for the recording, without the noise of the simulations
     batch: Batch  # cells and weights
     offset: FloatArray  # (c,) expected counts at the centre of the last streams
     estimator: FloatArray  # (free, c): parameters less that centre, by counts less their offset
@@ -231,7 +232,7 @@ class Fitted:
     by_shortest: tuple[float, float, float] | None  # the dead time and its interval, if the counts do not determine it
 
 
-def most_probable(model: Model, theta: FloatArray, covariance: FloatArray, free: NDArray[np.intp]) -> FloatArray:
+def most_probable(model: Model, theta: FloatArray, covariance: FloatArray, free: Index) -> FloatArray:
     """The most probable parameters (p,) of a normal law within the bounds of the model.
 
     One parameter after the other, the one farthest beyond its bound first, is set to that bound, and the others to
@@ -253,7 +254,7 @@ def most_probable(model: Model, theta: FloatArray, covariance: FloatArray, free:
     return model.bounded(theta)
 
 
-def draws(model: Model, theta: FloatArray, covariance: FloatArray, free: NDArray[np.intp]) -> FloatArray:
+def draws(model: Model, theta: FloatArray, covariance: FloatArray, free: Index) -> FloatArray:
     """Draws (n, p) of that law within the bounds; if hardly any lies there, about the most probable parameters."""
     root = root_of(covariance)
     rows = np.tile(theta, (Effort.draws, 1))
@@ -302,19 +303,13 @@ class Fit:
         return Cells(model, theta, [t for t in pilot if t.size > 2], photons)
 
     def law(
-        self,
-        guess: Guess,
-        photons: float,
-        cells: Cells | None = None,
-        spread: float | None = None,
-        more: int = 1,
-        times: float = 1.0,
+        self, guess: Guess, photons: float, cells: Cells | None = None, spread: float | None = None, more: int = 1
     ) -> Batch:
-        """The linear law of counts about a guess for an exposure of this many photons."""
+        """The linear law of counts about a guess for so many photons; with a given spread, of longer streams."""
         model, theta, root, free = guess
+        size = self.effort.of(photons, 1.0 if spread is None else self.effort.longer)
         spread = self.effort.spread if spread is None else spread
         cells = self.cells(model, theta, photons) if cells is None else cells
-        size = self.effort.of(photons, times)
         linear = np.diag(model.scale(theta)[free] ** -2.0)
         precision = np.linalg.inv(spread**2 * photons / size * root @ root.T) + linear
         wide = root_of(np.asarray(np.linalg.inv(precision), np.float64))
@@ -336,7 +331,7 @@ class Fit:
             gain = law.estimator(free, prior)
             step = gain @ (recorded - law.offset)
             scatter = law.residual @ gain.T
-            cov = scatter.T @ scatter / (len(scatter) - len(free) - 1) / law.ratio
+            cov = scatter.T @ scatter / (len(scatter) - len(free) - 1) / law.ratio + law.one_count(model, free)
             full = law.slope[:, free].T @ law.weight @ law.slope[:, free] + prior
             inverse = np.linalg.inv(full)
             cov = cov + inverse @ prior @ inverse
@@ -350,8 +345,7 @@ class Fit:
             near = size < (0.6 if weighed >= photons else 1.5)
             grown = min(photons, weighed * 6.0) if near else weighed
             cov = cov * (weighed / grown)
-            cov = cov + np.diag(0.02**2 * np.diag(cov))
-            root = root_of(cov)
+            root = root_of(cov + np.diag(0.02**2 * np.diag(cov)))
             if near and weighed >= photons:
                 break
             weighed = grown
@@ -371,33 +365,31 @@ class Fit:
         law = shortest_law(self.recording, model, middles, cycles, self.next_seed())
         return law.p_value([part[:, k] for part in parts]), law
 
-    def finish(self, guess: Guess, again: bool = True, known: bool = False) -> Fitted:
+    def finish(self, guess: Guess, again: bool = True, known: bool = False, finished: bool = False) -> Fitted:
         """The last estimate, with the slope, bias, scatter and misfit that fresh streams around it show.
 
+        A guess that is already the result of `finish` has the covariance with which the last streams are drawn.
+
         The dead time follows from the shortest interval alone (`known`) if that contradicts the 95 % interval of the
-        counts, or is more precise, or if the counts hardly change with the dead time on one side of the estimate. The
-        other parameters are then fitted once more at that dead time.
+        counts, or is more precise, or if counts claim more than intervals can tell. The other parameters are then
+        fitted once more at that dead time.
         """
         model, theta, root, free = guess
         photons, effort = float(self.recording.photons), self.effort
-        closer = (
-            effort.spread / effort.more**0.5
-        )  # counts near the end of a dead time are linear over short distances only
-        prior, middle = model.precision(free), model.middle(theta)
-        law = self.law(Guess(model, theta, root, free), photons, None, closer, effort.more, effort.longer)
+        closer = effort.spread / effort.more**0.5  # counts near the end of a dead time are linear over short distances
+        prior, middle = model.prior(theta, free)
+        law = self.law(Guess(model, theta, root, free), photons, None, closer, effort.more)
         nearby = _NEAR * (effort.of(photons, effort.longer) / photons) ** 0.5
         gain = law.estimator(free)
         recorded = law.cells.of(self.recording)
         centre, size = theta, np.zeros(len(free))
         for trial in range(effort.recentred):
-            near = self.law(Guess(model, centre, root, free), photons, law.cells, nearby, times=effort.longer)
+            near = self.law(Guess(model, centre, root, free), photons, law.cells, nearby)
             y = near.counts  # of streams near the estimate, in the recording's exposure
             moved = (near.theta - centre)[:, free]
             terms = np.c_[np.ones(len(y)), moved]
-            inverse = np.linalg.pinv(terms.T @ terms)
-            slope = inverse @ terms.T @ (y - near.offset) @ gain.T
+            slope, rest, inverse = least_squares(terms, (y - near.offset) @ gain.T)
             local = slope[1:].T
-            rest = (y - near.offset) @ gain.T - terms @ slope
             noise = np.atleast_2d(rest.T @ rest) / (len(y) - terms.shape[1])
             away = gain @ (recorded - near.offset) - slope[0]
             information = np.linalg.pinv(noise)
@@ -410,17 +402,17 @@ class Fit:
                 solve = scale * cov @ local.T @ information
                 there[1:] = solve @ away + cov @ prior @ (middle - centre)[free]
             estimator = solve @ gain
+            cov = cov + near.one_count(model, free)
             raw = centre.copy()
             raw[free] += there[1:]
             mean = most_probable(model, raw, cov, free)
             size = np.abs((mean - centre)[free]) / np.sqrt(np.diag(cov))
-            if trial and (size.max() < 1.0 or trial == effort.recentred - 1):
+            if (trial or finished) and (size.max() < 1.0 or trial == effort.recentred - 1):
                 break
             root = root_of(cov)
             centre = centre + (mean - centre) / max(1.0, float(size.max()) / _NEAR)
         if any(model.names[index].startswith("log_") for index in free):
-            counted, observed = (y - near.offset) @ gain.T, gain @ (recorded - near.offset)
-            raw, cov = _curved(model, free, raw, cov, centre, moved, counted, observed, near.ratio)
+            raw, cov = _curved(model, free, raw, cov, near, gain, recorded)
             mean = most_probable(model, raw, cov, free)
         sd = np.sqrt(np.diag(cov))
         if again and (np.abs((centre - theta)[free]) > _NEAR * sd).any():  # cells and weights were laid elsewhere
@@ -436,11 +428,10 @@ class Fit:
         rest = project @ unmoved
         (z, p), timed = _misfit(rest, fresh, law, near), free == model.light + 2
         judged, interval = self.shortest(model, draws(model, raw, cov, free)), None
-        uneven = judged is not None and timed.any() and _uneven(solve @ gain @ (y - near.offset).T, moved, timed)
         if judged is not None:
             early, shortest = judged
             dead = shortest.dead_time()
-            if timed.any() and (early < 0.05 or uneven or 1.96 * sd[timed][0] > dead[2] - dead[1]):
+            if timed.any() and (early < 0.05 or shortest.decides(sd[timed][0])):
                 at = mean.copy()
                 at[model.light + 2] = dead[0]
                 own = Guess(model, at, root_of(cov[np.ix_(~timed, ~timed)]), free[~timed])
@@ -451,78 +442,37 @@ class Fit:
                 interval, mean[model.light + 2] = dead, dead[0]
             elif early < FALSE_ALARM:
                 p = min(p, early)
-        scatter, converged = solve @ noise @ solve.T / near.ratio, bool(size.max() < _NEAR) and not uneven
-        return Fitted(
-            model,
-            free,
-            mean,
-            cov,
-            raw,
-            scatter,
-            law,
-            near.offset,
-            estimator,
-            jacobian,
-            rest,
-            fresh,
-            z,
-            p,
-            converged,
-            interval,
-        )
-
-
-def _uneven(estimates: FloatArray, moved: FloatArray, which: NDArray[np.bool_]) -> bool:
-    """Whether estimates (free, streams) follow the parameter `which` on one side much less than on the other.
-
-    A normal law about the centre then holds on neither side: dead times that end between two pulses change no interval.
-    """
-    x = moved[:, which]
-    terms = np.c_[np.ones(len(moved)), moved, np.abs(x)]
-    inverse = np.linalg.pinv(terms.T @ terms)
-    y = estimates[which][0]
-    slope = inverse @ terms.T @ y
-    error = float((y - terms @ slope).std() * inverse[-1, -1] ** 0.5)
-    along, kink = float(slope[1:-1][which][0]), abs(float(slope[-1]))
-    return along - kink + _NEAR * error < (along + kink) / _NEAR
+        scatter, converged = solve @ noise @ solve.T / near.ratio, bool(size.max() < _NEAR)
+        law_of_counts = law, near.offset, estimator, jacobian, rest, fresh
+        return Fitted(model, free, mean, cov, raw, scatter, *law_of_counts, z, p, converged, interval)
 
 
 def _curved(
-    model: Model,
-    free: NDArray[np.intp],
-    raw: FloatArray,
-    cov: FloatArray,
-    centre: FloatArray,
-    moved: FloatArray,
-    counted: FloatArray,
-    observed: FloatArray,
-    ratio: float,
+    model: Model, free: Index, raw: FloatArray, cov: FloatArray, near: Batch, gain: FloatArray, own: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Mean (p,) and covariance (free, free) of parameters whose last one, a logarithm, also acts by its square.
 
-    The estimates `counted` (streams, free) of streams at parameters `moved` from the centre are fitted by a law with
-    the square of the logarithm and its product with the size. Draws of the linear law are weighted by the likelihood of
-    the `observed` estimates under it.
+    The estimates by `gain` of the streams `near` the centre are fitted by a law with the square of the logarithm and
+    its product with the size. Draws of the linear law are weighted by the likelihood of the estimates by the counts
+    `own` (c,) under it.
     """
     rows = draws(model, raw, 2.25 * cov, free)
-    at = (rows - centre)[:, free]
+    at, counted = (rows - near.centre)[:, free], (near.counts - near.offset) @ gain.T
 
     def terms(x: FloatArray) -> FloatArray:
         return np.asarray(np.c_[np.ones(len(x)), x, x[:, -1:] * x[:, -2:]])
 
-    law, own = terms(moved), terms(at)
-    inverse = np.linalg.pinv(law.T @ law)
-    slope = inverse @ law.T @ counted
-    rest = counted - law @ slope
-    scale = (len(law) - law.shape[1]) / (1.0 / ratio + np.einsum("ki,ij,kj->k", own, inverse, own))
-    off, out = observed - own @ slope, (rows - raw)[:, free]
+    law, there = terms((near.theta - near.centre)[:, free]), terms(at)
+    slope, rest, inverse = least_squares(law, counted)
+    scale = (len(law) - law.shape[1]) / (1.0 / near.ratio + np.einsum("ki,ij,kj->k", there, inverse, there))
+    off, out = gain @ (own - near.offset) - there @ slope, (rows - raw)[:, free]
     log = np.einsum("ki,ij,kj->k", out, np.linalg.inv(2.25 * cov), out) + len(free) * np.log(scale)
     log -= scale * np.einsum("ki,ij,kj->k", off, np.linalg.inv(rest.T @ rest), off)
     weight = np.exp(0.5 * (log - log.max()))
     if not weight.sum() ** 2 > 200.0 * (weight**2).sum():  # too few effective draws: the linear law is kept
         return raw, cov
     mean = np.average(at, axis=0, weights=weight)
-    theta = centre.copy()
+    theta = near.centre.copy()
     theta[free] += mean
     return theta, np.atleast_2d(np.cov(at.T, aweights=weight))
 
@@ -544,6 +494,7 @@ def _misfit(rest: FloatArray, fresh: FloatArray, law: Batch, near: Batch) -> tup
     square = float(gammaincc(shape, recorded * shape / drawn.mean()))
     gaps = slice(law.cells.phases, law.cells.phases + law.cells.gap_edges.size)
     enough = np.cumsum(near.offset[gaps]) > _CUMULATED
-    departure = np.abs(np.cumsum(rest[gaps])) / (np.cumsum(fresh[:, gaps], axis=1).std(0) * noise**0.5)
-    late = 2.0 * enough.sum() * float(ndtr(-departure[enough].max(initial=0.0)))
+    scatter = np.cumsum(fresh[:, gaps], axis=1).std(0)[enough] * noise**0.5
+    departure = np.abs(np.cumsum(rest[gaps])[enough]) / scatter
+    late = 2.0 * enough.sum() * float(ndtr(-departure.max(initial=0.0)))
     return float((recorded - drawn.mean()) / drawn.std()), min(1.0, 2.0 * min(square, late))

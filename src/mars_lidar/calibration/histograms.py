@@ -208,12 +208,15 @@ def _with_response(
 
 def _armed_passes(counts: FloatArray, system: System) -> FloatArray:
     """Armed passes (pixels, bins) of each bin: the registrations for light of one photon per bin."""
+    return _expected(Histograms(counts, system, 1), np.tile([0.0, float(counts.shape[1]), 0.0], (len(counts), 1)))
+
+
+def _expected(histograms: Histograms, light: FloatArray) -> FloatArray:
+    """Expected registrations (pixels, bins) of light (pixels, 3), given those of the earlier bins."""
     from mars_lidar._base.native import _core
 
-    bins = counts.shape[1]
-    light = np.tile([0.0, float(bins), 0.0], (len(counts), 1))
-    expected = np.empty(counts.shape)
-    _core.expected_registrations(Histograms(counts, system, 1).recording, counts, light, expected)
+    expected = np.empty(histograms.counts.shape)
+    _core.expected_registrations(histograms.recording, histograms.counts, light, expected)
     return expected
 
 
@@ -254,11 +257,7 @@ def _half_width(loss: Callable[[FloatArray], float], at: FloatArray, k: int, lea
 
 def _log_likelihood(counts: FloatArray, system: System) -> float:
     """Sum over the pixels of the quasi-likelihood at the most likely light of each."""
-    from mars_lidar._base.native import _core
-
     histograms = Histograms(counts, system, 1)
     fit = MaximumLikelihood().estimate(histograms)
-    light = np.stack([fit.signal, np.maximum(fit.background, 1e-9), fit.delay], axis=1)
-    expected = np.empty(counts.shape)
-    _core.expected_registrations(histograms.recording, counts, light, expected)
+    expected = _expected(histograms, np.stack([fit.signal, np.maximum(fit.background, 1e-9), fit.delay], axis=1))
     return float((counts * np.log(np.maximum(expected, 1e-9))).sum() - expected.sum())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, cast
@@ -34,45 +34,35 @@ class Effect:
     """A property of a detector beside dead time and jitter.
 
     `names` of its parameters, of which the first is its size and the others are logarithms; `start`: their values in
-    the test for it; `least` and `most`: their bounds; `apply` adds it to the fields of a `Detector`; `words` for a
-    table; `onoff`: it has no size.
+    the test for it; `least` and `most`: their bounds; `words` for a table; `onoff`: it has no size.
     """
 
     names: tuple[str, ...]
     start: tuple[float, ...]
     least: tuple[float, ...]
     most: tuple[float, ...]
-    apply: Callable[[Fields, tuple[float, ...]], Fields]
     words: str
     onoff: bool = False
+
+    def of(self, fields: Fields, value: tuple[float, ...]) -> Fields:
+        """Fields of a `Detector` with the effect."""
+        name, size, dead = self.names[0], value[0], fields["dead_time_ns"]
+        if name == "electronics_excess":  # the observed dead time is theirs, behind a detector that is ready earlier
+            return fields | {"electronics_dead_time_ns": dead, "dead_time_ns": dead / (1.0 + size)}
+        if name == "afterpulse_probability":
+            delay = float(np.exp(value[1]))
+            carriers = all_carriers(size, delay, dead)
+            return fields | (
+                {"afterpulsing": Afterpulsing(probability=carriers, delay_ns=delay)} if carriers > 0 else {}
+            )
+        if name == "paralyzable":
+            return fields | ({"mode": "paralyzable"} if size > 0.5 else {})
+        return fields | {name: min(size, dead) if name == "twilight_ns" else size}
 
 
 def all_carriers(after: float, delay_ns: float, dead_time_ns: float) -> float:
     """Carriers of an avalanche, of which `after` outlive the dead time; fewer than one, as `Afterpulsing` requires."""
     return float(min(after * np.exp(min(dead_time_ns / delay_ns, 50.0)), _MOST_CARRIERS))
-
-
-def _afterpulses(fields: Fields, value: tuple[float, ...]) -> Fields:
-    after, delay = value[0], float(np.exp(value[1]))
-    carriers = all_carriers(after, delay, fields["dead_time_ns"])
-    return fields | ({"afterpulsing": Afterpulsing(probability=carriers, delay_ns=delay)} if carriers > 0 else {})
-
-
-def _electronics(fields: Fields, value: tuple[float, ...]) -> Fields:
-    observed = fields["dead_time_ns"]  # the dead time of the electronics, behind a detector that is ready earlier
-    return fields | {"electronics_dead_time_ns": observed, "dead_time_ns": observed / (1.0 + value[0])}
-
-
-def _twilight(fields: Fields, value: tuple[float, ...]) -> Fields:
-    return fields | {"twilight_ns": min(value[0], fields["dead_time_ns"])}
-
-
-def _recovery(fields: Fields, value: tuple[float, ...]) -> Fields:
-    return fields | {"recovery_ns": value[0]}
-
-
-def _paralyzable(fields: Fields, value: tuple[float, ...]) -> Fields:
-    return fields | ({"mode": "paralyzable"} if value[0] > 0.5 else {})
 
 
 def effects(dead_time_ns: float) -> tuple[Effect, ...]:
@@ -84,11 +74,11 @@ def effects(dead_time_ns: float) -> tuple[Effect, ...]:
     starts = [(0.03, middle + place * reach) for place in (-0.5, 0.0, 0.5)]
     own = "electronics with a dead time of their own"
     return (
-        *(Effect(after, start, least, most, _afterpulses, "afterpulses") for start in starts),
-        Effect(("twilight_ns",), (min(1.0, 0.2 * dead),), (0.0,), (dead,), _twilight, "twilight pulses"),
-        Effect(("recovery_ns",), (0.03 * dead,), (0.0,), (2.0 * dead,), _recovery, "slow recovery"),
-        Effect(("electronics_excess",), (0.25,), (0.0,), (19.0,), _electronics, own),
-        Effect(("paralyzable",), (1.0,), (0.0,), (1.0,), _paralyzable, "paralyzable detector", onoff=True),
+        *(Effect(after, start, least, most, "afterpulses") for start in starts),
+        Effect(("twilight_ns",), (min(1.0, 0.2 * dead),), (0.0,), (dead,), "twilight pulses"),
+        Effect(("recovery_ns",), (0.03 * dead,), (0.0,), (2.0 * dead,), "slow recovery"),
+        Effect(("electronics_excess",), (0.25,), (0.0,), (19.0,), own),
+        Effect(("paralyzable",), (1.0,), (0.0,), (1.0,), "paralyzable detector", onoff=True),
     )
 
 
@@ -145,10 +135,8 @@ class Model:
     @property
     def names(self) -> tuple[str, ...]:
         """Names of all parameters."""
-        several = self.returns > 1
-        light = [
-            f"{name}{f'_{k + 1}' if several else ''}" for k in range(self.returns) for name in ("signal", "delay_ns")
-        ]
+        places = [f"_{k + 1}" for k in range(self.returns)] if self.returns > 1 else [""] * self.returns
+        light = [f"{name}{place}" for place in places for name in ("signal", "delay_ns")]
         more = [name for effect in self.effects for name in effect.names]
         return ("background", *light, "width", "jitter", "dead_time_ns", *more)
 
@@ -162,8 +150,7 @@ class Model:
         out = np.array(theta, float)
         k = self.light
         out[..., 0] = np.maximum(out[..., 0], 1e-7)
-        for r in range(self.returns):
-            out[..., 1 + 2 * r] = np.maximum(out[..., 1 + 2 * r], 0.0)
+        out[..., 1:k:2] = np.maximum(out[..., 1:k:2], 0.0)
         period = self.clock.period_ns
         out[..., k] = np.clip(out[..., k], _NARROWEST * period, _WIDEST * period)
         if self.split:
@@ -191,7 +178,7 @@ class Model:
         k, unit = self.light, self.clock.unit_ns
         width = float(np.hypot(theta[k], unit / 12**0.5))
         out = np.zeros(self.size)
-        out[0] = 0.3 * theta[0]
+        out[0] = max(0.3 * theta[0], 0.02 * float(theta[1:k:2].sum()))
         out[1:k:2] = 0.2 * theta[1:k:2] + 0.04 * theta[0]
         out[2:k:2] = 0.6 * width
         out[k] = 0.3 * width
@@ -204,16 +191,10 @@ class Model:
             at += len(effect.start)
         return out
 
-    def middle(self, theta: FloatArray) -> FloatArray:
-        """Parameters (p,) with an unknown angle in the middle of its range, where its prior is centred."""
-        out = theta.copy()
-        out[self.light + 1] = np.pi / 4.0 if self.split else theta[self.light + 1]
-        return out
-
-    def precision(self, free: NDArray[np.intp]) -> FloatArray:
-        """Prior precision (free, free): that of an angle anywhere in its range; the other parameters have no prior."""
-        known = self.split & (free == self.light + 1)
-        return np.asarray(np.diag(known * (2.0 / np.pi) ** 2))
+    def prior(self, theta: FloatArray, free: NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
+        """Prior precision (free, free), and parameters (p,) at its centre: of an angle anywhere in its range alone."""
+        angle = self.split & (np.arange(self.size) == self.light + 1)
+        return np.diag(angle[free] * (2.0 / np.pi) ** 2), np.where(angle, np.pi / 4.0, theta)
 
     def system(self, theta: FloatArray, cycles: int, bins: int = 16, jitter: bool = True) -> System:
         """The instrument of parameters (p,), with or without jitter."""
@@ -223,7 +204,7 @@ class Model:
         fields: Fields = dict(self.fields) | {"dead_time_ns": float(theta[k + 2])}
         at = k + 3
         for effect in self.effects:
-            fields = effect.apply(fields, tuple(map(float, theta[at : at + len(effect.names)])))
+            fields = effect.of(fields, tuple(map(float, theta[at : at + len(effect.names)])))
             at += len(effect.names)
         least = _NARROWEST * self.clock.period_ns
         if jitter and sd > least:
@@ -244,9 +225,8 @@ class Model:
         back = rows[None, :, 0]
         if self.returns == 0:
             return Flux(np.zeros_like(back), back, np.zeros_like(back))
-        period = self.clock.period_ns
-        signal = np.stack([rows[None, :, 1 + 2 * r] for r in range(self.returns)])
-        delay = np.stack([rows[None, :, 2 + 2 * r] % period for r in range(self.returns)])
+        signal, delay = (rows[:, first : self.light : 2].T[:, None] for first in (1, 2))
+        delay = delay % self.clock.period_ns
         return Flux(signal, back, delay) if self.returns > 1 else Flux(signal[0], back, delay[0])
 
     def varied(self, flux: Flux, cycles: int, seed: int) -> Flux:
@@ -275,8 +255,9 @@ class Model:
         sigma[sigma <= _NARROWEST * self.clock.period_ns] = 0.0
         number = made.phase.size if sigma.any() else 0
         deviates = np.random.default_rng(seed).standard_normal(number, dtype=np.float32)
-        times = np.empty(made.phase.size)
+        times, clock = np.empty(made.phase.size), self.clock
+        grid = clock.period_ns, clock.unit_ns, clock.offset, clock.locked
         _core.recorded_times(
-            made.cycle, made.phase, made.offsets, sigma_ns=sigma, deviates=deviates, grid=self.clock.grid, out=times
+            made.cycle, made.phase, made.offsets, sigma_ns=sigma, deviates=deviates, grid=grid, out=times
         )
         return Streams(times, made.offsets)

@@ -39,11 +39,6 @@ class Clock:
         units = self.period_ns / self.unit_ns if self.unit_ns else 0.5
         return self.locked or abs(units - round(units)) < 1e-3
 
-    @property
-    def grid(self) -> tuple[float, float, float, bool]:
-        """(period, unit, offset, locked), as native code takes it."""
-        return self.period_ns, self.unit_ns, self.offset, self.locked
-
 
 @dataclass(frozen=True, eq=False)
 class Recording:
@@ -107,9 +102,7 @@ def recording_of(times: Timestamps | Sequence[Timestamps], *, pooled: bool = Fal
 
     `pooled`: the pixels of an image are recordings of one and the same pixel.
     """
-    streams = [times] if isinstance(times, Timestamps) else list(times) if isinstance(times, Sequence) else []
-    if not streams or not all(isinstance(stream, Timestamps) for stream in streams):
-        raise TypeError(f"times must be Timestamps or a sequence of them, got {type(times).__name__}")
+    streams = [times] if isinstance(times, Timestamps) else list(times)
     first = streams[0]
     if not (first.period_ns > 0 and math.isfinite(first.period_ns)):
         raise ValueError(f"times must give the laser period, got period_ns {first.period_ns}")
@@ -150,12 +143,18 @@ def clock_of(t: FloatArray, stream: Timestamps, probed: int = 2000) -> Clock:
             first = locked & (place < 1.0)  # those of the last unit of a period may lie beyond its end
             if first.all():
                 continue
-            offset = float(np.angle(np.exp(2j * np.pi * place[~first]).mean()) / (2 * np.pi) % 1.0)
+            offset = _offset(place[~first])
             last = np.where(first, place + period / unit, place)
             away = np.min([np.abs((at - offset + 0.5) % 1.0 - 0.5) for at in (place, last)], axis=0)
             if float(np.quantile(away, 0.99)) < _ON_GRID:
-                return Clock(period, unit, 0.0 if min(offset, 1.0 - offset) < _ON_GRID else offset, locked)
+                return Clock(period, unit, offset, locked)
     return Clock(period)
+
+
+def _offset(place: FloatArray) -> float:
+    """Where the points of a grid lie, in its units, by places (n,) on it."""
+    offset = float(np.angle(np.exp(2j * np.pi * place).mean()) / (2 * np.pi) % 1.0)
+    return 0.0 if min(offset, 1.0 - offset) < _ON_GRID else offset
 
 
 def recording_of_arrivals(times_ns: ArrayLike, unit_ns: float, probed: int = 2000) -> Recording:
@@ -173,9 +172,5 @@ def recording_of_arrivals(times_ns: ArrayLike, unit_ns: float, probed: int = 200
     period = float(t[-1] - t[0]) / (t.size - 1)
     if not period > 0.0:
         raise ValueError("times must contain different times, got one value only")
-    clock = Clock(period)
-    if unit_ns:
-        place = t[:: max(1, t.size // probed)] / unit_ns
-        offset = float(np.angle(np.exp(2j * np.pi * place).mean()) / (2 * np.pi) % 1.0)
-        clock = Clock(period, unit_ns, 0.0 if min(offset, 1.0 - offset) < _ON_GRID else offset)
+    clock = Clock(period, unit_ns, _offset(t[:: max(1, t.size // probed)] / unit_ns)) if unit_ns else Clock(period)
     return Recording((t,), (float(t[-1]) / period,), clock, laser=False)

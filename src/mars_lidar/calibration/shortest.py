@@ -11,10 +11,12 @@ that their number is a Poisson number: none is recorded with the probability exp
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from mars_lidar._base.cached import cached_property
 from mars_lidar._base.types import FloatArray
 from mars_lidar.calibration.model import Model
 from mars_lidar.calibration.recording import Clock, Recording
@@ -23,23 +25,55 @@ from mars_lidar.statistics.cells import photons_per_bin
 
 @dataclass(frozen=True, eq=False)
 class Shortest:
-    """Probabilities (laws, m) of a shortest interval of at `least` the recorded one, or `more`, for dead times (m,)."""
+    """Intervals recorded up to any end: expected numbers (laws, m) for dead times (m,), and those that were recorded.
+
+    `recorded` (n,) intervals, sorted; `expected` the numbers up to an end; `unit` of the clock, and the `reach` of the
+    jitter beyond the shortest interval, ns.
+    """
 
     dead: FloatArray
-    least: FloatArray
-    more: FloatArray
+    recorded: FloatArray
+    expected: Callable[[float], FloatArray]
+    unit: float
+    reach: float
+
+    @cached_property
+    def none(self) -> tuple[FloatArray, FloatArray]:
+        """Probabilities (laws, m) that no interval is recorded before the shortest one, and none up to it."""
+        x = float(self.recorded[0])
+        return np.exp(-self.expected(x - self.unit)), np.exp(-self.expected(x))
 
     def p_value(self, dead: list[FloatArray]) -> float:
         """Two-sided p-value of the recorded shortest interval, given draws (n,) of the dead time for each law."""
         least, more = (
             np.mean([np.interp(own, self.dead, row).mean() for own, row in zip(dead, rows, strict=True)])
-            for rows in (self.least, self.more)
+            for rows in self.none
         )
         return float(min(1.0, 2.0 * min(least, 1.0 - more)))
 
     def dead_time(self) -> tuple[float, float, float]:
         """Median and 95 % interval of the dead time given the shortest interval, for a flat prior."""
-        likely = (self.least - self.more).mean(0)
+        return self._interval((self.none[0] - self.none[1]).mean(0))
+
+    def decides(self, error: float) -> bool:
+        """Whether the 95 % interval of an estimate by counts is much wider than this one, or narrower than can be."""
+        _, low, high = self.dead_time()
+        return 3.92 * error > 2.0 * (high - low) or 3.92 * error < self.narrowest()
+
+    def narrowest(self, cells: int = 12) -> float:
+        """Width of the 95 % interval of the dead time given all intervals that jitter brings near its end.
+
+        They are Poisson numbers in cells from the shortest interval on; of all laws, the one that tells most is taken.
+        """
+        places = self.recorded[0] + np.linspace(0.0, 1.0, cells) ** 2 * self.reach
+        ends = self.recorded[0] + self.unit * np.unique(np.round((places - self.recorded[0]) / self.unit))
+        numbers = np.diff(np.searchsorted(self.recorded, np.r_[0.0, ends + 0.5 * self.unit]))
+        below = np.array([self.expected(end) for end in (ends[0] - self.unit, *ends)])
+        log = (numbers[:, None, None] * np.log(np.maximum(np.diff(below, axis=0), 1e-300))).sum(0) - below[-1]
+        ends = [self._interval(np.exp(row - row.max())) for row in log]
+        return min(high - low for _, low, high in ends)
+
+    def _interval(self, likely: FloatArray) -> tuple[float, float, float]:
         share = np.r_[0.0, np.cumsum(0.5 * (likely[1:] + likely[:-1]) * np.diff(self.dead))]
         low, middle, high = np.interp(np.array([0.025, 0.5, 0.975]) * share[-1], share, self.dead)
         return float(middle), float(low), float(high)
@@ -65,21 +99,21 @@ def shortest_law(
     rate = np.fft.irfft(np.conj(np.fft.rfft(phases)) * np.fft.rfft(light), bins) * (recording.photons * bins / period)
     sd = np.maximum(2.0**0.5 * model.widths(rows)[1], 1e-6)  # ns, of an interval
     unit = max(clock.unit_ns, 1e-6)
+    reach = float(6.0 * sd.max() + unit)
+    near = [gaps[gaps < x + 2.0 * reach] for gaps in map(np.diff, recording.pieces)]
     early, late = np.linspace(-1.0, 0.0, nodes) ** 3 * x, np.linspace(0.0, 1.0, nodes)[1:] ** 3
-    age = x + np.r_[early, late * (6.0 * sd.max() + unit)]
+    age = x + np.r_[early, late * reach]
 
-    def none_up_to(end: float) -> FloatArray:
-        """Probability (laws, m) that no interval is recorded up to `end`."""
+    def up_to(end: float) -> FloatArray:
         z = (end - age + np.array([unit, 0.0])[:, None, None]) / sd[:, None]
         above = z * ndtr(z) + np.exp(-0.5 * z**2) / (2.0 * np.pi) ** 0.5  # integral of the normal law
-        recorded = (above[0] - above[1]) * sd[:, None] / unit
+        share = (above[0] - above[1]) * sd[:, None] / unit
         place = age / period * bins
         cell = place.astype(np.int64)
         part = place - cell
         at = rate[:, cell % bins] * (1.0 - part) + rate[:, (cell + 1) % bins] * part
-        density = np.maximum(at, 0.0) * recorded
+        density = np.maximum(at, 0.0) * share
         steps = 0.5 * (density[:, 1:] + density[:, :-1]) * np.diff(age)
-        expected = np.c_[np.cumsum(steps[:, ::-1], axis=1)[:, ::-1], np.zeros(len(rows))]
-        return np.asarray(np.exp(-expected))
+        return np.asarray(np.c_[np.cumsum(steps[:, ::-1], axis=1)[:, ::-1], np.zeros(len(rows))])
 
-    return Shortest(age, none_up_to(x - unit), none_up_to(x))
+    return Shortest(age, np.sort(np.concatenate(near)), up_to, unit, reach)

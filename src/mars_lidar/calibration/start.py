@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mars_lidar._base.types import FloatArray
+from mars_lidar._base.types import FloatArray, NDArray
 from mars_lidar.calibration.fit import LIGHTS, Fit
 from mars_lidar.calibration.model import Model
 from mars_lidar.calibration.recording import Recording
@@ -79,15 +79,12 @@ def light(t: FloatArray, model: Model, hold: float) -> FloatArray:
 
 def starts(fit: Fit, recording: Recording, model: Model, fixed: dict[str, float]) -> list[tuple[float, FloatArray]]:
     """(misfit, parameters), the best first, for jitters from zero to the whole recorded width."""
-    names = model.names
-    k = model.light
+    names, k = model.names, model.light
     photons = min(recording.photons, fit.effort.first)
-    t = recording.pieces[0]
-    t = t[: 12 * photons]
+    t = recording.pieces[0][: 12 * photons]
     low = np.sort(np.diff(t))
     n = low.size
-    ranks = np.unique(np.minimum([1, 5, 20, max(30, n // 500), max(60, n // 100), max(120, n // 30)], n - 1))
-    observed, unit = low[ranks], model.clock.unit_ns
+    observed, unit = low[_ranks(n)], model.clock.unit_ns
     hold = max(4 * observed[-3] - 3 * observed[0], fixed.get("dead_time_ns", 0.0)) + 2 * unit
     if model.returns == 0:
         total = float(free_waveform(recording, 64)[0].sum())
@@ -104,11 +101,6 @@ def starts(fit: Fit, recording: Recording, model: Model, fixed: dict[str, float]
         theta[k + 1] = fixed.get("jitter", angle if model.split else np.sin(angle) * theta[k])
         jitter = float(model.widths(theta)[1])
         theta[k + 2] = fixed.get("dead_time_ns", max(observed[0], 0.05 * observed[-1]) + 2 * jitter)
-        at = k + 3
-        for effect in model.effects:
-            for name, value in zip(effect.names, effect.start, strict=True):
-                theta[at] = fixed.get(name, value)
-                at += 1
         if "dead_time_ns" not in fixed:
             theta = with_edge(fit, model, theta, low)
         cells = fit.cells(model, theta, photons)
@@ -121,15 +113,21 @@ def starts(fit: Fit, recording: Recording, model: Model, fixed: dict[str, float]
     return sorted(trials, key=lambda pair: pair[0])
 
 
+def _ranks(n: int) -> NDArray[np.intp]:
+    """Those of n sorted intervals that are compared at the end of the dead time."""
+    return np.unique(np.minimum([1, 5, 20, max(30, n // 500), max(60, n // 100), max(120, n // 30)], n - 1))
+
+
 def with_edge(fit: Fit, model: Model, theta: FloatArray, low: FloatArray) -> FloatArray:
     """Parameters with a dead time at which simulated streams have the smallest intervals of `low` (n,), sorted."""
-    n, k = low.size, model.light
-    ranks = np.unique(np.minimum([1, 5, 20, max(30, n // 500), max(60, n // 100), max(120, n // 30)], n - 1))
+    n, k, ranks = low.size, model.light, _ranks(low.size)
     observed = low[ranks]
     cycles = max(2, round(fit.exposure(min(fit.recording.photons, fit.effort.first))))
     for _ in range(4):
         streams = model.streams(np.tile(theta, (4, 1)), cycles, fit.next_seed())
         made = np.sort(np.concatenate([np.diff(x) for x in streams]))
+        if not made.size:
+            break
         here = made[np.minimum((ranks / n * made.size).astype(int), made.size - 1)]
         theta = theta.copy()
         theta[k + 2] = max(theta[k + 2] + float((observed - here)[1:-1].mean()), 0.05 * observed[0])

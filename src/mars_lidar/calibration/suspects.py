@@ -32,16 +32,11 @@ class Score:
         """Standard deviations above zero; no effect has a negative size."""
         return self.size / self.error
 
-    @property
-    def limit(self) -> float:
-        """Upper limit of the size, 95 %."""
-        return max(self.size, 0.0) + 1.645 * self.error
 
-
-def _counts(fit: Fit, fitted: Fitted, model: Model, theta: FloatArray) -> tuple[FloatArray, float]:
+def counts_of(fit: Fit, fitted: Fitted, model: Model, theta: FloatArray) -> tuple[FloatArray, float]:
     """Counts that a model expects in the cells of a fit, and the ratio of their variance to them."""
     photons = float(fit.recording.photons)
-    simulated = min(fit.effort.share * photons, max(fit.effort.batch, photons))
+    simulated = min(fit.effort.share * photons, fit.effort.batch)
     exposure = max(2, round(fit.exposure(simulated / LIGHTS)))
     ratio = fit.exposure(photons) / exposure
     rows = np.tile(model.bounded(theta), (LIGHTS, 1))
@@ -50,7 +45,7 @@ def _counts(fit: Fit, fitted: Fitted, model: Model, theta: FloatArray) -> tuple[
 
 def _score(fit: Fit, fitted: Fitted, plain: FloatArray, model: Model, theta: FloatArray, effect: Effect) -> Score:
     """Size of an effect along its change of the counts at `theta`, without the part that the fit absorbs."""
-    (made, share), size = _counts(fit, fitted, model, theta), theta[fitted.model.size]
+    (made, share), size = counts_of(fit, fitted, model, theta), theta[fitted.model.size]
     change, noise, used = made - plain, (np.maximum(plain, 0.5) + np.maximum(made, 0.5)) * share, fitted.batch.common
     change = change * np.maximum(0.0, 1.0 - 2.0 * noise / np.maximum(change**2, 1e-300)) / max(float(size), 1e-9)
     shift = fitted.estimator @ change
@@ -62,21 +57,57 @@ def _score(fit: Fit, fitted: Fitted, plain: FloatArray, model: Model, theta: Flo
     return Score(effect, float(fitted.rest @ along), spread, shift)
 
 
-def scores(fit: Fit, fitted: Fitted) -> list[Score]:
-    """The score of each effect that the model does not include, the most significant first."""
+def scores(fit: Fit, fitted: Fitted, plain: FloatArray) -> list[Score]:
+    """The score of each effect beyond the `plain` counts of the model, the most significant first."""
     model = fitted.model
-    have = {name for effect in model.effects for name in effect.names} | {name for name, _ in model.fields}
-    have |= {"afterpulse_probability"} if "afterpulsing" in have else set()
-    have |= {"electronics_excess"} if "electronics_dead_time_ns" in have else set()
-    have |= {"paralyzable"} if "mode" in have else set()
+    of = {
+        "afterpulsing": "afterpulse_probability",
+        "electronics_dead_time_ns": "electronics_excess",
+        "mode": "paralyzable",
+    }
+    have = {name for effect in model.effects for name in effect.names} | {
+        of.get(name, name) for name, _ in model.fields
+    }
     centre, listed = model.bounded(fitted.theta), []
-    dead, plain = float(centre[model.light + 2]), _counts(fit, fitted, model, centre)[0]
+    dead = float(centre[model.light + 2])
     for effect in effects(dead) if dead > 0.0 else ():
         if effect.names[0] not in have:
             wider = replace(model, effects=(*model.effects, effect))
             with suppress(ValueError):  # a detector cannot have both
                 listed.append(_score(fit, fitted, plain, wider, np.r_[centre, effect.start], effect))
     return sorted(listed, key=lambda score: -score.z)
+
+
+@dataclass(frozen=True)
+class Bound:
+    """Upper limit of an effect that is not significant (95 %), and by how much it would move the estimates (free,)."""
+
+    effect: Effect
+    limit: float
+    shift: FloatArray
+
+
+def at_limits(fit: Fit, fitted: Fitted, listed: list[Score]) -> list[Bound]:
+    """Limits of effects that are not significant, by refits that include them.
+
+    A score does not tell them: a dead time or background that has absorbed an effect leaves hardly any residual, and
+    that is not linear in the size. Of afterpulses, the delay of the refit is that of the recording.
+    """
+    model, most, shorter, out = fitted.model, clear(listed), fit.shorter, []
+    quiet = [score for score in listed if score.z <= most and not score.effect.onoff]
+    longest = {score.effect.names[0]: score for score in sorted(quiet, key=lambda score: score.effect.start[-1])}
+    for score in longest.values():
+        trial = _stepped(shorter, fitted, score)
+        final = None if trial is None else shorter.finish(trial[1])
+        if final is None or not final.converged or model.size not in final.free:
+            continue
+        at, rest = np.flatnonzero(final.free == model.size)[0], np.searchsorted(final.free, fitted.free)
+        size, variance = float(final.theta[model.size]), float(final.covariance[at, at])
+        limit = min(size + 1.645 * variance**0.5, score.effect.most[0])
+        slope = final.covariance[rest, at] / max(variance, 1e-300)
+        moved = final.theta[fitted.free] + slope * (limit - size)
+        out.append(Bound(score.effect, limit, fitted.theta[fitted.free] - moved))
+    return out
 
 
 def clear(listed: list[Score], alarm: float = FALSE_ALARM) -> float:
@@ -95,7 +126,21 @@ class Named:
     gain: float
 
 
-def refitted(fit: Fit, fitted: Fitted, listed: list[Score]) -> tuple[Fitted, Named | None] | None:
+def search(fit: Fit, fitted: Fitted) -> tuple[Fitted, list[Named], list[Score]]:
+    """The fit with the effects that the stream shows, those effects, and the scores of all others."""
+    included: list[Named] = []
+    for last in (*[False] * fit.effort.effects, True):
+        plain = counts_of(fit, fitted, fitted.model, fitted.theta)[0]
+        listed = scores(fit, fitted, plain)
+        better = None if last else refitted(fit, fitted, plain, listed)
+        if better is None:
+            break
+        fitted, effect = better
+        included += [] if effect is None else [effect]
+    return fitted, included, listed
+
+
+def refitted(fit: Fit, fitted: Fitted, plain: FloatArray, listed: list[Score]) -> tuple[Fitted, Named | None] | None:
     """The fit with the effect that explains most, or a better fit without any; None if no effect is significant.
 
     The refit decides which effect it is: a slow recovery may have the score of a paralyzable detector, and an effect
@@ -104,15 +149,17 @@ def refitted(fit: Fit, fitted: Fitted, listed: list[Score]) -> tuple[Fitted, Nam
     """
     limit = clear(listed, _TRIED)
     tried = {score.effect.names[0]: score for score in reversed(listed) if score.z > limit or fitted.p_value < _TRIED}
-    stepped = [(score, *trial) for score in tried.values() if (trial := _stepped(fit, fitted, score)) is not None]
-    plain, best, most = _counts(fit, fitted, fitted.model, fitted.theta)[0], None, clear(listed)
+    shorter = fit.shorter
+    stepped = [(score, *trial) for score in tried.values() if (trial := _stepped(shorter, fitted, score)) is not None]
+    best, most = None, clear(listed)
     for score, _, guess in sorted(stepped, key=lambda trial: (trial[0].z <= most, trial[1]))[: fit.effort.refits]:
-        final, size = fit.shorter.finish(guess), fitted.model.size
+        final, size = shorter.finish(guess), fitted.model.size
         along = _score(fit, fitted, plain, final.model, final.theta, score.effect)
         error = final.covariance[np.ix_(final.free == size, final.free == size)].sum() ** 0.5  # 0 where it has no size
         z = max(score.z, along.z, final.theta[size] / error if error else 0.0)
-        better = z > most or (final.p_value * _MISFIT > fitted.p_value and (z > limit or not error))
-        if final.converged and better and (best is None or final.misfit_z < best[0].misfit_z):
+        clearly = z > most or (final.p_value * _MISFIT > fitted.p_value and (z > limit or not error))
+        better = best is None or final.misfit_z < best[0].misfit_z
+        if final.converged and final.theta[size] > 0.0 and clearly and better:
             best = final, score.effect, z
     if best is None:
         return None
@@ -120,10 +167,10 @@ def refitted(fit: Fit, fitted: Fitted, listed: list[Score]) -> tuple[Fitted, Nam
     if fitted.p_value < _MISFIT:  # the first fit may have been a bad one
         known = final.free < fitted.model.size
         root = root_of(final.covariance[np.ix_(known, known)])
-        other = fit.shorter.finish(Guess(fitted.model, final.theta[: fitted.model.size], root, final.free[known]))
+        other = shorter.finish(Guess(fitted.model, final.theta[: fitted.model.size], root, final.free[known]))
         if other.converged and other.p_value > max(FALSE_ALARM, fitted.p_value / _MISFIT):
             return other, None
-    last = fit.finish(Guess(final.model, final.theta, root_of(final.covariance), final.free))
+    last = fit.finish(Guess(final.model, final.theta, root_of(final.covariance), final.free), finished=True)
     final = last if last.converged else final
     return final, Named(effect, z, fitted.misfit_z - final.misfit_z)
 
@@ -233,19 +280,15 @@ def drift(fit: Fit, fitted: Fitted) -> Drift | None:
     """Light and delay of parts of the recording, by the estimator of the whole; None for a short recording."""
     from scipy.special import chdtrc
 
-    recording: Recording = fit.recording
+    recording = fit.recording
     number = int(min(_PARTS, recording.photons // LEAST_PHOTONS))
     if number < 4:
         return None
     parts = [part for part in recording.parts(number) if part.photons > 20]
-    model, law = fitted.model, fitted.batch
-    free = fitted.free
+    model, cells, free = fitted.model, fitted.batch.cells, fitted.free
     light = [k for k, index in enumerate(free) if index < model.light]
-    values = []
-    for part in parts:
-        y = law.cells.of(part) * (recording.exposure / part.exposure)
-        values.append(fitted.estimator @ (y - fitted.offset))
-    estimates = np.array(values)[:, light]
+    counts = np.array([cells.of(part) * (recording.exposure / part.exposure) for part in parts])
+    estimates = (counts - fitted.offset) @ fitted.estimator[light].T
     cov = fitted.scatter[np.ix_(light, light)] * len(parts)
     names = [model.names[free[k]] for k in light]
     delays = [i for i, name in enumerate(names) if name.startswith("delay")]

@@ -167,22 +167,53 @@ class System:
         return 0.5 * SPEED_OF_LIGHT_M_PER_NS * np.asarray(delay_ns, dtype=np.float64)
 
     @property
-    def max_bin_count(self) -> float:
-        """Largest possible count of one bin; inf for a dead time of 0.
+    def max_registrations(self) -> float:
+        """Largest possible number of registrations of an exposure; inf for a dead time of 0.
 
-        One bin width per period allows floor(width / t_d) + 1 registrations, and an exposure floor(exposure / t_d) + 1;
-        only the latter limit holds where jitter moves records into the bin. A synchronous pixel registers once in
-        max(1, ceil(t_d / t_r)) periods.
+        floor(exposure / t_d) + 1; a synchronous pixel registers once in max(1, ceil(t_d / t_r)) periods.
         """
         dead = self.detector.dead_time_ns
         if self.detector.mode == "synchronous":
             return math.ceil(self.cycles / max(1, math.ceil(self.dead_time_periods - 1e-9)))
-        if dead == 0.0:
-            return math.inf
-        most = self.exposure_ns // dead + 1
+        return math.inf if dead == 0.0 else self.exposure_ns // dead + 1
+
+    @property
+    def max_bin_count(self) -> float:
+        """Largest possible count of one bin; inf for a dead time of 0.
+
+        One bin width per period allows floor(width / t_d) + 1 registrations; only `max_registrations` holds where
+        jitter moves records into the bin.
+        """
+        dead, most = self.detector.dead_time_ns, self.max_registrations
+        if self.detector.mode == "synchronous" or dead == 0.0:
+            return most
         if set(TIMING_EFFECTS) & set(self.detector.effects):
             return most
         return min(self.cycles * (self.bin_ns // dead + 1), most)
+
+    @property
+    def closed_bins(self) -> NDArray[np.bool_]:
+        """(bins,) which bins a fixed gate never opens; none where jitter may move records there."""
+        if (
+            self.detector.mode != "gated"
+            or self.detector.gate_moves
+            or set(TIMING_EFFECTS) & set(self.detector.effects)
+        ):
+            return np.zeros(self.bins, np.bool_)
+        start, _, width = self.detector.gate_periods(self.period_ns)
+        low = (np.arange(self.bins) / self.bins - start) % 1.0  # of a bin's first edge after the gate's opening
+        return (low >= width - 1e-9) & (low + 1.0 / self.bins <= 1.0 + 1e-9)
+
+    def check_possible(self, counts: NDArray[Any]) -> None:
+        """Raise ValueError where `counts` (..., bins) has some in bins that the gate never opens."""
+        closed = self.closed_bins
+        outside = int(counts[..., closed].sum()) if closed.any() else 0
+        if outside:
+            start, _, width = (self.period_ns * share for share in self.detector.gate_periods(self.period_ns))
+            raise ValueError(
+                f"{outside:,} of {int(counts.sum()):,} counts lie in bins that the gate, open from {start:g} to "
+                f"{start + width:g} ns, never opens: correct gate_start_ns and gate_width_ns, or set these bins to 0"
+            )
 
     @property
     def histogram_dtype(self) -> np.dtype[Any]:

@@ -89,9 +89,9 @@ def foreign_cube(
         cells of photon times), ``.h5``, ``.hdf5``, ``.tif`` (a page for each time bin), ``.csv`` or ``.txt`` (one
         histogram: a column of counts, or times and counts).
     system, axes, image, start_ns
-        As for `mars_lidar.io.from_histograms`. Default of `axes`: time is the only dimension whose length is the
-        number of bins of the system, else the last; in a TIFF the pages. A dimension of pixels is ordered by columns in
-        files of MATLAB, else by rows.
+        As for `mars_lidar.io.from_histograms`. Default of `axes`: time is the dimension whose length is the number of
+        bins of the system, else the last; in a TIFF the pages. It must be given if two are so long. A dimension of
+        pixels is ordered by columns in files of MATLAB, else by rows.
     variable
         Name of the array in a file with several; ``name[3]`` is the third array of a MATLAB cell.
     unit_ns
@@ -294,9 +294,15 @@ def _guessed(path: Path, shape: tuple[int, ...], bins: int | None) -> str:
     if image is None:
         raise ValueError(f"{path}: an array of shape {shape} is not a cube of histograms")
     fitting = [k for k, size in enumerate(shape) if size == bins]
-    place = fitting[0] if len(fitting) == 1 else len(shape) - 1
-    axes = "".join([*image[:place], "t", *image[place:]])
-    if axes == "yxt" and _uneven(*shape[:2]) > 2.0 * _uneven(*shape[1:]):
+    outer = [k for k in fitting if k != len(shape) - 2 or len(shape) == 2]  # time lies before the image or behind it
+    readings = ["".join([*image[:k], "t", *image[k:]]) for k in outer or fitting or [len(shape) - 1]]
+    if len(readings) > 1:
+        raise ValueError(
+            f"{path}: an array of shape {shape} has {len(readings)} dimensions of {bins} bins: give axes (--axes), "
+            f"{' or '.join(map(repr, readings))}"
+        )
+    axes = readings[0]
+    if not fitting and axes == "yxt" and _uneven(*shape[:2]) > 2.0 * _uneven(*shape[1:]):
         height, width, length = shape
         warnings.warn(
             f"{path}: an array of shape {shape} was taken for {height} x {width} pixels of {length} bins; where time "

@@ -96,6 +96,13 @@ def from_histograms(
         check_memory(int(np.prod(shape)) * kind.itemsize, "the cube of whole periods", "take a part of the image")
         whole = np.zeros(shape, kind)
         whole[..., (first + np.arange(ordered.shape[-1])) % system.bins] = ordered
+    recorded.check_possible(whole)
+    largest = whole.sum(-1, dtype=np.uint64).max()
+    if largest > recorded.max_registrations:
+        raise ValueError(
+            f"a pixel holds {largest:,} counts, and the system registers at most {recorded.max_registrations:,.0f}: "
+            f"cycles must be the laser periods that each histogram was accumulated over, got {system.cycles:,}"
+        )
     realizations, height, width, _ = whole.shape
     recording = Recording(system=recorded, pixels=(height, width), realizations=realizations, source=source)
     return Cube.of(whole, recording, registrations=int(whole.sum(dtype=np.uint64)))

@@ -174,12 +174,6 @@ class Transient:
         for first in range(0, height, step):
             yield slice(first, min(first + step, height))
 
-    def pixel_index(self, rows: slice) -> NDArray[np.int64]:
-        """`pixel_index` for `mars_lidar.simulate`, so that some rows have the photons of the whole image."""
-        first, last, _ = rows.indices(self.shape[0])
-        width = self.shape[1]
-        return np.arange(first * width, last * width, dtype=np.int64)
-
     @checked
     def flux(
         self,
@@ -234,7 +228,7 @@ class Transient:
         for name, value in (("signal", signal), ("photons_per_unit", photons_per_unit)):
             if value is not None:
                 checks.real(name, value, low=0.0, strict_low=True)
-        if sbr != math.inf:
+        if not isinstance(sbr, float) or sbr != math.inf:
             checks.real("sbr", sbr, low=0.0, strict_low=True)
         checks.real("dark_count_hz", dark_count_hz, low=0.0)
         first, last, stride = rows.indices(self.shape[0])

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 _MAP_INCHES = 2.35
 
 
-def reconstruction(cube: Cube, results: Mapping[str, Reconstruction], *, realization: int = 0) -> Figure:
-    """Depth, error of depth and reflectivity of each method; errors only if the truth is known.
+def reconstruction(cube: Cube, results: Mapping[str, Reconstruction]) -> Figure:
+    """Depth, its error, and reflectivity by each method, of the first exposure; errors only if the truth is known.
 
     For a single pixel its histogram, with the true light, or the fitted light of a measured one.
 
@@ -31,18 +31,16 @@ def reconstruction(cube: Cube, results: Mapping[str, Reconstruction], *, realiza
         The cube, whose maps are the truth if it has a scene.
     results
         Reconstructions (realizations, H, W) by name of the method.
-    realization
-        Number of the realization, from the start of the cube.
     """
     depth = cube.depth_m
     if depth.shape == (1, 1):
-        return pixel_histogram(cube, 0, 0, realization=realization)
+        return pixel_histogram(cube, 0, 0)
     known = bool(np.isfinite(depth).any())
     what = "signal" if cube.reflectivity is None else "reflectivity"
     reflectivity = cube.reflectivity
     truth = depth if cube.measured else cube.flux.signal if reflectivity is None else reflectivity
     unit = "reflectivity" if what == "reflectivity" else "photons per period"
-    pick = {name: _maps(each, what, realization) for name, each in results.items()}
+    pick = {name: _maps(each, what) for name, each in results.items()}
     first = next(iter(pick.values()))
     depth_limits = _limits(depth if known else first["depth"])
     share_limits = _limits(truth) if known else _limits(first["share"])
@@ -63,7 +61,7 @@ def reconstruction(cube: Cube, results: Mapping[str, Reconstruction], *, realiza
             axes[0, 1].set_axis_off()
             _draw_map(axes[0, 2], truth, unit, "gray", share_limits, f"Truth: {what}")
         for row, (name, returns) in zip(axes[int(known) + len(results) :], several.items(), strict=True):
-            _draw_returns(row, name, returns, realization)
+            _draw_returns(row, name, returns)
         for row, (name, each) in zip(axes[int(known) : int(known) + len(results)], pick.items(), strict=True):
             title = name.replace("_", " ")
             _draw_map(row[0], each["depth"], "depth (m)", "viridis", depth_limits, title)
@@ -80,9 +78,9 @@ def reconstruction(cube: Cube, results: Mapping[str, Reconstruction], *, realiza
     return figure
 
 
-def _draw_returns(row: Any, name: str, returns: Returns, realization: int) -> None:
+def _draw_returns(row: Any, name: str, returns: Returns) -> None:
     """Of a method that looked for several: how many, and the nearest and the farthest of those pixels."""
-    count, depth = returns.count[realization].astype(np.int64), returns.depth_m[realization]
+    count, depth = returns.count[0].astype(np.int64), returns.depth_m[0]
     most = depth.shape[-1]
     where = np.where(count > 1, 1.0, np.nan)
     farthest = np.take_along_axis(depth, np.maximum(count, 1)[..., None] - 1, axis=-1)[..., 0]
@@ -100,10 +98,9 @@ def _needs_own_scale(share: Any, truth: Any) -> bool:
     return bool(lit.any()) and not 0.5 <= float(np.median(share[lit] / truth[lit])) <= 2.0
 
 
-def _maps(result: Reconstruction, what: str, realization: int) -> dict[str, Any]:
-    count = len(result.depth_m)
-    if not 0 <= realization < count:
-        raise ValueError(f"realization must be an integer in [0, {count - 1}], got {realization}")
-    detected = result.detected[realization]
-    depth = np.where(detected, result.depth_m[realization], np.nan)
-    return {"depth": depth, "share": np.where(detected, getattr(result, what)[realization], 0.0)}
+def _maps(result: Reconstruction, what: str) -> dict[str, Any]:
+    detected = result.detected[0]
+    return {
+        "depth": np.where(detected, result.depth_m[0], np.nan),
+        "share": np.where(detected, getattr(result, what)[0], 0.0),
+    }

@@ -142,7 +142,7 @@ class GeneralisedCoates(RateMethod):
 def generalised_coates_rates(cube: ArrayLike, system: System, *, threads: int | None = None) -> FloatArray:
     """Photons per period in each bin from histograms of a free-running detector.
 
-    No pulse shape is assumed. The variance of a bin's rate l is about l^2 / h, with h its registrations, and bins are
+    No pulse shape is assumed. The variance of a dim bin's rate l is l / D, with D its armed periods, and bins are
     independent.
 
     Parameters

@@ -52,6 +52,7 @@ def checked(
         )
     shape = counts.shape[:-1]
     flat = np.ascontiguousarray(_typed(counts).reshape(-1, system.bins))
+    system.check_possible(flat)
     return Histograms(flat, system, team, progress, shape), shape
 
 

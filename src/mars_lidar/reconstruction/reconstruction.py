@@ -262,6 +262,8 @@ def reconstruct(
     used.check(system)
     warn_of_effects(system)
     estimates = used.estimate(given)
+    impossible = given.counts.sum(-1, dtype=np.float64) > system.max_registrations
+    estimates.flags[impossible] |= np.uint8(Flags.SATURATED)
     warn_of_bias(used, system, estimates)
     return assembled(used.name, system, estimates, shape, level, attenuation)
 

@@ -31,7 +31,8 @@ class Corrector {
           passes_(recording.bins),
           chain_(recording, settings.steps, settings.tolerance) {}
 
-    std::vector<double> rate, variance;
+    std::vector<double> rate;
+    const ArmedPasses& passes() const { return passes_; }
 
     // `finite`: no rate is infinite.
     uint8_t operator()(const CountRows& histograms, int64_t pixel, bool finite) {
@@ -41,7 +42,6 @@ class Corrector {
         else
             passes_.set(r_, histograms, pixel);
         rate.resize(r_.bins);
-        variance.assign(r_.bins, 0.0);
         std::fill(rate.begin(), rate.end(), 0.0);
         uint8_t flag = passes_.total > 0.0 ? 0 : kEmpty;
         if (settings_.correction == Correction::kChain) {
@@ -55,7 +55,6 @@ class Corrector {
             const double h = passes_.count[j];
             rate[j] = finite_rate(j, &flag);
             if (!finite && (flag & kSaturated) && !std::isfinite(corrected_rate(r_, passes_, j, h))) rate[j] = HUGE_VAL;
-            variance[j] = h > 0.0 ? rate[j] * rate[j] / h : 0.0;  // (R13)
         }
         return flag;
     }
@@ -87,7 +86,7 @@ inline uint8_t estimate_window(Corrector& correct, WindowEstimate& estimate, boo
     if (flag & kEmpty)
         found.signal = found.background = 0.0;
     else
-        found = estimate(correct.rate.data(), known ? correct.variance.data() : nullptr);
+        found = estimate(correct.rate.data(), known ? &correct.passes() : nullptr);
     const double row[kWindowColumns] = {found.signal, found.background, found.delay, found.signal_error,
                                         found.background_error};
     std::copy(row, row + kWindowColumns, out);

@@ -19,8 +19,8 @@
 
 namespace mars {
 
-constexpr int kQualityColumns =
-    5;  // chi-square, its degrees of freedom; scores of a longer, a shorter dead time, a wider pulse
+// Chi-square, its degrees of freedom; scores of a longer, a shorter dead time, a wider pulse; skewnesses of these.
+constexpr int kQualityColumns = 8;
 
 // How the histograms were recorded, and how they would have been with what is tested.
 struct QualityJob {
@@ -32,7 +32,7 @@ class FitQuality {
     explicit FitQuality(const QualityJob& job)
         : job_(job), bins_(job.recording.bins), typical_(bins_), reached_(bins_) {
         for (std::vector<double>* each : {&light_, &mean_, &variance_, &slope_, &fired_, &late_, &weight_, &residual_,
-                                          &change_, &share_, &moved_, &wider_, &raw_, &rearmed_})
+                                          &change_, &share_, &moved_, &wider_, &raw_, &rearmed_, &third_})
             each->resize(padded_length(bins_));
     }
 
@@ -50,20 +50,20 @@ class FitQuality {
         if (cells < kLeastCells) return;
         const double hidden = hidden_passes(passes.total);
         if (hidden > kMostHidden * kMostHidden * armed * armed / static_cast<double>(bins_ * bins_)) return;
-        int used;
-        out[0] = chi_square(passes.count, total, cells, hidden, &used);
-        out[1] = used - (lit ? 3 : 1);
+        out[0] = chi_square(passes.count, total, cells, hidden);
         for (int64_t j = 0; j < bins_; ++j) residual_[j] = passes.count[j] - mean_[j];
         typical_.set(job_.recording, mean_);
         set_law(typical_);
         set_tangent(lit, hidden);
+        set_chi_square_law(out);
+        set_third();
         if (tests_dead_time()) {
             raw_.swap(typical_.raw);
             rearmed_.swap(typical_.rearmed);
-            out[2] = dead_time_score(job_.longer);
-            out[3] = dead_time_score(job_.shorter);
+            out[2] = dead_time_score(job_.longer, out + 5);
+            out[3] = dead_time_score(job_.shorter, out + 6);
         }
-        if (lit) out[4] = width_score();
+        if (lit) out[4] = width_score(out + 7);
     }
 
     // Registrations that are expected in each bin (bins), given those before.
@@ -135,37 +135,97 @@ class FitQuality {
     }
 
     // Pearson's, over cells of about equal variance, whose excesses share the hidden passes.
-    double chi_square(const std::vector<double>& count, double total, int cells, double hidden, int* used) const {
-        double h[kCells] = {}, v[kCells] = {}, f[kCells] = {}, below = 0.0, sum = 0.0;
+    double chi_square(const std::vector<double>& count, double total, int cells, double hidden) {
+        double h[kCells] = {}, sum = 0.0, below = 0.0;
+        std::fill_n(cell_, kCells, Cell());
         const double scale = static_cast<double>(cells) / total;
         const double *registered = count.data(), *expected = mean_.data(), *variance = variance_.data();
-        const double* fired = fired_.data();
+        const double *fired = fired_.data(), *slope = slope_.data(), *share = share_.data(), *moved = moved_.data();
         for (int64_t j = 0; j < bins_;) {
-            const int cell = std::min(static_cast<int>((below + 0.5 * variance[j]) * scale), cells - 1);
-            double excess = 0.0, spread = 0.0, passes = 0.0;
+            const int c = std::min(static_cast<int>((below + 0.5 * variance[j]) * scale), cells - 1);
+            double excess = 0.0;
+            Cell add;
             do {
+                const double v = variance[j], quiet = expected[j] > 0.0 ? v / expected[j] : 1.0;
                 excess += registered[j] - expected[j];
-                spread += variance[j];
-                passes += fired[j];
+                add.variance += v;
+                add.fourth += v * (1.0 - 6.0 * quiet * (1.0 - quiet));
+                add.along[0] += share[j] * slope[j];
+                add.along[1] += slope[j];
+                add.along[2] += moved[j] * slope[j];
+                add.along[3] += fired[j];
                 below += variance[j++];
-            } while (j < bins_ && (below + 0.5 * variance[j]) * scale < static_cast<double>(cell + 1));
-            h[cell] += excess;
-            v[cell] += spread;
-            f[cell] += passes;
+            } while (j < bins_ && (below + 0.5 * variance[j]) * scale < static_cast<double>(c + 1));
+            h[c] += excess;
+            cell_[c].add(add);
         }
         double along = 0.0, own = hidden > 0.0 ? 1.0 / hidden : HUGE_VAL;
-        *used = 0;
         for (int c = 0; c < cells; ++c) {
-            if (v[c] > 0.0) {
-                sum += h[c] * h[c] / v[c];
-                along += f[c] * h[c] / v[c];
-                own += f[c] * f[c] / v[c];
-                ++*used;
+            const Cell& at = cell_[c];
+            if (at.variance > 0.0) {
+                sum += h[c] * h[c] / at.variance;
+                along += at.along[3] * h[c] / at.variance;
+                own += at.along[3] * at.along[3] / at.variance;
             } else if (h[c] > 0.0) {
                 sum = HUGE_VAL;
             }
         }
+        hidden_own_ = own;
         return sum - along * along / own;
+    }
+
+    // Scales chi-square so that it has the mean and variance of a chi-square of `out[1]` degrees of freedom. The estimates
+    // are those of bins: of a direction of which the cells have the share x of the information they take up x of a degree
+    // (Chernoff and Lehmann, Ann. Math. Stat. 25, 579, 1954), and the cells' numbers have a fourth cumulant.
+    void set_chi_square_law(double* out) const {
+        double bins[3][3], of_cells[3][3] = {}, hidden[3] = {}, inverse_of_bins[3][3];
+        for (int a = 0; a < 3; ++a)
+            for (int b = 0; b < 3; ++b)
+                bins[a][b] = normal_[a][b] - (free_[3] ? normal_[a][3] * normal_[b][3] / normal_[3][3] : 0.0);
+        if (!inverse<3>(bins, free_, inverse_of_bins)) {
+            out[0] = NAN;
+            return;
+        }
+        double mean = 0.0, variance = 0.0;
+        for (const Cell& at : cell_) {
+            if (!(at.variance > 0.0)) continue;
+            double taken = 0.0;
+            for (int a = 0; a < 3; ++a) {
+                const double one = at.along[a] * scale_[a];
+                hidden[a] += one * at.along[3] / at.variance;
+                for (int b = 0; b < 3; ++b) {
+                    const double both = one * at.along[b] * scale_[b] / at.variance;
+                    of_cells[a][b] += both;
+                    taken += inverse_of_bins[a][b] * both;
+                }
+            }
+            mean += 1.0;
+            const double own = std::max(1.0 - taken, 0.0) / at.variance;
+            variance += own * own * at.fourth;
+        }
+        variance += 2.0 * mean;
+        double product[3][3] = {};
+        for (int a = 0; a < 3; ++a)
+            for (int b = 0; b < 3; ++b)
+                for (int c = 0; c < 3; ++c)
+                    product[a][b] += inverse_of_bins[a][c] * (of_cells[c][b] - hidden[c] * hidden[b] / hidden_own_);
+        for (int a = 0; a < 3; ++a) {
+            mean -= product[a][a];
+            variance -= 4.0 * product[a][a];
+            for (int b = 0; b < 3; ++b) variance += 2.0 * product[a][b] * product[b][a];
+        }
+        if (!(mean > 0.0) || !(variance > 0.0)) {
+            out[0] = NAN;
+            return;
+        }
+        out[0] *= 2.0 * mean / variance;
+        out[1] = 2.0 * mean * mean / variance;
+    }
+
+    // Third cumulants of the registrations: binomial.
+    void set_third() {
+        for (int64_t j = 0; j < bins_; ++j)
+            third_[j] = mean_[j] > 0.0 ? variance_[j] * (2.0 * variance_[j] / mean_[j] - 1.0) : 0.0;
     }
 
     // Variance of the passes that the last registration blinds after the exposure (and from a stationary start one before
@@ -216,8 +276,9 @@ class FitQuality {
     }
 
     // Rao's score of a change of the expectation, what the estimates would take up left out: from the change's products
-    // with the estimates' directions, itself and the residuals. NaN where the estimates take up all of it.
-    double score(const double* own, double variance, double sum) const {
+    // with the estimates' directions, itself and the residuals; and the score's skewness. NaN where the estimates take up
+    // all of it.
+    double score(const double* own, double variance, double sum, double* skewness) const {
         double scaled[4], along[4];
         const double least = kLeft * variance;
         for (int a = 0; a < 4; ++a) scaled[a] = own[a] * scale_[a];
@@ -226,11 +287,20 @@ class FitQuality {
             variance -= along[a] * scaled[a];
             sum -= along[a] * taken_[a];
         }
-        return variance > least ? sum / std::sqrt(variance) : NAN;
+        if (!(variance > least)) return NAN;
+        for (int a = 0; a < 4; ++a) along[a] *= scale_[a];
+        const auto third = sums_of<1>(bins_, [&](int64_t j) {
+            const double light = along[0] * share_[j] + along[1] + along[2] * moved_[j];
+            const double each = change_[j] - weight_[j] * (slope_[j] * light + along[3] * fired_[j]);
+            return std::array<double, 1>{each * each * each * third_[j]};
+        });
+        const double deviation = std::sqrt(variance);
+        *skewness = third[0] / (variance * deviation);
+        return sum / deviation;
     }
 
     // Of a histogram with another dead time: the passes of the expected histogram change, and the mean by what a pass gives.
-    double dead_time_score(const HistogramRecord& recording) {
+    double dead_time_score(const HistogramRecord& recording, double* skewness) {
         typical_.arm(recording);
         const auto [along, variance, sum, passes] = bins_kernels().change(
             {raw_.data(), rearmed_.data(), typical_.raw.data(), typical_.rearmed.data(), fired_.data(), late_.data(),
@@ -240,11 +310,12 @@ class FitQuality {
             own[0] += share_[j] * slope_[j] * change_[j];
             own[2] += moved_[j] * slope_[j] * change_[j];
         }
-        return score(own, variance, sum);
+        return score(own, variance, sum, skewness);
     }
 
-    double width_score() const {
+    double width_score(double* skewness) {
         double own[4] = {}, variance = 0.0, sum = 0.0;
+        std::fill(change_.begin(), change_.end(), 0.0);
         for (const int64_t j : pulse_) {
             const double g = slope_[j], d = wider_[j] * g, dw = d * weight_[j];
             own[0] += share_[j] * g * dw;
@@ -253,9 +324,21 @@ class FitQuality {
             own[3] += fired_[j] * dw;
             variance += d * dw;
             sum += d * residual_[j];
+            change_[j] = dw;
         }
-        return score(own, variance, sum);
+        return score(own, variance, sum, skewness);
     }
+
+    // Of the registrations of some bins: their variance, fourth cumulant, and derivatives by S, B, delay, hidden passes.
+    struct Cell {
+        double variance = 0.0, fourth = 0.0, along[4] = {};
+
+        void add(const Cell& other) {
+            variance += other.variance;
+            fourth += other.fourth;
+            for (int a = 0; a < 4; ++a) along[a] += other.along[a];
+        }
+    };
 
     const QualityJob job_;
     const int64_t bins_;
@@ -266,12 +349,15 @@ class FitQuality {
     std::vector<double> light_;                       // photons of each bin
     std::vector<double> fired_, late_;                // chances that an armed and a re-armed pass register in the bin
     std::vector<double> weight_, residual_, change_;  // 1 / variance, weighted h - m, and what is tested
+    std::vector<double> third_;                       // cumulant of each bin's registrations
     std::vector<double> share_, moved_, wider_;       // of the pulse: s, change with delay, width; 0 but in `pulse_`
     PulseBins pulse_bins_;
     std::vector<int64_t> pulse_;
     std::vector<uint8_t> reached_;  // (bins) whether in `pulse_`
     bool free_[4] = {};             // S, B, delay, passes that the ends hide
     double normal_[4][4] = {}, scale_[4] = {}, taken_[4] = {};
+    Cell cell_[kCells];
+    double hidden_own_ = 0.0;  // information on the hidden passes: of the cells and their own
 };
 
 }  // namespace mars

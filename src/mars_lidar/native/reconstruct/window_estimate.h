@@ -6,6 +6,7 @@
 #include <utility>
 #include <vector>
 
+#include "reconstruct/armed_passes.h"
 #include "reconstruct/histogram_record.h"
 #include "reconstruct/pulse_template.h"
 
@@ -33,10 +34,9 @@ class WindowEstimate {
         for (int64_t j = 0; j < r_.bins; ++j) share_.push_back(r_.share(j));
     }
 
-    // `rate` (bins) photons per period; `variance` (bins) of them, or null.
-    WindowResult operator()(const double* rate, const double* variance) {
+    // `rate` (bins) photons per period, and the passes that they are of, or null: without errors then.
+    WindowResult operator()(const double* rate, const ArmedPasses* passes) {
         const double n = static_cast<double>(r_.bins);
-        WindowResult out;
         double delay;
         if (locator_ == Locator::kPeak) {
             const int64_t top = std::find(rate, rate + r_.bins, largest_of(rate, r_.bins)) - rate;
@@ -44,16 +44,17 @@ class WindowEstimate {
         } else {
             delay = refine(rate, search(rate, energy_), [](double s, double) { return s; });
         }
-        out = window(rate, variance, delay);
+        WindowResult out = window(rate, passes, delay);
         if (locator_ == Locator::kLog) {
             // weights log(1 + S s / b) of the pulse over its background (R17), both from the window
             const double least = 1e-9 + 1e-3 * std::max(out.signal, 0.0) / n;
-            const double b = std::max(out.background / n, least), s0 = std::max(out.signal, least);
+            const double b = std::max(least, out.background / n), s0 = std::max(out.signal, least);
             for (size_t i = 0; i < energy_.size(); ++i) weight_[i] = std::log1p(s0 * energy_[i] / b);
             delay = refine(rate, search(rate, weight_),
                            [b, s0](double s, double share) { return std::log1p(s0 * s / (b * share)); });
-            out = window(rate, variance, delay);
+            out = window(rate, passes, delay);
         }
+        if (passes) set_errors(*passes, out);
         return out;
     }
 
@@ -110,39 +111,70 @@ class WindowEstimate {
         return 0.5 * (a + d);
     }
 
+    // Whether a bin says anything of the light: it is open, and some pass was armed in it.
+    bool used(const ArmedPasses* passes, int64_t j) const {
+        return r_.share(j) > 0.0 && (!passes || passes->armed[j] + passes->rearmed[j] > 0.0);
+    }
+
     // Background from outside of the window, signal from inside of it less that background (R16).
-    WindowResult window(const double* rate, const double* variance, double delay) const {
-        double inside = 0.0, shares = 0.0, energy = 0.0, noise = 0.0;
+    WindowResult window(const double* rate, const ArmedPasses* passes, double delay) {
+        double inside = 0.0, shares = 0.0, energy = 0.0, beside = passes ? passes->total : HUGE_VAL;
         for_pulse_bins(r_, delay, r_.core_low, r_.core_high, [&](int64_t, int64_t j, double s, double) {
-            if (r_.share(j) <= 0.0) return;
+            if (passes) beside -= passes->count[j];
+            if (!used(passes, j)) return;
             inside += rate[j];
             shares += r_.share(j);
             energy += s;
-            if (variance) noise += variance[j];
         });
-        const double *share = share_.data(), *noises = variance ? variance : rate;  // of no use without a variance
-        const auto [all, all_shares, all_noise] = sums_of<3>(r_.bins, [=](int64_t j) {
-            return std::array<double, 3>{share[j] > 0.0 ? rate[j] : 0.0, share[j], share[j] > 0.0 ? noises[j] : 0.0};
+        const auto [all, all_shares] = sums_of<2>(r_.bins, [&](int64_t j) {
+            return used(passes, j) ? std::array<double, 2>{rate[j], share_[j]} : std::array<double, 2>{};
         });
         WindowResult out;
         out.delay = delay;
-        const double n = static_cast<double>(r_.bins), outside = all_shares - shares;
-        if (!(outside > 0.5) || !(energy > 1e-6)) return out;
-        const double flat = std::max(all - inside, 0.0) / outside;
-        out.background = flat * n;
+        outside_ = all_shares - shares;
+        shares_ = shares;
+        energy_inside_ = energy;
+        if (!(energy > 1e-6)) return out;
+        const bool flat_known = outside_ > 0.5;
+        const double flat = flat_known && beside > 0.0 ? std::max(all - inside, 0.0) / outside_ : 0.0;  // else rounding
+        if (flat_known) out.background = flat * static_cast<double>(r_.bins);
         out.signal = std::max(inside - flat * shares, 0.0) / energy;
-        if (variance) {
-            const double flat_noise = std::max(all_noise - noise, 0.0) / (outside * outside);
-            out.background_error = n * std::sqrt(flat_noise);
-            out.signal_error = std::sqrt(noise + shares * shares * flat_noise) / energy;
-        }
         return out;
+    }
+
+    // Variance of a rate at `light` photons: of the binomial number of registrations, over its slope squared (R13).
+    double variance_of(const ArmedPasses& passes, int64_t j, double light) const {
+        const double armed = passes.armed[j], rearmed = passes.rearmed[j];
+        if (r_.below_bin()) return light / armed;
+        const Expected law(light, armed, rearmed);
+        return law.mean * law.silent / ((armed + rearmed) * law.slope * law.slope);
+    }
+
+    // Standard errors by the law of the estimate itself: the observed registrations of the few passes that are armed late
+    // in a bright period do not tell it. None of the background where nothing registered outside of the window.
+    void set_errors(const ArmedPasses& passes, WindowResult& out) const {
+        if (!std::isfinite(out.background)) return;
+        const double flat = out.background / static_cast<double>(r_.bins);
+        const auto variance = [&](int64_t j, double light) {
+            return used(&passes, j) ? variance_of(passes, j, flat * share_[j] + light) : 0.0;
+        };
+        double inside = 0.0, background = 0.0;
+        for_pulse_bins(r_, out.delay, r_.core_low, r_.core_high, [&](int64_t, int64_t j, double s, double) {
+            inside += variance(j, out.signal * s);
+            background -= variance(j, 0.0);
+        });
+        background += sums_of<1>(r_.bins, [&](int64_t j) { return std::array<double, 1>{variance(j, 0.0)}; })[0];
+        background = std::max(background, 0.0) / (outside_ * outside_);
+        if (background > 0.0) out.background_error = static_cast<double>(r_.bins) * std::sqrt(background);
+        out.signal_error = std::sqrt(inside + shares_ * shares_ * background) / energy_inside_;
     }
 
     const HistogramRecord& r_;
     Locator locator_;
     int64_t first_ = 0, step_ = 1;
     std::vector<double> energy_, weight_, round_, share_;
+    double outside_ = 0.0, shares_ = 0.0,
+           energy_inside_ = 0.0;  // of the last window: bins outside and inside, pulse inside
 };
 
 }  // namespace mars

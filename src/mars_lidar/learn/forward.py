@@ -28,6 +28,8 @@ import math
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import numpy as np
+
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
 from mars_lidar.instrument.effects import LIGHT_EFFECTS
@@ -475,11 +477,16 @@ def expected_histogram(
     Solves ``h = p (N_r + e - G h) + q (L h - b)`` round the circle of a period: G counts the registrations of the
     preceding dead time, L those of one dead time ago; e and b account for
     the dead time that extends beyond the end of an exposure with an armed start (docs/joint_law.md, 3.2 and 4.6).
-    Derivatives are solutions of the same or of the transposed equation. The result is exact, up to the grid, if the
-    start-up transient ends before the exposure does; `mars_lidar.mean_histogram` needs no such condition. The
-    error of the grid decreases with the square of `refine`: at the default a total variation below 4e-4, and 1e-3
-    where the dead time is within 8 sigma of 0 or of whole periods (bins of up to 3 sigma); derivatives are within 4e-3
-    of those of the exact mean (norm over the bins; median 1e-4).
+    Derivatives are solutions of the same or of the transposed equation. That e and b are those of a settled pixel is
+    wrong while the start-up transient lasts: armed exposures of fewer than 625 dead times are followed period by period
+    instead, until two periods are equal to 1e-9.
+
+    Accuracy for S up to 10 and B up to 5 photons per period at the default of `refine`, with whose square the error of
+    the grid falls: a total variation below 4e-4, and 1e-3 for a Gaussian pulse with a dead time within 8 sigma of 0 or
+    of whole periods (bins of up to 3 sigma); derivatives are within 4e-3 of those of the exact mean (norm over the
+    bins; median 1e-4). docs/learn.md names two regions where derivatives are less accurate: that in the delay with
+    measured pulses narrower than a bin, and that in B with hardly any background in long armed
+    exposures of locked pixels.
 
     Parameters
     ----------
@@ -488,8 +495,9 @@ def expected_histogram(
     system
         Non-paralyzable, without gate, or effects beyond detection efficiency and dark counts.
     refine
-        Number of parts of each bin for the solution; None: four to a sigma of the pulse, 16 if the dead time is within
-        8 sigma of 0 or of whole periods (1 for a measured pulse).
+        Number of parts of each bin for the solution; None: four to a sigma of a Gaussian pulse, or to the width of a
+        box with the peak of a measured one, there at least 2048 in a period; four times as many if the dead time is
+        within 8 sigma, or the length of the measured pulse, of 0 or of whole periods.
 
     Returns
     -------
@@ -542,12 +550,21 @@ def expected_histogram(
 
 
 def _refined(system: System) -> int:
-    """Parts of a bin: four times as many where a pixel that registered the pulse is re-armed within a pulse."""
-    if not isinstance(system.pulse, GaussianPulse):
-        return 1
-    sigma, beyond = system.pulse.sigma_ns, math.remainder(system.detector.dead_time_ns, system.period_ns)
-    fine = TOLERANCES.parts_of_width * (4.0 if abs(beyond) < 8.0 * sigma else 1.0)
-    return max(1, math.ceil(fine * system.bin_ns / sigma))
+    """Parts of a bin by the width of the pulse: four times as many where it re-arms a pixel within a pulse.
+
+    A measured pulse has edges. The error of a derivative at an edge is the re-armings in its part of a bin, relative to
+    the armed fraction: of first order in the part, whatever the width of the pulse.
+    """
+    pulse, least = system.pulse, 0.0
+    if isinstance(pulse, SampledPulse):
+        width = pulse.bin_ns / float(np.diff(pulse._cumulative).max())  # of a box with the same peak
+        extent, least = len(pulse.values) * pulse.bin_ns, TOLERANCES.parts_of_period / system.bins
+    else:
+        assert isinstance(pulse, GaussianPulse)
+        width, extent = pulse.sigma_ns, 8.0 * pulse.sigma_ns
+    beyond = math.remainder(system.detector.dead_time_ns, system.period_ns)
+    finer = 4.0 if abs(beyond) < extent else 1.0
+    return min(math.ceil(finer * max(TOLERANCES.parts_of_width * system.bin_ns / width, least)), 2**16)
 
 
 class _Expected(torch.autograd.Function):
@@ -559,7 +576,7 @@ class _Expected(torch.autograd.Function):
     @staticmethod
     def forward(signal: Any, background: Any, delay_ns: Any, system: System, parts: int) -> tuple[torch.Tensor, ...]:
         check_values(signal, background, delay_ns)
-        every = blocks(TOLERANCES.photons, system.bins * parts, signal, background, delay_ns)
+        every = blocks(_together(system), system.bins * parts, signal, background, delay_ns)
         done = [_registered(rows, system, parts) for rows in every]
         return tuple(torch.cat(blocks_of) for blocks_of in zip(*done, strict=True))
 
@@ -594,7 +611,7 @@ class _Expected(torch.autograd.Function):
 
 def _again(ctx: Any, *others: torch.Tensor) -> Iterator[tuple[Any, Any, Any]]:
     """Block by block: the histogram as a function of its light, that light, and the same rows of `others`."""
-    for rows in blocks(TOLERANCES.photons, ctx.system.bins * ctx.parts, *ctx.saved_tensors, *others):
+    for rows in blocks(_together(ctx.system), ctx.system.bins * ctx.parts, *ctx.saved_tensors, *others):
         light, known, rest = rows[:3], rows[3:5], rows[5:]
 
         def again(*light: torch.Tensor, known: Any = known) -> torch.Tensor:
@@ -612,6 +629,9 @@ def _registered(rows: Any, system: System, parts: int, known: Any = (None, None)
     nothing = photons.detach()[:, :0]
     if system.dead_time_periods == 0.0:
         return _summed(photons * system.cycles, parts).to(rows[0].dtype), nothing, nothing
+    if _is_followed(system):
+        fine = _followed(photons, delay, system.cycles)
+        return _summed(fine, parts).to(rows[0].dtype), nothing, nothing
     p, q = fired(photons)
     settled = registered(photons, p, delay, tolerance, known[0])
     fine, more = settled * system.cycles, nothing
@@ -620,6 +640,63 @@ def _registered(rows: Any, system: System, parts: int, known: Any = (None, None)
         more = registered(photons, p * blind - q * back, delay, tolerance, known[1])
         fine = fine + more
     return _summed(fine, parts).to(rows[0].dtype), settled, more
+
+
+def _is_followed(system: System) -> bool:
+    """Whether the exposure may end before the start-up transient does, by `TOLERANCES.followed_dead_times`."""
+    return system.start == "armed" and system.cycles < TOLERANCES.followed_dead_times * system.dead_time_periods
+
+
+def _together(system: System) -> int:
+    """Pixels x bins of a block: derivatives of a followed exposure store every period."""
+    return TOLERANCES.photons // (TOLERANCES.arrays * system.cycles if _is_followed(system) else 1)
+
+
+def _followed(photons: Rows, delay: Delay, cycles: int) -> Rows:
+    """Registrations in an exposure that starts armed, followed from one block of bins to the next.
+
+    Blocks are no longer than the dead time, so that the re-armings in a block, L h, are known. With a the probability
+    that the pixel is armed at the start of a bin, h = p a + q L h, and a_{j+1} = e^-l_j a_j + (1 - q_j) (L h)_j.
+    Periods that repeat the one before are not followed any further.
+    """
+    n = photons.shape[-1]
+    dead = min(delay.whole * n + delay.shift, n * cycles)
+    lengths = [min(max(dead, 1), n - begin) for begin in range(0, n, max(dead, 1))]
+    blocks_of = [torch.split(part, lengths, -1) for part in (photons, *fired(photons))]
+    lit = [(light, p, q, _decays(light)) for light, p, q in zip(*blocks_of, strict=True)]
+    armed, past = torch.ones_like(photons[:, :1]), torch.zeros_like(photons[:, :1]).expand(-1, dead + 1)
+    total, before = torch.zeros_like(photons), torch.zeros_like(photons)
+    for cycle in range(cycles):
+        pieces = []
+        for light, p, q, decays in lit:
+            m = light.shape[-1]
+            if dead:
+                again = (1.0 - delay.part) * past[:, 1 : m + 1] + delay.part * past[:, :m]
+            else:  # within a bin: what it registers re-arms in it
+                last = delay.part * past
+                here = (p * armed + q * last) / (1.0 - q * (1.0 - delay.part))
+                again = (1.0 - delay.part) * here + last
+            chances = torch.cat([armed, (1.0 - q) * again], -1)
+            for step, decay in decays:
+                chances = torch.cat([chances[:, :step], chances[:, step:] + decay * chances[:, :-step]], -1)
+            pieces.append(p * chances[:, :-1] + q * again)
+            armed, past = chances[:, -1:], torch.cat([past, pieces[-1]], -1)[:, m:]
+        period = torch.cat(pieces, -1)
+        total = total + period
+        if bool((values_of(period - before).abs() <= TOLERANCES.repeated * values_of(period)).all()):
+            return total + (cycles - 1 - cycle) * period
+        before = period
+    return total
+
+
+def _decays(light: Rows) -> list[tuple[int, Rows]]:
+    """Probabilities of no photon in 1, 2, 4, .. bins in front of the edges of a block's bins."""
+    edges, step = torch.nn.functional.pad(light.cumsum(-1), (1, 0)), 1
+    decays: list[tuple[int, Rows]] = []
+    while step <= light.shape[-1]:
+        decays.append((step, torch.exp(edges[:, :-step] - edges[:, step:])))
+        step *= 2
+    return decays
 
 
 def refuse_nested_forward(name: str) -> None:

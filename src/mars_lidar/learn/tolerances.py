@@ -23,7 +23,15 @@ class Tolerances:
 
     # forward: the expected histogram
     parts_of_width: float = 4.0
-    """Of sigma of the pulse: the docstring of `expected_histogram` states the error."""
+    """Of sigma of the pulse, or of a box as high as a measured one; `expected_histogram` states the error."""
+    parts_of_period: float = 2048.0
+    """With a measured pulse, whose edges have derivatives within 4e-3 then, at up to 5 photons of background."""
+    followed_dead_times: float = 625.0
+    """An armed exposure of fewer dead times is followed period by period. In a longer one the last registrations pass
+    for those of a settled pixel: where none settles (bright light, one registration in several periods), their sum is
+    off by at most 1/2, and the total variation by 1 / (4 x 625)."""
+    repeated: float = 1e-9
+    """Change of the registrations of a bin from one period to the next, relative, at which periods repeat."""
     photons: int = 2**22
     """Pixels x bins in memory together: 32 MiB."""
 

@@ -70,8 +70,7 @@ class Shortest:
         numbers = np.diff(np.searchsorted(self.recorded, np.r_[0.0, ends + 0.5 * self.unit]))
         below = np.array([self.expected(end) for end in (ends[0] - self.unit, *ends)])
         log = (numbers[:, None, None] * np.log(np.maximum(np.diff(below, axis=0), 1e-300))).sum(0) - below[-1]
-        ends = [self._interval(np.exp(row - row.max())) for row in log]
-        return min(high - low for _, low, high in ends)
+        return min(high - low for _, low, high in (self._interval(np.exp(row - row.max())) for row in log))
 
     def _interval(self, likely: FloatArray) -> tuple[float, float, float]:
         share = np.r_[0.0, np.cumsum(0.5 * (likely[1:] + likely[:-1]) * np.diff(self.dead))]

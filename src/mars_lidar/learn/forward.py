@@ -643,7 +643,7 @@ def _registered(rows: Any, system: System, parts: int, known: Any = (None, None)
 
 
 def _is_followed(system: System) -> bool:
-    """Whether the exposure may end before the start-up transient does, by `TOLERANCES.followed_dead_times`."""
+    """Whether the exposure may end before the start-up transient does, by its cycles in dead times."""
     return system.start == "armed" and system.cycles < TOLERANCES.followed_dead_times * system.dead_time_periods
 
 

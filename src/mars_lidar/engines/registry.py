@@ -56,7 +56,7 @@ def find_engine(engine: str | Engine, **options: Unpack[EngineOptions]) -> Engin
     ----------
     engine
         A name, as for `mars_lidar.simulate`, such as ``"exact"``, ``"auto"`` or ``"mars"``; or an `Engine`.
-    options
+    **options
         `EngineOptions`; None: the default of the engine.
 
     Returns

@@ -1,5 +1,7 @@
 """The engines by name, and the alternatives where an engine does not apply."""
 
+from __future__ import annotations  # else Sphinx prints an unpacked type as *EngineOptions
+
 from typing import Unpack
 
 from mars_lidar._base import checks
@@ -56,7 +58,7 @@ def find_engine(engine: str | Engine, **options: Unpack[EngineOptions]) -> Engin
     ----------
     engine
         A name, as for `mars_lidar.simulate`, such as ``"exact"``, ``"auto"`` or ``"mars"``; or an `Engine`.
-    **options
+    options
         `EngineOptions`; None: the default of the engine.
 
     Returns

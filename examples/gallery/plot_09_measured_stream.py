@@ -37,5 +37,5 @@ axes[1].set_xlabel("time in the laser period (ns)")
 axes[1].legend()
 plt.show()
 dead_time = result.estimates["dead_time_ns"]
-detected = ", ".join(suspect.name for suspect in result.suspects)
+detected = ", ".join(suspect.name for suspect in result.suspects if suspect.included)  # in the result
 print(f"Detected: {detected}. Dead time {dead_time.value:.0f} ns, true {detector.dead_time_ns:.0f} ns.")

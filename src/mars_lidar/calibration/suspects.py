@@ -172,6 +172,10 @@ def refitted(fit: Fit, fitted: Fitted, plain: FloatArray, listed: list[Score]) -
             return other, None
     last = fit.finish(Guess(final.model, final.theta, root_of(final.covariance), final.free), finished=True)
     final = last if last.converged else final
+    at = final.free == fitted.model.size
+    error = float(final.covariance[np.ix_(at, at)].sum() ** 0.5)
+    if fitted.p_value >= FALSE_ALARM and final.theta[fitted.model.size] < 1.96 * error:
+        return None  # the stream fits without it, and its 95 % interval begins at none
     return final, Named(effect, z, fitted.misfit_z - final.misfit_z)
 
 

@@ -349,3 +349,9 @@ def test_batches_types_and_bad_arguments():
     with pytest.raises(ValueError, match="mode 'synchronous'"):
         expected_histogram(*maps, instrument.replace(detector=ml.Detector(dead_time_ns=10.0, mode="synchronous")))
     assert expected_histogram(*(torch.zeros(0, 3) for _ in range(3)), instrument).shape == (0, 3, 20)
+
+
+def test_armed_exposures_that_would_be_followed_too_long_are_refused():
+    system = make_system(4000.0, 21_000, 64, sigma_ns=2.0)
+    with pytest.raises(ValueError, match=r"at most 20,000 periods, got 21,000, which are only 525 dead times"):
+        expected_histogram(torch.tensor(0.5), torch.tensor(0.2), torch.tensor(40.0), system)

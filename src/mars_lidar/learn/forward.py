@@ -537,6 +537,12 @@ def expected_histogram(
     """
     check_detector(system, light=True)
     refuse_nested_forward("expected_histogram")
+    if _is_followed(system) and system.cycles > TOLERANCES.followed_periods:
+        raise ValueError(
+            f"expected_histogram follows an armed start through at most {TOLERANCES.followed_periods:,} periods, got "
+            f"{system.cycles:,}, which are only {system.cycles / system.dead_time_periods:.0f} dead times: use "
+            "start='stationary', or mean_histogram"
+        )
     given = alike(signal, background, delay_ns)
     given[0], given[1], system = detected(given[0], given[1], system)
     if given[0].numel() == 0:

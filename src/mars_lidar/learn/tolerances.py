@@ -30,6 +30,8 @@ class Tolerances:
     """An armed exposure of fewer dead times is followed period by period. In a longer one the last registrations pass
     for those of a settled pixel: where none settles (bright light, one registration in several periods), their sum is
     off by at most 1/2, and the total variation by 1 / (4 x 625)."""
+    followed_periods: int = 20_000
+    """In such an exposure at most: some 5 s a batch on one core."""
     repeated: float = 1e-9
     """Change of the registrations of a bin from one period to the next, relative, at which periods repeat."""
     photons: int = 2**22

@@ -523,7 +523,13 @@ def _estimates(fitted: Fitted, growth: FloatArray) -> dict[str, Estimate]:
     k = model.light
     free = {names[i] for i in fitted.free}
     grown = dict(zip(names, growth > 1.0, strict=True))  # the scatter of the parts includes a misfit
-    withheld = {name for name in names if fitted.p_value < FALSE_ALARM and not grown[name]}
+    misfit = "of a model that does not fit: no error is stated"
+    withheld = {name: misfit for name in names if fitted.p_value < FALSE_ALARM and not grown[name]}
+    errors = dict(zip(fitted.free.tolist(), np.sqrt(np.diag(covariance)), strict=True))
+    pulses_at = [i for i in range(1, k) if names[i].startswith("signal")]
+    if not withheld and any(i in errors and centre[i] < 1.96 * errors[i] for i in pulses_at):  # there may be another
+        dark = "no significant pulse: no error is stated"
+        withheld |= dict.fromkeys((*names[:k], "width", "jitter"), dark)
     extremes = _at_bounds(fitted, covariance, drawn) if model.split and "jitter" in free else []
     out: dict[str, Estimate] = {}
 
@@ -531,8 +537,8 @@ def _estimates(fitted: Fitted, growth: FloatArray) -> dict[str, Estimate]:
         if not free & set(needs):
             out[name] = Estimate(value, 0.0, value, value, "given")
             return
-        if withheld & set(needs):
-            out[name] = Estimate(value, np.nan, np.nan, np.nan, "of a model that does not fit: no error is stated")
+        if not withheld.keys().isdisjoint(needs):
+            out[name] = Estimate(value, np.nan, np.nan, np.nan, next(withheld[own] for own in needs if own in withheld))
             return
         parts = [sample, *(sample[rows] for rows in extremes)]  # the true angle may be a bound
         ends = [np.quantile(part, (0.025, 0.975)) for part in parts]
@@ -547,7 +553,6 @@ def _estimates(fitted: Fitted, growth: FloatArray) -> dict[str, Estimate]:
         put(names[i], float(centre[i] % period if wrapped else centre[i]), drawn[:, i], names[i])
     pulses, jitters = model.widths(drawn)
     pulse, jitter = map(float, model.widths(centre))
-    errors = dict(zip(fitted.free.tolist(), np.sqrt(np.diag(covariance)), strict=True))
     note = "not detected" if "jitter" in free and fitted.unbounded[k + 1] < 2.0 * errors[k + 1] else ""
     if note and model.split and np.quantile(jitters, 0.975) > 0.985 * centre[k]:
         note = "not identified: any share of the recorded width"

@@ -283,13 +283,7 @@ def test_times_beside_the_counts_are_those_of_the_bins(tmp_path, unit):
 
 def test_counts_that_the_detector_cannot_register_are_refused():
     """More than the dead time allows in all, and counts in bins that the gate never opens."""
-    plain = ml.System(
-        period_ns=100.0,
-        cycles=1000,
-        bins=50,
-        pulse=ml.GaussianPulse(sigma_ns=1.0),
-        detector=ml.Detector(dead_time_ns=75.0),
-    )
+    plain = make_system(75.0, 1000, 50)
     with pytest.raises(ValueError, match=r"a pixel holds 1,500 counts.*at most 1,334"):
         ml.io.from_histograms(np.full((1, 50), 30), plain)
     matched = ml.reconstruct(np.full((1, 50), 30), plain, method="matched_filter")

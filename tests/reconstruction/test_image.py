@@ -399,13 +399,7 @@ def image_of(counts_of: ml.Flux, system: ml.System, seed: int) -> ml.Reconstruct
 
 def test_intervals_hold_behind_a_sharp_edge():
     """A decay that begins at once, of which the networks know nothing: their intervals would hold 35 to 60 %."""
-    system = ml.System(
-        period_ns=100.0,
-        cycles=1000,
-        bins=1000,
-        pulse=ml.SampledPulse(np.exp(-np.arange(30) / 8.0), 0.1, "first"),
-        detector=ml.Detector(dead_time_ns=75.0),
-    )
+    system = make_system(75.0, 1000, 1000, pulse=ml.SampledPulse(np.exp(-np.arange(30) / 8.0), 0.1, "first"))
     y, x = np.mgrid[:48, :48]
     delay = 40.0 + 0.05 * x + 0.02 * y
     estimate = image_of(ml.Flux(np.full(x.shape, 0.004), 0.004, delay), system, 8)
@@ -418,13 +412,7 @@ def test_intervals_hold_behind_a_sharp_edge():
 
 def test_bright_pixels_are_not_put_elsewhere():
     """Of 800 registrations at S = 1.2: their likelihood left the range of floats, and 4 of 2304 were 16 ns off."""
-    system = ml.System(
-        period_ns=100.0,
-        cycles=1000,
-        bins=1000,
-        pulse=ml.GaussianPulse(sigma_ns=0.6),
-        detector=ml.Detector(dead_time_ns=75.0),
-    )
+    system = make_system(75.0, 1000, 1000, sigma_ns=0.6)
     y, x = np.mgrid[:32, :48]
     delay = 25.0 + 0.1 * x + 0.03 * y
     estimate = image_of(ml.Flux(np.full(x.shape, 1.16), 0.9, delay), system, 9)
@@ -434,13 +422,7 @@ def test_bright_pixels_are_not_put_elsewhere():
 @pytest.mark.parametrize(("method", "signal"), [("image", 0.1), ("image_untrained", 0.03)])
 def test_signal_errors_hold_on_texture(method: str, signal: float):
     """Windows that average an uneven signal stated a third of its errors; few photons have none."""
-    system = ml.System(
-        period_ns=100.0,
-        cycles=1000,
-        bins=1000,
-        pulse=ml.GaussianPulse(sigma_ns=0.6),
-        detector=ml.Detector(dead_time_ns=75.0),
-    )
+    system = make_system(75.0, 1000, 1000, sigma_ns=0.6)
     y, x = np.mgrid[:32, :32]
     true = signal * (1.0 + 0.4 * np.sin(x / 5.0))
     counts = ml.simulate(ml.Flux(true, signal, 40.0 + 0.02 * y), system, seed=2)[0]

@@ -155,7 +155,7 @@ def refitted(fit: Fit, fitted: Fitted, plain: FloatArray, listed: list[Score]) -
     for score, _, guess in sorted(stepped, key=lambda trial: (trial[0].z <= most, trial[1]))[: fit.effort.refits]:
         final, size = shorter.finish(guess), fitted.model.size
         along = _score(fit, fitted, plain, final.model, final.theta, score.effect)
-        error = final.covariance[np.ix_(final.free == size, final.free == size)].sum() ** 0.5  # 0 where it has no size
+        error = _error_of(final, size)
         z = max(score.z, along.z, final.theta[size] / error if error else 0.0)
         clearly = z > most or (final.p_value * _MISFIT > fitted.p_value and (z > limit or not error))
         better = best is None or final.misfit_z < best[0].misfit_z
@@ -172,11 +172,16 @@ def refitted(fit: Fit, fitted: Fitted, plain: FloatArray, listed: list[Score]) -
             return other, None
     last = fit.finish(Guess(final.model, final.theta, root_of(final.covariance), final.free), finished=True)
     final = last if last.converged else final
-    at = final.free == fitted.model.size
-    error = float(final.covariance[np.ix_(at, at)].sum() ** 0.5)
-    if fitted.p_value >= FALSE_ALARM and final.theta[fitted.model.size] < 1.96 * error:
+    size = fitted.model.size
+    if fitted.p_value >= FALSE_ALARM and final.theta[size] < 1.96 * _error_of(final, size):
         return None  # the stream fits without it, and its 95 % interval begins at none
     return final, Named(effect, z, fitted.misfit_z - final.misfit_z)
+
+
+def _error_of(fitted: Fitted, index: int) -> float:
+    """Standard error of a parameter; 0 where it was not free."""
+    at = fitted.free == index
+    return float(fitted.covariance[np.ix_(at, at)].sum() ** 0.5)
 
 
 def _stepped(fit: Fit, fitted: Fitted, score: Score) -> tuple[float, Guess] | None:

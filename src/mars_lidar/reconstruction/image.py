@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from statistics import NormalDist
-from typing import ClassVar
 
 import numpy as np
 
@@ -86,9 +85,6 @@ class Image(Method):
 
     efficiency: FloatArray | None = None
     returns: int = 1
-    checked: ClassVar[bool] = (
-        True  # whether a simulated plane tells if the networks' intervals hold for a measured pulse
-    )
 
     name = "image"
     modes = ("nonparalyzable", "synchronous", "gated")
@@ -138,15 +134,20 @@ class Image(Method):
             surfaces[k : k + 1] = [replace(surface, background=surface.background / share)]
         return _several(surfaces)
 
-    def _surface(self, photons: Photons, counted: NDArray[np.float32], system: System, threads: int) -> Estimates:
-        """One surface, from the photons that are `counted` (entries,)."""
+    def _surface(
+        self, photons: Photons, counted: NDArray[np.float32], system: System, threads: int, *, checked: bool = True
+    ) -> Estimates:
+        """One surface, from the photons that are `counted` (entries,).
+
+        `checked`: a simulated plane tells whether the networks' intervals hold for a measured pulse.
+        """
         pixels = photons.height * photons.width
         settings = settings_of(system)
         solver = solver_of(photons, threads, self.efficiency, counted)
         maps, flags = np.empty((_core.IMAGE_SIZES["maps"], pixels)), np.empty(pixels, np.uint8)
         trained = self._networks(system)
         solver.solve(settings, trained, maps=maps, flags=flags)
-        if trained is not None and self.checked and not _hold_for(system, maps):
+        if trained is not None and checked and not _hold_for(system, maps):
             solver.solve(settings, None, maps=maps, flags=flags)
         delay, half_width, deviation, outlier, signal, signal_error, background, number = maps
         of_bins, largest = centroid_error(system)
@@ -213,12 +214,6 @@ class UntrainedImage(Image):
         return None
 
 
-class _Unchecked(Image):
-    """By which planes are estimated that tell whether intervals hold."""
-
-    checked = False
-
-
 def _hold_for(system: System, maps: FloatArray) -> bool:
     """Whether the networks' intervals hold for this pulse, in light like that of an image's `maps`."""
     if not isinstance(system.pulse, SampledPulse):
@@ -243,7 +238,7 @@ def _plane_holds(system: System, signal_octave: float, background_octave: float,
     for seed in range(_PLANES):
         counts = simulate(flux, system, seed=seed)[0]
         photons = Photons.of(counts.reshape(-1, system.bins), _PLANE, _PLANE)
-        estimates = _Unchecked().of_photons(photons, system, 1)
+        estimates = Image()._surface(photons, photons.number, system, 1, checked=False)
         assert estimates.half_width is not None
         stated = np.isfinite(estimates.half_width)
         off = (estimates.delay - delay.ravel() / system.period_ns + 0.5) % 1.0 - 0.5

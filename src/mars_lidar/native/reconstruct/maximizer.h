@@ -195,16 +195,17 @@ class Maximizer {
         if (best.at[0] == 0.0 || gain < job_.least_gain) *flag |= kNoSignal;
         out[6] = gain;
         out[7] = best.likelihood.value;
-        errors(pixel, least, best, out + 3);
         const bool few = ends_.count > 0 && !narrow && best.at[0] > 0.0;  // passes: the likelihood is no parabola
-        if (few) profiled_errors(pixel, terrain, best, out + 3);
+        if (few) {
+            errors(pixel, least, best, out + 3);
+            profiled_errors(pixel, terrain, best, out + 3);
+        }
         double bias[3];
         if (job_.less_bias && *flag == 0 && !narrow && bias_of(best, bias)) {
-            if (few)
-                for (int k = 0; k < 3; ++k) out[3 + k] = std::hypot(out[3 + k], bias[k]);
+            for (int k = 0; k < 3 && few; ++k) out[3 + k] = std::hypot(out[3 + k], bias[k]);
             correct(pixel, least, bias, best);
-            if (!few) errors(pixel, least, best, out + 3);
         }
+        if (!few) errors(pixel, least, best, out + 3);
         for (int k = 0; k < 3; ++k) out[k] = best.at[k];
         if (best.at[0] == 0.0) out[2] = NAN;
         if (within) out[5] = kUniform / n;

@@ -204,13 +204,7 @@ def test_a_pixel_that_re_arms_just_before_the_next_pulse_is_drawn_whatever_the_e
 
     32 exposures; the mean count may be 4.5 standard errors and 0.05 standard deviations off.
     """
-    system = ml.System(
-        period_ns=100.0,
-        cycles=100_000_000,
-        bins=512,
-        pulse=ml.GaussianPulse(sigma_ns=0.1),
-        detector=ml.Detector(dead_time_ns=99.6),
-    )
+    system = make_system(99.6, 100_000_000, 512, sigma_ns=0.1)
     flux, report = ml.Flux(5.824, 4.044, 30.0), {}
     counts = ml.simulate(flux, system, engine="feedback", realizations=32, seed=1, report=report)[:, 0, 0].sum(-1)
     assert report["pixels given to exact"] == report["exposures drawn again by exact"] == 0.0

@@ -81,10 +81,7 @@ def build(
     table(_rows(path) | {"time": f"{span(time.perf_counter() - began)} in all"})
 
 
-def info(
-    file: Path | None = None,
-    /,
-) -> None:
+def info(file: Path | None = None, /) -> None:
     """Describe a table, or list the tables in the cache.
 
     Arguments
@@ -101,10 +98,7 @@ def info(
     table(rows + [(f"{path.stat().st_size / 1e6:,.4g} MB", _line(path)) for path in files])
 
 
-def clear(
-    *,
-    yes: Annotated[bool, Parameter(("--yes", "-y"))] = False,
-) -> None:
+def clear(*, yes: Annotated[bool, Parameter(("--yes", "-y"))] = False) -> None:
     """Remove the tables in the cache.
 
     Options

@@ -346,8 +346,4 @@ def _check_out(out: Any, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
 
 
 def _check_memory(shape: tuple[int, ...], itemsize: int, what: str) -> None:
-    check_memory(
-        math.prod(shape) * itemsize,
-        f"{what} of shape {shape}",
-        IN_PARTS,
-    )
+    check_memory(math.prod(shape) * itemsize, f"{what} of shape {shape}", IN_PARTS)

@@ -246,12 +246,7 @@ class CubeMaker:
     def _simulated(self, sample: Sample, out: NDArray[Any], threads: int) -> None:
         own = sample.system.histogram_dtype == self._counts
         made = simulate(
-            sample.flux,
-            sample.system,
-            engine=self._engine,
-            seed=sample.seed,
-            threads=threads,
-            out=out if own else None,
+            sample.flux, sample.system, engine=self._engine, seed=sample.seed, threads=threads, out=out if own else None
         )
         if not own:
             out[:] = made

@@ -376,12 +376,7 @@ _NATIVE = ("cumulants", "cumulant_rates", "histogram", "histogram_rate", "settle
 
 @checked
 def exposure_moments(
-    flux: Flux,
-    system: System,
-    *,
-    tolerance: float = 1e-4,
-    threads: int | None = None,
-    progress: Progress | None = None,
+    flux: Flux, system: System, *, tolerance: float = 1e-4, threads: int | None = None, progress: Progress | None = None
 ) -> Exposure:
     """Exact cumulants of the count and mean histogram of an exposure of `System.cycles` periods.
 
@@ -429,13 +424,7 @@ def exposure_moments(
     >>> round(float(exposure.mean), 1), round(float(exposure.variance), 1)
     (815.2, 127.3)
     """
-    cells = Cells.of_flux(
-        flux,
-        system,
-        what="exposure_moments",
-        modes=_MODES,
-        effects=LIGHT_EFFECTS + TIMING_EFFECTS,
-    )
+    cells = Cells.of_flux(flux, system, what="exposure_moments", modes=_MODES, effects=LIGHT_EFFECTS + TIMING_EFFECTS)
     return recorded_moments(cells, tolerance=tolerance, threads=threads, progress=progress)
 
 

@@ -24,12 +24,7 @@ from mars_lidar.statistics.tolerances import TOL
 
 
 @checked
-def paralyzable_moments(
-    flux: Flux,
-    system: System,
-    *,
-    tolerance: float = 1e-5,
-) -> Moments:
+def paralyzable_moments(flux: Flux, system: System, *, tolerance: float = 1e-5) -> Moments:
     """Mean and variance of the count and mean histogram of a pixel of mode ``"paralyzable"``, both starts.
 
     Parameters
@@ -70,12 +65,7 @@ def paralyzable_moments(
     >>> round(float(moments.mean), 1)  # a free-running pixel registers 815.2
     545.7
     """
-    cells = Cells.of_flux(
-        flux,
-        system,
-        what="paralyzable_moments",
-        modes=("paralyzable",),
-    )
+    cells = Cells.of_flux(flux, system, what="paralyzable_moments", modes=("paralyzable",))
     if system.dead_time_periods > TOL.paralyzable_periods:
         raise ValueError(
             f"dead_time_ns must be at most {TOL.paralyzable_periods} periods for the variance of mode 'paralyzable', "

@@ -589,10 +589,7 @@ def _evaluated(system: System, axes: Axes, recipe: Recipe, progress: Progress | 
     settled = cells + max(1, cells // 10)  # the start phases take about so much of the time
     total = settled + max(1, cells // 20)  # and the laws of some entries so much
     entries = recipe.entries(
-        np.repeat(signal, background.size),
-        np.tile(background, signal.size),
-        system,
-        of_part(progress, 0, cells, total),
+        np.repeat(signal, background.size), np.tile(background, signal.size), system, of_part(progress, 0, cells, total)
     )
     phases, laws = StartPhases.none(), NodeLaws.none()
     if recipe.method == "exposure":

@@ -151,7 +151,6 @@ CALLS: dict[str, Callable[[Path], tuple[Callable[..., Any], dict[str, Any]]]] = 
         {"system": SYSTEM, "signal": (0.1, 1, 2), "background": (0.1, 1, 2)},
     ),
     "Table.quantisation_error": lambda _: (table().quantisation_error, {"samples": 3}),
-    "Table.law_error": lambda _: (table().law_error, {"samples": 2}),
     "Table.save": lambda at: (table().save, {"path": at / "b.h5", "overwrite": True}),
     "Table.load": lambda at: (ml.Table.load, {"path": at / "table.h5"}),
     "calibrate": lambda _: (ml.calibrate, {"times": times()}),

@@ -59,7 +59,7 @@ def test_one_command_writes_a_cube_and_a_picture(tmp_path):
     [
         (["--cycles", 50], "short exposure"),
         (["--cycles", 10_000, "--signal", 2, "--sbr", 0.01], "slow sweeps"),
-        (["--cycles", 3000, "--signal", 40, "--sbr", 40], "locked, short exposure"),
+        (["--cycles", 3000, "--signal", 40, "--sbr", 40], "locked in short exposure"),
         (["--cycles", 10_000, "--dead-time-ns", 1e-4], "too many cells"),
         (["--cycles", 30_000, "--signal", 2.3, "--sbr", 0.1], "unsettled"),
     ],

@@ -78,8 +78,7 @@ class Maker:
                 if error.errno not in TRANSIENT:
                     raise
                 if pause is None:
-                    name = self.dataset.files(item)[0].relative_to(self.dataset.path).as_posix()
-                    return Failed(name, error.errno, error.strerror or str(error))
+                    return Failed(self.dataset.names(item)[0], error.errno, error.strerror or str(error))
                 time.sleep(pause)
         raise AssertionError("the last attempt returns")
 

@@ -145,12 +145,26 @@ def _check(variables: Mapping[str, NDArray[Any]], attrs: Mapping[str, Any]) -> N
             raise ValueError(
                 f"the coordinate {dim} must be 0 to {size - 1}, got {variables[dim].dtype} {variables[dim].shape}"
             )
+    methods = variables["method"]
+    if methods.ndim != 1 or methods.dtype.kind not in "UT" or len(set(methods.tolist())) != len(methods):
+        raise ValueError(f"method must be names, each once, got {methods.dtype} {methods.shape}")
+    levels = json.loads(attrs["level"])
+    if not isinstance(levels, dict) or {*levels} != {*methods.tolist()}:
+        raise ValueError(f"the attribute level must have a number for each method, got {attrs['level']!r}")
+    for method, level in levels.items():
+        if not isinstance(level, int | float) or isinstance(level, bool) or level < 0.0:
+            raise ValueError(f"the level of {method} must be a number >= 0, got {level!r}")
+    for name in ("source", "version"):
+        if not isinstance(attrs[name], str):
+            raise ValueError(f"the attribute {name} must be a text, got {attrs[name]!r}")
     for name in (*_VARIABLES, *_OF_RETURNS):
         values = variables.get(name)
         if name in _OF_RETURNS and values is not None:
             values = values[..., 0] if values.ndim == len(DIMS) + 1 and values.shape[-1] else values
         if values is not None and (values.shape != shape or values.dtype.kind not in "fiu"):
             raise ValueError(f"{name} must be numbers {shape} {DIMS}, got {values.dtype} {values.shape}")
+        if name.endswith("_error") and values is not None and (values < 0).any():
+            raise ValueError(f"{name} must not be negative, got {np.nanmin(values):g}")
 
 
 def _contents(results: Mapping[str, Any], source: str) -> tuple[list[Variable], dict[str, Any]]:

@@ -390,6 +390,7 @@ class _Run:
     level: float
     seed: int
     wave: tuple[FloatArray, FloatArray] | None = None
+    most: float = np.inf  # 95 % upper limit of the signal in a pulse, where none is significant
 
     def __post_init__(self) -> None:
         recording, shape = self.recording, self.shape
@@ -401,8 +402,10 @@ class _Run:
             self.wave = start.free_waveform(recording, self.fit.effort.shape_bins)
             shares, errors = (part / self.wave[0].sum() for part in self.wave)
             model = replace(model, waveform=shares, waveform_error=errors, exposure=recording.exposure)
-        elif recording.laser and start.brightest_window(recording) <= FALSE_ALARM:
-            model = replace(model, returns=self.returns, pulse=shape if isinstance(shape, Pulse) else None)
+        elif recording.laser:
+            p, self.most = start.brightest_window(recording)
+            if p <= FALSE_ALARM:
+                model = replace(model, returns=self.returns, pulse=shape if isinstance(shape, Pulse) else None)
         self.model = replace(model, fields=tuple(self.fields.items()), jitter_given="jitter" in self.fixed)
 
     def result(self) -> Calibration:
@@ -440,12 +443,15 @@ class _Run:
         return tuple(out)
 
     def first(self) -> Fitted:
-        """The plain model from the better of two starts, repeated with other simulated streams until it converges."""
-        for attempt in range(self.fit.effort.attempts):
-            self.fit = Fit(self.recording, Effort(), (self.seed, attempt))
-            fitted = self._attempt()
-            if fitted.converged:
-                break
+        """The plain model, from other starts and simulated streams until it converges with a significant pulse.
+
+        The phases have a bright window (`start.brightest_window`), so that a fit without a pulse is a bad one.
+        """
+        tried: list[tuple[Fit, Fitted]] = []
+        while len(tried) < self.fit.effort.attempts and not (tried and tried[-1][1].converged and tried[-1][1].lit):
+            self.fit = Fit(self.recording, Effort(), (self.seed, len(tried)))
+            tried.append((self.fit, self._attempt()))
+        self.fit, fitted = max(tried, key=lambda each: (each[1].converged, each[1].lit))
         return fitted
 
     def _attempt(self) -> Fitted:
@@ -473,6 +479,10 @@ class _Run:
         """The result of the last fit."""
         growth = _growth(fitted, drift)
         estimates = _estimates(fitted, growth)
+        if self.most < np.inf and fitted.model.returns < 2 and not (fitted.model.returns and fitted.lit):
+            signal = min(float(fitted.theta[1]), self.most) if fitted.model.returns else 0.0
+            words = "no significant pulse: upper limit of one anywhere"
+            estimates["signal"] = Estimate(signal, np.nan, 0.0, self.most, words)
         named: list[Suspect] = list(wrong)
         for refit in included:
             name = refit.effect.names[0]
@@ -549,8 +559,7 @@ def _estimates(fitted: Fitted, growth: FloatArray) -> dict[str, Estimate]:
     misfit = "of a model that does not fit: no error is stated"
     withheld = {name: misfit for name in names if fitted.p_value < FALSE_ALARM and not grown[name]}
     errors = dict(zip(fitted.free.tolist(), np.sqrt(np.diag(covariance)), strict=True))
-    pulses_at = [i for i in range(1, k) if names[i].startswith("signal")]
-    if not withheld and any(i in errors and centre[i] < 1.96 * errors[i] for i in pulses_at):  # there may be another
+    if not withheld and not fitted.lit:  # there may be another pulse
         dark = "no significant pulse: no error is stated"
         withheld |= dict.fromkeys((*names[:k], "width", "jitter"), dark)
     extremes = _at_bounds(fitted, covariance, drawn) if model.split and "jitter" in free else []

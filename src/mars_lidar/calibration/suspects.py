@@ -30,8 +30,8 @@ class Score:
 
     @property
     def z(self) -> float:
-        """Standard deviations above zero; no effect has a negative size."""
-        return self.size / self.error
+        """Standard deviations above zero; no effect has a negative size, and one that is on or off none beyond 1."""
+        return min(self.size, 1.0 if self.effect.onoff else np.inf) / self.error
 
 
 def counts_of(fit: Fit, fitted: Fitted, model: Model, theta: FloatArray) -> tuple[FloatArray, float]:
@@ -173,7 +173,8 @@ def refitted(fit: Fit, fitted: Fitted, plain: FloatArray, trials: list[Trial]) -
             continue
         along = _score(fit, fitted, plain, final.model, final.theta, score.effect)
         error = _error_of(final, size)
-        z = max(score.z, along.z, final.theta[size] / error if error else 0.0)
+        shown = min(along.size, final.theta[size]) / along.error  # what is beyond the refit's size is not the effect's
+        z = max(score.z, shown, final.theta[size] / error if error else 0.0)
         clearly = z > most or (final.p_value * _MISFIT > fitted.p_value and (z > limit or not error))
         better = best is None or final.misfit_z < best[0].misfit_z
         if final.theta[size] > 0.0 and clearly and better:

@@ -1,6 +1,7 @@
-"""Accuracy of `learn.expected_histogram` over random systems, the table of docs/learn.md: ``python -m tests.learn.accuracy``.
+"""Accuracy of `learn.expected_histogram` over random systems: ``python -m tests.learn.accuracy``.
 
-The exact mean histogram, which runs through the exposure period by period, and its central differences are the reference.
+Prints the table of docs/learn.md. The reference is the exact mean histogram, which runs through the exposure period by
+period, and its central differences.
 """
 
 from __future__ import annotations

@@ -32,7 +32,6 @@ System = type(SYSTEM)
 FLUX = ml.Flux(np.full((2, 3), 0.5), 0.1, 40.0)
 PIXEL = ml.Flux(0.5, 0.1, 40.0)
 SYNCHRONOUS = SYSTEM.replace(detector=ml.Detector(dead_time_ns=30.0, mode="synchronous"))
-PARALYZABLE = SYSTEM.replace(detector=ml.Detector(dead_time_ns=30.0, mode="paralyzable"))
 SCENE = ml.Scene(np.full((2, 3), 2.0), np.full((2, 3), 0.5))
 NUMBERS = itertools.count()
 RECIPE = {"scenes": {"example": "room", "size": [3, 4]}, "systems": [SYSTEM], "light": {"signal": 0.5}}
@@ -136,7 +135,6 @@ CALLS: dict[str, Callable[[Path], partial[Any]]] = {
     "holding_time_covariance": lambda _: partial(ml.holding_time_covariance, flux=PIXEL, system=SYSTEM),
     "Table.build": lambda _: partial(ml.Table.build, system=SYSTEM, signal=(0.1, 1, 2), background=(0.1, 1, 2)),
     "Table.quantisation_error": lambda _: partial(table().quantisation_error, samples=3),
-    "Table.law_error": lambda _: partial(table().law_error, samples=2),
     "Table.save": lambda at: partial(table().save, path=at / "b.h5", overwrite=True),
     "Table.load": lambda at: partial(ml.Table.load, path=at / "table.h5"),
     "calibrate": lambda _: partial(ml.calibrate, times=times()),
@@ -190,7 +188,6 @@ CALLS: dict[str, Callable[[Path], partial[Any]]] = {
             statistics.photons_per_bin,
         )
     },
-    "statistics.paralyzable_moments": lambda _: partial(statistics.paralyzable_moments, flux=PIXEL, system=PARALYZABLE),
     "statistics.PhaseChain": lambda _: partial(statistics.PhaseChain, photons=np.full(8, 0.1), dead_time=0.3),
     "statistics.holding_times": lambda _: partial(statistics.holding_times, chain=chain()),
     "statistics.constant_light_rate": lambda _: partial(

@@ -231,6 +231,13 @@ class Fitted:
     converged: bool
     by_shortest: tuple[float, float, float] | None  # the dead time and its interval, if the counts do not determine it
 
+    @property
+    def lit(self) -> bool:
+        """Whether the signal of every return differs from zero (95 %)."""
+        amounts = (self.free < self.model.light) & (self.free % 2 == 1)
+        signal, variance = self.theta[self.free[amounts]], np.diag(self.covariance)[amounts]
+        return bool((signal >= 1.96 * variance**0.5).all())
+
 
 def most_probable(model: Model, theta: FloatArray, covariance: FloatArray, free: Index) -> FloatArray:
     """The most probable parameters (p,) of a normal law within the bounds of the model.

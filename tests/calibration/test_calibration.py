@@ -11,7 +11,7 @@ from harness import make_system
 
 import mars_lidar as ml
 from tests.calibration.photon_by_photon import Truth, as_timestamps, photon_by_photon
-from tests.calibration.sweep import NAMES, pulls, random_truth, with_effect
+from tests.calibration.sweep import NAMES, pulls, random_truth, silent, with_effect
 from tests.calibration.sweep import ORDINARY as BASE
 
 FAR = 4.5  # stated errors: 7e-6 by chance for a normal law
@@ -270,6 +270,21 @@ def test_an_effect_is_named(effect: str) -> None:
     result = ml.calibrate(stream(truth, PHOTONS[effect], 5))
     assert NAMES[effect] in [suspect.name for suspect in result.suspects]
     assert pickle.loads(pickle.dumps(result)).estimates == result.estimates
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("other", ["recovery", *nightly("twilight", "afterpulses")])
+def test_electronics_that_are_not_named_are_within_the_ranges(other: str) -> None:
+    """Their dead time was stated for the detector's, 230 errors off, and S was 3.0 to 4.5 errors off, with p = 1."""
+    truth = with_effect(BASE, f"{other}+electronics")
+    result = ml.calibrate(stream(truth, 100_000, 6210), seed=6210)
+    assert not silent(result, truth)
+    dead = result.estimates["dead_time_ns"]
+    if NAMES["electronics"] not in [suspect.name for suspect in result.suspects]:
+        assert dead.least < truth.dead < truth.electronics < dead.most + FAR * dead.error
+        limit = next(limit for limit in result.limits if limit.words == NAMES["electronics"])
+        assert limit.limit > 0.2
+        assert limit.ranges["dead_time_ns"][0] == dead.least
 
 
 @pytest.mark.nightly

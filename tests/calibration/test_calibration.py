@@ -331,6 +331,16 @@ def test_flicker_is_named_and_no_afterpulses(periods: int) -> None:
     assert result.estimates["background"].error > 0.03 * 0.15  # twice that of steady light
 
 
+@pytest.mark.full
+def test_even_counts_of_a_bright_pulse_do_not_flicker() -> None:
+    """Ten photons a pulse, so that each window has its counts but for a few: 7.5 standard deviations of flicker."""
+    truth = Truth(signal=10.0, background=0.1, delay=40.0, sigma=0.5, dead=85.0, period=400.0 / 3.0)
+    result = ml.calibrate(stream(truth, 40_000, 2), seed=2)
+    assert result.fits
+    assert not result.suspects
+    assert (np.abs(pulls(result, truth)) < FAR).all()
+
+
 def test_a_look_stops_before_the_fit() -> None:
     result = ml.calibrate(stream(BASE, 3_000, 1), look=True)
     assert result.estimates == {}

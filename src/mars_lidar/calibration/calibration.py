@@ -461,10 +461,14 @@ class _Run:
         begin = start.starts(fit, self.recording, model, self.fixed)
         known = {*self.fixed, *(["width"] if model.returns == 0 or model.pulse is not None else [])}
         free = np.array([k for k, name in enumerate(model.names) if name not in known], np.intp)
+        first, photons = fit.effort.first, float(self.recording.photons)
         for _, theta in begin[:2]:
             trial = Guess(model, theta, np.diag(0.5 * model.scale(theta)[free]), free)
-            tried.append(fit.steps(trial, float(min(self.recording.photons, fit.effort.first))))
-        guess, _, settled = fit.steps(min(tried, key=lambda trial: trial[1])[0], float(self.recording.photons))
+            tried.append(fit.steps(trial, min(photons, first)))
+        guess, _, settled = min(tried, key=lambda trial: trial[1])
+        if first < photons:
+            more = 6.0 if settled else 1.0
+            guess, _, settled = fit.steps(guess._replace(root=guess.root / more**0.5), photons, more * first)
         final = fit.finish(guess)
         return replace(final, converged=final.converged and (settled or final.p_value >= self.level))
 

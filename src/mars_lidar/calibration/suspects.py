@@ -9,7 +9,7 @@ import numpy as np
 
 from mars_lidar._base.cached import cached_property
 from mars_lidar._base.types import FloatArray, NDArray
-from mars_lidar.calibration.fit import LIGHTS, Fit, Fitted, Guess, counted, root_of
+from mars_lidar.calibration.fit import LIGHTS, Fit, Fitted, Guess, counted, draws, root_of
 from mars_lidar.calibration.model import Effect, Model, effects
 from mars_lidar.calibration.recording import FALSE_ALARM, LEAST_PHOTONS, Recording
 from mars_lidar.calibration.start import with_edge
@@ -252,28 +252,30 @@ def _flicker(fit: Fit, fitted: Fitted, counts: float = 8.0, windows: int = 64) -
     Half the mean squared difference of counts in successive windows (Allan's variance, which a slow drift does not
     change), over that of streams of the fit: for longer windows, relative to the shortest. Afterpulses and other
     correlations shorter than the windows change all of them alike, fluctuations of the light the longer ones more. The
-    shortest windows have `counts` counts, each further size four times as many, as long as `windows` remain.
+    shortest windows have `counts` counts, each further size four times as many, as long as `windows` remain. The noise
+    is that of even counts, or what these streams scatter, whose light is drawn from its errors: the counts of a bright
+    pulse are even but for rare losses.
     """
     from scipy.special import ndtri
 
     recording, size = fit.recording, min(float(fit.recording.photons), fit.effort.batch / 4.0)
     cycles = max(2, round(fit.exposure(size)))
-    streams = fitted.model.streams(np.tile(fitted.theta, (LIGHTS, 1)), cycles, 0)
-    drawn = [Recording((t,), (cycles,), recording.clock) for t in streams]
-    rows: list[tuple[float, float, float]] = []
-    while not rows or counts * windows < recording.photons:
+    rows = draws(fitted.model, fitted.unbounded, fitted.covariance, fitted.free)[:LIGHTS]
+    drawn = [Recording((t,), (cycles,), recording.clock) for t in fitted.model.streams(rows, cycles, 0)]
+    table = []
+    while not table or counts * windows < recording.photons:
         window = counts * recording.exposure / recording.photons
-        (variance, number, mean), *other = [x.unevenness(window) for x in (recording, *drawn)]
-        expected = max(float(np.mean([each[0] for each in other])), 1e-300)
-        noise = 3.0 / max(number, 1) + 3.0 / max(sum(each[1] for each in other), 1)  # of the ratio, even counts
-        rows.append((max(variance / expected, 1e-300), noise, max(variance - expected, 0.0) ** 0.5 / max(mean, 1e-300)))
+        table.append([x.unevenness(window) for x in (recording, *drawn)])
         counts *= 4.0
-    ratio, noise, scatter = np.array(rows).T
-    if ratio.size == 1:
+    variance, number, mean = np.maximum(np.array(table).transpose(2, 0, 1), 1e-300)  # (windows, streams) each
+    expected = variance[:, 1:].mean(1)
+    ratio, even = variance[:, 0] / expected, 3.0 / number[:, 0] + 3.0 / number[:, 1:].sum(1)  # of even counts
+    if len(table) == 1:
         return 0.0, -np.inf, 1.0
-    z = np.log(ratio[1:] / ratio[0]) / np.sqrt(noise[1:] + noise[0])
-    p = min(1.0, z.size * _above(z.max()))
-    return float(scatter[1 + z.argmax()]), float(-ndtri(p)) if p > 0.0 else float(z.max()), float(ratio.max())
+    scatter = np.log(variance[1:, 1:] / variance[0, 1:]).var(1, ddof=1) * number[1:, 1:].mean(1) / number[1:, 0]
+    z = np.log(ratio[1:] / ratio[0]) / np.sqrt(np.maximum(even[1:] + even[0], scatter * (1.0 + 1.0 / LIGHTS)))
+    p, excess = min(1.0, z.size * _above(z.max())), np.sqrt(np.maximum(variance[:, 0] - expected, 0.0)) / mean[:, 0]
+    return float(excess[1 + z.argmax()]), float(-ndtri(p)) if p > 0.0 else float(z.max()), float(ratio.max())
 
 
 def drift(fit: Fit, fitted: Fitted) -> Drift | None:

@@ -227,15 +227,15 @@ CALLS: dict[str, Callable[[Path], tuple[Callable[..., Any], dict[str, Any]]]] = 
         statistics.constant_light_rate,
         {"rate_hz": 1e6, "detector": SYSTEM.detector},
     ),
-    "reconstruct.coates_rates": lambda _: (
-        reconstruction.coates_rates,
+    "Coates.rates": lambda _: (
+        reconstruction.Coates().rates,
         {"cube": np.minimum(counts(), 1), "system": SYNCHRONOUS},
     ),
-    "reconstruct.generalised_coates_rates": lambda _: (
-        reconstruction.generalised_coates_rates,
+    "GeneralisedCoates.rates": lambda _: (
+        reconstruction.GeneralisedCoates().rates,
         {"cube": counts(), "system": SYSTEM},
     ),
-    "reconstruct.mchc_rates": lambda _: (reconstruction.mchc_rates, {"cube": counts(), "system": SYSTEM}),
+    "ChainCorrection.rates": lambda _: (reconstruction.ChainCorrection().rates, {"cube": counts(), "system": SYSTEM}),
     "reconstruct.log_likelihood": lambda _: (
         reconstruction.log_likelihood,
         {"histogram": counts()[0, 0, 0], "flux": PIXEL, "system": SYSTEM},

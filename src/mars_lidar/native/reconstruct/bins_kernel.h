@@ -26,10 +26,21 @@ struct EnergyBlock {
     double *energy, *density;
 };
 
-// (R9) of bins of `light` photons, or where that is null of signal x energy + flat x share, share 1 where null.
+// What becomes of a pass of each bin (R7) of signal x energy + flat x share photons, share 1 where null: armed, P(none) and
+// P(one); re-armed, P(one) and its derivative. `passed` (kPassColumns, bins).
+constexpr int kPassColumns = 4;
+struct PassesBlock {
+    const double *energy, *share;
+    double signal, flat;
+    int64_t bins;
+    double* passed;
+};
+
+// (R9) of bins of which `passed` is known, or where that is null of `light` photons, or where that is null too of
+// signal x energy + flat x share, share 1 where null.
 struct TermsBlock {
     const double *count, *armed, *rearmed, *light;
-    const double *energy, *slope, *share;
+    const double *energy, *slope, *share, *passed;
     int64_t bins;
     double signal, flat;
     bool poisson;          // dead times below one bin: a bin may register again
@@ -108,6 +119,7 @@ MARS_DECLARE_KERNEL(TangentSums, bin_tangent_, const TangentBlock& block)
 MARS_DECLARE_KERNEL(ChangeSums, bin_change_, const ChangeBlock& block)
 MARS_DECLARE_KERNEL(void, arm_bins_, const ArmBlock& block)
 MARS_DECLARE_KERNEL(void, pulse_energy_, const EnergyBlock& block)
+MARS_DECLARE_KERNEL(void, bin_passes_, const PassesBlock& block)
 MARS_DECLARE_KERNEL(BinSums, bin_terms_, const TermsBlock& block)
 MARS_DECLARE_KERNEL(void, bin_products_, const ProductsBlock& block)
 MARS_DECLARE_KERNEL(void, bin_law_, const LawBlock& block)

@@ -74,15 +74,16 @@ class PixelLikelihood {
             low = std::min(low, ends.low - delay);
             high = std::max(high, ends.high - delay);
         }
-        pulse_.set(r_, delay, low, high);
+        pulse_.place(r_, delay, low, high);
         const OpenSums pulsed = sums(pulse_.first, pulse_.bins);
         const double count = std::max(all_.count - pulsed.count, 0.0), time = all_.time - pulsed.time;
         const double shares = all_.log_shares - pulsed.log_shares, bins = all_.bins - pulsed.bins;
         if (ends.count == 0 || !ends.covers(r_, pulse_)) {
+            pulse_.set(r_, delay, low, high);
             run_.set(r_, *passes_, pulse_.first, pulse_.bins);
             if (ends.count > 0) ends.leave_out(r_, pulse_, run_);
             out.add(bins_kernels().terms({run_.count.data(), run_.armed.data(), run_.rearmed.data(), nullptr,
-                                          pulse_.energy.data(), pulse_.slope.data(), run_.shares(),
+                                          pulse_.energy.data(), pulse_.slope.data(), run_.shares(), nullptr,
                                           static_cast<int64_t>(run_.count.size()), signal, flat, r_.below_bin(), true,
                                           nullptr, nullptr}),
                     scale);
@@ -104,10 +105,10 @@ class PixelLikelihood {
             out.add(count / flat + slope, -curve, dl);
         }
         if (ends.count > 0) {
-            ends.illuminate(r_, delay, pulse_);
+            ends.illuminate(r_, delay, signal, flat, pulse_, passed_);
             each_.assign(ends.count, {});
             for (int c = 0; c < ends.count; ++c) {
-                each_[c].add(ends.terms(c, signal, flat, pulse_), scale);
+                each_[c].add(ends.terms(c, pulse_, passed_), scale);
                 if (!ends.everywhere || whole || !(time > 0.0)) continue;
                 // a pass more in each bin outside, which registers as those that are counted
                 const double moved = ends.shift[c] * std::max(bins, 0.0);
@@ -154,6 +155,7 @@ class PixelLikelihood {
     OpenSums all_;
     PulseBins pulse_;
     BinRun run_;
+    BinValues passed_;  // see ExposureEnds
     std::vector<Likelihood> each_;
     BackgroundSeries series_;
     bool whole_ = false, expanded_ = false;  // every bin as those of the pulse; background alone by the series

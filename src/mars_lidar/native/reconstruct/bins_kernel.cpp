@@ -124,13 +124,16 @@ BinSums terms_of(const TermsBlock& of) {
         light = of.light ? reals(of.light + i) : of.signal * s + of.flat * share;
         const Term term = poisson ? poisson_term(h, armed, light)
                                   : passed_term(h, armed, reals(of.rearmed + i),
-                                                of.passed ? Passes(of.passed, of.bins, i) : Passes(light), of.by_time);
+                                                of.alike    ? Passes(of.passed, kBinsTogether, p * kReals)
+                                                : of.passed ? Passes(of.passed, of.bins, i)
+                                                            : Passes(light),
+                                                of.by_time);
         value[p] = value[p] + term.value;
         if (of.score) {
             put(of.score + i, term.score);
             put(of.info + i, term.info);
+            return;
         }
-        if (!of.energy) return;
         const Real rows[3] = {s, share, ds};
         int place = 0;
         for (int a = 0; a < 3; ++a) {
@@ -190,7 +193,8 @@ void MARS_JOIN(pulse_energy_, MARS_LEVEL)(const EnergyBlock& of) {
 void MARS_JOIN(bin_passes_, MARS_LEVEL)(const PassesBlock& of) {
     for (int64_t i = 0; i < of.bins; i += kReals) {
         const Real share = of.share ? reals(of.share + i) : splat(1.0);
-        const Passes pass(of.signal * reals(of.energy + i) + of.flat * share);
+        const Real energy = of.energy ? reals(of.energy + i) : splat(0.0);
+        const Passes pass(of.signal * energy + of.flat * share);
         const Real columns[kPassColumns] = {pass.quiet, pass.fired, pass.q, pass.dq};
         for (int k = 0; k < kPassColumns; ++k) put(of.passed + k * of.bins + i, columns[k]);
     }

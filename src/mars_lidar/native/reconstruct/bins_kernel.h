@@ -26,8 +26,8 @@ struct EnergyBlock {
     double *energy, *density;
 };
 
-// What becomes of a pass of each bin (R7) of signal x energy + flat x share photons, share 1 where null: armed, P(none) and
-// P(one); re-armed, P(one) and its derivative. `passed` (kPassColumns, bins).
+// What becomes of a pass of each bin (R7) of signal x energy + flat x share photons, energy 0 and share 1 where null: armed,
+// P(none) and P(one); re-armed, P(one) and its derivative. `passed` (kPassColumns, bins).
 constexpr int kPassColumns = 4;
 struct PassesBlock {
     const double *energy, *share;
@@ -36,11 +36,12 @@ struct PassesBlock {
     double* passed;
 };
 
-// (R9) of bins of which `passed` is known, or where that is null of `light` photons, or where that is null too of
-// signal x energy + flat x share, share 1 where null.
+// (R9) of bins of `light` photons, or where that is null of signal x energy + flat x share, energy 0 and share 1 where null.
+// `passed` (kPassColumns, bins), of `alike` bins (kPassColumns, kBinsTogether), or null: computed.
 struct TermsBlock {
     const double *count, *armed, *rearmed, *light;
     const double *energy, *slope, *share, *passed;
+    bool alike;
     int64_t bins;
     double signal, flat;
     bool poisson;          // dead times below one bin: a bin may register again
@@ -49,7 +50,7 @@ struct TermsBlock {
 };
 
 // The logarithm of the likelihood; and its derivatives by S, flat and delay / S, with Fisher's information: of (S, S),
-// (flat, S), (flat, flat), (delay, S), (delay, flat), (delay, delay). They are sums of the terms with `energy`.
+// (flat, S), (flat, flat), (delay, S), (delay, flat), (delay, delay). They are sums of the terms without `score`.
 struct BinSums {
     double value = 0.0, score[3] = {}, info[6] = {};
 };

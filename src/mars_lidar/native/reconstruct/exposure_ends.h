@@ -86,8 +86,8 @@ class ExposureEnds {
     BinSums terms(int c, const PulseBins& pulse, const BinValues& passed) const {
         const int64_t padded = static_cast<int64_t>(run_.count.size());
         return bins_kernels().terms({run_.count.data(), armed_.data() + c * padded, run_.rearmed.data(), nullptr,
-                                     pulse.energy.data(), pulse.slope.data(), run_.shares(), passed.data(), padded, 0.0,
-                                     0.0, false, false, nullptr, nullptr});
+                                     pulse.energy.data(), pulse.slope.data(), run_.shares(), passed.data(), false,
+                                     padded, 0.0, 0.0, false, false, nullptr, nullptr});
     }
 
     int count = 0;

@@ -172,8 +172,7 @@ def refitted(fit: Fit, fitted: Fitted, plain: FloatArray, trials: list[Trial]) -
             continue
         along = _score(fit, fitted, plain, final.model, final.theta, score.effect)
         error = _error_of(final, size)
-        explained = min(along.size, final.theta[size])  # what is beyond the size of the refit is not the effect's
-        z = max(score.z, explained / along.error, final.theta[size] / error if error else 0.0)
+        z = max(score.z, along.z, final.theta[size] / error if error else 0.0)
         fits = final.p_value * _MISFIT > fitted.p_value and (z > clear(trials[:1], _TRIED) or not error)
         better = best is None or final.misfit_z < best[0].misfit_z
         if final.theta[size] > 0.0 and (z > most or fits) and better:

@@ -6,17 +6,17 @@ something depend on the machine, and they name it.
 
 A study is a folder: `run.py` computes what its report states and draws, `report.md.jinja` is the report. Some folders
 hold several studies of one subject, a module and a template of its name for each. What they share is in `common`. All
-run alike: `run(request)` of the module returns the facts that the template states, among them ``rows`` of the CSV
-file and ``figures`` by name; what writes them is here.
+run alike: `run(settings, request)` of the module, with its `FULL` or `QUICK` settings, returns the facts that the
+template states, among them ``rows`` of the CSV file and ``figures`` by name; `common.report.make` writes them.
 """
 
 from __future__ import annotations
 
 import importlib
 import re
-import time
+from argparse import ArgumentTypeError
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -24,28 +24,52 @@ Facts = dict[str, Any]
 Tell = Callable[[str], object]
 
 
+def _existing(kind: str, words: str, inside: str = "") -> dict[str, Any]:
+    """Option of the command line whose value is a file, or a folder with files `inside`."""
+
+    def read(text: str) -> Path:
+        path = Path(text)
+        if not (path.is_file() if kind == "file" else path.is_dir()) or (inside and not any(path.glob(inside))):
+            raise ArgumentTypeError(f"must be a {kind}{f' with {inside}' * bool(inside)}, got {text!r}")
+        return path
+
+    return {"help": words, "type": read, "metavar": "FILE" if kind == "file" else "DIR"}
+
+
+_DATA = "folder of the reference cases, *.json (studies 'law', 'joint-covariance')"
+_STREAM = "measured photon stream: a .mat with times in units of 64 ps (study 'hardware')"
+_TRUTH = (
+    "reference engine (study 'count-law'): 'sequential' shares no code with the laws, 'exact' is several times faster "
+    "(default: %(default)s)"
+)
+_CONFIG = (
+    "size of the study 'downstream': some five minutes of one core, or some twenty (default: %(default)s); with "
+    "--quick a tiny one, seconds"
+)
+_SEED = "seed of the scenes for coverage (study 'image')"
+_RGBD = "folder of RGB-D pairs, NAME_depth.png and NAME_colors.png or Middlebury folders (study 'image')"
+_CAPTURES = "folder of measured cubes, .zarr, .h5 or .npz, as `mars_lidar.io.save` writes them (study 'image')"
+_DRUNET = (
+    "weights of a DRUNet of one channel, such as deepinv's drunet_deepinv_gray_finetune_26k.pth (study 'image'; "
+    "without, a small one is trained first)"
+)
+
+
 @dataclass(frozen=True)
 class Request:
-    """What is asked of a study: output folder, quick or full, reference data, who hears of progress.
-
-    `truth` is the engine whose simulation the study "count-law" takes for true; `stream` a measured photon stream for
-    the study "hardware"; `config` the size of "downstream"; `seed` and `systems` another sweep, and its size, of the
-    studies "domain" and "long-exposures", `seed` also other scenes for the coverage in the study "image"; `rgbd` a
-    folder of RGB-D pairs, `captures` one of measured cubes and `drunet` a file of weights of deepinv's DRUNet for it.
-    """
+    """What is asked of a study: output folder, quick or full, who hears of progress, and options of single studies."""
 
     out: Path
     quick: bool = False
-    data: Path | None = None
     tell: Tell = str
-    truth: str = "sequential"
-    stream: Path | None = None
-    config: str = "small"
-    seed: int | None = None
-    systems: int | None = None
-    rgbd: Path | None = None
-    captures: Path | None = None
-    drunet: Path | None = None
+    data: Path | None = field(default=None, metadata=_existing("folder", _DATA, "*.json"))
+    stream: Path | None = field(default=None, metadata=_existing("file", _STREAM))
+    truth: str = field(default="sequential", metadata={"help": _TRUTH, "choices": ("sequential", "exact")})
+    config: str = field(default="small", metadata={"help": _CONFIG, "choices": ("small", "full", "held-out")})
+    seed: int | None = field(default=None, metadata={"help": _SEED, "type": int, "metavar": "N"})
+    rgbd: Path | None = field(default=None, metadata=_existing("folder", _RGBD))
+    captures: Path | None = field(default=None, metadata=_existing("folder", _CAPTURES))
+    drunet: Path | None = field(default=None, metadata=_existing("file", _DRUNET))
 
 
 class OtherRunsError(ValueError):
@@ -67,15 +91,10 @@ STUDIES = _studies()
 
 
 def run(name: str, request: Request) -> list[Path]:
-    """Run a study, and write NAME.md, NAME.csv and its figures; returns the paths written."""
-    from mars_lidar.plot.style import style
-    from studies.common.report import write
+    """Run a study, imported when it is asked for, and write its report; returns the paths written."""
+    from studies.common.report import make
 
-    study = importlib.import_module(STUDIES[name][0])  # imported when it is asked for
-    began = time.monotonic()
-    with style():
-        facts = study.run(request)
-        return write(request, name.replace("-", "_"), study, {"spent": time.monotonic() - began} | facts)
+    return make(request, name, importlib.import_module(STUDIES[name][0]))
 
 
 __all__ = ["STUDIES", "Facts", "OtherRunsError", "Request", "Tell", "run"]

@@ -14,8 +14,7 @@ from studies import Facts
 from studies.common.draw import legend_below, panels
 from studies.common.report import Row
 from studies.downstream import data
-from studies.downstream.data import MAIN, PAIR, WORDS, Config, instrument
-from studies.downstream.settings import Run
+from studies.downstream.data import MAIN, PAIR, WORDS, Config, Run, instrument
 
 PAPER = {  # T5 of arXiv 2512.04924: by ratio and arm, own then gold; reflectivity PSNR in dB, depth RMSE in m
     (0.6, "poisson"): ((36.49, 0.072), (7.02, 1.654)),

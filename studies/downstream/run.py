@@ -8,23 +8,26 @@ configurations share the networks that they have in common.
 
 from __future__ import annotations
 
+import json
 import time
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
 from mars_lidar import Flux, System, cramer_rao, reconstruct
+from mars_lidar._base.files import beside
 from mars_lidar._base.imports import needed
 from mars_lidar._base.types import FloatArray
-from studies import Facts, Request
-from studies.common.kept import chosen, fixed, once
-from studies.downstream.data import CONFIGS, MAIN, Data, instrument, truths
+from studies import Facts, OtherRunsError, Request, Tell
+from studies.downstream import report
+from studies.downstream.data import CONFIGS, MAIN, Config, Data, Run, instrument, runs, truths
 from studies.downstream.networks import predicted, trained
 from studies.downstream.prediction import of_scenes
-from studies.downstream.settings import Run, runs
 
 METHODS = {  # that need no training
     "matched filter": "matched_filter",
@@ -35,12 +38,13 @@ LIGHT_M_PER_NS = 0.299792458 / 2.0  # of depth
 _GAUSSIAN: dict[str, Any] = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}  # SSIM's window
 
 
-def run(request: Request) -> Facts:
-    """Train what has no result, and report all."""
-    from studies.downstream import report
+FULL, QUICK = CONFIGS["small"], CONFIGS["tiny"]
 
+
+def run(settings: Config, request: Request) -> Facts:
+    """Train what has no result, and report all."""
     torch.set_num_threads(1)  # the networks are too small to gain from more
-    config, tell = chosen(CONFIGS, request), request.tell
+    config, tell = settings if request.quick else CONFIGS[request.config], request.tell
     folder = request.out / f"downstream-{config.sizes.name}"
     fixed(folder, asdict(config.sizes))
     data, every = Data(config.sizes), list(runs(config))
@@ -122,3 +126,26 @@ def methods(data: Data, dead: float, sbr: float) -> dict[str, dict[str, list[flo
         psnr.append(float(-10.0 * np.log10(np.mean((bound.signal / photons) ** 2))))
         depth.append(float(np.mean(bound.depth_m**2)))
     return out | {"Cramer-Rao bound": {"psnr": psnr, "depth_square": depth}}
+
+
+def fixed(folder: Path, config: Mapping[str, Any]) -> None:
+    """Write the configuration, or refuse a folder with runs of another."""
+    folder.mkdir(parents=True, exist_ok=True)
+    record, path = json.dumps(config, indent=2) + "\n", folder / "config.json"
+    if path.exists() and path.read_text() != record:
+        raise OtherRunsError(f"{folder} holds runs of another configuration ({path.name}); give another --out")
+    _save_whole(path, record)
+
+
+def once(path: Path, make: Callable[[], Any], tell: Tell) -> Any:
+    """What the JSON file `path` holds, made and written first where it is not there."""
+    if not path.exists():
+        _save_whole(path, json.dumps(make()) + "\n")
+        tell(f"{path.parent.name}: {path.stem}")
+    return json.loads(path.read_text())
+
+
+def _save_whole(path: Path, text: str) -> None:
+    """Write a text that is whole or not there, whatever stops the process."""
+    with beside(path) as unfinished:
+        unfinished.write_text(text, encoding="utf-8")

@@ -154,8 +154,8 @@ def _part(pair: Scene, size: int, rng: np.random.Generator) -> Scene:
     """Half to all of the sides of a scene, at random, mirrored or not."""
     share = rng.uniform(0.5, 1.0)
     sides = [round(share * side) for side in pair.shape]
-    top, left = (int(rng.integers(whole - side + 1)) for whole, side in zip(pair.shape, sides, strict=True))
-    part = pair[top : top + sides[0], left : left + sides[1]].resize(size)
+    row, column = (int(rng.integers(whole - side + 1)) for whole, side in zip(pair.shape, sides, strict=True))
+    part = pair[row : row + sides[0], column : column + sides[1]].resize(size)
     step = int(rng.choice((-1, 1)))
     return Scene(depth_m=part.depth_m[:, ::step], reflectivity=part.reflectivity[:, ::step])
 
@@ -171,9 +171,8 @@ def rgbd(folder: Path) -> dict[str, Scene]:
     return pairs
 
 
-def run(request: Request) -> Facts:
+def run(settings: Settings, request: Request) -> Facts:
     """Every scene, system and brightness by every method."""
-    settings = QUICK if request.quick else FULL
     every = scenes(settings.size)
     pairs = {} if request.rgbd is None else rgbd(request.rgbd)
     every |= {name: pair.resize(settings.size) for name, pair in pairs.items()}
@@ -221,7 +220,6 @@ def run(request: Request) -> Facts:
     cells = coverage(rows, "scenes", ("photons", "sbr"))
     request.tell("image: two returns, large images")
     return {
-        "s": settings,
         "tv_weight": alternating.TV_WEIGHT,
         "drunet": about_drunet,
         "fewest": captures.FEWEST,

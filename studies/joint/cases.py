@@ -17,7 +17,6 @@ from studies.common.sample import PERIOD_NS, system_of
 COARSE = 64  # bins in which single bins and neighbours are compared
 OFTEN = 500  # exposures that must differ from the rest before a z-score is as good as Gaussian
 TOLERANCE = 1e-4  # of the closed form
-AGAIN = "exact, again"  # a second sample of the exact engine: what agreement looks like
 _REACH = 3.0  # pulse widths on either side of the return
 HANDED = "pixels given to exact"  # key of the engine's report
 
@@ -118,24 +117,17 @@ def random_cases(
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """Of n exposures: `coarse` (n, COARSE) bins, `window` (n,) counts near the pulse, `fine` (n, k) single bins.
-
-    `handed`: whether the engine gave the pixel to the exact one.
-    """
+    """Of n exposures: `coarse` (n, COARSE) bins, `window` (n,) counts near the pulse."""
 
     coarse: FloatArray
     window: FloatArray
-    fine: FloatArray
-    handed: bool
 
     @classmethod
-    def of(cls, case: Case, bins: int, engine: str, exposures: int, seed: int, fine: NDArray[np.intp]) -> Sample:
-        """Simulate one pixel `exposures` times; `fine`: the single bins that are looked at."""
-        report: dict[str, float] = {}
-        x = case.histograms(bins, engine, exposures, seed, report)
+    def of(cls, case: Case, bins: int, engine: str, exposures: int, seed: int) -> Sample:
+        """Simulate one pixel `exposures` times."""
+        x = case.histograms(bins, engine, exposures, seed)
         coarse = x.reshape(exposures, COARSE, -1).sum(-1, dtype=np.float64)
-        window = x[:, case.window(bins)].sum(-1, dtype=np.float64)
-        return cls(coarse, window, x[:, fine].astype(np.float64), report.get(HANDED, 0.0) > 0)
+        return cls(coarse, x[:, case.window(bins)].sum(-1, dtype=np.float64))
 
 
 RATIOS = ("window", "bin", "neighbour", "count", "window mean")  # what a sample is compared in

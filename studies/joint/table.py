@@ -8,8 +8,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from mars_lidar.engines import ANY_SYSTEM
 from studies import Facts, Request, Tell
 from studies.common.report import crossed, marked
@@ -46,7 +44,7 @@ def compute(settings: Settings, tell: Tell) -> Scores:
     for number, case in enumerate(settings.cases):
         seed, law = (settings.seed << 16) + 100 * number, Law(case, settings.bins)
         for k, engine in enumerate(ANY_SYSTEM):
-            x = Sample.of(case, settings.bins, engine, settings.realizations, seed + k, np.zeros(0, np.intp))
+            x = Sample.of(case, settings.bins, engine, settings.realizations, seed + k)
             results[case.name, engine] = law.ratios(x)
         tell(f"joint-table: {case.name}")
     return results
@@ -58,12 +56,10 @@ def beyond(pair: tuple[float, float], key: str) -> bool:
     return abs(value - (0.0 if key == "window mean" else 1.0)) > SCORES * error
 
 
-def run(request: Request) -> Facts:
+def run(settings: Settings, request: Request) -> Facts:
     """All engines in all cases."""
-    settings = QUICK if request.quick else FULL
     result = compute(settings, request.tell)
     return {
-        "s": settings,
         "engines": list(ANY_SYSTEM),
         "period_ns": PERIOD_NS,
         "findings": [_finding(engine, result) for engine in ANY_SYSTEM],

@@ -180,10 +180,8 @@ def maps_figure(picture: Picture) -> Figure:
 _BOUNDS = 17  # delays at which the bound is computed; between them its logarithm is interpolated
 
 
-def run(request: Request) -> Facts:
+def run(settings: Settings, request: Request) -> Facts:
     """Sweeps over flux, near the bound, and a picture."""
-
-    settings = QUICK if request.quick else FULL
     rows = []
     for signal in settings.signals:
         request.tell(f"reconstruction: S = {signal:.3g}")
@@ -197,7 +195,6 @@ def run(request: Request) -> Facts:
     chosen = {settings.signals[k] for k in ((0, 1, 2) if n < 5 else (n // 4, (5 * n) // 8, n - 2))}
     words = {"matched_filter": "the matched filter", "maximum_likelihood": "maximum likelihood"}
     return {
-        "s": settings,
         "findings": [finding for mode, title in TITLE.items() if (finding := _finding(rows, mode, title))],
         "chosen": [row for row in rows if row["signal"] in chosen],
         "near": near,

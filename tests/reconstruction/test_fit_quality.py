@@ -148,8 +148,8 @@ def test_statistics_are_those_of_their_definition(dead: float) -> None:
         assert (fit.longer[k], fit.shorter[k], fit.wider[k]) == pytest.approx((longer, shorter, wider), abs=0.05)
         quiet = variance / mean
         third, fourth = variance * (2.0 * quiet - 1.0), variance * (1.0 - 6.0 * quiet * (1.0 - quiet))
-        left = np.linalg.solve(white, beyond @ white)
-        form = left.T @ form @ left
+        projection = np.linalg.solve(white, beyond @ white)
+        form = projection.T @ form @ projection
         average = np.trace(form @ covariance)
         spread = 2.0 * np.trace(form @ covariance @ form @ covariance) + np.diag(form) ** 2 @ fourth
         p = [chi2.sf(2.0 * average / spread * square, 2.0 * average**2 / spread)]

@@ -14,7 +14,6 @@ from mars_lidar.statistics.tolerances import TOL
 from studies.__main__ import main
 from studies.common.distance import wasserstein
 from studies.common.sample import draw
-from studies.count_law import cells as cells_of
 from studies.count_law import run as count_law
 from studies.count_law.run import shape_sweep
 from studies.neural import simulators
@@ -90,14 +89,14 @@ def test_floors_are_those_of_samples():
     law = Pmf(0, stats.poisson.pmf(np.arange(80), 20.0))
     size = 10_000
     random = np.random.default_rng(3)
-    result = cells_of.resampled_figures(law, size, 0, 2000, random)
+    result = count_law.resampled_figures(law, size, 0, 2000, random)
     assert result[:, 2].mean() == pytest.approx(np.sqrt(2 / np.pi * 20.0 / size), rel=0.06)
     assert result[:, 3].mean() == pytest.approx(np.sqrt(2 / np.pi * (20.0 + 2 * 20.0**2) / size), rel=0.06)
     times = np.arange(1, size + 1)
     rates = np.log(times[:, None] / (size * law.p)) * times[:, None] / size
     expected = (stats.binom.pmf(times[:, None], size, law.p) * rates).sum()
     assert result[:, 1].mean() == pytest.approx(expected, rel=0.05)
-    twice = cells_of.resampled_figures(law, size, size, 500, random)
+    twice = count_law.resampled_figures(law, size, size, 500, random)
     assert twice[:, 2].mean() == pytest.approx(np.sqrt(2) * result[:, 2].mean(), rel=0.12)
 
 

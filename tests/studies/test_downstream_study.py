@@ -14,14 +14,14 @@ from harness import make_system
 import mars_lidar as ml
 from mars_lidar.statistics import mean_histogram
 from studies import Request
-from studies.common.kept import fixed
-from studies.common.windows import BOX, LOGS, NEAR, WINDOW, features, number, starts
 from studies.downstream import data as downstream_data
 from studies.downstream import run as downstream
 from studies.downstream.data import CONFIGS, MAIN, WORDS, instrument
 from studies.downstream.networks import predicted, trained
 from studies.downstream.prediction import at
 from studies.downstream.report import scatter
+from studies.downstream.run import fixed
+from studies.downstream.windows import BOX, LOGS, NEAR, WINDOW, features, number, starts
 from studies.neural import NeuralEngine
 from tests.harness.study import quick_study
 

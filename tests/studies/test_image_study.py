@@ -56,10 +56,10 @@ def test_a_capture_is_thinned_to_so_many_photons(tmp_path):
 def test_a_folder_that_is_none_is_refused(capsys):
     with pytest.raises(SystemExit):
         main(["image", "--captures", "/nowhere"])
-    assert "--captures must be a folder" in capsys.readouterr().err
+    assert "argument --captures: must be a folder" in capsys.readouterr().err
     with pytest.raises(SystemExit):
         main(["image", "--drunet", "/nowhere"])
-    assert "--drunet must be a file" in capsys.readouterr().err
+    assert "argument --drunet: must be a file" in capsys.readouterr().err
 
 
 def test_total_variation_denoises():

@@ -10,12 +10,10 @@ from studies.joint import table as joint
 from studies.joint.cases import COARSE, RATIOS, REFERENCE, SEVEN, SEVEN_RATIOS, Case, Law, Sample
 from tests.harness.study import quick_study
 
-NONE = np.zeros(0, np.intp)
-
 
 def compared(case, engine, exposures, seed):
     """Ratios to the closed form of a sample on 256 bins."""
-    return Law(case, 256).ratios(Sample.of(case, 256, engine, exposures, seed, NONE))
+    return Law(case, 256).ratios(Sample.of(case, 256, engine, exposures, seed))
 
 
 def test_files(tmp_path):
@@ -56,7 +54,7 @@ def test_without_dead_time_bins_are_independent():
 def test_errors_are_the_scatter_of_samples():
     """Standard errors of 60 samples of one law against the scatter of their ratios; 5 of its own errors."""
     case, law = SEVEN[6], Law(SEVEN[6], 256)
-    results = [law.ratios(Sample.of(case, 256, "exact", 500, k, NONE)) for k in range(60)]
+    results = [law.ratios(Sample.of(case, 256, "exact", 500, k)) for k in range(60)]
     outcomes = {}
     for key in RATIOS:
         value, error = np.array([item[key] for item in results]).T

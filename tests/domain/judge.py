@@ -25,8 +25,8 @@ from mars_lidar import (
 )
 from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics import ConvergenceError, mean_histogram, photons_per_bin
-from studies.domain import simulator
-from studies.domain.checks import (
+from tests.domain import simulator
+from tests.domain.checks import (
     FIRST_LEVEL,
     Check,
     Sample,
@@ -41,7 +41,7 @@ from studies.domain.checks import (
     two_samples,
     variances_of,
 )
-from studies.domain.systems import PERIOD_NS, Case
+from tests.domain.systems import PERIOD_NS, Case
 
 _LIGHT = {"detection_efficiency", "dark_count_hz", "jitter", "code_density"}
 _MOST = 20_000  # counts of a law that is written out

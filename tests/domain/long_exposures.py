@@ -1,10 +1,10 @@
-"""Study "long-exposures": the feedback engine's means and variances at long exposures, against the closed form."""
+"""The feedback engine's means and variances at long exposures, against the closed form."""
 
 from __future__ import annotations
 
 import time
 from collections import Counter
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,8 +17,8 @@ from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.engines.feedback import FeedbackEngine, draw_rest
 from mars_lidar.statistics import ConvergenceError
 from studies import Facts, Request
-from studies.common.kept import Lines
-from studies.domain.systems import LONG, PERIOD_NS, Case, draw_long
+from tests.domain.sweep import Lines
+from tests.domain.systems import LONG, PERIOD_NS, Case, draw_long
 
 MEAN_OFF = 0.3  # standard deviations of a bin or window that its mean may be off
 VARIANCE_OFF = 0.05  # of the variance of a bin or window, or of the mean over the bins near the pulse
@@ -55,10 +55,8 @@ class _Sampled(FeedbackEngine):
         draw_rest(ExactEngine(), task, out, replace(rest, pixels=rest.pixels[:0]))
 
 
-def run(request: Request) -> Facts:
+def run(settings: Settings, request: Request) -> Facts:
     """Random systems, compared one by one until so many were drawn by the engine and have a law."""
-    settings = QUICK if request.quick else FULL
-    settings = replace(settings, seed=request.seed or settings.seed, systems=request.systems or settings.systems)
     config = {"seed": settings.seed, "items": settings.items}
     lines = Lines(request.out / "long_exposures.jsonl", config)
     number = judged = 0
@@ -77,8 +75,6 @@ def run(request: Request) -> Facts:
             request.tell(f"redrawn: {bias.records[k]}")
     rows = [row for row in every if row["outcome"] in ("right", "wrong")]
     return {
-        "s": settings,
-        "config": asdict(settings),
         "every": every,
         "outcomes": Counter(row["outcome"] for row in every),
         "families": [_family(every, family) for family in LONG],

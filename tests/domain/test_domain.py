@@ -13,13 +13,13 @@ import mars_lidar as ml
 from mars_lidar.instrument.effects import EFFECTS
 from mars_lidar.reconstruction.histogram_bound import _variances
 from mars_lidar.statistics import ConvergenceError
-from studies.common.distance import neighbours
-from studies.domain import judge as judging
-from studies.domain.checks import Check, Windows, simulated, two_samples
-from studies.domain.judge import Budget, judge, known
-from studies.domain.sweep import Settings, Watched, judge_case
-from studies.domain.systems import FAMILIES, MOVING, PERIOD_NS, Case, draw
-from tests.harness.study import quick_study
+from tests.domain import judge as judging
+from tests.domain.__main__ import main
+from tests.domain.checks import Check, Windows, neighbours, simulated, two_samples
+from tests.domain.judge import Budget, judge, known
+from tests.domain.sweep import Settings, Watched, judge_case
+from tests.domain.systems import FAMILIES, MOVING, PERIOD_NS, Case, draw
+from tests.harness.study import written
 
 
 def pixel(signal: float = 1.0, background: float = 0.5, dead: float = 0.4, cycles: int = 100, **more: object) -> Case:
@@ -200,7 +200,8 @@ def test_errors_without_information_are_infinite() -> None:
 @pytest.mark.full
 def test_quick_form(tmp_path, capsys) -> None:
     """Fifteen systems with fixed seeds: no failure, a report, its data and its maps."""
-    study = quick_study("domain", tmp_path, "--systems", 15)
+    assert main(["--quick", "--systems", "15", "--out", str(tmp_path)]) == 0
+    study = written("domain", tmp_path)
     capsys.readouterr()
     failures = tmp_path / "domain_failures.csv"
     assert not failures.exists(), failures.read_text()
@@ -208,4 +209,14 @@ def test_quick_form(tmp_path, capsys) -> None:
     assert len(study.rows) == 15
     assert {row["exact"] for row in study.rows} <= set(judging.STATES)
     assert sum(row["exact"] == judging.VERIFIED for row in study.rows) > 10
-    assert len(study.figures) == 5
+    assert len(study.figures) == 4
+
+
+@pytest.mark.full
+def test_long_exposures_are_those_of_the_closed_form(tmp_path):
+    assert main(["long-exposures", "--quick", "--out", str(tmp_path)]) == 0
+    study = written("long-exposures", tmp_path)
+    outcomes = [row["outcome"] for row in study.rows]
+    assert outcomes.count("right") >= 3
+    assert "wrong" not in outcomes
+    assert f"{outcomes.count('right')} " in study.text

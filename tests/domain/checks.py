@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from mars_lidar._base.types import FloatArray
-from studies.common.distance import neighbours
 from studies.common.sample import histograms
-from studies.domain.systems import PERIOD_NS, Case
+from tests.domain.systems import PERIOD_NS, Case
 
 _PIXELS = 32
 MOST_CELLS = 40
@@ -306,6 +305,20 @@ def homogeneous(a: str, b: str, what: str, table: NDArray[np.int64]) -> Check:
     size = 1.0 / math.sqrt(float((1.0 / merged.sum(1)).sum()))
     effect, detects = 0.5 * float(np.abs(rows[0] - rows[1]).sum()), _variation(merged.shape[1] - 1) / size
     return Check(a, b, what, p, effect, detects)
+
+
+def neighbours(expected: FloatArray, least: float) -> NDArray[np.int64]:
+    """First index (groups,) of groups of neighbouring cells with an expected sum of at least `least`.
+
+    `expected` is (n,); cells remaining at the end join the last group.
+    """
+    below, starts, held = np.cumsum(expected, dtype=np.float64), [0], 0.0
+    while True:
+        end = int(np.searchsorted(below, held + least)) + 1
+        if end >= below.size or below[-1] - below[end - 1] < least:
+            return np.array(starts, np.int64)
+        starts.append(end)
+        held = float(below[end - 1])
 
 
 def _poisson(events: FloatArray, expected: FloatArray, slack: FloatArray) -> FloatArray:

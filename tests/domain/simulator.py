@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mars_lidar import GaussianPulse
 from mars_lidar._base.types import FloatArray
-from studies.domain.systems import PERIOD_NS, Case
+from tests.domain.systems import PERIOD_NS, Case
 
 ABLE = {
     "detection_efficiency",

@@ -1,4 +1,4 @@
-"""Study "domain": every engine and prediction, verified on random systems."""
+"""Every engine and prediction, verified on random systems."""
 
 from __future__ import annotations
 
@@ -6,19 +6,20 @@ import math
 import time
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from mars_lidar._base.resources import thread_count
 from studies import Facts, Request
-from studies.common.kept import Lines
+from studies.common.draw import panels
 from studies.common.report import number
-from studies.domain import checks, judge, sweep
-from studies.domain.figures import decades, maps
-from studies.domain.judge import ENGINES, FAILED, LAWS, SLOW, SUBJECTS, VERIFIED, Budget
-from studies.domain.sweep import Judged, Settings
+from tests.domain import checks, judge, sweep
+from tests.domain.judge import ENGINES, FAILED, HANDED, LAWS, REFUSED, SLOW, SUBJECTS, UNJUDGED, VERIFIED, Budget
+from tests.domain.sweep import Judged, Lines, Settings
 
 SEED = 20_261_124
 FULL = Settings(3000, SEED, Budget(4e5, 4e6, 800), 100_000)
@@ -29,12 +30,27 @@ _UNITS = {  # of the effects of comparisons
     "covariance": "correlation",
 }
 _LISTED = 40  # failures that the report names; all are in domain_failures.csv
+_INK = {
+    VERIFIED: "#3b78b5",
+    HANDED: "#8fc1e3",
+    REFUSED: "#c9c9c9",
+    SLOW: "#f0a03c",
+    UNJUDGED: "#7a7a7a",
+    FAILED: "#c4161c",
+}
+_DOTS = 6  # in a decade, at most: those of one state that would lie on each other are drawn once
+_LEAST = {"S": 1e-7, "B": 1e-7, "dead": 1e-4}  # where zeros are drawn
+_TITLE = {
+    "S": "S (0 at the edge)",
+    "B": "B (0 at the edge)",
+    "dead": "dead time / period",
+    "cycles": "cycles",
+    "bins": "bins",
+}
 
 
-def run(request: Request) -> Facts:
+def run(settings: Settings, request: Request) -> Facts:
     """The sweep and its maps."""
-    settings = QUICK if request.quick else FULL
-    settings = replace(settings, seed=request.seed or settings.seed, systems=request.systems or settings.systems)
     lines = Lines(request.out / "domain.jsonl", {"seed": settings.seed, "budget": asdict(settings.budget)})
     began = time.monotonic()
     judged: list[Judged] = []
@@ -45,7 +61,6 @@ def run(request: Request) -> Facts:
     cases = [case_row(item) for item in judged]
     failures = failure_rows(judged)
     return {
-        "s": settings,
         "judged": judged,
         "checks": checks,
         "judge": judge,
@@ -61,7 +76,12 @@ def run(request: Request) -> Facts:
         "power": _power(judged),
         "seconds": sum(item.seconds for item in judged),
         "rows": cases,
-        "figures": maps(cases),
+        "figures": {
+            "engines": _map(cases, ENGINES, "S", "dead"),
+            "engines_exposure": _map(cases, ENGINES, "B", "cycles"),
+            "laws": _map(cases, LAWS[:5], "S", "dead"),
+            "laws_exposure": _map(cases, LAWS[:5], "cycles", "bins"),
+        },
     }
 
 
@@ -93,7 +113,7 @@ def _range(judged: Sequence[Judged], subject: str) -> dict[str, Any]:
     """Extent of what was verified."""
     facts = [item.case.facts() for item, state in _states(judged, subject) if state == VERIFIED]
     keys = {"S": "S", "B": "B", "dead": "t_d / t_r", "cycles": "cycles", "bins": "bins"}
-    return {"": f"`{subject}`"} | {title: decades([float(f[key]) for f in facts]) for key, title in keys.items()}
+    return {"": f"`{subject}`"} | {title: _decades([float(f[key]) for f in facts]) for key, title in keys.items()}
 
 
 def _slow(judged: Sequence[Judged], subject: str) -> dict[str, Any]:
@@ -154,3 +174,37 @@ def _power(judged: Sequence[Judged]) -> list[dict[str, Any]]:
         }
         for kind, values in sorted(detects.items())
     ]
+
+
+def _map(rows: Sequence[dict[str, Any]], subjects: Sequence[str], x: str, y: str) -> Figure:
+    """A scatter plot for each subject, over two quantities."""
+    figure, axes = panels(2.3, 1, len(subjects))
+    for ax, subject in zip(axes[0], subjects, strict=True):
+        for state, ink in _INK.items():
+            some = [row for row in rows if row.get(subject) == state]
+            at = np.array([[max(float(row[key]), _LEAST.get(key, 1.0)) for key in (x, y)] for row in some])
+            if state == FAILED:
+                ax.scatter(*at.reshape(-1, 2).T, s=14, marker="x", c=ink, lw=0.9, zorder=3)
+            else:
+                dots = np.unique(np.round(np.log10(at.reshape(-1, 2)) * _DOTS, 0), axis=0)
+                ax.scatter(*10.0 ** (dots.T / _DOTS), s=2.5, marker="o", c=ink, lw=0, zorder=1 + (state == SLOW))
+        ax.set(xscale="log", yscale="log")
+        ax.set_xlabel(_TITLE[x], fontsize=7)
+        ax.set_title(subject, fontsize=8)
+        ax.tick_params(labelsize=6, which="both")
+    axes[0, 0].set_ylabel(_TITLE[y], fontsize=7)
+    handles = [
+        Line2D([], [], marker="x" if state == FAILED else "o", ls="", ms=4, color=ink, label=state)
+        for state, ink in _INK.items()
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize=6, frameon=False)
+    return figure
+
+
+def _decades(values: Sequence[float]) -> str:
+    """The range of positive values, in words; and whether 0 is among them."""
+    positive = np.array([v for v in values if v > 0.0])
+    if not positive.size:
+        return "0"
+    zero = "0, " if len(positive) < len(values) else ""
+    return f"{zero}{positive.min():.2g} to {positive.max():.3g}"

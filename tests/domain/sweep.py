@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
+import json
 import multiprocessing
 import os
 import signal
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from multiprocessing.connection import Connection
+from pathlib import Path
 from queue import SimpleQueue
+from threading import Lock
 from types import TracebackType
 from typing import Any
 
-from studies import Tell
-from studies.common.kept import Lines
-from studies.domain.checks import FIRST_LEVEL, Check
-from studies.domain.judge import (
+from mars_lidar._base.files import beside
+from studies import OtherRunsError, Tell
+from tests.domain.checks import FIRST_LEVEL, Check
+from tests.domain.judge import (
     FAILED,
     SLOW,
     UNJUDGED,
@@ -29,7 +32,31 @@ from studies.domain.judge import (
     judge,
     second_level,
 )
-from studies.domain.systems import Case, draw
+from tests.domain.systems import Case, draw
+
+
+class Lines:
+    """JSON records by number, one a line of a file that is only appended to: a study that was stopped goes on with it.
+
+    The first line is the configuration; a file of another one is refused. A last line that was cut short is dropped.
+    """
+
+    def __init__(self, path: Path, config: Mapping[str, Any]) -> None:
+        self.path, self.records, self._lock = path, dict[int, Any](), Lock()
+        head = json.dumps(config)
+        lines = path.read_text(encoding="utf-8").split("\n")[:-1] if path.exists() else []
+        if lines and lines[0] != head:
+            raise OtherRunsError(f"{path} holds runs of another configuration; give another --out, or delete it")
+        self.records.update(json.loads(line) for line in lines[1:])
+        with beside(path) as unfinished:
+            unfinished.write_text("\n".join(lines or [head]) + "\n", encoding="utf-8")
+
+    def add(self, number: int, record: Any) -> None:
+        """Keep a record; from any thread."""
+        self.records[number] = record
+        with self._lock, self.path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps([number, record]) + "\n")
+
 
 PATIENCE = 2.1  # seconds of processor time of one step before it is stopped
 _WALL = 8.0  # the same on the clock, for what sleeps or machines that are busy, in units of the patience
@@ -94,7 +121,7 @@ class Watched:
         context: Any = multiprocessing.get_context("spawn")
         if "forkserver" in multiprocessing.get_all_start_methods():  # a new process begins with everything imported
             context = multiprocessing.get_context("forkserver")
-            context.set_forkserver_preload(["studies.domain.judge"])
+            context.set_forkserver_preload(["tests.domain.judge"])
         self.pipe, theirs = context.Pipe()
         self.process = context.Process(target=_work, args=(theirs,), daemon=True)
         self.process.start()

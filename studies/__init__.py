@@ -14,62 +14,68 @@ from __future__ import annotations
 
 import importlib
 import re
-from argparse import ArgumentTypeError
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
+
+from cyclopts import Parameter
+from cyclopts.types import ExistingDirectory, ExistingFile
+
+from mars_lidar.cli.options import Integer, OutPath, options
 
 Facts = dict[str, Any]
 Tell = Callable[[str], object]
 
 
-def _existing(kind: str, words: str, inside: str = "") -> dict[str, Any]:
-    """Option of the command line whose value is a file, or a folder with files `inside`."""
-
-    def read(text: str) -> Path:
-        path = Path(text)
-        if not (path.is_file() if kind == "file" else path.is_dir()) or (inside and not any(path.glob(inside))):
-            raise ArgumentTypeError(f"must be a {kind}{f' with {inside}' * bool(inside)}, got {text!r}")
-        return path
-
-    return {"help": words, "type": read, "metavar": "FILE" if kind == "file" else "DIR"}
-
-
-_DATA = "folder of the reference cases, *.json (studies 'law', 'joint-covariance')"
-_STREAM = "measured photon stream: a .mat with times in units of 64 ps (study 'hardware')"
-_TRUTH = (
-    "reference engine (study 'count-law'): 'sequential' shares no code with the laws, 'exact' is several times faster "
-    "(default: %(default)s)"
-)
-_CONFIG = (
-    "size of the study 'downstream': some five minutes of one core, or some twenty (default: %(default)s); with "
-    "--quick a tiny one, seconds"
-)
-_SEED = "seed of the scenes for coverage (study 'image')"
-_RGBD = "folder of RGB-D pairs, NAME_depth.png and NAME_colors.png or Middlebury folders (study 'image')"
-_CAPTURES = "folder of measured cubes, .zarr, .h5 or .npz, as `mars_lidar.io.save` writes them (study 'image')"
-_DRUNET = (
-    "weights of a DRUNet of one channel, such as deepinv's drunet_deepinv_gray_finetune_26k.pth (study 'image'; "
-    "without, a small one is trained first)"
-)
-
-
-@dataclass(frozen=True)
+@options
 class Request:
-    """What is asked of a study: output folder, quick or full, who hears of progress, and options of single studies."""
+    """What is asked of a study; `tell` hears of progress.
 
-    out: Path
+    Options
+    -------
+    out : DIR
+        Folder to write into, made if missing. [default: study-results]
+    quick
+        Small grids, few realizations: a preview in seconds, not for citation.
+    data : DIR
+        Folder of the reference cases, *.json (studies law, joint-covariance).
+    stream : FILE
+        Measured photon stream: a .mat with times in units of 64 ps (study hardware).
+    truth : {sequential, exact}
+        Reference engine (study count-law): sequential shares no code with the laws, exact is several times faster.
+        [default: sequential]
+    config : {small, full, held-out}
+        Size of the study downstream: some five minutes of one core, or some twenty; with --quick a tiny one, seconds.
+        [default: small]
+    seed
+        Seed of the scenes for coverage (study image).
+    rgbd : DIR
+        Folder of RGB-D pairs, NAME_depth.png and NAME_colors.png or Middlebury folders (study image).
+    captures : DIR
+        Folder of measured cubes, .zarr, .h5 or .npz, as `mars_lidar.io.save` writes them (study image).
+    drunet : FILE
+        Weights of a DRUNet of one channel, such as deepinv's drunet_deepinv_gray_finetune_26k.pth (study image;
+        without, a small one is trained first).
+    """
+
+    out: OutPath = Path("study-results")
     quick: bool = False
-    tell: Tell = str
-    data: Path | None = field(default=None, metadata=_existing("folder", _DATA, "*.json"))
-    stream: Path | None = field(default=None, metadata=_existing("file", _STREAM))
-    truth: str = field(default="sequential", metadata={"help": _TRUTH, "choices": ("sequential", "exact")})
-    config: str = field(default="small", metadata={"help": _CONFIG, "choices": ("small", "full", "held-out")})
-    seed: int | None = field(default=None, metadata={"help": _SEED, "type": int, "metavar": "N"})
-    rgbd: Path | None = field(default=None, metadata=_existing("folder", _RGBD))
-    captures: Path | None = field(default=None, metadata=_existing("folder", _CAPTURES))
-    drunet: Path | None = field(default=None, metadata=_existing("file", _DRUNET))
+    data: ExistingDirectory | None = None
+    stream: ExistingFile | None = None
+    truth: Literal["sequential", "exact"] = "sequential"
+    config: Literal["small", "full", "held-out"] = "small"
+    seed: Integer | None = None
+    rgbd: ExistingDirectory | None = None
+    captures: ExistingDirectory | None = None
+    drunet: ExistingFile | None = None
+    tell: Annotated[Tell, Parameter(parse=False)] = str
+
+    def cases(self) -> list[Path]:
+        """Files of the reference cases, none without `data`."""
+        paths = sorted(self.data.glob("*.json")) if self.data else []
+        if self.data and not paths:
+            raise ValueError(f"data must be a folder with *.json cases, got {str(self.data)!r}")
+        return paths
 
 
 class OtherRunsError(ValueError):

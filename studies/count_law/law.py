@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from mars_lidar import CountLaw, Flux, System, count_law
 from mars_lidar._base.types import FloatArray
 from mars_lidar.plot.style import COLOURS
+from mars_lidar.statistics import ConvergenceError
 from mars_lidar.statistics.count_pmf import Pmf, gaussian_pmf, total_variation
 from mars_lidar.statistics.matched import matched_pmf, trusted
 from studies import Facts, Request
@@ -104,8 +105,10 @@ class Part:
 def laws_of(flux: Flux, system: System) -> dict[str, CountLaw]:
     """Every law in closed form, of cells (cells,)."""
     law = partial(count_law, flux, system)
+    exact = law("exact")
+    assert exact.pmf is not None  # the longest of them, which may be refused
     marked = {"mars": law("mars"), "mars_edge": law("mars", rearm="edge")}
-    return {"exact": law("exact")} | marked | {name: law(name) for name in ("renewal", "poisson")}
+    return {"exact": exact} | marked | {name: law(name) for name in ("renewal", "poisson")}
 
 
 def pmfs_of(laws: dict[str, CountLaw]) -> Iterator[dict[str, Pmf]]:
@@ -118,11 +121,23 @@ def pmfs_of(laws: dict[str, CountLaw]) -> Iterator[dict[str, Pmf]]:
 
 
 def measure(kind: str, system: System, signal: FloatArray, background: FloatArray) -> Part:
-    """Distances of every law to the exact law of each cell."""
-    laws = laws_of(Flux(signal, background, 0.5 * system.period_ns), system)
-    far = [[total_variation(pmfs[name], pmfs["exact"]) for name in LAWS] for pmfs in pmfs_of(laws)]
-    cumulants = laws["exact"].cumulants
-    by_law = dict(zip(LAWS, np.array(far).T, strict=True))
+    """Distances of every law to the exact law of each cell; NaN where that takes too long."""
+    flux = Flux(signal, background, 0.5 * system.period_ns)
+    far = np.full((len(LAWS), signal.size), np.nan)
+
+    def fill(first: int, end: int) -> None:
+        try:
+            for k, pmfs in enumerate(pmfs_of(laws_of(flux[first:end], system)), first):
+                far[:, k] = [total_variation(pmfs[name], pmfs["exact"]) for name in LAWS]
+        except ConvergenceError:
+            if end - first > 1:
+                middle = (first + end) // 2
+                fill(first, middle)
+                fill(middle, end)
+
+    fill(0, signal.size)
+    cumulants = count_law(flux, system).cumulants
+    by_law = dict(zip(LAWS, far, strict=True))
     return Part(kind, system, signal, background, cumulants, by_law, trusted(cumulants))
 
 
@@ -152,21 +167,24 @@ def drawn(settings: Settings, tell: Callable[[str], object]) -> list[Part]:
 
 
 class Cells:
-    """Cells of several parts together."""
+    """Cells of several parts together whose exact law is known; `refused`: the number of the others."""
 
     def __init__(self, parts: Sequence[Part]) -> None:
-        self.distance = {law: np.concatenate([part.distance[law] for part in parts]) for law in LAWS}
-        self.cumulants = np.concatenate([part.cumulants for part in parts])
-        self.trusted = np.concatenate([part.trusted for part in parts])
-        self.names = [part.name(k) for part in parts for k in range(part.signal.size)]
+        known = [np.isfinite(part.distance["matched"]) for part in parts]
+        self.refused = sum(int((~some).sum()) for some in known)
+        pairs = list(zip(parts, known, strict=True))
+        self.distance = {law: np.concatenate([part.distance[law][some] for part, some in pairs]) for law in LAWS}
+        self.cumulants = np.concatenate([part.cumulants[some] for part, some in pairs])
+        self.trusted = np.concatenate([part.trusted[some] for part, some in pairs])
+        self.cells = [(part, int(k)) for part, some in pairs for k in np.flatnonzero(some)]
 
     def where(self, law: str, here: NDArray[np.bool_] | slice = slice(None)) -> dict[str, Any]:
         """Of some cells and one law: the number, the median and largest distance, and where that is."""
         far = self.distance[law][here]
         if not far.size:
             return {"cells": 0, "median": np.nan, "largest": np.nan, "cell": "", "beyond": 0}
-        worst = np.arange(len(self.names))[here][far.argmax()]
-        size = {"median": float(np.median(far)), "largest": float(far.max()), "cell": self.names[worst]}
+        part, k = self.cells[np.arange(len(self.cells))[here][far.argmax()]]
+        size = {"median": float(np.median(far)), "largest": float(far.max()), "cell": part.name(k)}
         return size | {"cells": far.size, "beyond": int((far > VISIBLE).sum())}
 
     def share(self) -> dict[str, float]:
@@ -207,12 +225,12 @@ def run(settings: Settings, request: Request) -> Facts:
     variance, third = everything.cumulants[:, 1], on_grid.cumulants
     plain = (third[:, 0] >= FEW) & (third[:, 1] >= STILL)
     skewness = np.abs(third[plain, 2]) / third[plain, 1] ** 1.5
-    by_cell = [(part, k) for part in (*parts, *others) for k in range(part.signal.size)]
-    listed = [(p, k) for p, k in by_cell if p.distance["matched"][k] > LISTED * AIM or not p.trusted[k]]
-    cases = {path.stem: _read(path) for path in sorted(request.data.glob("*.json"))} if request.data else {}
+    listed = [(p, k) for p, k in everything.cells if p.distance["matched"][k] > LISTED * AIM or not p.trusted[k]]
+    cases = {path.stem: _read(path) for path in request.cases()}
     references = [row for k, (name, case) in enumerate(cases.items()) for row in compare(name, case, settings.draws, k)]
     return {
         "kinds": {name: Cells(cells).share() for name, cells in kinds.items()},
+        "everything": everything,
         "grid": on_grid,
         "ratio": on_grid.distance["gaussian"][plain] / (_PER_SKEWNESS * skewness),
         "by_dead": {dead: Cells([p for p in armed if p.system.dead_time_periods == dead]) for dead in settings.dead},
@@ -221,7 +239,7 @@ def run(settings: Settings, request: Request) -> Facts:
             for low, high in pairwise(_EDGES)
             if (here := (variance >= low) & (variance < high)).any()
         ],
-        "worst": sorted(by_cell, key=lambda cell: -float(cell[0].distance["matched"][cell[1]]))[:_WORST],
+        "worst": sorted(everything.cells, key=lambda cell: -float(cell[0].distance["matched"][cell[1]]))[:_WORST],
         "references": references,
         "cases": cases,
         "rows": [_csv_row(part, k) for part, k in listed],

@@ -184,7 +184,7 @@ def variance_scores(x: FloatArray, variance: FloatArray) -> FloatArray:
 def run(settings: Settings, request: Request) -> Facts:
     """Random systems and the reference cases, compared with the closed form."""
     systems = random_systems(settings, request.tell)
-    cases = [reference_case(path) for path in sorted(request.data.glob("*.json"))] if request.data else []
+    cases = [reference_case(path) for path in request.cases()]
     scores = _scores(systems, settings)
     every = [z for o in systems for z in o.scores.values()]
     by_z = sorted(systems, key=lambda o: -o.worst()[0])

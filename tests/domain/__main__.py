@@ -28,7 +28,7 @@ def main(arguments: list[str] | None = None) -> int:
     changes = {name: value for name in ("seed", "systems") if (value := getattr(given, name)) is not None}
     settings = replace(sweep.QUICK if given.quick else sweep.FULL, **changes)
     given.out.mkdir(parents=True, exist_ok=True)
-    request = Request(given.out, given.quick, tell=partial(print, file=sys.stderr, flush=True))
+    request = Request(out=given.out, quick=given.quick, tell=partial(print, file=sys.stderr, flush=True))
     print(*make(request, given.sweep, sweep, settings), sep="\n")
     return 0
 

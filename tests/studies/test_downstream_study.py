@@ -42,7 +42,7 @@ def test_the_study_goes_on_where_it_was_stopped(tmp_path: Path, monkeypatch: pyt
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        downstream.run(Request(tmp_path, quick=True, tell=stop))
+        downstream.run(Request(out=tmp_path, quick=True, tell=stop))
     result = tmp_path / "downstream-tiny" / "pixel-exact-dead0.5625-sbr1-0.json"
     made = result.stat().st_mtime_ns
     study = quick_study("downstream", tmp_path)

@@ -53,15 +53,6 @@ def test_a_capture_is_thinned_to_so_many_photons(tmp_path):
     assert (counts <= capture.counts).all()
 
 
-def test_a_folder_that_is_none_is_refused(capsys):
-    with pytest.raises(SystemExit):
-        main(["image", "--captures", "/nowhere"])
-    assert "argument --captures: must be a folder" in capsys.readouterr().err
-    with pytest.raises(SystemExit):
-        main(["image", "--drunet", "/nowhere"])
-    assert "argument --drunet: must be a file" in capsys.readouterr().err
-
-
 def test_total_variation_denoises():
     """Least squares plus variation of one edge: both levels move by the weight over their width (Strong and Chan)."""
     image = np.zeros((8, 8))
@@ -118,11 +109,11 @@ def test_without_deepinv_the_study_says_so(monkeypatch, tmp_path):
 
     monkeypatch.setitem(sys.modules, "deepinv", None)
     monkeypatch.setitem(sys.modules, "deepinv.models", None)
-    methods, words = run._methods(Request(tmp_path), run.QUICK)
+    methods, words = run._methods(Request(out=tmp_path), run.QUICK)
     assert methods == run.METHODS
     assert words.startswith("skipped: DRUNet needs deepinv")
     with pytest.raises(ImportError):
-        run._methods(Request(tmp_path, drunet=tmp_path / "weights.pth"), run.QUICK)
+        run._methods(Request(out=tmp_path, drunet=tmp_path / "weights.pth"), run.QUICK)
 
 
 def test_coverage_over_further_scenes():

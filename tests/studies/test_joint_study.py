@@ -112,6 +112,6 @@ def test_files(tmp_path):
 
 def test_without_scikit_learn(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "sklearn", None)
-    assert main(["joint", "--quick", "--out", str(tmp_path)]) == 1
+    assert main(["joint", "--quick", "--out", str(tmp_path)]) == 2
     assert "mars-lidar[studies]" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())

@@ -72,13 +72,13 @@ def test_a_template_is_filled_strictly(tmp_path: Path):
     template.write_text(
         "# A\n\n{{ for_looking }}\n\n{% for v in values %}\n- {{ v|f('.2f') }}\n{% endfor %}\n\n{{ rest }}\n"
     )
-    request = Request(tmp_path, quick=True)
+    request = Request(out=tmp_path, quick=True)
     with pytest.raises(jinja2.UndefinedError, match="rest"):
         report.render(request, template, {"values": [1.0]})
     facts = {"values": [1.0, 2.345], "rest": "end"}
     text = report.render(request, template, facts)
     assert text == "# A\n\n_Quick run: a preview, not for citation._\n\n- 1.00\n- 2.35\n\nend\n"
-    assert "Quick" not in report.render(Request(tmp_path), template, facts)
+    assert "Quick" not in report.render(Request(out=tmp_path), template, facts)
 
 
 @pytest.mark.parametrize(("stem", "template"), [("short", "short"), ("run", "report")])
@@ -89,7 +89,7 @@ def test_a_report_has_the_template_and_the_constants_of_its_module(tmp_path: Pat
     module.run = lambda settings, request: facts | {"figures": {"": Figure(), "map": Figure()}}  # type: ignore[attr-defined]
     words = "{{ word }} {{ study.LIMIT }} {{ s }}{{ flag }} {{ figures[1].name }}"
     (tmp_path / f"{template}.md.jinja").write_text(words)
-    request = Request(tmp_path, quick=True)
+    request = Request(out=tmp_path, quick=True)
     written = report.make(request, "x-y", module)
     assert [path.name for path in written] == ["x_y.md", "x_y.png", "x_y_map.png", "x_y.csv", "x_y_wrong.csv"]
     assert written[0].read_text() == "at 3 2 --quick x_y_map.png\n"
@@ -117,5 +117,5 @@ def test_filters_and_tables():
 
 def test_without_jinja_it_says_what_to_install(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "jinja2", None)
-    assert main(["law", "--quick", "--out", str(tmp_path)]) == 1
+    assert main(["law", "--quick", "--out", str(tmp_path)]) == 2
     assert "pip install 'mars-lidar[studies]'" in capsys.readouterr().err

@@ -11,37 +11,29 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from mars_lidar import Flux, System, count_law, registration_pdf
+from mars_lidar import Flux, System, count_law
 from mars_lidar._base.types import FloatArray
 from mars_lidar.plot.style import COLOURS, INK, MUTED
 from mars_lidar.statistics.count_pmf import Pmf, kl_divergence
 from mars_lidar.statistics.tolerances import TOL
 from studies import Facts, Request, Tell
 from studies.common.distance import wasserstein
-from studies.common.draw import legend_below, panels
+from studies.common.draw import panels
 from studies.common.report import Row, picked
 from studies.common.sample import (
     NEAR_NS,
-    PERIOD_NS,
     WIDE_NS,
     Grid,
     Sample,
     draw,
-    linear_points,
-    log_points,
     paper_grids,
     system_of,
 )
 from studies.neural.pairs import Training
-from studies.neural.simulators import Prediction, arrival_shape, centred, simulators
+from studies.neural.simulators import Prediction, simulators
 
 FIGURES = ("wasserstein", "kl", "mean", "variance")  # distances of a law to the truth, in this order
 _NEGLIGIBLE = 1e-10  # probability of a count left out of a resampling, per exposure drawn
-SHAPES = {
-    "poisson": "Poisson",
-    "renewal": "renewal and MaRS, paper's, centre",
-    "mars_edge": "MaRS, paper's, edge",
-}
 
 
 @dataclass(frozen=True)
@@ -52,8 +44,6 @@ class Settings:
     realizations: int
     resamplings: int
     sampled: int
-    dead_sweep: tuple[float, ...]  # dead times in periods at which shapes are compared
-    sweep_flux: tuple[float, ...]
     cycles: int = 1000
     bins: int = 1024
     sigma_ns: float = 0.5
@@ -71,16 +61,12 @@ FULL = Settings(
     realizations=100_000,
     resamplings=200,
     sampled=4_000,
-    dead_sweep=linear_points(40, 0.05, 2.0),
-    sweep_flux=log_points(8),
 )
 QUICK = Settings(
     grids=paper_grids(2, (25.0, 75.0), (50.0,)),
     realizations=400,
     resamplings=50,
     sampled=40,
-    dead_sweep=(0.1875, 0.6375, 1.3),
-    sweep_flux=(0.1, 5.0),
     cycles=100,
     bins=256,
     steps=60,
@@ -244,25 +230,6 @@ def _figures(sample: FloatArray, law: FloatArray, first: int, mean: float, varia
     )
 
 
-def shape_sweep(settings: Settings, tell: Tell) -> dict[str, FloatArray]:
-    """Total variation (dead times, cells) of each of `SHAPES` to the exposure's exact mean histogram."""
-    signal, background = (g.ravel() for g in np.meshgrid(settings.sweep_flux, settings.sweep_flux, indexing="ij"))
-    results: dict[str, list[FloatArray]] = {name: [] for name in SHAPES}
-    for dead in settings.dead_sweep:
-        system = settings.system(PERIOD_NS, dead * PERIOD_NS)
-        flux = centred(signal, background, system)
-        truth = registration_pdf(flux, system, "exposure")
-        shapes = {
-            "poisson": arrival_shape(flux, system),
-            "renewal": registration_pdf(flux, system, "chain"),
-            "mars_edge": registration_pdf(flux, system, "chain", rearm="edge"),
-        }
-        for name, shape in shapes.items():
-            results[name].append(0.5 * np.abs(shape - truth).sum(-1))
-    tell(f"count-law: shapes at {len(settings.dead_sweep)} dead times, {signal.size} cells each")
-    return {name: np.array(rows) for name, rows in results.items()}
-
-
 PANELS = ((0.07, 0.07, 25.0), (0.5, 0.5, 50.0), (4.0, 0.5, 75.0), (10.0, 10.0, 100.0))  # nearest cells are drawn
 _LINES = {
     "mars_exact": (INK, "-", 2.0),
@@ -355,50 +322,6 @@ def _inset(ax: Axes, cell: Cell) -> None:
     inset.set_title("KL, nats (dots: floor)", fontsize=6.0)
 
 
-def shapes(settings: Settings, cells: Sequence[Cell], sweep: dict[str, FloatArray]) -> Figure:
-    """Total variation of the shape over the dead time: lines to the exact law, dots to the simulation."""
-    figure, axes = panels(2.9, 1, 2, sharey=True)
-    dead = np.array(settings.dead_sweep)
-    grid = [cell for cell in cells if cell.grid == "wide"]
-    ticks = sorted({cell.dead_ns for cell in grid})
-    for ax, quantile, words in zip(axes[0], (0.5, 0.95), ("median of the cells", "95 % of the cells"), strict=True):
-        for name in SHAPES:
-            colour, dash, _ = _colour(name)
-            ax.plot(dead, np.quantile(sweep[name], quantile, axis=1), dash, color=colour, lw=1.0, label=SHAPES[name])
-        sampled = [name for name in grid[0].scores if name not in _LINES]
-        labels = {"mars_exact": "MaRS, ours, to simulation", "neural": "neural, to simulation"}
-        labels |= {name: f"{', '.join(sampled)}: samples" for name in sampled[:1]}
-        for name in grid[0].scores:
-            at = [[c.scores[name].shape for c in grid if c.dead_ns == d] for d in ticks]
-            here = [float(np.quantile(values, quantile)) for values in at]
-            marker = "s" if name == "mars_exact" else "o"
-            size = 4.5 if name == "mars_exact" else 2.8
-            ax.plot(
-                np.array(ticks) / PERIOD_NS,
-                here,
-                marker,
-                ms=size,
-                color=_colour(name)[0],
-                label=labels.get(name),
-                mfc="none" if name == "mars_exact" else None,
-                mew=0.8,
-            )
-        noise = [[c.scores["mars_exact"].shape_floor for c in grid if c.dead_ns == d] for d in ticks]
-        ax.plot(
-            np.array(ticks) / PERIOD_NS,
-            [float(np.quantile(v, quantile)) for v in noise],
-            "_",
-            ms=9,
-            color=MUTED,
-            label="sampling floor",
-        )
-        ax.set(yscale="log", xlabel="$t_d / t_r$", ylim=(1e-6, 1.0))
-        ax.set_title(words, loc="left")
-    axes[0, 0].set_ylabel("total variation of the shape")
-    legend_below(figure, axes[0, :1], 3)
-    return figure
-
-
 PAPER = {  # T1 of arXiv 2512.04924: Wasserstein, KL, mean difference, variance difference
     "poisson": (7966.130, 24.208, 7966.130, 9257.464),
     "renewal": (207.565, 18.821, 207.564, 45.927),
@@ -460,9 +383,8 @@ def _row(name: str, words: str, cells: Sequence[Cell]) -> dict[str, Any]:
 
 
 def run(settings: Settings, request: Request) -> Facts:
-    """All cells, the sweep of shapes, and the figures."""
+    """All cells and their figure."""
     cells = compute(settings, request.truth, request.tell)
-    sweep = shape_sweep(settings, request.tell)
     first = cells[0].scores
     words = {simulator.name: simulator.words for simulator in simulators(1, 0) if simulator.name in first}
     by_grid = {grid.name: [cell for cell in cells if cell.grid == grid.name] for grid in settings.grids}
@@ -475,10 +397,7 @@ def run(settings: Settings, request: Request) -> Facts:
         },
         "keys": FIGURES,
         "rows": [_csv_row(cell) for cell in cells],
-        "figures": {
-            "panels": law_panels(cells),
-            "shape": shapes(settings, cells, sweep),
-        },
+        "figures": {"panels": law_panels(cells)},
     }
 
 

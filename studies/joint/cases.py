@@ -1,4 +1,4 @@
-"""Pixels of the studies of the joint law, noted before and at random; what is sampled of them, their closed form."""
+"""Pixels of the studies of the joint law, declared and at random; what is sampled of them, their closed form."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Case:
         return np.asarray(np.abs(centre - np.rint(centre)) <= max(_REACH * self.sigma, 1.0 / bins))
 
 
-# the reference cases, simulated elsewhere too, and seven for which a ratio was known beforehand
+# the reference cases, simulated elsewhere too, and seven more
 REFERENCE = (
     Case("s01 mid", 1.0, 1.0, 0.6375),
     Case("s02 bright", 5.0, 1.0, 0.6375),
@@ -89,8 +89,6 @@ SEVEN = tuple(
         (2.0, 5.0, 0.1),
     )
 )
-# exact / (count x multinomial) in the signal window of SEVEN, as noted when the project began
-SEVEN_RATIOS = (1.10, 1.17, 1.02, 0.74, 1.14, 0.70, 0.42)
 
 
 def random_cases(

@@ -12,7 +12,7 @@ from mars_lidar.engines import ANY_SYSTEM
 from studies import Facts, Request, Tell
 from studies.common.report import crossed, marked
 from studies.common.sample import PERIOD_NS
-from studies.joint.cases import COARSE, OFTEN, RATIOS, REFERENCE, SEVEN, SEVEN_RATIOS, TOLERANCE, Case, Law, Sample
+from studies.joint.cases import COARSE, OFTEN, RATIOS, REFERENCE, SEVEN, TOLERANCE, Case, Law, Sample
 
 __all__ = ["COARSE", "OFTEN", "SCORES", "TOLERANCE", "Scores", "beyond", "compute", "run"]  # the first for the report
 
@@ -63,11 +63,6 @@ def run(settings: Settings, request: Request) -> Facts:
         "engines": list(ANY_SYSTEM),
         "period_ns": PERIOD_NS,
         "findings": [_finding(engine, result) for engine in ANY_SYSTEM],
-        "known": [
-            (case.name, *result[case.name, "mars"]["window"], noted)
-            for case, noted in zip(SEVEN, SEVEN_RATIOS, strict=True)
-            if case in settings.cases
-        ],
         "compared": {
             key: crossed((*who, marked(item[key], beyond(item[key], key))) for who, item in result.items())
             for key in RATIOS

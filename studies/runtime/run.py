@@ -128,7 +128,6 @@ class Settings:
     side: int  # of the cube of the stages
     bins: int
     axes: tuple[Axis, ...]
-    teaser: tuple[int, int]  # cycles, realizations of the single pixel
     repeats: int
     limit_s: float  # a point predicted to take longer is left out
     enough_s: float  # repeats end once a contender has had so much
@@ -156,7 +155,6 @@ FULL = Settings(
     side=128,
     bins=1024,
     axes=_axes(256, 262_144, 1e5, 2),
-    teaser=(1000, 10_000),
     repeats=5,
     limit_s=8.0,
     enough_s=0.5,
@@ -167,7 +165,6 @@ QUICK = Settings(
     side=8,
     bins=128,
     axes=_axes(4, 16, 1e2, 1),
-    teaser=(100, 50),
     repeats=1,
     limit_s=0.5,
     enough_s=0.05,
@@ -241,19 +238,6 @@ def along(settings: Settings, axis: Axis, tell: Tell) -> list[Point]:
     return points
 
 
-def teaser(settings: Settings, tell: Tell) -> list[Point]:
-    """Many exposures of one pixel, S = B = 1."""
-    cycles, realizations = settings.teaser
-    flux, instrument = Flux([[1.0]], 1.0, 0.5 * PERIOD_NS), system(settings, cycles)
-    runs = {
-        contender.name: contender.prepare(flux, instrument, realizations)
-        for contender in contenders(Tables(settings.axis_table))
-    }
-    timed = _least(runs, _memory(flux, instrument, realizations), settings)
-    tell("runtime: teaser")
-    return [Point("teaser", float(realizations), name, seconds) for name, (seconds, _) in timed.items()]
-
-
 def _at(settings: Settings, axis: Axis, value: float) -> tuple[Flux, System, int]:
     """Flux, system and realizations of one value of an axis."""
     number = round(value)
@@ -307,7 +291,6 @@ def _least(runs: dict[str, Run], out: NDArray[Any], settings: Settings) -> dict[
     return best
 
 
-PAPER_TEASER = {"poisson": 0.2, TABLED: 0.3, "sequential": 16.1}  # seconds, of another workload
 _COLOURS = {
     "exact": INK,
     "sequential": COLOURS[1],
@@ -352,28 +335,6 @@ def along_axes(settings: Settings, points: Sequence[Point]) -> Figure:
     return figure
 
 
-def single_pixel(settings: Settings, single: Sequence[Point]) -> Figure:
-    """Bars of the single pixel, here and in the paper."""
-    figure, axes = panels(2.4, 1, 2, gridspec_kw={"width_ratios": (2, 1)})
-    cycles, realizations = settings.teaser
-    names = [p.contender for p in single]
-    here = {p.contender: float(p.seconds or 0.0) for p in single}
-    bars = {f"here: {cycles} cycles x {realizations} realizations": here, "paper: another workload": PAPER_TEASER}
-    for ax, (words, seconds) in zip(axes[0], bars.items(), strict=True):
-        order = [name for _, name in sorted((s, name) for name, s in seconds.items())]
-        at = np.arange(len(order))
-        ax.barh(at, [seconds[name] for name in order], color=[_colour(name, names) for name in order], height=0.7)
-        for y, name in zip(at, order, strict=True):
-            ax.text(seconds[name] * 1.1, y, f"{seconds[name]:.3g} s", va="center", fontsize=6.5)
-        ax.set_yticks(at, ["mars" if name == TABLED and seconds is PAPER_TEASER else name for name in order])
-        ax.set(xscale="log", xlabel="seconds")
-        low, high = ax.get_xlim()
-        ax.set_xlim(low, high * 4.0)
-        ax.set_title(words, loc="left")
-        ax.invert_yaxis()
-    return figure
-
-
 # T2 and T3 of arXiv 2512.04924; NumPy on a Ryzen 7 9700X
 PAPER_STAGES = {"lookup": 0.020, "alignment": 0.144, "sampling": 0.849}
 PAPER_TOTAL, PAPER_SEQUENTIAL = 1.013, 40.831
@@ -411,10 +372,9 @@ def crossover(points: Sequence[Point], axis: str, fast: str, other: str) -> tupl
 
 
 def run(settings: Settings, request: Request) -> Facts:
-    """Stages of a cube, four axes, and a single pixel, timed."""
+    """Stages of a cube and four axes, timed."""
     before = load()
     cubes, held = cube_stages(settings, request.tell)
-    single = teaser(settings, request.tell)
     points = [point for axis in settings.axes for point in along(settings, axis, request.tell)]
     others = [
         other for other in dict.fromkeys(p.contender for p in points) if other not in ("exact", "sequential", "poisson")
@@ -429,11 +389,10 @@ def run(settings: Settings, request: Request) -> Facts:
         "rules": [(words, *crossover(points, axis, "exact", other)) for other in others for axis, words in axes],
         "pixels": next(axis.pixels for axis in settings.axes if axis.name == "cycles"),
         "axes": {axis.words: _axis_rows(points, axis.name) for axis in settings.axes},
-        "single": single,
         "held": held,
         "size": PAPER_GRID[0] * PAPER_GRID[1] * (PAPER_GRID[2] + 2) * _BYTES,
-        "rows": [vars(p) | {"seconds": "" if p.seconds is None else p.seconds} for p in [*points, *single]],
-        "figures": {"axes": along_axes(settings, points), "teaser": single_pixel(settings, single)},
+        "rows": [vars(p) | {"seconds": "" if p.seconds is None else p.seconds} for p in points],
+        "figures": {"axes": along_axes(settings, points)},
     }
 
 

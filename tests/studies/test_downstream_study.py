@@ -19,8 +19,7 @@ from studies.downstream import run as downstream
 from studies.downstream.data import CONFIGS, MAIN, WORDS, instrument
 from studies.downstream.networks import predicted, trained
 from studies.downstream.prediction import at
-from studies.downstream.report import scatter
-from studies.downstream.run import fixed
+from studies.downstream.run import fixed, scatter
 from studies.downstream.windows import BOX, LOGS, NEAR, WINDOW, features, number, starts
 from studies.neural import NeuralEngine
 from tests.harness.study import quick_study

@@ -21,13 +21,13 @@ def system():
 def test_files(tmp_path):
     study = quick_study("runtime", tmp_path)
     rows, text = study.rows, study.text
-    assert {row["axis"] for row in rows} == {"cycles", "flux", "realizations", "pixels", "teaser"}
+    assert {row["axis"] for row in rows} == {"cycles", "flux", "realizations", "pixels"}
     assert {*ANY_SYSTEM, runtime.NUMPY} <= {row["contender"] for row in rows}
     assert all((row["seconds"] == "") == bool(row["why"]) for row in rows)
     assert "| 105.1 MB | 105 MB |" in text
     assert "40.83" in text
     assert "`Table` of this run, 5 x 4 entries" in text  # flux 0 is a node of either axis
-    assert study.figures == ["runtime_axes.png", "runtime_teaser.png"]
+    assert study.figures == ["runtime_axes.png"]
 
 
 def test_pipeline_draws_the_law_of_its_table(system):

@@ -33,7 +33,6 @@ System = type(SYSTEM)
 FLUX = ml.Flux(np.full((2, 3), 0.5), 0.1, 40.0)
 PIXEL = ml.Flux(0.5, 0.1, 40.0)
 SYNCHRONOUS = SYSTEM.replace(detector=ml.Detector(dead_time_ns=30.0, mode="synchronous"))
-PARALYZABLE = SYSTEM.replace(detector=ml.Detector(dead_time_ns=30.0, mode="paralyzable"))
 SCENE = ml.Scene(np.full((2, 3), 2.0), np.full((2, 3), 0.5))
 NUMBERS = itertools.count()
 RECIPE = {"scenes": {"example": "room", "size": [3, 4]}, "systems": [SYSTEM], "light": {"signal": 0.5}}
@@ -151,7 +150,6 @@ CALLS: dict[str, Callable[[Path], tuple[Callable[..., Any], dict[str, Any]]]] = 
         {"system": SYSTEM, "signal": (0.1, 1, 2), "background": (0.1, 1, 2)},
     ),
     "Table.quantisation_error": lambda _: (table().quantisation_error, {"samples": 3}),
-    "Table.law_error": lambda _: (table().law_error, {"samples": 2}),
     "Table.save": lambda at: (table().save, {"path": at / "b.h5", "overwrite": True}),
     "Table.load": lambda at: (ml.Table.load, {"path": at / "table.h5"}),
     "calibrate": lambda _: (ml.calibrate, {"times": times()}),
@@ -223,10 +221,6 @@ CALLS: dict[str, Callable[[Path], tuple[Callable[..., Any], dict[str, Any]]]] = 
             statistics.photons_per_bin,
         )
     },
-    "statistics.paralyzable_moments": lambda _: (
-        statistics.paralyzable_moments,
-        {"flux": PIXEL, "system": PARALYZABLE},
-    ),
     "statistics.PhaseChain": lambda _: (statistics.PhaseChain, {"photons": np.full(8, 0.1), "dead_time": 0.3}),
     "statistics.holding_times": lambda _: (statistics.holding_times, {"chain": chain()}),
     "statistics.constant_light_rate": lambda _: (

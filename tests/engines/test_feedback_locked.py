@@ -148,7 +148,7 @@ def test_the_kernel_asks_for_laps():
     assert (statuses(request, laps) == Reason.DRAWN).all()
     assert (statuses(request, laps + 1) == asked).all(), "no other number than that of the pixel"
     short = replace(request, system=request.system.replace(cycles=2000))
-    assert (statuses(short, 1) == Reason.FEW).all()
+    assert (statuses(short, 1) == Reason.LOCKED_IN_SHORT_EXPOSURE).all()
 
 
 @pytest.mark.parametrize("laps", [0, 191])
@@ -162,7 +162,7 @@ def test_reports_count_by_reason():
     flux = ml.Flux([[20.0, 1.0, 1.0]], [[2.0, 1.0, 400.0]], 60.0)
     ml.simulate(flux, SYSTEM.replace(cycles=3000), engine="feedback", seed=1, report=report)
     assert report[GIVEN] == 2
-    assert report[f"{GIVEN}, locked, short exposure"] == 1
+    assert report[f"{GIVEN}, locked in short exposure"] == 1
     assert report[f"{GIVEN}, slow sweeps"] == 1
     assert report["exposures drawn again by exact"] == 0
 

@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 from harness import require, system_of
+from harness.paralyzable import paralyzable_moments
 from harness.pvalues import variance_score
 from scipy import stats
 
 import mars_lidar as ml
-from mars_lidar.statistics import ConvergenceError, exposure_moments, mean_histogram, paralyzable_moments
+from mars_lidar.statistics import ConvergenceError, exposure_moments, mean_histogram
 from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.exposure import refined_moments
 from mars_lidar.table.entries import start_phases

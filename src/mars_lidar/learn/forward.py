@@ -462,12 +462,7 @@ def _block(device: torch.device) -> int:
 
 @checked
 def expected_histogram(
-    signal: torch.Tensor,
-    background: torch.Tensor,
-    delay_ns: torch.Tensor,
-    system: System,
-    *,
-    refine: int | None = None,
+    signal: torch.Tensor, background: torch.Tensor, delay_ns: torch.Tensor, system: System, *, refine: int | None = None
 ) -> torch.Tensor:
     """Expected registrations in each bin (..., bins) under dead time; differentiable in all three arguments.
 

@@ -174,12 +174,7 @@ class HoldingTimeCovariance:
 
 @checked
 def holding_time_covariance(
-    flux: Flux,
-    system: System,
-    *,
-    lags: int = 20,
-    rearm: Rearm = "centre",
-    bins: int | None = None,
+    flux: Flux, system: System, *, lags: int = 20, rearm: Rearm = "centre", bins: int | None = None
 ) -> HoldingTimeCovariance:
     """Covariances of the times between registrations, and their sum by several rules.
 

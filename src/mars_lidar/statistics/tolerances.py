@@ -190,8 +190,6 @@ class Tolerances:
         normal law beyond 8 standard deviations.
     least_spread
         Smallest standard deviation of a count relative to Poisson: that of the best locked pixels.
-    paralyzable_periods
-        Most periods of a paralyzable dead time; the variance is a sum over them.
     synchronous_tail, synchronous_loose_tail
         Probability outside the support of a synchronous law, at either end, by its sums and by its transform.
     synchronous_late, synchronous_reach
@@ -286,7 +284,6 @@ class Tolerances:
     most_mean: float = 1e15
     matched_outside: float = 1.5e-15
     least_spread: float = 1e-3
-    paralyzable_periods: int = 20_000
     synchronous_tail: float = 1e-13
     synchronous_loose_tail: float = 1e-10
     synchronous_late: float = 9.0

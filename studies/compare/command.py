@@ -14,14 +14,7 @@ from mars_lidar._base import checks
 from mars_lidar._base.progress import span
 from mars_lidar.cli.console import grid, progress_bar, screen, table
 from mars_lidar.cli.console import run as execute
-from mars_lidar.cli.options import (
-    Integer,
-    LightOptions,
-    SceneOptions,
-    Text,
-    read_scene,
-    two,
-)
+from mars_lidar.cli.options import Integer, LightOptions, SceneOptions, Text, read_scene, two
 from mars_lidar.cli.options import command as as_command
 from mars_lidar.cli.system_options import Effects, SystemOptions
 from mars_lidar.engines import ENGINES

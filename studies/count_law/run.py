@@ -1,9 +1,15 @@
-"""Study "count-law", T1 of the MaRS paper: every simulator's count law and shape against simulation."""
+"""Study "count-law", T1 of the MaRS paper: every simulator's count law and shape against simulation.
+
+The simulators are those of the MaRS paper (arXiv 2512.04924) and ours. Those with a count law in closed form are
+asked for it; any other engine of the registry is asked for a sample.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache, partial
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -11,26 +17,127 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from mars_lidar import Flux, System, count_law
+from mars_lidar import CountLaw, Flux, System, count_law, registration_pdf
 from mars_lidar._base.types import FloatArray
+from mars_lidar.engines import ENGINES
 from mars_lidar.plot.style import COLOURS, INK, MUTED
+from mars_lidar.statistics import photons_per_bin
 from mars_lidar.statistics.count_pmf import Pmf, kl_divergence
+from mars_lidar.statistics.matched import matched_pmf
 from mars_lidar.statistics.tolerances import TOL
 from studies import Facts, Request, Tell
 from studies.common.distance import wasserstein
 from studies.common.draw import panels
 from studies.common.report import Row, picked
-from studies.common.sample import (
-    NEAR_NS,
-    WIDE_NS,
-    Grid,
-    Sample,
-    draw,
-    paper_grids,
-    system_of,
-)
-from studies.neural.pairs import Training
-from studies.neural.simulators import Prediction, simulators
+from studies.common.sample import NEAR_NS, WIDE_NS, Grid, Sample, draw, paper_grids, system_of
+
+# engines whose count law is evaluated instead of sampled, and those that are the truth
+_IN_CLOSED_FORM = ("poisson", "renewal", "mars", "exact", "sequential")
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """Of cells (cells,): mean and variance of the count, its pmfs, and the shape (cells, bins).
+
+    `sampled` counts the exposures behind it, 0 where it is evaluated.
+    """
+
+    mean: FloatArray
+    variance: FloatArray
+    pmfs: list[Pmf]
+    shape: FloatArray
+    sampled: int = 0
+
+
+_Shape = Callable[[Flux, System], FloatArray]
+_Predict = Callable[[FloatArray, FloatArray, System], Prediction]
+
+
+@dataclass(frozen=True)
+class Simulator:
+    """A simulator by name, in words, and how it is asked."""
+
+    name: str
+    words: str
+    predict: _Predict
+
+
+def simulators(sampled: int, seed: int, steps: int = 1750, pairs: int = 6000) -> list[Simulator]:
+    """All simulators; engines without a law in closed form are asked for `sampled` exposures.
+
+    The network of the neural stand-in is trained for each system, once, in so many `steps` on so many `pairs`; it is
+    left out where PyTorch is not installed.
+    """
+    chain, exposure = (partial(registration_pdf, method=method) for method in ("chain", "exposure"))
+    edge = partial(registration_pdf, method="chain", rearm="edge")
+
+    def matched(signal: FloatArray, background: FloatArray, system: System) -> Prediction:
+        """What a table holds of the exact law, and an engine with a table draws: four cumulants."""
+        flux = centred(signal, background, system)
+        cumulants, shape = count_law(flux, system, "exact").cumulants, exposure(flux, system)
+        return Prediction(cumulants[:, 0], cumulants[:, 1], matched_pmf(cumulants), shape)
+
+    def neural(signal: FloatArray, background: FloatArray, system: System) -> Prediction:
+        engine = _trained(system.replace(cycles=1, start="armed"), steps, pairs)
+        flux = centred(signal, background, system)
+        return _of_law(engine.count_law(flux, system), engine.registration_pdf(flux, system))
+
+    evaluated = [
+        Simulator("poisson", "Poisson", _by_law(arrival_shape, method="poisson")),
+        Simulator("renewal", "renewal", _by_law(chain, method="renewal")),
+        Simulator("mars_centre", "MaRS, paper's, centre", _by_law(chain, method="mars")),
+        Simulator("mars_edge", "MaRS, paper's, edge", _by_law(edge, method="mars", rearm="edge")),
+        Simulator("mars_exact", "MaRS, ours, exact law", _by_law(exposure, method="exact")),
+        Simulator("mars_matched", "MaRS, ours, four cumulants", matched),
+    ]
+    if find_spec("torch") is not None:  # the extra "learn"
+        evaluated.append(Simulator("neural", "neural, stand-in", neural))
+    others = [name for name in ENGINES if name not in _IN_CLOSED_FORM]
+    return evaluated + [Simulator(name, f"{name} (sampled)", _sampler(name, sampled, seed)) for name in others]
+
+
+def _of_law(law: CountLaw, shape: FloatArray) -> Prediction:
+    """The prediction of a batched count law (cells,)."""
+    pmfs = [Pmf(int(first), p) for first, p in zip(law.support[:, 0], law.pmf, strict=True)]
+    return Prediction(law.mean, law.variance, pmfs, shape)
+
+
+def _by_law(shape: _Shape, **law: Any) -> _Predict:
+    def predict(signal: FloatArray, background: FloatArray, system: System) -> Prediction:
+        flux = centred(signal, background, system)
+        return _of_law(count_law(flux, system, **law), shape(flux, system))
+
+    return predict
+
+
+def centred(signal: FloatArray, background: FloatArray, system: System) -> Flux:
+    """Light whose return is in the middle of the period."""
+    return Flux(signal, background, 0.5 * system.period_ns)
+
+
+def arrival_shape(flux: Flux, system: System) -> FloatArray:
+    """Shape (cells, bins) of the arrivals, which is that of the flux."""
+    shape = photons_per_bin(flux, system, bins=system.bins)
+    return np.asarray(shape / shape.sum(-1, keepdims=True), dtype=np.float64)
+
+
+@lru_cache(maxsize=8)
+def _trained(system: System, steps: int, pairs: int) -> Any:
+    from studies.neural import NeuralEngine, Training, train
+
+    return NeuralEngine(train(system, Training(steps=steps, pairs=pairs, held_out=min(500, pairs))).map)
+
+
+def _sampler(engine: str, realizations: int, seed: int) -> _Predict:
+    def predict(signal: FloatArray, background: FloatArray, system: System) -> Prediction:
+        result = draw(engine, signal, background, system, realizations=realizations, seed=seed)
+        mean = result.counts.mean(0, dtype=np.float64)
+        variance = result.counts.var(0, dtype=np.float64, ddof=1)
+        pmfs = [Pmf.of_counts(column) for column in result.counts.T]
+        return Prediction(mean, variance, pmfs, result.shape, realizations)
+
+    return predict
+
 
 FIGURES = ("wasserstein", "kl", "mean", "variance")  # distances of a law to the truth, in this order
 _NEGLIGIBLE = 1e-10  # probability of a count left out of a resampling, per exposure drawn
@@ -56,12 +163,7 @@ class Settings:
         return system_of(dead_ns, self.cycles, period_ns=period_ns, bins=self.bins, sigma_ns=self.sigma_ns)
 
 
-FULL = Settings(
-    grids=paper_grids(8, WIDE_NS, NEAR_NS),
-    realizations=100_000,
-    resamplings=200,
-    sampled=4_000,
-)
+FULL = Settings(grids=paper_grids(8, WIDE_NS, NEAR_NS), realizations=100_000, resamplings=200, sampled=4_000)
 QUICK = Settings(
     grids=paper_grids(2, (25.0, 75.0), (50.0,)),
     realizations=400,
@@ -141,8 +243,7 @@ def _system_cells(settings: Settings, grid: Grid, dead_ns: float, truth: str, nu
     seed, size = (settings.seed << 16) + number, settings.realizations
     sample = draw(truth, signal, background, system, realizations=size, seed=seed)
     # another seed: an engine must not share random numbers with the truth
-    training = Training(steps=settings.steps, pairs=settings.pairs, held_out=min(500, settings.pairs))
-    asked = simulators(settings.sampled, seed + (1 << 40), training)
+    asked = simulators(settings.sampled, seed + (1 << 40), settings.steps, settings.pairs)
     predictions = {item.name: item.predict(signal, background, system) for item in asked}
     cumulants = count_law(Flux(signal, background, 0.5 * system.period_ns), system, "exact").cumulants
     random = np.random.default_rng([settings.seed, number])

@@ -15,26 +15,16 @@ import h5py
 import numpy as np
 from matplotlib.figure import Figure
 
-from mars_lidar import (
-    Afterpulsing,
-    Calibration,
-    Detector,
-    Flux,
-    GaussianPulse,
-    Jitter,
-    System,
-    Timestamps,
-    calibrate,
-    simulate_timestamps,
-)
+from mars_lidar import Afterpulsing, Calibration, Detector, Flux, Jitter, Timestamps, calibrate, simulate_timestamps
 from mars_lidar.calibration.curves import Realizations
 from mars_lidar.plot.stream import calibration_figure
 from mars_lidar.plot.style import COLOURS, MUTED
 from studies import Facts, Request, Tell
 from studies.common.draw import panels
 from studies.common.report import Row
+from studies.common.sample import PERIOD_NS, system_of
 
-PERIOD_NS, DEAD_NS, SIGMA_NS, DELAY_NS, BINS = 1e3 / 7.5, 85.0, 0.5, 40.0, 1024
+DEAD_NS, DELAY_NS = 85.0, 40.0
 EXAMPLE_UNIT_NS = 0.064  # of the times in the measured stream
 PIXELS = {"bright": (0.8, 0.1), "dark": (0.25, 0.1)}  # the paper's S and B are not known
 
@@ -136,20 +126,10 @@ class Case:
         return self.fault.suspect in self.suspects
 
 
-def system_of(cycles: int, detector: Detector | None = None) -> System:
-    """The paper's laser and detector, started ready as a recording is."""
-    return System(
-        period_ns=PERIOD_NS,
-        cycles=cycles,
-        bins=BINS,
-        pulse=GaussianPulse(sigma_ns=SIGMA_NS),
-        detector=Detector(dead_time_ns=DEAD_NS) if detector is None else detector,
-    )
-
-
 def stream_of(light: Flux, cycles: int, seed: int, detector: Detector | None = None) -> Timestamps:
     """A recording of one pixel in that light, without what it knows of light and detector."""
-    made = simulate_timestamps(light, system_of(cycles, detector), seed=seed)
+    system = system_of(DEAD_NS, cycles).replace(detector=detector or Detector(dead_time_ns=DEAD_NS))
+    made = simulate_timestamps(light, system, seed=seed)
     return replace(made, info={"source": "simulated"})
 
 

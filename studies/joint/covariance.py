@@ -24,9 +24,7 @@ from mars_lidar.statistics.joint import Pixel
 from studies import Facts, Request, Tell
 from studies.common.draw import panels
 from studies.common.report import Row, picked
-from studies.joint.cases import OFTEN, TOLERANCE, Case, random_cases
-
-__all__ = ["Outcome", "TOLERANCE", "compare", "random_systems", "run"]
+from studies.joint.table import OFTEN, TOLERANCE, Case, random_cases
 
 _QUANTILES = {  # in words: key of the scores
     "count variance": "count, variance",
@@ -190,6 +188,7 @@ def run(settings: Settings, request: Request) -> Facts:
     by_z = sorted(systems, key=lambda o: -o.worst()[0])
     return {
         "often": OFTEN,
+        "tolerance": TOLERANCE,
         "laws": [
             (name, z, stats.kstest(z, "norm").pvalue, stats.chi2.sf(float(np.sum(z**2)), z.size))
             for name, z in scores.items()

@@ -22,7 +22,7 @@ from mars_lidar.plot.style import COLOURS, INK, MISSING
 from studies import Facts, Request
 from studies.common.draw import legend_below, panels
 from studies.common.report import Row, crossed, marked, picked
-from studies.joint.cases import COARSE, HANDED, REFERENCE, SEVEN, Case
+from studies.joint.table import COARSE, HANDED, REFERENCE, SEVEN, Case
 
 QDA, BOOSTING, FOREST = "QDA", "gradient boosting", "random forest"
 CLASSIFIERS = (QDA, BOOSTING, FOREST)

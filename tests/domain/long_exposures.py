@@ -127,10 +127,7 @@ def compare(case: Case, items: int, seed: int) -> dict[str, Any]:
     try:
         law = joint_law(case.flux()[0, 0], system, tolerance=TOLERANCE)
     except (ConvergenceError, ValueError, MemoryError) as error:
-        return row | {
-            "outcome": "law refused",
-            "note": f"{type(error).__name__}: {error}"[:200],
-        }
+        return row | {"outcome": "law refused", "note": f"{type(error).__name__}: {error}"[:200]}
     judged = Judged.of(case, law, items, seed, report)
     if judged.wrong:
         judged = Judged.of(case, law, AGAIN * items, seed + 500_000, report)

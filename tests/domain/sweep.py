@@ -21,17 +21,7 @@ from typing import Any
 from mars_lidar._base.files import beside
 from studies import OtherRunsError, Tell
 from tests.domain.checks import FIRST_LEVEL, Check
-from tests.domain.judge import (
-    FAILED,
-    SLOW,
-    UNJUDGED,
-    VERIFIED,
-    Budget,
-    Outcome,
-    blamed,
-    judge,
-    second_level,
-)
+from tests.domain.judge import FAILED, SLOW, UNJUDGED, VERIFIED, Budget, Outcome, blamed, judge, second_level
 from tests.domain.systems import Case, draw
 
 

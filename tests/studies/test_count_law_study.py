@@ -14,7 +14,6 @@ from mars_lidar.statistics.tolerances import TOL
 from studies.common.distance import wasserstein
 from studies.common.sample import draw
 from studies.count_law import run as count_law
-from studies.neural import simulators
 from tests.harness.study import quick_study, written
 
 
@@ -118,9 +117,9 @@ def test_engine_without_a_law_is_sampled(monkeypatch):
         name = "other"
 
     monkeypatch.setitem(ENGINES, "other", Other())
-    names = [simulator.name for simulator in simulators.simulators(50, 1)]
+    names = [simulator.name for simulator in count_law.simulators(50, 1)]
     assert names[:6] == ["poisson", "renewal", "mars_centre", "mars_edge", "mars_exact", "mars_matched"]
-    other = next(simulator for simulator in simulators.simulators(50, 1) if simulator.name == "other")
+    other = next(simulator for simulator in count_law.simulators(50, 1) if simulator.name == "other")
     system = count_law.QUICK.system(100.0, 50.0)
     result = other.predict(np.array([0.1, 0.2]), np.array([0.1, 0.1]), system)
     assert result.sampled == 50

@@ -10,8 +10,8 @@ from harness import require
 from scipy import stats
 
 from studies.__main__ import main
-from studies.joint import cases as bins
 from studies.joint import run as joint
+from studies.joint import table as bins
 from tests.harness.study import quick_study
 
 

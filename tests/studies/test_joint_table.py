@@ -7,7 +7,7 @@ from scipy import stats
 
 from mars_lidar.engines import ANY_SYSTEM
 from studies.joint import table as joint
-from studies.joint.cases import COARSE, RATIOS, REFERENCE, SEVEN, Case, Law, Sample
+from studies.joint.table import COARSE, RATIOS, REFERENCE, SEVEN, Case, Law, Sample
 from tests.harness.study import quick_study
 
 

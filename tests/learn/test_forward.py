@@ -18,6 +18,7 @@ from mars_lidar.learn import (
     histogram_log_likelihood,
 )
 from mars_lidar.reconstruction.maximum_likelihood import log_likelihood
+from tests.learn.accuracy import CLASSES, errors, sweep
 
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated")  # torch's own forward mode calls it
 
@@ -201,7 +202,7 @@ def test_expected_histogram_is_the_exact_mean(start, dead_ns):
 def test_gradients_in_coarse_bins_are_those_of_the_exact_mean(bins, sigma, dead, light):
     """To 4e-3 in the norm over the bins, as the docstring says."""
     instrument = system(dead, bins=bins, pulse=ml.GaussianPulse(sigma_ns=sigma), cycles=1000)
-    assert _errors(light, instrument, 1e-3 * sigma)[1] < 4e-3
+    assert errors(light, instrument, 1e-3 * sigma)[1].max() < 4e-3
 
 
 @pytest.mark.parametrize(
@@ -212,9 +213,9 @@ def test_measured_pulses_in_coarse_bins(bins, sample, dead, light):
     """Values and gradients as accurate as those of Gaussian pulses, for pulses with an edge, wider than a bin."""
     pulse = ml.SampledPulse(np.exp(-np.arange(17) / 4.0), sample, origin="first")
     instrument = system(dead, bins=bins, pulse=pulse, cycles=1000)
-    variation, gradients = _errors(light, instrument, 1e-3 * sample)
+    variation, gradients = errors(light, instrument, 1e-3 * sample)
     assert variation < 4e-4
-    assert gradients < 4e-3
+    assert gradients.max() < 4e-3
 
 
 @pytest.mark.parametrize(
@@ -229,9 +230,19 @@ def test_measured_pulses_in_coarse_bins(bins, sample, dead, light):
 def test_armed_exposures_that_end_within_their_transient(periods, cycles, light):
     """The same accuracy where the pixel is not settled at the end."""
     instrument = system(100.0 * periods, bins=32, cycles=cycles, start="armed")
-    variation, gradients = _errors(light, instrument, 3e-3)
+    variation, gradients = errors(light, instrument, 3e-3)
     assert variation < 4e-4
-    assert gradients < 4e-3
+    assert gradients.max() < 4e-3
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("kind", CLASSES)
+def test_accuracy_over_random_systems(kind):
+    """The bounds that the docstring states, half as much again, over systems that the table of docs/learn.md lacks."""
+    variation, signal, background, delay = np.nanmax(sweep(kind, 60, seed=20_261_128), axis=0)
+    assert variation < 6e-4
+    assert max(signal, background) < 7e-3
+    assert delay < {"measured": 1.4e-2, "measured, near": 4.5e-2}.get(kind, 4.5e-3)
 
 
 def test_one_period_within_a_dead_time():
@@ -249,22 +260,6 @@ def test_dead_times_within_a_part_of_a_bin():
     exact = ml.mean_histogram(ml.Flux(*(np.array(values) for values in AT)), instrument).sum(-1)
     np.testing.assert_allclose(coarse, exact, rtol=4e-2)
     np.testing.assert_allclose(fine, exact, rtol=4e-3)
-
-
-def _errors(light, instrument, step_ns):
-    """Total variation from the native recursion, and of the gradients from its differences; norm over the bins."""
-    light, steps = np.array(light), np.array([1e-3 * light[0], 1e-3 * light[1], step_ns])
-    at = light + np.concatenate([np.zeros((1, 3)), np.diag(steps), -np.diag(steps)])
-    exact, *moved = ml.mean_histogram(ml.Flux(*at.T), instrument, tolerance=1e-7).reshape(7, -1)
-    mean = expected_histogram(*point(*light), instrument).detach().numpy()
-    slopes = (np.array(moved[:3]) - np.array(moved[3:])) / (2.0 * steps[:, None])
-    gradients = np.linalg.norm(_jacobian(light, instrument) - slopes, axis=1) / np.linalg.norm(slopes, axis=1)
-    return np.abs(mean - exact).sum() / 2.0 / exact.sum(), gradients.max()
-
-
-def _jacobian(light, instrument):
-    at = torch.tensor(light, dtype=torch.float64)
-    return torch.func.jacrev(lambda x: expected_histogram(x[0], x[1], x[2], instrument))(at).T.numpy()
 
 
 def test_efficiency_and_dark_counts_are_those_of_the_exact_mean():

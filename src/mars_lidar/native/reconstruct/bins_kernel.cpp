@@ -209,14 +209,17 @@ void MARS_JOIN(bin_law_, MARS_LEVEL)(const LawBlock& of) {
             put(of.mean + i, light * armed);
             put(of.variance + i, light * armed);
             put(of.slope + i, armed);
+            put(of.asymmetry + i, splat(1.0));
             continue;
         }
         const Passes pass = of.light ? Passes(light) : alike;
         const Real mean = armed * pass.fired + rearmed * pass.q, silent = armed * pass.quiet + rearmed * pass.none;
         const Real all = armed + rearmed;
+        const Real quiet = choose(all > 0.0, silent / choose(all > 0.0, all, splat(1.0)), splat(0.0));
         put(of.mean + i, mean);
         put(of.slope + i, armed * pass.quiet + rearmed * pass.dq);
-        put(of.variance + i, choose(all > 0.0, mean * silent / choose(all > 0.0, all, splat(1.0)), splat(0.0)));
+        put(of.variance + i, mean * quiet);
+        put(of.asymmetry + i, 2.0 * quiet - 1.0);
         put(of.fired + i, pass.fired);
         put(of.late + i, pass.q);
     }
@@ -250,6 +253,17 @@ ChangeSums MARS_JOIN(bin_change_, MARS_LEVEL)(const ChangeBlock& of) {
         for (int k = 0; k < 4; ++k) sum[k][p] = sum[k][p] + each[k];
     });
     return {total(sum[0]), total(sum[1]), total(sum[2]), total(sum[3])};
+}
+
+double MARS_JOIN(bin_cubes_, MARS_LEVEL)(const CubesBlock& of) {
+    Real sum[kParts] = {};
+    for_bins(of.bins, [&](int64_t i, int p) {
+        const Real light = of.along[0] * reals(of.share + i) + of.along[1] + of.along[2] * reals(of.moved + i);
+        const Real each = reals(of.change + i) -
+                          reals(of.weight + i) * (reals(of.slope + i) * light + of.along[3] * reals(of.fired + i));
+        sum[p] = sum[p] + each * each * each * (reals(of.variance + i) * reals(of.asymmetry + i));
+    });
+    return total(sum);
 }
 
 // Of log(m / (E l)) for the registrations and log(1 - m / passes) for the others (R9), in l = flat x open share.

@@ -53,14 +53,14 @@ struct ProductsBlock {
     double *sums, *products;
 };
 
-// Mean of the registrations of each bin of `light` photons, of `flat` where that is null, its slope by them, variance, and
-// the chances that an armed and a re-armed pass register (R7).
+// Mean of the registrations of each bin of `light` photons, of `flat` where that is null, its slope by them, variance, the
+// third cumulant over that, and the chances that an armed and a re-armed pass register (R7).
 struct LawBlock {
     const double *armed, *rearmed, *light;
     double flat;
     int64_t bins;
     bool poisson;
-    double *mean, *slope, *variance, *fired, *late;
+    double *mean, *slope, *variance, *asymmetry, *fired, *late;
 };
 
 // A series in the photons per bin of background alone (R10): terms (kSeriesTerms, bins).
@@ -96,6 +96,14 @@ struct ChangeSums {
     double along, variance, residual, passes;
 };
 
+// Of the weighted change of each bin, less what the estimates take up of it: `along` times the derivatives of the mean by S,
+// B, delay and hidden passes. The sum of its cubes times the third cumulants is that of the score (R30).
+struct CubesBlock {
+    const double *change, *weight, *slope, *fired, *share, *moved, *variance, *asymmetry, *along;
+    int64_t bins;
+};
+
+MARS_DECLARE_KERNEL(double, bin_cubes_, const CubesBlock& block)
 MARS_DECLARE_KERNEL(TangentSums, bin_tangent_, const TangentBlock& block)
 MARS_DECLARE_KERNEL(ChangeSums, bin_change_, const ChangeBlock& block)
 MARS_DECLARE_KERNEL(void, arm_bins_, const ArmBlock& block)

@@ -14,6 +14,7 @@ struct BinsKernels {
     TangentSums (*tangent)(const TangentBlock&) =
         kernel_at<const TangentBlock&, TangentSums>("", MARS_KERNELS(bin_tangent_));
     ChangeSums (*change)(const ChangeBlock&) = kernel_at<const ChangeBlock&, ChangeSums>("", MARS_KERNELS(bin_change_));
+    double (*cubes)(const CubesBlock&) = kernel_at<const CubesBlock&, double>("", MARS_KERNELS(bin_cubes_));
     void (*series)(const SeriesBlock&) = kernel_at<const SeriesBlock&>("", MARS_KERNELS(background_series_));
 };
 

@@ -178,8 +178,8 @@ class ExposureEnds {
     }
 
     int64_t first = 0, length = 0;
-    BinRun run_;                 // the bins that are covered
-    std::vector<double> armed_;  // (count, those bins)
+    BinRun run_;       // the bins that are covered
+    BinValues armed_;  // (count, those bins)
 };
 
 }  // namespace mars

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -61,10 +60,9 @@ QUICK = Settings((24, 16), ((8, 6),), samples=20, laws=4, cells=4, delays=4, sys
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One table, seconds to build it, and its errors between entries: bilinear, nearest."""
+    """One table, and its errors between entries: bilinear, nearest."""
 
     table: Table
-    seconds: float
     errors: tuple[QuantisationError, QuantisationError]
     law: Row
 
@@ -72,14 +70,13 @@ class Case:
     def of(cls, settings: Settings, points: tuple[int, int], case: Mapping[str, Any]) -> Case:
         """Build and measure."""
         system = system_of(case["dead_time_ns"], case.get("cycles", 1000), start=case.get("start", "armed"))
-        axes, began = [(LOW, HIGH, number) for number in points], time.perf_counter()
+        axes = [(LOW, HIGH, number) for number in points]
         table = Table.build(system, *axes, method=case.get("method", "exposure"))
-        seconds = time.perf_counter() - began
         errors = (
             table.quantisation_error(samples=settings.samples, seed=SEED),
             table.quantisation_error(interpolation="nearest", samples=settings.samples, seed=SEED),
         )
-        return cls(table, seconds, errors, law_error(table, settings.laws))
+        return cls(table, errors, law_error(table, settings.laws))
 
     def rows(self) -> Iterator[Row]:
         """Lines of the table of errors between the entries."""

@@ -15,25 +15,29 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from scipy.linalg import eig
 
 from mars_lidar import Flux, System, holding_time_covariance
 from mars_lidar._base.types import FloatArray
 from mars_lidar.plot.style import COLOURS, INK, MUTED
 from mars_lidar.statistics import ConvergenceError, HoldingTimeCovariance, PhaseChain
 from mars_lidar.statistics.chain import Rearm
-from mars_lidar.statistics.renewal import weighted_waits
+from mars_lidar.statistics.renewal import lag_covariances, weighted_waits
 from studies import Facts, Request, Tell
 from studies.common.draw import legend_below, maps, panels
 from studies.common.report import Row, picked
 from studies.common.sample import NEAR_NS, PERIOD_NS, WIDE_NS, Grid, log_points, paper_grids, system_of
 
 ComplexArray = NDArray[np.complex128]
+
+_MOST_LAGS, _MOST_MODES = 100_000, 12  # that the automatic rule considers
+
 
 MODES = 14  # two more than the automatic rule looks at, so that its last pair is whole
 _SUBSPACE = 80
@@ -43,26 +47,98 @@ _MATTERS = 0.03  # below it lambda^7 has left the tail
 
 
 @dataclass(frozen=True, eq=False)
-class LeadingTerms(HoldingTimeCovariance):
-    """`HoldingTimeCovariance` whose `eigenvalues` are the leading `MODES`, found by O(n) products.
+class TruncatedSums(HoldingTimeCovariance):
+    """`HoldingTimeCovariance` with its sum by several rules, from the dense transition matrix, O(n^3)."""
+
+    @classmethod
+    def of(cls, terms: HoldingTimeCovariance) -> Self:
+        """The same cell."""
+        return cls(**{field.name: getattr(terms, field.name) for field in fields(HoldingTimeCovariance)})
+
+    def cutoff_sum(self, cutoff: int) -> float:
+        """gamma_1 + ... + gamma_cutoff, ns^2: the sum over the first `cutoff` lags (4.1); 0 for none."""
+        if cutoff <= self.gamma.size:
+            return float(self.gamma[:cutoff].sum())
+        return float(lag_covariances(self.chain, self.times, cutoff).sum()) * (self.mu / self.times.mu) ** 2
+
+    @property
+    def eigenvalues(self) -> ComplexArray:
+        """Eigenvalues of P (bins,), by falling magnitude; the first is 1."""
+        return self._modes[0]
+
+    def spectral_sum(self, lags: int = 6, modes: int = 5) -> float:
+        """gamma_1 .. gamma_lags exactly, the tail from the leading `modes` eigenvalues, 1 included (4.2).
+
+        Where `modes` would split a conjugate pair, one more mode is taken. The paper's rule is L = 6, p = 5.
+        """
+        values, weights = self._modes
+        count = self._whole_pairs(modes)
+        leading, weight = values[1:count], weights[1:count]
+        tail = np.sum(weight * leading**lags / (1.0 - leading))
+        return self.cutoff_sum(lags) + float(tail.real)
+
+    def automatic_rule(self, tolerance: float = 1e-3) -> tuple[int, int]:
+        """The cheapest (lags, modes) whose neglected modes stay below `tolerance` x sigma_ss2 (4.3).
+
+        The neglected part is bounded by the spectral gap: ``|gamma_l| <= sigma_ss2``, and modes beyond the p-th decay
+        at least as ``|lambda_(p+1)|^l``. The bound is rigorous for a normal matrix. P is not normal, which affects the
+        first lags; at least six of them are therefore summed exactly.
+        """
+        size = np.abs(self.eigenvalues)
+        best: tuple[int, int] | None = None
+        for modes in range(1, min(_MOST_MODES, size.size - 1) + 1):
+            count = self._whole_pairs(modes)
+            next_size = float(size[count]) if count < size.size else 0.0
+            if next_size >= 1.0:
+                continue
+            lags = 6
+            if next_size > 0.0:
+                lags = max(6, math.ceil(math.log(tolerance * (1.0 - next_size)) / math.log(next_size)))
+            if lags <= _MOST_LAGS and (best is None or lags + count < sum(best)):
+                best = lags, count
+        if best is None:
+            raise ArithmeticError(
+                f"{self.chain.describe()}: no gap in the first {_MOST_MODES} eigenvalues; use exact_sum"
+            )
+        return best
+
+    def _whole_pairs(self, modes: int) -> int:
+        values = self.eigenvalues
+        if modes < values.size and modes > 1:
+            last, following = values[modes - 1], values[modes]
+            paired = abs(last.imag) > 0 and abs(following - last.conjugate()) <= 1e-9 * abs(last)
+            # pairs are ordered (+, -): a count that ends on the first of a pair includes the second
+            if paired and np.count_nonzero(values[1:modes].imag) % 2 == 1:
+                return modes + 1
+        return modes
+
+    @cached_property
+    def _modes(self) -> tuple[ComplexArray, ComplexArray]:
+        """Eigenvalues and the weights (pi Q_mu v_k)(u_k Q_mu 1) in ns^2, by falling magnitude (4.2)."""
+        # not the left eigenvectors of inv(V), with which variances were negative: P is far from normal (4.4)
+        decomposition: Any = eig(self.chain.dense(), left=True, right=True)
+        values, left_vectors, right_vectors = decomposition
+        order = np.argsort(-np.round(np.abs(values), 12), kind="stable")  # keeps conjugates adjacent
+        values, left_vectors, right_vectors = values[order], left_vectors[:, order], right_vectors[:, order]
+        pdf, times = self.times.stationary.pdf, self.times
+        row = weighted_waits(self.chain, pdf) - times.mu * pdf
+        with np.errstate(divide="ignore", invalid="ignore"):  # the many modes of lambda = 0 are defective
+            overlap = np.sum(left_vectors.conj() * right_vectors, axis=0)
+            weights = (row @ right_vectors) * (left_vectors.conj().T @ (times.mean - times.mu)) / overlap
+        return values, weights * (self.mu / self.times.mu) ** 2
+
+
+@dataclass(frozen=True, eq=False)
+class LeadingTerms(TruncatedSums):
+    """`TruncatedSums` whose `eigenvalues` are the leading `MODES`, by O(n) products.
 
     The sums by rule are those of the parent. A cell whose eigenpairs do not meet their checks raises
     `ConvergenceError`.
     """
 
-    @classmethod
-    def of(cls, terms: HoldingTimeCovariance) -> LeadingTerms:
-        """The same cell, with eigenvalues by Arnoldi iteration."""
-        return cls(**{field.name: getattr(terms, field.name) for field in fields(HoldingTimeCovariance)})
-
-    @property
-    def chain(self) -> PhaseChain:
-        """The chain of the cell."""
-        return self._chain
-
     @cached_property
     def _modes(self) -> tuple[ComplexArray, ComplexArray]:
-        chain, times = self._chain, self._times
+        chain, times = self.chain, self.times
         values, right = _eigenpairs(chain.backward, chain.bins, chain.describe())
         others, left_vectors = _eigenpairs(chain.forward, chain.bins, chain.describe())
         partner = _partners(values, others, chain.describe())
@@ -71,7 +147,7 @@ class LeadingTerms(HoldingTimeCovariance):
         row = weighted_waits(chain, pdf) - times.mu * pdf
         overlap = np.sum(left_vectors * right, axis=0)  # u_k v_k without conjugation: left vectors of P itself
         weights = (row @ right) * (left_vectors.T @ (times.mean - times.mu)) / overlap
-        return values, weights * self._unit
+        return values, weights * (self.mu / times.mu) ** 2
 
 
 def _eigenpairs(product: Callable[[FloatArray], FloatArray], n: int, cell: str) -> tuple[ComplexArray, ComplexArray]:
@@ -259,7 +335,7 @@ def _dense_check(cell: Cell) -> dict[str, Any]:
     change of sigma^2 by the paper's rule, relative to it; ``negative`` whether it is below 0.
     """
     terms = cell.terms
-    dense = HoldingTimeCovariance(**{name: getattr(terms, name) for name in terms.__dataclass_fields__})
+    dense = TruncatedSums.of(terms)
     count = SPECTRAL[1] + 1
     reference, arnoldi = dense.eigenvalues[:count], terms.eigenvalues[:count]
     apart = np.abs(reference[:, None] - arnoldi[None, :]).min(axis=1)

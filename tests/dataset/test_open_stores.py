@@ -1,7 +1,6 @@
 """A store that is replaced, changed or deleted after it was opened is not read as zeros or as another one."""
 
 import os
-import pickle
 import shutil
 import signal
 import subprocess
@@ -38,36 +37,6 @@ def store(tmp_path) -> Path:
     return tmp_path / "set.zarr"
 
 
-@pytest.mark.full
-def test_overwriting_in_mid_epoch_raises(store):
-    """Examples of the new light stood under the old labels."""
-    learn = pytest.importorskip("mars_lidar.learn")
-    examples = iter(learn.StoredDataset(store, pool=1, shuffle=False))
-    assert next(examples)["signal_level"] == 0.1
-    ml.generate(recipe(4.0), store, overwrite=True)
-    refused(r"set\.zarr is damaged, or was replaced or removed after it was opened", list, examples, error=FileError)
-    assert open_dataset(store).recipe.light.levels[0][0] == 4.0
-    assert verify(store, chunks=None).good
-    assert [path.name for path in store.parent.iterdir()] == ["set.zarr"]
-
-
-@pytest.mark.full
-def test_a_worker_opens_the_same_store(store, tmp_path):
-    learn = pytest.importorskip("mars_lidar.learn")
-    examples = learn.StoredDataset(store)
-    other = pickle.dumps(examples)
-    assert len(list(pickle.loads(other))) == 6
-    ml.generate(recipe(4.0), store, overwrite=True)
-    refused("was replaced after it was opened", lambda: list(pickle.loads(other)), error=FileError)
-
-
-def test_a_deleted_store_is_not_zeros(store):
-    opened = open_dataset(store)
-    shutil.rmtree(store)
-    for array in (opened.histogram, opened.maps["depth"]):
-        refused(r"set\.zarr.* removed after it was opened.* is missing", np.asarray, array, error=FileError)
-
-
 def test_a_deleted_cube_is_not_saved_as_zeros(tmp_path):
     flux = ml.Flux(np.full((3, 4), 1.0), 0.1, 40.0)
     for suffix in (".zarr", ".npz"):
@@ -77,18 +46,6 @@ def test_a_deleted_cube_is_not_saved_as_zeros(tmp_path):
         shutil.rmtree(path) if suffix == ".zarr" else path.unlink()
         refused(f"cube{suffix}.* removed after it was opened", io.save, tmp_path / "copy.h5", cube, error=FileError)
         assert not (tmp_path / "copy.h5").exists()
-
-
-def test_empty_and_exchanged_shards(store):
-    shards = sorted((store / "histogram").glob("c.*"))
-    contents = [path.read_bytes() for path in shards]
-    shards[0].write_bytes(contents[1])
-    shards[1].write_bytes(contents[0])
-    with pytest.raises(FileError, match=r"histogram/c\..* has changed since it was written"):
-        np.asarray(open_dataset(store).histogram)
-    shards[0].write_bytes(b"")
-    with pytest.raises(FileError, match=r"histogram/c\..* has changed since it was written"):
-        np.asarray(open_dataset(store).histogram)
 
 
 def test_a_line_that_is_taken_out_of_the_manifest_is_missed(store):

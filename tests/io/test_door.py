@@ -27,18 +27,23 @@ READERS = {
     **dict.fromkeys(["photons.npz", "photons.h5", "photons.mat"], ml.Timestamps.load),
     "light.npy": lambda path: io.read_transient(path, bin_ns=1.0),
     **dict.fromkeys(["light.npz", "light.h5", "light.mat"], io.read_transient),
-    **dict.fromkeys(["depth.png", "depth.npz", "depth.pfm", "depth.npy"], ml.Scene.from_rgbd),
+    **dict.fromkeys(["depth.png", "depth.tiff", "depth.npz", "depth.pfm", "depth.npy"], ml.Scene.from_rgbd),
     "nyu.mat": lambda path: ml.Scene.from_rgbd(path, index=0),
     **dict.fromkeys(["maps.h5", "maps.npz"], load_maps),
     "read.mat": io.read_mat,
+    **dict.fromkeys(["a.npy", "a.npz", "a.mat", "a.h5", "a.tif"], lambda path: io.foreign_cube(path, SYSTEM)),
     "table.h5": ml.Table.load,
     **dict.fromkeys(["system.yaml", "system.json"], ml.System.load),
     "recipe.yaml": DatasetRecipe.load,
 }
 
 
+CONTENTS = [b"", b"\0" * 3000, b"garbage" * 40, b"PK\3\4 no archive", b"\x89HDF\r\n\x1a\n" + b"\xff" * 200]
+CONTENTS += [b"\x89PNG\r\n\x1a\n garbage", b"\x93NUMPY"]
+
+
 @pytest.mark.parametrize("name", READERS)
-@pytest.mark.parametrize("content", [b"", b"\0" * 3000, b"PK\3\4 no archive", b"\x89HDF\r\n\x1a\n" + b"\xff" * 200])
+@pytest.mark.parametrize("content", CONTENTS)
 def test_whatever_is_in_it_the_error_names_the_file(tmp_path, name, content):
     (tmp_path / name).write_bytes(content)
     refused(name.replace(".", r"\."), READERS[name], tmp_path / name, error=FileError)

@@ -4,8 +4,6 @@ Without background a pixel knows of a pulse's width, and of what the dead time m
 their ratio: the law of a pulse a thousand times as wide is the same one, on bins that resolve it.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Shared fixtures, and the account of the statistical checks at the end of a run."""
 
-from __future__ import annotations
-
 import gc
 import os
 from collections.abc import Iterator

@@ -7,8 +7,6 @@ several with commas between them, of whose extras one is to be named; EXTRA may 
 no library are run where several are hidden.
 """
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import importlib.abc

@@ -4,8 +4,6 @@ The sources are in ``tests/emulation``; they include the headers of the installe
 are those of what is tested. A C++ compiler is what installing from source needs too: without any the tests are skipped.
 """
 
-from __future__ import annotations
-
 import ctypes
 import os
 import shlex

@@ -1,7 +1,5 @@
 """Jobs for the native core, in laser periods, for the tests that call it without the Python layers."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,6 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
 from mars_lidar import _core
+from mars_lidar.engines.pixels import Alignment
 
 PULSE = _core.PulseTable.gaussian(0.00375)
 
@@ -60,7 +59,7 @@ class Case:
             stationary=self.stationary,
         )
 
-    def change(self, **fields: Any) -> Case:
+    def change(self, **fields: Any) -> "Case":
         return replace(self, **fields)
 
     def histogram(self, engine: str, *, threads: int = 1, dtype: Any = np.uint32) -> NDArray[Any]:
@@ -77,17 +76,37 @@ def gaussian_energy(delay: float, sigma: float, bins: int) -> NDArray[np.float64
     return np.diff(sum(stats.norm.cdf((edges + k) / sigma) for k in range(-10, 11)))
 
 
-def chi_square(observed: ArrayLike, expected: ArrayLike, *, least: float = 20.0) -> float:
-    """p-value of independent Poisson counts; neighbours are merged until `least` are expected."""
-    obs, exp = np.asarray(observed, float), np.asarray(expected, float)
-    group = np.unique(np.floor(np.cumsum(exp) / least), return_inverse=True)[1]
-    merged_obs, merged_exp = np.bincount(group, obs), np.bincount(group, exp)
-    last = np.flatnonzero(merged_exp > 0)
-    keep = last[merged_exp[last] >= 0.5 * least]
-    value = np.sum((merged_obs[keep] - merged_exp[keep]) ** 2 / merged_exp[keep])
-    return float(stats.chi2.sf(value, keep.size))
+def shape_job(
+    shapes: NDArray[np.float32],
+    pixels: int,
+    realizations: int = 1,
+    seed: int = 1,
+    rows: Any = None,
+    weights: Any = None,
+) -> Any:
+    """A job for the sampler of shapes (rows, bins); every pixel has the first one unless `rows` and `weights` say."""
+    return _core.ShapeJob(
+        shapes=shapes,
+        rows=np.zeros((pixels, 4), np.int64) if rows is None else rows,
+        weights=np.tile([1.0, 0.0, 0.0, 0.0], (pixels, 1)) if weights is None else weights,
+        pixel_index=np.arange(pixels, dtype=np.uint32),
+        place=np.arange(pixels),
+        image=pixels,
+        realizations=realizations,
+        first_realization=0,
+        seed=seed,
+    )
 
 
-def z_to_p(z: ArrayLike) -> NDArray[np.float64]:
-    """Two-sided p-values of standard normal scores."""
-    return np.asarray(2.0 * stats.norm.sf(np.abs(z)))
+def align(job: Any, move: Alignment, dead_time: float) -> None:
+    """Move the job's shapes to their pixels' delays."""
+    job.align(
+        shift=move.shift,
+        signal=move.signal,
+        background=move.background,
+        rate=move.rate,
+        dead_time=dead_time,
+        first=move.frame.first,
+        cells=move.frame.cells,
+        energy=move.frame.energy,
+    )

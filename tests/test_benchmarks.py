@@ -1,7 +1,5 @@
 """The benchmarks run and their tables are whole; no time is asserted."""
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path
@@ -10,6 +8,8 @@ import numpy as np
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # benchmarks are run from the checkout, not installed
+from harness import refused
+
 from benchmarks import __main__ as command
 from benchmarks import child, rows, workload
 from benchmarks.config import Config
@@ -18,37 +18,11 @@ from benchmarks.report import Goal, Section, table
 from benchmarks.timing import Timing, in_turn
 from mars_lidar import _core
 
-TINY = Config(
-    mode="tiny",
-    side=8,
-    bins=64,
-    cycles=8,
-    repeats=2,
-    seconds=0.0,
-    table_entries=2,
-    starts=1,
-    commands=1,
-)
+TINY = Config(mode="tiny", side=8, bins=64, cycles=8, repeats=2, seconds=0.0, table_entries=2, starts=1, commands=1)
 IN_PROCESS = ("exact", "paths", "effects", "exposure")
 TIMING_COLUMNS = {
-    "case",
-    "engine",
-    "level",
-    "threads",
-    "pixels",
-    "cycles",
-    "S + B",
-    "registrations",
-    "ms",
-    "ms least",
-    "CPU ms",
-    "ns/reg/core",
-    "x reference",
-    "MiB written",
-    "write floor ms",
-    "ops/reg least",
-    "ops floor ns/reg",
-    "turns",
+    *("case", "engine", "level", "threads", "pixels", "cycles", "S + B", "registrations", "ms", "ms least", "CPU ms"),
+    *("ns/reg/core", "x reference", "MiB written", "write floor ms", "ops/reg least", "ops floor ns/reg", "turns"),
 }
 
 
@@ -99,8 +73,7 @@ def test_command_saves_markdown_and_json(tmp_path, monkeypatch, capsys):
 
 
 def test_unknown_section_is_refused(capsys):
-    with pytest.raises(SystemExit):
-        command.main(["--only", "nonsense"])
+    refused("", command.main, ["--only", "nonsense"], error=SystemExit)
     assert "nonsense" in capsys.readouterr().err
 
 

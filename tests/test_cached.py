@@ -1,7 +1,5 @@
 """Properties that are computed once: a process forked while another thread computes one can compute its own."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import sys
@@ -29,7 +27,7 @@ class Slow:
         return 7
 
 
-def answer(slow: Slow, queue: multiprocessing.SimpleQueue[int]) -> None:
+def answer(slow: Slow, queue: "multiprocessing.SimpleQueue[int]") -> None:
     queue.put(slow.value)
 
 

@@ -1,7 +1,5 @@
 """What every public object owes its user: a repr that fits on a screen, and a way to another process."""
 
-from __future__ import annotations
-
 import pickle
 from typing import Any
 

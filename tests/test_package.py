@@ -1,7 +1,5 @@
 """The package as a whole: version, what an import loads, documentation of every public name."""
 
-from __future__ import annotations
-
 import importlib
 import inspect
 import pkgutil
@@ -20,19 +18,7 @@ import mars_lidar as ml
 from mars_lidar.engines import EngineOptions
 
 ROOT = Path(__file__).parents[1]
-HEAVY = (
-    "scipy",
-    "matplotlib",
-    "zarr",
-    "xarray",
-    "h5py",
-    "PIL",
-    "cyclopts",
-    "rich",
-    "yaml",
-    "torch",
-    "pandas",
-)
+HEAVY = ("scipy", "matplotlib", "zarr", "xarray", "h5py", "PIL", "cyclopts", "rich", "yaml", "torch", "pandas")
 
 
 def test_a_name_of_a_package_is_named_with_its_place():
@@ -53,11 +39,17 @@ def test_version_is_that_of_the_project():
     assert ml.__version__ == installed
 
 
+def printed(code: str) -> list[str]:
+    """Words that a program prints."""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stderr == ""  # nanobind tells of instances that were never freed
+    return done.stdout.split()
+
+
 def test_import_is_light():
     """`import mars_lidar` needs NumPy and the native core only, so that the command line answers at once."""
     code = f"import sys, mars_lidar; print(*[name for name in {HEAVY!r} if name in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == []
+    assert printed(code) == []
 
 
 def test_simulation_is_light():
@@ -69,8 +61,7 @@ def test_simulation_is_light():
         "ml.simulate(ml.Flux(1.0, 1.0, 50.0), s)\n"
         f"print(*[name for name in {HEAVY!r} if name in sys.modules])"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == []
+    assert printed(code) == []
 
 
 def test_public_names_exist_and_are_sorted():
@@ -129,8 +120,7 @@ def test_packages_of_formats_and_learning_are_there_when_they_are_asked_for():
         "ml.io.load, ml.learn, ml.plot\n"
         "print(hasattr(ml, 'lern'), 'torch' in sys.modules)"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["False", "False"]
+    assert printed(code) == ["False", "False"]
 
 
 def test_nothing_native_is_left_when_the_interpreter_ends():
@@ -139,8 +129,7 @@ def test_nothing_native_is_left_when_the_interpreter_ends():
         "s = ml.System(period_ns=100.0, cycles=10, bins=8, pulse=ml.GaussianPulse(sigma_ns=1.0), detector=d); "
         "ml.simulate(ml.Flux(1.0, 1.0, 5.0), s)"
     )
-    ran = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-    assert (ran.stdout, ran.stderr) == ("", "")  # nanobind tells of instances that were never freed
+    assert printed(script) == []
 
 
 def test_wheels_and_recipe_follow_the_project():

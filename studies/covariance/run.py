@@ -17,10 +17,11 @@ from matplotlib.figure import Figure
 
 from mars_lidar._base.types import FloatArray
 from mars_lidar.plot.style import COLOURS, INK, MUTED
-from mars_lidar.statistics import HoldingTimeCovariance, PhaseChain
+from mars_lidar.statistics import PhaseChain
 from studies import Facts, Request, Tell
 from studies.common.draw import legend_below, maps, panels
 from studies.common.report import Row, picked
+from studies.covariance.rules import TruncatedSums
 from studies.covariance.settings import (
     CUTOFFS,
     FULL,
@@ -64,7 +65,7 @@ def _dense_check(cell: Cell) -> dict[str, Any]:
     change of sigma^2 by the paper's rule, relative to it; ``negative`` whether it is below 0.
     """
     terms = cell.terms
-    dense = HoldingTimeCovariance(**{name: getattr(terms, name) for name in terms.__dataclass_fields__})
+    dense = TruncatedSums.of(terms)
     count = SPECTRAL[1] + 1
     reference, arnoldi = dense.eigenvalues[:count], terms.eigenvalues[:count]
     apart = np.abs(reference[:, None] - arnoldi[None, :]).min(axis=1)

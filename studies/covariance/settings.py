@@ -8,7 +8,7 @@ hundredths of a second. Equation numbers refer to docs/theory.md, section 4.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -17,13 +17,12 @@ from numpy.typing import NDArray
 
 from mars_lidar import Flux, System, holding_time_covariance
 from mars_lidar._base.types import FloatArray
-from mars_lidar.statistics import ConvergenceError, HoldingTimeCovariance, PhaseChain
+from mars_lidar.statistics import ConvergenceError
 from mars_lidar.statistics.chain import Rearm
 from mars_lidar.statistics.renewal import weighted_waits
 from studies import Tell
 from studies.common.sample import NEAR_NS, PERIOD_NS, WIDE_NS, Grid, log_points, paper_grids, system_of
-
-ComplexArray = NDArray[np.complex128]
+from studies.covariance.rules import ComplexArray, TruncatedSums
 
 MODES = 14  # two more than the automatic rule looks at, so that its last pair is whole
 _SUBSPACE = 80
@@ -33,26 +32,16 @@ _MATTERS = 0.03  # below it lambda^7 has left the tail
 
 
 @dataclass(frozen=True, eq=False)
-class LeadingTerms(HoldingTimeCovariance):
-    """`HoldingTimeCovariance` whose `eigenvalues` are the leading `MODES`, found by O(n) products.
+class LeadingTerms(TruncatedSums):
+    """`TruncatedSums` whose `eigenvalues` are the leading `MODES`, by O(n) products.
 
     The sums by rule are those of the parent. A cell whose eigenpairs do not meet their checks raises
     `ConvergenceError`.
     """
 
-    @classmethod
-    def of(cls, terms: HoldingTimeCovariance) -> LeadingTerms:
-        """The same cell, with eigenvalues by Arnoldi iteration."""
-        return cls(**{field.name: getattr(terms, field.name) for field in fields(HoldingTimeCovariance)})
-
-    @property
-    def chain(self) -> PhaseChain:
-        """The chain of the cell."""
-        return self._chain
-
     @cached_property
     def _modes(self) -> tuple[ComplexArray, ComplexArray]:
-        chain, times = self._chain, self._times
+        chain, times = self.chain, self.times
         values, right = _eigenpairs(chain.backward, chain.bins, chain.describe())
         others, left_vectors = _eigenpairs(chain.forward, chain.bins, chain.describe())
         partner = _partners(values, others, chain.describe())
@@ -61,7 +50,7 @@ class LeadingTerms(HoldingTimeCovariance):
         row = weighted_waits(chain, pdf) - times.mu * pdf
         overlap = np.sum(left_vectors * right, axis=0)  # u_k v_k without conjugation: left vectors of P itself
         weights = (row @ right) * (left_vectors.T @ (times.mean - times.mu)) / overlap
-        return values, weights * self._unit
+        return values, weights * (self.mu / times.mu) ** 2
 
 
 def _eigenpairs(product: Callable[[FloatArray], FloatArray], n: int, cell: str) -> tuple[ComplexArray, ComplexArray]:

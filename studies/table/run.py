@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from mars_lidar import QuantisationError, Table
-from mars_lidar.table import LawError
 from mars_lidar.table.axes import PAPER_GRID
 from studies import Facts, Request
 from studies.common.report import Row
 from studies.common.sample import system_of
+from studies.table.law import LawError, law_error
 
 _SEED = 20263
 _SAMPLES, _LAWS = 400, 60
@@ -69,7 +69,7 @@ def run(request: Request) -> Facts:
             table.quantisation_error(samples=samples, seed=_SEED),
             table.quantisation_error(interpolation="nearest", samples=samples, seed=_SEED),
         )
-        cases.append(Case(table, errors, table.law_error(samples=laws, seed=_SEED)))
+        cases.append(Case(table, errors, law_error(table, laws, _SEED)))
         request.tell(f"table: {case}")
     return {
         "grids": grids,

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from scipy.special import ndtr
 
+from mars_lidar.calibration.recording import Clock
 from mars_lidar.calibration.start import free_light
 from tests.calibration.photon_by_photon import Truth, photon_by_photon
 from tests.calibration.sweep import random_truth
@@ -22,7 +23,7 @@ BINS = 4096
 
 def bound(truth: Truth, t: np.ndarray) -> np.ndarray:
     """Least standard errors of B and S by the stream t (n,), delay and width unknown."""
-    _, passes = free_light(t, truth.period, truth.dead, BINS)
+    _, passes = free_light(t, Clock(truth.period), truth.dead, BINS)
     at = np.array([truth.background, truth.signal, truth.delay, np.hypot(truth.width, truth.unit / 12**0.5)])
     edges = np.arange(BINS + 1) / BINS * truth.period
 

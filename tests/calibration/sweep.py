@@ -107,16 +107,23 @@ def pulls(result: ml.Calibration, truth: Truth) -> np.ndarray:
     return np.array(out)
 
 
-def outside(result: ml.Calibration, truth: Truth) -> list[str]:
+def outside(result: ml.Calibration, truth: Truth, low: str = "low", high: str = "high") -> list[str]:
     """Names of `PULLED` whose true values lie outside of the 95 % intervals."""
     out = []
     for name, true in zip(PULLED, true_values(truth), strict=True):
         estimate = result.estimates.get(name)
         if estimate is not None:
             wraps = (0.0, truth.period, -truth.period) if name == "delay_ns" else (0.0,)
-            if not any(estimate.low <= true + wrap <= estimate.high for wrap in wraps):
+            if not any(getattr(estimate, low) <= true + wrap <= getattr(estimate, high) for wrap in wraps):
                 out.append(name)
     return out
+
+
+def silent(result: ml.Calibration, truth: Truth) -> list[str]:
+    """Those more than 4.5 stated errors off (an interval alone: outside of it), and outside of the ranges as well."""
+    far = {name for name, z in zip(PULLED, pulls(result, truth), strict=True) if not abs(z) <= 4.5}
+    stated = {name for name in far if name in result.estimates and np.isfinite(result.estimates[name].low)}
+    return [name for name in outside(result, truth, "least", "most") if name in stated]
 
 
 def main() -> None:
@@ -233,6 +240,7 @@ def calibrated(number: int, effect: str | None, photons: int | None, ordinary: b
         "pulls": [None if np.isnan(z) else float(z) for z in pulls(result, truth)],
         "errors": [float(result.estimates[name].error) if name in result.estimates else None for name in PULLED],
         "outside": outside(result, truth),
+        "silent": silent(result, truth),
         "suspects": [suspect.name for suspect in result.suspects],
     }
 

@@ -11,7 +11,7 @@ from harness import make_system
 
 import mars_lidar as ml
 from tests.calibration.photon_by_photon import Truth, as_timestamps, photon_by_photon
-from tests.calibration.sweep import NAMES, pulls, random_truth, with_effect
+from tests.calibration.sweep import NAMES, pulls, random_truth, silent, with_effect
 from tests.calibration.sweep import ORDINARY as BASE
 
 FAR = 4.5  # stated errors: 7e-6 by chance for a normal law
@@ -172,6 +172,65 @@ def test_background_of_which_no_photon_may_be_recorded() -> None:
     assert 0.01 < background.error < 0.2
 
 
+@pytest.mark.full
+def test_a_clock_whose_points_some_bins_hold_twice() -> None:
+    """111.8 units of a period in 111 bins: the fullest bin looked like a pulse of .0019 ± .0032, 91 errors away."""
+    truth, photons = random_truth(10427)
+    result = ml.calibrate(stream(truth, photons, 10427), seed=10427)
+    assert result.fits
+    assert (np.abs(pulls(result, truth)) < FAR).all()
+
+
+@pytest.mark.parametrize("signal", [1e-9, 1e-3])
+def test_the_upper_limit_of_a_pulse_that_is_not_significant(signal: float) -> None:
+    """95 % of such limits hold a signal of any place and width; 40 streams of 5,000 photons."""
+    from scipy.stats import binom
+
+    from mars_lidar.calibration.recording import FALSE_ALARM, recording_of
+    from mars_lidar.calibration.start import brightest_window
+
+    truth = replace(BASE, signal=signal, sigma=1.5, unit=0.25)
+    drawn = [brightest_window(recording_of(stream(truth, 5_000, seed))) for seed in range(40)]
+    assert binom.cdf(sum(limit >= signal for _, limit in drawn), 40, 0.95) > 1e-3
+    assert max(limit for _, limit in drawn) < 0.02  # of a background of .15
+    assert signal > 1e-6 or sum(p < FALSE_ALARM for p, _ in drawn) <= 1
+
+
+@pytest.mark.full
+def test_a_stream_without_a_significant_pulse_states_its_upper_limit() -> None:
+    result = ml.calibrate(stream(replace(BASE, signal=1e-9), 5_000, 3), seed=3)
+    signal = result.estimates["signal"]
+    assert signal.low == 0.0 < signal.high < 0.05
+    assert np.isnan(signal.error)
+    assert "upper limit" in str(signal)
+
+
+def test_errors_of_a_free_shape() -> None:
+    """Pulls of all bins of 20 streams have a root mean square of .95 to 1.05, and those of the totals .6 to 1.4.
+
+    Where the clock's unit is longer than half the pulse, the light within a unit is not known, which no error contains.
+    """
+    from scipy.special import ndtr
+
+    from mars_lidar.calibration.recording import recording_of
+    from mars_lidar.calibration.start import free_waveform
+
+    squares, totals = [], []
+    for number in range(20_000, 20_033):
+        truth = replace(random_truth(number)[0], jitter=0.0)
+        if truth.unit > 0.5 * truth.sigma:
+            continue
+        light, error = free_waveform(recording_of(stream(truth, 10_000, number)), 128)
+        edges = np.linspace(0.0, truth.period, light.size + 1)
+        pulse = sum(np.diff(ndtr((edges + k * truth.period - truth.delay) / truth.sigma)) for k in (-1, 0, 1))
+        off = light - truth.signal * pulse - truth.background / light.size
+        squares.append(np.square(off / error).mean())
+        totals.append(off.sum() / np.sqrt((error**2).sum()))
+    assert len(squares) >= 20
+    assert 0.95 < np.sqrt(np.mean(squares)) < 1.05
+    assert 0.6 < np.sqrt(np.mean(np.square(totals))) < 1.4
+
+
 def test_the_clock_of_a_period_that_ends_within_a_unit() -> None:
     """A pulse about the end of the period: 1 in 86 times, of the unit that is cut, lie at the begin of the next."""
     truth, _ = random_truth(3234)
@@ -211,6 +270,21 @@ def test_an_effect_is_named(effect: str) -> None:
     result = ml.calibrate(stream(truth, PHOTONS[effect], 5))
     assert NAMES[effect] in [suspect.name for suspect in result.suspects]
     assert pickle.loads(pickle.dumps(result)).estimates == result.estimates
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("other", ["recovery", *nightly("twilight", "afterpulses")])
+def test_electronics_that_are_not_named_are_within_the_ranges(other: str) -> None:
+    """Their dead time was stated for the detector's, 230 errors off, and S was 3.0 to 4.5 errors off, with p = 1."""
+    truth = with_effect(BASE, f"{other}+electronics")
+    result = ml.calibrate(stream(truth, 100_000, 6210), seed=6210)
+    assert not silent(result, truth)
+    dead = result.estimates["dead_time_ns"]
+    if NAMES["electronics"] not in [suspect.name for suspect in result.suspects]:
+        assert dead.least < truth.dead < truth.electronics < dead.most + FAR * dead.error
+        limit = next(limit for limit in result.limits if limit.words == NAMES["electronics"])
+        assert limit.limit > 0.2
+        assert limit.ranges["dead_time_ns"][0] == dead.least
 
 
 @pytest.mark.nightly
@@ -255,6 +329,16 @@ def test_flicker_is_named_and_no_afterpulses(periods: int) -> None:
     assert not any(suspect.included for suspect in result.suspects)
     assert not result.fits
     assert result.estimates["background"].error > 0.03 * 0.15  # twice that of steady light
+
+
+@pytest.mark.full
+def test_even_counts_of_a_bright_pulse_do_not_flicker() -> None:
+    """Ten photons a pulse, so that each window has its counts but for a few: 7.5 standard deviations of flicker."""
+    truth = Truth(signal=10.0, background=0.1, delay=40.0, sigma=0.5, dead=85.0, period=400.0 / 3.0)
+    result = ml.calibrate(stream(truth, 40_000, 2), seed=2)
+    assert result.fits
+    assert not result.suspects
+    assert (np.abs(pulls(result, truth)) < FAR).all()
 
 
 def test_a_look_stops_before_the_fit() -> None:

@@ -1,7 +1,5 @@
 """Histograms of another program on the command line: from a bare array to maps, a store and a picture."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +8,7 @@ from harness import make_system
 from scipy.io import savemat
 
 import mars_lidar as ml
-from mars_lidar.cli import main
+from tests.harness.command import fails, ok
 
 SYSTEM = make_system(25.0, 4000, 200, sigma_ns=0.5, period_ns=40.0)
 DELAY = np.linspace(5.0, 35.0, 64).reshape(8, 8)
@@ -23,26 +21,10 @@ def counts() -> np.ndarray:
     return ml.simulate(ml.Flux(1.0, 0.2, DELAY), SYSTEM, seed=1)[0]
 
 
-def run(*words: object) -> int:
-    return main([str(word) for word in words])
-
-
 def test_reconstruct_from_a_bare_array(tmp_path: Path, counts: np.ndarray) -> None:
     np.save(tmp_path / "face.npy", counts.transpose(2, 0, 1))
-    assert (
-        run(
-            "reconstruct",
-            tmp_path / "face.npy",
-            "-o",
-            tmp_path / "maps.npz",
-            "--axes",
-            "tyx",
-            *SYSTEM_OPTIONS,
-            *CLOUD,
-            tmp_path / "face.ply",
-        )
-        == 0
-    )
+    given = ["--axes", "tyx", *SYSTEM_OPTIONS, *CLOUD, tmp_path / "face.ply"]
+    ok("reconstruct", tmp_path / "face.npy", "-o", tmp_path / "maps.npz", *given)
     assert b"element vertex 64" in (tmp_path / "face.ply").read_bytes()
     assert b"depth_error" in (tmp_path / "face.ply").read_bytes()
     result = ml.io.maps.load_maps(tmp_path / "maps.npz")[0]
@@ -56,21 +38,18 @@ def test_the_same_with_a_system_file_through_convert(tmp_path: Path, counts: np.
     savemat(tmp_path / "face.mat", {"counts": counts, "other": np.zeros((8, 8, 200))})
     SYSTEM.save(tmp_path / "camera.yaml")
     words = ("--variable", "counts", "--system", tmp_path / "camera.yaml")
-    assert run("convert", tmp_path / "face.mat", tmp_path / "face.zarr", *words) == 0
+    ok("convert", tmp_path / "face.mat", tmp_path / "face.zarr", *words)
     with ml.io.load(tmp_path / "face.zarr") as cube:
         np.testing.assert_array_equal(np.asarray(cube.histogram)[0], counts)
-    assert run("view", tmp_path / "face.zarr", "-o", tmp_path / "face.png") == 0
-    assert run("info", tmp_path / "face.zarr") == 0
-    assert run("info", tmp_path / "face.zarr", "--verify") == 2
-    assert run("reconstruct", tmp_path / "face.zarr", "-o", tmp_path / "maps.zarr") == 0
+    ok("view", tmp_path / "face.zarr", "-o", tmp_path / "face.png")
+    ok("info", tmp_path / "face.zarr")
+    fails("", "info", tmp_path / "face.zarr", "--verify")
+    ok("reconstruct", tmp_path / "face.zarr", "-o", tmp_path / "maps.zarr")
 
 
-def test_info_lists_what_is_in_a_foreign_file(
-    tmp_path: Path, counts: np.ndarray, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_info_lists_what_is_in_a_foreign_file(tmp_path: Path, counts: np.ndarray) -> None:
     np.savez(tmp_path / "two.npz", a=counts, b=np.zeros(3))
-    assert run("info", tmp_path / "two.npz") == 0
-    output = capsys.readouterr().out
+    output = ok("info", tmp_path / "two.npz").stdout
     assert "a 8 × 8 × 200" in output
     assert "--cycles" in output
 
@@ -90,10 +69,7 @@ def test_info_lists_what_is_in_a_foreign_file(
         (["--system", "none.yaml", "--cycles", "5"], "exclude each other"),
     ],
 )
-def test_what_is_missing_is_named(
-    tmp_path: Path, counts: np.ndarray, capsys: pytest.CaptureFixture[str], words: list[str], message: str
-) -> None:
+def test_what_is_missing_is_named(tmp_path: Path, counts: np.ndarray, words: list[str], message: str) -> None:
     np.save(tmp_path / "face.npy", counts)
-    assert run("reconstruct", tmp_path / "face.npy", "-o", tmp_path / "maps.zarr", *words) == 2
-    assert message in " ".join(capsys.readouterr().err.split())
+    fails(message, "reconstruct", tmp_path / "face.npy", "-o", tmp_path / "maps.zarr", *words)
     assert not (tmp_path / "maps.zarr").exists()

@@ -1,7 +1,5 @@
 """Without any of the optional libraries: one line that names the extra, never a traceback."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

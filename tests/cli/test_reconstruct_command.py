@@ -1,7 +1,5 @@
 """`mars-lidar reconstruct`, its files, its errors against the truth, and the study."""
 
-from __future__ import annotations
-
 import itertools
 import re
 import sys
@@ -20,21 +18,16 @@ from mars_lidar.reconstruction import METHODS
 from mars_lidar.reconstruction import stored as stored_module
 from mars_lidar.reconstruction.quality import map_error
 from mars_lidar.reconstruction.stored import reconstruct_stored
-from tests.harness.command import command_line
+from tests.harness.command import fails, ok, run
 from tests.harness.study import quick_study
 
 SMALL = ("--size", 12, "--cycles", 300, "--bins", 256, "--signal", 2)
 
 
-def run(*words):
-    return command_line([str(word) for word in words])
-
-
 @pytest.fixture(scope="module")
 def cube(tmp_path_factory):
     path = tmp_path_factory.mktemp("cube") / "room.zarr"
-    done = run("simulate", "--scene", "room", *SMALL, "--realizations", 2, "--no-picture", "-o", path)
-    assert done.exit_code == 0, done.output
+    ok("simulate", "--scene", "room", *SMALL, "--realizations", 2, "--no-picture", "-o", path)
     return path
 
 
@@ -42,7 +35,7 @@ def test_reflectivity_is_right_behind_a_detection_efficiency(tmp_path):
     """The truth's light falls on the pixel, the estimate's is detected: a level between them takes off the factor."""
     out, share = tmp_path / "a.zarr", 0.25
     words = (*SMALL[:-1], 8, "--detection-efficiency", share, "--cycles", 3000, "--no-picture", "-o", out)
-    assert run("simulate", "--scene", "room", *words).exit_code == 0
+    ok("simulate", "--scene", "room", *words)
     with io.load(out) as stored:
         outcome = reconstruct_stored(stored, ["maximum_likelihood"])["maximum_likelihood"].result
         ratio = outcome.reflectivity[0] / stored.reflectivity
@@ -58,8 +51,7 @@ OPTIONS = {"--bin-ps": 100, "--cycles": 20_000, "--dead-time-ns": 50, "--pulse-f
 def test_a_single_pixel_is_told_in_numbers_and_drawn_as_a_histogram(tmp_path):
     np.save(tmp_path / "hist.npy", ml.simulate(LIGHT, RECORDED, seed=1)[0, 0, 0])
     words = itertools.chain(*OPTIONS.items())
-    done = run("reconstruct", tmp_path / "hist.npy", *words, "-o", tmp_path / "maps.npz")
-    assert done.exit_code == 0, done.output
+    done = ok("reconstruct", tmp_path / "hist.npy", *words, "-o", tmp_path / "maps.npz")
     rows = [line for line in done.stdout.splitlines() if "±" in line]
     assert len(rows) == 1
     numbers = [float(number) for number in re.findall(r"[\d.]+", rows[0])]
@@ -83,8 +75,7 @@ def test_a_single_pixel_is_told_in_numbers_and_drawn_as_a_histogram(tmp_path):
 def test_a_single_pixel_of_a_wrong_system_is_warned_of(tmp_path, wrong):
     np.save(tmp_path / "hist.npy", ml.simulate(LIGHT, RECORDED, seed=1)[0, 0, 0])
     words = itertools.chain(*(OPTIONS | dict([wrong])).items())
-    done = run("reconstruct", tmp_path / "hist.npy", *words, "--no-picture", "-o", tmp_path / "maps.npz")
-    assert done.exit_code == 0, done.output
+    done = ok("reconstruct", tmp_path / "hist.npy", *words, "--no-picture", "-o", tmp_path / "maps.npz")
     assert "warning: maximum_likelihood: the histogram does not fit the estimate" in done.stderr
 
 
@@ -94,8 +85,7 @@ def test_maps_read_back(cube, tmp_path, suffix):
     out = tmp_path / f"maps{suffix}"
     picture = suffix == ".h5"
     words = () if picture else ("--no-picture",)
-    done = run("reconstruct", cube, "--method", "maximum_likelihood,peak", *words, "-o", out)
-    assert done.exit_code == 0, done.output
+    ok("reconstruct", cube, "--method", "maximum_likelihood,peak", *words, "-o", out)
     assert (tmp_path / "maps.png").exists() == picture
     assert not picture or (tmp_path / "maps.png").stat().st_size > 10_000
     assert not list(tmp_path.glob("*.incomplete"))
@@ -125,8 +115,7 @@ def test_several_returns_read_back(tmp_path, suffix):
     )
     out, cloud = tmp_path / f"maps{suffix}", tmp_path / "g.ply"
     words = ("--returns", 3, "--method", "maximum_likelihood", "--cloud", cloud, "--focal-px", 9)
-    done = run("reconstruct", tmp_path / "g.zarr", *words, "-o", out)
-    assert done.exit_code == 0, done.output
+    done = ok("reconstruct", tmp_path / "g.zarr", *words, "-o", out)
     assert (tmp_path / "maps.png").stat().st_size > 10_000
     head, line = done.stdout.splitlines()[1:3]
     assert "2 returns %" in head
@@ -153,11 +142,10 @@ def test_several_returns_read_back(tmp_path, suffix):
 def test_an_image_of_a_dim_cube(tmp_path, monkeypatch):
     """Rows are read in parts, the image is reconstructed whole; its maps are those of the array."""
     dim = ("--size", 24, "--cycles", 300, "--bins", 256, "--signal", 0.005, "--realizations", 2, "--no-picture")
-    assert run("simulate", "--scene", "room", *dim, "-o", tmp_path / "dim.zarr").exit_code == 0
+    ok("simulate", "--scene", "room", *dim, "-o", tmp_path / "dim.zarr")
     monkeypatch.setattr(recipes, "BLOCK_BYTES", 3 * 24 * 256 * 2)  # three rows at a time
     monkeypatch.setattr(stored_module, "_CHUNK_BYTES", 3 * 24 * 256 * 2)
-    done = run("reconstruct", tmp_path / "dim.zarr", "--method", "image,peak", "-o", tmp_path / "m.zarr")
-    assert done.exit_code == 0, done.output
+    ok("reconstruct", tmp_path / "dim.zarr", "--method", "image,peak", "-o", tmp_path / "m.zarr")
     result, _ = load_maps(tmp_path / "m.zarr")
     with io.load(tmp_path / "dim.zarr") as stored:
         direct = ml.reconstruct(stored, method="image")
@@ -168,8 +156,7 @@ def test_an_image_of_a_dim_cube(tmp_path, monkeypatch):
 
 
 def test_all_methods_and_errors_in_the_table(cube, tmp_path):
-    done = run("reconstruct", cube, "--method", "all", "--no-picture", "-o", tmp_path / "m.npz")
-    assert done.exit_code == 0, done.output
+    done = ok("reconstruct", cube, "--method", "all", "--no-picture", "-o", tmp_path / "m.npz")
     lines = {line.split()[0]: line.split() for line in done.stdout.splitlines()}
     free = [name for name, method in METHODS.items() if "nonparalyzable" in method.modes]
     assert set(free) <= set(lines)
@@ -190,9 +177,7 @@ def test_all_methods_and_errors_in_the_table(cube, tmp_path):
 )
 def test_bad_input(cube, tmp_path, monkeypatch, words, message):
     monkeypatch.chdir(tmp_path)
-    done = run("reconstruct", cube, *words)
-    assert done.exit_code == 2
-    assert message in done.stderr
+    fails(message, "reconstruct", cube, *words)
     assert not list(tmp_path.iterdir())
 
 
@@ -201,15 +186,14 @@ def test_nothing_is_overwritten_unasked(cube, tmp_path):
     out.write_text("mine")
     assert run("reconstruct", cube, "-o", out).exit_code == 2
     assert out.read_text() == "mine"
-    assert run("reconstruct", cube, "--no-picture", "--overwrite", "-o", out).exit_code == 0
+    ok("reconstruct", cube, "--no-picture", "--overwrite", "-o", out)
     assert load_maps(out)[0]["depth"].shape == (1, 2, 12, 12)
 
 
 def test_without_scikit_image_only_ssim_is_missing(cube, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "skimage", None)
     monkeypatch.setitem(sys.modules, "skimage.metrics", None)  # where another test has imported it
-    done = run("reconstruct", cube, "--no-picture", "-o", tmp_path / "m.npz")
-    assert done.exit_code == 0
+    done = ok("reconstruct", cube, "--no-picture", "-o", tmp_path / "m.npz")
     assert "mars-lidar[estimate]" in done.stderr
     assert "RMSE mm" in done.stdout
     assert "PSNR dB" in done.stdout

@@ -1,7 +1,5 @@
 """The processor in the place of a GPU: the kernels' source compiled for it, blocks and threads one after another."""
 
-from __future__ import annotations
-
 from pathlib import PurePath
 from typing import Any
 

@@ -1,7 +1,5 @@
 """NVRTC through its C interface: the kernels for a GPU compiled where there is none, and what ptxas says of them."""
 
-from __future__ import annotations
-
 import ctypes
 import re
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 Writes benchmarks/results/gpu-resources.md.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The kernels compile for GPUs, into registers, where there is none."""
 
-from __future__ import annotations
-
 import shutil
 from itertools import product
 from pathlib import Path
@@ -40,8 +38,7 @@ def nightly(*values: object) -> object:
 
 @pytest.mark.full
 @pytest.mark.parametrize(
-    ("architecture", "variants"),
-    [nightly("sm_80", BRIGHT[:2]), ("sm_90", [*BRIGHT, *OTHERS, *SINKS])],
+    ("architecture", "variants"), [nightly("sm_80", BRIGHT[:2]), ("sm_90", [*BRIGHT, *OTHERS, *SINKS])]
 )
 def test_compiles_without_spills(architecture: str, variants: list[Variant]):
     result = compiled([variant.kernel for variant in variants], architecture)

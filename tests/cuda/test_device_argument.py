@@ -1,17 +1,15 @@
 """device="cuda": what it refuses, with or without a GPU, and its bits where there is one."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from harness import make_system
+from harness import make_system, refused
 
 import mars_lidar as ml
-from tests.harness.command import command_line
+from tests.harness.command import fails
 
 FLUX = ml.Flux(np.full((2, 3), 2.0), 0.5, np.linspace(10.0, 80.0, 6).reshape(2, 3))
 SYSTEM = make_system(63.75, 500, 64, sigma_ns=0.5)
@@ -30,30 +28,23 @@ def test_engines_without_a_kernel_name_what_works(engine: str):
 
 def test_effects_and_waveforms_are_refused():
     jittery = make_system(63.75, 500, 64, sigma_ns=0.5, jitter=ml.Jitter(sigma_ns=0.1))
-    with pytest.raises(ValueError, match=r"'cuda' does not do jitter.*use device 'cpu'"):
-        ml.simulate(FLUX, jittery, device="cuda")
+    refused(r"'cuda' does not do jitter.*use device 'cpu'", ml.simulate, FLUX, jittery, device="cuda")
     wave = ml.Flux(waveform=np.full((1, 1, 8), 0.1), background=0.1)
-    with pytest.raises(ValueError, match=r"not a waveform, on device 'cuda'; use device 'cpu'"):
-        ml.simulate_timestamps(wave, SYSTEM, device="cuda")
+    refused(r"not a waveform, on device 'cuda'; use device 'cpu'", ml.simulate_timestamps, wave, SYSTEM, device="cuda")
 
 
 def test_without_cupy_the_extra_is_named(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "cupy", None)
     for call in (ml.simulate, ml.simulate_timestamps):
-        with pytest.raises(ImportError, match=r"mars-lidar\[cuda12\]"):
-            call(FLUX, SYSTEM, device="cuda")
+        refused(r"mars-lidar\[cuda12\]", call, FLUX, SYSTEM, device="cuda", error=ImportError)
 
 
 def test_the_command_line_says_what_is_missing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     monkeypatch.setitem(sys.modules, "cupy", None)
     out = tmp_path / "room.zarr"
     arguments = ["simulate", "--scene", "room", "--size", "4", "--cycles", "200", "--device", "cuda", "--out", str(out)]
-    done = command_line([*arguments, "--engine", "feedback"])
-    assert done.exit_code == 2
-    assert "mars-lidar[cuda12]" in done.stderr
-    done = command_line([*arguments, "--engine", "mars"])
-    assert done.exit_code == 2
-    assert "table must be given for engine 'mars' on device 'cuda'" in done.stderr
+    fails("mars-lidar[cuda12]", *arguments, "--engine", "feedback")
+    fails("table must be given for engine 'mars' on device 'cuda'", *arguments, "--engine", "mars")
     assert not out.exists()
 
 

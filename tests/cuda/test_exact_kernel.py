@@ -1,7 +1,5 @@
 """The GPU's kernel run on the processor, thread after thread: its bits are those of the exact engine."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

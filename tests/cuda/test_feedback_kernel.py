@@ -1,7 +1,5 @@
 """The kernel of the engine "feedback" run on the processor: its bits are those of the engine."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

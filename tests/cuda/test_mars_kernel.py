@@ -1,7 +1,5 @@
 """The kernels of the engine "mars" run on the processor: their bits are those of the engine."""
 
-from __future__ import annotations
-
 from functools import cache
 from typing import Any
 

@@ -1,12 +1,12 @@
 """A small recipe that every test of datasets begins with."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
 import pytest
 from harness import make_system
+
+import mars_lidar as ml
 
 SYSTEM = make_system(30.0, 50, 32)
 
@@ -27,3 +27,10 @@ def recipe() -> dict[str, Any]:
 def files(store: Path) -> dict[str, bytes]:
     """Every file of a store, by its path."""
     return {str(path.relative_to(store)): path.read_bytes() for path in sorted(store.rglob("*")) if path.is_file()}
+
+
+@pytest.fixture
+def whole(tmp_path, recipe) -> dict[str, bytes]:
+    """The files of a run that nothing stopped."""
+    ml.generate(recipe, tmp_path / "whole.zarr")
+    return files(tmp_path / "whole.zarr")

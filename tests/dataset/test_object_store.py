@@ -1,7 +1,5 @@
 """Datasets in an object store: moto's S3 server on this machine."""
 
-from __future__ import annotations
-
 import gc
 import logging
 import os
@@ -14,6 +12,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 from dataset.conftest import files
+from harness import refused
 
 import mars_lidar as ml
 from mars_lidar._base.files import FileError
@@ -64,14 +63,11 @@ def test_the_objects_are_the_files_of_a_folder(tmp_path, recipe, bucket):
     assert done.parts
     assert objects(f"{bucket}/one.zarr") == files(tmp_path / "one.zarr")
     assert verify(f"{bucket}/one.zarr", chunks=4).good
-    with pytest.raises(FileExistsError, match="exists already"):
-        ml.generate(recipe, f"{bucket}/one.zarr")
-    with pytest.raises(ValueError, match="is not overwritten"):
-        ml.generate(recipe, f"{bucket}/one.zarr", overwrite=True)
+    refused("exists already", ml.generate, recipe, f"{bucket}/one.zarr", error=FileExistsError)
+    refused("is not overwritten", ml.generate, recipe, f"{bucket}/one.zarr", overwrite=True)
     begin(recipe, f"{bucket}/two.zarr")
     make_part(f"{bucket}/two.zarr", (2, 2))
-    with pytest.raises(ValueError, match="are missing, the first"):
-        finish(f"{bucket}/two.zarr")
+    refused("are missing, the first", finish, f"{bucket}/two.zarr")
     command = [sys.executable, "-m", "mars_lidar", "generate", "-o", f"{bucket}/two.zarr"]
     assert subprocess.run([*command, "--part", "1/2"], env=os.environ).returncode == 0
     assert subprocess.run([*command, "--finish"], env=os.environ).returncode == 0
@@ -87,8 +83,7 @@ def test_what_was_stopped_goes_on(tmp_path, recipe, bucket):
 
     with pytest.raises(KeyboardInterrupt, match="marked incomplete: continue with --resume"):
         ml.generate(recipe, f"{bucket}/set.zarr", progress=progress, threads=1)
-    with pytest.raises(ValueError, match="is incomplete"):
-        open_dataset(f"{bucket}/set.zarr")
+    refused("is incomplete", open_dataset, f"{bucket}/set.zarr")
     ml.generate(None, f"{bucket}/set.zarr", resume=True)
     ml.generate(recipe, tmp_path / "one.zarr")
     assert objects(f"{bucket}/set.zarr") == files(tmp_path / "one.zarr")
@@ -119,8 +114,6 @@ def test_damage_is_an_error(recipe, bucket):
     content[10] ^= 1
     opened = open_dataset(f"{bucket}/set.zarr")
     system.pipe_file(name, bytes(content))
-    with pytest.raises(FileError, match="has changed since it was written"):
-        opened.read(name.partition("set.zarr/")[2])
+    refused("has changed since it was written", opened.read, name.partition("set.zarr/")[2], error=FileError)
     system.rm(name)
-    with pytest.raises(FileError, match="is missing"):
-        open_dataset(f"{bucket}/set.zarr")
+    refused("is missing", open_dataset, f"{bucket}/set.zarr", error=FileError)

@@ -1,12 +1,11 @@
 """Recipes: what they make, and errors that point at the line."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
 import yaml
 from dataset.conftest import SYSTEM
+from harness import refused
 
 from mars_lidar._base.yaml import read_yaml
 from mars_lidar.dataset import DatasetRecipe
@@ -84,8 +83,7 @@ def test_options_replace_values(write):
 )
 def test_errors_point_at_the_line(write, old, new, line, message):
     assert old in TEXT
-    with pytest.raises(ValueError, match=rf"recipe\.yaml:{line}: .*{message}"):
-        DatasetRecipe.load(write(TEXT.replace(old, new, 1)))
+    refused(rf"recipe\.yaml:{line}: .*{message}", DatasetRecipe.load, write(TEXT.replace(old, new, 1)))
 
 
 def test_errors_inside_of_a_system(write):
@@ -94,17 +92,14 @@ def test_errors_inside_of_a_system(write):
     assert DatasetRecipe.load(write(inline)).systems == (SYSTEM,)
     bad = inline.replace("cycles: 50", "cycles: 0")
     line = bad.splitlines().index("  cycles: 0") + 1
-    with pytest.raises(ValueError, match=rf"recipe\.yaml:{line}: cycles must be an integer"):
-        DatasetRecipe.load(write(bad))
+    refused(rf"recipe\.yaml:{line}: cycles must be an integer", DatasetRecipe.load, write(bad))
 
 
 def test_systems_must_agree_on_their_bins(recipe):
     recipe["systems"] = [SYSTEM, SYSTEM.replace(bins=64)]
-    with pytest.raises(ValueError, match="same number of bins, got 32 and 64"):
-        DatasetRecipe.from_dict(recipe)
+    refused("same number of bins, got 32 and 64", DatasetRecipe.from_dict, recipe)
     recipe["systems"] = [SYSTEM, SYSTEM]
-    with pytest.raises(ValueError, match="same as an earlier system"):
-        DatasetRecipe.from_dict(recipe)
+    refused("same as an earlier system", DatasetRecipe.from_dict, recipe)
 
 
 def test_blocks_are_runs_of_the_array():

@@ -1,7 +1,5 @@
 """What is not finished never looks complete, and what is resumed is byte for byte what would have been."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
@@ -13,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from dataset.conftest import SYSTEM, files
+from harness import refused
 
 import mars_lidar as ml
 from mars_lidar import io
@@ -49,13 +48,6 @@ def stopped(recipe: dict, out: Path, how: str, number: int) -> subprocess.Comple
     )
 
 
-@pytest.fixture
-def whole(tmp_path, recipe) -> dict[str, bytes]:
-    """The files of a run that nothing stopped."""
-    ml.generate(recipe, tmp_path / "whole.zarr")
-    return files(tmp_path / "whole.zarr")
-
-
 @pytest.mark.full
 @pytest.mark.skipif(os.name != "posix", reason="needs SIGKILL")
 @pytest.mark.parametrize(("how", "number"), [("kill", 1), ("kill", 11), ("int", 5), ("scenes", 0)])
@@ -68,8 +60,7 @@ def test_a_run_that_was_stopped_goes_on(tmp_path, recipe, whole, how, number):
         assert "continue with --resume" in ran.stdout
     else:
         assert ran.returncode == -signal.SIGKILL, ran.stderr
-    with pytest.raises(io.IncompleteFileError, match="generation did not finish"):
-        open_dataset(out)
+    refused("generation did not finish", open_dataset, out, error=io.IncompleteFileError)
     assert json.loads((out / "zarr.json").read_text())["attributes"]["complete"] is False
     if how == "kill":  # and what a killed writer leaves between its write and its rename
         (out / "histogram").mkdir(exist_ok=True)
@@ -85,8 +76,7 @@ def test_a_run_that_was_stopped_goes_on(tmp_path, recipe, whole, how, number):
 @pytest.mark.skipif(os.name != "posix", reason="needs SIGKILL")
 def test_without_its_scenes_a_store_needs_its_recipe(tmp_path, recipe):
     stopped(recipe, tmp_path / "set.zarr", "scenes", 0)
-    with pytest.raises(ValueError, match="give the recipe again"):
-        ml.generate(None, tmp_path / "set.zarr", resume=True)
+    refused("give the recipe again", ml.generate, None, tmp_path / "set.zarr", resume=True)
 
 
 @pytest.mark.full
@@ -111,8 +101,7 @@ def test_a_full_disk_is_told_and_the_run_goes_on_afterwards(tmp_path, recipe, wh
     assert "marked incomplete" in ran.stdout
     assert "GB free" in ran.stdout
     assert not list(out.rglob("*.partial"))
-    with pytest.raises(io.IncompleteFileError):
-        open_dataset(out)
+    refused("", open_dataset, out, error=io.IncompleteFileError)
     ml.generate(recipe, out, resume=True)
     assert files(out) == whole
 
@@ -123,8 +112,7 @@ def test_two_runs_do_not_write_one_store(tmp_path, recipe):
 
     with open(tmp_path / "set.zarr.lock", "w") as held:
         fcntl.flock(held, fcntl.LOCK_EX)
-        with pytest.raises(ValueError, match="being written by another process"):
-            ml.generate(recipe, tmp_path / "set.zarr")
+        refused("being written by another process", ml.generate, recipe, tmp_path / "set.zarr")
     ml.generate(recipe, tmp_path / "set.zarr")
 
 
@@ -165,8 +153,7 @@ def test_a_store_that_another_run_just_finished_is_not_replaced(tmp_path, recipe
         real(held, how)
 
     monkeypatch.setattr(fcntl, "flock", flock)
-    with pytest.raises(FileExistsError, match="exists already"):
-        ml.generate(recipe | {"seed": 99}, out)
+    refused("exists already", ml.generate, recipe | {"seed": 99}, out, error=FileExistsError)
     assert open_dataset(out).recipe.seed == recipe["seed"]
 
 
@@ -183,8 +170,7 @@ def test_what_is_taken_away_while_it_is_made_is_missed(tmp_path, recipe, what):
 
     with pytest.raises(OSError, match=r"removed while|has no zarr\.json|No such file|does not exist"):
         ml.generate(recipe, out, progress=progress, threads=1)
-    with pytest.raises((ValueError, FileNotFoundError)):
-        open_dataset(out)
+    refused("", open_dataset, out, error=(ValueError, FileNotFoundError))
 
 
 # --- Parts by processes that do not know of each other -------------------------------------------------------------
@@ -237,17 +223,13 @@ def test_finish_reads_no_shard_again(tmp_path, recipe, monkeypatch):
 
 def test_parts_that_cannot_be_made_are_refused(tmp_path, recipe, monkeypatch):
     out = tmp_path / "set.zarr"
-    with pytest.raises(FileNotFoundError):
-        make_part(out, (1, 2))
+    refused("", make_part, out, (1, 2), error=FileNotFoundError)
     begin(recipe, out)
     for part in ((0, 2), (3, 2)):
-        with pytest.raises(ValueError, match="must be an integer"):
-            make_part(out, part)
-    with pytest.raises(FileExistsError, match="exists already"):
-        begin(recipe, out)
+        refused("must be an integer", make_part, out, part)
+    refused("exists already", begin, recipe, out, error=FileExistsError)
     monkeypatch.setattr("mars_lidar.dataset.run.fingerprint", lambda: "other")
-    with pytest.raises(ValueError, match="draws other counts"):
-        make_part(out, (1, 2))
+    refused("draws other counts", make_part, out, (1, 2))
 
 
 # --- Scenes --------------------------------------------------------------------------------------------------------
@@ -285,8 +267,7 @@ def test_scenes_that_were_stopped_are_not_read_again(tmp_path, of_files, monkeyp
         yield from real(candidate, *rest)
 
     monkeypatch.setattr(ingest, "scenes", scenes)
-    with pytest.raises(io.Interrupted, match="continue with --resume"):
-        ml.generate(recipe, tmp_path / "set.zarr")
+    refused("continue with --resume", ml.generate, recipe, tmp_path / "set.zarr", error=io.Interrupted)
     ml.generate(recipe, tmp_path / "set.zarr", resume=True)
     assert len(calls) < 55  # 30, and those of the last shard of scenes
     assert files(tmp_path / "set.zarr") == files(tmp_path / "whole.zarr")

@@ -1,7 +1,5 @@
 """The page of claims names tests that exist, in the tier that it states."""
 
-from __future__ import annotations
-
 import ast
 import re
 from pathlib import Path

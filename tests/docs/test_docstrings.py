@@ -3,8 +3,6 @@
 Public is what the packages export and what the reference lists (docs/reference.md).
 """
 
-from __future__ import annotations
-
 import doctest
 import importlib
 import inspect

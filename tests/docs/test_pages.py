@@ -1,7 +1,5 @@
 """The pages' code: every block is run by `.ci/pages.py`, or says why not; the site names every page and public name."""
 
-from __future__ import annotations
-
 import ast
 import importlib.util
 import json
@@ -16,6 +14,7 @@ from types import ModuleType
 
 import pytest
 import yaml
+from harness import refused
 
 from studies import STUDIES
 
@@ -80,10 +79,8 @@ def test_an_unmarked_block_runs():
     pages.run_block(block, space)
     assert space["space"] == 1
     (failing,) = pages.blocks("```bash\nfalse\n```\n")
-    with pytest.raises(subprocess.CalledProcessError):
-        pages.run_block(failing, {})
-    with pytest.raises(SystemExit, match="nothing is known"):
-        pages.run_block(pages.blocks("```ruby\nputs 1\n```\n")[0], {})
+    refused("", pages.run_block, failing, {}, error=subprocess.CalledProcessError)
+    refused("nothing is known", pages.run_block, pages.blocks("```ruby\nputs 1\n```\n")[0], {}, error=SystemExit)
 
 
 def test_marks_are_read():

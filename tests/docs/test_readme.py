@@ -1,7 +1,5 @@
 """What README promises runs as written."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

@@ -5,8 +5,6 @@ A name of this package in backticks (`statistics.matched_pmf`, `System.start`, `
 reader follows, and so is `docs/table.md, section 3`: a rename that forgets it fails here.
 """
 
-from __future__ import annotations
-
 import ast
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """The built site in a browser: what a visitor must not meet, on every page, on a telephone and on a desk."""
 
-from __future__ import annotations
-
 import gzip
 import html
 import os

@@ -1,7 +1,5 @@
 """Cases for the feedback engine, and an engine that fails where it does not sample itself."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,11 +1,10 @@
 """Shapes moved by fractions of a bin, against exact statistics at the pixel's own delay."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from harness import make_system, require, two_lobes
 from harness.pvalues import goodness
+from native_jobs import align, shape_job
 
 import mars_lidar as ml
 from mars_lidar import _core
@@ -29,34 +28,11 @@ def system_of(sigma_bins: float, dead: float, **changes: object) -> ml.System:
 def moved(system: ml.System, signal: float, background: float, moves: np.ndarray, level: str = "") -> np.ndarray:
     """Shapes (moves, bins) by the native alignment."""
     canonical = exposure_moments(ml.Flux(signal, background, 50.0), system)
-    delay = 0.5 * PERIOD_NS + moves * BIN_NS
-    n = moves.size
+    n, delay = moves.size, 0.5 * PERIOD_NS + moves * BIN_NS
     rate = np.full(n, canonical.mean / system.cycles)
+    job = shape_job(as_shapes(canonical.histogram), n)
     alignment = Alignment.of(system, np.full(n, signal), np.full(n, background), delay, rate)
-    rows, weights = np.zeros((n, 4), np.int64), np.zeros((n, 4))
-    weights[:, 0] = 1.0
-    job = _core.ShapeJob(
-        shapes=as_shapes(canonical.histogram),
-        rows=rows,
-        weights=weights,
-        pixel_index=np.arange(n, dtype=np.uint32),
-        place=np.arange(n),
-        image=n,
-        realizations=1,
-        first_realization=0,
-        seed=1,
-    )
-    frame = alignment.frame
-    job.align(
-        shift=alignment.shift,
-        signal=alignment.signal,
-        background=alignment.background,
-        rate=alignment.rate,
-        dead_time=system.dead_time_periods,
-        first=frame.first,
-        cells=frame.cells,
-        energy=frame.energy,
-    )
+    align(job, alignment, system.dead_time_periods)
     out = np.empty((n, BINS))
     _core.shape_aligned(job, out, level)
     return out

@@ -3,38 +3,18 @@
 A new engine is one line in CLAIMS.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from harness import (
-    COUNTS,
-    INTERVALS,
-    JOINT,
-    PERIOD_NS,
-    REFERENCE_NAMES,
-    SHAPE,
-    Case,
-    JointLaw,
-    Law,
-    Reference,
-    armed_count_pmf,
-    check,
-    constant_rate_moments,
-    draw,
-    first_arrival,
-    flux_of,
-    make_system,
-    measured_pulse,
-    random_cases,
-    require,
-    stationary_count_pmf,
-    two_lobes,
-    two_mean_vectors,
-    waveform_flux,
-)
+from harness.cases import PERIOD_NS, Case, flux_of, make_system, measured_pulse, random_cases, two_lobes, waveform_flux
+from harness.check import COUNTS, INTERVALS, JOINT, SHAPE, check
+from harness.joint import JointLaw
+from harness.laws import Law, armed_count_pmf, constant_rate_moments, first_arrival, stationary_count_pmf
+from harness.ledger import require
+from harness.pvalues import two_mean_vectors
+from harness.reference import REFERENCE_NAMES, Reference
+from harness.sample import draw
 from scipy import stats
 
 from mars_lidar import Detector, GaussianPulse, SampledPulse
@@ -161,8 +141,7 @@ def test_the_law_of_the_arrivals_ignores_the_dead_time(engine: str, dead: float)
 @pytest.mark.full
 @pytest.mark.parametrize("start", ["armed", "stationary"])
 @pytest.mark.parametrize(
-    ("rate", "dead", "cycles"),
-    [(0.05, 0.1, 200), (1.0, 0.6375, 100), (6.0, 2.3, 40), (20.0, 0.3, 20), (2.0, 90.7, 50)],
+    ("rate", "dead", "cycles"), [(0.05, 0.1, 200), (1.0, 0.6375, 100), (6.0, 2.3, 40), (20.0, 0.3, 20), (2.0, 90.7, 50)]
 )
 @pytest.mark.parametrize("engine", WITH_DEAD_TIME)
 def test_constant_rate(engine: str, rate: float, dead: float, cycles: int, start: str):
@@ -269,14 +248,7 @@ def test_measured_pulse(engine: str, name: str, origin: str, start: str):
 @pytest.mark.full
 @pytest.mark.parametrize(
     ("signal", "dead", "cycles"),
-    [
-        (10.0, 0.99, 100),
-        (10.0, 1.9999, 100),
-        (3.0, 1.0, 150),
-        (3.0, 2.0, 150),
-        (1000.0, 0.6375, 4),
-        (30.0, 1e-3, 15),
-    ],
+    [(10.0, 0.99, 100), (10.0, 1.9999, 100), (3.0, 1.0, 150), (3.0, 2.0, 150), (1000.0, 0.6375, 4), (30.0, 1e-3, 15)],
 )
 @pytest.mark.parametrize("start", ["armed", "stationary"])
 @pytest.mark.parametrize("engine", sorted(set(WITH_DEAD_TIME) - {TRUTH}))

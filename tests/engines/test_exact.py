@@ -1,21 +1,12 @@
 """The exact engine by itself: random numbers, extremes of flux, dead time and exposure."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
-from harness import (
-    EVERYTHING,
-    Case,
-    armed_count_pmf,
-    check,
-    counts_against_law,
-    flux_of,
-    goodness,
-    make_system,
-    require,
-    two_lobes,
-)
+from harness.cases import Case, flux_of, make_system, two_lobes
+from harness.check import EVERYTHING, check
+from harness.laws import armed_count_pmf
+from harness.ledger import require
+from harness.pvalues import counts_against_law, goodness
 from native_emulation import threefry, words_of_key
 from scipy import stats
 
@@ -89,10 +80,7 @@ def test_phases_of_a_dim_background_have_no_lattice(photons: float):
 @pytest.mark.parametrize("photons", [1e-6, 1e-3])
 @pytest.mark.parametrize("name", ["gaussian", "lobes", "waveform"])
 def test_phases_of_a_dim_signal_have_no_lattice(name: str, photons: float):
-    pulse = {
-        "gaussian": ml.GaussianPulse(sigma_ns=5.0),
-        "lobes": ml.SampledPulse(two_lobes(), 0.8, "first"),
-    }.get(name)
+    pulse = {"gaussian": ml.GaussianPulse(sigma_ns=5.0), "lobes": ml.SampledPulse(two_lobes(), 0.8, "first")}.get(name)
     view = system(cycles=int(100 / photons), pulse=pulse or GAUSSIAN, bins=1)
     if name == "waveform":
         wave = two_lobes()

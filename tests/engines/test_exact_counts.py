@@ -1,7 +1,5 @@
 """Counts of pixels from a table whose four cumulants do not fix the law: kept by the table, or evaluated."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

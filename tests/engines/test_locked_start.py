@@ -1,14 +1,11 @@
 """Stationary starts where registrations lock to a bright pulse and drift through it slowly."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
-from harness import COUNTS, PERIOD_NS, SHAPE, Case, Law, check, flux_of, make_system
+from harness import COUNTS, PERIOD_NS, SHAPE, Case, check, flux_of, law_of, make_system
 
 import mars_lidar as ml
 from mars_lidar.engines import ENGINES
-from mars_lidar.statistics import count_law, exposure_moments
 
 GATE = {"mode": "gated", "gate_start_ns": 0.0, "gate_width_ns": PERIOD_NS}
 
@@ -19,26 +16,16 @@ GATE = {"mode": "gated", "gate_start_ns": 0.0, "gate_width_ns": PERIOD_NS}
 def test_a_locked_pixel_starts_as_the_statistics_say(dead: float, detector: dict[str, object]):
     """A grid that blurs each turn by a part of a bin puts 0.001 registrations too many into each period."""
     system = make_system(dead * PERIOD_NS, 12, 64, sigma_ns=0.5, start="stationary", **detector)
-    law = count_law(ml.Flux(20.0, 0.05, 37.0), system)
-    pmf = np.zeros(law.support[-1] + 1)
-    pmf[law.support] = law.pmf
-    histogram = exposure_moments(ml.Flux(20.0, 0.05, 37.0), system).histogram
     case = Case(f"locked, t_d {dead:g}", flux_of(20.0, 0.05, 0.37), system, 80_000)
-    check(ENGINES["exact"], case, Law(histogram, pmf), {COUNTS, SHAPE})
+    check(ENGINES["exact"], case, law_of(ml.Flux(20.0, 0.05, 37.0), system), {COUNTS, SHAPE})
 
 
 @pytest.mark.full
 def test_the_sequential_engine_begins_in_any_phase_of_a_slow_drift():
     """A round of the phase through the pulse took 200 turns, but began within 64: half too large a variance."""
-    pulse = ml.GaussianPulse(sigma_ns=0.01 * PERIOD_NS)
-    detector = ml.Detector(dead_time_ns=PERIOD_NS)
-    system = ml.System(period_ns=PERIOD_NS, cycles=12, bins=64, pulse=pulse, start="stationary", detector=detector)
-    law = count_law(ml.Flux(200.0, 0.01, 37.0), system)
-    pmf = np.zeros(law.support[-1] + 1)
-    pmf[law.support] = law.pmf
-    histogram = exposure_moments(ml.Flux(200.0, 0.01, 37.0), system).histogram
+    system = make_system(PERIOD_NS, 12, 64, start="stationary")
     case = Case("drift through a bright pulse", flux_of(200.0, 0.01, 0.37), system, 1000)
-    check(ENGINES["sequential"], case, Law(histogram, pmf), {COUNTS})
+    check(ENGINES["sequential"], case, law_of(ml.Flux(200.0, 0.01, 37.0), system), {COUNTS})
 
 
 @pytest.mark.parametrize("signal", [3.0, 160.0])

@@ -1,13 +1,12 @@
 """Photons one by one out of a table's rows: the law of the shape that would be formed from them."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np
 import pytest
 from harness import goodness, make_system, require
 from harness.pvalues import bonferroni, variance_score
+from native_jobs import align, shape_job
 from scipy import stats
 
 import mars_lidar as ml
@@ -49,28 +48,8 @@ class Pixels:
         self.guides = np.zeros((len(rows_of), 64), np.float32)
 
     def job(self, realizations: int, guided: bool = True) -> _core.ShapeJob:
-        move = self.alignment
-        job = _core.ShapeJob(
-            shapes=self.shapes,
-            rows=self.rows,
-            weights=self.weights,
-            pixel_index=np.arange(self.n, dtype=np.uint32),
-            place=np.arange(self.n),
-            image=self.n,
-            realizations=realizations,
-            first_realization=0,
-            seed=self.seed,
-        )
-        job.align(
-            shift=move.shift,
-            signal=move.signal,
-            background=move.background,
-            rate=move.rate,
-            dead_time=self.system.dead_time_periods,
-            first=move.frame.first,
-            cells=move.frame.cells,
-            energy=move.frame.energy,
-        )
+        job = shape_job(self.shapes, self.n, realizations, self.seed, self.rows, self.weights)
+        align(job, self.alignment, self.system.dead_time_periods)
         if guided:
             job.guide(guides=self.guides, threads=2)
         return job

@@ -1,7 +1,5 @@
 """The renewal baseline: its own count law, the chain's shape at the pixel's delay."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from harness import counts_against_law, make_system, require

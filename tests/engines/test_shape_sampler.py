@@ -1,11 +1,10 @@
 """The native sampler by itself: Multinomial(N, shape) whatever way it takes, the same bits at every level."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
-from harness import goodness, require
+from harness import goodness, refused, require
 from harness.pvalues import bonferroni, mean_vector, variance_score
+from native_jobs import shape_job
 from scipy import stats
 
 from mars_lidar import _core
@@ -21,23 +20,13 @@ def peaked(bins: int) -> np.ndarray:
     return (shape / shape.sum()).astype(np.float32)
 
 
-def sample(shape: np.ndarray, counts: np.ndarray, *, seed: int = 1, level: str = "", threads: int = 2) -> np.ndarray:
+def sample(
+    shape: np.ndarray, counts: np.ndarray, *, seed: int = 1, level: str = "", threads: int = 2, dtype: type = np.uint32
+) -> np.ndarray:
     """Histograms (realizations, pixels, bins) of counts (realizations, pixels), all pixels of one shape."""
     realizations, pixels = counts.shape
-    rows, weights = np.zeros((pixels, 4), np.int64), np.zeros((pixels, 4))
-    weights[:, 0] = 1.0
-    job = _core.ShapeJob(
-        shapes=shape[None],
-        rows=rows,
-        weights=weights,
-        pixel_index=np.arange(pixels, dtype=np.uint32),
-        place=np.arange(pixels),
-        image=pixels,
-        realizations=realizations,
-        first_realization=0,
-        seed=seed,
-    )
-    out = np.empty((realizations * pixels, shape.size), np.uint32)
+    out = np.empty((realizations * pixels, shape.size), dtype)
+    job = shape_job(shape[None], pixels, realizations, seed)
     _core.shape_histogram(job, np.ascontiguousarray(counts, dtype=np.int64), out, threads, level, None)
     return out.reshape(realizations, pixels, shape.size)
 
@@ -92,26 +81,6 @@ def test_any_number_of_bins_and_every_level(bins: int):
 
 def test_a_bin_that_is_too_full_is_an_error():
     shape = np.array([1.0, 0.0, 0.0], np.float32)
-    with pytest.raises(OverflowError, match="65535"):
-        small(shape, 70_000)
-    assert small(shape, 65_535)[0, 0] == 65_535
-    with pytest.raises(OverflowError, match="4294967295"):
-        sample(shape, np.array([[2**32]]))
-
-
-def small(shape: np.ndarray, photons: int) -> np.ndarray:
-    rows, weights = np.zeros((1, 4), np.int64), np.array([[1.0, 0, 0, 0]])
-    job = _core.ShapeJob(
-        shapes=shape[None],
-        rows=rows,
-        weights=weights,
-        pixel_index=np.zeros(1, np.uint32),
-        place=np.zeros(1, np.int64),
-        image=1,
-        realizations=1,
-        first_realization=0,
-        seed=1,
-    )
-    out = np.empty((1, shape.size), np.uint16)
-    _core.shape_histogram(job, np.array([[photons]]), out, 1, "", None)
-    return out
+    refused("65535", sample, shape, np.array([[70_000]]), dtype=np.uint16, error=OverflowError)
+    assert sample(shape, np.array([[65_535]]), dtype=np.uint16)[0, 0, 0] == 65_535
+    refused("4294967295", sample, shape, np.array([[2**32]]), error=OverflowError)

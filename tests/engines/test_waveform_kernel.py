@@ -1,10 +1,8 @@
 """The exact engine for waveforms where its tables are hardest: edges that meet, parts of hardly any energy, sizes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
-from harness import COUNTS, SHAPE, Case, Law, check, first_arrival, make_system, require, waveform_flux
+from harness import COUNTS, SHAPE, Case, Law, check, first_arrival, make_system, pmf_of, require, waveform_flux
 from scipy import stats
 
 import mars_lidar as ml
@@ -118,9 +116,7 @@ def test_dim_and_bright_pixels_against_the_count_law(dead: float):
         system = view(dead, cycles)
         case = Case(f"{photons:g} photons, t_d {dead:g}", waveform_flux(wave), system, 20_000 if dead else 4000)
         if dead:
-            law = ml.count_law(ml.Flux(waveform=wave), system)
-            pmf = np.zeros(int(law.support[-1]) + 1)
-            pmf[law.support] = law.pmf
+            pmf = pmf_of(ml.count_law(ml.Flux(waveform=wave), system))
         else:
             mean = photons * cycles
             pmf = stats.poisson.pmf(np.arange(int(mean + 60 * mean**0.5 + 60)), mean)

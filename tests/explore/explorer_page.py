@@ -1,7 +1,5 @@
 """The explorer's page in a headless browser, for tests: skipped, saying so, where there is none."""
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import shutil

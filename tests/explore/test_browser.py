@@ -1,7 +1,5 @@
 """The page in a browser, without a network: the package's bits, Python's values, clicks, keys, links, no complaint."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import re
@@ -21,29 +19,10 @@ from mars_lidar.statistics import count_law, joint_law, mean_histogram, photons_
 
 pytestmark = pytest.mark.full
 
-BASE: dict[str, Any] = {
-    "signal": 1,
-    "background": 0.2,
-    "delay": 40,
-    "sigma": 1,
-    "dead": 50,
-    "cycles": 10000,
-    "bins": 128,
-    "period": 100,
-    "second": 0,
-    "gap": 15,
-    "efficiency": 1,
-    "dark": 0,
-    "jitter": 0,
-    "afterpulses": 0,
-    "trapDelay": 50,
-    "twilight": 0,
-    "electronics": 0,
-    "seed": 1,
-    "mode": "nonparalyzable",
-    "start": "armed",
-    "pixel": -1,
-}
+BASE: dict[str, Any] = {"signal": 1, "background": 0.2, "delay": 40, "sigma": 1, "dead": 50, "cycles": 10000}
+BASE |= {"bins": 128, "period": 100, "second": 0, "gap": 15, "efficiency": 1, "dark": 0, "jitter": 0, "afterpulses": 0}
+BASE |= {"trapDelay": 50, "twilight": 0, "electronics": 0, "seed": 1, "mode": "nonparalyzable", "start": "armed"}
+BASE |= {"pixel": -1}
 STATES: dict[str, dict[str, Any]] = {
     "free running": {},
     "dead time of many periods": {"dead": 133},

@@ -1,7 +1,5 @@
 """The committed page is made of these sources, small, and draws golden cubes with the bits of the package's tests."""
 
-from __future__ import annotations
-
 import base64
 import gzip
 import hashlib

@@ -1,7 +1,5 @@
 """`mars-lidar explore`: what the server answers, whom it refuses, how it ends; and the page with a stored cube."""
 
-from __future__ import annotations
-
 import contextlib
 import http.client
 import json
@@ -20,14 +18,14 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 from explorer_page import Page, chromium
-from harness import make_system
+from harness import make_system, refused
 
 import mars_lidar as ml
 from mars_lidar import explore, io
 from mars_lidar.explore import CubeServer, page_text
 from mars_lidar.explore.server import settings_of
 from mars_lidar.reconstruction import reconstruct
-from tests.harness.command import command_line
+from tests.harness.command import command_line, fails
 
 SHAPE = (9, 14)
 
@@ -194,8 +192,7 @@ def test_silent_connections_hold_few_threads_and_end(monkeypatch):
 
 def test_a_port_in_use_is_named(server: CubeServer):
     port = urlsplit(server.url).port
-    with pytest.raises(OSError, match=rf"port {port} of 127\.0\.0\.1: .*in use; give another \(--port\)"):
-        CubeServer(port=port)
+    refused(rf"port {port} of 127\.0\.0\.1: .*in use; give another \(--port\)", CubeServer, port=port, error=OSError)
 
 
 def test_what_the_sliders_cannot_tell():
@@ -213,16 +210,13 @@ def test_what_the_sliders_cannot_tell():
 
 def test_an_installation_without_the_page(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     monkeypatch.setattr(explore.server, "files", lambda _: tmp_path)
-    with pytest.raises(FileNotFoundError, match="explorer/build"):
-        page_text()
+    refused("explorer/build", page_text, error=FileNotFoundError)
     result = command_line(["explore", "--no-browser"])
     assert result.exit_code == 2
 
 
 def test_bad_input():
-    result = command_line(["explore", "nothing.zarr", "--no-browser"])
-    assert result.exit_code == 2
-    assert "does not exist" in result.stderr
+    fails("does not exist", "explore", "nothing.zarr", "--no-browser")
 
 
 @pytest.mark.full

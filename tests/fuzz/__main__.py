@@ -1,7 +1,5 @@
 """Hours of it: ``python -m tests.fuzz --examples 2000``; a table of counts, and every bad input kept beside it."""
 
-from __future__ import annotations
-
 import argparse
 import collections
 import datetime

@@ -1,7 +1,5 @@
 """Single bits flipped in files that we write, data and metadata alike: ``python -m tests.fuzz.flips``."""
 
-from __future__ import annotations
-
 import argparse
 import collections
 import hashlib

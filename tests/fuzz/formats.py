@@ -1,7 +1,5 @@
 """A small good file of every format, and what reads all of it."""
 
-from __future__ import annotations
-
 import atexit
 import shutil
 import tempfile

@@ -4,8 +4,6 @@ Afterwards nothing under the final name may be half written, what was there befo
 whole, and the same command must succeed when it is repeated.
 """
 
-from __future__ import annotations
-
 import argparse
 import collections
 import os

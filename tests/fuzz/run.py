@@ -1,7 +1,5 @@
 """Mutations of one format, drawn by Hypothesis from a seed."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Reads files, each in a process of its own with limits of memory and CPU time, and says what became of it."""
 
-from __future__ import annotations
-
 import json
 import os
 import resource

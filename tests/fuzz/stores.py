@@ -5,8 +5,6 @@ with another seed, replaced or deleted; or the whole store is replaced or delete
 afterwards must be the one that was stored when it was opened, or an error must name the store.
 """
 
-from __future__ import annotations
-
 import argparse
 import collections
 import pickle
@@ -127,7 +125,7 @@ def attacks(folder: Path, number: int, seed: int) -> Iterator[tuple[str, str, st
         shutil.copytree(folder / f"a{name}", store)
         good = [np.array(part) for part in opened(reader, store)()]
         after = bool(k // len(READERS) % 2)
-        kind = ATTACKS[int(random.integers(len(ATTACKS)))]
+        kind = ATTACKS[k // (2 * len(READERS)) % len(ATTACKS)]
         if not after and kind == "replace_store":
             kind = "swap"  # a whole store is another store
         note, outcome = "", "same"

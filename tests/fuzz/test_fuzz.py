@@ -1,7 +1,5 @@
 """A minute of `python -m tests.fuzz`, of a fixed seed: all that a damaged file may do is to be refused by its name."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 
@@ -11,11 +9,13 @@ pytest.importorskip("hypothesis")
 if os.name != "posix":
     pytest.skip("needs fork", allow_module_level=True)
 
+from tests.fuzz import flips
 from tests.fuzz.formats import READERS, make
 from tests.fuzz.run import BAD, fuzz
 from tests.fuzz.server import Server
 
 EXAMPLES = 8
+FLIPS = int(os.environ.get("MARS_LIDAR_FLIPS", "30"))
 
 
 @pytest.fixture(scope="module")
@@ -70,3 +70,13 @@ def test_the_server_names_each_fault(tmp_path, server, strict_server):
         (tmp_path / "a.py").write_text(code)
         reader = strict_server if name in ("hang", "slow") else server
         assert reader.read("<run>", tmp_path / "a.py")["kind"] == {"slow": "hang", "large": "memory"}.get(name, name)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("name", flips.READERS)
+def test_every_flipped_bit_is_found(good, name):
+    """Data and metadata: refused by the file's name or read as before; `verify` finds each bit of a store."""
+    folder, _ = good
+    for kind, verified, where in flips.flips(name, folder / name, FLIPS, 20261122):
+        assert kind in ("refused", "same"), where
+        assert verified or not (folder / name).is_dir(), where

@@ -1,18 +1,17 @@
 """Some of `python -m tests.fuzz.stores`: what was opened is what is read, or an error names the store."""
 
-from __future__ import annotations
-
 import pytest
 
 pytest.importorskip("torch")
 
-from tests.fuzz.stores import READERS, attacks, make
+from tests.fuzz.stores import ATTACKS, READERS, attacks, make
 
 
 @pytest.mark.parametrize("seed", [3, pytest.param(20261123, marks=pytest.mark.full)])
 def test_attacked_stores_are_refused_or_the_same(tmp_path, seed):
     make(tmp_path)
-    number = 2 * len(READERS) if seed == 3 else 8 * len(READERS)
+    every = 2 * len(READERS) * len(ATTACKS)  # before and after opening
+    number = every // 8 if seed == 3 else every
     outcomes = list(attacks(tmp_path, number, seed))
     assert len(outcomes) == number
     assert [row for row in outcomes if row[2] not in ("refused", "same")] == []

@@ -27,52 +27,17 @@ from harness.cases import (
 )
 from harness.check import COUNTS, EVERYTHING, INTERVALS, JOINT, SHAPE, check, compare
 from harness.joint import JointLaw
-from harness.laws import Law, armed_count_pmf, constant_rate_moments, first_arrival, stationary_count_pmf
+from harness.laws import (
+    Law,
+    armed_count_pmf,
+    constant_rate_moments,
+    first_arrival,
+    law_of,
+    pmf_of,
+    stationary_count_pmf,
+)
 from harness.ledger import FAMILY_LEVEL, LEVEL, rejected, require
 from harness.pvalues import bonferroni, counts_against_law, goodness, mean_vector, same_law, two_mean_vectors
 from harness.reference import REFERENCE_NAMES, Reference
+from harness.refusal import refused
 from harness.sample import Sample, draw, task_of
-
-__all__ = [
-    "COUNTS",
-    "EVERYTHING",
-    "FAMILY_LEVEL",
-    "GATE",
-    "INTERVALS",
-    "JOINT",
-    "LEVEL",
-    "PERIOD_NS",
-    "REFERENCE_NAMES",
-    "SHAPE",
-    "WAVE",
-    "Case",
-    "JointLaw",
-    "Law",
-    "Reference",
-    "Sample",
-    "armed_count_pmf",
-    "bonferroni",
-    "check",
-    "compare",
-    "constant_rate_moments",
-    "counts_against_law",
-    "draw",
-    "first_arrival",
-    "flux_of",
-    "goodness",
-    "mean_vector",
-    "make_system",
-    "measured_pulse",
-    "case",
-    "random_cases",
-    "rejected",
-    "require",
-    "same_law",
-    "shared",
-    "stationary_count_pmf",
-    "system_of",
-    "task_of",
-    "two_lobes",
-    "two_mean_vectors",
-    "waveform_flux",
-]

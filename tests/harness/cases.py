@@ -55,14 +55,7 @@ def make_system(
     )
 
 
-def system_of(
-    dead: float,
-    cycles: int = 1000,
-    bins: int = 64,
-    *,
-    sigma: float = 0.00375,
-    **more: Any,
-) -> System:
+def system_of(dead: float, cycles: int = 1000, bins: int = 64, *, sigma: float = 0.00375, **more: Any) -> System:
     """The same by its dead time and pulse in periods of 100 ns."""
     return make_system(dead * PERIOD_NS, cycles, bins, sigma_ns=sigma * PERIOD_NS, **more)
 
@@ -90,8 +83,7 @@ def flux_of(signal: ArrayLike, background: float, delay: ArrayLike = 0.5, period
 def waveform_flux(waveform: ArrayLike, background: float = 0.0) -> Flux:
     """Alike pixels with a waveform (T,)."""
     return Flux(
-        waveform=np.broadcast_to(np.asarray(waveform, float), (1, _PIXELS, np.size(waveform))),
-        background=background,
+        waveform=np.broadcast_to(np.asarray(waveform, float), (1, _PIXELS, np.size(waveform))), background=background
     )
 
 

@@ -1,7 +1,5 @@
 """`check`: does an engine reproduce what it claims to?"""
 
-from __future__ import annotations
-
 from collections.abc import Collection
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The command line run in this process: its exit code and what it prints."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import signal
@@ -37,7 +35,7 @@ class _Stream(io.StringIO):
         return super().write(text)
 
 
-def command_line(arguments: Sequence[str], *, input: str = "", main: Callable[[Sequence[str]], int] = main) -> Done:
+def command_line(arguments: Sequence[object], *, input: str = "", main: Callable[[Sequence[str]], int] = main) -> Done:
     """Run ``mars-lidar ARGUMENTS``, or another `main`."""
     both = io.StringIO()
     out, err, stdin = _Stream(both), _Stream(both), sys.stdin
@@ -48,6 +46,26 @@ def command_line(arguments: Sequence[str], *, input: str = "", main: Callable[[S
         finally:
             sys.stdin = stdin
     return Done(code, out.getvalue(), err.getvalue(), both.getvalue())
+
+
+def run(*arguments: object) -> Done:
+    """Run ``mars-lidar ARGUMENTS``."""
+    return command_line(arguments)
+
+
+def ok(*arguments: object) -> Done:
+    """Run ``mars-lidar ARGUMENTS``, which succeeds."""
+    done = run(*arguments)
+    assert done.exit_code == 0, done.output
+    return done
+
+
+def fails(words: str, *arguments: object) -> Done:
+    """Run ``mars-lidar ARGUMENTS``, which ends with 2 and these words on standard error, however they are wrapped."""
+    done = run(*arguments)
+    assert done.exit_code == 2, done.output
+    assert words in " ".join(done.stderr.split()), done.output
+    return done
 
 
 def options_of(*commands: str, app: App = mars_lidar) -> dict[str, Argument]:

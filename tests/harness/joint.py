@@ -1,7 +1,5 @@
 """The closed-form mean and covariance of the histogram (`mars_lidar.joint_law`) as an oracle for every engine."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,8 +9,6 @@ import mars_lidar as ml
 from harness.cases import Case
 from harness.pvalues import merge
 
-_SAMPLES = 2**14  # of a waveform that stands for several returns
-
 
 @dataclass(frozen=True, eq=False)
 class JointLaw:
@@ -21,24 +17,9 @@ class JointLaw:
     law: ml.JointLaw
 
     @classmethod
-    def of(cls, case: Case, tolerance: float = 3e-4) -> JointLaw:
+    def of(cls, case: Case, tolerance: float = 3e-4) -> "JointLaw":
         """The law of the case's pixel; None of its engines is asked."""
-        flux, system = case.flux, case.system
-        background = float(flux.background[0, 0])
-        if flux.waveform is not None:
-            return cls(
-                ml.joint_law(ml.Flux(waveform=flux.waveform[0, 0], background=background), system, tolerance=tolerance)
-            )
-        signals, delays = flux.returns_signal[:, 0, 0], flux.returns_delay_ns[:, 0, 0]
-        if len(signals) == 1:
-            return cls(
-                ml.joint_law(ml.Flux(float(signals[0]), background, float(delays[0])), system, tolerance=tolerance)
-            )
-        wave = sum(
-            s * np.maximum(system.pulse.bin_energy(tau, system.period_ns, _SAMPLES), 0.0)
-            for s, tau in zip(signals, delays, strict=True)
-        )
-        return cls(ml.joint_law(ml.Flux(waveform=wave, background=background), system, tolerance=tolerance))
+        return cls(ml.joint_law(case.flux[0, 0], case.system, tolerance=tolerance))
 
     def cells(self, items: int, most: int) -> NDArray[np.float64]:
         """(cells, bins) weights of at most `most` cells, each with 500 registrations in `items` exposures."""

@@ -1,13 +1,13 @@
 """Closed forms (Coates 1968; renewal theory of the constant rate) as oracles. Times in laser periods."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import integrate, special
+
+import mars_lidar as ml
 
 Floats = NDArray[np.float64]
 
@@ -44,10 +44,7 @@ def stationary_count_pmf(rate: float, dead: float, exposure: float, most: int) -
     edges = np.linspace(0.0, min(dead, exposure), parts + 1)
     blind = sum(
         integrate.fixed_quad(
-            lambda r: np.array([armed_survival(n, rate, dead, exposure - x) for x in np.atleast_1d(r)]).T,
-            a,
-            b,
-            n=12,
+            lambda r: np.array([armed_survival(n, rate, dead, exposure - x) for x in np.atleast_1d(r)]).T, a, b, n=12
         )[0]
         for a, b in itertools.pairwise(edges)
     )
@@ -71,3 +68,15 @@ def first_arrival(photons: ArrayLike) -> Floats:
     l_j = np.asarray(photons, float)
     before = np.concatenate([[0.0], np.cumsum(l_j)[:-1]])
     return np.asarray(-np.expm1(-l_j) * np.exp(-before))
+
+
+def pmf_of(law: ml.CountLaw) -> Floats:
+    """P(N = 0), P(N = 1), ... of the package's law of one pixel."""
+    pmf = np.zeros(int(law.support[-1]) + 1)
+    pmf[law.support] = law.pmf
+    return pmf
+
+
+def law_of(flux: ml.Flux, system: ml.System) -> Law:
+    """What the package states of one pixel: the law of its count and its mean histogram."""
+    return Law(ml.mean_histogram(flux, system), pmf_of(ml.count_law(flux, system)))

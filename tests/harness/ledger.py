@@ -1,7 +1,5 @@
 """The account of all statistical checks: one level for each, the family's level by Bonferroni."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 
 LEVEL = 1e-7  # of each check: 5.3 standard deviations

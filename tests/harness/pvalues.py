@@ -6,8 +6,6 @@ over-dispersed, so the covariance comes from the sample: Hotelling's T^2 for all
 largest single z by Bonferroni for a deviation of one component; each takes half of the level.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats

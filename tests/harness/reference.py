@@ -1,7 +1,5 @@
 """Ten cases from an independent photon-by-photon simulator (../shared/reference)."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 
@@ -11,16 +9,8 @@ from numpy.typing import NDArray
 from harness.cases import Case, flux_of, shared, system_of
 
 REFERENCE_NAMES = (
-    "s01_mid",
-    "s02_bright",
-    "s03_dim",
-    "s04_saturated",
-    "s05_shortdead",
-    "s06_longdead",
-    "s07_wrap",
-    "s08_fewphotons",
-    "s09_hw_bright",
-    "s10_resonant",
+    *("s01_mid", "s02_bright", "s03_dim", "s04_saturated", "s05_shortdead", "s06_longdead", "s07_wrap"),
+    *("s08_fewphotons", "s09_hw_bright", "s10_resonant"),
 )
 
 
@@ -46,7 +36,7 @@ class Reference:
     window_var: float
 
     @classmethod
-    def load(cls, name: str) -> Reference:
+    def load(cls, name: str) -> "Reference":
         """Skips the test, saying so, where the cases are not there."""
         data = json.loads(shared(f"reference/{name}.json").read_text())
         numbers = {int(n): k for n, k in data["count"].items()}

@@ -1,7 +1,5 @@
 """What an engine drew for a case."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

@@ -1,7 +1,5 @@
 """A study in its quick form, run through the command."""
 
-from __future__ import annotations
-
 import csv
 from dataclasses import dataclass
 from pathlib import Path

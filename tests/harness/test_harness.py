@@ -3,8 +3,6 @@
 False alarms of the second kind of test are counted like all others; the first kind shows power.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from dataclasses import replace
 from typing import Any
@@ -14,32 +12,13 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from harness import (
-    COUNTS,
-    EVERYTHING,
-    JOINT,
-    LEVEL,
-    PERIOD_NS,
-    SHAPE,
-    Case,
-    JointLaw,
-    Law,
-    Reference,
-    armed_count_pmf,
-    bonferroni,
-    compare,
-    constant_rate_moments,
-    flux_of,
-    goodness,
-    make_system,
-    mean_vector,
-    rejected,
-    require,
-    same_law,
-    stationary_count_pmf,
-    two_mean_vectors,
-)
-from harness.pvalues import merge, variance_score
+from harness.cases import PERIOD_NS, Case, flux_of, make_system
+from harness.check import COUNTS, EVERYTHING, JOINT, SHAPE, compare
+from harness.joint import JointLaw
+from harness.laws import Law, armed_count_pmf, constant_rate_moments, stationary_count_pmf
+from harness.ledger import LEVEL, rejected, require
+from harness.pvalues import bonferroni, goodness, mean_vector, merge, same_law, two_mean_vectors, variance_score
+from harness.reference import Reference
 from harness.sample import draw
 from mars_lidar import Detector, Flux, GaussianPulse, count_law
 from mars_lidar.engines import ENGINES, Engine
@@ -47,12 +26,7 @@ from mars_lidar.engines.engine import PhaseRecords, Records, Task
 
 EXACT = ENGINES["exact"]
 HISTOGRAMS = {COUNTS, SHAPE, JOINT}
-MID = Case(
-    "mid",
-    flux_of(2.0, 1.0),
-    make_system(63.75, 100, 64, sigma_ns=1.5),
-    6000,
-)
+MID = Case("mid", flux_of(2.0, 1.0), make_system(63.75, 100, 64, sigma_ns=1.5), 6000)
 REPELLING = replace(MID, flux=flux_of(2.0, 5.0), system=MID.system.replace(detector=Detector(dead_time_ns=10.0)))
 
 
@@ -237,10 +211,7 @@ def test_p_values_of_hotelling_are_uniform_for_correlated_bins():
     mixing = random.normal(size=(12, 12)) @ np.diag(np.geomspace(1, 1e-3, 12))
     p = [two_mean_vectors(*(random.normal(size=(2, 300, 12)) @ mixing)) for _ in range(400)]
     q = [mean_vector(random.normal(size=(300, 12)) @ mixing, np.zeros(12)) for _ in range(400)]
-    require(
-        {f"below {a}": stats.binom.sf((np.array(p + q) < a).sum() - 1, 800, a) for a in (0.01, 0.1)},
-        "Hotelling",
-    )
+    require({f"below {a}": stats.binom.sf((np.array(p + q) < a).sum() - 1, 800, a) for a in (0.01, 0.1)}, "Hotelling")
     assert np.mean(np.array(p) < 0.2) > 0.08  # Bonferroni costs at most half
 
 
@@ -284,12 +255,7 @@ def test_a_variance_that_cannot_be_seen():
 @pytest.mark.parametrize(("dead", "differ"), [(0.9, 0), (0.893, 20)])
 def test_a_locked_pixel_is_right_and_a_wrong_one_is_found(dead: float, differ: int):
     """So bright that counts repeat: the engine agrees with the exact law, and one period less does not."""
-    locked = Case(
-        "locked",
-        flux_of(0.0, 300.0),
-        make_system(dead * PERIOD_NS, 60, 16, sigma_ns=1.5),
-        2000,
-    )
+    locked = Case("locked", flux_of(0.0, 300.0), make_system(dead * PERIOD_NS, 60, 16, sigma_ns=1.5), 2000)
     exact = count_law(Flux(0.0, 300.0), locked.system)
     pmf = np.zeros(exact.support[-1] + 1)
     pmf[exact.support] = exact.pmf

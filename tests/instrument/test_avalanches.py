@@ -1,26 +1,13 @@
 """Afterpulses, twilight pulses and crosstalk: engines against each other and closed forms, bits, what is refused."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from harness import (
-    GATE,
-    PERIOD_NS,
-    WAVE,
-    Case,
-    case,
-    draw,
-    make_system,
-    require,
-    two_lobes,
-    two_mean_vectors,
-)
-from instrument.effect_checks import exact_against_sequential, exact_bits_do_not_depend, mean_is
+from harness import GATE, PERIOD_NS, WAVE, Case, case, draw, make_system, refused, require, two_lobes, two_mean_vectors
+from instrument.effect_checks import bits_do_not_depend, exact_against_sequential, mean_is
 from scipy import stats
 from test_reproducibility import image
 
@@ -28,13 +15,17 @@ import mars_lidar as ml
 from mars_lidar import io
 from mars_lidar.engines import ENGINES
 from mars_lidar.statistics import constant_light_rate
-from tests.harness.command import command_line
+from tests.harness.command import fails, ok
 
 BOTH = ["exact", "sequential"]
 EXPONENTIAL = ml.Afterpulsing(probability=0.3, delay_ns=60.0)
 SAMPLED = ml.Afterpulsing(probability=0.5, delays=(0.0, 3.0, 0.0, 1.0), bin_ns=37.0, generations=2)
 
 
+# delays of hundreds of periods, whose fraction is drawn apart
+LATE = {"dead_time_ns": 30.0, "afterpulsing": ml.Afterpulsing(probability=0.8, delay_ns=40_000.0)}
+RECORDED = {"dead_time_ns": 100.0, "afterpulsing": SAMPLED, "electronics_dead_time_ns": 170.0, **GATE}
+RECORDED |= {"jitter": ml.Jitter(sigma_ns=1.5), "max_events_per_exposure": 31}
 CASES = [
     case(2.0, 1.0, dead_time_ns=75.0, afterpulsing=EXPONENTIAL),
     case(8.0, 0.3, "stationary", dead_time_ns=99.0, afterpulsing=SAMPLED, twilight_ns=9.0),
@@ -48,47 +39,18 @@ CASES = [
         twilight_ns=130.0,
         delay=[0.1, 0.93],
     ),
-    # delays of hundreds of periods, whose fraction is drawn apart
-    case(
-        0.02,
-        0.01,
-        cycles=3000,
-        items=1500,
-        dead_time_ns=30.0,
-        pulse=ml.GaussianPulse(sigma_ns=0.3),
-        afterpulsing=ml.Afterpulsing(probability=0.8, delay_ns=40_000.0),
-    ),
+    case(0.02, 0.01, cycles=3000, items=1500, pulse=ml.GaussianPulse(sigma_ns=0.3), **LATE),
     case(1.0, 1.0, dead_time_ns=200.0, twilight_ns=20.0, pulse=ml.SampledPulse(two_lobes(), 0.5)),
     case(2.0, 0.5, "stationary", dead_time_ns=30.0, mode="paralyzable", afterpulsing=EXPONENTIAL),
     case(2.0, 0.5, dead_time_ns=130.0, mode="synchronous", afterpulsing=SAMPLED),
     case(3.0, 0.5, dead_time_ns=40.0, afterpulsing=EXPONENTIAL, gate_step_ns=7.0, **GATE),
-    case(
-        3.0,
-        0.5,
-        "stationary",
-        dead_time_ns=100.0,
-        afterpulsing=SAMPLED,
-        electronics_dead_time_ns=170.0,
-        jitter=ml.Jitter(sigma_ns=1.5),
-        max_events_per_exposure=31,
-        **GATE,
-    ),
+    case(3.0, 0.5, "stationary", **RECORDED),
     case(WAVE, 0.3, dead_time_ns=75.0, afterpulsing=EXPONENTIAL, twilight_ns=31.0),
     case(WAVE, 0.3, "stationary", dead_time_ns=220.0, afterpulsing=SAMPLED, twilight_ns=130.0),
     case(WAVE, 0.3, "stationary", dead_time_ns=30.0, mode="paralyzable", afterpulsing=EXPONENTIAL),
     case(WAVE, 0.0, dead_time_ns=0.0, afterpulsing=ml.Afterpulsing(probability=0.9, delay_ns=900.0), cycles=20),
     case(WAVE, 0.3, dead_time_ns=130.0, mode="synchronous", afterpulsing=SAMPLED, bins=50),
-    case(
-        WAVE,
-        0.5,
-        "stationary",
-        dead_time_ns=100.0,
-        afterpulsing=SAMPLED,
-        electronics_dead_time_ns=170.0,
-        jitter=ml.Jitter(sigma_ns=1.5),
-        max_events_per_exposure=31,
-        **GATE,
-    ),
+    case(WAVE, 0.5, "stationary", **RECORDED),
 ]
 
 
@@ -110,16 +72,8 @@ def test_exact_against_sequential(made: Case):
 def test_without_a_dead_time_it_is_a_hawkes_process(engine: str):
     """Its rate solves r = lambda + p f * r: in each harmonic of the period r_k = lambda_k / (1 - p F_k)."""
     p, tau = 0.4, 0.37  # periods
-    made = case(
-        2.0,
-        0.5,
-        "stationary",
-        dead_time_ns=0.0,
-        items=8000,
-        cycles=20,
-        bins=32,
-        afterpulsing=ml.Afterpulsing(probability=p, delay_ns=tau * PERIOD_NS),
-    )
+    traps = ml.Afterpulsing(probability=p, delay_ns=tau * PERIOD_NS)
+    made = case(2.0, 0.5, "stationary", items=8000, cycles=20, bins=32, afterpulsing=traps)
     sample, fine = draw(ENGINES[engine], made, 3), 32
     k = np.fft.fftfreq(32 * fine, 1 / (32 * fine))
     photons = 2.0 * made.system.pulse.bin_energy(37.0, PERIOD_NS, 32 * fine) + 0.5 / (32 * fine)
@@ -130,16 +84,7 @@ def test_without_a_dead_time_it_is_a_hawkes_process(engine: str):
     for j in range(8):
         mean_is(part[:, j].astype(float), expected[j], f"{engine}: bin {j}")
     # armed at the start: the mean relaxes from lambda to lambda / (1 - p) at the rate (1 - p) / tau
-    armed = case(
-        0.0,
-        2.0,
-        dead_time_ns=0.0,
-        items=20_000,
-        cycles=2,
-        bins=4,
-        delay=0.0,
-        afterpulsing=ml.Afterpulsing(probability=p, delay_ns=tau * PERIOD_NS),
-    )
+    armed = case(0.0, 2.0, items=20_000, cycles=2, bins=4, delay=0.0, afterpulsing=traps)
     decay = (1 - p) / tau
     mean = 2.0 / (1 - p) * (2 - p * -np.expm1(-decay * 2) / decay)
     mean_is(draw(ENGINES[engine], armed, 4).counts, mean, f"{engine}: armed")
@@ -174,8 +119,7 @@ def test_constant_light_rate_of_sampled_and_exponential_delays():
     few = ml.Afterpulsing.after_dead_time(probability=1e-4, delay_ns=40.0, dead_time_ns=21.0)
     dim = replace(exponential, dark_count_hz=0.0, afterpulsing=few)
     assert constant_light_rate(0.02, dim) == pytest.approx(0.01 * 1.0001, rel=1e-7)
-    with pytest.raises(ValueError, match="generations"):
-        constant_light_rate(1e6, replace(exponential, afterpulsing=SAMPLED))
+    refused("generations", constant_light_rate, 1e6, replace(exponential, afterpulsing=SAMPLED))
     with pytest.raises(ValueError, match=r"crosstalk.*sequential"):
         constant_light_rate(1e6, ml.Detector(dead_time_ns=1.0, crosstalk=ml.Crosstalk(probability=0.1)))
 
@@ -187,7 +131,7 @@ def test_bits_are_those_of_every_level_thread_and_part(kind: str):
     flux, system = image(kind)
     detector = replace(system.detector, afterpulsing=ml.Afterpulsing(probability=0.3, delay_ns=50.0), twilight_ns=2.0)
     system = system.replace(detector=detector)
-    exact_bits_do_not_depend(flux, system)
+    bits_do_not_depend(flux, system)
 
 
 @pytest.mark.parametrize("kind", ["gaussian", "waveform"])
@@ -266,8 +210,7 @@ def test_crosstalk_bits_and_whole_images():
     )
     with pytest.raises(ValueError, match="pixel_index must be that of a whole image"):
         ml.simulate(flux[2:4], system, engine="sequential", pixel_index=np.arange(14, 28))
-    with pytest.raises(ValueError, match=r"engine 'exact' does not do crosstalk.*use 'sequential'"):
-        ml.simulate(flux, system)
+    refused(r"engine 'exact' does not do crosstalk.*use 'sequential'", ml.simulate, flux, system)
 
 
 @pytest.mark.parametrize(
@@ -294,8 +237,7 @@ def test_crosstalk_bits_and_whole_images():
     ],
 )
 def test_refused(make: Any, message: str):
-    with pytest.raises((ValueError, TypeError), match=message):
-        make()
+    refused(message, make, error=(ValueError, TypeError))
 
 
 def test_round_trip_and_preset():
@@ -318,31 +260,24 @@ def test_round_trip_and_preset():
 
 
 def test_command_line(tmp_path: Path):
-    def run(*options: str) -> Any:
-        return command_line(["simulate", "--scene", "room", "--size", "4", "--no-picture", *options])
-
+    room = ("simulate", "--scene", "room", "--size", "4", "--no-picture", "-o")
     file = tmp_path / "module.npz"
-    done = run("--detector", "excelitas-spcm-aqrh", "--twilight-ns", "1.5", "-o", str(file))
-    assert done.exit_code == 0, done.output
+    ok(*room, file, "--detector", "excelitas-spcm-aqrh", "--twilight-ns", "1.5")
     detector = io.load(file).system.detector
     assert detector == replace(ml.Detector.preset("excelitas-spcm-aqrh"), twilight_ns=1.5)
     file = tmp_path / "crosstalk.npz"
-    done = run("--crosstalk", "0.1", "--crosstalk-kernel", "4", "--engine", "sequential", "-o", str(file))
-    assert done.exit_code == 0, done.output
+    ok(*room, file, "--crosstalk", "0.1", "--crosstalk-kernel", "4", "--engine", "sequential")
     cube = io.load(file)
     assert cube.system.detector.crosstalk == ml.Crosstalk(probability=0.1, kernel="4")
     assert np.array_equal(io.regenerate(cube), cube.histogram)
-    with pytest.raises(ValueError, match="rows must be all 4 rows with crosstalk"):
-        io.regenerate(cube, rows=slice(1, 2))
+    refused("rows must be all 4 rows with crosstalk", io.regenerate, cube, rows=slice(1, 2))
     for options, message in (
         (("--afterpulse-delay-ns", "3"), "belong together"),
         (("--crosstalk-kernel", "4"), "belongs to --crosstalk"),
         (("--crosstalk", "0.1"), "use 'sequential'"),
         (("--detector", "spad"), "excelitas-spcm-aqrh"),
     ):
-        failed = run(*options, "-o", str(tmp_path / "not.npz"))
-        assert failed.exit_code != 0
-        assert message in " ".join(failed.output.split())
+        fails(message, *room, tmp_path / "not.npz", *options)
 
 
 @pytest.mark.parametrize("engine", ["exact", "sequential"])

@@ -1,33 +1,21 @@
-"""Paralyzable, synchronous and gated pixels: both engines that do them, against each other and closed forms."""
+"""Paralyzable, synchronous and gated pixels: both engines that do them, against each other and where no law knows them.
 
-from __future__ import annotations
+Their laws are compared with the engine "exact", and with closed forms, in tests/statistics/test_detector_statistics.py.
+"""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from harness import (
-    COUNTS,
-    EVERYTHING,
-    JOINT,
-    PERIOD_NS,
-    SHAPE,
-    Case,
-    Law,
-    check,
-    draw,
-    first_arrival,
-    flux_of,
-    random_cases,
-    two_lobes,
-    waveform_flux,
-)
+from harness.cases import PERIOD_NS, Case, flux_of, random_cases, two_lobes, waveform_flux
+from harness.check import COUNTS, EVERYTHING, JOINT, SHAPE, check
+from harness.laws import Law, law_of
+from harness.sample import draw
 from scipy import stats
 
-from mars_lidar import Detector, Flux, GaussianPulse, SampledPulse, System
+from mars_lidar import Detector, Flux, GaussianPulse, System
 from mars_lidar.engines import ENGINES
 from mars_lidar.instrument.detector import MODES
-from mars_lidar.statistics import count_law, exposure_moments
 
 BOTH = ["exact", "sequential"]
 
@@ -123,16 +111,6 @@ def test_hard_system(mode: str, signal: float, dead: float, cycles: int, start: 
 # Paralyzable
 
 
-@pytest.mark.parametrize(("rate", "dead", "cycles"), [(1.0, 0.6375, 60), (6.0, 0.5, 40), (0.3, 7.3, 60)])
-@pytest.mark.parametrize("engine", BOTH)
-def test_paralyzable_at_a_constant_rate(engine: str, rate: float, dead: float, cycles: int):
-    """r = lambda e^(-lambda t_d); pairs within t_d of each other do not occur, all others are independent."""
-    case = pulsed(0.0, rate, detector("paralyzable", dead), cycles=cycles, start="stationary", bins=16, items=20_000)
-    r = rate * np.exp(-rate * dead)
-    law = Law(np.full(16, r * cycles / 16), None, (r * cycles, r * cycles - r**2 * (2 * cycles * dead - dead**2)))
-    check(ENGINES[engine], case, law, {COUNTS, SHAPE})
-
-
 @pytest.mark.parametrize("engine", BOTH)
 def test_paralyzable_under_blinding_light_goes_dark(engine: str):
     """Armed at the start, it sees the first photon and, with lambda t_d = 40, nothing ever after."""
@@ -141,35 +119,6 @@ def test_paralyzable_under_blinding_light_goes_dark(engine: str):
 
 
 # Synchronous
-
-
-SYNCHRONOUS = {
-    "ideal": pulsed(1.5, 0.5, detector("synchronous", 0.0)),
-    "bright": pulsed(4.0, 2.0, detector("synchronous", 0.0)),
-    "stationary": pulsed(0.4, 0.2, detector("synchronous", 0.0), start="stationary"),
-    "lobes": pulsed(1.5, 0.5, detector("synchronous", 0.0), pulse=SampledPulse(two_lobes(), 0.3)),
-    "returns": replace(
-        pulsed(0, 0, detector("synchronous", 0.0)), flux=flux_of([1.0, 0.4, 0.1], 0.5, [0.2, 0.21, 0.9])
-    ),
-    # photons in the first 40 % of the period only, so that a dead time of 60 % never reaches the next
-    "dead time": replace(pulsed(0, 0, detector("synchronous", 0.6)), flux=waveform_flux([0.5, 0.3, 0.0, 0.0, 0.0])),
-}
-
-
-def period_photons(case: Case) -> np.ndarray:
-    whole = replace(case, system=case.system.replace(detector=gate(0.0, 1.0, 0.0)))
-    return gated_photons(whole)
-
-
-@pytest.mark.parametrize("kind", SYNCHRONOUS)
-@pytest.mark.parametrize("engine", BOTH)
-def test_synchronous_is_binomial(engine: str, kind: str):
-    """Coates 1968: N ~ Binomial(N_r, 1 - e^-Lambda), histogram N_r e^-F_j (1 - e^-l_j)."""
-    case = SYNCHRONOUS[kind]
-    photons, cycles = period_photons(case), case.system.cycles
-    pmf = stats.binom.pmf(np.arange(cycles + 1), cycles, -np.expm1(-photons.sum()))
-    check(ENGINES[engine], case, Law(cycles * first_arrival(photons), pmf), {COUNTS, SHAPE})
-    assert draw(ENGINES[engine], case, 2).counts.max() <= cycles
 
 
 @pytest.mark.parametrize("engine", BOTH)
@@ -230,16 +179,6 @@ def test_moving_gate_without_dead_time_is_poisson(engine: str, step: float, stay
 
 
 @pytest.mark.parametrize("start", ["armed", "stationary"])
-@pytest.mark.parametrize("engine", BOTH)
-def test_one_registration_in_each_gate(engine: str, start: str):
-    """t_d longer than the gate and over before the next one opens: Binomial, first arrivals behind the gate."""
-    case = pulsed(1.0, 2.0, gate(0.3, 0.25, 0.6), start=start)
-    photons, cycles = gated_photons(case), case.system.cycles
-    pmf = stats.binom.pmf(np.arange(cycles + 1), cycles, -np.expm1(-photons.sum()))
-    check(ENGINES[engine], case, Law(cycles * first_arrival(photons), pmf), {COUNTS, SHAPE})
-
-
-@pytest.mark.parametrize("start", ["armed", "stationary"])
 @pytest.mark.parametrize("dead", [0.6375, 3.0, 12.4])
 @pytest.mark.parametrize("engine", BOTH)
 def test_a_gate_that_is_always_open_changes_nothing(engine: str, dead: float, start: str):
@@ -247,8 +186,4 @@ def test_a_gate_that_is_always_open_changes_nothing(engine: str, dead: float, st
     items = 1000 if engine == "sequential" and start == "stationary" else 4000
     case = pulsed(1.5, 0.5, gate(0.4, 1.0, dead), start=start, items=items, cycles=104)
     free = case.system.replace(detector=Detector(dead_time_ns=dead * PERIOD_NS))
-    law = count_law(Flux(1.5, 0.5, 37.0), free)
-    pmf = np.zeros(law.support[-1] + 1)
-    pmf[law.support] = law.pmf
-    histogram = exposure_moments(Flux(1.5, 0.5, 37.0), free).histogram
-    check(ENGINES[engine], case, Law(histogram, pmf), {COUNTS, SHAPE})
+    check(ENGINES[engine], case, law_of(Flux(1.5, 0.5, 37.0), free), {COUNTS, SHAPE})

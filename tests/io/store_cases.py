@@ -1,12 +1,13 @@
 """The small system and flux that the tests of files share."""
 
-from __future__ import annotations
-
 import importlib.util
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from harness import make_system
+from PIL import Image
 
 import mars_lidar as ml
 
@@ -34,3 +35,9 @@ def several_returns() -> ml.Flux:
 
 def waveform() -> ml.Flux:
     return ml.Flux(waveform=np.random.default_rng(2).uniform(0.0, 0.05, (6, 5, 40)), background=0.2)
+
+
+def png(path: Path, array: Any) -> Path:
+    """A picture of any format."""
+    Image.fromarray(np.asarray(array)).save(path)
+    return path

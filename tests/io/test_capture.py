@@ -1,7 +1,5 @@
 """Captures around corners: every layout read, written back in the same one, and a hidden point found in the result."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 from pathlib import Path
@@ -9,12 +7,13 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from harness import make_system
+from harness import make_system, refused
+from harness.files import write_h5
 
 import mars_lidar as ml
 from mars_lidar import io
 from mars_lidar.io.capture import read_capture
-from tests.harness.command import command_line
+from tests.harness.command import fails, ok
 
 C_M_PER_NS = 0.299792458
 BIN_M, START_M, BINS, SIDE = 0.012, 0.6, 200, 4
@@ -165,16 +164,14 @@ def test_the_command_and_a_reconstruction(tmp_path, kind):
     """`simulate --like`: photons through a SPAD, in the bins of the render; the hidden point is where it was."""
     render, _ = write(tmp_path / "render.hdf5", f"tal {kind}")
     out = tmp_path / "capture.hdf5"
-    printed = command_line(["simulate", "--like", str(render), *OPTIONS, "-o", str(out), "--no-picture"])
-    assert printed.exit_code == 0, printed.output
+    ok("simulate", "--like", render, *OPTIONS, "-o", out, "--no-picture")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["capture.hdf5", "render.hdf5"]
     axes = [np.linspace(-0.4, 0.4, 9), np.linspace(-0.4, 0.4, 9), np.linspace(0.4, 1.0, 7)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     best = points[int(np.argmax(backprojected(out, points)))]
     assert np.abs(best - HIDDEN).max() < 0.01
     cube = tmp_path / "cube.zarr"  # any other suffix is a cube with those bins
-    printed = command_line(["simulate", "--like", str(render), *OPTIONS, "-o", str(cube), "--no-picture"])
-    assert printed.exit_code == 0, printed.output
+    ok("simulate", "--like", render, *OPTIONS, "-o", cube, "--no-picture")
     counts = io.load(cube).histogram[0]
     assert np.array_equal(io.read_transient(out).rows(slice(0, None)), counts)
 
@@ -188,23 +185,17 @@ def test_what_does_not_fit_is_refused(tmp_path):
         (["--period-ns", "5"], "must be a whole number of bins"),
         (["--realizations", "2"], "holds one exposure"),
     ):
-        printed = command_line(["simulate", "--like", str(render), *options, "-o", out])
-        assert printed.exit_code == 2, printed.output
-        assert words in printed.output
+        fails(words, "simulate", "--like", render, *options, "-o", out)
     other = tmp_path / "other.hdf5"
-    with h5py.File(other, "w") as file:
-        file["values"] = np.ones((2, 3, 4))
-    with pytest.raises(ValueError, match=r"other\.hdf5: no capture of tal"):
-        read_capture(other)
+    write_h5(other, {"values": np.ones((2, 3, 4))})
+    refused(r"other\.hdf5: no capture of tal", read_capture, other)
     with h5py.File(other, "a") as file:
         file["data"], file["deltaT"] = np.ones((2, 3, 4)), 0.01
-    with pytest.raises(ValueError, match=r"other\.hdf5: data must have 5 axes"):
-        read_capture(other)
+    refused(r"other\.hdf5: data must have 5 axes", read_capture, other)
     system = make_system(1.0, 100, 10, sigma_ns=0.1, period_ns=10.0)
     io.simulate_to(tmp_path / "small.npz", ml.Flux([[0.1]], 0.0, 2.0), system)
     cube = io.load(tmp_path / "small.npz")
-    with pytest.raises(ValueError, match="cube must be one exposure of 5 x 4 x 200"):
-        io.save_capture(tmp_path / "y.hdf5", cube, render)
+    refused("cube must be one exposure of 5 x 4 x 200", io.save_capture, tmp_path / "y.hdf5", cube, render)
 
 
 TAL = os.environ.get("MARS_LIDAR_TAL_PYTHON")  # a Python with y-tal, which needs NumPy 1
@@ -233,8 +224,7 @@ print(int(data.H.sum()), *points[np.unravel_index(found.argmax(), found.shape)])
 def test_tal_reconstructs_what_is_written(tmp_path, layout):
     render, _ = write(tmp_path / "render.hdf5", layout)
     out = tmp_path / "capture.hdf5"
-    printed = command_line(["simulate", "--like", str(render), *OPTIONS, "--no-picture", "-o", str(out)])
-    assert printed.exit_code == 0, printed.output
+    ok("simulate", "--like", render, *OPTIONS, "--no-picture", "-o", out)
     done = subprocess.run(
         [str(TAL), "-c", BY_TAL, str(out), layout.split()[0]], capture_output=True, text=True, check=False
     )

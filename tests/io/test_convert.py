@@ -1,24 +1,19 @@
 """From format to format, and from cube to photons: what is kept, what is told, what is refused."""
 
-from __future__ import annotations
-
 import importlib.util
 
 import numpy as np
 import pytest
+from harness import refused
 from store_cases import SYSTEM, one_return
 
 import mars_lidar as ml
 from mars_lidar import io
-from tests.harness.command import command_line
+from tests.harness.command import fails, ok, run
 
 HAVE = {name: importlib.util.find_spec(name) is not None for name in ("ptufile", "phconvert")}
 needs_ptu = pytest.mark.skipif(not HAVE["ptufile"], reason="ptufile (extra io) is not installed")
 needs_all = pytest.mark.skipif(not all(HAVE.values()), reason="ptufile and phconvert (extra io) are not installed")
-
-
-def run(*arguments: object):
-    return command_line([str(a) for a in arguments])
 
 
 @needs_ptu
@@ -78,8 +73,7 @@ def test_the_photons_of_a_cube_are_its_counts(tmp_path):
         assert np.array_equal(times.histogram(), cube.histogram[1])
         assert (times.info["realization"], times.info["source"]) == (6, "a test")
         other = io.Cube.of(np.asarray(cube.histogram) + np.uint16(1), cube.recipe)
-        with pytest.raises(ValueError, match="the photons of row 0 do not have the counts"):
-            io.photons(other)
+        refused("the photons of row 0 do not have the counts", io.photons, other)
 
 
 def test_what_cannot_be_converted_is_refused(tmp_path):
@@ -92,27 +86,21 @@ def test_what_cannot_be_converted_is_refused(tmp_path):
         ("photons.npz", "cube.zarr", r"is a photon stream, which goes into one of \.npz, \.ptu, \.h5"),
         ("cube.npz", "cube.npz", "target must not be the source"),
     ):
-        with pytest.raises((ValueError, OSError), match=message):
-            io.convert(tmp_path / source, tmp_path / target)
-    with pytest.raises(ValueError, match="realization is for cubes"):
-        io.convert(tmp_path / "photons.npz", tmp_path / "a.npz", realization=0)
-    with pytest.raises(ValueError, match="bins is for photon streams"):
-        io.convert(tmp_path / "cube.npz", tmp_path / "a.h5", bins=4)
+        refused(message, io.convert, tmp_path / source, tmp_path / target, error=(ValueError, OSError))
+    refused("realization is for cubes", io.convert, tmp_path / "photons.npz", tmp_path / "a.npz", realization=0)
+    refused("bins is for photon streams", io.convert, tmp_path / "cube.npz", tmp_path / "a.h5", bins=4)
     io.convert(tmp_path / "cube.npz", tmp_path / "a.h5")
-    with pytest.raises(FileExistsError):
-        io.convert(tmp_path / "cube.npz", tmp_path / "a.h5")
+    refused("", io.convert, tmp_path / "cube.npz", tmp_path / "a.h5", error=FileExistsError)
     io.convert(tmp_path / "cube.npz", tmp_path / "a.h5", overwrite=True)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.h5", "cube.npz", "photons.npz"]
 
 
 def test_the_commands(tmp_path):
     io.simulate_to(tmp_path / "set.zarr", one_return(), SYSTEM, realizations=2)
-    done = run("convert", tmp_path / "set.zarr", tmp_path / "one.mat", "--realization", 1)
-    assert done.exit_code == 0, done.output
+    done = ok("convert", tmp_path / "set.zarr", tmp_path / "one.mat", "--realization", 1)
     for words in ("one.mat", "1 × 6 × 5 × 64", "lost", "1 of 2 realizations"):
         assert words in done.output
-    done = run("convert", tmp_path / "one.mat", tmp_path / "two.npz")
-    assert (done.exit_code, "nothing" in done.output) == (0, True)
+    assert "nothing" in ok("convert", tmp_path / "one.mat", tmp_path / "two.npz").output
     done = run("timestamps", tmp_path / "set.zarr", "--realization", 1, "-o", tmp_path / "photons.npz")
     assert (done.exit_code, "photons of 6 × 5 pixels" in done.output) == (0, True)
     expected = ml.simulate(one_return(), SYSTEM, realizations=2)[1]
@@ -123,6 +111,4 @@ def test_the_commands(tmp_path):
         (("timestamps", tmp_path / "set.zarr", "-o", tmp_path / "a.zarr"), "must end in one of .npz"),
         (("timestamps", tmp_path / "set.zarr", "--realization", 2, "-o", tmp_path / "a.npz"), "[0, 1]"),
     ):
-        done = run(*arguments)
-        assert done.exit_code == 2
-        assert message in done.output
+        fails(message, *arguments)

@@ -1,13 +1,12 @@
 """HDF5 that we write carries checksums: no flipped bit changes what is read, and files without them open as before."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
-from harness import make_system
+from harness import make_system, refused
+from harness.files import overwrite
 
 import mars_lidar as ml
 from mars_lidar import io
@@ -52,45 +51,27 @@ def test_photon_hdf5_has_checksums(tmp_path):
 
 def test_a_changed_number_is_refused(files):
     """By the checksum of its chunk: the bytes are changed in the file, behind HDF5's back."""
-    with h5py.File(files["cube.h5"]) as file:
-        place = file["histogram"].id.get_chunk_info(0)
-        depth = file["signal"].id.get_chunk_info(0)
-    for damaged, read in ((place, lambda cube: cube.histogram[0]), (depth, lambda cube: cube.flux.signal)):
-        content = bytearray(files["cube.h5"].read_bytes())
-        content[damaged.byte_offset + damaged.size // 2] ^= 4
-        files["cube.h5"].write_bytes(content)
-        with pytest.raises(FileError, match=r"cube\.h5"):
-            read(io.load(files["cube.h5"]))
-        content[damaged.byte_offset + damaged.size // 2] ^= 4
-        files["cube.h5"].write_bytes(content)
-    with io.load(files["cube.h5"]) as cube:
+    path = files["cube.h5"]
+    with h5py.File(path) as file:
+        counts, light = (file[name].id.get_chunk_info(0) for name in ("histogram", "signal"))
+    for part, read in ((counts, lambda cube: cube.histogram[0]), (light, lambda cube: cube.flux.signal)):
+        overwrite(path, part.byte_offset + part.size // 2, 4)
+        refused(r"cube\.h5", lambda read=read: read(io.load(path)), error=FileError)
+        overwrite(path, part.byte_offset + part.size // 2, 4)
+    with io.load(path) as cube:
         assert cube.histogram[0].sum() == cube.registrations
-
-
-def test_what_is_mapped_into_memory_is_checked_too(files):
-    with h5py.File(files["table.h5"]) as file:
-        at = file["shape"].id.get_offset() + file["shape"].nbytes // 2
-    content = bytearray(files["table.h5"].read_bytes())
-    content[at] ^= 1
-    files["table.h5"].write_bytes(content)
-    with pytest.raises(FileError, match=r"table\.h5 is damaged"):
-        ml.Table.load(files["table.h5"])
 
 
 def test_a_changed_text_is_refused(files):
     """Texts of attributes lie in a heap that has no checksum of HDF5's own."""
-    content = files["cube.h5"].read_bytes()
-    assert content.count(b'"period_ns": 100.0') == 1
-    files["cube.h5"].write_bytes(content.replace(b'"period_ns": 100.0', b'"period_ns": 101.0'))
-    with pytest.raises(FileError, match=r"cube\.h5 is damaged: its attributes or variables"):
-        io.load(files["cube.h5"])
+    overwrite(files["cube.h5"], b'"period_ns": 100.0', b'"period_ns": 101.0')
+    refused(r"cube\.h5 is damaged: its attributes or variables", io.load, files["cube.h5"], error=FileError)
 
 
 def test_a_cube_without_its_sum_is_refused(files):
     with h5py.File(files["cube.h5"], "r+") as file:
         del file.attrs[SEAL]
-    with pytest.raises(FileError, match=r"cube\.h5 is damaged: it has no attribute sha256"):
-        io.load(files["cube.h5"])
+    refused(r"cube\.h5 is damaged: it has no attribute sha256", io.load, files["cube.h5"], error=FileError)
 
 
 @pytest.mark.parametrize("shape", [(), (0,), (3,), (5, 0), (7, 9), (300, 400, 500), (2, 3_000_000)])

@@ -1,7 +1,5 @@
 """What is half written never looks complete, whatever stopped the process."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal
@@ -12,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray
+from harness import refused
 from store_cases import PTU, SUFFIXES, SYSTEM, one_return
 
 import mars_lidar as ml
@@ -41,8 +40,7 @@ def test_an_interrupted_zarr_is_left_incomplete(tmp_path, small_blocks):
     path = tmp_path / "cube.zarr"
     with pytest.raises(io.Interrupted, match=r"cube\.zarr stays, marked incomplete: --resume"):
         io.simulate_to(path, one_return(), SYSTEM, realizations=4, progress=_interrupt_after(90))
-    with pytest.raises(io.IncompleteFileError, match=r"is incomplete: .*at least 2 of 4 chunks are written"):
-        io.load(path)
+    refused(r"is incomplete: .*at least 2 of 4 chunks are written", io.load, path, error=io.IncompleteFileError)
     with io.load(path, allow_incomplete=True) as cube:
         assert not cube.complete
         assert cube.registrations is None
@@ -66,15 +64,13 @@ def test_a_zarr_that_is_replaced_stays_until_the_new_one_is_complete(tmp_path, s
             with alone(tmp_path / "cube.incomplete.zarr"), pytest.raises(ValueError, match="being written by another"):
                 io.simulate_to(path, flux, SYSTEM, realizations=4, **busy)
         io.simulate_to(path, flux, SYSTEM, realizations=4, resume=True)
-        with pytest.raises(ValueError, match=r"cube\.zarr is damaged, or was replaced"):
-            np.asarray(cube.histogram[2:])
+        refused(r"cube\.zarr is damaged, or was replaced", lambda: np.asarray(cube.histogram[2:]))
     assert list(tmp_path.iterdir()) == [path]
     with io.load(path) as cube:
         assert cube.seed == 0
         assert io.verify(cube)
         io.save(path, one_exposure(cube, 3), overwrite=True)
-        with pytest.raises(ValueError, match="damaged, or was replaced"):
-            np.asarray(cube.histogram)
+        refused("damaged, or was replaced", np.asarray, cube.histogram)
 
 
 def test_a_zarr_is_not_made_through_a_link(tmp_path):
@@ -92,8 +88,7 @@ def test_an_interrupted_file_leaves_what_was_there(tmp_path, monkeypatch, suffix
     for module in (recipe, mat):
         monkeypatch.setattr(module, "BLOCK_BYTES", 2 * 5 * 64 * 2)
     path, half = tmp_path / f"cube{suffix}", {"progress": _interrupt_after(10)}
-    with pytest.raises(io.Interrupted, match="nothing was left at"):
-        io.simulate_to(path, one_return(), SYSTEM, **half)
+    refused("nothing was left at", io.simulate_to, path, one_return(), SYSTEM, **half, error=io.Interrupted)
     assert list(tmp_path.iterdir()) == []
     io.simulate_to(path, one_return(), SYSTEM, seed=5)
     with pytest.raises(io.Interrupted, match="is what it was before"):
@@ -104,8 +99,7 @@ def test_an_interrupted_file_leaves_what_was_there(tmp_path, monkeypatch, suffix
     # what a killed process leaves
     path.rename(tmp_path / f"cube{suffix}.incomplete")
     for name in (path, tmp_path / f"cube{suffix}.incomplete"):
-        with pytest.raises(io.IncompleteFileError, match=r"never finished|is incomplete"):
-            io.load(name)
+        refused(r"never finished|is incomplete", io.load, name, error=io.IncompleteFileError)
 
 
 _SCRIPT = """
@@ -142,15 +136,13 @@ def _run(path: Path, how: str) -> subprocess.CompletedProcess[str]:
 def test_kill_9_leaves_nothing_that_looks_complete(tmp_path, suffix):
     path = tmp_path / f"cube{suffix}"
     assert _run(path, "kill").returncode == -signal.SIGKILL
-    with pytest.raises(io.IncompleteFileError, match=r"cube.* (is incomplete|was never finished)"):
-        io.load(path)
+    refused(r"cube.* (is incomplete|was never finished)", io.load, path, error=io.IncompleteFileError)
     if suffix == ".zarr":
         assert not io.load(path, allow_incomplete=True).complete
     else:
         (leftover,) = tmp_path.iterdir()
         assert re.fullmatch(rf"cube\{suffix}\.[0-9a-f]{{8}}\.incomplete", leftover.name)
-        with pytest.raises(io.IncompleteFileError, match="incomplete"):
-            io.load(leftover)
+        refused("incomplete", io.load, leftover, error=io.IncompleteFileError)
     io.simulate_to(path, one_return(), SYSTEM, overwrite=True)  # the leftover is in nobody's way
     with io.load(path) as cube:
         assert io.verify(cube)
@@ -167,8 +159,7 @@ def test_a_full_disk_is_told_and_leaves_nothing_that_looks_complete(tmp_path, su
     assert done.stdout.startswith("WriteError: File too large; ")
     if suffix == ".zarr":
         assert "marked incomplete" in done.stdout
-        with pytest.raises(io.IncompleteFileError):
-            io.load(path)
+        refused("", io.load, path, error=io.IncompleteFileError)
     else:
         assert "nothing was left" in done.stdout
         assert list(tmp_path.iterdir()) == []
@@ -189,8 +180,7 @@ def test_a_disk_that_is_full_from_the_start_is_told(tmp_path, suffix):
 @pytest.mark.skipif(sys.platform == "win32", reason="needs a limit on file sizes")
 @pytest.mark.parametrize("missing", ["almost all", "a byte"])
 @pytest.mark.parametrize(
-    "name",
-    ["a.npz", "a.h5", "a.mat", "a.ptu", "s.npz", "s.h5", "s.ptu", "t.h5", "m.h5", "m.npz", "y.yaml", "y.json"],
+    "name", ["a.npz", "a.h5", "a.mat", "a.ptu", "s.npz", "s.h5", "s.ptu", "t.h5", "m.h5", "m.npz", "y.yaml", "y.json"]
 )
 def test_a_file_that_finds_no_room_says_so_and_leaves_nothing(tmp_path, name, missing):
     """Cubes (a), streams (s), tables (t), maps (m), systems (y): one kind of error, in the operating system's words."""
@@ -219,8 +209,7 @@ def test_a_file_that_finds_no_room_says_so_and_leaves_nothing(tmp_path, name, mi
     resource.setrlimit(resource.RLIMIT_FSIZE, (room, hard))
     try:
         full = "File too large|No space left on device" + ("|Input/output error" if name == "s.h5" else "")
-        with pytest.raises(io.WriteError, match=f"({full}); nothing was left at .*{name}"):
-            writes[name[0]]()
+        refused(f"({full}); nothing was left at .*{name}", writes[name[0]], error=io.WriteError)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert not list(tmp_path.iterdir())

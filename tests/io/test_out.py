@@ -1,13 +1,10 @@
 """What leaves for other programs: point clouds and labelled arrays."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
-import pytest
 import xarray
-from harness import make_system
+from harness import make_system, refused
 
 import mars_lidar as ml
 from mars_lidar import io
@@ -38,14 +35,10 @@ def test_a_wall_is_flat_again(tmp_path: Path) -> None:
     known = np.isfinite(depth)
     np.testing.assert_allclose(rows[:, 0], (3.0 * x / 40.0)[known], atol=1e-6)
     np.testing.assert_allclose(rows[:, 3], y[known])
-    with pytest.raises(FileExistsError):
-        io.save_cloud(tmp_path / "wall.ply", depth, 40.0)
-    with pytest.raises(ValueError, match=r"\.ply"):
-        io.save_cloud(tmp_path / "wall.obj", depth, 40.0)
-    with pytest.raises(ValueError, match="intensity must have the shape"):
-        io.save_cloud(tmp_path / "other.ply", depth, 40.0, intensity=np.zeros(3))
-    with pytest.raises(ValueError, match="focal_px"):
-        io.points(depth, 0.0)
+    refused("", io.save_cloud, tmp_path / "wall.ply", depth, 40.0, error=FileExistsError)
+    refused(r"\.ply", io.save_cloud, tmp_path / "wall.obj", depth, 40.0)
+    refused("intensity must have the shape", io.save_cloud, tmp_path / "other.ply", depth, 40.0, intensity=np.zeros(3))
+    refused("focal_px", io.points, depth, 0.0)
 
 
 def test_a_labelled_cube_is_that_of_its_store(tmp_path: Path) -> None:
@@ -65,11 +58,7 @@ def test_a_labelled_cube_is_that_of_its_store(tmp_path: Path) -> None:
 
 def test_labelled_arrays_that_do_not_fit_are_refused() -> None:
     array = np.zeros((2, 3, 64), np.uint16)
-    with pytest.raises(TypeError, match="beside the system that recorded them"):
-        ml.to_xarray(array)
-    with pytest.raises(ValueError, match="pixels of the counts"):
-        ml.to_xarray(array, SYSTEM, ml.Flux(1.0, 1.0, 1.0))
-    with pytest.raises(ValueError, match="must be"):
-        ml.to_xarray(array[..., :60], SYSTEM)
-    with pytest.raises(TypeError, match="has its own"):
-        ml.to_xarray(io.from_histograms(array, SYSTEM), SYSTEM)
+    refused("beside the system that recorded them", ml.to_xarray, array, error=TypeError)
+    refused("pixels of the counts", ml.to_xarray, array, SYSTEM, ml.Flux(1.0, 1.0, 1.0))
+    refused("must be", ml.to_xarray, array[..., :60], SYSTEM)
+    refused("has its own", ml.to_xarray, io.from_histograms(array, SYSTEM), SYSTEM, error=TypeError)

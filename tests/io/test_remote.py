@@ -1,7 +1,5 @@
 """Stores at URLs: in fsspec's memory, and behind a web server."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import http.server
@@ -13,11 +11,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from harness import refused
 from store_cases import SYSTEM, one_return
 
 from mars_lidar import io
 from mars_lidar._base.buckets import url_of
-from tests.harness.command import command_line
+from tests.harness.command import ok
 
 fsspec = pytest.importorskip("fsspec", reason="fsspec (extra remote) is not installed")
 pytest.importorskip("aiohttp", reason="aiohttp (extra remote) is not installed")
@@ -74,14 +73,11 @@ def test_memory_and_web(store, tmp_path):
     check(in_memory(store), store)
     with served(tmp_path) as url:
         check(f"{url}/a.zarr", store)
-        printed = command_line(["info", f"{url}/a.zarr"])
-        assert printed.exit_code == 0, printed.output
+        printed = ok("info", f"{url}/a.zarr")
         assert f"{url}/a.zarr (mars-lidar" in printed.output
         out = tmp_path / "maps.npz"
-        printed = command_line(["reconstruct", f"{url}/a.zarr", "--no-picture", "-o", str(out)])
-        assert printed.exit_code == 0, printed.output
-        with pytest.raises(ValueError, match=r"nothing\.zarr is not a Zarr v3 store"):
-            io.load(f"{url}/nothing.zarr")
+        ok("reconstruct", f"{url}/a.zarr", "--no-picture", "-o", out)
+        refused(r"nothing\.zarr is not a Zarr v3 store", io.load, f"{url}/nothing.zarr")
 
 
 def test_damage_is_told(store):
@@ -90,14 +86,12 @@ def test_damage_is_told(store):
     chunk = next(name for name in memory.find("/there/a.zarr/histogram") if "/c/" in name)
     content = memory.cat_file(chunk)
     memory.rm(chunk)
-    with pytest.raises(ValueError, match=r"memory://there/a\.zarr is damaged: histogram/c/.* is missing"):
-        io.load(url)
+    refused(r"memory://there/a\.zarr is damaged: histogram/c/.* is missing", io.load, url)
     memory.pipe_file(chunk, content[:-8] + b"\0" * 8)
     with io.load(url) as cube, pytest.raises(ValueError, match="memory:/"):
         np.asarray(cube.histogram)
     memory.pipe_file("/there/a.zarr/histogram/zarr.json", b"{}")
-    with pytest.raises(ValueError, match=r"histogram/zarr\.json has changed since it was written"):
-        io.load(url)
+    refused(r"histogram/zarr\.json has changed since it was written", io.load, url)
 
 
 def test_what_is_missing_and_what_is_no_url(tmp_path, monkeypatch):
@@ -106,8 +100,6 @@ def test_what_is_missing_and_what_is_no_url(tmp_path, monkeypatch):
     assert url_of("file:///a/b.zarr") == url_of(Path("file:///a/b.zarr")) == "file:///a/b.zarr"
     for path in ("a.zarr", "/a/b.zarr", "C:/a.zarr", "C:\\a.zarr", tmp_path):
         assert url_of(path) is None
-    with pytest.raises(ValueError, match=r"only a \.zarr is opened from a URL"):
-        io.load("memory://a.h5")
+    refused(r"only a \.zarr is opened from a URL", io.load, "memory://a.h5")
     monkeypatch.setitem(sys.modules, "upath", None)
-    with pytest.raises(ImportError, match=r"pip install 'mars-lidar\[remote\]'"):
-        io.load("memory://a.zarr")
+    refused(r"pip install 'mars-lidar\[remote\]'", io.load, "memory://a.zarr", error=ImportError)

@@ -1,32 +1,15 @@
 """Own files that a stranger opened with NumPy, changed and saved again: all sums are right, the content is not."""
 
-from __future__ import annotations
-
-import json
-
-import h5py
 import numpy as np
 import pytest
+from harness import make_system, refused
+from harness.files import rewrite, write_h5
 from store_cases import SYSTEM, one_return
 
 import mars_lidar as ml
 from mars_lidar import io
 from mars_lidar._base.files import FileError
 from mars_lidar.io.maps import load_maps, save_maps
-
-
-def rewrite(path, name, change):
-    """Replace one member of an archive; of the attributes, a dictionary."""
-    with np.load(path) as archive:
-        members = dict(archive)
-    if name == "attributes":
-        attributes = json.loads(members[name].item())
-        change(attributes)
-        members[name] = np.asarray(json.dumps(attributes))
-    else:
-        members[name] = change(members[name])
-    np.savez(path, **members)
-
 
 COUNTS = {
     "negative": lambda counts: -counts.astype(np.int64),
@@ -50,8 +33,7 @@ def test_counts_of_an_archive_are_counts_and_add_up(tmp_path, counts):
     path = tmp_path / "cube.npz"
     io.simulate_to(path, one_return(), SYSTEM)
     rewrite(path, "histogram", COUNTS[counts])
-    with pytest.raises(FileError, match=r"cube\.npz"):
-        np.asarray(io.load(path).histogram)
+    refused(r"cube\.npz", lambda: np.asarray(io.load(path).histogram), error=FileError)
 
 
 @pytest.mark.parametrize(
@@ -72,8 +54,7 @@ def test_the_light_and_the_attributes_of_an_archive_are_what_we_write(tmp_path, 
     path = tmp_path / "cube.npz"
     io.simulate_to(path, one_return(), SYSTEM)
     rewrite(path, name, change)
-    with pytest.raises(FileError, match=r"cube\.npz"):
-        io.load(path)
+    refused(r"cube\.npz", io.load, path, error=FileError)
 
 
 @pytest.mark.parametrize(
@@ -99,8 +80,7 @@ def test_the_labels_of_maps_are_what_we_write(tmp_path, name, change):
     save_maps(path, {"maximum_likelihood": ml.reconstruct(cube)}, source="a test")
     assert load_maps(path)[1]["source"] == "a test"
     rewrite(path, name, change)
-    with pytest.raises(FileError, match=r"maps\.npz"):
-        load_maps(path)
+    refused(r"maps\.npz", load_maps, path, error=FileError)
 
 
 @pytest.mark.parametrize("system", ["", {}, {"period_ns": 1.0}, [1], SYSTEM.replace(bins=2 * SYSTEM.bins).to_dict()])
@@ -108,14 +88,34 @@ def test_a_stream_has_the_system_of_its_photons(tmp_path, system):
     path = tmp_path / "photons.npz"
     ml.simulate_timestamps(one_return(), SYSTEM).save(path)
     rewrite(path, "attributes", lambda attributes: attributes["info"].update(system=system))
-    with pytest.raises(FileError, match=r"photons\.npz"):
-        ml.Timestamps.load(path)
+    refused(r"photons\.npz", ml.Timestamps.load, path, error=FileError)
 
 
 @pytest.mark.parametrize("values", [np.ones((2, 2, 8), bool), np.ones((2, 2, 8), complex), np.ones((2, 2, 8), "S3")])
 def test_light_of_another_type_is_an_error_of_the_file(tmp_path, values):
     """It was a TypeError, as if the caller had given it."""
-    with h5py.File(tmp_path / "light.h5", "w") as file:
-        file["transient"] = values
-    with pytest.raises(ValueError, match=r"light\.h5.*real numbers"):
-        io.read_transient(tmp_path / "light.h5", bin_ns=0.5).flux(SYSTEM, signal=1.0)
+    write_h5(tmp_path / "light.h5", {"transient": values})
+    path = tmp_path / "light.h5"
+    refused(r"light\.h5.*real numbers", lambda: io.read_transient(path, bin_ns=0.5).flux(SYSTEM, signal=1.0))
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "message"),
+    [
+        ("bin", lambda bins: bins[::-1], "bin must be that of times_ns"),
+        ("bin", lambda bins: bins.astype(complex), "bin must be integers"),
+        ("cycle", lambda cycle: cycle.astype(float), "cycle must be integers"),
+        ("times_ns", lambda times: times.astype("M8[ns]"), "times_ns must be times"),
+    ],
+)
+def test_bins_of_a_stream_belong_to_their_times(tmp_path, name, change, message):
+    ml.simulate_timestamps(one_return(), SYSTEM).save(tmp_path / "a.npz")
+    rewrite(tmp_path / "a.npz", name, change)
+    refused(rf"a\.npz.*{message}", ml.Timestamps.load, tmp_path / "a.npz", error=FileError)
+
+
+@pytest.mark.parametrize("effect", [{"jitter": ml.Jitter(sigma_ns=0.5)}, {"code_density": (0.5, 1.5) * 16}])
+def test_jittered_and_uneven_bins_are_stored(tmp_path, effect):
+    times = ml.simulate_timestamps(one_return(), make_system(30.0, 50, 32, **effect))
+    times.save(tmp_path / "a.npz")
+    assert (ml.Timestamps.load(tmp_path / "a.npz").bin == times.bin).all()

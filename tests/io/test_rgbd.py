@@ -2,14 +2,16 @@
 
 from pathlib import Path
 
+import harness
 import numpy as np
 import pytest
 from PIL import Image
+from store_cases import png
 
 from mars_lidar import io
 from mars_lidar.io.rgbd import read_layers, read_rgbd
 from mars_lidar.scene.scene import Scene
-from tests.harness.command import command_line
+from tests.harness.command import ok
 
 SHARED = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "rgbd"
 NAN = np.nan
@@ -27,11 +29,6 @@ def millimetres() -> np.ndarray:
 
 
 METRES = [[NAN, 1.0, 1.5], [65.535, 2.5, 0.001]]
-
-
-def png(path: Path, array: np.ndarray) -> Path:
-    Image.fromarray(array).save(path)
-    return path
 
 
 # --- depth -------------------------------------------------------------------------------------------------
@@ -181,22 +178,13 @@ def test_depth_unit_does_not_apply_to_middlebury(tmp_path):
 
 
 def refused(message: str, *paths: Path, **options):
-    with pytest.raises(ValueError, match=message) as caught:
-        Scene.from_rgbd(*paths, **options)
-    return str(caught.value)
+    return harness.refused(message, Scene.from_rgbd, *paths, **options)
 
 
 def test_missing_files(tmp_path, millimetres):
     assert str(tmp_path / "no.png") in refused("no such file", tmp_path / "no.png")
     depth = png(tmp_path / "d.png", millimetres)
     assert str(tmp_path / "no.jpg") in refused("no such file", depth, tmp_path / "no.jpg")
-
-
-@pytest.mark.parametrize("name", ["d.png", "d.npy", "d.npz", "d.tiff"])
-@pytest.mark.parametrize("content", [b"", b"not an image at all", b"\x89PNG\r\n\x1a\n garbage", b"\x93NUMPY"])
-def test_damaged_depth_files(tmp_path, name, content):
-    (tmp_path / name).write_bytes(content)
-    assert refused("cannot be read", tmp_path / name).startswith(str(tmp_path / name))
 
 
 def test_truncated_image(tmp_path):
@@ -210,37 +198,43 @@ def test_pickles_are_not_loaded(tmp_path):
     refused(r"d\.npy: cannot be read", tmp_path / "d.npy")
 
 
-def test_depth_of_the_wrong_kind(tmp_path):
-    refused("16-bit integers in one channel.*uint8", png(tmp_path / "8.png", np.ones((2, 2), dtype=np.uint8)))
-    refused("16-bit integers in one channel", png(tmp_path / "rgb.png", np.ones((2, 2, 3), dtype=np.uint8)))
-    np.save(tmp_path / "i.npy", np.ones((2, 2), dtype=np.uint16))
-    refused(r"i\.npy: depth is uint16.*depth_unit_m", tmp_path / "i.npy")
-    np.save(tmp_path / "n.npy", np.array([[1.0, -2.0]]))
-    refused(r"n\.npy: depth must not be negative, got -2 m", tmp_path / "n.npy")
-    np.save(tmp_path / "3.npy", np.ones((2, 2, 2)))
-    refused(r"3\.npy: depth must be real numbers \(H, W\), got shape \(2, 2, 2\)", tmp_path / "3.npy")
-    np.save(tmp_path / "e.npy", np.ones((0, 2)))
-    refused(r"e\.npy: depth must be real numbers", tmp_path / "e.npy")
-    np.save(tmp_path / "0.npy", np.zeros((2, 2)))
-    refused(r"0\.npy: no pixel has a depth", tmp_path / "0.npy")
-    jpg = png(tmp_path / "d.jpg", np.ones((4, 4), dtype=np.uint8))
-    refused(r"d\.jpg: depth must be a \.png", jpg)
+@pytest.mark.parametrize(
+    ("name", "array", "message"),
+    [
+        ("8.png", np.ones((2, 2), np.uint8), "16-bit integers in one channel.*uint8"),
+        ("rgb.png", np.ones((2, 2, 3), np.uint8), "16-bit integers in one channel"),
+        ("d.jpg", np.ones((4, 4), np.uint8), r"d\.jpg: depth must be a \.png"),
+        ("i.npy", np.ones((2, 2), np.uint16), r"i\.npy: depth is uint16.*depth_unit_m"),
+        ("n.npy", np.array([[1.0, -2.0]]), r"n\.npy: depth must not be negative, got -2 m"),
+        ("3.npy", np.ones((2, 2, 2)), r"3\.npy: depth must be real numbers \(H, W\), got shape \(2, 2, 2\)"),
+        ("e.npy", np.ones((0, 2)), r"e\.npy: depth must be real numbers"),
+        ("0.npy", np.zeros((2, 2)), r"0\.npy: no pixel has a depth"),
+    ],
+)
+def test_depth_of_the_wrong_kind(tmp_path, name, array, message):
+    (np.save if name.endswith(".npy") else png)(tmp_path / name, array)
+    refused(message, tmp_path / name)
 
 
-def test_bad_archives(tmp_path):
-    depth = np.ones((2, 2))
-    for name, arrays, message in (
-        ("a", {"z": depth}, "must hold an array 'depth', got z"),
-        ("b", {"depth": depth, "reflectivity": depth, "image": depth}, "one of 'reflectivity' and 'image'"),
-        ("c", {"depth": depth, "reflectivity": 2 * depth}, r"reflectivity must lie in \[0, 1\], got 2 to 2"),
-        ("d", {"depth": depth, "reflectivity": np.ones((3, 2))}, "size of depth, 2 x 2, got 3 x 2"),
-        ("e", {"depth": depth, "background": -depth}, "background must be finite and >= 0"),
-        ("f", {"depth": depth, "image": np.full((2, 2), 7.0)}, r"floats must lie in \[0, 1\]"),
-        ("g", {"depth": depth, "image": np.ones((2, 2), dtype=np.int32)}, "8 or 16 bits per channel"),
-        ("h", {"depth": depth, "image": np.ones((2, 2, 5))}, "grey or RGB"),
-    ):
-        np.savez(tmp_path / name, **arrays)
-        assert refused(message, tmp_path / f"{name}.npz").startswith(str(tmp_path / f"{name}.npz"))
+DEPTH = np.ones((2, 2))
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"z": DEPTH}, "must hold an array 'depth', got z"),
+        ({"depth": DEPTH, "reflectivity": DEPTH, "image": DEPTH}, "one of 'reflectivity' and 'image'"),
+        ({"depth": DEPTH, "reflectivity": 2 * DEPTH}, r"reflectivity must lie in \[0, 1\], got 2 to 2"),
+        ({"depth": DEPTH, "reflectivity": np.ones((3, 2))}, "size of depth, 2 x 2, got 3 x 2"),
+        ({"depth": DEPTH, "background": -DEPTH}, "background must be finite and >= 0"),
+        ({"depth": DEPTH, "image": np.full((2, 2), 7.0)}, r"floats must lie in \[0, 1\]"),
+        ({"depth": DEPTH, "image": np.ones((2, 2), np.int32)}, "8 or 16 bits per channel"),
+        ({"depth": DEPTH, "image": np.ones((2, 2, 5))}, "grey or RGB"),
+    ],
+)
+def test_bad_archives(tmp_path, arrays, message):
+    np.savez(tmp_path / "a.npz", **arrays)
+    assert refused(message, tmp_path / "a.npz").startswith(str(tmp_path / "a.npz"))
 
 
 def test_sizes_must_agree(tmp_path, millimetres):
@@ -307,13 +301,10 @@ def test_depths_beyond_the_largest_are_no_return(tmp_path):
     layers = read_layers(tmp_path / "layers.npz", max_depth_m=5.5).layers
     assert np.array_equal(np.isnan(layers[1].depth_m), depth + 1.0 > 5.5)
     out = tmp_path / "out.npz"
-    options = ["--depth", str(path), "--max-depth-m", "5", "--cycles", "100", "--no-picture", "-o", str(out)]
-    printed = command_line(["simulate", *options])
-    assert printed.exit_code == 0, printed.output
+    near = ("--max-depth-m", "5", "--cycles", "100", "-o")
+    ok("simulate", "--depth", path, "--no-picture", *near, out)
     assert np.array_equal(np.isnan(io.load(out).depth_m), depth > 5.0)
-    options = ["-o", str(tmp_path / "set.zarr"), "--cycles", "100", "--max-depth-m", "5"]
-    printed = command_line(["generate", str(path), *options])
-    assert printed.exit_code == 0, printed.output
+    ok("generate", path, *near, tmp_path / "set.zarr")
 
 
 @pytest.mark.parametrize("suffix", [".png", ".tif", ".npy"])

@@ -1,20 +1,20 @@
 """NYUv2, Middlebury 2014, PFM and EXR scenes, and whole folders of scenes."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
-from PIL import Image
+from harness import refused
+from harness.files import write_h5
+from store_cases import png
 
 from mars_lidar import io
 from mars_lidar.io.pixels import read_pfm
 from mars_lidar.io.rgbd import read_rgbd
 from mars_lidar.scene.scene import Scene
-from tests.harness.command import command_line
+from tests.harness.command import fails, ok
 
 SHARED = Path(__file__).resolve().parents[2].parent / "shared" / "data"
 NAN, INF = np.nan, np.inf
@@ -25,11 +25,6 @@ def pfm(path: Path, values, order: str = "<", scale: float = 1.0) -> Path:
     kind = "PF" if values.ndim == 3 else "Pf"
     head = f"{kind}\n{values.shape[1]} {values.shape[0]}\n{-scale if order == '<' else scale}\n"
     path.write_bytes(head.encode() + values[::-1].astype(f"{order}f4").tobytes())
-    return path
-
-
-def png(path: Path, array) -> Path:
-    Image.fromarray(np.asarray(array)).save(path)
     return path
 
 
@@ -66,13 +61,11 @@ def test_pfm_by_its_bytes(tmp_path):
 )
 def test_bad_pfm(tmp_path, content, message):
     (tmp_path / "d.pfm").write_bytes(content)
-    with pytest.raises(ValueError, match=rf"d\.pfm: cannot be read \(.*{message}"):
-        read_rgbd(tmp_path / "d.pfm")
+    refused(rf"d\.pfm: cannot be read \(.*{message}", read_rgbd, tmp_path / "d.pfm")
 
 
 def test_a_pfm_of_three_channels_is_no_depth(tmp_path):
-    with pytest.raises(ValueError, match=r"d\.pfm: depth must be real numbers \(H, W\)"):
-        read_rgbd(pfm(tmp_path / "d.pfm", np.ones((2, 2, 3))))
+    refused(r"d\.pfm: depth must be real numbers \(H, W\)", read_rgbd, pfm(tmp_path / "d.pfm", np.ones((2, 2, 3))))
 
 
 # --- EXR ---------------------------------------------------------------------------------------------------
@@ -90,22 +83,18 @@ def test_exr(tmp_path):
         np.testing.assert_array_equal(read_rgbd(tmp_path / "d.exr")[0], want)
     with openexr.File(header, {"U": values, "V": values}) as file:
         file.write(str(tmp_path / "uv.exr"))
-    with pytest.raises(ValueError, match=r"uv\.exr: must have a channel of depth"):
-        read_rgbd(tmp_path / "uv.exr")
+    refused(r"uv\.exr: must have a channel of depth", read_rgbd, tmp_path / "uv.exr")
     colours = {name: values + shift for name, shift in (("R", 0), ("G", 1), ("B", 2))}
     with openexr.File(header, colours) as file:
         file.write(str(tmp_path / "image.exr"))
-    with pytest.raises(ValueError, match=r"image\.exr: holds colours, not depth: its channels are B, G, R"):
-        read_rgbd(tmp_path / "image.exr")
+    refused(r"image\.exr: holds colours, not depth: its channels are B, G, R", read_rgbd, tmp_path / "image.exr")
     with openexr.File(header, {f"ViewLayer.Combined.{name}": colour for name, colour in colours.items()}) as file:
         file.write(str(tmp_path / "layers.exr"))
-    with pytest.raises(ValueError, match=r"layers\.exr: must have a channel of depth"):
-        read_rgbd(tmp_path / "layers.exr")
+    refused(r"layers\.exr: must have a channel of depth", read_rgbd, tmp_path / "layers.exr")
     whole = (tmp_path / "d.exr").read_bytes()
     for content in (b"", b"garbage", whole[:60], whole[:-20]):
         (tmp_path / "bad.exr").write_bytes(content)
-        with pytest.raises(ValueError, match=r"bad\.exr: "):
-            read_rgbd(tmp_path / "bad.exr")
+        refused(r"bad\.exr: ", read_rgbd, tmp_path / "bad.exr")
 
 
 @pytest.mark.parametrize("nothing", [1e10, 65504.0, np.inf])
@@ -138,9 +127,7 @@ def nyu(path: Path, frames: int = 3) -> np.ndarray:
     colours = np.zeros((frames, 2, 4, 3), np.uint8)
     colours[:, 0, 1] = [255, 0, 0]
     colours[:, 1, 3] = 255
-    with h5py.File(path, "w") as file:
-        file["depths"] = depth.transpose(0, 2, 1)
-        file["images"] = colours.transpose(0, 3, 2, 1)
+    write_h5(path, {"depths": depth.transpose(0, 2, 1), "images": colours.transpose(0, 3, 2, 1)})
     return depth
 
 
@@ -154,40 +141,31 @@ def test_nyu_frames(tmp_path):
         ({"index": 3}, r"index must be an integer in \[0, 2\], got 3"),
         ({"index": 0, "depth_unit_m": 1e-3}, "depth_unit_m does not apply to NYUv2"),
     ):
-        with pytest.raises(ValueError, match=message):
-            read_rgbd(tmp_path / "nyu.mat", **options)
+        refused(message, read_rgbd, tmp_path / "nyu.mat", **options)
     np.save(tmp_path / "d.npy", np.ones((2, 2)))
-    with pytest.raises(ValueError, match=r"d\.npy: has no frames, got index 0"):
-        read_rgbd(tmp_path / "d.npy", index=0)
+    refused(r"d\.npy: has no frames, got index 0", read_rgbd, tmp_path / "d.npy", index=0)
 
 
 def test_bad_nyu(tmp_path):
     path = tmp_path / "nyu.mat"
     path.write_bytes(b"MATLAB 5.0 MAT-file")
-    with pytest.raises(ValueError, match=r"nyu\.mat: has no frames, got index 0"):
-        read_rgbd(path, index=0)
-    with pytest.raises(ValueError, match=r"nyu\.mat"):
-        read_rgbd(path)
-    with h5py.File(path, "w") as file:
-        file["depths"] = np.ones((2, 4, 3))
-    with pytest.raises(ValueError, match="must hold 'depths' and 'images' as NYUv2 does, got depths"):
-        read_rgbd(path, index=0)
+    refused(r"nyu\.mat: has no frames, got index 0", read_rgbd, path, index=0)
+    refused(r"nyu\.mat", read_rgbd, path)
+    write_h5(path, {"depths": np.ones((2, 4, 3))})
+    refused("must hold 'depths' and 'images' as NYUv2 does, got depths", read_rgbd, path, index=0)
     with h5py.File(path, "a") as file:
         file["images"] = np.ones((2, 3, 3, 4), np.uint8)
-    with pytest.raises(ValueError, match=r"depths must be \(N, W, H\) and images \(N, 3, W, H\)"):
-        read_rgbd(path, index=0)
+    refused(r"depths must be \(N, W, H\) and images \(N, 3, W, H\)", read_rgbd, path, index=0)
 
 
 def test_the_command_takes_a_frame(tmp_path):
     nyu(tmp_path / "nyu.mat")
     arguments = ["simulate", "--depth", tmp_path / "nyu.mat", "--cycles", "5", "--bins", "16", "--no-picture"]
-    done = command_line([str(a) for a in (*arguments, "--index", 1, "-o", tmp_path / "a.npz")])
-    assert done.exit_code == 0, done.output
+    ok(*arguments, "--index", 1, "-o", tmp_path / "a.npz")
     with io.load(tmp_path / "a.npz") as cube:
         assert cube.depth_m[0, 0] == 9.0
         assert "frame 1" in cube.recipe.source
-    done = command_line([str(a) for a in (*arguments, "-o", tmp_path / "b.npz")])
-    assert (done.exit_code, "index tells which" in " ".join(done.output.split())) == (2, True)
+    fails("index tells which", *arguments, "-o", tmp_path / "b.npz")
 
 
 # --- Middlebury 2014 ---------------------------------------------------------------------------------------
@@ -224,8 +202,7 @@ def test_middlebury_2014(tmp_path):
 def test_middlebury_2014_with_a_file_missing(tmp_path, name):
     folder = middlebury(tmp_path / "a")
     (folder / name).unlink()
-    with pytest.raises(ValueError, match=rf"{name} not found.*Middlebury 2014/2021"):
-        read_rgbd(folder)
+    refused(rf"{name} not found.*Middlebury 2014/2021", read_rgbd, folder)
 
 
 @pytest.mark.parametrize(
@@ -238,8 +215,7 @@ def test_middlebury_2014_with_a_file_missing(tmp_path, name):
     ],
 )
 def test_bad_calibrations(tmp_path, old, new, message):
-    with pytest.raises(ValueError, match=rf"calib\.txt: {message}"):
-        read_rgbd(middlebury(tmp_path / "a", CALIB.replace(old, new)))
+    refused(rf"calib\.txt: {message}", read_rgbd, middlebury(tmp_path / "a", CALIB.replace(old, new)))
 
 
 # --- folders -----------------------------------------------------------------------------------------------
@@ -316,14 +292,10 @@ def test_by_manifest(tmp_path):
     ):
         assert part in line
     (tmp_path / "other.csv").write_text("depth,colour\nd.npy,x.png\n")
-    with pytest.raises(ValueError, match=r"other\.csv: columns must be depth and any of image"):
-        io.scan(tmp_path, manifest=tmp_path / "other.csv")
-    with pytest.raises(ValueError, match="no such file"):
-        io.scan(tmp_path, manifest=tmp_path / "none.csv")
-    with pytest.raises(ValueError, match="no such folder"):
-        io.scan(tmp_path / "none")
-    with pytest.raises(ValueError, match="image must be two texts that go with a pattern"):
-        io.scan(tmp_path, image=("a", "b"))
+    refused(r"other\.csv: columns must be depth and any of image", io.scan, tmp_path, manifest=tmp_path / "other.csv")
+    refused("no such file", io.scan, tmp_path, manifest=tmp_path / "none.csv")
+    refused("no such folder", io.scan, tmp_path / "none")
+    refused("image must be two texts that go with a pattern", io.scan, tmp_path, image=("a", "b"))
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason=f"real inputs are absent: {SHARED}")

@@ -1,7 +1,5 @@
 """Files: what is written comes back and makes the same cube again; bad input is refused and named."""
 
-from __future__ import annotations
-
 import json
 import warnings
 
@@ -10,6 +8,7 @@ import numpy as np
 import pytest
 import xarray
 import zarr
+from harness import refused
 from store_cases import PTU, SUFFIXES, SYSTEM, one_return, several_returns, waveform
 
 import mars_lidar as ml
@@ -179,8 +178,7 @@ def test_verify_sees_a_single_changed_count(tmp_path):
 
 def test_counts_that_do_not_belong_to_the_recipe_are_refused(tmp_path):
     made = io.Recipe(system=SYSTEM, flux=one_return())
-    with pytest.raises(ValueError, match=r"histogram must have the shape \(1, 6, 5, 64\)"):
-        io.Cube.of(np.zeros((1, 6, 5, 65), np.uint16), made)
+    refused(r"histogram must have the shape \(1, 6, 5, 64\)", io.Cube.of, np.zeros((1, 6, 5, 65), np.uint16), made)
     wrong = io.Cube.of(np.zeros((1, 6, 5, 64), np.float32), made)
     with pytest.raises(TypeError, match="histogram must be uint16 for this system, got float32"):
         io.save(tmp_path / "cube.h5", wrong)
@@ -203,16 +201,13 @@ def test_counts_that_do_not_belong_to_the_recipe_are_refused(tmp_path):
     ],
 )
 def test_a_recipe_checks_its_fields(changes, error, message):
-    with pytest.raises(error, match=message):
-        io.Recipe(**({"system": SYSTEM, "flux": one_return()} | changes))
+    refused(message, io.Recipe, **{"system": SYSTEM, "flux": one_return()} | changes, error=error)
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_bad_arguments_leave_nothing_on_disk(tmp_path, suffix):
-    with pytest.raises(ValueError, match="engine must be one of"):
-        io.simulate_to(tmp_path / f"cube{suffix}", one_return(), SYSTEM, engine="quick")
-    with pytest.raises(ValueError, match="threads must be"):
-        io.simulate_to(tmp_path / f"cube{suffix}", one_return(), SYSTEM, threads=0)
+    refused("engine must be one of", io.simulate_to, tmp_path / f"cube{suffix}", one_return(), SYSTEM, engine="quick")
+    refused("threads must be", io.simulate_to, tmp_path / f"cube{suffix}", one_return(), SYSTEM, threads=0)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -228,16 +223,14 @@ def test_the_place_to_write_to_is_checked_first(tmp_path):
         io.simulate_to(tmp_path / "photos.zarr", flux, SYSTEM, overwrite=True)
     assert (tmp_path / "photos.zarr" / "holiday.jpg").read_text() == "dear"
     (tmp_path / "folder.h5").mkdir()
-    with pytest.raises(FileExistsError, match="not a file"):
-        io.simulate_to(tmp_path / "folder.h5", flux, SYSTEM, overwrite=True)
+    refused("not a file", io.simulate_to, tmp_path / "folder.h5", flux, SYSTEM, overwrite=True, error=FileExistsError)
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_an_existing_file_is_replaced_only_on_request(tmp_path, suffix):
     path = tmp_path / f"cube{suffix}"
     io.simulate_to(path, one_return(), SYSTEM, seed=1)
-    with pytest.raises(FileExistsError, match="exists already"):
-        io.simulate_to(path, one_return(), SYSTEM, seed=2)
+    refused("exists already", io.simulate_to, path, one_return(), SYSTEM, seed=2, error=FileExistsError)
     with io.load(path) as cube:
         assert cube.seed == 1
     io.simulate_to(path, one_return(4, 3), SYSTEM, seed=2, overwrite=True)
@@ -251,8 +244,7 @@ def test_files_that_are_not_cubes_are_named(tmp_path, content):
     for suffix in SUFFIXES:
         path = tmp_path / f"cube{suffix}"
         if content == "nothing":
-            with pytest.raises(FileNotFoundError, match=r"cube.* does not exist"):
-                io.load(path)
+            refused(r"cube.* does not exist", io.load, path, error=FileNotFoundError)
             continue
         if suffix == ".zarr":
             zarr.create_group(path)
@@ -260,20 +252,17 @@ def test_files_that_are_not_cubes_are_named(tmp_path, content):
             h5py.File(path, "w").close()
         else:
             np.savez(path, a=np.zeros(3))
-        with pytest.raises(ValueError, match=r"cube.* is not a cube written by mars-lidar"):
-            io.load(path)
+        refused(r"cube.* is not a cube written by mars-lidar", io.load, path)
         if suffix != ".zarr":
             path.write_bytes(b"garbage")
-            with pytest.raises(ValueError, match=r"cube.* cannot be read as an?"):
-                io.load(path)
+            refused(r"cube.* cannot be read as an?", io.load, path)
 
 
 def test_a_layout_from_the_future_is_refused(tmp_path):
     io.simulate_to(tmp_path / "cube.h5", one_return(), SYSTEM)
     with h5py.File(tmp_path / "cube.h5", "a") as file:
         file.attrs["format_version"] = 2
-    with pytest.raises(ValueError, match="layout version 2; version 1 can be read"):
-        io.load(tmp_path / "cube.h5")
+    refused("layout version 2; version 1 can be read", io.load, tmp_path / "cube.h5")
 
 
 def test_an_npz_that_memory_cannot_hold_is_refused_before_the_work(tmp_path, monkeypatch):
@@ -285,7 +274,5 @@ def test_an_npz_that_memory_cannot_hold_is_refused_before_the_work(tmp_path, mon
 
 def test_a_part_to_regenerate_must_exist():
     made = io.Recipe(system=SYSTEM, flux=one_return())
-    with pytest.raises(ValueError, match=r"rows must select a run of at least one of 6, got slice\(7, 9"):
-        io.regenerate(made, rows=slice(7, 9))
-    with pytest.raises(ValueError, match="realizations must select"):
-        io.regenerate(made, realizations=slice(0, 1, 2))
+    refused(r"rows must select a run of at least one of 6, got slice\(7, 9", io.regenerate, made, rows=slice(7, 9))
+    refused("realizations must select", io.regenerate, made, realizations=slice(0, 1, 2))

@@ -1,7 +1,5 @@
 """Photon streams on disk: what comes back, what the libraries of others see, and damaged files."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 from pathlib import Path
@@ -9,6 +7,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from harness import refused
 from store_cases import SYSTEM, one_return
 
 import mars_lidar as ml
@@ -184,8 +183,7 @@ def test_a_lab_s_t2_stream_is_folded_with_the_period(tmp_path):
     absolute_ps = np.array([1_000, 60_500, 61_000, 131_000])  # below the 2^25 of an overflow
     records = (np.array([0, 0, 1, 0]) << 25) | absolute_ps
     path = lab_ptu(tmp_path / "lab.ptu", 0x00010207, records, mode=2)
-    with pytest.raises(ValueError, match="absolute times without laser pulses: give period_ns"):
-        ml.Timestamps.load(path)
+    refused("absolute times without laser pulses: give period_ns", ml.Timestamps.load, path)
     times = ml.Timestamps.load(path, period_ns=50.0, bins=100)
     counts = times.counts.ravel()
     photons_of = [times.pixel(0, int(k)) for k in np.flatnonzero(counts)]
@@ -211,8 +209,7 @@ def test_photon_hdf5_of_others(tmp_path):
     assert times.bin.tolist() == [10, 0, 20, 999]
     with h5py.File(path, "a") as file:
         del file["photon_data/nanotimes"]
-    with pytest.raises(ValueError, match="absolute times without laser pulses: give period_ns"):
-        ml.Timestamps.load(path)
+    refused("absolute times without laser pulses: give period_ns", ml.Timestamps.load, path)
     folded = ml.Timestamps.load(path, period_ns=50.0, bins=10)
     assert folded.cycle.tolist() == [3, 2, 3, 4]
     assert folded.bin.tolist() == [2, 7, 2, 7]
@@ -226,51 +223,39 @@ def test_damaged_streams_are_named(tmp_path, suffix):
     path = tmp_path / f"photons{suffix}"
     for content in (b"", b"garbage" * 40):
         path.write_bytes(content)
-        with pytest.raises(ValueError, match=r"photons\..* (is not|cannot be read as) an? "):
-            ml.Timestamps.load(path)
+        refused(r"photons\..* (is not|cannot be read as) an? ", ml.Timestamps.load, path)
     photons().save(path, overwrite=True)
     whole = path.read_bytes()
     for size in (100, len(whole) // 2, len(whole) - 4):
         path.write_bytes(whole[:size])
-        with pytest.raises(ValueError, match=r"photons\."):
-            ml.Timestamps.load(path)
+        refused(r"photons\.", ml.Timestamps.load, path)
     path.rename(tmp_path / (path.name + ".incomplete"))
     for name in (path, tmp_path / (path.name + ".incomplete")):
-        with pytest.raises(io.IncompleteFileError):
-            ml.Timestamps.load(name)
+        refused("", ml.Timestamps.load, name, error=io.IncompleteFileError)
 
 
 def test_wrong_kinds_are_told_apart(tmp_path):
     io.simulate_to(tmp_path / "cube.npz", one_return(), SYSTEM)
     io.simulate_to(tmp_path / "cube.h5", one_return(), SYSTEM)
-    with pytest.raises(ValueError, match=r"cube\.npz is not a file of timestamps"):
-        ml.Timestamps.load(tmp_path / "cube.npz")
-    with pytest.raises(ValueError, match=r"cube\.h5 is not Photon-HDF5"):
-        ml.Timestamps.load(tmp_path / "cube.h5")
+    refused(r"cube\.npz is not a file of timestamps", ml.Timestamps.load, tmp_path / "cube.npz")
+    refused(r"cube\.h5 is not Photon-HDF5", ml.Timestamps.load, tmp_path / "cube.h5")
     photons().save(tmp_path / "photons.npz")
-    with pytest.raises(ValueError, match=r"photons\.npz holds a photon stream, not a cube"):
-        io.load(tmp_path / "photons.npz")
-    with pytest.raises(ValueError, match=r"must end in one of \.npz, \.ptu, \.h5"):
-        photons().save(tmp_path / "photons.csv")
-    with pytest.raises(ValueError, match="are for streams of other programs"):
-        ml.Timestamps.load(tmp_path / "photons.npz", bins=10)
-    with pytest.raises(FileExistsError):
-        photons().save(tmp_path / "photons.npz")
-    with pytest.raises(FileNotFoundError):
-        ml.Timestamps.load(tmp_path / "nothing.npz")
+    refused(r"photons\.npz holds a photon stream, not a cube", io.load, tmp_path / "photons.npz")
+    refused(r"must end in one of \.npz, \.ptu, \.h5", photons().save, tmp_path / "photons.csv")
+    refused("are for streams of other programs", ml.Timestamps.load, tmp_path / "photons.npz", bins=10)
+    refused("", photons().save, tmp_path / "photons.npz", error=FileExistsError)
+    refused("", ml.Timestamps.load, tmp_path / "nothing.npz", error=FileNotFoundError)
 
 
 def test_nothing_is_left_of_a_stream_that_fails(tmp_path, monkeypatch):
     pytest.importorskip("ptufile", reason="ptufile (extra io) is not installed")
-    with pytest.raises(ValueError, match="bins must be at most 32768"):
-        photons(LONG.replace(bins=40000)).save(tmp_path / "photons.ptu")
+    refused("bins must be at most 32768", photons(LONG.replace(bins=40000)).save, tmp_path / "photons.ptu")
 
     def interrupted(*_: object):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(ptu, "set_integer", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        photons().save(tmp_path / "photons.ptu")
+    refused("", photons().save, tmp_path / "photons.ptu", error=KeyboardInterrupt)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -278,8 +263,7 @@ def test_a_layout_from_the_future_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr("mars_lidar.io.streams.photons.FORMAT_VERSION", 2)
     photons().save(tmp_path / "photons.npz")
     monkeypatch.undo()
-    with pytest.raises(ValueError, match=r"photons\.npz.*layout version 2; version 1 can be read"):
-        ml.Timestamps.load(tmp_path / "photons.npz")
+    refused(r"photons\.npz.*layout version 2; version 1 can be read", ml.Timestamps.load, tmp_path / "photons.npz")
 
 
 def test_the_info_of_timestamps_is_plain_data():

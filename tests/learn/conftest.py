@@ -1,7 +1,5 @@
 """Everything here has PyTorch on one thread."""
 
-from __future__ import annotations
-
 import pytest
 
 

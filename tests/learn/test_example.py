@@ -1,7 +1,5 @@
 """The example, shortened: it runs, learns, and measures itself."""
 
-from __future__ import annotations
-
 import runpy
 from pathlib import Path
 

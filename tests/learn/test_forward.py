@@ -1,23 +1,16 @@
 """The differentiable forward model: its gradients, and its values against independent ones."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from harness import make_system
+from harness import make_system, refused
 
 import mars_lidar as ml
-from mars_lidar.learn import (
-    HistogramTable,
-    bin_photons,
-    expected_histogram,
-    forward,
-    histogram_log_likelihood,
-)
+from mars_lidar.learn import HistogramTable, bin_photons, expected_histogram, forward, histogram_log_likelihood
 from mars_lidar.reconstruction.maximum_likelihood import log_likelihood
+from tests.learn.accuracy import CLASSES, errors, sweep
 
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated")  # torch's own forward mode calls it
 
@@ -92,8 +85,7 @@ def test_transforms_of_torch_func(start, cycles):
         scale = float(hessian.abs().max())
         torch.testing.assert_close(hessian, twice, rtol=0, atol=1e-9 * scale)
         torch.testing.assert_close(hessian, central, rtol=0, atol=1e-5 * scale)
-        with pytest.raises(ValueError, match="forward mode within forward mode"):
-            torch.func.jacfwd(torch.func.jacfwd(loss))(x)
+        refused("forward mode within forward mode", torch.func.jacfwd(torch.func.jacfwd(loss)), x)
     each = torch.vmap(torch.func.hessian(loss))(torch.stack(at, 1)[:2])
     torch.testing.assert_close(each[1], hessian, rtol=1e-9, atol=1e-9 * scale)
 
@@ -120,11 +112,9 @@ def test_vmap_and_jacobians_of_every_function(name):
     back, ahead = (torch.vmap(mode(function, argnums=every))(*at) for mode in (torch.func.jacrev, torch.func.jacfwd))
     for first, other in zip(back, ahead, strict=True):
         torch.testing.assert_close(first, other, rtol=1e-9, atol=1e-9)
-    with pytest.raises(ValueError, match="must be >= 0"):
-        torch.vmap(function)(-at[0], *at[1:])
+    refused("must be >= 0", torch.vmap(function), -at[0], *at[1:])
     for half in (torch.float16, torch.bfloat16):
-        with pytest.raises(TypeError, match="single or double precision"):
-            function(*(x.to(half) for x in at))
+        refused("single or double precision", function, *(x.to(half) for x in at), error=TypeError)
 
 
 @pytest.mark.parametrize("half", [torch.float16, torch.bfloat16])
@@ -201,20 +191,19 @@ def test_expected_histogram_is_the_exact_mean(start, dead_ns):
 def test_gradients_in_coarse_bins_are_those_of_the_exact_mean(bins, sigma, dead, light):
     """To 4e-3 in the norm over the bins, as the docstring says."""
     instrument = system(dead, bins=bins, pulse=ml.GaussianPulse(sigma_ns=sigma), cycles=1000)
-    assert _errors(light, instrument, 1e-3 * sigma)[1] < 4e-3
+    assert errors(light, instrument, 1e-3 * sigma)[1].max() < 4e-3
 
 
 @pytest.mark.parametrize(
-    ("bins", "sample", "dead", "light"),
-    [(64, 1.56, 12.0, (0.3, 4.75, 31.7)), (32, 4.28, 12.0, (2.0, 0.39, 43.1))],
+    ("bins", "sample", "dead", "light"), [(64, 1.56, 12.0, (0.3, 4.75, 31.7)), (32, 4.28, 12.0, (2.0, 0.39, 43.1))]
 )
 def test_measured_pulses_in_coarse_bins(bins, sample, dead, light):
     """Values and gradients as accurate as those of Gaussian pulses, for pulses with an edge, wider than a bin."""
     pulse = ml.SampledPulse(np.exp(-np.arange(17) / 4.0), sample, origin="first")
     instrument = system(dead, bins=bins, pulse=pulse, cycles=1000)
-    variation, gradients = _errors(light, instrument, 1e-3 * sample)
+    variation, gradients = errors(light, instrument, 1e-3 * sample)
     assert variation < 4e-4
-    assert gradients < 4e-3
+    assert gradients.max() < 4e-3
 
 
 @pytest.mark.parametrize(
@@ -229,9 +218,19 @@ def test_measured_pulses_in_coarse_bins(bins, sample, dead, light):
 def test_armed_exposures_that_end_within_their_transient(periods, cycles, light):
     """The same accuracy where the pixel is not settled at the end."""
     instrument = system(100.0 * periods, bins=32, cycles=cycles, start="armed")
-    variation, gradients = _errors(light, instrument, 3e-3)
+    variation, gradients = errors(light, instrument, 3e-3)
     assert variation < 4e-4
-    assert gradients < 4e-3
+    assert gradients.max() < 4e-3
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("kind", CLASSES)
+def test_accuracy_over_random_systems(kind):
+    """The bounds that the docstring states, half as much again, over systems that the table of docs/learn.md lacks."""
+    variation, signal, background, delay = np.nanmax(sweep(kind, 60, seed=20_261_128), axis=0)
+    assert variation < 6e-4
+    assert max(signal, background) < 7e-3
+    assert delay < {"measured": 1.4e-2, "measured, near": 4.5e-2}.get(kind, 4.5e-3)
 
 
 def test_one_period_within_a_dead_time():
@@ -249,22 +248,6 @@ def test_dead_times_within_a_part_of_a_bin():
     exact = ml.mean_histogram(ml.Flux(*(np.array(values) for values in AT)), instrument).sum(-1)
     np.testing.assert_allclose(coarse, exact, rtol=4e-2)
     np.testing.assert_allclose(fine, exact, rtol=4e-3)
-
-
-def _errors(light, instrument, step_ns):
-    """Total variation from the native recursion, and of the gradients from its differences; norm over the bins."""
-    light, steps = np.array(light), np.array([1e-3 * light[0], 1e-3 * light[1], step_ns])
-    at = light + np.concatenate([np.zeros((1, 3)), np.diag(steps), -np.diag(steps)])
-    exact, *moved = ml.mean_histogram(ml.Flux(*at.T), instrument, tolerance=1e-7).reshape(7, -1)
-    mean = expected_histogram(*point(*light), instrument).detach().numpy()
-    slopes = (np.array(moved[:3]) - np.array(moved[3:])) / (2.0 * steps[:, None])
-    gradients = np.linalg.norm(_jacobian(light, instrument) - slopes, axis=1) / np.linalg.norm(slopes, axis=1)
-    return np.abs(mean - exact).sum() / 2.0 / exact.sum(), gradients.max()
-
-
-def _jacobian(light, instrument):
-    at = torch.tensor(light, dtype=torch.float64)
-    return torch.func.jacrev(lambda x: expected_histogram(x[0], x[1], x[2], instrument))(at).T.numpy()
 
 
 def test_efficiency_and_dark_counts_are_those_of_the_exact_mean():
@@ -338,14 +321,11 @@ def test_batches_types_and_bad_arguments():
     assert result.dtype == torch.float32
     alone = expected_histogram(maps[0][1, 2, 3], maps[1][3], maps[2], instrument)
     torch.testing.assert_close(result[1, 2, 3], alone)
-    with pytest.raises(TypeError, match="signal must be a Tensor"):
-        expected_histogram(1.0, *maps[1:], instrument)
-    with pytest.raises(ValueError, match="must be >= 0"):
-        expected_histogram(-maps[0], *maps[1:], instrument)
+    refused("signal must be a Tensor", expected_histogram, 1.0, *maps[1:], instrument, error=TypeError)
+    refused("must be >= 0", expected_histogram, -maps[0], *maps[1:], instrument)
     with pytest.raises(ValueError, match=r"must broadcast, got shapes \(2, 3, 4\), \(5,\), \(\)"):
         expected_histogram(maps[0], torch.rand(5), maps[2], instrument)
-    with pytest.raises(ValueError, match="histogram must be a tensor"):
-        histogram_log_likelihood(torch.zeros(3), *maps, instrument)
+    refused("histogram must be a tensor", histogram_log_likelihood, torch.zeros(3), *maps, instrument)
     with pytest.raises(ValueError, match="mode 'synchronous'"):
         expected_histogram(*maps, instrument.replace(detector=ml.Detector(dead_time_ns=10.0, mode="synchronous")))
     assert expected_histogram(*(torch.zeros(0, 3) for _ in range(3)), instrument).shape == (0, 3, 20)

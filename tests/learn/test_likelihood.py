@@ -4,8 +4,6 @@ At the exact mean histogram (`mars_lidar.statistics.mean_histogram`, which share
 at the true light must vanish. What remains, times the inverse curvature, is the bias of the estimate.
 """
 
-from __future__ import annotations
-
 import re
 import warnings
 from dataclasses import dataclass
@@ -14,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from harness import make_system
+from harness import make_system, refused
 
 import mars_lidar as ml
 from mars_lidar._base.native import _core
@@ -200,9 +198,7 @@ def test_gradient_in_bins_that_are_cut(sigma, dead):
     for mode in (torch.func.grad, torch.func.jacrev, torch.func.jacfwd):
         slope = mode(value)(at)
         assert float((slope - central).abs().max()) < 1e-6 * float(central.abs().max())
-    with pytest.raises(ValueError, match="first and second derivatives only"):
-        torch.func.jacrev(torch.func.hessian(value))(at)
-    with pytest.raises(ValueError, match="forward mode within forward mode"):
-        torch.func.jacfwd(torch.func.jacfwd(value))(at)
+    refused("first and second derivatives only", torch.func.jacrev(torch.func.hessian(value)), at)
+    refused("forward mode within forward mode", torch.func.jacfwd(torch.func.jacfwd(value)), at)
     with pytest.raises(ValueError, match="no derivatives with respect to the histogram"):
         histogram_log_likelihood(counts.requires_grad_(), at[0], at[1], at[2], system)

@@ -1,7 +1,5 @@
 """Training examples of a stored dataset: each once, in an order of their own, shared out among ranks and workers."""
 
-from __future__ import annotations
-
 import json
 import os
 import socket
@@ -11,7 +9,7 @@ import sys
 import numpy as np
 import pytest
 import torch
-from harness import make_system
+from harness import make_system, refused
 from torch.utils.data import DataLoader
 
 import mars_lidar as ml
@@ -132,8 +130,7 @@ def test_transform_and_bad_arguments(path):
         ({"dtype": "float"}, TypeError, "dtype must be a torch.dtype"),
         ({"pool": 0}, ValueError, "pool must be"),
     ):
-        with pytest.raises(error, match=message):
-            StoredDataset(path, **options)
+        refused(message, StoredDataset, path, **options, error=error)
 
 
 @pytest.mark.full
@@ -276,12 +273,10 @@ def test_a_stateful_loader_goes_on(path, workers):
 
 def test_positions_that_do_not_fit_are_refused(path):
     dataset = StoredDataset(path, batch_size=4, seed=3)
-    with pytest.raises(ValueError, match="with seed 3, this one has 4"):
-        StoredDataset(path, seed=4).load_state_dict(dataset.state_dict())
+    refused("with seed 3, this one has 4", StoredDataset(path, seed=4).load_state_dict, dataset.state_dict())
     loader = DataLoader(dataset, batch_size=None, num_workers=1)
     next(iter(loader))
-    with pytest.raises(ValueError, match="batches must be given"):
-        dataset.state_dict()
+    refused("batches must be given", dataset.state_dict)
 
 
 @pytest.mark.full
@@ -307,8 +302,7 @@ def test_several_stores_as_one_dataset(path, tmp_path):
     assert {int(example["store"]) for example in StoredDataset([path, tmp_path / "more.zarr"], samples=[6])} == {1}
     recipe["scenes"]["size"] = [6, 9]
     ml.generate(recipe, tmp_path / "other.zarr")
-    with pytest.raises(ValueError, match="must have the same images and bins"):
-        StoredDataset([path, tmp_path / "other.zarr"])
+    refused("must have the same images and bins", StoredDataset, [path, tmp_path / "other.zarr"])
 
 
 _RANK = """

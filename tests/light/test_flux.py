@@ -1,9 +1,8 @@
 """Flux: maps, broadcasting, returns, waveforms, parts of an image."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
+from harness import refused
 
 import mars_lidar as ml
 
@@ -50,10 +49,7 @@ def test_maps_are_copies_and_read_only():
 
 @pytest.mark.parametrize("dtype", [np.float32, np.int64, np.uint8, bool])
 def test_any_real_type(dtype: type):
-    assert ml.Flux(np.ones((2, 2), dtype), np.zeros((2, 2), dtype), 5).total.tolist() == [
-        [1.0, 1.0],
-        [1.0, 1.0],
-    ]
+    assert ml.Flux(np.ones((2, 2), dtype), np.zeros((2, 2), dtype), 5).total.tolist() == [[1.0, 1.0], [1.0, 1.0]]
 
 
 def test_waveform():
@@ -141,7 +137,6 @@ def test_info_is_the_fluxs_own():
 
 def test_delays_beyond_a_second_are_refused():
     """Their phase is lost in the rounding of float64: 1e15 + 13 ns came out at another one than 13 ns."""
-    with pytest.raises(ValueError, match=r"delay_ns must be within 1e\+09 ns either way, got 1e\+15; give it modulo"):
-        ml.Flux(1.0, 0.1, 1e15 + 13.0)
+    refused(r"delay_ns must be within 1e\+09 ns either way, got 1e\+15; give it modulo", ml.Flux, 1.0, 0.1, 1e15 + 13.0)
     far, near = ml.Flux(1.0, 0.1, 1e9), ml.Flux(1.0, 0.1, 1e9 % 133.3)
     np.testing.assert_allclose(far.delay_periods(133.3), near.delay_periods(133.3), atol=1e-8)

@@ -1,7 +1,5 @@
 """Packed timestamps: layout, limits, single pixels."""
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 import pickle
@@ -9,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from harness import make_system
+from harness import make_system, refused
 
 import mars_lidar as ml
 from mars_lidar import _core
@@ -66,8 +64,7 @@ def test_pixels_are_views_in_order_of_time(system: ml.System, flux: ml.Flux):
 @pytest.mark.parametrize("place", [(2, 0), (0, 3), (-3, 0), (0, -4)])
 def test_pixel_outside_of_the_image(system: ml.System, flux: ml.Flux, place: tuple[int, int]):
     times = ml.simulate_timestamps(flux, system)
-    with pytest.raises(IndexError, match=r"pixel \(.*\) is outside of an image of 2 x 3"):
-        times.pixel(*place)
+    refused(r"pixel \(.*\) is outside of an image of 2 x 3", times.pixel, *place, error=IndexError)
 
 
 def test_parts_have_the_times_of_the_whole(system: ml.System, flux: ml.Flux):
@@ -78,17 +75,14 @@ def test_parts_have_the_times_of_the_whole(system: ml.System, flux: ml.Flux):
 
 
 def test_engine_without_times_says_so(system: ml.System, flux: ml.Flux):
-    with pytest.raises(ValueError, match="engine 'poisson' draws histograms only"):
-        ml.simulate_timestamps(flux, system, engine="poisson")
+    refused("engine 'poisson' draws histograms only", ml.simulate_timestamps, flux, system, engine="poisson")
 
 
 def test_units_are_nanoseconds(system: ml.System):
     """The same draws at another period: times in proportion."""
     flux = ml.Flux(2.0, 0.5, 50.0)
     half = system.replace(
-        period_ns=system.period_ns / 2,
-        pulse=ml.GaussianPulse(sigma_ns=0.25),
-        detector=ml.Detector(dead_time_ns=42.5),
+        period_ns=system.period_ns / 2, pulse=ml.GaussianPulse(sigma_ns=0.25), detector=ml.Detector(dead_time_ns=42.5)
     )
     a = ml.simulate_timestamps(flux, system, seed=3)
     b = ml.simulate_timestamps(ml.Flux(2.0, 0.5, 25.0), half, seed=3)

@@ -1,7 +1,5 @@
 """What a notebook shows of objects, and the tutorial."""
 
-from __future__ import annotations
-
 import json
 import re
 import sys

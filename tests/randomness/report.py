@@ -8,8 +8,6 @@ and generator are the same. Debian has TestU01 in its section non-free (libtestu
 of another installation, with `include` and `lib` in it.
 """
 
-from __future__ import annotations
-
 import argparse
 import csv
 import hashlib

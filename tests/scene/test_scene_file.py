@@ -1,7 +1,5 @@
 """Options that commands share, and scene files: what a YAML file names is what the options mean."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -11,18 +9,13 @@ import mars_lidar as ml
 from mars_lidar import io
 from studies.compare.command import compare_app
 from studies.compare.command import main as compare_main
-from tests.harness.command import command_line, options_of
+from tests.harness.command import command_line, fails, ok, options_of, run
 
 SMALL = ["--period-ns", "20", "--cycles", "30", "--bins", "64", "--dead-time-ns", "5"]
 
 
-def run(*arguments: object):
-    return command_line([str(a) for a in arguments])
-
-
 def simulated(path, *arguments: object):
-    done = run("simulate", *arguments, *SMALL, "--no-picture", "--overwrite", "-o", path)
-    assert done.exit_code == 0, done.output
+    ok("simulate", *arguments, *SMALL, "--no-picture", "--overwrite", "-o", path)
     with io.load(path) as cube:
         return np.asarray(cube.histogram), cube.recipe.source
 
@@ -120,9 +113,7 @@ def test_scene_files_of_depth_and_of_a_built_in_scene(tmp_path):
 )
 def test_bad_scene_files_are_one_clear_line(transient, text, more, words):
     (transient / "scene.yaml").write_text(text)
-    done = run("simulate", "--scene", transient / "scene.yaml", *more, *SMALL, "-o", transient / "a.npz")
-    assert done.exit_code == 2
-    assert words in done.stderr
+    done = fails(words, "simulate", "--scene", transient / "scene.yaml", *more, *SMALL, "-o", transient / "a.npz")
     assert len(done.stderr.splitlines()) == 1
     missing = run("simulate", "--scene", transient / "other.yaml", *SMALL, "-o", transient / "a.npz")
     assert (missing.exit_code, "other.yaml: no such file" in missing.stderr) == (2, True)

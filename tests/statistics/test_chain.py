@@ -4,7 +4,7 @@ import warnings
 
 import numpy as np
 import pytest
-from harness import system_of
+from harness import refused, system_of
 
 import mars_lidar as ml
 from mars_lidar.statistics import ConvergenceError, PhaseChain, photons_per_bin
@@ -204,14 +204,10 @@ def test_grid_of_the_statistics():
 
 def test_bad_input_is_named():
     system = system_of(0.6, bins=1024)
-    with pytest.raises(ValueError, match="photons must not all be 0"):
-        PhaseChain.from_flux(ml.Flux(0.0, 0.0), system)
-    with pytest.raises(ValueError, match=r"photons\[1\] = -1"):
-        PhaseChain(np.array([1.0, -1.0]), 0.5)
-    with pytest.raises(ValueError, match="photons must be"):
-        PhaseChain(np.ones((2, 2)), 0.5)
-    with pytest.raises(ValueError, match=r"x must be \(4,\), got shape \(3,\)"):
-        PhaseChain(np.ones(4), 0.5).forward(np.ones(3))
+    refused("photons must not all be 0", PhaseChain.from_flux, ml.Flux(0.0, 0.0), system)
+    refused(r"photons\[1\] = -1", PhaseChain, np.array([1.0, -1.0]), 0.5)
+    refused("photons must be", PhaseChain, np.ones((2, 2)), 0.5)
+    refused(r"x must be \(4,\), got shape \(3,\)", PhaseChain(np.ones(4), 0.5).forward, np.ones(3))
 
 
 def test_a_grid_that_cannot_hold_the_flux_is_refused_by_name():

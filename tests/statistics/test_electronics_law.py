@@ -1,12 +1,10 @@
 """The exact law of the number of records behind electronics with a dead time: closed forms, the sequential engine."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
 import pytest
-from harness import COUNTS, PERIOD_NS, SHAPE, Case, Law, check, flux_of, make_system, two_lobes, waveform_flux
+from harness import COUNTS, PERIOD_NS, SHAPE, Case, Law, check, flux_of, make_system, pmf_of, two_lobes, waveform_flux
 
 import mars_lidar as ml
 from mars_lidar.engines import ENGINES
@@ -23,12 +21,6 @@ def view(dead: float, electronics: float, start: str = "armed", cycles: int = 40
         electronics_dead_time_ns=electronics * PERIOD_NS,
         **detector,
     )
-
-
-def pmf_of(law: ml.CountLaw) -> np.ndarray:
-    pmf = np.zeros(law.support[-1] + 1)
-    pmf[law.support] = law.pmf
-    return pmf
 
 
 def test_law_at_a_constant_rate():
@@ -122,10 +114,7 @@ def test_long_exposures_and_cells():
     slope = b.cumulants - a.cumulants
     assert c.cumulants[:2] == pytest.approx((a.cumulants + slope * (1_000_000 - 400))[:2], rel=1e-3)
     assert c.pmf @ c.support == pytest.approx(float(c.mean), rel=1e-9)
-    both = ml.count_law(
-        ml.Flux(np.array([0.0, 2.0]), np.array([0.0, 0.3]), 50.0),
-        view(0.4, 1.3, cycles=400),
-    )
+    both = ml.count_law(ml.Flux(np.array([0.0, 2.0]), np.array([0.0, 0.3]), 50.0), view(0.4, 1.3, cycles=400))
     assert both.mean == pytest.approx([0.0, float(a.mean)], abs=1e-6)
     assert both.pmf[0, 0] == 1.0
     assert pmf_of(ml.count_law(ml.Flux(1e-9, 1e-9, 50.0), view(0.4, 1.3)))[0] == pytest.approx(1.0, abs=1e-6)
@@ -189,6 +178,5 @@ def test_stationary_shape_where_electronics_do_nothing():
     alone = ml.registration_pdf(ml.Flux(2.0, 0.3, 37.0), view(0.0, 0.7), "stationary")
     np.testing.assert_allclose(alone, same, rtol=1e-9)
     np.testing.assert_allclose(
-        ml.registration_pdf(ml.Flux([0.0, 1.0], 0.0, 50.0), view(0.3, 0.7), "stationary")[0],
-        0.02,
+        ml.registration_pdf(ml.Flux([0.0, 1.0], 0.0, 50.0), view(0.3, 0.7), "stationary")[0], 0.02
     )

@@ -5,8 +5,6 @@ expansion); a weighted delay recursion and a dense matrix, both on plain bins, w
 independent simulator. Engines are compared with it in tests/engines/test_engines.py.
 """
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np

@@ -1,12 +1,15 @@
 """Count laws and shapes under their two verbs (docs/theory_exposure.md, sections 8 and 9)."""
 
-import json
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
-from harness import random_cases, system_of
+from harness.cases import random_cases, system_of
+from harness.laws import law_of, pmf_of
+from harness.ledger import require
+from harness.pvalues import bonferroni, counts_against_law, goodness
+from harness.reference import REFERENCE_NAMES, Reference
+from harness.refusal import refused
 from scipy import stats
 
 import mars_lidar as ml
@@ -15,8 +18,6 @@ from mars_lidar.statistics.histogram import registration_pdf
 from mars_lidar.statistics.law import count_law
 from mars_lidar.statistics.tolerances import TOL
 
-REFERENCE = Path(__file__).parents[3] / "shared" / "reference"
-
 
 def moments_of(law):
     """Mean, variance, third and fourth cumulant from the pmf."""
@@ -24,21 +25,6 @@ def moments_of(law):
     offset = law.support - mean[..., None]
     second, third, fourth = ((law.pmf * offset**k).sum(-1) for k in (2, 3, 4))
     return mean, second, third, fourth - 3 * second**2
-
-
-def g_test(counts, law):
-    """p-value of observed counts (n,) under the law; counts expected below 5 are pooled."""
-    observed = (counts[:, None] == law.support).sum(0)
-    expected = law.pmf * counts.size
-    common = expected >= 5
-    o = np.append(observed[common], counts.size - observed[common].sum())
-    e = np.append(expected[common], max(counts.size - expected[common].sum(), 1e-12))
-    g = 2 * times_log(o, o / e).sum()
-    return float(stats.chi2.sf(g, max(common.sum() - (e[-1] < 1e-3), 1)))
-
-
-def times_log(x, y):
-    return np.where(x > 0, x * np.log(np.where(x > 0, y, 1.0)), 0.0)
 
 
 @pytest.mark.parametrize(
@@ -192,8 +178,7 @@ def test_shapes():
     ],
 )
 def test_bad_input(law, method, rearm, message):
-    with pytest.raises(ValueError, match=message):
-        law(ml.Flux(1.0, 1.0, 50.0), system_of(0.5), method, rearm=rearm)
+    refused(message, law, ml.Flux(1.0, 1.0, 50.0), system_of(0.5), method, rearm=rearm)
 
 
 def test_a_pmf_that_contradicts_its_cumulants_is_refused(monkeypatch):
@@ -219,7 +204,7 @@ def test_random_systems_against_the_exact_engine():
         scores.append((counts.mean() - law.mean) / math.sqrt(law.variance / counts.size))
         spread = law.cumulants[3] + 2 * law.variance**2
         scores.append((((counts - law.mean) ** 2).mean() - law.variance) / math.sqrt(spread / counts.size))
-        p_values.append(g_test(counts, law))
+        p_values.append(counts_against_law(counts, pmf_of(law)))
     assert len(p_values) > 75
     assert np.abs(scores[::2]).max() < 4.9
     assert np.abs(scores[1::2]).max() < 7  # the square's own tails are heavier
@@ -228,24 +213,26 @@ def test_random_systems_against_the_exact_engine():
     assert stats.kstest(p_values, "uniform").pvalue > 1e-6  # pooled cells: uniform only roughly
 
 
-@pytest.mark.full
-@pytest.mark.skipif(not REFERENCE.is_dir(), reason="the reference cases are not beside this checkout")
-@pytest.mark.parametrize("path", sorted(REFERENCE.glob("*.json")), ids=lambda path: path.stem)
-def test_reference(path):
-    """Total variation below the 99.9 % quantile of its bootstrap under the model, G-test p > 1e-4."""
-    case = json.loads(path.read_text())
-    system = system_of(case["dead"], cycles=case["cycles"], sigma=case["sigma"])
-    law = count_law(ml.Flux(case["S"], case["B"], 100.0 * case["tau"]), system)
-    counts = np.repeat([int(n) for n in case["count"]], list(case["count"].values()))
-    reals, rng = counts.size, np.random.default_rng(1)
-    model = law.pmf / law.pmf.sum()
-    assert law.support[0] <= counts.min()
-    assert counts.max() <= law.support[-1]
-    observed = np.bincount(counts - law.support[0], minlength=law.support.size)
-    distance = 0.5 * np.abs(observed / reals - model).sum()
-    drawn = 0.5 * np.abs(rng.multinomial(reals, model, size=20_000) / reals - model).sum(-1)
-    assert distance < np.quantile(drawn, 0.999)
-    common = model * reals >= 5
-    o = np.append(observed[common], observed[~common].sum())
-    e = np.append(model[common], model[~common].sum()) * reals
-    assert stats.chi2.sf(2 * times_log(o, o / e).sum(), o.size - 1) > 1e-4
+@pytest.mark.parametrize("name", REFERENCE_NAMES)
+def test_reference(name):
+    """Law of the count and mean histogram against ten cases of an independent simulator."""
+    reference = Reference.load(name)
+    case, size = reference.case(), reference.realizations
+    law = law_of(case.flux[0, 0], case.system)
+    pmf, observed = np.zeros((2, max(law.count_pmf.size, reference.count.size)))
+    pmf[: law.count_pmf.size], observed[: reference.count.size] = law.count_pmf, reference.count
+    n = np.arange(pmf.size)
+    mean = pmf @ n
+    second, fourth = (pmf @ (n - mean) ** k for k in (2, 4))
+    often = reference.mean * size > 500
+    score = (reference.mean - law.histogram)[often] / np.sqrt(reference.variance[often] / size)
+    z = [
+        (reference.count_mean - mean) / math.sqrt(second / size),
+        (reference.count_var - second) / math.sqrt((fourth - second**2) / size),
+    ]
+    p = {
+        "count law": goodness(observed, size * pmf + 1e-12),
+        "moments": bonferroni(2 * stats.norm.sf(np.abs(z))),
+        "mean histogram": bonferroni(2 * stats.norm.sf(np.abs(score))),
+    }
+    require(p, f"count law, {name}")

@@ -1,19 +1,16 @@
 """Every prediction is of (flux, system): a pixel, a row, an image; one return, several, a waveform."""
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
-from harness import make_system
+from harness import make_system, require
 from scipy import stats
 
 import mars_lidar as ml
 from mars_lidar import reconstruction, statistics
-from tests.harness.ledger import require
 
 SYSTEM = make_system(60.0, 200, 32, sigma_ns=2.0)
 IMAGE = ml.Flux(np.array([[0.5, 2.0, 0.0], [1.0, 0.1, 3.0]]), 0.3, np.array([[20.0, 40.0, np.nan], [60.0, 80.0, 10.0]]))

@@ -4,18 +4,17 @@ Without background a pixel knows of a pulse's width, and of what the dead time m
 their ratio: the law of a pulse a thousand times as wide is the same one, on bins that resolve it.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
 import pytest
 from harness import require, system_of
+from harness.paralyzable import paralyzable_moments
 from harness.pvalues import variance_score
 from scipy import stats
 
 import mars_lidar as ml
-from mars_lidar.statistics import ConvergenceError, exposure_moments, mean_histogram, paralyzable_moments
+from mars_lidar.statistics import ConvergenceError, exposure_moments, mean_histogram
 from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.exposure import refined_moments
 from mars_lidar.table.entries import start_phases

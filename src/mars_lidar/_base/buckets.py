@@ -3,7 +3,9 @@
 An object appears whole under its name or not at all. There are no renames, no locks, and no folders.
 """
 
+import os
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -64,7 +66,14 @@ def content_of(path: Any) -> bytes:
 
 
 def sizes(folder: Any) -> dict[str, int]:
-    """Sizes in bytes of all objects below a path, by their relative names; the object store is queried again."""
+    """Sizes in bytes of the files or objects below a path, by their relative names; a bucket is queried again."""
+    if not in_bucket(folder):
+        files: dict[str, int] = {}
+        for place, _, names in os.walk(folder):
+            prefix = "" if Path(place) == folder else Path(place).relative_to(folder).as_posix() + "/"
+            paths = ((name, os.path.join(place, name)) for name in names)
+            files |= {prefix + name: os.path.getsize(path) for name, path in paths if os.path.isfile(path)}
+        return files
     folder.fs.invalidate_cache()
     prefix = folder.path.rstrip("/") + "/"
     listed = folder.fs.find(folder.path, detail=True)
@@ -72,5 +81,5 @@ def sizes(folder: Any) -> dict[str, int]:
 
 
 def remove(folder: Any) -> None:
-    """Remove all objects below a path."""
-    folder.fs.rm(folder.path, recursive=True)
+    """Remove a folder, or all objects below a path."""
+    folder.fs.rm(folder.path, recursive=True) if in_bucket(folder) else shutil.rmtree(folder)

@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base import mat5
-from mars_lidar._base.buckets import in_bucket
+from mars_lidar._base.buckets import in_bucket, put
 from mars_lidar._base.resources import check_memory, no_thread
 from mars_lidar._base.sparse import check_sparse, is_sparse
 from mars_lidar._base.tolerances import TOL
@@ -127,7 +127,12 @@ def _remove_leftovers(target: Path) -> None:
 
 @contextlib.contextmanager
 def replacing(target: Path) -> Iterator[BinaryIO]:
-    """A stream whose content replaces `target` at the end; on an exception it is removed."""
+    """A stream whose content replaces `target`, a file or an object, at the end; on an exception it is removed."""
+    if in_bucket(target):
+        content = BytesIO()
+        yield content
+        put(target, content.getvalue())
+        return
     path = _created(target, folder=False)
     try:
         with open(path, "r+b") as stream:

@@ -12,7 +12,6 @@ document that marks the store complete: a run that stops between the two leaves 
 
 import hashlib
 import json
-import os
 import re
 import stat
 import threading
@@ -23,7 +22,7 @@ from typing import Any, NamedTuple
 
 import xxhash
 
-from mars_lidar._base.buckets import in_bucket, put, sizes
+from mars_lidar._base.buckets import in_bucket, sizes
 from mars_lidar._base.files import FileError, check_claim, reading, replacing
 from mars_lidar._base.tolerances import TOL
 
@@ -77,7 +76,7 @@ def seal(store: Path, attrs: dict[str, Any], known: Mapping[str, Sums] | None = 
     for name in document.get("consolidated_metadata", {}).get("metadata", {}):
         if not (store / name / _ROOT).is_file():
             raise FileNotFoundError(f"{store / name / _ROOT} was removed while the store was written")
-    names = sorted(_files(store) - {_ROOT, NAME, CHECKS})
+    names = sorted(sizes(store).keys() - {_ROOT, NAME, CHECKS})
     each = {name: known[name] for name in names if name in known} if known else {}
     others = [name for name in names if name not in each]
     with ThreadPoolExecutor(TOL.hash_threads) as pool:
@@ -88,9 +87,6 @@ def seal(store: Path, attrs: dict[str, Any], known: Mapping[str, Sums] | None = 
     root = json.dumps(document, indent=2).encode()
     lines[_ROOT] = sums_of(root).sha256
     for name, content in ((CHECKS, checks), (NAME, _lines(lines)), (_ROOT, root)):
-        if in_bucket(store):
-            put(store / name, content)
-            continue
         with replacing(store / name) as stream:
             stream.write(content)
 
@@ -170,12 +166,16 @@ class Manifest:
         before = _state(path)
         if before is None:
             raise self._error(f"{name} is missing")
-        content = path.read_bytes()
+        try:
+            content: bytes = path.read_bytes()
+        except FileNotFoundError:
+            raise self._error(f"{name} is missing") from None
         if self._known.get(name) != before and not self.is_good(name, content):
             raise self._error(f"{name} has changed since it was written")
         if _state(path) != before:
             raise self._error(f"{name} was replaced while it was read")
-        self._known[name] = before
+        if before:
+            self._known[name] = before
         return content
 
     def is_good(self, name: str, content: bytes | Path) -> bool:
@@ -188,29 +188,6 @@ class Manifest:
         return FileError(
             f"{self._store} is damaged, or was replaced or removed after it was opened: {reason}; open it again"
         )
-
-
-class ManifestInBucket(Manifest):
-    """The sums of a store in an object store: an object that is read is compared each time."""
-
-    def is_known(self, name: str) -> bool:
-        """Never: only the content of an object shows whether it has changed."""
-        return False
-
-    def check(self, name: str) -> None:
-        """Raise FileError unless the object is as it was written, or is absent and has no line."""
-        if name in self or (self._store / name).exists():
-            self.read(name)
-
-    def read(self, name: str) -> bytes:
-        """The content of an object, as it was when the store was sealed."""
-        try:
-            content = (self._store / name).read_bytes()
-        except FileNotFoundError:
-            raise self._error(f"{name} is missing") from None
-        if not self.is_good(name, content):
-            raise self._error(f"{name} has changed since it was written")
-        return content
 
 
 def description(store: Path) -> str:
@@ -227,7 +204,7 @@ def require(store: Path, *, listed: bool = True) -> Manifest:
     if wrong:
         more = f", and {len(wrong) - 3} more" if len(wrong) > 3 else ""
         raise FileError(f"{store} is damaged: {', '.join(wrong[:3])}{more}")
-    return (ManifestInBucket if in_bucket(store) else Manifest)(store, sums, checks, documents)
+    return Manifest(store, sums, checks, documents)
 
 
 def damage(store: Path, *, every: bool = True) -> list[str]:
@@ -245,7 +222,7 @@ def _compared(
     states: dict[str, tuple[int, ...]] = {}
 
     def read(name: str) -> Sums:
-        if not in_bucket(store) and (state := _state(store / name)) is not None:
+        if state := _state(store / name):
             states[name] = state
         return sums_of(store / name)
 
@@ -300,7 +277,9 @@ def _sum(sums: Mapping[str, str]) -> str:
 
 
 def _state(path: Path) -> tuple[int, ...] | None:
-    """What changes when a file is written or replaced; None where there is no file."""
+    """What changes when a file is written or replaced; None where there is no file; of an object nothing shows it."""
+    if in_bucket(path):
+        return ()
     try:
         entry = path.stat()
     except (FileNotFoundError, NotADirectoryError):
@@ -310,22 +289,10 @@ def _state(path: Path) -> tuple[int, ...] | None:
     return entry.st_dev, entry.st_ino, entry.st_size, entry.st_mtime_ns, entry.st_ctime_ns
 
 
-def _files(store: Path) -> set[str]:
-    """Relative paths of all regular files."""
-    if in_bucket(store):
-        return set(sizes(store))
-    files = set()
-    for folder, _, names in os.walk(store):
-        inside = os.path.relpath(folder, store)
-        prefix = "" if inside == "." else inside.replace(os.sep, "/") + "/"
-        files |= {prefix + name for name in names if os.path.isfile(os.path.join(folder, name))}
-    return files
-
-
 def _listed(store: Path) -> set[str] | None:
     """Relative paths of all files; None where they cannot be listed, as on most web servers."""
     try:
-        names = _files(store)
+        names = {*sizes(store)}
     except Exception:
         if not in_bucket(store):
             raise

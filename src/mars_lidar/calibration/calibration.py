@@ -20,7 +20,7 @@ from mars_lidar.calibration.fit import Effort, Fit, Fitted, Guess, draws
 from mars_lidar.calibration.look import Look, look_at
 from mars_lidar.calibration.model import Model, all_carriers
 from mars_lidar.calibration.recording import FALSE_ALARM, LEAST_PHOTONS, Recording, recording_of, recording_of_arrivals
-from mars_lidar.calibration.suspects import Bound, Drift, Named, Score
+from mars_lidar.calibration.suspects import Drift, Named, Trial
 from mars_lidar.instrument.avalanches import Afterpulsing
 from mars_lidar.instrument.detector import Detector
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, Jitter
@@ -44,6 +44,9 @@ class Estimate:
     `note` states whether it was given, not detected, or not identified; the interval of a jitter that was not detected
     begins at 0. The error of a dead time that follows from the shortest interval alone is NaN: its law is not normal,
     and the interval is stated. In a model that does not fit all errors and intervals are NaN.
+
+    `least` and `most`: of its 95 % intervals in this model and in those with one more effect, which fit the stream as
+    well (`Calibration.limits`).
     """
 
     value: float
@@ -51,12 +54,17 @@ class Estimate:
     low: float
     high: float
     note: str = ""
+    least: float = np.nan
+    most: float = np.nan
 
     def __str__(self) -> str:
         if self.error == 0.0:
             return f"{self.value:.6g} ({self.note or 'given'})"
         interval = "" if np.isnan(self.low) else f" (95 %: {self.low:.3g} to {self.high:.3g})"
-        return f"{self.value:.4g}{interval}, {self.note}" if self.note else measured(self.value, self.error)
+        text = f"{self.value:.4g}{interval}, {self.note}" if self.note else measured(self.value, self.error)
+        least, most = (measured(end, self.error).split()[0] for end in (self.least, self.most))
+        wider = self.least < self.low or self.most > self.high
+        return f"{text}; {least} to {most} with a further effect" if wider else text
 
 
 @dataclass(frozen=True)
@@ -87,12 +95,22 @@ class Suspect:
 
 @dataclass(frozen=True)
 class Limit:
-    """An effect that was not detected: 95 % upper limit in units of `name`, and its effect on estimates."""
+    """An effect that is not in the result: 95 % upper limit in units of `name`, and the estimates of a fit with it.
+
+    `ranges`: their 95 % intervals, where these extend beyond those without it by more than the stated error. The limit
+    of a paralyzable detector is 1, if it fits as well; that of a fit that did not converge is NaN.
+    """
 
     name: str
     words: str
     limit: float
-    shifts: dict[str, float] = field(default_factory=dict)
+    ranges: dict[str, tuple[float, float]] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        ranges = ", ".join(f"{name} {low:.5g} to {high:.5g}" for name, (low, high) in self.ranges.items())
+        size = f"{self.name} below {self.limit:.3g} (95 %)" if self.limit != 1.0 else "fits as well"
+        size = "no limit, since the fit with it did not converge" if np.isnan(self.limit) else size
+        return f"{self.words}: {size}" + (f"; then {ranges}" if ranges else "")
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +130,7 @@ class Calibration:
     suspects
         Effects and deviations beyond the plain model, the most significant first.
     limits
-        Effects that were not detected, each with its upper limit.
+        Effects that are not in the result, each with its upper limit.
     drift
         Light and delay by parts of the recording, or None for a short one.
     system, flux
@@ -372,6 +390,7 @@ class _Run:
     level: float
     seed: int
     wave: tuple[FloatArray, FloatArray] | None = None
+    most: float = np.inf  # 95 % upper limit of the signal in a pulse, where none is significant
 
     def __post_init__(self) -> None:
         recording, shape = self.recording, self.shape
@@ -383,8 +402,10 @@ class _Run:
             self.wave = start.free_waveform(recording, self.fit.effort.shape_bins)
             shares, errors = (part / self.wave[0].sum() for part in self.wave)
             model = replace(model, waveform=shares, waveform_error=errors, exposure=recording.exposure)
-        elif recording.laser and start.brightest_window(recording) <= FALSE_ALARM:
-            model = replace(model, returns=self.returns, pulse=shape if isinstance(shape, Pulse) else None)
+        elif recording.laser:
+            p, self.most = start.brightest_window(recording)
+            if p <= FALSE_ALARM:
+                model = replace(model, returns=self.returns, pulse=shape if isinstance(shape, Pulse) else None)
         self.model = replace(model, fields=tuple(self.fields.items()), jitter_given="jitter" in self.fixed)
 
     def result(self) -> Calibration:
@@ -393,11 +414,11 @@ class _Run:
         wrong = () if fitted.converged and fitted.p_value >= self.level else self.wrong_values(fitted)
         included: list[Named] = []
         drift = suspects.drift(self.fit, fitted) if fitted.converged else None
-        listed: list[Score] = []
+        trials: list[Trial] = []
         if fitted.converged and not wrong and not (drift is not None and drift.flickers):  # which looks like effects
-            fitted, included, listed = suspects.search(self.fit, fitted)
+            fitted, included, trials = suspects.search(self.fit, fitted)
             drift = suspects.drift(self.fit, fitted) if included else drift
-        return self.assembled(fitted, included, listed, drift, wrong)
+        return self.assembled(fitted, included, trials, drift, wrong)
 
     def wrong_values(self, fitted: Fitted) -> tuple[Suspect, ...]:
         """Given values that the stream contradicts (without one of them it fits), and the estimate of each."""
@@ -422,12 +443,15 @@ class _Run:
         return tuple(out)
 
     def first(self) -> Fitted:
-        """The plain model from the better of two starts, repeated with other simulated streams until it converges."""
-        for attempt in range(self.fit.effort.attempts):
-            self.fit = Fit(self.recording, Effort(), (self.seed, attempt))
-            fitted = self._attempt()
-            if fitted.converged:
-                break
+        """The plain model, from other starts and simulated streams until it converges with a significant pulse.
+
+        The phases have a bright window (`brightest_window`), so that a fit without a pulse is a bad one.
+        """
+        tried: list[tuple[Fit, Fitted]] = []
+        while len(tried) < self.fit.effort.attempts and not (tried and tried[-1][1].converged and tried[-1][1].lit):
+            self.fit = Fit(self.recording, Effort(), (self.seed, len(tried)))
+            tried.append((self.fit, self._attempt()))
+        self.fit, fitted = max(tried, key=lambda each: (each[1].converged, each[1].lit))
         return fitted
 
     def _attempt(self) -> Fitted:
@@ -437,10 +461,14 @@ class _Run:
         begin = start.starts(fit, self.recording, model, self.fixed)
         known = {*self.fixed, *(["width"] if model.returns == 0 or model.pulse is not None else [])}
         free = np.array([k for k, name in enumerate(model.names) if name not in known], np.intp)
+        first, photons = fit.effort.first, float(self.recording.photons)
         for _, theta in begin[:2]:
             trial = Guess(model, theta, np.diag(0.5 * model.scale(theta)[free]), free)
-            tried.append(fit.steps(trial, float(min(self.recording.photons, fit.effort.first))))
-        guess, _, settled = fit.steps(min(tried, key=lambda trial: trial[1])[0], float(self.recording.photons))
+            tried.append(fit.steps(trial, min(photons, first)))
+        guess, _, settled = min(tried, key=lambda trial: trial[1])
+        if first < photons:
+            more = 6.0 if settled else 1.0
+            guess, _, settled = fit.steps(guess._replace(root=guess.root / more**0.5), photons, more * first)
         final = fit.finish(guess)
         return replace(final, converged=final.converged and (settled or final.p_value >= self.level))
 
@@ -448,13 +476,17 @@ class _Run:
         self,
         fitted: Fitted,
         included: list[Named],
-        listed: list[Score],
+        trials: list[Trial],
         drift: Drift | None,
         wrong: tuple[Suspect, ...],
     ) -> Calibration:
         """The result of the last fit."""
         growth = _growth(fitted, drift)
         estimates = _estimates(fitted, growth)
+        if self.most < np.inf and fitted.model.returns < 2 and not (fitted.model.returns and fitted.lit):
+            signal = min(float(fitted.theta[1]), self.most) if fitted.model.returns else 0.0
+            words = "no significant pulse: upper limit of one anywhere"
+            estimates["signal"] = Estimate(signal, np.nan, 0.0, self.most, words)
         named: list[Suspect] = list(wrong)
         for refit in included:
             name = refit.effect.names[0]
@@ -475,8 +507,8 @@ class _Run:
                 words = "flicker of the light, counts relative"
                 named.append(Suspect(words, drift.flicker_z, drift.flicker, np.nan, np.nan, option, included=False))
         families = {suspect.name for suspect in named}
-        for score in listed:
-            if score.z > suspects.clear(listed) and score.effect.words not in families:
+        for score in (trial.score for trial in trials):
+            if score.z > suspects.clear(trials) and score.effect.words not in families:
                 families.add(score.effect.words)
                 words, option = score.effect.words, f"given {score.effect.names[0]}"
                 named.append(Suspect(words, score.z, score.size, score.error, np.nan, option, included=False))
@@ -489,13 +521,18 @@ class _Run:
         wave, error = self.wave or (None, None)
         if wave is not None and error is not None:
             wave, error = (float(centre[0] / wave.sum()) * part for part in (wave, error))
+        others = suspects.alternatives(trials) if fitted.p_value >= FALSE_ALARM else []
+        limits = tuple(_limit(trial, estimates, drift) for trial in others)
+        for limit in limits:
+            for name, (low, high) in limit.ranges.items():
+                at = estimates[name]
+                estimates[name] = replace(at, least=min(at.least, low), most=max(at.most, high))
         estimates = estimates if fitted.converged else {}
         known = bool(estimates) and self.recording.laser
         system = fitted.model.system(centre, cycles, 1024) if known else None
         flux = fitted.model.flux(centre) if known else None
         ordered = tuple(sorted(named, key=lambda suspect: (not suspect.included, -suspect.z)))
-        bounds = suspects.at_limits(self.fit, fitted, listed) if p >= self.level else []
-        limits, look, recording = _limits(fitted, bounds), self.look, self.recording
+        look, recording = self.look, self.recording
         return Calibration(
             look, estimates, p, ordered, limits, drift, system, flux, wave, error, recording, fitted, self.level
         )
@@ -526,8 +563,7 @@ def _estimates(fitted: Fitted, growth: FloatArray) -> dict[str, Estimate]:
     misfit = "of a model that does not fit: no error is stated"
     withheld = {name: misfit for name in names if fitted.p_value < FALSE_ALARM and not grown[name]}
     errors = dict(zip(fitted.free.tolist(), np.sqrt(np.diag(covariance)), strict=True))
-    pulses_at = [i for i in range(1, k) if names[i].startswith("signal")]
-    if not withheld and any(i in errors and centre[i] < 1.96 * errors[i] for i in pulses_at):  # there may be another
+    if not withheld and not fitted.lit:  # there may be another pulse
         dark = "no significant pulse: no error is stated"
         withheld |= dict.fromkeys((*names[:k], "width", "jitter"), dark)
     extremes = _at_bounds(fitted, covariance, drawn) if model.split and "jitter" in free else []
@@ -584,7 +620,7 @@ def _estimates(fitted: Fitted, growth: FloatArray) -> dict[str, Estimate]:
         out["dead_time_ns"] = Estimate(value, np.nan, low, high, "by the shortest interval alone")
     elif "dead_time_ns" not in out:
         put("dead_time_ns", observed, dead, "dead_time_ns")
-    return out
+    return {name: replace(own, least=own.low, most=own.high) for name, own in out.items()}
 
 
 def _at_bounds(fitted: Fitted, covariance: FloatArray, drawn: FloatArray) -> list[NDArray[np.intp]]:
@@ -596,16 +632,18 @@ def _at_bounds(fitted: Fitted, covariance: FloatArray, drawn: FloatArray) -> lis
     return [part for part, end in ((order[:count], 0.0), (order[-count:], most)) if abs(angle - end) < reach]
 
 
-def _limits(fitted: Fitted, bounds: list[Bound]) -> tuple[Limit, ...]:
-    """Upper limits of effects that were not detected, with the shifts that exceed the stated errors."""
-    names = [fitted.model.names[k] for k in fitted.free]
-    errors = np.sqrt(np.diag(fitted.covariance))
-    limits = []
-    for bound in bounds:
-        moves = zip(names, bound.shift, errors, strict=True)
-        shifts = {name: float(move) for name, move, error in moves if abs(move) > error}
-        limits.append(Limit(bound.effect.names[0], bound.effect.words, bound.limit, shifts))
-    return tuple(limits)
+def _limit(trial: Trial, estimates: dict[str, Estimate], drift: Drift | None) -> Limit:
+    """Upper limit of an effect that is not in the result, and the estimates of a fit with it where they differ."""
+    name, words, final = trial.effect.names[0], trial.effect.words, trial.final
+    if final is None or final.p_value < FALSE_ALARM:
+        return Limit(name, words, float("nan"))
+    sizes = draws(final.model, final.unbounded, final.covariance, final.free)[:, -len(trial.effect.names)]
+    ranges = {}
+    for key, other in _estimates(final, _growth(final, drift)).items():
+        own = estimates.get(key, other)
+        if max(own.low - other.low, other.high - own.high) > (own.high - own.low) / 3.92:
+            ranges[key] = other.low, other.high
+    return Limit(name, words, float(np.quantile(sizes, 0.95)), ranges)
 
 
 def _worst_cells(fitted: Fitted) -> tuple[str, float]:

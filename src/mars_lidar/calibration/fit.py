@@ -81,12 +81,16 @@ class Effort:
 
 
 class Guess(NamedTuple):
-    """Parameters (p,) of a model, which of them are free, and a root (free, free) of the covariance of those."""
+    """Parameters (p,) of a model, which of them are free, and a root (free, free) of the covariance of those.
+
+    `law`: that of the last step, if it is one of the whole recording.
+    """
 
     model: Model
     theta: FloatArray
     root: FloatArray
     free: Index
+    law: Batch | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,6 +235,13 @@ class Fitted:
     converged: bool
     by_shortest: tuple[float, float, float] | None  # the dead time and its interval, if the counts do not determine it
 
+    @property
+    def lit(self) -> bool:
+        """Whether the signal of every return differs from zero (95 %)."""
+        amounts = (self.free < self.model.light) & (self.free % 2 == 1)
+        signal, variance = self.theta[self.free[amounts]], np.diag(self.covariance)[amounts]
+        return bool((signal >= 1.96 * variance**0.5).all())
+
 
 def most_probable(model: Model, theta: FloatArray, covariance: FloatArray, free: Index) -> FloatArray:
     """The most probable parameters (p,) of a normal law within the bounds of the model.
@@ -306,7 +317,7 @@ class Fit:
         self, guess: Guess, photons: float, cells: Cells | None = None, spread: float | None = None, more: int = 1
     ) -> Batch:
         """The linear law of counts about a guess for so many photons; with a given spread, of longer streams."""
-        model, theta, root, free = guess
+        model, theta, root, free, _ = guess
         size = self.effort.of(photons, 1.0 if spread is None else self.effort.longer)
         spread = self.effort.spread if spread is None else spread
         cells = self.cells(model, theta, photons) if cells is None else cells
@@ -320,7 +331,7 @@ class Fit:
 
     def steps(self, guess: Guess, photons: float, first: float = 0.0) -> tuple[Guess, float, bool]:
         """Steps that weigh more and more photons, up to `photons`; misfit per cell, and whether the steps converged."""
-        model, theta, root, free = guess
+        model, theta, root, free, _ = guess
         weighed = float(min(photons, max(first, self.effort.first)))
         total = float(self.recording.photons)
         misfit, near = np.inf, False
@@ -349,7 +360,8 @@ class Fit:
             if near and weighed >= photons:
                 break
             weighed = grown
-        return Guess(model, theta, root, free), misfit, near and weighed >= photons
+        whole = near and weighed >= photons
+        return Guess(model, theta, root, free, law if whole else None), misfit, whole
 
     def shortest(self, model: Model, rows: FloatArray) -> tuple[float, Shortest] | None:
         """Probability of the shortest interval for draws (n, p) of the parameters, and its law; None with effects.
@@ -374,11 +386,12 @@ class Fit:
         counts, or is more precise, or if counts claim more than intervals can tell. The other parameters are then
         fitted once more at that dead time.
         """
-        model, theta, root, free = guess
+        model, theta, root, free, law = guess
         photons, effort = float(self.recording.photons), self.effort
         closer = effort.spread / effort.more**0.5  # counts near the end of a dead time are linear over short distances
         prior, middle = model.prior(theta, free)
-        law = self.law(Guess(model, theta, root, free), photons, None, closer, effort.more)
+        if law is None or effort.more > 1:
+            law = self.law(guess, photons, None, closer, effort.more)
         nearby = _NEAR * (effort.of(photons, effort.longer) / photons) ** 0.5
         gain = law.estimator(free)
         recorded = law.cells.of(self.recording)

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from functools import partial
+from typing import Literal
 
 import numpy as np
 
@@ -26,7 +27,7 @@ from mars_lidar.reconstruction.maximum_likelihood import MaximumLikelihood
 from mars_lidar.reconstruction.method import Estimates
 
 _GRID = 13  # dead times of the first search, over a period
-_DECREASE = 1e-2  # of the log likelihood, at which the maximisation ends
+_ROUNDS = 8  # of closer places, each at least a third as far apart
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,8 +96,6 @@ def calibrate_cube(
     ValueError
         A detector that is not free-running, or no pixel with 1000 registrations.
     """
-    from scipy.optimize import minimize
-
     checks.choice("pulse", pulse, ("gaussian", "free"))
     given, _ = checked(cube, system, 1)
     if not tested_recordings(system):
@@ -111,43 +110,36 @@ def calibrate_cube(
         raise ValueError(f"cube must have a pixel of 1000 registrations, got at most {int(totals.max()):,}")
     some = np.ascontiguousarray(given.counts[chosen])
 
-    def trial(at: FloatArray) -> System:
-        sigma = float(np.clip(np.exp(at[1]), 2e-6 * system.period_ns, 0.2 * system.period_ns))
-        dead = float(max(at[0], 0.0))
-        return system.replace(pulse=GaussianPulse(sigma_ns=sigma), detector=replace(system.detector, dead_time_ns=dead))
-
-    def loss(at: FloatArray) -> float:
-        return -_log_likelihood(some, trial(at))
+    def trial(dead: float, log_sigma: float) -> System:
+        sigma = float(np.clip(np.exp(log_sigma), 2e-6 * system.period_ns, 0.2 * system.period_ns))
+        return _with_dead_time(system.replace(pulse=GaussianPulse(sigma_ns=sigma)), dead)
 
     low, high = system.pulse.support_ns()
     width = system.pulse.sigma_ns if isinstance(system.pulse, GaussianPulse) else (high - low) / 8.0
-    widths = np.log(width) + np.array([-2.5, -1.2, 0.0, 1.2, 2.5])
     dead = checks.real("dead_time_ns", system.detector.dead_time_ns)
     most = max(1.5 * dead, 0.95 * system.period_ns)
-    grid = np.r_[dead, np.linspace(0.0, most, _GRID)]
-    start = min(([dead, w] for w in widths), key=lambda at: loss(np.array(at)))
-    start = min(([d, start[1]] for d in grid), key=lambda at: loss(np.array(at)))
-    simplex = np.array([start, [start[0] + most / _GRID, start[1]], [start[0], start[1] + 0.4]])
-    options: Any = {"initial_simplex": simplex, "fatol": _DECREASE, "xatol": 1e-4, "maxiter": 80}
-    best = minimize(loss, np.array(start), method="Nelder-Mead", options=options)
-    at = np.asarray(best.x, np.float64)
-    errors = np.array([_half_width(loss, at, k, float(best.fun)) for k in range(2)])
-    final, response_error = trial(at), None
+    deads = np.union1d(dead, np.linspace(0.0, most, _GRID))
+    widths = np.log(width) + np.array([-2.5, -1.2, 0.0, 1.2, 2.5])
+    sigma = Estimate(float(max(widths, key=lambda w: _log_likelihood(some, trial(dead, w)))), 0.0, 0.0, 0.0)
+    for _ in range(2):
+        hold = _law(some, partial(trial, log_sigma=sigma.value), deads)
+        sigma = _law(some, partial(trial, hold.value), widths)
+    final, response_error = trial(hold.value, sigma.value), None
     if pulse == "free":
         # a dead time just below a period looks like the tail of a pulse, so that each is tried with its own response
-        reach = int(min(np.ceil(10.0 * np.exp(at[1]) / system.bin_ns) + 2, system.bins // 2 - 1))
-        trials = [_with_response(some, trial(np.array([d, at[1]])), reach, 1)[0] for d in (at[0], *grid)]
+        reach = int(min(np.ceil(10.0 * np.exp(sigma.value) / system.bin_ns) + 2, system.bins // 2 - 1))
+        trials = [_with_response(some, trial(d, sigma.value), reach, 1)[0] for d in (hold.value, *deads)]
         final = max(trials, key=lambda each: _log_likelihood(some, each))
         for near in (most / _GRID, 0.2 * most / _GRID):
-            dead, errors[0] = _dead_time(some, final, near)
-            final = final.replace(detector=replace(final.detector, dead_time_ns=dead))
-            final, response_error = _with_response(some, final, reach, 2)
+            places = np.maximum(final.detector.dead_time_ns + near * np.linspace(-1.0, 1.0, _GRID), 0.0)
+            hold = _law(some, partial(_with_dead_time, final), np.unique(places))
+            final, response_error = _with_response(some, _with_dead_time(final, hold.value), reach, 2)
     light = MaximumLikelihood().estimate(Histograms(some, final, 1))
     p_values = np.asarray(light.p_value)
-    sigma = float(np.exp(at[1]))
-    estimates = {"dead_time_ns": _normal(final.detector.dead_time_ns, errors[0])}
+    estimates = {"dead_time_ns": hold}
     if pulse == "gaussian":
-        estimates["pulse_sigma_ns"] = _normal(sigma, sigma * errors[1])
+        value, low, high = np.exp([sigma.value, sigma.low, sigma.high])
+        estimates["pulse_sigma_ns"] = Estimate(float(value), float(value * sigma.error), float(low), float(high))
     estimates["background_floor"] = _of_pixel(light, "background", int(np.argmin(light.background)))
     if len(given.counts) == 1:
         estimates |= {name: _of_pixel(light, name, 0) for name in ("signal", "background")}
@@ -220,39 +212,31 @@ def _expected(histograms: Histograms, light: FloatArray) -> FloatArray:
     return expected
 
 
-def _dead_time(counts: FloatArray, system: System, reach: float) -> tuple[float, float]:
-    """The most likely dead time within `reach` of that of the system, and its standard error, with its pulse."""
-    from scipy.optimize import minimize_scalar
+def _with_dead_time(system: System, dead: float) -> System:
+    return system.replace(detector=replace(system.detector, dead_time_ns=float(max(dead, 0.0))))
 
-    def loss(at: FloatArray) -> float:
-        detector = replace(system.detector, dead_time_ns=float(max(at[0], 0.0)))
-        return -_log_likelihood(counts, system.replace(detector=detector))
 
-    dead = system.detector.dead_time_ns
-    best = minimize_scalar(
-        lambda d: loss(np.array([d])), bounds=(max(dead - reach, 0.0), dead + reach), method="bounded"
-    )
-    return float(best.x), _half_width(loss, np.array([best.x]), 0, float(best.fun))
+def _law(counts: FloatArray, of: Callable[[float], System], places: FloatArray, number: int = 33) -> Estimate:
+    """A parameter of the systems `of` it: mean, standard deviation and 95 % interval, if all values are as probable.
+
+    In few counts the likelihood of the place of an edge has many maxima: none of their curvatures is an error. `number`
+    places divide the range of a likelihood above that of five standard deviations; those of the next round are closer.
+    """
+    for _ in range(_ROUNDS):
+        log = np.array([_log_likelihood(counts, of(float(x))) for x in places])
+        near = np.flatnonzero(log > log.max() - 12.5)
+        if 3 * near.size > number:
+            break
+        places = np.linspace(places[max(near[0] - 1, 0)], places[min(near[-1] + 1, len(log) - 1)], number)
+    weight = np.exp(log - log.max()) * np.gradient(places)
+    weight /= weight.sum()
+    mean = float(weight @ places)
+    low, high = np.interp([0.025, 0.975], np.cumsum(weight) - 0.5 * weight, places)
+    return Estimate(mean, float(weight @ (places - mean) ** 2) ** 0.5, float(low), float(high))
 
 
 def _normal(value: float, error: float) -> Estimate:
     return Estimate(value, error, value - 1.96 * error, value + 1.96 * error)
-
-
-def _half_width(loss: Callable[[FloatArray], float], at: FloatArray, k: int, least: float) -> float:
-    """Distance at which the loss is 1/2 above its minimum, the mean of both sides: one standard error."""
-    sides = []
-    for sign in (-1.0, 1.0):
-        step = 1e-4 * max(abs(at[k]), 1.0)
-        for _ in range(40):
-            moved = at.copy()
-            moved[k] += sign * step
-            rise = loss(moved) - least
-            if rise > 0.5:
-                break
-            step *= 1.5
-        sides.append(step * (0.5 / max(rise, 0.5)) ** 0.5)
-    return float(np.mean(sides))
 
 
 def _log_likelihood(counts: FloatArray, system: System) -> float:

@@ -7,17 +7,20 @@ import numpy as np
 from mars_lidar._base.types import FloatArray, NDArray
 from mars_lidar.calibration.fit import LIGHTS, Fit
 from mars_lidar.calibration.model import Model
-from mars_lidar.calibration.recording import Recording
+from mars_lidar.calibration.recording import Clock, Recording
 
 _MOST_BINS = 2**14
 _WINDOWS = 64  # of the period, for the median light
 
 
-def free_light(t: FloatArray, period: float, hold: float, bins: int) -> tuple[FloatArray, FloatArray]:
+def free_light(t: FloatArray, clock: Clock, hold: float, bins: int) -> tuple[FloatArray, FloatArray]:
     """Registrations and armed passes (bins,) over the period, from `hold` after each registration on.
 
-    Their ratio is the light in photons per period and bin, for any shape and any dead time below `hold`.
+    Their ratio is the probability of a photon in a bin, for any shape of light and any dead time below `hold`. Times
+    are spread over the unit of the clock: bins hold different numbers of its points, or end at one.
     """
+    period = clock.period_ns
+    t = t + clock.unit_ns * (np.random.default_rng(0).random(t.size) - 0.5)
     a = np.floor((t[:-1] + hold) * (bins / period)).astype(np.int64)
     b = np.floor(t[1:] * (bins / period)).astype(np.int64)
     late = b > a
@@ -33,7 +36,7 @@ def light(t: FloatArray, model: Model, hold: float) -> FloatArray:
     """Background, signal and delay of each return, and width of the recorded pulse, by matched filters."""
     period, unit = model.clock.period_ns, model.clock.unit_ns
     bins = int(np.clip(period / max(unit, 1e-9), 64, _MOST_BINS))
-    hits, passes = free_light(t, period, hold, bins)
+    hits, passes = free_light(t, model.clock, hold, bins)
     rate = hits / np.maximum(passes, 1.0)
     cell = period / bins
     place = (np.arange(bins) + 0.5) * cell
@@ -72,7 +75,7 @@ def light(t: FloatArray, model: Model, hold: float) -> FloatArray:
         outside &= ~inside
         peaks += [signal, peak % period]
         variance = variance or var
-    own = max(variance - unit**2 / 12, 0.0025 * variance, (0.15 * unit) ** 2)
+    own = max(variance - unit**2 / 6, 0.0025 * variance, (0.15 * unit) ** 2)
     back = max(faint * bins if model.returns else float(rate.sum()), 1e-5)
     return np.array([back, *peaks, own**0.5])
 
@@ -143,7 +146,10 @@ def safe_hold(recording: Recording) -> float:
 
 
 def free_waveform(recording: Recording, most: int) -> tuple[FloatArray, FloatArray]:
-    """Light (bins,) of any shape in photons per period and bin, without dead time, and its standard errors."""
+    """Light (bins,) of any shape in photons per period and bin, without dead time, and its standard errors.
+
+    A bin records one photon a pass, with the probability 1 - exp(-light).
+    """
     period, unit = recording.period_ns, recording.clock.unit_ns
     units = round(period / unit) if unit else 0
     bins = most
@@ -153,21 +159,27 @@ def free_waveform(recording: Recording, most: int) -> tuple[FloatArray, FloatArr
     hold = safe_hold(recording)
     hits, passes = np.zeros(bins), np.zeros(bins)
     for piece in recording.pieces:
-        more = free_light(piece, period, hold, bins)
+        more = free_light(piece, recording.clock, hold, bins)
         hits, passes = hits + more[0], passes + more[1]
     passes = np.maximum(passes, 1.0)
-    return np.maximum(hits, 1e-3) / passes, np.sqrt(hits + 1.0) / passes
+    share = np.clip(hits, 1e-3, passes - 0.5) / passes
+    return -np.log1p(-share), np.sqrt((hits + 1.0) / (1.0 - share)) / passes
 
 
-def brightest_window(recording: Recording) -> float:
-    """Probability that constant light has a window as bright above the median, all windows together."""
+def brightest_window(recording: Recording) -> tuple[float, float]:
+    """Probability that constant light has a window as much brighter than the rest, and 95 % upper limit of a signal.
+
+    The windows are up to a quarter of the period wide. The limit is the largest of all of them, so that it holds for a
+    pulse anywhere.
+    """
     from scipy.special import ndtr
 
     rate, error = free_waveform(recording, 512)
-    faint = float(np.median(rate))
-    variance, best = error**2, -np.inf
-    for m in 2 ** np.arange(7):
-        inside = sum(np.roll(rate, -k) for k in range(m)) - m * faint
-        noise = np.sqrt(sum(np.roll(variance, -k) for k in range(m)))
-        best = max(best, float((inside / noise).max()))
-    return float(7 * rate.size * ndtr(-best))
+    best, limit = -np.inf, 0.0
+    for m in 2 ** np.arange(8):
+        share = m / (rate.size - m)
+        inside, variance = (sum(np.roll(part, -k) for k in range(m)) for part in (rate, error**2))
+        excess = inside - share * (rate.sum() - inside)
+        noise = np.sqrt(variance + share**2 * ((error**2).sum() - variance))
+        best, limit = max(best, float((excess / noise).max())), max(limit, float((excess + 1.645 * noise).max()))
+    return float(8 * rate.size * ndtr(-best)), limit

@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from mars_lidar._base.cached import cached_property
 from mars_lidar._base.types import FloatArray, NDArray
-from mars_lidar.calibration.fit import LIGHTS, Fit, Fitted, Guess, counted, root_of
+from mars_lidar.calibration.fit import LIGHTS, Fit, Fitted, Guess, counted, draws, root_of
 from mars_lidar.calibration.model import Effect, Model, effects
 from mars_lidar.calibration.recording import FALSE_ALARM, LEAST_PHOTONS, Recording
 from mars_lidar.calibration.start import with_edge
@@ -29,8 +30,8 @@ class Score:
 
     @property
     def z(self) -> float:
-        """Standard deviations above zero; no effect has a negative size."""
-        return self.size / self.error
+        """Standard deviations above zero; no effect has a negative size, and one that is on or off none beyond 1."""
+        return min(self.size, 1.0 if self.effect.onoff else np.inf) / self.error
 
 
 def counts_of(fit: Fit, fitted: Fitted, model: Model, theta: FloatArray) -> tuple[FloatArray, float]:
@@ -60,16 +61,12 @@ def _score(fit: Fit, fitted: Fitted, plain: FloatArray, model: Model, theta: Flo
 def scores(fit: Fit, fitted: Fitted, plain: FloatArray) -> list[Score]:
     """The score of each effect beyond the `plain` counts of the model, the most significant first."""
     model = fitted.model
-    of = {
-        "afterpulsing": "afterpulse_probability",
-        "electronics_dead_time_ns": "electronics_excess",
-        "mode": "paralyzable",
-    }
-    have = {name for effect in model.effects for name in effect.names} | {
-        of.get(name, name) for name, _ in model.fields
-    }
+    of = {"afterpulsing": "afterpulse_probability", "mode": "paralyzable"}
+    have = {of.get(name, name) for name, _ in model.fields} | {*model.names}
     centre, listed = model.bounded(fitted.theta), []
     dead = float(centre[model.light + 2])
+    given = model.light + 2 not in fitted.free and fitted.by_shortest is None  # the detector's, not the electronics'
+    have |= {"electronics_excess"} if given or "electronics_dead_time_ns" in have else set()
     for effect in effects(dead) if dead > 0.0 else ():
         if effect.names[0] not in have:
             wider = replace(model, effects=(*model.effects, effect))
@@ -78,39 +75,58 @@ def scores(fit: Fit, fitted: Fitted, plain: FloatArray) -> list[Score]:
     return sorted(listed, key=lambda score: -score.z)
 
 
-@dataclass(frozen=True)
-class Bound:
-    """Upper limit of an effect that is not significant (95 %), and by how much it would move the estimates (free,)."""
+class Trial:
+    """A further effect, and the fit with it by short batches, made when it is asked for."""
 
-    effect: Effect
-    limit: float
-    shift: FloatArray
+    def __init__(self, shorter: Fit, fitted: Fitted, score: Score) -> None:
+        self.score, self.effect, self._shorter, self._fitted = score, score.effect, shorter, fitted
+
+    @cached_property
+    def stepped(self) -> tuple[float, Guess] | None:
+        """Misfit and parameters of the steps with it; None if a detector cannot have it together with the others."""
+        fit, fitted, score = self._shorter, self._fitted, self.score
+        model, effect = replace(fitted.model, effects=(*fitted.model.effects, score.effect)), score.effect
+        size = effect.start[0]
+        moved = fitted.theta.copy()
+        if not effect.onoff and score.size > 0.0:
+            size = min(score.size, effect.most[0])
+            moved[fitted.free] -= score.shift * min(size, effect.start[0])
+        theta = model.bounded(np.r_[moved, size, effect.start[1:]])
+        spread = 0.5 * model.scale(theta)
+        own = np.sqrt(np.diag(fitted.covariance))
+        spread[fitted.free] = np.minimum(spread[fitted.free], np.maximum(8.0 * own, 1e-12))
+        more = [] if effect.onoff else range(fitted.model.size, model.size)
+        timed = [] if fitted.by_shortest is None else [fitted.model.light + 2]
+        free = np.r_[np.union1d(fitted.free, timed), more].astype(np.intp)
+        photons = float(fit.recording.photons)
+        try:
+            if fitted.model.light + 2 in free:  # the dead time has absorbed part of the effect
+                gaps = np.diff(fit.recording.pieces[0][: 12 * fit.effort.first])
+                theta = with_edge(fit, model, theta, np.sort(gaps))
+            guess, misfit, _ = fit.steps(Guess(model, theta, np.diag(spread[free]), free), photons, photons / 6.0)
+        except (ValueError, np.linalg.LinAlgError):
+            return None
+        return misfit, guess
+
+    @cached_property
+    def final(self) -> Fitted | None:
+        """The fit judged by fresh streams; None if there is none, or it did not converge."""
+        final = None if self.stepped is None else self._shorter.finish(self.stepped[1])
+        return final if final is not None and final.converged else None
 
 
-def at_limits(fit: Fit, fitted: Fitted, listed: list[Score]) -> list[Bound]:
-    """Limits of effects that are not significant, by refits that include them.
+def alternatives(trials: list[Trial]) -> list[Trial]:
+    """Effects that are not in the result and yet may be in the stream: of each kind, the refit with it.
 
-    A score does not tell them: a dead time or background that has absorbed an effect leaves hardly any residual, and
-    that is not linear in the size. Of afterpulses, the delay of the refit is that of the recording.
+    A score does not give their size: a dead time or background that has absorbed an effect leaves hardly any residual,
+    and that is not linear in the size. Of afterpulses, the delay of the refit is that of the recording. A paralyzable
+    detector, of size 1, is one of them if the 95 % upper limit of its score is not below 1.
     """
-    model, most, shorter, out = fitted.model, clear(listed), fit.shorter, []
-    quiet = [score for score in listed if score.z <= most and not score.effect.onoff]
-    longest = {score.effect.names[0]: score for score in sorted(quiet, key=lambda score: score.effect.start[-1])}
-    for score in longest.values():
-        trial = _stepped(shorter, fitted, score)
-        final = None if trial is None else shorter.finish(trial[1])
-        if final is None or not final.converged or model.size not in final.free:
-            continue
-        at, rest = np.flatnonzero(final.free == model.size)[0], np.searchsorted(final.free, fitted.free)
-        size, variance = float(final.theta[model.size]), float(final.covariance[at, at])
-        limit = min(size + 1.645 * variance**0.5, score.effect.most[0])
-        slope = final.covariance[rest, at] / max(variance, 1e-300)
-        moved = final.theta[fitted.free] + slope * (limit - size)
-        out.append(Bound(score.effect, limit, fitted.theta[fitted.free] - moved))
-    return out
+    possible = [t for t in trials if not t.effect.onoff or t.score.size + 1.645 * t.score.error > 1.0]
+    return list({t.effect.names[0]: t for t in sorted(possible, key=lambda t: t.effect.start[-1])}.values())
 
 
-def clear(listed: list[Score], alarm: float = FALSE_ALARM) -> float:
+def clear(listed: list[Trial], alarm: float = FALSE_ALARM) -> float:
     """Score that the largest of these effects exceeds by chance with probability `alarm`."""
     from scipy.special import ndtri
 
@@ -126,53 +142,53 @@ class Named:
     gain: float
 
 
-def search(fit: Fit, fitted: Fitted) -> tuple[Fitted, list[Named], list[Score]]:
-    """The fit with the effects that the stream shows, those effects, and the scores of all others."""
+def search(fit: Fit, fitted: Fitted) -> tuple[Fitted, list[Named], list[Trial]]:
+    """The fit with the effects that the stream shows, those effects, and all others."""
     included: list[Named] = []
     for last in (*[False] * fit.effort.effects, True):
         plain = counts_of(fit, fitted, fitted.model, fitted.theta)[0]
-        listed = scores(fit, fitted, plain)
-        better = None if last else refitted(fit, fitted, plain, listed)
+        trials = [Trial(fit.shorter, fitted, score) for score in scores(fit, fitted, plain)]
+        better = None if last else refitted(fit, fitted, plain, trials)
         if better is None:
             break
         fitted, effect = better
         included += [] if effect is None else [effect]
-    return fitted, included, listed
+    return fitted, included, trials
 
 
-def refitted(fit: Fit, fitted: Fitted, plain: FloatArray, listed: list[Score]) -> tuple[Fitted, Named | None] | None:
+def refitted(fit: Fit, fitted: Fitted, plain: FloatArray, trials: list[Trial]) -> tuple[Fitted, Named | None] | None:
     """The fit with the effect that explains most, or a better fit without any; None if no effect is significant.
 
     The refit decides which effect it is: a slow recovery may have the score of a paralyzable detector, and an effect
     that the dead time has absorbed has a score only along the counts of the refit. All effects are therefore tried if
     the misfit is suspicious. Short batches choose between effects; the chosen one is fitted with full batches.
     """
-    limit = clear(listed, _TRIED)
-    tried = {score.effect.names[0]: score for score in reversed(listed) if score.z > limit or fitted.p_value < _TRIED}
-    shorter = fit.shorter
-    stepped = [(score, *trial) for score in tried.values() if (trial := _stepped(shorter, fitted, score)) is not None]
-    best, most = None, clear(listed)
-    for score, _, guess in sorted(stepped, key=lambda trial: (trial[0].z <= most, trial[1]))[: fit.effort.refits]:
-        final, size = shorter.finish(guess), fitted.model.size
+    limit, most, best, size = clear(trials, _TRIED), clear(trials), None, fitted.model.size
+    tried = {t.effect.names[0]: t for t in reversed(trials) if t.score.z > limit or fitted.p_value < _TRIED}
+    stepped = [(trial.score.z <= most, trial.stepped[0], trial) for trial in tried.values() if trial.stepped]
+    for *_, trial in sorted(stepped, key=lambda each: each[:2])[: fit.effort.refits]:
+        score, final = trial.score, trial.final
+        if final is None:
+            continue
         along = _score(fit, fitted, plain, final.model, final.theta, score.effect)
         error = _error_of(final, size)
-        z = max(score.z, along.z, final.theta[size] / error if error else 0.0)
-        clearly = z > most or (final.p_value * _MISFIT > fitted.p_value and (z > limit or not error))
+        explained = min(along.size, final.theta[size])  # what is beyond the size of the refit is not the effect's
+        z = max(score.z, explained / along.error, final.theta[size] / error if error else 0.0)
+        fits = final.p_value * _MISFIT > fitted.p_value and (z > clear(trials[:1], _TRIED) or not error)
         better = best is None or final.misfit_z < best[0].misfit_z
-        if final.converged and final.theta[size] > 0.0 and clearly and better:
+        if final.theta[size] > 0.0 and (z > most or fits) and better:
             best = final, score.effect, z
     if best is None:
         return None
     final, effect, z = best
     if fitted.p_value < _MISFIT:  # the first fit may have been a bad one
-        known = final.free < fitted.model.size
+        known = final.free < size
         root = root_of(final.covariance[np.ix_(known, known)])
-        other = shorter.finish(Guess(fitted.model, final.theta[: fitted.model.size], root, final.free[known]))
+        other = fit.shorter.finish(Guess(fitted.model, final.theta[:size], root, final.free[known]))
         if other.converged and other.p_value > max(FALSE_ALARM, fitted.p_value / _MISFIT):
             return other, None
     last = fit.finish(Guess(final.model, final.theta, root_of(final.covariance), final.free), finished=True)
     final = last if last.converged else final
-    size = fitted.model.size
     if fitted.p_value >= FALSE_ALARM and final.theta[size] < 1.96 * _error_of(final, size):
         return None  # the stream fits without it, and its 95 % interval begins at none
     return final, Named(effect, z, fitted.misfit_z - final.misfit_z)
@@ -182,32 +198,6 @@ def _error_of(fitted: Fitted, index: int) -> float:
     """Standard error of a parameter; 0 where it was not free."""
     at = fitted.free == index
     return float(fitted.covariance[np.ix_(at, at)].sum() ** 0.5)
-
-
-def _stepped(fit: Fit, fitted: Fitted, score: Score) -> tuple[float, Guess] | None:
-    """Misfit and parameters with a further effect; None if a detector cannot have it together with the others."""
-    model, effect = replace(fitted.model, effects=(*fitted.model.effects, score.effect)), score.effect
-    size = effect.start[0]
-    moved = fitted.theta.copy()
-    if not effect.onoff and score.size > 0.0:
-        size = min(score.size, effect.most[0])
-        moved[fitted.free] -= score.shift * min(size, effect.start[0])
-    theta = model.bounded(np.r_[moved, size, effect.start[1:]])
-    spread = 0.5 * model.scale(theta)
-    own = np.sqrt(np.diag(fitted.covariance))
-    spread[fitted.free] = np.minimum(spread[fitted.free], np.maximum(8.0 * own, 1e-12))
-    more = [] if effect.onoff else range(fitted.model.size, model.size)
-    timed = [] if fitted.by_shortest is None else [fitted.model.light + 2]
-    free = np.r_[np.union1d(fitted.free, timed), more].astype(np.intp)
-    photons = float(fit.recording.photons)
-    try:
-        if fitted.model.light + 2 in free:  # the dead time has absorbed part of the effect
-            gaps = np.diff(fit.recording.pieces[0][: 12 * fit.effort.first])
-            theta = with_edge(fit, model, theta, np.sort(gaps))
-        guess, misfit, _ = fit.steps(Guess(model, theta, np.diag(spread[free]), free), photons, photons / 6.0)
-    except (ValueError, np.linalg.LinAlgError):
-        return None
-    return misfit, guess
 
 
 @dataclass(frozen=True, eq=False)
@@ -261,28 +251,30 @@ def _flicker(fit: Fit, fitted: Fitted, counts: float = 8.0, windows: int = 64) -
     Half the mean squared difference of counts in successive windows (Allan's variance, which a slow drift does not
     change), over that of streams of the fit: for longer windows, relative to the shortest. Afterpulses and other
     correlations shorter than the windows change all of them alike, fluctuations of the light the longer ones more. The
-    shortest windows have `counts` counts, each further size four times as many, as long as `windows` remain.
+    shortest windows have `counts` counts, each further size four times as many, as long as `windows` remain. The noise
+    is that of even counts, or what these streams scatter, whose light is drawn from its errors: the counts of a bright
+    pulse are even but for rare losses.
     """
     from scipy.special import ndtri
 
     recording, size = fit.recording, min(float(fit.recording.photons), fit.effort.batch / 4.0)
     cycles = max(2, round(fit.exposure(size)))
-    streams = fitted.model.streams(np.tile(fitted.theta, (LIGHTS, 1)), cycles, 0)
-    drawn = [Recording((t,), (cycles,), recording.clock) for t in streams]
-    rows: list[tuple[float, float, float]] = []
-    while not rows or counts * windows < recording.photons:
+    rows = draws(fitted.model, fitted.unbounded, fitted.covariance, fitted.free)[:LIGHTS]
+    drawn = [Recording((t,), (cycles,), recording.clock) for t in fitted.model.streams(rows, cycles, 0)]
+    table = []
+    while not table or counts * windows < recording.photons:
         window = counts * recording.exposure / recording.photons
-        (variance, number, mean), *other = [x.unevenness(window) for x in (recording, *drawn)]
-        expected = max(float(np.mean([each[0] for each in other])), 1e-300)
-        noise = 3.0 / max(number, 1) + 3.0 / max(sum(each[1] for each in other), 1)  # of the ratio, even counts
-        rows.append((max(variance / expected, 1e-300), noise, max(variance - expected, 0.0) ** 0.5 / max(mean, 1e-300)))
+        table.append([x.unevenness(window) for x in (recording, *drawn)])
         counts *= 4.0
-    ratio, noise, scatter = np.array(rows).T
-    if ratio.size == 1:
+    variance, number, mean = np.maximum(np.array(table).transpose(2, 0, 1), 1e-300)  # (windows, streams) each
+    expected = variance[:, 1:].mean(1)
+    ratio, even = variance[:, 0] / expected, 3.0 / number[:, 0] + 3.0 / number[:, 1:].sum(1)  # of even counts
+    if len(table) == 1:
         return 0.0, -np.inf, 1.0
-    z = np.log(ratio[1:] / ratio[0]) / np.sqrt(noise[1:] + noise[0])
-    p = min(1.0, z.size * _above(z.max()))
-    return float(scatter[1 + z.argmax()]), float(-ndtri(p)) if p > 0.0 else float(z.max()), float(ratio.max())
+    scatter = np.log(variance[1:, 1:] / variance[0, 1:]).var(1, ddof=1) * number[1:, 1:].mean(1) / number[1:, 0]
+    z = np.log(ratio[1:] / ratio[0]) / np.sqrt(np.maximum(even[1:] + even[0], scatter * (1.0 + 1.0 / LIGHTS)))
+    p, excess = min(1.0, z.size * _above(z.max())), np.sqrt(np.maximum(variance[:, 0] - expected, 0.0)) / mean[:, 0]
+    return float(excess[1 + z.argmax()]), float(-ndtri(p)) if p > 0.0 else float(z.max()), float(ratio.max())
 
 
 def drift(fit: Fit, fitted: Fitted) -> Drift | None:

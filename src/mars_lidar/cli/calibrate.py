@@ -1,5 +1,6 @@
 """`mars-lidar calibrate`: light and detector from a measured photon stream, with a test of fit."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -292,16 +293,16 @@ def fit_rows(result: Calibration) -> list[tuple[str, str]]:
     """Estimates, limits, drift, suspects, and the verdict."""
     rows = []
     for name, estimate in result.estimates.items():
-        text = f"{estimate}{_UNITS.get(name.split('_')[0], '')}"
+        text, *ranges = str(estimate).split("; ")
+        text += _UNITS.get(name.split("_")[0], "")
         if name.startswith("delay") and estimate.error:
             text += f", {0.5 * SPEED_OF_LIGHT_M_PER_NS * estimate.value:.6g} m"
-        rows.append((name, text))
+        rows.append((name, "; ".join([text, *ranges])))
     if result.waveform is not None:
         rows.append(("light", f"free shape of {result.waveform.size} bins, {result.waveform.sum():.6g} a period"))
-    for limit in result.limits:
-        shifts = ", ".join(f"{name} by {shift:+.2g}" for name, shift in limit.shifts.items())
-        at = f"; at that size it would move {shifts}" if shifts else ""
-        rows.append(("not detected", f"{limit.words}: {limit.name} below {limit.limit:.3g} (95 %){at}"))
+    for limit in result.limits:  # with the ranges of which it sets an end
+        sets = {k: r for k, r in limit.ranges.items() if {*r} & {result.estimates[k].least, result.estimates[k].most}}
+        rows.append(("not in result", str(replace(limit, ranges=sets))))
     if result.drift is not None:
         drift = result.drift
         for k, name in enumerate(drift.names):

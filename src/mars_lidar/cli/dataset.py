@@ -294,14 +294,7 @@ def _size(option: str, text: str | None) -> Any:
     return numbers[0] if len(numbers) == 1 else numbers
 
 
-def export(
-    dataset: Path,
-    /,
-    *,
-    out: OutPath,
-    layout: Text,
-    fill: bool = False,
-) -> None:
+def export(dataset: Path, /, *, out: OutPath, layout: Text, fill: bool = False) -> None:
     """Write a dataset as the files that depth networks load.
 
     One .mat for each exposure and a list of them, or tar archives.

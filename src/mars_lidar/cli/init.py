@@ -36,12 +36,7 @@ def of_instrument(name: str) -> str:
     return "\n".join([*lines, "start: armed", ""])
 
 
-def schema(
-    file: Text = "recipe",
-    /,
-    *,
-    out: OutPath | None = None,
-) -> None:
+def schema(file: Text = "recipe", /, *, out: OutPath | None = None) -> None:
     """Write the JSON Schema of scene, recipe or system files, for editors.
 
     With it an editor completes and checks keys.
@@ -69,12 +64,7 @@ def schema(
 
 
 def init(
-    file: Path = _FILE,
-    /,
-    *,
-    out: OutPath | None = None,
-    preset: Text | None = None,
-    overwrite: bool = False,
+    file: Path = _FILE, /, *, out: OutPath | None = None, preset: Text | None = None, overwrite: bool = False
 ) -> None:
     """Write a commented system file to start from.
 

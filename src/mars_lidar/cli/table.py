@@ -24,7 +24,6 @@ def build(
     method: Text = "exposure",
     rearm: Text = "centre",
     refine: Number | None = None,
-    check_law: bool = False,
     threads: Integer | None = None,
     out: OutPath | None = None,
     overwrite: bool = False,
@@ -43,8 +42,6 @@ def build(
         For mars: re-arming at the centre or the edge of a bin. [default: centre]
     refine
         Insert points until the error between them, in total variation, is below this.
-    check_law
-        Compare count laws with exact ones at the end.
 
     Simulation
     ----------
@@ -65,13 +62,7 @@ def build(
     refuse_existing(out, overwrite)
     system = instrument.build(effects)
     axes = _grid("--signal", signal), _grid("--background", background)
-    chosen: dict[str, Any] = {
-        "method": method,
-        "rearm": rearm,
-        "refine": refine,
-        "check_law": check_law,
-        "threads": threads,
-    }
+    chosen: dict[str, Any] = {"method": method, "rearm": rearm, "refine": refine, "threads": threads}
     with progress_bar("building") as progress:
         if out is None:
             path = Table.cached_path(system, *axes, progress=progress, **chosen)
@@ -81,10 +72,7 @@ def build(
     table(_rows(path) | {"time": f"{span(time.perf_counter() - began)} in all"})
 
 
-def info(
-    file: Path | None = None,
-    /,
-) -> None:
+def info(file: Path | None = None, /) -> None:
     """Describe a table, or list the tables in the cache.
 
     Arguments
@@ -101,10 +89,7 @@ def info(
     table(rows + [(f"{path.stat().st_size / 1e6:,.4g} MB", _line(path)) for path in files])
 
 
-def clear(
-    *,
-    yes: Annotated[bool, Parameter(("--yes", "-y"))] = False,
-) -> None:
+def clear(*, yes: Annotated[bool, Parameter(("--yes", "-y"))] = False) -> None:
     """Remove the tables in the cache.
 
     Options
@@ -150,7 +135,7 @@ def _rows(path: Path) -> dict[str, str]:
     else:
         serves = f"any number from {later:,} on (made for {system.cycles:,})"
     method = stored.method + (f", re-arming at the {stored.rearm}" if stored.method == "mars" else "")
-    rows = {
+    return {
         "table": f"{path} (mars-lidar {provenance['version']}, built in {provenance['build_s']:.3g} s)",
         "method": method,
         "signal": provenance["signal"],
@@ -167,13 +152,6 @@ def _rows(path: Path) -> dict[str, str]:
         f"error at {made['cycles']:,} cycles": _error(made),
         "error at any": _any_error(provenance.get("error_longest"), never),
     }
-    law = provenance.get("law")
-    if law is not None:
-        rows["count law"] = (
-            f"{law['samples']} random pixels: total variation {law['mean']:.2g}, at most {law['largest']:.2g}; "
-            f"{100 * law['within']:.3g} % within 0.002"
-        )
-    return rows
 
 
 def _error(made: dict[str, Any]) -> str:

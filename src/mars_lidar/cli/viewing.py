@@ -20,12 +20,7 @@ if TYPE_CHECKING:
     from mars_lidar.io import Cube
 
 
-def info(
-    file: Path,
-    /,
-    *,
-    verify: bool = False,
-) -> int | None:
+def info(file: Path, /, *, verify: bool = False) -> int | None:
     """Describe a cube, a dataset or a file of another program.
 
     System, light, engine and size; whether the file is complete, and how to open it.

@@ -71,10 +71,7 @@ class Estimate:
 
 @checked
 def estimate(
-    recipe: DatasetRecipe | dict[str, Any] | str | Path,
-    out: str | Path | None = None,
-    *,
-    threads: int | None = None,
+    recipe: DatasetRecipe | dict[str, Any] | str | Path, out: str | Path | None = None, *, threads: int | None = None
 ) -> Estimate:
     """Estimate size, time and memory of a dataset without writing anything.
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import shutil
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
@@ -13,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from mars_lidar._base.buckets import in_bucket, remove, zarr_store
+from mars_lidar._base.buckets import remove, zarr_store
 from mars_lidar._version import __version__
 from mars_lidar.dataset import arrays
 from mars_lidar.dataset.cluster import Crew
@@ -104,7 +103,7 @@ def begin(path: Path, recipe: DatasetRecipe) -> Any:
 
     if path.exists():
         (path / "zarr.json").unlink(missing_ok=True)  # from now on it is no store
-        remove(path) if in_bucket(path) else shutil.rmtree(path)
+        remove(path)
     attrs = {
         "complete": False,
         "stage": "scenes",

@@ -234,11 +234,7 @@ def begin(
 
 @checked
 def make_part(
-    out: str | Path,
-    part: tuple[int, int],
-    *,
-    threads: int | None = None,
-    progress: Progress | bool | None = None,
+    out: str | Path, part: tuple[int, int], *, threads: int | None = None, progress: Progress | bool | None = None
 ) -> Generated:
     """Make the K-th of N parts of a dataset that `begin` created; existing files are not made again.
 

@@ -4,14 +4,12 @@ zarr-python writes a whole shard at once and copies every chunk into a new array
 long as the encoding. Here a chunk is encoded while it is in the processor's cache, and a shard is never in memory.
 """
 
-import contextlib
-import io
 import itertools
 import secrets
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,7 +71,9 @@ def write_shard(path: Path, chunks: Iterator[bytes | None]) -> tuple[int, Sums]:
     """
     places: list[int] = []
     offset, summing = 0, Summing()
-    with _whole(path) as stream:
+    if not in_bucket(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as stream:
         for data in chunks:
             if data is None:
                 places += [_NONE, _NONE]
@@ -86,19 +86,6 @@ def write_shard(path: Path, chunks: Iterator[bytes | None]) -> tuple[int, Sums]:
         stream.write(index)
         summing.update(index)
     return offset + len(index), summing.sums()
-
-
-@contextlib.contextmanager
-def _whole(path: Path) -> Iterator[BinaryIO]:
-    """A stream whose content appears at `path` at the end, or not at all."""
-    if in_bucket(path):
-        content = io.BytesIO()
-        yield content
-        put(path, content.getvalue())
-        return
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as stream:
-        yield stream
 
 
 def digests_of(store: Path) -> Path:

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import json
 import math
-import shutil
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -160,44 +159,37 @@ class Dataset:
         for place in np.ndindex(arrays.grid(array.shape, array.shards)):
             yield Item(kind, place, arrays.block(place, array.shards, array.shape))
 
+    def names(self, item: Item) -> list[str]:
+        """The files of a part, relative to the store."""
+        every = {"histogram": self.histogram} if item.kind == "histogram" else self.maps
+        return [f"{name}/{array.metadata.encode_chunk_key(item.shard)}" for name, array in every.items()]
+
     def files(self, item: Item) -> list[Path]:
         """The files of a part."""
-        every = {"histogram": self.histogram} if item.kind == "histogram" else self.maps
-        return [self.path / name / array.metadata.encode_chunk_key(item.shard) for name, array in every.items()]
+        return [self.path / name for name in self.names(item)]
 
     def missing(self, items: Iterable[Item] | None = None) -> list[Item]:
         """Those of some parts, or of all, that are missing or whose files are truncated."""
-        if in_bucket(self.path):  # objects are whole or not there
-            there = sizes(self.path)
-            return [
-                item
-                for item in (self.items() if items is None else items)
-                if not all(file.relative_to(self.path).as_posix() in there for file in self.files(item))
-            ]
-        noted = self.written()
+        there, noted = sizes(self.path), self.written()
 
         def whole(item: Item) -> bool:
             array = self.histogram if item.kind == "histogram" else self.maps["depth"]
             chunks = math.prod(n // step for n, step in zip(array.shards, array.chunks, strict=True))
-            for file in self.files(item):
-                if not file.is_file():
-                    return False
-                size, _ = noted.get(file.relative_to(self.path).as_posix(), (-1, ""))
-                if file.stat().st_size != size and not _whole(file, chunks):
-                    return False
-            return True
+            return all(
+                name in there
+                and (
+                    in_bucket(self.path)  # objects are whole or not there
+                    or there[name] == noted.get(name, (-1, ""))[0]
+                    or _whole(self.path / name, chunks)
+                )
+                for name in self.names(item)
+            )
 
         return [item for item in (self.items() if items is None else items) if not whole(item)]
 
-    def missing_files(self) -> list[Path]:
-        """Missing files."""
-        if in_bucket(self.path):
-            return [file for item in self.missing() for file in self.files(item)]
-        return [file for item in self.items() for file in self.files(item) if not file.is_file()]
-
     def unlisted(self) -> str:
         """The first file of a part that the manifest does not have; empty where it has them all."""
-        names = (file.relative_to(self.path).as_posix() for item in self.items() for file in self.files(item))
+        names = (name for item in self.items() for name in self.names(item))
         return next((name for name in names if self.sums is not None and name not in self.sums), "")
 
     @property
@@ -232,25 +224,17 @@ class Dataset:
 
     def finish(self) -> None:
         """Mark the store complete, with one replacement of its root document, after its manifest."""
-        if lost := self.missing_files():
+        there = sizes(self.path)
+        if lost := [name for item in self.items() for name in self.names(item) if name not in there]:
             raise FileNotFoundError(f"{lost[0]} was removed while the others were made, the first of {len(lost)}")
         if "consolidated_metadata" not in manifest.root_document(self.path):  # stopped just before it
             arrays.mark(self.group, {})
         noted = self.written()
-        if in_bucket(self.path):
-            there = sizes(self.path)
-            known = {name: sums for name, (size, sums) in noted.items() if there.get(name) == size}
-            if noted:
-                remove(digests_of(self.path))
-        else:
-            known = {name: sums for name, (size, sums) in noted.items() if _has_size(self.path / name, size)}
-            shutil.rmtree(digests_of(self.path), ignore_errors=True)
+        known = {name: sums for name, (size, sums) in noted.items() if there.get(name) == size}
+        if digests_of(self.path).exists():
+            remove(digests_of(self.path))
         manifest.seal(self.path, {"stage": "done", "complete": True}, known)
         self.attrs = manifest.root_document(self.path)["attributes"]
-
-
-def _has_size(file: Path, size: int) -> bool:
-    return file.is_file() and file.stat().st_size == size
 
 
 def _whole(file: Path, chunks: int) -> bool:

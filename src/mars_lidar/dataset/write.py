@@ -78,8 +78,7 @@ class Maker:
                 if error.errno not in TRANSIENT:
                     raise
                 if pause is None:
-                    name = self.dataset.files(item)[0].relative_to(self.dataset.path).as_posix()
-                    return Failed(name, error.errno, error.strerror or str(error))
+                    return Failed(self.dataset.names(item)[0], error.errno, error.strerror or str(error))
                 time.sleep(pause)
         raise AssertionError("the last attempt returns")
 
@@ -205,11 +204,7 @@ class Maker:
 def fingerprint() -> str:
     """Hash of a small cube of engine exact: equal on all machines on which the package draws the same bits."""
     system = System(
-        period_ns=100.0,
-        cycles=50,
-        bins=16,
-        pulse=GaussianPulse(sigma_ns=2.0),
-        detector=Detector(dead_time_ns=40.0),
+        period_ns=100.0, cycles=50, bins=16, pulse=GaussianPulse(sigma_ns=2.0), detector=Detector(dead_time_ns=40.0)
     )
     flux = Flux([[0.1, 1.0, 5.0, 0.0]], [[0.3, 0.1, 0.0, 2.0]], [[10.0, 50.0, 90.0, 0.0]])
     counts = simulate(flux, system, realizations=2, seed=1, threads=1)

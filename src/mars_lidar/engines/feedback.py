@@ -19,8 +19,7 @@ import numpy as np
 from mars_lidar._base.native import _core
 from mars_lidar._base.types import FloatArray, IndexArray, NDArray
 from mars_lidar.engines.engine import Engine, Task, draw_pixels, stage
-from mars_lidar.engines.exact import ExactEngine
-from mars_lidar.engines.poisson import PoissonEngine
+from mars_lidar.engines.exact import ExactEngine, PoissonEngine
 from mars_lidar.engines.tolerances import TOL
 from mars_lidar.instrument.pulse import GaussianPulse, SampledPulse
 from mars_lidar.instrument.system import System
@@ -449,35 +448,21 @@ StatusArray = NDArray[np.uint8]
 
 
 class Reason(IntEnum):
-    """Outcome of an exposure: `FeedbackStatus` of native/feedback/kernel.h, and reasons known before the draw."""
+    """Outcome of an exposure: `FeedbackStatus` of native/feedback/kernel.h, and reasons known before the draw.
+
+    A report has the names in small letters.
+    """
 
     DRAWN = 0
-    SLOW = 1
-    FEW = 3
+    SLOW_SWEEPS = 1
+    LOCKED_IN_SHORT_EXPOSURE = 3
     UNSETTLED = 4
-    NEGATIVE = 5
-    UNLIKELY = 6
-    SHORT = 16
-    CELLS = 18
-    SLOWER = 19
+    NEGATIVE_ARMED = 5
+    UNLIKELY_COUNT = 6
+    SHORT_EXPOSURE = 16
+    TOO_MANY_CELLS = 18
+    QUICKER_EXACTLY = 19
     LAPS = 64  # and more: of a pixel that needs that many laps less 64
-
-    @property
-    def words(self) -> str:
-        """The name in a report."""
-        return _WORDS[self]
-
-
-_WORDS = {
-    Reason.SLOW: "slow sweeps",
-    Reason.FEW: "locked, short exposure",
-    Reason.UNSETTLED: "unsettled",
-    Reason.NEGATIVE: "negative armed",
-    Reason.UNLIKELY: "unlikely count",
-    Reason.SHORT: "short exposure",
-    Reason.CELLS: "too many cells",
-    Reason.SLOWER: "quicker exactly",
-}
 
 
 class Group(NamedTuple):
@@ -512,7 +497,7 @@ class Rest:
             reasons, numbers = np.unique(codes[codes != Reason.DRAWN], return_counts=True)
             task.report[about] = float(numbers.sum())
             for reason, number in zip(reasons, numbers, strict=True):
-                task.report[f"{about}, {Reason(reason).words}"] = float(number)
+                task.report[f"{about}, {Reason(reason).name.lower().replace('_', ' ')}"] = float(number)
         realization, column = np.nonzero(some)
         return cls(np.sort(pixels[all_of_it]), realization, pixels[column])
 
@@ -539,11 +524,11 @@ class Plan:
         """For some pixels (n,) of a task."""
         reason = np.zeros(pixels.size, np.uint8)
         if task.system.cycles < TOL.fewest_dead_times * math.ceil(task.system.dead_time_periods):
-            reason[:] = Reason.SHORT
+            reason[:] = Reason.SHORT_EXPOSURE
             return cls(Grids.coarsest(task, pixels.size), reason)
         grids = Grids.checked(task, pixels)
-        reason[grids.sweeps > TOL.mean_sweeps] = Reason.SLOW
-        reason[grids.of < 0] = Reason.CELLS
+        reason[grids.sweeps > TOL.mean_sweeps] = Reason.SLOW_SWEEPS
+        reason[grids.of < 0] = Reason.TOO_MANY_CELLS
         return cls(grids, reason)
 
     def part(self, some: NDArray[np.bool_]) -> Plan:
@@ -584,8 +569,8 @@ def sweep_pixels(
     laps = status[0, slow].astype(np.int64) - Reason.LAPS
     large = cells[slow] * laps > TOL.lap_cells
     slower = np.zeros_like(large) if worth is None else cells[slow] * laps > worth[slow]
-    status[:, slow[slower]] = Reason.SLOWER
-    status[:, slow[large]] = Reason.CELLS
+    status[:, slow[slower]] = Reason.QUICKER_EXACTLY
+    status[:, slow[large]] = Reason.TOO_MANY_CELLS
     far = ~large & ~slower
     status[:, slow[far]] = draw(replace(task, progress=None), 0, slow[far], laps[far])
     of_laps = np.ones(pixels.size, np.int64)

@@ -219,10 +219,12 @@ def simulate_timestamps(
         records = chosen.records(task, expected)
     info = {"system": system.to_dict(), "engine": chosen.name, "seed": int(seed), "realization": int(realization)}
     height, width = task.flux.shape
-    what = ((height, width), system.bins, system.histogram_dtype, system.period_ns, system.cycles, info)
+    what: dict[str, Any] = {"cycle": records.cycle, "offsets": records.offsets, "shape": (height, width), "info": info}
+    what |= {"bins": system.bins, "dtype": system.histogram_dtype}
+    what |= {"period_ns": system.period_ns, "cycles": system.cycles}
     if isinstance(records, PhaseRecords):
-        return DrawnTimestamps.of(records.cycle, records.phase, records.offsets, *what)
-    return Timestamps(records.times * system.period_ns, records.cycle, records.bin, records.offsets, *what)
+        return DrawnTimestamps.of(phase=records.phase, **what)
+    return Timestamps(times_ns=records.times * system.period_ns, bin=records.bin, **what)
 
 
 def _on_cuda(engine: Engine, task: Task, shape: tuple[int, ...], out: Any) -> Any:
@@ -346,8 +348,4 @@ def _check_out(out: Any, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
 
 
 def _check_memory(shape: tuple[int, ...], itemsize: int, what: str) -> None:
-    check_memory(
-        math.prod(shape) * itemsize,
-        f"{what} of shape {shape}",
-        IN_PARTS,
-    )
+    check_memory(math.prod(shape) * itemsize, f"{what} of shape {shape}", IN_PARTS)

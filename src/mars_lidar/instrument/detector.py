@@ -151,9 +151,7 @@ class Detector:
             if getattr(self, name) is None:
                 raise ValueError(f"mode 'gated' needs {name}, in ns, got None")
         set_field(
-            self,
-            "gate_start_ns",
-            checks.real("gate_start_ns", self.gate_start_ns, low=-TOL.gate_ns, high=TOL.gate_ns),
+            self, "gate_start_ns", checks.real("gate_start_ns", self.gate_start_ns, low=-TOL.gate_ns, high=TOL.gate_ns)
         )
         set_field(self, "gate_width_ns", checks.real("gate_width_ns", self.gate_width_ns, low=0.0, strict_low=True))
         step = 0.0 if self.gate_step_ns is None else self.gate_step_ns

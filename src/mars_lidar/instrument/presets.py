@@ -1,11 +1,13 @@
 """Detectors and instruments by name: published parameters, each with its source (docs/detectors.md).
 
-A value of an instrument is a pair (value, source). The source of a value without a data sheet begins with "assumption";
-check such values before use. The table in docs/detectors.md is `table` of this.
+A value of an instrument, in instruments.json, is a pair (value, source). The source of a value without a data sheet
+begins with "assumption"; check such values before use.
 """
 
+import json
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,89 +17,10 @@ from mars_lidar.instrument.avalanches import Afterpulsing
 
 # --- Instruments ---------------------------------------------------------------------------------------------------
 
-ASSUMED = "assumption"
-_QUOTED = f"{ASSUMED}: as it is commonly quoted, the data sheet was not read"
-_OFF = f"{ASSUMED}: not found"
-_S512 = "SPAD512S, a camera of this kind (axiomoptics.com/products/spad512s)"
-_TMF = "TMF8820/21/28 data sheet DS000693 v8-00"
-_TMF_BINS = "SparkFun library of the TMF882X, TMF882X_HIST_NUM_BINS"
-_ST = "DS14161 (VL53L8CX)"
-_CNH = "ST plugin_cnh.h of the VL53L8CH, CNH_BIN_WIDTH_MM = 37.5348"
-_FIFO = "Becker & Hickl, SPC_data_file_structure.h: ADC of 12 bits"
-_TAC = "Wahl, Time-Correlated Single Photon Counting, technical note: one photon in a cycle of the TAC"
+Sourced = dict[str, tuple[Any, str]]  # value and source
 
-Sourced = dict[str, tuple[Any, str]]
-
-# detector: fields of `Detector`; laser: period_ns, cycles, bins, pulse_fwhm_ns, where the instrument has them
-INSTRUMENTS: dict[str, dict[str, Sourced]] = {
-    "swissspad2-like": {
-        "detector": {
-            "dead_time_ns": (50.0, f"{ASSUMED}: of no effect, as a pixel holds one photon a frame"),
-            "mode": ("gated", _S512),
-            "gate_start_ns": (0.0, f"{ASSUMED}: where the gate is put"),
-            "gate_width_ns": (6.0, f"{_S512}: down to 6 ns, moved in steps of 17 ps"),
-            "detection_efficiency": (0.0525, f"{_S512}: 50 % at 520 nm; {ASSUMED}: fill factor 10.5 %, no microlenses"),
-            "dark_count_hz": (25.0, f"{_S512}: less than 25/s"),
-            "max_events_per_exposure": (1, f"{_S512}: one bit of memory in a pixel"),
-        },
-        "laser": {
-            "period_ns": (50.0, f"{ASSUMED}: 20 MHz"),
-            "cycles": (200, f"{_S512}: 100 000 frames/s, 10 us of the period"),
-            "bins": (50, f"{ASSUMED}: the camera has no time bins, the position of its gate is the time"),
-            "pulse_fwhm_ns": (0.2, _OFF),
-        },
-    },
-    **{
-        name: {
-            "detector": {"dead_time_ns": (10.0, _OFF)},
-            "laser": {
-                "period_ns": (2 * 5.0 / 0.299792458, f"{ASSUMED}: of its range, 5 m ({_TMF}, abstract)"),
-                "cycles": (500_000, _OFF),
-                "bins": (128, _TMF_BINS),
-                "pulse_fwhm_ns": (1.0, _OFF),
-            },
-        }
-        for name in ("tmf8820", "tmf8828")
-    },
-    "vl53l8cx": {
-        "detector": {"dead_time_ns": (10.0, _OFF)},
-        "laser": {
-            "period_ns": (128 * 2 * 0.0375348 / 0.299792458, f"128 bins of 37.5348 mm ({_CNH}); beyond 4 m ({_ST})"),
-            "cycles": (500_000, _OFF),
-            "bins": (128, f"{ASSUMED}: of {_CNH.split(',')[0]}, whose number of bins is set by the user"),
-            "pulse_fwhm_ns": (1.0, _OFF),
-        },
-    },
-    "ads6311": {
-        "detector": {"dead_time_ns": (10.0, _OFF)},
-        "laser": {
-            "period_ns": (200.0, f"{ASSUMED}: 30 m"),
-            "cycles": (10_000, _OFF),
-            "bins": (200, f"{ASSUMED}: 1 ns"),
-            "pulse_fwhm_ns": (2.0, _OFF),
-        },
-    },
-    "spc-150": {
-        "detector": {
-            "dead_time_ns": (0.0, f"{ASSUMED}: electronics alone; give that of the detector"),
-            "electronics_dead_time_ns": (100.0, _QUOTED),
-            "max_events_per_period": (1, _TAC),
-        },
-        "laser": {
-            "period_ns": (50.0, f"{ASSUMED}: 20 MHz"),
-            "cycles": (1_000_000, f"{ASSUMED}: 50 ms"),
-            "bins": (4096, _FIFO),
-            "pulse_fwhm_ns": (0.2, f"{ASSUMED}: of laser and detector"),
-        },
-    },
-    "mpd-pdm": {"detector": {"dead_time_ns": (77.0, _QUOTED), "dark_count_hz": (50.0, f"{_QUOTED}; 50 um, by grade")}},
-    "id-quantique-id100": {
-        "detector": {"dead_time_ns": (45.0, _QUOTED), "dark_count_hz": (20.0, f"{_QUOTED}; by grade")}
-    },
-    "id-quantique-id120": {
-        "detector": {"dead_time_ns": (400.0, f"{_QUOTED}; set by the user"), "dark_count_hz": (200.0, _QUOTED)}
-    },
-}
+INSTRUMENTS: dict[str, dict[str, Sourced]] = json.loads(Path(__file__).with_name("instruments.json").read_text("utf-8"))
+"""detector: fields of `Detector`; laser: period_ns, cycles, bins, pulse_fwhm_ns, where the instrument has them."""
 
 
 def detector_of(name: str) -> dict[str, Any]:
@@ -109,17 +32,6 @@ def sourced(name: str) -> Sourced:
     """All values of an instrument, with their sources; ValueError with all names if there is none."""
     fields = INSTRUMENTS[checks.choice("preset", name, tuple(INSTRUMENTS))]
     return {**fields.get("laser", {}), **fields["detector"]}
-
-
-def table() -> str:
-    """All instruments as the table of docs/detectors.md."""
-    lines = ["| name | field | value | source |", "|---|---|---|---|"]
-    for name in INSTRUMENTS:
-        label = f"`{name}`"
-        for field, (value, source) in sourced(name).items():
-            lines.append(f"| {label} | `{field}` | {value if isinstance(value, str) else f'{value:.6g}'} | {source} |")
-            label = ""
-    return "\n".join(lines)
 
 
 # --- Detectors -----------------------------------------------------------------------------------------------------

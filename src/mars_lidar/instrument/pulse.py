@@ -286,10 +286,7 @@ class SampledPulse(Pulse):
     def support_ns(self) -> tuple[float, float]:
         """Extent of the record around the origin, without samples of zero energy at either end."""
         inside = np.flatnonzero(np.diff(self._cumulative) > 0)
-        return (
-            self._start_ns + float(inside[0]) * self.bin_ns,
-            self._start_ns + float(inside[-1] + 1) * self.bin_ns,
-        )
+        return (self._start_ns + float(inside[0]) * self.bin_ns, self._start_ns + float(inside[-1] + 1) * self.bin_ns)
 
     def cumulative(self, t_ns: ArrayLike) -> NDArray[np.float64]:
         """Energy before `t_ns`, piecewise linear: the density is constant on each sample."""

@@ -185,11 +185,7 @@ def save_capture(path: str | Path, cube: Cube, like: str | Path, *, overwrite: b
     if abs(cube.system.bin_ns / float(source.bin_ns or 0.0) - 1.0) > 1e-6:
         raise ValueError(f"cube must have bins of {source.bin_ns:g} ns as {like} has, got {cube.system.bin_ns:g}")
     check_target(target, folder=False, overwrite=overwrite)
-    with (
-        beside(target) as unfinished,
-        open_hdf5(source.file.path) as old,
-        ForgivingFile(unfinished).hdf5() as new,
-    ):
+    with beside(target) as unfinished, open_hdf5(source.file.path) as old, ForgivingFile(unfinished).hdf5() as new:
         for name in old:
             if name != source.name:
                 old.copy(name, new)

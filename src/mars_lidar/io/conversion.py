@@ -133,11 +133,7 @@ def convert(
 
 @checked
 def photons(
-    cube: Cube,
-    *,
-    realization: int = 0,
-    threads: int | None = None,
-    progress: Progress | bool | None = None,
+    cube: Cube, *, realization: int = 0, threads: int | None = None, progress: Progress | bool | None = None
 ) -> Timestamps:
     """The photons of one exposure of a stored cube, simulated again from its recipe.
 

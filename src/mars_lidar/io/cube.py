@@ -27,14 +27,7 @@ from mars_lidar.light.flux import Flux
 if TYPE_CHECKING:
     import xarray
 
-_MODULES = {
-    ".zarr": "zarr_store",
-    ".h5": "hdf5",
-    ".hdf5": "hdf5",
-    ".npz": "npz",
-    ".mat": "mat",
-    ".ptu": "streams.ptu",
-}
+_MODULES = {".zarr": "zarr_store", ".h5": "hdf5", ".hdf5": "hdf5", ".npz": "npz", ".mat": "mat", ".ptu": "streams.ptu"}
 SUFFIXES = tuple(_MODULES)
 
 

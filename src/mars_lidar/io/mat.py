@@ -349,12 +349,7 @@ def _spad(source: Path, variables: dict[str, Any]) -> SpadMat:
 
 @checked
 def save_mat(
-    path: str | Path,
-    cube: Cube,
-    *,
-    realization: int = 0,
-    depth_hr_m: ArrayLike | None = None,
-    overwrite: bool = False,
+    path: str | Path, cube: Cube, *, realization: int = 0, depth_hr_m: ArrayLike | None = None, overwrite: bool = False
 ) -> None:
     """Write one exposure of a cube, with a finer depth map for the training of upsampling networks.
 

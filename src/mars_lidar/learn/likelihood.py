@@ -17,14 +17,7 @@ from mars_lidar._base.native import _core
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.pulse import GaussianPulse, SampledPulse
 from mars_lidar.instrument.system import System
-from mars_lidar.learn.forward import (
-    HALF,
-    by_rows,
-    check_detector,
-    detected,
-    inputs,
-    refuse_nested_forward,
-)
+from mars_lidar.learn.forward import HALF, by_rows, check_detector, detected, inputs, refuse_nested_forward
 from mars_lidar.learn.needed import torch
 from mars_lidar.learn.tolerances import TOLERANCES
 from mars_lidar.reconstruction.histogram_record import relative_width
@@ -32,11 +25,7 @@ from mars_lidar.reconstruction.histogram_record import relative_width
 
 @checked
 def histogram_log_likelihood(
-    histogram: torch.Tensor,
-    signal: torch.Tensor,
-    background: torch.Tensor,
-    delay_ns: torch.Tensor,
-    system: System,
+    histogram: torch.Tensor, signal: torch.Tensor, background: torch.Tensor, delay_ns: torch.Tensor, system: System
 ) -> torch.Tensor:
     """Log likelihood (...) of histograms (..., bins), up to a constant; its negative is a self-supervised loss.
 

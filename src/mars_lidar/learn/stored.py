@@ -26,7 +26,7 @@ from mars_lidar._base.resources import check_memory
 from mars_lidar.dataset.arrays import MAPS, sample_parts
 from mars_lidar.dataset.store import Block, Dataset, open_dataset, read_block
 from mars_lidar.learn.needed import torch
-from mars_lidar.learn.stream import Buffers, Passes, rank_of, worker_of
+from mars_lidar.learn.stream import UNSIGNED, Buffers, Passes, rank_of, worker_of
 from mars_lidar.learn.tolerances import TOLERANCES
 
 _NATIVE = {  # types that packed counts are decoded to without a copy
@@ -36,7 +36,6 @@ _NATIVE = {  # types that packed counts are decoded to without a copy
     torch.uint16: np.uint16,
     torch.uint32: np.uint32,
 }
-_STORED = {np.dtype(np.uint16): torch.uint16, np.dtype(np.uint32): torch.uint32}
 
 
 class StoredDataset(torch.utils.data.IterableDataset[dict[str, Any]]):
@@ -313,7 +312,7 @@ class StoredDataset(torch.utils.data.IterableDataset[dict[str, Any]]):
     ) -> torch.Tensor:
         """(B, H, W, bins)."""
         shape = (len(blocks), *self._shape)
-        kind = self._dtype if self._dtype in _NATIVE else _STORED[self._exposures.dtype]
+        kind = self._dtype if self._dtype in _NATIVE else UNSIGNED[self._exposures.dtype]
         check_memory(int(np.prod(shape)) * kind.itemsize, f"counts of shape {shape}", "use a smaller batch_size")
         out = self._buffers.take(shape, kind)
         rows = out.numpy()

@@ -184,7 +184,7 @@ def prefetched(items: Iterator[T], number: int) -> Iterator[T]:
 
 # --- Counts as tensors ---------------------------------------------------------------------------------------------
 
-_UNSIGNED = {np.dtype(np.uint16): torch.uint16, np.dtype(np.uint32): torch.uint32}
+UNSIGNED = {np.dtype(np.uint16): torch.uint16, np.dtype(np.uint32): torch.uint32}
 
 
 class CubeMaker:
@@ -222,7 +222,7 @@ class CubeMaker:
             counts = torch.stack([self._simulated_on_gpu(sample) for sample in samples])
             return self._finished(counts if self._layout == "dense" else counts.to_sparse())
         check_memory(int(np.prod(shape)) * self._counts.itemsize, f"cubes of shape {shape}", "use a smaller batch_size")
-        kind = _UNSIGNED[self._counts]
+        kind = UNSIGNED[self._counts]
         wanted = kind if self._dtype is None else self._dtype
         if self._layout == "sparse":
             counts = self._buffers.take(shape, kind)
@@ -246,12 +246,7 @@ class CubeMaker:
     def _simulated(self, sample: Sample, out: NDArray[Any], threads: int) -> None:
         own = sample.system.histogram_dtype == self._counts
         made = simulate(
-            sample.flux,
-            sample.system,
-            engine=self._engine,
-            seed=sample.seed,
-            threads=threads,
-            out=out if own else None,
+            sample.flux, sample.system, engine=self._engine, seed=sample.seed, threads=threads, out=out if own else None
         )
         if not own:
             out[:] = made

@@ -442,17 +442,9 @@ class StoredFlux(Flux):
         maps = Flux(signal, background, 0.0).image
         height, width = maps.shape
         none = np.empty((0, height, width))
-        for name, value in {
-            "signal": maps.signal,
-            "background": maps.background,
-            "delay_ns": np.full(maps.shape, np.nan),
-            "returns_signal": none,
-            "returns_delay_ns": none,
-            "waveform": Waveforms((height, width, parts), rows),
-            "info": dict(info or {}),
-            "_make": rows,
-        }.items():
-            object.__setattr__(self, name, value)
+        vars(self).update(signal=maps.signal, background=maps.background, delay_ns=np.full(maps.shape, np.nan))
+        vars(self).update(returns_signal=none, returns_delay_ns=none, info=dict(info or {}))
+        vars(self).update(waveform=Waveforms((height, width, parts), rows), _make=rows)
 
     _make: Callable[[slice], Flux]
 

@@ -66,12 +66,7 @@ class Fog:
 
 
 def in_fog(
-    flux: Flux,
-    system: System,
-    extinction_per_m: float,
-    backscatter: float,
-    nearest_m: float,
-    parts: int | None,
+    flux: Flux, system: System, extinction_per_m: float, backscatter: float, nearest_m: float, parts: int | None
 ) -> Flux:
     """The body of `Flux.in_fog`, which documents arguments and formulas."""
     if flux.waveform is not None:

@@ -224,31 +224,10 @@ class DrawnTimestamps(Timestamps):
     phase: NDArray[np.float32]  # (n,) part of the laser period, in [0, 1]
 
     @classmethod
-    def of(
-        cls,
-        cycle: NDArray[np.int32],
-        phase: NDArray[np.float32],
-        offsets: NDArray[np.int64],
-        shape: tuple[int, int],
-        bins: int,
-        dtype: np.dtype[Any],
-        period_ns: float,
-        cycles: int,
-        info: dict[str, Any],
-    ) -> DrawnTimestamps:
+    def of(cls, **parts: Any) -> DrawnTimestamps:
         """Of laser periods and phases (n,), and the attributes of `Timestamps`."""
         new = object.__new__(cls)
-        vars(new).update(
-            cycle=cycle,
-            phase=phase,
-            offsets=offsets,
-            shape=shape,
-            bins=bins,
-            dtype=dtype,
-            period_ns=period_ns,
-            cycles=cycles,
-            info=info,
-        )
+        vars(new).update(parts)
         return new
 
     @cached_property
@@ -268,19 +247,8 @@ class DrawnTimestamps(Timestamps):
         k = self._place(y, x)
         part = slice(self.offsets[k], self.offsets[k + 1])
         offsets = np.array([0, self.offsets[k + 1] - self.offsets[k]], np.int64)
-        pixel = self.of(
-            self.cycle[part],
-            self.phase[part],
-            offsets,
-            (1, 1),
-            self.bins,
-            self.dtype,
-            self.period_ns,
-            self.cycles,
-            self.info,
-        )
-        vars(pixel).update({name: vars(self)[name][part] for name in ("times_ns", "bin") if name in vars(self)})
-        return pixel
+        arrays = {name: vars(self)[name][part] for name in ("cycle", "phase", "times_ns", "bin") if name in vars(self)}
+        return self.of(**(vars(self) | arrays | {"offsets": offsets, "shape": (1, 1)}))
 
 
 def record_times(cycle: NDArray[np.int32], phase: NDArray[np.float32], period_ns: float) -> NDArray[np.float64]:

@@ -7,12 +7,4 @@ backend is selected, and figures can be made in any thread. ``figure.savefig(pat
 from mars_lidar.plot.figures import map_image, overview, pixel_histogram
 from mars_lidar.plot.views import count_maps, depth_error_m, example_pixels, incident_rate
 
-__all__ = [
-    "count_maps",
-    "depth_error_m",
-    "example_pixels",
-    "incident_rate",
-    "map_image",
-    "overview",
-    "pixel_histogram",
-]
+__all__ = ["count_maps", "depth_error_m", "example_pixels", "incident_rate", "map_image", "overview", "pixel_histogram"]

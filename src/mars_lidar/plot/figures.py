@@ -269,12 +269,7 @@ def _draw_maps(
 
 
 def _draw_map(
-    ax: Axes,
-    values: NDArray[Any],
-    label: str,
-    cmap: str,
-    limits: tuple[float, float] | None,
-    title: str = "",
+    ax: Axes, values: NDArray[Any], label: str, cmap: str, limits: tuple[float, float] | None, title: str = ""
 ) -> None:
     import matplotlib as mpl
 
@@ -296,11 +291,7 @@ def _draw_map(
 
 
 def _draw_pixels(
-    figure: Figure,
-    box: tuple[float, float, float, float],
-    cube: Cube,
-    realization: int,
-    pixels: _Pixels,
+    figure: Figure, box: tuple[float, float, float, float], cube: Cube, realization: int, pixels: _Pixels
 ) -> None:
     grid = figure.add_gridspec(
         len(pixels),

@@ -56,7 +56,7 @@ def _recorded(ax: Axes, edges: FloatArray, counts: FloatArray, fit: FloatArray |
 def _phases(ax: Axes, curves: Curves, result: Calibration) -> None:
     edges = curves.phase_edges_ns
     _recorded(ax, edges, curves.phases, curves.fitted_phases)
-    if "signal" in result.estimates:
+    if "background" in result.estimates:
         signal, background = result.estimates["signal"], result.estimates["background"]
         ax.plot([], [], " ", label=f"S {signal}\nB {background}")
     ax.set(yscale="log", xlabel="time in the laser period (ns)", ylabel="registrations", xlim=(0.0, edges[-1]))

@@ -242,11 +242,7 @@ def predicted_counts(cube: Cube, y: int, x: int) -> NDArray[np.float64] | None:
 
 @checked
 def depth_error_m(
-    cube: Cube | ArrayLike,
-    estimate_m: NDArray[np.float64],
-    *,
-    system: System | None = None,
-    flux: Flux | None = None,
+    cube: Cube | ArrayLike, estimate_m: NDArray[np.float64], *, system: System | None = None, flux: Flux | None = None
 ) -> NDArray[np.float64]:
     """Estimated minus true depth, modulo the unambiguous range.
 

@@ -248,10 +248,7 @@ def _plane_holds(system: System, signal_octave: float, background_octave: float,
 
 
 def solver_of(
-    photons: Photons,
-    threads: int,
-    efficiency: FloatArray | None = None,
-    counted: NDArray[np.float32] | None = None,
+    photons: Photons, threads: int, efficiency: FloatArray | None = None, counted: NDArray[np.float32] | None = None
 ) -> _core.ImageSolver:
     """The native solver of one image; `counted`: photons of each entry that are not attributed to another surface."""
     return _core.ImageSolver(

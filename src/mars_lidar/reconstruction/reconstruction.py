@@ -13,14 +13,13 @@ from mars_lidar._base.display import as_html, brief
 from mars_lidar._base.types import ArrayLike, FloatArray, NDArray, Progress
 from mars_lidar.instrument.system import System
 from mars_lidar.reconstruction.centroid import Centroid
-from mars_lidar.reconstruction.coates import Coates, GeneralisedCoates
 from mars_lidar.reconstruction.fit_quality import FALSE_ALARM
 from mars_lidar.reconstruction.histograms import checked
 from mars_lidar.reconstruction.image import Image, UntrainedImage
 from mars_lidar.reconstruction.matched_filter import MatchedFilter, Peak
 from mars_lidar.reconstruction.maximum_likelihood import MaximumLikelihood, warn_of_bias
-from mars_lidar.reconstruction.mchc import ChainCorrection
 from mars_lidar.reconstruction.method import Estimates, Flags, Method, warn_of_effects
+from mars_lidar.reconstruction.rates import ChainCorrection, Coates, GeneralisedCoates
 from mars_lidar.reconstruction.returns import MOST_RETURNS, Returns, returns_of
 
 ATTENUATIONS = ("none", "inverse_square")
@@ -291,8 +290,11 @@ def assembled(
     """The result (...) from the estimates of a method (pixels,)."""
     period = system.period_ns
 
-    def mapped(values: FloatArray | None, unit: float = 1.0) -> FloatArray | None:
+    def mapped(name: str, unit: float = 1.0) -> Any:
+        values = getattr(estimates, name)
         return None if values is None else (values * unit).reshape(shape)
+
+    same = ("signal_error", "background_error", "significance", "p_value", "longer", "shorter", "wider", "outlier")
 
     delay = (estimates.delay - np.floor(estimates.delay)).reshape(shape) * period
     delay = np.where(delay >= period, 0.0, delay)
@@ -311,20 +313,13 @@ def assembled(
         background=estimates.background.reshape(shape),
         reflectivity=returned / level,
         level=level,
-        delay_error_ns=mapped(estimates.delay_error, period),
-        depth_error_m=mapped(estimates.delay_error, float(system.depth_m(period))),
-        signal_error=mapped(estimates.signal_error),
-        background_error=mapped(estimates.background_error),
-        significance=mapped(estimates.significance),
-        p_value=mapped(estimates.p_value),
-        longer=mapped(estimates.longer),
-        shorter=mapped(estimates.shorter),
-        wider=mapped(estimates.wider),
+        delay_error_ns=mapped("delay_error", period),
+        depth_error_m=mapped("delay_error", float(system.depth_m(period))),
         flags=flags,
         returns=returns_of(estimates.returns, system, shape),
-        delay_half_width_ns=mapped(estimates.half_width, period),
-        depth_half_width_m=mapped(estimates.half_width, float(system.depth_m(period))),
-        outlier=mapped(estimates.outlier),
+        delay_half_width_ns=mapped("half_width", period),
+        depth_half_width_m=mapped("half_width", float(system.depth_m(period))),
+        **{name: mapped(name) for name in same},
     )
 
 

@@ -294,12 +294,7 @@ class Scene:
         if size is not None:  # refuse a bad size before reading anything
             cls(np.ones((1, 1)), 1.0).resize(size)
         read = late("io.rgbd:read_rgbd")(
-            depth_path,
-            image_path,
-            depth_unit_m=depth_unit_m,
-            focal_px=focal_px,
-            index=index,
-            max_depth_m=max_depth_m,
+            depth_path, image_path, depth_unit_m=depth_unit_m, focal_px=focal_px, index=index, max_depth_m=max_depth_m
         )
         with reading(depth_path, "a scene"):
             scene = cls(*read)

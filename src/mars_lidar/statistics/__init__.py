@@ -8,9 +8,7 @@ from mars_lidar.statistics.exposure import Exposure, Moments, exposure_moments
 from mars_lidar.statistics.histogram import mean_histogram, registration_pdf
 from mars_lidar.statistics.joint import JointLaw, joint_law
 from mars_lidar.statistics.law import CountLaw, count_law
-from mars_lidar.statistics.paralyzable import paralyzable_moments
-from mars_lidar.statistics.renewal import HoldingTimes, holding_times
-from mars_lidar.statistics.spectral import HoldingTimeCovariance, holding_time_covariance
+from mars_lidar.statistics.renewal import HoldingTimeCovariance, HoldingTimes, holding_time_covariance, holding_times
 
 __all__ = [
     "ConvergenceError",
@@ -30,7 +28,6 @@ __all__ = [
     "holding_times",
     "joint_law",
     "mean_histogram",
-    "paralyzable_moments",
     "photons_per_bin",
     "registration_pdf",
 ]

@@ -384,14 +384,7 @@ class PhaseChain:
             object.__setattr__(self, name, value)
 
     @classmethod
-    def from_flux(
-        cls,
-        flux: Flux,
-        system: System,
-        *,
-        rearm: Rearm = "centre",
-        bins: int | None = None,
-    ) -> PhaseChain:
+    def from_flux(cls, flux: Flux, system: System, *, rearm: Rearm = "centre", bins: int | None = None) -> PhaseChain:
         """The chain of one pixel `flux` of a `system` of mode ``"nonparalyzable"``.
 
         `rearm` is that of the chain, `bins` as for `photons_per_bin`.

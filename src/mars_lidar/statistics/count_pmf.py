@@ -265,8 +265,7 @@ def _supports(
     # a period multiplies E e^(theta N) at most by e^(theta (1 + t_r/t_d)) and by exp(Lambda (e^theta - 1))
     dead = cells.system.dead_time_periods
     growth = np.maximum(
-        TOL.most_log_growth / (1.0 + 1.0 / dead),
-        np.log1p(TOL.most_log_growth / np.maximum(cells.total, 1e-300)),
+        TOL.most_log_growth / (1.0 + 1.0 / dead), np.log1p(TOL.most_log_growth / np.maximum(cells.total, 1e-300))
     )
     # if necessary the tilts are reduced to this limit; where large counts are rare, small tilts give the best bounds
     unit = np.minimum(1.0 / np.maximum(spread, 1e-300), np.minimum(growth, TOL.most_tilt) / _TILTS[-1])

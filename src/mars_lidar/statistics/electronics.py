@@ -222,12 +222,7 @@ ELECTRONICS_MODES: tuple[Mode, ...] = ("nonparalyzable", "gated")
 
 
 @checked
-def electronics_moments(
-    flux: Flux,
-    system: System,
-    *,
-    tolerance: float = 1e-3,
-) -> Moments:
+def electronics_moments(flux: Flux, system: System, *, tolerance: float = 1e-3) -> Moments:
     """Mean and variance of the number of records, and their mean histogram, with `Detector.electronics_dead_time_ns`.
 
     For modes ``"nonparalyzable"`` and ``"gated"`` (a fixed gate), both starts.

@@ -30,9 +30,10 @@ from mars_lidar.instrument.detector import Mode
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
-from mars_lidar.statistics.cells import Cells, fine_histograms, photons_before, rearms_within_pulse
+from mars_lidar.statistics.cells import Cells, fine_histograms, rearms_within_pulse
 from mars_lidar.statistics.chain import ConvergenceError
 from mars_lidar.statistics.joint_grid import FoldedGrid
+from mars_lidar.statistics.paralyzable import registration_rates
 from mars_lidar.statistics.timing import Timing, is_timed
 from mars_lidar.statistics.tolerances import MOMENTS, TOL, Budget
 
@@ -129,17 +130,17 @@ class Moments:
 
     See Also
     --------
-    electronics_moments, paralyzable_moments
+    electronics_moments
 
     Examples
     --------
     >>> import mars_lidar as ml
     >>> system = ml.System(
     ...     period_ns=100.0, cycles=1000, bins=128,
-    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0),
+    ...     detector=ml.Detector(dead_time_ns=75.0, electronics_dead_time_ns=90.0),
     ... )
-    >>> paralyzable = system.replace(detector=ml.Detector(dead_time_ns=75.0, mode="paralyzable"))
-    >>> moments = ml.statistics.paralyzable_moments(ml.Flux(1.0, 1.0, 40.0), paralyzable)
+    >>> moments = ml.statistics.electronics_moments(ml.Flux(1.0, 1.0, 40.0), system)
     >>> bool(abs(moments.histogram.sum() - moments.mean) < 1e-6)
     True
     """
@@ -220,86 +221,6 @@ def normalised(histogram: FloatArray) -> FloatArray:
     return np.asarray(shape, dtype=np.float64)
 
 
-# --- Rates of a paralyzable pixel ----------------------------------------------------------------------------------
-
-_SERIES_BELOW, _SERIES_TERMS = 0.25, 10  # below this exponent the recursion loses 4 digits, the series none
-
-
-def registration_rates(cells: Cells, bins: int) -> FloatArray:
-    """Integrals of r(t) x^m over each bin, m = 0 .. 3, x from -1 to 1 in the bin, (cells, kinds * bins * 4).
-
-    Kinds: the steady rate; for an armed start also the rate before the end of the first dead time and that of the
-    period in which it ends.
-    """
-    if cells.follow:  # the bins differ from cell to cell
-        rows = [cells.part(slice(k, k + 1)) for k in range(cells.size)]
-        return np.concatenate([_rates(row, row.edges(4 * bins)) for row in rows])
-    return _rates(cells, np.arange(4 * bins + 1) / (4 * bins))
-
-
-def _rates(cells: Cells, edges: FloatArray) -> FloatArray:
-    """`registration_rates` on quarters of bins with the given edges (4 bins + 1,)."""
-    dead = cells.system.dead_time_periods
-    whole = math.floor(dead)
-    before = photons_before(cells, edges)
-    total = before[:, -1:]
-    past = edges - (dead - whole)
-    wrapped = past < 0.0
-    # photons in the dead time before each edge, t_d = K + f (1)
-    within = before - photons_before(cells, np.where(wrapped, past + 1.0, past)) + total * (wrapped + float(whole))
-    kinds = [within]
-    if cells.system.start == "armed":
-        kinds += [before, np.where(wrapped, total * whole + before, within)]
-    return np.concatenate([_moments(before, each).reshape(cells.size, -1) for each in kinds], axis=1)
-
-
-def _moments(before: FloatArray, within: FloatArray) -> FloatArray:
-    """Moments (cells, bins, 4), extrapolated to fourth order from quarters and halves of bins as in (12)."""
-    fine, coarse = _on_parts(before, within, 4), _on_parts(before[:, ::2], within[:, ::2], 2)
-    return np.asarray(fine + (fine - coarse) / 3.0, dtype=np.float64)
-
-
-def _on_parts(before: FloatArray, within: FloatArray, parts: int) -> FloatArray:
-    """Moments 0 to 3, for arrival rates, now and a dead time ago, that are constant in each of the `parts` of a bin.
-
-    The rate of registrations is then an exponential in each part. With x measured from the end of the part at which the
-    rate is largest, each moment is a sum of terms of one sign, however steep the exponential is.
-    """
-    photons, rise = np.diff(before), np.diff(within)
-    peak = photons * np.exp(-np.minimum(within[:, :-1], within[:, 1:]))
-    powers = peak * _decaying_powers(np.abs(rise))
-    step = np.where(rise < 0.0, -2.0, 2.0) / parts
-    out = np.zeros((before.shape[0], photons.shape[1] // parts, 4))
-    for part in range(parts):
-        width, (constant, linear, square, cube) = step[:, part::parts], powers[:, :, part::parts]
-        start = 2.0 * part / parts - 1.0 + np.where(width < 0.0, -width, 0.0)
-        out[:, :, 0] += constant
-        out[:, :, 1] += start * constant + width * linear
-        out[:, :, 2] += start * (start * constant + 2.0 * width * linear) + width**2 * square
-        out[:, :, 3] += (
-            start * (start * (start * constant + 3.0 * width * linear) + 3.0 * width**2 * square) + width**3 * cube
-        )
-    return out
-
-
-def _decaying_powers(fall: FloatArray) -> FloatArray:
-    """Integrals of x^m exp(-fall x) over [0, 1], m = 0 .. 3, (4, ...), for fall >= 0."""
-    out = np.empty((4, *fall.shape))
-    large = np.maximum(fall, _SERIES_BELOW)
-    last = np.exp(-large)
-    out[0] = -np.expm1(-large) / large
-    for m in range(1, 4):
-        out[m] = (m * out[m - 1] - last) / large
-    small = np.minimum(fall, _SERIES_BELOW)
-    for m in range(4):
-        term, total = np.ones_like(small), np.full_like(small, 1.0 / (m + 1))
-        for j in range(1, _SERIES_TERMS):
-            term *= -small / j
-            total += term / (m + 1 + j)
-        out[m] = np.where(fall < _SERIES_BELOW, total, out[m])
-    return out
-
-
 # --- Light for the native recursion --------------------------------------------------------------------------------
 
 
@@ -376,12 +297,7 @@ _NATIVE = ("cumulants", "cumulant_rates", "histogram", "histogram_rate", "settle
 
 @checked
 def exposure_moments(
-    flux: Flux,
-    system: System,
-    *,
-    tolerance: float = 1e-4,
-    threads: int | None = None,
-    progress: Progress | None = None,
+    flux: Flux, system: System, *, tolerance: float = 1e-4, threads: int | None = None, progress: Progress | None = None
 ) -> Exposure:
     """Exact cumulants of the count and mean histogram of an exposure of `System.cycles` periods.
 
@@ -429,13 +345,7 @@ def exposure_moments(
     >>> round(float(exposure.mean), 1), round(float(exposure.variance), 1)
     (815.2, 127.3)
     """
-    cells = Cells.of_flux(
-        flux,
-        system,
-        what="exposure_moments",
-        modes=_MODES,
-        effects=LIGHT_EFFECTS + TIMING_EFFECTS,
-    )
+    cells = Cells.of_flux(flux, system, what="exposure_moments", modes=_MODES, effects=LIGHT_EFFECTS + TIMING_EFFECTS)
     return recorded_moments(cells, tolerance=tolerance, threads=threads, progress=progress)
 
 

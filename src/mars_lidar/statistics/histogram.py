@@ -26,13 +26,7 @@ from mars_lidar.statistics.tolerances import LAW, TOL
 
 
 @checked
-def mean_histogram(
-    flux: Flux,
-    system: System,
-    *,
-    tolerance: float = 1e-4,
-    threads: int | None = None,
-) -> FloatArray:
+def mean_histogram(flux: Flux, system: System, *, tolerance: float = 1e-4, threads: int | None = None) -> FloatArray:
     """Mean histogram of the finite exposure, exact for every mode of the detector.
 
     It sums to the mean count and includes jitter, code widths and, for modes ``"nonparalyzable"`` and ``"gated"``, the
@@ -77,13 +71,7 @@ def mean_histogram(
     >>> mean.shape, round(float(mean.sum()), 1)
     ((128,), 815.2)
     """
-    cells = Cells.of_flux(
-        flux,
-        system,
-        what="mean_histogram",
-        modes=MODES,
-        effects=histogram_effects(system),
-    )
+    cells = Cells.of_flux(flux, system, what="mean_histogram", modes=MODES, effects=histogram_effects(system))
     return mean_histograms(cells, tolerance, threads).reshape(*cells.shape, system.bins)
 
 

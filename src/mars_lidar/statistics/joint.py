@@ -394,12 +394,7 @@ class TimedPixel(RecordedPixel):
 
 
 @checked
-def joint_law(
-    flux: Flux,
-    system: System,
-    *,
-    tolerance: float = 1e-3,
-) -> JointLaw:
+def joint_law(flux: Flux, system: System, *, tolerance: float = 1e-3) -> JointLaw:
     """Exact mean and covariance of the histogram of one pixel, for an exposure of `System.cycles` periods.
 
     Parameters
@@ -450,12 +445,7 @@ def joint_law(
     True
     """
     tolerance = checks.real("tolerance", tolerance, low=1e-7, high=0.1)
-    cells = Cells.of_flux(
-        one_pixel(flux),
-        system,
-        what="joint_law",
-        effects=LIGHT_EFFECTS + TIMING_EFFECTS,
-    )
+    cells = Cells.of_flux(one_pixel(flux), system, what="joint_law", effects=LIGHT_EFFECTS + TIMING_EFFECTS)
     if not is_timed(system):
         return replace(_law(cells, tolerance), system=system)
     timing = Timing(cells)

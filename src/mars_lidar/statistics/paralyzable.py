@@ -1,8 +1,8 @@
-"""Mean, variance and mean histogram of a paralyzable pixel, in closed form.
+"""A paralyzable pixel: its rate of registrations, and its mean histogram in closed form.
 
 An arrival is registered if and only if there is no other arrival within the dead time before it. The rate of
-registrations is therefore r(t) = lambda(t) exp(-(C(t) - C(t - t_d))), with the integrated flux C, and registrations
-further apart than the dead time are independent. Equation numbers: docs/theory_detectors.md.
+registrations is therefore r(t) = lambda(t) exp(-(C(t) - C(t - t_d))), with the integrated flux C. Equation numbers:
+docs/theory_detectors.md.
 """
 
 from __future__ import annotations
@@ -12,222 +12,156 @@ import math
 import numpy as np
 
 from mars_lidar._base import checks
-from mars_lidar._base.arguments import checked
-from mars_lidar._base.cached import cached_property
 from mars_lidar._base.types import FloatArray
-from mars_lidar.instrument.system import System
-from mars_lidar.light.flux import Flux
 from mars_lidar.statistics.cells import Cells, knots, photons_before
 from mars_lidar.statistics.chain import ConvergenceError
-from mars_lidar.statistics.exposure import Moments
 from mars_lidar.statistics.tolerances import TOL
 
 
-@checked
-def paralyzable_moments(
-    flux: Flux,
-    system: System,
-    *,
-    tolerance: float = 1e-5,
-) -> Moments:
-    """Mean and variance of the count and mean histogram of a pixel of mode ``"paralyzable"``, both starts.
+def _exponents(cells: Cells, edges: FloatArray) -> tuple[FloatArray, list[FloatArray]]:
+    """Photons (cells, n) of a period before the edges, and the exponents of the kinds of rates there (1).
 
-    Parameters
-    ----------
-    flux, system
-        The light of pixels of shape (...), and the system.
-    tolerance
-        The grid is refined until doubling it moves mean and variance by less than this, relative to
-        themselves, and the shape by less in total variation; in [1e-9, 0.1].
-
-    Returns
-    -------
-    Moments
-        For cells of shape (...).
-
-    Raises
-    ------
-    TypeError
-        Not a `Flux` or not a `System`.
-    ValueError
-        For arguments out of range, another mode, or a dead time of more than 20,000 periods.
-    ConvergenceError
-        No grid up to 2^20 bins meets the tolerance; the message names the cell.
-
-    See Also
-    --------
-    count_law, exposure_moments
-
-    Examples
-    --------
-    >>> import mars_lidar as ml
-    >>> system = ml.System(
-    ...     period_ns=100.0, cycles=1000, bins=128,
-    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
-    ... )
-    >>> paralyzable = system.replace(detector=ml.Detector(dead_time_ns=75.0, mode="paralyzable"))
-    >>> moments = ml.statistics.paralyzable_moments(ml.Flux(1.0, 1.0, 40.0), paralyzable)
-    >>> round(float(moments.mean), 1)  # a free-running pixel registers 815.2
-    545.7
+    Kinds: the steady rate; for an armed start also the rate before the end of the first dead time and that of the
+    period in which it ends.
     """
-    cells = Cells.of_flux(
-        flux,
-        system,
-        what="paralyzable_moments",
-        modes=("paralyzable",),
-    )
-    if system.dead_time_periods > TOL.paralyzable_periods:
-        raise ValueError(
-            f"dead_time_ns must be at most {TOL.paralyzable_periods} periods for the variance of mode 'paralyzable', "
-            f"got {system.dead_time_periods:g} periods"
-        )
-    return _refined(cells, tolerance, with_variance=True)
+    dead = cells.system.dead_time_periods
+    whole = math.floor(dead)
+    before = photons_before(cells, edges)
+    total = before[:, -1:]
+    past = edges - (dead - whole)
+    wrapped = past < 0.0
+    # photons in the dead time before each edge, t_d = K + f
+    within = before - photons_before(cells, np.where(wrapped, past + 1.0, past)) + total * (wrapped + float(whole))
+    if cells.system.start == "stationary":
+        return before, [within]
+    return before, [within, before, np.where(wrapped, total * whole + before, within)]
+
+
+# --- Mean histograms -----------------------------------------------------------------------------------------------
 
 
 def paralyzable_histograms(cells: Cells, tolerance: float) -> FloatArray:
     """Mean histograms (cells, bins) of checked cells, any dead time.
 
-    Their sums differ from the mean count by at most 10 x `tolerance` standard deviations (not less than 1e-3 of those
-    of a Poisson count), or 1e-12 of the mean.
+    The grid is refined until the shape moves by less than `tolerance` in total variation; sums differ from the mean
+    count by at most 10 x `tolerance` x 1e-3 standard deviations of a Poisson count, or 1e-12 of the mean.
     """
-    return _refined(cells, tolerance, with_variance=False).histogram.reshape(cells.size, -1)
-
-
-def _refined(cells: Cells, tolerance: float, *, with_variance: bool) -> Moments:
     tolerance = checks.real("tolerance", tolerance, low=1e-9, high=0.1)
-    system = cells.system
-    mean, variance, bins = np.empty(cells.size), np.empty(cells.size), np.empty(cells.size, np.int64)
-    histogram = np.empty((cells.size, system.bins))
-    for k in range(cells.size):
-        cell = cells.part(slice(k, k + 1))
-        usual = cell.usual_bins(system.bins)
-        # every grid includes the edges of the histogram; without further edges two grids would be equal
-        n = start = 2 * usual if usual // 2 < system.bins else usual
-        coarse, before = _Grid(cell, n // 2, knots(cell, usual, 0.5), with_variance), math.inf
-        while True:
-            fine = _Grid(cell, n, knots(cell, usual, n / start), with_variance)
-            limit = fine.mean + (fine.mean - coarse.mean) / 3.0  # the error is quadratic in the bin width
-            same_limit = with_variance or abs(limit - before) <= max(
-                10.0 * tolerance * min(limit, TOL.least_spread * math.sqrt(limit)), TOL.rounding * limit
-            )
-            if same_limit and _moved(coarse, fine) <= tolerance:
-                break
-            coarse, before, n = fine, limit, 2 * n
-            if n > max(TOL.most_bins, 4 * system.bins):
-                raise ConvergenceError(
-                    f"paralyzable statistics of {cells.name(k)}: with {n // 2} bins per period they still change by "
-                    f"more than {tolerance:g}; use a larger tolerance, or simulate it with engine 'exact'"
-                )
-        mean[k], variance[k], histogram[k], bins[k] = fine.mean, fine.variance, fine.histogram, n
-        if not with_variance:  # the limit for fine grids
-            histogram[k] = np.maximum(fine.histogram + (fine.histogram - coarse.histogram) / 3.0, 0.0)
-    shape = cells.shape
-    return Moments(
-        mean.reshape(shape), variance.reshape(shape), histogram.reshape(*shape, system.bins), bins.reshape(shape)
+    return np.array([_limit(cells, k, tolerance) for k in range(cells.size)]).reshape(cells.size, -1)
+
+
+def _limit(cells: Cells, k: int, tolerance: float) -> FloatArray:
+    cell, out_bins = cells.part(slice(k, k + 1)), cells.system.bins
+    usual = cell.usual_bins(out_bins)
+    # every grid includes the edges of the histogram; without further edges two grids would be equal
+    n = start = 2 * usual if usual // 2 < out_bins else usual
+    coarse, before = _on_grid(cell, n // 2, knots(cell, usual, 0.5)), math.inf
+    while n <= max(TOL.most_bins, 4 * out_bins):
+        fine = _on_grid(cell, n, knots(cell, usual, n / start))
+        limit = np.maximum(fine + (fine - coarse) / 3.0, 0.0)  # the error is quadratic in the bin width
+        mean = float(limit.sum())
+        allowed = max(10.0 * tolerance * min(mean, TOL.least_spread * math.sqrt(mean)), TOL.rounding * mean)
+        if abs(mean - before) <= allowed and np.abs(fine - coarse).sum() <= tolerance * float(fine.sum()):
+            return limit
+        coarse, before, n = fine, mean, 2 * n
+    raise ConvergenceError(
+        f"paralyzable statistics of {cells.name(k)}: with {n // 2} bins per period they still change by "
+        f"more than {tolerance:g}; use a larger tolerance, or simulate it with engine 'exact'"
     )
 
 
-class _Grid:
-    """One pixel on a grid with edges at `steps` (n,), phases of discontinuities, and one dead time after them.
+def _on_grid(cell: Cells, bins: int, steps: FloatArray) -> FloatArray:
+    """Mean histogram (bins,) of one pixel, on a grid that has the phases of discontinuities `steps` (n,) as edges (2).
 
-    Between these edges the rate of registrations is smooth. A further edge is the end of the first dead time.
+    Further edges: one dead time after those, and the end of the first dead time. The rate is smooth between them.
     """
-
-    def __init__(self, cell: Cells, bins: int, steps: FloatArray, with_variance: bool) -> None:
-        system = cell.system
-        dead = system.dead_time_periods
-        self.cell, self.cycles, self.armed = cell, system.cycles, system.start == "armed"
-        self.whole = math.floor(dead)
-        self.rest = dead - self.whole
-        out = np.arange(system.bins + 1) / system.bins
-        edges = [np.arange(bins + 1) / bins, out, np.array([self.rest]), steps, (steps + self.rest) % 1.0]
-        self.edges = np.unique(np.concatenate(edges))
-        self.before = self._photons(self.edges)  # C(x)
-        self.total = float(self.before[-1])
-        photons = np.diff(self.before)
-        # photons within the dead time before each edge, t_d = K + f (1)
-        shifted = self.edges - self.rest
-        self.early = early = int(np.searchsorted(shifted, 0.0))  # edges whose dead time began a period earlier
-        shifted[:early] += 1.0
-        within = self.before - self._photons(shifted)
-        within[:early] += self.total
-        within += self.total * self.whole
-        # integral of exp(-within) over a bin where it is linear in the exponent: (1 - e^-d) / d
-        rise = np.diff(within)
-        mean_keep = np.divide(np.expm1(-rise), -rise, out=np.ones_like(rise), where=rise != 0.0)
-        self.rate = np.exp(-within[:-1]) * mean_keep  # registrations of each bin and period, stationary
-        self.rate *= photons
-        self.alone = np.exp(-self.before[:-1]) * -np.expm1(-photons)  # probability of the first arrival of one period
-        self.histogram = np.add.reduceat(self._exposure(), np.searchsorted(self.edges, out[:-1]))
-        self.mean = float(self.histogram.sum())
-        self.variance = max(0.0, self.mean - 2.0 * self._pairs()) if with_variance else self.mean
-
-    @cached_property
-    def below(self) -> FloatArray:
-        """Registrations before each edge in a period of the stationary pixel."""
-        return np.concatenate([[0.0], np.cumsum(self.rate)])
-
-    def _photons(self, at: FloatArray) -> FloatArray:
-        return np.asarray(photons_before(self.cell, at)[0], dtype=np.float64)
-
-    def _exposure(self) -> FloatArray:
-        """Registrations of each bin in the whole exposure (2)."""
-        if not self.armed:
-            return self.cycles * self.rate
-        start = min(self.whole, self.cycles)  # whole periods within the first dead time
-        empty = math.expm1(-start * self.total) / math.expm1(-self.total) if self.total > 0.0 else float(start)
-        total = empty * self.alone
-        if self.cycles > self.whole:
-            total[: self.early] += math.exp(-self.whole * self.total) * self.alone[: self.early]
-            total[self.early :] += self.rate[self.early :]
-            total += (self.cycles - self.whole - 1) * self.rate
-        return total
-
-    def _registered(self, period: int, phase: FloatArray) -> FloatArray:
-        """R(t): expected registrations in [0, t), t = period + phase; 0 before the exposure."""
-        mean = float(self.below[-1])
-        steady = period * mean + np.interp(phase, self.edges, self.below)
-        if not self.armed:
-            return np.asarray(steady if period >= 0 else np.zeros_like(steady), dtype=np.float64)
-        if period < 0:
-            return np.zeros_like(steady)
-        lit = period * self.total + np.interp(phase, self.edges, self.before)
-        reached = self.whole * self.total + float(np.interp(self.rest, self.edges, self.before))
-        at_end = self.whole * mean + float(np.interp(self.rest, self.edges, self.below))
-        early = (period < self.whole) | ((period == self.whole) & (phase <= self.rest))
-        return np.where(early, -np.expm1(-lit), -math.expm1(-reached) + steady - at_end)
-
-    def _pairs(self) -> float:
-        """Integral of r(t) [R(t) - R(t - t_d)]: the pairs closer than the dead time, which do not occur (3)."""
-        total, first = 0.0, 0
-        if self.armed:  # up to t_d, where R(t - t_d) = 0, it is R^2 / 2
-            end = min(self.whole, self.cycles)
-            phase = np.array([self.rest if self.cycles > self.whole else 0.0])
-            total, first = 0.5 * float(self._registered(end, phase)[0]) ** 2, self.whole
-        step = 0.0
-        settled = 2 * self.whole + 2
-        for period in range(first, min(self.cycles, settled + 1)):
-            step = self._pairs_of(period, only_after=period == first and self.armed)
-            total += step
-        return total + max(0, self.cycles - settled - 1) * step
-
-    def _pairs_of(self, period: int, only_after: bool) -> float:
-        x = self.edges[self.edges >= self.rest] if only_after else self.edges
-        now = self._registered(period, x)
-        past = x - self.rest
-        before = np.where(
-            past < 0.0,
-            self._registered(period - self.whole - 1, past + 1.0),
-            self._registered(period - self.whole, np.maximum(past, 0.0)),
-        )
-        apart = now - before
-        return float(np.sum(0.5 * (apart[1:] + apart[:-1]) * np.diff(now)))
+    system = cell.system
+    whole, cycles = math.floor(system.dead_time_periods), system.cycles
+    rest = system.dead_time_periods - whole
+    out = np.arange(system.bins + 1) / system.bins
+    edges = np.unique(np.concatenate([np.arange(bins + 1) / bins, out, [rest], steps, (steps + rest) % 1.0]))
+    before, kinds = _exponents(cell, edges)
+    steady, *armed = (_registered(np.diff(before[0]), within[0]) for within in kinds)
+    if armed:
+        early, total = min(whole, cycles), float(before[0, -1])
+        empty = math.expm1(-early * total) / math.expm1(-total) if total > 0.0 else float(early)
+        rate = empty * armed[0]
+        if cycles > whole:
+            rate += armed[1] + (cycles - whole - 1) * steady
+    else:
+        rate = cycles * steady
+    return np.asarray(np.add.reduceat(rate, np.searchsorted(edges, out[:-1])))
 
 
-def _moved(coarse: _Grid, fine: _Grid) -> float:
-    tiny = np.finfo(float).tiny
-    return max(
-        abs(fine.mean - coarse.mean) / max(fine.mean, tiny),
-        abs(fine.variance - coarse.variance) / max(fine.variance, tiny),
-        0.5 * float(np.abs(fine.histogram - coarse.histogram).sum()) / max(fine.mean, tiny),
+def _registered(photons: FloatArray, within: FloatArray) -> FloatArray:
+    """Registrations (n,) of bins with so many photons, where the exponent is linear between its values at the edges."""
+    rise = np.diff(within)
+    return np.asarray(
+        photons * np.exp(-within[:-1]) * np.divide(np.expm1(-rise), -rise, np.ones_like(rise), where=rise != 0.0)
     )
+
+
+# --- Rates for the recursion ---------------------------------------------------------------------------------------
+
+_SERIES_BELOW, _SERIES_TERMS = 0.25, 10  # below this exponent the recursion loses 4 digits, the series none
+
+
+def registration_rates(cells: Cells, bins: int) -> FloatArray:
+    """Integrals of r(t) x^m over each bin, m = 0 .. 3, x from -1 to 1 in the bin, (cells, kinds * bins * 4)."""
+    if cells.follow:  # the bins differ from cell to cell
+        rows = [cells.part(slice(k, k + 1)) for k in range(cells.size)]
+        return np.concatenate([_rates(row, row.edges(4 * bins)) for row in rows])
+    return _rates(cells, np.arange(4 * bins + 1) / (4 * bins))
+
+
+def _rates(cells: Cells, edges: FloatArray) -> FloatArray:
+    """`registration_rates` on quarters of bins with the given edges (4 bins + 1,)."""
+    before, kinds = _exponents(cells, edges)
+    return np.concatenate([_moments(before, each).reshape(cells.size, -1) for each in kinds], axis=1)
+
+
+def _moments(before: FloatArray, within: FloatArray) -> FloatArray:
+    """Moments (cells, bins, 4), extrapolated to fourth order from quarters and halves of bins as in (12)."""
+    fine, coarse = _on_parts(before, within, 4), _on_parts(before[:, ::2], within[:, ::2], 2)
+    return np.asarray(fine + (fine - coarse) / 3.0, dtype=np.float64)
+
+
+def _on_parts(before: FloatArray, within: FloatArray, parts: int) -> FloatArray:
+    """Moments 0 to 3, for arrival rates, now and a dead time ago, that are constant in each of the `parts` of a bin.
+
+    The rate of registrations is then an exponential in each part. With x measured from the end of the part at which the
+    rate is largest, each moment is a sum of terms of one sign, however steep the exponential is.
+    """
+    photons, rise = np.diff(before), np.diff(within)
+    peak = photons * np.exp(-np.minimum(within[:, :-1], within[:, 1:]))
+    powers = peak * _decaying_powers(np.abs(rise))
+    step = np.where(rise < 0.0, -2.0, 2.0) / parts
+    out = np.zeros((before.shape[0], photons.shape[1] // parts, 4))
+    for part in range(parts):
+        width, (constant, linear, square, cube) = step[:, part::parts], powers[:, :, part::parts]
+        start = 2.0 * part / parts - 1.0 + np.where(width < 0.0, -width, 0.0)
+        out[:, :, 0] += constant
+        out[:, :, 1] += start * constant + width * linear
+        out[:, :, 2] += start * (start * constant + 2.0 * width * linear) + width**2 * square
+        out[:, :, 3] += (
+            start * (start * (start * constant + 3.0 * width * linear) + 3.0 * width**2 * square) + width**3 * cube
+        )
+    return out
+
+
+def _decaying_powers(fall: FloatArray) -> FloatArray:
+    """Integrals of x^m exp(-fall x) over [0, 1], m = 0 .. 3, (4, ...), for fall >= 0."""
+    out = np.empty((4, *fall.shape))
+    large = np.maximum(fall, _SERIES_BELOW)
+    last = np.exp(-large)
+    out[0] = -np.expm1(-large) / large
+    for m in range(1, 4):
+        out[m] = (m * out[m - 1] - last) / large
+    small = np.minimum(fall, _SERIES_BELOW)
+    for m in range(4):
+        term, total = np.ones_like(small), np.full_like(small, 1.0 / (m + 1))
+        for j in range(1, _SERIES_TERMS):
+            term *= -small / j
+            total += term / (m + 1 + j)
+        out[m] = np.where(fall < _SERIES_BELOW, total, out[m])
+    return out

@@ -10,10 +10,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.display import brief
 from mars_lidar._base.types import FloatArray
-from mars_lidar.statistics.chain import PhaseChain, Stationary, cyclic_recursion, stationary_from
+from mars_lidar.instrument.system import System
+from mars_lidar.light.flux import Flux
+from mars_lidar.statistics.cells import require_mode
+from mars_lidar.statistics.chain import PhaseChain, Rearm, Stationary, cyclic_recursion, stationary_from
 from mars_lidar.statistics.tolerances import TOL
 
 
@@ -188,3 +192,119 @@ def holding_times(chain: PhaseChain) -> HoldingTimes:
     for array in (mean, variance, value):
         array.flags.writeable = False
     return HoldingTimes(stationary, mean, variance, mu, sigma_ss2, sigma2, covariance_sum, value, defect)
+
+
+@dataclass(frozen=True, eq=False)
+class HoldingTimeCovariance:
+    """Lag covariances of the holding times of one pixel, and their sum. Times in ns, covariances in ns^2.
+
+    Attributes
+    ----------
+    gamma
+        (lags,) covariances gamma_1 .. gamma_lags, by O(n) products.
+    mu
+        Mean holding time.
+    sigma_ss2
+        Variance of one holding time.
+    exact_sum
+        gamma_1 + gamma_2 + ... without truncation, from one O(n) solution.
+    sigma2
+        sigma_ss2 + 2 exact_sum, computed as a sum of squares: never negative.
+    defect
+        Relative disagreement of independent computations of mu, exact_sum and sigma2 (see `HoldingTimes`).
+    chain, times
+        The chain of the pixel, and its holding times in periods.
+
+    See Also
+    --------
+    holding_time_covariance, HoldingTimes
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> covariance = ml.holding_time_covariance(ml.Flux(1.0, 1.0, 40.0), system, bins=128)
+    >>> bool(abs(covariance.gamma.sum() - covariance.exact_sum) < 1e-3 * covariance.sigma_ss2)
+    True
+    """
+
+    gamma: FloatArray
+    mu: float
+    sigma_ss2: float
+    exact_sum: float
+    sigma2: float
+    defect: float
+    chain: PhaseChain
+    times: HoldingTimes
+
+    __repr__ = brief
+
+    @property
+    def stationary_pdf(self) -> FloatArray:
+        """Stationary distribution of the phases (bins,)."""
+        return self.times.stationary.pdf
+
+
+@checked
+def holding_time_covariance(
+    flux: Flux, system: System, *, lags: int = 20, rearm: Rearm = "centre", bins: int | None = None
+) -> HoldingTimeCovariance:
+    """Covariances of the times between registrations, and their sum.
+
+    Parameters
+    ----------
+    flux
+        The light of one pixel, not 0.
+    system
+        Laser, detector and histogram.
+    lags
+        Lag covariances to compute, >= 0.
+    rearm
+        ``"centre"``, or ``"edge"`` for the re-arming of Rapp's code.
+    bins
+        As for `photons_per_bin`; the delay only shifts the phases on the grid.
+
+    Raises
+    ------
+    TypeError
+        Not a `Flux` or not a `System`.
+    ValueError
+        Arguments out of range, or a flux of 0, which has no registrations and thus no holding times.
+    ConvergenceError
+        A solution did not converge; the message names the cell.
+
+    See Also
+    --------
+    count_law, joint_law
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> covariance = ml.holding_time_covariance(ml.Flux(signal=1.0, background=1.0, delay_ns=50.0), system)
+    >>> round(covariance.mu, 1)  # mean time between registrations, ns
+    122.7
+    """
+    require_mode("holding_time_covariance", system)
+    lags = checks.integer("lags", lags, low=0, high=TOL.most_lags)
+    chain = PhaseChain.from_flux(flux, system, rearm=rearm, bins=bins)
+    times = holding_times(chain)
+    unit = system.period_ns**2
+    gamma = lag_covariances(chain, times, lags) * unit
+    gamma.flags.writeable = False
+    return HoldingTimeCovariance(
+        gamma=gamma,
+        mu=times.mu * system.period_ns,
+        sigma_ss2=times.sigma_ss2 * unit,
+        exact_sum=times.covariance_sum * unit,
+        sigma2=times.sigma2 * unit,
+        defect=times.defect,
+        chain=chain,
+        times=times,
+    )

@@ -181,17 +181,13 @@ class Tolerances:
         1e-14); largest backward error of a solution.
     holding_times
         Allowed difference of a moment of the holding times by independent routes, relative to its largest term.
-    eigen_bins
-        Most bins of an eigendecomposition, O(n^3).
-    most_lags, most_modes
-        Most lags of a covariance, an O(n) product each; most eigenvalues that the automatic rule considers.
+    most_lags
+        Most lags of a covariance, an O(n) product each.
     most_mean, matched_outside
         Largest mean of a matched law (doubles hold integers up to 9e15); probability outside its support, that of a
         normal law beyond 8 standard deviations.
     least_spread
         Smallest standard deviation of a count relative to Poisson: that of the best locked pixels.
-    paralyzable_periods
-        Most periods of a paralyzable dead time; the variance is a sum over them.
     synchronous_tail, synchronous_loose_tail
         Probability outside the support of a synchronous law, at either end, by its sums and by its transform.
     synchronous_late, synchronous_reach
@@ -280,13 +276,10 @@ class Tolerances:
     chain_residual: float = 1e-12
     chain_worst_residual: float = 1e-10
     holding_times: float = 1e-7
-    eigen_bins: int = 4096
     most_lags: int = 100_000
-    most_modes: int = 12
     most_mean: float = 1e15
     matched_outside: float = 1.5e-15
     least_spread: float = 1e-3
-    paralyzable_periods: int = 20_000
     synchronous_tail: float = 1e-13
     synchronous_loose_tail: float = 1e-10
     synchronous_late: float = 9.0

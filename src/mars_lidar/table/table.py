@@ -30,10 +30,7 @@ from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.statistics.cells import require_mode
 from mars_lidar.statistics.chain import ConvergenceError, Rearm
-from mars_lidar.statistics.count_pmf import Pmf, total_variation
 from mars_lidar.statistics.exposure import exposure_moments, normalised
-from mars_lidar.statistics.law import count_law
-from mars_lidar.statistics.matched import matched_pmf
 from mars_lidar.table import storage
 from mars_lidar.table.axes import PAPER_GRID, Grid, axis_values, describe, inserted, midpoints, thinned
 from mars_lidar.table.entries import (
@@ -48,7 +45,7 @@ from mars_lidar.table.entries import (
     read_pixels,
     start_phases,
 )
-from mars_lidar.table.error import LawError, QuantisationError, deviations, law_variation, random_pixels
+from mars_lidar.table.error import QuantisationError, deviations, law_variation, random_pixels
 from mars_lidar.table.tolerances import TOL
 
 Interpolation = Literal["bilinear", "nearest"]
@@ -123,7 +120,6 @@ class Table:
         rearm: Rearm = "centre",
         refine: float | None = None,
         tolerance: float = 1e-4,
-        check_law: bool = False,
         threads: int | None = None,
         progress: Progress | bool | None = None,
     ) -> Table:
@@ -146,8 +142,6 @@ class Table:
             (`QuantisationError.largest`). None: the given axes.
         tolerance
             Of each entry, for ``"exposure"``: see `exposure_moments`.
-        check_law
-            Also compare the count laws of the table with exact laws (`law_error`), and store the result.
         threads
             Threads to run on; default: all processors that this process may use.
         progress
@@ -167,8 +161,6 @@ class Table:
             raise ValueError(f"rearm must be 'centre' for method {method!r}, which has no such option, got {rearm!r}")
         goal = None if refine is None else checks.real("refine", refine, low=1e-5, high=0.1)
         tolerance = checks.real("tolerance", tolerance, low=1e-9, high=0.1)
-        if not isinstance(check_law, bool):
-            raise TypeError(f"check_law must be True or False, got {check_law!r}")
         progress = callback_of(progress, "building a table")
         recipe = Recipe(method, rearm, tolerance, thread_count(threads))
         began = time.perf_counter()
@@ -178,13 +170,11 @@ class Table:
         else:
             table, error = _refined(system, axes, recipe, goal, progress)
         longest = table._long_error(recipe.threads)
-        law = table.law_error(threads=recipe.threads).to_dict() if check_law else None
         table.provenance.update(
             key=storage.request_key(system, axes, method=method, rearm=rearm, refine=goal, tolerance=tolerance),
             refine=goal,
             error=error.to_dict(),
             error_longest=None if longest is None else longest.to_dict(),
-            law=law,
             build_s=time.perf_counter() - began,
         )
         return table
@@ -238,7 +228,7 @@ class Table:
         """Path of the table in the cache, and the existing file that can be used instead, or None."""
         system = system.detected()
         chosen = {"method": "exposure", "rearm": "centre", "refine": None, "tolerance": 1e-4} | options
-        unknown = set(chosen) - {"method", "rearm", "refine", "tolerance", "check_law", "threads", "progress"}
+        unknown = set(chosen) - {"method", "rearm", "refine", "tolerance", "threads", "progress"}
         if unknown:
             raise TypeError(f"the options are those of Table.build, got {sorted(unknown)[0]!r}")
         axes = axis_values("signal", signal), axis_values("background", background)
@@ -246,9 +236,8 @@ class Table:
         own, others = storage.cached_candidates(storage.request_key(system, axes, **request), system.cycles)
         for path in (own, *others):
             with contextlib.suppress(OSError, ValueError):  # absent, out of reach, damaged, or of too few cycles
-                law = cls.load(path, system).provenance["law"]
-                if law is not None or not chosen.get("check_law", False):
-                    return own, path
+                cls.load(path, system)
+                return own, path
         return own, None
 
     @checked
@@ -496,35 +485,6 @@ class Table:
             worst_background=float(background[worst]),
         )
 
-    def law_error(self, *, samples: int = 50, seed: int = 0, threads: int | None = None) -> LawError:
-        """Total variation, on random pixels, between the count law of the table and the exact law.
-
-        Some 10 to 20 ms a pixel. `samples`, `seed` and `threads` as for `quantisation_error`.
-        """
-        samples = checks.integer("samples", samples, low=1, high=100_000)
-        rng = np.random.default_rng(checks.integer("seed", seed, low=0, high=2**64 - 1))
-        system = self.system
-        signal, background = (random_pixels(rng, axis, samples, True) for axis in (self.signal, self.background))
-        delay = rng.uniform(0.0, system.period_ns, samples)
-        law = self.at(signal, background, delay)
-        exact = count_law(Flux(signal, background, delay), system, tolerance=self.tolerance, threads=threads)
-        matched = matched_pmf(law.cumulants, threads=threads)
-        off = np.array([total_variation(w, Pmf(int(exact.support[k, 0]), exact.pmf[k])) for k, w in enumerate(matched)])
-        good = law.trusted()
-        worst = int(off.argmax())
-        return LawError(
-            samples=samples,
-            cycles=system.cycles,
-            mean=float(off.mean()),
-            largest=float(off[worst]),
-            within=float(np.mean(off <= 0.002)),
-            trusted=float(good.mean()),
-            largest_trusted=float(off[good].max()) if good.any() else 0.0,
-            worst_signal=float(signal[worst]),
-            worst_background=float(background[worst]),
-            worst_delay_ns=float(delay[worst]),
-        )
-
     def _long_error(self, threads: int) -> QuantisationError | None:
         """Errors at the longest exposure, 1e8 cycles; None where some entry does not serve it, or has no exact law."""
         if self.system.cycles != TOL.cycles and not self.entries.serves(TOL.cycles).all():
@@ -589,10 +549,7 @@ def _evaluated(system: System, axes: Axes, recipe: Recipe, progress: Progress | 
     settled = cells + max(1, cells // 10)  # the start phases take about so much of the time
     total = settled + max(1, cells // 20)  # and the laws of some entries so much
     entries = recipe.entries(
-        np.repeat(signal, background.size),
-        np.tile(background, signal.size),
-        system,
-        of_part(progress, 0, cells, total),
+        np.repeat(signal, background.size), np.tile(background, signal.size), system, of_part(progress, 0, cells, total)
     )
     phases, laws = StartPhases.none(), NodeLaws.none()
     if recipe.method == "exposure":

@@ -51,10 +51,7 @@ def feedback_histogram(task: Task, out: Any, machine: Cuda, draw_exactly: Draw, 
 
 def _arrays(task: Task, machine: Cuda) -> dict[str, Any]:
     """What the kernel reads of the pixels and the pulse."""
-    here: dict[str, NDArray[Any]] = {
-        **task.pixel_arrays(),
-        **_core.feedback_pulse(task.pulse),
-    }
+    here: dict[str, NDArray[Any]] = {**task.pixel_arrays(), **_core.feedback_pulse(task.pulse)}
     if task.flux.waveform is not None:
         here["waveform"] = np.ascontiguousarray(task.flux.waveform.reshape(task.pixel_index.size, -1))
     return {name: machine.array(array) for name, array in here.items() if array.size}

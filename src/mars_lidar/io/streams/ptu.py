@@ -429,10 +429,7 @@ def _row(times: Timestamps, row: int, fine: int) -> tuple[NDArray[np.int64], NDA
     ends = np.array([pixels[0], pixels[-1] + 1]) * times.cycles
     marks = [_marker(_LINE_START), _marker(_LINE_STOP)]
     first, last = (np.uint32(mark | np.uint32(end % _WRAP)) for mark, end in zip(marks, ends, strict=True))
-    return (
-        np.concatenate([ends[:1], period, ends[1:]]),
-        np.concatenate([[first], records, [last]]).astype(np.uint32),
-    )
+    return (np.concatenate([ends[:1], period, ends[1:]]), np.concatenate([[first], records, [last]]).astype(np.uint32))
 
 
 def _marker(bits: int) -> np.uint32:

@@ -74,6 +74,36 @@ void build_forward(PulseTable& table, const std::vector<double>& early, const st
     }
 }
 
+// Where a cumulative energy is p < 1/2: Newton's method between `from` and the median at 0, kept inside the bracket by
+// bisection.
+template <class Below, class Density>
+double solved(const Below& below, const Density& density, double p, double from) {
+    double a = from, b = 0.0, v = from;
+    for (int step = 0; step < 60; ++step) {
+        const double error = below(v) - p;
+        if (std::fabs(error) <= 1e-14 * p) break;
+        (error < 0 ? a : b) = v;
+        const double newton = v - error / density(v), middle = 0.5 * (a + b);
+        if (!(newton > a && newton < b) && (middle == a || middle == b)) return middle;  // no number between
+        v = newton > a && newton < b ? newton : middle;
+    }
+    return v;
+}
+
+double normal_density(double x) { return 0.3989422804014326779 * exponential_function(-0.5 * x * x); }
+
+// Quantiles of the normal law at the edges of the octave table's cells up to 1/2: they take most of the time of a table.
+const std::vector<double>& normal_quantiles() {
+    static const std::vector<double> quantiles = [] {
+        std::vector<double> at(octave_cell(0.5f) + 1);
+        double from = -kGaussianReach;
+        for (int32_t cell = octave_cell(std::ldexp(1.0f, -kOctaves)); octave_edge(cell) < 0.5f; ++cell)
+            at[cell] = from = solved(normal_cumulative, normal_density, octave_edge(cell), from);
+        return at;
+    }();
+    return quantiles;
+}
+
 // The tables of a Gaussian pulse. Where it is longer than a period, its neighbours overlap in the frame and are added
 // up; energies of the early half count from the start, those of the late half from the end, so that both tails keep
 // their digits.
@@ -106,34 +136,23 @@ void build_gaussian(PulseTable& table) {
 
     auto density = [&](double v) {
         double sum = 0.0;
-        for (int k = -reach; k <= reach; ++k) {
-            const double x = (v + k) / shape.sigma;
-            sum += exponential_function(-0.5 * x * x);
-        }
-        return 0.3989422804014326779 / shape.sigma * sum;
+        for (int k = -reach; k <= reach; ++k) sum += normal_density((v + k) / shape.sigma);
+        return sum / shape.sigma;
     };
 
-    // Quantile of the early half on cells of equal relative width, linear inside a cell. Each edge is found by
-    // Newton's method between the one before and the median, kept inside the bracket by bisection.
-    auto quantile = [&](double p, double from) {
+    // Quantile of the early half on cells of equal relative width, linear inside a cell; of a pulse alone in its frame,
+    // that of the normal law.
+    const bool alone = reach == 0;
+    auto quantile = [&](double p, int32_t cell, double from) {
         if (p >= 0.5) return 0.0;
-        double a = from, b = 0.0, v = from;
-        for (int step = 0; step < 60; ++step) {
-            const double error = below(v) - p;
-            if (std::fabs(error) <= 1e-14 * p) break;
-            (error < 0 ? a : b) = v;
-            const double newton = v - error / density(v), middle = 0.5 * (a + b);
-            if (!(newton > a && newton < b) && (middle == a || middle == b)) return middle;  // no number between
-            v = newton > a && newton < b ? newton : middle;
-        }
-        return v;
+        return alone ? shape.sigma * normal_quantiles()[cell] : solved(below, density, p, from);
     };
     const int32_t last = octave_cell(0.5f), first = octave_cell(std::ldexp(1.0f, -kOctaves));
     table.inverse.assign(2 * (last + 2), 0.0f);  // p = 1/2 and what rounds to a little more: the centre
-    double edge = octave_edge(first), position = quantile(edge, std::max(-0.5, -kGaussianReach * shape.sigma));
+    double edge = octave_edge(first), position = quantile(edge, first, std::max(-0.5, -kGaussianReach * shape.sigma));
     for (int32_t cell = 0; cell < first; ++cell) table.inverse[2 * cell] = static_cast<float>(position);
     for (int32_t cell = first; cell < last; ++cell) {
-        const double next_edge = octave_edge(cell + 1), next_position = quantile(next_edge, position);
+        const double next_edge = octave_edge(cell + 1), next_position = quantile(next_edge, cell + 1, position);
         const double slope = (next_position - position) / (next_edge - edge);
         table.inverse[2 * cell] = static_cast<float>(position - slope * edge);
         table.inverse[2 * cell + 1] = static_cast<float>(slope);

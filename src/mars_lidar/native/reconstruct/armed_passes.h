@@ -17,9 +17,9 @@ namespace mars {
 // periods in which it became so inside of it, at a place taken as uniform. For dead times below one bin `armed` is
 // the armed time of the bin instead, in periods, and `rearmed` is 0. `raw` is `armed` before it is kept within bounds.
 struct ArmedPasses {
-    std::vector<double> count, before, armed, rearmed, raw;  // (padded_length(bins)), before (bins + 1)
+    BinValues count, before, armed, rearmed, raw;  // (padded_length(bins)), before (bins + 1)
     // Armed time of each bin, in periods, where the registrations of the bin came in its middle (R5).
-    std::vector<double> time;
+    BinValues time;
     double total = 0.0;
 
     explicit ArmedPasses(int64_t bins)
@@ -37,10 +37,8 @@ struct ArmedPasses {
     }
 
     void set(const HistogramRecord& r, const CountRows& histograms, int64_t pixel) {
-        const int64_t n = r.bins;
-        set_counts(r, histograms, pixel);
-        before[0] = 0.0;
-        for (int64_t j = 0; j < n; ++j) before[j + 1] = before[j] + count[j];
+        histograms.copy(pixel, count.data());
+        add_up(r.bins);
         arm(r);
         if (r.below_bin())
             std::copy(armed.begin(), armed.end(), time.begin());
@@ -49,9 +47,11 @@ struct ArmedPasses {
                 time[j] = std::max(armed[j] + 0.5 * rearmed[j] - 0.5 * count[j], 0.0);
     }
 
-    // Of a histogram that need not be whole.
-    void set(const HistogramRecord& r, const std::vector<double>& histogram) {
-        set(r, {histogram.data(), CountRows::Type::kDouble, r.bins}, 0);
+    // Of expected registrations, `time` aside.
+    void expect(const HistogramRecord& r, const BinValues& histogram) {
+        std::copy_n(histogram.begin(), r.bins, count.begin());
+        add_up(r.bins);
+        arm(r);
     }
 
     // Of the histogram that was set, with another dead time.
@@ -65,6 +65,22 @@ struct ArmedPasses {
     }
 
  private:
+    // `before` and `total`. One addition waits for another once in four bins.
+    void add_up(int64_t n) {
+        const double* h = count.data();
+        double* to = before.data();
+        *to = total = 0.0;
+        int64_t j = 0;
+        for (; j + 4 <= n; j += 4, h += 4) {
+            const double two = h[0] + h[1], three = two + h[2], four = three + h[3];
+            *++to = total + h[0];
+            *++to = total + two;
+            *++to = total + three;
+            *++to = total += four;
+        }
+        for (; j < n; ++j) *++to = total += *h++;
+    }
+
     // Share of the registrations whose effect `p` period edges later still lies within the exposure (R3). From a
     // stationary start those before the exposure make up for the rest.
     static double within(const HistogramRecord& r, int64_t p) {

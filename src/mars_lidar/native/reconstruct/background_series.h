@@ -48,7 +48,7 @@ class BackgroundSeries {
     }
 
     int64_t bins_ = 0, length_ = 0;
-    std::vector<double> terms_;  // (kOrder, length_)
+    BinValues terms_;  // (kOrder, length_)
     Terms sum_{};
 };
 

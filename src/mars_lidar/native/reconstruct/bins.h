@@ -16,16 +16,22 @@ namespace mars {
 // open part of each, and its derivative with respect to the delay.
 struct PulseBins {
     int64_t first = 0, bins = 0;
-    std::vector<double> energy, slope;  // padded_length(bins), and room for the kernel
+    BinValues energy, slope;  // padded_length(bins), and room for the kernel
 
-    // Whatever lies between `low` and `high` after the delay.
-    void set(const HistogramRecord& r, double delay, double low, double high) {
-        const double n = static_cast<double>(r.bins), bin = 1.0 / n;
+    // Which bins lie between `low` and `high` after the delay; returns the first, in periods before or after as well.
+    int64_t place(const HistogramRecord& r, double delay, double low, double high) {
+        const double n = static_cast<double>(r.bins);
         const int64_t from = static_cast<int64_t>(std::floor((delay + low) * n));
         const int64_t end = static_cast<int64_t>(std::ceil((delay + high) * n));
         bins = std::min(r.bins, std::max<int64_t>(end - from, 1));
         first = from % r.bins;
         if (first < 0) first += r.bins;
+        return from;
+    }
+    // And what of the pulse lies in them.
+    void set(const HistogramRecord& r, double delay, double low, double high) {
+        const double bin = 1.0 / static_cast<double>(r.bins);
+        const int64_t from = place(r, delay, low, high);
         const int64_t length = padded_length(bins), apart = r.gated() ? length : 1,
                       points = padded_length(bins + apart);
         energy.resize(points + kBinsTogether);
@@ -49,7 +55,7 @@ struct PulseBins {
 };
 
 // `bins` values from `first` on round the period of n, followed by zeros.
-inline void copy_round(const double* from, int64_t n, int64_t first, int64_t bins, std::vector<double>& to) {
+inline void copy_round(const double* from, int64_t n, int64_t first, int64_t bins, BinValues& to) {
     to.resize(padded_length(bins));
     const int64_t straight = std::min(bins, n - first);
     std::copy_n(from + first, straight, to.begin());
@@ -59,7 +65,7 @@ inline void copy_round(const double* from, int64_t n, int64_t first, int64_t bin
 
 // Registrations and passes of a run of bins; those of bins that are closed are left out. `share` is empty without a gate.
 struct BinRun {
-    std::vector<double> count, armed, rearmed, share;
+    BinValues count, armed, rearmed, share;
 
     void set(const HistogramRecord& r, const ArmedPasses& passes, int64_t first, int64_t bins) {
         copy_round(passes.count.data(), r.bins, first, bins, count);

@@ -26,10 +26,22 @@ struct EnergyBlock {
     double *energy, *density;
 };
 
-// (R9) of bins of `light` photons, or where that is null of signal x energy + flat x share, share 1 where null.
+// What becomes of a pass of each bin (R7) of signal x energy + flat x share photons, energy 0 and share 1 where null: armed,
+// P(none) and P(one); re-armed, P(one) and its derivative. `passed` (kPassColumns, bins).
+constexpr int kPassColumns = 4;
+struct PassesBlock {
+    const double *energy, *share;
+    double signal, flat;
+    int64_t bins;
+    double* passed;
+};
+
+// (R9) of bins of `light` photons, or where that is null of signal x energy + flat x share, energy 0 and share 1 where null.
+// `passed` (kPassColumns, bins), of `alike` bins (kPassColumns, kBinsTogether), or null: computed.
 struct TermsBlock {
     const double *count, *armed, *rearmed, *light;
-    const double *energy, *slope, *share;
+    const double *energy, *slope, *share, *passed;
+    bool alike;
     int64_t bins;
     double signal, flat;
     bool poisson;          // dead times below one bin: a bin may register again
@@ -38,7 +50,7 @@ struct TermsBlock {
 };
 
 // The logarithm of the likelihood; and its derivatives by S, flat and delay / S, with Fisher's information: of (S, S),
-// (flat, S), (flat, flat), (delay, S), (delay, flat), (delay, delay). They are sums of the terms with `energy`.
+// (flat, S), (flat, flat), (delay, S), (delay, flat), (delay, delay). They are sums of the terms without `score`.
 struct BinSums {
     double value = 0.0, score[3] = {}, info[6] = {};
 };
@@ -53,14 +65,14 @@ struct ProductsBlock {
     double *sums, *products;
 };
 
-// Mean of the registrations of each bin of `light` photons, of `flat` where that is null, its slope by them, variance, and
-// the chances that an armed and a re-armed pass register (R7).
+// Mean of the registrations of each bin of `light` photons, of `flat` where that is null, its slope by them, variance, the
+// third cumulant over that, and the chances that an armed and a re-armed pass register (R7).
 struct LawBlock {
     const double *armed, *rearmed, *light;
     double flat;
     int64_t bins;
     bool poisson;
-    double *mean, *slope, *variance, *fired, *late;
+    double *mean, *slope, *variance, *asymmetry, *fired, *late;
 };
 
 // A series in the photons per bin of background alone (R10): terms (kSeriesTerms, bins).
@@ -96,10 +108,19 @@ struct ChangeSums {
     double along, variance, residual, passes;
 };
 
+// Of the weighted change of each bin, less what the estimates take up of it: `along` times the derivatives of the mean by S,
+// B, delay and hidden passes. The sum of its cubes times the third cumulants is that of the score (R30).
+struct CubesBlock {
+    const double *change, *weight, *slope, *fired, *share, *moved, *variance, *asymmetry, *along;
+    int64_t bins;
+};
+
+MARS_DECLARE_KERNEL(double, bin_cubes_, const CubesBlock& block)
 MARS_DECLARE_KERNEL(TangentSums, bin_tangent_, const TangentBlock& block)
 MARS_DECLARE_KERNEL(ChangeSums, bin_change_, const ChangeBlock& block)
 MARS_DECLARE_KERNEL(void, arm_bins_, const ArmBlock& block)
 MARS_DECLARE_KERNEL(void, pulse_energy_, const EnergyBlock& block)
+MARS_DECLARE_KERNEL(void, bin_passes_, const PassesBlock& block)
 MARS_DECLARE_KERNEL(BinSums, bin_terms_, const TermsBlock& block)
 MARS_DECLARE_KERNEL(void, bin_products_, const ProductsBlock& block)
 MARS_DECLARE_KERNEL(void, bin_law_, const LawBlock& block)

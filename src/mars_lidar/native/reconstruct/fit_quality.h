@@ -31,8 +31,8 @@ class FitQuality {
  public:
     explicit FitQuality(const QualityJob& job)
         : job_(job), bins_(job.recording.bins), typical_(bins_), reached_(bins_) {
-        for (std::vector<double>* each : {&light_, &mean_, &variance_, &slope_, &fired_, &late_, &weight_, &residual_,
-                                          &change_, &share_, &moved_, &wider_, &raw_, &rearmed_, &third_})
+        for (BinValues* each : {&light_, &mean_, &variance_, &slope_, &fired_, &late_, &weight_, &residual_, &change_,
+                                &share_, &moved_, &wider_, &raw_, &rearmed_, &asymmetry_})
             each->resize(padded_length(bins_));
     }
 
@@ -52,11 +52,10 @@ class FitQuality {
         if (hidden > kMostHidden * kMostHidden * armed * armed / static_cast<double>(bins_ * bins_)) return;
         out[0] = chi_square(passes.count, total, cells, hidden);
         for (int64_t j = 0; j < bins_; ++j) residual_[j] = passes.count[j] - mean_[j];
-        typical_.set(job_.recording, mean_);
+        typical_.expect(job_.recording, mean_);
         set_law(typical_);
         set_tangent(lit, hidden);
         set_chi_square_law(out);
-        set_third();
         if (tests_dead_time()) {
             raw_.swap(typical_.raw);
             rearmed_.swap(typical_.rearmed);
@@ -78,7 +77,7 @@ class FitQuality {
         for (const int64_t j : pulse_) light_[j] += signal_ * share_[j];
         set_law(passes);
     }
-    const std::vector<double>& expected() const { return mean_; }
+    const BinValues& expected() const { return mean_; }
 
  private:
     static constexpr int kCells = 64;               // of a pixel, at most
@@ -100,7 +99,8 @@ class FitQuality {
         const auto set = [&](const double* light, int64_t from, int64_t bins) {
             bins_kernels().law({passes.armed.data() + from, passes.rearmed.data() + from, light, flat_, bins,
                                 job_.recording.below_bin(), mean_.data() + from, slope_.data() + from,
-                                variance_.data() + from, fired_.data() + from, late_.data() + from});
+                                variance_.data() + from, asymmetry_.data() + from, fired_.data() + from,
+                                late_.data() + from});
         };
         const auto set_lit = [&](int64_t from, int64_t end) {
             from = from / kBinsTogether * kBinsTogether;
@@ -136,24 +136,27 @@ class FitQuality {
     }
 
     // Pearson's, over cells of about equal variance, whose excesses share the hidden passes.
-    double chi_square(const std::vector<double>& count, double total, int cells, double hidden) {
+    double chi_square(const BinValues& count, double total, int cells, double hidden) {
         double h[kCells] = {}, sum = 0.0, below = 0.0;
         std::fill_n(cell_, kCells, Cell());
         const double scale = static_cast<double>(cells) / total;
         const double *registered = count.data(), *expected = mean_.data(), *variance = variance_.data();
         const double *fired = fired_.data(), *slope = slope_.data(), *share = share_.data(), *moved = moved_.data();
+        const double* asymmetry = asymmetry_.data();
         for (int64_t j = 0; j < bins_;) {
             const int c = std::min(static_cast<int>((below + 0.5 * variance[j]) * scale), cells - 1);
             double excess = 0.0;
             Cell add;
             do {
-                const double v = variance[j], quiet = expected[j] > 0.0 ? v / expected[j] : 1.0;
+                const double v = variance[j];
                 excess += registered[j] - expected[j];
                 add.variance += v;
-                add.fourth += v * (1.0 - 6.0 * quiet * (1.0 - quiet));
-                add.along[0] += share[j] * slope[j];
+                add.fourth += v * (1.5 * asymmetry[j] * asymmetry[j] - 0.5);
+                if (reached_[j]) {
+                    add.along[0] += share[j] * slope[j];
+                    add.along[2] += moved[j] * slope[j];
+                }
                 add.along[1] += slope[j];
-                add.along[2] += moved[j] * slope[j];
                 add.along[3] += fired[j];
                 below += variance[j++];
             } while (j < bins_ && (below + 0.5 * variance[j]) * scale < static_cast<double>(c + 1));
@@ -190,18 +193,19 @@ class FitQuality {
         double mean = 0.0, variance = 0.0;
         for (const Cell& at : cell_) {
             if (!(at.variance > 0.0)) continue;
+            const double weight = 1.0 / at.variance;
             double taken = 0.0;
             for (int a = 0; a < 3; ++a) {
-                const double one = at.along[a] * scale_[a];
-                hidden[a] += one * at.along[3] / at.variance;
+                const double one = at.along[a] * scale_[a] * weight;
+                hidden[a] += one * at.along[3];
                 for (int b = 0; b < 3; ++b) {
-                    const double both = one * at.along[b] * scale_[b] / at.variance;
+                    const double both = one * at.along[b] * scale_[b];
                     of_cells[a][b] += both;
                     taken += inverse_of_bins[a][b] * both;
                 }
             }
             mean += 1.0;
-            const double own = std::max(1.0 - taken, 0.0) / at.variance;
+            const double own = std::max(1.0 - taken, 0.0) * weight;
             variance += own * own * at.fourth;
         }
         variance += 2.0 * mean;
@@ -221,12 +225,6 @@ class FitQuality {
         }
         out[0] *= 2.0 * mean / variance;
         out[1] = 2.0 * mean * mean / variance;
-    }
-
-    // Third cumulants of the registrations: binomial.
-    void set_third() {
-        for (int64_t j = 0; j < bins_; ++j)
-            third_[j] = mean_[j] > 0.0 ? variance_[j] * (2.0 * variance_[j] / mean_[j] - 1.0) : 0.0;
     }
 
     // Variance of the passes that the last registration blinds after the exposure (and from a stationary start one before
@@ -290,13 +288,11 @@ class FitQuality {
         }
         if (!(variance > least)) return NAN;
         for (int a = 0; a < 4; ++a) along[a] *= scale_[a];
-        const auto third = sums_of<1>(bins_, [&](int64_t j) {
-            const double light = along[0] * share_[j] + along[1] + along[2] * moved_[j];
-            const double each = change_[j] - weight_[j] * (slope_[j] * light + along[3] * fired_[j]);
-            return std::array<double, 1>{each * each * each * third_[j]};
-        });
+        const double third = bins_kernels().cubes({change_.data(), weight_.data(), slope_.data(), fired_.data(),
+                                                   share_.data(), moved_.data(), variance_.data(), asymmetry_.data(),
+                                                   along, static_cast<int64_t>(change_.size())});
         const double deviation = std::sqrt(variance);
-        *skewness = third[0] / (variance * deviation);
+        *skewness = third / (variance * deviation);
         return sum / deviation;
     }
 
@@ -343,15 +339,15 @@ class FitQuality {
 
     const QualityJob job_;
     const int64_t bins_;
-    ArmedPasses typical_;                             // of the expected histogram, as it was recorded and otherwise
-    std::vector<double> raw_, rearmed_;               // passes of the expected histogram as it was recorded
-    double signal_ = 0.0, flat_ = 0.0;                // photons per period: S, and those of background in a bin
-    std::vector<double> mean_, variance_, slope_;     // of each bin's registrations; the slope by the bin's photons
-    std::vector<double> light_;                       // photons of each bin
-    std::vector<double> fired_, late_;                // chances that an armed and a re-armed pass register in the bin
-    std::vector<double> weight_, residual_, change_;  // 1 / variance, weighted h - m, and what is tested
-    std::vector<double> third_;                       // cumulant of each bin's registrations
-    std::vector<double> share_, moved_, wider_;       // of the pulse: s, change with delay, width; 0 but in `pulse_`
+    ArmedPasses typical_;                   // of the expected histogram, as it was recorded and otherwise
+    BinValues raw_, rearmed_;               // passes of the expected histogram as it was recorded
+    double signal_ = 0.0, flat_ = 0.0;      // photons per period: S, and those of background in a bin
+    BinValues mean_, variance_, slope_;     // of each bin's registrations; the slope by the bin's photons
+    BinValues light_;                       // photons of each bin
+    BinValues fired_, late_;                // chances that an armed and a re-armed pass register in the bin
+    BinValues weight_, residual_, change_;  // 1 / variance, weighted h - m, and what is tested
+    BinValues asymmetry_;                   // third cumulant of each bin's registrations over the variance
+    BinValues share_, moved_, wider_;       // of the pulse: s, change with delay, width; 0 but in `pulse_`
     PulseBins pulse_bins_;
     std::vector<int64_t> pulse_;
     std::vector<uint8_t> reached_;  // (bins) whether in `pulse_`

@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
+#include <new>
 #include <vector>
 
 namespace mars {
@@ -13,6 +14,28 @@ namespace mars {
 constexpr int64_t kBinsTogether = 8;
 
 constexpr int64_t padded_length(int64_t bins) { return (bins + kBinsTogether - 1) / kBinsTogether * kBinsTogether; }
+
+// Values of bins, from the beginning of a line of the cache on: a vector of them does not lie in two lines.
+template <class Value>
+struct LineMemory {
+    using value_type = Value;
+    static constexpr std::align_val_t kLine{64};
+
+    LineMemory() = default;
+    template <class Other>
+    LineMemory(const LineMemory<Other>&) {}
+    Value* allocate(size_t n) { return static_cast<Value*>(::operator new(n * sizeof(Value), kLine)); }
+    void deallocate(Value* values, size_t) { ::operator delete(values, kLine); }
+    template <class Other>
+    bool operator==(const LineMemory<Other>&) const {
+        return true;
+    }
+    template <class Other>
+    bool operator!=(const LineMemory<Other>&) const {
+        return false;
+    }
+};
+using BinValues = std::vector<double, LineMemory<double>>;
 
 // Energy of the periodic pulse train and its density, by cubic Hermite interpolation between equal knots. A pulse is
 // seldom evaluated at the same place twice, so the likelihood would otherwise spend its time in erf and exp.

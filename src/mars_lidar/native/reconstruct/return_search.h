@@ -109,7 +109,7 @@ class ReturnSearch {
     int64_t shift() const { return ((first_ % r_.bins) + r_.bins) % r_.bins; }
 
     // The values of the bins, times their open shares to a power, from `shift` on round the period.
-    void extend(const std::vector<double>& values, int power, std::vector<double>& out) const {
+    void extend(const BinValues& values, int power, std::vector<double>& out) const {
         const int64_t n = r_.bins, taps = static_cast<int64_t>(energy_.size());
         const int64_t end = std::max(n + taps, length_of_rows());
         out.resize(end);

@@ -59,8 +59,8 @@ class ReturnsLikelihood {
 
     // Of the last evaluation: derivatives of the logarithm of the likelihood by the photons of each bin (bins), the
     // information on them, and energy and slope (bins) of a return's pulse.
-    const std::vector<double>& score() const { return score_; }
-    const std::vector<double>& info() const { return info_; }
+    const BinValues& score() const { return score_; }
+    const BinValues& info() const { return info_; }
     const double* energy(int k) const { return energy_.data() + k * length_; }
     const double* slope(int k) const { return slope_.data() + k * length_; }
     const PulseBins& pulse(int k) const { return pulse_[k]; }
@@ -131,8 +131,8 @@ class ReturnsLikelihood {
         }
         point.value += bins_kernels()
                            .terms({run_.count.data() + from, run_.armed.data() + from, run_.rearmed.data() + from,
-                                   light, nullptr, nullptr, nullptr, bins, 0.0, 0.0, r_.below_bin(), true,
-                                   score_.data() + from, info_.data() + from})
+                                   light, nullptr, nullptr, nullptr, nullptr, false, bins, 0.0, 0.0, r_.below_bin(),
+                                   true, score_.data() + from, info_.data() + from})
                            .value;
         bins_kernels().products({score_.data() + from, info_.data() + from, rows, number, bins, sums, products});
         const double* product = products;
@@ -176,8 +176,8 @@ class ReturnsLikelihood {
     const ArmedPasses* passes_ = nullptr;
     OpenSums all_;
     BinRun run_;  // the whole period
-    std::vector<double> light_, score_, info_;
-    std::vector<double> energy_, slope_;  // (returns, bins), 0 beyond the pulse
+    BinValues light_, score_, info_;
+    BinValues energy_, slope_;  // (returns, bins), 0 beyond the pulse
     PulseBins pulse_[kMostReturns];
     double placed_[kMostReturns] = {};  // its delay
     std::vector<uint8_t> reached_;      // (bins / kBinsTogether) by which returns, one bit for each

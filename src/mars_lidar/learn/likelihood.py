@@ -69,14 +69,15 @@ def histogram_log_likelihood(
     Notes
     -----
     Unbiased to 0.1 of the Cramer-Rao bound's standard deviation at 1000 cycles, for bins of up to 3 widths (sigma) of
-    the pulse, S up to 10, B up to 5 and dead times of up to 3 periods: at most 0.03 over the 399 random instruments with
-    which its settings were chosen, 0.05 over 398 others, against the exact mean histogram (the bias in these units grows
-    with the square root of the cycles). Where a dead time is longer than a period, the registrations that the ends of
-    the exposure cut off matter, and a histogram does not contain them, if less than one pass of the pulse is expected to
-    end without registration (0.2 and 0.4 in two further instruments), or if the pixel is armed for less than two dead
-    times. Over simulated exposures with dead times of 3.3 to 14 periods S and B were then up to 1.8 standard deviations
-    off (docs/learn.md); a warning says so. The value jumps by up to 5e-3 (1e-4 mostly) where the window of
-    divided bins moves by a bin; the slope in the delay jumps where a sample of a pulse begins at the edge of a cell.
+    the pulse, S up to 10, B up to 5 and dead times of up to 3 periods: at most 0.03 over the 399 random instruments
+    with which its settings were chosen, 0.05 over 398 others, against the exact mean histogram (the bias in these units
+    grows with the square root of the cycles). Where a dead time is longer than a period, the registrations that the
+    ends of the exposure cut off matter, and a histogram does not contain them, if less than one pass of the pulse is
+    expected to end without registration (0.2 and 0.4 in two further instruments), or if the pixel is armed for less
+    than two dead times. Over simulated exposures with dead times of 3.3 to 14 periods S and B were then up to 1.8
+    standard deviations off (docs/learn.md); a warning says so. The value jumps by up to 5e-3 (1e-4 mostly) where the
+    window of divided bins moves by a bin; the slope in the delay jumps where a sample of a pulse begins at the edge of
+    a cell.
     The processor computes it with its first and second derivatives; tensors of other devices are copied there and back.
     Pixels are shared among PyTorch's threads; docs/learn.md has the times.
 

@@ -193,13 +193,11 @@ CALLS: dict[str, Callable[[Path], partial[Any]]] = {
     "statistics.constant_light_rate": lambda _: partial(
         statistics.constant_light_rate, rate_hz=1e6, detector=SYSTEM.detector
     ),
-    "reconstruct.coates_rates": lambda _: partial(
-        reconstruction.coates_rates, cube=np.minimum(counts(), 1), system=SYNCHRONOUS
+    "Coates.rates": lambda _: partial(reconstruction.Coates().rates, cube=np.minimum(counts(), 1), system=SYNCHRONOUS),
+    "GeneralisedCoates.rates": lambda _: partial(
+        reconstruction.GeneralisedCoates().rates, cube=counts(), system=SYSTEM
     ),
-    "reconstruct.generalised_coates_rates": lambda _: partial(
-        reconstruction.generalised_coates_rates, cube=counts(), system=SYSTEM
-    ),
-    "reconstruct.mchc_rates": lambda _: partial(reconstruction.mchc_rates, cube=counts(), system=SYSTEM),
+    "ChainCorrection.rates": lambda _: partial(reconstruction.ChainCorrection().rates, cube=counts(), system=SYSTEM),
     "reconstruct.log_likelihood": lambda _: partial(
         reconstruction.log_likelihood, histogram=counts()[0, 0, 0], flux=PIXEL, system=SYSTEM
     ),

@@ -13,7 +13,7 @@ Theory: :doc:`/theory_reconstruction`.
 import matplotlib.pyplot as plt
 
 import mars_lidar as ml
-from mars_lidar.reconstruction import coates_rates, generalised_coates_rates
+from mars_lidar.reconstruction import Coates, GeneralisedCoates
 
 pulse, detector = ml.GaussianPulse(sigma_ns=1.0), ml.Detector(dead_time_ns=75.0)
 system = ml.System(period_ns=100.0, cycles=50_000, bins=128, pulse=pulse, detector=detector)
@@ -25,8 +25,8 @@ fitted = ml.statistics.photons_per_bin(light, system).reshape(system.bins, -1).s
 
 fig, ax = plt.subplots()
 ax.step(system.time_ns, counts / system.cycles, where="mid", color="0.7", label="registered")
-ax.plot(system.time_ns, coates_rates(counts, synchronous), label="Coates")
-ax.plot(system.time_ns, generalised_coates_rates(counts, system), label="generalised Coates")
+ax.plot(system.time_ns, Coates().rates(counts, synchronous), label="Coates")
+ax.plot(system.time_ns, GeneralisedCoates().rates(counts, system), label="generalised Coates")
 ax.plot(system.time_ns, fitted, label=f"maximum likelihood: S = {estimate.signal:.3f}, B = {estimate.background:.3f}")
 ax.set(xlabel="time in the laser period (ns)", ylabel="photons per bin and period", yscale="log", ylim=(None, 3))
 ax.legend(ncols=2, loc="upper left")

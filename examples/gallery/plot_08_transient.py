@@ -14,7 +14,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import mars_lidar as ml
-from mars_lidar.reconstruction import generalised_coates_rates
+from mars_lidar.reconstruction import GeneralisedCoates
 
 y, x = np.mgrid[-1:1:24j, -1:1:32j]
 after_ns = 0.1 * np.arange(600) - (15 + 6 * (x**2 + y**2))[..., None]  # since the wall's return
@@ -24,7 +24,7 @@ pulse, detector = ml.GaussianPulse(sigma_ns=0.3), ml.Detector(dead_time_ns=40.0)
 system = ml.System(period_ns=60.0, cycles=20_000, bins=300, pulse=pulse, detector=detector)
 flux = ml.Flux.from_transient(light, system, bin_ns=0.1, signal=2.0, sbr=20.0)
 counts = ml.simulate(flux, system, seed=0)[0]
-rates = generalised_coates_rates(counts, system)
+rates = GeneralisedCoates().rates(counts, system)
 
 fig, (pixel, image) = plt.subplots(1, 2, width_ratios=(2, 1))
 pixel.plot(system.time_ns, counts[12, 16] / system.cycles, label="registered, per period")

@@ -20,7 +20,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import mars_lidar as ml
-from mars_lidar.reconstruction import coates_rates
+from mars_lidar.reconstruction import Coates
 
 pulse = ml.GaussianPulse(sigma_ns=2.0)
 detector = ml.Detector(dead_time_ns=0.0, mode="synchronous")
@@ -62,7 +62,7 @@ counts = ml.simulate(ml.Flux(2.0, 2.0, 60.0), system, seed=3)[0, 0, 0].astype(fl
 light = ml.statistics.photons_per_bin(ml.Flux(2.0, 2.0, 60.0), system, bins=128)
 armed = system.cycles - np.append(0, np.cumsum(counts)[:-1])
 estimate = -np.log1p(-counts / armed)  # equation (2)
-assert np.allclose(estimate, coates_rates(counts, system))
+assert np.allclose(estimate, Coates().rates(counts, system))
 
 fig, ax = plt.subplots()
 ax.fill_between(system.time_ns, light, step="mid", color="0.85", label="light")

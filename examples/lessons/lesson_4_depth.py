@@ -11,7 +11,7 @@ round the period
 .. math:: \text{armed}_j \approx N_r - \sum_{k = j - d}^{j - 1} n_k,
    \qquad \hat l_j = -\ln\Bigl(1 - \frac{n_j}{\text{armed}_j}\Bigr). \tag{1}
 
-``generalised_coates_rates`` computes (1) with fractions of bins. *Maximum likelihood* also uses that the light is a
+``GeneralisedCoates().rates`` computes (1) with fractions of bins. *Maximum likelihood* also uses that the light is a
 pulse of known shape on a uniform background, and maximises over :math:`S, B, \tau` the probability of the counts given
 the armed periods:
 
@@ -24,7 +24,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import mars_lidar as ml
-from mars_lidar.reconstruction import generalised_coates_rates
+from mars_lidar.reconstruction import GeneralisedCoates
 
 pulse, detector = ml.GaussianPulse(sigma_ns=2.0), ml.Detector(dead_time_ns=75.0)
 system = ml.System(period_ns=100.0, cycles=20_000, bins=128, pulse=pulse, detector=detector)
@@ -37,7 +37,7 @@ light = ml.statistics.photons_per_bin(truth, system, bins=128)
 fig, ax = plt.subplots()
 ax.fill_between(system.time_ns, light, step="mid", color="0.85", label="light")
 ax.step(system.time_ns, counts / system.cycles, where="mid", label="counts per period")
-ax.plot(system.time_ns, generalised_coates_rates(counts, system), ".", label="equation (1)")
+ax.plot(system.time_ns, GeneralisedCoates().rates(counts, system), ".", label="equation (1)")
 ax.axvline(float(estimate.delay_ns), color="C2", label="maximum likelihood")
 ax.set(yscale="log", xlabel="time in the period (ns)", ylabel="photons per bin and period")
 ax.legend(loc="upper left")

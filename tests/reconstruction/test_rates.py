@@ -8,7 +8,7 @@ from harness import make_system
 from scipy.stats import binom
 
 import mars_lidar as ml
-from mars_lidar.reconstruction import coates_rates, generalised_coates_rates, mchc_rates
+from mars_lidar.reconstruction import ChainCorrection, Coates, GeneralisedCoates
 from mars_lidar.statistics import mean_histogram
 
 PERIOD = 100.0
@@ -46,8 +46,8 @@ def test_generalised_coates_inverts_the_recursion(shift, cycles):
     system = system_of(shift / n * PERIOD, bins=n, cycles=cycles, sigma_ns=3.0)
     rate = photons(system, 1.5, 1.0, 37.0)
     mean = recursion(rate, cycles, shift)
-    error = np.abs(generalised_coates_rates(mean, system) / rate - 1.0).max()
-    careless = generalised_coates_rates(mean, system.replace(start="stationary"))
+    error = np.abs(GeneralisedCoates().rates(mean, system) / rate - 1.0).max()
+    careless = GeneralisedCoates().rates(mean, system.replace(start="stationary"))
     assert error < 3e-4
     assert error < 0.2 * np.abs(careless / rate - 1.0).max()
 
@@ -61,7 +61,7 @@ def test_generalised_coates_inverts_the_exact_mean(dead_ns, start):
         system = system_of(dead_ns, bins=bins, cycles=2000, start=start)
         rate = photons(system, 1.0, 1.0, 37.0)
         mean = mean_histogram(ml.Flux(1.0, 1.0, 37.0), system, tolerance=1e-6)
-        error.append(np.abs(generalised_coates_rates(mean, system) - rate).sum() / rate.sum())
+        error.append(np.abs(GeneralisedCoates().rates(mean, system) - rate).sum() / rate.sum())
     assert error[1] < 2e-4
     assert error[1] < 0.25 * error[0] + 2e-5
 
@@ -71,7 +71,7 @@ def test_coates_inverts_the_exact_mean(dead_ns, cycles):
     system = system_of(dead_ns, cycles=cycles, mode="synchronous")
     rate = photons(system, 1.0, 0.5, 37.0)
     mean = mean_histogram(ml.Flux(1.0, 0.5, 37.0), system)
-    result = coates_rates(mean, system)
+    result = Coates().rates(mean, system)
     assert np.abs(result / rate - 1.0).max() < (1e-9 if dead_ns == 0 else 1e-3)
 
 
@@ -122,15 +122,15 @@ def test_no_error_of_a_background_without_registrations():
 def test_coates_is_the_textbook_formula():
     system = system_of(0.0, bins=4, cycles=100, sigma_ns=5.0, mode="synchronous")
     h = np.array([10, 20, 0, 30])
-    result = coates_rates(h, system)
+    result = Coates().rates(h, system)
     assert result == pytest.approx(np.log([100 / 90, 90 / 70, 1.0, 70 / 40]), abs=1e-12)
-    assert np.isinf(coates_rates([10, 90, 0, 0], system)[1])
+    assert np.isinf(Coates().rates([10, 90, 0, 0], system)[1])
 
 
 def test_a_gate_that_stays():
     system = system_of(45.0, mode="gated", gate_start_ns=80.03, gate_width_ns=40.0)
     mean = mean_histogram(ml.Flux(1.0, 1.0, 95.0), system, tolerance=1e-6)
-    result = generalised_coates_rates(mean, system)
+    result = GeneralisedCoates().rates(mean, system)
     rate = photons(system, 1.0, 1.0, 95.0)
     inside = np.r_[402:500, 0:99]
     assert np.abs(result[inside] / rate[inside] - 1.0).max() < 2e-3
@@ -143,9 +143,9 @@ def test_mchc_has_the_histogram_as_its_fixed_point():
         system = system_of(dead_ns, cycles=10**6)
         rate = photons(system, 1.0, 1.0, 37.0)
         mean = mean_histogram(ml.Flux(1.0, 1.0, 37.0), system, tolerance=1e-6)
-        result = mchc_rates(mean, system, tolerance=1e-9)
+        result = ChainCorrection(tolerance=1e-9).rates(mean, system)
         assert np.abs(result - rate).sum() / rate.sum() < 1e-3
-        known = mchc_rates(mean, system, total=2.0, tolerance=1e-9)
+        known = ChainCorrection(tolerance=1e-9).rates(mean, system, total=2.0)
         assert known.sum() == pytest.approx(2.0, rel=1e-12)
         assert np.abs(known - rate).sum() / rate.sum() < 1e-3
 
@@ -155,7 +155,7 @@ def test_one_cycle_of_an_armed_pixel():
     free = system_of(99.0, bins=50, cycles=1, sigma_ns=5.0)
     clock = system_of(0.0, bins=50, cycles=1, sigma_ns=5.0, mode="synchronous")
     mean = np.linspace(0.0, 0.015, 50)
-    assert generalised_coates_rates(mean, free)[:49] == pytest.approx(coates_rates(mean, clock)[:49], abs=1e-12)
+    assert GeneralisedCoates().rates(mean, free)[:49] == pytest.approx(Coates().rates(mean, clock)[:49], abs=1e-12)
 
 
 @pytest.mark.parametrize(

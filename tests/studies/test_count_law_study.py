@@ -8,7 +8,7 @@ from harness.ledger import require
 from scipy import stats
 
 from mars_lidar.engines import ENGINES
-from mars_lidar.engines.poisson import PoissonEngine
+from mars_lidar.engines.exact import PoissonEngine
 from mars_lidar.statistics.count_pmf import Pmf, kl_divergence
 from mars_lidar.statistics.tolerances import TOL
 from studies.common.distance import wasserstein

@@ -19,8 +19,7 @@ import numpy as np
 from mars_lidar._base.native import _core
 from mars_lidar._base.types import FloatArray, IndexArray, NDArray
 from mars_lidar.engines.engine import Engine, Task, draw_pixels, stage
-from mars_lidar.engines.exact import ExactEngine
-from mars_lidar.engines.poisson import PoissonEngine
+from mars_lidar.engines.exact import ExactEngine, PoissonEngine
 from mars_lidar.engines.tolerances import TOL
 from mars_lidar.instrument.pulse import GaussianPulse, SampledPulse
 from mars_lidar.instrument.system import System

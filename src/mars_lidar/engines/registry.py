@@ -7,12 +7,10 @@ from typing import Unpack
 from mars_lidar._base import checks
 from mars_lidar.engines.auto import AutoEngine
 from mars_lidar.engines.engine import Engine, EngineOptions, given
-from mars_lidar.engines.exact import ExactEngine
+from mars_lidar.engines.exact import ExactEngine, PoissonEngine, SequentialEngine
 from mars_lidar.engines.feedback import FeedbackEngine
 from mars_lidar.engines.mars import MarsEngine
-from mars_lidar.engines.poisson import PoissonEngine
 from mars_lidar.engines.renewal import RenewalEngine
-from mars_lidar.engines.sequential import SequentialEngine
 from mars_lidar.instrument.detector import require_effects
 from mars_lidar.instrument.system import System
 from mars_lidar.instrument.tolerances import TOL

@@ -1,6 +1,5 @@
 """Reconstruction: depth, signal and background of every pixel of a cube, with errors and bounds."""
 
-from mars_lidar.reconstruction.coates import Coates, GeneralisedCoates, coates_rates, generalised_coates_rates
 from mars_lidar.reconstruction.histogram_bound import (
     HistogramBound,
     cramer_rao,
@@ -11,8 +10,8 @@ from mars_lidar.reconstruction.histogram_bound import (
 from mars_lidar.reconstruction.image import Image, UntrainedImage
 from mars_lidar.reconstruction.matched_filter import MatchedFilter, Peak
 from mars_lidar.reconstruction.maximum_likelihood import MaximumLikelihood, log_likelihood, systematic_error
-from mars_lidar.reconstruction.mchc import ChainCorrection, mchc_rates
 from mars_lidar.reconstruction.method import Flags, Method
+from mars_lidar.reconstruction.rates import ChainCorrection, Coates, GeneralisedCoates
 from mars_lidar.reconstruction.reconstruction import METHODS, Reconstruction, reconstruct
 from mars_lidar.reconstruction.returns import Returns
 
@@ -31,11 +30,8 @@ __all__ = [
     "Reconstruction",
     "Returns",
     "UntrainedImage",
-    "coates_rates",
     "cramer_rao",
-    "generalised_coates_rates",
     "log_likelihood",
-    "mchc_rates",
     "reconstruct",
     "returns_bound",
     "systematic_error",

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from mars_lidar._base import checks
+from mars_lidar._base import arguments, checks
 from mars_lidar._base.native import _core
 from mars_lidar._base.types import ArrayLike, FloatArray, NDArray
 from mars_lidar.instrument.detector import Mode
@@ -182,8 +182,32 @@ class RateMethod(Method):
         """Delay by the filter, signal and background by its window, and their standard errors."""
         return window_estimates(histograms, self.filter, self.correction, **self.settings)
 
-    def rates(self, cube: ArrayLike, system: System, threads: int | None, total: ArrayLike | None = None) -> FloatArray:
-        """Photons per period in each bin (..., bins) from the histograms (..., bins); `total` (...) of each."""
+    @arguments.checked
+    def rates(
+        self, cube: ArrayLike, system: System, *, total: ArrayLike | None = None, threads: int | None = None
+    ) -> FloatArray:
+        """Photons per period in each bin (..., bins); infinite with a registration in every armed period.
+
+        Parameters
+        ----------
+        cube
+            (..., bins) counts.
+        system
+            The system that recorded them.
+        total
+            Total photons per period, a scalar or (...), if known, for example from the times between registrations:
+            `ChainCorrection` uses it. None: the sum of the rates of `GeneralisedCoates`.
+        threads
+            Threads to run on; default: all processors that this process may use.
+
+        Raises
+        ------
+        TypeError
+            Counts that are not an array of numbers, or not a `System`.
+        ValueError
+            Counts that are not whole numbers >= 0, or more than the periods allow; a detector to which this does not
+            apply.
+        """
         given, shape = checked(cube, system, threads)
         self.check(system)
         flat = None

@@ -13,14 +13,13 @@ from mars_lidar._base.display import as_html, brief
 from mars_lidar._base.types import ArrayLike, FloatArray, NDArray, Progress
 from mars_lidar.instrument.system import System
 from mars_lidar.reconstruction.centroid import Centroid
-from mars_lidar.reconstruction.coates import Coates, GeneralisedCoates
 from mars_lidar.reconstruction.fit_quality import FALSE_ALARM
 from mars_lidar.reconstruction.histograms import checked
 from mars_lidar.reconstruction.image import Image, UntrainedImage
 from mars_lidar.reconstruction.matched_filter import MatchedFilter, Peak
 from mars_lidar.reconstruction.maximum_likelihood import MaximumLikelihood, warn_of_bias
-from mars_lidar.reconstruction.mchc import ChainCorrection
 from mars_lidar.reconstruction.method import Estimates, Flags, Method, warn_of_effects
+from mars_lidar.reconstruction.rates import ChainCorrection, Coates, GeneralisedCoates
 from mars_lidar.reconstruction.returns import MOST_RETURNS, Returns, returns_of
 
 ATTENUATIONS = ("none", "inverse_square")

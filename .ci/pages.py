@@ -118,7 +118,7 @@ def chosen(page: Path, environment: str) -> list[Block]:
     """What is to be run of a page in an environment."""
     found = [b for b in blocks(page.read_text(encoding="utf-8")) if b.language not in SHOWN and b.mark != "command"]
     if environment == "extras":
-        again = [block for block in found if not any(block._parts("core only"))]
+        again = [block for block in found if not block._parts("core only")]
         return again if any(block.extras for block in found) else []
     return [block for block in found if not block.extras]
 

@@ -194,7 +194,8 @@ EMSCRIPTEN_KEEPALIVE double exposure_moments(const double* grid_told, const doub
     MomentsBlock block{&grid, &light, histogram, &settled, cumulants, rate_out, rate_out + kExposureOrders};
     block.count = 1;
     block.stop = &kRun;
-    MARS_JOIN(exposure_moments_, MARS_BASE_LEVEL)(block);
+    rates ? MARS_JOIN(exposure_paralyzable_, MARS_BASE_LEVEL)(block)
+          : MARS_JOIN(exposure_moments_, MARS_BASE_LEVEL)(block);
     return static_cast<double>(settled);
 }
 

@@ -9,7 +9,6 @@
 namespace mars {
 
 void MARS_JOIN(exposure_moments_, MARS_LEVEL)(const MomentsBlock& block) {
-    if (block.light->rates) return MomentsRun<ParalyzableRecursion>(block).run();
     MomentsRun<Recursion>(block).run();
     if (!block.correction || block.stop->load(std::memory_order_relaxed)) return;
     const auto response = responses(*block.light, block.first, block.count);
@@ -20,6 +19,12 @@ void MARS_JOIN(exposure_moments_, MARS_LEVEL)(const MomentsBlock& block) {
         BackwardRun(block, response, nullptr).run();
     }
 }
+
+#if defined(MARS_LEVEL_vector128) || defined(MARS_LEVEL_scalar)
+void MARS_JOIN(exposure_paralyzable_, MARS_LEVEL)(const MomentsBlock& block) {
+    MomentsRun<ParalyzableRecursion>(block).run();
+}
+#endif
 
 void MARS_JOIN(exposure_stationary_, MARS_LEVEL)(const MomentsBlock& block) {
     const auto response = responses(*block.light, block.first, block.count);

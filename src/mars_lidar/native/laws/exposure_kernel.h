@@ -100,6 +100,8 @@ struct CharacteristicBlock {
 
 // Cumulants and mean histogram, and what start and end phases change; the stationary state; the generating function.
 MARS_DECLARE_KERNEL(void, exposure_moments_, const MomentsBlock& block)
+// Moments of paralyzable pixels, of the base level alone: 95 % of their time goes into the rates that the light holds.
+MARS_DECLARE_KERNEL(void, exposure_paralyzable_, const MomentsBlock& block)
 MARS_DECLARE_KERNEL(void, exposure_stationary_, const MomentsBlock& block)
 MARS_DECLARE_KERNEL(void, exposure_characteristic_, const CharacteristicBlock& block)
 

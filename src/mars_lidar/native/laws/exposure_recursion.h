@@ -12,6 +12,25 @@ inline namespace MARS_LEVEL {
 
 constexpr int kMarks = 64;  // phases at which the state is sampled, to see whether it repeats
 
+struct Cut {
+    int32_t bin;
+    bool mark;
+};
+
+// Edges at which the loop over the bins of a period stops, in order: the marks, where the source period changes, and
+// where the last d bins begin.
+inline std::vector<Cut> cuts_of(const ExposureGrid& grid) {
+    const int32_t n = grid.bins;
+    const int marks = std::min<int32_t>(kMarks, n);
+    std::vector<Cut> cuts;
+    for (int m = 1; m <= marks; ++m) cuts.push_back({static_cast<int32_t>(int64_t{n} * m / marks), true});
+    if (grid.shift > 0)
+        for (const int32_t bin : {grid.shift, n - grid.shift})
+            cuts.insert(std::find_if(cuts.begin(), cuts.end(), [&](const Cut& cut) { return cut.bin > bin; }),
+                        Cut{bin, false});
+    return cuts;
+}
+
 // N: what a probability is weighted with (Series or Complex). C: Real where the lanes are different pixels,
 // double where they are one pixel at different weights.
 template <class N, class C>
@@ -26,16 +45,9 @@ class Recursion {
           history_(history),
           shift_(grid.fraction),
           delay_(grid.delay()),
-          ring_(std::max<int64_t>(delay_ > 0 ? grid.memory() : 0, keep_period ? grid.bins : 0)) {
-        const int32_t n = grid.bins;
-        const int marks = std::min<int32_t>(kMarks, n);
-        for (int m = 1; m <= marks; ++m) cuts_.push_back({static_cast<int32_t>(int64_t{n} * m / marks), true});
-        if (grid.shift > 0) {  // where the source period changes, and where the last d bins begin
-            cuts_.push_back({grid.shift, false});
-            cuts_.push_back({n - grid.shift, false});
-        }
-        std::stable_sort(cuts_.begin(), cuts_.end(), [](const Cut& a, const Cut& b) { return a.bin < b.bin; });
-        repeated.resize(2 * marks);
+          ring_(std::max<int64_t>(delay_ > 0 ? grid.memory() : 0, keep_period ? grid.bins : 0)),
+          cuts_(cuts_of(grid)) {
+        repeated.resize(2 * std::min<int32_t>(kMarks, grid.bins));
     }
 
     N armed{};                // at the start of the period, then at its end
@@ -83,11 +95,6 @@ class Recursion {
     }
 
  private:
-    struct Cut {
-        int32_t bin;
-        bool mark;
-    };
-
     int64_t slot(int64_t bin) const { return bin % static_cast<int64_t>(ring_.size()); }
 
     // Registrations of global bin `g`, which may lie before the exposure.

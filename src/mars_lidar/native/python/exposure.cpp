@@ -7,6 +7,7 @@
 #include <nanobind/stl/string.h>
 
 #include "lanes/kernels.h"
+#include "lanes/lanes.h"
 #include "laws/exposure_kernel.h"
 #include "python/bindings.h"
 #include "python/watched.h"
@@ -114,8 +115,14 @@ void moments(const ExposureGrid& grid, const BoundLight& light, Matrix<double> c
             if (block.phase[p] < (p ? block.phase[p - 1] : 0) || block.phase[p] > grid.bins)
                 throw nb::value_error("phase must be ascending edges of the grid");
     }
-    run_entries(block, settled, (block.correction ? 2 : 1) * (kExposureOrders + 1), MARS_KERNELS(exposure_moments_),
-                threads, level, progress);
+    const int64_t numbers = (block.correction ? 2 : 1) * (kExposureOrders + 1);
+    if (light.rates)
+        run_entries(
+            block, settled, numbers,
+            {{"", true, MARS_JOIN(kDoubles_, MARS_BASE_LEVEL), MARS_JOIN(exposure_paralyzable_, MARS_BASE_LEVEL)}},
+            threads, "", progress);
+    else
+        run_entries(block, settled, numbers, MARS_KERNELS(exposure_moments_), threads, level, progress);
 }
 
 void stationary(const ExposureGrid& grid, const BoundLight& light, Matrix<double> histogram, Vector<int64_t> settled,

@@ -167,6 +167,10 @@ def test_statistics_are_those_of_their_definition(dead: float) -> None:
         (13.4, 0.7, 230.0, 5000, 504),
         (8.0, 0.2, 75.0, 2000, 200),  # three photons in the brightest bin
         (5.0, 0.1, 75.0, 1000, 200),
+        pytest.param(  # armed for one dead time in all
+            *(1.0, 8.0, 2030.0, 5000, 100),
+            marks=pytest.mark.filterwarnings("ignore:the bins of 1 ns bias the estimates"),
+        ),
     ],
 )
 def test_long_dead_times_and_bright_pulses_are_no_misfits(

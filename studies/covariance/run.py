@@ -378,7 +378,7 @@ def moment_matrices(chain: PhaseChain) -> tuple[FloatArray, FloatArray, FloatArr
 def _parts(cell: Cell) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Dense P, pi, pi Q_mu - mu pi and Q_mu 1 - mu, all from matrices, in periods (3.7)."""
     chain = cell.terms.chain
-    pdf = np.asarray(cell.terms.stationary_pdf)
+    pdf = np.asarray(cell.terms.times.stationary.pdf)
     matrix, waits, _ = moment_matrices(chain)
     q_mu = matrix * waits
     mean = q_mu.sum(axis=1)

@@ -59,7 +59,7 @@ def test_a_stream_becomes_a_system_and_a_picture(at: Path, tmp_path: Path):
     out, picture = tmp_path / "lab.yaml", tmp_path / "lab.png"
     words = [at / "lab.npz", "--given", "jitter_ns=0", "--cycles", 100, "-o", out, "--picture", picture]
     done = ok("calibrate", *words)
-    for word in ("signal", "dead_time_ns", "verdict", "counts", "not detected"):
+    for word in ("signal", "dead_time_ns", "verdict", "counts", "not in result"):
         assert word in done.stdout
     assert ml.System.load(out).detector.dead_time_ns == pytest.approx(50.0, abs=0.5)
     assert picture.stat().st_size > 10_000

@@ -64,7 +64,7 @@ class Estimate:
         text = f"{self.value:.4g}{interval}, {self.note}" if self.note else measured(self.value, self.error)
         least, most = (measured(end, self.error).split()[0] for end in (self.least, self.most))
         wider = self.least < self.low or self.most > self.high
-        return text + f"; {least} to {most} with an effect not detected" * wider
+        return f"{text}; {least} to {most} with a further effect" if wider else text
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ class Suspect:
 
 @dataclass(frozen=True)
 class Limit:
-    """An effect that was not detected: 95 % upper limit in units of `name`, and the estimates of a fit with it.
+    """An effect that is not in the result: 95 % upper limit in units of `name`, and the estimates of a fit with it.
 
     `ranges`: their 95 % intervals, where these extend beyond those without it by more than the stated error. The limit
     of a paralyzable detector is 1, if it fits as well; that of a fit that did not converge is NaN.
@@ -130,7 +130,7 @@ class Calibration:
     suspects
         Effects and deviations beyond the plain model, the most significant first.
     limits
-        Effects that were not detected, each with its upper limit.
+        Effects that are not in the result, each with its upper limit.
     drift
         Light and delay by parts of the recording, or None for a short one.
     system, flux
@@ -445,7 +445,7 @@ class _Run:
     def first(self) -> Fitted:
         """The plain model, from other starts and simulated streams until it converges with a significant pulse.
 
-        The phases have a bright window (`start.brightest_window`), so that a fit without a pulse is a bad one.
+        The phases have a bright window (`brightest_window`), so that a fit without a pulse is a bad one.
         """
         tried: list[tuple[Fit, Fitted]] = []
         while len(tried) < self.fit.effort.attempts and not (tried and tried[-1][1].converged and tried[-1][1].lit):
@@ -506,10 +506,8 @@ class _Run:
             if drift.flickers:
                 words = "flicker of the light, counts relative"
                 named.append(Suspect(words, drift.flicker_z, drift.flicker, np.nan, np.nan, option, included=False))
-        families = {suspect.name for suspect in named}
-        for score in (trial.score for trial in trials):
-            if score.z > suspects.clear(trials) and score.effect.words not in families:
-                families.add(score.effect.words)
+        for score in {trial.effect.words: trial.score for trial in reversed(trials)}.values():  # the largest of a kind
+            if score.z > suspects.clear(trials):
                 words, option = score.effect.words, f"given {score.effect.names[0]}"
                 named.append(Suspect(words, score.z, score.size, score.error, np.nan, option, included=False))
         if p < min(self.level, FALSE_ALARM) and not any(not suspect.included for suspect in named):
@@ -633,7 +631,7 @@ def _at_bounds(fitted: Fitted, covariance: FloatArray, drawn: FloatArray) -> lis
 
 
 def _limit(trial: Trial, estimates: dict[str, Estimate], drift: Drift | None) -> Limit:
-    """Upper limit of an effect that was not detected, and the estimates of a fit with it where they differ."""
+    """Upper limit of an effect that is not in the result, and the estimates of a fit with it where they differ."""
     name, words, final = trial.effect.names[0], trial.effect.words, trial.final
     if final is None or final.p_value < FALSE_ALARM:
         return Limit(name, words, float("nan"))

@@ -30,8 +30,8 @@ class Score:
 
     @property
     def z(self) -> float:
-        """Standard deviations above zero; no effect has a negative size."""
-        return self.size / self.error
+        """Standard deviations above zero; no effect has a negative size, and one that is on or off none beyond 1."""
+        return min(self.size, 1.0 if self.effect.onoff else np.inf) / self.error
 
 
 def counts_of(fit: Fit, fitted: Fitted, model: Model, theta: FloatArray) -> tuple[FloatArray, float]:
@@ -116,14 +116,13 @@ class Trial:
 
 
 def alternatives(trials: list[Trial]) -> list[Trial]:
-    """Effects that a stream does not show and yet may have: of each kind that is not significant, the refit with it.
+    """Effects that are not in the result and yet may be in the stream: of each kind, the refit with it.
 
     A score does not give their size: a dead time or background that has absorbed an effect leaves hardly any residual,
     and that is not linear in the size. Of afterpulses, the delay of the refit is that of the recording. A paralyzable
     detector, of size 1, is one of them if the 95 % upper limit of its score is not below 1.
     """
-    quiet = [trial for trial in trials if trial.score.z <= clear(trials)]
-    possible = [t for t in quiet if not t.effect.onoff or t.score.size + 1.645 * t.score.error > 1.0]
+    possible = [t for t in trials if not t.effect.onoff or t.score.size + 1.645 * t.score.error > 1.0]
     return list({t.effect.names[0]: t for t in sorted(possible, key=lambda t: t.effect.start[-1])}.values())
 
 
@@ -173,10 +172,11 @@ def refitted(fit: Fit, fitted: Fitted, plain: FloatArray, trials: list[Trial]) -
             continue
         along = _score(fit, fitted, plain, final.model, final.theta, score.effect)
         error = _error_of(final, size)
-        z = max(score.z, along.z, final.theta[size] / error if error else 0.0)
-        clearly = z > most or (final.p_value * _MISFIT > fitted.p_value and (z > limit or not error))
+        explained = min(along.size, final.theta[size])  # what is beyond the size of the refit is not the effect's
+        z = max(score.z, explained / along.error, final.theta[size] / error if error else 0.0)
+        fits = final.p_value * _MISFIT > fitted.p_value and (z > clear(trials[:1], _TRIED) or not error)
         better = best is None or final.misfit_z < best[0].misfit_z
-        if final.theta[size] > 0.0 and clearly and better:
+        if final.theta[size] > 0.0 and (z > most or fits) and better:
             best = final, score.effect, z
     if best is None:
         return None

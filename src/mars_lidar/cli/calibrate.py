@@ -302,7 +302,7 @@ def fit_rows(result: Calibration) -> list[tuple[str, str]]:
         rows.append(("light", f"free shape of {result.waveform.size} bins, {result.waveform.sum():.6g} a period"))
     for limit in result.limits:  # with the ranges of which it sets an end
         sets = {k: r for k, r in limit.ranges.items() if {*r} & {result.estimates[k].least, result.estimates[k].most}}
-        rows.append(("not detected", str(replace(limit, ranges=sets))))
+        rows.append(("not in result", str(replace(limit, ranges=sets))))
     if result.drift is not None:
         drift = result.drift
         for k, name in enumerate(drift.names):

@@ -18,14 +18,20 @@ struct PulseBins {
     int64_t first = 0, bins = 0;
     BinValues energy, slope;  // padded_length(bins), and room for the kernel
 
-    // Whatever lies between `low` and `high` after the delay.
-    void set(const HistogramRecord& r, double delay, double low, double high) {
-        const double n = static_cast<double>(r.bins), bin = 1.0 / n;
+    // Which bins lie between `low` and `high` after the delay; returns the first, in periods before or after as well.
+    int64_t place(const HistogramRecord& r, double delay, double low, double high) {
+        const double n = static_cast<double>(r.bins);
         const int64_t from = static_cast<int64_t>(std::floor((delay + low) * n));
         const int64_t end = static_cast<int64_t>(std::ceil((delay + high) * n));
         bins = std::min(r.bins, std::max<int64_t>(end - from, 1));
         first = from % r.bins;
         if (first < 0) first += r.bins;
+        return from;
+    }
+    // And what of the pulse lies in them.
+    void set(const HistogramRecord& r, double delay, double low, double high) {
+        const double bin = 1.0 / static_cast<double>(r.bins);
+        const int64_t from = place(r, delay, low, high);
         const int64_t length = padded_length(bins), apart = r.gated() ? length : 1,
                       points = padded_length(bins + apart);
         energy.resize(points + kBinsTogether);

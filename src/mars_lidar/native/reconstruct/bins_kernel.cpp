@@ -59,6 +59,13 @@ struct Passes {
         }
         none = 1.0 - q;
     }
+    // Of the vector from bin i on.
+    MARS_INLINE Passes(const double* passed, int64_t bins, int64_t i)
+        : quiet(reals(passed + i)),
+          fired(reals(passed + bins + i)),
+          q(reals(passed + 2 * bins + i)),
+          dq(reals(passed + 3 * bins + i)),
+          none(1.0 - q) {}
 };
 
 struct Term {
@@ -72,9 +79,8 @@ MARS_INLINE Term poisson_term(const Real& h, const Real& armed, const Real& l) {
             armed * inverse};
 }
 
-MARS_INLINE Term passed_term(const Real& h, const Real& armed, const Real& rearmed, const Real& l, bool by_time) {
+MARS_INLINE Term passed_term(const Real& h, const Real& armed, const Real& rearmed, const Passes& pass, bool by_time) {
     const Real zero = splat(0.0), one = splat(1.0);
-    const Passes pass(l);
     const Real all = armed + rearmed, time = armed + 0.5 * rearmed, silent_passes = larger(all - h, zero);
     const RealMask open = time > 1e-12;
     const Real passes = choose(open, all, one), armed_time = choose(open, time, one),
@@ -116,14 +122,18 @@ BinSums terms_of(const TermsBlock& of) {
             ds = reals(of.slope + i);
         }
         light = of.light ? reals(of.light + i) : of.signal * s + of.flat * share;
-        const Term term =
-            poisson ? poisson_term(h, armed, light) : passed_term(h, armed, reals(of.rearmed + i), light, of.by_time);
+        const Term term = poisson ? poisson_term(h, armed, light)
+                                  : passed_term(h, armed, reals(of.rearmed + i),
+                                                of.alike    ? Passes(of.passed, kBinsTogether, p * kReals)
+                                                : of.passed ? Passes(of.passed, of.bins, i)
+                                                            : Passes(light),
+                                                of.by_time);
         value[p] = value[p] + term.value;
         if (of.score) {
             put(of.score + i, term.score);
             put(of.info + i, term.info);
+            return;
         }
-        if (!of.energy) return;
         const Real rows[3] = {s, share, ds};
         int place = 0;
         for (int a = 0; a < 3; ++a) {
@@ -177,6 +187,16 @@ void MARS_JOIN(pulse_energy_, MARS_LEVEL)(const EnergyBlock& of) {
     for (int64_t i = 0; i < of.bins; i += kReals) {
         put(of.energy + i, larger(reals(of.energy + i + of.apart) - reals(of.energy + i), splat(0.0)));
         put(of.density + i, reals(of.density + i) - reals(of.density + i + of.apart));
+    }
+}
+
+void MARS_JOIN(bin_passes_, MARS_LEVEL)(const PassesBlock& of) {
+    for (int64_t i = 0; i < of.bins; i += kReals) {
+        const Real share = of.share ? reals(of.share + i) : splat(1.0);
+        const Real energy = of.energy ? reals(of.energy + i) : splat(0.0);
+        const Passes pass(of.signal * energy + of.flat * share);
+        const Real columns[kPassColumns] = {pass.quiet, pass.fired, pass.q, pass.dq};
+        for (int k = 0; k < kPassColumns; ++k) put(of.passed + k * of.bins + i, columns[k]);
     }
 }
 

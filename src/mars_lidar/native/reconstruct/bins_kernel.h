@@ -26,10 +26,22 @@ struct EnergyBlock {
     double *energy, *density;
 };
 
-// (R9) of bins of `light` photons, or where that is null of signal x energy + flat x share, share 1 where null.
+// What becomes of a pass of each bin (R7) of signal x energy + flat x share photons, energy 0 and share 1 where null: armed,
+// P(none) and P(one); re-armed, P(one) and its derivative. `passed` (kPassColumns, bins).
+constexpr int kPassColumns = 4;
+struct PassesBlock {
+    const double *energy, *share;
+    double signal, flat;
+    int64_t bins;
+    double* passed;
+};
+
+// (R9) of bins of `light` photons, or where that is null of signal x energy + flat x share, energy 0 and share 1 where null.
+// `passed` (kPassColumns, bins), of `alike` bins (kPassColumns, kBinsTogether), or null: computed.
 struct TermsBlock {
     const double *count, *armed, *rearmed, *light;
-    const double *energy, *slope, *share;
+    const double *energy, *slope, *share, *passed;
+    bool alike;
     int64_t bins;
     double signal, flat;
     bool poisson;          // dead times below one bin: a bin may register again
@@ -38,7 +50,7 @@ struct TermsBlock {
 };
 
 // The logarithm of the likelihood; and its derivatives by S, flat and delay / S, with Fisher's information: of (S, S),
-// (flat, S), (flat, flat), (delay, S), (delay, flat), (delay, delay). They are sums of the terms with `energy`.
+// (flat, S), (flat, flat), (delay, S), (delay, flat), (delay, delay). They are sums of the terms without `score`.
 struct BinSums {
     double value = 0.0, score[3] = {}, info[6] = {};
 };
@@ -108,6 +120,7 @@ MARS_DECLARE_KERNEL(TangentSums, bin_tangent_, const TangentBlock& block)
 MARS_DECLARE_KERNEL(ChangeSums, bin_change_, const ChangeBlock& block)
 MARS_DECLARE_KERNEL(void, arm_bins_, const ArmBlock& block)
 MARS_DECLARE_KERNEL(void, pulse_energy_, const EnergyBlock& block)
+MARS_DECLARE_KERNEL(void, bin_passes_, const PassesBlock& block)
 MARS_DECLARE_KERNEL(BinSums, bin_terms_, const TermsBlock& block)
 MARS_DECLARE_KERNEL(void, bin_products_, const ProductsBlock& block)
 MARS_DECLARE_KERNEL(void, bin_law_, const LawBlock& block)

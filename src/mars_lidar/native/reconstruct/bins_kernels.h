@@ -8,6 +8,7 @@ namespace mars {
 struct BinsKernels {
     void (*arm)(const ArmBlock&) = kernel_at<const ArmBlock&>("", MARS_KERNELS(arm_bins_));
     void (*energy)(const EnergyBlock&) = kernel_at<const EnergyBlock&>("", MARS_KERNELS(pulse_energy_));
+    void (*passes)(const PassesBlock&) = kernel_at<const PassesBlock&>("", MARS_KERNELS(bin_passes_));
     BinSums (*terms)(const TermsBlock&) = kernel_at<const TermsBlock&, BinSums>("", MARS_KERNELS(bin_terms_));
     void (*products)(const ProductsBlock&) = kernel_at<const ProductsBlock&>("", MARS_KERNELS(bin_products_));
     void (*law)(const LawBlock&) = kernel_at<const LawBlock&>("", MARS_KERNELS(bin_law_));

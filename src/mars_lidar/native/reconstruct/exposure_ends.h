@@ -74,16 +74,20 @@ class ExposureEnds {
         }
     }
 
-    // The bins that are covered with a pulse at `delay`.
-    void illuminate(const HistogramRecord& r, double delay, PulseBins& pulse) const {
+    // The bins that are covered with a pulse at `delay`, and what becomes of a pass of each.
+    void illuminate(const HistogramRecord& r, double delay, double signal, double flat, PulseBins& pulse,
+                    BinValues& passed) const {
         pulse.set(r, delay, low - delay, high - delay);
+        const int64_t padded = static_cast<int64_t>(run_.count.size());
+        passed.resize(kPassColumns * padded);
+        bins_kernels().passes({pulse.energy.data(), run_.shares(), signal, flat, padded, passed.data()});
     }
     // Their likelihood with the passes of choice c.
-    BinSums terms(int c, double signal, double flat, const PulseBins& pulse) const {
+    BinSums terms(int c, const PulseBins& pulse, const BinValues& passed) const {
         const int64_t padded = static_cast<int64_t>(run_.count.size());
         return bins_kernels().terms({run_.count.data(), armed_.data() + c * padded, run_.rearmed.data(), nullptr,
-                                     pulse.energy.data(), pulse.slope.data(), run_.shares(), padded, signal, flat,
-                                     false, false, nullptr, nullptr});
+                                     pulse.energy.data(), pulse.slope.data(), run_.shares(), passed.data(), false,
+                                     padded, 0.0, 0.0, false, false, nullptr, nullptr});
     }
 
     int count = 0;

@@ -69,25 +69,28 @@ class PixelLikelihood {
         Likelihood out;
         const double n = static_cast<double>(r_.bins), flat = background / n, scale[3] = {1.0, 1.0 / n, signal};
         whole = whole || whole_ || (expanded_ && flat > 2.0 * BackgroundSeries::kMost);
-        double low = r_.pulse.low, high = low + (whole ? 1.0 : r_.pulse.span());
-        if (ends.count > 0 && !whole) {  // always the same bins, or the mixture would jump where the pulse leaves one
+        double low = r_.pulse.low, high = low + r_.pulse.span();
+        if (ends.count > 0) {  // always the same bins, or the mixture would jump where the pulse leaves one
             low = std::min(low, ends.low - delay);
             high = std::max(high, ends.high - delay);
         }
-        pulse_.set(r_, delay, low, high);
+        pulse_.place(r_, delay, low, high);
         const OpenSums pulsed = sums(pulse_.first, pulse_.bins);
         const double count = std::max(all_.count - pulsed.count, 0.0), time = all_.time - pulsed.time;
         const double shares = all_.log_shares - pulsed.log_shares, bins = all_.bins - pulsed.bins;
         if (ends.count == 0 || !ends.covers(r_, pulse_)) {
+            pulse_.set(r_, delay, low, high);
             run_.set(r_, *passes_, pulse_.first, pulse_.bins);
             if (ends.count > 0) ends.leave_out(r_, pulse_, run_);
             out.add(bins_kernels().terms({run_.count.data(), run_.armed.data(), run_.rearmed.data(), nullptr,
-                                          pulse_.energy.data(), pulse_.slope.data(), run_.shares(),
+                                          pulse_.energy.data(), pulse_.slope.data(), run_.shares(), nullptr, false,
                                           static_cast<int64_t>(run_.count.size()), signal, flat, r_.below_bin(), true,
                                           nullptr, nullptr}),
                     scale);
         }
-        if (!whole && time > 0.0) {  // (R10)
+        if (whole) {
+            add_outside(flat, scale, out);
+        } else if (time > 0.0) {  // (R10)
             const double dl[3] = {0.0, 1.0 / n, 0.0};
             double sum = -flat * time, slope = -time, curve = -time / flat;
             if (expanded_) {
@@ -104,10 +107,10 @@ class PixelLikelihood {
             out.add(count / flat + slope, -curve, dl);
         }
         if (ends.count > 0) {
-            ends.illuminate(r_, delay, pulse_);
+            ends.illuminate(r_, delay, signal, flat, pulse_, passed_);
             each_.assign(ends.count, {});
             for (int c = 0; c < ends.count; ++c) {
-                each_[c].add(ends.terms(c, signal, flat, pulse_), scale);
+                each_[c].add(ends.terms(c, pulse_, passed_), scale);
                 if (!ends.everywhere || whole || !(time > 0.0)) continue;
                 // a pass more in each bin outside, which registers as those that are counted
                 const double moved = ends.shift[c] * std::max(bins, 0.0);
@@ -126,6 +129,21 @@ class PixelLikelihood {
         OpenSums out = open_sums(r_, *passes_, first, straight);
         if (straight < bins) out.add(open_sums(r_, *passes_, 0, bins - straight));
         return out;
+    }
+
+    // Adds the bins that the pulse does not reach, one by one.
+    void add_outside(double flat, const double* scale, Likelihood& out) {
+        const int64_t from = pulse_.first + pulse_.bins;
+        if (pulse_.bins == r_.bins) return;
+        run_.set(r_, *passes_, from < r_.bins ? from : from - r_.bins, r_.bins - pulse_.bins);
+        const double* const share = run_.shares();
+        const int64_t bins = static_cast<int64_t>(run_.count.size()), unlike = share ? bins : kBinsTogether;
+        passed_.resize(kPassColumns * unlike);
+        bins_kernels().passes({nullptr, share, 0.0, flat, unlike, passed_.data()});
+        out.add(bins_kernels().terms({run_.count.data(), run_.armed.data(), run_.rearmed.data(), nullptr, nullptr,
+                                      nullptr, share, passed_.data(), !share, bins, 0.0, flat, r_.below_bin(), true,
+                                      nullptr, nullptr}),
+                scale);
     }
 
     // Adds the mixture of `each` (R9a): gradient and information are means over what is likely.
@@ -154,6 +172,7 @@ class PixelLikelihood {
     OpenSums all_;
     PulseBins pulse_;
     BinRun run_;
+    BinValues passed_;  // see ExposureEnds
     std::vector<Likelihood> each_;
     BackgroundSeries series_;
     bool whole_ = false, expanded_ = false;  // every bin as those of the pulse; background alone by the series

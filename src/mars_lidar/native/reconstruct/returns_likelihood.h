@@ -131,8 +131,8 @@ class ReturnsLikelihood {
         }
         point.value += bins_kernels()
                            .terms({run_.count.data() + from, run_.armed.data() + from, run_.rearmed.data() + from,
-                                   light, nullptr, nullptr, nullptr, bins, 0.0, 0.0, r_.below_bin(), true,
-                                   score_.data() + from, info_.data() + from})
+                                   light, nullptr, nullptr, nullptr, nullptr, false, bins, 0.0, 0.0, r_.below_bin(),
+                                   true, score_.data() + from, info_.data() + from})
                            .value;
         bins_kernels().products({score_.data() + from, info_.data() + from, rows, number, bins, sums, products});
         const double* product = products;

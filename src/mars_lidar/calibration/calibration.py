@@ -445,7 +445,7 @@ class _Run:
     def first(self) -> Fitted:
         """The plain model, from other starts and simulated streams until it converges with a significant pulse.
 
-        The phases have a bright window (`start.brightest_window`), so that a fit without a pulse is a bad one.
+        The phases have a bright window, so that a fit without a pulse is a bad one.
         """
         tried: list[tuple[Fit, Fitted]] = []
         while len(tried) < self.fit.effort.attempts and not (tried and tried[-1][1].converged and tried[-1][1].lit):
@@ -506,10 +506,8 @@ class _Run:
             if drift.flickers:
                 words = "flicker of the light, counts relative"
                 named.append(Suspect(words, drift.flicker_z, drift.flicker, np.nan, np.nan, option, included=False))
-        families = {suspect.name for suspect in named}
-        for score in (trial.score for trial in trials):
-            if score.z > suspects.clear(trials) and score.effect.words not in families:
-                families.add(score.effect.words)
+        for score in {trial.effect.words: trial.score for trial in reversed(trials)}.values():  # the largest of a kind
+            if score.z > suspects.clear(trials):
                 words, option = score.effect.words, f"given {score.effect.names[0]}"
                 named.append(Suspect(words, score.z, score.size, score.error, np.nan, option, included=False))
         if p < min(self.level, FALSE_ALARM) and not any(not suspect.included for suspect in named):

@@ -6,46 +6,76 @@ something depend on the machine, and they name it.
 
 A study is a folder: `run.py` computes what its report states and draws, `report.md.jinja` is the report. Some folders
 hold several studies of one subject, a module and a template of its name for each. What they share is in `common`. All
-run alike: `run(request)` of the module returns the facts that the template states, among them ``rows`` of the CSV
-file and ``figures`` by name; what writes them is here.
+run alike: `run(settings, request)` of the module, with its `FULL` or `QUICK` settings, returns the facts that the
+template states, among them ``rows`` of the CSV file and ``figures`` by name; `common.report.make` writes them.
 """
 
 from __future__ import annotations
 
 import importlib
 import re
-import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
+
+from cyclopts import Parameter
+from cyclopts.types import ExistingDirectory, ExistingFile
+
+from mars_lidar.cli.options import Integer, OutPath, options
 
 Facts = dict[str, Any]
 Tell = Callable[[str], object]
 
 
-@dataclass(frozen=True)
+@options
 class Request:
-    """What is asked of a study: output folder, quick or full, reference data, who hears of progress.
+    """What is asked of a study; `tell` hears of progress.
 
-    `truth` is the engine whose simulation the study "count-law" takes for true; `stream` a measured photon stream for
-    the study "hardware"; `config` the size of "downstream"; `seed` and `systems` another sweep, and its size, of the
-    studies "domain" and "long-exposures", `seed` also other scenes for the coverage in the study "image"; `rgbd` a
-    folder of RGB-D pairs, `captures` one of measured cubes and `drunet` a file of weights of deepinv's DRUNet for it.
+    Options
+    -------
+    out : DIR
+        Folder to write into, made if missing. [default: study-results]
+    quick
+        Small grids, few realizations: a preview in seconds, not for citation.
+    data : DIR
+        Folder of the reference cases, *.json (studies law, joint-covariance).
+    stream : FILE
+        Measured photon stream: a .mat with times in units of 64 ps (study hardware).
+    truth : {sequential, exact}
+        Reference engine (study count-law): sequential shares no code with the laws, exact is several times faster.
+        [default: sequential]
+    config : {small, full, held-out}
+        Size of the study downstream: some five minutes of one core, or some twenty; with --quick a tiny one, seconds.
+        [default: small]
+    seed
+        Seed of the scenes for coverage (study image).
+    rgbd : DIR
+        Folder of RGB-D pairs, NAME_depth.png and NAME_colors.png or Middlebury folders (study image).
+    captures : DIR
+        Folder of measured cubes, .zarr, .h5 or .npz, as `mars_lidar.io.save` writes them (study image).
+    drunet : FILE
+        Weights of a DRUNet of one channel, such as deepinv's drunet_deepinv_gray_finetune_26k.pth (study image;
+        without, a small one is trained first).
     """
 
-    out: Path
+    out: OutPath = Path("study-results")
     quick: bool = False
-    data: Path | None = None
-    tell: Tell = str
-    truth: str = "sequential"
-    stream: Path | None = None
-    config: str = "small"
-    seed: int | None = None
-    systems: int | None = None
-    rgbd: Path | None = None
-    captures: Path | None = None
-    drunet: Path | None = None
+    data: ExistingDirectory | None = None
+    stream: ExistingFile | None = None
+    truth: Literal["sequential", "exact"] = "sequential"
+    config: Literal["small", "full", "held-out"] = "small"
+    seed: Integer | None = None
+    rgbd: ExistingDirectory | None = None
+    captures: ExistingDirectory | None = None
+    drunet: ExistingFile | None = None
+    tell: Annotated[Tell, Parameter(parse=False)] = str
+
+    def cases(self) -> list[Path]:
+        """Files of the reference cases, none without `data`."""
+        paths = sorted(self.data.glob("*.json")) if self.data else []
+        if self.data and not paths:
+            raise ValueError(f"data must be a folder with *.json cases, got {str(self.data)!r}")
+        return paths
 
 
 class OtherRunsError(ValueError):
@@ -67,15 +97,10 @@ STUDIES = _studies()
 
 
 def run(name: str, request: Request) -> list[Path]:
-    """Run a study, and write NAME.md, NAME.csv and its figures; returns the paths written."""
-    from mars_lidar.plot.style import style
-    from studies.common.report import write
+    """Run a study, imported when it is asked for, and write its report; returns the paths written."""
+    from studies.common.report import make
 
-    study = importlib.import_module(STUDIES[name][0])  # imported when it is asked for
-    began = time.monotonic()
-    with style():
-        facts = study.run(request)
-        return write(request, name.replace("-", "_"), study, {"spent": time.monotonic() - began} | facts)
+    return make(request, name, importlib.import_module(STUDIES[name][0]))
 
 
 __all__ = ["STUDIES", "Facts", "OtherRunsError", "Request", "Tell", "run"]

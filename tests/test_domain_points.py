@@ -1,6 +1,6 @@
 """Points of the declared domain where numbers were once wrong, or an exception told nobody what to do; by name.
 
-Found by the study "domain" (`studies.domain`) and by hand. Each stays here with the engine or the prediction
+Found by the sweep (`tests.domain`) and by hand. Each stays here with the engine or the prediction
 that failed, whatever became of it since: right numbers, or pixels given to another engine.
 """
 
@@ -20,9 +20,9 @@ from scipy import stats
 
 import mars_lidar as ml
 from mars_lidar.engines import ENGINES
-from studies.domain import simulator
-from studies.domain.systems import Case as Pixel
-from studies.domain.systems import draw
+from tests.domain import simulator
+from tests.domain.systems import Case as Pixel
+from tests.domain.systems import draw
 
 
 def _system(dead: float, sigma: float, bins: int, cycles: int, start: str = "armed") -> ml.System:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics.count_pmf import Pmf
@@ -59,20 +58,6 @@ def g_test(law: Pmf, sample: Pmf, size: int, *, any_mean: bool = False) -> float
     if any_mean:
         square -= float(((o - e) * d / e).sum()) ** 2 / max(float((d**2 / e).sum()), 1e-300)
     return float(chi2.sf(max(square, 0.0), e.size - 1 - any_mean))
-
-
-def neighbours(expected: FloatArray, least: float) -> NDArray[np.int64]:
-    """First index (groups,) of groups of neighbouring cells with an expected sum of at least `least`.
-
-    `expected` is (n,); cells remaining at the end join the last group.
-    """
-    below, starts, held = np.cumsum(expected, dtype=np.float64), [0], 0.0
-    while True:
-        end = int(np.searchsorted(below, held + least)) + 1
-        if end >= below.size or below[-1] - below[end - 1] < least:
-            return np.array(starts, np.int64)
-        starts.append(end)
-        held = float(below[end - 1])
 
 
 def mean_score(law_mean: float, law_variance: float, mean: float, size: int) -> float:

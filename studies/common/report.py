@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import csv
 import datetime
-import importlib
 import math
 import platform
 import re
+import time
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.machine import load, processor
 from mars_lidar._base.imports import needed
+from mars_lidar.plot.style import style
 
 if TYPE_CHECKING:
     from studies import Request
@@ -27,34 +28,38 @@ Row = Mapping[str, Any]
 MAX_FIGURE_BYTES = 200_000
 
 
-def write(request: Request, name: str, study: ModuleType, facts: Mapping[str, Any]) -> list[Path]:
-    """Write NAME.md, of the fact ``rows`` NAME.csv, and of each of ``tables`` NAME_KEY.csv; one of no rows is not kept.
+def make(request: Request, name: str, study: ModuleType, settings: Any = None) -> list[Path]:
+    """Run a study, by its settings for the request or by others, and write its report; returns all paths.
 
-    The fact ``figures`` holds figures by KEY, which become NAME_KEY.png, that of the empty key NAME.png; the template
-    gets their paths. Returns all paths.
+    Of its facts ``rows`` become NAME.csv, and each of ``tables`` NAME_KEY.csv; one of no rows is removed. ``figures``
+    by KEY become NAME_KEY.png, that of the empty key NAME.png; the template gets their paths.
 
-    The Markdown is made of the Jinja template beside the module `study`: that of its name, ``report.md.jinja`` beside a
-    ``run.py``. It gives the `facts`; `study` there is the module with its constants, and those of a ``settings.py``
-    beside it.
+    NAME.md is made of the Jinja template beside the module `study`: that of its name, ``report.md.jinja`` beside a
+    ``run.py``. It gives the facts; `s` there are the settings, `study` is the module with its constants.
     """
-    text, module = request.out / f"{name}.md", Path(str(study.__file__))
-    settings = f"{study.__package__}.settings"
-    shared = vars(importlib.import_module(settings)) if module.with_name("settings.py").exists() else {}
-    names = SimpleNamespace(**{**shared, **vars(study)})
+    name, module, began = name.replace("-", "_"), Path(str(study.__file__)), time.monotonic()
+    if settings is None:
+        settings = study.QUICK if request.quick else study.FULL
+    with style():
+        facts = study.run(settings, request)
+        drawn: Mapping[str, Figure] = facts.get("figures", {})
+        figures = [save_figure(_beside(request, name, key, "png"), figure) for key, figure in drawn.items()]
+    facts = {"study": study, "s": settings, "spent": time.monotonic() - began, **facts, "figures": figures}
     template = module.with_name(f"{'report' if module.stem == 'run' else module.stem}.md.jinja")
-    drawn: Mapping[str, Figure] = facts.get("figures", {})
-    figures = [
-        save_figure(request.out / f"{f'{name}_{key}' if key else name}.png", figure) for key, figure in drawn.items()
-    ]
-    text.write_text(render(request, template, {"study": names, **facts, "figures": figures}), encoding="utf-8")
+    text = _beside(request, name, "", "md")
+    text.write_text(render(request, template, facts), encoding="utf-8")
     paths = [text, *figures]
     for key, rows in {"": facts.get("rows", ()), **facts.get("tables", {})}.items():
-        path = request.out / f"{f'{name}_{key}' if key else name}.csv"
+        path = _beside(request, name, key, "csv")
         if rows:
             paths.append(save_csv(path, rows))
         else:
             path.unlink(missing_ok=True)
     return paths
+
+
+def _beside(request: Request, name: str, key: str, suffix: str) -> Path:
+    return request.out / f"{name}{'_' * bool(key)}{key}.{suffix}"
 
 
 def render(request: Request, template: Path, facts: Mapping[str, Any]) -> str:

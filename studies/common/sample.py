@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -32,13 +32,6 @@ def system_of(
     """A system with a Gaussian pulse; 1024 bins are the statistics grid of the chain."""
     pulse, detector = GaussianPulse(sigma_ns=sigma_ns), Detector(dead_time_ns=dead_ns)
     return System(period_ns=period_ns, cycles=cycles, bins=bins, pulse=pulse, detector=detector, start=start)
-
-
-def settings_of(system: System, light: Mapping[str, Any], exposures: int, seed: int) -> dict[str, Any]:
-    """A configuration by name: the system but for its detector, the light, and what is simulated."""
-    entries = {field.name: getattr(system, field.name) for field in fields(system) if field.name != "detector"}
-    simulated = {"exposures": exposures, "engine": "exact", "seed": seed}
-    return entries | dict(light) | simulated
 
 
 def log_points(points: int, low: float = 0.01, high: float = 10.0) -> tuple[float, ...]:

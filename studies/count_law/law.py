@@ -1,37 +1,55 @@
-"""Study "law": where each count law holds, total variation to exact simulation over flux, exposure and dead time."""
+"""Study "law": how far each count law is from the exact one, over flux, exposure and dead time.
+
+With `--data` every law is also compared with reference cases that another program simulated. A case, a JSON file, holds
+``S``, ``B`` (photons per period); ``tau``, ``sigma``, ``dead`` (laser periods); ``cycles``; and ``count``,
+{registrations: realizations}: an exposure on [0, cycles), armed at 0, Gaussian pulse.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
-from mars_lidar import CountLaw, Flux, System, count_law, simulate
+from mars_lidar import CountLaw, Flux, System, count_law
 from mars_lidar._base.types import FloatArray
 from mars_lidar.plot.style import COLOURS
+from mars_lidar.statistics import ConvergenceError
 from mars_lidar.statistics.count_pmf import Pmf, gaussian_pmf, total_variation
-from studies import Facts, Request, Tell
+from mars_lidar.statistics.matched import matched_pmf, trusted
+from studies import Facts, Request
 from studies.common import distance
-from studies.common.draw import legend_below, maps
-from studies.common.report import Row, picked
+from studies.common.draw import maps
+from studies.common.report import Row
 from studies.common.sample import PERIOD_NS, log_points, system_of
 
 LAWS = {
-    "exact": "exact",
+    "matched": "four cumulants",
     "gaussian": "best Gaussian",
     "mars": "mars, centre",
     "mars_edge": "mars, edge",
     "renewal": "renewal",
     "poisson": "Poisson",
 }
-
-_ROUNDING = 1e-9  # of a law whose count is certain: its floor is 0
+AIM = 0.002  # total variation of the law of four cumulants
 FEW, STILL, VISIBLE = 10.0, 1.0, 0.01  # E N below FEW, Var N below STILL, total variation above VISIBLE
 MODERATE = 200.0  # E N from where a Poisson law is within VISIBLE of its Gaussian
+LISTED = 0.25  # of the aim: all cells would be a large file of little news
+_EDGES = (0.0, 0.2, 0.7, 2.3, 9.0, 100.0, np.inf)  # of the variance
+_WORST = 12
+_LOW, _HIGH = 1e-5, 1.0  # total variation on the colour scale
+_REFERENCE_SEED, _REFERENCE_PERIOD_NS = 20262, 100.0
+_LIMIT_Z, _LIMIT_P = 4.0, 1e-4
+KEYS = ("S", "B", "tau", "sigma", "dead", "cycles", "count")
 
 # E |z^3 - 3 z| / 12, z standard normal: total variation of the first Edgeworth term per unit of skewness
 _PER_SKEWNESS = (1.0 + 4.0 * float(np.exp(-1.5))) / (6.0 * float(np.sqrt(2.0 * np.pi)))
@@ -39,277 +57,273 @@ _PER_SKEWNESS = (1.0 + 4.0 * float(np.exp(-1.5))) / (6.0 * float(np.sqrt(2.0 * n
 
 @dataclass(frozen=True)
 class Settings:
-    """Configuration of the study: maps over (S, B) at one exposure and over (S, exposure)."""
+    """Grids over (S, B) for each dead time and number of cycles, and systems drawn at random."""
 
     signal: tuple[float, ...]
     background: tuple[float, ...]
     dead: tuple[float, ...]  # periods
     cycles: tuple[int, ...]
-    realizations: int
-    draws: int  # of the bootstrap
-    map_cycles: int = 1000
-    ratio: float = 10.0  # S / B along the exposure map
+    stationary: tuple[tuple[float, int], ...]  # dead time and cycles, again with a stationary start
+    systems: int  # drawn at random
+    pixels: int  # of each
+    draws: int  # of the bootstrap of a reference case
     sigma_ns: float = 0.5
-    seed: int = 20263
-
-    def system(self, dead: float, cycles: int) -> System:
-        """System of a map; dead time in periods."""
-        return system_of(dead * PERIOD_NS, cycles, sigma_ns=self.sigma_ns)
+    seed: int = 20272
 
 
 FULL = Settings(
-    signal=log_points(8),
-    background=log_points(8),
-    dead=(0.1875, 0.6375, 0.9765, 1.0, 1.97),
-    cycles=(10, 30, 100, 300, 1000, 3000, 10000),
-    realizations=50_000,
-    draws=2000,
+    signal=log_points(24),
+    background=log_points(20),
+    dead=(0.1, 0.5625, 0.6375, 0.95, 0.9766, 1.0, 1.53),
+    cycles=(100, 1000, 10000),
+    stationary=((0.1, 1000), (0.6375, 100), (0.9766, 1000), (1.53, 100)),
+    systems=100,
+    pixels=40,
+    draws=20_000,
 )
-
-QUICK = Settings(
-    signal=(0.05, 5.0),
-    background=(0.1, 2.0),
-    dead=(0.1875, 0.9765),
-    cycles=(10, 100),
-    realizations=2000,
-    draws=200,
-    map_cycles=100,
-)
+QUICK = Settings(log_points(4), log_points(3), (0.6375, 1.53), (100,), ((0.6375, 100),), systems=3, pixels=5, draws=500)
 
 
 @dataclass(frozen=True, eq=False)
-class Cell:
-    """One pixel: moments of its exact law, distances of every law, the sampling floor.
+class Part:
+    """Cells of one system: flux (cells,), exact cumulants (cells, 4), by law the distance to the exact one (cells,)."""
 
-    `to_simulation` and `to_exact` are total variations by law; `floor` and `limit` the mean and the 99.9 %
-    quantile of the bootstrap of the exact law; `p_value` its G-test.
-    """
-
-    signal: float
-    background: float
-    dead: float
-    cycles: int
+    kind: str  # "armed", "stationary", "random"
+    system: System
+    signal: FloatArray
+    background: FloatArray
     cumulants: FloatArray
-    to_simulation: dict[str, float]
-    to_exact: dict[str, float]
-    floor: float
-    limit: float
-    p_value: float
-    mean_score: float
-    variance_score: float
+    distance: dict[str, FloatArray]
+    trusted: NDArray[np.bool_]
 
-    def within(self, law: str) -> bool:
-        """Whether the simulation cannot be told from this law by total variation, at this sample size."""
-        return self.to_simulation[law] <= self.limit + _ROUNDING
-
-    def name(self) -> str:
-        """The cell in words."""
-        flux = f"S = {self.signal:.3g}, B = {self.background:.3g}"
-        return f"{flux}, t_d = {self.dead:g} t_r, {self.cycles} cycles"
-
-
-_LOW, _HIGH = 3e-3, 1.0  # total variation on the colour scales
-_LOW_EXACT = 1e-3  # where there is no sampling noise
-Value = Callable[[Cell], float]
-
-
-def _row(
-    settings: Settings, cells: Sequence[Cell], kind: str, value: Value
-) -> tuple[Sequence[float], list[list[list[float]]]]:
-    """Maps of a value for each dead time: S along x; B or cycles along y, whose points come first."""
-    y = settings.background if kind == "flux" else settings.cycles
-    by = {(c.dead, c.signal, c.background if kind == "flux" else c.cycles): value(c) for c in cells}
-    return y, [[[by[dead, s, b] for s in settings.signal] for b in y] for dead in settings.dead]
-
-
-def _titles(settings: Settings) -> list[str]:
-    return [f"$t_d$ = {dead:g} $t_r$" for dead in settings.dead]
-
-
-def total_variation_maps(settings: Settings, cells: Sequence[Cell], kind: str) -> Figure:
-    """Total variation to simulation: rows for the sampling floor and each law, columns for dead times."""
-    lines: list[tuple[str, Value]] = [("sampling floor", lambda cell: cell.floor)]
-    lines += [(words, lambda cell, name=name: cell.to_simulation[name]) for name, words in LAWS.items()]  # type: ignore[misc]
-    name = "B" if kind == "flux" else "cycles"
-    images = {f"{words}\n{name}": _row(settings, cells, kind, value) for words, value in lines}
-    label = "total variation to simulation"
-    return maps(8.4, settings.signal, images, _titles(settings), LogNorm(_LOW, _HIGH), label)[0]
-
-
-def gaussian_map(settings: Settings, flux: Sequence[Cell], exposure: Sequence[Cell]) -> Figure:
-    """Where the Gaussian breaks: its distance to the exact law, without noise, and why."""
-    kinds = {"B": ("flux", flux), "cycles": ("exposure", exposure)}
-    images = {
-        name: _row(settings, cells, kind, lambda cell: cell.to_exact["gaussian"])
-        for name, (kind, cells) in kinds.items()
-    }
-    norm, label = LogNorm(_LOW_EXACT, _HIGH), "total variation,\nbest Gaussian to exact law"
-    figure, axes, _ = maps(3.3, settings.signal, images, _titles(settings), norm, label)
-    for row, (kind, cells) in zip(axes, kinds.values(), strict=True):
-        for cell in cells:
-            y = cell.background if kind == "flux" else cell.cycles
-            mark = "." if cell.cumulants[0] < 10.0 else "_" if cell.cumulants[1] < 1.0 else ""
-            if mark:
-                # dark on pale, pale on dark
-                colour = COLOURS[0] if cell.to_exact["gaussian"] < 0.05 else COLOURS[5]
-                ax = row[settings.dead.index(cell.dead)]
-                ax.plot(cell.signal, y, mark, ms=2.4, color=colour, mew=0.8)
-    for mark, words in ((".", "E N < 10"), ("_", "E N at least 10, Var N < 1")):
-        axes[0, 0].plot([], [], mark, ms=4, color=COLOURS[0], label=words)
-    legend_below(figure, axes[0, :1], 2)
-    return figure
-
-
-def flux_map(settings: Settings, tell: Tell) -> list[Cell]:
-    """Cells over (S, B) and dead time at `map_cycles`."""
-    signal, background = np.meshgrid(settings.signal, settings.background, indexing="ij")
-    cells = []
-    for k, dead in enumerate(settings.dead):
-        cells += _cells(settings, signal.ravel(), background.ravel(), dead, settings.map_cycles, k)
-        tell(f"law: t_d = {dead:g} t_r, {signal.size} cells over (S, B)")
-    return cells
-
-
-def exposure_map(settings: Settings, tell: Tell) -> list[Cell]:
-    """Cells over (S, cycles) and dead time at a fixed S / B."""
-    signal = np.array(settings.signal)
-    cells = []
-    for k, dead in enumerate(settings.dead):
-        for m, cycles in enumerate(settings.cycles):
-            number = 1000 + 100 * k + m
-            cells += _cells(settings, signal, signal / settings.ratio, dead, cycles, number)
-        tell(f"law: t_d = {dead:g} t_r, {signal.size * len(settings.cycles)} cells over (S, cycles)")
-    return cells
-
-
-def _cells(
-    settings: Settings, signal: FloatArray, background: FloatArray, dead: float, cycles: int, number: int
-) -> list[Cell]:
-    """All (S, B) of one system; `number` keys its simulation and its bootstrap."""
-    system = settings.system(dead, cycles)
-    # a histogram of one bin holds nothing but the count
-    flux, seed = Flux(signal[None], background[None], 0.5 * system.period_ns), (settings.seed << 16) + number
-    cube = simulate(flux, system.replace(bins=1), realizations=settings.realizations, seed=seed)
-    counts = cube.reshape(settings.realizations, signal.size)
-    random = np.random.default_rng([settings.seed, number])
-    batch = laws_of(Flux(signal, background, 0.5 * system.period_ns), system)
-    exact = batch["exact"]
-    cells = []
-    for k in range(signal.size):
-        laws = pmfs_of(batch, k)
-        sample, size = Pmf.of_counts(counts[:, k]), settings.realizations
-        noise = distance.sampling_floor(laws["exact"], size, settings.draws, random)
-        mean, variance = float(exact.mean[k]), float(exact.variance[k])
-        cells.append(
-            Cell(
-                float(signal[k]),
-                float(background[k]),
-                dead,
-                cycles,
-                exact.cumulants[k],
-                to_simulation={name: total_variation(law, sample) for name, law in laws.items()},
-                to_exact={name: total_variation(law, laws["exact"]) for name, law in laws.items()},
-                floor=float(noise.mean()),
-                limit=float(np.quantile(noise, 0.999)),
-                p_value=distance.g_test(laws["exact"], sample, size),
-                mean_score=distance.mean_score(mean, variance, float(counts[:, k].mean(dtype=np.float64)), size),
-                variance_score=distance.variance_score(exact.cumulants[k], sample, size),
-            )
-        )
-    return cells
-
-
-def second_look(settings: Settings, cells: list[Cell], tell: Tell) -> list[tuple[Cell, Cell]]:
-    """Cells in which the exact law looked worst, each with a fresh simulation four times as large."""
-    doubtful = [c for c in cells if not c.within("exact") or c.p_value < 1.0 / len(cells)]
-    larger = replace(settings, realizations=4 * settings.realizations)
-    results = []
-    for k, cell in enumerate(doubtful):
-        signal, background = np.array([cell.signal]), np.array([cell.background])
-        results.append((cell, _cells(larger, signal, background, cell.dead, cell.cycles, 10_000 + k)[0]))
-        tell(f"law: second look at {cell.name()}")
-    return results
+    def name(self, k: int | np.intp) -> str:
+        """One cell in words."""
+        flux = f"S = {self.signal[k]:.3g}, B = {self.background[k]:.3g}"
+        return f"{flux}, t_d = {self.system.dead_time_periods:.4g} t_r, {self.system.cycles} cycles"
 
 
 def laws_of(flux: Flux, system: System) -> dict[str, CountLaw]:
     """Every law in closed form, of cells (cells,)."""
     law = partial(count_law, flux, system)
+    exact = law("exact")
+    assert exact.pmf is not None  # the longest of them, which may be refused
     marked = {"mars": law("mars"), "mars_edge": law("mars", rearm="edge")}
-    return {"exact": law("exact")} | marked | {name: law(name) for name in ("renewal", "poisson")}
+    return {"exact": exact} | marked | {name: law(name) for name in ("renewal", "poisson")}
 
 
-def pmfs_of(laws: dict[str, CountLaw], k: int) -> dict[str, Pmf]:
-    """One cell of `laws_of`, in the order of `LAWS`, the best Gaussian among them."""
-    return {name: gaussian_of(laws["exact"], k) if name == "gaussian" else pmf_of(laws[name], k) for name in LAWS}
+def pmfs_of(laws: dict[str, CountLaw]) -> Iterator[dict[str, Pmf]]:
+    """The laws of each cell: the exact one, and `LAWS` in their order."""
+    exact = laws["exact"]
+    for k, matched in enumerate(matched_pmf(exact.cumulants)):
+        pmfs = {name: Pmf(int(law.support[k, 0]), law.pmf[k]) for name, law in laws.items()}
+        pmfs |= {"matched": matched, "gaussian": gaussian_pmf(float(exact.mean[k]), float(exact.variance[k]))}
+        yield {name: pmfs[name] for name in ("exact", *LAWS)}
 
 
-def pmf_of(law: CountLaw, k: int) -> Pmf:
-    """One cell of a batched count law."""
-    return Pmf(int(law.support[k, 0]), law.pmf[k])
+def measure(kind: str, system: System, signal: FloatArray, background: FloatArray) -> Part:
+    """Distances of every law to the exact law of each cell; NaN where that takes too long."""
+    flux = Flux(signal, background, 0.5 * system.period_ns)
+    far = np.full((len(LAWS), signal.size), np.nan)
+
+    def fill(first: int, end: int) -> None:
+        try:
+            for k, pmfs in enumerate(pmfs_of(laws_of(flux[first:end], system)), first):
+                far[:, k] = [total_variation(pmfs[name], pmfs["exact"]) for name in LAWS]
+        except ConvergenceError:
+            if end - first > 1:
+                middle = (first + end) // 2
+                fill(first, middle)
+                fill(middle, end)
+
+    fill(0, signal.size)
+    cumulants = count_law(flux, system).cumulants
+    by_law = dict(zip(LAWS, far, strict=True))
+    return Part(kind, system, signal, background, cumulants, by_law, trusted(cumulants))
 
 
-def gaussian_of(exact: CountLaw, k: int) -> Pmf:
-    """The Gaussian with mean and variance of one cell of the exact law."""
-    return gaussian_pmf(float(exact.mean[k]), float(exact.variance[k]))
+def grids(settings: Settings, tell: Callable[[str], object]) -> list[Part]:
+    """The grids, armed first, then stationary."""
+    signal, background = (g.ravel() for g in np.meshgrid(settings.signal, settings.background, indexing="ij"))
+    cases = [("armed", dead, cycles) for dead in settings.dead for cycles in settings.cycles]
+    parts = []
+    for start, dead, cycles in cases + [("stationary", *case) for case in settings.stationary]:
+        system = system_of(dead * PERIOD_NS, cycles, sigma_ns=settings.sigma_ns).replace(start=start)
+        parts.append(measure(start, system, signal, background))
+        tell(f"law: t_d = {dead:g} t_r, {cycles} cycles, {start}, {signal.size} cells")
+    return parts
 
 
-def _regimes(cells: Sequence[Cell]) -> dict[str, list[Cell]]:
-    """Cells by what their count is like."""
-    tests: dict[str, Callable[[float, float], bool]] = {
-        "few photons: E N < 10": lambda mean, variance: mean < FEW,
-        "locked or saturated: E N >= 10, Var N < 1": lambda mean, variance: mean >= FEW and variance < STILL,
-        "sub-Poissonian: 1 <= Var N < E N / 4": lambda mean, variance: mean >= FEW and STILL <= variance < 0.25 * mean,
-        f"moderate: 10 <= E N < {MODERATE:g}, Var N >= E N / 4": lambda mean, variance: (
-            FEW <= mean < MODERATE and variance >= max(STILL, 0.25 * mean)
-        ),
-        f"many: E N >= {MODERATE:g}, Var N >= E N / 4": lambda mean, variance: (
-            mean >= MODERATE and variance >= 0.25 * mean
-        ),
-    }
-    return {name: [c for c in cells if test(c.cumulants[0], c.cumulants[1])] for name, test in tests.items()}
+def drawn(settings: Settings, tell: Callable[[str], object]) -> list[Part]:
+    """Systems at random: no threshold of the law of four cumulants or of `trusted` was set on them."""
+    random = np.random.default_rng(settings.seed)
+    parts = []
+    for _ in range(settings.systems):
+        dead, sigma = float(random.uniform(0.02, 2.5)), float(np.exp(random.uniform(*np.log([0.2, 3.0]))))
+        cycles = round(float(np.exp(random.uniform(*np.log([30.0, 3000.0])))))
+        signal, background = 10.0 ** random.uniform(-2.0, 1.0, (2, settings.pixels))
+        parts.append(measure("random", system_of(dead * PERIOD_NS, cycles, sigma_ns=sigma), signal, background))
+    tell(f"law: {settings.systems * settings.pixels} cells at random")
+    return parts
 
 
-def run(request: Request) -> Facts:
-    """Both maps, and a second look where the exact law looked worst."""
+class Cells:
+    """Cells of several parts together whose exact law is known; `refused`: the number of the others."""
 
-    settings = QUICK if request.quick else FULL
-    flux, exposure = flux_map(settings, request.tell), exposure_map(settings, request.tell)
-    cells = [*flux, *exposure]
-    again = second_look(settings, cells, request.tell)
-    plain = [c for c in cells if c.cumulants[0] >= FEW and c.cumulants[1] >= STILL]
-    skewness = np.array([abs(c.cumulants[2]) / c.cumulants[1] ** 1.5 for c in plain])
-    cost = [c.to_exact["mars"] - c.to_exact["gaussian"] for c in cells]
+    def __init__(self, parts: Sequence[Part]) -> None:
+        known = [np.isfinite(part.distance["matched"]) for part in parts]
+        self.refused = sum(int((~some).sum()) for some in known)
+        pairs = list(zip(parts, known, strict=True))
+        self.distance = {law: np.concatenate([part.distance[law][some] for part, some in pairs]) for law in LAWS}
+        self.cumulants = np.concatenate([part.cumulants[some] for part, some in pairs])
+        self.trusted = np.concatenate([part.trusted[some] for part, some in pairs])
+        self.cells = [(part, int(k)) for part, some in pairs for k in np.flatnonzero(some)]
+
+    def where(self, law: str, here: NDArray[np.bool_] | slice = slice(None)) -> dict[str, Any]:
+        """Of some cells and one law: the number, the median and largest distance, and where that is."""
+        far = self.distance[law][here]
+        if not far.size:
+            return {"cells": 0, "median": np.nan, "largest": np.nan, "cell": "", "beyond": 0}
+        part, k = self.cells[np.arange(len(self.cells))[here][far.argmax()]]
+        size = {"median": float(np.median(far)), "largest": float(far.max()), "cell": part.name(k)}
+        return size | {"cells": far.size, "beyond": int((far > VISIBLE).sum())}
+
+    def share(self) -> dict[str, float]:
+        """Shares within the aim, and how the criterion fares."""
+        matched, gaussian, sure = self.distance["matched"], self.distance["gaussian"], self.trusted
+        good = matched <= AIM
+        return {
+            "cells": matched.size,
+            "within": float(good.mean()),
+            "within_gaussian": float((gaussian <= AIM).mean()),
+            "worst": float(matched.max()),
+            "worst_gaussian": float(gaussian.max()),
+            "untrusted": float((~sure).mean()),
+            "missed": int((~good & sure).sum()),  # trusted, but beyond the aim
+            "needless": int((good & ~sure).sum()),  # not trusted, but within the aim
+            "worst_trusted": float(matched[sure].max(initial=0.0)),
+        }
+
+    def regimes(self) -> dict[str, NDArray[np.bool_]]:
+        """Cells by what their count is like."""
+        mean, variance = self.cumulants[:, 0], self.cumulants[:, 1]
+        some, free = mean >= FEW, variance >= np.maximum(STILL, 0.25 * mean)
+        return {
+            "few photons: E N < 10": ~some,
+            "locked or saturated: E N >= 10, Var N < 1": some & (variance < STILL),
+            "sub-Poissonian: 1 <= Var N < E N / 4": some & (variance >= STILL) & (variance < 0.25 * mean),
+            f"moderate: 10 <= E N < {MODERATE:g}, Var N >= E N / 4": some & (mean < MODERATE) & free,
+            f"many: E N >= {MODERATE:g}, Var N >= E N / 4": (mean >= MODERATE) & free,
+        }
+
+
+def run(settings: Settings, request: Request) -> Facts:
+    """The grids, the systems at random, and the reference cases if there are any."""
+    parts, others = grids(settings, request.tell), drawn(settings, request.tell)
+    armed, stationary = ([part for part in parts if part.kind == kind] for kind in ("armed", "stationary"))
+    kinds = {"grid, armed": armed, "grid, stationary": stationary, "at random": others}
+    everything, on_grid = Cells([*parts, *others]), Cells(armed)
+    variance, third = everything.cumulants[:, 1], on_grid.cumulants
+    plain = (third[:, 0] >= FEW) & (third[:, 1] >= STILL)
+    skewness = np.abs(third[plain, 2]) / third[plain, 1] ** 1.5
+    listed = [(p, k) for p, k in everything.cells if p.distance["matched"][k] > LISTED * AIM or not p.trusted[k]]
+    cases = {path.stem: _read(path) for path in request.cases()}
+    references = [row for k, (name, case) in enumerate(cases.items()) for row in compare(name, case, settings.draws, k)]
     return {
-        "s": settings,
-        "flux": flux,
-        "exposure": exposure,
-        "cells": cells,
-        "again": again,
-        "within": {law: sum(c.within(law) for c in cells) for law in LAWS},
-        "regimes": _regimes(cells),
-        "beyond": sum(not c.within("exact") for c in cells),
-        "least": min(c.p_value for c in cells),
-        "worst_mean": max(abs(c.mean_score) for c in cells if c.cumulants[1] * settings.realizations > 20),
-        "broken": [c for c in cells if c.to_exact["gaussian"] > VISIBLE],
-        "ratio": np.array([c.to_exact["gaussian"] for c in plain]) / (_PER_SKEWNESS * skewness),
-        "cost": cost,
-        "costliest": cells[int(np.argmax(cost))],
-        "nan": float("nan"),
-        "rows": [_csv_row("flux", c) for c in flux] + [_csv_row("exposure", c) for c in exposure],
-        "figures": {
-            "gaussian": gaussian_map(settings, flux, exposure),
-            "flux": total_variation_maps(settings, flux, "flux"),
-            "exposure": total_variation_maps(settings, exposure, "exposure"),
-        },
+        "kinds": {name: Cells(cells).share() for name, cells in kinds.items()},
+        "everything": everything,
+        "grid": on_grid,
+        "ratio": on_grid.distance["gaussian"][plain] / (_PER_SKEWNESS * skewness),
+        "by_dead": {dead: Cells([p for p in armed if p.system.dead_time_periods == dead]) for dead in settings.dead},
+        "by_variance": [
+            (low, high, everything.distance["matched"][here], everything.distance["gaussian"][here])
+            for low, high in pairwise(_EDGES)
+            if (here := (variance >= low) & (variance < high)).any()
+        ],
+        "worst": sorted(everything.cells, key=lambda cell: -float(cell[0].distance["matched"][cell[1]]))[:_WORST],
+        "references": references,
+        "cases": cases,
+        "rows": [_csv_row(part, k) for part, k in listed],
+        "tables": {"reference": references},
+        "figures": {"map": _draw(settings, armed)},
     }
 
 
-def _csv_row(name: str, cell: Cell) -> Row:
+def _csv_row(part: Part, k: int) -> Row:
     return {
-        "map": name,
-        **picked(cell, "signal background dead_time_periods=dead cycles"),
-        **{f"cumulant_{k + 1}": float(cell.cumulants[k]) for k in range(4)},
-        **picked(cell, "floor limit g_test_p=p_value z_mean=mean_score z_variance=variance_score"),
-        **{f"tv_simulation_{law}": cell.to_simulation[law] for law in LAWS},
-        **{f"tv_exact_{law}": cell.to_exact[law] for law in LAWS if law != "exact"},
+        "kind": part.kind,
+        "signal": float(part.signal[k]),
+        "background": float(part.background[k]),
+        "dead_time": part.system.dead_time_periods,
+        "cycles": part.system.cycles,
+        "sigma_ns": part.system.pulse.to_dict()["sigma_ns"],
+        **{f"cumulant_{n + 1}": float(part.cumulants[k, n]) for n in range(4)},
+        **{f"tv_exact_{law}": float(far[k]) for law, far in part.distance.items()},
+        "trusted": bool(part.trusted[k]),
     }
+
+
+def _draw(settings: Settings, parts: Sequence[Part]) -> Figure:
+    """Maps over S and B: columns for dead times; rows for four cumulants by cycles, then for every other law."""
+    shape, middle = (len(settings.signal), len(settings.background)), settings.cycles[len(settings.cycles) // 2]
+    by = {(round(part.system.dead_time_periods, 9), part.system.cycles): part for part in parts}
+    lines = [("matched", cycles) for cycles in settings.cycles]
+    rows, chosen = {}, []
+    for law, cycles in lines + [(law, middle) for law in LAWS if law not in ("matched", "poisson")]:
+        here = [by[round(dead, 9), cycles] for dead in settings.dead]
+        images = [part.distance[law].reshape(shape).T for part in here]
+        rows[f"{LAWS[law]},\n{cycles} cycles\nB"] = settings.background, images
+        chosen += here if law == "matched" else []
+    titles, label = [f"{dead:g} $t_r$" for dead in settings.dead], "total variation to the exact law"
+    height = 0.5 + 0.95 * len(rows)
+    figure, axes, bar = maps(height, settings.signal, rows, titles, LogNorm(_LOW, _HIGH), label)
+    for ax, part in zip(axes[: len(lines)].flat, chosen, strict=True):
+        at = ~part.trusted
+        ax.plot(part.signal[at], part.background[at], "x", ms=1.4, mew=0.4, color=COLOURS[0])
+    bar.ax.axhline(AIM, color=COLOURS[0], lw=0.8)
+    return figure
+
+
+def compare(name: str, case: dict[str, Any], draws: int, number: int) -> list[dict[str, Any]]:
+    """Every law beside one reference case, at the case's own delay; z in standard errors, p of the G-test.
+
+    ``good``: mean and variance within 4 standard errors, total variation below the limit, p above 1e-4.
+    """
+    random, period = np.random.default_rng([_REFERENCE_SEED, number]), _REFERENCE_PERIOD_NS
+    system = system_of(case["dead"] * period, case["cycles"], period_ns=period, sigma_ns=case["sigma"] * period)
+    counts, times = np.array([[int(n), int(m)] for n, m in case["count"].items()]).T
+    size = int(times.sum())
+    sample = Pmf(int(counts.min()), np.bincount(counts - counts.min(), weights=times) / size)
+    mean = float((counts * (times / size)).sum())
+    laws = laws_of(Flux([float(case["S"])], float(case["B"]), case["tau"] * period), system)
+    [pmfs] = pmfs_of(laws)
+    exact = laws["exact"].cumulants[0]
+    noise = distance.sampling_floor(pmfs["exact"], size, draws, random)
+    results = []
+    for key, pmf in pmfs.items():
+        # those that are not among the laws have mean and variance of the exact law
+        expected, variance = (float(v) for v in laws.get(key, laws["exact"]).cumulants[0, :2])
+        row: dict[str, Any] = {
+            "case": name,
+            "law": key,
+            "size": size,
+            "mean": expected,
+            "variance": variance,
+            # what the sample's mean and variance scatter by is known from the exact law
+            "z_mean": distance.mean_score(expected, float(exact[1]), mean, size),
+            "z_variance": distance.variance_score(exact, sample, size, variance),
+            "distance": total_variation(pmf, sample),
+            "floor": float(noise.mean()),
+            "limit": float(np.quantile(noise, 0.999)),
+            "p_value": distance.g_test(pmf, sample, size),
+        }
+        close = max(abs(row["z_mean"]), abs(row["z_variance"])) <= _LIMIT_Z
+        results.append(row | {"good": close and row["distance"] <= row["limit"] and row["p_value"] > _LIMIT_P})
+    return results
+
+
+def _read(path: Path) -> dict[str, Any]:
+    case: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    missing = [key for key in KEYS if key not in case]
+    if missing:
+        raise ValueError(f"reference case {path.name} must hold {', '.join(KEYS)}, it lacks {', '.join(missing)}")
+    return case

@@ -1,8 +1,15 @@
-"""Study "count-law", T1 of the MaRS paper: every simulator's count law and shape against simulation."""
+"""Study "count-law", T1 of the MaRS paper: every simulator's count law and shape against simulation.
+
+The simulators are those of the MaRS paper (arXiv 2512.04924) and ours. Those with a count law in closed form are
+asked for it; any other engine of the registry is asked for a sample.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -10,15 +17,319 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
+from mars_lidar import CountLaw, Flux, System, count_law, registration_pdf
 from mars_lidar._base.types import FloatArray
+from mars_lidar.engines import ENGINES
 from mars_lidar.plot.style import COLOURS, INK, MUTED
+from mars_lidar.statistics import photons_per_bin
+from mars_lidar.statistics.count_pmf import Pmf, kl_divergence
+from mars_lidar.statistics.matched import matched_pmf
 from mars_lidar.statistics.tolerances import TOL
-from studies import Facts, Request
-from studies.common.draw import legend_below, panels
+from studies import Facts, Request, Tell
+from studies.common.distance import wasserstein
+from studies.common.draw import panels
 from studies.common.report import Row, picked
-from studies.common.sample import PERIOD_NS
-from studies.count_law.cells import FIGURES, FULL, QUICK, SHAPES, Cell, Settings, compute, shape_sweep
-from studies.neural.simulators import simulators
+from studies.common.sample import NEAR_NS, WIDE_NS, Grid, Sample, draw, paper_grids, system_of
+
+# engines whose count law is evaluated instead of sampled, and those that are the truth
+_IN_CLOSED_FORM = ("poisson", "renewal", "mars", "exact", "sequential")
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """Of cells (cells,): mean and variance of the count, its pmfs, and the shape (cells, bins).
+
+    `sampled` counts the exposures behind it, 0 where it is evaluated.
+    """
+
+    mean: FloatArray
+    variance: FloatArray
+    pmfs: list[Pmf]
+    shape: FloatArray
+    sampled: int = 0
+
+
+_Shape = Callable[[Flux, System], FloatArray]
+_Predict = Callable[[FloatArray, FloatArray, System], Prediction]
+
+
+@dataclass(frozen=True)
+class Simulator:
+    """A simulator by name, in words, and how it is asked."""
+
+    name: str
+    words: str
+    predict: _Predict
+
+
+def simulators(sampled: int, seed: int, steps: int = 1750, pairs: int = 6000) -> list[Simulator]:
+    """All simulators; engines without a law in closed form are asked for `sampled` exposures.
+
+    The network of the neural stand-in is trained for each system, once, in so many `steps` on so many `pairs`; it is
+    left out where PyTorch is not installed.
+    """
+    chain, exposure = (partial(registration_pdf, method=method) for method in ("chain", "exposure"))
+    edge = partial(registration_pdf, method="chain", rearm="edge")
+
+    def matched(signal: FloatArray, background: FloatArray, system: System) -> Prediction:
+        """What a table holds of the exact law, and an engine with a table draws: four cumulants."""
+        flux = centred(signal, background, system)
+        cumulants, shape = count_law(flux, system, "exact").cumulants, exposure(flux, system)
+        return Prediction(cumulants[:, 0], cumulants[:, 1], matched_pmf(cumulants), shape)
+
+    def neural(signal: FloatArray, background: FloatArray, system: System) -> Prediction:
+        engine = _trained(system.replace(cycles=1, start="armed"), steps, pairs)
+        flux = centred(signal, background, system)
+        return _of_law(engine.count_law(flux, system), engine.registration_pdf(flux, system))
+
+    evaluated = [
+        Simulator("poisson", "Poisson", _by_law(arrival_shape, method="poisson")),
+        Simulator("renewal", "renewal", _by_law(chain, method="renewal")),
+        Simulator("mars_centre", "MaRS, paper's, centre", _by_law(chain, method="mars")),
+        Simulator("mars_edge", "MaRS, paper's, edge", _by_law(edge, method="mars", rearm="edge")),
+        Simulator("mars_exact", "MaRS, ours, exact law", _by_law(exposure, method="exact")),
+        Simulator("mars_matched", "MaRS, ours, four cumulants", matched),
+    ]
+    if find_spec("torch") is not None:  # the extra "learn"
+        evaluated.append(Simulator("neural", "neural, stand-in", neural))
+    others = [name for name in ENGINES if name not in _IN_CLOSED_FORM]
+    return evaluated + [Simulator(name, f"{name} (sampled)", _sampler(name, sampled, seed)) for name in others]
+
+
+def _of_law(law: CountLaw, shape: FloatArray) -> Prediction:
+    """The prediction of a batched count law (cells,)."""
+    pmfs = [Pmf(int(first), p) for first, p in zip(law.support[:, 0], law.pmf, strict=True)]
+    return Prediction(law.mean, law.variance, pmfs, shape)
+
+
+def _by_law(shape: _Shape, **law: Any) -> _Predict:
+    def predict(signal: FloatArray, background: FloatArray, system: System) -> Prediction:
+        flux = centred(signal, background, system)
+        return _of_law(count_law(flux, system, **law), shape(flux, system))
+
+    return predict
+
+
+def centred(signal: FloatArray, background: FloatArray, system: System) -> Flux:
+    """Light whose return is in the middle of the period."""
+    return Flux(signal, background, 0.5 * system.period_ns)
+
+
+def arrival_shape(flux: Flux, system: System) -> FloatArray:
+    """Shape (cells, bins) of the arrivals, which is that of the flux."""
+    shape = photons_per_bin(flux, system, bins=system.bins)
+    return np.asarray(shape / shape.sum(-1, keepdims=True), dtype=np.float64)
+
+
+@lru_cache(maxsize=8)
+def _trained(system: System, steps: int, pairs: int) -> Any:
+    from studies.neural import NeuralEngine, Training, train
+
+    return NeuralEngine(train(system, Training(steps=steps, pairs=pairs, held_out=min(500, pairs))).map)
+
+
+def _sampler(engine: str, realizations: int, seed: int) -> _Predict:
+    def predict(signal: FloatArray, background: FloatArray, system: System) -> Prediction:
+        result = draw(engine, signal, background, system, realizations=realizations, seed=seed)
+        mean = result.counts.mean(0, dtype=np.float64)
+        variance = result.counts.var(0, dtype=np.float64, ddof=1)
+        pmfs = [Pmf.of_counts(column) for column in result.counts.T]
+        return Prediction(mean, variance, pmfs, result.shape, realizations)
+
+    return predict
+
+
+FIGURES = ("wasserstein", "kl", "mean", "variance")  # distances of a law to the truth, in this order
+_NEGLIGIBLE = 1e-10  # probability of a count left out of a resampling, per exposure drawn
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Configuration of the study; `realizations` of the truth, `sampled` of engines without a law."""
+
+    grids: tuple[Grid, ...]
+    realizations: int
+    resamplings: int
+    sampled: int
+    cycles: int = 1000
+    bins: int = 1024
+    sigma_ns: float = 0.5
+    seed: int = 20266
+    steps: int = 1750  # of the training of the neural stand-in, for each system
+    pairs: int = 6000
+
+    def system(self, period_ns: float, dead_ns: float) -> System:
+        """System of a grid."""
+        return system_of(dead_ns, self.cycles, period_ns=period_ns, bins=self.bins, sigma_ns=self.sigma_ns)
+
+
+FULL = Settings(grids=paper_grids(8, WIDE_NS, NEAR_NS), realizations=100_000, resamplings=200, sampled=4_000)
+QUICK = Settings(
+    grids=paper_grids(2, (25.0, 75.0), (50.0,)),
+    realizations=400,
+    resamplings=50,
+    sampled=40,
+    cycles=100,
+    bins=256,
+    steps=60,
+    pairs=200,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Score:
+    """One simulator in one cell: its distances, what sampling alone makes of them, and how its shape differs.
+
+    `figures` (4,) in the order of `FIGURES`; `floors` (resamplings, 4) the same figures of samples of the exact
+    law; `shape` and `shape_floor` total variations of the mean histogram; `noise` the standard error of a difference
+    in units of the truth's own, above 1 for a simulator that is sampled itself.
+    """
+
+    figures: FloatArray
+    floors: FloatArray
+    shape: float
+    shape_floor: float
+    noise: float
+
+
+@dataclass(frozen=True, eq=False)
+class Cell:
+    """One pixel: the truth and the score of every simulator."""
+
+    grid: str
+    period_ns: float
+    signal: float
+    background: float
+    dead_ns: float
+    mean: float
+    variance: float
+    exact: FloatArray  # (4,) cumulants
+    realizations: int
+    scores: dict[str, Score]
+    truth: Pmf
+    laws: dict[str, Pmf]
+
+    def name(self) -> str:
+        """The cell in words."""
+        flux = f"S = {self.signal:.3g}, B = {self.background:.3g}"
+        return f"{flux}, t_d = {self.dead_ns:g} ns, t_r = {self.period_ns:.4g} ns"
+
+    @property
+    def mean_error(self) -> float:
+        """Standard error of the simulated mean."""
+        return float(np.sqrt(self.exact[1] / self.realizations))
+
+    @property
+    def variance_error(self) -> float:
+        """Standard error of the simulated variance."""
+        return float(np.sqrt(max(self.exact[3] + 2.0 * self.exact[1] ** 2, 0.0) / self.realizations))
+
+
+def compute(settings: Settings, truth: str, tell: Tell) -> list[Cell]:
+    """All cells of all grids against simulation by engine `truth`."""
+    cells: list[Cell] = []
+    number = 0
+    for grid in settings.grids:
+        for dead_ns in grid.dead_ns:
+            cells += _system_cells(settings, grid, dead_ns, truth, number)
+            number += 1
+            tell(f"count-law: {grid.name}, t_d = {dead_ns:g} ns, {len(grid.flux) ** 2} cells")
+    return cells
+
+
+def _system_cells(settings: Settings, grid: Grid, dead_ns: float, truth: str, number: int) -> list[Cell]:
+    system = settings.system(grid.period_ns, dead_ns)
+    signal, background = grid.cells
+    seed, size = (settings.seed << 16) + number, settings.realizations
+    sample = draw(truth, signal, background, system, realizations=size, seed=seed)
+    # another seed: an engine must not share random numbers with the truth
+    asked = simulators(settings.sampled, seed + (1 << 40), settings.steps, settings.pairs)
+    predictions = {item.name: item.predict(signal, background, system) for item in asked}
+    cumulants = count_law(Flux(signal, background, 0.5 * system.period_ns), system, "exact").cumulants
+    random = np.random.default_rng([settings.seed, number])
+    cells = []
+    for k in range(signal.size):
+        counts = sample.counts[:, k].astype(np.float64)
+        cells.append(
+            Cell(
+                grid.name,
+                grid.period_ns,
+                float(signal[k]),
+                float(background[k]),
+                dead_ns,
+                float(counts.mean()),
+                float(counts.var(ddof=1)),
+                cumulants[k],
+                size,
+                _scores(settings, sample, predictions, k, random),
+                Pmf.of_counts(sample.counts[:, k]),
+                {name: prediction.pmfs[k] for name, prediction in predictions.items()},
+            )
+        )
+    return cells
+
+
+def _scores(
+    settings: Settings, sample: Sample, predictions: dict[str, Prediction], k: int, random: np.random.Generator
+) -> dict[str, Score]:
+    """Scores of every simulator in cell `k`."""
+    exact, size, result = predictions["mars_exact"], settings.realizations, Pmf.of_counts(sample.counts[:, k])
+    noise: dict[int, FloatArray] = {}
+    scores = {}
+    for name, prediction in predictions.items():
+        if prediction.sampled not in noise:
+            noise[prediction.sampled] = resampled_figures(
+                exact.pmfs[k], size, prediction.sampled, settings.resamplings, random
+            )
+        shape = 0.5 * float(np.abs(sample.shape[k] - prediction.shape[k]).sum())
+        # a sample has its own noise as well, as much as the truth's for the same number of exposures
+        own = float(np.sqrt(1.0 + size / prediction.sampled)) if prediction.sampled else 1.0
+        figures = law_figures(
+            result, prediction.pmfs[k], float(prediction.mean[k]), float(prediction.variance[k]), size
+        )
+        scores[name] = Score(figures, noise[prediction.sampled], shape, own * float(sample.shape_floor[k]), own)
+    return scores
+
+
+def law_figures(sample: Pmf, law: Pmf, mean: float, variance: float, size: int) -> FloatArray:
+    """`FIGURES` (4,) of a law with its own mean and variance, against frequencies of `size` simulated counts."""
+    low, high = min(sample.first, law.first), max(sample.last, law.last)
+    result = _figures(sample.on(low, high)[None], law.on(low, high), low, mean, variance, size)
+    return np.asarray(result[0], dtype=np.float64)
+
+
+def resampled_figures(law: Pmf, size: int, sampled: int, number: int, random: np.random.Generator) -> FloatArray:
+    """`FIGURES` (number, 4) of samples of `size` counts drawn from `law` against the law itself.
+
+    With `sampled` > 0 against other samples of that many counts instead: the floor of a law known by sampling.
+    """
+    selected = np.flatnonzero(law.p > _NEGLIGIBLE / size)
+    first, p = law.first + int(selected[0]), law.p[selected[0] : selected[-1] + 1]
+    p = p / p.sum()
+    counts = first + np.arange(p.size)
+    mean = float((p * counts).sum())
+    variance = float((p * (counts - mean) ** 2).sum())
+    drawn = random.multinomial(size, p, number) / size
+    if not sampled:
+        return _figures(drawn, p, first, mean, variance, size)
+    others = random.multinomial(sampled, p, number) / sampled
+    rows = []
+    for frequency, other in zip(drawn, others, strict=True):
+        own = float((other * counts).sum())
+        spread = float((other * (counts - own) ** 2).sum()) * sampled / (sampled - 1)
+        rows.append(_figures(frequency[None], other, first, own, spread, size)[0])
+    return np.array(rows)
+
+
+def _figures(sample: FloatArray, law: FloatArray, first: int, mean: float, variance: float, size: int) -> FloatArray:
+    """`FIGURES` (n, 4) of frequencies `sample` (n, w) of `size` counts against `law` (w,), counts from `first`."""
+    offset = first + np.arange(law.size) - mean
+    shift = sample @ offset
+    spread = (sample @ offset**2 - shift**2) * size / (size - 1)
+    return np.stack(
+        [wasserstein(sample, law), kl_divergence(sample, law), np.abs(shift), np.abs(spread - variance)], axis=-1
+    )
+
 
 PANELS = ((0.07, 0.07, 25.0), (0.5, 0.5, 50.0), (4.0, 0.5, 75.0), (10.0, 10.0, 100.0))  # nearest cells are drawn
 _LINES = {
@@ -112,50 +423,6 @@ def _inset(ax: Axes, cell: Cell) -> None:
     inset.set_title("KL, nats (dots: floor)", fontsize=6.0)
 
 
-def shapes(settings: Settings, cells: Sequence[Cell], sweep: dict[str, FloatArray]) -> Figure:
-    """Total variation of the shape over the dead time: lines to the exact law, dots to the simulation."""
-    figure, axes = panels(2.9, 1, 2, sharey=True)
-    dead = np.array(settings.dead_sweep)
-    grid = [cell for cell in cells if cell.grid == "wide"]
-    ticks = sorted({cell.dead_ns for cell in grid})
-    for ax, quantile, words in zip(axes[0], (0.5, 0.95), ("median of the cells", "95 % of the cells"), strict=True):
-        for name in SHAPES:
-            colour, dash, _ = _colour(name)
-            ax.plot(dead, np.quantile(sweep[name], quantile, axis=1), dash, color=colour, lw=1.0, label=SHAPES[name])
-        sampled = [name for name in grid[0].scores if name not in _LINES]
-        labels = {"mars_exact": "MaRS, ours, to simulation", "neural": "neural, to simulation"}
-        labels |= {name: f"{', '.join(sampled)}: samples" for name in sampled[:1]}
-        for name in grid[0].scores:
-            at = [[c.scores[name].shape for c in grid if c.dead_ns == d] for d in ticks]
-            here = [float(np.quantile(values, quantile)) for values in at]
-            marker = "s" if name == "mars_exact" else "o"
-            size = 4.5 if name == "mars_exact" else 2.8
-            ax.plot(
-                np.array(ticks) / PERIOD_NS,
-                here,
-                marker,
-                ms=size,
-                color=_colour(name)[0],
-                label=labels.get(name),
-                mfc="none" if name == "mars_exact" else None,
-                mew=0.8,
-            )
-        noise = [[c.scores["mars_exact"].shape_floor for c in grid if c.dead_ns == d] for d in ticks]
-        ax.plot(
-            np.array(ticks) / PERIOD_NS,
-            [float(np.quantile(v, quantile)) for v in noise],
-            "_",
-            ms=9,
-            color=MUTED,
-            label="sampling floor",
-        )
-        ax.set(yscale="log", xlabel="$t_d / t_r$", ylim=(1e-6, 1.0))
-        ax.set_title(words, loc="left")
-    axes[0, 0].set_ylabel("total variation of the shape")
-    legend_below(figure, axes[0, :1], 3)
-    return figure
-
-
 PAPER = {  # T1 of arXiv 2512.04924: Wasserstein, KL, mean difference, variance difference
     "poisson": (7966.130, 24.208, 7966.130, 9257.464),
     "renewal": (207.565, 18.821, 207.564, 45.927),
@@ -216,17 +483,13 @@ def _row(name: str, words: str, cells: Sequence[Cell]) -> dict[str, Any]:
     }
 
 
-def run(request: Request) -> Facts:
-    """All cells, the sweep of shapes, and the figures."""
-
-    settings = QUICK if request.quick else FULL
+def run(settings: Settings, request: Request) -> Facts:
+    """All cells and their figure."""
     cells = compute(settings, request.truth, request.tell)
-    sweep = shape_sweep(settings, request.tell)
     first = cells[0].scores
     words = {simulator.name: simulator.words for simulator in simulators(1, 0) if simulator.name in first}
     by_grid = {grid.name: [cell for cell in cells if cell.grid == grid.name] for grid in settings.grids}
     return {
-        "s": settings,
         "truth": request.truth,
         "kl_floor": TOL.tail,
         "sampled": [name for name in first if first[name].noise > 1.0],
@@ -235,10 +498,7 @@ def run(request: Request) -> Facts:
         },
         "keys": FIGURES,
         "rows": [_csv_row(cell) for cell in cells],
-        "figures": {
-            "panels": law_panels(cells),
-            "shape": shapes(settings, cells, sweep),
-        },
+        "figures": {"panels": law_panels(cells)},
     }
 
 

@@ -1,1 +1,1 @@
-"""What each mode and each effect of a detector does to the same flux."""
+"""What each mode and each effect of a detector does to the same light."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any
@@ -16,7 +16,7 @@ from mars_lidar.engines import Engine, MarsEngine, RenewalEngine
 from mars_lidar.learn import CubeStream, Uniform
 from mars_lidar.table.entries import StartPhases
 from studies.common.sample import PERIOD_NS, system_of
-from studies.common.windows import WINDOW, features, number
+from studies.downstream.windows import WINDOW, features, number
 from studies.neural import NeuralEngine
 
 WORDS = {
@@ -106,6 +106,34 @@ CONFIGS = {
         lines=(0.1, MAIN),
     ),
 }
+
+
+@dataclass(frozen=True)
+class Run:
+    """One network: its kind, the simulator of its data, dead time in periods, ratio, seed."""
+
+    kind: str
+    arm: str
+    dead: float
+    sbr: float
+    seed: int
+
+    @property
+    def file(self) -> str:
+        """Of its result."""
+        return f"{self.kind}-{self.arm}-dead{self.dead:g}-sbr{self.sbr:g}-{self.seed}.json"
+
+
+def runs(config: Config) -> Iterator[Run]:
+    """All networks, seed by seed; a spatial network follows the pixel network of the same data."""
+    for seed in range(config.seeds):
+        for sbr in config.sbr:
+            for arm in config.arms:
+                yield Run("pixel", arm, MAIN, sbr, seed)
+                if config.spatial and (seed == 0 or arm in PAIR):
+                    yield Run("spatial", arm, MAIN, sbr, seed)
+        if seed == 0:
+            yield from (Run("pixel", arm, dead, 1.0, seed) for dead in config.dead for arm in PAIR)
 
 
 def instrument(dead: float) -> System:

@@ -3,7 +3,7 @@
 Near a pixel's light theta = (S, B, delay) the features are f = m + J (theta' - theta) + noise. A network that is
 trained under the covariance C learns the estimate that is best there, theta + F^-1 J' C^-1 (f - m) with F = J' C^-1 J,
 and its variance F^-1. Under the true covariance C* the error has F^-1 J' C^-1 C* C^-1 J F^-1 instead. Features are the
-sums that the networks see (`studies/common/windows.py`).
+sums that the networks see (`studies/downstream/windows.py`).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from scipy import stats
 from mars_lidar import Flux, System, joint_law
 from mars_lidar._base.types import FloatArray
 from mars_lidar.learn import expected_histogram
-from studies.common.windows import WINDOW, starts
+from studies.downstream.windows import WINDOW, starts
 
 _STEP = 1e-3  # of S and B, relative, and of the delay in ns: central differences of a function that is known to 1e-12
 _LEAST = 0.02  # photons per period: a dimmer return says nothing of its delay

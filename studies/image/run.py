@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
@@ -13,7 +12,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from mars_lidar import Detector, GaussianPulse, SampledPulse, Scene, System, reconstruct, simulate
+from mars_lidar import Detector, Flux, GaussianPulse, SampledPulse, Scene, System, reconstruct, simulate
 from mars_lidar._base.imports import MissingLibraryError
 from mars_lidar._base.native import _core
 from mars_lidar._base.types import FloatArray
@@ -24,30 +23,24 @@ from mars_lidar.reconstruction.image_network import card
 from studies import Facts, Request
 from studies.common.draw import panels
 from studies.common.report import Row
-from studies.image import alternating, captures, drunet, large, two_returns
+from studies.image import captures, large, priors
 from studies.image.scenes import busier, light
 
 SEED = 41
 OUTLIER_SIGMA = _core.IMAGE_OUTLIER_SIGMA
 POOLED = 5  # pixels a side, whose histograms the pooled matched filter adds up
 SYSTEM = System(
-    period_ns=100.0,
-    cycles=1000,
-    bins=1000,
-    pulse=GaussianPulse(sigma_ns=0.6),
-    detector=Detector(dead_time_ns=75.0),
+    period_ns=100.0, cycles=1000, bins=1000, pulse=GaussianPulse(sigma_ns=0.6), detector=Detector(dead_time_ns=75.0)
 )
 # seeds of scenes "random" which nobody looked at, nor any of their results, before the code and the weights were frozen
 FROZEN = (20261227, 20261228, 20261229, 20261230, 20261231)
-# what reconstruct(neighbourhood=4) of version 0.2.0 made of the same cubes, judged as the others
-NEIGHBOURHOOD = Path(__file__).with_name("neighbourhood.csv")
 PICTURED = "random", 1.0, 1.0  # scene, photons and ratio of the picture
 # by name: what makes delays of a cube, or None for methods of the package
 Methods = dict[str, Callable[[np.ndarray, System], FloatArray] | None]
 METHODS: Methods = {
     "maximum_likelihood": None,
     "pooled matched filter": None,
-    "total variation": alternating.by_variation,
+    "total variation": priors.by_variation,
     "image_untrained": None,
     "image": None,
 }
@@ -154,8 +147,8 @@ def _part(pair: Scene, size: int, rng: np.random.Generator) -> Scene:
     """Half to all of the sides of a scene, at random, mirrored or not."""
     share = rng.uniform(0.5, 1.0)
     sides = [round(share * side) for side in pair.shape]
-    top, left = (int(rng.integers(whole - side + 1)) for whole, side in zip(pair.shape, sides, strict=True))
-    part = pair[top : top + sides[0], left : left + sides[1]].resize(size)
+    row, column = (int(rng.integers(whole - side + 1)) for whole, side in zip(pair.shape, sides, strict=True))
+    part = pair[row : row + sides[0], column : column + sides[1]].resize(size)
     step = int(rng.choice((-1, 1)))
     return Scene(depth_m=part.depth_m[:, ::step], reflectivity=part.reflectivity[:, ::step])
 
@@ -171,9 +164,8 @@ def rgbd(folder: Path) -> dict[str, Scene]:
     return pairs
 
 
-def run(request: Request) -> Facts:
+def run(settings: Settings, request: Request) -> Facts:
     """Every scene, system and brightness by every method."""
-    settings = QUICK if request.quick else FULL
     every = scenes(settings.size)
     pairs = {} if request.rgbd is None else rgbd(request.rgbd)
     every |= {name: pair.resize(settings.size) for name, pair in pairs.items()}
@@ -221,8 +213,7 @@ def run(request: Request) -> Facts:
     cells = coverage(rows, "scenes", ("photons", "sbr"))
     request.tell("image: two returns, large images")
     return {
-        "s": settings,
-        "tv_weight": alternating.TV_WEIGHT,
+        "tv_weight": priors.TV_WEIGHT,
         "drunet": about_drunet,
         "fewest": captures.FEWEST,
         "card": card(),
@@ -233,8 +224,7 @@ def run(request: Request) -> Facts:
         "frozen": _table(rows, "frozen", ("photons",)),
         "bright": _table(rows, "bright", ("photons",)),
         "captures": _table(rows, "captures", ("scene", "photons")),
-        "before": _before(rows),
-        "two": two_returns.rows(settings.two, SYSTEM, SEED),
+        "two": two_returns(settings.two, SYSTEM, SEED),
         "large": large.rows(settings.large, SYSTEM, 2.0, 1.0),
         "further_seed": further_seed(request),
         "coverage": cells,
@@ -281,14 +271,14 @@ def _methods(request: Request, settings: Settings) -> tuple[Methods, str]:
     steps, images = settings.drunet
     try:
         request.tell("image: the prior DRUNet")
-        prior = drunet.prior(request.drunet, steps, images, SEED)
+        prior = priors.drunet(request.drunet, steps, images, SEED)
     except MissingLibraryError as error:
         if request.drunet is not None:
             raise
         request.tell(f"image: {DRUNET} was skipped: {error}")
         return METHODS, f"skipped: {error}"
     before = dict(list(METHODS.items())[:3])
-    return before | {DRUNET: partial(alternating.by_denoiser, denoise=prior)} | METHODS, prior.weights
+    return before | {DRUNET: partial(priors.by_denoiser, denoise=prior)} | METHODS, prior.weights
 
 
 def _thin(scene: Scene, system: System, photons: float, results: Results) -> dict[str, float]:
@@ -401,38 +391,6 @@ def judged(
     }
 
 
-def _before(rows: Iterable[Row]) -> list[Row]:
-    """Method "image" beside ``neighbourhood=4`` of version 0.2.0, on the same cubes: means over the scenes of both."""
-    with NEIGHBOURHOOD.open(encoding="utf-8") as file:
-        saved = {(x["scene"], float(x["photons"]), float(x["sbr"])): x for x in csv.DictReader(file)}
-    pairs: dict[tuple[float, float], list[tuple[Row, Row]]] = {}
-    for row in rows:
-        if row["part"] != "scenes" or row["method"] != "image":
-            continue
-        at = row["scene"], row["photons"], row["sbr"]
-        if at in saved:
-            pairs.setdefault(at[1:], []).append((row, saved[at]))
-    out: list[Row] = []
-    for (photons, sbr), both in pairs.items():
-        new, old = (
-            {k: np.mean([float(x[j][k]) for x in both]) for k in both[0][1] if k not in ("scene",)} for j in (0, 1)
-        )
-        out.append(
-            {
-                "photons": photons,
-                "sbr": sbr,
-                "scenes": len(both),
-                "off %, image": new["off %"],
-                "neighbourhood": old["off %"],
-                "ratio": new["off %"] / old["off %"],
-                "signal RMSE, image": new["signal RMSE"],
-                "of neighbourhood": old["signal RMSE"],
-                "dB": 20.0 * float(np.log10(new["signal RMSE"] / old["signal RMSE"])),
-            }
-        )
-    return out
-
-
 def coverage(rows: Iterable[Row], part: str, keys: tuple[str, ...]) -> list[Row]:
     """Share of the intervals of method "image" that contain the truth in the further scenes: all kinds weigh the same.
 
@@ -484,6 +442,50 @@ def _table(rows: Iterable[Row], part: str, keys: tuple[str, ...]) -> list[Row]:
             line[value] = float(np.nanmean(numbers)) if np.isfinite(numbers).any() else "-"
         out.append(line)
     return out
+
+
+RETURN_PHOTONS = 1.0, 2.0, 5.0, 10.0, 20.0  # of each of two returns, a pixel
+_TWO_METHODS = "maximum_likelihood", "image"
+
+
+def two_returns(size: int, system: System, seed: int, photons: tuple[float, ...] = RETURN_PHOTONS) -> list[Row]:
+    """Shares of the pixels with both surfaces where there are two, and with a second return where there is one."""
+    x, half = np.arange(size), size // 2
+    pane = 10.0 + (3.0 * x + 2.0 * x[:, None]) / size  # ns: a pane of glass in front of the room
+    wall = np.asarray(Scene.example("room", size).flux(system, signal=1.0, sbr=1.0).delay_ns)
+    out: list[Row] = []
+    for each in photons:
+        level = np.full((size, size), each / system.cycles)
+        of_wall = Flux(level, level, wall)
+        scenes = {
+            "whole": Flux.multi(of_wall, Flux(level, 0.0, pane)),
+            "half": Flux.multi(of_wall, Flux(np.where(x < half, level, 0.0), 0.0, pane)),
+            "none": Flux(2.0 * level, level, wall),
+        }
+        cubes = {name: simulate(flux, system, seed=seed, threads=1)[0] for name, flux in scenes.items()}
+        for method in _TWO_METHODS:
+            delays = {name: _delays(cube, system, method) for name, cube in cubes.items()}
+            both = {name: _both(delays[name], wall, pane, system) for name in ("whole", "half")}
+            two = {name: np.asarray(np.isfinite(delays[name]).all(-1)) for name in ("half", "none")}
+            line = {"photons of each return": each, "method": method, "both, whole pane %": both["whole"]}
+            line |= {"both, half a pane %": both["half"][:, :half], "two beside it %": two["half"][:, half:]}
+            line |= {"two without a pane %": two["none"]}
+            out.append({k: 100.0 * float(v.mean()) if isinstance(v, np.ndarray) else v for k, v in line.items()})
+    return out
+
+
+def _delays(cube: np.ndarray, system: System, method: str) -> FloatArray:
+    """Of both returns (H, W, 2), ns."""
+    returns = reconstruct(cube, system, method, returns=2, threads=1).returns
+    assert returns is not None
+    return returns.delay_ns
+
+
+def _both(delays: FloatArray, wall: FloatArray, pane: FloatArray, system: System) -> np.ndarray:
+    """Whether the returns (H, W, 2) of a pixel are within 3 sigma of pane and wall, or of wall and pane."""
+    period, most = system.period_ns, OUTLIER_SIGMA * relative_width(system) * system.period_ns
+    near = [np.abs((delays - each[..., None] + 0.5 * period) % period - 0.5 * period) < most for each in (wall, pane)]
+    return np.asarray((near[0] & near[1][..., ::-1]).any(-1))
 
 
 def _figure(maps: Results, settings: Settings) -> Figure:

@@ -24,9 +24,7 @@ from mars_lidar.statistics.joint import Pixel
 from studies import Facts, Request, Tell
 from studies.common.draw import panels
 from studies.common.report import Row, picked
-from studies.joint.cases import OFTEN, TOLERANCE, Case, random_cases
-
-__all__ = ["Outcome", "TOLERANCE", "compare", "random_systems", "run"]
+from studies.joint.table import OFTEN, TOLERANCE, Case, random_cases
 
 _QUANTILES = {  # in words: key of the scores
     "count variance": "count, variance",
@@ -181,18 +179,16 @@ def variance_scores(x: FloatArray, variance: FloatArray) -> FloatArray:
     return np.asarray(np.log(second * len(x) / (len(x) - 1) / variance) / spread)
 
 
-def run(request: Request) -> Facts:
+def run(settings: Settings, request: Request) -> Facts:
     """Random systems and the reference cases, compared with the closed form."""
-
-    settings = QUICK if request.quick else FULL
     systems = random_systems(settings, request.tell)
-    cases = [reference_case(path) for path in sorted(request.data.glob("*.json"))] if request.data else []
+    cases = [reference_case(path) for path in request.cases()]
     scores = _scores(systems, settings)
     every = [z for o in systems for z in o.scores.values()]
     by_z = sorted(systems, key=lambda o: -o.worst()[0])
     return {
-        "s": settings,
         "often": OFTEN,
+        "tolerance": TOLERANCE,
         "laws": [
             (name, z, stats.kstest(z, "norm").pvalue, stats.chi2.sf(float(np.sum(z**2)), z.size))
             for name, z in scores.items()

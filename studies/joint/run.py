@@ -1,9 +1,7 @@
 """Study "joint": can a classifier tell an engine's histograms from exact ones?
 
-Every engine's sample of one pixel's histograms against one sample of the exact engine; a second sample of the
-exact engine shows what agreement looks like. Beside it variances and neighbours' covariances of every sample,
-over the closed form of `mars_lidar.joint_law`, which shares nothing with the engines. The only part of the package
-that uses scikit-learn (extra ``studies``), imported when it is first needed.
+Every engine's sample of one pixel's histograms against one sample of the exact engine; a second sample of the exact
+engine shows what agreement looks like. It uses scikit-learn (extra ``studies``), imported when it is first needed.
 """
 
 from __future__ import annotations
@@ -20,16 +18,11 @@ from scipy.stats import rankdata
 
 from mars_lidar._base.imports import needed
 from mars_lidar._base.types import FloatArray
-from mars_lidar.plot.style import COLOURS, DPI, INK, MISSING
-from mars_lidar.statistics import ConvergenceError
-from studies import Facts, Request, Tell
-from studies.common.draw import WIDTH, legend_below
+from mars_lidar.plot.style import COLOURS, INK, MISSING
+from studies import Facts, Request
+from studies.common.draw import legend_below, panels
 from studies.common.report import Row, crossed, marked, picked
-from studies.common.sample import PERIOD_NS
-from studies.joint import cases
-from studies.joint.cases import AGAIN, RATIOS, REFERENCE, SEVEN, Case, Law, Sample, random_cases
-
-__all__ = ["cases", "run"]
+from studies.joint.table import COARSE, HANDED, REFERENCE, SEVEN, Case
 
 QDA, BOOSTING, FOREST = "QDA", "gradient boosting", "random forest"
 CLASSIFIERS = (QDA, BOOSTING, FOREST)
@@ -81,11 +74,6 @@ def chance_error(n: int, m: int) -> float:
     return float(np.sqrt((n + m + 1) / (12.0 * n * m)))
 
 
-def chance(exposures: int) -> float:
-    """Standard error of the AUC of two samples of one law, half of the `exposures` of each held out."""
-    return chance_error(exposures - exposures // 2, exposures - exposures // 2)
-
-
 def _model(kind: str, seed: int) -> Any:
     if kind == QDA:
         from sklearn.discriminant_analysis import QuadraticDiscriminantAnalysis
@@ -112,74 +100,74 @@ def _score(model: Any, x: FloatArray) -> FloatArray:
     return np.asarray(model.predict_proba(x)[:, 1], dtype=np.float64)
 
 
+AGAIN = "exact, again"  # a second sample of the exact engine: what agreement looks like
 ENGINES = (AGAIN, "feedback", "mars", "renewal")
 FINE = "fine QDA"
 TESTS = (QDA, FINE, *CLASSIFIERS[1:])
 REACH = 16  # output bins on either side of the pulse and of its echo
+SIGNIFICANT = 4.0  # standard errors beyond which a figure is marked
+_LEAST_P = 1e-100  # told as a number
 
 
 @dataclass(frozen=True)
 class Settings:
-    """Configuration of the study: `cases` meet all classifiers, the random `systems` QDA alone."""
+    """Configuration of the study: pixels, exposures of each engine in each."""
 
     cases: tuple[Case, ...]
     exposures: int
-    systems: int
-    random_exposures: int
     bins: int = 1024
     seed: int = 20281
 
+    @property
+    def chance(self) -> float:
+        """Standard error of the AUC of two samples of one law, half of the exposures of each held out."""
+        held_out = self.exposures - self.exposures // 2
+        return chance_error(held_out, held_out)
 
-FULL = Settings((*REFERENCE, *SEVEN[4:]), exposures=16_000, systems=60, random_exposures=8_000)
-QUICK = Settings((REFERENCE[2], SEVEN[6]), exposures=1_200, systems=2, random_exposures=800, bins=256)
+
+FULL = Settings((*REFERENCE, *SEVEN[4:]), exposures=16_000)
+QUICK = Settings((REFERENCE[2], SEVEN[6]), exposures=1_200, bins=256)
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """Features of n exposures: `coarse` (n, COARSE + 2) bins, count and window, `fine` (n, k) single bins.
+
+    `handed`: whether the engine gave the pixel to the exact one.
+    """
+
+    coarse: FloatArray
+    fine: FloatArray
+    handed: bool
+
+    @classmethod
+    def of(cls, case: Case, settings: Settings, engine: str, seed: int) -> Sample:
+        """Simulate one pixel."""
+        report: dict[str, float] = {}
+        x = case.histograms(settings.bins, engine, settings.exposures, seed, report)
+        coarse = x.reshape(len(x), COARSE, -1).sum(-1, dtype=np.float64)
+        window = x[:, case.window(settings.bins)].sum(-1, dtype=np.float64)
+        features = np.column_stack([coarse, coarse.sum(-1), window])
+        return cls(features, x[:, near(case, settings.bins)].astype(np.float64), report.get(HANDED, 0.0) > 0)
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """One engine in one case.
-
-    `ratios` of variances (or covariances) to the closed form and `aucs`, each with its standard error; no AUCs
-    for the exact sample that all others are told from, nor for an engine that is not judged: `instead` is then "exact",
-    to which it gave the pixel, or "refused".
-    """
+    """One engine in one case: `aucs` with their standard errors; none for an engine that gave the pixel to exact."""
 
     case: Case
-    random: bool
     engine: str
-    instead: str
-    ratios: dict[str, tuple[float, float]]
     aucs: dict[str, tuple[float, float]]
 
 
-def compute(settings: Settings, tell: Tell) -> list[Outcome]:
-    """All engines in all cases, then in the random systems; raises MissingLibraryError without scikit-learn."""
-    require_sklearn()
-    results = []
-    for number, case in enumerate(settings.cases):
-        results += examine(case, settings, number, settings.exposures, TESTS)
-        tell(f"joint: {case.name}")
-    for number, case in enumerate(random_cases(settings.systems, settings.seed), len(settings.cases)):
-        results += examine(case, settings, number, settings.random_exposures, TESTS[:2], random=True)
-        if (number - len(settings.cases)) % 10 == 9:
-            tell(f"joint: {number - len(settings.cases) + 1} of {settings.systems} random systems")
-    return results
-
-
-def examine(
-    case: Case, settings: Settings, number: int, exposures: int, tests: tuple[str, ...], random: bool = False
-) -> list[Outcome]:
-    """One case: the exact sample first, then every engine against it."""
-    seed, law, fine = (settings.seed << 16) + 100 * number, Law(case, settings.bins), near(case, settings.bins)
-    truth = Sample.of(case, settings.bins, "exact", exposures, seed, fine)
-    results = [Outcome(case, random, "exact", "", law.ratios(truth), {})]
+def examine(case: Case, settings: Settings, number: int, tests: tuple[str, ...] = TESTS) -> list[Outcome]:
+    """One case: every engine against one exact sample."""
+    seed = (settings.seed << 16) + 100 * number
+    truth, results = Sample.of(case, settings, "exact", seed), []
     for k, engine in enumerate(ENGINES, 1):
-        try:
-            x = Sample.of(case, settings.bins, "exact" if engine == AGAIN else engine, exposures, seed + k, fine)
-        except ConvergenceError:  # a law that would take too long
-            results.append(Outcome(case, random, engine, "refused", dict.fromkeys(RATIOS, (np.nan, np.nan)), {}))
-            continue
+        x = Sample.of(case, settings, "exact" if engine == AGAIN else engine, seed + k)
         aucs = {} if x.handed else {test: _auc(test, truth, x, number) for test in tests}
-        results.append(Outcome(case, random, engine, "exact" if x.handed else "", law.ratios(x), aucs))
+        results.append(Outcome(case, engine, aucs))
     return results
 
 
@@ -193,8 +181,7 @@ def near(case: Case, bins: int) -> NDArray[np.intp]:
 def _auc(test: str, truth: Sample, x: Sample, seed: int) -> tuple[float, float]:
     if test == FINE:
         return separate(QDA, truth.fine, x.fine, seed)
-    both = [np.column_stack([f.coarse, f.coarse.sum(-1), f.window]) for f in (truth, x)]
-    return separate(test, both[0], both[1], seed)
+    return separate(test, truth.coarse, x.coarse, seed)
 
 
 _LINEAR = 0.02  # from chance, where the axis turns from linear to logarithmic
@@ -204,99 +191,46 @@ _MARK = dict(zip(ENGINES, "|osD", strict=True))
 
 
 def figure(settings: Settings, outcomes: Sequence[Outcome]) -> Figure:
-    """Cases above, one panel a classifier; the random systems below, in the order of each engine's AUCs."""
-    named, drawn = ([o for o in outcomes if o.random is kind and o.aucs] for kind in (False, True))
-    page = Figure(figsize=(WIDTH, 5.2), dpi=DPI, layout="constrained")
-    halves: Any = page.subfigures(2, 1, height_ratios=(1.5, 1.0))
-    upper, lower = halves
-    above = upper.subplots(1, len(TESTS), sharey=True)
-    for ax, test in zip(above, TESTS, strict=True):
-        _cases(ax, test, [c.name for c in settings.cases], named, 2.0 * chance(settings.exposures))
-    for ax, test in zip(lower.subplots(1, 2, sharey=True), TESTS[:2], strict=True):
-        _random(ax, test, drawn, 2.0 * chance(settings.random_exposures))
-    lower.axes[0].set_ylabel("share of systems below")
-    legend_below(lower, above[:1], len(ENGINES))
+    """AUC of each case and engine, one panel a classifier."""
+    page, axes = panels(3.1, 1, len(TESTS), sharey=True)
+    judged, cases = [o for o in outcomes if o.aucs], [case.name for case in settings.cases]
+    band, lowest = 2.0 * settings.chance, min(o.aucs[test][0] - 0.5 for o in judged for test in TESTS)
+    for ax, test in zip(axes[0], TESTS, strict=True):
+        ax.axvspan(-band, band, color=MISSING, alpha=0.6, lw=0)
+        ax.set_xscale("symlog", linthresh=_LINEAR)
+        ax.set(xlim=(min(-0.03, 1.1 * lowest), 0.7), ylim=(len(cases) - 0.5, -0.5), xlabel="AUC", title=test)
+        ax.set_xticks(_TICKS, [f"{0.5 + t:g}" for t in _TICKS])
+        ax.minorticks_off()
+        for line in range(1, len(cases)):
+            ax.axhline(line - 0.5, color=MISSING, lw=0.4)
+        for k, engine in enumerate(ENGINES):
+            here = [o for o in judged if o.engine == engine]
+            value = np.array([o.aucs[test][0] - 0.5 for o in here])
+            place = np.array([cases.index(o.case.name) for o in here]) + 0.2 * (k - 1.5)
+            ax.plot(value, place, _MARK[engine], color=_COLOUR[engine], ms=3.0, mew=0.9, mfc="none", label=engine)
+        ax.set_yticks(range(len(cases)), cases)
+        ax.tick_params(axis="y", length=0)
+    legend_below(page, axes[0, :1], len(ENGINES))
     return page
 
 
-def _axis(ax: Any, band: float, lowest: float) -> None:
-    ax.axvspan(-band, band, color=MISSING, alpha=0.6, lw=0)
-    ax.set_xscale("symlog", linthresh=_LINEAR)
-    ax.set(xlim=(min(-0.03, 1.1 * lowest), 0.7), xlabel="AUC")
-    ax.set_xticks(_TICKS, [f"{0.5 + t:g}" for t in _TICKS])
-    ax.minorticks_off()
-
-
-def _cases(ax: Any, test: str, cases: Sequence[str], outcomes: Sequence[Outcome], band: float) -> None:
-    _axis(ax, band, min((o.aucs[t][0] - 0.5 for o in outcomes for t in TESTS), default=0.0))
-    for row in range(1, len(cases)):
-        ax.axhline(row - 0.5, color=MISSING, lw=0.4)
-    for k, engine in enumerate(ENGINES):
-        here = [o for o in outcomes if o.engine == engine]
-        value = np.array([o.aucs[test][0] - 0.5 for o in here])
-        place = np.array([cases.index(o.case.name) for o in here]) + 0.2 * (k - 1.5)
-        ax.plot(value, place, _MARK[engine], color=_COLOUR[engine], ms=3.0, mew=0.9, mfc="none", label=engine)
-    ax.set_yticks(range(len(cases)), cases)
-    ax.set(ylim=(len(cases) - 0.5, -0.5), title=test)
-    ax.tick_params(axis="y", length=0)
-
-
-def _random(ax: Any, test: str, outcomes: Sequence[Outcome], band: float) -> None:
-    _axis(ax, band, min((o.aucs[test][0] - 0.5 for o in outcomes), default=0.0))
-    for engine in ENGINES:
-        value = np.sort([o.aucs[test][0] - 0.5 for o in outcomes if o.engine == engine])
-        share = (np.arange(value.size) + 0.5) / max(value.size, 1)
-        ax.plot(value, share, _MARK[engine], color=_COLOUR[engine], ms=2.5, mew=0.8, mfc="none")
-    ax.set(ylim=(0, 1), title=f"random systems, {test}")
-
-
-_COMPARED = RATIOS[:3]
-_SEEN = 4.0  # standard errors beyond which a figure is marked
-_WORST = 5  # random systems listed
-_LEAST_P = 1e-100  # told as a number
-
-
-def auc_score(outcome: Outcome, test: str, settings: Settings) -> float:
-    """AUC less 1/2 in standard errors of chance: standard normal if the two samples have one law."""
-    exposures = settings.random_exposures if outcome.random else settings.exposures
-    return (outcome.aucs[test][0] - 0.5) / chance(exposures)
-
-
-def run(request: Request) -> Facts:
+def run(settings: Settings, request: Request) -> Facts:
     """All engines in all cases; raises MissingLibraryError without scikit-learn."""
+    version, result = require_sklearn(), list[Outcome]()
+    for number, case in enumerate(settings.cases):
+        result += examine(case, settings, number)
+        request.tell(f"joint: {case.name}")
 
-    settings = QUICK if request.quick else FULL
+    def cell(o: Outcome, test: str) -> str:
+        return marked(o.aucs[test], abs(_score_of(o, test, settings)) > SIGNIFICANT) if o.aucs else "exact"
 
-    def significant(o: Outcome, test: str) -> bool:
-        return abs(auc_score(o, test, settings)) > _SEEN
-
-    result = compute(settings, request.tell)
-    named, drawn = ([o for o in result if o.random is kind] for kind in (False, True))
+    pairs = [(o, test) for o in result if o.aucs for test in TESTS]
+    judged = {engine: [pair for pair in pairs if pair[0].engine == engine] for engine in ENGINES}
     return {
-        "s": settings,
-        "period_ns": PERIOD_NS,
-        "sklearn": require_sklearn(),
-        "findings": [
-            _finding(engine, here, settings)
-            for engine in ENGINES
-            if (here := [(o, test) for o in named if o.engine == engine and o.aucs for test in TESTS])
-        ],
+        "sklearn": version,
+        "findings": [_finding(engine, here, settings) for engine, here in judged.items() if here],
         "gone": given_to_exact(result),
-        "refused": [f"{o.engine} {o.case.name}" for o in result if o.instead == "refused"],
-        "asked": sum(o.engine == "feedback" for o in result),
-        "band": [2 * chance(n) for n in (settings.exposures, settings.random_exposures)],
-        "aucs": {
-            test: crossed(
-                (o.case.name, o.engine, marked(o.aucs[test], significant(o, test)) if o.aucs else o.instead)
-                for o in named
-                if o.engine != "exact"
-            )
-            for test in TESTS
-        },
-        "ratios": [crossed((o.case.name, o.engine, _ratio_cell(o, key)) for o in named) for key in _COMPARED],
-        "random": [_random_row(drawn, engine, test, settings) for test in TESTS[:2] for engine in ENGINES],
-        "spread": [_spread_row(drawn, engine) for engine in ("exact", *ENGINES)],
-        "worst": _worst_rows(drawn, settings),
+        "aucs": {test: crossed((o.case.name, o.engine, cell(o, test)) for o in result) for test in TESTS},
         "rows": [_csv_row(o) for o in result],
         "figures": {"": figure(settings, result)},
     }
@@ -304,103 +238,37 @@ def run(request: Request) -> Facts:
 
 def given_to_exact(result: Sequence[Outcome]) -> list[str]:
     """Cases whose pixel the feedback engine gave to the exact one: they are not judged."""
-    return [o.case.name for o in result if o.engine == "feedback" and o.instead == "exact"]
+    return [o.case.name for o in result if o.engine == "feedback" and not o.aucs]
 
 
-def _p(value: float) -> str:
-    return f"{value:.2g}" if value >= _LEAST_P else f"< {_LEAST_P:g}"
+def _score_of(outcome: Outcome, test: str, settings: Settings) -> float:
+    """AUC less 1/2 in standard errors of chance: standard normal if the two samples have one law."""
+    return (outcome.aucs[test][0] - 0.5) / settings.chance
 
 
 def _finding(engine: str, here: Sequence[tuple[Outcome, str]], settings: Settings) -> dict[str, Any]:
-    z = np.abs([auc_score(o, test, settings) for o, test in here])
+    z = np.abs([_score_of(o, test, settings) for o, test in here])
     value = [o.aucs[test][0] for o, test in here]
     o, test = here[int(z.argmax())]
+    p = min(1.0, 2 * z.size * float(stats.norm.sf(z.max())))
     return {
         "engine": engine,
         "number": z.size,
         "cases": z.size // len(TESTS),
         "least": min(value),
         "most": max(value),
-        "seen": int((z > _SEEN).sum()),
+        "seen": int((z > SIGNIFICANT).sum()),
         "test": test,
         "case": o.case.name,
         "auc": o.aucs[test][0],
-        "p": _p(min(1.0, 2 * z.size * float(stats.norm.sf(z.max())))),
+        "p": f"{p:.2g}" if p >= _LEAST_P else f"< {_LEAST_P:g}",
     }
-
-
-def _ratio_cell(o: Outcome, key: str) -> str:
-    value, error = o.ratios[key]
-    return marked((value, error), abs(value - 1.0) > _SEEN * error)
-
-
-def _random_row(drawn: list[Outcome], engine: str, test: str, settings: Settings) -> Row:
-    here = [o for o in drawn if o.engine == engine and o.aucs]
-    value = np.array([o.aucs[test][0] for o in here])
-    z = np.array([auc_score(o, test, settings) for o in here])
-    some = value.size > 0
-    return {
-        "classifier": test,
-        "engine": engine,
-        "systems": value.size,
-        "median AUC": f"{np.median(value):.3f}" if some else "-",
-        "smallest": f"{value.min():.3f}" if some else "-",
-        "largest": f"{value.max():.3f}" if some else "-",
-        f"beyond {_SEEN:g} errors": int((np.abs(z) > _SEEN).sum()),
-        "rms z": f"{np.sqrt(np.mean(z**2)):.2f}" if some else "-",
-        "chi-square p": _p(float(stats.chi2.sf(float(z @ z), z.size))) if some else "-",
-    }
-
-
-def _spread_row(drawn: list[Outcome], engine: str) -> Row:
-    row: dict[str, object] = {"engine": engine}
-    here = [o for o in drawn if o.engine == engine and not o.instead]
-    row["systems"] = len(here)
-    for key in _COMPARED:
-        pairs: FloatArray = np.array([o.ratios[key] for o in here]).reshape(-1, 2)
-        value, error = pairs[np.isfinite(pairs[:, 0])].T
-        z = (value - 1.0) / error
-        worst = int(np.abs(z).argmax()) if z.size else -1
-        row[f"{key}: z"] = f"{z.mean():+.2f}, {z.std():.2f}" if z.size else "-"
-        row[f"{key}: worst"] = marked((value[worst], error[worst]), False) if z.size else "-"
-    return row
-
-
-def _worst_rows(drawn: list[Outcome], settings: Settings) -> list[Row]:
-    """Of the engine feedback: the largest |z| of QDA and fine QDA."""
-
-    def worst(o: Outcome) -> float:
-        return max(abs(auc_score(o, test, settings)) for test in TESTS[:2])
-
-    here = sorted((o for o in drawn if o.engine == "feedback" and o.aucs), key=worst, reverse=True)
-    again = {o.case.name: o for o in drawn if o.engine == AGAIN}
-    rows: list[Row] = []
-    for o in here[:_WORST]:
-        c = o.case
-        numbers = {"S": c.signal, "B": c.background, "t_d": c.dead, "tau": c.delay, "sigma": c.sigma}
-        row: dict[str, object] = {"case": c.name, **{key: f"{v:.4g}" for key, v in numbers.items()}}
-        row["cycles"] = c.cycles
-        for test in TESTS[:2]:
-            row[test] = f"{o.aucs[test][0]:.3f} (z {auc_score(o, test, settings):+.1f})"
-        row[f"{AGAIN}, QDA"] = f"{again[o.case.name].aucs[TESTS[0]][0]:.3f}"
-        row["window variance"] = marked(o.ratios["window"], False)
-        rows.append(row)
-    return rows
 
 
 def _csv_row(o: Outcome) -> Row:
-    c = o.case
-    row: dict[str, object] = {
-        "case": c.name,
-        "random": int(o.random),
-        **picked(c, "signal background dead delay sigma cycles"),
-        "engine": o.engine,
-        "given_to_exact": int(o.instead == "exact"),
-        "refused": int(o.instead == "refused"),
-    }
+    row: dict[str, object] = {"case": o.case.name, **picked(o.case, "signal background dead delay sigma cycles")}
+    row |= {"engine": o.engine, "given_to_exact": int(not o.aucs)}
     for test in TESTS:
         name = "auc_" + test.lower().replace(" ", "_")
         row[name], row[f"{name}_error"] = o.aucs.get(test, ("", ""))
-    for key in _COMPARED:
-        row[f"{key}_ratio"], row[f"{key}_ratio_error"] = o.ratios[key]
     return row

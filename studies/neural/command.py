@@ -2,75 +2,73 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+from cyclopts.types import ExistingFile
+
 from mars_lidar import System
+from mars_lidar.cli.options import Integer, Number, OutPath, command
 from studies.neural.model import NeuralMap, check_target
 from studies.neural.pairs import Training
-from studies.neural.training import save_curves, train
+from studies.neural.training import save_curves
+from studies.neural.training import train as train_map
 
 _TRAINING = ("steps", "pairs", "seconds", "processor_seconds", "seed")  # of a network's record
+_PLAN = Training()
 
 
-def main(arguments: Sequence[str], command: str) -> int:
-    """Entry point; returns the exit code. `command` is what was called, for the help."""
-    parser = _parser(command)
-    given = parser.parse_args(arguments)
-    try:
-        if given.verb == "train":
-            _train(given)
-        else:
-            _show(given.file, NeuralMap.example() if given.file is None else NeuralMap.load(given.file))
-        return 0
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        return 130
-    except (ValueError, TypeError, FileNotFoundError, FileExistsError) as error:
-        print(f"{command}: {error}", file=sys.stderr)
-        return 2
+def train(
+    *,
+    out: OutPath,
+    system: ExistingFile | None = None,
+    dead_time_ns: Number | None = None,
+    steps: Integer = _PLAN.steps,
+    pairs: Integer = _PLAN.pairs,
+    overwrite: bool = False,
+) -> None:
+    """Train on the Markov chain of phases, and validate on held-out fluxes.
+
+    Options
+    -------
+    out : FILE
+        The network: .npz. Curves go beside it: .csv and .png.
+    system : FILE
+        YAML or JSON file (mars-lidar init writes one); else as example.npz.
+    dead_time_ns
+        Dead time after a registration, ns, in place of that of the system.
+    steps
+        Steps of the training. [default: 1750]
+    pairs
+        Pairs to learn from. [default: 6000]
+    overwrite
+        Replace an existing network.
+    """
+    check_target(out, overwrite)
+    instrument = NeuralMap.example().system if system is None else System.load(system)
+    if dead_time_ns is not None:
+        instrument = instrument.replace(detector=replace(instrument.detector, dead_time_ns=dead_time_ns))
+    tell = partial(print, file=sys.stderr, flush=True)
+    trained = train_map(instrument, Training(steps=steps, pairs=pairs), tell=tell)
+    trained.map.save(out, overwrite=overwrite)
+    _show(out, trained.map)
+    print(f"{'curves':<10}", *save_curves(trained, out.with_suffix("")))
 
 
-def _parser(command: str) -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog=command, description=__doc__)
-    verbs = parser.add_subparsers(dest="verb", required=True, metavar="train|info")
-    learn = verbs.add_parser(
-        "train",
-        help="train on the Markov chain of phases, and validate on held-out fluxes",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-    )
-    add = learn.add_argument
-    add("-o", "--out", type=Path, required=True, help="the network: .npz. Curves go beside it: .csv and .png")
-    add(
-        "--system",
-        type=Path,
-        metavar="FILE",
-        help="YAML or JSON file (mars-lidar init writes one); else as example.npz",
-    )
-    add("--dead-time-ns", type=float, help="dead time after a registration, ns, in place of that of the system")
-    plan = Training()
-    add("--steps", type=int, default=plan.steps, help="steps of the training")
-    add("--pairs", type=int, default=plan.pairs, help="pairs to learn from")
-    add("--overwrite", action="store_true", help="replace an existing network")
-    info = verbs.add_parser("info", help="what a network was trained for, and how well it does")
-    info.add_argument("file", type=Path, nargs="?", help="a network: .npz. Without it: the one of this folder")
-    return parser
+def info(file: Path | None = None, /) -> None:
+    """What a network was trained for, and how well it does.
+
+    Arguments
+    ---------
+    file
+        A network: .npz. Without it: the one of this folder.
+    """
+    _show(file, NeuralMap.example() if file is None else NeuralMap.load(file))
 
 
-def _train(given: argparse.Namespace) -> None:
-    check_target(given.out, given.overwrite)
-    system = NeuralMap.example().system if given.system is None else System.load(given.system)
-    if given.dead_time_ns is not None:
-        system = system.replace(detector=replace(system.detector, dead_time_ns=given.dead_time_ns))
-    plan = Training(steps=given.steps, pairs=given.pairs)
-    trained = train(system, plan, tell=partial(print, file=sys.stderr, flush=True))
-    trained.map.save(given.out, overwrite=given.overwrite)
-    _show(given.out, trained.map)
-    print(f"{'curves':<10}", *save_curves(trained, given.out.with_suffix("")))
+train_app, info_app = command(train), command(info)
 
 
 def _show(path: Path | None, network: NeuralMap) -> None:

@@ -60,10 +60,7 @@ class _Tensors:
 
 @one_thread()
 def train(
-    system: System,
-    training: Training | None = None,
-    *,
-    tell: Callable[[Point], object] | None = None,
+    system: System, training: Training | None = None, *, tell: Callable[[Point], object] | None = None
 ) -> Trained:
     """Train the map of a system; the loss is the total variation to the chain plus the relative error of the mean.
 

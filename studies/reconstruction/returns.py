@@ -94,9 +94,8 @@ FULL = Settings(1000, 10_000, (400, 4000, 40_000))
 QUICK = Settings(100, 200, (4000,), every=6)
 
 
-def run(request: Request) -> Facts:
+def run(settings: Settings, request: Request) -> Facts:
     """False alarms, pairs of returns, and curves of resolution."""
-    settings = QUICK if request.quick else FULL
     request.tell("returns: false alarms")
     alarms = list(false_alarms(settings))
     rows = []
@@ -111,7 +110,6 @@ def run(request: Request) -> Facts:
             system = with_dead(75.3, cycles=cycles)
             curves.append({"cycles": cycles} | pair(system, (0.5, 0.5), 0.5, float(apart), settings.pixels // 2))
     return {
-        "s": settings,
         "alarms": alarms,
         "worst": max(alarms, key=lambda row: row["extra %"]),
         "pairs": [row for row in rows if row["separation"] in (1.0, 1.5, 2.0, 5.0, 20.0)],

@@ -10,8 +10,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from mars_lidar import Detector, Flux, Reconstruction, Scene, System, cramer_rao, reconstruct, simulate
-from mars_lidar.plot.figures import _draw_map, _limits
+from mars_lidar import Cube, Detector, Flux, Reconstruction, Scene, System, cramer_rao, reconstruct, simulate
+from mars_lidar.plot.reconstruction import reconstruction
 from mars_lidar.plot.style import COLOURS, INK
 from mars_lidar.reconstruction import METHODS, Flags, MaximumLikelihood, log_likelihood, window_error, window_weights
 from studies import Facts, Request
@@ -24,6 +24,7 @@ SBR = 1.0
 OUTLIER_SIGMAS = 4.0  # of the pulse: further off the pulse itself was missed
 _DEAD_NS = 75.0
 KNOWN = 10.0  # %, of S: a bound above it is not reached by any estimate (section "Near the bound")
+WORDS = {"matched_filter": "the matched filter", "maximum_likelihood": "maximum likelihood"}  # of the picture
 BRIGHT = 3.0  # mean signal photons per period of the picture
 PLAIN = system_of(_DEAD_NS, 1000)
 SYNCHRONOUS = PLAIN.replace(detector=Detector(dead_time_ns=0.0, mode="synchronous"))
@@ -40,15 +41,6 @@ class Settings:
 
 FULL = Settings(tuple(float(s) for s in np.geomspace(0.003, 10.0, 15)), 1000, 48)
 QUICK = Settings((0.03, 0.3, 3.0), 100, 24)
-
-
-@dataclass(frozen=True, eq=False)
-class Picture:
-    """A bright room: true depth (H, W), m, and what two methods make of it."""
-
-    depth_m: Any
-    signal: Any
-    estimates: dict[str, Reconstruction]
 
 
 _DELAY_NS = 50.0  # both ends of the exposure matter there
@@ -156,34 +148,11 @@ def flux_figure(rows: Sequence[Row]) -> Figure:
     return figure
 
 
-def maps_figure(picture: Picture) -> Figure:
-    """A bright room: true maps, and those of two methods."""
-    limits = _limits(picture.depth_m)
-    errors = {name: 1e3 * (each.depth_m - picture.depth_m) for name, each in picture.estimates.items()}
-    reach = float(np.percentile(np.abs(errors["matched_filter"]), 98))
-    share = _limits(picture.signal)
-    figure, axes = panels(4.3, 2, 3)
-    for ax, name in zip(axes[0, 1:], picture.estimates, strict=True):
-        words = "matched filter, raw counts" if name == "matched_filter" else "maximum likelihood"
-        _draw_map(ax, errors[name], "depth error (mm)", "RdBu_r", (-reach, reach), words)
-    for ax, (name, each) in zip(axes[1, 1:], picture.estimates.items(), strict=True):
-        raw = name == "matched_filter"
-        words = "signal, raw counts (own scale)" if raw else "signal, maximum likelihood"
-        _draw_map(ax, each.signal, "photons per period", "gray", _limits(each.signal) if raw else share, words)
-    _draw_map(axes[0, 0], picture.depth_m, "depth (m)", "viridis", limits, "true depth")
-    _draw_map(axes[1, 0], picture.signal, "photons per period", "gray", share, "true signal")
-    for ax in axes.flat:
-        ax.images[0].set_interpolation("nearest")  # a file a third as large
-    return figure
-
-
 _BOUNDS = 17  # delays at which the bound is computed; between them its logarithm is interpolated
 
 
-def run(request: Request) -> Facts:
+def run(settings: Settings, request: Request) -> Facts:
     """Sweeps over flux, near the bound, and a picture."""
-
-    settings = QUICK if request.quick else FULL
     rows = []
     for signal in settings.signals:
         request.tell(f"reconstruction: S = {signal:.3g}")
@@ -192,22 +161,20 @@ def run(request: Request) -> Facts:
     request.tell("reconstruction: near the bound")
     near = lines(2 * settings.pixels)
     request.tell("reconstruction: picture")
-    example = picture(settings)
+    cube, estimates = picture(settings.size)
     n = len(settings.signals)  # three fluxes: dim, ordinary, bright
     chosen = {settings.signals[k] for k in ((0, 1, 2) if n < 5 else (n // 4, (5 * n) // 8, n - 2))}
-    words = {"matched_filter": "the matched filter", "maximum_likelihood": "maximum likelihood"}
     return {
-        "s": settings,
         "findings": [finding for mode, title in TITLE.items() if (finding := _finding(rows, mode, title))],
         "chosen": [row for row in rows if row["signal"] in chosen],
         "near": near,
         "shown": [
-            (said, 1e3 * (estimate.depth_m - example.depth_m), float(np.median(estimate.signal / example.signal - 1.0)))
-            for said, estimate in ((said, example.estimates[name]) for name, said in words.items())
+            (words, 1e3 * (each.depth_m - cube.depth_m), float(np.median(each.signal / cube.flux.signal - 1.0)))
+            for words, each in ((words, estimates[name]) for name, words in WORDS.items())
         ],
         "window": window_lines(settings),
         "rows": rows,
-        "figures": {"flux": flux_figure(rows), "maps": maps_figure(example)},
+        "figures": {"flux": flux_figure(rows), "maps": maps_figure(cube, estimates)},
     }
 
 
@@ -288,10 +255,17 @@ def window_lines(settings: Settings) -> list[dict[str, Any]]:
     return lines
 
 
-def picture(settings: Settings) -> Picture:
+def picture(size: int) -> tuple[Cube, dict[str, Reconstruction]]:
     """A room of `BRIGHT` signal photons per period by the matched filter on raw counts and by maximum likelihood."""
-    scene = Scene.example("room", size=settings.size)
-    flux = scene.flux(PLAIN, signal=BRIGHT, sbr=SBR)
-    cube = simulate(flux, PLAIN, seed=SEED)[0]
-    estimate = {name: reconstruct(cube, PLAIN, name) for name in ("matched_filter", "maximum_likelihood")}
-    return Picture(scene.depth_m, flux.signal, estimate)
+    flux = Scene.example("room", size=size).flux(PLAIN, signal=BRIGHT, sbr=SBR)
+    cube = Cube(simulate(flux, PLAIN, seed=SEED), PLAIN, flux)
+    return cube, {name: reconstruct(cube, method=name) for name in WORDS}
+
+
+def maps_figure(cube: Cube, estimates: dict[str, Reconstruction]) -> Figure:
+    """True maps, and those of the methods."""
+    figure = reconstruction(cube, estimates)
+    for ax in figure.axes:
+        for image in ax.images:
+            image.set_interpolation("nearest")  # a file a third as large
+    return figure

@@ -1,1 +1,1 @@
-"""Lookup tables: what they hold, what their lookup costs, what their shape leaves out."""
+"""Lookup tables: what they hold, what their lookup costs over their size, what their shape leaves out."""

@@ -196,6 +196,13 @@ def test_small_words():
 LONG = SYSTEM.replace(cycles=10_000_000)
 
 
+@pytest.fixture
+def own_time(monkeypatch):
+    """The time of a processor, which other work on the machine does not change."""
+    monkeypatch.setattr("mars_lidar.io.simulated_file.time.perf_counter", time.process_time)
+
+
+@pytest.mark.usefixtures("own_time")
 def test_a_long_run_is_told_before_with_what_is_faster():
     flux = ml.Scene.example("room", size=32).flux(LONG, signal=1.0, sbr=1.0)
     text = advice(flux, LONG)
@@ -207,9 +214,8 @@ def test_a_long_run_is_told_before_with_what_is_faster():
     assert "auto" not in str(advice(flux, gated))  # which cannot do it
 
 
-def test_the_time_told_is_about_the_time_taken(monkeypatch):
-    """By the time of a processor, which other work on the machine does not change."""
-    monkeypatch.setattr("mars_lidar.io.simulated_file.time.perf_counter", time.process_time)
+@pytest.mark.usefixtures("own_time")
+def test_the_time_told_is_about_the_time_taken():
     system = SYSTEM.replace(cycles=40_000)
     flux = ml.Scene.example("room", size=48).flux(system, signal=1.0, sbr=1.0)
     began = time.process_time()
@@ -228,6 +234,7 @@ def test_commands_say_how_long_they_take(tmp_path, monkeypatch):
     assert words in ok("generate", "room", *small, "-o", tmp_path / "set.zarr").stderr
 
 
+@pytest.mark.usefixtures("own_time")
 def test_mars_takes_a_table_over_the_range_of_an_image(tmp_path, monkeypatch):
     monkeypatch.setenv("MARS_LIDAR_CACHE", str(tmp_path / "cache"))
     given = ["simulate", "--scene", "room", "--size", "24", "--cycles", "50", "--bins", "64", "--no-picture"]

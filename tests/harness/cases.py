@@ -5,16 +5,14 @@ from __future__ import annotations
 import itertools
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
 from mars_lidar import Detector, Flux, GaussianPulse, Pulse, SampledPulse, System
-
-if TYPE_CHECKING:
-    from studies.domain import systems
+from tests.domain import systems
 
 PERIOD_NS = 100.0
 WAVE = np.concatenate([np.full(40, 0.02), np.zeros(30), np.linspace(0.0, 0.08, 30)])  # 2 photons
@@ -125,14 +123,12 @@ def measured_pulse(name: str, span_ns: float, origin: str = "peak") -> SampledPu
 def random_cases(
     number: int, seed: int, photons: float = 6e6, least: int = 2000, most: int = 12_000, family: str | None = None
 ) -> list[Case]:
-    """Free-running systems of the study "domain", or those of its family "mode", over what the engines must cover.
+    """Free-running systems of `tests.domain`, or those of its family "mode", over what the engines must cover.
 
     `photons` bounds the arrivals to draw for each, `least` and `most` the exposures. With 2000 exposures on
     either side a mean that is off by 0.24 of its standard deviation, or a variance that is off by 34 %, is
     found with a probability of 0.99 at the level of the harness; with 12,000, 0.10 and 14 %.
     """
-    from studies.domain import systems  # the source archive has none, and golden bits are tested in it
-
     drawn = filter(_covered, (systems.draw(seed, k, family) for k in itertools.count()))
     if family is None:
         drawn = (case for case in drawn if case.mode == "nonparalyzable")

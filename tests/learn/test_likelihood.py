@@ -5,6 +5,7 @@ at the true light must vanish. What remains, times the inverse curvature, is the
 """
 
 import re
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -67,14 +68,15 @@ WARNS = "less than one pass of the pulse is expected to end without a registrati
 
 
 def end_matters(case: Case) -> bool:
-    """Whether it matters which registrations the end of the exposure cuts off, which a histogram does not say.
+    """Whether it matters which registrations the ends of the exposure cut off, which a histogram does not say.
 
-    So in an exposure that began armed, if registrations blind more than a period and less than one pass of the pulse
-    ends without.
+    So where registrations blind more than a period, if less than one pass of the pulse ends without, or if the pixel is
+    armed for less than two dead times.
     """
     passes = float(ml.mean_histogram(ml.Flux(*case.light), case.system).sum())  # no more than registrations and these
-    long = case.system.start == "armed" and case.system.dead_time_periods > 1.0
-    return long and passes * np.exp(-case.light[0]) < 1.0
+    dead = case.system.dead_time_periods
+    armed = case.system.cycles - passes * dead
+    return dead > 1.0 and (passes * np.exp(-case.light[0]) < 1.0 or armed < 2.0 * dead)
 
 
 @pytest.mark.nightly
@@ -95,6 +97,32 @@ def test_a_bias_at_the_end_is_warned_of():
     """0.42 standard deviations, as the docstring says."""
     with pytest.warns(UserWarning, match=WARNS):
         assert 0.3 < np.abs(bias(drawn(1069))).max() < 0.5
+
+
+@pytest.mark.parametrize(
+    ("start", "dead", "light", "least"),
+    [
+        ("stationary", 924.0, (9.4, 1.2, 40.3), 0.5),  # no pass of the pulse is left
+        ("armed", 1387.0, (2.0, 3.6, 40.3), 0.5),  # armed for about one dead time
+        ("armed", 1387.0, (0.5, 0.6, 40.3), 0.0),  # for four, and no warning
+    ],
+)
+def test_ends_that_matter_are_warned_of(start, dead, light, least):
+    """Mean score of 500 exposures, in standard deviations of the bound: within 5 standard errors of 0, or far off."""
+    exposures = 500
+    system = make_system(dead, 1000, 32, sigma_ns=2.5, start=start)
+    cube = ml.simulate(ml.Flux([[light[0]]], *light[1:]), system, realizations=exposures, seed=3, threads=1)
+    counts = torch.from_numpy(cube.reshape(exposures, 32).astype(float))
+    at = torch.tensor([light] * exposures, dtype=torch.float64, requires_grad=True)
+    with warnings.catch_warnings(record=True) as given:
+        warnings.simplefilter("always")
+        value = histogram_log_likelihood(counts, at[:, 0], at[:, 1], at[:, 2], system)
+    assert bool([w for w in given if WARNS in str(w.message)]) == (least > 0.0)
+    score = torch.autograd.grad(value.sum(), at)[0].numpy() * Case(system, light).bound
+    off = np.abs(score.mean(0))
+    assert off.max() > least
+    if least == 0.0:
+        assert (off < 5.0 * score.std(0) / exposures**0.5).all(), off
 
 
 @pytest.mark.parametrize("level", _core.levels())

@@ -18,8 +18,8 @@ from mars_lidar.statistics import joint as pixel_module
 from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.joint_grid import FoldedGrid, relative_residual
 from mars_lidar.statistics.tolerances import LAW, TOL
-from studies.domain.judge import Predictions, refusal
-from studies.domain.systems import draw
+from tests.domain.judge import Predictions, refusal
+from tests.domain.systems import draw
 
 PERIOD_NS = 100.0
 
@@ -440,10 +440,10 @@ def test_a_warm_state_that_is_not_found_is_refused():
 @pytest.mark.full
 @pytest.mark.parametrize("first", range(0, 48, 8))
 def test_random_systems(first: int):
-    """Laws of systems of the study "domain" agree with each other and with closed forms; refusals say what to do."""
+    """Laws of systems of the sweep agree with each other and with closed forms; refusals say what to do."""
     for number in range(first, first + 8):
         case = draw(20_000, number)
-        if case.system.dead_time_periods > 300.0 or case.system.bins > 4096:  # right, but slow: `studies domain`
+        if case.system.dead_time_periods > 300.0 or case.system.bins > 4096:  # right, but slow: `tests.domain`
             continue
         for name, law in Predictions(case).steps():
             wrong = []

@@ -9,8 +9,6 @@ import mars_lidar as ml
 from mars_lidar import _core
 from mars_lidar.statistics.count_pmf import Pmf, gaussian_pmf, total_variation
 from mars_lidar.statistics.matched import matched_pmf, trusted
-from studies.count_law.matched import QUICK
-from tests.harness.study import quick_study
 
 PERIOD_NS = 1e3 / 7.5
 AIM = 0.002
@@ -219,15 +217,3 @@ def test_next_to_no_step_at_the_change_of_form():
 )
 def test_bad_cumulants(cumulants, message):
     refused(message, matched_pmf, cumulants)
-
-
-@pytest.mark.full
-def test_study(tmp_path):
-    study = quick_study("matched", tmp_path)
-    rows = study.rows
-    cells = len(QUICK.signal) * len(QUICK.background)
-    maps = len(QUICK.dead) * len(QUICK.cycles) + len(QUICK.stationary)
-    assert 0 < len(rows) < maps * cells + QUICK.systems * QUICK.pixels
-    assert all(row["trusted"] == "False" or AIM / 4 < float(row["tv_exact_matched"]) <= AIM for row in rows)
-    assert f"| grid, armed | {len(QUICK.dead) * len(QUICK.cycles) * cells} |" in study.text
-    assert study.figures == ["matched_map.png"]

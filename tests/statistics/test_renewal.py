@@ -9,8 +9,7 @@ from harness import armed_count_pmf, constant_rate_moments, refused, stationary_
 import mars_lidar as ml
 from mars_lidar.statistics import PhaseChain, holding_time_covariance, holding_times, photons_per_bin
 from mars_lidar.statistics.renewal import lag_covariances, row_moments, weighted_waits
-from studies.covariance.rules import TruncatedSums
-from studies.covariance.run import moment_matrices
+from studies.covariance.run import TruncatedSums, moment_matrices
 
 # photons per period, dead time in periods, re-arming
 CASES = [

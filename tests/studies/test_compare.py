@@ -12,10 +12,8 @@ from scipy import stats
 
 import mars_lidar as ml
 from mars_lidar.engines import ENGINES, Engine
-from studies.compare.command import main
-from studies.compare.comparison import PixelLaw, compare
-from studies.compare.report import cell, show, with_error
-from studies.compare.sample import Estimate, Moments, ratio
+from studies.compare.command import cell, main, show, with_error
+from studies.compare.comparison import Estimate, Moments, PixelLaw, compare, ratio
 from tests.harness.command import command_line
 
 SYSTEM = make_system(63.0, 200, 100, sigma_ns=1.5)

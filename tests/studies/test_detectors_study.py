@@ -1,4 +1,4 @@
-"""The studies of detector modes and of a detector's effects in their quick form."""
+"""The study of detector modes and effects in its quick form."""
 
 from __future__ import annotations
 
@@ -6,29 +6,26 @@ import pytest
 from harness import require
 from scipy import stats
 
-from studies.detectors import effects
 from studies.detectors import run as detectors
 from tests.harness.study import quick_study, read_csv
 
 
 @pytest.mark.full
-def test_modes(tmp_path):
+def test_modes_and_effects(tmp_path, monkeypatch):
+    """A few of the effects; the law of the electronics takes a minute."""
+    few = [each for each in detectors.EFFECTS if each.figure in ("", "afterpulsing", "crosstalk", "jitter")]
+    monkeypatch.setattr(detectors, "EFFECTS", few)
     study = quick_study("detectors", tmp_path)
-    assert [row["detector"] for row in study.rows] == [example.name for example in detectors.EXAMPLES]
-    assert study.figures == ["detectors_gated.png", "detectors_paralyzable.png", "detectors_synchronous.png"]
-    for row in study.rows:
-        if row["detector"] == "moving gate":
-            assert row["predicted mean"] == "-"
-            continue
-        require({"mean": 2 * stats.norm.sf(abs(float(row["z mean"])))}, f"detector study, {row['detector']}")
-
-
-@pytest.mark.full
-def test_effects(tmp_path, monkeypatch):
-    """A few of its rows; the law of the electronics takes a minute."""
-    few = [example for example in effects.EXAMPLES if example.figure in ("", "afterpulsing", "crosstalk", "jitter")]
-    monkeypatch.setattr(effects, "EXAMPLES", few)
-    study = quick_study("effects", tmp_path)
-    assert [row["detector"] for row in study.rows] == [example.name for example in few]
-    assert study.figures == ["effects_afterpulsing.png", "effects_crosstalk.png", "effects_jitter.png"]
-    assert [abs(float(row["z"])) < 5.4 for row in read_csv(tmp_path / "effects_rate.csv")] == [True] * 5
+    assert [row["detector"] for row in study.rows] == [each.name for each in (*detectors.MODES, *few)]
+    groups = {each.figure for each in (*detectors.MODES, *few, *detectors.IN_FOG)} - {""}
+    assert study.figures == [f"detectors_{name}.png" for name in sorted(groups)]
+    fog = read_csv(tmp_path / "detectors_fog.csv")
+    for row in (*study.rows, *fog):
+        simulated_only = row["detector"] == "moving gate" or row["effect"] in ("afterpulsing", "crosstalk")
+        assert (row["predicted mean"] == "-") == simulated_only
+        if not simulated_only:
+            p = 2 * stats.norm.sf(abs(float(row["z mean"])))
+            require({"mean": p}, f"detector study, {row['effect']}, {row['detector']}")
+    wall = {row["detector"]: float(row["wall"]) for row in fog}
+    assert wall["synchronous"] < 0.4 * wall["non-paralyzable"], "the light of the fog arrives first"
+    assert [abs(float(row["z"])) < 5.4 for row in read_csv(tmp_path / "detectors_rate.csv")] == [True] * 5

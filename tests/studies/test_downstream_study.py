@@ -14,14 +14,13 @@ from harness import make_system
 import mars_lidar as ml
 from mars_lidar.statistics import mean_histogram
 from studies import Request
-from studies.common.kept import fixed
-from studies.common.windows import BOX, LOGS, NEAR, WINDOW, features, number, starts
 from studies.downstream import data as downstream_data
 from studies.downstream import run as downstream
 from studies.downstream.data import CONFIGS, MAIN, WORDS, instrument
 from studies.downstream.networks import predicted, trained
 from studies.downstream.prediction import at
-from studies.downstream.report import scatter
+from studies.downstream.run import fixed, scatter
+from studies.downstream.windows import BOX, LOGS, NEAR, WINDOW, features, number, starts
 from studies.neural import NeuralEngine
 from tests.harness.study import quick_study
 
@@ -42,7 +41,7 @@ def test_the_study_goes_on_where_it_was_stopped(tmp_path: Path, monkeypatch: pyt
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        downstream.run(Request(tmp_path, quick=True, tell=stop))
+        downstream.run(Request(out=tmp_path, quick=True, tell=stop))
     result = tmp_path / "downstream-tiny" / "pixel-exact-dead0.5625-sbr1-0.json"
     made = result.stat().st_mtime_ns
     study = quick_study("downstream", tmp_path)

@@ -17,7 +17,7 @@ from mars_lidar.reconstruction.image_network import CARD, WEIGHTS, networks_of
 from mars_lidar.reconstruction.image_pulse import settings_of
 from mars_lidar.reconstruction.photons import Photons
 from studies.__main__ import main
-from studies.image import alternating, captures
+from studies.image import captures, priors
 from tests.harness.study import quick_study
 
 SYSTEM = make_system(20.0, 20_000, 250, sigma_ns=0.6)
@@ -53,25 +53,16 @@ def test_a_capture_is_thinned_to_so_many_photons(tmp_path):
     assert (counts <= capture.counts).all()
 
 
-def test_a_folder_that_is_none_is_refused(capsys):
-    with pytest.raises(SystemExit):
-        main(["image", "--captures", "/nowhere"])
-    assert "--captures must be a folder" in capsys.readouterr().err
-    with pytest.raises(SystemExit):
-        main(["image", "--drunet", "/nowhere"])
-    assert "--drunet must be a file" in capsys.readouterr().err
-
-
 def test_total_variation_denoises():
     """Least squares plus variation of one edge: both levels move by the weight over their width (Strong and Chan)."""
     image = np.zeros((8, 8))
     image[:, 4:] = 1.0
-    result = alternating.total_variation(image, 0.5, projections=1000)
+    result = priors.total_variation(image, 0.5, projections=1000)
     np.testing.assert_allclose(result, np.where(image > 0.5, 1.0 - 0.5 / 4.0, 0.5 / 4.0), atol=0.01)
     delay = 30.0 + 0.02 * np.add.outer(np.arange(24.0), np.arange(24.0))
     system = SYSTEM.replace(cycles=1000)
     flux = ml.Flux(np.full(delay.shape, 5e-3), 5e-3, delay)
-    off = alternating.by_variation(ml.simulate(flux, system, seed=4)[0], system) - delay
+    off = priors.by_variation(ml.simulate(flux, system, seed=4)[0], system) - delay
     assert np.median(np.abs(off)) < 0.3
     assert (np.abs(off) > 1.8).mean() < 0.02
 
@@ -87,8 +78,8 @@ def test_a_denoiser_is_a_prior():
         noises.append(noise)
         return np.full_like(image, np.median(image))
 
-    assert np.ptp(alternating.by_denoiser(cube, system, mean)) == 0.0
-    assert abs(alternating.by_denoiser(cube, system, mean).mean() - delay.mean()) < 0.2
+    assert np.ptp(priors.by_denoiser(cube, system, mean)) == 0.0
+    assert abs(priors.by_denoiser(cube, system, mean).mean() - delay.mean()) < 0.2
     assert noises[-1] == pytest.approx(1.0)
     assert (np.diff(noises[: len(noises) // 2]) <= 0.0).all()
 
@@ -98,16 +89,14 @@ def test_drunet_learns(deepinv, tmp_path):
     """The error falls (measured: 64 to 2.1); read again from its file, with its sizes."""
     import torch
 
-    from studies.image import drunet
-
-    begun, trained = (drunet.prior(None, steps, 12, 1) for steps in (2, 60))
+    begun, trained = (priors.drunet(None, steps, 12, 1) for steps in (2, 60))
     assert "trained here" in trained.weights
     clean = np.add.outer(np.linspace(0.0, 8.0, 32), np.linspace(0.0, 4.0, 32))
     noisy = clean + np.random.default_rng(2).normal(size=clean.shape)
     errors = [np.square(net(noisy, 1.0) - clean).mean() for net in (begun, trained)]
     assert errors[1] < 0.2 * errors[0]
     torch.save(trained.net.state_dict(), tmp_path / "weights.pth")
-    read = drunet.prior(tmp_path / "weights.pth", 0, 0, 0)
+    read = priors.drunet(tmp_path / "weights.pth", 0, 0, 0)
     assert "weights.pth" in read.weights
     np.testing.assert_array_equal(read(noisy, 1.0), trained(noisy, 1.0))
 
@@ -118,11 +107,11 @@ def test_without_deepinv_the_study_says_so(monkeypatch, tmp_path):
 
     monkeypatch.setitem(sys.modules, "deepinv", None)
     monkeypatch.setitem(sys.modules, "deepinv.models", None)
-    methods, words = run._methods(Request(tmp_path), run.QUICK)
+    methods, words = run._methods(Request(out=tmp_path), run.QUICK)
     assert methods == run.METHODS
     assert words.startswith("skipped: DRUNet needs deepinv")
     with pytest.raises(ImportError):
-        run._methods(Request(tmp_path, drunet=tmp_path / "weights.pth"), run.QUICK)
+        run._methods(Request(out=tmp_path, drunet=tmp_path / "weights.pth"), run.QUICK)
 
 
 def test_coverage_over_further_scenes():

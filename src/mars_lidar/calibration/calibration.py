@@ -445,7 +445,7 @@ class _Run:
     def first(self) -> Fitted:
         """The plain model, from other starts and simulated streams until it converges with a significant pulse.
 
-        The phases have a bright window (`brightest_window`), so that a fit without a pulse is a bad one.
+        The phases have a bright window, so that a fit without a pulse is a bad one.
         """
         tried: list[tuple[Fit, Fitted]] = []
         while len(tried) < self.fit.effort.attempts and not (tried and tried[-1][1].converged and tried[-1][1].lit):

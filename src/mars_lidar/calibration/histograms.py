@@ -163,7 +163,8 @@ def _with_response(
     """The system with the most likely response in `reach` bins on either side, and the standard errors of its samples.
 
     A bin j of pixel k expects D_kj (B_k / bins + S_k sum_m a_kjm r_m), with r the response, a the share of its sample
-    m that falls into the bin at the pixel's delay, and D the armed passes. The likelihood is maximised by expectation
+    m that falls into the bin at the pixel's delay, and D the passes that are armed on average in the bin, by the
+    expected registrations of the response before. The likelihood is maximised by expectation
     and maximisation (Shepp and Vardi, IEEE Trans. Med. Imaging 1, 113, 1982), in turn with the light of each pixel.
     """
     from scipy.sparse import csr_matrix
@@ -175,8 +176,9 @@ def _with_response(
     edges = (np.arange(samples + 1) - reach) * width
     response = np.maximum(np.diff(system.pulse.cumulative(edges)), 1e-6)
     for _ in range(rounds):
-        light = MaximumLikelihood().estimate(Histograms(counts, system, 1))
-        passes = _armed_passes(counts, system)
+        histograms = Histograms(counts, system, 1)
+        light = MaximumLikelihood().estimate(histograms)
+        background = np.maximum(light.background, 1e-6)
         first = light.delay * bins - reach  # where the first sample begins, in bins
         whole = np.floor(first).astype(int)
         share = first - whole  # of a sample that falls into the bin after
@@ -184,23 +186,22 @@ def _with_response(
         row = np.arange(pixels)[:, None] * bins
         rows = np.stack([row + (whole[:, None] + sample) % bins, row + (whole[:, None] + sample + 1) % bins])
         weight = np.stack([1.0 - share, share])[:, :, None] * np.ones(samples)
-        weight = weight * light.signal[None, :, None] * passes.ravel()[rows]
+        weight = weight * light.signal[None, :, None]
         columns = np.broadcast_to(sample, rows.shape)
         to_bins = csr_matrix((weight.ravel(), (rows.ravel(), columns.ravel())), (pixels * bins, samples))
-        floor = (passes * light.background[:, None] / bins).ravel()
+        floor = np.repeat(background / bins, bins)
+        passes = _expected(histograms, np.stack([light.signal, background, light.delay], axis=1)).ravel()
+        passes = passes / (to_bins @ response + floor)
+        to_bins, floor = csr_matrix(to_bins.multiply(passes[:, None])), floor * passes
         recorded, exposed = counts.ravel(), np.maximum(np.asarray(to_bins.sum(0)).ravel(), 1e-9)
         for _ in range(steps):
             expected = np.maximum(to_bins @ response + floor, 1e-9)
             response = response * (to_bins.T @ (recorded / expected)) / exposed
         information = (to_bins.T @ to_bins.multiply((1.0 / expected)[:, None])).toarray()
-        error = np.sqrt(np.diag(np.linalg.pinv(information, rcond=1e-10, hermitian=True)))
+        curved = np.diff(response, 2, prepend=0.0, append=0.0) / 8.0  # of linear interpolation between bins
+        error = np.sqrt(np.diag(np.linalg.pinv(information, rcond=1e-10, hermitian=True)) + curved**2)
         system = system.replace(pulse=SampledPulse(response, bin_ns=width, origin="centroid"))
     return system, error
-
-
-def _armed_passes(counts: FloatArray, system: System) -> FloatArray:
-    """Armed passes (pixels, bins) of each bin: the registrations for light of one photon per bin."""
-    return _expected(Histograms(counts, system, 1), np.tile([0.0, float(counts.shape[1]), 0.0], (len(counts), 1)))
 
 
 def _expected(histograms: Histograms, light: FloatArray) -> FloatArray:

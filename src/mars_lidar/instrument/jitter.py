@@ -69,11 +69,6 @@ class Jitter:
         return cls(sigma_ns=sigma, tail_ns=tail_ns, tail_fraction=tail_fraction)
 
     @property
-    def mean_ns(self) -> float:
-        """Mean, ns."""
-        return self.tail_fraction * self.tail_ns
-
-    @property
     def std_ns(self) -> float:
         """Standard deviation, ns."""
         f = self.tail_fraction
@@ -180,11 +175,6 @@ class SampledJitter:
     def shape(self) -> SampledPulse:
         """The density as a pulse."""
         return SampledPulse(self.values, self.bin_ns, self.origin)
-
-    @property
-    def mean_ns(self) -> float:
-        """Mean, ns."""
-        return self._moment(1)
 
     @property
     def std_ns(self) -> float:

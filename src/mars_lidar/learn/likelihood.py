@@ -69,13 +69,15 @@ def histogram_log_likelihood(
     Notes
     -----
     Unbiased to 0.1 of the Cramer-Rao bound's standard deviation at 1000 cycles, for bins of up to 3 widths (sigma) of
-    the pulse, S up to 10, B up to 5 and any dead time: at most 0.03 over the 399 random instruments with which its
-    settings were chosen, 0.05 over 398 others, against the exact mean histogram (the bias in these units grows with the
-    square root of the cycles). The bias of S and of the delay is larger (0.2 and 0.4 in two further instruments) where
-    three conditions hold: an armed start, a dead time longer than a period, and less than one pass of the pulse that is
-    expected to end without registration. The registrations that the end of the exposure cuts off then matter, and a
-    histogram does not contain them; a warning says so. The value jumps by up to 5e-3 (1e-4 mostly) where the window of
-    divided bins moves by a bin; the slope in the delay jumps where a sample of a pulse begins at the edge of a cell.
+    the pulse, S up to 10, B up to 5 and dead times of up to 3 periods: at most 0.03 over the 399 random instruments
+    with which its settings were chosen, 0.05 over 398 others, against the exact mean histogram (the bias in these units
+    grows with the square root of the cycles). Where a dead time is longer than a period, the registrations that the
+    ends of the exposure cut off matter, and a histogram does not contain them, if less than one pass of the pulse is
+    expected to end without registration (0.2 and 0.4 in two further instruments), or if the pixel is armed for less
+    than two dead times. Over simulated exposures with dead times of 3.3 to 14 periods S and B were then up to 1.8
+    standard deviations off (docs/learn.md); a warning says so. The value jumps by up to 5e-3 (1e-4 mostly) where the
+    window of divided bins moves by a bin; the slope in the delay jumps where a sample of a pulse begins at the edge of
+    a cell.
     The processor computes it with its first and second derivatives; tensors of other devices are copied there and back.
     Pixels are shared among PyTorch's threads; docs/learn.md has the times.
 
@@ -182,18 +184,24 @@ def _evaluated(counts: torch.Tensor, light: torch.Tensor, system: System, column
 
 
 def _warn_of_the_end(counts: FloatArray, signal: FloatArray, system: System) -> None:
-    """Warn of pixels in which it matters which registrations the end of the exposure cuts off."""
-    if system.start == "stationary" or system.dead_time_periods <= 1.0:
+    """Warn of pixels in which it matters which registrations the ends of the exposure cut off.
+
+    An end hides up to a dead time, of which the likelihood takes the mean.
+    """
+    dead = system.dead_time_periods
+    if dead <= 1.0:
         return
-    fewest = system.cycles / (1.0 + math.ceil(system.dead_time_periods))  # armed passes, where each registers
-    passes = np.maximum(counts.sum(1), fewest)
-    affected = np.count_nonzero(passes * np.exp(-signal) < 1.0)
+    fewest = system.cycles / (1.0 + math.ceil(dead))  # armed passes, where each registers
+    registrations = counts.sum(1)
+    passes = np.maximum(registrations, fewest)
+    armed = system.cycles - registrations * dead
+    affected = np.count_nonzero((passes * np.exp(-signal) < 1.0) | (armed < 2.0 * dead))
     if affected:
         warnings.warn(
             f"histogram_log_likelihood: in {affected} of {len(signal)} pixels less than one pass of the pulse is "
-            "expected to end without a registration, each of which blinds the pixel for more than a period: which "
-            "registrations the end of the exposure cuts off matters, and S and delay may be 0.4 of the bound's "
-            "standard deviation off",
+            "expected to end without a registration, each of which blinds the pixel for more than a period, or the "
+            "pixel is armed for less than two dead times: which registrations the ends of the exposure cut off "
+            "matters, and S, B and delay may be off by more than the bound's standard deviation",
             UserWarning,
             stacklevel=2,
         )

@@ -92,7 +92,7 @@ def _density(system: System, blur: float, count: int) -> tuple[float, int, Float
     low, high = low - reach, high + reach
     wraps = high - low >= 1.0
     if wraps:
-        middle = float(system.pulse.mean_ns) / period if hasattr(system.pulse, "mean_ns") else 0.5 * (low + high)
+        middle = 0.5 * (low + high)
         low, high = middle - 0.5, middle + 0.5
     first = math.floor(low / step)
     number = min(math.ceil(high / step) - first, samples)

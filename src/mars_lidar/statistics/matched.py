@@ -61,7 +61,7 @@ def matched_pmf(cumulants: ArrayLike, *, threads: int | None = None) -> list[Pmf
 def trusted(cumulants: ArrayLike, *, threads: int | None = None) -> NDArray[np.bool_]:
     """Whether the law of `matched_pmf` is within a total variation of 0.002 of the exact law: (cells,).
 
-    The criterion uses the cumulants (cells, 4) alone; docs/studies/matched.md gives its error rate.
+    The criterion uses the cumulants (cells, 4) alone; docs/studies/law.md gives its error rate.
     """
     return _support(_checked(cumulants), thread_count(threads))[2]
 

@@ -242,11 +242,6 @@ class HoldingTimeCovariance:
 
     __repr__ = brief
 
-    @property
-    def stationary_pdf(self) -> FloatArray:
-        """Stationary distribution of the phases (bins,)."""
-        return self.times.stationary.pdf
-
 
 @checked
 def holding_time_covariance(

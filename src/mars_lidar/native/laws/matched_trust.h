@@ -3,7 +3,7 @@
 //
 // Laws on another base (matched_atoms.h), or with the fourth cumulant left to that base, must be close to the law that
 // is drawn from: where they are, what the cumulants leave open does not matter. Thresholds by a study of exact
-// laws (docs/studies/matched.md). For tables and engines once a pixel, not for drawing.
+// laws (docs/studies/law.md). For tables and engines once a pixel, not for drawing.
 #pragma once
 #include "laws/matched_law.h"
 

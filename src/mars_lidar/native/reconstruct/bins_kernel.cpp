@@ -59,12 +59,12 @@ struct Passes {
         }
         none = 1.0 - q;
     }
-    // Of the vector from bin i on.
-    MARS_INLINE Passes(const double* passed, int64_t bins, int64_t i)
-        : quiet(reals(passed + i)),
-          fired(reals(passed + bins + i)),
-          q(reals(passed + 2 * bins + i)),
-          dq(reals(passed + 3 * bins + i)),
+    // Of columns of `bins`.
+    MARS_INLINE Passes(const double* passed, int64_t bins)
+        : quiet(reals(passed)),
+          fired(reals(passed + bins)),
+          q(reals(passed + 2 * bins)),
+          dq(reals(passed + 3 * bins)),
           none(1.0 - q) {}
 };
 
@@ -110,7 +110,8 @@ double total(const Real (&parts)[kParts]) {
     return sum;
 }
 
-template <bool poisson>
+// `passed`: what becomes of a pass is known.
+template <bool poisson, bool passed>
 BinSums terms_of(const TermsBlock& of) {
     Real value[kParts] = {}, score[3][kParts] = {}, info[6][kParts] = {};
     for_bins(of.bins, [&](int64_t i, int p) {
@@ -122,12 +123,14 @@ BinSums terms_of(const TermsBlock& of) {
             ds = reals(of.slope + i);
         }
         light = of.light ? reals(of.light + i) : of.signal * s + of.flat * share;
-        const Term term = poisson ? poisson_term(h, armed, light)
-                                  : passed_term(h, armed, reals(of.rearmed + i),
-                                                of.alike    ? Passes(of.passed, kBinsTogether, p * kReals)
-                                                : of.passed ? Passes(of.passed, of.bins, i)
-                                                            : Passes(light),
-                                                of.by_time);
+        const auto pass = [&] {
+            if constexpr (passed)
+                return Passes(of.passed + (of.alike ? p * kReals : i), of.alike ? kBinsTogether : of.bins);
+            else
+                return Passes(light);
+        };
+        const Term term =
+            poisson ? poisson_term(h, armed, light) : passed_term(h, armed, reals(of.rearmed + i), pass(), of.by_time);
         value[p] = value[p] + term.value;
         if (of.score) {
             put(of.score + i, term.score);
@@ -201,7 +204,8 @@ void MARS_JOIN(bin_passes_, MARS_LEVEL)(const PassesBlock& of) {
 }
 
 BinSums MARS_JOIN(bin_terms_, MARS_LEVEL)(const TermsBlock& of) {
-    return of.poisson ? terms_of<true>(of) : terms_of<false>(of);
+    if (of.poisson) return terms_of<true, false>(of);
+    return of.passed ? terms_of<false, true>(of) : terms_of<false, false>(of);
 }
 
 void MARS_JOIN(bin_products_, MARS_LEVEL)(const ProductsBlock& of) {

@@ -1,1 +1,0 @@
-"""Two returns in fog through the dead time of three detectors."""

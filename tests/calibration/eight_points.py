@@ -134,11 +134,11 @@ def wide_jitter() -> str:
     results = [calibrated(truth, 40_000, seed) for seed in range(5)]
     suspects = sum(bool(result.suspects) for result in results)
     other = replace(with_effect(ORDINARY, "recovery"), jitter=0.72)
-    found = calibrated(other, 100_000, 5)
-    stated = found.estimates.get("recovery_ns", "none")
+    result = calibrated(other, 100_000, 5)
+    stated = result.estimates.get("recovery_ns", "none")
     return (
         f"suspects in {suspects} of 5; recovery of 2 ns beside a jitter of 0.72 ns: "
-        f"{', '.join(suspect.name for suspect in found.suspects) or 'nothing'}, {stated} ns"
+        f"{', '.join(suspect.name for suspect in result.suspects) or 'nothing'}, {stated} ns"
     )
 
 

@@ -260,7 +260,7 @@ def _flicker(fit: Fit, fitted: Fitted, counts: float = 8.0, windows: int = 64) -
     cycles = max(2, round(fit.exposure(size)))
     rows = draws(fitted.model, fitted.unbounded, fitted.covariance, fitted.free)[:LIGHTS]
     drawn = [Recording((t,), (cycles,), recording.clock) for t in fitted.model.streams(rows, cycles, 0)]
-    table = []
+    table: list[list[tuple[float, float, float]]] = []
     while not table or counts * windows < recording.photons:
         window = counts * recording.exposure / recording.photons
         table.append([x.unevenness(window) for x in (recording, *drawn)])

@@ -8,6 +8,7 @@ With `--data` every law is also compared with reference cases that another progr
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -233,7 +234,9 @@ def run(settings: Settings, request: Request) -> Facts:
         "everything": everything,
         "grid": on_grid,
         "ratio": on_grid.distance["gaussian"][plain] / (_PER_SKEWNESS * skewness),
-        "by_dead": {dead: Cells([p for p in armed if p.system.dead_time_periods == dead]) for dead in settings.dead},
+        "by_dead": {
+            dead: Cells([p for p in armed if math.isclose(p.system.dead_time_periods, dead)]) for dead in settings.dead
+        },
         "by_variance": [
             (low, high, everything.distance["matched"][here], everything.distance["gaussian"][here])
             for low, high in pairwise(_EDGES)

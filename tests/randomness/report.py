@@ -3,8 +3,8 @@
     python tests/randomness/report.py --minutes 60             # SmallCrush in every order, then Crush as far as it gets
     python tests/randomness/report.py --battery BigCrush --minutes 2000
 
-P-values go to docs/results/randomness.csv as they come; a run begins after the last test that is there, as long as seed
-and generator are the same. Debian has TestU01 in its section non-free (libtestu01-0-dev); `--library` names the folder
+P-values go to docs/results/randomness.csv as they come; tests that it has, of the same seed and generator, are not
+repeated. Debian has TestU01 in its section non-free (libtestu01-0-dev); `--library` names the folder
 of another installation, with `include` and `lib` in it.
 """
 
@@ -64,22 +64,27 @@ def run(program: Path, battery: str, order: tuple[str, int, int], seed: int, row
     """The tests of a battery that `rows` does not have, until a time; `rows` and the file grow by each."""
     kind, streams, words = order
     named = dict(zip(COLUMNS, (generator(), seed, battery, kind, streams, words), strict=False))
-    same = [row for row in rows if all(row[key] == str(value) for key, value in named.items())]
-    first = 1 + max((int(row["test"]) for row in same), default=0)
-    if first > TESTS[battery.removesuffix("-reversed")] or time.monotonic() > until:
-        return
-    command = [str(program), battery, kind, str(streams), str(words), str(seed), str(first)]
-    with subprocess.Popen(command, text=True, stdout=subprocess.PIPE) as process:
-        assert process.stdout is not None
-        try:
-            for line in process.stdout:
-                values = dict(zip(COLUMNS[6:], line.strip().split(",", 3), strict=True))
-                rows.append({**{key: str(value) for key, value in named.items()}, **values})
-                save(rows, path)
-                if time.monotonic() > until:
-                    break
-        finally:
-            process.kill()
+    every = set(range(1, 1 + TESTS[battery.removesuffix("-reversed")]))
+    while time.monotonic() < until:
+        same = [row for row in rows if all(row[key] == str(value) for key, value in named.items())]
+        done = {int(row["test"]) for row in same}
+        if done == every:
+            return
+        command = [str(program), battery, kind, str(streams), str(words), str(seed), str(min(every - done))]
+        with subprocess.Popen(command, text=True, stdout=subprocess.PIPE) as process:
+            assert process.stdout is not None
+            try:
+                for line in process.stdout:
+                    values = dict(zip(COLUMNS[6:], line.strip().split(",", 3), strict=True))
+                    if int(values["test"]) in done or time.monotonic() > until:
+                        break  # the process prints all p-values of a test at once, so that none is lost
+                    rows.append({**{key: str(value) for key, value in named.items()}, **values})
+                    save(rows, path)
+                else:
+                    if process.wait() != 0:
+                        raise RuntimeError(f"{command[0]} ended with exit status {process.returncode}")
+            finally:
+                process.kill()
 
 
 def save(rows: list[dict[str, str]], path: Path) -> None:
@@ -130,13 +135,13 @@ def report(rows: list[dict[str, str]]) -> str:
 
 
 def _complete(rows: list[dict[str, str]], battery: str) -> bool:
-    return max(int(row["test"]) for row in rows if row["battery"] == battery) == TESTS[battery]
+    return len({row["test"] for row in rows if row["battery"] == battery}) == TESTS[battery]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--battery", choices=TESTS, action="append", help="default: SmallCrush, then Crush")
-    parser.add_argument("--minutes", type=float, default=60.0, help="after which no further test begins")
+    parser.add_argument("--minutes", type=float, default=60.0, help="then the run ends with the tests that are complete")
     parser.add_argument("--seed", type=int, default=20_261_123)
     parser.add_argument("--library", type=Path, help="folder of an installation of TestU01")
     given = parser.parse_args()

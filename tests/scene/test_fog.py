@@ -1,4 +1,4 @@
-"""Returns in fog: the lidar equation, by brute force; limits; the study in its quick form."""
+"""Returns in fog: the lidar equation, by brute force; limits."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,6 @@ from harness import make_system, refused
 from scipy import integrate, special
 
 import mars_lidar as ml
-from tests.harness.study import quick_study
 
 C = 0.299792458
 SYSTEM = make_system(30.0, 100, 200, sigma_ns=0.4)
@@ -76,10 +75,3 @@ def test_bad_input():
         (ml.Flux(waveform=[1.0]), {}, "needs the delays of returns"),
     ):
         refused(message, light.in_fog, SYSTEM, **{"extinction_per_m": 0.1, "backscatter": 1.0} | changes)
-
-
-def test_study(tmp_path):
-    study = quick_study("transients", tmp_path)
-    rows = {row["detector"]: row for row in study.rows}
-    assert float(rows["synchronous"]["wall"]) < 0.3 * float(rows["non-paralyzable"]["wall"])
-    assert study.figures == ["transients.png"]

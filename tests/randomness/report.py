@@ -141,7 +141,7 @@ def _complete(rows: list[dict[str, str]], battery: str) -> bool:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--battery", choices=TESTS, action="append", help="default: SmallCrush, then Crush")
-    parser.add_argument("--minutes", type=float, default=60.0, help="then the run ends with the tests that are complete")
+    parser.add_argument("--minutes", type=float, default=60.0, help="then it ends with the tests that are complete")
     parser.add_argument("--seed", type=int, default=20_261_123)
     parser.add_argument("--library", type=Path, help="folder of an installation of TestU01")
     given = parser.parse_args()

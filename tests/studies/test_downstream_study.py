@@ -32,7 +32,7 @@ pytestmark = pytest.mark.usefixtures("one_torch_thread")
 @pytest.mark.full
 def test_the_study_goes_on_where_it_was_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     small = replace(TINY, arms=("exact", "mars", "poisson"), seeds=1, dead=(), spatial=0, lines=(MAIN,))
-    monkeypatch.setitem(CONFIGS, "tiny", small)
+    monkeypatch.setattr(downstream, "QUICK", small)
     messages: list[str] = []
 
     def stop(text: str) -> None:
@@ -41,7 +41,7 @@ def test_the_study_goes_on_where_it_was_stopped(tmp_path: Path, monkeypatch: pyt
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        downstream.run(Request(out=tmp_path, quick=True, tell=stop))
+        downstream.run(small, Request(out=tmp_path, quick=True, tell=stop))
     result = tmp_path / "downstream-tiny" / "pixel-exact-dead0.5625-sbr1-0.json"
     made = result.stat().st_mtime_ns
     study = quick_study("downstream", tmp_path)

@@ -176,10 +176,11 @@ def brightest_window(recording: Recording) -> tuple[float, float]:
 
     rate, error = free_waveform(recording, 512)
     best, limit = -np.inf, 0.0
-    for m in 2 ** np.arange(8):
+    widths = 2 ** np.arange(int(np.log2(rate.size / 4.0)) + 1)
+    for m in widths:
         share = m / (rate.size - m)
         inside, variance = (sum(np.roll(part, -k) for k in range(m)) for part in (rate, error**2))
         excess = inside - share * (rate.sum() - inside)
         noise = np.sqrt(variance + share**2 * ((error**2).sum() - variance))
         best, limit = max(best, float((excess / noise).max())), max(limit, float((excess + 1.645 * noise).max()))
-    return float(8 * rate.size * ndtr(-best)), limit
+    return float(widths.size * rate.size * ndtr(-best)), limit

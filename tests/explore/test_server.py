@@ -36,15 +36,8 @@ def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
     y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
     signal, delay = 0.2 + 0.1 * y, 20.0 + 3.0 * x + y
     signal[3, 4], delay[3, 4] = 0.0, np.nan
-    detector = ml.Detector(dead_time_ns=40.0, detection_efficiency=0.8, dark_count_hz=2e4)
-    system = ml.System(
-        period_ns=100.0,
-        cycles=600,
-        bins=80,
-        pulse=ml.GaussianPulse(sigma_ns=1.2),
-        detector=detector,
-        start="stationary",
-    )
+    effects = {"detection_efficiency": 0.8, "dark_count_hz": 2e4}
+    system = make_system(40.0, 600, 80, sigma_ns=1.2, start="stationary", **effects)
     path = tmp_path_factory.mktemp("explore") / "room <1>.zarr"
     io.simulate_to(path, ml.Flux(signal, 0.1, delay), system, realizations=2, seed=4)
     return path

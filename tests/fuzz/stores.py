@@ -20,14 +20,11 @@ import mars_lidar as ml
 from mars_lidar import io
 from mars_lidar._base.files import FileError
 from mars_lidar.dataset import open_dataset, read_sparse
+from tests.fuzz.formats import SYSTEM
 
 KINDS = ("refused", "same", "wrong", "unnamed")
 ATTACKS = ("flip", "cut", "empty", "swap", "foreign", "delete", "replace_store", "delete_store")
 READERS = ("dataset", "sparse", "scenes", "cube", "pickled", "learn")
-
-System = ml.System(
-    period_ns=100.0, cycles=50, bins=32, pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=30.0)
-)
 
 
 def make(folder: Path) -> None:
@@ -35,7 +32,7 @@ def make(folder: Path) -> None:
     for name, seed in (("a", 1), ("b", 2)):
         recipe = {
             "scenes": {"example": "room", "size": [6, 8], "seeds": {"count": 2}},
-            "systems": [System],
+            "systems": [SYSTEM],
             "light": {"signal": [0.5, 1.0]},
             "realizations": 2,
             "seed": seed,
@@ -43,7 +40,7 @@ def make(folder: Path) -> None:
         }
         ml.generate(recipe, folder / f"{name}.zarr")
         flux = ml.Flux(np.linspace(0.1, 2.0, 12).reshape(3, 4), 0.1, 40.0)
-        io.simulate_to(folder / f"{name}_cube.zarr", flux, System, realizations=3, seed=seed)
+        io.simulate_to(folder / f"{name}_cube.zarr", flux, SYSTEM, realizations=3, seed=seed)
 
 
 def opened(reader: str, store: Path) -> Callable[[], Iterator[Any]]:

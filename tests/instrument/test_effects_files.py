@@ -47,15 +47,6 @@ def system(detector: Detector = REAL, **changes: object) -> System:
     return System(period_ns=100.0, cycles=50, bins=32, pulse=pulse, detector=detector).replace(**changes)
 
 
-@pytest.mark.parametrize("jitter", [REAL.jitter, SampledJitter([0.0, 1, 2.5, 1], 0.05, "centroid"), None])
-@pytest.mark.parametrize("suffix", ["json", "yaml"])
-def test_files_of_systems(tmp_path, jitter, suffix):
-    mine = system(dataclasses.replace(ALL, jitter=jitter))
-    mine.save(tmp_path / f"spad.{suffix}")
-    assert System.load(tmp_path / f"spad.{suffix}") == mine
-    assert hash(System.from_json(mine.to_json())) == hash(mine)
-
-
 def test_every_effect_is_a_field_and_some_engine_does_it():
     assert set(EFFECTS) == set(FIELDS)
     for name in EFFECTS:

@@ -5,19 +5,38 @@ import json
 import math
 import pickle
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from harness import make_system, refused
+from instrument.test_effects_files import ALL
 
 import mars_lidar as ml
 
 SAMPLED = ml.SampledPulse([0.0, 1.0, 0.1, 1 / 3], 0.7, "centroid")
+GATED = ml.Detector(
+    dead_time_ns=30.0,
+    mode="gated",
+    gate_start_ns=83.0,
+    gate_width_ns=31.0,
+    gate_step_ns=-7.3,
+    gate_cycles=3,
+    jitter=ml.SampledJitter([0.0, 1, 2.5, 1], 0.05, "centroid"),
+    afterpulsing=ml.Afterpulsing(probability=0.5, delays=(0.0, 3.0, 0.0, 1.0), bin_ns=37.0, generations=2),
+    crosstalk=ml.Crosstalk(probability=0.1, kernel=[[0, 1, 0], [1, 0, 2], [0, 1, 0]]),
+)
+KINDS: dict[str, dict[str, Any]] = {
+    "gaussian": {},
+    "sampled": {"pulse": SAMPLED, "start": "stationary"},
+    "every effect": {"detector": ALL},
+    "moving gate": {"detector": GATED},
+}
 
 
-@pytest.fixture(params=["gaussian", "sampled"])
+@pytest.fixture(params=KINDS)
 def any_system(request: pytest.FixtureRequest, system: ml.System) -> ml.System:
-    return system if request.param == "gaussian" else system.replace(pulse=SAMPLED, start="stationary")
+    return system.replace(**KINDS[request.param])
 
 
 def test_frozen_hashable_printable(any_system: ml.System):
@@ -38,7 +57,8 @@ def test_dictionary_is_plain_data(any_system: ml.System):
 
 
 def test_json_reads_back_to_the_same_bits(any_system: ml.System):
-    odd = any_system.replace(period_ns=0.1 + 0.2 + 100, detector=ml.Detector(dead_time_ns=1 / 3))
+    odd = any_system.replace(period_ns=0.1 + 0.2 + 100, cycles=7)
+    odd = odd.replace(detector=dataclasses.replace(odd.detector, dead_time_ns=20.0 + 1 / 3))
     again = ml.System.from_json(odd.to_json())
     assert again == odd
     assert again.period_ns.hex() == odd.period_ns.hex()

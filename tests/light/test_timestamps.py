@@ -123,10 +123,7 @@ def test_one_pass_wherever_the_records_are_kept(level: str, light: str):
 
 
 def test_more_registrations_of_a_pixel_than_a_segment_holds():
-    detector = ml.Detector(dead_time_ns=30.0)
-    system = ml.System(
-        period_ns=100.0, cycles=300_000, bins=64, pulse=ml.GaussianPulse(sigma_ns=1.0), detector=detector
-    )
+    system = make_system(30.0, 300_000)
     flux = ml.Flux(np.array([[0.5, 0.0, 1.0]]), 0.1, 20.0)
     times = ml.simulate_timestamps(flux, system, seed=2)
     assert times.counts.max() > 2 * 65_536

@@ -377,13 +377,7 @@ def test_flat_pulses_are_not_for_the_networks() -> None:
 @pytest.mark.parametrize(("signal", "background", "cycles"), [(2.0, 0.5, 100), (3.0, 0.5, 50), (1.0, 0.3, 100)])
 def test_signals_hold_where_pulses_hide_their_own_end(signal: float, background: float, cycles: int) -> None:
     """The median of 576 pixels within 5 %, and 95 % intervals that hold in at least 85 %, at 1e-4."""
-    system = ml.System(
-        period_ns=100.0,
-        cycles=cycles,
-        bins=1000,
-        pulse=ml.GaussianPulse(sigma_ns=0.6),
-        detector=ml.Detector(dead_time_ns=75.0),
-    )
+    system = make_system(75.0, cycles, 1000, sigma_ns=SIGMA)
     y, x = np.mgrid[:24, :24]
     counts = ml.simulate(ml.Flux(np.full(x.shape, signal), background, 40.0 + 0.02 * x + 0.01 * y), system, seed=3)
     estimate = ml.reconstruct(counts, system, method="image")

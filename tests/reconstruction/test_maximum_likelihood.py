@@ -8,7 +8,7 @@ import warnings
 
 import numpy as np
 import pytest
-from harness import make_system, require
+from harness import make_system, refused, require
 from scipy import stats
 
 import mars_lidar as ml
@@ -120,16 +120,8 @@ def test_the_bound_knows_efficiency_and_dark_counts():
     assert bound.depth_m == pytest.approx(float(same.depth_m), rel=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"background": 0.0}, "background must be > 0, got 0.0"),
-    ],
-)
-def test_bad_arguments_of_the_bound_are_named(change, words):
-    given = {"signal": 1.0, "background": 1.0, "delay_ns": 37.0} | change
-    with pytest.raises(ValueError, match=words):
-        ml.cramer_rao(ml.Flux(**given), PLAIN)
+def test_the_bound_needs_background():
+    refused(r"background must be > 0, got 0\.0", ml.cramer_rao, ml.Flux(1.0, 0.0, 37.0), PLAIN)
 
 
 # few passes are left at the pulse, so that it matters what the ends of the exposure leave of them
@@ -208,14 +200,8 @@ KINKS = {  # samples, their width in bins, S, B, dead time in periods, cycles
 
 def kinked(name: str, pixels: int, seed: int):
     values, width, signal, background, dead, cycles = KINKS[name]
-    bins = 500
-    system = ml.System(
-        period_ns=PERIOD,
-        cycles=cycles,
-        bins=bins,
-        pulse=ml.SampledPulse(values, bin_ns=width * PERIOD / bins, origin="first"),
-        detector=ml.Detector(dead_time_ns=dead * PERIOD),
-    )
+    pulse = ml.SampledPulse(values, bin_ns=width * PERIOD / 500, origin="first")
+    system = make_system(dead * PERIOD, cycles, 500, pulse=pulse)
     delay = PERIOD * np.random.default_rng(seed).random((1, pixels))
     flux = ml.Flux(signal, background, delay)
     return system, flux, ml.simulate(flux, system, seed=seed)[0]
@@ -506,14 +492,7 @@ def test_intervals_hold_where_ends_hide_passes_and_where_background_is_zero(
 
     Also of those alone whose background is estimated as zero.
     """
-    system = ml.System(
-        period_ns=100.0,
-        cycles=cycles,
-        bins=256,
-        pulse=ml.GaussianPulse(sigma_ns=sigma),
-        detector=ml.Detector(dead_time_ns=dead),
-        start=start,
-    )
+    system = make_system(dead, cycles, 256, sigma_ns=sigma, start=start)
     delay = np.random.default_rng(9).uniform(0.0, 100.0, 400)
     counts = ml.simulate(ml.Flux(np.full(400, signal), background, delay), system, seed=9)[0, 0]
     estimate = ml.reconstruct(counts, system)

@@ -262,24 +262,6 @@ def test_memory_for_timestamps_is_estimated_before_they_are_counted(monkeypatch)
         ml.simulate_timestamps(bright, SYSTEM)
 
 
-def test_maps_that_do_not_fit_together_are_refused(tmp_path):
-    from mars_lidar.io.maps import load_maps, save_maps
-
-    save_maps(tmp_path / "maps.npz", {"peak": ml.reconstruct(ml.simulate(FLUX, SYSTEM), SYSTEM, "peak")})
-    with np.load(tmp_path / "maps.npz") as archive:
-        arrays = dict(archive)
-    system = arrays["attributes"].item().replace('"system"', '"sistem"')
-    for name, value, message in (
-        ("depth", arrays["depth"][..., :-1], "depth must be numbers"),
-        ("signal", arrays["signal"].astype(str), "signal must be numbers"),
-        ("flags", None, "has no variable 'flags'"),
-        ("attributes", np.asarray(system), "'system'"),
-    ):
-        changed = {key: each for key, each in {**arrays, name: value}.items() if each is not None}
-        np.savez(tmp_path / "bad.npz", **changed)
-        refused(lambda: load_maps(tmp_path / "bad.npz"), ValueError, "bad.npz", message)
-
-
 def test_what_is_no_array_of_counts_is_named_by_its_type(tmp_path):
     from mars_lidar import io
 

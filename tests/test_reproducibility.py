@@ -5,6 +5,7 @@ import hashlib
 import numpy as np
 import pytest
 from harness import make_system, refused
+from instrument.effect_checks import bits_do_not_depend
 from numpy.typing import NDArray
 
 import mars_lidar as ml
@@ -61,6 +62,7 @@ GOLDEN = {
 }
 GOLDEN_TIMES = {"gaussian": "e20008f18e3ca915", "returns": "b5ad4e2f769a3776"}
 KINDS = tuple(GOLDEN)
+FAST = ("exact", "sequential")
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -91,59 +93,24 @@ def drawn(engine: ExactEngine, request: Task) -> tuple[NDArray[np.uint32], Phase
     return out, engine.records(request, 0.0)
 
 
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    "engine",
+    [name if name in ("exact", "sequential") else pytest.param(name, marks=pytest.mark.full) for name in ANY_SYSTEM],
+)
+def test_bits_do_not_depend_on_levels_threads_and_parts(engine: str, kind: str):
+    flux, system = image(kind)
+    bits_do_not_depend(flux, system, engine)
+
+
 def test_there_are_levels_to_compare():
     """Widest first; the last one is what every processor of this kind runs. One number at a time: `tests/cuda`."""
     assert set(_core.levels()) <= {"avx512", "avx2", "vector128", "scalar"}
     assert _core.levels()[-1] in ("vector128", "scalar")
 
 
-@pytest.mark.parametrize("level", _core.levels())
-@pytest.mark.parametrize("kind", KINDS)
-def test_levels_give_the_same_bits(kind: str, level: str):
-    request = task(kind)
-    expected, times = drawn(ExactEngine(level=_core.levels()[-1]), request)
-    out, records = drawn(ExactEngine(level=level), request)
-    assert np.array_equal(out, expected)
-    assert np.array_equal(records.times, times.times)
-    assert np.array_equal(records.cycle, times.cycle)
-    assert np.array_equal(records.bin, times.bin)
-
-
 def test_unknown_level_is_an_error():
     refused("level must be one that this processor runs, got 'mmx'", drawn, ExactEngine(level="mmx"), task("gaussian"))
-
-
-@pytest.mark.full
-@pytest.mark.parametrize("engine", ANY_SYSTEM)
-@pytest.mark.parametrize("kind", KINDS)
-def test_threads_do_not_matter(engine: str, kind: str):
-    flux, system = image(kind)
-    single = ml.simulate(flux, system, engine=engine, realizations=4, seed=1, threads=1)
-    for threads in (2, 5, None):
-        assert np.array_equal(single, ml.simulate(flux, system, engine=engine, realizations=4, seed=1, threads=threads))
-
-
-@pytest.mark.full
-@pytest.mark.parametrize("engine", ANY_SYSTEM)
-@pytest.mark.parametrize("kind", KINDS)
-def test_any_part_has_the_bits_of_the_whole(engine: str, kind: str):
-    """Cut at random into rectangles and runs of realizations, each simulated alone."""
-    flux, system = image(kind)
-    whole = ml.simulate(flux, system, engine=engine, realizations=5, seed=3)
-    index = np.arange(SHAPE[0] * SHAPE[1]).reshape(SHAPE)
-    random = np.random.default_rng(0)
-    for _ in range(6):
-        rows, columns, run = (slice(*np.sort(random.choice(n + 1, 2, replace=False))) for n in (*SHAPE, 5))
-        part = ml.simulate(
-            flux[rows, columns],
-            system,
-            engine=engine,
-            realizations=run.stop - run.start,
-            first_realization=int(run.start),
-            pixel_index=index[rows, columns],
-            seed=3,
-        )
-        assert np.array_equal(part, whole[run, rows, columns])
 
 
 @pytest.mark.parametrize("engine", ANY_SYSTEM)
@@ -167,20 +134,6 @@ def test_seeds_pixels_and_realizations_have_their_own_streams(engine: str):
                 cube = ml.simulate(flux, system, engine=engine, seed=seed, first_realization=first, pixel_index=index)
                 rows.extend(cube[0, 0])
     assert len({row.tobytes() for row in rows}) == len(rows) == 120
-
-
-@pytest.mark.parametrize("engine", ["exact", "sequential"])
-@pytest.mark.parametrize("kind", KINDS)
-def test_timestamps_are_those_of_the_cube(engine: str, kind: str):
-    flux, system = image(kind)
-    cube = ml.simulate(flux, system, engine=engine, realizations=3, seed=8)
-    for realization in range(3):
-        for threads in (1, 3):
-            times = ml.simulate_timestamps(
-                flux, system, engine=engine, realization=realization, seed=8, threads=threads
-            )
-            assert np.array_equal(times.histogram(), cube[realization])
-            assert times.histogram().dtype == cube.dtype
 
 
 def test_nothing_global_is_left_behind():

@@ -116,14 +116,6 @@ def test_every_option_of_the_run_reaches_the_file(tmp_path, suffix):
         assert "seed 4" in cube.recipe.source
 
 
-def test_depth_and_image_files_are_a_scene(tmp_path):
-    np.save(tmp_path / "depth.npy", np.linspace(1.0, 4.0, 48).reshape(6, 8))
-    ok("simulate", "--depth", tmp_path / "depth.npy", *SMALL[2:], "-o", tmp_path / "a.npz")
-    with io.load(tmp_path / "a.npz") as cube:
-        assert cube.shape == (1, 6, 8, 64)
-        assert "depth.npy" in cube.recipe.source
-
-
 def test_warnings_are_one_line(tmp_path):
     depth = np.full((6, 8), 2.0)
     depth[0, 0] = np.nan

@@ -98,14 +98,6 @@ def test_progress_true_is_a_bar_and_a_log_gets_a_line_every_half_minute(monkeypa
     assert capsys.readouterr().err == ""
 
 
-def test_a_loaded_cube_carries_its_system(tmp_path):
-    flux = ml.Scene.example("room", size=6).flux(SYSTEM, signal=2.0, sbr=5.0)
-    io.simulate_to(tmp_path / "a.zarr", flux, SYSTEM)
-    with io.load(tmp_path / "a.zarr") as cube:
-        alone, given = ml.reconstruct(cube), ml.reconstruct(cube.histogram[:], cube.system)
-    assert np.array_equal(alone.depth_m, given.depth_m, equal_nan=True)
-
-
 def test_several_returns_go_into_a_flux():
     signal, delay = np.full((2, 3, 4), 0.25), np.stack([np.full((3, 4), 10.0), np.full((3, 4), 60.0)])
     flux = ml.Flux(signal, 0.1, delay)
@@ -179,11 +171,6 @@ def test_a_wrong_keyword_names_the_argument_that_was_meant(call, message):
 def test_the_package_runs_as_a_module():
     done = subprocess.run([sys.executable, "-m", "mars_lidar", "--version"], capture_output=True, text=True)
     assert done.stdout.strip() == f"mars-lidar {ml.__version__}"
-
-
-def test_objects_are_drawn_in_a_notebook():
-    for each in (ml.Detector(dead_time_ns=50.0, recovery_ns=5.0), SYSTEM.pulse, ml.SampledPulse([0, 1, 3, 1], 0.5)):
-        assert "data:image/png;base64" in each._repr_html_()
 
 
 def test_small_words():

@@ -1,6 +1,5 @@
 """Files as laboratories have them, from the command line."""
 
-import time
 from pathlib import Path
 
 import h5py
@@ -87,19 +86,6 @@ def test_info_of_a_v73_file_whose_first_element_is_no_cube(tmp_path):
     output = words("info", tmp_path / "stream.mat")
     assert "t_ns" in output
     assert "version 5" not in output
-
-
-@pytest.mark.full
-def test_info_lists_a_large_file_quickly(tmp_path):
-    random = np.random.default_rng(0)
-    cells = np.empty((150, 200), object)
-    for place in np.ndindex(cells.shape):
-        cells[place] = random.integers(0, 10_000, 80).astype(float)
-    savemat(tmp_path / "times.mat", {"times": cells}, do_compression=True)
-    ok("info", tmp_path / "times.mat")
-    began = time.process_time()
-    assert "times 150 × 200 cells" in words("info", tmp_path / "times.mat")
-    assert time.process_time() - began < 1.0
 
 
 def test_a_transient_of_any_name(tmp_path):

@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-from harness import make_system, require, two_lobes
-from harness.pvalues import goodness
+from harness import make_system, two_lobes
 from native_jobs import align, shape_job
 
 import mars_lidar as ml
@@ -11,7 +10,6 @@ from mars_lidar import _core
 from mars_lidar.engines.pixels import Alignment
 from mars_lidar.engines.table_reader import as_shapes
 from mars_lidar.statistics import exposure_moments
-from mars_lidar.table import Table
 
 BINS = 256
 PERIOD_NS = 100.0
@@ -93,15 +91,3 @@ def test_whole_bins_are_a_roll():
     shapes = moved(system, 3.0, 0.2, np.array([0.0, 5.0, -131.0]))
     assert np.array_equal(shapes[1], np.roll(shapes[0], 5))
     assert np.array_equal(shapes[2], np.roll(shapes[0], -131))
-
-
-def test_drawn_histograms_follow_the_aligned_shape():
-    """Chi-square of many drawn photons against the exact mean histogram at a delay between bins."""
-    system = system_of(1.5, 0.6375, cycles=400)
-    delay = 0.5 * PERIOD_NS + 33.37 * BIN_NS
-    flux = ml.Flux(np.full((8, 8), 2.0), 0.3, delay)
-    table = Table.build(system, np.array([1.9, 2.0]), np.array([0.3, 0.4]))
-    cube = ml.simulate(flux, system, engine="mars", table=table, realizations=8)
-    exact = exposure_moments(ml.Flux(2.0, 0.3, delay), system).histogram
-    observed = cube.reshape(-1, BINS).sum(0, dtype=np.int64)
-    require({"mean histogram": goodness(observed, exact / exact.sum() * observed.sum())}, "mars, aligned")

@@ -90,14 +90,6 @@ JOINT_ENGINES = [name for name in WITH_DEAD_TIME if JOINT in CLAIMS[name]]
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("name", REFERENCE_NAMES)
-@pytest.mark.parametrize("engine", JOINT_ENGINES)
-def test_reference_system_has_the_joint_law(engine: str, name: str):
-    case = Reference.load(name).case(photons=8e6 if engine == TRUTH else 3e7)
-    check(ENGINES[engine], case, JointLaw.of(case), CLAIMS[engine] - {INTERVALS}, seed=2)
-
-
-@pytest.mark.full
 @pytest.mark.parametrize("case", RANDOM[::2], ids=lambda case: case.name)
 @pytest.mark.parametrize("engine", JOINT_ENGINES)
 def test_random_system_has_the_joint_law(engine: str, case: Case):

@@ -198,19 +198,6 @@ def test_pulse_of_one_sample():
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("background", [1e-5, 0.01, 0.02, 0.6])
-def test_first_phases_have_no_lattice(background: float):
-    """First photons over 30,000 bins; before, 40 % of those at B = 0.01 were multiples of 2^-17 of a period."""
-    bins = 30_000
-    view = system(bins=bins, cycles=int(60 / background), detector=ml.Detector(dead_time_ns=1e8))
-    times = ml.simulate_timestamps(ml.Flux(np.zeros((1000, 2000)), background, DELAY), view, seed=9)
-    hist = np.bincount(times.bin, minlength=bins)
-    place = np.arange(bins + 1) / bins
-    law = -np.diff(np.exp(-background * place)) / -np.expm1(-background)
-    require({"phases": goodness(hist, hist.sum() * law)}, f"first phases, B = {background:g}")
-
-
-@pytest.mark.full
 @pytest.mark.parametrize(
     ("width", "background", "pixels", "cycles"),
     [

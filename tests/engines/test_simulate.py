@@ -99,12 +99,6 @@ def test_request_beyond_the_memory_is_refused_before_any_work(system: ml.System)
     assert "pixel_index" in message
 
 
-def test_timestamps_beyond_the_memory_are_refused(system: ml.System, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(_memory, "available_bytes", lambda: 10_000)
-    with pytest.raises(MemoryError, match="timestamps of shape"):
-        ml.simulate_timestamps(ml.Flux(np.ones((10, 10)), 1.0, 5.0), system)
-
-
 @pytest.mark.skipif(not Path("/proc/meminfo").exists(), reason="asks the kernel, where there is one to ask")
 def test_available_memory_is_that_of_the_machine():
     assert 2**20 < _memory.available_bytes() < 2**50

@@ -10,7 +10,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from tests.fuzz.formats import READERS, make
+from tests.fuzz.formats import make
 from tests.fuzz.run import BAD, fuzz
 from tests.fuzz.server import Server
 
@@ -25,8 +25,6 @@ names the file. The other columns are faults: an error without the file's name (
 takes more than 3 s or 200 MiB (*memory*). *most s*, *most MiB*: CPU time and memory of the costliest refusal, in
 addition to those of the process before it.
 """
-RUN = "commit, date, N, S"
-ONE_RUN = f"All rows are of one run ({RUN}): "
 
 
 def head() -> str:
@@ -35,26 +33,16 @@ def head() -> str:
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
 
-def write(out: Path, rows: dict[str, list[str]]) -> None:
-    """Put rows into the table of a report; those of other formats stay. A column names the run unless all have one."""
-    table = dict(rows)
-    lines = out.read_text(encoding="utf-8").splitlines() if out.is_file() else []
-    run = [line.removeprefix(ONE_RUN).rstrip(".") for line in lines if line.startswith(ONE_RUN)]
-    for line in lines:
-        cells = [cell.strip() for cell in line.strip("| ").split("|")]
-        if cells[0] in READERS and len(cells) + len(run) == len(KINDS) + 4:
-            table.setdefault(cells[0], [*cells[1:], *run])
-    table = {name: table[name] for name in READERS if name in table}
-    sums = [sum(int(row[k]) for row in table.values()) for k in range(len(KINDS))]
-    most = [f"{max(float(row[k]) for row in table.values()):g}" for k in (-3, -2)]
-    runs = {row[-1] for row in table.values()}
-    table[f"all {sum(sums)}"] = [*map(str, sums), *most, ""]
-    columns, note = [*KINDS, "most s", "most MiB", RUN], ""
-    if len(runs) == 1:
-        columns, note = columns[:-1], f"\n{ONE_RUN}{runs.pop()}.\n"
-    heading = f"| format | {' | '.join(columns)} |\n|---|{'--:|' * len(columns)}\n"
-    body = "".join(f"| {name} | {' | '.join(row[: len(columns)])} |\n" for name, row in table.items())
-    out.write_text(f"{HEAD}{note}\n{heading}{body}", encoding="utf-8")
+def write(out: Path, rows: dict[str, list[str]], run: str) -> None:
+    """The report: a row a format, and one of sums."""
+    columns = list(zip(*rows.values(), strict=True))
+    sums = [str(sum(map(int, column))) for column in columns[: len(KINDS)]]
+    most = [f"{max(map(float, column)):g}" for column in columns[len(KINDS) :]]
+    rows = rows | {f"all {sum(map(int, sums))}": [*sums, *most]}
+    heading = f"| format | {' | '.join([*KINDS, 'most s', 'most MiB'])} |\n|---|{'--:|' * (len(KINDS) + 2)}\n"
+    body = "".join(f"| {name} | {' | '.join(row)} |\n" for name, row in rows.items())
+    note = f"All rows are of one run (commit, date, N, S): {run}."
+    out.write_text(f"{HEAD}\n{note}\n\n{heading}{body}", encoding="utf-8")
 
 
 def main() -> int:
@@ -67,10 +55,11 @@ def main() -> int:
     parser.add_argument(
         "--commit", default="", help="of the code that is read, for the report; default: of this folder"
     )
-    parser.add_argument("--out", type=Path, help="a Markdown file whose table gets these rows, format by format")
+    parser.add_argument("--out", type=Path, help="a Markdown file for the table")
     given = parser.parse_args()
     code = f"{given.commit or head()}, {datetime.date.today()}, {given.examples}, {given.seed}"
     total: collections.Counter[str] = collections.Counter()
+    rows: dict[str, list[str]] = {}
     began = time.monotonic()
     with tempfile.TemporaryDirectory() as folder:
         good = Path(folder) / "good"
@@ -99,10 +88,10 @@ def main() -> int:
             fuzz(name, good, Path(folder), server, given.examples, given.seed, add)
             print(f"{name:22}" + "".join(f"{counts[kind]:9}" for kind in KINDS), flush=True)
             total += counts
+            most_s, most_mib = (max(column) for column in zip(*refusals, strict=True))
+            rows[name] = [*(str(counts[kind]) for kind in KINDS), f"{most_s:.2f}", f"{most_mib:.0f}"]
             if given.out:
-                most_s, most_mib = (max(column) for column in zip(*refusals, strict=True))
-                row = [*(str(counts[kind]) for kind in KINDS), f"{most_s:.2f}", f"{most_mib:.0f}", code]
-                write(given.out, {name: row})
+                write(given.out, rows, code)
         print(f"{'all ' + str(sum(total.values())):22}" + "".join(f"{total[kind]:9}" for kind in KINDS))
         print(f"{time.monotonic() - began:.0f} s")
         server.close()

@@ -4,68 +4,31 @@ import argparse
 import collections
 import hashlib
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import zarr
 
-import mars_lidar as ml
-from mars_lidar import io
 from mars_lidar._base import manifest
 from mars_lidar._base.files import FileError
-from mars_lidar._base.hdf5 import SEAL
-from mars_lidar.dataset import open_dataset, verify
-from mars_lidar.io.maps import load_maps
-from mars_lidar.io.store import OnDisk
+from mars_lidar.dataset import verify
+from tests.fuzz.formats import READERS, make
 
 KINDS = ("refused", "same", "wrong", "unnamed")  # read without an error, as it was or otherwise
 
 
-def _cube(path: Path) -> Iterator[Any]:
-    with io.load(path) as cube:
-        yield np.asarray(cube.histogram)
-        yield from (cube.depth_m, cube.flux.signal, cube.flux.background, cube.flux.delay_ns, cube.reflectivity)
-        yield from (cube.system.to_json(), cube.engine, cube.seed, cube.registrations, cube.settings)
-
-
-def _dataset(path: Path) -> Iterator[Any]:
-    stored = open_dataset(path)
-    yield stored.recipe
-    group = zarr.open_group(path, mode="r")
-    for folder in (group, group["scenes"]):
-        for name, array in sorted(folder.arrays()):
-            yield from (name, np.asarray(OnDisk(array, path)))
-
-
-def _maps(path: Path) -> Iterator[Any]:
-    maps, attrs = load_maps(path)
-    for entries in (maps, attrs):
-        yield from (
-            part for name in sorted(entries) if name not in (SEAL, "manifest") for part in (name, entries[name])
-        )
-
-
-def _photons(path: Path) -> Iterator[Any]:
-    times = ml.Timestamps.load(path)
-    yield from (times.times_ns, times.cycle, times.bin, times.counts, times.period_ns, times.cycles, times.bins)
-
-
-def _table(path: Path) -> Iterator[Any]:
-    table = ml.Table.load(path)
-    yield from (table.system.to_json(), table.signal, table.background, table.method, table.tolerance)
-    for part in (table.entries, table.start_phases, table.laws):
-        yield from (value for _, value in sorted(vars(part).items()) if isinstance(value, np.ndarray))
-
-
-READERS: dict[str, Callable[[Path], Iterator[Any]]] = {
-    "set.zarr": _dataset,
-    **dict.fromkeys(["cube.zarr", "cube.h5", "cube.npz"], _cube),
-    **dict.fromkeys(["maps.zarr", "maps.h5", "maps.npz"], _maps),
-    **dict.fromkeys(["photons.h5", "photons.npz"], _photons),
-    "table.h5": _table,
-}
+NAMES = (
+    "set.zarr",
+    "cube.zarr",
+    "cube.h5",
+    "cube.npz",
+    "maps.zarr",
+    "maps.h5",
+    "maps.npz",
+    "photons.h5",
+    "photons.npz",
+)
+NAMES += ("table.h5",)
 
 
 def content(name: str, path: Path) -> str:
@@ -107,8 +70,6 @@ def flips(name: str, path: Path, number: int, seed: int) -> Iterator[tuple[str, 
 
 
 if __name__ == "__main__":
-    from tests.fuzz.formats import make
-
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--flips", type=int, default=200, help="of each format")
     parser.add_argument("--seed", type=int, default=1)
@@ -118,7 +79,7 @@ if __name__ == "__main__":
     print("|---|" + "--:|" * 6)
     with tempfile.TemporaryDirectory() as folder:
         make(Path(folder))
-        for name in READERS:
+        for name in NAMES:
             rows = list(flips(name, Path(folder) / name, given.flips, given.seed))
             counts = collections.Counter(kind for kind, _, _ in rows)
             detected = sum(verified for _, verified, _ in rows)

@@ -1,22 +1,25 @@
-"""A small good file of every format, and what reads all of it."""
+"""A small good file of every format, and what reads all of it: it returns nothing, or yields what it reads."""
 
 import atexit
 import shutil
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import zarr
 
 import mars_lidar as ml
 from mars_lidar import io
+from mars_lidar._base.hdf5 import SEAL
 from mars_lidar.cli.system_options import _measured
 from mars_lidar.dataset import DatasetRecipe, open_dataset, read_sparse
 from mars_lidar.dataset.sources import read_view
 from mars_lidar.io.foreign import foreign_cube
 from mars_lidar.io.maps import load_maps, save_maps
 from mars_lidar.io.rgbd import read_layers
+from mars_lidar.io.store import OnDisk
 from mars_lidar.io.streams.recorders import recorded
 from mars_lidar.io.transient import read_truth
 
@@ -28,30 +31,47 @@ SYSTEM = ml.System(
 SECRET = 77  # counts of the file that external storage, virtual data and links point to
 
 
-def _cube(path: Path) -> None:
+def _cube(path: Path) -> Iterator[Any]:
     with io.load(path) as cube:
-        np.asarray(cube.histogram)
+        yield np.asarray(cube.histogram)
+        yield from (cube.depth_m, cube.flux.signal, cube.flux.background, cube.flux.delay_ns, cube.reflectivity)
+        yield from (cube.system.to_json(), cube.engine, cube.seed, cube.registrations, cube.settings)
 
 
-def _dataset(path: Path) -> None:
+def _dataset(path: Path) -> Iterator[Any]:
     stored = open_dataset(path)
-    for array in (stored.histogram, *stored.maps.values()):
-        np.asarray(array)
+    yield from (stored.recipe, stored.seeds)
+    group = zarr.open_group(path, mode="r")
+    for folder in (group, group["scenes"]):
+        for name, array in sorted(folder.arrays()):
+            yield from (name, np.asarray(OnDisk(array, path)))
     read_sparse(stored, 0)
     for number in range(len(stored.scene_names())):
         stored.scene(number)
-    _ = stored.seeds
+
+
+def _maps(path: Path) -> Iterator[Any]:
+    for entries in load_maps(path):
+        yield from ((name, entries[name]) for name in sorted(entries) if name not in (SEAL, "manifest"))
+
+
+def _photons(path: Path) -> Iterator[Any]:
+    given = {"period_ns": 100.0, "unit_ns": 1.0} if path.name.startswith("bare") else {}
+    times = ml.Timestamps.load(path, **given)
+    yield from (times.times_ns, times.cycle, times.bin, times.histogram(), times.period_ns, times.cycles, times.bins)
+
+
+def _table(path: Path) -> Iterator[Any]:
+    table = ml.Table.load(path)
+    yield from (table.system.to_json(), table.signal, table.background, table.method, table.tolerance)
+    for part in (table.entries, table.start_phases, table.laws):
+        yield from (value for _, value in sorted(vars(part).items()) if isinstance(value, np.ndarray))
 
 
 def _light(path: Path) -> None:
     light = io.read_transient(path, bin_ns=1.0 if path.suffix == ".npy" else None)
     read_truth(path, light.shape)
     light.flux(SYSTEM, signal=0.5, sbr=2.0)
-
-
-def _stream(path: Path) -> None:
-    given = {"period_ns": 100.0, "unit_ns": 1.0} if path.name.startswith("bare") else {}
-    ml.Timestamps.load(path, **given).histogram()
 
 
 def _counts_of_another_file(path: Path) -> None:
@@ -74,13 +94,13 @@ def _folder(path: Path) -> None:
 READERS: dict[str, Callable[[Path], Any]] = {
     **dict.fromkeys(["cube.zarr", "cube.h5", "cube.npz", "cube.mat", "cube.ptu"], _cube),
     "set.zarr": _dataset,
-    **dict.fromkeys(["photons.npz", "photons.h5", "photons.ptu", "bare.mat", "bare73.mat", "bare.npz"], _stream),
+    **dict.fromkeys(["photons.npz", "photons.h5", "photons.ptu", "bare.mat", "bare73.mat", "bare.npz"], _photons),
     **dict.fromkeys(
         ["light.npy", "light.npz", "light.h5", "light.mat", "light73.mat", "tal.hdf5", "zaragoza.hdf5"], _light
     ),
     "scan.ptu": recorded,
-    **dict.fromkeys(["maps.zarr", "maps.h5", "maps.npz"], load_maps),
-    "table.h5": ml.Table.load,
+    **dict.fromkeys(["maps.zarr", "maps.h5", "maps.npz"], _maps),
+    "table.h5": _table,
     **dict.fromkeys(["depth.png", "depth.tif", "depth.npy", "depth.npz", "depth.pfm", "depth.exr"], ml.Scene.from_rgbd),
     "layers.npz": read_layers,
     "nyu.mat": lambda path: ml.Scene.from_rgbd(path, index=1),

@@ -73,7 +73,7 @@ def test_the_server_names_each_fault(tmp_path, server, strict_server):
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("name", flips.READERS)
+@pytest.mark.parametrize("name", flips.NAMES)
 def test_every_flipped_bit_is_found(good, name):
     """Data and metadata: refused by the file's name or read as before; `verify` finds each bit of a store."""
     folder, _ = good

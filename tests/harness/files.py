@@ -36,6 +36,6 @@ def rewrite(path: Path, name: str, change: Callable[[Any], Any]) -> None:
         attributes = json.loads(members[name].item())
         change(attributes)
         members[name] = np.asarray(json.dumps(attributes))
-    else:
-        members[name] = change(members[name])
+    elif (changed := change(members.pop(name))) is not None:  # None: it is gone
+        members[name] = changed
     np.savez(path, **members)

@@ -1,147 +1,76 @@
-"""Mean, variance and mean histogram of a paralyzable pixel, in closed form: an oracle for the recursion.
+"""Mean, variance and mean histogram of a paralyzable pixel by integration over the exposure: an oracle for its laws.
 
 An arrival is registered if and only if there is no other arrival within the dead time before it. The rate of
-registrations is therefore r(t) = lambda(t) exp(-(C(t) - C(t - t_d))), with the integrated flux C, and registrations
-further apart than the dead time are independent. Equation numbers: docs/theory_detectors.md.
+registrations is therefore r(t) = lambda(t) exp(-(C(t) - C(t - t_d))), with the integrated light C, and registrations
+further apart than the dead time are independent. The variance is the mean less twice the integral of
+r(t) [R(t) - R(t - t_d)], the pairs that do not occur, with R the integral of r from the begin of the exposure on.
 """
 
-from __future__ import annotations
-
-import math
+from typing import NamedTuple
 
 import numpy as np
 
-from mars_lidar._base.cached import cached_property
-from mars_lidar._base.types import FloatArray
-from mars_lidar.instrument.system import System
-from mars_lidar.light.flux import Flux
-from mars_lidar.statistics.cells import Cells, knots, photons_before
-from mars_lidar.statistics.exposure import Moments
+import mars_lidar as ml
+from harness.laws import Floats
 
 
-def paralyzable_moments(flux: Flux, system: System, tolerance: float = 1e-5) -> Moments:
-    """Mean, variance and histogram of pixels; the grid is doubled until that moves none of them by `tolerance`."""
-    cells = Cells.of_flux(flux, system, what="paralyzable_moments", modes=("paralyzable",))
-    pixels = [_refined(cells.part(slice(k, k + 1)), tolerance) for k in range(cells.size)]
-    mean, variance, bins = np.array([(p.mean, p.variance, p.edges.size) for p in pixels]).T
-    histogram = np.array([p.histogram for p in pixels]).reshape(*cells.shape, -1)
-    return Moments(*(each.reshape(cells.shape) for each in (mean, variance)), histogram, bins.reshape(cells.shape))
+class Moments(NamedTuple):
+    """Of one pixel; `histogram` (bins,)."""
+
+    mean: float
+    variance: float
+    histogram: Floats
 
 
-def _refined(cell: Cells, tolerance: float) -> _Grid:
-    usual = cell.usual_bins(cell.system.bins)
-    # every grid includes the edges of the histogram; without further edges two grids would be equal
-    n = start = 2 * usual if usual // 2 < cell.system.bins else usual
-    coarse = _Grid(cell, n // 2, knots(cell, usual, 0.5))
-    while True:
-        fine = _Grid(cell, n, knots(cell, usual, n / start))
-        if _moved(coarse, fine) <= tolerance:
-            return fine
-        assert n < 2**20, "no grid meets the tolerance"
-        coarse, n = fine, 2 * n
-
-
-class _Grid:
-    """One pixel on a grid with edges at `steps` (n,), phases of discontinuities, and one dead time after them.
-
-    Between these edges the rate of registrations is smooth. A further edge is the end of the first dead time.
-    """
-
-    def __init__(self, cell: Cells, bins: int, steps: FloatArray) -> None:
-        system = cell.system
-        dead = system.dead_time_periods
-        self.cell, self.cycles, self.armed = cell, system.cycles, system.start == "armed"
-        self.whole = math.floor(dead)
-        self.rest = dead - self.whole
-        out = np.arange(system.bins + 1) / system.bins
-        edges = [np.arange(bins + 1) / bins, out, np.array([self.rest]), steps, (steps + self.rest) % 1.0]
-        self.edges = np.unique(np.concatenate(edges))
-        self.before = self._photons(self.edges)  # C(x)
-        self.total = float(self.before[-1])
-        photons = np.diff(self.before)
-        # photons within the dead time before each edge, t_d = K + f (1)
-        shifted = self.edges - self.rest
-        self.early = early = int(np.searchsorted(shifted, 0.0))  # edges whose dead time began a period earlier
-        shifted[:early] += 1.0
-        within = self.before - self._photons(shifted)
-        within[:early] += self.total
-        within += self.total * self.whole
-        # integral of exp(-within) over a bin where it is linear in the exponent: (1 - e^-d) / d
-        rise = np.diff(within)
+def paralyzable_moments(flux: ml.Flux, system: ml.System, parts: int = 4096) -> Moments:
+    """Integrals over `parts` of the period and as many of the pulse; beyond the transient they grow linearly."""
+    dead, bins, armed = system.dead_time_periods, system.bins, system.start == "armed"
+    whole = int(dead)
+    rest = dead - whole
+    steps, light = _light(flux, system, parts)
+    edges = np.arange(bins + 1) / bins
+    phase = np.unique(np.concatenate([edges, np.linspace(0.0, 1.0, parts + 1), steps, (steps + rest) % 1.0, [rest]]))
+    early = (phase < rest).astype(int)  # the dead time before began a period earlier
+    past = phase - rest + early
+    total, now, then = float(light(np.ones(1))[0]), light(phase), light(past)
+    periods = min(system.cycles, 2 * whole + 4)
+    rates, below, pairs = [], [np.zeros(phase.size)], [0.0]
+    for k in range(periods):
+        before = k - whole - early  # the period in which the dead time began
+        lit = (then + total * before) if not armed else np.where(before < 0, 0.0, then + total * before)
+        within = now + total * k - lit
+        rise = np.diff(within)  # exp(-within) over a part where it is linear in the exponent
         mean_keep = np.divide(np.expm1(-rise), -rise, out=np.ones_like(rise), where=rise != 0.0)
-        self.rate = np.exp(-within[:-1]) * mean_keep  # registrations of each bin and period, stationary
-        self.rate *= photons
-        self.alone = np.exp(-self.before[:-1]) * -np.expm1(-photons)  # probability of the first arrival of one period
-        self.histogram = np.add.reduceat(self._exposure(), np.searchsorted(self.edges, out[:-1]))
-        self.mean = float(self.histogram.sum())
-        self.variance = max(0.0, self.mean - 2.0 * self._pairs())
-
-    @cached_property
-    def below(self) -> FloatArray:
-        """Registrations before each edge in a period of the stationary pixel."""
-        return np.concatenate([[0.0], np.cumsum(self.rate)])
-
-    def _photons(self, at: FloatArray) -> FloatArray:
-        return np.asarray(photons_before(self.cell, at)[0], dtype=np.float64)
-
-    def _exposure(self) -> FloatArray:
-        """Registrations of each bin in the whole exposure (2)."""
-        if not self.armed:
-            return self.cycles * self.rate
-        start = min(self.whole, self.cycles)  # whole periods within the first dead time
-        empty = math.expm1(-start * self.total) / math.expm1(-self.total) if self.total > 0.0 else float(start)
-        total = empty * self.alone
-        if self.cycles > self.whole:
-            total[: self.early] += math.exp(-self.whole * self.total) * self.alone[: self.early]
-            total[self.early :] += self.rate[self.early :]
-            total += (self.cycles - self.whole - 1) * self.rate
-        return total
-
-    def _registered(self, period: int, phase: FloatArray) -> FloatArray:
-        """R(t): expected registrations in [0, t), t = period + phase; 0 before the exposure."""
-        mean = float(self.below[-1])
-        steady = period * mean + np.interp(phase, self.edges, self.below)
-        if not self.armed:
-            return np.asarray(steady if period >= 0 else np.zeros_like(steady), dtype=np.float64)
-        if period < 0:
-            return np.zeros_like(steady)
-        lit = period * self.total + np.interp(phase, self.edges, self.before)
-        reached = self.whole * self.total + float(np.interp(self.rest, self.edges, self.before))
-        at_end = self.whole * mean + float(np.interp(self.rest, self.edges, self.below))
-        early = (period < self.whole) | ((period == self.whole) & (phase <= self.rest))
-        return np.where(early, -np.expm1(-lit), -math.expm1(-reached) + steady - at_end)
-
-    def _pairs(self) -> float:
-        """Integral of r(t) [R(t) - R(t - t_d)]: the pairs closer than the dead time, which do not occur (3)."""
-        total, first = 0.0, 0
-        if self.armed:  # up to t_d, where R(t - t_d) = 0, it is R^2 / 2
-            end = min(self.whole, self.cycles)
-            phase = np.array([self.rest if self.cycles > self.whole else 0.0])
-            total, first = 0.5 * float(self._registered(end, phase)[0]) ** 2, self.whole
-        step = 0.0
-        settled = 2 * self.whole + 2
-        for period in range(first, min(self.cycles, settled + 1)):
-            step = self._pairs_of(period, only_after=period == first and self.armed)
-            total += step
-        return total + max(0, self.cycles - settled - 1) * step
-
-    def _pairs_of(self, period: int, only_after: bool) -> float:
-        x = self.edges[self.edges >= self.rest] if only_after else self.edges
-        now = self._registered(period, x)
-        past = x - self.rest
-        before = np.where(
-            past < 0.0,
-            self._registered(period - self.whole - 1, past + 1.0),
-            self._registered(period - self.whole, np.maximum(past, 0.0)),
-        )
-        apart = now - before
-        return float(np.sum(0.5 * (apart[1:] + apart[:-1]) * np.diff(now)))
-
-
-def _moved(coarse: _Grid, fine: _Grid) -> float:
-    tiny = np.finfo(float).tiny
-    return max(
-        abs(fine.mean - coarse.mean) / max(fine.mean, tiny),
-        abs(fine.variance - coarse.variance) / max(fine.variance, tiny),
-        0.5 * float(np.abs(fine.histogram - coarse.histogram).sum()) / max(fine.mean, tiny),
+        rates.append(np.diff(now) * np.exp(-within[:-1]) * mean_keep)
+        below.append(below[-1][-1] + np.concatenate([[0.0], np.cumsum(rates[-1])]))
+        first, last = (np.interp(past, phase, below[max(k - whole - j, -1) + 1]) for j in (1, 0))
+        apart = below[-1] - np.where(early, first, last)
+        pairs.append(pairs[-1] + float(0.5 * (apart[1:] + apart[:-1]) @ rates[-1]))
+    mean = np.array([each[-1] for each in below])
+    more = system.cycles - periods
+    histograms = [np.add.reduceat(rate, np.searchsorted(phase, edges[:-1])) for rate in rates]
+    variance = np.maximum(mean - 2.0 * np.array(pairs), 0.0)  # rounding of a pixel that counts 1
+    return Moments(
+        *(float(x[-1] + more * (x[-1] - x[-2])) for x in (mean, variance)), sum(histograms) + more * histograms[-1]
     )
+
+
+def _light(flux: ml.Flux, system: ml.System, parts: int):
+    """Phases between which the light is smooth, and photons before phases (n,) of a period."""
+    background = float(flux.background.item())
+    if flux.waveform is not None:
+        wave = flux.waveform.reshape(-1)
+        steps = np.arange(wave.size + 1) / wave.size
+        below = np.concatenate([[0.0], np.cumsum(wave)])
+        return steps, lambda x: background * x + np.interp(x, steps, below)
+    pulse, period = system.pulse, system.period_ns
+    signal, delay = (each.reshape(-1) for each in (flux.returns_signal, np.nan_to_num(flux.returns_delay_ns)))
+    steps = (delay[:, None] + np.linspace(*pulse.support_ns(), parts)).ravel() / period % 1.0
+
+    def light(x: Floats) -> Floats:
+        return background * x + sum(
+            s * (pulse.wrapped_cumulative(x * period - d, period) - pulse.wrapped_cumulative(-d, period))
+            for s, d in zip(signal, delay, strict=True)
+        )
+
+    return steps, light

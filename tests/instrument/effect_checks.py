@@ -1,5 +1,7 @@
 """What every effect of the detector is tested for: bits, means, and refusals where no law knows it."""
 
+from typing import Any
+
 import numpy as np
 from harness import Case, check, require
 from harness.check import EVERYTHING, INTERVALS
@@ -23,18 +25,26 @@ def mean_is(result: np.ndarray, expected: float, about: str) -> None:
     require({"mean": float(2 * stats.norm.sf(abs(z)))}, about)
 
 
-def bits_do_not_depend(flux: ml.Flux, system: ml.System, engine: str = "exact") -> None:
-    """On vector level, threads, and the part of the image; histograms are those of the timestamps."""
-    options = {"engine": engine, "seed": 9}
-    whole = ml.simulate(flux, system, realizations=2, **options)
-    for level in _core.levels() if engine == "exact" else ():
-        assert np.array_equal(ml.simulate(flux, system, engine=ExactEngine(level), seed=9, realizations=2), whole)
-    for threads in (1, 3):
-        assert np.array_equal(ml.simulate(flux, system, realizations=2, threads=threads, **options), whole)
+def bits_do_not_depend(flux: ml.Flux, system: ml.System, engine: str = "exact", **options: Any) -> None:
+    """On vector level, threads, and the part of image and realizations; histograms are those of the timestamps."""
+    given = {"engine": engine, "seed": 9, **options}
+    whole = ml.simulate(flux, system, realizations=4, threads=1, **given)
+    for threads in (2, 5, None):
+        assert np.array_equal(ml.simulate(flux, system, realizations=4, threads=threads, **given), whole)
     height, width = flux.shape
-    rows, columns = slice(1, max(2, height - 2)), slice(width // 4, width)
-    index = np.arange(height * width).reshape(height, width)[rows, columns]
-    again = ml.simulate(flux[rows, columns], system, first_realization=1, pixel_index=index, **options)
-    assert np.array_equal(again[0], whole[1, rows, columns])
-    times = ml.simulate_timestamps(flux, system, realization=1, **options)
+    index, random = np.arange(height * width).reshape(height, width), np.random.default_rng(0)
+    for _ in range(4):
+        rows, columns, run = (slice(*np.sort(random.choice(n + 1, 2, replace=False))) for n in (height, width, 4))
+        part = {"realizations": run.stop - run.start, "first_realization": int(run.start)}
+        again = ml.simulate(flux[rows, columns], system, pixel_index=index[rows, columns], **part, **given)
+        assert np.array_equal(again, whole[run, rows, columns])
+    if engine not in ("exact", "sequential"):
+        return
+    times = ml.simulate_timestamps(flux, system, realization=1, **given)
     assert np.array_equal(times.histogram(), whole[1])
+    for level in _core.levels() if engine == "exact" else ():
+        given["engine"] = ExactEngine(level)
+        assert np.array_equal(ml.simulate(flux, system, realizations=4, **given), whole)
+        same = ml.simulate_timestamps(flux, system, realization=1, threads=3, **given)
+        for name in ("times_ns", "cycle", "bin"):
+            assert np.array_equal(getattr(same, name), getattr(times, name))

@@ -189,10 +189,7 @@ def test_a_missing_library_is_named(tmp_path, monkeypatch):
 @pytest.mark.parametrize("suffix", [".mat", PTU])
 def test_damaged_files_are_named(tmp_path, suffix):
     path = tmp_path / f"cube{suffix}"
-    for content in (b"", b"garbage" * 40):
-        path.write_bytes(content)
-        refused(r"cube\..* (is not a|cannot be read as a) ", io.load, path)
-    io.simulate_to(path, one_return(), SYSTEM, overwrite=True)
+    io.simulate_to(path, one_return(), SYSTEM)
     whole = path.read_bytes()
     for size in (100, len(whole) // 2, len(whole) - 40):
         path.write_bytes(whole[:size])

@@ -23,8 +23,8 @@ from mars_lidar.io.maps import load_maps
 
 SYSTEM = make_system(30.0, 50, 32)
 READERS = {
-    **dict.fromkeys(["cube.h5", "cube.npz", "cube.mat"], io.load),
-    **dict.fromkeys(["photons.npz", "photons.h5", "photons.mat"], ml.Timestamps.load),
+    **dict.fromkeys(["cube.h5", "cube.npz", "cube.mat", "cube.ptu"], io.load),
+    **dict.fromkeys(["photons.npz", "photons.h5", "photons.mat", "photons.ptu"], ml.Timestamps.load),
     "light.npy": lambda path: io.read_transient(path, bin_ns=1.0),
     **dict.fromkeys(["light.npz", "light.h5", "light.mat"], io.read_transient),
     **dict.fromkeys(["depth.png", "depth.tiff", "depth.npz", "depth.pfm", "depth.npy"], ml.Scene.from_rgbd),

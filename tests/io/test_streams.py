@@ -221,10 +221,7 @@ def test_photon_hdf5_of_others(tmp_path):
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_damaged_streams_are_named(tmp_path, suffix):
     path = tmp_path / f"photons{suffix}"
-    for content in (b"", b"garbage" * 40):
-        path.write_bytes(content)
-        refused(r"photons\..* (is not|cannot be read as) an? ", ml.Timestamps.load, path)
-    photons().save(path, overwrite=True)
+    photons().save(path)
     whole = path.read_bytes()
     for size in (100, len(whole) // 2, len(whole) - 4):
         path.write_bytes(whole[:size])

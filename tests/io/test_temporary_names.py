@@ -6,29 +6,15 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 from harness import make_system, refused
 
-import mars_lidar as ml
 from mars_lidar import io
-from mars_lidar._base.files import INCOMPLETE_SUFFIX, beside, finished_name, open_own, replacing, unfinished_of
+from mars_lidar._base.files import beside, finished_name, open_own, replacing, unfinished_of
 from mars_lidar.dataset.run import _alone
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="links")
 SYSTEM = make_system(10.0, 40, 16, period_ns=50.0)
-
-
-@pytest.mark.parametrize("suffix", [".npz", ".h5", ".mat", ".ptu"])
-def test_a_link_under_the_old_name_is_not_followed(suffix, tmp_path):
-    if suffix == ".ptu":
-        pytest.importorskip("ptufile")
-    precious = tmp_path / "precious"
-    precious.write_text("mine")
-    (tmp_path / f"cube{suffix}{INCOMPLETE_SUFFIX}").symlink_to(precious)
-    io.simulate_to(tmp_path / f"cube{suffix}", ml.Flux(np.ones((2, 2)), 0.1, 20.0), SYSTEM)
-    assert precious.read_text() == "mine"
-    assert np.asarray(io.load(tmp_path / f"cube{suffix}").histogram).any()
 
 
 def test_names_are_random_and_files_new(tmp_path):

@@ -64,6 +64,15 @@ def bias(case: Case) -> np.ndarray:
     return (torch.linalg.solve(curvature, score)).numpy() / case.bound
 
 
+def scores(case: Case, exposures: int, seed: int) -> np.ndarray:
+    """Score (exposures, 3) of simulated exposures at the true light."""
+    cube = ml.simulate(ml.Flux(*case.light), case.system, realizations=exposures, seed=seed, threads=1)
+    counts = torch.from_numpy(cube.reshape(exposures, -1).astype(float))
+    at = torch.tensor([case.light] * exposures, dtype=torch.float64, requires_grad=True)
+    value = histogram_log_likelihood(counts, at[:, 0], at[:, 1], at[:, 2], case.system)
+    return torch.autograd.grad(value.sum(), at)[0].numpy()
+
+
 WARNS = "less than one pass of the pulse is expected to end without a registration"
 
 
@@ -109,20 +118,15 @@ def test_a_bias_at_the_end_is_warned_of():
 )
 def test_ends_that_matter_are_warned_of(start, dead, light, least):
     """Mean score of 500 exposures, in standard deviations of the bound: within 5 standard errors of 0, or far off."""
-    exposures = 500
-    system = make_system(dead, 1000, 32, sigma_ns=2.5, start=start)
-    cube = ml.simulate(ml.Flux([[light[0]]], *light[1:]), system, realizations=exposures, seed=3, threads=1)
-    counts = torch.from_numpy(cube.reshape(exposures, 32).astype(float))
-    at = torch.tensor([light] * exposures, dtype=torch.float64, requires_grad=True)
+    case = Case(make_system(dead, 1000, 32, sigma_ns=2.5, start=start), light)
     with warnings.catch_warnings(record=True) as given:
         warnings.simplefilter("always")
-        value = histogram_log_likelihood(counts, at[:, 0], at[:, 1], at[:, 2], system)
+        score = scores(case, 500, 3) * case.bound
     assert bool([w for w in given if WARNS in str(w.message)]) == (least > 0.0)
-    score = torch.autograd.grad(value.sum(), at)[0].numpy() * Case(system, light).bound
     off = np.abs(score.mean(0))
     assert off.max() > least
     if least == 0.0:
-        assert (off < 5.0 * score.std(0) / exposures**0.5).all(), off
+        assert (off < 5.0 * score.std(0) / 500**0.5).all(), off
 
 
 @pytest.mark.parametrize("level", _core.levels())
@@ -160,14 +164,9 @@ def test_bias_of_the_worst_of_600_systems(number):
 def test_bias_of_simulated_exposures(bins, sigma, dead, light):
     """Mean of 2,000 one-step estimates from the truth; 0.1 and 4 standard errors (false alarm 2e-4 a case)."""
     exposures = 2000
-    system = make_system(dead, 1000, bins, sigma_ns=sigma)
-    cube = ml.simulate(ml.Flux([[light[0]]], *light[1:]), system, realizations=exposures, seed=2, threads=1)
-    counts = torch.from_numpy(cube.reshape(exposures, bins).astype(float))
-    at = torch.tensor([light] * exposures, dtype=torch.float64, requires_grad=True)
-    value = histogram_log_likelihood(counts, at[:, 0], at[:, 1], at[:, 2], system)
-    score = torch.autograd.grad(value.sum(), at)[0]
-    inverse = torch.linalg.inv(torch.cov(score.T))  # the information, estimated by the scatter of the score
-    off = ((score @ inverse).mean(0) / inverse.diagonal().sqrt()).numpy()
+    score = scores(Case(make_system(dead, 1000, bins, sigma_ns=sigma), light), exposures, 2)
+    inverse = np.linalg.inv(np.cov(score.T))  # the information, estimated by the scatter of the score
+    off = (score @ inverse).mean(0) / np.sqrt(inverse.diagonal())
     assert (np.abs(off) < 0.1 + 4.0 / exposures**0.5).all(), off
 
 

@@ -43,27 +43,6 @@ def numbers(examples) -> list[tuple[int, int]]:
 EVERY = [(sample, number) for sample in range(6) for number in range(5)]
 
 
-@pytest.mark.full
-def test_examples_are_the_exposures(path):
-    stored = ml.dataset.open_dataset(path)
-    dataset = StoredDataset(path, maps=["depth", "signal"], seed=3)
-    examples = list(dataset)
-    assert len(dataset) == 30
-    assert numbers(examples) != EVERY
-    assert sorted(numbers(examples)) == EVERY
-    for example in examples:
-        assert example["counts"].shape == (32, 6, 8)
-        assert example["counts"].dtype == torch.float32
-        counts = np.asarray(stored.histogram[int(example["sample"]), int(example["realization"])])
-        np.testing.assert_array_equal(example["counts"].permute(1, 2, 0).numpy(), counts)
-        np.testing.assert_array_equal(
-            example["signal"].numpy(), np.asarray(stored.maps["signal"][int(example["sample"])])
-        )
-        assert example["seed"].item() == int(stored.seeds[int(example["sample"])])
-    numbered = {"sample", "realization", "scene", "system", "signal_level", "sbr", "seed"}
-    assert set(examples[0]) == {"counts", "depth", "signal"} | numbered
-
-
 @pytest.mark.parametrize("seed", [0x243F6A8885A308D3, 0x13198A2E03707344, 0xA4093822299F31D0, 2**64 - 1])
 def test_the_documented_loop_over_any_dataset_seed(tmp_path, seed):
     """Seeds of samples fill 64 bits: half of them overflow a signed integer, so collation must not see one."""
@@ -96,15 +75,6 @@ def test_orders(path):
     assert numbers(again) == two
     assert numbers(StoredDataset(path, shuffle=False)) == EVERY
     assert numbers(StoredDataset(path, seed=2)) != single
-
-
-@pytest.mark.full
-@pytest.mark.parametrize("world", [1, 2, 4, 7])
-def test_ranks_have_equally_many_and_none_twice(path, world):
-    parts = [numbers(StoredDataset(path, rank=rank, world_size=world, pool=2)) for rank in range(world)]
-    assert {len(part) for part in parts} == {30 // world}
-    together = [example for part in parts for example in part]
-    assert len(set(together)) == len(together) == 30 // world * world
 
 
 def test_some_samples_with_workers_of_a_loader(path):
@@ -150,12 +120,18 @@ def test_every_layout_chunk_and_type_holds_the_counts(tmp_path, layout, store, d
         "store": store | {"layout": layout},
     }
     ml.generate(recipe, tmp_path / "set.zarr")
-    histogram = np.asarray(ml.dataset.open_dataset(tmp_path / "set.zarr").histogram)
+    opened = ml.dataset.open_dataset(tmp_path / "set.zarr")
+    histogram, signal = np.asarray(opened.histogram), np.asarray(opened.maps["signal"])
+    numbered = {"sample", "realization", "scene", "system", "signal_level", "sbr", "seed"}
     for axes in ("THW", "HWT"):
         observed = 0
-        for batch in StoredDataset(tmp_path / "set.zarr", batch_size=5, dtype=dtype, axes=axes):
+        for batch in StoredDataset(
+            tmp_path / "set.zarr", batch_size=5, maps=["depth", "signal"], dtype=dtype, axes=axes
+        ):
+            assert set(batch) == {"counts", "depth", "signal"} | numbered
             assert batch["counts"].dtype == dtype
             stored = histogram[batch["sample"], batch["realization"]]
+            np.testing.assert_array_equal(batch["signal"].numpy(), signal[batch["sample"]])
             order = (0, 3, 1, 2) if axes == "THW" else (0, 1, 2, 3)
             np.testing.assert_array_equal(batch["counts"].to(torch.float64).numpy(), stored.transpose(order))
             assert batch["counts"].permute(0, 2, 3, 1).is_contiguous() == (axes == "THW")
@@ -202,81 +178,6 @@ def test_all_ranks_have_equally_many_batches_in_2000_random_configurations(path)
         else:
             assert set(given) == set(range(every))
             assert len(given) == every + (dataset._world - remaining) % dataset._world
-
-
-def content(batches) -> list[list[tuple[int, int]]]:
-    return [list(zip(batch["sample"].tolist(), batch["realization"].tolist(), strict=True)) for batch in batches]
-
-
-@pytest.mark.full
-def test_batches_do_not_depend_on_workers_and_passes_go_on_by_themselves(path):
-    alone = StoredDataset(path, batch_size=4, seed=3)
-    passes = [content(alone) for _ in range(2)]
-    assert passes[0] != passes[1]
-    for workers in (1, 2):
-        dataset = StoredDataset(path, batch_size=4, seed=3)
-        loader = DataLoader(dataset, batch_size=None, num_workers=workers, persistent_workers=workers == 2)
-        for single in passes:
-            assert sorted(content(loader)) == sorted(single)
-        dataset.set_epoch(0)
-        if workers != 2:  # workers that live on have a copy of the dataset, and its counter in shared memory
-            assert sorted(content(loader)) == sorted(passes[0])
-
-
-@pytest.mark.full
-@pytest.mark.parametrize("before", [0, 1, 2])
-@pytest.mark.parametrize("after", [0, 1, 2])
-def test_a_pass_goes_on_where_it_was_stopped(path, before, after):
-    """Also with another number of workers, after a second stop, and in the epoch that follows."""
-    whole = StoredDataset(path, batch_size=4, seed=3)
-    whole.set_epoch(1)
-    every = content(DataLoader(whole, batch_size=None, num_workers=before))
-    then = content(DataLoader(whole, batch_size=None, num_workers=after))
-    for stop in (1, 7):
-        first = StoredDataset(path, batch_size=4, seed=3)
-        first.set_epoch(1)
-        batches = iter(DataLoader(first, batch_size=None, num_workers=before))
-        taken = content([next(batches) for _ in range(stop)])
-        state = first.state_dict(stop)
-        del batches
-        second = StoredDataset(path, batch_size=4, seed=3)
-        second.load_state_dict(state)
-        loader = DataLoader(second, batch_size=None, num_workers=after)
-        batches = iter(loader)
-        more = content([next(batches) for _ in range(min(2, len(every) - stop))])
-        del batches
-        third = StoredDataset(path, batch_size=4, seed=3)
-        third.load_state_dict(second.state_dict(len(more)))
-        loader = DataLoader(third, batch_size=None, num_workers=after)
-        assert taken + more + content(loader) == every
-        assert sorted(content(loader)) == sorted(then)
-
-
-@pytest.mark.full
-@pytest.mark.filterwarnings("ignore:'set_vital' is deprecated")  # which torchdata calls
-@pytest.mark.parametrize("workers", [0, 2])
-def test_a_stateful_loader_goes_on(path, workers):
-    StatefulDataLoader = pytest.importorskip("torchdata.stateful_dataloader").StatefulDataLoader
-
-    def loader():
-        return StatefulDataLoader(StoredDataset(path, batch_size=4, seed=3), batch_size=None, num_workers=workers)
-
-    every = content(loader())
-    first = loader()
-    batches = iter(first)
-    taken = content([next(batches) for _ in range(3)])
-    state = first.state_dict()
-    second = loader()
-    second.load_state_dict(state)
-    assert taken + content(second) == every
-
-
-def test_positions_that_do_not_fit_are_refused(path):
-    dataset = StoredDataset(path, batch_size=4, seed=3)
-    refused("with seed 3, this one has 4", StoredDataset(path, seed=4).load_state_dict, dataset.state_dict())
-    loader = DataLoader(dataset, batch_size=None, num_workers=1)
-    next(iter(loader))
-    refused("batches must be given", dataset.state_dict)
 
 
 @pytest.mark.full

@@ -289,3 +289,13 @@ def test_example_names_and_the_error_that_lists_them():
     for name in Scene.example_names():
         assert Scene.example(name, size=4).shape == (4, 4)
     refused("name must be one of 'room', 'random', got 'kitchen'", Scene.example, "kitchen")
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_random_scenes_are_whole_and_different(seed):
+    first, again, other = (Scene.example("random", 24, k) for k in (seed, seed, seed + 100))
+    np.testing.assert_array_equal(first.depth_m, again.depth_m)
+    assert not np.array_equal(first.depth_m, other.depth_m)
+    assert first.valid.all()
+    assert 0.3 < first.depth_m.min() < first.depth_m.max() < 17.5
+    assert first.reflectivity.max() > 0.02

@@ -1,6 +1,5 @@
 """Histograms and joint laws of more bins than the statistics grid: against grids that have a bin for each of them."""
 
-import time
 from dataclasses import replace
 from typing import Any
 
@@ -97,21 +96,6 @@ def test_short_exposures():
     np.testing.assert_allclose(fine, known.window(windows), rtol=1e-3)
     direct = mean_histogram(ml.Flux(0.465, 2.72, 50.0), system)
     assert 0.5 * np.abs(law.mean - direct).sum() < 1e-4 * direct.sum()
-
-
-@pytest.mark.full
-@pytest.mark.parametrize("bins", [200_000, 902_677, 2**20])
-@pytest.mark.parametrize("dead", [0.5, 3.923])
-def test_two_seconds(bins: int, dead: float):
-    """The largest histograms took up to 10 s."""
-    system = view(dead, 102, 0.009, bins=bins)
-    for compute in (
-        lambda: mean_histogram(ml.Flux(0.465, 2.72, 50.0), system, threads=1),
-        lambda: ml.joint_law(ml.Flux(0.465, 2.72, 50.0), system),
-    ):
-        begin = time.process_time()
-        compute()
-        assert time.process_time() - begin < 2.0
 
 
 def test_light_that_cells_do_not_see():

@@ -27,21 +27,6 @@ def moments_of(law):
     return mean, second, third, fourth - 3 * second**2
 
 
-@pytest.mark.parametrize(
-    ("total", "dead", "cycles"),
-    [(2.0, 0.6375, 100), (0.05, 0.37, 50), (30.0, 0.11, 5), (1.2, 2.3, 40), (0.3, 0.003, 60)],
-)
-def test_constant_rate_pmf(total, dead, cycles):
-    """P(N >= n) = P(Gamma(n, 1 / rate) <= t - (n - 1) t_d) for an armed start."""
-    law = count_law(ml.Flux(0.0, total), system_of(dead, cycles=cycles), tolerance=1e-6)
-    n = np.append(law.support, law.support[-1] + 1).astype(float)
-    remaining = np.maximum(cycles - (n - 1) * dead, 0.0)
-    at_least = np.where(n == 0, 1.0, stats.gamma.cdf(remaining, np.maximum(n, 1.0), scale=1 / total))
-    np.testing.assert_allclose(law.pmf, at_least[:-1] - at_least[1:], atol=2e-6)
-    np.testing.assert_allclose(law.cdf, 1 - at_least[1:], atol=2e-6)
-    assert law.cdf[-1] == pytest.approx(1.0, abs=1e-10)
-
-
 @pytest.mark.parametrize("start", ["armed", "stationary"])
 @pytest.mark.parametrize(
     ("signal", "background", "dead", "cycles"),
@@ -71,13 +56,6 @@ def test_pmf_agrees_with_cumulants(signal, background, dead, cycles, start):
         scale = max(abs(law.cumulants[k]), float(law.variance) ** ((k + 1) / 2), 1e-12)
         noise = 1e-13 * law.support.size ** (k + 1)  # of the transform, some 1e-15 for every count
         assert result == pytest.approx(law.cumulants[k], abs=1e-5 * scale + noise)
-
-
-def test_single_cycle_is_bernoulli():
-    law = count_law(ml.Flux(0.7, 0.4, 50.0), system_of(5.5, cycles=4))
-    p = -math.expm1(-4.4)
-    np.testing.assert_allclose(law.pmf[:2], [1 - p, p], rtol=1e-9)
-    assert law.support[0] == 0
 
 
 def test_batches():

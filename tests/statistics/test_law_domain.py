@@ -216,6 +216,7 @@ def test_darkness():
     assert law.mean == law.variance == 0.0
     np.testing.assert_array_equal(law.pmf, [1.0])
     assert mean_histogram(ml.Flux(waveform=np.zeros(100)), system).sum() == 0.0
+    assert not ml.joint_law(ml.Flux(0.0, 0.0), view(0.6, 100)).covariance().any()
     some = ml.count_law(ml.Flux([0.0, 1.0], [0.0, 0.5], 50.0), view(0.6, 100))
     np.testing.assert_allclose(
         some.cumulants[1], ml.count_law(ml.Flux(1.0, 0.5, 50.0), view(0.6, 100)).cumulants, rtol=1e-10

@@ -65,11 +65,11 @@ def test_moments_are_the_closed_form_ones(case: Case):
     flux = case.flux[0, 0]
     law = ml.count_law(flux, system, tolerance=1e-5)
     known = paralyzable_moments(flux, system)
-    spread = np.sqrt(float(known.variance))
-    assert abs(float(law.mean - known.mean)) < 3e-5 * min(spread, float(known.mean)) + 1e-9
-    assert float(law.variance) == pytest.approx(float(known.variance), rel=1e-4, abs=1e-8)
+    spread = np.sqrt(known.variance)
+    assert abs(float(law.mean) - known.mean) < 3e-5 * min(spread, known.mean) + 1e-9
+    assert float(law.variance) == pytest.approx(known.variance, rel=1e-4, abs=1e-8)
     own = exposure_moments(flux, system, tolerance=1e-5)
-    assert 0.5 * np.abs(own.histogram - known.histogram).sum() < 3e-5 * float(known.mean)
+    assert 0.5 * np.abs(own.histogram - known.histogram).sum() < 3e-5 * known.mean
     # third and fourth cumulant came by series in s, the pmf by points on the circle
     n = law.support - law.mean
     third, fourth = law.pmf @ n**3, law.pmf @ n**4 - 3 * (law.pmf @ n**2) ** 2
@@ -86,15 +86,13 @@ def test_the_first_photon_of_a_short_pulse_is_registered(sigma: float, signal: f
     assert float(law.variance) == pytest.approx(-20.0 * np.expm1(-signal) * np.exp(-signal), rel=1e-6, abs=1e-9)
 
 
-@pytest.mark.parametrize("bins", [1, 50, 200, 1000])
+@pytest.mark.parametrize("bins", [1, 50, 1000])
 def test_the_grid_of_the_histogram_is_not_the_one_of_the_moments(bins: int):
-    """However many bins the histogram has, the closed form keeps its tolerance."""
-    system = view(0.45, cycles=500, sigma=0.01, bins=bins)
-    result = paralyzable_moments(ml.Flux(1.0, 1.0, 37.0), system)
-    assert float(mean_histogram(ml.Flux(1.0, 1.0, 37.0), system).sum()) == pytest.approx(float(result.mean), rel=1e-5)
-    known = exposure_moments(ml.Flux(1.0, 1.0, 37.0), system.replace(bins=1), tolerance=1e-7)
-    assert float(result.mean) == pytest.approx(float(known.mean), rel=1e-5)
-    assert float(result.variance) == pytest.approx(float(known.variance), rel=1e-5)
+    """However many bins the histogram has, the laws keep their tolerance."""
+    system, flux = view(0.45, cycles=500, sigma=0.01, bins=bins), ml.Flux(1.0, 1.0, 37.0)
+    known, law = paralyzable_moments(flux, system), exposure_moments(flux, system, tolerance=1e-6)
+    assert float(mean_histogram(flux, system).sum()) == pytest.approx(known.mean, rel=1e-5)
+    assert [float(law.mean), float(law.variance)] == pytest.approx(known[:2], rel=1e-5)
 
 
 @pytest.mark.parametrize("start", ["armed", "stationary"])
@@ -118,7 +116,7 @@ def test_dead_times_round_one_bin_of_the_grid():
         )
         assert law.exposure is not None
         assert law.exposure.bins <= 256
-        assert law.cumulants[:2] == pytest.approx([float(known.mean), float(known.variance)], rel=1e-4)
+        assert law.cumulants[:2] == pytest.approx(known[:2], rel=1e-4)
         assert law.pmf.sum() == pytest.approx(1.0, abs=1e-9)
 
 
@@ -129,8 +127,8 @@ def test_long_exposures_and_long_dead_times():
     assert c.pmf.sum() == pytest.approx(1.0, abs=1e-5)
     long = ml.count_law(ml.Flux(0.01, 0.005, 50.0), view(300.25, cycles=2000))
     known = paralyzable_moments(ml.Flux(0.01, 0.005, 50.0), view(300.25, cycles=2000))
-    assert long.cumulants[:2] == pytest.approx([float(known.mean), float(known.variance)], rel=1e-5)
-    assert long.pmf @ long.support == pytest.approx(float(known.mean), rel=1e-5)
+    assert long.cumulants[:2] == pytest.approx(known[:2], rel=1e-5)
+    assert long.pmf @ long.support == pytest.approx(known.mean, rel=1e-5)
 
 
 def test_dark_blinded_and_without_dead_time():

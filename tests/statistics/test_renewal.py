@@ -238,7 +238,9 @@ def test_random_cells_never_give_a_negative_variance():
 
 
 @pytest.mark.parametrize("start", ["armed", "stationary"])
-@pytest.mark.parametrize(("rate", "dead", "cycles"), [(0.4, 0.6375, 200), (3.0, 1.7, 300), (0.05, 0.3, 40)])
+@pytest.mark.parametrize(
+    ("rate", "dead", "cycles"), [(0.4, 0.6375, 200), (3.0, 1.7, 300), (0.05, 0.3, 40), (2.0, 0.6375, 100)]
+)
 def test_the_law_of_constant_light_is_a_renewal_process(start, rate, dead, cycles):
     """(6.4), (6.5), and the moments (6.3); the long exposure of (6.2) is off by less than half a count."""
     system, armed = make_system(dead, cycles=cycles, start=start), start == "armed"
@@ -247,6 +249,7 @@ def test_the_law_of_constant_light_is_a_renewal_process(start, rate, dead, cycle
     law = ml.count_law(ml.Flux(0.0, rate), system)
     on = pmf[np.minimum(law.support, pmf.size - 1)]
     np.testing.assert_allclose(law.pmf, on, atol=1e-9)
+    np.testing.assert_allclose(law.cdf, np.cumsum(on), atol=1e-9)
     mean, variance = constant_rate_moments(rate, dead, cycles, stationary=not armed)
     assert pmf.sum() == pytest.approx(1.0, abs=1e-11)
     assert pmf @ support == pytest.approx(mean, abs=1e-8)

@@ -125,23 +125,3 @@ def test_flux_beyond_the_table_is_left_out():
     assert single.takes(ml.Flux(0.01, 10.0, 1.0))
     assert not single.takes(ml.Flux(0.009, 1.0, 1.0))
     assert not single.takes(ml.Flux(0.1, 10.1, 1.0))
-
-
-@pytest.mark.full
-def test_tables_are_shared_between_exposures(system):
-    tables = runtime.Tables((4, 3))
-    first = tables.get(system)
-    longer = system.replace(cycles=5 * system.cycles)
-    assert first.serves(longer.cycles)
-    assert tables.get(longer) is first
-    assert tables.numpy(longer).system == longer
-    assert tables.numpy(longer) is tables.numpy(longer)
-    assert tables.get(system.replace(bins=32)).system.bins == 32
-    direct = ml.statistics.exposure_moments(ml.Flux(0.1, 10.0, 0.5 * longer.period_ns), longer)
-    row = tables.numpy(longer).rows(np.array([0.1]), np.array([10.0]))[0]
-    assert tables.numpy(longer).mean[row] == pytest.approx(float(direct.mean), rel=1e-6)
-    assert tables.numpy(longer).spread[row] == pytest.approx(float(direct.variance) ** 0.5, rel=1e-5)
-
-
-def test_stages_of_a_report():
-    assert runtime.stages_of({"lookup_s": 0.5, "pixels_exact": 3.0}) == {"lookup": 0.5}

@@ -240,9 +240,8 @@ def start_phases(
     cells = Cells.of(np.repeat(signal[row], column.size), np.tile(background[column], row.size), system).resolved(1)
     own = bins[index]
     grids = np.maximum(own, _phase_grid(cells, int(own.min())))
-    spread = np.sqrt(
-        np.maximum(cumulants[index, 1], 0.25)
-    )  # at least half a count: errors of small counts matter in counts
+    # at least half a count: errors of small counts matter in counts
+    spread = np.sqrt(np.maximum(cumulants[index, 1], 0.25))
     scale = spread[:, None] ** np.arange(1, 5)
     some = np.zeros((row.size, column.size), dtype=bool)
     some[np.ix_(_few(row.size), _few(column.size))] = True

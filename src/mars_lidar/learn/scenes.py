@@ -295,7 +295,7 @@ class Sample:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Recipe:
+class Samples:
     """Distribution from which samples are drawn."""
 
     source: SceneSource

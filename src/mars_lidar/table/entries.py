@@ -2,7 +2,7 @@
 
 Each entry has cumulants and shape at the canonical delay t_r / 2 (`Entries`), the exact law of the count if four
 cumulants do not determine it (`NodeLaws`), and for an armed start the change of the cumulants with the delay
-(`StartPhases`). A `Recipe` evaluates entries, by the exact recursion or by the method of the MaRS paper.
+(`StartPhases`). An `Evaluation` computes entries, by the exact recursion or by the method of the MaRS paper.
 """
 
 from __future__ import annotations
@@ -391,7 +391,7 @@ Method = Literal["exposure", "mars"]
 
 
 @dataclass(frozen=True, eq=False)
-class Recipe:
+class Evaluation:
     """Method and tolerance by which entries are evaluated."""
 
     method: Method

@@ -34,10 +34,10 @@ from mars_lidar.table import storage
 from mars_lidar.table.axes import PAPER_GRID, Grid, axis_values, describe
 from mars_lidar.table.entries import (
     Entries,
+    Evaluation,
     Lookup,
     Method,
     NodeLaws,
-    Recipe,
     StartPhases,
     evaluate,
     node_laws,
@@ -155,11 +155,11 @@ class Table:
             raise ValueError(f"rearm must be 'centre' for method {method!r}, which has no such option, got {rearm!r}")
         tolerance = checks.real("tolerance", tolerance, low=1e-9, high=0.1)
         progress = callback_of(progress, "building a table")
-        recipe = Recipe(method, rearm, tolerance, thread_count(threads))
+        evaluation = Evaluation(method, rearm, tolerance, thread_count(threads))
         began = time.perf_counter()
-        table = _evaluated(system, axes, recipe, progress)
-        error = table.quantisation_error(samples=TOL.error_pixels, threads=recipe.threads)
-        longest = table._long_error(recipe.threads)
+        table = _evaluated(system, axes, evaluation, progress)
+        error = table.quantisation_error(samples=TOL.error_pixels, threads=evaluation.threads)
+        longest = table._long_error(evaluation.threads)
         table.provenance.update(
             key=storage.request_key(system, axes, method=method, rearm=rearm, tolerance=tolerance),
             error=error.to_dict(),
@@ -438,8 +438,8 @@ class Table:
         system = self.system.replace(cycles=periods)
         below = interpolation == "bilinear"  # the nearest entry knows nothing between 0 and the lowest value
         signal, background = (random_pixels(rng, axis, samples, below) for axis in (self.signal, self.background))
-        recipe = Recipe(self.method, self.rearm, self.tolerance, thread_count(threads))
-        exact = recipe.entries(signal, background, system)
+        evaluation = Evaluation(self.method, self.rearm, self.tolerance, thread_count(threads))
+        exact = evaluation.entries(signal, background, system)
         looked_up = self.at(signal, background, cycles=periods, interpolation=interpolation)
         mixed = looked_up.mixture(self.shapes(periods))
         error = deviations(looked_up.cumulants, exact.cumulants)
@@ -448,7 +448,7 @@ class Table:
         if self.method == "exposure":
             shift = rng.integers(0, system.bins, samples)
             delay, cumulants, delayed_shape = self._against_exact(
-                signal, background, shift, mixed, periods, recipe.threads
+                signal, background, shift, mixed, periods, evaluation.threads
             )
             law = self.at(signal, background, delay, cycles=periods, interpolation=interpolation)
             delayed = deviations(law.cumulants, cumulants)
@@ -527,7 +527,7 @@ class Table:
         return delay, exact.cumulants, np.asarray(error, dtype=np.float64)
 
 
-def _evaluated(system: System, axes: Axes, recipe: Recipe, progress: Progress | None) -> Table:
+def _evaluated(system: System, axes: Axes, evaluation: Evaluation, progress: Progress | None) -> Table:
     signal, background = axes
     check_memory(
         2 * 4 * signal.size * background.size * system.bins,
@@ -537,18 +537,18 @@ def _evaluated(system: System, axes: Axes, recipe: Recipe, progress: Progress | 
     cells = signal.size * background.size
     settled = cells + max(1, cells // 10)  # the start phases take about so much of the time
     total = settled + max(1, cells // 20)  # and the laws of some entries so much
-    entries = recipe.entries(
+    entries = evaluation.entries(
         np.repeat(signal, background.size), np.tile(background, signal.size), system, of_part(progress, 0, cells, total)
     )
     phases, laws = StartPhases.none(), NodeLaws.none()
-    if recipe.method == "exposure":
+    if evaluation.method == "exposure":
         phases = start_phases(
             system,
             signal,
             background,
             entries.cumulants,
             entries.bins,
-            threads=recipe.threads,
+            threads=evaluation.threads,
             progress=of_part(progress, cells, settled, total),
         )
         laws = node_laws(
@@ -556,12 +556,21 @@ def _evaluated(system: System, axes: Axes, recipe: Recipe, progress: Progress | 
             signal,
             background,
             entries,
-            threads=recipe.threads,
+            threads=evaluation.threads,
             progress=of_part(progress, settled, total, total),
         )
     if progress is not None:
         progress(total, total)
     provenance = {"version": __version__, "signal": describe(signal), "background": describe(background)}
     return Table(
-        system, recipe.method, signal, background, recipe.rearm, recipe.tolerance, provenance, entries, phases, laws
+        system,
+        evaluation.method,
+        signal,
+        background,
+        evaluation.rearm,
+        evaluation.tolerance,
+        provenance,
+        entries,
+        phases,
+        laws,
     )

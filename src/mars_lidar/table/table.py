@@ -216,7 +216,7 @@ class Table:
     ) -> tuple[Path, Path | None]:
         """Path of the table in the cache, and the existing file that can be used instead, or None."""
         system = system.detected()
-        chosen = {"method": "exposure", "rearm": "centre", "tolerance": 1e-4} | options
+        chosen: dict[str, Any] = {"method": "exposure", "rearm": "centre", "tolerance": 1e-4} | options
         unknown = set(chosen) - {"method", "rearm", "tolerance", "threads", "progress"}
         if unknown:
             raise TypeError(f"the options are those of Table.build, got {sorted(unknown)[0]!r}")
@@ -562,15 +562,5 @@ def _evaluated(system: System, axes: Axes, evaluation: Evaluation, progress: Pro
     if progress is not None:
         progress(total, total)
     provenance = {"version": __version__, "signal": describe(signal), "background": describe(background)}
-    return Table(
-        system,
-        evaluation.method,
-        signal,
-        background,
-        evaluation.rearm,
-        evaluation.tolerance,
-        provenance,
-        entries,
-        phases,
-        laws,
-    )
+    made_as = evaluation.method, signal, background, evaluation.rearm, evaluation.tolerance
+    return Table(system, *made_as, provenance, entries, phases, laws)

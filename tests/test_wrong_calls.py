@@ -167,7 +167,6 @@ CALLS: dict[str, Callable[[Path], partial[Any]]] = {
         io.save_capture, path=at / "b.h5", cube=io.load(at / "cube.zarr"), like=at / "capture.h5", overwrite=True
     ),
     "io.read_transient": lambda at: partial(io.read_transient, path=at / "light.npy", bin_ns=1.0),
-    "io.read_mat": lambda at: partial(io.read_mat, path=at / "a.mat"),
     "io.save_mat": lambda at: partial(io.save_mat, path=at / "a.mat", cube=io.load(at / "cube.zarr"), overwrite=True),
     "io.scan": lambda at: partial(io.scan, folder=at),
     "io.photons": lambda at: partial(io.photons, cube=io.load(at / "cube.zarr")),
@@ -305,7 +304,7 @@ RESULTS = {
     *("Calibration", "CountLaw", "Generated", "JointLaw", "Lookup", "Pulse", "QuantisationError", "Reconstruction"),
     *("Table", "Timestamps", "UnitWarning", "__version__", "to_xarray"),  # the last is io's too
     *("io.Converted", "io.Cube", "io.IncompleteFileError", "io.Interrupted", "io.MissingLibraryError", "io.Problem"),
-    *("io.SUFFIXES", "io.SceneFile", "io.SpadMat", "io.WriteError", "io.Written"),
+    *("io.SUFFIXES", "io.SceneFile", "io.WriteError", "io.Written"),
 }
 
 

@@ -114,7 +114,7 @@ def test_several_returns_go_into_a_flux():
 def test_depth_is_judged_in_the_table_as_in_the_picture(tmp_path):
     """Pixels without a detection have a depth that is a guess: the table counted it, the picture did not."""
     from mars_lidar.plot.views import depth_error_m
-    from mars_lidar.reconstruction.quality import errors_against
+    from mars_lidar.reconstruction.map_errors import errors_against
 
     flux = ml.Scene.example("room", size=12).flux(SYSTEM, signal=0.02, sbr=0.5)
     io.simulate_to(tmp_path / "a.zarr", flux, SYSTEM)

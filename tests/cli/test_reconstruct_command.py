@@ -16,7 +16,7 @@ from mars_lidar.io import recipe as recipes
 from mars_lidar.io.maps import load_maps
 from mars_lidar.reconstruction import METHODS
 from mars_lidar.reconstruction import stored as stored_module
-from mars_lidar.reconstruction.quality import map_error
+from mars_lidar.reconstruction.map_errors import map_error
 from mars_lidar.reconstruction.stored import reconstruct_stored
 from tests.harness.command import fails, ok, run
 from tests.harness.study import quick_study

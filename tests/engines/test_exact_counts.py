@@ -10,7 +10,7 @@ from harness import Case, counts_against_law, make_system, require, task_of
 import mars_lidar as ml
 from mars_lidar.engines import MarsEngine
 from mars_lidar.engines.synthesis import Matched, PartlyReplaced, Run, Streams, Tabulated
-from mars_lidar.engines.table_reader import Entries
+from mars_lidar.engines.table_reader import PixelEntries
 from mars_lidar.engines.tolerances import TOL
 from mars_lidar.statistics.count_pmf import Pmf, total_variation
 from mars_lidar.statistics.tolerances import TOL as STATISTICS
@@ -38,7 +38,7 @@ def doubted(seed: int = 0, pixels: int = 400, start: str = "armed", cycles: int 
     return ml.Flux(signal[bad][None], background[bad][None], delay[bad][None])
 
 
-def laws_of(flux: ml.Flux, system: ml.System, **options: str) -> tuple[PartlyReplaced, Entries, dict[str, float]]:
+def laws_of(flux: ml.Flux, system: ml.System, **options: str) -> tuple[PartlyReplaced, PixelEntries, dict[str, float]]:
     """What the engine draws the counts of these pixels from, the table's entries of them, and its report."""
     engine = MarsEngine(table(system.start), **options)
     task = task_of(Case("pixels", flux, system, flux.signal.size), 1)

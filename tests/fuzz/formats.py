@@ -94,7 +94,6 @@ def _folder(path: Path) -> None:
 READERS: dict[str, Callable[[Path], Any]] = {
     **dict.fromkeys(["cube.zarr", "cube.h5", "cube.npz", "cube.mat", "cube.ptu"], _cube),
     "set.zarr": _dataset,
-    "read.mat": io.read_mat,
     **dict.fromkeys(["photons.npz", "photons.h5", "photons.ptu", "bare.mat", "bare73.mat", "bare.npz"], _photons),
     **dict.fromkeys(
         ["light.npy", "light.npz", "light.h5", "light.mat", "light73.mat", "tal.hdf5", "zaragoza.hdf5"], _light
@@ -144,7 +143,6 @@ def make(folder: Path) -> list[str]:
     flux = ml.Flux(np.linspace(0.1, 2.0, 12).reshape(3, 4), 0.1, 40.0)
     for suffix in (".zarr", ".h5", ".npz", ".mat", ".ptu"):
         io.simulate_to(folder / f"cube{suffix}", flux, SYSTEM)
-    shutil.copy(folder / "cube.mat", folder / "read.mat")
     recipe = {"scenes": {"example": "room", "size": [3, 4]}, "systems": [SYSTEM], "light": {"signal": [0.5, 1.0]}}
     ml.generate(recipe | {"store": {"layout": "sparse"}}, folder / "set.zarr")
     times = ml.simulate_timestamps(flux, SYSTEM)

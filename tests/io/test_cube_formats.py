@@ -64,10 +64,10 @@ def test_a_mat_tells_the_light_that_the_pixel_detects(tmp_path):
 def test_rates_are_the_signal_of_all_returns(tmp_path, make):
     flux = make()
     io.simulate_to(tmp_path / "cube.mat", flux, SYSTEM)
-    read = io.read_mat(tmp_path / "cube.mat")
+    rates = scipy.io.loadmat(tmp_path / "cube.mat")["rates"]
     for y, x in ((0, 0), (1, 2), (5, 4)):
         rate = incident_rate(flux, SYSTEM, y, x) - flux.background[y, x] / SYSTEM.bins
-        np.testing.assert_allclose(read.rates[y, x], rate / rate.max(), atol=1e-13)
+        np.testing.assert_allclose(rates[y, x], rate / rate.max(), atol=1e-13)
 
 
 @pytest.mark.full
@@ -92,13 +92,12 @@ def test_mat_loads_like_the_file_of_the_field(tmp_path):
 
 @pytest.mark.skipif(not FIELD_MAT.is_file(), reason=f"the field's file is absent: {FIELD_MAT}")
 def test_the_field_s_own_file_is_read(tmp_path):
-    read = io.read_mat(FIELD_MAT)
-    assert read.histogram.shape == read.rates.shape == (64, 64, 1024)
-    assert (read.sbr, read.photons, read.bin_hr.shape) == (0.2, 10.0, (512, 512))
+    system = SYSTEM.replace(bins=1024, cycles=1000)
+    counts = io.foreign_cube(FIELD_MAT, system, variable="spad", image=(64, 64)).histogram[0]
+    place = scipy.io.loadmat(FIELD_MAT)["bin"][..., None].astype(int) - 1
     # 10 signal photons over 50 of background: counts follow the rates only where pixels are in the right order
-    at_return = np.take_along_axis(read.histogram, read.bin[..., None].astype(int) - 1, -1).mean()
-    assert at_return > 10 * read.histogram.mean()
-    refused(r"not a cube written by mars-lidar .*read_mat", io.load, FIELD_MAT)
+    assert np.take_along_axis(counts, place, -1).mean() > 10 * counts.mean()
+    refused(r"not a cube written by mars-lidar .*foreign_cube", io.load, FIELD_MAT)
 
 
 def test_a_finer_depth_map_becomes_bin_hr(tmp_path):
@@ -108,11 +107,11 @@ def test_a_finer_depth_map_becomes_bin_hr(tmp_path):
     counts = ml.simulate(flux, system, realizations=3)
     cube = io.Cube.of(counts, io.Recipe(system=system, flux=flux, realizations=3))
     io.save_mat(tmp_path / "a.mat", cube, realization=2, depth_hr_m=depth)
-    read = io.read_mat(tmp_path / "a.mat")
-    assert np.array_equal(read.histogram, counts[2])
-    assert np.isnan(read.bin_hr[0, 0])
-    assert np.allclose(read.bin_hr[1:], system.delay_ns(4.0) / system.bin_ns + 0.5, rtol=1e-14)
+    fine = scipy.io.loadmat(tmp_path / "a.mat")["bin_hr"]
+    assert np.isnan(fine[0, 0])
+    assert np.allclose(fine[1:], system.delay_ns(4.0) / system.bin_ns + 0.5, rtol=1e-14)
     with io.load(tmp_path / "a.mat") as again:
+        assert np.array_equal(again.histogram[0], counts[2])
         assert again.recipe.first_realization == 2
         assert io.verify(again)
     refused("depth_hr_m must be positive", io.save_mat, tmp_path / "b.mat", cube, depth_hr_m=-depth)

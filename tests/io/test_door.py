@@ -30,7 +30,6 @@ READERS = {
     **dict.fromkeys(["depth.png", "depth.tiff", "depth.npz", "depth.pfm", "depth.npy"], ml.Scene.from_rgbd),
     "nyu.mat": lambda path: ml.Scene.from_rgbd(path, index=0),
     **dict.fromkeys(["maps.h5", "maps.npz"], load_maps),
-    "read.mat": io.read_mat,
     **dict.fromkeys(["a.npy", "a.npz", "a.mat", "a.h5", "a.tif"], lambda path: io.foreign_cube(path, SYSTEM)),
     "table.h5": ml.Table.load,
     **dict.fromkeys(["system.yaml", "system.json"], ml.System.load),

@@ -108,7 +108,6 @@ def test_the_cache_builds_once(own_cache, monkeypatch):
             tuple(axis_values(name, (grids | other)[name]) for name in ("signal", "background")),
             method=other.get("method", "exposure"),
             rearm="centre",
-            refine=None,
             tolerance=other.get("tolerance", 1e-4),
         )
         assert not file.name.startswith(key), other
@@ -148,7 +147,7 @@ def test_commands(tmp_path, own_cache):
     listed = run("table", "info").output
     assert "2 files" in listed
     assert "mars, S 0 and 5" in listed
-    for bad in (["--signal", "1,2"], ["--method", "no"], ["--refine", "7"]):
+    for bad in (["--signal", "1,2"], ["--method", "no"]):
         assert run("table", "build", *small, *bad).exit_code == 2
     assert run("table", "info", tmp_path / "no.h5").exit_code == 2
     (own_cache / "notes.txt").write_text("mine")

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from harness import refused, system_of
+from harness import refused
 from table.cases import small_table, table_system
 
 import mars_lidar as ml
@@ -217,18 +217,6 @@ def test_the_error_of_long_exposures_is_measured_and_told(tmp_path):
     assert f"up to some {within:.2g}" in rows["error at any"]
 
 
-def test_axes_refined_until_the_error_is_met():
-    system = system_of(0.6, 200, 16, sigma=0.04)
-    coarse = ml.Table.build(system, (1.0, 9.0, 4), (0.01, 0.3, 4), threads=2)
-    fine = ml.Table.build(system, (1.0, 9.0, 4), (0.01, 0.3, 4), refine=5e-3, threads=2)
-    assert coarse.quantisation_error(samples=200, seed=9).largest > 2e-2
-    assert fine.quantisation_error(samples=200, seed=9).largest < 7e-3
-    assert fine.provenance["error"]["law_max"] <= 5e-3
-    assert fine.provenance["refine"] == 5e-3
-    assert set(coarse.signal) <= set(fine.signal)
-    assert coarse.signal.size < fine.signal.size < 60
-
-
 def test_axes():
     grid = axis_values("signal", (0.01, 10, 256))
     assert grid.size == 257
@@ -252,7 +240,6 @@ def test_axes():
         ({"background": [-1.0, 0.5]}, ValueError, "background must be strictly ascending"),
         ({"background": [[1.0]]}, ValueError, r"background must have shape \(n,\)"),
         ({"rearm": "edge"}, ValueError, "rearm must be 'centre' for method 'exposure'"),
-        ({"refine": 0.5}, ValueError, "refine must be"),
         ({"tolerance": 0.0}, ValueError, "tolerance must be"),
     ],
 )

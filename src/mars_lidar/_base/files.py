@@ -312,9 +312,7 @@ def reading(path: str | Path, kind: str = "file") -> Iterator[Path]:
         named = str(source) in text or (isinstance(error, OSError) and error.filename is not None)
         if named and (isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno is not None)):
             raise
-        if named and (
-            type(error) is ValueError or isinstance(error, OSError)
-        ):  # an OSError of a library's own, such as Pillow's
+        if named and (type(error) is ValueError or isinstance(error, OSError)):  # such as an OSError of Pillow
             raise FileError(text) from error
         if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and no_thread(error)):
             raise MemoryError(f"{source}: does not fit in memory ({text[:300]})") from error

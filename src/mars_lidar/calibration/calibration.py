@@ -45,8 +45,8 @@ class Estimate:
     begins at 0. The error of a dead time that follows from the shortest interval alone is NaN: its law is not normal,
     and the interval is stated. In a model that does not fit all errors and intervals are NaN.
 
-    `least` and `most`: of its 95 % intervals in this model and in those with one more effect, which fit the stream as
-    well (`Calibration.limits`).
+    `least` and `most`: ends of the range of its 95 % intervals in this model and in those with one further effect that
+    fit the stream as well (`Calibration.limits`).
     """
 
     value: float
@@ -97,8 +97,8 @@ class Suspect:
 class Limit:
     """An effect that is not in the result: 95 % upper limit in units of `name`, and the estimates of a fit with it.
 
-    `ranges`: their 95 % intervals, where these extend beyond those without it by more than the stated error. The limit
-    of a paralyzable detector is 1, if it fits as well; that of a fit that did not converge is NaN.
+    `ranges`: 95 % intervals of the estimates with the effect, if they extend beyond the intervals without it by more
+    than the stated error. The limit is 1 for a paralyzable detector that fits as well, NaN if the fit did not converge.
     """
 
     name: str
@@ -184,7 +184,7 @@ class Calibration:
 
     @property
     def verdict(self) -> str:
-        """In one sentence."""
+        """The outcome of the test of fit, in one sentence."""
         if self.fitted is None:
             return "not fitted"
         included = [suspect.name for suspect in self.suspects if suspect.included]
@@ -445,7 +445,7 @@ class _Run:
     def first(self) -> Fitted:
         """The plain model, from other starts and simulated streams until it converges with a significant pulse.
 
-        The phases have a bright window, so that a fit without a pulse is a bad one.
+        For phases with a bright window: a fit without a pulse is then a failed one.
         """
         tried: list[tuple[Fit, Fitted]] = []
         while len(tried) < self.fit.effort.attempts and not (tried and tried[-1][1].converged and tried[-1][1].lit):
@@ -622,7 +622,7 @@ def _estimates(fitted: Fitted, growth: FloatArray) -> dict[str, Estimate]:
 
 
 def _at_bounds(fitted: Fitted, covariance: FloatArray, drawn: FloatArray) -> list[NDArray[np.intp]]:
-    """Draws next to each bound of the angle that its 95 % interval holds: a twentieth of all."""
+    """For each bound of the angle within its 95 % interval, the twentieth of all draws that is next to it."""
     k, order = fitted.model.light + 1, np.argsort(drawn[:, fitted.model.light + 1])
     reach = 1.96 * float(np.sqrt(np.diag(covariance))[list(fitted.free).index(k)])
     most = float(fitted.model.bounded(np.where(np.arange(drawn.shape[1]) == k, np.pi, fitted.theta))[k])

@@ -1,4 +1,4 @@
-"""Counts of a stream in cells of phase, of interval, and of both; simulated streams of the model place the cells."""
+"""Counts of a stream in cells of phase, of interval, and of both, whose edges simulated streams of the model set."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _CLASSES = 12  # parts of the period in the table, beside the stretches of brigh
 
 
 class Cells:
-    """Counts of a stream: phases; intervals; (interval, phase at its begin, does it end in a pulse).
+    """Counts of a stream: phases; intervals; (interval, phase at its start, whether it ends in a pulse).
 
     The edges are set by simulated streams, never by the data, which would bias the counts. The shortest intervals are
     resolved down to 0.7 counts in the exposure, to locate the end of the dead time.
@@ -101,7 +101,7 @@ class Cells:
 
     @staticmethod
     def _between(edges: FloatArray, unit: float) -> FloatArray:
-        """Edges of intervals, between the units of a clock; off their middle, where a period of half units may end."""
+        """Edges of intervals between the units of a clock, off the middle, where a period of half units may end."""
         return np.unique((np.floor(edges / unit + 1e-6) + _OFF) * unit) if unit > 0.0 else np.unique(edges)
 
     def count(self, streams: Streams) -> FloatArray:

@@ -93,7 +93,7 @@ def _edges(low: float, high: float, number: int, unit: float) -> FloatArray:
 def realizations(
     recording: Recording, fit: Fitted, cycles: int, simulated: int, seed: int, resampled: int = 400
 ) -> Realizations:
-    """Counts in pieces of `cycles` periods, against `simulated` pieces of the model's streams; `resampled` floors."""
+    """Counts in pieces of `cycles` periods, and in `simulated` pieces of the model's streams, by their distances."""
     length = cycles * recording.period_ns
 
     def cut(t: FloatArray, end: float) -> FloatArray:

@@ -83,7 +83,7 @@ class Effort:
 class Guess(NamedTuple):
     """Parameters (p,) of a model, which of them are free, and a root (free, free) of the covariance of those.
 
-    `law`: that of the last step, if it is one of the whole recording.
+    `law`: the linear law of the last step, if that was for the whole recording.
     """
 
     model: Model
@@ -113,7 +113,7 @@ class Batch:
         return np.asarray(self.offset > 2.0 * max(1.0, self.ratio / 4.0))
 
     def one_count(self, model: Model, free: Index) -> FloatArray:
-        """Variance (free, free) of the light by one registration more or less, where none of a kind may be recorded."""
+        """Variance (free, free) of the light by one registration more or less, of kinds that may have none."""
         rise = np.maximum(self.slope[: self.cells.phases, free], 0.0).sum(0)
         amount = (free == 0) | ((free < model.light) & (free % 2 == 1))
         return np.diag(amount / np.maximum(rise, 1.0 / model.scale(self.centre)[free]) ** 2)
@@ -228,7 +228,7 @@ class Fitted:
     offset: FloatArray  # (c,) expected counts at the centre of the last streams
     estimator: FloatArray  # (free, c): parameters less that centre, by counts less their offset
     jacobian: FloatArray  # (c, free)
-    rest: FloatArray  # (c,) counts that the fit leaves
+    rest: FloatArray  # (c,) residual counts
     fresh: FloatArray  # (streams, c) the same of fresh streams, of the recording's exposure
     misfit_z: float  # standard deviations of the misfit above that of fresh streams
     p_value: float
@@ -330,7 +330,7 @@ class Fit:
         return regression(cells, rows, theta, made, self.exposure(photons) / exposure, free)
 
     def steps(self, guess: Guess, photons: float, first: float = 0.0) -> tuple[Guess, float, bool]:
-        """Steps that weigh more and more photons, up to `photons`; misfit per cell, and whether the steps converged."""
+        """Gauss-Newton steps for ever more photons, up to `photons`; misfit per cell, and whether they converged."""
         model, theta, root, free, _ = guess
         weighed = float(min(photons, max(first, self.effort.first)))
         total = float(self.recording.photons)
@@ -428,7 +428,8 @@ class Fit:
             raw, cov = _curved(model, free, raw, cov, near, gain, recorded)
             mean = most_probable(model, raw, cov, free)
         sd = np.sqrt(np.diag(cov))
-        if again and (np.abs((centre - theta)[free]) > _NEAR * sd).any():  # cells and weights were laid elsewhere
+        # cells and weights were made at other parameters
+        if again and (np.abs((centre - theta)[free]) > _NEAR * sd).any():
             return self.finish(Guess(model, centre, root_of(cov), free), False, known)
         jacobian = law.slope[:, free] @ local
         # a parameter at its bound does not absorb counts that would move it beyond
@@ -465,9 +466,9 @@ def _curved(
 ) -> tuple[FloatArray, FloatArray]:
     """Mean (p,) and covariance (free, free) of parameters whose last one, a logarithm, also acts by its square.
 
-    The estimates by `gain` of the streams `near` the centre are fitted by a law with the square of the logarithm and
-    its product with the size. Draws of the linear law are weighted by the likelihood of the estimates by the counts
-    `own` (c,) under it.
+    `gain` gives an estimate for each stream `near` the centre, to which a law with the square of the logarithm and its
+    product with the size is fitted. Draws of the linear law are weighted by the likelihood, under this law, of the
+    estimate from the counts `own` (c,).
     """
     rows = draws(model, raw, 2.25 * cov, free)
     at, counted = (rows - near.centre)[:, free], (near.counts - near.offset) @ gain.T

@@ -1,8 +1,9 @@
 """Parameters common to all pixels of a histogram cube: dead time, pulse width or a free response, background floor.
 
-Registrations h_j of a bin are expected to be e_j = l_j D_j, the light times the passes for which the pixel was armed,
-and differ from it by a martingale of variance e_j. So sum_j h_j log e_j - e_j is a quasi-likelihood (Wedderburn,
-Biometrika 61, 439, 1974) of what all pixels share, at the most likely light of each; its curvature gives the errors.
+The expected registrations of bin j are e_j = l_j D_j, the light times the number of passes in which the pixel was
+armed, and the registrations h_j differ from them by a martingale of variance e_j. The sum of h_j log e_j - e_j is
+therefore a quasi-likelihood (Wedderburn, Biometrika 61, 439, 1974) of the common parameters, at the most likely light
+of each pixel; its curvature gives the errors.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from mars_lidar.reconstruction.maximum_likelihood import MaximumLikelihood
 from mars_lidar.reconstruction.method import Estimates
 
 _GRID = 13  # dead times of the first search, over a period
-_ROUNDS = 8  # of closer places, each at least a third as far apart
+_ROUNDS = 8  # of the search, each at dead times that lie closer
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,10 +163,10 @@ def _with_response(
 ) -> tuple[System, FloatArray]:
     """The system with the most likely response in `reach` bins on either side, and the standard errors of its samples.
 
-    A bin j of pixel k expects D_kj (B_k / bins + S_k sum_m a_kjm r_m), with r the response, a the share of its sample
-    m that falls into the bin at the pixel's delay, and D the passes that are armed on average in the bin, by the
-    expected registrations of the response before. The likelihood is maximised by expectation
-    and maximisation (Shepp and Vardi, IEEE Trans. Med. Imaging 1, 113, 1982), in turn with the light of each pixel.
+    The expected registrations of bin j of pixel k are D_kj (B_k / bins + S_k sum_m a_kjm r_m): r is the response, a_kjm
+    the share of its sample m that falls into the bin at the pixel's delay, and D_kj the mean number of passes in which
+    the pixel is armed in the bin, by the preceding response. The likelihood is maximised by expectation maximisation
+    (Shepp and Vardi, IEEE Trans. Med. Imaging 1, 113, 1982), alternately with the light of each pixel.
     """
     from scipy.sparse import csr_matrix
 
@@ -218,9 +219,9 @@ def _with_dead_time(system: System, dead: float) -> System:
 
 
 def _law(counts: FloatArray, of: Callable[[float], System], places: FloatArray, number: int = 33) -> Estimate:
-    """A parameter of the systems `of` it: mean, standard deviation and 95 % interval, if all values are as probable.
+    """Mean, standard deviation and 95 % interval of a parameter, of which `of` makes a system, for a flat prior.
 
-    In few counts the likelihood of the place of an edge has many maxima: none of their curvatures is an error. `number`
+    With few counts the likelihood of the place of an edge has many maxima, whose curvatures are not its width. `number`
     places divide the range of a likelihood above that of five standard deviations; those of the next round are closer.
     """
     for _ in range(_ROUNDS):

@@ -47,7 +47,7 @@ class Effect:
     def of(self, fields: Fields, value: tuple[float, ...]) -> Fields:
         """Fields of a `Detector` with the effect."""
         name, size, dead = self.names[0], value[0], fields["dead_time_ns"]
-        if name == "electronics_excess":  # the observed dead time is theirs, behind a detector that is ready earlier
+        if name == "electronics_excess":  # the observed dead time is the electronics'; the detector is ready earlier
             return fields | {"electronics_dead_time_ns": dead, "dead_time_ns": dead / (1.0 + size)}
         if name == "afterpulse_probability":
             delay = float(np.exp(value[1]))
@@ -99,7 +99,7 @@ class Model:
 
     The light is in photons per period, times in ns. `width` is the standard deviation of the recorded pulse, jitter
     included, and the jitter an angle, in radians, whose sine and cosine times `width` are the standard deviations of
-    jitter and pulse. Counts are smooth functions of both where one of the two vanishes; of variances they are not.
+    jitter and pulse. Counts are smooth functions of both where one width vanishes; of variances they would not be.
     Where the jitter is given (`jitter_given`) or the pulse is no Gaussian of unknown width, it is in ns. With a
     `waveform` (shares of the light in equal parts of the period, before jitter) there is no return, and the background
     is all light. `waveform_error` are the standard errors of these shares by a recording of `exposure` periods:
@@ -192,7 +192,7 @@ class Model:
         return out
 
     def prior(self, theta: FloatArray, free: NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
-        """Prior precision (free, free), and parameters (p,) at its centre: of an angle anywhere in its range alone."""
+        """Prior precision (free, free) and its centre (p,): only the angle has a prior, as wide as its range."""
         angle = self.split & (np.arange(self.size) == self.light + 1)
         return np.diag(angle[free] * (2.0 / np.pi) ** 2), np.where(angle, np.pi / 4.0, theta)
 

@@ -25,7 +25,7 @@ from mars_lidar.statistics.cells import photons_per_bin
 
 @dataclass(frozen=True, eq=False)
 class Shortest:
-    """Intervals recorded up to any end: expected numbers (laws, m) for dead times (m,), and those that were recorded.
+    """Expected numbers (laws, m) of intervals up to an end, for dead times (m,), and the recorded intervals.
 
     `recorded` (n,) intervals, sorted; `expected` the numbers up to an end; `unit` of the clock, and the `reach` of the
     jitter beyond the shortest interval, ns.
@@ -56,14 +56,14 @@ class Shortest:
         return self._interval((self.none[0] - self.none[1]).mean(0))
 
     def decides(self, error: float) -> bool:
-        """Whether the 95 % interval of an estimate by counts is much wider than this one, or narrower than can be."""
+        """Whether the 95 % interval of an estimate by counts is much wider than this one, or narrower than possible."""
         _, low, high = self.dead_time()
         return 3.92 * error > 2.0 * (high - low) or 3.92 * error < self.narrowest()
 
     def narrowest(self, cells: int = 12) -> float:
         """Width of the 95 % interval of the dead time given all intervals that jitter brings near its end.
 
-        They are Poisson numbers in cells from the shortest interval on; of all laws, the one that tells most is taken.
+        Their numbers in cells from the shortest interval on are Poisson; the law with the most information is used.
         """
         places = self.recorded[0] + np.linspace(0.0, 1.0, cells) ** 2 * self.reach
         ends = self.recorded[0] + self.unit * np.unique(np.round((places - self.recorded[0]) / self.unit))
@@ -81,10 +81,10 @@ class Shortest:
 def shortest_law(
     recording: Recording, model: Model, rows: FloatArray, cycles: int, seed: int, bins: int = 2**14, nodes: int = 2000
 ) -> Shortest:
-    """The law of the shortest interval for each of (laws, p) parameters, of all dead times.
+    """The law of the shortest interval as a function of the dead time, for each row of parameters (laws, p).
 
-    Phases of registrations are those of streams of so many `cycles`. The light has so many `bins` a period; the dead
-    times are closest next to the shortest interval.
+    The phases of registrations are those of streams of `cycles` periods, the light has `bins` bins in a period, and the
+    dead times lie closest near the shortest interval.
     """
     from scipy.special import ndtr
 

@@ -14,10 +14,10 @@ _WINDOWS = 64  # of the period, for the median light
 
 
 def free_light(t: FloatArray, clock: Clock, hold: float, bins: int) -> tuple[FloatArray, FloatArray]:
-    """Registrations and armed passes (bins,) over the period, from `hold` after each registration on.
+    """Registrations and armed passes (bins,) over the period, counted from `hold` after each registration on.
 
     Their ratio is the probability of a photon in a bin, for any shape of light and any dead time below `hold`. Times
-    are spread over the unit of the clock: bins hold different numbers of its points, or end at one.
+    are spread over the unit of the clock, because bins contain different numbers of its ticks, or end at one.
     """
     period = clock.period_ns
     t = t + clock.unit_ns * (np.random.default_rng(0).random(t.size) - 0.5)
@@ -117,7 +117,7 @@ def starts(fit: Fit, recording: Recording, model: Model, fixed: dict[str, float]
 
 
 def _ranks(n: int) -> NDArray[np.intp]:
-    """Those of n sorted intervals that are compared at the end of the dead time."""
+    """Ranks of the intervals, of n sorted ones, that are compared at the end of the dead time."""
     return np.unique(np.minimum([1, 5, 20, max(30, n // 500), max(60, n // 100), max(120, n // 30)], n - 1))
 
 

@@ -30,7 +30,7 @@ class Score:
 
     @property
     def z(self) -> float:
-        """Standard deviations above zero; no effect has a negative size, and one that is on or off none beyond 1."""
+        """Standard deviations above zero; the size of an effect that is on or off counts as 1 at most."""
         return min(self.size, 1.0 if self.effect.onoff else np.inf) / self.error
 
 
@@ -189,7 +189,7 @@ def refitted(fit: Fit, fitted: Fitted, plain: FloatArray, trials: list[Trial]) -
     last = fit.finish(Guess(final.model, final.theta, root_of(final.covariance), final.free), finished=True)
     final = last if last.converged else final
     if fitted.p_value >= FALSE_ALARM and final.theta[size] < 1.96 * _error_of(final, size):
-        return None  # the stream fits without it, and its 95 % interval begins at none
+        return None  # the stream fits without it, and its 95 % interval includes 0
     return final, Named(effect, z, fitted.misfit_z - final.misfit_z)
 
 
@@ -203,10 +203,10 @@ def _error_of(fitted: Fitted, index: int) -> float:
 class Drift:
     """Parameters by parts of the recording.
 
-    `times_s` (parts,) their middles; `values` (parts, p), and `errors` (p,) of each; `trend` (p,) change from begin to
-    end, in standard deviations; `p_value` (p,) of it or of the scatter, the smaller; `growth` (p,) of the stated errors
-    by the scatter; `flicker` relative standard deviation of counts in times shorter than such a part, `flicker_z` its
-    standard deviations.
+    `times_s` (parts,) their middles; `values` (parts, p), and `errors` (p,) of each; `trend` (p,) change from start to
+    end, in standard deviations; `p_value` (p,) of it or of the scatter, the smaller; `growth` (p,) factor of the
+    scatter on the stated errors; `flicker` relative standard deviation of counts in times shorter than such a part,
+    `flicker_z` its standard deviations.
     """
 
     names: tuple[str, ...]
@@ -222,7 +222,7 @@ class Drift:
 
     @property
     def probability(self) -> float:
-        """Probability of a trend, a scatter or flicker as large in a constant recording, all parameters together."""
+        """Probability that a constant recording shows as large a trend, scatter or flicker in any of the parameters."""
         p = min(float(self.p_value.min()), _above(self.flicker_z))
         return float(1.0 - (1.0 - p) ** (2 * self.p_value.size + 1))
 
@@ -251,8 +251,7 @@ def _flicker(fit: Fit, fitted: Fitted, counts: float = 8.0, windows: int = 64) -
     change), over that of streams of the fit: for longer windows, relative to the shortest. Afterpulses and other
     correlations shorter than the windows change all of them alike, fluctuations of the light the longer ones more. The
     shortest windows have `counts` counts, each further size four times as many, as long as `windows` remain. The noise
-    is that of even counts, or what these streams scatter, whose light is drawn from its errors: the counts of a bright
-    pulse are even but for rare losses.
+    is the larger of that of Poisson counts and the scatter of these streams, whose light is drawn from its errors.
     """
     from scipy.special import ndtri
 

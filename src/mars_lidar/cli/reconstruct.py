@@ -216,7 +216,7 @@ def _methods(text: str, cube: Cube) -> list[str]:
 
 def _show(cube: Cube, timed: dict[str, Timed]) -> None:
     """One line a method on standard output."""
-    from mars_lidar.reconstruction.quality import errors_against, ssim_available
+    from mars_lidar.reconstruction.map_errors import errors_against, ssim_available
 
     realizations, height, width, _ = cube.shape
     head = ["method", "seconds", "detected %", "saturated %", "misfit %"]

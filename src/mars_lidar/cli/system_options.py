@@ -18,16 +18,8 @@ from mars_lidar.instrument.system import Detector, System
 
 
 @options
-class LightEffects:
-    """Effects on the light that a pixel counts; None: as in the file."""
-
-    detection_efficiency: Number | None = None
-    dark_count_hz: Number | None = None
-
-
-@options
-class StreamEffects:
-    """Detector effects that the stream of one pixel reveals; None: as in the file.
+class Effects:
+    """Effects of the detector; None: as in the file.
 
     Effects of the detector (off by default)
     ----------------------------------------
@@ -47,8 +39,14 @@ class StreamEffects:
         Sample width of --jitter-file, ns.
     code_density_file
         TDC non-linearity: 1-D .npy array of relative code widths; their number divides the bins.
+    crosstalk
+        Mean number of neighbours that an avalanche triggers; with --engine sequential. [default: 0]
+    crosstalk_kernel
+        Which neighbours: 4 or 8. [default: 8]
     """
 
+    detection_efficiency: Number | None = None
+    dark_count_hz: Number | None = None
     afterpulse_probability: Number | None = None
     afterpulse_delay_ns: Number | None = None
     twilight_ns: Number | None = None
@@ -61,6 +59,9 @@ class StreamEffects:
     jitter_file: Path | None = None
     jitter_bin_ns: Number | None = None
     code_density_file: Path | None = None
+    crosstalk: Number | None = None
+    crosstalk_kernel: Text | None = None
+    max_events_per_exposure: Integer | None = None
 
     def given(self) -> dict[str, Any]:
         """Fields of `Detector`, as plain data."""
@@ -73,6 +74,10 @@ class StreamEffects:
             fields["afterpulsing"] = {"probability": probability, "delay_ns": delay_ns}
         if self.code_density_file is not None:
             fields["code_density"] = read_array("--code-density-file", self.code_density_file)
+        if self.crosstalk is not None:
+            fields["crosstalk"] = {"probability": self.crosstalk, "kernel": self.crosstalk_kernel or "8"}
+        elif self.crosstalk_kernel is not None:
+            raise ValueError("--crosstalk-kernel belongs to --crosstalk, which is not given")
         return {name: value for name, value in fields.items() if value is not None}
 
     def _jitter(self) -> dict[str, Any] | None:
@@ -96,34 +101,6 @@ class StreamEffects:
         if gaussian and self.jitter_fwhm_ns is None:
             raise ValueError("--jitter-tail-ns and --jitter-tail-fraction need --jitter-fwhm-ns")
         return {"kind": "gaussian", **gaussian} if gaussian else None
-
-
-@options
-class Effects(StreamEffects, LightEffects):
-    """Effects of the detector; None: as in the file.
-
-    Effects of the detector (off by default)
-    ----------------------------------------
-    crosstalk
-        Mean number of neighbours that an avalanche triggers; with --engine sequential. [default: 0]
-    crosstalk_kernel
-        Which neighbours: 4 or 8. [default: 8]
-    """
-
-    crosstalk: Number | None = None
-    crosstalk_kernel: Text | None = None
-    max_events_per_exposure: Integer | None = None
-
-    def given(self) -> dict[str, Any]:
-        """Fields of `Detector`, as plain data."""
-        fields = super().given()
-        if self.crosstalk is None:
-            fields.pop("crosstalk", None)
-            if self.crosstalk_kernel is not None:
-                raise ValueError("--crosstalk-kernel belongs to --crosstalk, which is not given")
-        else:
-            fields["crosstalk"] = {"probability": self.crosstalk, "kernel": self.crosstalk_kernel or "8"}
-        return fields
 
 
 def read_array(option: str, file: Path) -> Any:

@@ -8,7 +8,7 @@ from cyclopts import App, Parameter
 
 from mars_lidar._base.progress import span
 from mars_lidar.cli.console import progress_bar, refuse_existing, table
-from mars_lidar.cli.options import COMMAND_LINE, Integer, Number, OutPath, Text, command
+from mars_lidar.cli.options import COMMAND_LINE, Integer, OutPath, Text, command
 from mars_lidar.cli.system_options import Effects, SystemOptions
 from mars_lidar.table import Table
 from mars_lidar.table.error import QuantisationError
@@ -23,7 +23,6 @@ def build(
     background: Text = "0.01,10,100",
     method: Text = "exposure",
     rearm: Text = "centre",
-    refine: Number | None = None,
     threads: Integer | None = None,
     out: OutPath | None = None,
     overwrite: bool = False,
@@ -40,8 +39,6 @@ def build(
         exposure (exact, start-up included) or mars (the paper's). [default: exposure]
     rearm
         For mars: re-arming at the centre or the edge of a bin. [default: centre]
-    refine
-        Insert points until the error between them, in total variation, is below this.
 
     Simulation
     ----------
@@ -62,7 +59,7 @@ def build(
     refuse_existing(out, overwrite)
     system = instrument.build(effects)
     axes = _grid("--signal", signal), _grid("--background", background)
-    chosen: dict[str, Any] = {"method": method, "rearm": rearm, "refine": refine, "threads": threads}
+    chosen: dict[str, Any] = {"method": method, "rearm": rearm, "threads": threads}
     with progress_bar("building") as progress:
         if out is None:
             path = Table.cached_path(system, *axes, progress=progress, **chosen)

@@ -9,7 +9,7 @@ from mars_lidar._base.types import FloatArray, IndexArray
 from mars_lidar.engines import synthesis
 from mars_lidar.engines.engine import Count, Interpolation, Outside
 from mars_lidar.engines.pixels import Group, groups
-from mars_lidar.engines.table_reader import CountTimesShape, Entries, TableReader, as_shapes, exact_laws, untrusted
+from mars_lidar.engines.table_reader import CountTimesShape, PixelEntries, TableReader, as_shapes, exact_laws, untrusted
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 
@@ -125,7 +125,7 @@ class MarsEngine(CountTimesShape):
             laws = self._laws(task.system, cumulants[group.cell])
         return synthesis.Batch.unmixed(group.pixels, as_shapes(exposure.histogram), group.cell, laws)
 
-    def _laws_of(self, run: synthesis.Run, reader: TableReader, entries: Entries) -> synthesis.CountLaws:
+    def _laws_of(self, run: synthesis.Run, reader: TableReader, entries: PixelEntries) -> synthesis.CountLaws:
         laws = self._laws(run.task.system, entries.cumulants)
         if self.count != "exact":
             return laws

@@ -10,7 +10,7 @@ from mars_lidar._base.types import FloatArray, IndexArray, NDArray
 from mars_lidar.engines.engine import Interpolation, Outside
 from mars_lidar.engines.pixels import Alignment, Group, groups, single_return
 from mars_lidar.engines.synthesis import Batch, CountLaws, RoundedGaussian, Run
-from mars_lidar.engines.table_reader import CountTimesShape, Entries, TableReader, as_shapes
+from mars_lidar.engines.table_reader import CountTimesShape, PixelEntries, TableReader, as_shapes
 from mars_lidar.instrument.system import System
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ class RenewalEngine(CountTimesShape):
     ) -> None:
         super().__init__(table, interpolation, outside, level)
 
-    def _laws_of(self, run: Run, reader: TableReader, entries: Entries) -> CountLaws:
+    def _laws_of(self, run: Run, reader: TableReader, entries: PixelEntries) -> CountLaws:
         return _laws(run.task.system, entries.signal, entries.background)
 
     def _evaluate(self, run: Run, pixels: IndexArray) -> None:

@@ -37,7 +37,7 @@ _OUTSIDE = ("error", "exact")
 
 
 @dataclass(frozen=True, eq=False)
-class Entries:
+class PixelEntries:
     """Table entries of some pixels (P,) of the image, in the order of the grid.
 
     Neighbours on the grid are adjacent, so that their rows stay in the processor's cache.
@@ -151,7 +151,7 @@ class TableReader:
                 stacklevel=2,
             )
 
-    def read(self, task: Task, pixels: IndexArray) -> tuple[Entries, IndexArray]:
+    def read(self, task: Task, pixels: IndexArray) -> tuple[PixelEntries, IndexArray]:
         """Entries of those of the pixels that lie on the grid; the others."""
         single = single_return(task.flux)
         assert single is not None  # see check
@@ -172,7 +172,7 @@ class TableReader:
         signal, background, delay = signal[order], background[order], delay[order]
         cumulants = look.cumulants[order]
         alignment = Alignment.of(system, signal, background, delay, cumulants[:, 0] / system.cycles)
-        entries = Entries(
+        entries = PixelEntries(
             pixels[order],
             signal,
             background,
@@ -219,7 +219,7 @@ def table_record(table: Table) -> dict[str, Any]:
     }
 
 
-def untrusted(run: Run, reader: TableReader, entries: Entries) -> IndexArray:
+def untrusted(run: Run, reader: TableReader, entries: PixelEntries) -> IndexArray:
     """Which of the pixels (ascending) need an exact law: `statistics.matched.trusted`. None of a table of Gaussians."""
     if reader.table.method == "mars" or run.task.system.dead_time_periods == 0.0:
         return np.empty(0, np.int64)
@@ -228,7 +228,7 @@ def untrusted(run: Run, reader: TableReader, entries: Entries) -> IndexArray:
     return np.flatnonzero(~trusted(entries.cumulants, threads=run.task.threads))
 
 
-def exact_laws(run: Run, reader: TableReader, entries: Entries, at: IndexArray) -> Tabulated:
+def exact_laws(run: Run, reader: TableReader, entries: PixelEntries, at: IndexArray) -> Tabulated:
     """Laws of the pixels `at`, each distinct law evaluated once, or taken from the table if stored there."""
     keys = _keys(run, reader, entries, at)
     _, first, law = np.unique(keys, axis=0, return_index=True, return_inverse=True)
@@ -251,7 +251,7 @@ def exact_laws(run: Run, reader: TableReader, entries: Entries, at: IndexArray) 
     return Tabulated.of([each for each in laws if each is not None], law.reshape(-1).astype(np.int64))
 
 
-def _keys(run: Run, reader: TableReader, entries: Entries, at: IndexArray) -> FloatArray:
+def _keys(run: Run, reader: TableReader, entries: PixelEntries, at: IndexArray) -> FloatArray:
     """S, B and delay in periods (pixels, 3): of the pixel, or with the nearest entry's law of that one."""
     table = reader.table
     signal, background = entries.signal[at], entries.background[at]
@@ -263,7 +263,7 @@ def _keys(run: Run, reader: TableReader, entries: Entries, at: IndexArray) -> Fl
 
 
 def _table_laws(
-    run: Run, reader: TableReader, entries: Entries, pixels: IndexArray, keys: FloatArray
+    run: Run, reader: TableReader, entries: PixelEntries, pixels: IndexArray, keys: FloatArray
 ) -> list[Pmf | None]:
     """Laws stored in the table, which are those of its entries at its own delay and number of cycles."""
     table = reader.table
@@ -361,7 +361,7 @@ class CountTimesShape(Engine):
         return outside
 
     @abstractmethod
-    def _laws_of(self, run: Run, reader: TableReader, entries: Entries) -> CountLaws:
+    def _laws_of(self, run: Run, reader: TableReader, entries: PixelEntries) -> CountLaws:
         """Laws of the counts of pixels from a table."""
 
     @abstractmethod

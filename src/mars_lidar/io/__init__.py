@@ -11,7 +11,7 @@ from mars_lidar.io.cloud import points, save_cloud
 from mars_lidar.io.conversion import Converted, convert, photons
 from mars_lidar.io.cube import SUFFIXES, Cube, load, save, to_xarray
 from mars_lidar.io.foreign import foreign_cube
-from mars_lidar.io.mat import SpadMat, read_mat, save_mat
+from mars_lidar.io.mat import save_mat
 from mars_lidar.io.measured import from_histograms, from_photon_times
 from mars_lidar.io.recipe import Recipe, Recording
 from mars_lidar.io.scene_files import Problem, SceneFile, scan
@@ -30,7 +30,6 @@ __all__ = [
     "Recipe",
     "Recording",
     "SceneFile",
-    "SpadMat",
     "Transient",
     "WriteError",
     "Written",
@@ -41,7 +40,6 @@ __all__ = [
     "load",
     "photons",
     "points",
-    "read_mat",
     "read_transient",
     "regenerate",
     "save",

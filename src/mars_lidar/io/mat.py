@@ -24,7 +24,6 @@ import json
 import struct
 import zlib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -34,9 +33,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import mat5
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.files import FileError, beside, check_target, read_mat5, reading
+from mars_lidar._base.files import FileError, beside, check_target, read_mat5
 from mars_lidar._base.resources import check_memory
-from mars_lidar._base.sparse import dense_counts, is_sparse
+from mars_lidar._base.sparse import is_sparse
 from mars_lidar.instrument.system import System
 from mars_lidar.io import layout
 from mars_lidar.io.cube import Cube, copy_counts, one_exposure
@@ -189,7 +188,7 @@ def open_store(path: Path) -> OpenedStore:
     if "mars_lidar" not in {head.name for head in mat5.variables(path)}:
         raise ValueError(
             f"{path} is not a cube written by mars-lidar (no variable 'mars_lidar'); "
-            f"mars_lidar.io.read_mat reads such files of other programs"
+            f"mars_lidar.io.foreign_cube reads the counts of other programs' files"
         )
     variables = read_variables(path)
     ours = variables["mars_lidar"][0, 0]
@@ -231,122 +230,6 @@ def _is_hdf5(path: Path) -> bool:
     return bool(h5py.is_hdf5(path))
 
 
-@dataclass(frozen=True, eq=False)
-class SpadMat:
-    """Content of such a file.
-
-    Attributes
-    ----------
-    histogram
-        (H, W, bins) uint16 or uint32, counts.
-    rates
-        (H, W, bins), signal before dead time, in arbitrary units.
-    bin
-        (H, W), bin of the return, from 1.
-    bin_hr
-        (h, w), the same at a finer size, real numbers from 1.
-    sbr
-        Signal over background.
-    photons
-        Mean signal photons of a pixel.
-
-    See Also
-    --------
-    read_mat, save_mat
-
-    Examples
-    --------
-    >>> import pathlib, tempfile
-    >>> folder = pathlib.Path(tempfile.mkdtemp())
-    >>> import mars_lidar as ml
-    >>> system = ml.System(
-    ...     period_ns=100.0, cycles=1000, bins=128,
-    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
-    ... )
-    >>> flux = ml.Flux(signal=[[0.5, 2.0]], background=1.0, delay_ns=[[20.0, 60.0]])
-    >>> cube = ml.Cube(ml.simulate(flux, system), system, flux)
-    >>> ml.io.save_mat(folder / "spad.mat", cube)
-    >>> ml.io.read_mat(folder / "spad.mat").histogram.shape
-    (1, 2, 128)
-    """
-
-    histogram: NDArray[Any]
-    rates: NDArray[np.float64]
-    bin: NDArray[Any]
-    bin_hr: NDArray[np.float64]
-    sbr: float
-    photons: float
-
-
-@checked
-def read_mat(path: str | Path) -> SpadMat:
-    """Read a file of this layout, of mars-lidar or of others.
-
-    Parameters
-    ----------
-    path
-        The ``.mat``.
-
-    Raises
-    ------
-    ValueError
-        A file of another kind, or a damaged one; the message starts with the file.
-    FileNotFoundError
-        No such file.
-    TypeError
-        A path that is neither text nor Path.
-
-    See Also
-    --------
-    save_mat, SpadMat
-
-    Examples
-    --------
-    >>> import pathlib, tempfile
-    >>> folder = pathlib.Path(tempfile.mkdtemp())
-    >>> import mars_lidar as ml
-    >>> system = ml.System(
-    ...     period_ns=100.0, cycles=1000, bins=128,
-    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
-    ... )
-    >>> flux = ml.Flux(signal=[[0.5, 2.0]], background=1.0, delay_ns=[[20.0, 60.0]])
-    >>> cube = ml.Cube(ml.simulate(flux, system), system, flux)
-    >>> ml.io.save_mat(folder / "spad.mat", cube)
-    >>> ml.io.read_mat(folder / "spad.mat").bin.shape
-    (1, 2)
-    """
-    with reading(path, "a .mat of counts") as source:
-        return _spad(source, read_variables(source))
-
-
-def _spad(source: Path, variables: dict[str, Any]) -> SpadMat:
-    missing = [name for name in ("spad", "rates", "bin", "bin_hr", "SBR", "photons") if name not in variables]
-    if missing:
-        raise ValueError(f"{source}: has no variable {', '.join(missing)}")
-    spad, rates = variables["spad"], variables["rates"]
-    height, width = variables["bin"].shape
-    bins = rates.shape[-1]
-    if rates.shape != (height, width, bins) or spad.shape != (height * width, bins):
-        raise ValueError(
-            f"{source}: rates must be (H, W, bins) and spad (H W, bins) for bin {(height, width)}, "
-            f"got {rates.shape} and {spad.shape}"
-        )
-    check_memory(16 * height * width * bins, f"the counts of {source}", "read it on a larger machine")
-    dense = dense_counts("spad", spad) if is_sparse(spad) else np.asarray(spad)
-    if not ((dense >= 0) & (dense == np.round(dense)) & (dense < 2**32)).all():
-        raise ValueError(f"{source}: spad must hold counts, whole numbers from 0")
-    kind = np.uint16 if dense.max(initial=0) < 2**16 else np.uint32
-    histogram = dense.astype(kind).reshape(width, height, bins).transpose(1, 0, 2)
-    return SpadMat(
-        np.ascontiguousarray(histogram),
-        np.ascontiguousarray(rates, np.float64),
-        variables["bin"],
-        np.asarray(variables["bin_hr"], np.float64),
-        float(np.ravel(variables["SBR"])[0]),
-        float(np.ravel(variables["photons"])[0]),
-    )
-
-
 @checked
 def save_mat(
     path: str | Path, cube: Cube, *, realization: int = 0, depth_hr_m: ArrayLike | None = None, overwrite: bool = False
@@ -376,7 +259,7 @@ def save_mat(
 
     See Also
     --------
-    read_mat, save
+    save, foreign_cube
 
     Examples
     --------
@@ -390,8 +273,8 @@ def save_mat(
     >>> flux = ml.Flux(signal=[[0.5, 2.0]], background=1.0, delay_ns=[[20.0, 60.0]])
     >>> cube = ml.Cube(ml.simulate(flux, system), system, flux)
     >>> ml.io.save_mat(folder / "spad.mat", cube)
-    >>> round(ml.io.read_mat(folder / "spad.mat").sbr, 2)
-    1.25
+    >>> ml.io.load(folder / "spad.mat").shape
+    (1, 1, 2, 128)
     """
     target = Path(path)
     if target.suffix != ".mat":

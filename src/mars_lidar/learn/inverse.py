@@ -102,9 +102,8 @@ class LidarPhysics(Physics):  # type: ignore[misc]  # deepinv is not typed
 
     def A_jvp(self, x: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
         """``(dA/dx) v`` (B, bins, H, W) of v (B, 3, H, W)."""
-        whole = (
-            tensor.clone(memory_format=torch.contiguous_format) for tensor in (x, v)
-        )  # expanded views have no dual
+        # expanded views have no dual
+        whole = (tensor.clone(memory_format=torch.contiguous_format) for tensor in (x, v))
         moved: torch.Tensor = torch.func.jvp(self.A, *((tensor,) for tensor in whole))[1]
         return moved
 

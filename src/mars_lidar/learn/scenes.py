@@ -295,7 +295,7 @@ class Sample:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Recipe:
+class Samples:
     """Distribution from which samples are drawn."""
 
     source: SceneSource
@@ -325,9 +325,8 @@ class Recipe:
     def _light(self, epoch: int, index: int) -> tuple[float, ...]:
         """Signal, sbr and the factor on the depth."""
         given = (self.signal, self.sbr, self.depth_scale)
-        if all(
-            len(set(distribution.ends)) == 1 for distribution in given
-        ):  # nothing to draw, and a generator takes 10 us
+        # a generator takes 10 us
+        if all(len(set(distribution.ends)) == 1 for distribution in given):
             return tuple(distribution.ends[0] for distribution in given)
         light = generator(5, self.seed, epoch, index)
         return tuple(distribution.draw(light) for distribution in given)

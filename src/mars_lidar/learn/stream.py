@@ -31,7 +31,7 @@ from mars_lidar.instrument.system import System
 from mars_lidar.io.scene_files import SceneFile
 from mars_lidar.learn.needed import torch
 from mars_lidar.learn.ranges import LogUniform, Range, SystemRange, as_range, as_systems
-from mars_lidar.learn.scenes import Recipe, Sample, as_source, example_of
+from mars_lidar.learn.scenes import Sample, Samples, as_source, example_of
 from mars_lidar.scene.radiometry import AMBIENTS, ATTENUATIONS
 from mars_lidar.scene.scene import Scene
 
@@ -445,7 +445,7 @@ class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
         checks.choice("attenuation", attenuation, ATTENUATIONS)
         checks.choice("ambient", "map" if ambient is None else ambient, AMBIENTS)
         dark = checks.real("dark_count_hz", dark_count_hz, low=0.0)
-        self._recipe = Recipe(
+        self._samples = Samples(
             source=as_source(scenes, shape, reuse),
             systems=drawn,
             size=shape,
@@ -470,9 +470,9 @@ class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
 
     def __repr__(self) -> str:
         size = None if self._end == _LAST else self._end
-        settings = {"size": self._recipe.size, "epoch_size": size, "batch_size": self._batch}
+        settings = {"size": self._samples.size, "epoch_size": size, "batch_size": self._batch}
         given = ", ".join(f"{name}={value}" for name, value in settings.items() if value is not None)
-        return f"CubeStream({given}, seed={self._recipe.seed}, epoch {self.epoch})"
+        return f"CubeStream({given}, seed={self._samples.seed}, epoch {self.epoch})"
 
     def set_epoch(self, epoch: int, start: int = 0) -> None:
         """Select the `epoch` of the next pass and its first sample `start`, where an earlier run stopped.
@@ -509,7 +509,7 @@ class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
             Without `batches` in the parent of workers.
         """
         _, workers, in_worker = worker_of()
-        state = {"seed": self._recipe.seed, "epoch": self.epoch}
+        state = {"seed": self._samples.seed, "epoch": self.epoch}
         if in_worker:
             return state | {"start": self._pass_start, "given": self._given, "workers": workers}
         if batches is None and self._passes.by_workers:
@@ -528,8 +528,8 @@ class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
 
         A pass that was at its end is then empty, and the next pass is the next epoch.
         """
-        if state["seed"] != self._recipe.seed:
-            raise ValueError(f"the state is of a stream with seed {state['seed']}, this one has {self._recipe.seed}")
+        if state["seed"] != self._samples.seed:
+            raise ValueError(f"the state is of a stream with seed {state['seed']}, this one has {self._samples.seed}")
         _, workers, in_worker = worker_of()
         if in_worker != ("workers" in state) or state.get("workers", workers) != workers:
             raise ValueError(
@@ -544,7 +544,7 @@ class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
 
     def sample(self, index: int) -> Sample:
         """Scene, Flux, System and seed of sample `index` of this epoch, not simulated."""
-        return self._recipe.sample(self.epoch, checks.integer("index", index, low=0, high=self._end - 1))
+        return self._samples.sample(self.epoch, checks.integer("index", index, low=0, high=self._end - 1))
 
     def __len__(self) -> int:
         """Examples of one pass on this rank, all workers together."""
@@ -590,7 +590,7 @@ class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
             yield range(start + self._rank * part, start + (self._rank + 1) * part)
 
     def _example(self, epoch: int, indices: range, threads: int) -> dict[str, Any]:
-        samples = [self._recipe.sample(epoch, index) for index in indices]
+        samples = [self._samples.sample(epoch, index) for index in indices]
         example = example_of(samples, self._maker.cubes(samples, threads))
         return _first(example) if self._batch is None else example
 

@@ -16,7 +16,7 @@ from mars_lidar.io.layout import MEASURED
 from mars_lidar.io.recipe import Recipe
 from mars_lidar.light.flux import Flux
 from mars_lidar.reconstruction import METHODS, reconstruct
-from mars_lidar.reconstruction.quality import depth_lag_m
+from mars_lidar.reconstruction.map_errors import depth_lag_m
 from mars_lidar.statistics import ConvergenceError, mean_histogram, photons_per_bin
 from mars_lidar.statistics.histogram import histogram_effects
 

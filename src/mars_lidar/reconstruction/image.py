@@ -88,7 +88,6 @@ class Image(Method):
 
     name = "image"
     modes = ("nonparalyzable", "synchronous", "gated")
-    assumes = "surfaces that continue from pixel to pixel"
     windows = False
     of_images = True
 

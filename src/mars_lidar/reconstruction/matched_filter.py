@@ -45,7 +45,6 @@ class MatchedFilter(Method):
 
     name = "matched_filter"
     modes = ("nonparalyzable", "paralyzable", "synchronous", "gated")
-    assumes = "so little light that dead time loses nothing"
 
     def __post_init__(self) -> None:
         checks.choice("filter", self.filter, FILTERS)
@@ -77,7 +76,6 @@ class Peak(Method):
 
     name = "peak"
     modes = ("nonparalyzable", "paralyzable", "synchronous", "gated")
-    assumes = "so little light that dead time loses nothing, many signal photons"
 
     def estimate(self, histograms: Histograms) -> Estimates:
         """Delay, and signal and background of its window, of each of the `histograms`."""

@@ -74,7 +74,6 @@ class MaximumLikelihood(Method):
 
     name = "maximum_likelihood"
     modes = ("nonparalyzable", "synchronous", "gated")
-    assumes = "one return of the known pulse over uniform background"
     windows = False
 
     def __post_init__(self) -> None:

@@ -112,7 +112,6 @@ class Method(ABC):
 
     name: ClassVar[str]
     modes: ClassVar[tuple[Mode, ...]]  # of the detector, that the method holds for
-    assumes: ClassVar[str]  # in words, for tables
     windows: ClassVar[bool] = True  # signal and background come from inside and outside of a window
     of_images: ClassVar[bool] = False  # each pixel's estimate depends on those around it: cubes (..., H, W, bins)
 

@@ -53,7 +53,6 @@ class Coates(RateMethod):
 
     name = "coates"
     modes = ("synchronous",)
-    assumes = "nothing: exact for synchronous detectors"
 
 
 @dataclass(frozen=True)
@@ -95,7 +94,6 @@ class GeneralisedCoates(RateMethod):
 
     name = "generalised_coates"
     modes = ("nonparalyzable", "gated")
-    assumes = "nothing of the flux but its period"
 
 
 @dataclass(frozen=True)
@@ -145,7 +143,6 @@ class ChainCorrection(RateMethod):
     correction = _CHAIN
     name = "mchc"
     modes = ("nonparalyzable", "gated")
-    assumes = "a long exposure, in which the phases are stationary"
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -196,7 +196,7 @@ def waveform_parts(system: System) -> int:
     return system.bins * max(1, math.ceil(wanted / system.bins))
 
 
-# --- Pulses narrower than a cell -----------------------------------------------------------------------------------
+# --- Pulses narrower than a bin ------------------------------------------------------------------------------------
 
 
 def needed_bins(cells: Cells, coarsest: int) -> int:
@@ -318,7 +318,7 @@ def _extent(cells: Cells) -> tuple[float, float]:
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """Pixels (S, B, delay or waveform) of one system, flat, and the grids on which their statistics are computed.
+    """Pixels (S, B, delay or waveform) of one system, as flat arrays, and the grids of their statistics.
 
     Attributes
     ----------
@@ -368,7 +368,7 @@ class Cells:
         modes: tuple[Mode, ...] = PLAIN,
         effects: tuple[str, ...] = LIGHT_EFFECTS,
     ) -> Cells:
-        """Cells of numbers that `Flux` has checked; they broadcast, a `waveform` (..., T) over its leading axes.
+        """Cells of light that `Flux` has checked. Arguments broadcast, a `waveform` (..., T) by its leading axes.
 
         The cells hold the flux of detected photons and the system that detects all of it (`System.detected`). `what`
         names the statistic in errors; ValueError where it does not treat the detector's mode or effects.
@@ -425,9 +425,9 @@ class Cells:
 
     @property
     def native_flux(self) -> tuple[FloatArray, FloatArray]:
-        """Photons per period (cells,) of the shapes of `energies` and of a flat background, for the native core.
+        """Photons per period (cells,) that have the shapes of `energies`, and those of a flat background.
 
-        With a gate or uneven bins the background is part of the shapes, and the flat background is 0.
+        The native core takes them. With a gate or uneven bins the shapes include the background, and the flat one is 0.
         """
         if not self._all_in_shapes:
             return self.signal, self.background
@@ -445,9 +445,9 @@ class Cells:
 
     @property
     def jumps(self) -> bool:
-        """Whether the light is constant in samples, whose edges lie anywhere in the bins of a grid.
+        """Whether the light has steps, which need not lie on the edges of a grid.
 
-        Errors are then of second order and irregular, so that a grid may agree with the next by chance.
+        The error is then of second order in the bin width and irregular, so that two grids may agree by chance.
         """
         return self.waveform is not None or isinstance(self.system.pulse, SampledPulse)
 
@@ -543,7 +543,7 @@ class Cells:
         )
 
     def grid(self, bins: int, out_bins: int, steps: float | None = None) -> _core.ExposureGrid:
-        """The native grid of `bins` bins per period; a cell fails after `steps` bins x periods (None: minutes)."""
+        """The native grid of `bins` bins per period; it gives up after `steps` bins x periods (None: minutes)."""
         whole, shift, fraction = whole_bins(self.system.dead_time_periods, bins)
         return _core.ExposureGrid(
             cycles=self.system.cycles,
@@ -615,10 +615,10 @@ class Cells:
 
 
 def _multiple(wanted: float, out_bins: int) -> int:
-    """Smallest even multiple of `out_bins` that is at least `wanted`, whose half has their edges too.
+    """Smallest even multiple of `out_bins` that is at least `wanted`: half as many bins have its edges too.
 
-    Two grids that share only every second edge of the histogram can agree although registrations are assigned to the
-    neighbouring bin: 74,000 of 3 million in one system.
+    Two grids that have only every second edge of the histogram can agree although both count registrations in a
+    neighbouring bin (in one system, 74,000 of 3 million).
     """
     return 2 * out_bins * math.ceil(wanted / (2 * out_bins))
 

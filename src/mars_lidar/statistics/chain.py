@@ -8,7 +8,7 @@ equation (2.8), which does not contain the slow modes of the chain,
 
     A x = p,    A = I + diag(p) G - diag(p') S.
 
-G sums the s bins before a bin, S shifts by s bins, s the dead time in bins without whole periods. The equation
+G sums the s bins before a bin and S shifts by s bins; s is the dead time in bins, less whole periods. The equation
 x (I - P) = 0 of the chain is singular, with many further small singular values where the chain mixes slowly; A is
 well conditioned. Gauss-Seidel sweeps around the period converge fast unless about ten background photons fall into one
 dead time. Then GMRES is used and, if it does not converge either, a sparse factorisation.
@@ -110,7 +110,7 @@ class Feedback:
         return int(steps), float(error)
 
     def _terms(self, x: FloatArray, adjoint: bool) -> tuple[FloatArray, FloatArray]:
-        """The terms of A in G and in S applied to x, by prefix sums, independent of the sweeps."""
+        """The terms of A that contain G and S, applied to x by prefix sums: a check independent of the sweeps."""
         n, s = x.size, self.shift
         weighted = self.fire * x if adjoint else x
         prefix = np.concatenate([[0.0], np.cumsum(np.concatenate([weighted, weighted]))])
@@ -124,7 +124,7 @@ class Feedback:
         return rhs - x - window + shifted
 
     def _residual(self, rhs: FloatArray, x: FloatArray, adjoint: bool) -> float:
-        """Componentwise backward error of x; unlike a norm it gives bins of little flux the same weight."""
+        """Componentwise backward error of x: bins of little flux count as much as others, unlike in a norm."""
         window, shifted = self._terms(np.abs(x), adjoint)
         size = np.abs(x) + window + shifted + np.abs(rhs)
         defect = np.abs(self._defect(rhs, x, adjoint))
@@ -214,7 +214,7 @@ def cyclic_recursion(keep: FloatArray, source: FloatArray, loss: float, *, backw
     """Solution (n,) of v[j+1] = keep[j] v[j] + source[j] round the circle, or backward from v[j+1] to v[j].
 
     `loss` is 1 - prod(keep); the caller computes it accurately where the product is nearly 1. For non-negative input
-    the relative error of the result is of rounding, because no term is subtracted.
+    the relative error of the result is that of rounding, because no term is subtracted.
     """
     out = np.empty(keep.size)
     _core.cyclic_recursion(keep, np.ascontiguousarray(source, dtype=np.float64), loss, backward, out)
@@ -428,7 +428,7 @@ class PhaseChain:
         return np.roll(values, -self.shift)
 
     def dense(self) -> FloatArray:
-        """The transition matrix P (n, n), whose rows sum to 1: that of first arrivals with shifted rows (2.3)."""
+        """The transition matrix P (n, n), whose rows sum to 1: first arrivals, with shifted rows (2.3)."""
         n = self.bins
         order = (np.arange(n)[:, None] + np.arange(n)) % n  # bins in the order of their times after arming in bin a
         passed = self.photons[order]
@@ -461,7 +461,7 @@ class PhaseChain:
         return stationary_from(self, self.solve(adjoint=False))
 
     def solve(self, *, adjoint: bool) -> Solution:
-        """w of A w = p (2.8), or where `adjoint` o of A^T o = 1 (3.8); a failure names the cell."""
+        """The solution w of A w = p (2.8), or with `adjoint` o of A^T o = 1 (3.8); an error names the pixel."""
         try:
             return self.feedback().solve(adjoint=adjoint)
         except ConvergenceError as error:

@@ -30,10 +30,10 @@ _EFFECTS = (*LIGHT_EFFECTS, "afterpulsing", "twilight_ns", "recovery_ns", *TIMIN
 def constant_light_rate(rate_hz: float, detector: Detector) -> float:
     """Mean rate of registrations of a free-running pixel under constant light, counts/s.
 
-    Exact without afterpulsing, 1 / (t_d + e^(-lambda alpha) w) with the mean wait w of an armed pixel: 1 / lambda, or
-    1F1(1, 1 + a, a) / lambda, a = lambda r, where its sensitivity returns with the time constant r. With afterpulsing
-    it is exact to first order in the afterpulse probability p: the trapped carriers are replaced by their mean over all
-    histories, with an error of the order p^2.
+    Without afterpulsing the rate is exactly 1 / (t_d + e^(-lambda alpha) w), alpha the duration of twilight. The mean
+    wait w of an armed pixel is 1 / lambda, or 1F1(1, 1 + a, a) / lambda with a = lambda r if the sensitivity recovers
+    with the time constant r. With afterpulsing the rate is exact to first order in the afterpulse probability p: the
+    number of trapped carriers is replaced by its mean over all histories, with an error of the order p^2.
 
     Parameters
     ----------

@@ -55,7 +55,7 @@ class Pmf:
 
 
 def total_variation(a: Pmf, b: Pmf) -> float:
-    """Half the sum of |difference| over all counts."""
+    """Total variation distance of two laws: half the sum of |a - b| over all counts."""
     if a.last < b.first or b.last < a.first:
         return 0.5 * float(a.p.sum() + b.p.sum())
     low, high = min(a.first, b.first), max(a.last, b.last)
@@ -246,7 +246,7 @@ def _if_complete(pmf: FloatArray, first: int, mean: float, spread: float) -> Pmf
 
 
 def _ends(pmf: FloatArray, first: int, most: float = math.inf) -> float:
-    """Larger probability of the first and the last count, except of count 0 and of `most`, the largest possible one."""
+    """Larger probability of the first and the last count, neither being 0 nor `most`, the largest possible count."""
     low = abs(float(pmf[0])) if first > 0 else 0.0
     return max(low, abs(float(pmf[-1])) if first + pmf.size - 1 < most else 0.0)
 
@@ -338,9 +338,8 @@ def _narrow(
         return None
     angle = 2.0 * np.pi * np.arange(size // 2 + 1) / size
     value = np.zeros(angle.size, np.complex128)
-    step = max(
-        8, math.ceil(2.0 * size / (2.0 * np.pi * math.sqrt(variance)))
-    )  # about two standard deviations of the peak
+    # about two standard deviations of the peak
+    step = max(8, math.ceil(2.0 * size / (2.0 * np.pi * math.sqrt(variance))))
     end = 0
     while end < angle.size:
         some = slice(end, min(end + step, angle.size))
@@ -390,7 +389,6 @@ def _check(cells: Cells, cell: int, law: Pmf, cumulants: FloatArray) -> None:
             f"{total - 1.0:.2g}, mean off by {mean:.2g}, variance {variance:.6g} for {cumulants[1]:.6g}, "
             f"least {least:.2g}; mean, variance and cumulants are known; for the law {cells.instead}"
         )
-    pmf[pmf <= max(min(-least, rounding), 0.0)] = (
-        0.0  # of a locked count's variance 1e-9 in each of 30 is a few percent
-    )
+    # 1e-9 in each of 30 counts is a few percent of the variance of a locked count
+    pmf[pmf <= max(min(-least, rounding), 0.0)] = 0.0
     pmf /= pmf.sum()

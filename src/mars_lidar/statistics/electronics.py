@@ -50,7 +50,7 @@ class RecordGrid:
     ----------
     kernel
         (bins, steps - off + 1) probability of the next record `off` to `steps` bins after a record in each bin. After
-        `steps` bins every avalanche during the dead time of the electronics has re-armed.
+        `steps` bins the pixel has re-armed from every avalanche within the dead time of the electronics.
     late
         (bins,) probability of being armed, without a further record, at the start of the bin after these.
     first, first_armed
@@ -129,7 +129,7 @@ class RecordGrid:
 
 
 class RecordRun:
-    """Records bin by bin through the exposure, for several weightings (rows) at once (12).
+    """Computes the records of an exposure bin by bin, for several weightings (rows) at once (12).
 
     `start` (rows,) are the weights of the first record; `weigh` maps records (rows, bins) to their weights in later
     records.
@@ -308,7 +308,7 @@ def without_electronics(cells: Cells) -> tuple[Cells, float]:
     """Cells without electronics, and the dead time of the electronics in ns; 0 where a single dead time is equivalent.
 
     A single dead time, the longer one, is equivalent where the dead time of the pixel is 0 or is the longer one. The
-    returned cells then have that dead time. Behind a pixel without a dead time they begin armed, as electronics do.
+    returned cells then have that dead time. A pixel without a dead time starts armed, as the electronics do.
     """
     detector = cells.system.detector
     slower = max(detector.dead_time_ns, detector.electronics_dead_time_ns)
@@ -391,11 +391,11 @@ def rebinned(
 ) -> FloatArray | None:
     """Recorded histogram of `out` bins, from a grid and one of half as many bins; None where they do not agree.
 
-    The two may differ by `tolerance` in total variation, in the bins of either and of the histogram. Times of re-arming
-    are spread over a bin, which makes the error quadratic in the bin width; a third of the change from the coarse grid
-    is added to each pair of bins (Richardson). Where the histogram's edges are not on the grid, records are
-    interpolated as a function of the photons. A pulse within a bin of both grids then looks the same on both: unless
-    its light is `misplaced` by less than the tolerance, records that are spread evenly over a bin must agree as well.
+    They agree if they differ by at most `tolerance` in total variation, in the bins of the coarse grid and in those of
+    the histogram. The error is quadratic in the bin width, because times of re-arming are spread over a bin: a third of
+    the change from the coarse grid is added to each pair of bins (Richardson). Where edges of the histogram are not on
+    the grid, records are interpolated as a function of the photons. A pulse within one bin then looks the same on both
+    grids; unless its light is `misplaced` by less than the tolerance, records spread evenly over a bin must agree too.
     """
     pairs = fine.reshape(-1, 2)
     total = pairs.sum(-1)
@@ -600,7 +600,7 @@ def _law(cell: Cells, electronics_ns: float, tolerance: float) -> Pmf:
 def _folded(grid: RecordGrid, first: int, last: int, remaining: list[float]) -> FloatArray:
     """P(N = n) for n from `first` to `last`, by (23) of docs/theory_exposure.md.
 
-    `remaining` is a list of the multiplications left of the budget, from which the cost is subtracted.
+    `remaining` holds the multiplications that remain of the budget; the cost is subtracted from it.
     """
     counts = last - first + 1
     size = counts + counts % 2
@@ -657,7 +657,7 @@ def _values(grid: RecordGrid, z: ComplexArray, remaining: list[float]) -> Comple
 
 
 def _extrapolated(now: ComplexArray, was: ComplexArray, ratio: ComplexArray, periods: int) -> ComplexArray:
-    """now * ratio^periods; near z = 1 the ratio from the values, (26) of docs/theory_exposure.md."""
+    """``now * ratio^periods``; near z = 1 the ratio is that of the values, (26) of docs/theory_exposure.md."""
     near = np.abs(was) > 0.5
     w = np.where(near, (now - was) / np.where(near, was, 1.0), 0.0)
     log_near = 0.5 * np.log1p(2.0 * w.real + np.abs(w) ** 2) + 1j * np.arctan2(w.imag, 1.0 + w.real)

@@ -509,8 +509,8 @@ def stationary_histogram(
 ) -> FloatArray:
     """Registrations per period and bin (cells, out_bins) of a stationary pixel (18).
 
-    From a grid to the next the shape moves by less than `tolerance`, and so does the mean count of an exposure of
-    `periods`, in standard deviations of a Poisson count.
+    The grid is refined until the shape changes by less than `tolerance` in total variation, and the mean count of an
+    exposure of `periods` periods by less than `tolerance` standard deviations of a Poisson count.
     """
     tolerance = checks.real("tolerance", tolerance, low=1e-9, high=0.1)
     team = thread_count(threads)

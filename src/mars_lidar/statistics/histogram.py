@@ -98,7 +98,7 @@ def _registrations(cells: Cells, bins: int, tolerance: float, threads: int | Non
     if mode == "paralyzable":
         return paralyzable_histograms(cells, tolerance)
     if cells.system.start == "stationary" and cells.system.dead_time_periods > 0.0:
-        # every period has the same mean, so that refusals depend on the state alone
+        # every period has the same mean: the cost, and a refusal, do not depend on the number of cycles
         cycles = cells.system.cycles
         return cycles * stationary_histogram(cells, bins, tolerance=tolerance, threads=threads, periods=cycles)
 

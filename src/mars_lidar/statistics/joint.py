@@ -133,7 +133,7 @@ class SettledLaw:
         )
 
     def covariance(self, a: Windows, b: Windows) -> FloatArray:
-        """(m,) covariances of windows a[k] and b[k]; or (m,) with one b for all: (5.5)."""
+        """Covariances (m,) of windows a[k] with b[k], or of all a[k] with a single window b (5.5)."""
         rows = "ki,ki->k" if len(a.y) == len(b.y) else "ki,li->k"
         inside = np.einsum(rows, a.y, b.noise) + np.einsum(rows, a.noise, b.y)
         ends = np.einsum(rows, a.after_end, b.spread) + np.einsum(rows, a.edge @ self._old_spread, b.edge)
@@ -180,7 +180,7 @@ def _product(matrix: FloatArray, y: FloatArray) -> FloatArray:
 
 
 class Pixel:
-    """One pixel on one grid, windows on `out` bins: by the closed form, or by running through all periods."""
+    """Covariances of one pixel on one grid, for windows of `out` bins: closed form, or period by period."""
 
     def __init__(self, cells: Cells, bins: int, out: int) -> None:
         cells.check_history(bins)

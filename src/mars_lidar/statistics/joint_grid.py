@@ -158,7 +158,7 @@ class FoldedGrid:
     direct
         Whether sparse factors solve the equation, because the sweeps did not converge.
     unchecked
-        Number of further transposed solutions by sweeps whose residuals are to be checked; later ones converge alike.
+        Number of further transposed solutions whose residuals are checked; later ones converge in the same way.
     """
 
     whole: int

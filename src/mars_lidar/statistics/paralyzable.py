@@ -43,8 +43,8 @@ def _exponents(cells: Cells, edges: FloatArray) -> tuple[FloatArray, list[FloatA
 def paralyzable_histograms(cells: Cells, tolerance: float) -> FloatArray:
     """Mean histograms (cells, bins) of checked cells, any dead time.
 
-    The grid is refined until the shape moves by less than `tolerance` in total variation; sums differ from the mean
-    count by at most 10 x `tolerance` x 1e-3 standard deviations of a Poisson count, or 1e-12 of the mean.
+    The grid is refined until the shape changes by less than `tolerance` in total variation. Sums differ from the mean
+    count by at most `tolerance` / 100 standard deviations of a Poisson count, or 1e-12 of the mean.
     """
     tolerance = checks.real("tolerance", tolerance, low=1e-9, high=0.1)
     return np.array([_limit(cells, k, tolerance) for k in range(cells.size)]).reshape(cells.size, -1)
@@ -94,7 +94,7 @@ def _on_grid(cell: Cells, bins: int, steps: FloatArray) -> FloatArray:
 
 
 def _registered(photons: FloatArray, within: FloatArray) -> FloatArray:
-    """Registrations (n,) of bins with so many photons, where the exponent is linear between its values at the edges."""
+    """Registrations (n,) of bins with `photons`, if the exponent is linear between its values `within` at the edges."""
     rise = np.diff(within)
     return np.asarray(
         photons * np.exp(-within[:-1]) * np.divide(np.expm1(-rise), -rise, np.ones_like(rise), where=rise != 0.0)
@@ -127,7 +127,7 @@ def _moments(before: FloatArray, within: FloatArray) -> FloatArray:
 
 
 def _on_parts(before: FloatArray, within: FloatArray, parts: int) -> FloatArray:
-    """Moments 0 to 3, for arrival rates, now and a dead time ago, that are constant in each of the `parts` of a bin.
+    """Moments 0 to 3 if the arrival rates at a time and one dead time before it are constant in each part of a bin.
 
     The rate of registrations is then an exponential in each part. With x measured from the end of the part at which the
     rate is largest, each moment is a sum of terms of one sign, however steep the exponential is.

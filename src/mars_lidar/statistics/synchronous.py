@@ -59,7 +59,7 @@ class _Count:
         self.q = -math.expm1(-total)  # probability that an armed period registers
         after = math.exp(-early) * -math.expm1(-max(total - early, 0.0))
         late = min(after / self.q, 1.0) if self.q > 0.0 else 0.0
-        self.late = late if late * self.cycles > TOL.synchronous_tail else 0.0  # less likely than what is cut off
+        self.late = late if late * self.cycles > TOL.synchronous_tail else 0.0  # rarer than the tail that is cut off
         self.first = self._first(cells.system.start == "stationary")
 
     def _first(self, stationary: bool) -> FloatArray:

@@ -187,7 +187,7 @@ class Tolerances:
         Largest mean of a matched law (doubles hold integers up to 9e15); probability outside its support, that of a
         normal law beyond 8 standard deviations.
     least_spread
-        Smallest standard deviation of a count relative to Poisson: that of the best locked pixels.
+        Smallest standard deviation of a count relative to Poisson: that of the most strongly locked pixels.
     synchronous_tail, synchronous_loose_tail
         Probability outside the support of a synchronous law, at either end, by its sums and by its transform.
     synchronous_late, synchronous_reach

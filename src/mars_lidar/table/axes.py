@@ -1,7 +1,6 @@
-"""Axes of a table (photons per period, ascending): their specification, thinning and refinement."""
+"""Axes of a table (photons per period, ascending): their specification and thinning."""
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 
@@ -61,17 +60,6 @@ def thinned(values: FloatArray, step: float) -> NDArray[np.int64]:
     wanted = np.linspace(logs[0], logs[-1], intervals + 1)
     nearest = start + np.abs(wanted[:, None] - logs[None, :]).argmin(1)
     return np.unique(np.concatenate([[0], nearest])).astype(np.int64)
-
-
-def midpoints(values: FloatArray) -> FloatArray:
-    """(n - 1,) points between those of an axis: geometric means, and half of the lowest where it is after 0."""
-    low, high = values[:-1], values[1:]
-    return np.where(low > 0, np.sqrt(low * high), 0.5 * high)
-
-
-def inserted(values: FloatArray, more: Sequence[float] | FloatArray) -> FloatArray:
-    """The axis with `more` points."""
-    return np.unique(np.concatenate([values, np.asarray(more, dtype=np.float64)]))
 
 
 def describe(values: FloatArray) -> str:

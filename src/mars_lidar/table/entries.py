@@ -2,7 +2,7 @@
 
 Each entry has cumulants and shape at the canonical delay t_r / 2 (`Entries`), the exact law of the count if four
 cumulants do not determine it (`NodeLaws`), and for an armed start the change of the cumulants with the delay
-(`StartPhases`). A `Recipe` evaluates entries, by the exact recursion or by the method of the MaRS paper.
+(`StartPhases`). An `Evaluation` computes entries, by the exact recursion or by the method of the MaRS paper.
 """
 
 from __future__ import annotations
@@ -240,9 +240,8 @@ def start_phases(
     cells = Cells.of(np.repeat(signal[row], column.size), np.tile(background[column], row.size), system).resolved(1)
     own = bins[index]
     grids = np.maximum(own, _phase_grid(cells, int(own.min())))
-    spread = np.sqrt(
-        np.maximum(cumulants[index, 1], 0.25)
-    )  # at least half a count: errors of small counts matter in counts
+    # at least half a count: errors of small counts matter in counts
+    spread = np.sqrt(np.maximum(cumulants[index, 1], 0.25))
     scale = spread[:, None] ** np.arange(1, 5)
     some = np.zeros((row.size, column.size), dtype=bool)
     some[np.ix_(_few(row.size), _few(column.size))] = True
@@ -392,7 +391,7 @@ Method = Literal["exposure", "mars"]
 
 
 @dataclass(frozen=True, eq=False)
-class Recipe:
+class Evaluation:
     """Method and tolerance by which entries are evaluated."""
 
     method: Method

@@ -28,7 +28,6 @@ def request_key(
     *,
     method: str,
     rearm: str,
-    refine: float | None,
     tolerance: float,
 ) -> str:
     """Hash of all settings of a table except its cycles, on which many tables do not depend."""
@@ -41,7 +40,6 @@ def request_key(
         "axes": [[value.hex() for value in axis.tolist()] for axis in axes],
         "method": method,
         "rearm": rearm,
-        "refine": refine,
         "tolerance": tolerance,
     }
     text = json.dumps(request, sort_keys=True)

@@ -11,7 +11,6 @@ import contextlib
 import json
 import time
 import warnings
-from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
@@ -32,13 +31,13 @@ from mars_lidar.statistics.cells import require_mode
 from mars_lidar.statistics.chain import ConvergenceError, Rearm
 from mars_lidar.statistics.exposure import exposure_moments, normalised
 from mars_lidar.table import storage
-from mars_lidar.table.axes import PAPER_GRID, Grid, axis_values, describe, inserted, midpoints, thinned
+from mars_lidar.table.axes import PAPER_GRID, Grid, axis_values, describe
 from mars_lidar.table.entries import (
     Entries,
+    Evaluation,
     Lookup,
     Method,
     NodeLaws,
-    Recipe,
     StartPhases,
     evaluate,
     node_laws,
@@ -51,7 +50,6 @@ from mars_lidar.table.tolerances import TOL
 Interpolation = Literal["bilinear", "nearest"]
 
 Axes = tuple[FloatArray, FloatArray]
-Evaluate = Callable[[FloatArray, FloatArray], Entries]
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +116,6 @@ class Table:
         *,
         method: Method = "exposure",
         rearm: Rearm = "centre",
-        refine: float | None = None,
         tolerance: float = 1e-4,
         threads: int | None = None,
         progress: Progress | bool | None = None,
@@ -137,9 +134,6 @@ class Table:
             Gaussian of the Markov-renewal law, asymptotic in the exposure.
         rearm
             ``"centre"`` or ``"edge"`` of the bin, for ``"mars"``.
-        refine
-            Error in total variation, in [1e-5, 0.1]: points are inserted until the error between nodes is below it
-            (`QuantisationError.largest`). None: the given axes.
         tolerance
             Of each entry, for ``"exposure"``: see `exposure_moments`.
         threads
@@ -150,7 +144,7 @@ class Table:
         Raises
         ------
         ValueError, TypeError
-            An invalid argument, before any work; `refine` cannot be met.
+            An invalid argument, before any work.
         ConvergenceError
             An entry could not be evaluated; the message names it.
         """
@@ -159,20 +153,15 @@ class Table:
         axes = axis_values("signal", signal), axis_values("background", background)
         if rearm != "centre" and method != "mars":
             raise ValueError(f"rearm must be 'centre' for method {method!r}, which has no such option, got {rearm!r}")
-        goal = None if refine is None else checks.real("refine", refine, low=1e-5, high=0.1)
         tolerance = checks.real("tolerance", tolerance, low=1e-9, high=0.1)
         progress = callback_of(progress, "building a table")
-        recipe = Recipe(method, rearm, tolerance, thread_count(threads))
+        evaluation = Evaluation(method, rearm, tolerance, thread_count(threads))
         began = time.perf_counter()
-        if goal is None:
-            table = _evaluated(system, axes, recipe, progress)
-            error = table.quantisation_error(samples=TOL.error_pixels, threads=recipe.threads)
-        else:
-            table, error = _refined(system, axes, recipe, goal, progress)
-        longest = table._long_error(recipe.threads)
+        table = _evaluated(system, axes, evaluation, progress)
+        error = table.quantisation_error(samples=TOL.error_pixels, threads=evaluation.threads)
+        longest = table._long_error(evaluation.threads)
         table.provenance.update(
-            key=storage.request_key(system, axes, method=method, rearm=rearm, refine=goal, tolerance=tolerance),
-            refine=goal,
+            key=storage.request_key(system, axes, method=method, rearm=rearm, tolerance=tolerance),
             error=error.to_dict(),
             error_longest=None if longest is None else longest.to_dict(),
             build_s=time.perf_counter() - began,
@@ -227,12 +216,12 @@ class Table:
     ) -> tuple[Path, Path | None]:
         """Path of the table in the cache, and the existing file that can be used instead, or None."""
         system = system.detected()
-        chosen = {"method": "exposure", "rearm": "centre", "refine": None, "tolerance": 1e-4} | options
-        unknown = set(chosen) - {"method", "rearm", "refine", "tolerance", "threads", "progress"}
+        chosen: dict[str, Any] = {"method": "exposure", "rearm": "centre", "tolerance": 1e-4} | options
+        unknown = set(chosen) - {"method", "rearm", "tolerance", "threads", "progress"}
         if unknown:
             raise TypeError(f"the options are those of Table.build, got {sorted(unknown)[0]!r}")
         axes = axis_values("signal", signal), axis_values("background", background)
-        request = {name: chosen[name] for name in ("method", "rearm", "refine", "tolerance")}
+        request = {name: chosen[name] for name in ("method", "rearm", "tolerance")}
         own, others = storage.cached_candidates(storage.request_key(system, axes, **request), system.cycles)
         for path in (own, *others):
             with contextlib.suppress(OSError, ValueError):  # absent, out of reach, damaged, or of too few cycles
@@ -449,8 +438,8 @@ class Table:
         system = self.system.replace(cycles=periods)
         below = interpolation == "bilinear"  # the nearest entry knows nothing between 0 and the lowest value
         signal, background = (random_pixels(rng, axis, samples, below) for axis in (self.signal, self.background))
-        recipe = Recipe(self.method, self.rearm, self.tolerance, thread_count(threads))
-        exact = recipe.entries(signal, background, system)
+        evaluation = Evaluation(self.method, self.rearm, self.tolerance, thread_count(threads))
+        exact = evaluation.entries(signal, background, system)
         looked_up = self.at(signal, background, cycles=periods, interpolation=interpolation)
         mixed = looked_up.mixture(self.shapes(periods))
         error = deviations(looked_up.cumulants, exact.cumulants)
@@ -459,7 +448,7 @@ class Table:
         if self.method == "exposure":
             shift = rng.integers(0, system.bins, samples)
             delay, cumulants, delayed_shape = self._against_exact(
-                signal, background, shift, mixed, periods, recipe.threads
+                signal, background, shift, mixed, periods, evaluation.threads
             )
             law = self.at(signal, background, delay, cycles=periods, interpolation=interpolation)
             delayed = deviations(law.cumulants, cumulants)
@@ -538,7 +527,7 @@ class Table:
         return delay, exact.cumulants, np.asarray(error, dtype=np.float64)
 
 
-def _evaluated(system: System, axes: Axes, recipe: Recipe, progress: Progress | None) -> Table:
+def _evaluated(system: System, axes: Axes, evaluation: Evaluation, progress: Progress | None) -> Table:
     signal, background = axes
     check_memory(
         2 * 4 * signal.size * background.size * system.bins,
@@ -548,18 +537,18 @@ def _evaluated(system: System, axes: Axes, recipe: Recipe, progress: Progress | 
     cells = signal.size * background.size
     settled = cells + max(1, cells // 10)  # the start phases take about so much of the time
     total = settled + max(1, cells // 20)  # and the laws of some entries so much
-    entries = recipe.entries(
+    entries = evaluation.entries(
         np.repeat(signal, background.size), np.tile(background, signal.size), system, of_part(progress, 0, cells, total)
     )
     phases, laws = StartPhases.none(), NodeLaws.none()
-    if recipe.method == "exposure":
+    if evaluation.method == "exposure":
         phases = start_phases(
             system,
             signal,
             background,
             entries.cumulants,
             entries.bins,
-            threads=recipe.threads,
+            threads=evaluation.threads,
             progress=of_part(progress, cells, settled, total),
         )
         laws = node_laws(
@@ -567,89 +556,11 @@ def _evaluated(system: System, axes: Axes, recipe: Recipe, progress: Progress | 
             signal,
             background,
             entries,
-            threads=recipe.threads,
+            threads=evaluation.threads,
             progress=of_part(progress, settled, total, total),
         )
     if progress is not None:
         progress(total, total)
     provenance = {"version": __version__, "signal": describe(signal), "background": describe(background)}
-    return Table(
-        system, recipe.method, signal, background, recipe.rearm, recipe.tolerance, provenance, entries, phases, laws
-    )
-
-
-def _refined(
-    system: System, axes: Axes, recipe: Recipe, goal: float, progress: Progress | None
-) -> tuple[Table, QuantisationError]:
-    inner = goal
-    for _ in range(TOL.attempts):
-        axes = _refined_axes(*axes, lambda s, b: recipe.entries(s, b, system), inner)
-        table = _evaluated(system, axes, recipe, progress)
-        error = table.quantisation_error(samples=4 * TOL.error_pixels, threads=recipe.threads)
-        if error.largest <= goal:
-            return table, error
-        inner *= 0.5
-    raise ValueError(
-        f"refine must be an error that can be met, got {goal:g}: reached {error.largest:.2g} with "
-        f"{axes[0].size} x {axes[1].size} points at S = {error.worst_signal:g}, B = {error.worst_background:g}"
-    )
-
-
-def _refined_axes(
-    signal: FloatArray, background: FloatArray, evaluated: Evaluate, goal: float
-) -> tuple[FloatArray, FloatArray]:
-    """Axes with points inserted, where the error in the middle between two is above half of `goal`.
-
-    The error is in total variation, of the count law (two normal laws to first order) and of the shape; half of it
-    for each axis. Looked at along a few lines in the direction of each axis, in the canonical delay.
-    """
-    lines = _lines(background)
-    signal = _refined_axis(signal, lambda s: evaluated(np.repeat(s, lines.size), np.tile(lines, s.size)), lines, goal)
-    across = _lines(signal)
-    background = _refined_axis(
-        background, lambda b: evaluated(np.tile(across, b.size), np.repeat(b, across.size)), across, goal
-    )
-    return signal, background
-
-
-def _lines(axis: FloatArray) -> FloatArray:
-    positive = axis[axis > 0]
-    span = np.log(positive[-1] / positive[0]) if positive.size else 0.0
-    some = axis[thinned(axis, max(span / (TOL.lines - 1), 1e-9))]
-    return some[some > 0] if positive.size else some
-
-
-def _refined_axis(
-    axis: FloatArray, along: Callable[[FloatArray], Entries], lines: FloatArray, goal: float
-) -> FloatArray:
-    """One axis. `along` evaluates points x lines; lines are the exact nodes of a table's second axis here."""
-    for _ in range(TOL.rounds):
-        if axis.size < 2:
-            return axis
-        between = midpoints(axis)
-        nodes, exact = along(axis), along(between)
-        rows, weights, cumulants = evaluate(
-            (axis, lines),
-            nodes.cumulants,
-            StartPhases.none(),
-            True,
-            np.repeat(between, lines.size),
-            np.tile(lines, between.size),
-            np.zeros(between.size * lines.size),
-            False,
-            1,
-        )
-        law = law_variation(deviations(cumulants, exact.cumulants))
-        mixed = np.stack([w @ nodes.shape[r] for r, w in zip(rows, weights, strict=True)])
-        shape = 0.5 * np.abs(mixed - exact.shape).sum(-1)
-        bad = np.maximum(law, shape).reshape(between.size, lines.size).max(1) > 0.5 * goal
-        if not bad.any():
-            return axis
-        if axis.size + int(bad.sum()) > TOL.points:
-            break
-        axis = inserted(axis, between[bad])
-    raise ValueError(
-        f"refine must be an error that {TOL.points} points of an axis and {TOL.rounds} rounds can meet, "
-        f"got {goal:g}: "
-        f"{axis.size} points in [{axis[0]:g}, {axis[-1]:g}] do not meet it; choose a larger error or a smaller range"
-    )
+    made_as = evaluation.method, signal, background, evaluation.rearm, evaluation.tolerance
+    return Table(system, *made_as, provenance, entries, phases, laws)

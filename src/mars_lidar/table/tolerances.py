@@ -36,14 +36,6 @@ class Tolerances:
     """Largest `System.cycles`, at which errors of the mean are largest."""
     error_pixels: int = 128
     """Random ones, on which a new table is checked."""
-
-    # refinement
-    attempts: int = 4
-    """Each with half the error of the one before."""
-    lines: int = 8
-    """Values of the other axis at which an axis is examined."""
-    rounds: int = 12
-    """Of inserting points into an axis."""
     points: int = 4096
     """Values of an axis."""
 

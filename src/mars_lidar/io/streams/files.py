@@ -165,9 +165,8 @@ def _read_npz(path: Path, attrs: dict[str, Any]) -> Timestamps:
         )
     if times.bin.size and "code_density" not in json.dumps(attrs.get("info", {}), default=str):  # of uneven bins
         beyond = float(np.abs(since * times.bins - times.bin - 0.5).max()) - 0.5
-        rounding = 2.0**-23 + 4.0 * np.finfo(float).eps * max(
-            1, times.cycles
-        )  # of phases in single precision, of times
+        # of phases in single precision, and of times
+        rounding = 2.0**-23 + 4.0 * np.finfo(float).eps * max(1, times.cycles)
         if beyond > 1e-6 + rounding * times.bins:
             raise ValueError(f"bin must be that of times_ns, got one {beyond:.3g} bins off")
     return times

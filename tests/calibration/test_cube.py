@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Literal
+
 import numpy as np
 import pytest
 
@@ -41,6 +44,54 @@ def test_errors_of_equal_pixels_of_few_registrations() -> None:
             inside += estimate.low <= true <= estimate.high
     assert np.abs(off).max() < 4.5
     assert inside >= 25  # of 32: 1.7e-3 by chance at 95 %
+
+
+@pytest.mark.full
+@pytest.mark.parametrize(
+    ("period", "dead", "sigma", "cycles", "bins", "start"),
+    [
+        (20.0, 70.0, 0.4, 20_000, 100, "armed"),
+        (50.0, 230.0, 1.0, 10_000, 200, "stationary"),
+        (40.0, 150.0, 0.5, 10_000, 200, "armed"),
+    ],
+)
+def test_dead_times_of_several_periods(
+    period: float, dead: float, sigma: float, cycles: int, bins: int, start: Literal["armed", "stationary"]
+) -> None:
+    """From 0.5 to 1.6 times the truth: within 4.5 stated errors of it.
+
+    The likelihood has a maximum every period. From 5 % off, 99.7499 ± 0.0002 ns were stated for 70, as histograms that
+    fit, although so many registrations do not leave room for more than 80.
+    """
+    random = np.random.default_rng(302)
+    light = ml.Flux(
+        random.uniform(0.2, 2.0, (3, 4)), random.uniform(0.05, 1.0, (3, 4)), random.uniform(0, period, (3, 4))
+    )
+    truth = ml.System(
+        period_ns=period, cycles=cycles, bins=bins, pulse=ml.GaussianPulse(sigma_ns=sigma),
+        detector=ml.Detector(dead_time_ns=dead), start=start,
+    )  # fmt: skip
+    counts = ml.simulate(light, truth, seed=302)[0]
+    for factor in (0.5, 0.95, 1.2, 1.6):
+        given = truth.replace(
+            pulse=ml.GaussianPulse(sigma_ns=1.1 * sigma), detector=ml.Detector(dead_time_ns=factor * dead)
+        )
+        outcome = calibrate_cube(counts, given)
+        assert outcome.fits
+        for name, true in (("dead_time_ns", dead), ("pulse_sigma_ns", sigma)):
+            estimate = outcome.estimates[name]
+            assert abs(estimate.value - true) < 4.5 * estimate.error
+
+
+def test_histograms_that_do_not_fit_or_were_not_tested_state_no_error() -> None:
+    """Every 97th bin brighter than any light and dead time explain; and pixels of which no p-value is known."""
+    counts = ml.simulate(ml.Flux(np.full((2, 2), 0.5), 0.3, 40.0), system(bins=1000), seed=2)[0]
+    counts[..., ::97] += 40  # counts that no light explains
+    outcome = calibrate_cube(counts, system(bins=1000))
+    assert not outcome.fits
+    assert np.isnan(outcome.estimates["dead_time_ns"].error)
+    assert "no error is stated" in str(outcome.estimates["dead_time_ns"])
+    assert not replace(outcome, p_values=np.zeros(0)).fits
 
 
 def test_too_few_photons_are_refused() -> None:

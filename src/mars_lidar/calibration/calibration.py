@@ -583,8 +583,8 @@ def _estimates(fitted: Fitted, growth: FloatArray) -> dict[str, Estimate]:
     put(light, float(centre[0]), drawn[:, 0], names[0])
     for i in range(1, k):
         period = model.clock.period_ns
-        wrapped = names[i].startswith("delay")
-        put(names[i], float(centre[i] % period if wrapped else centre[i]), drawn[:, i], names[i])
+        value = float(centre[i] % period if names[i].startswith("delay") else centre[i])
+        put(names[i], value, drawn[:, i] + (value - centre[i]), names[i])
     pulses, jitters = model.widths(drawn)
     pulse, jitter = map(float, model.widths(centre))
     note = "not detected" if "jitter" in free and fitted.unbounded[k + 1] < 2.0 * errors[k + 1] else ""

@@ -27,7 +27,8 @@ from mars_lidar.reconstruction.histograms import Histograms, checked
 from mars_lidar.reconstruction.maximum_likelihood import MaximumLikelihood
 from mars_lidar.reconstruction.method import Estimates
 
-_GRID = 13  # dead times of the first search, over a period
+_GRID = 20  # dead times of the first search in each period; the likelihood has a maximum every period
+_PERIODS = 20  # of which it searches the ones nearest to the given dead time
 _ROUNDS = 8  # of the search, each at dead times that lie closer
 
 
@@ -40,7 +41,7 @@ class CubeCalibration:
     estimates
         ``dead_time_ns``, ``pulse_sigma_ns`` (of a Gaussian, jitter included), and ``background_floor``, photons per
         period of the darkest fitted pixel. For a single pixel also ``signal``, ``background``, ``delay_ns`` and
-        ``depth_m``.
+        ``depth_m``. Without errors where the histograms do not fit or could not be tested.
     system
         The given system with these values; with ``pulse="free"`` its pulse is a `SampledPulse` with one sample per bin.
     response_error
@@ -48,7 +49,7 @@ class CubeCalibration:
     counts, flux
         The fitted pixels, the brightest first: histograms (pixels, bins), and their light, an image of one row.
     p_values
-        (pixels,) for each fitted pixel the probability of a histogram at least as far from its law.
+        (pixels,) for each fitted pixel the probability of a histogram at least as far from its law, where it is known.
     """
 
     estimates: dict[str, Estimate]
@@ -67,9 +68,11 @@ class CubeCalibration:
 
     @property
     def fits(self) -> bool:
-        """Whether no more pixels than by chance (four standard deviations) have p below 1 %."""
-        expected = 0.01 * self.p_values.size
-        return bool((self.p_values < 0.01).sum() <= expected + 4.0 * expected**0.5 + 1.0)
+        """Whether pixels could be tested, and so many p below 1 % as theirs have a probability of at least 1 %."""
+        from scipy.special import bdtrc  # of at least k of n: bdtrc(k - 1, n, 0.01)
+
+        number = self.p_values.size
+        return bool(number and bdtrc((self.p_values < 0.01).sum() - 1, number, 0.01) >= 0.01)
 
 
 def calibrate_cube(
@@ -85,7 +88,7 @@ def calibrate_cube(
         (..., bins) counts.
     system
         The recording system, with a free-running detector. Its dead time and pulse width are starting values of the
-        fit.
+        fit, which tries all dead times within ten periods that the counts allow.
     pulse
         ``"gaussian"``, of unknown width; or ``"free"``: a response with one sample per bin, over ten standard
         deviations of the best Gaussian on either side, whose centroid is the delay of a pixel.
@@ -118,8 +121,12 @@ def calibrate_cube(
     low, high = system.pulse.support_ns()
     width = system.pulse.sigma_ns if isinstance(system.pulse, GaussianPulse) else (high - low) / 8.0
     dead = checks.real("dead_time_ns", system.detector.dead_time_ns)
-    most = max(1.5 * dead, 0.95 * system.period_ns)
-    deads = np.union1d(dead, np.linspace(0.0, most, _GRID))
+    step = system.period_ns / _GRID
+    # n registrations take at least n - 1 dead times
+    most = system.cycles * system.period_ns / (int(totals.max()) - 1)
+    dead = min(dead, most)
+    deads = dead + step * np.arange(-_GRID * _PERIODS // 2, _GRID * _PERIODS // 2 + 1)
+    deads = np.union1d([0.0, most], deads[(deads >= 0.0) & (deads <= most)])
     widths = np.log(width) + np.array([-2.5, -1.2, 0.0, 1.2, 2.5])
     sigma = Estimate(float(max(widths, key=lambda w: _log_likelihood(some, trial(dead, w)))), 0.0, 0.0, 0.0)
     for _ in range(2):
@@ -129,10 +136,11 @@ def calibrate_cube(
     if pulse == "free":
         # a dead time just below a period looks like the tail of a pulse, so that each is tried with its own response
         reach = int(min(np.ceil(10.0 * np.exp(sigma.value) / system.bin_ns) + 2, system.bins // 2 - 1))
-        trials = [_with_response(some, trial(d, sigma.value), reach, 1)[0] for d in (hold.value, *deads)]
+        near = deads[np.abs(deads - hold.value) < system.period_ns][::2]
+        trials = [_with_response(some, trial(d, sigma.value), reach, 1)[0] for d in (hold.value, *near)]
         final = max(trials, key=lambda each: _log_likelihood(some, each))
-        for near in (most / _GRID, 0.2 * most / _GRID):
-            places = np.maximum(final.detector.dead_time_ns + near * np.linspace(-1.0, 1.0, _GRID), 0.0)
+        for reach_ns in (step, 0.2 * step):
+            places = np.clip(final.detector.dead_time_ns + reach_ns * np.linspace(-1.0, 1.0, 13), 0.0, most)
             hold = _law(some, partial(_with_dead_time, final), np.unique(places))
             final, response_error = _with_response(some, _with_dead_time(final, hold.value), reach, 2)
     light = MaximumLikelihood().estimate(Histograms(some, final, 1))
@@ -147,9 +155,17 @@ def calibrate_cube(
         estimates["delay_ns"] = _of_pixel(light, "delay", 0, final.period_ns)
         estimates["depth_m"] = _of_pixel(light, "delay", 0, final.period_ns * 0.5 * SPEED_OF_LIGHT_M_PER_NS)
     flux = Flux(light.signal[None], np.maximum(light.background, 0.0)[None], light.delay[None] * final.period_ns)
-    return CubeCalibration(
+    result = CubeCalibration(
         estimates, final, p_values[np.isfinite(p_values)], response_error, np.asarray(some, np.float64), flux
     )
+    if result.fits:
+        return result
+    words = "of a model that does not fit" if result.p_values.size else "of histograms that could not be tested"
+    bare = {
+        name: Estimate(each.value, np.nan, np.nan, np.nan, f"{words}: no error is stated")
+        for name, each in estimates.items()
+    }
+    return replace(result, estimates=bare, response_error=None)
 
 
 def _of_pixel(light: Estimates, name: str, k: int, unit: float = 1.0) -> Estimate:

@@ -256,7 +256,8 @@ def _cube(path: Path, known: KnownOptions, out: Path | None, picture: Path | Non
         samples = f"{pulse.values.size} samples of {pulse.bin_ns:.5g} ns"
         rows.append(("response", f"{samples}, errors up to {worst:.2g} % of its peak"))
     verdict = "their histograms fit" if result.fits else "their histograms do NOT fit: another return, or an effect"
-    rows.append(("verdict", f"{100 * result.misfits:.3g} % of {result.p_values.size} pixels have p < 1 %: {verdict}"))
+    verdict = f"{100 * result.misfits:.3g} % of {result.p_values.size} pixels have p < 1 %: {verdict}"
+    rows.append(("verdict", verdict if result.p_values.size else "not known: none of the histograms could be tested"))
     table(rows)
     if out is not None:
         result.system.save(out)

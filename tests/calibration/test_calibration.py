@@ -172,6 +172,49 @@ def test_a_dead_time_that_ends_in_a_gap_without_light(first: int) -> None:
 
 
 @pytest.mark.full
+@pytest.mark.parametrize("seed", [2, 5, *nightly(6, 8)])
+def test_a_delay_at_an_end_of_the_period(seed: int) -> None:
+    """Delay, interval and ranges are of one period: -0.07 to 100.06 ns was once a range, for 0 of 100."""
+    truth = replace(BASE, signal=1.0, background=0.5, delay=0.0, sigma=1.0, dead=2.0 * BASE.period)
+    delay = ml.calibrate(stream(truth, 3000, seed), seed=seed).estimates["delay_ns"]
+    assert 0.0 <= delay.value < BASE.period
+    assert abs((delay.value + 0.5 * BASE.period) % BASE.period - 0.5 * BASE.period) < 4.5 * delay.error
+    assert delay.low < delay.value < delay.high
+    assert delay.most - delay.least < 2.0
+
+
+@pytest.mark.full
+def test_intervals_that_jitter_reverses_are_sorted() -> None:
+    """A jitter of a third of the dead time: numbers of intervals up to two ends are the law's, Poisson p > 1e-4."""
+    from scipy.stats import poisson
+
+    from mars_lidar.calibration.model import Model
+    from mars_lidar.calibration.recording import Clock, recording_of
+    from mars_lidar.calibration.shortest import shortest_law
+
+    truth = Truth(signal=0.4, background=0.4, delay=30.0, sigma=0.3, dead=12.0, period=100.0, jitter=4.0, unit=0.064)
+    model = Model(Clock(100.0, 0.064, 0.5, locked=True), 1, jitter_given=True)
+    row = np.array([[0.4, 0.4, 30.0, truth.width, 4.0, 12.0]])
+    law = shortest_law(recording_of(stream(truth, 800_000, 1)), model, row, 200_000, 1)
+    for units in (15, 31):  # of the clock: 1 and 2 ns
+        end = (units + 0.5) * law.unit
+        number = int((law.recorded <= end).sum())
+        expected = np.interp(12.0, law.dead, law.expected(units * law.unit)[0])
+        assert poisson.cdf(number, expected) > 1e-4
+        assert poisson.sf(number - 1, expected) > 1e-4
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("seed", [0, *nightly(1, 3)])
+def test_a_pulse_that_armed_passes_do_not_show(seed: int) -> None:
+    """Of 780 registrations hardly any are later than all ends of a dead time of 3.3 periods: no pulse was fitted."""
+    truth = replace(BASE, signal=1.6, background=0.04, dead=330.0, jitter=0.25)
+    result = ml.calibrate(stream(truth, 780, seed), {"dead_time_ns": 330.0}, seed=seed)
+    assert result.fits
+    assert (np.abs(pulls(result, truth)[:-1]) < FAR).all()
+
+
+@pytest.mark.full
 def test_background_of_which_no_photon_may_be_recorded() -> None:
     """Armed for 0.8 ns before a pulse: 1.8 background photons are expected, and without any B was 0 ± 0.0006."""
     truth, _ = random_truth(8600)

@@ -397,16 +397,17 @@ class _Run:
         self.fit = Fit(recording, Effort(), (self.seed, 0))
         if isinstance(shape, Pulse):
             shape.check(recording.period_ns)
-        model = Model(recording.clock, 0)
+        fields, given = tuple(self.fields.items()), "jitter" in self.fixed
+        model = pulsed = Model(recording.clock, 0, fields=fields, jitter_given=given)
         if shape == "free":
             self.wave = start.free_waveform(recording, self.fit.effort.shape_bins)
             shares, errors = (part / self.wave[0].sum() for part in self.wave)
-            model = replace(model, waveform=shares, waveform_error=errors, exposure=recording.exposure)
+            model = pulsed = replace(model, waveform=shares, waveform_error=errors, exposure=recording.exposure)
         elif recording.laser:
             p, self.most = start.brightest_window(recording)
-            if p <= FALSE_ALARM:
-                model = replace(model, returns=self.returns, pulse=shape if isinstance(shape, Pulse) else None)
-        self.model = replace(model, fields=tuple(self.fields.items()), jitter_given="jitter" in self.fixed)
+            pulsed = replace(model, returns=self.returns, pulse=shape if isinstance(shape, Pulse) else None)
+            model = pulsed if p <= FALSE_ALARM else model
+        self.model, self.pulsed = model, pulsed
 
     def result(self) -> Calibration:
         """The fit, the effects that it includes, and the suspects that remain."""
@@ -445,13 +446,17 @@ class _Run:
     def first(self) -> Fitted:
         """The plain model, from other starts and simulated streams until it converges with a significant pulse.
 
-        For phases with a bright window: a fit without a pulse is then a failed one.
+        Where the phases have a bright window, a fit without a pulse is a bad one. Light without a pulse is tried first
+        where they have none, and must not be rejected.
         """
-        tried: list[tuple[Fit, Fitted]] = []
-        while len(tried) < self.fit.effort.attempts and not (tried and tried[-1][1].converged and tried[-1][1].lit):
+        tried: list[tuple[bool, bool, Fit, Fitted]] = []
+        while len(tried) < self.fit.effort.attempts and not (tried and tried[-1][0] and tried[-1][1]):
             self.fit = Fit(self.recording, Effort(), (self.seed, len(tried)))
-            tried.append((self.fit, self._attempt()))
-        self.fit, fitted = max(tried, key=lambda each: (each[1].converged, each[1].lit))
+            fitted = self._attempt()
+            dark = self.model.returns < self.pulsed.returns and fitted.p_value < FALSE_ALARM
+            tried.append((fitted.converged, fitted.lit and not dark, self.fit, fitted))
+            self.model = self.pulsed
+        *_, self.fit, fitted = max(tried, key=lambda each: each[:2])
         return fitted
 
     def _attempt(self) -> Fitted:
@@ -637,10 +642,13 @@ def _limit(trial: Trial, estimates: dict[str, Estimate], drift: Drift | None) ->
         return Limit(name, words, float("nan"))
     sizes = draws(final.model, final.unbounded, final.covariance, final.free)[:, -len(trial.effect.names)]
     ranges = {}
+    period = final.model.clock.period_ns
     for key, other in _estimates(final, _growth(final, drift)).items():
         own = estimates.get(key, other)
-        if max(own.low - other.low, other.high - own.high) > (own.high - own.low) / 3.92:
-            ranges[key] = other.low, other.high
+        turn = period * round((own.value - other.value) / period) if key.startswith("delay") else 0.0
+        low, high = other.low + turn, other.high + turn
+        if max(own.low - low, high - own.high) > (own.high - own.low) / 3.92:
+            ranges[key] = low, high
     return Limit(name, words, float(np.quantile(sizes, 0.95)), ranges)
 
 

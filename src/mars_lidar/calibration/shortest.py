@@ -5,8 +5,9 @@ intervals up to x is
 
     H(x; t_d) = sum over all registrations p of the integral over a > t_d of r(p + a) K(x - a),
 
-where K(x - a) is the probability that jitter and clock record an interval a as at most x. Such intervals are rare, so
-that their number is a Poisson number: none is recorded with the probability exp(-H).
+where K(x - a) is the probability that jitter and clock record an interval a as at most x. Records that jitter puts in
+the reverse order are sorted, so that H(x) - H(-x) intervals up to x are recorded. Such intervals are rare, so that their
+number is a Poisson number: none is recorded with the probability exp(-H).
 """
 
 from __future__ import annotations
@@ -104,6 +105,11 @@ def shortest_law(
     age = x + np.r_[early, late * reach]
 
     def up_to(end: float) -> FloatArray:
+        if end < -0.5 * unit:
+            return np.zeros((len(rows), age.size))
+        return below(end) - below(-end - unit)
+
+    def below(end: float) -> FloatArray:
         z = (end - age + np.array([unit, 0.0])[:, None, None]) / sd[:, None]
         above = z * ndtr(z) + np.exp(-0.5 * z**2) / (2.0 * np.pi) ** 0.5  # integral of the normal law
         share = (above[0] - above[1]) * sd[:, None] / unit

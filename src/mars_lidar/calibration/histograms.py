@@ -125,8 +125,8 @@ def calibrate_cube(
     # n registrations take at least n - 1 dead times
     most = system.cycles * system.period_ns / (int(totals.max()) - 1)
     dead = min(dead, most)
-    deads = dead + step * np.arange(-_GRID * _PERIODS // 2, _GRID * _PERIODS // 2 + 1)
-    deads = np.union1d([0.0, most], deads[(deads >= 0.0) & (deads <= most)])
+    nearby = dead + step * np.arange(-_GRID * _PERIODS // 2, _GRID * _PERIODS // 2 + 1)
+    deads: FloatArray = np.union1d([0.0, most], nearby[(nearby >= 0.0) & (nearby <= most)])
     widths = np.log(width) + np.array([-2.5, -1.2, 0.0, 1.2, 2.5])
     sigma = Estimate(float(max(widths, key=lambda w: _log_likelihood(some, trial(dead, w)))), 0.0, 0.0, 0.0)
     for _ in range(2):

@@ -6,8 +6,8 @@ intervals up to x is
     H(x; t_d) = sum over all registrations p of the integral over a > t_d of r(p + a) K(x - a),
 
 where K(x - a) is the probability that jitter and clock record an interval a as at most x. Records that jitter puts in
-the reverse order are sorted, so that H(x) - H(-x) intervals up to x are recorded. Such intervals are rare, so that their
-number is a Poisson number: none is recorded with the probability exp(-H).
+the reverse order are sorted, so that H(x) - H(-x) intervals up to x are recorded. Such intervals are rare, so that
+their number is a Poisson number: none is recorded with the probability exp(-H).
 """
 
 from __future__ import annotations

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import zarr
 
 import mars_lidar as ml
 from mars_lidar import io
@@ -19,7 +18,6 @@ from mars_lidar.dataset.sources import read_view
 from mars_lidar.io.foreign import foreign_cube
 from mars_lidar.io.maps import load_maps, save_maps
 from mars_lidar.io.rgbd import read_layers
-from mars_lidar.io.store import OnDisk
 from mars_lidar.io.streams.recorders import recorded
 from mars_lidar.io.transient import read_truth
 
@@ -40,14 +38,12 @@ def _cube(path: Path) -> Iterator[Any]:
 
 def _dataset(path: Path) -> Iterator[Any]:
     stored = open_dataset(path)
-    yield from (stored.recipe, stored.seeds)
-    group = zarr.open_group(path, mode="r")
-    for folder in (group, group["scenes"]):
-        for name, array in sorted(folder.arrays()):
-            yield from (name, np.asarray(OnDisk(array, path)))
-    read_sparse(stored, 0)
+    yield from (stored.recipe, stored.seeds, np.asarray(stored.histogram))
+    yield from (np.asarray(array) for _, array in sorted(stored.maps.items()))
+    yield read_sparse(stored, 0).todense()
     for number in range(len(stored.scene_names())):
-        stored.scene(number)
+        scene = stored.scene(number)
+        yield from (value for _, value in sorted(vars(scene).items()) if isinstance(value, np.ndarray))
 
 
 def _maps(path: Path) -> Iterator[Any]:

@@ -4,8 +4,8 @@
     python tests/randomness/report.py --battery BigCrush --minutes 2000
 
 P-values go to docs/results/randomness.csv as they come; tests that it has, of the same seed and generator, are not
-repeated. Debian has TestU01 in its section non-free (libtestu01-0-dev); `--library` names the folder
-of another installation, with `include` and `lib` in it.
+repeated. The page tabulates the first seed and lists the tests of others. Debian has TestU01 in its section non-free
+(libtestu01-0-dev); `--library` names the folder of another installation, with `include` and `lib` in it.
 """
 
 import argparse
@@ -16,6 +16,8 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+
+from scipy.stats import kstest
 
 ROOT = Path(__file__).resolve().parents[2]
 NATIVE = ROOT / "src" / "mars_lidar" / "native"
@@ -100,8 +102,8 @@ def report(rows: list[dict[str, str]]) -> str:
     batteries = [name + bits for name in TESTS for bits in BITS]
     for battery in batteries:
         for kind, streams, words in ORDERS:
-            key = (battery, kind, str(streams), str(words))
-            own = [row for row in rows if (row["battery"], row["order"], row["streams"], row["words"]) == key]
+            key = (rows[0]["seed"], battery, kind, str(streams), str(words))
+            own = [row for row in rows if tuple(row[name] for name in COLUMNS[1:6]) == key]
             if not own:
                 continue
             tests, of = len({row["test"] for row in own}), TESTS[battery.removesuffix("-reversed")]
@@ -115,6 +117,7 @@ def report(rows: list[dict[str, str]]) -> str:
             )
             listed += [f"- {battery}, {kind} x {streams}: test {r['test']}, {r['name']}: p = {r['p']}" for r in far]
     done = {row["battery"] for row in rows}
+    again = [f"- test {r['test']}, {r['name']}: p = {r['p']}" for r in rows if r["seed"] != rows[0]["seed"]]
     open_ = [name for name in ("Crush", "BigCrush") if name not in done]
     open_ += [f"the rest of {name}" for name in ("Crush", "BigCrush") if name in done and not _complete(rows, name)]
     return (
@@ -129,13 +132,16 @@ def report(rows: list[dict[str, str]]) -> str:
             number=len(values),
             expected=2.0 * SUSPECT * len(values),
             listed="\n".join(listed) or "None.",
+            uniform=kstest(values, "uniform").pvalue,
+            again="\n".join(again) or "None.",
             open=", ".join([*open_, "PractRand beyond 8 GiB (1 TB was asked for)"]),
         )
     )
 
 
 def _complete(rows: list[dict[str, str]], battery: str) -> bool:
-    return len({row["test"] for row in rows if row["battery"] == battery}) == TESTS[battery]
+    own = {row["test"] for row in rows if (row["seed"], row["battery"]) == (rows[0]["seed"], battery)}
+    return len(own) == TESTS[battery]
 
 
 def main() -> None:

@@ -49,9 +49,8 @@ class Effort:
         Draws from the law of the estimate, for intervals within the bounds of the parameters.
     attempts
         Attempts to fit a recording, each with other simulated streams; the first that converges is used.
-    effects, refits
-        Effects that are included at most, one after the other, and refits with a further effect that fresh streams
-        judge.
+    effects
+        Effects that are included at most, one after the other.
     shape_bins
         Most bins of free light.
     """
@@ -70,7 +69,6 @@ class Effort:
     draws: int = 20_000
     attempts: int = 3
     effects: int = 2
-    refits: int = 2
     shape_bins: int = 256
 
     def of(self, photons: float, times: float = 1.0) -> int:

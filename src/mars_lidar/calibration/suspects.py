@@ -82,8 +82,8 @@ class Trial:
         self.score, self.effect, self._shorter, self._fitted = score, score.effect, shorter, fitted
 
     @cached_property
-    def stepped(self) -> tuple[float, Guess] | None:
-        """Misfit and parameters of the steps with it; None if a detector cannot have it together with the others."""
+    def stepped(self) -> Guess | None:
+        """Parameters of the steps with it; None if a detector cannot have it together with the others."""
         fit, fitted, score = self._shorter, self._fitted, self.score
         model, effect = replace(fitted.model, effects=(*fitted.model.effects, score.effect)), score.effect
         size = effect.start[0]
@@ -103,15 +103,15 @@ class Trial:
             if fitted.model.light + 2 in free:  # the dead time has absorbed part of the effect
                 gaps = np.diff(fit.recording.pieces[0][: 12 * fit.effort.first])
                 theta = with_edge(fit, model, theta, np.sort(gaps))
-            guess, misfit, _ = fit.steps(Guess(model, theta, np.diag(spread[free]), free), photons, photons / 6.0)
+            guess = fit.steps(Guess(model, theta, np.diag(spread[free]), free), photons, photons / 6.0)[0]
         except (ValueError, np.linalg.LinAlgError):
             return None
-        return misfit, guess
+        return guess
 
     @cached_property
     def final(self) -> Fitted | None:
         """The fit judged by fresh streams; None if there is none, or it did not converge."""
-        final = None if self.stepped is None else self._shorter.finish(self.stepped[1])
+        final = None if self.stepped is None else self._shorter.finish(self.stepped)
         return final if final is not None and final.converged else None
 
 
@@ -161,19 +161,20 @@ def refitted(fit: Fit, fitted: Fitted, plain: FloatArray, trials: list[Trial]) -
 
     The refit decides which effect it is: a slow recovery may have the score of a paralyzable detector, and an effect
     that the dead time has absorbed has a score only along the counts of the refit. All effects are therefore tried if
-    the misfit is suspicious. Short batches choose between effects; the chosen one is fitted with full batches.
+    the misfit is suspicious, by short batches; the chosen one is fitted with full batches. A rejected stream names the
+    effect with which it fits.
     """
     limit, most, best, size = clear(trials, _TRIED), clear(trials), None, fitted.model.size
     tried = {t.effect.names[0]: t for t in reversed(trials) if t.score.z > limit or fitted.p_value < _TRIED}
-    stepped = [(trial.score.z <= most, trial.stepped[0], trial) for trial in tried.values() if trial.stepped]
-    for *_, trial in sorted(stepped, key=lambda each: each[:2])[: fit.effort.refits]:
+    for trial in tried.values():
         score, final = trial.score, trial.final
         if final is None:
             continue
         along = _score(fit, fitted, plain, final.model, final.theta, score.effect)
         error = _error_of(final, size)
         z = max(score.z, along.z, final.theta[size] / error if error else 0.0)
-        fits = final.p_value * _MISFIT > fitted.p_value and (z > clear(trials[:1], _TRIED) or not error)
+        mended = (fitted.p_value < FALSE_ALARM and final.p_value > _TRIED) or final.p_value * _MISFIT > fitted.p_value
+        fits = mended and (z > clear(trials[:1], _TRIED) or not error)
         better = best is None or final.misfit_z < best[0].misfit_z
         if final.theta[size] > 0.0 and (z > most or fits) and better:
             best = final, score.effect, z

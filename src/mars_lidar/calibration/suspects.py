@@ -173,8 +173,8 @@ def refitted(fit: Fit, fitted: Fitted, plain: FloatArray, trials: list[Trial]) -
         along = _score(fit, fitted, plain, final.model, final.theta, score.effect)
         error = _error_of(final, size)
         z = max(score.z, along.z, final.theta[size] / error if error else 0.0)
-        mended = (fitted.p_value < FALSE_ALARM and final.p_value > _TRIED) or final.p_value * _MISFIT > fitted.p_value
-        fits = mended and (z > clear(trials[:1], _TRIED) or not error)
+        improved = (fitted.p_value < FALSE_ALARM and final.p_value > _TRIED) or final.p_value * _MISFIT > fitted.p_value
+        fits = improved and (z > clear(trials[:1], _TRIED) or not error)
         better = best is None or final.misfit_z < best[0].misfit_z
         if final.theta[size] > 0.0 and (z > most or fits) and better:
             best = final, score.effect, z

@@ -88,9 +88,9 @@ def effects() -> str:
         result = calibrated(truth, photons, 5)
         out.append(f"{words}: {', '.join(suspect.name for suspect in result.suspects) or 'nothing'}")
     dark = replace(with_effect(ORDINARY, "afterpulses"), signal=1e-9, background=0.5)
-    t, _ = photon_by_photon(dark, 40_000, 5)
-    result = ml.calibrate(t, unit_ns=UNIT_NS)
-    out.append(f"without a laser: {', '.join(suspect.name for suspect in result.suspects) or 'nothing'}")
+    results = [ml.calibrate(photon_by_photon(dark, 40_000, seed)[0], unit_ns=UNIT_NS) for seed in range(5, 11)]
+    named = sum([suspect.name for suspect in result.suspects] == ["afterpulses"] for result in results)
+    out.append(f"afterpulses of 3 % without a laser: named in {named} of 6")
     return "; ".join(out)
 
 

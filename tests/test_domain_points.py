@@ -10,12 +10,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from harness import COUNTS, JOINT, SHAPE, JointLaw, check, counts_against_law, law_of, pmf_of, require
 from harness.cases import PERIOD_NS, Case, flux_of, make_system, waveform_flux
-from harness.check import COUNTS, JOINT, SHAPE, check
-from harness.joint import JointLaw
-from harness.laws import law_of, pmf_of
-from harness.ledger import require
-from harness.pvalues import counts_against_law, variance_score
+from harness.pvalues import variance_score
 from scipy import stats
 
 import mars_lidar as ml

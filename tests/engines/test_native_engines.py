@@ -4,8 +4,7 @@ import time
 
 import numpy as np
 import pytest
-from harness import goodness, refused, require
-from harness.pvalues import bonferroni
+from harness import bonferroni, goodness, refused, require
 from native_emulation import poisson_sample
 from native_jobs import Case, gaussian_energy
 from scipy import stats

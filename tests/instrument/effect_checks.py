@@ -3,8 +3,7 @@
 from typing import Any
 
 import numpy as np
-from harness import Case, check, require
-from harness.check import EVERYTHING, INTERVALS
+from harness import EVERYTHING, INTERVALS, Case, check, require
 from scipy import stats
 
 import mars_lidar as ml

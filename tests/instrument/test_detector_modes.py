@@ -7,10 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from harness import COUNTS, EVERYTHING, JOINT, SHAPE, Law, check, draw, law_of
 from harness.cases import PERIOD_NS, Case, flux_of, random_cases, two_lobes, waveform_flux
-from harness.check import COUNTS, EVERYTHING, JOINT, SHAPE, check
-from harness.laws import Law, law_of
-from harness.sample import draw
 from scipy import stats
 
 from mars_lidar import Detector, Flux, GaussianPulse, System

@@ -6,12 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from harness import COUNTS, EVERYTHING, JOINT, SHAPE, JointLaw, Law, armed_count_pmf, check, require, task_of
 from harness.cases import PERIOD_NS, Case, flux_of, waveform_flux
-from harness.check import COUNTS, EVERYTHING, JOINT, SHAPE, check
-from harness.joint import JointLaw
-from harness.laws import Law, armed_count_pmf
-from harness.ledger import require
-from harness.sample import task_of
 from instrument.effect_checks import bits_do_not_depend
 from scipy import stats
 

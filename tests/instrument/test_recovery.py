@@ -6,11 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from harness import EVERYTHING, check, draw, refused, require
 from harness.cases import GATE, PERIOD_NS, WAVE, Case, case, two_lobes, waveform_flux
-from harness.check import EVERYTHING, check
-from harness.ledger import require
-from harness.refusal import refused
-from harness.sample import draw
 from instrument.effect_checks import bits_do_not_depend, exact_against_sequential, mean_is
 from scipy import integrate, stats
 from test_reproducibility import image

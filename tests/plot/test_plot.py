@@ -7,9 +7,7 @@ import matplotlib as mpl
 import matplotlib.style
 import numpy as np
 import pytest
-from harness import make_system, refused
-from harness.ledger import rejected, require
-from harness.pvalues import mean_vector
+from harness import make_system, mean_vector, refused, rejected, require
 from matplotlib.figure import Figure
 
 import mars_lidar as ml

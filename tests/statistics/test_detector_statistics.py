@@ -4,12 +4,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from harness import waveform_flux as flux_of_waveform
+from harness import COUNTS, SHAPE, Law, check, first_arrival, pmf_of, refused
 from harness.cases import PERIOD_NS, Case, flux_of, make_system, two_lobes
-from harness.check import COUNTS, SHAPE, check
-from harness.laws import Law, first_arrival, pmf_of
 from harness.paralyzable import paralyzable_moments
-from harness.refusal import refused
 from scipy import stats
 
 import mars_lidar as ml

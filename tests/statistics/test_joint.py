@@ -9,8 +9,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from harness import Reference, constant_rate_moments, refused, require, system_of
-from harness.reference import REFERENCE_NAMES
+from harness import REFERENCE_NAMES, Reference, constant_rate_moments, refused, require, system_of
 from scipy import stats
 
 import mars_lidar as ml

@@ -4,9 +4,7 @@ from math import comb, factorial
 
 import numpy as np
 import pytest
-from harness.cases import PERIOD_NS, Case, make_system, random_cases, two_lobes, waveform_flux
-from harness.check import COUNTS, check
-from harness.laws import Law, pmf_of
+from harness import COUNTS, PERIOD_NS, Case, Law, check, make_system, pmf_of, random_cases, two_lobes, waveform_flux
 from harness.paralyzable import paralyzable_moments
 from scipy.integrate import quad
 

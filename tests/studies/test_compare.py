@@ -6,8 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from harness import make_system
-from harness.ledger import require
+from harness import make_system, require
 from scipy import stats
 
 import mars_lidar as ml

@@ -1,4 +1,4 @@
-"""The exact engine by itself: random numbers, extremes of flux, dead time and exposure."""
+"""The exact engine by itself: random numbers, extremes of flux, dead time and exposure, tails, waveforms, starts."""
 
 from itertools import pairwise
 from typing import Any

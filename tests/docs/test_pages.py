@@ -13,10 +13,12 @@ from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 
+import numpy as np
 import pytest
 import yaml
 from harness import refused
 
+from benchmarks import readme
 from studies import STUDIES
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -120,3 +122,78 @@ def test_metadata_agree():
     assert set(citation["keywords"]) <= set(zenodo["keywords"])
     for form in ROOT.glob(".github/ISSUE_TEMPLATE/*.yml"):
         assert {"name", "description", "body"} <= set(yaml.safe_load(form.read_text(encoding="utf-8")))
+
+
+# What README promises runs as written.
+
+
+README = ROOT.joinpath("README.md").read_text()
+
+
+def test_python():
+    own, *more = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+    space: dict[str, object] = {}
+    exec(own, space)
+    assert space["cube"].shape == (1, 48, 64, 1024)
+    assert np.nanmedian(np.abs(space["estimate"].depth_m - space["depth_m"])) < 0.02
+    for code in more:  # each goes on where the one before ended
+        exec(code, space)
+
+
+def test_commands_that_the_checks_run_are_there():
+    for name in ("main", "tests"):
+        result = subprocess.run(
+            [sys.executable, ROOT / ".ci" / "readme_command.py", name], capture_output=True, text=True, check=True
+        )
+        assert ".venv/bin/" in result.stdout
+
+
+def test_links_lead_somewhere():
+    for target in re.findall(r"\]\(([^)#]+?)\)", README):
+        assert target.startswith("https://") or ROOT.joinpath(target).exists(), target
+
+
+@pytest.mark.parametrize("name", readme.TABLES)
+def test_tables_of_figures_are_those_of_the_saved_run(name: str):
+    text, wanted = readme.filled(name)
+    assert text == wanted
+
+
+# The page of claims names tests that exist, in the tier that it states.
+
+
+NIGHTLY = ("python -m ", "docs/results/")  # programs and reports, named beside tests
+
+
+def tiers_of(name: str) -> set[str]:
+    """Tiers that a test function, or the functions of a file of tests, belong to."""
+    file, _, wanted = name.partition("::")
+    tree = ast.parse((ROOT / file).read_text(encoding="utf-8"))
+    whole = any(isinstance(node, ast.Assign) and "pytest.mark.full" in ast.unparse(node) for node in tree.body)
+    tests = [
+        node
+        for node in tree.body
+        if isinstance(node, ast.FunctionDef) and node.name.startswith("test_") and wanted in ("", node.name)
+    ]
+    assert tests, name
+    marked = [any("mark.full" in ast.unparse(decorator) for decorator in node.decorator_list) for node in tests]
+    if not wanted:
+        return {"fast"} if not all(marked) else {"full"}
+    return {"full" if whole or any(marked) else "fast"}
+
+
+def test_each_claim_names_tests_of_its_tier():
+    page = (ROOT / "docs" / "claims.md").read_text(encoding="utf-8")
+    rows = [line.strip("| ").split(" | ") for line in page.splitlines() if line.startswith("|")][2:]
+    assert len(rows) > 20
+    wrong = []
+    for claim, stated, guards in rows:
+        names = re.findall(r"`([^`]+)`", guards)
+        tests = [name for name in names if name.startswith("tests/")]
+        guarded = set().union(*(tiers_of(name) for name in tests))
+        guarded |= {"fast"} if ".ci/pages.py" in names else set()
+        if any(name.startswith(NIGHTLY) for name in names):
+            guarded.add("nightly")
+        if guarded != set(stated.split(", ")):
+            wrong.append(f"{claim}: {sorted(guarded)}, not {stated}")
+    assert not wrong, "\n".join(wrong)

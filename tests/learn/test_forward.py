@@ -1,5 +1,6 @@
 """The differentiable forward model: its gradients, and its values against independent ones."""
 
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -309,3 +310,289 @@ def test_armed_exposures_that_would_be_followed_too_long_are_refused():
     system = make_system(4000.0, 21_000, 64, sigma_ns=2.0)
     with pytest.raises(ValueError, match=r"at most 20,000 periods, got 21,000, which are only 525 dead times"):
         expected_histogram(torch.tensor(0.5), torch.tensor(0.2), torch.tensor(40.0), system)
+
+
+# The differentiable forward model from a table: against the exact mean histogram, and its gradients.
+
+
+AXES = np.array([0.0, 0.1, 0.98, 1.02, 4.9, 5.1]), np.array([0.0, 0.05, 0.98, 1.02, 2.0])
+
+
+def build(sigma_ns=0.5, dead_ns=64.0, start="stationary", bins=1024) -> ml.Table:
+    system = make_system(dead_ns, 1000, bins, sigma_ns=sigma_ns, start=start)
+    return ml.Table.build(system, *AXES, threads=1)
+
+
+@pytest.fixture(scope="module")
+def table() -> ml.Table:
+    return build()
+
+
+def table_point(*values, dtype=torch.float64):
+    return [torch.tensor(value, dtype=dtype, requires_grad=True) for value in values]
+
+
+@pytest.mark.full
+@pytest.mark.parametrize(
+    ("sigma_ns", "dead_ns", "start", "bins", "error"),
+    [
+        (0.5, 64.0, "stationary", 1024, 1e-4),
+        (0.5, 0.0, "armed", 1024, 1e-4),
+        (0.5, 64.0, "armed", 1024, 1e-3),  # its start-up part stays at the canonical delay (docs/table.md, 4)
+        (0.13, 64.0, "stationary", 256, 1e-3),  # a third of a bin: what lies inside is told by the edges alone
+    ],
+)
+def test_it_is_the_exact_mean_histogram(sigma_ns, dead_ns, start, bins, error):
+    """At nodes and in small cells, moved to any delay; in float32, total variation."""
+    table = build(sigma_ns, dead_ns, start, bins)
+    s = np.array([0.1, 1.0, 5.0, 5.0, 0.0, 1.0, 5.02])
+    b = np.array([0.05, 1.0, 0.05, 2.0, 1.0, 0.0, 0.99])
+    tau = np.array([40.03, 50.0, 99.98, 75.02, 5.0, 0.01, 20.07])
+    result = HistogramTable(table)(*table_point(s, b, tau, dtype=torch.float32)).detach().double().numpy()
+    exact = ml.statistics.mean_histogram(ml.Flux(s, b, tau), table.system)
+    assert (result >= 0.0).all()
+    off = np.abs(result - exact).sum(-1) / 2 / exact.sum(-1)
+    assert (off < error).all(), off
+
+
+@pytest.mark.full
+def test_gradients_from_a_table(table):
+    """Sums over windows that cut the pulse; all delays, also where a bin's edge meets the canonical one."""
+    model = HistogramTable(table).double()
+    at = table_point([0.5, 0.05, 2.0, 3.0], [0.3, 0.3, 0.02, 1.5], [40.0, 1.0, 99.9, 50.0 + 3e-5])
+
+    def windows(*x):
+        return model(*x)[:, :1020].reshape(4, 60, 17).sum(-1) / 1000
+
+    assert torch.autograd.gradcheck(windows, at, eps=1e-6, atol=1e-6)
+
+
+@pytest.mark.full
+def test_kinks_at_the_nodes_are_as_small_as_is_said():
+    """The spacing of the paper's 256 x 100 table; jumps over what the derivatives are, summed over the bins."""
+    system = build(bins=256, sigma_ns=1.0).system
+    axes = (10 ** (-0.3 + 3.0 * np.arange(6) / 255), 10 ** (-0.3 + 3.0 * np.arange(6) / 99))
+    model = HistogramTable(ml.Table.build(system, *axes, threads=1)).double()
+    nodes = [float(axes[0][3]), float(axes[1][2]), (0.5 - 40 / 256) * system.period_ns]
+    for place, most in enumerate((0.05, 0.15, 1e-3)):
+        others = [torch.tensor([0.999 * x], dtype=torch.float64) for x in nodes]
+
+        def along(x, place=place, others=others):
+            return model(*(x if k == place else other for k, other in enumerate(others)))[0]
+
+        below, above = (
+            torch.autograd.functional.jacobian(along, torch.tensor([nodes[place] * (1.0 + step)], dtype=torch.float64))
+            for step in (-1e-9, 1e-9)
+        )
+        assert 0.0 < float((above - below).abs().sum() / above.abs().sum()) < most
+
+
+def test_delay_moves_it_continuously_and_keeps_the_total(table):
+    model = HistogramTable(table).double()
+    bin_ns = table.system.bin_ns
+    near = 33.0 + bin_ns * torch.tensor([1 - 1e-9, 1.0, 1 + 1e-9], dtype=torch.float64)
+    delay = torch.cat([torch.linspace(33.0, 33.5, 50).double(), near])
+    level = torch.tensor(3.0).double(), torch.tensor(0.5).double()
+    single = model(*level, delay)
+    torch.testing.assert_close(single.sum(-1), single.sum(-1)[:1].expand(53), rtol=1e-12, atol=0)
+    torch.testing.assert_close(single[-3], single[-1], rtol=1e-6, atol=1e-6)
+    whole = model(*level, torch.tensor([33.0, 33.0 + 7 * bin_ns, 133.0]).double())
+    torch.testing.assert_close(whole[1], torch.roll(whole[0], 7, -1))
+    torch.testing.assert_close(whole[2], whole[0])
+
+
+@pytest.mark.full
+def test_it_leads_back_to_the_pixel_of_an_exact_mean(table):
+    """From a mean histogram that no table knows, by its gradients alone (L-BFGS), pixel by pixel of a map."""
+    true = np.array([[1.0, 0.5, 61.3], [3.0, 1.5, 12.34], [0.5, 0.1, 99.9]])
+    single = table.system
+    mean = torch.from_numpy(ml.statistics.mean_histogram(ml.Flux(*true.T), single))
+    fine = HistogramTable(ml.Table.build(single, (0.2, 5.0, 24), (0.05, 2.0, 16), threads=1)).double()
+    x = (torch.from_numpy(true) * torch.tensor([0.8, 1.3, 1.0]) + torch.tensor([0.0, 0.0, 0.4])).requires_grad_()
+    optimizer = torch.optim.LBFGS([x], max_iter=60, line_search_fn="strong_wolfe", tolerance_change=1e-12)
+
+    def loss():
+        optimizer.zero_grad()
+        s, b, tau = x.unbind(-1)
+        result = fine(s.clamp(0.0, 5.0), b.clamp(0.0, 2.0), tau)
+        value = (result - mean * torch.log(result.clamp_min(1e-12))).sum() / 1000
+        value.backward()
+        return value
+
+    optimizer.step(loss)
+    np.testing.assert_allclose(x.detach()[:, :2], true[:, :2], rtol=2e-2)
+    np.testing.assert_allclose(x.detach()[:, 2], true[:, 2], atol=5e-3)
+
+
+def test_bad_arguments(table):
+    model = HistogramTable(table)
+    maps = torch.full((2, 3), 0.5), torch.tensor(0.5), torch.tensor(30.0)
+    assert model(*maps).shape == (2, 3, 1024)
+    assert model(*(values.double() for values in maps)).dtype == torch.float64
+    assert model(*(torch.zeros(0) for _ in range(3))).shape == (0, 1024)
+    assert "6 x 5 x 1024, 1000 cycles" in repr(model)
+    refused(r"signal must lie in the table's \[0, 5.1\] .* got 6 to 6", model, torch.tensor(6.0), *maps[1:])
+    refused("delay_ns finite", model, *maps[:2], torch.tensor(float("nan")))
+    refused(r"table must be a mars_lidar\.Table", HistogramTable, "table.h5", error=TypeError)
+    longer = HistogramTable(table, cycles=5000)
+    torch.testing.assert_close(longer(*maps), 5 * model(*maps), rtol=1e-5, atol=1e-6)
+
+
+# The operator for deepinv: its mean, its draws, its gradients.
+
+
+SYSTEM = make_system(40.0, 300, 16, sigma_ns=4.0, start="stationary")
+
+
+@pytest.fixture
+def physics(deepinv):
+    from mars_lidar.learn import LidarPhysics
+
+    return LidarPhysics(SYSTEM, seed=5)
+
+
+def test_draws_have_the_mean(physics):
+    """4000 pixels alike: every bin within 4.5 standard errors (false alarm 1e-4 over 16 bins)."""
+    x = torch.tensor([0.8, 0.4, 37.0], dtype=torch.float64).reshape(1, 3, 1, 1).expand(2, 3, 40, 50)
+    drawn, mean = physics(x), physics.A(x)
+    assert drawn.shape == mean.shape == (2, 16, 40, 50)
+    error = drawn.var(dim=(0, 2, 3)).sqrt() / 4000**0.5
+    assert ((drawn.mean(dim=(0, 2, 3)) - mean[0, :, 0, 0]).abs() < 4.5 * error).all()
+    assert not torch.equal(drawn[0], drawn[1])
+    assert not torch.equal(drawn, physics(x))
+    cube = ml.simulate(ml.Flux(np.full((40, 50), 0.8), 0.4, 37.0), SYSTEM, seed=5)[0]
+    np.testing.assert_array_equal(drawn[0].permute(1, 2, 0), cube)
+
+
+def test_vjp_and_jvp_are_what_deepinv_asks_for(physics):
+    """A, A_vjp and A_jvp against differences along directions, each other's transposes, and the same from a table."""
+    from mars_lidar.learn import LidarPhysics
+
+    pixel, way = (
+        torch.tensor(v, dtype=torch.float64).reshape(1, 3, 1, 1) for v in ([0.8, 0.4, 37.0], [0.3, -0.2, 0.7])
+    )
+    assert torch.autograd.gradcheck(physics.A, (pixel.clone().requires_grad_(),))
+    refused(r"\(B, 3, H, W\)", physics, pixel[0])
+    x = pixel.expand(1, 3, 2, 2)
+    torch.manual_seed(1)
+    step, back = way * torch.randn_like(x), torch.randn(1, 16, 2, 2, dtype=torch.float64)
+    moved = (physics.A(x + 1e-5 * step) - physics.A(x - 1e-5 * step)) / 2e-5
+    torch.testing.assert_close(physics.A_jvp(x, step), moved, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close((physics.A_vjp(x, back) * step).sum(), (moved * back).sum(), rtol=1e-5, atol=1e-5)
+    entries = ml.Table.build(SYSTEM, (0.5, 1.5, 30), (0.2, 0.8, 30), threads=1)
+    table = LidarPhysics(SYSTEM, table=entries)
+    torch.testing.assert_close(table.A(x), physics.A(x), rtol=2e-3, atol=1e-2)
+    torch.testing.assert_close(table.A_vjp(x, back), physics.A_vjp(x, back), rtol=2e-2, atol=1e-2)
+    there, here = (table.A_jvp(x, step) * back).sum(), (table.A_vjp(x, back) * step).sum()
+    torch.testing.assert_close(there, here, rtol=1e-4, atol=1e-4)  # a table's is of single precision
+    refused("table must be of this system", LidarPhysics, SYSTEM.replace(bins=32), table=entries)
+
+
+@pytest.mark.full
+def test_reconstruction_with_deepinv(physics):
+    """Projected gradient steps on deepinv's own data fidelity and prior, from A_dagger: nearer to a smooth truth."""
+    from deepinv.optim import L2, Tikhonov
+
+    true = torch.tensor([0.8, 0.4, 37.0], dtype=torch.float64).reshape(1, 3, 1, 1).expand(1, 3, 6, 6).contiguous()
+    y = physics(true)
+    start = physics.A_dagger(y)
+    assert start.shape == true.shape
+    units = torch.tensor([0.1, 0.05, 0.5], dtype=torch.float64).reshape(1, 3, 1, 1)  # of about equal standard errors
+    fidelity, prior = L2(sigma=3.0), Tikhonov()
+    x, first = start.clone(), None
+    for _ in range(25):
+        rough = (x - x.mean((2, 3), keepdim=True)) / units
+        gradient = units * fidelity.grad(x, y, physics) + 4.0 * prior.grad(rough)
+        first = gradient.norm() if first is None else first
+        x = (x - 0.05 * units * gradient).clamp_min(0.0)
+    assert gradient.norm() < 0.2 * first
+    before, after = ((example - true).square().mean((0, 2, 3)) for example in (start, x))
+    assert (after < before).all()
+
+
+def test_without_deepinv_the_error_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "deepinv", None)
+    monkeypatch.delitem(sys.modules, "deepinv.physics", raising=False)
+    monkeypatch.delitem(sys.modules, "mars_lidar.learn.inverse", raising=False)
+    monkeypatch.delitem(vars(ml.learn), "LidarPhysics", raising=False)
+    with pytest.raises(ImportError, match="deepinv: pip install"):
+        from mars_lidar.learn import LidarPhysics  # noqa: F401
+
+
+def test_a_seed_that_is_given_is_honoured(physics):
+    x = torch.tensor([0.8, 0.4, 37.0], dtype=torch.float64).reshape(1, 3, 1, 1).expand(2, 3, 4, 5)
+    first, second = physics(x), physics(x)
+    assert torch.equal(physics(x, seed=5), first)
+    assert torch.equal(physics(x, seed=6), second)
+    assert not torch.equal(first, second)
+    refused("seed", physics, x, seed=-1)
+
+
+def test_depth_images_are_those_of_deepinv(physics):
+    """Without dead time its own operator, whose pulse is sampled in the middle of bins; and back by A_dagger."""
+    from deepinv.physics import SinglePhotonLidar
+
+    from mars_lidar.learn import LidarPhysics
+
+    system = SYSTEM.replace(bins=64, detector=ml.Detector(dead_time_ns=0.0), cycles=5000)
+    ours, theirs = (LidarPhysics(system, images="depth", seed=2), SinglePhotonLidar(sigma=4.0 / system.bin_ns, bins=64))
+    x = torch.tensor([20.3, 900.0, 7.0]).reshape(1, 3, 1, 1).expand(1, 3, 3, 3)
+    torch.testing.assert_close(ours.A(x), theirs.A(x), rtol=0.01, atol=0.5)
+    result = ours.A_dagger(ours(x).double())
+    errors = torch.tensor([0.1, 30.0, 0.4]).reshape(1, 3, 1, 1)  # standard errors, about
+    assert ((result - x).abs() < 5.0 * errors).all()
+    refused("depth, intensity and background", ours.A, x[0])
+
+
+def likelihood_descent(physics, y, prior, **options):
+    """Images by deepinv's proximal gradient descent with the likelihood of dead time, started at maximum likelihood."""
+    from deepinv.optim import PGD
+
+    from mars_lidar.learn import LidarLikelihood
+
+    descent = PGD(data_fidelity=LidarLikelihood(), prior=prior, custom_init=physics.custom_init, **options)
+    return descent(y, physics).detach()
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("name", ["TVPrior", "MedianFilter"])
+def test_stock_solvers_on_a_step(deepinv, name):
+    """Half a bin of depth in constant light: mean squared errors below 0.4 of those of maximum likelihood."""
+    from deepinv.models import MedianFilter
+    from deepinv.optim.prior import PnP, TVPrior
+
+    from mars_lidar.learn import LidarPhysics
+
+    physics = LidarPhysics(SYSTEM.replace(cycles=100), images="log", seed=3)
+    light = torch.tensor([0.6, 0.32, 40.625], dtype=torch.float64).reshape(3, 1, 1, 1).repeat(1, 1, 8, 8)
+    light[2, :, :, 4:] += 0.5 * SYSTEM.bin_ns
+    true = physics.images(*light)
+    y = physics(true)
+    prior, options = {
+        "TVPrior": (lambda: TVPrior(n_it_max=20), {"stepsize": 0.02, "lambda_reg": 2.0}),
+        "MedianFilter": (lambda: PnP(MedianFilter(kernel_size=3)), {"stepsize": 0.005}),
+    }[name]
+    result = likelihood_descent(physics, y, prior(), max_iter=60, **options)
+    error = [(each - true).square().mean((0, 2, 3)) for each in (physics.A_dagger(y), result)]
+    assert (error[1] < 0.4 * error[0]).all(), error[1] / error[0]
+
+
+@pytest.mark.full
+def test_drunet_runs_as_it_comes(deepinv, tmp_path):
+    """Weights of one's own from a file, for deepinv's own are a download: two steps, beside the same by hand."""
+    from deepinv.models import DRUNet
+    from deepinv.optim.prior import PnP
+
+    from mars_lidar.learn import LidarLikelihood, LidarPhysics
+
+    physics, weights = LidarPhysics(SYSTEM.replace(cycles=100), images="log", seed=3), tmp_path / "weights.pt"
+    torch.manual_seed(0)
+    torch.save(DRUNet(3, 3, nc=(8, 8, 8, 8), nb=1, pretrained=None).state_dict(), weights)
+    denoiser = DRUNet(3, 3, nc=(8, 8, 8, 8), nb=1, pretrained=str(weights)).eval()
+    y = physics(physics.images(*torch.tensor([0.6, 0.32, 40.0]).reshape(3, 1, 1, 1).expand(3, 1, 16, 16)))
+    images = likelihood_descent(physics, y, PnP(denoiser), stepsize=0.005, sigma_denoiser=0.1, max_iter=2)
+    by_hand = physics.A_dagger(y)
+    for _ in range(2):
+        by_hand = denoiser(by_hand - 0.005 * LidarLikelihood().grad(by_hand, y, physics), 0.1).detach()
+    torch.testing.assert_close(images, by_hand, rtol=1e-4, atol=1e-5)
+    assert (images - physics.A_dagger(y)).abs().max() > 0.1

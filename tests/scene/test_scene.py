@@ -1,5 +1,6 @@
 """Scenes, and the radiometry that turns them into a flux: every mean and every count is checked."""
 
+import itertools
 import json
 import math
 import warnings
@@ -8,9 +9,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from harness import make_system, refused
+from scipy import integrate, special
 
+import mars_lidar as ml
+from mars_lidar import io
 from mars_lidar.instrument.system import SPEED_OF_LIGHT_M_PER_NS, System
-from mars_lidar.scene.scene import Scene
+from mars_lidar.io.rgbd import read_layers
+from mars_lidar.light.fog import Fog
+from mars_lidar.light.transient import Transient
+from mars_lidar.scene.scene import LayeredScene, Scene
+from studies.compare.command import compare_app
+from studies.compare.command import main as compare_main
+from tests.harness.command import command_line, fails, ok, options_of, run
 
 NAN = math.nan
 
@@ -299,3 +309,283 @@ def test_random_scenes_are_whole_and_different(seed):
     assert first.valid.all()
     assert 0.3 < first.depth_m.min() < first.depth_m.max() < 17.5
     assert first.reflectivity.max() > 0.02
+
+
+# Options that commands share, and scene files: what a YAML file names is what the options mean.
+
+
+SMALL = ["--period-ns", "20", "--cycles", "30", "--bins", "64", "--dead-time-ns", "5"]
+
+
+def simulated(path, *arguments: object):
+    ok("simulate", *arguments, *SMALL, "--no-picture", "--overwrite", "-o", path)
+    with io.load(path) as cube:
+        return np.asarray(cube.histogram), cube.recipe.source
+
+
+@pytest.fixture
+def transient(tmp_path):
+    values = np.random.default_rng(1).random((3, 4, 40, 2)) ** 4
+    np.save(tmp_path / "t.npy", values)
+    return tmp_path
+
+
+def compared(*arguments: object):
+    return command_line([str(each) for each in arguments], main=compare_main)
+
+
+def test_the_commands_that_take_a_system_take_the_same_options():
+    every = options_of("simulate"), options_of("table", "build"), options_of(app=compare_app())
+    simulate, table, compare = ({name: each.parameter.help for name, each in options.items()} for options in every)
+    system = list(simulate)[list(simulate).index("--system") : list(simulate).index("--max-events-per-exposure") + 1]
+    assert len(system) > 30
+    assert {"--detector", "--mode", "--jitter-fwhm-ns", "--electronics-dead-time-ns", "--crosstalk"} < set(system)
+    for name in system:
+        assert compare[name] == table[name] == simulate[name]
+    shared = {name for name in simulate if name.startswith(("--transient", "--scene", "--depth", "--light"))}
+    assert shared <= set(compare)
+
+
+def test_effects_reach_compare():
+    effects = ["--detector", "excelitas-spcm-aqrh", "--jitter-fwhm-ns", "0.4", "--electronics-dead-time-ns", "90"]
+    room = ["--scene", "room", "--size", 8, "--cycles", 20, "--bins", 64, "--engines", "exact"]
+    done = compared(*room, "--realizations", 50, "--repeats", 1, *effects)
+    assert done.exit_code == 0, done.output
+    detector = ml.Detector.preset("excelitas-spcm-aqrh")
+    detector = replace(detector, jitter=ml.Jitter.from_fwhm(fwhm_ns=0.4), electronics_dead_time_ns=90.0)
+    for effect in detector.effects:
+        assert effect.removesuffix("_ns").removesuffix("_hz").replace("_", " ") in " ".join(done.stdout.split())
+    refused = compared("--scene", "room", "--crosstalk", 0.1, "--against", "sequential")
+    assert refused.exit_code == 2
+    assert "compare draws single pixels" in refused.stderr
+
+
+@pytest.mark.full
+def test_a_scene_file_of_a_transient_is_its_options(transient):
+    (transient / "scene.yaml").write_text(
+        "transient: t.npy\nbin_ns: 0.5\nstart_ns: 1\nchannel: 1\npulse: false\n"
+        "light: {photons_per_unit: 2e-2, sbr: 4}\n"
+    )
+    out = transient / "a.npz"
+    times = "--transient-bin-ns 0.5 --transient-start-ns 1 --transient-channel 1 --no-transient-pulse"
+    options = ["--transient", transient / "t.npy", *times.split()]
+    by_options, source = simulated(out, *options, "--photons-per-unit", 0.02, "--sbr", 4)
+    by_file, same = simulated(out, "--scene", transient / "scene.yaml")
+    assert np.array_equal(by_file, by_options)
+    assert source == same
+    # single options replace what the file says; the level is one of two
+    by_options, _ = simulated(out, *options, "--transient-start-ns", 3, "--signal", 2, "--sbr", 4)
+    by_file, _ = simulated(out, "--scene", transient / "scene.yaml", "--transient-start-ns", 3, "--signal", 2)
+    assert np.array_equal(by_file, by_options)
+    few = ["--engines", "exact,poisson", "--realizations", 50, "--repeats", 1]
+    done = compared("--scene", transient / "scene.yaml", *SMALL, *few)
+    assert done.exit_code == 0, done.output
+
+
+def test_scene_files_of_depth_and_of_a_built_in_scene(tmp_path):
+    np.save(tmp_path / "depth.npy", np.linspace(1.0, 2.5, 48).reshape(6, 8))
+    (tmp_path / "depth.yml").write_text(
+        "depth: depth.npy\ndepth_unit_m: 0.5\nlight:\n  signal: 0.7\n  sbr: inf\n  attenuation: inverse_square\n"
+    )
+    (tmp_path / "room.yaml").write_text("example: room\nsize: 9\nseed: 4\n")
+    out = tmp_path / "a.npz"
+    light = ["--signal", 0.7, "--sbr", "inf", "--attenuation", "inverse_square"]
+    by_options, _ = simulated(out, "--depth", tmp_path / "depth.npy", "--depth-unit-m", 0.5, *light)
+    assert np.array_equal(simulated(out, "--scene", tmp_path / "depth.yml")[0], by_options)
+    by_options, _ = simulated(out, "--scene", "room", "--size", 9, "--scene-seed", 4)
+    assert np.array_equal(simulated(out, "--scene", tmp_path / "room.yaml")[0], by_options)
+
+
+@pytest.mark.parametrize(
+    ("text", "more", "words"),
+    [
+        ("example: room\nsiz: 9\n", [], "scene.yaml:2: a scene file has unknown key 'siz'"),
+        ("example: room\nsize: 0\n", [], "scene.yaml:2: size must be an integer in [1, "),
+        ("size: 9\n", [], "a scene file must give one of example, depth (or path) and transient, got none of them"),
+        ("example: room\ndepth: a.png\n", [], "got example and depth"),
+        ("transient: t.npy\npulse: 3\n", [], "scene.yaml:2: pulse must be true or false, got 3"),
+        ("transient: t.npy\nlight:\n  sbr: x\n", [], "scene.yaml:3: light.sbr must be a finite number"),
+        ("transient: t.npy\nlight: {signal: 1, photons_per_unit: 1}\n", [], "one of signal and photons_per_unit"),
+        ("transient: t.npy\nlight: {glow: 1}\n", [], "light has unknown key 'glow'"),
+        ("transient: t.npy\n", [], "give bin_ns"),
+        ("transient: nowhere.npy\nbin_ns: 1\n", [], "no such file"),
+        ("- a\n- b\n", [], "a scene file must give one of"),
+        ("example: [room\n", [], "scene.yaml:"),
+        ("example: room\n", ["--depth", "d.npy"], "got --scene and --depth"),
+    ],
+)
+def test_bad_scene_files_are_one_clear_line(transient, text, more, words):
+    (transient / "scene.yaml").write_text(text)
+    done = fails(words, "simulate", "--scene", transient / "scene.yaml", *more, *SMALL, "-o", transient / "a.npz")
+    assert len(done.stderr.splitlines()) == 1
+    missing = run("simulate", "--scene", transient / "other.yaml", *SMALL, "-o", transient / "a.npz")
+    assert (missing.exit_code, "other.yaml: no such file" in missing.stderr) == (2, True)
+
+
+# Scenes of several surfaces: panes, files of layers, and what cannot be; parts of transients that stay on disk.
+
+
+SYSTEM = make_system(30.0, 50, 32)
+
+
+def test_a_pane_hides_behind_what_is_nearer():
+    scene = ml.Scene([[1.0, 4.0, np.nan]], 0.5, [[1.0, 2.0, 3.0]])
+    visible = LayeredScene.behind_pane(scene, 2.0, 0.1, 0.8)
+    np.testing.assert_array_equal(visible.layers[1].depth_m, [[np.nan, 2.0, 2.0]])
+    np.testing.assert_allclose(visible.reflectivity, [[0.5, 0.4, 0.4]])
+    assert visible.valid.all()
+    flux = visible.flux(SYSTEM, signal=2.0, sbr=4.0)
+    assert flux.returns_signal.shape == (2, 1, 3)
+    assert flux.signal.mean() == pytest.approx(2.0)
+    np.testing.assert_allclose(flux.returns_signal[:, 0, 1] / flux.signal[0, 0], [0.8, 0.2])
+    np.testing.assert_allclose(flux.background, 0.5 * np.array([[0.5, 1.0, 1.5]]))  # the map of the first layer
+    near = visible.flux(SYSTEM, signal=2.0, sbr=4.0, attenuation="inverse_square", ambient="reflectivity")
+    np.testing.assert_allclose(near.returns_signal[:, 0, 1] / near.signal[0, 0], [0.4 / 16 / 0.5, 0.1 / 4 / 0.5])
+    np.testing.assert_allclose(near.background / near.background[0, 0], [[1.0, 1.0, 0.2]])  # the last: the pane alone
+    twice = LayeredScene.behind_pane(visible, 1.5, 0.2)
+    assert len(twice.layers) == 3
+    assert twice[:, 1:].shape == (1, 2)
+    assert twice.resize((2, 6)).shape == (2, 6)
+
+
+@pytest.mark.filterwarnings("ignore:.* have no return")
+def test_ambient_light_of_layers_in_any_order():
+    nan, rng = np.nan, np.random.default_rng(5)
+    depths = [[[1.0, nan, nan, 3.0, nan]], [[2.0, 2.0, nan, nan, nan]], [[4.0, nan, 4.0, nan, nan]]]
+    layers = [ml.Scene(depth, rng.uniform(0.1, 0.9, (1, 5))) for depth in depths]
+    share = [item.reflectivity[0] for item in layers]
+    sums = [share[0][0] + share[1][0] + share[2][0], share[1][1], share[2][2], share[0][3], max(s[4] for s in share)]
+    for order in itertools.permutations(range(3)):
+        flux = LayeredScene([layers[k] for k in order]).flux(SYSTEM, signal=2.0, sbr=4.0, ambient="reflectivity")
+        np.testing.assert_allclose(flux.background[0] / flux.background[0, 1], np.array(sums) / sums[1], rtol=1e-12)
+        assert flux.background[0, :4].mean() == pytest.approx(0.5)  # over the pixels with a return
+    alone = layers[0].flux(SYSTEM, signal=2.0, sbr=4.0, ambient="reflectivity")
+    item = LayeredScene(layers[:1]).flux(SYSTEM, signal=2.0, sbr=4.0, ambient="reflectivity")
+    np.testing.assert_array_equal(alone.background, item.background)
+
+
+def test_bad_layers(tmp_path):
+    item = ml.Scene(np.ones((2, 2)), 1.0)
+    for layers, message in (([], "1 to 16"), ([item] * 17, "1 to 16"), ([item, ml.Scene([[1.0]], 1.0)], "one shape")):
+        refused(message, LayeredScene, layers)
+    for arguments, name in (((0.0, 0.1), "depth_m"), ((1.0, 2.0), "reflectivity"), ((1.0, 0.1, 0.0), "transmission")):
+        refused(f"{name} must be", LayeredScene.behind_pane, item, *arguments)
+    path = tmp_path / "s.npz"
+    depth = np.ones((2, 3, 4))
+    for arrays, message in (
+        ({"depth": depth[0]}, r"must be an \.npz with a depth of \(layers, H, W\)"),
+        ({"depth": depth, "image": depth}, "give reflectivity, not image"),
+        ({"depth": depth, "reflectivity": depth[0]}, "reflectivity must have the shape of depth"),
+        ({"depth": depth, "reflectivity": 2 * depth}, r"reflectivity must lie in \[0, 1\]"),
+        ({"depth": depth, "background": depth}, r"background must be real numbers \(H, W\)"),
+        ({"depth": -depth}, "depth must not be negative"),
+        ({"depth": depth.astype(np.uint16)}, "give depth_unit_m"),
+        ({"depth": np.ones((17, 3, 4))}, "layers must be 1 to 16"),
+    ):
+        np.savez(path, **arrays)
+        refused(message, read_layers, path)
+    np.savez(path, depth=(1000 * depth).astype(np.uint16))
+    np.testing.assert_array_equal(read_layers(path, depth_unit_m=0.001).layers[1].depth_m, depth[1])
+
+
+def test_fog_made_by_rows_is_that_of_the_flux():
+    rng = np.random.default_rng(0)
+    clear = ml.Scene(rng.uniform(1.0, 12.0, (5, 4)), rng.uniform(0.1, 0.9, (5, 4))).flux(SYSTEM, signal=0.7, sbr=2.0)
+    stored = Fog(extinction_per_m=0.1, backscatter=0.5).before(clear, SYSTEM, 0.7)
+    whole = clear.in_fog(SYSTEM, extinction_per_m=0.1, backscatter=0.35)
+    np.testing.assert_array_equal(stored[1:4].waveform, whole.waveform[1:4])
+    np.testing.assert_allclose(stored.signal, whole.signal, rtol=1e-12)
+    assert np.array_equal(ml.simulate(stored, SYSTEM, seed=1), ml.simulate(whole, SYSTEM, seed=1))
+    refused("backscatter must be", Fog, extinction_per_m=0.1, backscatter=-1.0)
+
+
+def test_parts_of_a_transient():
+    values = np.random.default_rng(0).exponential(1.0, (6, 8, 5))
+    transient = Transient(values, 0.5)
+    crop = transient[4:1:-1, 1:7:2]
+    np.testing.assert_array_equal(crop.rows(slice(0, 3)), values[4:1:-1, 1:7:2])
+    np.testing.assert_array_equal(crop.rows(slice(1, 3)), values[3:1:-1, 1:7:2])
+    np.testing.assert_allclose(transient.resize((3, 4)).rows(slice(0, 3)), values.reshape(3, 2, 4, 2, 5).mean((1, 3)))
+    odd = transient.resize((4, 8))
+    rows = [values[0] + 0.5 * values[1], 0.5 * values[1] + values[2], values[3] + 0.5 * values[4]]
+    np.testing.assert_allclose(odd.rows(slice(0, 3)), np.stack(rows) / 1.5)
+    np.testing.assert_allclose(odd.totals.sum() / 4, values.sum() / 6)
+    assert Transient(values, 0.5, totals=values.sum(-1)).totals.shape == (6, 8)
+    refused("totals must have shape", Transient, values, 0.5, totals=[1.0])
+    with pytest.raises(IndexError, match="selects no pixel"):
+        transient[6:]
+
+
+# Returns in fog: the lidar equation, by brute force; limits.
+
+
+C = 0.299792458
+FOG_SYSTEM = make_system(30.0, 100, 200, sigma_ns=0.4)
+
+
+@pytest.mark.parametrize(("alpha", "first", "delay"), [(0.05, 0.5, 60.0), (1.0, 2.0, 33.3), (0.02, 1.0, 140.0)])
+def test_lidar_equation(alpha: float, first: float, delay: float):
+    flux = ml.Flux(0.7, 0.1, delay).in_fog(
+        FOG_SYSTEM, extinction_per_m=alpha, backscatter=1.3, nearest_m=first, parts=1000
+    )
+    assert (flux.background == 0.1).all()
+    target = 0.5 * C * delay
+    total = integrate.quad(lambda z: np.exp(-2 * alpha * z) / z**2, first, np.inf)[0]
+    observed = integrate.quad(lambda z: np.exp(-2 * alpha * z) / z**2, first, target)[0]
+    assert flux.signal == pytest.approx(0.7 * np.exp(-2 * alpha * target) + 1.3 * observed / total, rel=1e-6)
+    # the cloud through the pulse, point by point
+    z = np.linspace(first, target, 400_001)
+    density = np.exp(-2 * alpha * z) / z**2
+    weight = np.diff(z) * 0.5 * (density[1:] + density[:-1])
+    tau = (z[1:] + z[:-1]) / C
+    place = (tau[:, None] + 0.4 * np.random.default_rng(1).standard_normal((tau.size, 4))) % 100.0
+    cloud = np.histogram(place, 50, (0.0, 100.0), weights=np.repeat(weight[:, None], 4, 1))[0] * 1.3 / total / 4
+    target_energy = 0.7 * np.exp(-2 * alpha * target) * FOG_SYSTEM.pulse.bin_energy(delay, 100.0, 50)
+    assert flux.waveform.reshape(50, 20).sum(-1) == pytest.approx(
+        cloud + target_energy, abs=5e-3 * 1.3 * observed / total
+    )
+
+
+def test_limits():
+    clear = ml.Flux.multi(ml.Flux([[1.0, 0.0]], 0.2, [[30.0, np.nan]]), ml.Flux([[0.3, 0.0]], 0.0, [[50.0, np.nan]]))
+    thin = clear.in_fog(FOG_SYSTEM, extinction_per_m=1e-9, backscatter=0.0)
+    expected = FOG_SYSTEM.pulse.bin_energy(30.0, 100.0, 800) + 0.3 * FOG_SYSTEM.pulse.bin_energy(50.0, 100.0, 800)
+    assert thin.waveform.shape == (1, 2, 800)
+    assert thin.waveform[0, 0] == pytest.approx(expected, abs=1e-8)
+    assert not thin.waveform[0, 1].any()
+    thick = clear.in_fog(FOG_SYSTEM, extinction_per_m=3.0, backscatter=0.8)
+    assert thick.signal == pytest.approx(np.full((1, 2), 0.8), rel=1e-6)  # all of it comes from the fog
+    assert thick.info["extinction_per_m"] == 3.0
+    near = ml.Flux(1.0, 0.0, 3.0).in_fog(FOG_SYSTEM, extinction_per_m=0.1, backscatter=5.0)  # before the fog begins
+    assert near.signal == pytest.approx(np.exp(-0.2 * 1.5 * C), rel=1e-6)
+
+
+def test_light_that_comes_many_periods_late():
+    """Thin fog without a target: light from 50 km on 15 m of range, in a memory that does not grow with it."""
+    quick = FOG_SYSTEM.replace(pulse=ml.GaussianPulse(sigma_ns=0.001))
+    flux = ml.Flux([[0.0, 1.0]], 0.0, [[np.nan, 3e5]]).in_fog(
+        quick, extinction_per_m=1e-5, backscatter=1.0, nearest_m=0.5, parts=16
+    )
+
+    def share(z):
+        z = np.maximum(z, 0.5)
+        return 1.0 - special.expn(2, 2e-5 * z) / z * 0.5 / special.expn(2, 1e-5)
+
+    edges = np.arange(16 * 20_000 + 1) * (0.5 * C * 100.0 / 16)
+    for pixel, end in ((0, np.inf), (1, 0.5 * C * 3e5)):
+        expected = np.diff(share(np.minimum(edges, end))).reshape(-1, 16).sum(0)
+        expected += np.exp(-2e-5 * end) * quick.pulse.bin_energy(3e5, 100.0, 16) if pixel else 0.0
+        assert flux.waveform[0, pixel] == pytest.approx(expected, abs=1e-6)
+
+
+def test_bad_input():
+    flux = ml.Flux(1.0, 0.0, 30.0)
+    for light, changes, message in (
+        (flux, {"extinction_per_m": 0.0}, "extinction_per_m must be"),
+        (flux, {"backscatter": -1.0}, "backscatter must be"),
+        (flux, {"nearest_m": 0.0}, "nearest_m must be"),
+        (flux, {"parts": 0}, "parts must be"),
+        (ml.Flux(1.0, 0.0, -3.0), {}, "delay_ns must be >= 0 in fog"),
+        (ml.Flux(waveform=[1.0]), {}, "needs the delays of returns"),
+    ):
+        refused(message, light.in_fog, FOG_SYSTEM, **{"extinction_per_m": 0.1, "backscatter": 1.0} | changes)

@@ -9,9 +9,13 @@ import pytest
 from harness import require
 from scipy import stats
 
+from mars_lidar.engines import ANY_SYSTEM
 from studies.__main__ import main
+from studies.joint import covariance as joint_covariance
 from studies.joint import run as joint
-from studies.joint import table as bins
+from studies.joint import table as joint_table
+from studies.joint.covariance import QUICK, random_systems
+from studies.joint.table import COARSE, RATIOS, REFERENCE, SEVEN, Case, Law, Sample
 from tests.harness.study import quick_study
 
 
@@ -62,16 +66,16 @@ def test_qda_sees_covariance():
     assert result > 0.7
 
 
-SHORT = bins.Case("too short", 1.0, 1.0, 0.6375, cycles=50)
+SHORT = joint_table.Case("too short", 1.0, 1.0, 0.6375, cycles=50)
 
 
 def test_features():
-    case, settings = bins.REFERENCE[0], joint.Settings((), 50, bins=256)
+    case, settings = REFERENCE[0], joint.Settings((), 50, bins=256)
     fine = joint.near(case, 256)
     x = joint.Sample.of(case, settings, "feedback", 1)
     assert not x.handed
-    assert x.coarse.shape == (50, bins.COARSE + 2)
-    assert (x.coarse[:, : bins.COARSE].sum(1) == x.coarse[:, -2]).all()
+    assert x.coarse.shape == (50, COARSE + 2)
+    assert (x.coarse[:, :COARSE].sum(1) == x.coarse[:, -2]).all()
     assert {128 - 16, 128, 128 + 16} <= set(fine.tolist())
     echo = int(256 * (0.5 + 0.6375 - 1.0))
     assert {echo - 16, echo + 16} <= set(fine.tolist())
@@ -104,7 +108,7 @@ def test_files(tmp_path):
                 outcomes[f"{row['case']}, {row['engine']}, {key}"] = 2 * stats.norm.sf(abs(z))
     assert len(outcomes) == 16
     require(outcomes, "joint study")
-    bright = [row for row in rows if row["case"] == bins.SEVEN[6].name]
+    bright = [row for row in rows if row["case"] == SEVEN[6].name]
     recorded = {row["engine"]: float(row["auc_qda"]) for row in bright if row["auc_qda"]}
     assert recorded["mars"] > 0.7, "its window variance is more than twice the exact one"
     assert recorded["renewal"] > 0.7
@@ -115,3 +119,108 @@ def test_without_scikit_learn(tmp_path, monkeypatch, capsys):
     assert main(["joint", "--quick", "--out", str(tmp_path)]) == 2
     assert "mars-lidar[studies]" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+# The study of the closed-form covariance in its quick form: law and exact engine agree on random systems.
+
+
+@pytest.fixture(scope="module")
+def systems():
+    return random_systems(QUICK, str)
+
+
+@pytest.mark.full
+def test_random_systems(systems):
+    """One z from each system and kind: independent, standard normal."""
+    for name, z in joint_covariance._scores(systems, QUICK).items():
+        outcome = {"normal": stats.kstest(z, "norm").pvalue, "chi-square": stats.chi2.sf((z**2).sum(), z.size)}
+        require(outcome, f"joint-covariance study, {name}")
+    assert {o.law.settled >= 0 for o in systems} == {True, False}, "both routes"
+
+
+@pytest.mark.full
+def test_report(systems, tmp_path, monkeypatch):
+    monkeypatch.setattr(joint_covariance, "random_systems", lambda *_: systems)
+    study = quick_study("joint-covariance", tmp_path)
+    assert "Quick run" in study.text
+    assert "None given" in study.text
+    assert study.figures == ["joint_covariance.png"]
+    assert len(study.rows) == QUICK.systems
+    assert all(float(row["movement"]) <= 1e-4 for row in study.rows)
+
+
+# The joint table: what samples are compared with, against independent bins and known figures, and its quick form.
+
+
+def compared(case, engine, exposures, seed):
+    """Ratios to the closed form of a sample on 256 bins."""
+    return Law(case, 256).ratios(Sample.of(case, 256, engine, exposures, seed))
+
+
+def test_files_of_the_table(tmp_path):
+    study = quick_study("joint-table", tmp_path)
+    assert len(study.rows) == len(joint_table.QUICK.cases) * len(ANY_SYSTEM)
+    assert {row["engine"] for row in study.rows} == set(ANY_SYSTEM)
+    assert all(f"| {case.name} |" in study.text for case in joint_table.QUICK.cases)
+
+
+def test_cases_are_the_declared_ones():
+    assert len(REFERENCE) == 10
+    assert len(SEVEN) == 7
+    assert [case.name for case in joint_table.FULL.cases] == [case.name for case in (*REFERENCE, *SEVEN)]
+
+
+def test_window_goes_round_the_circle():
+    inside = np.flatnonzero(REFERENCE[6].window(1024))
+    assert {0, 1023} <= set(inside.tolist())
+    assert inside.size == pytest.approx(6 * 0.00375 * 1024, abs=1)
+    assert Case("narrow", 1.0, 1.0, 0.5, sigma=1e-4).window(64).sum() == 2
+
+
+def test_without_dead_time_bins_are_independent():
+    """Poisson bins: both engines have the law's window, bins and count; no covariance of neighbours to compare."""
+    case = Case("no dead time", 0.5, 0.5, 0.0, cycles=300)
+    outcomes = {}
+    for seed, engine in enumerate(("exact", "poisson")):
+        result = compared(case, engine, 4000, seed)
+        assert list(result) == list(RATIOS)
+        for key, none in (("window", 1.0), ("bin", 1.0), ("count", 1.0), ("window mean", 0.0)):
+            value, error = result[key]
+            outcomes[f"{engine}: {key}"] = 2 * stats.norm.sf(abs(value - none) / error)
+            assert not joint_table.beyond(result[key], key)
+    require(outcomes, "joint table")
+
+
+@pytest.mark.full
+def test_errors_are_the_scatter_of_samples():
+    """Standard errors of 60 samples of one law against the scatter of their ratios; 5 of its own errors."""
+    case, law = SEVEN[6], Law(SEVEN[6], 256)
+    results = [law.ratios(Sample.of(case, 256, "exact", 500, k)) for k in range(60)]
+    outcomes = {}
+    for key in RATIOS:
+        value, error = np.array([item[key] for item in results]).T
+        z = (value - (key != "window mean")) / error
+        outcomes[key] = 2 * min(stats.chi2.sf((z**2).sum(), z.size), stats.chi2.cdf((z**2).sum(), z.size))
+    require(outcomes, "errors of the joint table")
+
+
+def test_dead_time_is_seen():
+    """The closed form, whose count and window variance the reference simulation gave as 140.2 and 273.6."""
+    law = Law(REFERENCE[0], 256)
+    assert law._count == pytest.approx(140.2, rel=0.05)
+    assert law._window[1] == pytest.approx(273.6, rel=0.05)
+    result = compared(REFERENCE[0], "poisson", 800, 2)
+    assert result["count"][0] > 5
+    assert all(joint_table.beyond(result[key], key) for key in ("window", "bin", "count", "window mean"))
+    assert compared(SEVEN[6], "mars", 800, 3)["window"][0] == pytest.approx(2.3, rel=0.3)
+
+
+def test_bins_without_neighbours():
+    """Neighbours are compared only where both bins vary; a lone pulse has none."""
+    case = Case("pulse alone", 1.0, 0.0, 0.1, delay=0.5 + 0.5 / COARSE, sigma=0.0005, cycles=100)
+    result = compared(case, "sequential", 400, 2)
+    assert np.isnan(result["neighbour"]).all()
+    assert not joint_table.beyond(result["neighbour"], "neighbour")
+    assert result["bin"][0] == pytest.approx(1.0, abs=6 * result["bin"][1])
+    near = Case("on an edge", 1.0, 0.0, 0.1, delay=0.5, sigma=0.0005, cycles=100)
+    assert np.isfinite(compared(near, "exact", 400, 3)["neighbour"]).all()

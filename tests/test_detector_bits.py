@@ -27,36 +27,18 @@ DETECTORS: dict[str, dict[str, Any]] = {
 }
 # Start of the SHA-256 of the cubes (2 realizations, seed 2**63 + 1), as little-endian uint32; see
 # test_reproducibility.py.
+LIGHTS = ("gaussian", "returns", "sampled", "waveform", "whole periods")
+OTHER_LIGHTS = ("stationary", "stationary waveform", "long dead time")  # no start of a moving gate is stationary
+BITS = """
+paralyzable 195c64d00133 0746b1a76141 414db86b0651 bbf85cb92979 95832b01433d 9cb3fca214e0 8dbfe198298a b1c2de556d0f
+synchronous 5e2fb06ab885 2f1c241ef0d2 0f1db204f2eb e23bb5c64d7f 30365f65cb2c fac5eb740995 12cdfd8f949c 434dfebbb61e
+gated 1ccd551675ad c2337b2c598a 4801bac9c25c 96f0446f147c 89c8e0890dda fa61095eae92 dd4589e48507 7d1f00c9c48d
+moving 012d4c326ae5 5b03b7940810 8cffb1cccbc7 c2e7cf93ecb5 ffa11c61a6ed
+"""
 GOLDEN = {
-    "paralyzable gaussian": "195c64d00133",
-    "paralyzable returns": "0746b1a76141",
-    "paralyzable sampled": "414db86b0651",
-    "paralyzable waveform": "bbf85cb92979",
-    "paralyzable stationary": "9cb3fca214e0",
-    "paralyzable stationary waveform": "8dbfe198298a",
-    "paralyzable whole periods": "95832b01433d",
-    "paralyzable long dead time": "b1c2de556d0f",
-    "synchronous gaussian": "5e2fb06ab885",
-    "synchronous returns": "2f1c241ef0d2",
-    "synchronous sampled": "0f1db204f2eb",
-    "synchronous waveform": "e23bb5c64d7f",
-    "synchronous stationary": "fac5eb740995",
-    "synchronous stationary waveform": "12cdfd8f949c",
-    "synchronous whole periods": "30365f65cb2c",
-    "synchronous long dead time": "434dfebbb61e",
-    "gated gaussian": "1ccd551675ad",
-    "gated returns": "c2337b2c598a",
-    "gated sampled": "4801bac9c25c",
-    "gated waveform": "96f0446f147c",
-    "gated stationary": "fa61095eae92",
-    "gated stationary waveform": "dd4589e48507",
-    "gated whole periods": "89c8e0890dda",
-    "gated long dead time": "7d1f00c9c48d",
-    "moving gaussian": "012d4c326ae5",
-    "moving returns": "5b03b7940810",
-    "moving sampled": "8cffb1cccbc7",
-    "moving waveform": "c2e7cf93ecb5",
-    "moving whole periods": "ffa11c61a6ed",
+    f"{mode} {kind}": bits
+    for mode, *row in map(str.split, BITS.strip().splitlines())
+    for kind, bits in zip(LIGHTS + OTHER_LIGHTS * (mode != "moving"), row, strict=True)
 }
 KINDS = [tuple(name.split(" ", 1)) for name in GOLDEN]
 

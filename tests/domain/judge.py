@@ -13,34 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special, stats
 
-from mars_lidar import (
-    CountLaw,
-    JointLaw,
-    count_law,
-    cramer_rao,
-    joint_law,
-    registration_pdf,
-    simulate,
-    simulate_timestamps,
-)
+import mars_lidar as ml
 from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics import ConvergenceError, mean_histogram, photons_per_bin
-from tests.domain import simulator
-from tests.domain.checks import (
-    FIRST_LEVEL,
-    Check,
-    Sample,
-    Windows,
-    against_law,
-    collect,
-    covariance_of,
-    handed,
-    mean_of,
-    rare,
-    simulated,
-    two_samples,
-    variances_of,
-)
+from tests.domain import checks, simulator
+from tests.domain.checks import FIRST_LEVEL, Check, Sample, Windows
 from tests.domain.systems import PERIOD_NS, Case
 
 _LIGHT = {"detection_efficiency", "dark_count_hz", "jitter", "code_density"}
@@ -132,10 +109,10 @@ class Predictions:
     def __init__(self, case: Case) -> None:
         self.case = case
         self.known = known(case)
-        self.law: CountLaw | None = None
+        self.law: ml.CountLaw | None = None
         self.pmf: tuple[int, FloatArray] | None = None
         self.histogram: FloatArray | None = None
-        self.joint: JointLaw | None = None
+        self.joint: ml.JointLaw | None = None
         self.windows: Windows | None = None
         self.window_mean: FloatArray | None = None
         self.window_variance: FloatArray | None = None
@@ -169,7 +146,7 @@ class Predictions:
         return self.histogram if self.histogram is not None else None if self.joint is None else self.joint.mean
 
     def _count_law(self) -> list[Check]:
-        law = count_law(self.case.flux()[0, 0], self.case.system, threads=1)
+        law = ml.count_law(self.case.flux()[0, 0], self.case.system, threads=1)
         self.law = law
         results = [_sane("count_law", bool(np.isfinite(law.cumulants).all() and law.mean >= 0 and law.variance >= 0))]
         if self.known is not None:
@@ -222,7 +199,7 @@ class Predictions:
 
     def _stationary(self) -> list[Check]:
         case = self.case
-        shape = np.asarray(registration_pdf(case.flux()[0, 0], case.system, "stationary", threads=1))
+        shape = np.asarray(ml.registration_pdf(case.flux()[0, 0], case.system, "stationary", threads=1))
         results = [_sane("stationary shape", bool(np.isfinite(shape).all() and abs(shape.sum() - 1.0) < 1e-6))]
         dead = case.system.dead_time_periods
         plain = case.mode == "nonparalyzable" and not case.system.detector.effects
@@ -240,7 +217,7 @@ class Predictions:
 
     def _joint(self) -> list[Check]:
         began = time.process_time()
-        joint = joint_law(self.case.flux()[0, 0], self.case.system)
+        joint = ml.joint_law(self.case.flux()[0, 0], self.case.system)
         took = time.process_time() - began
         self.joint = joint
         if self.windows is None:
@@ -264,7 +241,7 @@ class Predictions:
         return results
 
     def _bound(self) -> list[Check]:
-        bound = cramer_rao(self.case.flux()[0, 0], self.case.system, threads=1)
+        bound = ml.cramer_rao(self.case.flux()[0, 0], self.case.system, threads=1)
         errors = np.array([bound.signal, bound.background, bound.delay_ns], dtype=np.float64)
         return [_sane("cramer_rao", bool((errors > 0.0).all() and np.isfinite(bound.information).all()))]
 
@@ -299,8 +276,8 @@ def recorded(case: Case, seed: int, budget: float) -> list[Check]:
     flux, system = case.flux(pixels), case.system
     if case.mode in ("gated", "moving gate") and system.cycles * min(1.0, case.photons) * pixels > 10 * _INSPECTED:
         return []
-    times = simulate_timestamps(flux, system, seed=seed, threads=1)
-    cube = simulate(flux, system, seed=seed, threads=1).reshape(pixels, system.bins)
+    times = ml.simulate_timestamps(flux, system, seed=seed, threads=1)
+    cube = ml.simulate(flux, system, seed=seed, threads=1).reshape(pixels, system.bins)
     owner = np.repeat(np.arange(pixels), np.diff(times.offsets))
     binned = np.bincount(owner * system.bins + times.bin, minlength=cube.size).reshape(cube.shape)
     t = times.times_ns / PERIOD_NS
@@ -340,33 +317,15 @@ def _lattice(case: Case, t: NDArray[np.float64], owner: NDArray[np.int64]) -> li
     return results
 
 
-VERIFIED, REFUSED, HANDED, SLOW, FAILED, UNJUDGED = (
-    "verified",
-    "refused",
-    "given to exact",
-    "slower than real use",
-    "failed",
-    "not judged",
-)
+VERIFIED, REFUSED, HANDED = "verified", "refused", "given to exact"
+SLOW, FAILED, UNJUDGED = "slower than real use", "failed", "not judged"
 STATES = (VERIFIED, HANDED, REFUSED, SLOW, UNJUDGED, FAILED)
 ENGINES = ("exact", "feedback", "auto", "mars", "sequential")
 LAWS = ("count_law", "pmf", "mean_histogram", "stationary shape", "joint_law", "cramer_rao")
 SUBJECTS = (*ENGINES, "timestamps", *LAWS)
 _SUSPECTS = (
-    "feedback",
-    "auto",
-    "mars",
-    "cramer_rao",
-    "stationary shape",
-    "pmf",
-    "joint_law",
-    "mean_histogram",
-    "count_law",
-    "timestamps",
-    "exact",
-    "sequential",
-    "simulator",
-    "closed form",
+    *("feedback", "auto", "mars", "cramer_rao", "stationary shape", "pmf", "joint_law", "mean_histogram", "count_law"),
+    *("timestamps", "exact", "sequential", "simulator", "closed form"),
 )
 _ADVICE = re.compile(
     r"\b(use|engines?|instead|simulat\w*|give|take|methods?|shorter|fewer|must|at most|at least|mode)\b", re.IGNORECASE
@@ -420,12 +379,9 @@ _SLACK = {"feedback": 0.05, "auto": 0.05}  # standard deviations that the mean o
 _OWN = 0.15  # arrivals that the sweep's own simulator may draw, over the registrations of an engine
 _MARS_SECONDS = 0.03  # of its laws, beyond which engine "mars" is not asked for them again
 _DRAWN = ("exact", "sequential", "feedback", "auto", "mars")  # in order of drawing; each has a seed of its own
-_PAIRS = (
-    ("exact", "sequential"),
-    ("exact", "simulator"),
-    ("sequential", "simulator"),
-    ("feedback", "exact"),
-    ("auto", "exact"),
+_PAIRS = tuple(
+    pair.split()
+    for pair in ("exact sequential", "exact simulator", "sequential simulator", "feedback exact", "auto exact")
 )
 Tell = Callable[[str, str], None]
 
@@ -511,7 +467,7 @@ class _Judge:
         """Draw, and compare with the predictions."""
         case, per_exposure = self.case, self.case.registrations()
         if engine != "exact" and engine != "sequential":
-            simulate(case.flux(), case.system.replace(cycles=1), engine=engine, threads=1)  # claims it, or refuses
+            ml.simulate(case.flux(), case.system.replace(cycles=1), engine=engine, threads=1)  # claims it, or refuses
         # before a stationary exposure the sequential engine draws so many periods
         early = 320.0 * (case.system.dead_time_periods + 1.0) if case.system.start == "stationary" else 0.0
         arrivals = case.photons * (case.system.cycles + early)
@@ -526,7 +482,7 @@ class _Judge:
             items = self._handed(engine, items, per_exposure)
         if self.windows is None:
             self.windows = Windows.of(case, self._pilot())
-        sample = simulated(engine, case, items, self.seed + 1 + 1000 * _DRAWN.index(engine), self.windows)
+        sample = checks.simulated(engine, case, items, self.seed + 1 + 1000 * _DRAWN.index(engine), self.windows)
         if sample.counts.sum() > 0 or items * per_exposure > 30:
             self.samples[engine] = sample
         if engine in ("feedback", "auto") and sample.handed >= 1.0:
@@ -540,7 +496,7 @@ class _Judge:
     def _pilot(self) -> FloatArray:
         """Roughly the mean histogram where nothing predicts it: a few short exposures."""
         cycles = int(np.clip(1e5 / max(self.case.photons, 1e-9), 1, self.case.system.cycles))
-        cube = simulate(self.case.flux(), self.case.system.replace(cycles=cycles), threads=1, seed=self.seed + 99)
+        cube = ml.simulate(self.case.flux(), self.case.system.replace(cycles=cycles), threads=1, seed=self.seed + 99)
         return np.asarray(cube.reshape(-1).astype(np.float64) + 1e-9)
 
     def _handed(self, engine: str, items: int, per_exposure: float) -> int:
@@ -551,8 +507,8 @@ class _Judge:
         pixels = 1 if cost > 0.03 else 16
         report: dict[str, float] = {}
         case = self.case
-        simulate(case.flux(pixels), case.system, engine=engine, threads=1, seed=self.seed, report=report)
-        share = handed(report) / pixels
+        ml.simulate(case.flux(pixels), case.system, engine=engine, threads=1, seed=self.seed, report=report)
+        share = checks.handed(report) / pixels
         if share >= 1.0 and cost > EXPOSURE_SECONDS:
             raise _Skipped(HANDED, "report: pixels given to exact")
         if share > 0.0:
@@ -571,10 +527,10 @@ class _Judge:
                 continue
             mean, variance = np.array([float(law.mean)]), np.array([float(law.variance)])
             allowed = (slack + TOLERANCE) * np.sqrt(variance) + (2e-6 * mean + 0.03) * (slack > 0.0)
-            results += mean_of(sample, oracle, "mean of the count", number, mean, variance, allowed)
-            results += variances_of(sample, oracle, ["variance of the count"], number, variance)
+            results += checks.mean_of(sample, oracle, "mean of the count", number, mean, variance, allowed)
+            results += checks.variances_of(sample, oracle, ["variance of the count"], number, variance)
         if laws.pmf is not None and (slack == 0.0 or sample.items < 200):
-            results += against_law(sample, "pmf", *laws.pmf)
+            results += checks.against_law(sample, "pmf", *laws.pmf)
         if laws.histogram is not None and self.windows is not None:
             results += self._histogram(sample, laws.histogram, slack)
         if laws.joint is not None and laws.window_variance is not None and joint_claimed:
@@ -592,7 +548,9 @@ class _Judge:
         results = []
         if variance is not None:
             allowed = slack * np.sqrt(variance) * np.sqrt(10.0 * (slack > 0) + 1.0) + 0.2 * TOLERANCE * cells.sum()
-            results += mean_of(sample, "mean_histogram", "mean histogram", sample.cells, cells, variance, allowed)
+            results += checks.mean_of(
+                sample, "mean_histogram", "mean histogram", sample.cells, cells, variance, allowed
+            )
         for low, high in self.case.rare:
             bins = self.case.system.bins
             first, last = int(np.ceil(low * bins)), int(np.floor(high * bins))
@@ -600,7 +558,7 @@ class _Judge:
             expected = float(mean[inside].sum()) * sample.items
             if slack == 0.0 and 0 < inside.size < bins // 2 and expected < 1e5:
                 name = f"rare photons, {low:.4f} to {high:.4f}"
-                results.append(rare(sample, "mean_histogram", name, int(sample.total[inside].sum()), expected))
+                results.append(checks.rare(sample, "mean_histogram", name, int(sample.total[inside].sum()), expected))
         return results
 
     def _joint(self, sample: Sample, slack: float) -> list[Check]:
@@ -610,15 +568,15 @@ class _Judge:
         sd = np.sqrt(laws.window_variance)
         allowed = 1e-3 * sd + slack * sd * 3.0 + 1e-6 * laws.window_mean
         x = sample.windows
-        results = mean_of(
+        results = checks.mean_of(
             sample, "joint_law", "mean of the windows", x, laws.window_mean, laws.window_variance, allowed
         )
         names = ["variance of the count", "variance of the window", "variance of the echo"]
         if slack == 0.0 or sample.items < 1000:
-            results += variances_of(sample, "joint_law", names, x, laws.window_variance)
+            results += checks.variances_of(sample, "joint_law", names, x, laws.window_variance)
             pulse, echo = x[:, 1].astype(np.float64), x[:, 2].astype(np.float64)
             name = "covariance at the dead time"
-            results += covariance_of(sample, "joint_law", name, pulse, echo, laws.echo_covariance)
+            results += checks.covariance_of(sample, "joint_law", name, pulse, echo, laws.echo_covariance)
         return results
 
     def _own(self) -> None:
@@ -630,9 +588,9 @@ class _Judge:
         assert self.windows is not None
         self.tell("simulator", "begin")
         drawn = simulator.counts(self.case, items, self.seed + 5)
-        self.samples["simulator"] = collect("simulator", [drawn], self.windows)
-        checks = self._against_predictions(self.samples["simulator"])
-        self.outcomes.append(Outcome("simulator", VERIFIED, checks=checks))
+        self.samples["simulator"] = checks.collect("simulator", [drawn], self.windows)
+        compared = self._against_predictions(self.samples["simulator"])
+        self.outcomes.append(Outcome("simulator", VERIFIED, checks=compared))
         self.tell("simulator", "end")
 
     def _pairs(self) -> None:
@@ -642,12 +600,12 @@ class _Judge:
             if a in self.samples and b in self.samples and not self.samples[a].handed:
                 if a in ("feedback", "auto") and self.samples[b].items > 400:
                     continue  # feedback states its own error, which many exposures would see
-                checks = two_samples(self.samples[a], self.samples[b])
+                compared = checks.two_samples(self.samples[a], self.samples[b])
                 for name in (a, b):
                     outcome = by_name[name]
-                    if checks and outcome.state == UNJUDGED:
+                    if compared and outcome.state == UNJUDGED:
                         outcome.state = VERIFIED
-                by_name[a].checks = by_name[a].checks + checks
+                by_name[a].checks = by_name[a].checks + compared
 
 
 class _Skipped(Exception):

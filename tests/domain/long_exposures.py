@@ -104,21 +104,9 @@ def _family(every: list[dict[str, Any]], family: str) -> dict[str, Any]:
 def compare(case: Case, items: int, seed: int) -> dict[str, Any]:
     """A row of the study: outcome, and by how much the sample is off."""
     began, system = time.process_time(), case.system
-    row: dict[str, Any] = {
-        "case": case.name,
-        "family": case.family,
-        "S": sum(case.signal),
-        "B": case.background,
-        "t_d": system.dead_time_periods,
-        "cycles": system.cycles,
-        "bins": system.bins,
-        "start": system.start,
-        "outcome": "right",
-        "again": 0.0,
-        **dict.fromkeys(("mean", "window", "variance", "window variance", "near"), 0.0),
-        "seconds": 0.0,
-        "note": "",
-    }
+    row = _facts(case) | {"cycles": system.cycles, "bins": system.bins, "start": system.start, "outcome": "right"}
+    row |= dict.fromkeys(("again", "mean", "window", "variance", "window variance", "near", "seconds"), 0.0)
+    row["note"] = ""
     report: dict[str, float] = {}
     _sample(case, 1, 1, seed, report)
     if report["refused"]:
@@ -128,10 +116,10 @@ def compare(case: Case, items: int, seed: int) -> dict[str, Any]:
         law = joint_law(case.flux()[0, 0], system, tolerance=TOLERANCE)
     except (ConvergenceError, ValueError, MemoryError) as error:
         return row | {"outcome": "law refused", "note": f"{type(error).__name__}: {error}"[:200]}
-    judged = Judged.of(case, law, items, seed, report)
-    if judged.wrong:
-        judged = Judged.of(case, law, AGAIN * items, seed + 500_000, report)
-    return row | judged.row | {"seconds": round(time.process_time() - began, 2)}
+    judged = judged_row(case, law, items, seed, report)
+    if judged["outcome"] == "wrong":
+        judged = judged_row(case, law, AGAIN * items, seed + 500_000, report)
+    return row | judged | {"seconds": round(time.process_time() - began, 2)}
 
 
 def redrawn(case: Case, items: int, seed: int) -> dict[str, Any]:
@@ -152,12 +140,7 @@ def redrawn(case: Case, items: int, seed: int) -> dict[str, Any]:
         number, again = number + len(x), again + report["again"]
     off = (total / number - mean) / np.sqrt(variance)
     share = again / number
-    return {
-        "case": case.name,
-        "family": case.family,
-        "S": sum(case.signal),
-        "B": case.background,
-        "t_d": case.system.dead_time_periods,
+    return _facts(case) | {
         "exposures": number,
         "redrawn": share,
         "bound": float(np.sqrt(share / (1.0 - share))),
@@ -167,6 +150,11 @@ def redrawn(case: Case, items: int, seed: int) -> dict[str, Any]:
     }
 
 
+def _facts(case: Case) -> dict[str, Any]:
+    light = {"S": sum(case.signal), "B": case.background}
+    return {"case": case.name, "family": case.family, **light, "t_d": case.system.dead_time_periods}
+
+
 def _sample(case: Case, items: int, pixels: int, seed: int, report: dict[str, float]) -> NDArray[Any]:
     cube = simulate(
         case.flux(pixels), case.system, engine=_Sampled(), realizations=-(-items // pixels), seed=seed, report=report
@@ -174,58 +162,40 @@ def _sample(case: Case, items: int, pixels: int, seed: int, report: dict[str, fl
     return cube.reshape(-1, case.system.bins)
 
 
-@dataclass(frozen=True)
-class Judged:
-    """What a sample is off by; `wrong`: by more than is allowed and the sample's noise."""
+def judged_row(case: Case, law: JointLaw, items: int, seed: int, report: dict[str, float]) -> dict[str, Any]:
+    """By how much `items` drawn exposures are off; outcome "wrong": by more than is allowed and the sample's noise."""
+    x = _sample(case, items, min(_MOST_PIXELS, items), seed, report).astype(np.float64)
+    n = len(x)
+    weights = _linear(case)
+    weights = weights[weights @ law.mean * n >= _FEWEST]
+    mean, variance = law.window(weights)
+    moving = variance * n >= _FEWEST  # else no more can be said than that it did not change
+    weights, mean, variance = weights[moving], mean[moving], variance[moving]
+    windows = _off(x @ weights.T, mean, variance)
+    rare = np.minimum(law.mean, law.variance) * n < _FEWEST
+    bins = _off(x, law.mean, law.variance)
+    scaled = np.where(rare, 0.0, (x - law.mean) / np.sqrt(np.maximum(law.variance, 1e-300)))
+    near = _near(case) & (law.mean > 1.0)
+    each = np.mean(scaled[:, near] ** 2, axis=1) - 1.0 if near.any() else np.zeros(n)
+    near_off, near_error = float(each.mean()), float(each.std() / np.sqrt(n))
+    bins = {key: value[~rare] for key, value in bins.items()}
+    many = law.mean[~rare] > _FEWEST
+    errors = [np.abs(both["mean"]) - MEAN_OFF - SIGMAS * both["mean error"] for both in (bins, windows)]
+    errors += [
+        (np.abs(both["variance"]) - VARIANCE_OFF - SIGMAS * both["variance error"])[some]
+        for both, some in ((bins, many), (windows, mean > _FEWEST))
+    ]
+    errors.append(np.array([abs(near_off) - VARIANCE_OFF - SIGMAS * near_error]))
+    wrong = any((e > 0.0).any() for e in errors)
 
-    row: dict[str, Any]
+    def largest(values: FloatArray) -> float:
+        return float(values[np.argmax(np.abs(values))]) if values.size else 0.0
 
-    @property
-    def wrong(self) -> bool:
-        """Whether it is wrong."""
-        return bool(self.row["outcome"] == "wrong")
-
-    @classmethod
-    def of(cls, case: Case, law: JointLaw, items: int, seed: int, report: dict[str, float]) -> Judged:
-        """Draw `items` exposures and compare them with their law."""
-        x = _sample(case, items, min(_MOST_PIXELS, items), seed, report).astype(np.float64)
-        n = len(x)
-        weights = _linear(case)
-        weights = weights[weights @ law.mean * n >= _FEWEST]
-        mean, variance = law.window(weights)
-        moving = variance * n >= _FEWEST  # else no more can be said than that it did not change
-        weights, mean, variance = weights[moving], mean[moving], variance[moving]
-        windows = _off(x @ weights.T, mean, variance)
-        rare = np.minimum(law.mean, law.variance) * n < _FEWEST
-        bins = _off(x, law.mean, law.variance)
-        scaled = np.where(rare, 0.0, (x - law.mean) / np.sqrt(np.maximum(law.variance, 1e-300)))
-        near = _near(case) & (law.mean > 1.0)
-        each = np.mean(scaled[:, near] ** 2, axis=1) - 1.0 if near.any() else np.zeros(n)
-        near_off, near_error = float(each.mean()), float(each.std() / np.sqrt(n))
-        bins = {key: value[~rare] for key, value in bins.items()}
-        many = law.mean[~rare] > _FEWEST
-        errors = [np.abs(both["mean"]) - MEAN_OFF - SIGMAS * both["mean error"] for both in (bins, windows)]
-        errors += [
-            (np.abs(both["variance"]) - VARIANCE_OFF - SIGMAS * both["variance error"])[some]
-            for both, some in ((bins, many), (windows, mean > _FEWEST))
-        ]
-        errors.append(np.array([abs(near_off) - VARIANCE_OFF - SIGMAS * near_error]))
-        wrong = any((e > 0.0).any() for e in errors)
-
-        def largest(values: FloatArray) -> float:
-            return float(values[np.argmax(np.abs(values))]) if values.size else 0.0
-
-        return cls(
-            {
-                "outcome": "wrong" if wrong else "right",
-                "again": report["again"],
-                "mean": abs(largest(bins["mean"])),
-                "window": abs(largest(windows["mean"])),
-                "variance": largest(bins["variance"][many]),
-                "window variance": largest(windows["variance"][mean > _FEWEST]),
-                "near": near_off,
-            }
-        )
+    means = {"mean": abs(largest(bins["mean"])), "window": abs(largest(windows["mean"]))}
+    variances = {"variance": largest(bins["variance"][many])}
+    variances["window variance"] = largest(windows["variance"][mean > _FEWEST])
+    outcome = {"outcome": "wrong" if wrong else "right", "again": report["again"]}
+    return outcome | means | variances | {"near": near_off}
 
 
 def _off(x: FloatArray, mean: FloatArray, variance: FloatArray) -> dict[str, FloatArray]:

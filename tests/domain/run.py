@@ -24,29 +24,13 @@ from tests.domain.sweep import Judged, Lines, Settings
 SEED = 20_261_124
 FULL = Settings(3000, SEED, Budget(4e5, 4e6, 800), 100_000)
 QUICK = Settings(60, SEED, Budget(4e5, 4e6, 800), 3_000)
-_UNITS = {  # of the effects of comparisons
-    "mean": "standard deviations of one exposure",
-    "variance": "relative",
-    "covariance": "correlation",
-}
+_UNITS = {"mean": "standard deviations of one exposure", "variance": "relative", "covariance": "correlation"}
 _LISTED = 40  # failures that the report names; all are in domain_failures.csv
-_INK = {
-    VERIFIED: "#3b78b5",
-    HANDED: "#8fc1e3",
-    REFUSED: "#c9c9c9",
-    SLOW: "#f0a03c",
-    UNJUDGED: "#7a7a7a",
-    FAILED: "#c4161c",
-}
+_INK = {VERIFIED: "#3b78b5", HANDED: "#8fc1e3", REFUSED: "#c9c9c9"}
+_INK |= {SLOW: "#f0a03c", UNJUDGED: "#7a7a7a", FAILED: "#c4161c"}
 _DOTS = 6  # in a decade, at most: those of one state that would lie on each other are drawn once
 _LEAST = {"S": 1e-7, "B": 1e-7, "dead": 1e-4}  # where zeros are drawn
-_TITLE = {
-    "S": "S (0 at the edge)",
-    "B": "B (0 at the edge)",
-    "dead": "dead time / period",
-    "cycles": "cycles",
-    "bins": "bins",
-}
+_TITLE = {"S": "S (0 at the edge)", "B": "B (0 at the edge)", "dead": "dead time / period"}
 
 
 def run(settings: Settings, request: Request) -> Facts:
@@ -87,12 +71,8 @@ def run(settings: Settings, request: Request) -> Facts:
 
 def case_row(judged: Judged) -> dict[str, Any]:
     """A case on one line: what it is, and the state of every subject ("" where it was not asked)."""
-    states = {outcome.subject: outcome.state for outcome in judged.outcomes}
-    return (
-        judged.case.facts()
-        | {subject: states.get(subject, "") for subject in SUBJECTS}
-        | {"checks": judged.checks, "seconds": round(judged.seconds, 2)}
-    )
+    states = dict.fromkeys(SUBJECTS, "") | {o.subject: o.state for o in judged.outcomes if o.subject in SUBJECTS}
+    return judged.case.facts() | states | {"checks": judged.checks, "seconds": round(judged.seconds, 2)}
 
 
 def failure_rows(judged: list[Judged]) -> list[dict[str, Any]]:
@@ -123,16 +103,17 @@ def _slow(judged: Sequence[Judged], subject: str) -> dict[str, Any]:
     def share(some: list[str]) -> str:
         return f"{some.count(SLOW)} of {len(some)}"
 
-    load = [(item, state, item.case.photons * item.case.system.dead_time_periods) for item, state in asked]
     seconds = [o.seconds for item in judged for o in item.outcomes if o.subject == subject and o.state == VERIFIED]
     quantiles = np.quantile(seconds, (0.5, 0.99)).tolist() if seconds else []
+    cases = [(item.case, state) for item, state in asked]
+    load = [(case.photons * case.system.dead_time_periods, state) for case, state in cases]
     return {
         "": f"`{subject}`",
-        "all": share([state for _, state in asked]),
-        "up to 1e4 cycles": share([state for item, state in asked if item.case.system.cycles <= 1e4]),
-        "bins up to 1024": share([state for item, state in asked if item.case.system.bins <= 1024]),
-        "S + B up to 10": share([state for item, state in asked if item.case.photons <= 10]),
-        "(S + B) t_d up to 8": share([state for _, state, x in load if x <= 8]),
+        "all": share([state for _, state in cases]),
+        "up to 1e4 cycles": share([state for case, state in cases if case.system.cycles <= 1e4]),
+        "bins up to 1024": share([state for case, state in cases if case.system.bins <= 1024]),
+        "S + B up to 10": share([state for case, state in cases if case.photons <= 10]),
+        "(S + B) t_d up to 8": share([state for x, state in load if x <= 8]),
         "of those verified: median, 99 %": " / ".join(f"{number(float(q))} s" for q in quantiles),
     }
 
@@ -142,17 +123,10 @@ def _drawn(judged: Sequence[Judged]) -> list[dict[str, Any]]:
     rows = []
     for family in sorted({item.case.family for item in judged}):
         some = [item for item in judged if item.case.family == family]
-        engines = [state for engine in ENGINES for _, state in _states(some, engine)]
-        rows.append(
-            {
-                "family": family,
-                "systems": len(some),
-                "comparisons": sum(item.checks for item in some),
-                "engines verified": engines.count(VERIFIED),
-                "engines failed": engines.count(FAILED),
-                "seconds each": float(np.mean([item.seconds for item in some])),
-            }
-        )
+        states = [state for engine in ENGINES for _, state in _states(some, engine)]
+        row = {"family": family, "systems": len(some), "comparisons": sum(item.checks for item in some)}
+        row |= {f"engines {state}": states.count(state) for state in (VERIFIED, FAILED)}
+        rows.append(row | {"seconds each": float(np.mean([item.seconds for item in some]))})
     return rows
 
 
@@ -189,10 +163,10 @@ def _map(rows: Sequence[dict[str, Any]], subjects: Sequence[str], x: str, y: str
                 dots = np.unique(np.round(np.log10(at.reshape(-1, 2)) * _DOTS, 0), axis=0)
                 ax.scatter(*10.0 ** (dots.T / _DOTS), s=2.5, marker="o", c=ink, lw=0, zorder=1 + (state == SLOW))
         ax.set(xscale="log", yscale="log")
-        ax.set_xlabel(_TITLE[x], fontsize=7)
+        ax.set_xlabel(_TITLE.get(x, x), fontsize=7)
         ax.set_title(subject, fontsize=8)
         ax.tick_params(labelsize=6, which="both")
-    axes[0, 0].set_ylabel(_TITLE[y], fontsize=7)
+    axes[0, 0].set_ylabel(_TITLE.get(y, y), fontsize=7)
     handles = [
         Line2D([], [], marker="x" if state == FAILED else "o", ls="", ms=4, color=ink, label=state)
         for state, ink in _INK.items()

@@ -66,7 +66,7 @@ def test_a_right_engine_passes_and_wrong_ones_do_not(monkeypatch: pytest.MonkeyP
     }
     assert min(c.p for o in outcomes for c in o.checks) > 1e-4
     monkeypatch.setattr(
-        judging,
+        judging.checks,
         "simulated",
         lambda engine, *rest: _called(simulated("poisson" if engine == "exact" else engine, *rest), engine),
     )

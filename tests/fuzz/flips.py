@@ -15,9 +15,7 @@ from mars_lidar.dataset import verify
 from tests.fuzz.formats import READERS, make
 
 KINDS = ("refused", "same", "wrong", "unnamed")  # read without an error, as it was or otherwise
-
-
-NAMES = (
+NAMES = [
     "set.zarr",
     "cube.zarr",
     "cube.h5",
@@ -27,8 +25,8 @@ NAMES = (
     "maps.npz",
     "photons.h5",
     "photons.npz",
-)
-NAMES += ("table.h5",)
+    "table.h5",
+]
 
 
 def content(name: str, path: Path) -> str:

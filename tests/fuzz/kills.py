@@ -42,24 +42,13 @@ else:
     io.simulate_to(path, ml.Flux(np.full((48, 48), 2.0), 0.5, 40.0), system, realizations=3, overwrite=True)
 print("end", flush=True)
 """
-WRITERS = {
-    "export": "files",
-    "generate": "set.zarr",
-    "overwrite": "old.zarr",
-    "cube.zarr": "cube.zarr",
-    "replaced.zarr": "replaced.zarr",
-    "cube.h5": "cube.h5",
-    "cube.npz": "cube.npz",
-    "cube.mat": "cube.mat",
-}
+WRITERS = {"export": "files", "generate": "set.zarr", "overwrite": "old.zarr"}
+WRITERS |= {name: name for name in ("cube.zarr", "replaced.zarr", "cube.h5", "cube.npz", "cube.mat")}
 
 
 def run(what: str, path: Path, source: Path, after_s: float | None) -> float:
     """Seconds from the first to the last line; killed `after_s` the first one, if that is given."""
-    if what == "cube.mat":  # one exposure
-        code = _CHILD.replace("realizations=3, ", "")
-    else:
-        code = _CHILD
+    code = _CHILD.replace("realizations=3, ", "") if what == "cube.mat" else _CHILD  # one exposure
     child = subprocess.Popen([sys.executable, "-c", code, what, str(path), str(source)], stdout=subprocess.PIPE)
     assert child.stdout is not None
     assert child.stdout.readline() == b"begin\n"

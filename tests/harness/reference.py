@@ -39,27 +39,22 @@ class Reference:
     def load(cls, name: str) -> "Reference":
         """Skips the test, saying so, where the cases are not there."""
         data = json.loads(shared(f"reference/{name}.json").read_text())
-        numbers = {int(n): k for n, k in data["count"].items()}
-        count = np.zeros(max(numbers) + 1, np.int64)
-        count[list(numbers)] = list(numbers.values())
-        return cls(
-            name=name,
-            signal=data["S"],
-            background=data["B"],
-            delay=data["tau"],
-            sigma=data["sigma"],
-            dead=data["dead"],
-            cycles=data["cycles"],
-            realizations=data["reals"],
-            count=count,
-            count_mean=data["count_mean"],
-            count_var=data["count_var"],
-            mean=np.array(data["hist_mean"]),
-            variance=np.array(data["hist_var"]),
-            lag1=np.array(data["hist_cov_lag1"]),
-            window_mean=data["win_mean"],
-            window_var=data["win_var"],
-        )
+        times = {int(n): k for n, k in data["count"].items()}
+        count = np.zeros(max(times) + 1, np.int64)
+        count[list(times)] = list(times.values())
+        numbers = {
+            "signal": "S",
+            "background": "B",
+            "delay": "tau",
+            "sigma": "sigma",
+            "dead": "dead",
+            "cycles": "cycles",
+        }
+        numbers |= {"realizations": "reals", "count_mean": "count_mean", "count_var": "count_var"}
+        numbers |= {"window_mean": "win_mean", "window_var": "win_var"}
+        arrays = {"mean": "hist_mean", "variance": "hist_var", "lag1": "hist_cov_lag1"}
+        fields = {field: data[key] for field, key in numbers.items()}
+        return cls(name=name, count=count, **fields, **{field: np.array(data[key]) for field, key in arrays.items()})
 
     def case(self, photons: float = 3e7, most: int = 20_000) -> Case:
         """The same, to be drawn until about so many photons have arrived."""

@@ -161,8 +161,7 @@ def test_middlebury_folder(tmp_path):
 def test_middlebury_folder_with_a_file_missing(tmp_path, name):
     folder = middlebury(tmp_path / "a")
     (folder / name).unlink()
-    with pytest.raises(ValueError, match=rf"{name} not found.*Middlebury"):
-        read_rgbd(folder)
+    refused(rf"{name} not found.*Middlebury", read_rgbd, folder)
 
 
 @pytest.mark.parametrize("text", ["", "two hundred", "nan", "-3", "1 2"])
@@ -293,8 +292,7 @@ def test_depths_beyond_the_largest_are_no_return(tmp_path):
     near, _, _ = read_rgbd(path, max_depth_m=5.0)
     assert np.array_equal(np.isnan(near), depth > 5.0)
     assert np.array_equal(np.isnan(read_rgbd(path, max_depth_m=5.0, focal_px=1.0)[0]), depth > 5.0)
-    with pytest.raises(ValueError, match="no pixel has a depth"):
-        read_rgbd(path, max_depth_m=0.5)
+    refused("no pixel has a depth", read_rgbd, path, max_depth_m=0.5)
     (tmp_path / "manifest.csv").write_text("depth,max_depth_m\nd.npy,10\n")
     (listed,), problems = io.scan(tmp_path)
     assert problems == []
@@ -317,8 +315,7 @@ def test_a_colour_image_is_no_depth(tmp_path, suffix):
         np.save(path, colours)
     else:
         Image.fromarray(colours).save(path)
-    with pytest.raises(ValueError, match=rf"colour\{suffix}: .*(4, 5, 3)"):
-        read_rgbd(path, depth_unit_m=1.0)
+    refused(rf"colour\{suffix}: .*(4, 5, 3)", read_rgbd, path, depth_unit_m=1.0)
 
 
 # NYUv2, Middlebury 2014, PFM and EXR scenes, and whole folders of scenes.

@@ -15,7 +15,7 @@ import h5py
 import jinja2
 import numpy as np
 import pytest
-from harness import make_system, require
+from harness import make_system, refused, require
 from matplotlib.figure import Figure
 from scipy import stats
 
@@ -107,8 +107,7 @@ def test_modes_without_convergence_name_the_cell(monkeypatch):
         ml.statistics.holding_time_covariance(ml.Flux(1.0, 1.0, 0.5 * system.period_ns), system, bins=128)
     )
     assert isinstance(leading.chain, PhaseChain)
-    with pytest.raises(ConvergenceError, match=r"S = 1, B = 1 .*eigenvalue 1 has a residual"):
-        leading.spectral_sum()
+    refused(r"S = 1, B = 1 .*eigenvalue 1 has a residual", leading.spectral_sum, error=ConvergenceError)
 
 
 @pytest.mark.full
@@ -227,8 +226,7 @@ def test_reference_study(tmp_path):
     assert abs(rows["exact"]["z_mean"]) < 5
     del case["tau"]
     (data / "made.json").write_text(json.dumps(case))
-    with pytest.raises(ValueError, match=r"made\.json must hold .* lacks tau"):
-        law._read(data / "made.json")
+    refused(r"made\.json must hold .* lacks tau", law._read, data / "made.json")
 
 
 @pytest.mark.parametrize(
@@ -249,8 +247,7 @@ def test_bad_command(arguments, message, capsys):
 
 
 def test_a_folder_without_cases_is_refused(tmp_path):
-    with pytest.raises(ValueError, match="data must be a folder with"):
-        Request(out=tmp_path, data=tmp_path).cases()
+    refused("data must be a folder with", Request(out=tmp_path, data=tmp_path).cases)
     assert Request(out=tmp_path).cases() == []
 
 
@@ -595,8 +592,7 @@ def test_a_template_is_filled_strictly(tmp_path: Path):
         "# A\n\n{{ for_looking }}\n\n{% for v in values %}\n- {{ v|f('.2f') }}\n{% endfor %}\n\n{{ rest }}\n"
     )
     request = Request(out=tmp_path, quick=True)
-    with pytest.raises(jinja2.UndefinedError, match="rest"):
-        report.render(request, template, {"values": [1.0]})
+    refused("rest", report.render, request, template, {"values": [1.0]}, error=jinja2.UndefinedError)
     facts = {"values": [1.0, 2.345], "rest": "end"}
     text = report.render(request, template, facts)
     assert text == "# A\n\n_Quick run: a preview, not for citation._\n\n- 1.00\n- 2.35\n\nend\n"

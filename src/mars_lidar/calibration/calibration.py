@@ -511,10 +511,6 @@ class _Run:
             if drift.flickers:
                 words = "flicker of the light, counts relative"
                 named.append(Suspect(words, drift.flicker_z, drift.flicker, np.nan, np.nan, option, included=False))
-        for score in {trial.effect.words: trial.score for trial in reversed(trials)}.values():  # the largest of a kind
-            if score.z > suspects.clear(trials):
-                words, option = score.effect.words, f"given {score.effect.names[0]}"
-                named.append(Suspect(words, score.z, score.size, score.error, np.nan, option, included=False))
         if p < min(self.level, FALSE_ALARM) and not any(not suspect.included for suspect in named):
             worst, z = _worst_cells(fitted)
             advice = "pulse='free', or returns=2" if worst.startswith("phases") else "no option of the model"
@@ -524,7 +520,7 @@ class _Run:
         wave, error = self.wave or (None, None)
         if wave is not None and error is not None:
             wave, error = (float(centre[0] / wave.sum()) * part for part in (wave, error))
-        others = suspects.alternatives(trials) if fitted.p_value >= FALSE_ALARM else []
+        others = [trial for trial in trials if fitted.p_value >= FALSE_ALARM and not trial.refuted]
         limits = tuple(_limit(trial, estimates, drift) for trial in others)
         for limit in limits:
             for name, (low, high) in limit.ranges.items():

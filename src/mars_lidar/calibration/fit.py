@@ -221,13 +221,13 @@ class Fitted:
     theta: FloatArray
     covariance: FloatArray  # of the law before the bounds
     unbounded: FloatArray  # (p,) before the bounds of the model
-    scatter: FloatArray  # (free, free) of the estimator for the recording, without the noise of the simulations
     batch: Batch  # cells and weights
     offset: FloatArray  # (c,) expected counts at the centre of the last streams
     estimator: FloatArray  # (free, c): parameters less that centre, by counts less their offset
     jacobian: FloatArray  # (c, free)
     rest: FloatArray  # (c,) residual counts
-    fresh: FloatArray  # (streams, c) the same of fresh streams, of the recording's exposure
+    noise: FloatArray  # (streams, c) counts of fresh streams less expected ones, of the recording's exposure
+    fresh: FloatArray  # (streams, c) their residual counts
     misfit_z: float  # standard deviations of the misfit above that of fresh streams
     p_value: float
     converged: bool
@@ -435,8 +435,9 @@ class Fit:
         estimator = estimator - cov[:, at_bound] @ np.linalg.pinv(cov[np.ix_(at_bound, at_bound)]) @ estimator[at_bound]
         unmoved = recorded - near.offset - jacobian[:, at_bound] @ (mean - centre)[free[at_bound]]
         project = np.eye(len(recorded)) - jacobian @ estimator
-        fresh = near.residual @ project.T
-        fresh = (fresh - fresh.mean(0)) / np.sqrt(near.ratio) * np.sqrt(len(y) / (len(y) - terms.shape[1]))
+        departure = near.residual * (len(y) / (len(y) - terms.shape[1]) / near.ratio) ** 0.5
+        fresh = departure @ project.T
+        fresh -= fresh.mean(0)
         rest = project @ unmoved
         (z, p), timed = _misfit(rest, fresh, law, near), free == model.light + 2
         judged, interval = self.shortest(model, draws(model, raw, cov, free)), None
@@ -447,16 +448,18 @@ class Fit:
                 at = mean.copy()
                 at[model.light + 2] = dead[0]
                 own = Guess(model, at, root_of(cov[np.ix_(~timed, ~timed)]), free[~timed])
-                other = self.finish(self.steps(own, photons, photons / 6.0)[0], known=True)
-                if other.converged and other.p_value > FALSE_ALARM:
+                stepped = self.steps(own, photons, photons / 6.0)[0]
+                for other in (by.finish(stepped, known=True) for by in (self.shorter, self)):  # the first costs less
+                    if not (other.converged and other.p_value > FALSE_ALARM):
+                        break
+                else:
                     return other
             if known:
                 interval, mean[model.light + 2] = dead, dead[0]
             elif early < FALSE_ALARM:
                 p = min(p, early)
-        scatter, converged = solve @ noise @ solve.T / near.ratio, bool(size.max() < _NEAR)
-        law_of_counts = law, near.offset, estimator, jacobian, rest, fresh
-        return Fitted(model, free, mean, cov, raw, scatter, *law_of_counts, z, p, converged, interval)
+        law_of_counts, converged = (law, near.offset, estimator, jacobian, rest, departure, fresh), size.max() < _NEAR
+        return Fitted(model, free, mean, cov, raw, *law_of_counts, z, p, bool(converged), interval)
 
 
 def _curved(

@@ -5,22 +5,23 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 from itertools import pairwise
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
 from mars_lidar._base.native import _core
 from mars_lidar._base.types import FloatArray, NDArray
 from mars_lidar.calibration.recording import Clock
-from mars_lidar.engines.simulation import simulate_timestamps
+from mars_lidar.engines.engine import Task
+from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.instrument.avalanches import Afterpulsing
 from mars_lidar.instrument.detector import Detector
 from mars_lidar.instrument.effects import Jitter
 from mars_lidar.instrument.pulse import GaussianPulse, Pulse
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
-from mars_lidar.light.timestamps import DrawnTimestamps
 
 _NARROWEST = 2e-6  # periods: the narrowest pulse that the engines draw
 _WIDEST = 0.3  # sigma of a recorded pulse, periods: a wider one is hardly distinguished from background
@@ -91,6 +92,20 @@ class Streams:
 
     def __iter__(self) -> Iterator[FloatArray]:
         return (self.times[a:b] for a, b in pairwise(self.offsets))
+
+
+@cache
+def _quantiles() -> NDArray[np.float32]:
+    """Quantiles (65536,) of a normal law of variance 1/2, in the middle of equally probable parts."""
+    from scipy.special import ndtri
+
+    return np.asarray(0.5**0.5 * ndtri((np.arange(2**16) + 0.5) / 2**16), np.float32)
+
+
+def _normal_deviates(number: int, seed: int) -> NDArray[np.float32]:
+    """Normal deviates (n,), each the sum of two quantiles of 16 random bits: a third of the time of NumPy's."""
+    words = np.frombuffer(np.random.Generator(np.random.SFC64(seed)).bytes(4 * number), np.uint16).reshape(2, number)
+    return np.asarray(_quantiles()[words[0]] + _quantiles()[words[1]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,12 +264,13 @@ class Model:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a trial value may look like one in another unit
             system = self.system(rows[0], cycles, jitter=False)
-            flux = self.varied(self.flux(rows), cycles, seed)
-            made = cast(DrawnTimestamps, simulate_timestamps(flux, system, seed=seed, threads=1))
+        flux = self.varied(self.flux(rows), cycles, seed)
+        task = Task(flux, system, 1, 0, np.arange(len(rows), dtype=np.uint32), seed, threads=1, progress=None)
+        most = self.clock.period_ns / max(system.detector.dead_time_ns, 1e-9)  # registrations in a period
+        made = ExactEngine().records(task, float(cycles * np.minimum(flux.total, most).sum()))
         sigma = self.widths(rows)[1] * jitter
         sigma[sigma <= _NARROWEST * self.clock.period_ns] = 0.0
-        number = made.phase.size if sigma.any() else 0
-        deviates = np.random.default_rng(seed).standard_normal(number, dtype=np.float32)
+        deviates = _normal_deviates(made.phase.size if sigma.any() else 0, seed)
         times, clock = np.empty(made.phase.size), self.clock
         grid = clock.period_ns, clock.unit_ns, clock.offset, clock.locked
         _core.recorded_times(

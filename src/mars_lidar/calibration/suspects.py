@@ -15,7 +15,6 @@ from mars_lidar.calibration.recording import FALSE_ALARM, LEAST_PHOTONS, Recordi
 from mars_lidar.calibration.start import with_edge
 
 _MISFIT = 1e-3  # a fit is bad if its p-value is below this fraction of another's
-_TRIED = 0.1  # false-alarm probability of a score or a misfit at which effects are tried; the refit decides
 _PARTS = 16  # of a recording, for drift: a trend then has 14 degrees of freedom
 
 
@@ -58,21 +57,28 @@ def _score(fit: Fit, fitted: Fitted, plain: FloatArray, model: Model, theta: Flo
     return Score(effect, float(fitted.rest @ along), spread, shift)
 
 
-def scores(fit: Fit, fitted: Fitted, plain: FloatArray) -> list[Score]:
-    """The score of each effect beyond the `plain` counts of the model, the most significant first."""
+def possible(fit: Fit, fitted: Fitted, plain: FloatArray) -> list[Trial]:
+    """Effects that the stream may have beyond the `plain` counts of the model, one trial of each kind.
+
+    Afterpulses start from the mean delay with the largest score. A paralyzable detector, of size 1, is left out of a
+    stream that fits where the 95 % upper limit of its score is below 1.
+    """
     model = fitted.model
     of = {"afterpulsing": "afterpulse_probability", "mode": "paralyzable"}
     have = {of.get(name, name) for name, _ in model.fields} | {*model.names}
-    centre, listed = model.bounded(fitted.theta), []
+    centre = model.bounded(fitted.theta)
     dead = float(centre[model.light + 2])
     given = model.light + 2 not in fitted.free and fitted.by_shortest is None  # the detector's, not the electronics'
     have |= {"electronics_excess"} if given or "electronics_dead_time_ns" in have else set()
+    listed: list[Score] = []
     for effect in effects(dead) if dead > 0.0 else ():
         if effect.names[0] not in have:
             wider = replace(model, effects=(*model.effects, effect))
             with suppress(ValueError):  # a detector cannot have both
                 listed.append(_score(fit, fitted, plain, wider, np.r_[centre, effect.start], effect))
-    return sorted(listed, key=lambda score: -score.z)
+    listed = [s for s in listed if not s.effect.onoff or fitted.p_value < FALSE_ALARM or s.size + 1.645 * s.error > 1.0]
+    best = {score.effect.names[0]: score for score in sorted(listed, key=lambda score: score.z)}
+    return [Trial(fit.shorter, fitted, score) for score in best.values()]
 
 
 class Trial:
@@ -82,10 +88,10 @@ class Trial:
         self.score, self.effect, self._shorter, self._fitted = score, score.effect, shorter, fitted
 
     @cached_property
-    def stepped(self) -> Guess | None:
-        """Parameters of the steps with it; None if a detector cannot have it together with the others."""
-        fit, fitted, score = self._shorter, self._fitted, self.score
-        model, effect = replace(fitted.model, effects=(*fitted.model.effects, score.effect)), score.effect
+    def final(self) -> Fitted | None:
+        """The fit judged by fresh streams; None if a detector cannot have all effects, or it did not converge."""
+        fit, fitted, score, effect = self._shorter, self._fitted, self.score, self.effect
+        model = replace(fitted.model, effects=(*fitted.model.effects, effect))
         size = effect.start[0]
         moved = fitted.theta.copy()
         if not effect.onoff and score.size > 0.0:
@@ -106,36 +112,18 @@ class Trial:
             guess = fit.steps(Guess(model, theta, np.diag(spread[free]), free), photons, photons / 6.0)[0]
         except (ValueError, np.linalg.LinAlgError):
             return None
-        return guess
+        final = fit.finish(guess)
+        return final if final.converged else None
 
-    @cached_property
-    def final(self) -> Fitted | None:
-        """The fit judged by fresh streams; None if there is none, or it did not converge."""
-        final = None if self.stepped is None else self._shorter.finish(self.stepped)
-        return final if final is not None and final.converged else None
-
-
-def alternatives(trials: list[Trial]) -> list[Trial]:
-    """Effects that are not in the result and yet may be in the stream: of each kind, the refit with it.
-
-    A score does not give their size: a dead time or background that has absorbed an effect leaves hardly any residual,
-    and that is not linear in the size. Of afterpulses, the delay of the refit is that of the recording. A paralyzable
-    detector, of size 1, is one of them if the 95 % upper limit of its score is not below 1.
-    """
-    possible = [t for t in trials if not t.effect.onoff or t.score.size + 1.645 * t.score.error > 1.0]
-    return list({t.effect.names[0]: t for t in sorted(possible, key=lambda t: t.effect.start[-1])}.values())
-
-
-def clear(listed: list[Trial], alarm: float = FALSE_ALARM) -> float:
-    """Score that the largest of these effects exceeds by chance with probability `alarm`."""
-    from scipy.special import ndtri
-
-    return float(-ndtri(alarm / max(len(listed), 1)))
+    @property
+    def refuted(self) -> bool:
+        """Whether the fit with an effect that has no size is rejected: it is not there."""
+        return self.effect.onoff and self.final is not None and self.final.p_value < FALSE_ALARM
 
 
 @dataclass(frozen=True)
 class Named:
-    """An effect that a refit included: its score before, and the decrease of the misfit in standard deviations."""
+    """An effect that a refit included: its score, and the decrease of the misfit in standard deviations."""
 
     effect: Effect
     z: float
@@ -143,11 +131,11 @@ class Named:
 
 
 def search(fit: Fit, fitted: Fitted) -> tuple[Fitted, list[Named], list[Trial]]:
-    """The fit with the effects that the stream shows, those effects, and all others."""
+    """The fit with the effects that the stream shows, those effects, and the trials of all others."""
     included: list[Named] = []
     for last in (*[False] * fit.effort.effects, True):
         plain = counts_of(fit, fitted, fitted.model, fitted.theta)[0]
-        trials = [Trial(fit.shorter, fitted, score) for score in scores(fit, fitted, plain)]
+        trials = possible(fit, fitted, plain)
         better = None if last else refitted(fit, fitted, plain, trials)
         if better is None:
             break
@@ -159,28 +147,27 @@ def search(fit: Fit, fitted: Fitted) -> tuple[Fitted, list[Named], list[Trial]]:
 def refitted(fit: Fit, fitted: Fitted, plain: FloatArray, trials: list[Trial]) -> tuple[Fitted, Named | None] | None:
     """The fit with the effect that explains most, or a better fit without any; None if no effect is significant.
 
-    The refit decides which effect it is: a slow recovery may have the score of a paralyzable detector, and an effect
-    that the dead time has absorbed has a score only along the counts of the refit. All effects are therefore tried if
-    the misfit is suspicious, by short batches; the chosen one is fitted with full batches. A rejected stream names the
-    effect with which it fits.
+    An effect is significant if its refit fits where the model is rejected; or if the refit is not worse and the
+    residual counts have a significant score, along the change by a small effect or along that by the effect of the
+    refit. (The first alone misleads: a slow recovery has the score of a paralyzable detector, and an effect that the
+    dead time has absorbed has none.) All refits are by short batches; that with the least misfit is repeated by full
+    ones.
     """
-    limit, most, best, size = clear(trials, _TRIED), clear(trials), None, fitted.model.size
-    tried = {t.effect.names[0]: t for t in reversed(trials) if t.score.z > limit or fitted.p_value < _TRIED}
-    for trial in tried.values():
-        score, final = trial.score, trial.final
-        if final is None:
-            continue
-        along = _score(fit, fitted, plain, final.model, final.theta, score.effect)
-        error = _error_of(final, size)
-        z = max(score.z, along.z, final.theta[size] / error if error else 0.0)
-        improved = (fitted.p_value < FALSE_ALARM and final.p_value > _TRIED) or final.p_value * _MISFIT > fitted.p_value
-        fits = improved and (z > clear(trials[:1], _TRIED) or not error)
-        better = best is None or final.misfit_z < best[0].misfit_z
-        if final.theta[size] > 0.0 and (z > most or fits) and better:
-            best = final, score.effect, z
-    if best is None:
+    from scipy.special import ndtri
+
+    limit, size = float(-ndtri(FALSE_ALARM / max(len(trials), 1))), fitted.model.size
+
+    def clear(trial: Trial, final: Fitted | None) -> float:
+        """The score of a significant effect, by a refit; else -inf."""
+        if final is None or not final.theta[size] > 0.0 or final.p_value <= min(FALSE_ALARM, fitted.p_value):
+            return -np.inf
+        z = max(trial.score.z, _score(fit, fitted, plain, final.model, final.theta, trial.effect).z)
+        return z if z > limit or fitted.p_value < FALSE_ALARM < final.p_value else -np.inf
+
+    significant = [(trial, trial.final) for trial in trials if clear(trial, trial.final) > -np.inf and trial.final]
+    if not significant:
         return None
-    final, effect, z = best
+    trial, final = min(significant, key=lambda pair: pair[1].misfit_z)
     if fitted.p_value < _MISFIT:  # the first fit may have been a bad one
         known = final.free < size
         root = root_of(final.covariance[np.ix_(known, known)])
@@ -189,15 +176,8 @@ def refitted(fit: Fit, fitted: Fitted, plain: FloatArray, trials: list[Trial]) -
             return other, None
     last = fit.finish(Guess(final.model, final.theta, root_of(final.covariance), final.free), finished=True)
     final = last if last.converged else final
-    if fitted.p_value >= FALSE_ALARM and final.theta[size] < 1.96 * _error_of(final, size):
-        return None  # the stream fits without it, and its 95 % interval includes 0
-    return final, Named(effect, z, fitted.misfit_z - final.misfit_z)
-
-
-def _error_of(fitted: Fitted, index: int) -> float:
-    """Standard error of a parameter; 0 where it was not free."""
-    at = fitted.free == index
-    return float(fitted.covariance[np.ix_(at, at)].sum() ** 0.5)
+    z = clear(trial, final)
+    return (final, Named(trial.effect, z, fitted.misfit_z - final.misfit_z)) if z > -np.inf else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -277,7 +257,7 @@ def _flicker(fit: Fit, fitted: Fitted, counts: float = 8.0, windows: int = 64) -
 
 
 def drift(fit: Fit, fitted: Fitted) -> Drift | None:
-    """Light and delay of parts of the recording, by the estimator of the whole; None for a short recording."""
+    """Light and delay of parts of the recording, with all else constant; None for a short recording."""
     from scipy.special import chdtrc
 
     recording = fit.recording
@@ -285,17 +265,23 @@ def drift(fit: Fit, fitted: Fitted) -> Drift | None:
     if number < 4:
         return None
     parts = [part for part in recording.parts(number) if part.photons > 20]
-    model, cells, free = fitted.model, fitted.batch.cells, fitted.free
-    light = [k for k, index in enumerate(free) if index < model.light]
-    counts = np.array([cells.of(part) * (recording.exposure / part.exposure) for part in parts])
-    estimates = (counts - fitted.offset) @ fitted.estimator[light].T
-    cov = fitted.scatter[np.ix_(light, light)] * len(parts)
-    names = [model.names[free[k]] for k in light]
-    delays = [i for i, name in enumerate(names) if name.startswith("delay")]
-    combine = np.eye(len(names))[[0, *delays]]  # all light; then each delay
-    combine[0] = [not name.startswith("delay") for name in names]
-    x = estimates @ combine.T
-    sd = np.sqrt(np.diag(combine @ cov @ combine.T))
+    model, batch, light = fitted.model, fitted.batch, fitted.free[fitted.free < fitted.model.light]
+    delays = light[(light > 0) & (light % 2 == 0)]
+    directions = np.zeros(
+        (model.size, 1 + delays.size)
+    )  # all light in proportion, and each delay; the rest is constant
+    amounts = np.setdiff1d(light, delays)
+    directions[amounts, 0] = fitted.theta[amounts] / fitted.theta[amounts].sum()
+    directions[delays, 1 + np.arange(delays.size)] = 1.0
+    response = fitted.jacobian @ directions[fitted.free]
+    # and the number of registrations, because the weights are noisy
+    sums = np.vstack([response.T @ batch.weight, np.arange(len(response)) < batch.cells.phases])
+    precision = np.linalg.pinv(np.cov(sums @ fitted.noise.T))
+    known = (sums @ response).T @ precision
+    estimator = np.linalg.pinv(known @ sums @ response) @ known @ sums
+    counts = np.array([batch.cells.of(part) * (recording.exposure / part.exposure) for part in parts])
+    x = (counts - fitted.offset) @ estimator.T
+    sd = (fitted.noise @ estimator.T).std(0) * len(parts) ** 0.5
     place = np.linspace(-0.5, 0.5, len(parts))
     slope = place @ (x - x.mean(0)) / (place @ place)
     square = (((x - x.mean(0)) / sd) ** 2).sum(0)
@@ -303,9 +289,9 @@ def drift(fit: Fit, fitted: Fitted) -> Drift | None:
     p = np.minimum([2.0 * _above(abs(z)) for z in trend], chdtrc(len(parts) - 1, square))
     begins = np.cumsum([0.0, *(part.exposure for part in parts)])
     middle = 0.5 * (begins[1:] + begins[:-1]) * recording.period_ns * 1e-9
-    about = combine @ fitted.theta[free[light]]
+    about = np.r_[fitted.theta[amounts].sum(), fitted.theta[delays]]
     growth = np.sqrt(np.maximum(square / (len(parts) - 1), 1.0))
     flicker, flicker_z, ratio = _flicker(fit, fitted)
     growth[0] = max(growth[0], ratio**0.5)
-    printed = ("light", *(names[i] for i in delays))
-    return Drift(printed, middle, x - x.mean(0) + about, sd, trend, slope, p, growth, flicker, flicker_z)
+    names = ("light", *(model.names[k] for k in delays))
+    return Drift(names, middle, x - x.mean(0) + about, sd, trend, slope, p, growth, flicker, flicker_z)

@@ -62,7 +62,6 @@ GOLDEN = {
 }
 GOLDEN_TIMES = {"gaussian": "e20008f18e3ca915", "returns": "b5ad4e2f769a3776"}
 KINDS = tuple(GOLDEN)
-FAST = ("exact", "sequential")
 
 
 @pytest.mark.parametrize("kind", KINDS)

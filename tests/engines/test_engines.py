@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from harness.cases import PERIOD_NS, Case, flux_of, make_system, measured_pulse, random_cases, two_lobes, waveform_flux
 from harness.check import COUNTS, INTERVALS, JOINT, SHAPE, check
-from harness.joint import JointLaw
-from harness.laws import Law, armed_count_pmf, constant_rate_moments, first_arrival, stationary_count_pmf
+from harness.laws import JointLaw, Law, armed_count_pmf, constant_rate_moments, first_arrival, stationary_count_pmf
 from harness.ledger import require
 from harness.pvalues import two_mean_vectors
 from harness.reference import REFERENCE_NAMES, Reference

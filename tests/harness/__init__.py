@@ -26,8 +26,8 @@ from harness.cases import (
     waveform_flux,
 )
 from harness.check import COUNTS, EVERYTHING, INTERVALS, JOINT, SHAPE, check, compare
-from harness.joint import JointLaw
 from harness.laws import (
+    JointLaw,
     Law,
     armed_count_pmf,
     constant_rate_moments,

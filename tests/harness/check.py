@@ -8,8 +8,7 @@ from scipy import stats
 
 from harness import ledger
 from harness.cases import Case
-from harness.joint import JointLaw
-from harness.laws import Law
+from harness.laws import JointLaw, Law
 from harness.pvalues import (
     bonferroni,
     counts_against_law,

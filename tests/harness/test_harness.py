@@ -14,8 +14,7 @@ from scipy import stats
 
 from harness.cases import PERIOD_NS, Case, flux_of, make_system
 from harness.check import COUNTS, EVERYTHING, JOINT, SHAPE, compare
-from harness.joint import JointLaw
-from harness.laws import Law, armed_count_pmf, constant_rate_moments, stationary_count_pmf
+from harness.laws import JointLaw, Law, armed_count_pmf, constant_rate_moments, stationary_count_pmf
 from harness.ledger import LEVEL, rejected, require
 from harness.pvalues import bonferroni, goodness, mean_vector, merge, same_law, two_mean_vectors, variance_score
 from harness.reference import Reference

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from harness import COUNTS, SHAPE, Law, check, first_arrival, pmf_of, refused
 from harness.cases import PERIOD_NS, Case, flux_of, make_system, random_cases, two_lobes, waveform_flux
-from harness.paralyzable import paralyzable_moments
+from harness.laws import paralyzable_moments
 from scipy import stats
 from scipy.integrate import quad
 

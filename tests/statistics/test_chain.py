@@ -153,23 +153,21 @@ def test_slow_mixing_cells_converge(dead):
     assert np.all(solution.pdf >= 0)
 
 
-def test_both_iterations_and_the_factorisation_agree():
+def test_sweeps_and_the_factorisation_agree():
     """One cell in which sweeps suffice, solved by each method."""
     feedback = pulse_chain(2.0, 1.0, 0.6375, bins=512).feedback()
     for adjoint in (False, True):
         solution = feedback.solve(adjoint=adjoint)
         assert solution.method == "sweeps"
         rhs = np.ones(512) if adjoint else feedback.fire
-        krylov = feedback._krylov(rhs, np.zeros(512), adjoint)[0]
-        direct = feedback._direct(rhs, np.zeros(512), adjoint)[0]
-        np.testing.assert_allclose(krylov, solution.x, rtol=1e-10, atol=1e-12 * np.abs(solution.x).max())
+        direct = feedback._direct(rhs, adjoint)[0]
         np.testing.assert_allclose(direct, solution.x, rtol=1e-10, atol=1e-12 * np.abs(solution.x).max())
 
 
-@pytest.mark.parametrize(("background", "method"), [(30.0, "gmres"), (1e3, "lu")])
-def test_bright_background_uses_stronger_methods(background, method):
+@pytest.mark.parametrize("background", [30.0, 1e3, 1e5])
+def test_bright_background_is_factorised(background):
     solution = pulse_chain(1.0, background, 0.6375).stationary()
-    assert solution.method == method
+    assert solution.method == "lu"
     assert solution.error < 1e-11
 
 

@@ -11,7 +11,7 @@ equation (2.8), which does not contain the slow modes of the chain,
 G sums the s bins before a bin and S shifts by s bins; s is the dead time in bins, less whole periods. The equation
 x (I - P) = 0 of the chain is singular, with many further small singular values where the chain mixes slowly; A is
 well conditioned. Gauss-Seidel sweeps around the period converge fast unless about ten background photons fall into one
-dead time. Then GMRES is used and, if it does not converge either, a sparse factorisation.
+dead time. Then a sparse factorisation is used.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Solution:
     """Solution x (n,) of a feedback equation, with its residual and cost.
 
     `residual` is the componentwise backward error: max |A x - b| / (|A| |x| + |b|), or the same with A^T.
-    `steps` counts sweeps and Krylov steps.
+    `steps` counts sweeps.
     """
 
     x: FloatArray
@@ -94,11 +94,7 @@ class Feedback:
         method = "sweeps"
         residual = self._residual(rhs, x, adjoint)
         if not error <= 10.0 * TOL.chain_change or not residual <= TOL.chain_residual:
-            x, more = self._krylov(rhs, x, adjoint)
-            steps, method = steps + more, "gmres"
-            residual = self._residual(rhs, x, adjoint)
-        if not residual <= TOL.chain_residual:
-            x, residual = self._direct(rhs, x, adjoint)
+            x, residual = self._direct(rhs, adjoint)
             method = "lu"
         if not residual <= TOL.chain_worst_residual:
             raise ConvergenceError(f"the feedback equation has a backward error of {residual:.1e}")
@@ -131,74 +127,45 @@ class Feedback:
         with np.errstate(invalid="ignore", divide="ignore"):
             return float(np.max(np.where(defect == 0.0, 0.0, defect / size)))
 
-    def _krylov(self, rhs: FloatArray, x: FloatArray, adjoint: bool) -> tuple[FloatArray, int]:
-        """GMRES for the fixed point of a sweep, starting at `x`; each step removes one slow mode."""
-        from scipy.sparse.linalg import LinearOperator, gmres
-
-        n = x.size
-        zero = np.zeros(n)
-        steps = 0
-
-        def swept(b: FloatArray, v: FloatArray) -> FloatArray:
-            nonlocal steps
-            steps += 1
-            out = np.array(v, dtype=np.float64).reshape(n)
-            self._sweep(b, out, adjoint, 1)
-            return out
-
-        operator = LinearOperator((n, n), matvec=lambda v: v - swept(zero, v), dtype=np.float64)
-        for _ in range(2):  # the second round removes the rounding error of the first
-            rest = swept(self._defect(rhs, x, adjoint), zero)
-            goal = 1e-16 * float(np.linalg.norm(x))
-            if not float(np.linalg.norm(rest)) > goal:
-                break
-            step, unconverged = gmres(
-                operator, rest, rtol=1e-13, atol=goal, restart=min(n, TOL.chain_krylov), maxiter=1
-            )
-            x = x + step
-            if unconverged:  # many slow modes: the factorisation is cheaper than another round
-                break
-        return x, steps
-
-    def _direct(self, rhs: FloatArray, x: FloatArray, adjoint: bool) -> tuple[FloatArray, float]:
+    def _direct(self, rhs: FloatArray, adjoint: bool) -> tuple[FloatArray, float]:
         """Sparse LU for the prefix sums C of x (2.10): four entries a row, with the fill-in of a planar grid.
 
-        Differences of C lose digits; iterative refinement of the equation for x restores them.
+        Differences of C lose digits, above all those of dim bins: refinement of the equation for x restores them, with
+        a sweep after each correction.
         """
         from scipy.sparse.linalg import splu
 
-        try:
-            solve: Callable[..., FloatArray] = splu(self._prefix_matrix()).solve
-        except RuntimeError as error:  # SuperLU raises it for an exactly singular matrix
-            raise ConvergenceError(f"the feedback equation is singular: {error}") from None
-        if not np.isfinite(x).all():
-            x = np.zeros_like(x)
-        best = self._residual(rhs, x, adjoint)
+        solve: Callable[..., FloatArray] = splu(self._prefix_matrix()).solve
+        x = np.zeros_like(rhs)
+        best, least = x, np.inf
         for _ in range(4):
             rest = self._defect(rhs, x, adjoint)
             if adjoint:
-                step = solve(rest - np.append(rest[1:], 0.0), trans="T")
+                x = x + solve(rest - np.append(rest[1:], 0.0), trans="T")
             else:
-                step = np.diff(solve(rest), prepend=0.0)
-            refined = x + step
-            residual = self._residual(rhs, refined, adjoint)
-            if not residual < best:
-                break
-            x, best = refined, residual
-        return x, best
+                x = x + np.diff(solve(rest), prepend=0.0)
+            self._sweep(rhs, x, adjoint, 1)
+            residual = self._residual(rhs, x, adjoint)
+            if residual < least:
+                best, least = x, residual
+        return best, least
 
     def _prefix_matrix(self) -> csc_matrix:
-        """Row j: C[j+1] - (1-p) C[j] - (p-p') C[j-s] - p' C[j-s+1]; C[0] = 0, C[i-n] = C[i] - C[n]."""
+        """Row j: C[j+1] - (1-p) C[j] - (p-p') C[j-s] - p' C[j-s+1]; C[0] = 0, C[i-n] = C[i] - C[n].
+
+        With p = p' = 1 in every bin, which rounding gives beyond 37 photons a bin, the matrix would be singular.
+        """
         from scipy.sparse import csc_matrix
 
         n, s = self.fire.size, self.shift
         j = np.arange(n)
+        fire, refire = np.minimum((self.fire, self.refire), 1.0 - TOL.chain_passed)
         rows, columns, values = [], [], []
         for index, value in (
             (j + 1, np.ones(n)),
-            (j, self.fire - 1.0),
-            (j - s, self.refire - self.fire),
-            (j - s + 1, -self.refire),
+            (j, fire - 1.0),
+            (j - s, refire - fire),
+            (j - s + 1, -refire),
         ):
             wrapped = index < 0
             inside = np.where(wrapped, index + n, index)
@@ -243,9 +210,9 @@ class Stationary:
     error
         Componentwise backward error of the feedback equation (2.8), which does not depend on the mixing.
     sweeps
-        Gauss-Seidel sweeps and Krylov steps spent; 0 where no iteration was needed.
+        Gauss-Seidel sweeps spent; 0 where no iteration was needed.
     method
-        ``"sweeps"``, ``"gmres"`` or ``"lu"``: the method that converged.
+        ``"sweeps"`` or ``"lu"``: the method that converged.
 
     See Also
     --------

@@ -174,8 +174,10 @@ class Tolerances:
     folded_residual, folded_change, folded_sweeps, folded_checked
         Relative residual of this equation; change per sweep relative to the largest value; sweeps beyond which a
         factorisation is faster; windows of a block whose residual is checked.
-    chain_sweeps, chain_krylov
-        Gauss-Seidel sweeps of the phase chain before GMRES, and the dimension of the Krylov space.
+    chain_sweeps
+        Gauss-Seidel sweeps of the phase chain before its matrix is factorised.
+    chain_passed
+        Least probability of passing a bin in that matrix.
     chain_change, chain_residual, chain_worst_residual
         Relative change per sweep and backward error that end an iteration (rounding alone gives errors of 1e-16 to
         1e-14); largest backward error of a solution.
@@ -271,7 +273,7 @@ class Tolerances:
     folded_sweeps: int = 200
     folded_checked: int = 3
     chain_sweeps: int = 24
-    chain_krylov: int = 48
+    chain_passed: float = 1e-12
     chain_change: float = 1e-15
     chain_residual: float = 1e-12
     chain_worst_residual: float = 1e-10

@@ -41,7 +41,8 @@ from mars_lidar.io import layout
 from mars_lidar.io.cube import Cube, copy_counts, one_exposure
 from mars_lidar.io.recipe import BLOCK_BYTES, Recipe
 from mars_lidar.io.store import LazyCounts, OnDisk, OpenedStore, Writer
-from mars_lidar.light.flux import Flux
+from mars_lidar.light.flux import Flux, made
+from mars_lidar.statistics.cells import photons_per_bin
 
 UPSAMPLING = 8  # bin_hr over bin: 512 x 512 and 64 x 64 in the files that the networks were trained on
 MAX_BYTES = 2**31 - 2**16  # a variable of a v5 file, before compression
@@ -163,20 +164,9 @@ def rates(flux: Flux, system: System) -> NDArray[np.float64]:
 def _rate_bands(flux: Flux, system: System) -> Iterator[NDArray[np.float64]]:
     """The signal in each bin, photons per period, row after row."""
     for y in range(flux.shape[0]):
-        if flux.waveform is not None:
-            wave = flux.waveform[y : y + 1]
-            parts = wave.shape[-1]
-            total = np.concatenate([np.zeros((*wave.shape[:2], 1)), wave.cumsum(-1)], axis=-1)
-            place = np.linspace(0.0, parts, system.bins + 1)
-            below = np.minimum(place.astype(np.int64), parts - 1)
-            at = total[..., below] + (place - below) * (total[..., below + 1] - total[..., below])
-            yield np.maximum(np.diff(at, axis=-1), 0.0)
-            continue
-        band = np.zeros((1, flux.shape[1], system.bins))
-        for s, tau in zip(flux.returns_signal[:, y], flux.returns_delay_ns[:, y], strict=True):
-            delay = np.where(s > 0, tau, 0.0)
-            band[0] += s[:, None] * system.pulse.bin_energy(delay, system.period_ns, system.bins)
-        yield band
+        row = flux[y : y + 1]
+        signal = made(row.returns_signal, row.returns_delay_ns, np.zeros(row.shape), row.waveform, None)
+        yield photons_per_bin(signal, system.detected(), bins=system.bins)
 
 
 def open_store(path: Path) -> OpenedStore:

@@ -32,7 +32,7 @@ def at(tmp_path_factory) -> Path:
         ("lab.npz --given dead_time_ns=long", "--given dead_time_ns must be a number, got 'long'"),
         ("lab.npz --given dead_time_ns=50 --system spad.yaml", "give the detector once: --system or --given"),
         ("lab.npz --free --pulse-sigma-ns 0.5", "give the shape of the light once"),
-        ("lab.npz -o lab.txt", "--out must end in .yaml, .yml or .json"),
+        ("lab.npz -o lab.txt", "--out must end in one of .yaml, .yml, .json"),
         ("lab.npz --look -o lab.yaml", "--out needs a fitted pulse"),
         ("lab.npz --cycles 0", "--cycles must be"),
         ("lab.npz --pixel 3,3", "--pixel must lie in y 0 to 0, x 0 to 0, got (3, 3)"),

@@ -199,7 +199,7 @@ def test_view_draws_a_cube(tmp_path):
     assert (tmp_path / "v.pdf").read_bytes().startswith(b"%PDF")
     for wrong, words in (
         (("-o", tmp_path / "v.png"), "exists already"),
-        (("-o", tmp_path / "w.gif"), "--out must end in .png, .pdf or .svg"),
+        (("-o", tmp_path / "w.gif"), "--out must end in one of .png, .pdf, .svg"),
         (("-o", tmp_path / "w.png", "--pixel", "3"), "--pixel must be two integers Y,X (row, column), got"),
         (("-o", tmp_path / "w.png", "--pixel", "12,0"), "y of pixels must be an integer in [0, 11], got 12"),
         (("-o", tmp_path / "w.png", "--realization", "1"), "realization must be"),

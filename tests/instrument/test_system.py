@@ -129,8 +129,8 @@ def test_fwhm_in_a_file(system: ml.System):
 
 @pytest.mark.parametrize("name", ["system.txt", "system", "system.toml"])
 def test_suffix_is_checked(system: ml.System, tmp_path: Path, name: str):
-    refused(r"path must end in \.json, \.yaml or \.yml", system.save, tmp_path / name)
-    refused(r"path must end in \.json, \.yaml or \.yml", ml.System.load, tmp_path / name)
+    refused(r"path must end in one of \.json, \.yaml, \.yml", system.save, tmp_path / name)
+    refused(r"path must end in one of \.json, \.yaml, \.yml", ml.System.load, tmp_path / name)
 
 
 def test_broken_file_is_named(tmp_path: Path):

@@ -516,7 +516,7 @@ def test_files_of_other_formats_are_refused(tmp_path, number):
 
 def test_files_that_are_not_tables(tmp_path, monkeypatch):
     table = small_table()
-    refused(r"path must end in .h5 or .hdf5", table.save, tmp_path / "t.npz")
+    refused(r"path must end in one of .h5, .hdf5", table.save, tmp_path / "t.npz")
     table.save(tmp_path / "t.h5")
     refused("exists already", table.save, tmp_path / "t.h5", error=FileExistsError)
     table.save(tmp_path / "t.h5", overwrite=True)

@@ -4,6 +4,7 @@ import difflib
 import math
 from collections.abc import Sequence
 from numbers import Integral, Real
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -47,6 +48,12 @@ def choice(name: str, value: Any, allowed: tuple[str, ...]) -> str:
         message = f"{name} must be one of {', '.join(map(repr, allowed))}"
         raise ValueError(f"{message}, got {value!r}{did_you_mean(value, allowed)}")
     return value
+
+
+def suffix(name: str, path: Path, allowed: Sequence[str]) -> None:
+    """ValueError for a path with another suffix than those `allowed`."""
+    if path.suffix not in allowed:
+        raise ValueError(f"{name} must end in {'one of ' * (len(allowed) > 1)}{', '.join(allowed)}, got {str(path)!r}")
 
 
 def unmasked(name: str, value: Any) -> Any:

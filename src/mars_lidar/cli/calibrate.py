@@ -194,8 +194,7 @@ def calibrate(
     check_picture(picture, overwrite)
     cube = stream.suffix in (".npy", ".zarr")
     if out is not None:
-        if out.suffix not in (".yaml", ".yml", ".json"):
-            raise ValueError(f"--out must end in .yaml, .yml or .json, got {str(out)!r}")
+        checks.suffix("--out", out, (".yaml", ".yml", ".json"))
         if look or (known.free and not cube):
             raise ValueError("--out needs a fitted pulse: omit --free and --look, or --out")
         refuse_existing(out, overwrite)

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
 from cyclopts import App
 from cyclopts import exceptions as wrong
 
+from mars_lidar._base import checks
 from mars_lidar._base.checks import did_you_mean
 from mars_lidar._base.files import WriteError, beside
 from mars_lidar._base.progress import Bar
@@ -226,8 +227,8 @@ def progress_bar(label: str) -> Iterator[Bar]:
 
 def check_picture(out: Path | None, overwrite: bool) -> None:
     """Raise, before any work, what `save_picture` would raise."""
-    if out is not None and out.suffix not in (".png", ".pdf", ".svg"):
-        raise ValueError(f"--out must end in .png, .pdf or .svg, got {str(out)!r}")
+    if out is not None:
+        checks.suffix("--out", out, (".png", ".pdf", ".svg"))
     check_new(out, overwrite)
 
 

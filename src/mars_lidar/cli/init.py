@@ -90,8 +90,7 @@ def init(
         if file != _FILE and file != out:
             raise ValueError(f"give the file once, got {str(file)!r} and --out {str(out)!r}")
         file = out
-    if file.suffix not in (".yaml", ".yml"):
-        raise ValueError(f"FILE must end in .yaml or .yml, got {str(file)!r}")
+    checks.suffix("FILE", file, (".yaml", ".yml"))
     refuse_existing(file, overwrite)
     write_text(file, commented(file) if preset is None else of_instrument(preset))
     table([("wrote", str(file))])

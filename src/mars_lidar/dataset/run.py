@@ -368,8 +368,7 @@ def _share(items: list[Item], which: int, of: int) -> list[Item]:
 
 def _target(out: str | Path) -> Path:
     target: Path = place_of(out)
-    if target.suffix != ".zarr":
-        raise ValueError(f"out must end in .zarr, got {str(target)!r}")
+    checks.suffix("out", target, [".zarr"])
     check_zarr_threads()
     return target
 

@@ -26,6 +26,7 @@ from mars_lidar.instrument.units import check_units, period_hint
 
 SPEED_OF_LIGHT_M_PER_NS = 0.299792458
 _STARTS = ("armed", "stationary")
+_SUFFIXES = (".json", ".yaml", ".yml")
 
 
 @constructed_by_name
@@ -275,23 +276,20 @@ class System:
     @checked
     def save(self, path: str | Path) -> None:
         """Write to a ``.json``, ``.yaml`` or ``.yml`` file `path`."""
-        target = Path(path)
-        if target.suffix == ".json":
-            write_text(target, json.dumps(self.to_dict(), indent=2) + "\n")
-        elif target.suffix in (".yaml", ".yml"):
-            import yaml
+        import yaml
 
-            write_text(target, yaml.safe_dump(self.to_dict(), sort_keys=False))
-        else:
-            raise ValueError(f"path must end in .json, .yaml or .yml, got {str(path)!r}")
+        target = Path(path)
+        checks.suffix("path", target, _SUFFIXES)
+        data = self.to_dict()
+        as_json = target.suffix == ".json"
+        write_text(target, json.dumps(data, indent=2) + "\n" if as_json else yaml.safe_dump(data, sort_keys=False))
 
     @classmethod
     @checked
     def load(cls, path: str | Path) -> System:
         """Read the file `path` that `save` wrote; errors name the file, the line and the key."""
         source = Path(path)
-        if source.suffix not in (".json", ".yaml", ".yml"):
-            raise ValueError(f"path must end in .json, .yaml or .yml, got {str(path)!r}")
+        checks.suffix("path", source, _SUFFIXES)
         lines: Lines = {}
         if source.suffix != ".json" or (source.is_file() and source.stat().st_size <= TOL.lined_bytes):
             data, lines = read_yaml(source)  # JSON is YAML, and YAML has lines

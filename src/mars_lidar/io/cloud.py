@@ -102,8 +102,7 @@ def save_cloud(
     3
     """
     target = Path(path)
-    if target.suffix != ".ply":
-        raise ValueError(f"path of a point cloud must end in .ply, got {str(path)!r}")
+    checks.suffix("path of a point cloud", target, [".ply"])
     place = points(depth_m, focal_px)
     columns = {"x": place[..., 0], "y": place[..., 1], "z": place[..., 2]}
     for name, argument, values in (("intensity", "intensity", intensity), ("depth_error", "error_m", error_m)):

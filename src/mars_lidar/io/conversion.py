@@ -116,8 +116,7 @@ def convert(
     old, new = Path(source), Path(target)
     allowed = sorted({*SUFFIXES, *STREAM_SUFFIXES})
     for name, path in (("source", old), ("target", new)):
-        if path.suffix not in allowed:
-            raise ValueError(f"{name} must end in one of {', '.join(allowed)}, got {str(path)!r}")
+        checks.suffix(name, path, allowed)
     if new.exists() and old.exists() and new.resolve() == old.resolve():
         raise ValueError(f"target must not be the source, got {str(new)!r} for both")
     if old.is_file() and is_stream(old):

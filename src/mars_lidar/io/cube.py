@@ -457,8 +457,7 @@ def open_writer(path: str | Path, recipe: Recipe | Recording) -> AbstractContext
 
 def format_of(path: Path, argument: str) -> Any:
     """The module for files of this suffix."""
-    if path.suffix not in _MODULES:
-        raise ValueError(f"{argument} must end in one of {', '.join(SUFFIXES)}, got {str(path)!r}")
+    checks.suffix(argument, path, SUFFIXES)
     return import_module(f"mars_lidar.io.{_MODULES[path.suffix]}")
 
 

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar._base import manifest
+from mars_lidar._base import checks, manifest
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.files import beside, check_finished, check_target, reading
 from mars_lidar._base.hdf5 import ForgivingFile, seal
@@ -63,7 +63,7 @@ _OF_RETURNS["return_false_alarm"] = ("false_alarm", "1", "chance of so much like
 def check_maps_output(path: str | Path, *, overwrite: bool = False) -> None:
     """Raise what `save_maps` would raise for this path, without touching anything."""
     target = Path(path)
-    _check_suffix("out", target)
+    checks.suffix("out", target, SUFFIXES)
     check_target(target, folder=target.suffix == ".zarr", overwrite=overwrite)
 
 
@@ -109,18 +109,13 @@ def load_maps(path: str | Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]
     source = Path(path)
     check_finished(source)
     with reading(source, "maps of mars-lidar"):
-        _check_suffix("path", source)
+        checks.suffix("path", source, SUFFIXES)
         with contextlib.closing(format_of(source, "path").open_store(source, _check_format)) as store:
             variables = {name: values(array) for name, array in store.arrays.items()}
         if variables.get("method", np.empty(0)).dtype.kind == "S":
             variables["method"] = variables["method"].astype(str)
         _check(variables, store.attrs)
         return variables, dict(store.attrs)
-
-
-def _check_suffix(name: str, path: Path) -> None:
-    if path.suffix not in SUFFIXES:
-        raise ValueError(f"{name} must end in one of {', '.join(SUFFIXES)}, got {str(path)!r}")
 
 
 def _check_format(path: Path, attrs: Mapping[str, Any]) -> None:

@@ -31,7 +31,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mars_lidar._base import mat5
+from mars_lidar._base import checks, mat5
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.files import FileError, beside, check_target, read_mat5
 from mars_lidar._base.resources import check_memory
@@ -267,8 +267,7 @@ def save_mat(
     (1, 1, 2, 128)
     """
     target = Path(path)
-    if target.suffix != ".mat":
-        raise ValueError(f"path must end in .mat, got {str(path)!r}")
+    checks.suffix("path", target, [".mat"])
     cube.simulation("a .mat")
     exposure = one_exposure(cube, realization)
     recipe = exposure.simulation()

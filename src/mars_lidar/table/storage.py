@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from mars_lidar._base import checks
 from mars_lidar._base.files import beside, check_target, whole
 from mars_lidar._base.hdf5 import ForgivingFile, open_hdf5, seal
 from mars_lidar._base.types import FloatArray, NDArray
@@ -48,8 +49,7 @@ def request_key(
 
 def write(path: Path, header: dict[str, Any], arrays: dict[str, NDArray[Any]], overwrite: bool) -> None:
     """Write attributes and arrays to a new HDF5 file, renamed to its final name when complete."""
-    if path.suffix not in _SUFFIXES:
-        raise ValueError(f"path must end in .h5 or .hdf5, got {str(path)!r}")
+    checks.suffix("path", path, _SUFFIXES)
     check_target(path, folder=False, overwrite=overwrite)
     with beside(path) as unfinished, ForgivingFile(unfinished).hdf5() as file:
         for name, value in ({"kind": _KIND, "format": FORMAT} | header).items():

@@ -127,8 +127,7 @@ def is_stream(path: Path) -> bool:
 
 
 def _module(path: Path, suffixes: tuple[str, ...] = READ_SUFFIXES) -> Any:
-    if path.suffix not in suffixes:
-        raise ValueError(f"path of timestamps must end in one of {', '.join(suffixes)}, got {str(path)!r}")
+    checks.suffix("path of timestamps", path, suffixes)
     return importlib.import_module(f"mars_lidar.io.streams.{_MODULES[path.suffix]}")
 
 

@@ -274,7 +274,7 @@ def _task(
         check_delays(float(np.median(lit)), system.period_ns)
     check_detector(chosen, system)
     chosen.check(flux, system)
-    index = _pixel_index(pixel_index, flux.shape)
+    index = checked_index(pixel_index, flux.shape)
     if system.detector.crosstalk is not None and not np.array_equal(index, np.arange(index.size)):
         raise ValueError(
             "pixel_index must be that of a whole image with crosstalk, 0 to H * W - 1: pixels depend on each other, "
@@ -283,7 +283,8 @@ def _task(
     return Task(flux, system, number, first, index, seed, team, progress)
 
 
-def _pixel_index(pixel_index: ArrayLike | None, shape: tuple[int, ...]) -> NDArray[np.uint32]:
+def checked_index(pixel_index: ArrayLike | None, shape: tuple[int, ...]) -> NDArray[np.uint32]:
+    """The numbers (H * W,) of the random streams of an image of this shape; None: in row-major order from 0."""
     pixels = math.prod(shape)
     if pixel_index is None:
         return np.arange(pixels, dtype=np.uint32)

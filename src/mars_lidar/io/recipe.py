@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.display import brief
+from mars_lidar.engines.simulation import checked_index
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux, StoredFlux
 
@@ -242,16 +243,8 @@ class Recipe(_Blocks):
         if self.reflectivity is not None:
             object.__setattr__(self, "reflectivity", self._map("reflectivity", self.reflectivity))
         if self.pixel_index is not None:
-            index = np.ascontiguousarray(
-                checks.numbers("pixel_index", checks.unmasked("pixel_index", self.pixel_index))
-            )
-            pixels = math.prod(self.flux.shape)
-            if index.dtype.kind not in "iu" or index.size != pixels:
-                raise ValueError(
-                    f"pixel_index must be {pixels} integers, one per pixel of the flux, "
-                    f"got {index.size} of dtype {index.dtype}"
-                )
-            object.__setattr__(self, "pixel_index", index.astype(np.int64).ravel())
+            index = checked_index(self.pixel_index, self.flux.shape)
+            object.__setattr__(self, "pixel_index", index.astype(np.int64))
 
     def _map(self, name: str, value: ArrayLike) -> NDArray[np.float64]:
         array = np.asarray(checks.numbers(name, checks.unmasked(name, value)), dtype=np.float64)

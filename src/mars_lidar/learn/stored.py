@@ -26,7 +26,7 @@ from mars_lidar._base.resources import check_memory
 from mars_lidar.dataset.arrays import MAPS, sample_parts
 from mars_lidar.dataset.store import Block, Dataset, open_dataset, read_block
 from mars_lidar.learn.needed import torch
-from mars_lidar.learn.stream import UNSIGNED, Buffers, Passes, rank_of, worker_of
+from mars_lidar.learn.stream import UNSIGNED, Buffers, Passes, rank_of, resumed_in_worker, worker_of
 from mars_lidar.learn.tolerances import TOLERANCES
 
 _NATIVE = {  # types that packed counts are decoded to without a copy
@@ -229,14 +229,7 @@ class StoredDataset(torch.utils.data.IterableDataset[dict[str, Any]]):
 
         A pass that was at its end is then empty, and the next pass is the next epoch.
         """
-        if state["seed"] != self._seed:
-            raise ValueError(f"the state is of a dataset with seed {state['seed']}, this one has {self._seed}")
-        _, workers, in_worker = worker_of()
-        if in_worker != ("given_here" in state) or state.get("workers_here", workers) != workers:
-            raise ValueError(
-                f"the state is of a loader with {state.get('workers_here', 'no')} workers, this one has "
-                f"{workers if in_worker else 'no'} workers"
-            )
+        in_worker = resumed_in_worker(state, self._seed)
         epoch, start, first = state["epoch"], state["start"], state["workers"]
         if in_worker:
             self._passes.join(epoch, start)

@@ -61,6 +61,19 @@ def worker_of() -> tuple[int, int, bool]:
     return (0, 1, False) if info is None else (info.id, info.num_workers, True)
 
 
+def resumed_in_worker(state: Mapping[str, int], seed: int) -> bool:
+    """Whether this is a worker of a loader; ValueError unless the state is of one so, and of this `seed`."""
+    if state["seed"] != seed:
+        raise ValueError(f"the state is of a dataset with seed {state['seed']}, this one has {seed}")
+    _, workers, in_worker = worker_of()
+    if in_worker != ("workers_here" in state) or state.get("workers_here", workers) != workers:
+        raise ValueError(
+            f"the state is of a loader with {state.get('workers_here', 'no')} workers, this one has "
+            f"{workers if in_worker else 'no'} workers"
+        )
+    return in_worker
+
+
 # --- Passes --------------------------------------------------------------------------------------------------------
 
 _WORKERS = 1024  # largest number of workers of one loader
@@ -511,7 +524,7 @@ class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
         _, workers, in_worker = worker_of()
         state = {"seed": self._samples.seed, "epoch": self.epoch}
         if in_worker:
-            return state | {"start": self._pass_start, "given": self._given, "workers": workers}
+            return state | {"start": self._pass_start, "given_here": self._given, "workers_here": workers}
         if batches is None and self._passes.by_workers:
             raise ValueError(
                 "batches must be given: workers of a loader made the pass, and only its caller knows how many batches "
@@ -528,17 +541,9 @@ class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
 
         A pass that was at its end is then empty, and the next pass is the next epoch.
         """
-        if state["seed"] != self._samples.seed:
-            raise ValueError(f"the state is of a stream with seed {state['seed']}, this one has {self._samples.seed}")
-        _, workers, in_worker = worker_of()
-        if in_worker != ("workers" in state) or state.get("workers", workers) != workers:
-            raise ValueError(
-                f"the state is of a loader with {state.get('workers', 'no')} workers, this one has "
-                f"{workers if in_worker else 'no'} workers"
-            )
-        if in_worker:
+        if resumed_in_worker(state, self._samples.seed):
             self._passes.join(state["epoch"], state["start"])
-            self._joined = state["epoch"], state["start"], state["given"]
+            self._joined = state["epoch"], state["start"], state["given_here"]
         else:
             self.set_epoch(state["epoch"], state["start"])
 

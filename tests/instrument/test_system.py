@@ -237,9 +237,9 @@ def test_frozen():
     sampled, gaussian = PULSES["peak"], PULSES["gaussian"]
     with pytest.raises(AttributeError):
         gaussian.sigma_ns = 2.0
-    with pytest.raises(AttributeError, match="frozen"):
+    with pytest.raises(AttributeError):
         sampled.bin_ns = 2.0
-    with pytest.raises(AttributeError, match="frozen"):
+    with pytest.raises(AttributeError):
         del sampled.values
     with pytest.raises(ValueError, match="read-only"):
         sampled.values[0] = 5.0

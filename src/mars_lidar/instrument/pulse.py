@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -196,6 +196,7 @@ class GaussianPulse(Pulse):
 
 
 @constructed_by_name
+@dataclass(frozen=True, init=False, repr=False)
 class SampledPulse(Pulse):
     """A measured impulse response: constant on samples of width `bin_ns`.
 
@@ -236,14 +237,12 @@ class SampledPulse(Pulse):
     0.1
     """
 
-    __slots__ = ("_bytes", "_cumulative", "_start_ns", "bin_ns", "origin", "values")
-
-    values: NDArray[np.float64]
+    values: NDArray[np.float64] = field(compare=False)
     bin_ns: float
     origin: str
-    _start_ns: float
-    _cumulative: NDArray[np.float64]
-    _bytes: bytes
+    _start_ns: float = field(compare=False)
+    _cumulative: NDArray[np.float64] = field(compare=False)
+    _bytes: bytes  # of the values, by which pulses are compared
 
     def __init__(self, values: ArrayLike, bin_ns: float, origin: str = "peak") -> None:
         samples = checks.weights("values", values, most=TOL.samples, what="samples")
@@ -263,22 +262,8 @@ class SampledPulse(Pulse):
         }.items():
             object.__setattr__(self, name, value)
 
-    def __setattr__(self, name: str, value: Any) -> None:
-        raise AttributeError(f"SampledPulse is frozen: cannot set {name!r}")
-
-    def __delattr__(self, name: str) -> None:
-        raise AttributeError(f"SampledPulse is frozen: cannot delete {name!r}")
-
     def __reduce__(self) -> tuple[Any, ...]:
         return SampledPulse, (self.values, self.bin_ns, self.origin)
-
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, SampledPulse):
-            return NotImplemented
-        return (self._bytes, self.bin_ns, self.origin) == (other._bytes, other.bin_ns, other.origin)
-
-    def __hash__(self) -> int:
-        return hash((self._bytes, self.bin_ns, self.origin))
 
     def __repr__(self) -> str:
         return f"SampledPulse({self.values.size} samples, bin_ns={self.bin_ns:g}, origin={self.origin!r})"

@@ -37,6 +37,7 @@ from mars_lidar.instrument.pulse import GaussianPulse, Pulse, SampledPulse
 from mars_lidar.instrument.system import System
 from mars_lidar.learn.needed import torch
 from mars_lidar.learn.tolerances import TOLERANCES
+from mars_lidar.statistics.cells import whole_bins
 from mars_lidar.statistics.chain import ConvergenceError
 
 # --- Photons of each bin -------------------------------------------------------------------------------------------
@@ -216,10 +217,7 @@ class Delay:
 
     def __init__(self, dead: float, bins: int) -> None:
         self.periods, self.bins = dead, bins
-        self.whole = math.floor(dead)
-        steps = (dead - self.whole) * bins  # whole periods apart first: else they cost digits of the fraction
-        self.shift = min(math.floor(steps + 1e-9), bins - 1)
-        self.part = max(steps - self.shift, 0.0)
+        self.whole, self.shift, self.part = whole_bins(dead, bins)
 
     def rearmed(self, h: torch.Tensor, near: Any = 1.0, far: Any = 1.0) -> torch.Tensor:
         """L h, its two parts weighted."""

@@ -118,17 +118,12 @@ def cramer_rao(flux: Flux, system: System, *, threads: int | None = None) -> His
     >>> round(1000 * float(bound.depth_m), 1)  # mm
     8.2
     """
-    from mars_lidar.reconstruction.maximum_likelihood import MaximumLikelihood
+    from mars_lidar.reconstruction.maximum_likelihood import MaximumLikelihood, hypotheses
 
     MaximumLikelihood().check(system)
     require_effects("cramer_rao", system.detector, LIGHT_EFFECTS, _simulate_instead)
-    if len(flux.returns_signal) != 1:
-        raise ValueError("flux must have one return in each pixel; several returns of one pixel have `returns_bound`")
+    hypotheses(flux, system)
     s, b, tau = flux.signal, flux.background, flux.delay_ns
-    if not (b > 0).all():
-        raise ValueError(f"background must be > 0, got {b[~(b > 0)].flat[0]}")
-    if not np.isfinite(tau).all():
-        raise ValueError(f"delay_ns must be finite, got {tau[~np.isfinite(tau)].flat[0]}")
     mean = mean_histogram(flux, system, threads=threads)
     energy, slope, share = _pulse_bins(system, tau)
     information = _information(system, mean, s[..., None, None], b, energy[..., None, :], slope[..., None, :], share)

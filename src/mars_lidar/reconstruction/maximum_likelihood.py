@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from statistics import NormalDist
 
 import numpy as np
@@ -195,7 +195,7 @@ def log_likelihood(histogram: ArrayLike, flux: Flux, system: System) -> tuple[Fl
     given, _ = checked(histogram, system, 1)
     MaximumLikelihood().check(system)
     shape = flux.signal.shape
-    at = _hypotheses(flux, system)
+    at = hypotheses(flux, system)
     out = np.empty((len(at), 13))
     _core.histogram_log_likelihood(recording_of(system), given.counts[0].astype(np.float64), at, out)
     unit = np.array([1.0, 1.0, 1.0 / system.period_ns])
@@ -255,11 +255,10 @@ def systematic_error(flux: Flux, system: System) -> tuple[FloatArray, FloatArray
     from mars_lidar.statistics import mean_histogram
 
     MaximumLikelihood().check(system)
-    at = _hypotheses(flux, system)
+    at = hypotheses(flux, system)
     if not (at[:, 0] > 0).all():
         raise ValueError("flux must have a signal > 0 in each pixel")
-    detected = replace(system.detector, detection_efficiency=1.0, dark_count_hz=0.0)
-    mean = mean_histogram(flux, system.replace(detector=detected)).reshape(len(at), system.bins)
+    mean = mean_histogram(flux, system.detected()).reshape(len(at), system.bins)
     out = np.empty((len(at), 13))
     recording = recording_of(system)
     for row, histogram in enumerate(mean):
@@ -316,9 +315,12 @@ def warn_of_bias(method: Method, system: System, estimates: Estimates) -> None:
     )
 
 
-def _hypotheses(flux: Flux, system: System) -> FloatArray:
+def hypotheses(flux: Flux, system: System) -> FloatArray:
     """(pixels, 3) signal, background, and delay in periods, of light with one return and background."""
     s, b, tau = flux.signal, flux.background, flux.delay_ns
     if len(flux.returns_signal) != 1 or not ((b > 0) & np.isfinite(tau)).all():
-        raise ValueError("flux must have one return of finite delay and background > 0 in each pixel")
+        raise ValueError(
+            "flux must have one return of finite delay and background > 0 in each pixel; "
+            "several returns of one pixel have `returns_bound`"
+        )
     return np.ascontiguousarray(np.stack([s.ravel(), b.ravel(), tau.ravel() / system.period_ns], axis=-1))

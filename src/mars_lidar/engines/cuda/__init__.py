@@ -40,7 +40,7 @@ def check(engine: Engine, flux: Flux, system: System) -> None:
                     "table must be given for engine 'mars' on device 'cuda': without one every pixel is evaluated by "
                     "the processor; build a mars_lidar.Table, or use device 'cpu'"
                 )
-            check_mars(float(flux.total.max()), system.cycles, system.dead_time_periods)
+            check_mars(flux, system)
         case _:
             names = " or ".join(repr(able.name) for able in ABLE)
             raise ValueError(

@@ -19,6 +19,8 @@ from mars_lidar.engines.table_reader import TableReader, exact_laws
 
 if TYPE_CHECKING:
     from mars_lidar.engines.mars import MarsEngine
+    from mars_lidar.instrument.system import System
+    from mars_lidar.light.flux import Flux
     from mars_lidar.table import Table
 
 
@@ -41,9 +43,15 @@ class TableThere:
 _tables: WeakKeyDictionary[Table, dict[Any, TableThere]] = WeakKeyDictionary()
 
 
-def check_mars(task_flux_most: float, cycles: int, dead_time_periods: float) -> None:
+def _most_registrations(flux: Flux, system: System) -> float:
+    """Registrations of the brightest pixel, at most."""
+    dead = system.dead_time_periods
+    return float(system.cycles * min(float(flux.total.max()), 1.0 / dead if dead > 0.0 else np.inf))
+
+
+def check_mars(flux: Flux, system: System) -> None:
     """Raise ValueError for exposures beyond the range of the kernel's integers."""
-    most = cycles * min(task_flux_most, 1.0 / dead_time_periods if dead_time_periods > 0.0 else np.inf)
+    most = _most_registrations(flux, system)
     if most > 0.9 * _MOST_COUNTS:
         raise ValueError(
             f"cycles must be few enough for {0.9 * _MOST_COUNTS:.3g} registrations of a pixel on device 'cuda', "
@@ -204,9 +212,7 @@ class _Launches:
 
     def _may_overflow(self) -> bool:
         """Whether a pixel could have more registrations than a bin of 16 bits holds."""
-        system, flux = self.task.system, self.task.flux
-        dead = system.dead_time_periods
-        most = system.cycles * min(float(flux.total.max()), 1.0 / dead if dead > 0.0 else np.inf)
+        most = _most_registrations(self.task.flux, self.task.system)
         return bool(most + 10.0 * np.sqrt(most) + 100.0 > np.iinfo(np.uint16).max)
 
     def _addresses(self) -> dict[str, int]:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -76,7 +77,11 @@ def reconstruct_stored(
     total, done = len(used) * shape[0] * shape[1] * shape[2], 0
     blocks = recipe.blocks(recipe.chunks(_CHUNK_BYTES))
 
-    def keep(method: Method, estimates: Estimates, images: slice, rows: slice) -> None:
+    def use(method: Method, estimate: Callable[[], Estimates], images: slice, rows: slice) -> None:
+        nonlocal done
+        began = time.perf_counter()
+        estimates = estimate()
+        seconds[method.name] += time.perf_counter() - began
         for field in fields(estimates):
             values = getattr(estimates, field.name)
             if values is None:
@@ -84,21 +89,17 @@ def reconstruct_stored(
             whole = buffers[method.name].setdefault(field.name, np.empty((*shape, *values.shape[1:]), values.dtype))
             part = whole[images, rows]
             part[...] = values.reshape(part.shape)
+        done += len(estimates.signal)
+        if progress is not None:
+            progress(done, total)
 
     of_images = [method for method in used if isinstance(method, Image)]
     gathered: dict[int, list[Photons]] = {}  # by image, rows of it: of whole images only the photons are held
     for images, rows in blocks:
         counts, block = checked(np.asarray(cube.histogram[images, rows]), system, team)
         for method in used:
-            if isinstance(method, Image):
-                continue
-            began = time.perf_counter()
-            estimates = method.estimate(counts)
-            seconds[method.name] += time.perf_counter() - began
-            keep(method, estimates, images, rows)
-            done += len(counts.counts)
-            if progress is not None:
-                progress(done, total)
+            if not isinstance(method, Image):
+                use(method, partial(method.estimate, counts), images, rows)
         if not of_images:
             continue
         for k, part in zip(range(images.start, images.stop), counts.counts.reshape(*block, -1), strict=True):
@@ -107,13 +108,7 @@ def reconstruct_stored(
                 continue
             photons = Photons.joined(gathered.pop(k))
             for method in of_images:
-                began = time.perf_counter()
-                estimates = method.of_photons(photons, system, team)
-                seconds[method.name] += time.perf_counter() - began
-                keep(method, estimates, slice(k, k + 1), slice(0, shape[1]))
-                done += shape[1] * shape[2]
-                if progress is not None:
-                    progress(done, total)
+                use(method, partial(method.of_photons, photons, system, team), slice(k, k + 1), slice(0, shape[1]))
     results = {}
     for method in used:
         estimates = Estimates(

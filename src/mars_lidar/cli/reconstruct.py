@@ -19,7 +19,7 @@ from mars_lidar.cli.foreign import ForeignOptions
 from mars_lidar.cli.options import Integer, Number, OutPath, Switch, Text, command
 from mars_lidar.reconstruction import METHODS, Flags, MaximumLikelihood, Method, Reconstruction
 from mars_lidar.reconstruction.keep import KEEP, common_delay, has_later_light, keep_return
-from mars_lidar.reconstruction.reconstruction import ATTENUATIONS
+from mars_lidar.scene.radiometry import ATTENUATIONS
 
 if TYPE_CHECKING:
     from mars_lidar._base.types import FloatArray

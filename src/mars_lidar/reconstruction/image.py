@@ -32,9 +32,7 @@ from mars_lidar.reconstruction.returns import MOST_RETURNS, RETURN_COLUMNS
 VOLUME_BYTES = 96 * 2**20  # of each of three volumes (rows, columns, cells): larger images are computed in parts
 BLOCK_PIXELS = 2**17  # of the second network at a time
 NORMAL_HALF_WIDTH = NormalDist().inv_cdf(0.95)  # standard errors to either side that hold 90 %
-_SELF_BLIND = (
-    1.0  # signal photons a period, above which a pulse hides so much of itself that its armed time says little
-)
+_SELF_BLIND = 1.0  # signal photons a period, above which a pulse hides so much of itself that armed time says little
 _BRIGHT_BYTES = 64 * 2**20  # of the counts of such pixels at a time
 _PLANE, _PLANES = 32, 4  # pixels a side of a simulated plane, and their number
 _SLOPES = 0.06, 0.03  # widths of the pulse from row to row and from column to column

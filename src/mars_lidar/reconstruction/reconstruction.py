@@ -21,8 +21,7 @@ from mars_lidar.reconstruction.maximum_likelihood import MaximumLikelihood, warn
 from mars_lidar.reconstruction.method import Estimates, Flags, Method, warn_of_effects
 from mars_lidar.reconstruction.rates import ChainCorrection, Coates, GeneralisedCoates
 from mars_lidar.reconstruction.returns import MOST_RETURNS, Returns, returns_of
-
-ATTENUATIONS = ("none", "inverse_square")
+from mars_lidar.scene.radiometry import ATTENUATIONS
 
 METHODS: dict[str, Method] = {
     method.name: method

@@ -133,7 +133,7 @@ def test_engines_say_what_they_do(system: ml.System, flux: ml.Flux):
 
     assert ml.simulate(flux, system, engine=Plain()).sum() > 0
     gated = system.replace(detector=ml.Detector(dead_time_ns=5.0, **GATE))
-    with pytest.raises(ValueError, match=r"engine 'plain' does not do mode 'gated'.*use 'exact' or 'sequential'"):
+    with pytest.raises(ValueError, match=r"'plain' is not for detectors of mode 'gated'.*use 'exact' or 'sequential'"):
         ml.simulate(flux, gated, engine=Plain())
     for mode in ("paralyzable", "synchronous", "gated"):
         able = {name for name, engine in ENGINES.items() if mode in engine.modes}

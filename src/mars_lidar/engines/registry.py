@@ -11,7 +11,7 @@ from mars_lidar.engines.exact import ExactEngine, PoissonEngine, SequentialEngin
 from mars_lidar.engines.feedback import FeedbackEngine
 from mars_lidar.engines.mars import MarsEngine
 from mars_lidar.engines.renewal import RenewalEngine
-from mars_lidar.instrument.detector import require_effects
+from mars_lidar.instrument.detector import require_effects, require_mode_of
 from mars_lidar.instrument.system import System
 from mars_lidar.instrument.tolerances import TOL
 
@@ -35,13 +35,7 @@ def check_detector(engine: Engine, system: System) -> None:
     """Raise ValueError, naming alternatives, if `engine` does not support the detector's mode or effects."""
     if system.cycles > TOL.cycles:
         raise ValueError(f"cycles must be an integer in [1, {TOL.cycles}] to be simulated, got {system.cycles}")
-    mode = system.detector.mode
-    if mode not in engine.modes:
-        able = " or ".join(repr(name) for name, each in ENGINES.items() if mode in each.modes)
-        raise ValueError(
-            f"engine {engine.name!r} does not do mode {mode!r} of the detector, only "
-            f"{', '.join(map(repr, engine.modes))}; use {able}"
-        )
+    require_mode_of("engine", engine, ENGINES.values(), system.detector.mode)
 
     def instead(effect: str) -> str:
         return "; use " + " or ".join(repr(name) for name, each in ENGINES.items() if effect in each.effects)

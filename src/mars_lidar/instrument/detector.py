@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -276,6 +276,14 @@ class Detector:
             if field.read is not None and known.get(name) is not None:
                 known[name] = field.read(known[name])
         return cls(**known)
+
+
+def require_mode_of(what: str, chosen: Any, every: Iterable[Any], mode: str) -> None:
+    """Raise ValueError if `mode` is none of the modes of `chosen`, with the names of those of `every` whose it is."""
+    if mode not in chosen.modes:
+        able = " or ".join(repr(each.name) for each in every if mode in each.modes)
+        modes = ", ".join(map(repr, chosen.modes))
+        raise ValueError(f"{what} {chosen.name!r} is not for detectors of mode {mode!r}, only for {modes}; use {able}")
 
 
 def require_effects(what: str, detector: Detector, able: tuple[str, ...], instead: Callable[[str], str]) -> None:

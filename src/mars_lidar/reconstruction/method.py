@@ -14,7 +14,7 @@ import numpy as np
 from mars_lidar._base import arguments, checks
 from mars_lidar._base.native import _core
 from mars_lidar._base.types import ArrayLike, FloatArray, NDArray
-from mars_lidar.instrument.detector import Mode
+from mars_lidar.instrument.detector import Mode, require_mode_of
 from mars_lidar.instrument.effects import LIGHT_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.reconstruction.histogram_record import check_window, recording_of
@@ -117,13 +117,7 @@ class Method(ABC):
 
     def check(self, system: System) -> None:
         """Raise ValueError, naming mode and method, for a `system` to which this method does not apply."""
-        mode = system.detector.mode
-        if mode not in self.modes:
-            able = " or ".join(repr(each.name) for each in _known() if mode in each.modes)
-            raise ValueError(
-                f"method {self.name!r} is not for detectors of mode {mode!r}, only for "
-                f"{', '.join(map(repr, self.modes))}; use {able}"
-            )
+        require_mode_of("method", self, _known(), system.detector.mode)
         if system.detector.gate_moves:
             raise ValueError(
                 f"method {self.name!r} needs a gate that repeats every period, got "

@@ -48,8 +48,29 @@ class Settled(IntEnum):
     NOT_WARM = -3  # the iteration did not reach the stationary state of the start: no result
 
 
+class OfCumulants:
+    """Mean, variance and standard deviation of a count N from its `cumulants` (..., 4)."""
+
+    cumulants: FloatArray
+
+    @property
+    def mean(self) -> FloatArray:
+        """Mean of N (...)."""
+        return self.cumulants[..., 0]
+
+    @property
+    def variance(self) -> FloatArray:
+        """Variance of N (...), never negative."""
+        return self.cumulants[..., 1]
+
+    @property
+    def std(self) -> FloatArray:
+        """Standard deviation of N (...)."""
+        return np.sqrt(self.variance)
+
+
 @dataclass(frozen=True, eq=False)
-class Exposure:
+class Exposure(OfCumulants):
     """Statistics of the count N and of the histogram of one exposure, for cells of shape (...).
 
     Attributes
@@ -98,21 +119,6 @@ class Exposure:
     movement: FloatArray
 
     __repr__ = brief
-
-    @property
-    def mean(self) -> FloatArray:
-        """Mean of N (...)."""
-        return self.cumulants[..., 0]
-
-    @property
-    def variance(self) -> FloatArray:
-        """Variance of N (...), never negative."""
-        return self.cumulants[..., 1]
-
-    @property
-    def std(self) -> FloatArray:
-        """Standard deviation of N (...)."""
-        return np.sqrt(self.variance)
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,7 @@ from mars_lidar.statistics.chain import Rearm
 from mars_lidar.statistics.constant_light import renewal_moments
 from mars_lidar.statistics.count_pmf import Pmf, exact_pmfs, gaussian_pmf, poisson_pmf
 from mars_lidar.statistics.electronics import record_pmfs
-from mars_lidar.statistics.exposure import Exposure, refined_moments
+from mars_lidar.statistics.exposure import Exposure, OfCumulants, refined_moments
 from mars_lidar.statistics.histogram import chain_of, histogram_effects, rearm_of
 from mars_lidar.statistics.renewal import holding_times
 from mars_lidar.statistics.synchronous import cumulants_of, synchronous_pmfs
@@ -30,7 +30,7 @@ from mars_lidar.statistics.tolerances import LAW, TOL
 Method = Literal["exact", "mars", "renewal", "poisson"]
 
 
-class CountLaw:
+class CountLaw(OfCumulants):
     """Law of the number N of registrations in an exposure, for pixels of shape (...); returned by `count_law`.
 
     `support`, `pmf` and `cdf` are computed on first use.
@@ -80,21 +80,6 @@ class CountLaw:
         self.cumulants = cumulants
         self.exposure = exposure
         self._evaluate = evaluate
-
-    @property
-    def mean(self) -> FloatArray:
-        """E N (...)."""
-        return self.cumulants[..., 0]
-
-    @property
-    def variance(self) -> FloatArray:
-        """Var N (...)."""
-        return self.cumulants[..., 1]
-
-    @property
-    def std(self) -> FloatArray:
-        """Standard deviation of N (...)."""
-        return np.sqrt(self.variance)
 
     @cached_property
     def _laws(self) -> list[Pmf]:

@@ -184,7 +184,7 @@ def test_counts_that_do_not_belong_to_the_recipe_are_refused(tmp_path):
         ({"seed": -1}, ValueError, r"seed must be an integer in \[0, 18446744073709551615\], got -1"),
         ({"realizations": 0}, ValueError, r"realizations must be an integer in \[1, .*got 0"),
         ({"first_realization": 2**32}, ValueError, r"first_realization must be .*got 4294967296"),
-        ({"engine": None}, TypeError, "engine must be the name of an engine, got None"),
+        ({"engine": None}, TypeError, "engine must be a text, got None"),
         ({"depth_m": np.zeros((2, 2))}, ValueError, r"depth_m must have .* \(6, 5\), got \(2, 2\)"),
         ({"reflectivity": np.zeros(5)}, ValueError, r"reflectivity must have the flux's shape"),
         ({"pixel_index": np.arange(4)}, ValueError, r"pixel_index must have shape \(30,\)"),

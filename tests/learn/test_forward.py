@@ -433,7 +433,7 @@ def test_bad_arguments(table):
     assert "6 x 5 x 1024, 1000 cycles" in repr(model)
     refused(r"signal must lie in the table's \[0, 5.1\] .* got 6 to 6", model, torch.tensor(6.0), *maps[1:])
     refused("delay_ns finite", model, *maps[:2], torch.tensor(float("nan")))
-    refused(r"table must be a mars_lidar\.Table", HistogramTable, "table.h5", error=TypeError)
+    refused(r"table must be a Table", HistogramTable, "table.h5", error=TypeError)
     longer = HistogramTable(table, cycles=5000)
     torch.testing.assert_close(longer(*maps), 5 * model(*maps), rtol=1e-5, atol=1e-6)
 

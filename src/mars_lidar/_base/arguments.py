@@ -116,6 +116,12 @@ def constructed_by_name(cls: C) -> C:
     return cls
 
 
+def checked_fields(cls: C) -> C:
+    """Apply `checked` to the constructor of a class."""
+    cls.__init__ = checked(cls.__init__)  # type: ignore[misc]
+    return cls
+
+
 def _bound(name: str, signature: inspect.Signature, args: tuple[Any, ...], kwargs: dict[str, Any]) -> dict[str, Any]:
     """The arguments of a call by their names; TypeError names the argument that was meant, or the form of the call.
 
@@ -162,7 +168,7 @@ def _rules(function: Callable[..., Any], signature: inspect.Signature) -> dict[s
         annotation = parameter.annotation
         if isinstance(annotation, str):
             annotation = eval(annotation.strip("'\""), {}, names)
-        members = tuple(_members(annotation))
+        members = (*_members(annotation), *([type(None)] if parameter.default is None else []))
         if set(members) - _NUMBERS and all(_known(member) for member in members):
             rules[name] = members
     return rules or {"": ()}

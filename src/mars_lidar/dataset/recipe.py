@@ -18,7 +18,7 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 import numpy as np
 
 from mars_lidar._base import checks
-from mars_lidar._base.arguments import checked
+from mars_lidar._base.arguments import checked, checked_fields
 from mars_lidar._base.yaml import Key, RecipeError, located, read_yaml
 from mars_lidar.dataset import values
 from mars_lidar.dataset.values import Fields
@@ -44,6 +44,7 @@ LIGHT: Fields = {
 }
 
 
+@checked_fields
 @dataclass(frozen=True, kw_only=True)
 class Light:
     """Levels of light, and the arguments of `mars_lidar.Scene.flux` that all samples share.
@@ -57,8 +58,8 @@ class Light:
     """
 
     levels: tuple[tuple[float, float], ...] = ((1.0, 1.0),)
-    attenuation: str = "none"
-    ambient: str | None = None
+    attenuation: Literal["none", "inverse_square"] = "none"
+    ambient: Literal["uniform", "reflectivity", "map"] | None = None
     dark_count_hz: float = 0.0
     photons_per_unit: float | None = None
 
@@ -66,9 +67,6 @@ class Light:
         pairs = self.levels
         if not isinstance(pairs, list | tuple) or not pairs or not all(map(_is_pair, pairs)):
             raise ValueError(f"levels must be pairs (signal, sbr) of numbers >= 0, got {pairs!r}")
-        checks.choice("attenuation", self.attenuation, ("none", "inverse_square"))
-        if self.ambient is not None:
-            checks.choice("ambient", self.ambient, ("uniform", "reflectivity", "map"))
         checks.real("dark_count_hz", self.dark_count_hz, low=0.0)
         if self.photons_per_unit is not None:
             checks.real("photons_per_unit", self.photons_per_unit, low=0.0, strict_low=True)

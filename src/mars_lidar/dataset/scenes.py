@@ -99,8 +99,8 @@ class Surfaces:
                 system,
                 signal=signal,
                 sbr=sbr,
-                attenuation=light.attenuation,  # type: ignore[arg-type]  # checked by the recipe
-                ambient=light.ambient,  # type: ignore[arg-type]
+                attenuation=light.attenuation,  # checked by the recipe
+                ambient=light.ambient,
                 dark_count_hz=light.dark_count_hz if dark is None else dark,
             )
         return clear if self.fog is None else self.fog.before(clear, system, signal)

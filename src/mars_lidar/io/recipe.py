@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked_fields
 from mars_lidar._base.display import brief
 from mars_lidar.engines.simulation import checked_index
 from mars_lidar.instrument.system import System
@@ -88,6 +89,7 @@ class _Blocks:
                 yield slice(k, k + 1), slice(row, min(row + band, height))
 
 
+@checked_fields
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Recording(_Blocks):
     """Recording of a measured cube, whose light is unknown.
@@ -136,14 +138,11 @@ class Recording(_Blocks):
     reflectivity: ClassVar[None] = None
 
     def __post_init__(self) -> None:
-        if not isinstance(self.system, System):
-            raise TypeError(f"system must be a System, got {self.system!r}")
         if not isinstance(self.pixels, tuple) or len(self.pixels) != 2:
             raise TypeError(f"pixels must be (H, W), got {self.pixels!r}")
         for size in self.pixels:
             checks.integer("pixels", size, low=1, high=2**32)
         checks.integer("realizations", self.realizations, low=1, high=2**32)
-        _require_text("source", self.source)
 
     @property
     def image(self) -> tuple[int, int]:
@@ -161,6 +160,7 @@ class Recording(_Blocks):
         return dataclasses.replace(self, **changes)
 
 
+@checked_fields
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Recipe(_Blocks):
     """All arguments of one call of `mars_lidar.simulate`, and the maps of the scene.
@@ -220,10 +220,6 @@ class Recipe(_Blocks):
     __repr__ = brief
 
     def __post_init__(self) -> None:
-        if not isinstance(self.system, System):
-            raise TypeError(f"system must be a System, got {self.system!r}")
-        if not isinstance(self.flux, Flux):
-            raise TypeError(f"flux must be a Flux, got {self.flux!r}")
         object.__setattr__(self, "flux", self.flux.image)
         for name, low, high in (
             ("seed", 0, 2**64 - 1),
@@ -232,12 +228,6 @@ class Recipe(_Blocks):
         ):
             number = checks.integer(name, getattr(self, name), low=low, high=high)
             object.__setattr__(self, name, number)
-        if not isinstance(self.engine, str):
-            raise TypeError(f"engine must be the name of an engine, got {self.engine!r}")
-        _require_text("source", self.source)
-        for name in ("options", "settings"):
-            if not isinstance(getattr(self, name), dict):
-                raise TypeError(f"{name} must be a dictionary, got {getattr(self, name)!r}")
         depth = self.system.depth_m(self.flux.delay_ns) if self.depth_m is None else self.depth_m
         object.__setattr__(self, "depth_m", self._map("depth_m", depth))
         if self.reflectivity is not None:
@@ -290,8 +280,3 @@ class Recipe(_Blocks):
     def replace(self, **changes: Any) -> Recipe:
         """A copy with some fields changed: `changes`, by their names."""
         return dataclasses.replace(self, **changes)
-
-
-def _require_text(name: str, value: Any) -> None:
-    if not isinstance(value, str):
-        raise TypeError(f"{name} must be a text, got {value!r}")

@@ -77,8 +77,6 @@ class LidarPhysics(Physics):  # type: ignore[misc]  # deepinv is not typed
         threads: int | None = None,
     ) -> None:
         super().__init__()
-        if not isinstance(system, System):
-            raise TypeError(f"system must be a System, got {type(system).__name__}")
         check_detector(system)
         if table is not None and table.system.replace(cycles=system.cycles) != system:
             raise ValueError(f"table must be of this system, got one of {table.system}")

@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked_fields
 from mars_lidar._base.display import brief
 from mars_lidar.instrument.pulse import GaussianPulse
 from mars_lidar.instrument.system import System
@@ -164,6 +165,7 @@ def as_range(name: str, value: float | Range, *, low: float = 0.0, infinite: boo
     return given
 
 
+@checked_fields
 @dataclass(frozen=True, kw_only=True)
 class SystemRange:
     """Distribution of instruments: those of `base`, with the given fields drawn from ranges or set to numbers.
@@ -214,8 +216,6 @@ class SystemRange:
     __repr__ = brief
 
     def __post_init__(self) -> None:
-        if not isinstance(self.base, System):
-            raise TypeError(f"base must be a System, got {type(self.base).__name__}")
         for name in _DRAWN:
             value = getattr(self, name)
             if value is not None:

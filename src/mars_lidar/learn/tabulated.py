@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+from mars_lidar._base.arguments import checked
 from mars_lidar.learn.forward import Delay, blocks, by_rows, check_detector, inputs, values_of, wrapped_energy
 from mars_lidar.learn.needed import torch
 from mars_lidar.learn.tolerances import TOLERANCES
@@ -67,10 +68,9 @@ class HistogramTable(torch.nn.Module):
     ((1, 64), True)
     """
 
+    @checked
     def __init__(self, table: Table, *, cycles: int | None = None) -> None:
         super().__init__()
-        if not isinstance(table, Table):
-            raise TypeError(f"table must be a mars_lidar.Table, got {type(table).__name__}")
         system = table.system if cycles is None else table.system.replace(cycles=cycles)
         check_detector(system)
         if not table.serves(system.cycles):

@@ -19,11 +19,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked_fields
 from mars_lidar._base.display import brief
 from mars_lidar._base.native import _core
 from mars_lidar._base.types import ArrayLike, FloatArray
@@ -192,8 +193,6 @@ def cyclic_recursion(keep: FloatArray, source: FloatArray, loss: float, *, backw
 
 Rearm = Literal["centre", "edge"]
 
-_REARMS = get_args(Rearm)
-
 
 @dataclass(frozen=True, eq=False)
 class Stationary:
@@ -240,6 +239,7 @@ class Stationary:
     __repr__ = brief
 
 
+@checked_fields
 @dataclass(frozen=True, eq=False)
 class PhaseChain:
     """Chain of registration phases of a free-running, non-paralyzable detector.
@@ -312,7 +312,6 @@ class PhaseChain:
     __repr__ = brief
 
     def __post_init__(self) -> None:
-        checks.numbers("photons", checks.unmasked("photons", self.photons))
         photons = np.array(self.photons, dtype=np.float64)
         if photons.ndim != 1 or photons.size == 0:
             raise ValueError(f"photons must be (n,) with n >= 1, got shape {photons.shape}")
@@ -324,7 +323,6 @@ class PhaseChain:
         if not total > 0:
             raise ValueError("photons must not all be 0: without flux there is no registration and no chain")
         dead = checks.real("dead_time", self.dead_time, low=0.0, high=INSTRUMENT.dead_periods)
-        checks.choice("rearm", self.rearm, _REARMS)
         photons.flags.writeable = False
         n = photons.size
         # without the whole periods, whose digits the fraction of t_d = 200.9 periods would lose (2.2)

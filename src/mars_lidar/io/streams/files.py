@@ -31,8 +31,6 @@ READ_SUFFIXES = tuple(_MODULES)
 
 def save(path: str | Path, times: Timestamps, *, overwrite: bool = False, clock_ps: float | None = None) -> None:
     """Write timestamps; see `Timestamps.save`."""
-    if not isinstance(times, Timestamps):
-        raise TypeError(f"times must be Timestamps, got {type(times).__name__}")
     target = Path(path)
     write = _write_npz if target.suffix == ".npz" else _module(target, STREAM_SUFFIXES).write
     if not (times.cycles >= 1 and times.period_ns > 0 and math.isfinite(times.period_ns)):

@@ -147,8 +147,9 @@ class Feedback:
                 x = x + np.diff(solve(rest), prepend=0.0)
             self._sweep(rhs, x, adjoint, 1)
             residual = self._residual(rhs, x, adjoint)
-            if residual < least:
-                best, least = x, residual
+            if not residual < least:
+                break
+            best, least = x, residual
         return best, least
 
     def _prefix_matrix(self) -> csc_matrix:

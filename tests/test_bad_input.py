@@ -68,17 +68,6 @@ def test_system_as_a_whole():
 
 
 @pytest.mark.parametrize(
-    ("changes", "kind", "fragments"),
-    [
-        ({"dead_time_ns": -0.1}, ValueError, ["dead_time_ns", "[0, inf)", "got -0.1"]),
-        ({"mode": "paralysable"}, ValueError, ["mode", "'nonparalyzable'", "'paralyzable'", "got 'paralysable'"]),
-    ],
-)
-def test_detector(changes: dict[str, Any], kind: type[Exception], fragments: list[str]):
-    refused(lambda: ml.Detector(**{"dead_time_ns": 5.0} | changes), kind, *fragments)
-
-
-@pytest.mark.parametrize(
     ("make", "kind", "fragments"),
     [
         (lambda: ml.GaussianPulse(sigma_ns=0.0), ValueError, ["sigma_ns", "(0, inf)", "got 0.0"]),

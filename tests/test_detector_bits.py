@@ -93,7 +93,9 @@ def test_rules_hold_for_every_registration(mode: str, kind: str):
 @pytest.mark.parametrize(
     ("changes", "kind", "fragments"),
     [
-        ({"mode": "gate"}, ValueError, ["mode", "'paralyzable'", "'synchronous'", "'gated'", "got 'gate'"]),
+        ({"dead_time_ns": -0.1}, ValueError, ["dead_time_ns", "[0, inf)", "got -0.1"]),
+        ({"mode": "gate"}, ValueError, ["mode", "'nonparalyzable'", "'paralyzable'", "'synchronous'", "got 'gate'"]),
+        ({"mode": "paralysable"}, ValueError, ["mode", "'nonparalyzable'", "'gated'", "got 'paralysable'"]),
         ({"gate_start_ns": 5.0}, ValueError, ["gate_start_ns", "'gated'", "'nonparalyzable'", "got 5.0"]),
         ({"mode": "paralyzable", "gate_width_ns": 5.0}, ValueError, ["gate_width_ns", "'gated'", "'paralyzable'"]),
         ({"mode": "synchronous", "gate_step_ns": 0.0}, ValueError, ["gate_step_ns", "'gated'", "'synchronous'"]),

@@ -215,7 +215,7 @@ def _require(name: str, value: Any, members: tuple[Any, ...], masks: bool) -> No
 def _fits(value: Any, member: Any, paths: bool) -> bool:
     origin = typing.get_origin(member) or member
     if origin is typing.Literal:
-        return any(value is choice or (type(value) is type(choice) and value == choice) for choice in member.__args__)
+        return any(isinstance(value, type(choice)) and bool(value == choice) for choice in member.__args__)
     if origin is _Array or (origin is str and paths):
         return False
     if isinstance(origin, _NameOnly):

@@ -16,7 +16,7 @@ from mars_lidar.io import recipe as recipes
 from mars_lidar.io.maps import load_maps
 from mars_lidar.reconstruction import METHODS
 from mars_lidar.reconstruction import stored as stored_module
-from mars_lidar.reconstruction.map_errors import map_error
+from mars_lidar.reconstruction.map_errors import errors_against, map_error
 from mars_lidar.reconstruction.stored import reconstruct_stored
 from tests.harness.command import fails, ok, run
 from tests.harness.study import quick_study
@@ -41,6 +41,32 @@ def test_reflectivity_is_right_behind_a_detection_efficiency(tmp_path):
         ratio = outcome.reflectivity[0] / stored.reflectivity
         np.testing.assert_allclose(outcome.signal[0] / stored.flux.signal, share, rtol=0.15)
     assert np.median(ratio) == pytest.approx(1.0, abs=0.02)
+
+
+def test_signal_is_judged_behind_a_detection_efficiency(tmp_path):
+    """The true signal falls on the pixel, the estimate is detectable: with an efficiency of 1/4 the error was 3/4 S."""
+    signal = np.linspace(0.5, 2.0, 16).reshape(4, 4)
+    detector = ml.Detector(dead_time_ns=50.0, detection_efficiency=0.25)
+    system = make_system(50.0, 20_000, 128).replace(detector=detector)
+    io.simulate_to(tmp_path / "a.zarr", ml.Flux(signal, 0.2, 40.0), system)
+    with io.load(tmp_path / "a.zarr") as stored:
+        maps = reconstruct_stored(stored)["maximum_likelihood"].result
+        error = errors_against(stored, maps)["signal"].rmse
+    assert error == pytest.approx(float(np.sqrt(np.mean((maps.signal - 0.25 * signal) ** 2))))
+    assert error < 0.02
+
+
+@pytest.mark.filterwarnings("ignore:the bins of")
+@pytest.mark.parametrize("method", ["peak", "maximum_likelihood", "image"])
+def test_impossible_counts_are_flagged_as_by_reconstruct(tmp_path, method):
+    """More counts than the dead time allows: flagged in an array, they were not flagged in a file."""
+    system = make_system(75.0, 100, 128)
+    io.simulate_to(tmp_path / "a.zarr", ml.Flux(np.full((4, 4), 2.0), 3.0, 40.0), system, engine="poisson")
+    with io.load(tmp_path / "a.zarr") as stored:
+        whole = ml.reconstruct(np.asarray(stored.histogram[:]), system, method)
+        parts = reconstruct_stored(stored, [method])[method].result
+    assert (whole.flags & ml.reconstruction.Flags.SATURATED).all()
+    np.testing.assert_array_equal(parts.flags, whole.flags)
 
 
 LIGHT = ml.Flux(0.3, 0.3, 40.0)

@@ -15,6 +15,7 @@ from mars_lidar.reconstruction import METHODS, Flags, Image, UntrainedImage
 from mars_lidar.reconstruction import image as image_module
 from mars_lidar.reconstruction.image_network import LIMITS, card, networks, trained_for
 from mars_lidar.reconstruction.image_pulse import centroid_error, kurtosis, settings_of
+from mars_lidar.reconstruction.keep import keep_return
 from mars_lidar.reconstruction.photons import Photons
 
 SIGMA = 0.6
@@ -246,6 +247,22 @@ def test_two_surfaces(dead_time):
     some = result.returns.count > 0
     assert np.array_equal(result.signal[some], strongest[some])
     assert np.array_equal(result.returns.count, np.isfinite(result.returns.false_alarm).sum(-1))
+
+
+def test_a_return_that_is_not_the_strongest_has_no_interval():
+    """The only stated intervals are those of the strongest returns: for the nearest ones 75 % of them were right."""
+    even = np.ones((16, 16))
+    flux = ml.Flux.multi(ml.Flux(0.004 * even, 0.002, 20.0 * even), ml.Flux(0.012 * even, 0.0, 60.0 * even))
+    system = make_system(75.0, 1000, 128, pulse=ml.GaussianPulse(sigma_ns=1.0))
+    maps = ml.reconstruct(ml.simulate(flux, system, seed=0)[0], system, "image", returns=2)
+    both = maps.returns.count == 2
+    assert both.mean() > 0.9
+    near, far = keep_return(maps, "nearest"), keep_return(maps, "farthest")
+    assert np.isnan(near.delay_half_width_ns[both]).all()
+    assert np.isnan(near.depth_half_width_m[both]).all()
+    np.testing.assert_array_equal(near.outlier[both], maps.returns.false_alarm[both][:, 0])
+    np.testing.assert_array_equal(far.delay_half_width_ns[both], maps.delay_half_width_ns[both])
+    np.testing.assert_array_equal(far.outlier[both], maps.outlier[both])
 
 
 def test_bright_pixels_are_estimated_alone():

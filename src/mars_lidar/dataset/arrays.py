@@ -59,12 +59,12 @@ def fitting(shape: Sequence[int], unit: Sequence[int], itemsize: int, most_bytes
 
 
 def grid(shape: Sequence[int], steps: Sequence[int]) -> tuple[int, ...]:
-    """How many blocks of `steps` there are along each axis."""
+    """Number of blocks of size `steps` along each axis of an array of `shape`."""
     return tuple(math.ceil(n / step) for n, step in zip(shape, steps, strict=True))
 
 
 def block(place: Sequence[int], steps: Sequence[int], shape: Sequence[int]) -> tuple[slice, ...]:
-    """The part of an array that is the block at a place of the grid."""
+    """Slices of the block at index `place` of the grid of blocks of size `steps`."""
     every = zip(place, steps, shape, strict=True)
     return tuple(slice(k * step, min((k + 1) * step, n)) for k, step, n in every)
 
@@ -149,7 +149,7 @@ def create_maps(
 
 
 def with_zeros(array: Any) -> Any:
-    """The array, so that a part without counts is written too: a missing file means "not made yet"."""
+    """The array with chunks of zeros written too, because a missing file means that the part is not made yet."""
     return array.with_config({"write_empty_chunks": True})
 
 

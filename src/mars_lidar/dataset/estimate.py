@@ -146,7 +146,7 @@ def quick_advice(recipe: DatasetRecipe | dict[str, Any] | str | Path, threads: i
 def _read_some(
     recipe: Any, most: int = _SCENES
 ) -> tuple[DatasetRecipe, list[Candidate], list[Problem], list[Content], float]:
-    """The recipe, its scenes, what is bad, some scenes of one size, and the seconds that reading one took."""
+    """The recipe, its candidates, their problems, up to `most` scenes of one size, and seconds of reading per scene."""
     plan, folder = read_recipe(recipe)
     assert plan is not None
     listed, problems = candidates(plan.scenes, folder)
@@ -163,7 +163,7 @@ def _read_some(
 
 
 def _scene_bytes(content: Content) -> int:
-    """Bytes of one scene in the store, not packed."""
+    """Bytes of one scene in the store before compression."""
     maps = 3 + content.transient.values.shape[2] if isinstance(content, Rendered) else 2 * len(content.layers)
     return 8 * maps * math.prod(content.shape)
 

@@ -20,7 +20,7 @@ from mars_lidar._base.manifest import Summing, Sums, sums_of
 from mars_lidar._base.native import _core
 
 _NOTE_S = 10.0  # between two writes of digests in an object store: what a killed worker loses is read again
-_NONE = 2**64 - 1  # offset and length of a chunk that is not there
+_NONE = 2**64 - 1  # offset and length of a missing chunk in the index of a shard (Zarr v3)
 Region = tuple[slice, ...]
 
 

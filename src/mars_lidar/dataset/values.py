@@ -18,7 +18,7 @@ class Field:
 
     read: Callable[[Key, Any], Any]
     schema: dict[str, Any]
-    default: Any = None  # left out where None
+    default: Any = None  # None: a missing key stays missing
 
     def or_else(self, default: Any) -> Field:
         """With a default."""
@@ -63,7 +63,7 @@ def integer(about: str, *, low: int, high: int, name: str | None = None) -> Fiel
 
 
 def choice(about: str, allowed: tuple[str, ...]) -> Field:
-    """One of some words."""
+    """One of the `allowed` words."""
     return _field(about, lambda key, value: checked(key, checks.choice, key_name(key), value, allowed), enum=[*allowed])
 
 
@@ -135,7 +135,7 @@ def listed_numbers(value: Any) -> list[int]:
 
 
 def mapping(about: str, fields: Fields, needed: tuple[str, ...] = ()) -> Field:
-    """Keys of their own."""
+    """A mapping with the keys of `fields`."""
     return _field(about, lambda key, value: read_mapping(key, value, fields, needed), **schema_of(fields, needed))
 
 

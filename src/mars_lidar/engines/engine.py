@@ -218,12 +218,12 @@ class Engine(ABC):
 
 @lru_cache(maxsize=16)
 def _recording(detector: Detector, period_ns: float) -> _core.Recording:
-    """What the electronics make of registrations; times in periods."""
+    """Native form of the effects of the electronics: which registrations are recorded, and when; times in periods."""
     given = native_fields({name: getattr(detector, name) for name in RECORDING_EFFECTS}, period_ns)
     return _core.Recording(**(_EVERYTHING | given))
 
 
-_EVERYTHING: dict[str, Any] = {  # recorded, when it happens
+_EVERYTHING: dict[str, Any] = {  # without effects: every registration is recorded, at its time
     "electronics_dead_time": 0.0,
     "most_per_period": 2**31 - 1,
     "most_per_exposure": 2**31 - 1,

@@ -33,7 +33,7 @@ def single_return(flux: Flux) -> tuple[FloatArray, FloatArray] | None:
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Pixels (P,) of the image, `cell` (P,) the one of `cells` that each is."""
+    """Pixels (P,) of the image, and for each the index `cell` (P,) of the equal one in `cells`."""
 
     pixels: IndexArray
     cells: Cells

@@ -55,7 +55,7 @@ class Tolerances:
     lanes, most of them idle, where a full one breaks even at 4."""
 
     other_numbers: int = 0x278DDE6E5FD29E45
-    """What a try changes the seed by."""
+    """Multiplied by the number of the try and combined with the seed by exclusive or: the seed of that try."""
 
     # auto: registrations that the exact engine draws in the time that feedback takes for
     cell_even: float = 4.0

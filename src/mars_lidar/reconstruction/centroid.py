@@ -43,13 +43,16 @@ class Centroid(Peak):
 
 
 def _reach(system: System) -> int:
-    """Bins on either side of the peak that the pulse's core reaches."""
+    """Bins from the delay to the farther end of the pulse's core (`core_ns`), less than half of the period."""
     low, high = core_ns(system)
     return min(math.ceil(max(-low, high) / system.bin_ns), (system.bins - 1) // 2)
 
 
 def _centred(given: Histograms, background: FloatArray, delay: FloatArray, first: int) -> FloatArray:
-    """(1) for some pixels, in periods; the peak itself where nothing stands out of the background."""
+    """Delays (1), in periods, of the pixels from `first` on, whose peaks lie at `delay`.
+
+    A peak is returned as it is if the window has no more counts than the background, or (1) lies outside the window.
+    """
     system, reach = given.system, _reach(given.system)
     bins, around = system.bins, np.arange(-reach, reach + 1)
     known = np.isfinite(delay)
@@ -67,7 +70,7 @@ def _centred(given: Histograms, background: FloatArray, delay: FloatArray, first
 
 
 def _pulse_centre(system: System, reach: int) -> float:
-    """Centre of mass of the pulse within so many bins of its delay, in bins from the delay."""
+    """Centre of mass of the pulse within `reach` bins of its delay: m of (1), in bins."""
     edges = np.linspace(-reach - 0.5, reach + 0.5, 64 * (2 * reach + 1) + 1)
     energy = np.diff(system.pulse.cumulative(edges * system.bin_ns))
     return float((energy * 0.5 * (edges[1:] + edges[:-1])).sum() / energy.sum())

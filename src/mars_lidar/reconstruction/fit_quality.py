@@ -15,15 +15,16 @@ from mars_lidar.reconstruction.histogram_record import recording_of, relative_wi
 
 FALSE_ALARM = 1e-3  # of `Flags.MISFIT`, a pixel
 COLUMNS = 8  # of the native statistics of a pixel
-_DEAD_TIME = 1.2  # factor of the dead times, longer and shorter, ...
-_WIDTH = 1.1  # ... and of the pulse whose score is computed, ...
-_BIN = 0.5  # ... which has the width of so much of a bin in addition: less cannot be seen
+_DEAD_TIME = 1.2  # factor by which the dead time of an alternative is longer or shorter
+_WIDTH = 1.1  # factor by which the pulse of an alternative is wider, ...
+_BIN = 0.5  # ... and bins added to its width in quadrature: a smaller change does not alter the histogram
 
 
 def tested_recordings(system: System) -> list[_core.HistogramRecord]:
-    """The changes for which scores are computed (longer, shorter, wider); none if armed passes do not follow.
+    """Systems with a longer dead time, a shorter one and a wider pulse, for which scores are computed.
 
-    They follow for a free-running detector without a gate in an exposure much longer than its dead time.
+    Empty unless the detector is free-running without a gate and the exposure is longer than four dead times and four
+    periods: otherwise the histogram does not determine the armed periods of its bins.
     """
     if system.detector.mode != "nonparalyzable" or system.cycles <= 4.0 * max(1.0, system.dead_time_periods):
         return []
@@ -51,7 +52,7 @@ class Quality:
 
 
 def quality_of(statistics: FloatArray) -> Quality:
-    """From the native statistics (pixels, 8)."""
+    """The tests from the native statistics (pixels, `COLUMNS`)."""
     from scipy.special import gammaincc
 
     chi2, freedom, longer, shorter, wider, *skewness = np.ascontiguousarray(statistics.T)
@@ -69,13 +70,14 @@ def quality_of(statistics: FloatArray) -> Quality:
 
 
 def law_above(score: FloatArray, skewness: FloatArray) -> FloatArray:
-    """Probability of more than this score, and half of that of itself, of mean 0, variance 1 and a skewness.
+    """Mid-p upper tail, P(X > score) + P(X = score) / 2, of a score X of mean 0, variance 1 and given skewness.
 
-    That of a Poisson number of this skewness, between whole ones too; the normal law, which is above, if negative.
+    X is a standardised Poisson number of mean 1 / skewness^2, continued between integers by the incomplete gamma
+    function. For a skewness below 1e-3, or negative, it is normal; for negative skewness this tail is too large.
     """
     from scipy.special import gammainc, ndtr
 
-    mean = np.where(skewness > 1e-3, skewness, np.nan) ** -2.0  # beyond a million the same
+    mean = np.where(skewness > 1e-3, skewness, np.nan) ** -2.0  # for larger means the normal law
     number = mean + score * np.sqrt(mean)
     law = 0.5 * (gammainc(np.maximum(number, 0.0), mean) + gammainc(np.maximum(number + 1.0, 0.0), mean))
     return np.where(np.isnan(mean), ndtr(-score), law)

@@ -11,8 +11,8 @@ from mars_lidar.instrument.pulse import GaussianPulse, Pulse, SampledPulse
 from mars_lidar.instrument.system import System
 
 _CELLS_PER_SIGMA = 32  # Hermite interpolation: energies to 3e-9
-_CELLS_PER_PERIOD = 4096  # of a Gaussian that is wider than the period
-_CELLS_PER_SAMPLE = 16  # of few samples, whose edges are rounded over one of them
+_CELLS_PER_PERIOD = 4096  # of a pulse that is wider than the period; most of a sampled pulse
+_CELLS_PER_SAMPLE = 16  # at most: the interpolation rounds the edge of a sample over one cell
 _OUTSIDE_CORE = 0.0015  # of the energy on either side of the window in which the signal is counted: 3 sigma
 
 
@@ -24,7 +24,7 @@ def recording_of(system: System, *, longer: float = 1.0, wider: float = 1.0) -> 
     """
     from mars_lidar.statistics.cells import whole_bins
 
-    # a wider pulse has in a period the form that this has in a shorter one
+    # a pulse that is wider by a factor looks, in units of the period, like this one in a period shorter by it
     low, cell, energy, slope = _curve(system.pulse, system.period_ns / wider)
     peak = low + cell * (int(np.argmax(np.diff(energy))) + 0.5)
     core = core_ns(system)
@@ -54,7 +54,7 @@ def recording_of(system: System, *, longer: float = 1.0, wider: float = 1.0) -> 
 
 
 def pulse_width(sharpness: float) -> float:
-    """Sigma of the Gaussian with the same integral of s^2."""
+    """Sigma of the Gaussian whose density s has the integral `sharpness` of s^2, in the reciprocal unit."""
     return 1.0 / (2.0 * math.sqrt(math.pi) * sharpness)
 
 
@@ -105,7 +105,7 @@ def _curve(pulse: Pulse, period: float) -> tuple[float, float, FloatArray, Float
 
 
 def _unit(energy: FloatArray) -> FloatArray:
-    """Energies that end at exactly 0 and 1, so that what lies between two periods of the pulse is nothing."""
+    """Cumulative energies that are exactly 0 at the first knot and 1 at the last: no energy lies outside of them."""
     energy = np.clip(energy, 0.0, 1.0)
     energy[0], energy[-1] = 0.0, 1.0
     return energy

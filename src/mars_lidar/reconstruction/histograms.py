@@ -1,4 +1,4 @@
-"""Histograms for the estimators: checked, flat, in a type of the native core."""
+"""Checked histograms (pixels, bins), the input of the estimators, in a data type of the native core."""
 
 from __future__ import annotations
 

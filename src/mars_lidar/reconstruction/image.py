@@ -32,7 +32,7 @@ from mars_lidar.reconstruction.returns import MOST_RETURNS, RETURN_COLUMNS
 VOLUME_BYTES = 96 * 2**20  # of each of three volumes (rows, columns, cells): larger images are computed in parts
 BLOCK_PIXELS = 2**17  # of the second network at a time
 NORMAL_HALF_WIDTH = NormalDist().inv_cdf(0.95)  # standard errors to either side that hold 90 %
-_SELF_BLIND = 1.0  # signal photons a period, above which a pulse hides so much of itself that armed time says little
+_SELF_BLIND = 1.0  # signal photons per period, above which few pixels are armed in the later part of a pulse
 _BRIGHT_BYTES = 64 * 2**20  # of the counts of such pixels at a time
 _PLANE, _PLANES = 32, 4  # pixels a side of a simulated plane, and their number
 _SLOPES = 0.06, 0.03  # widths of the pulse from row to row and from column to column
@@ -124,7 +124,7 @@ class Image(Method):
             return self._surface(photons, photons.number, system, threads)
         setting = settings_of(system)[-1]
         surfaces: list[Estimates] = []
-        for k in 2 * tuple(range(self.returns)):  # twice, so that the first knows of the others
+        for k in 2 * tuple(range(self.returns)):  # twice: the first surface needs the others
             others = surfaces[:k] + surfaces[k + 1 :]
             counted, share = _outside(photons, others, setting)
             surface = self._surface(photons, counted, system, threads)
@@ -136,7 +136,7 @@ class Image(Method):
     ) -> Estimates:
         """One surface, from the photons that are `counted` (entries,).
 
-        `checked`: a simulated plane tells whether the networks' intervals hold for a measured pulse.
+        `checked`: for a measured pulse the networks are used only if their intervals hold on a simulated plane.
         """
         pixels = photons.height * photons.width
         settings = settings_of(system)
@@ -163,7 +163,7 @@ class Image(Method):
             width = settings[-1].sigma / settings[-1].cells
             self_blind = signal > _SELF_BLIND
             bright = np.flatnonzero((number > _core.IMAGE_BRIGHT) | self_blind)
-            signal_error[self_blind] = np.nan  # unless their own likelihood says it
+            signal_error[self_blind] = np.nan  # unless the refit of the pixel below gives it
             _refit_bright(estimates, bright, width, photons, system, self.efficiency, threads)
         return estimates
 
@@ -265,7 +265,7 @@ def solver_of(
 def _outside(
     photons: Photons, surfaces: list[Estimates], setting: _core.ImageSetting
 ) -> tuple[NDArray[np.float32], FloatArray]:
-    """Photons (entries,) outside the pulses of `surfaces`, and the share of the period (pixels,) that is."""
+    """Photons (entries,) outside the pulses of `surfaces`, and the share (pixels,) of the period outside them."""
     first, last = (end / setting.cells for end in setting.pulse)
     counted, share = photons.number.copy(), np.ones(photons.height * photons.width)
     for each in surfaces:

@@ -14,8 +14,8 @@ from mars_lidar.reconstruction.histogram_record import recording_of, relative_wi
 
 CELLS_PER_SIGMA = 1.5
 _MOST_CELLS = 4096  # a period, of the sum-product: narrower pulses are first blurred to it
-_LEAST_DENSITY = 1e-4  # of the pulse, relative to its largest, to which its slope is taken
-_SMOOTHING = 0.25  # widths of the pulse, of the Gaussian that takes the noise off the slope of a measured one
+_LEAST_DENSITY = 1e-4  # relative to the largest density: a lower bound where the slope is divided by the density
+_SMOOTHING = 0.25  # sigma, in widths of the pulse, of the Gaussian that smooths a measured pulse before its slope
 _PLACES = 128  # of a pulse within a bin, over which the error of its centroid is taken
 _CURVE = 4096  # parts of a pulse for its moments
 
@@ -41,12 +41,12 @@ def settings_of(system: System) -> list[_core.ImageSetting]:
 
 @lru_cache(maxsize=16)
 def centroid_error(system: System) -> tuple[float, float]:
-    """By how much bins move the centroid of a surface's photons, over all places of the surface within a bin.
+    """Error of the centroid of a pulse by binning, over all positions of the pulse within a bin, in periods.
 
-    Root mean square, and what 90 % do not exceed, in periods. All photons share this error: more do not reduce it.
+    Root mean square and 90 % quantile of the modulus. More photons do not reduce it, because all share it.
     """
     if not _within_bin(system):
-        return 0.0, 0.0  # of a Gaussian 0.2 % of a bin at most
+        return 0.0, 0.0  # at most 0.2 % of a bin for a Gaussian
     low, high = (end / system.period_ns * system.bins for end in system.pulse.support_ns())
     place = (np.arange(_PLACES) + 0.5) / _PLACES
     edges = np.arange(math.floor(low), math.ceil(high) + 2)
@@ -109,9 +109,10 @@ def _density(system: System, blur: float, count: int) -> tuple[float, int, Float
 
 
 def _score(system: System, blur: float, x: NDArray[Any], density: FloatArray) -> tuple[FloatArray, float]:
-    """Shift of the delay that a photon at x asks for, and standard deviation of one photon's; in periods.
+    """Score of a photon at x after the delay, scaled to a shift of the delay, and its standard deviation; in periods.
 
-    - s' / s over its Fisher information; x itself where the pulse is Gaussian, or lost within its bin.
+    The score is -s' / s, s the density of the pulse, divided by the Fisher information of a photon. For a Gaussian
+    pulse, or one much narrower than a bin, it is x minus its mean.
     """
     width, bin_width = relative_width(system), 1.0 / system.bins
     plain = math.sqrt(width**2 + blur**2 + bin_width**2 / 12.0)

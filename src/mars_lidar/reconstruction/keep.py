@@ -10,13 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base import checks
+from mars_lidar._base.types import FloatArray
 from mars_lidar.reconstruction.method import Flags
 from mars_lidar.reconstruction.reconstruction import Reconstruction
 
 KEEP = ("strongest", "nearest", "farthest")
-_SAME_BINS = 3  # width of what counts as one place
-_MOSTLY = 0.5  # share of the pixels
-_EXCESS = 5.0  # standard deviations by which a later return rises above the median bin of the whole image
+_SAME_BINS = 3  # bins within which delays count as equal
+_MOSTLY = 0.5  # share of the pixels with equal delay, above which it is a common one
+_EXCESS = 5.0  # standard deviations of the median bin by which a bin must exceed it to show a later return
 
 
 def keep_return(
@@ -24,9 +25,10 @@ def keep_return(
 ) -> Reconstruction:
     """The maps (...) of one return of each pixel, among the returns at least `from_ns` after the laser pulse.
 
-    `found` is a reconstruction with ``returns=2`` or more: an internal reflection is then a separate return, whose
-    counts and dead time the likelihood includes, and is omitted here. Pixels without another return are flagged.
-    `attenuation` is that of the reconstruction; its level is unchanged.
+    `result` is a reconstruction with ``returns=2`` or more: an internal reflection is then a separate return, whose
+    counts and dead time the likelihood includes, and is omitted here. Pixels without a return after `from_ns` are
+    flagged ``NO_SIGNAL``. `attenuation` is that of the reconstruction; its level is unchanged. Only the strongest
+    return of a pixel has a 90 % interval: the half width of any other is NaN.
     """
     checks.choice("keep", keep, KEEP)
     first = checks.real("from_ns", from_ns, low=0.0, high=result.system.period_ns)
@@ -41,6 +43,12 @@ def keep_return(
     def chosen(values: NDArray[Any], without: float = math.nan) -> NDArray[Any]:
         return np.where(lacking, without, np.take_along_axis(values, place, -1)[..., 0])
 
+    strongest = np.argmax(np.nan_to_num(every.signal, nan=-1.0), axis=-1)
+    with_interval = ~lacking & (place[..., 0] == strongest)
+
+    def interval(half_width: FloatArray | None) -> FloatArray | None:
+        return None if half_width is None else np.where(with_interval, half_width, np.nan)
+
     signal, depth = chosen(every.signal, 0.0), chosen(every.depth_m)
     returned = signal * depth**2 if attenuation == "inverse_square" else signal
     return replace(
@@ -52,12 +60,15 @@ def keep_return(
         delay_error_ns=chosen(every.delay_error_ns),
         depth_error_m=chosen(every.depth_error_m),
         signal_error=chosen(every.signal_error),
+        delay_half_width_ns=interval(result.delay_half_width_ns),
+        depth_half_width_m=interval(result.depth_half_width_m),
+        outlier=None if result.outlier is None else chosen(every.false_alarm),
         flags=np.where(lacking, result.flags | np.uint8(Flags.NO_SIGNAL), result.flags).astype(np.uint8),
     )
 
 
 def common_delay(result: Reconstruction) -> tuple[float, float] | None:
-    """(share of the pixels, delay in ns) if more than half of the first returns lie in the same few bins."""
+    """(share of the pixels, median delay in ns) if more than half of the first returns lie within three bins."""
     every = result.returns
     first = result.delay_ns if every is None else np.where(every.count > 0, every.delay_ns[..., 0], np.nan)
     delays = first[result.detected & np.isfinite(first)]
@@ -73,7 +84,7 @@ def common_delay(result: Reconstruction) -> tuple[float, float] | None:
 
 
 def has_later_light(counts: NDArray[Any], result: Reconstruction, delay_ns: float) -> bool:
-    """Whether the summed counts of all pixels (bins,) show light outside the pulse at a delay."""
+    """Whether `counts` (bins,), summed over the pixels, show light beside the pulse at `delay_ns`."""
     system = result.system
     low, high = system.pulse.support_ns()
     since = (system.time_ns - delay_ns) % system.period_ns

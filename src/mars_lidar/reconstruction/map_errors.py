@@ -91,8 +91,9 @@ def _mean_ssim(truth: FloatArray, images: FloatArray, known: BoolArray, span: fl
 def errors_against(cube: Cube, result: Reconstruction) -> dict[str, MapError]:
     """Errors of depth, in m modulo the unambiguous range, and of reflectivity or else signal, of a known scene.
 
-    Depth is compared where a return was detected, as in the figure of `mars_lidar.plot.reconstruction`: elsewhere the
-    estimate is arbitrary, and counts as missing.
+    Signal is compared in detectable photons per period: the true signal times the detection efficiency. Depth is
+    compared where a return was detected, as in the figure of `mars_lidar.plot.reconstruction`: elsewhere the estimate
+    is arbitrary, and counts as missing.
     """
     out: dict[str, MapError] = {}
     if cube.measured:
@@ -108,7 +109,8 @@ def errors_against(cube: Cube, result: Reconstruction) -> dict[str, MapError]:
         else:
             strongest = result.returns is not None and len(cube.flux.returns_signal) > 0
             signal = cube.flux.returns_signal.max(0) if strongest else cube.flux.signal
-            out["signal"] = map_error(np.where(lit, signal, np.nan), result.signal)
+            detectable = cube.system.detector.detection_efficiency * signal
+            out["signal"] = map_error(np.where(lit, detectable, np.nan), result.signal)
     return out
 
 

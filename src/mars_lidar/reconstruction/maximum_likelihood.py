@@ -20,7 +20,7 @@ from mars_lidar.reconstruction.histograms import Histograms, checked
 from mars_lidar.reconstruction.method import Estimates, Flags, Method
 from mars_lidar.reconstruction.returns import MOST_RETURNS, RETURN_COLUMNS
 
-NEGLIGIBLE = 0.5  # systematic error in standard errors: intervals of 95 % hold 92 % then
+NEGLIGIBLE = 0.5  # systematic error, in standard errors: intervals of 95 % then have a coverage of 92 %
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ class MaximumLikelihood(Method):
         )
 
     def _several(self, histograms: Histograms, out: FloatArray, flags: NDArray[np.uint8]) -> FloatArray:
-        """Further returns of what was found: (pixels, returns, 5), and what the strongest of them changes."""
+        """All returns (pixels, returns, 5) from the first in `out`, which becomes the strongest of each pixel."""
         pixels = len(histograms.counts)
         returns = np.empty((pixels, self.returns * len(RETURN_COLUMNS)))
         _core.several_returns(
@@ -277,11 +277,10 @@ def systematic_error(flux: Flux, system: System) -> tuple[FloatArray, FloatArray
 
 
 def warn_of_bias(method: Method, system: System, estimates: Estimates) -> None:
-    """Warn if one of three estimates has a systematic error above half a standard error.
+    """Warn if one of three pixels has a systematic error above half a standard error.
 
-    They are those of the most precise signal, the most precise delay and the median signal.
-
-    Nothing is said where the law of the mean histogram is not known, or would take seconds.
+    The pixels are those with the most precise signal, the most precise delay and the median signal. There is no
+    warning if the mean histogram of the detector is not known, or takes too long to compute.
     """
     if not isinstance(method, MaximumLikelihood) or method.returns > 1:
         return

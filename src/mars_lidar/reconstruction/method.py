@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from enum import IntFlag
 from typing import Any, ClassVar, Literal
 
@@ -57,13 +57,13 @@ class Flags(IntFlag):
     SATURATED = 4
     """Bins that registered whenever they could: the rate has no upper bound."""
     UNCONVERGED = 8
-    """The iteration did not come to rest."""
+    """The iteration did not converge."""
     MORE_RETURNS = 16
-    """There is light of further returns than the most that were asked for."""
+    """More returns are significant than were requested."""
     FILLED = 32
-    """An outlier is likelier than not, or nothing came: the delay is that of the pixels around."""
+    """No registrations, or an outlier with probability above 1/2: the delay is that of neighbouring pixels."""
     MISFIT = 64
-    """The histogram is not one of the estimate's (p below 1e-3): a wrong dead time or pulse, another return."""
+    """The test of fit rejects the estimate (p below 1e-3): a wrong dead time or pulse, or another return."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,10 +80,10 @@ class Estimates:
     signal_error: FloatArray | None = None
     background_error: FloatArray | None = None
     delay_error: FloatArray | None = None
-    significance: FloatArray | None = field(default=None)
+    significance: FloatArray | None = None
     half_width: FloatArray | None = None  # of the 90 % interval of the delay
     outlier: FloatArray | None = None  # probability that the delay is another surface's
-    p_value: FloatArray | None = None  # of the fit; NaN where too few photons tell
+    p_value: FloatArray | None = None  # of the test of fit; NaN for too few photons
     longer: FloatArray | None = None  # scores, standard deviations: where a longer dead time, ...
     shorter: FloatArray | None = None  # ... a shorter one, ...
     wider: FloatArray | None = None  # ... a wider pulse would fit better
@@ -111,9 +111,9 @@ class Method(ABC):
     """
 
     name: ClassVar[str]
-    modes: ClassVar[tuple[Mode, ...]]  # of the detector, that the method holds for
+    modes: ClassVar[tuple[Mode, ...]]  # modes of the detector to which the method applies
     windows: ClassVar[bool] = True  # signal and background come from inside and outside of a window
-    of_images: ClassVar[bool] = False  # each pixel's estimate depends on those around it: cubes (..., H, W, bins)
+    of_images: ClassVar[bool] = False  # estimates use neighbouring pixels: cubes are (..., H, W, bins)
 
     def check(self, system: System) -> None:
         """Raise ValueError, naming mode and method, for a `system` to which this method does not apply."""

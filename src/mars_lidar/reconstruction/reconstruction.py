@@ -156,7 +156,7 @@ class Reconstruction:
         return f"{text} ({abs(means[best]):.0f} standard deviations over all pixels)"
 
     def maps(self) -> dict[str, NDArray[Any]]:
-        """The maps that this method gives, by name."""
+        """All maps that the method estimates, by the names of the attributes."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
 
@@ -255,15 +255,20 @@ def reconstruct(
     if given.counts.dtype.kind == "f" and (given.counts != np.round(given.counts)).any():
         part = given.counts[given.counts != np.round(given.counts)].flat[0]
         raise ValueError(
-            f"cube must hold whole counts, got {part}: add exposures up, and tell it by cycles of the system"
+            f"cube must hold whole counts, got {part}: add exposures instead of averaging them, and multiply cycles "
+            "of the system by their number"
         )
     used.check(system)
     warn_of_effects(system)
     estimates = used.estimate(given)
-    impossible = given.counts.sum(-1, dtype=np.float64) > system.max_registrations
-    estimates.flags[impossible] |= np.uint8(Flags.SATURATED)
+    flag_impossible(estimates, given.counts.sum(-1, dtype=np.float64), system)
     warn_of_bias(used, system, estimates)
     return assembled(used.name, system, estimates, shape, level, attenuation)
+
+
+def flag_impossible(estimates: Estimates, registrations: FloatArray, system: System) -> None:
+    """Flag pixels as ``SATURATED`` whose `registrations` (pixels,) exceed those that the dead time allows."""
+    estimates.flags[registrations > system.max_registrations] |= np.uint8(Flags.SATURATED)
 
 
 def find_method(method: str | Method) -> Method:
@@ -274,7 +279,7 @@ def find_method(method: str | Method) -> Method:
 
 
 def with_returns(method: Method, returns: int) -> Method:
-    """The method for up to so many returns of each pixel."""
+    """The method with up to `returns` returns in each pixel; unchanged for 1."""
     if checks.integer("returns", returns, low=1, high=MOST_RETURNS) == 1:
         return method
     if not isinstance(method, MaximumLikelihood | Image):

@@ -13,23 +13,29 @@ import numpy as np
 from mars_lidar._base import checks
 from mars_lidar._base.progress import callback_of
 from mars_lidar._base.resources import thread_count
-from mars_lidar._base.types import Progress
+from mars_lidar._base.types import FloatArray, Progress
 from mars_lidar.reconstruction.histograms import checked
 from mars_lidar.reconstruction.image import Image
 from mars_lidar.reconstruction.maximum_likelihood import warn_of_bias
 from mars_lidar.reconstruction.method import Estimates, Method, warn_of_effects
 from mars_lidar.reconstruction.photons import Photons
-from mars_lidar.reconstruction.reconstruction import Reconstruction, assembled, find_method, with_returns
+from mars_lidar.reconstruction.reconstruction import (
+    Reconstruction,
+    assembled,
+    find_method,
+    flag_impossible,
+    with_returns,
+)
 
 if TYPE_CHECKING:
     from mars_lidar.io import Cube
 
-_CHUNK_BYTES = 4 * 2**20
+_CHUNK_BYTES = 4 * 2**20  # of counts read at a time
 
 
 @dataclass(frozen=True, eq=False)
 class Timed:
-    """A reconstruction (realizations, H, W) and its time in seconds, without reading."""
+    """A reconstruction (realizations, H, W), and the seconds of its estimates, without those of reading the file."""
 
     result: Reconstruction
     seconds: float
@@ -77,11 +83,15 @@ def reconstruct_stored(
     total, done = len(used) * shape[0] * shape[1] * shape[2], 0
     blocks = recipe.blocks(recipe.chunks(_CHUNK_BYTES))
 
-    def use(method: Method, estimate: Callable[[], Estimates], images: slice, rows: slice) -> None:
+    def use(
+        method: Method, estimate: Callable[[], Estimates], registrations: FloatArray, images: slice, rows: slice
+    ) -> None:
+        """Hold the estimates of some rows of some images, with `registrations` (pixels,)."""
         nonlocal done
         began = time.perf_counter()
         estimates = estimate()
         seconds[method.name] += time.perf_counter() - began
+        flag_impossible(estimates, registrations, system)
         for field in fields(estimates):
             values = getattr(estimates, field.name)
             if values is None:
@@ -94,12 +104,13 @@ def reconstruct_stored(
             progress(done, total)
 
     of_images = [method for method in used if isinstance(method, Image)]
-    gathered: dict[int, list[Photons]] = {}  # by image, rows of it: of whole images only the photons are held
+    gathered: dict[int, list[Photons]] = {}  # by image: of a whole one only photons are in memory
     for images, rows in blocks:
         counts, block = checked(np.asarray(cube.histogram[images, rows]), system, team)
+        registrations = counts.counts.sum(-1, dtype=np.float64)
         for method in used:
             if not isinstance(method, Image):
-                use(method, partial(method.estimate, counts), images, rows)
+                use(method, partial(method.estimate, counts), registrations, images, rows)
         if not of_images:
             continue
         for k, part in zip(range(images.start, images.stop), counts.counts.reshape(*block, -1), strict=True):
@@ -108,7 +119,8 @@ def reconstruct_stored(
                 continue
             photons = Photons.joined(gathered.pop(k))
             for method in of_images:
-                use(method, partial(method.of_photons, photons, system, team), slice(k, k + 1), slice(0, shape[1]))
+                estimate = partial(method.of_photons, photons, system, team)
+                use(method, estimate, photons.total().ravel(), slice(k, k + 1), slice(0, shape[1]))
     results = {}
     for method in used:
         estimates = Estimates(

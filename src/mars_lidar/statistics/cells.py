@@ -98,7 +98,7 @@ def photons_per_bin(flux: Flux, system: System, *, bins: int | None = None) -> F
         Laser, detector and histogram.
     bins
         Bins of the statistics grid; None: the smallest multiple of the histogram's bins that is at least 512
-        and resolves the pulse (bin at most sigma / 3 of a Gaussian), or the waveform's samples.
+        and resolves the pulse (bin at most sigma / 3 of a Gaussian); for a waveform, at least its number of samples.
 
     Returns
     -------
@@ -165,7 +165,7 @@ def _peak(system: System) -> float:
 
 
 def _bins_for_waveform(samples: int, bins: int) -> int:
-    """A multiple of the histogram's bins, and of the samples where that is not too many."""
+    """Multiple of the histogram's bins, at least 512 and `samples`; also of `samples` if both fit into 2^14 bins."""
     common = math.lcm(samples, bins)
     step = common if common <= TOL.most_first_bins else bins
     return step * math.ceil(max(TOL.unrefined_bins, samples) / step)
@@ -191,7 +191,7 @@ def cell_name(flux: Flux, system: System) -> str:
 
 
 def waveform_parts(system: System) -> int:
-    """Samples of a waveform of several returns: at least 8192, and 50 per standard deviation of the pulse."""
+    """Samples of a waveform of several returns: at least 8192, and 8 per sigma of a Gaussian up to 2^18."""
     wanted = max(2**13, min(2**18, 20.0 * _peak(system)))
     return system.bins * max(1, math.ceil(wanted / system.bins))
 
@@ -427,7 +427,7 @@ class Cells:
     def native_flux(self) -> tuple[FloatArray, FloatArray]:
         """Photons per period (cells,) that have the shapes of `energies`, and those of a flat background.
 
-        The native core takes them. With a gate or uneven bins the shapes include the background, and the flat one is 0.
+        Input of the native core. With a gate or uneven bins the shapes include the background, and the flat one is 0.
         """
         if not self._all_in_shapes:
             return self.signal, self.background

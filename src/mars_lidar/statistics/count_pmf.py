@@ -63,7 +63,7 @@ def total_variation(a: Pmf, b: Pmf) -> float:
 
 
 def kl_divergence(sample: FloatArray, law: FloatArray) -> FloatArray:
-    """KL(sample || law) (...) in nats, pmfs (..., w) and (w,) on the same counts; floored at `Tolerances.tail`."""
+    """KL(sample || law) (...) in nats, pmfs (..., w) and (w,) on the same counts; `law` at least `Tolerances.tail`."""
     log_law = np.log(np.maximum(law, TOL.tail))
     log_sample = np.log(np.where(sample > 0, sample, 1.0))
     return np.asarray((sample * (log_sample - log_law)).sum(-1), dtype=np.float64)

@@ -466,7 +466,7 @@ class _Run:
 
 
 def stationary_records(cells: Cells, *, tolerance: float, threads: int | None) -> FloatArray:
-    """Mean histograms (cells, bins), of sum 1, of the records of stationary pixels; 0 where there is no flux.
+    """Mean histograms (cells, bins) of the records of stationary pixels, up to a factor; 0 where there is no flux.
 
     The grid is refined until doubling it moves the shape by less than `tolerance`, at least 1e-3, in total variation.
     """

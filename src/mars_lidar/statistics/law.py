@@ -1,4 +1,4 @@
-"""The law of the count of a pixel: exact, Gaussian (MaRS, renewal) or Poisson."""
+"""`count_law`: the law of the count of a pixel, exact, Gaussian (MaRS, renewal) or Poisson."""
 
 from __future__ import annotations
 
@@ -44,9 +44,10 @@ class CountLaw(OfCumulants):
     cumulants
         (..., 4) mean, variance, third and fourth cumulant of N.
     evaluate
-        Function that returns the probabilities of each cell, called on first use.
+        Argument only, no attribute: function that returns the law of each cell, called on first use.
     exposure
-        The `Exposure` of an exact law (its histogram has a single bin), else None.
+        The `Exposure` from which an exact law is computed (its histogram has a single bin); None for the other methods,
+        for mode ``"synchronous"`` and behind electronics with a dead time.
 
     See Also
     --------

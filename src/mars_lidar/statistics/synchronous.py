@@ -63,7 +63,7 @@ class _Count:
         self.first = self._first(cells.system.start == "stationary")
 
     def _first(self, stationary: bool) -> FloatArray:
-        """Probabilities (r,) that the first armed period is 0, 1, ...; of a stationary pixel by (7)."""
+        """Probabilities (r,) that the first armed period is 0, 1, ...; for a stationary start (7)."""
         if not stationary:
             return np.ones(1)
         longer = np.full(min(self.whole, self.cycles) + 2, self.q)  # P(M > r)

@@ -28,14 +28,14 @@ from mars_lidar.dataset.store import Dataset, Item, open_dataset
 from mars_lidar.dataset.write import Failed, Made, Maker, fingerprint
 
 _LIBRARY = "distributed", "making parts by workers", "cluster"
-LOOK_S = 1.0  # between two looks at the workers that are there, and for whom there may be parts
+LOOK_S = 1.0  # between two queries of the number of workers
 TIMEOUT_S = 20.0  # for a scheduler to answer
 _local = threading.local()
 
 
 @dataclass(frozen=True)
 class Dispatch:
-    """How many tasks are given out at a time, and how large they are."""
+    """Number of tasks that are submitted at a time, and their size in parts."""
 
     ahead: int = 3  # tasks per worker thread: none waits for the scheduler, and a million are not queued at once
     least_queued: int = 512  # tasks: an adaptive cluster starts workers, also the first, by the length of its queue
@@ -45,7 +45,7 @@ class Dispatch:
 
 @dataclass(frozen=True)
 class Team:
-    """What makes parts: `make` makes several in the `executor`; `threads` counts the workers that are there now."""
+    """An `executor`, a function `make` of several parts to run in it, and `threads`: how many threads it has now."""
 
     executor: Executor
     make: Callable[[Sequence[Item]], list[Made | Failed]]
@@ -77,7 +77,7 @@ def reach(scheduler: str | None) -> None:
 
 @dataclass(frozen=True)
 class Crew:
-    """Workers: an executor that runs what they are given, and the number of their threads that are there now."""
+    """Workers of dask: their `executor`, and `threads`, which returns the number of their threads now."""
 
     executor: Executor
     threads: Callable[[], int]

@@ -26,7 +26,7 @@ NAME = "mars_lidar.sparse"
 
 @dataclass(frozen=True)
 class SparseCodec(ArrayBytesCodec):
-    """Array to bytes: Rice codes of the gaps between elements that are not zero, and of what they hold less one."""
+    """Array to bytes: Rice codes of the gaps between nonzero counts, and of these counts minus 1."""
 
     is_fixed_size = False
 
@@ -40,7 +40,7 @@ class SparseCodec(ArrayBytesCodec):
         return {"name": NAME, "configuration": {}}
 
     def compute_encoded_size(self, input_byte_length: int, chunk_spec: ArraySpec) -> int:
-        """Not known before."""
+        """Not implemented: the size depends on the counts."""
         raise NotImplementedError
 
     async def _encode_single(self, chunk_data: NDBuffer, chunk_spec: ArraySpec) -> Buffer:

@@ -37,9 +37,9 @@ from mars_lidar.io import mat
 from mars_lidar.io.mat import write_variables
 from mars_lidar.light.flux import Flux
 
-_PULSE_BINS, _PULSE_PEAK = 16, 6  # what `deepsensorfusion` reads: the pulse in so many bins, its peak in that one
-_PULSE_LEAST = 0.999  # of its energy
-_NAMES = {"intensity_hr": "intensity"}  # what another name is stored under
+_PULSE_BINS, _PULSE_PEAK = 16, 6  # bins of the pulse that `deepsensorfusion` reads, and index of its peak
+_PULSE_LEAST = 0.999  # least share of the energy of a pulse in these bins
+_NAMES = {"intensity_hr": "intensity"}  # name of a variable in the file, where it differs from its key
 WEBDATASET = "webdataset"
 _TAR_BYTES = 256 * 2**20  # of counts
 _MONOCULAR_M = 10.0  # depth of grey value 255 in SPADnet's images
@@ -50,7 +50,8 @@ class Layout:
     """A layout: names of the files with ``{scene}``, ``{number}`` and ``{level}``, and the variables in each.
 
     `lists` is the file that the loader's list names, relative to the folder `inside`; `root` are files for the whole
-    dataset, `pictures` the images beside an exposure, `size` what the loader has written into it, if anything.
+    dataset, `pictures` the images beside an exposure, `size` the shape (H, W) or (H, W, bins) that the loader assumes,
+    empty for any.
     """
 
     files: dict[str, tuple[str, ...]]
@@ -254,14 +255,14 @@ def _notes(name: str, layout: Layout, shape: tuple[int, ...]) -> list[str]:
     out = []
     if layout.size and shape[: len(layout.size)] != layout.size:
         sizes = [" x ".join(map(str, size)) for size in (layout.size, shape[: len(layout.size)])]
-        out.append(f"the loader of {name} has {sizes[0]} written into it, and these files hold {sizes[1]}")
+        out.append(f"the loader of {name} assumes arrays of {sizes[0]}, and these files have {sizes[1]}")
     if layout.pictures:
         out.append("*_pred.png hold one depth each, the median of the scene: put a monocular network's in their place")
     return out
 
 
 def _plain(name: str) -> str:
-    """A scene's name without what loaders' lists cannot have."""
+    """A scene's name without characters and words that the loaders misread in their lists."""
     return re.sub(r"[^A-Za-z0-9]+", "-", name).strip("-").replace("intensity", "i").replace("spad", "s")[-60:]
 
 
@@ -377,7 +378,7 @@ KEYS: dict[str, Callable[[Exposure], Any]] = {  # maps are (H, W)
     "mean_signal_photons": lambda e: e._photons(e._flux.signal),
     "photons": lambda e: e._photons(e._flux.signal),
     "mean_background_photons": lambda e: e._photons(e._flux.background),
-    "SBR": Exposure._ratio,  # of these two
+    "SBR": Exposure._ratio,  # mean_signal_photons / mean_background_photons; inf without background
     "bin_size": lambda e: 1e-9 * e._system.bin_ns,  # s
 }
 

@@ -33,13 +33,13 @@ from mars_lidar.dataset.write import Failed, Made, Maker, fingerprint
 from mars_lidar.io.scene_files import Problem
 from mars_lidar.io.zarr_store import check_zarr_threads
 
-_NAMED = 5  # parts that an error names
+_NAMED = 5  # most parts named in an error
 BUFFER_BYTES = 512 * 2**20  # of all chunks that are made at the same time on one machine
 
 
 @dataclass(frozen=True)
 class Generated:
-    """What `generate` did.
+    """Result of `generate`: the dataset, and the parts and seconds of the run.
 
     Attributes
     ----------
@@ -539,7 +539,7 @@ def _here(dataset: Dataset, parts: int, threads: int | None) -> Iterator[Team]:
 
 
 def _make_all(team: AbstractContextManager[Team], todo: Sequence[Item], add: Callable[[Made], None]) -> None:
-    """Make parts, some of them at a time; raises WriteError at the end where some could not be written."""
+    """Make all parts of `todo` concurrently; WriteError at the end if some could not be written."""
     given, failed, seconds = 0, list[Failed](), 0.0
     with team as crew:
         running: set[Future[list[Made | Failed]]] = set()

@@ -59,7 +59,7 @@ class Surfaces:
 
     @property
     def layers(self) -> tuple[Scene, ...]:
-        """All of them; one of an ordinary scene."""
+        """All layers of the scene; a `Scene` has one."""
         return self.scene.layers if isinstance(self.scene, LayeredScene) else (self.scene,)
 
     @property
@@ -78,7 +78,7 @@ class Surfaces:
         return any((layer.reflectivity[layer.valid] > 0.0).any() for layer in self.layers)
 
     def resize(self, size: int | tuple[int, int]) -> Surfaces:
-        """At another size."""
+        """The scene resampled to `size`."""
         return replace(self, scene=self.scene.resize(size))
 
     def __getitem__(self, key: Any) -> Surfaces:
@@ -126,7 +126,7 @@ class Rendered:
         return bool((self.transient.totals > 0.0).any())
 
     def resize(self, size: int | tuple[int, int]) -> Rendered:
-        """At another size: mean light, nearest depth."""
+        """The scene resampled to `size`: mean light and reflectivity, nearest depth."""
         height, width = new_size(size, self.shape)
         place = np.ix_(nearest(self.shape[0], height), nearest(self.shape[1], width))
         share = area_mean(area_mean(self.reflectivity, height, axis=0), width, axis=1)

@@ -78,7 +78,7 @@ class Dataset:
 
     def __repr__(self) -> str:
         if not self.planned:
-            return f"Dataset({str(self.path)!r}, its scenes are not all there)"
+            return f"Dataset({str(self.path)!r}, scenes incomplete)"
         sizes = " x ".join(map(str, self.group["histogram"].shape))
         state = "" if self.complete else ", incomplete"
         return f"Dataset({str(self.path)!r}, {sizes} (sample, realization, y, x, time){state})"
@@ -169,7 +169,7 @@ class Dataset:
         return [self.path / name for name in self.names(item)]
 
     def missing(self, items: Iterable[Item] | None = None) -> list[Item]:
-        """Those of some parts, or of all, that are missing or whose files are truncated."""
+        """The parts among `items` (None: all) whose files are missing or truncated."""
         there, noted = sizes(self.path), self.written()
 
         def whole(item: Item) -> bool:
@@ -188,7 +188,7 @@ class Dataset:
         return [item for item in (self.items() if items is None else items) if not whole(item)]
 
     def unlisted(self) -> str:
-        """The first file of a part that the manifest does not have; empty where it has them all."""
+        """Name of the first file of a part that is missing in the manifest; empty if there is none."""
         names = (name for item in self.items() for name in self.names(item))
         return next((name for name in names if self.sums is not None and name not in self.sums), "")
 
@@ -409,7 +409,7 @@ def read_block(dataset: Dataset, place: tuple[int, int], maps: Sequence[str]) ->
 
 
 def _index(tail: bytes, path: Path) -> NDArray[np.uint64]:
-    """Offset and length of each chunk of a shard, of the end of its file."""
+    """Offset and length (chunks, 2) of each chunk of a shard, from its index, the `tail` of the file."""
     if not is_good(tail):
         raise FileError(f"{path}: the index of a shard is damaged (its checksum differs)")
     return np.frombuffer(tail[:-4], "<u8").reshape(-1, 2)

@@ -99,7 +99,7 @@ def verify(
 
 
 def _labels(dataset: Dataset) -> Iterator[str]:
-    """What is wrong with the coordinates and labels of a dataset: all of them follow from its recipe and scenes."""
+    """A sentence for each coordinate or label that differs from that of the recipe and scenes."""
     for v in coordinates(dataset.recipe, dataset.scene_names(), dataset.histogram.shape[2:4]):
         array = dataset.group[v.name]
         try:
@@ -112,7 +112,7 @@ def _labels(dataset: Dataset) -> Iterator[str]:
 
 
 def _compare(maker: Maker, region: tuple[slice, ...]) -> str:
-    """Empty, or what is wrong with a chunk."""
+    """Description of the first difference in a chunk; empty if there is none."""
     dataset = maker.dataset
     text = ", ".join(f"{part.start}:{part.stop}" for part in region[:4])
     try:

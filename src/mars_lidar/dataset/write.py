@@ -27,7 +27,7 @@ _KEPT = 4  # cached scenes and fluxes: consecutive parts use the same ones
 
 
 class Stopped(Exception):
-    """The run ends: nothing was written."""
+    """Raised in a thread that makes a part when the run stops; the part is not written."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ class Maker:
             yield made.pop(k, None)
 
     def _chunk(self, region: tuple[slice, ...]) -> bytes:
-        """A chunk, packed."""
+        """The encoded bytes of the counts of a region, padded to a whole chunk."""
         array = self.dataset.histogram
         began = time.perf_counter()
         counts = self.counts(region)
@@ -181,16 +181,16 @@ class Maker:
         """Part of the flux; the last one is cached, because making waveforms takes longer than simulating them."""
         key = (sample, rows.start, rows.stop, columns.start, columns.stop)
         if self._last is None or self._last[0] != key:
-            self._last = None  # its memory first
+            self._last = None  # frees its memory before the next is made
             self._last = key, self.flux(sample)[rows, columns]
         return self._last[1]
 
     def scene(self, sample: int) -> Content:
-        """What a sample shows."""
+        """The scene of a sample."""
         return self._scene(sample_parts(self.dataset.recipe, sample)[0])
 
     def _room(self, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
-        """An array of this shape in the buffer, whose pages need not be asked for again."""
+        """An array of this shape in the buffer, which is reused because new memory pages take time."""
         size = int(np.prod(shape))
         if self._buffer is None or self._buffer.size < size:
             self._buffer = np.empty(size, dtype)

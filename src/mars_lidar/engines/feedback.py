@@ -107,7 +107,7 @@ def judged_alone(task: Task, pixels: IndexArray) -> NDArray[np.bool_]:
 
 
 def cells_of(kinds: KindArray) -> int:
-    """Cells of a grid."""
+    """Number of cells per period of a grid."""
     return int((1 << kinds.astype(np.int64)).sum())
 
 
@@ -272,12 +272,12 @@ def _corners_of(flux: Flux, pixels: IndexArray) -> tuple[list[Corner], IndexArra
 
 @lru_cache(maxsize=64)
 def _known(system: System) -> Known:
-    """Grids of the levels of light that were met so far."""
+    """Cache of the grids of the levels of light for a system; `_corner_grids` fills it."""
     return {}
 
 
 def _corner_grids(task: Task, corners: list[Corner], start: KindArray) -> Known:
-    """Grids of levels of light."""
+    """Grids of the levels of light `corners`, from the cache or refined from `start`."""
     known = _known(task.system)
     new = [corner for corner in corners if corner not in known]
     if new:
@@ -286,7 +286,7 @@ def _corner_grids(task: Task, corners: list[Corner], start: KindArray) -> Known:
 
 
 def _refined(task: Task, corners: list[Corner], start: KindArray) -> Known:
-    """Cut bins where they make the mean wrong, until it is not; corners of one grid are judged in one call."""
+    """Grids of `corners`, refined from `start` until a finer grid gives the same law; equal ones are judged at once."""
     system, each = task.system, 4 * len(TOL.delays)
     powers = np.array([[(s - i, b - j) for i in (0, 1) for j in (0, 1)] for s, b in corners])
     light = np.repeat(np.ldexp(1.0, TOL.light_octaves * powers).reshape(-1, 2), len(TOL.delays), axis=0)
@@ -327,11 +327,11 @@ def _refined(task: Task, corners: list[Corner], start: KindArray) -> Known:
 
 
 def _recut(kinds: KindArray, widest: KindArray, distance: FloatArray, parts: FloatArray) -> KindArray:
-    """Cells that lessen the squared distances (n,) to the goal, of whose `parts` (n, bins) each is a bin's.
+    """A grid whose distance is 0.8 of the limit, from `distance` (n,) on `kinds` and `parts` (n, bins) of its square.
 
-    A part falls with the fourth power of the width of the bin's cells. The number of cells is least where the parts of
-    all cells are equal, up to the power of two. None is wider than on the grid `widest`; where distances are below the
-    goal, none is narrower than it was.
+    The part of a bin is proportional to the fourth power of the width of its cells. The number of cells is least if the
+    parts of all cells are equal, up to powers of two. No cell is wider than on `widest`; if all distances are within
+    the limit, no cell is narrower than before.
     """
     worst = (parts * np.maximum(distance**2 / np.maximum(parts.sum(-1), 1e-300), 1.0)[:, None]).max(0)
     now = kinds.astype(np.int64)

@@ -60,7 +60,7 @@ def groups(flux: Flux, system: System, pixels: IndexArray, *, delays: bool = Tru
 
 
 def _doubles(flux: Flux, system: System) -> int:
-    """Numbers that the statistics of one pixel hold at a time."""
+    """Number of doubles in memory while the statistics of one pixel are computed."""
     parts = 0
     if flux.waveform is not None:
         parts = 4 * flux.waveform.shape[-1]
@@ -189,7 +189,7 @@ def _deviation(pulse: Pulse, period_ns: float) -> float:
 
 
 def _power_of_two(wanted: float, low: int, high: int) -> int:
-    """The power of two next above `wanted`, kept in [low, high]."""
+    """The smallest power of two that is at least `wanted`, limited to [low, high]."""
     power = 1 << math.ceil(math.log2(max(wanted, 1.0)))
     while power > high:
         power //= 2

@@ -258,7 +258,7 @@ def _task(
     progress: Progress | bool | None,
     first_name: str = "first_realization",
 ) -> Task:
-    flux = flux[:] if isinstance(flux, StoredFlux) else flux.image  # whole, or a MemoryError that says so
+    flux = flux[:] if isinstance(flux, StoredFlux) else flux.image  # read into memory, or MemoryError
     first = checks.integer(first_name, first_realization, low=0, high=2**32 - 1)
     number = checks.integer("realizations", realizations, low=1, high=2**32 - first)
     seed = checks.integer("seed", seed, low=0, high=2**64 - 1)
@@ -315,17 +315,18 @@ def check_registrations(flux: Flux, system: System) -> None:
 
 
 def _share_registered(flux: Flux, system: System) -> FloatArray:
-    """Of the arrivals (H, W) that are drawn one by one: in a dead time that each prolongs, or during the recovery."""
+    """Fraction (H, W) of the drawn arrivals that are registered; below 1 if paralyzable or with a slow recovery."""
     if system.detector.mode == "paralyzable":
         return np.exp(-flux.total * system.dead_time_periods)
-    # up to the one that is registered in steady light, by the mean wait r e^a a^-a gamma(a, a), a = r light
+    # 1 / (light x mean wait) in constant light; the wait, below (22) of docs/theory_detectors.md, for long recovery
     recovery = system.detector.recovery_ns / system.period_ns
     return np.asarray(1.0 / (1.0 + np.sqrt(0.5 * np.pi * recovery * flux.total)))
 
 
 def _expected_arrivals(flux: Flux, system: System) -> FloatArray:
-    """Arrivals that are drawn of each pixel (H, W) of detected photons, within a factor of two: registrations, if
-    paralyzable all, with a slow recovery those that it loses too.
+    """Arrivals (H, W) that an engine draws for each pixel of detected photons, within a factor of two.
+
+    They are the registrations; all arrivals if paralyzable; with a slow recovery also those lost during it.
     """
     photons, dead, mode = flux.total, system.dead_time_periods, system.detector.mode
     if mode == "gated":  # what arrives outside of the gate costs one draw a period

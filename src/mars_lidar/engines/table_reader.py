@@ -55,7 +55,7 @@ class PixelEntries:
     alignment: Alignment
 
     def batch(self, laws: CountLaws) -> Batch:
-        """With counts from `laws`."""
+        """The batch of these pixels, with counts from `laws`."""
         return Batch(self.pixels, self.shapes, self.rows, self.weights, laws, self.alignment, self.guides)
 
 
@@ -152,7 +152,7 @@ class TableReader:
             )
 
     def read(self, task: Task, pixels: IndexArray) -> tuple[PixelEntries, IndexArray]:
-        """Entries of those of the pixels that lie on the grid; the others."""
+        """Entries of the `pixels` within the grid of the table, and the pixels beyond it."""
         single = single_return(task.flux)
         assert single is not None  # see check
         system = task.system
@@ -252,7 +252,7 @@ def exact_laws(run: Run, reader: TableReader, entries: PixelEntries, at: IndexAr
 
 
 def _keys(run: Run, reader: TableReader, entries: PixelEntries, at: IndexArray) -> FloatArray:
-    """S, B and delay in periods (pixels, 3): of the pixel, or with the nearest entry's law of that one."""
+    """S, B and delay in periods (pixels, 3); with interpolation "nearest", S and B of the nearest entry."""
     table = reader.table
     signal, background = entries.signal[at], entries.background[at]
     if reader.interpolation == "nearest":
@@ -307,7 +307,7 @@ def image_table(
 
 
 def _axis(name: str, photons: FloatArray) -> Any:
-    """(low, high, points) round about the photons that there are, or an array where they are all the same."""
+    """(low, high, points) of an axis that contains all `photons` > 0; two points about them where all are equal."""
     some = photons[photons > 0.0]
     if some.size == 0:
         return np.array([0.0, 1e-6])
@@ -337,12 +337,12 @@ class CountTimesShape(Engine):
         return self.reader.settings if self.reader else {}
 
     def check(self, flux: Flux, system: System) -> None:
-        """Check that the table is of the system and covers the pixels unless they may lie outside; one return each."""
+        """Raise ValueError unless the table is of this system, with one return a pixel, in its grid (see `outside`)."""
         if self.reader:
             self.reader.check(flux, system)
 
     def histogram(self, task: Task, out: NDArray[Any]) -> None:
-        """Look up or evaluate, draw the counts, draw their places: batch by batch."""
+        """Look up or evaluate the pixels, draw their counts, and draw a bin for each count, batch by batch."""
         run = Run(task, out, self.level)
         pixels = np.arange(task.pixel_index.size)
         if self.reader is None:

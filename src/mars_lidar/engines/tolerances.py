@@ -101,9 +101,9 @@ class Tolerances:
 
     # all engines
     twilight_photons: float = 5.0
-    """Photons within `twilight_ns` above which the phase of ticks is remembered longer than the engines warm up. A
-    tick, a dead time that ends with a twilight pulse, is followed by another with the probability 1 - e^-photons, so
-    that phases are remembered for some e^photons ticks: 150 of them at 5, against 256 turns before the exposure."""
+    """Photons within `twilight_ns` above which a warm-up becomes long. A dead time that ends with a twilight pulse is
+    followed by another with the probability 1 - e^-photons, so that the phase is remembered for some e^photons dead
+    times; the engines warm up for ten times that, 1,500 dead times at 5."""
     room: float = 1.3
     """Of memory for registrations, over those that a constant rate would make."""
     buffer_bytes: int = 64 << 20

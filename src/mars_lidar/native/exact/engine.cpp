@@ -51,7 +51,7 @@ void run_exact(const Job& job, const PulseTable& pulse, const Output& output, in
         WarmStarts<float> starts;
         if (starts.wanted(job)) {
             if (job.dead_time > 0.0) draw_starts(job, pulse, block, starts.cycle, starts.phase);
-            starts.settle(job, block.items);
+            starts.settle(job, block.items, [&](int64_t k) { return job.pixel(block.first_item + k); });
             block.start_cycle = starts.cycle.data();
             block.start_phase = starts.phase.data();
         }

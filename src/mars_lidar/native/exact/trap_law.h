@@ -7,6 +7,7 @@
 // avalanches leave any, so the number of avalanches up to the next one that does is drawn, which is geometric, instead
 // of a number for each.
 #pragma once
+#include <algorithm>
 #include <cmath>
 #include <cstdint>
 #include <vector>
@@ -57,13 +58,18 @@ struct WarmStarts {
     static bool wanted(const Job& job) { return job.stationary && (job.dead_time > 0.0 || job.avalanches_matter()); }
 
     // Pixels whose avalanches matter live on from the stationary state of the plain pixel, for as many periods before the
-    // exposure as it takes until their traps are as full, and they as far recovered, as they will be.
-    void settle(const Job& job, int64_t items) {
+    // exposure as it takes until their traps are as full, and they as far recovered, as they will be. `pixel_of` names
+    // the pixel of an item of the block.
+    template <class PixelOf>
+    void settle(const Job& job, int64_t items, const PixelOf& pixel_of) {
         if (!job.avalanches_matter()) return;
         cycle.resize(static_cast<size_t>(items), 0);
         phase.resize(static_cast<size_t>(items), Phase{0});
-        const double periods = std::ceil(64.0 * (job.dead_time + 1.0) + 32.0 * job.aftermath());
-        for (int32_t& start : cycle) start -= static_cast<int32_t>(periods);
+        for (int64_t k = 0; k < items; ++k) {
+            const double turns = std::max(64.0, twilight_memory(job, pixel_of(k)));
+            const double periods = std::ceil(turns * (job.dead_time + 1.0) + 32.0 * job.aftermath());
+            cycle[static_cast<size_t>(k)] -= static_cast<int32_t>(periods);
+        }
     }
 };
 

@@ -66,6 +66,7 @@ class EventSimulator {
         Arrivals arrivals;
         Xoshiro256 random;  // the photons, and the avalanches' consequences
         Pixel pixel;
+        int64_t index;  // of the pixel in the job
         std::vector<uint64_t> times;
         size_t next = 0;
         bool fires_again = false;  // at the end of the present dead time
@@ -74,7 +75,8 @@ class EventSimulator {
         Member(const Job& job, const PulseShape& pulse, int64_t item)
             : arrivals(job, pulse, job.pixel(item)),
               random(job.seed, job.realization(item), job.pixel_index[job.pixel(item)]),
-              pixel(job) {}
+              pixel(job),
+              index(job.pixel(item)) {}
     };
 
     // The `number` items from `first` on, which influence each other where they are neighbours: all pixels of one
@@ -110,10 +112,12 @@ class EventSimulator {
     int64_t begin() {
         if (!job_.stationary) return 0;
         int64_t start = 0;
+        double memory = 0.0;
+        for (const Member& member : pixels_) memory = std::max(memory, twilight_memory(job_, member.index));
         for (Member& member : pixels_) {
             const double settle = job_.dead_time + 1.0 + 0.125 * job_.aftermath();
             const double photons = member.arrivals.photons_per_period();
-            const double length = warm_up_periods(job_.dead_time, settle, photons, member.random.uniform());
+            const double length = warm_up_periods(job_.dead_time, settle, photons, member.random.uniform(), memory);
             member.pixel.ready = Time{0, 0}.plus(-length);
             start = std::min(start, member.pixel.ready.cycle);
             const double x = photons * job_.dead_time;

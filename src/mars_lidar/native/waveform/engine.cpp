@@ -68,7 +68,8 @@ void run_waveform(const Job& job, const Output& output, int threads, const std::
         WarmStarts<double> starts;
         if (starts.wanted(job)) {
             if (job.dead_time > 0.0) draw_starts(job, block, starts.cycle, starts.phase);
-            starts.settle(job, block.pixels * block.realizations);
+            starts.settle(job, block.pixels * block.realizations,
+                          [&](int64_t k) { return block.first_pixel + k / block.realizations; });
             block.start_cycle = starts.cycle.data();
             block.start_phase = starts.phase.data();
         }

@@ -34,7 +34,7 @@ from mars_lidar.statistics.cells import Cells, fine_histograms, rearms_within_pu
 from mars_lidar.statistics.chain import ConvergenceError
 from mars_lidar.statistics.joint_grid import FoldedGrid
 from mars_lidar.statistics.paralyzable import registration_rates
-from mars_lidar.statistics.timing import Timing, is_timed
+from mars_lidar.statistics.timing import is_timed, settled
 from mars_lidar.statistics.tolerances import MOMENTS, TOL, Budget
 
 # --- Results on one grid and their comparison ----------------------------------------------------------------------
@@ -361,9 +361,12 @@ def recorded_moments(
     """`exposure_moments` of checked cells; the histogram includes jitter and code widths."""
     if not is_timed(cells.system):
         return refined_moments(cells, cells.system.bins, tolerance=tolerance, threads=threads, progress=progress)
-    timing = Timing(cells)
-    untimed = replace(cells, system=timing.untimed)
-    exposure = refined_moments(untimed, timing.parts, tolerance=tolerance, threads=threads, progress=progress)
+
+    def compute(untimed: Cells, parts: int) -> tuple[Exposure, FloatArray]:
+        exposure = refined_moments(untimed, parts, tolerance=tolerance, threads=threads, progress=progress)
+        return exposure, exposure.histogram
+
+    exposure, timing, _ = settled(cells, compute, tolerance)
     return replace(
         exposure, histogram=timing.forward(exposure.histogram), histogram_rate=timing.forward(exposure.histogram_rate)
     )

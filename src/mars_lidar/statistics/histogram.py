@@ -85,7 +85,7 @@ def mean_histograms(cells: Cells, tolerance: float, threads: int | None) -> Floa
     """`mean_histogram` of checked cells: (cells, bins)."""
     if "electronics_dead_time_ns" in cells.system.detector.effects:
         return moments(cells, max(tolerance, TOL.records), LAW).histogram.reshape(cells.size, cells.system.bins)
-    return recorded(cells, lambda some, parts: _registrations(some, parts, tolerance, threads))
+    return recorded(cells, lambda some, parts: _registrations(some, parts, tolerance, threads), tolerance)
 
 
 def _registrations(cells: Cells, bins: int, tolerance: float, threads: int | None) -> FloatArray:
@@ -186,7 +186,9 @@ def registration_pdf(
         shape = stationary_records(cells, tolerance=tolerance, threads=threads)
     else:
         shape = recorded(
-            cells, lambda some, parts: stationary_histogram(some, parts, tolerance=tolerance, threads=threads)
+            cells,
+            lambda some, parts: stationary_histogram(some, parts, tolerance=tolerance, threads=threads),
+            tolerance,
         )
     return normalised(shape).reshape(*cells.shape, system.bins)
 

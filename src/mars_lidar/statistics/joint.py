@@ -42,6 +42,7 @@ from mars_lidar.statistics.cells import (
 )
 from mars_lidar.statistics.chain import ConvergenceError
 from mars_lidar.statistics.exposure import recorded_light
+from mars_lidar.statistics.histogram import mean_histograms
 from mars_lidar.statistics.joint_grid import FoldedGrid
 from mars_lidar.statistics.timing import Timing, is_timed
 from mars_lidar.statistics.tolerances import LAW, TOL, advice
@@ -451,7 +452,7 @@ def joint_law(flux: Flux, system: System, *, tolerance: float = 1e-3) -> JointLa
     timing = Timing(cells)
     law = _law(replace(cells, system=timing.untimed), tolerance)
     pixel = None if law._pixel is None else TimedPixel(law._pixel, law.mean, timing)
-    return replace(law, system=system, mean=timing.forward(law.mean), _pixel=pixel)
+    return replace(law, system=system, mean=mean_histograms(cells, tolerance, None)[0], _pixel=pixel)
 
 
 def _law(cells: Cells, tolerance: float) -> JointLaw:

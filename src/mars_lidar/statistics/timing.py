@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -26,29 +27,56 @@ def is_timed(system: System) -> bool:
     return any(name in TIMING_EFFECTS for name in system.detector.effects)
 
 
-def recorded(cells: Cells, compute: Callable[[Cells, int], FloatArray]) -> FloatArray:
+def recorded(cells: Cells, compute: Callable[[Cells, int], FloatArray], tolerance: float) -> FloatArray:
     """Histograms (..., bins) of records, from `compute` (cells, parts) -> (..., parts) of registrations."""
     system = cells.system
     if not is_timed(system):
         return compute(cells, system.bins)
+    _, timing, registered = settled(cells, lambda some, parts: (compute(some, parts),) * 2, tolerance)
+    return timing.forward(registered)
+
+
+Computed = TypeVar("Computed")
+
+
+def settled(
+    cells: Cells, compute: Callable[[Cells, int], tuple[Computed, FloatArray]], tolerance: float
+) -> tuple[Computed, Timing, FloatArray]:
+    """What `compute` (cells, parts) returns, with registrations (..., parts), on parts that records do not depend on.
+
+    Where light lies within a part is lost. So parts are halved until the records of no cell move by more than
+    `tolerance` of all of them.
+    """
     timing = Timing(cells)
-    return timing.forward(compute(replace(cells, system=timing.untimed), timing.parts))
+    result, registered = compute(replace(cells, system=timing.untimed), timing.parts)
+    records = timing.forward(registered)
+    while 2 * timing.parts <= TOL.most_parts:
+        timing = Timing(cells, 2 * timing.parts)
+        result, registered = compute(replace(cells, system=timing.untimed), timing.parts)
+        before, records = records, timing.forward(registered)
+        if np.all(np.abs(records - before).sum(-1) <= 2.0 * tolerance * records.sum(-1)):
+            break
+    return result, timing, registered
 
 
 class Timing:
     """The map from registrations in equal parts of the period to records in the bins of the histogram, for some cells.
 
-    With jitter, times are uniform within their parts, which are narrow compared with it. Without, an edge of a code
+    With jitter, times are uniform within their parts, narrow compared with it (`settled`). Without, an edge of a code
     divides the registrations of a part as it divides the photons.
     """
 
-    def __init__(self, cells: Cells) -> None:
+    def __init__(self, cells: Cells, parts: int | None = None) -> None:
         self.system, self._cells = cells.system, cells
+        self.parts = parts or self._usual_parts(cells)
+
+    @staticmethod
+    def _usual_parts(cells: Cells) -> int:
         system, jitter = cells.system, cells.system.detector.jitter
         width = math.hypot(cells.finest, 0.0 if jitter is None else jitter.finest_ns / system.period_ns)
         split = math.ceil(TOL.parts_per_sigma / (max(width, 1e-9) * system.bins))
         split = 2 * max(1, min(split, TOL.most_parts // system.bins) // 2)
-        self.parts = system.bins * split
+        return system.bins * split
 
     @cached_property
     def untimed(self) -> System:

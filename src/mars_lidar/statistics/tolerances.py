@@ -198,8 +198,8 @@ class Tolerances:
         Terms of (6), and counts at the lower end, from which the transform (21) is used; terms computed together, of so
         many incomplete beta functions each; points of the circle evaluated together.
     parts_per_sigma, most_parts
-        Parts of the period per sigma of jitter and light (a part adds 1/6 of its square to the variance: 3e-4 of
-        sigma^2), and at most (512 KiB an array).
+        Parts of the period per sigma of jitter and light, at first (a part adds 1/6 of its square to the variance: 3e-4
+        of sigma^2), and at most (512 KiB an array).
     """
 
     rounding: float = 1e-12

@@ -121,7 +121,7 @@ class MaximumLikelihood(Method):
             flags=flags,
             signal_error=column[3],
             background_error=column[4],
-            delay_error=column[5],
+            delay_error=np.where(flags & np.uint8(Flags.NO_SIGNAL), np.nan, column[5]),  # it may be anywhere
             significance=np.sqrt(column[6]),
             returns=several,
             p_value=None if quality is None else quality.p_value,
@@ -225,7 +225,8 @@ def systematic_error(flux: Flux, system: System) -> tuple[FloatArray, FloatArray
     tuple
         Error and standard error, each (..., 3), of S, B and the delay in ns. The error is that of one step of Fisher
         scoring: accurate as long as the estimates are near the truth. It is 0, and the standard error infinite, for the
-        delay of a pulse that lies within one bin.
+        delay of a pulse that lies within one bin. Both are NaN where the likelihood of the mean histogram has no
+        maximum near this light.
 
     Raises
     ------
@@ -268,12 +269,21 @@ def systematic_error(flux: Flux, system: System) -> tuple[FloatArray, FloatArray
     gradient, information = out[:, 1:4], out[:, 4:].reshape(-1, 3, 3)
     anywhere = information[:, 2, 2] <= 0.0  # within its bin
     information[anywhere, 2], information[anywhere, :, 2], information[anywhere, 2, 2] = 0.0, 0.0, 1.0
+    unstable = np.linalg.eigvalsh(_scaled(information))[:, 0] <= 0.0  # no maximum is near
+    information[unstable] = np.eye(3)
     inverse = np.linalg.inv(information)
     error = np.sqrt(np.einsum("kii->ki", inverse))
     gradient[anywhere, 2], error[anywhere, 2] = 0.0, np.inf
+    gradient[unstable], error[unstable] = np.nan, np.nan
     unit, shape = np.array([1.0, 1.0, system.period_ns]), (*flux.signal.shape, 3)
     bias = np.einsum("kij,kj->ki", inverse, gradient)
     return (bias * unit).reshape(shape), (error * unit).reshape(shape)
+
+
+def _scaled(information: FloatArray) -> FloatArray:
+    """Matrices (pixels, 3, 3) scaled to a diagonal of 1 or -1, which keeps the signs of their eigenvalues."""
+    size = np.sqrt(np.maximum(np.abs(np.einsum("kii->ki", information)), np.finfo(float).tiny))
+    return np.asarray(information / (size[:, :, None] * size[:, None, :]))
 
 
 def warn_of_bias(method: Method, system: System, estimates: Estimates) -> None:
@@ -298,7 +308,7 @@ def warn_of_bias(method: Method, system: System, estimates: Estimates) -> None:
         bias, error = systematic_error(Flux(s[pixels], b[pixels], tau[pixels] * system.period_ns), system)
     except (ValueError, ArithmeticError):
         return
-    ratio = bias / error
+    ratio = np.nan_to_num(bias / error)
     worst = int(np.abs(ratio).max(-1).argmax())
     if not abs(ratio[worst]).max() > NEGLIGIBLE:
         return

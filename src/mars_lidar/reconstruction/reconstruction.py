@@ -59,7 +59,8 @@ class Reconstruction:
     level
         Signal photons per period of a surface of reflectivity 1 (at 1 m with inverse-square attenuation).
     delay_error_ns, depth_error_m, signal_error, background_error
-        Standard errors, or None for methods without them; NaN for an estimate on its bound.
+        Standard errors, or None for methods without them; NaN for an estimate on its bound. The delay and depth of a
+        pixel flagged ``NO_SIGNAL`` have none.
     significance
         Square root of twice the gain in log likelihood by the signal, approximately in standard deviations; or None.
     flags

@@ -217,7 +217,7 @@ def test_view_draws_a_cube(tmp_path):
         (["--scene", "room", "--image", "a.png"], "--image belongs to --depth"),
         (["--depth", "nowhere.png"], "nowhere.png"),
         (["--scene", "room", "--dead-time-ns", "-1"], "--dead-time-ns must be"),
-        (["--scene", "room", "--sbr", "0"], "sbr must be"),
+        (["--scene", "room", "--sbr", "0"], "sbr must be a number in (0, inf]"),
         (["--scene", "room", "--system", "nowhere.yaml"], "nowhere.yaml"),
         (["--scene", "room", "--pulse-sigma-ns", "1", "--pulse-fwhm-ns", "1"], "give the pulse once"),
         (["--scene", "room", "--pulse-bin-ns", "1"], "belong to --pulse-file"),

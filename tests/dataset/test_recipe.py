@@ -81,7 +81,7 @@ def test_options_replace_values(write):
         ("size: 8,", "size: 0,", 8, r"crop.size must be an integer in \[1, 8192\], got 0"),
         ("system.yaml", "other.yaml", 10, "does not exist"),
         ("1e-1, 1]", "1e-1, -1]", 12, r"light\.signal\[1\] must be a finite number"),
-        ("sbr: [inf, 2]", "sbr: [0]", 13, r"light\.sbr\[0\] must be a finite number in"),
+        ("sbr: [inf, 2]", "sbr: [0]", 13, r"light\.sbr\[0\] must be a number in"),
         ("sbr: [inf, 2]", "sbr: [2, 2.0]", 12, "levels that differ"),
         ("sbr:", "levels: [[1, 1]]\n  sbr:", 13, "give them, or signal and sbr"),
         ("layout: dense", "layout: thick", 14, "store.layout must be one of 'sparse', 'dense', got 'thick'"),

@@ -510,7 +510,7 @@ def test_bad_input(light, tmp_path):
         (lambda: Transient(0 * light, 1.0).flux(SYSTEM, signal=1.0), "must have light"),
         (lambda: Transient(light, 1.0).flux(SYSTEM), "one of signal and photons_per_unit"),
         (lambda: Transient(light, 1.0).flux(SYSTEM, signal=0.0), "signal must be"),
-        (lambda: Transient(light, 1.0).flux(SYSTEM, signal=1.0, sbr=0.0), "sbr must be"),
+        (lambda: Transient(light, 1.0).flux(SYSTEM, signal=1.0, sbr=0.0), r"sbr must be a number in \(0, inf\]"),
         (lambda: Transient(light, 1.0).flux(SYSTEM, signal=1.0, rows=slice(0, 4, 2)), "rows must select"),
         (lambda: Transient(light, 1.0).flux(SYSTEM, signal=1.0, parts=0), "parts must be"),
     ):

@@ -405,7 +405,7 @@ def test_scene_files_of_depth_and_of_a_built_in_scene(tmp_path):
         ("size: 9\n", [], "a scene file must give one of example, depth (or path) and transient, got none of them"),
         ("example: room\ndepth: a.png\n", [], "got example and depth"),
         ("transient: t.npy\npulse: 3\n", [], "scene.yaml:2: pulse must be true or false, got 3"),
-        ("transient: t.npy\nlight:\n  sbr: x\n", [], "scene.yaml:3: light.sbr must be a finite number"),
+        ("transient: t.npy\nlight:\n  sbr: x\n", [], "scene.yaml:3: light.sbr must be a number in (0, inf]"),
         ("transient: t.npy\nlight: {signal: 1, photons_per_unit: 1}\n", [], "one of signal and photons_per_unit"),
         ("transient: t.npy\nlight: {glow: 1}\n", [], "light has unknown key 'glow'"),
         ("transient: t.npy\n", [], "give bin_ns"),

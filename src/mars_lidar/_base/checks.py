@@ -12,13 +12,24 @@ import numpy as np
 from mars_lidar._base.types import FloatArray
 
 
-def real(name: str, value: Any, *, low: float = -math.inf, high: float = math.inf, strict_low: bool = False) -> float:
-    """A finite real number in [low, high] (or (low, high] with `strict_low`), as float."""
-    opening, closing = "(" if strict_low or math.isinf(low) else "[", ")" if math.isinf(high) else "]"
-    allowed = f"a finite number in {opening}{low:g}, {high:g}{closing}"
+def real(
+    name: str,
+    value: Any,
+    *,
+    low: float = -math.inf,
+    high: float = math.inf,
+    strict_low: bool = False,
+    infinite: bool = False,
+) -> float:
+    """A finite real number in [low, high] (or (low, high] with `strict_low`), as float; inf too where `infinite`."""
+    opening = "(" if strict_low or math.isinf(low) else "["
+    closing = ")" if math.isinf(high) and not infinite else "]"
+    allowed = f"a {'' if infinite else 'finite '}number in {opening}{low:g}, {high:g}{closing}"
     if isinstance(value, bool) or not isinstance(value, Real):
         raise TypeError(f"{name} must be {allowed}, got {value!r} ({type(value).__name__})")
     number = float(value)
+    if infinite and number == math.inf:
+        return number
     if not math.isfinite(number) or number > high or number < low or (strict_low and number == low):
         raise ValueError(f"{name} must be {allowed}, got {value!r}")
     return number

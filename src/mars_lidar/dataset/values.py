@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 from mars_lidar._base import checks
@@ -46,9 +47,8 @@ def real(
 
     def read(key: Key, value: Any) -> float:
         given = number(value)
-        if infinite and given == math.inf:
-            return math.inf
-        return float(checked(key, lambda: checks.real(key_name(key), given, low=low, high=high, strict_low=strict_low)))
+        limited = partial(checks.real, low=low, high=high, strict_low=strict_low, infinite=infinite)
+        return float(checked(key, lambda: limited(key_name(key), given)))
 
     return _field(about, read, **limits)
 

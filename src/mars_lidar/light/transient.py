@@ -228,8 +228,7 @@ class Transient:
         for name, value in (("signal", signal), ("photons_per_unit", photons_per_unit)):
             if value is not None:
                 checks.real(name, value, low=0.0, strict_low=True)
-        if not isinstance(sbr, float) or sbr != math.inf:
-            checks.real("sbr", sbr, low=0.0, strict_low=True)
+        checks.real("sbr", sbr, low=0.0, strict_low=True, infinite=True)
         checks.real("dark_count_hz", dark_count_hz, low=0.0)
         first, last, stride = rows.indices(self.shape[0])
         if stride != 1 or first >= last:

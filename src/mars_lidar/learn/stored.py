@@ -42,7 +42,8 @@ class StoredDataset(torch.utils.data.IterableDataset[dict[str, Any]]):
     """The exposures of stored datasets, as batches or examples for a `torch.utils.data.DataLoader`.
 
     Give `batch_size` here and ``batch_size=None`` to the loader: counts are then decoded into the batch itself, and a
-    batch contains the same exposures for any number of workers. A loader that collates single examples also works, at
+    batch contains the same exposures for any number of workers; from two workers on, the order of the batches depends
+    on it. A loader that collates single examples also works, at
     the cost of a copy.
 
     All ranks of a distributed run give the same number of batches, for any number of ranks and workers and any batch

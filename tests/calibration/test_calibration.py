@@ -11,7 +11,7 @@ from harness import make_system
 
 import mars_lidar as ml
 from tests.calibration.photon_by_photon import Truth, as_timestamps, photon_by_photon
-from tests.calibration.sweep import NAMES, pulls, random_truth, silent, with_effect
+from tests.calibration.sweep import NAMES, outside, pulls, random_truth, silent, with_effect
 from tests.calibration.sweep import ORDINARY as BASE
 
 FAR = 4.5  # stated errors: 7e-6 by chance for a normal law
@@ -346,6 +346,16 @@ def test_strong_afterpulses_are_taken_in(probability: float, delay: float) -> No
 
 
 @pytest.mark.full
+def test_stretches_of_unequal_length_do_not_drift() -> None:
+    """Parts of unequal exposure have unequal errors: taken as equal, they were called a drift, with p = 0."""
+    recorded = [stream(BASE, photons, 9700 + k) for k, photons in enumerate([20_000] + [200] * 60)]
+    result = ml.calibrate(recorded)
+    assert result.fits
+    assert result.drift is not None
+    assert not result.drift.drifts.any()
+
+
+@pytest.mark.full
 def test_a_drift_is_named_and_grows_the_errors() -> None:
     result = ml.calibrate(stream(replace(BASE, drift=0.2), 60_000, 5))
     assert NAMES["drift"] in [suspect.name for suspect in result.suspects]
@@ -399,6 +409,20 @@ def test_constant_light_without_a_laser() -> None:
     assert abs(dead.value - 50.0) < FAR * dead.error
     rate = result.estimates["light"]  # photons of a mean interval, the unit of time here
     assert abs(rate.value / result.recording.period_ns - 0.005) < FAR * rate.error / result.recording.period_ns
+
+
+@pytest.mark.full
+def test_a_free_shape_has_the_jitter_once() -> None:
+    """Light of free shape includes the jitter; it was added once more: 5 of 8 intervals of a dead time missed it."""
+    missed = 0
+    for number, jitter in [*((9600 + k, 0.3) for k in range(5)), (9600, 0.0), (9601, 0.0)]:
+        truth = replace(BASE, sigma=0.5, jitter=jitter, dead=50.0 if jitter else 130.0)
+        result = ml.calibrate(stream(truth, 20_000, number), pulse="free")
+        assert result.fits
+        assert not result.suspects
+        assert np.isnan(result.estimates["jitter_ns"].error)
+        missed += "dead_time_ns" in outside(result, truth)
+    assert missed <= 2  # of seven 95 % intervals; three or more: p = 0.4 %
 
 
 @pytest.mark.full

@@ -18,7 +18,7 @@ from mars_lidar.calibration import start, suspects
 from mars_lidar.calibration.curves import Curves, Realizations, curves, realizations
 from mars_lidar.calibration.fit import Effort, Fit, Fitted, Guess, draws
 from mars_lidar.calibration.look import Look, look_at
-from mars_lidar.calibration.model import Model, all_carriers
+from mars_lidar.calibration.model import Model, Waveform, all_carriers
 from mars_lidar.calibration.recording import FALSE_ALARM, LEAST_PHOTONS, Recording, recording_of, recording_of_arrivals
 from mars_lidar.calibration.suspects import Drift, Named, Trial
 from mars_lidar.instrument.avalanches import Afterpulsing
@@ -136,7 +136,7 @@ class Calibration:
     system, flux
         Instrument and light of these estimates, for `simulate`; None with ``look=True``.
     waveform, waveform_error
-        Light (bins,) in photons per period and bin, with ``pulse="free"``; else None.
+        Light (bins,) as recorded, jitter included, in photons per period and bin, with ``pulse="free"``; else None.
     recording, fitted
         The recorded times and the fit, the inputs of `curves` and `realizations`; no fit with ``look=True``.
     level
@@ -401,8 +401,10 @@ class _Run:
         model = pulsed = Model(recording.clock, 0, fields=fields, jitter_given=given)
         if shape == "free":
             self.wave = start.free_waveform(recording, self.fit.effort.shape_bins)
-            shares, errors = (part / self.wave[0].sum() for part in self.wave)
-            model = pulsed = replace(model, waveform=shares, waveform_error=errors, exposure=recording.exposure)
+            fine = recording.photons >= self.fit.effort.bin_photons * self.fit.effort.light_bins
+            light = start.free_waveform(recording, self.fit.effort.light_bins) if fine else self.wave
+            waveform = Waveform(*light, recording.exposure, recording.period_ns, fine)
+            model = pulsed = replace(model, waveform=waveform)
         elif recording.laser:
             p, self.most = start.brightest_window(recording)
             pulsed = replace(model, returns=self.returns, pulse=shape if isinstance(shape, Pulse) else None)
@@ -565,6 +567,8 @@ def _estimates(fitted: Fitted, growth: FloatArray) -> dict[str, Estimate]:
     if not withheld and not fitted.lit:  # there may be another pulse
         dark = "no significant pulse: no error is stated"
         withheld |= dict.fromkeys((*names[:k], "width", "jitter"), dark)
+    if model.waveform is not None and "jitter" in free:  # which the shape follows
+        withheld.setdefault("jitter", "beside light of free shape: no error is stated")
     extremes = _at_bounds(fitted, covariance, drawn) if model.split and "jitter" in free else []
     out: dict[str, Estimate] = {}
 

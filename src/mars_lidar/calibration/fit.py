@@ -34,8 +34,9 @@ class Effort:
     ----------
     settings
         Detectors of a batch, each with `LIGHTS` streams.
-    stream, batch, share
-        Fewest photons of a stream, most photons of a batch, and photons of a batch relative to those of the recording.
+    stream, batch, share, least
+        Fewest photons of a stream, most photons of a batch, and photons of a batch relative to those of the recording:
+        up to that number, and at least.
     first, rounds
         Photons of the recording that the first steps weigh; most steps.
     spread
@@ -51,14 +52,15 @@ class Effort:
         Attempts to fit a recording, each with other simulated streams; the first that converges is used.
     effects
         Effects that are included at most, one after the other.
-    shape_bins
-        Most bins of free light.
+    shape_bins, light_bins, bin_photons
+        Most bins of free light in the result; and of that from which streams are drawn, if each has so many photons.
     """
 
     settings: int = 32
     stream: int = 2_000
     batch: float = 4e6
     share: float = 12.0
+    least: float = 2.0
     first: int = 8_000
     rounds: int = 10
     spread: float = 2.0
@@ -70,12 +72,14 @@ class Effort:
     attempts: int = 3
     effects: int = 2
     shape_bins: int = 256
+    light_bins: int = 1024
+    bin_photons: float = 10.0
 
     def of(self, photons: float, times: float = 1.0) -> int:
         """Photons of each stream of a batch, for this many of the recording; `times` as many for the last batches."""
         number = self.settings * LIGHTS
         wanted = times * max(self.stream, min(self.share * photons, self.batch) / number)
-        return int(min(photons, max(wanted, 2.0 * photons / number)))
+        return int(min(photons, max(wanted, self.least * photons / number)))
 
 
 class Guess(NamedTuple):
@@ -294,7 +298,7 @@ class Fit:
     @property
     def shorter(self) -> Fit:
         """A fit whose last batches are as short as those of the steps, to choose between models."""
-        effort = replace(self.effort, longer=1.0, more=1, recentred=2)
+        effort = replace(self.effort, least=0.25, longer=1.0, more=1, recentred=2)
         return Fit(self.recording, effort, (self.next_seed(),))
 
     def next_seed(self) -> int:

@@ -26,6 +26,8 @@ from mars_lidar.light.flux import Flux
 _NARROWEST = 2e-6  # periods: the narrowest pulse that the engines draw
 _WIDEST = 0.3  # sigma of a recorded pulse, periods: a wider one is hardly distinguished from background
 _WIDEST_JITTER = 0.05  # periods: the widest that `Jitter` takes
+_SMOOTHED = 9  # frequencies over which the power of a waveform is averaged
+_ITERATIONS = 100  # of a deconvolution: recorded pulses are then reproduced to 0.1 %
 _MOST_CARRIERS = 0.95  # of an avalanche
 Fields = dict[str, Any]
 
@@ -108,6 +110,57 @@ def _normal_deviates(number: int, seed: int) -> NDArray[np.float32]:
     return np.asarray(_quantiles()[words[0]] + _quantiles()[words[1]])
 
 
+class Waveform:
+    """Light of any shape, as shares of it in equal parts of the period, from recorded ones, which jitter has blurred.
+
+    The noise of the recorded shares is white; what is above it in the power of nearby frequencies is signal, and all
+    else is removed (Wiener's filter) if there are enough photons to know it. The light before a jitter of given width
+    is the nonnegative one that the jitter blurs to these shares, by the iteration of Richardson (J. Opt. Soc. Am. 62,
+    55, 1972) and Lucy (Astron. J. 79, 745, 1974). Light drawn for a stream of fewer periods scatters about that as the
+    recorded shares do, and more.
+    """
+
+    def __init__(self, light: FloatArray, error: FloatArray, exposure: float, period_ns: float, filtered: bool) -> None:
+        """Recorded light (parts,) and its standard errors by `exposure` periods."""
+        from scipy.special import ndtr
+
+        # error**2 is that of one registration more, (light passes + 1) / passes**2
+        passes = (light + np.sqrt(light**2 + 4.0 * error**2)) / (2.0 * error**2)
+        self._variance, self._exposure = light / passes / light.sum() ** 2, exposure
+        spectrum, few = np.fft.rfft(light / light.sum()), np.full(_SMOOTHED, 1.0 / _SMOOTHED)
+        power = np.convolve(np.pad(np.abs(spectrum[1:]) ** 2, _SMOOTHED // 2, "symmetric"), few, "valid")
+        signal = np.maximum(1.0 - self._variance.sum() / power, 0.0) * filtered + (not filtered)
+        self._signal = np.r_[1.0, signal]
+        shares = np.maximum(np.fft.irfft(spectrum * self._signal, light.size), 1e-3 / light.size)
+        self._shares = shares / shares.sum()
+        self._jitters = _WIDEST_JITTER * period_ns * np.linspace(0.0, 1.0, 25) ** 2
+        width, half = period_ns / light.size, light.size // 2
+        jitters = np.maximum(self._jitters, 1e-3 * width)[:, None]
+        x = width * np.arange(-half - 1, light.size - half + 1)
+        integral = x * ndtr(x / jitters) + jitters * np.exp(-0.5 * (x / jitters) ** 2) / (2.0 * np.pi) ** 0.5
+        blur = np.fft.rfft(np.roll(np.diff(integral, 2), -half, axis=1) / width)  # from part to part: positive
+        self._before = np.tile(self._shares, (self._jitters.size, 1))
+        for _ in range(_ITERATIONS):
+            ratio = self._shares / self._blurred(self._before, blur)
+            self._before *= self._blurred(ratio, blur)
+
+    def _blurred(self, shares: FloatArray, blur: FloatArray) -> FloatArray:
+        parts = self._shares.size
+        return np.maximum(np.fft.irfft(blur * np.fft.rfft(shares), parts), 1e-6 / parts)  # of rounding
+
+    def drawn(self, jitter: FloatArray, cycles: int, seed: int) -> FloatArray:
+        """Shares (rows, parts) before jitters (rows,), drawn for a stream of so many periods; of 0, the mean."""
+        place = np.interp(jitter, self._jitters, np.arange(self._jitters.size))
+        first = np.minimum(place.astype(int), self._jitters.size - 2)
+        part = (place - first)[:, None]
+        out = (1.0 - part) * self._before[first] + part * self._before[first + 1]
+        if cycles:
+            scale = self._variance * (self._exposure / cycles) / self._shares  # of gamma laws: none is negative
+            shares = np.random.default_rng(seed).gamma(self._shares / scale, size=out.shape) * scale
+            out *= self._blurred(shares, self._signal) / self._shares
+        return np.asarray(out / out.sum(-1, keepdims=True))
+
+
 @dataclass(frozen=True, eq=False)
 class Model:
     """Parameters, in this order: background, (signal, delay) of each return, width, jitter, dead time, effects.
@@ -116,18 +169,14 @@ class Model:
     included, and the jitter an angle, in radians, whose sine and cosine times `width` are the standard deviations of
     jitter and pulse. Counts are smooth functions of both where one width vanishes; of variances they would not be.
     Where the jitter is given (`jitter_given`) or the pulse is no Gaussian of unknown width, it is in ns. With a
-    `waveform` (shares of the light in equal parts of the period, before jitter) there is no return, and the background
-    is all light. `waveform_error` are the standard errors of these shares by a recording of `exposure` periods:
-    simulated streams have light that scatters about the waveform by so much, and more in shorter streams, as their
-    counts do. With a `pulse` its shape is known, before any jitter, and `width` is not used.
+    `waveform` there is no return, and the background is all light. With a `pulse` its shape is known, before any
+    jitter, and `width` is not used.
     """
 
     clock: Clock
     returns: int
     pulse: Pulse | None = None
-    waveform: FloatArray | None = None
-    waveform_error: FloatArray | None = None
-    exposure: float = 1.0
+    waveform: Waveform | None = None
     effects: tuple[Effect, ...] = ()
     fields: tuple[tuple[str, Any], ...] = ()  # of the detector, as given
     jitter_given: bool = False
@@ -232,27 +281,17 @@ class Model:
             period_ns=self.clock.period_ns, cycles=cycles, bins=bins, pulse=pulse, detector=Detector(**fields)
         )
 
-    def flux(self, rows: FloatArray) -> Flux:
-        """Light (1, rows) of parameters (rows, p)."""
+    def flux(self, rows: FloatArray, cycles: int = 0, seed: int = 0) -> Flux:
+        """Light (1, rows) of parameters (rows, p); of a waveform, with shapes as uncertain as by so many `cycles`."""
         rows = self.bounded(np.atleast_2d(rows))
         if self.waveform is not None:
-            return Flux(waveform=(rows[:, :1] * self.waveform)[None])
+            return Flux(waveform=(rows[:, :1] * self.waveform.drawn(self.widths(rows)[1], cycles, seed))[None])
         back = rows[None, :, 0]
         if self.returns == 0:
             return Flux(np.zeros_like(back), back, np.zeros_like(back))
         signal, delay = (rows[:, first : self.light : 2].T[:, None] for first in (1, 2))
         delay = delay % self.clock.period_ns
         return Flux(signal, back, delay) if self.returns > 1 else Flux(signal[0], back, delay[0])
-
-    def varied(self, flux: Flux, cycles: int, seed: int) -> Flux:
-        """The light, its shape drawn from the uncertainty of the waveform; unchanged where that is known."""
-        if self.waveform is None or self.waveform_error is None or flux.waveform is None:
-            return flux
-        light = flux.waveform.sum(-1, keepdims=True)
-        variance = self.waveform_error**2 * (self.exposure / cycles)
-        scale = variance / self.waveform  # of gamma laws, so that no light is negative
-        shape = np.random.default_rng(seed).gamma(self.waveform / scale, size=flux.waveform.shape) * scale
-        return Flux(waveform=light * shape / shape.sum(-1, keepdims=True))
 
     def streams(self, rows: FloatArray, cycles: int, seed: int, jitter: bool = True) -> Streams:
         """Recorded times of a stream for each row of (rows, p); all have the detector of the first row but its jitter.
@@ -264,7 +303,7 @@ class Model:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a trial value may look like one in another unit
             system = self.system(rows[0], cycles, jitter=False)
-        flux = self.varied(self.flux(rows), cycles, seed)
+        flux = self.flux(rows, cycles, seed)
         task = Task(flux, system, 1, 0, np.arange(len(rows), dtype=np.uint32), seed, threads=1, progress=None)
         most = self.clock.period_ns / max(system.detector.dead_time_ns, 1e-9)  # registrations in a period
         made = ExactEngine().records(task, float(cycles * np.minimum(flux.total, most).sum()))

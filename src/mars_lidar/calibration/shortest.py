@@ -93,7 +93,7 @@ def shortest_law(
     middle = np.tile(rows[len(rows) // 2], (len(rows), 1))
     drawn = replace(model, clock=Clock(period)).streams(middle, cycles, seed, jitter=False).times
     phases = np.bincount((drawn / period * bins).astype(np.int64) % bins, minlength=bins) / drawn.size
-    flux = model.varied(model.flux(rows), round(recording.exposure), seed)
+    flux = model.flux(rows, round(recording.exposure), seed)
     systems = [model.system(row, 2, jitter=False) for row in rows]
     light = np.array([photons_per_bin(flux[:, k : k + 1], s, bins=bins)[0, 0] for k, s in enumerate(systems)])
     rate = np.fft.irfft(np.conj(np.fft.rfft(phases)) * np.fft.rfft(light), bins) * (recording.photons * bins / period)

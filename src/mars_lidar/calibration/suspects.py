@@ -30,7 +30,7 @@ class Score:
     @property
     def z(self) -> float:
         """Standard deviations above zero; the size of an effect that is on or off counts as 1 at most."""
-        return min(self.size, 1.0 if self.effect.onoff else np.inf) / self.error
+        return min(self.size, 1.0 if self.effect.onoff else np.inf) / max(self.error, 1e-300)
 
 
 def counts_of(fit: Fit, fitted: Fitted, model: Model, theta: FloatArray) -> tuple[FloatArray, float]:
@@ -150,21 +150,24 @@ def refitted(fit: Fit, fitted: Fitted, plain: FloatArray, trials: list[Trial]) -
     An effect is significant if its refit fits where the model is rejected; or if the refit is not worse and the
     residual counts have a significant score, along the change by a small effect or along that by the effect of the
     refit. (The first alone misleads: a slow recovery has the score of a paralyzable detector, and an effect that the
-    dead time has absorbed has none.) All refits are by short batches; that with the least misfit is repeated by full
-    ones.
+    dead time has absorbed has none.) Of light of free shape, which follows the recorded phases, only the misfit counts.
+    All refits are by short batches; that with the least misfit is repeated by full ones.
     """
     from scipy.special import ndtri
 
     limit, size = float(-ndtri(FALSE_ALARM / max(len(trials), 1))), fitted.model.size
 
-    def clear(trial: Trial, final: Fitted | None) -> float:
+    def significance(trial: Trial, final: Fitted | None) -> float:
         """The score of a significant effect, by a refit; else -inf."""
         if final is None or not final.theta[size] > 0.0 or final.p_value <= min(FALSE_ALARM, fitted.p_value):
             return -np.inf
         z = max(trial.score.z, _score(fit, fitted, plain, final.model, final.theta, trial.effect).z)
-        return z if z > limit or fitted.p_value < FALSE_ALARM < final.p_value else -np.inf
+        clear = z > limit and final.model.waveform is None
+        return z if clear or fitted.p_value < FALSE_ALARM < final.p_value else -np.inf
 
-    significant = [(trial, trial.final) for trial in trials if clear(trial, trial.final) > -np.inf and trial.final]
+    significant = [
+        (trial, trial.final) for trial in trials if significance(trial, trial.final) > -np.inf and trial.final
+    ]
     if not significant:
         return None
     trial, final = min(significant, key=lambda pair: pair[1].misfit_z)
@@ -173,10 +176,12 @@ def refitted(fit: Fit, fitted: Fitted, plain: FloatArray, trials: list[Trial]) -
         root = root_of(final.covariance[np.ix_(known, known)])
         other = fit.shorter.finish(Guess(fitted.model, final.theta[:size], root, final.free[known]))
         if other.converged and other.p_value > max(FALSE_ALARM, fitted.p_value / _MISFIT):
-            return other, None
+            fitted, plain = other, counts_of(fit, other, other.model, other.theta)[0]
+            if not _score(fit, fitted, plain, final.model, final.theta, trial.effect).z > limit:
+                return fitted, None
     last = fit.finish(Guess(final.model, final.theta, root_of(final.covariance), final.free), finished=True)
     final = last if last.converged else final
-    z = clear(trial, final)
+    z = significance(trial, final)
     return (final, Named(trial.effect, z, fitted.misfit_z - final.misfit_z)) if z > -np.inf else None
 
 
@@ -281,17 +286,24 @@ def drift(fit: Fit, fitted: Fitted) -> Drift | None:
     estimator = np.linalg.pinv(known @ sums @ response) @ known @ sums
     counts = np.array([batch.cells.of(part) * (recording.exposure / part.exposure) for part in parts])
     x = (counts - fitted.offset) @ estimator.T
-    sd = (fitted.noise @ estimator.T).std(0) * len(parts) ** 0.5
-    place = np.linspace(-0.5, 0.5, len(parts))
-    slope = place @ (x - x.mean(0)) / (place @ place)
-    square = (((x - x.mean(0)) / sd) ** 2).sum(0)
-    trend = slope / (sd / np.sqrt(place @ place))
+    exposures = np.array([part.exposure for part in parts])
+    share = exposures / exposures.sum()
+    noise = (fitted.noise @ estimator.T).std(0)  # of the whole recording
+    sd = noise * len(parts) ** 0.5  # of a part of mean exposure
+    ends = np.cumsum(np.r_[0.0, exposures])
+    middle = 0.5 * (ends[1:] + ends[:-1]) * recording.period_ns * 1e-9
+    # parts of a recording with interruptions differ in exposure: weights are their shares
+    place = 0.5 * (ends[1:] + ends[:-1]) / ends[-1] - 0.5
+    place -= share @ place
+    mean = share @ x
+    spread = float(share @ place**2)
+    slope = (share * place) @ (x - mean) / spread
+    square = (share[:, None] * ((x - mean) / noise) ** 2).sum(0)
+    trend = slope * spread**0.5 / noise
     p = np.minimum([2.0 * _above(abs(z)) for z in trend], chdtrc(len(parts) - 1, square))
-    begins = np.cumsum([0.0, *(part.exposure for part in parts)])
-    middle = 0.5 * (begins[1:] + begins[:-1]) * recording.period_ns * 1e-9
     about = np.r_[fitted.theta[amounts].sum(), fitted.theta[delays]]
     growth = np.sqrt(np.maximum(square / (len(parts) - 1), 1.0))
     flicker, flicker_z, ratio = _flicker(fit, fitted)
     growth[0] = max(growth[0], ratio**0.5)
     names = ("light", *(model.names[k] for k in delays))
-    return Drift(names, middle, x - x.mean(0) + about, sd, trend, slope, p, growth, flicker, flicker_z)
+    return Drift(names, middle, x - mean + about, sd, trend, slope, p, growth, flicker, flicker_z)

@@ -138,15 +138,16 @@ class Waveform:
         jitters = np.maximum(self._jitters, 1e-3 * width)[:, None]
         x = width * np.arange(-half - 1, light.size - half + 1)
         integral = x * ndtr(x / jitters) + jitters * np.exp(-0.5 * (x / jitters) ** 2) / (2.0 * np.pi) ** 0.5
-        blur = np.fft.rfft(np.roll(np.diff(integral, 2), -half, axis=1) / width)  # from part to part: positive
+        kernel = np.roll(np.diff(integral, 2), -half, axis=1) / width  # from part to part: positive, symmetric
+        blur = np.asarray(np.fft.rfft(kernel).real, np.float64)
         self._before = np.tile(self._shares, (self._jitters.size, 1))
         for _ in range(_ITERATIONS):
             ratio = self._shares / self._blurred(self._before, blur)
-            self._before *= self._blurred(ratio, blur)
+            self._before = self._before * self._blurred(ratio, blur)
 
     def _blurred(self, shares: FloatArray, blur: FloatArray) -> FloatArray:
         parts = self._shares.size
-        return np.maximum(np.fft.irfft(blur * np.fft.rfft(shares), parts), 1e-6 / parts)  # of rounding
+        return np.asarray(np.maximum(np.fft.irfft(blur * np.fft.rfft(shares), parts), 1e-6 / parts))  # of rounding
 
     def drawn(self, jitter: FloatArray, cycles: int, seed: int) -> FloatArray:
         """Shares (rows, parts) before jitters (rows,), drawn for a stream of so many periods; of 0, the mean."""

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from mars_lidar._base.types import FloatArray
-from mars_lidar.statistics.count_pmf import Pmf
+from mars_lidar.statistics.pmf import Pmf
 
 _POOLED = 5.0  # expected counts below which cells of a G-test are pooled
 _NEGLIGIBLE = 1e-10  # expected counts below which the bootstrap pools the classes into one

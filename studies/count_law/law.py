@@ -25,8 +25,8 @@ from mars_lidar import CountLaw, Flux, System, count_law
 from mars_lidar._base.types import FloatArray
 from mars_lidar.plot.style import COLOURS
 from mars_lidar.statistics import ConvergenceError
-from mars_lidar.statistics.count_pmf import Pmf, gaussian_pmf, total_variation
 from mars_lidar.statistics.matched import matched_pmf, trusted
+from mars_lidar.statistics.pmf import Pmf, gaussian_pmf, total_variation
 from studies import Facts, Request
 from studies.common import distance
 from studies.common.draw import maps

@@ -22,8 +22,8 @@ from mars_lidar._base.types import FloatArray
 from mars_lidar.engines import ENGINES
 from mars_lidar.plot.style import COLOURS, INK, MUTED
 from mars_lidar.statistics import photons_per_bin
-from mars_lidar.statistics.count_pmf import Pmf, kl_divergence
 from mars_lidar.statistics.matched import matched_pmf
+from mars_lidar.statistics.pmf import Pmf, kl_divergence
 from mars_lidar.statistics.tolerances import TOL
 from studies import Facts, Request, Tell
 from studies.common.distance import wasserstein

@@ -19,7 +19,7 @@ from mars_lidar.engines.table_reader import as_shapes
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.statistics import photons_per_bin
 from mars_lidar.statistics.cells import Cells
-from mars_lidar.statistics.count_pmf import gaussian_pmf
+from mars_lidar.statistics.pmf import gaussian_pmf
 from studies.neural.model import NeuralMap
 
 

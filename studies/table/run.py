@@ -10,8 +10,8 @@ import numpy as np
 
 from mars_lidar import Flux, QuantisationError, System, Table, count_law
 from mars_lidar.statistics import exposure_moments
-from mars_lidar.statistics.count_pmf import Pmf, total_variation
 from mars_lidar.statistics.matched import matched_pmf
+from mars_lidar.statistics.pmf import Pmf, total_variation
 from mars_lidar.table.error import random_pixels
 from studies import Facts, Request
 from studies.common.report import Row

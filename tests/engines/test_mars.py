@@ -18,7 +18,7 @@ from mars_lidar.engines.synthesis import Matched, PartlyReplaced, Run, Streams, 
 from mars_lidar.engines.table_reader import PixelEntries
 from mars_lidar.engines.tolerances import TOL
 from mars_lidar.statistics import exposure_moments
-from mars_lidar.statistics.count_pmf import Pmf, total_variation
+from mars_lidar.statistics.pmf import Pmf, total_variation
 from mars_lidar.statistics.tolerances import TOL as STATISTICS
 from mars_lidar.table import Table
 from tests.harness.command import command_line, fails, ok

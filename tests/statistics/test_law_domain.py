@@ -13,9 +13,9 @@ from scipy import integrate, special, stats
 
 import mars_lidar as ml
 from mars_lidar.statistics import ConvergenceError, exposure_moments, mean_histogram
-from mars_lidar.statistics import count_pmf as pmf_module
 from mars_lidar.statistics import exposure as exposure_module
 from mars_lidar.statistics import joint as pixel_module
+from mars_lidar.statistics import pmf as pmf_module
 from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.exposure import refined_moments
 from mars_lidar.statistics.joint_grid import FoldedGrid, relative_residual
@@ -305,7 +305,7 @@ def test_refusals_say_what_to_use(signal: float, background: float, dead: float,
 def test_a_law_that_is_refused_is_to_be_had_elsewhere(monkeypatch: pytest.MonkeyPatch):
     system = view(2.04, 20_000)
     expected = exposure_moments(ml.Flux(4.0, 0.1, 50.0), system)
-    monkeypatch.setattr("mars_lidar.statistics.law.LAW", replace(LAW, recursion=1e4, one_pass=1e4))
+    monkeypatch.setattr("mars_lidar.statistics.count_laws.LAW", replace(LAW, recursion=1e4, one_pass=1e4))
     refused("exposure_moments, which may take", ml.count_law, ml.Flux(4.0, 0.1, 50.0), system, error=ConvergenceError)
     assert exposure_moments(ml.Flux(4.0, 0.1, 50.0), system).mean == expected.mean
     assert ml.joint_law(ml.Flux(4.0, 0.1, 50.0), system).count_mean == pytest.approx(float(expected.mean), rel=1e-6)

@@ -24,7 +24,7 @@ from mars_lidar.engines import ANY_SYSTEM, ENGINES
 from mars_lidar.engines.exact import PoissonEngine
 from mars_lidar.statistics import ConvergenceError
 from mars_lidar.statistics.chain import PhaseChain
-from mars_lidar.statistics.count_pmf import Pmf, gaussian_pmf, kl_divergence, total_variation
+from mars_lidar.statistics.pmf import Pmf, gaussian_pmf, kl_divergence, total_variation
 from mars_lidar.statistics.tolerances import TOL
 from studies import STUDIES, Request
 from studies.__main__ import main

@@ -9,7 +9,7 @@ import numpy as np
 from mars_lidar._base.types import FloatArray
 from mars_lidar.calibration.fit import LIGHTS, Effort, Fitted
 from mars_lidar.calibration.recording import Recording
-from mars_lidar.statistics.count_pmf import Pmf, kl_divergence, total_variation
+from mars_lidar.statistics.pmf import Pmf, kl_divergence, total_variation
 
 _RATIO = 4.0  # photons of the model's streams over those of the recording
 

@@ -112,8 +112,8 @@ class MarsEngine(CountTimesShape):
             run.draw(batch)
 
     def _evaluated(self, run: synthesis.Run, group: Group) -> synthesis.Batch:
-        from mars_lidar.statistics.count_pmf import exact_pmfs
         from mars_lidar.statistics.exposure import recorded_moments
+        from mars_lidar.statistics.pmf import exact_pmfs
 
         task = run.task
         exposure = recorded_moments(group.cells, tolerance=1e-4, threads=task.threads, progress=run.waiting)

@@ -23,7 +23,7 @@ from mars_lidar._base.types import FloatArray, IndexArray, NDArray, Progress
 from mars_lidar.engines.engine import Task
 from mars_lidar.engines.pixels import Alignment
 from mars_lidar.engines.tolerances import TOL
-from mars_lidar.statistics.count_pmf import Pmf
+from mars_lidar.statistics.pmf import Pmf
 
 # --- Counts ----------------------------------------------------------------------------------------------------------
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mars_lidar.instrument.system import System
 from mars_lidar.io.layout import MEASURED
-from mars_lidar.plot.style import INK, MUTED
+from mars_lidar.plot.style import MUTED, PREDICTION
 from mars_lidar.plot.views import incident_rate, predicted_counts
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ def draw_pixel(
     _draw_means(whole, system, counts, expected, lowest, colour)
     whole.plot(*_steps(edges, expected), color=MUTED, lw=0.8, label="incident rate, same total")
     if predicted is not None:
-        whole.plot(*_steps(edges, predicted), color=INK, lw=0.9, label="predicted mean")
+        whole.plot(*_steps(edges, predicted), color=PREDICTION, lw=0.9, label="predicted mean")
     label = "fitted delay" if cube.engine == MEASURED else "true delay"
     for k, tau in enumerate(delays):
         whole.axvline(tau, color=MUTED, lw=0.7, ls=(0, (3, 2)), zorder=0, label=label if k == 0 else None)
@@ -73,7 +73,7 @@ def draw_pixel(
     zoom.plot(*_steps(edges, near), color=colour, lw=0.6)
     zoom.plot(*_steps(edges, incident), color=MUTED, lw=0.9)
     if predicted is not None:
-        zoom.plot(*_steps(edges, predicted[bins % system.bins]), color=INK, lw=0.9)
+        zoom.plot(*_steps(edges, predicted[bins % system.bins]), color=PREDICTION, lw=0.9)
     for tau in delays:
         offset = (tau - centre + 0.5 * system.period_ns) % system.period_ns - 0.5 * system.period_ns
         zoom.axvline(offset, color=MUTED, lw=0.7, ls=(0, (3, 2)), zorder=0)

@@ -11,7 +11,7 @@ import numpy as np
 from mars_lidar._base.native import _core
 from mars_lidar._base.resources import thread_count
 from mars_lidar._base.types import ArrayLike, FloatArray, IndexArray, NDArray
-from mars_lidar.statistics.count_pmf import Pmf
+from mars_lidar.statistics.pmf import Pmf
 from mars_lidar.statistics.tolerances import TOL
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from mars_lidar._base.types import FloatArray, NDArray
 from mars_lidar.statistics.cells import Cells, photons_before
 from mars_lidar.statistics.chain import ConvergenceError
-from mars_lidar.statistics.count_pmf import Pmf
+from mars_lidar.statistics.pmf import Pmf
 from mars_lidar.statistics.tolerances import LAW, TOL, advice
 
 _INSTEAD = advice("fewer cycles")

@@ -1,4 +1,4 @@
-"""``python -m studies``: run studies and write their reports."""
+"""``python -m studies``: run studies and write their reports; `studies/__init__.py` says how a new one is added."""
 
 from __future__ import annotations
 

@@ -76,7 +76,7 @@ once, twice = (np.nanmean(np.abs(pull) < within) for within in (1, 2))
 print(f"{once:.0%} of all depths are within one standard error, {twice:.0%} within two.")
 
 # %%
-# The last line printed is ``69% of all depths are within one standard error, 95% within two.``
+# The last line printed is ``68% of all depths are within one standard error, 95% within two.``
 #
 # This was the last lesson. Theory: :doc:`/theory_reconstruction` derives the bound and the errors. How-to:
 # :doc:`/reconstruction` gives both for your own histogram. Next: :doc:`/howto` for recipes,

@@ -13,6 +13,7 @@
 #include <vector>
 
 #include "instrument/job.h"
+#include "instrument/twilight.h"
 
 namespace mars {
 
@@ -68,7 +69,7 @@ struct WarmStarts {
         for (int64_t k = 0; k < items; ++k) {
             const double turns = std::max(64.0, twilight_memory(job, pixel_of(k)));
             const double periods = std::ceil(turns * (job.dead_time + 1.0) + 32.0 * job.aftermath());
-            cycle[static_cast<size_t>(k)] -= static_cast<int32_t>(periods);
+            cycle[static_cast<size_t>(k)] -= static_cast<int32_t>(std::min(periods, 1e9));
         }
     }
 };

@@ -8,6 +8,7 @@
 #include <utility>
 #include <vector>
 
+#include "instrument/twilight.h"
 #include "numbers/poisson_sampler.h"
 #include "sequential/pixel.h"
 #include "sequential/recorder.h"

@@ -12,7 +12,7 @@ namespace mars {
 // Where the dead time is nearly a whole number of periods a registration's phase drifts through the pulse, by one photon's
 // share a turn, and begins anew behind it: rounds of as many turns as the pulse has photons, all about as long, whose place
 // is not forgotten for the square of that. There the spread is some ten rounds.
-// `memory` is the number of turns for which twilight pulses are remembered (instrument/job.h).
+// `memory` is the number of turns for which twilight pulses are remembered (instrument/twilight.h).
 constexpr double kSettle = 256.0, kSpread = 64.0;
 constexpr double kDrifts = 0.05;           // periods that the dead time is from a whole number of them
 constexpr double kPhotonsInSpread = 10.0;  // turns of a round that kSpread will do for

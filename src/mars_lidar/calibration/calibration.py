@@ -39,7 +39,7 @@ GIVEN = (*_TIMES, "mode", "afterpulse_probability", "afterpulse_delay_ns")
 
 @dataclass(frozen=True)
 class Estimate:
-    """A parameter: its value, standard error, and 95 % interval; the error of a given value is 0.
+    """Estimate of a parameter: value, standard error and 95 % interval; the error of a given value is 0.
 
     `note` states whether it was given, not detected, or not identified; the interval of a jitter that was not detected
     begins at 0. The error of a dead time that follows from the shortest interval alone is NaN: its law is not normal,
@@ -87,9 +87,11 @@ class Suspect:
     def __str__(self) -> str:
         size = "" if np.isnan(self.size) else f" {self.size:.3g}"
         size += "" if np.isnan(self.error) else f" ± {self.error:.2g}"
-        gain = "" if np.isnan(self.gain) else f", taking it in gains {self.gain:.1f} standard deviations of the misfit"
+        gain = (
+            "" if np.isnan(self.gain) else f", including it reduces the misfit by {self.gain:.1f} standard deviations"
+        )
         state = "in the result" if self.included else f"not in the result: {self.option}"
-        clear = f"{self.z:.1f} standard deviations{gain}" if self.z > 0.0 else f"no score of its own{gain}"
+        clear = f"{self.z:.1f} standard deviations{gain}" if self.z > 0.0 else f"no significant score{gain}"
         return f"{self.name}{size} ({clear}); {state}"
 
 
@@ -446,7 +448,7 @@ class _Run:
         return tuple(out)
 
     def first(self) -> Fitted:
-        """The plain model, from other starts and simulated streams until it converges with a significant pulse.
+        """The fit without effects, repeated with other simulated streams until it has a significant pulse.
 
         Where the phases have a bright window, a fit without a pulse is a bad one. Light without a pulse is tried first
         where they have none, and must not be rejected.
@@ -540,7 +542,7 @@ class _Run:
 
 
 def _growth(fitted: Fitted, drift: Drift | None) -> FloatArray:
-    """Factor (p,) on the errors of the light where parts of the recording scatter more than their errors."""
+    """Factor (p,) on the errors: of the light, scatter of the parts of the recording over their errors; else 1."""
     out = np.ones(fitted.model.size)
     if drift is None:
         return out
@@ -552,7 +554,7 @@ def _growth(fitted: Fitted, drift: Drift | None) -> FloatArray:
 
 
 def _estimates(fitted: Fitted, growth: FloatArray) -> dict[str, Estimate]:
-    """The estimates that are printed, written and drawn: moments and quantiles of draws of the parameters."""
+    """Estimates by name: the most probable values, with errors and intervals of draws; errors grow by `growth` (p,)."""
     model = fitted.model
     scale = growth[fitted.free]
     covariance = fitted.covariance * np.outer(scale, scale)
@@ -579,7 +581,10 @@ def _estimates(fitted: Fitted, growth: FloatArray) -> dict[str, Estimate]:
         if not withheld.keys().isdisjoint(needs):
             out[name] = Estimate(value, np.nan, np.nan, np.nan, next(withheld[own] for own in needs if own in withheld))
             return
-        parts = [sample, *(sample[rows] for rows in extremes)]  # the true angle may be a bound
+        parts = [
+            sample,
+            *(sample[rows] for rows in extremes),
+        ]  # near a bound of the angle the interval also covers the draws next to it
         ends = [np.quantile(part, (0.025, 0.975)) for part in parts]
         low, high = (0.0, np.quantile(sample, 0.95)) if limit else (np.min(ends), np.max(ends))
         out[name] = Estimate(value, float(((sample - value) ** 2).mean() ** 0.5), float(low), float(high), note)
@@ -627,7 +632,7 @@ def _estimates(fitted: Fitted, growth: FloatArray) -> dict[str, Estimate]:
 
 
 def _at_bounds(fitted: Fitted, covariance: FloatArray, drawn: FloatArray) -> list[NDArray[np.intp]]:
-    """For each bound of the angle within its 95 % interval, the twentieth of all draws that is next to it."""
+    """For each bound of the jitter angle within its 95 % interval: indices of the 5 % of draws next to that bound."""
     k, order = fitted.model.light + 1, np.argsort(drawn[:, fitted.model.light + 1])
     reach = 1.96 * float(np.sqrt(np.diag(covariance))[list(fitted.free).index(k)])
     most = float(fitted.model.bounded(np.where(np.arange(drawn.shape[1]) == k, np.pi, fitted.theta))[k])

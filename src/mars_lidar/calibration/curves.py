@@ -16,7 +16,10 @@ _RATIO = 4.0  # photons of the model's streams over those of the recording
 
 @dataclass(frozen=True, eq=False)
 class Curves:
-    """Counts of intervals (200,) and phases (256,), recorded and of the model, and residuals (60,) by age."""
+    """Histograms of intervals (200,) and phases (256,), of the recording and of the fitted model.
+
+    `recovery` (60,): residuals of the intervals near the dead time, in standard deviations; NaN below 3 counts.
+    """
 
     interval_edges_ns: FloatArray
     intervals: FloatArray

@@ -115,7 +115,10 @@ class Batch:
         return np.asarray(self.offset > 2.0 * max(1.0, self.ratio / 4.0))
 
     def one_count(self, model: Model, free: Index) -> FloatArray:
-        """Variance (free, free) of the light by one registration more or less, of kinds that may have none."""
+        """Covariance (free, free) that one registration more or less adds to background and signals.
+
+        It is the inverse square of the sum of the positive slopes; without it an amount of no counts has no error.
+        """
         rise = np.maximum(self.slope[: self.cells.phases, free], 0.0).sum(0)
         amount = (free == 0) | ((free < model.light) & (free % 2 == 1))
         return np.diag(amount / np.maximum(rise, 1.0 / model.scale(self.centre)[free]) ** 2)
@@ -227,11 +230,11 @@ class Fitted:
     unbounded: FloatArray  # (p,) before the bounds of the model
     batch: Batch  # cells and weights
     offset: FloatArray  # (c,) expected counts at the centre of the last streams
-    estimator: FloatArray  # (free, c): parameters less that centre, by counts less their offset
+    estimator: FloatArray  # (free, c): theta_free = centre + estimator @ (counts - offset)
     jacobian: FloatArray  # (c, free)
-    rest: FloatArray  # (c,) residual counts
+    rest: FloatArray  # (c,) recorded counts less those of the fitted model
     noise: FloatArray  # (streams, c) counts of fresh streams less expected ones, of the recording's exposure
-    fresh: FloatArray  # (streams, c) their residual counts
+    fresh: FloatArray  # (streams, c) residual counts of these streams, of mean 0
     misfit_z: float  # standard deviations of the misfit above that of fresh streams
     p_value: float
     converged: bool
@@ -268,7 +271,10 @@ def most_probable(model: Model, theta: FloatArray, covariance: FloatArray, free:
 
 
 def draws(model: Model, theta: FloatArray, covariance: FloatArray, free: Index) -> FloatArray:
-    """Draws (n, p) of that law within the bounds; if hardly any lies there, about the most probable parameters."""
+    """Draws (n, p) from the normal law of mean `theta` and covariance of the free parameters, within the bounds.
+
+    If fewer than 200 lie there, all draws are moved to the most probable parameters and clipped.
+    """
     root = root_of(covariance)
     rows = np.tile(theta, (Effort.draws, 1))
     rows[:, free] += np.random.default_rng(0).standard_normal((Effort.draws, len(free))) @ root.T
@@ -411,7 +417,7 @@ class Fit:
             there = np.r_[1.0, np.linalg.pinv(local) @ away]  # the place at which the law is used, and its noise there
             for _ in range(2):
                 scale = 1.0 / (1.0 / near.ratio + there @ inverse @ there)
-                # the square of the slope is too large by that of its noise
+                # the square of an estimated slope exceeds that of the slope by its variance
                 fisher = scale * (local.T @ information @ local - len(free) * inverse[1:, 1:])
                 cov = _inverse(fisher, prior, root)
                 solve = scale * cov @ local.T @ information
@@ -434,7 +440,7 @@ class Fit:
         if again and (np.abs((centre - theta)[free]) > _NEAR * sd).any():
             return self.finish(Guess(model, centre, root_of(cov), free), False, known)
         jacobian = law.slope[:, free] @ local
-        # a parameter at its bound does not absorb counts that would move it beyond
+        # a parameter at a bound cannot move further, so that the projection does not remove counts in its direction
         at_bound = ((model.bounded(mean + 1e-6 * (raw - mean)) == mean) & (raw != mean))[free]
         estimator = estimator - cov[:, at_bound] @ np.linalg.pinv(cov[np.ix_(at_bound, at_bound)]) @ estimator[at_bound]
         unmoved = recorded - near.offset - jacobian[:, at_bound] @ (mean - centre)[free[at_bound]]
@@ -497,7 +503,7 @@ def _curved(
 
 
 def _misfit(rest: FloatArray, fresh: FloatArray, law: Batch, near: Batch) -> tuple[float, float]:
-    """Weighted square of the residual counts, in standard deviations above that of fresh streams; its probability.
+    """Misfit r' W r of the residual counts r, in standard deviations above its mean over fresh streams; its p-value.
 
     The probability is that of two tests together: the weighted square of all cells, and the largest residual of the
     cumulated intervals, which is sensitive to a few missing or early intervals at the end of the dead time.

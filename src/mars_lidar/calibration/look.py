@@ -13,8 +13,8 @@ from mars_lidar.calibration.recording import FALSE_ALARM, Recording
 
 _CELLS = 2**20  # of the time axis: all of it where the stream is shorter
 _PER_PERIOD = 32  # cells of the given period: lines up to 16 times its frequency
-_SLOWEST = 0.3  # of the laser's frequency
-_STRONG = 40.0  # times the power of light without a period: one of 2^20 lines by chance at e^-40
+_SLOWEST = 0.3  # lowest frequency that is searched, relative to the laser's
+_STRONG = 40.0  # power of a line over that of Poisson noise: by chance with probability e^-40 in each line
 _CLEAR = 4.0  # times as strong as the line at the given period
 
 

@@ -64,7 +64,7 @@ class Effect:
 
 
 def all_carriers(after: float, delay_ns: float, dead_time_ns: float) -> float:
-    """Carriers of an avalanche, of which `after` outlive the dead time; fewer than one, as `Afterpulsing` requires."""
+    """Mean carriers of an avalanche, after * exp(t_d / delay), of which `after` outlive the dead time; at most 0.95."""
     return float(min(after * np.exp(min(dead_time_ns / delay_ns, 50.0)), _MOST_CARRIERS))
 
 
@@ -168,7 +168,7 @@ class Model:
 
     The light is in photons per period, times in ns. `width` is the standard deviation of the recorded pulse, jitter
     included, and the jitter an angle, in radians, whose sine and cosine times `width` are the standard deviations of
-    jitter and pulse. Counts are smooth functions of both where one width vanishes; of variances they would not be.
+    jitter and pulse. Counts are differentiable in both where one width is 0; in the variances they are not.
     Where the jitter is given (`jitter_given`) or the pulse is no Gaussian of unknown width, it is in ns. With a
     `waveform` there is no return, and the background is all light. With a `pulse` its shape is known, before any
     jitter, and `width` is not used.

@@ -14,7 +14,7 @@ from mars_lidar._base.cached import cached_property
 from mars_lidar._base.types import ArrayLike, FloatArray
 from mars_lidar.light.timestamps import Timestamps
 
-_ON_GRID = 0.02  # units: largest distance from the grid of a clock, for times in float64 over an hour
+_ON_GRID = 0.02  # units: distance from a tick of the clock that rounding of float64 times over an hour can cause
 FALSE_ALARM = 0.003  # probability that an effect, drift, misfit, other period or pulse is named where there is none
 LEAST_PHOTONS = 300  # of a recording or a part of it: with fewer, the counts of the cells do not have a normal law
 _OWN_UNITS = (2**15, 2**16)  # units of the period in our own PTU and Photon-HDF5, at most

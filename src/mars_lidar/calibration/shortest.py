@@ -26,7 +26,7 @@ from mars_lidar.statistics.cells import photons_per_bin
 
 @dataclass(frozen=True, eq=False)
 class Shortest:
-    """Expected numbers (laws, m) of intervals up to an end, for dead times (m,), and the recorded intervals.
+    """Law of the shortest interval: expected numbers (laws, m) of intervals up to an end, for dead times (m,).
 
     `recorded` (n,) intervals, sorted; `expected` the numbers up to an end; `unit` of the clock, and the `reach` of the
     jitter beyond the shortest interval, ns.
@@ -57,7 +57,10 @@ class Shortest:
         return self._interval((self.none[0] - self.none[1]).mean(0))
 
     def decides(self, error: float) -> bool:
-        """Whether the 95 % interval of an estimate by counts is much wider than this one, or narrower than possible."""
+        """Whether this law determines the dead time better than counts that give it a standard `error`, ns.
+
+        Their 95 % interval is over twice as wide as this one, or narrower than all short intervals allow.
+        """
         _, low, high = self.dead_time()
         return 3.92 * error > 2.0 * (high - low) or 3.92 * error < self.narrowest()
 

@@ -81,7 +81,7 @@ def light(t: FloatArray, model: Model, hold: float) -> FloatArray:
 
 
 def starts(fit: Fit, recording: Recording, model: Model, fixed: dict[str, float]) -> list[tuple[float, FloatArray]]:
-    """(misfit, parameters), the best first, for jitters from zero to the whole recorded width."""
+    """(misfit, parameters (p,)) for seven shares of jitter in the recorded width, sorted by the misfit."""
     names, k = model.names, model.light
     photons = min(recording.photons, fit.effort.first)
     t = recording.pieces[0][: 12 * photons]

@@ -14,7 +14,7 @@ from mars_lidar.calibration.model import Effect, Model, effects
 from mars_lidar.calibration.recording import FALSE_ALARM, LEAST_PHOTONS, Recording
 from mars_lidar.calibration.start import with_edge
 
-_MISFIT = 1e-3  # a fit is bad if its p-value is below this fraction of another's
+_MISFIT = 1e-3  # ratio of p-values of two fits of one model (at most 1) below which the lesser is a local minimum
 _PARTS = 16  # of a recording, for drift: a trend then has 14 degrees of freedom
 
 
@@ -44,7 +44,10 @@ def counts_of(fit: Fit, fitted: Fitted, model: Model, theta: FloatArray) -> tupl
 
 
 def _score(fit: Fit, fitted: Fitted, plain: FloatArray, model: Model, theta: FloatArray, effect: Effect) -> Score:
-    """Size of an effect along its change of the counts at `theta`, without the part that the fit absorbs."""
+    """Size of an effect by generalised least squares: residual counts along the change that it makes at `theta`.
+
+    From that change the part is removed that the other parameters of the fit can absorb.
+    """
     (made, share), size = counts_of(fit, fitted, model, theta), theta[fitted.model.size]
     change, noise, used = made - plain, (np.maximum(plain, 0.5) + np.maximum(made, 0.5)) * share, fitted.batch.common
     change = change * np.maximum(0.0, 1.0 - 2.0 * noise / np.maximum(change**2, 1e-300)) / max(float(size), 1e-9)
@@ -89,7 +92,7 @@ class Trial:
 
     @cached_property
     def final(self) -> Fitted | None:
-        """The fit judged by fresh streams; None if a detector cannot have all effects, or it did not converge."""
+        """The fit with the effect, tested by fresh streams; None if no detector can have it, or it did not converge."""
         fit, fitted, score, effect = self._shorter, self._fitted, self.score, self.effect
         model = replace(fitted.model, effects=(*fitted.model.effects, effect))
         size = effect.start[0]
@@ -117,13 +120,13 @@ class Trial:
 
     @property
     def refuted(self) -> bool:
-        """Whether the fit with an effect that has no size is rejected: it is not there."""
+        """Whether the effect is on or off, and the fit with it is rejected: it is not there."""
         return self.effect.onoff and self.final is not None and self.final.p_value < FALSE_ALARM
 
 
 @dataclass(frozen=True)
 class Named:
-    """An effect that a refit included: its score, and the decrease of the misfit in standard deviations."""
+    """An effect in the result: its score in standard deviations, and the decrease of the misfit, in its own."""
 
     effect: Effect
     z: float
@@ -140,7 +143,8 @@ def search(fit: Fit, fitted: Fitted) -> tuple[Fitted, list[Named], list[Trial]]:
         if better is None:
             break
         fitted, effect = better
-        included += [] if effect is None else [effect]
+        if effect is not None:
+            included.append(effect)
     return fitted, included, trials
 
 
@@ -192,7 +196,7 @@ class Drift:
     `times_s` (parts,) their middles; `values` (parts, p), and `errors` (p,) of each; `trend` (p,) change from start to
     end, in standard deviations; `p_value` (p,) of it or of the scatter, the smaller; `growth` (p,) factor of the
     scatter on the stated errors; `flicker` relative standard deviation of counts in times shorter than such a part,
-    `flicker_z` its standard deviations.
+    `flicker_z` its score in standard deviations.
     """
 
     names: tuple[str, ...]
@@ -231,7 +235,7 @@ def _above(z: float) -> float:
 
 
 def _flicker(fit: Fit, fitted: Fitted, counts: float = 8.0, windows: int = 64) -> tuple[float, float, float]:
-    """Relative scatter of counts by flickering light, its standard deviations, and the factor on their variance.
+    """Relative standard deviation of flickering light, its score, and the factor on the variance of the counts.
 
     Half the mean squared difference of counts in successive windows (Allan's variance, which a slow drift does not
     change), over that of streams of the fit: for longer windows, relative to the shortest. Afterpulses and other

@@ -13,6 +13,8 @@ export class Jitter {
     const width = Math.hypot(finest, system.jitter), bins = system.bins;
     const split = Math.ceil(PARTS_PER_SIGMA / (Math.max(width, 1e-9) * bins));
     this.split = 2 * Math.max(1, Math.floor(Math.min(split, Math.floor(MOST_PARTS / bins)) / 2));
+    // halved once, as Python does until records stand still, which they mostly do at once
+    if (2 * bins * this.split <= MOST_PARTS) this.split *= 2;
     this.parts = bins * this.split;
     const part = 1 / this.parts, reach = 8.5 * system.jitter;
     const first = Math.floor(-reach / part) - 1, last = Math.ceil(reach / part) + 1;

@@ -581,10 +581,8 @@ def _estimates(fitted: Fitted, growth: FloatArray) -> dict[str, Estimate]:
         if not withheld.keys().isdisjoint(needs):
             out[name] = Estimate(value, np.nan, np.nan, np.nan, next(withheld[own] for own in needs if own in withheld))
             return
-        parts = [
-            sample,
-            *(sample[rows] for rows in extremes),
-        ]  # near a bound of the angle the interval also covers the draws next to it
+        # near a bound of the angle the interval also covers the draws next to it
+        parts = [sample, *(sample[rows] for rows in extremes)]
         ends = [np.quantile(part, (0.025, 0.975)) for part in parts]
         low, high = (0.0, np.quantile(sample, 0.95)) if limit else (np.min(ends), np.max(ends))
         out[name] = Estimate(value, float(((sample - value) ** 2).mean() ** 0.5), float(low), float(high), note)

@@ -13,9 +13,8 @@ from mars_lidar.calibration.model import Model, Streams
 from mars_lidar.calibration.recording import Recording
 
 _PHASES = 2**15  # cells of the table from phase to class
-_OFF = (
-    0.5 + 1.0 / 64.0 / np.pi
-)  # units from a tick of the clock to an edge: half, and a part that no multiple of half a unit meets
+# units from a tick of the clock to an edge: half, and a part that no multiple of half a unit meets
+_OFF = 0.5 + 1.0 / 64.0 / np.pi
 _SHIFT = 0.37  # of such a cell: no edge lies where a clock ticks
 _CLASSES = 12  # parts of the period in the table, beside the stretches of bright light
 

@@ -276,9 +276,8 @@ def drift(fit: Fit, fitted: Fitted) -> Drift | None:
     parts = [part for part in recording.parts(number) if part.photons > 20]
     model, batch, light = fitted.model, fitted.batch, fitted.free[fitted.free < fitted.model.light]
     delays = light[(light > 0) & (light % 2 == 0)]
-    directions = np.zeros(
-        (model.size, 1 + delays.size)
-    )  # all light in proportion, and each delay; the rest is constant
+    # all light in proportion, and each delay; the rest is constant
+    directions = np.zeros((model.size, 1 + delays.size))
     amounts = np.setdiff1d(light, delays)
     directions[amounts, 0] = fitted.theta[amounts] / fitted.theta[amounts].sum()
     directions[delays, 1 + np.arange(delays.size)] = 1.0

@@ -122,8 +122,6 @@ class Waveform:
 
     def __init__(self, light: FloatArray, error: FloatArray, exposure: float, period_ns: float, filtered: bool) -> None:
         """Recorded light (parts,) and its standard errors by `exposure` periods."""
-        from scipy.special import ndtr
-
         # error**2 is that of one registration more, (light passes + 1) / passes**2
         passes = (light + np.sqrt(light**2 + 4.0 * error**2)) / (2.0 * error**2)
         self._variance, self._exposure = light / passes / light.sum() ** 2, exposure
@@ -135,9 +133,8 @@ class Waveform:
         self._shares = shares / shares.sum()
         self._jitters = _WIDEST_JITTER * period_ns * np.linspace(0.0, 1.0, 25) ** 2
         width, half = period_ns / light.size, light.size // 2
-        jitters = np.maximum(self._jitters, 1e-3 * width)[:, None]
         x = width * np.arange(-half - 1, light.size - half + 1)
-        integral = x * ndtr(x / jitters) + jitters * np.exp(-0.5 * (x / jitters) ** 2) / (2.0 * np.pi) ** 0.5
+        integral = np.array([Jitter(sigma_ns=max(sigma, 1e-3 * width)).integral(x) for sigma in self._jitters])
         kernel = np.roll(np.diff(integral, 2), -half, axis=1) / width  # from part to part: positive, symmetric
         blur = np.asarray(np.fft.rfft(kernel).real, np.float64)
         self._before = np.tile(self._shares, (self._jitters.size, 1))

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from mars_lidar import CountLaw, Flux, System, count_law
 from mars_lidar._base.types import FloatArray
-from mars_lidar.plot.style import COLOURS
+from mars_lidar.plot.colours import COLOURS
 from mars_lidar.statistics import ConvergenceError
 from mars_lidar.statistics.matched import matched_pmf, trusted
 from mars_lidar.statistics.pmf import Pmf, gaussian_pmf, total_variation

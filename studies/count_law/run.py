@@ -20,7 +20,7 @@ from matplotlib.patches import Patch
 from mars_lidar import CountLaw, Flux, System, count_law, registration_pdf
 from mars_lidar._base.types import FloatArray
 from mars_lidar.engines import ENGINES
-from mars_lidar.plot.style import COLOURS, INK, MUTED
+from mars_lidar.plot.colours import COLOURS, INK, MUTED
 from mars_lidar.statistics import photons_per_bin
 from mars_lidar.statistics.matched import matched_pmf
 from mars_lidar.statistics.pmf import Pmf, kl_divergence

@@ -25,7 +25,7 @@ from scipy.linalg import eig
 
 from mars_lidar import Flux, System, holding_time_covariance
 from mars_lidar._base.types import FloatArray
-from mars_lidar.plot.style import COLOURS, INK, MUTED
+from mars_lidar.plot.colours import COLOURS, INK, MUTED
 from mars_lidar.statistics import ConvergenceError, HoldingTimeCovariance, PhaseChain
 from mars_lidar.statistics.chain import Rearm
 from mars_lidar.statistics.renewal import lag_covariances, weighted_waits

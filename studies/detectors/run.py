@@ -26,7 +26,7 @@ from mars_lidar import (
 )
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.effects import AVALANCHE_EFFECTS
-from mars_lidar.plot.style import COLOURS, INK, MUTED
+from mars_lidar.plot.colours import COLOURS, INK, MUTED
 from mars_lidar.statistics import constant_light_rate, mean_histogram, photons_per_bin
 from mars_lidar.statistics.pmf import Pmf
 from studies import Facts, Request

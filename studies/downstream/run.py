@@ -24,7 +24,7 @@ from mars_lidar import Flux, System, cramer_rao, reconstruct
 from mars_lidar._base.files import beside
 from mars_lidar._base.imports import needed
 from mars_lidar._base.types import FloatArray
-from mars_lidar.plot.style import COLOURS
+from mars_lidar.plot.colours import COLOURS
 from studies import Facts, OtherRunsError, Request, Tell
 from studies.common.draw import legend_below, panels
 from studies.common.report import Row

@@ -17,8 +17,8 @@ from matplotlib.figure import Figure
 
 from mars_lidar import Afterpulsing, Calibration, Detector, Flux, Jitter, Timestamps, calibrate, simulate_timestamps
 from mars_lidar.calibration.curves import Realizations
+from mars_lidar.plot.colours import COLOURS, MUTED
 from mars_lidar.plot.stream import calibration_figure
-from mars_lidar.plot.style import COLOURS, MUTED
 from studies import Facts, Request, Tell
 from studies.common.draw import panels
 from studies.common.report import Row

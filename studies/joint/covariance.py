@@ -18,7 +18,7 @@ from scipy import stats
 
 from mars_lidar import JointLaw
 from mars_lidar._base.types import FloatArray
-from mars_lidar.plot.style import COLOURS, INK, MUTED
+from mars_lidar.plot.colours import COLOURS, INK, MUTED
 from mars_lidar.statistics import ConvergenceError
 from mars_lidar.statistics.joint import Pixel
 from studies import Facts, Request, Tell

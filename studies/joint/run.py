@@ -18,7 +18,7 @@ from scipy.stats import rankdata
 
 from mars_lidar._base.imports import needed
 from mars_lidar._base.types import FloatArray
-from mars_lidar.plot.style import COLOURS, INK, MISSING
+from mars_lidar.plot.colours import COLOURS, INK, MISSING
 from studies import Facts, Request
 from studies.common.draw import legend_below, panels
 from studies.common.report import Row, crossed, marked, picked

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from mars_lidar import Detector, Flux, GaussianPulse, System, reconstruct, simulate
-from mars_lidar.plot.style import COLOURS, INK
+from mars_lidar.plot.colours import COLOURS, INK
 from mars_lidar.reconstruction import MaximumLikelihood, returns_bound
 from studies import Facts, Request
 from studies.common.draw import legend_below, panels

@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from mars_lidar import Cube, Detector, Flux, Reconstruction, Scene, System, cramer_rao, reconstruct, simulate
+from mars_lidar.plot.colours import COLOURS, INK
 from mars_lidar.plot.reconstruction import reconstruction
-from mars_lidar.plot.style import COLOURS, INK
 from mars_lidar.reconstruction import METHODS, Flags, MaximumLikelihood, log_likelihood, window_error, window_weights
 from studies import Facts, Request
 from studies.common.draw import legend_below, panels

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from benchmarks.machine import load
 from mars_lidar import Flux, System, Table, simulate
 from mars_lidar.engines import ANY_SYSTEM, Engine, MarsEngine
-from mars_lidar.plot.style import COLOURS, INK, MUTED
+from mars_lidar.plot.colours import COLOURS, INK, MUTED
 from studies import Facts, Request, Tell
 from studies.common.draw import legend_below, panels
 from studies.common.report import Row

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 import mars_lidar as ml
 from mars_lidar import io, plot
 from mars_lidar.plot import views
-from mars_lidar.plot.style import COLOURS
+from mars_lidar.plot.colours import COLOURS
 
 SYSTEM = make_system(30.0, 300, 128)
 

@@ -14,8 +14,9 @@ from mars_lidar.instrument.system import System
 from mars_lidar.io.cube import Cube, as_cube
 from mars_lidar.io.layout import MEASURED
 from mars_lidar.light.flux import Flux
+from mars_lidar.plot.colours import COLOURS, COUNTS_MAP, DEPTH_MAP, HALO, MISSING, SHARE_MAP
 from mars_lidar.plot.pixel import draw_pixel, quiet_corner
-from mars_lidar.plot.style import COLOURS, DPI, MISSING, style
+from mars_lidar.plot.style import DPI, style
 from mars_lidar.plot.views import count_maps, depth_error_m, example_pixels, fitted, incident_rate, instrument
 
 if TYPE_CHECKING:
@@ -189,7 +190,7 @@ def pixel_histogram(
 
 
 @checked
-def map_image(values: NDArray[Any], label: str, *, cmap: str = "viridis") -> Figure:
+def map_image(values: NDArray[Any], label: str, *, cmap: str = DEPTH_MAP) -> Figure:
     """A map with a colour bar; NaN is grey.
 
     Parameters
@@ -247,24 +248,24 @@ def _draw_maps(
     known, fit = bool(np.isfinite(depth).any()), ", fitted" if cube.engine == MEASURED else ""
     limits = _limits(depth if known else peaks_m)
     if known:
-        _draw_map(axes[0], depth, "depth (m)", "viridis", limits, f"Depth{fit}")
+        _draw_map(axes[0], depth, "depth (m)", DEPTH_MAP, limits, f"Depth{fit}")
     else:  # a waveform has no depth: its background stands here
-        _draw_map(axes[0], cube.flux.background, "photons per period", "viridis", None, "Background")
+        _draw_map(axes[0], cube.flux.background, "photons per period", DEPTH_MAP, None, "Background")
     if cube.reflectivity is not None:
-        _draw_map(axes[1], cube.reflectivity, "reflectivity", "gray", None, "Reflectivity")
+        _draw_map(axes[1], cube.reflectivity, "reflectivity", SHARE_MAP, None, "Reflectivity")
     else:
         signal = cube.flux.signal
-        _draw_map(axes[1], signal, "photons per period", "gray", _limits(signal) if fit else None, f"Signal{fit}")
-    _draw_map(axes[2], totals, "registrations", "magma", _limits(totals), "Total counts")
+        _draw_map(axes[1], signal, "photons per period", SHARE_MAP, _limits(signal) if fit else None, f"Signal{fit}")
+    _draw_map(axes[2], totals, "registrations", COUNTS_MAP, _limits(totals), "Total counts")
     note = "Peak-bin depth"
     error = np.abs(depth_error_m(cube, peaks_m))
     if np.isfinite(error).any():
         median = _metres(float(np.nanmedian(error)))
         note = f"Peak bin, off {median}" if short else f"{note} (median {'distance' if fit else 'error'} {median})"
-    _draw_map(axes[3], peaks_m, "depth (m)", "viridis", limits, note)
+    _draw_map(axes[3], peaks_m, "depth (m)", DEPTH_MAP, limits, note)
     for ax in axes:
         for (y, x), colour in zip(pixels.values(), COLOURS, strict=False):
-            ax.plot(x, y, "o", ms=6, mfc="none", mec="white", mew=2.2)
+            ax.plot(x, y, "o", ms=6, mfc="none", mec=HALO, mew=2.2)
             ax.plot(x, y, "o", ms=6, mfc="none", mec=colour, mew=1.1)
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mars_lidar.instrument.system import System
 from mars_lidar.io.layout import MEASURED
-from mars_lidar.plot.style import MUTED, PREDICTION
+from mars_lidar.plot.colours import MUTED, PREDICTION
 from mars_lidar.plot.views import incident_rate, predicted_counts
 
 if TYPE_CHECKING:

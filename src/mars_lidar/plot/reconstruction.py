@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mars_lidar.plot.colours import DEPTH_MAP, SHARE_MAP
 from mars_lidar.plot.figures import _draw_map, _limits, _metres, pixel_histogram
 from mars_lidar.plot.style import DPI, style
 from mars_lidar.plot.views import depth_error_m
@@ -57,14 +58,14 @@ def reconstruction(cube: Cube, results: Mapping[str, Reconstruction]) -> Figure:
         figure = Figure(figsize=size, dpi=DPI, layout="constrained")
         axes: Any = figure.subplots(rows, columns, squeeze=False)
         if known:
-            _draw_map(axes[0, 0], depth, "depth (m)", "viridis", depth_limits, "Truth: depth")
+            _draw_map(axes[0, 0], depth, "depth (m)", DEPTH_MAP, depth_limits, "Truth: depth")
             axes[0, 1].set_axis_off()
-            _draw_map(axes[0, 2], truth, unit, "gray", share_limits, f"Truth: {what}")
+            _draw_map(axes[0, 2], truth, unit, SHARE_MAP, share_limits, f"Truth: {what}")
         for row, (name, returns) in zip(axes[int(known) + len(results) :], several.items(), strict=True):
             _draw_returns(row, name, returns)
         for row, (name, each) in zip(axes[int(known) : int(known) + len(results)], pick.items(), strict=True):
             title = name.replace("_", " ")
-            _draw_map(row[0], each["depth"], "depth (m)", "viridis", depth_limits, title)
+            _draw_map(row[0], each["depth"], "depth (m)", DEPTH_MAP, depth_limits, title)
             if known:
                 error = errors[name]
                 note = ""
@@ -74,7 +75,7 @@ def reconstruction(cube: Cube, results: Mapping[str, Reconstruction]) -> Figure:
                 _draw_map(row[1], 1e3 * error, "depth error (mm)", "RdBu_r", (-1e3 * scale, 1e3 * scale), note)
             own = known and _needs_own_scale(each["share"], truth)
             limits = _limits(each["share"]) if own else share_limits
-            _draw_map(row[-1], each["share"], unit, "gray", limits, f"{what}, a scale of its own" if own else what)
+            _draw_map(row[-1], each["share"], unit, SHARE_MAP, limits, f"{what}, a scale of its own" if own else what)
     return figure
 
 
@@ -84,12 +85,12 @@ def _draw_returns(row: Any, name: str, returns: Returns) -> None:
     most = depth.shape[-1]
     where = np.where(count > 1, 1.0, np.nan)
     farthest = np.take_along_axis(depth, np.maximum(count, 1)[..., None] - 1, axis=-1)[..., 0]
-    _draw_map(row[0], count.astype(np.float64), "returns", "viridis", (0.0, most), f"{name.replace('_', ' ')}: returns")
+    _draw_map(row[0], count.astype(np.float64), "returns", DEPTH_MAP, (0.0, most), f"{name.replace('_', ' ')}: returns")
     row[0].images[0].colorbar.set_ticks(range(most + 1))
     limits = _limits(np.stack([where * depth[..., 0], where * farthest])) if (count > 1).any() else (0.0, 1.0)
-    _draw_map(row[-1], where * farthest, "depth (m)", "viridis", limits, "farthest of several")
+    _draw_map(row[-1], where * farthest, "depth (m)", DEPTH_MAP, limits, "farthest of several")
     if len(row) > 2:
-        _draw_map(row[1], where * depth[..., 0], "depth (m)", "viridis", limits, "nearest of several")
+        _draw_map(row[1], where * depth[..., 0], "depth (m)", DEPTH_MAP, limits, "nearest of several")
 
 
 def _needs_own_scale(share: Any, truth: Any) -> bool:

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mars_lidar._base.types import FloatArray
-from mars_lidar.plot.style import COLOURS, DPI, INK, MUTED, style
+from mars_lidar.plot.colours import COLOURS, INK, MUTED
+from mars_lidar.plot.style import DPI, style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -21,11 +21,10 @@ namespace mars {
 
 // Whether the search is cheaper than the solver: `least` photons, at most, in the darkest window of a dead time.
 inline bool gaps_are_near(double photons, double least, double dead_time) {
-    constexpr double kMostArrivals = 1500.0;  // some 40 us
-    if (least > 8.0) return false;
+    if (least > kGapPhotonsMost) return false;
     double growth = 1.0 + least / 64.0;  // to the power of 64: e^least without libm
     for (int k = 0; k < 6; ++k) growth *= growth;
-    return photons * (std::floor(dead_time) + 1.0) * growth < kMostArrivals;
+    return photons * (std::floor(dead_time) + 1.0) * growth < kGapArrivalsMost;
 }
 
 // A uniform number on (0, 1) of 64 bits.
@@ -43,7 +42,7 @@ class GapSearch {
     template <class Place>
     double residual(double photons, double dead_time, const Pair<uint32_t>& key, const Place& place) {
         arrivals_.clear();
-        if (!(photons >= 1e-30)) return 0.0;
+        if (!(photons >= kDarkest)) return 0.0;
         // numbers of arrivals in successive periods are those of a Poisson process on the axis of expected photons
         double clock = 0.0, armed = 0.0;  // `armed`: the earliest arrival looked at; before any, t = 0
         uint32_t event = 0, choice = 0;

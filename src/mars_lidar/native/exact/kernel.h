@@ -5,6 +5,7 @@
 #include <atomic>
 #include <cstdint>
 
+#include "exact/constants.h"
 #include "instrument/job.h"
 #include "instrument/output.h"
 #include "lanes/levels.h"
@@ -12,8 +13,6 @@
 namespace mars {
 
 struct PulseTable;
-
-constexpr int64_t kMaxItems = 4096;  // of a block
 
 // Consecutive items of a job (item = realization * pixels + pixel).
 struct ExactBlock {

@@ -19,8 +19,6 @@ namespace mars {
 inline namespace MARS_LEVEL {
 namespace {
 
-constexpr int kPollEvery = 512;  // rounds between looks at `stop`
-
 // What lies between a registration and the log.
 enum class Stage { kPlain, kRecording, kAvalanches };  // the last: what avalanches leave behind, and recording
 
@@ -194,8 +192,6 @@ class LaneHost {
         }
         load_items();
     }
-
-    static constexpr int32_t kRested = 1 << 26;  // periods, 67 of the longest time constant
 
     const Rate recovery_;
     Time blind_until_ = Clock::all(Clock::idle());         // end of the last dead time

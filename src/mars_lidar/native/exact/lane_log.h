@@ -16,9 +16,6 @@
 namespace mars {
 inline namespace MARS_LEVEL {
 
-constexpr int kLog = 128;          // rows
-constexpr size_t kMostOwn = 2048;  // bins of histograms in the lanes' own rows: 64 or 128 KB for all lanes
-
 // `Phase` is the precision that times are told in. Which output is asked for matters only when the log is written, and
 // for whether times are kept, so one kernel serves them all.
 template <class Phase>
@@ -131,11 +128,10 @@ class LaneLog {
     // of the time of dim light.
     template <class Count>
     void clear_row(int64_t item) const {
-        constexpr size_t most = 4096, line = 64;
         Count* const cleared = row<Count>(item);
         const size_t bytes = bins_ * sizeof(Count);
         const char* const next = reinterpret_cast<const char*>(cleared) + bytes;
-        for (size_t k = 0; k < (bytes < most ? bytes : most); k += line) prefetch<1, 2>(next + k);
+        for (size_t k = 0; k < (bytes < kPrefetched ? bytes : kPrefetched); k += kCacheLine) prefetch<1, 2>(next + k);
         memset(cleared, 0, bytes);
     }
 

@@ -6,6 +6,7 @@
 #include <cstdint>
 #include <vector>
 
+#include "exact/constants.h"
 #include "instrument/job.h"
 #include "lanes/lanes.h"
 #include "lanes/levels.h"
@@ -18,7 +19,8 @@ namespace mars {
 // before it matters, and that only if it is within the dead time; none comes in 40 / Lambda periods with probability
 // e^-40, below the resolution of the draws.
 inline int64_t paralyzable_warm_up(double dead_time, double photons) {
-    return 1 + static_cast<int64_t>(std::ceil(photons * dead_time > 40.0 ? 40.0 / photons : dead_time));
+    return 1 +
+           static_cast<int64_t>(std::ceil(photons * dead_time > kWarmUpPhotons ? kWarmUpPhotons / photons : dead_time));
 }
 
 // Periods until a synchronous pixel is armed, from the start of a period at which it has been running for long.
@@ -53,7 +55,7 @@ class SynchronousStart {
 // of stationary.h blurs their phase by some 0.4 parts, which a pixel that remembers a hundred periods adds up to four.
 inline bool nearly_locked(double dead_time, double width, double signal) {
     const double part = dead_time - std::floor(dead_time), drift = std::min(part, 1.0 - part);
-    return signal > 4.0 && drift > 0.0 && drift < 0.25 * width;
+    return signal > kLockedSignal && drift > 0.0 && drift < kLockedDrift * width;
 }
 
 // Their state by the recursion of docs/theory_exposure.md, which does not blur; `photons` in quarters of its bins.
@@ -66,7 +68,7 @@ inline StationaryState locked_state(const std::vector<double>& photons, double d
     grid.shift = static_cast<int32_t>(place);
     grid.fraction = place - std::floor(place);
     grid.stationary = true;
-    grid.tolerance = 1e-7;
+    grid.tolerance = kLockedTolerance;
     const int32_t row = 0;
     const ExposureLight light{1, &one, &none, &row, photons.data(), n};
     std::vector<double> registrations(n);

@@ -77,7 +77,6 @@ struct FrameClock {
     MARS_INLINE static Time all(const Moment& time) { return {splat(time.frame), splat(time.phase)}; }
 
     // For releases of carriers (trap_lanes.h).
-    static constexpr int32_t kNever = INT32_MAX;
     static Moment never() { return {kNever, 0.0f}; }
     MARS_INLINE static Int period(const Time& time) { return time.frame; }
     MARS_INLINE static Time after(const Time& time, const Wait& wait) { return later(time, wait.whole, wait.fraction); }

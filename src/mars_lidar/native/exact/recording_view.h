@@ -58,7 +58,7 @@ MARS_INLINE Pair<Float> jitter_of(const JitterView& jitter, Pair<UInt> words) {
 
 // The exponential tail of some records: given that it is below the bound the word is uniform again.
 MARS_INLINE Float tail_of(const JitterView& jitter, UInt word) {
-    const Float stretched = minimum(to_float(as_int(word >> 1)) * jitter.tail_scale, splat(2147483520.0f));
+    const Float stretched = minimum(to_float(as_int(word >> 1)) * jitter.tail_scale, splat(kIntegerMost));
     const Float delay = exponential(as_uint(truncate(stretched)) << 1) * jitter.tail;
     return select(word < splat(jitter.tail_below), delay, splat(0.0f));
 }

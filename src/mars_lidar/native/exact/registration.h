@@ -14,10 +14,6 @@
 namespace mars {
 inline namespace MARS_LEVEL {
 
-// Energies nearer to 0 than this are drawn afresh: between two numbers of the lattice of 2^-24 of energies near 1.
-constexpr float kTail = 0x1p-14f - 0x1p-25f;
-constexpr int kEnergyShift = 16;  // the leading bits of an energy name its cell in the tables
-
 struct Return {
     Rate flux;
     Float offset;  // of this return from the first one, in [-1/2, 1/2) periods

@@ -11,8 +11,6 @@ namespace mars {
 inline namespace MARS_LEVEL {
 namespace {
 
-constexpr int kLead = 2;  // draws before the step that takes them: they fill the gaps in the chain of the steps
-
 // Plain memory behind the lanes, for changing single lanes.
 struct RateArray {
     float rate[kLanes], inverse[kLanes];

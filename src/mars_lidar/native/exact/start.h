@@ -49,7 +49,7 @@ class PulseLight {
         double bright = 0.0;  // signal photons
         for (int64_t k = 0; k < job_.returns; ++k) bright += std::max(0.0, signal_[k]);
         const bool locked = nearly_locked(job_.dead_time, shape_.equivalent_width(), bright);
-        std::vector<double> photons = locked ? on_grid(kFinest, kExposureParts) : on_grid(1024, 1);
+        std::vector<double> photons = locked ? on_grid(kStartPartsMost, kExposureParts) : on_grid(kStartParts, 1);
         if (job_.mode == DetectorMode::kGated)
             apply_gate(job_.gate, photons, [&](double a, double b) { return between(a, b); });
         return locked ? locked_state(photons, job_.dead_time) : StationaryState(photons, job_.dead_time);
@@ -69,15 +69,13 @@ class PulseLight {
     }
 
  private:
-    // Parts of a period at most. Bright pixels register within a fraction of the pulse's width, to which a locked one
-    // returns: on a grid for the pulse alone (S = 612, 2 parts a standard deviation) 4 % of them moved to the next bin.
-    static constexpr int64_t kFinest = 16384;
-
     // Photons in the `n` parts of a grid, or more where pulse or gate are narrow, each cut into `split`.
     std::vector<double> on_grid(int64_t n, int64_t split) const {
         const bool gated = job_.mode == DetectorMode::kGated;
-        const double parts = gated ? 28.0 : 7.0, narrowest = gated ? job_.gate.width / 64.0 : 1.0;
-        while (n < kFinest && static_cast<double>(n) * std::min(shape_.equivalent_width() / parts, narrowest) < 1.0)
+        const double parts = gated ? kGatedPulseParts : kPulseParts;
+        const double narrowest = gated ? job_.gate.width / kGateParts : 1.0;
+        while (n < kStartPartsMost &&
+               static_cast<double>(n) * std::min(shape_.equivalent_width() / parts, narrowest) < 1.0)
             n *= 2;
         n *= split;
         const double cells = static_cast<double>(n);
@@ -102,8 +100,9 @@ class PulseLight {
     const PulseShape& shape_;
     PulseView view_;
     double background_, total_;
-    double signal_[16], delay_[16];
-    double until_[16], centre_[16];  // photons of the background and the returns up to this one; its centre
+    double signal_[kMaxReturns], delay_[kMaxReturns];
+    double until_[kMaxReturns],
+        centre_[kMaxReturns];  // photons of the background and the returns up to this one; its centre
 };
 
 // Where the items of a block that starts warmed up begin.

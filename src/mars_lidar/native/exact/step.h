@@ -7,10 +7,6 @@
 namespace mars {
 inline namespace MARS_LEVEL {
 
-constexpr int kAhead = 8;                  // registrations drawn ahead
-constexpr int kMaxReturns = 16;            // echoes of one pixel
-constexpr int32_t kIdleFrame = 100000001;  // every exposure has ended; + kAhead (kForever + t_d) fits 32 bits
-
 // One registration of each lane.
 struct Registration {
     Time hit;   // in frames

@@ -111,7 +111,7 @@ class TrapLanes {
     // Avalanches up to and including the next one that leaves carriers: 1 + floor(E / p), E ~ Exp(1), exceeds k with
     // probability e^(-p k), that of k avalanches without a carrier.
     MARS_INLINE Int until_next(UInt word) const {
-        return truncate(minimum(exponential(word) * law_.avalanches_per_carrier, splat(2147483520.0f))) + 1;
+        return truncate(minimum(exponential(word) * law_.avalanches_per_carrier, splat(kIntegerMost))) + 1;
     }
 
     // Carriers of avalanches that leave some. Most leave one, whose delay comes from the same word that says so: below
@@ -122,7 +122,7 @@ class TrapLanes {
         countdown_ = select(lanes, until_next(words.first), countdown_);
         const Mask in_time = lanes & (clock_.period(time) < last_);  // and not after the exposure
         const Mask one = words.second < splat(law_.one_below);
-        const Float spread = minimum(to_float(as_int(words.second >> 1)) * law_.stretch, splat(2147483520.0f));
+        const Float spread = minimum(to_float(as_int(words.second >> 1)) * law_.stretch, splat(kIntegerMost));
         // spread in float32, which drops the low bits of the upper half: others in their place
         const Int upper = truncate(spread), lower = as_int((words.first >> 16) & 127u);
         const UInt word = as_uint(upper + select(upper >= (1 << 30), lower, splat(0))) << 1;
@@ -174,7 +174,7 @@ class TrapLanes {
         store(key[0], key0);
         store(key[1], key1);
         store(number, number_);
-        double delays[TrapLaw::kMostCarriers];
+        double delays[kMostCarriers];
         uint64_t left = lane_bits(lanes);
         for (int lane = 0; left; ++lane, left >>= 1) {
             if (!(left & 1)) continue;
@@ -192,7 +192,7 @@ class TrapLanes {
     MARS_INLINE void insert(Mask lanes, const Time& time, const Wait& wait, const Int& generation) {
         const Time release = clock_.after(time, wait);
         const Mask in_time = lanes & (clock_.period(release) < last_);
-        const Mask empty = in_time & (clock_.period(next_) == Clock::kNever);
+        const Mask empty = in_time & (clock_.period(next_) == kNever);
         next_ = earlier(empty, release, next_);
         generation_ = select(empty, generation + 1, generation_);
         const Mask more = except(in_time, empty);

@@ -12,6 +12,7 @@
 #include <cstdint>
 #include <vector>
 
+#include "exact/constants.h"
 #include "instrument/job.h"
 #include "instrument/twilight.h"
 
@@ -21,7 +22,6 @@ namespace mars {
 // their words are those of stage kStageTraps (the next one, and how many), + 1, + 2, ... (delays of several), + kFine.
 class TrapLaw {
  public:
-    static constexpr int kMostCarriers = 64;  // of one avalanche: more come with probability < 1e-89
     static constexpr uint32_t kFine = kMostCarriers + 1;
 
     explicit TrapLaw(const Job& job);

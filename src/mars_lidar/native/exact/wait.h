@@ -3,15 +3,11 @@
 // Whole periods and the fraction of an exponential wait are independent of each other. Both come from one word; what of
 // the fraction that word cannot resolve is drawn afresh (docs/theory_exact.md, section 2).
 #pragma once
-#include "exact/stages.h"
+#include "exact/constants.h"
 #include "numbers/word_stream.h"
 
 namespace mars {
 inline namespace MARS_LEVEL {
-
-constexpr float kLongWait = 256.0f;       // periods; `split_wait` resolves 2^-24 of one up to here
-constexpr float kForever = 134217728.0f;  // 2^27 periods: beyond every exposure
-constexpr float kDarkInverse = 1e30f;     // 1 / rate of a component without photons: every wait is kForever
 
 // Flux of one component at the lane's pixel. A component without photons has rate = 0 and inverse = kDarkInverse.
 struct Rate {

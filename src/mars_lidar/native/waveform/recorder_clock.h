@@ -147,7 +147,6 @@ struct PartClock {
     }
 
     // For releases of carriers (trap_lanes.h).
-    static constexpr int32_t kNever = INT32_MAX;
     static Moment never() { return {kNever, 0, 0.0f}; }
     MARS_INLINE static Int period(const Time& time) { return time.cycle; }
     MARS_INLINE Time after(const Time& time, const Wait& wait) const {

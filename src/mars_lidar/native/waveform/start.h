@@ -45,7 +45,7 @@ class WaveformLight {
 
     StationaryState state() const {
         const bool gated = job_.mode == DetectorMode::kGated;
-        std::vector<double> photons = on_grid(gated ? 64.0 / job_.gate.width : 0.0);
+        std::vector<double> photons = on_grid(gated ? kGateParts / job_.gate.width : 0.0);
         if (gated) apply_gate(job_.gate, photons, [&](double a, double b) { return between(a, b); });
         return StationaryState(photons, job_.dead_time);
     }
@@ -68,9 +68,9 @@ class WaveformLight {
         return std::min((static_cast<double>(j) + inside) / static_cast<double>(parts_), 1.0 - 0x1p-53);
     }
 
-    // Photons in at least 1024 parts, or `least` up to 16384; a whole number of them in each sample.
+    // Photons in at least kStartParts parts, or `least` up to kStartPartsMost; a whole number of them in each sample.
     std::vector<double> on_grid(double least) const {
-        const int64_t wanted = static_cast<int64_t>(std::min(std::max(least, 1024.0), 16384.0));
+        const int64_t wanted = static_cast<int64_t>(std::clamp(least, double{kStartParts}, double{kStartPartsMost}));
         const int64_t split = std::max<int64_t>(1, wanted / parts_);
         std::vector<double> photons;
         photons.reserve(parts_ * split);

@@ -94,7 +94,7 @@ def _top_level(tree: ast.Module) -> set[str]:
 
 
 def _strings(tree: ast.Module) -> set[str]:
-    """Names that a package has in texts: those that it looks up when they are first asked for."""
+    """Names that a module of the studies has in texts."""
     texts = (node.value for node in ast.walk(tree) if isinstance(node, ast.Constant))
     return {text for text in texts if isinstance(text, str) and text.isidentifier()}
 
@@ -106,7 +106,9 @@ def _index() -> tuple[dict[str, set[str]], dict[str, list[ast.ClassDef]]]:
     classes: dict[str, list[ast.ClassDef]] = {}
     for path, tree in _modules():
         parts = path.relative_to(PACKAGE).with_suffix("").parts
-        names = _top_level(tree) | (_strings(tree) if parts[-1] == "__init__" else set())
+        names = _top_level(tree)
+        if (stub := path.with_suffix(".pyi")).is_file():  # of a package whose modules are imported on first use
+            names |= _top_level(ast.parse(stub.read_text(encoding="utf-8")))
         modules[".".join(part for part in parts if part != "__init__")] = names
         for node in tree.body:
             if isinstance(node, ast.ClassDef):

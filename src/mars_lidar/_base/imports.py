@@ -6,8 +6,6 @@ calls into a higher layer: docs/architecture.md lists them, tests/test_package.p
 """
 
 import importlib
-import sys
-from collections.abc import Callable
 from importlib import import_module
 from typing import Any
 
@@ -16,24 +14,6 @@ def late(name: str) -> Any:
     """The object called ``module:name`` in this package, such as ``"io.rgbd:read_rgbd"``."""
     module, _, attribute = name.partition(":")
     return getattr(import_module(f"mars_lidar.{module}"), attribute)
-
-
-def names_of(package: str, homes: dict[str, str]) -> Callable[[str], Any]:
-    """The ``__getattr__`` of a package that imports the module of a name at its first use.
-
-    All names of a module enter the package together, because one of them may have the name of the module.
-    """
-
-    def get(name: str) -> Any:
-        if name not in homes:
-            raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        module = import_module(f"{package}.{homes[name]}")
-        for each, home in homes.items():
-            if home == homes[name]:
-                setattr(sys.modules[package], each, getattr(module, each))
-        return getattr(module, name)
-
-    return get
 
 
 class MissingLibraryError(ImportError, ValueError):

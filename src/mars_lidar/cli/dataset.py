@@ -157,6 +157,7 @@ def generate(
     Recipes: docs/generate.md. Clusters: docs/scale.md.
     """
     from mars_lidar import dataset
+    from mars_lidar.dataset.estimate import quick_advice
 
     if sum((begin, part is not None, finish, dry_run)) > 1:
         raise ValueError("--begin, --part, --finish and --dry-run are four steps: give one of them")
@@ -198,7 +199,7 @@ def generate(
         print_result(dataset.begin(recipe, out, **where))
         return None
     here = workers is None and scheduler is None and not (resume and out.exists())
-    if here and recipe is not None and (advice := str(dataset.quick_advice(recipe, threads))):
+    if here and recipe is not None and (advice := str(quick_advice(recipe, threads))):
         say(advice)
     with progress_bar("generating") as progress:
         print_result(dataset.generate(recipe, out, threads=threads, progress=progress, **where))

@@ -1,0 +1,12 @@
+from .forward import bin_photons as bin_photons
+from .forward import expected_histogram as expected_histogram
+from .inverse import LidarLikelihood as LidarLikelihood
+from .inverse import LidarPhysics as LidarPhysics
+from .likelihood import histogram_log_likelihood as histogram_log_likelihood
+from .ranges import Choice as Choice
+from .ranges import LogUniform as LogUniform
+from .ranges import SystemRange as SystemRange
+from .ranges import Uniform as Uniform
+from .stored import StoredDataset as StoredDataset
+from .stream import CubeStream as CubeStream
+from .tabulated import HistogramTable as HistogramTable

@@ -14,7 +14,8 @@ from mars_lidar._base.types import FloatArray, NDArray
 from mars_lidar.io.capture import CAPTURE_SUFFIXES, Capture, capture_in
 from mars_lidar.io.named_arrays import NamedArrays, open_arrays
 from mars_lidar.io.store import OnDisk, values
-from mars_lidar.light.transient import Rows, Transient
+from mars_lidar.light.transient import Rows
+from mars_lidar.light.transient import Transient as Transient
 
 SUFFIXES = (".npy", ".npz", ".h5", ".hdf5", ".mat")
 _NAME = "transient"

@@ -1,4 +1,4 @@
-"""One pixel's histogram: the whole period, and the return close up; colours are those of `style.py`."""
+"""One pixel's histogram: the whole period, and the return close up; colours are those of `colours.py`."""
 
 from __future__ import annotations
 

@@ -154,23 +154,6 @@ def test_no_photons_no_counts(cycles: int):
             assert len(ml.simulate_timestamps(nothing, view)) == 0
 
 
-def test_dark_pixels_among_bright_ones_stay_dark():
-    signal = np.zeros((8, 16))
-    signal[::2, ::3] = 50.0
-    cube = ml.simulate(ml.Flux(signal, 0.0, 30.0), system(cycles=300), realizations=2)
-    assert np.array_equal(cube.sum((0, -1)) > 0, signal > 0)
-
-
-def test_without_background_all_is_in_the_pulse():
-    cube = ml.simulate(ml.Flux(np.full((4, 8), 3.0), 0.0, 50.0), system())
-    assert cube[..., 160:240].sum() == cube.sum() > 0  # +-10 sigma
-    lobes = system(pulse=ml.SampledPulse(two_lobes(), 0.5, "first"), bins=200)
-    cube = ml.simulate(ml.Flux(np.full((4, 8), 3.0), 0.0, 20.0), lobes)
-    dark = lobes.pulse.bin_energy(20.0, 100.0, 200) == 0
-    assert dark.sum() > 60
-    assert not cube[..., dark].any()  # the gap of the pulse included
-
-
 def test_pulse_wraps_into_both_neighbouring_periods():
     """At delay 0 half of the pulse is at the end of the period; the same at any whole number of periods."""
     view = system(detector=dead(0.0))
@@ -179,27 +162,6 @@ def test_pulse_wraps_into_both_neighbouring_periods():
     require({"halves": stats.binomtest(int(early), int(early + late)).pvalue}, "wrapped pulse")
     for whole in (100.0, -100.0, 4200.0):
         assert np.array_equal(half, ml.simulate(ml.Flux(np.full((10, 10), 1.0), 0.0, whole), view))
-
-
-def test_dead_time_is_kept():
-    for t_d in (0.01, 0.6375, 1.0, 3.2, 40.9):
-        for start in ("armed", "stationary"):
-            view = system(detector=dead(t_d), start=start, cycles=3000)
-            times = ml.simulate_timestamps(ml.Flux([[3.0, 30.0]], 0.5, 20.0), view, seed=1)
-            for x in range(2):
-                gap = np.diff(times.pixel(0, x).times_ns) / 100.0
-                assert gap.min() >= t_d - 3e-7  # phases are float32
-                assert gap.min() < t_d + 0.6  # and it is not much more than that
-
-
-def test_counts_beyond_uint16():
-    """4000 registrations of one bin a period: uint16 would wrap after 17 of them."""
-    view = system(cycles=40, bins=1, detector=ml.Detector(dead_time_ns=0.0125))
-    assert view.histogram_dtype == np.uint32
-    count = ml.simulate(ml.Flux(0.0, 4000.0), view, seed=1).item()
-    x = 4000.0 * 0.000125
-    mean, variance = 160_000 / (1 + x), 160_000 / (1 + x) ** 3
-    require({"count": 2 * stats.norm.sf(abs(count - mean) / np.sqrt(variance))}, "uint32")
 
 
 def test_histogram_type_changes_where_a_bin_could_overflow():

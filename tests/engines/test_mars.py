@@ -14,10 +14,11 @@ from scipy import stats
 import mars_lidar as ml
 from mars_lidar import io
 from mars_lidar.engines import MarsEngine
-from mars_lidar.engines.synthesis import Matched, PartlyReplaced, Run, Streams, Tabulated
+from mars_lidar.engines.synthesis import PartlyReplaced, Run
 from mars_lidar.engines.table_reader import PixelEntries
 from mars_lidar.engines.tolerances import TOL
 from mars_lidar.statistics import exposure_moments
+from mars_lidar.statistics.matched import matched_pmf
 from mars_lidar.statistics.pmf import Pmf, total_variation
 from mars_lidar.statistics.tolerances import TOL as STATISTICS
 from mars_lidar.table import Table
@@ -64,18 +65,19 @@ def test_a_table_serves_other_numbers_of_cycles():
     assert np.array_equal(again[2], again[4])
 
 
-def test_the_gaussian_count_is_the_paper_s():
-    flux = ml.Flux(np.full((1, 8), 0.9), 0.4, 40.0)
-    for given in (None, table()):
-        cube = ml.simulate(flux, SYSTEM, engine="mars", table=given, count="gaussian", realizations=3000)
-        exact = ml.count_law(ml.Flux(0.9, 0.4, 40.0), SYSTEM)
-        n = np.arange(int(exact.mean + 12 * np.sqrt(exact.variance)))
-        from scipy.stats import norm
+def rounded_normal(mean: float, variance: float) -> np.ndarray:
+    """P(N = 0), P(N = 1), ... of a normal number that is rounded to a count."""
+    n = np.arange(int(mean + 12 * np.sqrt(variance)))
+    return np.diff(stats.norm.cdf((n + 0.5 - mean) / np.sqrt(variance)), prepend=0.0)
 
-        below = norm.cdf((n + 0.5 - exact.mean) / np.sqrt(exact.variance))
-        pmf = np.diff(below, prepend=0.0)
-        outcome = counts_against_law(cube.sum(-1).ravel(), pmf)
-        require({"count law": outcome}, f"gaussian count, {'table' if given else 'no table'}")
+
+@pytest.mark.parametrize("with_table", [True, False])
+def test_the_gaussian_count_is_the_paper_s(with_table: bool):
+    flux, lut = ml.Flux(np.full((1, 8), 0.9), 0.4, 40.0), table() if with_table else None
+    cube = ml.simulate(flux, SYSTEM, engine="mars", table=lut, count="gaussian", realizations=3000)
+    law = ml.count_law(ml.Flux(0.9, 0.4, 40.0), SYSTEM)
+    outcome = counts_against_law(cube.sum(-1).ravel(), rounded_normal(law.mean, law.variance))
+    require({"count law": outcome}, f"gaussian count, table {with_table}")
 
 
 def test_a_locked_pixel_needs_the_exact_count():
@@ -95,17 +97,6 @@ def test_a_locked_pixel_needs_the_exact_count():
 @pytest.mark.parametrize("with_table", [True, False])
 def test_any_part_alone_on_any_threads(with_table: bool):
     bits_do_not_depend(image(), SYSTEM, "mars", table=table() if with_table else None)
-
-
-def test_batches_do_not_show(monkeypatch: pytest.MonkeyPatch):
-    from mars_lidar.engines import synthesis as _synthesis
-    from mars_lidar.engines import table_reader as _table_reader
-
-    whole = ml.simulate(image(), SYSTEM, engine="mars", table=table(), realizations=5)
-    small = replace(TOL, batch_exposures=4, looked_up=11)
-    monkeypatch.setattr(_synthesis, "TOL", small)
-    monkeypatch.setattr(_table_reader, "TOL", small)
-    assert np.array_equal(whole, ml.simulate(image(), SYSTEM, engine="mars", table=table(), realizations=5))
 
 
 def test_pixels_beyond_the_table_are_evaluated_and_counted():
@@ -132,18 +123,6 @@ def test_nearest_and_bilinear():
     assert np.array_equal(plain, cubes["bilinear"])
     own = MarsEngine(table(), interpolation="nearest")
     assert np.array_equal(ml.simulate(image(), SYSTEM, engine=own, realizations=2), cubes["nearest"])
-
-
-def test_a_masked_image_works():
-    signal, delay = np.full((3, 4), 0.7), np.full((3, 4), 20.0)
-    signal[1], delay[1] = 0.0, np.nan
-    background = np.full((3, 4), 0.3)
-    background[2] = 0.0
-    signal[2, 0] = 0.0
-    flux = ml.Flux(signal, background, delay)
-    cube = ml.simulate(flux, SYSTEM, engine="mars", table=table(), realizations=20)
-    assert cube[:, :2].sum(-1).min() > 0
-    assert not cube[:, 2, 0].any()
 
 
 @pytest.mark.parametrize("engine", ["mars", "renewal"])
@@ -207,10 +186,6 @@ def test_memory_is_the_output_and_a_bounded_work_area():
 def test_bad_input(options, kind, message):
     made = {name: value() if value is table else value for name, value in options.items()}
     refused(message, ml.simulate, **{"flux": image(), "system": SYSTEM, "engine": "mars"} | made, error=kind)
-
-
-def test_there_are_no_times():
-    refused(r"'mars'.*histograms only", ml.simulate_timestamps, image(), SYSTEM, engine="mars")
 
 
 # Start-up of short armed exposures, which a table turns with the pulse
@@ -375,24 +350,10 @@ def test_between_the_entries_the_law_is_exact(start: str, cycles: int):
     assert max(errors) < 1e-4  # far below the aim: only the grid of the nearest entries is the table's
 
 
-def test_the_four_cumulants_would_not_do():
-    """What the exact laws are for: at some of these pixels the law of the cumulants is beyond the aim."""
-    lut, flux = bright_table(), doubted()
-    result = lut.lookup(flux)
-    from mars_lidar.statistics.matched import matched_pmf
-
-    off = [
-        total_variation(law, exact(flux, LOCKED_SYSTEM, k)) for k, law in enumerate(matched_pmf(result.cumulants)[:80])
-    ]
-    assert max(off) > AIM
-
-
 @pytest.mark.parametrize("start", ["armed", "stationary"])
 def test_at_the_entries_the_table_keeps_the_law(start: str):
     lut, system = bright_table(start), LOCKED_SYSTEM.replace(start=start)
     result = lut.at(np.repeat(lut.signal, lut.background.size), np.tile(lut.background, lut.signal.size))
-    from mars_lidar.statistics.matched import matched_pmf
-
     sure = result.trusted()
     assert np.array_equal(np.flatnonzero(~sure), lut.laws.row)
     assert lut.laws.row.size > 3
@@ -443,58 +404,33 @@ def test_counts_follow_the_exact_law():
 
 def test_usual_pixels_are_drawn_as_before():
     """No pixel in doubt: the same bits as from four cumulants; some in doubt: the others keep theirs."""
-    flux = doubted()
+    flux, lut = doubted(), bright_table()
     parts = zip(
         (flux.signal, flux.background, flux.delay_ns), ([3.0] * 5, [0.55] * 5, np.linspace(0, 90, 5)), strict=True
     )
     mixed = ml.Flux(*(np.concatenate([some[0, :5], others])[None] for some, others in parts))
-    lut = bright_table()
     sure = lut.at(mixed.signal, mixed.background, delay_ns=mixed.delay_ns).trusted()
     assert 0 < sure.sum() < 10
-    cubes = {
-        count: ml.simulate(mixed, LOCKED_SYSTEM, engine="mars", table=lut, count=count, realizations=50)
-        for count in ("exact", "matched")
-    }
-    assert np.array_equal(cubes["exact"][:, 0, sure], cubes["matched"][:, 0, sure])
-    assert not np.array_equal(cubes["exact"], cubes["matched"])
+    given = {"engine": "mars", "table": lut, "realizations": 50}
+    exact, matched = (ml.simulate(mixed, LOCKED_SYSTEM, count=count, **given) for count in ("exact", "matched"))
+    assert np.array_equal(exact[:, 0, sure], matched[:, 0, sure])
+    assert not np.array_equal(exact, matched)
 
 
-def test_parts_batches_and_threads_do_not_show(monkeypatch: pytest.MonkeyPatch):
-    from mars_lidar.engines import synthesis as _synthesis
-    from mars_lidar.engines import table_reader as _table_reader
-
-    flux = doubted(pixels=160)
-    whole = ml.simulate(flux, LOCKED_SYSTEM, engine="mars", table=bright_table(), realizations=3, threads=2)
+@pytest.mark.parametrize("light", ["usual", "doubted"])
+def test_batches_parts_and_threads_do_not_show(light: str, monkeypatch: pytest.MonkeyPatch):
+    flux, system, lut = image(), SYSTEM, table()
+    if light == "doubted":
+        flux, system, lut = doubted(pixels=160), LOCKED_SYSTEM, bright_table()
+    given = {"engine": "mars", "table": lut, "realizations": 3}
+    whole = ml.simulate(flux, system, threads=2, **given)
     small = replace(TOL, batch_exposures=4, looked_up=11)
-    monkeypatch.setattr(_synthesis, "TOL", small)
-    monkeypatch.setattr(_table_reader, "TOL", small)
+    for module in ("synthesis", "table_reader"):
+        monkeypatch.setattr(f"mars_lidar.engines.{module}.TOL", small)
     monkeypatch.setitem(vars(STATISTICS), "block", 3)
-    assert np.array_equal(
-        whole,
-        ml.simulate(flux, LOCKED_SYSTEM, engine="mars", table=bright_table(), realizations=3, threads=1),
-    )
-    index = np.arange(flux.signal.size).reshape(1, -1)[:, 7:20]
-    part = ml.simulate(
-        flux[:, 7:20],
-        LOCKED_SYSTEM,
-        engine="mars",
-        table=bright_table(),
-        realizations=3,
-        pixel_index=index,
-    )
-    assert np.array_equal(part, whole[:, :, 7:20])
-
-
-def test_a_part_of_mended_laws_is_mended_alike():
-    cumulants = np.tile([[40.0, 3.0, -0.7, 0.3]], (9, 1))
-    other = Tabulated.of([Pmf(7, np.array([0.5, 0.5]))], np.zeros(3, np.int64))
-    laws = PartlyReplaced(Matched(cumulants), np.array([1, 4, 8]), other)
-    streams = Streams(np.arange(9, dtype=np.uint32), 4, 0, 1, 1)
-    whole = laws.draw(streams)
-    assert (whole[:, [1, 4, 8]] < 9).all()
-    for some in (slice(0, 3), slice(3, 7), slice(2, 4), slice(5, 20)):
-        part = Streams(streams.pixel_index[some], 4, 0, 1, 1)
-        assert np.array_equal(laws.part(some).draw(part), whole[:, some])
+    assert np.array_equal(whole, ml.simulate(flux, system, threads=1, **given))
+    index = np.arange(flux.signal.size).reshape(flux.shape)[:, 2:6]
+    assert np.array_equal(whole[:, :, 2:6], ml.simulate(flux[:, 2:6], system, pixel_index=index, **given))
 
 
 def test_the_evaluation_can_be_stopped(monkeypatch: pytest.MonkeyPatch):
@@ -526,34 +462,22 @@ RENEWAL_SYSTEM = make_system(63.75, 400, 128, sigma_ns=1.5, start="stationary")
 @pytest.mark.parametrize("with_table", [True, False])
 def test_count_and_shape(with_table: bool):
     signal, background, delay = 1.3, 0.4, 31.234
-    table = Table.build(RENEWAL_SYSTEM, np.array([1.2, 1.3]), np.array([0.4, 0.5])) if with_table else None
+    lut = Table.build(RENEWAL_SYSTEM, np.array([1.2, 1.3]), np.array([0.4, 0.5])) if with_table else None
     flux = ml.Flux(np.full((2, 4), signal), background, delay)
-    cube = ml.simulate(flux, RENEWAL_SYSTEM, engine="renewal", table=table, realizations=1000).reshape(
-        -1, RENEWAL_SYSTEM.bins
-    )
+    cube = ml.simulate(flux, RENEWAL_SYSTEM, engine="renewal", table=lut, realizations=1000).reshape(-1, 128)
     renewal = ml.count_law(ml.Flux(signal, background, 0.0), RENEWAL_SYSTEM, "renewal")
-    mean, variance = float(renewal.mean), float(renewal.variance)
-    n = np.arange(int(mean + 12 * np.sqrt(variance)))
-    pmf = np.diff(stats.norm.cdf((n + 0.5 - mean) / np.sqrt(variance)), prepend=0.0)
+    pmf = rounded_normal(float(renewal.mean), float(renewal.variance))
     exact = exposure_moments(ml.Flux(signal, background, delay), RENEWAL_SYSTEM).histogram
     observed = cube.sum(0, dtype=np.int64)
-    require(
-        {
-            "count law": counts_against_law(cube.sum(1, dtype=np.int64), pmf),
-            "shape": goodness(observed, exact / exact.sum() * observed.sum()),
-        },
-        f"renewal, table {with_table}",
-    )
+    shape = goodness(observed, exact / exact.sum() * observed.sum())
+    require({"count law": counts_against_law(cube.sum(1, dtype=np.int64), pmf), "shape": shape}, f"table {with_table}")
 
 
 def test_waveforms_and_returns_are_solved_at_their_own_delays():
     pixel = ml.Flux(np.full((1, 4), 0.9), 0.2, 31.7)
     both = ml.Flux.multi(pixel, ml.Flux(np.full((1, 4), 0.5), 0.0, 77.7))
-    cube = ml.simulate(both, RENEWAL_SYSTEM, engine="renewal", realizations=1000).reshape(-1, RENEWAL_SYSTEM.bins)
-    parts = RENEWAL_SYSTEM.bins * 64
-    wave = 0.9 * RENEWAL_SYSTEM.pulse.bin_energy(31.7, 100.0, parts) + 0.5 * RENEWAL_SYSTEM.pulse.bin_energy(
-        77.7, 100.0, parts
-    )
-    exact = exposure_moments(ml.Flux(waveform=np.maximum(wave, 0.0), background=0.2), RENEWAL_SYSTEM).histogram
-    observed = cube.sum(0, dtype=np.int64)
+    observed = ml.simulate(both, RENEWAL_SYSTEM, engine="renewal", realizations=1000).sum((0, 1, 2), dtype=np.int64)
+    energy = RENEWAL_SYSTEM.pulse.bin_energy(np.array([31.7, 77.7]), 100.0, 128 * 64)
+    wave = np.maximum(np.array([0.9, 0.5]) @ energy, 0.0)
+    exact = exposure_moments(ml.Flux(waveform=wave, background=0.2), RENEWAL_SYSTEM).histogram
     require({"shape": goodness(observed, exact / exact.sum() * observed.sum())}, "renewal, two returns")

@@ -98,11 +98,6 @@ def test_stops_inside_a_long_pixel():
     assert time.process_time() - begun < 2.0
 
 
-def test_the_dead_time_is_ignored():
-    dead = Case(dead_time=50.0, stationary=True).histogram("poisson")
-    assert np.array_equal(dead, Case(dead_time=0.0).histogram("poisson"))
-
-
 # The Poisson sampler
 
 

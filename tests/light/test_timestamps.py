@@ -74,8 +74,9 @@ def test_parts_have_the_times_of_the_whole(system: ml.System, flux: ml.Flux):
     assert not np.array_equal(whole.times_ns[:50], ml.simulate_timestamps(flux, system, seed=4).times_ns[:50])
 
 
-def test_engine_without_times_says_so(system: ml.System, flux: ml.Flux):
-    refused("engine 'poisson' draws histograms only", ml.simulate_timestamps, flux, system, engine="poisson")
+@pytest.mark.parametrize("engine", ["poisson", "mars", "renewal", "feedback", "auto"])
+def test_engine_without_times_says_so(system: ml.System, flux: ml.Flux, engine: str):
+    refused(f"engine '{engine}' draws histograms only", ml.simulate_timestamps, flux, system, engine=engine)
 
 
 def test_units_are_nanoseconds(system: ml.System):

@@ -471,6 +471,9 @@ def test_window_error_is_that_of_the_raw_estimate():
         },
         "window estimate",
     )
+    energy = system.pulse.bin_energy(37.0, PERIOD, system.bins)  # of S and B as light without dead time
+    assert weights @ energy * system.cycles == pytest.approx(1.0, rel=1e-6)
+    assert weights.sum() * system.cycles == pytest.approx(0.0, abs=1e-9)
     independent = np.sqrt(weights**2 @ cube.mean(0))  # what Poisson bins would have
     assert abs(independent / deviation - 1) > 0.02
 

@@ -287,7 +287,7 @@ def window_weights(system: System, delay_ns: float) -> FloatArray:
     TypeError
         Not a `System`, or a delay that is not a number.
     ValueError
-        A delay that is not finite; a pulse too wide for a background window in the period.
+        A delay that is not finite; a pulse too wide for a background window in the period or outside of the gate.
 
     See Also
     --------
@@ -313,9 +313,13 @@ def window_weights(system: System, delay_ns: float) -> FloatArray:
     inside[np.arange(int(first), max(int(last), int(first) + 1)) % system.bins] = True
     inside &= share > 0
     outside = ~inside & (share > 0)
-    ratio = share[inside].sum() / share[outside].sum()
-    weights = np.where(inside, 1.0, np.where(outside, -ratio, 0.0))
-    return np.asarray(weights / (energy[inside].sum() * system.cycles), dtype=np.float64)
+    pulse = energy[inside].sum(), energy[outside].sum()
+    open_share = share[inside].sum(), share[outside].sum()
+    weights = np.where(inside, open_share[1], np.where(outside, -open_share[0], 0.0))
+    scale = pulse[0] * open_share[1] - pulse[1] * open_share[0]
+    if not scale > 0.0:
+        raise ValueError(f"the window at {tau:g} ns does not separate the pulse from the background of the open bins")
+    return np.asarray(weights / (scale * system.cycles), dtype=np.float64)
 
 
 def _pulse_bins(system: System, delay_ns: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

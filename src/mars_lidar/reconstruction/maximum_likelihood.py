@@ -289,23 +289,28 @@ def _scaled(information: FloatArray) -> FloatArray:
 def warn_of_bias(method: Method, system: System, estimates: Estimates) -> None:
     """Warn if one of three pixels has a systematic error above half a standard error.
 
-    The pixels are those with the most precise signal, the most precise delay and the median signal. There is no
-    warning if the mean histogram of the detector is not known, or takes too long to compute.
+    The pixels are those with the most precise signal, the most precise delay or background, and the median signal.
+    There is no warning if the method states no errors of the background, or if the mean histogram of the detector is
+    not known or takes too long to compute.
     """
-    if not isinstance(method, MaximumLikelihood) or method.returns > 1:
+    likelihood = isinstance(method, MaximumLikelihood)
+    other_error = estimates.delay_error if likelihood else estimates.background_error
+    if other_error is None or estimates.signal_error is None or estimates.returns is not None:
         return
-    assert estimates.signal_error is not None
-    assert estimates.delay_error is not None
     s, b, tau = estimates.signal, estimates.background, estimates.delay
-    stated = np.isfinite(estimates.signal_error) & np.isfinite(estimates.delay_error) & (s > 0) & (b > 0)
+    stated = np.isfinite(estimates.signal_error) & np.isfinite(other_error) & (s > 0) & (b > 0)
     usable = np.flatnonzero(stated & ((estimates.flags & np.uint8(Flags.EMPTY | Flags.NO_SIGNAL)) == 0))
     if usable.size == 0:
         return
     relative = estimates.signal_error[usable] / s[usable]
     median = np.argsort(s[usable])[usable.size // 2]
-    pixels = usable[np.unique([relative.argmin(), estimates.delay_error[usable].argmin(), median])]
+    pixels = usable[np.unique([relative.argmin(), other_error[usable].argmin(), median])]
     try:
-        bias, error = systematic_error(Flux(s[pixels], b[pixels], tau[pixels] * system.period_ns), system)
+        light = Flux(s[pixels], b[pixels], tau[pixels] * system.period_ns)
+        if likelihood:
+            bias, error = systematic_error(light, system)
+        else:
+            bias, error = _error_at_mean(method, light, system)
     except (ValueError, ArithmeticError):
         return
     ratio = np.nan_to_num(bias / error)
@@ -314,14 +319,28 @@ def warn_of_bias(method: Method, system: System, estimates: Estimates) -> None:
         return
     effects = [name for name in system.detector.effects if name not in LIGHT_EFFECTS]
     cause = " and ".join([f"the bins of {system.bin_ns:g} ns", *effects])
+    each = ", ".join(
+        f"{name} by {r:+.1f}" for name, r in zip(("signal", "background", "delay"), ratio[worst], strict=False)
+    )
     warnings.warn(
-        f"{cause} bias the estimates by maximum likelihood: signal by {ratio[worst, 0]:+.1f}, background by "
-        f"{ratio[worst, 1]:+.1f}, delay by {ratio[worst, 2]:+.1f} standard errors at S = {s[pixels[worst]]:.3g}, "
-        f"B = {b[pixels[worst]]:.3g} (mars_lidar.reconstruction.systematic_error); narrower bins "
+        f"{cause} bias the estimates by {method.name.replace('_', ' ')}: {each} standard errors at "
+        f"S = {s[pixels[worst]]:.3g}, B = {b[pixels[worst]]:.3g}"
+        f"{' (mars_lidar.reconstruction.systematic_error)' if likelihood else ''}; narrower bins "
         "reduce the part due to bins",
         UserWarning,
         stacklevel=4,
     )
+
+
+def _error_at_mean(method: Method, light: Flux, system: System) -> tuple[FloatArray, FloatArray]:
+    """Error of S and B (pixels, 2) that a method makes of the exact mean histograms of `light`, and standard errors."""
+    from mars_lidar.statistics import mean_histogram
+
+    mean = method.estimate(checked(mean_histogram(light, system.detected()), system, 1)[0])
+    assert mean.signal_error is not None
+    assert mean.background_error is not None
+    bias = np.stack([mean.signal - light.signal, mean.background - light.background], axis=-1)
+    return bias, np.stack([mean.signal_error, mean.background_error], axis=-1)
 
 
 def hypotheses(flux: Flux, system: System) -> FloatArray:

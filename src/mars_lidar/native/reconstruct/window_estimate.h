@@ -21,6 +21,11 @@ struct WindowResult {
     double signal = NAN, background = NAN, delay = NAN, signal_error = NAN, background_error = NAN;
 };
 
+// Light of the window or of the rest: bins of background, and energy of the pulse.
+struct WindowLight {
+    double share = 0.0, pulse = 0.0;
+};
+
 // The estimates of one histogram after another, with the pulse's energy in bins worked out once. The grid of delays has
 // three steps to the pulse's width.
 class WindowEstimate {
@@ -31,6 +36,8 @@ class WindowEstimate {
         step_ = pulse.step;
         energy_ = std::move(pulse.energy);
         weight_.resize(energy_.size());
+        pulse_.resize(r_.bins);
+        core_.resize(r_.bins);
         for (int64_t j = 0; j < r_.bins; ++j) share_.push_back(r_.share(j));
     }
 
@@ -116,29 +123,33 @@ class WindowEstimate {
         return r_.share(j) > 0.0 && (!passes || passes->armed[j] + passes->rearmed[j] > 0.0);
     }
 
-    // Background from outside of the window, signal from inside of it less that background (R16).
+    // Signal and background from the rates inside and outside of the window, each of which has light of both (R16).
     WindowResult window(const double* rate, const ArmedPasses* passes, double delay) {
-        double inside = 0.0, shares = 0.0, energy = 0.0, beside = passes ? passes->total : HUGE_VAL;
-        for_pulse_bins(r_, delay, r_.core_low, r_.core_high, [&](int64_t, int64_t j, double s, double) {
-            if (passes) beside -= passes->count[j];
-            if (!used(passes, j)) return;
-            inside += rate[j];
-            shares += r_.share(j);
-            energy += s;
-        });
-        const auto [all, all_shares] = sums_of<2>(r_.bins, [&](int64_t j) {
-            return used(passes, j) ? std::array<double, 2>{rate[j], share_[j]} : std::array<double, 2>{};
-        });
+        std::fill(pulse_.begin(), pulse_.end(), 0.0);
+        std::fill(core_.begin(), core_.end(), 0);
+        for_pulse_bins(r_, delay, r_.pulse.low, r_.pulse.low + r_.pulse.span(),
+                       [&](int64_t, int64_t j, double s, double) { pulse_[j] = s; });
+        for_pulse_bins(r_, delay, r_.core_low, r_.core_high, [&](int64_t, int64_t j, double, double) { core_[j] = 1; });
+        in_ = out_ = {};
+        double light_in = 0.0, light_out = 0.0;
+        for (int64_t j = 0; j < r_.bins; ++j) {
+            if (!used(passes, j)) continue;
+            WindowLight& part = core_[j] ? in_ : out_;
+            (core_[j] ? light_in : light_out) += rate[j];
+            part.share += share_[j];
+            part.pulse += pulse_[j];
+        }
         WindowResult out;
         out.delay = delay;
-        outside_ = all_shares - shares;
-        shares_ = shares;
-        energy_inside_ = energy;
-        if (!(energy > 1e-6)) return out;
-        const bool flat_known = outside_ > 0.5;
-        const double flat = flat_known && beside > 0.0 ? std::max(all - inside, 0.0) / outside_ : 0.0;  // else rounding
+        determinant_ = in_.pulse * out_.share - out_.pulse * in_.share;
+        if (!(in_.pulse > 1e-6)) return out;
+        const bool flat_known = out_.share > 0.5 && determinant_ > 0.0;
+        const double flat =
+            flat_known ? std::max(in_.pulse * light_out - out_.pulse * light_in, 0.0) / determinant_ : 0.0;
         if (flat_known) out.background = flat * static_cast<double>(r_.bins);
-        out.signal = std::max(inside - flat * shares, 0.0) / energy;
+        const double signal = flat > 0.0 ? (out_.share * light_in - in_.share * light_out) / determinant_
+                                         : light_in / in_.pulse;
+        out.signal = std::max(signal, 0.0);
         return out;
     }
 
@@ -155,26 +166,28 @@ class WindowEstimate {
     void set_errors(const ArmedPasses& passes, WindowResult& out) const {
         if (!std::isfinite(out.background)) return;
         const double flat = out.background / static_cast<double>(r_.bins);
-        const auto variance = [&](int64_t j, double light) {
-            return used(&passes, j) ? variance_of(passes, j, flat * share_[j] + light) : 0.0;
+        double inside = 0.0, outside = 0.0, beside = 0.0;
+        for (int64_t j = 0; j < r_.bins; ++j) {
+            if (!core_[j]) beside += passes.count[j];
+            if (used(&passes, j))
+                (core_[j] ? inside : outside) += variance_of(passes, j, flat * share_[j] + out.signal * pulse_[j]);
+        }
+        const auto error = [&](double of_in, double of_out) {
+            return std::sqrt(of_in * of_in * inside + of_out * of_out * outside) / determinant_;
         };
-        double inside = 0.0, background = 0.0;
-        for_pulse_bins(r_, out.delay, r_.core_low, r_.core_high, [&](int64_t, int64_t j, double s, double) {
-            inside += variance(j, out.signal * s);
-            background -= variance(j, 0.0);
-        });
-        background += sums_of<1>(r_.bins, [&](int64_t j) { return std::array<double, 1>{variance(j, 0.0)}; })[0];
-        background = std::max(background, 0.0) / (outside_ * outside_);
-        if (background > 0.0) out.background_error = static_cast<double>(r_.bins) * std::sqrt(background);
-        out.signal_error = std::sqrt(inside + shares_ * shares_ * background) / energy_inside_;
+        if (beside > 0.0) out.background_error = static_cast<double>(r_.bins) * error(out_.pulse, in_.pulse);
+        out.signal_error = error(out_.share, in_.share);
     }
 
     const HistogramRecord& r_;
     Locator locator_;
     int64_t first_ = 0, step_ = 1;
     std::vector<double> energy_, weight_, round_, share_;
-    double outside_ = 0.0, shares_ = 0.0,
-           energy_inside_ = 0.0;  // of the last window: bins outside and inside, pulse inside
+    // Of the last window: pulse of each bin, whether the window has the bin, sums of both sides, and their determinant.
+    std::vector<double> pulse_;
+    std::vector<char> core_;
+    WindowLight in_, out_;
+    double determinant_ = 0.0;
 };
 
 }  // namespace mars

@@ -15,7 +15,6 @@ import mars_lidar as ml
 from mars_lidar import io
 from mars_lidar._base import progress as bars
 from mars_lidar._base.tolerances import TOL
-from mars_lidar.cli.simulate import each_ns
 from mars_lidar.io.simulated_file import _Probe, advice
 from studies.compare.comparison import compare
 from tests.harness.command import ok, run
@@ -171,13 +170,6 @@ def test_a_wrong_keyword_names_the_argument_that_was_meant(call, message):
 def test_the_package_runs_as_a_module():
     done = subprocess.run([sys.executable, "-m", "mars_lidar", "--version"], capture_output=True, text=True)
     assert done.stdout.strip() == f"mars-lidar {ml.__version__}"
-
-
-def test_small_words():
-    from mars_lidar.cli.dataset import files
-
-    assert [each_ns(3.0), each_ns(3020.0)] == ["3 ns", "3.02 µs"]
-    assert [files(0), files(1), files(2)] == ["nothing", "1 file", "2 files"]
 
 
 LONG = SYSTEM.replace(cycles=10_000_000)

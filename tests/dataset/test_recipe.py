@@ -16,7 +16,7 @@ import mars_lidar as ml
 from mars_lidar import io
 from mars_lidar._base.yaml import read_yaml
 from mars_lidar.dataset import DatasetRecipe, json_schema, read_view
-from mars_lidar.dataset.arrays import count_samples, fitting, sample_parts
+from mars_lidar.dataset.arrays import count_samples, sample_parts
 from mars_lidar.dataset.recipe import KINDS
 from tests.harness.command import ok, run
 
@@ -109,15 +109,6 @@ def test_systems_must_agree_on_their_bins(recipe):
     refused("same number of bins, got 32 and 64", DatasetRecipe.from_dict, recipe)
     recipe["systems"] = [SYSTEM, SYSTEM]
     refused("same as an earlier system", DatasetRecipe.from_dict, recipe)
-
-
-def test_blocks_are_runs_of_the_array():
-    whole = (10, 3, 64, 64, 1024)
-    assert fitting(whole, (1, 1, 1, 1, 1024), 2, 8 * 2**20) == (1, 1, 64, 64, 1024)
-    assert fitting(whole, (1, 1, 64, 64, 1024), 2, 64 * 2**20) == (2, 3, 64, 64, 1024)
-    assert fitting(whole, (1, 1, 1, 1, 1024), 2, 3 * 2**20) == (1, 1, 22, 64, 1024)
-    assert fitting(whole, (1, 1, 1, 1, 1024), 2, 1000) == (1, 1, 1, 1, 1024)
-    assert fitting((1, 1, 4, 100, 1024), (1, 1, 1, 1, 1024), 2, 60_000) == (1, 1, 1, 25, 1024)
 
 
 def test_scalars_are_those_of_yaml_1_2(tmp_path):

@@ -14,14 +14,14 @@ from mars_lidar._base.types import FloatArray
 from tests.domain.systems import PERIOD_NS, Case
 
 ABLE = {"detection_efficiency", "dark_count_hz", "electronics_dead_time_ns", "twilight_ns"}
-ABLE |= {"max_events_per_period", "max_events_per_exposure"}
+ABLE |= {"max_events_per_period", "max_events_per_exposure", "recovery_ns"}
 
 
 def warm_up(case: Case) -> float:
     """Periods simulated before the exposure for a stationary start, so that the start-up transient decays."""
     if case.system.start == "armed" or case.system.dead_time_periods == 0.0:
         return 0.0
-    return 150.0 * (case.system.dead_time_periods + 1.0)
+    return 150.0 * (case.system.dead_time_periods + 1.0) + 20.0 * case.system.detector.recovery_ns / PERIOD_NS
 
 
 def arrivals(case: Case) -> float:
@@ -36,6 +36,13 @@ def able(case: Case) -> bool:
 
 def counts(case: Case, exposures: int, seed: int) -> NDArray[np.int64]:
     """Histograms (exposures, bins)."""
+    owner, time = registered(case, exposures, seed)
+    bins = np.minimum((time % 1.0 * case.system.bins).astype(np.int64), case.system.bins - 1)
+    return np.bincount(owner * case.system.bins + bins, minlength=exposures * case.system.bins).reshape(exposures, -1)
+
+
+def registered(case: Case, exposures: int, seed: int) -> tuple[NDArray[np.int64], FloatArray]:
+    """Owner and time (periods) of what is recorded, in no order."""
     random = np.random.default_rng([seed, 77])
     system, detector = case.system, case.system.detector
     early = np.ceil(warm_up(case))
@@ -50,9 +57,7 @@ def counts(case: Case, exposures: int, seed: int) -> NDArray[np.int64]:
     order = np.lexsort((time, owner))
     owner, time = owner[order], time[order]
     first = np.searchsorted(owner, np.arange(exposures + 1))
-    taken_owner, taken = _registered(case, first, time)
-    bins = np.minimum((taken % 1.0 * system.bins).astype(np.int64), system.bins - 1)
-    return np.bincount(taken_owner * system.bins + bins, minlength=exposures * system.bins).reshape(exposures, -1)
+    return _recorded(case, first, time, random)
 
 
 def _arrivals(
@@ -92,11 +97,13 @@ def _pulse(case: Case, number: int, random: np.random.Generator) -> FloatArray:
     return np.asarray(np.interp(random.random(number) * below[-1], below, edges) / PERIOD_NS)
 
 
-def _registered(case: Case, first: NDArray[np.int64], time: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
+def _recorded(
+    case: Case, first: NDArray[np.int64], time: FloatArray, random: np.random.Generator
+) -> tuple[NDArray[np.int64], FloatArray]:
     """Owner and time of what is recorded in the exposure, arrival by arrival, all exposures side by side."""
     detector, dead, cycles = case.system.detector, case.system.dead_time_periods, case.system.cycles
     exposures = first.size - 1
-    twilight = detector.twilight_ns / PERIOD_NS
+    twilight, recovery = detector.twilight_ns / PERIOD_NS, detector.recovery_ns / PERIOD_NS
     electronics = case.system.electronics_dead_time_periods
     per_period, per_exposure = (
         np.inf if most is None else most for most in (detector.max_events_per_period, detector.max_events_per_exposure)
@@ -109,6 +116,9 @@ def _registered(case: Case, first: NDArray[np.int64], time: FloatArray) -> tuple
         here = here[first[here] + step < first[here + 1]]
         t = time[first[here] + step]
         fires = t >= ready[here] - twilight
+        if recovery:  # a photon within the twilight fires as the dead time ends
+            insensitive = np.exp(-np.maximum(t - ready[here], 0.0) / recovery)
+            fires &= (t < ready[here]) | (random.random(t.size) >= insensitive)
         t = np.maximum(t, np.where(fires, ready[here], t)) if twilight else t
         if detector.mode == "paralyzable":
             ready[here] = t + dead

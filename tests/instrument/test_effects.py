@@ -276,23 +276,6 @@ def test_bits_do_not_depend_on_level_threads_and_parts(name: str, mode: str, wav
     bits_do_not_depend(flux, system)
 
 
-def test_off_is_the_ideal_pixel():
-    off = Detector(
-        dead_time_ns=17.0,
-        detection_efficiency=1.0,
-        dark_count_hz=0.0,
-        electronics_dead_time_ns=0.0,
-        jitter=None,
-        code_density=None,
-        max_events_per_period=None,
-        max_events_per_exposure=None,
-    )
-    assert off == Detector(dead_time_ns=17.0)
-    assert off.to_dict() == {"dead_time_ns": 17.0, "mode": "nonparalyzable"}
-    assert off.effects == ()
-    assert task_of(case_of(off), 1).system.detector is off
-
-
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("wave", [False, True])
 def test_a_recorder_that_changes_nothing_gives_the_plain_bits(mode: str, wave: bool):

@@ -17,15 +17,14 @@ from mars_lidar import statistics
 from mars_lidar.engines import ENGINES
 from mars_lidar.engines.engine import Engine, Records, Task
 from mars_lidar.instrument.effects import EFFECTS
+from tests.domain import simulator
+from tests.domain.systems import Case as Pixel
 
 BOTH = ["exact", "sequential"]
 
 
 class EveryArrival(Engine):
-    """The definition in double precision: all arrivals of an armed pixel in order, each with a probability of its own.
-
-    One return or a waveform, no effect but the recovery; a gate that stays.
-    """
+    """The definition in double precision: the simulator of the sweep, for one return or a waveform."""
 
     name = "every arrival"
     description = "an oracle of NumPy"
@@ -46,38 +45,18 @@ class EveryArrival(Engine):
         return Records(offsets, time, np.floor(time).astype(np.int32), place)
 
     def _registered(self, task: Task) -> tuple[Any, Any]:
-        pixels = task.pixel_index.size
-        parts = [self._item(task, k % pixels, task.seed * 10**6 + k) for k in range(task.items)]
-        return np.repeat(np.arange(task.items), [len(p) for p in parts]), np.concatenate(parts)
-
-    def _item(self, task: Task, pixel: int, seed: int) -> Any:
-        random, system, flux = np.random.default_rng(seed), task.system, task.flux
-        cycles, period = system.cycles, system.period_ns
-        times = [random.random(random.poisson(flux.background.flat[pixel] * cycles)) * cycles]
-        if flux.waveform is not None:
-            wave = flux.waveform.reshape(pixels_of(flux), -1)[pixel]
-            part = np.repeat(np.arange(wave.size), random.poisson(wave * cycles))
-            times.append(random.integers(cycles, size=part.size) + (part + random.random(part.size)) / wave.size)
-        else:
-            number = random.poisson(flux.signal.flat[pixel] * cycles)
-            assert isinstance(system.pulse, ml.GaussianPulse)
-            phase = flux.delay_ns.flat[pixel] / period + random.normal(size=number) * system.pulse.sigma_ns / period
-            times.append(random.integers(cycles, size=number) + phase % 1.0)
-        start, _, width = system.detector.gate_periods(period)
-        arrivals = np.sort(np.concatenate(times))
-        arrivals = arrivals[(arrivals - start) % 1.0 < width]
-        dead, recovery = system.dead_time_periods, system.detector.recovery_ns / period
-        asked = random.random(arrivals.size)
-        recorded, ready = [], -np.inf
-        for t, u in zip(arrivals, asked, strict=True):
-            if t >= ready and u >= np.exp(-(t - ready) / recovery):
-                recorded.append(t)
-                ready = t + dead
-        return np.array(recorded)
-
-
-def pixels_of(flux: ml.Flux) -> int:
-    return flux.shape[0] * flux.shape[1]
+        """In blocks of 64 items, so that the first are the same however many follow."""
+        light = task.flux.signal.flat[0], task.flux.delay_ns.flat[0] / PERIOD_NS, task.flux.background.flat[0]
+        wave = None if task.flux.waveform is None else task.flux.waveform.reshape(-1, task.flux.waveform.shape[-1])[0]
+        pixel = Pixel("by hand", "any", task.system, light[:1], light[1:2], light[2], wave)
+        blocks = [
+            (first, *simulator.registered(pixel, min(64, task.items - first), task.seed * 10**6 + first))
+            for first in range(0, task.items, 64)
+        ]
+        item = np.concatenate([first + owner for first, owner, _ in blocks])
+        time = np.concatenate([times for *_, times in blocks])
+        order = np.lexsort((time, item))
+        return item[order], time[order]
 
 
 ARMED = [

@@ -177,11 +177,6 @@ def test_most_registrations_of_a_bin(system: ml.System, dead: float, bins: int, 
     assert view.histogram_dtype == (np.uint16 if most <= 65535 else np.uint32)
 
 
-def test_type_depends_on_the_system_only(system: ml.System):
-    assert system.histogram_dtype == np.uint16
-    assert system.replace(detector=ml.Detector(dead_time_ns=0.0)).histogram_dtype == np.uint32
-
-
 def test_bound_on_a_bin_is_never_exceeded():
     """Blinding light: the bound is reached, not passed."""
     for dead, bins in ((30.0, 7), (12.5, 8), (0.7, 100), (250.0, 4)):
@@ -346,10 +341,6 @@ def test_centroid_is_the_mean_of_a_compact_pulse():
 def test_scale_and_type_of_the_record_do_not_matter(values):
     expected = PULSES["peak"].bin_energy(20.0, 100.0, 50)
     assert ml.SampledPulse(values, 2.0).bin_energy(20.0, 100.0, 50) == pytest.approx(expected, abs=1e-12)
-
-
-def test_bool_records_are_taken_as_numbers():
-    assert ml.SampledPulse([False, True], 1.0).support_ns() == (-0.5, 0.5)
 
 
 def test_empty_ends_are_left_out():

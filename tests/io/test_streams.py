@@ -1,7 +1,6 @@
 """Photon streams on disk: what comes back, what the libraries of others see, and damaged files."""
 
 import importlib.util
-import json
 from pathlib import Path
 
 import h5py
@@ -262,13 +261,6 @@ def test_a_layout_from_the_future_is_refused(tmp_path, monkeypatch):
     photons().save(tmp_path / "photons.npz")
     monkeypatch.undo()
     refused(r"photons\.npz.*layout version 2; version 1 can be read", ml.Timestamps.load, tmp_path / "photons.npz")
-
-
-def test_the_info_of_timestamps_is_plain_data():
-    times = photons()
-    assert json.loads(json.dumps(times.info)) == times.info
-    assert times.pixel(1, 1).info == times.info
-    assert times.pixel(1, 1).period_ns == LONG.period_ns
 
 
 # Times without a header: .mat of both versions, .npz, cells with scalars and empties.

@@ -9,7 +9,7 @@ from scipy.stats import binom, chi2, norm, poisson
 
 import mars_lidar as ml
 from mars_lidar.reconstruction import Flags
-from mars_lidar.reconstruction.fit_quality import law_above, quality_of
+from mars_lidar.reconstruction.fit_quality import law_above
 from mars_lidar.reconstruction.histograms import checked
 from mars_lidar.reconstruction.maximum_likelihood import MaximumLikelihood
 
@@ -182,21 +182,6 @@ def test_long_dead_times_and_bright_pulses_are_no_misfits(
     small = int((estimate.p_value < 0.01).sum())
     assert binom.sf(small - 1, estimate.p_value.size, 0.01) > 1e-4
     assert estimate.advice == ""
-
-
-def test_p_value_of_statistics() -> None:
-    """Of the smallest of the tests that there are; none without photons."""
-    nan = np.nan
-    table = np.array(
-        [
-            [60.0, 50.0, nan, nan, nan, nan, nan, nan],
-            [60.0, 50.0, 3.5, -1.0, 0.1, 0.0, 0.0, 0.0],
-            [nan, 0.0, nan, nan, nan, nan, nan, nan],
-        ]
-    )
-    p = quality_of(table).p_value
-    assert p[:2] == pytest.approx([chi2.sf(60.0, 50), 1.0 - (1.0 - norm.sf(3.5)) ** 4])
-    assert np.isnan(p[2])
 
 
 @pytest.mark.parametrize("photons", [0.002, 0.05, 0.5, 5.0, 200.0, 1e5])

@@ -3,7 +3,6 @@
 import itertools
 import json
 import math
-import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -139,10 +138,6 @@ def test_resize_to_the_same_size_changes_nothing(scene):
     np.testing.assert_array_equal(same.reflectivity, scene.reflectivity)
 
 
-def test_resize_of_white_stays_white():
-    assert (Scene(np.ones((997, 3)), 1.0).resize((101, 7)).reflectivity == 1.0).all()
-
-
 # --- radiometry --------------------------------------------------------------------------------------------
 
 
@@ -160,21 +155,6 @@ def test_levels_are_reached(scene, system, attenuation, ambient, signal, sbr):
     shape = {"uniform": np.ones(scene.shape), "reflectivity": scene.reflectivity, "map": light}[ambient]
     np.testing.assert_allclose(flux.background, signal / sbr * shape / shape.mean(), rtol=1e-12)
     np.testing.assert_allclose(flux.delay_ns, 2.0 * scene.depth_m / SPEED_OF_LIGHT_M_PER_NS, rtol=1e-15)
-
-
-def test_ambient_is_the_map_where_there_is_one(scene, system):
-    assert scene.flux(system, signal=1.0, sbr=1.0).info["ambient"] == "uniform"
-    light = np.arange(35.0).reshape(7, 5)
-    flux = Scene(scene.depth_m, scene.reflectivity, light).flux(system, signal=1.0, sbr=1.0)
-    assert flux.info["ambient"] == "map"
-    np.testing.assert_allclose(flux.background, light / light.mean(), rtol=1e-12)
-
-
-def test_dark_counts_come_on_top(scene, system):
-    flux = scene.flux(system, signal=2.0, sbr=4.0, dark_count_hz=1e5)
-    assert flux.background.mean() == pytest.approx(0.5 + 0.01, rel=1e-12)  # 1e5 /s in 100 ns
-    assert flux.info["achieved_sbr"] == pytest.approx(4.0, rel=1e-12)
-    assert flux.info["achieved_sbr_with_dark"] == pytest.approx(2.0 / 0.51, rel=1e-12)
 
 
 def test_dark_counts_are_counts_whatever_the_efficiency(scene, system):
@@ -227,12 +207,6 @@ def test_depth_beyond_the_unambiguous_range_wraps_with_one_warning(system):
     assert flux.info["n_wrapped"] == 3
     assert flux.info["unambiguous_range_m"] == reach
     np.testing.assert_allclose(flux.delay_ns[0, 2:4], [150.0, 700.0], rtol=1e-14)  # kept unwrapped
-
-
-def test_no_warning_where_nothing_is_lost(scene, system):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        scene.flux(system, signal=1.0, sbr=1.0)
 
 
 def test_info_is_plain_json_and_repeats_the_request(scene, system):

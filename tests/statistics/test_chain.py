@@ -7,7 +7,7 @@ import pytest
 from harness import refused, system_of
 
 import mars_lidar as ml
-from mars_lidar.statistics import ConvergenceError, PhaseChain, photons_per_bin
+from mars_lidar.statistics import ConvergenceError, PhaseChain
 
 # photons per period, dead time in periods, re-arming
 CASES = [
@@ -182,22 +182,6 @@ def test_dark_and_empty_fluxes(signal, background):
         assert solution.pdf.sum() == pytest.approx(1.0)
         assert np.isfinite(solution.rate)
         assert solution.rate > 0
-
-
-def test_grid_of_the_statistics():
-    system = system_of(0.6, bins=100)
-    photons = photons_per_bin(ml.Flux(2.0, 0.5, 50.0), system)
-    assert photons.size % 100 == 0
-    assert photons.size >= 512
-    assert 1.0 / photons.size <= 0.00375 / 2.9
-    assert photons.sum() == pytest.approx(2.5, rel=1e-12)
-    assert photons_per_bin(ml.Flux(2.0, 0.5, 50.0), system, bins=77).shape == (77,)
-    wave = photons_per_bin(ml.Flux(waveform=[1.0, 0.0, 3.0], background=0.5), system, bins=9)
-    np.testing.assert_allclose(wave, 0.5 / 9 + np.repeat([1.0, 0.0, 3.0], 3) / 3)
-    assert photons_per_bin(ml.Flux(waveform=np.ones(7), background=0.5), system).size == 700
-    assert photons_per_bin(ml.Flux(waveform=np.ones(1021), background=0.5), system).size == 1100
-    sampled = system.replace(pulse=ml.SampledPulse(np.array([1.0, 3.0, 2.0]), bin_ns=0.5))
-    assert photons_per_bin(ml.Flux(2.0, 0.5, 50.0), sampled).sum() == pytest.approx(2.5, rel=1e-12)
 
 
 def test_bad_input_is_named():

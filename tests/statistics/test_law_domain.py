@@ -13,13 +13,11 @@ from scipy import integrate, special, stats
 
 import mars_lidar as ml
 from mars_lidar.statistics import ConvergenceError, exposure_moments, mean_histogram
-from mars_lidar.statistics import exposure as exposure_module
 from mars_lidar.statistics import joint as pixel_module
-from mars_lidar.statistics import pmf as pmf_module
 from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.exposure import refined_moments
 from mars_lidar.statistics.joint_grid import FoldedGrid, relative_residual
-from mars_lidar.statistics.tolerances import LAW, TOL
+from mars_lidar.statistics.tolerances import LAW
 from mars_lidar.table.entries import start_phases
 from tests.domain.judge import Predictions, refusal
 from tests.domain.systems import draw
@@ -51,32 +49,6 @@ def test_warm_start_of_a_bright_clock(background: float, dead: float, cycles: in
 
 
 @pytest.mark.parametrize(
-    ("signal", "background", "dead", "detector"),
-    [
-        (2.0, 0.3, 0.6375, {}),
-        (10.0, 0.05, 1.97, {}),
-        (0.5, 4.0, 3.25, {}),
-        (3.0, 0.5, 0.002, {}),
-        (3.0, 0.5, 0.7, {"mode": "gated", "gate_start_ns": 30.0, "gate_width_ns": 40.0}),
-    ],
-)
-def test_warm_states_by_sweeps_and_by_the_equation(
-    monkeypatch: pytest.MonkeyPatch, signal: float, background: float, dead: float, detector: dict[str, Any]
-):
-    system = view(dead, 30, start="stationary")
-    system = system.replace(detector=ml.Detector(dead_time_ns=dead * PERIOD_NS, **detector))
-    swept = ml.count_law(ml.Flux([signal, 0.1], background, 47.0), system)
-    shape = ml.registration_pdf(ml.Flux([signal, 0.1], background, 47.0), system, "stationary")
-    assert swept.pmf.shape[0] == 2
-    monkeypatch.setitem(vars(TOL), "warm_periods", 1)
-    solved = ml.count_law(ml.Flux([signal, 0.1], background, 47.0), system)
-    np.testing.assert_allclose(solved.cumulants, swept.cumulants, rtol=1e-8, atol=1e-10)
-    np.testing.assert_allclose(solved.pmf, swept.pmf, atol=1e-9)
-    again = ml.registration_pdf(ml.Flux([signal, 0.1], background, 47.0), system, "stationary")
-    np.testing.assert_allclose(again, shape, atol=1e-9)
-
-
-@pytest.mark.parametrize(
     ("signal", "background", "dead", "sigma"),
     [
         (205.648, 6.66524, 0.999856070836575, 0.013763629840558421),
@@ -93,22 +65,6 @@ def test_stationary_shapes_of_locked_pixels(signal: float, background: float, de
     assert shape.min() >= 0.0
     other = ml.registration_pdf(ml.Flux(signal, background, 30.0), view(dead + 3.0, sigma=sigma, bins=32), "stationary")
     np.testing.assert_allclose(other, shape, atol=1e-6)  # whole periods only wait
-
-
-@pytest.mark.parametrize(
-    ("signal", "background", "dead"),
-    [(1.0, 0.5, 0.6375), (20.0, 0.1, 0.97), (0.2, 60.0, 0.81), (5.0, 1.0, 2.003), (60.0, 0.6, 0.97)],
-)
-def test_factors_of_the_feedback_equation(signal: float, background: float, dead: float):
-    """The factors, whose full row is put back, and the sweeps solve the same equations, forward and transposed."""
-    cells = Cells.of(signal, background, view(dead), delay_ns=33.0)
-    swept, direct = FoldedGrid.of(cells, 512), FoldedGrid.of(cells, 512)
-    direct.direct = True
-    np.testing.assert_allclose(direct.state, swept.state, rtol=1e-7, atol=1e-12)
-    weights = np.random.default_rng(1).normal(size=(3, 512))
-    a, b = direct.adjoint(weights), swept.adjoint(weights)
-    np.testing.assert_allclose(a, b, atol=1e-7 * np.abs(b).max())
-    assert direct.residual < 1e-9
 
 
 @pytest.mark.parametrize(
@@ -138,28 +94,6 @@ def test_stationary_shape_without_a_dead_time():
 # Wide laws
 
 
-@pytest.mark.parametrize(
-    ("signal", "background", "dead", "cycles", "start"),
-    [
-        (1.0, 1.0, 0.6375, 100_000, "armed"),
-        (0.01, 0.02, 1.3, 1_000_000, "stationary"),
-        (3.0, 3.0, 0.01, 2000, "armed"),
-        (0.3, 30.0, 0.01, 400, "stationary"),
-        (9.0, 0.1, 2.2, 300_000, "armed"),
-    ],
-)
-def test_wide_laws_from_few_points(
-    monkeypatch: pytest.MonkeyPatch, signal: float, background: float, dead: float, cycles: int, start: str
-):
-    system = view(dead, cycles, start=start)
-    law = ml.count_law(ml.Flux(signal, background, 50.0), system)
-    assert law.pmf.size > 256
-    monkeypatch.setitem(vars(TOL), "all_points", 10**9)
-    every = ml.count_law(ml.Flux(signal, background, 50.0), system)
-    assert every.pmf.size == law.pmf.size
-    np.testing.assert_allclose(law.pmf, every.pmf, atol=1e-12)
-
-
 def test_the_law_of_a_hundred_million_periods():
     """125 s once: at t_d = t_r registrations are a renewal process of whole periods and the phase of one photon."""
     law = ml.count_law(ml.Flux(5.0, 1.0, 50.0), view(1.0, 10**8, 0.00375))
@@ -171,23 +105,6 @@ def test_the_law_of_a_hundred_million_periods():
     assert law.pmf @ offset**2 == pytest.approx(float(law.variance), rel=1e-4)
     normal = stats.norm.pdf(law.support, law.mean, math.sqrt(law.variance))
     assert 0.5 * np.abs(law.pmf - normal).sum() < 1e-3
-
-
-@pytest.mark.parametrize(("lattice", "converges"), [(1, True), (2, False), (3, False)])
-def test_laws_on_a_lattice_take_all_points(monkeypatch: pytest.MonkeyPatch, lattice: int, converges: bool):
-    """Counts that come in pairs have a second peak of the transform at -1, as narrow as the first."""
-    system = view(0.5, 10_000)
-
-    def transform(cells: Cells, re: np.ndarray, im: np.ndarray | None, *_: Any) -> tuple[np.ndarray, np.ndarray]:
-        assert im is not None
-        value = np.exp(0.3 * cells.system.cycles * ((re + 1j * im) ** lattice - 1.0))
-        return value.real, value.imag
-
-    monkeypatch.setattr(pmf_module, "characteristic", transform)
-    variance = 0.3 * 10_000 * lattice**2
-    size = 2 * math.ceil(8 * math.sqrt(variance))
-    result = pmf_module._narrow(Cells.of(1.0, 1.0, system), size, 128, 1, variance, pmf_module.Remaining())
-    assert (result is not None) == converges
 
 
 @pytest.mark.parametrize(
@@ -239,29 +156,6 @@ def test_one_registration_at_most(cycles: int, dead: float):
 
 
 # Laws that would take longer than two seconds
-
-
-@pytest.mark.full
-@pytest.mark.parametrize(
-    ("signal", "dead", "cycles", "sigma", "start"),
-    [(1.0, 1e-6, 1, 1e-6, "stationary"), (1000.0, 1e-6, 2, 1e-6, "armed")],
-)
-def test_work_of_refused_laws(
-    monkeypatch: pytest.MonkeyPatch, signal: float, dead: float, cycles: int, sigma: float, start: str
-):
-    """A refusal comes before the budget is spent: the light of each grid is in it, and the periods run."""
-    done: list[float] = []
-    run = exposure_module._run
-
-    def recorded(cells: Cells, bins: int, *arguments: Any) -> Any:
-        result = run(cells, bins, *arguments)
-        done.append(float(bins) * (10.0 + min(cycles, max(int(result.settled[0]), 1))))
-        return result
-
-    monkeypatch.setattr(exposure_module, "_run", recorded)
-    with pytest.raises(ConvergenceError, match="the limit of a law"):
-        ml.count_law(ml.Flux(signal, 0.0, 50.0), view(dead, cycles, sigma, start))
-    assert sum(done) <= LAW.recursion
 
 
 # The joint law of an exposure that forgets its start long before its end

@@ -122,23 +122,6 @@ def test_spectral_rules_against_the_exact_sum():
         assert abs(terms.spectral_sum(lags, modes) - exact) < tolerance * terms.sigma_ss2
 
 
-def test_spectral_sum_keeps_conjugates_together():
-    terms = truncated(10.0, 1.0, 1.0, bins=512)
-    values = terms.eigenvalues
-    assert abs(values[1].imag) > 0
-    assert values[2] == pytest.approx(values[1].conjugate())
-    assert terms.spectral_sum(6, 2) == terms.spectral_sum(6, 3)
-
-
-def test_left_eigenvectors_where_inverting_the_right_ones_fails():
-    """P is so far from normal that V has no usable inverse; left eigenvectors of their own are exact."""
-    terms = truncated(10.0, 1.0, 1.0, bins=256, rearm="edge")
-    chain = PhaseChain.from_flux(ml.Flux(10.0, 1.0, 50.0), make_system(1.0), bins=256, rearm="edge")
-    assert np.linalg.cond(np.linalg.eig(chain.dense())[1]) > 1e10
-    assert terms.spectral_sum() == pytest.approx(terms.exact_sum, rel=5e-3)
-    assert terms.sigma_ss2 + 2 * terms.spectral_sum() > 0
-
-
 def gaussian(times, cycles):
     """Mean and variance of the count of `cycles` periods (3.11)."""
     return cycles / times.mu, cycles * times.sigma2 / times.mu**3
@@ -213,13 +196,6 @@ def test_moments_against_simulation(signal, background, dead):
     assert abs(waited.var() / variance - 1) < 4 * np.sqrt(2 / pixels)
     # and the covariances are not decoration: without them, or without the factor 2, the variance is wrong
     assert law.sigma2 == pytest.approx(variance / count, rel=0.05)
-
-
-def test_the_gaussian_law_is_that_of_the_holding_times():
-    law = ml.count_law(ml.Flux(1.0, 0.5, 50.0), make_system(0.6375), "mars")
-    terms = holding_time_covariance(ml.Flux(1.0, 0.5, 50.0), make_system(0.6375))  # times in ns
-    assert law.mean == pytest.approx(1000 * 100.0 / terms.mu)
-    assert law.variance == pytest.approx(1000 * 100.0 * terms.sigma2 / terms.mu**3)
 
 
 def test_random_cells_never_give_a_negative_variance():

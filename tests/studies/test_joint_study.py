@@ -164,12 +164,6 @@ def test_files_of_the_table(tmp_path):
     assert all(f"| {case.name} |" in study.text for case in joint_table.QUICK.cases)
 
 
-def test_cases_are_the_declared_ones():
-    assert len(REFERENCE) == 10
-    assert len(SEVEN) == 7
-    assert [case.name for case in joint_table.FULL.cases] == [case.name for case in (*REFERENCE, *SEVEN)]
-
-
 def test_window_goes_round_the_circle():
     inside = np.flatnonzero(REFERENCE[6].window(1024))
     assert {0, 1023} <= set(inside.tolist())

@@ -23,6 +23,7 @@ from harness import make_system
 
 import mars_lidar as ml
 from mars_lidar import io, statistics
+from mars_lidar._base.arguments import _rules
 from mars_lidar._base.cached import cached_property
 from mars_lidar._base.display import brief
 from mars_lidar.engines import EngineOptions, MarsEngine
@@ -140,6 +141,22 @@ def test_no_function_hides_a_module():
         if not each.name.startswith("_"):
             module = importlib.import_module(f"mars_lidar.{each.name}")
             assert getattr(ml, each.name) is module, each.name
+
+
+def test_names_in_annotations_of_checked_functions_are_known():
+    """One that is imported for types only would be an error at the first call."""
+    functions = set()
+    for each in pkgutil.walk_packages(ml.__path__, "mars_lidar."):
+        if each.name.startswith(("mars_lidar.learn", "mars_lidar.__main__")):
+            continue
+        for thing in vars(importlib.import_module(each.name)).values():
+            members = [thing, *(vars(thing).values() if inspect.isclass(thing) else ())]
+            wrapped = [getattr(member, "__func__", member) for member in members]
+            functions |= {f for f in wrapped if inspect.isfunction(f) and hasattr(f, "__wrapped__")}
+    ours = [f for f in functions if f.__module__.startswith("mars_lidar.")]
+    assert len(ours) > 200
+    for function in ours:
+        _rules(function, inspect.signature(function))
 
 
 # What every public object owes its user: a repr that fits on a screen, and a way to another process.

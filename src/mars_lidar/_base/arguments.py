@@ -8,14 +8,14 @@ Ranges of numbers are checked in the functions (`checks`).
 
 from __future__ import annotations
 
-import builtins
 import collections.abc
 import functools
 import inspect
 import os
 import types
 import typing
-from collections.abc import Callable, Mapping
+from collections import ChainMap
+from collections.abc import Callable
 from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
@@ -36,38 +36,6 @@ class _Array:
 
     def __class_getitem__(cls, _: Any) -> type[_Array]:
         return cls
-
-
-class _NameOnly(type):
-    """A class whose module is not imported here: values are compared with it by the names of their classes."""
-
-    def __getitem__(cls, _: Any) -> _NameOnly:
-        return cls
-
-    def __getattr__(cls, name: str) -> _NameOnly:
-        if name.startswith("__"):
-            raise AttributeError(name)
-        return _NameOnly(name, (), {})
-
-
-class _Names(Mapping[str, Any]):
-    """What the names of an annotation stand for."""
-
-    def __init__(self, scope: dict[str, Any]) -> None:
-        self._scope = scope
-
-    def __getitem__(self, name: str) -> Any:
-        if name in _ARRAYS:
-            return _Array
-        if name in self._scope:
-            return self._scope[name]
-        return getattr(builtins, name, None) or _NameOnly(name, (), {})
-
-    def __iter__(self) -> Any:
-        return iter(self._scope)
-
-    def __len__(self) -> int:
-        return len(self._scope)
 
 
 def checked(function: Callable[P, R], masks: bool = False) -> Callable[P, R]:
@@ -157,7 +125,7 @@ def checked_with_masks(function: Callable[P, R]) -> Callable[P, R]:
 
 def _rules(function: Callable[..., Any], signature: inspect.Signature) -> dict[str, tuple[Any, ...]]:
     """Members of the union of each parameter; none where one of them is not for this module to judge."""
-    names = _Names(getattr(inspect.unwrap(function), "__globals__", {}))
+    names = ChainMap(dict.fromkeys(_ARRAYS, _Array), getattr(inspect.unwrap(function), "__globals__", {}))
     rules: dict[str, tuple[Any, ...]] = {}
     for name, parameter in signature.parameters.items():
         if parameter.annotation is parameter.empty or parameter.kind in (
@@ -218,8 +186,6 @@ def _fits(value: Any, member: Any, paths: bool) -> bool:
         return any(isinstance(value, type(choice)) and bool(value == choice) for choice in member.__args__)
     if origin is _Array or (origin is str and paths):
         return False
-    if isinstance(origin, _NameOnly):
-        return any(each.__name__ == origin.__name__ for each in type(value).__mro__)
     if origin is float:
         return isinstance(value, Real) and not isinstance(value, bool | np.bool_)
     if origin is int:

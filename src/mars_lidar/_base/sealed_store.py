@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import asyncio
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from zarr.storage import LocalStore, WrapperStore
 
 from mars_lidar._base.buckets import in_bucket, zarr_store
 from mars_lidar._base.files import FileError, is_plain_file
-
-if TYPE_CHECKING:
-    from mars_lidar._base.manifest import Manifest
+from mars_lidar._base.manifest import Manifest
 
 
 def store_at(path: Any, sums: Manifest | None, *, read_only: bool = True) -> Any:

@@ -6,7 +6,7 @@ import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypedDict
+from typing import Any, ClassVar, Literal, TypedDict
 
 import numpy as np
 
@@ -27,9 +27,7 @@ from mars_lidar.instrument.effects import (
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.light.timestamps import record_bins, record_times
-
-if TYPE_CHECKING:
-    from mars_lidar.table import Table
+from mars_lidar.table.table import Table
 
 IN_PARTS = (
     "simulate rows (flux[rows] with pixel_index) or realizations (first_realization) one after another, "

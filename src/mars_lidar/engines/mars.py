@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 from mars_lidar._base import checks
 from mars_lidar._base.types import FloatArray, IndexArray
@@ -12,10 +12,9 @@ from mars_lidar.engines.pixels import Group, groups
 from mars_lidar.engines.table_reader import CountTimesShape, PixelEntries, TableReader, as_shapes, exact_laws, untrusted
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
-
-if TYPE_CHECKING:
-    from mars_lidar.table import Table
-
+from mars_lidar.statistics.exposure import recorded_moments
+from mars_lidar.statistics.pmf import exact_pmfs
+from mars_lidar.table.table import Table
 
 _COUNTS = ("exact", "matched", "gaussian")
 
@@ -112,9 +111,6 @@ class MarsEngine(CountTimesShape):
             run.draw(batch)
 
     def _evaluated(self, run: synthesis.Run, group: Group) -> synthesis.Batch:
-        from mars_lidar.statistics.exposure import recorded_moments
-        from mars_lidar.statistics.pmf import exact_pmfs
-
         task = run.task
         exposure = recorded_moments(group.cells, tolerance=1e-4, threads=task.threads, progress=run.waiting)
         cumulants = exposure.cumulants.reshape(-1, 4)

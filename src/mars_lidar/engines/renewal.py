@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -12,9 +12,9 @@ from mars_lidar.engines.pixels import Alignment, Group, groups, single_return
 from mars_lidar.engines.synthesis import Batch, CountLaws, RoundedGaussian, Run
 from mars_lidar.engines.table_reader import CountTimesShape, PixelEntries, TableReader, as_shapes
 from mars_lidar.instrument.system import System
-
-if TYPE_CHECKING:
-    from mars_lidar.table import Table
+from mars_lidar.statistics.constant_light import renewal_moments
+from mars_lidar.statistics.histogram import chain_of
+from mars_lidar.table.table import Table
 
 
 class RenewalEngine(CountTimesShape):
@@ -94,15 +94,11 @@ class RenewalEngine(CountTimesShape):
 
 
 def _laws(system: System, signal: FloatArray, background: FloatArray) -> CountLaws:
-    from mars_lidar.statistics.constant_light import renewal_moments
-
     return RoundedGaussian(*renewal_moments(signal + background, system))
 
 
 def _chains(run: Run, group: Group) -> tuple[NDArray[np.float32], FloatArray]:
     """Shapes (cells, bins) and registrations per period (cells,)."""
-    from mars_lidar.statistics.histogram import chain_of
-
     cells, system = group.cells, run.task.system
     shapes, rates = np.zeros((cells.size, system.bins)), np.zeros(cells.size)
     for k in range(cells.size):

@@ -11,7 +11,7 @@ import warnings
 from abc import abstractmethod
 from dataclasses import dataclass
 from hashlib import blake2b
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -25,12 +25,11 @@ from mars_lidar.engines.tolerances import TOL
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
-from mars_lidar.statistics.cells import Cells
+from mars_lidar.statistics.cells import Cells, require_mode
 from mars_lidar.statistics.exposure import normalised
+from mars_lidar.statistics.matched import trusted
 from mars_lidar.statistics.pmf import Pmf, guessed_pmfs
-
-if TYPE_CHECKING:
-    from mars_lidar.table import Table
+from mars_lidar.table.table import Table
 
 _INTERPOLATIONS = ("bilinear", "nearest")
 _OUTSIDE = ("error", "exact")
@@ -223,8 +222,6 @@ def untrusted(run: Run, reader: TableReader, entries: PixelEntries) -> IndexArra
     """Which of the pixels (ascending) need an exact law: `statistics.matched.trusted`. None of a table of Gaussians."""
     if reader.table.method == "mars" or run.task.system.dead_time_periods == 0.0:
         return np.empty(0, np.int64)
-    from mars_lidar.statistics.matched import trusted
-
     return np.flatnonzero(~trusted(entries.cumulants, threads=run.task.threads))
 
 
@@ -288,9 +285,6 @@ def image_table(
     than `Tolerances.table_pixels` distinct pixels. Pixels beyond it (S = 0 or B = 0) are evaluated with
     ``outside="exact"``.
     """
-    from mars_lidar.statistics.cells import require_mode
-    from mars_lidar.table import Table
-
     try:
         require_mode("a table", system)
     except ValueError:

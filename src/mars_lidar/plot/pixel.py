@@ -8,14 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar.instrument.system import System
+from mars_lidar.io.cube import Cube
 from mars_lidar.io.layout import MEASURED
 from mars_lidar.plot.colours import MUTED, PREDICTION
 from mars_lidar.plot.views import incident_rate, predicted_counts
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-    from mars_lidar.io import Cube
 
 _Array = NDArray[np.float64]
 _COARSE = 64  # parts of the period over which background counts are averaged

@@ -7,16 +7,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mars_lidar.io.cube import Cube
 from mars_lidar.plot.colours import DEPTH_MAP, SHARE_MAP
 from mars_lidar.plot.figures import _draw_map, _limits, _metres, pixel_histogram
 from mars_lidar.plot.style import DPI, style
 from mars_lidar.plot.views import depth_error_m
+from mars_lidar.reconstruction import Reconstruction, Returns
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from mars_lidar.io import Cube
-    from mars_lidar.reconstruction import Reconstruction, Returns
 
 _MAP_INCHES = 2.35
 

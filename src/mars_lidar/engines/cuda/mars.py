@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -13,16 +13,13 @@ from mars_lidar._base.types import FloatArray, IndexArray, NDArray
 from mars_lidar.engines.cuda.kernels import MARS_LAWS, mars_histograms, overflow
 from mars_lidar.engines.cuda.machine import Cuda
 from mars_lidar.engines.engine import Task, part_of
+from mars_lidar.engines.mars import MarsEngine
 from mars_lidar.engines.pixels import Frame, pulse_frame, shift_of, single_return
 from mars_lidar.engines.synthesis import Run, Streams
 from mars_lidar.engines.table_reader import TableReader, exact_laws
-
-if TYPE_CHECKING:
-    from mars_lidar.engines.mars import MarsEngine
-    from mars_lidar.instrument.system import System
-    from mars_lidar.light.flux import Flux
-    from mars_lidar.table import Table
-
+from mars_lidar.instrument.system import System
+from mars_lidar.light.flux import Flux
+from mars_lidar.table.table import Table
 
 _LAW_LANES = 64
 LANES = 128  # threads that share a pixel
@@ -252,8 +249,6 @@ def _table_there(table: Table, cycles: int, dead_time: float, frame: Frame, mach
 
 def _on_host(engine: MarsEngine, task: Task, out: Any, machine: Cuda, pixels: IndexArray) -> None:
     """Pixels beyond the table: evaluated and drawn by the processor, then copied."""
-    from mars_lidar.engines.mars import MarsEngine
-
     alone, every, bins = MarsEngine(), task.pixel_index.size, task.system.bins
     alone.count = engine.count
     cube = out.reshape(task.realizations, every, bins)

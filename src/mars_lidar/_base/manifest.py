@@ -18,7 +18,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import xxhash
 
@@ -32,6 +32,7 @@ CHECKS = "manifest.xxh128"
 # documents, the XXH128 of all others, and arrays of one dimension: coordinates
 _SMALL = re.compile(rf"(^|/)zarr\.json$|^[^/]+/c/\d+$|^{re.escape(CHECKS)}$")
 _CHUNK = re.compile(r"(^|/)c([/.]\d+)+$")
+Content = TypeVar("Content", bytes, Path)
 SUM = "manifest_sha256"  # attribute of the root document: the sum over the lines of all other files
 
 
@@ -141,39 +142,30 @@ class Manifest:
             if _state(self._store / name) is not None:
                 raise self._error(f"{name} is not in its {NAME}")
             return
-        if self.is_known(name):
-            return
-        with self._lock:
-            lock = self._locks.setdefault(name, threading.Lock())
-        with lock:
-            if self.is_known(name):
-                return
-            path = self._store / name
-            before = _state(path)
-            if before is None:
-                raise self._error(f"{name} is missing")
-            try:
-                good = self.is_good(name, path)
-            except FileNotFoundError:
-                raise self._error(f"{name} is missing") from None
-            if not good or _state(path) != before:
-                raise self._error(f"{name} has changed since it was written")
-            self._known[name] = before
+        if not self.is_known(name):
+            with self._lock:
+                lock = self._locks.setdefault(name, threading.Lock())
+            with lock:
+                if not self.is_known(name):
+                    self._verified(name, lambda path: path)
 
     def read(self, name: str) -> bytes:
         """The content of a file, as it was when the store was sealed."""
+        return self._verified(name, lambda path: path.read_bytes())
+
+    def _verified(self, name: str, read: Callable[[Path], Content]) -> Content:
+        """What `read` returns for the path of a file, which has the content that it had when the store was sealed."""
         path = self._store / name
         before = _state(path)
-        if before is None:
-            raise self._error(f"{name} is missing")
         try:
-            content: bytes = path.read_bytes()
+            if before is None:
+                raise FileNotFoundError
+            content = read(path)
+            good = self._known.get(name) == before or self.is_good(name, content)
         except FileNotFoundError:
             raise self._error(f"{name} is missing") from None
-        if self._known.get(name) != before and not self.is_good(name, content):
+        if not good or _state(path) != before:
             raise self._error(f"{name} has changed since it was written")
-        if _state(path) != before:
-            raise self._error(f"{name} was replaced while it was read")
         if before:
             self._known[name] = before
         return content
@@ -215,20 +207,35 @@ def damage(store: Path, *, every: bool = True) -> list[str]:
 def _compared(
     store: Path, every: bool, listed: bool = True
 ) -> tuple[dict[str, str], dict[str, str], dict[str, tuple[int, ...]], list[str]]:
-    """SHA-256 and XXH128 by name, the states of the files that were read, and what is wrong."""
+    """SHA-256 and XXH128 by name, the states of the files that were read, and what is wrong, a sentence each.
+
+    Files are listed only if `listed`, and where they can be. The root document has the checksum of all lines.
+    """
     if not (store / NAME).exists():
         return {}, {}, {}, [f"its {NAME} is missing"]
     sums, checks = (_read_lines(store / name) for name in (NAME, CHECKS))
     states: dict[str, tuple[int, ...]] = {}
+    wrong: list[str] = []
+    if root_document(store).get("attributes", {}).get(SUM) != _sum(sums):
+        wrong.append(f"its {NAME} is not that of its {_ROOT}")
+    there = _listed(store) if listed else None
+    if there is not None:
+        wrong += [f"{name} is missing" for name in sums if name not in there]
+        more = {name for name in there if name.rpartition("/")[2] == _ROOT or _CHUNK.search(name)}
+        wrong += [f"{name} is not in its {NAME}" for name in sorted(more - set(sums))]
 
     def read(name: str) -> Sums:
         if state := _state(store / name):
             states[name] = state
         return sums_of(store / name)
 
-    stated = root_document(store).get("attributes", {}).get(SUM)
-    wrong = _differences(sums, checks, _listed(store) if listed else None, read, every, stated)
-    return sums, checks, states, list(wrong)
+    known = sums if there is None else there
+    names = sorted(name for name in sums if name in known and (every or _SMALL.search(name)))
+    with ThreadPoolExecutor(TOL.hash_threads) as pool:
+        for name, now in zip(names, pool.map(read, names), strict=True):
+            if now != Sums(sums[name], checks.get(name, now.xxh128)):
+                wrong.append(f"{name} has changed since it was written")
+    return sums, checks, states, wrong
 
 
 def _read_lines(path: Path) -> dict[str, str]:
@@ -238,33 +245,6 @@ def _read_lines(path: Path) -> dict[str, str]:
         check_claim(path, 4 * path.stat().st_size)
         lines = (line.partition("  ") for line in path.read_text("utf-8").splitlines())
         return {name: digest for digest, _, name in lines}
-
-
-def _differences(
-    sums: Mapping[str, str],
-    checks: Mapping[str, str],
-    there: set[str] | None,
-    read: Callable[[str], Sums],
-    every: bool,
-    stated: str | None,
-) -> Iterator[str]:
-    """A sentence for each file whose SHA-256 or XXH128 differs from its line.
-
-    `there` are the existing files, None where they cannot be listed. `stated` is the checksum of all lines in the root
-    document.
-    """
-    if stated != _sum(sums):
-        yield f"its {NAME} is not that of its {_ROOT}"
-    if there is not None:
-        yield from (f"{name} is missing" for name in sums if name not in there)
-        more = {name for name in there if name.rpartition("/")[2] == _ROOT or _CHUNK.search(name)}
-        yield from (f"{name} is not in its {NAME}" for name in sorted(more - set(sums)))
-    known = set(sums) if there is None else there
-    names = sorted(name for name in sums if name in known and (every or _SMALL.search(name)))
-    with ThreadPoolExecutor(TOL.hash_threads) as pool:
-        for name, now in zip(names, pool.map(read, names), strict=True):
-            if now != Sums(sums[name], checks.get(name, now.xxh128)):
-                yield f"{name} has changed since it was written"
 
 
 def _lines(sums: Mapping[str, str]) -> bytes:

@@ -583,6 +583,7 @@ def read_pixels(
 def evaluate(
     axes: tuple[FloatArray, FloatArray],
     cumulants: FloatArray,
+    limit: FloatArray,
     phases: StartPhases,
     own_cycles: bool,
     signal: FloatArray,
@@ -598,6 +599,7 @@ def evaluate(
         signal_axis=axes[0],
         background_axis=axes[1],
         entries=cumulants,
+        limit=limit,
         sub_signal=phases.signal,
         sub_background=phases.background,
         phase=phases.phase,

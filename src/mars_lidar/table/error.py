@@ -18,7 +18,7 @@ _TV_MEAN, _TV_VARIANCE = 1.0 / math.sqrt(2.0 * math.pi), 1.0 / math.sqrt(2.0 * m
 
 @dataclass(frozen=True)
 class QuantisationError:
-    """Errors of a table on random pixels between its nodes.
+    """Errors of a table on random pixels between its nodes, and on dim ones between its lowest nodes and 0.
 
     Errors of the cumulants are in units of powers of the standard deviation, at least 1/2 count. Errors
     `delayed` are at random delays, where an armed start has another law; the others at the canonical delay t_r / 2.
@@ -120,3 +120,13 @@ def random_pixels(rng: np.random.Generator, axis: FloatArray, samples: int, belo
         low = rng.random(samples) < 0.125
         values[low] = positive[0] * rng.random(int(low.sum()))
     return values
+
+
+def dim_pixels(signal: FloatArray, background: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Pixels (P,) at quarters of the cells that begin at 0: errors relative to the law are largest there."""
+    below = [
+        axis[1] * np.arange(4) / 4 if axis.size > 1 and axis[0] == 0.0 else axis[:1] for axis in (signal, background)
+    ]
+    s, b = (values.ravel() for values in np.meshgrid(*below, indexing="ij"))
+    between = (~np.isin(s, signal)) | (~np.isin(b, background))
+    return s[between], b[between]

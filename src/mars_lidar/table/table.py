@@ -44,7 +44,7 @@ from mars_lidar.table.entries import (
     read_pixels,
     start_phases,
 )
-from mars_lidar.table.error import QuantisationError, deviations, law_variation, random_pixels
+from mars_lidar.table.error import QuantisationError, deviations, dim_pixels, law_variation, random_pixels
 from mars_lidar.table.tolerances import TOL
 
 Interpolation = Literal["bilinear", "nearest"]
@@ -356,6 +356,7 @@ class Table:
         rows[pick], weights[pick], cumulants[pick] = evaluate(
             (self.signal, self.background),
             self.entries.cumulants_at(periods),
+            self.limit(periods),
             self.start_phases,
             periods == self.entries.cycles,
             s[pick],
@@ -390,6 +391,10 @@ class Table:
         parts = vars(self.entries) | vars(self.laws)
         parts |= {name: getattr(self.start_phases, name) for name in ("correction", "settled")}
         return sum(each.nbytes for each in parts.values() if isinstance(each, np.ndarray))
+
+    def limit(self, cycles: int) -> FloatArray:
+        """Cumulants (4,) per photon a period as the light vanishes: those of a Poisson law, or of method ``"mars"``."""
+        return np.array([1.0, 1.0, 1.0, 1.0] if self.method == "exposure" else [1.0, 1.0, 0.0, 0.0]) * cycles
 
     def _cycles(self, cycles: int | None) -> int:
         return self.system.cycles if cycles is None else checks.integer("cycles", cycles, low=1, high=10**8)
@@ -428,7 +433,7 @@ class Table:
             As `lookup`.
         samples, seed
             Pixels, log-uniform over the axes, with random delays; with ``"bilinear"`` one in eight lies between 0
-            and the lowest value, where the axis has a 0.
+            and the lowest value, where the axis has a 0, and quarters of these cells come on top.
         threads
             Threads to run on; default: all processors that this process may use.
         """
@@ -438,6 +443,9 @@ class Table:
         system = self.system.replace(cycles=periods)
         below = interpolation == "bilinear"  # the nearest entry knows nothing between 0 and the lowest value
         signal, background = (random_pixels(rng, axis, samples, below) for axis in (self.signal, self.background))
+        if below:
+            dim = dim_pixels(self.signal, self.background)
+            signal, background = np.append(signal, dim[0]), np.append(background, dim[1])
         evaluation = Evaluation(self.method, self.rearm, self.tolerance, thread_count(threads))
         exact = evaluation.entries(signal, background, system)
         looked_up = self.at(signal, background, cycles=periods, interpolation=interpolation)
@@ -446,7 +454,7 @@ class Table:
         shape = 0.5 * np.abs(mixed - exact.shape).sum(-1)
         delayed, delayed_shape = error, shape
         if self.method == "exposure":
-            shift = rng.integers(0, system.bins, samples)
+            shift = rng.integers(0, system.bins, signal.size)
             delay, cumulants, delayed_shape = self._against_exact(
                 signal, background, shift, mixed, periods, evaluation.threads
             )
@@ -456,7 +464,7 @@ class Table:
         worst = int(np.argmax(np.maximum(variation, shape)))
         return QuantisationError(
             interpolation=interpolation,
-            samples=samples,
+            samples=signal.size,
             cycles=periods,
             mean_rms=float(np.sqrt(np.mean(error[:, 0] ** 2))),
             mean_max=float(error[:, 0].max()),

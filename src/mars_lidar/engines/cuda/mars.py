@@ -232,6 +232,7 @@ def _table_there(table: Table, cycles: int, dead_time: float, frame: Frame, mach
     axes = {name: np.ascontiguousarray(axis, np.float64) for name, axis in axes.items()}
     here: dict[str, NDArray[Any]] = {
         "entries": np.ascontiguousarray(entries.cumulants_at(cycles)),
+        "limit": table.limit(cycles),
         "phases": np.ascontiguousarray(phases.phase),
         "correction": np.ascontiguousarray(phases.correction_at(own)),
         "shapes": np.ascontiguousarray(table.shapes(cycles)),

@@ -54,6 +54,7 @@ struct Stencil {
     int count;          // nodes of the cumulants
     int64_t node[4];
     double weight[4];  // Lagrange, in log photons (L2)
+    bool dim;          // between 0 and the first node above it: in photons
 };
 
 // Cubic through up to four nodes at coordinates `at`.
@@ -84,6 +85,7 @@ MARS_APART inline Stencil stencil(const Axis& axis, const TableFlux& x, bool nea
         out.node[0] = out.low;
         out.weight[0] = 1.0;
     } else if (left == 0.0) {  // no logarithm: cubic in the photons, through nodes of about equal distances
+        out.dim = true;
         double at[4], scale[4];
         for (int64_t k = 0; k < axis.size && out.count < 4; ++k)
             if (axis.value[k] >= out.count * right) {
@@ -106,6 +108,7 @@ MARS_APART inline Stencil stencil(const Axis& axis, const TableFlux& x, bool nea
 struct TableLookup {
     Axis signal, background, sub_signal, sub_background;
     const double* cumulants;  // (signal * background, 4)
+    const double* limit;      // (4) of them, per photon a period, as the light vanishes
     const double* phase;      // (phases) ascending, from 0 to 1
     int64_t phases;           // 0: no correction
     const float* correction;  // (sub_signal * sub_background, phases * 4)
@@ -130,11 +133,20 @@ struct TableLookup {
         for (int m = 0; m < 4; ++m) weight[m] = sum > 0.0 ? weight[m] / sum : v[m / 2] * w[m % 2];
     }
 
-    // Cumulants by a cubic through the nodes of either axis (L2); adds them to `out`.
-    void bicubic(const Stencil& s, const Stencil& b, double* out) const {
+    // Cumulants by a cubic through the nodes of either axis (L2), below the lowest nodes those per photon, which have a
+    // limit; adds them to `out`.
+    void bicubic(const Stencil& s, const Stencil& b, double photons, double* out) const {
         for (int k = 0; k < s.count; ++k)
-            for (int m = 0; m < b.count; ++m)
-                add(cumulants + (s.node[k] * background.size + b.node[m]) * kCumulants, s.weight[k] * b.weight[m], out);
+            for (int m = 0; m < b.count; ++m) {
+                const double* node = cumulants + (s.node[k] * background.size + b.node[m]) * kCumulants;
+                double w = s.weight[k] * b.weight[m];
+                if (s.dim || b.dim) {
+                    const double there = signal.value[s.node[k]] + background.value[b.node[m]];
+                    if (!(there > 0.0)) node = limit;
+                    w *= there > 0.0 ? photons / there : photons;
+                }
+                add(node, w, out);
+            }
     }
 
     // Cumulants by the convex combination of the cell's four entries: coarser, and never out of range.
@@ -169,7 +181,7 @@ struct TableLookup {
         const Stencil x = stencil(signal, s, nearest != 0), y = stencil(background, b, nearest != 0);
         rows(x, y, row, weight);
         std::fill(out, out + kCumulants, 0.0);
-        bicubic(x, y, out);
+        bicubic(x, y, s.value + b.value, out);
         if (out[0] < 0.0 || out[1] < 0.0) {  // overshoot of a coarse grid: the convex combination has none
             std::fill(out, out + kCumulants, 0.0);
             bilinear(x, y, out);

@@ -12,7 +12,7 @@ namespace {
 constexpr int64_t kBlock = 512;  // pixels per chunk
 
 void lookup(Vector<const double> signal_axis, Vector<const double> background_axis, Matrix<const double> entries,
-            Vector<const double> sub_signal, Vector<const double> sub_background, Vector<const double> phase,
+            Vector<const double> limit, Vector<const double> sub_signal, Vector<const double> sub_background, Vector<const double> phase,
             Matrix<const float> correction, Vector<const double> signal, Vector<const double> background,
             Vector<const double> at, bool nearest, Matrix<int64_t> rows, Matrix<double> weights,
             Matrix<double> cumulants, int threads) {
@@ -24,6 +24,7 @@ void lookup(Vector<const double> signal_axis, Vector<const double> background_ax
                             x.axis(),
                             y.axis(),
                             entries.data(),
+                            limit.data(),
                             phase.data(),
                             static_cast<int64_t>(phase.shape(0)),
                             correction.data(),
@@ -34,6 +35,7 @@ void lookup(Vector<const double> signal_axis, Vector<const double> background_ax
     if (table.signal.size < 1 || table.background.size < 1 || entries.shape(1) != kCumulants ||
         entries.shape(0) != signal_axis.shape(0) * background_axis.shape(0))
         throw nb::value_error("entries must be (signal * background, 4)");
+    expect("limit must be (4)", {kCumulants}, limit);
     if (table.phases == 1 || (table.phases > 1 && (sub == 0 || correction.shape(0) != sub ||
                                                    correction.shape(1) != phase.shape(0) * kCumulants)))
         throw nb::value_error("correction must be (sub_signal * sub_background, phases * 4)");
@@ -51,7 +53,7 @@ void lookup(Vector<const double> signal_axis, Vector<const double> background_ax
 
 void bind_table(nb::module_& module) {
     module.def("table_lookup", &lookup, nb::kw_only(), "signal_axis"_a, "background_axis"_a, "entries"_a,
-               "sub_signal"_a, "sub_background"_a, "phase"_a, "correction"_a, "signal"_a, "background"_a, "at"_a,
+               "limit"_a, "sub_signal"_a, "sub_background"_a, "phase"_a, "correction"_a, "signal"_a, "background"_a, "at"_a,
                "nearest"_a, "rows"_a, "weights"_a, "cumulants"_a, "threads"_a);
 }
 

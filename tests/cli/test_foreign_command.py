@@ -65,7 +65,6 @@ def test_info_lists_what_is_in_a_foreign_file(tmp_path: Path, counts: np.ndarray
     [
         ([], "give --cycles, --dead-time-ns, --pulse-sigma-ns, --bin-ps, or --system"),
         (SYSTEM_OPTIONS[:2], "give --cycles, --dead-time-ns, --pulse-sigma-ns, or --system"),
-        ([*SYSTEM_OPTIONS, "--bin-ns", "0.2"], "exclude each other"),
         ([*SYSTEM_OPTIONS, "--period-ns", "40.1"], "40 and 40.2 would be"),
         ([*SYSTEM_OPTIONS, "--axes", "yx"], "axes must be made of"),
         ([*SYSTEM_OPTIONS, "--cloud", "a.ply"], "belong together"),

@@ -36,10 +36,8 @@ class ForeignOptions:
 
     A file of another program
     -------------------------
-    bin_ns
-        Width of a histogram bin, ns ...
     bin_ps
-        ... or ps.
+        Width of a histogram bin, ps.
     period_ns
         Laser period, ns. [default: the histogram's length]
     cycles
@@ -62,7 +60,6 @@ class ForeignOptions:
     """
 
     system: Path | None = None
-    bin_ns: Number | None = None
     bin_ps: Number | None = None
     period_ns: Number | None = None
     cycles: Integer | None = None
@@ -84,7 +81,7 @@ class ForeignOptions:
         """Whether `path` is read as histograms: by its suffix, or by options that apply to histograms only."""
         if path.suffix.lower() in (".npy", ".csv", ".txt", ".tif", ".tiff", ".sdt"):
             return True
-        names = ("system", "cycles", "bin_ns", "bin_ps", "dead_time_ns", "axes", "image")
+        names = ("system", "cycles", "bin_ps", "dead_time_ns", "axes", "image")
         return any(getattr(self, name) is not None for name in names)
 
     def opened(self, path: Path) -> Cube:
@@ -129,18 +126,18 @@ class ForeignOptions:
 
     def _completed(self, recorder: Recorded, length: int | None) -> ForeignOptions:
         """With the recorder's values where no option is given; the period is rounded to a whole number of its bins."""
-        width = recorder.bin_ns if self.bin_ns is None and self.bin_ps is None else None
+        width = recorder.bin_ns if self.bin_ps is None else None
         if width is None:
             return self if self.cycles is not None else replace(self, cycles=recorder.cycles)
         period = self.period_ns or recorder.period_ns or (width * length if length else None)
         whole = None if period is None else max(round(period / width), length or 1) * width
         cycles = recorder.cycles if self.cycles is None else self.cycles
-        return replace(self, bin_ns=width, period_ns=whole, cycles=cycles)
+        return replace(self, bin_ps=1e3 * width, period_ns=whole, cycles=cycles)
 
     def _file(self) -> System | None:
         if self.system is None:
             return None
-        single = ("bin_ns", "bin_ps", "period_ns", "cycles", "detector", "dead_time_ns")
+        single = ("bin_ps", "period_ns", "cycles", "detector", "dead_time_ns")
         given = [name for name in single if getattr(self, name) is not None]
         if given or self.pulse != PulseOptions():
             excluded = ", ".join(f"--{name.replace('_', '-')}" for name in given) or "a pulse"
@@ -155,7 +152,7 @@ class ForeignOptions:
                 ("--cycles", self.cycles is not None),
                 ("--dead-time-ns", self.dead_time_ns is not None or self.detector is not None),
                 ("--pulse-sigma-ns", pulse is not None),
-                ("--bin-ps", (self.bin_ns, self.bin_ps, self.period_ns) != (None, None, None)),
+                ("--bin-ps", (self.bin_ps, self.period_ns) != (None, None)),
             )
             if not given
         ]
@@ -169,11 +166,9 @@ class ForeignOptions:
 
     def _clock(self, path: Path, length: int | None) -> tuple[float, int]:
         """Laser period, ns, and bins in it."""
-        if self.bin_ns is not None and self.bin_ps is not None:
-            raise ValueError("--bin-ns and --bin-ps exclude each other")
-        width = self.bin_ns if self.bin_ps is None else 1e-3 * self.bin_ps
+        width = None if self.bin_ps is None else 1e-3 * self.bin_ps
         if width is not None and not width > 0.0:
-            raise ValueError(f"--bin-ps or --bin-ns must be positive, got {width:g} ns")
+            raise ValueError(f"--bin-ps must be positive, got {self.bin_ps:g}")
         if width is None or self.period_ns is None:
             if length is None:
                 raise ValueError(f"{path} holds photon times: give --period-ns and --bin-ps")

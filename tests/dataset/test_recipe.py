@@ -162,10 +162,7 @@ def test_keys_of_one_scene_stand_for_those_of_many():
     assert DatasetRecipe.from_dict(single).scenes == ({"example": "room", "size": 128, "seeds": [3]},)
     refused("seed stands for seeds of one", read_view, {"example": "room", "seed": 3, "seeds": [3]}, SCENE_SYSTEM)
     refused(
-        "there must be one scene: 2 are named",
-        read_view,
-        {"example": "room", "size": 8, "seeds": [3, 4]},
-        SCENE_SYSTEM,
+        "there must be one scene: 2 are named", read_view, {"example": "room", "size": 8, "seeds": [3, 4]}, SCENE_SYSTEM
     )
     with pytest.raises(ValueError, match="one level of one scene, got 2"):
         read_view({"example": "room", "size": 8, "light": {"signal": [1, 2]}}, SCENE_SYSTEM)

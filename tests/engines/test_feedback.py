@@ -15,13 +15,7 @@ from mars_lidar import Detector, Flux, SampledPulse, System, _core, joint_law
 from mars_lidar.engines import ENGINES
 from mars_lidar.engines.engine import Task
 from mars_lidar.engines.exact import ExactEngine
-from mars_lidar.engines.feedback import (
-    Check,
-    FeedbackEngine,
-    Grids,
-    KindArray,
-    expected_registrations,
-)
+from mars_lidar.engines.feedback import Check, FeedbackEngine, Grids, KindArray, expected_registrations
 from mars_lidar.engines.tolerances import TOL
 
 GIVEN = "pixels given to exact"
@@ -506,6 +500,17 @@ def test_parts_and_threads(engine: str):
 def test_level_must_run_here():
     with pytest.raises(ValueError, match="level must be one that this processor runs, got 'mmx'"):
         drawn(FeedbackEngine("mmx"), case(1.0, 1.0, 0.6375, 1000, items=4))
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("engine", ["feedback", "auto"])
+def test_progress_runs_once_to_its_end(engine: str):
+    flux, system = mixture()
+    recorded: list[float] = []
+    ml.simulate(flux, system, engine=engine, realizations=3000, progress=lambda done, of: recorded.append(done / of))
+    assert len(recorded) > 1  # every 50 ms, and at the end
+    assert recorded[-1] == 1.0
+    assert recorded == sorted(recorded)
 
 
 # The choice

@@ -221,13 +221,16 @@ def test_a_short_recovery_has_the_law_of_none(engine: str):
     mean_is(sample.counts, law.sum(), engine)
 
 
+AVALANCHES = {"afterpulsing": ml.Afterpulsing(probability=0.3, delay_ns=50.0), "twilight_ns": 2.0}
+
+
 @pytest.mark.parametrize(
     "kind", ["gaussian", "returns", "sampled", "long dead time", "waveform", "stationary waveform"]
 )
-def test_bits_are_those_of_every_level_thread_and_part(kind: str):
+@pytest.mark.parametrize("effects", [{"recovery_ns": 25.0}, AVALANCHES], ids=["recovery", "avalanches"])
+def test_bits_are_those_of_every_level_thread_and_part(kind: str, effects: dict[str, Any]):
     flux, system = image(kind)
-    system = system.replace(detector=replace(system.detector, recovery_ns=25.0))
-    bits_do_not_depend(flux, system)
+    bits_do_not_depend(flux, system.replace(detector=replace(system.detector, **effects)))
 
 
 def test_what_has_no_law_says_so():

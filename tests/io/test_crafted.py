@@ -22,7 +22,7 @@ from store_cases import SYSTEM, one_return
 
 import mars_lidar as ml
 from mars_lidar import io
-from mars_lidar._base.files import LIMIT, FileError, NpyFile, read_column
+from mars_lidar._base.files import LIMIT, FileError, NpyFile, read_column, reading
 from mars_lidar._base.hdf5 import SEAL
 from mars_lidar._base.tolerances import TOL
 from mars_lidar.dataset import DatasetRecipe, open_dataset
@@ -381,7 +381,28 @@ def test_a_cube_without_its_sum_is_refused(files):
     refused(r"cube\.h5 is damaged: it has no attribute sha256", io.load, files["cube.h5"], error=FileError)
 
 
+@pytest.mark.parametrize("name", ["cube.h5", "maps.h5", "table.h5", "photons.h5"])
+def test_a_changed_text_is_refused(files, tmp_path, name):
+    """Texts of attributes lie in a heap that has no checksum of HDF5's own."""
+    if name == "photons.h5":
+        pytest.importorskip("phconvert")
+        ml.simulate_timestamps(ml.Flux(np.ones((2, 3)), 0.1, 40.0), SHORT).save(tmp_path / name)
+    overwrite(tmp_path / name, b'"period_ns": 100.0', b'"period_ns": 101.0')
+    refused(rf"{name} is damaged: its attributes or variables", READERS[name], tmp_path / name, error=FileError)
+
+
 # The door that files are read through: no pipes, no bombs, and one error that names the file.
+
+
+def test_what_goes_wrong_behind_the_door_names_the_file(tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_text("a")
+    with pytest.raises(MemoryError, match=r"a\.txt"), reading(path):
+        raise MemoryError
+    with pytest.raises(PermissionError), reading(path):
+        raise PermissionError(13, "Permission denied", str(path))
+    with pytest.raises(FileError, match=r"a\.txt: cannot be read as JSON \(KeyError 'x'\)"), reading(path, "JSON"):
+        json.loads("{}")["x"]
 
 
 READERS = {

@@ -144,10 +144,7 @@ def test_the_parent_of_workers_does_not_know_where_they_are(make: Make) -> None:
     del taken
     dataset.set_epoch(1)
     assert (dataset.state_dict()["epoch"], dataset.state_dict()["start"]) == (1, 0)
-    for more, words in (
-        ({"seed": 9}, "seed 9"),
-        ({"given_here": 1, "workers_here": 2}, "no"),
-    ):
+    for more, words in (({"seed": 9}, "seed 9"), ({"given_here": 1, "workers_here": 2}, "no")):
         refused(words, dataset.load_state_dict, state | more)
 
 

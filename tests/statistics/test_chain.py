@@ -7,7 +7,7 @@ import pytest
 from harness import refused, system_of
 
 import mars_lidar as ml
-from mars_lidar.statistics import ConvergenceError, PhaseChain
+from mars_lidar.statistics import ConvergenceError, PhaseChain, photons_per_bin
 
 # photons per period, dead time in periods, re-arming
 CASES = [
@@ -50,6 +50,17 @@ def dense_by_rapp(chain):
     matrix = np.exp(-exposure) * -np.expm1(-chain.photons) / chain.loss
     matrix[j, arm] = (chain.refire + chain.again())[arm]
     return matrix
+
+
+def test_grid_of_the_statistics():
+    """A multiple of the histogram's bins, at least 512, that resolves the pulse or the samples of a waveform."""
+    system = system_of(0.6, bins=100)
+    size = photons_per_bin(ml.Flux(2.0, 0.5, 50.0), system).size
+    assert size % 100 == 0
+    assert size >= max(512, 2.9 / 0.00375)
+    assert photons_per_bin(ml.Flux(2.0, 0.5, 50.0), system, bins=77).size == 77
+    for samples, bins in ((7, 700), (1021, 1100)):
+        assert photons_per_bin(ml.Flux(waveform=np.ones(samples), background=0.5), system).size == bins
 
 
 @pytest.mark.parametrize(("total", "dead", "rearm"), CASES)

@@ -54,10 +54,11 @@ def test_statistics_are_those_of_the_exact_engine(mode: str, dead: float, start:
     check(ENGINES["exact"], case, law, {COUNTS, SHAPE})
 
 
+@pytest.mark.parametrize("start", ["armed", "stationary"])
 @pytest.mark.parametrize("mode", ["paralyzable", "synchronous", "wrapping gate"])
-def test_waveforms(mode: str):
+def test_waveforms(mode: str, start: str):
     wave = two_lobes() / 12
-    case = Case(f"{mode}, waveform", waveform_flux(wave, 0.3), view(mode, 0.7), 6000)
+    case = Case(f"{mode}, waveform, {start}", waveform_flux(wave, 0.3), view(mode, 0.7, start), 6000)
     law = law_of(case, ml.Flux(waveform=wave, background=0.3))
     check(ENGINES["exact"], case, law, {COUNTS, SHAPE})
 
@@ -493,15 +494,6 @@ def test_the_grid_of_the_histogram_is_not_the_one_of_the_moments(bins: int):
     known, law = paralyzable_moments(flux, system), exposure_moments(flux, system, tolerance=1e-6)
     assert float(mean_histogram(flux, system).sum()) == pytest.approx(known.mean, rel=1e-5)
     assert [float(law.mean), float(law.variance)] == pytest.approx(known[:2], rel=1e-5)
-
-
-@pytest.mark.parametrize("start", ["armed", "stationary"])
-def test_waveform_of_a_paralyzable_pixel(start: str):
-    wave = two_lobes() / 12
-    system = paralyzable_view(0.7, start)
-    law = ml.count_law(ml.Flux(waveform=wave, background=0.3), system)
-    case = Case(f"waveform, {start}", waveform_flux(wave, 0.3), system, 12_000)
-    check(ENGINES["sequential"], case, Law(None, pmf_of(law)), {COUNTS})
 
 
 def test_dead_times_round_one_bin_of_the_grid():

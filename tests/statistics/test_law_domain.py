@@ -14,6 +14,7 @@ from scipy import integrate, special, stats
 import mars_lidar as ml
 from mars_lidar.statistics import ConvergenceError, exposure_moments, mean_histogram
 from mars_lidar.statistics import joint as pixel_module
+from mars_lidar.statistics import pmf as pmf_module
 from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.exposure import refined_moments
 from mars_lidar.statistics.joint_grid import FoldedGrid, relative_residual
@@ -476,6 +477,21 @@ def test_phases_of_a_table() -> None:
         delay = (0.5 - phases.phase[node]) * PERIOD_NS
         moved = exposure_moments(ml.Flux(cells.signal, cells.background, delay), view).cumulants - entries.cumulants
         assert text[:, node] == pytest.approx(moved[:, :2], abs=1e-3)
+
+
+@pytest.mark.parametrize("lattice", [1, 2, 3])
+def test_laws_on_a_lattice_take_all_points(monkeypatch: pytest.MonkeyPatch, lattice: int):
+    """Counts that come in pairs have a second peak of the transform at -1, as narrow as the first."""
+    system, variance = view(0.5, 10_000), 3000.0 * lattice**2
+
+    def transform(cells: Cells, re: np.ndarray, im: np.ndarray, *_: Any) -> tuple[np.ndarray, np.ndarray]:
+        value = np.exp(0.3 * cells.system.cycles * ((re + 1j * im) ** lattice - 1.0))
+        return value.real, value.imag
+
+    monkeypatch.setattr(pmf_module, "characteristic", transform)
+    size = 2 * math.ceil(8 * math.sqrt(variance))
+    result = pmf_module._narrow(Cells.of(1.0, 1.0, system), size, 128, 1, variance, pmf_module.Remaining())
+    assert (result is not None) == (lattice == 1)
 
 
 def test_narrow_pulses_that_nothing_re_arms_within() -> None:

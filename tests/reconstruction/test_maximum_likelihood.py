@@ -345,6 +345,20 @@ def test_delays_of_pixels_without_signal_state_no_error():
         assert stats.binom.cdf(hold.sum(), hold.size, 0.9) > 1e-7
 
 
+def test_intervals_of_weak_returns():
+    """Few photons: 95 % intervals of delay as the docs state them by significance, each at 1e-4."""
+    system = make_system(75.0, 1000, 200, sigma_ns=1.0)
+    random = np.random.default_rng(20261129)
+    delay, signal = random.uniform(0.0, 100.0, 10_000), np.exp(random.uniform(np.log(1e-3), np.log(2e-2), 10_000))
+    for background in (0.003, 0.01):  # 9 and 16 registrations
+        estimate = ml.reconstruct(ml.simulate(ml.Flux(signal, background, delay), system, seed=17)[0, 0], system)
+        hold = np.abs((estimate.delay_ns - delay + 50.0) % 100.0 - 50.0) < 1.96 * estimate.delay_error_ns
+        for low, high, least in ((0.0, 4.0, 0.87), (4.0, 5.0, 0.92), (5.0, np.inf, 0.94)):
+            some = hold[estimate.detected & (estimate.significance >= low) & (estimate.significance < high)]
+            assert some.size > 300
+            assert stats.binom.cdf(int(some.sum()), some.size, least) > 1e-4
+
+
 @pytest.mark.parametrize("signal", [7.68513482, 3.49032099])
 def test_systematic_error_where_the_likelihood_has_no_maximum(signal: float):
     """It was that of a negative variance, with a warning of NumPy's."""

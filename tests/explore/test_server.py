@@ -78,6 +78,25 @@ def test_a_pixel_and_its_light(server: CubeServer, stored: Path):
             assert state["light"] == expected | {"delay": 0.0 if dark else 20.0 + 3.0 * column + row}
 
 
+def test_parts_of_the_file_are_read_as_they_are_asked_for(stored: Path):
+    class Counting:
+        def __init__(self, counts: Any) -> None:
+            self.counts, self.shape, self.dtype, self.asked = counts, counts.shape, counts.dtype, []
+
+        def __getitem__(self, key: Any) -> Any:
+            self.asked.append(key)
+            return self.counts[key]
+
+    with io.load(stored) as cube:
+        counting = Counting(cube.histogram)
+        object.__setattr__(cube, "histogram", counting)
+        server = CubeServer(cube, "x")
+        assert counting.asked == []
+        server.answer(urlsplit(server.url).path + "pixel?image=1&row=2&column=3")
+        assert counting.asked == [(1, 2, 3)]
+        server.close()
+
+
 @pytest.mark.parametrize("method", ["truth", "peak", "likelihood", "image"])
 def test_rows(server: CubeServer, stored: Path, method: str):
     _, content, _ = got(server, f"/rows?image=1&first=2&rows=3&method={method}")

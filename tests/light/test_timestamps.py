@@ -48,7 +48,7 @@ def test_pixels_are_views_in_order_of_time(system: ml.System, flux: ml.Flux):
     for y in range(2):
         for x in range(3):
             single = times.pixel(y, x)
-            assert single.shape == (1, 1)
+            assert (single.shape, single.info) == ((1, 1), times.info)
             assert len(single) == times.counts[y, x]
             assert np.all(np.diff(single.times_ns) >= system.detector.dead_time_ns - 1e-4)
             assert np.shares_memory(single.cycle, times.cycle) or len(single) == 0

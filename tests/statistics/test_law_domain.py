@@ -13,6 +13,7 @@ from scipy import integrate, special, stats
 
 import mars_lidar as ml
 from mars_lidar.statistics import ConvergenceError, exposure_moments, mean_histogram
+from mars_lidar.statistics import exposure as exposure_module
 from mars_lidar.statistics import joint as pixel_module
 from mars_lidar.statistics import pmf as pmf_module
 from mars_lidar.statistics.cells import Cells
@@ -195,6 +196,29 @@ def test_refusals_say_what_to_use(signal: float, background: float, dead: float,
     shapes = () if start == "stationary" else (mean_histogram, ml.registration_pdf)  # every period has the same one
     for law in (ml.count_law, *shapes):
         refused(message, law, ml.Flux(signal, background, 50.0), system, error=(ConvergenceError, MemoryError))
+
+
+@pytest.mark.full
+@pytest.mark.parametrize(
+    ("signal", "dead", "cycles", "sigma", "start"),
+    [(1.0, 1e-6, 1, 1e-6, "stationary"), (1000.0, 1e-6, 2, 1e-6, "armed")],
+)
+def test_work_of_refused_laws(
+    monkeypatch: pytest.MonkeyPatch, signal: float, dead: float, cycles: int, sigma: float, start: str
+):
+    """A refusal comes before the budget is spent: the light of each grid is in it, and the periods run."""
+    done: list[float] = []
+    run = exposure_module._run
+
+    def recorded(cells: Cells, bins: int, *arguments: Any) -> Any:
+        result = run(cells, bins, *arguments)
+        done.append(float(bins) * (10.0 + min(cycles, max(int(result.settled[0]), 1))))
+        return result
+
+    monkeypatch.setattr(exposure_module, "_run", recorded)
+    with pytest.raises(ConvergenceError, match="the limit of a law"):
+        ml.count_law(ml.Flux(signal, 0.0, 50.0), view(dead, cycles, sigma, start))
+    assert sum(done) <= LAW.recursion
 
 
 def test_a_law_that_is_refused_is_to_be_had_elsewhere(monkeypatch: pytest.MonkeyPatch):

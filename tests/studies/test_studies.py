@@ -86,6 +86,13 @@ def test_leading_modes_are_those_of_the_dense_matrix(rearm):
     assert leading.automatic_rule() == dense.automatic_rule()
 
 
+def test_modes_without_convergence_name_the_cell(monkeypatch):
+    monkeypatch.setattr(covariance, "_WORST", 0.0)
+    light, system = ml.Flux(1.0, 1.0, 50.0), covariance.QUICK.system(100.0, 30.0)
+    leading = covariance.LeadingTerms.of(ml.statistics.holding_time_covariance(light, system, bins=128))
+    refused(r"S = 1, B = 1 .*eigenvalue 1 has a residual", leading.spectral_sum, error=ConvergenceError)
+
+
 @pytest.mark.full
 def test_law_figures_make_sense(quick):
     settings, rows = law.QUICK, read_csv(quick / "law.csv")
@@ -417,6 +424,18 @@ def test_files_of_runtimes(tmp_path):
     assert "40.83" in text
     assert "`Table` of this run, 5 x 4 entries" in text  # flux 0 is a node of either axis
     assert study.figures == ["runtime_axes.png"]
+
+
+def test_flux_beyond_the_table_is_left_out():
+    contender = next(c for c in runtime.contenders(runtime.Tables((4, 3))) if c.name == runtime.NUMPY)
+    takes = [contender.takes(ml.Flux(*light, 1.0)) for light in ((0.01, 10.0), (0.009, 1.0), (0.1, 10.1))]
+    assert takes == [True, False, False]
+
+
+def test_pipeline_takes_the_nearest_entry(system):
+    table = NumpyTable.of(ml.Table.build(system, (0.01, 10.0, 4), (0.1, 10.0, 3)), system)
+    signal, background = np.array([0.011, 0.3, 9.0, 99.0]), np.array([0.1, 0.4, 8.0, 0.01])
+    assert table.rows(signal, background).tolist() == [0, 4, 11, 9]
 
 
 def test_pipeline_draws_the_law_of_its_table(system):

@@ -62,13 +62,17 @@ def settled(
 class Timing:
     """The map from registrations in equal parts of the period to records in the bins of the histogram, for some cells.
 
-    With jitter, times are uniform within their parts, narrow compared with it (`settled`). Without, an edge of a code
-    divides the registrations of a part as it divides the photons.
+    With jitter, registrations of a part lie in its pieces, which resolve the light, as its first photons do. Without,
+    an edge of a code divides the registrations of a part as it divides the photons.
     """
 
     def __init__(self, cells: Cells, parts: int | None = None) -> None:
         self.system, self._cells = cells.system, cells
         self.parts = parts or self._usual_parts(cells)
+        split = 1
+        if self.system.detector.jitter is not None:
+            split = math.ceil(TOL.pieces_per_sigma / (max(cells.finest, 1e-9) * self.parts))
+        self.pieces = self.parts * max(1, min(split, TOL.most_parts // self.parts))
 
     @staticmethod
     def _usual_parts(cells: Cells) -> int:
@@ -85,23 +89,37 @@ class Timing:
 
     @cached_property
     def _jitter(self) -> NDArray[np.complex128] | None:
-        """Transform of P(a record is d parts after its avalanche), for times that are uniform within their parts."""
+        """Transform of P(a record is d pieces after its avalanche), for times that are uniform within their pieces."""
         jitter = self.system.detector.jitter
         if jitter is None:
             return None
-        part = self.system.period_ns / self.parts
+        piece = self.system.period_ns / self.pieces
         low, high = jitter.reach_ns()
-        first, last = math.floor(low / part) - 1, math.ceil(high / part) + 1
-        area = jitter.integral(np.arange(first - 1, last + 2) * part)
-        mass = np.maximum(np.diff(area, 2), 0.0) / part
-        kernel = np.bincount(np.arange(first, last + 1) % self.parts, mass, minlength=self.parts)
+        first, last = math.floor(low / piece) - 1, math.ceil(high / piece) + 1
+        area = jitter.integral(np.arange(first - 1, last + 2) * piece)
+        mass = np.maximum(np.diff(area, 2), 0.0) / piece
+        kernel = np.bincount(np.arange(first, last + 1) % self.pieces, mass, minlength=self.pieces)
         return np.fft.rfft(kernel / kernel.sum())
+
+    def _within(self, cells: Cells) -> FloatArray:
+        """Fraction (cells, parts, pieces of a part) of the registrations of a part in each of its pieces.
+
+        They are first photons of the part, or without a dead time all of them.
+        """
+        before = photons_before(cells, np.arange(self.pieces + 1) / self.pieces)
+        start = before[:, :-1].reshape(cells.size, self.parts, -1)
+        end = before[:, 1:].reshape(start.shape)
+        light = end - start
+        if self.system.dead_time_periods * self.parts >= 1.0:
+            light = -np.exp(start[..., :1] - start) * np.expm1(-light)
+        total = light.sum(-1, keepdims=True)
+        return np.where(total > 0, light / np.where(total > 0, total, 1.0), 1.0 / light.shape[-1])
 
     @cached_property
     def _edges(self) -> FloatArray:
-        """Edges (bins + 1,) of the bins of the histogram, in parts of the period."""
+        """Edges (bins + 1,) of the bins of the histogram, in pieces of the period."""
         density, bins = self.system.detector.code_density, self.system.bins
-        split = self.parts // bins
+        split = self.pieces // bins
         if density is None:
             return np.arange(bins + 1.0) * split
         edges, codes = code_edges(density), len(density)
@@ -110,37 +128,57 @@ class Timing:
 
     def forward(self, histogram: FloatArray, cell: int | None = None) -> FloatArray:
         """Records (..., bins) of registrations (..., parts), of all cells or of one."""
-        if self._jitter is not None:
-            spectrum = np.fft.rfft(histogram, axis=-1) * self._jitter
-            histogram = np.maximum(np.fft.irfft(spectrum, self.parts, axis=-1), 0.0)
         rows = histogram.reshape(-1, self.parts)
+        step = max(1, TOL.timing_bytes // (8 * self.pieces))
+        records = [
+            self._records(rows[k : k + step], slice(k, k + step) if cell is None else slice(cell, cell + 1))
+            for k in range(0, len(rows), step)
+        ]
+        return np.concatenate(records).reshape(*histogram.shape[:-1], -1)
+
+    def _records(self, rows: FloatArray, some: slice) -> FloatArray:
+        """Records (n, bins) of registrations (n, parts) of some cells, or of one."""
+        if self.pieces > self.parts:
+            rows = (rows[:, :, None] * self._within(self._cells.part(some))).reshape(-1, self.pieces)
+        if self._jitter is not None:
+            spectrum = np.fft.rfft(rows, axis=-1) * self._jitter
+            rows = np.maximum(np.fft.irfft(spectrum, self.pieces, axis=-1), 0.0)
         before = np.concatenate([np.zeros((len(rows), 1)), np.cumsum(rows, axis=-1)], axis=-1)
         whole, rest = self._split
-        if cell is not None and len(rest) > 1:
-            rest = rest[cell]
-        at = before[:, whole] + rest * rows[:, np.minimum(whole, self.parts - 1)]
-        return np.asarray(np.diff(at, axis=-1).reshape(*histogram.shape[:-1], -1), dtype=np.float64)
+        rest = rest[some] if len(rest) > 1 else rest
+        at = before[:, whole] + rest * rows[:, np.minimum(whole, self.pieces - 1)]
+        return np.asarray(np.diff(at, axis=-1), dtype=np.float64)
 
     def backward(self, weights: FloatArray) -> FloatArray:
         """Mean weight (..., parts) of registrations of the only cell in a part, for weights (..., bins) of records."""
+        rows = weights.reshape(-1, weights.shape[-1])
+        step = max(1, TOL.timing_bytes // (8 * self.pieces))
+        within = self._within(self._cells)[0] if self.pieces > self.parts else None
+        mean = [self._mean_weights(rows[k : k + step], within) for k in range(0, len(rows), step)]
+        return np.concatenate(mean).reshape(*weights.shape[:-1], self.parts)
+
+    def _mean_weights(self, weights: FloatArray, within: FloatArray | None) -> FloatArray:
+        """Mean weight (n, parts) of registrations, `within` (parts, pieces) as in the pieces of a part."""
         whole, rest = self._split
         whole, rest = whole[1:-1], rest[0, 1:-1, None]
-        step = np.diff(weights.reshape(-1, weights.shape[-1]), axis=-1).T  # at each edge
-        beyond = np.zeros((self.parts + 2, step.shape[1]))
-        np.add.at(beyond, whole, step * (1.0 - rest))  # several edges may lie in one part
+        step = np.diff(weights, axis=-1).T  # at each edge
+        beyond = np.zeros((self.pieces + 2, step.shape[1]))
+        np.add.at(beyond, whole, step * (1.0 - rest))  # several edges may lie in one piece
         np.add.at(beyond, whole + 1, step * rest)
-        at = np.cumsum(beyond[: self.parts], axis=0).T.reshape(*weights.shape[:-1], self.parts) + weights[..., :1]
+        at = np.cumsum(beyond[: self.pieces], axis=0).T + weights[:, :1]
         if self._jitter is not None:
-            at = np.fft.irfft(np.fft.rfft(at, axis=-1) * np.conj(self._jitter), self.parts, axis=-1)
+            at = np.fft.irfft(np.fft.rfft(at, axis=-1) * np.conj(self._jitter), self.pieces, axis=-1)
+        if within is not None:
+            at = (at.reshape(len(weights), self.parts, -1) * within).sum(-1)
         return np.asarray(at, dtype=np.float64)
 
     @cached_property
     def _split(self) -> tuple[NDArray[np.int64], FloatArray]:
-        """The part (bins + 1,) of each edge, and what fraction (cells or 1, bins + 1) of that part is before the edge.
+        """The piece (bins + 1,) of each edge, and the fraction (cells or 1, bins + 1) of that piece before the edge.
 
         It is a fraction of the photons without jitter, of the time otherwise.
         """
-        whole = np.minimum(np.floor(self._edges), self.parts).astype(np.int64)
+        whole = np.minimum(np.floor(self._edges), self.pieces).astype(np.int64)
         rest = (self._edges - whole)[None]
         if self._jitter is not None or not rest.any():
             return whole, rest

@@ -197,9 +197,11 @@ class Tolerances:
     synchronous_terms, synchronous_terms_together, synchronous_sums, synchronous_counts, synchronous_points
         Terms of (6), and counts at the lower end, from which the transform (21) is used; terms computed together, of so
         many incomplete beta functions each; points of the circle evaluated together.
-    parts_per_sigma, most_parts
+    parts_per_sigma, pieces_per_sigma, most_parts
         Parts of the period per sigma of jitter and light, at first (a part adds 1/6 of its square to the variance: 3e-4
-        of sigma^2), and at most (512 KiB an array).
+        of sigma^2); pieces of parts per width of the narrowest light; and of either at most (512 KiB an array).
+    timing_bytes
+        Of the histograms on pieces that are computed together.
     """
 
     rounding: float = 1e-12
@@ -292,6 +294,8 @@ class Tolerances:
     synchronous_counts: int = 20
     synchronous_points: int = 32
     parts_per_sigma: float = 24.0
+    pieces_per_sigma: float = 4.0
+    timing_bytes: int = 32 << 20
     most_parts: int = 2**16
 
 

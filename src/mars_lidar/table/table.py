@@ -128,7 +128,7 @@ class Table:
             Laser, detector and histogram. Its detection efficiency and dark counts are ignored (`System.detected`).
         signal, background
             Axes, detected photons per period (`Flux.detected`): ``(low, high, points)`` for 0 and `points` log-spaced
-            values, or an array of values. Between 0 and the next value interpolation is linear.
+            values, or an array of values. Between 0 and the next value cumulants per photon are interpolated.
         method
             ``"exposure"``: exact statistics of the finite exposure. ``"mars"``: the paper's, Markov chain and
             Gaussian of the Markov-renewal law, asymptotic in the exposure.

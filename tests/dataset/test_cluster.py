@@ -74,6 +74,21 @@ def test_a_cluster_that_starts_with_no_worker_fills(tmp_path, recipe):
     assert files(tmp_path / "one.zarr") == files(tmp_path / "two.zarr")
 
 
+def test_parts_in_flight_follow_the_workers_that_are_there():
+    threads = [0]
+    team = cluster_module.Team(None, None, lambda: threads[0], cluster_module.Dispatch(3, 512, 50.0))  # type: ignore[arg-type]
+    assert team.capacity() == 512
+    threads[0] = 320
+    assert team.capacity() == 960
+    many = 1_000_000
+    assert team.parts_of_a_task(0.0, many) == 1
+    assert team.parts_of_a_task(10.0, many) == 1
+    assert team.parts_of_a_task(0.5, many) == 13  # 320 workers make 640 such parts a second: 49 tasks
+    assert team.parts_of_a_task(1e-6, many) == 1000
+    assert team.parts_of_a_task(0.5, 1000) == 3  # of the last parts each worker gets some
+    assert team.parts_of_a_task(0.5, 100) == 1
+
+
 def test_a_worker_of_another_version_is_refused_before_it_writes(tmp_path):
     own = cluster_module.fingerprint()
     for version, fingerprint, words in (("0.0.1", own, "has mars-lidar"), (ml.__version__, "0", "draws other counts")):

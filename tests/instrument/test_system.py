@@ -343,6 +343,10 @@ def test_scale_and_type_of_the_record_do_not_matter(values):
     assert ml.SampledPulse(values, 2.0).bin_energy(20.0, 100.0, 50) == pytest.approx(expected, abs=1e-12)
 
 
+def test_bool_records_are_taken_as_numbers():
+    assert ml.SampledPulse([False, True], 1.0).support_ns() == (-0.5, 0.5)
+
+
 def test_empty_ends_are_left_out():
     pulse = ml.SampledPulse([0, 0, 1, 2, 0, 1, 0], 1.0, "first")
     assert pulse.support_ns() == (2.0, 6.0)

@@ -516,18 +516,21 @@ def test_errors_of_reading_later_name_the_file(tmp_path):
 
 @pytest.fixture
 def folder(tmp_path):
-    """A good scene and five that are damaged or no files."""
+    """A good scene and seven that are damaged or no files."""
     here = tmp_path / "in"
     here.mkdir()
     np.savez(here / "good.npz", depth=np.full((4, 5), 2.0))
     Image.fromarray(np.full((4, 5), 2000, np.uint16)).save(here / "a_depth.png")
     (here / "a_depth.png").write_bytes((here / "a_depth.png").read_bytes()[:-30])
     (here / "c.mat").write_bytes(b"MATLAB 5.0 MAT-file" + bytes(109) + b"\xff" * 64)
+    write_h5(here / "d.mat", {"depths": np.ones((2, 5, 4)), "images": np.ones((2, 3, 5, 4), np.uint8)})
+    (here / "d.mat").write_bytes((here / "d.mat").read_bytes()[:1500])
     with h5py.File(here / "e.mat", "w") as file:
         file.create_dataset("depths", data=np.ones((1, 5, 4)), chunks=(1, 5, 4), compression="gzip")
         file["images"] = np.ones((1, 3, 5, 4), np.uint8)
         place = file["depths"].id.get_chunk_info(0).byte_offset
     overwrite(here / "e.mat", place, b"\xff" * 6)
+    (here / "f.pfm").write_bytes(b"Pf\n4 4\n-1\n" + bytes(20))
     np.save(here / "g_depth.npy", np.full((4, 5), -1.0))
     if os.name == "posix":
         (here / "h_depth.npy").symlink_to("/dev/zero")

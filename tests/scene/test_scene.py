@@ -141,6 +141,10 @@ def test_resize_to_the_same_size_changes_nothing(scene):
 # --- radiometry --------------------------------------------------------------------------------------------
 
 
+def test_resize_of_white_stays_white():
+    assert (Scene(np.ones((997, 3)), 1.0).resize((101, 7)).reflectivity == 1.0).all()
+
+
 @pytest.mark.parametrize("attenuation", ["none", "inverse_square"])
 @pytest.mark.parametrize("ambient", ["uniform", "reflectivity", "map"])
 @pytest.mark.parametrize(("signal", "sbr"), [(1.0, 1.0), (0.037, 0.02), (12.5, 80.0), (1e-6, 0.6)])

@@ -86,6 +86,17 @@ def test_order_of_convergence(dead, start):
     assert (errors[2] < 2e-6).all()
 
 
+def test_sampled_pulse_converges_at_second_order():
+    pulse = ml.SampledPulse(np.array([1.0, 5.0, 2.0, 0.5]), 1.3)
+    system = system_of(0.6375, pulse=pulse, cycles=40)
+    errors = []
+    exact = on_grid(3.0, 0.7, system, 16384, delay_ns=33.3)[0][0]
+    for n in (128, 512, 2048):
+        errors.append(abs(on_grid(3.0, 0.7, system, n, delay_ns=33.3)[0][0] - exact))
+    assert errors[2] < errors[0] / 100
+    assert errors[2] < 1e-5
+
+
 @pytest.mark.parametrize("start", ["armed", "stationary"])
 def test_no_dead_time_is_poisson_and_small_ones_lead_there(start):
     system = system_of(0.0, start=start)

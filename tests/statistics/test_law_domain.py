@@ -86,6 +86,19 @@ def test_factors_of_locked_pixels(signal: float, background: float, dead: float,
     assert grid.residual < 1e-11
 
 
+@pytest.mark.parametrize(("signal", "background", "dead"), [(1.0, 0.5, 0.6375), (20.0, 0.1, 0.97), (5.0, 1.0, 2.003)])
+def test_factors_of_the_feedback_equation(signal: float, background: float, dead: float):
+    """The factors, whose full row is put back, and the sweeps solve the same equations, forward and transposed."""
+    cells = Cells.of(signal, background, view(dead), delay_ns=33.0)
+    swept, direct = FoldedGrid.of(cells, 512), FoldedGrid.of(cells, 512)
+    direct.direct = True
+    np.testing.assert_allclose(direct.state, swept.state, rtol=1e-7, atol=1e-12)
+    weights = np.random.default_rng(1).normal(size=(3, 512))
+    a, b = direct.adjoint(weights), swept.adjoint(weights)
+    np.testing.assert_allclose(a, b, atol=1e-7 * np.abs(b).max())
+    assert direct.residual < 1e-9
+
+
 def test_stationary_shape_without_a_dead_time():
     """The light itself, whatever the width of the pulse."""
     system = view(0.0, 1, 1e-6, bins=2)

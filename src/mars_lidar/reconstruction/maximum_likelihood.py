@@ -27,7 +27,7 @@ NEGLIGIBLE = 0.5  # systematic error, in standard errors: intervals of 95 % then
 class MaximumLikelihood(Method):
     """Maximum-likelihood S, B and delay, given the armed time estimated from the histogram (R9, R10).
 
-    Intervals of 95 % hold in 94 to 95 % of the pixels with a significance above 5, in 87 to 92 % of those below 4: weak
+    Intervals of 95 % hold in 93 to 95 % of the pixels with a significance above 5, in 87 to 92 % of those below 4: weak
     returns are detected where noise resembles them. They hold less often in pixels that remember the start of
     the exposure, whose count has a standard deviation below one (docs/reconstruction.md, limits).
 

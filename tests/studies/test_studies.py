@@ -8,6 +8,7 @@ import sys
 import types
 from dataclasses import replace
 from importlib import import_module
+from itertools import pairwise
 from pathlib import Path
 
 import h5py
@@ -71,6 +72,18 @@ def test_covariance_figures_make_sense(quick):
     text = (quick / "covariance.md").read_text()
     assert "- cells skipped: 0" in text
     assert "125.91" in text
+
+
+@pytest.mark.full
+def test_rules_of_the_covariance_sum():
+    cells = covariance.compute(covariance.QUICK, "centre", str)
+    errors = [covariance.mean_error(cells, covariance.cutoff_name(c)) for c in (0, 20, 500)]
+    assert all(first > other for first, other in pairwise(errors))
+    best = covariance.best_cutoff(cells)
+    assert covariance.mean_error(cells, covariance.cutoff_name(best)) <= errors[1]
+    for cell in cells:
+        expected = -2 * cell.terms.exact_sum / cell.terms.sigma2
+        assert cell.relative_error("cut-off 0") == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("rearm", ["centre", "edge"])

@@ -9,7 +9,7 @@ import inspect
 import re
 import warnings
 from collections.abc import Callable, Iterable, Iterator
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -143,4 +143,9 @@ def test_every_parameter_is_described_and_typed(name: str):
             if not known.get(each.name) and not re.search(rf"`[^`]*\b{each.name}\b[^`]*`", text)
         ]
         problems += [f"{method} has no text"] if not inspect.getdoc(function) else []
+    problems += [
+        f"{member} has no text"
+        for member, value in vars(thing).items()
+        if not member.startswith("_") and isinstance(value, property | cached_property) and not value.__doc__
+    ]
     assert not problems, f"{name}: {problems}"

@@ -375,6 +375,19 @@ def files(tmp_path) -> dict[str, Path]:
     return {path.name: path for path in tmp_path.glob("*.h5")}
 
 
+def test_a_changed_number_is_refused(files):
+    """By the checksum of its chunk: the bytes are changed in the file, behind HDF5's back."""
+    path = files["cube.h5"]
+    with h5py.File(path) as file:
+        counts, light = (file[name].id.get_chunk_info(0) for name in ("histogram", "signal"))
+    for part, read in ((counts, lambda cube: cube.histogram[0]), (light, lambda cube: cube.flux.signal)):
+        overwrite(path, part.byte_offset + part.size // 2, 4)
+        refused(r"cube\.h5", lambda read=read: read(io.load(path)), error=FileError)
+        overwrite(path, part.byte_offset + part.size // 2, 4)
+    with io.load(path) as cube:
+        assert cube.histogram[0].sum() == cube.registrations
+
+
 def test_a_cube_without_its_sum_is_refused(files):
     with h5py.File(files["cube.h5"], "r+") as file:
         del file.attrs[SEAL]

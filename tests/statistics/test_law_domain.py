@@ -414,11 +414,9 @@ DARK = 1e-9  # background
 Figures = tuple[float, float]
 
 
-def system(
-    dead: float, sigma: float, cycles: int = 50, start: str = "armed", mode: str = "nonparalyzable"
-) -> ml.System:
+def system(dead: float, sigma: float, cycles: int = 50, start: str = "armed", **detector: Any) -> ml.System:
     """Times in periods."""
-    return system_of(dead, cycles, 2, sigma=sigma, start=start, mode=mode)
+    return system_of(dead, cycles, 2, sigma=sigma, start=start, **detector)
 
 
 def by_count_law(*light: float, view: ml.System, delay_ns: float) -> Figures:
@@ -486,19 +484,33 @@ def test_near_whole_periods(law: Any, whole: int, apart: float, sigma: float) ->
     assert not refusal or ("engine 'exact'" in refusal and "joint_law" not in refusal)  # which refuses it too
 
 
-@pytest.mark.parametrize("delay", [0.0, 0.5, 0.5 + 2e-6])
-def test_against_photon_by_photon_simulation(delay: float) -> None:
-    view, shots = system(1.0, 1e-6), 40_000
-    light = 1.5, 0.1, delay * PERIOD_NS
-    counts = ml.simulate(ml.Flux(*light), view, engine="sequential", realizations=shots, seed=17).sum(-1).ravel()
-    law = exposure_moments(ml.Flux(*light), view)
+SIMULATED: dict[str, tuple[tuple[float, float, float], ml.System, str]] = {
+    **{
+        f"a pulse of a millionth of a period at {delay}": ((1.5, 0.1, delay), system(1.0, 1e-6), "sequential")
+        for delay in (0.0, 0.5, 0.5 + 2e-6)
+    },
+    "stationary, at most one count": (
+        (0.648, 0.208, 0.2815),
+        system(24.745, 0.00628, 20, "stationary", jitter=ml.Jitter(sigma_ns=0.000355 * PERIOD_NS)),
+        "exact",
+    ),
+    "stationary, two or three counts": ((6.19, 0.0637, 0.0), system(28.504, 0.0689, 60, "stationary"), "exact"),
+}
+
+
+@pytest.mark.parametrize("name", SIMULATED)
+def test_moments_are_those_of_a_simulation(name: str) -> None:
+    (signal, background, delay), view, engine = SIMULATED[name]
+    flux, shots = ml.Flux(signal, background, delay * PERIOD_NS), 40_000
+    counts = ml.simulate(flux, view, engine=engine, realizations=shots, seed=17).sum(-1).ravel()
+    law = exposure_moments(flux, view)
     mean, variance = float(law.mean), float(law.variance)
     require(
         {
             "mean": 2.0 * stats.norm.sf(abs(counts.mean() - mean) / np.sqrt(variance / shots)),
             "variance": 2.0 * stats.norm.sf(abs(variance_score(counts[:, None], variance)[0])),
         },
-        f"a pulse of a millionth of a period at {delay}",
+        name,
     )
 
 

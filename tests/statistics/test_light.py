@@ -1,5 +1,6 @@
 """Every prediction is of (flux, system): a pixel, a row, an image; one return, several, a waveform."""
 
+import inspect
 from collections.abc import Callable
 from typing import Any
 
@@ -10,7 +11,7 @@ from scipy import stats
 from scipy.special import ndtr
 
 import mars_lidar as ml
-from mars_lidar import statistics
+from mars_lidar import reconstruction, statistics
 
 SYSTEM = make_system(60.0, 200, 32, sigma_ns=2.0)
 IMAGE = ml.Flux(np.array([[0.5, 2.0, 0.0], [1.0, 0.1, 3.0]]), 0.3, np.array([[20.0, 40.0, np.nan], [60.0, 80.0, 10.0]]))
@@ -67,6 +68,24 @@ def test_laws_of_one_pixel_ask_for_one(name: str) -> None:
     getattr(ml, name)(IMAGE[0:1, 1:2], SYSTEM)
     with pytest.raises(ValueError, match=r"flux must be one pixel, such as flux\[0, 0\], got pixels of shape \(2, 3\)"):
         getattr(ml, name)(IMAGE, SYSTEM)
+
+
+def test_every_prediction_takes_flux_and_system_first() -> None:
+    """By their signatures; laws of given numbers (`matched_pmf`, cumulants) and of given rates have no light."""
+    results = {}
+    for home in (statistics, reconstruction):
+        for name in home.__all__:
+            thing = getattr(home, name)
+            if inspect.isfunction(thing):
+                results[name] = list(inspect.signature(thing).parameters)
+    light = {name: names for name, names in results.items() if "flux" in names}
+    assert len(light) >= 13, sorted(light)
+    for name, names in light.items():
+        first = names.index("flux")
+        assert names[first + 1] == "system", name
+    for name, names in results.items():
+        assert not {"signal", "background", "delay_ns", "waveform"} <= set(names), name
+        assert not ({"signal", "background"} <= set(names)), name
 
 
 def test_several_returns_are_those_of_the_exact_engine() -> None:

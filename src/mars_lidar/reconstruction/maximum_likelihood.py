@@ -214,7 +214,7 @@ def systematic_error(flux: Flux, system: System) -> tuple[FloatArray, FloatArray
 
     The likelihood takes the light and the armed periods of a bin from its histogram and knows no effect of the detector
     beyond efficiency and dark counts. Its score at the exact mean histogram (`mars_lidar.mean_histogram`), which
-    includes electronics dead time, twilight and jitter, gives the error that no exposure averages out.
+    includes electronics dead time, jitter and code widths, gives the error that no exposure averages out.
     `mars_lidar.reconstruct` computes it at the estimates of three pixels, and warns of half a standard error.
 
     Parameters

@@ -40,8 +40,8 @@ def constant_light_rate(rate_hz: float, detector: Detector) -> float:
     rate_hz
         Photons per second at the pixel, before its detection efficiency; dark counts are added.
     detector
-        A detector of mode ``"nonparalyzable"`` without crosstalk and without a longer dead time of the electronics. It
-        may have `recovery_ns` or afterpulses of all generations, but not both.
+        A detector of mode ``"nonparalyzable"`` without crosstalk, limits of events or a longer dead time of the
+        electronics. It may have `recovery_ns` or afterpulses of all generations, but not both.
 
     Returns
     -------

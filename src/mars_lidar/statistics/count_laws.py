@@ -182,7 +182,10 @@ def count_law(
     TypeError
         Not a `Flux` or not a `System`.
     ValueError
-        An unknown `method`, a tolerance out of range, or a detector that the method does not describe.
+        An unknown `method`, a tolerance out of range, or a detector that the method does not describe: with a moving
+        gate, afterpulses, twilight pulses, slow recovery, crosstalk or limits of events; with electronics dead time,
+        but for ``"exact"`` in the modes above; for ``"mars"`` and ``"renewal"``, of another mode than
+        ``"nonparalyzable"``; for ``"mars"``, with jitter or code widths.
     ConvergenceError
         No grid meets the tolerance, or the exposure is too long to be computed; the message names the cell.
 

@@ -331,7 +331,8 @@ def exposure_moments(
         Not a `Flux` or not a `System`.
     ValueError
         A tolerance out of range; a detector of mode ``"synchronous"``, with a moving gate, or with effects that this
-        law does not describe.
+        law does not describe: afterpulses, twilight pulses, slow recovery, crosstalk, electronics dead time, limits of
+        events.
     ConvergenceError
         No grid up to 2^20 bins meets the tolerance, or the state has not repeated after some 10^5 to 10^7 periods of a
         longer exposure; the message names the cell.

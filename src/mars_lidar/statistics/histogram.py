@@ -51,7 +51,8 @@ def mean_histogram(flux: Flux, system: System, *, tolerance: float = 1e-4, threa
     TypeError
         Not a `Flux` or not a `System`.
     ValueError
-        A tolerance out of range, a moving gate, or effects whose mean is not known (afterpulses, crosstalk).
+        A tolerance out of range, a moving gate, or effects whose mean is not known: afterpulses, twilight pulses, slow
+        recovery, crosstalk, limits of events, and electronics dead time in other modes.
     ConvergenceError
         No grid meets the tolerance, or the exposure is too long to be computed; the message names the cell.
 

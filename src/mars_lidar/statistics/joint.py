@@ -417,7 +417,9 @@ def joint_law(flux: Flux, system: System, *, tolerance: float = 1e-3) -> JointLa
     TypeError
         Not a `Flux` or not a `System`.
     ValueError
-        Several pixels, a tolerance out of range, or a detector that this law does not describe.
+        Several pixels, a tolerance out of range, or a detector that this law does not describe: of another mode than
+        ``"nonparalyzable"``, or with afterpulses, twilight pulses, slow recovery, crosstalk, electronics dead time or
+        limits of events.
     ConvergenceError
         No grid up to 2^17 bins meets the tolerance, or the start-up transient does not end within the exposure, which
         is too long to be computed bin by bin (more than 2^22 bins x periods); the message names the pixel.

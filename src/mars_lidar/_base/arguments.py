@@ -22,7 +22,8 @@ from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 
-from mars_lidar._base.checks import did_you_mean, numbers, unmasked, whole
+from mars_lidar._base.checks import numbers, unmasked, whole
+from mars_lidar._base.spelling import did_you_mean
 
 P = ParamSpec("P")
 R = TypeVar("R")

@@ -1,6 +1,5 @@
 """Argument checks: every message names the argument, the value given and what is allowed."""
 
-import difflib
 import math
 from collections.abc import Sequence
 from numbers import Integral, Real
@@ -9,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from mars_lidar._base.spelling import did_you_mean
 from mars_lidar._base.types import FloatArray
 
 
@@ -126,9 +126,3 @@ def known_keys(name: str, mapping: Any, allowed: tuple[str, ...], needed: tuple[
         if key not in mapping:
             raise ValueError(f"{name} must give {key}; needed: {', '.join(needed)}")
     return mapping
-
-
-def did_you_mean(word: Any, allowed: Sequence[str]) -> str:
-    """`` (did you mean 'near'?)`` for the allowed word nearest to `word`, or an empty text where none is near."""
-    near = difflib.get_close_matches(str(word), [str(each) for each in allowed], 1)
-    return f" (did you mean {near[0]!r}?)" if near else ""

@@ -42,6 +42,9 @@ class Tolerances:
         Sum of a sparse matrix up to which its elements are counts of 32 bits.
     shown_values, shown_text
         Values of an array or sequence, and characters of other values, that a `repr` writes out.
+    suggestions, similarity
+        Names that a message suggests for a misspelt one, at most; ratio of `difflib.SequenceMatcher` from which a name
+        is similar to it.
     map_pixels
         Of a map's longer side in a notebook, more than the picture has.
     patience_s, often_s, seldom_s
@@ -72,6 +75,8 @@ class Tolerances:
     counts: int = 2**32
     shown_values: int = 4
     shown_text: int = 240
+    suggestions: int = 3
+    similarity: float = 0.7
     map_pixels: int = 160
     patience_s: float = 0.5
     often_s: float = 0.2

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import difflib
 import os
 import re
 import sys
@@ -19,10 +18,10 @@ from cyclopts import App
 from cyclopts import exceptions as wrong
 
 from mars_lidar._base import checks
-from mars_lidar._base.checks import did_you_mean
 from mars_lidar._base.files import WriteError, beside
 from mars_lidar._base.progress import Bar
 from mars_lidar._base.resources import no_thread
+from mars_lidar._base.spelling import did_you_mean
 from mars_lidar.cli.options import describe
 
 if TYPE_CHECKING:
@@ -154,11 +153,11 @@ def _usage_message(error: wrong.CycloptsError, commands: str) -> str:
     if isinstance(error, wrong.UnknownOptionError):
         option = (error.token.keyword or error.token.value).partition("=")[0]
         options = [name for argument in error.argument_collection for name in argument.names]
-        return f"{commands} has no option {option}{_suggestion(option, options)}"
+        return f"{commands} has no option {option}{did_you_mean(option.replace('_', '-'), options)}"
     if isinstance(error, wrong.UnknownCommandError) and error.unused_tokens and error.app is not None:
         token = error.unused_tokens[0]
         kind = "option" if token.startswith("-") else "command"
-        return f"{commands} has no {kind} {token}{_suggestion(token, list(error.app))}"
+        return f"{commands} has no {kind} {token}{did_you_mean(token.replace('_', '-'), list(error.app))}"
     if isinstance(error, wrong.MissingArgumentError) and error.argument is not None:
         if error.keyword is not None:
             return f"{error.keyword} needs a value"
@@ -179,15 +178,6 @@ def _usage_message(error: wrong.CycloptsError, commands: str) -> str:
         if error.target_type is bool:
             return f"{name} takes no value, got {value!r}"
     return str(error)
-
-
-def _suggestion(word: str, names: Sequence[str]) -> str:
-    """The names that `word` may be meant to be."""
-    word = word.replace("_", "-")
-    close = [name for name in names if name.startswith("--") and name.startswith(word)]
-    close += difflib.get_close_matches(word, names, n=3, cutoff=0.7)
-    close = list(dict.fromkeys(close))[:3]
-    return f"; did you mean {' or '.join(close)}?" if close else ""
 
 
 def _with_options(message: str, tokens: Sequence[str]) -> str:

@@ -100,8 +100,8 @@ def test_where_a_module_calls_one_above_it():
         "io/cube.py: plot.figures:overview",
         "light/flux.py: light.fog:in_fog",
         "light/flux.py: light.transient:Transient",
-        "light/timestamps.py: io.streams.files:load",
-        "light/timestamps.py: io.streams.files:save",
+        "light/timestamps.py: io.streams.formats:load",
+        "light/timestamps.py: io.streams.formats:save",
         "scene/scene.py: io.rgbd:read_rgbd",
     ]
 

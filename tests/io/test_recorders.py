@@ -9,7 +9,7 @@ from harness import make_system, refused
 
 import mars_lidar as ml
 from mars_lidar import io
-from mars_lidar.io.streams import files
+from mars_lidar.io.streams import formats
 from mars_lidar.io.streams.recorders import recorded
 from tests.harness.command import ok
 
@@ -133,7 +133,7 @@ def test_absolute_times(tmp_path, suffix, unit_ns):
         assert np.allclose(
             of_pixel.times_ns - of_pixel.cycle * times.period_ns, fine[channel == k] * 0.016, atol=2 * unit_ns
         )
-    bare = files.recorded(path)
+    bare = formats.recorded(path)
     assert bare.fine is None
     assert bare.clock_ns == pytest.approx(unit_ns)
     assert np.array_equal(np.sort(bare.clock), np.sort(clock))
@@ -157,7 +157,7 @@ def test_t3r_has_histograms_but_no_periods(tmp_path, version):
     tags = [100, 0, 0, 0, 0, 0, 0, 20_000_000, 0, 0, 0, records.size, 3]
     path = tmp_path / "a.t3r"
     path.write_bytes(header + struct.pack("<13i", *tags) + bytes(12) + records.astype("<u4").tobytes())
-    result = files.recorded(path)
+    result = formats.recorded(path)
     assert (result.clock_ns, result.period_ns) == (pytest.approx(100.0), None)
     assert np.array_equal(result.clock, clock)
     assert np.array_equal(result.detector, channel)
@@ -177,7 +177,7 @@ def test_t3r_has_histograms_but_no_periods(tmp_path, version):
         (header + struct.pack("<13i", *tags[:11], -5, 3) + content[-4 * records.size :], "states -5 records"),
     ):
         path.write_bytes(damaged)
-        refused(f"a\\.t3r.*{reason}", files.recorded, path)
+        refused(f"a\\.t3r.*{reason}", formats.recorded, path)
 
 
 def becker(path: Path, clock_is_sync: int, marker: bool = False) -> Path:

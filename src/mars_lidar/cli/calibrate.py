@@ -47,7 +47,7 @@ class StreamOptions:
 
     def arrivals(self, stream: Path) -> tuple[FloatArray, float, list[tuple[str, str]]]:
         """Times (n,) and clock unit, ns, of a recording without a laser, and rows that describe the file."""
-        from mars_lidar.io.streams.files import recorded
+        from mars_lidar.io.streams.formats import recorded
 
         recording = recorded(stream, unit_ns=self.unit_ns, variable=self.variable)
         channels, counts = np.unique(recording.detector[recording.detector >= 0], return_counts=True)

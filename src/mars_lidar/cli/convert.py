@@ -135,7 +135,7 @@ def timestamps(
     """
     from mars_lidar.io.conversion import photons, resolution_ns
     from mars_lidar.io.cube import load
-    from mars_lidar.io.streams.files import check_output
+    from mars_lidar.io.streams.formats import check_output
 
     check_output(out, overwrite=overwrite, clock_ps=clock_ps)
     with load(cube) as stored, progress_bar("simulating") as progress:

@@ -195,7 +195,7 @@ def is_foreign(path: Path, error: ValueError) -> bool:
 def foreign_rows(path: Path) -> list[tuple[str, str]]:
     """Rows that `mars-lidar info` prints for a file of another program."""
     from mars_lidar.io.foreign import listed
-    from mars_lidar.io.streams.recorders import RECORDER_SUFFIXES
+    from mars_lidar.io.streams.formats import RECORDER_SUFFIXES
 
     if path.suffix.lower() in RECORDER_SUFFIXES:
         return _recorder_rows(path)
@@ -206,7 +206,7 @@ def foreign_rows(path: Path) -> list[tuple[str, str]]:
 
 def _recorder_rows(path: Path) -> list[tuple[str, str]]:
     """What a photon counter recorded: its clocks, the photons of each channel, and the images of a scan."""
-    from mars_lidar.io.streams.files import recorded as photons_of
+    from mars_lidar.io.streams.formats import recorded as photons_of
     from mars_lidar.io.streams.recorders import recorded
 
     rows = [("file", f"{path} (not written by mars-lidar)")]

@@ -14,7 +14,7 @@ from mars_lidar._version import __version__
 from mars_lidar.engines.simulation import simulate_timestamps
 from mars_lidar.io.cube import SUFFIXES, Cube, load, one_exposure, save
 from mars_lidar.io.streams import photon_hdf5, ptu
-from mars_lidar.io.streams.files import STREAM_SUFFIXES, is_stream
+from mars_lidar.io.streams.formats import STREAM_SUFFIXES, is_stream
 from mars_lidar.light.timestamps import Timestamps
 
 

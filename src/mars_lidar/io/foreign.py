@@ -22,7 +22,8 @@ from mars_lidar.io.measured import from_histograms, from_photon_times, in_order
 from mars_lidar.io.named_arrays import cell_arrays, hdf5_arrays, mat_arrays
 from mars_lidar.io.pixels import decoded
 from mars_lidar.io.streams.bare_stream import cells_of
-from mars_lidar.io.streams.recorders import RECORDER_SUFFIXES, Recorded, recorded
+from mars_lidar.io.streams.formats import RECORDER_SUFFIXES
+from mars_lidar.io.streams.recorders import Recorded, recorded
 
 FOREIGN_SUFFIXES = (".npy", ".npz", ".mat", ".h5", ".hdf5", ".tif", ".tiff", ".csv", ".txt", *RECORDER_SUFFIXES)
 

@@ -134,7 +134,7 @@ class Timestamps:
         OSError
             `path` exists and `overwrite` is false, or cannot be written.
         """
-        late("io.streams.files:save")(path, self, overwrite=overwrite, clock_ps=clock_ps)
+        late("io.streams.formats:save")(path, self, overwrite=overwrite, clock_ps=clock_ps)
 
     @classmethod
     @checked
@@ -167,7 +167,7 @@ class Timestamps:
         ValueError
             A file of another kind, damaged or incomplete: the message names it.
         """
-        load = late("io.streams.files:load")
+        load = late("io.streams.formats:load")
         loaded: Timestamps = load(path, period_ns=period_ns, bins=bins, unit_ns=unit_ns, variable=variable)
         return loaded
 

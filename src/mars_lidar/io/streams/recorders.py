@@ -1,4 +1,4 @@
-"""Files of photon counters: histograms (.ptu and related formats, .t3r, .spc, .sdt), and photons of .t3r and .spc."""
+"""Histograms in files of photon counters: .ptu and related formats, .t3r, .spc, .sdt."""
 
 import math
 from dataclasses import dataclass
@@ -10,11 +10,7 @@ from numpy.typing import NDArray
 
 from mars_lidar._base.files import check_claim, reading
 from mars_lidar._base.imports import needed
-from mars_lidar.io.streams import files, ptu
-from mars_lidar.io.streams.photons import BEFORE_PTU, Photons
-
-_PICOQUANT = (".ptu", *BEFORE_PTU)
-RECORDER_SUFFIXES = (*_PICOQUANT, ".t3r", ".spc", ".sdt")
+from mars_lidar.io.streams import formats, ptu
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,21 +24,16 @@ class Recorded:
     notes: tuple[str, ...] = ()  # what else is worth a line
 
 
-def photons(path: Path) -> Photons:
-    """The photons of a .t3r or .spc."""
-    return _time_harp(path) if path.suffix == ".t3r" else _becker_hickl(path)
-
-
 def recorded(path: Path) -> Recorded:
     """Read the histograms of a file."""
     with reading(path, f"a {path.suffix}"):
         if path.suffix == ".sdt":
             return _sdt(path)
-        if path.suffix in _PICOQUANT:
+        if formats.MODULES.get(path.suffix) == "ptu":
             with ptu.open_ptu(path, trimdims="T") as file:
                 if file.is_image:
                     return _image(path, file)
-        recording = files.recorded(path)
+        recording = formats.recorded(path)
         period = recording.period_ns
         cycles = int(recording.clock.max()) + 1 if recording.clock.size and period is not None else None
         return Recorded(recording.histograms(), recording.fine_ns, period, cycles)
@@ -82,82 +73,3 @@ def _sdt(path: Path) -> Recorded:
         raise ValueError(f"{path} holds no histograms: photon by photon is in .spc")
     width = widths.pop() if len(widths) == 1 else math.nan
     return Recorded(blocks, width if width > 0.0 else None)
-
-
-# of the header: bytes of its text, and of the names of the hardware that come before the board's numbers
-_FORMATS = {b"5.0": (304, 0), b"6.0": (328, 24)}
-_MEASUREMENT = 212  # bytes of settings between the two
-_OVERFLOW = 0x800  # of the data of a record that is not valid
-
-
-def _time_harp(path: Path) -> Photons:
-    """A clock that runs free of the laser, and the time since the laser pulse.
-
-    Headers and records as PicoQuant's demonstration programs have them (TimeHarp 200, T3R file access, software 5.0 of
-    2003 and 6.x of 2009). A record: time tag 16 bits, data 12, route 2, valid 1; a record that is not valid is an
-    overflow of the time tag, or a marker.
-    """
-    content = path.read_bytes()
-    kind, version = content[:16].strip(b"\0 "), content[16:22].strip(b"\0 ")
-    if kind != b"TimeHarp 200" or version not in _FORMATS:
-        known = " or ".join(name.decode() for name in _FORMATS)
-        raise ValueError(f"{path} is no .t3r of format {known}: it begins with {kind!r} {version!r}")
-    text, names = _FORMATS[version]
-    board = text + _MEASUREMENT + names
-    tags = board + 24
-    if len(content) < tags + 52:
-        raise ValueError(f"{path} is cut short: its header takes {tags + 52} bytes")
-    fine_ns = float(np.frombuffer(content, "<f4", 1, board + 20)[0])
-    header = np.frombuffer(content, "<i4", 13, tags)
-    clock_ns, number, more = int(header[0]), int(header[11]), int(header[12])
-    begin = tags + 52 + 4 * more
-    if not (math.isfinite(fine_ns) and fine_ns > 0.0 and clock_ns > 0 and more >= 0):
-        raise ValueError(f"{path} is damaged: its clocks are {clock_ns} ns and {fine_ns:g} ns, image header {more}")
-    if not 0 <= number <= (len(content) - begin) // 4:
-        raise ValueError(f"{path} is cut short: its header states {number} records")
-    records = np.frombuffer(content, "<u4", number, begin)
-    data, valid = (records >> 16) & 0xFFF, (records >> 30) & 1 == 1
-    wraps = np.cumsum(~valid & (data & _OVERFLOW > 0), dtype=np.int64)
-    clock = (records & 0xFFFF).astype(np.int64) + (wraps << 16)
-    route = ((records >> 28) & 3).astype(np.int64)
-    return Photons(clock[valid], clock_ns, route[valid], str(path), data[valid].astype(np.int64), fine_ns)
-
-
-_SYNC = 1  # SP_MST_CLK: the macro clock is the laser's sync; 0: one of its own, others: the sync divided
-_MARKER_WRAP = 0xD  # a marker with an overflow: phconvert 0.10 reads its bits as the number of overflows
-
-
-def _becker_hickl(path: Path) -> Photons:
-    """Becker & Hickl's FIFO records; phconvert reads them with the .set that SPCM writes beside them."""
-    reader = needed("phconvert.bhreader", "a .spc")
-    settings = next((each for each in map(path.with_suffix, (".set", ".SET")) if each.is_file()), None)
-    if settings is None:
-        raise ValueError(
-            f"{path} needs {path.with_suffix('.set').name} beside it: it tells the card and its time range"
-        )
-    code = int(reader.load_set(settings)["header"][0]["revision"] & 0xFF0) >> 4
-    card = reader._spc_codes.get(code, f"of code {code:#x}")
-    kind = "SPC-1XX" if card == "SPC-140" else "auto"  # phconvert knows the card, but not that it is of this kind
-    if reader._spc_types.get(card) in (None, "NotSup", "DPC-230"):
-        raise ValueError(f"{path} is of a card {card}, whose records phconvert does not read")
-    if kind == "SPC-1XX" or reader._spc_types[card] == "SPC-1XX":
-        words = np.fromfile(path, "<u4")[1:]
-        if (words >> 28 == _MARKER_WRAP).any():
-            raise ValueError(f"{path} has markers of a scan, which phconvert misreads: save it as .sdt or export times")
-    recording = reader.load_spc(path, settings, kind)
-    data, setup = recording["photon_data"], recording["meta"]["setup"]
-    photon = ~np.isin(data["detectors"], data["marker_ids"])
-    clock_ns = 1e9 * float(data["timestamps_unit"])
-    bins = int(data.get("tcspc_num_bins", 4096))
-    fine_ns = 1e9 * float(setup.get("SP_TAC_R", 0.0)) / float(setup.get("SP_TAC_G", 1) or 1) / bins
-    if not fine_ns > 0.0:
-        raise ValueError(f"{settings} does not state the time range, SP_TAC_R")
-    return Photons(
-        np.asarray(data["timestamps"][photon], np.int64),
-        clock_ns,
-        np.asarray(data["detectors"][photon], np.int64),
-        str(path),
-        np.asarray(data["nanotimes"][photon], np.int64),
-        fine_ns,
-        clock_ns if setup.get("SP_MST_CLK") == _SYNC else None,
-    )

@@ -13,7 +13,7 @@ from mars_lidar.io.streams.photons import BEFORE_PTU, FORMAT, Photons, attribute
 from mars_lidar.light.timestamps import Timestamps
 
 STREAM_SUFFIXES = (".npz", ".ptu", ".h5", ".hdf5")
-_MODULES = {  # that read them; of .npz, those of others
+MODULES = {  # that read files of each suffix; of .npz, those of others
     ".npz": "bare_stream",
     ".ptu": "ptu",
     ".h5": "photon_hdf5",
@@ -22,11 +22,15 @@ _MODULES = {  # that read them; of .npz, those of others
     ".csv": "bare_stream",
     ".txt": "bare_stream",
     **dict.fromkeys(BEFORE_PTU, "ptu"),
-    ".t3r": "recorders",
-    ".spc": "recorders",
+    ".t3r": "time_harp",
+    ".spc": "becker_hickl",
+    ".sdt": "recorders",  # histograms, no photons
 }
+RECORDER_SUFFIXES = tuple(
+    suffix for suffix, module in MODULES.items() if module in ("ptu", "time_harp", "becker_hickl", "recorders")
+)
+READ_SUFFIXES = tuple(suffix for suffix, module in MODULES.items() if module != "recorders")  # as photon streams
 _BARE = (".mat", ".npz", ".csv", ".txt")  # may have no header
-READ_SUFFIXES = tuple(_MODULES)
 
 
 def save(path: str | Path, times: Timestamps, *, overwrite: bool = False, clock_ps: float | None = None) -> None:
@@ -126,7 +130,7 @@ def is_stream(path: Path) -> bool:
 
 def _module(path: Path, suffixes: tuple[str, ...] = READ_SUFFIXES) -> Any:
     checks.suffix("path of timestamps", path, suffixes)
-    return importlib.import_module(f"mars_lidar.io.streams.{_MODULES[path.suffix]}")
+    return importlib.import_module(f"mars_lidar.io.streams.{MODULES[path.suffix]}")
 
 
 def _write_npz(path: Path, times: Timestamps) -> None:

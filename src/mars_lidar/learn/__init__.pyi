@@ -1,3 +1,4 @@
+from .cube_stream import CubeStream as CubeStream
 from .forward import bin_photons as bin_photons
 from .forward import expected_histogram as expected_histogram
 from .inverse import LidarLikelihood as LidarLikelihood
@@ -7,6 +8,5 @@ from .ranges import Choice as Choice
 from .ranges import LogUniform as LogUniform
 from .ranges import SystemRange as SystemRange
 from .ranges import Uniform as Uniform
-from .stored import StoredDataset as StoredDataset
-from .stream import CubeStream as CubeStream
+from .stored_dataset import StoredDataset as StoredDataset
 from .tabulated import HistogramTable as HistogramTable

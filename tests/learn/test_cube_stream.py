@@ -16,8 +16,8 @@ from torch.utils.data import DataLoader
 
 import mars_lidar as ml
 from mars_lidar.learn import Choice, CubeStream, LogUniform, SystemRange, Uniform
+from mars_lidar.learn.cube_stream import prefetched
 from mars_lidar.learn.scenes import SharedScenes
-from mars_lidar.learn.stream import prefetched
 
 SYSTEM = make_system(30.0, 60, 64)
 SYSTEMS = SystemRange(

@@ -15,7 +15,7 @@ from torch.utils.data import DataLoader
 import mars_lidar as ml
 from mars_lidar import io
 from mars_lidar.learn import StoredDataset
-from mars_lidar.learn.stored import Exposures
+from mars_lidar.learn.stored_dataset import Exposures
 
 SYSTEM = make_system(30.0, 50, 32)
 
@@ -257,8 +257,8 @@ def test_two_ranks_train_three_epochs_on_uneven_data(path):
 
 
 def test_without_torch(monkeypatch):
-    for module in ("stored", "needed"):
+    for module in ("stored_dataset", "needed"):
         monkeypatch.delitem(sys.modules, f"mars_lidar.learn.{module}")
     monkeypatch.setitem(sys.modules, "torch", None)
     with pytest.raises(io.MissingLibraryError, match=r"pip install 'mars-lidar\[learn\]'"):
-        from mars_lidar.learn.stored import StoredDataset  # noqa: F401
+        from mars_lidar.learn.stored_dataset import StoredDataset  # noqa: F401

@@ -14,6 +14,7 @@ from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.statistics.exposure import recorded_moments
 from mars_lidar.statistics.pmf import exact_pmfs
+from mars_lidar.statistics.tolerances import TOL
 from mars_lidar.table.table import Table
 
 _COUNTS = ("exact", "matched", "gaussian")
@@ -112,7 +113,7 @@ class MarsEngine(CountTimesShape):
 
     def _evaluated(self, run: synthesis.Run, group: Group) -> synthesis.Batch:
         task = run.task
-        exposure = recorded_moments(group.cells, tolerance=1e-4, threads=task.threads, progress=run.waiting)
+        exposure = recorded_moments(group.cells, tolerance=TOL.movement, threads=task.threads, progress=run.waiting)
         cumulants = exposure.cumulants.reshape(-1, 4)
         if self.count == "exact" and task.system.dead_time_periods > 0.0:
             pmfs = exact_pmfs(group.cells, cumulants, exposure.bins.reshape(-1), task.threads)

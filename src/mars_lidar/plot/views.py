@@ -19,6 +19,7 @@ from mars_lidar.reconstruction import METHODS, reconstruct
 from mars_lidar.reconstruction.map_errors import depth_lag_m
 from mars_lidar.statistics import ConvergenceError, mean_histogram, photons_per_bin
 from mars_lidar.statistics.histogram import histogram_effects
+from mars_lidar.statistics.tolerances import TOL
 
 _READ_BYTES = 64 * 2**20
 
@@ -233,7 +234,7 @@ def predicted_counts(cube: Cube, y: int, x: int) -> NDArray[np.float64] | None:
         return photons_per_bin(flux[y, x], system, bins=system.bins) * system.cycles
     if cube.engine == "poisson":
         system = system.replace(detector=replace(system.detector, dead_time_ns=0.0))
-    tolerance = 1e-2 if "electronics_dead_time_ns" in effects else 1e-4  # seconds each beyond that
+    tolerance = 1e-2 if "electronics_dead_time_ns" in effects else TOL.movement  # seconds each beyond that
     try:
         return mean_histogram(flux[y, x], system, tolerance=tolerance)
     except ConvergenceError:

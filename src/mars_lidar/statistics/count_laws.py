@@ -145,7 +145,7 @@ def count_law(
     method: Method = "exact",
     *,
     rearm: Rearm | None = None,
-    tolerance: float = 1e-4,
+    tolerance: float = TOL.movement,
     threads: int | None = None,
 ) -> CountLaw:
     """Law of the number of registrations in one exposure.

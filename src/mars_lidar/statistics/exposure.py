@@ -303,7 +303,12 @@ _NATIVE = ("cumulants", "cumulant_rates", "histogram", "histogram_rate", "settle
 
 @checked
 def exposure_moments(
-    flux: Flux, system: System, *, tolerance: float = 1e-4, threads: int | None = None, progress: Progress | None = None
+    flux: Flux,
+    system: System,
+    *,
+    tolerance: float = TOL.movement,
+    threads: int | None = None,
+    progress: Progress | None = None,
 ) -> Exposure:
     """Exact cumulants of the count and mean histogram of an exposure of `System.cycles` periods.
 

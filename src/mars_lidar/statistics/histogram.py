@@ -26,7 +26,9 @@ from mars_lidar.statistics.tolerances import LAW, TOL
 
 
 @checked
-def mean_histogram(flux: Flux, system: System, *, tolerance: float = 1e-4, threads: int | None = None) -> FloatArray:
+def mean_histogram(
+    flux: Flux, system: System, *, tolerance: float = TOL.movement, threads: int | None = None
+) -> FloatArray:
     """Mean histogram of the finite exposure, exact for every mode of the detector.
 
     It sums to the mean count and includes jitter, code widths and, for modes ``"nonparalyzable"`` and ``"gated"``, the
@@ -120,7 +122,7 @@ def registration_pdf(
     method: Literal["exposure", "stationary", "chain"] = "exposure",
     *,
     rearm: Rearm | None = None,
-    tolerance: float = 1e-4,
+    tolerance: float = TOL.movement,
     threads: int | None = None,
 ) -> FloatArray:
     """Shape of the mean histogram: the distribution of registrations over the bins of the period.

@@ -30,6 +30,7 @@ from mars_lidar.light.flux import Flux
 from mars_lidar.statistics.cells import require_mode
 from mars_lidar.statistics.chain import ConvergenceError, Rearm
 from mars_lidar.statistics.exposure import exposure_moments, normalised
+from mars_lidar.statistics.tolerances import TOL as STATISTICS
 from mars_lidar.table import storage
 from mars_lidar.table.axes import PAPER_GRID, Grid, axis_values, describe
 from mars_lidar.table.entries import (
@@ -116,7 +117,7 @@ class Table:
         *,
         method: Method = "exposure",
         rearm: Rearm = "centre",
-        tolerance: float = 1e-4,
+        tolerance: float = STATISTICS.movement,
         threads: int | None = None,
         progress: Progress | bool | None = None,
     ) -> Table:
@@ -216,7 +217,7 @@ class Table:
     ) -> tuple[Path, Path | None]:
         """Path of the table in the cache, and the existing file that can be used instead, or None."""
         system = system.detected()
-        chosen: dict[str, Any] = {"method": "exposure", "rearm": "centre", "tolerance": 1e-4} | options
+        chosen: dict[str, Any] = {"method": "exposure", "rearm": "centre", "tolerance": STATISTICS.movement} | options
         unknown = set(chosen) - {"method", "rearm", "tolerance", "threads", "progress"}
         if unknown:
             raise TypeError(f"the options are those of Table.build, got {sorted(unknown)[0]!r}")

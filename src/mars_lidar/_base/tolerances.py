@@ -43,8 +43,8 @@ class Tolerances:
     shown_values, shown_text
         Values of an array or sequence, and characters of other values, that a `repr` writes out.
     suggestions, similarity
-        Names that a message suggests for a misspelt one, at most; ratio of `difflib.SequenceMatcher` from which a name
-        is similar to it.
+        Names that a message suggests for a misspelt one, at most; ratio of matching characters (Python's difflib) from
+        which a name is similar to it.
     map_pixels
         Of a map's longer side in a notebook, more than the picture has.
     patience_s, often_s, seldom_s

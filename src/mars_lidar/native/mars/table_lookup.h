@@ -54,7 +54,7 @@ struct Stencil {
     int count;          // nodes of the cumulants
     int64_t node[4];
     double weight[4];  // Lagrange, in log photons (L2)
-    bool dim;          // between 0 and the first node above it: in photons
+    bool dim;          // in the cell that begins at 0
 };
 
 // Cubic through up to four nodes at coordinates `at`.
@@ -80,12 +80,12 @@ MARS_APART inline Stencil stencil(const Axis& axis, const TableFlux& x, bool nea
         out.low = out.high = up ? out.high : out.low;
         out.fraction = 0.0;
     }
+    out.dim = left == 0.0 && !nearest;
     if (out.high == out.low || out.fraction == 0.0) {
         out.count = 1;
         out.node[0] = out.low;
         out.weight[0] = 1.0;
     } else if (left == 0.0) {  // no logarithm: cubic in the photons, through nodes of about equal distances
-        out.dim = true;
         double at[4], scale[4];
         for (int64_t k = 0; k < axis.size && out.count < 4; ++k)
             if (axis.value[k] >= out.count * right) {
@@ -133,14 +133,14 @@ struct TableLookup {
         for (int m = 0; m < 4; ++m) weight[m] = sum > 0.0 ? weight[m] / sum : v[m / 2] * w[m % 2];
     }
 
-    // Cumulants by a cubic through the nodes of either axis (L2), below the lowest nodes those per photon, which have a
-    // limit; adds them to `out`.
+    // Cumulants by a cubic through the nodes of either axis (L2), below the lowest nodes of both those per photon, which
+    // have a limit; adds them to `out`.
     void bicubic(const Stencil& s, const Stencil& b, double photons, double* out) const {
         for (int k = 0; k < s.count; ++k)
             for (int m = 0; m < b.count; ++m) {
                 const double* node = cumulants + (s.node[k] * background.size + b.node[m]) * kCumulants;
                 double w = s.weight[k] * b.weight[m];
-                if (s.dim || b.dim) {
+                if (s.dim && b.dim) {
                     const double there = signal.value[s.node[k]] + background.value[b.node[m]];
                     if (!(there > 0.0)) node = limit;
                     w *= there > 0.0 ? photons / there : photons;

@@ -28,8 +28,8 @@ nb::bytes law_task(const nb::dict& addresses, const nb::dict& axes, const nb::di
     table.background = axis_at(fields, "background_axis", axes);
     table.sub_signal = axis_at(fields, "sub_signal", axes);
     table.sub_background = axis_at(fields, "sub_background", axes);
-    fields.set("entries", table.cumulants, "limit", table.limit, "phases", table.phase, "phases", table.phases, "correction",
-               table.correction, "nearest", table.nearest);
+    fields.set("entries", table.cumulants, "limit", table.limit, "phases", table.phase, "phases", table.phases,
+               "correction", table.correction, "nearest", table.nearest);
     fields.set("signal", task.signal, "background", task.background, "phase", task.phase, "rows", task.rows, "weights",
                task.weights, "cumulants", task.cumulants, "rate", task.rate, "laws", task.laws, "doubted", task.doubted,
                "found", task.found, "pixels", task.pixels, "cycles", task.cycles);

@@ -12,10 +12,10 @@ namespace {
 constexpr int64_t kBlock = 512;  // pixels per chunk
 
 void lookup(Vector<const double> signal_axis, Vector<const double> background_axis, Matrix<const double> entries,
-            Vector<const double> limit, Vector<const double> sub_signal, Vector<const double> sub_background, Vector<const double> phase,
-            Matrix<const float> correction, Vector<const double> signal, Vector<const double> background,
-            Vector<const double> at, bool nearest, Matrix<int64_t> rows, Matrix<double> weights,
-            Matrix<double> cumulants, int threads) {
+            Vector<const double> limit, Vector<const double> sub_signal, Vector<const double> sub_background,
+            Vector<const double> phase, Matrix<const float> correction, Vector<const double> signal,
+            Vector<const double> background, Vector<const double> at, bool nearest, Matrix<int64_t> rows,
+            Matrix<double> weights, Matrix<double> cumulants, int threads) {
     const auto tables = [](const Vector<const double>& axis) { return AxisTables(axis.data(), size_of(axis)); };
     const AxisTables s = tables(signal_axis), b = tables(background_axis);
     const AxisTables x = tables(sub_signal), y = tables(sub_background);
@@ -52,8 +52,8 @@ void lookup(Vector<const double> signal_axis, Vector<const double> background_ax
 }  // namespace
 
 void bind_table(nb::module_& module) {
-    module.def("table_lookup", &lookup, nb::kw_only(), "signal_axis"_a, "background_axis"_a, "entries"_a,
-               "limit"_a, "sub_signal"_a, "sub_background"_a, "phase"_a, "correction"_a, "signal"_a, "background"_a, "at"_a,
+    module.def("table_lookup", &lookup, nb::kw_only(), "signal_axis"_a, "background_axis"_a, "entries"_a, "limit"_a,
+               "sub_signal"_a, "sub_background"_a, "phase"_a, "correction"_a, "signal"_a, "background"_a, "at"_a,
                "nearest"_a, "rows"_a, "weights"_a, "cumulants"_a, "threads"_a);
 }
 

@@ -147,8 +147,8 @@ class WindowEstimate {
         const double flat =
             flat_known ? std::max(in_.pulse * light_out - out_.pulse * light_in, 0.0) / determinant_ : 0.0;
         if (flat_known) out.background = flat * static_cast<double>(r_.bins);
-        const double signal = flat > 0.0 ? (out_.share * light_in - in_.share * light_out) / determinant_
-                                         : light_in / in_.pulse;
+        const double signal =
+            flat > 0.0 ? (out_.share * light_in - in_.share * light_out) / determinant_ : light_in / in_.pulse;
         out.signal = std::max(signal, 0.0);
         return out;
     }

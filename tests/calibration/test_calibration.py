@@ -486,7 +486,7 @@ def test_native_counts_are_those_of_numpy() -> None:
                 assert np.abs(t / clock.unit_ns % 1.0 - 0.5).max() < 1e-6
         cells = Cells(model, rows[0], list(streams), 1e4)
         gaps = slice(cells.phases, cells.phases + cells.gap_edges.size + 1)
-        for t, counts in zip(streams, cells.count(streams), strict=True):
+        for t, counts in zip(streams, cells.count(streams)[:, 0], strict=True):
             edges = np.r_[-np.inf, np.nextafter(cells.gap_edges, np.inf), np.inf]  # an interval at an edge is below it
             assert (counts[gaps] == np.histogram(np.diff(t), edges)[0]).all()
             assert counts[: cells.phases].sum() == t.size

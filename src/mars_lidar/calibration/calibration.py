@@ -413,9 +413,12 @@ class _Run:
             model = pulsed if p <= FALSE_ALARM else model
         self.model, self.pulsed = model, pulsed
 
-    def result(self) -> Calibration:
-        """The fit, the effects that it includes, and the suspects that remain."""
-        fitted = self.first()
+    def result(self, attempt: int = 0) -> Calibration:
+        """The fit, the effects that it includes, and the suspects that remain.
+
+        A fit that is clearly rejected with every effect may be a local minimum: another one is used if it fits.
+        """
+        fitted = self.first(attempt)
         wrong = () if fitted.converged and fitted.p_value >= self.level else self.wrong_values(fitted)
         included: list[Named] = []
         drift = suspects.drift(self.fit, fitted) if fitted.converged else None
@@ -423,7 +426,11 @@ class _Run:
         if fitted.converged and not wrong and not (drift is not None and drift.flickers):  # which looks like effects
             fitted, included, trials = suspects.search(self.fit, fitted)
             drift = suspects.drift(self.fit, fitted) if included else drift
-        return self.assembled(fitted, included, trials, drift, wrong)
+        out = self.assembled(fitted, included, trials, drift, wrong)
+        if attempt == 0 and not included and not wrong and fitted.p_value < suspects.MISFIT * FALSE_ALARM:
+            other = self.result(self.fit.effort.attempts)
+            return other if other.fits else out
+        return out
 
     def wrong_values(self, fitted: Fitted) -> tuple[Suspect, ...]:
         """Given values that the stream contradicts (without one of them it fits), and the estimate of each."""
@@ -447,15 +454,15 @@ class _Run:
             out.append(Suspect(words, z, at.value, at.error, gain, option, included=False))
         return tuple(out)
 
-    def first(self) -> Fitted:
-        """The fit without effects, repeated with other simulated streams until it has a significant pulse.
+    def first(self, attempt: int = 0) -> Fitted:
+        """The fit without effects by the streams of an attempt, and of further ones until a pulse is significant.
 
         Where the phases have a bright window, a fit without a pulse is a bad one. Light without a pulse is tried first
         where they have none, and must not be rejected.
         """
         tried: list[tuple[bool, bool, Fit, Fitted]] = []
         while len(tried) < self.fit.effort.attempts and not (tried and tried[-1][0] and tried[-1][1]):
-            self.fit = Fit(self.recording, Effort(), (self.seed, len(tried)))
+            self.fit = Fit(self.recording, Effort(), (self.seed, attempt + len(tried)))
             fitted = self._attempt()
             dark = self.model.returns < self.pulsed.returns and fitted.p_value < FALSE_ALARM
             tried.append((fitted.converged, fitted.lit and not dark, self.fit, fitted))

@@ -105,13 +105,13 @@ class Cells:
         """Edges of intervals between the units of a clock, off the middle, where a period of half units may end."""
         return np.unique((np.floor(edges / unit + 1e-6) + _OFF) * unit) if unit > 0.0 else np.unique(edges)
 
-    def count(self, streams: Streams) -> FloatArray:
-        """Counts (streams, size)."""
-        counts = np.empty((streams.offsets.size - 1, self.size))
-        _core.count_streams(self._native, streams.times, streams.offsets, counts)
-        return counts
+    def count(self, streams: Streams, pieces: int = 1, length: float = np.inf) -> FloatArray:
+        """Counts (streams, pieces, size) of sorted times, by pieces of this length in ns; the last has no end."""
+        counts = np.empty(((streams.offsets.size - 1) * pieces, self.size))
+        _core.count_streams(self._native, streams.times, streams.offsets, pieces=pieces, length=length, out=counts)
+        return counts.reshape(-1, pieces, self.size)
 
     def of(self, recording: Recording) -> FloatArray:
         """Counts (size,) of a recording, all stretches together."""
         offsets = np.cumsum([0, *(piece.size for piece in recording.pieces)])
-        return np.asarray(self.count(Streams(np.concatenate(recording.pieces), offsets)).sum(0))
+        return np.asarray(self.count(Streams(np.concatenate(recording.pieces), offsets)).sum((0, 1)))

@@ -46,12 +46,16 @@ class Effort:
         gives the weights has `more` times as many streams; it is recentred at most `recentred` times.
     widths
         Different pulse widths in a batch, because the table of a pulse takes as long as a stream.
+    pieces
+        Pieces of each stream whose counts are correlated.
     draws
         Draws from the law of the estimate, for intervals within the bounds of the parameters.
     attempts
         Attempts to fit a recording, each with other simulated streams; the first that converges is used.
     effects
         Effects that are included at most, one after the other.
+    closely
+        Photons, relative to a batch, of the streams that test an effect again.
     shape_bins, light_bins, bin_photons
         Most bins of free light in the result; and of that from which streams are drawn, if each has so many photons.
     """
@@ -68,9 +72,11 @@ class Effort:
     more: int = 2
     recentred: int = 4
     widths: int = 4
+    pieces: int = 16
     draws: int = 20_000
     attempts: int = 3
     effects: int = 2
+    closely: float = 4.0
     shape_bins: int = 256
     light_bins: int = 1024
     bin_photons: float = 10.0
@@ -134,12 +140,31 @@ class Batch:
         return np.asarray(inverse @ jacobian.T @ self.weight)
 
 
-def counted(model: Model, cells: Cells, rows: FloatArray, exposure: float, seed: int) -> FloatArray:
-    """Counts (rows, c) of simulated streams, one for each row of parameters; `LIGHTS` rows share a detector."""
+class Counts(NamedTuple):
+    """Counts (rows, c) of simulated streams, and the correlation (c, c) of counts in pieces of one stream.
+
+    Pieces have the light of their stream, so that their scatter is noise alone; `freedom` of that correlation.
+    """
+
+    total: FloatArray
+    correlation: FloatArray
+    freedom: int
+
+
+def counted(
+    model: Model, cells: Cells, rows: FloatArray, exposure: float, seed: int, pieces: int = Effort.pieces
+) -> Counts:
+    """Counts of simulated streams, one for each row of parameters (rows, p); `LIGHTS` rows share a detector."""
     cycles = max(2, round(exposure))
-    return np.concatenate(
-        [cells.count(model.streams(rows[k : k + LIGHTS], cycles, seed + k)) for k in range(0, len(rows), LIGHTS)]
-    )
+    square, totals = np.zeros((cells.size, cells.size)), []
+    for k in range(0, len(rows), LIGHTS):
+        streams = model.streams(rows[k : k + LIGHTS], cycles, seed + k)
+        counts = cells.count(streams, pieces, cycles * model.clock.period_ns / pieces)
+        totals.append(counts.sum(1))
+        off = (counts - counts.mean(1, keepdims=True)).reshape(-1, cells.size)
+        square += off.T @ off
+    sd = np.sqrt(np.maximum(np.diag(square), 1e-300))
+    return Counts(np.concatenate(totals), square / np.outer(sd, sd), len(rows) * (pieces - 1))
 
 
 def design(
@@ -193,11 +218,9 @@ def least_squares(terms: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatAr
     return slope, y - terms @ slope, inverse
 
 
-def regression(
-    cells: Cells, theta: FloatArray, centre: FloatArray, counts: FloatArray, ratio: float, free: Index
-) -> Batch:
+def regression(cells: Cells, theta: FloatArray, centre: FloatArray, counts: Counts, ratio: float, free: Index) -> Batch:
     """The linear law of counts (streams, c), in units of an exposure `ratio` times as long as theirs."""
-    y = counts * ratio
+    y = counts.total * ratio
     x = (theta - centre)[:, free]
     scale = np.maximum(np.abs(x).max(0), 1e-300)
     terms = np.c_[np.ones(len(x)), x / scale]
@@ -209,12 +232,10 @@ def regression(
     strength = fitted[1:] ** 2 / (np.diag(inverse)[1:, None] * variance * ratio)
     slope = np.zeros((y.shape[1], centre.size))
     slope[:, free] = (fitted[1:] * np.maximum(0.0, 1.0 - 2.0 / np.maximum(strength, 1e-9)) / scale[:, None]).T
-    e = residual / np.sqrt(variance * ratio)
-    correlation = e.T @ e / freedom
-    off = correlation - np.diag(np.diag(correlation))
-    noise = (1.0 - correlation**2) / freedom
+    off = counts.correlation - np.diag(np.diag(counts.correlation))
+    noise = (1.0 - counts.correlation**2) / counts.freedom
     # Ledoit and Wolf, J. Multivar. Anal. 88, 365 (2004): shrinking to no correlation
-    shrink = np.clip((noise.sum() - np.trace(noise)) / max((off**2).sum(), 1e-9), 0.1, 0.95)
+    shrink = np.clip((noise.sum() - np.trace(noise)) / max((off**2).sum(), 1e-9), 0.02, 0.95)
     weight = np.linalg.inv((1.0 - shrink) * off + np.eye(len(off))) / np.sqrt(np.outer(variance, variance))
     return Batch(cells, centre, fitted[0], slope, weight, y, residual, ratio, theta)
 

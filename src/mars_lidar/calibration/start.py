@@ -107,7 +107,7 @@ def starts(fit: Fit, recording: Recording, model: Model, fixed: dict[str, float]
         if "dead_time_ns" not in fixed:
             theta = with_edge(fit, model, theta, low)
         cells = fit.cells(model, theta, photons)
-        rows = cells.count(model.streams(np.tile(theta, (LIGHTS, 1)), cycles, fit.next_seed()))
+        rows = cells.count(model.streams(np.tile(theta, (LIGHTS, 1)), cycles, fit.next_seed()))[:, 0]
         recorded = cells.of(recording) * (photons / recording.photons)
         r = (2 * np.sqrt(recorded + 0.375) - 2 * np.sqrt(rows + 0.375).mean(0)) ** 2
         trials.append((float(r.sum()), theta))

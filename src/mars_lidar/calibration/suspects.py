@@ -14,7 +14,7 @@ from mars_lidar.calibration.model import Effect, Model, effects
 from mars_lidar.calibration.recording import FALSE_ALARM, LEAST_PHOTONS, Recording
 from mars_lidar.calibration.start import with_edge
 
-_MISFIT = 1e-3  # ratio of p-values of two fits of one model (at most 1) below which the lesser is a local minimum
+MISFIT = 1e-3  # ratio of p-values of two fits of one model (at most 1) below which the lesser is a local minimum
 _PARTS = 16  # of a recording, for drift: a trend then has 14 degrees of freedom
 
 
@@ -33,22 +33,27 @@ class Score:
         return min(self.size, 1.0 if self.effect.onoff else np.inf) / max(self.error, 1e-300)
 
 
-def counts_of(fit: Fit, fitted: Fitted, model: Model, theta: FloatArray) -> tuple[FloatArray, float]:
-    """Counts that a model expects in the cells of a fit, and the ratio of their variance to them."""
+def counts_of(
+    fit: Fit, fitted: Fitted, model: Model, theta: FloatArray, times: float = 1.0
+) -> tuple[FloatArray, float]:
+    """Counts that a model expects in the cells of a fit, by `times` a batch; ratio of their variance to them."""
     photons = float(fit.recording.photons)
-    simulated = min(fit.effort.share * photons, fit.effort.batch)
+    simulated = times * min(fit.effort.share * photons, fit.effort.batch)
     exposure = max(2, round(fit.exposure(simulated / LIGHTS)))
     ratio = fit.exposure(photons) / exposure
     rows = np.tile(model.bounded(theta), (LIGHTS, 1))
-    return counted(model, fitted.batch.cells, rows, exposure, fit.next_seed()).mean(0) * ratio, ratio / LIGHTS
+    return counted(model, fitted.batch.cells, rows, exposure, fit.next_seed()).total.mean(0) * ratio, ratio / LIGHTS
 
 
-def _score(fit: Fit, fitted: Fitted, plain: FloatArray, model: Model, theta: FloatArray, effect: Effect) -> Score:
+def _score(
+    fit: Fit, fitted: Fitted, plain: FloatArray, model: Model, theta: FloatArray, effect: Effect, times: float = 1.0
+) -> Score:
     """Size of an effect by generalised least squares: residual counts along the change that it makes at `theta`.
 
-    From that change the part is removed that the other parameters of the fit can absorb.
+    From that change the part is removed that the other parameters of the fit can absorb. The noise of the simulated
+    counts, of `times` a batch, makes the size too small on average, and no false score.
     """
-    (made, share), size = counts_of(fit, fitted, model, theta), theta[fitted.model.size]
+    (made, share), size = counts_of(fit, fitted, model, theta, times), theta[fitted.model.size]
     change, noise, used = made - plain, (np.maximum(plain, 0.5) + np.maximum(made, 0.5)) * share, fitted.batch.common
     change = change * np.maximum(0.0, 1.0 - 2.0 * noise / np.maximum(change**2, 1e-300)) / max(float(size), 1e-9)
     shift = fitted.estimator @ change
@@ -63,8 +68,9 @@ def _score(fit: Fit, fitted: Fitted, plain: FloatArray, model: Model, theta: Flo
 def possible(fit: Fit, fitted: Fitted, plain: FloatArray) -> list[Trial]:
     """Effects that the stream may have beyond the `plain` counts of the model, one trial of each kind.
 
-    Afterpulses start from the mean delay with the largest score. A paralyzable detector, of size 1, is left out of a
-    stream that fits where the 95 % upper limit of its score is below 1.
+    Afterpulses start from the mean delay with the largest score. A score above 1 is estimated once more, by longer
+    streams. A paralyzable detector, of size 1, is left out of a stream that fits if the 95 % upper limit of its score
+    is below 1.
     """
     model = fitted.model
     of = {"afterpulsing": "afterpulse_probability", "mode": "paralyzable"}
@@ -73,15 +79,22 @@ def possible(fit: Fit, fitted: Fitted, plain: FloatArray) -> list[Trial]:
     dead = float(centre[model.light + 2])
     given = model.light + 2 not in fitted.free and fitted.by_shortest is None  # the detector's, not the electronics'
     have |= {"electronics_excess"} if given or "electronics_dead_time_ns" in have else set()
+
+    def scored(effect: Effect, plain: FloatArray, times: float = 1.0) -> Score:
+        wider = replace(model, effects=(*model.effects, effect))
+        return _score(fit, fitted, plain, wider, np.r_[centre, effect.start], effect, times)
+
     listed: list[Score] = []
     for effect in effects(dead) if dead > 0.0 else ():
         if effect.names[0] not in have:
-            wider = replace(model, effects=(*model.effects, effect))
             with suppress(ValueError):  # a detector cannot have both
-                listed.append(_score(fit, fitted, plain, wider, np.r_[centre, effect.start], effect))
+                listed.append(scored(effect, plain))
     listed = [s for s in listed if not s.effect.onoff or fitted.p_value < FALSE_ALARM or s.size + 1.645 * s.error > 1.0]
     best = {score.effect.names[0]: score for score in sorted(listed, key=lambda score: score.z)}
-    return [Trial(fit.shorter, fitted, score) for score in best.values()]
+    if any(score.z > 1.0 for score in best.values()):
+        plain = counts_of(fit, fitted, model, fitted.theta, fit.effort.closely)[0]
+    scores = [scored(s.effect, plain, fit.effort.closely) if s.z > 1.0 else s for s in best.values()]
+    return [Trial(fit.shorter, fitted, score) for score in scores]
 
 
 class Trial:
@@ -175,11 +188,11 @@ def refitted(fit: Fit, fitted: Fitted, plain: FloatArray, trials: list[Trial]) -
     if not significant:
         return None
     trial, final = min(significant, key=lambda pair: pair[1].misfit_z)
-    if fitted.p_value < _MISFIT:  # the first fit may have been a bad one
+    if fitted.p_value < MISFIT:  # the first fit may have been a bad one
         known = final.free < size
         root = root_of(final.covariance[np.ix_(known, known)])
         other = fit.shorter.finish(Guess(fitted.model, final.theta[:size], root, final.free[known]))
-        if other.converged and other.p_value > max(FALSE_ALARM, fitted.p_value / _MISFIT):
+        if other.converged and other.p_value > max(FALSE_ALARM, fitted.p_value / MISFIT):
             fitted, plain = other, counts_of(fit, other, other.model, other.theta)[0]
             if not _score(fit, fitted, plain, final.model, final.theta, trial.effect).z > limit:
                 return fitted, None

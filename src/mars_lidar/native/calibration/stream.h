@@ -66,21 +66,23 @@ class StreamCounter {
         }
     }
 
-    // Adds the counts of sorted times t (n) to out (size).
-    void operator()(const double* t, int64_t n, double* out) const {
-        double* const gaps = out + cells_.phases;
-        double* const table = gaps + cells_.gaps();
+    // Adds the counts of sorted times t (n) to out (pieces, size): a row for each of equal pieces of time, the last without
+    // end. An interval belongs to the piece in which it ends.
+    void operator()(const double* t, int64_t n, double* out, int64_t pieces, double length) const {
         const double rate = 1.0 / cells_.period, parts = static_cast<double>(cells_.phase_of.size());
         int64_t begin = 0;  // class of the phase of the time before
         for (int64_t k = 0; k < n; ++k) {
             double phase = t[k] * rate + cells_.shift;
             phase -= whole_below(phase);
             const size_t part = std::min(static_cast<size_t>(phase * parts), cells_.phase_of.size() - 1);
-            out[cells_.phase_of[part]] += 1.0;
+            const int64_t piece = std::min(static_cast<int64_t>(std::max(t[k], 0.0) / length), pieces - 1);
+            double* const row = out + piece * cells_.size();
+            row[cells_.phase_of[part]] += 1.0;
             if (k > 0) {
                 const int64_t gap = gap_of(t[k] - t[k - 1]);
+                double* const gaps = row + cells_.phases;
                 gaps[gap] += 1.0;
-                table[cells_.age_of[gap] * cells_.classes + begin + cells_.lit_of[part]] += 1.0;
+                gaps[cells_.gaps() + cells_.age_of[gap] * cells_.classes + begin + cells_.lit_of[part]] += 1.0;
             }
             begin = cells_.class_of[part];
         }
@@ -91,7 +93,7 @@ class StreamCounter {
 
     // Number of edges below an interval.
     int64_t gap_of(double interval) const {
-        const double place = interval * scale_;
+        const double place = std::max(interval, 0.0) * scale_;
         int64_t gap = first_[place < kParts ? static_cast<int64_t>(place) : kParts];
         while (gap < static_cast<int64_t>(cells_.gap_edges.size()) && cells_.gap_edges[gap] < interval) ++gap;
         return gap;

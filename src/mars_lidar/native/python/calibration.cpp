@@ -48,16 +48,17 @@ void recorded_times(const Vector<const int32_t>& cycle, const Vector<const float
 }
 
 void count_streams(const StreamCells& cells, const Vector<const double>& times, const Vector<const int64_t>& offsets,
-                   const Matrix<double>& out) {
+                   int64_t pieces, double length, const Matrix<double>& out) {
     check_offsets(offsets, size_of(times));
-    expect("out must be (streams, cells)", {size_of(offsets) - 1, cells.size()}, out);
+    if (pieces < 1 || !(length > 0.0)) throw nb::value_error("pieces and their length must be positive");
+    expect("out must be (streams * pieces, cells)", {(size_of(offsets) - 1) * pieces, cells.size()}, out);
     const nb::gil_scoped_release release;
     const StreamCounter count(cells);
     for (int64_t stream = 0; stream + 1 < size_of(offsets); ++stream) {
-        double* const row = out.data() + stream * cells.size();
-        std::fill_n(row, cells.size(), 0.0);
+        double* const rows = out.data() + stream * pieces * cells.size();
+        std::fill_n(rows, pieces * cells.size(), 0.0);
         const int64_t first = offsets.data()[stream];
-        count(times.data() + first, offsets.data()[stream + 1] - first, row);
+        count(times.data() + first, offsets.data()[stream + 1] - first, rows, pieces, length);
     }
 }
 
@@ -92,8 +93,9 @@ void bind_calibration(nb::module_& module) {
         "recorded_times", &recorded_times, "cycle"_a, "phase"_a, "offsets"_a, nb::kw_only(), "sigma_ns"_a, "deviates"_a,
         "grid"_a, "out"_a.noconvert(),
         "Times of streams with jitter, sorted, on the grid (period, unit, offset, locked) of a recorder: out (n).");
-    module.def("count_streams", &count_streams, "cells"_a, "times"_a, "offsets"_a, "out"_a.noconvert(),
-               "Counts of streams of sorted times: out (streams, cells).");
+    module.def("count_streams", &count_streams, "cells"_a, "times"_a, "offsets"_a, nb::kw_only(), "pieces"_a,
+               "length"_a, "out"_a.noconvert(),
+               "Counts of streams of sorted times in pieces of this length: out (streams * pieces, cells).");
 }
 
 }  // namespace mars

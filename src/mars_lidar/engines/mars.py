@@ -113,7 +113,9 @@ class MarsEngine(CountTimesShape):
 
     def _evaluated(self, run: synthesis.Run, group: Group) -> synthesis.Batch:
         task = run.task
-        exposure = recorded_moments(group.cells, tolerance=TOL.movement, threads=task.threads, progress=run.waiting)
+        exposure = recorded_moments(
+            group.cells, tolerance=TOL.law_tolerance, threads=task.threads, progress=run.waiting
+        )
         cumulants = exposure.cumulants.reshape(-1, 4)
         if self.count == "exact" and task.system.dead_time_periods > 0.0:
             pmfs = exact_pmfs(group.cells, cumulants, exposure.bins.reshape(-1), task.threads)

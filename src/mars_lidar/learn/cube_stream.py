@@ -21,8 +21,8 @@ from mars_lidar.engines import Engine, check_detector, find_engine
 from mars_lidar.engines.simulation import simulate
 from mars_lidar.instrument.system import System
 from mars_lidar.io.scene_files import SceneFile
+from mars_lidar.learn.loaders import UNSIGNED, Buffers, Passes, rank_of, resumed_in_worker, worker_of
 from mars_lidar.learn.needed import torch
-from mars_lidar.learn.passes import UNSIGNED, Buffers, Passes, rank_of, resumed_in_worker, worker_of
 from mars_lidar.learn.ranges import LogUniform, Range, SystemRange, as_range, as_systems
 from mars_lidar.learn.scenes import Sample, Samples, as_source, example_of
 from mars_lidar.scene.radiometry import AMBIENTS, ATTENUATIONS

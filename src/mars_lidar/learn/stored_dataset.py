@@ -25,8 +25,8 @@ from mars_lidar._base.native import _core
 from mars_lidar._base.resources import check_memory
 from mars_lidar.dataset.arrays import MAPS, sample_parts
 from mars_lidar.dataset.store import Block, Dataset, open_dataset, read_block
+from mars_lidar.learn.loaders import UNSIGNED, Buffers, Passes, rank_of, resumed_in_worker, worker_of
 from mars_lidar.learn.needed import torch
-from mars_lidar.learn.passes import UNSIGNED, Buffers, Passes, rank_of, resumed_in_worker, worker_of
 from mars_lidar.learn.tolerances import TOLERANCES
 
 _NATIVE = {  # types that packed counts are decoded to without a copy

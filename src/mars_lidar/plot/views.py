@@ -234,7 +234,7 @@ def predicted_counts(cube: Cube, y: int, x: int) -> NDArray[np.float64] | None:
         return photons_per_bin(flux[y, x], system, bins=system.bins) * system.cycles
     if cube.engine == "poisson":
         system = system.replace(detector=replace(system.detector, dead_time_ns=0.0))
-    tolerance = 1e-2 if "electronics_dead_time_ns" in effects else TOL.movement  # seconds each beyond that
+    tolerance = 1e-2 if "electronics_dead_time_ns" in effects else TOL.law_tolerance  # seconds each beyond that
     try:
         return mean_histogram(flux[y, x], system, tolerance=tolerance)
     except ConvergenceError:

@@ -145,7 +145,7 @@ def count_law(
     method: Method = "exact",
     *,
     rearm: Rearm | None = None,
-    tolerance: float = TOL.movement,
+    tolerance: float = TOL.law_tolerance,
     threads: int | None = None,
 ) -> CountLaw:
     """Law of the number of registrations in one exposure.

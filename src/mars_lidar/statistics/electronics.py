@@ -114,7 +114,7 @@ class RecordGrid:
         n, system = self.bins, self.cell.system
         if system.start == "armed":
             return np.zeros(0), 1.0
-        rate = stationary_histogram(self.cell, n, tolerance=TOL.movement, threads=None)[0]
+        rate = stationary_histogram(self.cell, n, tolerance=TOL.law_tolerance, threads=None)[0]
         at = self.shift + 1
         past = np.tile(rate, at // n + 2)[-(at + 1) :]  # of the bins -(at + 1) .. -1
         blind = past[1:].sum() - (1.0 - self.part) * past[1]
@@ -289,7 +289,7 @@ def moments(cells: Cells, tolerance: float, budget: Budget = MOMENTS) -> Moments
     histogram = np.empty((cells.size, out.bins))
     bare, slower = without_electronics(cells)
     if slower == 0.0:
-        exposure = refined_moments(bare, bins, tolerance=min(tolerance, TOL.movement), threads=None)
+        exposure = refined_moments(bare, bins, tolerance=min(tolerance, TOL.law_tolerance), threads=None)
         flat = exposure.cumulants.reshape(-1, exposure.cumulants.shape[-1])
         mean, variance, histogram = flat[:, 0], flat[:, 1], _record(timing)(exposure.histogram.reshape(-1, bins))
         grid = exposure.bins.reshape(-1)
@@ -556,7 +556,7 @@ def record_pmfs(cells: Cells, tolerance: float, threads: int) -> list[Pmf]:
     """Pmf of the number of records of each cell; the tolerance is that of `electronics_moments`."""
     bare, slower = without_electronics(cells)
     if slower == 0.0:
-        exposure = refined_moments(bare, 1, tolerance=min(tolerance, TOL.movement), threads=threads)
+        exposure = refined_moments(bare, 1, tolerance=min(tolerance, TOL.law_tolerance), threads=threads)
         return exact_pmfs(bare, exposure.cumulants.reshape(-1, 4), exposure.bins.reshape(-1), threads)
     return [_law(bare.part(slice(k, k + 1)), slower, tolerance) for k in range(cells.size)]
 

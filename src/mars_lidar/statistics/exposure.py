@@ -306,7 +306,7 @@ def exposure_moments(
     flux: Flux,
     system: System,
     *,
-    tolerance: float = TOL.movement,
+    tolerance: float = TOL.law_tolerance,
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> Exposure:

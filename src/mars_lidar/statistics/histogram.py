@@ -27,7 +27,7 @@ from mars_lidar.statistics.tolerances import LAW, TOL
 
 @checked
 def mean_histogram(
-    flux: Flux, system: System, *, tolerance: float = TOL.movement, threads: int | None = None
+    flux: Flux, system: System, *, tolerance: float = TOL.law_tolerance, threads: int | None = None
 ) -> FloatArray:
     """Mean histogram of the finite exposure, exact for every mode of the detector.
 
@@ -122,7 +122,7 @@ def registration_pdf(
     method: Literal["exposure", "stationary", "chain"] = "exposure",
     *,
     rearm: Rearm | None = None,
-    tolerance: float = TOL.movement,
+    tolerance: float = TOL.law_tolerance,
     threads: int | None = None,
 ) -> FloatArray:
     """Shape of the mean histogram: the distribution of registrations over the bins of the period.

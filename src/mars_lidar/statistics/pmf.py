@@ -253,7 +253,7 @@ def _ends(pmf: FloatArray, first: int, most: float = math.inf) -> float:
 
 def _by_own_cumulants(cell: Cells, threads: int) -> Pmf:
     """Exact pmf of one cell, computed with its exact cumulants."""
-    own = refined_moments(cell, 1, tolerance=TOL.movement, threads=threads)
+    own = refined_moments(cell, 1, tolerance=TOL.law_tolerance, threads=threads)
     return exact_pmfs(cell, own.cumulants.reshape(-1, 4), own.bins.reshape(-1), threads)[0]
 
 

@@ -72,7 +72,7 @@ class Tolerances:
 
     Attributes
     ----------
-    movement
+    law_tolerance
         Default tolerance of the exact law of an exposure: `Exposure.movement`, the largest of the changes of mean (in
         standard deviations), further cumulants and shape (total variation) when the bins of a grid are last halved,
         (21) of docs/theory_exposure.md. The error is smaller.
@@ -208,7 +208,7 @@ class Tolerances:
         Of the histograms on pieces that are computed together.
     """
 
-    movement: float = 1e-4
+    law_tolerance: float = 1e-4
     rounding: float = 1e-12
     repeats: float = 1e-12
     transient: float = 1e-9

@@ -117,7 +117,7 @@ class Table:
         *,
         method: Method = "exposure",
         rearm: Rearm = "centre",
-        tolerance: float = STATISTICS.movement,
+        tolerance: float = STATISTICS.law_tolerance,
         threads: int | None = None,
         progress: Progress | bool | None = None,
     ) -> Table:
@@ -217,7 +217,11 @@ class Table:
     ) -> tuple[Path, Path | None]:
         """Path of the table in the cache, and the existing file that can be used instead, or None."""
         system = system.detected()
-        chosen: dict[str, Any] = {"method": "exposure", "rearm": "centre", "tolerance": STATISTICS.movement} | options
+        chosen: dict[str, Any] = {
+            "method": "exposure",
+            "rearm": "centre",
+            "tolerance": STATISTICS.law_tolerance,
+        } | options
         unknown = set(chosen) - {"method", "rearm", "tolerance", "threads", "progress"}
         if unknown:
             raise TypeError(f"the options are those of Table.build, got {sorted(unknown)[0]!r}")

@@ -151,11 +151,9 @@ class Counts(NamedTuple):
     freedom: int
 
 
-def counted(
-    model: Model, cells: Cells, rows: FloatArray, exposure: float, seed: int, pieces: int = Effort.pieces
-) -> Counts:
+def counted(model: Model, cells: Cells, rows: FloatArray, exposure: float, seed: int) -> Counts:
     """Counts of simulated streams, one for each row of parameters (rows, p); `LIGHTS` rows share a detector."""
-    cycles = max(2, round(exposure))
+    cycles, pieces = max(2, round(exposure)), Effort.pieces
     square, totals = np.zeros((cells.size, cells.size)), []
     for k in range(0, len(rows), LIGHTS):
         streams = model.streams(rows[k : k + LIGHTS], cycles, seed + k)

@@ -1,5 +1,6 @@
 """The command: what it writes, what it says, and its exit codes."""
 
+import inspect
 import json
 import os
 import re
@@ -18,7 +19,8 @@ from harness import make_system, refused
 
 import mars_lidar as ml
 from mars_lidar import _core, io
-from mars_lidar.cli import main
+from mars_lidar.cli import _COMMANDS, main
+from mars_lidar.cli import app as mars_lidar
 from mars_lidar.cli.system_options import DEFAULT_SYSTEM
 from mars_lidar.dataset import open_dataset
 from mars_lidar.engines.feedback import Reason
@@ -322,8 +324,9 @@ sys.meta_path.insert(0, Press)
 from mars_lidar_command import main
 sys.exit(main())
 """
+    arguments = ["calibrate", "--help"]
     done = subprocess.run(
-        [sys.executable, "-c", code, "--version"], capture_output=True, text=True, preexec_fn=listen_to_ctrl_c
+        [sys.executable, "-c", code, *arguments], capture_output=True, text=True, preexec_fn=listen_to_ctrl_c
     )
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "mars-lidar: interrupted\n")
 
@@ -355,10 +358,17 @@ def test_help_teaches_and_starts_light():
     for words in ("--dead-time-ns", "default: 75", "Examples", "simulate --scene room -o room.zarr"):
         assert words in text
     assert run("--version").output == f"mars-lidar {ml.__version__}\n"
-    heavy = {"matplotlib", "zarr", "h5py", "xarray", "scipy", "PIL", "yaml", "torch"}
-    code = f"import sys, mars_lidar.cli; print(*({heavy!r} & set(sys.modules)))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == ""
+    heavy = {"matplotlib", "zarr", "h5py", "xarray", "scipy", "PIL", "yaml", "torch", "mars_lidar.engines"}
+    for arguments in ([], ["--help"], ["--version"]):
+        code = f"import sys; from mars_lidar.cli import main; main({arguments}); print(*({heavy!r} & set(sys.modules)))"
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+        assert done.stdout.splitlines()[-1] == ""
+
+
+def test_the_list_of_commands_has_the_summaries_of_their_docstrings():
+    for name, (_, summary) in (entry for entries in _COMMANDS.values() for entry in entries.items()):
+        docstring = inspect.getdoc(mars_lidar[name].default_command) if name != "table" else summary
+        assert " ".join(docstring.split("\n\n")[0].split()) == summary
 
 
 def install_completion(home: Path, *arguments: str) -> subprocess.CompletedProcess[str]:

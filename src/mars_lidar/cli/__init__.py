@@ -31,24 +31,35 @@ app = App(
     **COMMAND_LINE,
     version=f"mars-lidar {__version__}",
 )
-_COMMANDS = {  # heading: {command: module}; a module is imported when its command is used, or all for the list of them
+_COMMANDS = {  # heading: {command: (module, summary)}; the list of commands imports no module, a command only its own
     "Simulate": {
-        "simulate": "simulate",
-        "generate": "dataset",
-        "verify": "dataset",
-        "export": "dataset",
-        "timestamps": "convert",
-        "table": "table",
+        "simulate": ("simulate", "Simulate the histograms of a scene: a cube and a picture of it."),
+        "generate": ("dataset", "Simulate a dataset of many scenes, systems and levels of light."),
+        "verify": ("dataset", "Simulate chunks of a dataset again and compare every count."),
+        "export": ("dataset", "Write a dataset as the files that depth networks load."),
+        "timestamps": ("convert", "Write the photons of a cube one by one, with their times."),
+        "table": ("table", "Build, describe and clear lookup tables over signal and background."),
     },
-    "Look at files": {"info": "viewing", "view": "viewing", "explore": "viewing"},
-    "Reconstruct and calibrate": {"reconstruct": "reconstruct", "calibrate": "calibrate"},
-    "Write files": {"convert": "convert", "init": "init", "schema": "init"},
+    "Look at files": {
+        "info": ("viewing", "Describe a cube, a dataset or a file of another program."),
+        "view": ("viewing", "Draw depth, reflectivity, counts and a few histograms."),
+        "explore": ("viewing", "Show pixels and their exact laws in a browser."),
+    },
+    "Reconstruct and calibrate": {
+        "reconstruct": ("reconstruct", "Reconstruct depth and reflectivity from a cube."),
+        "calibrate": ("calibrate", "Fit light and detector to a measured photon stream."),
+    },
+    "Write files": {
+        "convert": ("convert", "Write a cube or a photon stream in another format."),
+        "init": ("init", "Write a commented system file to start from."),
+        "schema": ("init", "Write the JSON Schema of scene, recipe or system files, for editors."),
+    },
 }
-for _heading, _modules in _COMMANDS.items():
+for _heading, _commands in _COMMANDS.items():
     _group = Group.create_ordered(_heading)
-    for _place, (_name, _module) in enumerate(_modules.items()):
+    for _place, (_name, (_module, _summary)) in enumerate(_commands.items()):
         _command = f"mars_lidar.cli.{_module}:{_name}_command"
-        app.command(_command, name=_name, group=_group, sort_key=_place)
+        app.command(_command, name=_name, help=_summary, group=_group, sort_key=_place)
 app.register_install_completion_command(
     help="Install the completion of commands and options in bash, zsh, fish or PowerShell.",
     help_epilogue="",

@@ -70,7 +70,8 @@ def run(app: App, tokens: Sequence[str]) -> int:
             warnings.showwarning = partial(_show_warning, set())
             _refuse_empty(tokens)
             command = _command(app, tokens)
-            describe(command)
+            if command is not app:  # the list of commands has their summaries
+                describe(command)
             code = app(tokens, exit_on_error=False, print_error=False, result_action="return_value")
             sys.stdout.flush()
         asked = command.default_command or any(token.startswith("-") for token in tokens)

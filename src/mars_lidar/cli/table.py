@@ -199,12 +199,7 @@ def _line(path: Path) -> str:
     )
 
 
-table_command = App(
-    name="table",
-    help="Build, describe and clear lookup tables over signal and background.",
-    help_epilogue="",
-    **COMMAND_LINE,
-)
+table_command = App(name="table", help_epilogue="", **COMMAND_LINE)
 for _place, _command in enumerate((command(build), command(info), command(clear))):
     _command.sort_key = _place
     table_command.command(_command)

@@ -123,9 +123,9 @@ def random_pixels(rng: np.random.Generator, axis: FloatArray, samples: int, belo
 
 
 def dim_pixels(signal: FloatArray, background: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Pixels (P,) at quarters of the cells that begin at 0: errors relative to the law are largest there."""
+    """Pixels (P,) at quarters of the cells that begin at 0, with their edges: relative errors are largest there."""
     below = [
-        axis[1] * np.arange(4) / 4 if axis.size > 1 and axis[0] == 0.0 else axis[:1] for axis in (signal, background)
+        axis[1] * np.arange(5) / 4 if axis.size > 1 and axis[0] == 0.0 else axis[:1] for axis in (signal, background)
     ]
     s, b = (values.ravel() for values in np.meshgrid(*below, indexing="ij"))
     between = (~np.isin(s, signal)) | (~np.isin(b, background))

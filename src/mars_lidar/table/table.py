@@ -129,7 +129,7 @@ class Table:
             Laser, detector and histogram. Its detection efficiency and dark counts are ignored (`System.detected`).
         signal, background
             Axes, detected photons per period (`Flux.detected`): ``(low, high, points)`` for 0 and `points` log-spaced
-            values, or an array of values. Between 0 and the next value cumulants per photon are interpolated.
+            values, or an array of values. At 0 cumulants have the slopes of a Poisson law.
         method
             ``"exposure"``: exact statistics of the finite exposure. ``"mars"``: the paper's, Markov chain and
             Gaussian of the Markov-renewal law, asymptotic in the exposure.
@@ -398,7 +398,7 @@ class Table:
         return sum(each.nbytes for each in parts.values() if isinstance(each, np.ndarray))
 
     def limit(self, cycles: int) -> FloatArray:
-        """Cumulants (4,) per photon a period as the light vanishes: those of a Poisson law, or of method ``"mars"``."""
+        """Slopes of the cumulants (4,) in S and in B without light: of a Poisson law, or of method ``"mars"``."""
         return np.array([1.0, 1.0, 1.0, 1.0] if self.method == "exposure" else [1.0, 1.0, 0.0, 0.0]) * cycles
 
     def _cycles(self, cycles: int | None) -> int:

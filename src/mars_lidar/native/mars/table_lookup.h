@@ -55,6 +55,8 @@ struct Stencil {
     int64_t node[4];
     double weight[4];  // Lagrange, in log photons (L2)
     bool dim;          // in the cell that begins at 0
+    double rise[4];    // there, of nodes above 0: slope of the weight at 0
+    double bend;       // there: polynomial of slope 1 at 0 that vanishes at every node
 };
 
 // Cubic through up to four nodes at coordinates `at`.
@@ -94,6 +96,13 @@ MARS_APART inline Stencil stencil(const Axis& axis, const TableFlux& x, bool nea
             }
         lagrange_scales(at, out.count, scale);
         lagrange(out, at, scale, x.value);
+        out.bend = x.value;
+        for (int k = 1; k < out.count; ++k) {
+            out.bend *= 1.0 - x.value / at[k];
+            out.rise[k] = scale[k];
+            for (int i = 1; i < out.count; ++i)
+                if (i != k) out.rise[k] *= -at[i];
+        }
     } else {
         out.count = axis.count;
         const int64_t first = std::clamp(out.low - 1, axis.lowest, axis.size - out.count);
@@ -108,7 +117,7 @@ MARS_APART inline Stencil stencil(const Axis& axis, const TableFlux& x, bool nea
 struct TableLookup {
     Axis signal, background, sub_signal, sub_background;
     const double* cumulants;  // (signal * background, 4)
-    const double* limit;      // (4) of them, per photon a period, as the light vanishes
+    const double* limit;      // (4) slopes of them in S and in B at S = B = 0
     const double* phase;      // (phases) ascending, from 0 to 1
     int64_t phases;           // 0: no correction
     const float* correction;  // (sub_signal * sub_background, phases * 4)
@@ -133,20 +142,23 @@ struct TableLookup {
         for (int m = 0; m < 4; ++m) weight[m] = sum > 0.0 ? weight[m] / sum : v[m / 2] * w[m % 2];
     }
 
-    // Cumulants by a cubic through the nodes of either axis (L2), below the lowest nodes of both those per photon, which
-    // have a limit; adds them to `out`.
-    void bicubic(const Stencil& s, const Stencil& b, double photons, double* out) const {
+    // Cumulants by a cubic through the nodes of either axis (L2), in the cell that begins at S = B = 0 with the slopes that
+    // they have there (L3); adds them to `out`.
+    void bicubic(const Stencil& s, const Stencil& b, double* out) const {
         for (int k = 0; k < s.count; ++k)
-            for (int m = 0; m < b.count; ++m) {
-                const double* node = cumulants + (s.node[k] * background.size + b.node[m]) * kCumulants;
-                double w = s.weight[k] * b.weight[m];
-                if (s.dim && b.dim) {
-                    const double there = signal.value[s.node[k]] + background.value[b.node[m]];
-                    if (!(there > 0.0)) node = limit;
-                    w *= there > 0.0 ? photons / there : photons;
-                }
-                add(node, w, out);
-            }
+            for (int m = 0; m < b.count; ++m)
+                add(cumulants + (s.node[k] * background.size + b.node[m]) * kCumulants, s.weight[k] * b.weight[m], out);
+        if (!s.dim || !b.dim) return;
+        steepen(s, background.size, s.bend * (1.0 - b.fraction), out);
+        steepen(b, 1, b.bend * (1.0 - s.fraction), out);
+    }
+
+    // Adds `weight` times the part of `limit` that the slope of the cubic along one axis, of nodes `stride` entries apart,
+    // lacks at S = B = 0.
+    void steepen(const Stencil& along, int64_t stride, double weight, double* out) const {
+        add(limit, weight, out);
+        for (int k = 1; k < along.count; ++k)
+            add(cumulants + along.node[k] * stride * kCumulants, -weight * along.rise[k], out);
     }
 
     // Cumulants by the convex combination of the cell's four entries: coarser, and never out of range.
@@ -181,7 +193,7 @@ struct TableLookup {
         const Stencil x = stencil(signal, s, nearest != 0), y = stencil(background, b, nearest != 0);
         rows(x, y, row, weight);
         std::fill(out, out + kCumulants, 0.0);
-        bicubic(x, y, s.value + b.value, out);
+        bicubic(x, y, out);
         if (out[0] < 0.0 || out[1] < 0.0) {  // overshoot of a coarse grid: the convex combination has none
             std::fill(out, out + kCumulants, 0.0);
             bilinear(x, y, out);

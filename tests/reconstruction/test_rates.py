@@ -168,6 +168,20 @@ def test_coates_is_the_textbook_formula():
     assert np.isinf(Coates().rates([10, 90, 0, 0], system)[1])
 
 
+@pytest.mark.parametrize("method", ["generalised_coates", "mchc"])
+def test_a_bin_that_always_registered_is_saturated_in_spite_of_rounding(method):
+    """With 1000 cycles armed passes are whole thousandths, and sums of them may exceed an equal count by 1e-13."""
+    system = make_system(75.0, 1000, 1024, period_ns=400 / 3, sigma_ns=0.5)
+    delay = np.random.default_rng(9).uniform(0.0, 400 / 3, 1000)
+    cube = ml.simulate(ml.Flux(np.full(1000, 10.0), 10.0, delay), system, seed=9)
+    maps = ml.reconstruct(cube, system, method)
+    known = maps.flags & ml.reconstruction.Flags.SATURATED == 0
+    assert 0.5 < known.mean() < 0.7
+    assert maps.signal[known].max() < 1e4
+    rates = GeneralisedCoates().rates(cube, system)
+    assert np.array_equal(np.isinf(rates).any(-1), ~known)
+
+
 def test_a_gate_that_stays():
     system = system_of(45.0, mode="gated", gate_start_ns=80.03, gate_width_ns=40.0)
     mean = mean_histogram(ml.Flux(1.0, 1.0, 95.0), system, tolerance=1e-6)

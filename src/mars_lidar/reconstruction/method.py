@@ -179,7 +179,7 @@ class RateMethod(Method):
     def rates(
         self, cube: ArrayLike, system: System, *, total: ArrayLike | None = None, threads: int | None = None
     ) -> FloatArray:
-        """Photons per period in each bin (..., bins); infinite with a registration in every armed period.
+        """Photons per period in each bin (..., bins); infinite above 1e4, as with a registration in every armed period.
 
         Parameters
         ----------

@@ -13,6 +13,8 @@
 
 namespace mars {
 
+constexpr double kMostPhotons = 1e4;  // per period: a bound on S, on B and on the rate of a bin
+
 // Of one pixel, folded over the exposure: `armed` periods in which it was armed at the start of the bin, `rearmed`
 // periods in which it became so inside of it, at a place taken as uniform. For dead times below one bin `armed` is
 // the armed time of the bin instead, in periods, and `rearmed` is 0. `raw` is `armed` before it is kept within bounds.
@@ -185,12 +187,15 @@ struct Expected {
     Expected(double photons, double armed, double rearmed) : Expected(Pass(photons, rearmed != 0.0), armed, rearmed) {}
 };
 
-// Photons per period of a bin with which it registers as often as it did (R8); infinite where it always did.
+// Photons per period of a bin with which it registers as often as it did (R8), at most `kMostPhotons`; infinite where it
+// always did. The ends of the exposure make passes sums of fractions, which rounding may leave just above an equal count:
+// the root is then beyond any bound.
 inline double corrected_rate(const HistogramRecord& r, const ArmedPasses& passes, int64_t j, double count) {
     if (!(count > 0.0)) return 0.0;
     const double armed = passes.armed[j], rearmed = passes.rearmed[j];
-    if (r.below_bin()) return armed > 0.0 ? count / armed : HUGE_VAL;
+    if (r.below_bin()) return armed > 0.0 ? std::min(count / armed, kMostPhotons) : HUGE_VAL;
     if (count >= armed + rearmed) return HUGE_VAL;
+    if (count >= Expected(kMostPhotons, armed, rearmed).mean) return kMostPhotons;
     if (rearmed == 0.0) return -std::log1p(-count / armed);
     // m is concave in l, so Newton's steps from below rise to the root without overshooting
     double l = count / (armed + 0.5 * rearmed);

@@ -54,17 +54,18 @@ class Corrector {
         for (int64_t j = 0; j < r_.bins && !plain; ++j) {
             const double h = passes_.count[j];
             rate[j] = finite_rate(j, &flag);
-            if (!finite && (flag & kSaturated) && !std::isfinite(corrected_rate(r_, passes_, j, h))) rate[j] = HUGE_VAL;
+            if (!finite && (flag & kSaturated) && corrected_rate(r_, passes_, j, h) >= kMostPhotons) rate[j] = HUGE_VAL;
         }
         return flag;
     }
 
  private:
-    // A bin that registered whenever it could gets the rate of half a registration less, and the pixel a flag.
+    // A bin that registered whenever it could, or has a rate beyond the bound, gets that of half a registration less, and the
+    // pixel a flag.
     double finite_rate(int64_t j, uint8_t* flag) const {
         const double h = passes_.count[j];
         double found = corrected_rate(r_, passes_, j, h);
-        if (std::isfinite(found)) return found;
+        if (found < kMostPhotons) return found;
         *flag |= kSaturated;
         found = corrected_rate(r_, passes_, j, h - 0.5);
         return std::isfinite(found) ? found : 0.0;

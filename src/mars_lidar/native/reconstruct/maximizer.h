@@ -21,14 +21,13 @@ struct ReconstructionJob {
     bool less_bias = false;   // take off the first-order bias of the maximum
 };
 
-constexpr int kMostSteps = 80;        // of a climb; most end within ten
-constexpr double kGain = 5e-7;        // of the log likelihood that a further step promises: 1e-3 of a standard error
-constexpr double kMostPhotons = 1e4;  // per period: a bound on S and on B
-constexpr int kMostTurns = 20;        // of the search around a maximum of a likelihood with kinks; most end after two
-constexpr double kSteps = 4.0;        // of the profile of the delay, in a bin or a standard error
-constexpr double kPart = 0.4;         // of it, at most, in standard errors where it stands
-constexpr int kDepth = 3;             // halvings of a step of it in which a kink is looked for
-constexpr double kFallen = 1e-4;      // of the likelihood of the maximum: nothing
+constexpr int kMostSteps = 80;    // of a climb; most end within ten
+constexpr double kGain = 5e-7;    // of the log likelihood that a further step promises: 1e-3 of a standard error
+constexpr int kMostTurns = 20;    // of the search around a maximum of a likelihood with kinks; most end after two
+constexpr double kSteps = 4.0;    // of the profile of the delay, in a bin or a standard error
+constexpr double kPart = 0.4;     // of it, at most, in standard errors where it stands
+constexpr int kDepth = 3;         // halvings of a step of it in which a kink is looked for
+constexpr double kFallen = 1e-4;  // of the likelihood of the maximum: nothing
 constexpr double kUniform = 0.28867513459481287;  // standard deviation of the uniform law on a unit interval
 constexpr double kDrop = 2.0;                     // of the logarithm of a likelihood at two standard errors
 constexpr double kNearDrop = 0.2;                 // of it, at which a standard error is right to 5 %

@@ -158,7 +158,7 @@ def save_csv(path: Path, rows: Sequence[Row]) -> Path:
 
 def save_figure(path: Path, figure: Figure) -> Path:
     """Write a PNG; raises ValueError where it is too large to keep beside the text. Returns `path`."""
-    figure.savefig(path, metadata={"Software": None})
+    figure.savefig(path, metadata={"Software": None}, pil_kwargs={"optimize": True})
     size = path.stat().st_size
     if size > MAX_FIGURE_BYTES:
         raise ValueError(f"figure {path.name} has {size} bytes, at most {MAX_FIGURE_BYTES} are allowed")

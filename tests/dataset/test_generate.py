@@ -462,7 +462,7 @@ def test_bad_transients(tmp_path, of_transients, renders):
         ({"light": {"ambient": "map"}}, "ambient must be uniform"),
         ({"scenes": {"transient": str(tmp_path / "none.npz")}}, "no such file or folder"),
         ({"scenes": {"transient": str(renders), "pattern": "*.png"}}, "no transient found"),
-        ({"scenes": {"transient": str(renders / "a.npz"), "pattern": "*"}}, "pattern belongs to a folder"),
+        ({"scenes": {"transient": str(renders / "a.npz"), "pattern": "*"}}, "pattern applies to a folder"),
         ({"scenes": {"transient": str(renders / "a.npz"), "name": "x"}}, r"none of the scenes can be used:\s+.*no arr"),
         ({"engine": "neural"}, "engine must be one of"),
     ):

@@ -83,7 +83,7 @@ def test_options_replace_values(write):
         ("1e-1, 1]", "1e-1, -1]", 12, r"light\.signal\[1\] must be a finite number"),
         ("sbr: [inf, 2]", "sbr: [0]", 13, r"light\.sbr\[0\] must be a number in"),
         ("sbr: [inf, 2]", "sbr: [2, 2.0]", 12, "levels that differ"),
-        ("sbr:", "levels: [[1, 1]]\n  sbr:", 13, "give them, or signal and sbr"),
+        ("sbr:", "levels: [[1, 1]]\n  sbr:", 13, "give levels, or signal and sbr"),
         ("layout: dense", "layout: thick", 14, "store.layout must be one of 'sparse', 'dense', got 'thick'"),
         ("layout: dense", "chunk_mib: 8, shard_mib: 4", 14, "shard_mib must be at least chunk_mib"),
         ("store: {", "engine: fast\nstore: {", 14, "engine must be one of"),
@@ -160,7 +160,7 @@ def test_layers_of_a_file_are_simulated_too(tmp_path):
 def test_keys_of_one_scene_stand_for_those_of_many():
     single = {"systems": SCENE_SYSTEM, "scenes": {"example": "room", "seed": 3}}
     assert DatasetRecipe.from_dict(single).scenes == ({"example": "room", "size": 128, "seeds": [3]},)
-    refused("seed stands for seeds of one", read_view, {"example": "room", "seed": 3, "seeds": [3]}, SCENE_SYSTEM)
+    refused("seed is short for seeds", read_view, {"example": "room", "seed": 3, "seeds": [3]}, SCENE_SYSTEM)
     refused(
         "there must be one scene: 2 are named", read_view, {"example": "room", "size": 8, "seeds": [3, 4]}, SCENE_SYSTEM
     )

@@ -79,9 +79,9 @@ def generate(
     size : SIDE
         Resample every scene: the longer side, or HEIGHT,WIDTH. [default: as it is; room: 128]
     crop : SIDE
-        Cut out parts at random places: side, or HEIGHT,WIDTH.
+        Crops at random positions: side, or HEIGHT,WIDTH.
     crops
-        Parts per scene. [default: 1]
+        Crops per scene. [default: 1]
     scene_seeds
         Built-in scene: that many, of seeds 0, 1, ... [default: 1]
     depth_unit_m

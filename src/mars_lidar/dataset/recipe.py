@@ -36,7 +36,7 @@ LIGHT: Fields = {
     "sbr": values.several(_SBR),
     "levels": values.other("Pairs [signal, sbr] instead of all combinations.", {"type": "array", "items": _PAIR}),
     "photons_per_unit": values.real(
-        "Of one transient, instead of signal: photons per period for one unit of its light.", low=0.0, strict_low=True
+        "For one transient, instead of signal: photons per period for one unit of its light.", low=0.0, strict_low=True
     ),
     "attenuation": values.choice("Signal against depth.", ("none", "inverse_square")).or_else("none"),
     "ambient": values.choice("Ambient light over the image.", ("uniform", "reflectivity", "map")),
@@ -49,7 +49,7 @@ LIGHT: Fields = {
 class Light:
     """Levels of light, and the arguments of `mars_lidar.Scene.flux` that all samples share.
 
-    `levels` are pairs (signal, sbr). `photons_per_unit` stands for the signal of a single rendered transient.
+    `levels` are pairs (signal, sbr). `photons_per_unit` replaces the signal for a single rendered transient.
 
     Raises
     ------
@@ -73,7 +73,7 @@ class Light:
 
 
 def _is_pair(pair: Any) -> bool:
-    """Whether this is (signal, sbr); the latter may be infinite."""
+    """Whether `pair` is (signal, sbr), of which sbr may be infinite."""
     if not isinstance(pair, list | tuple) or len(pair) != 2:
         return False
     numbers = all(isinstance(value, Real) and not isinstance(value, bool) for value in pair)
@@ -81,11 +81,11 @@ def _is_pair(pair: Any) -> bool:
 
 
 def read_light(data: Any, key: Key = ("light",)) -> Light:
-    """The mapping under `light`."""
+    """Read the mapping under the key `light`."""
     given = values.read_mapping(key, data, LIGHT)
     if "levels" in given:
         if "signal" in given or "sbr" in given:
-            raise RecipeError((*key, "levels"), "levels are pairs of signal and sbr: give them, or signal and sbr")
+            raise RecipeError((*key, "levels"), "levels are pairs of signal and sbr: give levels, or signal and sbr")
         pairs = given.pop("levels")
         if not isinstance(pairs, list) or not pairs or not all(isinstance(p, list) and len(p) == 2 for p in pairs):
             raise RecipeError((*key, "levels"), f"levels must be a list of pairs [signal, sbr], got {pairs!r}")
@@ -115,7 +115,7 @@ def refuse_for_transients(light: Light, key: Key = ("light",)) -> None:
 
 
 def plain_levels(light: Light) -> list[list[Any]]:
-    """The levels as JSON has them."""
+    """The levels as JSON can store them: an infinite sbr is the text "inf"."""
     return [[s, "inf" if math.isinf(b) else b] for s, b in light.levels]
 
 
@@ -132,14 +132,14 @@ PANE: Fields = {
     "depth_m": values.real("Depth of the pane, m.", low=0.0, strict_low=True),
     "reflectivity": values.real("Reflectivity of the pane.", low=0.0, high=1.0),
     "transmission": values.real(
-        "Fraction of the light that passes it there and back.", low=0.0, high=1.0, strict_low=True
+        "Fraction of the light that passes the pane on the way there and back.", low=0.0, high=1.0, strict_low=True
     ).or_else(1.0),
 }
 _SIZE = values.size("Resample: the longer side, or [height, width].")
 _BEFORE: Fields = {
     "fog": values.several(
         values.mapping(
-            "Fog in front of the surfaces; a list makes a scene of each.", FOG, ("extinction_per_m", "backscatter")
+            "Fog in front of the surfaces; a list makes a scene with each.", FOG, ("extinction_per_m", "backscatter")
         )
     ),
     "pane": values.mapping("A pane in front of the surfaces.", PANE, ("depth_m", "reflectivity")),
@@ -154,8 +154,8 @@ KINDS: dict[str, Fields] = {
     },
     "path": {
         "path": values.text("Depth: a file, or a folder of scenes."),
-        "pattern": values.text("For a folder: the depth files, such as **/*_depth.png."),
-        "image": values.other("The image of a file; with pattern, a text of it and its replacement.", _IMAGE),
+        "pattern": values.text("For a folder: pattern of the depth files, such as **/*_depth.png."),
+        "image": values.other("Image of a depth file; with pattern, part of its name and the replacement.", _IMAGE),
         "manifest": values.text("For a folder: a CSV with a column depth."),
         "depth_unit_m": values.real("Metres per stored unit of depth.", low=0.0, strict_low=True),
         "focal_px": values.real("Focal length, pixels: converts depth to range.", low=0.0, strict_low=True),
@@ -165,8 +165,8 @@ KINDS: dict[str, Fields] = {
         **_BEFORE,
     },
     "transient": {
-        "transient": values.text("Rendered light (y, x, time): a file, or a folder of them."),
-        "pattern": values.text("For a folder: the files."),
+        "transient": values.text("Rendered light (y, x, time): a file, or a folder of files."),
+        "pattern": values.text("For a folder: pattern of the files."),
         "bin_ns": values.real("Width of a time bin, ns.", low=0.0, strict_low=True),
         "start_ns": values.real("Travel time at the first bin, ns."),
         "name": values.text("Name of the array in the file."),
@@ -184,11 +184,11 @@ SINGLE: dict[str, Fields] = {
     "transient": {},
 }
 _STANDS_FOR = {"depth": "path", "index": "frames", "seed": "seeds"}
-"""Keys of a single scene, and those of many that they stand for."""
+"""Keys of a single scene, and the keys of several scenes that they abbreviate."""
 
 
 def read_scenes(data: Any) -> tuple[dict[str, Any], ...]:
-    """The list under `scenes`, or its only entry."""
+    """Read `scenes`: a list of entries, or one entry."""
     entries = data if isinstance(data, list) else [data]
     if not entries:
         raise RecipeError(("scenes",), "scenes must have at least one entry")
@@ -196,7 +196,7 @@ def read_scenes(data: Any) -> tuple[dict[str, Any], ...]:
 
 
 def read_scene(key: Key, entry: Any) -> dict[str, Any]:
-    """One entry; keys of a single scene become those of many."""
+    """Read one entry; keys of a single scene are replaced by those of several scenes."""
     name = values.key_name(key) or "a scene file"
     kinds = [kind for kind in ("example", "depth", *KINDS) if isinstance(entry, dict) and kind in entry]
     kinds = list(dict.fromkeys(kinds))
@@ -210,7 +210,7 @@ def read_scene(key: Key, entry: Any) -> dict[str, Any]:
     for each, many in _STANDS_FOR.items():
         if each in given:
             if entry.get(many) is not None:
-                raise RecipeError((*key, each), f"{each} stands for {many} of one: give one of them")
+                raise RecipeError((*key, each), f"{each} is short for {many} with one entry: give one of the two")
             given[many] = given.pop(each) if many == "path" else [given.pop(each)]
     image = given.get("image")
     texts = image if isinstance(image, list) else [image]
@@ -226,26 +226,26 @@ LAYOUTS = ("sparse", "dense")
 STORE: Fields = {
     "layout": values.choice("dense: any Zarr library reads it; sparse: smaller.", LAYOUTS).or_else("dense"),
     "chunk_mib": values.real(
-        "Size of a chunk, which is read at once, MiB of dense counts.", low=0.001, high=512.0
+        "Size of a chunk, the least that is read, MiB of dense counts.", low=0.001, high=512.0
     ).or_else(8.0),
     "shard_mib": values.real("Size of a file, MiB of dense counts.", low=0.001, high=1024.0),
 }
 _CROP: Fields = {
     "size": values.size("Side, or [height, width]."),
-    "count": values.integer("Parts per scene.", low=1, high=2**20).or_else(1),
+    "count": values.integer("Crops per scene.", low=1, high=2**20).or_else(1),
 }
 ROOT: Fields = {
     "seed": values.integer("Seed of the dataset.", low=0, high=2**64 - 1).or_else(0),
     "scenes": values.other("Sources of the scenes.", {}),
     "size": values.size("Resample every scene: the longer side, or [height, width]."),
-    "crop": values.mapping("Parts at random places.", _CROP, ("size",)),
+    "crop": values.mapping("Crops at random positions.", _CROP, ("size",)),
     "systems": values.other("Lasers, detectors and histograms.", {}),
     "light": values.other("Levels of light.", {}),
-    "engine": values.other("As for simulate.", {"type": "string"}).or_else("exact"),
+    "engine": values.other("Engine, as for simulate.", {"type": "string"}).or_else("exact"),
     "realizations": values.integer("Exposures of each sample.", low=1, high=2**31).or_else(1),
     "store": values.mapping("Layout of the counts on disk.", STORE),
 }
-"""The keys of a recipe; `json_schema` puts in what scenes, systems and light are."""
+"""The keys of a recipe; `json_schema` adds the schemas of scenes, systems and light."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -262,13 +262,13 @@ class DatasetRecipe:
     light
         Levels (signal, sbr) and radiometry.
     size
-        Every scene is resampled to it: the longer side, or (H, W). None: as it is.
+        Size to which every scene is resampled: the longer side, or (H, W). None: scenes keep their sizes.
     crop, crops
-        (H, W) of parts cut out at random places, and how many per scene. None: whole scenes.
+        Size (H, W) of crops at random positions, and their number per scene. None: whole scenes.
     engine, realizations, seed
         As for `mars_lidar.simulate`; each sample has a seed of its own, drawn from this one.
     layout
-        ``"sparse"``: bins that are not zero, packed; ``"dense"``: readable by every Zarr library.
+        ``"sparse"``: the nonzero bins, packed; ``"dense"``: readable by every Zarr library.
     chunk_mib, shard_mib
         Upper limits of a chunk (what is read at once) and a shard (a file), as dense counts. shard_mib None: 64, in
         large datasets more.
@@ -288,7 +288,7 @@ class DatasetRecipe:
     shard_mib: float | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data, as in the YAML file with its files included, from which `from_dict` makes an equal recipe."""
+        """Plain data as in a YAML file that names no other files; `from_dict` makes an equal recipe of it."""
         light = asdict(self.light)
         light["levels"] = plain_levels(self.light)
         return {
@@ -333,7 +333,7 @@ class DatasetRecipe:
             refuse_for_transients(light)
         if light.photons_per_unit is not None:
             text = (
-                "photons_per_unit is for a single transient (simulate, compare): the samples of a dataset have a signal"
+                "photons_per_unit is for a single transient (simulate, compare); the samples of a dataset need a signal"
             )
             raise RecipeError(("light", "photons_per_unit"), text)
         return cls(
@@ -351,7 +351,7 @@ class DatasetRecipe:
 
     @classmethod
     def load(cls, path: str | Path, **replaced: Any) -> DatasetRecipe:
-        """Read a YAML file; `replaced` are keys of the top that take other values.
+        """Read a YAML file; `replaced` gives top-level keys other values.
 
         Raises
         ------
@@ -361,17 +361,17 @@ class DatasetRecipe:
         source = Path(path)
         data, lines = read_yaml(source)
         for name, value in replaced.items() if isinstance(data, dict) else ():
-            old = data.get(name)  # of light and store, the entries that are not given stay
+            old = data.get(name)  # light and store keep their other entries
             data[name] = old | value if isinstance(old, dict) and isinstance(value, dict) else value
         with located(source, lines, lambda key: bool(key) and key[0] in replaced):
             return cls.from_dict(data, source.parent)
 
 
-_FILE: Fields = {"file": values.text("A system of its own file.")}
+_FILE: Fields = {"file": values.text("File of a system.")}
 
 
 def pair(size: Any) -> Any:
-    """A size as the package has it."""
+    """A size as the package takes it: a number, or a tuple instead of a list."""
     return tuple(size) if isinstance(size, list) else size
 
 
@@ -457,7 +457,7 @@ def _system() -> dict[str, Any]:
     made["properties"]["pulse"] = _pulse()
     detector = made["properties"]["detector"]
     detector["properties"] |= {"preset": {"enum": list(PRESETS), "description": "A published detector by name."}}
-    detector.pop("required", None)  # a preset has them
+    detector.pop("required", None)  # a preset provides them
     return made
 
 
@@ -474,7 +474,7 @@ def _pulse() -> dict[str, Any]:
 
 
 def _of_class(kind: Any) -> dict[str, Any]:
-    """Schema of the plain form of a frozen dataclass of the package: types of its fields, texts of its docstring."""
+    """Schema of a frozen dataclass as plain data: types from its fields, descriptions from its docstring."""
     hints, sentences = get_type_hints(kind), _sentences(kind)
     properties: dict[str, Any] = {}
     needed = []
@@ -501,7 +501,7 @@ def _of_type(kind: Any) -> dict[str, Any]:
         return {"type": "array", "items": {"type": "number"}}
     if dataclasses.is_dataclass(kind):
         made = _of_class(kind)
-        if kind is not Detector:  # effects have a kind beside their fields, and other ways to give them
+        if kind is not Detector:  # effects also have a kind, and alternative forms
             made.pop("required", None)
             made["additionalProperties"] = True
         return made
@@ -509,7 +509,7 @@ def _of_type(kind: Any) -> dict[str, Any]:
 
 
 def _sentences(kind: type) -> dict[str, str]:
-    """First sentence on each parameter in a docstring."""
+    """First sentence of the description of each parameter in a docstring."""
     parameters = re.findall(r"^    (\w[\w, ]*)\n((?:        .*\n|\n)+)", kind.__doc__ or "", flags=re.MULTILINE)
     first = {names: " ".join(text.split()).split(". ")[0] for names, text in parameters}
     return {name.strip(): text for names, text in first.items() for name in names.split(",")}

@@ -1,4 +1,4 @@
-"""Scenes of a recipe one by one: read, resized, cropped and named; unusable ones are listed and omitted.
+"""Scenes of a recipe: read, resized, cropped and named, one after another; unusable ones are listed and omitted.
 
 A `View` is one scene with its light, the input of `simulate`.
 """
@@ -33,13 +33,13 @@ from mars_lidar.light.flux import Flux
 from mars_lidar.light.fog import Fog
 from mars_lidar.scene.scene import LayeredScene, Scene
 
-_TRIES = 20  # places tried for a crop with a return in it
+_TRIES = 20  # random positions at which a crop may have no return before the scene is refused
 _LIGHT = ("bin_ns", "start_ns", "name", "channel")  # arguments of `read_transient`
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A scene before it is read; its name enters the seeds of its samples, `place` those of its crops."""
+    """A scene that is not read yet. Seeds of its samples depend on `name`, positions of its crops on `place`."""
 
     name: str
     path: Path
@@ -48,7 +48,7 @@ class Candidate:
 
 
 def candidates(entries: Sequence[dict[str, Any]], folder: Path) -> tuple[list[Candidate], list[Problem]]:
-    """All scenes that the entries of a recipe name, in its order, and entries of manifests that are not scenes.
+    """All scenes of the entries of a recipe, in its order, and the lines of manifests that give none.
 
     ValueError for a source that does not exist or contains no scene.
     """
@@ -81,7 +81,7 @@ def candidates(entries: Sequence[dict[str, Any]], folder: Path) -> tuple[list[Ca
 def scenes(
     candidate: Candidate, recipe: DatasetRecipe, shape: tuple[int, int] | None
 ) -> Iterator[tuple[str, Content] | Problem]:
-    """The scene of a candidate, or its crops, by name, checked against all levels and systems; or the problem.
+    """Name and content of a scene, or of its crops, checked for all levels and systems; or the problem.
 
     `shape` is that of the dataset, None while it is not known.
     """
@@ -114,7 +114,7 @@ def scenes(
 def several(
     some: Sequence[Candidate], recipe: DatasetRecipe, shape: tuple[int, int] | None
 ) -> list[list[tuple[str, Content] | Problem]]:
-    """The same for several candidates; runs on workers."""
+    """`scenes` of several candidates, for a worker process."""
     return [list(scenes(candidate, recipe, shape)) for candidate in some]
 
 
@@ -146,9 +146,9 @@ def _files(entry: dict[str, Any], folder: Path, problems: list[Problem]) -> Iter
             return
     for name in ("pattern", "manifest"):
         if name in entry:
-            raise ValueError(f"{name} belongs to a folder, and {path} is none")
+            raise ValueError(f"{name} applies to a folder, and {path} is not one")
     if isinstance(image, list):
-        raise ValueError(f"image must be a file where path is one, got {image!r}")
+        raise ValueError(f"image must be a file if path is a file, got {image!r}")
     own = SceneFile(depth=path, image=None if image is None else folder / image, **options)
     if path.suffix.lower() != ".mat" or not path.is_file() or not rgbd.is_nyu(path):
         yield from _chosen([own], entry)
@@ -159,7 +159,7 @@ def _files(entry: dict[str, Any], folder: Path, problems: list[Problem]) -> Iter
 
 
 def _transients(entry: dict[str, Any], folder: Path) -> Iterator[tuple[Path, Callable[[], Rendered]]]:
-    """The files of an entry in the order of their paths, and what opens each; ValueError where there is none."""
+    """Files of an entry in the order of their paths, each with its reader; ValueError if there are none."""
     root = folder / entry["transient"]
     options = {name: entry[name] for name in _LIGHT if name in entry}
     files = [root]
@@ -169,7 +169,7 @@ def _transients(entry: dict[str, Any], folder: Path) -> Iterator[tuple[Path, Cal
         if not files:
             raise ValueError(f"{root}: no transient found, a file {', '.join(SUFFIXES)}")
     elif "pattern" in entry:
-        raise ValueError(f"pattern belongs to a folder, and {root} is none")
+        raise ValueError(f"pattern applies to a folder, and {root} is not one")
     elif not root.is_file():
         raise ValueError(f"{root}: no such file or folder")
     for file in files:
@@ -177,7 +177,7 @@ def _transients(entry: dict[str, Any], folder: Path) -> Iterator[tuple[Path, Cal
 
 
 def _rendered(file: Path, options: dict[str, Any], pulse: bool) -> Rendered:
-    """A file of rendered light, with the depth and reflectivity that it holds."""
+    """Read a file of rendered light; depth and reflectivity are NaN unless it contains them."""
     transient = read_transient(file, **options)
     nothing = np.full(transient.shape, np.nan)
     truth = {"depth": nothing, "reflectivity": nothing} | read_truth(file, transient.shape)
@@ -217,7 +217,7 @@ def _root_names(entries: Sequence[dict[str, Any]], folder: Path) -> dict[Path, s
 
 
 def _named(roots: dict[Path, str], root: Path, path: Path) -> str:
-    """A file by the name of what the recipe gives, and its place in it."""
+    """Name of a file: the name of its root, and its path below that."""
     own = Path(os.path.abspath(path))
     if own == root:
         return roots[root]
@@ -258,9 +258,9 @@ def _surfaces(file: SceneFile) -> Content:
 
 
 def _behind_all(clear: Candidate, entry: dict[str, Any]) -> Iterator[Candidate]:
-    """The scene behind the pane and in each of the fogs of an entry; itself where there are none.
+    """The scene behind the pane and in each fog of an entry; unchanged if the entry has neither.
 
-    Crops of a scene are at the same places whatever stands before it.
+    The positions of crops do not depend on pane and fog.
     """
     pane = entry.get("pane")
     for fog in entry.get("fog") or [None]:
@@ -294,7 +294,7 @@ def _cropped(scene: Content, size: tuple[int, int], name: str, seed: int) -> Con
 
 
 def _check_levels(scene: Content, recipe: DatasetRecipe) -> None:
-    """Raise ValueError where a level cannot be had of a scene: before anything is simulated."""
+    """Raise ValueError, before anything is simulated, if a scene cannot be simulated at one of the levels."""
     light, engine = recipe.light, find_engine(recipe.engine)
     unit_sbr = 1.0 if any(math.isfinite(sbr) for _, sbr in light.levels) else math.inf
     units: dict[float, Flux] = {}
@@ -315,7 +315,7 @@ def _check_levels(scene: Content, recipe: DatasetRecipe) -> None:
 
 
 def _at_level(unit: Flux, signal: float, ambient: float, dark: float) -> Flux:
-    """Light at the level 1, at another one."""
+    """Light of one pixel at a level, from its light at signal 1."""
     background = ambient * unit.background + dark
     if unit.waveform is not None:
         return Flux(waveform=signal * unit.waveform, background=background)
@@ -327,7 +327,7 @@ _PATHS = ("depth", "path", "image", "manifest", "transient")
 
 @dataclass(frozen=True)
 class View:
-    """Flux, true depth (m) and reflectivity of one scene, None where unknown, and its description."""
+    """Flux of one scene, its true depth (m) and reflectivity (None if unknown), and its description."""
 
     flux: Flux
     depth_m: NDArray[Any] | None
@@ -370,7 +370,7 @@ def read_view(scene: dict[str, Any] | str | Path, system: System, *, whole: bool
     given = {(name,) for name in changes} | {("light", name) for name in shining}
     own: Lines = {key: line for key, line in lines.items() if key[:1] not in given and key[:2] not in given}
     with located(file, own, lambda key: key[:1] in given or key[:2] in given):
-        if isinstance(data, dict):  # files of a description are relative to it
+        if isinstance(data, dict):  # paths are relative to the file that states them
             data |= {name: str(file.parent / data[name]) for name in _PATHS if isinstance(data.get(name), str)}
         return _view(_merged(data, changes, shining), system, whole)
 
@@ -380,7 +380,7 @@ def _merged(data: Any, changes: dict[str, Any], shining: dict[str, Any]) -> Any:
         return data
     light = data.get("light") or {}
     if isinstance(light, dict):
-        if "signal" in shining or "photons_per_unit" in shining:  # the level is one of the two
+        if "signal" in shining or "photons_per_unit" in shining:  # they exclude each other
             light = {name: value for name, value in light.items() if name not in ("signal", "photons_per_unit")}
         light = light | shining
     return data | changes | {"light": light}
@@ -400,8 +400,7 @@ def _view(data: Any, system: System, whole: bool) -> View:
     listed, problems = candidates([entry], Path())
     if problems or len(listed) != 1:
         problem = (
-            "; ".join(map(str, problems))
-            or f"{len(listed)} are named (of frames, index tells which); generate takes several"
+            "; ".join(map(str, problems)) or f"{len(listed)} are named (index selects a frame); generate takes several"
         )
         raise RecipeError((), f"there must be one scene: {problem}")
     content = listed[0].load()

@@ -59,7 +59,7 @@ class ExactEngine(Engine):
         drawn = _core.exact_records(
             task.job, task.pulse, offsets, cycle, phase, task.threads, task.progress, self.level
         )
-        for array in (cycle, phase):  # what has not been written to costs no memory till now
+        for array in (cycle, phase):  # memory that has not been written to is not in use yet
             array.resize(int(offsets[-1]), refcheck=False)
         if cycle.size > room:
             drawn.rest(cycle, phase)
@@ -90,7 +90,7 @@ class SequentialEngine(Engine):
         _core.sequential_histogram(task.job, task.pulse, out, task.threads, task.progress)
 
     def records(self, task: Task, expected: float) -> Records:
-        """In two passes of the same draws: the first counts the registrations."""
+        """Two passes with the same random numbers: the first counts the registrations."""
         _check_unique_start(task)
         counts = np.empty(task.items, np.int64)
         _core.sequential_counts(task.job, task.pulse, counts, task.threads, None)

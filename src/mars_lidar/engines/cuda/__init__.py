@@ -1,6 +1,6 @@
 """Engines on a GPU: the native headers compiled for CUDA at run time.
 
-This module selects the engines; the engines of the processor are independent of it.
+This module selects the engines; those of the processor do not depend on it.
 """
 
 from typing import Any
@@ -29,7 +29,7 @@ def check(engine: Engine, flux: Flux, system: System) -> None:
         case ExactEngine():
             _check_exact(engine, flux, system)
         case FeedbackEngine():
-            if system.dead_time_periods == 0.0:  # the bins are Poisson numbers, which no kernel draws
+            if system.dead_time_periods == 0.0:  # counts of bins are Poisson numbers, which no kernel draws
                 raise ValueError(
                     "dead_time_ns must be > 0 for engine 'feedback' on device 'cuda'; use engine 'exact' there, or "
                     "device 'cpu'"
@@ -50,17 +50,17 @@ def check(engine: Engine, flux: Flux, system: System) -> None:
 
 
 def histogram(engine: Engine, task: Task, out: Any) -> None:
-    """Fill `out` (items, bins), a C-contiguous CuPy array, with the bits of the processor.
+    """Fill `out` (items, bins), a C-contiguous CuPy array, with the same bits as on the processor.
 
     Runs on CuPy's current device and stream, for a task that `check` accepts.
     """
     match engine:
         case ExactEngine():  # one exposure a thread
             exact_histogram(task, out, Cuda())
-        case FeedbackEngine():  # one pixel a thread; what the sweeps refuse is drawn exactly
+        case FeedbackEngine():  # one pixel a thread; pixels that the sweeps refuse are drawn exactly
             machine = Cuda()
             feedback_histogram(task, out, machine, _exactly(engine, machine))
-        case MarsEngine():  # one pixel a block; what lies beyond the table is evaluated by the processor
+        case MarsEngine():  # one pixel a block; pixels beyond the table are evaluated by the processor
             mars_histogram(engine, task, out, Cuda())
         case _:
             check(engine, task.flux, task.system)
@@ -74,7 +74,7 @@ def records(engine: Engine, task: Task) -> PhaseRecords:
 
 
 def _check_exact(engine: ExactEngine, flux: Flux, system: System) -> None:
-    """On a GPU: returns of a pulse, in every mode, recorded as they are registered."""
+    """Refuse waveforms, and effects other than efficiency and dark counts."""
     if flux.waveform is not None:
         raise ValueError("flux must have returns, not a waveform, on device 'cuda'; use device 'cpu'")
     able = tuple(effect for effect in LIGHT_EFFECTS if effect in engine.effects)
@@ -88,8 +88,8 @@ def _exactly(engine: FeedbackEngine, machine: Cuda) -> Any:
         if part.flux.waveform is None:
             exact_histogram(part, rows, machine)
             return
-        here = np.empty((part.items, part.system.bins), rows.dtype)
-        ExactEngine(engine.level).histogram(part, here)
-        rows[...] = machine.array(here)
+        on_host = np.empty((part.items, part.system.bins), rows.dtype)
+        ExactEngine(engine.level).histogram(part, on_host)
+        rows[...] = machine.array(on_host)
 
     return draw

@@ -11,13 +11,13 @@ from mars_lidar.engines.cuda.machine import Cuda
 from mars_lidar.engines.engine import PhaseRecords, Task
 
 _WARP = 32
-_ROW_THREADS = 128  # of a block whose histograms are not in its memory
+_ROW_THREADS = 128  # of a block whose histograms are in device memory
 _LAUNCH_ITEMS = 1 << 22
-_LEAST_WARPS = 3  # of histograms that must fit into a multiprocessor, else they are counted in the device's memory
+_LEAST_WARPS = 3  # whose histograms must fit into shared memory; else they are counted in device memory
 
 
 def exact_histogram(task: Task, out: Any, machine: Cuda, *, in_block: bool | None = None) -> None:
-    """Fill `out` (items, bins), a C-contiguous array of the machine, with the bits of the processor.
+    """Fill `out` (items, bins), a C-contiguous array of the machine, with the same bits as on the processor.
 
     `in_block`: histograms are counted in the shared memory of a block (True), in device memory (False), or wherever
     they fit (None).
@@ -37,27 +37,30 @@ def exact_records(task: Task, machine: Cuda) -> PhaseRecords:
     _run(task, Sink.COUNTS, {"out": counts}, arrays, machine)
     offsets = np.concatenate([[0], np.cumsum(machine.host(counts))]).astype(np.int64)
     n = int(offsets[-1])
-    there = {
+    on_device = {
         "offsets": machine.array(offsets),
         "cycles": machine.empty((n,), np.int32),
         "phases": machine.empty((n,), np.float32),
     }
-    _run(task, Sink.TIMESTAMPS, there, arrays, machine)
-    return PhaseRecords(offsets, machine.host(there["cycles"]), machine.host(there["phases"]), task.system.bins)
+    _run(task, Sink.TIMESTAMPS, on_device, arrays, machine)
+    return PhaseRecords(offsets, machine.host(on_device["cycles"]), machine.host(on_device["phases"]), task.system.bins)
 
 
 def _arrays(task: Task, machine: Cuda) -> dict[str, Any]:
-    """What the kernel reads, by name: flux, tables of the pulse, order of the pixels, starts of the exposures."""
-    here: dict[str, NDArray[Any]] = {
+    """Input of the kernel by name: flux, tables of the pulse, order of the pixels, starts of the exposures."""
+    on_host: dict[str, NDArray[Any]] = {
         **task.pixel_arrays(),
         # the threads of a warp wait for each other, and the longest exposures should begin first
         "order": np.argsort(-task.flux.total.reshape(-1), kind="stable").astype(np.int32),
         **_core.device_tables(task.pulse),
     }
     if task.system.start == "stationary" and task.system.dead_time_periods > 0.0:
-        here["start_cycle"], here["start_phase"] = np.empty(task.items, np.int32), np.empty(task.items, np.float32)
-        _core.device_starts(task.job, task.pulse, here["start_cycle"], here["start_phase"], task.threads, None)
-    return {name: machine.array(array) for name, array in here.items() if array.size}
+        on_host["start_cycle"], on_host["start_phase"] = (
+            np.empty(task.items, np.int32),
+            np.empty(task.items, np.float32),
+        )
+        _core.device_starts(task.job, task.pulse, on_host["start_cycle"], on_host["start_phase"], task.threads, None)
+    return {name: machine.array(array) for name, array in on_host.items() if array.size}
 
 
 def _run(task: Task, sink: Sink, to: dict[str, Any], arrays: dict[str, Any], machine: Cuda) -> None:
@@ -71,5 +74,5 @@ def _run(task: Task, sink: Sink, to: dict[str, Any], arrays: dict[str, Any], mac
         argument = _core.device_task(task.job, task.pulse, addresses, first, items)
         machine.launch(kernel, -(-items // lanes), lanes, argument, shared)
         if task.progress is not None:
-            machine.host(next(iter(to.values()))[:1])  # all before is done
+            machine.host(next(iter(to.values()))[:1])  # waits for the launches so far
             task.progress(first + items, task.items)

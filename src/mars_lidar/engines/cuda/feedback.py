@@ -13,15 +13,15 @@ from mars_lidar.engines.cuda.machine import Cuda
 from mars_lidar.engines.engine import Task, part_of
 from mars_lidar.engines.feedback import Group, Plan, sweep_pixels
 
-_LANES = 32  # a warp: its threads' rows lie side by side
-_WORK_BYTES = 4 << 30  # of all warps that run at the same time, at most
-_STREAMS_EACH = 4  # batches for each warp in flight, where there are realizations enough
+_LANES = 32  # threads of a warp, whose rows are interleaved
+_WORK_BYTES = 4 << 30  # at most, for all warps that run at the same time
+_STREAMS_EACH = 4  # batches for each warp that runs, if there are enough realizations
 
 Draw = Callable[[Task, Any], None]
 
 
 def feedback_histogram(task: Task, out: Any, machine: Cuda, draw_exactly: Draw, *, warps: int | None = None) -> None:
-    """Fill `out` (items, bins), a C-contiguous array of the machine, with the bits of the processor.
+    """Fill `out` (items, bins), a C-contiguous array of the machine, with the same bits as on the processor.
 
     Pixels on which the sweeps are not tried or which they refuse, and single exposures that do not settle, are drawn
     by ``draw_exactly(task, out)``.
@@ -45,22 +45,22 @@ def feedback_histogram(task: Task, out: Any, machine: Cuda, draw_exactly: Draw, 
         draw_exactly(part, rows)
         cube[first : first + number, machine.array(pixels)] = rows.reshape(number, pixels.size, task.system.bins)
     if task.progress is not None:
-        machine.host(out[:1, :1])  # all is done
+        machine.host(out[:1, :1])  # waits for the device
         task.progress(task.items, task.items)
 
 
 def _arrays(task: Task, machine: Cuda) -> dict[str, Any]:
-    """What the kernel reads of the pixels and the pulse."""
-    here: dict[str, NDArray[Any]] = {**task.pixel_arrays(), **_core.feedback_pulse(task.pulse)}
+    """Input of the kernel that describes the pixels and the pulse."""
+    on_host: dict[str, NDArray[Any]] = {**task.pixel_arrays(), **_core.feedback_pulse(task.pulse)}
     if task.flux.waveform is not None:
-        here["waveform"] = np.ascontiguousarray(task.flux.waveform.reshape(task.pixel_index.size, -1))
-    return {name: machine.array(array) for name, array in here.items() if array.size}
+        on_host["waveform"] = np.ascontiguousarray(task.flux.waveform.reshape(task.pixel_index.size, -1))
+    return {name: machine.array(array) for name, array in on_host.items() if array.size}
 
 
 def _launch(
     task: Task, out: Any, group: Group, common: dict[str, Any], machine: Cuda, warps: int | None
 ) -> NDArray[np.uint8]:
-    """Draw the pixels (n,) of one internal grid; the status (realizations, n) of each exposure."""
+    """Draw the pixels (n,) of one internal grid; returns the status (realizations, n) of each exposure."""
     pixels, on = group.pixels, (group.kinds, group.laps)
     cells = _core.feedback_grid(task.job, *on)
     work = _core.feedback_warp_bytes(cells["place"].size - 1, group.laps)

@@ -14,9 +14,9 @@ from mars_lidar.instrument.detector import MODES
 
 HEADERS = Path(__file__).resolve().parents[2] / "native"
 AHEAD = 8  # registrations drawn ahead; changes speed only
-# The bits are those of the processor: no fused multiply-add, IEEE division, subnormal numbers.
+# For the same bits as on the processor: no fused multiply-add, IEEE division, subnormal numbers.
 OPTIONS = (
-    "-std=c++17",  # in this form: CuPy looks whether it is there
+    "-std=c++17",  # in this form, which CuPy recognises; else it adds another
     "--fmad=false",
     "--prec-div=true",
     "--prec-sqrt=true",
@@ -46,12 +46,12 @@ MARS_LAWS = Kernel("cuda/mars.h", "mars::mars_laws")
 
 
 def mars_histograms(wide: bool) -> Kernel:
-    """The kernel that draws, into histograms of uint32 or uint16."""
+    """The kernel that draws histograms of uint32 (`wide`) or uint16."""
     return Kernel("cuda/mars.h", f"mars::mars_histograms<{str(wide).lower()}>")
 
 
 def feedback_histograms(wide: bool) -> Kernel:
-    """The engine "feedback", into histograms of uint32 or uint16."""
+    """The kernel of engine "feedback", for histograms of uint32 (`wide`) or uint16."""
     return Kernel("cuda/feedback.h", f"mars::feedback_histograms<{str(wide).lower()}>")
 
 
@@ -96,7 +96,7 @@ class Variant:
 
 
 def overflow(itemsize: int) -> OverflowError:
-    """The error of the engines for a bin that exceeds its type."""
+    """The error of the engines for a count beyond the range of its type."""
     most = 2 ** (8 * itemsize) - 1
     return OverflowError(
         f"a histogram bin exceeds {most} counts: use fewer cycles, less flux"

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from mars_lidar._base.imports import MissingLibraryError
 from mars_lidar.engines.cuda.kernels import HEADERS, OPTIONS, Kernel, source
 
-_PLAIN_SHARED = 48 << 10  # bytes that a block gets without asking
+_PLAIN_SHARED = 48 << 10  # bytes of a block that need no request
 
 
 class NoDeviceError(RuntimeError, ValueError):
@@ -22,7 +22,7 @@ def cupy_with_device() -> Any:
         import cupy
     except ImportError as error:
         raise MissingLibraryError(
-            "device='cuda' needs CuPy: pip install 'mars-lidar[cuda12]' or 'mars-lidar[cuda13]', as your driver has it"
+            "device='cuda' needs CuPy: pip install 'mars-lidar[cuda12]' or 'mars-lidar[cuda13]', to suit your driver"
         ) from error
     try:
         number = cupy.cuda.runtime.getDeviceCount()

@@ -23,13 +23,13 @@ from mars_lidar.table.table import Table
 
 _LAW_LANES = 64
 LANES = 128  # threads that share a pixel
-_MOST_COUNTS = 2**24  # registrations of a bin that single precision counts
-_RUNS_EACH = 8  # runs for each block that is in flight, at least, where there are realizations enough
+_MOST_COUNTS = 2**24  # up to which single precision counts in steps of 1
+_RUNS_EACH = 8  # at least, for each block that runs, if there are enough realizations
 _HOST_BYTES = 256 << 20  # of histograms that the processor draws, at a time
 
 
 @dataclass
-class TableThere:
+class TableOnDevice:
     """A table on a device, for one number of cycles: arrays by name, and axes as the kernel's argument takes them."""
 
     cycles: int
@@ -37,7 +37,7 @@ class TableThere:
     arrays: dict[str, Any] = field(default_factory=dict)
 
 
-_tables: WeakKeyDictionary[Table, dict[Any, TableThere]] = WeakKeyDictionary()
+_tables: WeakKeyDictionary[Table, dict[Any, TableOnDevice]] = WeakKeyDictionary()
 
 
 def _most_registrations(flux: Flux, system: System) -> float:
@@ -57,7 +57,7 @@ def check_mars(flux: Flux, system: System) -> None:
 
 
 def mars_histogram(engine: MarsEngine, task: Task, out: Any, machine: Cuda) -> None:
-    """Fill `out` (items, bins), a C-contiguous array of the machine, with the bits of the processor."""
+    """Fill `out` (items, bins), a C-contiguous array of the machine, with the same bits as on the processor."""
     reader = engine.reader
     assert reader is not None  # see cuda.check
     single = single_return(task.flux)
@@ -68,12 +68,12 @@ def mars_histogram(engine: MarsEngine, task: Task, out: Any, machine: Cuda) -> N
     if outside.size:
         _on_host(engine, task, out, machine, outside)
     if task.progress is not None:
-        machine.host(out[:1, :1])  # all is done
+        machine.host(out[:1, :1])  # waits for the device
         task.progress(task.items, task.items)
 
 
 def _on_grid(table: Table, signal: FloatArray, background: FloatArray) -> tuple[IndexArray, IndexArray]:
-    """Pixels that the table reaches, and the others."""
+    """Indices of the pixels within the axes of the table, and of the others."""
     reach = (signal >= table.signal[0]) & (signal <= table.signal[-1])
     reach &= (background >= table.background[0]) & (background <= table.background[-1])
     return np.flatnonzero(reach), np.flatnonzero(~reach)
@@ -86,8 +86,8 @@ class _Launches:
         self.engine, self.reader, self.task, self.machine = engine, reader, task, machine
         self.cycles = task.system.cycles
         self.frame = pulse_frame(task.system)
-        self.there = _table_there(reader.table, self.cycles, task.system.dead_time_periods, self.frame, machine)
-        self.arrays: dict[str, Any] = dict(self.there.arrays)
+        self.table = _table_on_device(reader.table, self.cycles, task.system.dead_time_periods, self.frame, machine)
+        self.arrays: dict[str, Any] = dict(self.table.arrays)
 
     def draw(self, out: Any, pixels: IndexArray) -> None:
         """All realizations of pixels on the grid."""
@@ -104,7 +104,7 @@ class _Launches:
         period = task.system.period_ns
         phase = (0.5 * period - delay_ns) / period  # as Table.lookup
         phase -= np.floor(phase)
-        here: dict[str, NDArray[Any]] = {
+        on_host: dict[str, NDArray[Any]] = {
             "signal": signal,
             "background": background,
             "shift": shift_of(delay_ns, period),
@@ -112,7 +112,7 @@ class _Launches:
             "place": pixels,
             "pixel_index": np.ascontiguousarray(task.pixel_index[pixels]),
         }
-        self.arrays |= {name: machine.array(array) for name, array in here.items()}
+        self.arrays |= {name: machine.array(array) for name, array in on_host.items()}
         for name, width in (("rows", np.int64), ("weights", np.float64), ("cumulants", np.float64)):
             self.arrays[name] = machine.empty((n, 4), width)
         self.arrays["rate"] = machine.empty((n,), np.float64)
@@ -129,9 +129,9 @@ class _Launches:
             "nearest": int(self.reader.interpolation == "nearest"),
             "phases": self.reader.table.start_phases.phase.size,
         }
-        argument = _core.mars_law_task(self._addresses(), self.there.axes, numbers)
+        argument = _core.mars_law_task(self._addresses(), self.table.axes, numbers)
         machine.launch(MARS_LAWS, -(-n // _LAW_LANES), _LAW_LANES, argument)
-        if doubts or not self.reader.table.serves(self.cycles):  # else nothing has to be waited for
+        if doubts or not self.reader.table.serves(self.cycles):  # else no result is needed on the host yet
             doubted, refused = (int(k) for k in machine.host(self.arrays["found"]))
             if refused:
                 self.reader.table._refuse(self.cycles)
@@ -145,19 +145,19 @@ class _Launches:
         return single[0][pixels], background, single[1][pixels]
 
     def _use_exact_laws(self, pixels: IndexArray, doubted: IndexArray) -> None:
-        """Exact laws for pixels whose cumulants do not fix them, from the table or evaluated by the processor."""
+        """Exact laws for pixels whose cumulants do not determine them, from the table or evaluated by the processor."""
         run = Run(self.task, np.empty((0, 0)))
         entries, _ = self.reader.read(self.task, pixels[doubted])
         laws = exact_laws(run, self.reader, entries, np.arange(entries.pixels.size))
         which = np.full(pixels.size, -1, np.int32)
         which[np.searchsorted(pixels, entries.pixels)] = laws.law
-        there: dict[str, NDArray[Any]] = {
+        on_device: dict[str, NDArray[Any]] = {
             "exact": which,
             "law_first": laws.first,
             "law_offsets": laws.offsets,
             "law_cumulative": np.ascontiguousarray(laws.cumulative),
         }
-        self.arrays |= {name: self.machine.array(array) for name, array in there.items()}
+        self.arrays |= {name: self.machine.array(array) for name, array in on_device.items()}
         run.count("pixels_exact_count", doubted.size)
 
     def _counts(self, pixels: IndexArray) -> IndexArray | None:
@@ -177,7 +177,7 @@ class _Launches:
             shared = 0
         kernel = mars_histograms(out.dtype.itemsize == 4)
         blocks = machine.resident(kernel, LANES, shared)
-        # realizations of a pixel share its shape, but no block should be without work
+        # realizations of a pixel share its shape; split them only as far as all blocks need work
         parts = min(task.realizations, max(1, -(-_RUNS_EACH * blocks // pixels.size)))
         deep = -(-task.realizations // parts)
         parts = -(-task.realizations // deep)
@@ -216,7 +216,7 @@ class _Launches:
         return {name: self.machine.address(array) for name, array in self.arrays.items() if array.size}
 
 
-def _table_there(table: Table, cycles: int, dead_time: float, frame: Frame, machine: Cuda) -> TableThere:
+def _table_on_device(table: Table, cycles: int, dead_time: float, frame: Frame, machine: Cuda) -> TableOnDevice:
     """The table on the machine; that of the last number of cycles stays as long as the table lives."""
     resident = _tables.setdefault(table, {})
     key = machine.key
@@ -230,7 +230,7 @@ def _table_there(table: Table, cycles: int, dead_time: float, frame: Frame, mach
         "sub_background": phases.background,
     }
     axes = {name: np.ascontiguousarray(axis, np.float64) for name, axis in axes.items()}
-    here: dict[str, NDArray[Any]] = {
+    on_host: dict[str, NDArray[Any]] = {
         "entries": np.ascontiguousarray(entries.cumulants_at(cycles)),
         "limit": table.limit(cycles),
         "phases": np.ascontiguousarray(phases.phase),
@@ -238,14 +238,16 @@ def _table_there(table: Table, cycles: int, dead_time: float, frame: Frame, mach
         "shapes": np.ascontiguousarray(table.shapes(cycles)),
         "energy": frame.energy,
     }
-    guides: Any = _core.shape_guides(here["shapes"], dead_time=dead_time, first=frame.first, size=frame.energy.shape[1])
-    here["guides"] = guides
+    guides: Any = _core.shape_guides(
+        on_host["shapes"], dead_time=dead_time, first=frame.first, size=frame.energy.shape[1]
+    )
+    on_host["guides"] = guides
     for name, axis in axes.items():
-        here |= {f"{name}.{part}": array for part, array in _core.table_axis(axis).items()}
-    there = TableThere(cycles, axes, {name: machine.array(array) for name, array in here.items()})
-    machine.host(there.arrays["energy"])  # all is there, for other streams too
-    resident[key] = there
-    return there
+        on_host |= {f"{name}.{part}": array for part, array in _core.table_axis(axis).items()}
+    on_device = TableOnDevice(cycles, axes, {name: machine.array(array) for name, array in on_host.items()})
+    machine.host(on_device.arrays["energy"])  # waits for the copies, which other streams use too
+    resident[key] = on_device
+    return on_device
 
 
 def _on_host(engine: MarsEngine, task: Task, out: Any, machine: Cuda, pixels: IndexArray) -> None:

@@ -32,8 +32,8 @@ def long_exposures(config: Config, bandwidth: Bandwidth) -> Section:
             f"All threads, warm memory. mars: with a table of {points[0]} x {points[1]} entries. x reference: over "
             "feedback, in turn. exact is left out beyond 2e9 registrations. The cost of mars "
             "hardly depends on the exposure (7 to 12 us a pixel and core from 100 to 10,000 cycles); below some 3,000 "
-            "cycles exact is faster, and 20 ms at 1,000 cycles, once aimed at, are not reached: the start-up of some "
-            "pixels is compared with the exact law before a short exposure is drawn, 19 ms of a processor a call."
+            "cycles exact is faster. Before the first short exposure of an image the start-up of some pixels is "
+            "compared with the exact law, 13 ms of a processor that these times do not include."
         ],
     )
     each = replace(config, seconds=config.seconds / len(exposures))

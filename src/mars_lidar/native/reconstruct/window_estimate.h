@@ -6,9 +6,11 @@
 #include <utility>
 #include <vector>
 
+#include "lanes/kernels.h"
 #include "reconstruct/armed_passes.h"
 #include "reconstruct/histogram_record.h"
 #include "reconstruct/pulse_template.h"
+#include "reconstruct/sums.h"
 
 namespace mars {
 
@@ -38,6 +40,7 @@ class WindowEstimate {
         weight_.resize(energy_.size());
         pulse_.resize(r_.bins);
         core_.resize(r_.bins);
+        beside_.resize(r_.bins);
         for (int64_t j = 0; j < r_.bins; ++j) share_.push_back(r_.share(j));
     }
 
@@ -70,18 +73,14 @@ class WindowEstimate {
     double search(const double* rate, const std::vector<double>& weights) {
         const int64_t n = r_.bins, taps = static_cast<int64_t>(weights.size());
         const int64_t shift = ((first_ % n) + n) % n;
-        round_.resize(2 * n + taps);
-        for (int64_t j = 0; j < 2 * n + taps; ++j) round_[j] = j < n ? rate[j] : round_[j - n];
-        double top = -HUGE_VAL;
-        int64_t best = 0;
-        for (int64_t g = 0; g < n; g += step_) {
-            double sum = 0.0;
-            for (int64_t i = 0; i < taps; ++i) sum += weights[i] * round_[shift + g + i];
-            if (sum > top) {
-                top = sum;
-                best = g;
-            }
-        }
+        const int64_t points = (n + step_ - 1) / step_, length = correlated_length(points, taps, step_);
+        round_.resize(std::max(2 * n + taps, shift + length));
+        std::copy_n(rate, n, round_.begin());
+        for (int64_t j = n; j < 2 * n + taps; ++j) round_[j] = round_[j - n];
+        score_.resize(correlated_points(points));
+        const double* const rows = in_rows(round_, shift, step_, length, rows_);
+        correlate_({rows, weights.data(), length, taps, points, step_, score_.data()});
+        const int64_t best = step_ * (std::max_element(score_.begin(), score_.begin() + points) - score_.begin());
         return (static_cast<double>(best) + 0.5) / static_cast<double>(n);
     }
 
@@ -120,25 +119,32 @@ class WindowEstimate {
 
     // Whether a bin says anything of the light: it is open, and some pass was armed in it.
     bool used(const ArmedPasses* passes, int64_t j) const {
-        return r_.share(j) > 0.0 && (!passes || passes->armed[j] + passes->rearmed[j] > 0.0);
+        return share_[j] > 0.0 && (!passes || passes->armed[j] + passes->rearmed[j] > 0.0);
     }
 
     // Signal and background from the rates inside and outside of the window, each of which has light of both (R16).
     WindowResult window(const double* rate, const ArmedPasses* passes, double delay) {
         std::fill(pulse_.begin(), pulse_.end(), 0.0);
-        std::fill(core_.begin(), core_.end(), 0);
         for_pulse_bins(r_, delay, r_.pulse.low, r_.pulse.low + r_.pulse.span(),
                        [&](int64_t, int64_t j, double s, double) { pulse_[j] = s; });
-        for_pulse_bins(r_, delay, r_.core_low, r_.core_high, [&](int64_t, int64_t j, double, double) { core_[j] = 1; });
-        in_ = out_ = {};
-        double light_in = 0.0, light_out = 0.0;
-        for (int64_t j = 0; j < r_.bins; ++j) {
-            if (!used(passes, j)) continue;
-            WindowLight& part = core_[j] ? in_ : out_;
-            (core_[j] ? light_in : light_out) += rate[j];
-            part.share += share_[j];
-            part.pulse += pulse_[j];
-        }
+        std::fill(core_.begin(), core_.end(), 0);
+        for (int64_t j = 0; j < r_.bins; ++j) beside_[j] = used(passes, j) ? 1.0 : 0.0;
+        in_ = {};
+        double light_in = 0.0;
+        for_pulse_bins(r_, delay, r_.core_low, r_.core_high, [&](int64_t, int64_t j, double, double) {
+            core_[j] = 1;
+            if (beside_[j] == 0.0) return;
+            beside_[j] = 0.0;
+            light_in += rate[j];
+            in_.share += share_[j];
+            in_.pulse += pulse_[j];
+        });
+        const double *beside = beside_.data(), *share = share_.data(), *pulse = pulse_.data();
+        const auto [light_out, share_out, pulse_out] = sums_of<3>(r_.bins, [=](int64_t j) {
+            const bool out = beside[j] > 0.0;
+            return std::array<double, 3>{out ? rate[j] : 0.0, out ? share[j] : 0.0, out ? pulse[j] : 0.0};
+        });
+        out_ = {share_out, pulse_out};
         WindowResult out;
         out.delay = delay;
         determinant_ = in_.pulse * out_.share - out_.pulse * in_.share;
@@ -154,10 +160,10 @@ class WindowEstimate {
     }
 
     // Variance of a rate at `light` photons: of the binomial number of registrations, over its slope squared (R13).
-    double variance_of(const ArmedPasses& passes, int64_t j, double light) const {
+    double variance_of(const ArmedPasses& passes, int64_t j, double light, const Pass& pass) const {
         const double armed = passes.armed[j], rearmed = passes.rearmed[j];
         if (r_.below_bin()) return light / armed;
-        const Expected law(light, armed, rearmed);
+        const Expected law(pass, armed, rearmed);
         return law.mean * law.silent / ((armed + rearmed) * law.slope * law.slope);
     }
 
@@ -166,11 +172,19 @@ class WindowEstimate {
     void set_errors(const ArmedPasses& passes, WindowResult& out) const {
         if (!std::isfinite(out.background)) return;
         const double flat = out.background / static_cast<double>(r_.bins);
-        double inside = 0.0, outside = 0.0, beside = 0.0;
+        double inside = 0.0, outside = 0.0, beside = 0.0, light = 0.0;
+        bool rearmed = false;
+        Pass pass(light, rearmed);
         for (int64_t j = 0; j < r_.bins; ++j) {
             if (!core_[j]) beside += passes.count[j];
-            if (used(&passes, j))
-                (core_[j] ? inside : outside) += variance_of(passes, j, flat * share_[j] + out.signal * pulse_[j]);
+            if (!used(&passes, j)) continue;
+            const double next = flat * share_[j] + out.signal * pulse_[j];
+            if (next != light || rearmed != (passes.rearmed[j] != 0.0)) {  // most bins have the light of the background
+                light = next;
+                rearmed = passes.rearmed[j] != 0.0;
+                pass = Pass(light, rearmed);
+            }
+            (core_[j] ? inside : outside) += variance_of(passes, j, light, pass);
         }
         const auto error = [&](double of_in, double of_out) {
             return std::sqrt(of_in * of_in * inside + of_out * of_out * outside) / determinant_;
@@ -180,11 +194,13 @@ class WindowEstimate {
     }
 
     const HistogramRecord& r_;
+    void (*correlate_)(const FineCorrelation&) = kernel_at<const FineCorrelation&>("", MARS_KERNELS(correlate_finely_));
     Locator locator_;
     int64_t first_ = 0, step_ = 1;
-    std::vector<double> energy_, weight_, round_, share_;
-    // Of the last window: pulse of each bin, whether the window has the bin, sums of both sides, and their determinant.
-    std::vector<double> pulse_;
+    std::vector<double> energy_, weight_, round_, rows_, score_, share_;
+    // Of the last window: pulse of each bin, 1 for the bins used beside it, whether the window has the bin, sums of both
+    // sides, and their determinant.
+    std::vector<double> pulse_, beside_;
     std::vector<char> core_;
     WindowLight in_, out_;
     double determinant_ = 0.0;

@@ -49,8 +49,7 @@ class WindowEstimate {
         const double n = static_cast<double>(r_.bins);
         double delay;
         if (locator_ == Locator::kPeak) {
-            const int64_t top = std::find(rate, rate + r_.bins, largest_of(rate, r_.bins)) - rate;
-            delay = (static_cast<double>(top) + 0.5) / n - r_.peak;
+            delay = (static_cast<double>(place_of_largest(rate, r_.bins)) + 0.5) / n - r_.peak;
         } else {
             delay = refine(rate, search(rate, energy_), [](double s, double) { return s; });
         }
@@ -69,6 +68,8 @@ class WindowEstimate {
     }
 
  private:
+    static int64_t place_of_largest(const double* x, int64_t n) { return std::find(x, x + n, largest_of(x, n)) - x; }
+
     // The delay on the grid at which the correlation of rates and weights round the period is largest.
     double search(const double* rate, const std::vector<double>& weights) {
         const int64_t n = r_.bins, taps = static_cast<int64_t>(weights.size());
@@ -80,7 +81,7 @@ class WindowEstimate {
         score_.resize(correlated_points(points));
         const double* const rows = in_rows(round_, shift, step_, length, rows_);
         correlate_({rows, weights.data(), length, taps, points, step_, score_.data()});
-        const int64_t best = step_ * (std::max_element(score_.begin(), score_.begin() + points) - score_.begin());
+        const int64_t best = step_ * place_of_largest(score_.data(), points);
         return (static_cast<double>(best) + 0.5) / static_cast<double>(n);
     }
 

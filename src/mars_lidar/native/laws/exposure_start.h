@@ -2,6 +2,7 @@
 // pixel, and the test whether a state repeats (docs/theory_exposure.md).
 #pragma once
 #include <algorithm>
+#include <cstring>
 
 #include "laws/exposure_recursion.h"
 
@@ -9,29 +10,60 @@ namespace mars {
 inline namespace MARS_LEVEL {
 namespace {
 
+// Bins without light of the pulse have the response of the bin before them: computed once, for the same photons.
+class LastResponse {
+ public:
+    const Response<Real>& operator()(const Real (&photons)[kExposureParts]) {
+        if (std::memcmp(photons, photons_, sizeof photons_) != 0) {
+            std::memcpy(photons_, photons, sizeof photons_);
+            response_ = respond(photons);
+        }
+        return response_;
+    }
+
+ private:
+    Real photons_[kExposureParts]{};
+    Response<Real> response_ = respond(photons_);
+};
+
 // Responses with one entry per lane.
 std::vector<Response<Real>> responses(const ExposureLight& light, int64_t first, int64_t count) {
+    const int64_t parts = int64_t{light.bins} * kExposureParts;
+    Real signal{}, background{};
+    const double* shape[kReals];
+    for (int k = 0; k < count; ++k) {
+        set_lane(signal, k, light.signal[first + k]);
+        set_lane(background, k, light.background[first + k] / static_cast<double>(parts));
+        shape[k] = light.shapes + light.shape[first + k] * parts;
+    }
     std::vector<Response<Real>> out(light.bins);
+    LastResponse response;
     for (int32_t j = 0; j < light.bins; ++j) {
-        Real photons[kExposureParts]{};
-        for (int i = 0; i < kExposureParts; ++i)
-            for (int k = 0; k < count; ++k)
-                set_lane(photons[i], k, light.photons(first + k, int64_t{j} * kExposureParts + i));
-        out[j] = respond(photons);
+        Real photons[kExposureParts];
+        for (int i = 0; i < kExposureParts; ++i) {
+            Real energy{};
+            for (int k = 0; k < count; ++k) set_lane(energy, k, shape[k][int64_t{j} * kExposureParts + i]);
+            photons[i] = signal * energy + background;
+        }
+        out[j] = response(photons);
     }
     return out;
 }
 
 // Responses of one entry: lanes are bins on the way, then laid out bin after bin.
 std::vector<Response<double>> responses(const ExposureLight& light, int64_t entry) {
+    const int64_t parts = int64_t{light.bins} * kExposureParts;
+    const double signal = light.signal[entry], background = light.background[entry] / static_cast<double>(parts);
+    const double* shape = light.shapes + light.shape[entry] * parts;
     std::vector<Response<double>> out(light.bins);
+    LastResponse response;
     for (int32_t from = 0; from < light.bins; from += kReals) {
         const int count = std::min<int32_t>(kReals, light.bins - from);
         Real photons[kExposureParts]{};
-        for (int i = 0; i < kExposureParts; ++i)
-            for (int k = 0; k < count; ++k)
-                set_lane(photons[i], k, light.photons(entry, int64_t{from + k} * kExposureParts + i));
-        const Response<Real> r = respond(photons);
+        for (int k = 0; k < count; ++k)
+            for (int i = 0; i < kExposureParts; ++i)
+                set_lane(photons[i], k, signal * shape[int64_t{from + k} * kExposureParts + i] + background);
+        const Response<Real>& r = response(photons);
         for (int k = 0; k < count; ++k)
             out[from + k] = {lane(r.mass_armed, k),   lane(r.mass_in, k),   lane(r.mass_slope, k),
                              lane(r.moment_armed, k), lane(r.moment_in, k), lane(r.moment_slope, k)};

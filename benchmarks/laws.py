@@ -78,6 +78,6 @@ def _row(case: str, threads: int, cells: int, timing: Timing) -> Row:
 _EXPOSURE_NOTE = (
     "N_r and bins as in the canonical configuration; S and B log-uniform on [0.01, 10]. The statistics grid "
     "is refined until the result settles, so these times hold more than one grid; the pmf includes the "
-    "moments. Moments and entries take 1.8 times as long as at revision 726fa7b: both grids must have the edges of the "
+    "moments. Moments and entries take 1.4 times as long as at revision 726fa7b: both grids must have the edges of the "
     "histogram's bins now. Coarser ones agreed with each other where registrations lay in the neighbouring bin."
 )

@@ -1,4 +1,4 @@
-"""``python -m studies``: run studies and write their reports; `studies/__init__.py` says how a new one is added."""
+"""``python -m studies``: run studies and write their reports; `studies/__init__.py` says how to add one."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from cyclopts import App
 from mars_lidar._base import checks
 from mars_lidar.cli import console
 from mars_lidar.cli.options import COMMAND_LINE, Text, command
-from studies import STUDIES, Request, run
+from studies import Request
+from studies.registry import STUDIES, run
 
 _DEFAULTS = Request()
 

@@ -19,7 +19,7 @@ import yaml
 from harness import refused
 
 from benchmarks import readme
-from studies import STUDIES
+from studies.registry import STUDIES
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -25,7 +25,7 @@ from mars_lidar.engines.exact import PoissonEngine
 from mars_lidar.statistics import ConvergenceError
 from mars_lidar.statistics.pmf import Pmf, kl_divergence
 from mars_lidar.statistics.tolerances import TOL
-from studies import STUDIES, Request
+from studies import Request
 from studies.__main__ import main
 from studies.common import report
 from studies.common.distance import g_test, sampling_floor, variance_score, wasserstein
@@ -34,6 +34,7 @@ from studies.count_law import law
 from studies.count_law import run as count_law
 from studies.covariance import run as covariance
 from studies.detectors import run as detectors
+from studies.registry import STUDIES
 from studies.runtime import run as runtime
 from studies.runtime.numpy_pipeline import STAGES, NumpyTable, synthesize
 from tests.harness.study import quick_study, read_csv, written

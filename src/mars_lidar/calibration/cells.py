@@ -9,7 +9,7 @@ import numpy as np
 from mars_lidar._base.cached import cached_property
 from mars_lidar._base.native import _core
 from mars_lidar._base.types import FloatArray
-from mars_lidar.calibration.model import Model, Streams
+from mars_lidar.calibration.model import EXCESS, Model, Streams
 from mars_lidar.calibration.recording import Recording
 
 _PHASES = 2**15  # cells of the table from phase to class
@@ -33,7 +33,10 @@ class Cells:
         edges, lit = self._layout(model, theta, phases)
         centre = (np.arange(_PHASES) + 0.5) / _PHASES
         phase_of = np.searchsorted(edges, centre).astype(np.int32)
-        coarse = np.unique(np.concatenate([np.linspace(0.0, 1.0, _CLASSES + 1)[1:-1], lit.ravel()]))
+        # phases from which the dead time, or a shorter one that electronics' dead time hides, ends in a pulse
+        hidden = theta[model.light + 2] / (1.0 + np.array([0.0, EXCESS])[:, None, None])
+        ends = (lit[: model.returns] - hidden / period) % 1.0
+        coarse = np.unique(np.concatenate([np.linspace(0.0, 1.0, _CLASSES + 1)[1:-1], lit.ravel(), ends.ravel()]))
         inside = np.zeros(_PHASES, bool)
         for low, high in lit:
             inside |= (centre - low) % 1.0 < (high - low) % 1.0

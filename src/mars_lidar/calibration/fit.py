@@ -54,8 +54,9 @@ class Effort:
         Attempts to fit a recording, each with other simulated streams; the first that converges is used.
     effects
         Effects that are included at most, one after the other.
-    closely
-        Photons, relative to a batch, of the streams that test an effect again.
+    closely, noise
+        Photons, relative to a batch, of the streams that estimate the score of an effect again, as long as more than
+        this share of the square of its change is noise.
     shape_bins, light_bins, bin_photons
         Most bins of free light in the result; and of that from which streams are drawn, if each has so many photons.
     """
@@ -76,7 +77,8 @@ class Effort:
     draws: int = 20_000
     attempts: int = 3
     effects: int = 2
-    closely: float = 4.0
+    closely: tuple[float, ...] = (4.0, 16.0)
+    noise: float = 0.1
     shape_bins: int = 256
     light_bins: int = 1024
     bin_photons: float = 10.0

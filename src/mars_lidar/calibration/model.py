@@ -29,6 +29,7 @@ _WIDEST_JITTER = 0.05  # periods: the widest that `Jitter` takes
 _SMOOTHED = 9  # frequencies over which the power of a waveform is averaged
 _ITERATIONS = 100  # of a deconvolution: recorded pulses are then reproduced to 0.1 %
 _MOST_CARRIERS = 0.95  # of an avalanche
+EXCESS = 0.25  # of an electronics' dead time over the detector's, in the test for one
 Fields = dict[str, Any]
 
 
@@ -80,7 +81,7 @@ def effects(dead_time_ns: float) -> tuple[Effect, ...]:
         *(Effect(after, start, least, most, "afterpulses") for start in starts),
         Effect(("twilight_ns",), (min(1.0, 0.2 * dead),), (0.0,), (dead,), "twilight pulses"),
         Effect(("recovery_ns",), (0.03 * dead,), (0.0,), (2.0 * dead,), "slow recovery"),
-        Effect(("electronics_excess",), (0.25,), (0.0,), (19.0,), own),
+        Effect(("electronics_excess",), (EXCESS,), (0.0,), (19.0,), own),
         Effect(("paralyzable",), (1.0,), (0.0,), (1.0,), "paralyzable detector", onoff=True),
     )
 

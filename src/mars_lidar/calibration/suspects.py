@@ -20,11 +20,15 @@ _PARTS = 16  # of a recording, for drift: a trend then has 14 degrees of freedom
 
 @dataclass(frozen=True)
 class Score:
-    """Size of an effect from the residual counts, its standard deviation, and the shift of the parameters."""
+    """Size of an effect from the residual counts, its standard deviation, and the shift of the parameters.
+
+    `noise`: share of noise in the square of the simulated change, which lowers the score.
+    """
 
     effect: Effect
     size: float
     error: float
+    noise: float
     shift: FloatArray  # (free,) of the estimates, by an effect of size 1 that the model does not have
 
     @property
@@ -51,26 +55,31 @@ def _score(
     """Size of an effect by generalised least squares: residual counts along the change that it makes at `theta`.
 
     From that change the part is removed that the other parameters of the fit can absorb. The noise of the simulated
-    counts, of `times` a batch, makes the size too small on average, and no false score.
+    counts, of `times` a batch as those of `plain`, makes the size too small on average, and no false score.
     """
-    (made, share), size = counts_of(fit, fitted, model, theta, times), theta[fitted.model.size]
-    change, noise, used = made - plain, (np.maximum(plain, 0.5) + np.maximum(made, 0.5)) * share, fitted.batch.common
-    change = change * np.maximum(0.0, 1.0 - 2.0 * noise / np.maximum(change**2, 1e-300)) / max(float(size), 1e-9)
+    (made, share), size, used = (
+        counts_of(fit, fitted, model, theta, times),
+        theta[fitted.model.size],
+        fitted.batch.common,
+    )
+    change, noise = (made - plain) / max(float(size), 1e-9), (plain + made) * share / max(float(size), 1e-9) ** 2
     shift = fitted.estimator @ change
     way = change - fitted.jacobian @ shift
     along = np.zeros_like(way)
     along[used] = fitted.batch.weight[np.ix_(used, used)] @ way[used]
-    along /= max(float(way @ along), 1e-300)
+    square = max(float(way @ along), 1e-300)
+    along /= square
     spread = float((fitted.fresh @ along).std()) * (1.0 + 2.0 * share) ** 0.5
-    return Score(effect, float(fitted.rest @ along), spread, shift)
+    part = float(noise[used] @ np.diag(fitted.batch.weight)[used]) / square
+    return Score(effect, float(fitted.rest @ along), spread, part, shift)
 
 
 def possible(fit: Fit, fitted: Fitted, plain: FloatArray) -> list[Trial]:
     """Effects that the stream may have beyond the `plain` counts of the model, one trial of each kind.
 
-    Afterpulses start from the mean delay with the largest score. A score above 1 is estimated once more, by longer
-    streams. A paralyzable detector, of size 1, is left out of a stream that fits if the 95 % upper limit of its score
-    is below 1.
+    Afterpulses start from the mean delay with the largest score. Scores above 1 that noise of the simulated change
+    lowers are estimated again by longer streams, unless the model is rejected and refits decide. A paralyzable
+    detector, of size 1, is left out of a stream that fits if the 95 % upper limit of its score is below 1.
     """
     model = fitted.model
     of = {"afterpulsing": "afterpulse_probability", "mode": "paralyzable"}
@@ -91,9 +100,12 @@ def possible(fit: Fit, fitted: Fitted, plain: FloatArray) -> list[Trial]:
                 listed.append(scored(effect, plain))
     listed = [s for s in listed if not s.effect.onoff or fitted.p_value < FALSE_ALARM or s.size + 1.645 * s.error > 1.0]
     best = {score.effect.names[0]: score for score in sorted(listed, key=lambda score: score.z)}
-    if any(score.z > 1.0 for score in best.values()):
-        plain = counts_of(fit, fitted, model, fitted.theta, fit.effort.closely)[0]
-    scores = [scored(s.effect, plain, fit.effort.closely) if s.z > 1.0 else s for s in best.values()]
+    scores = list(best.values())
+    for times in fit.effort.closely if fitted.p_value >= FALSE_ALARM else ():
+        noisy = [score.z > 1.0 and score.noise > fit.effort.noise for score in scores]
+        if any(noisy):
+            plain = counts_of(fit, fitted, model, fitted.theta, times)[0]
+            scores = [scored(s.effect, plain, times) if again else s for s, again in zip(scores, noisy, strict=True)]
     return [Trial(fit.shorter, fitted, score) for score in scores]
 
 

@@ -14,7 +14,7 @@ from benchmarks.timing import Timing, in_turn
 from benchmarks.workload import system
 from mars_lidar import Flux
 from mars_lidar.statistics.count_laws import count_law
-from mars_lidar.statistics.exposure import exposure_moments
+from mars_lidar.statistics.moments import exposure_moments
 
 GOAL_MOMENTS_MS, GOAL_PMF_MS, GOAL_TABLE_S = 3.0, 20.0, 30.0
 TABLE = (256, 100)  # of the paper: S x B, log-spaced on [0.01, 10]

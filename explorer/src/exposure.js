@@ -1,5 +1,5 @@
 // Exact cumulants of the count and mean histogram of an exposure by the native recursion, on a grid that is refined until
-// they rest: as statistics/exposure.py composes them.
+// they rest: as statistics/moments.py composes them.
 import { PARTS, firstBins, gridOf, photonsIn, sum } from "./light.js";
 import { registrationRates } from "./paralyzable.js";
 

@@ -1,4 +1,4 @@
-// Registrations of a paralyzable pixel on the grid of the native recursion, as statistics/exposure.py has them
+// Registrations of a paralyzable pixel on the grid of the native recursion, as statistics/moments.py has them
 // (docs/theory_detectors.md, (1) and (17)).
 import { PARTS, differences, edgesOf, photonsBefore } from "./light.js";
 

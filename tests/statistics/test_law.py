@@ -18,9 +18,9 @@ from mars_lidar.statistics import ConvergenceError, PhaseChain, holding_times
 from mars_lidar.statistics import pmf as _pmf
 from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.count_laws import count_law
-from mars_lidar.statistics.exposure import refined_moments
 from mars_lidar.statistics.histogram import registration_pdf
 from mars_lidar.statistics.matched import matched_pmf, trusted
+from mars_lidar.statistics.moments import refined_moments
 from mars_lidar.statistics.pmf import Pmf, exact_pmfs, gaussian_pmf, guessed_pmfs, total_variation
 from mars_lidar.statistics.tolerances import TOL
 

@@ -17,8 +17,8 @@ from mars_lidar.statistics import exposure as exposure_module
 from mars_lidar.statistics import joint as pixel_module
 from mars_lidar.statistics import pmf as pmf_module
 from mars_lidar.statistics.cells import Cells
-from mars_lidar.statistics.exposure import refined_moments
 from mars_lidar.statistics.joint_grid import FoldedGrid, relative_residual
+from mars_lidar.statistics.moments import refined_moments
 from mars_lidar.statistics.tolerances import LAW
 from mars_lidar.table.entries import start_phases
 from tests.domain.judge import Predictions, refusal
@@ -250,7 +250,7 @@ def test_a_dead_time_of_many_periods_is_refused_before_the_work():
     """
     system = view(60_000.3, 60_000_000)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("mars_lidar.statistics.exposure.native_light", None)
+        patch.setattr("mars_lidar.statistics.moments.native_light", None)
         refused("joint_law", ml.count_law, ml.Flux(4.0, 0.13, 50.0), system, error=ConvergenceError)
 
 

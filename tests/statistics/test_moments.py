@@ -13,8 +13,8 @@ from mars_lidar import _core
 from mars_lidar.statistics import ConvergenceError, PhaseChain, joint
 from mars_lidar.statistics import cells as cells_module
 from mars_lidar.statistics.cells import Cells
-from mars_lidar.statistics.exposure import exposure_moments, native_light, stationary_histogram
 from mars_lidar.statistics.histogram import mean_histogram
+from mars_lidar.statistics.moments import exposure_moments, native_light, stationary_histogram
 from mars_lidar.statistics.tolerances import LAW, MOMENTS, TOL
 
 

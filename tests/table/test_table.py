@@ -12,7 +12,7 @@ import mars_lidar as ml
 from mars_lidar import _core
 from mars_lidar.statistics import exposure_moments
 from mars_lidar.statistics.cells import Cells
-from mars_lidar.statistics.exposure import blank, native_light
+from mars_lidar.statistics.moments import blank, native_light
 from mars_lidar.table import storage
 from mars_lidar.table.axes import axis_values, thinned
 from mars_lidar.table.entries import start_phases

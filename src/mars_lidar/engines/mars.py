@@ -12,7 +12,7 @@ from mars_lidar.engines.pixels import Group, groups
 from mars_lidar.engines.table_reader import CountTimesShape, PixelEntries, TableReader, as_shapes, exact_laws, untrusted
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
-from mars_lidar.statistics.exposure import recorded_moments
+from mars_lidar.statistics.moments import recorded_moments
 from mars_lidar.statistics.pmf import exact_pmfs
 from mars_lidar.statistics.tolerances import TOL
 from mars_lidar.table.table import Table

@@ -26,8 +26,8 @@ from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.statistics.cells import Cells, require_mode
-from mars_lidar.statistics.exposure import normalised
 from mars_lidar.statistics.matched import trusted
+from mars_lidar.statistics.moments import normalised
 from mars_lidar.statistics.pmf import Pmf, guessed_pmfs
 from mars_lidar.table.table import Table
 

@@ -6,9 +6,9 @@ from .constant_light import constant_light_rate as constant_light_rate
 from .count_laws import CountLaw as CountLaw
 from .count_laws import count_law as count_law
 from .electronics import electronics_moments as electronics_moments
-from .exposure import Exposure as Exposure
-from .exposure import Moments as Moments
-from .exposure import exposure_moments as exposure_moments
+from .moments import Exposure as Exposure
+from .moments import Moments as Moments
+from .moments import exposure_moments as exposure_moments
 from .histogram import mean_histogram as mean_histogram
 from .histogram import registration_pdf as registration_pdf
 from .joint import JointLaw as JointLaw

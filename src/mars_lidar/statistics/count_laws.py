@@ -20,8 +20,8 @@ from mars_lidar.statistics.cells import PLAIN, Cells
 from mars_lidar.statistics.chain import Rearm
 from mars_lidar.statistics.constant_light import renewal_moments
 from mars_lidar.statistics.electronics import record_pmfs
-from mars_lidar.statistics.exposure import Exposure, OfCumulants, refined_moments
 from mars_lidar.statistics.histogram import chain_of, histogram_effects, rearm_of
+from mars_lidar.statistics.moments import Exposure, OfCumulants, refined_moments
 from mars_lidar.statistics.pmf import Pmf, exact_pmfs, gaussian_pmf, poisson_pmf
 from mars_lidar.statistics.renewal import holding_times
 from mars_lidar.statistics.synchronous import cumulants_of, synchronous_pmfs

@@ -27,7 +27,7 @@ from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.statistics.cells import Cells, light_before, misplaced, photons_before, registered_before
 from mars_lidar.statistics.chain import ConvergenceError
-from mars_lidar.statistics.exposure import Moments, refined_moments, stationary_histogram
+from mars_lidar.statistics.moments import Moments, refined_moments, stationary_histogram
 from mars_lidar.statistics.pmf import Pmf, exact_pmfs
 from mars_lidar.statistics.timing import Timing, is_timed
 from mars_lidar.statistics.tolerances import LAW, MOMENTS, TOL, Budget, advice

@@ -16,7 +16,7 @@ from mars_lidar.light.flux import Flux
 from mars_lidar.statistics.cells import PLAIN, Cells, fine_histograms
 from mars_lidar.statistics.chain import PhaseChain, Rearm
 from mars_lidar.statistics.electronics import ELECTRONICS_MODES, moments, stationary_records
-from mars_lidar.statistics.exposure import normalised, refined_moments, stationary_histogram
+from mars_lidar.statistics.moments import normalised, refined_moments, stationary_histogram
 from mars_lidar.statistics.paralyzable import paralyzable_histograms
 from mars_lidar.statistics.synchronous import cumulants_of, first_arrivals, synchronous_pmfs
 from mars_lidar.statistics.timing import recorded

@@ -41,9 +41,9 @@ from mars_lidar.statistics.cells import (
     registered_before,
 )
 from mars_lidar.statistics.chain import ConvergenceError
-from mars_lidar.statistics.exposure import recorded_light
 from mars_lidar.statistics.histogram import mean_histograms
 from mars_lidar.statistics.joint_grid import FoldedGrid
+from mars_lidar.statistics.moments import recorded_light
 from mars_lidar.statistics.timing import Timing, is_timed
 from mars_lidar.statistics.tolerances import LAW, TOL, advice
 

@@ -17,7 +17,7 @@ from mars_lidar._base.native import _core
 from mars_lidar._base.types import FloatArray, IndexArray, NDArray
 from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.chain import ConvergenceError
-from mars_lidar.statistics.exposure import Settled, native_light, refined_moments, warm_history
+from mars_lidar.statistics.moments import Settled, native_light, refined_moments, warm_history
 from mars_lidar.statistics.tolerances import LAW, TOL
 
 # --- Support of the count, and closed forms ------------------------------------------------------------------------

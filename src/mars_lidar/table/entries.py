@@ -22,8 +22,8 @@ from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux, broadcast
 from mars_lidar.statistics.cells import Cells, cell_name, default_bins, flat
 from mars_lidar.statistics.chain import ConvergenceError, PhaseChain, Rearm
-from mars_lidar.statistics.exposure import Settled, _run, blank, native_light, normalised, refined_moments
 from mars_lidar.statistics.matched import trusted
+from mars_lidar.statistics.moments import Settled, _run, blank, native_light, normalised, refined_moments
 from mars_lidar.statistics.pmf import Pmf, guessed_pmfs
 from mars_lidar.statistics.renewal import holding_times
 from mars_lidar.table.axes import thinned

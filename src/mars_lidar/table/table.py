@@ -29,7 +29,7 @@ from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.statistics.cells import require_mode
 from mars_lidar.statistics.chain import ConvergenceError, Rearm
-from mars_lidar.statistics.exposure import exposure_moments, normalised
+from mars_lidar.statistics.moments import exposure_moments, normalised
 from mars_lidar.statistics.tolerances import TOL as STATISTICS
 from mars_lidar.table import storage
 from mars_lidar.table.axes import PAPER_GRID, Grid, axis_values, describe

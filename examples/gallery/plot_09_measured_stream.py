@@ -12,6 +12,7 @@ How-to: :doc:`/calibration`. Theory: :doc:`/calibration_method`.
 """
 
 import matplotlib.pyplot as plt
+import numpy as np
 
 import mars_lidar as ml
 
@@ -25,15 +26,17 @@ for name, estimate in result.estimates.items():
     print(f"{name:<28} {estimate}")
 print(*result.suspects, result.verdict, sep="\n")
 
-curves = result.curves()
+fitted = ml.simulate_timestamps(result.flux, result.system, seed=2)
 fig, axes = plt.subplots(1, 2, figsize=(8, 3.2))
-for ax, what in zip(axes, ("interval", "phase"), strict=True):
-    edges_ns = getattr(curves, f"{what}_edges_ns")
-    ax.stairs(getattr(curves, f"{what}s"), edges_ns, fill=True, color="0.8", label="recorded")
-    ax.stairs(getattr(curves, f"fitted_{what}s"), edges_ns, color="C0", label="fitted model")
-    ax.set(yscale="log", ylim=(0.5, None), ylabel="registrations per bin")
-axes[0].set_xlabel("time since the last registration (ns)")
-axes[1].set_xlabel("time in the laser period (ns)")
+recorded_style, fitted_style = (
+    {"fill": True, "color": "0.8", "label": "recorded"},
+    {"color": "C0", "label": "fitted model"},
+)
+for stream, style in ((times, recorded_style), (fitted, fitted_style)):
+    axes[0].stairs(*np.histogram(np.diff(stream.times_ns), 200, (0.0, 3500.0)), **style)
+    axes[1].stairs(*np.histogram(stream.times_ns % system.period_ns, 250, (0.0, system.period_ns)), **style)
+for ax, label in zip(axes, ("time since the last registration (ns)", "time in the laser period (ns)"), strict=True):
+    ax.set(xlabel=label, yscale="log", ylim=(0.5, None), ylabel="registrations per bin")
 axes[1].legend()
 plt.show()
 dead_time = result.estimates["dead_time_ns"]

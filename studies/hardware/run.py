@@ -16,9 +16,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from mars_lidar import Afterpulsing, Calibration, Detector, Flux, Jitter, Timestamps, calibrate, simulate_timestamps
-from mars_lidar.calibration.curves import Realizations
+from mars_lidar.calibration.realizations import Realizations
 from mars_lidar.plot.colours import COLOURS, MUTED
-from mars_lidar.plot.stream import calibration_figure
+from mars_lidar.plot.stream import calibration
 from studies import Facts, Request, Tell
 from studies.common.draw import panels
 from studies.common.report import Row
@@ -241,7 +241,7 @@ def run(settings: Settings, request: Request) -> Facts:
     measured = [] if request.stream is None else example(request.stream, settings, request.tell)
     drawn = {"pixels": pixels_figure(pixels), "range": range_figure(swept)}
     if measured:
-        drawn["measured"] = calibration_figure(measured[0].result, measured[0].name)
+        drawn["measured"] = calibration(measured[0].result, measured[0].name)
     scores = [value for case in (*pixels, *swept) for value in case.scores if not np.isnan(value)]
     return {
         "pixels": pixels,

@@ -15,10 +15,10 @@ from mars_lidar._base.display import brief, measured
 from mars_lidar._base.resources import one_blas_thread
 from mars_lidar._base.types import ArrayLike, FloatArray, NDArray
 from mars_lidar.calibration import start, suspects
-from mars_lidar.calibration.curves import Curves, Realizations, curves, realizations
 from mars_lidar.calibration.fit import Effort, Fit, Fitted, Guess, draws
 from mars_lidar.calibration.look import Look, look_at
 from mars_lidar.calibration.model import Model, Waveform, all_carriers
+from mars_lidar.calibration.realizations import Realizations, realizations
 from mars_lidar.calibration.recording import FALSE_ALARM, LEAST_PHOTONS, Recording, recording_of, recording_of_arrivals
 from mars_lidar.calibration.suspects import Drift, Named, Trial
 from mars_lidar.instrument.avalanches import Afterpulsing
@@ -33,8 +33,10 @@ from mars_lidar.light.timestamps import Timestamps
 _SAME_TIME = 0.01  # fraction of records at exactly the time of the preceding one, above which they are not photons
 LEVEL = 0.01  # false-alarm probability of the verdict
 
-_TIMES = ("dead_time_ns", "jitter_ns", "pulse_sigma_ns", "twilight_ns", "recovery_ns", "electronics_dead_time_ns")
-GIVEN = (*_TIMES, "mode", "afterpulse_probability", "afterpulse_delay_ns")
+GIVEN = (
+    *("dead_time_ns", "jitter_ns", "pulse_sigma_ns", "twilight_ns", "recovery_ns", "electronics_dead_time_ns"),
+    *("mode", "afterpulse_probability", "afterpulse_delay_ns"),
+)
 
 
 @dataclass(frozen=True)
@@ -140,7 +142,7 @@ class Calibration:
     waveform, waveform_error
         Light (bins,) as recorded, jitter included, in photons per period and bin, with ``pulse="free"``; else None.
     recording, fitted
-        The recorded times and the fit, the inputs of `curves` and `realizations`; no fit with ``look=True``.
+        The recorded times and the fit, of which figures and `realizations` are made; no fit with ``look=True``.
     level
         False-alarm probability of the verdict.
 
@@ -197,10 +199,6 @@ class Calibration:
         if self.fits:
             return f"p = {self.p_value:.2g}: {model} is not rejected at the {self.level:.0%} level"
         return f"p = {self.p_value:.2g}: {model} does not fit"
-
-    def curves(self, seed: int = 0) -> Curves:
-        """Histograms of the recording and of streams that the fitted model draws with `seed`, for a figure."""
-        return curves(self.recording, self.fitted, seed, (200, 256, 60))
 
     def realizations(self, cycles: int, *, simulated: int = 4000, seed: int = 0) -> Realizations:
         """Distribution of the count in pieces of `cycles` periods, and of `simulated` pieces drawn with `seed` (T6).

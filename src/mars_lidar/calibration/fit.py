@@ -54,6 +54,8 @@ class Effort:
         Attempts to fit a recording, each with other simulated streams; the first that converges is used.
     effects
         Effects that are included at most, one after the other.
+    parts
+        Parts of a recording that are tested for drift: a trend then has 14 degrees of freedom.
     closely, noise
         Photons, relative to a batch, of the streams that estimate the score of an effect again, as long as more than
         this share of the square of its change is noise.
@@ -77,6 +79,7 @@ class Effort:
     draws: int = 20_000
     attempts: int = 3
     effects: int = 2
+    parts: int = 16
     closely: tuple[float, ...] = (4.0, 16.0)
     noise: float = 0.1
     shape_bins: int = 256

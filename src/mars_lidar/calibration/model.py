@@ -21,11 +21,11 @@ from mars_lidar.instrument.detector import Detector
 from mars_lidar.instrument.effects import Jitter
 from mars_lidar.instrument.pulse import GaussianPulse, Pulse
 from mars_lidar.instrument.system import System
+from mars_lidar.instrument.tolerances import TOL
 from mars_lidar.light.flux import Flux
 
 _NARROWEST = 2e-6  # periods: the narrowest pulse that the engines draw
 _WIDEST = 0.3  # sigma of a recorded pulse, periods: a wider one is hardly distinguished from background
-_WIDEST_JITTER = 0.05  # periods: the widest that `Jitter` takes
 _SMOOTHED = 9  # frequencies over which the power of a waveform is averaged
 _ITERATIONS = 100  # of a deconvolution: recorded pulses are then reproduced to 0.1 %
 _MOST_CARRIERS = 0.95  # of an avalanche
@@ -132,7 +132,7 @@ class Waveform:
         self._signal = np.r_[1.0, signal]
         shares = np.maximum(np.fft.irfft(spectrum * self._signal, light.size), 1e-3 / light.size)
         self._shares = shares / shares.sum()
-        self._jitters = _WIDEST_JITTER * period_ns * np.linspace(0.0, 1.0, 25) ** 2
+        self._jitters = TOL.jitter_periods * period_ns * np.linspace(0.0, 1.0, 25) ** 2
         width, half = period_ns / light.size, light.size // 2
         x = width * np.arange(-half - 1, light.size - half + 1)
         integral = np.array([Jitter(sigma_ns=max(sigma, 1e-3 * width)).integral(x) for sigma in self._jitters])
@@ -217,9 +217,9 @@ class Model:
         period = self.clock.period_ns
         out[..., k] = np.clip(out[..., k], _NARROWEST * period, _WIDEST * period)
         if self.split:
-            most = np.arcsin(np.minimum(_WIDEST_JITTER * period / out[..., k], 1.0))
+            most = np.arcsin(np.minimum(TOL.jitter_periods * period / out[..., k], 1.0))
         else:
-            most = np.full_like(out[..., k], _WIDEST_JITTER * period)
+            most = np.full_like(out[..., k], TOL.jitter_periods * period)
         out[..., k + 1] = np.clip(out[..., k + 1], 0.0, most)
         if self.gaussian and self.jitter_given:
             out[..., k] = np.maximum(out[..., k], out[..., k + 1])

@@ -15,7 +15,6 @@ from mars_lidar.calibration.recording import FALSE_ALARM, LEAST_PHOTONS, Recordi
 from mars_lidar.calibration.start import with_edge
 
 MISFIT = 1e-3  # ratio of p-values of two fits of one model (at most 1) below which the lesser is a local minimum
-_PARTS = 16  # of a recording, for drift: a trend then has 14 degrees of freedom
 
 
 @dataclass(frozen=True)
@@ -295,7 +294,7 @@ def drift(fit: Fit, fitted: Fitted) -> Drift | None:
     from scipy.special import chdtrc
 
     recording = fit.recording
-    number = int(min(_PARTS, recording.photons // LEAST_PHOTONS))
+    number = int(min(fit.effort.parts, recording.photons // LEAST_PHOTONS))
     if number < 4:
         return None
     parts = [part for part in recording.parts(number) if part.photons > 20]

@@ -221,9 +221,9 @@ def calibrate(
         result.system.save(out)
         written.append(("wrote", str(out)))
     if picture is not None:
-        from mars_lidar.plot.stream import calibration_figure
+        from mars_lidar.plot.stream import calibration
 
-        save_picture(calibration_figure(result, stream.name), picture)
+        save_picture(calibration(result, stream.name), picture)
         written.append(("picture", str(picture)))
     if written:
         table(written)

@@ -13,6 +13,7 @@ from mars_lidar._base.arguments import constructed_by_name
 from mars_lidar._base.cached import cached_property
 from mars_lidar._base.types import ArrayLike, FloatArray
 from mars_lidar.instrument.pulse import FWHM_PER_SIGMA, SampledPulse, shape_from_dict
+from mars_lidar.instrument.tolerances import TOL
 
 
 @constructed_by_name
@@ -115,9 +116,9 @@ class Jitter:
 
     def check(self, period_ns: float) -> None:
         """Check sigma, 1e-6 to 1/20 of `period_ns` (8.5 sigma within half a period), and the tail's mean."""
-        if not 1e-6 * period_ns <= self.sigma_ns <= 0.05 * period_ns:
+        if not 1e-6 * period_ns <= self.sigma_ns <= TOL.jitter_periods * period_ns:
             raise ValueError(
-                f"sigma_ns of a jitter must lie in [{1e-6 * period_ns:g}, {0.05 * period_ns:g}] ns "
+                f"sigma_ns of a jitter must lie in [{1e-6 * period_ns:g}, {TOL.jitter_periods * period_ns:g}] ns "
                 f"(1e-6 to 1/20 period), got {self.sigma_ns:g}"
             )
         if self.tail_ns > period_ns:

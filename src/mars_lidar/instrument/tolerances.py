@@ -30,6 +30,8 @@ class Tolerances:
         Codes of a TDC.
     curve_points
         Points of a curve in a notebook, more than its pixels.
+    jitter_periods
+        Widest sigma of a Gaussian jitter, in periods: 8.5 of it lie within half a period.
     gaussian_sigmas
         Half support of a Gaussian pulse in sigma: what lies outside, 1e-17, is below one photon in any exposure.
     train_periods
@@ -61,6 +63,7 @@ class Tolerances:
     events: int = 2**31 - 1
     codes: int = 2**16
     curve_points: int = 300
+    jitter_periods: float = 0.05
     gaussian_sigmas: float = 8.5
     train_periods: float = 0.3
     times_together: int = 1 << 15

@@ -6,13 +6,13 @@ from .constant_light import constant_light_rate as constant_light_rate
 from .count_laws import CountLaw as CountLaw
 from .count_laws import count_law as count_law
 from .electronics import electronics_moments as electronics_moments
-from .moments import Exposure as Exposure
-from .moments import Moments as Moments
-from .moments import exposure_moments as exposure_moments
 from .histogram import mean_histogram as mean_histogram
 from .histogram import registration_pdf as registration_pdf
 from .joint import JointLaw as JointLaw
 from .joint import joint_law as joint_law
+from .moments import Exposure as Exposure
+from .moments import Moments as Moments
+from .moments import exposure_moments as exposure_moments
 from .renewal import HoldingTimeCovariance as HoldingTimeCovariance
 from .renewal import HoldingTimes as HoldingTimes
 from .renewal import holding_time_covariance as holding_time_covariance

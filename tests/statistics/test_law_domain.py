@@ -13,8 +13,8 @@ from scipy import integrate, special, stats
 
 import mars_lidar as ml
 from mars_lidar.statistics import ConvergenceError, exposure_moments, mean_histogram
-from mars_lidar.statistics import exposure as exposure_module
 from mars_lidar.statistics import joint as pixel_module
+from mars_lidar.statistics import moments as moments_module
 from mars_lidar.statistics import pmf as pmf_module
 from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.joint_grid import FoldedGrid, relative_residual
@@ -221,14 +221,14 @@ def test_work_of_refused_laws(
 ):
     """A refusal comes before the budget is spent: the light of each grid is in it, and the periods run."""
     done: list[float] = []
-    run = exposure_module._run
+    run = moments_module._run
 
     def recorded(cells: Cells, bins: int, *arguments: Any) -> Any:
         result = run(cells, bins, *arguments)
         done.append(float(bins) * (10.0 + min(cycles, max(int(result.settled[0]), 1))))
         return result
 
-    monkeypatch.setattr(exposure_module, "_run", recorded)
+    monkeypatch.setattr(moments_module, "_run", recorded)
     with pytest.raises(ConvergenceError, match="the limit of a law"):
         ml.count_law(ml.Flux(signal, 0.0, 50.0), view(dead, cycles, sigma, start))
     assert sum(done) <= LAW.recursion

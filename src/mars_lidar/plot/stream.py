@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from mars_lidar._base.types import FloatArray
-from mars_lidar.calibration.fit import LIGHTS, Effort
 from mars_lidar.plot.colours import COLOURS, INK, MUTED
 from mars_lidar.plot.style import DPI, style
 
@@ -17,6 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from mars_lidar.calibration import Calibration, Estimate
+
 
 _PHOTONS = 4.0  # of the model's streams, over those of the recording
 
@@ -39,7 +39,37 @@ def calibration(result: Calibration, title: str = "") -> Figure:
         Of `mars_lidar.calibrate`; with ``look=True`` without a fit, recovery and parts.
     title
         Words before the verdict, such as the name of the recording.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        ``figure.savefig(path)`` writes it.
+
+    Raises
+    ------
+    TypeError
+        `result` is not a `Calibration`.
+
+    See Also
+    --------
+    mars_lidar.calibrate, pixel_histogram
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=5000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=0.3), detector=ml.Detector(dead_time_ns=50.0),
+    ... )
+    >>> times = ml.simulate_timestamps(ml.Flux(0.4, 0.15, 30.0), system, seed=1)
+    >>> figure = ml.plot.calibration(ml.calibrate(times))
+    >>> len(figure.axes)
+    4
     """
+    from mars_lidar.calibration import Calibration
+
+    if not isinstance(result, Calibration):
+        raise TypeError(f"result must be a Calibration, the result of calibrate, got {type(result).__name__}")
     with style():
         from matplotlib.figure import Figure
 
@@ -59,6 +89,8 @@ def calibration(result: Calibration, title: str = "") -> Figure:
 
 def _histograms(result: Calibration, intervals: int = 200, phases: int = 256, ages: int = 60) -> list[_Histogram]:
     """Histograms of the intervals, of the phases, and of the intervals near the dead time, in so many cells."""
+    from mars_lidar.calibration.fit import LIGHTS, Effort
+
     recording, fit = result.recording, result.fitted
     period, unit = recording.period_ns, recording.clock.unit_ns
 

@@ -25,8 +25,8 @@ class MarsEngine(CountTimesShape):
 
     The method of arXiv 2512.04924, with the exact statistics of the finite exposure in place of those of the stationary
     chain. The law of the count and the mean histogram are exact; *the joint law of the bins is not*, because
-    registrations are at least a dead time apart: the variance of a window of bins is off by factors such as 0.28 and
-    9.7.
+    registrations are at least a dead time apart: the variance of the count around the return is off by factors of 0.87
+    to 2.4 (docs/results/joint_table.md).
 
     Parameters
     ----------

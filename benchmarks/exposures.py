@@ -33,7 +33,7 @@ def long_exposures(config: Config, bandwidth: Bandwidth) -> Section:
             "feedback, in turn. exact is left out beyond 2e9 registrations. The cost of mars "
             "hardly depends on the exposure (7 to 12 us a pixel and core from 100 to 10,000 cycles); below some 3,000 "
             "cycles exact is faster. Before the first short exposure of an image the start-up of some pixels is "
-            "compared with the exact law, 13 ms of a processor that these times do not include."
+            "compared with the exact law, 9 ms of a processor that these times do not include."
         ],
     )
     each = replace(config, seconds=config.seconds / len(exposures))

@@ -199,7 +199,7 @@ class TableReader:
 # shapes are therefore cached for the lifetime of the table, together with the sampler's guides to them.
 _last_shapes: WeakKeyDictionary[Table, tuple[int, NDArray[np.float32], NDArray[np.float32]]] = WeakKeyDictionary()
 
-# Another exposure of an image, with another seed, has the same error of the start-up: 13 ms of a processor.
+# Another exposure of an image, with another seed, has the same error of the start-up: 9 ms of a processor.
 _last_start_up: WeakKeyDictionary[Table, tuple[tuple[Any, ...], FloatArray]] = WeakKeyDictionary()
 
 

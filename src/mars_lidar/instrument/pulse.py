@@ -107,8 +107,18 @@ class Pulse(ABC):
             (..., bins); sums to 1 over the last axis.
         """
         edges = np.linspace(0.0, period_ns, bins + 1)
-        delay = np.asarray(delay_ns, dtype=np.float64)[..., None]
-        return np.diff(self.wrapped_cumulative(edges - delay, period_ns), axis=-1)
+        delays = np.asarray(delay_ns, dtype=np.float64)
+        delay = delays.reshape(-1, 1)
+        low, high = self.support_ns()
+        reached = math.ceil((high - low) / period_ns * bins) + 3  # bins of a pulse, one more at either end for rounding
+        if 2 * reached >= bins or not np.isfinite(delay).all():
+            return np.diff(self.wrapped_cumulative(edges - delays[..., None], period_ns), axis=-1)
+        first = np.floor((delay + low) / period_ns * bins).astype(np.int64) - 1
+        places = (first + np.arange(reached)) % bins
+        until, after = (self.wrapped_cumulative(edges[places + k] - delay, period_ns) for k in (0, 1))
+        energy = np.zeros((delays.size, bins))
+        energy[np.arange(delays.size)[:, None], places] = after - until
+        return energy.reshape(*delays.shape, bins)
 
 
 @constructed_by_name

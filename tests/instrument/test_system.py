@@ -288,6 +288,16 @@ def test_bin_energies_of_many_delays():
     assert np.array_equal(energy[1, 0], pulse.bin_energy(5.0, 100.0, 32))
 
 
+@pytest.mark.parametrize("name", PULSES)
+@pytest.mark.parametrize("bins", [64, 5000])
+def test_bins_that_the_pulse_does_not_reach_have_no_energy(name: str, bins: int):
+    """The energies are the differences at all edges to the last bit."""
+    pulse, delays = PULSES[name], np.array([0.0, 0.3, 50.0, 99.9, 250.0, -1e4])
+    edges = np.linspace(0.0, 100.0, bins + 1) - delays[:, None]
+    direct = np.diff(pulse.wrapped_cumulative(edges, 100.0), axis=-1)
+    assert np.array_equal(pulse.bin_energy(delays, 100.0, bins), direct)
+
+
 def test_gaussian_energy_is_that_of_the_density():
     energy = ml.GaussianPulse(sigma_ns=1.7).bin_energy(20.0, 100.0, 50)
     for k in (0, 8, 9, 10, 14):

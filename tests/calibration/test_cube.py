@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import mars_lidar as ml
-from mars_lidar.calibration import calibrate_cube
+from mars_lidar.calibration import CubeCalibration, calibrate_cube
 from tests.reconstruction.test_fit_quality import system
 
 
@@ -26,6 +26,43 @@ def test_dead_time_and_pulse_are_found_from_wrong_ones(dead: float, sigma: float
         assert abs(estimate.value - true) < 4.5 * estimate.error
         assert estimate.error < 0.01 * true
     assert outcome.fits
+
+
+@pytest.mark.full
+@pytest.mark.parametrize(
+    ("dead", "sigma", "given_sigma", "light", "cycles", "bins"),
+    [(42.97, 0.91, 0.455, (1.22, 0.12), 15_559, 123), (97.71, 1.02, 2.04, (0.59, 0.34), 23_274, 127)],
+)
+def test_dead_time_beside_a_wrong_width(
+    dead: float, sigma: float, given_sigma: float, light: tuple[float, float], cycles: int, bins: int
+) -> None:
+    """With the true dead time given, and half or twice the width: 111.0 ns and 3.24 +- 0.12 ns where widths came first.
+
+    At a wrong width another dead time is the most likely one. The second ends within the next pulse.
+    """
+    random = np.random.default_rng(1)
+    each = [mean * random.uniform(0.7, 1.5, 8) for mean in light]
+    truth = ml.System(
+        period_ns=100.0,
+        cycles=cycles,
+        bins=bins,
+        pulse=ml.GaussianPulse(sigma_ns=sigma),
+        detector=ml.Detector(dead_time_ns=dead),
+    )
+    counts = ml.simulate(ml.Flux(*each, random.uniform(0.0, 100.0, 8)), truth, seed=1)[0]
+    outcome = calibrate_cube(counts, truth.replace(pulse=ml.GaussianPulse(sigma_ns=given_sigma)))
+    assert outcome.fits
+    for name, true in (("dead_time_ns", dead), ("pulse_sigma_ns", sigma)):
+        estimate = outcome.estimates[name]
+        assert abs(estimate.value - true) < 4.5 * estimate.error
+        assert estimate.error < 0.02 * true
+
+
+def test_a_single_pixel_can_fail_to_fit() -> None:
+    for p_value, fits in ((1e-30, False), (0.009, False), (0.02, True)):
+        flux = ml.Flux(0.6, 0.4, 40.0)
+        outcome = CubeCalibration({}, system(), np.array([p_value]), None, np.zeros((1, 500)), flux)
+        assert outcome.fits == fits
 
 
 @pytest.mark.full

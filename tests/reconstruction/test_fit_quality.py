@@ -57,6 +57,15 @@ def test_a_wrong_dead_time_or_pulse_is_flagged_in_99_of_100(dead: float, sigma: 
     assert estimate.advice.startswith(words)
 
 
+def test_registrations_that_the_dead_time_does_not_allow_are_flagged() -> None:
+    """A dead time 11 % too long arms some bins less often than they registered: p was 0.29, at S = 735 for 1.17."""
+    truth = make_system(97.67, 1814, 192, sigma_ns=0.63)
+    counts = ml.simulate(ml.Flux(1.17, 1.09, 46.8), truth, seed=1)[0]
+    wrong = make_system(108.4, 1814, 192, sigma_ns=0.995)
+    assert (ml.reconstruct(counts, wrong, threads=1).flags & Flags.MISFIT > 0).all()
+    assert (ml.reconstruct(counts, truth, threads=1).flags & Flags.MISFIT == 0).all()
+
+
 def test_a_wrong_dead_time_in_dim_light_is_flagged_as_far_as_its_photons_tell_it() -> None:
     """At S = 0.1, B = 0.4 5,000 photons hold 1.6 standard deviations of 20 % less dead time: 7 % could be flagged."""
     cycles = round(5000 / (cube(0.1, 0.4, system(), 4).sum(-1).mean() / 8000))

@@ -1,9 +1,7 @@
 """Parameters common to all pixels of a histogram cube: dead time, pulse width or a free response, background floor.
 
-The expected registrations of bin j are e_j = l_j D_j, the light times the number of passes in which the pixel was
-armed, and the registrations h_j differ from them by a martingale of variance e_j. The sum of h_j log e_j - e_j is
-therefore a quasi-likelihood (Wedderburn, Biometrika 61, 439, 1974) of the common parameters, at the most likely light
-of each pixel; its curvature gives the errors.
+Given the registrations before, those of a bin are binomial in the passes in which it was armed (R9), at the most likely
+light of each pixel. The parameters are tried together: at a wrong width a wrong dead time may be the most likely one.
 """
 
 from __future__ import annotations
@@ -29,7 +27,9 @@ from mars_lidar.reconstruction.method import Estimates
 
 _GRID = 20  # dead times of the first search in each period; the likelihood has a maximum every period
 _PERIODS = 20  # of which it searches the ones nearest to the given dead time
-_ROUNDS = 8  # of the search, each at dead times that lie closer
+_ROUNDS = 14  # of the search, each with places between the likely ones
+_MAXIMA = 6  # of a likelihood, the highest, between whose neighbours the search goes on
+_TRIALS = 8  # pixels, the brightest, by which pulse widths are compared in the first search
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,11 +68,14 @@ class CubeCalibration:
 
     @property
     def fits(self) -> bool:
-        """Whether pixels could be tested, and so many p below 1 % as theirs have a probability of at least 1 %."""
+        """Whether pixels could be tested, and so many p below 1 % as theirs have a probability above 1 %."""
         from scipy.special import bdtrc  # of at least k of n: bdtrc(k - 1, n, 0.01)
 
         number = self.p_values.size
-        return bool(number and bdtrc((self.p_values < 0.01).sum() - 1, number, 0.01) >= 0.01)
+        misfits = int((self.p_values < 0.01).sum())
+        if number == 1:
+            return misfits == 0  # whose probability is 1 %
+        return bool(number and bdtrc(misfits - 1, number, 0.01) >= 0.01)
 
 
 def calibrate_cube(
@@ -127,11 +130,32 @@ def calibrate_cube(
     dead = min(dead, most)
     nearby = dead + step * np.arange(-_GRID * _PERIODS // 2, _GRID * _PERIODS // 2 + 1)
     deads: FloatArray = np.union1d([0.0, most], nearby[(nearby >= 0.0) & (nearby <= most)])
-    widths = np.log(width) + np.array([-2.5, -1.2, 0.0, 1.2, 2.5])
-    sigma = Estimate(float(max(widths, key=lambda w: _log_likelihood(some, trial(dead, w)))), 0.0, 0.0, 0.0)
-    for _ in range(2):
-        hold = _law(some, partial(trial, log_sigma=sigma.value), deads)
-        sigma = _law(some, partial(trial, hold.value), widths)
+    whole = system.period_ns * np.arange(deads[0] // system.period_ns, deads[-1] // system.period_ns + 2)
+
+    def places(log_sigma: float) -> FloatArray:
+        """Dead times of the search: one near whole periods ends within the next pulse, and its maximum is as narrow."""
+        inside = (whole[:, None] + np.exp(log_sigma) * np.arange(-3.0, 4.0)).ravel()
+        return np.union1d(deads, inside[(inside > deads[0]) & (inside < deads[-1])])
+
+    # both at once: at a wrong width a wrong dead time may be the most likely one, which that width then fits
+    few = some[:_TRIALS]
+    widths = np.log(width) + np.linspace(-2.4, 2.4, 9)
+    pairs = [(float(d), float(w)) for w in widths for d in places(float(w))]
+    values = [_log_likelihood(few, trial(*pair)) for pair in pairs]
+    tops: list[tuple[float, float]] = []
+    for k in np.argsort(values)[::-1]:
+        if all(abs(pairs[k][0] - other) > 0.5 * step for other, _ in tops):
+            tops.append(pairs[k])
+        if len(tops) == _MAXIMA:
+            break
+    climbs = []
+    for d, w in tops:
+        inside = np.unique(np.clip(d + np.exp(w) * np.linspace(-3.0, 3.0, 25), 0.0, most))
+        close = [(float(x), w + v) for x in inside for v in (-0.6, -0.3, 0.0, 0.3, 0.6)]
+        best = max(close, key=lambda pair: _log_likelihood(few, trial(*pair)))
+        climbs.append(_climb(some, trial, best, step, most))
+    _, dead, log_sigma = max(climbs)
+    hold, sigma = _joint_law(some, trial, dead, log_sigma, np.union1d(places(log_sigma), [each[1] for each in climbs]))
     final, response_error = trial(hold.value, sigma.value), None
     if pulse == "free":
         # a dead time just below a period looks like the tail of a pulse, so that each is tried with its own response
@@ -140,8 +164,8 @@ def calibrate_cube(
         trials = [_with_response(some, trial(d, sigma.value), reach, 1)[0] for d in (hold.value, *near)]
         final = max(trials, key=lambda each: _log_likelihood(some, each))
         for reach_ns in (step, 0.2 * step):
-            places = np.clip(final.detector.dead_time_ns + reach_ns * np.linspace(-1.0, 1.0, 13), 0.0, most)
-            hold = _law(some, partial(_with_dead_time, final), np.unique(places))
+            around = np.clip(final.detector.dead_time_ns + reach_ns * np.linspace(-1.0, 1.0, 13), 0.0, most)
+            hold, _, _ = _law(partial(_log_likelihood_at, some, final), np.unique(around))
             final, response_error = _with_response(some, _with_dead_time(final, hold.value), reach, 2)
     light = MaximumLikelihood().estimate(Histograms(some, final, 1))
     p_values = np.asarray(light.p_value)
@@ -234,23 +258,92 @@ def _with_dead_time(system: System, dead: float) -> System:
     return system.replace(detector=replace(system.detector, dead_time_ns=float(max(dead, 0.0))))
 
 
-def _law(counts: FloatArray, of: Callable[[float], System], places: FloatArray, number: int = 33) -> Estimate:
-    """Mean, standard deviation and 95 % interval of a parameter, of which `of` makes a system, for a flat prior.
+def _log_likelihood_at(counts: FloatArray, system: System, dead: float) -> float:
+    return _log_likelihood(counts, _with_dead_time(system, dead))
 
-    With few counts the likelihood of the place of an edge has many maxima, whose curvatures are not its width. `number`
-    places divide the range of a likelihood above that of five standard deviations; those of the next round are closer.
+
+def _climb(
+    counts: FloatArray, trial: Callable[[float, float], System], start: tuple[float, float], step: float, most: float
+) -> tuple[float, float, float]:
+    """Value and place of the maximum of the likelihood next to a dead time and a logarithm of the width."""
+    from scipy.optimize import minimize
+
+    (dead, log_sigma), reach = start, min(0.5 * step, 0.5 * float(np.exp(start[1])))
+    corners = np.array([[dead, log_sigma], [dead + reach, log_sigma], [dead, log_sigma + 0.1]])
+
+    def cost(at: FloatArray) -> float:
+        return -_log_likelihood(counts, trial(float(np.clip(at[0], 0.0, most)), float(at[1])))
+
+    result = minimize(
+        cost,
+        corners[0],
+        method="Nelder-Mead",
+        options={"initial_simplex": corners, "maxfev": 80, "xatol": 1e-4, "fatol": 0.05},
+    )
+    return -float(result.fun), float(np.clip(result.x[0], 0.0, most)), float(result.x[1])
+
+
+def _joint_law(
+    counts: FloatArray, trial: Callable[[float, float], System], dead: float, log_sigma: float, places: FloatArray
+) -> tuple[Estimate, Estimate]:
+    """Laws of the dead time, at the most likely width for each, and of the logarithm of the width.
+
+    The variance of the width is that at a fixed dead time, and that of the most likely widths over the dead times.
     """
+    alone, _, _ = _law(lambda w: _log_likelihood(counts, trial(dead, w)), log_sigma + np.linspace(-0.6, 0.6, 9))
+    span = 3.0 * max(alone.error, 1e-4)
+    best: dict[float, float] = {}
+
+    def at_best_width(d: float) -> float:
+        centre = alone.value
+        for _ in range(_ROUNDS):
+            low, middle, high = (_log_likelihood(counts, trial(d, centre + x)) for x in (-span, 0.0, span))
+            curve, rise = low - 2.0 * middle + high, 0.5 * (high - low)
+            move = float(np.clip(-rise / curve, -2.0, 2.0)) if curve < 0.0 else 2.0 * float(np.sign(rise))
+            if abs(move) <= 1.0:
+                break
+            centre += move * span
+        best[d] = centre + move * span
+        return middle + rise * move + 0.5 * curve * move**2 if abs(move) <= 1.0 else middle
+
+    hold, at, weight = _law(at_best_width, places)
+    widths = np.array([best[float(d)] for d in at])
+    value = float(weight @ widths)
+    error = float(np.hypot(alone.error, np.sqrt(weight @ (widths - value) ** 2)))
+    return hold, _normal(value, error)
+
+
+def _law(value: Callable[[float], float], places: FloatArray) -> tuple[Estimate, FloatArray, FloatArray]:
+    """Mean, error and 95 % interval of a parameter of this log likelihood, for a flat prior; the places, their weights.
+
+    The mean is that of the likeliest stretch between places without likelihood, or if it is itself unlikely the most
+    likely place; the error is the root of the mean square about it.
+
+    With few counts the likelihood of the place of an edge has many maxima, whose curvatures are not its width. Places
+    halfway to the neighbours are added to those that hold much of the law, and to the highest maxima, until none does.
+    """
+    log = np.array([value(float(x)) for x in places])
     for _ in range(_ROUNDS):
-        log = np.array([_log_likelihood(counts, of(float(x))) for x in places])
-        near = np.flatnonzero(log > log.max() - 12.5)
-        if 3 * near.size > number:
+        weight = np.exp(log - log.max()) * np.gradient(places)
+        if weight.max() < 0.1 * weight.sum():
             break
-        places = np.linspace(places[max(near[0] - 1, 0)], places[min(near[-1] + 1, len(log) - 1)], number)
+        padded = np.pad(log, 1, constant_values=-np.inf)
+        maxima = np.flatnonzero((log >= padded[:-2]) & (log >= padded[2:]))
+        near = np.union1d(np.flatnonzero(weight > 0.03 * weight.sum()), maxima[np.argsort(log[maxima])[-_MAXIMA:]])
+        gaps = np.intersect1d(np.union1d(near, near - 1), np.arange(len(places) - 1))
+        between = 0.5 * (places[gaps] + places[gaps + 1])
+        log = np.insert(log, gaps + 1, [value(float(x)) for x in between])
+        places = np.insert(places, gaps + 1, between)
     weight = np.exp(log - log.max()) * np.gradient(places)
     weight /= weight.sum()
-    mean = float(weight @ places)
+    # another maximum, a period away, is part of the error: a mean between the two would be neither
+    run = np.cumsum(np.diff(log > log.max() - 12.5, prepend=False))
+    part = weight * (run == np.argmax(np.bincount(run, weight)))
+    mean = float(part @ places / part.sum())
+    if value(mean) < log.max() - 2.0:
+        mean = float(places[log.argmax()])
     low, high = np.interp([0.025, 0.975], np.cumsum(weight) - 0.5 * weight, places)
-    return Estimate(mean, float(weight @ (places - mean) ** 2) ** 0.5, float(low), float(high))
+    return Estimate(mean, float(weight @ (places - mean) ** 2) ** 0.5, float(low), float(high)), places, weight
 
 
 def _normal(value: float, error: float) -> Estimate:
@@ -258,8 +351,37 @@ def _normal(value: float, error: float) -> Estimate:
 
 
 def _log_likelihood(counts: FloatArray, system: System) -> float:
-    """Sum over the pixels of the quasi-likelihood at the most likely light of each."""
+    """Sum over the pixels of the logarithm of (R9a), for the mean of the hidden passes, at the most likely light."""
+    from scipy.special import gammaln, xlogy
+
     histograms = Histograms(counts, system, 1)
     fit = MaximumLikelihood().estimate(histograms)
-    expected = _expected(histograms, np.stack([fit.signal, np.maximum(fit.background, 1e-9), fit.delay], axis=1))
-    return float((counts * np.log(np.maximum(expected, 1e-9))).sum() - expected.sum())
+    light = np.stack([fit.signal, np.maximum(fit.background, 1e-9), fit.delay], axis=1)
+    expected = np.maximum(_expected(histograms, light), 1e-9)
+    if system.detector.dead_time_ns < system.bin_ns:
+        return float((xlogy(counts, expected) - expected - gammaln(counts + 1)).sum())
+    endless = np.stack([0.0 * fit.signal, np.full(len(light), 1e12), fit.delay], axis=1)
+    passes = np.maximum(_expected(histograms, endless), counts)
+    rest = passes - counts
+    share = np.clip(expected / np.maximum(passes, 1e-9), 1e-12, 1.0 - 1e-12)
+    ways = gammaln(passes + 1) - gammaln(rest + 1) - gammaln(counts + 1)
+    likelihood = ways + xlogy(counts, share) + xlogy(rest, 1.0 - share)
+    return float(likelihood.sum() - 0.5 * (_impossible(counts, system) ** 2).sum())
+
+
+def _impossible(counts: FloatArray, system: System) -> FloatArray:
+    """Registrations beyond the passes in which their bin was armed (pixels, bins), over the deviation of the latter.
+
+    The native likelihood takes as many passes as a bin has registrations at least, with which such bins fit.
+    """
+    bins, dead, total = counts.shape[1], system.dead_time_periods, counts.sum(1, keepdims=True)
+    whole, rest = divmod(dead * bins, bins)
+    shift = int(rest)
+    before = np.pad(np.cumsum(np.tile(counts, (1, 2)), axis=1), ((0, 0), (1, 0)))
+    at = bins + np.arange(bins)
+    partial = before[:, at - shift] - before[:, at - shift - 1]  # of the bin that the dead time's start shares
+    lost = whole * total + before[:, at] - before[:, at - shift] + (rest - shift) * partial
+    hidden = np.minimum(1.0, total * dead / system.cycles) * dead**2 / 3.0 + 1.0
+    # all that the last dead time may hide counts as armed
+    excess = np.maximum(counts - (system.cycles - lost + dead), 0.0)
+    return np.asarray(excess / np.sqrt(hidden + 0.5 * counts.max(1, keepdims=True)))

@@ -43,6 +43,11 @@ class FitQuality {
         out[1] = 0.0;
         if (!std::isfinite(background)) return;
         const bool lit = signal > 0.0 && std::isfinite(delay);
+        if (impossible(passes)) {
+            out[0] = HUGE_VAL;
+            out[1] = 1.0;
+            return;
+        }
         expect(passes, signal, background, delay);
         const auto [total, armed] =
             sums_of<2>(bins_, [&](int64_t j) { return std::array<double, 2>{variance_[j], passes.armed[j]}; });
@@ -90,6 +95,7 @@ class FitQuality {
     // Of the armed passes, what the ends of the exposure hide at most (standard deviation): the tests are linear in it, and
     // gave 0.8 % of the pixels of the right model p < 1e-3 at 0.06, 8 % at 0.13, 32 % at 0.26.
     static constexpr double kMostHidden = 0.05;
+    static constexpr double kImpossible = 6.0;  // standard deviations by which registrations exceed the passes
 
     // Whether both change what is blind by registrations of other bins alone: the score of what a bin's own number
     // decides has a mean.
@@ -236,6 +242,18 @@ class FitQuality {
         const double chance = std::min(1.0, total * dead / static_cast<double>(r.cycles));
         const double one = chance * (dead * dead / 3.0 - 0.25 * chance * dead * dead + 0.25);
         return r.stationary ? 2.0 * one : one;
+    }
+
+    // Whether a bin registered more often than the dead time left it armed. Of the passes, those that the ends hide are not
+    // known, and those that registrations of two other bins re-arm: half of these at most, by their binomial law.
+    bool impossible(const ArmedPasses& passes) const {
+        if (job_.recording.below_bin()) return false;
+        double most = 0.0, excess = 0.0;
+        for (int64_t j = 0; j < bins_; ++j) {
+            most = std::max(most, passes.count[j]);
+            excess = std::max(excess, passes.count[j] - passes.raw[j] - passes.rearmed[j]);
+        }
+        return excess > kImpossible * std::sqrt(hidden_passes(passes.total) + 0.5 * most);
     }
 
     // Normal equations of the estimates and of the passes that the ends hide, which are of the known variance `hidden`, and

@@ -155,7 +155,8 @@ def calibrate_cube(
         best = max(close, key=lambda pair: _log_likelihood(few, trial(*pair)))
         climbs.append(_climb(some, trial, best, step, most))
     _, dead, log_sigma = max(climbs)
-    hold, sigma = _joint_law(some, trial, dead, log_sigma, np.union1d(places(log_sigma), [each[1] for each in climbs]))
+    tried = np.union1d(places(log_sigma), [each[1] for each in climbs])
+    hold, sigma = _joint_law(some, trial, dead, log_sigma, tried, system.detector.dead_time_ns)
     final, response_error = trial(hold.value, sigma.value), None
     if pulse == "free":
         # a dead time just below a period looks like the tail of a pulse, so that each is tried with its own response
@@ -284,7 +285,12 @@ def _climb(
 
 
 def _joint_law(
-    counts: FloatArray, trial: Callable[[float, float], System], dead: float, log_sigma: float, places: FloatArray
+    counts: FloatArray,
+    trial: Callable[[float, float], System],
+    dead: float,
+    log_sigma: float,
+    places: FloatArray,
+    given: float,
 ) -> tuple[Estimate, Estimate]:
     """Laws of the dead time, at the most likely width for each, and of the logarithm of the width.
 
@@ -306,18 +312,21 @@ def _joint_law(
         best[d] = centre + move * span
         return middle + rise * move + 0.5 * curve * move**2 if abs(move) <= 1.0 else middle
 
-    hold, at, weight = _law(at_best_width, places)
+    hold, at, weight = _law(at_best_width, places, given)
     widths = np.array([best[float(d)] for d in at])
     value = float(weight @ widths)
     error = float(np.hypot(alone.error, np.sqrt(weight @ (widths - value) ** 2)))
     return hold, _normal(value, error)
 
 
-def _law(value: Callable[[float], float], places: FloatArray) -> tuple[Estimate, FloatArray, FloatArray]:
+def _law(
+    value: Callable[[float], float], places: FloatArray, given: float | None = None
+) -> tuple[Estimate, FloatArray, FloatArray]:
     """Mean, error and 95 % interval of a parameter of this log likelihood, for a flat prior; the places, their weights.
 
-    The mean is that of the likeliest stretch between places without likelihood, or if it is itself unlikely the most
-    likely place; the error is the root of the mean square about it.
+    The mean is that of the likeliest stretch between places without likelihood (of those that hold 5 % of the law the
+    one nearest to a `given` value), or, if it is itself unlikely, the most likely place there; the error is the root of
+    the mean square about it.
 
     With few counts the likelihood of the place of an edge has many maxima, whose curvatures are not its width. Places
     halfway to the neighbours are added to those that hold much of the law, and to the highest maxima, until none does.
@@ -338,10 +347,14 @@ def _law(value: Callable[[float], float], places: FloatArray) -> tuple[Estimate,
     weight /= weight.sum()
     # another maximum, a period away, is part of the error: a mean between the two would be neither
     run = np.cumsum(np.diff(log > log.max() - 12.5, prepend=False))
-    part = weight * (run == np.argmax(np.bincount(run, weight)))
+    mass = np.bincount(run, weight)
+    likely = np.flatnonzero(mass >= (mass.max() if given is None else 0.05))
+    off = [0.0 if given is None else np.abs(places[run == k] - given).min() for k in likely]
+    part = weight * (run == likely[int(np.argmin(off))])
     mean = float(part @ places / part.sum())
-    if value(mean) < log.max() - 2.0:
-        mean = float(places[log.argmax()])
+    top = np.where(part > 0.0, log, -np.inf)
+    if value(mean) < top.max() - 2.0:
+        mean = float(places[top.argmax()])
     low, high = np.interp([0.025, 0.975], np.cumsum(weight) - 0.5 * weight, places)
     return Estimate(mean, float(weight @ (places - mean) ** 2) ** 0.5, float(low), float(high)), places, weight
 

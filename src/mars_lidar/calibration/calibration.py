@@ -59,14 +59,18 @@ class Estimate:
     least: float = np.nan
     most: float = np.nan
 
-    def __str__(self) -> str:
+    @property
+    def short(self) -> str:
+        """In words, without the range in fits with a further effect."""
         if self.error == 0.0:
             return f"{self.value:.6g} ({self.note or 'given'})"
         interval = "" if np.isnan(self.low) else f" (95 %: {self.low:.3g} to {self.high:.3g})"
-        text = f"{self.value:.4g}{interval}, {self.note}" if self.note else measured(self.value, self.error)
+        return f"{self.value:.4g}{interval}, {self.note}" if self.note else measured(self.value, self.error)
+
+    def __str__(self) -> str:
         least, most = (measured(end, self.error).split()[0] for end in (self.least, self.most))
         wider = self.least < self.low or self.most > self.high
-        return f"{text}; {least} to {most} with a further effect" if wider else text
+        return f"{self.short}; {least} to {most} with a further effect" if wider else self.short
 
 
 @dataclass(frozen=True)
@@ -500,7 +504,7 @@ class _Run:
         if self.most < np.inf and fitted.model.returns < 2 and not (fitted.model.returns and fitted.lit):
             signal = min(float(fitted.theta[1]), self.most) if fitted.model.returns else 0.0
             words = "no significant pulse: upper limit of one anywhere"
-            estimates["signal"] = Estimate(signal, np.nan, 0.0, self.most, words)
+            estimates["signal"] = Estimate(signal, np.nan, 0.0, self.most, words, 0.0, self.most)
         named: list[Suspect] = list(wrong)
         for refit in included:
             name = refit.effect.names[0]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -15,7 +14,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from mars_lidar.calibration import Calibration, Estimate
+    from mars_lidar.calibration import Calibration
 
 
 _PHOTONS = 4.0  # of the model's streams, over those of the recording
@@ -127,17 +126,12 @@ def _intervals(ax: Axes, counts: _Histogram, result: Calibration) -> None:
     _stairs(ax, counts)
     if "dead_time_ns" in result.estimates:
         dead = result.estimates["dead_time_ns"]
-        ax.axvline(dead.value, color=MUTED, lw=0.7, label=f"dead time, ns: {_short(dead)}")
+        ax.axvline(dead.value, color=MUTED, lw=0.7, label=f"dead time, ns: {dead.short}")
     ax.set(yscale="log", xlabel="time between registrations (ns)", ylabel="intervals", xlim=counts.edges[[0, -1]])
     ax.set_ylim(bottom=0.5)
     ax.set_ylim(top=20.0 * ax.get_ylim()[1])  # room for the legend
     ax.set_title("Intervals", loc="left")
     ax.legend(frameon=False, loc="upper right")
-
-
-def _short(estimate: Estimate) -> str:
-    """An estimate without its range in fits with a further effect."""
-    return str(replace(estimate, least=np.nan, most=np.nan))
 
 
 def _stairs(ax: Axes, counts: _Histogram) -> None:
@@ -150,7 +144,7 @@ def _phases(ax: Axes, counts: _Histogram, result: Calibration) -> None:
     _stairs(ax, counts)
     if "background" in result.estimates:
         signal, background = result.estimates["signal"], result.estimates["background"]
-        ax.plot([], [], " ", label=f"S {_short(signal)}\nB {_short(background)}")
+        ax.plot([], [], " ", label=f"S {signal.short}\nB {background.short}")
     ax.set(yscale="log", xlabel="time in the laser period (ns)", ylabel="registrations", xlim=counts.edges[[0, -1]])
     ax.set_title("Phases", loc="left")
     ax.legend(frameon=False)

@@ -44,7 +44,8 @@ def main() -> None:
     for line in Path(sys.argv[1]).read_text().splitlines():
         row = json.loads(line)
         truth, photons = random_truth(row["number"])
-        if row["effect"] or None in row["errors"] or truth.jitter > 0.1 * truth.dead:
+        stated = np.isfinite(np.array(row["errors"], float)).all()
+        if row["effect"] or row["asked"] or not stated or truth.jitter > 0.1 * truth.dead:
             continue
         t, _ = photon_by_photon(truth, photons, row["number"])
         ratios.append(np.array(row["errors"][:2]) / bound(truth, t))

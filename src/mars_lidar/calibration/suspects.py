@@ -183,7 +183,7 @@ def refitted(fit: Fit, fitted: Fitted, plain: FloatArray, trials: list[Trial]) -
     """
     from scipy.special import ndtri
 
-    limit, size = float(-ndtri(FALSE_ALARM / max(len(trials), 1))), fitted.model.size
+    limit, size = float(-ndtri(FALSE_ALARM / max(2 * len(trials), 1))), fitted.model.size  # two scores each
 
     def significance(trial: Trial, final: Fitted | None) -> float:
         """The score of a significant effect, by a refit; else -inf."""

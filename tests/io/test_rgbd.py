@@ -457,7 +457,7 @@ def test_the_command_takes_a_frame(tmp_path):
     with io.load(tmp_path / "a.npz") as cube:
         assert cube.depth_m[0, 0] == 9.0
         assert "frame 1" in cube.recipe.source
-    fails("index tells which", *arguments, "-o", tmp_path / "b.npz")
+    fails("index selects", *arguments, "-o", tmp_path / "b.npz")
 
 
 # --- Middlebury 2014 ---------------------------------------------------------------------------------------

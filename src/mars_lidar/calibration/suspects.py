@@ -77,8 +77,8 @@ def possible(fit: Fit, fitted: Fitted, plain: FloatArray) -> list[Trial]:
     """Effects that the stream may have beyond the `plain` counts of the model, one trial of each kind.
 
     Afterpulses start from the mean delay with the largest score. Scores above 1 that noise of the simulated change
-    lowers are estimated again by longer streams, unless the model is rejected and refits decide. A paralyzable
-    detector, of size 1, is left out of a stream that fits if the 95 % upper limit of its score is below 1.
+    lowers are estimated again by longer streams. A paralyzable detector, of size 1, is left out of a stream that fits
+    if the 95 % upper limit of its score is below 1.
     """
     model = fitted.model
     of = {"afterpulsing": "afterpulse_probability", "mode": "paralyzable"}
@@ -100,7 +100,7 @@ def possible(fit: Fit, fitted: Fitted, plain: FloatArray) -> list[Trial]:
     listed = [s for s in listed if not s.effect.onoff or fitted.p_value < FALSE_ALARM or s.size + 1.645 * s.error > 1.0]
     best = {score.effect.names[0]: score for score in sorted(listed, key=lambda score: score.z)}
     scores = list(best.values())
-    for times in fit.effort.closely if fitted.p_value >= FALSE_ALARM else ():
+    for times in fit.effort.closely:
         noisy = [score.z > 1.0 and score.noise > fit.effort.noise for score in scores]
         if any(noisy):
             plain = counts_of(fit, fitted, model, fitted.theta, times)[0]

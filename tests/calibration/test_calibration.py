@@ -292,7 +292,7 @@ PHOTONS = {  # in which the score of the effect is expected 4 to 6 standard devi
     "afterpulses": 40_000,
     "paralyzable": 30_000,
     "recovery": 100_000,
-    "electronics": 150_000,  # which a fitted dead time takes up in part
+    "electronics": 300_000,  # of 150,000, where refits end at no excess or are rejected, 4 of 6 fits name them
     "twilight": 300_000,
 }
 

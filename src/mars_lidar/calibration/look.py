@@ -74,7 +74,7 @@ class Look:
 
 def look_at(recording: Recording) -> Look:
     """`Look` of a recording."""
-    gaps = np.concatenate([np.diff(piece) for piece in recording.pieces])
+    gaps = recording.intervals
     count = min(20, gaps.size)
     seconds = 1e-9 * recording.exposure * recording.period_ns
     clock, n, cycles = recording.clock, recording.photons, recording.exposure

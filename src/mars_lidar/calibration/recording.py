@@ -68,10 +68,15 @@ class Recording:
         """Laser periods of all stretches."""
         return float(sum(self.cycles))
 
+    @property
+    def intervals(self) -> FloatArray:
+        """Intervals (n,) between successive registrations, ns, of all stretches."""
+        return np.concatenate([np.diff(piece) for piece in self.pieces])
+
     @cached_property
     def shortest(self) -> float:
         """The shortest interval, ns."""
-        return min(float(np.diff(piece).min()) for piece in self.pieces)
+        return float(self.intervals.min())
 
     def unevenness(self, window: float) -> tuple[float, int, float]:
         """Allan variance of the count in windows of `window` periods, the number of differences, and the mean count."""

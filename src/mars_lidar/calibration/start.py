@@ -139,7 +139,7 @@ def with_edge(fit: Fit, model: Model, theta: FloatArray, low: FloatArray) -> Flo
 
 def safe_hold(recording: Recording) -> float:
     """Time after a registration, ns, at which the pixel is certainly armed: beyond the shortest intervals."""
-    gaps = np.concatenate([np.diff(piece) for piece in recording.pieces])
+    gaps = recording.intervals
     first, late = min(1, gaps.size - 1), max(30, gaps.size // 500) % gaps.size
     low, edge = np.partition(gaps, (first, late))[[first, late]]
     return float(edge + 3.0 * (edge - low) + 2.0 * recording.clock.unit_ns)

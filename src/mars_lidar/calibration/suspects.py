@@ -56,12 +56,9 @@ def _score(
     From that change the part is removed that the other parameters of the fit can absorb. The noise of the simulated
     counts, of `times` a batch as those of `plain`, makes the size too small on average, and no false score.
     """
-    (made, share), size, used = (
-        counts_of(fit, fitted, model, theta, times),
-        theta[fitted.model.size],
-        fitted.batch.common,
-    )
-    change, noise = (made - plain) / max(float(size), 1e-9), (plain + made) * share / max(float(size), 1e-9) ** 2
+    made, share = counts_of(fit, fitted, model, theta, times)
+    size, used = max(float(theta[fitted.model.size]), 1e-9), fitted.batch.common
+    change, noise = (made - plain) / size, (plain + made) * share / size**2
     shift = fitted.estimator @ change
     way = change - fitted.jacobian @ shift
     along = np.zeros_like(way)

@@ -98,7 +98,7 @@ def _histograms(result: Calibration, intervals: int = 200, phases: int = 256, ag
         phase = np.concatenate([t - np.floor(t / period) * period for t in times])
         return [np.histogram(x, at)[0].astype(float) for x, at in zip((gaps, phase, gaps), edges, strict=True)]
 
-    low, high, top = np.quantile(np.concatenate([np.diff(piece) for piece in recording.pieces]), (0.0005, 0.5, 0.99))
+    low, high, top = np.quantile(recording.intervals, (0.0005, 0.5, 0.99))
     near = _edges(max(low - 0.1 * (high - low), 0.0), high + (high - low), ages, unit)
     edges = [_edges(0.0, 1.05 * top, intervals, unit), np.linspace(0.0, period, phases + 1), near]
     recorded = counted(list(recording.pieces))

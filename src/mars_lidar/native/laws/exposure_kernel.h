@@ -51,10 +51,6 @@ struct ExposureLight {
     const double* total = nullptr;  // (entries) photons per period, of paralyzable pixels
     int64_t kinds = 1;              // steady, and for an armed start the first period and period K: kRateKinds
 
-    double photons(int64_t entry, int64_t part) const {
-        const int64_t parts = static_cast<int64_t>(bins) * kExposureParts;
-        return signal[entry] * shapes[shape[entry] * parts + part] + background[entry] / static_cast<double>(parts);
-    }
     const double* rate_moments(int64_t entry, int64_t kind, int64_t bin) const {
         return rates + ((entry * kinds + kind) * bins + bin) * kRateMoments;
     }

@@ -6,15 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from mars_lidar._base.cached import cached_property
 from mars_lidar._base.native import _core
 from mars_lidar._base.types import FloatArray
 from mars_lidar.calibration.model import EXCESS, Model, Streams
 from mars_lidar.calibration.recording import Recording
 
 _PHASES = 2**15  # cells of the table from phase to class
-# units from a tick of the clock to an edge: half, and a part that no multiple of half a unit meets
-_OFF = 0.5 + 1.0 / 64.0 / np.pi
 _SHIFT = 0.37  # of such a cell: no edge lies where a clock ticks
 _CLASSES = 12  # parts of the period in the table, beside the stretches of bright light
 
@@ -37,9 +34,8 @@ class Cells:
         hidden = theta[model.light + 2] / (1.0 + np.array([0.0, EXCESS])[:, None, None])
         ends = (lit[: model.returns] - hidden / period) % 1.0
         coarse = np.unique(np.concatenate([np.linspace(0.0, 1.0, _CLASSES + 1)[1:-1], lit.ravel(), ends.ravel()]))
-        inside = np.zeros(_PHASES, bool)
-        for low, high in lit:
-            inside |= (centre - low) % 1.0 < (high - low) % 1.0
+        begin, end = lit.T
+        inside = ((centre[:, None] - begin) % 1.0 < (end - begin) % 1.0).any(1)
         self.phases = edges.size + 1
         ratio = gaps.size / max(photons, 1.0)
         fine = max(0.7, 2.0 / ratio) * 1.5 ** np.arange(60)
@@ -50,9 +46,7 @@ class Cells:
         early = (np.arange(1, 7) / 7) ** 3  # quantiles of the intervals that divide the table, closer for short ones
         ages = self._between(gaps[(early * gaps.size).astype(int)], unit)
         self.gap_edges = np.union1d(self._between(place, unit), ages)
-        self.gap_edges = self.gap_edges[self.gap_edges > 0.0]
-        ages = ages[ages > 0.0]
-        self._arguments: dict[str, Any] = {
+        self._arguments: dict[str, Any] = {  # of the native cells, which cannot be pickled
             "period_ns": period,
             "shift": _SHIFT / _PHASES,
             "phase_of": phase_of,
@@ -64,15 +58,7 @@ class Cells:
             "classes": 2 * (coarse.size + 1),
             "ages": ages.size + 1,
         }
-        self.size = int(self._native.size)
-
-    @cached_property
-    def _native(self) -> _core.StreamCells:
-        return _core.StreamCells(**self._arguments)
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Without the native cells, which cannot be pickled and are made again."""
-        return {name: value for name, value in vars(self).items() if name != "_native"}
+        self.size = int(_core.StreamCells(**self._arguments).size)
 
     @staticmethod
     def _layout(model: Model, theta: FloatArray, phases: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -97,7 +83,7 @@ class Cells:
         for r in range(model.returns):
             delay = theta[2 + 2 * r]
             peak = np.arange(-5.0, 5.01, 0.5) * width + delay
-            if unit > 0.4 * width and clock.repeats:  # edges between the units of the clock
+            if unit > 0.4 * width and (clock.locked or clock.units):  # edges between the units of the clock
                 peak = np.unique(np.round(peak / unit)) * unit
             edges.append(peak / period % 1.0)
             lit.append(((delay - 3 * width) / period % 1.0, (delay + 3 * width) / period % 1.0))
@@ -105,13 +91,16 @@ class Cells:
 
     @staticmethod
     def _between(edges: FloatArray, unit: float) -> FloatArray:
-        """Edges of intervals between the units of a clock, off the middle, where a period of half units may end."""
-        return np.unique((np.floor(edges / unit + 1e-6) + _OFF) * unit) if unit > 0.0 else np.unique(edges)
+        """Positive edges of intervals between units of a clock, off the middle where a period of half units may end."""
+        off = 0.5 + 1.0 / 64.0 / np.pi  # units from a tick: half, and a part that no multiple of half a unit meets
+        edges = np.unique((np.floor(edges / unit + 1e-6) + off) * unit if unit > 0.0 else edges)
+        return np.asarray(edges[edges > 0.0])
 
     def count(self, streams: Streams, pieces: int = 1, length: float = np.inf) -> FloatArray:
         """Counts (streams, pieces, size) of sorted times, by pieces of this length in ns; the last has no end."""
         counts = np.empty(((streams.offsets.size - 1) * pieces, self.size))
-        _core.count_streams(self._native, streams.times, streams.offsets, pieces=pieces, length=length, out=counts)
+        native = _core.StreamCells(**self._arguments)
+        _core.count_streams(native, streams.times, streams.offsets, pieces=pieces, length=length, out=counts)
         return counts.reshape(-1, pieces, self.size)
 
     def of(self, recording: Recording) -> FloatArray:

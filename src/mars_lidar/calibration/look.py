@@ -75,11 +75,10 @@ class Look:
 def look_at(recording: Recording) -> Look:
     """`Look` of a recording."""
     gaps = recording.intervals
-    count = min(20, gaps.size)
     seconds = 1e-9 * recording.exposure * recording.period_ns
     clock, n, cycles = recording.clock, recording.photons, recording.exposure
     period = recording.period_ns if recording.laser else float("nan")
-    smallest, quantiles = np.sort(np.partition(gaps, count - 1)[:count]), np.quantile(gaps, (0.01, 0.5, 0.99))
+    smallest, quantiles = gaps[:20], np.quantile(gaps, (0.01, 0.5, 0.99))
     same, own, unit, locked = int((gaps == 0.0).sum()), other_period(recording), clock.unit_ns, clock.locked
     return Look(n, cycles, period, seconds, unit, locked, n / seconds, smallest, quantiles, same, own)
 
@@ -105,7 +104,7 @@ def other_period(recording: Recording) -> float | None:
     power = np.abs(np.fft.rfft(np.bincount(place, minlength=length))) ** 2 / times.size
     given = length / _PER_PERIOD  # the line of the given period
     low = int(np.ceil(_SLOWEST * given))
-    if low < 3 or power.size < low + 2:
+    if low < 3:
         return None
     at_given = _strongest(power, given)
     strong = np.flatnonzero(power[low:] > max(_STRONG, _CLEAR * at_given, 0.25 * float(power[low:].max()))) + low

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mars_lidar._base.types import FloatArray
+from mars_lidar._base.types import NDArray
 from mars_lidar.calibration.fit import LIGHTS, Fitted
 from mars_lidar.calibration.recording import Recording
 from mars_lidar.statistics.pmf import Pmf, kl_divergence, total_variation
@@ -21,7 +21,7 @@ class Realizations:
     """
 
     cycles: int
-    counts: FloatArray
+    counts: NDArray[np.int64]
     measured: Pmf
     predicted: Pmf
     total_variation: float
@@ -42,15 +42,7 @@ def realizations(
     recording: Recording, fit: Fitted, cycles: int, simulated: int, seed: int, resampled: int = 400
 ) -> Realizations:
     """Counts in pieces of `cycles` periods, and in `simulated` pieces of the model's streams, by their distances."""
-    length = cycles * recording.period_ns
-
-    def cut(t: FloatArray, end: float) -> FloatArray:
-        number = int(end // length)
-        return np.diff(np.searchsorted(t, np.arange(number + 1) * length))
-
-    counts = np.concatenate(
-        [cut(piece, own * recording.period_ns) for piece, own in zip(recording.pieces, recording.cycles, strict=True)]
-    )
+    counts = np.concatenate(recording.counts(cycles))
     if counts.size < 20:
         raise ValueError(
             f"cycles must leave at least 20 realizations of a recording of {recording.exposure:,.0f} periods, got "
@@ -58,9 +50,10 @@ def realizations(
         )
     each = -(-simulated // LIGHTS) + 1
     streams = fit.model.streams(np.tile(fit.theta, (LIGHTS, 1)), each * cycles, seed)
-    drawn = np.concatenate([cut(t, each * length)[1:] for t in streams])  # the first begins with an armed pixel
-    low, high = int(min(counts.min(), drawn.min())), int(max(counts.max(), drawn.max()))
+    simulation = Recording(tuple(streams), (each * cycles,) * LIGHTS, recording.clock)
+    drawn = np.concatenate([row[1:] for row in simulation.counts(cycles)])  # the first begins with an armed pixel
     measured, predicted = Pmf.of_counts(counts), Pmf.of_counts(drawn)
+    low, high = min(measured.first, predicted.first), max(measured.last, predicted.last)
     law, sample = predicted.on(low, high), measured.on(low, high)
     random = np.random.default_rng(seed)
     floor = []

@@ -11,7 +11,7 @@ import numpy as np
 
 from mars_lidar._base import checks
 from mars_lidar._base.cached import cached_property
-from mars_lidar._base.types import ArrayLike, FloatArray
+from mars_lidar._base.types import ArrayLike, FloatArray, NDArray
 from mars_lidar.light.timestamps import Timestamps
 
 _ON_GRID = 0.02  # units: distance from a tick of the clock that rounding of float64 times over an hour can cause
@@ -34,10 +34,10 @@ class Clock:
     locked: bool = False
 
     @property
-    def repeats(self) -> bool:
-        """Whether the grid lies at the same phases of each laser period, for a thousand of them at least."""
-        units = self.period_ns / self.unit_ns if self.unit_ns else 0.5
-        return self.locked or abs(units - round(units)) < 1e-3
+    def units(self) -> int:
+        """Units in a laser period, if their number is whole for a thousand periods at least; else 0."""
+        units = self.period_ns / self.unit_ns if self.unit_ns else 0.0
+        return round(units) if abs(units - round(units)) < 1e-3 else 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,26 +68,29 @@ class Recording:
         """Laser periods of all stretches."""
         return float(sum(self.cycles))
 
-    @property
-    def intervals(self) -> FloatArray:
-        """Intervals (n,) between successive registrations, ns, of all stretches."""
-        return np.concatenate([np.diff(piece) for piece in self.pieces])
-
     @cached_property
+    def intervals(self) -> FloatArray:
+        """Intervals (n,) between successive registrations, ns, of all stretches, sorted."""
+        return np.sort(np.concatenate([np.diff(piece) for piece in self.pieces]))
+
+    @property
     def shortest(self) -> float:
         """The shortest interval, ns."""
-        return float(self.intervals.min())
+        return float(self.intervals[0])
+
+    def counts(self, window: float) -> list[NDArray[np.int64]]:
+        """Counts (windows,) of each stretch in its successive windows of `window` periods."""
+        at = [(piece / (window * self.period_ns)).astype(np.int64) for piece in self.pieces]
+        whole = [int(cycles / window) for cycles in self.cycles]
+        return [np.bincount(k, minlength=number)[:number] for k, number in zip(at, whole, strict=True)]
 
     def unevenness(self, window: float) -> tuple[float, int, float]:
         """Allan variance of the count in windows of `window` periods, the number of differences, and the mean count."""
-        rows = [
-            np.bincount((piece / (window * self.period_ns)).astype(np.int64), minlength=int(cycles / window) + 1)
-            for piece, cycles in zip(self.pieces, self.cycles, strict=True)
-        ]
-        whole = [row[: int(cycles / window)] for row, cycles in zip(rows, self.cycles, strict=True)]
-        steps = np.concatenate([np.diff(row) for row in whole])
-        mean = float(np.concatenate(whole).mean()) if steps.size else 0.0
-        return (0.5 * float((steps**2.0).mean()) if steps.size else 0.0), steps.size, mean
+        counts = self.counts(window)
+        steps = np.concatenate([np.diff(row) for row in counts])
+        if not steps.size:
+            return 0.0, 0, 0.0
+        return 0.5 * float((steps**2.0).mean()), steps.size, float(np.concatenate(counts).mean())
 
     def parts(self, number: int) -> list[Recording]:
         """About `number` parts of equal exposure, in order of time."""

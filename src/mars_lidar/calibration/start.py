@@ -9,9 +9,6 @@ from mars_lidar.calibration.fit import LIGHTS, Fit
 from mars_lidar.calibration.model import Model
 from mars_lidar.calibration.recording import Clock, Recording
 
-_MOST_BINS = 2**14
-_WINDOWS = 64  # of the period, for the median light
-
 
 def free_light(t: FloatArray, clock: Clock, hold: float, bins: int) -> tuple[FloatArray, FloatArray]:
     """Registrations and armed passes (bins,) over the period, counted from `hold` after each registration on.
@@ -25,33 +22,32 @@ def free_light(t: FloatArray, clock: Clock, hold: float, bins: int) -> tuple[Flo
     b = np.floor(t[1:] * (bins / period)).astype(np.int64)
     late = b > a
     a, b = a[late], b[late]
-    hits = np.bincount(b % bins, minlength=bins)
-    first, length = (a + 1) % bins, b - a
-    change = np.bincount(first, minlength=2 * bins + 1) - np.bincount(first + length % bins, minlength=2 * bins + 1)
-    passes = np.cumsum(change)[: 2 * bins]
-    return hits.astype(float), (passes[:bins] + passes[bins:] + (length // bins).sum()).astype(float)
+    begun, hits = (np.bincount(x % bins, minlength=bins) for x in (a, b))
+    # a bin is passed once in each whole period from a to b, and once more where it lies up to b % bins, not a % bins
+    passes = (b // bins - a // bins).sum() + np.cumsum((hits - begun)[::-1])[::-1]
+    return hits.astype(float), passes.astype(float)
 
 
 def light(t: FloatArray, model: Model, hold: float) -> FloatArray:
     """Background, signal and delay of each return, and width of the recorded pulse, by matched filters."""
     period, unit = model.clock.period_ns, model.clock.unit_ns
-    bins = int(np.clip(period / max(unit, 1e-9), 64, _MOST_BINS))
+    bins = int(np.clip(period / max(unit, 1e-9), 64, 2**14))
     hits, passes = free_light(t, model.clock, hold, bins)
     rate = hits / np.maximum(passes, 1.0)
     cell = period / bins
     place = (np.arange(bins) + 0.5) * cell
     outside = np.ones(bins, bool)
     # the median of windows with enough photons for one
-    coarse = [np.add.reduceat(x, np.linspace(0, bins, _WINDOWS, endpoint=False).astype(int)) for x in (hits, passes)]
-    faint = max(float(np.median(coarse[0] / np.maximum(coarse[1], 1.0))), 1e-3 / max(passes.sum(), 1.0))
+    windows = np.linspace(0, bins, 64, endpoint=False).astype(int)
+    coarse = np.add.reduceat(hits, windows) / np.maximum(np.add.reduceat(passes, windows), 1.0)
+    faint = max(float(np.median(coarse)), 1e-3 / max(passes.sum(), 1.0))
+    boxes = np.unique(np.round(1.5 ** np.arange(30)).astype(int))  # of every width
     peaks, variance = [], 0.0
     for _ in range(model.returns):
         best = (-np.inf, 0, 1)
-        masked_hits, masked_passes = np.where(outside, hits, faint * passes), passes
-        for m in np.unique(np.round(1.5 ** np.arange(30)).astype(int)):  # boxes of every width
-            if m > bins // 4:
-                break
-            sums = [np.cumsum(np.r_[0.0, x, x[: m - 1]]) for x in (masked_hits, masked_passes)]
+        masked = np.where(outside, hits, faint * passes)
+        for m in boxes[boxes <= bins // 4]:
+            sums = [np.cumsum(np.r_[0.0, x, x[: m - 1]]) for x in (masked, passes)]
             inside, armed = (c[m:] - c[:-m] for c in sums)
             expected = np.maximum(faint * armed, 1e-9)
             more = np.maximum(inside, expected)
@@ -96,7 +92,8 @@ def starts(fit: Fit, recording: Recording, model: Model, fixed: dict[str, float]
         first = light(t, model, hold)
     trials = []
     cycles = max(2, round(fit.exposure(photons)))
-    for angle in np.linspace(0.0, np.pi / 2.0, 7):  # from no jitter to a width of jitter alone
+    # from no jitter to a width of jitter alone
+    for angle in np.linspace(0.0, np.pi / 2.0, 1 if "jitter" in fixed else 7):
         theta = np.zeros(model.size)
         theta[: k + 1] = first
         for name, value in fixed.items():
@@ -111,8 +108,6 @@ def starts(fit: Fit, recording: Recording, model: Model, fixed: dict[str, float]
         recorded = cells.of(recording) * (photons / recording.photons)
         r = (2 * np.sqrt(recorded + 0.375) - 2 * np.sqrt(rows + 0.375).mean(0)) ** 2
         trials.append((float(r.sum()), theta))
-        if "jitter" in fixed:
-            break
     return sorted(trials, key=lambda pair: pair[0])
 
 
@@ -137,30 +132,18 @@ def with_edge(fit: Fit, model: Model, theta: FloatArray, low: FloatArray) -> Flo
     return theta
 
 
-def safe_hold(recording: Recording) -> float:
-    """Time after a registration, ns, at which the pixel is certainly armed: beyond the shortest intervals."""
-    gaps = recording.intervals
-    first, late = min(1, gaps.size - 1), max(30, gaps.size // 500) % gaps.size
-    low, edge = np.partition(gaps, (first, late))[[first, late]]
-    return float(edge + 3.0 * (edge - low) + 2.0 * recording.clock.unit_ns)
-
-
 def free_waveform(recording: Recording, most: int) -> tuple[FloatArray, FloatArray]:
     """Light (bins,) of any shape in photons per period and bin, without dead time, and its standard errors.
 
-    A bin records one photon a pass, with the probability 1 - exp(-light).
+    A bin records one photon a pass, with the probability 1 - exp(-light). Passes are counted from beyond the shortest
+    intervals on, where the pixel is certainly armed.
     """
-    period, unit = recording.period_ns, recording.clock.unit_ns
-    units = round(period / unit) if unit else 0
-    bins = most
-    if units and abs(period / unit - units) < 1e-3:  # whole units in each bin
-        bins = max((n for n in range(1, most + 1) if units % n == 0), default=1)
-        bins = bins if bins >= most // 8 else most
-    hold = safe_hold(recording)
-    hits, passes = np.zeros(bins), np.zeros(bins)
-    for piece in recording.pieces:
-        more = free_light(piece, recording.clock, hold, bins)
-        hits, passes = hits + more[0], passes + more[1]
+    gaps, clock = recording.intervals, recording.clock
+    low, edge = gaps[min(1, gaps.size - 1)], gaps[max(30, gaps.size // 500) % gaps.size]
+    hold = float(edge + 3.0 * (edge - low) + 2.0 * clock.unit_ns)
+    # whole units of the clock in each bin, if possible; every number divides 0, where the period has no whole units
+    bins = max((n for n in range(most // 8, most + 1) if clock.units % n == 0), default=most)
+    hits, passes = np.sum([free_light(piece, clock, hold, bins) for piece in recording.pieces], axis=0)
     passes = np.maximum(passes, 1.0)
     share = np.clip(hits, 1e-3, passes - 0.5) / passes
     return -np.log1p(-share), np.sqrt((hits + 1.0) / (1.0 - share)) / passes

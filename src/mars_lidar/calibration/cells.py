@@ -12,8 +12,7 @@ from mars_lidar.calibration.model import EXCESS, Model, Streams
 from mars_lidar.calibration.recording import Recording
 
 _PHASES = 2**15  # cells of the table from phase to class
-_SHIFT = 0.37  # of such a cell: no edge lies where a clock ticks
-_CLASSES = 12  # parts of the period in the table, beside the stretches of bright light
+_PARTS = np.linspace(0.0, 1.0, 13)[1:-1]  # edges of phases in the counts and in the table, beside those of the light
 
 
 class Cells:
@@ -33,7 +32,7 @@ class Cells:
         # phases from which the dead time, or a shorter one that electronics' dead time hides, ends in a pulse
         hidden = theta[model.light + 2] / (1.0 + np.array([0.0, EXCESS])[:, None, None])
         ends = (lit[: model.returns] - hidden / period) % 1.0
-        coarse = np.unique(np.concatenate([np.linspace(0.0, 1.0, _CLASSES + 1)[1:-1], lit.ravel(), ends.ravel()]))
+        coarse = np.unique(np.concatenate([_PARTS, lit.ravel(), ends.ravel()]))
         begin, end = lit.T
         inside = ((centre[:, None] - begin) % 1.0 < (end - begin) % 1.0).any(1)
         self.phases = edges.size + 1
@@ -48,7 +47,7 @@ class Cells:
         self.gap_edges = np.union1d(self._between(place, unit), ages)
         self._arguments: dict[str, Any] = {  # of the native cells, which cannot be pickled
             "period_ns": period,
-            "shift": _SHIFT / _PHASES,
+            "shift": 0.37 / _PHASES,  # no edge lies where a clock ticks
             "phase_of": phase_of,
             "class_of": (2 * np.searchsorted(coarse, centre)).astype(np.int32),
             "lit_of": inside.astype(np.int32),
@@ -65,14 +64,14 @@ class Cells:
         """Edges of the phase cells, and the stretches (n, 2) of bright light, in periods."""
         clock = model.clock
         period, unit = clock.period_ns, clock.unit_ns
-        edges, lit = [np.linspace(0.0, 1.0, 13)[1:-1]], []
+        edges, lit = [_PARTS], []
         if model.waveform is not None or model.pulse is not None:
             edges.append(np.quantile(phases, np.linspace(0.0, 1.0, 33)[1:-1]))
         if model.waveform is not None:
             dense = np.bincount((phases * 32).astype(int) % 32, minlength=32)
             bright = np.flatnonzero(dense > 1.5 * np.median(dense))
             lit = [(k / 32, (k + 1) / 32) for k in bright]
-        width = float(np.sqrt(theta[model.light] ** 2 + unit**2 / 12)) if model.waveform is None else 0.0
+        width = float(np.sqrt(theta[model.light] ** 2 + unit**2 / 12))
         if model.pulse is not None and model.returns:  # by the scatter of the phases about the delay
             off = (phases - theta[2] / period + 0.5) % 1.0 - 0.5
             dense, at = np.histogram(off, 512)

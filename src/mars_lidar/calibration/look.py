@@ -11,11 +11,8 @@ from mars_lidar._base.display import brief
 from mars_lidar._base.types import FloatArray
 from mars_lidar.calibration.recording import FALSE_ALARM, Recording
 
-_CELLS = 2**20  # of the time axis: all of it where the stream is shorter
 _PER_PERIOD = 32  # cells of the given period: lines up to 16 times its frequency
-_SLOWEST = 0.3  # lowest frequency that is searched, relative to the laser's
 _STRONG = 40.0  # power of a line over that of Poisson noise: by chance with probability e^-40 in each line
-_CLEAR = 4.0  # times as strong as the line at the given period
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,17 +80,20 @@ def look_at(recording: Recording) -> Look:
     return Look(n, cycles, period, seconds, unit, locked, n / seconds, smallest, quantiles, same, own)
 
 
-def other_period(recording: Recording) -> float | None:
+def other_period(recording: Recording, cells: int = 2**20, slowest: float = 0.3) -> float | None:
     """The period of the photons, ns, if they have one other than that of the recording; else None.
 
-    Periodogram of the first times: in constant light the power of a line is the number of photons, in pulsed light the
-    square of that number at the laser's frequency and its multiples. The lowest strong line is taken. A dead time in
-    bright light makes broad lines, so that a line must exceed its neighbours. Times are spread over the unit of the
-    clock, which would be a period as well.
+    Periodogram of the first `cells` of time: in constant light the power of a line is the number of photons, in pulsed
+    light the square of that number at the laser's frequency and its multiples. The lowest strong line is taken, from
+    `slowest` laser frequencies on, if it is four times as strong as that of the laser. A dead time in bright light
+    makes broad lines, so that a line must exceed its neighbours. Times are spread over the unit of the clock, which
+    would be a period as well.
     """
+    from scipy.ndimage import maximum_filter1d
+
     times = max(recording.pieces, key=lambda piece: piece.size)
     cell = recording.period_ns / _PER_PERIOD
-    times = times[: np.searchsorted(times, times[0] + _CELLS * cell)] - times[0]
+    times = times[: np.searchsorted(times, times[0] + cells * cell)] - times[0]
     if times.size < 100:
         return None
     if unit := recording.clock.unit_ns:
@@ -103,36 +103,32 @@ def other_period(recording: Recording) -> float | None:
     length = int(2 ** np.ceil(np.log2(place.max() + 1)))
     power = np.abs(np.fft.rfft(np.bincount(place, minlength=length))) ** 2 / times.size
     given = length / _PER_PERIOD  # the line of the given period
-    low = int(np.ceil(_SLOWEST * given))
+    low = int(np.ceil(slowest * given))
     if low < 3:
         return None
-    at_given = _strongest(power, given)
-    strong = np.flatnonzero(power[low:] > max(_STRONG, _CLEAR * at_given, 0.25 * float(power[low:].max()))) + low
+    near = maximum_filter1d(power, 3)  # the strongest of three lines
+    strong = np.flatnonzero(power[low:] > max(_STRONG, 4.0 * near[round(given)], 0.25 * power[low:].max())) + low
     first = next((int(line) for line in strong if power[line] > _STRONG * _neighbours(power, int(line))), None)
     if first is None:
         return None
     first += int(np.argmax(power[first : first + 3]))
-    if abs(first - given) < 1.5 or _is_harmonic(power, first, given):
+    if abs(first - given) < 1.5 or _is_harmonic(power, near, first, given):
         return None
     around = power[first - 1 : first + 2]
     return float(length * cell / (first + (around[2] - around[0]) / around.sum()))
 
 
-def _is_harmonic(power: FloatArray, line: int, given: float) -> bool:
+def _is_harmonic(power: FloatArray, near: FloatArray, line: int, given: float) -> bool:
     """Whether a line is a multiple of the given frequency whose lower multiples exist, weakened by a dead time."""
     from scipy.stats import gamma
 
     number = round(line / given)
     if number < 2 or abs(line - number * given) > 1.5:
         return False
-    lower = [_strongest(power, k * given) / _neighbours(power, round(k * given)) for k in range(1, number)]
+    lines = [round(k * given) for k in range(1, number)]
+    lower = [float(near[k]) / _neighbours(power, k) for k in lines]
     # the strongest of three lines each
     return bool(gamma.sf(sum(lower), number - 1) * 3.0 ** (number - 1) < FALSE_ALARM)
-
-
-def _strongest(power: FloatArray, line: float) -> float:
-    near = round(line)
-    return float(power[max(near - 1, 0) : near + 2].max())
 
 
 def _neighbours(power: FloatArray, line: int) -> float:

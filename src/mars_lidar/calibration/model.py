@@ -6,7 +6,6 @@ import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -26,9 +25,6 @@ from mars_lidar.light.flux import Flux
 
 _NARROWEST = 2e-6  # periods: the narrowest pulse that the engines draw
 _WIDEST = 0.3  # sigma of a recorded pulse, periods: a wider one is hardly distinguished from background
-_SMOOTHED = 9  # frequencies over which the power of a waveform is averaged
-_ITERATIONS = 100  # of a deconvolution: recorded pulses are then reproduced to 0.1 %
-_MOST_CARRIERS = 0.95  # of an avalanche
 EXCESS = 0.25  # of an electronics' dead time over the detector's, in the test for one
 Fields = dict[str, Any]
 
@@ -48,25 +44,25 @@ class Effect:
     words: str
     onoff: bool = False
 
-    def of(self, fields: Fields, value: tuple[float, ...]) -> Fields:
-        """Fields of a `Detector` with the effect."""
-        name, size, dead = self.names[0], value[0], fields["dead_time_ns"]
+    def of(self, fields: Fields, values: dict[str, float]) -> Fields:
+        """Fields of a `Detector` with the effect, whose parameters have these `values`."""
+        name, dead = self.names[0], fields["dead_time_ns"]
+        size = values[name]
         if name == "electronics_excess":  # the observed dead time is the electronics'; the detector is ready earlier
             return fields | {"electronics_dead_time_ns": dead, "dead_time_ns": dead / (1.0 + size)}
         if name == "afterpulse_probability":
-            delay = float(np.exp(value[1]))
+            delay = float(np.exp(values["log_afterpulse_delay"]))
             carriers = all_carriers(size, delay, dead)
-            return fields | (
-                {"afterpulsing": Afterpulsing(probability=carriers, delay_ns=delay)} if carriers > 0 else {}
-            )
+            of = Afterpulsing(probability=carriers, delay_ns=delay) if carriers > 0 else None
+            return fields | {"afterpulsing": of}
         if name == "paralyzable":
-            return fields | ({"mode": "paralyzable"} if size > 0.5 else {})
+            return fields | {"mode": "paralyzable"}
         return fields | {name: min(size, dead) if name == "twilight_ns" else size}
 
 
 def all_carriers(after: float, delay_ns: float, dead_time_ns: float) -> float:
     """Mean carriers of an avalanche, after * exp(t_d / delay), of which `after` outlive the dead time; at most 0.95."""
-    return float(min(after * np.exp(min(dead_time_ns / delay_ns, 50.0)), _MOST_CARRIERS))
+    return float(min(after * np.exp(dead_time_ns / delay_ns), 0.95))
 
 
 def effects(dead_time_ns: float) -> tuple[Effect, ...]:
@@ -94,7 +90,7 @@ class Streams:
     offsets: NDArray[np.int64]
 
     def __iter__(self) -> Iterator[FloatArray]:
-        return (self.times[a:b] for a, b in pairwise(self.offsets))
+        return iter(np.split(self.times, self.offsets[1:-1]))
 
 
 @cache
@@ -107,8 +103,8 @@ def _quantiles() -> NDArray[np.float32]:
 
 def _normal_deviates(number: int, seed: int) -> NDArray[np.float32]:
     """Normal deviates (n,), each the sum of two quantiles of 16 random bits: a third of the time of NumPy's."""
-    words = np.frombuffer(np.random.Generator(np.random.SFC64(seed)).bytes(4 * number), np.uint16).reshape(2, number)
-    return np.asarray(_quantiles()[words[0]] + _quantiles()[words[1]])
+    first, second = np.random.Generator(np.random.SFC64(seed)).integers(0, 2**16, (2, number), np.uint16)
+    return np.asarray(_quantiles()[first] + _quantiles()[second])
 
 
 class Waveform:
@@ -126,8 +122,8 @@ class Waveform:
         # error**2 is that of one registration more, (light passes + 1) / passes**2
         passes = (light + np.sqrt(light**2 + 4.0 * error**2)) / (2.0 * error**2)
         self._variance, self._exposure = light / passes / light.sum() ** 2, exposure
-        spectrum, few = np.fft.rfft(light / light.sum()), np.full(_SMOOTHED, 1.0 / _SMOOTHED)
-        power = np.convolve(np.pad(np.abs(spectrum[1:]) ** 2, _SMOOTHED // 2, "symmetric"), few, "valid")
+        spectrum = np.fft.rfft(light / light.sum())
+        power = np.convolve(np.pad(np.abs(spectrum[1:]) ** 2, 4, "symmetric"), np.full(9, 1.0 / 9), "valid")
         signal = np.maximum(1.0 - self._variance.sum() / power, 0.0) * filtered + (not filtered)
         self._signal = np.r_[1.0, signal]
         shares = np.maximum(np.fft.irfft(spectrum * self._signal, light.size), 1e-3 / light.size)
@@ -139,7 +135,7 @@ class Waveform:
         kernel = np.roll(np.diff(integral, 2), -half, axis=1) / width  # from part to part: positive, symmetric
         blur = np.asarray(np.fft.rfft(kernel).real, np.float64)
         self._before = np.tile(self._shares, (self._jitters.size, 1))
-        for _ in range(_ITERATIONS):
+        for _ in range(100):  # which reproduce recorded pulses to 0.1 %
             ratio = self._shares / self._blurred(self._before, blur)
             self._before = self._before * self._blurred(ratio, blur)
 
@@ -210,23 +206,18 @@ class Model:
 
     def bounded(self, theta: FloatArray) -> FloatArray:
         """Parameters (..., p) within their bounds."""
-        out = np.array(theta, float)
-        k = self.light
-        out[..., 0] = np.maximum(out[..., 0], 1e-7)
-        out[..., 1:k:2] = np.maximum(out[..., 1:k:2], 0.0)
-        period = self.clock.period_ns
-        out[..., k] = np.clip(out[..., k], _NARROWEST * period, _WIDEST * period)
+        k, period = self.light, self.clock.period_ns
+        jitter = TOL.jitter_periods * period
+        least = [1e-7, *(0.0, -np.inf) * self.returns, _NARROWEST * period, 0.0, 0.0]
+        most = [*(np.inf,) * k, _WIDEST * period, np.pi / 2.0 if self.split else jitter, np.inf]
+        for effect in self.effects:
+            least += effect.least
+            most += effect.most
+        out = np.clip(theta, least, most)
         if self.split:
-            most = np.arcsin(np.minimum(TOL.jitter_periods * period / out[..., k], 1.0))
-        else:
-            most = np.full_like(out[..., k], TOL.jitter_periods * period)
-        out[..., k + 1] = np.clip(out[..., k + 1], 0.0, most)
-        if self.gaussian and self.jitter_given:
+            out[..., k + 1] = np.minimum(out[..., k + 1], np.arcsin(np.minimum(jitter / out[..., k], 1.0)))
+        elif self.gaussian:
             out[..., k] = np.maximum(out[..., k], out[..., k + 1])
-        out[..., k + 2] = np.maximum(out[..., k + 2], 0.0)
-        bounds = [each for effect in self.effects for each in zip(effect.least, effect.most, strict=True)]
-        for at, (low, high) in enumerate(bounds, k + 3):
-            out[..., at] = np.clip(out[..., at], low, high)
         return out
 
     def widths(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -247,11 +238,10 @@ class Model:
         out[k] = 0.3 * width
         out[k + 1] = 0.6 * (1.0 if self.split else width)
         out[k + 2] = 0.6 * width + unit
-        at = k + 3
+        out[k + 3 :] = 0.8
         for effect in self.effects:
-            out[at : at + len(effect.start)] = 0.8
+            at = self.names.index(effect.names[0])
             out[at] *= max(effect.start[0], theta[at])
-            at += len(effect.start)
         return out
 
     def prior(self, theta: FloatArray, free: NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
@@ -261,24 +251,18 @@ class Model:
 
     def system(self, theta: FloatArray, cycles: int, bins: int = 16, jitter: bool = True) -> System:
         """The instrument of parameters (p,), with or without jitter."""
-        k = self.light
-        theta = self.bounded(theta)
+        theta, period = self.bounded(theta), self.clock.period_ns
+        values = dict(zip(self.names, theta.tolist(), strict=True))
         sigma, sd = map(float, self.widths(theta))
-        fields: Fields = dict(self.fields) | {"dead_time_ns": float(theta[k + 2])}
-        at = k + 3
+        fields: Fields = dict(self.fields) | {"dead_time_ns": values["dead_time_ns"]}
         for effect in self.effects:
-            fields = effect.of(fields, tuple(map(float, theta[at : at + len(effect.names)])))
-            at += len(effect.names)
-        least = _NARROWEST * self.clock.period_ns
-        if jitter and sd > least:
+            fields = effect.of(fields, values)
+        if jitter and sd > _NARROWEST * period:
             fields["jitter"] = Jitter(sigma_ns=sd)
-        sigma = (
-            max(sigma, least) if self.returns else _WIDEST * self.clock.period_ns
-        )  # without a return the pulse has no light
+        # without a return the pulse has no light
+        sigma = max(sigma, _NARROWEST * period) if self.returns else _WIDEST * period
         pulse = self.pulse or GaussianPulse(sigma_ns=float(f"{sigma:.9g}"))
-        return System(
-            period_ns=self.clock.period_ns, cycles=cycles, bins=bins, pulse=pulse, detector=Detector(**fields)
-        )
+        return System(period_ns=period, cycles=cycles, bins=bins, pulse=pulse, detector=Detector(**fields))
 
     def flux(self, rows: FloatArray, cycles: int = 0, seed: int = 0) -> Flux:
         """Light (1, rows) of parameters (rows, p); of a waveform, with shapes as uncertain as by so many `cycles`."""
@@ -287,10 +271,9 @@ class Model:
             return Flux(waveform=(rows[:, :1] * self.waveform.drawn(self.widths(rows)[1], cycles, seed))[None])
         back = rows[None, :, 0]
         if self.returns == 0:
-            return Flux(np.zeros_like(back), back, np.zeros_like(back))
+            return Flux(0.0, back)
         signal, delay = (rows[:, first : self.light : 2].T[:, None] for first in (1, 2))
-        delay = delay % self.clock.period_ns
-        return Flux(signal, back, delay) if self.returns > 1 else Flux(signal[0], back, delay[0])
+        return Flux(signal, back, delay % self.clock.period_ns)
 
     def streams(self, rows: FloatArray, cycles: int, seed: int, jitter: bool = True) -> Streams:
         """Recorded times of a stream for each row of (rows, p); all have the detector of the first row but its jitter.

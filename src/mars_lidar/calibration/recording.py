@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
@@ -17,7 +16,6 @@ from mars_lidar.light.timestamps import Timestamps
 _ON_GRID = 0.02  # units: distance from a tick of the clock that rounding of float64 times over an hour can cause
 FALSE_ALARM = 0.003  # probability that an effect, drift, misfit, other period or pulse is named where there is none
 LEAST_PHOTONS = 300  # of a recording or a part of it: with fewer, the counts of the cells do not have a normal law
-_OWN_UNITS = (2**15, 2**16)  # units of the period in our own PTU and Photon-HDF5, at most
 
 
 @dataclass(frozen=True)
@@ -95,13 +93,11 @@ class Recording:
     def parts(self, number: int) -> list[Recording]:
         """About `number` parts of equal exposure, in order of time."""
         size = self.exposure / number
-        parts = []
+        parts: list[Recording] = []
         for piece, cycles in zip(self.pieces, self.cycles, strict=True):
             count = max(1, round(cycles / size))
-            edges = np.searchsorted(piece, np.arange(count + 1) * (cycles / count * self.period_ns))
-            edges[-1] = piece.size
-            for first, last in pairwise(edges):
-                parts.append(Recording((piece[first:last],), (cycles / count,), self.clock, self.laser))
+            edges = np.searchsorted(piece, np.arange(1, count) * (cycles / count * self.period_ns))
+            parts += [Recording((t,), (cycles / count,), self.clock, self.laser) for t in np.split(piece, edges)]
         return parts
 
 
@@ -125,8 +121,7 @@ def recording_of(times: Timestamps | Sequence[Timestamps], *, pooled: bool = Fal
                 f"times must be of one pixel, got {height} x {width}: choose one with times.pixel(y, x), or give "
                 "pooled=True where all are recordings of the same pixel"
             )
-        for k in range(height * width):
-            t = stream.times_ns[stream.offsets[k] : stream.offsets[k + 1]]
+        for t in np.split(stream.times_ns, stream.offsets[1:-1]):
             if t.size > 1:
                 pieces.append(np.ascontiguousarray(t, np.float64))
                 cycles.append(max(float(stream.cycles), float(t[-1]) / stream.period_ns))
@@ -145,7 +140,8 @@ def clock_of(t: FloatArray, stream: Timestamps, probed: int = 2000) -> Clock:
     x = probe / period
     x -= np.floor(x)
     unit = float(stream.info.get("unit_ns", 0.0))
-    candidates = [unit] if unit > 0.0 else [period / (most // stream.bins * stream.bins) for most in _OWN_UNITS]
+    own = [period / (most // stream.bins * stream.bins) for most in (2**15, 2**16)]  # our PTU and Photon-HDF5
+    candidates = [unit] if unit > 0.0 else own
     for unit in candidates:
         for locked, place in ((False, probe / unit), (True, x * period / unit)):
             first = locked & (place < 1.0)  # those of the last unit of a period may lie beyond its end

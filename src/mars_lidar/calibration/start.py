@@ -78,7 +78,7 @@ def light(t: FloatArray, model: Model, hold: float) -> FloatArray:
 
 def starts(fit: Fit, recording: Recording, model: Model, fixed: dict[str, float]) -> list[tuple[float, FloatArray]]:
     """(misfit, parameters (p,)) for seven shares of jitter in the recorded width, sorted by the misfit."""
-    names, k = model.names, model.light
+    k = model.light
     photons = min(recording.photons, fit.effort.first)
     t = recording.pieces[0][: 12 * photons]
     low = np.sort(np.diff(t))
@@ -96,8 +96,6 @@ def starts(fit: Fit, recording: Recording, model: Model, fixed: dict[str, float]
     for angle in np.linspace(0.0, np.pi / 2.0, 1 if "jitter" in fixed else 7):
         theta = np.zeros(model.size)
         theta[: k + 1] = first
-        for name, value in fixed.items():
-            theta[names.index(name)] = value
         theta[k + 1] = fixed.get("jitter", angle if model.split else np.sin(angle) * theta[k])
         jitter = float(model.widths(theta)[1])
         theta[k + 2] = fixed.get("dead_time_ns", max(observed[0], 0.05 * observed[-1]) + 2 * jitter)

@@ -8,7 +8,7 @@ import numpy as np
 
 from mars_lidar._base.native import _core
 from mars_lidar._base.types import FloatArray
-from mars_lidar.calibration.model import EXCESS, Model, Streams
+from mars_lidar.calibration.model import EXCESS, Model
 from mars_lidar.calibration.recording import Recording
 
 _PHASES = 2**15  # cells of the table from phase to class
@@ -95,14 +95,14 @@ class Cells:
         edges = np.unique((np.floor(edges / unit + 1e-6) + off) * unit if unit > 0.0 else edges)
         return np.asarray(edges[edges > 0.0])
 
-    def count(self, streams: Streams, pieces: int = 1, length: float = np.inf) -> FloatArray:
-        """Counts (streams, pieces, size) of sorted times, by pieces of this length in ns; the last has no end."""
-        counts = np.empty(((streams.offsets.size - 1) * pieces, self.size))
+    def count(self, streams: Recording, pieces: int = 1, length: float = np.inf) -> FloatArray:
+        """Counts (streams, pieces, size), by pieces of this length in ns of each stream; the last has no end."""
+        offsets = np.cumsum([0, *(stream.size for stream in streams)])
+        counts = np.empty(((offsets.size - 1) * pieces, self.size))
         native = _core.StreamCells(**self._arguments)
-        _core.count_streams(native, streams.times, streams.offsets, pieces=pieces, length=length, out=counts)
+        _core.count_streams(native, streams.times, offsets, pieces=pieces, length=length, out=counts)
         return counts.reshape(-1, pieces, self.size)
 
     def of(self, recording: Recording) -> FloatArray:
         """Counts (size,) of a recording, all stretches together."""
-        offsets = np.cumsum([0, *(piece.size for piece in recording.pieces)])
-        return np.asarray(self.count(Streams(np.concatenate(recording.pieces), offsets)).sum((0, 1)))
+        return np.asarray(self.count(recording).sum((0, 1)))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -12,7 +11,7 @@ import numpy as np
 
 from mars_lidar._base.native import _core
 from mars_lidar._base.types import FloatArray, NDArray
-from mars_lidar.calibration.recording import Clock
+from mars_lidar.calibration.recording import Clock, Recording
 from mars_lidar.engines.engine import Task
 from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.instrument.avalanches import Afterpulsing
@@ -80,17 +79,6 @@ def effects(dead_time_ns: float) -> tuple[Effect, ...]:
         Effect(("electronics_excess",), (EXCESS,), (0.0,), (19.0,), own),
         Effect(("paralyzable",), (1.0,), (0.0,), (1.0,), "paralyzable detector", onoff=True),
     )
-
-
-@dataclass(frozen=True, eq=False)
-class Streams:
-    """Recorded times (n,) of several streams one after the other, stream k in ``offsets[k]`` to ``offsets[k + 1]``."""
-
-    times: FloatArray
-    offsets: NDArray[np.int64]
-
-    def __iter__(self) -> Iterator[FloatArray]:
-        return iter(np.split(self.times, self.offsets[1:-1]))
 
 
 @cache
@@ -275,8 +263,8 @@ class Model:
         signal, delay = (rows[:, first : self.light : 2].T[:, None] for first in (1, 2))
         return Flux(signal, back, delay % self.clock.period_ns)
 
-    def streams(self, rows: FloatArray, cycles: int, seed: int, jitter: bool = True) -> Streams:
-        """Recorded times of a stream for each row of (rows, p); all have the detector of the first row but its jitter.
+    def streams(self, rows: FloatArray, cycles: int, seed: int, jitter: bool = True) -> Recording:
+        """A stream of `cycles` periods for each row of (rows, p), all with the detector of the first but its jitter.
 
         The jitter is added here, a normal deviate for each time, so that it may differ from row to row and no table is
         built for each value.
@@ -297,4 +285,4 @@ class Model:
         _core.recorded_times(
             made.cycle, made.phase, made.offsets, sigma_ns=sigma, deviates=deviates, grid=grid, out=times
         )
-        return Streams(times, made.offsets)
+        return Recording(tuple(np.split(times, made.offsets[1:-1])), (float(cycles),) * len(rows), clock)

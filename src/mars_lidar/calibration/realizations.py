@@ -50,8 +50,7 @@ def realizations(
         )
     each = -(-simulated // LIGHTS) + 1
     streams = fit.model.streams(np.tile(fit.theta, (LIGHTS, 1)), each * cycles, seed)
-    simulation = Recording(tuple(streams), (each * cycles,) * LIGHTS, recording.clock)
-    drawn = np.concatenate([row[1:] for row in simulation.counts(cycles)])  # the first begins with an armed pixel
+    drawn = np.concatenate([row[1:] for row in streams.counts(cycles)])  # the first begins with an armed pixel
     measured, predicted = Pmf.of_counts(counts), Pmf.of_counts(drawn)
     low, high = min(measured.first, predicted.first), max(measured.last, predicted.last)
     law, sample = predicted.on(low, high), measured.on(low, high)
@@ -60,9 +59,8 @@ def realizations(
     for _ in range(resampled):  # two samples of one law: the recording's size and the simulation's
         a = random.multinomial(counts.size, law) / counts.size
         b = random.multinomial(drawn.size, law) / drawn.size
-        floor.append((0.5 * np.abs(a - b).sum(), float(kl_divergence(a[None], b)[0])))
-    variation, divergence = np.array(floor).T
-    finite = divergence[np.isfinite(divergence)]
+        floor.append((0.5 * np.abs(a - b).sum(), kl_divergence(a, b)))
+    variation, divergence = np.array(floor, float).T
     return Realizations(
         cycles,
         counts,
@@ -70,6 +68,6 @@ def realizations(
         predicted,
         total_variation(measured, predicted),
         (float(variation.mean()), float(np.quantile(variation, 0.99))),
-        float(kl_divergence(sample[None], law)[0]),
-        float(finite.mean()) if finite.size else float("nan"),
+        float(kl_divergence(sample, law)),
+        float(divergence.mean()),
     )

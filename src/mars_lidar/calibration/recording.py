@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,7 +40,7 @@ class Clock:
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """One pixel's times, recorded in stretches without interruption.
+    """One pixel's times, recorded in stretches without interruption, or simulated streams.
 
     `pieces` sorted times (n,) of each stretch, ns from a laser pulse; `cycles` laser periods of each; `clock`;
     `laser` is False where no laser was recorded, and then the period is a unit of time alone.
@@ -50,6 +50,14 @@ class Recording:
     cycles: tuple[float, ...]
     clock: Clock
     laser: bool = True
+
+    def __iter__(self) -> Iterator[FloatArray]:
+        return iter(self.pieces)
+
+    @property
+    def times(self) -> FloatArray:
+        """Times (n,) of all stretches, one after the other."""
+        return np.concatenate(self.pieces)
 
     @property
     def period_ns(self) -> float:

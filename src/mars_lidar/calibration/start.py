@@ -120,8 +120,7 @@ def with_edge(fit: Fit, model: Model, theta: FloatArray, low: FloatArray) -> Flo
     observed = low[ranks]
     cycles = max(2, round(fit.exposure(min(fit.recording.photons, fit.effort.first))))
     for _ in range(4):
-        streams = model.streams(np.tile(theta, (4, 1)), cycles, fit.next_seed())
-        made = np.sort(np.concatenate([np.diff(x) for x in streams]))
+        made = model.streams(np.tile(theta, (4, 1)), cycles, fit.next_seed()).intervals
         if not made.size:
             break
         here = made[np.minimum((ranks / n * made.size).astype(int), made.size - 1)]

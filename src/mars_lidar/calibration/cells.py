@@ -25,7 +25,7 @@ class Cells:
     def __init__(self, model: Model, theta: FloatArray, pilot: list[FloatArray], photons: float) -> None:
         period, unit = model.clock.period_ns, model.clock.unit_ns
         gaps = np.sort(np.concatenate([np.diff(t) for t in pilot]))
-        phases = np.concatenate([t / period - np.floor(t / period) for t in pilot])
+        phases = np.concatenate(pilot) / period % 1.0
         edges, lit = self._layout(model, theta, phases)
         centre = (np.arange(_PHASES) + 0.5) / _PHASES
         phase_of = np.searchsorted(edges, centre).astype(np.int32)
@@ -72,7 +72,7 @@ class Cells:
             bright = np.flatnonzero(dense > 1.5 * np.median(dense))
             lit = [(k / 32, (k + 1) / 32) for k in bright]
         width = float(np.sqrt(theta[model.light] ** 2 + unit**2 / 12))
-        if model.pulse is not None and model.returns:  # by the scatter of the phases about the delay
+        if model.pulse is not None:  # by the scatter of the phases about the delay
             off = (phases - theta[2] / period + 0.5) % 1.0 - 0.5
             dense, at = np.histogram(off, 512)
             dense = np.maximum(dense - np.median(dense), 0.0)

@@ -64,9 +64,8 @@ def all_carriers(after: float, delay_ns: float, dead_time_ns: float) -> float:
     return float(min(after * np.exp(dead_time_ns / delay_ns), 0.95))
 
 
-def effects(dead_time_ns: float) -> tuple[Effect, ...]:
-    """Effects that are tested in the stream of a detector with this dead time."""
-    dead = dead_time_ns
+def effects(dead: float) -> tuple[Effect, ...]:
+    """Effects that are tested in the stream of a detector with this dead time, ns."""
     after = ("afterpulse_probability", "log_afterpulse_delay")
     middle, reach = float(np.log(1.6 * dead)), float(np.log(8.0))  # mean delays from a fifth to 13 dead times
     least, most = (0.0, middle - reach), (0.5, middle + reach)
@@ -167,7 +166,7 @@ class Model:
     @property
     def gaussian(self) -> bool:
         """Whether the pulse is a Gaussian of unknown width."""
-        return self.pulse is None and self.waveform is None and self.returns > 0
+        return self.pulse is None and self.returns > 0
 
     @property
     def split(self) -> bool:
@@ -190,7 +189,7 @@ class Model:
     @property
     def size(self) -> int:
         """Number of parameters."""
-        return self.light + 3 + sum(len(effect.names) for effect in self.effects)
+        return len(self.names)
 
     def bounded(self, theta: FloatArray) -> FloatArray:
         """Parameters (..., p) within their bounds."""
@@ -280,9 +279,6 @@ class Model:
         sigma = self.widths(rows)[1] * jitter
         sigma[sigma <= _NARROWEST * self.clock.period_ns] = 0.0
         deviates = _normal_deviates(made.phase.size if sigma.any() else 0, seed)
-        times, clock = np.empty(made.phase.size), self.clock
-        grid = clock.period_ns, clock.unit_ns, clock.offset, clock.locked
-        _core.recorded_times(
-            made.cycle, made.phase, made.offsets, sigma_ns=sigma, deviates=deviates, grid=grid, out=times
-        )
-        return Recording(tuple(np.split(times, made.offsets[1:-1])), (float(cycles),) * len(rows), clock)
+        times, drawn = np.empty(made.phase.size), (made.cycle, made.phase, made.offsets)
+        _core.recorded_times(*drawn, sigma_ns=sigma, deviates=deviates, grid=self.clock, out=times)
+        return Recording(tuple(np.split(times, made.offsets[1:-1])), (float(cycles),) * len(rows), self.clock)

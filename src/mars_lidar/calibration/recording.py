@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,8 +19,7 @@ FALSE_ALARM = 0.003  # probability that an effect, drift, misfit, other period o
 LEAST_PHOTONS = 300  # of a recording or a part of it: with fewer, the counts of the cells do not have a normal law
 
 
-@dataclass(frozen=True)
-class Clock:
+class Clock(NamedTuple):
     """The grid of a recorder, whose nearest point it writes for a time.
 
     `unit_ns` its spacing, 0 for real numbers; `offset` where its points lie, in units; `locked` whether the grid
@@ -145,13 +145,10 @@ def clock_of(t: FloatArray, stream: Timestamps, probed: int = 2000) -> Clock:
     """
     period = stream.period_ns
     probe = t[:: max(1, t.size // probed)]
-    x = probe / period
-    x -= np.floor(x)
-    unit = float(stream.info.get("unit_ns", 0.0))
+    given = float(stream.info.get("unit_ns", 0.0))
     own = [period / (most // stream.bins * stream.bins) for most in (2**15, 2**16)]  # our PTU and Photon-HDF5
-    candidates = [unit] if unit > 0.0 else own
-    for unit in candidates:
-        for locked, place in ((False, probe / unit), (True, x * period / unit)):
+    for unit in [given] if given > 0.0 else own:
+        for locked, place in ((False, probe / unit), (True, probe / period % 1.0 * period / unit)):
             first = locked & (place < 1.0)  # those of the last unit of a period may lie beyond its end
             if first.all():
                 continue

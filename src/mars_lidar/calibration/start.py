@@ -72,8 +72,7 @@ def light(t: FloatArray, model: Model, hold: float) -> FloatArray:
         peaks += [signal, peak % period]
         variance = variance or var
     own = max(variance - unit**2 / 6, 0.0025 * variance, (0.15 * unit) ** 2)
-    back = max(faint * bins if model.returns else float(rate.sum()), 1e-5)
-    return np.array([back, *peaks, own**0.5])
+    return np.array([max(faint * bins, 1e-5), *peaks, own**0.5])
 
 
 def starts(fit: Fit, recording: Recording, model: Model, fixed: dict[str, float]) -> list[tuple[float, FloatArray]]:

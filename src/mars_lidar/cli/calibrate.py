@@ -133,7 +133,7 @@ class KnownOptions:
         return "free" if self.free else pulse or "gaussian"
 
 
-_UNITS = {"signal": " photons per period", "background": " photons per period", "light": " photons per period"}
+_UNITS = dict.fromkeys(("signal", "background", "light"), " photons per period")
 
 
 def calibrate(

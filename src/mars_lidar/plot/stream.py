@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from mars_lidar.calibration import Calibration
+    from mars_lidar.calibration.recording import Recording
 
 
 _PHOTONS = 4.0  # of the model's streams, over those of the recording
@@ -93,23 +94,21 @@ def _histograms(result: Calibration, intervals: int = 200, phases: int = 256, ag
     recording, fit = result.recording, result.fitted
     period, unit = recording.period_ns, recording.clock.unit_ns
 
-    def counted(times: list[FloatArray]) -> list[FloatArray]:
-        gaps = np.concatenate([np.diff(t) for t in times])
-        phase = np.concatenate([t - np.floor(t / period) * period for t in times])
-        return [np.histogram(x, at)[0].astype(float) for x, at in zip((gaps, phase, gaps), edges, strict=True)]
+    def counted(times: Recording) -> list[FloatArray]:
+        phase = times.times - np.floor(times.times / period) * period
+        samples = times.intervals, phase, times.intervals
+        return [np.histogram(x, at)[0].astype(float) for x, at in zip(samples, edges, strict=True)]
 
     low, high, top = np.quantile(recording.intervals, (0.0005, 0.5, 0.99))
     near = _edges(max(low - 0.1 * (high - low), 0.0), high + (high - low), ages, unit)
     edges = [_edges(0.0, 1.05 * top, intervals, unit), np.linspace(0.0, period, phases + 1), near]
-    recorded = counted(list(recording.pieces))
+    recorded = counted(recording)
     if fit is None:
         return [_Histogram(*each) for each in zip(edges, recorded, strict=True)]
     photons = min(_PHOTONS * recording.photons, Effort.batch)
     cycles = max(2, round(recording.exposure * photons / recording.photons / LIGHTS))
     scale = recording.exposure / (cycles * LIGHTS)
-    expected = [
-        scale * counts for counts in counted(list(fit.model.streams(np.tile(fit.theta, (LIGHTS, 1)), cycles, 0)))
-    ]
+    expected = [scale * counts for counts in counted(fit.model.streams(np.tile(fit.theta, (LIGHTS, 1)), cycles, 0))]
     return [_Histogram(*each, scale) for each in zip(edges, recorded, expected, strict=True)]
 
 

@@ -25,7 +25,6 @@ from mars_lidar.light.flux import Flux
 _NARROWEST = 2e-6  # periods: the narrowest pulse that the engines draw
 _WIDEST = 0.3  # sigma of a recorded pulse, periods: a wider one is hardly distinguished from background
 EXCESS = 0.25  # of an electronics' dead time over the detector's, in the test for one
-Fields = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -43,7 +42,7 @@ class Effect:
     words: str
     onoff: bool = False
 
-    def of(self, fields: Fields, values: dict[str, float]) -> Fields:
+    def of(self, fields: dict[str, Any], values: dict[str, float]) -> dict[str, Any]:
         """Fields of a `Detector` with the effect, whose parameters have these `values`."""
         name, dead = self.names[0], fields["dead_time_ns"]
         size = values[name]
@@ -89,7 +88,7 @@ def _quantiles() -> NDArray[np.float32]:
 
 
 def _normal_deviates(number: int, seed: int) -> NDArray[np.float32]:
-    """Normal deviates (n,), each the sum of two quantiles of 16 random bits: a third of the time of NumPy's."""
+    """Normal deviates (n,), each the sum of two quantiles of 16 random bits: two thirds of the time of NumPy's."""
     first, second = np.random.Generator(np.random.SFC64(seed)).integers(0, 2**16, (2, number), np.uint16)
     return np.asarray(_quantiles()[first] + _quantiles()[second])
 
@@ -241,7 +240,7 @@ class Model:
         theta, period = self.bounded(theta), self.clock.period_ns
         values = dict(zip(self.names, theta.tolist(), strict=True))
         sigma, sd = map(float, self.widths(theta))
-        fields: Fields = dict(self.fields) | {"dead_time_ns": values["dead_time_ns"]}
+        fields: dict[str, Any] = dict(self.fields) | {"dead_time_ns": values["dead_time_ns"]}
         for effect in self.effects:
             fields = effect.of(fields, values)
         if jitter and sd > _NARROWEST * period:

@@ -28,7 +28,6 @@ class Cells:
         phases = np.concatenate(pilot) / period % 1.0
         edges, lit = self._layout(model, theta, phases)
         centre = (np.arange(_PHASES) + 0.5) / _PHASES
-        phase_of = np.searchsorted(edges, centre).astype(np.int32)
         # phases from which the dead time, or a shorter one that electronics' dead time hides, ends in a pulse
         hidden = theta[model.light + 2] / (1.0 + np.array([0.0, EXCESS])[:, None, None])
         ends = (lit[: model.returns] - hidden / period) % 1.0
@@ -38,8 +37,7 @@ class Cells:
         self.phases = edges.size + 1
         ratio = gaps.size / max(photons, 1.0)
         fine = max(0.7, 2.0 / ratio) * 1.5 ** np.arange(60)
-        tail = 0.2 * 0.5 ** np.arange(1, 6)
-        quantiles = np.r_[np.linspace(0.2, 0.8, 7), 1.0 - tail]
+        quantiles = np.r_[np.linspace(0.2, 0.8, 7), 1.0 - 0.2 * 0.5 ** np.arange(1, 6)]
         rank = np.r_[fine[fine < 0.15 * photons], photons * quantiles] * ratio
         place = gaps[np.minimum(rank.astype(int), gaps.size - 1)]
         early = (np.arange(1, 7) / 7) ** 3  # quantiles of the intervals that divide the table, closer for short ones
@@ -48,7 +46,7 @@ class Cells:
         self._arguments: dict[str, Any] = {  # of the native cells, which cannot be pickled
             "period_ns": period,
             "shift": 0.37 / _PHASES,  # no edge lies where a clock ticks
-            "phase_of": phase_of,
+            "phase_of": np.searchsorted(edges, centre).astype(np.int32),
             "class_of": (2 * np.searchsorted(coarse, centre)).astype(np.int32),
             "lit_of": inside.astype(np.int32),
             "gap_edges": self.gap_edges,

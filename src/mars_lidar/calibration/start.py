@@ -81,20 +81,17 @@ def starts(fit: Fit, recording: Recording, model: Model, fixed: dict[str, float]
     photons = min(recording.photons, fit.effort.first)
     t = recording.pieces[0][: 12 * photons]
     low = np.sort(np.diff(t))
-    n = low.size
-    observed, unit = low[_ranks(n)], model.clock.unit_ns
+    observed, unit = low[_ranks(low.size)], model.clock.unit_ns
     hold = max(4 * observed[-3] - 3 * observed[0], fixed.get("dead_time_ns", 0.0)) + 2 * unit
     if model.returns == 0:
-        total = float(free_waveform(recording, 64)[0].sum())
-        first = np.array([total, max((observed[-3] - observed[0]) / 4, 0.3 * unit)])
+        first = np.array([free_waveform(recording, 64)[0].sum(), max((observed[-3] - observed[0]) / 4, 0.3 * unit)])
     else:
         first = light(t, model, hold)
     trials = []
     cycles = max(2, round(fit.exposure(photons)))
     # from no jitter to a width of jitter alone
     for angle in np.linspace(0.0, np.pi / 2.0, 1 if "jitter" in fixed else 7):
-        theta = np.zeros(model.size)
-        theta[: k + 1] = first
+        theta = np.r_[first, 0.0, 0.0]
         theta[k + 1] = fixed.get("jitter", angle if model.split else np.sin(angle) * theta[k])
         jitter = float(model.widths(theta)[1])
         theta[k + 2] = fixed.get("dead_time_ns", max(observed[0], 0.05 * observed[-1]) + 2 * jitter)

@@ -114,7 +114,7 @@ def other_period(recording: Recording, cells: int = 2**20, slowest: float = 0.3)
     first += int(np.argmax(power[first : first + 3]))
     if abs(first - given) < 1.5 or _is_harmonic(power, near, first, given):
         return None
-    around = power[first - 1 : first + 2]
+    around = np.pad(power, (0, 1), "reflect")[first - 1 : first + 2]
     return float(length * cell / (first + (around[2] - around[0]) / around.sum()))
 
 

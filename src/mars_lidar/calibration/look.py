@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -135,4 +134,4 @@ def _neighbours(power: FloatArray, line: int) -> float:
     """Mean power of a line without a period, from the median of the lines around it except the nearest."""
     reach = 2 * _PER_PERIOD
     around = np.concatenate([power[max(line - reach, 1) : line - 3], power[line + 4 : line + reach + 1]])
-    return max(float(np.median(around)) / math.log(2.0), 1.0)
+    return max(float(np.median(around) / np.log(2.0)), 1.0)

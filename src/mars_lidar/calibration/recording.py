@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -116,7 +115,7 @@ def recording_of(times: Timestamps | Sequence[Timestamps], *, pooled: bool = Fal
     """
     streams = [times] if isinstance(times, Timestamps) else list(times)
     first = streams[0]
-    if not (first.period_ns > 0 and math.isfinite(first.period_ns)):
+    if not (first.period_ns > 0 and np.isfinite(first.period_ns)):
         raise ValueError(f"times must give the laser period, got period_ns {first.period_ns}")
     pieces: list[FloatArray] = []
     cycles: list[float] = []
